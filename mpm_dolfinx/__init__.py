@@ -1,0 +1,28 @@
+# SPDX-License-Identifier: MIT
+"""Implicit, iteratively coupled material point / finite volume poromechanics on FEniCSx."""
+
+from mpm_dolfinx.coupling import COUPLINGS, NotConverged
+from mpm_dolfinx.grid import Grid
+from mpm_dolfinx.materials import LAWS, Fluid, Hencky, LinearElastic, NeoHookean
+from mpm_dolfinx.points import box, probes, shape
+from mpm_dolfinx.simulation import Drained, GaveUp, Inflow, Result, Simulation, Traction
+
+__all__ = [
+    "COUPLINGS",
+    "LAWS",
+    "Drained",
+    "Fluid",
+    "GaveUp",
+    "Grid",
+    "Hencky",
+    "Inflow",
+    "LinearElastic",
+    "NeoHookean",
+    "NotConverged",
+    "Result",
+    "Simulation",
+    "Traction",
+    "box",
+    "probes",
+    "shape",
+]

@@ -1,0 +1,198 @@
+# SPDX-License-Identifier: MIT
+"""Every spelling that differs between the supported dolfinx releases (0.5.2, 0.9 and 0.11).
+
+The rest of the package never asks for a version.  A branch goes when the oldest release that needs
+it goes; the branches marked OLD are those of 0.5.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+
+from mpi4py import MPI
+from petsc4py import PETSc
+
+import numpy as np
+import ufl
+from dolfinx import cpp, fem, mesh
+from numpy.typing import NDArray
+
+OLD = not hasattr(fem, "functionspace")
+SUBDOMAIN = 1  # the one subdomain id of our measures
+
+if OLD:
+    from dolfinx import jit
+    from dolfinx.fem.assemble import pack_coefficients as _pack_coefficients
+else:
+    import basix.ufl
+
+
+def function_space(msh: mesh.Mesh, family: str, degree: int, shape: tuple[int, ...] = ()):
+    """Return the space of `shape`-valued functions of a family ("DG", "Lagrange") and degree."""
+    if not OLD:
+        return fem.functionspace(msh, (family, degree, shape) if shape else (family, degree))
+    return fem.FunctionSpace(msh, _old_element(msh, family, degree, shape))
+
+
+def _old_element(msh, family: str, degree: int, shape: tuple[int, ...]):
+    cell = msh.ufl_cell()
+    if len(shape) == 2:
+        return ufl.TensorElement(family, cell, degree, shape=shape)
+    if len(shape) == 1:
+        return ufl.VectorElement(family, cell, degree, dim=shape[0])
+    return ufl.FiniteElement(family, cell, degree)
+
+
+def mixed_space(msh: mesh.Mesh, parts: Sequence[tuple[str, int, tuple[int, ...]]]):
+    """Return the mixed space of several (family, degree, shape)."""
+    if OLD:
+        return fem.FunctionSpace(msh, ufl.MixedElement(*[_old_element(msh, *p) for p in parts]))
+    elements = [basix.ufl.element(f, msh.basix_cell(), k, shape=s) for f, k, s in parts]
+    return fem.functionspace(msh, basix.ufl.mixed_element(elements))
+
+
+def cell_dofs(V) -> NDArray[np.int32]:
+    """Return the blocked degrees of freedom of the cells, ghosts included, (cells, n)."""
+    dofs = V.dofmap.list
+    return dofs.array.reshape(dofs.num_nodes, -1) if OLD else np.asarray(dofs)
+
+
+def petsc_vec(u: fem.Function) -> PETSc.Vec:
+    """Return the PETSc vector that shares the function's memory."""
+    return u.vector if OLD else u.x.petsc_vec
+
+
+def create_vector(A: PETSc.Mat) -> PETSc.Vec:
+    """Return a vector for the rows of a matrix (`create_vector` takes a form or a space by release)."""
+    return A.createVecLeft()
+
+
+def num_cells(msh: mesh.Mesh) -> tuple[int, int]:
+    """Return the numbers of owned cells and of all cells on this process."""
+    index_map = msh.topology.index_map(msh.topology.dim)
+    return index_map.size_local, index_map.size_local + index_map.num_ghosts
+
+
+def scatter_reverse_add(u: fem.Function) -> None:
+    """Add the values at ghosts to those of their owners."""
+    if OLD:
+        from dolfinx import la
+
+        u.x.scatter_reverse(la.ScatterMode.add)
+    else:
+        from dolfinx import la
+
+        u.x.scatter_reverse(la.InsertMode.add)
+
+
+class CompiledForm:
+    """A UFL form over cells or interior facets, compiled once and bound to entity lists at will.
+
+    The list may name a cell any number of times: the kernel is called once an entry.  Only owned
+    cells may be named (0.5 skips ghosts without a word).  0.5 takes the list as mesh tags with
+    repeated indices, later releases as an entity list.
+
+    Parameters
+    ----------
+    form
+        Form with one integral type, all integrals with the subdomain id `SUBDOMAIN`.
+    """
+
+    def __init__(self, form: ufl.Form):
+        (self.integral_type,) = {i.integral_type() for i in form.integrals()}
+        self.mesh = form.ufl_domain().ufl_cargo() if OLD else _mesh_of(form)
+        self._spaces = [a.ufl_function_space() for a in form.arguments()]
+        coefficients, self._constants = form.coefficients(), form.constants()
+        if OLD:
+            logging.disable(logging.INFO)  # 0.5 logs every compiler call
+            self._ufcx, self._module, _ = jit.ffcx_jit(self.mesh.comm, form)
+            logging.disable(logging.NOTSET)
+            position = self._ufcx.original_coefficient_position
+            count = self._ufcx.num_coefficients
+        else:
+            self._compiled = fem.compile_form(self.mesh.comm, form)
+            position = self._compiled.ufcx_form.original_coefficient_position
+            count = self._compiled.ufcx_form.num_coefficients
+            self._all = coefficients
+        self.coefficients = [coefficients[position[i]] for i in range(count)]
+        self.constants = np.empty(0)
+        self.form = None
+
+    def bind(self, entities: NDArray[np.int32]) -> None:
+        """Set the cells (repeats allowed) or the interior facets over which the form is integrated."""
+        entities = np.ascontiguousarray(entities, dtype=np.int32)
+        cells = self.integral_type == "cell"
+        kind = cpp.fem.IntegralType.cell if cells else cpp.fem.IntegralType.interior_facet
+        dim = self.mesh.topology.dim - (0 if cells else 1)
+        if OLD:
+            values = np.full(len(entities), SUBDOMAIN, dtype=np.int32)
+            tags = cpp.mesh.MeshTags_int32(self.mesh, dim, entities, values)
+            ffi = self._module.ffi
+            self.form = cpp.fem.Form_float64(
+                int(ffi.cast("uintptr_t", ffi.addressof(self._ufcx))),
+                [V._cpp_object for V in self._spaces],
+                [c._cpp_object for c in self.coefficients],
+                [c._cpp_object for c in self._constants],
+                {kind: tags},
+                self.mesh,
+            )
+        else:
+            if not cells:
+                entities = _facet_cells(self.mesh, entities, dim)
+            bound = fem.create_form(
+                self._compiled,
+                self._spaces,
+                self.mesh,
+                {kind: [(SUBDOMAIN, entities)]},
+                {c: c for c in self._all},
+                {c: c for c in self._constants},
+            )
+            self._bound, self.form = bound, bound._cpp_object
+        self.constants = cpp.fem.pack_constants(self.form)
+
+    def packed(self) -> dict:
+        """Return dolfinx's own packed coefficients, one row an entity."""
+        return _pack_coefficients(self.form) if OLD else cpp.fem.pack_coefficients(self.form)
+
+    def assemble_vector(self, b: NDArray[np.float64], rows: NDArray[np.float64] | None = None) -> None:
+        """Add the vector to `b` (ghosts not accumulated), with own coefficient rows if given."""
+        cpp.fem.assemble_vector(b, self.form, self.constants, self._coefficients(rows))
+
+    def assemble_matrix(self, A: PETSc.Mat, rows: NDArray[np.float64] | None = None) -> None:
+        """Add the matrix to `A` (not finalised), dofs unrolled, with own coefficient rows if given."""
+        cpp.fem.petsc.assemble_matrix(
+            A, self.form, self.constants, self._coefficients(rows), [], unrolled=True
+        )
+
+    def _coefficients(self, rows) -> dict:
+        if rows is None:
+            return self.packed()
+        # 0.11 counts the integrals where earlier releases name the subdomain
+        return {(cpp.fem.IntegralType.cell, key): rows for key in self._keys()}
+
+    def _keys(self) -> list[int]:
+        if not hasattr(self, "_key"):
+            self._key = [key for _, key in self.packed()] or [SUBDOMAIN]
+        return self._key
+
+
+def _mesh_of(form: ufl.Form):
+    spaces = [a.ufl_function_space() for a in form.arguments()]
+    return spaces[0].mesh
+
+
+def _facet_cells(msh, facets, dim: int) -> NDArray[np.int32]:
+    """Return the flat list (cell0, local facet0, cell1, local facet1, ...) of interior facets."""
+    kind = cpp.fem.IntegralType.interior_facet
+    compute = cpp.fem.compute_integration_domains
+    topology = msh.topology._cpp_object
+    try:
+        return compute(kind, topology, facets, dim)
+    except TypeError:  # 0.11
+        return compute(kind, topology, facets)
+
+
+def comm_sum(comm: MPI.Intracomm, value):
+    """Return the sum of a number or an array over the processes."""
+    return comm.allreduce(value, op=MPI.SUM)

@@ -1,0 +1,237 @@
+# SPDX-License-Identifier: MIT
+"""The coupler: momentum and storage exchange u and p until both balance.
+
+A Newton step of the two problems reads
+
+    [ K  -B^T ] [du]     [R_u]
+    [ B   C   ] [dp] = - [R_p].
+
+`schur-cg` eliminates du and solves with S = C + B K^-1 B^T by conjugate gradients, preconditioned
+with the fixed-stress operator C + beta V (beta = 0.75 alpha^2 / K_dr): the paper's two separate
+solvers, accelerated.  `schur-fgmres` does the same with the full, slightly unsymmetric Jacobian.
+`fixed-stress` is the paper's Richardson iteration: a storage solve with C + beta V at frozen stress,
+then a momentum solve, in turn.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from dolfinx.common import Timer
+from petsc4py import PETSc
+
+from mpm_dolfinx.momentum import Momentum
+from mpm_dolfinx.storage import Storage
+from mpm_dolfinx.unknowns import direct_solver
+
+COUPLINGS = {
+    "schur-cg": 0.75,
+    "schur-fgmres": 0.75,
+    "fixed-stress": 0.75,
+    "fixed-stress-full": 1.0,
+    "fixed-stress-paper": None,
+}
+"""Coupling schemes and the multiple of alpha^2/K_dr that they take as beta; None: 1/K_w, as printed in the paper."""
+
+KEEP = 0.05  # the tangent is kept while a Newton step reduces the residual to less than this
+FORCING = 1e-3  # relative accuracy of the linear solve
+
+
+class NotConverged(RuntimeError):
+    """A step's equations could not be solved; `history` lists (momentum, storage) relative residuals."""
+
+    def __init__(self, reason: str, history: list[tuple[float, float]]):
+        worst = "momentum" if not history or history[-1][0] >= history[-1][1] else "storage"
+        shown = ", ".join(f"({u:.1e}, {p:.1e})" for u, p in history[-6:])
+        super().__init__(f"{reason}; worst in {worst}; last residuals (momentum, storage): {shown}")
+        self.reason, self.field, self.history = reason, worst, history
+
+
+@dataclass
+class Report:
+    """What a converged step took: Newton and coupling iterations, relative residuals, fluid balance."""
+
+    newton: int = 0
+    coupling: int = 0
+    history: list[tuple[float, float]] = field(default_factory=list)
+    balance: float = 0.0
+
+
+class SchurComplement:
+    """Matrix-free S = C + B K^-1 B^T for PETSc's Krylov solvers."""
+
+    def __init__(self, storage: Storage, solve_momentum: PETSc.KSP):
+        self.storage, self.solve = storage, solve_momentum
+        self.f = storage.B.createVecRight()
+        self.v = storage.B.createVecRight()
+
+    def mult(self, A: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        s = self.storage
+        s.B_momentum.multTranspose(x, self.f)
+        self.solve.solve(self.f, self.v)
+        s.B.mult(self.v, y)
+        s.C.multAdd(x, y, y)
+
+
+class Coupler:
+    """Solver of one step of the coupled problem, or of the momentum problem alone.
+
+    Parameters
+    ----------
+    momentum, storage
+        The two problems; storage is None without fluid.
+    coupling
+        Name in `COUPLINGS`.
+    tolerance
+        Both residuals fall below this, relative to the forces and to the fluid that changes places.
+    max_iterations
+        Newton steps, or coupling iterations of `fixed-stress`, before a step is given up.
+    """
+
+    def __init__(
+        self,
+        momentum: Momentum,
+        storage: Storage | None,
+        coupling: str = "schur-cg",
+        tolerance: float = 1e-8,
+        max_iterations: int | None = None,
+    ):
+        if coupling not in COUPLINGS:
+            raise ValueError(f"coupling {coupling!r}: must be one of {', '.join(COUPLINGS)}")
+        self.momentum, self.storage, self.coupling, self.tolerance = momentum, storage, coupling, tolerance
+        self.richardson = storage is not None and coupling.startswith("fixed-stress")
+        self.max_iterations = max_iterations or (200 if self.richardson else 25)
+        self.beta = COUPLINGS[coupling] or 1.0
+
+    def set_unknowns(self) -> None:
+        """Make the solvers for the present matrices."""
+        self._solve_u = direct_solver(self.momentum.K, "momentum")
+        self._du, self._rhs = self.momentum.unknowns.vector(), self.momentum.unknowns.vector()
+        if self.storage is None:
+            return
+        self._dp, self._g = self.storage.unknowns.vector(), self.storage.unknowns.vector()
+        self._schur = None
+
+    def solve(self, dt: float) -> Report:
+        """Solve a step from the present (u, p).
+
+        Raises
+        ------
+        NotConverged
+            With the residual history; u and p are then void, the state of the points is untouched.
+        """
+        report = Report()
+        self._scale_u = 0.0
+        errors = self._errors(dt, report)
+        fresh = True
+        while max(errors) > self.tolerance:
+            if report.newton >= self.max_iterations:
+                raise NotConverged(f"no convergence in {report.newton} iterations", report.history)
+            if fresh:
+                self._linearise(dt)
+            report.newton += 1
+            before = errors
+            if self.richardson:
+                errors = self._richardson(dt, report)
+                fresh = True
+            else:
+                report.coupling += self._newton_direction(max(errors))
+                errors = self._line_search(dt, before, report)
+                fresh = max(errors) > KEEP * max(before)
+            if not np.isfinite(errors).all() or max(errors) > 1e8:
+                raise NotConverged("the iteration diverges", report.history)
+        if self.storage is not None:
+            report.balance = abs(self.storage.balance(dt)) / max(self._exchanged, 1e-300)
+        return report
+
+    def _errors(self, dt: float, report: Report) -> tuple[float, float]:
+        """Assemble both residuals; return and note their norms relative to their scales."""
+        with Timer("mpm: residual"):
+            r, scale = self.momentum.assemble_residual()
+            self._scale_u = max(self._scale_u, scale)
+            errors = [_relative(r.norm(), self._scale_u, self.momentum.round_off), 0.0]
+            if self.storage is not None:
+                r, self._exchanged = self.storage.assemble_residual(dt)
+                errors[1] = _relative(r.norm(PETSc.NormType.N1), self._exchanged, self.storage.round_off)
+        report.history.append((errors[0], errors[1]))
+        return errors[0], errors[1]
+
+    def _linearise(self, dt: float) -> None:
+        with Timer("mpm: tangent"):
+            K = self.momentum.assemble_tangent()
+            if self.storage is not None:
+                self.storage.assemble_tangent(dt)
+        with Timer("mpm: factorisation"):
+            self._solve_u.setOperators(K)
+            self._solve_u.setUp()
+            if self.storage is not None:
+                if self._schur is None:
+                    self._make_schur()
+                P = self.storage.assemble_preconditioner(dt, self.beta)
+                self._solve_s.setOperators(self._schur, P)
+                self._solve_s.setUp()
+
+    def _make_schur(self) -> None:
+        """Make the Krylov solver on the Schur complement; Richardson's needs only its preconditioner."""
+        n = (self.storage.unknowns.size, None)
+        context = SchurComplement(self.storage, self._solve_u)
+        self._schur = PETSc.Mat().createPython((n, n), context, comm=self.storage.unknowns.comm)
+        self._schur.setUp()
+        self._solve_s = direct_solver(self.storage.assemble_preconditioner(1.0, self.beta), "storage")
+        kind = {"schur-cg": PETSc.KSP.Type.CG, "schur-fgmres": PETSc.KSP.Type.FGMRES}
+        self._solve_s.setType(kind.get(self.coupling, PETSc.KSP.Type.PREONLY))
+
+    def _newton_direction(self, error: float) -> int:
+        """Solve the linearised problem for (du, dp) in place; return the coupling iterations."""
+        with Timer("mpm: linear solve"):
+            if self.storage is None:
+                self._solve_u.solve(self.momentum.residual, self._du)
+                return 0
+            s = self.storage
+            self._solve_u.solve(self.momentum.residual, self._du)
+            s.B.mult(self._du, self._g)
+            self._g.aypx(-1.0, s.residual)  # R_p - B K^-1 R_u
+            # no more accuracy than the next residual can use
+            rtol = min(1e-2, max(FORCING, 0.05 * self.tolerance / error))
+            self._solve_s.setTolerances(rtol=rtol, atol=0.0, max_it=500)
+            self._solve_s.solve(self._g, self._dp)
+            s.B_momentum.multTranspose(self._dp, self._rhs)
+            self._rhs.axpy(1.0, self.momentum.residual)
+            self._solve_u.solve(self._rhs, self._du)
+            return self._solve_s.getIterationNumber()
+
+    def _line_search(self, dt: float, before: tuple[float, float], report: Report) -> tuple[float, float]:
+        """Go along the direction, backtracking while the residual is not finite or explodes."""
+        step, moved = 1.0, 0.0
+        while True:
+            self._move(moved - step)
+            moved = step
+            errors = self._errors(dt, report)
+            if np.isfinite(errors).all() and max(errors) < 1e4 * max(before):
+                return errors
+            step /= 2
+            if step < 1e-3:
+                raise NotConverged("no descent along the Newton direction", report.history)
+
+    def _move(self, scale: float) -> None:
+        self.momentum.unknowns.add(self.momentum.u, scale, self._du)
+        if self.storage is not None:
+            self.storage.unknowns.add(self.storage.p, scale, self._dp)
+
+    def _richardson(self, dt: float, report: Report) -> tuple[float, float]:
+        """One fixed-stress iteration: momentum at fixed pressure, then storage at fixed stress."""
+        self._solve_u.solve(self.momentum.residual, self._du)
+        self.momentum.unknowns.add(self.momentum.u, -1.0, self._du)
+        residual, _ = self.storage.assemble_residual(dt)
+        self._solve_s.solve(residual, self._dp)
+        self.storage.unknowns.add(self.storage.p, -1.0, self._dp)
+        report.coupling += 1
+        return self._errors(dt, report)
+
+
+def _relative(norm: float, scale: float, round_off: float) -> float:
+    """Return norm / scale; 0 where the norm is round-off."""
+    if norm <= round_off:
+        return 0.0
+    return norm / scale if scale > 0 else np.inf

@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: MIT
+"""Rows of arrays that travel to other processes, and answers that come back.
+
+The unit that travels is what lies in a cell (a piece of a domain, a corner, a loaded point): a cell
+integral is assembled by the rank that owns the cell.  On one process nothing is copied.
+"""
+
+from __future__ import annotations
+
+from mpi4py import MPI
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class Exchange:
+    """A fixed pattern of rows to ranks.
+
+    Parameters
+    ----------
+    comm
+        The processes.
+    destination : (n,)
+        Rank that each row goes to.
+    """
+
+    def __init__(self, comm: MPI.Intracomm, destination: NDArray[np.int32]):
+        self.comm = comm
+        if comm.size == 1:
+            return
+        self._order = np.argsort(destination, kind="stable")
+        self._sent = np.bincount(destination, minlength=comm.size).astype(np.int32)
+        self._received = np.empty_like(self._sent)
+        comm.Alltoall(self._sent, self._received)
+
+    def send(self, rows: NDArray) -> NDArray:
+        """Return the rows that this rank received, ordered by sender."""
+        if self.comm.size == 1:
+            return rows
+        return self._transfer(rows[self._order], self._sent, self._received)
+
+    def back(self, rows: NDArray) -> NDArray:
+        """Return answers, one for each received row, to the senders in the order they sent."""
+        if self.comm.size == 1:
+            return rows
+        answers = self._transfer(rows, self._received, self._sent)
+        out = np.empty_like(answers)
+        out[self._order] = answers
+        return out
+
+    def _transfer(self, rows: NDArray, counts, received) -> NDArray:
+        rows = np.ascontiguousarray(rows)
+        width = int(np.prod(rows.shape[1:], dtype=int))
+        out = np.empty((int(received.sum()), *rows.shape[1:]), dtype=rows.dtype)
+        kind = MPI._typedict[rows.dtype.char]
+        self.comm.Alltoallv([rows, counts * width, kind], [out, received * width, kind])
+        return out

@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: MIT
+"""Forms at material points: any UFL form, evaluated where the points are.
+
+A multilinear function on a box is a polynomial of degree d, so its Taylor series about the cell's
+midpoint ends after d terms: with xi = x_p - x_mid,
+
+    v(x_p) = v + grad v . xi + 1/2 xi . grad grad v . xi + ...,   the right side taken at the midpoint.
+
+The right side is plain UFL, integrated by the one-point rule; xi and whatever else a point carries
+are DG0 coefficients, of which every entry of the integral's entity list has values of its own.
+Hence listing a cell as often as it has points, with one row of coefficients a point, makes the
+assembler call the kernel once a point, and int f w/|cell| dx over that list is sum_p w_p f(x_p).
+No generated code is touched.
+"""
+
+from __future__ import annotations
+
+from math import factorial
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from numpy.typing import NDArray
+from petsc4py import PETSc
+
+from mpm_dolfinx import _compat
+from mpm_dolfinx.grid import Grid
+
+
+class PointMeasure(ufl.Measure):
+    """Measure of a sum over points: `f * dx` stands for sum_p w_p f(x_p)."""
+
+    def __init__(self, grid: Grid, weight: ufl.core.expr.Expr):
+        super().__init__(
+            "dx",
+            domain=grid.mesh,
+            subdomain_id=_compat.SUBDOMAIN,
+            metadata={"quadrature_degree": 0},
+        )
+        self._weight = weight
+
+    def __rmul__(self, integrand) -> ufl.Form:
+        return super().__rmul__(self._weight * integrand)
+
+
+class FormPoints:
+    """Points, weights and data of the points at which forms are evaluated.
+
+    Parameters
+    ----------
+    grid
+        The background grid.
+    fields
+        Name and shape of each quantity that the points carry; `points.name` is then a UFL
+        coefficient with the point's value.
+    """
+
+    def __init__(self, grid: Grid, **fields: tuple[int, ...]):
+        self.grid = grid
+        self._functions = {
+            name: fem.Function(_compat.function_space(grid.mesh, "DG", 0, shape))
+            for name, shape in {"offset": (grid.dim,), "weight": (), **fields}.items()
+        }
+        self.dx = PointMeasure(grid, self._functions["weight"])
+        self.cells = np.empty(0, dtype=np.int32)
+        self.data: dict[str, NDArray[np.float64]] = {}
+        self.version = 0
+
+    def __getattr__(self, name: str) -> fem.Function:
+        functions = self.__dict__.get("_functions", {})
+        if name in functions:
+            return functions[name]
+        raise AttributeError(f"the points carry {', '.join(functions)}, not {name!r}")
+
+    def place(self, cells: NDArray[np.int32], x: NDArray[np.float64], weight: NDArray[np.float64], **data) -> None:
+        """Put the points into owned cells, with all their data.
+
+        Parameters
+        ----------
+        cells : (n,)
+            Owned local cell of each point.
+        x : (n, d), m
+            Positions.
+        weight : (n,), m^d
+            Volumes.
+        data : (n, ...)
+            Values of the fields.
+        """
+        self.cells, self.x = cells, x
+        self.data = {
+            "offset": x - self.grid.midpoints[cells],
+            "weight": (weight / self.grid.cell_volume)[:, None],
+            **{name: value.reshape(len(cells), -1) for name, value in data.items()},
+        }
+        self.version += 1
+
+    def value(self, f):
+        """Return f at the point, f a P1 function, test or trial function (any shape)."""
+        return self._taylor(f, self.grid.dim)
+
+    def grad(self, f):
+        """Return grad f at the point, f a P1 function, test or trial function (any shape)."""
+        return self._taylor(ufl.grad(f), self.grid.dim - 1)
+
+    def _taylor(self, f, order: int):
+        total = derivative = f
+        for k in range(1, order + 1):
+            derivative = term = ufl.grad(derivative)
+            for _ in range(k):  # contracting a k-th gradient halves the cost of nested grad(dot(., xi))
+                term = ufl.dot(term, self.offset)
+            total += term / factorial(k)
+        return total
+
+
+class PointForm:
+    """A form over `points.dx`, compiled once, assembled wherever the points are.
+
+    Parameters
+    ----------
+    form
+        Linear or bilinear UFL form whose integrals are all over `points.dx`.
+    points
+        The points; their data and the nodal values of grid functions are read at each assembly.
+    """
+
+    def __init__(self, form: ufl.Form, points: FormPoints):
+        self.points = points
+        self._compiled = _compat.CompiledForm(form)
+        self._version = -1
+        names = {f: name for name, f in points._functions.items()}
+        self._columns, self._gathered, start = [], [], 0
+        for f in self._compiled.coefficients:
+            dofs, bs = _compat.cell_dofs(f.function_space), f.function_space.dofmap.bs
+            stop = start + dofs.shape[1] * bs
+            if f in names:
+                self._columns.append((slice(start, stop), names[f]))
+            else:
+                self._gathered.append((slice(start, stop), f, (dofs[:, :, None] * bs + np.arange(bs))))
+            start = stop
+        self._width = start
+
+    def _rows(self) -> NDArray[np.float64]:
+        cells = self.points.cells
+        if self._version != self.points.version:
+            self._version = self.points.version
+            self._compiled.bind(cells)
+            self._packed = np.empty((len(cells), self._width))
+            for columns, name in self._columns:
+                self._packed[:, columns] = self.points.data[name]
+            self._dofs = [(c, f, dofs[cells].reshape(len(cells), -1)) for c, f, dofs in self._gathered]
+        for columns, f, dofs in self._dofs:
+            self._packed[:, columns] = f.x.array[dofs]
+        return self._packed
+
+    def assemble_vector(self, b: NDArray[np.float64]) -> None:
+        """Add the vector to the local array `b`; contributions to ghosts stay there."""
+        rows = self._rows()
+        if len(rows):
+            self._compiled.assemble_vector(b, rows)
+
+    def assemble_matrix(self, A: PETSc.Mat) -> None:
+        """Add the matrix to `A`, by unrolled local dofs; the caller finalises it."""
+        rows = self._rows()
+        if len(rows):
+            self._compiled.assemble_matrix(A, rows)

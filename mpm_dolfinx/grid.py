@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: MIT
+"""The background grid: a box of equal quadrilaterals or hexahedra, in which points are found by arithmetic."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from mpi4py import MPI
+
+import numpy as np
+from dolfinx import mesh
+from numpy.typing import ArrayLike, NDArray
+
+from mpm_dolfinx import _compat
+
+SIDES = {
+    2: {"left": (0, 0), "right": (0, 1), "bottom": (1, 0), "top": (1, 1)},
+    3: {"left": (0, 0), "right": (0, 1), "front": (1, 0), "back": (1, 1), "bottom": (2, 0), "top": (2, 1)},
+}
+"""Names of the sides of a box: (axis, 0 for the lower or 1 for the upper end)."""
+
+
+def side(name: str, dim: int) -> tuple[int, int]:
+    """Return (axis, end) of a named side of a box."""
+    if name not in SIDES[dim]:
+        raise ValueError(f"side {name!r}: in {dim}D a side is one of {', '.join(SIDES[dim])}")
+    return SIDES[dim][name]
+
+
+class Grid:
+    """Background grid of equal cells over the box [lower, upper].
+
+    Parameters
+    ----------
+    upper : (d,), m
+        Upper corner; d = 2 (plane strain) or 3.
+    cells : (d,)
+        Number of cells along each axis, at least 1.
+    lower : (d,), m
+        Lower corner, by default the origin.
+    comm
+        Processes that share the grid.
+    """
+
+    def __init__(
+        self,
+        upper: ArrayLike,
+        cells: Sequence[int],
+        lower: ArrayLike | None = None,
+        comm: MPI.Intracomm = MPI.COMM_WORLD,
+    ):
+        self.upper = np.asarray(upper, dtype=float)
+        self.dim = self.upper.size
+        self.lower = np.zeros(self.dim) if lower is None else np.asarray(lower, dtype=float)
+        self.shape = np.asarray(cells, dtype=np.int64)
+        if self.dim not in (2, 3) or self.shape.size != self.dim or self.lower.size != self.dim:
+            raise ValueError(f"grid: upper {upper}, cells {cells}: both need 2 or 3 entries, lower as many")
+        if (self.shape < 1).any() or not (self.upper > self.lower).all():
+            raise ValueError(f"grid: cells {cells} over {self.lower} to {self.upper}: need cells >= 1, upper > lower")
+        self.h = (self.upper - self.lower) / self.shape
+        self.comm = comm
+        create, cell = (
+            (mesh.create_rectangle, mesh.CellType.quadrilateral)
+            if self.dim == 2
+            else (mesh.create_box, mesh.CellType.hexahedron)
+        )
+        self.mesh = create(
+            comm, [self.lower, self.upper], self.shape.tolist(), cell, ghost_mode=mesh.GhostMode.shared_facet
+        )
+        nodes = _compat.function_space(self.mesh, "Lagrange", 1)
+        self.num_owned, self.num_local = _compat.num_cells(self.mesh)
+        self.cell_nodes = _compat.cell_dofs(nodes)
+        """(cells, 2^d): nodes of the cells, numbered as the P1 degrees of freedom."""
+        self.node_x = nodes.tabulate_dof_coordinates()[:, : self.dim]
+        self._nodes_owned = nodes.dofmap.index_map.size_local
+        corners = self.node_x[self.cell_nodes]
+        self.midpoints = corners.mean(axis=1)
+        # all cells list their vertices in the same order (tested), so one set of signs serves all
+        self.signs = np.sign(corners[0] - self.midpoints[0]) if len(corners) else np.zeros((2**self.dim, self.dim))
+        self._lookup()
+        self._facets()
+
+    @property
+    def cell_volume(self) -> float:
+        """Volume of a cell (m^d)."""
+        return float(np.prod(self.h))
+
+    def _lookup(self) -> None:
+        """Tables from the lexicographic number of a cell to the local cell and to its owner."""
+        self.cell_number = self.number(np.floor((self.midpoints - self.lower) / self.h).astype(np.int64))
+        self._local = np.full(int(np.prod(self.shape)), -1, dtype=np.int32)
+        self._local[self.cell_number] = np.arange(self.num_local)
+        if self.comm.size > 1:
+            owner = np.full(self._local.size, -1, dtype=np.int32)
+            owner[self.cell_number[: self.num_owned]] = self.comm.rank
+            self._owner = np.empty_like(owner)
+            self.comm.Allreduce(owner, self._owner, op=MPI.MAX)
+
+    def _facets(self) -> None:
+        topology, d = self.mesh.topology, self.dim
+        topology.create_connectivity(d, d - 1)
+        topology.create_connectivity(d - 1, d)
+        self.cell_facets = topology.connectivity(d, d - 1).array.reshape(-1, 2 * d)
+        adjacency = topology.connectivity(d - 1, d)
+        first = adjacency.offsets[:-1]
+        two = np.diff(adjacency.offsets) == 2
+        self.facet_cells = np.stack([adjacency.array[first], np.full(len(first), -1, dtype=np.int32)], axis=1)
+        self.facet_cells[two, 1] = adjacency.array[first[two] + 1]
+        self._facets_owned = topology.index_map(d - 1).size_local
+
+    def number(self, index: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the lexicographic numbers of cells from their (n, d) indices along the axes."""
+        return np.ravel_multi_index(tuple(index.T), tuple(self.shape))
+
+    def index(self, x: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Return the (n, d) indices of the cells that hold points, clamped into the grid."""
+        i = np.floor((x - self.lower) / self.h).astype(np.int64)
+        return np.clip(i, 0, self.shape - 1, out=i)
+
+    def owner(self, number: NDArray[np.int64]) -> NDArray[np.int32]:
+        """Return the rank that owns each cell, given by its lexicographic number."""
+        return self._owner[number] if self.comm.size > 1 else np.zeros(len(number), dtype=np.int32)
+
+    def local(self, number: NDArray[np.int64]) -> NDArray[np.int32]:
+        """Return this process's index of each cell, -1 where it does not have the cell."""
+        return self._local[number]
+
+    def outside(self, x: NDArray[np.float64], tolerance: float = 1e-9) -> NDArray[np.bool_]:
+        """Return which points lie outside the grid by more than `tolerance` cells."""
+        y = (x - self.lower) / self.h
+        return ((y < -tolerance) | (y > self.shape + tolerance) | ~np.isfinite(y)).any(axis=1)
+
+    def shape_functions(
+        self, cells: NDArray[np.int32], x: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the P1 shape functions (n, 2^d) of local cells at points and their gradients (n, 2^d, d), 1/m."""
+        t = 0.5 + self.signs * ((x - self.midpoints[cells]) / self.h)[:, None, :]
+        N = t.prod(axis=2)
+        dN = np.empty_like(t)
+        for a in range(self.dim):
+            dN[:, :, a] = self.signs[:, a] / self.h[a]
+            for b in range(self.dim):
+                if b != a:
+                    dN[:, :, a] *= t[:, :, b]
+        return N, dN
+
+    def interior_facets(self, active: NDArray[np.bool_], cells: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Return the facets of this process between two active cells (`cells` = where `active` holds)."""
+        facets = np.unique(self.cell_facets[cells])
+        facets = facets[facets < self._facets_owned]
+        both = self.facet_cells[facets]
+        return facets[(both[:, 1] >= 0) & active[both[:, 0]] & active[both[:, 1]]]
+
+    def wall_nodes(self, name: str) -> NDArray[np.bool_]:
+        """Return which nodes lie on a side of the box."""
+        axis, end = side(name, self.dim)
+        plane = (self.lower, self.upper)[end][axis]
+        return np.abs(self.node_x[:, axis] - plane) < 1e-6 * self.h[axis]

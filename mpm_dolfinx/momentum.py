@@ -1,0 +1,187 @@
+# SPDX-License-Identifier: MIT
+"""Balance of momentum: quasi-static, P1 on the grid, evaluated at the pieces of the points' domains.
+
+With Delta = I + grad u for the increment u since the start of the step, F = Delta F_n and J = det F,
+the residual is the derivative of
+
+    int psi(F) / J_n - alpha p det(Delta) dV_n  -  loads,
+
+that is int (P' - alpha p J_Delta Delta^-T) : grad v dV_n = int rho g . v dV_n + tractions, P' the
+first Piola-Kirchhoff effective stress relative to the start of the step.  The derivatives are UFL's.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from numpy.typing import NDArray
+from petsc4py import PETSc
+
+from mpm_dolfinx import _compat
+from mpm_dolfinx.forms import FormPoints, PointForm
+from mpm_dolfinx.grid import Grid
+from mpm_dolfinx.unknowns import Unknowns, matrix, sum_ghosts, zero
+
+GHOST = 1e-2
+"""Strength of the ghost penalty; 1e-3 to 1/30 changes the beam's tip by 1e-5."""
+FULL = 0.9
+"""A cell filled less than this is partly filled: its faces carry the ghost penalty."""
+
+
+class Momentum:
+    """The momentum problem of a scene.
+
+    Parameters
+    ----------
+    grid
+        Background grid.
+    pieces
+        Points of integration with the fields F (d, d), the law's parameters and, with fluid, biot.
+    law
+        Class of the skeleton's law.
+    fixed : (nodes, d)
+        Which components of the displacement are zero at which nodes of the grid.
+    pressure
+        DG0 pore pressure, None without fluid.
+    gravity : (d,), m/s^2
+        Acceleration; the pieces then carry `density`, kg/m^3.
+    """
+
+    def __init__(
+        self,
+        grid: Grid,
+        pieces: FormPoints,
+        law,
+        fixed: NDArray[np.bool_],
+        pressure: fem.Function | None = None,
+        gravity: NDArray[np.float64] | None = None,
+    ):
+        self.grid, self.pieces = grid, pieces
+        V = _compat.function_space(grid.mesh, "Lagrange", 1, (grid.dim,))
+        self.u, self._b, self._f = (fem.Function(V) for _ in range(3))
+        self.free = ~fixed
+        v, du = ufl.TestFunction(V), ufl.TrialFunction(V)
+
+        delta = ufl.Identity(grid.dim) + pieces.grad(self.u)
+        parameters = {name: getattr(pieces, name) for name in law.parameters}
+        energy = law.energy(ufl.variable(delta * pieces.F), **parameters) / ufl.det(pieces.F)
+        if pressure is not None:
+            energy -= pieces.biot * pressure * ufl.det(delta)
+        residual = ufl.derivative(energy * pieces.dx, self.u, v)
+        self._residual = PointForm(residual, pieces)
+        self._tangent = PointForm(ufl.derivative(residual, self.u, du), pieces)
+
+        self.loads = FormPoints(grid, force=(grid.dim,))
+        self._traction = PointForm(ufl.inner(self.loads.force, self.loads.value(v)) * self.loads.dx, self.loads)
+        self._weight = None
+        if gravity is not None:
+            g = fem.Constant(grid.mesh, np.asarray(gravity, dtype=float))
+            self._weight = PointForm(pieces.density * ufl.inner(g, pieces.value(v)) * pieces.dx, pieces)
+        self._ghost(V, v, du)
+
+    def _ghost(self, V, v, du) -> None:
+        """Penalise jumps of the normal derivative on faces of partly filled cells (Burman 2010, Coombs 2023).
+
+        gamma M h/3 int [d_n u].[d_n v] dS, M = lambda + 2G, on the step's increment only.
+        """
+        cellwise = _compat.function_space(self.grid.mesh, "DG", 0)
+        self.modulus, self.fill = fem.Function(cellwise), fem.Function(cellwise)
+        n = ufl.FacetNormal(self.grid.mesh)
+        h = fem.Constant(self.grid.mesh, self.grid.h)
+        across = sum(abs(n("+")[a]) * h[a] for a in range(self.grid.dim))
+        dS = ufl.Measure("dS", domain=self.grid.mesh, subdomain_id=_compat.SUBDOMAIN, metadata={"quadrature_degree": 2})
+
+        def kink(w):
+            return ufl.dot(ufl.grad(w)("+") - ufl.grad(w)("-"), n("+"))
+
+        form = GHOST / 3 * ufl.avg(self.modulus) * across * ufl.inner(kink(du), kink(v)) * dS
+        self._ghost_form = _compat.CompiledForm(form)
+
+    def set_active(self, active: NDArray[np.bool_], cells: NDArray[np.int32], partly: NDArray[np.bool_]) -> bool:
+        """Number the unknowns of the active cells and make the ghost penalty's matrix.
+
+        Parameters
+        ----------
+        active : (cells,)
+            Which local cells are active, ghosts included; `cells` are their indices.
+        partly : (cells,)
+            Which local cells are partly filled.
+
+        Returns
+        -------
+        Whether the unknowns differ from those before, so that matrices have been made anew.
+        """
+        facets = self.grid.interior_facets(active, cells)
+        facets = facets[partly[self.grid.facet_cells[facets]].any(axis=1)]
+        nodes = np.zeros(len(self.free), dtype=bool)
+        nodes[self.grid.cell_nodes[cells]] = True
+        nodes = self._shared(nodes)
+        dofs = np.flatnonzero((self.free & nodes[:, None]).ravel())
+        same = (
+            hasattr(self, "unknowns")
+            and np.array_equal(dofs, self._dofs)
+            and np.array_equal(facets, self._facets)
+        )
+        if self.grid.comm.allreduce(not same):
+            self._dofs, self._facets = dofs, facets
+            self.unknowns = Unknowns(self.u, dofs)
+            self.K = matrix(self.unknowns, self.unknowns, 5**self.grid.dim * self.grid.dim)
+            self.ghost = matrix(self.unknowns, self.unknowns, 5**self.grid.dim * self.grid.dim)
+            self.residual = self.unknowns.vector()
+            self._ghost_form.bind(facets)
+        stiffness = float(self.modulus.x.array[cells].max(initial=0.0)) * self.grid.cell_volume / self.grid.h.min()
+        self.round_off = 1e-13 * self.grid.comm.allreduce(stiffness) * np.sqrt(max(1, self.unknowns.global_size))
+        zero(self.ghost)
+        if len(facets):
+            self._ghost_form.assemble_matrix(self.ghost)
+        self.ghost.assemble()
+        return not same
+
+    def _shared(self, nodes: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Return which nodes are active on any process."""
+        if self.grid.comm.size == 1:
+            return nodes
+        self._b.x.array[:] = np.repeat(nodes, self.grid.dim)
+        _compat.scatter_reverse_add(self._b)
+        self._b.x.scatter_forward()
+        return self._b.x.array[:: self.grid.dim] > 0
+
+    def set_loads(self) -> None:
+        """Assemble the dead loads and the weight at the present places of points and `loads`."""
+        self._f.x.array[:] = 0.0
+        self._traction.assemble_vector(self._f.x.array)
+        if self._weight is not None:
+            self._weight.assemble_vector(self._f.x.array)
+        self._external = sum_ghosts(self._f)
+
+    def start(self) -> None:
+        """Begin a step: no displacement."""
+        self.u.x.array[:] = 0.0
+
+    def assemble_residual(self) -> tuple[PETSc.Vec, float]:
+        """Return the out-of-balance nodal forces at u and their scale, the larger of internal and external (N)."""
+        b = self._b.x.array
+        b[:] = 0.0
+        self._residual.assemble_vector(b)
+        sum_ghosts(self._b)
+        owned = self._owned()
+        squares = [b[owned] @ b[owned], self._external[owned] @ self._external[owned]]
+        if self.grid.comm.size > 1:
+            squares = self.grid.comm.allreduce(np.array(squares))
+        b[owned] -= self._external[owned]
+        r = self.unknowns.gather(b, self.residual)
+        du = self.unknowns.gather(self.u.x.array, self.K.createVecRight())
+        self.ghost.multAdd(du, r, r)
+        return r, float(np.sqrt(max(squares)))
+
+    def _owned(self) -> slice:
+        return slice(0, self.u.function_space.dofmap.index_map.size_local * self.grid.dim)
+
+    def assemble_tangent(self) -> PETSc.Mat:
+        """Return the tangent at u."""
+        zero(self.K)
+        self._tangent.assemble_matrix(self.K)
+        self.K.assemble()
+        self.K.axpy(1.0, self.ghost, PETSc.Mat.Structure.UNKNOWN)
+        return self.K

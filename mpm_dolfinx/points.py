@@ -1,0 +1,296 @@
+# SPDX-License-Identifier: MIT
+"""Material points: what the body remembers while the grid is reset, and the surface of the body."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mpm_dolfinx.domains import corner_bits
+from mpm_dolfinx.exchange import Exchange
+from mpm_dolfinx.grid import Grid, side
+
+SURFACE = 0.98  # loads act this share of the way from a point to the surface, always in a filled cell
+
+
+@dataclass
+class MaterialPoints:
+    """Material points of this process; arrays over its n points.
+
+    Attributes
+    ----------
+    id : (n,)
+        Number of the point in the body.
+    corners : (n, 2^d, d), m
+        Tracked corners of the point's domain, in the order of `domains.corner_bits`.
+    F : (n, d, d)
+        Deformation gradient.
+    volume0 : (n,), m^d
+        Reference volume.
+    material : (n,)
+        Index of the point's material in the scene's list.
+    pressure : (n,), Pa
+        Pore pressure, positive in compression.
+    x : (n, d), m
+        Position.
+    """
+
+    id: NDArray[np.int64]
+    corners: NDArray[np.float64]
+    F: NDArray[np.float64]
+    volume0: NDArray[np.float64]
+    material: NDArray[np.int32]
+    pressure: NDArray[np.float64]
+    x: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.id)
+
+    @property
+    def J(self) -> NDArray[np.float64]:
+        """Volume ratio det F (n,)."""
+        return np.linalg.det(self.F)
+
+    def copy(self) -> MaterialPoints:
+        """Return a copy that shares no array."""
+        return replace(self, **{f.name: getattr(self, f.name).copy() for f in fields(self)})
+
+    def migrated(self, exchange: Exchange) -> MaterialPoints:
+        """Return the points of this process after every point went to its destination, ordered by id."""
+        arrays = {f.name: exchange.send(getattr(self, f.name)) for f in fields(self)}
+        order = np.argsort(arrays["id"])
+        return MaterialPoints(**{name: a[order] for name, a in arrays.items()})
+
+    def find(self, ids: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return (which of `ids` are points of this process, their indices); points are ordered by id."""
+        at = np.searchsorted(self.id, ids)
+        here = np.flatnonzero((at < len(self)) & (self.id[np.minimum(at, len(self) - 1)] == ids)) if len(self) else []
+        here = np.asarray(here, dtype=np.int64)
+        return here, at[here]
+
+
+@dataclass(frozen=True)
+class Body:
+    """A body as seeded: reference geometry of all its domains, the same on every process.
+
+    lower, spacing : (n, d), (d,), m — box of each domain; sides : (n, d, 2) — whether a face of the
+    domain lies on the surface of the body.
+    """
+
+    lower: NDArray[np.float64]
+    spacing: NDArray[np.float64]
+    sides: NDArray[np.bool_]
+    material: int = 0
+
+    def __len__(self) -> int:
+        return len(self.lower)
+
+    @property
+    def centre(self) -> NDArray[np.float64]:
+        """Reference positions (n, d), m."""
+        return self.lower + 0.5 * self.spacing
+
+
+def box(grid: Grid, lower: ArrayLike, upper: ArrayLike, per_cell: int = 2, material: int = 0) -> Body:
+    """Seed the box [lower, upper] with a lattice of points that fills it exactly.
+
+    Parameters
+    ----------
+    lower, upper : (d,), m
+        Corners of the box, inside the grid.
+    per_cell
+        Points per cell and direction (rounded so that they fit the box), >= 1.
+    material
+        Index of the material.
+    """
+    lower, upper = np.asarray(lower, dtype=float), np.asarray(upper, dtype=float)
+    if lower.shape != (grid.dim,) or upper.shape != (grid.dim,) or not (upper > lower).all():
+        raise ValueError(f"body: box {lower} to {upper}: needs {grid.dim} coordinates each and upper > lower")
+    count = np.maximum(1, np.rint((upper - lower) / (grid.h / _per_cell(per_cell)))).astype(int)
+    spacing = (upper - lower) / count
+    index = np.stack(np.meshgrid(*map(np.arange, count), indexing="ij"), axis=-1).reshape(-1, grid.dim)
+    sides = np.stack([index == 0, index == count - 1], axis=-1)
+    return _inside(grid, Body(lower + index * spacing, spacing, sides, material))
+
+
+def shape(
+    grid: Grid, inside: Callable[[NDArray[np.float64]], NDArray[np.bool_]], per_cell: int = 2, material: int = 0
+) -> Body:
+    """Seed the points of the grid's own lattice whose centres are inside a shape.
+
+    Parameters
+    ----------
+    inside
+        Maps positions (n, d), m, to booleans (n,).
+    per_cell
+        Points per cell and direction, >= 1.
+    material
+        Index of the material.
+    """
+    spacing = grid.h / _per_cell(per_cell)
+    count = grid.shape * per_cell
+    index = np.stack(np.meshgrid(*map(np.arange, count), indexing="ij"), axis=-1).reshape(-1, grid.dim)
+    filled = np.asarray(inside(grid.lower + (index + 0.5) * spacing), dtype=bool)
+    padded = np.pad(filled.reshape(count), 1)
+    index = index[filled]
+    if not len(index):
+        raise ValueError("body: inside(x) holds at no point of the grid; the body fits in no cell")
+    sides = np.empty((len(index), grid.dim, 2), dtype=bool)
+    for axis in range(grid.dim):
+        for end in (0, 1):
+            neighbour = index + 1
+            neighbour[:, axis] += 2 * end - 1
+            sides[:, axis, end] = ~padded[tuple(neighbour.T)]
+    return _inside(grid, Body(grid.lower + index * spacing, spacing, sides, material))
+
+
+def _per_cell(per_cell: int) -> int:
+    if per_cell != int(per_cell) or per_cell < 1:
+        raise ValueError(f"body: per_cell = {per_cell!r}, must be an integer >= 1")
+    return int(per_cell)
+
+
+def _inside(grid: Grid, body: Body) -> Body:
+    out = np.flatnonzero(grid.outside(body.lower) | grid.outside(body.lower + body.spacing))
+    if len(out):
+        raise ValueError(
+            f"body: {len(out)} points outside the grid {grid.lower} to {grid.upper}, the first at "
+            f"{body.centre[out[0]]}"
+        )
+    return body
+
+
+def material_points(grid: Grid, bodies: Sequence[Body], pressure: float = 0.0) -> MaterialPoints:
+    """Return this process's material points of the bodies, at rest at pore pressure `pressure` (Pa)."""
+    bits, d = corner_bits(grid.dim), grid.dim
+    corners = np.concatenate([b.lower[:, None] + bits * b.spacing for b in bodies])
+    spacing = np.concatenate([np.broadcast_to(b.spacing, b.lower.shape) for b in bodies])
+    material = np.concatenate([np.full(len(b), b.material, dtype=np.int32) for b in bodies])
+    x = corners.mean(axis=1)
+    mine = np.flatnonzero(grid.owner(grid.number(grid.index(x))) == grid.comm.rank)
+    n = len(mine)
+    return MaterialPoints(
+        id=mine,
+        corners=corners[mine],
+        F=np.tile(np.eye(d), (n, 1, 1)),
+        volume0=spacing[mine].prod(axis=1),
+        material=material[mine],
+        pressure=np.full(n, float(pressure)),
+        x=x[mine],
+    )
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Faces of domains on one side of the bodies, the same on every process; arrays over m faces.
+
+    id : (m,) number of the point; xi : (m, d) centre of the face in the domain, from -1 to 1, pulled
+    to 0.98 of the way; area0, whole0 : (m,) reference area of the part that counts and of the whole
+    face, m^(d-1); axis, end : side of the domain.
+    """
+
+    id: NDArray[np.int64]
+    xi: NDArray[np.float64]
+    area0: NDArray[np.float64]
+    whole0: NDArray[np.float64]
+    axis: int
+    end: int
+
+    def __len__(self) -> int:
+        return len(self.id)
+
+
+Region = tuple[ArrayLike, ArrayLike]
+
+
+def surface(bodies: Sequence[Body], name: str, region: Region | None = None) -> Surface:
+    """Return the faces on a named side of the bodies.
+
+    Parameters
+    ----------
+    name
+        Side: "left", "right", "bottom", "top", in 3D also "front", "back".
+    region : ((d,), (d,)), m
+        Box of reference positions that limits the faces; faces partly in it count with that part.
+    """
+    dim = bodies[0].lower.shape[1]
+    axis, end = side(name, dim)
+    start, ids, xis, areas, wholes = 0, [], [], [], []
+    for body in bodies:
+        chosen = np.flatnonzero(body.sides[:, axis, end])
+        low = np.broadcast_to(body.lower[chosen], (len(chosen), dim))
+        high = low + body.spacing
+        inner_low, inner_high = low, high
+        if region is not None:
+            inner_low = np.maximum(low, np.asarray(region[0], dtype=float))
+            inner_high = np.minimum(high, np.asarray(region[1], dtype=float))
+        tangential = np.arange(dim) != axis
+        plane = (high if end else low)[:, axis]
+        on = (inner_high > inner_low)[:, tangential].all(axis=1)
+        if region is not None:
+            on &= (plane >= np.asarray(region[0])[axis] - 1e-12) & (plane <= np.asarray(region[1])[axis] + 1e-12)
+        xi = (inner_low + inner_high - low - high) / body.spacing
+        xi[:, axis] = SURFACE * (2 * end - 1)
+        ids.append(start + chosen[on])
+        xis.append(xi[on])
+        areas.append((inner_high - inner_low)[on][:, tangential].prod(axis=1))
+        wholes.append((high - low)[on][:, tangential].prod(axis=1))
+        start += len(body)
+    return Surface(np.concatenate(ids), np.concatenate(xis), np.concatenate(areas), np.concatenate(wholes), axis, end)
+
+
+def interpolate(corners: NDArray[np.float64], xi: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the positions (m, d) in domains (m, 2^d, d) at local coordinates (m, d) from -1 to 1."""
+    signs = 2 * corner_bits(xi.shape[1]) - 1
+    N = (0.5 * (1 + signs * xi[:, None, :])).prod(axis=2)
+    return np.einsum("mk,mkd->md", N, corners)
+
+
+def face_vectors(corners: NDArray[np.float64], axis: int, end: int) -> NDArray[np.float64]:
+    """Return the outward area vectors (m, d), m^(d-1), of one face of domains (m, 2^d, d)."""
+    dim = corners.shape[2]
+    face = corners[:, corner_bits(dim)[:, axis] == end]
+    if dim == 2:
+        t = face[:, 1] - face[:, 0]
+        n = np.stack([t[:, 1], -t[:, 0]], axis=1) * (1 if axis == 0 else -1)
+    else:
+        n = 0.5 * np.cross(face[:, 3] - face[:, 0], face[:, 2] - face[:, 1])
+        n *= 1 if axis != 1 else -1
+    return n * (1 if end else -1)
+
+
+@dataclass(frozen=True)
+class Probes:
+    """Tracked positions: material particles whose displacement is wanted; m of them.
+
+    x0 : (m, d) reference positions; id : (m,) the domain that holds each; xi : (m, d) place in it.
+    """
+
+    x0: NDArray[np.float64]
+    id: NDArray[np.int64]
+    xi: NDArray[np.float64]
+
+    def displacement(self, points: MaterialPoints, comm) -> NDArray[np.float64]:
+        """Return the displacements (m, d), m, on every process."""
+        here, at = points.find(self.id)
+        u = np.zeros_like(self.x0)
+        u[here] = interpolate(points.corners[at], self.xi[here]) - self.x0[here]
+        return comm.allreduce(u)
+
+
+def probes(bodies: Sequence[Body], x0: ArrayLike) -> Probes:
+    """Return probes at reference positions x0 (m, d), m, inside or on the surface of the bodies."""
+    x0 = np.atleast_2d(np.asarray(x0, dtype=float))
+    centre = np.concatenate([b.centre for b in bodies])
+    spacing = np.concatenate([np.broadcast_to(b.spacing, b.lower.shape) for b in bodies])
+    ids = np.empty(len(x0), dtype=np.int64)
+    for i, x in enumerate(x0):  # a handful of positions, once a scene
+        ids[i] = np.argmin(np.abs((centre - x) / spacing).max(axis=1))
+    xi = 2 * (x0 - centre[ids]) / spacing[ids]
+    far = np.flatnonzero((np.abs(xi) > 1 + 1e-9).any(axis=1))
+    if len(far):
+        raise ValueError(f"probe at {x0[far[0]]}: outside the bodies")
+    return Probes(x0, ids, xi)

@@ -1,0 +1,260 @@
+# SPDX-License-Identifier: MIT
+"""Storage of the pore fluid: DG0 on the grid, which is the finite volume method.
+
+In each active cell, with J_Delta = det(I + grad u) (never div u: a rotation would fake a compression),
+
+    int alpha (J_Delta - 1) + S J_Delta (p - p_n) dV_n  +  dt sum_faces Q  =  0,
+    Q = T [p+ - p- + rho_w g . (x- - x+)],   T = A / (d+ / kappa+ + d- / kappa-),   kappa = k / (rho_w g),
+
+where A is the exact overlap of the body with the face, x+- are the centroids of what the cells hold
+and d+- their distances from the face.  Distances from the centroids keep the error at 0.2 % for any
+filling, where half the cell size reaches 12 %.  The sum over the cells is the fluid balance.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from numpy.typing import NDArray
+from petsc4py import PETSc
+
+from mpm_dolfinx import _compat
+from mpm_dolfinx.forms import FormPoints, PointForm
+from mpm_dolfinx.grid import Grid
+from mpm_dolfinx.unknowns import Unknowns, matrix, sum_ghosts, zero
+
+
+class Storage:
+    """The storage problem of a scene.
+
+    Parameters
+    ----------
+    grid
+        Background grid.
+    pieces
+        Points of integration with the fields biot and storage (1/Pa).
+    displacement
+        Increment of the displacement since the start of the step.
+    pressure
+        DG0 pore pressure, Pa, positive in compression.
+    weight : (d,), N/m^3
+        Weight of the pore fluid rho_w g, None without gravity.
+    symmetric
+        Leave S (p - p_n) dJ_Delta out of the Jacobian, which then is symmetric; it is of the order of
+        (p - p_n) / K_w, so Newton's method converges as fast.
+    """
+
+    def __init__(
+        self,
+        grid: Grid,
+        pieces: FormPoints,
+        displacement: fem.Function,
+        pressure: fem.Function,
+        weight: NDArray[np.float64] | None = None,
+        symmetric: bool = True,
+    ):
+        self.grid, self.p = grid, pressure
+        Q = pressure.function_space
+        self.p_n, self._b = fem.Function(Q), fem.Function(Q)
+        q, dp = ufl.TestFunction(Q), ufl.TrialFunction(Q)
+        du = ufl.TrialFunction(displacement.function_space)
+        one = fem.Function(Q)
+        one.x.array[:] = 1.0
+        J = ufl.det(ufl.Identity(grid.dim) + pieces.grad(displacement))
+        strain = pieces.biot * (J - 1) * q * pieces.dx
+        change = strain + pieces.storage * J * (pressure - self.p_n) * q * pieces.dx
+        self._change = PointForm(change, pieces)
+        self._capacity = PointForm(ufl.derivative(change, pressure, one), pieces)
+        coupled = strain if symmetric else change
+        self._coupling = PointForm(ufl.derivative(coupled, displacement, du), pieces)
+        self._momentum_coupling = (
+            self._coupling if symmetric else PointForm(ufl.derivative(strain, displacement, du), pieces)
+        )
+        self.symmetric = symmetric
+        self._slot = np.empty(grid.num_local, dtype=np.int64)  # of active owned cells: place in the vectors
+        self._fluxes(Q, q, dp, weight)
+
+    def _fluxes(self, Q, q, dp, weight) -> None:
+        """Two-point fluxes over the inner faces of the active cells."""
+        mesh, d = self.grid.mesh, self.grid.dim
+        vector = _compat.function_space(mesh, "DG", 0, (d,))
+        self.mobility = fem.Function(Q)
+        self.centroid, self.lower_face, self.upper_face = (fem.Function(vector) for _ in range(3))
+        n, h = ufl.FacetNormal(mesh), fem.Constant(mesh, self.grid.h)
+        n0 = n("+")
+        across = sum(abs(n0[a]) * h[a] for a in range(d))
+
+        def opening(side, sign):
+            """Share of the face that the body covers, on the side of the cell that sign * n0 points to."""
+            lower, upper = self.lower_face(side), self.upper_face(side)
+            return sum(
+                ufl.conditional(ufl.gt(sign * n0[a], 0.5), upper[a], 0.0)
+                + ufl.conditional(ufl.lt(sign * n0[a], -0.5), lower[a], 0.0)
+                for a in range(d)
+            )
+
+        share = ufl.min_value(opening("+", 1), opening("-", -1))
+        d0 = across / 2 - ufl.dot(self.centroid("+"), n0)
+        d1 = across / 2 + ufl.dot(self.centroid("-"), n0)
+        k0, k1 = self.mobility("+"), self.mobility("-")
+        T = share * k0 * k1 / (d0 * k1 + d1 * k0 + 1e-300)
+        dS = ufl.Measure("dS", domain=mesh, subdomain_id=_compat.SUBDOMAIN, metadata={"quadrature_degree": 0})
+        self._flux = _compat.CompiledForm(T * ufl.jump(dp) * ufl.jump(q) * dS)
+        self._gravity = None
+        if weight is not None:
+            w = fem.Constant(mesh, np.asarray(weight, dtype=float))
+            apart = across * n0 + self.centroid("-") - self.centroid("+")
+            self._gravity = _compat.CompiledForm(T * ufl.dot(w, apart) * ufl.jump(q) * dS)
+
+    def set_active(self, cells: NDArray[np.int32], facets: NDArray[np.int32]) -> None:
+        """Number the unknowns of the active cells; `facets` are the faces between two of them."""
+        self.unknowns = Unknowns(self.p, cells.astype(np.int64))
+        self._slot[self.unknowns.owned] = np.arange(self.unknowns.size)
+        self.T = matrix(self.unknowns, self.unknowns, 2 * self.grid.dim + 1)
+        self.C = self.P = None
+        self.residual, self._p, self._rate = (self.unknowns.vector() for _ in range(3))
+        self._flux.bind(facets)
+        if self._gravity is not None:
+            self._gravity.bind(facets)
+        self._has_facets = len(facets) > 0
+
+    def set_coupled(self, momentum: Unknowns) -> None:
+        """Make the coupling matrices for the unknowns of the displacement."""
+        length = 2**self.grid.dim * self.grid.dim
+        self.B = matrix(self.unknowns, momentum, length)
+        self.B_momentum = self.B if self.symmetric else matrix(self.unknowns, momentum, length)
+
+    def set_contents(
+        self,
+        cells: NDArray[np.int32],
+        weight: NDArray[np.float64],
+        x: NDArray[np.float64],
+        mobility: NDArray[np.float64],
+        faces: NDArray[np.float64],
+        capacity: NDArray[np.float64],
+        pressure: NDArray[np.float64],
+        fixed_stress: NDArray[np.float64],
+    ) -> None:
+        """Sum over the pieces in each owned cell: volume, centroid, mobility, open faces, pressure.
+
+        Parameters
+        ----------
+        cells, weight, x, mobility, faces
+            Cell, volume (m^d), centroid (m), mobility kappa (m^2/(Pa s)) and areas on the cell's
+            faces (m^(d-1)) of the pieces.
+        capacity : (m,), 1/Pa
+            Storage coefficient, by which the pressure is averaged.
+        pressure : (m,), Pa
+            Pressure that each piece brings.
+        fixed_stress : (m,), 1/Pa
+            The fixed-stress coefficient beta.
+        """
+        grid, filled = self.grid, self.unknowns.owned
+        volume = self._total(cells, weight)
+        self._volume = volume.sum()
+        self.mobility.x.array[filled] = self._total(cells, weight * mobility) / volume
+        centroid, lower, upper = (f.x.array.reshape(-1, grid.dim) for f in self._shapes())
+        for a in range(grid.dim):
+            centroid[filled, a] = self._total(cells, weight * x[:, a]) / volume - grid.midpoints[filled, a]
+            for target, end in ((lower, 0), (upper, 1)):
+                target[filled, a] = self._total(cells, faces[:, a, end]) * grid.h[a] / grid.cell_volume
+        held = self._total(cells, weight * capacity)
+        mean = self._total(cells, weight * pressure) / volume
+        stored = self._total(cells, weight * capacity * pressure)
+        self.p_n.x.array[filled] = np.divide(stored, held, out=mean, where=held > 0)
+        for f in (self.mobility, self.p_n, *self._shapes()):
+            f.x.scatter_forward()
+        self.fixed_stress = self._total(cells, weight * fixed_stress)
+
+    def _total(self, cells: NDArray[np.int32], values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Sum values over the rows of each active owned cell."""
+        return np.bincount(self._slot[cells], weights=values, minlength=self.unknowns.size)
+
+    def start(self) -> None:
+        """Begin a step: the pressure that the cells hold."""
+        self.p.x.array[:] = self.p_n.x.array
+
+    def _shapes(self) -> tuple[fem.Function, fem.Function, fem.Function]:
+        return self.centroid, self.lower_face, self.upper_face
+
+    def set_fluxes(
+        self, cells: NDArray[np.int32], conductance: NDArray[np.float64], inflow: NDArray[np.float64]
+    ) -> None:
+        """Assemble the fluxes: the inner faces, and the boundary with given conductance and inflow.
+
+        Parameters
+        ----------
+        cells : (m,)
+            Owned cell behind each boundary face.
+        conductance : (m,), m^d/(Pa s)
+            Outflow per unit of the cell's pressure.
+        inflow : (m,), m^d/s
+            Prescribed inflow, and what a given outer pressure and gravity drive in.
+        """
+        self._conductance = self._total(cells, conductance)
+        self._inflow = self._total(cells, inflow)
+        zero(self.T)
+        self._b.x.array[:] = 0.0
+        if self._has_facets:
+            self._flux.assemble_matrix(self.T)
+            if self._gravity is not None:
+                self._gravity.assemble_vector(self._b.x.array)
+        self.unknowns.gather(sum_ghosts(self._b), self._rate)
+        self._rate.array_w[:] -= self._inflow
+        self.T.assemble()
+        _add_diagonal(self.T, self._conductance)
+        self._outflow = self.T.getDiagonal().array
+        if self.C is None:
+            self.C, self.P = self.T.duplicate(copy=True), self.T.duplicate(copy=True)
+
+    def assemble_residual(self, dt: float) -> tuple[PETSc.Vec, float]:
+        """Return the fluid volume out of balance in each cell at (u, p) and its scale, sum |change| (m^d)."""
+        b, comm = self._b.x.array, self.grid.comm
+        b[:] = 0.0
+        self._change.assemble_vector(b)
+        change = b[self.unknowns.owned]
+        self._change_total = change.sum()
+        r = self.unknowns.gather(b, self.residual)
+        p = self.unknowns.gather(self.p.x.array, self._p)
+        # what rounding may leave: of the volumes and of the fluxes that cancel
+        turnover = dt * (np.abs(self._outflow) @ np.abs(p.array_r))
+        self.round_off = comm.allreduce(1e-14 * (self._volume + turnover))
+        flux = self.T * p
+        flux.axpy(1.0, self._rate)
+        r.axpy(dt, flux)
+        scale = comm.allreduce(float(np.abs(change).sum()))
+        return r, scale
+
+    def balance(self, dt: float) -> float:
+        """Return the change of the fluid's volume plus what crossed the boundary (m^d), at the last residual."""
+        p = self.p.x.array[self.unknowns.owned]
+        out = (self._conductance * p - self._inflow).sum()
+        return float(self.grid.comm.allreduce(self._change_total + dt * out))
+
+    def assemble_tangent(self, dt: float) -> None:
+        """Assemble C = d/dp and B = d/du of the residual at (u, p)."""
+        for A, form in {self.B: self._coupling, self.B_momentum: self._momentum_coupling}.items():
+            zero(A)
+            form.assemble_matrix(A)
+            A.assemble()
+        self._with_fluxes(self.C, dt, 0.0)
+
+    def assemble_preconditioner(self, dt: float, factor: float) -> PETSc.Mat:
+        """Return the fixed-stress operator C + factor * beta V at (u, p)."""
+        return self._with_fluxes(self.P, dt, factor * self.fixed_stress)
+
+    def _with_fluxes(self, A: PETSc.Mat, dt: float, diagonal) -> PETSc.Mat:
+        b = self._b.x.array
+        b[:] = 0.0
+        self._capacity.assemble_vector(b)
+        self.T.copy(A, structure=PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+        A.scale(dt)
+        _add_diagonal(A, b[self.unknowns.owned] + diagonal)
+        return A
+
+
+def _add_diagonal(A: PETSc.Mat, values: NDArray[np.float64]) -> None:
+    d = A.getDiagonal()
+    d.array_w[:] += values
+    A.setDiagonal(d)

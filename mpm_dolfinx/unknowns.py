@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: MIT
+"""The unknowns that a step has: its own numbering, vectors and matrices.
+
+Functions live on the whole grid; vectors, matrices and factors hold only the free degrees of freedom
+of active nodes or cells.  A local-to-global map with -1 for every other degree of freedom lets
+dolfinx assemble straight into them: PETSc ignores negative indices.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from dolfinx import fem
+from numpy.typing import NDArray
+from petsc4py import PETSc
+
+from mpm_dolfinx import _compat
+
+
+class Unknowns:
+    """Numbering of some of the degrees of freedom of a function's space.
+
+    Parameters
+    ----------
+    function
+        Any function of the space; its ghost pattern is used.
+    dofs
+        Unrolled local degrees of freedom, ghosts included, that are unknowns.
+    """
+
+    def __init__(self, function: fem.Function, dofs: NDArray[np.int64]):
+        space = function.function_space
+        self.comm = space.mesh.comm
+        owned = space.dofmap.index_map.size_local * space.dofmap.bs
+        number = np.full(len(function.x.array), -1, dtype=np.int32)
+        self.owned = dofs[dofs < owned]
+        """Unrolled local degrees of freedom of the entries of the vectors."""
+        self.size = len(self.owned)
+        start = 0
+        if self.comm.size > 1:
+            start = self.comm.exscan(self.size) or 0
+        number[self.owned] = np.arange(start, start + self.size)
+        if self.comm.size > 1:
+            carrier = fem.Function(space)
+            carrier.x.array[:] = number
+            carrier.x.scatter_forward()
+            number[:] = carrier.x.array
+        self.global_size = self.comm.allreduce(self.size)
+        self.map = PETSc.LGMap().create(number, comm=self.comm)
+
+    def vector(self) -> PETSc.Vec:
+        """Return a new vector of zeros."""
+        v = PETSc.Vec().createMPI((self.size, None), comm=self.comm)
+        if self.comm.size == 1:
+            v.destroy()
+            v = PETSc.Vec().createSeq(self.size, comm=self.comm)
+        v.set(0.0)
+        return v
+
+    def gather(self, values: NDArray[np.float64], out: PETSc.Vec) -> PETSc.Vec:
+        """Copy the entries of a local array on the whole grid into a vector."""
+        out.array_w[:] = values[self.owned]
+        return out
+
+    def add(self, function: fem.Function, scale: float, v: PETSc.Vec) -> None:
+        """Add scale * v to a function, ghosts updated."""
+        function.x.array[self.owned] += scale * v.array_r
+        function.x.scatter_forward()
+
+
+def matrix(rows: Unknowns, columns: Unknowns, row_length: int) -> PETSc.Mat:
+    """Return an empty sparse matrix for assembly, with room for `row_length` entries a row."""
+    A = PETSc.Mat().create(rows.comm)
+    A.setSizes(((rows.size, None), (columns.size, None)))
+    A.setType(PETSc.Mat.Type.AIJ)
+    A.setPreallocationNNZ((min(row_length, columns.size), row_length))
+    A.setOption(PETSc.Mat.Option.NEW_NONZERO_ALLOCATION_ERR, False)
+    A.setLGMap(rows.map, columns.map)
+    return A
+
+
+def direct_solver(A: PETSc.Mat, name: str) -> PETSc.KSP:
+    """Return a solver that factorises A, refactorised when A has changed.
+
+    MUMPS in parallel; on one process PETSc's own LU, whose overhead is smaller.
+    """
+    ksp = PETSc.KSP().create(A.comm)
+    ksp.setType(PETSc.KSP.Type.PREONLY)
+    ksp.setOptionsPrefix(f"mpm_{name}_")
+    ksp.pc.setType(PETSc.PC.Type.LU)
+    if A.comm.size > 1:
+        ksp.pc.setFactorSolverType("mumps")
+    else:
+        ksp.pc.setFactorOrdering(PETSc.Mat.OrderingType.QMD)
+    ksp.setOperators(A)
+    ksp.setFromOptions()
+    return ksp
+
+
+def zero(A: PETSc.Mat) -> None:
+    """Empty a matrix for assembly, whether it was assembled before or not."""
+    if A.assembled:
+        A.zeroEntries()
+
+
+def sum_ghosts(function: fem.Function) -> NDArray[np.float64]:
+    """Add up what other processes assembled into ghosts; return the function's local array."""
+    if function.function_space.mesh.comm.size > 1:
+        _compat.scatter_reverse_add(function)
+    return function.x.array
