@@ -196,3 +196,14 @@ def _facet_cells(msh, facets, dim: int) -> NDArray[np.int32]:
 def comm_sum(comm: MPI.Intracomm, value):
     """Return the sum of a number or an array over the processes."""
     return comm.allreduce(value, op=MPI.SUM)
+
+
+def compiled(form: ufl.Form):
+    """Return `fem.form`, without the compiler calls that 0.5 logs."""
+    if not OLD:
+        return fem.form(form)
+    logging.disable(logging.INFO)
+    try:
+        return fem.form(form)
+    finally:
+        logging.disable(logging.NOTSET)

@@ -63,37 +63,38 @@ def cut(grid: Grid, corners: NDArray[np.float64]) -> Pieces:
     The pieces, slivers below 1e-9 of their domain left out; fractions sum to one for every domain.
     """
     d = grid.dim
-    y = (corners - grid.lower) / grid.h
+    y = np.ascontiguousarray(((corners - grid.lower) / grid.h).transpose(1, 2, 0))
     nearest = np.rint(y)
     y = np.where(np.abs(y - nearest) < SNAP, nearest, y)
-    simplices = kuhn_simplices(d)
-    s = y[:, simplices].reshape(-1, d + 1, d)
-    owner = np.repeat(np.arange(len(corners)), len(simplices))
+    # simplices (d+1, d, m): vertices and coordinates first, which keeps the loops below in numpy's fast lanes
+    s = np.concatenate([y[corner] for corner in kuhn_simplices(d)], axis=2)
+    owner = np.tile(np.arange(len(corners)), s.shape[2] // max(1, len(corners)))
     for axis in range(d):
         s, owner = _slice(s, owner, axis)
-
-    volume = np.abs(np.linalg.det(s[:, 1:] - s[:, :1])) if d == 3 else _triangle(s)
-    volume /= 1 if d == 2 else 6
-    x = s.mean(axis=1)
-    index = np.clip(np.floor(x).astype(np.int64), 0, grid.shape - 1)
-    return _sum(grid, len(corners), y, s, owner, volume, x, index)
+    return _sum(grid, y, s, owner)
 
 
-def _triangle(s: NDArray[np.float64]) -> NDArray[np.float64]:
-    a, b = s[:, 1] - s[:, 0], s[:, 2] - s[:, 0]
-    return 0.5 * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+def _volume(s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the volumes of simplices (d+1, d, m)."""
+    e = s[1:] - s[0]
+    if len(e) == 2:
+        return np.abs(e[0, 0] * e[1, 1] - e[0, 1] * e[1, 0]) / 2
+    return np.abs(np.einsum("am,am->m", e[0], np.cross(e[1], e[2], axis=0))) / 6
 
 
-def _sum(grid, n, y, s, owner, volume, x, index) -> Pieces:
+def _sum(grid: Grid, y: NDArray[np.float64], s: NDArray[np.float64], owner: NDArray[np.int64]) -> Pieces:
     """Sum the simplices by (point, cell) into pieces."""
-    d = grid.dim
-    low = np.clip(np.floor(y.min(axis=1)).astype(np.int64), 0, grid.shape - 1)
-    high = np.clip(np.floor(y.max(axis=1)).astype(np.int64), 0, grid.shape - 1)
+    d, n = grid.dim, y.shape[2]
+    volume, x, top = _volume(s), s.mean(axis=0), (grid.shape - 1)[:, None]
+    index = np.clip(np.floor(x).astype(np.int64), 0, top)
+    low = np.clip(np.floor(y.min(axis=0)).astype(np.int64), 0, top)
+    high = np.clip(np.floor(y.max(axis=0)).astype(np.int64), 0, top)
     span = high - low + 1  # cells that the domain's bounding box touches
-    start = np.concatenate([[0], np.cumsum(span.prod(axis=1))])
-    slot, width = np.zeros(len(s), dtype=np.int64), span[owner]
+    count = span.prod(axis=0)
+    start = np.concatenate([[0], np.cumsum(count)])
+    slot = np.zeros(len(owner), dtype=np.int64)
     for a in range(d):
-        slot = slot * width[:, a] + (index[:, a] - low[owner, a])
+        slot = slot * span[a][owner] + (index[a] - low[a][owner])
     slot += start[owner]
 
     def total(values):
@@ -101,26 +102,26 @@ def _sum(grid, n, y, s, owner, volume, x, index) -> Pieces:
 
     sums = total(volume)
     whole = np.bincount(owner, weights=volume, minlength=n)
-    point = np.repeat(np.arange(n), span.prod(axis=1))
+    point = np.repeat(np.arange(n), count)
     kept = np.flatnonzero(sums > SLIVER * whole[point])
     point, sums = point[kept], sums[kept]
-    centroid = np.stack([total(volume * x[:, a])[kept] / sums for a in range(d)], axis=1)
+    centroid = np.stack([total(volume * x[a])[kept] / sums for a in range(d)], axis=1)
 
     rest = kept - start[point]
     cell = np.empty((len(kept), d), dtype=np.int64)
     for a in reversed(range(d)):
-        cell[:, a] = low[point, a] + rest % span[point, a]
-        rest //= span[point, a]
+        cell[:, a] = low[a][point] + rest % span[a][point]
+        rest //= span[a][point]
 
     faces = np.zeros((len(kept), d, 2))
+    solid = volume > 1e-13  # a vertex on a plane leaves simplices whose height is rounding
     for a in range(d):
         for end in (0, 1):
-            plane = (index[:, a] + end)[:, None]
-            distance = np.abs(s[:, :, a] - plane)
-            on = (distance == 0).sum(axis=1) == d  # the facet opposite to the last vertex lies on the plane
-            area = np.zeros(len(s))
-            area[on] = d * volume[on] / distance[on].max(axis=1)
-            faces[:, a, end] = total(area)[kept] * grid.cell_volume / grid.h[a]
+            distance = np.abs(s[:, a] - (index[a] + end))
+            on = np.flatnonzero(((distance < SNAP).sum(axis=0) == d) & solid)  # a facet lies on the plane
+            area = d * volume[on] / distance[:, on].max(axis=0)
+            area = np.bincount(slot[on], weights=area, minlength=start[-1])[kept]
+            faces[:, a, end] = area * grid.cell_volume / grid.h[a]
 
     # centroids stay off the grid lines, and inside the cell that they belong to
     centroid = np.clip(centroid, cell + SNAP, cell + 1 - SNAP)
@@ -131,51 +132,49 @@ def _sum(grid, n, y, s, owner, volume, x, index) -> Pieces:
 def _slice(s: NDArray[np.float64], owner: NDArray[np.int64], axis: int):
     """Slice simplices by the integer planes of an axis until none crosses a plane."""
     done_s, done_owner = [], []
-    while len(s):
-        t = s[:, :, axis]
-        plane = np.floor(t.min(axis=1)) + 1
-        crossing = t.max(axis=1) > plane
-        done_s.append(s[~crossing])
+    while len(owner):
+        t = s[:, axis]
+        plane = np.floor(t.min(axis=0)) + 1
+        crossing = t.max(axis=0) > plane
+        done_s.append(s[:, :, ~crossing])
         done_owner.append(owner[~crossing])
-        below, below_owner, s, owner = _cut_at(s[crossing], owner[crossing], axis, plane[crossing])
+        below, below_owner, s, owner = _cut_at(s[:, :, crossing], owner[crossing], axis, plane[crossing])
         done_s.append(below)
         done_owner.append(below_owner)
-    return np.concatenate(done_s), np.concatenate(done_owner)
+    return np.concatenate([s, *done_s], axis=2), np.concatenate([owner, *done_owner])
 
 
 def _cut_at(s, owner, axis: int, plane):
     """Cut each simplex at its plane; return the parts below and above with their owners."""
-    order = np.argsort(s[:, :, axis], axis=1)
-    s = np.take_along_axis(s, order[:, :, None], axis=1)
-    count = (s[:, :, axis] < plane[:, None]).sum(axis=1)  # vertices below the plane
-    dim = s.shape[2]
-    parts = {"below": [], "above": []}
-    owners = {"below": [], "above": []}
+    order = np.argsort(s[:, axis], axis=0)
+    s = np.take_along_axis(s, order[:, None], axis=0)
+    count = (s[:, axis] < plane).sum(axis=0)  # vertices below the plane
+    dim = s.shape[1]
+    parts = {"below": [s[:, :, :0]], "above": [s[:, :, :0]]}
+    owners = {"below": [owner[:0]], "above": [owner[:0]]}
     for k in range(1, dim + 1):
         chosen = np.flatnonzero(count == k)
-        if not len(chosen):
-            continue
-        v, c = s[chosen], plane[chosen]
-        points = {(i,): v[:, i] for i in range(dim + 1)}
+        v, c = s[:, :, chosen], plane[chosen]
+        points = {(i,): v[i] for i in range(dim + 1)}
         for i in range(k):
             for j in range(k, dim + 1):
-                points[i, j] = _on_plane(v[:, i], v[:, j], axis, c)
+                points[i, j] = _on_plane(v[i], v[j], axis, c)
         for where, simplices in _CUTS[dim][k].items():
-            for simplex in simplices:
-                parts[where].append(np.stack([points[p] for p in simplex], axis=1))
-                owners[where].append(owner[chosen])
-    empty = np.empty((0, dim + 1, dim)), np.empty(0, dtype=np.int64)
-    out = []
-    for where in ("below", "above"):
-        out += [np.concatenate([empty[0], *parts[where]]), np.concatenate([empty[1], *owners[where]])]
-    return out
+            parts[where] += [np.stack([points[p] for p in simplex]) for simplex in simplices]
+            owners[where] += [owner[chosen]] * len(simplices)
+    return (
+        np.concatenate(parts["below"], axis=2),
+        np.concatenate(owners["below"]),
+        np.concatenate(parts["above"], axis=2),
+        np.concatenate(owners["above"]),
+    )
 
 
 def _on_plane(a, b, axis: int, plane):
     """Return the points where the edges from a to b meet the plane, exactly on it."""
-    t = (plane - a[:, axis]) / (b[:, axis] - a[:, axis])
-    x = a + t[:, None] * (b - a)
-    x[:, axis] = plane
+    t = (plane - a[axis]) / (b[axis] - a[axis])
+    x = a + t * (b - a)
+    x[axis] = plane
     return x
 
 

@@ -134,14 +134,12 @@ class Grid:
         self, cells: NDArray[np.int32], x: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the P1 shape functions (n, 2^d) of local cells at points and their gradients (n, 2^d, d), 1/m."""
-        t = 0.5 + self.signs * ((x - self.midpoints[cells]) / self.h)[:, None, :]
-        N = t.prod(axis=2)
-        dN = np.empty_like(t)
+        y = (x - self.midpoints[cells]) / self.h
+        t = [0.5 + y[:, a : a + 1] * self.signs[:, a] for a in range(self.dim)]
+        N, dN = np.prod(t, axis=0), np.empty((len(x), 2**self.dim, self.dim))
         for a in range(self.dim):
-            dN[:, :, a] = self.signs[:, a] / self.h[a]
-            for b in range(self.dim):
-                if b != a:
-                    dN[:, :, a] *= t[:, :, b]
+            others = [t[b] for b in range(self.dim) if b != a]
+            np.multiply(np.prod(others, axis=0), self.signs[:, a] / self.h[a], out=dN[:, :, a])
         return N, dN
 
     def interior_facets(self, active: NDArray[np.bool_], cells: NDArray[np.int32]) -> NDArray[np.int32]:

@@ -183,7 +183,7 @@ class Simulation:
             raise ValueError("drained and inflow sides need a fluid")
         self.grid, self.materials, self.fluid, self.bodies = grid, materials, fluid, bodies
         self.quadrature, self.gravity = quadrature, None if gravity is None else np.asarray(gravity, dtype=float)
-        self.t = 0.0
+        self.t, self.active_cells = 0.0, 0
         self.points = material_points(grid, bodies, pressure)
         self._loads = [(load, self._faces(bodies, load)) for load in tractions]
         self._outlets = [(outlet, self._faces(bodies, outlet)) for outlet in (*drained, *inflows)]
@@ -328,6 +328,7 @@ class Simulation:
         fill = momentum.fill.x.array
         active = fill > 0
         cells = np.flatnonzero(active)
+        self.active_cells = grid.comm.allreduce(int(active[: grid.num_owned].sum()))
         renumbered = momentum.set_active(active, cells, fill < FULL)
         if self.storage:
             s = self.storage
@@ -387,7 +388,7 @@ class Simulation:
         x = interpolate(self.points.corners[at], faces.xi[here])
         cell, inside = self._filled_cell(at, x)
         if not inside.all():  # a sliver was dropped, or there is no domain: act at the point's largest piece
-            x = np.where(inside[:, None], x, self._cut.x[self._largest[at]])
+            x = np.where(inside[:, None], x, self._cut.x[self._largest()[at]])
         return here, at, cell, x
 
     def _filled_cell(self, at: NDArray[np.int64], x: NDArray[np.float64]):
@@ -401,9 +402,10 @@ class Simulation:
         key, keys = at * cells + cell, cutting.point * cells + cutting.cell
         found = np.searchsorted(keys, key)
         inside = keys[np.minimum(found, len(keys) - 1)] == key if len(keys) else np.zeros(0, dtype=bool)
-        return np.where(inside, cell, cutting.cell[self._largest[at]]), inside
+        if not inside.all():
+            cell = np.where(inside, cell, cutting.cell[self._largest()[at]])
+        return cell, inside
 
-    @property
     def _largest(self) -> NDArray[np.int64]:
         """Largest piece of each point (n,)."""
         order = np.lexsort((self._cut.fraction, self._cut.point))

@@ -234,7 +234,8 @@ class Storage:
 
     def assemble_tangent(self, dt: float) -> None:
         """Assemble C = d/dp and B = d/du of the residual at (u, p)."""
-        for A, form in {self.B: self._coupling, self.B_momentum: self._momentum_coupling}.items():
+        pairs = [(self.B, self._coupling), (self.B_momentum, self._momentum_coupling)]
+        for A, form in pairs[: 1 if self.symmetric else 2]:
             zero(A)
             form.assemble_matrix(A)
             A.assemble()

@@ -1,0 +1,85 @@
+# Sourced by demos/run.sh, tests/run.sh and tests/release.sh.
+#
+#   setup [MODULE...]   installs what is missing and sets $python, the interpreter that has dolfinx,
+#                       this package, what the demos import and the MODULEs
+#
+# A module's Debian package is python3-MODULE. Nothing comes by pip: another numpy than Debian's
+# would break Debian's petsc4py.
+
+root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
+modules=(dolfinx scipy tqdm matplotlib)
+
+# One thread per process; pictures without a display; mpirun as root, as in a container; messages
+# through shared memory, for everything runs on one machine (and Open MPI 5 warns about its network).
+export OMP_NUM_THREADS="${OMP_NUM_THREADS:-1}"
+export MPLBACKEND="${MPLBACKEND:-Agg}"
+export OMPI_ALLOW_RUN_AS_ROOT=1 OMPI_ALLOW_RUN_AS_ROOT_CONFIRM=1
+export OMPI_MCA_btl="${OMPI_MCA_btl:-^tcp}"
+
+say() { echo "$*" >&2; }
+
+setup() {
+    modules+=("$@")
+    if ! command -v apt-get >/dev/null || has_dolfinx_of_its_own; then
+        use_python_as_is
+    else
+        debian_install "${modules[@]/#/python3-}"
+        make_venv
+    fi
+}
+
+# Is the first python in PATH one with a dolfinx that is not Debian's (conda-forge, say)?
+has_dolfinx_of_its_own() {
+    python3 -c 'import sys, dolfinx; sys.exit(dolfinx.__file__.startswith("/usr/lib/"))' >/dev/null 2>&1
+}
+
+use_python_as_is() {
+    local module missing=()
+    for module in "${modules[@]}"; do
+        python3 -c "import $module" >/dev/null 2>&1 || missing+=("${module/#dolfinx/fenics-dolfinx}")
+    done
+    if [ ${#missing[@]} -gt 0 ]; then
+        say "Missing in python3: ${missing[*]}. Where there is no apt-get, install them first, for instance by"
+        say "    conda install -c conda-forge ${missing[*]}"
+        exit 1
+    fi
+    python=python3
+    export PYTHONPATH="$root${PYTHONPATH:+:$PYTHONPATH}"
+}
+
+# debian_install PACKAGE...: apt-get those that are missing, by way of the command in $within, if any.
+within=()
+debian_install() {
+    local package missing=() as_root=("${within[@]}")
+    for package; do
+        [ "$("${within[@]}" dpkg-query -W -f '${db:Status-Status}' "$package" 2>/dev/null)" = installed ] ||
+            missing+=("$package")
+    done
+    [ ${#missing[@]} -gt 0 ] || return 0
+    if [ "$(id -u)" != 0 ]; then
+        command -v sudo >/dev/null || { say "As root: apt-get install ${missing[*]}"; exit 1; }
+        as_root=(sudo)
+    fi
+    say "Installing ${missing[*]}"
+    # A source that is out of reach need not matter: the installation tells.
+    "${as_root[@]}" apt-get update -q >&2 || say "apt-get update failed, trying all the same"
+    "${as_root[@]}" env DEBIAN_FRONTEND=noninteractive \
+        apt-get install -q -y --no-install-recommends -o DPkg::Lock::Timeout=600 "${missing[@]}" </dev/null >&2
+}
+
+# A .venv on the system's own python, whichever comes first in PATH, for dolfinx belongs to that one.
+# It sees Debian's modules, and this package by a .pth file: an editable installation without pip.
+make_venv() {
+    local venv=$root/.venv site
+    python=$venv/bin/python
+    site=$(/usr/bin/python3 -c 'import sys; print("lib/python%d.%d/site-packages" % sys.version_info[:2])')
+    export PYTHONNOUSERSITE=1 # a numpy in ~/.local would come before Debian's
+    if [ ! -x "$python" ] || [ "$(cat "$venv/$site/mpm_dolfinx.pth" 2>/dev/null)" != "$root" ]; then
+        if [ -x "$python" ] && [ "$(readlink -f "$python")" != "$(readlink -f /usr/bin/python3)" ]; then
+            say "$venv is of another python than /usr/bin/python3: move it away, please"
+            exit 1
+        fi
+        /usr/bin/python3 -m venv --without-pip --system-site-packages "$venv"
+        echo "$root" >"$venv/$site/mpm_dolfinx.pth"
+    fi
+}

@@ -1,0 +1,241 @@
+# SPDX-License-Identifier: MIT
+"""A saturated cantilever under a load that stays: the paper's poroelastic beam.
+
+A beam of 1 m x 0.3 m (plane strain), clamped at x = 0, carries a dead load on its top from
+x = 0.05 m on, raised linearly over the ramp and then held.  Its ends are permeable, its long sides
+sealed.  At first the pore water carries part of the load; as it drains, the beam sags by a third of
+its length.  Shown beside it: Euler-Bernoulli's small-strain beam without water, and (--reference)
+a body-fitted Taylor-Hood finite element solution of the same finite-strain Biot problem.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import sys
+from pathlib import Path
+
+from mpi4py import MPI
+
+import numpy as np
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.reference import BiotFEM, euler_bernoulli
+
+LENGTH, HEIGHT, CLAMP = 1.0, 0.3, 0.05  # m; the load begins at x = CLAMP
+BOX = np.array([1.5, 1.2])  # m
+REFERENCE_CELLS = (40, 12)
+
+
+def arguments(argv: list[str] | None = None) -> argparse.Namespace:
+    """Parse the command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    add = parser.add_argument
+    add("--h", type=float, default=0.015, help="cell size, m")
+    add("--dt", type=float, default=0.02, help="time step, s")
+    add("--t-end", type=float, default=1.2, help="end time, s")
+    add("--ramp", type=float, default=0.06, help="time in which the load is raised, s")
+    add("--load", type=float, default=54e3, help="load on the top, Pa, downwards")
+    add("--bulk", type=float, default=1e7 / 3, help="drained bulk modulus, Pa")
+    add("--shear", type=float, default=5e6, help="shear modulus, Pa")
+    add("--conductivity", type=float, default=1e-4, help="hydraulic conductivity, m/s")
+    add("--fluid-bulk", type=float, default=2.2e9, help="bulk modulus of the pore fluid, Pa")
+    add("--porosity", type=float, default=0.4, help="porosity at the start")
+    add("--points-per-cell", type=int, default=2, help="material points per cell and direction")
+    add("--quadrature", choices=("domain", "point"), default="domain", help="exact domains, or the paper's points")
+    add("--offset", type=float, default=0.5, help="of the beam's underside from a grid line, cells")
+    add("--coupling", choices=tuple(mpm.COUPLINGS), default="schur-cg", help="coupling scheme")
+    add("--drained", action="store_true", help="no fluid at all")
+    add("--reference", action="store_true", help="run the Taylor-Hood finite elements beside it")
+    add("--out", type=Path, default=Path("out/poroelastic_beam"), help="folder for pictures and tables")
+    add("--json", action="store_true", help="print the results as one line of JSON at the end")
+    options = parser.parse_args(argv)
+    for name in ("h", "dt", "t_end", "ramp", "load"):
+        if not getattr(options, name) > 0:
+            parser.error(f"--{name.replace('_', '-')} {getattr(options, name)}: must be > 0")
+    return options
+
+
+def physics(o: argparse.Namespace) -> dict:
+    """Return what material points and finite elements share: boundary conditions and fluid."""
+    load = mpm.Traction(
+        "top",
+        lambda t: (0.0, -o.load * min(1.0, t / o.ramp)),
+        region=((CLAMP, -np.inf), (LENGTH, np.inf)),
+    )
+    if o.drained:
+        return {"fixed": {"left": "xy"}, "tractions": [load]}
+    fluid = mpm.Fluid(bulk=o.fluid_bulk)
+    ends = [mpm.Drained("left"), mpm.Drained("right")]
+    return {"fixed": {"left": "xy"}, "tractions": [load], "fluid": fluid, "drained": ends}
+
+
+def material(o: argparse.Namespace) -> mpm.Hencky:
+    """Return the skeleton."""
+    return mpm.Hencky(bulk=o.bulk, shear=o.shear, porosity=o.porosity, conductivity=o.conductivity)
+
+
+def scene(o: argparse.Namespace) -> tuple[mpm.Simulation, float]:
+    """Return the simulation and the height of the beam's underside on the grid."""
+    grid = mpm.Grid(BOX, np.rint(BOX / o.h).astype(int))
+    bottom = (round(0.5 * BOX[1] / o.h) + o.offset) * grid.h[1]
+    beam = mpm.box(grid, [0, bottom], [LENGTH, bottom + HEIGHT], per_cell=o.points_per_cell)
+    simulation = mpm.Simulation(
+        grid, [beam], [material(o)], quadrature=o.quadrature, coupling=o.coupling, **physics(o)
+    )
+    return simulation, bottom
+
+
+def main(argv: list[str] | None = None) -> dict:
+    """Run the demo; return what --json prints."""
+    o = arguments(argv)
+    simulation, bottom = scene(o)
+    axis = np.stack([np.linspace(0, LENGTH, 41), np.full(41, bottom + HEIGHT / 2)], axis=1)
+    steps = max(1, round(o.t_end / o.dt))
+    shown = np.unique(np.rint(np.geomspace(1, steps, 6)).astype(int))
+    snapshots: list[tuple[float, np.ndarray, np.ndarray]] = []
+
+    def observe(s: mpm.Simulation) -> None:
+        if round(s.t / o.dt) in shown and not o.drained:
+            parts = s.grid.comm.gather((s.points.corners, s.points.pressure))
+            if parts:
+                corners, pressure = (np.concatenate(a) for a in zip(*parts, strict=True))
+                snapshots.append((s.t, corners, pressure))
+
+    failure = None
+    try:
+        result = simulation.run(o.t_end, o.dt, probes=mpm.probes(simulation.bodies, axis), observe=observe)
+    except mpm.GaveUp as error:
+        failure, result = error, error.result
+    fem = None
+    if o.reference:
+        fem = BiotFEM([0, 0], [LENGTH, HEIGHT], REFERENCE_CELLS, material(o), **physics(o)).run(
+            o.t_end, o.dt, probes=axis - [0, bottom], progress=True
+        )
+    if simulation.grid.comm.rank == 0:
+        o.out.mkdir(parents=True, exist_ok=True)
+        write_tables(o, axis, result, fem)
+        draw_deflection(o, axis, result, fem, shown)
+        if snapshots:
+            draw_pressure(o, snapshots)
+        report(o, result, fem)
+    out = summary(simulation, result)
+    if failure is not None and MPI.COMM_WORLD.rank == 0:
+        print(f"error: {failure}", file=sys.stderr)
+    if o.json and MPI.COMM_WORLD.rank == 0:
+        print(json.dumps(out))
+    return out
+
+
+def summary(simulation: mpm.Simulation, result: mpm.Result) -> dict:
+    """Return the run's results as plain numbers."""
+    comm = simulation.grid.comm
+    return {
+        "tip": [[t, *map(float, u[-1])] for t, u in zip(result.t[1:], result.displacement[1:], strict=True)],
+        "p_range": [[t, *map(float, p)] for t, p in zip(result.t[1:], result.pressure[1:])],
+        "wall_s": result.wall,
+        "jit_s": simulation.jit,
+        "steps": result.steps,
+        "newton_iterations": result.newton,
+        "coupling_iterations": result.coupling,
+        "fluid_balance": result.balance,
+        "residual": result.residual,
+        "points": comm.allreduce(len(simulation.points)),
+        "active_cells": simulation.active_cells,
+        "converged": result.converged,
+    }
+
+
+def report(o: argparse.Namespace, result: mpm.Result, fem) -> None:
+    """Print the tip's deflection, beside the reference where there is one."""
+    print(f"\n{'t (s)':>8} {'u_x (m)':>10} {'u_y (m)':>10}" + (f" {'FEM':>10} {'difference':>11}" if fem else ""))
+    every = max(1, len(result.t) // 12)
+    for k in sorted({*range(1, min(4, len(result.t))), *range(every, len(result.t), every), len(result.t) - 1}):
+        u = result.displacement[k][-1]
+        line = f"{result.t[k]:8.3f} {u[0]:10.5f} {u[1]:10.5f}"
+        if fem:
+            exact = fem.displacement[k][-1][1]
+            line += f" {exact:10.5f} {100 * (u[1] / exact - 1):10.3f}%"
+        print(line)
+    print(
+        f"{result.steps} steps, {result.newton} Newton and {result.coupling} coupling iterations, "
+        f"fluid balance {result.balance:.1e}, {result.wall:.1f} s"
+    )
+    print(f"pictures and tables: {o.out}/")
+
+
+def write_tables(o: argparse.Namespace, axis: np.ndarray, result: mpm.Result, fem) -> None:
+    """Write the tip's history and the deflection curves as CSV."""
+    with (o.out / "tip.csv").open("w", newline="") as file:
+        table = csv.writer(file)
+        names = ["t_s", "ux_m", "uy_m", *([] if o.drained else ["p_min_Pa", "p_max_Pa"])]
+        table.writerow([*names, *(["fem_ux_m", "fem_uy_m"] if fem else [])])
+        for k, t in enumerate(result.t):
+            row = [t, *result.displacement[k][-1], *([] if o.drained else result.pressure[k])]
+            table.writerow([*row, *(fem.displacement[k][-1] if fem else [])])
+    with (o.out / "deflection.csv").open("w", newline="") as file:
+        table = csv.writer(file)
+        table.writerow(["t_s", "x_m", "ux_m", "uy_m"])
+        for t, u in zip(result.t, result.displacement, strict=True):
+            table.writerows([t, x, *v] for x, v in zip(axis[:, 0], u, strict=True))
+
+
+def figure(rows: int, columns: int, size: tuple[float, float]):
+    """Return (figure, axes) of matplotlib without a display."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    return plt.subplots(rows, columns, figsize=size, layout="constrained", squeeze=False)
+
+
+def draw_pressure(o: argparse.Namespace, snapshots: list) -> None:
+    """Draw the pore pressure on the material points at six times."""
+    from matplotlib.collections import PolyCollection
+
+    fig, axes = figure(2, 3, (13, 7))
+    for ax, (t, corners, pressure) in zip(axes.ravel(), snapshots):
+        limit = np.abs(pressure).max() / 1e3
+        domains = PolyCollection(corners[:, [0, 1, 3, 2]], array=pressure / 1e3, cmap="RdBu_r", edgecolors="face")
+        domains.set(linewidth=0.1, clim=(-limit, limit))
+        ax.add_collection(domains)
+        low, high = snapshots[-1][1].min(axis=(0, 1)), snapshots[0][1].max(axis=(0, 1))
+        ax.set(aspect="equal", title=f"t = {t:.3g} s", xlim=(-0.03, high[0] + 0.05), ylim=(low[1] - 0.03, high[1] + 0.03))
+        ax.set(xlabel="x (m)", ylabel="y (m)")
+        bar = fig.colorbar(domains, ax=ax, shrink=0.85)
+        bar.set_label("pore pressure (kPa)")
+    for ax in axes.ravel()[len(snapshots) :]:
+        ax.set_axis_off()
+    fig.savefig(o.out / "pressure.png", dpi=130)
+
+
+def draw_deflection(o: argparse.Namespace, axis: np.ndarray, result: mpm.Result, fem, shown) -> None:
+    """Draw the beam's axis at several times beside Euler-Bernoulli and the finite elements."""
+    import matplotlib
+
+    fig, ((ax,),) = figure(1, 1, (8, 5))
+    shown = [k for k in shown if k < len(result.t)]
+    colours = matplotlib.colormaps["viridis"](np.linspace(0.9, 0, len(shown)))
+    y0 = axis[0, 1]
+    for k, colour in zip(shown, colours, strict=True):
+        x, y = (axis + result.displacement[k]).T
+        ax.plot(x, y - y0, color=colour, label=f"t = {result.t[k]:.3g} s")
+        if fem:
+            x, y = (axis + fem.displacement[k]).T
+            label = "Taylor-Hood FEM" if k == shown[-1] else None
+            ax.plot(x, y - y0, "o", color="black", ms=3, mfc="none", markevery=4, label=label)
+    young = 9 * o.bulk * o.shear / (3 * o.bulk + o.shear)
+    nu = young / (2 * o.shear) - 1
+    x = axis[:, 0]
+    w = -euler_bernoulli(x, o.load, LENGTH, young / (1 - nu**2), HEIGHT**3 / 12)
+    ax.plot(x, w, "--", color="crimson", label="Euler-Bernoulli, drained,\nsmall strain, load on all of the top")
+    ax.set(xlabel="x (m)", ylabel="height of the beam's axis (m)", title="Deflection of the beam's axis")
+    ax.legend(loc="lower left")
+    ax.grid(alpha=0.3)
+    fig.savefig(o.out / "deflection.png", dpi=130)
+
+
+if __name__ == "__main__":
+    sys.exit(0 if main()["converged"] else 1)

@@ -1,0 +1,14 @@
+#!/usr/bin/env bash
+# bash tests/run.sh [--release NAME] [ARGUMENTS OF PYTEST]
+#
+# Installs what is missing (on Debian, as root or with sudo) and runs the tests. With --release they
+# run with the dolfinx of another Debian release: bookworm, trixie or sid (tests/release.sh).
+set -euo pipefail
+. "$(dirname "${BASH_SOURCE[0]}")/../.ci/setup.sh"
+
+cd "$root"
+if [ "${1-}" = --release ]; then
+    exec bash tests/release.sh "${@:2}"
+fi
+setup pytest
+exec "$python" -m pytest "$@" # of tests/, says pyproject.toml

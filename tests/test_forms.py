@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: MIT
+"""Forms at material points equal the explicit sums over points and shape functions."""
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+
+from mpm_dolfinx import Grid, Hencky, NeoHookean, _compat
+from mpm_dolfinx.forms import FormPoints, PointForm
+from mpm_dolfinx.unknowns import Unknowns, matrix
+
+GRIDS = {2: Grid([1.5, 1.0], [4, 3]), 3: Grid([1.0, 1.2, 0.9], [2, 3, 2])}
+
+
+class Scene:
+    """Random points in a grid, many in one cell and unsorted, with a random nodal field."""
+
+    def __init__(self, dim, n=40, **fields):
+        rng = np.random.default_rng(dim)
+        self.grid = grid = GRIDS[dim]
+        self.points = FormPoints(grid, **fields)
+        x = rng.uniform(grid.lower, grid.lower + 0.7 * (grid.upper - grid.lower), (n, dim))
+        self.cells = grid.local(grid.number(grid.index(x)))
+        self.weight = rng.uniform(0.5, 2, n)
+        self.x, self.rng = x, rng
+        self.N, self.dN = grid.shape_functions(self.cells, x)
+        self.nodes = grid.cell_nodes[self.cells]
+        self.V = _compat.function_space(grid.mesh, "Lagrange", 1, (dim,))
+        self.S = _compat.function_space(grid.mesh, "Lagrange", 1)
+
+    def place(self, **data):
+        self.points.place(self.cells, self.x, self.weight, **data)
+
+    def vector(self, form, space):
+        b = np.zeros_like(fem.Function(space).x.array)
+        PointForm(form, self.points).assemble_vector(b)
+        return b
+
+    def matrix(self, form, space):
+        unknowns = Unknowns(fem.Function(space), np.arange(len(fem.Function(space).x.array)))
+        A = matrix(unknowns, unknowns, unknowns.size)
+        PointForm(form, self.points).assemble_matrix(A)
+        A.assemble()
+        return A.convert("dense").getDenseArray()
+
+
+@pytest.fixture(params=[2, 3], ids=["2D", "3D"])
+def dim(request):
+    return request.param
+
+
+@pytest.mark.parametrize(
+    "f", [lambda x: 0 * x[0] + 3, lambda x: 1 + 2 * x[0] - x[1], lambda x: np.prod(1 + x, axis=0)],
+    ids=["constant", "linear", "multilinear"],
+)
+def test_a_field_of_the_grid_is_summed_at_the_points_exactly(dim, f):
+    s = Scene(dim)
+    s.place()
+    w, q = fem.Function(s.S), ufl.TestFunction(_compat.function_space(s.grid.mesh, "DG", 0))
+    w.interpolate(lambda x: f(x[:dim]))
+    b = s.vector(s.points.value(w) * q * s.points.dx, q.ufl_function_space())
+    assert b.sum() == pytest.approx(s.weight @ f(s.x.T), rel=1e-13)
+
+
+def test_vectors_equal_the_sum_over_shape_functions(dim):
+    s = Scene(dim, flow=(dim,))
+    flow = s.rng.normal(size=(len(s.x), dim))
+    s.place(flow=flow)
+    v = ufl.TestFunction(s.S)
+    form = (s.points.value(v) + ufl.inner(s.points.flow, s.points.grad(v))) * s.points.dx
+    expected = np.zeros(s.grid.node_x.shape[0])
+    np.add.at(expected, s.nodes, s.weight[:, None] * (s.N + np.einsum("md,mkd->mk", flow, s.dN)))
+    assert np.abs(s.vector(form, s.S) - expected).max() < 1e-12
+
+
+def test_matrices_equal_the_sum_over_shape_functions(dim):
+    s = Scene(dim, stiffness=())
+    k = s.rng.uniform(1, 2, len(s.x))
+    s.place(stiffness=k)
+    u, v = ufl.TrialFunction(s.S), ufl.TestFunction(s.S)
+    form = s.points.stiffness * ufl.inner(s.points.grad(u), s.points.grad(v)) * s.points.dx
+    expected = np.zeros((s.grid.node_x.shape[0],) * 2)
+    local = np.einsum("m,mia,mja->mij", s.weight * k, s.dN, s.dN)
+    np.add.at(expected, (s.nodes[:, :, None], s.nodes[:, None, :]), local)
+    assert np.abs(s.matrix(form, s.S) - expected).max() < 1e-11
+
+
+@pytest.mark.parametrize("law", [Hencky, NeoHookean])
+def test_tangents_by_ufl_derivative_equal_finite_differences(dim, law):
+    s = Scene(dim, n=8, F=(dim, dim))
+    s.place(F=np.eye(dim) + 0.1 * s.rng.normal(size=(8, dim, dim)))
+    u, v = fem.Function(s.V), ufl.TestFunction(s.V)
+    u.x.array[:] = 0.02 * s.rng.normal(size=len(u.x.array))
+    F = (ufl.Identity(dim) + s.points.grad(u)) * s.points.F
+    residual = ufl.derivative(law.energy(F, 2.0, 1.0) * s.points.dx, u, v)
+    K = s.matrix(ufl.derivative(residual, u), s.V)
+    assert np.abs(K - K.T).max() < 1e-10 * np.abs(K).max()
+
+    assemble, direction, step = PointForm(residual, s.points), s.rng.normal(size=len(u.x.array)), 1e-6
+    start, ends = u.x.array.copy(), []
+    for sign in (1, -1):
+        u.x.array[:] = start + sign * step * direction
+        ends.append(np.zeros_like(start))
+        assemble.assemble_vector(ends[-1])
+    difference = (ends[0] - ends[1]) / (2 * step)
+    assert np.abs(K @ direction - difference).max() < 1e-7 * np.abs(difference).max()
+
+
+def test_moving_the_points_moves_the_form(dim):
+    s = Scene(dim)
+    s.place()
+    v = ufl.TestFunction(s.S)
+    form = PointForm(s.points.value(v) * s.points.dx, s.points)
+    b = np.zeros(s.grid.node_x.shape[0])
+    form.assemble_vector(b)
+    s.points.place(s.cells[:1], s.grid.midpoints[s.cells[:1]], np.array([2.0]))
+    b[:] = 0
+    form.assemble_vector(b)
+    assert b.sum() == pytest.approx(2) and np.count_nonzero(b) == 2**dim
+
+
+def test_an_unknown_field_is_named():
+    with pytest.raises(AttributeError, match="carry offset, weight, not 'sigma'"):
+        _ = FormPoints(GRIDS[2]).sigma
