@@ -64,7 +64,8 @@ debian_install() {
     # A source that is out of reach need not matter: the installation tells.
     "${as_root[@]}" apt-get update -q >&2 || say "apt-get update failed, trying all the same"
     "${as_root[@]}" env DEBIAN_FRONTEND=noninteractive \
-        apt-get install -q -y --no-install-recommends -o DPkg::Lock::Timeout=600 "${missing[@]}" </dev/null >&2
+        apt-get install -q -y --no-install-recommends -o DPkg::Lock::Timeout=600 -o Dpkg::Use-Pty=0 \
+        "${missing[@]}" </dev/null >&2
 }
 
 # A .venv on the system's own python, whichever comes first in PATH, for dolfinx belongs to that one.

@@ -62,6 +62,7 @@ class FormPoints:
             for name, shape in {"offset": (grid.dim,), "weight": (), **fields}.items()
         }
         self.dx = PointMeasure(grid, self._functions["weight"])
+        self._size = {name: int(np.prod(shape, dtype=int)) for name, shape in fields.items()}
         self.cells = np.empty(0, dtype=np.int32)
         self.data: dict[str, NDArray[np.float64]] = {}
         self.version = 0
@@ -90,7 +91,7 @@ class FormPoints:
         self.data = {
             "offset": x - self.grid.midpoints[cells],
             "weight": (weight / self.grid.cell_volume)[:, None],
-            **{name: value.reshape(len(cells), -1) for name, value in data.items()},
+            **{name: value.reshape(len(cells), self._size[name]) for name, value in data.items()},
         }
         self.version += 1
 

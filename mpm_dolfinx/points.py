@@ -13,7 +13,7 @@ from mpm_dolfinx.domains import corner_bits
 from mpm_dolfinx.exchange import Exchange
 from mpm_dolfinx.grid import Grid, side
 
-SURFACE = 0.98  # loads act this share of the way from a point to the surface, always in a filled cell
+SURFACE = 0.98  # a place this share of the way from a point to the surface lies in a filled cell
 
 
 @dataclass
@@ -187,8 +187,7 @@ def material_points(grid: Grid, bodies: Sequence[Body], pressure: float = 0.0) -
 class Surface:
     """Faces of domains on one side of the bodies, the same on every process; arrays over m faces.
 
-    id : (m,) number of the point; xi : (m, d) centre of the face in the domain, from -1 to 1, pulled
-    to 0.98 of the way; area0, whole0 : (m,) reference area of the part that counts and of the whole
+    id : (m,) number of the point; xi : (m, d) centre of the face in the domain, from -1 to 1; area0, whole0 : (m,) reference area of the part that counts and of the whole
     face, m^(d-1); axis, end : side of the domain.
     """
 
@@ -233,7 +232,7 @@ def surface(bodies: Sequence[Body], name: str, region: Region | None = None) -> 
         if region is not None:
             on &= (plane >= np.asarray(region[0])[axis] - 1e-12) & (plane <= np.asarray(region[1])[axis] + 1e-12)
         xi = (inner_low + inner_high - low - high) / body.spacing
-        xi[:, axis] = SURFACE * (2 * end - 1)
+        xi[:, axis] = 2 * end - 1
         ids.append(start + chosen[on])
         xis.append(xi[on])
         areas.append((inner_high - inner_low)[on][:, tangential].prod(axis=1))

@@ -25,6 +25,7 @@ from mpm_dolfinx.points import (
     Body,
     MaterialPoints,
     Probes,
+    SURFACE,
     Region,
     Surface,
     face_vectors,
@@ -383,13 +384,16 @@ class Simulation:
             )
 
     def _surface_points(self, faces: Surface):
-        """Return (faces of this process, their points, cells, positions): just under the surface, in filled cells."""
+        """Return (faces of this process, their points, cells, positions on the surface).
+
+        The cell is that of a place just under the surface, which holds a piece of the domain: its
+        shape functions, continued to the surface, put the load on nodes that have stiffness.
+        """
         here, at = self.points.find(faces.id)
-        x = interpolate(self.points.corners[at], faces.xi[here])
-        cell, inside = self._filled_cell(at, x)
-        if not inside.all():  # a sliver was dropped, or there is no domain: act at the point's largest piece
-            x = np.where(inside[:, None], x, self._cut.x[self._largest()[at]])
-        return here, at, cell, x
+        corners, xi = self.points.corners[at], faces.xi[here].copy()
+        xi[:, faces.axis] *= SURFACE
+        cell, _ = self._filled_cell(at, interpolate(corners, xi))
+        return here, at, cell, interpolate(corners, faces.xi[here])
 
     def _filled_cell(self, at: NDArray[np.int64], x: NDArray[np.float64]):
         """Return the cells of positions in domains, and whether a piece of the domain lies there.
@@ -413,7 +417,7 @@ class Simulation:
         return order[last]
 
     def _place_loads(self, t: float) -> None:
-        """Put the dead loads of time t just under the surface."""
+        """Put the dead loads of time t on the surface."""
         cells, xs, forces = [], [], []
         for load, faces in self._loads:
             here, _, cell, x = self._surface_points(faces)
@@ -434,15 +438,12 @@ class Simulation:
         grid, s, d = self.grid, self.storage, self.grid.dim
         cells, conductances, inflows = [], [], []
         for outlet, faces in self._outlets:
-            here, at, cell, _ = self._surface_points(faces)
-            corners = self.points.corners[at]
-            xi = faces.xi[here].copy()
-            xi[:, faces.axis] = 2 * faces.end - 1
-            whole = face_vectors(corners, faces.axis, faces.end)
+            here, at, cell, x = self._surface_points(faces)
+            whole = face_vectors(self.points.corners[at], faces.axis, faces.end)
             area = whole * (faces.area0[here] / faces.whole0[here])[:, None]
             travel = Exchange(grid.comm, grid.owner(cell))
             cell = grid.local(travel.send(cell))
-            area, x = travel.send(area), travel.send(interpolate(corners, xi))
+            area, x = travel.send(area), travel.send(x)
             size = np.linalg.norm(area, axis=1)
             cells.append(cell)
             if isinstance(outlet, Inflow):

@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: MIT
+"""Small scenes that several tests share."""
+
+import numpy as np
+
+import mpm_dolfinx as mpm
+
+SOFT = mpm.Hencky(bulk=1e7 / 3, shear=5e6, porosity=0.4, conductivity=1e-4)
+
+
+def beam(*, fluid=True, ramp=0.06, load=54e3, offset=0.5, h=0.03, material=SOFT, box=1.2, **options):
+    """Return (simulation, probe at the tip) of the paper's beam on a coarse grid."""
+    grid = mpm.Grid([1.2, box], [round(1.2 / h), round(box / h)])
+    bottom = (round(box / 2 / h) + offset) * grid.h[1]
+    body = mpm.box(grid, [0, bottom], [1, bottom + 0.3])
+    if fluid:
+        options.setdefault("drained", [mpm.Drained("left"), mpm.Drained("right")])
+        options["fluid"] = mpm.Fluid() if fluid is True else fluid
+    simulation = mpm.Simulation(
+        grid, [body], [material], fixed={"left": "xy"}, tractions=[top_load(load, ramp)], **options
+    )
+    return simulation, mpm.probes([body], [[1.0, bottom + 0.15]])
+
+
+def top_load(load=54e3, ramp=0.06):
+    """Return the beam's load."""
+    return mpm.Traction(
+        "top", lambda t: (0, -load * min(1, t / ramp)), region=((0.05, -np.inf), (1.0, np.inf))
+    )
+
+
+def column(*, cells=10, offset=0.0, width=1, fluid=True, height=1.0, bottom=0.0, **options):
+    """Return a laterally held column on the floor, its top `offset` cells above a grid line."""
+    h = height / cells
+    grid = mpm.Grid([width * h, (cells + 4) * h], [width, cells + 4])
+    body = mpm.box(grid, [0, bottom], [width * h, height + offset * h])
+    if fluid:
+        options["fluid"] = mpm.Fluid() if fluid is True else fluid
+    options.setdefault("fixed", {"left": "x", "right": "x", "bottom": "y"})
+    material = options.pop("material", SOFT)
+    return mpm.Simulation(grid, [body], [material], **options)

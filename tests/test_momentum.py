@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: MIT
+"""Momentum: patch tests, rigid motion, loads and weight."""
+
+import numpy as np
+import pytest
+
+import mpm_dolfinx as mpm
+from helpers import SOFT, beam, column
+from mpm_dolfinx.momentum import GHOST
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.3, 0.77])
+@pytest.mark.parametrize("law", [mpm.Hencky, mpm.NeoHookean])
+def test_uniform_compression_is_exact_however_the_body_lies_on_the_grid(offset, law):
+    material = law(bulk=2e5, shear=1e5)
+    s = column(fluid=False, offset=offset, material=material, tractions=[mpm.Traction("top", lambda t: (0, -5e4 * t))])
+    s.run(1.0, 0.25)
+    stretch = s.points.F[:, 1, 1]
+    assert np.ptp(stretch) < 1e-6, "stretch is not uniform"
+    # the column's first Piola-Kirchhoff stress is the load
+    lam, a = 2e5 - 2e5 / 3, stretch.mean()
+    P = (lam + 2e5) * np.log(a) / a if law is mpm.Hencky else 1e5 * (a - 1 / a) + lam * np.log(a) / a
+    assert pytest.approx(-5e4, rel=1e-5) == P
+
+
+def test_weight_gives_the_stress_of_the_column_above():
+    s = column(fluid=False, gravity=[0, -10], cells=8)
+    s.run(1.0, 1.0)
+    density = 0.6 * SOFT.grain_density
+    strain = -density * 10 * (1 - s.points.x[:, 1]) / SOFT.oedometric
+    assert s.points.F[:, 1, 1] - 1 == pytest.approx(strain, abs=0.08 * abs(strain).max())
+
+
+def test_a_rotation_of_the_nodes_gives_no_force():
+    s, _ = beam(fluid=False)
+    s._reset_grid()
+    s._place_loads(0.0)
+    x = s.grid.node_x - [0.5, 0.7]
+    angle = 0.7
+    R = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    s.momentum.u.x.array[:] = (x @ R.T - x).ravel()
+    _, scale = s.momentum.assemble_residual()
+    assert scale < 1e-9 * SOFT.shear
+
+
+def test_the_load_is_the_traction_times_the_area_also_where_a_domain_is_partly_loaded():
+    s, _ = beam(fluid=False, ramp=1.0)
+    s._reset_grid()
+    s._place_loads(1.0)
+    assert s.momentum._external.reshape(-1, 2).sum(axis=0) == pytest.approx([0, -54e3 * 0.95], rel=1e-12)
+
+
+def test_the_answer_does_not_depend_on_the_number_of_steps():
+    tips = []
+    for n in (10, 40, 160):
+        s, probe = beam(fluid=False, ramp=1.0, h=0.015)
+        tips.append(s.run(1.0, 1 / n, probes=probe).displacement[-1][0, 1])
+    assert np.ptp(tips) < 5e-4 * abs(tips[0])
+
+
+def test_the_answer_does_not_depend_on_how_the_beam_lies_on_the_grid():
+    tips = []
+    for offset in (0.0, 0.25, 0.5):
+        s, probe = beam(fluid=False, ramp=1.0, offset=offset)
+        tips.append(s.run(1.0, 0.1, probes=probe).displacement[-1][0, 1])
+    assert np.ptp(tips) < 5e-4 * abs(tips[0])
+
+
+def test_a_large_load_is_held_for_hundreds_of_steps_without_drift():
+    s, probe = beam(fluid=False, ramp=1.0, load=162e3, box=2.4)
+    result = s.run(11.0, 0.05, probes=probe)
+    tips = np.array(result.displacement)[20:, 0, 1]
+    assert result.converged and np.ptp(tips) < 1e-3 * abs(tips[0])
+
+
+def test_the_ghost_penalty_hardly_changes_the_tip(monkeypatch):
+    tips = []
+    for strength in (GHOST / 10, GHOST):
+        monkeypatch.setattr("mpm_dolfinx.momentum.GHOST", strength)
+        s, probe = beam(fluid=False, ramp=1.0)
+        tips.append(s.run(1.0, 0.1, probes=probe).displacement[-1][0, 1])
+    assert tips[0] != tips[1] and np.ptp(tips) < 2e-4 * abs(tips[0])
+
+
+def test_three_dimensions_equal_plane_strain():
+    h, tips = 0.1, []
+    for dim in (2, 3):
+        grid = mpm.Grid([1.2, *[h] * (dim - 2), 1.0], [12, *[1] * (dim - 2), 10])
+        body = mpm.box(grid, [0, *[0] * (dim - 2), 0.45], [1, *[h] * (dim - 2), 0.75])
+        fixed = {"left": "xy"} if dim == 2 else {"left": "xyz", "front": "y", "back": "y"}
+        load = mpm.Traction("top", lambda t, dim=dim: (*[0] * (dim - 1), -30e3 * t))
+        material = mpm.NeoHookean(bulk=1e7 / 3, shear=5e6)
+        s = mpm.Simulation(grid, [body], [material], fixed=fixed, tractions=[load])
+        probe = mpm.probes([body], [[1, *[h / 2] * (dim - 2), 0.6]])
+        tips.append(s.run(1.0, 0.5, probes=probe).displacement[-1][0, [0, -1]])
+    assert tips[1] == pytest.approx(tips[0], rel=1e-6)

@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: MIT
+"""Storage: hydrostatics, flow patch test, conservation."""
+
+import numpy as np
+import pytest
+
+import mpm_dolfinx as mpm
+from helpers import SOFT, beam, column
+from mpm_dolfinx.materials import STANDARD_GRAVITY
+
+
+def hold(s):
+    """Prepare the integration data with the body at rest."""
+    s._reset_grid()
+    s._place_loads(0.0)
+    s.momentum.start()
+    s.storage.start()
+    return s
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.1, 0.5])
+def test_hydrostatic_pressure_does_not_flow(offset):
+    s = hold(column(offset=offset, gravity=[0, -STANDARD_GRAVITY], drained=[mpm.Drained("top")], width=2))
+    y = (s.grid.midpoints + s.storage.centroid.x.array.reshape(-1, 2))[:, 1]
+    s.storage.p.x.array[:] = 1000 * STANDARD_GRAVITY * (1 + offset / 10 - y)
+    s.storage.p_n.x.array[:] = s.storage.p.x.array
+    residual, _ = s.storage.assemble_residual(1.0)
+    through = SOFT.conductivity * 0.2  # of a unit gradient
+    assert np.abs(residual.array).max() < 1e-12 * through
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.1, 0.5])
+def test_a_linear_pressure_flows_evenly_however_the_body_lies_on_the_grid(offset):
+    s = hold(column(offset=offset, drained=[mpm.Drained("top", pressure=0.0), mpm.Drained("bottom", pressure=1e4)]))
+    length = 1 + offset / 10
+    y = (s.grid.midpoints + s.storage.centroid.x.array.reshape(-1, 2))[:, 1]
+    s.storage.p.x.array[:] = s.storage.p_n.x.array[:] = 1e4 * (1 - y / length)
+    residual, _ = s.storage.assemble_residual(1.0)
+    flux = SOFT.conductivity / 9810 * 1e4 / length * 0.1
+    assert np.abs(residual.array).max() < 1e-9 * flux
+
+
+def test_a_prescribed_inflow_passes_through():
+    s = column(inflows=[mpm.Inflow("bottom", 1e-5)], drained=[mpm.Drained("top")])
+    s.run(200.0, 20.0)
+    gradient = 1e-5 / (SOFT.conductivity / 9810)
+    assert s.points.pressure == pytest.approx(gradient * (1 - s.points.x[:, 1]), abs=0.06 * gradient)
+
+
+def test_a_rotation_squeezes_no_fluid_out():
+    s, _ = beam()
+    hold(s)
+    x, angle = s.grid.node_x - [0.5, 0.7], 0.5
+    R = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    s.momentum.u.x.array[:] = (x @ R.T - x).ravel()
+    residual, _ = s.storage.assemble_residual(1.0)
+    assert np.abs(residual.array).max() < 1e-14
+
+
+@pytest.mark.parametrize("bulk", [2.2e9, np.inf])
+def test_the_fluid_balance_closes_in_every_step(bulk):
+    s, _ = beam(fluid=True)
+    s, _ = beam(fluid=mpm.Fluid(bulk=bulk))
+    result = s.run(0.2, 0.02)
+    assert result.balance <= 1e-8 and result.residual <= 1e-8
+
+
+def test_a_sealed_body_keeps_its_fluid():
+    s = column(tractions=[mpm.Traction("top", (0, -1e4))], material=SOFT)
+    result = s.run(1.0, 0.25)
+    assert result.balance <= 1e-8
+    # all the load is carried by the water but for its compressibility
+    undrained = SOFT.oedometric + 2.2e9 / 0.4
+    assert s.points.pressure == pytest.approx(1e4 * (1 - SOFT.oedometric / undrained), rel=2e-3)
+
+
+def test_biot_coefficient_and_grains_enter_the_undrained_response():
+    material = mpm.Hencky(bulk=1e7, shear=6e6, porosity=0.3, biot=0.8, grain_bulk=5e7)
+    s = column(material=material, fluid=mpm.Fluid(bulk=2e7), tractions=[mpm.Traction("top", (0, -100.0))])
+    s.run(1.0, 1.0)
+    storage = 0.3 / 2e7 + 0.5 / 5e7
+    skempton = 0.8 / (storage * material.oedometric + 0.64)
+    assert s.points.pressure == pytest.approx(np.full(len(s.points), 100 * skempton), rel=1e-3)
+
+
+def test_one_dimensional_consolidation_follows_terzaghi():
+    s = column(cells=20, drained=[mpm.Drained("top")], tractions=[mpm.Traction("top", (0, -100.0))], offset=0.3)
+    height = 1 + 0.3 / 20
+    cv = SOFT.conductivity / 9810 * SOFT.oedometric
+    t = 0.5 * height**2 / cv
+    s.run(t, t / 100)
+    m = np.arange(200)
+    M, z = np.pi * (m + 0.5), 1 - s.points.x[:, 1, None] / height
+    exact = 100 * (2 / M * np.sin(M * z) * np.exp(-(M**2) * 0.5)).sum(axis=1)
+    assert np.abs(s.points.pressure - exact).max() < 0.015 * 100
