@@ -37,7 +37,6 @@ COUPLINGS = {
 KEEP = 0.05  # the tangent is kept while a Newton step reduces the residual to less than this
 FORCING = 1e-3  # relative accuracy of the linear solve
 EXPLODES = 1e4  # a bending body's residual may grow this much in a good step: rotations stretch at first order
-DIVERGED = 1e3  # relative residual at which the paper's iteration is given up
 INNER = 1e-3  # the momentum is solved to this share of the storage's error: rotations fake volume changes
 MOMENTUM_STEPS = 10
 
@@ -46,8 +45,9 @@ class NotConverged(RuntimeError):
     """A step's equations could not be solved; `history` lists (momentum, storage) relative residuals."""
 
     def __init__(self, reason: str, history: list[tuple[float, float]]):
-        worst = "momentum" if not history or history[-1][0] >= history[-1][1] else "storage"
-        shown = ", ".join(f"({u:.1e}, {p:.1e})" for u, p in history[-6:])
+        finite = [h for h in history if np.isfinite(h).all()]
+        worst = "momentum" if not finite or finite[-1][0] >= finite[-1][1] else "storage"
+        shown = ", ".join(f"({u:.1e}, {p:.1e})" for u, p in finite[-4:])
         super().__init__(f"{reason}; worst in {worst}; last residuals (momentum, storage): {shown}")
         self.reason, self.field, self.history = reason, worst, history
 
@@ -152,20 +152,26 @@ class Coupler:
         self._linearise(dt)
         while max(errors) > self.tolerance:
             self._check(report, report.coupling)
-            newton = 0
-            while errors[0] > INNER * max(self.tolerance, errors[1]) and newton < MOMENTUM_STEPS:
-                self._solve_u.solve(self.momentum.residual, self._du)
-                self._dp.set(0.0)
-                before, errors = errors[0], self._line_search(dt, errors, report)
-                newton += 1
-                if errors[0] > KEEP * before:
-                    self._linearise(dt)
+            try:
+                self._balance_momentum(dt, errors, report)
+            except NotConverged as failed:
+                why = "beta is below alpha^2 / (2 K_dr)" if COUPLINGS[self.coupling] is None else "cut the step"
+                raise NotConverged(f"the {self.coupling} iteration diverges ({why})", report.history) from failed
             self._solve_s.solve(self.storage.residual, self._dp)
             self.storage.unknowns.add(self.storage.p, -1.0, self._dp)
             report.coupling += 1
             errors = self._errors(dt, report)
-            if not np.isfinite(errors).all() or errors[0] > DIVERGED:
-                raise NotConverged("the iteration diverges", report.history)
+
+    def _balance_momentum(self, dt: float, errors: tuple[float, float], report: Report) -> None:
+        """Newton's method on the momentum at fixed pressure."""
+        self._dp.set(0.0)
+        for _ in range(MOMENTUM_STEPS):
+            if errors[0] <= INNER * max(self.tolerance, errors[1]):
+                return
+            self._solve_u.solve(self.momentum.residual, self._du)
+            before, errors = errors[0], self._line_search(dt, errors, report)
+            if errors[0] > KEEP * before:
+                self._linearise(dt)
 
     def _check(self, report: Report, count: int) -> None:
         if count >= self.max_iterations:

@@ -63,14 +63,17 @@ class Momentum:
         self.free = ~fixed
         v, du = ufl.TestFunction(V), ufl.TrialFunction(V)
 
-        delta = ufl.Identity(grid.dim) + pieces.grad(self.u)
-        parameters = {name: getattr(pieces, name) for name in law.parameters}
-        energy = law.energy(ufl.variable(delta * pieces.F), **parameters) / ufl.det(pieces.F)
+        F = ufl.variable((ufl.Identity(grid.dim) + pieces.grad(self.u)) * pieces.F)
+        energy = law.energy(F, **{name: getattr(pieces, name) for name in law.parameters})
         if pressure is not None:
-            energy -= pieces.biot * pressure * ufl.det(delta)
-        residual = ufl.derivative(energy * pieces.dx, self.u, v)
-        self._residual = PointForm(residual, pieces)
-        self._tangent = PointForm(ufl.derivative(residual, self.u, du), pieces)
+            energy -= pieces.biot * pressure * ufl.det(F)
+        # differentiated by F and contracted: in 3D a twentieth of the compile time of derivatives by u
+        P = ufl.diff(energy / ufl.det(pieces.F), F)
+        A = ufl.diff(P, F)
+        i, j, k, l = ufl.indices(4)
+        dF_v, dF_u = pieces.grad(v) * pieces.F, pieces.grad(du) * pieces.F
+        self._residual = PointForm(ufl.inner(P, dF_v) * pieces.dx, pieces)
+        self._tangent = PointForm(dF_v[i, j] * A[i, j, k, l] * dF_u[k, l] * pieces.dx, pieces)
 
         self.loads = FormPoints(grid, force=(grid.dim,))
         self._traction = PointForm(ufl.inner(self.loads.force, self.loads.value(v)) * self.loads.dx, self.loads)

@@ -172,8 +172,8 @@ class BiotFEM:
         across = sum(abs(normal[a]) * h[a] for a in range(self.grid.dim))
         dS = ufl.dS(domain=self.grid.mesh, metadata={"quadrature_degree": 2})
         flux = kappa * ufl.avg(stretch) / across("+") * ufl.jump(p) * ufl.jump(q) * dS
-        for outlet in outlets:
-            flux += self._on(outlet, 2 * kappa * stretch / across * (p - self._constant(outlet.pressure / self.scale)) * q)
+        for o in outlets:
+            flux += self._on(o, 2 * kappa * stretch / across * (p - self._constant(o.pressure / self.scale)) * q)
         return flux
 
     def _make_solver(self) -> None:
