@@ -25,7 +25,7 @@ from mpm_dolfinx.reference import BiotFEM, euler_bernoulli
 
 LENGTH, HEIGHT, CLAMP = 1.0, 0.3, 0.05  # m; the load begins at x = CLAMP
 BOX = np.array([1.5, 1.2])  # m
-REFERENCE_CELLS = (40, 12)
+REFERENCE_CELLS = (67, 20)
 
 
 def arguments(argv: list[str] | None = None) -> argparse.Namespace:
@@ -133,7 +133,7 @@ def summary(simulation: mpm.Simulation, result: mpm.Result) -> dict:
     comm = simulation.grid.comm
     return {
         "tip": [[t, *map(float, u[-1])] for t, u in zip(result.t[1:], result.displacement[1:], strict=True)],
-        "p_range": [[t, *map(float, p)] for t, p in zip(result.t[1:], result.pressure[1:])],
+        "p_range": [[t, *map(float, p)] for t, p in zip(result.t[1:], result.pressure[1:], strict=False)],
         "wall_s": result.wall,
         "jit_s": simulation.jit,
         "steps": result.steps,
@@ -195,16 +195,17 @@ def draw_pressure(o: argparse.Namespace, snapshots: list) -> None:
     """Draw the pore pressure on the material points at six times."""
     from matplotlib.collections import PolyCollection
 
-    fig, axes = figure(2, 3, (13, 7))
-    for ax, (t, corners, pressure) in zip(axes.ravel(), snapshots):
+    fig, axes = figure(2, 3, (13, 6))
+    for ax, (t, corners, pressure) in zip(axes.ravel(), snapshots, strict=False):
         limit = np.abs(pressure).max() / 1e3
         domains = PolyCollection(corners[:, [0, 1, 3, 2]], array=pressure / 1e3, cmap="RdBu_r", edgecolors="face")
         domains.set(linewidth=0.1, clim=(-limit, limit))
         ax.add_collection(domains)
         low, high = snapshots[-1][1].min(axis=(0, 1)), snapshots[0][1].max(axis=(0, 1))
-        ax.set(aspect="equal", title=f"t = {t:.3g} s", xlim=(-0.03, high[0] + 0.05), ylim=(low[1] - 0.03, high[1] + 0.03))
+        ax.set(aspect="equal", title=f"t = {t:.3g} s")
+        ax.set(xlim=(-0.03, high[0] + 0.05), ylim=(low[1] - 0.03, high[1] + 0.03))
         ax.set(xlabel="x (m)", ylabel="y (m)")
-        bar = fig.colorbar(domains, ax=ax, shrink=0.85)
+        bar = fig.colorbar(domains, ax=ax, shrink=0.72, aspect=16)
         bar.set_label("pore pressure (kPa)")
     for ax in axes.ravel()[len(snapshots) :]:
         ax.set_axis_off()

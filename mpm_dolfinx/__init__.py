@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: MIT
 """Implicit, iteratively coupled material point / finite volume poromechanics on FEniCSx."""
 
+from mpm_dolfinx.conditions import Drained, Inflow, Traction
 from mpm_dolfinx.coupling import COUPLINGS, NotConverged
 from mpm_dolfinx.grid import Grid
 from mpm_dolfinx.materials import LAWS, Fluid, Hencky, LinearElastic, NeoHookean
 from mpm_dolfinx.points import box, probes, shape
-from mpm_dolfinx.simulation import Drained, GaveUp, Inflow, Result, Simulation, Traction
+from mpm_dolfinx.simulation import Simulation
+from mpm_dolfinx.timeloop import GaveUp, Result
 
 __all__ = [
     "COUPLINGS",

@@ -17,9 +17,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from petsc4py import PETSc
+
 import numpy as np
 from dolfinx.common import Timer
-from petsc4py import PETSc
 
 from mpm_dolfinx.momentum import Momentum
 from mpm_dolfinx.storage import Storage

@@ -18,7 +18,7 @@ from itertools import permutations
 import numpy as np
 from numpy.typing import NDArray
 
-from mpm_dolfinx.grid import Grid
+from mpm_dolfinx.grid import Grid, sum_by
 
 SNAP = 1e-10  # cells: vertices this close to a grid plane are taken to lie on it
 SLIVER = 1e-9  # of the domain: smaller pieces are dropped
@@ -98,10 +98,10 @@ def _sum(grid: Grid, y: NDArray[np.float64], s: NDArray[np.float64], owner: NDAr
     slot += start[owner]
 
     def total(values):
-        return np.bincount(slot, weights=values, minlength=start[-1])
+        return sum_by(slot, values, start[-1])
 
     sums = total(volume)
-    whole = np.bincount(owner, weights=volume, minlength=n)
+    whole = sum_by(owner, volume, n)
     point = np.repeat(np.arange(n), count)
     kept = np.flatnonzero(sums > SLIVER * whole[point])
     point, sums = point[kept], sums[kept]
@@ -120,12 +120,12 @@ def _sum(grid: Grid, y: NDArray[np.float64], s: NDArray[np.float64], owner: NDAr
             distance = np.abs(s[:, a] - (index[a] + end))
             on = np.flatnonzero(((distance < SNAP).sum(axis=0) == d) & solid)  # a facet lies on the plane
             area = d * volume[on] / distance[:, on].max(axis=0)
-            area = np.bincount(slot[on], weights=area, minlength=start[-1])[kept]
+            area = sum_by(slot[on], area, start[-1])[kept]
             faces[:, a, end] = area * grid.cell_volume / grid.h[a]
 
     # centroids stay off the grid lines, and inside the cell that they belong to
     centroid = np.clip(centroid, cell + SNAP, cell + 1 - SNAP)
-    fraction = sums / np.bincount(point, weights=sums, minlength=n)[point]
+    fraction = sums / sum_by(point, sums, n)[point]
     return Pieces(point, grid.number(cell), fraction, grid.lower + grid.h * centroid, faces)
 
 

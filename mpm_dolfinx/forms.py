@@ -17,11 +17,12 @@ from __future__ import annotations
 
 from math import factorial
 
+from petsc4py import PETSc
+
 import numpy as np
 import ufl
 from dolfinx import fem
 from numpy.typing import NDArray
-from petsc4py import PETSc
 
 from mpm_dolfinx import _compat
 from mpm_dolfinx.grid import Grid
@@ -136,7 +137,8 @@ class PointForm:
             if f in names:
                 self._columns.append((slice(start, stop), names[f]))
             else:
-                self._gathered.append((slice(start, stop), f, (dofs[:, :, None] * bs + np.arange(bs))))
+                unrolled = (dofs[:, :, None] * bs + np.arange(bs)).reshape(len(dofs), stop - start)
+                self._gathered.append((slice(start, stop), f, unrolled))
             start = stop
         self._width = start
 
@@ -148,7 +150,7 @@ class PointForm:
             self._packed = np.empty((len(cells), self._width))
             for columns, name in self._columns:
                 self._packed[:, columns] = self.points.data[name]
-            self._dofs = [(c, f, dofs[cells].reshape(len(cells), -1)) for c, f, dofs in self._gathered]
+            self._dofs = [(c, f, dofs[cells]) for c, f, dofs in self._gathered]
         for columns, f, dofs in self._dofs:
             self._packed[:, columns] = f.x.array[dofs]
         return self._packed

@@ -27,6 +27,11 @@ def side(name: str, dim: int) -> tuple[int, int]:
     return SIDES[dim][name]
 
 
+def sum_by(index: NDArray, values: NDArray[np.float64], size: int) -> NDArray[np.float64]:
+    """Return the sums (size,) of values by index (numpy's bincount, which gives integers for no values)."""
+    return np.bincount(index, weights=values, minlength=size).astype(float, copy=False)
+
+
 class Grid:
     """Background grid of equal cells over the box [lower, upper].
 

@@ -12,11 +12,12 @@ first Piola-Kirchhoff effective stress relative to the start of the step.  The d
 
 from __future__ import annotations
 
+from petsc4py import PETSc
+
 import numpy as np
 import ufl
 from dolfinx import fem
 from numpy.typing import NDArray
-from petsc4py import PETSc
 
 from mpm_dolfinx import _compat
 from mpm_dolfinx.forms import FormPoints, PointForm

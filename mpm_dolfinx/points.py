@@ -187,8 +187,9 @@ def material_points(grid: Grid, bodies: Sequence[Body], pressure: float = 0.0) -
 class Surface:
     """Faces of domains on one side of the bodies, the same on every process; arrays over m faces.
 
-    id : (m,) number of the point; xi : (m, d) centre of the face in the domain, from -1 to 1; area0, whole0 : (m,) reference area of the part that counts and of the whole
-    face, m^(d-1); axis, end : side of the domain.
+    id : (m,) number of the point; xi : (m, d) centre of the face in the domain, from -1 to 1;
+    area0, whole0 : (m,) reference area of the part that counts and of the whole face, m^(d-1);
+    axis, end : side of the domain.
     """
 
     id: NDArray[np.int64]
@@ -238,7 +239,7 @@ def surface(bodies: Sequence[Body], name: str, region: Region | None = None) -> 
         areas.append((inner_high - inner_low)[on][:, tangential].prod(axis=1))
         wholes.append((high - low)[on][:, tangential].prod(axis=1))
         start += len(body)
-    return Surface(np.concatenate(ids), np.concatenate(xis), np.concatenate(areas), np.concatenate(wholes), axis, end)
+    return Surface(*map(np.concatenate, (ids, xis, areas, wholes)), axis, end)
 
 
 def interpolate(corners: NDArray[np.float64], xi: NDArray[np.float64]) -> NDArray[np.float64]:

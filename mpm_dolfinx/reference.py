@@ -28,11 +28,12 @@ from numpy.typing import ArrayLike, NDArray
 from tqdm import tqdm
 
 from mpm_dolfinx import _compat
+from mpm_dolfinx.conditions import Drained, Traction
 from mpm_dolfinx.coupling import NotConverged
 from mpm_dolfinx.grid import Grid, side
 from mpm_dolfinx.materials import Fluid, Skeleton
 from mpm_dolfinx.points import Region
-from mpm_dolfinx.simulation import Drained, GaveUp, Result, Traction
+from mpm_dolfinx.timeloop import GaveUp, Result
 
 ELEMENTS = {"taylor-hood": (2, ("Lagrange", 1, ())), "q1-dg0": (1, ("DG", 0, ()))}  # degree of u; space of p
 CUT_DEGREE = 20  # of quadrature on a side of which a region is loaded: the region's edge may cut facets
@@ -263,7 +264,8 @@ class BiotFEM:
             try:
                 newton, residual = self.step(dt)
             except NotConverged as failed:
-                raise GaveUp(f"gave up at t = {self.t:g} s with dt = {dt:.3g} s: {failed}", result, failed) from failed
+                message = f"gave up at t = {self.t:g} s with dt = {dt:.3g} s: {failed}"
+                raise GaveUp(message, result, failed.history) from failed
             result.steps += 1
             result.newton += newton
             result.residual = max(result.residual, residual)

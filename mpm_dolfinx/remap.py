@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.domains import Pieces
 from mpm_dolfinx.exchange import Exchange
+from mpm_dolfinx.grid import sum_by
 from mpm_dolfinx.points import MaterialPoints
 
 
@@ -63,8 +64,8 @@ def remap(old: Carried, points: MaterialPoints, new: Pieces) -> NDArray[np.float
     stays[match] = np.minimum(new.fraction[match], old.fraction[before])
     leaves = old.fraction.copy()
     leaves[before] -= stays[match]
-    mean = np.bincount(owner, weights=leaves * old.pressure, minlength=n)
-    left = np.bincount(owner, weights=leaves, minlength=n)
+    mean = sum_by(owner, leaves * old.pressure, n)
+    left = sum_by(owner, leaves, n)
     mean = np.divide(mean, left, out=np.zeros(n), where=left > 0)
 
     kept = np.zeros(len(new_key))

@@ -1,132 +1,30 @@
 # SPDX-License-Identifier: MIT
-"""The time loop: cut the domains by the grid, solve for u and p, move the points, reset the grid."""
+"""A scene and one step of it: cut the domains by the grid, solve for u and p, move the points, reset the grid."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
 
 import numpy as np
 from dolfinx import fem
 from dolfinx.common import Timer
 from numpy.typing import ArrayLike, NDArray
-from tqdm import tqdm
 
 from mpm_dolfinx import _compat
-from mpm_dolfinx.coupling import COUPLINGS, Coupler, NotConverged, Report
-from mpm_dolfinx.domains import Pieces, corner_bits, cut
+from mpm_dolfinx.conditions import Drained, Inflow, Traction
+from mpm_dolfinx.coupling import COUPLINGS, Coupler, Report
+from mpm_dolfinx.domains import corner_bits
 from mpm_dolfinx.exchange import Exchange
 from mpm_dolfinx.forms import FormPoints
-from mpm_dolfinx.grid import Grid
+from mpm_dolfinx.grid import Grid, sum_by
 from mpm_dolfinx.materials import Fluid, Skeleton
 from mpm_dolfinx.momentum import FULL, Momentum
-from mpm_dolfinx.points import (
-    Body,
-    MaterialPoints,
-    Probes,
-    SURFACE,
-    Region,
-    Surface,
-    face_vectors,
-    interpolate,
-    material_points,
-    surface,
-)
-from mpm_dolfinx.remap import Carried, carry, remap
+from mpm_dolfinx.placement import Placement
+from mpm_dolfinx.points import Body, Probes, Surface, face_vectors, material_points, surface
+from mpm_dolfinx.remap import carry, remap
 from mpm_dolfinx.storage import Storage
-
-MIN_CUT = 2.0**-10  # of dt: a step is not cut below this
-
-
-@dataclass(frozen=True)
-class Traction:
-    """Dead traction on a side of the bodies.
-
-    Parameters
-    ----------
-    side
-        Side of the bodies, see `grid.SIDES`.
-    value : (d,) or callable t -> (d,), Pa
-        Force per reference area.
-    region : ((d,), (d,)), m
-        Box of reference positions to which the traction is limited.
-    """
-
-    side: str
-    value: ArrayLike | Callable[[float], ArrayLike]
-    region: Region | None = None
-
-    def at(self, t: float) -> NDArray[np.float64]:
-        """Return the traction (d,) at time t (s), Pa."""
-        return np.asarray(self.value(t) if callable(self.value) else self.value, dtype=float)
-
-
-@dataclass(frozen=True)
-class Drained:
-    """Side of the bodies, moving with them, at which the pore pressure is given.
-
-    Parameters
-    ----------
-    side
-        Side of the bodies.
-    pressure
-        Outer pore pressure, Pa.
-    region : ((d,), (d,)), m
-        Box of reference positions to which the drained faces are limited.
-    """
-
-    side: str
-    pressure: float = 0.0
-    region: Region | None = None
-
-
-@dataclass(frozen=True)
-class Inflow:
-    """Side of the bodies through which fluid is pressed in.
-
-    Parameters
-    ----------
-    side
-        Side of the bodies.
-    flux
-        Volume per area and time into the body, m/s; negative: out of it.
-    region : ((d,), (d,)), m
-        Box of reference positions to which the faces are limited.
-    """
-
-    side: str
-    flux: float
-    region: Region | None = None
-
-
-@dataclass
-class Result:
-    """Histories of a run; one entry an output time, the start included.
-
-    t (s); displacement (m, d) of the probes, m; pressure: least and largest on the points, Pa; and of
-    the steps so far: steps, newton, coupling (iterations), balance (worst, relative), cuts.
-    """
-
-    t: list[float] = field(default_factory=list)
-    displacement: list[NDArray[np.float64]] = field(default_factory=list)
-    pressure: list[tuple[float, float]] = field(default_factory=list)
-    steps: int = 0
-    newton: int = 0
-    coupling: int = 0
-    cuts: int = 0
-    balance: float = 0.0
-    residual: float = 0.0
-    wall: float = 0.0
-    converged: bool = False
-
-
-class GaveUp(RuntimeError):
-    """A step failed however small it was cut; `result` holds the histories up to the last good step."""
-
-    def __init__(self, message: str, result: Result, cause: NotConverged):
-        super().__init__(message)
-        self.result, self.field, self.history = result, cause.field, cause.history
+from mpm_dolfinx.timeloop import Result, run
 
 
 class Simulation:
@@ -262,43 +160,18 @@ class Simulation:
 
     def _reset_grid(self) -> None:
         """Rebuild the integration data on the fresh grid: pieces, active cells, remapped pressure."""
-        grid, points = self.grid, self.points
-        self._check_inside()
         with Timer("mpm: cut domains"):
-            self._cut = cut(grid, points.corners) if self.quadrature == "domain" else self._at_points()
-        cutting = self._cut
-        self._travel = Exchange(grid.comm, grid.owner(cutting.cell))
-        send, at = self._travel.send, cutting.point
+            self.placement = place = Placement(self.grid, self.points, self.quadrature, self.t)
         with Timer("mpm: integration data"):
-            J = points.J
+            J = self.points.J
             self.pieces.place(
-                grid.local(send(cutting.cell)),
-                send(cutting.x),
-                send((cutting.fraction * (points.volume0 * J)[at])),
-                **{name: send(values[at]) for name, values in self._fields(J).items()},
+                place.cells,
+                place.pieces_to_cells(place.pieces.x),
+                place.pieces_to_cells(place.pieces.fraction * (self.points.volume0 * J)[place.pieces.point]),
+                **{name: place.to_cells(values) for name, values in self._fields(J).items()},
             )
             self._activate(J)
         self._prepared = True
-
-    def _check_inside(self) -> None:
-        flat = self.points.corners.reshape(-1, self.grid.dim) if self.quadrature == "domain" else self.points.x
-        out = np.flatnonzero(self.grid.outside(flat))
-        if len(out):
-            i = out[0] // (len(flat) // len(self.points))
-            raise RuntimeError(
-                f"point {self.points.id[i]} at {self.points.x[i]} left the grid "
-                f"{self.grid.lower} to {self.grid.upper} at t = {self.t:g} s"
-            )
-
-    def _at_points(self) -> Pieces:
-        """The seed paper's choice: each point is one piece, in its own cell."""
-        grid, x, n = self.grid, self.points.x, len(self.points)
-        index = grid.index(x)
-        size = np.prod(grid.h) / grid.h
-        faces = np.zeros((n, grid.dim, 2))
-        count = np.bincount(grid.number(index), minlength=int(np.prod(grid.shape)))[grid.number(index)]
-        faces += (size / count[:, None])[:, :, None]  # a cell that holds points has open faces
-        return Pieces(np.arange(n), grid.number(index), np.ones(n), x.copy(), faces)
 
     def _fields(self, J: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
         """Return what the points bring to their pieces."""
@@ -318,10 +191,8 @@ class Simulation:
         """Set the active cells and what they hold."""
         grid, pieces, momentum = self.grid, self.pieces, self.momentum
         weight = pieces.data["weight"][:, 0] * grid.cell_volume
-        filled = np.bincount(pieces.cells, weights=weight, minlength=grid.num_local)
-        stiffness = np.bincount(
-            pieces.cells, weights=weight * self._rows(lambda m: m.oedometric), minlength=grid.num_local
-        )
+        filled = sum_by(pieces.cells, weight, grid.num_local)
+        stiffness = sum_by(pieces.cells, weight * self._rows(lambda m: m.oedometric), grid.num_local)
         momentum.fill.x.array[:] = filled / grid.cell_volume
         momentum.modulus.x.array[:] = np.divide(stiffness, filled, out=stiffness, where=filled > 0)
         for f in (momentum.fill, momentum.modulus):
@@ -341,9 +212,9 @@ class Simulation:
                 weight,
                 pieces.x,
                 self._rows(lambda m: m.conductivity) / self.fluid.unit_weight,
-                self._travel.send(self._cut.faces),
+                self.placement.pieces_to_cells(self.placement.pieces.faces),
                 pieces.data["storage"][:, 0],
-                self._travel.send(remap(self._carried, self.points, self._cut)),
+                self.placement.pieces_to_cells(remap(self._carried, self.points, self.placement.pieces)),
                 self._fixed_stress(J),
             )
             self._open_boundary()
@@ -353,14 +224,14 @@ class Simulation:
 
     def _rows(self, value: Callable[[Skeleton], float]) -> NDArray[np.float64]:
         """Return a constant of the materials at the pieces of this process (m,)."""
-        return self._travel.send(self._table(value)[self._cut.point])
+        return self.placement.to_cells(self._table(value))
 
     def _fixed_stress(self, J: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return beta of the fixed-stress operator at the pieces, 1/Pa, before the scheme's factor."""
         if COUPLINGS[self.coupler.coupling] is None:  # as printed in the paper
             return np.full(len(self.pieces.cells), 1 / self.fluid.bulk)
         beta = self._table(lambda m: m.biot**2 / m.drained_modulus(self.grid.dim)) * J
-        return self._travel.send(beta[self._cut.point])
+        return self.placement.to_cells(beta)
 
     def _check_held(self) -> None:
         """Refuse a scene whose body can move as a rigid body: its tangent is singular."""
@@ -383,53 +254,19 @@ class Simulation:
                 "it must touch walls whose fixed components hold it"
             )
 
-    def _surface_points(self, faces: Surface):
-        """Return (faces of this process, their points, cells, positions on the surface).
-
-        The cell is that of a place just under the surface, which holds a piece of the domain: its
-        shape functions, continued to the surface, put the load on nodes that have stiffness.
-        """
-        here, at = self.points.find(faces.id)
-        corners, xi = self.points.corners[at], faces.xi[here].copy()
-        xi[:, faces.axis] *= SURFACE
-        cell, _ = self._filled_cell(at, interpolate(corners, xi))
-        return here, at, cell, interpolate(corners, faces.xi[here])
-
-    def _filled_cell(self, at: NDArray[np.int64], x: NDArray[np.float64]):
-        """Return the cells of positions in domains, and whether a piece of the domain lies there.
-
-        Where none does, the cell is that of the domain's largest piece.
-        """
-        grid, cutting = self.grid, self._cut
-        cell = grid.number(grid.index(x))
-        cells = int(np.prod(grid.shape))
-        key, keys = at * cells + cell, cutting.point * cells + cutting.cell
-        found = np.searchsorted(keys, key)
-        inside = keys[np.minimum(found, len(keys) - 1)] == key if len(keys) else np.zeros(0, dtype=bool)
-        if not inside.all():
-            cell = np.where(inside, cell, cutting.cell[self._largest()[at]])
-        return cell, inside
-
-    def _largest(self) -> NDArray[np.int64]:
-        """Largest piece of each point (n,)."""
-        order = np.lexsort((self._cut.fraction, self._cut.point))
-        last = np.cumsum(np.bincount(self._cut.point, minlength=len(self.points))) - 1
-        return order[last]
-
     def _place_loads(self, t: float) -> None:
         """Put the dead loads of time t on the surface."""
         cells, xs, forces = [], [], []
         for load, faces in self._loads:
-            here, _, cell, x = self._surface_points(faces)
+            here, _, cell, x = self.placement.surface(faces)
             cells.append(cell)
             xs.append(x)
             forces.append(faces.area0[here, None] * load.at(t))
         d = self.grid.dim
         cell = np.concatenate([np.empty(0, dtype=np.int64), *cells])
         travel = Exchange(self.grid.comm, self.grid.owner(cell))
-        cell, x, force = (
-            travel.send(a) for a in (cell, np.concatenate([np.empty((0, d)), *xs]), np.concatenate([np.empty((0, d)), *forces]))
-        )
+        cell = travel.send(cell)
+        x, force = (travel.send(np.concatenate([np.empty((0, d)), *a])) for a in (xs, forces))
         self.momentum.loads.place(self.grid.local(cell), x, np.ones(len(cell)), force=force)
         self.momentum.set_loads()
 
@@ -438,7 +275,7 @@ class Simulation:
         grid, s, d = self.grid, self.storage, self.grid.dim
         cells, conductances, inflows = [], [], []
         for outlet, faces in self._outlets:
-            here, at, cell, x = self._surface_points(faces)
+            here, at, cell, x = self.placement.surface(faces)
             whole = face_vectors(self.points.corners[at], faces.axis, faces.end)
             area = whole * (faces.area0[here] / faces.whole0[here])[:, None]
             travel = Exchange(grid.comm, grid.owner(cell))
@@ -468,41 +305,28 @@ class Simulation:
     def _move_points(self) -> None:
         """Move the corners, update F, take the pressures along."""
         with Timer("mpm: move points"):
-            grid, points, cutting = self.grid, self.points, self._cut
+            grid, points, place = self.grid, self.points, self.placement
             n, d = len(points), grid.dim
             u = self.momentum.u.x.array.reshape(-1, d)
-            nodes, pieces = grid.cell_nodes, self.pieces
-            _, dN = grid.shape_functions(pieces.cells, pieces.x)
-            gradient = np.einsum("mka,mkb->mab", u[nodes[pieces.cells]], dN)
-            gradient = self._travel.back(gradient).reshape(-1, d * d)
+            _, dN = grid.shape_functions(self.pieces.cells, self.pieces.x)
+            gradient = np.einsum("mka,mkb->mab", u[grid.cell_nodes[self.pieces.cells]], dN)
             # F_p <- (sum_k w_k Delta_k / V_p) F_p
-            mean = [np.bincount(cutting.point, cutting.fraction * column, minlength=n) for column in gradient.T]
-            delta = np.eye(d) + np.stack(mean, axis=1).reshape(n, d, d)
-            points.F = delta @ points.F
+            mean = [place.mean(column) for column in place.to_pieces(gradient).reshape(-1, d * d).T]
+            points.F = (np.eye(d) + np.stack(mean, axis=1).reshape(n, d, d)) @ points.F
             if self.quadrature == "domain":
-                count = 2**d
-                moved = points.corners.reshape(-1, d)
-                points.corners = (moved + self._displacement(np.repeat(np.arange(n), count), moved)).reshape(n, count, d)
+                corners = points.corners.reshape(-1, d)
+                moved = corners + place.displacement(u, np.repeat(np.arange(n), 2**d), corners)
+                points.corners = moved.reshape(n, 2**d, d)
                 points.x = points.corners.mean(axis=1)
             else:
-                points.x = points.x + self._displacement(np.arange(n), points.x)
+                points.x = points.x + place.displacement(u, np.arange(n), points.x)
                 offset = (corner_bits(d) - 0.5) * self._spacing()[:, None, :]
                 points.corners = points.x[:, None] + np.einsum("nab,nkb->nka", points.F, offset)
             if self.storage:
-                p = self._travel.back(self.storage.p.x.array[pieces.cells])
-                points.pressure = np.bincount(cutting.point, cutting.fraction * p, minlength=n)
-                self._carried = carry(points, cutting, p)
+                p = place.to_pieces(self.storage.p.x.array[self.pieces.cells])
+                points.pressure = place.mean(p)
+                self._carried = carry(points, place.pieces, p)
             self._migrate()
-
-    def _displacement(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the displacements (m, d), m, at positions in the domains of points `at`."""
-        grid = self.grid
-        cell, _ = self._filled_cell(at, x)
-        travel = Exchange(grid.comm, grid.owner(cell))
-        cells, x = grid.local(travel.send(cell)), travel.send(x)
-        N, _ = grid.shape_functions(cells, x)
-        u = self.momentum.u.x.array.reshape(-1, grid.dim)
-        return travel.back(np.einsum("mk,mkd->md", N, u[grid.cell_nodes[cells]]))
 
     def _spacing(self) -> NDArray[np.float64]:
         """Reference size of the points' domains (n, d), m."""
@@ -530,72 +354,5 @@ class Simulation:
         observe: Callable[[Simulation], None] | None = None,
         progress: bool = True,
     ) -> Result:
-        """Advance to t_end in steps of dt; a step that does not converge is cut in two, and grows again.
-
-        Parameters
-        ----------
-        t_end
-            End time, s.
-        dt
-            Step and output interval, s, > 0.
-        probes
-            Particles whose displacement is recorded.
-        observe
-            Called after each output interval.
-        progress
-            Show a progress bar on a terminal.
-
-        Raises
-        ------
-        GaveUp
-            With the histories so far; `points` and `t` are those of the last good step.
-        """
-        if not (dt > 0 and t_end > self.t):
-            raise ValueError(f"dt = {dt!r}, t_end = {t_end!r}: must be dt > 0 and t_end > {self.t:g}")
-        result, start, small = Result(), self.t, dt
-        self._record(result, probes)
-        intervals = max(1, round((t_end - start) / dt))
-        began = time.perf_counter()
-        quiet = None if progress and self.grid.comm.rank == 0 else True
-        with tqdm(total=intervals, disable=quiet, unit="step") as bar:
-            for k in range(1, intervals + 1):
-                target = t_end if k == intervals else start + k * dt
-                while target - self.t > 1e-9 * dt:
-                    small = self._try(min(small, target - self.t), dt, result)
-                self.t = target
-                self._record(result, probes)
-                result.wall = time.perf_counter() - began
-                if observe is not None:
-                    observe(self)
-                bar.set_postfix(t=f"{self.t:.4g} s", newton=result.newton, coupling=result.coupling)
-                bar.update()
-        result.converged = True
-        return result
-
-    def _try(self, small: float, dt: float, result: Result) -> float:
-        """Take one step of at most `small`, cutting it until it converges; return the next step to try."""
-        while True:
-            try:
-                report = self.step(small)
-            except NotConverged as failed:
-                result.cuts += 1
-                if small / 2 < MIN_CUT * dt:
-                    raise GaveUp(f"gave up at t = {self.t:g} s with dt = {small:.3g} s: {failed}", result, failed) from failed
-                small /= 2
-                continue
-            result.steps += 1
-            result.newton += report.newton
-            result.coupling += report.coupling
-            result.balance = max(result.balance, report.balance)
-            result.residual = max(result.residual, *report.history[-1])
-            return min(2 * small, dt)
-
-    def _record(self, result: Result, probes: Probes | None) -> None:
-        comm = self.grid.comm
-        result.t.append(self.t)
-        if probes is not None:
-            result.displacement.append(probes.displacement(self.points, comm))
-        if self.fluid:
-            p = self.points.pressure
-            ends = comm.allgather((p.min(initial=np.inf), p.max(initial=-np.inf)))
-            result.pressure.append((min(e[0] for e in ends), max(e[1] for e in ends)))
+        """Advance to t_end in steps of dt: see `timeloop.run`."""
+        return run(self, t_end, dt, probes=probes, observe=observe, progress=progress)

@@ -13,15 +13,16 @@ filling, where half the cell size reaches 12 %.  The sum over the cells is the f
 
 from __future__ import annotations
 
+from petsc4py import PETSc
+
 import numpy as np
 import ufl
 from dolfinx import fem
 from numpy.typing import NDArray
-from petsc4py import PETSc
 
 from mpm_dolfinx import _compat
 from mpm_dolfinx.forms import FormPoints, PointForm
-from mpm_dolfinx.grid import Grid
+from mpm_dolfinx.grid import Grid, sum_by
 from mpm_dolfinx.unknowns import Unknowns, matrix, sum_ghosts, zero
 
 
@@ -169,7 +170,7 @@ class Storage:
 
     def _total(self, cells: NDArray[np.int32], values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Sum values over the rows of each active owned cell."""
-        return np.bincount(self._slot[cells], weights=values, minlength=self.unknowns.size)
+        return sum_by(self._slot[cells], values, self.unknowns.size)
 
     def start(self) -> None:
         """Begin a step: the pressure that the cells hold."""

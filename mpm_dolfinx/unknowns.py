@@ -8,10 +8,11 @@ dolfinx assemble straight into them: PETSc ignores negative indices.
 
 from __future__ import annotations
 
+from petsc4py import PETSc
+
 import numpy as np
 from dolfinx import fem
 from numpy.typing import NDArray
-from petsc4py import PETSc
 
 from mpm_dolfinx import _compat
 

@@ -3,9 +3,9 @@
 
 import numpy as np
 import pytest
+from helpers import beam
 
 import mpm_dolfinx as mpm
-from helpers import beam
 
 
 @pytest.fixture(scope="module")

@@ -3,9 +3,9 @@
 
 import numpy as np
 import pytest
+from helpers import SOFT, beam, column
 
 import mpm_dolfinx as mpm
-from helpers import SOFT, beam, column
 from mpm_dolfinx.momentum import GHOST
 
 

@@ -3,9 +3,9 @@
 
 import numpy as np
 import pytest
+from helpers import beam
 
 import mpm_dolfinx as mpm
-from helpers import beam
 from mpm_dolfinx.domains import cut
 from mpm_dolfinx.remap import carry, remap
 

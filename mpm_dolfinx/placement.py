@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: MIT
+"""Where the points lie on the grid of a step: their pieces, who owns the cells, values there and back."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpm_dolfinx.domains import Pieces, cut
+from mpm_dolfinx.exchange import Exchange
+from mpm_dolfinx.grid import Grid, sum_by
+from mpm_dolfinx.points import SURFACE, MaterialPoints, Surface, interpolate
+
+
+class LeftGrid(RuntimeError):
+    """A material point lies outside the grid."""
+
+
+class Placement:
+    """The points' domains cut by the cells, and the way of their data to the owners of the cells.
+
+    Parameters
+    ----------
+    grid
+        Background grid.
+    points
+        The material points of this process.
+    quadrature
+        "domain": exact pieces of the points' domains; "point": one piece a point, as in the seed paper.
+    t
+        Time, s, for the message of a point that has left the grid.
+
+    Raises
+    ------
+    LeftGrid
+        Naming the first point outside the grid.
+    """
+
+    def __init__(self, grid: Grid, points: MaterialPoints, quadrature: str, t: float):
+        self.grid, self.points = grid, points
+        self._check_inside(points.corners if quadrature == "domain" else points.x[:, None], t)
+        self.pieces = cut(grid, points.corners) if quadrature == "domain" else whole_points(grid, points.x)
+        self._travel = Exchange(grid.comm, grid.owner(self.pieces.cell))
+        self.cells = grid.local(self._travel.send(self.pieces.cell))
+        """Owned cells of the pieces that this process integrates."""
+
+    def _check_inside(self, x: NDArray[np.float64], t: float) -> None:
+        out = np.flatnonzero(self.grid.outside(x.reshape(-1, self.grid.dim)))
+        if len(out):
+            i, points = out[0] // x.shape[1], self.points
+            raise LeftGrid(
+                f"point {points.id[i]} at {points.x[i]} left the grid "
+                f"{self.grid.lower} to {self.grid.upper} at t = {t:g} s"
+            )
+
+    def to_cells(self, values: NDArray) -> NDArray:
+        """Send values of the points (n, ...) to the owners of their pieces' cells (m, ...)."""
+        return self._travel.send(values[self.pieces.point])
+
+    def pieces_to_cells(self, values: NDArray) -> NDArray:
+        """Send values of the pieces to the owners of their cells."""
+        return self._travel.send(values)
+
+    def to_pieces(self, values: NDArray) -> NDArray:
+        """Bring values at the integrated pieces back to the pieces of this process's points."""
+        return self._travel.back(values)
+
+    def mean(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the volume means (n,) over the pieces of each point of values (m,) on the pieces."""
+        return sum_by(self.pieces.point, self.pieces.fraction * values, len(self.points))
+
+    def surface(self, faces: Surface):
+        """Return (faces of this process, their points, cells, positions on the surface).
+
+        The cell is that of a place just under the surface, which holds a piece of the domain: its
+        shape functions, continued to the surface, put the load on nodes that have stiffness.
+        """
+        here, at = self.points.find(faces.id)
+        corners, xi = self.points.corners[at], faces.xi[here].copy()
+        xi[:, faces.axis] *= SURFACE
+        cell = self._filled_cell(at, interpolate(corners, xi))
+        return here, at, cell, interpolate(corners, faces.xi[here])
+
+    def displacement(
+        self, u: NDArray[np.float64], at: NDArray[np.int64], x: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return the P1 field u (nodes, d) at positions (m, d) in the domains of points `at`."""
+        grid, cell = self.grid, self._filled_cell(at, x)
+        travel = Exchange(grid.comm, grid.owner(cell))
+        cells, x = grid.local(travel.send(cell)), travel.send(x)
+        N, _ = grid.shape_functions(cells, x)
+        return travel.back(np.einsum("mk,mkd->md", N, u[grid.cell_nodes[cells]]))
+
+    def _filled_cell(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Return the cells (m,) of positions in domains; where no piece of the domain lies, of its largest piece."""
+        pieces, cells = self.pieces, int(np.prod(self.grid.shape))
+        cell = self.grid.number(self.grid.index(x))
+        key, keys = at * cells + cell, pieces.point * cells + pieces.cell
+        if not len(key):
+            return cell
+        found = np.minimum(np.searchsorted(keys, key), len(keys) - 1)
+        empty = keys[found] != key
+        if empty.any():
+            cell[empty] = pieces.cell[self._largest()[at[empty]]]
+        return cell
+
+    def _largest(self) -> NDArray[np.int64]:
+        """Return the largest piece of each point (n,)."""
+        order = np.lexsort((self.pieces.fraction, self.pieces.point))
+        return order[np.cumsum(np.bincount(self.pieces.point, minlength=len(self.points))) - 1]
+
+
+def whole_points(grid: Grid, x: NDArray[np.float64]) -> Pieces:
+    """Return one piece a point, at the point; a cell that holds points has open faces."""
+    n, number = len(x), grid.number(grid.index(x))
+    _, cell, count = np.unique(number, return_inverse=True, return_counts=True)
+    share = (grid.cell_volume / grid.h) / count[cell][:, None]
+    return Pieces(np.arange(n), number, np.ones(n), x.copy(), np.stack([share, share], axis=2))
