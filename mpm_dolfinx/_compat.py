@@ -112,7 +112,7 @@ class CompiledForm:
             count = self._ufcx.num_coefficients
         else:
             self._compiled = fem.compile_form(self.mesh.comm, form)
-            position = self._compiled.ufcx_form.original_coefficient_position
+            position = self._compiled.ufcx_form.original_coefficient_positions
             count = self._compiled.ufcx_form.num_coefficients
             self._all = coefficients
         self.coefficients = [coefficients[position[i]] for i in range(count)]

@@ -166,12 +166,13 @@ class Coupler:
     def _balance_momentum(self, dt: float, errors: tuple[float, float], report: Report) -> None:
         """Newton's method on the momentum at fixed pressure."""
         self._dp.set(0.0)
-        for _ in range(MOMENTUM_STEPS):
-            if errors[0] <= INNER * max(self.tolerance, errors[1]):
+        goal = INNER * max(self.tolerance, min(1.0, errors[1]))
+        for count in range(MOMENTUM_STEPS):
+            if count and errors[0] <= goal:
                 return
             self._solve_u.solve(self.momentum.residual, self._du)
             before, errors = errors[0], self._line_search(dt, errors, report)
-            if errors[0] > KEEP * before:
+            if errors[0] > max(goal, KEEP * before):
                 self._linearise(dt)
 
     def _check(self, report: Report, count: int) -> None:
