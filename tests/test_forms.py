@@ -42,7 +42,7 @@ class Scene:
         A = matrix(unknowns, unknowns, unknowns.size)
         PointForm(form, self.points).assemble_matrix(A)
         A.assemble()
-        return A.convert("dense").getDenseArray()
+        return A[:, :]
 
 
 @pytest.fixture(params=[2, 3], ids=["2D", "3D"])
