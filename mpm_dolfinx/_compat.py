@@ -10,12 +10,11 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 
-from mpi4py import MPI
 from petsc4py import PETSc
 
 import numpy as np
 import ufl
-from dolfinx import cpp, fem, mesh
+from dolfinx import cpp, fem, la, mesh
 from numpy.typing import NDArray
 
 OLD = not hasattr(fem, "functionspace")
@@ -63,11 +62,6 @@ def petsc_vec(u: fem.Function) -> PETSc.Vec:
     return u.vector if OLD else u.x.petsc_vec
 
 
-def create_vector(A: PETSc.Mat) -> PETSc.Vec:
-    """Return a vector for the rows of a matrix (`create_vector` takes a form or a space by release)."""
-    return A.createVecLeft()
-
-
 def num_cells(msh: mesh.Mesh) -> tuple[int, int]:
     """Return the numbers of owned cells and of all cells on this process."""
     index_map = msh.topology.index_map(msh.topology.dim)
@@ -76,14 +70,7 @@ def num_cells(msh: mesh.Mesh) -> tuple[int, int]:
 
 def scatter_reverse_add(u: fem.Function) -> None:
     """Add the values at ghosts to those of their owners."""
-    if OLD:
-        from dolfinx import la
-
-        u.x.scatter_reverse(la.ScatterMode.add)
-    else:
-        from dolfinx import la
-
-        u.x.scatter_reverse(la.InsertMode.add)
+    u.x.scatter_reverse(la.ScatterMode.add if OLD else la.InsertMode.add)
 
 
 class CompiledForm:
@@ -123,7 +110,7 @@ class CompiledForm:
         """Set the cells (repeats allowed) or the interior facets over which the form is integrated."""
         entities = np.ascontiguousarray(entities, dtype=np.int32)
         cells = self.integral_type == "cell"
-        kind = cpp.fem.IntegralType.cell if cells else cpp.fem.IntegralType.interior_facet
+        kind = fem.IntegralType.cell if cells else fem.IntegralType.interior_facet
         dim = self.mesh.topology.dim - (0 if cells else 1)
         if OLD:
             values = np.full(len(entities), SUBDOMAIN, dtype=np.int32)
@@ -169,7 +156,7 @@ class CompiledForm:
         if rows is None:
             return self.packed()
         # 0.11 counts the integrals where earlier releases name the subdomain
-        return {(cpp.fem.IntegralType.cell, key): rows for key in self._keys()}
+        return {(fem.IntegralType.cell, key): rows for key in self._keys()}
 
     def _keys(self) -> list[int]:
         if not hasattr(self, "_key"):
@@ -184,18 +171,11 @@ def _mesh_of(form: ufl.Form):
 
 def _facet_cells(msh, facets, dim: int) -> NDArray[np.int32]:
     """Return the flat list (cell0, local facet0, cell1, local facet1, ...) of interior facets."""
-    kind = cpp.fem.IntegralType.interior_facet
-    compute = cpp.fem.compute_integration_domains
-    topology = msh.topology._cpp_object
-    try:
-        return compute(kind, topology, facets, dim)
-    except TypeError:  # 0.11
-        return compute(kind, topology, facets)
-
-
-def comm_sum(comm: MPI.Intracomm, value):
-    """Return the sum of a number or an array over the processes."""
-    return comm.allreduce(value, op=MPI.SUM)
+    adjacency = msh.topology.connectivity(dim, dim + 1)
+    cells = adjacency.array[adjacency.offsets[facets][:, None] + np.arange(2)]
+    cell_facets = msh.topology.connectivity(dim + 1, dim).array.reshape(-1, 2 * (dim + 1))  # of boxes
+    local = np.argmax(cell_facets[cells] == facets[:, None, None], axis=2)
+    return np.stack([cells, local], axis=2).reshape(-1).astype(np.int32)
 
 
 def compiled(form: ufl.Form):

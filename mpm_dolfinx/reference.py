@@ -242,7 +242,7 @@ class BiotFEM:
         squares = (self._b.x.array / scale) ** 2
         squares[_compat.petsc_vec(self._b).getLocalSize() :] = 0.0  # ghosts
         storage = squares[self._p_dofs].sum()
-        return tuple(np.sqrt(_compat.comm_sum(self.grid.comm, np.array([squares.sum() - storage, storage]))))
+        return tuple(np.sqrt(self.grid.comm.allreduce(np.array([squares.sum() - storage, storage]))))
 
     def run(self, t_end: float, dt: float, *, probes: ArrayLike, progress: bool = False) -> Result:
         """Advance to t_end (s) in equal steps dt (s); `GaveUp` has the histories up to the last good step.
@@ -281,7 +281,7 @@ class BiotFEM:
         here = np.flatnonzero((cells >= 0) & (cells < grid.num_owned))
         if len(here):
             out[here] = self._u.eval(np.pad(x[here], ((0, 0), (0, 3 - grid.dim))), cells[here]).reshape(-1, grid.dim)
-        return _compat.comm_sum(grid.comm, out)
+        return grid.comm.allreduce(out)
 
     def _record(self, result: Result, x: NDArray[np.float64]) -> None:
         result.t.append(self.t)

@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: MIT
+"""The paper's beam against body-fitted Taylor-Hood finite elements with the same time step."""
+
+import numpy as np
+import poroelastic_beam as demo
+import pytest
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.reference import BiotFEM
+
+
+def run(arguments="", cells=demo.REFERENCE_CELLS, probe=((1.0, 0.15),)):
+    """Return (material points' result, finite elements' result) of the demo's scene."""
+    o = demo.arguments(arguments.split())
+    simulation, bottom = demo.scene(o)
+    result = simulation.run(o.t_end, o.dt, probes=mpm.probes(simulation.bodies, np.add(probe, [0, bottom])))
+    fem = BiotFEM([0, 0], [demo.LENGTH, demo.HEIGHT], cells, demo.material(o), **demo.physics(o))
+    return result, fem.run(o.t_end, o.dt, probes=probe)
+
+
+@pytest.fixture(scope="module")
+def beam():
+    return run()
+
+
+def error(result, fem):
+    u, exact = (np.array(r.displacement)[1:, 0, 1] for r in (result, fem))
+    return np.abs(u / exact - 1)
+
+
+def test_the_tip_follows_the_finite_elements(beam):
+    late = np.array(beam[0].t[1:]) > 0.0599
+    assert error(*beam)[late].max() < 0.0025
+    assert error(*beam)[~late].max() < 0.006
+    assert error(*beam)[np.array(beam[0].t[1:]) > 0.0999].max() < 0.001
+
+
+def test_the_pressure_extremes_follow_the_finite_elements(beam):
+    p, exact = (np.array(r.pressure)[1:] for r in beam)
+    largest = np.maximum.accumulate(np.abs(exact).max(axis=1))
+    assert (np.abs(p - exact).max(axis=1) < 0.05 * largest).all()
+    for k in (9, 59):  # 0.2 s and 1.2 s
+        assert np.abs(p[k] - exact[k]).max() < 0.05 * np.abs(exact[k]).max()
+
+
+def test_fluid_balance_and_residuals_close_in_every_step(beam):
+    assert beam[0].balance <= 1e-8 and beam[0].residual <= 1e-8 and beam[0].cuts == 0
+
+
+@pytest.mark.parametrize("extra", ["", "--bulk 8.3333e6 --shear 3.84615e6"], ids=["nu 0", "nu 0.3"])
+def test_the_drained_tip_is_that_of_the_finite_elements(extra):
+    result, fem = run(f"--drained --ramp 1 --t-end 1 --dt 0.1 {extra}")
+    assert error(result, fem)[-1] < 1e-3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("load", ["54e3", "162e3"])
+def test_the_drained_tip_holds_for_hundreds_of_steps(load, monkeypatch):
+    monkeypatch.setattr(demo, "BOX", np.array([1.5, 2.4]))
+    o = demo.arguments(f"--drained --ramp 1 --t-end 1 --dt 0.05 --load {load}".split())
+    simulation, bottom = demo.scene(o)
+    probe = mpm.probes(simulation.bodies, [[1.0, bottom + 0.15]])
+    tips = np.array(simulation.run(16.0, o.dt, probes=probe).displacement)[20:, 0, 1]
+    fem = BiotFEM([0, 0], [1, 0.3], demo.REFERENCE_CELLS, demo.material(o), **demo.physics(o))
+    exact = fem.run(1.0, o.dt, probes=[[1.0, 0.15]]).displacement[-1][0, 1]
+    assert np.abs(tips / exact - 1).max() < 1e-3

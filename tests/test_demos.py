@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: MIT
+"""Every demo runs at quick settings, writes its pictures and prints its results as JSON."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+QUICK = {
+    "poroelastic_beam": ("--h 0.03 --t-end 0.2 --reference", ["pressure.png", "deflection.png", "tip.csv"]),
+    "quadrature": ("--h 0.05 --steps 5 10", ["quadrature.png", "tip.csv"]),
+    "benchmark_beam": ("--h 0.05 --t-end 0.1 --repeat 1", []),
+}
+
+
+def run(demo, arguments):
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, ROOT / "demos" / f"{demo}.py", *arguments.split()]
+    return subprocess.run(command, capture_output=True, text=True, env=environment, timeout=300)
+
+
+def test_every_demo_is_run():
+    assert {p.stem for p in (ROOT / "demos").glob("*.py")} == set(QUICK)
+
+
+@pytest.mark.parametrize("demo", QUICK)
+def test_the_demo_runs(demo, tmp_path):
+    arguments, files = QUICK[demo]
+    done = run(demo, f"{arguments} --json" + (f" --out {tmp_path}" if files else ""))
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert json.loads(done.stdout.splitlines()[-1])["converged"]
+    for file in files:
+        assert (tmp_path / file).stat().st_size > 100
+
+
+def test_the_beam_prints_all_that_it_promises(tmp_path):
+    done = run("poroelastic_beam", f"--h 0.05 --t-end 0.06 --json --out {tmp_path}")
+    out = json.loads(done.stdout.splitlines()[-1])
+    assert len(out["tip"]) == 3 and len(out["tip"][0]) == 3 and len(out["p_range"][0]) == 3
+    assert out["steps"] == 3 and out["points"] == 40 * 12 and out["active_cells"] > 100
+    assert out["fluid_balance"] <= 1e-8 and out["wall_s"] > 0 and out["jit_s"] > 0
+    assert out["newton_iterations"] > 2 and out["coupling_iterations"] > 2
+
+
+def test_the_beam_says_how_the_papers_beta_fails_and_keeps_its_results(tmp_path):
+    done = run("poroelastic_beam", f"--h 0.05 --t-end 0.06 --json --coupling fixed-stress-paper --out {tmp_path}")
+    assert done.returncode == 1
+    assert "the fixed-stress-paper iteration diverges (beta is below alpha^2 / (2 K_dr))" in done.stderr
+    assert json.loads(done.stdout.splitlines()[-1])["converged"] is False
+
+
+@pytest.mark.parametrize("option", ["--h 0", "--dt -1", "--load 0"])
+def test_the_beam_refuses_bad_options_in_one_line(option):
+    done = run("poroelastic_beam", option)
+    assert done.returncode == 2 and done.stderr.splitlines()[-1].endswith("must be > 0")

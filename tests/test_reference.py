@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: MIT
+"""The finite element reference: beam theory, consolidation, and its two elements against each other."""
+
+import numpy as np
+import pytest
+
+import mpm_dolfinx as mpm
+from helpers import SOFT, top_load
+from mpm_dolfinx.reference import BiotFEM, euler_bernoulli
+
+SIZE, TIP = ([0, 0], [1, 0.3]), [[1.0, 0.15]]
+
+
+def test_a_lightly_loaded_beam_follows_beam_theory():
+    load = mpm.Traction("top", (0, -10.0))
+    fem = BiotFEM(*SIZE, (24, 8), SOFT, fixed={"left": "xy"}, tractions=[load])
+    tip = fem.run(1.0, 1.0, probes=TIP).displacement[-1][0, 1]
+    bending = euler_bernoulli(np.array([1.0]), 10.0, 1.0, 1e7, 0.3**3 / 12)[0]
+    shear = 10.0 / (2 * 5 / 6 * 5e6 * 0.3)
+    assert -tip == pytest.approx(bending + shear, rel=5e-3)
+
+
+def test_both_elements_converge_to_one_answer():
+    tips = {}
+    for element, cells in {"taylor-hood": (20, 6), "q1-dg0": (67, 20)}.items():
+        drained = [mpm.Drained("left"), mpm.Drained("right")]
+        options = dict(fixed={"left": "xy"}, fluid=mpm.Fluid(), tractions=[top_load()], drained=drained)
+        fem = BiotFEM(*SIZE, cells, SOFT, element=element, **options)
+        result = fem.run(0.2, 0.02, probes=TIP)
+        assert result.converged and result.residual <= 1e-8
+        tips[element] = result.displacement[-1][0, 1]
+    assert tips["q1-dg0"] == pytest.approx(tips["taylor-hood"], rel=5e-3)
+
+
+@pytest.mark.parametrize("element", ["taylor-hood", "q1-dg0"])
+def test_one_dimensional_consolidation_follows_terzaghi(element):
+    options = dict(fixed={"left": "x", "right": "x", "bottom": "y"}, fluid=mpm.Fluid(bulk=np.inf))
+    load, drained = mpm.Traction("top", (0, -100.0)), [mpm.Drained("top")]
+    fem = BiotFEM([0, 0], [0.1, 1], (1, 40), SOFT, element=element, tractions=[load], drained=drained, **options)
+    t = 0.5 / (SOFT.conductivity / 9810 * SOFT.oedometric)
+    result = fem.run(t, t / 100, probes=[[0.05, 1.0]])
+    settlement = -result.displacement[-1][0, 1] / (100 / SOFT.oedometric)
+    assert settlement == pytest.approx(0.7639503, rel=4e-3)  # degree of consolidation at T_v = 0.5
+    assert result.pressure[-1][1] == pytest.approx(37.07774, rel=1e-2)
