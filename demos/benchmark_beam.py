@@ -27,7 +27,7 @@ def run(name: str, o: argparse.Namespace):
     if name.startswith("mpm"):
         o.coupling = name.removeprefix("mpm ")
         simulation, bottom = beam.scene(o)
-        probes = mpm.probes(simulation.bodies, probe + [0, bottom])
+        probes = mpm.probes(simulation.bodies, np.add(probe, [0, bottom]))
         return simulation.run(o.t_end, o.dt, probes=probes), simulation.jit
     cells = [round(beam.LENGTH / o.h), round(beam.HEIGHT / o.h)]
     fem = BiotFEM([0, 0], [beam.LENGTH, beam.HEIGHT], cells, beam.material(o), element=name, **beam.physics(o))

@@ -81,9 +81,7 @@ def scene(o: argparse.Namespace) -> tuple[mpm.Simulation, float]:
     grid = mpm.Grid(BOX, np.rint(BOX / o.h).astype(int))
     bottom = (round(0.5 * BOX[1] / o.h) + o.offset) * grid.h[1]
     beam = mpm.box(grid, [0, bottom], [LENGTH, bottom + HEIGHT], per_cell=o.points_per_cell)
-    simulation = mpm.Simulation(
-        grid, [beam], [material(o)], quadrature=o.quadrature, coupling=o.coupling, **physics(o)
-    )
+    simulation = mpm.Simulation(grid, [beam], [material(o)], quadrature=o.quadrature, coupling=o.coupling, **physics(o))
     return simulation, bottom
 
 

@@ -29,7 +29,7 @@ def tip(h: float, steps: int, quadrature: str) -> tuple[float, float]:
     o = options(h, steps, quadrature)
     simulation, bottom = beam.scene(o)
     try:
-        result = simulation.run(1.0, o.dt, probes=mpm.probes(simulation.bodies, PROBE + [0, bottom]))
+        result = simulation.run(1.0, o.dt, probes=mpm.probes(simulation.bodies, np.add(PROBE, [0, bottom])))
     except mpm.GaveUp as error:
         print(f"{quadrature}, {steps} steps: {error}", file=sys.stderr)
         return np.nan, error.result.wall

@@ -12,11 +12,15 @@ from collections.abc import Sequence
 
 from petsc4py import PETSc
 
+import dolfinx
 import numpy as np
 import ufl
 from dolfinx import cpp, fem, la, mesh
 from numpy.typing import NDArray
 
+SUPPORTED = ((0, 5), (0, 9), (0, 10), (0, 11))
+if tuple(map(int, dolfinx.__version__.split(".")[:2])) not in SUPPORTED:
+    raise ImportError(f"dolfinx {dolfinx.__version__} is not supported; mpm_dolfinx needs 0.5.2, 0.9, 0.10 or 0.11")
 OLD = not hasattr(fem, "functionspace")
 SUBDOMAIN = 1  # the one subdomain id of our measures
 
@@ -148,9 +152,7 @@ class CompiledForm:
 
     def assemble_matrix(self, A: PETSc.Mat, rows: NDArray[np.float64] | None = None) -> None:
         """Add the matrix to `A` (not finalised), dofs unrolled, with own coefficient rows if given."""
-        cpp.fem.petsc.assemble_matrix(
-            A, self.form, self.constants, self._coefficients(rows), [], unrolled=True
-        )
+        cpp.fem.petsc.assemble_matrix(A, self.form, self.constants, self._coefficients(rows), [], unrolled=True)
 
     def _coefficients(self, rows) -> dict:
         if rows is None:

@@ -122,11 +122,7 @@ class Momentum:
         nodes[self.grid.cell_nodes[cells]] = True
         nodes = self._shared(nodes)
         dofs = np.flatnonzero((self.free & nodes[:, None]).ravel())
-        same = (
-            hasattr(self, "unknowns")
-            and np.array_equal(dofs, self._dofs)
-            and np.array_equal(facets, self._facets)
-        )
+        same = hasattr(self, "unknowns") and np.array_equal(dofs, self._dofs) and np.array_equal(facets, self._facets)
         if self.grid.comm.allreduce(not same):
             self._dofs, self._facets = dofs, facets
             self.unknowns = Unknowns(self.u, dofs)

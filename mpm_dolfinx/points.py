@@ -157,8 +157,7 @@ def _inside(grid: Grid, body: Body) -> Body:
     out = np.flatnonzero(grid.outside(body.lower) | grid.outside(body.lower + body.spacing))
     if len(out):
         raise ValueError(
-            f"body: {len(out)} points outside the grid {grid.lower} to {grid.upper}, the first at "
-            f"{body.centre[out[0]]}"
+            f"body: {len(out)} points outside the grid {grid.lower} to {grid.upper}, the first at {body.centre[out[0]]}"
         )
     return body
 

@@ -24,9 +24,7 @@ def beam(*, fluid=True, ramp=0.06, load=54e3, offset=0.5, h=0.03, material=SOFT,
 
 def top_load(load=54e3, ramp=0.06):
     """Return the beam's load."""
-    return mpm.Traction(
-        "top", lambda t: (0, -load * min(1, t / ramp)), region=((0.05, -np.inf), (1.0, np.inf))
-    )
+    return mpm.Traction("top", lambda t: (0, -load * min(1, t / ramp)), region=((0.05, -np.inf), (1.0, np.inf)))
 
 
 def column(*, cells=10, offset=0.0, width=1, fluid=True, height=1.0, bottom=0.0, **options):

@@ -51,7 +51,8 @@ def dim(request):
 
 
 @pytest.mark.parametrize(
-    "f", [lambda x: 0 * x[0] + 3, lambda x: 1 + 2 * x[0] - x[1], lambda x: np.prod(1 + x, axis=0)],
+    "f",
+    [lambda x: 0 * x[0] + 3, lambda x: 1 + 2 * x[0] - x[1], lambda x: np.prod(1 + x, axis=0)],
     ids=["constant", "linear", "multilinear"],
 )
 def test_a_field_of_the_grid_is_summed_at_the_points_exactly(dim, f):

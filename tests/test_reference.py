@@ -3,9 +3,9 @@
 
 import numpy as np
 import pytest
+from helpers import SOFT, top_load
 
 import mpm_dolfinx as mpm
-from helpers import SOFT, top_load
 from mpm_dolfinx.reference import BiotFEM, euler_bernoulli
 
 SIZE, TIP = ([0, 0], [1, 0.3]), [[1.0, 0.15]]
