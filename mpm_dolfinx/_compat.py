@@ -107,7 +107,6 @@ class CompiledForm:
             count = self._compiled.ufcx_form.num_coefficients
             self._all = coefficients
         self.coefficients = [coefficients[position[i]] for i in range(count)]
-        self.constants = np.empty(0)
         self.form = None
 
     def bind(self, entities: NDArray[np.int32]) -> None:
@@ -140,7 +139,6 @@ class CompiledForm:
                 {c: c for c in self._constants},
             )
             self._bound, self.form = bound, bound._cpp_object
-        self.constants = cpp.fem.pack_constants(self.form)
 
     def packed(self) -> dict:
         """Return dolfinx's own packed coefficients, one row an entity."""
@@ -148,11 +146,12 @@ class CompiledForm:
 
     def assemble_vector(self, b: NDArray[np.float64], rows: NDArray[np.float64] | None = None) -> None:
         """Add the vector to `b` (ghosts not accumulated), with own coefficient rows if given."""
-        cpp.fem.assemble_vector(b, self.form, self.constants, self._coefficients(rows))
+        cpp.fem.assemble_vector(b, self.form, cpp.fem.pack_constants(self.form), self._coefficients(rows))
 
     def assemble_matrix(self, A: PETSc.Mat, rows: NDArray[np.float64] | None = None) -> None:
         """Add the matrix to `A` (not finalised), dofs unrolled, with own coefficient rows if given."""
-        cpp.fem.petsc.assemble_matrix(A, self.form, self.constants, self._coefficients(rows), [], unrolled=True)
+        constants = cpp.fem.pack_constants(self.form)
+        cpp.fem.petsc.assemble_matrix(A, self.form, constants, self._coefficients(rows), [], unrolled=True)
 
     def _coefficients(self, rows) -> dict:
         if rows is None:

@@ -127,11 +127,11 @@ class PointForm:
 
     def __init__(self, form: ufl.Form, points: FormPoints):
         self.points = points
-        self._compiled = _compat.CompiledForm(form)
+        self.compiled = _compat.CompiledForm(form)
         self._version = -1
         names = {f: name for name, f in points._functions.items()}
         self._columns, self._gathered, start = [], [], 0
-        for f in self._compiled.coefficients:
+        for f in self.compiled.coefficients:
             dofs, bs = _compat.cell_dofs(f.function_space), f.function_space.dofmap.bs
             stop = start + dofs.shape[1] * bs
             if f in names:
@@ -142,11 +142,12 @@ class PointForm:
             start = stop
         self._width = start
 
-    def _rows(self) -> NDArray[np.float64]:
+    def rows(self) -> NDArray[np.float64]:
+        """Return the coefficients of the form, one row a point."""
         cells = self.points.cells
         if self._version != self.points.version:
             self._version = self.points.version
-            self._compiled.bind(cells)
+            self.compiled.bind(cells)
             self._packed = np.empty((len(cells), self._width))
             for columns, name in self._columns:
                 self._packed[:, columns] = self.points.data[name]
@@ -157,12 +158,52 @@ class PointForm:
 
     def assemble_vector(self, b: NDArray[np.float64]) -> None:
         """Add the vector to the local array `b`; contributions to ghosts stay there."""
-        rows = self._rows()
+        rows = self.rows()
         if len(rows):
-            self._compiled.assemble_vector(b, rows)
+            self.compiled.assemble_vector(b, rows)
 
     def assemble_matrix(self, A: PETSc.Mat) -> None:
         """Add the matrix to `A`, by unrolled local dofs; the caller finalises it."""
-        rows = self._rows()
+        rows = self.rows()
         if len(rows):
-            self._compiled.assemble_matrix(A, rows)
+            self.compiled.assemble_matrix(A, rows)
+
+
+class PointExpression:
+    """A UFL expression of the fields that points carry, evaluated at every point.
+
+    Tested with DG0 the assembler sums the points of a cell, so it is called once for the first
+    points of all cells, once for the second ones, and so on.
+
+    Parameters
+    ----------
+    expression
+        UFL expression of any shape in the fields of `points`.
+    points
+        The points.
+    """
+
+    def __init__(self, expression: ufl.core.expr.Expr, points: FormPoints):
+        self.points, self._shape = points, expression.ufl_shape
+        space = _compat.function_space(points.grid.mesh, "DG", 0, self._shape)
+        self._sum = fem.Function(space)
+        q = ufl.TestFunction(space)
+        self._form = PointForm(ufl.inner(expression, q) * points.dx, points)
+
+    def evaluate(self) -> NDArray[np.float64]:
+        """Return the values (n, *shape) at the points where they are now."""
+        rows, cells, form = self._form.rows(), self.points.cells, self._form.compiled
+        values = np.empty((len(cells), int(np.prod(self._shape, dtype=int))))
+        order = np.argsort(cells, kind="stable")
+        first = np.searchsorted(cells[order], cells[order])
+        turn = np.empty(len(cells), dtype=np.int64)
+        turn[order] = np.arange(len(cells)) - first
+        total = self._sum.x.array.reshape(-1, values.shape[1])
+        for k in range(turn.max(initial=-1) + 1):
+            chosen = np.flatnonzero(turn == k)
+            total[:] = 0.0
+            form.bind(cells[chosen])
+            form.assemble_vector(self._sum.x.array, np.ascontiguousarray(rows[chosen]))
+            values[chosen] = total[cells[chosen]]
+        volume = self.points.data["weight"] * self.points.grid.cell_volume
+        return (values / volume).reshape(len(cells), *self._shape)

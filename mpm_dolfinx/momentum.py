@@ -46,7 +46,7 @@ class Momentum:
     pressure
         DG0 pore pressure, None without fluid.
     gravity : (d,), m/s^2
-        Acceleration; the pieces then carry `density`, kg/m^3.
+        Acceleration, a UFL constant; the pieces then carry `density`, kg/m^3.
     """
 
     def __init__(
@@ -56,7 +56,7 @@ class Momentum:
         law,
         fixed: NDArray[np.bool_],
         pressure: fem.Function | None = None,
-        gravity: NDArray[np.float64] | None = None,
+        gravity: fem.Constant | None = None,
     ):
         self.grid, self.pieces = grid, pieces
         V = _compat.function_space(grid.mesh, "Lagrange", 1, (grid.dim,))
@@ -80,8 +80,7 @@ class Momentum:
         self._traction = PointForm(ufl.inner(self.loads.force, self.loads.value(v)) * self.loads.dx, self.loads)
         self._weight = None
         if gravity is not None:
-            g = fem.Constant(grid.mesh, np.asarray(gravity, dtype=float))
-            self._weight = PointForm(pieces.density * ufl.inner(g, pieces.value(v)) * pieces.dx, pieces)
+            self._weight = PointForm(pieces.density * ufl.inner(gravity, pieces.value(v)) * pieces.dx, pieces)
         self._ghost(V, v, du)
 
     def _ghost(self, V, v, du) -> None:

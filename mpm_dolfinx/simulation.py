@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
+import ufl
 from dolfinx import fem
 from dolfinx.common import Timer
 from numpy.typing import ArrayLike, NDArray
@@ -16,7 +17,7 @@ from mpm_dolfinx.conditions import Drained, Inflow, Traction
 from mpm_dolfinx.coupling import COUPLINGS, Coupler, Report
 from mpm_dolfinx.domains import corner_bits
 from mpm_dolfinx.exchange import Exchange
-from mpm_dolfinx.forms import FormPoints
+from mpm_dolfinx.forms import FormPoints, PointExpression
 from mpm_dolfinx.grid import Grid, sum_by
 from mpm_dolfinx.materials import Fluid, Skeleton
 from mpm_dolfinx.momentum import FULL, Momentum
@@ -44,7 +45,7 @@ class Simulation:
         Pore fluid; without it there is no storage problem.
     tractions, drained, inflows
         Boundary conditions on sides of the bodies; other sides are free and sealed.
-    gravity : (d,), m/s^2
+    gravity : (d,) or callable t -> (d,), m/s^2
         Acceleration of gravity.
     pressure
         Pore pressure at the start, Pa.
@@ -65,7 +66,7 @@ class Simulation:
         tractions: Sequence[Traction] = (),
         drained: Sequence[Drained] = (),
         inflows: Sequence[Inflow] = (),
-        gravity: ArrayLike | None = None,
+        gravity: ArrayLike | Callable[[float], ArrayLike] | None = None,
         pressure: float = 0.0,
         quadrature: str = "domain",
         coupling: str = "schur-cg",
@@ -81,7 +82,9 @@ class Simulation:
         if fluid is None and (drained or inflows):
             raise ValueError("drained and inflow sides need a fluid")
         self.grid, self.materials, self.fluid, self.bodies = grid, materials, fluid, bodies
-        self.quadrature, self.gravity = quadrature, None if gravity is None else np.asarray(gravity, dtype=float)
+        self.quadrature = quadrature
+        self._gravity_at = gravity if callable(gravity) or gravity is None else lambda t: gravity
+        self.gravity = None if gravity is None else fem.Constant(grid.mesh, np.zeros(grid.dim))
         self.t, self.active_cells = 0.0, 0
         self.points = material_points(grid, bodies, pressure)
         self._loads = [(load, self._faces(bodies, load)) for load in tractions]
@@ -94,6 +97,7 @@ class Simulation:
         """Seconds spent on compiling or finding the forms."""
         self._carried = carry(self.points) if fluid else None
         self._prepared = False
+        self._stress: PointExpression | None = None
 
     # ---- building -------------------------------------------------------------------------------
 
@@ -146,17 +150,25 @@ class Simulation:
         """
         if not dt > 0:
             raise ValueError(f"dt = {dt!r}, must be > 0")
-        if not self._prepared:
-            self._reset_grid()
-        self._place_loads(self.t + dt)
-        self.momentum.start()
-        if self.storage:
-            self.storage.start()
+        self._begin(self.t + dt)
         report = self.coupler.solve(dt)
         self._move_points()
         self.t += dt
         self._prepared = False
         return report
+
+    def _begin(self, t: float) -> None:
+        """Set up the step that ends at time t: grid, loads of that time, u = 0 and the cells' pressure."""
+        if self.gravity is not None:
+            self.gravity.value = np.asarray(self._gravity_at(t), dtype=float)
+        if not self._prepared:
+            self._reset_grid()
+        elif self.gravity is not None and self.storage:
+            self._open_boundary()  # a step is tried again, with the gravity of another time
+        self._place_loads(t)
+        self.momentum.start()
+        if self.storage:
+            self.storage.start()
 
     def _reset_grid(self) -> None:
         """Rebuild the integration data on the fresh grid: pieces, active cells, remapped pressure."""
@@ -292,7 +304,7 @@ class Simulation:
             conductance = s.mobility.x.array[cell] * size / np.maximum(distance, 1e-3 * grid.h.min())
             outer = np.full(len(cell), outlet.pressure)
             if self.gravity is not None:
-                outer -= self.fluid.density * (x - centre) @ self.gravity
+                outer -= self.fluid.density * (x - centre) @ self.gravity.value
             conductances.append(conductance)
             inflows.append(conductance * outer)
         empty = np.empty(0)
@@ -342,6 +354,18 @@ class Simulation:
             travel = Exchange(grid.comm, owner[np.searchsorted(self.points.id, self._carried.id)])
             self._carried = self._carried.migrated(travel)
         self.points = self.points.migrated(Exchange(grid.comm, owner))
+
+    def effective_stress(self) -> NDArray[np.float64]:
+        """Return the effective Cauchy stress (n, d, d), Pa, tension positive, at the material points."""
+        grid, d = self.grid, self.grid.dim
+        if self._stress is None:
+            state = FormPoints(grid, F=(d, d), **{name: () for name in self._law.parameters})
+            F = ufl.variable(state.F)
+            energy = self._law.energy(F, **{name: getattr(state, name) for name in self._law.parameters})
+            self._stress = PointExpression(ufl.diff(energy, F) * F.T / ufl.det(F), state)
+        x, fields = self.points.x, {name: self._fields(self.points.J)[name] for name in ("F", *self._law.parameters)}
+        self._stress.points.place(grid.local(grid.number(grid.index(x))), x, self.points.volume0, **fields)
+        return self._stress.evaluate()
 
     # ---- many steps -----------------------------------------------------------------------------
 

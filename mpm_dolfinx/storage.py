@@ -40,7 +40,7 @@ class Storage:
     pressure
         DG0 pore pressure, Pa, positive in compression.
     weight : (d,), N/m^3
-        Weight of the pore fluid rho_w g, None without gravity.
+        Weight of the pore fluid rho_w g as UFL, None without gravity.
     symmetric
         Leave S (p - p_n) dJ_Delta out of the Jacobian, which then is symmetric; it is of the order of
         (p - p_n) / K_w, so Newton's method converges as fast.
@@ -52,7 +52,7 @@ class Storage:
         pieces: FormPoints,
         displacement: fem.Function,
         pressure: fem.Function,
-        weight: NDArray[np.float64] | None = None,
+        weight: ufl.core.expr.Expr | None = None,
         symmetric: bool = True,
     ):
         self.grid, self.p = grid, pressure
@@ -104,9 +104,8 @@ class Storage:
         self._flux = _compat.CompiledForm(T * ufl.jump(dp) * ufl.jump(q) * dS)
         self._gravity = None
         if weight is not None:
-            w = fem.Constant(mesh, np.asarray(weight, dtype=float))
             apart = across * n0 + self.centroid("-") - self.centroid("+")
-            self._gravity = _compat.CompiledForm(T * ufl.dot(w, apart) * ufl.jump(q) * dS)
+            self._gravity = _compat.CompiledForm(T * ufl.dot(weight, apart) * ufl.jump(q) * dS)
 
     def set_active(self, cells: NDArray[np.int32], facets: NDArray[np.int32]) -> None:
         """Number the unknowns of the active cells; `facets` are the faces between two of them."""

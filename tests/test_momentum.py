@@ -33,8 +33,7 @@ def test_weight_gives_the_stress_of_the_column_above():
 
 def test_a_rotation_of_the_nodes_gives_no_force():
     s, _ = beam(fluid=False)
-    s._reset_grid()
-    s._place_loads(0.0)
+    s._begin(0.0)
     x = s.grid.node_x - [0.5, 0.7]
     angle = 0.7
     R = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
@@ -45,8 +44,7 @@ def test_a_rotation_of_the_nodes_gives_no_force():
 
 def test_the_load_is_the_traction_times_the_area_also_where_a_domain_is_partly_loaded():
     s, _ = beam(fluid=False, ramp=1.0)
-    s._reset_grid()
-    s._place_loads(1.0)
+    s._begin(1.0)
     assert s.momentum._external.reshape(-1, 2).sum(axis=0) == pytest.approx([0, -54e3 * 0.95], rel=1e-12)
 
 
@@ -94,3 +92,14 @@ def test_three_dimensions_equal_plane_strain():
         probe = mpm.probes([body], [[1, *[h / 2] * (dim - 2), 0.6]])
         tips.append(s.run(1.0, 0.5, probes=probe).displacement[-1][0, [0, -1]])
     assert tips[1] == pytest.approx(tips[0], rel=1e-6)
+
+
+def test_the_stress_of_the_points_is_that_of_the_law():
+    s = column(fluid=False, material=SOFT, tractions=[mpm.Traction("top", lambda t: (0, -2e6 * t))])
+    s.run(1.0, 0.25)
+    J = s.points.J
+    stress = s.effective_stress()
+    lam = SOFT.bulk - 2 * SOFT.shear / 3
+    assert stress[:, 1, 1] == pytest.approx((lam + 2 * SOFT.shear) * np.log(J) / J, rel=1e-6)
+    assert stress[:, 0, 0] == pytest.approx(lam * np.log(J) / J, abs=1e-6 * abs(stress).max())
+    assert np.abs(stress[:, 0, 1]).max() < 1e-9 * np.abs(stress).max()

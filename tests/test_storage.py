@@ -11,10 +11,7 @@ from mpm_dolfinx.materials import STANDARD_GRAVITY
 
 def hold(s):
     """Prepare the integration data with the body at rest."""
-    s._reset_grid()
-    s._place_loads(0.0)
-    s.momentum.start()
-    s.storage.start()
+    s._begin(0.0)
     return s
 
 
