@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Implicit, iteratively coupled material point / finite volume poromechanics on FEniCSx."""
 
-from mpm_dolfinx.conditions import Drained, Inflow, Traction
+from mpm_dolfinx.conditions import Drained, Inflow, RigidPlate, Traction
 from mpm_dolfinx.coupling import COUPLINGS, NotConverged
 from mpm_dolfinx.grid import Grid
 from mpm_dolfinx.materials import LAWS, Fluid, Hencky, LinearElastic, NeoHookean
@@ -22,6 +22,7 @@ __all__ = [
     "NeoHookean",
     "NotConverged",
     "Result",
+    "RigidPlate",
     "Simulation",
     "Traction",
     "box",

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Conditions on the sides of the bodies: dead tractions, drained sides, prescribed inflow."""
+"""Conditions on the sides of the bodies: dead tractions, rigid plates, drained sides, prescribed inflow."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mpm_dolfinx.grid import side
 from mpm_dolfinx.points import Region
 
 
@@ -71,3 +72,37 @@ class Inflow:
     side: str
     flux: float
     region: Region | None = None
+
+
+RIGIDITY = 1e4
+"""Rigidity of a plate, in units of (oedometric modulus of the body) x (length of the side)."""
+
+
+@dataclass(frozen=True)
+class RigidPlate:
+    """Rigid, smooth plate on a flat side of the bodies: one displacement along the side's axis for all its faces.
+
+    The tangential gradient of the normal displacement is penalised, kappa/2 int |grad_t u_n|^2 dA on the
+    step's increment; a uniform displacement is free, so the plate carries the given total force exactly.
+
+    Parameters
+    ----------
+    side
+        Side of the bodies, normal to an axis.
+    force : float or callable t -> float, N (N/m in plane strain)
+        Total force that presses on the side; negative: pulls.
+    region : ((d,), (d,)), m
+        Box of reference positions to which the plate is limited.
+    """
+
+    side: str
+    force: float | Callable[[float], float]
+    region: Region | None = None
+
+    def traction(self, area: float, dim: int) -> Traction:
+        """Return the even traction of the plate on its reference area, m^(d-1)."""
+        axis, end = side(self.side, dim)
+        inward = np.zeros(dim)
+        inward[axis] = 1 - 2 * end
+        force = self.force if callable(self.force) else lambda t: self.force
+        return Traction(self.side, lambda t: inward * force(t) / area, self.region)

@@ -47,6 +47,8 @@ class Momentum:
         DG0 pore pressure, None without fluid.
     gravity : (d,), m/s^2
         Acceleration, a UFL constant; the pieces then carry `density`, kg/m^3.
+    plates
+        Whether the scene has rigid plates: points `plates` with their rigidity and normal.
     """
 
     def __init__(
@@ -57,6 +59,7 @@ class Momentum:
         fixed: NDArray[np.bool_],
         pressure: fem.Function | None = None,
         gravity: fem.Constant | None = None,
+        plates: bool = False,
     ):
         self.grid, self.pieces = grid, pieces
         V = _compat.function_space(grid.mesh, "Lagrange", 1, (grid.dim,))
@@ -81,7 +84,21 @@ class Momentum:
         self._weight = None
         if gravity is not None:
             self._weight = PointForm(pieces.density * ufl.inner(gravity, pieces.value(v)) * pieces.dx, pieces)
+        self._plate = None
+        if plates:
+            self.plates = FormPoints(grid, rigidity=(), normal=(grid.dim,))
+            self._plate = PointForm(self._bend(v, du), self.plates)
         self._ghost(V, v, du)
+
+    def _bend(self, v, du) -> ufl.Form:
+        """Return the penalty of plates that bend or turn: kappa grad_t(u_n) . grad_t(v_n)."""
+        n = self.plates.normal
+
+        def slope(w):
+            gradient = ufl.dot(n, self.plates.grad(w))
+            return gradient - ufl.dot(gradient, n) * n
+
+        return self.plates.rigidity * ufl.inner(slope(du), slope(v)) * self.plates.dx
 
     def _ghost(self, V, v, du) -> None:
         """Penalise jumps of the normal derivative on faces of partly filled cells (Burman 2010, Coombs 2023).
@@ -102,7 +119,7 @@ class Momentum:
         self._ghost_form = _compat.CompiledForm(form)
 
     def set_active(self, active: NDArray[np.bool_], cells: NDArray[np.int32], partly: NDArray[np.bool_]) -> bool:
-        """Number the unknowns of the active cells and make the ghost penalty's matrix.
+        """Number the unknowns of the active cells.
 
         Parameters
         ----------
@@ -126,16 +143,21 @@ class Momentum:
             self._dofs, self._facets = dofs, facets
             self.unknowns = Unknowns(self.u, dofs)
             self.K = matrix(self.unknowns, self.unknowns, 5**self.grid.dim * self.grid.dim)
-            self.ghost = matrix(self.unknowns, self.unknowns, 5**self.grid.dim * self.grid.dim)
+            self.penalty = matrix(self.unknowns, self.unknowns, 5**self.grid.dim * self.grid.dim)
             self.residual = self.unknowns.vector()
             self._ghost_form.bind(facets)
         stiffness = float(self.modulus.x.array[cells].max(initial=0.0)) * self.grid.cell_volume / self.grid.h.min()
         self.round_off = 1e-13 * self.grid.comm.allreduce(stiffness) * np.sqrt(max(1, self.unknowns.global_size))
-        zero(self.ghost)
-        if len(facets):
-            self._ghost_form.assemble_matrix(self.ghost)
-        self.ghost.assemble()
         return not same
+
+    def set_penalty(self) -> None:
+        """Assemble what is linear in the step's increment: ghost penalty and, at their present places, plates."""
+        zero(self.penalty)
+        if len(self._facets):
+            self._ghost_form.assemble_matrix(self.penalty)
+        if self._plate is not None:
+            self._plate.assemble_matrix(self.penalty)
+        self.penalty.assemble()
 
     def _shared(self, nodes: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Return which nodes are active on any process."""
@@ -171,7 +193,7 @@ class Momentum:
         b[owned] -= self._external[owned]
         r = self.unknowns.gather(b, self.residual)
         du = self.unknowns.gather(self.u.x.array, self.K.createVecRight())
-        self.ghost.multAdd(du, r, r)
+        self.penalty.multAdd(du, r, r)
         return r, float(np.sqrt(max(squares)))
 
     def _owned(self) -> slice:
@@ -182,5 +204,5 @@ class Momentum:
         zero(self.K)
         self._tangent.assemble_matrix(self.K)
         self.K.assemble()
-        self.K.axpy(1.0, self.ghost, PETSc.Mat.Structure.UNKNOWN)
+        self.K.axpy(1.0, self.penalty, PETSc.Mat.Structure.UNKNOWN)
         return self.K

@@ -28,7 +28,7 @@ from numpy.typing import ArrayLike, NDArray
 from tqdm import tqdm
 
 from mpm_dolfinx import _compat
-from mpm_dolfinx.conditions import Drained, Traction
+from mpm_dolfinx.conditions import RIGIDITY, Drained, RigidPlate, Traction
 from mpm_dolfinx.coupling import NotConverged
 from mpm_dolfinx.grid import Grid, side
 from mpm_dolfinx.materials import Fluid, Skeleton
@@ -52,7 +52,7 @@ class BiotFEM:
         Skeleton and pore fluid, whose pressure is zero at the start.
     fixed
         Sides with the components that are zero there, such as {"left": "xy"}.
-    tractions, drained
+    tractions, drained, plates
         Conditions on sides, nodal pressures on whole facets of a region; other sides are free and sealed.
     element
         "taylor-hood": Q2 displacement, Q1 pressure; "q1-dg0": Q1, constant in the cells with two-point fluxes.
@@ -71,6 +71,7 @@ class BiotFEM:
         fluid: Fluid | None = None,
         tractions: Sequence[Traction] = (),
         drained: Sequence[Drained] = (),
+        plates: Sequence[RigidPlate] = (),
         element: str = "taylor-hood",
         comm: MPI.Intracomm = MPI.COMM_WORLD,
         tolerance: float = 1e-8,
@@ -86,6 +87,8 @@ class BiotFEM:
         self._make_spaces(*ELEMENTS[element])
         self._bcs = self._conditions(fixed, drained if element == "taylor-hood" else ())
         start = time.perf_counter()
+        self._plates = [(plate, self._area(plate)) for plate in plates]
+        tractions = [*tractions, *(plate.traction(area, self.grid.dim) for plate, area in self._plates)]
         self._compile(tractions, drained if element == "q1-dg0" else None)
         self.jit = time.perf_counter() - start  # s, compiling or finding the forms
         self._make_solver()
@@ -130,7 +133,13 @@ class BiotFEM:
             bcs += [self._prescribe(space.sub(axes.index(a)), 0.0, name) for a in held]
         return bcs + [self._prescribe(self._W.sub(1), o.pressure / self.scale, o.side, o.region) for o in drained]
 
-    def _on(self, condition: Traction | Drained, integrand):
+    def _area(self, condition: RigidPlate) -> float:
+        """Return the area of the part of a side that a condition names (m^(d-1))."""
+        low, high = self._box(condition.side, condition.region)
+        within = np.minimum(high, self.grid.upper) - np.maximum(low, self.grid.lower)
+        return float(np.delete(within, side(condition.side, self.grid.dim)[0]).prod())
+
+    def _on(self, condition: Traction | Drained | RigidPlate, integrand):
         """Return the integral over the part of a side that a condition names, as UFL."""
         low, high = map(self._constant, self._box(condition.side, condition.region))
         for a, x in enumerate(ufl.SpatialCoordinate(self.grid.mesh)):
@@ -161,6 +170,12 @@ class BiotFEM:
                 residual += kappa * J * ufl.inner(pull * ufl.grad(p), pull * ufl.grad(q)) * dx
             else:
                 residual += self._two_point(kappa, J, pull, p, q, outlets)
+        for plate, area in self._plates:
+            axis = side(plate.side, self.grid.dim)[0]
+            slope = [ufl.as_vector([f[axis].dx(a) for a in range(self.grid.dim) if a != axis]) for f in (u, v)]
+            residual += self._on(
+                plate, self._constant(RIGIDITY * area ** (1 / (self.grid.dim - 1))) * ufl.inner(*slope)
+            )
         self._residual_form = _compat.compiled(residual)
         self._tangent_form = _compat.compiled(ufl.derivative(residual, self.w, ufl.TrialFunction(self._W)))
         loads = [self._on(load, ufl.inner(t, v) / self._constant(self.scale)) for load, t in self._loads]

@@ -13,7 +13,7 @@ from dolfinx.common import Timer
 from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx import _compat
-from mpm_dolfinx.conditions import Drained, Inflow, Traction
+from mpm_dolfinx.conditions import RIGIDITY, Drained, Inflow, RigidPlate, Traction
 from mpm_dolfinx.coupling import COUPLINGS, Coupler, Report
 from mpm_dolfinx.domains import corner_bits
 from mpm_dolfinx.exchange import Exchange
@@ -43,7 +43,7 @@ class Simulation:
         Walls of the grid with the components that are zero there, such as {"left": "xy", "bottom": "y"}.
     fluid
         Pore fluid; without it there is no storage problem.
-    tractions, drained, inflows
+    tractions, drained, inflows, plates
         Boundary conditions on sides of the bodies; other sides are free and sealed.
     gravity : (d,) or callable t -> (d,), m/s^2
         Acceleration of gravity.
@@ -66,6 +66,7 @@ class Simulation:
         tractions: Sequence[Traction] = (),
         drained: Sequence[Drained] = (),
         inflows: Sequence[Inflow] = (),
+        plates: Sequence[RigidPlate] = (),
         gravity: ArrayLike | Callable[[float], ArrayLike] | None = None,
         pressure: float = 0.0,
         quadrature: str = "domain",
@@ -87,6 +88,8 @@ class Simulation:
         self.gravity = None if gravity is None else fem.Constant(grid.mesh, np.zeros(grid.dim))
         self.t, self.active_cells = 0.0, 0
         self.points = material_points(grid, bodies, pressure)
+        self._plates = [(plate, self._faces(bodies, plate)) for plate in plates]
+        tractions = [*tractions, *(plate.traction(faces.area0.sum(), grid.dim) for plate, faces in self._plates)]
         self._loads = [(load, self._faces(bodies, load)) for load in tractions]
         self._outlets = [(outlet, self._faces(bodies, outlet)) for outlet in (*drained, *inflows)]
         self._law = law
@@ -127,7 +130,7 @@ class Simulation:
             shapes |= {"density": ()}
         self.pieces = FormPoints(grid, **shapes)
         p = fem.Function(_compat.function_space(grid.mesh, "DG", 0)) if fluid else None
-        self.momentum = Momentum(grid, self.pieces, law, fixed, p, self.gravity)
+        self.momentum = Momentum(grid, self.pieces, law, fixed, p, self.gravity, bool(self._plates))
         self.storage = None
         if fluid:
             weight = None if self.gravity is None else fluid.density * self.gravity
@@ -214,6 +217,9 @@ class Simulation:
         cells = np.flatnonzero(active)
         self.active_cells = grid.comm.allreduce(int(active[: grid.num_owned].sum()))
         renumbered = momentum.set_active(active, cells, fill < FULL)
+        if self._plates:
+            self._place_plates()
+        momentum.set_penalty()
         if self.storage:
             s = self.storage
             if renumbered:
@@ -268,19 +274,34 @@ class Simulation:
 
     def _place_loads(self, t: float) -> None:
         """Put the dead loads of time t on the surface."""
-        cells, xs, forces = [], [], []
+        rows = []
         for load, faces in self._loads:
             here, _, cell, x = self.placement.surface(faces)
-            cells.append(cell)
-            xs.append(x)
-            forces.append(faces.area0[here, None] * load.at(t))
-        d = self.grid.dim
-        cell = np.concatenate([np.empty(0, dtype=np.int64), *cells])
-        travel = Exchange(self.grid.comm, self.grid.owner(cell))
-        cell = travel.send(cell)
-        x, force = (travel.send(np.concatenate([np.empty((0, d)), *a])) for a in (xs, forces))
-        self.momentum.loads.place(self.grid.local(cell), x, np.ones(len(cell)), force=force)
+            rows.append((cell, x, faces.area0[here, None] * load.at(t)))
+        cell, x, force = self._gathered(rows, (self.grid.dim,))
+        self.momentum.loads.place(cell, x, np.ones(len(cell)), force=force)
         self.momentum.set_loads()
+
+    def _place_plates(self) -> None:
+        """Put the plates on the surface."""
+        grid, rows = self.grid, []
+        modulus = max(m.oedometric for m in self.materials)
+        for _, faces in self._plates:
+            _, at, cell, x = self.placement.surface(faces)
+            size = np.linalg.norm(face_vectors(self.points.corners[at], faces.axis, faces.end), axis=1)
+            length = faces.area0.sum() ** (1 / (grid.dim - 1))
+            rows.append((cell, x, np.outer(RIGIDITY * modulus * length * size, np.eye(grid.dim)[faces.axis])))
+        cell, x, normal = self._gathered(rows, (grid.dim,))
+        rigidity = np.linalg.norm(normal, axis=1)
+        self.momentum.plates.place(cell, x, np.ones(len(cell)), rigidity=rigidity, normal=normal / rigidity[:, None])
+
+    def _gathered(self, rows: list, shape: tuple[int, ...]) -> tuple[NDArray, NDArray, NDArray]:
+        """Send (cells, positions, values) to the owners of the cells; return (owned cells, positions, values)."""
+        empty = (np.empty(0, dtype=np.int64), np.empty((0, self.grid.dim)), np.empty((0, *shape)))
+        parts = [np.concatenate(column) for column in zip(empty, *rows, strict=True)]
+        travel = Exchange(self.grid.comm, self.grid.owner(parts[0]))
+        cell, x, values = map(travel.send, parts)
+        return self.grid.local(cell), x, values
 
     def _open_boundary(self) -> None:
         """Set the conductances of drained sides and the inflows."""

@@ -103,3 +103,18 @@ def test_the_stress_of_the_points_is_that_of_the_law():
     assert stress[:, 1, 1] == pytest.approx((lam + 2 * SOFT.shear) * np.log(J) / J, rel=1e-6)
     assert stress[:, 0, 0] == pytest.approx(lam * np.log(J) / J, abs=1e-6 * abs(stress).max())
     assert np.abs(stress[:, 0, 1]).max() < 1e-9 * np.abs(stress).max()
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.4])
+def test_a_rigid_plate_settles_evenly_on_uneven_ground_and_carries_its_force(offset):
+    grid = mpm.Grid([1.0, 1.4], [10, 14])
+    soft, hard = mpm.Hencky(bulk=1e6, shear=6e5), mpm.Hencky(bulk=4e6, shear=2.4e6)
+    top = 1 + offset / 10
+    bodies = [mpm.box(grid, [0, 0], [0.5, top]), mpm.box(grid, [0.5, 0], [1, top], material=1)]
+    fixed = {"left": "x", "right": "x", "bottom": "y"}
+    s = mpm.Simulation(grid, bodies, [soft, hard], fixed=fixed, plates=[mpm.RigidPlate("top", 1e3)])
+    probes = mpm.probes(bodies, [[0.0, top], [0.3, top], [1.0, top]])
+    u = s.run(1.0, 0.5, probes=probes).displacement[-1]
+    assert np.ptp(u[:, 1]) < 1e-3 * abs(u[0, 1])
+    stress, volume = s.effective_stress()[:, 1, 1], s.points.volume0
+    assert stress @ volume / volume.sum() == pytest.approx(-1e3, rel=1e-2)
