@@ -49,6 +49,7 @@ def arguments(argv: list[str] | None = None) -> argparse.Namespace:
     add("--drained", action="store_true", help="no fluid at all")
     add("--reference", action="store_true", help="run the Taylor-Hood finite elements beside it")
     add("--out", type=Path, default=Path("out/poroelastic_beam"), help="folder for pictures and tables")
+    add("--profile", action="store_true", help="print where the time went")
     add("--json", action="store_true", help="print the results as one line of JSON at the end")
     options = parser.parse_args(argv)
     for name in ("h", "dt", "t_end", "ramp", "load"):
@@ -88,7 +89,10 @@ def scene(o: argparse.Namespace) -> tuple[mpm.Simulation, float]:
 def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return what --json prints."""
     o = arguments(argv)
-    simulation, bottom = scene(o)
+    try:
+        simulation, bottom = scene(o)
+    except ValueError as error:
+        sys.exit(f"error: {error}")
     axis = np.stack([np.linspace(0, LENGTH, 41), np.full(41, bottom + HEIGHT / 2)], axis=1)
     steps = max(1, round(o.t_end / o.dt))
     shown = np.unique(np.rint(np.geomspace(1, steps, 6)).astype(int))
@@ -160,6 +164,8 @@ def report(o: argparse.Namespace, result: mpm.Result, fem) -> None:
         f"{result.steps} steps, {result.newton} Newton and {result.coupling} coupling iterations, "
         f"fluid balance {result.balance:.1e}, {result.wall:.1f} s"
     )
+    if o.profile:
+        print(result.shares())
     print(f"pictures and tables: {o.out}/")
 
 

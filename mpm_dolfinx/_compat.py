@@ -15,7 +15,7 @@ from petsc4py import PETSc
 import dolfinx
 import numpy as np
 import ufl
-from dolfinx import cpp, fem, la, mesh
+from dolfinx import common, cpp, fem, la, mesh
 from numpy.typing import NDArray
 
 SUPPORTED = ((0, 5), (0, 9), (0, 10), (0, 11))
@@ -75,6 +75,15 @@ def num_cells(msh: mesh.Mesh) -> tuple[int, int]:
 def scatter_reverse_add(u: fem.Function) -> None:
     """Add the values at ghosts to those of their owners."""
     u.x.scatter_reverse(la.ScatterMode.add if OLD else la.InsertMode.add)
+
+
+def seconds(task: str) -> float:
+    """Return the wall seconds that dolfinx's timers have counted for a task so far."""
+    try:
+        total = common.timing(task)[1]
+    except RuntimeError:  # not met yet
+        return 0.0
+    return total.total_seconds() if hasattr(total, "total_seconds") else total
 
 
 class CompiledForm:

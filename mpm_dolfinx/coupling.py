@@ -158,7 +158,8 @@ class Coupler:
             except NotConverged as failed:
                 why = "beta is below alpha^2 / (2 K_dr)" if COUPLINGS[self.coupling] is None else "cut the step"
                 raise NotConverged(f"the {self.coupling} iteration diverges ({why})", report.history) from failed
-            self._solve_s.solve(self.storage.residual, self._dp)
+            with Timer("mpm: linear solve"):
+                self._solve_s.solve(self.storage.residual, self._dp)
             self.storage.unknowns.add(self.storage.p, -1.0, self._dp)
             report.coupling += 1
             errors = self._errors(dt, report)
@@ -170,7 +171,8 @@ class Coupler:
         for count in range(MOMENTUM_STEPS):
             if count and errors[0] <= goal:
                 return
-            self._solve_u.solve(self.momentum.residual, self._du)
+            with Timer("mpm: linear solve"):
+                self._solve_u.solve(self.momentum.residual, self._du)
             before, errors = errors[0], self._line_search(dt, errors, report)
             if errors[0] > max(goal, KEEP * before):
                 self._linearise(dt)

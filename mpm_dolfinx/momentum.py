@@ -139,16 +139,18 @@ class Momentum:
         nodes = self._shared(nodes)
         dofs = np.flatnonzero((self.free & nodes[:, None]).ravel())
         same = hasattr(self, "unknowns") and np.array_equal(dofs, self._dofs) and np.array_equal(facets, self._facets)
-        if self.grid.comm.allreduce(not same):
+        changed = self.grid.comm.allreduce(not same) > 0
+        if changed:
             self._dofs, self._facets = dofs, facets
             self.unknowns = Unknowns(self.u, dofs)
             self.K = matrix(self.unknowns, self.unknowns, 5**self.grid.dim * self.grid.dim)
+            self._summed = False
             self.penalty = matrix(self.unknowns, self.unknowns, 5**self.grid.dim * self.grid.dim)
             self.residual = self.unknowns.vector()
             self._ghost_form.bind(facets)
         stiffness = float(self.modulus.x.array[cells].max(initial=0.0)) * self.grid.cell_volume / self.grid.h.min()
         self.round_off = 1e-13 * self.grid.comm.allreduce(stiffness) * np.sqrt(max(1, self.unknowns.global_size))
-        return not same
+        return changed
 
     def set_penalty(self) -> None:
         """Assemble what is linear in the step's increment: ghost penalty and, at their present places, plates."""
@@ -204,5 +206,8 @@ class Momentum:
         zero(self.K)
         self._tangent.assemble_matrix(self.K)
         self.K.assemble()
-        self.K.axpy(1.0, self.penalty, PETSc.Mat.Structure.UNKNOWN)
+        # the first sum gives K the pattern of both
+        pattern = PETSc.Mat.Structure
+        self.K.axpy(1.0, self.penalty, pattern.SUBSET_NONZERO_PATTERN if self._summed else pattern.UNKNOWN)
+        self._summed = True
         return self.K

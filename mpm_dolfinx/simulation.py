@@ -177,6 +177,9 @@ class Simulation:
         """Rebuild the integration data on the fresh grid: pieces, active cells, remapped pressure."""
         with Timer("mpm: cut domains"):
             self.placement = place = Placement(self.grid, self.points, self.quadrature, self.t)
+        if self.storage:
+            with Timer("mpm: remap"):
+                self._brought = remap(self._carried, self.points, place.pieces)
         with Timer("mpm: integration data"):
             J = self.points.J
             self.pieces.place(
@@ -232,7 +235,7 @@ class Simulation:
                 self._rows(lambda m: m.conductivity) / self.fluid.unit_weight,
                 self.placement.pieces_to_cells(self.placement.pieces.faces),
                 pieces.data["storage"][:, 0],
-                self.placement.pieces_to_cells(remap(self._carried, self.points, self.placement.pieces)),
+                self.placement.pieces_to_cells(self._brought),
                 self._fixed_stress(J),
             )
             self._open_boundary()
@@ -274,13 +277,14 @@ class Simulation:
 
     def _place_loads(self, t: float) -> None:
         """Put the dead loads of time t on the surface."""
-        rows = []
-        for load, faces in self._loads:
-            here, _, cell, x = self.placement.surface(faces)
-            rows.append((cell, x, faces.area0[here, None] * load.at(t)))
-        cell, x, force = self._gathered(rows, (self.grid.dim,))
-        self.momentum.loads.place(cell, x, np.ones(len(cell)), force=force)
-        self.momentum.set_loads()
+        with Timer("mpm: loads"):
+            rows = []
+            for load, faces in self._loads:
+                here, _, cell, x = self.placement.surface(faces)
+                rows.append((cell, x, faces.area0[here, None] * load.at(t)))
+            cell, x, force = self._gathered(rows, (self.grid.dim,))
+            self.momentum.loads.place(cell, x, np.ones(len(cell)), force=force)
+            self.momentum.set_loads()
 
     def _place_plates(self) -> None:
         """Put the plates on the surface."""

@@ -9,9 +9,11 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
+from dolfinx.common import Timer
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from mpm_dolfinx import _compat
 from mpm_dolfinx.coupling import NotConverged
 from mpm_dolfinx.placement import LeftGrid
 from mpm_dolfinx.points import Probes
@@ -19,6 +21,19 @@ from mpm_dolfinx.points import Probes
 if TYPE_CHECKING:
     from mpm_dolfinx.simulation import Simulation
 
+PARTS = (
+    "cut domains",
+    "remap",
+    "integration data",
+    "loads",
+    "residual",
+    "tangent",
+    "factorisation",
+    "linear solve",
+    "move points",
+    "output",
+)
+"""Parts of a run that are timed, as `mpm: ...` in dolfinx's own list of timings."""
 MIN_CUT = 2.0**-10  # of dt: a step is not cut below this
 
 
@@ -27,7 +42,8 @@ class Result:
     """Histories of a run; one entry an output time, the start included.
 
     t (s); displacement (m, d) of the probes, m; pressure: least and largest on the points, Pa; and of
-    the steps so far: steps, newton, coupling (iterations), balance (worst, relative), cuts.
+    the steps so far: steps, newton, coupling (iterations), balance and residual (worst, relative), cuts,
+    wall (s), and profile: seconds of each part of the run on this process, from dolfinx's timers.
     """
 
     t: list[float] = field(default_factory=list)
@@ -41,6 +57,12 @@ class Result:
     residual: float = 0.0
     wall: float = 0.0
     converged: bool = False
+    profile: dict[str, float] = field(default_factory=dict)
+
+    def shares(self) -> str:
+        """Return the profile as a table: seconds and share of the wall time of each part."""
+        rows = [*self.profile.items(), ("rest", self.wall - sum(self.profile.values()))]
+        return "\n".join(f"{name:18} {s:8.2f} s {100 * s / max(self.wall, 1e-9):5.1f} %" for name, s in rows)
 
 
 class GaveUp(RuntimeError):
@@ -88,7 +110,7 @@ def run(
     result, start, small = Result(), simulation.t, dt
     _record(simulation, result, probes)
     intervals = max(1, round((t_end - start) / dt))
-    began = time.perf_counter()
+    began, timed = time.perf_counter(), _timings()
     quiet = None if progress and simulation.grid.comm.rank == 0 else True
     with tqdm(total=intervals, disable=quiet, unit="step") as bar:
         for k in range(1, intervals + 1):
@@ -96,14 +118,20 @@ def run(
             while target - simulation.t > 1e-9 * dt:
                 small = _advance(simulation, min(small, target - simulation.t), dt, result)
             simulation.t = target
-            _record(simulation, result, probes)
+            with Timer("mpm: output"):
+                _record(simulation, result, probes)
+                if observe is not None:
+                    observe(simulation)
             result.wall = time.perf_counter() - began
-            if observe is not None:
-                observe(simulation)
+            result.profile = {part: after - timed[part] for part, after in _timings().items()}
             bar.set_postfix(t=f"{simulation.t:.4g} s", newton=result.newton, coupling=result.coupling)
             bar.update()
     result.converged = True
     return result
+
+
+def _timings() -> dict[str, float]:
+    return {part: _compat.seconds(f"mpm: {part}") for part in PARTS}
 
 
 def _advance(simulation: Simulation, small: float, dt: float, result: Result) -> float:

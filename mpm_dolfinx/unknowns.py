@@ -80,18 +80,20 @@ def matrix(rows: Unknowns, columns: Unknowns, row_length: int) -> PETSc.Mat:
 
 
 def direct_solver(A: PETSc.Mat, name: str) -> PETSc.KSP:
-    """Return a solver that factorises A, refactorised when A has changed.
+    """Return a solver that factorises a symmetric A = L D L^T, refactorised when A has changed.
 
-    MUMPS in parallel; on one process PETSc's own LU, whose overhead is smaller.
+    MUMPS in parallel; on one process PETSc's own, whose overhead is smaller (3 ms instead of 6 ms by LU
+    and by MUMPS at 3000 unknowns in 2D).
     """
+    A.setOption(PETSc.Mat.Option.SYMMETRIC, True)
     ksp = PETSc.KSP().create(A.comm)
     ksp.setType(PETSc.KSP.Type.PREONLY)
     ksp.setOptionsPrefix(f"mpm_{name}_")
-    ksp.pc.setType(PETSc.PC.Type.LU)
+    ksp.pc.setType(PETSc.PC.Type.CHOLESKY)
     if A.comm.size > 1:
         ksp.pc.setFactorSolverType("mumps")
     else:
-        ksp.pc.setFactorOrdering(PETSc.Mat.OrderingType.QMD)
+        ksp.pc.setFactorOrdering(PETSc.Mat.OrderingType.ND)
     ksp.setOperators(A)
     ksp.setFromOptions()
     return ksp

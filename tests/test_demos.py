@@ -53,6 +53,18 @@ def test_the_beam_says_how_the_papers_beta_fails_and_keeps_its_results(tmp_path)
     assert json.loads(done.stdout.splitlines()[-1])["converged"] is False
 
 
+def test_the_beam_prints_where_the_time_went(tmp_path):
+    done = run("poroelastic_beam", f"--h 0.05 --t-end 0.06 --profile --out {tmp_path}")
+    shares = [float(line.split()[-2]) for line in done.stdout.splitlines() if line.endswith("%")]
+    assert len(shares) > 8 and sum(shares) == pytest.approx(100, abs=1) and min(shares) >= 0
+
+
+@pytest.mark.parametrize("option", ["--bulk -1", "--porosity 1.5", "--conductivity=-1e-4", "--points-per-cell 0"])
+def test_the_beam_refuses_bad_constants_in_one_line(option):
+    done = run("poroelastic_beam", option)
+    assert done.returncode == 1 and len(done.stderr.splitlines()) == 1 and "must be" in done.stderr
+
+
 @pytest.mark.parametrize("option", ["--h 0", "--dt -1", "--load 0"])
 def test_the_beam_refuses_bad_options_in_one_line(option):
     done = run("poroelastic_beam", option)
