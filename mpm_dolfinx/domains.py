@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from mpm_dolfinx.grid import Grid, sum_by
 
 SNAP = 1e-10  # cells: vertices this close to a grid plane are taken to lie on it
-SLIVER = 1e-9  # of the domain: smaller pieces are dropped
+SLIVER = 1e-12  # of the domain: smaller pieces are dropped; less than a piece that is SNAP thin, whose face is open
 
 
 @dataclass
@@ -60,7 +60,7 @@ def cut(grid: Grid, corners: NDArray[np.float64]) -> Pieces:
 
     Returns
     -------
-    The pieces, slivers below 1e-9 of their domain left out; fractions sum to one for every domain.
+    The pieces, slivers below 1e-12 of their domain left out; fractions sum to one for every domain.
     """
     d = grid.dim
     y = np.ascontiguousarray(((corners - grid.lower) / grid.h).transpose(1, 2, 0))

@@ -15,7 +15,7 @@ The material objects are those of the material point method, so the two differ i
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -54,6 +54,8 @@ class BiotFEM:
         Sides with the components that are zero there, such as {"left": "xy"}.
     tractions, drained, plates
         Conditions on sides, nodal pressures on whole facets of a region; other sides are free and sealed.
+    gravity : callable t -> (d,), m/s^2
+        Acceleration of gravity, without fluid only.
     element
         "taylor-hood": Q2 displacement, Q1 pressure; "q1-dg0": Q1, constant in the cells with two-point fluxes.
     tolerance
@@ -72,6 +74,7 @@ class BiotFEM:
         tractions: Sequence[Traction] = (),
         drained: Sequence[Drained] = (),
         plates: Sequence[RigidPlate] = (),
+        gravity: Callable[[float], ArrayLike] | None = None,
         element: str = "taylor-hood",
         comm: MPI.Intracomm = MPI.COMM_WORLD,
         tolerance: float = 1e-8,
@@ -80,6 +83,8 @@ class BiotFEM:
             raise ValueError(f"element {element!r}: must be one of {', '.join(ELEMENTS)}")
         if fluid is None and drained:
             raise ValueError("drained sides need a fluid")
+        if fluid is not None and gravity is not None:
+            raise ValueError("gravity with a fluid: the reference has none; leave out one of them")
         self.grid, self.material, self.fluid = Grid(upper, cells, lower, comm), material, fluid
         self.t, self.tolerance = 0.0, tolerance
         self.scale = material.oedometric
@@ -87,6 +92,7 @@ class BiotFEM:
         self._make_spaces(*ELEMENTS[element])
         self._bcs = self._conditions(fixed, drained if element == "taylor-hood" else ())
         start = time.perf_counter()
+        self._gravity = gravity
         self._plates = [(plate, self._area(plate)) for plate in plates]
         tractions = [*tractions, *(plate.traction(area, self.grid.dim) for plate, area in self._plates)]
         self._compile(tractions, drained if element == "q1-dg0" else None)
@@ -179,6 +185,9 @@ class BiotFEM:
         self._residual_form = _compat.compiled(residual)
         self._tangent_form = _compat.compiled(ufl.derivative(residual, self.w, ufl.TrialFunction(self._W)))
         loads = [self._on(load, ufl.inner(t, v) / self._constant(self.scale)) for load, t in self._loads]
+        if self._gravity is not None:
+            self._weight = self._constant(np.zeros(self.grid.dim))
+            loads.append(ufl.inner(self._weight, v) / self._constant(self.scale) * dx)
         self._load_form = _compat.compiled(sum(loads)) if loads else None
 
     def _two_point(self, kappa, J, pull, p, q, outlets: Sequence[Drained]):
@@ -233,7 +242,10 @@ class BiotFEM:
         self._dt.value = dt
         for traction, constant in self._loads:
             constant.value[:] = traction.at(self.t + dt)
-        if self._loads:
+        if self._gravity is not None:
+            density = (1 - self.material.porosity) * self.material.grain_density
+            self._weight.value = density * np.asarray(self._gravity(self.t + dt), dtype=float)
+        if self._load_form is not None:
             self._assemble(self._f, self._load_form)
         x, load, snes = _compat.petsc_vec(self.w).copy(), _compat.petsc_vec(self._f).norm(), self._snes
         petsc.set_bc(x, self._bcs)

@@ -346,7 +346,7 @@ class Simulation:
             n, d = len(points), grid.dim
             u = self.momentum.u.x.array.reshape(-1, d)
             _, dN = grid.shape_functions(self.pieces.cells, self.pieces.x)
-            gradient = np.einsum("mka,mkb->mab", u[grid.cell_nodes[self.pieces.cells]], dN)
+            gradient = u[grid.cell_nodes[self.pieces.cells]].transpose(0, 2, 1) @ dN
             # F_p <- (sum_k w_k Delta_k / V_p) F_p
             mean = [place.mean(column) for column in place.to_pieces(gradient).reshape(-1, d * d).T]
             points.F = (np.eye(d) + np.stack(mean, axis=1).reshape(n, d, d)) @ points.F

@@ -12,6 +12,9 @@ import pytest
 ROOT = Path(__file__).parent.parent
 QUICK = {
     "poroelastic_beam": ("--h 0.03 --t-end 0.2 --reference", ["pressure.png", "deflection.png", "tip.csv"]),
+    "terzaghi": ("--cells 10 --steps 20", ["terzaghi.png"]),
+    "self_weight_column": ("--cells 16", ["self_weight_column.png"]),
+    "error_vs_runtime": ("--quick --cases column", ["column.png", "runs.csv", "comparison.md"]),
     "quadrature": ("--h 0.05 --steps 5 10", ["quadrature.png", "tip.csv"]),
     "benchmark_beam": ("--h 0.05 --t-end 0.1 --repeat 1", []),
 }

@@ -1,0 +1,298 @@
+# SPDX-License-Identifier: MIT
+"""What accuracy costs: error against run time, material points beside finite elements, in one run.
+
+Five cases with an exact or converged solution.  In each, cell size, points per cell, quadrature and
+coupling of the material points are varied, beside body-fitted finite elements on the same grid
+(Q1/DG0, the peer) and Taylor-Hood elements.  Time is that of the time loop, the least of `--repeat`
+runs; compile times are listed apart.
+
+* beam: the coupled seed beam; largest error of the tip from 0.1 s on, against Taylor-Hood, 67 x 20 cells
+* drained: the same without water, load in ten steps; tip, against Taylor-Hood, 67 x 20 cells
+* terzaghi: settlement at T_v = 0.5, exact;  mandel: settlement of the plate at T = 0.1, exact
+* column: height of the soft column under its own weight, exact
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import poroelastic_beam as beam
+import self_weight_column as column
+import terzaghi
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.exact import Mandel, terzaghi_consolidation
+from mpm_dolfinx.reference import BiotFEM
+
+PEER, TRUTH = "FEM Q1/DG0, same grid", "FEM Taylor-Hood"
+DEFAULT = "MPM, defaults"
+Run = Callable[[], tuple[float, mpm.Result, float]]
+"""A run: error, result, compile seconds."""
+
+
+@dataclass
+class Row:
+    """A measured run."""
+
+    case: str
+    method: str
+    setting: str
+    error: float
+    wall_s: float
+    jit_s: float
+    steps: int
+
+
+# ---- the seed beam -------------------------------------------------------------------------------
+
+
+def beam_runs(drained: bool, quick: bool) -> Iterator[tuple[str, str, Run]]:
+    """Yield (method, setting, run) of the beam, coupled or drained."""
+    time = "--drained --ramp 1 --t-end 1 --dt 0.1" if drained else f"--t-end {0.3 if quick else 1.2}"
+    truth = beam_fem(time, "taylor-hood", beam.REFERENCE_CELLS)[0]
+
+    def error(result: mpm.Result) -> float:
+        kept = np.array(result.t) > (0.95 if drained else 0.0999)
+        u, exact = (np.array(r.displacement)[kept, 0, 1] for r in (result, truth))
+        return float(np.abs(u / exact - 1).max())
+
+    def points(options: str) -> Run:
+        def run():
+            simulation, bottom = beam.scene(o := beam.arguments(f"{time} {options}".split()))
+            probe = mpm.probes(simulation.bodies, [[beam.LENGTH, bottom + beam.HEIGHT / 2]])
+            result = simulation.run(o.t_end, o.dt, probes=probe)
+            return error(result), result, simulation.jit
+
+        return run
+
+    def elements(element: str, cells: tuple[int, int]) -> Run:
+        def run():
+            result, jit = beam_fem(time, element, cells)
+            return error(result), result, jit
+
+        return run
+
+    sizes = (0.06, 0.03) if quick else (0.06, 0.03, 0.015)
+    for h in sizes:
+        yield DEFAULT, f"h = {h} m", points(f"--h {h}")
+        yield PEER, f"h = {h} m", elements("q1-dg0", (round(beam.LENGTH / h), round(beam.HEIGHT / h)))
+        yield "MPM, at the points", f"h = {h} m", points(f"--h {h} --quadrature point")
+        if not drained:
+            yield "MPM, fixed-stress", f"h = {h} m", points(f"--h {h} --coupling fixed-stress")
+    for n in (1, 3):
+        yield f"MPM, {n}x{n} points a cell", "h = 0.03 m", points(f"--h 0.03 --points-per-cell {n}")
+    for cells in ((10, 3), (20, 6)) if quick else ((10, 3), (20, 6), (40, 12)):
+        yield TRUTH, f"{cells[0]} x {cells[1]} cells", elements("taylor-hood", cells)
+
+
+def beam_fem(time: str, element: str, cells: tuple[int, int]) -> tuple[mpm.Result, float]:
+    """Return (result, compile seconds) of finite elements for the beam."""
+    o = beam.arguments(time.split())
+    fem = BiotFEM([0, 0], [beam.LENGTH, beam.HEIGHT], cells, beam.material(o), element=element, **beam.physics(o))
+    return fem.run(o.t_end, o.dt, probes=[[beam.LENGTH, beam.HEIGHT / 2]]), fem.jit
+
+
+# ---- columns and slabs with exact solutions --------------------------------------------------------
+
+
+def scene_runs(
+    physics: dict, material, size: tuple[float, float], width: int, time: tuple[float, int], exact: float, cells, steps
+) -> Iterator[tuple[str, str, Run]]:
+    """Yield (method, setting, run) of a box whose top moves by `exact` (m); `width` cells wide, or -1: as high.
+
+    time: end (s) and the number of steps of the sweep over the cells; steps: those of the sweep over time.
+    """
+
+    def points(n: int, m: int, **options) -> Run:
+        def run():
+            h = size[1] / n
+            grid = mpm.Grid([size[0] + (2 * h if width < 0 else 0), size[1]], [n + 2 if width < 0 else width, n])
+            body = mpm.box(grid, [0, 0], size)
+            probe = mpm.probes([body], [[0, size[1]]])
+            simulation = mpm.Simulation(grid, [body], [material], **physics, **options)
+            result = simulation.run(time[0], time[0] / m, probes=probe)
+            return abs(result.displacement[-1][0, 1] / exact - 1), result, simulation.jit
+
+        return run
+
+    def elements(n: int, m: int, element: str) -> Run:
+        def run():
+            fem = BiotFEM([0, 0], size, (n if width < 0 else width, n), material, element=element, **physics)
+            result = fem.run(time[0], time[0] / m, probes=[[0, size[1]]])
+            return abs(result.displacement[-1][0, 1] / exact - 1), result, fem.jit
+
+        return run
+
+    for n, m in [(n, time[1]) for n in cells] + [(cells[-1], m) for m in steps]:
+        setting = f"{n} cells, {m} steps"
+        yield DEFAULT, setting, points(n, m)
+        yield PEER, setting, elements(n, m, "q1-dg0")
+        yield TRUTH, setting, elements(n, m, "taylor-hood")
+    for n in cells:
+        yield "MPM, at the points", f"{n} cells, {time[1]} steps", points(n, time[1], quadrature="point")
+
+
+def terzaghi_runs(quick: bool) -> Iterator[tuple[str, str, Run]]:
+    """Yield the runs of Terzaghi's column, a load that strains it by 1e-5."""
+    cells = (5, 20) if quick else (5, 10, 20, 50)
+    load = 1e-5 * terzaghi.SOIL.oedometric
+    physics = {
+        "fluid": terzaghi.WATER,
+        "fixed": {"left": "x", "right": "x", "bottom": "y"},
+        "tractions": [mpm.Traction("top", (0, -load))],
+        "drained": [mpm.Drained("top")],
+    }
+    end = 0.5 / terzaghi.CV
+    exact = -1e-5 * float(terzaghi_consolidation(end, 1.0, terzaghi.CV))
+    size = (1 / cells[-1], 1.0)
+    yield from scene_runs(physics, terzaghi.SOIL, size, 1, (end, 100), exact, cells, (25,) if quick else (25, 400))
+
+
+def mandel_runs(quick: bool) -> Iterator[tuple[str, str, Run]]:
+    """Yield the runs of Mandel's slab of 1 m x 1 m (a quarter) at T = 0.1."""
+    soil = mpm.LinearElastic(bulk=4e6 / 3, shear=1e6, conductivity=1e-5)
+    water = mpm.Fluid(bulk=np.inf)
+    slab = Mandel(1.0, 1.0, soil.bulk, soil.shear, soil.conductivity / water.unit_weight, force=20.0)
+    physics = {
+        "fluid": water,
+        "fixed": {"left": "x", "bottom": "y"},
+        "plates": [mpm.RigidPlate("top", 20.0)],
+        "drained": [mpm.Drained("right")],
+    }
+    end = 0.1 / slab.cv
+    exact = float(slab.displacement(0.0, 1.0, end)[1])
+    cells, steps = ((5, 10), (10,)) if quick else ((5, 10, 20), (10, 160))
+    yield from scene_runs(physics, soil, (1.0, 1.0), -1, (end, 40), exact, cells, steps)
+
+
+def column_runs(quick: bool) -> Iterator[tuple[str, str, Run]]:
+    """Yield the runs of the soft column under its own weight."""
+    soft = column.EXACT
+    physics = {
+        "fixed": {"left": "x", "right": "x", "bottom": "y"},
+        "gravity": lambda t: (0, -soft.gravity * t),
+    }
+    cells, steps = ((8, 16), ()) if quick else ((8, 16, 32, 64), (160,))
+    exact = soft.height - soft.l0
+    yield from scene_runs(physics, column.FOAM, (50 / cells[-1], 50.0), 1, (1.0, 40), exact, cells, steps)
+
+
+CASES = {
+    "beam": lambda quick: beam_runs(False, quick),
+    "drained": lambda quick: beam_runs(True, quick),
+    "terzaghi": terzaghi_runs,
+    "mandel": mandel_runs,
+    "column": column_runs,
+}
+
+
+# ---- measuring and reporting -----------------------------------------------------------------------
+
+
+def measure(case: str, quick: bool, repeat: int) -> list[Row]:
+    """Run one case; a run that gives up has no error."""
+    rows = []
+    for method, setting, run in CASES[case](quick):
+        try:
+            runs = [run() for _ in range(repeat)]
+            error, result, _ = runs[0]
+            wall, jit = min(r.wall for _, r, _ in runs), max(j for *_, j in runs)
+            rows.append(Row(case, method, setting, error, wall, jit, result.steps))
+        except (mpm.GaveUp, ValueError) as failed:
+            print(f"{case}, {method}, {setting}: {failed}", file=sys.stderr)
+            rows.append(Row(case, method, setting, np.nan, np.nan, np.nan, 0))
+        r = rows[-1]
+        print(f"{case:10} {method:24} {setting:22} {r.error:10.2e} {r.wall_s:9.3f} s", flush=True)
+    return rows
+
+
+def time_at(rows: list[Row], error: float) -> float:
+    """Return the least time in which runs reach an error; nan where none does."""
+    return min((r.wall_s for r in rows if r.error <= error), default=np.nan)
+
+
+def compare(rows: list[Row]) -> list[dict]:
+    """Return, for every run with default settings, its time over the peer's on the same grid and at no more error."""
+    out = []
+    for r in (r for r in rows if r.method == DEFAULT):
+        peers = [q for q in rows if q.case == r.case and q.method == PEER]
+        same = next(q for q in peers if q.setting == r.setting)
+        out.append(
+            {
+                "case": r.case,
+                "setting": r.setting,
+                "error": r.error,
+                "peer_error": same.error,
+                "time_ratio": r.wall_s / same.wall_s,
+                "time_ratio_at_equal_error": r.wall_s / time_at(peers, r.error),
+            }
+        )
+    return out
+
+
+def table(comparison: list[dict]) -> str:
+    """Return the comparison as a Markdown table."""
+    lines = [
+        "| case | setting | error | same-grid FEM's error | time / same-grid FEM's | at equal error |",
+        "|---|---|---|---|---|---|",
+    ]
+    for c in comparison:
+        equal = "none so exact" if np.isnan(c["time_ratio_at_equal_error"]) else f"{c['time_ratio_at_equal_error']:.2f}"
+        numbers = f"{c['error']:.1e} | {c['peer_error']:.1e} | {c['time_ratio']:.2f} | {equal}"
+        lines.append(f"| {c['case']} | {c['setting']} | {numbers} |")
+    return "\n".join(lines)
+
+
+def draw(out: Path, case: str, rows: list[Row]) -> None:
+    """Draw error against time, a line a method."""
+    fig, ((ax,),) = beam.figure(1, 1, (7.5, 5))
+    for i, method in enumerate(dict.fromkeys(r.method for r in rows)):
+        mine = sorted((r.wall_s, r.error) for r in rows if r.method == method and np.isfinite(r.error))
+        if mine:
+            style = {"color": "black" if method == TRUTH else f"C{i}", "lw": 2 if method == DEFAULT else 1}
+            ax.loglog(
+                *zip(*mine, strict=True), "os^Dvx*"[i % 7] + ("-" if len(mine) > 1 else ""), label=method, **style
+            )
+    ax.set(xlabel="time of the time loop (s)", ylabel="relative error (-)", title=f"{case}: error against run time")
+    ax.grid(alpha=0.3, which="both")
+    ax.legend(fontsize=8)
+    fig.savefig(out / f"{case}.png", dpi=120)
+
+
+def main(argv: list[str] | None = None) -> dict:
+    """Run the demo; return what --json prints."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--cases", nargs="+", choices=tuple(CASES), default=list(CASES), help="cases to run")
+    parser.add_argument("--quick", action="store_true", help="a few coarse runs of each case")
+    parser.add_argument("--repeat", type=int, default=None, help="runs of each setting (default 2, with --quick 1)")
+    parser.add_argument("--out", type=Path, default=Path("out/error_vs_runtime"), help="folder for pictures and tables")
+    parser.add_argument("--json", action="store_true", help="print the results as one line of JSON at the end")
+    o = parser.parse_args(argv)
+    o.out.mkdir(parents=True, exist_ok=True)
+    rows = []
+    for case in o.cases:
+        rows += measure(case, o.quick, o.repeat or (1 if o.quick else 2))
+        draw(o.out, case, [r for r in rows if r.case == case])
+        with (o.out / "runs.csv").open("w", newline="") as file:
+            writer = csv.DictWriter(file, fieldnames=list(asdict(rows[0])))
+            writer.writeheader()
+            writer.writerows(map(asdict, rows))
+    comparison = compare(rows)
+    (o.out / "comparison.md").write_text(table(comparison) + "\n")
+    print(table(comparison))
+    print(f"pictures and tables: {o.out}/")
+    out = {"comparison": comparison, "converged": all(np.isfinite(r.error) for r in rows if r.method == DEFAULT)}
+    if o.json:
+        print(json.dumps(out))
+    return out
+
+
+if __name__ == "__main__":
+    sys.exit(0 if main()["converged"] else 1)

@@ -1,0 +1,349 @@
+# SPDX-License-Identifier: MIT
+"""Exact solutions that results can be compared with: consolidation, columns and rods.  No dolfinx.
+
+Stress is positive in tension, pore pressure in compression, as in the rest of the package.  Times are
+reduced to T = c_v t / length².  The series of exponentials converges slowly for small T; below `SWITCH`
+the Laplace transform, with tanh X, coth X -> 1 for X = sqrt(s), is inverted in closed form instead.  What
+either leaves out is of the order of erfc(1/sqrt(T)) < 2e-23 or less: both are exact to round-off.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.integrate import solve_bvp
+from scipy.optimize import brentq
+from scipy.special import ellipe, ellipeinc, ellipkinc, ellipkm1, erf, erfc, erfcx, lambertw
+
+SWITCH = 0.02  # reduced time below which the closed form for short times is taken
+TERMS = 20  # exponentials above it: the last is below exp(-70)
+Array = NDArray[np.float64]
+
+
+def _check(ok, name: str, value: ArrayLike, allowed: str) -> None:
+    if not np.all(ok):
+        bad = np.broadcast_to(value, np.shape(ok))[np.logical_not(ok)].flat[0]
+        raise ValueError(f"{name} = {bad:.12g}: must be {allowed}")
+
+
+def _positive(**values) -> None:
+    for name, value in values.items():
+        _check(np.greater(value, 0), name, value, "> 0")
+
+
+def _within(name: str, value: ArrayLike, upper: float) -> Array:
+    array = np.asarray(value, dtype=float)
+    _check((array >= 0) & (array <= upper), name, array, f"in [0, {upper:g}]")
+    return array
+
+
+def _by_time(short, long, T: ArrayLike) -> Array:
+    """Return short(T) where T < SWITCH and long(T) elsewhere; neither sees a T of the other's range."""
+    T = np.asarray(T)
+    return np.where(T < SWITCH, short(np.minimum(T, SWITCH)), long(np.maximum(T, SWITCH)))[()]
+
+
+def _series(amplitudes: Array, roots: Array, T: Array) -> Array:
+    return (amplitudes * np.exp(-(roots**2) * T[..., None])).sum(-1)
+
+
+def _transient(k: complex, z: ArrayLike, T: Array) -> NDArray:
+    """Return the inverse of exp(-z X) / (X (X - k)), X = sqrt(s); Abramowitz & Stegun 29.3.90."""
+    return np.exp(-np.square(z) / (4 * T)) * erfcx(z / (2 * np.sqrt(T)) - k * np.sqrt(T))
+
+
+def terzaghi_pressure(z: ArrayLike, t: ArrayLike, height: float, cv: float, p0: float = 1.0) -> Array:
+    """Return the pore pressure of a layer that drains at one end and is sealed at the other.
+
+    Parameters
+    ----------
+    z : (...), m, in [0, height]; distance from the drained end, broadcasts with t
+    t : (...), s, > 0; time since the pressure was p0
+    height, cv : m and m²/s, > 0; length, and coefficient of consolidation kappa / (S + alpha²/(K + 4G/3))
+    p0 : Pa; pressure at t = 0+
+
+    Returns (...), Pa. Source: Terzaghi (1923); both series in Verruijt, Theory and Problems of Poroelasticity.
+    """
+    _positive(height=height, cv=cv, t=t)
+    zeta, T = np.broadcast_arrays(_within("z", z, height) / height, cv * np.asarray(t, dtype=float) / height**2)
+    m = (np.arange(TERMS) + 0.5) * np.pi
+    return p0 * _by_time(
+        lambda T: erf(zeta / (2 * np.sqrt(T))) - erfc((2 - zeta) / (2 * np.sqrt(T))),
+        lambda T: _series(2 / m * np.sin(m * zeta[..., None]), m, T),
+        T,
+    )
+
+
+def terzaghi_consolidation(t: ArrayLike, height: float, cv: float) -> Array:
+    """Return the degree of consolidation: settlement since t = 0+ over its final value.
+
+    The parameters are those of `terzaghi_pressure`: t (...), s, > 0; height, m, > 0; cv, m²/s, > 0.
+    Returns (...), in (0, 1]. Source: Terzaghi (1923); Verruijt.
+    """
+    _positive(height=height, cv=cv, t=t)
+    m = (np.arange(TERMS) + 0.5) * np.pi
+    T = cv * np.asarray(t, dtype=float) / height**2
+    return _by_time(lambda T: 2 * np.sqrt(T / np.pi), lambda T: 1 - _series(2 / m**2, m, T), T)
+
+
+@dataclass(frozen=True)
+class Mandel:
+    """Mandel's slab in plane strain, squeezed from t = 0 by rigid smooth plates, free and drained at its sides.
+
+    One quarter of the slab: symmetry at x = 0 and at y = 0, the plate at y = b, the drained side at x = a.
+
+    Parameters
+    ----------
+    a, b : m, > 0; width and height of the quarter, half of those of the slab
+    bulk, shear : Pa, > 0; drained moduli K and G (K of three dimensions)
+    mobility : m²/(Pa s), > 0; kappa = permeability / viscosity = conductivity / (density of the fluid * g)
+    storage : 1/Pa, >= 0; S at constant strain, n/K_w + (alpha - n)/K_s
+    alpha : in (0, 1]; Biot's coefficient
+    force : N/m; resultant on the plate of width a, per depth, positive in compression
+
+    Source: Mandel (1953), Géotechnique 3; Cheng & Detournay (1988), Int. J. Numer. Anal. Methods Geomech. 12;
+    Abousleiman et al. (1996), Géotechnique 46. Their (1 - nu)/(nu_u - nu) is written with K, G, alpha and S.
+    """
+
+    a: float
+    b: float
+    bulk: float
+    shear: float
+    mobility: float
+    storage: float = 0.0
+    alpha: float = 1.0
+    force: float = 1.0
+
+    def __post_init__(self):
+        _positive(a=self.a, b=self.b, bulk=self.bulk, shear=self.shear, mobility=self.mobility)
+        _check(self.storage >= 0, "storage", self.storage, ">= 0")
+        _check(0 < self.alpha <= 1, "alpha", self.alpha, "in (0, 1]")
+
+    @property
+    def _oedometric(self) -> float:
+        return self.bulk + 4 / 3 * self.shear
+
+    @property
+    def cv(self) -> float:
+        """Coefficient of consolidation kappa / (S + alpha²/(K + 4G/3)), m²/s."""
+        return self.mobility / (self.storage + self.alpha**2 / self._oedometric)
+
+    @property
+    def nu_undrained(self) -> float:
+        """Undrained Poisson ratio, that of G and the bulk modulus K + alpha²/S; 0.5 for S = 0."""
+        bulk, shear = self.bulk * self.storage + self.alpha**2, self.shear * self.storage
+        return (3 * bulk - 2 * shear) / (6 * bulk + 2 * shear)
+
+    @property
+    def skempton(self) -> float:
+        """Skempton's coefficient B = alpha / (alpha² + K S)."""
+        return self.alpha / (self.alpha**2 + self.bulk * self.storage)
+
+    @property
+    def _ratio(self) -> float:
+        """(1 - nu)/(nu_u - nu) > 1, without the difference."""
+        return 1 + (self.bulk / self.shear + 1 / 3) * (1 + self._oedometric * self.storage / self.alpha**2)
+
+    @cached_property
+    def roots(self) -> Array:
+        """The first positive roots of tan(r) = r (1 - nu)/(nu_u - nu), (TERMS,)."""
+        n = np.arange(TERMS) * np.pi
+        r = n + np.pi / 2
+        for _ in range(50):  # Newton on a convex function, from its positive side: monotone
+            r = r - (r - n - np.arctan(self._ratio * r)) / (1 - self._ratio / (1 + (self._ratio * r) ** 2))
+        return r
+
+    def pressure(self, x: ArrayLike, t: ArrayLike) -> Array:
+        """Return the pore pressure, the same at all y.
+
+        Distances from the middle x are (...), m, in [0, a], and broadcast with times t (...), s, > 0.
+        Returns (...), Pa; at t = 0+ it is B (1 + nu_u) force / (3 a). Source: see the class.
+        """
+        return self._pressures(x, t)[0]
+
+    def displacement(self, x: ArrayLike, y: ArrayLike, t: ArrayLike) -> tuple[Array, Array]:
+        """Return the displacement from the state before the force.
+
+        Positions x and y are (...), m, in [0, a] and [0, b]; each broadcasts with times t (...), s, > 0.
+        Returns (u_x, u_y), m; u_x does not depend on y, u_y not on x. Source: the pressure, no lateral total
+        stress, and the resultant on the plate; equal to the class's papers.
+        """
+        x, y = np.asarray(x, dtype=float), _within("y", y, self.b)
+        plane = self.bulk + self.shear / 3  # lambda + G
+        load = self.force / self.a * self._oedometric / (2 * self.shear)
+        strain = (self.alpha * self._pressures(self.a, t)[1] - load) / (2 * plane)
+        lateral = self.alpha * self._pressures(x, t)[1] * self.a - (plane - self.shear) * strain * x
+        return lateral / self._oedometric, strain * y
+
+    def _pressures(self, x: ArrayLike, t: ArrayLike) -> Array:
+        """Return the pressure, and its integral from 0 to x over a, (2, ...)."""
+        _positive(t=t)
+        xi, T = np.broadcast_arrays(_within("x", x, self.a) / self.a, self.cv * np.asarray(t, dtype=float) / self.a**2)
+        p0 = self.skempton * (1 + self.nu_undrained) * self.force / (3 * self.a)
+        return p0 * _by_time(lambda T: self._short(xi, T), lambda T: self._long(xi, T), T)
+
+    def _long(self, xi: Array, T: Array) -> Array:
+        r, xi = self.roots, xi[..., None]
+        shapes = np.stack([np.cos(r * xi) - np.cos(r), np.sin(r * xi) / r - xi * np.cos(r)])
+        return _series(2 * np.sin(r) / (r - np.sin(r) * np.cos(r)) * shapes, r, T)
+
+    def _short(self, xi: Array, T: Array) -> Array:
+        k = 1 / self._ratio
+        e0, e1, e2 = (_transient(k, z, T) for z in (0, 1 - xi, 1 + xi))
+        i1, i2 = ((e - erfc(z / (2 * np.sqrt(T)))) / k for e, z in ((e1, 1 - xi), (e2, 1 + xi)))  # divided by X
+        return np.stack([e0 - e1 - e2, xi * e0 - i1 + i2])
+
+
+def cryer_pressure(t: ArrayLike, radius: float, cv: float, nu: float, p0: float = 1.0) -> Array:
+    """Return the pore pressure at the centre of a loaded sphere that drains at its surface.
+
+    Parameters
+    ----------
+    t : (...), s, > 0; time
+    radius, cv : m and m²/s, > 0; radius, and kappa (K + 4G/3): fluid and grains are incompressible
+    nu : in (0, 0.5); drained Poisson ratio
+    p0 : Pa; uniform load on the surface, and the pressure at t = 0+
+
+    Returns (...), Pa. Source: Cryer (1963), Q. J. Mech. Appl. Math. 16; Verruijt.
+    """
+    _positive(radius=radius, cv=cv, t=t)
+    _check(0 < nu < 0.5, "nu", nu, "in (0, 0.5)")
+    mu = 2 * (1 - 2 * nu) / (1 - nu)  # 4G/(K + 4G/3)
+    T = cv * np.asarray(t, dtype=float) / radius**2
+    return p0 * _by_time(lambda T: _cryer_short(mu, T), lambda T: _cryer_long(mu, T), T)
+
+
+def _cryer_short(mu: float, T: Array) -> Array:
+    """Invert (1 - 2 X exp(-X)) / (X² - mu X + mu), whose poles in X are k and its conjugate."""
+    k = (mu + 1j * np.sqrt(mu * (4 - mu))) / 2
+    uniform = (k * _transient(k, 0, T)).imag / k.imag
+    gauss = np.exp(-1 / (4 * T)) / np.sqrt(np.pi * T)
+    return uniform - 2 * (gauss + (k**2 * _transient(k, 1, T)).imag / k.imag)
+
+
+def _cryer_long(mu: float, T: Array) -> Array:
+    def zero(x):  # (1 - x²/mu) tan(x) = x
+        return x * np.cos(x) - (1 - x**2 / mu) * np.sin(x)
+
+    r = np.array([brentq(zero, max(n * np.pi, 0.1), (n + 1) * np.pi, xtol=1e-14) for n in range(TERMS)])
+    return _series(2 * (np.sin(r) - r) / ((2 - mu) * np.sin(r) + r * np.cos(r)), r, T)
+
+
+@dataclass(frozen=True)
+class SelfWeightColumn:
+    """Column of Hencky's material, held laterally, standing at Y = 0 under its own weight.
+
+    With no lateral stretch, Cauchy's and the first Piola-Kirchhoff stress along the column are both
+    tau / stretch, and carry the weight above. For nu = 0 the modulus K + 4G/3 is Young's.
+
+    Parameters
+    ----------
+    l0 : m, > 0; height without weight
+    bulk, shear : Pa, > 0; moduli K and G of tau = (K + 4G/3) ln(stretch)
+    density : kg/m³, > 0; without weight
+    gravity : m/s², > 0; downwards
+
+    Source: tau / stretch = -density gravity (l0 - Y), solved with W of Corless et al. (1996), Adv. Comput. Math. 5.
+    """
+
+    l0: float
+    bulk: float
+    shear: float
+    density: float
+    gravity: float
+
+    def __post_init__(self):
+        _positive(**vars(self))
+
+    def _shortening(self, Y: ArrayLike) -> Array:
+        """Return w = -ln(stretch), the solution of w exp(w) = weight above / (K + 4G/3)."""
+        return lambertw(-self.stress(Y) / (self.bulk + 4 / 3 * self.shear)).real
+
+    def stress(self, Y: ArrayLike) -> Array:
+        """Return the vertical Cauchy stress (...), Pa, at heights Y (...), m, in [0, l0]. Source: the weight above."""
+        return -self.density * self.gravity * (self.l0 - _within("Y", Y, self.l0))
+
+    def stretch(self, Y: ArrayLike) -> Array:
+        """Return the stretch (...), in (0, 1], at heights Y (...), m, in [0, l0]. Source: see the class."""
+        return np.exp(-self._shortening(Y))
+
+    def position(self, Y: ArrayLike) -> Array:
+        """Return the heights (...), m, now of what was at Y (...), m, in [0, l0]. Source: integral of the stretch."""
+        foot, w = self._shortening(0.0), self._shortening(Y)
+        return self.l0 * (foot - w) * (1 + (foot + w) / 2) / (foot * np.exp(foot))
+
+    @property
+    def height(self) -> float:
+        """The height of the column now, m."""
+        return float(self.position(self.l0))
+
+
+def elastica_tip(load_parameter: float) -> tuple[float, float]:
+    """Return the displacement of the tip of an inextensible cantilever under a dead transverse load there.
+
+    The load_parameter is P L²/(E I), in [0, 1e5].
+    Returns (shortening u/L, deflection v/L), to 1e-12 absolute. Source: Bisshopp & Drucker (1945), Q. Appl. Math. 3.
+    """
+    _check(0 <= load_parameter <= 1e5, "load_parameter", load_parameter, "in [0, 1e5]")
+    if load_parameter < 1e-4:
+        return load_parameter**2 / 15, load_parameter / 3
+    root = np.sqrt(load_parameter)
+
+    def angles(q):  # for a rotation of the tip whose sine is 1 - exp(-q)
+        return np.exp(-q) / 2, np.arctan2(1, np.sqrt(-np.expm1(-q)))
+
+    def excess(q):
+        m1, theta = angles(q)
+        return ellipkm1(m1) - ellipkinc(theta, 1 - m1) - root
+
+    m1, theta = angles(q := brentq(excess, 0, 650, xtol=1e-300, rtol=1e-15))
+    v = 1 - 2 / root * (ellipe(1 - m1) - ellipeinc(theta, 1 - m1))
+    return float(1 - np.sqrt(-2 * np.expm1(-q)) / root), float(v)
+
+
+def shear_flexible_rod(
+    length: float, EA: float, GA: float, EI: float, end_load: float = 0, line_load: float = 0, points: ArrayLike = 101
+) -> Array:
+    """Return the deformed axis of a geometrically exact planar cantilever that stretches and shears.
+
+    The rod lies along x from its clamp at the origin. Loads are dead, and positive along +y.
+
+    Parameters
+    ----------
+    length : m, > 0
+    EA, GA, EI : N, N, N m² (per depth: N/m, N/m, N m), > 0, inf allowed for EA and GA; GA with its shear correction
+    end_load, line_load : N and N/m; force at the end, and per reference length
+    points : at least 2 equidistant points from end to end, or their reference arclengths (n,), m, in [0, length]
+
+    Returns (n, 2), m, by collocation with a residual of 1e-8. Source: Reissner (1972), ZAMP 23; Simo (1985), CMAME 49.
+    """
+    _positive(length=length, EA=EA, GA=GA, EI=EI)
+    _check(np.isfinite([end_load, line_load]), "end_load, line_load", [end_load, line_load], "finite")
+    _check(np.ndim(points) or points >= 2, "points", points, "at least 2, or arclengths")
+    points = points if np.ndim(points) else np.linspace(0, length, points)
+    s = _within("points", points, length) / length
+    loads = np.array([end_load * length**2, line_load * length**3]) / EI
+    return length * _rod(loads, EI / (EA * length**2), EI / (GA * length**2))(s)[:2].T
+
+
+def _rod(loads: Array, axial: float, shear: float):
+    """Solve for (x, y, rotation, moment) of the rod of unit length and bending stiffness, in steps of the load."""
+    s, state = np.linspace(0, 1, 41), np.zeros((4, 41))
+    state[0] = s
+
+    def slope(s, state):
+        force = part * (loads[0] + loads[1] * (1 - s))
+        cos, sin = np.cos(state[2]), np.sin(state[2])
+        stretch, slip = 1 + axial * force * sin, shear * force * cos
+        x = stretch * cos - slip * sin
+        return np.array([x, stretch * sin + slip * cos, state[3], -force * x])
+
+    for part in np.linspace(0, 1, 1 + max(1, int(np.ceil(np.abs(loads).sum() / 2))))[1:]:
+        solution = solve_bvp(slope, lambda a, b: np.append(a[:3], b[3]), s, state, tol=1e-8, max_nodes=20000)
+        if not solution.success:
+            raise RuntimeError(f"rod under {part:.3g} of its load: {solution.message}")
+        s, state = solution.x, solution.y
+    return solution.sol

@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: MIT
+"""Orders of convergence to exact solutions, each as a rate and as a ceiling of the error."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+import self_weight_column
+import terzaghi
+
+
+def rates(errors):
+    """Return the orders between errors at sizes that are halved each time."""
+    return np.log2(np.array(errors[:-1]) / np.array(errors[1:]))
+
+
+# ---- Terzaghi: in space, against the exact solution of what backward Euler leaves of the equation ----
+
+
+def backward_euler(z, steps, size):
+    """Return (p / p0 at depths z, consolidation) after steps of backward Euler of a size in T_v, exact in space."""
+    m = (np.arange(4000) + 0.5) * np.pi
+    left = (1 + m**2 * size) ** -float(steps)
+    return (2 / m * np.sin(np.outer(z, m)) * left).sum(axis=1), 1 - (2 / m**2 * left).sum()
+
+
+@cache
+def errors_in_space(cells, steps=20):
+    """Return the largest errors over depth and time of p / p0 and of the consolidation at the same time steps."""
+    out = terzaghi.run(cells, steps)
+    exact = [backward_euler(z, k + 1, 1 / steps) for k, z in enumerate(out.z)]
+    p = max(np.abs(p - e[0]).max() for p, e in zip(out.p, exact, strict=True))
+    return p, max(abs(s - e[1]) for s, e in zip(out.settlement, exact, strict=True))
+
+
+@pytest.mark.parametrize("which, ceiling", [(0, 4e-4), (1, 1e-4)], ids=["pressure", "settlement"])
+def test_consolidation_is_of_second_order_in_the_cell_size(which, ceiling):
+    errors = [errors_in_space(cells)[which] for cells in (10, 20, 40, 80)]
+    assert rates(errors).min() > 1.7 and errors[-1] < ceiling, errors
+
+
+@cache
+def errors_in_time(steps):
+    return terzaghi.errors(terzaghi.run(50, steps))
+
+
+@pytest.mark.parametrize(
+    "name, ceiling", [("p_0.1", 6.9e-3), ("p_0.5", 2.9e-3), ("p_1", 1.7e-3), ("settlement", 2.5e-3)]
+)
+def test_consolidation_is_of_first_order_in_the_time_step(name, ceiling):
+    errors = [errors_in_time(steps)[name] for steps in (50, 100, 200)]  # of the last, 2 % are due to the cells
+    assert rates(errors).min() > 0.85 and errors[-1] < ceiling, errors
+
+
+@pytest.mark.parametrize("strain", [1e-4, 1e-7])
+def test_consolidation_does_not_depend_on_how_small_the_load_is(strain):
+    """Domains that leave their cells by next to nothing must not close the faces between cells."""
+    p = terzaghi.run(50, 50, strain).p
+    assert max(np.abs(a - b).max() for a, b in zip(p, terzaghi.run(50, 50).p, strict=True)) < 3 * max(strain, 1e-5)
+
+
+# ---- column under its own weight ----
+
+
+@cache
+def column_errors(cells, quadrature="domain"):
+    return self_weight_column.errors(self_weight_column.run(cells, 40, quadrature))
+
+
+CEILINGS = {4: 3.5e-2, 8: 1.1e-2, 16: 3.7e-3, 32: 1e-3, 64: 4.4e-4}  # published for GIMP: those of 16 and 64
+
+
+@pytest.mark.parametrize("cells", CEILINGS)
+def test_the_columns_stress_is_as_good_as_published(cells):
+    assert column_errors(cells)["stress"] < CEILINGS[cells]
+
+
+def test_the_columns_stress_converges_with_the_cell_size():
+    errors = [column_errors(cells)["stress"] for cells in (4, 8, 16, 32)]
+    assert rates(errors).min() > 1.5, errors
+
+
+@pytest.mark.parametrize("cells, ceiling", [(16, 2e-4), (32, 5e-5), (64, 5e-5)])
+def test_the_columns_height_is_exact(cells, ceiling):
+    assert column_errors(cells)["height"] < ceiling
+
+
+def test_the_columns_stress_does_not_converge_when_integrated_at_the_points():
+    errors = [column_errors(cells, "point")["stress"] for cells in (8, 16, 32, 64)]
+    assert min(errors) > 0.03, errors
