@@ -132,16 +132,18 @@ def _sum(grid: Grid, y: NDArray[np.float64], s: NDArray[np.float64], owner: NDAr
 def _slice(s: NDArray[np.float64], owner: NDArray[np.int64], axis: int):
     """Slice simplices by the integer planes of an axis until none crosses a plane."""
     done_s, done_owner = [], []
-    while len(owner):
+    while True:
         t = s[:, axis]
         plane = np.floor(t.min(axis=0)) + 1
         crossing = t.max(axis=0) > plane
+        if not crossing.any():
+            break
         done_s.append(s[:, :, ~crossing])
         done_owner.append(owner[~crossing])
         below, below_owner, s, owner = _cut_at(s[:, :, crossing], owner[crossing], axis, plane[crossing])
         done_s.append(below)
         done_owner.append(below_owner)
-    return np.concatenate([s, *done_s], axis=2), np.concatenate([owner, *done_owner])
+    return (np.concatenate([s, *done_s], axis=2), np.concatenate([owner, *done_owner])) if done_s else (s, owner)
 
 
 def _cut_at(s, owner, axis: int, plane):
