@@ -171,7 +171,7 @@ class Simulation:
         self._place_loads(t)
         self.momentum.start()
         if self.storage:
-            self.storage.start()
+            self.storage.start(t - self.t)
 
     def _reset_grid(self) -> None:
         """Rebuild the integration data on the fresh grid: pieces, active cells, remapped pressure."""
@@ -237,6 +237,7 @@ class Simulation:
                 pieces.data["storage"][:, 0],
                 self.placement.pieces_to_cells(self._brought),
                 self._fixed_stress(J),
+                self._rows(lambda m: m.pressure_damping(grid.dim)),
             )
             self._open_boundary()
         if renumbered:

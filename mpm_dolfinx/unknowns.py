@@ -94,6 +94,7 @@ def direct_solver(A: PETSc.Mat, name: str) -> PETSc.KSP:
         ksp.pc.setFactorSolverType("mumps")
     else:
         ksp.pc.setFactorOrdering(PETSc.Mat.OrderingType.ND)
+        ksp.pc.setFactorPivot(0.0)  # PETSc's 2e-14 refuses slivers of cells: rows of any scale are welcome
     ksp.setOperators(A)
     ksp.setFromOptions()
     return ksp

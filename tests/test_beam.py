@@ -71,3 +71,16 @@ def test_the_drained_tip_holds_for_hundreds_of_steps(load, monkeypatch):
     fem = BiotFEM([0, 0], [1, 0.3], demo.REFERENCE_CELLS, demo.material(o), **demo.physics(o))
     exact = fem.run(1.0, o.dt, probes=[[1.0, 0.15]]).displacement[-1][0, 1]
     assert np.abs(tips / exact - 1).max() < 1e-3
+
+
+def test_the_undrained_tip_is_that_of_sealed_finite_elements_and_does_not_creep():
+    o = demo.arguments("--conductivity 1e-12 --t-end 0.3".split())
+    simulation, bottom = demo.scene(o)
+    result = simulation.run(o.t_end, o.dt, probes=mpm.probes(simulation.bodies, [[1.0, bottom + 0.15]]))
+    sealed = {**demo.physics(o), "drained": []}
+    fem = BiotFEM([0, 0], [1, 0.3], (40, 12), demo.material(o), **sealed)
+    exact = fem.run(0.06, o.dt, probes=[[1.0, 0.15]]).displacement[-1][0, 1]
+    tips = np.array(result.displacement)[3:, 0, 1]
+    assert tips[0] == pytest.approx(exact, rel=6e-3)
+    assert np.ptp(tips) < 5e-3 * abs(tips[0])
+    assert result.balance <= 1e-8 and result.coupling < 45 * result.steps

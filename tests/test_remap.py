@@ -19,7 +19,7 @@ def test_a_thousand_resets_of_a_body_at_rest_change_nothing():
     for _ in range(1000):
         s._move_points()
         s._reset_grid()
-        s.storage.start()
+        s.storage.start(1.0)
     assert np.abs(s.storage.p.x.array[cells] - pressure[cells]).max() < 1e-12 * np.abs(pressure).max()
 
 
