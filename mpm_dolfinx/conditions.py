@@ -82,8 +82,8 @@ RIGIDITY = 1e4
 class RigidPlate:
     """Rigid, smooth plate on a flat side of the bodies: one displacement along the side's axis for all its faces.
 
-    The tangential gradient of the normal displacement is penalised, kappa/2 int |grad_t u_n|^2 dA on the
-    step's increment; a uniform displacement is free, so the plate carries the given total force exactly.
+    The slope of the faces is penalised, kappa/2 int |grad_t x_n|^2 dA; an even displacement is free, so
+    the plate carries the given total force exactly.
 
     Parameters
     ----------

@@ -48,7 +48,7 @@ class Momentum:
     gravity : (d,), m/s^2
         Acceleration, a UFL constant; the pieces then carry `density`, kg/m^3.
     plates
-        Whether the scene has rigid plates: points `plates` with their rigidity and normal.
+        Whether the scene has rigid plates: points `plates` with their rigidity, normal and present tilt.
     """
 
     def __init__(
@@ -86,19 +86,20 @@ class Momentum:
             self._weight = PointForm(pieces.density * ufl.inner(gravity, pieces.value(v)) * pieces.dx, pieces)
         self._plate = None
         if plates:
-            self.plates = FormPoints(grid, rigidity=(), normal=(grid.dim,))
-            self._plate = PointForm(self._bend(v, du), self.plates)
+            self.plates = FormPoints(grid, rigidity=(), normal=(grid.dim,), tilt=(grid.dim,))
+            self._plate = PointForm(self._bend(v, self._slope(du)), self.plates)
+            self._tilt = PointForm(-self._bend(v, self.plates.tilt), self.plates)
         self._ghost(V, v, du)
 
-    def _bend(self, v, du) -> ufl.Form:
-        """Return the penalty of plates that bend or turn: kappa grad_t(u_n) . grad_t(v_n)."""
+    def _slope(self, w):
+        """Return the tangential gradient of the normal displacement, grad_t(w_n), at the plates."""
         n = self.plates.normal
+        gradient = ufl.dot(n, self.plates.grad(w))
+        return gradient - ufl.dot(gradient, n) * n
 
-        def slope(w):
-            gradient = ufl.dot(n, self.plates.grad(w))
-            return gradient - ufl.dot(gradient, n) * n
-
-        return self.plates.rigidity * ufl.inner(slope(du), slope(v)) * self.plates.dx
+    def _bend(self, v, slope) -> ufl.Form:
+        """Return the work of plates that bend or turn by a slope: kappa slope . grad_t(v_n)."""
+        return self.plates.rigidity * ufl.inner(slope, self._slope(v)) * self.plates.dx
 
     def _ghost(self, V, v, du) -> None:
         """Penalise jumps of the normal derivative on faces of partly filled cells (Burman 2010, Coombs 2023).
@@ -149,7 +150,7 @@ class Momentum:
             self.residual = self.unknowns.vector()
             self._ghost_form.bind(facets)
         stiffness = float(self.modulus.x.array[cells].max(initial=0.0)) * self.grid.cell_volume / self.grid.h.min()
-        self.round_off = 1e-13 * self.grid.comm.allreduce(stiffness) * np.sqrt(max(1, self.unknowns.global_size))
+        self.round_off = 1e-14 * self.grid.comm.allreduce(stiffness) * np.sqrt(max(1, self.unknowns.global_size))
         return changed
 
     def set_penalty(self) -> None:
@@ -176,6 +177,8 @@ class Momentum:
         self._traction.assemble_vector(self._f.x.array)
         if self._weight is not None:
             self._weight.assemble_vector(self._f.x.array)
+        if self._plate is not None:
+            self._tilt.assemble_vector(self._f.x.array)
         self._external = sum_ghosts(self._f)
 
     def start(self) -> None:

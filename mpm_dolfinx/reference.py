@@ -202,9 +202,15 @@ class BiotFEM:
         return flux
 
     def _make_solver(self) -> None:
-        """Set up Newton's method with line search and a direct solver."""
+        """Set up Newton's method with full steps and a direct solver.
+
+        A line search on the residual crawls where a slender body turns: rotations stretch at first order.
+        """
+        options, prefix = PETSc.Options(), "mpm_reference_"
+        if not options.hasName(f"{prefix}snes_linesearch_type"):
+            options[f"{prefix}snes_linesearch_type"] = "basic"
         self._snes = PETSc.SNES().create(self.grid.comm)
-        self._snes.setOptionsPrefix("mpm_reference_")
+        self._snes.setOptionsPrefix(prefix)
         self._snes.setFunction(self._residual, _compat.petsc_vec(self._b).duplicate())
         self._snes.setJacobian(self._tangent, petsc.create_matrix(self._tangent_form))
         self._snes.ksp.setType("preonly")

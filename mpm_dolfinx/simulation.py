@@ -293,12 +293,15 @@ class Simulation:
         modulus = max(m.oedometric for m in self.materials)
         for _, faces in self._plates:
             _, at, cell, x = self.placement.surface(faces)
-            size = np.linalg.norm(face_vectors(self.points.corners[at], faces.axis, faces.end), axis=1)
+            area = face_vectors(self.points.corners[at], faces.axis, faces.end)
             length = faces.area0.sum() ** (1 / (grid.dim - 1))
-            rows.append((cell, x, np.outer(RIGIDITY * modulus * length * size, np.eye(grid.dim)[faces.axis])))
-        cell, x, normal = self._gathered(rows, (grid.dim,))
-        rigidity = np.linalg.norm(normal, axis=1)
-        self.momentum.plates.place(cell, x, np.ones(len(cell)), rigidity=rigidity, normal=normal / rigidity[:, None])
+            rigidity = RIGIDITY * modulus * length * np.linalg.norm(area, axis=1, keepdims=True)
+            normal = np.tile(np.eye(grid.dim)[faces.axis], (len(at), 1))
+            tilt = normal - area / area[:, [faces.axis]]  # slope of the face: its normal is (-slope, 1)
+            rows.append((cell, x, np.concatenate([rigidity, normal, tilt], axis=1)))
+        cell, x, values = self._gathered(rows, (1 + 2 * grid.dim,))
+        rigidity, normal, tilt = np.split(values, [1, 1 + grid.dim], axis=1)
+        self.momentum.plates.place(cell, x, np.ones(len(cell)), rigidity=rigidity, normal=normal, tilt=tilt)
 
     def _gathered(self, rows: list, shape: tuple[int, ...]) -> tuple[NDArray, NDArray, NDArray]:
         """Send (cells, positions, values) to the owners of the cells; return (owned cells, positions, values)."""

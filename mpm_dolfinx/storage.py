@@ -246,7 +246,7 @@ class Storage:
         p = self.unknowns.gather(self.p.x.array, self._p)
         # what rounding may leave: of the volumes and of the fluxes that cancel
         turnover = dt * (np.abs(self._outflow) @ np.abs(p.array_r))
-        self.round_off = comm.allreduce(1e-14 * (self._volume + turnover))
+        self.round_off = comm.allreduce(2e-15 * (self._volume + turnover))
         flux = self.T * p
         flux.axpy(1.0, self._rate)
         r.axpy(dt, flux)

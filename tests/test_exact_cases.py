@@ -3,8 +3,6 @@
 
 from functools import cache
 
-from petsc4py import PETSc
-
 import cantilever
 import mandel
 import numpy as np
@@ -52,34 +50,32 @@ def test_the_modes_are_those_of_the_exact_solution():
     assert backward_euler(x, 4, 10**6) == pytest.approx(mandel.EXACT.pressure(x, t), abs=1e-5 * mandel.FORCE)
 
 
-@pytest.mark.parametrize("stage, ceiling", [(0, 1.6e-3), (1, 3e-4), (2, 1e-4), (3, 5e-5)], ids=map(str, mandel.SAMPLES))
+@pytest.mark.parametrize(
+    "stage, ceiling", [(0, 1.2e-3), (1, 1.3e-4), (2, 6e-5), (3, 5e-5)], ids=map(str, mandel.SAMPLES)
+)
 def test_the_slabs_pressure_is_of_second_order_in_the_cell_size(stage, ceiling):
     errors = [error_in_space(cells, stage) for cells in (10, 20, 40)]
-    print(errors, rates(errors))
-    assert rates(errors).min() > 1.5 and errors[-1] < ceiling, errors
+    assert rates(errors).min() > 1.8 and errors[-1] < ceiling, errors
 
 
-@pytest.mark.parametrize("name, ceiling", [("p_0.5", 1.5e-3), ("p_1", 1.6e-3), ("p_max", 1.9e-3)])
+@pytest.mark.parametrize("name, ceiling", [("p_0.5", 1.8e-3), ("p_1", 1.9e-3), ("p_max", 2.2e-3)])
 def test_the_slabs_pressure_is_of_first_order_in_the_time_step(name, ceiling):
-    errors = [slab(40, steps)[0][name] for steps in (12, 25, 50)]
-    print(errors, rates(errors))
-    assert rates(errors).min() > 0.8 and errors[-1] < ceiling, errors
+    errors = [slab(40, steps)[0][name] for steps in (10, 20, 40)]
+    assert rates(errors).min() > 0.85 and errors[-1] < ceiling, errors
 
 
 def test_the_pressure_rise_in_the_middle_is_exact_within_a_percent():
     errors, out = mandel.run()
     peak = max(p[0, 0] for p in out.p) * mandel.WIDTH / mandel.FORCE
-    print(errors)
     assert peak > 0.55  # 0.5 at first
     assert errors["p_max"] < 1e-3 and errors["p_rise"] < 1e-2
     assert max(error for name, error in errors.items() if name != "p_rise") < 2e-3
 
 
 def test_the_plate_stays_even_and_settles_as_exact():
-    errors, out = slab(40, 50)
+    errors, out = slab(40, 40)
     spread = [np.ptp(top) / top.mean() for top in out.settlement]
-    print(max(spread))
-    assert max(spread) < 5e-4 and errors["settlement"] < 1e-3
+    assert max(spread) < 1e-5 and errors["settlement"] < 1.2e-3
 
 
 # ---- cantilever ----
@@ -88,13 +84,8 @@ def test_the_plate_stays_even_and_settles_as_exact():
 @cache
 def finite_elements():
     """Return the displacement (2,) of the tip at alpha = 1 and 5 by Taylor-Hood's elements, converged to 1e-5."""
-    options, name = PETSc.Options(), "mpm_reference_snes_linesearch_type"
-    options[name] = "basic"  # a line search on the residual crawls where a slender body turns
-    try:
-        body = [cantilever.LENGTH, cantilever.HEIGHT]
-        fem = BiotFEM([0, 0], body, [40, 4], cantilever.RUBBER, **cantilever.PHYSICS)
-    finally:
-        options.delValue(name)
+    body = [cantilever.LENGTH, cantilever.HEIGHT]
+    fem = BiotFEM([0, 0], body, [40, 4], cantilever.RUBBER, **cantilever.PHYSICS)
     result = fem.run(5, 0.5, probes=[[body[0], body[1] / 2]])
     return {alpha: result.displacement[round(2 * alpha)][0] for alpha in (1, 5)}
 
@@ -112,19 +103,16 @@ def tip_error(cells, alpha):
 @pytest.mark.parametrize("alpha, ceiling", [(1, 3e-4), (5, 1.3e-3)])
 def test_the_cantilevers_tip_is_the_rods(alpha, ceiling):
     errors = bent(8)[0]
-    print(errors)
     assert max(errors[f"v_{alpha}"], errors[f"u_{alpha}"]) < ceiling
 
 
 @pytest.mark.parametrize("alpha, ceiling", [(1, 2.5e-4), (5, 1e-3)])
 def test_the_cantilevers_tip_is_the_finite_elements(alpha, ceiling):
-    print(tip_error(8, alpha))
     assert tip_error(8, alpha) < ceiling
 
 
 def test_the_cantilevers_tip_converges_to_the_finite_elements():
     errors = [tip_error(cells, 5) for cells in (4, 8, 16)]
-    print(errors, rates(errors))
     assert rates(errors).min() > 1.6 and errors[-1] < 3e-4, errors
 
 
