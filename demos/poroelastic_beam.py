@@ -199,7 +199,8 @@ def draw_pressure(o: argparse.Namespace, snapshots: list) -> None:
     """Draw the pore pressure on the material points at six times."""
     from matplotlib.collections import PolyCollection
 
-    fig, axes = figure(2, 3, (13, 6))
+    rows = 1 + (len(snapshots) > 3)
+    fig, axes = figure(rows, 3, (13, 3 * rows))
     for ax, (t, corners, pressure) in zip(axes.ravel(), snapshots, strict=False):
         limit = np.abs(pressure).max() / 1e3
         domains = PolyCollection(corners[:, [0, 1, 3, 2]], array=pressure / 1e3, cmap="RdBu_r", edgecolors="face")
