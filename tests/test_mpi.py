@@ -20,18 +20,15 @@ def mpirun(processes: int, script: str, *arguments: str) -> None:
     assert done.returncode == 0, done.stderr[-3000:]
 
 
-@pytest.fixture(scope="module")
-def alone(tmp_path_factory):
-    file = tmp_path_factory.mktemp("mpi") / "one.npz"
-    mpirun(1, "mpi_beam.py", str(file))
-    return np.load(file)
-
-
-@pytest.mark.parametrize("processes", [2, 3])
-def test_the_beam_is_the_same_on_several_processes(alone, processes, tmp_path):
-    mpirun(processes, "mpi_beam.py", str(tmp_path / "many.npz"))
-    many = np.load(tmp_path / "many.npz")
-    assert len(many["counts"]) == processes
-    assert many["x"] == pytest.approx(alone["x"], abs=1e-10)
-    assert many["p"] == pytest.approx(alone["p"], abs=1e-8 * np.abs(alone["p"]).max())
-    assert many["balance"] <= 1e-8
+@pytest.mark.parametrize("scene", ["mpi_beam.py", "mpi_slab.py"])
+def test_the_state_is_the_same_on_several_processes(scene, tmp_path):
+    states = []
+    for processes in (1, 2, 3):
+        file = tmp_path / f"{processes}.npz"
+        mpirun(processes, scene, str(file))
+        states.append(np.load(file))
+        assert len(states[-1]["counts"]) == processes and states[-1]["balance"] <= 1e-8
+    for other in states[1:]:
+        assert other["x"] == pytest.approx(states[0]["x"], abs=1e-10)
+        for name in set(other.files) - {"x", "tip", "balance", "counts"}:
+            assert other[name] == pytest.approx(states[0][name], abs=1e-8 * np.abs(states[0][name]).max())

@@ -1,0 +1,31 @@
+# SPDX-License-Identifier: MIT
+"""Run a slab with a plate, gravity, inflow and next to no flow on however many processes there are; write its state."""
+
+import sys
+
+import numpy as np
+
+import mpm_dolfinx as mpm
+
+grid = mpm.Grid([1.2, 1.3], [12, 13])
+slab = mpm.box(grid, [0, 0], [1, 1.03])
+soil = mpm.Hencky(bulk=4e6 / 3, shear=1e6, conductivity=1e-9, biot=0.9, grain_bulk=1e9)
+simulation = mpm.Simulation(
+    grid,
+    [slab],
+    [soil],
+    fluid=mpm.Fluid(),
+    fixed={"left": "x", "bottom": "y"},
+    drained=[mpm.Drained("right", pressure=50.0)],
+    inflows=[mpm.Inflow("left", 1e-9)],
+    plates=[mpm.RigidPlate("top", lambda t: 2e4 * t)],
+    gravity=lambda t: (0, -9.81 * t),
+)
+result = simulation.run(1.0, 0.25, progress=False)
+stress, points = simulation.effective_stress(), simulation.points
+parts = simulation.grid.comm.gather((points.id, points.x, points.pressure, stress))
+if parts:
+    ids, x, p, s = (np.concatenate(a) for a in zip(*parts, strict=True))
+    order = np.argsort(ids)
+    counts = [len(part[0]) for part in parts]
+    np.savez(sys.argv[1], x=x[order], p=p[order], stress=s[order], balance=result.balance, counts=counts)
