@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The same answer on any number of processes, one of which owns no point."""
+"""The same answer on any number of processes."""
 
 import os
 import subprocess
