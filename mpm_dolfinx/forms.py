@@ -15,7 +15,7 @@ No generated code is touched.
 
 from __future__ import annotations
 
-from math import factorial
+from math import factorial, prod
 
 from petsc4py import PETSc
 
@@ -167,6 +167,65 @@ class PointForm:
         rows = self.rows()
         if len(rows):
             self.compiled.assemble_matrix(A, rows)
+
+
+class ElementMatrices:
+    """The bilinear form grad v : A : grad u of P1 vectors over points, summed in each cell before insertion.
+
+    Inserting the matrix of every point costs twice as much as computing it.  Here the entries of the
+    element matrix, A contracted with the gradients of the shape functions at the point, are tested
+    with DG0, so that the assembler sums them over the points of a cell; then each cell is inserted once.
+
+    Parameters
+    ----------
+    tangent : UFL tensor (d, d, d, d)
+        A[i, k, j, l] at the points, with A[i, k, j, l] = A[j, l, i, k].
+    points
+        The points.
+    """
+
+    def __init__(self, tangent: ufl.core.expr.Expr, points: FormPoints):
+        self.points, grid = points, points.grid
+        count = 2**grid.dim * grid.dim
+        rows, columns = np.triu_indices(count)
+        self._entry = np.empty((count, count), dtype=np.int64)  # symmetric: place of each entry in the vector
+        self._entry[rows, columns] = self._entry[columns, rows] = np.arange(len(rows))
+        space = _compat.function_space(grid.mesh, "DG", 0, (len(rows),))
+        self._values, q = fem.Function(space), ufl.TestFunction(space)
+        gradients = self._gradients()
+        integrand = 0
+        for n, (row, column) in enumerate(zip(rows, columns, strict=True)):
+            (v, i), (u, j) = divmod(row, grid.dim), divmod(column, grid.dim)
+            block = ufl.as_matrix([[tangent[int(i), k, int(j), l] for l in range(grid.dim)] for k in range(grid.dim)])
+            integrand += q[n] * ufl.dot(gradients[v], ufl.dot(block, gradients[u]))
+        self._form = PointForm(integrand * points.dx, points)
+        self._version = -1
+
+    def _gradients(self) -> list:
+        """Return the gradients of the shape functions at the point as UFL."""
+        grid, xi = self.points.grid, self.points.offset
+        h = fem.Constant(grid.mesh, grid.h)
+        out = []
+        for signs in grid.signs.tolist():
+            t = [0.5 + signs[a] * xi[a] / h[a] for a in range(grid.dim)]
+            slopes = [signs[a] / h[a] * prod(t[b] for b in range(grid.dim) if b != a) for a in range(grid.dim)]
+            out.append(ufl.as_vector(slopes))
+        return out
+
+    def assemble_matrix(self, A: PETSc.Mat) -> None:
+        """Add the matrix to `A`, by unrolled local dofs; the caller finalises it."""
+        if self._version != self.points.version:
+            self._version = self.points.version
+            self._cells = np.unique(self.points.cells)
+            dofs = self.points.grid.cell_nodes[self._cells][:, :, None] * self.points.grid.dim
+            dofs = dofs + np.arange(self.points.grid.dim)
+            self._dofs = dofs.reshape(len(self._cells), len(self._entry)).astype(PETSc.IntType)
+        if not len(self._cells):
+            return
+        values = self._values.x.array.reshape(len(self._values.x.array) // (self._entry.max() + 1), -1)
+        values[self._cells] = 0.0
+        self._form.assemble_vector(self._values.x.array)
+        A.setValuesLocalRCV(self._dofs, self._dofs, values[self._cells][:, self._entry], addv=True)
 
 
 class PointExpression:

@@ -20,7 +20,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from mpm_dolfinx import _compat
-from mpm_dolfinx.forms import FormPoints, PointForm
+from mpm_dolfinx.forms import ElementMatrices, FormPoints, PointForm
 from mpm_dolfinx.grid import Grid
 from mpm_dolfinx.unknowns import Unknowns, matrix, sum_ghosts, zero
 
@@ -74,10 +74,14 @@ class Momentum:
         # differentiated by F and contracted: in 3D a twentieth of the compile time of derivatives by u
         P = ufl.diff(energy / ufl.det(pieces.F), F)
         A = ufl.diff(P, F)
-        i, j, k, l = ufl.indices(4)
-        dF_v, dF_u = pieces.grad(v) * pieces.F, pieces.grad(du) * pieces.F
-        self._residual = PointForm(ufl.inner(P, dF_v) * pieces.dx, pieces)
-        self._tangent = PointForm(dF_v[i, j] * A[i, j, k, l] * dF_u[k, l] * pieces.dx, pieces)
+        i, j, k, l, m, n = ufl.indices(6)
+        self._residual = PointForm(ufl.inner(P, pieces.grad(v) * pieces.F) * pieces.dx, pieces)
+        if grid.dim == 2:
+            A = ufl.as_tensor(A[i, m, j, n] * pieces.F[k, m] * pieces.F[l, n], (i, k, j, l))
+            self._tangent = ElementMatrices(A, pieces)
+        else:  # 300 entries a cell of the whole grid: memory and compile time do not pay
+            dF_v, dF_u = pieces.grad(v) * pieces.F, pieces.grad(du) * pieces.F
+            self._tangent = PointForm(dF_v[i, j] * A[i, j, k, l] * dF_u[k, l] * pieces.dx, pieces)
 
         self.loads = FormPoints(grid, force=(grid.dim,))
         self._traction = PointForm(ufl.inner(self.loads.force, self.loads.value(v)) * self.loads.dx, self.loads)

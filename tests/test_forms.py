@@ -7,7 +7,7 @@ import ufl
 from dolfinx import fem
 
 from mpm_dolfinx import Grid, Hencky, NeoHookean, _compat
-from mpm_dolfinx.forms import FormPoints, PointForm
+from mpm_dolfinx.forms import ElementMatrices, FormPoints, PointForm
 from mpm_dolfinx.unknowns import Unknowns, matrix
 
 GRIDS = {2: Grid([1.5, 1.0], [4, 3]), 3: Grid([1.0, 1.2, 0.9], [2, 3, 2])}
@@ -109,6 +109,22 @@ def test_tangents_differentiated_by_ufl_equal_finite_differences(dim, law):
         assemble.assemble_vector(ends[-1])
     difference = (ends[0] - ends[1]) / (2 * step)
     assert np.abs(K @ direction - difference).max() < 1e-7 * np.abs(difference).max()
+
+
+def test_element_matrices_equal_the_form_point_by_point(dim):
+    s = Scene(dim, stiffness=())
+    s.place(stiffness=s.rng.uniform(1, 2, len(s.x)))
+    i, j, k, l = ufl.indices(4)
+    one = ufl.Identity(dim)
+    A = s.points.stiffness * ufl.as_tensor(one[i, j] * one[k, l] + 0.3 * one[i, k] * one[j, l], (i, k, j, l))
+    u, v = ufl.TrialFunction(s.V), ufl.TestFunction(s.V)
+    form = s.points.grad(v)[i, k] * A[i, k, j, l] * s.points.grad(u)[j, l] * s.points.dx
+    unknowns = Unknowns(fem.Function(s.V), np.arange(len(fem.Function(s.V).x.array)))
+    K = matrix(unknowns, unknowns, unknowns.size)
+    ElementMatrices(A, s.points).assemble_matrix(K)
+    K.assemble()
+    expected = s.matrix(form, s.V)
+    assert np.abs(K[:, :] - expected).max() < 1e-12 * np.abs(expected).max()
 
 
 def test_moving_the_points_moves_the_form(dim):
