@@ -102,8 +102,6 @@ class Coupler:
         tolerance: float = 1e-8,
         max_iterations: int | None = None,
     ):
-        if coupling not in COUPLINGS:
-            raise ValueError(f"coupling {coupling!r}: must be one of {', '.join(COUPLINGS)}")
         self.momentum, self.storage, self.coupling, self.tolerance = momentum, storage, coupling, tolerance
         self.richardson = storage is not None and coupling.startswith("fixed-stress")
         self.max_iterations = max_iterations or (200 if self.richardson else 25)
@@ -214,7 +212,7 @@ class Coupler:
         context = SchurComplement(self.storage, self._solve_u)
         self._schur = PETSc.Mat().createPython((n, n), context, comm=self.storage.unknowns.comm)
         self._schur.setUp()
-        self._solve_s = direct_solver(self.storage.assemble_preconditioner(1.0, self.beta), "storage")
+        self._solve_s = direct_solver(self.storage.P, "storage")
         kind = {"schur-cg": PETSc.KSP.Type.CG, "schur-fgmres": PETSc.KSP.Type.FGMRES}
         self._solve_s.setType(kind.get(self.coupling, PETSc.KSP.Type.PREONLY))
 

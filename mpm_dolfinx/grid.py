@@ -77,7 +77,6 @@ class Grid:
         self.cell_nodes = _compat.cell_dofs(nodes)
         """(cells, 2^d): nodes of the cells, numbered as the P1 degrees of freedom."""
         self.node_x = nodes.tabulate_dof_coordinates()[:, : self.dim]
-        self._nodes_owned = nodes.dofmap.index_map.size_local
         corners = self.node_x[self.cell_nodes]
         self.midpoints = corners.mean(axis=1)
         # all cells list their vertices in the same order (tested), so one set of signs serves all

@@ -123,13 +123,13 @@ class Momentum:
         form = GHOST / 3 * ufl.avg(self.modulus) * across * ufl.inner(kink(du), kink(v)) * dS
         self._ghost_form = _compat.CompiledForm(form)
 
-    def set_active(self, active: NDArray[np.bool_], cells: NDArray[np.int32], partly: NDArray[np.bool_]) -> bool:
+    def set_active(self, cells: NDArray[np.int32], facets: NDArray[np.int32], partly: NDArray[np.bool_]) -> bool:
         """Number the unknowns of the active cells.
 
         Parameters
         ----------
-        active : (cells,)
-            Which local cells are active, ghosts included; `cells` are their indices.
+        cells, facets
+            Active local cells, ghosts included, and the faces between two of them.
         partly : (cells,)
             Which local cells are partly filled.
 
@@ -137,7 +137,6 @@ class Momentum:
         -------
         Whether the unknowns differ from those before, so that matrices have been made anew.
         """
-        facets = self.grid.interior_facets(active, cells)
         facets = facets[partly[self.grid.facet_cells[facets]].any(axis=1)]
         nodes = np.zeros(len(self.free), dtype=bool)
         nodes[self.grid.cell_nodes[cells]] = True

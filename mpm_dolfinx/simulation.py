@@ -198,8 +198,9 @@ class Simulation:
             fields[name] = self._table(lambda m, name=name: getattr(m, name))
         n = 1 - (1 - self._table(lambda m: m.porosity)) / J
         if self.fluid:
-            alpha, grain = self._table(lambda m: m.biot), self._table(lambda m: m.grain_bulk)
-            fields |= {"biot": alpha, "storage": n / self.fluid.bulk + (alpha - n) / grain}
+            storage = np.stack([m.storage(self.fluid.bulk, n) for m in self.materials])
+            fields["biot"] = self._table(lambda m: m.biot)
+            fields["storage"] = storage[self.points.material, np.arange(len(n))]
         if self.gravity is not None:
             wet = self.fluid.density if self.fluid else 0.0
             fields["density"] = (1 - n) * self._table(lambda m: m.grain_density) + n * wet
@@ -219,14 +220,15 @@ class Simulation:
         active = fill > 0
         cells = np.flatnonzero(active)
         self.active_cells = grid.comm.allreduce(int(active[: grid.num_owned].sum()))
-        renumbered = momentum.set_active(active, cells, fill < FULL)
+        facets = grid.interior_facets(active, cells)
+        renumbered = momentum.set_active(cells, facets, fill < FULL)
         if self._plates:
             self._place_plates()
         momentum.set_penalty()
         if self.storage:
             s = self.storage
             if renumbered:
-                s.set_active(cells, grid.interior_facets(active, cells))
+                s.set_active(cells, facets)
                 s.set_coupled(momentum.unknowns)
             s.set_contents(
                 pieces.cells,
@@ -260,14 +262,11 @@ class Simulation:
         grid, momentum = self.grid, self.momentum
         nodes = np.zeros(len(grid.node_x), dtype=bool)
         nodes[grid.cell_nodes[np.flatnonzero(momentum.fill.x.array > 0)]] = True
-        held = nodes[:, None] & ~momentum.free
-        modes, d = [np.tile(e, (len(nodes), 1)) for e in np.eye(grid.dim)], grid.dim
-        for a in range(d):
-            for b in range(a):
-                rotation = np.zeros((len(nodes), d))
-                rotation[:, a], rotation[:, b] = grid.node_x[:, b], -grid.node_x[:, a]
-                modes.append(rotation / (grid.upper - grid.lower).max())
-        R = np.stack([m[held] for m in modes], axis=1)
+        node, axis = np.nonzero(nodes[:, None] & ~momentum.free)
+        x = grid.node_x[node] / (grid.upper - grid.lower).max()
+        modes = [(axis == a) * 1.0 for a in range(grid.dim)]
+        modes += [(axis == a) * x[:, b] - (axis == b) * x[:, a] for a in range(grid.dim) for b in range(a)]
+        R = np.stack(modes, axis=1)
         gram = grid.comm.allreduce(R.T @ R)
         missing = len(modes) - np.linalg.matrix_rank(gram, tol=1e-12 * max(1.0, np.abs(gram).max()))
         if missing:
