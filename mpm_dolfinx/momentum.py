@@ -135,17 +135,19 @@ class Momentum:
 
         Returns
         -------
-        Whether the unknowns differ from those before, so that matrices have been made anew.
+        Whether cells or unknowns differ from those before, so that matrices have been made anew.
         """
         facets = facets[partly[self.grid.facet_cells[facets]].any(axis=1)]
         nodes = np.zeros(len(self.free), dtype=bool)
         nodes[self.grid.cell_nodes[cells]] = True
         nodes = self._shared(nodes)
         dofs = np.flatnonzero((self.free & nodes[:, None]).ravel())
-        same = hasattr(self, "unknowns") and np.array_equal(dofs, self._dofs) and np.array_equal(facets, self._facets)
+        # a cell may become active between active nodes, so equal dofs do not mean equal cells
+        now = (cells, dofs, facets)
+        same = hasattr(self, "unknowns") and all(map(np.array_equal, now, (self._cells, self._dofs, self._facets)))
         changed = self.grid.comm.allreduce(not same) > 0
         if changed:
-            self._dofs, self._facets = dofs, facets
+            self._cells, self._dofs, self._facets = now
             self.unknowns = Unknowns(self.u, dofs)
             self.K = matrix(self.unknowns, self.unknowns, 5**self.grid.dim * self.grid.dim)
             self._summed = False

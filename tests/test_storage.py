@@ -6,6 +6,7 @@ import pytest
 from helpers import SOFT, beam, column
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx.domains import corner_bits
 from mpm_dolfinx.materials import STANDARD_GRAVITY
 
 
@@ -109,3 +110,21 @@ def test_pressure_jumps_are_damped_only_where_next_to_nothing_flows():
     # flow and damping together carry tau d A on every inner face: here each one half
     row = -np.array([v for v in damping.getRow(3)[1] if v < 0])
     assert len(row) and row == pytest.approx(0.5 * tau * s.grid.h[0] ** 2 * np.ones(len(row)), rel=1e-9)
+
+
+def test_a_cell_that_becomes_active_between_active_nodes_gets_an_unknown():
+    grid = mpm.Grid([3.0, 3.0], [3, 3])
+
+    def ring(x):
+        return (np.abs(x - 1.5) > 0.5).any(axis=1)
+
+    s = mpm.Simulation(grid, [mpm.shape(grid, ring)], [SOFT], fluid=mpm.Fluid(), fixed={"left": "xy", "bottom": "xy"})
+    s._begin(0.0)
+    assert s.storage.unknowns.size == 8
+    # one domain of the cell below comes to fill the hole, another one the place that it left
+    moved, other = np.flatnonzero((np.abs(s.points.x - [1.5, 0.5]) < 0.5).all(axis=1))[:2]
+    s.points.corners[moved] = 1 + corner_bits(2)
+    s.points.volume0[[moved, other]] = 1.0, 0.5
+    s._prepared = False
+    s._begin(0.0)
+    assert s.storage.unknowns.size == 9
