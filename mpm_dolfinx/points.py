@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -36,6 +36,8 @@ class MaterialPoints:
         Pore pressure, positive in compression.
     x : (n, d), m
         Position.
+    data : name -> (n, ...)
+        What else the points carry: parameters that differ from point to point, state of the law.
     """
 
     id: NDArray[np.int64]
@@ -45,6 +47,7 @@ class MaterialPoints:
     material: NDArray[np.int32]
     pressure: NDArray[np.float64]
     x: NDArray[np.float64]
+    data: dict[str, NDArray[np.float64]] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.id)
@@ -54,15 +57,20 @@ class MaterialPoints:
         """Volume ratio det F (n,)."""
         return np.linalg.det(self.F)
 
+    def map(self, function: Callable[[NDArray], NDArray]) -> MaterialPoints:
+        """Return points with a function applied to each of their arrays: a choice of rows, a copy, a transfer."""
+        arrays = {f.name: function(getattr(self, f.name)) for f in fields(self) if f.name != "data"}
+        return MaterialPoints(**arrays, data={name: function(values) for name, values in self.data.items()})
+
     def copy(self) -> MaterialPoints:
         """Return a copy that shares no array."""
-        return replace(self, **{f.name: getattr(self, f.name).copy() for f in fields(self)})
+        return self.map(np.copy)
 
     def migrated(self, exchange: Exchange) -> MaterialPoints:
         """Return the points of this process after every point went to its destination, ordered by id."""
-        arrays = {f.name: exchange.send(getattr(self, f.name)) for f in fields(self)}
-        order = np.argsort(arrays["id"])
-        return MaterialPoints(**{name: a[order] for name, a in arrays.items()})
+        received = self.map(exchange.send)
+        order = np.argsort(received.id)
+        return received.map(lambda rows: rows[order])
 
     def find(self, ids: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return (which of `ids` are points of this process, their indices); points are ordered by id."""
