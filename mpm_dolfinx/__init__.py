@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Implicit, iteratively coupled material point / finite volume poromechanics on FEniCSx."""
 
-from mpm_dolfinx.conditions import Drained, Inflow, RigidPlate, Traction
+from mpm_dolfinx.conditions import Displacement, Drained, Inflow, RigidPlate, Traction
 from mpm_dolfinx.coupling import COUPLINGS, NotConverged
 from mpm_dolfinx.grid import Grid
 from mpm_dolfinx.materials import LAWS, Fluid, Hencky, LinearElastic, NeoHookean
@@ -12,6 +12,7 @@ from mpm_dolfinx.timeloop import GaveUp, Result
 __all__ = [
     "COUPLINGS",
     "LAWS",
+    "Displacement",
     "Drained",
     "Fluid",
     "GaveUp",

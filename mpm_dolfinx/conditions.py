@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Conditions on the sides of the bodies: dead tractions, rigid plates, drained sides, prescribed inflow."""
+"""Conditions on the sides of the bodies: tractions, displacements, rigid plates, drained sides, prescribed inflow."""
 
 from __future__ import annotations
 
@@ -76,6 +76,44 @@ class Inflow:
 
 RIGIDITY = 1e4
 """Rigidity of a plate, in units of (oedometric modulus of the body) x (length of the side)."""
+HOLD = 1e4
+"""Stiffness of what holds a side with given displacement, in units of (oedometric modulus) / (cell size).
+
+The side gives way by strain x cell size / HOLD, always measured from its given place: nothing adds up.
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class Displacement:
+    """Side of the bodies whose displacement is given: a footing, a clamp that moves, a body carried along.
+
+    Parameters
+    ----------
+    side
+        Side of the bodies.
+    value : (d,) or callable (t, X) -> (d,) or (m, d), m
+        Displacement of the side since the start, given the time (s) and the reference positions X (m, d).
+    components
+        Components that are given, such as "y"; the others are free.  By default all.
+    region : ((d,), (d,)), m
+        Box of reference positions to which the condition is limited.
+    """
+
+    side: str
+    value: ArrayLike | Callable[[float, NDArray[np.float64]], ArrayLike]
+    components: str = ""
+    region: Region | None = None
+
+    def axes(self, dim: int) -> list[int]:
+        """Return the axes of the given components."""
+        if any(c not in "xyz"[:dim] for c in self.components):
+            raise ValueError(f"{self}: components must be some of {'xyz'[:dim]!r}")
+        return sorted("xyz".index(c) for c in set(self.components or "xyz"[:dim]))
+
+    def at(self, t: float, X: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the displacement (m, d), m, at time t (s) of reference positions X (m, d)."""
+        value = np.asarray(self.value(t, X) if callable(self.value) else self.value, dtype=float)
+        return np.broadcast_to(value, X.shape)
 
 
 @dataclass(frozen=True)

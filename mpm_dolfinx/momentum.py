@@ -49,6 +49,8 @@ class Momentum:
         Acceleration, a UFL constant; the pieces then carry `density`, kg/m^3.
     plates
         Whether the scene has rigid plates: points `plates` with their rigidity, normal and present tilt.
+    held
+        Whether sides of bodies have given displacements: points `holds` with stiffness, direction and gap.
     """
 
     def __init__(
@@ -60,10 +62,11 @@ class Momentum:
         pressure: fem.Function | None = None,
         gravity: fem.Constant | None = None,
         plates: bool = False,
+        held: bool = False,
     ):
         self.grid, self.pieces = grid, pieces
         V = _compat.function_space(grid.mesh, "Lagrange", 1, (grid.dim,))
-        self.u, self._b, self._f = (fem.Function(V) for _ in range(3))
+        self.u, self._b, self._f, self._pulls = (fem.Function(V) for _ in range(4))
         self.free = ~fixed
         v, du = ufl.TestFunction(V), ufl.TrialFunction(V)
 
@@ -93,6 +96,12 @@ class Momentum:
             self.plates = FormPoints(grid, rigidity=(), normal=(grid.dim,), tilt=(grid.dim,))
             self._plate = PointForm(self._bend(v, self._slope(du)), self.plates)
             self._tilt = PointForm(-self._bend(v, self.plates.tilt), self.plates)
+        self._hold = None
+        if held:
+            self.holds = h = FormPoints(grid, stiffness=(), direction=(grid.dim,), gap=())
+            along = ufl.dot(h.value(v), h.direction)
+            self._hold = PointForm(h.stiffness * ufl.dot(h.value(du), h.direction) * along * h.dx, h)
+            self._pull = PointForm(h.stiffness * h.gap * along * h.dx, h)
         self._ghost(V, v, du)
 
     def _slope(self, w):
@@ -159,12 +168,17 @@ class Momentum:
         return changed
 
     def set_penalty(self) -> None:
-        """Assemble what is linear in the step's increment: ghost penalty and, at their present places, plates."""
+        """Assemble what is linear in the step's increment: ghost penalty, and plates and holds at their places."""
         zero(self.penalty)
         if len(self._facets):
             self._ghost_form.assemble_matrix(self.penalty)
         if self._plate is not None:
             self._plate.assemble_matrix(self.penalty)
+        if self._hold is not None:
+            self._hold.assemble_matrix(self.penalty)
+            stiffest = self.holds.data["stiffness"].max(initial=0.0)  # what rounding of places makes of it
+            reach = np.abs(np.concatenate([self.grid.lower, self.grid.upper])).max()
+            self.round_off += 1e-15 * self.grid.comm.allreduce(stiffest) * reach
         self.penalty.assemble()
 
     def _shared(self, nodes: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -185,6 +199,10 @@ class Momentum:
         if self._plate is not None:
             self._tilt.assemble_vector(self._f.x.array)
         self._external = sum_ghosts(self._f)
+        if self._hold is not None:
+            self._pulls.x.array[:] = 0.0
+            self._pull.assemble_vector(self._pulls.x.array)
+            sum_ghosts(self._pulls)
 
     def start(self) -> None:
         """Begin a step: no displacement."""
@@ -201,6 +219,8 @@ class Momentum:
         if self.grid.comm.size > 1:
             squares = self.grid.comm.allreduce(np.array(squares))
         b[owned] -= self._external[owned]
+        if self._hold is not None:  # no measure of forces: at the start of a step it is far above them
+            b[owned] -= self._pulls.x.array[owned]
         r = self.unknowns.gather(b, self.residual)
         du = self.unknowns.gather(self.u.x.array, self.K.createVecRight())
         self.penalty.multAdd(du, r, r)

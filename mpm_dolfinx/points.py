@@ -194,13 +194,14 @@ def material_points(grid: Grid, bodies: Sequence[Body], pressure: float = 0.0) -
 class Surface:
     """Faces of domains on one side of the bodies, the same on every process; arrays over m faces.
 
-    id : (m,) number of the point; xi : (m, d) centre of the face in the domain, from -1 to 1;
-    area0, whole0 : (m,) reference area of the part that counts and of the whole face, m^(d-1);
-    axis, end : side of the domain.
+    id : (m,) number of the point; xi : (m, d) centre of the face in the domain, from -1 to 1; x0 : (m, d)
+    its reference position, m; area0, whole0 : (m,) reference area of the part that counts and of the whole
+    face, m^(d-1); axis, end : side of the domain.
     """
 
     id: NDArray[np.int64]
     xi: NDArray[np.float64]
+    x0: NDArray[np.float64]
     area0: NDArray[np.float64]
     whole0: NDArray[np.float64]
     axis: int
@@ -225,7 +226,7 @@ def surface(bodies: Sequence[Body], name: str, region: Region | None = None) -> 
     """
     dim = bodies[0].lower.shape[1]
     axis, end = side(name, dim)
-    start, ids, xis, areas, wholes = 0, [], [], [], []
+    start, ids, xis, x0s, areas, wholes = 0, [], [], [], [], []
     for body in bodies:
         chosen = np.flatnonzero(body.sides[:, axis, end])
         low = np.broadcast_to(body.lower[chosen], (len(chosen), dim))
@@ -241,12 +242,15 @@ def surface(bodies: Sequence[Body], name: str, region: Region | None = None) -> 
             on &= (plane >= np.asarray(region[0])[axis] - 1e-12) & (plane <= np.asarray(region[1])[axis] + 1e-12)
         xi = (inner_low + inner_high - low - high) / body.spacing
         xi[:, axis] = 2 * end - 1
+        x0 = (inner_low + inner_high) / 2
+        x0[:, axis] = plane
         ids.append(start + chosen[on])
         xis.append(xi[on])
+        x0s.append(x0[on])
         areas.append((inner_high - inner_low)[on][:, tangential].prod(axis=1))
         wholes.append((high - low)[on][:, tangential].prod(axis=1))
         start += len(body)
-    return Surface(*map(np.concatenate, (ids, xis, areas, wholes)), axis, end)
+    return Surface(*map(np.concatenate, (ids, xis, x0s, areas, wholes)), axis, end)
 
 
 def interpolate(corners: NDArray[np.float64], xi: NDArray[np.float64]) -> NDArray[np.float64]:

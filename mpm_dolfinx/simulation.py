@@ -13,7 +13,7 @@ from dolfinx.common import Timer
 from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx import _compat
-from mpm_dolfinx.conditions import RIGIDITY, Drained, Inflow, RigidPlate, Traction
+from mpm_dolfinx.conditions import HOLD, RIGIDITY, Displacement, Drained, Inflow, RigidPlate, Traction
 from mpm_dolfinx.coupling import COUPLINGS, Coupler, Report
 from mpm_dolfinx.domains import corner_bits
 from mpm_dolfinx.exchange import Exchange
@@ -43,7 +43,7 @@ class Simulation:
         Walls of the grid with the components that are zero there, such as {"left": "xy", "bottom": "y"}.
     fluid
         Pore fluid; without it there is no storage problem.
-    tractions, drained, inflows, plates
+    tractions, displacements, drained, inflows, plates
         Boundary conditions on sides of the bodies; other sides are free and sealed.
     gravity : (d,) or callable t -> (d,), m/s^2
         Acceleration of gravity.
@@ -64,6 +64,7 @@ class Simulation:
         fixed: Mapping[str, str],
         fluid: Fluid | None = None,
         tractions: Sequence[Traction] = (),
+        displacements: Sequence[Displacement] = (),
         drained: Sequence[Drained] = (),
         inflows: Sequence[Inflow] = (),
         plates: Sequence[RigidPlate] = (),
@@ -91,6 +92,9 @@ class Simulation:
         self._plates = [(plate, self._faces(bodies, plate)) for plate in plates]
         tractions = [*tractions, *(plate.traction(faces.area0.sum(), grid.dim) for plate, faces in self._plates)]
         self._loads = [(load, self._faces(bodies, load)) for load in tractions]
+        self._holds = [(hold, self._faces(bodies, hold), hold.axes(grid.dim)) for hold in displacements]
+        self.reactions = np.zeros((len(displacements), grid.dim))
+        """(displacements, d): force by which each given displacement acts on the bodies, N (N/m in plane strain)."""
         self._outlets = [(outlet, self._faces(bodies, outlet)) for outlet in (*drained, *inflows)]
         self._law = law
 
@@ -130,7 +134,7 @@ class Simulation:
             shapes |= {"density": ()}
         self.pieces = FormPoints(grid, **shapes)
         p = fem.Function(_compat.function_space(grid.mesh, "DG", 0)) if fluid else None
-        self.momentum = Momentum(grid, self.pieces, law, fixed, p, self.gravity, bool(self._plates))
+        self.momentum = Momentum(grid, self.pieces, law, fixed, p, self.gravity, bool(self._plates), bool(self._holds))
         self.storage = None
         if fluid:
             weight = None if self.gravity is None else fluid.density * self.gravity
@@ -155,6 +159,8 @@ class Simulation:
             raise ValueError(f"dt = {dt!r}, must be > 0")
         self._begin(self.t + dt)
         report = self.coupler.solve(dt)
+        if self._holds:
+            self._react()
         self._move_points()
         self.t += dt
         self._prepared = False
@@ -164,11 +170,17 @@ class Simulation:
         """Set up the step that ends at time t: grid, loads of that time, u = 0 and the cells' pressure."""
         if self.gravity is not None:
             self.gravity.value = np.asarray(self._gravity_at(t), dtype=float)
-        if not self._prepared:
+        fresh = not self._prepared
+        if fresh:
             self._reset_grid()
         elif self.gravity is not None and self.storage:
             self._open_boundary()  # a step is tried again, with the gravity of another time
         self._place_loads(t)
+        if fresh:
+            self.momentum.set_penalty()
+            if self._renumbered:
+                self._check_held()
+            self._prepared = True
         self.momentum.start()
         if self.storage:
             self.storage.start(t - self.t)
@@ -189,7 +201,6 @@ class Simulation:
                 **{name: place.to_cells(values) for name, values in self._fields(J).items()},
             )
             self._activate(J)
-        self._prepared = True
 
     def _fields(self, J: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
         """Return what the points bring to their pieces."""
@@ -224,7 +235,6 @@ class Simulation:
         renumbered = momentum.set_active(cells, facets, fill < FULL)
         if self._plates:
             self._place_plates()
-        momentum.set_penalty()
         if self.storage:
             s = self.storage
             if renumbered:
@@ -244,7 +254,7 @@ class Simulation:
             self._open_boundary()
         if renumbered:
             self.coupler.set_unknowns()
-            self._check_held()
+        self._renumbered = renumbered
 
     def _rows(self, value: Callable[[Skeleton], float]) -> NDArray[np.float64]:
         """Return a constant of the materials at the pieces of this process (m,)."""
@@ -263,16 +273,20 @@ class Simulation:
         nodes = np.zeros(len(grid.node_x), dtype=bool)
         nodes[grid.cell_nodes[np.flatnonzero(momentum.fill.x.array > 0)]] = True
         node, axis = np.nonzero(nodes[:, None] & ~momentum.free)
-        x = grid.node_x[node] / (grid.upper - grid.lower).max()
-        modes = [(axis == a) * 1.0 for a in range(grid.dim)]
-        modes += [(axis == a) * x[:, b] - (axis == b) * x[:, a] for a in range(grid.dim) for b in range(a)]
+        x, direction = grid.node_x[node], np.eye(grid.dim)[axis]
+        if self._holds:
+            x = np.concatenate([x, momentum.holds.x])
+            direction = np.concatenate([direction, momentum.holds.data["direction"]])
+        x = x / (grid.upper - grid.lower).max()
+        modes = list(direction.T)
+        modes += [direction[:, a] * x[:, b] - direction[:, b] * x[:, a] for a in range(grid.dim) for b in range(a)]
         R = np.stack(modes, axis=1)
         gram = grid.comm.allreduce(R.T @ R)
         missing = len(modes) - np.linalg.matrix_rank(gram, tol=1e-12 * max(1.0, np.abs(gram).max()))
         if missing:
             raise ValueError(
                 f"fixed walls: the body is free to move as a rigid body in {missing} of {len(modes)} ways; "
-                "it must touch walls whose fixed components hold it"
+                "it must touch walls whose fixed components hold it, or have given displacements"
             )
 
     def _place_loads(self, t: float) -> None:
@@ -284,6 +298,8 @@ class Simulation:
                 rows.append((cell, x, faces.area0[here, None] * load.at(t)))
             cell, x, force = self._gathered(rows, (self.grid.dim,))
             self.momentum.loads.place(cell, x, np.ones(len(cell)), force=force)
+            if self._holds:
+                self._place_holds(t)
             self.momentum.set_loads()
 
     def _place_plates(self) -> None:
@@ -301,6 +317,37 @@ class Simulation:
         cell, x, values = self._gathered(rows, (1 + 2 * grid.dim,))
         rigidity, normal, tilt = np.split(values, [1, 1 + grid.dim], axis=1)
         self.momentum.plates.place(cell, x, np.ones(len(cell)), rigidity=rigidity, normal=normal, tilt=tilt)
+
+    def _place_holds(self, t: float) -> None:
+        """Put the given displacements of time t on the surface: one row a face and component."""
+        d, rows = self.grid.dim, []
+        stiffness = HOLD * max(m.oedometric for m in self.materials) / self.grid.h.min()
+        for number, (hold, faces, axes) in enumerate(self._holds):
+            here, _, cell, x = self.placement.surface(faces)
+            gap = faces.x0[here] + hold.at(t, faces.x0)[here] - x
+            for axis in axes:
+                rows.append((cell, x, np.zeros((len(cell), 3 + d))))
+                rows[-1][2][:, 0] = number
+                rows[-1][2][:, 1] = stiffness * faces.area0[here]
+                rows[-1][2][:, 2] = gap[:, axis]
+                rows[-1][2][:, 3 + axis] = 1.0
+        cell, x, values = self._gathered(rows, (3 + d,))
+        self._hold_number = values[:, 0].astype(np.int64)
+        ones = np.ones(len(cell))
+        self.momentum.holds.place(
+            cell, x, ones, stiffness=values[:, 1:2], gap=values[:, 2:3], direction=np.ascontiguousarray(values[:, 3:])
+        )
+
+    def _react(self) -> None:
+        """Sum the forces of the given displacements."""
+        grid, holds = self.grid, self.momentum.holds
+        N, _ = grid.shape_functions(holds.cells, holds.x)
+        u = self.momentum.u.x.array.reshape(-1, grid.dim)[grid.cell_nodes[holds.cells]]
+        direction = holds.data["direction"]
+        moved = np.einsum("mk,mkd,md->m", N, u, direction)
+        force = (holds.data["stiffness"][:, 0] * (holds.data["gap"][:, 0] - moved))[:, None] * direction
+        sums = [sum_by(self._hold_number, column, len(self._holds)) for column in force.T]
+        self.reactions = grid.comm.allreduce(np.stack(sums, axis=1))
 
     def _gathered(self, rows: list, shape: tuple[int, ...]) -> tuple[NDArray, NDArray, NDArray]:
         """Send (cells, positions, values) to the owners of the cells; return (owned cells, positions, values)."""
