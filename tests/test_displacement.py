@@ -48,11 +48,11 @@ def test_the_reaction_is_that_of_the_stress():
 def test_a_side_slides_freely_along_the_components_that_are_not_given():
     grid = mpm.Grid([0.5, 1.2], [5, 12])
     top = mpm.Displacement("top", (0, -0.05), "y")
-    body = mpm.box(grid, [0, 0], [0.33, 1])
+    body = mpm.box(grid, [0, 0], [0.35, 1])
     s = mpm.Simulation(grid, [body], [SOFT], fixed={"bottom": "y", "left": "x"}, displacements=[top])
     s.run(1.0, 0.5)
     strain = np.log(1 - 0.05)  # nu = 0 for this soil: nothing widens
-    assert s.effective_stress()[:, 1, 1] * s.points.J == pytest.approx(1e7 * strain, rel=1e-4)
+    assert s.effective_stress()[:, 1, 1] * s.points.J == pytest.approx(1e7 * strain, rel=5e-5)
     assert np.abs(s.effective_stress()[:, 0, 0]).max() < 10
 
 
