@@ -137,10 +137,11 @@ class PointForm:
             if f in names:
                 self._columns.append((slice(start, stop), names[f]))
             else:
-                unrolled = (dofs[:, :, None] * bs + np.arange(bs)).reshape(len(dofs), stop - start)
+                # as numpy's own index type, which it would else convert to in every assembly
+                unrolled = (dofs[:, :, None].astype(np.intp) * bs + np.arange(bs)).reshape(len(dofs), stop - start)
                 self._gathered.append((slice(start, stop), f, unrolled))
             start = stop
-        self._width = start
+        self._width, self._room = start, np.empty((0, start))
 
     def rows(self) -> NDArray[np.float64]:
         """Return the coefficients of the form, one row a point."""
@@ -148,12 +149,14 @@ class PointForm:
         if self._version != self.points.version:
             self._version = self.points.version
             self.compiled.bind(cells)
-            self._packed = np.empty((len(cells), self._width))
+            if len(cells) > len(self._room):  # memory that is kept saves the page faults of every step
+                self._room = np.empty((len(cells) + len(cells) // 8, self._width))
+            self._packed = self._room[: len(cells)]
             for columns, name in self._columns:
                 self._packed[:, columns] = self.points.data[name]
             self._dofs = [(c, f, dofs[cells]) for c, f, dofs in self._gathered]
         for columns, f, dofs in self._dofs:
-            self._packed[:, columns] = f.x.array[dofs]
+            self._packed[:, columns] = np.take(f.x.array, dofs, mode="wrap")  # "raise" checks every index
         return self._packed
 
     def assemble_vector(self, b: NDArray[np.float64]) -> None:

@@ -341,7 +341,7 @@ class Simulation:
     def _react(self) -> None:
         """Sum the forces of the given displacements."""
         grid, holds = self.grid, self.momentum.holds
-        N, _ = grid.shape_functions(holds.cells, holds.x)
+        N = grid.shape_values(holds.cells, holds.x)
         u = self.momentum.u.x.array.reshape(-1, grid.dim)[grid.cell_nodes[holds.cells]]
         direction = holds.data["direction"]
         moved = np.einsum("mk,mkd,md->m", N, u, direction)
