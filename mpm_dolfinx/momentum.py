@@ -20,6 +20,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from mpm_dolfinx import _compat
+from mpm_dolfinx.dilatation import MeanDilatation
 from mpm_dolfinx.forms import ElementMatrices, FormPoints, PointForm
 from mpm_dolfinx.grid import Grid
 from mpm_dolfinx.unknowns import Unknowns, matrix, sum_ghosts, zero
@@ -51,6 +52,8 @@ class Momentum:
         Whether the scene has rigid plates: points `plates` with their rigidity, normal and present tilt.
     held
         Whether sides of bodies have given displacements: points `holds` with stiffness, direction and gap.
+    mean_dilatation
+        Whether the law sees one volume change per cell, see `dilatation`.
     """
 
     def __init__(
@@ -63,6 +66,7 @@ class Momentum:
         gravity: fem.Constant | None = None,
         plates: bool = False,
         held: bool = False,
+        mean_dilatation: bool = False,
     ):
         self.grid, self.pieces = grid, pieces
         V = _compat.function_space(grid.mesh, "Lagrange", 1, (grid.dim,))
@@ -71,7 +75,13 @@ class Momentum:
         v, du = ufl.TestFunction(V), ufl.TrialFunction(V)
 
         F = ufl.variable((ufl.Identity(grid.dim) + pieces.grad(self.u)) * pieces.F)
-        energy = law.energy(F, **{name: getattr(pieces, name) for name in law.parameters})
+        constants = {name: getattr(pieces, name) for name in law.parameters}
+        self.dilatation = None
+        if mean_dilatation:
+            self.dilatation = MeanDilatation(pieces, F, lambda Fbar: law.energy(Fbar, **constants))
+            energy = self.dilatation.energy + self.dilatation.pi * ufl.det(F)
+        else:
+            energy = law.energy(F, **constants)
         if pressure is not None:
             energy -= pieces.biot * pressure * ufl.det(F)
         # differentiated by F and contracted: in 3D a twentieth of the compile time of derivatives by u
@@ -207,9 +217,13 @@ class Momentum:
     def start(self) -> None:
         """Begin a step: no displacement."""
         self.u.x.array[:] = 0.0
+        if self.dilatation is not None:
+            self.dilatation.start()
 
     def assemble_residual(self) -> tuple[PETSc.Vec, float]:
         """Return the out-of-balance nodal forces at u and their scale, the larger of internal and external (N)."""
+        if self.dilatation is not None:
+            self.dilatation.update()
         b = self._b.x.array
         b[:] = 0.0
         self._residual.assemble_vector(b)
@@ -233,6 +247,8 @@ class Momentum:
         """Return the tangent at u."""
         zero(self.K)
         self._tangent.assemble_matrix(self.K)
+        if self.dilatation is not None:
+            self.dilatation.assemble_matrix(self.K)
         self.K.assemble()
         # the first sum gives K the pattern of both
         pattern = PETSc.Mat.Structure

@@ -134,7 +134,10 @@ class Simulation:
             shapes |= {"density": ()}
         self.pieces = FormPoints(grid, **shapes)
         p = fem.Function(_compat.function_space(grid.mesh, "DG", 0)) if fluid else None
-        self.momentum = Momentum(grid, self.pieces, law, fixed, p, self.gravity, bool(self._plates), bool(self._holds))
+        mean = any(m.nearly_incompressible for m in self.materials)
+        self.momentum = Momentum(
+            grid, self.pieces, law, fixed, p, self.gravity, bool(self._plates), bool(self._holds), mean
+        )
         self.storage = None
         if fluid:
             weight = None if self.gravity is None else fluid.density * self.gravity
@@ -397,9 +400,12 @@ class Simulation:
             u = self.momentum.u.x.array.reshape(-1, d)
             _, dN = grid.shape_functions(self.pieces.cells, self.pieces.x)
             gradient = u[grid.cell_nodes[self.pieces.cells]].transpose(0, 2, 1) @ dN
+            delta = np.eye(d) + gradient
+            if self.momentum.dilatation is not None:
+                delta = self.momentum.dilatation.averaged(delta)
             # F_p <- (sum_k w_k Delta_k / V_p) F_p
-            mean = [place.mean(column) for column in place.to_pieces(gradient).reshape(-1, d * d).T]
-            points.F = (np.eye(d) + np.stack(mean, axis=1).reshape(n, d, d)) @ points.F
+            mean = [place.mean(column) for column in place.to_pieces(delta).reshape(-1, d * d).T]
+            points.F = np.stack(mean, axis=1).reshape(n, d, d) @ points.F
             if self.quadrature == "domain":
                 corners = points.corners.reshape(-1, d)
                 moved = corners + place.displacement(u, np.repeat(np.arange(n), 2**d), corners)
