@@ -55,12 +55,14 @@ class NotConverged(RuntimeError):
 
 @dataclass
 class Report:
-    """What a converged step took: Newton and coupling iterations, relative residuals, fluid balance."""
+    """What a converged step took: Newton and coupling iterations, relative residuals, fluid balance, and mending."""
 
     newton: int = 0
     coupling: int = 0
     history: list[tuple[float, float]] = field(default_factory=list)
     balance: float = 0.0
+    rederived: int = 0
+    """Domains that had folded and were re-derived from F."""
 
 
 class SchurComplement:
