@@ -110,27 +110,29 @@ class Hencky(Skeleton):
     """Hencky's law: psi = lambda/2 (ln J)^2 + G sum_i (ln lambda_i)^2, lambda_i the principal stretches.
 
     Plane strain in 2D.  Hencky (1928); a small constant under the root keeps the derivatives of the
-    eigenvalues of C = F^T F finite where they coincide.
+    eigenvalues of C = F^T F finite where they coincide.  It enters the deviatoric part only, whose
+    derivative vanishes there: at rest there is no stress at all.
     """
 
     @staticmethod
     def energy(F, bulk, shear):
-        C = F.T * F
-        squares = sum((ufl.ln(e) / 2) ** 2 for e in _eigenvalues(C))
-        return (bulk - 2 * shear / 3) / 2 * ufl.ln(ufl.det(F)) ** 2 + shear * squares
+        d, ln_J = F.ufl_shape[0], ufl.ln(ufl.det(F))
+        logs = [ufl.ln(e) / 2 for e in _eigenvalues_over_mean(F.T * F)]
+        deviatoric = sum(l**2 for l in logs) - sum(logs) ** 2 / d
+        return ((bulk - 2 * shear / 3) / 2 + shear / d) * ln_J**2 + shear * deviatoric
 
 
-def _eigenvalues(C):
-    """Return the eigenvalues of a symmetric 2x2 or 3x3 tensor as UFL."""
+def _eigenvalues_over_mean(C):
+    """Return the eigenvalues of a symmetric 2x2 or 3x3 tensor, divided by their mean, as UFL."""
     if C.ufl_shape[0] == 2:
         mean = (C[0, 0] + C[1, 1]) / 2
-        radius = ufl.sqrt((C[0, 0] - C[1, 1]) ** 2 + 4 * C[0, 1] ** 2 + 1e-8) / 2
-        return mean + radius, mean - radius
+        radius = ufl.sqrt(((C[0, 0] - C[1, 1]) ** 2 + 4 * C[0, 1] ** 2) / (4 * mean**2) + 2.5e-9)
+        return 1 + radius, 1 - radius
     mean = ufl.tr(C) / 3
-    D = C - mean * ufl.Identity(3)
+    D = C / mean - ufl.Identity(3)
     r = ufl.sqrt(ufl.inner(D, D) / 6 + 1e-10)
     phi = ufl.acos((1 - 1e-6) * ufl.det(D) / (2 * r**3)) / 3
-    return tuple(mean + 2 * r * ufl.cos(phi + 2 * ufl.pi * k / 3) for k in range(3))
+    return tuple(1 + 2 * r * ufl.cos(phi + 2 * ufl.pi * k / 3) for k in range(3))
 
 
 @dataclass(frozen=True)
