@@ -131,7 +131,7 @@ def _eigenvalues_over_mean(C):
     mean = ufl.tr(C) / 3
     D = C / mean - ufl.Identity(3)
     r = ufl.sqrt(ufl.inner(D, D) / 6 + 1e-10)
-    phi = ufl.acos((1 - 1e-6) * ufl.det(D) / (2 * r**3)) / 3
+    phi = ufl.acos((1 - 1e-6) * ufl.det(D) / (2 * r * r * r)) / 3
     return tuple(1 + 2 * r * ufl.cos(phi + 2 * ufl.pi * k / 3) for k in range(3))
 
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx import _compat
 from mpm_dolfinx.dilatation import MeanDilatation
-from mpm_dolfinx.forms import ElementMatrices, FormPoints, PointForm
+from mpm_dolfinx.forms import ElementForces, ElementMatrices, FormPoints, PointForm, StackedElementMatrices
 from mpm_dolfinx.grid import Grid
 from mpm_dolfinx.unknowns import Unknowns, matrix, sum_ghosts, zero
 
@@ -74,7 +74,8 @@ class Momentum:
         self.free = ~fixed
         v, du = ufl.TestFunction(V), ufl.TrialFunction(V)
 
-        F = ufl.variable((ufl.Identity(grid.dim) + pieces.grad(self.u)) * pieces.F)
+        gradient = pieces.grad(self.u) if grid.dim == 2 else pieces.gradient(self.u)
+        F = ufl.variable((ufl.Identity(grid.dim) + gradient) * pieces.F)
         constants = {name: getattr(pieces, name) for name in law.parameters}
         self.dilatation = None
         if mean_dilatation:
@@ -88,13 +89,13 @@ class Momentum:
         P = ufl.diff(energy / ufl.det(pieces.F), F)
         A = ufl.diff(P, F)
         i, j, k, l, m, n = ufl.indices(6)
-        self._residual = PointForm(ufl.inner(P, pieces.grad(v) * pieces.F) * pieces.dx, pieces)
         if grid.dim == 2:
+            self._residual = PointForm(ufl.inner(P, pieces.grad(v) * pieces.F) * pieces.dx, pieces)
             A = ufl.as_tensor(A[i, m, j, n] * pieces.F[k, m] * pieces.F[l, n], (i, k, j, l))
             self._tangent = ElementMatrices(A, pieces)
-        else:  # 300 entries a cell of the whole grid: memory and compile time do not pay
-            dF_v, dF_u = pieces.grad(v) * pieces.F, pieces.grad(du) * pieces.F
-            self._tangent = PointForm(dF_v[i, j] * A[i, j, k, l] * dF_u[k, l] * pieces.dx, pieces)
+        else:
+            self._residual = ElementForces(P * pieces.F.T, pieces)
+            self._tangent = StackedElementMatrices(A, pieces)
 
         self.loads = FormPoints(grid, force=(grid.dim,))
         self._traction = PointForm(ufl.inner(self.loads.force, self.loads.value(v)) * self.loads.dx, self.loads)
