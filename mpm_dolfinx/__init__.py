@@ -4,7 +4,7 @@
 from mpm_dolfinx.conditions import Displacement, Drained, Inflow, RigidPlate, Traction
 from mpm_dolfinx.coupling import COUPLINGS, NotConverged
 from mpm_dolfinx.grid import Grid
-from mpm_dolfinx.materials import LAWS, Fluid, Hencky, LinearElastic, NeoHookean
+from mpm_dolfinx.materials import LAWS, Fluid, Hencky, LinearElastic, NeoHookean, Skeleton, kozeny_carman
 from mpm_dolfinx.points import box, probes, shape
 from mpm_dolfinx.simulation import Simulation
 from mpm_dolfinx.timeloop import GaveUp, Result
@@ -25,8 +25,10 @@ __all__ = [
     "Result",
     "RigidPlate",
     "Simulation",
+    "Skeleton",
     "Traction",
     "box",
+    "kozeny_carman",
     "probes",
     "shape",
 ]

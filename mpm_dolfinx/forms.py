@@ -96,6 +96,17 @@ class FormPoints:
         }
         self.version += 1
 
+    def take(self, points: FormPoints, rows: NDArray[np.int64]) -> None:
+        """Be some rows of other points, which carry the fields of these."""
+        self.cells, self.x = points.cells[rows], points.x[rows]
+        self.data = {name: points.data[name][rows] for name in self._functions}
+        self.version += 1
+
+    @property
+    def position(self):
+        """Position of the point as UFL, m."""
+        return ufl.SpatialCoordinate(self.grid.mesh) + self.offset
+
     def value(self, f):
         """Return f at the point, f a P1 function, test or trial function (any shape)."""
         return self._taylor(f, self.grid.dim)
@@ -179,17 +190,21 @@ class ElementMatrices:
     Parameters
     ----------
     tangent : UFL tensor (d, d, d, d)
-        A[i, k, j, l] at the points, with A[i, k, j, l] = A[j, l, i, k].
+        A[i, k, j, l] at the points.
     points
         The points.
+    symmetric
+        Whether A[i, k, j, l] = A[j, l, i, k]: half of the entries are then left out.
     """
 
-    def __init__(self, tangent: ufl.core.expr.Expr, points: FormPoints):
+    def __init__(self, tangent: ufl.core.expr.Expr, points: FormPoints, symmetric: bool = True):
         self.points, grid = points, points.grid
         count = 2**grid.dim * grid.dim
-        rows, columns = np.triu_indices(count)
-        self._entry = np.empty((count, count), dtype=np.int64)  # symmetric: place of each entry in the vector
-        self._entry[rows, columns] = self._entry[columns, rows] = np.arange(len(rows))
+        rows, columns = np.triu_indices(count) if symmetric else np.divmod(np.arange(count**2), count)
+        self._entry = np.empty((count, count), dtype=np.int64)  # place of each entry in the vector
+        if symmetric:
+            self._entry[columns, rows] = np.arange(len(rows))
+        self._entry[rows, columns] = np.arange(len(rows))
         space = _compat.function_space(grid.mesh, "DG", 0, (len(rows),))
         self._values, q = fem.Function(space), ufl.TestFunction(space)
         gradients = self._gradients()

@@ -7,10 +7,13 @@ the residual is the derivative of
     int psi(F) / J_n - alpha p det(Delta) dV_n  -  loads,
 
 that is int (P' - alpha p J_Delta Delta^-T) : grad v dV_n = int rho g . v dV_n + tractions, P' the
-first Piola-Kirchhoff effective stress relative to the start of the step.  The derivatives are UFL's.
+first Piola-Kirchhoff effective stress relative to the start of the step; a law may also give the stress
+itself.  The derivatives are UFL's.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 from petsc4py import PETSc
 
@@ -22,6 +25,7 @@ from numpy.typing import NDArray
 from mpm_dolfinx import _compat
 from mpm_dolfinx.forms import ElementMatrices, FormPoints, PointForm
 from mpm_dolfinx.grid import Grid
+from mpm_dolfinx.materials import Skeleton
 from mpm_dolfinx.unknowns import Unknowns, matrix, sum_ghosts, zero
 
 GHOST = 1e-2
@@ -38,9 +42,10 @@ class Momentum:
     grid
         Background grid.
     pieces
-        Points of integration with the fields F (d, d), the law's parameters and, with fluid, biot.
-    law
-        Class of the skeleton's law.
+        All points of integration.
+    laws
+        Classes of the skeletons' laws, each with the pieces that follow it; they carry F, what the law takes
+        and, with fluid, biot.
     fixed : (nodes, d)
         Which components of the displacement are zero at which nodes of the grid.
     pressure
@@ -51,18 +56,21 @@ class Momentum:
         Whether the scene has rigid plates: points `plates` with their rigidity, normal and present tilt.
     held
         Whether sides of bodies have given displacements: points `holds` with stiffness, direction and gap.
+    symmetric
+        Whether the tangents of all laws are symmetric.
     """
 
     def __init__(
         self,
         grid: Grid,
         pieces: FormPoints,
-        law,
+        laws: Sequence[tuple[type[Skeleton], FormPoints]],
         fixed: NDArray[np.bool_],
         pressure: fem.Function | None = None,
         gravity: fem.Constant | None = None,
         plates: bool = False,
         held: bool = False,
+        symmetric: bool = True,
     ):
         self.grid, self.pieces = grid, pieces
         V = _compat.function_space(grid.mesh, "Lagrange", 1, (grid.dim,))
@@ -70,21 +78,10 @@ class Momentum:
         self.free = ~fixed
         v, du = ufl.TestFunction(V), ufl.TrialFunction(V)
 
-        F = ufl.variable((ufl.Identity(grid.dim) + pieces.grad(self.u)) * pieces.F)
-        energy = law.energy(F, **{name: getattr(pieces, name) for name in law.parameters})
-        if pressure is not None:
-            energy -= pieces.biot * pressure * ufl.det(F)
-        # differentiated by F and contracted: in 3D a twentieth of the compile time of derivatives by u
-        P = ufl.diff(energy / ufl.det(pieces.F), F)
-        A = ufl.diff(P, F)
-        i, j, k, l, m, n = ufl.indices(6)
-        self._residual = PointForm(ufl.inner(P, pieces.grad(v) * pieces.F) * pieces.dx, pieces)
-        if grid.dim == 2:
-            A = ufl.as_tensor(A[i, m, j, n] * pieces.F[k, m] * pieces.F[l, n], (i, k, j, l))
-            self._tangent = ElementMatrices(A, pieces)
-        else:  # 300 entries a cell of the whole grid: memory and compile time do not pay
-            dF_v, dF_u = pieces.grad(v) * pieces.F, pieces.grad(du) * pieces.F
-            self._tangent = PointForm(dF_v[i, j] * A[i, j, k, l] * dF_u[k, l] * pieces.dx, pieces)
+        self.symmetric = symmetric
+        self._residuals, self._tangents = [], []
+        for law, points in laws:
+            self._add_law(law, points, v, du, pressure)
 
         self.loads = FormPoints(grid, force=(grid.dim,))
         self._traction = PointForm(ufl.inner(self.loads.force, self.loads.value(v)) * self.loads.dx, self.loads)
@@ -103,6 +100,25 @@ class Momentum:
             self._hold = PointForm(h.stiffness * ufl.dot(h.value(du), h.direction) * along * h.dx, h)
             self._pull = PointForm(h.stiffness * h.gap * along * h.dx, h)
         self._ghost(V, v, du)
+
+    def _add_law(self, law: type[Skeleton], points: FormPoints, v, du, pressure: fem.Function | None) -> None:
+        """Compile residual and tangent of the pieces that follow a law."""
+        grid = self.grid
+        F = ufl.variable((ufl.Identity(grid.dim) + points.grad(self.u)) * points.F)
+        P = law.first_piola(F, {name: getattr(points, name) for name in (*law.parameters, *law.state)})
+        if pressure is not None:
+            P -= points.biot * pressure * ufl.diff(ufl.det(F), F)
+        # differentiated by F and contracted: in 3D a twentieth of the compile time of derivatives by u
+        P /= ufl.det(points.F)
+        A = ufl.diff(P, F)
+        i, j, k, l, m, n = ufl.indices(6)
+        self._residuals.append(PointForm(ufl.inner(P, points.grad(v) * points.F) * points.dx, points))
+        if grid.dim == 2:
+            A = ufl.as_tensor(A[i, m, j, n] * points.F[k, m] * points.F[l, n], (i, k, j, l))
+            self._tangents.append(ElementMatrices(A, points, self.symmetric))
+        else:  # 300 entries a cell of the whole grid: memory and compile time do not pay
+            dF_v, dF_u = points.grad(v) * points.F, points.grad(du) * points.F
+            self._tangents.append(PointForm(dF_v[i, j] * A[i, j, k, l] * dF_u[k, l] * points.dx, points))
 
     def _slope(self, w):
         """Return the tangential gradient of the normal displacement, grad_t(w_n), at the plates."""
@@ -212,7 +228,8 @@ class Momentum:
         """Return the out-of-balance nodal forces at u and their scale, the larger of internal and external (N)."""
         b = self._b.x.array
         b[:] = 0.0
-        self._residual.assemble_vector(b)
+        for residual in self._residuals:
+            residual.assemble_vector(b)
         sum_ghosts(self._b)
         owned = self._owned()
         squares = [b[owned] @ b[owned], self._external[owned] @ self._external[owned]]
@@ -232,7 +249,8 @@ class Momentum:
     def assemble_tangent(self) -> PETSc.Mat:
         """Return the tangent at u."""
         zero(self.K)
-        self._tangent.assemble_matrix(self.K)
+        for tangent in self._tangents:
+            tangent.assemble_matrix(self.K)
         self.K.assemble()
         # the first sum gives K the pattern of both
         pattern = PETSc.Mat.Structure

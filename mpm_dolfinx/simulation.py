@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
-import ufl
 from dolfinx import fem
 from dolfinx.common import Timer
 from numpy.typing import ArrayLike, NDArray
@@ -17,8 +16,9 @@ from mpm_dolfinx.conditions import HOLD, RIGIDITY, Displacement, Drained, Inflow
 from mpm_dolfinx.coupling import COUPLINGS, Coupler, Report
 from mpm_dolfinx.domains import corner_bits
 from mpm_dolfinx.exchange import Exchange
-from mpm_dolfinx.forms import FormPoints, PointExpression
+from mpm_dolfinx.forms import FormPoints
 from mpm_dolfinx.grid import Grid, sum_by
+from mpm_dolfinx.laws import SceneMaterials
 from mpm_dolfinx.materials import Fluid, Skeleton
 from mpm_dolfinx.momentum import FULL, Momentum
 from mpm_dolfinx.placement import Placement
@@ -38,7 +38,7 @@ class Simulation:
     bodies
         Seeded bodies.
     materials
-        Material of each index that the bodies name; all of one law.
+        Material of each index that the bodies name.
     fixed
         Walls of the grid with the components that are zero there, such as {"left": "xy", "bottom": "y"}.
     fluid
@@ -78,9 +78,6 @@ class Simulation:
             raise ValueError(f"quadrature {quadrature!r}: must be domain or point")
         if coupling not in COUPLINGS:
             raise ValueError(f"coupling {coupling!r}: must be one of {', '.join(COUPLINGS)}")
-        law = type(materials[0])
-        if any(type(m) is not law for m in materials):
-            raise ValueError("materials: all must be of one law")
         if fluid is None and (drained or inflows):
             raise ValueError("drained and inflow sides need a fluid")
         self.grid, self.materials, self.fluid, self.bodies = grid, materials, fluid, bodies
@@ -89,6 +86,7 @@ class Simulation:
         self.gravity = None if gravity is None else fem.Constant(grid.mesh, np.zeros(grid.dim))
         self.t, self.active_cells = 0.0, 0
         self.points = material_points(grid, bodies, pressure)
+        self._scene = SceneMaterials(grid, materials, bodies, self.points)
         self._plates = [(plate, self._faces(bodies, plate)) for plate in plates]
         tractions = [*tractions, *(plate.traction(faces.area0.sum(), grid.dim) for plate, faces in self._plates)]
         self._loads = [(load, self._faces(bodies, load)) for load in tractions]
@@ -96,15 +94,13 @@ class Simulation:
         self.reactions = np.zeros((len(displacements), grid.dim))
         """(displacements, d): force by which each given displacement acts on the bodies, N (N/m in plane strain)."""
         self._outlets = [(outlet, self._faces(bodies, outlet)) for outlet in (*drained, *inflows)]
-        self._law = law
 
         start = time.perf_counter()
-        self._build(law, self._fixed_nodes(fixed), coupling, tolerance)
+        self._build(self._fixed_nodes(fixed), coupling, tolerance)
         self.jit = time.perf_counter() - start
         """Seconds spent on compiling or finding the forms."""
         self._carried = carry(self.points) if fluid else None
         self._prepared = False
-        self._stress: PointExpression | None = None
 
     # ---- building -------------------------------------------------------------------------------
 
@@ -124,26 +120,32 @@ class Simulation:
                 out[self.grid.wall_nodes(wall), "xyz".index(a)] = True
         return out
 
-    def _build(self, law, fixed: NDArray[np.bool_], coupling: str, tolerance: float) -> None:
+    def _build(self, fixed: NDArray[np.bool_], coupling: str, tolerance: float) -> None:
         """Compile the forms that the scene needs."""
-        grid, d, fluid = self.grid, self.grid.dim, self.fluid
-        shapes: dict[str, tuple[int, ...]] = {"F": (d, d), **{name: () for name in law.parameters}}
+        grid, d, fluid, scene = self.grid, self.grid.dim, self.fluid, self._scene
+        shapes: dict[str, tuple[int, ...]] = {"F": (d, d), **scene.shapes}
         if fluid:
             shapes |= {"biot": (), "storage": ()}
         if self.gravity is not None:
             shapes |= {"density": ()}
         self.pieces = FormPoints(grid, **shapes)
+        self._parts = scene.parts(self.pieces, ["F", "biot"] if fluid else ["F"])
         p = fem.Function(_compat.function_space(grid.mesh, "DG", 0)) if fluid else None
-        self.momentum = Momentum(grid, self.pieces, law, fixed, p, self.gravity, bool(self._plates), bool(self._holds))
+        conditions = bool(self._plates), bool(self._holds)
+        self.momentum = Momentum(
+            grid, self.pieces, self._parts, fixed, p, self.gravity, *conditions, symmetric=scene.symmetric
+        )
         self.storage = None
+        if not self.momentum.symmetric and coupling == "schur-cg":
+            coupling = "schur-fgmres"
         if fluid:
             weight = None if self.gravity is None else fluid.density * self.gravity
             self.storage = Storage(grid, self.pieces, self.momentum.u, p, weight, coupling != "schur-fgmres")
         self.coupler = Coupler(self.momentum, self.storage, coupling, tolerance)
 
-    def _table(self, value: Callable[[Skeleton], float]) -> NDArray[np.float64]:
-        """Return a constant of the materials at the points (n,)."""
-        return np.array([value(m) for m in self.materials])[self.points.material]
+    def _table(self, value: Callable[..., float], *columns: NDArray) -> NDArray[np.float64]:
+        """Return a constant of the materials at the points (n,); `value` also takes columns (n,) of the points."""
+        return self._scene.table(self.points, value, *columns)
 
     # ---- one step -------------------------------------------------------------------------------
 
@@ -200,18 +202,19 @@ class Simulation:
                 place.pieces_to_cells(place.pieces.fraction * (self.points.volume0 * J)[place.pieces.point]),
                 **{name: place.to_cells(values) for name, values in self._fields(J).items()},
             )
+            if len(self._parts) > 1:
+                law = place.to_cells(self._scene.law_of(self.points))
+                for number, (_, part) in enumerate(self._parts):
+                    part.take(self.pieces, np.flatnonzero(law == number))
             self._activate(J)
 
     def _fields(self, J: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
         """Return what the points bring to their pieces."""
-        fields = {"F": self.points.F}
-        for name in self._law.parameters:
-            fields[name] = self._table(lambda m, name=name: getattr(m, name))
+        fields = {"F": self.points.F, **self._scene.values(self.points)}
         n = 1 - (1 - self._table(lambda m: m.porosity)) / J
         if self.fluid:
-            storage = np.stack([m.storage(self.fluid.bulk, n) for m in self.materials])
             fields["biot"] = self._table(lambda m: m.biot)
-            fields["storage"] = storage[self.points.material, np.arange(len(n))]
+            fields["storage"] = self._table(lambda m, n: m.storage(self.fluid.bulk, n), n)
         if self.gravity is not None:
             wet = self.fluid.density if self.fluid else 0.0
             fields["density"] = (1 - n) * self._table(lambda m: m.grain_density) + n * wet
@@ -305,7 +308,7 @@ class Simulation:
     def _place_plates(self) -> None:
         """Put the plates on the surface."""
         grid, rows = self.grid, []
-        modulus = max(m.oedometric for m in self.materials)
+        modulus = self._scene.stiffest
         for _, faces in self._plates:
             _, at, cell, x = self.placement.surface(faces)
             area = face_vectors(self.points.corners[at], faces.axis, faces.end)
@@ -321,7 +324,7 @@ class Simulation:
     def _place_holds(self, t: float) -> None:
         """Put the given displacements of time t on the surface: one row a face and component."""
         d, rows = self.grid.dim, []
-        stiffness = HOLD * max(m.oedometric for m in self.materials) / self.grid.h.min()
+        stiffness = HOLD * self._scene.stiffest / self.grid.h.min()
         for number, (hold, faces, axes) in enumerate(self._holds):
             here, _, cell, x = self.placement.surface(faces)
             gap = faces.x0[here] + hold.at(t, faces.x0)[here] - x
@@ -400,6 +403,7 @@ class Simulation:
             # F_p <- (sum_k w_k Delta_k / V_p) F_p
             mean = [place.mean(column) for column in place.to_pieces(gradient).reshape(-1, d * d).T]
             points.F = (np.eye(d) + np.stack(mean, axis=1).reshape(n, d, d)) @ points.F
+            self._scene.update_state(points)
             if self.quadrature == "domain":
                 corners = points.corners.reshape(-1, d)
                 moved = corners + place.displacement(u, np.repeat(np.arange(n), 2**d), corners)
@@ -432,15 +436,7 @@ class Simulation:
 
     def effective_stress(self) -> NDArray[np.float64]:
         """Return the effective Cauchy stress (n, d, d), Pa, tension positive, at the material points."""
-        grid, d = self.grid, self.grid.dim
-        if self._stress is None:
-            state = FormPoints(grid, F=(d, d), **{name: () for name in self._law.parameters})
-            F = ufl.variable(state.F)
-            energy = self._law.energy(F, **{name: getattr(state, name) for name in self._law.parameters})
-            self._stress = PointExpression(ufl.diff(energy, F) * F.T / ufl.det(F), state)
-        x, fields = self.points.x, {name: self._fields(self.points.J)[name] for name in ("F", *self._law.parameters)}
-        self._stress.points.place(grid.local(grid.number(grid.index(x))), x, self.points.volume0, **fields)
-        return self._stress.evaluate()
+        return self._scene.effective_stress(self.points)
 
     # ---- many steps -----------------------------------------------------------------------------
 
