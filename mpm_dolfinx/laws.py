@@ -55,6 +55,8 @@ class SceneMaterials:
         X, index = _reference(bodies, len(materials))
         evaluated = [m.at(X[index == i]) for i, m in enumerate(materials)]
         self.laws = list(dict.fromkeys(map(type, materials)))
+        self.conductivity_laws = list(dict.fromkeys(m.conductivity_law for m in materials if m.conductivity_law))
+        """The different conductivity laws of the scene."""
         self._law = np.array([self.laws.index(type(m)) for m in materials])
         self.stiffest = max(float(np.max(m.oedometric, initial=0.0)) for m in evaluated)
         """Largest oedometric modulus, Pa."""
@@ -264,4 +266,44 @@ class LawAtPoints:
             stop = start + int(np.prod(shape, dtype=int))
             out[name] = values[:, start:stop].reshape(-1, *shape)
             start = stop
+        return out
+
+
+class ConductivityAtPieces:
+    """Conductivities that depend on deformation and place, evaluated at the pieces at the start of a step.
+
+    Parameters
+    ----------
+    scene
+        The scene's materials.
+    pieces
+        Points with the fields F, conductivity and porosity0, where a material has a conductivity law.
+    """
+
+    def __init__(self, scene: SceneMaterials, pieces: FormPoints):
+        self._points, self._materials = pieces, scene.materials
+        self._laws = {law: PointExpression(self._in_ufl(law), pieces) for law in scene.conductivity_laws}
+
+    def _in_ufl(self, law: Callable):
+        points, J = self._points, ufl.det(self._points.F)
+        return call(
+            law,
+            conductivity=points.conductivity,
+            F=points.F,
+            J=J,
+            porosity=1 - (1 - points.porosity0) / J,
+            porosity0=points.porosity0,
+            x=points.position,
+        )
+
+    def evaluate(self, material: NDArray[np.int32]) -> NDArray[np.float64]:
+        """Return the conductivities (m,), m/s, of pieces of the given materials (m,)."""
+        out = self._points.data["conductivity"][:, 0].copy()
+        for law, expression in self._laws.items():
+            rows = np.flatnonzero([m.conductivity_law is law for m in self._materials])
+            chosen = np.isin(material, rows)
+            out[chosen] = expression.evaluate()[chosen]
+            bad = np.flatnonzero(chosen & ~(out >= 0))
+            if len(bad):
+                raise ValueError(f"conductivity law: k = {out[bad[0]]} at {self._points.x[bad[0]]}, must be >= 0")
         return out

@@ -177,16 +177,16 @@ class Hencky(Skeleton):
         return (bulk - 2 * shear / 3) / 2 * ufl.ln(ufl.det(F)) ** 2 + shear * squares
 
 
-def _eigenvalues(C):
-    """Return the eigenvalues of a symmetric 2x2 or 3x3 tensor as UFL."""
+def _eigenvalues(C, apart: float = 1e-4):
+    """Return the eigenvalues of a symmetric 2x2 or 3x3 tensor as UFL, equal ones set apart."""
     if C.ufl_shape[0] == 2:
         mean = (C[0, 0] + C[1, 1]) / 2
-        radius = ufl.sqrt((C[0, 0] - C[1, 1]) ** 2 + 4 * C[0, 1] ** 2 + 1e-8) / 2
+        radius = ufl.sqrt((C[0, 0] - C[1, 1]) ** 2 + 4 * C[0, 1] ** 2 + apart**2) / 2
         return mean + radius, mean - radius
     mean = ufl.tr(C) / 3
     D = C - mean * ufl.Identity(3)
-    r = ufl.sqrt(ufl.inner(D, D) / 6 + 1e-10)
-    phi = ufl.acos((1 - 1e-6) * ufl.det(D) / (2 * r**3)) / 3
+    r = ufl.sqrt(ufl.inner(D, D) / 6 + 1e-2 * apart**2)
+    phi = ufl.acos((1 - 1e2 * apart**2) * ufl.det(D) / (2 * r**3)) / 3
     return tuple(mean + 2 * r * ufl.cos(phi + 2 * ufl.pi * k / 3) for k in range(3))
 
 

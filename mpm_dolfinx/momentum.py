@@ -13,7 +13,7 @@ itself.  The derivatives are UFL's.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from petsc4py import PETSc
 
@@ -23,6 +23,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from mpm_dolfinx import _compat
+from mpm_dolfinx.extend import call
 from mpm_dolfinx.forms import ElementMatrices, FormPoints, PointForm
 from mpm_dolfinx.grid import Grid
 from mpm_dolfinx.materials import Skeleton
@@ -78,8 +79,9 @@ class Momentum:
         self.free = ~fixed
         v, du = ufl.TestFunction(V), ufl.TrialFunction(V)
 
-        self.symmetric = symmetric
+        self.symmetric, self.holding = symmetric, False
         self._residuals, self._tangents = [], []
+        self._terms: list[PointForm] = []
         for law, points in laws:
             self._add_law(law, points, v, du, pressure)
 
@@ -119,6 +121,21 @@ class Momentum:
         else:  # 300 entries a cell of the whole grid: memory and compile time do not pay
             dF_v, dF_u = points.grad(v) * points.F, points.grad(du) * points.F
             self._tangents.append(PointForm(dF_v[i, j] * A[i, j, k, l] * dF_u[k, l] * points.dx, points))
+
+    def add(self, term: Callable, t: fem.Constant) -> None:
+        """Add a term of the user's: see `extend`."""
+        V = self.u.function_space
+        v, du = ufl.TestFunction(V), ufl.TrialFunction(V)
+        form = call(term, points=self.pieces, u=self.u, v=v, t=t)
+        potential = not form.arguments()
+        if potential:
+            form = ufl.derivative(form, self.u, v)
+        self._terms.append(PointForm(form, self.pieces))
+        self._own = fem.Function(V)
+        if self.u in form.coefficients():
+            self._tangents.append(PointForm(ufl.derivative(form, self.u, du), self.pieces))
+            self.holding = True
+            self.symmetric = self.symmetric and potential
 
     def _slope(self, w):
         """Return the tangential gradient of the normal displacement, grad_t(w_n), at the plates."""
@@ -225,7 +242,7 @@ class Momentum:
         self.u.x.array[:] = 0.0
 
     def assemble_residual(self) -> tuple[PETSc.Vec, float]:
-        """Return the out-of-balance nodal forces at u and their scale, the larger of internal and external (N)."""
+        """Return the out-of-balance nodal forces at u and their scale, the largest of internal, external, terms (N)."""
         b = self._b.x.array
         b[:] = 0.0
         for residual in self._residuals:
@@ -233,6 +250,10 @@ class Momentum:
         sum_ghosts(self._b)
         owned = self._owned()
         squares = [b[owned] @ b[owned], self._external[owned] @ self._external[owned]]
+        if self._terms:
+            own = self._assemble_terms()[owned]
+            squares.append(own @ own)
+            b[owned] += own
         if self.grid.comm.size > 1:
             squares = self.grid.comm.allreduce(np.array(squares))
         b[owned] -= self._external[owned]
@@ -242,6 +263,13 @@ class Momentum:
         du = self.unknowns.gather(self.u.x.array, self.K.createVecRight())
         self.penalty.multAdd(du, r, r)
         return r, float(np.sqrt(max(squares)))
+
+    def _assemble_terms(self) -> NDArray[np.float64]:
+        """Return the nodal forces of the user's terms at u."""
+        self._own.x.array[:] = 0.0
+        for term in self._terms:
+            term.assemble_vector(self._own.x.array)
+        return sum_ghosts(self._own)
 
     def _owned(self) -> slice:
         return slice(0, self.u.function_space.dofmap.index_map.size_local * self.grid.dim)

@@ -18,7 +18,7 @@ from mpm_dolfinx.domains import corner_bits
 from mpm_dolfinx.exchange import Exchange
 from mpm_dolfinx.forms import FormPoints
 from mpm_dolfinx.grid import Grid, sum_by
-from mpm_dolfinx.laws import SceneMaterials
+from mpm_dolfinx.laws import ConductivityAtPieces, SceneMaterials
 from mpm_dolfinx.materials import Fluid, Skeleton
 from mpm_dolfinx.momentum import FULL, Momentum
 from mpm_dolfinx.placement import Placement
@@ -53,6 +53,8 @@ class Simulation:
         "domain": exact pieces of the points' domains; "point": at the points, as in the seed paper.
     coupling, tolerance
         See `Coupler`.
+    terms, sources
+        Functions that give terms of the user's own to the two balances in UFL: see `extend`.
     """
 
     def __init__(
@@ -73,13 +75,15 @@ class Simulation:
         quadrature: str = "domain",
         coupling: str = "schur-cg",
         tolerance: float = 1e-8,
+        terms: Sequence[Callable] = (),
+        sources: Sequence[Callable] = (),
     ):
         if quadrature not in ("domain", "point"):
             raise ValueError(f"quadrature {quadrature!r}: must be domain or point")
         if coupling not in COUPLINGS:
             raise ValueError(f"coupling {coupling!r}: must be one of {', '.join(COUPLINGS)}")
-        if fluid is None and (drained or inflows):
-            raise ValueError("drained and inflow sides need a fluid")
+        if fluid is None and (drained or inflows or sources):
+            raise ValueError("drained and inflow sides and sources need a fluid")
         self.grid, self.materials, self.fluid, self.bodies = grid, materials, fluid, bodies
         self.quadrature = quadrature
         self._gravity_at = gravity if callable(gravity) or gravity is None else lambda t: gravity
@@ -96,7 +100,7 @@ class Simulation:
         self._outlets = [(outlet, self._faces(bodies, outlet)) for outlet in (*drained, *inflows)]
 
         start = time.perf_counter()
-        self._build(self._fixed_nodes(fixed), coupling, tolerance)
+        self._build(self._fixed_nodes(fixed), coupling, tolerance, terms, sources)
         self.jit = time.perf_counter() - start
         """Seconds spent on compiling or finding the forms."""
         self._carried = carry(self.points) if fluid else None
@@ -120,7 +124,7 @@ class Simulation:
                 out[self.grid.wall_nodes(wall), "xyz".index(a)] = True
         return out
 
-    def _build(self, fixed: NDArray[np.bool_], coupling: str, tolerance: float) -> None:
+    def _build(self, fixed: NDArray[np.bool_], coupling: str, tolerance: float, terms, sources) -> None:
         """Compile the forms that the scene needs."""
         grid, d, fluid, scene = self.grid, self.grid.dim, self.fluid, self._scene
         shapes: dict[str, tuple[int, ...]] = {"F": (d, d), **scene.shapes}
@@ -128,6 +132,11 @@ class Simulation:
             shapes |= {"biot": (), "storage": ()}
         if self.gravity is not None:
             shapes |= {"density": ()}
+        self._extended = bool(terms or sources)
+        if self._extended:
+            shapes |= {"displacement": (d,), **{name: v.shape[1:] for name, v in self.points.data.items()}}
+        if fluid and scene.conductivity_laws:
+            shapes |= {"conductivity": (), "porosity0": ()}
         self.pieces = FormPoints(grid, **shapes)
         self._parts = scene.parts(self.pieces, ["F", "biot"] if fluid else ["F"])
         p = fem.Function(_compat.function_space(grid.mesh, "DG", 0)) if fluid else None
@@ -135,12 +144,18 @@ class Simulation:
         self.momentum = Momentum(
             grid, self.pieces, self._parts, fixed, p, self.gravity, *conditions, symmetric=scene.symmetric
         )
+        self._time = fem.Constant(grid.mesh, 0.0)
+        for term in terms:
+            self.momentum.add(term, self._time)
         self.storage = None
         if not self.momentum.symmetric and coupling == "schur-cg":
             coupling = "schur-fgmres"
         if fluid:
             weight = None if self.gravity is None else fluid.density * self.gravity
             self.storage = Storage(grid, self.pieces, self.momentum.u, p, weight, coupling != "schur-fgmres")
+            for source in sources:
+                self.storage.add(source, self._time)
+            self._conductivity = ConductivityAtPieces(scene, self.pieces)
         self.coupler = Coupler(self.momentum, self.storage, coupling, tolerance)
 
     def _table(self, value: Callable[..., float], *columns: NDArray) -> NDArray[np.float64]:
@@ -170,6 +185,7 @@ class Simulation:
 
     def _begin(self, t: float) -> None:
         """Set up the step that ends at time t: grid, loads of that time, u = 0 and the cells' pressure."""
+        self._time.value = t
         if self.gravity is not None:
             self.gravity.value = np.asarray(self._gravity_at(t), dtype=float)
         fresh = not self._prepared
@@ -180,7 +196,7 @@ class Simulation:
         self._place_loads(t)
         if fresh:
             self.momentum.set_penalty()
-            if self._renumbered:
+            if self._renumbered and not self.momentum.holding:
                 self._check_held()
             self._prepared = True
         self.momentum.start()
@@ -201,6 +217,7 @@ class Simulation:
                 place.pieces_to_cells(place.pieces.x),
                 place.pieces_to_cells(place.pieces.fraction * (self.points.volume0 * J)[place.pieces.point]),
                 **{name: place.to_cells(values) for name, values in self._fields(J).items()},
+                **({"displacement": place.pieces_to_cells(self._displacement())} if self._extended else {}),
             )
             if len(self._parts) > 1:
                 law = place.to_cells(self._scene.law_of(self.points))
@@ -210,15 +227,31 @@ class Simulation:
 
     def _fields(self, J: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
         """Return what the points bring to their pieces."""
-        fields = {"F": self.points.F, **self._scene.values(self.points)}
+        fields = {"F": self.points.F, **(self.points.data if self._extended else {}), **self._scene.values(self.points)}
         n = 1 - (1 - self._table(lambda m: m.porosity)) / J
         if self.fluid:
             fields["biot"] = self._table(lambda m: m.biot)
             fields["storage"] = self._table(lambda m, n: m.storage(self.fluid.bulk, n), n)
+            if self._scene.conductivity_laws:
+                fields["conductivity"] = self._table(lambda m: m.conductivity)
+                fields["porosity0"] = self._table(lambda m: m.porosity)
         if self.gravity is not None:
             wet = self.fluid.density if self.fluid else 0.0
             fields["density"] = (1 - n) * self._table(lambda m: m.grain_density) + n * wet
         return fields
+
+    def _displacement(self) -> NDArray[np.float64]:
+        """Return the displacements (m, d), m, of the pieces' centroids since the start, by the F of their points."""
+        points, pieces = self.points, self.placement.pieces
+        X = np.concatenate([b.centre for b in self.bodies])[points.id]
+        off = pieces.x - points.x[pieces.point]
+        return off + (points.x - X)[pieces.point] - np.einsum("mab,mb->ma", np.linalg.inv(points.F)[pieces.point], off)
+
+    def _mobility(self) -> NDArray[np.float64]:
+        """Return the mobility k / (rho_w g) at the pieces (m,), m^2/(Pa s)."""
+        if not self._scene.conductivity_laws:
+            return self._rows(lambda m: m.conductivity) / self.fluid.unit_weight
+        return self._conductivity.evaluate(self.placement.to_cells(self.points.material)) / self.fluid.unit_weight
 
     def _activate(self, J: NDArray[np.float64]) -> None:
         """Set the active cells and what they hold."""
@@ -247,7 +280,7 @@ class Simulation:
                 pieces.cells,
                 weight,
                 pieces.x,
-                self._rows(lambda m: m.conductivity) / self.fluid.unit_weight,
+                self._mobility(),
                 self.placement.pieces_to_cells(self.placement.pieces.faces),
                 pieces.data["storage"][:, 0],
                 self.placement.pieces_to_cells(self._brought),
