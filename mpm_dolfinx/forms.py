@@ -15,6 +15,7 @@ No generated code is touched.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import factorial, prod
 
 from petsc4py import PETSc
@@ -64,7 +65,7 @@ class FormPoints:
         }
         self.dx = PointMeasure(grid, self._functions["weight"])
         self._size = {name: int(np.prod(shape, dtype=int)) for name, shape in fields.items()}
-        self.cells = np.empty(0, dtype=np.int32)
+        self.cells = self.filled = np.empty(0, dtype=np.int32)
         self.data: dict[str, NDArray[np.float64]] = {}
         self.version = 0
 
@@ -88,7 +89,7 @@ class FormPoints:
         data : (n, ...)
             Values of the fields.
         """
-        self.cells, self.x = cells, x
+        self.cells, self.x, self.filled = cells, x, np.unique(cells)
         self.data = {
             "offset": x - self.grid.midpoints[cells],
             "weight": (weight / self.grid.cell_volume)[:, None],
@@ -99,6 +100,7 @@ class FormPoints:
     def take(self, points: FormPoints, rows: NDArray[np.int64]) -> None:
         """Be some rows of other points, which carry the fields of these."""
         self.cells, self.x = points.cells[rows], points.x[rows]
+        self.filled = np.unique(self.cells)
         self.data = {name: points.data[name][rows] for name in self._functions}
         self.version += 1
 
@@ -148,10 +150,11 @@ class PointForm:
             if f in names:
                 self._columns.append((slice(start, stop), names[f]))
             else:
-                unrolled = (dofs[:, :, None] * bs + np.arange(bs)).reshape(len(dofs), stop - start)
+                # as numpy's own index type, which it would else convert to in every assembly
+                unrolled = (dofs[:, :, None].astype(np.intp) * bs + np.arange(bs)).reshape(len(dofs), stop - start)
                 self._gathered.append((slice(start, stop), f, unrolled))
             start = stop
-        self._width = start
+        self._width, self._room = start, np.empty((0, start))
 
     def rows(self) -> NDArray[np.float64]:
         """Return the coefficients of the form, one row a point."""
@@ -159,12 +162,14 @@ class PointForm:
         if self._version != self.points.version:
             self._version = self.points.version
             self.compiled.bind(cells)
-            self._packed = np.empty((len(cells), self._width))
+            if len(cells) > len(self._room):  # memory that is kept saves the page faults of every step
+                self._room = np.empty((len(cells) + len(cells) // 8, self._width))
+            self._packed = self._room[: len(cells)]
             for columns, name in self._columns:
                 self._packed[:, columns] = self.points.data[name]
             self._dofs = [(c, f, dofs[cells]) for c, f, dofs in self._gathered]
         for columns, f, dofs in self._dofs:
-            self._packed[:, columns] = f.x.array[dofs]
+            self._packed[:, columns] = np.take(f.x.array, dofs, mode="wrap")  # "raise" checks every index
         return self._packed
 
     def assemble_vector(self, b: NDArray[np.float64]) -> None:
@@ -198,49 +203,70 @@ class ElementMatrices:
     """
 
     def __init__(self, tangent: ufl.core.expr.Expr, points: FormPoints, symmetric: bool = True):
-        self.points, grid = points, points.grid
-        count = 2**grid.dim * grid.dim
+        self.points, dim = points, points.grid.dim
+        count = 2**dim * dim
         rows, columns = np.triu_indices(count) if symmetric else np.divmod(np.arange(count**2), count)
-        self._entry = np.empty((count, count), dtype=np.int64)  # place of each entry in the vector
+        self._entry = np.empty((count, count), dtype=np.int64)  # place of each entry among the sums
         if symmetric:
             self._entry[columns, rows] = np.arange(len(rows))
         self._entry[rows, columns] = np.arange(len(rows))
-        space = _compat.function_space(grid.mesh, "DG", 0, (len(rows),))
-        self._values, q = fem.Function(space), ufl.TestFunction(space)
-        gradients = self._gradients()
-        integrand = 0
-        for n, (row, column) in enumerate(zip(rows, columns, strict=True)):
-            (v, i), (u, j) = divmod(row, grid.dim), divmod(column, grid.dim)
-            block = ufl.as_matrix([[tangent[int(i), k, int(j), l] for l in range(grid.dim)] for k in range(grid.dim)])
-            integrand += q[n] * ufl.dot(gradients[v], ufl.dot(block, gradients[u]))
-        self._form = PointForm(integrand * points.dx, points)
-        self._version = -1
-
-    def _gradients(self) -> list:
-        """Return the gradients of the shape functions at the point as UFL."""
-        grid, xi = self.points.grid, self.points.offset
-        h = fem.Constant(grid.mesh, grid.h)
-        out = []
-        for signs in grid.signs.tolist():
-            t = [0.5 + signs[a] * xi[a] / h[a] for a in range(grid.dim)]
-            slopes = [signs[a] / h[a] * prod(t[b] for b in range(grid.dim) if b != a) for a in range(grid.dim)]
-            out.append(ufl.as_vector(slopes))
-        return out
+        gradients, entries = shape_gradients(points), []
+        for row, column in zip(rows, columns, strict=True):
+            (v, i), (u, j) = divmod(row, dim), divmod(column, dim)
+            block = ufl.as_matrix([[tangent[int(i), k, int(j), l] for l in range(dim)] for k in range(dim)])
+            entries.append(ufl.dot(gradients[v], ufl.dot(block, gradients[u])))
+        self._sums = CellSums(entries, points)
 
     def assemble_matrix(self, A: PETSc.Mat) -> None:
         """Add the matrix to `A`, by unrolled local dofs; the caller finalises it."""
-        if self._version != self.points.version:
-            self._version = self.points.version
-            self._cells = np.unique(self.points.cells)
-            dofs = self.points.grid.cell_nodes[self._cells][:, :, None] * self.points.grid.dim
-            dofs = dofs + np.arange(self.points.grid.dim)
-            self._dofs = dofs.reshape(len(self._cells), len(self._entry)).astype(PETSc.IntType)
-        if not len(self._cells):
-            return
-        values = self._values.x.array.reshape(len(self._values.x.array) // (self._entry.max() + 1), -1)
-        values[self._cells] = 0.0
+        insert(A, self.points, self._sums()[:, self._entry])
+
+
+def shape_gradients(points: FormPoints) -> list:
+    """Return the gradients of the cell's P1 shape functions at the point as UFL."""
+    grid, xi = points.grid, points.offset
+    h = fem.Constant(grid.mesh, grid.h)
+    out = []
+    for signs in grid.signs.tolist():
+        t = [0.5 + signs[a] * xi[a] / h[a] for a in range(grid.dim)]
+        slopes = [signs[a] / h[a] * prod(t[b] for b in range(grid.dim) if b != a) for a in range(grid.dim)]
+        out.append(ufl.as_vector(slopes))
+    return out
+
+
+def insert(A: PETSc.Mat, points: FormPoints, matrices: NDArray[np.float64]) -> None:
+    """Add the element matrices of P1 vectors (cells, n, n) in the filled cells of `points` to `A`."""
+    grid, cells = points.grid, points.filled
+    if len(cells):
+        dofs = grid.cell_nodes[cells][:, :, None] * grid.dim + np.arange(grid.dim)
+        dofs = dofs.reshape(len(cells), -1).astype(PETSc.IntType)
+        A.setValuesLocalRCV(dofs, dofs, matrices, addv=True)
+
+
+class CellSums:
+    """Sums over the points of each cell: DG0 tests them, so that the assembler adds them up.
+
+    Parameters
+    ----------
+    quantities
+        Scalar UFL expressions at the points.
+    points
+        The points.
+    """
+
+    def __init__(self, quantities: Sequence[ufl.core.expr.Expr], points: FormPoints):
+        self.points, self._count = points, len(quantities)
+        space = _compat.function_space(points.grid.mesh, "DG", 0, (self._count,))
+        self._values, q = fem.Function(space), ufl.TestFunction(space)
+        self._form = PointForm(ufl.inner(ufl.as_vector(quantities), q) * points.dx, points)
+
+    def __call__(self) -> NDArray[np.float64]:
+        """Return the sums (cells, quantities) in the filled cells of the points."""
+        cells = self.points.filled
+        values = self._values.x.array.reshape(-1, self._count)
+        values[cells] = 0.0
         self._form.assemble_vector(self._values.x.array)
-        A.setValuesLocalRCV(self._dofs, self._dofs, values[self._cells][:, self._entry], addv=True)
+        return values[cells]
 
 
 class PointExpression:

@@ -88,7 +88,7 @@ class Placement:
         grid, cell = self.grid, self._filled_cell(at, x)
         travel = Exchange(grid.comm, grid.owner(cell))
         cells, x = grid.local(travel.send(cell)), travel.send(x)
-        N, _ = grid.shape_functions(cells, x)
+        N = grid.shape_values(cells, x)
         return travel.back(np.einsum("mk,mkd->md", N, u[grid.cell_nodes[cells]]))
 
     def _filled_cell(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:

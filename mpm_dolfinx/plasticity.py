@@ -75,6 +75,10 @@ class DruckerPrager(Skeleton):
     def symmetric(self) -> bool:
         return self.dilation == self.friction
 
+    @property
+    def nearly_incompressible(self) -> bool:
+        return True  # plastic flow is
+
     def _cone(self, angle):
         angle = np.radians(angle)
         return MATCHES[self.match](np.tan(angle), np.sin(angle), np.cos(angle))

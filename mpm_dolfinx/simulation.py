@@ -141,9 +141,8 @@ class Simulation:
         self._parts = scene.parts(self.pieces, ["F", "biot"] if fluid else ["F"])
         p = fem.Function(_compat.function_space(grid.mesh, "DG", 0)) if fluid else None
         conditions = bool(self._plates), bool(self._holds)
-        self.momentum = Momentum(
-            grid, self.pieces, self._parts, fixed, p, self.gravity, *conditions, symmetric=scene.symmetric
-        )
+        options = {"mean_dilatation": scene.nearly_incompressible, "symmetric": scene.symmetric}
+        self.momentum = Momentum(grid, self.pieces, self._parts, fixed, p, self.gravity, *conditions, **options)
         self._time = fem.Constant(grid.mesh, 0.0)
         for term in terms:
             self.momentum.add(term, self._time)
@@ -377,7 +376,7 @@ class Simulation:
     def _react(self) -> None:
         """Sum the forces of the given displacements."""
         grid, holds = self.grid, self.momentum.holds
-        N, _ = grid.shape_functions(holds.cells, holds.x)
+        N = grid.shape_values(holds.cells, holds.x)
         u = self.momentum.u.x.array.reshape(-1, grid.dim)[grid.cell_nodes[holds.cells]]
         direction = holds.data["direction"]
         moved = np.einsum("mk,mkd,md->m", N, u, direction)
@@ -433,9 +432,12 @@ class Simulation:
             u = self.momentum.u.x.array.reshape(-1, d)
             _, dN = grid.shape_functions(self.pieces.cells, self.pieces.x)
             gradient = u[grid.cell_nodes[self.pieces.cells]].transpose(0, 2, 1) @ dN
+            delta = np.eye(d) + gradient
+            if self.momentum.dilatation is not None:
+                delta = self.momentum.dilatation.averaged(delta)
             # F_p <- (sum_k w_k Delta_k / V_p) F_p
-            mean = [place.mean(column) for column in place.to_pieces(gradient).reshape(-1, d * d).T]
-            points.F = (np.eye(d) + np.stack(mean, axis=1).reshape(n, d, d)) @ points.F
+            mean = [place.mean(column) for column in place.to_pieces(delta).reshape(-1, d * d).T]
+            points.F = np.stack(mean, axis=1).reshape(n, d, d) @ points.F
             self._scene.update_state(points)
             if self.quadrature == "domain":
                 corners = points.corners.reshape(-1, d)

@@ -83,8 +83,8 @@ def matrix(rows: Unknowns, columns: Unknowns, row_length: int) -> PETSc.Mat:
 def direct_solver(A: PETSc.Mat, name: str, symmetric: bool = True) -> PETSc.KSP:
     """Return a solver that factorises A, a symmetric one as L D L^T, refactorised when A has changed.
 
-    MUMPS in parallel; on one process PETSc's own, whose overhead is smaller (3 ms instead of 6 ms by LU
-    and by MUMPS at 3000 unknowns in 2D).
+    MUMPS in parallel; on one process PETSc's own with an approximate minimum degree ordering: at 3000
+    unknowns in 2D 3 ms (nested dissection 4, MUMPS 5, UMFPACK 7, CHOLMOD 9), at 44000 150 (290) ms.
     """
     if symmetric:
         A.setOption(PETSc.Mat.Option.SYMMETRIC, True)
@@ -95,7 +95,7 @@ def direct_solver(A: PETSc.Mat, name: str, symmetric: bool = True) -> PETSc.KSP:
     if A.comm.size > 1:
         ksp.pc.setFactorSolverType("mumps")
     else:
-        ksp.pc.setFactorOrdering(PETSc.Mat.OrderingType.ND)
+        ksp.pc.setFactorOrdering("amd")
         ksp.pc.setFactorPivot(0.0)  # PETSc's 2e-14 refuses slivers of cells: rows of any scale are welcome
     ksp.setOperators(A)
     ksp.setFromOptions()
