@@ -4,7 +4,8 @@
 from mpm_dolfinx.conditions import Displacement, Drained, Inflow, RigidPlate, Traction
 from mpm_dolfinx.coupling import COUPLINGS, NotConverged
 from mpm_dolfinx.grid import Grid
-from mpm_dolfinx.materials import LAWS, Fluid, Hencky, LinearElastic, NeoHookean
+from mpm_dolfinx.materials import LAWS, Fluid, Hencky, LinearElastic, NeoHookean, Skeleton, kozeny_carman
+from mpm_dolfinx.plasticity import DruckerPrager
 from mpm_dolfinx.points import box, probes, shape
 from mpm_dolfinx.simulation import Simulation
 from mpm_dolfinx.timeloop import GaveUp, Result
@@ -14,6 +15,7 @@ __all__ = [
     "LAWS",
     "Displacement",
     "Drained",
+    "DruckerPrager",
     "Fluid",
     "GaveUp",
     "Grid",
@@ -25,8 +27,10 @@ __all__ = [
     "Result",
     "RigidPlate",
     "Simulation",
+    "Skeleton",
     "Traction",
     "box",
+    "kozeny_carman",
     "probes",
     "shape",
 ]
