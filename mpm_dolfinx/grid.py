@@ -140,11 +140,18 @@ class Grid:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the P1 shape functions (n, 2^d) of local cells at points and their gradients (n, 2^d, d), 1/m."""
         t = self._hats(cells, x)
-        dN = np.empty((len(x), 2**self.dim, self.dim))
+        return reduce(np.multiply, t), self._slopes(t)
+
+    def shape_gradients(self, cells: NDArray[np.int32], x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the gradients (n, 2^d, d), 1/m, of the P1 shape functions of local cells at points."""
+        return self._slopes(self._hats(cells, x))
+
+    def _slopes(self, hats: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+        dN = np.empty((*hats[0].shape, self.dim))
         for a in range(self.dim):
-            others = reduce(np.multiply, [t[b] for b in range(self.dim) if b != a])
+            others = reduce(np.multiply, [hats[b] for b in range(self.dim) if b != a])
             np.multiply(others, self.signs[:, a] / self.h[a], out=dN[:, :, a])
-        return reduce(np.multiply, t), dN
+        return dN
 
     def shape_values(self, cells: NDArray[np.int32], x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the P1 shape functions (n, 2^d) of local cells at points."""

@@ -13,16 +13,17 @@ from dolfinx.common import Timer
 from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx import _compat
-from mpm_dolfinx.conditions import HOLD, RIGIDITY, Displacement, Drained, Inflow, RigidPlate, Traction
+from mpm_dolfinx.boundary import Boundary
+from mpm_dolfinx.conditions import Displacement, Drained, Inflow, RigidPlate, Traction
 from mpm_dolfinx.coupling import COUPLINGS, Coupler, Report
-from mpm_dolfinx.domains import corner_bits
+from mpm_dolfinx.domains import parallelepipeds, tangled
 from mpm_dolfinx.exchange import Exchange
 from mpm_dolfinx.forms import FormPoints, PointExpression
 from mpm_dolfinx.grid import Grid, sum_by
 from mpm_dolfinx.materials import Fluid, Skeleton
 from mpm_dolfinx.momentum import FULL, Momentum
 from mpm_dolfinx.placement import Placement
-from mpm_dolfinx.points import Body, Probes, Surface, face_vectors, material_points, surface
+from mpm_dolfinx.points import Body, Probes, material_points
 from mpm_dolfinx.remap import carry, remap
 from mpm_dolfinx.storage import Storage
 from mpm_dolfinx.timeloop import Result, run
@@ -89,13 +90,10 @@ class Simulation:
         self.gravity = None if gravity is None else fem.Constant(grid.mesh, np.zeros(grid.dim))
         self.t, self.active_cells = 0.0, 0
         self.points = material_points(grid, bodies, pressure)
-        self._plates = [(plate, self._faces(bodies, plate)) for plate in plates]
-        tractions = [*tractions, *(plate.traction(faces.area0.sum(), grid.dim) for plate, faces in self._plates)]
-        self._loads = [(load, self._faces(bodies, load)) for load in tractions]
-        self._holds = [(hold, self._faces(bodies, hold), hold.axes(grid.dim)) for hold in displacements]
+        modulus = max(m.oedometric for m in materials)
+        self.boundary = Boundary(grid, bodies, modulus, tractions, displacements, plates, [*drained, *inflows])
         self.reactions = np.zeros((len(displacements), grid.dim))
         """(displacements, d): force by which each given displacement acts on the bodies, N (N/m in plane strain)."""
-        self._outlets = [(outlet, self._faces(bodies, outlet)) for outlet in (*drained, *inflows)]
         self._law = law
 
         start = time.perf_counter()
@@ -107,12 +105,6 @@ class Simulation:
         self._stress: PointExpression | None = None
 
     # ---- building -------------------------------------------------------------------------------
-
-    def _faces(self, bodies: Sequence[Body], condition) -> Surface:
-        faces = surface(bodies, condition.side, condition.region)
-        if not len(faces):
-            raise ValueError(f"{condition}: no point has this side" + (" in the region" if condition.region else ""))
-        return faces
 
     def _fixed_nodes(self, fixed: Mapping[str, str]) -> NDArray[np.bool_]:
         d = self.grid.dim
@@ -134,7 +126,10 @@ class Simulation:
             shapes |= {"density": ()}
         self.pieces = FormPoints(grid, **shapes)
         p = fem.Function(_compat.function_space(grid.mesh, "DG", 0)) if fluid else None
-        self.momentum = Momentum(grid, self.pieces, law, fixed, p, self.gravity, bool(self._plates), bool(self._holds))
+        mean = any(m.nearly_incompressible for m in self.materials)
+        self.momentum = Momentum(
+            grid, self.pieces, law, fixed, p, self.gravity, bool(self.boundary.plates), bool(self.boundary.holds), mean
+        )
         self.storage = None
         if fluid:
             weight = None if self.gravity is None else fluid.density * self.gravity
@@ -159,9 +154,9 @@ class Simulation:
             raise ValueError(f"dt = {dt!r}, must be > 0")
         self._begin(self.t + dt)
         report = self.coupler.solve(dt)
-        if self._holds:
-            self._react()
-        self._move_points()
+        if self.boundary.holds:
+            self.reactions = self.boundary.reactions(self.momentum)
+        report.rederived = self._move_points()
         self.t += dt
         self._prepared = False
         return report
@@ -174,7 +169,7 @@ class Simulation:
         if fresh:
             self._reset_grid()
         elif self.gravity is not None and self.storage:
-            self._open_boundary()  # a step is tried again, with the gravity of another time
+            self._open_outlets()  # a step is tried again, with the gravity of another time
         self._place_loads(t)
         if fresh:
             self.momentum.set_penalty()
@@ -233,8 +228,8 @@ class Simulation:
         self.active_cells = grid.comm.allreduce(int(active[: grid.num_owned].sum()))
         facets = grid.interior_facets(active, cells)
         renumbered = momentum.set_active(cells, facets, fill < FULL)
-        if self._plates:
-            self._place_plates()
+        if self.boundary.plates:
+            self.boundary.place_plates(self.placement, self.momentum)
         if self.storage:
             s = self.storage
             if renumbered:
@@ -251,7 +246,7 @@ class Simulation:
                 self._fixed_stress(J),
                 self._rows(lambda m: m.pressure_damping(grid.dim)),
             )
-            self._open_boundary()
+            self._open_outlets()
         if renumbered:
             self.coupler.set_unknowns()
         self._renumbered = renumbered
@@ -274,7 +269,7 @@ class Simulation:
         nodes[grid.cell_nodes[np.flatnonzero(momentum.fill.x.array > 0)]] = True
         node, axis = np.nonzero(nodes[:, None] & ~momentum.free)
         x, direction = grid.node_x[node], np.eye(grid.dim)[axis]
-        if self._holds:
+        if self.boundary.holds:
             x = np.concatenate([x, momentum.holds.x])
             direction = np.concatenate([direction, momentum.holds.data["direction"]])
         x = x / (grid.upper - grid.lower).max()
@@ -290,130 +285,57 @@ class Simulation:
             )
 
     def _place_loads(self, t: float) -> None:
-        """Put the dead loads of time t on the surface."""
+        """Put the loads and given displacements of time t on the surface."""
         with Timer("mpm: loads"):
-            rows = []
-            for load, faces in self._loads:
-                here, _, cell, x = self.placement.surface(faces)
-                rows.append((cell, x, faces.area0[here, None] * load.at(t)))
-            cell, x, force = self._gathered(rows, (self.grid.dim,))
-            self.momentum.loads.place(cell, x, np.ones(len(cell)), force=force)
-            if self._holds:
-                self._place_holds(t)
+            self.boundary.place_loads(self.placement, self.momentum, t)
+            if self.boundary.holds:
+                self.boundary.place_holds(self.placement, self.momentum, t)
             self.momentum.set_loads()
 
-    def _place_plates(self) -> None:
-        """Put the plates on the surface."""
-        grid, rows = self.grid, []
-        modulus = max(m.oedometric for m in self.materials)
-        for _, faces in self._plates:
-            _, at, cell, x = self.placement.surface(faces)
-            area = face_vectors(self.points.corners[at], faces.axis, faces.end)
-            length = faces.area0.sum() ** (1 / (grid.dim - 1))
-            rigidity = RIGIDITY * modulus * length * np.linalg.norm(area, axis=1, keepdims=True)
-            normal = np.tile(np.eye(grid.dim)[faces.axis], (len(at), 1))
-            tilt = normal - area / area[:, [faces.axis]]  # slope of the face: its normal is (-slope, 1)
-            rows.append((cell, x, np.concatenate([rigidity, normal, tilt], axis=1)))
-        cell, x, values = self._gathered(rows, (1 + 2 * grid.dim,))
-        rigidity, normal, tilt = np.split(values, [1, 1 + grid.dim], axis=1)
-        self.momentum.plates.place(cell, x, np.ones(len(cell)), rigidity=rigidity, normal=normal, tilt=tilt)
+    def _open_outlets(self) -> None:
+        weight = None if self.gravity is None else self.fluid.density * self.gravity.value
+        self.boundary.open_outlets(self.placement, self.storage, weight)
 
-    def _place_holds(self, t: float) -> None:
-        """Put the given displacements of time t on the surface: one row a face and component."""
-        d, rows = self.grid.dim, []
-        stiffness = HOLD * max(m.oedometric for m in self.materials) / self.grid.h.min()
-        for number, (hold, faces, axes) in enumerate(self._holds):
-            here, _, cell, x = self.placement.surface(faces)
-            gap = faces.x0[here] + hold.at(t, faces.x0)[here] - x
-            for axis in axes:
-                rows.append((cell, x, np.zeros((len(cell), 3 + d))))
-                rows[-1][2][:, 0] = number
-                rows[-1][2][:, 1] = stiffness * faces.area0[here]
-                rows[-1][2][:, 2] = gap[:, axis]
-                rows[-1][2][:, 3 + axis] = 1.0
-        cell, x, values = self._gathered(rows, (3 + d,))
-        self._hold_number = values[:, 0].astype(np.int64)
-        ones = np.ones(len(cell))
-        self.momentum.holds.place(
-            cell, x, ones, stiffness=values[:, 1:2], gap=values[:, 2:3], direction=np.ascontiguousarray(values[:, 3:])
-        )
-
-    def _react(self) -> None:
-        """Sum the forces of the given displacements."""
-        grid, holds = self.grid, self.momentum.holds
-        N = grid.shape_values(holds.cells, holds.x)
-        u = self.momentum.u.x.array.reshape(-1, grid.dim)[grid.cell_nodes[holds.cells]]
-        direction = holds.data["direction"]
-        moved = np.einsum("mk,mkd,md->m", N, u, direction)
-        force = (holds.data["stiffness"][:, 0] * (holds.data["gap"][:, 0] - moved))[:, None] * direction
-        sums = [sum_by(self._hold_number, column, len(self._holds)) for column in force.T]
-        self.reactions = grid.comm.allreduce(np.stack(sums, axis=1))
-
-    def _gathered(self, rows: list, shape: tuple[int, ...]) -> tuple[NDArray, NDArray, NDArray]:
-        """Send (cells, positions, values) to the owners of the cells; return (owned cells, positions, values)."""
-        empty = (np.empty(0, dtype=np.int64), np.empty((0, self.grid.dim)), np.empty((0, *shape)))
-        parts = [np.concatenate(column) for column in zip(empty, *rows, strict=True)]
-        travel = Exchange(self.grid.comm, self.grid.owner(parts[0]))
-        cell, x, values = map(travel.send, parts)
-        return self.grid.local(cell), x, values
-
-    def _open_boundary(self) -> None:
-        """Set the conductances of drained sides and the inflows."""
-        grid, s, d = self.grid, self.storage, self.grid.dim
-        cells, conductances, inflows = [], [], []
-        for outlet, faces in self._outlets:
-            here, at, cell, x = self.placement.surface(faces)
-            whole = face_vectors(self.points.corners[at], faces.axis, faces.end)
-            area = whole * (faces.area0[here] / faces.whole0[here])[:, None]
-            travel = Exchange(grid.comm, grid.owner(cell))
-            cell = grid.local(travel.send(cell))
-            area, x = travel.send(area), travel.send(x)
-            size = np.linalg.norm(area, axis=1)
-            cells.append(cell)
-            if isinstance(outlet, Inflow):
-                conductances.append(np.zeros(len(cell)))
-                inflows.append(outlet.flux * size)
-                continue
-            centre = grid.midpoints[cell] + s.centroid.x.array.reshape(-1, d)[cell]
-            distance = np.einsum("md,md->m", x - centre, area) / size
-            conductance = s.mobility.x.array[cell] * size / np.maximum(distance, 1e-3 * grid.h.min())
-            outer = np.full(len(cell), outlet.pressure)
-            if self.gravity is not None:
-                outer -= self.fluid.density * (x - centre) @ self.gravity.value
-            conductances.append(conductance)
-            inflows.append(conductance * outer)
-        empty = np.empty(0)
-        s.set_fluxes(
-            np.concatenate([empty.astype(np.int32), *cells]),
-            np.concatenate([empty, *conductances]),
-            np.concatenate([empty, *inflows]),
-        )
-
-    def _move_points(self) -> None:
-        """Move the corners, update F, take the pressures along."""
+    def _move_points(self) -> int:
+        """Move the corners, update F, take the pressures along; return how many domains had folded."""
+        folded = 0
         with Timer("mpm: move points"):
             grid, points, place = self.grid, self.points, self.placement
             n, d = len(points), grid.dim
             u = self.momentum.u.x.array.reshape(-1, d)
             _, dN = grid.shape_functions(self.pieces.cells, self.pieces.x)
             gradient = u[grid.cell_nodes[self.pieces.cells]].transpose(0, 2, 1) @ dN
+            delta = np.eye(d) + gradient
+            if self.momentum.dilatation is not None:
+                delta = self.momentum.dilatation.averaged(delta)
             # F_p <- (sum_k w_k Delta_k / V_p) F_p
-            mean = [place.mean(column) for column in place.to_pieces(gradient).reshape(-1, d * d).T]
-            points.F = (np.eye(d) + np.stack(mean, axis=1).reshape(n, d, d)) @ points.F
+            mean = [place.mean(column) for column in place.to_pieces(delta).reshape(-1, d * d).T]
+            points.F = np.stack(mean, axis=1).reshape(n, d, d) @ points.F
             if self.quadrature == "domain":
                 corners = points.corners.reshape(-1, d)
                 moved = corners + place.displacement(u, np.repeat(np.arange(n), 2**d), corners)
                 points.corners = moved.reshape(n, 2**d, d)
                 points.x = points.corners.mean(axis=1)
+                folded = self._untangle()
             else:
                 points.x = points.x + place.displacement(u, np.arange(n), points.x)
-                offset = (corner_bits(d) - 0.5) * self._spacing()[:, None, :]
-                points.corners = points.x[:, None] + np.einsum("nab,nkb->nka", points.F, offset)
+                points.corners = parallelepipeds(points.x, points.F, self._spacing())
             if self.storage:
                 p = place.to_pieces(self.storage.p.x.array[self.pieces.cells])
                 points.pressure = place.mean(p)
                 self._carried = carry(points, place.pieces, p)
             self._migrate()
+        return folded
+
+    def _untangle(self) -> int:
+        """Re-derive from F the domains that have folded: points whose neighbours went elsewhere."""
+        points, grid = self.points, self.grid
+        bad = np.flatnonzero(tangled(points.corners, points.volume0 * points.J))
+        if len(bad):
+            corners = parallelepipeds(points.x[bad], points.F[bad], self._spacing()[bad])
+            points.corners[bad] = np.clip(corners, grid.lower, grid.upper)
+            points.x[bad] = points.corners[bad].mean(axis=1)
+        return grid.comm.allreduce(len(bad))
 
     def _spacing(self) -> NDArray[np.float64]:
         """Reference size of the points' domains (n, d), m."""

@@ -31,6 +31,9 @@ from mpm_dolfinx.forms import FormPoints, PointForm
 from mpm_dolfinx.grid import Grid, sum_by
 from mpm_dolfinx.unknowns import Unknowns, matrix, sum_ghosts, zero
 
+FILTER = 0.75
+"""Share of beta V that the filtered fixed-stress operator leaves out for checkers of the pressure, in [0, 1]."""
+
 
 class Storage:
     """The storage problem of a scene.
@@ -112,6 +115,11 @@ class Storage:
         self._dt = fem.Constant(mesh, 0.0)
         damped = ufl.max_value(ufl.avg(self.damping) * share * (d0 + d1) - self._dt * T, 0.0)
         self._damp = _compat.CompiledForm(damped * ufl.jump(dp) * ufl.jump(q) * dS)
+        self.fixed_stress = fem.Function(Q)
+        smaller = ufl.min_value(self.fixed_stress("+"), self.fixed_stress("-"))
+        self._alternation = _compat.CompiledForm(
+            smaller / (4 * d) * across / self.grid.cell_volume * ufl.jump(dp) * ufl.jump(q) * dS
+        )
         self._gravity = None
         if weight is not None:
             apart = across * n0 + self.centroid("-") - self.centroid("+")
@@ -123,9 +131,10 @@ class Storage:
         self._slot[self.unknowns.owned] = np.arange(self.unknowns.size)
         self.T = matrix(self.unknowns, self.unknowns, 2 * self.grid.dim + 1)
         self.D = matrix(self.unknowns, self.unknowns, 2 * self.grid.dim + 1)
+        self.L = matrix(self.unknowns, self.unknowns, 2 * self.grid.dim + 1)
         self.C = self.P = None
         self.residual, self._p, self._rate, self._p_start = (self.unknowns.vector() for _ in range(4))
-        for form in (self._flux, self._damp):
+        for form in (self._flux, self._damp, self._alternation):
             form.bind(facets)
         if self._gravity is not None:
             self._gravity.bind(facets)
@@ -179,9 +188,13 @@ class Storage:
         mean = self._total(cells, weight * pressure) / volume
         stored = self._total(cells, weight * capacity * pressure)
         self.p_n.x.array[filled] = np.divide(stored, held, out=mean, where=held > 0)
-        for f in (self.mobility, self.damping, self.p_n, *self._shapes()):
+        self.fixed_stress.x.array[filled] = self._total(cells, weight * fixed_stress)
+        for f in (self.mobility, self.damping, self.fixed_stress, self.p_n, *self._shapes()):
             f.x.scatter_forward()
-        self.fixed_stress = self._total(cells, weight * fixed_stress)
+        zero(self.L)
+        if self._has_facets:
+            self._alternation.assemble_matrix(self.L)
+        self.L.assemble()
 
     def _total(self, cells: NDArray[np.int32], values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Sum values over the rows of each active owned cell."""
@@ -268,22 +281,31 @@ class Storage:
             zero(A)
             form.assemble_matrix(A)
             A.assemble()
-        self._with_fluxes(self.C, dt, 0.0)
-
-    def assemble_preconditioner(self, dt: float, factor: float) -> PETSc.Mat:
-        """Return the fixed-stress operator C + factor * beta V at (u, p)."""
-        return self._with_fluxes(self.P, dt, factor * self.fixed_stress)
-
-    def _with_fluxes(self, A: PETSc.Mat, dt: float, diagonal) -> PETSc.Mat:
         b = self._b.x.array
         b[:] = 0.0
         self._capacity.assemble_vector(b)
-        self.T.copy(A, structure=PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
-        A.scale(dt)
+        self.T.copy(self.C, structure=PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+        self.C.scale(dt)
         if self.damped:
-            A.axpy(1.0, self.D, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
-        _add_diagonal(A, b[self.unknowns.owned] + diagonal)
-        return A
+            self.C.axpy(1.0, self.D, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
+        _add_diagonal(self.C, b[self.unknowns.owned])
+
+    def assemble_preconditioner(self, factor: float, share: float) -> PETSc.Mat:
+        """Return the fixed-stress operator C + factor (beta V - share L) for the present C.
+
+        Parameters
+        ----------
+        factor
+            Multiple of beta, >= 0.
+        share
+            Of the filter L, in [0, 1]: 0 is the fixed-stress operator.  B K^-1 B^T falls from beta V for a smooth
+            pressure to a half (at nu = 0) where it alternates along one axis and to nothing for checkers.
+            So does beta V - L, with L = sum over the faces of min(beta V+, beta V-) / (4 d) [p][q] <= beta V.
+        """
+        self.C.copy(self.P, structure=PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+        self.P.axpy(-factor * share, self.L, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
+        _add_diagonal(self.P, factor * self.fixed_stress.x.array[self.unknowns.owned])
+        return self.P
 
 
 def _add_diagonal(A: PETSc.Mat, values: NDArray[np.float64]) -> None:

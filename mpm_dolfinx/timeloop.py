@@ -43,7 +43,8 @@ class Result:
 
     t (s); displacement (m, d) of the probes, m; pressure: least and largest on the points, Pa; and of
     the steps so far: steps, newton, coupling (iterations), balance and residual (worst, relative), cuts,
-    wall (s), and profile: seconds of each part of the run on this process, from dolfinx's timers.
+    rederived (domains that had folded), wall (s), and profile: seconds of each part of the run on this
+    process, from dolfinx's timers.
     """
 
     t: list[float] = field(default_factory=list)
@@ -53,6 +54,7 @@ class Result:
     newton: int = 0
     coupling: int = 0
     cuts: int = 0
+    rederived: int = 0
     balance: float = 0.0
     residual: float = 0.0
     wall: float = 0.0
@@ -149,6 +151,7 @@ def _advance(simulation: Simulation, small: float, dt: float, result: Result) ->
         except LeftGrid as failed:
             raise GaveUp(str(failed), result) from failed
         result.steps += 1
+        result.rederived += report.rederived
         result.newton += report.newton
         result.coupling += report.coupling
         result.balance = max(result.balance, report.balance)
