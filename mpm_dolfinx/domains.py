@@ -138,8 +138,10 @@ def _sum(grid: Grid, y: NDArray[np.float64], s: NDArray[np.float64], owner: NDAr
     for a in range(d):
         for end in (0, 1):
             distance = np.abs(s[:, a] - (index[a] + end))
-            on = np.flatnonzero(((distance < SNAP).sum(axis=0) == d) & solid)  # a facet lies on the plane
-            area = d * volume[on] / distance[:, on].max(axis=0)
+            height = distance.max(axis=0)
+            near = distance < np.minimum(2 * SNAP, height / 2)  # of two domains that touch, rounding may snap one only
+            on = np.flatnonzero((near.sum(axis=0) == d) & solid)  # a facet lies on the plane
+            area = d * volume[on] / height[on]
             area = sum_by(slot[on], area, start[-1])[kept]
             faces[:, a, end] = area * grid.cell_volume / grid.h[a]
 
