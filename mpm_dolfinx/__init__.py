@@ -5,13 +5,17 @@ from mpm_dolfinx.conditions import Displacement, Drained, Inflow, RigidPlate, Tr
 from mpm_dolfinx.coupling import COUPLINGS, NotConverged
 from mpm_dolfinx.grid import Grid
 from mpm_dolfinx.materials import LAWS, Fluid, Hencky, LinearElastic, NeoHookean
+from mpm_dolfinx.output import Writer
 from mpm_dolfinx.points import box, probes, shape
+from mpm_dolfinx.restart import Checkpoint, resume
 from mpm_dolfinx.simulation import Simulation
 from mpm_dolfinx.timeloop import GaveUp, Result
 
+__version__ = "0.1.0"
 __all__ = [
     "COUPLINGS",
     "LAWS",
+    "Checkpoint",
     "Displacement",
     "Drained",
     "Fluid",
@@ -26,7 +30,9 @@ __all__ = [
     "RigidPlate",
     "Simulation",
     "Traction",
+    "Writer",
     "box",
     "probes",
+    "resume",
     "shape",
 ]
