@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Checkpoints on several processes; arguments: one of a single process, one to write, the state to write.
 
-Resumes the first and goes on to the end; writes the second half way; resumes it on as many processes.
+Resumes the first and goes on to the end; writes the second half way, and files beside it; runs and resumes on as
+many processes.
 """
 
 import sys
@@ -50,7 +51,8 @@ if __name__ == "__main__":
     theirs, ours, out = sys.argv[1:]
     end = to_the_end(*beam(h=0.06), theirs)
     simulation, probe = beam(h=0.06)
-    simulation.run(T_END / 2, DT, probes=probe, checkpoint=mpm.Checkpoint(ours), progress=False)
+    writer = mpm.Writer(simulation, ours + ".out", grid=True)
+    simulation.run(T_END / 2, DT, probes=probe, checkpoint=mpm.Checkpoint(ours), observe=writer, progress=False)
     counts = simulation.grid.comm.gather(len(simulation.points))
     same = simulation.grid.comm.allreduce(same_bits(ours + ".same")) == simulation.grid.comm.size
     if counts:

@@ -13,6 +13,9 @@ from dataclasses import fields
 from pathlib import Path
 from xml.etree import ElementTree
 
+from mpi4py import MPI
+
+import meshio
 import mpi_restart
 import numpy as np
 import pytest
@@ -22,6 +25,7 @@ from test_mpi import mpirun
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx import restart
+from mpm_dolfinx.output import Series
 
 
 def cut_beam():
@@ -125,19 +129,44 @@ def readable(folder):
     return True
 
 
-def test_one_process_goes_on_where_two_were_and_two_where_one_was(tmp_path):
+@pytest.fixture(scope="module")
+def parallel(tmp_path_factory):
+    """Return the beam run by one process, and the folder of what `mpi_restart.py` leaves on two."""
+    folder = tmp_path_factory.mktemp("parallel")
     one, probe = beam(h=0.06)
     half, end, dt = mpi_restart.T_END / 2, mpi_restart.T_END, mpi_restart.DT
-    one.run(half, dt, probes=probe, checkpoint=mpm.Checkpoint(tmp_path / "one"))
+    writer = mpm.Writer(one, folder / "one.out", grid=True)
+    one.run(half, dt, probes=probe, checkpoint=mpm.Checkpoint(folder / "one"), observe=writer)
     one.run(end, dt, probes=probe, after=one.result)
-    mpirun(2, "mpi_restart.py", *(str(tmp_path / name) for name in ("one", "two", "end.npz")))
-    there = np.load(tmp_path / "end.npz")
-    assert there["same"] and min(there["counts"]) > 0
-    other, probe = beam(h=0.06)
-    states = [dict(there), mpi_restart.to_the_end(other, probe, tmp_path / "two")]
+    mpirun(2, "mpi_restart.py", *(str(folder / name) for name in ("one", "two", "end.npz")))
+    return one, folder
+
+
+def test_one_process_goes_on_where_two_were_and_two_where_one_was(parallel):
+    one, folder = parallel
+    there, (other, probe) = np.load(folder / "end.npz"), beam(h=0.06)
+    assert min(there["counts"]) > 0
+    states = [there, mpi_restart.to_the_end(other, probe, folder / "two")]
     for name, values in mpi_restart.state(one).items():
         for state in states:
             assert state[name] == pytest.approx(np.array(values), rel=0, abs=1e-10 * np.abs(values).max()), name
+
+
+def test_two_processes_go_on_with_the_same_bits(parallel):
+    assert np.load(parallel[1] / "end.npz")["same"]
+
+
+def test_two_processes_write_the_files_of_one(parallel):
+    _, folder = parallel
+    one, two = (Series(MPI.COMM_SELF, folder / f"{name}.out" / "points.pvd", 1.0).entries for name in ("one", "two"))
+    assert [t for t, _ in one] == [t for t, _ in two] and len(one) == 4
+    for (_, (here,)), (_, (there,)) in zip(one, two, strict=True):
+        here, there = meshio.read(here), meshio.read(there)
+        assert there.points == pytest.approx(here.points, abs=1e-12)
+        for name, (values,) in here.cell_data.items():
+            assert there.cell_data[name][0] == pytest.approx(values, rel=0, abs=1e-9 * np.abs(values).max()), name
+    grids = Series(MPI.COMM_SELF, folder / "two.out" / "grid.pvd", 1.0).entries
+    assert [len(files) for _, files in grids] == [2, 2, 2] and readable(folder / "two.out")
 
 
 @pytest.fixture(scope="module")
