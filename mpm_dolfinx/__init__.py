@@ -5,14 +5,18 @@ from mpm_dolfinx.conditions import Displacement, Drained, Inflow, RigidPlate, Tr
 from mpm_dolfinx.coupling import COUPLINGS, NotConverged
 from mpm_dolfinx.grid import Grid
 from mpm_dolfinx.materials import LAWS, Fluid, Hencky, LinearElastic, NeoHookean, Skeleton, kozeny_carman
+from mpm_dolfinx.output import Writer
 from mpm_dolfinx.plasticity import DruckerPrager
 from mpm_dolfinx.points import box, probes, shape
+from mpm_dolfinx.restart import Checkpoint, resume
 from mpm_dolfinx.simulation import Simulation
 from mpm_dolfinx.timeloop import GaveUp, Result
 
+__version__ = "0.1.0"
 __all__ = [
     "COUPLINGS",
     "LAWS",
+    "Checkpoint",
     "Displacement",
     "Drained",
     "DruckerPrager",
@@ -29,8 +33,10 @@ __all__ = [
     "Simulation",
     "Skeleton",
     "Traction",
+    "Writer",
     "box",
     "kozeny_carman",
     "probes",
+    "resume",
     "shape",
 ]

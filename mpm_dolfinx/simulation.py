@@ -23,10 +23,10 @@ from mpm_dolfinx.laws import ConductivityAtPieces, SceneMaterials
 from mpm_dolfinx.materials import Fluid, Skeleton
 from mpm_dolfinx.momentum import FULL, Momentum
 from mpm_dolfinx.placement import Placement
-from mpm_dolfinx.points import Body, Probes, material_points
-from mpm_dolfinx.remap import carry, remap
+from mpm_dolfinx.points import Body, MaterialPoints, Probes, material_points
+from mpm_dolfinx.remap import Carried, carry, remap
 from mpm_dolfinx.storage import Storage
-from mpm_dolfinx.timeloop import Result, run
+from mpm_dolfinx.timeloop import Observer, Result, run
 
 
 class Simulation:
@@ -103,6 +103,8 @@ class Simulation:
         """Seconds spent on compiling or finding the forms."""
         self._carried = carry(self.points) if fluid else None
         self._prepared = False
+        self.result: Result | None = None
+        """Histories of the last run, also while it runs."""
 
     # ---- building -------------------------------------------------------------------------------
 
@@ -385,6 +387,17 @@ class Simulation:
             self._carried = self._carried.migrated(travel)
         self.points = self.points.migrated(Exchange(grid.comm, owner))
 
+    @property
+    def carried(self) -> Carried | None:
+        """Pressures of the points' pieces between two steps; None without fluid."""
+        return self._carried
+
+    def restore(self, points: MaterialPoints, carried: Carried | None, t: float) -> None:
+        """Put the scene into a state at time t, s: points and pieces, on whatever processes they are."""
+        self.points, self._carried, self.t = points, carried, t
+        self._prepared = False
+        self._migrate()
+
     def effective_stress(self) -> NDArray[np.float64]:
         """Return the effective Cauchy stress (n, d, d), Pa, tension positive, at the material points."""
         return self._scene.effective_stress(self.points)
@@ -397,8 +410,11 @@ class Simulation:
         dt: float,
         *,
         probes: Probes | None = None,
-        observe: Callable[[Simulation], None] | None = None,
+        observe: Observer | Sequence[Observer] = (),
+        checkpoint: Observer | None = None,
+        after: Result | None = None,
         progress: bool = True,
     ) -> Result:
         """Advance to t_end in steps of dt: see `timeloop.run`."""
-        return run(self, t_end, dt, probes=probes, observe=observe, progress=progress)
+        options = {"probes": probes, "observe": observe, "checkpoint": checkpoint, "after": after}
+        return run(self, t_end, dt, progress=progress, **options)
