@@ -427,6 +427,7 @@ class PointExpression:
         self._rows = Rows(self._compiled, points)
         self._many = min(BATCH, grid.num_owned)
         self._compiled.bind(np.arange(self._many))
+        self._rows.room(self._many)
         self._values = np.empty((self._many, int(np.prod(self._shape, dtype=int))))
 
     def evaluate(self, chosen: NDArray[np.int64] | None = None) -> NDArray[np.float64]:
@@ -437,6 +438,6 @@ class PointExpression:
             part = chosen[start : start + self._many]
             self._rows(part)
             self._values[:] = 0.0
-            self._compiled.assemble_vector(self._values.reshape(-1), self._rows.room(self._many)[: self._many])
+            self._compiled.assemble_vector(self._values.reshape(-1), self._rows.room(self._many))
             out[start : start + len(part)] = self._values[: len(part)]
         return out.reshape(len(chosen), *self._shape)
