@@ -7,7 +7,8 @@ A Newton step of the two problems reads
     [ B   C   ] [dp] = - [R_p].
 
 `schur-cg` eliminates du and solves with S = C + B K^-1 B^T by conjugate gradients, preconditioned
-with the fixed-stress operator C + beta V (beta = 0.75 alpha^2 / K_dr): the paper's two separate
+with the fixed-stress operator C + beta V (beta = 0.75 alpha^2 / K_dr), filtered: less beta V for pressures
+that alternate from cell to cell (`Storage.assemble_preconditioner`).  These are the paper's two separate
 solvers, accelerated.  `schur-fgmres` does the same with the full, slightly unsymmetric Jacobian.
 `fixed-stress` is the paper's Richardson iteration: a storage solve with C + beta V at frozen stress,
 then a momentum solve, in turn.
@@ -23,7 +24,7 @@ import numpy as np
 from dolfinx.common import Timer
 
 from mpm_dolfinx.momentum import Momentum
-from mpm_dolfinx.storage import Storage
+from mpm_dolfinx.storage import FILTER, Storage
 from mpm_dolfinx.unknowns import direct_solver
 
 COUPLINGS = {
@@ -55,12 +56,14 @@ class NotConverged(RuntimeError):
 
 @dataclass
 class Report:
-    """What a converged step took: Newton and coupling iterations, relative residuals, fluid balance."""
+    """What a converged step took: Newton and coupling iterations, relative residuals, fluid balance, and mending."""
 
     newton: int = 0
     coupling: int = 0
     history: list[tuple[float, float]] = field(default_factory=list)
     balance: float = 0.0
+    rederived: int = 0
+    """Domains that had folded and were re-derived from F."""
 
 
 class SchurComplement:
@@ -109,7 +112,7 @@ class Coupler:
 
     def set_unknowns(self) -> None:
         """Make the solvers for the present matrices."""
-        self._solve_u = direct_solver(self.momentum.K, "momentum")
+        self._solve_u = direct_solver(self.momentum.K, "momentum", self.momentum.symmetric)
         self._du, self._rhs = self.momentum.unknowns.vector(), self.momentum.unknowns.vector()
         if self.storage is None:
             return
@@ -202,7 +205,7 @@ class Coupler:
             if self.storage is not None:
                 if self._schur is None:
                     self._make_schur()
-                P = self.storage.assemble_preconditioner(dt, self.beta)
+                P = self.storage.assemble_preconditioner(self.beta, 0.0 if self.richardson else FILTER)
                 self._solve_s.setOperators(self._schur, P)
                 self._solve_s.setUp()
 
@@ -222,18 +225,22 @@ class Coupler:
             if self.storage is None:
                 self._solve_u.solve(self.momentum.residual, self._du)
                 return 0
-            s = self.storage
-            self._solve_u.solve(self.momentum.residual, self._du)
-            s.B.mult(self._du, self._g)
-            self._g.aypx(-1.0, s.residual)  # R_p - B K^-1 R_u
+            s, g = self.storage, self._condense()
             # no more accuracy than the next residual can use
             rtol = min(1e-2, max(FORCING, 0.05 * self.tolerance / error))
             self._solve_s.setTolerances(rtol=rtol, atol=0.0, max_it=500)
-            self._solve_s.solve(self._g, self._dp)
+            self._solve_s.solve(g, self._dp)
             s.B_momentum.multTranspose(self._dp, self._rhs)
             self._rhs.axpy(1.0, self.momentum.residual)
             self._solve_u.solve(self._rhs, self._du)
             return self._solve_s.getIterationNumber()
+
+    def _condense(self) -> PETSc.Vec:
+        """Return the residual of the Schur complement's system, R_p - B K^-1 R_u."""
+        self._solve_u.solve(self.momentum.residual, self._du)
+        self.storage.B.mult(self._du, self._g)
+        self._g.aypx(-1.0, self.storage.residual)
+        return self._g
 
     def _line_search(self, dt: float, before: tuple[float, float], report: Report) -> tuple[float, float]:
         """Go against the direction, backtracking while the residual is not finite or explodes."""

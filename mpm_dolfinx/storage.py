@@ -19,6 +19,8 @@ and Borja 2021).
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from petsc4py import PETSc
 
 import numpy as np
@@ -27,9 +29,13 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from mpm_dolfinx import _compat
+from mpm_dolfinx.extend import call
 from mpm_dolfinx.forms import FormPoints, PointForm
 from mpm_dolfinx.grid import Grid, sum_by
 from mpm_dolfinx.unknowns import Unknowns, matrix, sum_ghosts, zero
+
+FILTER = 0.75
+"""Share of beta V that the filtered fixed-stress operator leaves out for checkers of the pressure, in [0, 1]."""
 
 
 class Storage:
@@ -78,9 +84,27 @@ class Storage:
         self._momentum_coupling = (
             self._coupling if symmetric else PointForm(ufl.derivative(strain, displacement, du), pieces)
         )
-        self.symmetric = symmetric
+        self.symmetric, self._pieces = symmetric, pieces
+        self._sources: list[tuple[PointForm, PointForm | None]] = []
         self._slot = np.empty(grid.num_local, dtype=np.int64)  # of active owned cells: place in the vectors
         self._fluxes(Q, q, dp, weight)
+
+    def add(self, source: Callable, t: fem.Constant) -> None:
+        """Add a source of the user's: see `extend`."""
+        Q, points = self.p.function_space, self._pieces
+        one, self._gain = fem.Function(Q), fem.Function(Q)
+        one.x.array[:] = 1.0
+        form = call(source, points=points, q=ufl.TestFunction(Q), p=self.p, t=t)
+        slope = PointForm(ufl.derivative(form, self.p, one), points) if self.p in form.coefficients() else None
+        self._sources.append((PointForm(form, points), slope))
+
+    def _assemble_sources(self, slope: bool = False) -> NDArray[np.float64]:
+        """Return the rate of the sources in each active cell at p (m^d/s), or its derivative by the cell's p."""
+        self._gain.x.array[:] = 0.0
+        for forms in self._sources:
+            if forms[slope] is not None:
+                forms[slope].assemble_vector(self._gain.x.array)
+        return self._gain.x.array[self.unknowns.owned]
 
     def _fluxes(self, Q, q, dp, weight) -> None:
         """Two-point fluxes over the inner faces of the active cells."""
@@ -112,6 +136,11 @@ class Storage:
         self._dt = fem.Constant(mesh, 0.0)
         damped = ufl.max_value(ufl.avg(self.damping) * share * (d0 + d1) - self._dt * T, 0.0)
         self._damp = _compat.CompiledForm(damped * ufl.jump(dp) * ufl.jump(q) * dS)
+        self.fixed_stress = fem.Function(Q)
+        smaller = ufl.min_value(self.fixed_stress("+"), self.fixed_stress("-"))
+        self._alternation = _compat.CompiledForm(
+            smaller / (4 * d) * across / self.grid.cell_volume * ufl.jump(dp) * ufl.jump(q) * dS
+        )
         self._gravity = None
         if weight is not None:
             apart = across * n0 + self.centroid("-") - self.centroid("+")
@@ -123,9 +152,10 @@ class Storage:
         self._slot[self.unknowns.owned] = np.arange(self.unknowns.size)
         self.T = matrix(self.unknowns, self.unknowns, 2 * self.grid.dim + 1)
         self.D = matrix(self.unknowns, self.unknowns, 2 * self.grid.dim + 1)
+        self.L = matrix(self.unknowns, self.unknowns, 2 * self.grid.dim + 1)
         self.C = self.P = None
         self.residual, self._p, self._rate, self._p_start = (self.unknowns.vector() for _ in range(4))
-        for form in (self._flux, self._damp):
+        for form in (self._flux, self._damp, self._alternation):
             form.bind(facets)
         if self._gravity is not None:
             self._gravity.bind(facets)
@@ -179,9 +209,13 @@ class Storage:
         mean = self._total(cells, weight * pressure) / volume
         stored = self._total(cells, weight * capacity * pressure)
         self.p_n.x.array[filled] = np.divide(stored, held, out=mean, where=held > 0)
-        for f in (self.mobility, self.damping, self.p_n, *self._shapes()):
+        self.fixed_stress.x.array[filled] = self._total(cells, weight * fixed_stress)
+        for f in (self.mobility, self.damping, self.fixed_stress, self.p_n, *self._shapes()):
             f.x.scatter_forward()
-        self.fixed_stress = self._total(cells, weight * fixed_stress)
+        zero(self.L)
+        if self._has_facets:
+            self._alternation.assemble_matrix(self.L)
+        self.L.assemble()
 
     def _total(self, cells: NDArray[np.int32], values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Sum values over the rows of each active owned cell."""
@@ -252,11 +286,16 @@ class Storage:
         r.axpy(dt, flux)
         if self.damped:
             self.D.multAdd(p - self._p_start, r, r)
-        scale = comm.allreduce(float(np.abs(change).sum()))
-        return r, scale
+        exchanged = float(np.abs(change).sum())
+        if self._sources:
+            gain = dt * self._assemble_sources()
+            r.array_w[:] -= gain
+            self._change_total -= gain.sum()
+            exchanged += np.abs(gain).sum()
+        return r, comm.allreduce(exchanged)
 
     def balance(self, dt: float) -> float:
-        """Return the change of the fluid's volume plus what crossed the boundary (m^d), at the last residual."""
+        """Return the change of the fluid's volume, plus what left, less sources (m^d), at the last residual."""
         p = self.p.x.array[self.unknowns.owned]
         out = (self._conductance * p - self._inflow).sum()
         return float(self.grid.comm.allreduce(self._change_total + dt * out))
@@ -268,22 +307,33 @@ class Storage:
             zero(A)
             form.assemble_matrix(A)
             A.assemble()
-        self._with_fluxes(self.C, dt, 0.0)
-
-    def assemble_preconditioner(self, dt: float, factor: float) -> PETSc.Mat:
-        """Return the fixed-stress operator C + factor * beta V at (u, p)."""
-        return self._with_fluxes(self.P, dt, factor * self.fixed_stress)
-
-    def _with_fluxes(self, A: PETSc.Mat, dt: float, diagonal) -> PETSc.Mat:
         b = self._b.x.array
         b[:] = 0.0
         self._capacity.assemble_vector(b)
-        self.T.copy(A, structure=PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
-        A.scale(dt)
+        self.T.copy(self.C, structure=PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+        self.C.scale(dt)
         if self.damped:
-            A.axpy(1.0, self.D, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
-        _add_diagonal(A, b[self.unknowns.owned] + diagonal)
-        return A
+            self.C.axpy(1.0, self.D, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
+        _add_diagonal(self.C, b[self.unknowns.owned])
+        if self._sources:
+            _add_diagonal(self.C, -dt * self._assemble_sources(slope=True))
+
+    def assemble_preconditioner(self, factor: float, share: float) -> PETSc.Mat:
+        """Return the fixed-stress operator C + factor (beta V - share L) for the present C.
+
+        Parameters
+        ----------
+        factor
+            Multiple of beta, >= 0.
+        share
+            Of the filter L, in [0, 1]: 0 is the fixed-stress operator.  B K^-1 B^T falls from beta V for a smooth
+            pressure to a half (at nu = 0) where it alternates along one axis and to nothing for checkers.
+            So does beta V - L, with L = sum over the faces of min(beta V+, beta V-) / (4 d) [p][q] <= beta V.
+        """
+        self.C.copy(self.P, structure=PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+        self.P.axpy(-factor * share, self.L, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
+        _add_diagonal(self.P, factor * self.fixed_stress.x.array[self.unknowns.owned])
+        return self.P
 
 
 def _add_diagonal(A: PETSc.Mat, values: NDArray[np.float64]) -> None:

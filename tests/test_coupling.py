@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: MIT
 """The coupler: schemes agree, steps are cut and grow, giving up is clear and keeps the state."""
 
+import coupling_iterations as demo
 import numpy as np
 import pytest
 from helpers import beam
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx.storage import FILTER
 
 
 @pytest.fixture(scope="module")
@@ -64,3 +66,58 @@ def test_without_a_fluid_there_is_no_storage_problem():
     s, _ = beam(fluid=False)
     assert s.storage is None
     assert np.isfinite(s.run(0.04, 0.02).wall)
+
+
+OWN = ("Schur-CG",)
+
+
+@pytest.mark.parametrize("scene", demo.SCENES)
+def test_a_linear_solve_takes_few_iterations_from_drained_to_undrained_whatever_the_cell_size(scene):
+    """To 1e-8, k from 1e-14 to 1e2 m/s, steps from 1e-9 to 1e9 s, water from 1e4 Pa to incompressible."""
+    most = [demo.worst(demo.scan(scene, h, schemes=OWN)) for h in (0.06, 0.03)]
+    assert max(most) <= 14 and np.ptp(most) <= 1
+
+
+def test_only_the_product_of_conductivity_and_step_matters():
+    s, counts = demo.cantilever(0.06), set()
+    for conductivity, dt in ((1e-14, 1e6), (1e-8, 1.0), (1e1, 1e-9)):
+        demo.linearise(s, conductivity, dt, 2.2e9)
+        counts.add(demo.count(s, "Schur-CG")[0])
+    assert len(counts) == 1
+
+
+def test_the_plain_fixed_stress_iteration_needs_more_and_the_papers_beta_diverges():
+    own, plain, paper = (
+        demo.worst(demo.scan("beam", 0.06, bulks=[2.2e9], k_dt=[-23, -8, -6], schemes=[scheme]))
+        for scheme in ("Schur-CG", "fixed stress, 3/4", "fixed stress, 1/K_w")
+    )
+    assert own < plain / 2 < np.inf and paper == np.inf
+
+
+def test_the_filter_takes_at_most_what_the_fixed_stress_operator_has():
+    """0 <= L <= beta V, also in cells that are hardly filled: the preconditioner is positive definite."""
+    s, _ = beam(offset=0.01)
+    s._begin(0.02)
+    storage = s.storage
+    L, V = storage.L, storage.fixed_stress.x.array[storage.unknowns.owned]
+    assert V.min() < 0.02 * V.max(), "no cell is hardly filled"
+    x, y = L.createVecs()
+    index = s.grid.index(s.grid.midpoints[storage.unknowns.owned])
+    for values in (np.random.default_rng(0).normal(size=x.size), (-1.0) ** index.sum(axis=1), np.ones(x.size)):
+        x.array_w[:] = values
+        L.mult(x, y)
+        share = (x.array @ y.array) / (values @ (V * values))
+        assert -1e-12 <= share <= 1 + 1e-12
+        checkers = (values == (-1.0) ** index.sum(axis=1)).all()
+        assert share > 0.85 if checkers else share < 0.6
+    assert 0 < FILTER < 1
+
+
+def test_the_undrained_pressure_has_no_checkers():
+    rough = {
+        (h, name): demo.roughness(demo.undrained(h, law)[0]) for h in (0.06, 0.03) for name, law in demo.LAWS.items()
+    }
+    for h in (0.06, 0.03):
+        assert rough[h, "damped"] < 0.4 * rough[h, "undamped"]
+    assert rough[0.03, "damped"] < 0.006
+    assert rough[0.03, "damped"] < 0.35 * rough[0.06, "damped"], "what is left is not the curvature of the pressure"

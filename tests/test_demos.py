@@ -16,6 +16,7 @@ QUICK = {
     "self_weight_column": ("--cells 16", ["self_weight_column.png"]),
     "error_vs_runtime": ("--quick --cases column", ["column.png", "runs.csv", "comparison.md"]),
     "mandel": ("--cells 8 --steps 5", ["mandel.png"]),
+    "coupling_iterations": ("--quick --h 0.06", ["iterations.png", "iterations.csv", "iterations.md", "roughness.md"]),
     "cantilever": ("--cells 2 --steps 20", ["cantilever.png"]),
     "quadrature": ("--h 0.05 --steps 5 10", ["quadrature.png", "tip.csv"]),
     "benchmark_beam": ("--h 0.05 --t-end 0.1 --repeat 1", []),

@@ -1,0 +1,300 @@
+# SPDX-License-Identifier: MIT
+"""How many iterations the coupling of displacement and pore pressure takes, from drained to undrained.
+
+The linear systems of Newton's first step are solved to 1e-8 (true residual) for a cantilever (the
+paper's, at rest and bent) and a footing on a column, with conductivities from 1e-14 to 1e2 m/s, steps
+from 1e-9 to 1e9 s and water from soft (1e4 Pa) to incompressible; only the product k dt matters.
+Compared are the package's conjugate gradients on the Schur complement, S = C + B K^-1 B^T, with the
+filtered fixed-stress operator C + beta (V - 3/4 L) and with the plain one, C + beta V; and the plain
+fixed-stress iteration (Richardson's) with beta = 0.5, 0.75 and 1 times alpha²/K_dr and with 1/K_w as
+printed in the paper, which diverges.  An iteration is one solve of the storage and one of the momentum.
+
+Undrained, what P1 with DG0 does not see are checkers of the pressure; only the damping of jumps
+(`storage.py`) bounds them, and the count.  The second picture shows the pressure with and without it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from petsc4py import PETSc
+
+import numpy as np
+import poroelastic_beam as beam
+from numpy.typing import NDArray
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.coupling import Report
+from mpm_dolfinx.storage import FILTER
+
+K_DT = np.array([-23, -16, -12, -10, -9, -8, -7, -6, -5, -4, -3, -2, 0, 3, 7, 11])  # log10 of k dt in m
+BULK = (1e4, 1e6, 2.2e9, np.inf)  # of the water, Pa
+SCHEMES = {
+    "Schur-CG": ("cg", 0.75, FILTER),
+    "Schur-CG, plain operator": ("cg", 0.75, 0.0),
+    "fixed stress, 1/2": ("richardson", 0.5, 0.0),
+    "fixed stress, 3/4": ("richardson", 0.75, 0.0),
+    "fixed stress, 1": ("richardson", 1.0, 0.0),
+    "fixed stress, 1/K_w": ("richardson", None, 0.0),
+}
+"""Krylov method, multiple of alpha^2/K_dr taken as beta (None: 1/K_w), share of the filter."""
+MOST = 200  # iterations before a scheme is given up
+RAMP_STEP = 0.02  # s: every system has the load increment of this time, whatever its dt
+CLEAR = 0.1  # m from the corners of the clamp, where the pressure is singular
+GOAL = 15  # iterations
+
+
+class Undamped(mpm.Hencky):
+    """Hencky's law without the damping of pressure jumps."""
+
+    def pressure_damping(self, dim: int) -> float:
+        """Return tau = 0."""
+        return 0.0
+
+
+LAWS = {"damped": mpm.Hencky, "undamped": Undamped}
+
+
+@dataclass(frozen=True)
+class Count:
+    """Iterations of a scheme for one system: None if it diverges; eigenvalues: extreme ones of P^-1 S (CG)."""
+
+    scene: str
+    h: float
+    fluid_bulk: float
+    conductivity: float
+    dt: float
+    scheme: str
+    iterations: int | None
+    lowest: float = np.nan
+    highest: float = np.nan
+
+
+def cantilever(h: float, *options: str) -> mpm.Simulation:
+    """Return the paper's beam with cells of h."""
+    return beam.scene(beam.arguments(["--h", str(h), *options]))[0]
+
+
+def bent(h: float) -> mpm.Simulation:
+    """Return the paper's beam after two steps, its tip deflected by half its height."""
+    simulation = cantilever(h)
+    simulation.run(2 * RAMP_STEP, RAMP_STEP, progress=False)
+    return simulation
+
+
+def column(h: float) -> mpm.Simulation:
+    """Return a drained column of 0.5 m x 1 m between smooth walls with a load on half of its top."""
+    cells = np.rint(np.array([0.5, 1.2]) / h).astype(int)
+    grid = mpm.Grid([0.5, 1.2], cells)
+    soil = beam.material(beam.arguments([]))
+    footing = mpm.Traction("top", lambda t: (0, -1e6 * t), region=((0, 0), (0.25, 2)))
+    return mpm.Simulation(
+        grid,
+        [mpm.box(grid, [0, 0], [0.5, 1.0])],
+        [soil],
+        fluid=mpm.Fluid(),
+        fixed={"left": "x", "right": "x", "bottom": "xy"},
+        tractions=[footing],
+        drained=[mpm.Drained("top")],
+    )
+
+
+SCENES = {"beam": cantilever, "bent beam": bent, "column": column}
+
+
+def linearise(s: mpm.Simulation, conductivity: float, dt: float, bulk: float) -> None:
+    """Set up the first linear system of a step of dt with other constants, at the load of the next RAMP_STEP."""
+    s.materials[:] = [replace(m, conductivity=conductivity) for m in s.materials]
+    s.fluid = mpm.Fluid(bulk=bulk)
+    s._prepared = False
+    s._begin(s.t + RAMP_STEP)
+    s.storage.start(dt)
+    s.coupler._scale_u = 0.0
+    s.coupler._errors(dt, Report())
+    s.coupler._linearise(dt)
+
+
+def count(s: mpm.Simulation, scheme: str) -> tuple[int | None, float, float]:
+    """Solve the linear system of `linearise` to 1e-8; return iterations and the extreme eigenvalues of P^-1 S."""
+    method, factor, share = SCHEMES[scheme]
+    if factor is None:
+        soil = s.materials[0]
+        factor = soil.drained_modulus(s.grid.dim) / soil.biot**2 / s.fluid.bulk
+    coupler, g = s.coupler, s.coupler._condense()
+    solver = PETSc.KSP().create(g.comm)
+    solver.setType(method)
+    solver.setPC(coupler._solve_s.pc)
+    solver.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
+    solver.setTolerances(rtol=1e-8, atol=0.0, divtol=1e5, max_it=MOST)
+    solver.setComputeEigenvalues(method == "cg")
+    solver.setOperators(coupler._schur, s.storage.assemble_preconditioner(factor, share))
+    solver.solve(g, g.duplicate())
+    iterations = solver.getIterationNumber() if solver.getConvergedReason() > 0 else None
+    if method != "cg":
+        return iterations, np.nan, np.nan
+    values = solver.computeEigenvalues().real
+    return iterations, values.min(), values.max()
+
+
+def scan(scene: str, h: float, bulks=BULK, k_dt=K_DT, schemes=tuple(SCHEMES)) -> list[Count]:
+    """Count the iterations of the schemes over the range of fluids and of k dt."""
+    s, out = SCENES[scene](h), []
+    for bulk in bulks:
+        for exponent in k_dt:
+            along = (exponent + 23) / 34  # k from 1e-14 to 1e2 m/s and dt from 1e-9 to 1e9 s grow together
+            k, dt = 10 ** (-14 + 16 * along), 10 ** (-9 + 18 * along)
+            linearise(s, k, dt, bulk)
+            out += [Count(scene, h, bulk, k, dt, scheme, *count(s, scheme)) for scheme in schemes]
+    return out
+
+
+def worst(counts: list[Count]) -> float:
+    """Return the most iterations of some counts; infinite if one diverges or takes more than MOST."""
+    return max(np.inf if c.iterations is None else c.iterations for c in counts)
+
+
+def cells(s: mpm.Simulation) -> NDArray[np.float64]:
+    """Return the pressure of the cells (nx, ny), Pa; nan where nothing is and near the corners of the clamp."""
+    p = np.full(s.grid.shape.prod(), np.nan)
+    body = s.bodies[0]
+    corners = [[0, body.lower[:, 1].min()], [0, (body.lower + body.spacing)[:, 1].max()]]
+    apart = np.linalg.norm(s.grid.midpoints[:, None] - corners, axis=2).min(axis=1)
+    filled = s.storage.unknowns.owned
+    shown = filled[apart[filled] > CLEAR]
+    p[s.grid.cell_number[shown]] = s.storage.p.x.array[shown]
+    return p.reshape(s.grid.shape)
+
+
+def roughness(s: mpm.Simulation) -> float:
+    """Return rms(p - mean of the four neighbours) / max |p| over the cells that have four neighbours."""
+    p = cells(s)
+    deviation = p[1:-1, 1:-1] - (p[:-2, 1:-1] + p[2:, 1:-1] + p[1:-1, :-2] + p[1:-1, 2:]) / 4
+    return float(np.sqrt(np.nanmean(deviation**2)) / np.nanmax(np.abs(p)))
+
+
+def undrained(h: float, law: type[mpm.Hencky]) -> tuple[mpm.Simulation, mpm.Result]:
+    """Load the undrained beam in three steps."""
+    s = cantilever(h, "--conductivity", "1e-12")
+    m = s.materials[0]
+    s.materials = [law(bulk=m.bulk, shear=m.shear, porosity=m.porosity, conductivity=m.conductivity)]
+    return s, s.run(3 * RAMP_STEP, RAMP_STEP, progress=False)
+
+
+def main(argv: list[str] | None = None) -> dict:
+    """Run the demo; return what --json prints."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser.add_argument("--h", type=float, nargs="+", default=[0.06, 0.03, 0.015], help="cell sizes, m")
+    parser.add_argument("--quick", action="store_true", help="coarser: every other k dt, hard water only")
+    parser.add_argument("--out", type=Path, default=Path("out/coupling_iterations"), help="folder for tables, pictures")
+    parser.add_argument("--json", action="store_true", help="print the results as one line of JSON at the end")
+    o = parser.parse_args(argv)
+    if not min(o.h) > 0:
+        parser.error(f"--h {min(o.h)}: must be > 0")
+    bulks, k_dt = (BULK[2:], K_DT[::2]) if o.quick else (BULK, K_DT)
+    counts = [c for scene in SCENES for h in o.h for c in scan(scene, h, bulks, k_dt)]
+    runs = {(h, name): undrained(h, law) for h in o.h for name, law in LAWS.items()}
+    o.out.mkdir(parents=True, exist_ok=True)
+    write(o, counts)
+    write_roughness(o, runs)
+    draw(o, counts)
+    draw_pressure(o, runs)
+    print(f"tables and pictures: {o.out}/")
+    own = worst([c for c in counts if c.scheme == "Schur-CG"])
+    out = {
+        "worst_iterations": own if np.isfinite(own) else None,
+        "worst_plain_operator": worst([c for c in counts if c.scheme == "Schur-CG, plain operator"]),
+        "roughness": {name: [roughness(runs[h, name][0]) for h in o.h] for name in LAWS},
+        "converged": bool(own <= GOAL),
+    }
+    if o.json:
+        print(json.dumps(out))
+    return out
+
+
+def shown(iterations: float) -> str:
+    """Return a count as text."""
+    return f"{iterations:.0f}" if np.isfinite(iterations) else "none"
+
+
+def write(o: argparse.Namespace, counts: list[Count]) -> None:
+    """Write all counts as CSV, and the worst of each scene and cell size as Markdown."""
+    with (o.out / "iterations.csv").open("w", newline="") as file:
+        table = csv.writer(file)
+        table.writerow(
+            ["scene", "h_m", "fluid_bulk_Pa", "k_m_s", "dt_s", "scheme", "iterations", "lowest_eigenvalue", "highest"]
+        )
+        table.writerows(vars(c).values() for c in counts)
+    rows = [["scene", "h (m)", *SCHEMES, "eigenvalues of P⁻¹S"]]
+    for scene, h in dict.fromkeys((c.scene, c.h) for c in counts):
+        here = [c for c in counts if (c.scene, c.h) == (scene, h)]
+        each = [shown(worst([c for c in here if c.scheme == scheme])) for scheme in SCHEMES]
+        own = [c for c in here if c.scheme == "Schur-CG"]
+        rows.append([scene, f"{h:g}", *each, f"{min(c.lowest for c in own):.2f} to {max(c.highest for c in own):.2f}"])
+    print(f"most iterations to 1e-8 over all k dt and K_w (none: diverges, or more than {MOST})")
+    tabulate(o.out / "iterations.md", rows)
+
+
+def write_roughness(o: argparse.Namespace, runs: dict) -> None:
+    """Write the roughness of the undrained pressure and the iterations of a linear solve as Markdown."""
+    rows = [["h (m)", *(f"roughness, {name}" for name in LAWS), *(f"iterations to 1e-3, {name}" for name in LAWS)]]
+    for h in o.h:
+        here = [runs[h, name] for name in LAWS]
+        rough, solves = [roughness(s) for s, _ in here], [r.coupling / r.newton for _, r in here]
+        rows.append([f"{h:g}", *(f"{x:.2%}" for x in rough), *(f"{x:.1f}" for x in solves)])
+    print("undrained beam: rms difference of a cell's pressure from its neighbours' mean / largest pressure")
+    tabulate(o.out / "roughness.md", rows)
+
+
+def tabulate(path: Path, rows: list[list[str]]) -> None:
+    """Print and write a Markdown table."""
+    rows.insert(1, ["---"] * len(rows[0]))
+    text = "\n".join("| " + " | ".join(row) + " |" for row in rows)
+    path.write_text(text + "\n")
+    print(text + "\n")
+
+
+def draw(o: argparse.Namespace, counts: list[Count]) -> None:
+    """Draw iterations against k dt: the scenes beside each other, a colour a scheme, a line style a cell size."""
+    fig, ((*axes, side),) = beam.figure(1, len(SCENES) + 1, (16, 4.6))
+    styles = dict(zip(o.h, ("-", "--", ":", "-."), strict=False))
+    for ax, scene in zip(axes, SCENES, strict=True):
+        for colour, scheme in enumerate(SCHEMES):
+            for h, style in styles.items():
+                line = [c for c in counts if (c.scene, c.h, c.scheme, c.fluid_bulk) == (scene, h, scheme, 2.2e9)]
+                n = [np.nan if c.iterations is None else c.iterations for c in line]
+                ax.loglog([c.conductivity * c.dt for c in line], n, style, color=f"C{colour}")
+        ax.axhline(GOAL, color="black", lw=0.8)
+        ax.set(xlabel="k Δt (m)", ylabel="iterations to 1e-8", title=scene, ylim=(0.9, MOST))
+        ax.grid(alpha=0.3)
+    handles = [axes[0].plot([], [], color=f"C{colour}", label=name)[0] for colour, name in enumerate(SCHEMES)]
+    handles += [axes[0].plot([], [], style, color="black", label=f"h = {h:g} m")[0] for h, style in styles.items()]
+    side.legend(handles=handles, loc="center left")
+    side.set_axis_off()
+    fig.suptitle("Iterations of a linear solve, water of 2.2 GPa; a line ends where the scheme diverges")
+    fig.savefig(o.out / "iterations.png", dpi=130)
+
+
+def draw_pressure(o: argparse.Namespace, runs: dict) -> None:
+    """Draw the undrained pressure of the cells beside each other, for the middle one of the cell sizes."""
+    h = o.h[len(o.h) // 2]
+    fig, (axes,) = beam.figure(1, len(LAWS), (13, 3.9))
+    limit = np.nanmax(np.abs(cells(runs[h, "damped"][0]))) / 1e3
+    for ax, name in zip(axes, LAWS, strict=True):
+        s = runs[h, name][0]
+        extent = np.stack([s.grid.lower, s.grid.upper], axis=1).ravel()
+        image = ax.imshow(cells(s).T / 1e3, origin="lower", extent=extent, cmap="RdBu_r", clim=(-limit, limit))
+        low, high = s.points.corners.min(axis=(0, 1)), s.points.corners.max(axis=(0, 1))
+        ax.set(xlim=(0, high[0] + 0.05), ylim=(low[1] - 0.05, high[1] + 0.05))
+        ax.set(xlabel="x (m)", ylabel="y (m)", title=f"{name}, h = {h:g} m: roughness {roughness(s):.2%}")
+        fig.colorbar(image, ax=ax, shrink=0.8).set_label("pore pressure (kPa)")
+    fig.suptitle("Undrained beam after three steps, without the corners of the clamp")
+    fig.savefig(o.out / "checkerboard.png", dpi=130)
+
+
+if __name__ == "__main__":
+    sys.exit(0 if main()["converged"] else 1)

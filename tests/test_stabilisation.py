@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: MIT
+"""Ghost penalty and damping of pressure jumps vanish with the cell size as fast as the scheme's own error."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.momentum import GHOST
+
+SHEAR, LOAD, K = 1e6, 1e2, np.pi  # Pa, Pa, 1/m
+CELLS = (8, 16, 32)
+
+
+class Soil(mpm.LinearElastic):
+    """Linear elasticity with another strength of the damping."""
+
+    strength = 1.0
+
+    def pressure_damping(self, dim):
+        return self.strength * super().pressure_damping(dim)
+
+
+def exact(x):
+    """Return (displacement, pressure) of an undrained layer of 1 m on a smooth floor, -LOAD cos(K x) on its top.
+
+    Incompressible, u = curl psi, psi = (A sinh Ky + B y cosh Ky) sin Kx, which leaves the floor and, at
+    Kx = 0 and pi, the walls free of shear; A and B from the tractions of the top.
+    """
+
+    def derivatives(y):
+        """Return psi's two parts in y and their first three derivatives."""
+        s, c = np.sinh(K * y), np.cosh(K * y)
+        a = np.stack([s, K * c, K**2 * s, K**3 * c])
+        b = np.stack([y * c, c + K * y * s, 2 * K * s + K**2 * y * c, 3 * K**2 * c + K**3 * y * s])
+        return a, b
+
+    parts = derivatives(np.array(1.0))
+    shear = [f[2] + K**2 * f[0] for f in parts]
+    normal = [SHEAR / K * (f[3] - 3 * K**2 * f[1]) for f in parts]
+    A, B = np.linalg.solve([shear, normal], [0, -LOAD])
+    f = sum(c * part for c, part in zip((A, B), derivatives(x[:, 1]), strict=True))
+    u = np.stack([f[1] * np.sin(K * x[:, 0]), -K * f[0] * np.cos(K * x[:, 0])], axis=1)
+    return u, -SHEAR / K * (f[3] - K**2 * f[1]) * np.cos(K * x[:, 0])
+
+
+@cache
+def layer(cells, damping=1.0, ghost=1.0):
+    """Return (displacement, pressure, their exact values) of the layer at the points, its top row half filled."""
+    h = 1 / (cells - 0.5)
+    grid = mpm.Grid([1, (cells + 1) * h], [cells, cells + 1])
+    body = mpm.box(grid, [0, 0], [1, 1])
+    x = np.linspace(0, 1, 2 * cells + 1)
+    load = -LOAD * np.diff(np.sin(K * x)) / (K * np.diff(x))
+    tractions = [
+        mpm.Traction("top", (0, q), region=((a, 0), (b, 2))) for q, a, b in zip(load, x[:-1], x[1:], strict=True)
+    ]
+    soil = Soil(bulk=2 * SHEAR / 3, shear=SHEAR)
+    walls = {"left": "x", "right": "x", "bottom": "y"}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Soil, "strength", damping)
+        patch.setattr("mpm_dolfinx.momentum.GHOST", ghost * GHOST)
+        s = mpm.Simulation(grid, [body], [soil], fluid=mpm.Fluid(bulk=np.inf), fixed=walls, tractions=tractions)
+        s.run(1.0, 1.0, progress=False)
+    return s.points.x - body.centre, s.points.pressure, *exact(body.centre)
+
+
+def rms(values):
+    return np.sqrt(np.mean(values**2))
+
+
+def errors(which):
+    """Return the relative errors of displacement (0) or pressure (1)."""
+    solutions = [layer(cells) for cells in CELLS]
+    return np.array([rms(s[which] - s[2 + which]) / rms(s[2 + which]) for s in solutions])
+
+
+def changes(which, **options):
+    """Return by how much another strength changes displacement or pressure, relative to the exact ones."""
+    pairs = [(layer(cells), layer(cells, **options)) for cells in CELLS]
+    return np.array([rms(a[which] - b[which]) / rms(a[2 + which]) for a, b in pairs])
+
+
+def orders(values):
+    return np.log2(values[:-1] / values[1:])
+
+
+def test_undrained_displacement_is_of_second_order_and_pressure_of_first():
+    assert orders(errors(0)).min() > 1.9 and errors(0)[-1] < 1.1e-3
+    assert orders(errors(1)).min() > 0.9 and errors(1)[-1] < 4e-2  # constant in a cell
+
+
+@pytest.mark.parametrize("strength, share", [(0.25, 0.25), (4.0, 1.0)])
+def test_what_the_damping_changes_vanishes_as_fast_as_the_error(strength, share):
+    u, p = changes(0, damping=strength), changes(1, damping=strength)
+    assert orders(u).min() > 1.9 and (u < share * errors(0)).all()
+    assert orders(p).min() > 1.2
+
+
+@pytest.mark.parametrize("strength, share", [(0.1, 0.03), (10.0, 0.25)])
+def test_what_the_ghost_penalty_changes_vanishes_faster_than_the_error(strength, share):
+    u, p = changes(0, ghost=strength), changes(1, ghost=strength)
+    assert orders(u).min() > 2.3 and (u < share * errors(0)).all()
+    assert orders(p).min() > 1.2
