@@ -18,6 +18,7 @@ QUICK = {
     "mandel": ("--cells 8 --steps 5", ["mandel.png"]),
     "cantilever": ("--cells 2 --steps 20", ["cantilever.png"]),
     "quadrature": ("--h 0.05 --steps 5 10", ["quadrature.png", "tip.csv"]),
+    "extending_with_ufl": ("--cells 8", ["extending_with_ufl.png"]),
     "benchmark_beam": ("--h 0.05 --t-end 0.1 --repeat 1", []),
 }
 
