@@ -54,8 +54,9 @@ class Skeleton:
     """Names of the constants that the energy takes."""
 
     def __post_init__(self):
-        for name in ("bulk", "shear", "grain_bulk"):
-            _check(self, name, 0 < getattr(self, name), "> 0")
+        for name in ("bulk", "shear"):
+            _check(self, name, 0 < getattr(self, name) < inf, "> 0 and finite")
+        _check(self, "grain_bulk", 0 < self.grain_bulk, "> 0")
         for name in ("conductivity", "grain_density"):
             _check(self, name, 0 <= getattr(self, name) < inf, ">= 0 and finite")
         _check(self, "porosity", 0 < self.porosity < 1, "in (0, 1)")

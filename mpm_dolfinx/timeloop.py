@@ -6,6 +6,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from math import inf
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -94,7 +95,7 @@ def run(
     t_end
         End time, s.
     dt
-        Step and output interval, s, > 0.
+        Step and output interval, s, > 0; one step to t_end where it is longer than that.
     probes
         Particles whose displacement is recorded.
     observe
@@ -107,8 +108,9 @@ def run(
     GaveUp
         With the histories so far; `points` and `t` are those of the last good step.
     """
-    if not (dt > 0 and t_end > simulation.t):
-        raise ValueError(f"dt = {dt!r}, t_end = {t_end!r}: must be dt > 0 and t_end > {simulation.t:g}")
+    if not (dt > 0 and simulation.t < t_end < inf):
+        raise ValueError(f"dt = {dt!r}, t_end = {t_end!r}: must be dt > 0 and t_end > {simulation.t:g} and finite")
+    dt = min(dt, t_end - simulation.t)
     result, start, small = Result(), simulation.t, dt
     _record(simulation, result, probes)
     intervals = max(1, round((t_end - start) / dt))
