@@ -112,7 +112,7 @@ class Coupler:
 
     def set_unknowns(self) -> None:
         """Make the solvers for the present matrices."""
-        self._solve_u = direct_solver(self.momentum.K, "momentum")
+        self._solve_u = direct_solver(self.momentum.K, "momentum", self.momentum.symmetric)
         self._du, self._rhs = self.momentum.unknowns.vector(), self.momentum.unknowns.vector()
         if self.storage is None:
             return

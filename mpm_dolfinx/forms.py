@@ -103,6 +103,18 @@ class FormPoints:
         }
         self.version += 1
 
+    def take(self, points: FormPoints, rows: NDArray[np.int64]) -> None:
+        """Be some rows of other points, which carry the fields of these."""
+        self.cells, self.x = points.cells[rows], points.x[rows]
+        self.filled = np.unique(self.cells)
+        self.data = {name: points.data[name][rows] for name in self._functions if name not in self._live}
+        self.version += 1
+
+    @property
+    def position(self):
+        """Position of the point as UFL, m."""
+        return ufl.SpatialCoordinate(self.grid.mesh) + self.offset
+
     def value(self, f):
         """Return f at the point, f a P1 function, test or trial function (any shape)."""
         return self._taylor(f, self.grid.dim)
@@ -117,10 +129,17 @@ class FormPoints:
         Derivatives by u do not see it.  In 3D, where the Taylor series has many terms, a kernel of Hencky's law
         takes half or a quarter of the time, and its compilation a fifth.
         """
+        if "gradient" in self._live:
+            return self._functions["gradient"]
         shape = (self.grid.dim, self.grid.dim)
         self._functions["gradient"] = fem.Function(_compat.function_space(self.grid.mesh, "DG", 0, shape))
         self._live["gradient"] = u
         return self._functions["gradient"]
+
+    def deformation(self, u: fem.Function):
+        """Return F = (I + grad u) F_n at the points, which carry F_n as F, as a UFL variable."""
+        gradient = self.grad(u) if self.grid.dim == 2 else self.gradient(u)
+        return ufl.variable((ufl.Identity(self.grid.dim) + gradient) * self.F)
 
     def values(self, name: str, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
         """Return a field at the chosen points (m, size)."""
@@ -243,17 +262,16 @@ class ElementMatrices:
     Parameters
     ----------
     tangent : UFL tensor (d, d, d, d)
-        A[i, k, j, l] at the points, with A[i, k, j, l] = A[j, l, i, k].
+        A[i, k, j, l] at the points.
     points
         The points.
+    symmetric
+        Whether A[i, k, j, l] = A[j, l, i, k]: half of the entries are then left out.
     """
 
-    def __init__(self, tangent: ufl.core.expr.Expr, points: FormPoints):
+    def __init__(self, tangent: ufl.core.expr.Expr, points: FormPoints, symmetric: bool = True):
         self.points, dim = points, points.grid.dim
-        count = 2**dim * dim
-        rows, columns = np.triu_indices(count)
-        self._entry = np.empty((count, count), dtype=np.int64)  # symmetric: place of each entry in the vector
-        self._entry[rows, columns] = self._entry[columns, rows] = np.arange(len(rows))
+        rows, columns, self._entry = _entries(2**dim * dim, symmetric)
         gradients, entries = shape_gradients(points), []
         for row, column in zip(rows, columns, strict=True):
             (v, i), (u, j) = divmod(row, dim), divmod(column, dim)
@@ -264,6 +282,16 @@ class ElementMatrices:
     def assemble_matrix(self, A: PETSc.Mat) -> None:
         """Add the matrix to `A`, by unrolled local dofs; the caller finalises it."""
         insert(A, self.points, self._sums()[:, self._entry])
+
+
+def _entries(count: int, symmetric: bool) -> tuple[NDArray, NDArray, NDArray]:
+    """Return rows and columns of the entries of a matrix that are needed, and the place of every entry among them."""
+    rows, columns = np.triu_indices(count) if symmetric else np.divmod(np.arange(count**2), count)
+    place = np.empty((count, count), dtype=np.int64)
+    if symmetric:
+        place[columns, rows] = np.arange(len(rows))
+    place[rows, columns] = np.arange(len(rows))
+    return rows, columns, place
 
 
 class ElementForces:
@@ -298,16 +326,16 @@ class StackedElementMatrices:
     Parameters
     ----------
     tangent : UFL tensor (d, d, d, d)
-        A[i, k, j, l] at the points, with A[i, k, j, l] = A[j, l, i, k].
+        A[i, k, j, l] at the points.
     points
         The points, with the field F (d, d).
+    symmetric
+        Whether A[i, k, j, l] = A[j, l, i, k]: half of the entries are then left out.
     """
 
-    def __init__(self, tangent: ufl.core.expr.Expr, points: FormPoints):
+    def __init__(self, tangent: ufl.core.expr.Expr, points: FormPoints, symmetric: bool = True):
         self.points, self._d = points, points.grid.dim
-        d, rows, columns = self._d, *np.triu_indices(self._d**2)
-        place = np.empty((d * d, d * d), dtype=np.int64)
-        place[rows, columns] = place[columns, rows] = np.arange(len(rows))
+        d, (rows, columns, place) = self._d, _entries(self._d**2, symmetric)
         self._entry = place.reshape(d, d, d, d).transpose(1, 0, 2, 3).ravel()  # (k, i, j, l)
         pairs = [(*divmod(int(r), d), *divmod(int(c), d)) for r, c in zip(rows, columns, strict=True)]
         self._tangent = PointExpression(ufl.as_vector([tangent[pair] for pair in pairs]), points)

@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
-import ufl
 from dolfinx import fem
 from dolfinx.common import Timer
 from numpy.typing import ArrayLike, NDArray
@@ -18,15 +17,16 @@ from mpm_dolfinx.conditions import Displacement, Drained, Inflow, RigidPlate, Tr
 from mpm_dolfinx.coupling import COUPLINGS, Coupler, Report
 from mpm_dolfinx.domains import parallelepipeds, tangled
 from mpm_dolfinx.exchange import Exchange
-from mpm_dolfinx.forms import FormPoints, PointExpression
+from mpm_dolfinx.forms import FormPoints
 from mpm_dolfinx.grid import Grid, sum_by
+from mpm_dolfinx.laws import ConductivityAtPieces, SceneMaterials
 from mpm_dolfinx.materials import Fluid, Skeleton
 from mpm_dolfinx.momentum import FULL, Momentum
 from mpm_dolfinx.placement import Placement
-from mpm_dolfinx.points import Body, Probes, material_points
-from mpm_dolfinx.remap import carry, remap
+from mpm_dolfinx.points import Body, MaterialPoints, Probes, material_points
+from mpm_dolfinx.remap import Carried, carry, remap
 from mpm_dolfinx.storage import Storage
-from mpm_dolfinx.timeloop import Result, run
+from mpm_dolfinx.timeloop import Observer, Result, run
 
 
 class Simulation:
@@ -39,7 +39,7 @@ class Simulation:
     bodies
         Seeded bodies.
     materials
-        Material of each index that the bodies name; all of one law.
+        Material of each index that the bodies name.
     fixed
         Walls of the grid with the components that are zero there, such as {"left": "xy", "bottom": "y"}.
     fluid
@@ -54,6 +54,8 @@ class Simulation:
         "domain": exact pieces of the points' domains; "point": at the points, as in the seed paper.
     coupling, tolerance
         See `Coupler`.
+    terms, sources
+        Functions that give terms of the user's own to the two balances in UFL: see `extend`.
     """
 
     def __init__(
@@ -74,35 +76,35 @@ class Simulation:
         quadrature: str = "domain",
         coupling: str = "schur-cg",
         tolerance: float = 1e-8,
+        terms: Sequence[Callable] = (),
+        sources: Sequence[Callable] = (),
     ):
         if quadrature not in ("domain", "point"):
             raise ValueError(f"quadrature {quadrature!r}: must be domain or point")
         if coupling not in COUPLINGS:
             raise ValueError(f"coupling {coupling!r}: must be one of {', '.join(COUPLINGS)}")
-        law = type(materials[0])
-        if any(type(m) is not law for m in materials):
-            raise ValueError("materials: all must be of one law")
-        if fluid is None and (drained or inflows):
-            raise ValueError("drained and inflow sides need a fluid")
+        if fluid is None and (drained or inflows or sources):
+            raise ValueError("drained and inflow sides and sources need a fluid")
         self.grid, self.materials, self.fluid, self.bodies = grid, materials, fluid, bodies
         self.quadrature = quadrature
         self._gravity_at = gravity if callable(gravity) or gravity is None else lambda t: gravity
         self.gravity = None if gravity is None else fem.Constant(grid.mesh, np.zeros(grid.dim))
         self.t, self.active_cells = 0.0, 0
         self.points = material_points(grid, bodies, pressure)
-        modulus = max(m.oedometric for m in materials)
-        self.boundary = Boundary(grid, bodies, modulus, tractions, displacements, plates, [*drained, *inflows])
+        self._scene = SceneMaterials(grid, materials, bodies, self.points)
+        conditions = (tractions, displacements, plates, [*drained, *inflows])
+        self.boundary = Boundary(grid, bodies, self._scene.stiffest, *conditions)
         self.reactions = np.zeros((len(displacements), grid.dim))
         """(displacements, d): force by which each given displacement acts on the bodies, N (N/m in plane strain)."""
-        self._law = law
 
         start = time.perf_counter()
-        self._build(law, self._fixed_nodes(fixed), coupling, tolerance)
+        self._build(self._fixed_nodes(fixed), coupling, tolerance, terms, sources)
         self.jit = time.perf_counter() - start
         """Seconds spent on compiling or finding the forms."""
         self._carried = carry(self.points) if fluid else None
         self._prepared = False
-        self._stress: PointExpression | None = None
+        self.result: Result | None = None
+        """Histories of the last run, also while it runs."""
 
     # ---- building -------------------------------------------------------------------------------
 
@@ -116,29 +118,42 @@ class Simulation:
                 out[self.grid.wall_nodes(wall), "xyz".index(a)] = True
         return out
 
-    def _build(self, law, fixed: NDArray[np.bool_], coupling: str, tolerance: float) -> None:
+    def _build(self, fixed: NDArray[np.bool_], coupling: str, tolerance: float, terms, sources) -> None:
         """Compile the forms that the scene needs."""
-        grid, d, fluid = self.grid, self.grid.dim, self.fluid
-        shapes: dict[str, tuple[int, ...]] = {"F": (d, d), **{name: () for name in law.parameters}}
+        grid, d, fluid, scene = self.grid, self.grid.dim, self.fluid, self._scene
+        shapes: dict[str, tuple[int, ...]] = {"F": (d, d), **scene.shapes}
         if fluid:
             shapes |= {"biot": (), "storage": ()}
         if self.gravity is not None:
             shapes |= {"density": ()}
+        self._extended = bool(terms or sources)
+        if self._extended:
+            shapes |= {"displacement": (d,), **{name: v.shape[1:] for name, v in self.points.data.items()}}
+        if fluid and scene.conductivity_laws:
+            shapes |= {"conductivity": (), "porosity0": ()}
         self.pieces = FormPoints(grid, **shapes)
+        self._parts = scene.parts(self.pieces, ["F", "biot"] if fluid else ["F"])
         p = fem.Function(_compat.function_space(grid.mesh, "DG", 0)) if fluid else None
-        mean = any(m.nearly_incompressible for m in self.materials)
-        self.momentum = Momentum(
-            grid, self.pieces, law, fixed, p, self.gravity, bool(self.boundary.plates), bool(self.boundary.holds), mean
-        )
+        conditions = bool(self.boundary.plates), bool(self.boundary.holds)
+        options = {"mean_dilatation": scene.nearly_incompressible, "symmetric": scene.symmetric}
+        self.momentum = Momentum(grid, self.pieces, self._parts, fixed, p, self.gravity, *conditions, **options)
+        self._time = fem.Constant(grid.mesh, 0.0)
+        for term in terms:
+            self.momentum.add(term, self._time)
         self.storage = None
+        if not self.momentum.symmetric and coupling == "schur-cg":
+            coupling = "schur-fgmres"
         if fluid:
             weight = None if self.gravity is None else fluid.density * self.gravity
             self.storage = Storage(grid, self.pieces, self.momentum.u, p, weight, coupling != "schur-fgmres")
+            for source in sources:
+                self.storage.add(source, self._time)
+            self._conductivity = ConductivityAtPieces(scene, self.pieces)
         self.coupler = Coupler(self.momentum, self.storage, coupling, tolerance)
 
-    def _table(self, value: Callable[[Skeleton], float]) -> NDArray[np.float64]:
-        """Return a constant of the materials at the points (n,)."""
-        return np.array([value(m) for m in self.materials])[self.points.material]
+    def _table(self, value: Callable[..., float], *columns: NDArray) -> NDArray[np.float64]:
+        """Return a constant of the materials at the points (n,); `value` also takes columns (n,) of the points."""
+        return self._scene.table(self.points, value, *columns)
 
     # ---- one step -------------------------------------------------------------------------------
 
@@ -163,6 +178,7 @@ class Simulation:
 
     def _begin(self, t: float) -> None:
         """Set up the step that ends at time t: grid, loads of that time, u = 0 and the cells' pressure."""
+        self._time.value = t
         if self.gravity is not None:
             self.gravity.value = np.asarray(self._gravity_at(t), dtype=float)
         fresh = not self._prepared
@@ -173,7 +189,7 @@ class Simulation:
         self._place_loads(t)
         if fresh:
             self.momentum.set_penalty()
-            if self._renumbered:
+            if self._renumbered and not self.momentum.holding:
                 self._check_held()
             self._prepared = True
         self.momentum.start()
@@ -194,23 +210,41 @@ class Simulation:
                 place.pieces_to_cells(place.pieces.x),
                 place.pieces_to_cells(place.pieces.fraction * (self.points.volume0 * J)[place.pieces.point]),
                 **{name: place.to_cells(values) for name, values in self._fields(J).items()},
+                **({"displacement": place.pieces_to_cells(self._displacement())} if self._extended else {}),
             )
+            if len(self._parts) > 1:
+                law = place.to_cells(self._scene.law_of(self.points))
+                for number, (_, part) in enumerate(self._parts):
+                    part.take(self.pieces, np.flatnonzero(law == number))
             self._activate(J)
 
     def _fields(self, J: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
         """Return what the points bring to their pieces."""
-        fields = {"F": self.points.F}
-        for name in self._law.parameters:
-            fields[name] = self._table(lambda m, name=name: getattr(m, name))
+        fields = {"F": self.points.F, **(self.points.data if self._extended else {}), **self._scene.values(self.points)}
         n = 1 - (1 - self._table(lambda m: m.porosity)) / J
         if self.fluid:
-            storage = np.stack([m.storage(self.fluid.bulk, n) for m in self.materials])
             fields["biot"] = self._table(lambda m: m.biot)
-            fields["storage"] = storage[self.points.material, np.arange(len(n))]
+            fields["storage"] = self._table(lambda m, n: m.storage(self.fluid.bulk, n), n)
+            if self._scene.conductivity_laws:
+                fields["conductivity"] = self._table(lambda m: m.conductivity)
+                fields["porosity0"] = self._table(lambda m: m.porosity)
         if self.gravity is not None:
             wet = self.fluid.density if self.fluid else 0.0
             fields["density"] = (1 - n) * self._table(lambda m: m.grain_density) + n * wet
         return fields
+
+    def _displacement(self) -> NDArray[np.float64]:
+        """Return the displacements (m, d), m, of the pieces' centroids since the start, by the F of their points."""
+        points, pieces = self.points, self.placement.pieces
+        X = np.concatenate([b.centre for b in self.bodies])[points.id]
+        off = pieces.x - points.x[pieces.point]
+        return off + (points.x - X)[pieces.point] - np.einsum("mab,mb->ma", np.linalg.inv(points.F)[pieces.point], off)
+
+    def _mobility(self) -> NDArray[np.float64]:
+        """Return the mobility k / (rho_w g) at the pieces (m,), m^2/(Pa s)."""
+        if not self._scene.conductivity_laws:
+            return self._rows(lambda m: m.conductivity) / self.fluid.unit_weight
+        return self._conductivity.evaluate(self.placement.to_cells(self.points.material)) / self.fluid.unit_weight
 
     def _activate(self, J: NDArray[np.float64]) -> None:
         """Set the active cells and what they hold."""
@@ -239,7 +273,7 @@ class Simulation:
                 pieces.cells,
                 weight,
                 pieces.x,
-                self._rows(lambda m: m.conductivity) / self.fluid.unit_weight,
+                self._mobility(),
                 self.placement.pieces_to_cells(self.placement.pieces.faces),
                 pieces.data["storage"][:, 0],
                 self.placement.pieces_to_cells(self._brought),
@@ -311,6 +345,7 @@ class Simulation:
             # F_p <- (sum_k w_k Delta_k / V_p) F_p
             mean = [place.mean(column) for column in place.to_pieces(delta).reshape(-1, d * d).T]
             points.F = np.stack(mean, axis=1).reshape(n, d, d) @ points.F
+            self._scene.update_state(points)
             if self.quadrature == "domain":
                 corners = points.corners.reshape(-1, d)
                 moved = corners + place.displacement(u, np.repeat(np.arange(n), 2**d), corners)
@@ -352,17 +387,20 @@ class Simulation:
             self._carried = self._carried.migrated(travel)
         self.points = self.points.migrated(Exchange(grid.comm, owner))
 
+    @property
+    def carried(self) -> Carried | None:
+        """Pressures of the points' pieces between two steps; None without fluid."""
+        return self._carried
+
+    def restore(self, points: MaterialPoints, carried: Carried | None, t: float) -> None:
+        """Put the scene into a state at time t, s: points and pieces, on whatever processes they are."""
+        self.points, self._carried, self.t = points, carried, t
+        self._prepared = False
+        self._migrate()
+
     def effective_stress(self) -> NDArray[np.float64]:
         """Return the effective Cauchy stress (n, d, d), Pa, tension positive, at the material points."""
-        grid, d = self.grid, self.grid.dim
-        if self._stress is None:
-            state = FormPoints(grid, F=(d, d), **{name: () for name in self._law.parameters})
-            F = ufl.variable(state.F)
-            energy = self._law.energy(F, **{name: getattr(state, name) for name in self._law.parameters})
-            self._stress = PointExpression(ufl.diff(energy, F) * F.T / ufl.det(F), state)
-        x, fields = self.points.x, {name: self._fields(self.points.J)[name] for name in ("F", *self._law.parameters)}
-        self._stress.points.place(grid.local(grid.number(grid.index(x))), x, self.points.volume0, **fields)
-        return self._stress.evaluate()
+        return self._scene.effective_stress(self.points)
 
     # ---- many steps -----------------------------------------------------------------------------
 
@@ -372,8 +410,11 @@ class Simulation:
         dt: float,
         *,
         probes: Probes | None = None,
-        observe: Callable[[Simulation], None] | None = None,
+        observe: Observer | Sequence[Observer] = (),
+        checkpoint: Observer | None = None,
+        after: Result | None = None,
         progress: bool = True,
     ) -> Result:
         """Advance to t_end in steps of dt: see `timeloop.run`."""
-        return run(self, t_end, dt, probes=probes, observe=observe, progress=progress)
+        options = {"probes": probes, "observe": observe, "checkpoint": checkpoint, "after": after}
+        return run(self, t_end, dt, progress=progress, **options)
