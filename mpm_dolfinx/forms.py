@@ -511,10 +511,11 @@ class PointExpression:
         """Return the values (m, *shape) at the chosen points, by default at all, where they are now."""
         chosen = np.arange(len(self.points.cells)) if chosen is None else chosen
         out = np.empty((len(chosen), self._values.shape[1]))
+        rows = self._rows.room(self._many)  # before it is filled: making room loses what there was
         for start in range(0, len(chosen), max(1, self._many)):
             part = chosen[start : start + self._many]
             self._rows(part)
             self._values[:] = 0.0
-            self._compiled.assemble_vector(self._values.reshape(-1), self._rows.room(self._many)[: self._many])
+            self._compiled.assemble_vector(self._values.reshape(-1), rows[: self._many])
             out[start : start + len(part)] = self._values[: len(part)]
         return out.reshape(len(chosen), *self._shape)
