@@ -7,7 +7,7 @@
 # would break Debian's petsc4py.
 
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
-modules=(dolfinx scipy tqdm matplotlib)
+modules=(dolfinx scipy tqdm meshio matplotlib)
 
 # One thread per process; pictures without a display; mpirun as root, as in a container; messages
 # through shared memory, for everything runs on one machine (and Open MPI 5 warns about its network).

@@ -109,7 +109,7 @@ SCENES = {"beam": cantilever, "bent beam": bent, "column": column}
 
 def linearise(s: mpm.Simulation, conductivity: float, dt: float, bulk: float) -> None:
     """Set up the first linear system of a step of dt with other constants, at the load of the next RAMP_STEP."""
-    s.materials = [replace(m, conductivity=conductivity) for m in s.materials]
+    s.materials[:] = [replace(m, conductivity=conductivity) for m in s.materials]
     s.fluid = mpm.Fluid(bulk=bulk)
     s._prepared = False
     s._begin(s.t + RAMP_STEP)

@@ -4,16 +4,22 @@
 from mpm_dolfinx.conditions import Displacement, Drained, Inflow, RigidPlate, Traction
 from mpm_dolfinx.coupling import COUPLINGS, NotConverged
 from mpm_dolfinx.grid import Grid
-from mpm_dolfinx.materials import LAWS, Fluid, Hencky, LinearElastic, NeoHookean
+from mpm_dolfinx.materials import LAWS, Fluid, Hencky, LinearElastic, NeoHookean, Skeleton, kozeny_carman
+from mpm_dolfinx.output import Writer
+from mpm_dolfinx.plasticity import DruckerPrager
 from mpm_dolfinx.points import box, probes, shape
+from mpm_dolfinx.restart import Checkpoint, resume
 from mpm_dolfinx.simulation import Simulation
 from mpm_dolfinx.timeloop import GaveUp, Result
 
+__version__ = "0.1.0"
 __all__ = [
     "COUPLINGS",
     "LAWS",
+    "Checkpoint",
     "Displacement",
     "Drained",
+    "DruckerPrager",
     "Fluid",
     "GaveUp",
     "Grid",
@@ -25,8 +31,12 @@ __all__ = [
     "Result",
     "RigidPlate",
     "Simulation",
+    "Skeleton",
     "Traction",
+    "Writer",
     "box",
+    "kozeny_carman",
     "probes",
+    "resume",
     "shape",
 ]

@@ -118,8 +118,11 @@ class CompiledForm:
         self.coefficients = [coefficients[position[i]] for i in range(count)]
         self.form = None
 
-    def bind(self, entities: NDArray[np.int32]) -> None:
-        """Set the cells (repeats allowed) or the interior facets over which the form is integrated."""
+    def bind(self, entities: NDArray[np.int32]):
+        """Set the cells (repeats allowed) or the interior facets over which the form is integrated; return it so bound.
+
+        What is returned stays bound to them, and can be given to `assemble_vector` and `assemble_matrix`.
+        """
         entities = np.ascontiguousarray(entities, dtype=np.int32)
         cells = self.integral_type == "cell"
         kind = fem.IntegralType.cell if cells else fem.IntegralType.interior_facet
@@ -148,19 +151,22 @@ class CompiledForm:
                 {c: c for c in self._constants},
             )
             self._bound, self.form = bound, bound._cpp_object
+        return self.form
 
     def packed(self) -> dict:
         """Return dolfinx's own packed coefficients, one row an entity."""
         return _pack_coefficients(self.form) if OLD else cpp.fem.pack_coefficients(self.form)
 
-    def assemble_vector(self, b: NDArray[np.float64], rows: NDArray[np.float64] | None = None) -> None:
+    def assemble_vector(self, b: NDArray[np.float64], rows: NDArray[np.float64] | None = None, form=None) -> None:
         """Add the vector to `b` (ghosts not accumulated), with own coefficient rows if given."""
-        cpp.fem.assemble_vector(b, self.form, cpp.fem.pack_constants(self.form), self._coefficients(rows))
+        form = form or self.form
+        cpp.fem.assemble_vector(b, form, cpp.fem.pack_constants(form), self._coefficients(rows))
 
-    def assemble_matrix(self, A: PETSc.Mat, rows: NDArray[np.float64] | None = None) -> None:
+    def assemble_matrix(self, A: PETSc.Mat, rows: NDArray[np.float64] | None = None, form=None) -> None:
         """Add the matrix to `A` (not finalised), dofs unrolled, with own coefficient rows if given."""
-        constants = cpp.fem.pack_constants(self.form)
-        cpp.fem.petsc.assemble_matrix(A, self.form, constants, self._coefficients(rows), [], unrolled=True)
+        form = form or self.form
+        constants = cpp.fem.pack_constants(form)
+        cpp.fem.petsc.assemble_matrix(A, form, constants, self._coefficients(rows), [], unrolled=True)
 
     def _coefficients(self, rows) -> dict:
         if rows is None:

@@ -56,12 +56,14 @@ class NotConverged(RuntimeError):
 
 @dataclass
 class Report:
-    """What a converged step took: Newton and coupling iterations, relative residuals, fluid balance."""
+    """What a converged step took: Newton and coupling iterations, relative residuals, fluid balance, and mending."""
 
     newton: int = 0
     coupling: int = 0
     history: list[tuple[float, float]] = field(default_factory=list)
     balance: float = 0.0
+    rederived: int = 0
+    """Domains that had folded and were re-derived from F."""
 
 
 class SchurComplement:
@@ -110,7 +112,7 @@ class Coupler:
 
     def set_unknowns(self) -> None:
         """Make the solvers for the present matrices."""
-        self._solve_u = direct_solver(self.momentum.K, "momentum")
+        self._solve_u = direct_solver(self.momentum.K, "momentum", self.momentum.symmetric)
         self._du, self._rhs = self.momentum.unknowns.vector(), self.momentum.unknowns.vector()
         if self.storage is None:
             return

@@ -22,6 +22,7 @@ from mpm_dolfinx.grid import Grid, sum_by
 
 SNAP = 1e-10  # cells: vertices this close to a grid plane are taken to lie on it
 SLIVER = 1e-12  # of the domain: smaller pieces are dropped; less than a piece that is SNAP thin, whose face is open
+TANGLED = 0.2  # of its volume: a domain whose corners span less is re-derived from F
 
 
 @dataclass
@@ -48,6 +49,25 @@ def corner_bits(dim: int) -> NDArray[np.int64]:
 def kuhn_simplices(dim: int) -> NDArray[np.int64]:
     """Return the (d!, d+1) corners of the simplices that a domain is split into."""
     return np.array([[sum(1 << a for a in p[:k]) for k in range(dim + 1)] for p in permutations(range(dim))])
+
+
+def tangled(corners: NDArray[np.float64], volume: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which domains (n, 2^d, d) have folded: their corners span far less, or more, than their volume (n,)."""
+    simplices = corners[:, kuhn_simplices(corners.shape[2])]
+    spanned = np.linalg.det(simplices[:, :, 1:] - simplices[:, :, :1]) * _ORIENTATION[corners.shape[2]]
+    ratio = spanned.mean(axis=1) / volume
+    return (ratio < TANGLED) | (ratio > 1 / TANGLED)
+
+
+def parallelepipeds(
+    x: NDArray[np.float64], F: NDArray[np.float64], spacing: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the corners (n, 2^d, d), m, of boxes of size `spacing` (n, d) about x (n, d), deformed by F (n, d, d)."""
+    offset = (corner_bits(x.shape[1]) - 0.5) * spacing[:, None, :]
+    return x[:, None] + np.einsum("nab,nkb->nka", F, offset)
+
+
+_ORIENTATION = {d: np.sign(np.linalg.det(np.diff(corner_bits(d)[kuhn_simplices(d)], axis=1))) for d in (2, 3)}
 
 
 def cut(grid: Grid, corners: NDArray[np.float64]) -> Pieces:
@@ -118,8 +138,10 @@ def _sum(grid: Grid, y: NDArray[np.float64], s: NDArray[np.float64], owner: NDAr
     for a in range(d):
         for end in (0, 1):
             distance = np.abs(s[:, a] - (index[a] + end))
-            on = np.flatnonzero(((distance < SNAP).sum(axis=0) == d) & solid)  # a facet lies on the plane
-            area = d * volume[on] / distance[:, on].max(axis=0)
+            height = distance.max(axis=0)
+            near = distance < np.minimum(2 * SNAP, height / 2)  # of two domains that touch, rounding may snap one only
+            on = np.flatnonzero((near.sum(axis=0) == d) & solid)  # a facet lies on the plane
+            area = d * volume[on] / height[on]
             area = sum_by(slot[on], area, start[-1])[kept]
             faces[:, a, end] = area * grid.cell_volume / grid.h[a]
 
@@ -127,6 +149,58 @@ def _sum(grid: Grid, y: NDArray[np.float64], s: NDArray[np.float64], owner: NDAr
     centroid = np.clip(centroid, cell + SNAP, cell + 1 - SNAP)
     fraction = sums / sum_by(point, sums, n)[point]
     return Pieces(point, grid.number(cell), fraction, grid.lower + grid.h * centroid, faces)
+
+
+def cut_faces(
+    grid: Grid, corners: NDArray[np.float64], local: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Cut faces of domains by the grid; return points of integration, exact for what P1 makes of a face in a cell.
+
+    A force on a face that crosses a grid line belongs to the nodes on both sides by what lies there: with one
+    point a face, what is left over moves nodes of partly filled cells in every step, for ever.
+
+    Parameters
+    ----------
+    corners : (m, 2^(d-1), d), m
+        Corners of the faces.
+    local : (m, 2^(d-1), e)
+        Coordinates of the corners to be interpolated.
+
+    Returns
+    -------
+    Of each point: its face, its position (n, d), its local coordinates (n, e), its share of the face; and the
+    middle (n, d) of the part of the face in one cell that it belongs to.
+    """
+    d, m = grid.dim, len(corners)
+    y = (corners - grid.lower) / grid.h
+    nearest = np.rint(y)
+    y = np.where(np.abs(y - nearest) < SNAP, nearest, y)
+    both = np.concatenate([y, local], axis=2).transpose(1, 2, 0)
+    split = kuhn_simplices(d - 1)
+    s = np.concatenate([both[list(simplex)] for simplex in split], axis=2)
+    owner = np.arange(s.shape[2])
+    whole = s
+    for axis in range(d):
+        s, owner = _slice(s, owner, axis)
+    # the local coordinates tell sizes, for they are never degenerate
+    share = _size(s[:, d:]) / _size(whole[:, d:])[owner] / len(split)
+    points = np.einsum("qk,kam->qam", _RULES[d], s)
+    middle = np.tile((grid.lower + grid.h * s[:, :d].mean(axis=0).T), (len(points), 1))
+    points = points.transpose(0, 2, 1).reshape(-1, both.shape[1])
+    face = np.tile(owner % max(1, m), d)
+    return face, grid.lower + grid.h * points[:, :d], points[:, d:], np.tile(share / d, d), middle
+
+
+def _size(s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return lengths or areas, up to a factor, of segments or triangles (k+1, e, m)."""
+    e = s[1:] - s[0]
+    return np.sqrt(np.abs(np.linalg.det(np.einsum("iam,jam->mij", e, e))))
+
+
+_RULES = {  # barycentric points of equal weight, exact to second order on segments and triangles
+    2: 0.5 + np.array([[1, -1], [-1, 1]]) / np.sqrt(12),
+    3: (1 + 3 * np.eye(3)) / 6,
+}
 
 
 def _slice(s: NDArray[np.float64], owner: NDArray[np.int64], axis: int):
@@ -151,7 +225,7 @@ def _cut_at(s, owner, axis: int, plane):
     order = np.argsort(s[:, axis], axis=0)
     s = np.take_along_axis(s, order[:, None], axis=0)
     count = (s[:, axis] < plane).sum(axis=0)  # vertices below the plane
-    dim = s.shape[1]
+    dim = len(s) - 1
     parts = {"below": [s[:, :, :0]], "above": [s[:, :, :0]]}
     owners = {"below": [owner[:0]], "above": [owner[:0]]}
     for k in range(1, dim + 1):
@@ -188,6 +262,7 @@ def _prism(a, b):
 _A, _B, _C, _D = (0,), (1,), (2,), (3,)
 # vertices are sorted along the axis; (i, j) is the point where the edge from i to j meets the plane
 _CUTS = {
+    1: {1: {"below": [(_A, (0, 1))], "above": [((0, 1), _B)]}},
     2: {
         1: {"below": [(_A, (0, 1), (0, 2))], "above": [((0, 1), _B, _C), ((0, 1), _C, (0, 2))]},
         2: {"below": [(_A, _B, (1, 2)), (_A, (1, 2), (0, 2))], "above": [((0, 2), (1, 2), _C)]},

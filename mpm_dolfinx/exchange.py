@@ -7,10 +7,15 @@ integral is assembled by the rank that owns the cell.  On one process nothing is
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import TypeVar
+
 from mpi4py import MPI
 
 import numpy as np
 from numpy.typing import NDArray
+
+T = TypeVar("T")
 
 
 class Exchange:
@@ -55,3 +60,22 @@ class Exchange:
         kind = MPI._typedict[rows.dtype.char]
         self.comm.Alltoallv([rows, counts * width, kind], [out, received * width, kind])
         return out
+
+
+def to_root(comm: MPI.Intracomm, rows: int) -> Exchange:
+    """Return the exchange that takes this process's rows to rank 0."""
+    return Exchange(comm, np.zeros(rows, dtype=np.int32))
+
+
+def at_root(comm: MPI.Intracomm, action: Callable[[], T]) -> T:
+    """Return on every process what rank 0 gets from `action`; all raise what it raises."""
+    value = error = None
+    if comm.rank == 0:
+        try:
+            value = action()
+        except Exception as raised:
+            error = raised
+    value, error = comm.bcast((value, error))
+    if error is not None:
+        raise error
+    return value

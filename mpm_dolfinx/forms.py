@@ -15,6 +15,7 @@ No generated code is touched.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import factorial, prod
 
 from petsc4py import PETSc
@@ -25,7 +26,12 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from mpm_dolfinx import _compat
-from mpm_dolfinx.grid import Grid
+from mpm_dolfinx.grid import Grid, sum_by
+
+CHUNK = 2**14
+"""Points whose coefficients are packed at a time: no form holds a row for each point of a large body."""
+BATCH = 2**10
+"""Points whose element matrices are made at a time, in the processor's cache."""
 
 
 class PointMeasure(ufl.Measure):
@@ -62,9 +68,10 @@ class FormPoints:
             name: fem.Function(_compat.function_space(grid.mesh, "DG", 0, shape))
             for name, shape in {"offset": (grid.dim,), "weight": (), **fields}.items()
         }
+        self._live: dict[str, fem.Function] = {}
         self.dx = PointMeasure(grid, self._functions["weight"])
         self._size = {name: int(np.prod(shape, dtype=int)) for name, shape in fields.items()}
-        self.cells = np.empty(0, dtype=np.int32)
+        self.cells = self.filled = np.empty(0, dtype=np.int32)
         self.data: dict[str, NDArray[np.float64]] = {}
         self.version = 0
 
@@ -88,13 +95,25 @@ class FormPoints:
         data : (n, ...)
             Values of the fields.
         """
-        self.cells, self.x = cells, x
+        self.cells, self.x, self.filled = cells, x, np.unique(cells)
         self.data = {
             "offset": x - self.grid.midpoints[cells],
             "weight": (weight / self.grid.cell_volume)[:, None],
             **{name: value.reshape(len(cells), self._size[name]) for name, value in data.items()},
         }
         self.version += 1
+
+    def take(self, points: FormPoints, rows: NDArray[np.int64]) -> None:
+        """Be some rows of other points, which carry the fields of these."""
+        self.cells, self.x = points.cells[rows], points.x[rows]
+        self.filled = np.unique(self.cells)
+        self.data = {name: points.data[name][rows] for name in self._functions if name not in self._live}
+        self.version += 1
+
+    @property
+    def position(self):
+        """Position of the point as UFL, m."""
+        return ufl.SpatialCoordinate(self.grid.mesh) + self.offset
 
     def value(self, f):
         """Return f at the point, f a P1 function, test or trial function (any shape)."""
@@ -104,6 +123,37 @@ class FormPoints:
         """Return grad f at the point, f a P1 function, test or trial function (any shape)."""
         return self._taylor(ufl.grad(f), self.grid.dim - 1)
 
+    def gradient(self, u: fem.Function) -> fem.Function:
+        """Return grad u at the point, u a P1 vector function, as a coefficient that numpy computes for the kernels.
+
+        Derivatives by u do not see it.  In 3D, where the Taylor series has many terms, a kernel of Hencky's law
+        takes half or a quarter of the time, and its compilation a fifth.
+        """
+        if "gradient" in self._live:
+            return self._functions["gradient"]
+        shape = (self.grid.dim, self.grid.dim)
+        self._functions["gradient"] = fem.Function(_compat.function_space(self.grid.mesh, "DG", 0, shape))
+        self._live["gradient"] = u
+        return self._functions["gradient"]
+
+    def deformation(self, u: fem.Function):
+        """Return F = (I + grad u) F_n at the points, which carry F_n as F, as a UFL variable."""
+        gradient = self.grad(u) if self.grid.dim == 2 else self.gradient(u)
+        return ufl.variable((ufl.Identity(self.grid.dim) + gradient) * self.F)
+
+    def values(self, name: str, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return a field at the chosen points (m, size)."""
+        if name not in self._live:
+            return self.data[name][chosen]
+        cells = self.cells[chosen]
+        u = self._live[name].x.array.reshape(-1, self.grid.dim)
+        du = u[self.grid.cell_nodes[cells]].transpose(0, 2, 1) @ self.grid.shape_gradients(cells, self.x[chosen])
+        return du.reshape(len(cells), -1)
+
+    def changes(self, name: str) -> bool:
+        """Return whether a field changes while the points stay."""
+        return name in self._live
+
     def _taylor(self, f, order: int):
         total = derivative = f
         for k in range(1, order + 1):
@@ -112,6 +162,58 @@ class FormPoints:
                 term = ufl.dot(term, self.offset)
             total += term / factorial(k)
         return total
+
+
+class Rows:
+    """Coefficients of a compiled form, one row a point.
+
+    Parameters
+    ----------
+    compiled
+        The form.
+    points
+        The points; their data and the nodal values of grid functions are read at each call.
+    """
+
+    def __init__(self, compiled: _compat.CompiledForm, points: FormPoints):
+        self.points = points
+        names = {f: name for name, f in points._functions.items()}
+        self._columns, self._gathered, start = [], [], 0
+        for f in compiled.coefficients:
+            dofs, bs = _compat.cell_dofs(f.function_space), f.function_space.dofmap.bs
+            stop = start + dofs.shape[1] * bs
+            if f in names:
+                self._columns.append((slice(start, stop), names[f]))
+            else:
+                # as numpy's own index type, which it would else convert to in every assembly
+                unrolled = (dofs[:, :, None].astype(np.intp) * bs + np.arange(bs)).reshape(len(dofs), stop - start)
+                self._gathered.append((slice(start, stop), f, unrolled))
+            start = stop
+        self._room = np.zeros((0, start))
+        self._packed: tuple[int, slice | None] = (-1, None)
+
+    def room(self, size: int) -> NDArray[np.float64]:
+        """Return the memory of the rows, at least `size` of them; what is kept saves the page faults of every step."""
+        if size > len(self._room):
+            self._room = np.zeros((size, self._room.shape[1]))
+            self._packed = (-1, None)
+        return self._room
+
+    def __call__(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the rows of the chosen points, the first of the memory of all."""
+        cells = self.points.cells[chosen]
+        rows = self.room(len(cells))[: len(cells)]
+        now = (self.points.version, chosen if isinstance(chosen, slice) else None)
+        fresh = now[1] is None or now != self._packed
+        for columns, name in self._columns:
+            if fresh or self.points.changes(name):
+                rows[:, columns] = self.points.values(name, chosen)
+        if fresh:
+            self._dofs = [(c, f, dofs[cells]) for c, f, dofs in self._gathered]
+        self._packed = now
+        for columns, f, dofs in self._dofs:
+            rows[:, columns] = np.take(f.x.array, dofs, mode="wrap")  # "raise" checks every index
+        return rows
 
 
 class PointForm:
@@ -128,45 +230,26 @@ class PointForm:
     def __init__(self, form: ufl.Form, points: FormPoints):
         self.points = points
         self.compiled = _compat.CompiledForm(form)
-        self._version = -1
-        names = {f: name for name, f in points._functions.items()}
-        self._columns, self._gathered, start = [], [], 0
-        for f in self.compiled.coefficients:
-            dofs, bs = _compat.cell_dofs(f.function_space), f.function_space.dofmap.bs
-            stop = start + dofs.shape[1] * bs
-            if f in names:
-                self._columns.append((slice(start, stop), names[f]))
-            else:
-                unrolled = (dofs[:, :, None] * bs + np.arange(bs)).reshape(len(dofs), stop - start)
-                self._gathered.append((slice(start, stop), f, unrolled))
-            start = stop
-        self._width = start
+        self._rows, self._bound, self._version = Rows(self.compiled, points), [], -1
 
-    def rows(self) -> NDArray[np.float64]:
-        """Return the coefficients of the form, one row a point."""
-        cells = self.points.cells
+    def _parts(self):
+        """Yield the form bound to CHUNK points after the other, with their rows."""
         if self._version != self.points.version:
-            self._version = self.points.version
-            self.compiled.bind(cells)
-            self._packed = np.empty((len(cells), self._width))
-            for columns, name in self._columns:
-                self._packed[:, columns] = self.points.data[name]
-            self._dofs = [(c, f, dofs[cells]) for c, f, dofs in self._gathered]
-        for columns, f, dofs in self._dofs:
-            self._packed[:, columns] = f.x.array[dofs]
-        return self._packed
+            self._version, cells = self.points.version, self.points.cells
+            parts = [slice(start, start + CHUNK) for start in range(0, len(cells), CHUNK)]
+            self._bound = [(part, self.compiled.bind(cells[part])) for part in parts]
+        for part, form in self._bound:
+            yield form, self._rows(part)
 
     def assemble_vector(self, b: NDArray[np.float64]) -> None:
         """Add the vector to the local array `b`; contributions to ghosts stay there."""
-        rows = self.rows()
-        if len(rows):
-            self.compiled.assemble_vector(b, rows)
+        for form, rows in self._parts():
+            self.compiled.assemble_vector(b, rows, form)
 
     def assemble_matrix(self, A: PETSc.Mat) -> None:
         """Add the matrix to `A`, by unrolled local dofs; the caller finalises it."""
-        rows = self.rows()
-        if len(rows):
-            self.compiled.assemble_matrix(A, rows)
+        for form, rows in self._parts():
+            self.compiled.assemble_matrix(A, rows, form)
 
 
 class ElementMatrices:
@@ -179,60 +262,181 @@ class ElementMatrices:
     Parameters
     ----------
     tangent : UFL tensor (d, d, d, d)
-        A[i, k, j, l] at the points, with A[i, k, j, l] = A[j, l, i, k].
+        A[i, k, j, l] at the points.
+    points
+        The points.
+    symmetric
+        Whether A[i, k, j, l] = A[j, l, i, k]: half of the entries are then left out.
+    """
+
+    def __init__(self, tangent: ufl.core.expr.Expr, points: FormPoints, symmetric: bool = True):
+        self.points, dim = points, points.grid.dim
+        rows, columns, self._entry = _entries(2**dim * dim, symmetric)
+        gradients, entries = shape_gradients(points), []
+        for row, column in zip(rows, columns, strict=True):
+            (v, i), (u, j) = divmod(row, dim), divmod(column, dim)
+            block = ufl.as_matrix([[tangent[int(i), k, int(j), l] for l in range(dim)] for k in range(dim)])
+            entries.append(ufl.dot(gradients[v], ufl.dot(block, gradients[u])))
+        self._sums = CellSums(entries, points)
+
+    def assemble_matrix(self, A: PETSc.Mat) -> None:
+        """Add the matrix to `A`, by unrolled local dofs; the caller finalises it."""
+        insert(A, self.points, self._sums()[:, self._entry])
+
+
+def _entries(count: int, symmetric: bool) -> tuple[NDArray, NDArray, NDArray]:
+    """Return rows and columns of the entries of a matrix that are needed, and the place of every entry among them."""
+    rows, columns = np.triu_indices(count) if symmetric else np.divmod(np.arange(count**2), count)
+    place = np.empty((count, count), dtype=np.int64)
+    if symmetric:
+        place[columns, rows] = np.arange(len(rows))
+    place[rows, columns] = np.arange(len(rows))
+    return rows, columns, place
+
+
+class ElementForces:
+    """The linear form T : grad v of P1 vectors over points, summed in each cell: for 3D, see `FormPoints.gradient`.
+
+    Parameters
+    ----------
+    stress : UFL tensor (d, d)
+        T[i, k] at the points.
     points
         The points.
     """
 
-    def __init__(self, tangent: ufl.core.expr.Expr, points: FormPoints):
-        self.points, grid = points, points.grid
-        count = 2**grid.dim * grid.dim
-        rows, columns = np.triu_indices(count)
-        self._entry = np.empty((count, count), dtype=np.int64)  # symmetric: place of each entry in the vector
-        self._entry[rows, columns] = self._entry[columns, rows] = np.arange(len(rows))
-        space = _compat.function_space(grid.mesh, "DG", 0, (len(rows),))
-        self._values, q = fem.Function(space), ufl.TestFunction(space)
-        gradients = self._gradients()
-        integrand = 0
-        for n, (row, column) in enumerate(zip(rows, columns, strict=True)):
-            (v, i), (u, j) = divmod(row, grid.dim), divmod(column, grid.dim)
-            block = ufl.as_matrix([[tangent[int(i), k, int(j), l] for l in range(grid.dim)] for k in range(grid.dim)])
-            integrand += q[n] * ufl.dot(gradients[v], ufl.dot(block, gradients[u]))
-        self._form = PointForm(integrand * points.dx, points)
+    def __init__(self, stress: ufl.core.expr.Expr, points: FormPoints):
+        self.points, dim = points, points.grid.dim
+        forces = [ufl.dot(stress, gradient) for gradient in shape_gradients(points)]
+        self._sums = CellSums([force[i] for force in forces for i in range(dim)], points)
+
+    def assemble_vector(self, b: NDArray[np.float64]) -> None:
+        """Add the vector to the local array `b`; contributions to ghosts stay there."""
+        dofs = element_dofs(self.points.grid, self.points.filled)
+        b += sum_by(dofs.ravel(), self._sums().ravel(), len(b))
+
+
+class StackedElementMatrices:
+    """The bilinear form (grad v F) : A : (grad u F) of P1 vectors over points: kernels give A, BLAS contracts it.
+
+    For 3D, where cells hold many points: with the gradients g of the shape functions, times F, stacked over the
+    n points of a cell, its matrix is one product of an 8 x 3n with a 3n x 72 matrix.  Cells are taken in
+    batches of about as many points.
+
+    Parameters
+    ----------
+    tangent : UFL tensor (d, d, d, d)
+        A[i, k, j, l] at the points.
+    points
+        The points, with the field F (d, d).
+    symmetric
+        Whether A[i, k, j, l] = A[j, l, i, k]: half of the entries are then left out.
+    """
+
+    def __init__(self, tangent: ufl.core.expr.Expr, points: FormPoints, symmetric: bool = True):
+        self.points, self._d = points, points.grid.dim
+        d, (rows, columns, place) = self._d, _entries(self._d**2, symmetric)
+        self._entry = place.reshape(d, d, d, d).transpose(1, 0, 2, 3).ravel()  # (k, i, j, l)
+        pairs = [(*divmod(int(r), d), *divmod(int(c), d)) for r, c in zip(rows, columns, strict=True)]
+        self._tangent = PointExpression(ufl.as_vector([tangent[pair] for pair in pairs]), points)
         self._version = -1
 
-    def _gradients(self) -> list:
-        """Return the gradients of the shape functions at the point as UFL."""
-        grid, xi = self.points.grid, self.points.offset
-        h = fem.Constant(grid.mesh, grid.h)
-        out = []
-        for signs in grid.signs.tolist():
-            t = [0.5 + signs[a] * xi[a] / h[a] for a in range(grid.dim)]
-            slopes = [signs[a] / h[a] * prod(t[b] for b in range(grid.dim) if b != a) for a in range(grid.dim)]
-            out.append(ufl.as_vector(slopes))
-        return out
+    def _sort(self) -> None:
+        """Find batches of filled cells that hold about as many points, and their points (cells, most points)."""
+        cells, filled = self.points.cells, self.points.filled
+        order = np.argsort(cells, kind="stable")
+        start = np.searchsorted(cells[order], filled)
+        count = np.diff(start, append=len(cells))
+        self._batches, by_count = [], np.argsort(count, kind="stable")
+        while len(by_count):
+            size = max(1, BATCH // count[by_count[0]])
+            size = max(1, BATCH // count[by_count[min(size, len(by_count)) - 1]])
+            batch, by_count = by_count[:size], by_count[size:]
+            turn = np.arange(count[batch].max())
+            missing = turn >= count[batch, None]
+            points = order[np.where(missing, start[batch, None], start[batch, None] + turn)]
+            self._batches.append((filled[batch], points, missing))
 
     def assemble_matrix(self, A: PETSc.Mat) -> None:
         """Add the matrix to `A`, by unrolled local dofs; the caller finalises it."""
         if self._version != self.points.version:
             self._version = self.points.version
-            self._cells = np.unique(self.points.cells)
-            dofs = self.points.grid.cell_nodes[self._cells][:, :, None] * self.points.grid.dim
-            dofs = dofs + np.arange(self.points.grid.dim)
-            self._dofs = dofs.reshape(len(self._cells), len(self._entry)).astype(PETSc.IntType)
-        if not len(self._cells):
-            return
-        values = self._values.x.array.reshape(len(self._values.x.array) // (self._entry.max() + 1), -1)
-        values[self._cells] = 0.0
+            self._sort()
+        for cells, points, missing in self._batches:
+            insert(A, self.points, self._matrices(points.ravel(), missing), cells)
+
+    def _matrices(self, chosen: NDArray[np.int64], missing: NDArray[np.bool_]) -> NDArray[np.float64]:
+        """Return the element matrices (cells, n, n) of a batch."""
+        points, d, (cells, most) = self.points, self._d, missing.shape
+        g = points.grid.shape_gradients(points.cells[chosen], points.x[chosen])
+        g = g @ points.values("F", chosen).reshape(-1, d, d)
+        nodes = g.shape[1]
+        tangent = self._tangent.evaluate(chosen)[:, self._entry].reshape(-1, d**3, d)
+        right = (tangent @ g.transpose(0, 2, 1)).reshape(cells, most * d, d * d * nodes)
+        weight = points.data["weight"][chosen, 0] * points.grid.cell_volume
+        g *= np.where(missing.ravel(), 0.0, weight)[:, None, None]
+        left = g.reshape(cells, most, nodes, d).transpose(0, 2, 1, 3).reshape(cells, nodes, most * d)
+        matrices = (left @ right).reshape(cells, nodes, d, d, nodes)
+        return matrices.transpose(0, 1, 2, 4, 3).reshape(cells, nodes * d, nodes * d)
+
+
+def shape_gradients(points: FormPoints) -> list:
+    """Return the gradients of the cell's P1 shape functions at the point as UFL."""
+    grid, xi = points.grid, points.offset
+    h = fem.Constant(grid.mesh, grid.h)
+    out = []
+    for signs in grid.signs.tolist():
+        t = [0.5 + signs[a] * xi[a] / h[a] for a in range(grid.dim)]
+        slopes = [signs[a] / h[a] * prod(t[b] for b in range(grid.dim) if b != a) for a in range(grid.dim)]
+        out.append(ufl.as_vector(slopes))
+    return out
+
+
+def insert(A: PETSc.Mat, points: FormPoints, matrices: NDArray[np.float64], cells=None) -> None:
+    """Add the element matrices of P1 vectors (cells, n, n) in cells, by default all filled ones, of `points` to `A`."""
+    grid, cells = points.grid, points.filled if cells is None else cells
+    if len(cells):
+        dofs = element_dofs(grid, cells).astype(PETSc.IntType)
+        A.setValuesLocalRCV(dofs, dofs, matrices, addv=True)
+
+
+def element_dofs(grid: Grid, cells: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Return the unrolled local dofs (cells, n) of P1 vectors in cells."""
+    dofs = grid.cell_nodes[cells][:, :, None] * grid.dim + np.arange(grid.dim, dtype=grid.cell_nodes.dtype)
+    return dofs.reshape(len(cells), -1)
+
+
+class CellSums:
+    """Sums over the points of each cell: DG0 tests them, so that the assembler adds them up.
+
+    Parameters
+    ----------
+    quantities
+        Scalar UFL expressions at the points.
+    points
+        The points.
+    """
+
+    def __init__(self, quantities: Sequence[ufl.core.expr.Expr], points: FormPoints):
+        self.points, self._count = points, len(quantities)
+        space = _compat.function_space(points.grid.mesh, "DG", 0, (self._count,))
+        self._values, q = fem.Function(space), ufl.TestFunction(space)
+        self._form = PointForm(ufl.inner(ufl.as_vector(quantities), q) * points.dx, points)
+
+    def __call__(self) -> NDArray[np.float64]:
+        """Return the sums (cells, quantities) in the filled cells of the points."""
+        cells = self.points.filled
+        values = self._values.x.array.reshape(-1, self._count)
+        values[cells] = 0.0
         self._form.assemble_vector(self._values.x.array)
-        A.setValuesLocalRCV(self._dofs, self._dofs, values[self._cells][:, self._entry], addv=True)
+        return values[cells]
 
 
 class PointExpression:
     """A UFL expression of the fields that points carry, evaluated at every point.
 
-    Tested with DG0 the assembler sums the points of a cell, so it is called once for the first
-    points of all cells, once for the second ones, and so on.
+    The kernel sees of its cell the size only, which all have in common.  So it is called for as many
+    different cells, whichever, and DG0, which tests the expression, keeps a value for each point.
 
     Parameters
     ----------
@@ -244,25 +448,23 @@ class PointExpression:
 
     def __init__(self, expression: ufl.core.expr.Expr, points: FormPoints):
         self.points, self._shape = points, expression.ufl_shape
-        space = _compat.function_space(points.grid.mesh, "DG", 0, self._shape)
-        self._sum = fem.Function(space)
-        q = ufl.TestFunction(space)
-        self._form = PointForm(ufl.inner(expression, q) * points.dx, points)
+        grid = points.grid
+        q = ufl.TestFunction(_compat.function_space(grid.mesh, "DG", 0, self._shape))
+        dx = ufl.dx(domain=grid.mesh, subdomain_id=_compat.SUBDOMAIN, metadata={"quadrature_degree": 0})
+        self._compiled = _compat.CompiledForm(ufl.inner(expression, q) / grid.cell_volume * dx)
+        self._rows = Rows(self._compiled, points)
+        self._many = min(BATCH, grid.num_owned)
+        self._compiled.bind(np.arange(self._many))
+        self._values = np.empty((self._many, int(np.prod(self._shape, dtype=int))))
 
-    def evaluate(self) -> NDArray[np.float64]:
-        """Return the values (n, *shape) at the points where they are now."""
-        rows, cells, form = self._form.rows(), self.points.cells, self._form.compiled
-        values = np.empty((len(cells), int(np.prod(self._shape, dtype=int))))
-        order = np.argsort(cells, kind="stable")
-        first = np.searchsorted(cells[order], cells[order])
-        turn = np.empty(len(cells), dtype=np.int64)
-        turn[order] = np.arange(len(cells)) - first
-        total = self._sum.x.array.reshape(-1, values.shape[1])
-        for k in range(turn.max(initial=-1) + 1):
-            chosen = np.flatnonzero(turn == k)
-            total[:] = 0.0
-            form.bind(cells[chosen])
-            form.assemble_vector(self._sum.x.array, np.ascontiguousarray(rows[chosen]))
-            values[chosen] = total[cells[chosen]]
-        volume = self.points.data["weight"] * self.points.grid.cell_volume
-        return (values / volume).reshape(len(cells), *self._shape)
+    def evaluate(self, chosen: NDArray[np.int64] | None = None) -> NDArray[np.float64]:
+        """Return the values (m, *shape) at the chosen points, by default at all, where they are now."""
+        chosen = np.arange(len(self.points.cells)) if chosen is None else chosen
+        out = np.empty((len(chosen), self._values.shape[1]))
+        for start in range(0, len(chosen), max(1, self._many)):
+            part = chosen[start : start + self._many]
+            self._rows(part)
+            self._values[:] = 0.0
+            self._compiled.assemble_vector(self._values.reshape(-1), self._rows.room(self._many)[: self._many])
+            out[start : start + len(part)] = self._values[: len(part)]
+        return out.reshape(len(chosen), *self._shape)

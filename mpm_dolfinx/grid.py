@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import reduce
 
 from mpi4py import MPI
 
@@ -138,13 +139,28 @@ class Grid:
         self, cells: NDArray[np.int32], x: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the P1 shape functions (n, 2^d) of local cells at points and their gradients (n, 2^d, d), 1/m."""
-        y = (x - self.midpoints[cells]) / self.h
-        t = [0.5 + y[:, a : a + 1] * self.signs[:, a] for a in range(self.dim)]
-        N, dN = np.prod(t, axis=0), np.empty((len(x), 2**self.dim, self.dim))
+        t = self._hats(cells, x)
+        return reduce(np.multiply, t), self._slopes(t)
+
+    def shape_gradients(self, cells: NDArray[np.int32], x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the gradients (n, 2^d, d), 1/m, of the P1 shape functions of local cells at points."""
+        return self._slopes(self._hats(cells, x))
+
+    def _slopes(self, hats: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+        dN = np.empty((*hats[0].shape, self.dim))
         for a in range(self.dim):
-            others = [t[b] for b in range(self.dim) if b != a]
-            np.multiply(np.prod(others, axis=0), self.signs[:, a] / self.h[a], out=dN[:, :, a])
-        return N, dN
+            others = reduce(np.multiply, [hats[b] for b in range(self.dim) if b != a])
+            np.multiply(others, self.signs[:, a] / self.h[a], out=dN[:, :, a])
+        return dN
+
+    def shape_values(self, cells: NDArray[np.int32], x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the P1 shape functions (n, 2^d) of local cells at points."""
+        return reduce(np.multiply, self._hats(cells, x))
+
+    def _hats(self, cells: NDArray[np.int32], x: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+        """Return the linear factors (n, 2^d) of the shape functions, one an axis."""
+        y = (x - self.midpoints[cells]) / self.h
+        return [0.5 + y[:, a, None] * self.signs[:, a] for a in range(self.dim)]
 
     def interior_facets(self, active: NDArray[np.bool_], cells: NDArray[np.int32]) -> NDArray[np.int32]:
         """Return the facets of this process between two active cells (`cells` = where `active` holds)."""

@@ -7,10 +7,13 @@ the residual is the derivative of
     int psi(F) / J_n - alpha p det(Delta) dV_n  -  loads,
 
 that is int (P' - alpha p J_Delta Delta^-T) : grad v dV_n = int rho g . v dV_n + tractions, P' the
-first Piola-Kirchhoff effective stress relative to the start of the step.  The derivatives are UFL's.
+first Piola-Kirchhoff effective stress relative to the start of the step; a law may also give the stress
+itself.  The derivatives are UFL's.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable, Sequence
 
 from petsc4py import PETSc
 
@@ -20,8 +23,11 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from mpm_dolfinx import _compat
-from mpm_dolfinx.forms import ElementMatrices, FormPoints, PointForm
+from mpm_dolfinx.dilatation import MeanDilatation
+from mpm_dolfinx.extend import call
+from mpm_dolfinx.forms import ElementForces, ElementMatrices, FormPoints, PointForm, StackedElementMatrices
 from mpm_dolfinx.grid import Grid
+from mpm_dolfinx.materials import Skeleton
 from mpm_dolfinx.unknowns import Unknowns, matrix, sum_ghosts, zero
 
 GHOST = 1e-2
@@ -38,9 +44,10 @@ class Momentum:
     grid
         Background grid.
     pieces
-        Points of integration with the fields F (d, d), the law's parameters and, with fluid, biot.
-    law
-        Class of the skeleton's law.
+        All points of integration.
+    laws
+        Classes of the skeletons' laws, each with the pieces that follow it; they carry F, what the law takes
+        and, with fluid, biot.
     fixed : (nodes, d)
         Which components of the displacement are zero at which nodes of the grid.
     pressure
@@ -51,18 +58,24 @@ class Momentum:
         Whether the scene has rigid plates: points `plates` with their rigidity, normal and present tilt.
     held
         Whether sides of bodies have given displacements: points `holds` with stiffness, direction and gap.
+    mean_dilatation
+        Whether the laws see one volume change per cell, see `dilatation`.
+    symmetric
+        Whether the tangents of all laws are symmetric.
     """
 
     def __init__(
         self,
         grid: Grid,
         pieces: FormPoints,
-        law,
+        laws: Sequence[tuple[type[Skeleton], FormPoints]],
         fixed: NDArray[np.bool_],
         pressure: fem.Function | None = None,
         gravity: fem.Constant | None = None,
         plates: bool = False,
         held: bool = False,
+        mean_dilatation: bool = False,
+        symmetric: bool = True,
     ):
         self.grid, self.pieces = grid, pieces
         V = _compat.function_space(grid.mesh, "Lagrange", 1, (grid.dim,))
@@ -70,21 +83,12 @@ class Momentum:
         self.free = ~fixed
         v, du = ufl.TestFunction(V), ufl.TrialFunction(V)
 
-        F = ufl.variable((ufl.Identity(grid.dim) + pieces.grad(self.u)) * pieces.F)
-        energy = law.energy(F, **{name: getattr(pieces, name) for name in law.parameters})
-        if pressure is not None:
-            energy -= pieces.biot * pressure * ufl.det(F)
-        # differentiated by F and contracted: in 3D a twentieth of the compile time of derivatives by u
-        P = ufl.diff(energy / ufl.det(pieces.F), F)
-        A = ufl.diff(P, F)
-        i, j, k, l, m, n = ufl.indices(6)
-        self._residual = PointForm(ufl.inner(P, pieces.grad(v) * pieces.F) * pieces.dx, pieces)
-        if grid.dim == 2:
-            A = ufl.as_tensor(A[i, m, j, n] * pieces.F[k, m] * pieces.F[l, n], (i, k, j, l))
-            self._tangent = ElementMatrices(A, pieces)
-        else:  # 300 entries a cell of the whole grid: memory and compile time do not pay
-            dF_v, dF_u = pieces.grad(v) * pieces.F, pieces.grad(du) * pieces.F
-            self._tangent = PointForm(dF_v[i, j] * A[i, j, k, l] * dF_u[k, l] * pieces.dx, pieces)
+        self.symmetric, self.holding = symmetric, False
+        self.dilatation = MeanDilatation(pieces, self.u, symmetric) if mean_dilatation else None
+        self._residuals, self._tangents = [], []
+        self._terms: list[PointForm] = []
+        for law, points in laws:
+            self._add_law(law, points, v, pressure)
 
         self.loads = FormPoints(grid, force=(grid.dim,))
         self._traction = PointForm(ufl.inner(self.loads.force, self.loads.value(v)) * self.loads.dx, self.loads)
@@ -103,6 +107,44 @@ class Momentum:
             self._hold = PointForm(h.stiffness * ufl.dot(h.value(du), h.direction) * along * h.dx, h)
             self._pull = PointForm(h.stiffness * h.gap * along * h.dx, h)
         self._ghost(V, v, du)
+
+    def _add_law(self, law: type[Skeleton], points: FormPoints, v, pressure: fem.Function | None) -> None:
+        """Compile residual and tangent of the pieces that follow a law."""
+        grid = self.grid
+        F = points.deformation(self.u)
+        values = {name: getattr(points, name) for name in (*law.parameters, *law.state)}
+        if self.dilatation is not None:
+            P = self.dilatation.add(law, points, F, values)
+        else:
+            P = law.first_piola(F, values)
+        if pressure is not None:
+            P -= points.biot * pressure * ufl.diff(ufl.det(F), F)
+        # differentiated by F and contracted: in 3D a twentieth of the compile time of derivatives by u
+        P /= ufl.det(points.F)
+        A = ufl.diff(P, F)
+        i, j, k, l, m, n = ufl.indices(6)
+        if grid.dim == 2:
+            self._residuals.append(PointForm(ufl.inner(P, points.grad(v) * points.F) * points.dx, points))
+            A = ufl.as_tensor(A[i, m, j, n] * points.F[k, m] * points.F[l, n], (i, k, j, l))
+            self._tangents.append(ElementMatrices(A, points, self.symmetric))
+        else:
+            self._residuals.append(ElementForces(P * points.F.T, points))
+            self._tangents.append(StackedElementMatrices(A, points, self.symmetric))
+
+    def add(self, term: Callable, t: fem.Constant) -> None:
+        """Add a term of the user's: see `extend`."""
+        V = self.u.function_space
+        v, du = ufl.TestFunction(V), ufl.TrialFunction(V)
+        form = call(term, points=self.pieces, u=self.u, v=v, t=t)
+        potential = not form.arguments()
+        if potential:
+            form = ufl.derivative(form, self.u, v)
+        self._terms.append(PointForm(form, self.pieces))
+        self._own = fem.Function(V)
+        if self.u in form.coefficients():
+            self._tangents.append(PointForm(ufl.derivative(form, self.u, du), self.pieces))
+            self.holding = True
+            self.symmetric = self.symmetric and potential
 
     def _slope(self, w):
         """Return the tangential gradient of the normal displacement, grad_t(w_n), at the plates."""
@@ -207,15 +249,24 @@ class Momentum:
     def start(self) -> None:
         """Begin a step: no displacement."""
         self.u.x.array[:] = 0.0
+        if self.dilatation is not None:
+            self.dilatation.start()
 
     def assemble_residual(self) -> tuple[PETSc.Vec, float]:
-        """Return the out-of-balance nodal forces at u and their scale, the larger of internal and external (N)."""
+        """Return the out-of-balance nodal forces at u and their scale, the largest of internal, external, terms (N)."""
+        if self.dilatation is not None:
+            self.dilatation.update()
         b = self._b.x.array
         b[:] = 0.0
-        self._residual.assemble_vector(b)
+        for residual in self._residuals:
+            residual.assemble_vector(b)
         sum_ghosts(self._b)
         owned = self._owned()
         squares = [b[owned] @ b[owned], self._external[owned] @ self._external[owned]]
+        if self._terms:
+            own = self._assemble_terms()[owned]
+            squares.append(own @ own)
+            b[owned] += own
         if self.grid.comm.size > 1:
             squares = self.grid.comm.allreduce(np.array(squares))
         b[owned] -= self._external[owned]
@@ -226,13 +277,23 @@ class Momentum:
         self.penalty.multAdd(du, r, r)
         return r, float(np.sqrt(max(squares)))
 
+    def _assemble_terms(self) -> NDArray[np.float64]:
+        """Return the nodal forces of the user's terms at u."""
+        self._own.x.array[:] = 0.0
+        for term in self._terms:
+            term.assemble_vector(self._own.x.array)
+        return sum_ghosts(self._own)
+
     def _owned(self) -> slice:
         return slice(0, self.u.function_space.dofmap.index_map.size_local * self.grid.dim)
 
     def assemble_tangent(self) -> PETSc.Mat:
         """Return the tangent at u."""
         zero(self.K)
-        self._tangent.assemble_matrix(self.K)
+        for tangent in self._tangents:
+            tangent.assemble_matrix(self.K)
+        if self.dilatation is not None:
+            self.dilatation.assemble_matrix(self.K)
         self.K.assemble()
         # the first sum gives K the pattern of both
         pattern = PETSc.Mat.Structure

@@ -3,13 +3,32 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
-from mpm_dolfinx.domains import Pieces, cut
+from mpm_dolfinx.domains import Pieces, cut, cut_faces
 from mpm_dolfinx.exchange import Exchange
 from mpm_dolfinx.grid import Grid, sum_by
-from mpm_dolfinx.points import SURFACE, MaterialPoints, Surface, interpolate
+from mpm_dolfinx.points import MaterialPoints, Surface, face_vectors, interpolate
+
+DEPTH = 1e-6  # cells: how far under the surface the cell is looked up
+
+
+@dataclass
+class Patches:
+    """Points of integration on faces of the domains; arrays over n points.
+
+    cell : (n,) lexicographic cell; x : (n, d) position, m; X : (n, d) reference position, m; area0 : (n,)
+    reference area, m^(d-1); area : (n, d) outward area vector, m^(d-1).
+    """
+
+    cell: NDArray[np.int64]
+    x: NDArray[np.float64]
+    X: NDArray[np.float64]
+    area0: NDArray[np.float64]
+    area: NDArray[np.float64]
 
 
 class LeftGrid(RuntimeError):
@@ -69,17 +88,24 @@ class Placement:
         """Return the volume means (n,) over the pieces of each point of values (m,) on the pieces."""
         return sum_by(self.pieces.point, self.pieces.fraction * values, len(self.points))
 
-    def surface(self, faces: Surface):
-        """Return (faces of this process, their points, cells, positions on the surface).
+    def surface(self, faces: Surface) -> Patches:
+        """Return points of integration on the faces that this process's points have.
 
         The cell is that of a place just under the surface, which holds a piece of the domain: its
         shape functions, continued to the surface, put the load on nodes that have stiffness.
         """
         here, at = self.points.find(faces.id)
-        corners, xi = self.points.corners[at], faces.xi[here].copy()
-        xi[:, faces.axis] *= SURFACE
-        cell = self._filled_cell(at, interpolate(corners, xi))
-        return here, at, cell, interpolate(corners, faces.xi[here])
+        corners, xi = self.points.corners[at], faces.corners()[here]
+        count = xi.shape[1]
+        places = interpolate(np.repeat(corners, count, axis=0), xi.reshape(-1, self.grid.dim)).reshape(xi.shape)
+        face, x, xi, share, middle = cut_faces(self.grid, places, xi)
+        outward = face_vectors(corners, faces.axis, faces.end)
+        size = np.linalg.norm(outward, axis=1, keepdims=True)
+        inward = -DEPTH * self.grid.h.min() * np.divide(outward, size, out=np.zeros_like(outward), where=size > 0)
+        cell = self._filled_cell(at[face], middle + inward[face])
+        area0, whole = share * faces.area0[here][face], faces.whole0[here][face]
+        X = faces.reference(here[face], xi)
+        return Patches(cell, x, X, area0, outward[face] * (area0 / whole)[:, None])
 
     def displacement(
         self, u: NDArray[np.float64], at: NDArray[np.int64], x: NDArray[np.float64]
@@ -88,7 +114,7 @@ class Placement:
         grid, cell = self.grid, self._filled_cell(at, x)
         travel = Exchange(grid.comm, grid.owner(cell))
         cells, x = grid.local(travel.send(cell)), travel.send(x)
-        N, _ = grid.shape_functions(cells, x)
+        N = grid.shape_values(cells, x)
         return travel.back(np.einsum("mk,mkd->md", N, u[grid.cell_nodes[cells]]))
 
     def _filled_cell(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -8,12 +8,11 @@ from dataclasses import dataclass, field, fields
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
 
 from mpm_dolfinx.domains import corner_bits
 from mpm_dolfinx.exchange import Exchange
 from mpm_dolfinx.grid import Grid, side
-
-SURFACE = 0.98  # a place this share of the way from a point to the surface lies in a filled cell
 
 
 @dataclass
@@ -194,15 +193,14 @@ def material_points(grid: Grid, bodies: Sequence[Body], pressure: float = 0.0) -
 class Surface:
     """Faces of domains on one side of the bodies, the same on every process; arrays over m faces.
 
-    id : (m,) number of the point; xi : (m, d) centre of the face in the domain, from -1 to 1; x0 : (m, d)
-    its reference position, m; area0, whole0 : (m,) reference area of the part that counts and of the whole
-    face, m^(d-1); axis, end : side of the domain.
+    id : (m,) number of the point; xi : (m, 2, d) ends of the part of the face that counts, in the domain's
+    coordinates from -1 to 1; X : (m, 2, d) their reference positions, m; whole0 : (m,) reference area of the
+    whole face, m^(d-1); axis, end : side of the domain.
     """
 
     id: NDArray[np.int64]
     xi: NDArray[np.float64]
-    x0: NDArray[np.float64]
-    area0: NDArray[np.float64]
+    X: NDArray[np.float64]
     whole0: NDArray[np.float64]
     axis: int
     end: int
@@ -210,12 +208,29 @@ class Surface:
     def __len__(self) -> int:
         return len(self.id)
 
+    @property
+    def area0(self) -> NDArray[np.float64]:
+        """Reference area (m,) of the parts that count, m^(d-1)."""
+        return np.delete(self.X[:, 1] - self.X[:, 0], self.axis, axis=1).prod(axis=1)
+
+    def corners(self) -> NDArray[np.float64]:
+        """Return the corners (m, 2^(d-1), d) of the parts in the domain's coordinates."""
+        dim = self.xi.shape[2]
+        bits = np.insert(corner_bits(dim - 1), self.axis, 0, axis=1)
+        return self.xi[:, bits, np.arange(dim)]
+
+    def reference(self, face: NDArray[np.int64], xi: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the reference positions (n, d), m, of places xi (n, d) on faces."""
+        (a, b), (A, B) = self.xi[face].swapaxes(0, 1), self.X[face].swapaxes(0, 1)
+        t = np.divide(xi - a, b - a, out=np.zeros_like(xi), where=b > a)
+        return A + t * (B - A)
+
 
 Region = tuple[ArrayLike, ArrayLike]
 
 
 def surface(bodies: Sequence[Body], name: str, region: Region | None = None) -> Surface:
-    """Return the faces on a named side of the bodies.
+    """Return the faces on a named side of the bodies, where no other body touches them.
 
     Parameters
     ----------
@@ -226,31 +241,36 @@ def surface(bodies: Sequence[Body], name: str, region: Region | None = None) -> 
     """
     dim = bodies[0].lower.shape[1]
     axis, end = side(name, dim)
-    start, ids, xis, x0s, areas, wholes = 0, [], [], [], [], []
+    tangential = np.arange(dim) != axis
+    limits = [np.full(dim, -np.inf), np.full(dim, np.inf)] if region is None else np.asarray(region, dtype=float)
+    start, ids, xis, Xs, wholes = 0, [], [], [], []
     for body in bodies:
         chosen = np.flatnonzero(body.sides[:, axis, end])
-        low = np.broadcast_to(body.lower[chosen], (len(chosen), dim))
-        high = low + body.spacing
-        inner_low, inner_high = low, high
-        if region is not None:
-            inner_low = np.maximum(low, np.asarray(region[0], dtype=float))
-            inner_high = np.minimum(high, np.asarray(region[1], dtype=float))
-        tangential = np.arange(dim) != axis
-        plane = (high if end else low)[:, axis]
-        on = (inner_high > inner_low)[:, tangential].all(axis=1)
-        if region is not None:
-            on &= (plane >= np.asarray(region[0])[axis] - 1e-12) & (plane <= np.asarray(region[1])[axis] + 1e-12)
-        xi = (inner_low + inner_high - low - high) / body.spacing
-        xi[:, axis] = 2 * end - 1
-        x0 = (inner_low + inner_high) / 2
-        x0[:, axis] = plane
+        box = np.stack([body.lower[chosen], body.lower[chosen] + body.spacing], axis=1)
+        face = box.copy()
+        face[:, :, axis] = box[:, end, None, axis]
+        part = np.stack([np.maximum(face[:, 0], limits[0]), np.minimum(face[:, 1], limits[1])], axis=1)
+        on = (part[:, 1] > part[:, 0])[:, tangential].all(axis=1)
+        on &= ~_touched(face.mean(axis=1), axis, end, [other for other in bodies if other is not body])
+        on &= (face[:, 0, axis] >= limits[0][axis] - 1e-12) & (face[:, 0, axis] <= limits[1][axis] + 1e-12)
+        part[:, :, axis] = face[:, :, axis]
         ids.append(start + chosen[on])
-        xis.append(xi[on])
-        x0s.append(x0[on])
-        areas.append((inner_high - inner_low)[on][:, tangential].prod(axis=1))
-        wholes.append((high - low)[on][:, tangential].prod(axis=1))
+        xis.append((2 * part - box.sum(axis=1, keepdims=True))[on] / body.spacing)
+        Xs.append(part[on])
+        wholes.append((face[:, 1] - face[:, 0])[on][:, tangential].prod(axis=1))
         start += len(body)
-    return Surface(*map(np.concatenate, (ids, xis, x0s, areas, wholes)), axis, end)
+    return Surface(*map(np.concatenate, (ids, xis, Xs, wholes)), axis, end)
+
+
+def _touched(centre: NDArray[np.float64], axis: int, end: int, others: Sequence[Body]) -> NDArray[np.bool_]:
+    """Return which faces, given by their centres (m, d) in the reference configuration, lie on one of other bodies."""
+    out = np.zeros(len(centre), dtype=bool)
+    for body in others:
+        just_outside = centre / body.spacing
+        just_outside[:, axis] += 1e-6 * (2 * end - 1)
+        distance, _ = cKDTree(body.centre / body.spacing).query(just_outside, p=np.inf, distance_upper_bound=0.5)
+        out |= distance < 0.5
+    return out
 
 
 def interpolate(corners: NDArray[np.float64], xi: NDArray[np.float64]) -> NDArray[np.float64]:

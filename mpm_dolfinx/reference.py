@@ -163,8 +163,8 @@ class BiotFEM:
         F, F_n = (ufl.variable(ufl.Identity(self.grid.dim) + ufl.grad(f)) for f in (u, u_n))
         J, J_n, alpha = ufl.det(F), ufl.det(F_n), self._constant(law.biot)
         parameters = {name: self._constant(getattr(law, name)) for name in law.parameters}
-        energy = law.energy(F, **parameters) / self._constant(self.scale) - alpha * p * J
-        residual = ufl.inner(ufl.diff(energy, F), ufl.grad(v)) * dx
+        P = law.first_piola(F, parameters) / self._constant(self.scale) - alpha * p * ufl.diff(J, F)
+        residual = ufl.inner(P, ufl.grad(v)) * dx
         if self.fluid:
             # S is linear in the porosity, and its constants stay finite where a bulk modulus is infinite
             S_0, S_1 = (self.scale * law.storage(self.fluid.bulk, n) for n in (0.0, 1.0))

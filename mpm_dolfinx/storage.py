@@ -19,6 +19,8 @@ and Borja 2021).
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from petsc4py import PETSc
 
 import numpy as np
@@ -27,6 +29,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from mpm_dolfinx import _compat
+from mpm_dolfinx.extend import call
 from mpm_dolfinx.forms import FormPoints, PointForm
 from mpm_dolfinx.grid import Grid, sum_by
 from mpm_dolfinx.unknowns import Unknowns, matrix, sum_ghosts, zero
@@ -81,9 +84,27 @@ class Storage:
         self._momentum_coupling = (
             self._coupling if symmetric else PointForm(ufl.derivative(strain, displacement, du), pieces)
         )
-        self.symmetric = symmetric
+        self.symmetric, self._pieces = symmetric, pieces
+        self._sources: list[tuple[PointForm, PointForm | None]] = []
         self._slot = np.empty(grid.num_local, dtype=np.int64)  # of active owned cells: place in the vectors
         self._fluxes(Q, q, dp, weight)
+
+    def add(self, source: Callable, t: fem.Constant) -> None:
+        """Add a source of the user's: see `extend`."""
+        Q, points = self.p.function_space, self._pieces
+        one, self._gain = fem.Function(Q), fem.Function(Q)
+        one.x.array[:] = 1.0
+        form = call(source, points=points, q=ufl.TestFunction(Q), p=self.p, t=t)
+        slope = PointForm(ufl.derivative(form, self.p, one), points) if self.p in form.coefficients() else None
+        self._sources.append((PointForm(form, points), slope))
+
+    def _assemble_sources(self, slope: bool = False) -> NDArray[np.float64]:
+        """Return the rate of the sources in each active cell at p (m^d/s), or its derivative by the cell's p."""
+        self._gain.x.array[:] = 0.0
+        for forms in self._sources:
+            if forms[slope] is not None:
+                forms[slope].assemble_vector(self._gain.x.array)
+        return self._gain.x.array[self.unknowns.owned]
 
     def _fluxes(self, Q, q, dp, weight) -> None:
         """Two-point fluxes over the inner faces of the active cells."""
@@ -265,11 +286,16 @@ class Storage:
         r.axpy(dt, flux)
         if self.damped:
             self.D.multAdd(p - self._p_start, r, r)
-        scale = comm.allreduce(float(np.abs(change).sum()))
-        return r, scale
+        exchanged = float(np.abs(change).sum())
+        if self._sources:
+            gain = dt * self._assemble_sources()
+            r.array_w[:] -= gain
+            self._change_total -= gain.sum()
+            exchanged += np.abs(gain).sum()
+        return r, comm.allreduce(exchanged)
 
     def balance(self, dt: float) -> float:
-        """Return the change of the fluid's volume plus what crossed the boundary (m^d), at the last residual."""
+        """Return the change of the fluid's volume, plus what left, less sources (m^d), at the last residual."""
         p = self.p.x.array[self.unknowns.owned]
         out = (self._conductance * p - self._inflow).sum()
         return float(self.grid.comm.allreduce(self._change_total + dt * out))
@@ -289,6 +315,8 @@ class Storage:
         if self.damped:
             self.C.axpy(1.0, self.D, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
         _add_diagonal(self.C, b[self.unknowns.owned])
+        if self._sources:
+            _add_diagonal(self.C, -dt * self._assemble_sources(slope=True))
 
     def assemble_preconditioner(self, factor: float, share: float) -> PETSc.Mat:
         """Return the fixed-stress operator C + factor (beta V - share L) for the present C.

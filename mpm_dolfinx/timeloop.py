@@ -3,10 +3,13 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
+
+from mpi4py import MPI
 
 import numpy as np
 from dolfinx.common import Timer
@@ -35,15 +38,18 @@ PARTS = (
 )
 """Parts of a run that are timed, as `mpm: ...` in dolfinx's own list of timings."""
 MIN_CUT = 2.0**-10  # of dt: a step is not cut below this
+logger = logging.getLogger("mpm_dolfinx")
 
 
 @dataclass
 class Result:
-    """Histories of a run; one entry an output time, the start included.
+    """Histories of a run, and where its time loop is; one entry an output time, the start included.
 
     t (s); displacement (m, d) of the probes, m; pressure: least and largest on the points, Pa; and of
     the steps so far: steps, newton, coupling (iterations), balance and residual (worst, relative), cuts,
-    wall (s), and profile: seconds of each part of the run on this process, from dolfinx's timers.
+    rederived (domains that had folded), wall (s), and profile: seconds of each part of the run on this
+    process, from dolfinx's timers.
+    dt: output interval, s; small: the step to try next, s; converged: the end has been reached.
     """
 
     t: list[float] = field(default_factory=list)
@@ -53,9 +59,12 @@ class Result:
     newton: int = 0
     coupling: int = 0
     cuts: int = 0
+    rederived: int = 0
     balance: float = 0.0
     residual: float = 0.0
     wall: float = 0.0
+    dt: float = 0.0
+    small: float = 0.0
     converged: bool = False
     profile: dict[str, float] = field(default_factory=dict)
 
@@ -63,6 +72,12 @@ class Result:
         """Return the profile as a table: seconds and share of the wall time of each part."""
         rows = [*self.profile.items(), ("rest", self.wall - sum(self.profile.values()))]
         return "\n".join(f"{name:18} {s:8.2f} s {100 * s / max(self.wall, 1e-9):5.1f} %" for name, s in rows)
+
+
+def log(comm: MPI.Intracomm, message: str, *values) -> None:
+    """Log a message of the package, once for all processes."""
+    if comm.rank == 0:
+        logger.info(message, *values)
 
 
 class GaveUp(RuntimeError):
@@ -76,13 +91,18 @@ class GaveUp(RuntimeError):
         self.result, self.history = result, history
 
 
+Observer = Callable[["Simulation"], None]
+
+
 def run(
     simulation: Simulation,
     t_end: float,
     dt: float,
     *,
     probes: Probes | None = None,
-    observe: Callable[[Simulation], None] | None = None,
+    observe: Observer | Sequence[Observer] = (),
+    checkpoint: Observer | None = None,
+    after: Result | None = None,
     progress: bool = True,
 ) -> Result:
     """Advance to t_end in steps of dt; a step that does not converge is cut in two, and grows again.
@@ -96,7 +116,11 @@ def run(
     probes
         Particles whose displacement is recorded.
     observe
-        Called after each output interval.
+        Called after each output interval, such as a `Writer`; `simulation.result` then holds the histories so far.
+    checkpoint
+        Called after all observers: a `Checkpoint`.
+    after
+        Histories to go on with, of a run with the same dt: what `resume` returns.
     progress
         Show a progress bar on a terminal.
 
@@ -105,55 +129,98 @@ def run(
     GaveUp
         With the histories so far; `points` and `t` are those of the last good step.
     """
-    if not (dt > 0 and t_end > simulation.t):
-        raise ValueError(f"dt = {dt!r}, t_end = {t_end!r}: must be dt > 0 and t_end > {simulation.t:g}")
-    result, start, small = Result(), simulation.t, dt
-    _record(simulation, result, probes)
-    intervals = max(1, round((t_end - start) / dt))
-    began, timed = time.perf_counter(), _timings()
+    result = simulation.result = _histories(simulation, t_end, dt, probes, after)
+    start, done = result.t[0], len(result.t) - 1
+    # a last interval that is a fraction of dt counts as one
+    intervals = max(done + (t_end - simulation.t > 1e-9 * dt), round((t_end - start) / dt))
+    result.converged = done == intervals
+    observers = [observe] if callable(observe) else observe
+    stopwatch = _Stopwatch(result)
     quiet = None if progress and simulation.grid.comm.rank == 0 else True
-    with tqdm(total=intervals, disable=quiet, unit="step") as bar:
-        for k in range(1, intervals + 1):
+    with tqdm(total=intervals, initial=done, disable=quiet, unit="step") as bar:
+        for k in range(done + 1, intervals + 1):
             target = t_end if k == intervals else start + k * dt
             while target - simulation.t > 1e-9 * dt:
-                small = _advance(simulation, min(small, target - simulation.t), dt, result)
+                _advance(simulation, min(result.small, target - simulation.t), result)
+                bar.set_postfix(t=f"{simulation.t:.4g} s", newton=result.newton, coupling=result.coupling)
             simulation.t = target
+            result.converged = k == intervals
             with Timer("mpm: output"):
                 _record(simulation, result, probes)
-                if observe is not None:
-                    observe(simulation)
-            result.wall = time.perf_counter() - began
-            result.profile = {part: after - timed[part] for part, after in _timings().items()}
-            bar.set_postfix(t=f"{simulation.t:.4g} s", newton=result.newton, coupling=result.coupling)
+                stopwatch.read()
+                for observer in observers:
+                    observer(simulation)
+                stopwatch.read()
+                if checkpoint is not None:
+                    checkpoint(simulation)
             bar.update()
-    result.converged = True
+    stopwatch.read()
     return result
+
+
+def _histories(simulation, t_end: float, dt: float, probes: Probes | None, after: Result | None) -> Result:
+    """Return new histories that begin with the present state, or those to go on with."""
+    if not (dt > 0 and (t_end >= simulation.t if after else t_end > simulation.t)):
+        raise ValueError(f"dt = {dt!r}, t_end = {t_end!r}: must be dt > 0 and t_end > {simulation.t:g}")
+    if after is None:
+        result = Result(dt=dt, small=dt)
+        _record(simulation, result, probes)
+        return result
+    if after.dt != dt or after.t[-1] != simulation.t:
+        raise ValueError(
+            f"dt = {dt!r} from t = {simulation.t!r}: the run to go on with has dt = {after.dt!r}, t = {after.t[-1]!r}"
+        )
+    recorded = len(after.displacement[0]) if after.displacement else 0
+    if recorded != (0 if probes is None else len(probes.id)):
+        raise ValueError(f"probes: the run to go on with has {recorded} of them")
+    return after
+
+
+class _Stopwatch:
+    """Wall time and profile of a run, those that its histories have already included."""
+
+    def __init__(self, result: Result):
+        self._result = result
+        self._began = time.perf_counter() - result.wall
+        self._timed = {part: seconds - result.profile.get(part, 0.0) for part, seconds in _timings().items()}
+
+    def read(self) -> None:
+        """Note the seconds so far."""
+        self._result.wall = time.perf_counter() - self._began
+        self._result.profile = {part: seconds - self._timed[part] for part, seconds in _timings().items()}
 
 
 def _timings() -> dict[str, float]:
     return {part: _compat.seconds(f"mpm: {part}") for part in PARTS}
 
 
-def _advance(simulation: Simulation, small: float, dt: float, result: Result) -> float:
-    """Take one step of at most `small`, cutting it until it converges; return the next step to try."""
+def _advance(simulation: Simulation, small: float, result: Result) -> None:
+    """Take one step of at most `small`, cutting it until it converges."""
+    comm = simulation.grid.comm
     while True:
         try:
             report = simulation.step(small)
         except NotConverged as failed:
             result.cuts += 1
-            if small / 2 < MIN_CUT * dt:
+            if small / 2 < MIN_CUT * result.dt:
                 message = f"gave up at t = {simulation.t:g} s with dt = {small:.3g} s: {failed}"
                 raise GaveUp(message, result, failed.history) from failed
-            small /= 2
+            result.small = small = small / 2
+            log(comm, "t = %g s: step cut to %.3g s: %s", simulation.t, small, failed)
             continue
         except LeftGrid as failed:
             raise GaveUp(str(failed), result) from failed
         result.steps += 1
+        result.rederived += report.rederived
         result.newton += report.newton
         result.coupling += report.coupling
         result.balance = max(result.balance, report.balance)
         result.residual = max(result.residual, *report.history[-1])
-        return min(2 * small, dt)
+        grown = min(2 * small, result.dt)
+        if grown > 1.01 * result.small:  # not by rounding only
+            log(comm, "t = %g s: step grows to %.3g s", simulation.t, grown)
+        result.small = grown
+        return
 
 
 def _record(simulation: Simulation, result: Result, probes: Probes | None) -> None:

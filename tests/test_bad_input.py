@@ -33,9 +33,9 @@ CASES = {
     "drained without fluid": (lambda: scene(drained=[mpm.Drained("left")]), "need a fluid"),
     "unknown quadrature": (lambda: scene(quadrature="gauss"), "must be domain or point"),
     "unknown coupling": (lambda: scene(coupling="monolithic"), "must be one of schur-cg"),
-    "two laws": (
-        lambda: mpm.Simulation(GRID, [BODY], [SOFT, mpm.NeoHookean(1.0, 1.0)], fixed={"left": "xy"}),
-        "all must be of one law",
+    "no such material": (
+        lambda: mpm.Simulation(GRID, [mpm.box(GRID, [0, 0], [1, 1], material=1)], [SOFT], fixed={"left": "xy"}),
+        "material = 1, must be an index of the 1 materials",
     ),
     "probe outside": (lambda: mpm.probes([BODY], [[0.9, 0.9]]), "probe at .* outside the bodies"),
     "no step": (lambda: scene().run(1.0, 0.0), "must be dt > 0"),

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from mpm_dolfinx import Grid, box
-from mpm_dolfinx.domains import corner_bits, cut
+from mpm_dolfinx.domains import SNAP, corner_bits, cut
 
 GRIDS = {2: Grid([1.0, 1.2], [5, 6]), 3: Grid([1.0, 1.2, 0.8], [4, 3, 4])}
 
@@ -67,6 +67,23 @@ def test_open_faces_agree_on_both_sides_and_are_whole_within_the_body(grid):
         assert upper.max() <= area * (1 + 1e-12)
     if grid.dim == 2:  # cell (2, 2) lies within the body
         assert lower[2, 2] == pytest.approx(area) == upper[2, 2]
+
+
+@pytest.mark.parametrize("gap", [0.0, 0.5, 1.0, 1.5, 2.0, 5.0])
+@pytest.mark.parametrize("rounding", [-1e-5, 0.0, 1e-5])
+def test_the_face_between_two_domains_is_open_however_near_it_is_to_a_grid_plane(grid, gap, rounding):
+    """Of two domains that meet where vertices begin to be snapped, rounding may snap one only."""
+    low, high = np.zeros(grid.dim), 2 * grid.h
+    corners = low + corner_bits(grid.dim) * grid.h + np.zeros((2, 1, grid.dim))
+    upper = corner_bits(grid.dim)[:, -1] == 1
+    corners[0, upper, -1] = grid.h[-1] * (1 - SNAP * (gap + rounding))
+    corners[1, ~upper, -1], corners[1, upper, -1] = grid.h[-1] * (1 - SNAP * (gap - rounding)), high[-1]
+    p = cut(grid, corners)
+    axis, whole = grid.dim - 1, grid.cell_volume / grid.h[-1]
+    index = np.stack(np.unravel_index(p.cell, grid.shape), axis=1)
+    below, above = index[:, axis] == 0, index[:, axis] == 1
+    assert p.faces[below, axis, 1].sum() >= whole * (1 - 1e-8)
+    assert p.faces[above, axis, 0].sum() == pytest.approx(whole, rel=1e-8)
 
 
 def test_a_domain_many_cells_long_is_cut_into_all_of_them(grid):

@@ -6,6 +6,8 @@ from math import inf
 import numpy as np
 import pytest
 import ufl
+from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
+from ufl.algorithms.apply_derivatives import apply_derivatives
 
 from mpm_dolfinx import LAWS, Fluid, Hencky, LinearElastic, NeoHookean
 
@@ -44,6 +46,16 @@ def test_hencky_of_a_principal_stretch_is_the_formula():
     a, b = np.log(1.3), np.log(0.8)
     exact = (2 - 2 / 3) / 2 * (a + b) ** 2 + a**2 + b**2
     assert energy(Hencky, rotation(2, 0.4) @ np.diag([1.3, 0.8])) == pytest.approx(exact, rel=1e-7)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("law", [Hencky, NeoHookean])
+def test_a_tiny_strain_gives_a_tiny_stress(law, dim):
+    E = 1e-7 * np.diag([1.0, -0.3, 0.5][:dim])
+    F = ufl.variable(ufl.as_matrix((np.eye(dim) + E).tolist()))
+    P = apply_derivatives(apply_algebra_lowering(ufl.diff(law.energy(F, 2.0, 1.0), F)))
+    exact = (2 - 2 / 3) * np.trace(E) + 2 * E[1, 1]
+    assert float(P[1, 1](())) == pytest.approx(exact, rel=1e-5)
 
 
 @pytest.mark.parametrize(

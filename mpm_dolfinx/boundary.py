@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: MIT
+"""The conditions on the sides of the bodies, put where the sides are at the start of a step."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpm_dolfinx.conditions import HOLD, RIGIDITY, Displacement, Drained, Inflow, RigidPlate, Traction
+from mpm_dolfinx.domains import SNAP
+from mpm_dolfinx.exchange import Exchange
+from mpm_dolfinx.grid import Grid, sum_by
+from mpm_dolfinx.momentum import Momentum
+from mpm_dolfinx.placement import Placement
+from mpm_dolfinx.points import Body, Surface, surface
+from mpm_dolfinx.storage import Storage
+
+
+class Boundary:
+    """The sides of a scene's bodies and what acts on them.
+
+    Parameters
+    ----------
+    grid, bodies
+        Background grid and bodies.
+    modulus
+        Oedometric modulus of the stiffest material, Pa, by which plates and held sides are rigid.
+    tractions, displacements, plates, outlets
+        The conditions; outlets are drained sides and prescribed inflows.
+
+    Raises
+    ------
+    ValueError
+        Naming a condition whose side no point has.
+    """
+
+    def __init__(
+        self,
+        grid: Grid,
+        bodies: Sequence[Body],
+        modulus: float,
+        tractions: Sequence[Traction],
+        displacements: Sequence[Displacement],
+        plates: Sequence[RigidPlate],
+        outlets: Sequence[Drained | Inflow],
+    ):
+        self.grid, self._bodies, self._modulus = grid, bodies, modulus
+        self.plates = [(plate, self._faces(plate)) for plate in plates]
+        tractions = [*tractions, *(plate.traction(faces.area0.sum(), grid.dim) for plate, faces in self.plates)]
+        self.loads = [(load, self._faces(load)) for load in tractions]
+        self.holds = [(hold, self._faces(hold), hold.axes(grid.dim)) for hold in displacements]
+        self.outlets = [(outlet, self._faces(outlet)) for outlet in outlets]
+
+    def _faces(self, condition) -> Surface:
+        faces = surface(self._bodies, condition.side, condition.region)
+        if not len(faces):
+            raise ValueError(f"{condition}: no point has this side" + (" in the region" if condition.region else ""))
+        return faces
+
+    def place_loads(self, place: Placement, momentum: Momentum, t: float) -> None:
+        """Put the dead loads of time t (s) on the surface."""
+        rows = []
+        for load, faces in self.loads:
+            patches = place.surface(faces)
+            rows.append((patches.cell, patches.x, patches.area0[:, None] * load.at(t)))
+        cell, x, force = self._gathered(rows, self.grid.dim)
+        momentum.loads.place(cell, x, np.ones(len(cell)), force=force)
+
+    def place_plates(self, place: Placement, momentum: Momentum) -> None:
+        """Put the plates on the surface."""
+        grid, rows = self.grid, []
+        for _, faces in self.plates:
+            patches = place.surface(faces)
+            area = patches.area
+            length = faces.area0.sum() ** (1 / (grid.dim - 1))
+            rigidity = RIGIDITY * self._modulus * length * np.linalg.norm(area, axis=1, keepdims=True)
+            normal = np.tile(np.eye(grid.dim)[faces.axis], (len(area), 1))
+            tilt = normal - area / area[:, [faces.axis]]  # slope of the face: its normal is (-slope, 1)
+            rows.append((patches.cell, patches.x, np.concatenate([rigidity, normal, tilt], axis=1)))
+        cell, x, values = self._gathered(rows, 1 + 2 * grid.dim)
+        rigidity, normal, tilt = np.split(values, [1, 1 + grid.dim], axis=1)
+        momentum.plates.place(cell, x, np.ones(len(cell)), rigidity=rigidity, normal=normal, tilt=tilt)
+
+    def place_holds(self, place: Placement, momentum: Momentum, t: float) -> None:
+        """Put the given displacements of time t (s) on the surface: one row a place and component."""
+        d, rows = self.grid.dim, []
+        stiffness = HOLD * self._modulus / self.grid.h.min()
+        for number, (hold, faces, axes) in enumerate(self.holds):
+            patches = place.surface(faces)
+            gap = patches.X + hold.at(t, patches.X) - patches.x
+            for axis in axes:
+                values = np.zeros((len(gap), 3 + d))
+                values[:, 0] = number
+                values[:, 1] = stiffness * patches.area0
+                values[:, 2] = gap[:, axis]
+                values[:, 3 + axis] = 1.0
+                rows.append((patches.cell, patches.x, values))
+        cell, x, values = self._gathered(rows, 3 + d)
+        number, stiffness, gap, direction = np.split(values, [1, 2, 3], axis=1)
+        self._number = number[:, 0].astype(np.int64)
+        momentum.holds.place(cell, x, np.ones(len(cell)), stiffness=stiffness, gap=gap, direction=direction)
+
+    def reactions(self, momentum: Momentum) -> NDArray[np.float64]:
+        """Return the forces (holds, d), N, by which the given displacements act at the present displacement."""
+        grid, holds = self.grid, momentum.holds
+        N = grid.shape_values(holds.cells, holds.x)
+        u = momentum.u.x.array.reshape(-1, grid.dim)[grid.cell_nodes[holds.cells]]
+        direction = holds.data["direction"]
+        moved = np.einsum("mk,mkd,md->m", N, u, direction)
+        force = (holds.data["stiffness"][:, 0] * (holds.data["gap"][:, 0] - moved))[:, None] * direction
+        sums = [sum_by(self._number, column, len(self.holds)) for column in force.T]
+        return grid.comm.allreduce(np.stack(sums, axis=1))
+
+    def open_outlets(self, place: Placement, storage: Storage, weight: NDArray[np.float64] | None) -> None:
+        """Set the conductances of drained sides and the inflows; weight: rho_w g (d,), N/m^3, if there is gravity."""
+        grid, d = self.grid, self.grid.dim
+        cells, conductances, inflows = [np.empty(0, dtype=np.int32)], [np.empty(0)], [np.empty(0)]
+        for outlet, faces in self.outlets:
+            patches = place.surface(faces)
+            travel = Exchange(grid.comm, grid.owner(patches.cell))
+            cell = grid.local(travel.send(patches.cell))
+            area, x = travel.send(patches.area), travel.send(patches.x)
+            size = np.linalg.norm(area, axis=1)
+            cells.append(cell)
+            if isinstance(outlet, Inflow):
+                conductances.append(np.zeros(len(cell)))
+                inflows.append(outlet.flux * size)
+                continue
+            centre = grid.midpoints[cell] + storage.centroid.x.array.reshape(-1, d)[cell]
+            distance = np.einsum("md,md->m", x - centre, area) / size
+            conductance = storage.mobility.x.array[cell] * size / np.maximum(distance, SNAP * grid.h.min())
+            outer = np.full(len(cell), outlet.pressure)
+            if weight is not None:
+                outer -= (x - centre) @ weight
+            conductances.append(conductance)
+            inflows.append(conductance * outer)
+        storage.set_fluxes(np.concatenate(cells), np.concatenate(conductances), np.concatenate(inflows))
+
+    def _gathered(self, rows: list, width: int) -> tuple[NDArray, NDArray, NDArray]:
+        """Send (cells, positions, values) to the owners of the cells; return (owned cells, positions, values)."""
+        empty = (np.empty(0, dtype=np.int64), np.empty((0, self.grid.dim)), np.empty((0, width)))
+        parts = [np.concatenate(column) for column in zip(empty, *rows, strict=True)]
+        travel = Exchange(self.grid.comm, self.grid.owner(parts[0]))
+        cell, x, values = map(travel.send, parts)
+        return self.grid.local(cell), x, values

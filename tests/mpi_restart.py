@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: MIT
+"""Checkpoints on several processes; arguments: one of a single process, one to write, the state to write.
+
+Resumes the first and goes on to the end; writes the second half way, and files beside it; runs and resumes on as
+many processes.
+"""
+
+import sys
+
+from petsc4py import PETSc
+
+import numpy as np
+from helpers import beam
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.exchange import to_root
+
+T_END, DT = 0.12, 0.02
+
+
+def state(simulation):
+    """Return all points on rank 0, and the histories."""
+    points = simulation.points.migrated(to_root(simulation.grid.comm, len(simulation.points)))
+    return {**{name: a for name, a in vars(points).items() if name != "data"}, "tip": simulation.result.displacement}
+
+
+def to_the_end(simulation, probe, file):
+    """Return the state at the end of a run from a checkpoint."""
+    simulation.run(T_END, DT, probes=probe, after=mpm.resume(simulation, file), progress=False)
+    return state(simulation)
+
+
+def same_bits(file):
+    """Return whether run and resumed run end with the same bits, on solvers and a grid that are reproducible.
+
+    MUMPS adds up messages in the order in which they come in, and PT-Scotch's partition differs from grid to grid.
+    """
+    options = PETSc.Options()
+    for name in ("momentum", "storage"):
+        options[f"mpm_{name}_pc_type"] = "lu"
+        options[f"mpm_{name}_pc_factor_mat_solver_type"] = "superlu_dist"
+    simulation, probe = beam(h=0.06)
+    simulation.run(T_END / 2, DT, probes=probe, checkpoint=mpm.Checkpoint(file, every=100), progress=False)
+    after = mpm.resume(simulation, file)
+    simulation.run(T_END, DT, probes=probe, after=after, progress=False)
+    one, other = state(simulation), to_the_end(simulation, probe, file)
+    return all(np.array_equal(one[name], other[name]) for name in one)
+
+
+if __name__ == "__main__":
+    theirs, ours, out = sys.argv[1:]
+    end = to_the_end(*beam(h=0.06), theirs)
+    simulation, probe = beam(h=0.06)
+    writer = mpm.Writer(simulation, ours + ".out", grid=True)
+    simulation.run(T_END / 2, DT, probes=probe, checkpoint=mpm.Checkpoint(ours), observe=writer, progress=False)
+    counts = simulation.grid.comm.gather(len(simulation.points))
+    same = simulation.grid.comm.allreduce(same_bits(ours + ".same")) == simulation.grid.comm.size
+    if counts:
+        np.savez(out, same=same, counts=counts, **end)

@@ -1,0 +1,227 @@
+# SPDX-License-Identifier: MIT
+"""What a run leaves on the disk and on the terminal."""
+
+import csv
+import io
+import logging
+import re
+import subprocess
+import sys
+from pathlib import Path
+from xml.etree import ElementTree
+
+import dolfinx
+import meshio
+import numpy as np
+import pytest
+from helpers import beam
+from test_restart import block, cut_beam
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.__main__ import main
+
+
+def index(file):
+    """Return the times of an index and the files of each."""
+    out = {}
+    for item in ElementTree.parse(file).iter("DataSet"):
+        out.setdefault(float(item.get("timestep")), []).append(file.parent / item.get("file"))
+    return out
+
+
+def table(file):
+    """Return the columns of a CSV file."""
+    with open(file, newline="") as f:
+        rows = list(csv.DictReader(f))
+    return {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
+
+
+def fields(file):
+    """Return the arrays of a file of dolfinx's, which are text."""
+    arrays = ElementTree.parse(file).iter("DataArray")
+    return {a.get("Name", "x"): np.array(a.text.split(), dtype=float) for a in arrays}
+
+
+def grid_functions(simulation):
+    """Return step displacement, filling and pressure."""
+    return simulation.momentum.u, simulation.momentum.fill, simulation.storage.p
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """Return the beam after seven intervals, the folder of its files, and its states at the ends of all intervals."""
+    folder, states = tmp_path_factory.mktemp("out") / "beam", []
+    simulation, probe = beam(h=0.06)
+    simulation.points.data["grains"] = 0.1 * simulation.points.id
+    simulation.points.data["axis"] = np.tile([1.0, 2.0], (len(simulation.points), 1))
+
+    def keep(s):
+        states.append((s.points.copy(), s.effective_stress(), *(f.x.array.copy() for f in grid_functions(s))))
+
+    keep(simulation)
+    simulation.run(0.14, 0.02, probes=probe, observe=[mpm.Writer(simulation, folder, every=3, grid=True), keep])
+    return simulation, folder, states
+
+
+def test_start_end_and_every_third_state_are_written(written):
+    _, folder, _ = written
+    assert list(index(folder / "points.pvd")) == pytest.approx([0, 0.06, 0.12, 0.14])
+    assert list(index(folder / "grid.pvd")) == pytest.approx([0.06, 0.12, 0.14])
+
+
+def test_points_are_read_back_as_they_were(written):
+    simulation, folder, states = written
+    for (file,), k in zip(index(folder / "points.pvd").values(), (0, 3, 6, 7), strict=True):
+        points, stress = states[k][:2]
+        mesh = meshio.read(file)
+        data = {name: rows for name, (rows,) in mesh.cell_data.items()}
+        centre = np.column_stack([points.x, np.zeros(len(points))])
+        assert mesh.points[mesh.cells[0].data].mean(axis=1) == pytest.approx(centre, abs=1e-15)
+        expected = {name: getattr(points, name) for name in ("id", "material", "pressure", "J")}
+        expected |= {"F_xx": points.F[:, 0, 0], "F_xy": points.F[:, 0, 1], "F_yx": points.F[:, 1, 0]}
+        expected |= {"effective_stress_xy": stress[:, 0, 1], "effective_stress_yy": stress[:, 1, 1]}
+        expected |= {"displacement": centre - np.column_stack([simulation.bodies[0].centre, centre[:, 2]])}
+        expected |= {"grains": 0.1 * points.id, "axis": np.tile([1.0, 2.0, 0.0], (len(points), 1))}
+        for name, values in expected.items():
+            assert np.array_equal(data[name], values), name
+
+
+def test_the_cells_of_a_file_fill_the_body(written):
+    _, folder, states = written
+    for (file,), k in zip(index(folder / "points.pvd").values(), (0, 3, 6, 7), strict=True):
+        mesh = meshio.read(file)
+        assert mesh.cells[0].type == "quad"
+        x = mesh.points[mesh.cells[0].data]
+        a, b = x[:, 2] - x[:, 0], x[:, 3] - x[:, 1]
+        area = (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 2  # next to nothing for corners in a wrong order
+        volume = states[k][0].volume0 * states[k][0].J
+        assert area.min() > 0.5 * volume.min() and area.sum() == pytest.approx(volume.sum(), rel=1e-3 if k else 1e-12)
+
+
+def test_domains_in_3d_are_hexahedra(tmp_path):
+    simulation, _ = block()
+    mpm.Writer(simulation, tmp_path)
+    mesh = meshio.read(tmp_path / "points" / "000000.vtu")
+    assert mesh.cells[0].type == "hexahedron" and "pressure" not in mesh.cell_data
+    x = mesh.points[mesh.cells[0].data]
+    e = x[:, [1, 3, 4]] - x[:, :1]
+    assert np.linalg.det(e) == pytest.approx(simulation.points.volume0)
+    for corner, sides in ((2, [0, 1]), (5, [0, 2]), (6, [0, 1, 2]), (7, [1, 2])):
+        assert x[:, corner] - x[:, 0] == pytest.approx(e[:, sides].sum(axis=1)), "VTK numbers the corners otherwise"
+    assert mesh.cell_data["F"][0].shape == (len(x), 9)
+
+
+def test_fields_of_the_grid_are_read_back_as_they_were(written):
+    simulation, folder, states = written
+    for (file,), k in zip(index(folder / "grid.pvd").values(), (3, 6, 7), strict=True):
+        found, (u, fill, p) = fields(file), states[k][2:]
+        x = found["x"].reshape(-1, 3)[:, :2]
+        middle = x[found["connectivity"].astype(int).reshape(-1, 4)].mean(axis=1)
+        cells = simulation.grid.cell_number[: simulation.grid.num_owned]
+        at = np.argsort(cells)[simulation.grid.number(simulation.grid.index(middle))]
+        assert found["fill"] == pytest.approx(fill[at], rel=1e-12)
+        assert found["pressure"] == pytest.approx(np.where(fill > 0, p, 0.0)[at], rel=1e-12)
+        assert found["fill"].sum() * simulation.grid.cell_volume == pytest.approx(0.3, rel=1e-3)
+        here, there = (np.lexsort(np.rint(y / simulation.grid.h).T) for y in (x, simulation.grid.node_x))
+        assert found["step_displacement"].reshape(-1, 3)[here, :2] == pytest.approx(u.reshape(-1, 2)[there], rel=1e-12)
+
+
+def test_the_table_holds_the_histories(written):
+    simulation, folder, _ = written
+    result, found = simulation.result, table(folder / "history.csv")
+    assert np.array_equal(found["t"], result.t)
+    assert np.array_equal(np.column_stack([found["p_min"], found["p_max"]]), result.pressure)
+    assert np.array_equal(np.column_stack([found["ux_0"], found["uy_0"]]), np.array(result.displacement)[:, 0])
+    for name in ("steps", "newton", "coupling", "cuts", "balance", "residual"):
+        assert found[name][0] == 0 and found[name][-1] == getattr(result, name)
+    assert (np.diff(found["wall"]) > 0).all()
+
+
+def test_an_interrupted_run_leaves_whole_files_which_another_continues(tmp_path):
+    simulation, probe = beam(h=0.06)
+
+    def interrupt(s):
+        if s.t > 0.07:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        simulation.run(0.2, 0.02, probes=probe, observe=[mpm.Writer(simulation, tmp_path), interrupt])
+    times = np.linspace(0, 0.08, 5)
+    assert list(index(tmp_path / "points.pvd")) == pytest.approx(times)
+    assert all(len(meshio.read(file).points) for (file,) in index(tmp_path / "points.pvd").values())
+    file = tmp_path / "history.csv"
+    assert table(file)["t"] == pytest.approx(times)
+    file.write_text(file.read_text()[:-5])  # the last row is broken off
+    simulation.run(0.1, 0.02, probes=probe, observe=mpm.Writer(simulation, tmp_path), after=simulation.result)
+    assert list(index(tmp_path / "points.pvd")) == pytest.approx([*times, 0.1])
+    assert table(file)["t"] == pytest.approx([*times[:4], 0.1])
+    again, _ = beam(h=0.06)
+    again.run(0.02, 0.02, observe=mpm.Writer(again, tmp_path))
+    assert list(index(tmp_path / "points.pvd")) == list(table(file)["t"]) == [0.0, 0.02], "a new run begins anew"
+
+
+def test_a_writer_made_before_the_run_was_resumed_harms_nothing(tmp_path):
+    simulation, _ = beam(h=0.06)
+    checkpoint = mpm.Checkpoint(tmp_path / "run.ckpt")
+    simulation.run(0.04, 0.02, observe=mpm.Writer(simulation, tmp_path), checkpoint=checkpoint)
+    other, probe = beam(h=0.06)
+    early = mpm.Writer(other, tmp_path)
+    after = mpm.resume(other, checkpoint.file)
+    with pytest.raises(ValueError, match=r"writer: made at t = 0 s for a run that goes on from t = 0\.04 s"):
+        other.run(0.06, 0.02, observe=early, after=after)
+    assert list(index(tmp_path / "points.pvd")) == list(table(tmp_path / "history.csv")["t"]) == [0.0, 0.02, 0.04]
+    with pytest.raises(ValueError, match=r"its columns are t, .*, p_max, the run's t, .*, p_max, ux_0, uy_0"):
+        other.run(0.08, 0.02, probes=probe, observe=mpm.Writer(other, tmp_path))
+    with pytest.raises(ValueError, match="every = 0, must be an integer >= 1"):
+        mpm.Writer(other, tmp_path, every=0)
+
+
+def test_steps_checkpoints_and_resumptions_are_logged(tmp_path, caplog):
+    simulation, _ = cut_beam()
+    checkpoint = mpm.Checkpoint(tmp_path / "run.ckpt")
+    with caplog.at_level(logging.INFO, "mpm_dolfinx"):
+        simulation.run(0.08, 0.02, checkpoint=checkpoint)
+        mpm.resume(simulation, checkpoint.file)
+    said = "\n".join(record.getMessage() for record in caplog.records if record.name == "mpm_dolfinx")
+    assert said.count("step cut to") == simulation.result.cuts > 0
+    assert said.count(f"checkpoint {checkpoint.file} written") == 4
+    assert "step grows to 0.02 s" in said and "t = 0.08 s: resumed from" in said
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def test_progress_shows_on_a_terminal_and_nowhere_else(monkeypatch, capsys):
+    simulation, _ = beam(h=0.06)
+    simulation.run(0.02, 0.02)
+    assert capsys.readouterr() == ("", "")
+    monkeypatch.setattr(sys, "stderr", Terminal())
+    result = simulation.run(0.06, 0.02)
+    assert re.search(rf"2/2 .*coupling={result.coupling}, newton={result.newton}, t=0.06 s", sys.stderr.getvalue())
+    monkeypatch.setattr(sys, "stderr", Terminal())
+    simulation.run(0.08, 0.02, progress=False)
+    assert sys.stderr.getvalue() == "" and capsys.readouterr().out == ""
+
+
+def test_nothing_in_the_package_prints_but_the_command():
+    for file in Path(mpm.__file__).parent.glob("*.py"):
+        assert file.name == "__main__.py" or not re.search(r"\bprint\(", file.read_text()), file
+
+
+def test_info_names_versions_and_solvers():
+    done = subprocess.run([sys.executable, "-m", "mpm_dolfinx", "info"], capture_output=True, text=True)
+    lines = dict(line.split(maxsplit=1) for line in done.stdout.splitlines())
+    assert done.returncode == 0 and "not found" not in done.stdout
+    assert lines["mpm_dolfinx"] == mpm.__version__ and lines["dolfinx"] == dolfinx.__version__
+    assert lines["numpy"] == np.__version__ and "mumps" in lines["solvers"].split(", ")
+    assert {"fenics-basix", "fenics-ffcx", "fenics-ufl", "PETSc", "petsc4py", "MPI", "Python"} <= lines.keys()
+
+
+@pytest.mark.parametrize("arguments", [[], ["nonsense"], ["info", "more"]])
+def test_nonsense_gets_the_usage(arguments, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(arguments)
+    assert ended.value.code == 2
+    assert capsys.readouterr().err.startswith("usage: python -m mpm_dolfinx [-h] {info}")
