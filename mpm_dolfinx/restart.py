@@ -12,7 +12,6 @@ import os
 import time
 import zlib
 from dataclasses import dataclass, field, fields
-from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -170,7 +169,8 @@ def describe(simulation: Simulation) -> dict[str, Any]:
     for name, one in [(f"material {i}", m) for i, m in enumerate(simulation.materials)] + [("fluid", simulation.fluid)]:
         scene[name] = None if one is None else type(one).__name__
         constants = {f.name: getattr(one, f.name) for f in fields(one)} if one is not None else {}
-        scene |= {f"{key} of {name}": float(v) for key, v in constants.items() if isinstance(v, Real)}
+        constants = {key: value for key, value in constants.items() if value is not None and not callable(value)}
+        scene |= {f"{key} of {name}": np.asarray(value).tolist() for key, value in constants.items()}
     scene["data of the points"] = sorted(simulation.points.data)
     return scene
 
