@@ -80,6 +80,7 @@ def save(simulation: Simulation, file: Path) -> None:
     note["result"] = {name: value for name, value in result.items() if name not in LISTS}
 
     def write() -> int:
+        file.parent.mkdir(parents=True, exist_ok=True)
         with replacing(file) as part, open(part, "wb") as f:
             np.savez(f, format=np.array(FORMAT), note=np.array(json.dumps(note)), **_named("", state))
         return file.stat().st_size
@@ -96,7 +97,8 @@ def resume(simulation: Simulation, file: str | os.PathLike) -> Result:
     ----------
     simulation
         The scene of the checkpoint, on any number of processes.  Grid, bodies, materials and fluid are
-        compared with the file; loads and boundary conditions may differ.
+        compared with the file; loads and boundary conditions may differ.  What observers have gathered for
+        themselves is not in the file.
     file
         The checkpoint.
 
