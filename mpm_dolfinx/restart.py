@@ -65,12 +65,11 @@ class Checkpoint:
             due = comm.bcast(time.monotonic() - self._last >= self.seconds)
         if due or result.converged:
             save(simulation, Path(self.file))
-            simulation.coupler.forget()  # as after `resume`
             self._last = time.monotonic()
 
 
 def save(simulation: Simulation, file: Path) -> None:
-    """Write the state of a simulation between two steps of a run."""
+    """Write the state of a simulation between two steps of a run, and go on as after `resume`."""
     comm, began = simulation.grid.comm, time.perf_counter()
     points, carried, result = simulation.points, simulation.carried, vars(simulation.result)
     state = {"points": vars(points.migrated(to_root(comm, len(points))))}
@@ -87,6 +86,7 @@ def save(simulation: Simulation, file: Path) -> None:
         return file.stat().st_size
 
     size = at_root(comm, write)
+    simulation.coupler.forget()
     seconds = time.perf_counter() - began
     log(comm, "t = %g s: checkpoint %s written: %.3g MB, %.2g s", simulation.t, file, size / 1e6, seconds)
 
