@@ -23,9 +23,10 @@ from petsc4py import PETSc
 import numpy as np
 from dolfinx.common import Timer
 
+from mpm_dolfinx.block import BlockSolver
 from mpm_dolfinx.momentum import Momentum
 from mpm_dolfinx.storage import FILTER, Storage
-from mpm_dolfinx.unknowns import direct_solver
+from mpm_dolfinx.unknowns import direct_solver, multigrid_solver
 
 COUPLINGS = {
     "schur-cg": 0.75,
@@ -112,17 +113,22 @@ class Coupler:
 
     def set_unknowns(self) -> None:
         """Make the solvers for the present matrices."""
+        m = self.momentum
+        self._iterative = m.unknowns.iterative
         self.forget()
-        self._solve_u = direct_solver(self.momentum.K, "momentum", self.momentum.symmetric)
         self._du, self._rhs = self.momentum.unknowns.vector(), self.momentum.unknowns.vector()
         if self.storage is None:
             return
         self._dp, self._g = self.storage.unknowns.vector(), self.storage.unknowns.vector()
-        self._schur = None
 
     def forget(self) -> None:
-        """Make the tangent anew in the next step: what follows then does not depend on the steps before."""
-        self._tangent_of = None
+        """Make tangent and solvers anew in the next step: what follows then does not depend on the steps before."""
+        m = self.momentum
+        self._tangent_of = self._schur = self._block = None
+        if self._iterative:
+            self._solve_u, self._modes = multigrid_solver(m.K, "momentum"), m.unknowns.rigid_body_modes()
+        else:
+            self._solve_u = direct_solver(m.K, "momentum", m.symmetric)
 
     def solve(self, dt: float) -> Report:
         """Solve a step from the present (u, p).
@@ -214,12 +220,18 @@ class Coupler:
             if self.storage is not None:
                 self.storage.assemble_tangent(dt)
         with Timer("mpm: factorisation"):
+            if self._iterative:
+                K.setNearNullSpace(self._modes)
             self._solve_u.setOperators(K)
             self._solve_u.setUp()
             if self.storage is not None:
+                P = self.storage.assemble_preconditioner(self.beta, 0.0 if self.richardson else FILTER)
+                if self._iterative and not self.richardson:
+                    self._block = self._block or BlockSolver(self.momentum, self.storage, self._solve_u.pc)
+                    self._block.set_preconditioner(P)
+                    return
                 if self._schur is None:
                     self._make_schur()
-                P = self.storage.assemble_preconditioner(self.beta, 0.0 if self.richardson else FILTER)
                 self._solve_s.setOperators(self._schur, P)
                 self._solve_s.setUp()
 
@@ -236,18 +248,28 @@ class Coupler:
     def _direction(self, dt: float, error: float) -> int:
         """Solve the linearised problem for (du, dp) in place; return the coupling iterations."""
         with Timer("mpm: linear solve"):
-            if self.storage is None:
-                self._solve_u.solve(self.momentum.residual, self._du)
-                return 0
-            s, g = self.storage, self._condense()
             # no more accuracy than the next residual can use
-            rtol = min(1e-2, max(0.0 if self.momentum.linear else FORCING, 0.05 * self.tolerance / error))
+            linear = self.momentum.linear and not self._iterative
+            rtol = min(1e-2, max(0.0 if linear else FORCING, 0.05 * self.tolerance / error))
+            if self.storage is None:
+                self._solve_u.setTolerances(rtol=rtol, atol=0.0, max_it=500)
+                self._solve_u.solve(self.momentum.residual, self._du)
+                return self._solve_u.getIterationNumber() if self._iterative else 0
+            if self._block is not None:
+                return self._block.solve(self._du, self._dp, self._scales(), rtol)
+            s, g = self.storage, self._condense()
             self._solve_s.setTolerances(rtol=rtol, atol=0.0, max_it=500)
             self._solve_s.solve(g, self._dp)
             s.B_momentum.multTranspose(self._dp, self._rhs)
             self._rhs.axpy(1.0, self.momentum.residual)
             self._solve_u.solve(self._rhs, self._du)
             return self._solve_s.getIterationNumber()
+
+    def _scales(self) -> tuple[float, float]:
+        """Return the scales of the residuals' Euclidean norms that make them the errors."""
+        r = self.storage.residual
+        size, total = r.norm(), r.norm(PETSc.NormType.N1)
+        return self._scale_u or 1.0, (self._exchanged or 1.0) * (size / total if total > 0 else 1.0)
 
     def _condense(self) -> PETSc.Vec:
         """Return the residual of the Schur complement's system, R_p - B K^-1 R_u."""

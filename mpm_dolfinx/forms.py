@@ -137,10 +137,13 @@ class FormPoints:
         self._live["gradient"] = u
         return self._functions["gradient"]
 
+    def increment(self, u: fem.Function):
+        """Return Delta = I + grad u at the points as UFL."""
+        return ufl.Identity(self.grid.dim) + (self.grad(u) if self.grid.dim == 2 else self.gradient(u))
+
     def deformation(self, u: fem.Function):
-        """Return F = (I + grad u) F_n at the points, which carry F_n as F, as a UFL variable."""
-        gradient = self.grad(u) if self.grid.dim == 2 else self.gradient(u)
-        return ufl.variable((ufl.Identity(self.grid.dim) + gradient) * self.F)
+        """Return F = Delta F_n at the points, which carry F_n as F, as a UFL variable."""
+        return ufl.variable(self.increment(u) * self.F)
 
     def values(self, name: str, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
         """Return a field at the chosen points (m, size)."""
@@ -345,7 +348,7 @@ def _entries(count: int, symmetric: bool) -> tuple[NDArray, NDArray, NDArray]:
 
 
 class ElementForces:
-    """The linear form T : grad v of P1 vectors over points, summed in each cell: for 3D, see `FormPoints.gradient`.
+    """The linear form T : grad v of P1 vectors over points, summed in each cell.
 
     Parameters
     ----------
@@ -364,6 +367,13 @@ class ElementForces:
         """Add the vector to the local array `b`; contributions to ghosts stay there."""
         dofs = element_dofs(self.points.grid, self.points.filled)
         b += sum_by(dofs.ravel(), self._sums().ravel(), len(b))
+
+    def assemble_matrix(self, A: PETSc.Mat) -> None:
+        """Add to `A`, which has a row a cell, the vectors of the cells; the caller finalises it."""
+        cells = self.points.filled
+        if len(cells):
+            dofs = element_dofs(self.points.grid, cells).astype(PETSc.IntType)
+            A.setValuesLocalRCV(cells[:, None].astype(PETSc.IntType), dofs, self._sums()[:, None], addv=True)
 
 
 class StackedElementMatrices:
@@ -506,6 +516,7 @@ class PointExpression:
         self._rows = Rows(self._compiled, points)
         self._rows.room(self._many)  # of all calls: room that grows between filling and use is empty
         self._compiled.bind(np.arange(self._many))
+        self._rows.room(self._many)
         self._values = np.empty((self._many, int(np.prod(self._shape, dtype=int))))
 
     def evaluate(self, chosen: NDArray[np.int64] | None = None) -> NDArray[np.float64]:
@@ -516,6 +527,6 @@ class PointExpression:
             part = chosen[start : start + self._many]
             self._rows(part)
             self._values[:] = 0.0
-            self._compiled.assemble_vector(self._values.reshape(-1), self._rows.room(self._many)[: self._many])
+            self._compiled.assemble_vector(self._values.reshape(-1), self._rows.room(self._many))
             out[start : start + len(part)] = self._values[: len(part)]
         return out.reshape(len(chosen), *self._shape)

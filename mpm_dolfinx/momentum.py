@@ -207,14 +207,26 @@ class Momentum:
         if changed:
             self._cells, self._dofs, self._facets = now
             self.unknowns = Unknowns(self.u, dofs)
-            self.K = matrix(self.unknowns, self.unknowns, 5**self.grid.dim * self.grid.dim)
+            self.K = matrix(self.unknowns, self.unknowns, 3**self.grid.dim * self.grid.dim)
             self._summed = False
-            self.penalty = matrix(self.unknowns, self.unknowns, 5**self.grid.dim * self.grid.dim)
+            self.penalty = self._penalty_matrix()
             self.residual = self.unknowns.vector()
             self.ghost.place(facets)
         stiffness = float(self.modulus.x.array[cells].max(initial=0.0)) * self.grid.cell_volume / self.grid.h.min()
         self.round_off = 1e-14 * self.grid.comm.allreduce(stiffness) * np.sqrt(max(1, self.unknowns.global_size))
         return changed
+
+    def _penalty_matrix(self) -> PETSc.Mat:
+        """Return an empty matrix for the penalties: the ghost penalty couples like components, of two cells."""
+        d = self.grid.dim
+        length = 3**d + 2 * d * 3 ** (d - 1)
+        if self._plate is not None or self._hold is not None:
+            return matrix(self.unknowns, self.unknowns, d * length)
+        touched = np.zeros(len(self.free), dtype=bool)
+        touched[self.grid.cell_nodes[self.grid.facet_cells[self._facets]]] = True
+        A = matrix(self.unknowns, self.unknowns, np.where(self._shared(touched)[self.unknowns.owned // d], length, 1))
+        A.setOption(PETSc.Mat.Option.IGNORE_ZERO_ENTRIES, True)
+        return A
 
     def set_penalty(self) -> None:
         """Assemble what is linear in the step's increment: ghost penalty, and plates and holds at their places."""

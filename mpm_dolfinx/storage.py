@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx import _compat
 from mpm_dolfinx.extend import call
-from mpm_dolfinx.forms import FacetForm, FormPoints, PointForm
+from mpm_dolfinx.forms import ElementForces, FacetForm, FormPoints, PointForm
 from mpm_dolfinx.grid import Grid, sum_by
 from mpm_dolfinx.unknowns import Unknowns, matrix, sum_ghosts, zero
 
@@ -74,19 +74,17 @@ class Storage:
         Q = pressure.function_space
         self.p_n, self._b = fem.Function(Q), fem.Function(Q)
         q, dp = ufl.TestFunction(Q), ufl.TrialFunction(Q)
-        du = ufl.TrialFunction(displacement.function_space)
         one = fem.Function(Q)
         one.x.array[:] = 1.0
-        J = ufl.det(ufl.Identity(grid.dim) + pieces.grad(displacement))
-        strain = pieces.biot * (J - 1) * q * pieces.dx
-        change = strain + pieces.storage * J * (pressure - self.p_n) * q * pieces.dx
+        delta = ufl.variable(pieces.increment(displacement))
+        J = ufl.det(delta)
+        strain = pieces.biot * (J - 1)
+        stored = strain + pieces.storage * J * (pressure - self.p_n)
+        change = stored * q * pieces.dx
         self._change = PointForm(change, pieces)
         self._capacity = PointForm(ufl.derivative(change, pressure, one), pieces)
-        coupled = strain if symmetric else change
-        self._coupling = PointForm(ufl.derivative(coupled, displacement, du), pieces)
-        self._momentum_coupling = (
-            self._coupling if symmetric else PointForm(ufl.derivative(strain, displacement, du), pieces)
-        )
+        self._coupling = ElementForces(ufl.diff(strain if symmetric else stored, delta), pieces)
+        self._momentum_coupling = self._coupling if symmetric else ElementForces(ufl.diff(strain, delta), pieces)
         self.symmetric, self._pieces = symmetric, pieces
         self.sources: list[tuple[PointForm, PointForm | None]] = []
         self._slot = np.empty(grid.num_local, dtype=np.int64)  # of active owned cells: place in the vectors

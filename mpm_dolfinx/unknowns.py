@@ -16,6 +16,9 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx import _compat
 
+ITERATIVE = 2000
+"""Unknowns of a 3D problem from which on it is solved by iterations: see `multigrid_solver`."""
+
 
 class Unknowns:
     """Numbering of some of the degrees of freedom of a function's space.
@@ -29,7 +32,7 @@ class Unknowns:
     """
 
     def __init__(self, function: fem.Function, dofs: NDArray[np.int64]):
-        space = function.function_space
+        self._space = space = function.function_space
         self.comm = space.mesh.comm
         owned = space.dofmap.index_map.size_local * space.dofmap.bs
         number = np.full(len(function.x.array), -1, dtype=np.int32)
@@ -47,6 +50,33 @@ class Unknowns:
             number[:] = carrier.x.array
         self.global_size = self.comm.allreduce(self.size)
         self.map = PETSc.LGMap().create(number, comm=self.comm)
+
+    @property
+    def iterative(self) -> bool:
+        """Whether problems of these unknowns are better solved by iterations than by factors."""
+        return self._space.mesh.topology.dim == 3 and self.global_size >= ITERATIVE
+
+    def rigid_body_modes(self) -> PETSc.NullSpace:
+        """Return translations and rotations, as far as the unknowns allow them: what strain does not see."""
+        d = self._space.dofmap.bs
+        node, axis = np.divmod(self.owned, d)
+        x, direction = self._space.tabulate_dof_coordinates()[node, :d], np.eye(d)[axis]
+        modes = np.concatenate([direction, np.empty((self.size, d * (d - 1) // 2))], axis=1)
+        x = x - self.comm.allreduce(x.sum(axis=0)) / self.global_size
+        x /= np.sqrt(self.comm.allreduce(float(np.square(x).sum())) / self.global_size)
+        for k, (a, b) in enumerate((a, b) for a in range(d) for b in range(a)):
+            modes[:, d + k] = direction[:, a] * x[:, b] - direction[:, b] * x[:, a]
+        size, turn = np.linalg.eigh(self.comm.allreduce(modes.T @ modes))
+        kept = size > 1e-10 * size.max()
+        modes = modes @ (turn[:, kept] / np.sqrt(size[kept]))
+        vectors = [self.gather_owned(mode) for mode in modes.T]
+        return PETSc.NullSpace().create(vectors=vectors, comm=self.comm)
+
+    def gather_owned(self, values: NDArray[np.float64]) -> PETSc.Vec:
+        """Return a new vector with these entries of this process."""
+        v = self.vector()
+        v.array_w[:] = values
+        return v
 
     def vector(self) -> PETSc.Vec:
         """Return a new vector of zeros."""
@@ -69,12 +99,13 @@ class Unknowns:
         function.x.scatter_forward()
 
 
-def matrix(rows: Unknowns, columns: Unknowns, row_length: int) -> PETSc.Mat:
-    """Return an empty sparse matrix for assembly, with room for `row_length` entries a row."""
+def matrix(rows: Unknowns, columns: Unknowns, row_length: int | NDArray[np.int64]) -> PETSc.Mat:
+    """Return an empty sparse matrix for assembly, with room for `row_length` entries a row, or in each row."""
     A = PETSc.Mat().create(rows.comm)
     A.setSizes(((rows.size, None), (columns.size, None)))
     A.setType(PETSc.Mat.Type.AIJ)
-    A.setPreallocationNNZ((min(row_length, columns.size), row_length))
+    length = np.broadcast_to(row_length, (rows.size,)).astype(PETSc.IntType)
+    A.setPreallocationNNZ((np.minimum(length, columns.size), length if rows.comm.size > 1 else 0))
     A.setOption(PETSc.Mat.Option.NEW_NONZERO_ALLOCATION_ERR, False)
     A.setLGMap(rows.map, columns.map)
     return A
@@ -100,6 +131,35 @@ def direct_solver(A: PETSc.Mat, name: str, symmetric: bool = True) -> PETSc.KSP:
     ksp.setOperators(A)
     ksp.setFromOptions()
     return ksp
+
+
+def multigrid_solver(A: PETSc.Mat, name: str) -> PETSc.KSP:
+    """Return GMRES with smoothed aggregation multigrid (GAMG), set up anew when A has changed.
+
+    For elasticity A must have the rigid body modes as near-null space when it is set up.  GMRES because a
+    tangent may be unsymmetric or, where a body buckles, indefinite; on definite ones conjugate gradients
+    take as many iterations.
+    """
+    prefix = f"mpm_{name}_"
+    options = PETSc.Options(prefix)
+    for option, value in _MULTIGRID.items():
+        if not options.hasName(option):
+            options.setValue(option, value)
+    ksp = PETSc.KSP().create(A.comm)
+    ksp.setType(PETSc.KSP.Type.GMRES)
+    ksp.setPCSide(PETSc.PC.Side.RIGHT)
+    ksp.setOptionsPrefix(prefix)
+    ksp.pc.setType(PETSc.PC.Type.GAMG)
+    ksp.setOperators(A)
+    ksp.setFromOptions()
+    return ksp
+
+
+_MULTIGRID = {
+    "pc_gamg_reuse_interpolation": "true",  # a new tangent of the same unknowns: a quarter of the time
+    "mg_levels_ksp_type": "chebyshev",
+    "mg_levels_pc_type": "jacobi",
+}
 
 
 def zero(A: PETSc.Mat) -> None:

@@ -19,6 +19,7 @@ QUICK = {
     "coupling_iterations": ("--quick --h 0.06", ["iterations.png", "iterations.csv", "iterations.md", "roughness.md"]),
     "cantilever": ("--cells 2 --steps 20", ["cantilever.png"]),
     "quadrature": ("--h 0.05 --steps 5 10", ["quadrature.png", "tip.csv"]),
+    "extending_with_ufl": ("--cells 8", ["extending_with_ufl.png"]),
     "benchmark_beam": ("--h 0.05 --t-end 0.1 --repeat 1", []),
 }
 
