@@ -512,9 +512,8 @@ class PointExpression:
         q = ufl.TestFunction(_compat.function_space(grid.mesh, "DG", 0, self._shape))
         dx = ufl.dx(domain=grid.mesh, subdomain_id=_compat.SUBDOMAIN, metadata={"quadrature_degree": 0})
         self._compiled = _compat.CompiledForm(ufl.inner(expression, q) / grid.cell_volume * dx)
-        self._many = min(BATCH, grid.num_owned)
         self._rows = Rows(self._compiled, points)
-        self._rows.room(self._many)  # of all calls: room that grows between filling and use is empty
+        self._many = min(BATCH, grid.num_owned)
         self._compiled.bind(np.arange(self._many))
         self._rows.room(self._many)
         self._values = np.empty((self._many, int(np.prod(self._shape, dtype=int))))

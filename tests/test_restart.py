@@ -24,7 +24,7 @@ from helpers import beam, column
 from test_mpi import mpirun
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx import restart
+from mpm_dolfinx import restart, unknowns
 from mpm_dolfinx.output import Series
 
 
@@ -48,12 +48,13 @@ def plastic_column():
     return simulation, None
 
 
-def block():
+def block(fluid=None):
     grid = mpm.Grid([0.6, 0.4, 0.5], [3, 2, 3])
     body = mpm.box(grid, [0.1, 0, 0], [0.5, 0.4, 0.35])
     load = mpm.Traction("top", lambda t: (2e6 * t, 0, -4e6 * t))
     fixed = {"bottom": "xyz", "front": "y", "back": "y"}
-    simulation = mpm.Simulation(grid, [body], [mpm.NeoHookean(1e7, 5e6)], fixed=fixed, tractions=[load])
+    rubber = mpm.NeoHookean(1e7, 5e6, conductivity=1e-4)
+    simulation = mpm.Simulation(grid, [body], [rubber], fixed=fixed, tractions=[load], fluid=fluid)
     return simulation, mpm.probes([body], [[0.5, 0.4, 0.35]])
 
 
@@ -96,6 +97,12 @@ def test_resumed_after_any_step_the_end_is_the_same_to_the_last_bit(scene, tmp_p
         assert len(after.t) == k and after.t[-1] == other.t
         other.run(0.12, 0.02, probes=probe, after=after, checkpoint=every_step(tmp_path / "again"))
         same(one, other)
+
+
+@pytest.mark.parametrize("fluid", [None, mpm.Fluid()], ids=["dry", "wet"])
+def test_resumed_runs_end_with_the_same_bits_by_multigrid_too(fluid, tmp_path, monkeypatch):
+    monkeypatch.setattr(unknowns, "ITERATIVE", 50)
+    test_resumed_after_any_step_the_end_is_the_same_to_the_last_bit(lambda: block(fluid), tmp_path)
 
 
 def test_a_run_may_be_made_longer():
