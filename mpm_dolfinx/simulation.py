@@ -403,6 +403,8 @@ class Simulation:
         """Put the scene into a state at time t, s: points and pieces, on whatever processes they are."""
         self.points, self._carried, self.t = points, carried, t
         self._prepared = False
+        if self.active_cells:  # of a step that was taken before
+            self.coupler.forget()
         self._migrate()
 
     def effective_stress(self) -> NDArray[np.float64]:

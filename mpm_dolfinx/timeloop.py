@@ -6,6 +6,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from math import inf
 from typing import TYPE_CHECKING
@@ -16,6 +17,7 @@ import numpy as np
 from dolfinx.common import Timer
 from numpy.typing import NDArray
 from tqdm import tqdm
+from tqdm.contrib.logging import logging_redirect_tqdm
 
 from mpm_dolfinx import _compat
 from mpm_dolfinx.coupling import NotConverged
@@ -138,7 +140,8 @@ def run(
     observers = [observe] if callable(observe) else observe
     stopwatch = _Stopwatch(result)
     quiet = None if progress and simulation.grid.comm.rank == 0 else True
-    with tqdm(total=intervals, initial=done, disable=quiet, unit="step") as bar:
+    bar = tqdm(total=intervals, initial=done, disable=quiet, unit="step")
+    with bar, nullcontext() if bar.disable else logging_redirect_tqdm():  # messages above the bar, not into it
         for k in range(done + 1, intervals + 1):
             target = t_end if k == intervals else start + k * dt
             while target - simulation.t > 1e-9 * dt:

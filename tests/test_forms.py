@@ -7,7 +7,7 @@ import ufl
 from dolfinx import fem
 
 from mpm_dolfinx import Grid, Hencky, NeoHookean, _compat
-from mpm_dolfinx.forms import ElementMatrices, FormPoints, PointForm
+from mpm_dolfinx.forms import ElementMatrices, FormPoints, PointExpression, PointForm
 from mpm_dolfinx.unknowns import Unknowns, matrix
 
 GRIDS = {2: Grid([1.5, 1.0], [4, 3]), 3: Grid([1.0, 1.2, 0.9], [2, 3, 2])}
@@ -143,3 +143,11 @@ def test_moving_the_points_moves_the_form(dim):
 def test_an_unknown_field_is_named():
     with pytest.raises(AttributeError, match="carry offset, weight, not 'sigma'"):
         _ = FormPoints(GRIDS[2]).sigma
+
+
+def test_an_expression_is_right_when_it_is_evaluated_first():
+    """Fewer points than cells: nothing but the first call may make room for the rows."""
+    points = FormPoints(GRIDS[2], a=())
+    x = GRIDS[2].midpoints[:2]
+    points.place(np.arange(2, dtype=np.int32), x, np.ones(2), a=np.array([3.0, 4.0]))
+    assert PointExpression(points.a**2, points).evaluate() == pytest.approx([9.0, 16.0])

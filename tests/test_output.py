@@ -198,7 +198,9 @@ def test_progress_shows_on_a_terminal_and_nowhere_else(monkeypatch, capsys):
     simulation.run(0.02, 0.02)
     assert capsys.readouterr() == ("", "")
     monkeypatch.setattr(sys, "stderr", Terminal())
-    result = simulation.run(0.06, 0.02)
+    monkeypatch.setattr(logging.getLogger(), "handlers", [logging.StreamHandler(sys.stderr)])
+    result = simulation.run(0.06, 0.02, observe=lambda s: logging.getLogger("mpm_dolfinx").warning("between"))
+    assert "between" in re.split(r"[\r\n]", sys.stderr.getvalue()), "a message is not on a line of its own"
     assert re.search(rf"2/2 .*coupling={result.coupling}, newton={result.newton}, t=0.06 s", sys.stderr.getvalue())
     monkeypatch.setattr(sys, "stderr", Terminal())
     simulation.run(0.08, 0.02, progress=False)
