@@ -181,7 +181,7 @@ def undrained(h: float, law: type[mpm.Hencky]) -> tuple[mpm.Simulation, mpm.Resu
     """Load the undrained beam in three steps."""
     s = cantilever(h, "--conductivity", "1e-12")
     m = s.materials[0]
-    s.materials = [law(bulk=m.bulk, shear=m.shear, porosity=m.porosity, conductivity=m.conductivity)]
+    s.materials[:] = [law(bulk=m.bulk, shear=m.shear, porosity=m.porosity, conductivity=m.conductivity)]
     return s, s.run(3 * RAMP_STEP, RAMP_STEP, progress=False)
 
 

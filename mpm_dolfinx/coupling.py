@@ -113,6 +113,7 @@ class Coupler:
 
     def set_unknowns(self) -> None:
         """Make the solvers for the present matrices."""
+        self.forget()
         m = self.momentum
         self._iterative = m.unknowns.iterative
         if self._iterative:
@@ -125,6 +126,10 @@ class Coupler:
         self._dp, self._g = self.storage.unknowns.vector(), self.storage.unknowns.vector()
         self._schur = self._block = None
 
+    def forget(self) -> None:
+        """Make the tangent anew in the next step: what follows then does not depend on the steps before."""
+        self._tangent_of = None
+
     def solve(self, dt: float) -> Report:
         """Solve a step from the present (u, p).
 
@@ -135,17 +140,21 @@ class Coupler:
         """
         report = Report()
         self._scale_u = 0.0
-        if self.richardson:
-            self._alternate(dt, report)
-        else:
-            self._newton(dt, report)
+        try:
+            if self.richardson:
+                self._alternate(dt, report)
+            else:
+                self._newton(dt, report)
+        except NotConverged:
+            self.forget()
+            raise
         if self.storage is not None:
             report.balance = _relative(abs(self.storage.balance(dt)), self._exchanged, self.storage.round_off)
         return report
 
     def _newton(self, dt: float, report: Report) -> None:
-        """Newton's method on both problems at once; the tangent is kept while it serves."""
-        errors, fresh = self._errors(dt, report), True
+        """Newton's method on both problems at once; the tangent is kept while it serves, of linear laws over steps."""
+        errors, fresh = self._errors(dt, report), not (self.momentum.linear and self._kept(dt))
         while max(errors) > self.tolerance:
             self._check(report, report.newton)
             if fresh:
@@ -153,6 +162,10 @@ class Coupler:
             report.coupling += self._direction(dt, max(errors))
             before, errors = errors, self._line_search(dt, errors, report)
             fresh = max(errors) > KEEP * max(before)
+
+    def _kept(self, dt: float) -> bool:
+        """Return whether there is a tangent of steps of dt, but for rounding."""
+        return self._tangent_of is not None and abs(self._tangent_of - dt) < 1e-9 * dt
 
     def _alternate(self, dt: float, report: Report) -> None:
         """The paper's iteration: momentum at fixed pressure, then storage at fixed stress, until both balance."""
@@ -201,6 +214,7 @@ class Coupler:
         return errors[0], errors[1]
 
     def _linearise(self, dt: float) -> None:
+        self._tangent_of = dt
         with Timer("mpm: tangent"):
             K = self.momentum.assemble_tangent()
             if self.storage is not None:
@@ -235,7 +249,7 @@ class Coupler:
         """Solve the linearised problem for (du, dp) in place; return the coupling iterations."""
         with Timer("mpm: linear solve"):
             # no more accuracy than the next residual can use
-            rtol = min(1e-2, max(FORCING, 0.05 * self.tolerance / error))
+            rtol = min(1e-2, max(0.0 if self.momentum.linear else FORCING, 0.05 * self.tolerance / error))
             if self.storage is None:
                 self._solve_u.setTolerances(rtol=rtol, atol=0.0, max_it=500)
                 self._solve_u.solve(self.momentum.residual, self._du)

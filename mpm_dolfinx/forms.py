@@ -18,6 +18,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from math import factorial, prod
 
+from mpi4py import MPI
 from petsc4py import PETSc
 
 import numpy as np
@@ -285,6 +286,55 @@ class ElementMatrices:
     def assemble_matrix(self, A: PETSc.Mat) -> None:
         """Add the matrix to `A`, by unrolled local dofs; the caller finalises it."""
         insert(A, self.points, self._sums()[:, self._entry])
+
+
+class FacetForm:
+    """A form over faces between active cells, compiled when first a process has such a face.
+
+    All processes assemble it together, for they compile it together.
+
+    Parameters
+    ----------
+    form
+        Linear or bilinear UFL form over interior facets.
+    comm
+        The processes.
+    """
+
+    def __init__(self, form: ufl.Form, comm: MPI.Intracomm):
+        self._form, self._comm = form, comm
+        self._compiled: _compat.CompiledForm | None = None
+        self._facets = np.empty(0, dtype=np.int32)
+        self._bound = False
+
+    @property
+    def used(self) -> bool:
+        """Whether the form has been needed so far."""
+        return self._compiled is not None
+
+    def place(self, facets: NDArray[np.int32]) -> None:
+        """Set the facets of this process."""
+        self._facets, self._bound = facets, False
+
+    def _bind(self) -> bool:
+        """Compile and bind the form if need be; return whether this process has a facet."""
+        if not self._bound:
+            self._bound = True
+            if self._comm.allreduce(len(self._facets)) and self._compiled is None:
+                self._compiled = _compat.CompiledForm(self._form)
+            if len(self._facets):
+                self._compiled.bind(self._facets)
+        return len(self._facets) > 0
+
+    def assemble_matrix(self, A: PETSc.Mat) -> None:
+        """Add the matrix to `A`, by unrolled local dofs; the caller finalises it."""
+        if self._bind():
+            self._compiled.assemble_matrix(A)
+
+    def assemble_vector(self, b: NDArray[np.float64]) -> None:
+        """Add the vector to the local array `b`; contributions to ghosts stay there."""
+        if self._bind():
+            self._compiled.assemble_vector(b)
 
 
 def _entries(count: int, symmetric: bool) -> tuple[NDArray, NDArray, NDArray]:

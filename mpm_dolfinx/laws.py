@@ -60,6 +60,8 @@ class SceneMaterials:
         self._law = np.array([self.laws.index(type(m)) for m in materials])
         self.stiffest = max(float(np.max(m.oedometric, initial=0.0)) for m in evaluated)
         """Largest oedometric modulus, Pa."""
+        self.conducts = any(m.conductivity_law or np.any(np.asarray(m.conductivity) > 0) for m in evaluated)
+        """Whether fluid flows anywhere."""
         self.nearly_incompressible = any(np.any(m.nearly_incompressible) for m in evaluated)
         """Whether P1 cells would lock somewhere."""
         self._fields = [[name for name in _names(m) if callable(getattr(m, name))] for m in materials]

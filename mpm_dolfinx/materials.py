@@ -80,6 +80,8 @@ class Skeleton:
     energy: ClassVar[Callable | None] = None
     kirchhoff: ClassVar[Callable | None] = None
     update: ClassVar[Callable | None] = None
+    linear: ClassVar[bool] = False
+    """Whether the stress is linear in F: one factorisation then serves for as long as the active cells stay."""
     state: ClassVar[Mapping[str, ArrayLike]] = {}
     parameters: ClassVar[tuple[str, ...]] = ()
     """Names of the fields and properties that the law's functions take."""
@@ -236,6 +238,8 @@ class LinearElastic(Skeleton):
 
     The law of the seed paper; not objective, so only for small rotations.
     """
+
+    linear: ClassVar[bool] = True
 
     @staticmethod
     def energy(F, bulk, shear):

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from mpm_dolfinx import _compat
 from mpm_dolfinx.dilatation import MeanDilatation
 from mpm_dolfinx.extend import call
-from mpm_dolfinx.forms import ElementForces, ElementMatrices, FormPoints, PointForm, StackedElementMatrices
+from mpm_dolfinx.forms import ElementForces, ElementMatrices, FacetForm, FormPoints, PointForm, StackedElementMatrices
 from mpm_dolfinx.grid import Grid
 from mpm_dolfinx.materials import Skeleton
 from mpm_dolfinx.unknowns import Unknowns, matrix, sum_ghosts, zero
@@ -54,6 +54,8 @@ class Momentum:
         DG0 pore pressure, None without fluid.
     gravity : (d,), m/s^2
         Acceleration, a UFL constant; the pieces then carry `density`, kg/m^3.
+    loaded
+        Whether the scene has tractions: points `loads` with their force.
     plates
         Whether the scene has rigid plates: points `plates` with their rigidity, normal and present tilt.
     held
@@ -72,6 +74,7 @@ class Momentum:
         fixed: NDArray[np.bool_],
         pressure: fem.Function | None = None,
         gravity: fem.Constant | None = None,
+        loaded: bool = False,
         plates: bool = False,
         held: bool = False,
         mean_dilatation: bool = False,
@@ -84,14 +87,18 @@ class Momentum:
         v, du = ufl.TestFunction(V), ufl.TrialFunction(V)
 
         self.symmetric, self.holding = symmetric, False
+        self.linear = not mean_dilatation and all(law.linear for law, _ in laws)
+        """Whether the tangent changes with the places of the points only."""
         self.dilatation = MeanDilatation(pieces, self.u, symmetric) if mean_dilatation else None
         self._residuals, self._tangents = [], []
-        self._terms: list[PointForm] = []
+        self.terms: list[PointForm] = []
         for law, points in laws:
             self._add_law(law, points, v, pressure)
 
         self.loads = FormPoints(grid, force=(grid.dim,))
-        self._traction = PointForm(ufl.inner(self.loads.force, self.loads.value(v)) * self.loads.dx, self.loads)
+        self._traction = None
+        if loaded:
+            self._traction = PointForm(ufl.inner(self.loads.force, self.loads.value(v)) * self.loads.dx, self.loads)
         self._weight = None
         if gravity is not None:
             self._weight = PointForm(pieces.density * ufl.inner(gravity, pieces.value(v)) * pieces.dx, pieces)
@@ -139,7 +146,7 @@ class Momentum:
         potential = not form.arguments()
         if potential:
             form = ufl.derivative(form, self.u, v)
-        self._terms.append(PointForm(form, self.pieces))
+        self.terms.append(PointForm(form, self.pieces))
         self._own = fem.Function(V)
         if self.u in form.coefficients():
             self._tangents.append(PointForm(ufl.derivative(form, self.u, du), self.pieces))
@@ -172,7 +179,7 @@ class Momentum:
             return ufl.dot(ufl.grad(w)("+") - ufl.grad(w)("-"), n("+"))
 
         form = GHOST / 3 * ufl.avg(self.modulus) * across * ufl.inner(kink(du), kink(v)) * dS
-        self._ghost_form = _compat.CompiledForm(form)
+        self.ghost = FacetForm(form, self.grid.comm)
 
     def set_active(self, cells: NDArray[np.int32], facets: NDArray[np.int32], partly: NDArray[np.bool_]) -> bool:
         """Number the unknowns of the active cells.
@@ -204,7 +211,7 @@ class Momentum:
             self._summed = False
             self.penalty = self._penalty_matrix()
             self.residual = self.unknowns.vector()
-            self._ghost_form.bind(facets)
+            self.ghost.place(facets)
         stiffness = float(self.modulus.x.array[cells].max(initial=0.0)) * self.grid.cell_volume / self.grid.h.min()
         self.round_off = 1e-14 * self.grid.comm.allreduce(stiffness) * np.sqrt(max(1, self.unknowns.global_size))
         return changed
@@ -224,8 +231,7 @@ class Momentum:
     def set_penalty(self) -> None:
         """Assemble what is linear in the step's increment: ghost penalty, and plates and holds at their places."""
         zero(self.penalty)
-        if len(self._facets):
-            self._ghost_form.assemble_matrix(self.penalty)
+        self.ghost.assemble_matrix(self.penalty)
         if self._plate is not None:
             self._plate.assemble_matrix(self.penalty)
         if self._hold is not None:
@@ -247,7 +253,8 @@ class Momentum:
     def set_loads(self) -> None:
         """Assemble the dead loads and the weight at the present places of points and `loads`."""
         self._f.x.array[:] = 0.0
-        self._traction.assemble_vector(self._f.x.array)
+        if self._traction is not None:
+            self._traction.assemble_vector(self._f.x.array)
         if self._weight is not None:
             self._weight.assemble_vector(self._f.x.array)
         if self._plate is not None:
@@ -275,7 +282,7 @@ class Momentum:
         sum_ghosts(self._b)
         owned = self._owned()
         squares = [b[owned] @ b[owned], self._external[owned] @ self._external[owned]]
-        if self._terms:
+        if self.terms:
             own = self._assemble_terms()[owned]
             squares.append(own @ own)
             b[owned] += own
@@ -292,7 +299,7 @@ class Momentum:
     def _assemble_terms(self) -> NDArray[np.float64]:
         """Return the nodal forces of the user's terms at u."""
         self._own.x.array[:] = 0.0
-        for term in self._terms:
+        for term in self.terms:
             term.assemble_vector(self._own.x.array)
         return sum_ghosts(self._own)
 

@@ -66,6 +66,7 @@ class Checkpoint:
             due = comm.bcast(time.monotonic() - self._last >= self.seconds)
         if due or result.converged:
             save(simulation, Path(self.file))
+            simulation.coupler.forget()  # as after `resume`
             self._last = time.monotonic()
 
 

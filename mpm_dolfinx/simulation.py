@@ -11,7 +11,7 @@ from dolfinx import fem
 from dolfinx.common import Timer
 from numpy.typing import ArrayLike, NDArray
 
-from mpm_dolfinx import _compat
+from mpm_dolfinx import _compat, summary
 from mpm_dolfinx.boundary import Boundary
 from mpm_dolfinx.conditions import Displacement, Drained, Inflow, RigidPlate, Traction
 from mpm_dolfinx.coupling import COUPLINGS, Coupler, Report
@@ -106,6 +106,10 @@ class Simulation:
         self.result: Result | None = None
         """Histories of the last run, also while it runs."""
 
+    def __str__(self) -> str:
+        """Return a table of the terms and solvers that the scene has, and why it does without the others."""
+        return summary.table(self)
+
     # ---- building -------------------------------------------------------------------------------
 
     def _fixed_nodes(self, fixed: Mapping[str, str]) -> NDArray[np.bool_]:
@@ -132,11 +136,12 @@ class Simulation:
         if fluid and scene.conductivity_laws:
             shapes |= {"conductivity": (), "porosity0": ()}
         self.pieces = FormPoints(grid, **shapes)
-        self._parts = scene.parts(self.pieces, ["F", "biot"] if fluid else ["F"])
+        self.laws = scene.parts(self.pieces, ["F", "biot"] if fluid else ["F"])
         p = fem.Function(_compat.function_space(grid.mesh, "DG", 0)) if fluid else None
-        conditions = bool(self.boundary.plates), bool(self.boundary.holds)
+        side = self.boundary
+        conditions = bool(side.loads), bool(side.plates), bool(side.holds)
         options = {"mean_dilatation": scene.nearly_incompressible, "symmetric": scene.symmetric}
-        self.momentum = Momentum(grid, self.pieces, self._parts, fixed, p, self.gravity, *conditions, **options)
+        self.momentum = Momentum(grid, self.pieces, self.laws, fixed, p, self.gravity, *conditions, **options)
         self._time = fem.Constant(grid.mesh, 0.0)
         for term in terms:
             self.momentum.add(term, self._time)
@@ -145,7 +150,9 @@ class Simulation:
             coupling = "schur-fgmres"
         if fluid:
             weight = None if self.gravity is None else fluid.density * self.gravity
-            self.storage = Storage(grid, self.pieces, self.momentum.u, p, weight, coupling != "schur-fgmres")
+            self.storage = Storage(
+                grid, self.pieces, self.momentum.u, p, weight, coupling != "schur-fgmres", scene.conducts
+            )
             for source in sources:
                 self.storage.add(source, self._time)
             self._conductivity = ConductivityAtPieces(scene, self.pieces)
@@ -212,9 +219,9 @@ class Simulation:
                 **{name: place.to_cells(values) for name, values in self._fields(J).items()},
                 **({"displacement": place.pieces_to_cells(self._displacement())} if self._extended else {}),
             )
-            if len(self._parts) > 1:
+            if len(self.laws) > 1:
                 law = place.to_cells(self._scene.law_of(self.points))
-                for number, (_, part) in enumerate(self._parts):
+                for number, (_, part) in enumerate(self.laws):
                     part.take(self.pieces, np.flatnonzero(law == number))
             self._activate(J)
 

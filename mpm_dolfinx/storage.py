@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx import _compat
 from mpm_dolfinx.extend import call
-from mpm_dolfinx.forms import ElementForces, FormPoints, PointForm
+from mpm_dolfinx.forms import ElementForces, FacetForm, FormPoints, PointForm
 from mpm_dolfinx.grid import Grid, sum_by
 from mpm_dolfinx.unknowns import Unknowns, matrix, sum_ghosts, zero
 
@@ -56,6 +56,8 @@ class Storage:
     symmetric
         Leave S (p - p_n) dJ_Delta out of the Jacobian, which then is symmetric; it is of the order of
         (p - p_n) / K_w, so Newton's method converges as fast.
+    flows
+        Whether anything conducts; without, there are no fluxes.
     """
 
     def __init__(
@@ -66,6 +68,7 @@ class Storage:
         pressure: fem.Function,
         weight: ufl.core.expr.Expr | None = None,
         symmetric: bool = True,
+        flows: bool = True,
     ):
         self.grid, self.p = grid, pressure
         Q = pressure.function_space
@@ -83,8 +86,9 @@ class Storage:
         self._coupling = ElementForces(ufl.diff(strain if symmetric else stored, delta), pieces)
         self._momentum_coupling = self._coupling if symmetric else ElementForces(ufl.diff(strain, delta), pieces)
         self.symmetric, self._pieces = symmetric, pieces
-        self._sources: list[tuple[PointForm, PointForm | None]] = []
+        self.sources: list[tuple[PointForm, PointForm | None]] = []
         self._slot = np.empty(grid.num_local, dtype=np.int64)  # of active owned cells: place in the vectors
+        self.flows, self.damped = flows, False
         self._fluxes(Q, q, dp, weight)
 
     def add(self, source: Callable, t: fem.Constant) -> None:
@@ -94,12 +98,12 @@ class Storage:
         one.x.array[:] = 1.0
         form = call(source, points=points, q=ufl.TestFunction(Q), p=self.p, t=t)
         slope = PointForm(ufl.derivative(form, self.p, one), points) if self.p in form.coefficients() else None
-        self._sources.append((PointForm(form, points), slope))
+        self.sources.append((PointForm(form, points), slope))
 
     def _assemble_sources(self, slope: bool = False) -> NDArray[np.float64]:
         """Return the rate of the sources in each active cell at p (m^d/s), or its derivative by the cell's p."""
         self._gain.x.array[:] = 0.0
-        for forms in self._sources:
+        for forms in self.sources:
             if forms[slope] is not None:
                 forms[slope].assemble_vector(self._gain.x.array)
         return self._gain.x.array[self.unknowns.owned]
@@ -129,20 +133,19 @@ class Storage:
         k0, k1 = self.mobility("+"), self.mobility("-")
         T = share * k0 * k1 / (d0 * k1 + d1 * k0 + 1e-300)
         dS = ufl.Measure("dS", domain=mesh, subdomain_id=_compat.SUBDOMAIN, metadata={"quadrature_degree": 0})
-        self._flux = _compat.CompiledForm(T * ufl.jump(dp) * ufl.jump(q) * dS)
+        self.flux = FacetForm(T * ufl.jump(dp) * ufl.jump(q) * dS, self.grid.comm)
         self.damping = fem.Function(Q)
         self._dt = fem.Constant(mesh, 0.0)
         damped = ufl.max_value(ufl.avg(self.damping) * share * (d0 + d1) - self._dt * T, 0.0)
-        self._damp = _compat.CompiledForm(damped * ufl.jump(dp) * ufl.jump(q) * dS)
+        self.damp = FacetForm(damped * ufl.jump(dp) * ufl.jump(q) * dS, self.grid.comm)
         self.fixed_stress = fem.Function(Q)
         smaller = ufl.min_value(self.fixed_stress("+"), self.fixed_stress("-"))
-        self._alternation = _compat.CompiledForm(
-            smaller / (4 * d) * across / self.grid.cell_volume * ufl.jump(dp) * ufl.jump(q) * dS
-        )
-        self._gravity = None
-        if weight is not None:
+        alternation = smaller / (4 * d) * across / self.grid.cell_volume * ufl.jump(dp) * ufl.jump(q) * dS
+        self._alternation = FacetForm(alternation, self.grid.comm)
+        self.gravity = None
+        if weight is not None and self.flows:
             apart = across * n0 + self.centroid("-") - self.centroid("+")
-            self._gravity = _compat.CompiledForm(T * ufl.dot(weight, apart) * ufl.jump(q) * dS)
+            self.gravity = FacetForm(T * ufl.dot(weight, apart) * ufl.jump(q) * dS, self.grid.comm)
 
     def set_active(self, cells: NDArray[np.int32], facets: NDArray[np.int32]) -> None:
         """Number the unknowns of the active cells; `facets` are the faces between two of them."""
@@ -153,11 +156,9 @@ class Storage:
         self.L = matrix(self.unknowns, self.unknowns, 2 * self.grid.dim + 1)
         self.C = self.P = None
         self.residual, self._p, self._rate, self._p_start = (self.unknowns.vector() for _ in range(4))
-        for form in (self._flux, self._damp, self._alternation):
-            form.bind(facets)
-        if self._gravity is not None:
-            self._gravity.bind(facets)
-        self._has_facets = len(facets) > 0
+        for form in (self.flux, self.damp, self._alternation, self.gravity):
+            if form is not None:
+                form.place(facets)
 
     def set_coupled(self, momentum: Unknowns) -> None:
         """Make the coupling matrices for the unknowns of the displacement."""
@@ -211,9 +212,11 @@ class Storage:
         for f in (self.mobility, self.damping, self.fixed_stress, self.p_n, *self._shapes()):
             f.x.scatter_forward()
         zero(self.L)
-        if self._has_facets:
-            self._alternation.assemble_matrix(self.L)
+        self._alternation.assemble_matrix(self.L)
         self.L.assemble()
+        if self.C is None:
+            _add_diagonal(self.L, np.zeros(self.unknowns.size))  # of a cell without faces
+            self.C, self.P = self.L.duplicate(), self.L.duplicate()
 
     def _total(self, cells: NDArray[np.int32], values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Sum values over the rows of each active owned cell."""
@@ -230,8 +233,7 @@ class Storage:
         if self.damped:
             self._dt.value = dt
             zero(self.D)
-            if self._has_facets:
-                self._damp.assemble_matrix(self.D)
+            self.damp.assemble_matrix(self.D)
             self.D.assemble()
 
     def _shapes(self) -> tuple[fem.Function, fem.Function, fem.Function]:
@@ -255,17 +257,15 @@ class Storage:
         self._inflow = self._total(cells, inflow)
         zero(self.T)
         self._b.x.array[:] = 0.0
-        if self._has_facets:
-            self._flux.assemble_matrix(self.T)
-            if self._gravity is not None:
-                self._gravity.assemble_vector(self._b.x.array)
+        if self.flows:
+            self.flux.assemble_matrix(self.T)
+        if self.gravity is not None:
+            self.gravity.assemble_vector(self._b.x.array)
         self.unknowns.gather(sum_ghosts(self._b), self._rate)
         self._rate.array_w[:] -= self._inflow
         self.T.assemble()
         _add_diagonal(self.T, self._conductance)
         self._outflow = self.T.getDiagonal().array
-        if self.C is None:
-            self.C, self.P = self.T.duplicate(copy=True), self.T.duplicate(copy=True)
 
     def assemble_residual(self, dt: float) -> tuple[PETSc.Vec, float]:
         """Return the fluid volume out of balance in each cell at (u, p) and its scale, sum |change| (m^d)."""
@@ -285,7 +285,7 @@ class Storage:
         if self.damped:
             self.D.multAdd(p - self._p_start, r, r)
         exchanged = float(np.abs(change).sum())
-        if self._sources:
+        if self.sources:
             gain = dt * self._assemble_sources()
             r.array_w[:] -= gain
             self._change_total -= gain.sum()
@@ -308,12 +308,12 @@ class Storage:
         b = self._b.x.array
         b[:] = 0.0
         self._capacity.assemble_vector(b)
-        self.T.copy(self.C, structure=PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
-        self.C.scale(dt)
+        self.C.zeroEntries()
+        self.C.axpy(dt, self.T, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
         if self.damped:
             self.C.axpy(1.0, self.D, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
         _add_diagonal(self.C, b[self.unknowns.owned])
-        if self._sources:
+        if self.sources:
             _add_diagonal(self.C, -dt * self._assemble_sources(slope=True))
 
     def assemble_preconditioner(self, factor: float, share: float) -> PETSc.Mat:

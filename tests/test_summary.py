@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: MIT
+"""A scene is compiled to the terms that it has, and says so."""
+
+import numpy as np
+import pytest
+from helpers import SOFT, beam, column
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.summary import parts
+
+LINEAR = mpm.LinearElastic(bulk=1e7 / 3, shear=5e6, conductivity=1e-4)
+SEALED = mpm.Hencky(bulk=1e7 / 3, shear=5e6)
+STIFF = mpm.NeoHookean(bulk=1e9, shear=5e6)
+
+ALWAYS = {"stress"}
+FLUID = {"pore pressure", "coupling"}
+SCENES = {
+    "drained beam": (lambda: beam(fluid=False, load=1e3)[0], {"tractions", "ghost penalty"}),
+    "beam": (lambda: beam(load=1e3)[0], FLUID | {"tractions", "ghost penalty", "fluxes between cells", "open sides"}),
+    "sealed column": (
+        lambda: column(material=SEALED, displacements=[mpm.Displacement("top", (0, -0.01), "y")]),
+        FLUID | {"given displacements", "damping of pressure jumps"},
+    ),
+    "linear column": (
+        lambda: column(material=LINEAR, fluid=False, tractions=[mpm.Traction("top", (0, -1e3))]),
+        {"tractions", "one factorisation for many steps"},
+    ),
+    "column that drains under its weight": (
+        lambda: column(gravity=(0, -9.81), drained=[mpm.Drained("top")]),
+        FLUID | {"body force", "fluxes between cells", "weight of the fluid", "open sides"},
+    ),
+    "incompressible column under a plate": (
+        lambda: column(material=STIFF, fluid=False, plates=[mpm.RigidPlate("top", 1e3)]),
+        {"mean dilatation", "tractions", "rigid plates"},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_the_scene_has_the_terms_it_needs_and_no_others(name):
+    build, used = SCENES[name]
+    s = build()
+    s.step(1.0)
+    assert {part.name for part in parts(s) if part.used} == ALWAYS | used
+    assert all(part.why for part in parts(s))
+    assert len(str(s).splitlines()) == len(parts(s))
+
+
+def test_what_is_left_out_is_not_compiled():
+    drained, sealed = column(fluid=False), column(material=SEALED)
+    drained.step(0.01)
+    sealed.step(0.01)
+    assert drained.storage is None and drained.momentum.dilatation is None
+    assert not drained.momentum.ghost.used and drained.momentum._weight is None and drained.momentum._traction is None
+    assert not sealed.storage.flux.used and sealed.storage.gravity is None
+
+
+def test_a_linear_law_is_factorised_once_while_the_active_cells_stay():
+    s = column(material=LINEAR, tractions=[mpm.Traction("top", lambda t: (0, -1e3 * t))], drained=[mpm.Drained("top")])
+    count, linearise = [], s.coupler._linearise
+    s.coupler._linearise = lambda dt: (count.append(dt), linearise(dt))
+    result = s.run(1.0, 0.05)
+    assert len(count) == 1 and result.steps == 20 and result.residual <= 1e-8
+    s.run(1.2, 0.1)
+    assert len(count) == 2, "another step has another tangent"
+
+
+def test_a_law_that_is_not_linear_is_linearised_in_every_step():
+    s = column(material=SOFT, fluid=False, tractions=[mpm.Traction("top", lambda t: (0, -1e5 * t))])
+    count, linearise = [], s.coupler._linearise
+    s.coupler._linearise = lambda dt: (count.append(dt), linearise(dt))
+    s.run(1.0, 0.25)
+    assert len(count) >= 4 and np.isfinite(s.points.x).all()
