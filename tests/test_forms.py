@@ -7,7 +7,14 @@ import ufl
 from dolfinx import fem
 
 from mpm_dolfinx import Grid, Hencky, NeoHookean, _compat
-from mpm_dolfinx.forms import ElementMatrices, FormPoints, PointExpression, PointForm
+from mpm_dolfinx.forms import (
+    ElementForces,
+    ElementMatrices,
+    FormPoints,
+    PointExpression,
+    PointForm,
+    StackedElementMatrices,
+)
 from mpm_dolfinx.unknowns import Unknowns, matrix
 
 GRIDS = {2: Grid([1.5, 1.0], [4, 3]), 3: Grid([1.0, 1.2, 0.9], [2, 3, 2])}
@@ -111,20 +118,57 @@ def test_tangents_differentiated_by_ufl_equal_finite_differences(dim, law):
     assert np.abs(K @ direction - difference).max() < 1e-7 * np.abs(difference).max()
 
 
-def test_element_matrices_equal_the_form_point_by_point(dim):
-    s = Scene(dim, stiffness=())
-    s.place(stiffness=s.rng.uniform(1, 2, len(s.x)))
+@pytest.mark.parametrize(
+    "dim, symmetric, stacked",
+    [(2, True, False), (2, False, False), (2, True, True), (3, True, True), (3, False, True)],
+)
+def test_element_matrices_equal_the_form_point_by_point(dim, symmetric, stacked):
+    s = Scene(dim, stiffness=(), F=(dim, dim), skew=(dim, dim))
+    F = np.eye(dim) + 0.1 * s.rng.normal(size=(len(s.x), dim, dim))
+    s.place(stiffness=s.rng.uniform(1, 2, len(s.x)), F=F, skew=s.rng.normal(size=F.shape))
     i, j, k, l = ufl.indices(4)
-    one = ufl.Identity(dim)
-    A = s.points.stiffness * ufl.as_tensor(one[i, j] * one[k, l] + 0.3 * one[i, k] * one[j, l], (i, k, j, l))
+    one, p = ufl.Identity(dim), s.points
+    A = p.stiffness * ufl.as_tensor(one[i, j] * one[k, l] + 0.3 * one[i, k] * one[j, l], (i, k, j, l))
+    if not symmetric:
+        A += ufl.as_tensor(p.skew[i, k] * p.F[j, l], (i, k, j, l))
+    pull = p.F if stacked else one
     u, v = ufl.TrialFunction(s.V), ufl.TestFunction(s.V)
-    form = s.points.grad(v)[i, k] * A[i, k, j, l] * s.points.grad(u)[j, l] * s.points.dx
+    form = (p.grad(v) * pull)[i, k] * A[i, k, j, l] * (p.grad(u) * pull)[j, l] * p.dx
     unknowns = Unknowns(fem.Function(s.V), np.arange(len(fem.Function(s.V).x.array)))
-    K = matrix(unknowns, unknowns, unknowns.size)
-    ElementMatrices(A, s.points).assemble_matrix(K)
-    K.assemble()
-    expected = s.matrix(form, s.V)
-    assert np.abs(K[:, :] - expected).max() < 1e-12 * np.abs(expected).max()
+    matrices = (StackedElementMatrices if stacked else ElementMatrices)(A, p, symmetric)
+    for _ in range(2):  # anew where the points have moved
+        K = matrix(unknowns, unknowns, unknowns.size)
+        matrices.assemble_matrix(K)
+        K.assemble()
+        expected = s.matrix(form, s.V)
+        assert np.abs(K[:, :] - expected).max() < 1e-12 * np.abs(expected).max()
+        p.take(p, s.rng.permutation(len(p.cells))[: len(p.cells) // 2])
+
+
+def test_element_forces_equal_the_form_point_by_point(dim):
+    s = Scene(dim, T=(dim, dim))
+    s.place(T=s.rng.normal(size=(len(s.x), dim, dim)))
+    v, q = ufl.TestFunction(s.V), ufl.TestFunction(_compat.function_space(s.grid.mesh, "DG", 0))
+    expected = s.vector(ufl.inner(s.points.T, s.points.grad(v)) * s.points.dx, s.V)
+    forces, b = ElementForces(s.points.T, s.points), np.zeros_like(expected)
+    forces.assemble_vector(b)
+    assert np.abs(b - expected).max() < 1e-12 * np.abs(expected).max()
+    rows, columns = (Unknowns(f, np.arange(len(f.x.array))) for f in map(fem.Function, (q.ufl_function_space(), s.V)))
+    A = matrix(rows, columns, columns.size)
+    forces.assemble_matrix(A)
+    A.assemble()
+    assert np.abs(A[:, :].sum(axis=0) - expected).max() < 1e-12 * np.abs(expected).max()
+    assert np.abs(A[:, :]).sum(axis=1).nonzero()[0] == pytest.approx(s.points.filled)
+
+
+def test_the_gradient_as_data_equals_the_gradient_in_the_kernel(dim):
+    s = Scene(dim)
+    s.place()
+    u = fem.Function(s.V)
+    by_numpy, by_kernel = (PointExpression(g, s.points) for g in (s.points.gradient(u), s.points.grad(u)))
+    for _ in range(2):  # of the present u
+        u.x.array[:] = s.rng.normal(size=len(u.x.array))
+        assert by_numpy.evaluate() == pytest.approx(by_kernel.evaluate(), rel=1e-12)
 
 
 def test_moving_the_points_moves_the_form(dim):
@@ -143,11 +187,3 @@ def test_moving_the_points_moves_the_form(dim):
 def test_an_unknown_field_is_named():
     with pytest.raises(AttributeError, match="carry offset, weight, not 'sigma'"):
         _ = FormPoints(GRIDS[2]).sigma
-
-
-def test_an_expression_is_right_when_it_is_evaluated_first():
-    """Fewer points than cells: nothing but the first call may make room for the rows."""
-    points = FormPoints(GRIDS[2], a=())
-    x = GRIDS[2].midpoints[:2]
-    points.place(np.arange(2, dtype=np.int32), x, np.ones(2), a=np.array([3.0, 4.0]))
-    assert PointExpression(points.a**2, points).evaluate() == pytest.approx([9.0, 16.0])
