@@ -144,9 +144,13 @@ class Simulation:
             shapes |= {"density": ()}
         self._extended = bool(terms or sources)
         if self._extended:
-            shapes |= {"displacement": (d,), **{name: v.shape[1:] for name, v in self.points.data.items()}}
+            shapes |= {
+                "position": (d,),
+                "displacement": (d,),
+                **{name: v.shape[1:] for name, v in self.points.data.items()},
+            }
         if fluid and scene.conductivity_laws:
-            shapes |= {"conductivity": (), "porosity0": ()}
+            shapes |= {"position": (d,), "conductivity": (), "porosity0": ()}
         self.pieces = FormPoints(grid, **shapes)
         self.laws = scene.parts(self.pieces, ["F", "biot"] if fluid else ["F"])
         p = fem.Function(_compat.function_space(grid.mesh, "DG", 0)) if fluid else None
@@ -317,7 +321,7 @@ class Simulation:
                 place.pieces_to_cells(place.pieces.x),
                 place.pieces_to_cells(place.pieces.fraction * (self.points.volume0 * J)[place.pieces.point]),
                 **{name: place.to_cells(values) for name, values in self._fields(J).items()},
-                **({"displacement": place.pieces_to_cells(self._displacement())} if self._extended else {}),
+                **{name: place.pieces_to_cells(values) for name, values in self._piece_fields().items()},
             )
             if len(self.laws) > 1:
                 law = place.to_cells(self._scene.law_of(self.points))
@@ -338,6 +342,15 @@ class Simulation:
         if self.gravity is not None:
             wet = self.fluid.density if self.fluid else 0.0
             fields["density"] = (1 - n) * self._table(lambda m: m.grain_density) + n * wet
+        return fields
+
+    def _piece_fields(self) -> dict[str, NDArray[np.float64]]:
+        """Return what differs from piece to piece of a point, where functions of the user's may ask for it."""
+        fields = {}
+        if self._extended or (self.fluid and self._scene.conductivity_laws):
+            fields["position"] = self.placement.pieces.x
+        if self._extended:
+            fields["displacement"] = self._displacement()
         return fields
 
     def _displacement(self) -> NDArray[np.float64]:

@@ -356,7 +356,7 @@ CASES = {
     "unknown argument of a conductivity": (
         lambda: column(material=replace(SOFT, conductivity_law=lambda stress: stress)), "argument 'stress', must be"),
     "negative conductivity": (
-        lambda: column(material=replace(SOFT, conductivity_law=lambda J: 1 - 2 * J)).step(1.0), "k = -1.0 at .* >= 0"),
+        lambda: column(material=replace(SOFT, conductivity_law=lambda J: 1 - 2 * J)).step(1.0), "k = -1 at .* >= 0"),
     "state in the reference": (
         lambda: BiotFEM([0, 0], [1, 1], (2, 2), Damaged(1, 1), fixed={}), "the reference has no state"),
 }  # fmt: skip
