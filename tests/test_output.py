@@ -112,7 +112,7 @@ def test_domains_in_3d_are_hexahedra(tmp_path):
 
 
 def test_fields_of_the_grid_are_read_back_as_they_were(written):
-    _, folder, states = written
+    simulation, folder, states = written
     for (file,), k in zip(index(folder / "grid.pvd").values(), (3, 6, 7), strict=True):
         found, (u, fill, p) = fields(file), states[k][2:]
         x = found["x"].reshape(-1, 3)[:, :2]
