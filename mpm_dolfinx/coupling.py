@@ -51,7 +51,7 @@ class NotConverged(RuntimeError):
         finite = [h for h in history if np.isfinite(h).all()]
         worst = "momentum" if not finite or finite[-1][0] >= finite[-1][1] else "storage"
         shown = ", ".join(f"({u:.1e}, {p:.1e})" for u, p in finite[-4:])
-        super().__init__(f"{reason}; worst in {worst}; last residuals (momentum, storage): {shown}")
+        super().__init__(reason + (f"; worst in {worst}; last residuals (momentum, storage): {shown}" if shown else ""))
         self.reason, self.field, self.history = reason, worst, history
 
 
