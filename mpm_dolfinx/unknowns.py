@@ -8,6 +8,8 @@ dolfinx assemble straight into them: PETSc ignores negative indices.
 
 from __future__ import annotations
 
+from itertools import combinations
+
 from petsc4py import PETSc
 
 import numpy as np
@@ -64,7 +66,7 @@ class Unknowns:
         modes = np.concatenate([direction, np.empty((self.size, d * (d - 1) // 2))], axis=1)
         x = x - self.comm.allreduce(x.sum(axis=0)) / self.global_size
         x /= np.sqrt(self.comm.allreduce(float(np.square(x).sum())) / self.global_size)
-        for k, (a, b) in enumerate((a, b) for a in range(d) for b in range(a)):
+        for k, (a, b) in enumerate(combinations(range(d), 2)):
             modes[:, d + k] = direction[:, a] * x[:, b] - direction[:, b] * x[:, a]
         size, turn = np.linalg.eigh(self.comm.allreduce(modes.T @ modes))
         kept = size > 1e-10 * size.max()
