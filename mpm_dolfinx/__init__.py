@@ -4,7 +4,7 @@
 from mpm_dolfinx.conditions import Displacement, Drained, Inflow, RigidPlate, Traction
 from mpm_dolfinx.coupling import COUPLINGS, NotConverged
 from mpm_dolfinx.grid import Grid
-from mpm_dolfinx.materials import LAWS, Fluid, Hencky, LinearElastic, NeoHookean, Skeleton, kozeny_carman
+from mpm_dolfinx.materials import LAWS, Field, Fluid, Hencky, LinearElastic, NeoHookean, Skeleton, kozeny_carman
 from mpm_dolfinx.output import Writer
 from mpm_dolfinx.plasticity import DruckerPrager
 from mpm_dolfinx.points import box, probes, shape
@@ -20,6 +20,7 @@ __all__ = [
     "Displacement",
     "Drained",
     "DruckerPrager",
+    "Field",
     "Fluid",
     "GaveUp",
     "Grid",

@@ -111,11 +111,6 @@ class FormPoints:
         self.data = {name: points.data[name][rows] for name in self._functions if name not in self._live}
         self.version += 1
 
-    @property
-    def position(self):
-        """Position of the point as UFL, m."""
-        return ufl.SpatialCoordinate(self.grid.mesh) + self.offset
-
     def value(self, f):
         """Return f at the point, f a P1 function, test or trial function (any shape)."""
         return self._taylor(f, self.grid.dim)

@@ -24,7 +24,9 @@ RESERVED = (
     "weight",
     "storage",
     "density",
+    "position",
     "displacement",
+    "porosity0",
     "grid",
     "dx",
     "cells",
@@ -281,7 +283,7 @@ class ConductivityAtPieces:
     scene
         The scene's materials.
     pieces
-        Points with the fields F, conductivity and porosity0, where a material has a conductivity law.
+        Points with the fields F, position, conductivity and porosity0, where a material has a conductivity law.
     """
 
     def __init__(self, scene: SceneMaterials, pieces: FormPoints):
@@ -309,5 +311,5 @@ class ConductivityAtPieces:
             out[chosen] = expression.evaluate()[chosen]
             bad = np.flatnonzero(chosen & ~(out >= 0))
             if len(bad):
-                raise ValueError(f"conductivity law: k = {out[bad[0]]} at {self._points.x[bad[0]]}, must be >= 0")
+                raise ValueError(f"conductivity law: k = {out[bad[0]]:g} at {self._points.x[bad[0]]}, must be >= 0")
         return out

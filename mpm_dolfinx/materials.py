@@ -93,8 +93,9 @@ class Skeleton:
         cls.parameters = tuple(name for name in names if name != "F" and name not in cls.state)
 
     def __post_init__(self):
-        for name in ("bulk", "shear", "grain_bulk"):
-            _check(self, name, lambda v: 0 < v, "> 0")
+        for name in ("bulk", "shear"):
+            _check(self, name, lambda v: (0 < v) & (v < inf), "> 0 and finite")
+        _check(self, "grain_bulk", lambda v: 0 < v, "> 0")
         for name in ("conductivity", "grain_density"):
             _check(self, name, lambda v: (0 <= v) & (v < inf), ">= 0 and finite")
         _check(self, "porosity", lambda v: (0 < v) & (v < 1), "in (0, 1)")

@@ -30,8 +30,9 @@ from tqdm import tqdm
 from mpm_dolfinx import _compat
 from mpm_dolfinx.conditions import RIGIDITY, Drained, RigidPlate, Traction
 from mpm_dolfinx.coupling import NotConverged
+from mpm_dolfinx.extend import call
 from mpm_dolfinx.grid import Grid, side
-from mpm_dolfinx.materials import Fluid, Skeleton
+from mpm_dolfinx.materials import Field, Fluid, Skeleton
 from mpm_dolfinx.points import Region
 from mpm_dolfinx.timeloop import GaveUp, Result
 
@@ -49,7 +50,7 @@ class BiotFEM:
     cells : (d,)
         Number of cells along each axis, at least 1.
     material, fluid
-        Skeleton and pore fluid, whose pressure is zero at the start.
+        Skeleton without state, and pore fluid, whose pressure is zero at the start.
     fixed
         Sides with the components that are zero there, such as {"left": "xy"}.
     tractions, drained, plates
@@ -85,9 +86,14 @@ class BiotFEM:
             raise ValueError("drained sides need a fluid")
         if fluid is not None and gravity is not None:
             raise ValueError("gravity with a fluid: the reference has none; leave out one of them")
+        if material.state or callable(material.porosity) or callable(material.biot) or callable(material.grain_bulk):
+            raise ValueError(
+                f"{type(material).__name__}: the reference has no state, and only moduli, conductivity and "
+                "parameters of the law may be functions of place"
+            )
         self.grid, self.material, self.fluid = Grid(upper, cells, lower, comm), material, fluid
         self.t, self.tolerance = 0.0, tolerance
-        self.scale = material.oedometric
+        self.scale = float(np.max(material.at(self.grid.midpoints).oedometric))
         """Unit of the pressure among the unknowns, Pa; both equations are divided by it."""
         self._make_spaces(*ELEMENTS[element])
         self._bcs = self._conditions(fixed, drained if element == "taylor-hood" else ())
@@ -101,6 +107,16 @@ class BiotFEM:
 
     def _constant(self, value: ArrayLike) -> fem.Constant:
         return fem.Constant(self.grid.mesh, np.asarray(value, dtype=float))
+
+    def _field(self, value: Field) -> fem.Constant | fem.Function:
+        """Return a parameter as UFL, one that is a function of place as its quadratic interpolant in the cells."""
+        if not callable(value):
+            return self._constant(value)
+        d = self.grid.dim
+        shape = np.shape(value(self.grid.midpoints[:1]))[1:]
+        f = fem.Function(_compat.function_space(self.grid.mesh, "DG", 2, shape))
+        f.interpolate(lambda x: np.asarray(value(x[:d].T), dtype=float).T)
+        return f
 
     def _make_spaces(self, degree: int, pressure: tuple[str, int, tuple[int, ...]]) -> None:
         """Make the space of the unknowns w = (u, p/scale), or of w = u."""
@@ -162,15 +178,21 @@ class BiotFEM:
         dx = ufl.dx(domain=self.grid.mesh, metadata={"quadrature_degree": 2 * self._degree})
         F, F_n = (ufl.variable(ufl.Identity(self.grid.dim) + ufl.grad(f)) for f in (u, u_n))
         J, J_n, alpha = ufl.det(F), ufl.det(F_n), self._constant(law.biot)
-        parameters = {name: self._constant(getattr(law, name)) for name in law.parameters}
+        parameters = {name: self._field(getattr(law, name)) for name in law.parameters}
         P = law.first_piola(F, parameters) / self._constant(self.scale) - alpha * p * ufl.diff(J, F)
         residual = ufl.inner(P, ufl.grad(v)) * dx
         if self.fluid:
             # S is linear in the porosity, and its constants stay finite where a bulk modulus is infinite
             S_0, S_1 = (self.scale * law.storage(self.fluid.bulk, n) for n in (0.0, 1.0))
-            S = self._constant(S_0) + self._constant(S_1 - S_0) * (1 - self._constant(1 - law.porosity) / J_n)
+            n = 1 - self._constant(1 - law.porosity) / J_n
+            S = self._constant(S_0) + self._constant(S_1 - S_0) * n
             residual += (alpha * (J - J_n) + S * J * (p - p_n)) * q * dx
-            kappa = self._dt * self._constant(self.scale * law.conductivity / self.fluid.unit_weight)
+            k = self._field(law.conductivity)
+            if law.conductivity_law is not None:
+                porosity = {"porosity": n, "porosity0": self._constant(law.porosity)}
+                x = ufl.SpatialCoordinate(self.grid.mesh) + u_n
+                k = call(law.conductivity_law, conductivity=k, F=F_n, J=J_n, x=x, **porosity)
+            kappa = self._dt * self._constant(self.scale / self.fluid.unit_weight) * k
             pull = ufl.inv(F).T
             if outlets is None:
                 residual += kappa * J * ufl.inner(pull * ufl.grad(p), pull * ufl.grad(q)) * dx
@@ -196,7 +218,8 @@ class BiotFEM:
         stretch = J * ufl.inner(pull * normal, pull * normal)
         across = sum(abs(normal[a]) * h[a] for a in range(self.grid.dim))
         dS = ufl.dS(domain=self.grid.mesh, metadata={"quadrature_degree": 2})
-        flux = kappa * ufl.avg(stretch) / across("+") * ufl.jump(p) * ufl.jump(q) * dS
+        harmonic = 2 * kappa("+") * kappa("-") / (kappa("+") + kappa("-") + 1e-300)
+        flux = harmonic * ufl.avg(stretch) / across("+") * ufl.jump(p) * ufl.jump(q) * dS
         for o in outlets:
             flux += self._on(o, 2 * kappa * stretch / across * (p - self._constant(o.pressure / self.scale)) * q)
         return flux

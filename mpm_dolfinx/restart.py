@@ -12,7 +12,6 @@ import os
 import time
 import zlib
 from dataclasses import dataclass, field, fields
-from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -66,12 +65,11 @@ class Checkpoint:
             due = comm.bcast(time.monotonic() - self._last >= self.seconds)
         if due or result.converged:
             save(simulation, Path(self.file))
-            simulation.coupler.forget()  # as after `resume`
             self._last = time.monotonic()
 
 
 def save(simulation: Simulation, file: Path) -> None:
-    """Write the state of a simulation between two steps of a run."""
+    """Write the state of a simulation between two steps of a run, and go on as after `resume`."""
     comm, began = simulation.grid.comm, time.perf_counter()
     points, carried, result = simulation.points, simulation.carried, vars(simulation.result)
     state = {"points": vars(points.migrated(to_root(comm, len(points))))}
@@ -82,11 +80,13 @@ def save(simulation: Simulation, file: Path) -> None:
     note["result"] = {name: value for name, value in result.items() if name not in LISTS}
 
     def write() -> int:
+        file.parent.mkdir(parents=True, exist_ok=True)
         with replacing(file) as part, open(part, "wb") as f:
             np.savez(f, format=np.array(FORMAT), note=np.array(json.dumps(note)), **_named("", state))
         return file.stat().st_size
 
     size = at_root(comm, write)
+    simulation.coupler.forget()
     seconds = time.perf_counter() - began
     log(comm, "t = %g s: checkpoint %s written: %.3g MB, %.2g s", simulation.t, file, size / 1e6, seconds)
 
@@ -98,7 +98,8 @@ def resume(simulation: Simulation, file: str | os.PathLike) -> Result:
     ----------
     simulation
         The scene of the checkpoint, on any number of processes.  Grid, bodies, materials and fluid are
-        compared with the file; loads and boundary conditions may differ.
+        compared with the file; loads and boundary conditions may differ.  What observers have gathered for
+        themselves is not in the file.
     file
         The checkpoint.
 
@@ -163,6 +164,7 @@ def describe(simulation: Simulation) -> dict[str, Any]:
     grid = simulation.grid
     scene = {"grid cells": grid.shape.tolist(), "grid lower": grid.lower.tolist(), "grid upper": grid.upper.tolist()}
     scene["quadrature"] = simulation.quadrature
+    scene["bodies present"] = list(simulation.present)
     for i, body in enumerate(simulation.bodies):
         scene[f"points of body {i}"] = len(body)
         scene[f"material of body {i}"] = int(body.material)
@@ -171,7 +173,8 @@ def describe(simulation: Simulation) -> dict[str, Any]:
     for name, one in [(f"material {i}", m) for i, m in enumerate(simulation.materials)] + [("fluid", simulation.fluid)]:
         scene[name] = None if one is None else type(one).__name__
         constants = {f.name: getattr(one, f.name) for f in fields(one)} if one is not None else {}
-        scene |= {f"{key} of {name}": float(v) for key, v in constants.items() if isinstance(v, Real)}
+        constants = {key: value for key, value in constants.items() if value is not None and not callable(value)}
+        scene |= {f"{key} of {name}": np.asarray(value).tolist() for key, value in constants.items()}
     scene["data of the points"] = sorted(simulation.points.data)
     return scene
 

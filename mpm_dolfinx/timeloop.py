@@ -6,7 +6,9 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field
+from math import inf
 from typing import TYPE_CHECKING
 
 from mpi4py import MPI
@@ -15,6 +17,7 @@ import numpy as np
 from dolfinx.common import Timer
 from numpy.typing import NDArray
 from tqdm import tqdm
+from tqdm.contrib.logging import logging_redirect_tqdm
 
 from mpm_dolfinx import _compat
 from mpm_dolfinx.coupling import NotConverged
@@ -112,7 +115,7 @@ def run(
     t_end
         End time, s.
     dt
-        Step and output interval, s, > 0.
+        Step and output interval, s, > 0; one step to t_end where it is longer than that.
     probes
         Particles whose displacement is recorded.
     observe
@@ -130,14 +133,15 @@ def run(
         With the histories so far; `points` and `t` are those of the last good step.
     """
     result = simulation.result = _histories(simulation, t_end, dt, probes, after)
-    start, done = result.t[0], len(result.t) - 1
+    dt, start, done = result.dt, result.t[0], len(result.t) - 1
     # a last interval that is a fraction of dt counts as one
     intervals = max(done + (t_end - simulation.t > 1e-9 * dt), round((t_end - start) / dt))
     result.converged = done == intervals
     observers = [observe] if callable(observe) else observe
     stopwatch = _Stopwatch(result)
     quiet = None if progress and simulation.grid.comm.rank == 0 else True
-    with tqdm(total=intervals, initial=done, disable=quiet, unit="step") as bar:
+    bar = tqdm(total=intervals, initial=done, disable=quiet, unit="step")
+    with bar, nullcontext() if bar.disable else logging_redirect_tqdm():  # messages above the bar, not into it
         for k in range(done + 1, intervals + 1):
             target = t_end if k == intervals else start + k * dt
             while target - simulation.t > 1e-9 * dt:
@@ -160,8 +164,9 @@ def run(
 
 def _histories(simulation, t_end: float, dt: float, probes: Probes | None, after: Result | None) -> Result:
     """Return new histories that begin with the present state, or those to go on with."""
-    if not (dt > 0 and (t_end >= simulation.t if after else t_end > simulation.t)):
-        raise ValueError(f"dt = {dt!r}, t_end = {t_end!r}: must be dt > 0 and t_end > {simulation.t:g}")
+    if not (dt > 0 and (t_end >= simulation.t if after else t_end > simulation.t) and t_end < inf):
+        raise ValueError(f"dt = {dt!r}, t_end = {t_end!r}: must be dt > 0 and t_end > {simulation.t:g} and finite")
+    dt = min(dt, t_end - (after.t[0] if after else simulation.t))
     if after is None:
         result = Result(dt=dt, small=dt)
         _record(simulation, result, probes)

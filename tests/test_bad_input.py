@@ -41,6 +41,7 @@ CASES = {
     "no step": (lambda: scene().run(1.0, 0.0), "must be dt > 0"),
     "negative step": (lambda: scene().step(-1.0), "dt = -1.0, must be > 0"),
     "end before start": (lambda: scene().run(-1.0, 0.1), "t_end > 0"),
+    "no end": (lambda: scene().run(np.inf, 0.1), "t_end = inf: must be .* finite"),
     "nothing holds the body": (lambda: scene(fixed={"right": "xy"}).run(1, 1), "3 of 3 ways"),
     "the body may turn": (lambda: scene(fixed={"left": "x"}).run(1, 1), "1 of 3 ways"),
 }

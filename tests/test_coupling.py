@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: MIT
 """The coupler: schemes agree, steps are cut and grow, giving up is clear and keeps the state."""
 
+from dataclasses import replace
+
 import coupling_iterations as demo
 import numpy as np
 import pytest
-from helpers import beam
+from helpers import SOFT, beam
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.storage import FILTER
@@ -73,17 +75,19 @@ OWN = ("Schur-CG",)
 
 @pytest.mark.parametrize("scene", demo.SCENES)
 def test_a_linear_solve_takes_few_iterations_from_drained_to_undrained_whatever_the_cell_size(scene):
-    """To 1e-8, k from 1e-14 to 1e2 m/s, steps from 1e-9 to 1e9 s, water from 1e4 Pa to incompressible."""
+    """To 1e-8, from k = 1e-14 m/s, dt = 1e-9 s to k = 1e2 m/s, dt = 1e9 s, water from 1e4 Pa to incompressible."""
     most = [demo.worst(demo.scan(scene, h, schemes=OWN)) for h in (0.06, 0.03)]
     assert max(most) <= 14 and np.ptp(most) <= 1
 
 
 def test_only_the_product_of_conductivity_and_step_matters():
-    s, counts = demo.cantilever(0.06), set()
-    for conductivity, dt in ((1e-14, 1e6), (1e-8, 1.0), (1e1, 1e-9)):
-        demo.linearise(s, conductivity, dt, 2.2e9)
-        counts.add(demo.count(s, "Schur-CG")[0])
-    assert len(counts) == 1
+    counts = []
+    for k_dt in (1e-8, 1e-6):
+        for conductivity in (1e-14, 1e-8, 1e2):
+            s, _ = beam(material=replace(SOFT, conductivity=conductivity))
+            demo.linearise(s, k_dt / conductivity, 2.2e9)
+            counts.append(demo.count(s, "Schur-CG")[0])
+    assert len(set(counts[:3])) == len(set(counts[3:])) == 1 and counts[0] > counts[3]
 
 
 def test_the_plain_fixed_stress_iteration_needs_more_and_the_papers_beta_diverges():
@@ -121,3 +125,31 @@ def test_the_undrained_pressure_has_no_checkers():
         assert rough[h, "damped"] < 0.4 * rough[h, "undamped"]
     assert rough[0.03, "damped"] < 0.006
     assert rough[0.03, "damped"] < 0.35 * rough[0.06, "damped"], "what is left is not the curvature of the pressure"
+
+
+def slender(thrust, side_load):
+    """Return a cantilever of 1 m x 0.1 m, pressed by a multiple of its buckling load, and its tip."""
+    grid = mpm.Grid([1.2, 1.6], [48, 64])
+    body = mpm.box(grid, [0, 1.2], [1, 1.3])
+    critical = np.pi**2 * 1e7 * 0.1**2 / 12 / 4  # Pa
+    press = mpm.Traction("right", lambda t: (-thrust * critical * t, 0))
+    push = mpm.Traction("top", lambda t: (0, -side_load * t))
+    s = mpm.Simulation(grid, [body], [SOFT], fixed={"left": "xy"}, tractions=[press, push])
+    return s, mpm.probes([body], [[1, 1.25]])
+
+
+def test_a_slender_body_pressed_at_once_beyond_its_buckling_load_buckles():
+    tips = []
+    for dt in (1.0, 0.05):
+        s, probe = slender(1.6, 200.0)
+        result = s.run(1.0, dt, probes=probe)
+        tips.append(result.displacement[-1][0])
+        assert (result.cuts > 0) == (dt == 1.0), "the straight equilibrium is unstable and must be refused"
+    assert tips[1][1] < -0.6 and tips[0] == pytest.approx(tips[1], abs=0.05)
+
+
+def test_a_body_that_nothing_disturbs_has_no_stable_equilibrium_beyond_its_buckling_load():
+    s, _ = slender(1.6, 0.0)
+    with pytest.raises(mpm.GaveUp, match="the equilibrium is unstable, its tangent has 1 negative eigenvalue"):
+        s.run(1.0, 0.05)
+    assert 0.6 < s.t < 0.7  # it stood up to its buckling load, at 1 / 1.6

@@ -63,6 +63,7 @@ def test_a_tiny_strain_gives_a_tiny_stress(law, dim):
     [
         ({"bulk": -1.0}, "bulk = -1.0, must be > 0"),
         ({"shear": 0.0}, "shear = 0.0, must be > 0"),
+        ({"bulk": inf}, "bulk = inf, must be > 0 and finite"),
         ({"porosity": 1.0}, r"porosity = 1.0, must be in \(0, 1\)"),
         ({"porosity": -0.1}, r"porosity = -0.1, must be in \(0, 1\)"),
         ({"conductivity": -1e-4}, "conductivity = -0.0001, must be >= 0"),

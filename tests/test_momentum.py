@@ -48,6 +48,26 @@ def test_the_load_is_the_traction_times_the_area_also_where_a_domain_is_partly_l
     assert s.momentum._external.reshape(-1, 2).sum(axis=0) == pytest.approx([0, -54e3 * 0.95], rel=1e-12)
 
 
+@pytest.mark.parametrize("strain", [1e-3, 1e-9])
+def test_a_tiny_load_is_carried_however_stiff_a_part_of_the_body_is(strain):
+    """Round-off in the stiff part is larger than the load."""
+    grid = mpm.Grid([0.1, 1.0], [1, 10])
+    bodies = [mpm.box(grid, [0, 0], [0.1, 0.5]), mpm.box(grid, [0, 0.5], [0.1, 1.0], material=1)]
+    soft, hard = mpm.Hencky(bulk=1e5, shear=1e5), mpm.Hencky(bulk=1e13, shear=1e13)
+    fixed = {"left": "x", "right": "x", "bottom": "y"}
+    load = mpm.Traction("top", (0, -strain * soft.oedometric), region=((-np.inf, 0.9), (np.inf, np.inf)))
+    s = mpm.Simulation(grid, bodies, [soft, hard], fixed=fixed, tractions=[load])
+    result = s.run(1.0, 1.0, probes=mpm.probes(bodies, [[0.05, 1.0]]))
+    assert result.displacement[-1][0, 1] == pytest.approx(-0.5 * strain, rel=2e-3)
+
+
+@pytest.mark.parametrize("dt", [1.0, 1e3, 1e12, np.inf])
+def test_a_step_longer_than_the_run_is_one_step(dt):
+    s = column(fluid=False, tractions=[mpm.Traction("top", (0, -1e4))])
+    result = s.run(1.0, dt)
+    assert result.steps == 1 and s.points.F[:, 1, 1] == pytest.approx(1 - 1e4 / SOFT.oedometric, abs=1e-5)
+
+
 def test_the_answer_does_not_depend_on_the_number_of_steps():
     tips = []
     for n in (10, 40, 160):

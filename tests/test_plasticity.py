@@ -225,6 +225,7 @@ def assembled(simulation, u):
         momentum.u.x.array[momentum.unknowns.owned] = u + step * w
         residuals.append(momentum.assemble_residual()[0].array.copy())
     momentum.u.x.array[momentum.unknowns.owned] = u
+    momentum.assemble_residual()
     K = momentum.assemble_tangent()
     x = momentum.unknowns.vector()
     x.array[:] = w

@@ -1,0 +1,216 @@
+# SPDX-License-Identifier: MIT
+"""Time steps as small as one likes: what is left is the error of the cells, at rest and on the move.
+
+Terzaghi's column (demo `terzaghi`) is taken to T_v = c_v t / height² = 0.1 in 1, 10, ..., 10 000 equal steps,
+0.1 to 1e-5 of the time of consolidation.  Error: the root mean square over the column of p - exact, over p0, a
+cell's pressure compared at its centroid.  Backward Euler's part falls with the step; what is left must be the
+error of the cells alone, found by an exact solution in time of their ordinary differential equations, and stay
+there however many steps are taken: a pressure that is averaged to points and back in every step would go on
+diffusing.  Three columns:
+
+* resting on the grid;
+* moving: its foot is carried down by half the height meanwhile, through half of all cells;
+* moving, soft water: the fluid stores as much as the skeleton, S = 1/M.  The pressure of hard water is
+  that which the strain of the points leaves; soft water's is brought from grid to grid by the remap, which is
+  donor-cell where the body moves: an error of first order in h, in proportion to the way and not to the steps.
+
+The overshoot, the largest p / p0 - 1 of all steps, is nothing at rest, however small the step: the scheme has
+no least time step in one dimension.  In more, small steps bring checkers of the pressure, but for the damping of
+jumps (`storage.py`): shown for a strip load on a layer in a rough box, first step, with and without.  On one
+process.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import poroelastic_beam as beam
+import terzaghi
+from coupling_iterations import Undamped
+from numpy.typing import NDArray
+from scipy.linalg import expm
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.exact import terzaghi_pressure
+
+HEIGHT, SOIL = terzaghi.HEIGHT, terzaghi.SOIL
+T_END = 0.1
+CASES = {"resting": (0.0, 0.0), "moving": (0.5, 0.0), "moving, soft water": (0.5, 1.0)}
+"""Way of the foot over the height, and the water's storage coefficient times M."""
+STRIP_STEPS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)  # of the layer's time of consolidation
+
+
+@dataclass
+class Run:
+    """A column at T_END: depth z of the cells' centroids over the height, p / p0, errors as the module says."""
+
+    z: NDArray[np.float64]
+    p: NDArray[np.float64]
+    error: float
+    overshoot: float
+
+
+def column(cells: int, steps: int, way: float = 0.0, softness: float = 0.0, strain: float = 1e-5) -> Run:
+    """Consolidate a column to T_END in equal steps while its foot moves down by way * HEIGHT."""
+    h, modulus = HEIGHT / cells, SOIL.oedometric
+    load, p0 = strain * modulus, strain * modulus / (1 + softness)
+    water = mpm.Fluid(bulk=SOIL.porosity * modulus / softness if softness else np.inf)
+    t_end = T_END * HEIGHT**2 * (1 + softness) / (SOIL.conductivity / water.unit_weight * modulus)
+    below = int(np.ceil(way * cells))
+    grid = mpm.Grid([h, HEIGHT], [1, cells + below], lower=[0, -below * h])
+    foot = mpm.Displacement("bottom", lambda t, X: (0, -way * HEIGHT * t / t_end), "y")
+    simulation = mpm.Simulation(
+        grid,
+        [mpm.box(grid, [0, 0], [h, HEIGHT])],
+        [SOIL],
+        fluid=water,
+        fixed={"left": "x", "right": "x", **({} if way else {"bottom": "y"})},
+        tractions=[mpm.Traction("top", (0, -load))],
+        displacements=[foot] if way else [],
+        drained=[mpm.Drained("top")],
+    )
+    highest = []
+    simulation.run(t_end, t_end / steps, observe=lambda s: highest.append(s.points.pressure.max() / p0))
+    storage = simulation.storage
+    here = storage.unknowns.owned
+    # the cells hold what they held at the start of the last step
+    y = grid.midpoints[here, 1] + storage.centroid.x.array.reshape(-1, 2)[here, 1] + way * HEIGHT * (1 - 1 / steps)
+    z, p = np.clip(1 - y / HEIGHT, 0, 1), storage.p.x.array[here] / p0
+    volume = simulation.momentum.fill.x.array[here]
+    error = np.sqrt(volume @ (p - terzaghi_pressure(z, T_END, 1.0, 1.0)) ** 2 / volume.sum())
+    order = np.argsort(z)
+    return Run(z[order], p[order], float(error), max(highest))
+
+
+def error_of_cells(cells: int) -> float:
+    """Return the same error on equal cells with exact time: two-point fluxes and the damping of small steps."""
+    laplacian = 2 * np.eye(cells) - np.eye(cells, k=1) - np.eye(cells, k=-1)
+    laplacian[0, 0] = laplacian[-1, -1] = 1
+    outflow = laplacian.copy()
+    outflow[0, 0] += 2  # drained half a cell above the first centroid
+    store = np.eye(cells) + SOIL.pressure_damping(2) * SOIL.oedometric * laplacian
+    p = expm(-T_END * cells**2 * np.linalg.solve(store, outflow)) @ np.ones(cells)
+    z = (np.arange(cells) + 0.5) / cells
+    return float(np.sqrt(np.mean((p - terzaghi_pressure(z, T_END, 1.0, 1.0)) ** 2)))
+
+
+def strip(cells: int, dt: float, law: type[mpm.Skeleton]) -> NDArray[np.float64]:
+    """Return p / load (nx, ny) after the first step, dt over the time of consolidation, under a strip load."""
+    grid = mpm.Grid([2 * HEIGHT, HEIGHT], [2 * cells, cells])
+    soil = law(bulk=SOIL.bulk, shear=SOIL.shear, porosity=SOIL.porosity, conductivity=SOIL.conductivity)
+    load = 1e-5 * SOIL.oedometric
+    simulation = mpm.Simulation(
+        grid,
+        [mpm.box(grid, [0, 0], [2 * HEIGHT, HEIGHT])],
+        [soil],
+        fluid=terzaghi.WATER,
+        fixed={"left": "xy", "right": "xy", "bottom": "xy"},
+        tractions=[mpm.Traction("top", (0, -load), region=((0, 0), (HEIGHT / 2, 2 * HEIGHT)))],
+        drained=[mpm.Drained("top")],
+    )
+    simulation.step(dt * HEIGHT**2 / terzaghi.CV)
+    p = np.empty(grid.shape.prod())
+    p[grid.cell_number] = simulation.storage.p.x.array / load
+    return p.reshape(grid.shape)
+
+
+def roughness(p: NDArray[np.float64]) -> float:
+    """Return rms(p - mean of the four neighbours) / max |p| over the inner cells (nx, ny)."""
+    mean = (p[:-2, 1:-1] + p[2:, 1:-1] + p[1:-1, :-2] + p[1:-1, 2:]) / 4
+    return float(np.sqrt(np.mean((p[1:-1, 1:-1] - mean) ** 2)) / np.abs(p).max())
+
+
+LAWS = {"damped": mpm.Hencky, "undamped": Undamped}
+
+
+def main(argv: list[str] | None = None) -> dict:
+    """Run the demo; return what --json prints."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser.add_argument("--cells", type=int, default=25, help="cells over the height of the column")
+    parser.add_argument("--steps", type=int, nargs="+", default=[1, 10, 100, 1000, 10000], help="to T_v = 0.1")
+    parser.add_argument("--strip-cells", type=int, default=20, help="cells over the height of the layer")
+    parser.add_argument("--out", type=Path, default=Path("out/small_steps"), help="folder for the pictures")
+    parser.add_argument("--json", action="store_true", help="print the results as one line of JSON at the end")
+    o = parser.parse_args(argv)
+    for name in ("cells", "steps", "strip_cells"):
+        if np.min(getattr(o, name)) < 1:
+            parser.error(f"--{name.replace('_', '-')} {np.min(getattr(o, name))}: must be >= 1")
+    try:
+        runs = {name: [column(o.cells, n, *case) for n in o.steps] for name, case in CASES.items()}
+        strips = {name: [strip(o.strip_cells, dt, law) for dt in STRIP_STEPS] for name, law in LAWS.items()}
+    except mpm.GaveUp as error:
+        sys.exit(f"error: {error}")
+    limit = error_of_cells(o.cells)
+    print(f"{'steps':>7} {'dt (T_v)':>9} " + " ".join(f"{name:>19}" for name in runs))
+    for k, n in enumerate(o.steps):
+        print(f"{n:7} {T_END / n:9.0e} " + " ".join(f"{r[k].error:19.2e}" for r in runs.values()))
+    print(f"error of {o.cells} cells, exact in time: {limit:.2e}")
+    overshoot = {name: max(run.overshoot for run in case) - 1 for name, case in runs.items()}
+    print("largest p / p0 - 1 of all steps: " + ", ".join(f"{name} {x:.1e}" for name, x in overshoot.items()))
+    for name, fields in strips.items():
+        print(f"strip load, {name:>8}: roughness " + ", ".join(f"{roughness(p):.2%}" for p in fields))
+    o.out.mkdir(parents=True, exist_ok=True)
+    draw(o, runs, limit)
+    draw_strip(o, strips)
+    print(f"pictures: {o.out}/")
+    out = {
+        "steps": o.steps,
+        "errors": {name: [run.error for run in case] for name, case in runs.items()},
+        "error_of_cells": limit,
+        "overshoot": overshoot,
+        "roughness": {name: [roughness(p) for p in fields] for name, fields in strips.items()},
+        "converged": True,
+    }
+    if o.json:
+        print(json.dumps(out))
+    return out
+
+
+def draw(o: argparse.Namespace, runs: dict[str, list[Run]], limit: float) -> None:
+    """Draw the error against the step, and the pressure over the depth of the longest and the shortest steps."""
+    fig, ((left, right),) = beam.figure(1, 2, (11.5, 4.8))
+    dt = T_END / np.array(o.steps)
+    for name, case in runs.items():
+        left.loglog(dt, [run.error for run in case], "o-", ms=4, label=name)
+    left.axhline(limit, color="black", lw=1, ls="--", label=f"{o.cells} cells, exact in time")
+    left.set(xlabel="step / time of consolidation (-)", ylabel="rms error of p / p0 (-)")
+    left.set(title=f"Error at $T_v$ = {T_END:g}")
+    left.legend()
+    z = np.linspace(0, 1, 201)
+    right.plot(terzaghi_pressure(z, T_END, 1.0, 1.0), z, color="black", lw=1, label="exact")
+    for k, mark in ((0, "s"), (-1, "o")):
+        for colour, (name, case) in enumerate(runs.items()):
+            label = f"{name}, {o.steps[k]} step" + "s" * (o.steps[k] > 1)
+            right.plot(case[k].p, case[k].z, mark, ms=3, mfc="none", color=f"C{colour}", label=label)
+    right.set(xlabel="pore pressure / p0 (-)", ylabel="depth / height (-)", title="Pressure of the cells", ylim=(1, 0))
+    right.legend(loc="lower left")
+    for ax in (left, right):
+        ax.grid(alpha=0.3)
+    fig.savefig(o.out / "small_steps.png", dpi=130)
+
+
+def draw_strip(o: argparse.Namespace, strips: dict[str, list[NDArray[np.float64]]]) -> None:
+    """Draw the pressure after the smallest first step, and the roughness against the step."""
+    fig, ((*axes, right),) = beam.figure(1, len(strips) + 1, (15, 3.8))
+    for ax, (name, fields) in zip(axes, strips.items(), strict=True):
+        extent = (0, 2 * HEIGHT, 0, HEIGHT)
+        image = ax.imshow(
+            fields[-1].T, origin="lower", extent=extent, cmap="viridis", clim=(0, strips["damped"][-1].max())
+        )
+        ax.plot([0, HEIGHT / 2], [HEIGHT] * 2, color="crimson", lw=4, clip_on=False)
+        ax.set(xlabel="x (m)", ylabel="y (m)", title=f"{name}: p / load after one step of {STRIP_STEPS[-1]:g}")
+        fig.colorbar(image, ax=ax, shrink=0.7)
+        right.semilogx(STRIP_STEPS, [100 * roughness(p) for p in fields], "o-", ms=4, label=name)
+    right.set(xlabel="step / time of consolidation (-)", ylabel="roughness (% of the largest p)", ylim=(0, None))
+    right.legend()
+    right.grid(alpha=0.3)
+    fig.savefig(o.out / "strip.png", dpi=130)
+
+
+if __name__ == "__main__":
+    sys.exit(0 if main()["converged"] else 1)

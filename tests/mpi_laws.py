@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: MIT
+"""Run two laws, one with state, fields and terms of the user's on however many processes there are; write the state."""
+
+import sys
+
+import numpy as np
+import ufl
+
+import mpm_dolfinx as mpm
+
+
+def push(points, u, v, t):
+    """Return a force that turns with the material."""
+    F = (ufl.Identity(2) + points.grad(u)) * points.F
+    return -ufl.inner(F * ufl.as_vector([2e4 * t, 0]), points.value(v)) / ufl.det(points.F) * points.dx
+
+
+grid = mpm.Grid([1.6, 1.3], [16, 13])
+bodies = [mpm.box(grid, [0, 0], [1, 0.5]), mpm.box(grid, [0, 0.5], [1, 1.03], material=1)]
+sand = mpm.DruckerPrager(
+    bulk=lambda X: 4e6 * (2 - X[:, 1]),
+    shear=2e6,
+    friction=30.0,
+    dilation=5.0,
+    cohesion=lambda X: 1e4 + 2e4 * X[:, 0],
+    conductivity=1e-4,
+    conductivity_law=mpm.kozeny_carman,
+)
+gel = mpm.NeoHookean(bulk=2e6, shear=1e6, conductivity=lambda X: 1e-5 * (1 + X[:, 0]))
+simulation = mpm.Simulation(
+    grid,
+    bodies,
+    [sand, gel],
+    fluid=mpm.Fluid(),
+    fixed={"left": "x", "bottom": "y"},
+    drained=[mpm.Drained("right")],
+    tractions=[mpm.Traction("top", lambda t: (0, -2e5 * t), region=((0, 1), (1, 2)))],
+    terms=[push],
+    sources=[lambda points, q, t: 1e-3 * t * points.displacement[0] * q * points.dx],
+)
+result = simulation.run(1.0, 0.1, progress=False)
+stress, points = simulation.effective_stress(), simulation.points
+columns = (points.id, points.x, points.pressure, stress, points.data["plastic"], points.data["hardened"])
+parts = simulation.grid.comm.gather(columns)
+if parts:
+    ids, x, p, s, plastic, hardened = (np.concatenate(a) for a in zip(*parts, strict=True))
+    assert hardened.max() > 1e-3
+    order = np.argsort(ids)
+    state = {"x": x, "p": p, "stress": s, "plastic": plastic, "hardened": hardened}
+    counts = [len(part[0]) for part in parts]
+    np.savez(sys.argv[1], **{k: v[order] for k, v in state.items()}, balance=result.balance, counts=counts)

@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: MIT
+"""Small time steps leave only the error of the cells: nothing diffuses, nothing overshoots, nothing checkers."""
+
+import numpy as np
+import pytest
+import small_steps as demo
+from helpers import column
+from terzaghi import SOIL, WATER
+
+import mpm_dolfinx as mpm
+
+
+def test_at_rest_the_error_falls_with_the_step_to_that_of_the_cells_and_stays():
+    errors = np.array([demo.column(10, steps).error for steps in (10, 100, 1000)])
+    limit = demo.error_of_cells(10)
+    assert (errors[:-1] / errors[1:])[0] > 3
+    assert errors[-1] == pytest.approx(limit, rel=0.03)
+    assert errors[1] - limit < 0.1 * (errors[0] - limit), "the step's part is not of first order"
+
+
+def test_the_error_of_the_cells_is_of_second_order():
+    errors = np.array([demo.error_of_cells(cells) for cells in (10, 20, 40)])
+    assert np.log2(errors[:-1] / errors[1:]).min() > 1.9
+
+
+def test_on_the_move_the_error_does_not_grow_with_the_number_of_steps():
+    few, many = (demo.column(10, steps, way=0.5).error for steps in (100, 400))
+    assert many < 1.1 * few and many < 3 * demo.error_of_cells(10)
+
+
+def test_what_the_remap_does_to_soft_water_goes_with_cell_size_and_way_but_not_with_the_steps():
+    coarse, fine, half, more = (
+        demo.column(cells, steps, way, softness=1.0).error
+        for cells, steps, way in ((10, 100, 0.5), (20, 100, 0.5), (10, 100, 0.25), (10, 400, 0.5))
+    )
+    assert 1.7 < coarse / fine < 2.5 and 1.6 < coarse / half < 2.2
+    assert more == pytest.approx(coarse, rel=0.15)
+
+
+@pytest.mark.parametrize("dt", [1e-12, 1e-6, 1e-3, 1.0])
+def test_the_first_step_overshoots_by_nothing_however_small(dt):
+    """In s; the step for which P1 pressures stop overshooting, h^2 / (6 c_v), is 4e-3 s."""
+    load = mpm.Traction("top", (0, -100.0))
+    s = column(cells=20, material=SOIL, fluid=WATER, drained=[mpm.Drained("top")], tractions=[load])
+    s.step(dt)
+    assert s.points.pressure.max() < 100 * (1 + 1e-6) and s.points.pressure.min() > 0
+
+
+def test_only_the_damping_keeps_checkers_out_of_the_first_small_step():
+    damped, undamped = (
+        [demo.roughness(demo.strip(10, dt, law)) for dt in (1e-2, 1e-6, 1e-9)] for law in demo.LAWS.values()
+    )
+    assert damped[0] == undamped[0], "damped where enough flows"
+    assert max(damped[1:]) < damped[0], "a small step is rougher than a long one"
+    assert undamped[1] > 5 * damped[1] and undamped[2] > 5 * damped[2]
