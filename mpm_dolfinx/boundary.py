@@ -24,7 +24,9 @@ class Boundary:
     Parameters
     ----------
     grid, bodies
-        Background grid and bodies.
+        Background grid and all bodies of the scene.
+    present
+        Which bodies are there.
     modulus
         Oedometric modulus of the stiffest material, Pa, by which plates and held sides are rigid.
     tractions, displacements, plates, outlets
@@ -40,13 +42,14 @@ class Boundary:
         self,
         grid: Grid,
         bodies: Sequence[Body],
+        present: Sequence[bool],
         modulus: float,
         tractions: Sequence[Traction],
         displacements: Sequence[Displacement],
         plates: Sequence[RigidPlate],
         outlets: Sequence[Drained | Inflow],
     ):
-        self.grid, self._bodies, self._modulus = grid, bodies, modulus
+        self.grid, self._bodies, self._present, self._modulus = grid, bodies, list(present), modulus
         self.plates = [(plate, self._faces(plate)) for plate in plates]
         tractions = [*tractions, *(plate.traction(faces.area0.sum(), grid.dim) for plate, faces in self.plates)]
         self.loads = [(load, self._faces(load)) for load in tractions]
@@ -54,7 +57,7 @@ class Boundary:
         self.outlets = [(outlet, self._faces(outlet)) for outlet in outlets]
 
     def _faces(self, condition) -> Surface:
-        faces = surface(self._bodies, condition.side, condition.region)
+        faces = surface(self._bodies, condition.side, condition.region, self._present)
         if not len(faces):
             raise ValueError(f"{condition}: no point has this side" + (" in the region" if condition.region else ""))
         return faces
@@ -89,7 +92,7 @@ class Boundary:
         stiffness = HOLD * self._modulus / self.grid.h.min()
         for number, (hold, faces, axes) in enumerate(self.holds):
             patches = place.surface(faces)
-            gap = patches.X + hold.at(t, patches.X) - patches.x
+            gap = patches.origin + hold.at(t, patches.X) - patches.x
             for axis in axes:
                 values = np.zeros((len(gap), 3 + d))
                 values[:, 0] = number

@@ -26,7 +26,7 @@ from dolfinx.common import Timer
 from mpm_dolfinx.block import BlockSolver
 from mpm_dolfinx.momentum import Momentum
 from mpm_dolfinx.storage import FILTER, Storage
-from mpm_dolfinx.unknowns import direct_solver, multigrid_solver
+from mpm_dolfinx.unknowns import direct_solver, multigrid_solver, negative_pivots
 
 COUPLINGS = {
     "schur-cg": 0.75,
@@ -145,6 +145,8 @@ class Coupler:
                 self._alternate(dt, report)
             else:
                 self._newton(dt, report)
+            if report.newton and self.storage is None and self.momentum.symmetric and not self._iterative:
+                self._check_stable(dt, report)
         except NotConverged:
             self.forget()
             raise
@@ -162,6 +164,20 @@ class Coupler:
             report.coupling += self._direction(dt, max(errors))
             before, errors = errors, self._line_search(dt, errors, report)
             fresh = max(errors) > KEEP * max(before)
+
+    def _check_stable(self, dt: float, report: Report) -> None:
+        """Refuse an equilibrium that the body leaves at the least disturbance: smaller steps find where it goes.
+
+        Its tangent has negative eigenvalues.  Without water only, which holds a buckling body back for a while.
+        Where a step kept its first tangent, it is the next step that finds out.
+        """
+        if not negative_pivots(self._solve_u):
+            return
+        self._linearise(dt)  # the last tangent may be that of another state
+        if count := negative_pivots(self._solve_u):
+            raise NotConverged(
+                f"the equilibrium is unstable, its tangent has {count} negative eigenvalues", report.history
+            )
 
     def _kept(self, dt: float) -> bool:
         """Return whether there is a tangent of steps of dt, but for rounding."""

@@ -54,12 +54,6 @@ class Momentum:
         DG0 pore pressure, None without fluid.
     gravity : (d,), m/s^2
         Acceleration, a UFL constant; the pieces then carry `density`, kg/m^3.
-    loaded
-        Whether the scene has tractions: points `loads` with their force.
-    plates
-        Whether the scene has rigid plates: points `plates` with their rigidity, normal and present tilt.
-    held
-        Whether sides of bodies have given displacements: points `holds` with stiffness, direction and gap.
     mean_dilatation
         Whether the laws see one volume change per cell, see `dilatation`.
     symmetric
@@ -74,16 +68,13 @@ class Momentum:
         fixed: NDArray[np.bool_],
         pressure: fem.Function | None = None,
         gravity: fem.Constant | None = None,
-        loaded: bool = False,
-        plates: bool = False,
-        held: bool = False,
         mean_dilatation: bool = False,
         symmetric: bool = True,
     ):
         self.grid, self.pieces = grid, pieces
         V = _compat.function_space(grid.mesh, "Lagrange", 1, (grid.dim,))
         self.u, self._b, self._f, self._pulls = (fem.Function(V) for _ in range(4))
-        self.free = ~fixed
+        self.fix(fixed)
         v, du = ufl.TestFunction(V), ufl.TrialFunction(V)
 
         self.symmetric, self.holding = symmetric, False
@@ -96,23 +87,10 @@ class Momentum:
             self._add_law(law, points, v, pressure)
 
         self.loads = FormPoints(grid, force=(grid.dim,))
-        self._traction = None
-        if loaded:
-            self._traction = PointForm(ufl.inner(self.loads.force, self.loads.value(v)) * self.loads.dx, self.loads)
         self._weight = None
         if gravity is not None:
             self._weight = PointForm(pieces.density * ufl.inner(gravity, pieces.value(v)) * pieces.dx, pieces)
-        self._plate = None
-        if plates:
-            self.plates = FormPoints(grid, rigidity=(), normal=(grid.dim,), tilt=(grid.dim,))
-            self._plate = PointForm(self._bend(v, self._slope(du)), self.plates)
-            self._tilt = PointForm(-self._bend(v, self.plates.tilt), self.plates)
-        self._hold = None
-        if held:
-            self.holds = h = FormPoints(grid, stiffness=(), direction=(grid.dim,), gap=())
-            along = ufl.dot(h.value(v), h.direction)
-            self._hold = PointForm(h.stiffness * ufl.dot(h.value(du), h.direction) * along * h.dx, h)
-            self._pull = PointForm(h.stiffness * h.gap * along * h.dx, h)
+        self.loads = self.plates = self.holds = None
         self._ghost(V, v, du)
 
     def _add_law(self, law: type[Skeleton], points: FormPoints, v, pressure: fem.Function | None) -> None:
@@ -152,6 +130,37 @@ class Momentum:
             self._tangents.append(PointForm(ufl.derivative(form, self.u, du), self.pieces))
             self.holding, self.linear = True, False
             self.symmetric = self.symmetric and potential
+
+    def require(self, loaded: bool, plates: bool, held: bool) -> None:
+        """Compile what conditions on sides of the bodies need and has not been compiled yet.
+
+        Parameters
+        ----------
+        loaded
+            There are tractions: points `loads` with their force.
+        plates
+            There are rigid plates: points `plates` with their rigidity, normal and present tilt.
+        held
+            Sides have given displacements: points `holds` with stiffness, direction and gap.
+        """
+        grid, V = self.grid, self.u.function_space
+        v, du = ufl.TestFunction(V), ufl.TrialFunction(V)
+        if loaded and self.loads is None:
+            self.loads = FormPoints(grid, force=(grid.dim,))
+            self._traction = PointForm(ufl.inner(self.loads.force, self.loads.value(v)) * self.loads.dx, self.loads)
+        if plates and self.plates is None:
+            self.plates = FormPoints(grid, rigidity=(), normal=(grid.dim,), tilt=(grid.dim,))
+            self._plate = PointForm(self._bend(v, self._slope(du)), self.plates)
+            self._tilt = PointForm(-self._bend(v, self.plates.tilt), self.plates)
+        if held and self.holds is None:
+            self.holds = h = FormPoints(grid, stiffness=(), direction=(grid.dim,), gap=())
+            along = ufl.dot(h.value(v), h.direction)
+            self._hold = PointForm(h.stiffness * ufl.dot(h.value(du), h.direction) * along * h.dx, h)
+            self._pull = PointForm(h.stiffness * h.gap * along * h.dx, h)
+
+    def fix(self, fixed: NDArray[np.bool_]) -> None:
+        """Set which components are zero at which nodes (nodes, d); unknowns are numbered anew."""
+        self.free, self._dofs = ~fixed, None
 
     def _slope(self, w):
         """Return the tangential gradient of the normal displacement, grad_t(w_n), at the plates."""
@@ -202,7 +211,7 @@ class Momentum:
         dofs = np.flatnonzero((self.free & nodes[:, None]).ravel())
         # a cell may become active between active nodes, so equal dofs do not mean equal cells
         now = (cells, dofs, facets)
-        same = hasattr(self, "unknowns") and all(map(np.array_equal, now, (self._cells, self._dofs, self._facets)))
+        same = self._dofs is not None and all(map(np.array_equal, now, (self._cells, self._dofs, self._facets)))
         changed = self.grid.comm.allreduce(not same) > 0
         if changed:
             self._cells, self._dofs, self._facets = now
@@ -220,7 +229,7 @@ class Momentum:
         """Return an empty matrix for the penalties: the ghost penalty couples like components, of two cells."""
         d = self.grid.dim
         length = 3**d + 2 * d * 3 ** (d - 1)
-        if self._plate is not None or self._hold is not None:
+        if self.plates is not None or self.holds is not None:
             return matrix(self.unknowns, self.unknowns, d * length)
         touched = np.zeros(len(self.free), dtype=bool)
         touched[self.grid.cell_nodes[self.grid.facet_cells[self._facets]]] = True
@@ -232,9 +241,9 @@ class Momentum:
         """Assemble what is linear in the step's increment: ghost penalty, and plates and holds at their places."""
         zero(self.penalty)
         self.ghost.assemble_matrix(self.penalty)
-        if self._plate is not None:
+        if self.plates is not None:
             self._plate.assemble_matrix(self.penalty)
-        if self._hold is not None:
+        if self.holds is not None:
             self._hold.assemble_matrix(self.penalty)
             stiffest = self.holds.data["stiffness"].max(initial=0.0)  # what rounding of places makes of it
             reach = np.abs(np.concatenate([self.grid.lower, self.grid.upper])).max()
@@ -253,14 +262,14 @@ class Momentum:
     def set_loads(self) -> None:
         """Assemble the dead loads and the weight at the present places of points and `loads`."""
         self._f.x.array[:] = 0.0
-        if self._traction is not None:
+        if self.loads is not None:
             self._traction.assemble_vector(self._f.x.array)
         if self._weight is not None:
             self._weight.assemble_vector(self._f.x.array)
-        if self._plate is not None:
+        if self.plates is not None:
             self._tilt.assemble_vector(self._f.x.array)
         self._external = sum_ghosts(self._f)
-        if self._hold is not None:
+        if self.holds is not None:
             self._pulls.x.array[:] = 0.0
             self._pull.assemble_vector(self._pulls.x.array)
             sum_ghosts(self._pulls)
@@ -289,7 +298,7 @@ class Momentum:
         if self.grid.comm.size > 1:
             squares = self.grid.comm.allreduce(np.array(squares))
         b[owned] -= self._external[owned]
-        if self._hold is not None:  # no measure of forces: at the start of a step it is far above them
+        if self.holds is not None:  # no measure of forces: at the start of a step it is far above them
             b[owned] -= self._pulls.x.array[owned]
         r = self.unknowns.gather(b, self.residual)
         du = self.unknowns.gather(self.u.x.array, self.K.createVecRight())

@@ -102,9 +102,10 @@ class Writer:
         points = replace(points, data=data).migrated(to_root(comm, len(points)))
 
         def write() -> None:
-            start = np.concatenate([body.centre for body in simulation.bodies])[points.id]
             with replacing(file) as part:
-                solid(points, points.x - start, simulation.fluid is not None).write(part, file_format="vtu")
+                solid(points, points.x - points.origin.mean(axis=1), simulation.fluid is not None).write(
+                    part, file_format="vtu"
+                )
 
         at_root(comm, write)
         self._points.entries.append((simulation.t, [file]))

@@ -20,13 +20,15 @@ DEPTH = 1e-6  # cells: how far under the surface the cell is looked up
 class Patches:
     """Points of integration on faces of the domains; arrays over n points.
 
-    cell : (n,) lexicographic cell; x : (n, d) position, m; X : (n, d) reference position, m; area0 : (n,)
-    reference area, m^(d-1); area : (n, d) outward area vector, m^(d-1).
+    cell : (n,) lexicographic cell; x : (n, d) position, m; X : (n, d) reference position, m; origin : (n, d)
+    position from which displacements count, m; area0 : (n,) reference area, m^(d-1); area : (n, d) outward
+    area vector, m^(d-1).
     """
 
     cell: NDArray[np.int64]
     x: NDArray[np.float64]
     X: NDArray[np.float64]
+    origin: NDArray[np.float64]
     area0: NDArray[np.float64]
     area: NDArray[np.float64]
 
@@ -105,7 +107,8 @@ class Placement:
         cell = self._filled_cell(at[face], middle + inward[face])
         area0, whole = share * faces.area0[here][face], faces.whole0[here][face]
         X = faces.reference(here[face], xi)
-        return Patches(cell, x, X, area0, outward[face] * (area0 / whole)[:, None])
+        origin = interpolate(self.points.origin[at][face], xi)
+        return Patches(cell, x, X, origin, area0, outward[face] * (area0 / whole)[:, None])
 
     def displacement(
         self, u: NDArray[np.float64], at: NDArray[np.int64], x: NDArray[np.float64]

@@ -35,6 +35,8 @@ class MaterialPoints:
         Pore pressure, positive in compression.
     x : (n, d), m
         Position.
+    origin : (n, 2^d, d), m
+        Corners from which displacements count: as seeded, or when a stage reset them.
     data : name -> (n, ...)
         What else the points carry: parameters that differ from point to point, state of the law.
     """
@@ -46,6 +48,7 @@ class MaterialPoints:
     material: NDArray[np.int32]
     pressure: NDArray[np.float64]
     x: NDArray[np.float64]
+    origin: NDArray[np.float64]
     data: dict[str, NDArray[np.float64]] = field(default_factory=dict)
 
     def __len__(self) -> int:
@@ -60,6 +63,13 @@ class MaterialPoints:
         """Return points with a function applied to each of their arrays: a choice of rows, a copy, a transfer."""
         arrays = {f.name: function(getattr(self, f.name)) for f in fields(self) if f.name != "data"}
         return MaterialPoints(**arrays, data={name: function(values) for name, values in self.data.items()})
+
+    def joined(self, other: MaterialPoints) -> MaterialPoints:
+        """Return these points and others, ordered by id."""
+        order = np.argsort(np.concatenate([self.id, other.id]))
+        pairs = {f.name: (getattr(self, f.name), getattr(other, f.name)) for f in fields(self) if f.name != "data"}
+        data = {name: np.concatenate([rows, other.data[name]])[order] for name, rows in self.data.items()}
+        return MaterialPoints(**{name: np.concatenate(pair)[order] for name, pair in pairs.items()}, data=data)
 
     def copy(self) -> MaterialPoints:
         """Return a copy that shares no array."""
@@ -186,6 +196,7 @@ def material_points(grid: Grid, bodies: Sequence[Body], pressure: float = 0.0) -
         material=material[mine],
         pressure=np.full(n, float(pressure)),
         x=x[mine],
+        origin=corners[mine],
     )
 
 
@@ -229,8 +240,10 @@ class Surface:
 Region = tuple[ArrayLike, ArrayLike]
 
 
-def surface(bodies: Sequence[Body], name: str, region: Region | None = None) -> Surface:
-    """Return the faces on a named side of the bodies, where no other body touches them.
+def surface(
+    bodies: Sequence[Body], name: str, region: Region | None = None, present: Sequence[bool] | None = None
+) -> Surface:
+    """Return the faces on a named side of the bodies that are present, where no other of them touches.
 
     Parameters
     ----------
@@ -238,20 +251,23 @@ def surface(bodies: Sequence[Body], name: str, region: Region | None = None) -> 
         Side: "left", "right", "bottom", "top", in 3D also "front", "back".
     region : ((d,), (d,)), m
         Box of reference positions that limits the faces; faces partly in it count with that part.
+    present
+        Which bodies are there, by default all.
     """
+    there = [body for i, body in enumerate(bodies) if present is None or present[i]]
     dim = bodies[0].lower.shape[1]
     axis, end = side(name, dim)
     tangential = np.arange(dim) != axis
     limits = [np.full(dim, -np.inf), np.full(dim, np.inf)] if region is None else np.asarray(region, dtype=float)
     start, ids, xis, Xs, wholes = 0, [], [], [], []
     for body in bodies:
-        chosen = np.flatnonzero(body.sides[:, axis, end])
+        chosen = np.flatnonzero(body.sides[:, axis, end] & any(body is other for other in there))
         box = np.stack([body.lower[chosen], body.lower[chosen] + body.spacing], axis=1)
         face = box.copy()
         face[:, :, axis] = box[:, end, None, axis]
         part = np.stack([np.maximum(face[:, 0], limits[0]), np.minimum(face[:, 1], limits[1])], axis=1)
         on = (part[:, 1] > part[:, 0])[:, tangential].all(axis=1)
-        on &= ~_touched(face.mean(axis=1), axis, end, [other for other in bodies if other is not body])
+        on &= ~_touched(face.mean(axis=1), axis, end, [other for other in there if other is not body])
         on &= (face[:, 0, axis] >= limits[0][axis] - 1e-12) & (face[:, 0, axis] <= limits[1][axis] + 1e-12)
         part[:, :, axis] = face[:, :, axis]
         ids.append(start + chosen[on])
@@ -305,10 +321,10 @@ class Probes:
     xi: NDArray[np.float64]
 
     def displacement(self, points: MaterialPoints, comm) -> NDArray[np.float64]:
-        """Return the displacements (m, d), m, on every process."""
+        """Return the displacements (m, d), m, on every process; zero where the particle is not there."""
         here, at = points.find(self.id)
         u = np.zeros_like(self.x0)
-        u[here] = interpolate(points.corners[at], self.xi[here]) - self.x0[here]
+        u[here] = interpolate(points.corners[at] - points.origin[at], self.xi[here])
         return comm.allreduce(u)
 
 

@@ -10,7 +10,7 @@ donor-cell remap.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +39,18 @@ class Carried:
         id, cell = exchange.send(self.id), exchange.send(self.cell)
         order = np.lexsort((cell, id))
         fraction, pressure = exchange.send(self.fraction), exchange.send(self.pressure)
+        return Carried(id[order], cell[order], fraction[order], pressure[order])
+
+    def kept(self, ids: NDArray[np.int64]) -> Carried:
+        """Return the pieces of some points, given by their ids in order."""
+        rows = np.isin(self.id, ids)
+        return Carried(self.id[rows], self.cell[rows], self.fraction[rows], self.pressure[rows])
+
+    def joined(self, other: Carried) -> Carried:
+        """Return these pieces and those of other points, ordered by point and cell."""
+        pairs = [(getattr(self, f.name), getattr(other, f.name)) for f in fields(self)]
+        id, cell, fraction, pressure = map(np.concatenate, pairs)
+        order = np.lexsort((cell, id))
         return Carried(id[order], cell[order], fraction[order], pressure[order])
 
 

@@ -164,6 +164,7 @@ def describe(simulation: Simulation) -> dict[str, Any]:
     grid = simulation.grid
     scene = {"grid cells": grid.shape.tolist(), "grid lower": grid.lower.tolist(), "grid upper": grid.upper.tolist()}
     scene["quadrature"] = simulation.quadrature
+    scene["bodies present"] = list(simulation.present)
     for i, body in enumerate(simulation.bodies):
         scene[f"points of body {i}"] = len(body)
         scene[f"material of body {i}"] = int(body.material)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from dolfinx import fem
@@ -56,6 +57,8 @@ class Simulation:
         See `Coupler`.
     terms, sources
         Functions that give terms of the user's own to the two balances in UFL: see `extend`.
+    later
+        Indices of bodies that a later stage adds.
     """
 
     def __init__(
@@ -78,30 +81,39 @@ class Simulation:
         tolerance: float = 1e-8,
         terms: Sequence[Callable] = (),
         sources: Sequence[Callable] = (),
+        later: Sequence[int] = (),
     ):
         if quadrature not in ("domain", "point"):
             raise ValueError(f"quadrature {quadrature!r}: must be domain or point")
         if coupling not in COUPLINGS:
             raise ValueError(f"coupling {coupling!r}: must be one of {', '.join(COUPLINGS)}")
-        if fluid is None and (drained or inflows or sources):
-            raise ValueError("drained and inflow sides and sources need a fluid")
+        if fluid is None and sources:
+            raise ValueError("sources need a fluid")
         self.grid, self.materials, self.fluid, self.bodies = grid, materials, fluid, bodies
         self.quadrature = quadrature
-        self._gravity_at = gravity if callable(gravity) or gravity is None else lambda t: gravity
         self.gravity = None if gravity is None else fem.Constant(grid.mesh, np.zeros(grid.dim))
         self.t, self.active_cells = 0.0, 0
         self.points = material_points(grid, bodies, pressure)
         self._scene = SceneMaterials(grid, materials, bodies, self.points)
-        conditions = (tractions, displacements, plates, [*drained, *inflows])
-        self.boundary = Boundary(grid, bodies, self._scene.stiffest, *conditions)
-        self.reactions = np.zeros((len(displacements), grid.dim))
-        """(displacements, d): force by which each given displacement acts on the bodies, N (N/m in plane strain)."""
+        self.present = [body not in later for body in range(len(bodies))]
+        """Which bodies are there."""
 
         start = time.perf_counter()
         self._build(self._fixed_nodes(fixed), coupling, tolerance, terms, sources)
+        self._conditions: dict[str, Any] = {}
+        self._set_conditions(
+            fixed=fixed,
+            tractions=tractions,
+            displacements=displacements,
+            drained=drained,
+            inflows=inflows,
+            plates=plates,
+            gravity=gravity,
+        )
         self.jit = time.perf_counter() - start
         """Seconds spent on compiling or finding the forms."""
         self._carried = carry(self.points) if fluid else None
+        self._waiting = {body: self._take(body) for body in later}
         self._prepared = False
         self.result: Result | None = None
         """Histories of the last run, also while it runs."""
@@ -142,10 +154,8 @@ class Simulation:
         self.pieces = FormPoints(grid, **shapes)
         self.laws = scene.parts(self.pieces, ["F", "biot"] if fluid else ["F"])
         p = fem.Function(_compat.function_space(grid.mesh, "DG", 0)) if fluid else None
-        side = self.boundary
-        conditions = bool(side.loads), bool(side.plates), bool(side.holds)
         options = {"mean_dilatation": scene.nearly_incompressible, "symmetric": scene.symmetric}
-        self.momentum = Momentum(grid, self.pieces, self.laws, fixed, p, self.gravity, *conditions, **options)
+        self.momentum = Momentum(grid, self.pieces, self.laws, fixed, p, self.gravity, **options)
         self._time = fem.Constant(grid.mesh, 0.0)
         for term in terms:
             self.momentum.add(term, self._time)
@@ -161,6 +171,96 @@ class Simulation:
                 self.storage.add(source, self._time)
             self._conductivity = ConductivityAtPieces(scene, self.pieces)
         self.coupler = Coupler(self.momentum, self.storage, coupling, tolerance)
+
+    # ---- stages ---------------------------------------------------------------------------------
+
+    def stage(
+        self,
+        *,
+        fixed: Mapping[str, str] | None = None,
+        tractions: Sequence[Traction] | None = None,
+        displacements: Sequence[Displacement] | None = None,
+        drained: Sequence[Drained] | None = None,
+        inflows: Sequence[Inflow] | None = None,
+        plates: Sequence[RigidPlate] | None = None,
+        gravity: ArrayLike | Callable[[float], ArrayLike] | None = None,
+        add: Sequence[int] = (),
+        remove: Sequence[int] = (),
+        reset_displacement: bool = False,
+    ) -> None:
+        """Begin a stage: bodies come and go; conditions that are named take the place of those so far.
+
+        Stresses and pressures stay what they are; the next `run` finds the new balance, all at once or, where
+        loads depend on time, little by little.
+
+        Parameters
+        ----------
+        fixed, tractions, displacements, drained, inflows, plates, gravity
+            As for the scene; `gravity` only if the scene had it.
+        add
+            Indices of bodies that were to come `later`: a fill, at rest and without stress where it was seeded.
+        remove
+            Indices of bodies: an excavation.
+        reset_displacement
+            From now on displacements count from the present positions.
+        """
+        if gravity is not None and self.gravity is None:
+            raise ValueError("gravity: the scene was made without; make it with (0, 0) first")
+        for body in remove:
+            self._check_body(body, self.present[body] if 0 <= body < len(self.present) else False, "present")
+            self._take(body)
+        for body in add:
+            self._check_body(body, body in self._waiting, "one of the bodies to come later")
+            points = self._waiting.pop(body)
+            self.present[body] = True
+            self.points = self.points.joined(points)
+            if self._carried is not None:
+                self._carried = self._carried.joined(carry(points))
+        if reset_displacement:
+            self.points.origin = self.points.corners.copy()
+        named = {"fixed": fixed, "tractions": tractions, "displacements": displacements, "drained": drained}
+        named |= {"inflows": inflows, "plates": plates, "gravity": gravity}
+        self._set_conditions(**{name: value for name, value in named.items() if value is not None})
+
+    def _check_body(self, body: int, ok: bool, what: str) -> None:
+        if not ok:
+            raise ValueError(f"stage: body {body}, must be {what}")
+
+    def _take(self, body: int) -> MaterialPoints:
+        """Take a body away; return its points."""
+        if not 0 <= body < len(self.bodies):
+            raise ValueError(f"later: body {body}, must be an index of the {len(self.bodies)} bodies")
+        self.present[body] = False
+        start = sum(len(b) for b in self.bodies[:body])
+        mine = (self.points.id >= start) & (self.points.id < start + len(self.bodies[body]))
+        taken, self.points = self.points.map(lambda rows: rows[mine]), self.points.map(lambda rows: rows[~mine])
+        if self._carried is not None:
+            self._carried = self._carried.kept(self.points.id)
+        return taken
+
+    def _set_conditions(self, **conditions) -> None:
+        """Take over the conditions that are named, on the bodies that are there."""
+        self._conditions |= conditions
+        now = self._conditions
+        if self.fluid is None and (now["drained"] or now["inflows"]):
+            raise ValueError("drained and inflow sides need a fluid")
+        gravity = now["gravity"]
+        self._gravity_at = gravity if callable(gravity) else lambda t: gravity
+        self.boundary = side = Boundary(
+            self.grid,
+            self.bodies,
+            self.present,
+            self._scene.stiffest,
+            now["tractions"],
+            now["displacements"],
+            now["plates"],
+            [*now["drained"], *now["inflows"]],
+        )
+        self.reactions = np.zeros((len(now["displacements"]), self.grid.dim))
+        """(displacements, d): force by which each given displacement acts on the bodies, N (N/m in plane strain)."""
+        self.momentum.require(bool(side.loads), bool(side.plates), bool(side.holds))
+        self.momentum.fix(self._fixed_nodes(now["fixed"]))
+        self._prepared = False
 
     def _table(self, value: Callable[..., float], *columns: NDArray) -> NDArray[np.float64]:
         """Return a constant of the materials at the points (n,); `value` also takes columns (n,) of the points."""
@@ -254,11 +354,13 @@ class Simulation:
         return fields
 
     def _displacement(self) -> NDArray[np.float64]:
-        """Return the displacements (m, d), m, of the pieces' centroids since the start, by the F of their points."""
+        """Return the displacements (m, d), m, of the pieces' centroids, as those of their domains' corners."""
         points, pieces = self.points, self.placement.pieces
-        X = np.concatenate([b.centre for b in self.bodies])[points.id]
+        now, then = (c - c.mean(axis=1, keepdims=True) for c in (points.corners, points.origin))
+        stretch = np.linalg.solve(then.swapaxes(1, 2) @ then, then.swapaxes(1, 2) @ now)  # of the corners' pattern
         off = pieces.x - points.x[pieces.point]
-        return off + (points.x - X)[pieces.point] - np.einsum("mab,mb->ma", np.linalg.inv(points.F)[pieces.point], off)
+        off0 = np.linalg.solve(stretch.swapaxes(1, 2)[pieces.point], off[:, :, None])[:, :, 0]
+        return off + (points.x - points.origin.mean(axis=1))[pieces.point] - off0
 
     def _mobility(self) -> NDArray[np.float64]:
         """Return the mobility k / (rho_w g) at the pieces (m,), m^2/(Pa s)."""
@@ -282,7 +384,7 @@ class Simulation:
         self.active_cells = grid.comm.allreduce(int(active[: grid.num_owned].sum()))
         facets = grid.interior_facets(active, cells)
         renumbered = momentum.set_active(cells, facets, fill < FULL)
-        if self.boundary.plates:
+        if momentum.plates is not None:
             self.boundary.place_plates(self.placement, self.momentum)
         if self.storage:
             s = self.storage
@@ -341,8 +443,9 @@ class Simulation:
     def _place_loads(self, t: float) -> None:
         """Put the loads and given displacements of time t on the surface."""
         with Timer("mpm: loads"):
-            self.boundary.place_loads(self.placement, self.momentum, t)
-            if self.boundary.holds:
+            if self.momentum.loads is not None:
+                self.boundary.place_loads(self.placement, self.momentum, t)
+            if self.momentum.holds is not None:
                 self.boundary.place_holds(self.placement, self.momentum, t)
             self.momentum.set_loads()
 

@@ -126,6 +126,7 @@ def direct_solver(A: PETSc.Mat, name: str, symmetric: bool = True) -> PETSc.KSP:
     ksp.setOptionsPrefix(f"mpm_{name}_")
     ksp.pc.setType(PETSc.PC.Type.CHOLESKY if symmetric else PETSc.PC.Type.LU)
     if A.comm.size > 1:
+        PETSc.Options(ksp.getOptionsPrefix()).setValue("mat_mumps_icntl_13", 1)  # counts negative pivots
         ksp.pc.setFactorSolverType("mumps")
     else:
         ksp.pc.setFactorOrdering("amd")
@@ -133,6 +134,12 @@ def direct_solver(A: PETSc.Mat, name: str, symmetric: bool = True) -> PETSc.KSP:
     ksp.setOperators(A)
     ksp.setFromOptions()
     return ksp
+
+
+def negative_pivots(solver: PETSc.KSP) -> int:
+    """Return the number of negative eigenvalues of the matrix whose L D L^T factors a direct solver has."""
+    factors = solver.pc.getFactorMatrix()
+    return factors.getMumpsInfog(12) if factors.comm.size > 1 else factors.getInertia()[0]
 
 
 def multigrid_solver(A: PETSc.Mat, name: str) -> PETSc.KSP:

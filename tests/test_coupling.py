@@ -125,3 +125,31 @@ def test_the_undrained_pressure_has_no_checkers():
         assert rough[h, "damped"] < 0.4 * rough[h, "undamped"]
     assert rough[0.03, "damped"] < 0.006
     assert rough[0.03, "damped"] < 0.35 * rough[0.06, "damped"], "what is left is not the curvature of the pressure"
+
+
+def slender(thrust, side_load):
+    """Return a cantilever of 1 m x 0.1 m, pressed by a multiple of its buckling load, and its tip."""
+    grid = mpm.Grid([1.2, 1.6], [48, 64])
+    body = mpm.box(grid, [0, 1.2], [1, 1.3])
+    critical = np.pi**2 * 1e7 * 0.1**2 / 12 / 4  # Pa
+    press = mpm.Traction("right", lambda t: (-thrust * critical * t, 0))
+    push = mpm.Traction("top", lambda t: (0, -side_load * t))
+    s = mpm.Simulation(grid, [body], [SOFT], fixed={"left": "xy"}, tractions=[press, push])
+    return s, mpm.probes([body], [[1, 1.25]])
+
+
+def test_a_slender_body_pressed_at_once_beyond_its_buckling_load_buckles():
+    tips = []
+    for dt in (1.0, 0.05):
+        s, probe = slender(1.6, 200.0)
+        result = s.run(1.0, dt, probes=probe)
+        tips.append(result.displacement[-1][0])
+        assert (result.cuts > 0) == (dt == 1.0), "the straight equilibrium is unstable and must be refused"
+    assert tips[1][1] < -0.6 and tips[0] == pytest.approx(tips[1], abs=0.05)
+
+
+def test_a_body_that_nothing_disturbs_has_no_stable_equilibrium_beyond_its_buckling_load():
+    s, _ = slender(1.6, 0.0)
+    with pytest.raises(mpm.GaveUp, match="the equilibrium is unstable, its tangent has 1 negative eigenvalue"):
+        s.run(1.0, 0.05)
+    assert 0.6 < s.t < 0.7  # it stood up to its buckling load, at 1 / 1.6

@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: MIT
+"""Stages: conditions change, displacements are reset, bodies are dug away and filled in."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+import mpm_dolfinx as mpm
+
+GRAVITY = (0.0, -9.81)
+DENSE = mpm.Hencky(bulk=1e6, shear=6e5, porosity=0.4, conductivity=1e-3, grain_density=2500.0)
+WALLS = {"left": "x", "right": "x", "bottom": "y"}
+
+
+def blocks(heights=(0.5, 0.5), **options):
+    """Return a simulation of blocks on one another, 1 m wide, and a probe in the middle of the lowest block's top."""
+    grid = mpm.Grid([1.0, 1.4], [10, 14])
+    bottoms = np.concatenate([[0], np.cumsum(heights)])
+    bodies = [mpm.box(grid, [0, a], [1, b]) for a, b in pairwise(bottoms)]
+    options = {"gravity": GRAVITY, "fixed": WALLS} | options
+    return mpm.Simulation(grid, bodies, [DENSE], **options), mpm.probes(bodies, [[0.5, heights[0]]])
+
+
+def vertical(s):
+    """Return the vertical stress at the points by id."""
+    return dict(zip(s.points.id.tolist(), s.effective_stress()[:, 1, 1].tolist(), strict=True))
+
+
+def test_after_a_reset_displacements_count_from_there():
+    s, probe = blocks()
+    first = s.run(1.0, 1.0, probes=probe).displacement[-1]
+    stress = vertical(s)
+    s.stage(tractions=[mpm.Traction("top", (0, -1e4))], reset_displacement=True)
+    second = s.run(2.0, 1.0, probes=probe).displacement
+    whole, probe = blocks(tractions=[mpm.Traction("top", lambda t: (0, -1e4 * (t > 1)))])
+    both = whole.run(2.0, 1.0, probes=probe).displacement
+    assert second[0] == pytest.approx(np.zeros((1, 2)), abs=0)
+    assert first + second[-1] == pytest.approx(both[-1], abs=1e-12)
+    assert vertical(s) == pytest.approx(vertical(whole), rel=1e-9)
+    assert max(vertical(s).values()) < max(stress.values()), "the weight's stress is kept and the load's added"
+
+
+def test_what_a_load_did_to_an_elastic_body_goes_with_it():
+    s, probe = blocks(tractions=[mpm.Traction("top", lambda t: (0, -1e4 * min(1, t)))], gravity=None)
+    s.run(1.0, 0.5, probes=probe)
+    s.stage(tractions=[])
+    left = s.run(2.0, 1.0, probes=probe).displacement[-1]
+    assert np.abs(left).max() < 1e-6
+
+
+def test_an_excavation_relieves_what_lies_below():
+    s, probe = blocks()
+    s.run(1.0, 0.5)
+    s.stage(remove=[1])
+    s.run(2.0, 1.0, probes=probe)
+    alone, probe = blocks(heights=(0.5,))
+    alone.run(1.0, 0.5, probes=probe)
+    assert len(s.points) == len(alone.points)
+    assert vertical(s) == pytest.approx(vertical(alone), abs=2e-3 * 0.5 * 15e3)
+
+
+def test_the_top_of_what_is_left_is_a_side():
+    """The pressure of an excavation's water goes out through the new surface."""
+    s, _ = blocks(fluid=mpm.Fluid(), pressure=1e3, gravity=(0, 0), drained=[mpm.Drained("top")])
+    s.run(10.0, 10.0)
+    s.stage(remove=[1])
+    result = s.run(1000.0, 100.0)
+    assert result.balance < 1e-8
+    assert np.abs(s.points.pressure).max() < 1e-3 * 1e3
+
+
+def test_a_fill_loads_what_lies_below():
+    s, _ = blocks(heights=(0.5, 0.3), later=[1])
+    assert len(s.points) == 20 * 10
+    s.run(1.0, 1.0)
+    density = 0.6 * 2500
+    column = 0.5 * density * 9.81
+    assert min(vertical(s).values()) == pytest.approx(-0.9 * column, rel=1e-3)  # of the lowest cells, constant in each
+    settled = s.points.corners[:, :, 1].max()
+    assert settled < 0.5
+    s.stage(add=[1])
+    result = s.run(2.0, 1.0)
+    assert result.converged and len(s.points) == 20 * 16
+    assert min(vertical(s).values()) == pytest.approx(-0.75 * density * 9.81, rel=0.01)
+
+
+def test_a_wet_fill_keeps_the_fluids_balance():
+    s, _ = blocks(fluid=mpm.Fluid(), later=[1], drained=[mpm.Drained("top")])
+    s.run(1.0, 0.5)
+    s.stage(add=[1], drained=[mpm.Drained("top")])
+    result = s.run(2.0, 0.5)
+    assert result.balance < 1e-8 and np.isfinite(s.points.pressure).all() and len(s.points) == 400
+
+
+def test_walls_plates_and_given_displacements_come_and_go():
+    s, probe = blocks(gravity=None, fixed=WALLS)
+    s.stage(plates=[mpm.RigidPlate("top", 1e3)])
+    down = s.run(1.0, 1.0, probes=probe).displacement[-1]
+    assert down[0, 1] == pytest.approx(-0.5 * 1e3 / DENSE.oedometric, rel=1e-2)
+    s.stage(plates=[], displacements=[mpm.Displacement("top", (0, 0), "y")])
+    back = s.run(2.0, 1.0, probes=probe).displacement[-1]
+    assert abs(back[0, 1]) < 1e-6 and s.reactions.shape == (1, 2)
+    s.stage(displacements=[], fixed={"bottom": "xy"})
+    assert s.run(3.0, 1.0).converged
+
+
+@pytest.mark.parametrize(
+    "stage, message",
+    [
+        ({"remove": [2]}, "stage: body 2, must be present"),
+        ({"add": [0]}, "stage: body 0, must be one of the bodies to come later"),
+        ({"drained": [mpm.Drained("top")]}, "need a fluid"),
+        ({"gravity": (0, -1)}, "gravity: the scene was made without"),
+    ],
+)
+def test_what_cannot_be_is_refused(stage, message):
+    s, _ = blocks(gravity=None)
+    with pytest.raises(ValueError, match=message):
+        s.stage(**stage)
+
+
+def test_a_body_that_is_to_come_must_exist():
+    with pytest.raises(ValueError, match="later: body 5, must be an index of the 2 bodies"):
+        blocks(later=[5])
