@@ -268,7 +268,7 @@ class Coupler:
         with Timer("mpm: linear solve"):
             # no more accuracy than the next residual can use
             linear = self.momentum.linear and not self._iterative
-            rtol = min(1e-2, max(0.0 if linear else FORCING, 0.05 * self.tolerance / error))
+            rtol = min(1e-2, max(0.0 if linear else FORCING, 0.05 * self.tolerance / min(1.0, error)))
             if self.storage is None:
                 self._solve_u.setTolerances(rtol=rtol, atol=0.0, max_it=500)
                 self._solve_u.solve(self.momentum.residual, self._du)
