@@ -128,7 +128,7 @@ class Momentum:
         self._own = fem.Function(V)
         if self.u in form.coefficients():
             self._tangents.append(PointForm(ufl.derivative(form, self.u, du), self.pieces))
-            self.holding = True
+            self.holding, self.linear = True, False
             self.symmetric = self.symmetric and potential
 
     def require(self, loaded: bool, plates: bool, held: bool) -> None:
