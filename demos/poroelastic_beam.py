@@ -91,7 +91,9 @@ def scene(o: argparse.Namespace) -> tuple[mpm.Simulation, float]:
     bottom = (round(0.5 * BOX[1] / o.h) + o.offset) * h[1]
     start, end = np.array([0, bottom]), np.array([LENGTH, bottom + HEIGHT])
     if o.dim == 3:
-        lower, upper, start, end = (np.insert(x, 1, y) for x, y in ((lower, 0), (upper, DEPTH), (start, 0), (end, DEPTH)))
+        lower, upper, start, end = (
+            np.insert(x, 1, y) for x, y in ((lower, 0), (upper, DEPTH), (start, 0), (end, DEPTH))
+        )
         cells = np.insert(cells, 1, 1)
     grid = mpm.Grid(upper, cells, lower)
     beam = mpm.box(grid, start, end, per_cell=o.points_per_cell)
