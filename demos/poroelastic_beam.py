@@ -3,9 +3,10 @@
 
 A beam of 1 m x 0.3 m, clamped at x = 0, carries a dead load on its top from x = 0.05 m on, raised
 linearly over the ramp and then held.  Its ends are permeable, its long sides sealed.  It is in plane
-strain, or 0.1 m deep between smooth walls (--dim 3), which is the same.  At first the pore water carries part of the load; as it drains, the beam sags by a third of
-its length.  Shown beside it: Euler-Bernoulli's small-strain beam without water, and (--reference)
-a body-fitted Taylor-Hood finite element solution of the same finite-strain Biot problem.
+strain, or 0.1 m deep between smooth walls (--dim 3), which is the same.  At first the pore water
+carries part of the load; as it drains, the beam sags by a third of its length.  Shown beside it:
+Euler-Bernoulli's small-strain beam without water, and (--reference) a body-fitted Taylor-Hood
+finite element solution of the same finite-strain Biot problem.
 """
 
 from __future__ import annotations
@@ -91,7 +92,9 @@ def scene(o: argparse.Namespace) -> tuple[mpm.Simulation, float]:
     bottom = (round(0.5 * BOX[1] / o.h) + o.offset) * h[1]
     start, end = np.array([0, bottom]), np.array([LENGTH, bottom + HEIGHT])
     if o.dim == 3:
-        lower, upper, start, end = (np.insert(x, 1, y) for x, y in ((lower, 0), (upper, DEPTH), (start, 0), (end, DEPTH)))
+        lower, upper, start, end = (
+            np.insert(x, 1, y) for x, y in ((lower, 0), (upper, DEPTH), (start, 0), (end, DEPTH))
+        )
         cells = np.insert(cells, 1, 1)
     grid = mpm.Grid(upper, cells, lower)
     beam = mpm.box(grid, start, end, per_cell=o.points_per_cell)
