@@ -3,9 +3,10 @@
 
 A beam of 1 m x 0.3 m, clamped at x = 0, carries a dead load on its top from x = 0.05 m on, raised
 linearly over the ramp and then held.  Its ends are permeable, its long sides sealed.  It is in plane
-strain, or 0.1 m deep between smooth walls (--dim 3), which is the same.  At first the pore water carries part of the load; as it drains, the beam sags by a third of
-its length.  Shown beside it: Euler-Bernoulli's small-strain beam without water, and (--reference)
-a body-fitted Taylor-Hood finite element solution of the same finite-strain Biot problem.
+strain, or 0.1 m deep between smooth walls (--dim 3), which is the same.  At first the pore water
+carries part of the load; as it drains, the beam sags by a third of its length.  Shown beside it:
+Euler-Bernoulli's small-strain beam without water, and (--reference) a body-fitted Taylor-Hood
+finite element solution of the same finite-strain Biot problem.
 """
 
 from __future__ import annotations

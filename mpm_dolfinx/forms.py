@@ -70,6 +70,8 @@ class FormPoints:
             for name, shape in {"offset": (grid.dim,), "weight": (), **fields}.items()
         }
         self._live: dict[str, fem.Function] = {}
+        self._of: tuple[int, NDArray[np.float64]] | None = None
+        self._gradients = np.empty((0, grid.dim**2))
         self.dx = PointMeasure(grid, self._functions["weight"])
         self._size = {name: int(np.prod(shape, dtype=int)) for name, shape in fields.items()}
         self.cells = self.filled = np.empty(0, dtype=np.int32)
@@ -142,12 +144,25 @@ class FormPoints:
 
     def values(self, name: str, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
         """Return a field at the chosen points (m, size)."""
-        if name not in self._live:
-            return self.data[name][chosen]
-        cells = self.cells[chosen]
-        u = self._live[name].x.array.reshape(-1, self.grid.dim)
-        du = u[self.grid.cell_nodes[cells]].transpose(0, 2, 1) @ self.grid.shape_gradients(cells, self.x[chosen])
-        return du.reshape(len(cells), -1)
+        if name in self._live:
+            self._update(self._live[name].x.array)
+            return self._gradients[chosen]
+        return self.data[name][chosen]
+
+    def _update(self, u: NDArray[np.float64]) -> None:
+        """Set the gradients of u at the points, of which several forms ask, if u or the points have changed."""
+        if self._of is not None and self._of[0] == self.version and np.array_equal(self._of[1], u):
+            return
+        self._of = (self.version, u.copy())
+        d, n = self.grid.dim, len(self.cells)
+        if len(self._gradients) != n:
+            self._gradients = np.empty((n, d * d))
+        nodal = u.reshape(-1, d)
+        for part in (slice(start, start + BATCH) for start in range(0, n, BATCH)):
+            cells = self.cells[part]
+            slopes = self.grid.shape_gradients(cells, self.x[part])
+            du = nodal[self.grid.cell_nodes[cells]].transpose(0, 2, 1) @ slopes
+            self._gradients[part] = du.reshape(len(cells), d * d)
 
     def changes(self, name: str) -> bool:
         """Return whether a field changes while the points stay."""
