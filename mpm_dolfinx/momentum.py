@@ -24,8 +24,9 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx import _compat
 from mpm_dolfinx.dilatation import MeanDilatation
+from mpm_dolfinx.elements import ElementForces, ElementMatrices, StackedElementMatrices
 from mpm_dolfinx.extend import call
-from mpm_dolfinx.forms import ElementForces, ElementMatrices, FacetForm, FormPoints, PointForm, StackedElementMatrices
+from mpm_dolfinx.forms import FacetForm, FormPoints, PointForm
 from mpm_dolfinx.grid import Grid
 from mpm_dolfinx.materials import Skeleton
 from mpm_dolfinx.unknowns import Unknowns, matrix, sum_ghosts, zero
