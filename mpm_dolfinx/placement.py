@@ -13,7 +13,7 @@ from mpm_dolfinx.exchange import Exchange
 from mpm_dolfinx.grid import Grid, sum_by
 from mpm_dolfinx.points import MaterialPoints, Surface, face_vectors, interpolate
 
-DEPTH = 1e-6  # cells: how far under the surface the cell is looked up
+DEPTH = 1e-6  # cells: how far under the surface the cell is looked up; of corners, share of the way to the middle
 
 
 @dataclass
@@ -120,7 +120,8 @@ class Placement:
         self, u: NDArray[np.float64], at: NDArray[np.int64], x: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """Return the P1 field u (nodes, d) at positions (m, d) in the domains of points `at`."""
-        grid, cell = self.grid, self._filled_cell(at, x)
+        # of a corner on a grid line, rounding must not choose a cell in which the domain does not lie
+        grid, cell = self.grid, self._filled_cell(at, x + DEPTH * (self.points.x[at] - x))
         travel = Exchange(grid.comm, grid.owner(cell))
         cells, x = grid.local(travel.send(cell)), travel.send(x)
         N = grid.shape_values(cells, x)
