@@ -184,6 +184,8 @@ def cut_faces(
         s, owner = _slice(s, owner, axis)
     # the local coordinates tell sizes, for they are never degenerate
     share = _size(s[:, d:]) / _size(whole[:, d:])[owner] / len(split)
+    solid = share > 0  # a corner on a plane leaves parts without size
+    s, owner, share = s[:, :, solid], owner[solid], share[solid]
     points = np.einsum("qk,kam->qam", _RULES[d], s)
     middle = np.tile((grid.lower + grid.h * s[:, :d].mean(axis=0).T), (len(points), 1))
     points = points.transpose(0, 2, 1).reshape(-1, both.shape[1])
