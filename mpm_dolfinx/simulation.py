@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from mpm_dolfinx import _compat, summary
 from mpm_dolfinx.boundary import Boundary
 from mpm_dolfinx.conditions import Displacement, Drained, Inflow, RigidPlate, Traction
-from mpm_dolfinx.coupling import COUPLINGS, Coupler, Report
+from mpm_dolfinx.coupling import COUPLINGS, Coupler, NotConverged, Report
 from mpm_dolfinx.domains import parallelepipeds, tangled
 from mpm_dolfinx.exchange import Exchange
 from mpm_dolfinx.forms import FormPoints
@@ -469,7 +469,9 @@ class Simulation:
                 delta = self.momentum.dilatation.averaged(delta)
             # F_p <- (sum_k w_k Delta_k / V_p) F_p
             mean = [place.mean(column) for column in place.to_pieces(delta).reshape(-1, d * d).T]
-            points.F = np.stack(mean, axis=1).reshape(n, d, d) @ points.F
+            F = np.stack(mean, axis=1).reshape(n, d, d) @ points.F
+            self._check_volumes(np.linalg.det(F))
+            points.F = F
             self._scene.update_state(points)
             if self.quadrature == "domain":
                 corners = points.corners.reshape(-1, d)
@@ -486,6 +488,15 @@ class Simulation:
                 self._carried = carry(points, place.pieces, p)
             self._migrate()
         return folded
+
+    def _check_volumes(self, J: NDArray[np.float64]) -> None:
+        """Refuse what a law may allow and a body does not: points turned inside out, pores of no volume."""
+        least = 1 - self._table(lambda m: m.porosity) if self.fluid else np.zeros(len(J))
+        bad = np.flatnonzero(J <= least)
+        if self.grid.comm.allreduce(len(bad)):
+            shown = [f"point {self.points.id[i]} at {self.points.x[i]} with J = {J[i]:.3g}" for i in bad[:1]]
+            what = "the pores have closed" if self.fluid else "the body is turned inside out"
+            raise NotConverged(f"{what}, J <= {least.max(initial=0):.3g}: {', '.join(shown) or 'elsewhere'}", [])
 
     def _untangle(self) -> int:
         """Re-derive from F the domains that have folded: points whose neighbours went elsewhere."""
