@@ -28,6 +28,7 @@ from mpm_dolfinx.points import Body, MaterialPoints, Probes, material_points
 from mpm_dolfinx.remap import Carried, carry, remap
 from mpm_dolfinx.storage import Storage
 from mpm_dolfinx.timeloop import Observer, Result, run
+from mpm_dolfinx.unknowns import collect_garbage
 
 
 class Simulation:
@@ -289,6 +290,7 @@ class Simulation:
 
     def _begin(self, t: float) -> None:
         """Set up the step that ends at time t: grid, loads of that time, u = 0 and the cells' pressure."""
+        collect_garbage(self.grid.mesh.comm)
         self._time.value = t
         if self.gravity is not None:
             self.gravity.value = np.asarray(self._gravity_at(t), dtype=float)
@@ -508,7 +510,7 @@ class Simulation:
 
     def _spacing(self) -> NDArray[np.float64]:
         """Reference size of the points' domains (n, d), m."""
-        return np.concatenate([np.broadcast_to(b.spacing, b.lower.shape) for b in self.bodies])[self.points.id]
+        return np.concatenate([b.size() for b in self.bodies])[self.points.id]
 
     def _migrate(self) -> None:
         """Send the points whose cell another process owns."""
