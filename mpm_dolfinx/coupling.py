@@ -169,7 +169,7 @@ class Coupler:
                 self._linearise(dt)
             report.coupling += self._direction(dt, max(errors))
             before, errors = errors, self._line_search(dt, errors, report)
-            fresh = max(errors) > KEEP * max(before)
+            fresh = max(errors) > KEEP * min(1.0, max(before))  # inf where no fluid has moved yet
 
     def _check_stable(self, dt: float, report: Report) -> None:
         """Refuse an equilibrium that the body leaves at the least disturbance: smaller steps find where it goes.
