@@ -511,7 +511,7 @@ class Simulation:
 
     def _spacing(self) -> NDArray[np.float64]:
         """Reference size of the points' domains (n, d), m."""
-        return np.concatenate([np.broadcast_to(b.spacing, b.lower.shape) for b in self.bodies])[self.points.id]
+        return np.concatenate([b.size() for b in self.bodies])[self.points.id]
 
     def _migrate(self) -> None:
         """Send the points whose cell another process owns."""

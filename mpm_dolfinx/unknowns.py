@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx import _compat
 
-ITERATIVE = 2000
+ITERATIVE = 1500
 """Unknowns of a 3D problem from which on it is solved by iterations: see `multigrid_solver`."""
 
 
