@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: MIT
 """A saturated cantilever under a load that stays: the paper's poroelastic beam.
 
-A beam of 1 m x 0.3 m (plane strain), clamped at x = 0, carries a dead load on its top from
-x = 0.05 m on, raised linearly over the ramp and then held.  Its ends are permeable, its long sides
-sealed.  At first the pore water carries part of the load; as it drains, the beam sags by a third of
-its length.  Shown beside it: Euler-Bernoulli's small-strain beam without water, and (--reference)
-a body-fitted Taylor-Hood finite element solution of the same finite-strain Biot problem.
+A beam of 1 m x 0.3 m, clamped at x = 0, carries a dead load on its top from x = 0.05 m on, raised
+linearly over the ramp and then held.  Its ends are permeable, its long sides sealed.  It is in plane
+strain, or 0.1 m deep between smooth walls (--dim 3), which is the same.  At first the pore water
+carries part of the load; as it drains, the beam sags by a third of its length.  Shown beside it:
+Euler-Bernoulli's small-strain beam without water, and (--reference) a body-fitted Taylor-Hood
+finite element solution of the same finite-strain Biot problem.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ import numpy as np
 import mpm_dolfinx as mpm
 from mpm_dolfinx.reference import BiotFEM, euler_bernoulli
 
-LENGTH, HEIGHT, CLAMP = 1.0, 0.3, 0.05  # m; the load begins at x = CLAMP
+LENGTH, HEIGHT, DEPTH, CLAMP = 1.0, 0.3, 0.1, 0.05  # m; the load begins at x = CLAMP
 BOX = np.array([1.5, 1.2])  # m
 REFERENCE_CELLS = (67, 20)
 
@@ -32,6 +33,7 @@ def arguments(argv: list[str] | None = None) -> argparse.Namespace:
     """Parse the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     add = parser.add_argument
+    add("--dim", type=int, choices=(2, 3), default=2, help="plane strain, or one cell deep between smooth walls")
     add("--h", type=float, default=0.015, help="cell size, m")
     add("--dt", type=float, default=0.02, help="time step, s")
     add("--t-end", type=float, default=1.2, help="end time, s")
@@ -45,6 +47,7 @@ def arguments(argv: list[str] | None = None) -> argparse.Namespace:
     add("--points-per-cell", type=int, default=2, help="material points per cell and direction")
     add("--quadrature", choices=("domain", "point"), default="domain", help="exact domains, or the paper's points")
     add("--offset", type=float, default=0.5, help="of the beam's underside from a grid line, cells")
+    add("--box-scale", type=int, default=1, help="size of the background grid, in boxes of 1.5 m x 1.2 m")
     add("--coupling", choices=tuple(mpm.COUPLINGS), default="schur-cg", help="coupling scheme")
     add("--drained", action="store_true", help="no fluid at all")
     add("--reference", action="store_true", help="run the Taylor-Hood finite elements beside it")
@@ -52,24 +55,26 @@ def arguments(argv: list[str] | None = None) -> argparse.Namespace:
     add("--profile", action="store_true", help="print where the time went")
     add("--json", action="store_true", help="print the results as one line of JSON at the end")
     options = parser.parse_args(argv)
-    for name in ("h", "dt", "t_end", "ramp", "load"):
+    for name in ("h", "dt", "t_end", "ramp", "load", "box_scale"):
         if not getattr(options, name) > 0:
             parser.error(f"--{name.replace('_', '-')} {getattr(options, name)}: must be > 0")
     return options
 
 
-def physics(o: argparse.Namespace) -> dict:
+def physics(o: argparse.Namespace, dim: int = 2) -> dict:
     """Return what material points and finite elements share: boundary conditions and fluid."""
+    inner = [np.inf] * (dim - 1)
     load = mpm.Traction(
         "top",
-        lambda t: (0.0, -o.load * min(1.0, t / o.ramp)),
-        region=((CLAMP, -np.inf), (LENGTH, np.inf)),
+        lambda t: [0.0] * (dim - 1) + [-o.load * min(1.0, t / o.ramp)],
+        region=((CLAMP, *np.negative(inner)), (LENGTH, *inner)),
     )
+    fixed = {"left": "xy"} if dim == 2 else {"left": "xyz", "front": "y", "back": "y"}
     if o.drained:
-        return {"fixed": {"left": "xy"}, "tractions": [load]}
+        return {"fixed": fixed, "tractions": [load]}
     fluid = mpm.Fluid(bulk=o.fluid_bulk)
     ends = [mpm.Drained("left"), mpm.Drained("right")]
-    return {"fixed": {"left": "xy"}, "tractions": [load], "fluid": fluid, "drained": ends}
+    return {"fixed": fixed, "tractions": [load], "fluid": fluid, "drained": ends}
 
 
 def material(o: argparse.Namespace) -> mpm.Hencky:
@@ -78,11 +83,23 @@ def material(o: argparse.Namespace) -> mpm.Hencky:
 
 
 def scene(o: argparse.Namespace) -> tuple[mpm.Simulation, float]:
-    """Return the simulation and the height of the beam's underside on the grid."""
-    grid = mpm.Grid(BOX, np.rint(BOX / o.h).astype(int))
-    bottom = (round(0.5 * BOX[1] / o.h) + o.offset) * grid.h[1]
-    beam = mpm.box(grid, [0, bottom], [LENGTH, bottom + HEIGHT], per_cell=o.points_per_cell)
-    simulation = mpm.Simulation(grid, [beam], [material(o)], quadrature=o.quadrature, coupling=o.coupling, **physics(o))
+    """Return the simulation and the height of the beam's underside."""
+    cells = np.rint(BOX / o.h).astype(int)
+    h = BOX / cells
+    # a larger box reaches as far below the beam as above it, by whole cells: the beam lies on the grid as before
+    lower = np.array([0, -((o.box_scale - 1) * cells[1] // 2) * h[1]])
+    upper, cells = lower + o.box_scale * BOX, o.box_scale * cells
+    bottom = (round(0.5 * BOX[1] / o.h) + o.offset) * h[1]
+    start, end = np.array([0, bottom]), np.array([LENGTH, bottom + HEIGHT])
+    if o.dim == 3:
+        lower, upper, start, end = (
+            np.insert(x, 1, y) for x, y in ((lower, 0), (upper, DEPTH), (start, 0), (end, DEPTH))
+        )
+        cells = np.insert(cells, 1, 1)
+    grid = mpm.Grid(upper, cells, lower)
+    beam = mpm.box(grid, start, end, per_cell=o.points_per_cell)
+    conditions = physics(o, o.dim)
+    simulation = mpm.Simulation(grid, [beam], [material(o)], quadrature=o.quadrature, coupling=o.coupling, **conditions)
     return simulation, bottom
 
 
@@ -103,13 +120,18 @@ def main(argv: list[str] | None = None) -> dict:
             parts = s.grid.comm.gather((s.points.corners, s.points.pressure))
             if parts:
                 corners, pressure = (np.concatenate(a) for a in zip(*parts, strict=True))
+                if o.dim == 3:  # the front
+                    front = corners[:, 0, 1] < 1e-9
+                    corners, pressure = corners[front][:, [0, 1, 4, 5]][..., [0, 2]], pressure[front]
                 snapshots.append((s.t, corners, pressure))
 
     failure = None
+    places = axis if o.dim == 2 else np.insert(axis, 1, DEPTH / 2, axis=1)
     try:
-        result = simulation.run(o.t_end, o.dt, probes=mpm.probes(simulation.bodies, axis), observe=observe)
+        result = simulation.run(o.t_end, o.dt, probes=mpm.probes(simulation.bodies, places), observe=observe)
     except mpm.GaveUp as error:
         failure, result = error, error.result
+    result.displacement = [u[:, [0, -1]] for u in result.displacement]
     fem = None
     if o.reference:
         fem = BiotFEM([0, 0], [LENGTH, HEIGHT], REFERENCE_CELLS, material(o), **physics(o)).run(

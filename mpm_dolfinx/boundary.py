@@ -50,6 +50,7 @@ class Boundary:
         outlets: Sequence[Drained | Inflow],
     ):
         self.grid, self._bodies, self._present, self._modulus = grid, bodies, list(present), modulus
+        self._found: dict[tuple[str, str], Surface] = {}
         self.plates = [(plate, self._faces(plate)) for plate in plates]
         tractions = [*tractions, *(plate.traction(faces.area0.sum(), grid.dim) for plate, faces in self.plates)]
         self.loads = [(load, self._faces(load)) for load in tractions]
@@ -57,10 +58,13 @@ class Boundary:
         self.outlets = [(outlet, self._faces(outlet)) for outlet in outlets]
 
     def _faces(self, condition) -> Surface:
-        faces = surface(self._bodies, condition.side, condition.region, self._present)
-        if not len(faces):
+        """Return the faces of a condition's side, the same object for conditions on the same faces."""
+        key = (condition.side, str(condition.region))
+        if key not in self._found:
+            self._found[key] = surface(self._bodies, condition.side, condition.region, self._present)
+        if not len(self._found[key]):
             raise ValueError(f"{condition}: no point has this side" + (" in the region" if condition.region else ""))
-        return faces
+        return self._found[key]
 
     def place_loads(self, place: Placement, momentum: Momentum, t: float) -> None:
         """Put the dead loads of time t (s) on the surface."""

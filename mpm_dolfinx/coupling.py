@@ -51,7 +51,7 @@ class NotConverged(RuntimeError):
         finite = [h for h in history if np.isfinite(h).all()]
         worst = "momentum" if not finite or finite[-1][0] >= finite[-1][1] else "storage"
         shown = ", ".join(f"({u:.1e}, {p:.1e})" for u, p in finite[-4:])
-        super().__init__(f"{reason}; worst in {worst}; last residuals (momentum, storage): {shown}")
+        super().__init__(reason + (f"; worst in {worst}; last residuals (momentum, storage): {shown}" if shown else ""))
         self.reason, self.field, self.history = reason, worst, history
 
 
@@ -268,7 +268,7 @@ class Coupler:
         with Timer("mpm: linear solve"):
             # no more accuracy than the next residual can use
             linear = self.momentum.linear and not self._iterative
-            rtol = min(1e-2, max(0.0 if linear else FORCING, 0.05 * self.tolerance / error))
+            rtol = min(1e-2, max(0.0 if linear else FORCING, 0.05 * self.tolerance / min(1.0, error)))
             if self.storage is None:
                 self._solve_u.setTolerances(rtol=rtol, atol=0.0, max_it=500)
                 self._solve_u.solve(self.momentum.residual, self._du)

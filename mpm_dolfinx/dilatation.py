@@ -28,8 +28,9 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from mpm_dolfinx import _compat
+from mpm_dolfinx.elements import insert, shape_gradients
 from mpm_dolfinx.extend import call
-from mpm_dolfinx.forms import CellSums, FormPoints, insert, shape_gradients
+from mpm_dolfinx.forms import CellSums, FormPoints
 from mpm_dolfinx.materials import Skeleton
 
 

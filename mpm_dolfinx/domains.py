@@ -5,14 +5,15 @@ A point stands for a quadrilateral or hexahedron of tracked corners.  Its pieces
 and centroids: gradients of P1 functions are linear within a cell, so one row of integration data a
 piece integrates them exactly, and the answer does not depend on how points lie on the grid.
 
-The domains are split into simplices (2 triangles, or the 6 Kuhn tetrahedra, whose faces match those
-of the neighbours), all simplices are sliced by the grid planes of one axis after the other, and the
-slices are summed by (point, cell).
+The surface of a domain (4 edges, or the 12 outer triangles of its 6 Kuhn tetrahedra, which match those of
+the neighbours) is sliced by the grid planes of one axis after the other.  Gauss's theorem turns the slices into
+volumes and first moments of what lies between them and the lower face of their cell and, below it, of whole
+columns of cells: nothing inside a domain is ever cut, and the faces of the pieces come for free.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import permutations
 
 import numpy as np
@@ -22,12 +23,13 @@ from mpm_dolfinx.grid import Grid, sum_by
 
 SNAP = 1e-10  # cells: vertices this close to a grid plane are taken to lie on it
 SLIVER = 1e-12  # of the domain: smaller pieces are dropped; less than a piece that is SNAP thin, whose face is open
+CHUNK = 2**15  # corners of domains that are cut at a time, in the processor's cache
 TANGLED = 0.2  # of its volume: a domain whose corners span less is re-derived from F
 
 
 @dataclass
 class Pieces:
-    """Domains cut by the cells; arrays over the pieces, ordered by point.
+    """Domains cut by the cells; arrays over the pieces, ordered by point and cell.
 
     point : (m,) index of the domain; cell : (m,) lexicographic number of the cell;
     fraction : (m,) share of the domain's volume; x : (m, d) centroid, m;
@@ -82,73 +84,149 @@ def cut(grid: Grid, corners: NDArray[np.float64]) -> Pieces:
     -------
     The pieces, slivers below 1e-12 of their domain left out; fractions sum to one for every domain.
     """
-    d = grid.dim
-    y = np.ascontiguousarray(((corners - grid.lower) / grid.h).transpose(1, 2, 0))
+    size = CHUNK // 2**grid.dim
+    starts = range(0, max(1, len(corners)), size)
+    parts = [_cut(grid, corners[start : start + size]) for start in starts]
+    for start, part in zip(starts, parts, strict=True):
+        part.point += start
+    columns = zip(*([getattr(part, f.name) for f in fields(Pieces)] for part in parts), strict=True)
+    return Pieces(*map(np.concatenate, columns))
+
+
+def _cut(grid: Grid, corners: NDArray[np.float64]) -> Pieces:
+    d, y = grid.dim, np.ascontiguousarray(((corners - grid.lower) / grid.h).transpose(1, 2, 0))
     nearest = np.rint(y)
     y = np.where(np.abs(y - nearest) < SNAP, nearest, y)
-    # simplices (d+1, d, m): vertices and coordinates first, which keeps the loops below in numpy's fast lanes
-    s = np.concatenate([y[corner] for corner in kuhn_simplices(d)], axis=2)
-    owner = np.tile(np.arange(len(corners)), s.shape[2] // max(1, len(corners)))
+    # segments or triangles (d, d, m): vertices and coordinates first, which keeps the loops in numpy's fast lanes
+    s = np.concatenate([y[facet] for facet in _FACETS[d][:, [0, -1]].reshape(-1, d)], axis=2)
+    outward, owner = _area_vectors(s), np.tile(np.arange(len(corners)), 2 * len(_FACETS[d]))
+    # a simplex that is turned inside out, in a domain about to fold, counts as positive: minus twice its volume
+    simplex, folded = _turned(y)
+    if len(folded):
+        turned = y[_FACETS[d][simplex], :, folded[:, None, None]].transpose(2, 3, 0, 1).reshape(d, d, -1)
+        s = np.concatenate([s, turned, turned], axis=2)
+        outward = np.concatenate([outward, *[-_area_vectors(turned)] * 2], axis=1)
+        owner = np.concatenate([owner, *[np.repeat(folded, d + 1)] * 2])
+    facet = np.arange(s.shape[2])
     for axis in range(d):
-        s, owner = _slice(s, owner, axis)
-    return _sum(grid, y, s, owner)
+        s, facet = _slice(s, facet, axis)
+    area = _area_vectors(s)
+    area *= np.sign((area * outward[:, facet]).sum(axis=0))  # slicing has shuffled the vertices
+    return _sum(grid, _Slots(grid, y), s, area, owner[facet])
 
 
-def _volume(s: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the volumes of simplices (d+1, d, m)."""
+def _turned(y: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return which simplices of which domains (2^d, d, n) are turned inside out."""
+    d, out = y.shape[1], []
+    for simplex, sign in zip(kuhn_simplices(d), _ORIENTATION[d], strict=True):
+        height = y[simplex[-1]] - y[simplex[0]]
+        out.append((_area_vectors(y[simplex[:-1]]) * height).sum(axis=0) * sign * (-1) ** (d + 1) < 0)
+    return np.nonzero(out)
+
+
+def _area_vectors(s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the normals (d, m) of segments or triangles (d, d, m), as long as these are large."""
     e = s[1:] - s[0]
-    if len(e) == 2:
-        return np.abs(e[0, 0] * e[1, 1] - e[0, 1] * e[1, 0]) / 2
-    return np.abs(np.einsum("am,am->m", e[0], np.cross(e[1], e[2], axis=0))) / 6
+    if len(e) == 1:
+        return np.stack([e[0, 1], -e[0, 0]])
+    (ax, ay, az), (bx, by, bz) = e
+    return 0.5 * np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
 
 
-def _sum(grid: Grid, y: NDArray[np.float64], s: NDArray[np.float64], owner: NDArray[np.int64]) -> Pieces:
-    """Sum the simplices by (point, cell) into pieces."""
-    d, n = grid.dim, y.shape[2]
-    volume, x, top = _volume(s), s.mean(axis=0), (grid.shape - 1)[:, None]
-    index = np.clip(np.floor(x).astype(np.int64), 0, top)
-    low = np.clip(np.floor(y.min(axis=0)).astype(np.int64), 0, top)
-    high = np.clip(np.floor(y.max(axis=0)).astype(np.int64), 0, top)
-    span = high - low + 1  # cells that the domain's bounding box touches
-    count = span.prod(axis=0)
-    start = np.concatenate([[0], np.cumsum(count)])
-    slot = np.zeros(len(owner), dtype=np.int64)
+def _facets(dim: int) -> NDArray[np.int64]:
+    """Return the (d!, d+1, d) corners of the facets of a domain's simplices, turned outward.
+
+    The k-th facet lacks the k-th corner; the first and the last are part of the domain's surface.
+    """
+    out = np.stack([np.delete(kuhn_simplices(dim), k, axis=1) for k in range(dim + 1)], axis=1)
+    bits = corner_bits(dim).astype(float)
+    for simplex, facets in zip(kuhn_simplices(dim), out, strict=True):
+        for facet in facets:
+            away = bits[facet].mean(axis=0) - bits[simplex].mean(axis=0)
+            if _area_vectors(bits[facet][:, :, None])[:, 0] @ away < 0:
+                facet[:2] = facet[1::-1].copy()
+    return out
+
+
+class _Slots:
+    """The cells that the bounding boxes of domains touch: a slot for each domain and cell, the last axis fastest."""
+
+    def __init__(self, grid: Grid, y: NDArray[np.float64]):
+        top = (grid.shape - 1)[:, None]
+        self.low = np.clip(np.floor(y.min(axis=0)).astype(np.int64), 0, top)
+        self.high = np.clip(np.ceil(y.max(axis=0)).astype(np.int64) - 1, self.low, top)
+        span = self.high - self.low + 1
+        stop = np.cumsum(span.prod(axis=0))
+        self.size = int(stop[-1]) if len(stop) else 0
+        self.point = np.repeat(np.arange(y.shape[2]), span.prod(axis=0))
+        self._stride = np.cumprod(np.concatenate([np.ones_like(span[:1]), span[:0:-1]]), axis=0)[::-1]
+        self._start, self._span = stop - span.prod(axis=0), span
+        number = np.arange(self.size) - self._start[self.point]
+        self._place = number // self._stride[:, self.point] % span[:, self.point]
+        self.cell = self.low[:, self.point] + self._place
+
+    def of(self, owner: NDArray[np.int64], index: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Return the slots (m,) of domains and cells (d, m)."""
+        place = index.astype(np.int64) - self.low[:, owner]
+        return self._start[owner] + (place * self._stride[:, owner]).sum(axis=0)
+
+    def beyond(self, values: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
+        """Return the sums of the values of slots over the cells further along an axis in the same column."""
+        out = np.zeros(self.size)
+        for steps in range(1, int(self._span[axis].max(initial=1))):
+            has = np.flatnonzero(self._place[axis] + steps < self._span[axis][self.point])
+            out[has] += values[has + steps * self._stride[axis][self.point[has]]]
+        return out
+
+
+def _sum(
+    grid: Grid, slots: _Slots, s: NDArray[np.float64], area: NDArray[np.float64], owner: NDArray[np.int64]
+) -> Pieces:
+    """Sum the slices of the surfaces by (point, cell) into pieces."""
+    d = grid.dim
+    index, least, most = np.floor(s.mean(axis=0)), s.min(axis=0), s.max(axis=0)
+    ends = []
     for a in range(d):
-        slot = slot * span[a][owner] + (index[a] - low[a][owner])
-    slot += start[owner]
+        # what lies on a grid plane belongs to the cell of the body behind it
+        index[a] -= (area[a] > 0) & (most[a] == index[a])
+        np.clip(index[a], slots.low[a][owner], slots.high[a][owner], out=index[a])
+        flat = most[a] - least[a] < SNAP  # of two domains that touch, rounding may snap one only: hence 2 SNAP
+        lower = np.flatnonzero(flat & (area[a] < 0) & (most[a] - index[a] < 2 * SNAP))
+        upper = np.flatnonzero(flat & (area[a] > 0) & (index[a] + 1 - least[a] < 2 * SNAP))
+        ends.append((lower, upper))
+    slot = slots.of(owner, index)
 
-    def total(values):
-        return sum_by(slot, values, start[-1])
+    def total(values, chosen=slice(None)):
+        return sum_by(slot[chosen], values[chosen], slots.size)
 
-    sums = total(volume)
-    whole = sum_by(owner, volume, n)
-    point = np.repeat(np.arange(n), count)
-    kept = np.flatnonzero(sums > SLIVER * whole[point])
-    point, sums = point[kept], sums[kept]
-    centroid = np.stack([total(volume * x[a])[kept] / sums for a in range(d)], axis=1)
+    # integrals over the slices of (x, x^2/2, xy, xz) n_x from the cell's lower face, and of the columns beyond
+    x = s - index
+    sums, products = x.sum(axis=0), area[0] / (d * (d + 1))
+    shadow = total(area[0])
+    beyond = slots.beyond(shadow, 0)
+    volume = total(area[0] * sums[0] / d) + beyond
+    moments = [total(products / 2 * (sums[0] ** 2 + (x[:, 0] ** 2).sum(axis=0))) + beyond / 2]
+    for a in range(1, d):
+        within = total(products * (sums[0] * sums[a] + (x[:, 0] * x[:, a]).sum(axis=0)))
+        moments.append(within + slots.beyond(total(area[0] * sums[a] / d), 0))
 
-    rest = kept - start[point]
-    cell = np.empty((len(kept), d), dtype=np.int64)
-    for a in reversed(range(d)):
-        cell[:, a] = low[a][point] + rest % span[a][point]
-        rest //= span[a][point]
-
-    faces = np.zeros((len(kept), d, 2))
-    solid = volume > 1e-13  # a vertex on a plane leaves simplices whose height is rounding
+    whole = sum_by(slots.point, volume, len(slots.low[0]))[slots.point]
+    kept = np.flatnonzero(volume / whole > SLIVER)
+    point, cell = slots.point[kept], slots.cell[:, kept].T
+    faces = np.empty((len(kept), d, 2))
     for a in range(d):
-        for end in (0, 1):
-            distance = np.abs(s[:, a] - (index[a] + end))
-            height = distance.max(axis=0)
-            near = distance < np.minimum(2 * SNAP, height / 2)  # of two domains that touch, rounding may snap one only
-            on = np.flatnonzero((near.sum(axis=0) == d) & solid)  # a facet lies on the plane
-            area = d * volume[on] / height[on]
-            area = sum_by(slot[on], area, start[-1])[kept]
-            faces[:, a, end] = area * grid.cell_volume / grid.h[a]
+        shadow = total(area[a]) if a else shadow
+        beyond = slots.beyond(shadow, a)
+        lower, upper = (total(area[a], chosen) for chosen in ends[a])
+        # the section of the body just above the lower and just below the upper face
+        faces[:, a] = np.stack([beyond + shadow - lower, beyond + upper], axis=1)[kept]
+        faces[:, a] *= grid.cell_volume / grid.h[a]
 
     # centroids stay off the grid lines, and inside the cell that they belong to
-    centroid = np.clip(centroid, cell + SNAP, cell + 1 - SNAP)
-    fraction = sums / sum_by(point, sums, n)[point]
-    return Pieces(point, grid.number(cell), fraction, grid.lower + grid.h * centroid, faces)
+    volume = volume[kept]
+    centroid = cell + np.clip(np.stack([m[kept] / volume for m in moments], axis=1), SNAP, 1 - SNAP)
+    fraction = volume / sum_by(point, volume, len(slots.low[0]))[point]
+    return Pieces(point, grid.number(cell), fraction, grid.lower + grid.h * centroid, np.abs(faces))
 
 
 def cut_faces(
@@ -254,12 +332,7 @@ def _on_plane(a, b, axis: int, plane):
     return x
 
 
-def _prism(a, b):
-    """Return the 3 tetrahedra of the prism with triangles a and b."""
-    return [(a[0], a[1], a[2], b[2]), (a[0], a[1], b[1], b[2]), (a[0], b[0], b[1], b[2])]
-
-
-_A, _B, _C, _D = (0,), (1,), (2,), (3,)
+_A, _B, _C = (0,), (1,), (2,)
 # vertices are sorted along the axis; (i, j) is the point where the edge from i to j meets the plane
 _CUTS = {
     1: {1: {"below": [(_A, (0, 1))], "above": [((0, 1), _B)]}},
@@ -267,18 +340,5 @@ _CUTS = {
         1: {"below": [(_A, (0, 1), (0, 2))], "above": [((0, 1), _B, _C), ((0, 1), _C, (0, 2))]},
         2: {"below": [(_A, _B, (1, 2)), (_A, (1, 2), (0, 2))], "above": [((0, 2), (1, 2), _C)]},
     },
-    3: {
-        1: {
-            "below": [(_A, (0, 1), (0, 2), (0, 3))],
-            "above": _prism(((0, 1), (0, 2), (0, 3)), (_B, _C, _D)),
-        },
-        2: {
-            "below": _prism((_A, (0, 2), (0, 3)), (_B, (1, 2), (1, 3))),
-            "above": _prism((_C, (0, 2), (1, 2)), (_D, (0, 3), (1, 3))),
-        },
-        3: {
-            "below": _prism((_A, _B, _C), ((0, 3), (1, 3), (2, 3))),
-            "above": [((0, 3), (1, 3), (2, 3), _D)],
-        },
-    },
 }
+_FACETS = {d: _facets(d) for d in (2, 3)}

@@ -16,7 +16,7 @@ No generated code is touched.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import factorial, prod
+from math import factorial
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -27,7 +27,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from mpm_dolfinx import _compat
-from mpm_dolfinx.grid import Grid, sum_by
+from mpm_dolfinx.grid import Grid
 
 CHUNK = 2**14
 """Points whose coefficients are packed at a time: no form holds a row for each point of a large body."""
@@ -70,6 +70,8 @@ class FormPoints:
             for name, shape in {"offset": (grid.dim,), "weight": (), **fields}.items()
         }
         self._live: dict[str, fem.Function] = {}
+        self._of: tuple[int, NDArray[np.float64]] | None = None
+        self._gradients = np.empty((0, grid.dim**2))
         self.dx = PointMeasure(grid, self._functions["weight"])
         self._size = {name: int(np.prod(shape, dtype=int)) for name, shape in fields.items()}
         self.cells = self.filled = np.empty(0, dtype=np.int32)
@@ -142,12 +144,25 @@ class FormPoints:
 
     def values(self, name: str, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
         """Return a field at the chosen points (m, size)."""
-        if name not in self._live:
-            return self.data[name][chosen]
-        cells = self.cells[chosen]
-        u = self._live[name].x.array.reshape(-1, self.grid.dim)
-        du = u[self.grid.cell_nodes[cells]].transpose(0, 2, 1) @ self.grid.shape_gradients(cells, self.x[chosen])
-        return du.reshape(len(cells), -1)
+        if name in self._live:
+            self._update(self._live[name].x.array)
+            return self._gradients[chosen]
+        return self.data[name][chosen]
+
+    def _update(self, u: NDArray[np.float64]) -> None:
+        """Set the gradients of u at the points, of which several forms ask, if u or the points have changed."""
+        if self._of is not None and self._of[0] == self.version and np.array_equal(self._of[1], u):
+            return
+        self._of = (self.version, u.copy())
+        d, n = self.grid.dim, len(self.cells)
+        if len(self._gradients) != n:
+            self._gradients = np.empty((n, d * d))
+        nodal = u.reshape(-1, d)
+        for part in (slice(start, start + BATCH) for start in range(0, n, BATCH)):
+            cells = self.cells[part]
+            slopes = self.grid.shape_gradients(cells, self.x[part])
+            du = nodal[self.grid.cell_nodes[cells]].transpose(0, 2, 1) @ slopes
+            self._gradients[part] = du.reshape(len(cells), d * d)
 
     def changes(self, name: str) -> bool:
         """Return whether a field changes while the points stay."""
@@ -251,38 +266,6 @@ class PointForm:
             self.compiled.assemble_matrix(A, rows, form)
 
 
-class ElementMatrices:
-    """The bilinear form grad v : A : grad u of P1 vectors over points, summed in each cell before insertion.
-
-    Inserting the matrix of every point costs twice as much as computing it.  Here the entries of the
-    element matrix, A contracted with the gradients of the shape functions at the point, are tested
-    with DG0, so that the assembler sums them over the points of a cell; then each cell is inserted once.
-
-    Parameters
-    ----------
-    tangent : UFL tensor (d, d, d, d)
-        A[i, k, j, l] at the points.
-    points
-        The points.
-    symmetric
-        Whether A[i, k, j, l] = A[j, l, i, k]: half of the entries are then left out.
-    """
-
-    def __init__(self, tangent: ufl.core.expr.Expr, points: FormPoints, symmetric: bool = True):
-        self.points, dim = points, points.grid.dim
-        rows, columns, self._entry = _entries(2**dim * dim, symmetric)
-        gradients, entries = shape_gradients(points), []
-        for row, column in zip(rows, columns, strict=True):
-            (v, i), (u, j) = divmod(row, dim), divmod(column, dim)
-            block = ufl.as_matrix([[tangent[int(i), k, int(j), l] for l in range(dim)] for k in range(dim)])
-            entries.append(ufl.dot(gradients[v], ufl.dot(block, gradients[u])))
-        self._sums = CellSums(entries, points)
-
-    def assemble_matrix(self, A: PETSc.Mat) -> None:
-        """Add the matrix to `A`, by unrolled local dofs; the caller finalises it."""
-        insert(A, self.points, self._sums()[:, self._entry])
-
-
 class FacetForm:
     """A form over faces between active cells, compiled when first a process has such a face.
 
@@ -332,161 +315,6 @@ class FacetForm:
             self._compiled.assemble_vector(b)
 
 
-def _entries(count: int, symmetric: bool) -> tuple[NDArray, NDArray, NDArray]:
-    """Return rows and columns of the entries of a matrix that are needed, and the place of every entry among them."""
-    rows, columns = np.triu_indices(count) if symmetric else np.divmod(np.arange(count**2), count)
-    place = np.empty((count, count), dtype=np.int64)
-    if symmetric:
-        place[columns, rows] = np.arange(len(rows))
-    place[rows, columns] = np.arange(len(rows))
-    return rows, columns, place
-
-
-class ElementForces:
-    """The linear form T : grad v of P1 vectors over points, summed in each cell.
-
-    Parameters
-    ----------
-    stress : UFL tensor (d, d)
-        T[i, k] at the points.
-    points
-        The points.
-    """
-
-    def __init__(self, stress: ufl.core.expr.Expr, points: FormPoints):
-        self.points, dim = points, points.grid.dim
-        forces = [ufl.dot(stress, gradient) for gradient in shape_gradients(points)]
-        self._sums = CellSums([force[i] for force in forces for i in range(dim)], points)
-
-    def assemble_vector(self, b: NDArray[np.float64]) -> None:
-        """Add the vector to the local array `b`; contributions to ghosts stay there."""
-        dofs = element_dofs(self.points.grid, self.points.filled)
-        b += sum_by(dofs.ravel(), self._sums().ravel(), len(b))
-
-    def assemble_matrix(self, A: PETSc.Mat) -> None:
-        """Add to `A`, which has a row a cell, the vectors of the cells; the caller finalises it."""
-        cells = self.points.filled
-        if len(cells):
-            dofs = element_dofs(self.points.grid, cells).astype(PETSc.IntType)
-            A.setValuesLocalRCV(cells[:, None].astype(PETSc.IntType), dofs, self._sums()[:, None], addv=True)
-
-
-class StackedElementMatrices:
-    """The bilinear form (grad v F) : A : (grad u F) of P1 vectors over points: kernels give A, BLAS contracts it.
-
-    For 3D, where cells hold many points: with the gradients g of the shape functions, times F, stacked over the
-    n points of a cell, its matrix is one product of an 8 x 3n with a 3n x 72 matrix.  Cells are taken in
-    batches of about as many points.
-
-    Parameters
-    ----------
-    tangent : UFL tensor (d, d, d, d)
-        A[i, k, j, l] at the points.
-    points
-        The points, with the field F (d, d).
-    symmetric
-        Whether A[i, k, j, l] = A[j, l, i, k]: half of the entries are then left out.
-    """
-
-    def __init__(self, tangent: ufl.core.expr.Expr, points: FormPoints, symmetric: bool = True):
-        self.points, self._d = points, points.grid.dim
-        d, (rows, columns, place) = self._d, _entries(self._d**2, symmetric)
-        self._entry = place.reshape(d, d, d, d).transpose(1, 0, 2, 3).ravel()  # (k, i, j, l)
-        pairs = [(*divmod(int(r), d), *divmod(int(c), d)) for r, c in zip(rows, columns, strict=True)]
-        self._tangent = PointExpression(ufl.as_vector([tangent[pair] for pair in pairs]), points)
-        self._version = -1
-
-    def _sort(self) -> None:
-        """Find batches of filled cells that hold about as many points, and their points (cells, most points)."""
-        cells, filled = self.points.cells, self.points.filled
-        order = np.argsort(cells, kind="stable")
-        start = np.searchsorted(cells[order], filled)
-        count = np.diff(start, append=len(cells))
-        self._batches, by_count = [], np.argsort(count, kind="stable")
-        while len(by_count):
-            size = max(1, BATCH // count[by_count[0]])
-            size = max(1, BATCH // count[by_count[min(size, len(by_count)) - 1]])
-            batch, by_count = by_count[:size], by_count[size:]
-            turn = np.arange(count[batch].max())
-            missing = turn >= count[batch, None]
-            points = order[np.where(missing, start[batch, None], start[batch, None] + turn)]
-            self._batches.append((filled[batch], points, missing))
-
-    def assemble_matrix(self, A: PETSc.Mat) -> None:
-        """Add the matrix to `A`, by unrolled local dofs; the caller finalises it."""
-        if self._version != self.points.version:
-            self._version = self.points.version
-            self._sort()
-        for cells, points, missing in self._batches:
-            insert(A, self.points, self._matrices(points.ravel(), missing), cells)
-
-    def _matrices(self, chosen: NDArray[np.int64], missing: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """Return the element matrices (cells, n, n) of a batch."""
-        points, d, (cells, most) = self.points, self._d, missing.shape
-        g = points.grid.shape_gradients(points.cells[chosen], points.x[chosen])
-        g = g @ points.values("F", chosen).reshape(-1, d, d)
-        nodes = g.shape[1]
-        tangent = self._tangent.evaluate(chosen)[:, self._entry].reshape(-1, d**3, d)
-        right = (tangent @ g.transpose(0, 2, 1)).reshape(cells, most * d, d * d * nodes)
-        weight = points.data["weight"][chosen, 0] * points.grid.cell_volume
-        g *= np.where(missing.ravel(), 0.0, weight)[:, None, None]
-        left = g.reshape(cells, most, nodes, d).transpose(0, 2, 1, 3).reshape(cells, nodes, most * d)
-        matrices = (left @ right).reshape(cells, nodes, d, d, nodes)
-        return matrices.transpose(0, 1, 2, 4, 3).reshape(cells, nodes * d, nodes * d)
-
-
-def shape_gradients(points: FormPoints) -> list:
-    """Return the gradients of the cell's P1 shape functions at the point as UFL."""
-    grid, xi = points.grid, points.offset
-    h = fem.Constant(grid.mesh, grid.h)
-    out = []
-    for signs in grid.signs.tolist():
-        t = [0.5 + signs[a] * xi[a] / h[a] for a in range(grid.dim)]
-        slopes = [signs[a] / h[a] * prod(t[b] for b in range(grid.dim) if b != a) for a in range(grid.dim)]
-        out.append(ufl.as_vector(slopes))
-    return out
-
-
-def insert(A: PETSc.Mat, points: FormPoints, matrices: NDArray[np.float64], cells=None) -> None:
-    """Add the element matrices of P1 vectors (cells, n, n) in cells, by default all filled ones, of `points` to `A`."""
-    grid, cells = points.grid, points.filled if cells is None else cells
-    if len(cells):
-        dofs = element_dofs(grid, cells).astype(PETSc.IntType)
-        A.setValuesLocalRCV(dofs, dofs, matrices, addv=True)
-
-
-def element_dofs(grid: Grid, cells: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Return the unrolled local dofs (cells, n) of P1 vectors in cells."""
-    dofs = grid.cell_nodes[cells][:, :, None] * grid.dim + np.arange(grid.dim, dtype=grid.cell_nodes.dtype)
-    return dofs.reshape(len(cells), -1)
-
-
-class CellSums:
-    """Sums over the points of each cell: DG0 tests them, so that the assembler adds them up.
-
-    Parameters
-    ----------
-    quantities
-        Scalar UFL expressions at the points.
-    points
-        The points.
-    """
-
-    def __init__(self, quantities: Sequence[ufl.core.expr.Expr], points: FormPoints):
-        self.points, self._count = points, len(quantities)
-        space = _compat.function_space(points.grid.mesh, "DG", 0, (self._count,))
-        self._values, q = fem.Function(space), ufl.TestFunction(space)
-        self._form = PointForm(ufl.inner(ufl.as_vector(quantities), q) * points.dx, points)
-
-    def __call__(self) -> NDArray[np.float64]:
-        """Return the sums (cells, quantities) in the filled cells of the points."""
-        cells = self.points.filled
-        values = self._values.x.array.reshape(-1, self._count)
-        values[cells] = 0.0
-        self._form.assemble_vector(self._values.x.array)
-        return values[cells]
-
-
 class PointExpression:
     """A UFL expression of the fields that points carry, evaluated at every point.
 
@@ -524,3 +352,29 @@ class PointExpression:
             self._compiled.assemble_vector(self._values.reshape(-1), self._rows.room(self._many))
             out[start : start + len(part)] = self._values[: len(part)]
         return out.reshape(len(chosen), *self._shape)
+
+
+class CellSums:
+    """Sums over the points of each cell: DG0 tests them, so that the assembler adds them up.
+
+    Parameters
+    ----------
+    quantities
+        Scalar UFL expressions at the points.
+    points
+        The points.
+    """
+
+    def __init__(self, quantities: Sequence[ufl.core.expr.Expr], points: FormPoints):
+        self.points, self._count = points, len(quantities)
+        space = _compat.function_space(points.grid.mesh, "DG", 0, (self._count,))
+        self._values, q = fem.Function(space), ufl.TestFunction(space)
+        self._form = PointForm(ufl.inner(ufl.as_vector(quantities), q) * points.dx, points)
+
+    def __call__(self) -> NDArray[np.float64]:
+        """Return the sums (cells, quantities) in the filled cells of the points."""
+        cells = self.points.filled
+        values = self._values.x.array.reshape(-1, self._count)
+        values[cells] = 0.0
+        self._form.assemble_vector(self._values.x.array)
+        return values[cells]

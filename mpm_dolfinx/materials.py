@@ -91,6 +91,8 @@ class Skeleton:
         functions = [f for f in (cls.energy, cls.kirchhoff, cls.update) if f is not None]
         names = dict.fromkeys(name for f in functions for name in signature(f).parameters)
         cls.parameters = tuple(name for name in names if name != "F" and name not in cls.state)
+        if "energy" in vars(cls) and "linear" not in vars(cls):
+            cls.linear = False  # not what the law had that this one is derived from
 
     def __post_init__(self):
         for name in ("bulk", "shear"):

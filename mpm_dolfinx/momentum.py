@@ -24,8 +24,9 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx import _compat
 from mpm_dolfinx.dilatation import MeanDilatation
+from mpm_dolfinx.elements import ElementForces, ElementMatrices, StackedElementMatrices
 from mpm_dolfinx.extend import call
-from mpm_dolfinx.forms import ElementForces, ElementMatrices, FacetForm, FormPoints, PointForm, StackedElementMatrices
+from mpm_dolfinx.forms import FacetForm, FormPoints, PointForm
 from mpm_dolfinx.grid import Grid
 from mpm_dolfinx.materials import Skeleton
 from mpm_dolfinx.unknowns import Unknowns, matrix, sum_ghosts, zero
@@ -128,7 +129,7 @@ class Momentum:
         self._own = fem.Function(V)
         if self.u in form.coefficients():
             self._tangents.append(PointForm(ufl.derivative(form, self.u, du), self.pieces))
-            self.holding = True
+            self.holding, self.linear = True, False
             self.symmetric = self.symmetric and potential
 
     def require(self, loaded: bool, plates: bool, held: bool) -> None:

@@ -59,6 +59,7 @@ class Placement:
 
     def __init__(self, grid: Grid, points: MaterialPoints, quadrature: str, t: float):
         self.grid, self.points = grid, points
+        self._patches: dict[Surface, Patches] = {}
         self._check_inside(points.corners if quadrature == "domain" else points.x[:, None], t)
         self.pieces = cut(grid, points.corners) if quadrature == "domain" else whole_points(grid, points.x)
         self._travel = Exchange(grid.comm, grid.owner(self.pieces.cell))
@@ -96,6 +97,11 @@ class Placement:
         The cell is that of a place just under the surface, which holds a piece of the domain: its
         shape functions, continued to the surface, put the load on nodes that have stiffness.
         """
+        if faces not in self._patches:
+            self._patches[faces] = self._cut_surface(faces)
+        return self._patches[faces]
+
+    def _cut_surface(self, faces: Surface) -> Patches:
         here, at = self.points.find(faces.id)
         corners, xi = self.points.corners[at], faces.corners()[here]
         count = xi.shape[1]

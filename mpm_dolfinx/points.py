@@ -200,7 +200,7 @@ def material_points(grid: Grid, bodies: Sequence[Body], pressure: float = 0.0) -
     )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Surface:
     """Faces of domains on one side of the bodies, the same on every process; arrays over m faces.
 

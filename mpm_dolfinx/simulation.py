@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from mpm_dolfinx import _compat, summary
 from mpm_dolfinx.boundary import Boundary
 from mpm_dolfinx.conditions import Displacement, Drained, Inflow, RigidPlate, Traction
-from mpm_dolfinx.coupling import COUPLINGS, Coupler, Report
+from mpm_dolfinx.coupling import COUPLINGS, Coupler, NotConverged, Report
 from mpm_dolfinx.domains import parallelepipeds, tangled
 from mpm_dolfinx.exchange import Exchange
 from mpm_dolfinx.forms import FormPoints
@@ -468,7 +468,9 @@ class Simulation:
                 delta = self.momentum.dilatation.averaged(delta)
             # F_p <- (sum_k w_k Delta_k / V_p) F_p
             mean = [place.mean(column) for column in place.to_pieces(delta).reshape(-1, d * d).T]
-            points.F = np.stack(mean, axis=1).reshape(n, d, d) @ points.F
+            F = np.stack(mean, axis=1).reshape(n, d, d) @ points.F
+            self._check_volumes(np.linalg.det(F))
+            points.F = F
             self._scene.update_state(points)
             if self.quadrature == "domain":
                 corners = points.corners.reshape(-1, d)
@@ -487,15 +489,21 @@ class Simulation:
 
     def _carry(self, moved: NDArray[np.float64]) -> Carried:
         """Return the pressures that the pieces take along; `moved` (m, d), m: their centroids at the end of the step."""
-        points, place, J = self.points, self.placement, self.points.J
+        points, place, pieces, J = self.points, self.placement, self.placement.pieces, self.points.J
         n = 1 - (1 - self._table(lambda m: m.porosity)) / J
         store = self._table(lambda m, n: m.storage(self.fluid.bulk, n), n) * points.volume0 * J
-        at_pieces = self.storage.at_pieces(place.pieces_to_cells(place.pieces.fraction * store[place.pieces.point]))
-        pressure, slope, bounds = map(place.to_pieces, at_pieces)
-        pieces = place.pieces
-        return Carried(
-            points.id[pieces.point], pieces.cell, pieces.fraction, pressure, place.to_pieces(moved), slope, bounds
-        )
+        at_pieces = self.storage.at_pieces(place.pieces_to_cells(pieces.fraction * store[pieces.point]))
+        pressure, slope, bounds, x = map(place.to_pieces, (*at_pieces, moved))
+        return Carried(points.id[pieces.point], pieces.cell, pieces.fraction, pressure, x, slope, bounds)
+
+    def _check_volumes(self, J: NDArray[np.float64]) -> None:
+        """Refuse what a law may allow and a body does not: points turned inside out, pores of no volume."""
+        least = 1 - self._table(lambda m: m.porosity) if self.fluid else np.zeros(len(J))
+        bad = np.flatnonzero(J <= least)
+        if self.grid.comm.allreduce(len(bad)):
+            shown = [f"point {self.points.id[i]} at {self.points.x[i]} with J = {J[i]:.3g}" for i in bad[:1]]
+            what = "the pores have closed" if self.fluid else "the body is turned inside out"
+            raise NotConverged(f"{what}, J <= {least.max(initial=0):.3g}: {', '.join(shown) or 'elsewhere'}", [])
 
     def _untangle(self) -> int:
         """Re-derive from F the domains that have folded: points whose neighbours went elsewhere."""

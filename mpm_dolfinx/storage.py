@@ -29,8 +29,9 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from mpm_dolfinx import _compat
+from mpm_dolfinx.elements import ElementForces
 from mpm_dolfinx.extend import call
-from mpm_dolfinx.forms import ElementForces, FacetForm, FormPoints, PointForm
+from mpm_dolfinx.forms import FacetForm, FormPoints, PointForm
 from mpm_dolfinx.grid import Grid, sum_by
 from mpm_dolfinx.remap import Reconstruction
 from mpm_dolfinx.unknowns import Unknowns, matrix, sum_ghosts, zero

@@ -36,7 +36,9 @@ def _momentum(s: Simulation) -> list[Part]:
     state = ", ".join(name for law, _ in s.laws for name in law.state)
     return [
         Part("stress", True, f"{laws}; integrated over {'exact domains' if s.quadrature == 'domain' else 'points'}"),
-        _either("mean dilatation", m.dilatation, f"nu > {LOCKING}", f"no Poisson's ratio above {LOCKING}"),
+        _either(
+            "mean dilatation", m.dilatation, f"nu > {LOCKING}, or plastic flow", f"nu <= {LOCKING}, no plastic flow"
+        ),
         _either("state of the law", state, state, "the stress depends on F only"),
         _either("body force", s.gravity is not None, "gravity", "no gravity"),
         _either("tractions", side.loads, f"on {len(side.loads)} sides", "no tractions"),

@@ -64,3 +64,14 @@ def test_a_point_that_leaves_the_grid_is_named_with_its_time():
 def test_a_column_that_slides_is_refused():
     with pytest.raises(ValueError, match="free to move as a rigid body in 1 of 3 ways"):
         column(fluid=False, fixed={"left": "x", "right": "x"}, tractions=[top_load()]).run(1.0, 1.0)
+
+
+@pytest.mark.parametrize("fluid, message", [(False, "the body is turned inside out"), (True, "the pores have closed")])
+def test_a_load_that_leaves_no_volume_is_refused(fluid, message):
+    """The linear law has an answer for any load: half of the volume is more than the pores, twice more than all."""
+    law = mpm.LinearElastic(SOFT.bulk, SOFT.shear, porosity=0.4, conductivity=1.0)
+    load = [mpm.Traction("top", (0, -(0.5 if fluid else 2.0) * law.oedometric))]
+    s = column(fluid=fluid, material=law, tractions=load, **({"drained": [mpm.Drained("top")]} if fluid else {}))
+    with pytest.raises(mpm.GaveUp, match=f"{message}, J <= .*: point"):
+        s.run(1e6, 1e6)
+    assert s.t == 0 and (s.points.J == 1).all()

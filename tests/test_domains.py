@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from mpm_dolfinx import Grid, box
-from mpm_dolfinx.domains import SNAP, corner_bits, cut
+from mpm_dolfinx.domains import SNAP, corner_bits, cut, kuhn_simplices
 
 GRIDS = {2: Grid([1.0, 1.2], [5, 6]), 3: Grid([1.0, 1.2, 0.8], [4, 3, 4])}
 
@@ -22,9 +22,10 @@ def domains(grid, distort):
     return x + distort * np.sin(3 * np.roll(x, 1, axis=2))
 
 
-def volume2d(c):
-    a, b = c[:, 3] - c[:, 0], c[:, 2] - c[:, 1]
-    return 0.5 * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+def simplices(corners):
+    """The simplices (n, d!, d+1, d) of domains and their volumes, all positive."""
+    s = corners[:, kuhn_simplices(corners.shape[2])]
+    return s, np.abs(np.linalg.det(s[:, :, 1:] - s[:, :, :1])) / s.shape[1]
 
 
 def test_pieces_of_undistorted_domains_fill_the_body(grid):
@@ -43,17 +44,44 @@ def test_fractions_sum_to_one_and_centroids_lie_in_their_cells(grid):
     assert (grid.number(grid.index(p.x)) == p.cell).all()
 
 
-def test_pieces_of_distorted_quadrilaterals_have_the_exact_area_and_centroid():
-    grid = GRIDS[2]
+def test_pieces_of_distorted_domains_have_the_exact_volume_and_centroid(grid):
     corners = domains(grid, 0.08)
     p = cut(grid, corners)
-    whole = cut(Grid([1.0, 1.2], [1, 1]), corners)  # one cell: nothing is cut
-    assert len(whole.point) == len(corners) < len(p.point)
-    area = volume2d(corners)
-    for a in range(2):
-        assert np.bincount(p.point, p.fraction * p.x[:, a]) == pytest.approx(whole.x[:, a], rel=1e-12)
-    inside = np.bincount(p.cell, p.fraction * area[p.point], minlength=30)
-    assert inside.max() == pytest.approx(grid.cell_volume, rel=1e-12), "no cell is filled exactly"
+    s, volume = simplices(corners)
+    whole, n = volume.sum(axis=1), int(np.prod(grid.shape))
+    assert len(corners) < len(p.point)
+    for a in range(grid.dim):
+        centroid = (volume * s[..., a].mean(axis=2)).sum(axis=1) / whole
+        assert np.bincount(p.point, p.fraction * p.x[:, a]) == pytest.approx(centroid, rel=1e-12)
+    filled = np.bincount(p.cell, p.fraction * whole[p.point], minlength=n)
+    assert filled.max() <= grid.cell_volume * (1 + 1e-12)
+    if grid.dim == 2:
+        assert filled.max() == pytest.approx(grid.cell_volume, rel=1e-12), "no cell is filled exactly"
+
+
+def test_a_domain_about_to_fold_is_cut_as_the_sum_of_its_simplices(grid):
+    """A simplex that is turned inside out counts as positive: the domain keeps pieces wherever it lies."""
+    corners = domains(grid, 0.0)[:1]
+    low, size = corners[0, 0], corners[0, -1] - corners[0, 0]
+    corners[0, 1] = low + np.array([0.2, 0.6, 0.7])[: grid.dim] * size  # across the diagonal
+    p = cut(grid, corners)
+    s, volume = simplices(corners)
+    before, _ = simplices(domains(grid, 0.0)[:1])
+    turned = np.linalg.det(s[:, :, 1:] - s[:, :, :1]) * np.linalg.det(before[:, :, 1:] - before[:, :, :1]) < 0
+    assert turned.any() and not turned.all()
+    total = volume[0].sum()
+    moment = (volume[0, :, None] * s[0].mean(axis=1)).sum(axis=0)
+    assert p.fraction.sum() == pytest.approx(1)
+    assert p.fraction @ p.x == pytest.approx(moment / total, rel=1e-12)
+    assert (p.fraction > 0).all()
+
+
+def test_every_chunk_of_domains_is_cut_alike(grid, monkeypatch):
+    corners = domains(grid, 0.05)
+    whole = cut(grid, corners)
+    monkeypatch.setattr("mpm_dolfinx.domains.CHUNK", 5 * 2**grid.dim)
+    parts = cut(grid, corners)
+    assert all((getattr(whole, name) == getattr(parts, name)).all() for name in ("point", "cell", "fraction", "faces"))
 
 
 def test_open_faces_agree_on_both_sides_and_are_whole_within_the_body(grid):
@@ -63,7 +91,7 @@ def test_open_faces_agree_on_both_sides_and_are_whole_within_the_body(grid):
         area = grid.cell_volume / grid.h[axis]
         ends = [np.bincount(p.cell, p.faces[:, axis, end], minlength=n).reshape(grid.shape) for end in (0, 1)]
         lower, upper = (np.moveaxis(e, axis, 0) for e in ends)
-        assert np.abs(lower[1:] - upper[:-1]).max() < 1e-9 * area
+        assert np.abs(lower[1:] - upper[:-1]).max() < 1e-12 * area
         assert upper.max() <= area * (1 + 1e-12)
     if grid.dim == 2:  # cell (2, 2) lies within the body
         assert lower[2, 2] == pytest.approx(area) == upper[2, 2]

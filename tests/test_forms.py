@@ -7,14 +7,8 @@ import ufl
 from dolfinx import fem
 
 from mpm_dolfinx import Grid, Hencky, NeoHookean, _compat
-from mpm_dolfinx.forms import (
-    ElementForces,
-    ElementMatrices,
-    FormPoints,
-    PointExpression,
-    PointForm,
-    StackedElementMatrices,
-)
+from mpm_dolfinx.elements import ElementForces, ElementMatrices, StackedElementMatrices
+from mpm_dolfinx.forms import FormPoints, PointExpression, PointForm
 from mpm_dolfinx.unknowns import Unknowns, matrix
 
 GRIDS = {2: Grid([1.5, 1.0], [4, 3]), 3: Grid([1.0, 1.2, 0.9], [2, 3, 2])}

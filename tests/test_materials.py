@@ -9,7 +9,7 @@ import ufl
 from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
 from ufl.algorithms.apply_derivatives import apply_derivatives
 
-from mpm_dolfinx import LAWS, Fluid, Hencky, LinearElastic, NeoHookean
+from mpm_dolfinx import LAWS, Fluid, Hencky, LinearElastic, NeoHookean, kozeny_carman
 
 
 def energy(law, F):
@@ -81,3 +81,25 @@ def test_an_incompressible_fluid_is_allowed_and_a_negative_modulus_is_not():
     assert Hencky(1.0, 1.0).storage(Fluid(bulk=inf).bulk, 0.4) == 0
     with pytest.raises(ValueError, match=r"bulk = -2.0, must be > 0"):
         Fluid(bulk=-2.0)
+
+
+def test_a_law_derived_from_the_linear_one_is_not_linear_by_itself():
+    class Derived(LinearElastic):
+        @staticmethod
+        def energy(F, bulk):
+            return bulk * ufl.tr(F) ** 4
+
+    assert LinearElastic.linear and not Derived.linear and Derived.parameters == ("bulk",)
+
+
+def test_fields_are_evaluated_and_checked_where_they_are_needed():
+    X = np.array([[0.0, 0.0], [1.0, 0.0]])
+    soil = Hencky(bulk=lambda X: 1 + X[:, 0], shear=1.0).at(X)
+    assert soil.bulk == pytest.approx([1, 2]) and soil.oedometric == pytest.approx([1 + 4 / 3, 2 + 4 / 3])
+    with pytest.raises(ValueError, match=r"shear = -1.0, must be > 0"):
+        Hencky(bulk=1.0, shear=lambda X: -X[:, 0]).at(X[1:])
+
+
+def test_kozeny_and_carmans_conductivity_is_that_of_the_start_at_the_start():
+    assert kozeny_carman(2.0, 0.4, 0.4) == 2.0
+    assert kozeny_carman(1.0, 0.2, 0.4) == pytest.approx((0.2 / 0.4) ** 3 * (0.6 / 0.8) ** 2)

@@ -70,7 +70,7 @@ def test_start_end_and_every_third_state_are_written(written):
 
 
 def test_points_are_read_back_as_they_were(written):
-    simulation, folder, states = written
+    _, folder, states = written
     for (file,), k in zip(index(folder / "points.pvd").values(), (0, 3, 6, 7), strict=True):
         points, stress = states[k][:2]
         mesh = meshio.read(file)

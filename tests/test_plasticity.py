@@ -118,7 +118,7 @@ def test_stress_and_state_are_those_of_the_return_in_principal_strains(law):
     exact = np.einsum("nij,nj,nkj->nik", axes, np.exp(ln_b), axes)
     assert np.abs(b - exact).max() < 1e-9
     assert hardened == pytest.approx(kappa, rel=1e-9, abs=1e-12)
-    assert (plastic[region == ELASTIC] == np.eye(3)).all()
+    assert np.abs(plastic[region == ELASTIC] - np.eye(3)).max() < 1e-14
 
 
 def test_the_new_state_is_on_the_yield_surface(law):
@@ -307,6 +307,22 @@ def test_drained_triaxial_compression_follows_the_exact_path():
 
     s.run(1.0, 0.1, observe=compare)
     assert kappas[4] == 0 and kappas[-1] > 0.01
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("friction", "factor"), [(0.0, 2 + np.pi), (20.0, 14.83)])
+def test_a_strip_footing_sinks_at_prandtls_load(friction, factor):
+    """Bearing capacity over the cohesion, associated flow; from above, and a plateau: nothing locks."""
+    clay = mpm.DruckerPrager(bulk=2e7, shear=1e7, friction=friction, dilation=friction, cohesion=1e4)
+    grid = mpm.Grid([5.0, 3.5], [40, 28])
+    soil = mpm.box(grid, [0, 0], [5, 3])
+    footing = mpm.Displacement("top", lambda t, X: (0, -0.04 * t), region=((0, 0), (1, 9)))  # rough, half of it
+    walls = {"left": "x", "right": "x", "bottom": "xy"}
+    s = mpm.Simulation(grid, [soil], [clay], fixed=walls, displacements=[footing])
+    loads = []
+    s.run(1.0, 0.1, observe=lambda s: loads.append(-s.reactions[0, 1] / clay.cohesion))
+    assert factor < loads[-1] < 1.12 * factor
+    assert abs(loads[-1] / loads[-3] - 1) < 0.02
 
 
 @pytest.mark.parametrize(

@@ -51,7 +51,7 @@ def test_what_is_left_out_is_not_compiled():
     drained.step(0.01)
     sealed.step(0.01)
     assert drained.storage is None and drained.momentum.dilatation is None
-    assert not drained.momentum.ghost.used and drained.momentum._weight is None and drained.momentum._traction is None
+    assert not drained.momentum.ghost.used and drained.momentum._weight is None and drained.momentum.loads is None
     assert not sealed.storage.flux.used and sealed.storage.gravity is None
 
 

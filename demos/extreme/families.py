@@ -1,0 +1,320 @@
+# SPDX-License-Identifier: MIT
+"""The families of `extreme_cases`: what is extreme, scenes, exact solutions, and the bounds of the errors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import cache, partial
+from math import exp, inf, log, nan
+
+import numpy as np
+from extreme.scenes import (
+    INCOMPRESSIBLE,
+    SOIL,
+    WATER,
+    Beam,
+    Error,
+    M,
+    Make,
+    Scene,
+    column,
+    off,
+    settled,
+    soil,
+    square,
+    stretch,
+    tip,
+)
+from scipy.optimize import brentq
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.exact import SelfWeightColumn
+
+
+@dataclass(frozen=True)
+class Family:
+    """Scenes of one kind: settings and scenes, and the bound of their errors."""
+
+    cases: Callable[[], Iterator[tuple[str, Make]]]
+    bound: float
+
+
+FAMILIES: dict[str, Family] = {}
+
+
+def family(bound: float):
+    """Register a generator of (setting, scene) as a family."""
+
+    def register(cases):
+        FAMILIES[cases.__name__.replace("_", "-")] = Family(cases, bound)
+        return cases
+
+    return register
+
+
+def decades(low: int, high: int, step: int = 1) -> list[float]:
+    return [float(f"1e{n}") for n in range(low, high + 1, step)]
+
+
+@family(0.01)
+def conductivity():
+    """Beam that drains at its end, k = 1e-14 ... 1e2 m/s: tip, finite elements."""
+    for k in decades(-14, 2):
+        yield f"k = {k:.0e} m/s", Beam(soil(conductivity=k), WATER)
+
+
+@family(0.02)
+def time_step():
+    """Terzaghi's layer, dt = 1e-9 ... 1e9 s: mean error of the pressures, settlement, backward Euler exact in space."""
+    water = {"fluid": INCOMPRESSIBLE, "drained": [mpm.Drained("top")], "load": 1e-5 * M}
+    for dt in decades(-9, 9):
+        yield f"dt = {dt:.0e} s", column(partial(terzaghi, 0.05, dt), (SOIL, 1.0), end=10 * dt, steps=10, **water)
+
+
+def terzaghi(h: float, dt: float, s: mpm.Simulation, r: mpm.Result) -> float:
+    """Return the error relative to the load, 1e-5 M: a sum of modes, averaged over the cells."""
+    m = (np.arange(20000) + 0.5) * np.pi
+    left = (1 + m**2 * dt * SOIL.conductivity / INCOMPRESSIBLE.unit_weight * M) ** -float(r.steps)
+    middle = (np.floor(s.points.x[:, 1:] / h) + 0.5) * h
+    p = (2 / m * left * np.sin(m * (1 - middle)) * np.sinc(m * h / (2 * np.pi))).sum(axis=1)
+    return max(
+        np.abs(s.points.pressure / (1e-5 * M) - p).mean(), off(-tip(r)[1] / 1e-5, 1 - (2 / m**2 * left).sum(), 1)
+    )
+
+
+@family(0.01)
+def time_step_of_a_beam():
+    """Beam that drains at its end, dt = 1e-9 ... 1e9 s: tip, finite elements."""
+    for dt in decades(-9, 9, 3):
+        yield f"dt = {dt:.0e} s", Beam(SOIL, WATER, end=8 * dt)
+
+
+@family(0.01)
+def fluid_bulk():
+    """Sealed column and beam, K_w = 1e4 Pa ... infinity: pressure and settlement, exact; tip, finite elements."""
+    load = 1e-5 * M
+    for bulk in [*decades(4, 12), inf]:
+        p = load / (1 + SOIL.storage(bulk, SOIL.porosity) * M)
+
+        def error(s, r, p=p):
+            return max(off(s.points.pressure, p, load), off(-tip(r)[1] * M, load - p, load))
+
+        yield f"column, K_w = {bulk:.0e} Pa", column(error, (SOIL, 1.0), fluid=mpm.Fluid(bulk), load=load)
+        yield f"beam, K_w = {bulk:.0e} Pa", Beam(SOIL, mpm.Fluid(bulk), drained=())
+
+
+@family(0.02)
+def poisson():
+    """Beam without and with water, nu = 0 ... 0.499: tip, finite elements."""
+    for nu in (0.0, 0.2, 0.3, 0.4, 0.45, 0.48, 0.49, 0.499):
+        yield f"drained, nu = {nu}", Beam(soil(nu=nu))
+        yield f"wet, nu = {nu}", Beam(soil(nu=nu), WATER)
+
+
+@family(0.01)
+def steps():
+    """Beam loaded in 1 to 640 steps, drained and undrained: tip, finite elements."""
+    for n in (1, 2, 5, 10, 20, 40, 80, 160, 320, 640):
+        yield f"drained, {n} steps", Beam(SOIL, steps=n, ramp=1.0)
+        if n <= 160:
+            yield f"undrained, {n} steps", Beam(soil(conductivity=0), WATER, drained=(), steps=n, ramp=1.0)
+
+
+CUTS = {"on a grid line": 0.5, "within a cell": 0.50625}  # m; cells of 1/80 m
+
+
+@family(0.02)
+def contrast_of_conductivity():
+    """Steady flow through two layers, k differs by 1e-8 ... 1e8: pressures over their difference, exact."""
+    for name, cut in CUTS.items():
+        for ratio in decades(-8, 8, 1 if cut == 0.5 else 2):
+            layers = (SOIL, cut), (soil(conductivity=SOIL.conductivity * ratio), 1.0)
+            ends = [mpm.Drained(side, p, ([-inf, y], [inf, y])) for side, p, y in (("bottom", 1e3, 0), ("top", 0, 1))]
+            flow = {"h": 1 / 80, "end": 1e15, "fluid": INCOMPRESSIBLE, "drained": ends}
+            yield f"{ratio:.0e}, interface {name}", column(partial(series, cut, ratio), *layers, **flow)
+
+
+def series(cut: float, ratio: float, s: mpm.Simulation, r: mpm.Result) -> float:
+    """Return the error of the pressures in the cells for two layers in series."""
+    y = (np.floor(s.points.x[:, 1] * 80) + 0.5) / 80
+    lost = np.where(y < cut, y, cut + (y - cut) / ratio) / (cut + (1 - cut) / ratio)
+    return off(s.points.pressure / 1e3, 1 - lost, 1)
+
+
+@family(0.02)
+def contrast_of_stiffness():
+    """Two layers under a load, E differs by 1e-6 ... 1e6, and under tiny loads: settlement, exact."""
+    for name, cut in CUTS.items():
+        for ratio in decades(-6, 6, 1 if cut == 0.5 else 2):
+            for strain in (1e-2, 1e-6, 1e-10) if ratio in (1e-6, 1e6) else (1e-2,):
+                load = strain * M * min(1, ratio)
+                exact = cut * (stretch(load / M) - 1) + (1 - cut) * (stretch(load / M / ratio) - 1)
+                layers = (SOIL, cut), (soil(1e7 * ratio), 1.0)
+                setting = f"{ratio:.0e}, strain {strain:.0e}, interface {name}"
+                yield setting, column(settled(exact), *layers, h=1 / 80, load=load)
+
+
+@family(0.01)
+def offset():
+    """Beam at 20 random places on the grid, its end within a cell, too: tip, finite elements."""
+    for i, (x, y) in enumerate(np.random.default_rng(0).random((20, 2))):
+        place = {"offset": float(y), "h": (1 / (19 + float(x)), 0.05)}
+        yield f"{i}: {x:.3f}, {y:.3f} of a cell", Beam(soil(conductivity=1e-5), WATER, **place)
+
+
+@family(0.02)
+def rotation():
+    """Square turned by 0 ... 90 degrees, under pressure: volume, pressure, exact; mean pressure, a finer grid."""
+    K, S = SOIL.drained_modulus(2), SOIL.storage(WATER.bulk, SOIL.porosity)
+    J = stretch(1e5 / (2 * K)) ** 2
+    a = brentq(lambda a: 2 * K * log(a) / a - (1 - a * a) / (S * a) + 1e5, 0.5, 1)
+    p = (1 - a * a) / (S * a * a)
+    for angle in (0, 5, 15, 30, 45, 60, 75, 90):
+        yield f"drained, {angle} degrees", square(angle, lambda s, r: off(s.points.J, J, 1 - J))
+        sealed = {"fluid": WATER, "steps": 1}
+        yield f"undrained, {angle} degrees", square(angle, lambda s, r: off(s.points.pressure, p), **sealed)
+        yield f"draining, {angle} degrees", square(angle, draining_error, **DRAINING)
+
+
+DRAINING = {"cells": 24, "fluid": WATER, "end": 0.4, "steps": 16, "drained": ("left", "right", "bottom", "top")}
+
+
+def held(s: mpm.Simulation) -> float:
+    """Return the mean pressure."""
+    return float(s.points.volume0 @ s.points.pressure / s.points.volume0.sum())
+
+
+@cache
+def half_drained() -> float:
+    """Return the mean pressure at the end on a fine grid that the square fits."""
+    scene = square(0, None, **{**DRAINING, "cells": 48})()
+    scene.simulation.run(scene.end, scene.end / scene.steps, progress=False)
+    return held(scene.simulation)
+
+
+def draining_error(s: mpm.Simulation, r: mpm.Result) -> float:
+    """Return the error of the mean pressure over that at the start."""
+    return off(held(s), half_drained(), 1e5)
+
+
+@family(0.02)
+def rotation_of_a_beam():
+    """Beam turned by 5 ... 90 degrees, held at its end by given displacements: tip, finite elements."""
+    for angle in (5, 15, 30, 45, 60, 75, 90):
+        yield f"{angle} degrees", Beam(soil(conductivity=1e-5), WATER, angle=angle, h=(0.025, 0.025))
+
+
+@family(0.01)
+def points_per_cell():
+    """Beam of 1 ... 5 points per cell and direction: tip, finite elements."""
+    for n in range(1, 6):
+        for y in (0.0, 0.3):
+            many = {"per_cell": n, "offset": y, "h": (0.025, 0.025)}
+            yield f"{n} x {n} points, {y} of a cell", Beam(soil(conductivity=1e-5), WATER, **many)
+
+
+@family(0.01)
+def filling():
+    """Beam and column that stick 1e-10 ... 0.5 of a cell into the next: tip, finite elements; settlement, exact."""
+    for f in (*decades(-10, -1), 0.5):
+        yield f"beam, {f:.0e} of a cell", Beam(soil(conductivity=1e-5), WATER, offset=1 - f)
+        top = 1 + 0.05 * f
+        yield f"column, {f:.0e} of a cell", column(settled(top * (stretch(0.1) - 1)), (SOIL, top), load=0.1 * M)
+
+
+@family(0.01)
+def few_points():
+    """Columns of one cell or less, of one point: settlement, exact."""
+    for name, h, n in (("1 cell, 1 point", 1, 1), ("1 cell, 2 x 2 points", 1, 2), ("0.1 of a cell, 1 point", 10, 1)):
+        yield name, column(settled(stretch(0.1) - 1), (SOIL, 1.0), h=h, per_cell=n, load=0.1 * M)
+
+
+@family(1.0)
+def thin():
+    """Beam of half a cell, one cell, two cells: error of the tip over that of Q1 elements on as many cells."""
+    for height, h, cells in ((0.05, 0.1, (10, 1)), (0.1, 0.1, (10, 1)), (0.1, 0.05, (20, 2))):
+        for n in (2, 3):
+            for y in (0.0, 0.3):
+                beam = Beam(load=500.0, size=(1.0, height), truth=(40, 4), h=(h, h), offset=y, per_cell=n)
+                yield f"{height / h:g} cells, {n} x {n} points, {y} of a cell", partial(beside_q1, beam, cells)
+
+
+def beside_q1(beam: Beam, cells: tuple[int, int]) -> Scene:
+    """Return the beam's scene with its error measured by that of Q1 elements."""
+    scene = beam()
+    bound = off(beam.elements("q1-dg0", cells), beam.elements())
+    return replace(scene, error=lambda s, r: off(tip(r), beam.elements()) / bound)
+
+
+@family(0.01)
+def weight():
+    """Column under its weight, rho g H / M = 1e-6 ... 10, and wet: height, exact; beam: tip, finite elements."""
+    density = (1 - SOIL.porosity) * SOIL.grain_density
+    for ratio in decades(-6, 1):
+        E = density * 10 / ratio
+        exact = SelfWeightColumn(1.0, E / 3, E / 2, density, 10.0).height - 1
+        yield f"{ratio:.0e}", column(settled(exact), (soil(E), 1.0), steps=10, gravity=lambda t: (0, -10 * t))
+    for g in (1.0, 10.0):
+        yield f"beam, {g:g} m/s2", Beam(load=0, weight=g)
+    for bulk in (1e6, inf):
+        buoyant = -(1 - SOIL.porosity) * (SOIL.grain_density - 1000) * 9.81 / (2 * M)
+        wet = {"fluid": mpm.Fluid(bulk), "drained": [mpm.Drained("top")], "gravity": (0, -9.81)}
+        yield f"wet, K_w = {bulk:.0e} Pa", column(settled(buoyant), (SOIL, 1.0), end=1e9, steps=5, **wet)
+
+
+@family(0.01)
+def suction():
+    """Column with an outer pressure p, -10 ... 0.5 M: settlement, exact; refused where pores close or it bursts."""
+    for ratio in (*(-x for x in decades(-6, 1)), 0.01, 0.1, 0.3, 0.4, 0.5):
+        a = stretch(-ratio) if ratio < exp(-1) else nan
+
+        def error(s, r, a=a, p=ratio * M):
+            return max(off(tip(r)[1], a - 1), off(s.points.pressure, p))
+
+        physics = {"end": 1e9, "room": 30, "fluid": WATER, "drained": [mpm.Drained("top", ratio * M)]}
+        yield f"p = {ratio:g} M", column(error if a > 1 - SOIL.porosity else None, (SOIL, 1.0), **physics)
+
+
+@family(0.02)
+def buckling():
+    """Slender cantilever under 0.5 ... 3 times its buckling load: tip, finite elements in 40 steps."""
+    critical = np.pi**2 * M * 0.1**2 / 12 / 4
+    slender = Beam(load=200.0, size=(1.0, 0.1), truth=(40, 4), truth_steps=40, h=(0.0125, 0.0125), ramp=1.0)
+    for ratio, n in ((0.5, 40), (0.9, 40), (1.1, 40), (1.1, 1), (1.5, 40), (1.5, 1), (2.0, 40), (2.0, 1), (3.0, 1)):
+        yield f"{ratio} of it in {n} steps", replace(slender, thrust=ratio * critical, steps=n)
+
+
+@family(0.01)
+def overload():
+    """All in one step: column pressed by up to 100 M or pulled: settlement, exact; refused where there is none."""
+    for law in (mpm.Hencky, mpm.NeoHookean, mpm.LinearElastic):
+        for ratio in (0.1, 1, 10, 100, -0.1, -0.3, -0.4, -1):
+            error = pressed(soil(law=law), ratio * M)
+            yield f"{law.__name__}, {ratio:g} M", column(error, (soil(law=law), 1.0), load=ratio * M, room=40)
+    for load in (2e5, 2e6, 2e7):
+        yield f"beam, {load:.0e} Pa", Beam(load=load, steps=1, truth_steps=40, ramp=1.0)
+
+
+def pressed(material, load: float) -> Error | None:
+    """Return the error of the settlement under a load, None where no stretch carries it."""
+
+    def excess(a):
+        lam = material.bulk - 2 * material.shear / 3
+        stress = {mpm.Hencky: M * log(a) / a, mpm.LinearElastic: M * (a - 1)}
+        return load + stress.get(type(material), material.shear * (a - 1 / a) + lam * log(a) / a)
+
+    low, high = (1e-6, 1.0) if load > 0 else (1.0, exp(1) if isinstance(material, mpm.Hencky) else 1e3)
+    return settled(brentq(excess, low, high, xtol=1e-15) - 1) if excess(low) * excess(high) < 0 else None
+
+
+@family(0.01)
+def units():
+    """Beam of 1e-6 ... 1e6 m, of E = 1 ... 1e15 Pa: tip, finite elements of 1 m and 10 MPa."""
+    exact = Beam().elements()
+    for x in decades(-6, 6, 3):
+        beam = Beam(size=(x, 0.4 * x), h=(0.05 * x, 0.05 * x))
+        yield f"{x:.0e} m", lambda b=beam, e=x * exact: replace(b(), error=lambda s, r: off(tip(r), e))
+    for E in (1.0, 1e3, 1e11, 1e15):
+        beam = Beam(soil(E), load=2e-3 * E)
+        yield f"{E:.0e} Pa", lambda b=beam: replace(b(), error=lambda s, r: off(tip(r), exact))

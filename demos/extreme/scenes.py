@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: MIT
+"""The scenes of `extreme_cases`: a cantilever, a column, a square in a corner; on one process."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache
+from itertools import pairwise
+from math import ceil, cos, inf, radians, sin
+
+import numpy as np
+from scipy.special import lambertw
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.reference import BiotFEM
+
+
+def soil(young: float = 1e7, nu: float = 0.0, conductivity: float = 1e-4, law=mpm.Hencky):
+    """Return a material from Young's modulus (Pa), Poisson's ratio and hydraulic conductivity (m/s)."""
+    return law(bulk=young / (3 - 6 * nu), shear=young / (2 + 2 * nu), conductivity=conductivity)
+
+
+SOIL = soil()
+M = SOIL.oedometric  # Pa; nu = 0, so it is Young's modulus
+WATER, INCOMPRESSIBLE = mpm.Fluid(), mpm.Fluid(bulk=inf)
+
+
+Error = Callable[[mpm.Simulation, mpm.Result], float]
+
+
+@dataclass
+class Scene:
+    """A run to its `end` (s), and the error of its result; without `error` there is no equilibrium."""
+
+    simulation: mpm.Simulation
+    end: float
+    steps: int
+    error: Error | None
+    probes: mpm.Probes | None = None
+
+
+Make = Callable[[], Scene]
+
+
+def off(measured, exact, scale: float | None = None) -> float:
+    """Return the largest difference, over `scale` or the largest exact value."""
+    return float(np.abs(np.subtract(measured, exact)).max() / (np.abs(exact).max() if scale is None else scale))
+
+
+def tip(result: mpm.Result) -> np.ndarray:
+    """Return the displacement (2,) of the first probe at the end."""
+    return result.displacement[-1][0]
+
+
+def settled(exact: float) -> Error:
+    """Return the error of a settlement."""
+    return lambda s, r: off(tip(r)[1], exact)
+
+
+def turned(x: np.ndarray, angle: float) -> np.ndarray:
+    """Return vectors (..., 2) turned by an angle (degrees)."""
+    c, s = cos(radians(angle)), sin(radians(angle))
+    return x @ np.array([[c, s], [-s, c]])
+
+
+def place(s: mpm.Simulation, corners: np.ndarray) -> None:
+    """Put the undeformed body elsewhere, turned: the corners (n, 4, 2) of its points' domains."""
+    s.points.corners, s.points.origin, s.points.x = corners, corners.copy(), corners.mean(axis=1)
+
+
+@dataclass(frozen=True)
+class Beam:
+    """A cantilever held at its left end; its tip is compared with that of Taylor-Hood elements."""
+
+    material: mpm.materials.Skeleton = SOIL
+    fluid: mpm.Fluid | None = None
+    load: float = 2e4  # Pa, on the top, downwards
+    thrust: float = 0.0  # Pa, on the free end
+    weight: float = 0.0  # m/s^2
+    drained: tuple[str, ...] = ("right",)
+    end: float = 1.0  # s
+    ramp: float = 0.25  # share of the time in which the loads are raised
+    steps: int = 8
+    size: tuple[float, float] = (1.0, 0.4)  # m
+    h: tuple[float, float] = (0.05, 0.05)
+    offset: float = 0.5  # of the underside from a grid line, cells
+    per_cell: int = 2
+    angle: float = 0.0  # degrees; turned about the middle of its left end, all loads with it
+    truth: tuple[int, int] = (40, 16)  # Taylor-Hood elements
+    truth_steps: int = 8  # of theirs, where water does not drain meanwhile
+
+    def physics(self) -> dict:
+        """Return the conditions that material points and finite elements share."""
+
+        def along(x: float, y: float):
+            return lambda t: turned(np.array([x, y]), self.angle) * min(1.0, t / (self.ramp * self.end))
+
+        loads = [mpm.Traction("top", along(0, -self.load)), mpm.Traction("right", along(-self.thrust, 0))]
+        out: dict = {"tractions": loads}
+        if self.weight:
+            out["gravity"] = along(0, -self.weight)
+        if self.fluid:
+            out |= {"fluid": self.fluid, "drained": [mpm.Drained(side) for side in self.drained]}
+        return out
+
+    def __call__(self) -> Scene:
+        (length, height), (hx, hy) = self.size, self.h
+        nx, below, above = ceil(1.2 * length / hx), ceil(length / hy), ceil((1.2 * length + height) / hy)
+        left = nx if self.angle else 0
+        grid = mpm.Grid([nx * hx, above * hy], [left + nx, below + above], [-left * hx, -below * hy])
+        low = np.array([0.0, self.offset * hy])
+        body = mpm.box(grid, low, low + self.size, per_cell=self.per_cell)
+        middle = low + np.array([0, height / 2])
+        clamp: dict = {"fixed": {"left": "xy"}}
+        if self.angle:
+            clamp = {"fixed": {}, "displacements": [mpm.Displacement("left", (0, 0))]}
+        s = mpm.Simulation(grid, [body], [self.material], **clamp, **self.physics())
+        place(s, turned(s.points.corners - middle, self.angle) + middle)
+        probes = mpm.probes([body], [middle + np.array([length, 0])])
+        return Scene(s, self.end, self.steps, lambda s, r: off(turned(tip(r), -self.angle), self.elements()), probes)
+
+    def elements(self, element: str = "taylor-hood", cells: tuple[int, int] | None = None) -> np.ndarray:
+        """Return the displacement (2,) of the tip by finite elements, which do not see the grid."""
+        steps = self.steps if self.fluid and self.drained else self.truth_steps
+        seen = replace(self, steps=steps, h=(1, 1), offset=0, per_cell=0, angle=0, truth=cells or self.truth)
+        return finite_elements(seen, element)
+
+
+@cache
+def finite_elements(beam: Beam, element: str) -> np.ndarray:
+    """Return the displacement (2,) of the tip."""
+    fem = BiotFEM([0, 0], beam.size, beam.truth, beam.material, fixed={"left": "xy"}, element=element, **beam.physics())
+    return tip(fem.run(beam.end, beam.end / beam.steps, probes=[[beam.size[0], beam.size[1] / 2]]))
+
+
+def column(error: Error | None, *layers, h=0.05, end=1.0, steps=1, per_cell=2, load=0.0, room=2, **physics) -> Make:
+    """Return a column one cell wide between smooth walls, of layers (material, top), with a load (Pa) on its top."""
+
+    def make() -> Scene:
+        tops = [0.0, *(top for _, top in layers)]
+        cells = ceil(tops[-1] / h - 1e-12) + room
+        grid = mpm.Grid([h, cells * h], [1, cells])
+        bodies = [
+            mpm.box(grid, [0, low], [h, high], per_cell=per_cell, material=i)
+            for i, (low, high) in enumerate(pairwise(tops))
+        ]
+        walls = {"left": "x", "right": "x", "bottom": "y"}
+        loads = [mpm.Traction("top", (0, -load), region=([-inf, tops[-1]], [inf, inf]))]
+        s = mpm.Simulation(grid, bodies, [m for m, _ in layers], fixed=walls, tractions=loads, **physics)
+        return Scene(s, end, steps, error, mpm.probes(bodies, [[h / 2, tops[-1]]]))
+
+    return make
+
+
+def stretch(ratio: float) -> float:
+    """Return the stretch a of a column of Hencky's law under a load q = ratio M: M ln(a) / a = -q."""
+    return float(np.exp(-lambertw(ratio).real))
+
+
+def square(angle: float, error: Error | None, cells: int = 12, end=1.0, steps=4, fluid=None, drained=()) -> Make:
+    """Return a square of 0.6 m, turned by an angle (degrees) in the corner of two walls, under 1e5 Pa all around."""
+
+    def make() -> Scene:
+        grid = mpm.Grid([1.2, 1.2], [2 * cells, 2 * cells])
+        body = mpm.box(grid, [0, 0], [0.6, 0.6])
+        inward = {"left": (1, 0), "right": (-1, 0), "bottom": (0, 1), "top": (0, -1)}
+        loads = [mpm.Traction(side, turned(1e5 * np.array(n), angle)) for side, n in inward.items()]
+        water = {"fluid": fluid, "drained": [mpm.Drained(side) for side in drained]} if fluid else {}
+        s = mpm.Simulation(grid, [body], [SOIL], fixed={"left": "x", "bottom": "y"}, tractions=loads, **water)
+        corners = turned(s.points.corners, angle)
+        place(s, corners - corners.min(axis=(0, 1)))
+        return Scene(s, end, steps, error)
+
+    return make

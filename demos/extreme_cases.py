@@ -1,0 +1,214 @@
+# SPDX-License-Identifier: MIT
+"""Where others stop: scenes at the edge of what can be asked, none of them silently wrong.
+
+Every scene is tiny, and one thing about it is extreme.  It ends in one of
+
+* converged: within its family's bound of an exact solution, of finite elements of the same law, or of the
+  same scene at a moderate setting; both residuals and the fluid balance below 1e-8;
+* recovered: the same, after steps that were cut;
+* refused: with an error that says why; a scene that has no equilibrium must be refused;
+* wrong, nan or hung: a defect.  The exit status says whether there was none.
+
+An error is relative to the largest exact value, unless its family says otherwise.  The condition number is that
+of the last tangent of the momentum, scaled to a unit diagonal.  `wrong` also counts errors of an unknown kind.
+On one process.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import signal
+import sys
+import time
+from collections import Counter
+from dataclasses import asdict, dataclass, fields
+from math import isnan, nan
+from pathlib import Path
+
+import numpy as np
+import poroelastic_beam
+from extreme.families import FAMILIES
+from extreme.scenes import Make, Scene
+from scipy.sparse import csr_matrix
+
+import mpm_dolfinx as mpm
+
+LIMIT = 100  # s, for a case
+CLOSED = 1e-8  # residuals and fluid balance
+OUTCOMES = ("converged", "recovered", "refused", "wrong", "nan", "hung")
+
+
+@dataclass
+class Row:
+    """What became of a case; worst residual and balance of its steps, iterations in all."""
+
+    family: str
+    setting: str
+    outcome: str = ""
+    error: float = nan
+    residual: float = nan
+    balance: float = nan
+    steps: int = 0
+    cuts: int = 0
+    newton: int = 0
+    coupling: int = 0
+    condition: float = nan
+    seconds: float = nan
+    note: str = ""
+
+
+class Hung(Exception):
+    """A case takes longer than the limit."""
+
+
+def hang(*_) -> None:
+    raise Hung(f"more than {LIMIT} s")
+
+
+def judge(row: Row, make: Make, bound: float) -> Row:
+    """Run a case and fill in its row."""
+    signal.signal(signal.SIGALRM, hang)
+    signal.alarm(LIMIT)
+    began, result = time.perf_counter(), mpm.Result()
+    try:
+        scene = make()
+        result = scene.simulation.run(scene.end, scene.end / scene.steps, probes=scene.probes, progress=False)
+        row.outcome = "recovered" if result.cuts else "converged"
+    except (mpm.GaveUp, ValueError) as refusal:
+        row.outcome, row.note, result = "refused", str(refusal), getattr(refusal, "result", result)
+    except Hung as hung:
+        row.outcome, row.note = "hung", str(hung)
+    except Exception as error:  # not one that says clearly what the matter is
+        row.outcome, row.note = "wrong", repr(error)
+    finally:
+        signal.alarm(0)
+    row.seconds = time.perf_counter() - began
+    for name in ("residual", "balance", "steps", "cuts", "newton", "coupling"):
+        setattr(row, name, getattr(result, name))
+    if row.outcome in ("converged", "recovered"):
+        check(row, scene, result, bound)
+    return row
+
+
+def check(row: Row, scene: Scene, result: mpm.Result, bound: float) -> None:
+    """Compare a run that came to its end with its reference."""
+    points, s = scene.simulation.points, scene.simulation
+    row.condition = condition(s.momentum.K)
+    row.error = nan if scene.error is None else scene.error(s, result)
+    values = (points.x, points.F, points.pressure, result.residual, result.balance, *result.displacement[-1:])
+    if not all(np.isfinite(v).all() for v in values):
+        row.outcome = "nan"
+    elif not (row.error <= bound and max(row.residual, row.balance) <= CLOSED):
+        row.outcome, row.note = "wrong", "" if scene.error else "there is no equilibrium"
+
+
+def condition(K) -> float:
+    """Return the condition number of a matrix scaled to a unit diagonal; nan if none was needed."""
+    if not K.assembled:
+        return nan
+    A = csr_matrix(K.getValuesCSR()[::-1], shape=K.getSize()).toarray()
+    scale = 1 / np.sqrt(np.abs(A.diagonal()))
+    size = np.abs(np.linalg.eigvalsh(scale[:, None] * A * scale))
+    return float(size.max() / size.min())
+
+
+def worst(rows: list[Row], name: str) -> float:
+    """Return the largest finite value of a column."""
+    return max((v for r in rows if not isnan(v := getattr(r, name))), default=nan)
+
+
+def table(head: list[str], rows: list[list]) -> str:
+    """Return a Markdown table; numbers in short, blank if they are not."""
+
+    def cell(v) -> str:
+        if isinstance(v, float):
+            return "" if isnan(v) else f"{v:.2g}"
+        return str(v).replace("|", "/")
+
+    lines = [head, ["---"] * len(head), *[[cell(v) for v in row] for row in rows]]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def summary(rows: list[Row]) -> str:
+    """Return a line a family: what it shows, its bound, counts of the outcomes and worst figures."""
+    names = ("error", "residual", "balance", "condition")
+    lines = []
+    for name, f in FAMILIES.items():
+        if mine := [r for r in rows if r.family == name]:
+            count = Counter(r.outcome for r in mine)
+            figures = [worst(mine, n) for n in names]
+            lines.append([name, f.cases.__doc__.rstrip("."), f.bound, *(count[n] for n in OUTCOMES), *figures])
+    return table(["family", "what, and its reference", "bound", *OUTCOMES, *(f"worst {n}" for n in names)], lines)
+
+
+def write(out: Path, rows: list[Row]) -> None:
+    """Write the tables."""
+    out.mkdir(parents=True, exist_ok=True)
+    head = [f.name for f in fields(Row)]
+    with (out / "cases.csv").open("w", newline="") as file:
+        csv.writer(file).writerows([head, *[asdict(r).values() for r in rows]])
+    (out / "cases.md").write_text(table(head, [list(asdict(r).values()) for r in rows]) + "\n")
+    (out / "summary.md").write_text(summary(rows) + "\n")
+
+
+def draw(out: Path, rows: list[Row]) -> None:
+    """Draw the errors, condition numbers and Newton iterations a step of all cases, a row a family."""
+    names = [name for name in FAMILIES if any(r.family == name for r in rows)]
+    colours = dict(zip(OUTCOMES, ("C0", "C2", "0.5", "C3", "black", "C4"), strict=True))
+    fig, (axes,) = poroelastic_beam.figure(1, 3, (13, 1.5 + 0.34 * len(names)))
+    rng = np.random.default_rng(1)
+    for r in rows:
+        y = -names.index(r.family) + rng.uniform(-0.28, 0.28)
+        style = {"color": colours[r.outcome], "ms": 4, "alpha": 0.6, "mew": 0}
+        refused = isnan(r.error)
+        axes[0].plot(3e2 if refused else max(r.error, 1e-12), y, "s" if refused else "o", **style)
+        axes[1].plot(r.condition, y, "o", **style)
+        axes[2].plot(r.newton / max(r.steps, 1) if r.steps else nan, y, "o", **style)
+    for i, name in enumerate(names):
+        axes[0].plot([FAMILIES[name].bound] * 2, [-i - 0.4, -i + 0.4], color="black", lw=1.5)
+    axes[0].axvline(30, color="0.8", lw=1)
+    axes[0].set(xlim=(5e-13, 2e3), xlabel="error (-), black: the family's bound", title="Error; on the right: refused")
+    axes[1].set(xlabel="condition number (-)", title="Conditioning, momentum")
+    axes[2].set(xlabel="Newton iterations per step (-)", title="Iterations")
+    for ax in axes:
+        ax.set(xscale="log", yticks=-np.arange(len(names)), ylim=(0.6 - len(names), 0.6))
+        ax.set_yticklabels(names if ax is axes[0] else [])
+        ax.grid(alpha=0.3)
+    axes[0].set_xticks(10.0 ** np.arange(-12, 1, 2))
+    for name, n in Counter(r.outcome for r in rows).items():
+        axes[2].plot([], [], "o", color=colours[name], label=f"{name}: {n}")
+    axes[2].legend(loc="lower right", fontsize=8)
+    fig.savefig(out / "extreme_cases.png", dpi=130)
+
+
+def main(argv: list[str] | None = None) -> dict:
+    """Run the demo; return what --json prints."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--families", nargs="+", choices=tuple(FAMILIES), default=list(FAMILIES), metavar="NAME")
+    parser.add_argument("--quick", action="store_true", help="four cases of each family, the first and last among them")
+    parser.add_argument("--out", type=Path, default=Path("out/extreme_cases"), help="folder for picture and tables")
+    parser.add_argument("--json", action="store_true", help="print the results as one line of JSON at the end")
+    o = parser.parse_args(argv)
+    rows = []
+    for name in o.families:
+        cases = list(FAMILIES[name].cases())
+        chosen = sorted({round(i) for i in np.linspace(0, len(cases) - 1, 4 if o.quick else len(cases))})
+        for setting, make in (cases[i] for i in chosen):
+            rows.append(r := judge(Row(name, setting), make, FAMILIES[name].bound))
+            print(f"{name:25} {setting:44} {r.outcome:10} {r.error:8.1e} {r.seconds:6.2f} s {r.note[:90]}", flush=True)
+        write(o.out, rows)
+    draw(o.out, rows)
+    print(summary(rows))
+    print(f"picture and tables: {o.out}/")
+    counts = Counter(r.outcome for r in rows)
+    out = {"cases": len(rows), **{name: counts[name] for name in OUTCOMES}}
+    if o.json:
+        print(json.dumps(out))
+    return out
+
+
+if __name__ == "__main__":
+    found = main()
+    sys.exit(1 if found["wrong"] + found["nan"] + found["hung"] else 0)
