@@ -27,7 +27,7 @@ from mpm_dolfinx.timeloop import Result, log
 if TYPE_CHECKING:
     from mpm_dolfinx.simulation import Simulation
 
-FORMAT, VERSION = "mpm_dolfinx checkpoint", 1
+FORMAT, VERSION = "mpm_dolfinx checkpoint", 2
 LISTS = ("t", "displacement", "pressure")  # of Result
 ZIP = b"PK\3\4"  # how numpy's archives begin
 

@@ -25,9 +25,10 @@ from mpm_dolfinx.materials import Fluid, Skeleton
 from mpm_dolfinx.momentum import FULL, Momentum
 from mpm_dolfinx.placement import Placement
 from mpm_dolfinx.points import Body, MaterialPoints, Probes, material_points
-from mpm_dolfinx.remap import Carried, carry, remap
+from mpm_dolfinx.remap import Carried, at_start, remap
 from mpm_dolfinx.storage import Storage
 from mpm_dolfinx.timeloop import Observer, Result, run
+from mpm_dolfinx.unknowns import collect_garbage
 
 
 class Simulation:
@@ -91,6 +92,7 @@ class Simulation:
             raise ValueError("sources need a fluid")
         self.grid, self.materials, self.fluid, self.bodies = grid, materials, fluid, bodies
         self.quadrature = quadrature
+        grid.share(np.concatenate([body.centre for body in bodies]))
         self.gravity = None if gravity is None else fem.Constant(grid.mesh, np.zeros(grid.dim))
         self.t, self.active_cells = 0.0, 0
         self.points = material_points(grid, bodies, pressure)
@@ -112,7 +114,7 @@ class Simulation:
         )
         self.jit = time.perf_counter() - start
         """Seconds spent on compiling or finding the forms."""
-        self._carried = carry(self.points) if fluid else None
+        self._carried = at_start(self.points) if fluid else None
         self._waiting = {body: self._take(body) for body in later}
         self._prepared = False
         self.result: Result | None = None
@@ -215,7 +217,7 @@ class Simulation:
             self.present[body] = True
             self.points = self.points.joined(points)
             if self._carried is not None:
-                self._carried = self._carried.joined(carry(points))
+                self._carried = self._carried.joined(at_start(points))
         if reset_displacement:
             self.points.origin = self.points.corners.copy()
         named = {"fixed": fixed, "tractions": tractions, "displacements": displacements, "drained": drained}
@@ -289,6 +291,7 @@ class Simulation:
 
     def _begin(self, t: float) -> None:
         """Set up the step that ends at time t: grid, loads of that time, u = 0 and the cells' pressure."""
+        collect_garbage(self.grid.mesh.comm)
         self._time.value = t
         if self.gravity is not None:
             self.gravity.value = np.asarray(self._gravity_at(t), dtype=float)
@@ -460,8 +463,9 @@ class Simulation:
             grid, points, place = self.grid, self.points, self.placement
             n, d = len(points), grid.dim
             u = self.momentum.u.x.array.reshape(-1, d)
-            _, dN = grid.shape_functions(self.pieces.cells, self.pieces.x)
-            gradient = u[grid.cell_nodes[self.pieces.cells]].transpose(0, 2, 1) @ dN
+            N, dN = grid.shape_functions(self.pieces.cells, self.pieces.x)
+            at_nodes = u[grid.cell_nodes[self.pieces.cells]].transpose(0, 2, 1)
+            gradient = at_nodes @ dN
             delta = np.eye(d) + gradient
             if self.momentum.dilatation is not None:
                 delta = self.momentum.dilatation.averaged(delta)
@@ -481,11 +485,19 @@ class Simulation:
                 points.x = points.x + place.displacement(u, np.arange(n), points.x)
                 points.corners = parallelepipeds(points.x, points.F, self._spacing())
             if self.storage:
-                p = place.to_pieces(self.storage.p.x.array[self.pieces.cells])
-                points.pressure = place.mean(p)
-                self._carried = carry(points, place.pieces, p)
+                points.pressure = place.mean(place.to_pieces(self.storage.p.x.array[self.pieces.cells]))
+                self._carried = self._carry(self.pieces.x + (at_nodes @ N[:, :, None])[:, :, 0])
             self._migrate()
         return folded
+
+    def _carry(self, moved: NDArray[np.float64]) -> Carried:
+        """Return the pressures that the pieces take along; `moved` (m, d), m: their centroids after the step."""
+        points, place, pieces, J = self.points, self.placement, self.placement.pieces, self.points.J
+        n = 1 - (1 - self._table(lambda m: m.porosity)) / J
+        store = self._table(lambda m, n: m.storage(self.fluid.bulk, n), n) * points.volume0 * J
+        at_pieces = self.storage.at_pieces(place.pieces_to_cells(pieces.fraction * store[pieces.point]))
+        pressure, slope, bounds, x = map(place.to_pieces, (*at_pieces, moved))
+        return Carried(points.id[pieces.point], pieces.cell, pieces.fraction, pressure, x, slope, bounds)
 
     def _check_volumes(self, J: NDArray[np.float64]) -> None:
         """Refuse what a law may allow and a body does not: points turned inside out, pores of no volume."""

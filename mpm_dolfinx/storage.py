@@ -33,6 +33,7 @@ from mpm_dolfinx.elements import ElementForces
 from mpm_dolfinx.extend import call
 from mpm_dolfinx.forms import FacetForm, FormPoints, PointForm
 from mpm_dolfinx.grid import Grid, sum_by
+from mpm_dolfinx.remap import Reconstruction
 from mpm_dolfinx.unknowns import Unknowns, matrix, sum_ghosts, zero
 
 FILTER = 0.75
@@ -87,6 +88,7 @@ class Storage:
         self._coupling = ElementForces(ufl.diff(strain if symmetric else stored, delta), pieces)
         self._momentum_coupling = self._coupling if symmetric else ElementForces(ufl.diff(strain, delta), pieces)
         self.symmetric, self._pieces = symmetric, pieces
+        self._reconstruction = Reconstruction(grid)
         self.sources: list[tuple[PointForm, PointForm | None]] = []
         self._slot = np.empty(grid.num_local, dtype=np.int64)  # of active owned cells: place in the vectors
         self.flows, self.damped = flows, False
@@ -150,7 +152,7 @@ class Storage:
 
     def set_active(self, cells: NDArray[np.int32], facets: NDArray[np.int32]) -> None:
         """Number the unknowns of the active cells; `facets` are the faces between two of them."""
-        self.unknowns = Unknowns(self.p, cells.astype(np.int64))
+        self.unknowns, self._active = Unknowns(self.p, cells.astype(np.int64)), cells
         self._slot[self.unknowns.owned] = np.arange(self.unknowns.size)
         self.T = matrix(self.unknowns, self.unknowns, 2 * self.grid.dim + 1)
         self.D = matrix(self.unknowns, self.unknowns, 2 * self.grid.dim + 1)
@@ -222,6 +224,28 @@ class Storage:
     def _total(self, cells: NDArray[np.int32], values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Sum values over the rows of each active owned cell."""
         return sum_by(self._slot[cells], values, self.unknowns.size)
+
+    def at_pieces(self, store: NDArray[np.float64]) -> tuple[NDArray, NDArray, NDArray]:
+        """Return pressures (m,), slopes (m, d) and bounds (m, 2) at the pieces, whose mean in a cell is the cell's.
+
+        Parameters
+        ----------
+        store : (m,), m^d/Pa
+            What the pieces store, by which the mean is taken; where a cell stores nothing, by their volumes.
+        """
+        grid, points, filled, active = self.grid, self._pieces, self.unknowns.owned, self._active
+        cells, offset = points.cells, points.x - grid.midpoints[points.cells]
+        total = self._total(cells, store)
+        weight = np.where(total[self._slot[cells]] > 0, store, points.data["weight"][:, 0])
+        total = self._total(cells, weight)
+        origin = np.stack([self._total(cells, weight * x) / total for x in offset.T], axis=1)
+        faces = np.zeros((grid.num_local, grid.dim, 2))
+        centroid, lower, upper = (f.x.array.reshape(-1, grid.dim) for f in self._shapes())
+        faces[active] = np.stack([lower[active], upper[active]], axis=2)
+        slope, bounds = self._reconstruction(filled, self.p.x.array, centroid, faces, origin)
+        at = self._slot[cells]
+        p = self.p.x.array[cells] + np.einsum("md,md->m", slope[at], offset - origin[at])
+        return p, slope[at], bounds[at]
 
     def start(self, dt: float) -> None:
         """Begin a step of dt: the pressure that the cells hold, and the damping of its jumps where it is needed."""

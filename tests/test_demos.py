@@ -23,6 +23,10 @@ QUICK = {
     "cantilever": ("--cells 2 --steps 20", ["cantilever.png"]),
     "quadrature": ("--h 0.05 --steps 5 10", ["quadrature.png", "tip.csv"]),
     "extending_with_ufl": ("--cells 8", ["extending_with_ufl.png"]),
+    "extreme_cases": (
+        "--quick --families conductivity contrast-of-stiffness filling overload",
+        ["extreme_cases.png", "cases.csv", "cases.md", "summary.md"],
+    ),
     "benchmark_beam": ("--h 0.05 --t-end 0.1 --repeat 1", []),
 }
 

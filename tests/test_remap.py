@@ -7,7 +7,7 @@ from helpers import beam
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.domains import cut
-from mpm_dolfinx.remap import carry, remap
+from mpm_dolfinx.remap import remap
 
 
 def test_a_thousand_resets_of_a_body_at_rest_change_nothing():
