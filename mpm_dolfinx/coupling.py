@@ -144,7 +144,6 @@ class Coupler:
         NotConverged
             With the residual history; u and p are then void, the state of the points is untouched.
         """
-        PETSc.garbage_cleanup(self.momentum.unknowns.comm)  # petsc4py keeps what Python has dropped until it is asked
         report = Report()
         self._scale_u = 0.0
         try:
