@@ -178,7 +178,7 @@ class Momentum:
 
         gamma M h/3 int [d_n u].[d_n v] dS, M = lambda + 2G, on the step's increment only.
         """
-        cellwise = _compat.function_space(self.grid.mesh, "DG", 0)
+        cellwise = self.grid.cellwise()
         self.modulus, self.fill = fem.Function(cellwise), fem.Function(cellwise)
         n = ufl.FacetNormal(self.grid.mesh)
         h = fem.Constant(self.grid.mesh, self.grid.h)

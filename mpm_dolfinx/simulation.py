@@ -12,7 +12,7 @@ from dolfinx import fem
 from dolfinx.common import Timer
 from numpy.typing import ArrayLike, NDArray
 
-from mpm_dolfinx import _compat, summary
+from mpm_dolfinx import summary
 from mpm_dolfinx.boundary import Boundary
 from mpm_dolfinx.conditions import Displacement, Drained, Inflow, RigidPlate, Traction
 from mpm_dolfinx.coupling import COUPLINGS, Coupler, NotConverged, Report
@@ -155,7 +155,7 @@ class Simulation:
             shapes |= {"position": (d,), "conductivity": (), "porosity0": ()}
         self.pieces = FormPoints(grid, **shapes)
         self.laws = scene.parts(self.pieces, ["F", "biot"] if fluid else ["F"])
-        p = fem.Function(_compat.function_space(grid.mesh, "DG", 0)) if fluid else None
+        p = fem.Function(grid.cellwise()) if fluid else None
         options = {"mean_dilatation": scene.nearly_incompressible, "symmetric": scene.symmetric}
         self.momentum = Momentum(grid, self.pieces, self.laws, fixed, p, self.gravity, **options)
         self._time = fem.Constant(grid.mesh, 0.0)
