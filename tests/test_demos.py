@@ -21,6 +21,7 @@ QUICK = {
     "cantilever": ("--cells 2 --steps 20", ["cantilever.png"]),
     "quadrature": ("--h 0.05 --steps 5 10", ["quadrature.png", "tip.csv"]),
     "extending_with_ufl": ("--cells 8", ["extending_with_ufl.png"]),
+    "slump": ("--cells 6 --steps 10", ["slump.png", "failure.png", "slump.gif"]),
     "benchmark_beam": ("--h 0.05 --t-end 0.1 --repeat 1", []),
 }
 
