@@ -158,9 +158,9 @@ class Simulation:
         p = fem.Function(grid.cellwise()) if fluid else None
         options = {"mean_dilatation": scene.nearly_incompressible, "symmetric": scene.symmetric}
         self.momentum = Momentum(grid, self.pieces, self.laws, fixed, p, self.gravity, **options)
-        self._time = fem.Constant(grid.mesh, 0.0)
+        self._time, self._dt = fem.Constant(grid.mesh, 0.0), fem.Constant(grid.mesh, 1.0)
         for term in terms:
-            self.momentum.add(term, self._time)
+            self.momentum.add(term, self._time, self._dt)
         self.storage = None
         if not self.momentum.symmetric and coupling == "schur-cg":
             coupling = "schur-fgmres"
@@ -292,7 +292,7 @@ class Simulation:
     def _begin(self, t: float) -> None:
         """Set up the step that ends at time t: grid, loads of that time, u = 0 and the cells' pressure."""
         collect_garbage(self.grid.mesh.comm)
-        self._time.value = t
+        self._time.value, self._dt.value = t, t - self.t
         if self.gravity is not None:
             self.gravity.value = np.asarray(self._gravity_at(t), dtype=float)
         fresh = not self._prepared
