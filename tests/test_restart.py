@@ -43,7 +43,7 @@ def pressed_column():
 def plastic_column():
     options = {"friction": 30.0, "dilation": 10.0, "cohesion": 1e4, "conductivity": lambda X: 1e-4 * (1 + X[:, 1])}
     sand = mpm.DruckerPrager(bulk=2e7, shear=1e7, hardening=5e6, **options)
-    push = mpm.Displacement("top", lambda t, X: (0, -2 * t), "y")
+    push = mpm.Displacement("top", lambda t, X: (0, -1.5 * t), "y")
     simulation = column(width=3, cells=6, material=sand, displacements=[push], drained=[mpm.Drained("top")])
     return simulation, None
 
