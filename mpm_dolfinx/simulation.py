@@ -488,7 +488,7 @@ class Simulation:
         return folded
 
     def _carry(self, moved: NDArray[np.float64]) -> Carried:
-        """Return the pressures that the pieces take along; `moved` (m, d), m: their centroids at the end of the step."""
+        """Return the pressures that the pieces take along; `moved` (m, d), m: their centroids at the step's end."""
         points, place, pieces, J = self.points, self.placement, self.placement.pieces, self.points.J
         n = 1 - (1 - self._table(lambda m: m.porosity)) / J
         store = self._table(lambda m, n: m.storage(self.fluid.bulk, n), n) * points.volume0 * J
