@@ -7,7 +7,7 @@ from mpm_dolfinx.grid import Grid
 from mpm_dolfinx.materials import LAWS, Field, Fluid, Hencky, LinearElastic, NeoHookean, Skeleton, kozeny_carman
 from mpm_dolfinx.output import Writer
 from mpm_dolfinx.plasticity import DruckerPrager
-from mpm_dolfinx.points import box, probes, shape
+from mpm_dolfinx.points import box, mapped, probes, shape
 from mpm_dolfinx.restart import Checkpoint, resume
 from mpm_dolfinx.simulation import Simulation
 from mpm_dolfinx.timeloop import GaveUp, Result
@@ -37,6 +37,7 @@ __all__ = [
     "Writer",
     "box",
     "kozeny_carman",
+    "mapped",
     "probes",
     "resume",
     "shape",

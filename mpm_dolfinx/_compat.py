@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 
+from mpi4py import MPI
 from petsc4py import PETSc
 
 import dolfinx
@@ -29,6 +30,37 @@ if OLD:
     from dolfinx.fem.assemble import pack_coefficients as _pack_coefficients
 else:
     import basix.ufl
+    from dolfinx import graph
+
+
+def box_mesh(
+    comm: MPI.Intracomm,
+    cells: NDArray[np.int64],
+    x: NDArray[np.float64],
+    ranks: NDArray[np.int32],
+    offsets: NDArray[np.int32],
+) -> mesh.Mesh:
+    """Return a mesh of quadrilaterals or hexahedra, shared out as told.
+
+    Parameters
+    ----------
+    cells : (n, 2^d)
+        Nodes of the cells that this process brings in, first axis fastest.
+    x : (m, d), m
+        Positions of the nodes that this process brings in; those of all processes follow each other.
+    ranks, offsets
+        Processes that have cell i: `ranks[offsets[i] : offsets[i + 1]]`, its owner first.
+    """
+    kind = {4: "quadrilateral", 8: "hexahedron"}[cells.shape[1]]
+    where = (ranks, offsets)
+    if OLD:
+        domain = ufl.Mesh(ufl.VectorElement("Lagrange", kind, 1))
+        ghosts = mesh.GhostMode.shared_facet
+        lists = cpp.graph.AdjacencyList_int32(*where)
+        return mesh.create_mesh(comm, cells, x, domain, ghosts, lambda *_: lists)
+    domain = ufl.Mesh(basix.ufl.element("Lagrange", kind, 1, shape=(x.shape[1],)))
+    lists = graph.adjacencylist(*where)
+    return mesh.create_mesh(comm, cells=cells, x=x, e=domain, partitioner=lambda *_: lists)
 
 
 def function_space(msh: mesh.Mesh, family: str, degree: int, shape: tuple[int, ...] = ()):

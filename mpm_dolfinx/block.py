@@ -39,7 +39,8 @@ class BlockSolver:
         self._A = PETSc.Mat().createPython((size, size), self, comm=momentum.unknowns.comm)
         self._A.setUp()
         self._x, self._b = self._A.createVecs()
-        self._storage_cycle = multigrid_solver(storage.P, "storage").pc
+        self._storage_solver = multigrid_solver(storage.P, "storage")
+        self._storage_cycle = self._storage_solver.pc
         self._ksp = PETSc.KSP().create(self._A.comm)
         self._ksp.setType(PETSc.KSP.Type.GMRES)
         self._ksp.setOptionsPrefix("mpm_block_")
@@ -50,6 +51,11 @@ class BlockSolver:
         self._ksp.setOperators(self._A)
         self._ksp.setFromOptions()
         self._scale = 1.0, 1.0
+
+    def free(self) -> None:
+        """Free solvers and matrix, which refer to this object as it does to them."""
+        for own in (self._ksp, self._A, self._storage_solver):
+            own.destroy()
 
     def set_preconditioner(self, P: PETSc.Mat) -> None:
         """Take the present fixed-stress operator."""

@@ -71,7 +71,10 @@ class Boundary:
         rows = []
         for load, faces in self.loads:
             patches = place.surface(faces)
-            rows.append((patches.cell, patches.x, patches.area0[:, None] * load.at(t)))
+            traction = load.at(t)
+            if traction.ndim == 0:
+                traction = traction * patches.area / np.linalg.norm(patches.area, axis=1, keepdims=True)
+            rows.append((patches.cell, patches.x, patches.area0[:, None] * traction))
         cell, x, force = self._gathered(rows, self.grid.dim)
         momentum.loads.place(cell, x, np.ones(len(cell)), force=force)
 

@@ -21,8 +21,8 @@ class Traction:
     ----------
     side
         Side of the bodies, see `grid.SIDES`.
-    value : (d,) or callable t -> (d,), Pa
-        Force per reference area.
+    value : (d,) or number, or callable t -> (d,) or number, Pa
+        Force per reference area; a number acts along the outward normal at the start of the step, negative: presses.
     region : ((d,), (d,)), m
         Box of reference positions to which the traction is limited.
     """
@@ -32,7 +32,7 @@ class Traction:
     region: Region | None = None
 
     def at(self, t: float) -> NDArray[np.float64]:
-        """Return the traction (d,) at time t (s), Pa."""
+        """Return the traction (d,), or () along the normal, at time t (s), Pa."""
         return np.asarray(self.value(t) if callable(self.value) else self.value, dtype=float)
 
 

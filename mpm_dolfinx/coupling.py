@@ -110,6 +110,7 @@ class Coupler:
         self.richardson = storage is not None and coupling.startswith("fixed-stress")
         self.max_iterations = max_iterations or (200 if self.richardson else 25)
         self.beta = COUPLINGS[coupling] or 1.0
+        self._solve_u = self._solve_s = self._schur = self._block = None
 
     def set_unknowns(self) -> None:
         """Make the solvers for the present matrices."""
@@ -124,7 +125,12 @@ class Coupler:
     def forget(self) -> None:
         """Make tangent and solvers anew in the next step: what follows then does not depend on the steps before."""
         m = self.momentum
-        self._tangent_of = self._schur = self._block = None
+        if self._block is not None:
+            self._block.free()
+        for solver in (self._solve_s, self._schur, self._solve_u):
+            if solver is not None:
+                solver.destroy()  # PETSc's and Python's objects refer to each other
+        self._tangent_of = self._solve_s = self._schur = self._block = None
         if self._iterative:
             self._solve_u, self._modes = multigrid_solver(m.K, "momentum"), m.unknowns.rigid_body_modes()
         else:
@@ -163,7 +169,7 @@ class Coupler:
                 self._linearise(dt)
             report.coupling += self._direction(dt, max(errors))
             before, errors = errors, self._line_search(dt, errors, report)
-            fresh = max(errors) > KEEP * max(before)
+            fresh = max(errors) > KEEP * min(1.0, max(before))  # inf where no fluid has moved yet
 
     def _check_stable(self, dt: float, report: Report) -> None:
         """Refuse an equilibrium that the body leaves at the least disturbance: smaller steps find where it goes.

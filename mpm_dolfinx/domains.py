@@ -53,11 +53,17 @@ def kuhn_simplices(dim: int) -> NDArray[np.int64]:
     return np.array([[sum(1 << a for a in p[:k]) for k in range(dim + 1)] for p in permutations(range(dim))])
 
 
+def volumes(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the volumes (n,), m^d, of domains (n, 2^d, d), negative if they are turned inside out."""
+    dim = corners.shape[2]
+    simplices = corners[:, kuhn_simplices(dim)]
+    spanned = np.linalg.det(simplices[:, :, 1:] - simplices[:, :, :1]) * _ORIENTATION[dim]
+    return spanned.mean(axis=1)
+
+
 def tangled(corners: NDArray[np.float64], volume: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return which domains (n, 2^d, d) have folded: their corners span far less, or more, than their volume (n,)."""
-    simplices = corners[:, kuhn_simplices(corners.shape[2])]
-    spanned = np.linalg.det(simplices[:, :, 1:] - simplices[:, :, :1]) * _ORIENTATION[corners.shape[2]]
-    ratio = spanned.mean(axis=1) / volume
+    ratio = volumes(corners) / volume
     return (ratio < TANGLED) | (ratio > 1 / TANGLED)
 
 
@@ -262,6 +268,8 @@ def cut_faces(
         s, owner = _slice(s, owner, axis)
     # the local coordinates tell sizes, for they are never degenerate
     share = _size(s[:, d:]) / _size(whole[:, d:])[owner] / len(split)
+    kept = np.flatnonzero(share > SLIVER)  # what only touches a plane leaves nothing
+    s, owner, share = s[:, :, kept], owner[kept], share[kept]
     points = np.einsum("qk,kam->qam", _RULES[d], s)
     middle = np.tile((grid.lower + grid.h * s[:, :d].mean(axis=0).T), (len(points), 1))
     points = points.transpose(0, 2, 1).reshape(-1, both.shape[1])

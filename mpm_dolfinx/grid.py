@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The background grid: a box of equal quadrilaterals or hexahedra, in which points are found by arithmetic."""
+"""The background grid: a box of equal quadrilaterals or hexahedra, in which points are found by arithmetic.
+
+Its mesh is made when first it is needed: by then a simulation has shared out the cells by the points in them.
+"""
 
 from __future__ import annotations
 
@@ -9,10 +12,10 @@ from functools import reduce
 from mpi4py import MPI
 
 import numpy as np
-from dolfinx import mesh
 from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx import _compat
+from mpm_dolfinx.partition import destinations, owners
 
 SIDES = {
     2: {"left": (0, 0), "right": (0, 1), "bottom": (1, 0), "top": (1, 1)},
@@ -65,14 +68,23 @@ class Grid:
             raise ValueError(f"grid: cells {cells} over {self.lower} to {self.upper}: need cells >= 1, upper > lower")
         self.h = (self.upper - self.lower) / self.shape
         self.comm = comm
-        create, cell = (
-            (mesh.create_rectangle, mesh.CellType.quadrilateral)
-            if self.dim == 2
-            else (mesh.create_box, mesh.CellType.hexahedron)
-        )
-        self.mesh = create(
-            comm, [self.lower, self.upper], self.shape.tolist(), cell, ghost_mode=mesh.GhostMode.shared_facet
-        )
+
+    def __getattr__(self, name: str):
+        """Make the mesh when first something of it is asked for."""
+        if name.startswith("__") or "mesh" in self.__dict__:
+            raise AttributeError(f"the grid has no {name!r}")
+        self.share(np.zeros((0, self.dim)))
+        return getattr(self, name)
+
+    def share(self, x: NDArray[np.float64]) -> None:
+        """Make the mesh, its cells shared out among the processes by the points x (n, d), m; once."""
+        if "mesh" in self.__dict__:
+            return
+        load = sum_by(self.number(self.index(x)), np.ones(len(x)), int(np.prod(self.shape)))
+        owner = owners(load.reshape(self.shape), self.comm.size)
+        self._owner = owner.ravel()
+        own = np.flatnonzero(self._owner == self.comm.rank)
+        self.mesh = _compat.box_mesh(self.comm, self._corners(own), self._nodes(), *destinations(owner, own))
         nodes = _compat.function_space(self.mesh, "Lagrange", 1)
         self.num_owned, self.num_local = _compat.num_cells(self.mesh)
         self.cell_nodes = _compat.cell_dofs(nodes)
@@ -85,21 +97,29 @@ class Grid:
         self._lookup()
         self._facets()
 
+    def _corners(self, cells: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the lexicographic numbers of the nodes (n, 2^d) of cells."""
+        bits = np.arange(2**self.dim)[:, None] >> np.arange(self.dim) & 1
+        index = np.stack(np.unravel_index(cells, self.shape), axis=-1)[:, None] + bits
+        return np.ravel_multi_index(tuple(np.moveaxis(index, 2, 0)), tuple(self.shape + 1))
+
+    def _nodes(self) -> NDArray[np.float64]:
+        """Return the positions (n, d), m, of this process's share of the nodes, in lexicographic order."""
+        count = int(np.prod(self.shape + 1))
+        start, stop = (count * (self.comm.rank + end) // self.comm.size for end in (0, 1))
+        index = np.stack(np.unravel_index(np.arange(start, stop), self.shape + 1), axis=-1)
+        return self.lower + index * self.h
+
     @property
     def cell_volume(self) -> float:
         """Volume of a cell (m^d)."""
         return float(np.prod(self.h))
 
     def _lookup(self) -> None:
-        """Tables from the lexicographic number of a cell to the local cell and to its owner."""
+        """Make the table from the lexicographic number of a cell to the local cell."""
         self.cell_number = self.number(np.floor((self.midpoints - self.lower) / self.h).astype(np.int64))
         self._local = np.full(int(np.prod(self.shape)), -1, dtype=np.int32)
         self._local[self.cell_number] = np.arange(self.num_local)
-        if self.comm.size > 1:
-            owner = np.full(self._local.size, -1, dtype=np.int32)
-            owner[self.cell_number[: self.num_owned]] = self.comm.rank
-            self._owner = np.empty_like(owner)
-            self.comm.Allreduce(owner, self._owner, op=MPI.MAX)
 
     def _facets(self) -> None:
         topology, d = self.mesh.topology, self.dim
@@ -124,7 +144,7 @@ class Grid:
 
     def owner(self, number: NDArray[np.int64]) -> NDArray[np.int32]:
         """Return the rank that owns each cell, given by its lexicographic number."""
-        return self._owner[number] if self.comm.size > 1 else np.zeros(len(number), dtype=np.int32)
+        return self._owner[number]
 
     def local(self, number: NDArray[np.int64]) -> NDArray[np.int32]:
         """Return this process's index of each cell, -1 where it does not have the cell."""

@@ -4,13 +4,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from mpm_dolfinx.domains import corner_bits
+from mpm_dolfinx.domains import corner_bits, volumes
 from mpm_dolfinx.exchange import Exchange
 from mpm_dolfinx.grid import Grid, side
 
@@ -94,21 +94,38 @@ class Body:
     """A body as seeded: reference geometry of all its domains, the same on every process.
 
     lower, spacing : (n, d), (d,), m — box of each domain; sides : (n, d, 2) — whether a face of the
-    domain lies on the surface of the body.
+    domain lies on the surface of the body; map : where the corners of the boxes are put, see `mapped`.
     """
 
     lower: NDArray[np.float64]
     spacing: NDArray[np.float64]
     sides: NDArray[np.bool_]
     material: int = 0
+    map: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None
 
     def __len__(self) -> int:
         return len(self.lower)
 
     @property
     def centre(self) -> NDArray[np.float64]:
-        """Reference positions (n, d), m."""
+        """Centres of the boxes (n, d), m."""
         return self.lower + 0.5 * self.spacing
+
+    def corners(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
+        """Return the reference corners (m, 2^d, d), m, of domains."""
+        lower = self.lower[chosen]
+        corners = lower[:, None] + corner_bits(lower.shape[1]) * self.spacing
+        if self.map is None:
+            return corners
+        return np.asarray(self.map(corners.reshape(lower.shape[0] * corners.shape[1], -1))).reshape(corners.shape)
+
+    def size(self) -> NDArray[np.float64]:
+        """Return the edges (n, d), m, of boxes that are as large as the domains."""
+        boxes = np.broadcast_to(self.spacing, self.lower.shape)
+        if self.map is None:
+            return boxes
+        ratio = volumes(self.corners()) / self.spacing.prod()
+        return boxes * ratio[:, None] ** (1 / len(self.spacing))
 
 
 def box(grid: Grid, lower: ArrayLike, upper: ArrayLike, per_cell: int = 2, material: int = 0) -> Body:
@@ -164,6 +181,28 @@ def shape(
     return _inside(grid, Body(grid.lower + index * spacing, spacing, sides, material))
 
 
+def mapped(grid: Grid, body: Body, map: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> Body:
+    """Bend a body: its boxes become the quadrilaterals or hexahedra between the images of their corners.
+
+    Sides keep their names; regions and probes are given by places before the map.
+
+    Parameters
+    ----------
+    map
+        Maps positions (n, d), m, to positions (n, d), m, inside the grid; smooth, and not turning boxes inside out.
+    """
+    bent = replace(body, map=map)
+    corners = bent.corners()
+    out = np.flatnonzero(grid.outside(corners.reshape(-1, grid.dim)))
+    if len(out):
+        x = corners.reshape(-1, grid.dim)[out[0]]
+        raise ValueError(f"body: the map takes a corner to {x}, outside the grid {grid.lower} to {grid.upper}")
+    smallest = int(np.argmin(volumes(corners)))
+    if not volumes(corners)[smallest] > 0:
+        raise ValueError(f"body: the map turns the domain at {body.centre[smallest]} inside out")
+    return bent
+
+
 def _per_cell(per_cell: int) -> int:
     if per_cell != int(per_cell) or per_cell < 1:
         raise ValueError(f"body: per_cell = {per_cell!r}, must be an integer >= 1")
@@ -181,9 +220,9 @@ def _inside(grid: Grid, body: Body) -> Body:
 
 def material_points(grid: Grid, bodies: Sequence[Body], pressure: float = 0.0) -> MaterialPoints:
     """Return this process's material points of the bodies, at rest at pore pressure `pressure` (Pa)."""
-    bits, d = corner_bits(grid.dim), grid.dim
-    corners = np.concatenate([b.lower[:, None] + bits * b.spacing for b in bodies])
-    spacing = np.concatenate([np.broadcast_to(b.spacing, b.lower.shape) for b in bodies])
+    d = grid.dim
+    corners = np.concatenate([b.corners() for b in bodies])
+    size = np.concatenate([b.size() for b in bodies])
     material = np.concatenate([np.full(len(b), b.material, dtype=np.int32) for b in bodies])
     x = corners.mean(axis=1)
     mine = np.flatnonzero(grid.owner(grid.number(grid.index(x))) == grid.comm.rank)
@@ -192,7 +231,7 @@ def material_points(grid: Grid, bodies: Sequence[Body], pressure: float = 0.0) -
         id=mine,
         corners=corners[mine],
         F=np.tile(np.eye(d), (n, 1, 1)),
-        volume0=spacing[mine].prod(axis=1),
+        volume0=size[mine].prod(axis=1),
         material=material[mine],
         pressure=np.full(n, float(pressure)),
         x=x[mine],
@@ -205,8 +244,8 @@ class Surface:
     """Faces of domains on one side of the bodies, the same on every process; arrays over m faces.
 
     id : (m,) number of the point; xi : (m, 2, d) ends of the part of the face that counts, in the domain's
-    coordinates from -1 to 1; X : (m, 2, d) their reference positions, m; whole0 : (m,) reference area of the
-    whole face, m^(d-1); axis, end : side of the domain.
+    coordinates from -1 to 1; X : (m, 2, d) their reference positions, before a map, m; whole0 : (m,) reference
+    area of the whole face, m^(d-1); axis, end : side of the domain.
     """
 
     id: NDArray[np.int64]
@@ -222,7 +261,7 @@ class Surface:
     @property
     def area0(self) -> NDArray[np.float64]:
         """Reference area (m,) of the parts that count, m^(d-1)."""
-        return np.delete(self.X[:, 1] - self.X[:, 0], self.axis, axis=1).prod(axis=1)
+        return self.whole0 * np.delete((self.xi[:, 1] - self.xi[:, 0]) / 2, self.axis, axis=1).prod(axis=1)
 
     def corners(self) -> NDArray[np.float64]:
         """Return the corners (m, 2^(d-1), d) of the parts in the domain's coordinates."""
@@ -273,7 +312,7 @@ def surface(
         ids.append(start + chosen[on])
         xis.append((2 * part - box.sum(axis=1, keepdims=True))[on] / body.spacing)
         Xs.append(part[on])
-        wholes.append((face[:, 1] - face[:, 0])[on][:, tangential].prod(axis=1))
+        wholes.append(np.linalg.norm(face_vectors(body.corners(chosen[on]), axis, end), axis=1))
         start += len(body)
     return Surface(*map(np.concatenate, (ids, xis, Xs, wholes)), axis, end)
 
@@ -329,7 +368,7 @@ class Probes:
 
 
 def probes(bodies: Sequence[Body], x0: ArrayLike) -> Probes:
-    """Return probes at reference positions x0 (m, d), m, inside or on the surface of the bodies."""
+    """Return probes at reference positions x0 (m, d), m, before a map, inside or on the surface of the bodies."""
     x0 = np.atleast_2d(np.asarray(x0, dtype=float))
     centre = np.concatenate([b.centre for b in bodies])
     spacing = np.concatenate([np.broadcast_to(b.spacing, b.lower.shape) for b in bodies])

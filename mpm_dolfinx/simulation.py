@@ -28,6 +28,7 @@ from mpm_dolfinx.points import Body, MaterialPoints, Probes, material_points
 from mpm_dolfinx.remap import Carried, at_start, remap
 from mpm_dolfinx.storage import Storage
 from mpm_dolfinx.timeloop import Observer, Result, run
+from mpm_dolfinx.unknowns import collect_garbage
 
 
 class Simulation:
@@ -91,6 +92,7 @@ class Simulation:
             raise ValueError("sources need a fluid")
         self.grid, self.materials, self.fluid, self.bodies = grid, materials, fluid, bodies
         self.quadrature = quadrature
+        grid.share(np.concatenate([body.centre for body in bodies]))
         self.gravity = None if gravity is None else fem.Constant(grid.mesh, np.zeros(grid.dim))
         self.t, self.active_cells = 0.0, 0
         self.points = material_points(grid, bodies, pressure)
@@ -289,6 +291,7 @@ class Simulation:
 
     def _begin(self, t: float) -> None:
         """Set up the step that ends at time t: grid, loads of that time, u = 0 and the cells' pressure."""
+        collect_garbage(self.grid.mesh.comm)
         self._time.value = t
         if self.gravity is not None:
             self.gravity.value = np.asarray(self._gravity_at(t), dtype=float)
@@ -488,7 +491,7 @@ class Simulation:
         return folded
 
     def _carry(self, moved: NDArray[np.float64]) -> Carried:
-        """Return the pressures that the pieces take along; `moved` (m, d), m: their centroids at the step's end."""
+        """Return the pressures that the pieces take along; `moved` (m, d), m: their centroids after the step."""
         points, place, pieces, J = self.points, self.placement, self.placement.pieces, self.points.J
         n = 1 - (1 - self._table(lambda m: m.porosity)) / J
         store = self._table(lambda m, n: m.storage(self.fluid.bulk, n), n) * points.volume0 * J
@@ -517,7 +520,7 @@ class Simulation:
 
     def _spacing(self) -> NDArray[np.float64]:
         """Reference size of the points' domains (n, d), m."""
-        return np.concatenate([np.broadcast_to(b.spacing, b.lower.shape) for b in self.bodies])[self.points.id]
+        return np.concatenate([b.size() for b in self.bodies])[self.points.id]
 
     def _migrate(self) -> None:
         """Send the points whose cell another process owns."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from itertools import combinations
 
+from mpi4py import MPI
 from petsc4py import PETSc
 
 import numpy as np
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx import _compat
 
-ITERATIVE = 2000
+ITERATIVE = 1500
 """Unknowns of a 3D problem from which on it is solved by iterations: see `multigrid_solver`."""
 
 
@@ -175,6 +176,16 @@ def zero(A: PETSc.Mat) -> None:
     """Empty a matrix for assembly, whether it was assembled before or not."""
     if A.assembled:
         A.zeroEntries()
+
+
+def collect_garbage(comm: MPI.Intracomm) -> None:
+    """Free the PETSc objects that Python has dropped on all processes, together: PETSc keeps them until it is asked.
+
+    On several processes their order of going may differ from one to the other; releases before 3.20 or so keep
+    those of a single process too.  Without this, a run keeps the matrices and factors of all its steps.
+    """
+    PETSc.garbage_cleanup(comm)
+    PETSc.garbage_cleanup(PETSc.COMM_SELF)
 
 
 def sum_ghosts(function: fem.Function) -> NDArray[np.float64]:

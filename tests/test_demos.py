@@ -18,9 +18,15 @@ QUICK = {
     "mandel": ("--cells 8 --steps 5", ["mandel.png"]),
     "coupling_iterations": ("--quick --h 0.06", ["iterations.png", "iterations.csv", "iterations.md", "roughness.md"]),
     "small_steps": ("--cells 10 --steps 1 10 40 --strip-cells 10", ["small_steps.png", "strip.png"]),
+    "cantilever_3d": ("--cells 2 --steps 2 4", ["cantilever_3d.png"]),
+    "cryer": ("--cells 6 --steps 12", ["cryer.png"]),
     "cantilever": ("--cells 2 --steps 20", ["cantilever.png"]),
     "quadrature": ("--h 0.05 --steps 5 10", ["quadrature.png", "tip.csv"]),
     "extending_with_ufl": ("--cells 8", ["extending_with_ufl.png"]),
+    "extreme_cases": (
+        "--quick --families conductivity contrast-of-stiffness filling overload",
+        ["extreme_cases.png", "cases.csv", "cases.md", "summary.md"],
+    ),
     "benchmark_beam": ("--h 0.05 --t-end 0.1 --repeat 1", []),
 }
 

@@ -1,0 +1,178 @@
+# SPDX-License-Identifier: MIT
+"""A square cantilever in 3D, pulled aslant: its tip, the number of load steps, and what a step costs.
+
+A dry beam of 1 m x 0.1 m x 0.1 m, clamped at x = 0, carries a dead load P on its free end, along (0, 3, -4) / 5:
+aslant to the grid.  A square bends alike about all axes, so it must move in the direction of the load, as the
+geometrically exact rod does that stretches and shears (Reissner 1972, Simo 1985).  The load parameter is
+alpha = P L² / (E I).  The material is elastic: the answer must not depend on the number of steps, which is
+the test of the domains' exact pieces.  Runs on any number of processes; --profile says what a step costs.
+
+Errors, over L: `v` and `u`, the distance of the tip's deflection and shortening from the rod's, `w`, its
+displacement across the load, and `drift`, the tip's greatest distance from that of most steps.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import sys
+from pathlib import Path
+
+from mpi4py import MPI
+
+import numpy as np
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.exact import shear_flexible_rod
+
+LENGTH, SIDE, YOUNG = 1.0, 0.1, 12e6  # m, m, Pa
+ALONG, ACROSS = np.array([0, 3, -4]) / 5, np.array([0, 4, 3]) / 5
+RUBBER = mpm.NeoHookean(bulk=YOUNG / 3, shear=YOUNG / 2)  # nu = 0
+STIFFNESS = YOUNG * SIDE**4 / 12  # E I, N m²
+OFFSET = np.array([0, 0.37, 0.5])  # of the beam from the grid lines, cells
+
+
+def rod(alpha: float) -> tuple[float, float]:
+    """Return (shortening, deflection) of the rod's tip, m."""
+    area, load = SIDE**2, alpha * STIFFNESS / LENGTH**2
+    x, y = shear_flexible_rod(LENGTH, YOUNG * area, 5 / 6 * RUBBER.shear * area, STIFFNESS, load, points=2)[-1]
+    return LENGTH - x, y
+
+
+def scene(cells: int, alpha: float) -> tuple[mpm.Simulation, mpm.points.Probes]:
+    """Return the beam, that many cells high, and the middle of its end; time 1 is the load alpha."""
+    h = SIDE / cells
+    reach = np.abs(ALONG) * rod(alpha)[1] * 1.05
+    span = np.array([LENGTH * 1.05, SIDE, SIDE]) + reach + 3 * h
+    span[1:] += h
+    count = np.ceil(span / h).astype(int)
+    grid = mpm.Grid(count * h, count)
+    lower = OFFSET * h
+    lower[1:] += h
+    lower[2] += np.ceil(reach[2] / h) * h
+    size = np.array([LENGTH, SIDE, SIDE])
+    body = mpm.box(grid, lower, lower + size)
+    traction = ALONG * alpha * STIFFNESS / LENGTH**2 / SIDE**2
+    pull = mpm.Traction("right", lambda t: traction * t)
+    simulation = mpm.Simulation(grid, [body], [RUBBER], fixed={"left": "xyz"}, tractions=[pull])
+    return simulation, mpm.probes([body], [lower + size * [1, 0.5, 0.5]])
+
+
+def run(cells: int, steps: int, alpha: float, taken: int | None = None) -> tuple[np.ndarray, mpm.Result, dict]:
+    """Return the tip's displacement (3,), m, the result and the costs of a run; only `taken` of the steps."""
+    simulation, tip = scene(cells, alpha)
+    result = simulation.run((taken or steps) / steps, 1 / steps, probes=tip)
+    comm = simulation.grid.comm
+    memory = comm.allreduce(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss) / 1024
+    costs = {
+        "steps": result.steps,
+        "active_cells": simulation.active_cells,
+        "grid_cells": int(simulation.grid.shape.prod()),
+        "unknowns": simulation.momentum.unknowns.global_size,
+        "newton_iterations": result.newton,
+        "linear_iterations": result.coupling,
+        "seconds_per_step": result.wall / result.steps,
+        "memory_MB": memory,
+    }
+    if comm.rank == 0 and cells <= 8:
+        costs["surface"] = surface(simulation)
+    return result.displacement[-1][0], result, costs
+
+
+def surface(simulation: mpm.Simulation) -> tuple[np.ndarray, np.ndarray]:
+    """Return the faces (m, 4, 3) of the body's domains on this process, m, and their stretch along the beam."""
+    points, (body,) = simulation.points, simulation.bodies
+    bits, faces, stretch = mpm.domains.corner_bits(3), [], []
+    for axis in range(3):
+        for end in (0, 1):
+            on = body.sides[points.id, axis, end]
+            corners = points.corners[on][:, bits[:, axis] == end]
+            faces.append(corners[:, [0, 1, 3, 2]])
+            stretch.append(np.linalg.norm(points.F[on, :, 0], axis=1))
+    return np.concatenate(faces), np.concatenate(stretch)
+
+
+def main(argv: list[str] | None = None) -> dict:
+    """Run the demo; return what --json prints."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    add = parser.add_argument
+    add("--cells", type=int, default=4, help="cells over the height")
+    add("--steps", type=int, nargs="+", default=[10, 20, 40], help="numbers of load steps")
+    add("--taken", type=int, default=None, help="take only so many of the steps: no errors, but costs")
+    add("--alpha", type=float, default=1.0, help="load parameter")
+    add("--out", type=Path, default=Path("out/cantilever_3d"), help="folder for the picture")
+    add("--profile", action="store_true", help="print where the time went")
+    add("--json", action="store_true", help="print the results as one line of JSON at the end")
+    o = parser.parse_args(argv)
+    if o.cells < 1 or min(o.steps) < 1 or not 0 < o.alpha <= 10:
+        parser.error(f"--cells {o.cells} --steps {o.steps} --alpha {o.alpha}: must be >= 1, >= 1 and in (0, 10]")
+    out = {"errors": {}, "runs": [], "converged": True}
+    talk = MPI.COMM_WORLD.rank == 0
+    tips, picture = [], None
+    try:
+        for steps in o.steps:
+            tip, result, costs = run(o.cells, steps, o.alpha, o.taken)
+            picture = costs.pop("surface", None)
+            tips.append(tip)
+            out["runs"].append({"load_steps": steps, "tip": tip.tolist(), **costs, "wall_s": result.wall})
+            if talk:
+                print(f"{steps} steps, {costs}" + (f"\n{result.shares()}" if o.profile else ""))
+    except mpm.GaveUp as error:
+        print(f"error: {error}", file=sys.stderr)
+        out["converged"] = False
+    if talk and out["converged"] and o.taken is None:
+        out["errors"] = errors(np.array(tips), o.alpha)
+        report(o, np.array(tips), out["errors"])
+        if picture:
+            draw(o, *picture)
+    if talk and o.json:
+        print(json.dumps(out))
+    return out
+
+
+def errors(tips: np.ndarray, alpha: float) -> dict[str, float]:
+    """Return the errors that the module's docstring defines, of the run with most steps."""
+    u, v = rod(alpha)
+    tip = tips[-1]
+    drift = np.linalg.norm(tips - tip, axis=1).max()
+    distances = {"v": tip @ ALONG - v, "u": -tip[0] - u, "w": tip @ ACROSS, "drift": drift}
+    return {name: float(abs(d)) / LENGTH for name, d in distances.items()}
+
+
+def report(o: argparse.Namespace, tips: np.ndarray, found: dict[str, float]) -> None:
+    """Print the tips beside the rod's."""
+    u, v = rod(o.alpha)
+    print(f"{'steps':>6} {'along':>10} {'across':>10} {'shortening':>10}")
+    for steps, tip in zip(o.steps, tips, strict=True):
+        print(f"{steps:6} {tip @ ALONG:10.6f} {tip @ ACROSS:10.6f} {-tip[0]:10.6f}")
+    print(f"{'rod':>6} {v:10.6f} {0:10.6f} {u:10.6f}")
+    print(", ".join(f"{name} {100 * e:.3f} %" for name, e in found.items()))
+
+
+def draw(o: argparse.Namespace, faces: np.ndarray, stretch: np.ndarray) -> None:
+    """Draw the deformed beam, coloured by the stretch along it."""
+    import matplotlib.pyplot as plt
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+
+    fig = plt.figure(figsize=(8, 4.5))
+    ax = fig.add_subplot(projection="3d", proj_type="ortho")
+    limit = np.abs(stretch - 1).max()
+    colours = ScalarMappable(Normalize(1 - limit, 1 + limit), "RdBu_r")
+    ax.add_collection3d(Poly3DCollection(faces, facecolors=colours.to_rgba(stretch), edgecolors="0.3", linewidths=0.1))
+    low, high = faces.min(axis=(0, 1)), faces.max(axis=(0, 1))
+    ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
+    ax.set(xlabel="x (m)", ylabel="y (m)", zlabel="z (m)", title=rf"Square cantilever, $P L^2 / (E I)$ = {o.alpha:g}")
+    ax.set_box_aspect(high - low, zoom=1.2)
+    ax.locator_params(axis="y", nbins=3)
+    ax.locator_params(axis="z", nbins=4)
+    ax.view_init(elev=25, azim=-70)
+    fig.colorbar(colours, ax=ax, shrink=0.7, pad=0.1, label="stretch along the beam (-)")
+    o.out.mkdir(parents=True, exist_ok=True)
+    fig.savefig(o.out / "cantilever_3d.png", dpi=130)
+
+
+if __name__ == "__main__":
+    sys.exit(0 if main()["converged"] else 1)

@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: MIT
+"""Cryer's sphere: pressed all around and drained at its surface, the pressure at its centre rises at first.
+
+A saturated ball is loaded by an even normal traction p0 at once, and kept; its surface is drained.  The outer
+shell gives up its water, shrinks and presses on the core: the pressure at the centre rises by nearly a third above
+p0 before it falls (Cryer 1963), which no uncoupled theory of consolidation can show.  Fluid and grains are
+incompressible, nu = 0.25.  One octant is computed: a lattice of boxes, bent into the ball by a smooth map.
+
+Errors, of the pressure at the centre against the exact one at reduced times T = c_v t / R²: `peak`, of its
+greatest value, and `curve`, the greatest over T from 0.02 on, over p0.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import poroelastic_beam as beam
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.exact import cryer_pressure
+
+RADIUS, LOAD, NU = 1.0, 100.0, 0.25  # m, Pa, -
+SHEAR, CONDUCTIVITY = 1e6, 1e-6  # Pa, m/s
+SAND = mpm.LinearElastic(bulk=SHEAR * 2 * (1 + NU) / (3 - 6 * NU), shear=SHEAR, conductivity=CONDUCTIVITY)
+WATER = mpm.Fluid(bulk=np.inf)
+CV = CONDUCTIVITY / WATER.unit_weight * SAND.oedometric  # m²/s
+END = 0.12  # reduced time
+OUTER = ("right", "back", "top")  # sides of the lattice that become the surface of the ball
+
+
+def ball(x: np.ndarray) -> np.ndarray:
+    """Return where a map from the cube [-R, R]^3 onto the ball takes positions (n, 3), m; planes x = 0 stay."""
+    s = (x / RADIUS) ** 2
+    b, c = np.roll(s, -1, axis=1), np.roll(s, -2, axis=1)
+    return x * np.sqrt(1 - b / 2 - c / 2 + b * c / 3)
+
+
+def scene(cells: int) -> mpm.Simulation:
+    """Return the octant with that many cells to the radius."""
+    h = RADIUS / cells
+    grid = mpm.Grid([RADIUS + h] * 3, [cells + 1] * 3)
+    octant = mpm.mapped(grid, mpm.box(grid, [0] * 3, [RADIUS] * 3), ball)
+    walls = {"left": "x", "front": "y", "bottom": "z"}
+    pressed, drained = [mpm.Traction(s, -LOAD) for s in OUTER], [mpm.Drained(s) for s in OUTER]
+    return mpm.Simulation(grid, [octant], [SAND], fluid=WATER, fixed=walls, tractions=pressed, drained=drained)
+
+
+@dataclass
+class Outcome:
+    """Reduced times (m,), pressures at the centre over p0 (m,), and what the run took."""
+
+    T: np.ndarray
+    pressure: np.ndarray
+    result: mpm.Result
+    cells: int
+
+
+def run(cells: int = 20, steps: int = 120) -> tuple[dict[str, float], Outcome]:
+    """Run to reduced time END in equal steps; return the errors that the module's docstring defines."""
+    simulation, history = scene(cells), []
+
+    def observe(s: mpm.Simulation) -> None:
+        nearest = np.square(s.points.x).sum(axis=1)
+        at = np.argmin(nearest) if len(nearest) else None
+        found = (nearest[at], s.points.pressure[at]) if len(nearest) else (np.inf, 0.0)
+        history.append(min(s.grid.comm.allgather(found))[1] / LOAD)
+
+    end = END * RADIUS**2 / CV
+    result = simulation.run(end, end / steps, observe=observe)
+    out = Outcome(END * np.arange(1, steps + 1) / steps, np.array(history), result, simulation.active_cells)
+    return errors(out), out
+
+
+def exact(T: np.ndarray) -> np.ndarray:
+    """Return the exact pressure at the centre over p0 at reduced times."""
+    return cryer_pressure(T, 1.0, 1.0, NU)
+
+
+def errors(out: Outcome) -> dict[str, float]:
+    """Return the errors that the module's docstring defines."""
+    late = out.T >= 0.02
+    highest = exact(np.linspace(0.04, 0.06, 2001)).max()
+    return {
+        "peak": float(abs(out.pressure.max() / highest - 1)),
+        "curve": float(np.abs(out.pressure - exact(out.T))[late].max()),
+    }
+
+
+def main(argv: list[str] | None = None) -> dict:
+    """Run the demo; return what --json prints."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser.add_argument("--cells", type=int, default=20, help="cells to the radius")
+    parser.add_argument("--steps", type=int, default=120, help=f"equal steps to the reduced time {END}")
+    parser.add_argument("--out", type=Path, default=Path("out/cryer"), help="folder for the picture")
+    parser.add_argument("--profile", action="store_true", help="print where the time went")
+    parser.add_argument("--json", action="store_true", help="print the results as one line of JSON at the end")
+    o = parser.parse_args(argv)
+    if o.cells < 2 or o.steps < 1:
+        parser.error(f"--cells {o.cells} --steps {o.steps}: must be >= 2 and >= 1")
+    try:
+        found, outcome = run(o.cells, o.steps)
+        result = outcome.result
+        out = {"errors": found, "active_cells": outcome.cells, "wall_s": result.wall, "converged": True}
+        report(outcome, found)
+        if o.profile:
+            print(result.shares())
+        draw(o, outcome)
+    except mpm.GaveUp as error:
+        print(f"error: {error}", file=sys.stderr)
+        out = {"errors": {}, "wall_s": error.result.wall, "converged": False}
+    if o.json:
+        print(json.dumps(out))
+    return out
+
+
+def report(out: Outcome, found: dict[str, float]) -> None:
+    """Print the pressure at the centre beside the exact one."""
+    print(f"{'T':>6} {'p/p0':>8} {'exact':>8}")
+    for k in np.unique(np.linspace(0, len(out.T) - 1, 13).astype(int)):
+        print(f"{out.T[k]:6.4f} {out.pressure[k]:8.4f} {exact(out.T[k]):8.4f}")
+    r = out.result
+    print(f"{out.cells} cells, {r.steps} steps, {r.newton} Newton and {r.coupling} linear iterations, {r.wall:.1f} s")
+    print(f"errors: peak {found['peak']:.2%}, curve {found['curve']:.2%}")
+
+
+def draw(o: argparse.Namespace, out: Outcome) -> None:
+    """Draw the pressure at the centre beside the exact one."""
+    fig, ((ax,),) = beam.figure(1, 1, (7, 4.5))
+    T = np.linspace(1e-3, out.T[-1], 400)
+    ax.plot(T, exact(T), color="black", lw=1, label="Cryer (1963)")
+    ax.plot(out.T, out.pressure, "o", ms=4, mfc="none", label=f"material points, {o.cells} cells to the radius")
+    ax.axhline(1, color="grey", lw=0.6, ls="--")
+    ax.set(xlabel="reduced time $c_v t / R^2$ (-)", ylabel="pressure at the centre / load (-)", title="Cryer's sphere")
+    ax.set(xlim=(0, out.T[-1]), ylim=(0.9, 1.4))
+    ax.legend(loc="lower left")
+    ax.grid(alpha=0.3)
+    o.out.mkdir(parents=True, exist_ok=True)
+    fig.savefig(o.out / "cryer.png", dpi=130)
+
+
+if __name__ == "__main__":
+    sys.exit(0 if main()["converged"] else 1)

@@ -1,0 +1,50 @@
+# SPDX-License-Identifier: MIT
+"""Time and memory go with the points, not with the grid nor with the steps."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers import beam
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx import unknowns
+from mpm_dolfinx.domains import cut_faces
+
+
+def memory() -> float:
+    """Return the memory that this process has at present, MB."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * 4096 / 2**20
+
+
+def test_memory_does_not_grow_with_the_number_of_steps():
+    simulation, _ = beam()
+    simulation.run(0.2, 0.02, progress=False)
+    before = memory()
+    simulation.run(0.8, 0.02, progress=False)
+    assert memory() - before < 3, "MB in 30 steps of 360 kB of matrices each"
+
+
+def test_iterative_solvers_are_freed_with_the_matrices_they_were_made_for(monkeypatch):
+    monkeypatch.setattr(unknowns, "ITERATIVE", 1)
+    grid = mpm.Grid([4, 1.5, 2], [16, 6, 8])
+    body = mpm.box(grid, [0, 0.25, 0.625], [3.75, 1.25, 1.625])
+    law = mpm.LinearElastic(bulk=1e7, shear=1e7, conductivity=1e-4)
+    water = {"fluid": mpm.Fluid(), "drained": [mpm.Drained("right")]}
+    load = mpm.Traction("top", lambda t: (0, 0, -1e3 * t))
+    s = mpm.Simulation(grid, [body], [law], fixed={"left": "xyz"}, tractions=[load], **water)
+    used = []
+    for _ in range(10):
+        s.step(0.1)
+        assert s.coupler._block is not None
+        s.coupler.forget()
+        used.append(memory())
+    assert used[-1] - used[3] < 6, f"MB after each step: {used}"
+
+
+def test_faces_that_end_on_grid_planes_have_no_points_without_area():
+    grid = mpm.Grid([2, 2, 2], [2, 2, 2])
+    face = np.array([[[2, 0.25, 0.5], [2, 0.75, 1.0], [2, 0.25, 1.0], [2, 0.75, 1.5]]])
+    _, _, _, share, _ = cut_faces(grid, face, face)
+    assert share.min() > 0 and share.sum() == pytest.approx(1, abs=1e-14)
