@@ -11,8 +11,10 @@ diffusing.  Three columns:
 * resting on the grid;
 * moving: its foot is carried down by half the height meanwhile, through half of all cells;
 * moving, soft water: the fluid stores as much as the skeleton, S = 1/M.  The pressure of hard water is
-  that which the strain of the points leaves; soft water's is brought from grid to grid by the remap, which is
-  donor-cell where the body moves: an error of first order in h, in proportion to the way and not to the steps.
+  that which the strain of the points leaves; soft water's is brought from grid to grid by the remap as well.
+
+What the motion adds is the strain that points of a cell share in a step, most of all where a cell holds little of
+the column at its drained top; the remap's own error is of second order and smaller.
 
 The overshoot, the largest p / p0 - 1 of all steps, is nothing at rest, however small the step: the scheme has
 no least time step in one dimension.  In more, small steps bring checkers of the pressure, but for the damping of

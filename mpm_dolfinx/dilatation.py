@@ -27,7 +27,6 @@ import ufl
 from dolfinx import fem
 from numpy.typing import NDArray
 
-from mpm_dolfinx import _compat
 from mpm_dolfinx.elements import insert, shape_gradients
 from mpm_dolfinx.extend import call
 from mpm_dolfinx.forms import CellSums, FormPoints
@@ -49,7 +48,7 @@ class MeanDilatation:
 
     def __init__(self, pieces: FormPoints, u: fem.Function, symmetric: bool = True):
         self.pieces, self._d, self._symmetric = pieces, pieces.grid.dim, symmetric
-        cellwise = _compat.function_space(pieces.grid.mesh, "DG", 0)
+        cellwise = pieces.grid.cellwise()
         self.theta, self.pi = fem.Function(cellwise), fem.Function(cellwise)
         F = pieces.deformation(u)
         ratio = ufl.det(F) / ufl.det(pieces.F)

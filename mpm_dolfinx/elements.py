@@ -162,6 +162,7 @@ class StackedElementMatrices:
         if self._version != self.points.version:
             self._version = self.points.version
             self._sort()
+        self.points.refresh()
         for cells, points, missing in self._batches:
             insert(A, self.points, self._matrices(points.ravel(), missing), cells)
 

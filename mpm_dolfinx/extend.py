@@ -20,6 +20,8 @@ u
 v
     Test function.  The term is a linear form in v, such as -inner(b, points.value(v)) * points.dx for a
     body force b; or a stored energy without v, whose derivative is added.
+dt
+    Length of the step, s, a UFL constant: for what resists the rate u / dt.
 
 A term that is linear in v and depends on u is taken to have an unsymmetric tangent.
 

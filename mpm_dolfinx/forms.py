@@ -66,15 +66,15 @@ class FormPoints:
     def __init__(self, grid: Grid, **fields: tuple[int, ...]):
         self.grid = grid
         self._functions = {
-            name: fem.Function(_compat.function_space(grid.mesh, "DG", 0, shape))
-            for name, shape in {"offset": (grid.dim,), "weight": (), **fields}.items()
+            name: grid.coefficient(shape) for name, shape in {"offset": (grid.dim,), "weight": (), **fields}.items()
         }
         self._live: dict[str, fem.Function] = {}
         self._of: tuple[int, NDArray[np.float64]] | None = None
         self._gradients = np.empty((0, grid.dim**2))
         self.dx = PointMeasure(grid, self._functions["weight"])
         self._size = {name: int(np.prod(shape, dtype=int)) for name, shape in fields.items()}
-        self.cells = self.filled = np.empty(0, dtype=np.int32)
+        self.cells = self.filled = self.slots = np.empty(0, dtype=np.int32)
+        """Cell of each point; the cells that hold points; and the place of each point's cell among these."""
         self.data: dict[str, NDArray[np.float64]] = {}
         self.version = 0
 
@@ -98,7 +98,8 @@ class FormPoints:
         data : (n, ...)
             Values of the fields.
         """
-        self.cells, self.x, self.filled = cells, x, np.unique(cells)
+        self.cells, self.x = cells, x
+        self.filled, self.slots = np.unique(cells, return_inverse=True)
         self.data = {
             "offset": x - self.grid.midpoints[cells],
             "weight": (weight / self.grid.cell_volume)[:, None],
@@ -109,7 +110,7 @@ class FormPoints:
     def take(self, points: FormPoints, rows: NDArray[np.int64]) -> None:
         """Be some rows of other points, which carry the fields of these."""
         self.cells, self.x = points.cells[rows], points.x[rows]
-        self.filled = np.unique(self.cells)
+        self.filled, self.slots = np.unique(self.cells, return_inverse=True)
         self.data = {name: points.data[name][rows] for name in self._functions if name not in self._live}
         self.version += 1
 
@@ -130,7 +131,7 @@ class FormPoints:
         if "gradient" in self._live:
             return self._functions["gradient"]
         shape = (self.grid.dim, self.grid.dim)
-        self._functions["gradient"] = fem.Function(_compat.function_space(self.grid.mesh, "DG", 0, shape))
+        self._functions["gradient"] = self.grid.coefficient(shape)
         self._live["gradient"] = u
         return self._functions["gradient"]
 
@@ -144,13 +145,14 @@ class FormPoints:
 
     def values(self, name: str, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
         """Return a field at the chosen points (m, size)."""
-        if name in self._live:
-            self._update(self._live[name].x.array)
-            return self._gradients[chosen]
-        return self.data[name][chosen]
+        return self._gradients[chosen] if name in self._live else self.data[name][chosen]
+
+    def refresh(self) -> None:
+        """Set the gradients of u at the points, of which several forms ask, if u or the points have changed."""
+        for u in self._live.values():
+            self._update(u.x.array)
 
     def _update(self, u: NDArray[np.float64]) -> None:
-        """Set the gradients of u at the points, of which several forms ask, if u or the points have changed."""
         if self._of is not None and self._of[0] == self.version and np.array_equal(self._of[1], u):
             return
         self._of = (self.version, u.copy())
@@ -199,9 +201,7 @@ class Rows:
             if f in names:
                 self._columns.append((slice(start, stop), names[f]))
             else:
-                # as numpy's own index type, which it would else convert to in every assembly
-                unrolled = (dofs[:, :, None].astype(np.intp) * bs + np.arange(bs)).reshape(len(dofs), stop - start)
-                self._gathered.append((slice(start, stop), f, unrolled))
+                self._gathered.append((slice(start, stop), f, dofs))
             start = stop
         self._room = np.zeros((0, start))
         self._packed: tuple[int, slice | None] = (-1, None)
@@ -223,11 +223,17 @@ class Rows:
             if fresh or self.points.changes(name):
                 rows[:, columns] = self.points.values(name, chosen)
         if fresh:
-            self._dofs = [(c, f, dofs[cells]) for c, f, dofs in self._gathered]
+            self._dofs = [(columns, f, _unrolled(f, dofs[cells])) for columns, f, dofs in self._gathered]
         self._packed = now
         for columns, f, dofs in self._dofs:
             rows[:, columns] = np.take(f.x.array, dofs, mode="wrap")  # "raise" checks every index
         return rows
+
+
+def _unrolled(f: fem.Function, dofs: NDArray[np.int32]) -> NDArray[np.intp]:
+    """Return unrolled (n, m) dofs, in numpy's own index type, which it would else convert to in every assembly."""
+    bs = f.function_space.dofmap.bs
+    return (dofs[:, :, None].astype(np.intp) * bs + np.arange(bs)).reshape(len(dofs), dofs.shape[1] * bs)
 
 
 class PointForm:
@@ -239,17 +245,21 @@ class PointForm:
         Linear or bilinear UFL form whose integrals are all over `points.dx`.
     points
         The points; their data and the nodal values of grid functions are read at each assembly.
+    dense
+        Tested by DG0, it has a value for each of `points.filled` rather than for each cell of the grid: as
+        `PointExpression`, it is called for other cells.
     """
 
-    def __init__(self, form: ufl.Form, points: FormPoints):
-        self.points = points
+    def __init__(self, form: ufl.Form, points: FormPoints, dense: bool = False):
+        self.points, self._dense = points, dense
         self.compiled = _compat.CompiledForm(form)
         self._rows, self._bound, self._version = Rows(self.compiled, points), [], -1
 
     def _parts(self):
         """Yield the form bound to CHUNK points after the other, with their rows."""
+        self.points.refresh()
         if self._version != self.points.version:
-            self._version, cells = self.points.version, self.points.cells
+            self._version, cells = self.points.version, self.points.slots if self._dense else self.points.cells
             parts = [slice(start, start + CHUNK) for start in range(0, len(cells), CHUNK)]
             self._bound = [(part, self.compiled.bind(cells[part])) for part in parts]
         for part, form in self._bound:
@@ -332,7 +342,7 @@ class PointExpression:
     def __init__(self, expression: ufl.core.expr.Expr, points: FormPoints):
         self.points, self._shape = points, expression.ufl_shape
         grid = points.grid
-        q = ufl.TestFunction(_compat.function_space(grid.mesh, "DG", 0, self._shape))
+        q = ufl.TestFunction(grid.cellwise(self._shape))
         dx = ufl.dx(domain=grid.mesh, subdomain_id=_compat.SUBDOMAIN, metadata={"quadrature_degree": 0})
         self._compiled = _compat.CompiledForm(ufl.inner(expression, q) / grid.cell_volume * dx)
         self._rows = Rows(self._compiled, points)
@@ -342,8 +352,10 @@ class PointExpression:
         self._values = np.empty((self._many, int(np.prod(self._shape, dtype=int))))
 
     def evaluate(self, chosen: NDArray[np.int64] | None = None) -> NDArray[np.float64]:
-        """Return the values (m, *shape) at the chosen points, by default at all, where they are now."""
-        chosen = np.arange(len(self.points.cells)) if chosen is None else chosen
+        """Return the values (m, *shape) at the chosen points, after a `refresh`, or else at all, where they are now."""
+        if chosen is None:
+            self.points.refresh()
+            chosen = np.arange(len(self.points.cells))
         out = np.empty((len(chosen), self._values.shape[1]))
         for start in range(0, len(chosen), max(1, self._many)):
             part = chosen[start : start + self._many]
@@ -367,14 +379,11 @@ class CellSums:
 
     def __init__(self, quantities: Sequence[ufl.core.expr.Expr], points: FormPoints):
         self.points, self._count = points, len(quantities)
-        space = _compat.function_space(points.grid.mesh, "DG", 0, (self._count,))
-        self._values, q = fem.Function(space), ufl.TestFunction(space)
-        self._form = PointForm(ufl.inner(ufl.as_vector(quantities), q) * points.dx, points)
+        q = ufl.TestFunction(points.grid.cellwise((self._count,)))
+        self._form = PointForm(ufl.inner(ufl.as_vector(quantities), q) * points.dx, points, dense=True)
 
     def __call__(self) -> NDArray[np.float64]:
         """Return the sums (cells, quantities) in the filled cells of the points."""
-        cells = self.points.filled
-        values = self._values.x.array.reshape(-1, self._count)
-        values[cells] = 0.0
-        self._form.assemble_vector(self._values.x.array)
-        return values[cells]
+        sums = np.zeros((len(self.points.filled), self._count))
+        self._form.assemble_vector(sums.reshape(-1))
+        return sums

@@ -12,6 +12,7 @@ from functools import reduce
 from mpi4py import MPI
 
 import numpy as np
+from dolfinx import fem
 from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx import _compat
@@ -68,6 +69,8 @@ class Grid:
             raise ValueError(f"grid: cells {cells} over {self.lower} to {self.upper}: need cells >= 1, upper > lower")
         self.h = (self.upper - self.lower) / self.shape
         self.comm = comm
+        self._spaces: dict[tuple[int, ...], fem.FunctionSpace] = {}
+        self._coefficients: dict[tuple[int, ...], fem.Function] = {}
 
     def __getattr__(self, name: str):
         """Make the mesh when first something of it is asked for."""
@@ -109,6 +112,19 @@ class Grid:
         start, stop = (count * (self.comm.rank + end) // self.comm.size for end in (0, 1))
         index = np.stack(np.unravel_index(np.arange(start, stop), self.shape + 1), axis=-1)
         return self.lower + index * self.h
+
+    def cellwise(self, shape: tuple[int, ...] = ()):
+        """Return the space of functions of a shape that are constant in the cells (DG0), made once."""
+        if shape not in self._spaces:
+            self._spaces[shape] = _compat.function_space(self.mesh, "DG", 0, shape)
+        return self._spaces[shape]
+
+    def coefficient(self, shape: tuple[int, ...] = ()) -> fem.Function:
+        """Return a new cellwise function that stands in forms for rows of values; all of a shape share its memory."""
+        first = self._coefficients.get(shape)
+        out = fem.Function(self.cellwise(shape), None if first is None else first.x)
+        self._coefficients.setdefault(shape, out)
+        return out
 
     @property
     def cell_volume(self) -> float:

@@ -117,11 +117,11 @@ class Momentum:
             self._residuals.append(ElementForces(P * points.F.T, points))
             self._tangents.append(StackedElementMatrices(A, points, self.symmetric))
 
-    def add(self, term: Callable, t: fem.Constant) -> None:
+    def add(self, term: Callable, t: fem.Constant, dt: fem.Constant) -> None:
         """Add a term of the user's: see `extend`."""
         V = self.u.function_space
         v, du = ufl.TestFunction(V), ufl.TrialFunction(V)
-        form = call(term, points=self.pieces, u=self.u, v=v, t=t)
+        form = call(term, points=self.pieces, u=self.u, v=v, t=t, dt=dt)
         potential = not form.arguments()
         if potential:
             form = ufl.derivative(form, self.u, v)
@@ -178,7 +178,7 @@ class Momentum:
 
         gamma M h/3 int [d_n u].[d_n v] dS, M = lambda + 2G, on the step's increment only.
         """
-        cellwise = _compat.function_space(self.grid.mesh, "DG", 0)
+        cellwise = self.grid.cellwise()
         self.modulus, self.fill = fem.Function(cellwise), fem.Function(cellwise)
         n = ufl.FacetNormal(self.grid.mesh)
         h = fem.Constant(self.grid.mesh, self.grid.h)

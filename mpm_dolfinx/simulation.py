@@ -12,7 +12,7 @@ from dolfinx import fem
 from dolfinx.common import Timer
 from numpy.typing import ArrayLike, NDArray
 
-from mpm_dolfinx import _compat, summary
+from mpm_dolfinx import summary
 from mpm_dolfinx.boundary import Boundary
 from mpm_dolfinx.conditions import Displacement, Drained, Inflow, RigidPlate, Traction
 from mpm_dolfinx.coupling import COUPLINGS, Coupler, NotConverged, Report
@@ -155,12 +155,12 @@ class Simulation:
             shapes |= {"position": (d,), "conductivity": (), "porosity0": ()}
         self.pieces = FormPoints(grid, **shapes)
         self.laws = scene.parts(self.pieces, ["F", "biot"] if fluid else ["F"])
-        p = fem.Function(_compat.function_space(grid.mesh, "DG", 0)) if fluid else None
+        p = fem.Function(grid.cellwise()) if fluid else None
         options = {"mean_dilatation": scene.nearly_incompressible, "symmetric": scene.symmetric}
         self.momentum = Momentum(grid, self.pieces, self.laws, fixed, p, self.gravity, **options)
-        self._time = fem.Constant(grid.mesh, 0.0)
+        self._time, self._dt = fem.Constant(grid.mesh, 0.0), fem.Constant(grid.mesh, 1.0)
         for term in terms:
-            self.momentum.add(term, self._time)
+            self.momentum.add(term, self._time, self._dt)
         self.storage = None
         if not self.momentum.symmetric and coupling == "schur-cg":
             coupling = "schur-fgmres"
@@ -292,7 +292,7 @@ class Simulation:
     def _begin(self, t: float) -> None:
         """Set up the step that ends at time t: grid, loads of that time, u = 0 and the cells' pressure."""
         collect_garbage(self.grid.mesh.comm)
-        self._time.value = t
+        self._time.value, self._dt.value = t, t - self.t
         if self.gravity is not None:
             self.gravity.value = np.asarray(self._gravity_at(t), dtype=float)
         fresh = not self._prepared

@@ -114,7 +114,7 @@ class Storage:
     def _fluxes(self, Q, q, dp, weight) -> None:
         """Two-point fluxes over the inner faces of the active cells."""
         mesh, d = self.grid.mesh, self.grid.dim
-        vector = _compat.function_space(mesh, "DG", 0, (d,))
+        vector = self.grid.cellwise((d,))
         self.mobility = fem.Function(Q)
         self.centroid, self.lower_face, self.upper_face = (fem.Function(vector) for _ in range(3))
         n, h = ufl.FacetNormal(mesh), fem.Constant(mesh, self.grid.h)

@@ -27,6 +27,7 @@ QUICK = {
         "--quick --families conductivity contrast-of-stiffness filling overload",
         ["extreme_cases.png", "cases.csv", "cases.md", "summary.md"],
     ),
+    "slump": ("--cells 6 --steps 10", ["slump.png", "failure.png", "slump.gif"]),
     "benchmark_beam": ("--h 0.05 --t-end 0.1 --repeat 1", []),
 }
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The pressure's remap changes nothing at rest and loses nothing in motion."""
+"""The pressure's remap changes nothing at rest, loses nothing in motion, and is exact for what is linear."""
 
 import numpy as np
 import pytest
@@ -7,14 +7,32 @@ from helpers import beam
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.domains import cut
-from mpm_dolfinx.remap import remap
+from mpm_dolfinx.remap import Carried, Reconstruction, remap
+
+MOVES = [0.01, 0.3, 2.6]
 
 
-def test_a_thousand_resets_of_a_body_at_rest_change_nothing():
-    s, _ = beam(offset=0.3)
+def random_beam():
+    """Return a beam at the start of a step, with random pressures of its cells and soft water."""
+    s, _ = beam(offset=0.3, fluid=mpm.Fluid(bulk=1e6))
     s._begin(0.0)
     pressure = np.random.default_rng(0).normal(size=s.grid.num_local) * 1e5
     s.storage.p.x.array[:] = pressure
+    return s, pressure
+
+
+def moving_body(move, pressure, slope, bounds):
+    """Return what pieces of a rigid body carry, how they lie after a move (in cells), and the move (m)."""
+    grid = mpm.Grid([2.0, 2.0], [20, 20])
+    points = mpm.points.material_points(grid, [mpm.box(grid, [0.33, 0.41], [1.2, 1.0])])
+    old, way = cut(grid, points.corners), move * grid.h * [0.8, 1.0]
+    p, s = pressure(old.x), slope(old.x)
+    carried = Carried(points.id[old.point], old.cell, old.fraction, p, old.x + way, s, bounds(p))
+    return carried, points, cut(grid, points.corners + way), way
+
+
+def test_a_thousand_resets_of_a_body_at_rest_change_nothing():
+    s, pressure = random_beam()
     cells = s.storage.unknowns.owned
     for _ in range(1000):
         s._move_points()
@@ -23,15 +41,94 @@ def test_a_thousand_resets_of_a_body_at_rest_change_nothing():
     assert np.abs(s.storage.p.x.array[cells] - pressure[cells]).max() < 1e-12 * np.abs(pressure).max()
 
 
-@pytest.mark.parametrize("move", [0.01, 0.3, 2.6])
-def test_a_moving_body_keeps_the_mean_and_the_bounds(move):
-    grid = mpm.Grid([2.0, 2.0], [20, 20])
-    points = mpm.points.material_points(grid, [mpm.box(grid, [0.33, 0.41], [1.2, 1.0])])
-    old = cut(grid, points.corners)
-    pressure = np.random.default_rng(1).normal(size=400)[old.cell]
-    moved = points.corners + move * grid.h * [0.8, 1.0]
-    new = cut(grid, moved)
-    after = remap(carry(points, old, pressure), points, new)
-    assert after.min() >= pressure.min() - 1e-12 and after.max() <= pressure.max() + 1e-12
-    total = np.bincount(old.point, old.fraction * pressure)
+@pytest.mark.parametrize("way", [0.0, 0.4, 1.7])
+def test_the_fluid_stored_in_all_cells_is_kept_without_new_extremes(way):
+    """`way` in cells; the storage coefficient differs from point to point with the porosity."""
+    s, pressure = random_beam()
+    s.points.F *= (1 + 0.1 * np.sin(s.points.x[:, :1] * 9))[:, :, None]
+    s._prepared = False
+    s._begin(0.0)
+    s.storage.p.x.array[:] = pressure
+    before, (low, high) = stored(s), extremes(s)
+    s.momentum.u.x.array[:] = np.tile(way * s.grid.h, len(s.grid.node_x))
+    s._move_points()
+    s._reset_grid()
+    s.storage.start(1.0)
+    assert stored(s) == pytest.approx(before, rel=1e-12)
+    assert extremes(s)[0] >= low - 1e-6 and extremes(s)[1] <= high + 1e-6
+
+
+def stored(s):
+    """Return sum w S |p| with the sign of p: the volume of fluid that the pressure stores."""
+    pieces = s.pieces
+    p = s.storage.p.x.array[pieces.cells]
+    return (pieces.data["weight"][:, 0] * pieces.data["storage"][:, 0]) @ p * s.grid.cell_volume
+
+
+def extremes(s):
+    p = s.storage.p.x.array[s.storage.unknowns.owned]
+    return p.min(), p.max()
+
+
+@pytest.mark.parametrize("move", MOVES)
+def test_a_moving_body_keeps_the_mean_of_each_point_and_the_bounds(move):
+    random = np.random.default_rng(1).normal
+    old, points, new, _ = moving_body(
+        move,
+        pressure=lambda x: random(size=len(x)),
+        slope=lambda x: 100 * random(size=x.shape),
+        bounds=lambda p: np.stack([p - 0.1, p + 0.1], axis=1),
+    )
+    after = remap(old, points, new)
+    assert after.min() >= old.bounds.min() - 1e-12 and after.max() <= old.bounds.max() + 1e-12
+    total = np.bincount(old.id, old.fraction * old.pressure)
     assert np.bincount(new.point, new.fraction * after) == pytest.approx(total, abs=1e-12)
+
+
+@pytest.mark.parametrize("move", MOVES)
+def test_a_linear_pressure_moves_with_the_body(move):
+    slope = np.array([3.0, -2.0])
+    old, points, new, way = moving_body(
+        move,
+        pressure=lambda x: x @ slope,
+        slope=lambda x: np.tile(slope, (len(x), 1)),
+        bounds=lambda p: np.tile([-9.0, 9.0], (len(p), 1)),
+    )
+    assert remap(old, points, new) == pytest.approx((new.x - way) @ slope, abs=1e-12)
+
+
+def reconstruct(p, filled=None):
+    """Return (midpoints, slopes, bounds) of cells with values p(x), all full, or those where `filled(x)`."""
+    grid = mpm.Grid([1.0, 0.5], [10, 5])
+    faces = np.ones((grid.num_local, 2, 2))
+    if filled is not None:
+        faces[~filled(grid.midpoints)] = 0.0
+    nowhere, cells = np.zeros((grid.num_local, 2)), np.arange(grid.num_owned)
+    slope, bounds = Reconstruction(grid)(cells, p(grid.midpoints), nowhere, faces, nowhere)
+    return grid.midpoints, slope, bounds
+
+
+def test_slopes_of_a_linear_field_are_exact_but_at_the_surface():
+    x, slope, _ = reconstruct(lambda x: 3 * x[:, 0] - 2 * x[:, 1])
+    inner = np.abs(x - [0.5, 0.25]) < [0.39, 0.19]
+    for axis, exact in enumerate((3.0, -2.0)):
+        assert slope[inner[:, axis], axis] == pytest.approx(exact, rel=1e-12)
+        assert (slope[~inner[:, axis], axis] == 0).all()
+
+
+def test_there_is_no_slope_across_a_closed_face_nor_in_a_body_one_cell_thick():
+    _, slope, bounds = reconstruct(lambda x: x[:, 0] + 100 * x[:, 1], filled=lambda x: np.abs(x[:, 1] - 0.25) < 0.01)
+    assert (slope[:, 1] == 0).all() and slope[:, 0].max() > 0.9
+    assert np.ptp(bounds, axis=1).max() < 0.21
+
+
+def test_a_reconstruction_passes_neither_a_neighbour_nor_an_extreme():
+    random = np.random.default_rng(2)
+    values = random.normal(size=50)
+    _, slope, bounds = reconstruct(lambda x: values)
+    for corner in ([-1, -1], [-1, 1], [1, -1], [1, 1]):
+        at = values + slope @ (0.05 * np.array(corner))
+        assert (at >= bounds[:, 0] - 1e-12).all() and (at <= bounds[:, 1] + 1e-12).all()
+    assert bounds.min() == values.min() and bounds.max() == values.max()
+    highest, lowest = np.argmax(values), np.argmin(values)
+    assert (slope[[highest, lowest]] == 0).all()

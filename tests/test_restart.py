@@ -41,9 +41,15 @@ def pressed_column():
 
 
 def plastic_column():
-    options = {"friction": 30.0, "dilation": 10.0, "cohesion": 1e4, "conductivity": lambda X: 1e-4 * (1 + X[:, 1])}
+    options = {
+        "friction": 30.0,
+        "dilation": 10.0,
+        "cohesion": 1e4,
+        "porosity": 0.9,
+        "conductivity": lambda X: 1e-4 * (1 + X[:, 1]),
+    }
     sand = mpm.DruckerPrager(bulk=2e7, shear=1e7, hardening=5e6, **options)
-    push = mpm.Displacement("top", lambda t, X: (0, -2 * t), "y")
+    push = mpm.Displacement("top", lambda t, X: (0, -1.5 * t), "y")
     simulation = column(width=3, cells=6, material=sand, displacements=[push], drained=[mpm.Drained("top")])
     return simulation, None
 
@@ -240,7 +246,7 @@ def test_a_foreign_file_is_refused(checkpoint, tmp_path):
 
 def test_a_checkpoint_of_another_version_is_refused(checkpoint, monkeypatch):
     monkeypatch.setattr(restart, "VERSION", restart.VERSION + 1)
-    refused(checkpoint, "checkpoint of version 1, this mpm_dolfinx reads 2")
+    refused(checkpoint, "checkpoint of version 2, this mpm_dolfinx reads 3")
 
 
 OTHER_SCENES = {

@@ -1,0 +1,371 @@
+# SPDX-License-Identifier: MIT
+"""A submarine bank loses its strength and slumps: large plastic deformation with pore pressures.
+
+A bank of saturated soil, 10 m high and as long on a rough floor (half of it, x = 0 is a plane of symmetry), stands
+with a vertical side under water.  Pressures are those in excess of the water outside and the weight is the
+buoyant one, gamma' = (1 - n) (rho_s - rho_w) g, given as a term in UFL.  The inertia is left out.
+
+1. How weak may it be?  Without friction and sealed, the strength c is lowered by 1 % a step.  A vertical side of
+   height H stands while gamma H / c < 3.78 (limit analysis has it between 3.76 and 3.79: Pastor, Thai and
+   Francescato 2000; the best circle gives 3.83: Fellenius 1927).  The bank has failed where its crest settles
+   20 times as much in a step as it did when strong.
+2. What comes then?  With friction the bank, consolidated, loses its cohesion within T = 10 minutes, far less than
+   water needs to leave; it slumps, undrained, runs out to 1.9 heights and comes to rest.  Then the excess pressure
+   drains.
+
+The cohesion is a function of place, so the points carry it (`points.data["cohesion"]`) and an observer lowers it
+between two steps.  A step that does not converge is cut and tried again with the same strength; that helps
+because a viscous stress 2 eta D, a term in UFL like the weight, lets the bank move only so far in so much time.
+eta / T is a hundredth of gamma' H; part 1 does without.  No mesh would follow: what was the bank's side comes to lie
+on the floor.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import poroelastic_beam as beam
+import ufl
+
+import mpm_dolfinx as mpm
+
+HEIGHT = 10.0  # m; also the length of half the bank
+POROSITY, DENSITY = 0.4, 2650 - 1000  # -, kg/m³: of the grains in water
+WEIGHT = (1 - POROSITY) * DENSITY * 9.81  # N/m³
+SCALE = WEIGHT * HEIGHT  # Pa
+SHEAR = 30 * SCALE
+FRICTION, CONDUCTIVITY = 25.0, 1e-9  # degrees, m/s
+STRONG, WEAK = 0.3 * SCALE, 0.01 * SCALE  # cohesion before and after, Pa
+DURATION = 600.0  # s, in which it is lost
+VISCOSITY = 0.01 * SCALE * DURATION  # Pa s
+THEORY, RUNAWAY = 3.78, 20
+CV = CONDUCTIVITY / mpm.Fluid().unit_weight * (2 + 4 / 3) * SHEAR  # m²/s
+
+
+def weight(points, v):
+    """Buoyant weight, downwards; the grains of a volume are more in a body that has shrunk."""
+    return WEIGHT / ufl.det(points.F) * points.value(v)[1] * points.dx
+
+
+def viscous(points, u, dt):
+    """Potential of the stress 2 eta D of the rate of strain D = sym grad u / dt."""
+    strain = ufl.sym(points.grad(u))
+    return VISCOSITY / dt * ufl.inner(strain, strain) * points.dx
+
+
+def bank(cells: int, length: float, room: float, friction: float, cohesion: float, conductivity: float, **scene):
+    """Return the consolidated bank with so many cells over its height, `room` m before it, and a probe on its crest."""
+    h = HEIGHT / cells
+    grid = mpm.Grid([length + room, HEIGHT + h], [round((length + room) / h), cells + 1])
+    body = mpm.box(grid, [0, 0], [length, HEIGHT])
+    soil = mpm.DruckerPrager(
+        bulk=2 * SHEAR,
+        shear=SHEAR,
+        friction=friction,
+        dilation=0.0,
+        cohesion=lambda X: np.full(len(X), cohesion),
+        porosity=POROSITY,
+        conductivity=conductivity,
+    )
+    walls = {"left": "x", "bottom": "xy"}
+    simulation = mpm.Simulation(grid, [body], [soil], fluid=mpm.Fluid(), fixed=walls, **scene)
+    simulation.run(1e12, 1e12, progress=False)  # time enough for the water to leave, where it can
+    simulation.stage(reset_displacement=True)
+    simulation.t = 0.0
+    return simulation, mpm.probes([body], [[length, HEIGHT]])
+
+
+# ---- 1. the strength at which it fails ------------------------------------------------------------
+
+
+@dataclass
+class Failure:
+    """Stability numbers gamma H / c (n,), the crest's settlement in each step over that in the first five (n,).
+
+    critical: the number at which the bank fails.
+    """
+
+    cells: int
+    number: np.ndarray
+    rate: np.ndarray
+    critical: float
+
+
+def fail(cells: int, start: float = 3.0, ratio: float = 0.99) -> Failure:
+    """Lower the strength of an undrained bank without friction until its crest runs away."""
+    s, crest = bank(cells, 2 * HEIGHT, HEIGHT / 2, 0.0, SCALE / start, 0.0, terms=[weight])
+    number, settlement, rate = [start], [0.0], np.zeros(0)
+    while len(rate) < 10 or rate[-1] < 2 * RUNAWAY:
+        s.points.data["cohesion"] *= ratio
+        s.run(s.t + 1, 1, progress=False)
+        number.append(number[-1] / ratio)
+        settlement.append(-crest.displacement(s.points, s.grid.comm)[0, 1])
+        rate = np.diff(settlement) / np.mean(np.diff(settlement[:6]))
+    middle = np.sqrt(np.multiply(number[1:], number[:-1]))
+    k = int(np.argmax(rate > RUNAWAY))
+    at = np.interp(np.log(RUNAWAY), np.log(rate[k - 1 : k + 1]), middle[k - 1 : k + 1])
+    return Failure(cells, middle, rate, float(at))
+
+
+# ---- 2. the slump ---------------------------------------------------------------------------------
+
+
+@dataclass
+class Frame:
+    """The bank at a time, s.
+
+    corners of the domains, m; surface (m, 2) from the crown to the toe, m; excess pore pressure, Pa; plastic strain;
+    volume, m²; cohesion, Pa.
+    """
+
+    t: float
+    corners: np.ndarray
+    surface: np.ndarray
+    pressure: np.ndarray
+    strain: np.ndarray
+    volume: float
+    cohesion: float
+
+    @property
+    def run_out(self) -> float:
+        """How far the bank reaches, m."""
+        return float(self.corners[:, :, 0].max())
+
+    @property
+    def slope(self) -> float:
+        """Slope from the crown to the toe, degrees."""
+        return float(np.degrees(np.arctan2(self.surface[:, 1].max(), self.run_out)))
+
+    def steepest(self, length: float) -> float:
+        """Return the steepest slope of the surface over a horizontal length, m, degrees."""
+        x, y = self.surface[: np.argmax(self.surface[:, 0]) + 1].T
+        at = np.linspace(0, self.run_out - length, 200)
+        fall = np.interp(at, x, y) - np.interp(at + length, x, y)
+        return float(np.degrees(np.arctan(fall.max() / length)))
+
+
+@dataclass
+class Slump:
+    """What a run gives; `rest` and `drained` are the indices of the frames at which the two stages end."""
+
+    frames: list[Frame] = field(default_factory=list)
+    rest: int = 0
+    drained: int = 0
+    balance: float = 0.0
+    steps: int = 0
+    cuts: int = 0
+    wall: float = 0.0
+
+
+def slump(cells: int, steps: int) -> Slump:
+    """Let the bank lose its cohesion in so many steps, come to rest, and drain."""
+    sides = [mpm.Drained("top"), mpm.Drained("right")]
+    s, _ = bank(cells, HEIGHT, 1.5 * HEIGHT, FRICTION, STRONG, CONDUCTIVITY, terms=[weight, viscous], drained=sides)
+    out = Slump()
+
+    def look(s: mpm.Simulation) -> None:
+        p, body = s.points, s.bodies[0]
+        top, front = p.corners[body.sides[:, 1, 1]][:, [2, 3]], p.corners[body.sides[:, 0, 1]][::-1, [3, 1]]
+        line = np.concatenate([top, front]).reshape(-1, 2)
+        fields = p.corners.copy(), line, p.pressure.copy(), p.data["hardened"].copy()
+        out.frames.append(Frame(s.t, *fields, float(p.J @ p.volume0), float(p.data["cohesion"][0])))
+
+    def weaken(s: mpm.Simulation) -> None:
+        """Give the next step the strength of its end."""
+        lost = min(1.0, (s.t + dt) / DURATION)
+        s.points.data["cohesion"][:] = STRONG + lost * (WEAK - STRONG)
+
+    def go(t_end: float, dt: float, *observers: Callable) -> int:
+        result = s.run(t_end, dt, observe=observers)
+        out.balance = max(out.balance, result.balance)
+        out.steps, out.cuts, out.wall = out.steps + result.steps, out.cuts + result.cuts, out.wall + result.wall
+        return len(out.frames) - 1
+
+    look(s)
+    dt = DURATION / steps
+    weaken(s)
+    go(DURATION, dt, look, weaken)
+    go(2 * DURATION, dt, look)
+    out.rest = go(20 * DURATION, 10 * dt, look)
+    out.drained = go(s.t + 2 * HEIGHT**2 / CV, HEIGHT**2 / CV / 20, look)
+    return out
+
+
+# ---- what comes of it -----------------------------------------------------------------------------
+
+
+def errors(failures: list[Failure], run: Slump) -> dict[str, float]:
+    """Return how far the results are from what they should be, relative; slopes in degrees."""
+    coarse, fine = (f.critical for f in failures)
+    start, rest, end = run.frames[0], run.frames[run.rest], run.frames[run.drained]
+    return {
+        "critical_coarse": coarse / THEORY - 1,
+        "critical": fine / THEORY - 1,
+        "critical_extrapolated": (2 * fine - coarse) / THEORY - 1,
+        "volume": rest.volume / start.volume - 1,
+        "fluid_balance": run.balance,
+        "slope_above_friction": rest.slope - FRICTION,
+        "steepest_above_friction": rest.steepest(HEIGHT / 3) - FRICTION,
+        "creep_at_rest": rest.run_out / run.frames[run.rest - 1].run_out - 1,
+        "pressure_left": float(np.abs(end.pressure).max() / np.abs(rest.pressure).max()),
+    }
+
+
+def main(argv: list[str] | None = None) -> dict:
+    """Run the demo; return what --json prints."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--cells", type=int, default=20, help="cells over the height (20)")
+    parser.add_argument("--steps", type=int, default=100, help="steps in which the cohesion is lost (100)")
+    parser.add_argument("--out", type=Path, default=Path("out/slump"), help="folder for the pictures (out/slump)")
+    parser.add_argument("--json", action="store_true", help="print the results as one line of JSON at the end")
+    o = parser.parse_args(argv)
+    if o.cells < 4 or o.cells % 2 or o.steps < 10:
+        parser.error(f"--cells {o.cells} --steps {o.steps}: must be even and >= 4, and >= 10")
+    try:
+        failures = [fail(cells) for cells in (o.cells // 2, o.cells)]
+        for f in failures:
+            print(f"{f.cells:>3} cells: fails at gamma' H / c = {f.critical:.3f} ({f.critical / THEORY - 1:+.1%})")
+        run = slump(o.cells, o.steps)
+        out = {"errors": errors(failures, run), "wall_s": run.wall, "converged": True}
+        report(run, out["errors"])
+        o.out.mkdir(parents=True, exist_ok=True)
+        draw(o.out / "slump.png", run)
+        draw_failure(o.out / "failure.png", failures)
+        animate(o.out / "slump.gif", run)
+        print(f"{run.steps} steps, {run.cuts} cuts, {run.wall:.1f} s; pictures: {o.out}/")
+    except mpm.GaveUp as error:
+        print(f"error: {error}", file=sys.stderr)
+        out = {"errors": {}, "wall_s": error.result.wall, "converged": False}
+    if o.json:
+        print(json.dumps(out))
+    return out
+
+
+def report(run: Slump, found: dict[str, float]) -> None:
+    """Print the stages of the slump and what the errors say."""
+    print(f"{'':>10} {'t (s)':>8} {'run-out (m)':>11} {'height (m)':>10} {'slope':>6} {'p (kPa)':>14}")
+    for name, k in stages(run).items():
+        f = run.frames[k]
+        p = f"{f.pressure.min() / 1e3:.2f} to {f.pressure.max() / 1e3:.2f}"
+        height = f.surface[:, 1].max()
+        print(f"{name:>10} {f.t:8.3g} {f.run_out:11.2f} {height:10.2f} {f.slope:5.1f}° {p:>14}")
+    print(f"critical strength, extrapolated to h = 0: {found['critical_extrapolated']:+.1%} of gamma' H / c")
+    print(f"volume until at rest: {found['volume']:+.1e}; fluid balance {found['fluid_balance']:.1e}")
+    steepest = run.frames[run.rest].steepest(HEIGHT / 3)
+    print(f"steepest slope at rest over {HEIGHT / 3:.1f} m: {steepest:.1f}°, friction {FRICTION:g}°")
+    print(f"run-out at rest: grows by {found['creep_at_rest']:.1e} in the last step")
+
+
+def stages(run: Slump) -> dict[str, int]:
+    """Return names and frames of the stages that are shown."""
+    lost = np.array([f.cohesion for f in run.frames])
+    weak = int(np.argmax(lost <= 1.001 * WEAK))
+    return {"failing": int(0.6 * weak), "slumping": int(0.9 * weak), "at rest": run.rest, "drained": run.drained}
+
+
+class Panel:
+    """A frame on axes: values on the domains, and the surface."""
+
+    def __init__(self, ax, frame: Frame, values: np.ndarray, **style):
+        from matplotlib.collections import PolyCollection
+
+        self.domains = PolyCollection([], edgecolors="face", linewidth=0.2, **style)
+        ax.add_collection(self.domains)
+        (self.line,) = ax.plot([], [], color="black", lw=0.6)
+        ax.plot([0, HEIGHT, HEIGHT], [HEIGHT, HEIGHT, 0], color="grey", lw=0.8, ls=":")
+        ax.set(aspect="equal", xlim=(0, 2.3 * HEIGHT), ylim=(0, 1.08 * HEIGHT))
+        self.show(frame, values)
+
+    def show(self, frame: Frame, values: np.ndarray) -> None:
+        """Show another frame."""
+        self.domains.set(verts=frame.corners[:, [0, 1, 3, 2]], array=values)
+        self.line.set_data(*frame.surface.T)
+
+
+def shown(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
+    """Return the values that are drawn: pressure, kPa, and plastic strain."""
+    return frame.pressure / 1e3, np.maximum(frame.strain, 1e-3)
+
+
+def panels(axes, run: Slump, frame: Frame) -> list[Panel]:
+    """Draw pressure and plastic strain of a frame on two axes."""
+    from matplotlib.colors import LogNorm
+
+    limit = np.quantile(np.abs(run.frames[run.rest].pressure), 0.98) / 1e3
+    styles = {"cmap": "RdBu_r", "clim": (-limit, limit)}, {"cmap": "viridis", "norm": LogNorm(0.01, 10)}
+    return [Panel(ax, frame, values, **style) for ax, values, style in zip(axes, shown(frame), styles, strict=True)]
+
+
+def draw(path: Path, run: Slump) -> None:
+    """Draw pressures and plastic strain at several stages."""
+    chosen = stages(run)
+    fig, axes = beam.figure(len(chosen), 2, (10, 2.55 * len(chosen)))
+    for row, (name, k) in zip(axes, chosen.items(), strict=True):
+        frame = run.frames[k]
+        left, right = panels(row, run, frame)
+        row[0].set(title=f"{name}, t = {time(frame.t)}", ylabel="y (m)")
+        row[1].set(title=rf"$\gamma' H / c$ = {SCALE / frame.cohesion:.3g}, slope {frame.slope:.0f}°")
+    for ax in axes[-1]:
+        ax.set(xlabel="x (m)")
+    bars = {"location": "bottom", "shrink": 0.8, "aspect": 40, "pad": 0.02}
+    fig.colorbar(left.domains, ax=axes[:, 0], label="excess pore pressure (kPa)", extend="both", **bars)
+    fig.colorbar(right.domains, ax=axes[:, 1], label="accumulated plastic strain (-)", extend="both", **bars)
+    fig.savefig(path, dpi=90)
+
+
+def time(seconds: float) -> str:
+    """Return a time in a fitting unit."""
+    units = {"years": 365.25 * 86400, "days": 86400, "h": 3600, "min": 60}
+    name = next((name for name, unit in units.items() if seconds >= unit), "min")
+    return f"{seconds / units[name]:.3g} {name}"
+
+
+def draw_failure(path: Path, failures: list[Failure]) -> None:
+    """Draw how fast the crest settles over the stability number."""
+    fig, ((ax,),) = beam.figure(1, 1, (6.5, 4))
+    for f in failures:
+        (line,) = ax.semilogy(f.number, f.rate, ".-", label=f"{f.cells} cells over the height")
+        ax.plot(f.critical, RUNAWAY, "o", mfc="none", ms=9, color=line.get_color(), label=f"fails at {f.critical:.2f}")
+    ax.axvline(THEORY, color="black", lw=1, ls="--", label=f"limit analysis: {THEORY}")
+    ax.set(xlabel=r"$\gamma' H / c$ (-)", ylabel="settlement in a step / that at the start (-)")
+    ax.set_title("The strength is lowered by 1 % a step, undrained, without friction", fontsize=11)
+    ax.grid(alpha=0.3)
+    ax.legend()
+    fig.savefig(path, dpi=110)
+
+
+def animate(path: Path, run: Slump) -> None:
+    """Draw the slump as an animation, whose clock goes faster from part to part."""
+    from matplotlib.animation import FuncAnimation, PillowWriter
+
+    weak = int(np.argmax([f.cohesion <= 1.001 * WEAK for f in run.frames]))
+    ends = (weak // 2, weak, 3 * weak // 2, run.rest, run.drained)
+    parts = [np.linspace(a, b, n, dtype=int) for a, b, n in zip(ends, ends[1:], (20, 10, 12, 6), strict=False)]
+    fig, axes = beam.figure(2, 1, (6, 6))
+    axes = axes[:, 0]
+    both = panels(axes, run, run.frames[0])
+    for ax, panel, label in zip(axes, both, ("excess pore pressure (kPa)", "plastic strain (-)"), strict=True):
+        fig.colorbar(panel.domains, ax=ax, label=label, shrink=0.8, extend="both")
+        ax.set(ylabel="y (m)")
+    title = axes[0].set_title(" ")
+    axes[1].set(xlabel="x (m)")
+    fig.canvas.draw()
+    fig.set_layout_engine("none")  # laid out once
+
+    def show(k: int) -> None:
+        frame = run.frames[k]
+        for panel, values in zip(both, shown(frame), strict=True):
+            panel.show(frame, values)
+        title.set_text(rf"$t$ = {time(frame.t)}, $\gamma' H / c$ = {SCALE / frame.cohesion:.3g}")
+
+    FuncAnimation(fig, show, frames=np.unique(np.concatenate(parts))).save(path, PillowWriter(fps=6), dpi=70)
+
+
+if __name__ == "__main__":
+    sys.exit(0 if main()["converged"] else 1)
