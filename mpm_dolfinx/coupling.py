@@ -11,7 +11,8 @@ with the fixed-stress operator C + beta V (beta = 0.75 alpha^2 / K_dr), filtered
 that alternate from cell to cell (`Storage.assemble_preconditioner`).  These are the paper's two separate
 solvers, accelerated.  `schur-fgmres` does the same with the full, slightly unsymmetric Jacobian.
 `fixed-stress` is the paper's Richardson iteration: a storage solve with C + beta V at frozen stress,
-then a momentum solve, in turn.
+then a momentum solve, in turn.  Large bodies in 3D, of which factors of K cost too much, are solved by
+iterations: `schur-...` then solve both problems at once, see `block`.
 """
 
 from __future__ import annotations

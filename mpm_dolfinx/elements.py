@@ -123,6 +123,11 @@ class StackedElementMatrices:
     n points of a cell, its matrix is one product of an 8 x 3n with a 3n x 72 matrix.  Cells are taken in
     batches of about as many points.
 
+    Hencky's law with 20 points a cell takes 4.2 us a point and 86 us a cell: 2.3 the kernel, 1.4 the products, 0.4
+    the insertion.  Inserting 24 x 24 entries a point took 13.8 us, 300 sums a cell as in `ElementMatrices` take 4.8
+    and twice the time to compile (13 s against 7 s; the former 15 s).  With the points of each octant of a cell
+    merged, 8 in a cell, Newton's method on a bending beam no longer converges.
+
     Parameters
     ----------
     tangent : UFL tensor (d, d, d, d)

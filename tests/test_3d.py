@@ -3,6 +3,8 @@
 
 import resource
 
+import cantilever_3d
+import cryer
 import numpy as np
 import poroelastic_beam as demo
 import pytest
@@ -166,3 +168,20 @@ def test_a_normal_traction_on_a_closed_surface_has_no_resultant_and_squeezes_eve
     s.run(1.0, 1.0, progress=False)
     assert s.points.J == pytest.approx(np.full(len(s.points), 1 - 1e-3), abs=2e-4)
     assert np.mean(s.points.J * s.points.volume0) / s.points.volume0.mean() == pytest.approx(1 - 1e-3, abs=5e-6)
+
+
+def test_cryers_sphere_comes_near_the_exact_pressure_and_nearer_with_smaller_cells():
+    peaks = [cryer.run(cells, 24)[0]["peak"] for cells in (4, 8)]
+    assert peaks[1] < 0.05 and peaks[1] < 0.6 * peaks[0]
+
+
+@pytest.mark.slow
+def test_cryers_sphere_peaks_within_two_percent():
+    errors, outcome = cryer.run()
+    assert errors["peak"] < 0.02 and outcome.result.balance <= 1e-8
+
+
+@pytest.mark.slow
+def test_the_number_of_steps_does_not_move_a_cantilever():
+    tips = np.array([cantilever_3d.run(4, steps, 1.0)[0] for steps in (10, 40, 160)])
+    assert np.abs(tips - tips[-1]).max() < 1e-3 * np.linalg.norm(tips[-1])

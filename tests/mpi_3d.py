@@ -1,0 +1,33 @@
+# SPDX-License-Identifier: MIT
+"""Run a saturated block in 3D, solved by iterations, on however many processes there are; write its state."""
+
+import sys
+
+import numpy as np
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx import unknowns
+
+unknowns.ITERATIVE = 0
+grid = mpm.Grid([1.2] * 3, [6] * 3)
+block = mpm.box(grid, [0.2, 0.2, 0], [0.9, 0.93, 0.77])
+soil = mpm.Hencky(bulk=4e6 / 3, shear=1e6, conductivity=1e-7)
+simulation = mpm.Simulation(
+    grid,
+    [block],
+    [soil],
+    fluid=mpm.Fluid(),
+    fixed={"bottom": "xyz"},
+    drained=[mpm.Drained("top")],
+    tractions=[mpm.Traction("top", lambda t: (2e4 * t, 1e4 * t, -5e4 * t))],
+    tolerance=1e-11,
+)
+result = simulation.run(1.0, 0.25, progress=False)
+points = simulation.points
+parts = simulation.grid.comm.gather((points.id, points.x, points.pressure))
+if parts:
+    ids, x, p = (np.concatenate(a) for a in zip(*parts, strict=True))
+    order = np.argsort(ids)
+    counts = [len(part[0]) for part in parts]
+    np.savez(sys.argv[1], x=x[order], p=p[order], balance=result.balance, counts=counts)
+    print(result.newton, result.coupling, result.cuts)
