@@ -75,6 +75,10 @@ class SchurComplement:
         self.f = storage.B.createVecRight()
         self.v = storage.B.createVecRight()
 
+    def free(self) -> None:
+        """Let the problems and the solver go: the matrix refers to this object, which refers to them."""
+        self.storage = self.solve = None
+
     def mult(self, A: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         s = self.storage
         s.B_momentum.multTranspose(x, self.f)
@@ -127,9 +131,8 @@ class Coupler:
         m = self.momentum
         if self._block is not None:
             self._block.free()
-        for solver in (self._solve_s, self._schur, self._solve_u):
-            if solver is not None:
-                solver.destroy()  # PETSc's and Python's objects refer to each other
+        if self._schur is not None:
+            self._schur.getPythonContext().free()
         self._tangent_of = self._solve_s = self._schur = self._block = None
         if self._iterative:
             self._solve_u, self._modes = multigrid_solver(m.K, "momentum"), m.unknowns.rigid_body_modes()
