@@ -55,10 +55,16 @@ def kuhn_simplices(dim: int) -> NDArray[np.int64]:
 
 def volumes(corners: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the volumes (n,), m^d, of domains (n, 2^d, d), negative if they are turned inside out."""
-    dim = corners.shape[2]
-    simplices = corners[:, kuhn_simplices(dim)]
-    spanned = np.linalg.det(simplices[:, :, 1:] - simplices[:, :, :1]) * _ORIENTATION[dim]
-    return spanned.mean(axis=1)
+    return sum(_simplex_volumes(np.ascontiguousarray(corners.transpose(1, 2, 0))))
+
+
+def _simplex_volumes(y: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    """Return the signed volumes (n,) of each simplex of domains (2^d, d, n)."""
+    d, out = y.shape[1], []
+    for simplex, sign in zip(kuhn_simplices(d), _ORIENTATION[d], strict=True):
+        height = y[simplex[-1]] - y[simplex[0]]
+        out.append((_area_vectors(y[simplex[:-1]]) * height).sum(axis=0) * (sign * (-1) ** (d + 1) / d))
+    return out
 
 
 def tangled(corners: NDArray[np.float64], volume: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -107,7 +113,7 @@ def _cut(grid: Grid, corners: NDArray[np.float64]) -> Pieces:
     s = np.concatenate([y[facet] for facet in _FACETS[d][:, [0, -1]].reshape(-1, d)], axis=2)
     outward, owner = _area_vectors(s), np.tile(np.arange(len(corners)), 2 * len(_FACETS[d]))
     # a simplex that is turned inside out, in a domain about to fold, counts as positive: minus twice its volume
-    simplex, folded = _turned(y)
+    simplex, folded = np.nonzero(np.less(_simplex_volumes(y), 0))
     if len(folded):
         turned = y[_FACETS[d][simplex], :, folded[:, None, None]].transpose(2, 3, 0, 1).reshape(d, d, -1)
         s = np.concatenate([s, turned, turned], axis=2)
@@ -119,15 +125,6 @@ def _cut(grid: Grid, corners: NDArray[np.float64]) -> Pieces:
     area = _area_vectors(s)
     area *= np.sign((area * outward[:, facet]).sum(axis=0))  # slicing has shuffled the vertices
     return _sum(grid, _Slots(grid, y), s, area, owner[facet])
-
-
-def _turned(y: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return which simplices of which domains (2^d, d, n) are turned inside out."""
-    d, out = y.shape[1], []
-    for simplex, sign in zip(kuhn_simplices(d), _ORIENTATION[d], strict=True):
-        height = y[simplex[-1]] - y[simplex[0]]
-        out.append((_area_vectors(y[simplex[:-1]]) * height).sum(axis=0) * sign * (-1) ** (d + 1) < 0)
-    return np.nonzero(out)
 
 
 def _area_vectors(s: NDArray[np.float64]) -> NDArray[np.float64]:

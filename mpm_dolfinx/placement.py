@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.domains import Pieces, cut, cut_faces
 from mpm_dolfinx.exchange import Exchange
+from mpm_dolfinx.forms import CHUNK
 from mpm_dolfinx.grid import Grid, sum_by
 from mpm_dolfinx.points import MaterialPoints, Surface, face_vectors, interpolate
 
@@ -124,8 +125,11 @@ class Placement:
         grid, cell = self.grid, self._filled_cell(at, x + DEPTH * (self.points.x[at] - x))
         travel = Exchange(grid.comm, grid.owner(cell))
         cells, x = grid.local(travel.send(cell)), travel.send(x)
-        N = grid.shape_values(cells, x)
-        return travel.back(np.einsum("mk,mkd->md", N, u[grid.cell_nodes[cells]]))
+        moved = np.empty_like(x)
+        for part in (slice(start, start + CHUNK) for start in range(0, len(x), CHUNK)):
+            N = grid.shape_values(cells[part], x[part])
+            moved[part] = np.einsum("mk,mkd->md", N, u[grid.cell_nodes[cells[part]]])
+        return travel.back(moved)
 
     def _filled_cell(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
         """Return the cells (m,) of positions in domains; where no piece of the domain lies, of its largest piece."""
