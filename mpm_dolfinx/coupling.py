@@ -120,14 +120,13 @@ class Coupler:
         """Make the solvers for the present matrices."""
         m = self.momentum
         self._iterative = m.unknowns.iterative
-        self.forget()
+        self._make_solvers()
         self._du, self._rhs = self.momentum.unknowns.vector(), self.momentum.unknowns.vector()
         if self.storage is None:
             return
         self._dp, self._g = self.storage.unknowns.vector(), self.storage.unknowns.vector()
 
-    def forget(self) -> None:
-        """Make tangent and solvers anew in the next step: what follows then does not depend on the steps before."""
+    def _make_solvers(self) -> None:
         m = self.momentum
         if self._block is not None:
             self._block.free()
@@ -138,6 +137,12 @@ class Coupler:
             self._solve_u, self._modes = multigrid_solver(m.K, "momentum"), m.unknowns.rigid_body_modes()
         else:
             self._solve_u = direct_solver(m.K, "momentum", m.symmetric)
+
+    def forget(self) -> None:
+        """Make tangent and multigrid anew in the next step: what follows does not depend on the steps before."""
+        self._tangent_of = None
+        if self._iterative:
+            self._make_solvers()
 
     def solve(self, dt: float) -> Report:
         """Solve a step from the present (u, p).
