@@ -24,6 +24,7 @@ import numpy as np
 from dolfinx.common import Timer
 
 from mpm_dolfinx.block import BlockSolver
+from mpm_dolfinx.check import numbers
 from mpm_dolfinx.momentum import Momentum
 from mpm_dolfinx.storage import FILTER, Storage
 from mpm_dolfinx.unknowns import direct_solver, multigrid_solver, negative_pivots
@@ -110,6 +111,7 @@ class Coupler:
         tolerance: float = 1e-8,
         max_iterations: int | None = None,
     ):
+        numbers("tolerance", tolerance, test=lambda v: (0 < v) & (v < 1), allowed="in (0, 1)")
         self.momentum, self.storage, self.coupling, self.tolerance = momentum, storage, coupling, tolerance
         self.richardson = storage is not None and coupling.startswith("fixed-stress")
         self.max_iterations = max_iterations or (200 if self.richardson else 25)
