@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from mpm_dolfinx.check import line
 from mpm_dolfinx.conditions import HOLD, RIGIDITY, Displacement, Drained, Inflow, RigidPlate, Traction
 from mpm_dolfinx.domains import SNAP
 from mpm_dolfinx.exchange import Exchange
@@ -56,6 +57,9 @@ class Boundary:
         self.loads = [(load, self._faces(load)) for load in tractions]
         self.holds = [(hold, self._faces(hold), hold.axes(grid.dim)) for hold in displacements]
         self.outlets = [(outlet, self._faces(outlet)) for outlet in outlets]
+        for condition in [*tractions, *displacements]:
+            if not callable(condition.value):  # what a function gives is checked when it is called
+                condition.at(0.0, *([grid.dim] if isinstance(condition, Traction) else [np.empty((1, grid.dim))]))
 
     def _faces(self, condition) -> Surface:
         """Return the faces of a condition's side, the same object for conditions on the same faces."""
@@ -63,7 +67,8 @@ class Boundary:
         if key not in self._found:
             self._found[key] = surface(self._bodies, condition.side, condition.region, self._present)
         if not len(self._found[key]):
-            raise ValueError(f"{condition}: no point has this side" + (" in the region" if condition.region else ""))
+            where = " in the region" if condition.region else ""
+            raise ValueError(f"{line(condition)}: no point has this side{where}, must be one of a body")
         return self._found[key]
 
     def place_loads(self, place: Placement, momentum: Momentum, t: float) -> None:
@@ -71,7 +76,7 @@ class Boundary:
         rows = []
         for load, faces in self.loads:
             patches = place.surface(faces)
-            traction = load.at(t)
+            traction = load.at(t, self.grid.dim)
             if traction.ndim == 0:
                 traction = traction * patches.area / np.linalg.norm(patches.area, axis=1, keepdims=True)
             rows.append((patches.cell, patches.x, patches.area0[:, None] * traction))

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mpm_dolfinx.check import line, numbers
 from mpm_dolfinx.grid import side
 from mpm_dolfinx.points import Region
 
@@ -31,9 +32,12 @@ class Traction:
     value: ArrayLike | Callable[[float], ArrayLike]
     region: Region | None = None
 
-    def at(self, t: float) -> NDArray[np.float64]:
-        """Return the traction (d,), or () along the normal, at time t (s), Pa."""
-        return np.asarray(self.value(t) if callable(self.value) else self.value, dtype=float)
+    def at(self, t: float, dim: int) -> NDArray[np.float64]:
+        """Return the traction (d,), or () along the normal, at time t (s), Pa, in a dimension."""
+        value = self.value(t) if callable(self.value) else self.value
+        return numbers(
+            f"{line(self)}: value at t = {t:g} s", value, (), (dim,), allowed=f"a finite number or {dim} of them"
+        )
 
 
 @dataclass(frozen=True)
@@ -54,6 +58,9 @@ class Drained:
     pressure: float = 0.0
     region: Region | None = None
 
+    def __post_init__(self):
+        numbers("Drained: pressure", self.pressure)
+
 
 @dataclass(frozen=True)
 class Inflow:
@@ -72,6 +79,9 @@ class Inflow:
     side: str
     flux: float
     region: Region | None = None
+
+    def __post_init__(self):
+        numbers("Inflow: flux", self.flux)
 
 
 RIGIDITY = 1e4
@@ -106,14 +116,17 @@ class Displacement:
 
     def axes(self, dim: int) -> list[int]:
         """Return the axes of the given components."""
-        if any(c not in "xyz"[:dim] for c in self.components):
-            raise ValueError(f"{self}: components must be some of {'xyz'[:dim]!r}")
+        if not isinstance(self.components, str) or any(c not in "xyz"[:dim] for c in self.components):
+            raise ValueError(f"{line(self)}: components must be some of {'xyz'[:dim]!r}")
         return sorted("xyz".index(c) for c in set(self.components or "xyz"[:dim]))
 
     def at(self, t: float, X: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the displacement (m, d), m, at time t (s) of reference positions X (m, d)."""
-        value = np.asarray(self.value(t, X) if callable(self.value) else self.value, dtype=float)
-        return np.broadcast_to(value, X.shape)
+        value, (m, d) = self.value(t, X) if callable(self.value) else self.value, X.shape
+        allowed = f"{d} finite numbers, or {d} for each of {m} places"
+        return np.broadcast_to(
+            numbers(f"{line(self)}: value at t = {t:g} s", value, (d,), X.shape, allowed=allowed), X.shape
+        )
 
 
 @dataclass(frozen=True)
@@ -137,10 +150,18 @@ class RigidPlate:
     force: float | Callable[[float], float]
     region: Region | None = None
 
+    def __post_init__(self):
+        if not callable(self.force):
+            numbers("RigidPlate: force", self.force)
+
     def traction(self, area: float, dim: int) -> Traction:
         """Return the even traction of the plate on its reference area, m^(d-1)."""
         axis, end = side(self.side, dim)
         inward = np.zeros(dim)
         inward[axis] = 1 - 2 * end
-        force = self.force if callable(self.force) else lambda t: self.force
-        return Traction(self.side, lambda t: inward * force(t) / area, self.region)
+
+        def even(t: float) -> NDArray[np.float64]:
+            force = self.force(t) if callable(self.force) else self.force
+            return inward * numbers(f"{line(self)}: force at t = {t:g} s", force) / area
+
+        return Traction(self.side, even, self.region)

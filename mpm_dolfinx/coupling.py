@@ -25,6 +25,7 @@ import numpy as np
 from dolfinx.common import Timer
 
 from mpm_dolfinx.block import BlockSolver
+from mpm_dolfinx.check import numbers
 from mpm_dolfinx.momentum import Momentum
 from mpm_dolfinx.storage import FILTER, Storage
 from mpm_dolfinx.unknowns import direct_solver, multigrid_solver, negative_pivots
@@ -76,6 +77,10 @@ class SchurComplement:
         self.f = storage.B.createVecRight()
         self.v = storage.B.createVecRight()
 
+    def free(self) -> None:
+        """Let the problems and the solver go: the matrix refers to this object, which refers to them."""
+        self.storage = self.solve = None
+
     def mult(self, A: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         s = self.storage
         s.B_momentum.multTranspose(x, self.f)
@@ -107,6 +112,7 @@ class Coupler:
         tolerance: float = 1e-8,
         max_iterations: int | None = None,
     ):
+        numbers("tolerance", tolerance, test=lambda v: (0 < v) & (v < 1), allowed="in (0, 1)")
         self.momentum, self.storage, self.coupling, self.tolerance = momentum, storage, coupling, tolerance
         self.richardson = storage is not None and coupling.startswith("fixed-stress")
         self.max_iterations = max_iterations or (200 if self.richardson else 25)
@@ -117,25 +123,29 @@ class Coupler:
         """Make the solvers for the present matrices."""
         m = self.momentum
         self._iterative = m.unknowns.iterative
-        self.forget()
+        self._make_solvers()
         self._du, self._rhs = self.momentum.unknowns.vector(), self.momentum.unknowns.vector()
         if self.storage is None:
             return
         self._dp, self._g = self.storage.unknowns.vector(), self.storage.unknowns.vector()
 
-    def forget(self) -> None:
-        """Make tangent and solvers anew in the next step: what follows then does not depend on the steps before."""
+    def _make_solvers(self) -> None:
         m = self.momentum
         if self._block is not None:
             self._block.free()
-        for solver in (self._solve_s, self._schur, self._solve_u):
-            if solver is not None:
-                solver.destroy()  # PETSc's and Python's objects refer to each other
+        if self._schur is not None:
+            self._schur.getPythonContext().free()
         self._tangent_of = self._solve_s = self._schur = self._block = None
         if self._iterative:
             self._solve_u, self._modes = multigrid_solver(m.K, "momentum"), m.unknowns.rigid_body_modes()
         else:
             self._solve_u = direct_solver(m.K, "momentum", m.symmetric)
+
+    def forget(self) -> None:
+        """Make tangent and multigrid anew in the next step: what follows does not depend on the steps before."""
+        self._tangent_of = None
+        if self._iterative:
+            self._make_solvers()
 
     def solve(self, dt: float) -> Report:
         """Solve a step from the present (u, p).

@@ -16,6 +16,7 @@ from dolfinx import fem
 from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx import _compat
+from mpm_dolfinx.check import line, numbers
 from mpm_dolfinx.partition import destinations, owners
 
 SIDES = {
@@ -27,8 +28,8 @@ SIDES = {
 
 def side(name: str, dim: int) -> tuple[int, int]:
     """Return (axis, end) of a named side of a box."""
-    if name not in SIDES[dim]:
-        raise ValueError(f"side {name!r}: in {dim}D a side is one of {', '.join(SIDES[dim])}")
+    if not isinstance(name, str) or name not in SIDES[dim]:
+        raise ValueError(f"side {name!r}: must be one of {', '.join(SIDES[dim])} in {dim}D")
     return SIDES[dim][name]
 
 
@@ -59,14 +60,16 @@ class Grid:
         lower: ArrayLike | None = None,
         comm: MPI.Intracomm = MPI.COMM_WORLD,
     ):
-        self.upper = np.asarray(upper, dtype=float)
-        self.dim = self.upper.size
-        self.lower = np.zeros(self.dim) if lower is None else np.asarray(lower, dtype=float)
-        self.shape = np.asarray(cells, dtype=np.int64)
-        if self.dim not in (2, 3) or self.shape.size != self.dim or self.lower.size != self.dim:
-            raise ValueError(f"grid: upper {upper}, cells {cells}: both need 2 or 3 entries, lower as many")
-        if (self.shape < 1).any() or not (self.upper > self.lower).all():
-            raise ValueError(f"grid: cells {cells} over {self.lower} to {self.upper}: need cells >= 1, upper > lower")
+        self.upper = numbers("grid: upper", upper, (2,), (3,), allowed="2 or 3 finite coordinates")
+        self.dim = d = self.upper.size
+        lower = np.zeros(d) if lower is None else lower
+        self.lower = numbers("grid: lower", lower, (d,), allowed=f"{d} finite coordinates")
+        if not (self.upper > self.lower).all():
+            raise ValueError(f"grid: upper = {line(upper)}, must be > lower = {line(lower)}")
+        count = numbers(
+            "grid: cells", cells, (d,), allowed=f"{d} integers >= 1", test=lambda n: (n >= 1) & (n % 1 == 0)
+        )
+        self.shape = count.astype(np.int64)
         self.h = (self.upper - self.lower) / self.shape
         self.comm = comm
         self._spaces: dict[tuple[int, ...], fem.FunctionSpace] = {}

@@ -186,7 +186,7 @@ def _reference(bodies: Sequence[Body], count: int) -> tuple[NDArray[np.float64],
     """Return the reference positions (n, d) of all points of all processes and the index (n,) of their material."""
     for body in bodies:
         if not 0 <= body.material < count:
-            raise ValueError(f"body: material = {body.material}, must be an index of the {count} materials")
+            raise ValueError(f"body: material = {body.material!r}, must be an index of the {count} materials")
     return (
         np.concatenate([b.centre for b in bodies]),
         np.concatenate([np.full(len(b), b.material) for b in bodies]),

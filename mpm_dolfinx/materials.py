@@ -17,6 +17,7 @@ import numpy as np
 import ufl
 from numpy.typing import ArrayLike, NDArray
 
+from mpm_dolfinx.check import functions, line, numbers
 from mpm_dolfinx.extend import call
 
 Field = float | Sequence[float] | Callable[[NDArray[np.float64]], ArrayLike]
@@ -95,6 +96,9 @@ class Skeleton:
             cls.linear = False  # not what the law had that this one is derived from
 
     def __post_init__(self):
+        functions(
+            f"{type(self).__name__}: conductivity_law", [self.conductivity_law] * (self.conductivity_law is not None)
+        )
         for name in ("bulk", "shear"):
             _check(self, name, lambda v: (0 < v) & (v < inf), "> 0 and finite")
         _check(self, "grain_bulk", lambda v: 0 < v, "> 0")
@@ -107,14 +111,17 @@ class Skeleton:
 
     def at(self, X: NDArray[np.float64]) -> Skeleton:
         """Return this material with its fields evaluated at reference positions X (n, d), m: arrays (n, ...)."""
-        names = [f.name for f in fields(self) if f.name != "conductivity_law" and callable(getattr(self, f.name))]
-        values = {name: np.asarray(getattr(self, name)(X), dtype=float) for name in names}
-        for name, value in values.items():
-            if value.shape[:1] != (len(X),):
-                raise ValueError(
-                    f"{type(self).__name__}: {name}(X) has shape {value.shape}, must be one value a position, "
-                    f"({len(X)}, ...)"
-                )
+        values, scalars = {}, [f.name for f in fields(Skeleton)]
+        for name in (f.name for f in fields(self) if f.name != "conductivity_law"):
+            value, what = getattr(self, name), f"{type(self).__name__}: {name}"
+            if callable(value):
+                values[name] = given = numbers(f"{what}(X)", value(X), None, allowed="numbers", test=np.isreal)
+                if given.shape[:1] != (len(X),) or (name in scalars and given.ndim > 1):
+                    more = "" if name in scalars else " ..."
+                    allowed = f"one value a position, ({len(X)},{more})"
+                    raise ValueError(f"{what}(X) has shape {given.shape}, must be {allowed}")
+            elif name in scalars and np.ndim(value):
+                raise ValueError(f"{what} has shape {np.shape(value)}, must be a number or a function of X")
         return replace(self, **values)
 
     @property
@@ -182,10 +189,13 @@ def _check(obj, name: str, test: Callable, allowed: str) -> None:
     value = getattr(obj, name)
     if callable(value):
         return
-    good = np.asarray(test(value))
+    try:
+        good = np.asarray(test(value))
+    except TypeError:
+        good = np.array(False)
     if not good.all():
-        value = value if np.ndim(value) == 0 else float(np.asarray(value)[np.argmin(good)])
-        raise ValueError(f"{type(obj).__name__}: {name} = {value!r}, must be {allowed}")
+        value = value if good.ndim == 0 else float(np.asarray(value)[np.argmin(good)])
+        raise ValueError(f"{type(obj).__name__}: {name} = {line(value)}, must be {allowed}")
 
 
 @dataclass(frozen=True)
@@ -277,8 +287,8 @@ class Fluid:
     density: float = 1000.0
 
     def __post_init__(self):
-        for f in fields(self):
-            _check(self, f.name, lambda v: 0 < v, "> 0")
+        _check(self, "bulk", lambda v: 0 < v, "> 0")
+        _check(self, "density", lambda v: (0 < v) & (v < inf), "> 0 and finite")
 
     @property
     def unit_weight(self) -> float:

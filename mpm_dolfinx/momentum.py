@@ -23,6 +23,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from mpm_dolfinx import _compat
+from mpm_dolfinx.check import line
 from mpm_dolfinx.dilatation import MeanDilatation
 from mpm_dolfinx.elements import ElementForces, ElementMatrices, StackedElementMatrices
 from mpm_dolfinx.extend import call
@@ -122,6 +123,8 @@ class Momentum:
         V = self.u.function_space
         v, du = ufl.TestFunction(V), ufl.TrialFunction(V)
         form = call(term, points=self.pieces, u=self.u, v=v, t=t, dt=dt)
+        if not isinstance(form, ufl.Form):
+            raise ValueError(f"terms: a function gives {line(form)}, must be a form with points.dx")
         potential = not form.arguments()
         if potential:
             form = ufl.derivative(form, self.u, v)

@@ -23,6 +23,7 @@ import numpy as np
 from dolfinx import fem, io
 from numpy.typing import NDArray
 
+from mpm_dolfinx.check import whole
 from mpm_dolfinx.exchange import at_root, to_root
 from mpm_dolfinx.points import MaterialPoints
 from mpm_dolfinx.timeloop import Result
@@ -60,10 +61,8 @@ class Writer:
     """
 
     def __init__(self, simulation: Simulation, folder: str | os.PathLike, *, every: int = 1, grid: bool = False):
-        if every != int(every) or every < 1:
-            raise ValueError(f"writer: every = {every!r}, must be an integer >= 1")
         folder, comm, self._t = Path(folder), simulation.grid.comm, simulation.t
-        self.every, self._started = int(every), False
+        self.every, self._started = whole("writer: every", every), False
         self._table = Table(comm, folder / "history.csv", self._t)
         self._points = Series(comm, folder / "points.pvd", self._t)
         self._grid = Series(comm, folder / "grid.pvd", self._t) if grid else None

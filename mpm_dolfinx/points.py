@@ -5,11 +5,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
+from mpm_dolfinx.check import line, numbers, whole
 from mpm_dolfinx.domains import corner_bits, volumes
 from mpm_dolfinx.exchange import Exchange
 from mpm_dolfinx.grid import Grid, side
@@ -117,7 +119,11 @@ class Body:
         corners = lower[:, None] + corner_bits(lower.shape[1]) * self.spacing
         if self.map is None:
             return corners
-        return np.asarray(self.map(corners.reshape(lower.shape[0] * corners.shape[1], -1))).reshape(corners.shape)
+        x = corners.reshape(lower.shape[0] * corners.shape[1], -1)
+        images = np.asarray(self.map(x), dtype=float)
+        if images.shape != x.shape:
+            raise ValueError(f"body: the map gives shape {images.shape}, must be one position each, {x.shape}")
+        return images.reshape(corners.shape)
 
     def size(self) -> NDArray[np.float64]:
         """Return the edges (n, d), m, of boxes that are as large as the domains."""
@@ -140,10 +146,14 @@ def box(grid: Grid, lower: ArrayLike, upper: ArrayLike, per_cell: int = 2, mater
     material
         Index of the material.
     """
-    lower, upper = np.asarray(lower, dtype=float), np.asarray(upper, dtype=float)
-    if lower.shape != (grid.dim,) or upper.shape != (grid.dim,) or not (upper > lower).all():
-        raise ValueError(f"body: box {lower} to {upper}: needs {grid.dim} coordinates each and upper > lower")
-    count = np.maximum(1, np.rint((upper - lower) / (grid.h / _per_cell(per_cell)))).astype(int)
+    lower, upper = (
+        numbers(f"body: {name}", x, (grid.dim,), allowed=f"{grid.dim} finite coordinates")
+        for name, x in (("lower", lower), ("upper", upper))
+    )
+    if not (upper > lower).all():
+        raise ValueError(f"body: box {lower.tolist()} to {upper.tolist()}: upper must be > lower")
+    material, per_cell = whole("body: material", material, 0), whole("body: per_cell", per_cell)
+    count = np.maximum(1, np.rint((upper - lower) / (grid.h / per_cell))).astype(int)
     spacing = (upper - lower) / count
     index = np.stack(np.meshgrid(*map(np.arange, count), indexing="ij"), axis=-1).reshape(-1, grid.dim)
     sides = np.stack([index == 0, index == count - 1], axis=-1)
@@ -164,14 +174,17 @@ def shape(
     material
         Index of the material.
     """
-    spacing = grid.h / _per_cell(per_cell)
+    material, per_cell = whole("body: material", material, 0), whole("body: per_cell", per_cell)
+    spacing = grid.h / per_cell
     count = grid.shape * per_cell
     index = np.stack(np.meshgrid(*map(np.arange, count), indexing="ij"), axis=-1).reshape(-1, grid.dim)
     filled = np.asarray(inside(grid.lower + (index + 0.5) * spacing), dtype=bool)
+    if filled.shape != (len(index),):
+        raise ValueError(f"body: inside(x) has shape {filled.shape}, must be one bool a position, ({len(index)},)")
     padded = np.pad(filled.reshape(count), 1)
     index = index[filled]
     if not len(index):
-        raise ValueError("body: inside(x) holds at no point of the grid; the body fits in no cell")
+        raise ValueError("body: inside(x) holds at no point of the grid, must hold at one; the body fits in no cell")
     sides = np.empty((len(index), grid.dim, 2), dtype=bool)
     for axis in range(grid.dim):
         for end in (0, 1):
@@ -196,24 +209,21 @@ def mapped(grid: Grid, body: Body, map: Callable[[NDArray[np.float64]], NDArray[
     out = np.flatnonzero(grid.outside(corners.reshape(-1, grid.dim)))
     if len(out):
         x = corners.reshape(-1, grid.dim)[out[0]]
-        raise ValueError(f"body: the map takes a corner to {x}, outside the grid {grid.lower} to {grid.upper}")
+        raise ValueError(
+            f"body: the map takes a corner to {x}, must not be outside the grid {grid.lower} to {grid.upper}"
+        )
     smallest = int(np.argmin(volumes(corners)))
     if not volumes(corners)[smallest] > 0:
-        raise ValueError(f"body: the map turns the domain at {body.centre[smallest]} inside out")
+        raise ValueError(f"body: the map turns the domain at {body.centre[smallest]} inside out, must not")
     return bent
-
-
-def _per_cell(per_cell: int) -> int:
-    if per_cell != int(per_cell) or per_cell < 1:
-        raise ValueError(f"body: per_cell = {per_cell!r}, must be an integer >= 1")
-    return int(per_cell)
 
 
 def _inside(grid: Grid, body: Body) -> Body:
     out = np.flatnonzero(grid.outside(body.lower) | grid.outside(body.lower + body.spacing))
     if len(out):
         raise ValueError(
-            f"body: {len(out)} points outside the grid {grid.lower} to {grid.upper}, the first at {body.centre[out[0]]}"
+            f"body: {len(out)} points outside the grid, the first at {body.centre[out[0]]}, "
+            f"must be inside {grid.lower} to {grid.upper}"
         )
     return body
 
@@ -233,7 +243,7 @@ def material_points(grid: Grid, bodies: Sequence[Body], pressure: float = 0.0) -
         F=np.tile(np.eye(d), (n, 1, 1)),
         volume0=size[mine].prod(axis=1),
         material=material[mine],
-        pressure=np.full(n, float(pressure)),
+        pressure=np.full(n, float(numbers("pressure", pressure))),
         x=x[mine],
         origin=corners[mine],
     )
@@ -279,6 +289,32 @@ class Surface:
 Region = tuple[ArrayLike, ArrayLike]
 
 
+def limits(region: Region | None, dim: int) -> NDArray[np.float64]:
+    """Return the corners (2, d) of a region, m; without one, of all space."""
+    if region is None:
+        return np.repeat([[-np.inf], [np.inf]], dim, axis=1)
+    allowed = f"two corners of {dim} coordinates each, the lower first"
+    return numbers("region", region, (2, dim), allowed=allowed, test=lambda x: x[0] <= x[1])
+
+
+def check_apart(bodies: Sequence[Body], present: Sequence[bool]) -> None:
+    """Refuse bodies of which domains lie in each other as seeded; those that a map has bent are not looked at."""
+    there = [i for i, body in enumerate(bodies) if present[i] and body.map is None]
+    for i, j in combinations(there, 2):
+        a, b = bodies[i], bodies[j]
+        low, high = (
+            np.maximum(a.lower.min(axis=0), b.lower.min(axis=0)),
+            [(body.lower.max(axis=0) + body.spacing) for body in (a, b)],
+        )
+        size = (a.spacing + b.spacing) / 2
+        if not (np.minimum(*high) - low > 1e-6 * size).all():
+            continue
+        distance, _ = cKDTree(a.centre / size).query(b.centre / size, p=np.inf, distance_upper_bound=1 - 1e-6)
+        inside = np.flatnonzero(distance < 1 - 1e-6)
+        if len(inside):
+            raise ValueError(f"bodies {i} and {j}: both are at {b.centre[inside[0]]}, must not lie in each other")
+
+
 def surface(
     bodies: Sequence[Body], name: str, region: Region | None = None, present: Sequence[bool] | None = None
 ) -> Surface:
@@ -297,17 +333,17 @@ def surface(
     dim = bodies[0].lower.shape[1]
     axis, end = side(name, dim)
     tangential = np.arange(dim) != axis
-    limits = [np.full(dim, -np.inf), np.full(dim, np.inf)] if region is None else np.asarray(region, dtype=float)
+    low, high = limits(region, dim)
     start, ids, xis, Xs, wholes = 0, [], [], [], []
     for body in bodies:
         chosen = np.flatnonzero(body.sides[:, axis, end] & any(body is other for other in there))
         box = np.stack([body.lower[chosen], body.lower[chosen] + body.spacing], axis=1)
         face = box.copy()
         face[:, :, axis] = box[:, end, None, axis]
-        part = np.stack([np.maximum(face[:, 0], limits[0]), np.minimum(face[:, 1], limits[1])], axis=1)
+        part = np.stack([np.maximum(face[:, 0], low), np.minimum(face[:, 1], high)], axis=1)
         on = (part[:, 1] > part[:, 0])[:, tangential].all(axis=1)
         on &= ~_touched(face.mean(axis=1), axis, end, [other for other in there if other is not body])
-        on &= (face[:, 0, axis] >= limits[0][axis] - 1e-12) & (face[:, 0, axis] <= limits[1][axis] + 1e-12)
+        on &= (face[:, 0, axis] >= low[axis] - 1e-12) & (face[:, 0, axis] <= high[axis] + 1e-12)
         part[:, :, axis] = face[:, :, axis]
         ids.append(start + chosen[on])
         xis.append((2 * part - box.sum(axis=1, keepdims=True))[on] / body.spacing)
@@ -367,9 +403,18 @@ class Probes:
         return comm.allreduce(u)
 
 
+def positions(x0: ArrayLike, dim: int) -> NDArray[np.float64]:
+    """Return places where something is probed, as an array (m, d), m."""
+    allowed = f"positions of {dim} finite coordinates"
+    x = np.atleast_2d(numbers("probes: x0", x0, None, allowed=allowed))
+    if x.shape[1:] != (dim,):
+        raise ValueError(f"probes: x0 = {line(x0)}, must be {allowed}")
+    return x
+
+
 def probes(bodies: Sequence[Body], x0: ArrayLike) -> Probes:
     """Return probes at reference positions x0 (m, d), m, before a map, inside or on the surface of the bodies."""
-    x0 = np.atleast_2d(np.asarray(x0, dtype=float))
+    x0 = positions(x0, bodies[0].lower.shape[1])
     centre = np.concatenate([b.centre for b in bodies])
     spacing = np.concatenate([np.broadcast_to(b.spacing, b.lower.shape) for b in bodies])
     ids = np.empty(len(x0), dtype=np.int64)
@@ -378,5 +423,5 @@ def probes(bodies: Sequence[Body], x0: ArrayLike) -> Probes:
     xi = 2 * (x0 - centre[ids]) / spacing[ids]
     far = np.flatnonzero((np.abs(xi) > 1 + 1e-9).any(axis=1))
     if len(far):
-        raise ValueError(f"probe at {x0[far[0]]}: outside the bodies")
+        raise ValueError(f"probe at {x0[far[0]]}: outside the bodies, must be in one or on its surface")
     return Probes(x0, ids, xi)

@@ -28,12 +28,13 @@ from numpy.typing import ArrayLike, NDArray
 from tqdm import tqdm
 
 from mpm_dolfinx import _compat
+from mpm_dolfinx.check import all_of, line, numbers
 from mpm_dolfinx.conditions import RIGIDITY, Drained, RigidPlate, Traction
 from mpm_dolfinx.coupling import NotConverged
 from mpm_dolfinx.extend import call
 from mpm_dolfinx.grid import Grid, side
 from mpm_dolfinx.materials import Field, Fluid, Skeleton
-from mpm_dolfinx.points import Region
+from mpm_dolfinx.points import Region, limits, positions
 from mpm_dolfinx.timeloop import GaveUp, Result
 
 ELEMENTS = {"taylor-hood": (2, ("Lagrange", 1, ())), "q1-dg0": (1, ("DG", 0, ()))}  # degree of u; space of p
@@ -80,16 +81,19 @@ class BiotFEM:
         comm: MPI.Intracomm = MPI.COMM_WORLD,
         tolerance: float = 1e-8,
     ):
+        all_of("material", [material], Skeleton)
+        all_of("fluid", [fluid] if fluid is not None else [], Fluid)
+        numbers("tolerance", tolerance, test=lambda v: (0 < v) & (v < 1), allowed="in (0, 1)")
         if element not in ELEMENTS:
             raise ValueError(f"element {element!r}: must be one of {', '.join(ELEMENTS)}")
         if fluid is None and drained:
             raise ValueError("drained sides need a fluid")
         if fluid is not None and gravity is not None:
-            raise ValueError("gravity with a fluid: the reference has none; leave out one of them")
+            raise ValueError("gravity with a fluid: the reference has none, one of them must be left out")
         if material.state or callable(material.porosity) or callable(material.biot) or callable(material.grain_bulk):
             raise ValueError(
-                f"{type(material).__name__}: the reference has no state, and only moduli, conductivity and "
-                "parameters of the law may be functions of place"
+                f"{type(material).__name__}: the reference has no state; only moduli, conductivity and "
+                "parameters of the law may be functions of place, the rest must be numbers"
             )
         self.grid, self.material, self.fluid = Grid(upper, cells, lower, comm), material, fluid
         self.t, self.tolerance = 0.0, tolerance
@@ -100,6 +104,9 @@ class BiotFEM:
         start = time.perf_counter()
         self._gravity = gravity
         self._plates = [(plate, self._area(plate)) for plate in plates]
+        for load in tractions:
+            if not callable(load.value):
+                self._traction(load, 0.0)
         tractions = [*tractions, *(plate.traction(area, self.grid.dim) for plate, area in self._plates)]
         self._compile(tractions, drained if element == "q1-dg0" else None)
         self.jit = time.perf_counter() - start  # s, compiling or finding the forms
@@ -132,11 +139,11 @@ class BiotFEM:
     def _box(self, name: str, region: Region | None = None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the corners of a flat box around a side, or around the part of it in a region."""
         grid, (axis, end) = self.grid, side(name, self.grid.dim)
-        low, high = np.array((grid.lower, grid.upper) if region is None else region, dtype=float)
+        low, high = limits(region, grid.dim)
         plane, near = (grid.lower, grid.upper)[end][axis], 1e-6 * grid.h
         low, high = np.maximum(low, grid.lower) - near, np.minimum(high, grid.upper) + near
         if not (low[axis] <= plane <= high[axis] and (low < high).all()):
-            raise ValueError(f"side {name!r}: no part of it is in the region {region}")
+            raise ValueError(f"side {name!r}: the region {line(region)} must have a part of it")
         low[axis], high[axis] = plane - near[axis], plane + near[axis]
         return low, high
 
@@ -150,7 +157,7 @@ class BiotFEM:
         """Return the conditions of zero displacement and of nodal pressure."""
         axes, bcs, space = "xyz"[: self.grid.dim], [], self._u.function_space
         for name, held in fixed.items():
-            if not held or not set(held) <= set(axes):
+            if not isinstance(held, str) or not held or not set(held) <= set(axes):
                 raise ValueError(f"fixed side {name!r}: components {held!r}, must be some of {axes!r}")
             bcs += [self._prescribe(space.sub(axes.index(a)), 0.0, name) for a in held]
         return bcs + [self._prescribe(self._W.sub(1), o.pressure / self.scale, o.side, o.region) for o in drained]
@@ -268,12 +275,16 @@ class BiotFEM:
 
     def step(self, dt: float) -> tuple[int, float]:
         """Advance by dt (s, > 0); return Newton iterations, relative residual.  `NotConverged` keeps the state."""
+        numbers("dt", dt, test=lambda v: (0 < v) & (v < np.inf), allowed="> 0 and finite")
         self._dt.value = dt
         for traction, constant in self._loads:
-            constant.value[:] = traction.at(self.t + dt)
+            constant.value[:] = self._traction(traction, self.t + dt)
         if self._gravity is not None:
             density = (1 - self.material.porosity) * self.material.grain_density
-            self._weight.value = density * np.asarray(self._gravity(self.t + dt), dtype=float)
+            g = numbers(
+                "gravity", self._gravity(self.t + dt), (self.grid.dim,), allowed=f"{self.grid.dim} finite numbers"
+            )
+            self._weight.value = density * g
         if self._load_form is not None:
             self._assemble(self._f, self._load_form)
         x, load, snes = _compat.petsc_vec(self.w).copy(), _compat.petsc_vec(self._f).norm(), self._snes
@@ -291,6 +302,15 @@ class BiotFEM:
         self._old.x.array[:] = self.w.x.array
         self.t += dt
         return snes.its, norms[-1] / scale
+
+    def _traction(self, load: Traction, t: float) -> NDArray[np.float64]:
+        """Return the components (d,), Pa, of a traction at time t, s."""
+        value = load.at(t, self.grid.dim)
+        if not value.ndim:
+            raise ValueError(
+                f"{line(load)}: value must have {self.grid.dim} components, the reference knows no normals"
+            )
+        return value
 
     def _parts(self, x: PETSc.Vec, scale: float) -> tuple[float, float]:
         """Return the norms of the residuals of momentum and storage at x, relative to `scale`."""
@@ -313,7 +333,10 @@ class BiotFEM:
         steps = round((t_end - self.t) / dt) if dt > 0 else 0
         if steps < 1 or abs(steps * dt - (t_end - self.t)) > 1e-6 * dt:
             raise ValueError(f"dt = {dt!r}, t_end = {t_end!r}: dt must divide the {t_end - self.t:g} s left")
-        x, result = np.atleast_2d(np.asarray(probes, dtype=float)), Result()
+        x, result = positions(probes, self.grid.dim), Result()
+        out = np.flatnonzero(self.grid.outside(x))
+        if len(out):
+            raise ValueError(f"probe at {x[out[0]]}: outside the body, must be in it or on its surface")
         self._record(result, x)
         began = time.perf_counter()
         for _ in tqdm(range(steps), disable=not progress or self.grid.comm.rank > 0 or None, unit="step"):

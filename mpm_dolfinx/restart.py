@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mpm_dolfinx.check import numbers, whole
 from mpm_dolfinx.exchange import at_root, to_root
 from mpm_dolfinx.output import replacing
 from mpm_dolfinx.points import MaterialPoints
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 
 FORMAT, VERSION = "mpm_dolfinx checkpoint", 2
 LISTS = ("t", "displacement", "pressure")  # of Result
+FOREIGN = "no checkpoint of mpm_dolfinx, must be one"
 ZIP = b"PK\3\4"  # how numpy's archives begin
 
 
@@ -52,10 +54,8 @@ class Checkpoint:
     _last: float = field(default_factory=time.monotonic, init=False, repr=False)
 
     def __post_init__(self):
-        if self.every != int(self.every) or self.every < 1:
-            raise ValueError(f"checkpoint: every = {self.every!r}, must be an integer >= 1")
-        if not self.seconds >= 0:
-            raise ValueError(f"checkpoint: seconds = {self.seconds!r}, must be >= 0")
+        whole("checkpoint: every", self.every)
+        numbers("checkpoint: seconds", self.seconds, test=lambda v: v >= 0, allowed=">= 0")
 
     def __call__(self, simulation: Simulation) -> None:
         """Save the state if it is time."""
@@ -149,10 +149,10 @@ def _read(file: Path, arrays: dict[str, NDArray]) -> dict:
         with np.load(file, allow_pickle=False) as archive:
             arrays.update({name: archive[name] for name in archive.files})
     except Exception as error:  # numpy and zipfile have many for bytes that are not what they expect
-        what = "cut short or damaged" if begin == ZIP else "no checkpoint of mpm_dolfinx"
+        what = "is cut short or damaged, must be a whole checkpoint" if begin == ZIP else FOREIGN
         raise ValueError(f"{file}: {what}") from error
     if str(arrays.pop("format", None)) != FORMAT:
-        raise ValueError(f"{file}: no checkpoint of mpm_dolfinx")
+        raise ValueError(f"{file}: {FOREIGN}")
     note = json.loads(str(arrays.pop("note")))
     if note["version"] != VERSION:
         raise ValueError(f"{file}: checkpoint of version {note['version']}, this mpm_dolfinx reads {VERSION}")

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx import summary
 from mpm_dolfinx.boundary import Boundary
+from mpm_dolfinx.check import all_of, functions, line, numbers
 from mpm_dolfinx.conditions import Displacement, Drained, Inflow, RigidPlate, Traction
 from mpm_dolfinx.coupling import COUPLINGS, Coupler, NotConverged, Report
 from mpm_dolfinx.domains import parallelepipeds, tangled
@@ -24,11 +25,19 @@ from mpm_dolfinx.laws import ConductivityAtPieces, SceneMaterials
 from mpm_dolfinx.materials import Fluid, Skeleton
 from mpm_dolfinx.momentum import FULL, Momentum
 from mpm_dolfinx.placement import Placement
-from mpm_dolfinx.points import Body, MaterialPoints, Probes, material_points
+from mpm_dolfinx.points import Body, MaterialPoints, Probes, check_apart, material_points
 from mpm_dolfinx.remap import Carried, at_start, remap
 from mpm_dolfinx.storage import Storage
 from mpm_dolfinx.timeloop import Observer, Result, run
 from mpm_dolfinx.unknowns import collect_garbage
+
+CONDITIONS = {
+    "tractions": Traction,
+    "displacements": Displacement,
+    "drained": Drained,
+    "inflows": Inflow,
+    "plates": RigidPlate,
+}
 
 
 class Simulation:
@@ -90,6 +99,14 @@ class Simulation:
             raise ValueError(f"coupling {coupling!r}: must be one of {', '.join(COUPLINGS)}")
         if fluid is None and sources:
             raise ValueError("sources need a fluid")
+        all_of("bodies", bodies, Body, 1)
+        all_of("materials", materials, Skeleton, 1)
+        all_of("fluid", [fluid] if fluid is not None else [], Fluid)
+        functions("terms", terms)
+        functions("sources", sources)
+        for i, body in enumerate(bodies):
+            if body.lower.shape[1] != grid.dim:
+                raise ValueError(f"body {i}: has {body.lower.shape[1]} coordinates, must have the grid's {grid.dim}")
         self.grid, self.materials, self.fluid, self.bodies = grid, materials, fluid, bodies
         self.quadrature = quadrature
         grid.share(np.concatenate([body.centre for body in bodies]))
@@ -99,6 +116,7 @@ class Simulation:
         self._scene = SceneMaterials(grid, materials, bodies, self.points)
         self.present = [body not in later for body in range(len(bodies))]
         """Which bodies are there."""
+        check_apart(bodies, self.present)
 
         start = time.perf_counter()
         self._build(self._fixed_nodes(fixed), coupling, tolerance, terms, sources)
@@ -129,8 +147,10 @@ class Simulation:
     def _fixed_nodes(self, fixed: Mapping[str, str]) -> NDArray[np.bool_]:
         d = self.grid.dim
         out = np.zeros((len(self.grid.node_x), d), dtype=bool)
+        if not isinstance(fixed, Mapping):
+            raise ValueError(f"fixed = {line(fixed)}, must be walls with their components, such as {{'left': 'xy'}}")
         for wall, axes in fixed.items():
-            if not axes or any(a not in "xyz"[:d] for a in axes):
+            if not isinstance(axes, str) or not axes or any(a not in "xyz"[:d] for a in axes):
                 raise ValueError(f"fixed wall {wall!r}: components {axes!r}, must be some of {'xyz'[:d]!r}")
             for a in axes:
                 out[self.grid.wall_nodes(wall), "xyz".index(a)] = True
@@ -207,12 +227,16 @@ class Simulation:
             From now on displacements count from the present positions.
         """
         if gravity is not None and self.gravity is None:
-            raise ValueError("gravity: the scene was made without; make it with (0, 0) first")
+            raise ValueError("gravity: the scene was made without, must be made with (0, 0) first")
         for body in remove:
             self._check_body(body, self.present[body] if 0 <= body < len(self.present) else False, "present")
-            self._take(body)
         for body in add:
             self._check_body(body, body in self._waiting, "one of the bodies to come later")
+        there = enumerate(self.present)
+        check_apart(self.bodies, [(here and body not in remove) or body in add for body, here in there])
+        for body in remove:
+            self._take(body)
+        for body in add:
             points = self._waiting.pop(body)
             self.present[body] = True
             self.points = self.points.joined(points)
@@ -242,12 +266,14 @@ class Simulation:
 
     def _set_conditions(self, **conditions) -> None:
         """Take over the conditions that are named, on the bodies that are there."""
-        self._conditions |= conditions
-        now = self._conditions
+        now = self._conditions | conditions
+        for name, kind in CONDITIONS.items():
+            all_of(name, now[name], kind)
         if self.fluid is None and (now["drained"] or now["inflows"]):
             raise ValueError("drained and inflow sides need a fluid")
-        gravity = now["gravity"]
-        self._gravity_at = gravity if callable(gravity) else lambda t: gravity
+        if now["gravity"] is not None and not callable(now["gravity"]):
+            self._gravity(now["gravity"], "gravity")
+        fixed = self._fixed_nodes(now["fixed"])
         self.boundary = side = Boundary(
             self.grid,
             self.bodies,
@@ -258,11 +284,16 @@ class Simulation:
             now["plates"],
             [*now["drained"], *now["inflows"]],
         )
+        self._conditions = now
         self.reactions = np.zeros((len(now["displacements"]), self.grid.dim))
         """(displacements, d): force by which each given displacement acts on the bodies, N (N/m in plane strain)."""
         self.momentum.require(bool(side.loads), bool(side.plates), bool(side.holds))
-        self.momentum.fix(self._fixed_nodes(now["fixed"]))
+        self.momentum.fix(fixed)
         self._prepared = False
+
+    def _gravity(self, value: ArrayLike, name: str) -> NDArray[np.float64]:
+        """Return a given acceleration of gravity (d,), m/s^2; `name` for the message of one that is not."""
+        return numbers(name, value, (self.grid.dim,), allowed=f"{self.grid.dim} finite numbers")
 
     def _table(self, value: Callable[..., float], *columns: NDArray) -> NDArray[np.float64]:
         """Return a constant of the materials at the points (n,); `value` also takes columns (n,) of the points."""
@@ -278,8 +309,7 @@ class Simulation:
         NotConverged
             The state is then still that before the step.
         """
-        if not dt > 0:
-            raise ValueError(f"dt = {dt!r}, must be > 0")
+        numbers("dt", dt, test=lambda v: (0 < v) & (v < np.inf), allowed="> 0 and finite")
         self._begin(self.t + dt)
         report = self.coupler.solve(dt)
         if self.boundary.holds:
@@ -294,7 +324,8 @@ class Simulation:
         collect_garbage(self.grid.mesh.comm)
         self._time.value, self._dt.value = t, t - self.t
         if self.gravity is not None:
-            self.gravity.value = np.asarray(self._gravity_at(t), dtype=float)
+            given = self._conditions["gravity"]
+            self.gravity.value = self._gravity(given(t) if callable(given) else given, f"gravity at t = {t:g} s")
         fresh = not self._prepared
         if fresh:
             self._reset_grid()

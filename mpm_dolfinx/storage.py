@@ -29,6 +29,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from mpm_dolfinx import _compat
+from mpm_dolfinx.check import line
 from mpm_dolfinx.elements import ElementForces
 from mpm_dolfinx.extend import call
 from mpm_dolfinx.forms import FacetForm, FormPoints, PointForm
@@ -100,6 +101,8 @@ class Storage:
         one, self._gain = fem.Function(Q), fem.Function(Q)
         one.x.array[:] = 1.0
         form = call(source, points=points, q=ufl.TestFunction(Q), p=self.p, t=t)
+        if not isinstance(form, ufl.Form):
+            raise ValueError(f"sources: a function gives {line(form)}, must be a form with points.dx")
         slope = PointForm(ufl.derivative(form, self.p, one), points) if self.p in form.coefficients() else None
         self.sources.append((PointForm(form, points), slope))
 

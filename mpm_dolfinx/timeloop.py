@@ -20,6 +20,7 @@ from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
 from mpm_dolfinx import _compat
+from mpm_dolfinx.check import functions, line
 from mpm_dolfinx.coupling import NotConverged
 from mpm_dolfinx.placement import LeftGrid
 from mpm_dolfinx.points import Probes
@@ -132,6 +133,10 @@ def run(
     GaveUp
         With the histories so far; `points` and `t` are those of the last good step.
     """
+    if probes is not None and not isinstance(probes, Probes):
+        raise ValueError(f"probes = {line(probes)}, must be what `probes` gives")
+    functions("observe", observe)
+    functions("checkpoint", [checkpoint] if checkpoint is not None else [])
     result = simulation.result = _histories(simulation, t_end, dt, probes, after)
     dt, start, done = result.dt, result.t[0], len(result.t) - 1
     # a last interval that is a fraction of dt counts as one

@@ -276,6 +276,21 @@ def test_a_term_without_symmetry_has_a_consistent_tangent_coupled_too():
     assert (m.assemble_tangent() * x).array == pytest.approx(slope, abs=1e-7 * np.abs(slope).max())
 
 
+def viscous(points, u, dt):
+    rate = ufl.sym(points.grad(u)) / dt
+    return 2e6 * dt * ufl.inner(rate, rate) * points.dx  # 2 eta D, eta = 2e6 Pa s
+
+
+def test_a_viscous_stress_takes_the_length_of_each_step():
+    soil, load = mpm.LinearElastic(bulk=SOFT.bulk, shear=SOFT.shear), 100.0
+    s = column(fluid=False, material=soil, terms=[viscous], tractions=[mpm.Traction("top", (0, -load))])
+    strain = 0.0
+    for dt in (0.5, 0.5, 0.1, 2.0):
+        s.step(dt)
+        strain = (-load + 4e6 / dt * strain) / (soil.oedometric + 4e6 / dt)
+        assert s.points.F[:, 1, 1] - 1 == pytest.approx(strain, rel=1e-4)
+
+
 def test_a_source_raises_the_steady_pressure_and_the_balance_closes():
     rate, soil = 1e-7, replace(SOFT, conductivity=1e-6)
     s = column(cells=20, material=soil, drained=[mpm.Drained("top")], sources=[lambda points, q: rate * q * points.dx])
@@ -351,7 +366,7 @@ CASES = {
     ),
     "update of another shape": (lambda: column(fluid=False, material=WrongUpdate(1, 1)).step(1.0), "'damage' of shape"),
     "unknown argument of a term": (
-        lambda: column(fluid=False, terms=[lambda points, w: w]), "argument 'w', must be some of points, u, v, t"),
+        lambda: column(fluid=False, terms=[lambda points, w: w]), "argument 'w', must be some of points, u, v, t, dt"),
     "source without fluid": (lambda: column(fluid=False, sources=[lambda q: q]), "need a fluid"),
     "unknown argument of a conductivity": (
         lambda: column(material=replace(SOFT, conductivity_law=lambda stress: stress)), "argument 'stress', must be"),
