@@ -344,7 +344,7 @@ class PointExpression:
         grid = points.grid
         q = ufl.TestFunction(grid.cellwise(self._shape))
         dx = ufl.dx(domain=grid.mesh, subdomain_id=_compat.SUBDOMAIN, metadata={"quadrature_degree": 0})
-        self._compiled = _compat.CompiledForm(ufl.inner(expression, q) / grid.cell_volume * dx)
+        self._compiled = _compat.CompiledForm(ufl.inner(expression, q) * dx)
         self._rows = Rows(self._compiled, points)
         self._many = min(BATCH, grid.num_owned)
         self._compiled.bind(np.arange(self._many))
@@ -362,7 +362,7 @@ class PointExpression:
             self._rows(part)
             self._values[:] = 0.0
             self._compiled.assemble_vector(self._values.reshape(-1), self._rows.room(self._many))
-            out[start : start + len(part)] = self._values[: len(part)]
+            np.divide(self._values[: len(part)], self.points.grid.cell_volume, out=out[start : start + len(part)])
         return out.reshape(len(chosen), *self._shape)
 
 

@@ -146,7 +146,8 @@ class Storage:
         self.damp = FacetForm(damped * ufl.jump(dp) * ufl.jump(q) * dS, self.grid.comm)
         self.fixed_stress = fem.Function(Q)
         smaller = ufl.min_value(self.fixed_stress("+"), self.fixed_stress("-"))
-        alternation = smaller / (4 * d) * across / self.grid.cell_volume * ufl.jump(dp) * ufl.jump(q) * dS
+        volume = fem.Constant(mesh, self.grid.cell_volume)  # not a number: each would be compiled anew
+        alternation = smaller / (4 * d) * across / volume * ufl.jump(dp) * ufl.jump(q) * dS
         self._alternation = FacetForm(alternation, self.grid.comm)
         self.gravity = None
         if weight is not None and self.flows:

@@ -49,15 +49,14 @@ def test_a_larger_background_box_changes_nothing():
     assert states[1].pressure == pytest.approx(states[0].pressure, rel=1e-9, abs=1e-6)
 
 
-@pytest.mark.parametrize("fluid", [False, True], ids=["dry", "saturated"])
-@pytest.mark.parametrize("coupling", ["schur-cg", "fixed-stress"])
+@pytest.mark.parametrize(
+    "fluid, coupling", [(False, "schur-cg"), (True, "schur-cg"), (True, "fixed-stress")], ids=["dry", "schur", "fixed"]
+)
 def test_iterations_and_factors_give_the_same_answer(monkeypatch, fluid, coupling):
-    if coupling == "fixed-stress" and not fluid:
-        pytest.skip("nothing is coupled")
     states = []
     for least in (10**9, 0):
         monkeypatch.setattr(unknowns, "ITERATIVE", least)
-        s = block(fluid=fluid, coupling=coupling)
+        s = block(n=3, fluid=fluid, coupling=coupling)
         result = s.run(1.0, 0.5, progress=False)
         assert result.cuts == 0 and result.residual <= 1e-8 and result.balance <= 1e-8
         states.append(s.points)
@@ -171,8 +170,8 @@ def test_a_normal_traction_on_a_closed_surface_has_no_resultant_and_squeezes_eve
 
 
 def test_cryers_sphere_comes_near_the_exact_pressure_and_nearer_with_smaller_cells():
-    peaks = [cryer.run(cells, 24)[0]["peak"] for cells in (4, 8)]
-    assert peaks[1] < 0.05 and peaks[1] < 0.6 * peaks[0]
+    peaks = [cryer.run(cells, 16)[0]["peak"] for cells in (3, 6)]
+    assert peaks[1] < 0.07 and peaks[1] < 0.6 * peaks[0]
 
 
 @pytest.mark.slow
