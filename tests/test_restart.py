@@ -30,7 +30,7 @@ from mpm_dolfinx.output import Series
 
 def cut_beam():
     simulation, probe = beam(h=0.06)
-    simulation.coupler.max_iterations = 5  # most steps are cut
+    simulation.coupler.max_iterations = 4  # most steps are cut
     return simulation, probe
 
 
