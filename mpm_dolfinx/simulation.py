@@ -122,6 +122,7 @@ class Simulation:
         self._build(self._fixed_nodes(fixed), coupling, tolerance, terms, sources)
         self._conditions: dict[str, Any] = {}
         self._set_conditions(
+            self.present,
             fixed=fixed,
             tractions=tractions,
             displacements=displacements,
@@ -232,8 +233,11 @@ class Simulation:
             self._check_body(body, self.present[body] if 0 <= body < len(self.present) else False, "present")
         for body in add:
             self._check_body(body, body in self._waiting, "one of the bodies to come later")
-        there = enumerate(self.present)
-        check_apart(self.bodies, [(here and body not in remove) or body in add for body, here in there])
+        present = [(here and body not in remove) or body in add for body, here in enumerate(self.present)]
+        check_apart(self.bodies, present)
+        named = {"fixed": fixed, "tractions": tractions, "displacements": displacements, "drained": drained}
+        named |= {"inflows": inflows, "plates": plates, "gravity": gravity}
+        self._set_conditions(present, **{name: value for name, value in named.items() if value is not None})
         for body in remove:
             self._take(body)
         for body in add:
@@ -244,9 +248,6 @@ class Simulation:
                 self._carried = self._carried.joined(at_start(points))
         if reset_displacement:
             self.points.origin = self.points.corners.copy()
-        named = {"fixed": fixed, "tractions": tractions, "displacements": displacements, "drained": drained}
-        named |= {"inflows": inflows, "plates": plates, "gravity": gravity}
-        self._set_conditions(**{name: value for name, value in named.items() if value is not None})
 
     def _check_body(self, body: int, ok: bool, what: str) -> None:
         if not ok:
@@ -264,8 +265,8 @@ class Simulation:
             self._carried = self._carried.kept(self.points.id)
         return taken
 
-    def _set_conditions(self, **conditions) -> None:
-        """Take over the conditions that are named, on the bodies that are there."""
+    def _set_conditions(self, present: Sequence[bool], **conditions) -> None:
+        """Take over the conditions that are named, on the bodies that are there, or none if one is refused."""
         now = self._conditions | conditions
         for name, kind in CONDITIONS.items():
             all_of(name, now[name], kind)
@@ -277,7 +278,7 @@ class Simulation:
         self.boundary = side = Boundary(
             self.grid,
             self.bodies,
-            self.present,
+            present,
             self._scene.stiffest,
             now["tractions"],
             now["displacements"],

@@ -296,6 +296,15 @@ def test_a_run_that_ends_in_bad_input_keeps_what_it_has():
     assert s.run(1.0, 0.125).converged
 
 
+def test_a_stage_that_is_refused_changes_nothing():
+    s = scene([BODY, mpm.box(GRID, [0, 0.5], [0.5, 0.6])], tractions=[mpm.Traction("top", (0, -1e4))])
+    count, boundary = len(s.points), s.boundary
+    with pytest.raises(ValueError, match="side 'lid'"):
+        s.stage(remove=[1], tractions=[mpm.Traction("lid", (0, 1))])
+    assert len(s.points) == count and s.present == [True, True] and s.boundary is boundary
+    assert s.run(1.0, 1.0, progress=False).converged
+
+
 def test_a_point_that_leaves_the_grid_is_named_with_its_time():
     s, _ = beam(fluid=False, ramp=1.0, load=400e3)
     with pytest.raises(mpm.GaveUp, match=r"point \d+ at \[.*\] left the grid .* at t = ") as caught:
