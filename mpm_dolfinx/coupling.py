@@ -139,7 +139,7 @@ class Coupler:
         if self._iterative:
             self._solve_u, self._modes = multigrid_solver(m.K, "momentum"), m.unknowns.rigid_body_modes()
         else:
-            self._solve_u = direct_solver(m.K, "momentum", m.symmetric)
+            self._solve_u = direct_solver(m.K, "momentum", m.symmetric, often=self.storage is not None)
 
     def forget(self) -> None:
         """Make tangent and multigrid anew in the next step: what follows does not depend on the steps before."""
@@ -276,7 +276,7 @@ class Coupler:
         context = SchurComplement(self.storage, self._solve_u)
         self._schur = PETSc.Mat().createPython((n, n), context, comm=self.storage.unknowns.comm)
         self._schur.setUp()
-        self._solve_s = direct_solver(self.storage.P, "storage")
+        self._solve_s = direct_solver(self.storage.P, "storage", often=True)
         kind = {"schur-cg": PETSc.KSP.Type.CG, "schur-fgmres": PETSc.KSP.Type.FGMRES}
         self._solve_s.setType(kind.get(self.coupling, PETSc.KSP.Type.PREONLY))
 

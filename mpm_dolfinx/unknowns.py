@@ -118,27 +118,40 @@ def matrix(rows: Unknowns, columns: Unknowns, row_length: int | NDArray[np.int64
     return A
 
 
-def direct_solver(A: PETSc.Mat, name: str, symmetric: bool = True) -> PETSc.KSP:
+def direct_solver(A: PETSc.Mat, name: str, symmetric: bool = True, often: bool = False) -> PETSc.KSP:
     """Return a solver that factorises A, a symmetric one as L D L^T, refactorised when A has changed.
 
-    MUMPS in parallel; on one process PETSc's own with an approximate minimum degree ordering: at 3000
-    unknowns in 2D 3 ms (nested dissection 4, MUMPS 5, UMFPACK 7, CHOLMOD 9), at 44000 150 (290) ms.
+    On one process PETSc's own with an approximate minimum degree ordering: at 3000 unknowns in 2D 3 ms (nested
+    dissection 4, MUMPS 5, UMFPACK 7, CHOLMOD 9), at 44000 150 (290) ms.  In parallel MUMPS, whose factors take
+    as long on two processes, and a solve five to ten times as long as PETSc's own: if factors are used `often`,
+    each of a few processes (`REDUNDANT`) has them all and they do the same work.
     """
     if symmetric:
         A.setOption(PETSc.Mat.Option.SYMMETRIC, True)
     ksp = PETSc.KSP().create(A.comm)
     ksp.setType(PETSc.KSP.Type.PREONLY)
     ksp.setOptionsPrefix(f"mpm_{name}_")
-    ksp.pc.setType(PETSc.PC.Type.CHOLESKY if symmetric else PETSc.PC.Type.LU)
-    if A.comm.size > 1:
-        PETSc.Options(ksp.getOptionsPrefix()).setValue("mat_mumps_icntl_13", 1)  # counts negative pivots
-        ksp.pc.setFactorSolverType("mumps")
+    kind = PETSc.PC.Type.CHOLESKY if symmetric else PETSc.PC.Type.LU
+    options = PETSc.Options(ksp.getOptionsPrefix())
+    if often and 1 < A.comm.size <= REDUNDANT:
+        ksp.pc.setType(PETSc.PC.Type.REDUNDANT)
+        for name, value in {"type": kind, "factor_mat_ordering_type": "amd", "factor_zeropivot": 0.0}.items():
+            options.setValue(f"redundant_pc_{name}", value)
     else:
-        ksp.pc.setFactorOrdering("amd")
-        ksp.pc.setFactorPivot(0.0)  # PETSc's 2e-14 refuses slivers of cells: rows of any scale are welcome
+        ksp.pc.setType(kind)
+        if A.comm.size > 1:
+            options.setValue("mat_mumps_icntl_13", 1)  # counts negative pivots
+            ksp.pc.setFactorSolverType("mumps")
+        else:
+            ksp.pc.setFactorOrdering("amd")
+            ksp.pc.setFactorPivot(0.0)  # PETSc's 2e-14 refuses slivers of cells: rows of any scale are welcome
     ksp.setOperators(A)
     ksp.setFromOptions()
     return ksp
+
+
+REDUNDANT = 4
+"""Processes up to which each has the factors that are used often."""
 
 
 def negative_pivots(solver: PETSc.KSP) -> int:
