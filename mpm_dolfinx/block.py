@@ -19,8 +19,8 @@ from petsc4py import PETSc
 import numpy as np
 
 from mpm_dolfinx.momentum import Momentum
+from mpm_dolfinx.solvers import multigrid_solver
 from mpm_dolfinx.storage import Storage
-from mpm_dolfinx.unknowns import multigrid_solver
 
 
 class BlockSolver:

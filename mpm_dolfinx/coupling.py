@@ -27,8 +27,8 @@ from dolfinx.common import Timer
 from mpm_dolfinx.block import BlockSolver
 from mpm_dolfinx.check import numbers
 from mpm_dolfinx.momentum import Momentum
+from mpm_dolfinx.solvers import direct_solver, iterative, multigrid_solver, negative_pivots, nodal_solver
 from mpm_dolfinx.storage import FILTER, Storage
-from mpm_dolfinx.unknowns import direct_solver, multigrid_solver, negative_pivots
 
 COUPLINGS = {
     "schur-cg": 0.75,
@@ -122,7 +122,7 @@ class Coupler:
     def set_unknowns(self) -> None:
         """Make the solvers for the present matrices."""
         m = self.momentum
-        self._iterative = m.unknowns.iterative
+        self._iterative = iterative(m.unknowns)
         self._make_solvers()
         self._du, self._rhs = self.momentum.unknowns.vector(), self.momentum.unknowns.vector()
         if self.storage is None:
@@ -138,8 +138,10 @@ class Coupler:
         self._tangent_of = self._solve_s = self._schur = self._block = None
         if self._iterative:
             self._solve_u, self._modes = multigrid_solver(m.K, "momentum"), m.unknowns.rigid_body_modes()
+        elif self.storage is None:
+            self._solve_u = direct_solver(m.K, "momentum", m.symmetric)
         else:
-            self._solve_u = direct_solver(m.K, "momentum", m.symmetric, often=self.storage is not None)
+            self._solve_u = nodal_solver(m.K, "momentum", m.unknowns, m.symmetric)
 
     def forget(self) -> None:
         """Make tangent and multigrid anew in the next step: what follows does not depend on the steps before."""

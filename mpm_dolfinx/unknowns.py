@@ -19,13 +19,6 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx import _compat
 
-ITERATIVE = 1500
-"""Unknowns of a 3D problem from which on it is solved by iterations: see `multigrid_solver`.
-
-Seconds of five load steps of a square beam by factors and by iterations: 0.5 and 0.5 with 1200 unknowns, 2.5 and 1.4
-with 2600, 8.2 and 2.1 with 4900.  In a plate of one cell both cost the same up to 6000.
-"""
-
 
 class Unknowns:
     """Numbering of some of the degrees of freedom of a function's space.
@@ -59,14 +52,19 @@ class Unknowns:
         self.map = PETSc.LGMap().create(number, comm=self.comm)
 
     @property
-    def iterative(self) -> bool:
-        """Whether problems of these unknowns are better solved by iterations than by factors."""
-        return self._space.mesh.topology.dim == 3 and self.global_size >= ITERATIVE
+    def dim(self) -> int:
+        """Degrees of freedom of a node or a cell."""
+        return self._space.dofmap.bs
+
+    @property
+    def nodes(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Node and component of the entries of the vectors."""
+        return np.divmod(self.owned, self.dim)
 
     def rigid_body_modes(self) -> PETSc.NullSpace:
         """Return translations and rotations, as far as the unknowns allow them: what strain does not see."""
         d = self._space.dofmap.bs
-        node, axis = np.divmod(self.owned, d)
+        node, axis = self.nodes
         x, direction = self._space.tabulate_dof_coordinates()[node, :d], np.eye(d)[axis]
         modes = np.concatenate([direction, np.empty((self.size, d * (d - 1) // 2))], axis=1)
         x = x - self.comm.allreduce(x.sum(axis=0)) / self.global_size
@@ -116,80 +114,6 @@ def matrix(rows: Unknowns, columns: Unknowns, row_length: int | NDArray[np.int64
     A.setOption(PETSc.Mat.Option.NEW_NONZERO_ALLOCATION_ERR, False)
     A.setLGMap(rows.map, columns.map)
     return A
-
-
-def direct_solver(A: PETSc.Mat, name: str, symmetric: bool = True, often: bool = False) -> PETSc.KSP:
-    """Return a solver that factorises A, a symmetric one as L D L^T, refactorised when A has changed.
-
-    On one process PETSc's own with an approximate minimum degree ordering: at 3000 unknowns in 2D 3 ms (nested
-    dissection 4, MUMPS 5, UMFPACK 7, CHOLMOD 9), at 44000 150 (290) ms.  In parallel MUMPS, whose factors take
-    as long on two processes, and a solve five to ten times as long as PETSc's own: if factors are used `often`,
-    each of a few processes (`REDUNDANT`) has them all and they do the same work.
-    """
-    if symmetric:
-        A.setOption(PETSc.Mat.Option.SYMMETRIC, True)
-    ksp = PETSc.KSP().create(A.comm)
-    ksp.setType(PETSc.KSP.Type.PREONLY)
-    ksp.setOptionsPrefix(f"mpm_{name}_")
-    kind = PETSc.PC.Type.CHOLESKY if symmetric else PETSc.PC.Type.LU
-    options = PETSc.Options(ksp.getOptionsPrefix())
-    if often and 1 < A.comm.size <= REDUNDANT:
-        ksp.pc.setType(PETSc.PC.Type.REDUNDANT)
-        for name, value in {"type": kind, "factor_mat_ordering_type": "amd", "factor_zeropivot": 0.0}.items():
-            options.setValue(f"redundant_pc_{name}", value)
-    else:
-        ksp.pc.setType(kind)
-        if A.comm.size > 1:
-            options.setValue("mat_mumps_icntl_13", 1)  # counts negative pivots
-            ksp.pc.setFactorSolverType("mumps")
-        else:
-            ksp.pc.setFactorOrdering("amd")
-            ksp.pc.setFactorPivot(0.0)  # PETSc's 2e-14 refuses slivers of cells: rows of any scale are welcome
-    ksp.setOperators(A)
-    ksp.setFromOptions()
-    return ksp
-
-
-REDUNDANT = 4
-"""Processes up to which each has the factors that are used often."""
-
-
-def negative_pivots(solver: PETSc.KSP) -> int:
-    """Return the number of negative eigenvalues of the matrix whose L D L^T factors a direct solver has."""
-    factors = solver.pc.getFactorMatrix()
-    return factors.getMumpsInfog(12) if factors.comm.size > 1 else factors.getInertia()[0]
-
-
-def multigrid_solver(A: PETSc.Mat, name: str) -> PETSc.KSP:
-    """Return GMRES with smoothed aggregation multigrid (GAMG), set up anew when A has changed.
-
-    For elasticity A must have the rigid body modes as near-null space when it is set up.  GMRES because a
-    tangent may be unsymmetric or, where a body buckles, indefinite; on definite ones conjugate gradients
-    take as many iterations: about 20 to 1e-8, with 5000 unknowns as with 60000.  With 60000 the set-up takes 1.0 s,
-    for another tangent of the same unknowns 0.3 s, the solution 0.5 s; BoomerAMG (hypre) takes three to four times
-    as long, and ML cannot keep its set-up.  Unknowns in blocks of three, with rows of the identity for fixed ones,
-    would save a quarter.
-    """
-    prefix = f"mpm_{name}_"
-    options = PETSc.Options(prefix)
-    for option, value in _MULTIGRID.items():
-        if not options.hasName(option):
-            options.setValue(option, value)
-    ksp = PETSc.KSP().create(A.comm)
-    ksp.setType(PETSc.KSP.Type.GMRES)
-    ksp.setPCSide(PETSc.PC.Side.RIGHT)
-    ksp.setOptionsPrefix(prefix)
-    ksp.pc.setType(PETSc.PC.Type.GAMG)
-    ksp.setOperators(A)
-    ksp.setFromOptions()
-    return ksp
-
-
-_MULTIGRID = {
-    "pc_gamg_reuse_interpolation": "true",  # a new tangent of the same unknowns: a quarter of the time
-    "mg_levels_ksp_type": "chebyshev",
-    "mg_levels_pc_type": "jacobi",
-}
 
 
 def zero(A: PETSc.Mat) -> None:

@@ -6,9 +6,9 @@ import sys
 import numpy as np
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx import unknowns
+from mpm_dolfinx import solvers
 
-unknowns.ITERATIVE = 0
+solvers.ITERATIVE = 0
 grid = mpm.Grid([1.2] * 3, [6] * 3)
 block = mpm.box(grid, [0.2, 0.2, 0], [0.9, 0.93, 0.77])
 soil = mpm.Hencky(bulk=4e6 / 3, shear=1e6, conductivity=1e-7)

@@ -24,7 +24,7 @@ from helpers import beam, column
 from test_mpi import mpirun
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx import restart, unknowns
+from mpm_dolfinx import restart, solvers
 from mpm_dolfinx.output import Series
 
 
@@ -107,7 +107,7 @@ def test_resumed_after_any_step_the_end_is_the_same_to_the_last_bit(scene, tmp_p
 
 @pytest.mark.parametrize("fluid", [None, mpm.Fluid()], ids=["dry", "wet"])
 def test_resumed_runs_end_with_the_same_bits_by_multigrid_too(fluid, tmp_path, monkeypatch):
-    monkeypatch.setattr(unknowns, "ITERATIVE", 50)
+    monkeypatch.setattr(solvers, "ITERATIVE", 50)
     test_resumed_after_any_step_the_end_is_the_same_to_the_last_bit(lambda: block(fluid), tmp_path)
 
 

@@ -8,7 +8,7 @@ import pytest
 from helpers import beam
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx import unknowns
+from mpm_dolfinx import solvers
 from mpm_dolfinx.domains import cut_faces
 
 
@@ -27,7 +27,7 @@ def test_memory_does_not_grow_with_the_number_of_steps():
 
 
 def test_iterative_solvers_are_freed_with_the_matrices_they_were_made_for(monkeypatch):
-    monkeypatch.setattr(unknowns, "ITERATIVE", 1)
+    monkeypatch.setattr(solvers, "ITERATIVE", 1)
     grid = mpm.Grid([4, 1.5, 2], [16, 6, 8])
     body = mpm.box(grid, [0, 0.25, 0.625], [3.75, 1.25, 1.625])
     law = mpm.LinearElastic(bulk=1e7, shear=1e7, conductivity=1e-4)

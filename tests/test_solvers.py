@@ -1,0 +1,42 @@
+# SPDX-License-Identifier: MIT
+"""Factors in blocks solve what they are given."""
+
+import numpy as np
+import pytest
+from helpers import SOFT
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.solvers import direct_solver, nodal_solver
+
+
+def momentum(dim: int):
+    """Return the momentum problem of a cube on rollers after a step: some nodes have one unknown, some two or three."""
+    grid = mpm.Grid([1.0] * dim, [4] * dim)
+    walls = {"left": "x", "bottom": "xyz"[dim - 1], "front": "y"}
+    fixed = {wall: axis for wall, axis in walls.items() if dim == 3 or wall != "front"}
+    body, load = mpm.box(grid, [0] * dim, [0.6] * dim), [0.0] * (dim - 1) + [-1e4]
+    s = mpm.Simulation(grid, [body], [SOFT], fixed=fixed, tractions=[mpm.Traction("top", load)])
+    s.step(1.0)
+    return s.momentum
+
+
+@pytest.mark.parametrize("symmetric", [True, False])
+@pytest.mark.parametrize("dim", [2, 3])
+def test_blocks_of_nodes_solve_as_single_unknowns_do_also_when_the_matrix_changes(dim, symmetric):
+    m = momentum(dim)
+    assert m.unknowns.size < dim * len(np.unique(m.unknowns.nodes[0]))  # some blocks are not full
+    K, (b, x) = m.K.copy(), m.K.createVecs()
+    b.array_w[:] = np.random.default_rng(1).standard_normal(b.size)
+    solver = nodal_solver(K, "nodal", m.unknowns, symmetric)
+    for factor in (1.0, 3.0):
+        scale = b.duplicate()
+        scale.array_w[:] = factor
+        if not symmetric:
+            scale.array_w[::2] = 2 * factor
+        K.diagonalScale(L=scale)
+        solver.setOperators(K)
+        solver.solve(b, x)
+        single = x.duplicate()
+        direct_solver(K, "single", symmetric).solve(b, single)
+        assert x.array == pytest.approx(single.array, rel=1e-9, abs=1e-9 * abs(single.array).max())
+        assert (K * x).array == pytest.approx(b.array, abs=1e-9)
