@@ -78,7 +78,8 @@ class Boundary:
             patches = place.surface(faces)
             traction = load.at(t, self.grid.dim)
             if traction.ndim == 0:
-                traction = traction * patches.area / np.linalg.norm(patches.area, axis=1, keepdims=True)
+                area = patches.area(place.points)
+                traction = traction * area / np.linalg.norm(area, axis=1, keepdims=True)
             rows.append((patches.cell, patches.x, patches.area0[:, None] * traction))
         cell, x, force = self._gathered(rows, self.grid.dim)
         momentum.loads.place(cell, x, np.ones(len(cell)), force=force)
@@ -88,7 +89,7 @@ class Boundary:
         grid, rows = self.grid, []
         for _, faces in self.plates:
             patches = place.surface(faces)
-            area = patches.area
+            area = patches.area(place.points)
             length = faces.area0.sum() ** (1 / (grid.dim - 1))
             rigidity = RIGIDITY * self._modulus * length * np.linalg.norm(area, axis=1, keepdims=True)
             normal = np.tile(np.eye(grid.dim)[faces.axis], (len(area), 1))
@@ -104,7 +105,7 @@ class Boundary:
         stiffness = HOLD * self._modulus / self.grid.h.min()
         for number, (hold, faces, axes) in enumerate(self.holds):
             patches = place.surface(faces)
-            gap = patches.origin + hold.at(t, patches.X) - (patches.x + patches.moved)
+            gap = patches.origin(place.points) + hold.at(t, patches.X) - patches.now(place.points)
             for axis in axes:
                 values = np.zeros((len(gap), 3 + d))
                 values[:, 0] = number
@@ -136,7 +137,7 @@ class Boundary:
             patches = place.surface(faces)
             travel = Exchange(grid.comm, grid.owner(patches.cell))
             cell = grid.local(travel.send(patches.cell))
-            area, x = travel.send(patches.area), travel.send(patches.x)
+            area, x = travel.send(patches.area(place.points)), travel.send(patches.x)
             size = np.linalg.norm(area, axis=1)
             cells.append(cell)
             if isinstance(outlet, Inflow):

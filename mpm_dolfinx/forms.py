@@ -92,7 +92,7 @@ class FormPoints:
         Parameters
         ----------
         cells : (n,)
-            Owned local cell of each point; the same array as before if the points stay in their cells.
+            Owned local cell of each point.
         x : (n, d), m
             Positions.
         weight : (n,), m^d
@@ -102,11 +102,13 @@ class FormPoints:
         """
         self._put(cells)
         self.x = x
-        self.data = {
-            "offset": x - self.grid.midpoints[cells],
-            "weight": (weight / self.grid.cell_volume)[:, None],
-            **{name: value.reshape(len(cells), self._size[name]) for name, value in data.items()},
-        }
+        self.data = {"offset": x - self.grid.midpoints[cells]}
+        self.renew(weight, **data)
+
+    def renew(self, weight: NDArray[np.float64], **data) -> None:
+        """Give the points, which stay where they are, new weights and new values of some fields."""
+        rows = {name: value.reshape(len(self.cells), self._size[name]) for name, value in data.items()}
+        self.data |= {"weight": (weight / self.grid.cell_volume)[:, None], **rows}
         self.version += 1
 
     def take(self, points: FormPoints, rows: NDArray[np.int64]) -> None:
@@ -119,10 +121,9 @@ class FormPoints:
         self.version += 1
 
     def _put(self, cells: NDArray[np.int32]) -> None:
-        if cells is not self.cells:
-            self.cells = cells
-            self.filled, self.slots = np.unique(cells, return_inverse=True)
-            self.places += 1
+        self.cells = cells
+        self.filled, self.slots = np.unique(cells, return_inverse=True)
+        self.places += 1
 
     def value(self, f):
         """Return f at the point, f a P1 function, test or trial function (any shape)."""

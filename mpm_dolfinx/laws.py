@@ -152,6 +152,10 @@ class SceneMaterials:
                 out[name][rows] = getattr(at, name)
         return out
 
+    def state(self, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
+        """Return the state at the points (n, ...)."""
+        return {name: points.data[name] for name in self.shapes if any(name in law.state for law in self.laws)}
+
     def effective_stress(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the effective Cauchy stress (n, d, d), Pa, at the points."""
         out = np.zeros_like(points.F)

@@ -119,6 +119,8 @@ class Simulation:
         check_apart(bodies, self.present)
         self.placement: Placement | None = None
         """The domains as they have been cut; None where they are to be cut anew."""
+        self.resets = 0
+        """How often the grid has been reset, and the domains cut."""
 
         start = time.perf_counter()
         self._build(self._fixed_nodes(fixed), coupling, tolerance, terms, sources)
@@ -356,8 +358,9 @@ class Simulation:
     def _stay(self) -> None:
         """Bring the integration data to where the points are now, in the same cells."""
         with Timer("mpm: integration data"):
-            self.placement.follow()
-            self._place_pieces(self.points.J)
+            J = self.points.J
+            self.pieces.renew(self._weight(J), **self._values(self._changing(J)), **self._piece_fields())
+            self._part_laws()
             if self.momentum.plates is not None:
                 self.boundary.place_plates(self.placement, self.momentum)
             if self.storage:
@@ -372,6 +375,7 @@ class Simulation:
 
     def _reset_grid(self) -> None:
         """Rebuild the integration data on the fresh grid: pieces, active cells, remapped pressure."""
+        self.resets += 1
         self._leave_grid()
         self._migrate()
         with Timer("mpm: cut domains"):
@@ -382,34 +386,46 @@ class Simulation:
                 self._travelled = np.zeros_like(place.pieces.x)
         with Timer("mpm: integration data"):
             self.placement, J = place, self.points.J
-            self._place_pieces(J)
+            fields = self._values({**self._scene.values(self.points), **self._constants(), **self._changing(J)})
+            self.pieces.place(place.cells, place.x, self._weight(J), **fields, **self._piece_fields())
+            self._part_laws()
             self._activate(J)
 
-    def _place_pieces(self, J: NDArray[np.float64]) -> None:
-        """Set the integration data of the pieces."""
-        place = self.placement
-        self.pieces.place(
-            place.cells,
-            place.x,
-            place.pieces_to_cells(place.pieces.fraction * (self.points.volume0 * J)[place.pieces.point]),
-            **{name: place.to_cells(values) for name, values in self._fields(J).items()},
-            **{name: place.pieces_to_cells(values) for name, values in self._piece_fields().items()},
-        )
+    def _weight(self, J: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the volumes of the pieces (m,), m^d, on the owners of their cells."""
+        pieces = self.placement.pieces
+        return self.placement.pieces_to_cells(pieces.fraction * (self.points.volume0 * J)[pieces.point])
+
+    def _values(self, fields: Mapping[str, NDArray]) -> dict[str, NDArray]:
+        """Return fields of the points at their pieces, on the owners of their cells."""
+        return {name: self.placement.to_cells(values) for name, values in fields.items()}
+
+    def _part_laws(self) -> None:
+        """Give each of several laws the pieces that follow it."""
         if len(self.laws) > 1:
-            law = place.to_cells(self._scene.law_of(self.points))
+            law = self.placement.to_cells(self._scene.law_of(self.points))
             for number, (_, part) in enumerate(self.laws):
                 part.take(self.pieces, np.flatnonzero(law == number))
 
-    def _fields(self, J: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
-        """Return what the points bring to their pieces."""
-        fields = {"F": self.points.F, **(self.points.data if self._extended else {}), **self._scene.values(self.points)}
-        n = 1 - (1 - self._table(lambda m: m.porosity)) / J
+    def _constants(self) -> dict[str, NDArray[np.float64]]:
+        """Return what the materials bring to their pieces for good."""
+        fields = {}
         if self.fluid:
             fields["biot"] = self._table(lambda m: m.biot)
-            fields["storage"] = self._table(lambda m, n: m.storage(self.fluid.bulk, n), n)
             if self._scene.conductivity_laws:
                 fields["conductivity"] = self._table(lambda m: m.conductivity)
                 fields["porosity0"] = self._table(lambda m: m.porosity)
+        return fields
+
+    def _changing(self, J: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+        """Return what the points bring to their pieces and what changes with them."""
+        points = self.points
+        fields = {"F": points.F, **(points.data if self._extended else self._scene.state(points))}
+        if not self.fluid and self.gravity is None:
+            return fields
+        n = 1 - (1 - self._table(lambda m: m.porosity)) / J
+        if self.fluid:
+            fields["storage"] = self._table(lambda m, n: m.storage(self.fluid.bulk, n), n)
         if self.gravity is not None:
             wet = self.fluid.density if self.fluid else 0.0
             fields["density"] = (1 - n) * self._table(lambda m: m.grain_density) + n * wet
@@ -422,7 +438,7 @@ class Simulation:
             fields["position"] = self.placement.pieces.x
         if self._extended:
             fields["displacement"] = self._displacement()
-        return fields
+        return {name: self.placement.pieces_to_cells(values) for name, values in fields.items()}
 
     def _displacement(self) -> NDArray[np.float64]:
         """Return the displacements (m, d), m, of the pieces' centroids, as those of their domains' corners."""

@@ -35,6 +35,7 @@ def _momentum(s: Simulation) -> list[Part]:
     laws = ", ".join(law.__name__ for law, _ in s.laws)
     state = ", ".join(name for law, _ in s.laws for name in law.state)
     return [
+        _either("reset of the grid", s.resets > 1, f"{s.resets} so far", "nothing has moved so far"),
         Part("stress", True, f"{laws}; integrated over {'exact domains' if s.quadrature == 'domain' else 'points'}"),
         _either(
             "mean dilatation", m.dilatation, f"nu > {LOCKING}, or plastic flow", f"nu <= {LOCKING}, no plastic flow"
