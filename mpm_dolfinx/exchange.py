@@ -8,6 +8,7 @@ integral is assembled by the rank that owns the cell.  On one process nothing is
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TypeVar
 
 from mpi4py import MPI
@@ -16,6 +17,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 T = TypeVar("T")
+
+
+@dataclass
+class Traffic:
+    """What exchanges have sent from this process to others so far: transfers, messages that were not empty, bytes."""
+
+    transfers: int = 0
+    messages: int = 0
+    bytes: int = 0
+
+
+traffic = Traffic()
 
 
 class Exchange:
@@ -58,6 +71,10 @@ class Exchange:
         width = int(np.prod(rows.shape[1:], dtype=int))
         out = np.empty((int(received.sum()), *rows.shape[1:]), dtype=rows.dtype)
         kind = MPI._typedict[rows.dtype.char]
+        away = np.delete(counts, self.comm.rank)
+        traffic.transfers += 1
+        traffic.messages += int(np.count_nonzero(away))
+        traffic.bytes += int(away.sum()) * width * rows.itemsize
         self.comm.Alltoallv([rows, counts * width, kind], [out, received * width, kind])
         return out
 

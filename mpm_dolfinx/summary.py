@@ -1,10 +1,17 @@
 # SPDX-License-Identifier: MIT
-"""What a scene is compiled to: its terms and solvers, and why it does without the others."""
+"""What a scene is compiled to: its terms and solvers, and why it does without the others; how it is shared out."""
 
 from __future__ import annotations
 
+import resource
+import sys
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
+
+from mpi4py import MPI
+
+import numpy as np
 
 from mpm_dolfinx.materials import LOCKING
 
@@ -85,3 +92,26 @@ def table(simulation: Simulation) -> str:
     rows = parts(simulation)
     width = max(len(part.name) for part in rows)
     return "\n".join(f"{part.name:{width}}  {'yes' if part.used else 'no ':3}  {part.why}" for part in rows)
+
+
+def imbalance(simulation: Simulation) -> dict[str, float]:
+    """Return the most that one process has over the mean of all: points, pieces, active cells; after the first step.
+
+    1 is perfect; the time of a step goes with the pieces.  Called on all processes together.
+    """
+    comm, pieces = simulation.grid.comm, simulation.pieces
+    mine = np.array([len(simulation.points), len(pieces.cells), len(pieces.filled)], dtype=float)
+    total, most = np.empty_like(mine), np.empty_like(mine)
+    comm.Allreduce(mine, total)
+    comm.Allreduce(mine, most, MPI.MAX)
+    ratio = np.divide(most * comm.size, total, out=np.ones_like(mine), where=total > 0)
+    return dict(zip(("points", "pieces", "active cells"), ratio.tolist(), strict=True))
+
+
+def peak_memory() -> float:
+    """Return the most memory that this process has had, MB."""
+    status = Path("/proc/self/status")
+    if status.exists():  # Linux counts the parent's into getrusage
+        (line,) = (line for line in status.read_text().splitlines() if line.startswith("VmHWM:"))
+        return int(line.split()[1]) / 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 1024)

@@ -24,6 +24,7 @@ from mpm_dolfinx.check import functions, line
 from mpm_dolfinx.coupling import NotConverged
 from mpm_dolfinx.placement import LeftGrid
 from mpm_dolfinx.points import Probes
+from mpm_dolfinx.summary import imbalance, peak_memory
 
 if TYPE_CHECKING:
     from mpm_dolfinx.simulation import Simulation
@@ -52,7 +53,8 @@ class Result:
     t (s); displacement (m, d) of the probes, m; pressure: least and largest on the points, Pa; and of
     the steps so far: steps, newton, coupling (iterations), balance and residual (worst, relative), cuts,
     rederived (domains that had folded), wall (s), and profile: seconds of each part of the run on this
-    process, from dolfinx's timers.
+    process, from dolfinx's timers.  points: material points; memory: peak of all processes, libraries
+    included, MB; imbalance: the most that one of several processes has over their mean, at the last output time.
     dt: output interval, s; small: the step to try next, s; converged: the end has been reached.
     """
 
@@ -71,11 +73,20 @@ class Result:
     small: float = 0.0
     converged: bool = False
     profile: dict[str, float] = field(default_factory=dict)
+    points: int = 0
+    memory: float = 0.0
+    imbalance: dict[str, float] = field(default_factory=dict)
 
     def shares(self) -> str:
-        """Return the profile as a table: seconds and share of the wall time of each part."""
+        """Return seconds and share of the wall time of each part, memory and imbalance as a table."""
         rows = [*self.profile.items(), ("rest", self.wall - sum(self.profile.values()))]
-        return "\n".join(f"{name:18} {s:8.2f} s {100 * s / max(self.wall, 1e-9):5.1f} %" for name, s in rows)
+        lines = [f"{name:18} {s:8.2f} s {100 * s / max(self.wall, 1e-9):5.1f} %" for name, s in rows]
+        per_point = 1024 * self.memory / max(self.points, 1)
+        lines.append(f"{'memory':18} {self.memory:8.0f} MB, {per_point:.3g} kB for each of {self.points} points")
+        if self.imbalance:
+            ratios = ", ".join(f"{name} {ratio:.2f}" for name, ratio in self.imbalance.items())
+            lines.append(f"{'most over mean':18} {ratios} (1: perfect balance)")
+        return "\n".join(lines)
 
 
 def log(comm: MPI.Intracomm, message: str, *values) -> None:
@@ -156,6 +167,7 @@ def run(
             result.converged = k == intervals
             with Timer("mpm: output"):
                 _record(simulation, result, probes)
+                _measure(simulation, result)
                 stopwatch.read()
                 for observer in observers:
                     observer(simulation)
@@ -242,3 +254,11 @@ def _record(simulation: Simulation, result: Result, probes: Probes | None) -> No
         p = points.pressure
         ends = comm.allgather((p.min(initial=np.inf), p.max(initial=-np.inf)))
         result.pressure.append((min(e[0] for e in ends), max(e[1] for e in ends)))
+
+
+def _measure(simulation: Simulation, result: Result) -> None:
+    """Note the memory, and how evenly processes share the work."""
+    comm = simulation.grid.comm
+    points, result.memory = comm.allreduce(np.array([len(simulation.points), peak_memory()])).tolist()
+    result.points = int(points)
+    result.imbalance = imbalance(simulation) if comm.size > 1 else {}

@@ -32,3 +32,21 @@ def test_the_state_is_the_same_on_several_processes(scene, tmp_path):
         assert other["x"] == pytest.approx(states[0]["x"], abs=1e-10)
         for name in set(other.files) - {"x", "tip", "balance", "counts"}:
             assert other[name] == pytest.approx(states[0][name], abs=1e-8 * np.abs(states[0][name]).max())
+
+
+def test_imbalance_memory_and_traffic_are_those_of_the_processes(tmp_path):
+    found = {}
+    for processes in (1, 2):
+        mpirun(processes, "mpi_imbalance.py", str(tmp_path / "out.npz"))
+        found[processes] = dict(np.load(tmp_path / "out.npz"))
+    one, two = found[1], found[2]
+    assert not one["sent"].any() and not one["whole_imbalance"].size, "a process alone sends nothing"
+    assert one["whole_points"] == two["whole_points"] == 400 and two["half_points"] == 200
+    assert 1.5 < two["whole_memory"] / one["whole_memory"] < 3
+    for when in ("whole", "half"):
+        counts = two[f"{when}_counts"]
+        assert two[f"{when}_imbalance"] == pytest.approx(counts.max(axis=0) / counts.mean(axis=0))
+    assert two["whole_imbalance"].max() < 1.1
+    assert two["half_imbalance"][0] == 2, "what is left lies on one process"
+    (transfers, other), messages, sent = two["sent"].T
+    assert transfers == other > 0 and (messages <= transfers).all() and (sent > 8 * messages).any()

@@ -1,0 +1,202 @@
+# SPDX-License-Identifier: MIT
+"""What a scene saves by what it does without: each feature measured in a pair of scenes, with and without it.
+
+A square block of 1 m between smooth walls is pressed on its top, little enough that the active cells stay.  In each
+pair one feature is left out, or is there and does next to nothing: gravity of zero, a conductivity of 1e-30 m/s, a
+plastic law far from yielding, a penalty that damps what is not there.  `settlement` is the largest relative
+difference of the answers; with mean dilatation it is that of the two Poisson ratios.
+
+Steps of both scenes are taken in turn, --repeat times; the least of each counts, since other work on the machine
+only adds.  Compile time is what the scene and its first step take longer in a process with an empty cache of
+compiled forms than in one that finds them; memory the peak of the latter.  All times are processor times.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from unittest.mock import patch
+
+import numpy as np
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.materials import LOCKING
+from mpm_dolfinx.summary import peak_memory
+
+SHEAR, LOAD, DT, STEPS = 5e6, 20.0, 1.0, 4  # Pa, Pa a step, s, steps at a time
+WATER = {"fluid": mpm.Fluid(), "drained": [mpm.Drained("top")]}
+SEALED = {"fluid": mpm.Fluid()}
+
+
+def soil(law: type[mpm.Skeleton] = mpm.Hencky, nu: float = 0.0, **options) -> mpm.Skeleton:
+    """Return a skeleton with a Poisson ratio."""
+    return law(bulk=2 * SHEAR * (1 + nu) / (3 * (1 - 2 * nu)), shear=SHEAR, **options)
+
+
+def block(cells: int, material: mpm.Skeleton | None = None, box: float = 1.0, **options) -> mpm.Simulation:
+    """Return the block, that many cells wide; the grid reaches to `box`, m, and two cells above it."""
+    h = 1 / cells
+    grid = mpm.Grid([box, box + 2 * h], [round(box * cells), round(box * cells) + 2])
+    load = mpm.Traction("top", lambda t: (0, -LOAD * t))
+    fixed = {"left": "x", "right": "x", "bottom": "y"}
+    body = mpm.box(grid, [0, 0], [1, 1])
+    return mpm.Simulation(grid, [body], [material or soil()], fixed=fixed, tractions=[load], **options)
+
+
+def weighted(cells: int) -> mpm.Simulation:
+    """Return the block with the ghost penalty on all faces: every cell passes for partly filled."""
+    simulation = block(cells)
+    activate = simulation._activate
+
+    def all_partly(J):
+        with patch("mpm_dolfinx.simulation.FULL", 2.0):
+            activate(J)
+
+    simulation._activate = all_partly
+    return simulation
+
+
+def refactorised(cells: int) -> mpm.Simulation:
+    """Return the draining block of a linear law, taken for one that is not."""
+    simulation = linear(cells)
+    simulation.momentum.linear = False
+    return simulation
+
+
+def linear(cells: int) -> mpm.Simulation:
+    """Return the draining block of a linear law."""
+    return block(cells, soil(mpm.LinearElastic, conductivity=1e-4), **WATER)
+
+
+class Watched(mpm.Hencky):
+    """A skeleton whose pressure jumps are looked after at four times the flow."""
+
+    def pressure_damping(self, dim: int) -> float:
+        return 4 * super().pressure_damping(dim)
+
+
+def conducting(cells: int, law: type[mpm.Skeleton]) -> mpm.Simulation:
+    """Return the draining block with dt kappa = 8 tau h²; below 4 jumps are looked after, below 1 damped."""
+    kappa = 8 * soil().pressure_damping(2) / cells**2 / DT
+    return block(cells, soil(law, conductivity=kappa * WATER["fluid"].unit_weight), **WATER)
+
+
+Make = Callable[[int], mpm.Simulation]
+PAIRS: dict[str, tuple[Make, Make]] = {
+    "pore fluid that drains at once": (block, lambda n: block(n, soil(conductivity=1e3), **WATER)),
+    "flux form": (lambda n: block(n, **SEALED), lambda n: block(n, soil(conductivity=1e-30), **SEALED)),
+    "body force": (block, lambda n: block(n, gravity=(0, 0))),
+    "ghost penalty on all faces": (block, weighted),
+    "damping of pressure jumps": (lambda n: conducting(n, mpm.Hencky), lambda n: conducting(n, Watched)),
+    "mean dilatation": (
+        lambda n: block(n, soil(nu=LOCKING - 1e-3)),
+        lambda n: block(n, soil(nu=LOCKING + 1e-3)),
+    ),
+    "plastic law, with mean dilatation": (
+        block,
+        lambda n: block(n, soil(mpm.DruckerPrager, friction=30.0, dilation=0.0, cohesion=1e9)),
+    ),
+    "finite strain": (lambda n: block(n, soil(mpm.LinearElastic)), block),
+    "factors of a linear law in each step": (linear, refactorised),
+    "files of each step": (block, block),
+    "16 times the background grid": (lambda n: block(n, box=1 + 2 / n), lambda n: block(n, box=4.0)),
+}
+QUICK = ("body force", "files of each step")
+MAKES = [make for pair in PAIRS.values() for make in pair]
+
+
+def take(simulation: mpm.Simulation, folder: str | None) -> tuple[float, mpm.Result]:
+    """Take some steps; return processor seconds of one, and the result."""
+    probe = mpm.probes(simulation.bodies, [[0.5, 1.0]])
+    observe = [mpm.Writer(simulation, folder)] if folder else []
+    end, began = simulation.t + STEPS * DT, time.process_time()
+    result = simulation.run(end, DT, probes=probe, observe=observe, progress=False)
+    return (time.process_time() - began) / result.steps, result
+
+
+def first_step(make: Make, cells: int) -> dict[str, float]:
+    """Return the processor seconds to a scene's first step and the peak memory of this process, MB."""
+    began = sum(os.times()[:4])  # the C compiler's too
+    make(cells).step(DT)
+    return {"seconds": sum(os.times()[:4]) - began, "memory": peak_memory()}
+
+
+@cache
+def compiled(make: Make, cells: int) -> tuple[float, float]:
+    """Return seconds of compilation, and memory of a process that finds all compiled, MB."""
+    command = [sys.executable, __file__, "--cells", str(cells), "--one", str(MAKES.index(make))]
+    with TemporaryDirectory() as folder:
+        environment = {**os.environ, "XDG_CACHE_HOME": folder}
+        runs = [subprocess.run(command, env=environment, capture_output=True, text=True, check=True) for _ in range(2)]
+    cold, warm = (json.loads(done.stdout.splitlines()[-1]) for done in runs)
+    return cold["seconds"] - warm["seconds"], warm["memory"]
+
+
+def measure(name: str, cells: int, repeat: int) -> dict:
+    """Return what a pair costs without and with the feature, as lists of two."""
+    pair = [make(cells) for make in PAIRS[name]]
+    least, tops = [np.inf, np.inf], [0.0, 0.0]
+    with TemporaryDirectory() as folder:
+        files = [None, folder if name == "files of each step" else None]
+        for turn in range(repeat + 1):  # the first is not counted
+            for k in (0, 1):
+                seconds, result = take(pair[k], files[k] and f"{files[k]}/{turn}")
+                tops[k] = result.displacement[-1][0, 1]
+                if turn:
+                    least[k] = min(least[k], seconds)
+    compile_s, memory = zip(*(compiled(make, cells) for make in PAIRS[name]), strict=True)
+    ratio, difference = least[1] / least[0], abs(tops[1] / tops[0] - 1)
+    return {"step_s": least, "ratio": ratio, "compile_s": compile_s, "memory_MB": memory, "settlement": difference}
+
+
+def line(name: str, row: dict) -> str:
+    """Return a row of the Markdown table."""
+    ms, compile_s = 1e3 * np.array(row["step_s"]), row["compile_s"]
+    more = row["memory_MB"][1] - row["memory_MB"][0]
+    times = f"{ms[0]:.1f} | {ms[1]:.1f} | {row['ratio']:.2f}"
+    return f"| {name} | {times} | {compile_s[0]:.1f} | {compile_s[1]:.1f} | {more:+.0f} | {row['settlement']:.0e} |"
+
+
+def main(argv: list[str] | None = None) -> dict:
+    """Run the demo; return what --json prints."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--cells", type=int, default=40, help="cells over the width of the block")
+    parser.add_argument("--repeat", type=int, default=8, help="turns of a pair, after one that is not counted")
+    parser.add_argument("--quick", action="store_true", help="a few pairs of small blocks, one turn")
+    parser.add_argument("--out", type=Path, default=Path("out/benchmark_pruning"), help="folder for the table")
+    parser.add_argument("--one", type=int, help=argparse.SUPPRESS)  # of MAKES, in a process of its own
+    parser.add_argument("--json", action="store_true", help="print the results as one line of JSON at the end")
+    o = parser.parse_args(argv)
+    if min(o.cells, o.repeat) < 1:
+        parser.error(f"--cells {o.cells} --repeat {o.repeat}: must be >= 1")
+    if o.one is not None:
+        print(json.dumps(first_step(MAKES[o.one], o.cells)))
+        return {"converged": True}
+    cells, repeat = (10, 1) if o.quick else (o.cells, o.repeat)
+    lines = [
+        "| feature | step without (ms) | with (ms) | ratio | compile without (s) | with (s) | MB more | settlement |"
+    ]
+    lines.append("|---" * 8 + "|")
+    print("\n".join(lines), flush=True)
+    out = {"cells": cells, "pairs": {}, "converged": True}
+    for name in QUICK if o.quick else PAIRS:
+        out["pairs"][name] = measure(name, cells, repeat)
+        lines.append(line(name, out["pairs"][name]))
+        print(lines[-1], flush=True)
+    o.out.mkdir(parents=True, exist_ok=True)
+    (o.out / "pruning.md").write_text("\n".join(lines) + "\n")
+    if o.json:
+        print(json.dumps(out))
+    return out
+
+
+if __name__ == "__main__":
+    sys.exit(0 if main()["converged"] else 1)

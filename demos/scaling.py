@@ -1,0 +1,324 @@
+# SPDX-License-Identifier: MIT
+"""What a step costs: time of each part, memory and messages against the number of material points and processes.
+
+Two saturated bodies that creep through the grid: the beam of `poroelastic_beam.py` in 2D (direct solvers, in a
+background box that is six times as large), and a cube of 1 m that is sheared and pressed in 3D (multigrid).  Every
+run is a process of its own, or several under mpirun (--processes 1 2).  After a first step, which compiles and
+fills the caches, steps are taken one by one; the fastest counts, since other work on the machine only adds.  Memory
+is the peak since the start of the process, libraries and compiler included.
+
+The exponent of a part is the slope of log(time) over log(points), by least squares over the upper half of the
+sizes; `kB a point` is the slope of the memory.  Runs on several processes also say how even the work is (`imbalance`:
+the most pieces that a process has over the mean) and what travels in a step, most of any process: `exchange_...` is
+what the package sends (pieces, corners, points), `solver_...` what PETSc counts in set-up and solution of its Krylov
+solvers; MUMPS's and dolfinx's own messages are not counted.
+
+With runs on one and on several processes, a cost model is fitted to the seconds of a step of n points on P
+processes,
+
+    T = e + a n / P + b (n / P)^((d - 1) / d) [P > 1] + c log2 P,
+
+a fixed cost, work of the points, halo, and messages whose size does not matter; all >= 0, by least squares of
+relative errors.  Runs on more processes than the machine has processors count for messages only.  In 2D the solvers
+are left out: factors do not cost n / P.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from mpi4py import MPI
+from petsc4py import PETSc
+
+import numpy as np
+import poroelastic_beam as beam
+from scipy.optimize import nnls
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.exchange import traffic
+from mpm_dolfinx.timeloop import PARTS
+
+SIZES = {
+    "quick": {2: (500, 2000), 3: (200, 1000)},
+    "default": {2: (1e3, 3e3, 1e4, 3e4, 1e5), 3: (1e3, 3e3, 1e4, 3e4)},
+    "largest": {2: (1e3, 3e3, 1e4, 3e4, 1e5, 3e5, 1e6), 3: (1e3, 3e3, 1e4, 3e4, 1e5, 3e5)},
+}
+STEPS = 3  # after the first
+SOLVERS = ("factorisation", "linear solve")
+
+
+# ---- one run -------------------------------------------------------------------------------------
+
+
+def scene(dim: int, points: float) -> tuple[mpm.Simulation, float]:
+    """Return a body of about so many points, and its time step, s."""
+    if dim == 2:
+        h = np.sqrt(4 * beam.LENGTH * beam.HEIGHT / points)
+        return beam.scene(beam.arguments(["--h", str(h), "--ramp", "0.6"]))[0], 0.02
+    n = max(2, round((points / 8) ** (1 / 3)))
+    grid = mpm.Grid([1 + 3 / n] * 3, [n + 3] * 3)
+    lower = np.array([1.5, 1.5, 0]) / n
+    load = mpm.Traction("top", lambda t: (2e4 * t, 1e4 * t, -5e4 * t))
+    simulation = mpm.Simulation(
+        grid,
+        [mpm.box(grid, lower, lower + 1)],
+        [mpm.Hencky(bulk=4e6 / 3, shear=1e6, conductivity=1e-5)],
+        fluid=mpm.Fluid(),
+        fixed={"bottom": "xyz"},
+        drained=[mpm.Drained("top")],
+        tractions=[load],
+    )
+    return simulation, 0.25
+
+
+def sent() -> np.ndarray:
+    """Return messages and bytes of the exchanges, and messages, bytes and reductions of the solvers so far."""
+    events = [PETSc.Log.Event(name).getPerfInfo() for name in ("KSPSolve", "PCSetUp")]
+    solver = [sum(e[name] for e in events) for name in ("numMessages", "messageLength", "numReductions")]
+    return np.array([traffic.messages, traffic.bytes, *solver], dtype=float)
+
+
+def measure(dim: int, points: float) -> dict:
+    """Return the costs of the fastest step of a run; on all processes together."""
+    PETSc.Log.begin()
+    began = time.perf_counter()
+    simulation, dt = scene(dim, points)
+    first = simulation.run(dt, dt, progress=False)
+    comm, setup, before = simulation.grid.comm, time.perf_counter() - began, sent()
+    steps = [simulation.run(simulation.t + dt, dt, progress=False) for _ in range(STEPS)]
+    best = min(steps, key=lambda step: step.wall)
+    most = np.max(comm.allgather((sent() - before) / STEPS), axis=0).tolist()
+    names = ("exchange_messages", "exchange_bytes", "solver_messages", "solver_bytes", "solver_reductions")
+    return {
+        "dim": dim,
+        "processes": comm.size,
+        "points": best.points,
+        "active_cells": simulation.active_cells,
+        "grid_cells": int(simulation.grid.shape.prod()),
+        "unknowns": simulation.momentum.unknowns.global_size + simulation.storage.unknowns.global_size,
+        "newton": best.newton,
+        "coupling": best.coupling,
+        "cuts": first.cuts + sum(step.cuts for step in steps),
+        "setup_s": setup,
+        "step": best.wall,
+        **best.profile,
+        "rest": best.wall - sum(best.profile.values()),
+        "memory_MB": best.memory,
+        "imbalance": best.imbalance.get("pieces", 1.0),
+        **dict(zip(names, most, strict=True)),
+    }
+
+
+def in_own_process(dim: int, points: float, processes: int) -> dict:
+    """Return what `measure` does in a process of its own, or in several."""
+    command = [sys.executable, "-m", "mpi4py", __file__, "--one", str(dim), str(points)]
+    if processes > 1:
+        command = ["mpirun", "--oversubscribe", "-n", str(processes), *command]
+    done = subprocess.run(command, env=dict(os.environ), capture_output=True, text=True)
+    if done.returncode:
+        raise RuntimeError(f"{dim}D, {points:g} points, {processes} processes: {done.stderr[-2000:]}")
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+# ---- many runs -----------------------------------------------------------------------------------
+
+
+def exponents(rows: list[dict]) -> dict[str, float]:
+    """Return the exponents of the parts over the upper half of the sizes, and the memory's slope, kB a point."""
+    upper = rows[(len(rows) - 1) // 2 :]
+    n = np.array([row["points"] for row in upper], dtype=float)
+    found = {"kB a point": 1024 * float(np.polyfit(n, [row["memory_MB"] for row in upper], 1)[0])}
+    for part in ("step", *PARTS, "rest"):
+        seconds = np.array([row[part] for row in upper])
+        if (seconds > 0).all():
+            found[part] = float(np.polyfit(np.log(n), np.log(seconds), 1)[0])
+    return found
+
+
+def terms(dim: int, n: float, processes: int) -> list[float]:
+    """Return the terms of the cost model."""
+    share = n / processes
+    return [1.0, share, share ** ((dim - 1) / dim) * (processes > 1), np.log2(processes)]
+
+
+def modelled(row: dict) -> float:
+    """Return the seconds of a step that the cost model stands for."""
+    return row["step"] - (sum(row[part] for part in SOLVERS) if row["dim"] == 2 else 0.0)
+
+
+def fit(rows: list[dict]) -> dict[str, float]:
+    """Return the coefficients of the cost model, s, and its largest relative error on the runs."""
+    timed = [row for row in rows if row["processes"] <= (os.cpu_count() or 1)]
+    A = np.array([terms(row["dim"], row["points"], row["processes"]) for row in timed])
+    T = np.array([modelled(row) for row in timed])
+    coefficients, _ = nnls(A / T[:, None], np.ones(len(T)))
+    found = dict(zip("eabc", coefficients.tolist(), strict=True))
+    return {**found, "worst": float(np.abs(A @ coefficients / T - 1).max())}
+
+
+def predicted(model: dict[str, float], dim: int, n: float, processes: int) -> float:
+    """Return the model's seconds of a step."""
+    return float(np.dot(terms(dim, n, processes), [model[name] for name in "eabc"]))
+
+
+# ---- reporting -----------------------------------------------------------------------------------
+
+
+def table(rows: list[dict], found: dict[str, float]) -> str:
+    """Return times by part, s, and memory as a Markdown table."""
+    names = ("step", *PARTS, "rest")
+    lines = [f"| points | processes | cells | {' | '.join(names)} | MB | imbalance |", "|---" * (len(names) + 5) + "|"]
+    for row in rows:
+        seconds = " | ".join(f"{row[name]:.3g}" for name in names)
+        sizes = f"{row['points']} | {row['processes']} | {row['active_cells']}"
+        lines.append(f"| {sizes} | {seconds} | {row['memory_MB']:.0f} | {row['imbalance']:.2f} |")
+    slopes = " | ".join(f"{found.get(name, np.nan):.2f}" for name in names)
+    return "\n".join([*lines, f"| exponent | | | {slopes} | {found['kB a point']:.2f} kB a point | |"])
+
+
+def messages(rows: list[dict]) -> str:
+    """Return what a process sends in a step as a Markdown table."""
+    lines = ["| points | processes | exchange: messages | kB | solvers: messages | kB | reductions |", "|---" * 7 + "|"]
+    for r in (row for row in rows if row["processes"] > 1):
+        exchange = f"{r['exchange_messages']:.0f} | {r['exchange_bytes'] / 1024:.0f}"
+        solver = f"{r['solver_messages']:.0f} | {r['solver_bytes'] / 1024:.0f} | {r['solver_reductions']:.0f}"
+        lines.append(f"| {r['points']} | {r['processes']} | {exchange} | {solver} |")
+    return "\n".join(lines)
+
+
+def prediction(model: dict[str, float], dim: int) -> str:
+    """Return the cost model, and what it says of many processes."""
+    form = (
+        f"{model['e']:.2g} + {model['a']:.2g} n/P + {model['b']:.2g} (n/P)^({dim - 1}/{dim}) + {model['c']:.2g} log2 P"
+    )
+    lines = [f"{dim}D: T = {form} s, within {100 * model['worst']:.0f} % of the runs"]
+    for share in (1e4, 1e5):
+        times = [f"{predicted(model, dim, share * P, P):.2f} s on {P}" for P in (1, 2, 64, 1024, 4096)]
+        lines.append(f"    {share:g} points a process: {', '.join(times)}")
+    return "\n".join(lines)
+
+
+def draw(out: Path, rows: list[dict]) -> None:
+    """Draw the time of the parts and the memory against the number of points."""
+    dims = sorted({row["dim"] for row in rows})
+    fig, axes = beam.figure(len(dims), 2, (12, 4.6 * len(dims)))
+    for dim, (left, right) in zip(dims, axes, strict=True):
+        by_processes = {
+            p: [r for r in rows if (r["dim"], r["processes"]) == (dim, p)] for p in {r["processes"] for r in rows}
+        }
+        for k, p in enumerate(sorted(by_processes)):
+            n = [row["points"] for row in by_processes[p]]
+            label = f"{p} process" + "es" * (p > 1)
+            left.loglog(
+                n,
+                [row["step"] for row in by_processes[p]],
+                "ks-"[0] + "os^D"[k % 4] + "-",
+                lw=2,
+                label=f"step, {label}",
+            )
+            right.loglog(n, [row["memory_MB"] for row in by_processes[p]], "o-", label=label)
+        alone = by_processes[min(by_processes)]
+        n, found = np.array([row["points"] for row in alone]), exponents(alone)
+        for k, part in enumerate(sorted((*PARTS, "rest"), key=lambda part: -alone[-1][part])[:8]):
+            left.loglog(
+                n,
+                [row[part] for row in alone],
+                "osv^D*Pd"[k] + "-",
+                ms=3,
+                lw=1,
+                label=f"{part}, {found.get(part, np.nan):.2f}",
+            )
+        left.loglog(n, alone[-1]["step"] * n / n[-1], "k:", lw=1, label="slope 1")
+        base = alone[-1]["memory_MB"] - found["kB a point"] / 1024 * n[-1]
+        right.loglog(
+            n,
+            base + found["kB a point"] / 1024 * n,
+            "k:",
+            lw=1,
+            label=f"{base:.0f} MB + {found['kB a point']:.1f} kB a point",
+        )
+        left.set(
+            xlabel="material points", ylabel="time per step (s)", title=f"{dim}D: a step, and the exponent of each part"
+        )
+        right.set(xlabel="material points", ylabel="peak memory, all processes (MB)", title=f"{dim}D: memory")
+        left.legend(fontsize=8)
+        right.legend(fontsize=8)
+        for ax in (left, right):
+            ax.grid(alpha=0.3, which="both")
+    fig.savefig(out / "scaling.png", dpi=120)
+
+
+def write(out: Path, rows: list[dict]) -> dict:
+    """Write tables and pictures, print what they say; return exponents and cost models, by dimension."""
+    out.mkdir(parents=True, exist_ok=True)
+    with (out / "scaling.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, fieldnames=list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+    text, found = [], {}
+    for dim in sorted({row["dim"] for row in rows}):
+        mine = [row for row in rows if row["dim"] == dim]
+        fewest = min(row["processes"] for row in mine)
+        found[f"{dim}D"] = slopes = {"exponents": exponents([row for row in mine if row["processes"] == fewest])}
+        text += [f"{dim}D, seconds of a step:", "", table(mine, slopes["exponents"]), ""]
+        several = {row["processes"] for row in mine} - {1}
+        if several:
+            text += ["Sent by a process in a step:", "", messages(mine), ""]
+        if several and fewest == 1:
+            slopes["model"] = fit(mine)
+            text += [prediction(slopes["model"], dim), ""]
+    (out / "scaling.md").write_text("\n".join(text))
+    print("\n".join(text))
+    draw(out, rows)
+    print(f"pictures and tables: {out}/")
+    return found
+
+
+def main(argv: list[str] | None = None) -> dict:
+    """Run the demo; return what --json prints."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    add = parser.add_argument
+    add("--dims", type=int, nargs="+", choices=(2, 3), default=[2, 3], help="dimensions")
+    size = parser.add_mutually_exclusive_group()
+    size.add_argument("--quick", action="store_true", help="a few small sizes")
+    size.add_argument("--largest", action="store_true", help="up to 1e6 points in 2D, 3e5 in 3D: a quarter of an hour")
+    add("--processes", type=int, nargs="+", default=[1], help="numbers of processes; under mpirun: its own")
+    add("--one", nargs=2, help=argparse.SUPPRESS)  # a run in a process of its own: dimension, points
+    add("--out", type=Path, default=Path("out/scaling"), help="folder for the picture and the tables")
+    add("--json", action="store_true", help="print the results as one line of JSON at the end")
+    o = parser.parse_args(argv)
+    if min(o.processes) < 1:
+        parser.error(f"--processes {min(o.processes)}: must be >= 1")
+    comm = MPI.COMM_WORLD
+    if o.one:
+        row = measure(int(o.one[0]), float(o.one[1]))
+        if comm.rank == 0:
+            print(json.dumps(row))
+        return {"converged": True}
+    sizes = SIZES["quick" if o.quick else "largest" if o.largest else "default"]
+    rows = []
+    for dim in o.dims:
+        for points in sizes[dim]:
+            for processes in o.processes if comm.size == 1 else [comm.size]:
+                row = measure(dim, points) if comm.size > 1 else in_own_process(dim, points, processes)
+                rows.append(row)
+                if comm.rank == 0:
+                    what = f"{dim}D, {row['points']:8} points, {processes} processes"
+                    print(f"{what}: {row['step']:.3g} s a step, {row['memory_MB']:.0f} MB", flush=True)
+    out = {"rows": rows, "converged": True}
+    if comm.rank == 0:
+        out |= write(o.out, rows)
+        if o.json:
+            print(json.dumps(out))
+    return out
+
+
+if __name__ == "__main__":
+    sys.exit(0 if main()["converged"] else 1)

@@ -1,0 +1,34 @@
+# SPDX-License-Identifier: MIT
+"""Dig half of a body away on however many processes there are; write how even the work is, and what was sent."""
+
+import sys
+
+import numpy as np
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.exchange import traffic
+
+grid = mpm.Grid([2.0, 0.6], [20, 6])
+bodies = [mpm.box(grid, [0, 0], [1, 0.5]), mpm.box(grid, [1, 0], [2, 0.5])]
+walls = {"left": "x", "right": "x", "bottom": "xy"}
+simulation = mpm.Simulation(
+    grid, bodies, [mpm.Hencky(bulk=1e6, shear=6e5)], fixed=walls, gravity=lambda t: (0, -9.81 * t)
+)
+
+
+def measured(t_end):
+    """Return the reported imbalance and memory of a run, and on rank 0 what all processes have."""
+    result = simulation.run(t_end, 0.5, progress=False)
+    mine = (len(simulation.points), len(simulation.pieces.cells), len(simulation.pieces.filled))
+    print(result.shares())
+    return list(result.imbalance.values()), result.memory, result.points, grid.comm.gather(mine)
+
+
+whole = measured(1.0)
+simulation.stage(remove=[1])
+half = measured(2.0)
+sent = grid.comm.gather((traffic.transfers, traffic.messages, traffic.bytes))
+if sent:
+    names = ("imbalance", "memory", "points", "counts")
+    states = {f"{when}_{n}": v for when, s in (("whole", whole), ("half", half)) for n, v in zip(names, s, strict=True)}
+    np.savez(sys.argv[1], sent=sent, **states)
