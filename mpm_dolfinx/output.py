@@ -23,7 +23,7 @@ import numpy as np
 from dolfinx import fem, io
 from numpy.typing import NDArray
 
-from mpm_dolfinx.check import whole
+from mpm_dolfinx.check import flag, line, line_of, on_disk, path, whole
 from mpm_dolfinx.exchange import at_root, to_root
 from mpm_dolfinx.points import MaterialPoints
 from mpm_dolfinx.timeloop import Result
@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
 VTK_CELLS = {2: ("quad", [0, 1, 3, 2]), 3: ("hexahedron", [0, 1, 3, 2, 4, 5, 7, 6])}
 """VTK's cell for a domain, and the domain's corners in VTK's order."""
+WRITABLE = "writable and have room; the run goes on with `after=simulation.result`"
 COUNTS = ("steps", "newton", "coupling", "cuts", "rederived", "balance", "residual", "wall")
 
 
@@ -61,16 +62,26 @@ class Writer:
     """
 
     def __init__(self, simulation: Simulation, folder: str | os.PathLike, *, every: int = 1, grid: bool = False):
-        folder, comm, self._t = Path(folder), simulation.grid.comm, simulation.t
-        self.every, self._started = whole("writer: every", every), False
-        self._table = Table(comm, folder / "history.csv", self._t)
-        self._points = Series(comm, folder / "points.pvd", self._t)
-        self._grid = Series(comm, folder / "grid.pvd", self._t) if grid else None
-        if not self._points.entries:
-            self._write_points(simulation)
+        if not hasattr(simulation, "effective_stress"):  # its class is defined later than this one
+            raise ValueError(f"writer: simulation = {line(simulation)}, must be a Simulation")
+        flag("writer: grid", grid)
+        folder, comm, self._t = path("writer: folder", folder), simulation.grid.comm, simulation.t
+        self.every, self._started, self._simulation = whole("writer: every", every), False, simulation
+        with on_disk("writer: folder", "one that can be written"):
+            self._table = Table(comm, folder / "history.csv", self._t)
+            self._points = Series(comm, folder / "points.pvd", self._t)
+            self._grid = Series(comm, folder / "grid.pvd", self._t) if grid else None
+            if not self._points.entries:
+                self._write_points(simulation)
 
     def __call__(self, simulation: Simulation) -> None:
         """Write a row of the histories and, in its turn, the present state."""
+        if simulation is not self._simulation:
+            raise ValueError("writer: made for another simulation, must be made for the one that runs")
+        with on_disk(f"writer at t = {simulation.t:g} s", WRITABLE):
+            self._write(simulation)
+
+    def _write(self, simulation: Simulation) -> None:
         result = simulation.result
         if not self._started:
             self._start(result)
@@ -200,6 +211,15 @@ def replacing(file: Path) -> Iterator[Path]:
     os.replace(part, file)
 
 
+@contextmanager
+def _ours(file: Path) -> Iterator[None]:
+    """Refuse a file that no `Writer` has written, with a ValueError."""
+    try:
+        yield
+    except (ElementTree.ParseError, KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{file}: not of a Writer ({line_of(error)}), must be, or take another folder") from error
+
+
 def kept(entries: Sequence[tuple[float, Any]], t: float) -> list[tuple[float, Any]]:
     """Return what a run that goes on from time t leaves of earlier (time, ...): nothing if it is a new one."""
     out = [entry for entry in entries if entry[0] <= t]
@@ -224,8 +244,9 @@ class Series:
         self.folder.mkdir(parents=True, exist_ok=True)
         times: dict[float, list[Path]] = {}
         if self.file.exists():
-            for item in ElementTree.parse(self.file).iter("DataSet"):
-                times.setdefault(float(item.get("timestep")), []).append(self.file.parent / item.get("file"))
+            with _ours(self.file):
+                for item in ElementTree.parse(self.file).iter("DataSet"):
+                    times.setdefault(float(item.get("timestep")), []).append(self.file.parent / item.get("file"))
         return list(times.items())
 
     def write_index(self) -> None:
@@ -254,15 +275,16 @@ class Table:
     def _read(self) -> list[tuple[float, dict[str, str]]]:
         if not self.file.exists():
             return []
-        text = self.file.read_text()
-        whole = text[: text.rfind("\n") + 1].splitlines()  # the last line may have been broken off
-        return [(float(row["t"]), row) for row in csv.DictReader(whole)]
+        with _ours(self.file):
+            text = self.file.read_text()
+            whole = text[: text.rfind("\n") + 1].splitlines()  # the last line may have been broken off
+            return [(float(row["t"]), row) for row in csv.DictReader(whole)]
 
     def start(self, first: dict[str, float]) -> None:
         """Write the rows that were kept, or else a first row."""
         rows = [row for _, row in self._rows] or [first]
-        if list(rows[0]) != list(first):
-            raise ValueError(f"{self.file}: its columns are {', '.join(rows[0])}, the run's {', '.join(first)}")
+        self._columns = list(rows[0])
+        self._check(first)
 
         def write() -> None:
             with replacing(self.file) as part:
@@ -272,7 +294,13 @@ class Table:
 
     def add(self, row: dict[str, float]) -> None:
         """Add a row."""
+        self._check(row)
         at_root(self.comm, lambda: self._append(self.file, [row], "a"))
+
+    def _check(self, row: dict[str, float]) -> None:
+        if list(row) != self._columns:
+            both = f"{', '.join(self._columns)}, the run's {', '.join(row)}"
+            raise ValueError(f"{self.file}: its columns are {both}; must be the same, or in another folder")
 
     @staticmethod
     def _append(file: Path, rows: Sequence[dict], mode: str) -> None:
