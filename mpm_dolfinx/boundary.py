@@ -116,7 +116,7 @@ class Boundary:
         stiffness = HOLD * self._modulus / self.grid.h.min()
         for number, (hold, faces, axes) in enumerate(self.holds):
             patches = place.surface(faces)
-            gap = patches.origin + hold.at(t, patches.X) - patches.x
+            gap = patches.origin + hold.at(t, patches.X) - (patches.x + patches.moved)
             for axis in axes:
                 values = np.zeros((len(gap), 3 + d))
                 values[:, 0] = number

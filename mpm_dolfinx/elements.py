@@ -144,7 +144,7 @@ class StackedElementMatrices:
         self._entry = place.reshape(d, d, d, d).transpose(1, 0, 2, 3).ravel()  # (k, i, j, l)
         pairs = [(*divmod(int(r), d), *divmod(int(c), d)) for r, c in zip(rows, columns, strict=True)]
         self._tangent = PointExpression(ufl.as_vector([tangent[pair] for pair in pairs]), points)
-        self._version = -1
+        self._places = -1
 
     def _sort(self) -> None:
         """Find batches of filled cells that hold about as many points, and their points (cells, most points)."""
@@ -164,8 +164,8 @@ class StackedElementMatrices:
 
     def assemble_matrix(self, A: PETSc.Mat) -> None:
         """Add the matrix to `A`, by unrolled local dofs; the caller finalises it."""
-        if self._version != self.points.version:
-            self._version = self.points.version
+        if self._places != self.points.places:
+            self._places = self.points.places
             self._sort()
         self.points.refresh()
         for cells, points, missing in self._batches:

@@ -71,12 +71,14 @@ class FormPoints:
         self._live: dict[str, fem.Function] = {}
         self._of: tuple[int, NDArray[np.float64]] | None = None
         self._gradients = np.empty((0, grid.dim**2))
+        self._taken: NDArray[np.int32] | None = None
         self.dx = PointMeasure(grid, self._functions["weight"])
         self._size = {name: int(np.prod(shape, dtype=int)) for name, shape in fields.items()}
         self.cells = self.filled = self.slots = np.empty(0, dtype=np.int32)
         """Cell of each point; the cells that hold points; and the place of each point's cell among these."""
         self.data: dict[str, NDArray[np.float64]] = {}
-        self.version = 0
+        self.version = self.places = 0
+        """Count of changes of the data, and of the cells too."""
 
     def __getattr__(self, name: str) -> fem.Function:
         functions = self.__dict__.get("_functions", {})
@@ -90,7 +92,7 @@ class FormPoints:
         Parameters
         ----------
         cells : (n,)
-            Owned local cell of each point.
+            Owned local cell of each point; the same array as before if the points stay in their cells.
         x : (n, d), m
             Positions.
         weight : (n,), m^d
@@ -98,8 +100,8 @@ class FormPoints:
         data : (n, ...)
             Values of the fields.
         """
-        self.cells, self.x = cells, x
-        self.filled, self.slots = np.unique(cells, return_inverse=True)
+        self._put(cells)
+        self.x = x
         self.data = {
             "offset": x - self.grid.midpoints[cells],
             "weight": (weight / self.grid.cell_volume)[:, None],
@@ -109,10 +111,18 @@ class FormPoints:
 
     def take(self, points: FormPoints, rows: NDArray[np.int64]) -> None:
         """Be some rows of other points, which carry the fields of these."""
-        self.cells, self.x = points.cells[rows], points.x[rows]
-        self.filled, self.slots = np.unique(self.cells, return_inverse=True)
+        if self._taken is not points.cells:
+            self._taken = points.cells
+            self._put(points.cells[rows])
+        self.x = points.x[rows]
         self.data = {name: points.data[name][rows] for name in self._functions if name not in self._live}
         self.version += 1
+
+    def _put(self, cells: NDArray[np.int32]) -> None:
+        if cells is not self.cells:
+            self.cells = cells
+            self.filled, self.slots = np.unique(cells, return_inverse=True)
+            self.places += 1
 
     def value(self, f):
         """Return f at the point, f a P1 function, test or trial function (any shape)."""
@@ -205,6 +215,7 @@ class Rows:
             start = stop
         self._room = np.zeros((0, start))
         self._packed: tuple[int, slice | None] = (-1, None)
+        self._gathered_at: tuple[int, slice | None] = (-1, None)
 
     def room(self, size: int) -> NDArray[np.float64]:
         """Return the memory of the rows, at least `size` of them; what is kept saves the page faults of every step."""
@@ -222,9 +233,10 @@ class Rows:
         for columns, name in self._columns:
             if fresh or self.points.changes(name):
                 rows[:, columns] = self.points.values(name, chosen)
-        if fresh:
+        where = (self.points.places, now[1])
+        if where[1] is None or where != self._gathered_at:
             self._dofs = [(columns, f, _unrolled(f, dofs[cells])) for columns, f, dofs in self._gathered]
-        self._packed = now
+        self._packed, self._gathered_at = now, where
         for columns, f, dofs in self._dofs:
             rows[:, columns] = np.take(f.x.array, dofs, mode="wrap")  # "raise" checks every index
         return rows
@@ -253,13 +265,13 @@ class PointForm:
     def __init__(self, form: ufl.Form, points: FormPoints, dense: bool = False):
         self.points, self._dense = points, dense
         self.compiled = _compat.CompiledForm(form)
-        self._rows, self._bound, self._version = Rows(self.compiled, points), [], -1
+        self._rows, self._bound, self._places = Rows(self.compiled, points), [], -1
 
     def _parts(self):
         """Yield the form bound to CHUNK points after the other, with their rows."""
         self.points.refresh()
-        if self._version != self.points.version:
-            self._version, cells = self.points.version, self.points.slots if self._dense else self.points.cells
+        if self._places != self.points.places:
+            self._places, cells = self.points.places, self.points.slots if self._dense else self.points.cells
             parts = [slice(start, start + CHUNK) for start in range(0, len(cells), CHUNK)]
             self._bound = [(part, self.compiled.bind(cells[part])) for part in parts]
         for part, form in self._bound:

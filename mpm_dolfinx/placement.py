@@ -5,6 +5,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from mpi4py import MPI
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,6 +16,8 @@ from mpm_dolfinx.forms import CHUNK
 from mpm_dolfinx.grid import Grid, sum_by
 from mpm_dolfinx.points import MaterialPoints, Surface, face_vectors, interpolate
 
+STAYS = 1e-3
+"""Cells by which corners may have moved since the domains were cut before they are cut anew."""
 DEPTH = 1e-6  # cells: how far under the surface the cell is looked up; of corners, share of the way to the middle
 
 
@@ -21,13 +25,14 @@ DEPTH = 1e-6  # cells: how far under the surface the cell is looked up; of corne
 class Patches:
     """Points of integration on faces of the domains; arrays over n points.
 
-    cell : (n,) lexicographic cell; x : (n, d) position, m; X : (n, d) reference position, m; origin : (n, d)
-    position from which displacements count, m; area0 : (n,) reference area, m^(d-1); area : (n, d) outward
-    area vector, m^(d-1).
+    cell : (n,) lexicographic cell; x : (n, d) position when the domains were cut, m; moved : (n, d) displacement
+    since then, m; X : (n, d) reference position, m; origin : (n, d) position from which displacements count, m;
+    area0 : (n,) reference area, m^(d-1); area : (n, d) outward area vector, m^(d-1).
     """
 
     cell: NDArray[np.int64]
     x: NDArray[np.float64]
+    moved: NDArray[np.float64]
     X: NDArray[np.float64]
     origin: NDArray[np.float64]
     area0: NDArray[np.float64]
@@ -40,6 +45,8 @@ class LeftGrid(RuntimeError):
 
 class Placement:
     """The points' domains cut by the cells, and the way of their data to the owners of the cells.
+
+    It serves until the points have moved: where they were when they were cut is what the grid sees.
 
     Parameters
     ----------
@@ -60,12 +67,16 @@ class Placement:
 
     def __init__(self, grid: Grid, points: MaterialPoints, quadrature: str, t: float):
         self.grid, self.points = grid, points
+        self._corners, self._x = points.corners.copy(), points.x
+        self._faces: dict[Surface, tuple[NDArray, ...]] = {}
         self._patches: dict[Surface, Patches] = {}
+        self._followed: tuple[Exchange, NDArray[np.int32], NDArray[np.float64]] | None = None
         self._check_inside(points.corners if quadrature == "domain" else points.x[:, None], t)
         self.pieces = cut(grid, points.corners) if quadrature == "domain" else whole_points(grid, points.x)
         self._travel = Exchange(grid.comm, grid.owner(self.pieces.cell))
         self.cells = grid.local(self._travel.send(self.pieces.cell))
-        """Owned cells of the pieces that this process integrates."""
+        self.x = self._travel.send(self.pieces.x)
+        """Owned cells, and centroids (m, d), m, of the pieces that this process integrates."""
 
     def _check_inside(self, x: NDArray[np.float64], t: float) -> None:
         out = np.flatnonzero(self.grid.outside(x.reshape(-1, self.grid.dim)))
@@ -75,6 +86,11 @@ class Placement:
                 f"point {points.id[i]} at {points.x[i]} left the grid "
                 f"{self.grid.lower} to {self.grid.upper} at t = {t:g} s"
             )
+
+    def serves(self) -> bool:
+        """Return whether the points are still where they were, but for `STAYS`."""
+        moved = np.abs((self.points.corners - self._corners) / self.grid.h).max(initial=0.0)
+        return self.grid.comm.allreduce(moved, op=MPI.MAX) <= STAYS
 
     def to_cells(self, values: NDArray) -> NDArray:
         """Send values of the points (n, ...) to the owners of their pieces' cells (m, ...)."""
@@ -102,34 +118,52 @@ class Placement:
             self._patches[faces] = self._cut_surface(faces)
         return self._patches[faces]
 
+    def follow(self) -> None:
+        """Take the surface to where the points are now."""
+        self._patches.clear()
+
     def _cut_surface(self, faces: Surface) -> Patches:
+        if faces not in self._faces:
+            self._faces[faces] = self._cut_faces(faces)
+        here, at, cell, face, x, xi, share = self._faces[faces]
+        corners = self.points.corners[at]
+        moved = interpolate((corners - self._corners[at])[face], xi)
+        area0, whole = share * faces.area0[here][face], faces.whole0[here][face]
+        area = face_vectors(corners, faces.axis, faces.end)[face] * (area0 / whole)[:, None]
+        X, origin = faces.reference(here[face], xi), interpolate(self.points.origin[at][face], xi)
+        return Patches(cell, x, moved, X, origin, area0, area)
+
+    def _cut_faces(self, faces: Surface) -> tuple[NDArray, ...]:
         here, at = self.points.find(faces.id)
-        corners, xi = self.points.corners[at], faces.corners()[here]
+        corners, xi = self._corners[at], faces.corners()[here]
         count = xi.shape[1]
         places = interpolate(np.repeat(corners, count, axis=0), xi.reshape(-1, self.grid.dim)).reshape(xi.shape)
         face, x, xi, share, middle = cut_faces(self.grid, places, xi)
         outward = face_vectors(corners, faces.axis, faces.end)
         size = np.linalg.norm(outward, axis=1, keepdims=True)
         inward = -DEPTH * self.grid.h.min() * np.divide(outward, size, out=np.zeros_like(outward), where=size > 0)
-        cell = self._filled_cell(at[face], middle + inward[face])
-        area0, whole = share * faces.area0[here][face], faces.whole0[here][face]
-        X = faces.reference(here[face], xi)
-        origin = interpolate(self.points.origin[at][face], xi)
-        return Patches(cell, x, X, origin, area0, outward[face] * (area0 / whole)[:, None])
+        return here, at, self._filled_cell(at[face], middle + inward[face]), face, x, xi, share
 
-    def displacement(
-        self, u: NDArray[np.float64], at: NDArray[np.int64], x: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Return the P1 field u (nodes, d) at positions (m, d) in the domains of points `at`."""
-        # of a corner on a grid line, rounding must not choose a cell in which the domain does not lie
-        grid, cell = self.grid, self._filled_cell(at, x + DEPTH * (self.points.x[at] - x))
-        travel = Exchange(grid.comm, grid.owner(cell))
-        cells, x = grid.local(travel.send(cell)), travel.send(x)
+    def displacement(self, u: NDArray[np.float64], corners: bool) -> NDArray[np.float64]:
+        """Return the P1 field u (nodes, d) at the corners (n, 2^d, d), or at the points (n, d), when they were cut."""
+        if self._followed is None:
+            self._followed = self._follow(corners)
+        travel, cells, x = self._followed
         moved = np.empty_like(x)
         for part in (slice(start, start + CHUNK) for start in range(0, len(x), CHUNK)):
-            N = grid.shape_values(cells[part], x[part])
-            moved[part] = np.einsum("mk,mkd->md", N, u[grid.cell_nodes[cells[part]]])
-        return travel.back(moved)
+            N = self.grid.shape_values(cells[part], x[part])
+            moved[part] = np.einsum("mk,mkd->md", N, u[self.grid.cell_nodes[cells[part]]])
+        return travel.back(moved).reshape(self._corners.shape if corners else self._x.shape)
+
+    def _follow(self, corners: bool) -> tuple[Exchange, NDArray[np.int32], NDArray[np.float64]]:
+        """Return the way to the owners of the cells of corners or points, these cells, and the positions."""
+        grid, n, d = self.grid, len(self.points), self.grid.dim
+        at = np.repeat(np.arange(n), 2**d if corners else 1)
+        x = self._corners.reshape(-1, d) if corners else self._x
+        # of a corner on a grid line, rounding must not choose a cell in which the domain does not lie
+        cell = self._filled_cell(at, x + DEPTH * (self._x[at] - x))
+        travel = Exchange(grid.comm, grid.owner(cell))
+        return travel, grid.local(travel.send(cell)), travel.send(x)
 
     def _filled_cell(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
         """Return the cells (m,) of positions in domains; where no piece of the domain lies, of its largest piece."""

@@ -127,6 +127,8 @@ class Simulation:
         """Which bodies are there."""
         check_apart(bodies, self.present)
         warn_thin(grid, bodies, fixed)
+        self.placement: Placement | None = None
+        """The domains as they have been cut; None where they are to be cut anew."""
 
         start = time.perf_counter()
         self._build(self._fixed_nodes(fixed), coupling, tolerance, terms, sources)
@@ -294,6 +296,7 @@ class Simulation:
         """(displacements, d): force by which each given displacement acts on the bodies, N (N/m in plane strain)."""
         self.momentum.require(bool(side.loads), bool(side.plates), bool(side.holds))
         self.momentum.fix(fixed)
+        self._leave_grid()
         self._prepared = False
 
     def _gravity(self, value: ArrayLike, name: str) -> NDArray[np.float64]:
@@ -332,42 +335,75 @@ class Simulation:
             given, name = self._conditions["gravity"], f"gravity at t = {t:g} s"
             given = asked(name, f"{self.grid.dim} numbers for a time", given, t) if callable(given) else given
             self.gravity.value = self._gravity(given, name)
-        fresh = not self._prepared
+        fresh = not self._prepared and not self._stays()
         if fresh:
             self._reset_grid()
-        elif self.gravity is not None and self.storage:
-            self._open_outlets()  # a step is tried again, with the gravity of another time
+        else:
+            if not self._prepared:
+                self._stay()
+            if self.gravity is not None and self.storage:
+                self._open_outlets()  # with the gravity of another time
         self._place_loads(t)
         if fresh:
             self.momentum.set_penalty()
             if self._renumbered and not self.momentum.holding:
                 self._check_held()
-            self._prepared = True
+        self._prepared = True
         self.momentum.start()
         if self.storage:
             self.storage.start(t - self.t)
 
+    def _stays(self) -> bool:
+        """Return whether the points have moved so little that nothing need be cut or remapped."""
+        changing = self.fluid is not None and self._scene.conductivity_laws
+        return self.placement is not None and not changing and self.placement.serves()
+
+    def _stay(self) -> None:
+        """Bring the integration data to where the points are now, in the same cells."""
+        with Timer("mpm: integration data"):
+            self.placement.follow()
+            self._place_pieces(self.points.J)
+            if self.momentum.plates is not None:
+                self.boundary.place_plates(self.placement, self.momentum)
+            if self.storage:
+                self.storage.p_n.x.array[:] = self.storage.p.x.array
+
+    def _leave_grid(self) -> None:
+        """Let the points take the pressures of their pieces along; the domains are cut anew in the next step."""
+        if self.placement is not None and self.storage:
+            with Timer("mpm: remap"):
+                self._carried = self._carry()
+        self.placement = None
+
     def _reset_grid(self) -> None:
         """Rebuild the integration data on the fresh grid: pieces, active cells, remapped pressure."""
+        self._leave_grid()
+        self._migrate()
         with Timer("mpm: cut domains"):
-            self.placement = place = Placement(self.grid, self.points, self.quadrature, self.t)
+            place = Placement(self.grid, self.points, self.quadrature, self.t)
         if self.storage:
             with Timer("mpm: remap"):
                 self._brought = remap(self._carried, self.points, place.pieces)
+                self._travelled = np.zeros_like(place.pieces.x)
         with Timer("mpm: integration data"):
-            J = self.points.J
-            self.pieces.place(
-                place.cells,
-                place.pieces_to_cells(place.pieces.x),
-                place.pieces_to_cells(place.pieces.fraction * (self.points.volume0 * J)[place.pieces.point]),
-                **{name: place.to_cells(values) for name, values in self._fields(J).items()},
-                **{name: place.pieces_to_cells(values) for name, values in self._piece_fields().items()},
-            )
-            if len(self.laws) > 1:
-                law = place.to_cells(self._scene.law_of(self.points))
-                for number, (_, part) in enumerate(self.laws):
-                    part.take(self.pieces, np.flatnonzero(law == number))
+            self.placement, J = place, self.points.J
+            self._place_pieces(J)
             self._activate(J)
+
+    def _place_pieces(self, J: NDArray[np.float64]) -> None:
+        """Set the integration data of the pieces."""
+        place = self.placement
+        self.pieces.place(
+            place.cells,
+            place.x,
+            place.pieces_to_cells(place.pieces.fraction * (self.points.volume0 * J)[place.pieces.point]),
+            **{name: place.to_cells(values) for name, values in self._fields(J).items()},
+            **{name: place.pieces_to_cells(values) for name, values in self._piece_fields().items()},
+        )
+        if len(self.laws) > 1:
+            law = place.to_cells(self._scene.law_of(self.points))
+            for number, (_, part) in enumerate(self.laws):
+                part.take(self.pieces, np.flatnonzero(law == number))
 
     def _fields(self, J: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
         """Return what the points bring to their pieces."""
@@ -512,28 +548,27 @@ class Simulation:
             self._check_volumes(np.linalg.det(F))
             self._scene.update_state(replace(points, F=F))
             points.F = F
+            moved = place.displacement(u, corners=self.quadrature == "domain")
             if self.quadrature == "domain":
-                corners = points.corners.reshape(-1, d)
-                moved = corners + place.displacement(u, np.repeat(np.arange(n), 2**d), corners)
-                points.corners = moved.reshape(n, 2**d, d)
+                points.corners = points.corners + moved
                 points.x = points.corners.mean(axis=1)
                 folded = self._untangle()
             else:
-                points.x = points.x + place.displacement(u, np.arange(n), points.x)
+                points.x = points.x + moved
                 points.corners = parallelepipeds(points.x, points.F, self._spacing())
             if self.storage:
                 points.pressure = place.mean(place.to_pieces(self.storage.p.x.array[self.pieces.cells]))
-                self._carried = self._carry(self.pieces.x + (at_nodes @ N[:, :, None])[:, :, 0])
-            self._migrate()
+                self._travelled += place.to_pieces((at_nodes @ N[:, :, None])[:, :, 0])
         return folded
 
-    def _carry(self, moved: NDArray[np.float64]) -> Carried:
-        """Return the pressures that the pieces take along; `moved` (m, d), m: their centroids after the step."""
+    def _carry(self) -> Carried:
+        """Return the pressures that the pieces take along."""
         points, place, pieces, J = self.points, self.placement, self.placement.pieces, self.points.J
         n = 1 - (1 - self._table(lambda m: m.porosity)) / J
         store = self._table(lambda m, n: m.storage(self.fluid.bulk, n), n) * points.volume0 * J
         at_pieces = self.storage.at_pieces(place.pieces_to_cells(pieces.fraction * store[pieces.point]))
-        pressure, slope, bounds, x = map(place.to_pieces, (*at_pieces, moved))
+        pressure, slope, bounds = map(place.to_pieces, at_pieces)
+        x = pieces.x + self._travelled
         return Carried(points.id[pieces.point], pieces.cell, pieces.fraction, pressure, x, slope, bounds)
 
     def _check_volumes(self, J: NDArray[np.float64]) -> None:
@@ -572,13 +607,14 @@ class Simulation:
 
     @property
     def carried(self) -> Carried | None:
-        """Pressures of the points' pieces between two steps; None without fluid."""
+        """Pressures of the points' pieces between two steps, None without fluid; the next step cuts them anew."""
+        self._leave_grid()
         return self._carried
 
     def restore(self, points: MaterialPoints, carried: Carried | None, t: float) -> None:
         """Put the scene into a state at time t, s: points and pieces, on whatever processes they are."""
         self.points, self._carried, self.t = points, carried, t
-        self._prepared = False
+        self._prepared, self.placement = False, None
         if self.active_cells:  # of a step that was taken before
             self.coupler.forget()
         self._migrate()

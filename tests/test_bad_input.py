@@ -169,7 +169,11 @@ CASES = {
     "term of a number": (lambda: scene(terms=[1.0]), "terms", "1.0"),
     "term that gives nothing": (lambda: scene(terms=[lambda v: None]), "terms", "None"),
     "source that gives a number": (lambda: scene(fluid=WATER, sources=[lambda q: 1.0]), "sources", "1.0"),
-    "body to come that there is not": (lambda: scene(later=[5]), "later: body 5", "indices of the bodies, each once: 0"),
+    "body to come that there is not": (
+        lambda: scene(later=[5]),
+        "later: body 5",
+        "indices of the bodies, each once: 0",
+    ),
     # ---- conditions on sides
     "unknown side": (lambda: sides("Traction", "lid", (0, 1)), "side 'lid'", "left, right, bottom, top"),
     "side of another dimension": (
