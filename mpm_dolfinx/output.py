@@ -8,6 +8,7 @@ whenever a run ends, what it has written until then can be read.
 from __future__ import annotations
 
 import csv
+import errno
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
 
 VTK_CELLS = {2: ("quad", [0, 1, 3, 2]), 3: ("hexahedron", [0, 1, 3, 2, 4, 5, 7, 6])}
 """VTK's cell for a domain, and the domain's corners in VTK's order."""
-WRITABLE = "writable and have room; the run goes on with `after=simulation.result`"
+WRITABLE = "in a folder that can be written, with room; the run goes on with `after=simulation.result`"
 COUNTS = ("steps", "newton", "coupling", "cuts", "rederived", "balance", "residual", "wall")
 
 
@@ -78,7 +79,7 @@ class Writer:
         """Write a row of the histories and, in its turn, the present state."""
         if simulation is not self._simulation:
             raise ValueError("writer: made for another simulation, must be made for the one that runs")
-        with on_disk(f"writer at t = {simulation.t:g} s", WRITABLE):
+        with on_disk(f"{self._points.file.parent}: writer at t = {simulation.t:g} s", WRITABLE):
             self._write(simulation)
 
     def _write(self, simulation: Simulation) -> None:
@@ -124,9 +125,11 @@ class Writer:
         comm, stem = simulation.grid.comm, self._grid.next
         _write_fields(comm, stem.with_suffix(".pvd"), _grid_fields(simulation), simulation.t)
         if comm.rank == 0:  # our index names the pieces themselves: 0.5's own names each of them once a function
-            stem.with_suffix(".pvd").unlink()
-            stem.with_name(f"{stem.name}000000.pvtu").unlink()
+            stem.with_suffix(".pvd").unlink(missing_ok=True)
+            stem.with_name(f"{stem.name}000000.pvtu").unlink(missing_ok=True)
         pieces = [stem.with_name(f"{stem.name}_p{rank}_000000.vtu") for rank in range(comm.size)]
+        if not comm.allreduce(_ends(pieces[comm.rank]), op=MPI.LAND):  # dolfinx does not notice a full disk
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(stem))
         self._grid.entries.append((simulation.t, pieces))
 
 
@@ -199,6 +202,15 @@ def _grid_fields(simulation: Simulation) -> list[fem.Function]:
 def _write_fields(comm: MPI.Intracomm, file: Path, fields: list[fem.Function], t: float) -> None:
     with io.VTKFile(comm, str(file), "w") as f:  # writes its index once more when it goes out of scope
         f.write_function(fields, t)
+
+
+def _ends(file: Path) -> bool:
+    """Whether a file of VTK is there up to its end."""
+    if not file.exists():
+        return False
+    with open(file, "rb") as f:
+        f.seek(-min(64, file.stat().st_size), os.SEEK_END)
+        return f.read().rstrip().endswith(b"</VTKFile>")
 
 
 @contextmanager

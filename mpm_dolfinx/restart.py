@@ -87,7 +87,7 @@ def save(simulation: Simulation, file: Path) -> None:
             np.savez(f, format=np.array(FORMAT), note=np.array(json.dumps(note)), **_named("", state))
         return file.stat().st_size
 
-    with on_disk(f"checkpoint at t = {simulation.t:g} s", WRITABLE):
+    with on_disk(f"{file}: checkpoint at t = {simulation.t:g} s", WRITABLE):
         size = at_root(comm, write)
     simulation.coupler.forget()
     seconds = time.perf_counter() - began
