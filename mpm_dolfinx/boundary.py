@@ -4,9 +4,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from mpm_dolfinx.check import line
 from mpm_dolfinx.conditions import HOLD, RIGIDITY, Displacement, Drained, Inflow, RigidPlate, Traction
@@ -36,7 +40,8 @@ class Boundary:
     Raises
     ------
     ValueError
-        Naming a condition whose side no point has.
+        Naming a condition whose side no point has, a plate whose faces are not one flat side, or two conditions
+        that contradict each other on the same faces.
     """
 
     def __init__(
@@ -57,13 +62,20 @@ class Boundary:
         self.loads = [(load, self._faces(load)) for load in tractions]
         self.holds = [(hold, self._faces(hold), hold.axes(grid.dim)) for hold in displacements]
         self.outlets = [(outlet, self._faces(outlet)) for outlet in outlets]
+        for plate, faces in self.plates:
+            _check_flat(plate, faces)
+        for one, other in combinations(self.outlets, 2):
+            _check_apart(*one, *other)
+        for (one, faces, axes), (other, others, more) in combinations(self.holds, 2):
+            if set(axes) & set(more):
+                _check_apart(one, faces, other, others)
         for condition in [*tractions, *displacements]:
             if not callable(condition.value):  # what a function gives is checked when it is called
                 condition.at(0.0, *([grid.dim] if isinstance(condition, Traction) else [np.empty((1, grid.dim))]))
 
     def _faces(self, condition) -> Surface:
         """Return the faces of a condition's side, the same object for conditions on the same faces."""
-        key = (condition.side, str(condition.region))
+        key = (str(condition.side), str(condition.region))
         if key not in self._found:
             self._found[key] = surface(self._bodies, condition.side, condition.region, self._present)
         if not len(self._found[key]):
@@ -161,3 +173,32 @@ class Boundary:
         travel = Exchange(self.grid.comm, self.grid.owner(parts[0]))
         cell, x, values = map(travel.send, parts)
         return self.grid.local(cell), x, values
+
+
+def _check_flat(plate: RigidPlate, faces: Surface) -> None:
+    """Refuse a plate on faces that are not one flat, connected side: each part would move by itself."""
+    height, tangential = faces.X[:, 0, faces.axis], np.arange(faces.X.shape[2]) != faces.axis
+    X, size = faces.X.mean(axis=1), np.ptp(faces.X, axis=1)[:, tangential].max(axis=0)
+    apart = np.flatnonzero(np.abs(height - height[0]) > 1e-6 * size.min())
+    if not len(apart):
+        pairs = cKDTree(X[:, tangential] / size).query_pairs(1 + 1e-6, p=np.inf, output_type="ndarray")
+        graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(X), len(X)))
+        _, part = connected_components(graph, directed=False)
+        apart = np.flatnonzero(part != part[0])
+    if len(apart):
+        where = f"faces at {X[0]} and {X[apart[0]]} do not hang together"
+        raise ValueError(f"{line(plate)}: {where}, must be one flat side; take a plate with a region for each")
+
+
+def _check_apart(one, faces: Surface, other, others: Surface) -> None:
+    """Refuse two conditions, of a kind that excludes the other, on the same part of a face."""
+    if (faces.axis, faces.end) != (others.axis, others.end):
+        return
+    _, a, b = np.intersect1d(faces.id, others.id, return_indices=True)
+    low, high = np.maximum(faces.X[a, 0], others.X[b, 0]), np.minimum(faces.X[a, 1], others.X[b, 1])
+    common = high - low > 1e-9 * (faces.X[a, 1] - faces.X[a, 0])
+    common[:, faces.axis] = True
+    both = np.flatnonzero(common.all(axis=1))
+    if len(both):
+        x = (low[both[0]] + high[both[0]]) / 2
+        raise ValueError(f"{line(one)} and {line(other)}: both act at {x}, must not; limit them by regions")

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mpm_dolfinx.check import line, numbers
+from mpm_dolfinx.check import asked, line, numbers
 from mpm_dolfinx.grid import side
 from mpm_dolfinx.points import Region
 
@@ -34,10 +34,9 @@ class Traction:
 
     def at(self, t: float, dim: int) -> NDArray[np.float64]:
         """Return the traction (d,), or () along the normal, at time t (s), Pa, in a dimension."""
-        value = self.value(t) if callable(self.value) else self.value
-        return numbers(
-            f"{line(self)}: value at t = {t:g} s", value, (), (dim,), allowed=f"a finite number or {dim} of them"
-        )
+        name, allowed = f"{line(self)}: value at t = {t:g} s", f"a finite number or {dim} of them"
+        value = asked(name, f"{allowed} for a time", self.value, t) if callable(self.value) else self.value
+        return numbers(name, value, (), (dim,), allowed=allowed)
 
 
 @dataclass(frozen=True)
@@ -122,11 +121,10 @@ class Displacement:
 
     def at(self, t: float, X: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the displacement (m, d), m, at time t (s) of reference positions X (m, d)."""
-        value, (m, d) = self.value(t, X) if callable(self.value) else self.value, X.shape
-        allowed = f"{d} finite numbers, or {d} for each of {m} places"
-        return np.broadcast_to(
-            numbers(f"{line(self)}: value at t = {t:g} s", value, (d,), X.shape, allowed=allowed), X.shape
-        )
+        m, d = X.shape
+        name, allowed = f"{line(self)}: value at t = {t:g} s", f"{d} finite numbers, or {d} for each of {m} places"
+        value = asked(name, f"{allowed}, for (t, X)", self.value, t, X) if callable(self.value) else self.value
+        return np.broadcast_to(numbers(name, value, (d,), X.shape, allowed=allowed), X.shape)
 
 
 @dataclass(frozen=True)
@@ -161,7 +159,8 @@ class RigidPlate:
         inward[axis] = 1 - 2 * end
 
         def even(t: float) -> NDArray[np.float64]:
-            force = self.force(t) if callable(self.force) else self.force
-            return inward * numbers(f"{line(self)}: force at t = {t:g} s", force) / area
+            name = f"{line(self)}: force at t = {t:g} s"
+            force = asked(name, "a finite number for a time", self.force, t) if callable(self.force) else self.force
+            return inward * numbers(name, force) / area
 
         return Traction(self.side, even, self.region)

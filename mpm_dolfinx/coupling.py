@@ -243,10 +243,15 @@ class Coupler:
             self._scale_u = max(self._scale_u, scale)
             # a tiny load drowns in the round-off of a stiff part: that is no reason not to solve for it once
             round_off = self.momentum.round_off if report.history else 0.0
-            errors = [_relative(r.norm(), self._scale_u, round_off), 0.0]
+            norm, norm_p = r.norm(), 0.0
+            errors = [_relative(norm, self._scale_u, round_off), 0.0]
             if self.storage is not None:
                 r, self._exchanged = self.storage.assemble_residual(dt)
-                errors[1] = _relative(r.norm(PETSc.NormType.N1), self._exchanged, self.storage.round_off)
+                norm_p = r.norm(PETSc.NormType.N1)
+                errors[1] = _relative(norm_p, self._exchanged, self.storage.round_off)
+        if not report.history and np.isnan(norm + norm_p):
+            where = "storage: a source" if norm == norm else "momentum: a law or term"
+            raise NotConverged(f"nan in the residual of the {where} gives it, must be finite", [])
         report.history.append((errors[0], errors[1]))
         return errors[0], errors[1]
 
@@ -336,7 +341,7 @@ class Coupler:
 
 
 def _relative(norm: float, scale: float, round_off: float) -> float:
-    """Return norm / scale; 0 where the norm is round-off."""
+    """Return norm / scale; 0 where the norm is round-off, never nan, which no comparison would notice."""
     if norm <= round_off:
         return 0.0
-    return norm / scale if scale > 0 else np.inf
+    return norm / scale if scale > 0 and norm < np.inf else np.inf

@@ -28,7 +28,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from mpm_dolfinx.elements import insert, shape_gradients
-from mpm_dolfinx.extend import call
+from mpm_dolfinx.extend import expression
 from mpm_dolfinx.forms import CellSums, FormPoints
 from mpm_dolfinx.materials import Skeleton
 
@@ -93,7 +93,7 @@ class MeanDilatation:
         """Return the derivatives by F and by theta of psi(Fbar); of a law without energy, of its work."""
         Fbar = (theta * J_n / ufl.det(F)) ** (1 / self._d) * F
         if law.kirchhoff is None:
-            energy = call(law.energy, F=Fbar, **values)
+            energy = expression(law.energy, [()], F=Fbar, **values)
             return ufl.diff(energy, F), ufl.diff(energy, theta)
         tau = law.kirchhoff_in_plane(Fbar, values)  # dFbar Fbar^-1 = dev(dF F^-1) + dtheta / (d theta) I
         mean = ufl.tr(tau) / self._d

@@ -35,8 +35,15 @@ p
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from inspect import signature
+
+import ufl
+from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
+from ufl.corealg.traversal import unique_pre_traversal
+
+from mpm_dolfinx.check import asked, line, line_of
 
 
 def call(function: Callable, **available):
@@ -45,13 +52,68 @@ def call(function: Callable, **available):
     Raises
     ------
     ValueError
-        Naming the function, the argument that there is not, and those that there are.
+        Naming the function, the argument that there is not, and those that there are; or what it raises.
     """
     wanted = list(signature(function).parameters)
     for name in wanted:
         if name not in available:
-            raise ValueError(
-                f"{getattr(function, '__qualname__', function)}: argument {name!r}, "
-                f"must be some of {', '.join(available)}"
-            )
-    return function(**{name: available[name] for name in wanted})
+            raise ValueError(f"{_name(function)}: argument {name!r}, must be some of {', '.join(available)}")
+    given = {name: available[name] for name in wanted}
+    return asked(_name(function), f"UFL of {', '.join(wanted) or 'no argument'}", lambda: function(**given))
+
+
+def expression(function: Callable, shapes: Sequence[tuple[int, ...]], of: str = "", **available):
+    """Return the UFL expression that a function of the user's gives, of one of some shapes.
+
+    Raises
+    ------
+    ValueError
+        As `call`; what it gives is no UFL, has another shape, or does not depend on the argument `of`.
+    """
+    value = call(function, **available)
+    allowed = f"UFL of shape {' or '.join(map(str, shapes))}{f' that depends on {of}' if of else ''}"
+    try:
+        out = ufl.as_ufl(value)
+        apply_algebra_lowering(out)  # where UFL finds most of what cannot be
+    except Exception as error:  # UFL has several kinds
+        why = f" ({line_of(error)})" if isinstance(value, ufl.core.expr.Expr) else ""
+        raise ValueError(f"{_name(function)}: gives {line(value)}{why}, must be {allowed}") from error
+    if out.ufl_shape not in shapes:
+        raise ValueError(f"{_name(function)}: gives shape {out.ufl_shape}, must be {allowed}")
+    if of and not any(part is available[of] for part in unique_pre_traversal(out)):
+        raise ValueError(f"{_name(function)}: gives {line_of(out)}, must be {allowed}")
+    return out
+
+
+def form(kind: str, function: Callable, **available) -> ufl.Form:
+    """Return the form that a function of the user's gives, integrated over the points.
+
+    Raises
+    ------
+    ValueError
+        As `call`; or what it gives is no form, or has integrals that are not over the points.
+    """
+    out, dx = call(function, **available), available["points"].dx
+    allowed = "a form with points.dx"
+    if not isinstance(out, ufl.Form):
+        raise ValueError(f"{kind}: {_name(function)} gives {line(out)}, must be {allowed}")
+    for integral in out.integrals():
+        if (integral.integral_type(), integral.subdomain_id()) != (dx.integral_type(), dx.subdomain_id()):
+            raise ValueError(f"{kind}: {_name(function)} gives an integral over the grid, must be {allowed}")
+    return out
+
+
+@contextmanager
+def compiling(what: str, allowed: str) -> Iterator[None]:
+    """Name the object and the remedy where UFL or its compiler refuses an expression, with a ValueError."""
+    try:
+        yield
+    except ValueError:  # has its own
+        raise
+    except Exception as error:  # UFL and FFCx have many kinds
+        why = f"{type(error).__name__}: {line_of(error)}"
+        raise ValueError(f"{what}: does not compile ({why}), must be {allowed}") from error
+
+
+def _name(function: Callable) -> str:
+    return getattr(function, "__qualname__", repr(function))

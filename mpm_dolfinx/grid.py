@@ -16,7 +16,7 @@ from dolfinx import fem
 from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx import _compat
-from mpm_dolfinx.check import line, numbers
+from mpm_dolfinx.check import instance, line, numbers
 from mpm_dolfinx.partition import destinations, owners
 
 SIDES = {
@@ -24,6 +24,10 @@ SIDES = {
     3: {"left": (0, 0), "right": (0, 1), "front": (1, 0), "back": (1, 1), "bottom": (2, 0), "top": (2, 1)},
 }
 """Names of the sides of a box: (axis, 0 for the lower or 1 for the upper end)."""
+
+
+MOST = 2**31 - 1
+"""Unknowns that PETSc's numbers of 32 bits count."""
 
 
 def side(name: str, dim: int) -> tuple[int, int]:
@@ -69,7 +73,12 @@ class Grid:
         count = numbers(
             "grid: cells", cells, (d,), allowed=f"{d} integers >= 1", test=lambda n: (n >= 1) & (n % 1 == 0)
         )
+        instance("grid: comm", comm, MPI.Comm)
         self.shape = count.astype(np.int64)
+        if d * np.prod(count + 1) > MOST:
+            raise ValueError(
+                f"grid: cells = {line(cells)}: has {np.prod(count + 1):.3g} nodes, must be below {MOST // d}"
+            )
         self.h = (self.upper - self.lower) / self.shape
         self.comm = comm
         self._spaces: dict[tuple[int, ...], fem.FunctionSpace] = {}

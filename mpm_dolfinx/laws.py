@@ -12,7 +12,9 @@ import numpy as np
 import ufl
 from numpy.typing import NDArray
 
-from mpm_dolfinx.extend import call
+from mpm_dolfinx.check import instance, numbers
+from mpm_dolfinx.coupling import NotConverged
+from mpm_dolfinx.extend import call, expression
 from mpm_dolfinx.forms import FormPoints, PointExpression
 from mpm_dolfinx.grid import Grid
 from mpm_dolfinx.materials import Skeleton
@@ -53,7 +55,7 @@ class SceneMaterials:
     """
 
     def __init__(self, grid: Grid, materials: Sequence[Skeleton], bodies: Sequence[Body], points: MaterialPoints):
-        self.materials = materials
+        self._grid, self.materials = grid, materials
         X, index = _reference(bodies, len(materials))
         evaluated = [m.at(X[index == i]) for i, m in enumerate(materials)]
         self.laws = list(dict.fromkeys(map(type, materials)))
@@ -91,10 +93,12 @@ class SceneMaterials:
             if not hasattr(m, name):
                 known = ", ".join([*_names(m), *law.state])
                 raise ValueError(f"{law.__name__}: its law takes {name!r}, must be F or some of {known}")
-            self._set_shape(law, name, np.shape(getattr(m, name))[1:])
+            value = _known(f"{law.__name__}: {name}", getattr(m, name))
+            self._set_shape(law, name, value.shape[1:])
         for name, value in law.state.items():
-            self._set_shape(law, name, np.shape(value))
-            points.data[name] = np.tile(np.asarray(value, dtype=float), (len(points), *[1] * np.ndim(value)))
+            value = _known(f"{law.__name__}: state {name!r}", value)
+            self._set_shape(law, name, value.shape)
+            points.data[name] = np.tile(value, (len(points), *[1] * value.ndim))
 
     def _set_shape(self, law, name: str, shape: tuple[int, ...]) -> None:
         if name in RESERVED or hasattr(FormPoints, name):
@@ -164,12 +168,23 @@ class SceneMaterials:
         return out
 
     def update_state(self, points: MaterialPoints) -> None:
-        """Set the state of the points anew, once their F is that of the end of the step."""
+        """Set the state of the points anew, given with the F of the end of the step.
+
+        Raises
+        ------
+        NotConverged
+            The new state is not finite; the state of the points is then what it was.
+        """
         if all(law.update is None for law in self.laws):
             return
-        for law, rows in self._place(points):
-            for name, values in law.new_state().items():
-                points.data[name][rows] = values
+        new = [(law.law, rows, name, v) for law, rows in self._place(points) for name, v in law.new_state().items()]
+        bad = [(law, name, rows[~_finite(values)]) for law, rows, name, values in new]
+        shown = [f"{law.__name__}.update: {name!r} is not finite at {points.x[i[0]]}" for law, name, i in bad if len(i)]
+        everywhere = [line for lines in self._grid.comm.allgather(shown) for line in lines]
+        if everywhere:
+            raise NotConverged(everywhere[0], [])
+        for _, rows, name, values in new:
+            points.data[name][rows] = values
 
     def _place(self, points: MaterialPoints) -> list[tuple[LawAtPoints, NDArray[np.int64]]]:
         """Put every law at the points that follow it; return the laws with the indices of their points."""
@@ -179,6 +194,19 @@ class SceneMaterials:
             out.append((law, np.flatnonzero(number == k)))
             law.place(points, out[-1][1], values)
         return out
+
+
+def _known(name: str, value) -> NDArray[np.float64]:
+    """Return what a law takes as an array; it may be infinite, but not nan."""
+    out = numbers(name, value, None, allowed="numbers", test=np.isreal)
+    if np.isnan(out).any():
+        raise ValueError(f"{name} = nan, must be numbers")
+    return out
+
+
+def _finite(values: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which rows (n,) of values (n, ...) are finite."""
+    return np.isfinite(values).reshape(len(values), -1).all(axis=1)
 
 
 def _takes(law: type[Skeleton]) -> list[str]:
@@ -259,7 +287,9 @@ class LawAtPoints:
     @cached_property
     def _update(self) -> PointExpression:
         """All components of the new state in one vector, whose parts have the shapes `self._parts`."""
-        new = {name: ufl.as_ufl(f) for name, f in call(self.law.update, F=self.points.F, **self._values).items()}
+        given = call(self.law.update, F=self.points.F, **self._values)
+        instance(f"{self.law.__name__}.update: the new state", given, dict)
+        new = {name: ufl.as_ufl(f) for name, f in given.items()}
         for name, f in new.items():
             if name not in self.law.state or f.ufl_shape != np.shape(self.law.state[name]):
                 raise ValueError(f"{self.law.__name__}.update: {name!r} of shape {f.ufl_shape} is not in its state")
@@ -296,8 +326,9 @@ class ConductivityAtPieces:
 
     def _in_ufl(self, law: Callable):
         points, J = self._points, ufl.det(self._points.F)
-        return call(
+        return expression(
             law,
+            [()],
             conductivity=points.conductivity,
             F=points.F,
             J=J,
@@ -309,11 +340,12 @@ class ConductivityAtPieces:
     def evaluate(self, material: NDArray[np.int32]) -> NDArray[np.float64]:
         """Return the conductivities (m,), m/s, of pieces of the given materials (m,)."""
         out = self._points.data["conductivity"][:, 0].copy()
-        for law, expression in self._laws.items():
+        for law, k in self._laws.items():
             rows = np.flatnonzero([m.conductivity_law is law for m in self._materials])
             chosen = np.isin(material, rows)
-            out[chosen] = expression.evaluate()[chosen]
-            bad = np.flatnonzero(chosen & ~(out >= 0))
+            out[chosen] = k.evaluate()[chosen]
+            bad = np.flatnonzero(chosen & ~((out >= 0) & (out < np.inf)))
             if len(bad):
-                raise ValueError(f"conductivity law: k = {out[bad[0]]:g} at {self._points.x[bad[0]]}, must be >= 0")
+                where = f"k = {out[bad[0]]:g} at {self._points.x[bad[0]]}"
+                raise ValueError(f"conductivity law: {where}, must be >= 0 and finite")
         return out

@@ -17,8 +17,8 @@ import numpy as np
 import ufl
 from numpy.typing import ArrayLike, NDArray
 
-from mpm_dolfinx.check import functions, line, numbers
-from mpm_dolfinx.extend import call
+from mpm_dolfinx.check import asked, functions, line, numbers
+from mpm_dolfinx.extend import expression
 
 Field = float | Sequence[float] | Callable[[NDArray[np.float64]], ArrayLike]
 """A constant (number or vector), or a function of the reference positions X (n, d), m, that gives (n, ...)."""
@@ -115,7 +115,8 @@ class Skeleton:
         for name in (f.name for f in fields(self) if f.name != "conductivity_law"):
             value, what = getattr(self, name), f"{type(self).__name__}: {name}"
             if callable(value):
-                values[name] = given = numbers(f"{what}(X)", value(X), None, allowed="numbers", test=np.isreal)
+                given = asked(f"{what}(X)", f"one value for each of {len(X)} positions", value, X)
+                values[name] = given = numbers(f"{what}(X)", given, None, allowed="numbers", test=np.isreal)
                 if given.shape[:1] != (len(X),) or (name in scalars and given.ndim > 1):
                     more = "" if name in scalars else " ..."
                     allowed = f"one value a position, ({len(X)},{more})"
@@ -141,13 +142,14 @@ class Skeleton:
             UFL values of the parameters and of the state.
         """
         if cls.kirchhoff is None:
-            return ufl.diff(call(cls.energy, F=F, **values), F)
+            return ufl.diff(expression(cls.energy, [()], "F", F=F, **values), F)
         return cls.kirchhoff_in_plane(F, values) * ufl.inv(F).T
 
     @classmethod
     def kirchhoff_in_plane(cls, F, values: Mapping[str, object]):
         """Return the Kirchhoff stress (d, d), Pa, as UFL, of a law that gives it."""
-        tau, d = call(cls.kirchhoff, F=F, **values), F.ufl_shape[0]
+        d = F.ufl_shape[0]
+        tau = expression(cls.kirchhoff, [(d, d), (3, 3)], "F", F=F, **values)
         return ufl.as_matrix([[tau[a, b] for b in range(d)] for a in range(d)])
 
     def drained_modulus(self, dim: int) -> float:
@@ -194,7 +196,7 @@ def _check(obj, name: str, test: Callable, allowed: str) -> None:
     except TypeError:
         good = np.array(False)
     if not good.all():
-        value = value if good.ndim == 0 else float(np.asarray(value)[np.argmin(good)])
+        value = value if good.ndim == 0 else float(np.broadcast_to(value, good.shape)[np.argmin(good)])
         raise ValueError(f"{type(obj).__name__}: {name} = {line(value)}, must be {allowed}")
 
 

@@ -26,7 +26,8 @@ from mpm_dolfinx import _compat
 from mpm_dolfinx.check import line
 from mpm_dolfinx.dilatation import MeanDilatation
 from mpm_dolfinx.elements import ElementForces, ElementMatrices, StackedElementMatrices
-from mpm_dolfinx.extend import call
+from mpm_dolfinx.extend import compiling
+from mpm_dolfinx.extend import form as form_of
 from mpm_dolfinx.forms import FacetForm, FormPoints, PointForm
 from mpm_dolfinx.grid import Grid
 from mpm_dolfinx.materials import Skeleton
@@ -122,13 +123,14 @@ class Momentum:
         """Add a term of the user's: see `extend`."""
         V = self.u.function_space
         v, du = ufl.TestFunction(V), ufl.TrialFunction(V)
-        form = call(term, points=self.pieces, u=self.u, v=v, t=t, dt=dt)
-        if not isinstance(form, ufl.Form):
-            raise ValueError(f"terms: a function gives {line(form)}, must be a form with points.dx")
+        form = form_of("terms", term, points=self.pieces, u=self.u, v=v, t=t, dt=dt)
         potential = not form.arguments()
+        if potential and self.u not in form.coefficients():
+            raise ValueError(f"terms: {line(form)}: depends on neither u nor v, must be a form in one of them")
         if potential:
             form = ufl.derivative(form, self.u, v)
-        self.terms.append(PointForm(form, self.pieces))
+        with compiling(f"terms: {line(term)}", "linear in v, or an energy of u"):
+            self.terms.append(PointForm(form, self.pieces))
         self._own = fem.Function(V)
         if self.u in form.coefficients():
             self._tangents.append(PointForm(ufl.derivative(form, self.u, du), self.pieces))

@@ -8,6 +8,7 @@ whenever a run ends, what it has written until then can be read.
 from __future__ import annotations
 
 import csv
+import errno
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -23,7 +24,7 @@ import numpy as np
 from dolfinx import fem, io
 from numpy.typing import NDArray
 
-from mpm_dolfinx.check import whole
+from mpm_dolfinx.check import flag, line, line_of, on_disk, path, whole
 from mpm_dolfinx.exchange import at_root, to_root
 from mpm_dolfinx.points import MaterialPoints
 from mpm_dolfinx.timeloop import Result
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 
 VTK_CELLS = {2: ("quad", [0, 1, 3, 2]), 3: ("hexahedron", [0, 1, 3, 2, 4, 5, 7, 6])}
 """VTK's cell for a domain, and the domain's corners in VTK's order."""
+WRITABLE = "in a folder that can be written, with room; the run goes on with `after=simulation.result`"
 COUNTS = ("steps", "newton", "coupling", "cuts", "rederived", "balance", "residual", "wall")
 
 
@@ -61,16 +63,26 @@ class Writer:
     """
 
     def __init__(self, simulation: Simulation, folder: str | os.PathLike, *, every: int = 1, grid: bool = False):
-        folder, comm, self._t = Path(folder), simulation.grid.comm, simulation.t
-        self.every, self._started = whole("writer: every", every), False
-        self._table = Table(comm, folder / "history.csv", self._t)
-        self._points = Series(comm, folder / "points.pvd", self._t)
-        self._grid = Series(comm, folder / "grid.pvd", self._t) if grid else None
-        if not self._points.entries:
-            self._write_points(simulation)
+        if not hasattr(simulation, "effective_stress"):  # its class is defined later than this one
+            raise ValueError(f"writer: simulation = {line(simulation)}, must be a Simulation")
+        flag("writer: grid", grid)
+        folder, comm, self._t = path("writer: folder", folder), simulation.grid.comm, simulation.t
+        self.every, self._started, self._simulation = whole("writer: every", every), False, simulation
+        with on_disk("writer: folder", "one that can be written"):
+            self._table = Table(comm, folder / "history.csv", self._t)
+            self._points = Series(comm, folder / "points.pvd", self._t)
+            self._grid = Series(comm, folder / "grid.pvd", self._t) if grid else None
+            if not self._points.entries:
+                self._write_points(simulation)
 
     def __call__(self, simulation: Simulation) -> None:
         """Write a row of the histories and, in its turn, the present state."""
+        if simulation is not self._simulation:
+            raise ValueError("writer: made for another simulation, must be made for the one that runs")
+        with on_disk(f"{self._points.file.parent}: writer at t = {simulation.t:g} s", WRITABLE):
+            self._write(simulation)
+
+    def _write(self, simulation: Simulation) -> None:
         result = simulation.result
         if not self._started:
             self._start(result)
@@ -113,9 +125,11 @@ class Writer:
         comm, stem = simulation.grid.comm, self._grid.next
         _write_fields(comm, stem.with_suffix(".pvd"), _grid_fields(simulation), simulation.t)
         if comm.rank == 0:  # our index names the pieces themselves: 0.5's own names each of them once a function
-            stem.with_suffix(".pvd").unlink()
-            stem.with_name(f"{stem.name}000000.pvtu").unlink()
+            stem.with_suffix(".pvd").unlink(missing_ok=True)
+            stem.with_name(f"{stem.name}000000.pvtu").unlink(missing_ok=True)
         pieces = [stem.with_name(f"{stem.name}_p{rank}_000000.vtu") for rank in range(comm.size)]
+        if not comm.allreduce(_ends(pieces[comm.rank]), op=MPI.LAND):  # dolfinx does not notice a full disk
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(stem))
         self._grid.entries.append((simulation.t, pieces))
 
 
@@ -190,6 +204,15 @@ def _write_fields(comm: MPI.Intracomm, file: Path, fields: list[fem.Function], t
         f.write_function(fields, t)
 
 
+def _ends(file: Path) -> bool:
+    """Whether a file of VTK is there up to its end."""
+    if not file.exists():
+        return False
+    with open(file, "rb") as f:
+        f.seek(-min(64, file.stat().st_size), os.SEEK_END)
+        return f.read().rstrip().endswith(b"</VTKFile>")
+
+
 @contextmanager
 def replacing(file: Path) -> Iterator[Path]:
     """Give the path of a file to write, which takes the place of `file` when it is whole and on the disk."""
@@ -198,6 +221,15 @@ def replacing(file: Path) -> Iterator[Path]:
     with open(part, "rb") as f:
         os.fsync(f.fileno())
     os.replace(part, file)
+
+
+@contextmanager
+def _ours(file: Path) -> Iterator[None]:
+    """Refuse a file that no `Writer` has written, with a ValueError."""
+    try:
+        yield
+    except (ElementTree.ParseError, KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{file}: not of a Writer ({line_of(error)}), must be, or take another folder") from error
 
 
 def kept(entries: Sequence[tuple[float, Any]], t: float) -> list[tuple[float, Any]]:
@@ -224,8 +256,9 @@ class Series:
         self.folder.mkdir(parents=True, exist_ok=True)
         times: dict[float, list[Path]] = {}
         if self.file.exists():
-            for item in ElementTree.parse(self.file).iter("DataSet"):
-                times.setdefault(float(item.get("timestep")), []).append(self.file.parent / item.get("file"))
+            with _ours(self.file):
+                for item in ElementTree.parse(self.file).iter("DataSet"):
+                    times.setdefault(float(item.get("timestep")), []).append(self.file.parent / item.get("file"))
         return list(times.items())
 
     def write_index(self) -> None:
@@ -254,15 +287,16 @@ class Table:
     def _read(self) -> list[tuple[float, dict[str, str]]]:
         if not self.file.exists():
             return []
-        text = self.file.read_text()
-        whole = text[: text.rfind("\n") + 1].splitlines()  # the last line may have been broken off
-        return [(float(row["t"]), row) for row in csv.DictReader(whole)]
+        with _ours(self.file):
+            text = self.file.read_text()
+            whole = text[: text.rfind("\n") + 1].splitlines()  # the last line may have been broken off
+            return [(float(row["t"]), row) for row in csv.DictReader(whole)]
 
     def start(self, first: dict[str, float]) -> None:
         """Write the rows that were kept, or else a first row."""
         rows = [row for _, row in self._rows] or [first]
-        if list(rows[0]) != list(first):
-            raise ValueError(f"{self.file}: its columns are {', '.join(rows[0])}, the run's {', '.join(first)}")
+        self._columns = list(rows[0])
+        self._check(first)
 
         def write() -> None:
             with replacing(self.file) as part:
@@ -272,7 +306,13 @@ class Table:
 
     def add(self, row: dict[str, float]) -> None:
         """Add a row."""
+        self._check(row)
         at_root(self.comm, lambda: self._append(self.file, [row], "a"))
+
+    def _check(self, row: dict[str, float]) -> None:
+        if list(row) != self._columns:
+            both = f"{', '.join(self._columns)}, the run's {', '.join(row)}"
+            raise ValueError(f"{self.file}: its columns are {both}; must be the same, or in another folder")
 
     @staticmethod
     def _append(file: Path, rows: Sequence[dict], mode: str) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from mpm_dolfinx.check import line, numbers, whole
+from mpm_dolfinx.check import all_of, asked, instance, line, numbers, whole
 from mpm_dolfinx.domains import corner_bits, volumes
 from mpm_dolfinx.exchange import Exchange
 from mpm_dolfinx.grid import Grid, side
@@ -120,7 +120,7 @@ class Body:
         if self.map is None:
             return corners
         x = corners.reshape(lower.shape[0] * corners.shape[1], -1)
-        images = np.asarray(self.map(x), dtype=float)
+        images = numbers("body: the map", asked("body: the map", "a function of positions", self.map, x), None)
         if images.shape != x.shape:
             raise ValueError(f"body: the map gives shape {images.shape}, must be one position each, {x.shape}")
         return images.reshape(corners.shape)
@@ -146,6 +146,7 @@ def box(grid: Grid, lower: ArrayLike, upper: ArrayLike, per_cell: int = 2, mater
     material
         Index of the material.
     """
+    instance("body: grid", grid, Grid)
     lower, upper = (
         numbers(f"body: {name}", x, (grid.dim,), allowed=f"{grid.dim} finite coordinates")
         for name, x in (("lower", lower), ("upper", upper))
@@ -157,7 +158,7 @@ def box(grid: Grid, lower: ArrayLike, upper: ArrayLike, per_cell: int = 2, mater
     spacing = (upper - lower) / count
     index = np.stack(np.meshgrid(*map(np.arange, count), indexing="ij"), axis=-1).reshape(-1, grid.dim)
     sides = np.stack([index == 0, index == count - 1], axis=-1)
-    return _inside(grid, Body(lower + index * spacing, spacing, sides, material))
+    return check_inside(grid, Body(lower + index * spacing, spacing, sides, material))
 
 
 def shape(
@@ -174,13 +175,15 @@ def shape(
     material
         Index of the material.
     """
+    instance("body: grid", grid, Grid)
     material, per_cell = whole("body: material", material, 0), whole("body: per_cell", per_cell)
     spacing = grid.h / per_cell
     count = grid.shape * per_cell
     index = np.stack(np.meshgrid(*map(np.arange, count), indexing="ij"), axis=-1).reshape(-1, grid.dim)
-    filled = np.asarray(inside(grid.lower + (index + 0.5) * spacing), dtype=bool)
-    if filled.shape != (len(index),):
-        raise ValueError(f"body: inside(x) has shape {filled.shape}, must be one bool a position, ({len(index)},)")
+    allowed = f"one bool a position, ({len(index)},)"
+    filled = np.asarray(asked("body: inside(x)", allowed, inside, grid.lower + (index + 0.5) * spacing))
+    if filled.shape != (len(index),) or filled.dtype != bool:  # a distance is neither inside nor outside
+        raise ValueError(f"body: inside(x) has shape {filled.shape} of {filled.dtype}, must be {allowed}")
     padded = np.pad(filled.reshape(count), 1)
     index = index[filled]
     if not len(index):
@@ -191,7 +194,7 @@ def shape(
             neighbour = index + 1
             neighbour[:, axis] += 2 * end - 1
             sides[:, axis, end] = ~padded[tuple(neighbour.T)]
-    return _inside(grid, Body(grid.lower + index * spacing, spacing, sides, material))
+    return check_inside(grid, Body(grid.lower + index * spacing, spacing, sides, material))
 
 
 def mapped(grid: Grid, body: Body, map: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> Body:
@@ -204,6 +207,8 @@ def mapped(grid: Grid, body: Body, map: Callable[[NDArray[np.float64]], NDArray[
     map
         Maps positions (n, d), m, to positions (n, d), m, inside the grid; smooth, and not turning boxes inside out.
     """
+    instance("body: grid", grid, Grid)
+    instance("body to bend", body, Body)
     bent = replace(body, map=map)
     corners = bent.corners()
     out = np.flatnonzero(grid.outside(corners.reshape(-1, grid.dim)))
@@ -218,11 +223,13 @@ def mapped(grid: Grid, body: Body, map: Callable[[NDArray[np.float64]], NDArray[
     return bent
 
 
-def _inside(grid: Grid, body: Body) -> Body:
-    out = np.flatnonzero(grid.outside(body.lower) | grid.outside(body.lower + body.spacing))
+def check_inside(grid: Grid, body: Body, name: str = "body") -> Body:
+    """Return a body; refuse one that is not wholly in the grid.  What a map has bent has been looked at."""
+    outside = grid.outside(body.lower) | grid.outside(body.lower + body.spacing)
+    out = np.flatnonzero(outside & (body.map is None))
     if len(out):
         raise ValueError(
-            f"body: {len(out)} points outside the grid, the first at {body.centre[out[0]]}, "
+            f"{name}: {len(out)} points outside the grid, the first at {body.centre[out[0]]}, "
             f"must be inside {grid.lower} to {grid.upper}"
         )
     return body
@@ -388,19 +395,36 @@ def face_vectors(corners: NDArray[np.float64], axis: int, end: int) -> NDArray[n
 class Probes:
     """Tracked positions: material particles whose displacement is wanted; m of them.
 
-    x0 : (m, d) reference positions; id : (m,) the domain that holds each; xi : (m, d) place in it.
+    x0 : (m, d) reference positions; id : (m,) the domain that holds each; xi : (m, d) place in it;
+    bodies: those of the scene that they are for.
     """
 
     x0: NDArray[np.float64]
     id: NDArray[np.int64]
     xi: NDArray[np.float64]
+    bodies: tuple[Body, ...] = ()
+
+    def check(self, bodies: Sequence[Body], present: Sequence[bool]) -> None:
+        """Refuse, with a ValueError, a scene of other bodies, or one from which a probed body has gone."""
+        if len(bodies) != len(self.bodies) or not all(map(_same, bodies, self.bodies)):
+            what = f"made for {len(self.bodies)} bodies, the scene has {len(bodies)}"
+            raise ValueError(f"probes: {what}; must be made with all bodies of the scene, in its order")
+        body = np.searchsorted(np.cumsum([len(b) for b in bodies]), self.id, side="right")
+        gone = np.flatnonzero(~np.asarray(present)[body])
+        if len(gone):
+            raise ValueError(f"probe at {self.x0[gone[0]]}: in body {body[gone[0]]}, must be in one that is there now")
 
     def displacement(self, points: MaterialPoints, comm) -> NDArray[np.float64]:
-        """Return the displacements (m, d), m, on every process; zero where the particle is not there."""
+        """Return the displacements (m, d), m, on every process."""
         here, at = points.find(self.id)
         u = np.zeros_like(self.x0)
         u[here] = interpolate(points.corners[at] - points.origin[at], self.xi[here])
         return comm.allreduce(u)
+
+
+def _same(a: Body, b: Body) -> bool:
+    """Whether two bodies have the same points."""
+    return a is b or (a.lower.shape == b.lower.shape and np.array_equal(a.lower, b.lower))
 
 
 def positions(x0: ArrayLike, dim: int) -> NDArray[np.float64]:
@@ -414,6 +438,7 @@ def positions(x0: ArrayLike, dim: int) -> NDArray[np.float64]:
 
 def probes(bodies: Sequence[Body], x0: ArrayLike) -> Probes:
     """Return probes at reference positions x0 (m, d), m, before a map, inside or on the surface of the bodies."""
+    all_of("probes: bodies", bodies, Body, 1)
     x0 = positions(x0, bodies[0].lower.shape[1])
     centre = np.concatenate([b.centre for b in bodies])
     spacing = np.concatenate([np.broadcast_to(b.spacing, b.lower.shape) for b in bodies])
@@ -424,4 +449,4 @@ def probes(bodies: Sequence[Body], x0: ArrayLike) -> Probes:
     far = np.flatnonzero((np.abs(xi) > 1 + 1e-9).any(axis=1))
     if len(far):
         raise ValueError(f"probe at {x0[far[0]]}: outside the bodies, must be in one or on its surface")
-    return Probes(x0, ids, xi)
+    return Probes(x0, ids, xi, tuple(bodies))

@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mpm_dolfinx.check import numbers, whole
+from mpm_dolfinx.check import line, numbers, on_disk, path, whole
 from mpm_dolfinx.exchange import at_root, to_root
-from mpm_dolfinx.output import replacing
+from mpm_dolfinx.output import WRITABLE, replacing
 from mpm_dolfinx.points import MaterialPoints
 from mpm_dolfinx.remap import Carried
 from mpm_dolfinx.timeloop import Result, log
@@ -54,6 +54,8 @@ class Checkpoint:
     _last: float = field(default_factory=time.monotonic, init=False, repr=False)
 
     def __post_init__(self):
+        if path("checkpoint: file", self.file).is_dir():
+            raise ValueError(f"checkpoint: file = {line(self.file)}: is a folder, must be a file")
         whole("checkpoint: every", self.every)
         numbers("checkpoint: seconds", self.seconds, test=lambda v: v >= 0, allowed=">= 0")
 
@@ -85,7 +87,8 @@ def save(simulation: Simulation, file: Path) -> None:
             np.savez(f, format=np.array(FORMAT), note=np.array(json.dumps(note)), **_named("", state))
         return file.stat().st_size
 
-    size = at_root(comm, write)
+    with on_disk(f"{file}: checkpoint at t = {simulation.t:g} s", WRITABLE):
+        size = at_root(comm, write)
     simulation.coupler.forget()
     seconds = time.perf_counter() - began
     log(comm, "t = %g s: checkpoint %s written: %.3g MB, %.2g s", simulation.t, file, size / 1e6, seconds)
@@ -108,10 +111,14 @@ def resume(simulation: Simulation, file: str | os.PathLike) -> Result:
     ValueError
         The file is not a whole checkpoint, or one of another scene: says what differs.
     """
+    file = path("checkpoint: file", file)
+    if not hasattr(simulation, "restore"):  # its class is defined later than this
+        raise ValueError(f"resume: simulation = {line(simulation)}, must be a Simulation")
     comm, arrays = simulation.grid.comm, {}
 
     def read() -> tuple[dict, dict, dict]:
-        note = _read(Path(file), arrays)
+        with on_disk("resume", "a checkpoint that can be read"):
+            note = _read(file, arrays)
         _check_scene(file, note["scene"], describe(simulation))
         lists = _part(arrays, "result/")
         return note, lists, {name: (values.dtype, values.shape[1:]) for name, values in arrays.items()}
@@ -151,11 +158,11 @@ def _read(file: Path, arrays: dict[str, NDArray]) -> dict:
     except Exception as error:  # numpy and zipfile have many for bytes that are not what they expect
         what = "is cut short or damaged, must be a whole checkpoint" if begin == ZIP else FOREIGN
         raise ValueError(f"{file}: {what}") from error
-    if str(arrays.pop("format", None)) != FORMAT:
+    if str(arrays.pop("format", None)) != FORMAT or "note" not in arrays:
         raise ValueError(f"{file}: {FOREIGN}")
     note = json.loads(str(arrays.pop("note")))
-    if note["version"] != VERSION:
-        raise ValueError(f"{file}: checkpoint of version {note['version']}, this mpm_dolfinx reads {VERSION}")
+    if note.get("version") != VERSION:
+        raise ValueError(f"{file}: checkpoint of version {note.get('version')}, must be {VERSION} for this mpm_dolfinx")
     return note
 
 
@@ -183,6 +190,5 @@ def _check_scene(file: Path, there: dict[str, Any], here: dict[str, Any]) -> Non
     """Refuse the checkpoint of another scene."""
     for name in {**there, **here}:
         if there.get(name) != here.get(name):
-            raise ValueError(
-                f"{file}: checkpoint of another scene: {name}: {there.get(name)} there, {here.get(name)} here"
-            )
+            both = f"{there.get(name)} there, {here.get(name)} here, must agree"
+            raise ValueError(f"{file}: checkpoint of another scene: {name}: {both}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,20 +15,22 @@ from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx import summary
 from mpm_dolfinx.boundary import Boundary
-from mpm_dolfinx.check import all_of, functions, line, numbers
+from mpm_dolfinx.check import all_of, asked, chosen, flag, functions, instance, line, numbers
 from mpm_dolfinx.conditions import Displacement, Drained, Inflow, RigidPlate, Traction
 from mpm_dolfinx.coupling import COUPLINGS, Coupler, NotConverged, Report
 from mpm_dolfinx.domains import parallelepipeds, tangled
 from mpm_dolfinx.exchange import Exchange
+from mpm_dolfinx.extend import compiling
 from mpm_dolfinx.forms import FormPoints
 from mpm_dolfinx.grid import Grid, sum_by
 from mpm_dolfinx.laws import ConductivityAtPieces, SceneMaterials
 from mpm_dolfinx.materials import Fluid, Skeleton
 from mpm_dolfinx.momentum import FULL, Momentum
 from mpm_dolfinx.placement import Placement
-from mpm_dolfinx.points import Body, MaterialPoints, Probes, check_apart, material_points
+from mpm_dolfinx.points import Body, MaterialPoints, Probes, check_apart, check_inside, material_points
 from mpm_dolfinx.remap import Carried, at_start, remap
 from mpm_dolfinx.storage import Storage
+from mpm_dolfinx.thin import warn_thin
 from mpm_dolfinx.timeloop import Observer, Result, run
 from mpm_dolfinx.unknowns import collect_garbage
 
@@ -95,18 +98,24 @@ class Simulation:
     ):
         if quadrature not in ("domain", "point"):
             raise ValueError(f"quadrature {quadrature!r}: must be domain or point")
-        if coupling not in COUPLINGS:
+        if not isinstance(coupling, str) or coupling not in COUPLINGS:
             raise ValueError(f"coupling {coupling!r}: must be one of {', '.join(COUPLINGS)}")
         if fluid is None and sources:
             raise ValueError("sources need a fluid")
+        instance("grid", grid, Grid)
         all_of("bodies", bodies, Body, 1)
         all_of("materials", materials, Skeleton, 1)
-        all_of("fluid", [fluid] if fluid is not None else [], Fluid)
+        if fluid is not None:
+            instance("fluid", fluid, Fluid)
+        elif numbers("pressure", pressure):
+            raise ValueError(f"pressure = {line(pressure)}: needs a fluid")
+        chosen("later", later, range(len(bodies)), "indices of the bodies")
         functions("terms", terms)
         functions("sources", sources)
         for i, body in enumerate(bodies):
             if body.lower.shape[1] != grid.dim:
                 raise ValueError(f"body {i}: has {body.lower.shape[1]} coordinates, must have the grid's {grid.dim}")
+            check_inside(grid, body, f"body {i}")
         self.grid, self.materials, self.fluid, self.bodies = grid, materials, fluid, bodies
         self.quadrature = quadrature
         grid.share(np.concatenate([body.centre for body in bodies]))
@@ -117,6 +126,7 @@ class Simulation:
         self.present = [body not in later for body in range(len(bodies))]
         """Which bodies are there."""
         check_apart(bodies, self.present)
+        warn_thin(grid, bodies, fixed)
         self.placement: Placement | None = None
         """The domains as they have been cut; None where they are to be cut anew."""
         self.resets = 0
@@ -182,7 +192,8 @@ class Simulation:
         self.laws = scene.parts(self.pieces, ["F", "biot"] if fluid else ["F"])
         p = fem.Function(grid.cellwise()) if fluid else None
         options = {"mean_dilatation": scene.nearly_incompressible, "symmetric": scene.symmetric}
-        self.momentum = Momentum(grid, self.pieces, self.laws, fixed, p, self.gravity, **options)
+        with compiling(f"materials: {', '.join(law.__name__ for law in scene.laws)}", "laws in UFL of these shapes"):
+            self.momentum = Momentum(grid, self.pieces, self.laws, fixed, p, self.gravity, **options)
         self._time, self._dt = fem.Constant(grid.mesh, 0.0), fem.Constant(grid.mesh, 1.0)
         for term in terms:
             self.momentum.add(term, self._time, self._dt)
@@ -233,10 +244,9 @@ class Simulation:
         """
         if gravity is not None and self.gravity is None:
             raise ValueError("gravity: the scene was made without, must be made with (0, 0) first")
-        for body in remove:
-            self._check_body(body, self.present[body] if 0 <= body < len(self.present) else False, "present")
-        for body in add:
-            self._check_body(body, body in self._waiting, "one of the bodies to come later")
+        chosen("stage: remove", remove, np.flatnonzero(self.present).tolist(), "bodies that are present")
+        chosen("stage: add", add, list(self._waiting), "bodies that are to come later")
+        flag("stage: reset_displacement", reset_displacement)
         present = [(here and body not in remove) or body in add for body, here in enumerate(self.present)]
         check_apart(self.bodies, present)
         named = {"fixed": fixed, "tractions": tractions, "displacements": displacements, "drained": drained}
@@ -253,14 +263,8 @@ class Simulation:
         if reset_displacement:
             self.points.origin = self.points.corners.copy()
 
-    def _check_body(self, body: int, ok: bool, what: str) -> None:
-        if not ok:
-            raise ValueError(f"stage: body {body}, must be {what}")
-
     def _take(self, body: int) -> MaterialPoints:
         """Take a body away; return its points."""
-        if not 0 <= body < len(self.bodies):
-            raise ValueError(f"later: body {body}, must be an index of the {len(self.bodies)} bodies")
         self.present[body] = False
         start = sum(len(b) for b in self.bodies[:body])
         mine = (self.points.id >= start) & (self.points.id < start + len(self.bodies[body]))
@@ -330,8 +334,9 @@ class Simulation:
         collect_garbage(self.grid.mesh.comm)
         self._time.value, self._dt.value = t, t - self.t
         if self.gravity is not None:
-            given = self._conditions["gravity"]
-            self.gravity.value = self._gravity(given(t) if callable(given) else given, f"gravity at t = {t:g} s")
+            given, name = self._conditions["gravity"], f"gravity at t = {t:g} s"
+            given = asked(name, f"{self.grid.dim} numbers for a time", given, t) if callable(given) else given
+            self.gravity.value = self._gravity(given, name)
         fresh = not self._prepared and not self._stays()
         if fresh:
             self._reset_grid()
@@ -557,8 +562,8 @@ class Simulation:
             mean = [place.mean(column) for column in place.to_pieces(delta).reshape(-1, d * d).T]
             F = np.stack(mean, axis=1).reshape(n, d, d) @ points.F
             self._check_volumes(np.linalg.det(F))
+            self._scene.update_state(replace(points, F=F))
             points.F = F
-            self._scene.update_state(points)
             moved = place.displacement(u, corners=self.quadrature == "domain")
             if self.quadrature == "domain":
                 points.corners = points.corners + moved

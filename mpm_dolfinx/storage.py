@@ -31,7 +31,8 @@ from numpy.typing import NDArray
 from mpm_dolfinx import _compat
 from mpm_dolfinx.check import line
 from mpm_dolfinx.elements import ElementForces
-from mpm_dolfinx.extend import call
+from mpm_dolfinx.extend import compiling
+from mpm_dolfinx.extend import form as form_of
 from mpm_dolfinx.forms import FacetForm, FormPoints, PointForm
 from mpm_dolfinx.grid import Grid, sum_by
 from mpm_dolfinx.remap import Reconstruction
@@ -100,11 +101,10 @@ class Storage:
         Q, points = self.p.function_space, self._pieces
         one, self._gain = fem.Function(Q), fem.Function(Q)
         one.x.array[:] = 1.0
-        form = call(source, points=points, q=ufl.TestFunction(Q), p=self.p, t=t)
-        if not isinstance(form, ufl.Form):
-            raise ValueError(f"sources: a function gives {line(form)}, must be a form with points.dx")
+        form = form_of("sources", source, points=points, q=ufl.TestFunction(Q), p=self.p, t=t)
         slope = PointForm(ufl.derivative(form, self.p, one), points) if self.p in form.coefficients() else None
-        self.sources.append((PointForm(form, points), slope))
+        with compiling(f"sources: {line(source)}", "linear in q"):
+            self.sources.append((PointForm(form, points), slope))
 
     def _assemble_sources(self, slope: bool = False) -> NDArray[np.float64]:
         """Return the rate of the sources in each active cell at p (m^d/s), or its derivative by the cell's p."""

@@ -20,7 +20,7 @@ from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
 from mpm_dolfinx import _compat
-from mpm_dolfinx.check import functions, line
+from mpm_dolfinx.check import functions, instance, line, numbers
 from mpm_dolfinx.coupling import NotConverged
 from mpm_dolfinx.placement import LeftGrid
 from mpm_dolfinx.points import Probes
@@ -43,6 +43,8 @@ PARTS = (
 )
 """Parts of a run that are timed, as `mpm: ...` in dolfinx's own list of timings."""
 MIN_CUT = 2.0**-10  # of dt: a step is not cut below this
+MOST = 1e9
+"""Output intervals of a run: with more, a step is lost in the rounding of the time."""
 logger = logging.getLogger("mpm_dolfinx")
 
 
@@ -58,9 +60,9 @@ class Result:
     dt: output interval, s; small: the step to try next, s; converged: the end has been reached.
     """
 
-    t: list[float] = field(default_factory=list)
-    displacement: list[NDArray[np.float64]] = field(default_factory=list)
-    pressure: list[tuple[float, float]] = field(default_factory=list)
+    t: list[float] = field(default_factory=list, repr=False)
+    displacement: list[NDArray[np.float64]] = field(default_factory=list, repr=False)
+    pressure: list[tuple[float, float]] = field(default_factory=list, repr=False)
     steps: int = 0
     newton: int = 0
     coupling: int = 0
@@ -72,7 +74,7 @@ class Result:
     dt: float = 0.0
     small: float = 0.0
     converged: bool = False
-    profile: dict[str, float] = field(default_factory=dict)
+    profile: dict[str, float] = field(default_factory=dict, repr=False)
     points: int = 0
     memory: float = 0.0
     imbalance: dict[str, float] = field(default_factory=dict)
@@ -146,14 +148,19 @@ def run(
     """
     if probes is not None and not isinstance(probes, Probes):
         raise ValueError(f"probes = {line(probes)}, must be what `probes` gives")
-    functions("observe", observe)
+    observers = [observe] if callable(observe) else observe
+    if probes is not None:
+        probes.check(simulation.bodies, simulation.present)
+    functions("observe", observers)
     functions("checkpoint", [checkpoint] if checkpoint is not None else [])
+    if after is not None:
+        instance("after", after, Result)
+    t_end, dt = _times(simulation.t, t_end, dt, after is not None)
     result = simulation.result = _histories(simulation, t_end, dt, probes, after)
     dt, start, done = result.dt, result.t[0], len(result.t) - 1
     # a last interval that is a fraction of dt counts as one
     intervals = max(done + (t_end - simulation.t > 1e-9 * dt), round((t_end - start) / dt))
     result.converged = done == intervals
-    observers = [observe] if callable(observe) else observe
     stopwatch = _Stopwatch(result)
     quiet = None if progress and simulation.grid.comm.rank == 0 else True
     bar = tqdm(total=intervals, initial=done, disable=quiet, unit="step")
@@ -179,10 +186,16 @@ def run(
     return result
 
 
+def _times(now: float, t_end: float, dt: float, goes_on: bool) -> tuple[float, float]:
+    """Return end and step of a run from `now`, s; ValueError if there are none, or too many steps to tell apart."""
+    more, least = (">=", now) if goes_on else (">", np.nextafter(now, inf))
+    end = numbers("t_end", t_end, allowed=f"{more} {now:g} s and finite", test=lambda v: (v >= least) & (v < inf))
+    allowed = f"> 0, and not below {(end - now) / MOST:g} s"
+    return float(end), float(numbers("dt", dt, allowed=allowed, test=lambda v: (v > 0) & (v * MOST >= end - now)))
+
+
 def _histories(simulation, t_end: float, dt: float, probes: Probes | None, after: Result | None) -> Result:
     """Return new histories that begin with the present state, or those to go on with."""
-    if not (dt > 0 and (t_end >= simulation.t if after else t_end > simulation.t) and t_end < inf):
-        raise ValueError(f"dt = {dt!r}, t_end = {t_end!r}: must be dt > 0 and t_end > {simulation.t:g} and finite")
     dt = min(dt, t_end - (after.t[0] if after else simulation.t))
     if after is None:
         result = Result(dt=dt, small=dt)

@@ -169,7 +169,11 @@ CASES = {
     "term of a number": (lambda: scene(terms=[1.0]), "terms", "1.0"),
     "term that gives nothing": (lambda: scene(terms=[lambda v: None]), "terms", "None"),
     "source that gives a number": (lambda: scene(fluid=WATER, sources=[lambda q: 1.0]), "sources", "1.0"),
-    "body to come that there is not": (lambda: scene(later=[5]), "later: body 5", "index of the 1 bodies"),
+    "body to come that there is not": (
+        lambda: scene(later=[5]),
+        "later: body 5",
+        "indices of the bodies, each once: 0",
+    ),
     # ---- conditions on sides
     "unknown side": (lambda: sides("Traction", "lid", (0, 1)), "side 'lid'", "left, right, bottom, top"),
     "side of another dimension": (
@@ -240,8 +244,8 @@ CASES = {
     "probes in a list": (lambda: run(probes=[[0.1, 0.3]]), "probes", "[[0.1, 0.3]]"),
     "observer of a word": (lambda: run(observe="me"), "observe", "'me'"),
     "checkpoint of a word": (lambda: run(checkpoint="me"), "checkpoint", "'me'"),
-    "a body that is not there leaves": (lambda: scene().stage(remove=[1]), "stage: body", "1"),
-    "a body that is there comes": (lambda: scene().stage(add=[0]), "stage: body", "0"),
+    "a body that is not there leaves": (lambda: scene().stage(remove=[1]), "stage: remove: body", "1"),
+    "a body that is there comes": (lambda: scene().stage(add=[0]), "stage: add: body", "0"),
     "gravity that comes later": (lambda: scene().stage(gravity=(0, -1)), "gravity", "(0, 0)"),
     "no checkpoints": (lambda: mpm.Checkpoint("file", every=0), "checkpoint: every", "= 0"),
     "checkpoints every nan": (lambda: mpm.Checkpoint("file", every=NAN), "checkpoint: every", "= nan"),

@@ -246,7 +246,7 @@ def test_a_foreign_file_is_refused(checkpoint, tmp_path):
 
 def test_a_checkpoint_of_another_version_is_refused(checkpoint, monkeypatch):
     monkeypatch.setattr(restart, "VERSION", restart.VERSION + 1)
-    refused(checkpoint, "checkpoint of version 2, this mpm_dolfinx reads 3")
+    refused(checkpoint, "checkpoint of version 2, must be 3")
 
 
 OTHER_SCENES = {

@@ -108,8 +108,8 @@ def test_walls_plates_and_given_displacements_come_and_go():
 @pytest.mark.parametrize(
     "stage, message",
     [
-        ({"remove": [2]}, "stage: body 2, must be present"),
-        ({"add": [0]}, "stage: body 0, must be one of the bodies to come later"),
+        ({"remove": [2]}, "stage: remove: body 2, must be one of the bodies that are present, each once: 0"),
+        ({"add": [0]}, "stage: add: body 0, must be one of the bodies that are to come later, each once"),
         ({"drained": [mpm.Drained("top")]}, "need a fluid"),
         ({"gravity": (0, -1)}, "gravity: the scene was made without"),
     ],
@@ -121,5 +121,5 @@ def test_what_cannot_be_is_refused(stage, message):
 
 
 def test_a_body_that_is_to_come_must_exist():
-    with pytest.raises(ValueError, match="later: body 5, must be an index of the 2 bodies"):
+    with pytest.raises(ValueError, match="later: body 5, must be one of the indices of the bodies, each once: 0, 1"):
         blocks(later=[5])
