@@ -17,7 +17,7 @@ from mpm_dolfinx.coupling import NotConverged
 from mpm_dolfinx.extend import call, expression
 from mpm_dolfinx.forms import FormPoints, PointExpression
 from mpm_dolfinx.grid import Grid
-from mpm_dolfinx.materials import Skeleton
+from mpm_dolfinx.materials import Fluid, Skeleton
 from mpm_dolfinx.points import Body, MaterialPoints
 
 RESERVED = (
@@ -155,6 +155,14 @@ class SceneMaterials:
             for name in m.parameters:
                 out[name][rows] = getattr(at, name)
         return out
+
+    def porosity(self, points: MaterialPoints) -> NDArray[np.float64]:
+        """Return the porosity n = 1 - (1 - n_0) / J at the points (n,)."""
+        return 1 - (1 - self.table(points, lambda m: m.porosity)) / points.J
+
+    def storage(self, points: MaterialPoints, fluid: Fluid) -> NDArray[np.float64]:
+        """Return the storage coefficient at the points (n,), 1/Pa."""
+        return self.table(points, lambda m, n: m.storage(fluid.bulk, n), self.porosity(points))
 
     def state(self, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
         """Return the state at the points (n, ...)."""
