@@ -543,9 +543,11 @@ class Simulation:
     def _untangle(self) -> int:
         """Re-derive from F the domains that have folded: points whose neighbours went elsewhere."""
         points, grid = self.points, self.grid
-        bad = np.flatnonzero(tangled(points.corners, points.volume0 * points.J))
+        volume = points.volume0 * points.J
+        bad = np.flatnonzero(tangled(points.corners, volume))
         if len(bad):
             corners = parallelepipeds(points.x[bad], points.F[bad], self._spacing()[bad])
+            corners = self.boundary.under_held(points.id[bad], points.corners[bad], volume[bad], corners)
             points.corners[bad] = np.clip(corners, grid.lower, grid.upper)
             points.x[bad] = points.corners[bad].mean(axis=1)
         return grid.comm.allreduce(len(bad))
