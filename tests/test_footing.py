@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""A footing pushed into soil: its edge folds the domains that it holds, and it stays where it is."""
+"""A footing pushed into soil: it carries what limit analysis says, and the domains that it folds stay with it."""
 
+import footing
 import numpy as np
 import pytest
 from helpers import SOFT
@@ -30,3 +31,33 @@ def test_a_held_domain_that_folds_keeps_its_face_and_its_volume(dim):
     assert volumes(points.corners[folded]) == pytest.approx(1.1 * points.volume0[folded], rel=1e-12)
     rest = np.setdiff1d(np.arange(len(points)), folded)
     assert np.array_equal(points.corners[rest], corners[rest])
+
+
+def test_the_undrained_limit_load_of_stiff_soil_tends_to_prandtls():
+    coarse, fine = (footing.limit_load("undrained", cells).load for cells in (5, 9))
+    assert coarse[-1] / coarse[30] < 1.001  # it flows
+    assert -0.065 < coarse[-1] - 1 < 2 * (fine[-1] - 1) < 0
+
+
+@pytest.mark.slow
+def test_the_drained_limit_load_of_stiff_soil_tends_to_prandtls():
+    coarse, fine = (footing.limit_load("drained", cells).load for cells in (9, 17))
+    assert 0 < fine[-1] - 1 < coarse[-1] - 1 < 0.05
+    assert fine[-1] / fine[30] < coarse[-1] / coarse[30] < 1.015  # what goes on rising is the error of the grid
+
+
+@pytest.mark.slow
+def test_a_footing_is_pushed_in_as_deep_as_it_is_wide():
+    """With the held faces of folded domains put elsewhere no step was small enough at 0.86 of the way."""
+    run = footing.push(footing.SOIL, 5, 1.0, footing.RATES["slow"])
+    assert run.total("rederived") and not run.total("cuts")
+    assert footing.SURFACE["drained, associated"] < run.load[-1] < 1.25 * footing.SURFACE["drained, associated"]
+    assert max(result.balance for result in run.results) < 1e-8
+
+
+@pytest.mark.slow
+def test_a_fast_push_carries_what_limit_analysis_says_of_an_embedded_base():
+    run = footing.push(footing.SOIL, 9, 0.3, footing.RATES["fast"])
+    depth = np.array(run.settlement)
+    deep = depth > 0.05
+    assert np.array(run.load)[deep] == pytest.approx(footing.embedded(depth[deep]), rel=0.04)
