@@ -23,6 +23,7 @@ from mpm_dolfinx.exchange import Exchange
 from mpm_dolfinx.extend import compiling
 from mpm_dolfinx.forms import FormPoints
 from mpm_dolfinx.grid import Grid, sum_by
+from mpm_dolfinx.held import check_held
 from mpm_dolfinx.laws import ConductivityAtPieces, SceneMaterials
 from mpm_dolfinx.materials import Fluid, Skeleton
 from mpm_dolfinx.momentum import FULL, Momentum
@@ -293,7 +294,7 @@ class Simulation:
             now["plates"],
             [*now["drained"], *now["inflows"]],
         )
-        self._conditions = now
+        self._conditions, self._begins = now, True
         self.reactions = np.zeros((len(now["displacements"]), self.grid.dim))
         """(displacements, d): force by which each given displacement acts on the bodies, N (N/m in plane strain)."""
         self.momentum.require(bool(side.loads), bool(side.plates), bool(side.holds))
@@ -511,26 +512,11 @@ class Simulation:
         return self.placement.to_cells(beta)
 
     def _check_held(self) -> None:
-        """Refuse a scene whose body can move as a rigid body: its tangent is singular."""
-        grid, momentum = self.grid, self.momentum
-        nodes = np.zeros(len(grid.node_x), dtype=bool)
-        nodes[grid.cell_nodes[np.flatnonzero(momentum.fill.x.array > 0)]] = True
-        node, axis = np.nonzero(nodes[:, None] & ~momentum.free)
-        x, direction = grid.node_x[node], np.eye(grid.dim)[axis]
-        if self.boundary.holds:
-            x = np.concatenate([x, momentum.holds.x])
-            direction = np.concatenate([direction, momentum.holds.data["direction"]])
-        x = x / (grid.upper - grid.lower).max()
-        modes = list(direction.T)
-        modes += [direction[:, a] * x[:, b] - direction[:, b] * x[:, a] for a in range(grid.dim) for b in range(a)]
-        R = np.stack(modes, axis=1)
-        gram = grid.comm.allreduce(R.T @ R)
-        missing = len(modes) - np.linalg.matrix_rank(gram, tol=1e-12 * max(1.0, np.abs(gram).max()))
-        if missing:
-            raise ValueError(
-                f"fixed walls: the body is free to move as a rigid body in {missing} of {len(modes)} ways; "
-                "it must touch walls whose fixed components hold it, or have given displacements"
-            )
+        """Refuse a scene whose body can move as a rigid body; at the start of a stage, any part of it."""
+        momentum, holds = self.momentum, self.momentum.holds
+        held = (holds.cells, holds.x, holds.data["direction"]) if self.boundary.holds else None
+        check_held(self.grid, momentum.fill.x.array > 0, momentum.free, held, self._begins)
+        self._begins = False
 
     def _place_loads(self, t: float) -> None:
         """Put the loads and given displacements of time t on the surface."""
