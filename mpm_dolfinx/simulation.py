@@ -426,7 +426,9 @@ class Simulation:
     def _changing(self, J: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
         """Return what the points bring to their pieces and what changes with them."""
         points = self.points
-        fields = {"F": points.F, **(points.data if self._extended else self._scene.state(points))}
+        fields = {"F": points.F, **self._scene.state(points)}
+        if self._extended:  # what laws take is known for all materials, and zero in `data` for those of other points
+            fields |= {name: rows for name, rows in points.data.items() if name not in self._scene.shapes}
         if not self.fluid and self.gravity is None:
             return fields
         n = 1 - (1 - self._table(lambda m: m.porosity)) / J
