@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import ufl
 from test_bad_input import BODY, GRID, NAN, WATER, law, run, sand, scene, sides, soil
+from test_mpi import mpirun
 
 import mpm_dolfinx as mpm
 
@@ -371,3 +372,8 @@ def test_a_column_between_walls_or_a_layer_among_others_is_not_too_thin(fixed, c
 
 def test_a_result_is_shown_in_a_line():
     assert len(repr(run(1.0, 0.01))) < 400
+
+
+def test_what_one_process_refuses_all_refuse():
+    """Else the others wait for it for ever."""
+    mpirun(2, "mpi_refusals.py")
