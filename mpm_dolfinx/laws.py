@@ -206,7 +206,7 @@ def _known(name: str, value) -> NDArray[np.float64]:
 
 def _finite(values: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return which rows (n,) of values (n, ...) are finite."""
-    return np.isfinite(values).reshape(len(values), -1).all(axis=1)
+    return np.isfinite(values).all(axis=tuple(range(1, values.ndim)))
 
 
 def _takes(law: type[Skeleton]) -> list[str]:

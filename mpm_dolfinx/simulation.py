@@ -619,6 +619,7 @@ class Simulation:
         """Put the scene into a state at time t, s: points and pieces, on whatever processes they are."""
         self.points, self._carried, self.t = points, carried, t
         self._prepared, self.placement = False, None
+        self._begins = False  # parts that have torn off since are what they are
         if self.active_cells:  # of a step that was taken before
             self.coupler.forget()
         self._migrate()
