@@ -18,7 +18,7 @@ from mpm_dolfinx.exchange import first
 from mpm_dolfinx.extend import call, expression
 from mpm_dolfinx.forms import FormPoints, PointExpression
 from mpm_dolfinx.grid import Grid
-from mpm_dolfinx.materials import Skeleton
+from mpm_dolfinx.materials import Fluid, Skeleton
 from mpm_dolfinx.points import Body, MaterialPoints
 
 RESERVED = (
@@ -157,6 +157,14 @@ class SceneMaterials:
                 out[name][rows] = getattr(at, name)
         return out
 
+    def porosity(self, points: MaterialPoints) -> NDArray[np.float64]:
+        """Return the porosity n = 1 - (1 - n_0) / J at the points (n,)."""
+        return 1 - (1 - self.table(points, lambda m: m.porosity)) / points.J
+
+    def storage(self, points: MaterialPoints, fluid: Fluid) -> NDArray[np.float64]:
+        """Return the storage coefficient at the points (n,), 1/Pa."""
+        return self.table(points, lambda m, n: m.storage(fluid.bulk, n), self.porosity(points))
+
     def state(self, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
         """Return the state at the points (n, ...)."""
         return {name: points.data[name] for name in self.shapes if any(name in law.state for law in self.laws)}
@@ -206,7 +214,7 @@ def _known(name: str, value) -> NDArray[np.float64]:
 
 def _finite(values: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return which rows (n,) of values (n, ...) are finite."""
-    return np.isfinite(values).all(axis=tuple(range(1, values.ndim)))
+    return np.isfinite(values).all(axis=tuple(range(1, np.ndim(values))))
 
 
 def _takes(law: type[Skeleton]) -> list[str]:

@@ -102,6 +102,8 @@ class Placement:
         self.pieces = cut(grid, points.corners) if quadrature == "domain" else whole_points(grid, points.x)
         self._travel = Exchange(grid.comm, grid.owner(self.pieces.cell))
         self.cells = grid.local(self._travel.send(self.pieces.cell))
+        self.moved = np.zeros_like(self.pieces.x)
+        """Displacements (m, d), m, of the pieces since they were cut."""
         self.x = self._travel.send(self.pieces.x)
         """Owned cells, and centroids (m, d), m, of the pieces that this process integrates."""
 
@@ -177,6 +179,15 @@ class Placement:
         cell = self._filled_cell(at, x + DEPTH * (self._x[at] - x))
         travel = Exchange(grid.comm, grid.owner(cell))
         return travel, grid.local(travel.send(cell)), travel.send(x)
+
+    def total_displacement(self) -> NDArray[np.float64]:
+        """Return the displacements (m, d), m, of the pieces' centroids, as those of their domains' corners."""
+        points, pieces = self.points, self.pieces
+        now, then = (c - c.mean(axis=1, keepdims=True) for c in (points.corners, points.origin))
+        stretch = np.linalg.solve(then.swapaxes(1, 2) @ then, then.swapaxes(1, 2) @ now)  # of the corners' pattern
+        off = pieces.x - points.x[pieces.point]
+        off0 = np.linalg.solve(stretch.swapaxes(1, 2)[pieces.point], off[:, :, None])[:, :, 0]
+        return off + (points.x - points.origin.mean(axis=1))[pieces.point] - off0
 
     def _filled_cell(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
         """Return the cells (m,) of positions in domains; where no piece of the domain lies, of its largest piece."""

@@ -17,6 +17,13 @@ from mpm_dolfinx.exchange import Exchange
 from mpm_dolfinx.grid import Grid, side
 
 
+def determinant(F: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return det F (n,) of (n, d, d); numpy's own, by factors, takes twenty times as long."""
+    if F.shape[1] == 2:
+        return F[:, 0, 0] * F[:, 1, 1] - F[:, 0, 1] * F[:, 1, 0]
+    return np.einsum("ni,ni->n", F[:, 0], np.cross(F[:, 1], F[:, 2]))
+
+
 @dataclass
 class MaterialPoints:
     """Material points of this process; arrays over its n points.
@@ -59,7 +66,7 @@ class MaterialPoints:
     @property
     def J(self) -> NDArray[np.float64]:
         """Volume ratio det F (n,)."""
-        return np.linalg.det(self.F)
+        return determinant(self.F)
 
     def map(self, function: Callable[[NDArray], NDArray]) -> MaterialPoints:
         """Return points with a function applied to each of their arrays: a choice of rows, a copy, a transfer."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,16 +16,16 @@ from mpm_dolfinx import summary
 from mpm_dolfinx.boundary import Boundary
 from mpm_dolfinx.check import all_of, asked, chosen, flag, functions, instance, line, numbers
 from mpm_dolfinx.conditions import Displacement, Drained, Inflow, RigidPlate, Traction
-from mpm_dolfinx.coupling import COUPLINGS, Coupler, NotConverged, Report
-from mpm_dolfinx.domains import parallelepipeds, tangled
+from mpm_dolfinx.coupling import COUPLINGS, Coupler, Report
 from mpm_dolfinx.exchange import Exchange
 from mpm_dolfinx.extend import compiling
-from mpm_dolfinx.forms import FormPoints
 from mpm_dolfinx.grid import Grid, sum_by
 from mpm_dolfinx.held import check_held
-from mpm_dolfinx.laws import ConductivityAtPieces, SceneMaterials
+from mpm_dolfinx.integration import IntegrationData
+from mpm_dolfinx.laws import SceneMaterials
 from mpm_dolfinx.materials import Fluid, Skeleton
 from mpm_dolfinx.momentum import FULL, Momentum
+from mpm_dolfinx.motion import Motion
 from mpm_dolfinx.placement import Placement
 from mpm_dolfinx.points import Body, MaterialPoints, Probes, check_apart, check_inside, material_points
 from mpm_dolfinx.remap import Carried, at_start, remap
@@ -174,23 +173,11 @@ class Simulation:
 
     def _build(self, fixed: NDArray[np.bool_], coupling: str, tolerance: float, terms, sources) -> None:
         """Compile the forms that the scene needs."""
-        grid, d, fluid, scene = self.grid, self.grid.dim, self.fluid, self._scene
-        shapes: dict[str, tuple[int, ...]] = {"F": (d, d), **scene.shapes}
-        if fluid:
-            shapes |= {"biot": (), "storage": ()}
-        if self.gravity is not None:
-            shapes |= {"density": ()}
-        self._extended = bool(terms or sources)
-        if self._extended:
-            shapes |= {
-                "position": (d,),
-                "displacement": (d,),
-                **{name: v.shape[1:] for name, v in self.points.data.items()},
-            }
-        if fluid and scene.conductivity_laws:
-            shapes |= {"position": (d,), "conductivity": (), "porosity0": ()}
-        self.pieces = FormPoints(grid, **shapes)
-        self.laws = scene.parts(self.pieces, ["F", "biot"] if fluid else ["F"])
+        grid, fluid, scene = self.grid, self.fluid, self._scene
+        self._integration = IntegrationData(
+            grid, scene, self.points, fluid, weighs=self.gravity is not None, extended=bool(terms or sources)
+        )
+        self.pieces, self.laws = self._integration.pieces, self._integration.laws
         p = fem.Function(grid.cellwise()) if fluid else None
         options = {"mean_dilatation": scene.nearly_incompressible, "symmetric": scene.symmetric}
         with compiling(f"materials: {', '.join(law.__name__ for law in scene.laws)}", "laws in UFL of these shapes"):
@@ -208,8 +195,9 @@ class Simulation:
             )
             for source in sources:
                 self.storage.add(source, self._time)
-            self._conductivity = ConductivityAtPieces(scene, self.pieces)
         self.coupler = Coupler(self.momentum, self.storage, coupling, tolerance)
+        problems = (self.momentum, self.storage, fluid)
+        self._motion = Motion(scene, self.bodies, self.pieces, *problems, domains=self.quadrature == "domain")
 
     # ---- stages ---------------------------------------------------------------------------------
 
@@ -306,10 +294,6 @@ class Simulation:
         """Return a given acceleration of gravity (d,), m/s^2; `name` for the message of one that is not."""
         return numbers(name, value, (self.grid.dim,), allowed=f"{self.grid.dim} finite numbers")
 
-    def _table(self, value: Callable[..., float], *columns: NDArray) -> NDArray[np.float64]:
-        """Return a constant of the materials at the points (n,); `value` also takes columns (n,) of the points."""
-        return self._scene.table(self.points, value, *columns)
-
     # ---- one step -------------------------------------------------------------------------------
 
     def step(self, dt: float) -> Report:
@@ -358,15 +342,12 @@ class Simulation:
 
     def _stays(self) -> bool:
         """Return whether the points have moved so little that nothing need be cut or remapped."""
-        changing = self.fluid is not None and self._scene.conductivity_laws
-        return self.placement is not None and not changing and self.placement.serves()
+        return self.placement is not None and self._integration.stays and self.placement.serves()
 
     def _stay(self) -> None:
         """Bring the integration data to where the points are now, in the same cells."""
         with Timer("mpm: integration data"):
-            J = self.points.J
-            self.pieces.renew(self._weight(J), **self._values(self._changing(J)), **self._piece_fields())
-            self._part_laws()
+            self._integration.renew(self.placement, self.points)
             if self.momentum.plates is not None:
                 self.boundary.place_plates(self.placement, self.momentum)
             if self.storage:
@@ -376,7 +357,7 @@ class Simulation:
         """Let the points take the pressures of their pieces along; the domains are cut anew in the next step."""
         if self.placement is not None and self.storage:
             with Timer("mpm: remap"):
-                self._carried = self._carry()
+                self._carried = self._motion.carry(self.points, self.placement)
         self.placement = None
 
     def _reset_grid(self) -> None:
@@ -386,85 +367,17 @@ class Simulation:
         self._migrate()
         with Timer("mpm: cut domains"):
             place = Placement(self.grid, self.points, self.quadrature, self.t)
+        brought = None
         if self.storage:
             with Timer("mpm: remap"):
-                self._brought = remap(self._carried, self.points, place.pieces)
-                self._travelled = np.zeros_like(place.pieces.x)
+                brought = place.pieces_to_cells(remap(self._carried, self.points, place.pieces))
         with Timer("mpm: integration data"):
-            self.placement, J = place, self.points.J
-            fields = self._values({**self._scene.values(self.points), **self._constants(), **self._changing(J)})
-            self.pieces.place(place.cells, place.x, self._weight(J), **fields, **self._piece_fields())
-            self._part_laws()
-            self._activate(J)
+            self.placement = place
+            self._integration.place(place, self.points)
+            self._activate(brought)
 
-    def _weight(self, J: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the volumes of the pieces (m,), m^d, on the owners of their cells."""
-        pieces = self.placement.pieces
-        return self.placement.pieces_to_cells(pieces.fraction * (self.points.volume0 * J)[pieces.point])
-
-    def _values(self, fields: Mapping[str, NDArray]) -> dict[str, NDArray]:
-        """Return fields of the points at their pieces, on the owners of their cells."""
-        return {name: self.placement.to_cells(values) for name, values in fields.items()}
-
-    def _part_laws(self) -> None:
-        """Give each of several laws the pieces that follow it."""
-        if len(self.laws) > 1:
-            law = self.placement.to_cells(self._scene.law_of(self.points))
-            for number, (_, part) in enumerate(self.laws):
-                part.take(self.pieces, np.flatnonzero(law == number))
-
-    def _constants(self) -> dict[str, NDArray[np.float64]]:
-        """Return what the materials bring to their pieces for good."""
-        fields = {}
-        if self.fluid:
-            fields["biot"] = self._table(lambda m: m.biot)
-            if self._scene.conductivity_laws:
-                fields["conductivity"] = self._table(lambda m: m.conductivity)
-                fields["porosity0"] = self._table(lambda m: m.porosity)
-        return fields
-
-    def _changing(self, J: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
-        """Return what the points bring to their pieces and what changes with them."""
-        points = self.points
-        fields = {"F": points.F, **self._scene.state(points)}
-        if self._extended:  # what laws take is known for all materials, and zero in `data` for those of other points
-            fields |= {name: rows for name, rows in points.data.items() if name not in self._scene.shapes}
-        if not self.fluid and self.gravity is None:
-            return fields
-        n = 1 - (1 - self._table(lambda m: m.porosity)) / J
-        if self.fluid:
-            fields["storage"] = self._table(lambda m, n: m.storage(self.fluid.bulk, n), n)
-        if self.gravity is not None:
-            wet = self.fluid.density if self.fluid else 0.0
-            fields["density"] = (1 - n) * self._table(lambda m: m.grain_density) + n * wet
-        return fields
-
-    def _piece_fields(self) -> dict[str, NDArray[np.float64]]:
-        """Return what differs from piece to piece of a point, where functions of the user's may ask for it."""
-        fields = {}
-        if self._extended or (self.fluid and self._scene.conductivity_laws):
-            fields["position"] = self.placement.pieces.x
-        if self._extended:
-            fields["displacement"] = self._displacement()
-        return {name: self.placement.pieces_to_cells(values) for name, values in fields.items()}
-
-    def _displacement(self) -> NDArray[np.float64]:
-        """Return the displacements (m, d), m, of the pieces' centroids, as those of their domains' corners."""
-        points, pieces = self.points, self.placement.pieces
-        now, then = (c - c.mean(axis=1, keepdims=True) for c in (points.corners, points.origin))
-        stretch = np.linalg.solve(then.swapaxes(1, 2) @ then, then.swapaxes(1, 2) @ now)  # of the corners' pattern
-        off = pieces.x - points.x[pieces.point]
-        off0 = np.linalg.solve(stretch.swapaxes(1, 2)[pieces.point], off[:, :, None])[:, :, 0]
-        return off + (points.x - points.origin.mean(axis=1))[pieces.point] - off0
-
-    def _mobility(self) -> NDArray[np.float64]:
-        """Return the mobility k / (rho_w g) at the pieces (m,), m^2/(Pa s)."""
-        if not self._scene.conductivity_laws:
-            return self._rows(lambda m: m.conductivity) / self.fluid.unit_weight
-        return self._conductivity.evaluate(self.placement.to_cells(self.points.material)) / self.fluid.unit_weight
-
-    def _activate(self, J: NDArray[np.float64]) -> None:
-        """Set the active cells and what they hold."""
+    def _activate(self, pressure: NDArray[np.float64] | None) -> None:
+        """Set the active cells and what they hold; pressure: (m,), Pa, that the pieces bring, if there is fluid."""
         grid, pieces, momentum = self.grid, self.pieces, self.momentum
         weight = pieces.data["weight"][:, 0] * grid.cell_volume
         filled = sum_by(pieces.cells, weight, grid.num_local)
@@ -480,9 +393,9 @@ class Simulation:
         facets = grid.interior_facets(active, cells)
         renumbered = momentum.set_active(cells, facets, fill < FULL)
         if momentum.plates is not None:
-            self.boundary.place_plates(self.placement, self.momentum)
+            self.boundary.place_plates(self.placement, momentum)
         if self.storage:
-            s = self.storage
+            s, place, as_printed = self.storage, self.placement, COUPLINGS[self.coupler.coupling] is None
             if renumbered:
                 s.set_active(cells, facets)
                 s.set_coupled(momentum.unknowns)
@@ -490,11 +403,11 @@ class Simulation:
                 pieces.cells,
                 weight,
                 pieces.x,
-                self._mobility(),
-                self.placement.pieces_to_cells(self.placement.pieces.faces),
+                self._integration.mobility(place, self.points),
+                place.pieces_to_cells(place.pieces.faces),
                 pieces.data["storage"][:, 0],
-                self.placement.pieces_to_cells(self._brought),
-                self._fixed_stress(J),
+                pressure,
+                self._integration.fixed_stress(place, self.points, as_printed),
                 self._rows(lambda m: m.pressure_damping(grid.dim)),
             )
             self._open_outlets()
@@ -504,14 +417,7 @@ class Simulation:
 
     def _rows(self, value: Callable[[Skeleton], float]) -> NDArray[np.float64]:
         """Return a constant of the materials at the pieces of this process (m,)."""
-        return self.placement.to_cells(self._table(value))
-
-    def _fixed_stress(self, J: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return beta of the fixed-stress operator at the pieces, 1/Pa, before the scheme's factor."""
-        if COUPLINGS[self.coupler.coupling] is None:  # as printed in the paper
-            return np.full(len(self.pieces.cells), 1 / self.fluid.bulk)
-        beta = self._table(lambda m: m.biot**2 / m.drained_modulus(self.grid.dim)) * J
-        return self.placement.to_cells(beta)
+        return self._integration.rows(self.placement, self.points, value)
 
     def _check_held(self) -> None:
         """Refuse a scene whose body can move as a rigid body; at the start of a stage, any part of it."""
@@ -534,69 +440,9 @@ class Simulation:
         self.boundary.open_outlets(self.placement, self.storage, weight)
 
     def _move_points(self) -> int:
-        """Move the corners, update F, take the pressures along; return how many domains had folded."""
-        folded = 0
+        """Move the points; return how many domains had folded."""
         with Timer("mpm: move points"):
-            grid, points, place = self.grid, self.points, self.placement
-            n, d = len(points), grid.dim
-            u = self.momentum.u.x.array.reshape(-1, d)
-            N, dN = grid.shape_functions(self.pieces.cells, self.pieces.x)
-            at_nodes = u[grid.cell_nodes[self.pieces.cells]].transpose(0, 2, 1)
-            gradient = at_nodes @ dN
-            delta = np.eye(d) + gradient
-            if self.momentum.dilatation is not None:
-                delta = self.momentum.dilatation.averaged(delta)
-            # F_p <- (sum_k w_k Delta_k / V_p) F_p
-            mean = [place.mean(column) for column in place.to_pieces(delta).reshape(-1, d * d).T]
-            F = np.stack(mean, axis=1).reshape(n, d, d) @ points.F
-            self._check_volumes(np.linalg.det(F))
-            self._scene.update_state(replace(points, F=F))
-            points.F = F
-            moved = place.displacement(u, corners=self.quadrature == "domain")
-            if self.quadrature == "domain":
-                points.corners = points.corners + moved
-                points.x = points.corners.mean(axis=1)
-                folded = self._untangle()
-            else:
-                points.x = points.x + moved
-                points.corners = parallelepipeds(points.x, points.F, self._spacing())
-            if self.storage:
-                points.pressure = place.mean(place.to_pieces(self.storage.p.x.array[self.pieces.cells]))
-                self._travelled += place.to_pieces((at_nodes @ N[:, :, None])[:, :, 0])
-        return folded
-
-    def _carry(self) -> Carried:
-        """Return the pressures that the pieces take along."""
-        points, place, pieces, J = self.points, self.placement, self.placement.pieces, self.points.J
-        n = 1 - (1 - self._table(lambda m: m.porosity)) / J
-        store = self._table(lambda m, n: m.storage(self.fluid.bulk, n), n) * points.volume0 * J
-        at_pieces = self.storage.at_pieces(place.pieces_to_cells(pieces.fraction * store[pieces.point]))
-        pressure, slope, bounds = map(place.to_pieces, at_pieces)
-        x = pieces.x + self._travelled
-        return Carried(points.id[pieces.point], pieces.cell, pieces.fraction, pressure, x, slope, bounds)
-
-    def _check_volumes(self, J: NDArray[np.float64]) -> None:
-        """Refuse what a law may allow and a body does not: points turned inside out, pores of no volume."""
-        least = 1 - self._table(lambda m: m.porosity) if self.fluid else np.zeros(len(J))
-        bad = np.flatnonzero(J <= least)
-        if self.grid.comm.allreduce(len(bad)):
-            shown = [f"point {self.points.id[i]} at {self.points.x[i]} with J = {J[i]:.3g}" for i in bad[:1]]
-            what = "the pores have closed" if self.fluid else "the body is turned inside out"
-            raise NotConverged(f"{what}, J <= {least.max(initial=0):.3g}: {', '.join(shown) or 'elsewhere'}", [])
-
-    def _untangle(self) -> int:
-        """Re-derive from F the domains that have folded: points whose neighbours went elsewhere."""
-        points, grid = self.points, self.grid
-        bad = np.flatnonzero(tangled(points.corners, points.volume0 * points.J))
-        if len(bad):
-            corners = parallelepipeds(points.x[bad], points.F[bad], self._spacing()[bad])
-            points.corners[bad] = np.clip(corners, grid.lower, grid.upper)
-            points.x[bad] = points.corners[bad].mean(axis=1)
-        return grid.comm.allreduce(len(bad))
-
-    def _spacing(self) -> NDArray[np.float64]:
-        """Reference size of the points' domains (n, d), m."""
-        return np.concatenate([b.size() for b in self.bodies])[self.points.id]
+            return self._motion.move(self.points, self.placement)
 
     def _migrate(self) -> None:
         """Send the points whose cell another process owns."""
