@@ -52,6 +52,7 @@ def arguments(argv: list[str] | None = None) -> argparse.Namespace:
     add("--drained", action="store_true", help="no fluid at all")
     add("--reference", action="store_true", help="run the Taylor-Hood finite elements beside it")
     add("--out", type=Path, default=Path("out/poroelastic_beam"), help="folder for pictures and tables")
+    add("--paraview", action="store_true", help="write points, grid and histories of every step to OUT/paraview")
     add("--profile", action="store_true", help="print where the time went")
     add("--json", action="store_true", help="print the results as one line of JSON at the end")
     options = parser.parse_args(argv)
@@ -125,10 +126,12 @@ def main(argv: list[str] | None = None) -> dict:
                     corners, pressure = corners[front][:, [0, 1, 4, 5]][..., [0, 2]], pressure[front]
                 snapshots.append((s.t, corners, pressure))
 
-    failure = None
+    failure, observers = None, [observe]
+    if o.paraview:
+        observers.append(mpm.Writer(simulation, o.out / "paraview", grid=True))
     places = axis if o.dim == 2 else np.insert(axis, 1, DEPTH / 2, axis=1)
     try:
-        result = simulation.run(o.t_end, o.dt, probes=mpm.probes(simulation.bodies, places), observe=observe)
+        result = simulation.run(o.t_end, o.dt, probes=mpm.probes(simulation.bodies, places), observe=observers)
     except mpm.GaveUp as error:
         failure, result = error, error.result
     result.displacement = [u[:, [0, -1]] for u in result.displacement]
@@ -188,7 +191,7 @@ def report(o: argparse.Namespace, result: mpm.Result, fem) -> None:
     )
     if o.profile:
         print(result.shares())
-    print(f"pictures and tables: {o.out}/")
+    print(f"pictures and tables: {o.out}/" + (f", for ParaView: {o.out}/paraview/points.pvd" if o.paraview else ""))
 
 
 def write_tables(o: argparse.Namespace, axis: np.ndarray, result: mpm.Result, fem) -> None:

@@ -1,5 +1,15 @@
 # SPDX-License-Identifier: MIT
-"""Implicit, iteratively coupled material point / finite volume poromechanics on FEniCSx."""
+"""Implicit, iteratively coupled material point / finite volume poromechanics on FEniCSx.
+
+A scene is a `Simulation` of a `Grid`, bodies (`box`, `shape`, `mapped`), materials (`Hencky`, `NeoHookean`,
+`LinearElastic`, `DruckerPrager`, or your own `Skeleton`), a `Fluid` and conditions on the sides of the bodies
+(`Traction`, `Displacement`, `RigidPlate`, `Drained`, `Inflow`).  Its `run` gives a `Result` with the displacements
+of `probes`, and feeds a `Writer` and a `Checkpoint`, from which `resume` goes on; `stage` changes the scene between
+two runs.  Terms and sources in UFL: see `mpm_dolfinx.extend`.
+
+SI units throughout.  Stress is positive in tension, pore pressure in compression; 2D is plane strain, and forces
+are those of a slice of 1 m.
+"""
 
 from mpm_dolfinx.conditions import Displacement, Drained, Inflow, RigidPlate, Traction
 from mpm_dolfinx.coupling import COUPLINGS, NotConverged

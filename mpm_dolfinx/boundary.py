@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from mpm_dolfinx.check import line
 from mpm_dolfinx.conditions import HOLD, RIGIDITY, Displacement, Drained, Inflow, RigidPlate, Traction
 from mpm_dolfinx.domains import SNAP
-from mpm_dolfinx.exchange import Exchange
+from mpm_dolfinx.exchange import Exchange, first
 from mpm_dolfinx.grid import Grid, sum_by
 from mpm_dolfinx.momentum import Momentum
 from mpm_dolfinx.placement import Placement
@@ -117,7 +117,7 @@ class Boundary:
         stiffness = HOLD * self._modulus / self.grid.h.min()
         for number, (hold, faces, axes) in enumerate(self.holds):
             patches = place.surface(faces)
-            gap = patches.origin(place.points) + hold.at(t, patches.X) - patches.now(place.points)
+            gap = patches.origin(place.points) + self._given(hold, t, patches.X) - patches.now(place.points)
             for axis in axes:
                 values = np.zeros((len(gap), 3 + d))
                 values[:, 0] = number
@@ -129,6 +129,17 @@ class Boundary:
         number, stiffness, gap, direction = np.split(values, [1, 2, 3], axis=1)
         self._number = number[:, 0].astype(np.int64)
         momentum.holds.place(cell, x, np.ones(len(cell)), stiffness=stiffness, gap=gap, direction=direction)
+
+    def _given(self, hold: Displacement, t: float, X: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the displacements (m, d), m, that a side is given at places X (m, d) of this process."""
+        message, value = "", None
+        try:
+            value = hold.at(t, X)
+        except ValueError as error:
+            message = str(error)
+        if message := first(self.grid.comm, message):
+            raise ValueError(message)
+        return value
 
     def reactions(self, momentum: Momentum) -> NDArray[np.float64]:
         """Return the forces (holds, d), N, by which the given displacements act at the present displacement."""

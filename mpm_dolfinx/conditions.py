@@ -1,5 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Conditions on the sides of the bodies: tractions, displacements, rigid plates, drained sides, prescribed inflow."""
+"""Conditions on the sides of the bodies: tractions, displacements, rigid plates, drained sides, prescribed inflow.
+
+A side is named "left", "right", "bottom" or "top", in 3D also "front" (lower y) and "back" (upper y), by where it is
+in the seeded body; it moves with the body.  What is wrong with a condition is said, with a ValueError, when a
+scene or a stage is made with it, of functions of time at the step that asks for it.
+"""
 
 from __future__ import annotations
 
@@ -21,11 +26,18 @@ class Traction:
     Parameters
     ----------
     side
-        Side of the bodies, see `grid.SIDES`.
-    value : (d,) or number, or callable t -> (d,) or number, Pa
+        Side of the bodies: "left", "right", "bottom", "top", in 3D also "front" (lower y) and "back" (upper y).
+    value : (d,) or number, or callable t (s) -> (d,) or number, Pa
         Force per reference area; a number acts along the outward normal at the start of the step, negative: presses.
+        Several tractions on one face add up.
     region : ((d,), (d,)), m
-        Box of reference positions to which the traction is limited.
+        Lower and upper corner of the box of reference positions to which the traction is limited; faces partly in
+        it count with that part.
+
+    Raises
+    ------
+    ValueError
+        From the scene or the step: no point has the side, or the value is none that is allowed.
     """
 
     side: str
@@ -46,11 +58,17 @@ class Drained:
     Parameters
     ----------
     side
-        Side of the bodies.
+        Side of the bodies, as for `Traction`.
     pressure
-        Outer pore pressure, Pa.
+        Outer pore pressure, Pa, finite; the same on the whole side and at all times of a stage.
     region : ((d,), (d,)), m
         Box of reference positions to which the drained faces are limited.
+
+    Raises
+    ------
+    ValueError
+        The pressure is no finite number; from the scene: there is no fluid, no point has the side, or another
+        `Drained` or `Inflow` acts on the same part of a face.
     """
 
     side: str
@@ -68,11 +86,16 @@ class Inflow:
     Parameters
     ----------
     side
-        Side of the bodies.
+        Side of the bodies, as for `Traction`.
     flux
-        Volume per area and time into the body, m/s; negative: out of it.
+        Volume per present area and time into the body, m/s, finite; negative: out of it.
     region : ((d,), (d,)), m
         Box of reference positions to which the faces are limited.
+
+    Raises
+    ------
+    ValueError
+        As for `Drained`.
     """
 
     side: str
@@ -96,16 +119,25 @@ The side gives way by strain x cell size / HOLD, always measured from its given 
 class Displacement:
     """Side of the bodies whose displacement is given: a footing, a clamp that moves, a body carried along.
 
+    The forces that it takes are `reactions` of the simulation.
+
     Parameters
     ----------
     side
-        Side of the bodies.
+        Side of the bodies, as for `Traction`.
     value : (d,) or callable (t, X) -> (d,) or (m, d), m
-        Displacement of the side since the start, given the time (s) and the reference positions X (m, d).
+        Displacement of the side since the start, or since a stage reset it, given the time (s) and the reference
+        positions X (m, d).  A number for every component, also for those that are free.
     components
         Components that are given, such as "y"; the others are free.  By default all.
     region : ((d,), (d,)), m
         Box of reference positions to which the condition is limited.
+
+    Raises
+    ------
+    ValueError
+        From the scene or the step: no point has the side, the value or the components are none that are allowed,
+        or another `Displacement` gives a component on the same part of a face.
     """
 
     side: str
@@ -132,16 +164,22 @@ class RigidPlate:
     """Rigid, smooth plate on a flat side of the bodies: one displacement along the side's axis for all its faces.
 
     The slope of the faces is penalised, kappa/2 int |grad_t x_n|^2 dA; an even displacement is free, so
-    the plate carries the given total force exactly.
+    the plate carries the given total force exactly.  It does not tilt.
 
     Parameters
     ----------
     side
-        Side of the bodies, normal to an axis.
-    force : float or callable t -> float, N (N/m in plane strain)
+        Side of the bodies, as for `Traction`; its faces lie in one plane normal to an axis, and hang together.
+    force : float or callable t (s) -> float, N (N/m in plane strain)
         Total force that presses on the side; negative: pulls.
     region : ((d,), (d,)), m
         Box of reference positions to which the plate is limited.
+
+    Raises
+    ------
+    ValueError
+        The force is no finite number; from the scene or the step: no point has the side, or its faces do not hang
+        together or lie at different heights (take a plate with a region for each part).
     """
 
     side: str

@@ -84,6 +84,11 @@ def to_root(comm: MPI.Intracomm, rows: int) -> Exchange:
     return Exchange(comm, np.zeros(rows, dtype=np.int32))
 
 
+def first(comm: MPI.Intracomm, message: str) -> str:
+    """Return the first message of all processes that is not empty: what one of them refuses, all must."""
+    return next(filter(None, comm.allgather(message)), "") if comm.size > 1 else message
+
+
 def at_root(comm: MPI.Intracomm, action: Callable[[], T]) -> T:
     """Return on every process what rank 0 gets from `action`; all raise what it raises."""
     value = error = None

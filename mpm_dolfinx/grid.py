@@ -45,6 +45,9 @@ def sum_by(index: NDArray, values: NDArray[np.float64], size: int) -> NDArray[np
 class Grid:
     """Background grid of equal cells over the box [lower, upper].
 
+    Bodies must stay in it; what is empty of it costs next to nothing.  Its sides are the walls that `fixed` names:
+    "left", "right" (x), "bottom", "top" (y in 2D, z in 3D), in 3D also "front", "back" (y).
+
     Parameters
     ----------
     upper : (d,), m
@@ -55,6 +58,19 @@ class Grid:
         Lower corner, by default the origin.
     comm
         Processes that share the grid.
+
+    Raises
+    ------
+    ValueError
+        Corners that are not finite or not in order, numbers of cells that are no integers >= 1, or more cells than
+        PETSc's numbers count.
+
+    Attributes
+    ----------
+    dim, shape, h, lower, upper
+        d; cells along each axis (d,); their edges (d,), m; corners (d,), m.
+    mesh
+        The dolfinx mesh; made when first it is needed.
     """
 
     def __init__(

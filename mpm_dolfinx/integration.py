@@ -106,7 +106,9 @@ class IntegrationData:
 
     def _changing(self, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
         """Return what the points bring to their pieces and what changes with them."""
-        fields = {"F": points.F, **(points.data if self._extended else self._scene.state(points))}
+        fields = {"F": points.F, **self._scene.state(points)}
+        if self._extended:  # what laws take is known for all materials, and zero in `data` for those of other points
+            fields |= {name: rows for name, rows in points.data.items() if name not in self._scene.shapes}
         if self.fluid:
             fields["storage"] = self._scene.storage(points, self.fluid)
         if self._weighs:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.check import instance, numbers
 from mpm_dolfinx.coupling import NotConverged
+from mpm_dolfinx.exchange import first
 from mpm_dolfinx.extend import call, expression
 from mpm_dolfinx.forms import FormPoints, PointExpression
 from mpm_dolfinx.grid import Grid
@@ -188,9 +189,8 @@ class SceneMaterials:
         new = [(law.law, rows, name, v) for law, rows in self._place(points) for name, v in law.new_state().items()]
         bad = [(law, name, rows[~_finite(values)]) for law, rows, name, values in new]
         shown = [f"{law.__name__}.update: {name!r} is not finite at {points.x[i[0]]}" for law, name, i in bad if len(i)]
-        everywhere = [line for lines in self._grid.comm.allgather(shown) for line in lines]
-        if everywhere:
-            raise NotConverged(everywhere[0], [])
+        if message := first(self._grid.comm, "".join(shown[:1])):
+            raise NotConverged(message, [])
         for _, rows, name, values in new:
             points.data[name][rows] = values
 
@@ -352,8 +352,8 @@ class ConductivityAtPieces:
             rows = np.flatnonzero([m.conductivity_law is law for m in self._materials])
             chosen = np.isin(material, rows)
             out[chosen] = k.evaluate()[chosen]
-            bad = np.flatnonzero(chosen & ~((out >= 0) & (out < np.inf)))
-            if len(bad):
-                where = f"k = {out[bad[0]]:g} at {self._points.x[bad[0]]}"
+            bad = np.flatnonzero(chosen & ~((out >= 0) & (out < np.inf)))[:1]
+            shown = [f"k = {out[i]:g} at {self._points.x[i]}" for i in bad]
+            if where := first(self._points.grid.comm, "".join(shown)):
                 raise ValueError(f"conductivity law: {where}, must be >= 0 and finite")
         return out

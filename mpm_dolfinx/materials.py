@@ -65,8 +65,27 @@ class Skeleton:
         Kirchhoff stress tau = J sigma', Pa, (d, d) or (3, 3), where there is no energy; the tangent is UFL's.
 
     What evolves is the law's `state`, name -> value at the start, which `update` (F, ...) -> {name: UFL}
-    sets anew at the points after every converged step.  bulk and shear are also what the scheme takes its
-    scales from (ghost penalty, fixed-stress coefficient, damping of pressures), for every law.
+    sets anew at the points after every converged step; a state that is not finite cuts the step.  bulk and shear
+    are also what the scheme takes its scales from (ghost penalty, fixed-stress coefficient, damping of pressures),
+    for every law.
+
+    Raises
+    ------
+    ValueError
+        A constant that is out of its range; from the scene: fields that are, names or shapes that do not agree, or
+        functions that raise or give anything but UFL of the shape that is wanted.
+
+    Examples
+    --------
+    A law of your own is a frozen dataclass (the README has one with a fibre)::
+
+        @dataclass(frozen=True)
+        class Stiffening(mpm.NeoHookean):
+            factor: mpm.Field = 1.0
+
+            @staticmethod
+            def energy(F, bulk, shear, factor):
+                return factor * mpm.NeoHookean.energy(F, bulk, shear)
     """
 
     bulk: Field
@@ -206,11 +225,12 @@ class Hencky(Skeleton):
 
     Plane strain in 2D.  Hencky (1928); a small constant under the root keeps the derivatives of the
     eigenvalues of C = F^T F finite where they coincide.  It enters the deviatoric part only, whose
-    derivative vanishes there: at rest there is no stress at all.
+    derivative vanishes there: at rest there is no stress at all.  Parameters as for `Skeleton`.
     """
 
     @staticmethod
     def energy(F, bulk, shear):
+        """Return psi, Pa, as UFL of F (d, d)."""
         d, ln_J = F.ufl_shape[0], ufl.ln(ufl.det(F))
         logs = [ufl.ln(e) / 2 for e in _eigenvalues_over_mean(F.T * F)]
         deviatoric = sum(l**2 for l in logs) - sum(logs) ** 2 / d
@@ -238,10 +258,14 @@ def _eigenvalues(C, apart: float = 1e-4):
 
 @dataclass(frozen=True)
 class NeoHookean(Skeleton):
-    """Compressible neo-Hookean law: psi = G/2 (F:F - d - 2 ln J) + lambda/2 (ln J)^2."""
+    """Compressible neo-Hookean law: psi = G/2 (F:F - d - 2 ln J) + lambda/2 (ln J)^2.
+
+    Plane strain in 2D.  Simo and Pister (1984).  Parameters as for `Skeleton`.
+    """
 
     @staticmethod
     def energy(F, bulk, shear):
+        """Return psi, Pa, as UFL of F (d, d)."""
         ln_J = ufl.ln(ufl.det(F))
         lam = bulk - 2 * shear / 3
         return shear / 2 * (ufl.inner(F, F) - F.ufl_shape[0] - 2 * ln_J) + lam / 2 * ln_J**2
@@ -251,21 +275,29 @@ class NeoHookean(Skeleton):
 class LinearElastic(Skeleton):
     """Linear elasticity of small strain: psi = lambda/2 (tr eps)^2 + G eps:eps, eps = sym F - I.
 
-    The law of the seed paper; not objective, so only for small rotations.
+    The law of the seed paper; not objective, so only for small rotations.  Parameters as for `Skeleton`.
     """
 
     linear: ClassVar[bool] = True
 
     @staticmethod
     def energy(F, bulk, shear):
+        """Return psi, Pa, as UFL of F (d, d)."""
         eps = ufl.sym(F) - ufl.Identity(F.ufl_shape[0])
         return (bulk - 2 * shear / 3) / 2 * ufl.tr(eps) ** 2 + shear * ufl.inner(eps, eps)
 
 
 def kozeny_carman(conductivity, porosity, porosity0):
-    """Return k = k0 n^3 / (1 - n)^2 / (n0^3 / (1 - n0)^2), the law of Kozeny (1927) and Carman (1937).
+    """Return k = k0 n^3 / (1 - n)^2 / (n0^3 / (1 - n0)^2), m/s, the law of Kozeny (1927) and Carman (1937).
 
-    To be given to a material as its `conductivity_law`; the conductivity there is k0, at the porosity n0.
+    To be given to a material as its `conductivity_law`.
+
+    Parameters
+    ----------
+    conductivity
+        k0, m/s: the material's conductivity, at the porosity at the start.
+    porosity, porosity0
+        Porosity now and at the start, n and n0, in (0, 1).
     """
     return conductivity * (porosity / porosity0) ** 3 * ((1 - porosity0) / (1 - porosity)) ** 2
 
@@ -283,6 +315,11 @@ class Fluid:
         Bulk modulus K_w, Pa, > 0; infinite for an incompressible fluid.
     density
         Density rho_w, kg/m^3, > 0.
+
+    Raises
+    ------
+    ValueError
+        Naming the constant that is out of its range.
     """
 
     bulk: float = 2.2e9

@@ -62,6 +62,14 @@ class Writer:
         Output intervals between two files of points and grid, >= 1; start and end are always written.
     grid
         Write the fields of the grid too.
+
+    Raises
+    ------
+    ValueError
+        An argument of another kind, files in the folder that no writer has written or of other columns, a run of
+        another simulation or one that does not go on from where the writer was made.
+    OSError
+        A folder that cannot be written, a disk that is full: `simulation.run(..., after=simulation.result)` goes on.
     """
 
     def __init__(self, simulation: Simulation, folder: str | os.PathLike, *, every: int = 1, grid: bool = False):

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.domains import Pieces, cut, cut_faces
-from mpm_dolfinx.exchange import Exchange
+from mpm_dolfinx.exchange import Exchange, first
 from mpm_dolfinx.forms import CHUNK
 from mpm_dolfinx.grid import Grid, sum_by
 from mpm_dolfinx.points import MaterialPoints, Surface, face_vectors, interpolate
@@ -108,13 +108,13 @@ class Placement:
         """Owned cells, and centroids (m, d), m, of the pieces that this process integrates."""
 
     def _check_inside(self, x: NDArray[np.float64], t: float) -> None:
-        out = np.flatnonzero(self.grid.outside(x.reshape(-1, self.grid.dim)))
+        grid, points, message = self.grid, self.points, ""
+        out = np.flatnonzero(grid.outside(x.reshape(-1, grid.dim)))
         if len(out):
-            i, points = out[0] // x.shape[1], self.points
-            raise LeftGrid(
-                f"point {points.id[i]} at {points.x[i]} left the grid "
-                f"{self.grid.lower} to {self.grid.upper} at t = {t:g} s"
-            )
+            i = out[0] // x.shape[1]
+            message = f"point {points.id[i]} at {points.x[i]} left the grid {grid.lower} to {grid.upper} at t = {t:g} s"
+        if message := first(grid.comm, message):
+            raise LeftGrid(message)
 
     def serves(self) -> bool:
         """Return whether the points are still where they were, but for `STAYS`."""

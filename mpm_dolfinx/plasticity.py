@@ -50,7 +50,13 @@ class DruckerPrager(Skeleton):
         The cone meets Mohr and Coulomb's surface in "plane strain" (the same collapse load there; for associated
         flow exactly), triaxial "compression" (outer cone) or triaxial "extension" (inner cone).
 
-    The state is `plastic`, C_p^-1 (3, 3), and `hardened`, kappa.
+    The other parameters are those of `Skeleton`, all by name.  The state is `plastic`, C_p^-1 (3, 3), and
+    `hardened`, kappa, in `points.data`.  De Souza Neto, Peric and Owen (2008), 8.3 and 14.6.
+
+    Raises
+    ------
+    ValueError
+        Naming the constant that is out of its range.
     """
 
     friction: Field
@@ -100,12 +106,14 @@ class DruckerPrager(Skeleton):
 
     @staticmethod
     def kirchhoff(F, bulk, shear, eta, xi, eta_flow, cohesion, hardening, plastic, hardened):
+        """Return the Kirchhoff stress (3, 3), Pa, as UFL."""
         trial = _Trial(F, plastic)
         to = _return(trial, bulk, shear, eta, xi, eta_flow, cohesion, hardening, hardened)
         return to["p"] * ufl.Identity(3) + 2 * shear * to["ratio"] * trial.deviatoric
 
     @staticmethod
     def update(F, bulk, shear, eta, xi, eta_flow, cohesion, hardening, plastic, hardened):
+        """Return the state at the end of the step, name -> UFL."""
         trial = _Trial(F, plastic)
         to = _return(trial, bulk, shear, eta, xi, eta_flow, cohesion, hardening, hardened)
         # b = exp(2 eps), the elastic strain now eps = p/(3K) I + ratio dev(trial eps)

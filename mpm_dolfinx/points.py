@@ -142,16 +142,24 @@ class Body:
 
 
 def box(grid: Grid, lower: ArrayLike, upper: ArrayLike, per_cell: int = 2, material: int = 0) -> Body:
-    """Seed the box [lower, upper] with a lattice of points that fills it exactly.
+    """Seed the box [lower, upper] with a lattice of points that fills it exactly; return the body.
 
     Parameters
     ----------
+    grid
+        Background grid.
     lower, upper : (d,), m
-        Corners of the box, inside the grid.
+        Corners of the box, inside the grid; they need not lie on grid lines.
     per_cell
-        Points per cell and direction (rounded so that they fit the box), >= 1.
+        Points per cell and direction (rounded so that they fit the box), >= 1.  With 1, bodies of a few cells'
+        thickness bend too easily (a warning says so), and the error is about ten times that of 2.
     material
-        Index of the material.
+        Index of the material in the scene's list, >= 0.
+
+    Raises
+    ------
+    ValueError
+        A corner outside the grid, upper not above lower, or per_cell or material that is no such integer.
     """
     instance("body: grid", grid, Grid)
     lower, upper = (
@@ -171,16 +179,25 @@ def box(grid: Grid, lower: ArrayLike, upper: ArrayLike, per_cell: int = 2, mater
 def shape(
     grid: Grid, inside: Callable[[NDArray[np.float64]], NDArray[np.bool_]], per_cell: int = 2, material: int = 0
 ) -> Body:
-    """Seed the points of the grid's own lattice whose centres are inside a shape.
+    """Seed the points of the grid's own lattice whose centres are inside a shape; return the body.
+
+    Its surface is made of steps of a point's size: for smooth sides take `mapped`.
 
     Parameters
     ----------
+    grid
+        Background grid.
     inside
         Maps positions (n, d), m, to booleans (n,).
     per_cell
         Points per cell and direction, >= 1.
     material
-        Index of the material.
+        Index of the material in the scene's list, >= 0.
+
+    Raises
+    ------
+    ValueError
+        `inside` raises, gives no booleans or holds nowhere; per_cell or material that is no such integer.
     """
     instance("body: grid", grid, Grid)
     material, per_cell = whole("body: material", material, 0), whole("body: per_cell", per_cell)
@@ -207,12 +224,21 @@ def shape(
 def mapped(grid: Grid, body: Body, map: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> Body:
     """Bend a body: its boxes become the quadrilaterals or hexahedra between the images of their corners.
 
-    Sides keep their names; regions and probes are given by places before the map.
+    Sides keep their names; regions and probes are given by places before the map.  Returns the bent body.
 
     Parameters
     ----------
+    grid
+        Background grid.
+    body
+        Of `box` or `shape`.
     map
         Maps positions (n, d), m, to positions (n, d), m, inside the grid; smooth, and not turning boxes inside out.
+
+    Raises
+    ------
+    ValueError
+        The map raises, gives another shape or nan, leads out of the grid or turns a box inside out.
     """
     instance("body: grid", grid, Grid)
     instance("body to bend", body, Body)
@@ -444,14 +470,29 @@ def positions(x0: ArrayLike, dim: int) -> NDArray[np.float64]:
 
 
 def probes(bodies: Sequence[Body], x0: ArrayLike) -> Probes:
-    """Return probes at reference positions x0 (m, d), m, before a map, inside or on the surface of the bodies."""
+    """Return probes: material particles whose displacement a run records, the `probes` of `Simulation.run`.
+
+    Parameters
+    ----------
+    bodies
+        All bodies of the scene, in its order.
+    x0 : (m, d), m
+        Reference positions, before a map, inside or on the surface of the bodies.  Where bodies touch, a position
+        belongs to the first of them: keep off by a little to have the other.
+
+    Raises
+    ------
+    ValueError
+        A position outside the bodies; from the run: other bodies than the scene's, or one that is not there now.
+    """
     all_of("probes: bodies", bodies, Body, 1)
     x0 = positions(x0, bodies[0].lower.shape[1])
     centre = np.concatenate([b.centre for b in bodies])
     spacing = np.concatenate([np.broadcast_to(b.spacing, b.lower.shape) for b in bodies])
     ids = np.empty(len(x0), dtype=np.int64)
     for i, x in enumerate(x0):  # a handful of positions, once a scene
-        ids[i] = np.argmin(np.abs((centre - x) / spacing).max(axis=1))
+        far = np.abs((centre - x) / spacing).max(axis=1)
+        ids[i] = np.flatnonzero(far <= far.min() + 1e-9)[0]
     xi = 2 * (x0 - centre[ids]) / spacing[ids]
     far = np.flatnonzero((np.abs(xi) > 1 + 1e-9).any(axis=1))
     if len(far):

@@ -46,6 +46,13 @@ class Checkpoint:
         Output intervals between two checkpoints, >= 1.
     seconds
         Least wall time between two checkpoints, s, >= 0.
+
+    Raises
+    ------
+    ValueError
+        An argument that is none of these.
+    OSError
+        From the run, when the file cannot be written; the one before stays whole.
     """
 
     file: str | os.PathLike
@@ -100,9 +107,10 @@ def resume(simulation: Simulation, file: str | os.PathLike) -> Result:
     Parameters
     ----------
     simulation
-        The scene of the checkpoint, on any number of processes.  Grid, bodies, materials and fluid are
-        compared with the file; loads and boundary conditions may differ.  What observers have gathered for
-        themselves is not in the file.
+        The scene of the checkpoint, on any number of processes, in the stage of the checkpoint: call its `stage`
+        with what came and went first.  Grid, bodies, materials and fluid are compared with the file; loads,
+        boundary conditions, terms and sources may differ.  What observers have gathered for themselves is not in
+        the file.
     file
         The checkpoint.
 
@@ -110,6 +118,8 @@ def resume(simulation: Simulation, file: str | os.PathLike) -> Result:
     ------
     ValueError
         The file is not a whole checkpoint, or one of another scene: says what differs.
+    OSError
+        The file is not there (FileNotFoundError) or cannot be read.
     """
     file = path("checkpoint: file", file)
     if not hasattr(simulation, "restore"):  # its class is defined later than this

@@ -20,6 +20,7 @@ from mpm_dolfinx.coupling import COUPLINGS, Coupler, Report
 from mpm_dolfinx.exchange import Exchange
 from mpm_dolfinx.extend import compiling
 from mpm_dolfinx.grid import Grid, sum_by
+from mpm_dolfinx.held import check_held
 from mpm_dolfinx.integration import IntegrationData
 from mpm_dolfinx.laws import SceneMaterials
 from mpm_dolfinx.materials import Fluid, Skeleton
@@ -281,7 +282,7 @@ class Simulation:
             now["plates"],
             [*now["drained"], *now["inflows"]],
         )
-        self._conditions = now
+        self._conditions, self._begins = now, True
         if "displacements" in conditions:
             unknown = np.nan if self.active_cells else 0.0
             self.reactions = np.full((len(side.holds), self.grid.dim), unknown)
@@ -424,26 +425,11 @@ class Simulation:
         return self._integration.rows(self.placement, self.points, value)
 
     def _check_held(self) -> None:
-        """Refuse a scene whose body can move as a rigid body: its tangent is singular."""
-        grid, momentum = self.grid, self.momentum
-        nodes = np.zeros(len(grid.node_x), dtype=bool)
-        nodes[grid.cell_nodes[np.flatnonzero(momentum.fill.x.array > 0)]] = True
-        node, axis = np.nonzero(nodes[:, None] & ~momentum.free)
-        x, direction = grid.node_x[node], np.eye(grid.dim)[axis]
-        if self.boundary.holds:
-            x = np.concatenate([x, momentum.holds.x])
-            direction = np.concatenate([direction, momentum.holds.data["direction"]])
-        x = x / (grid.upper - grid.lower).max()
-        modes = list(direction.T)
-        modes += [direction[:, a] * x[:, b] - direction[:, b] * x[:, a] for a in range(grid.dim) for b in range(a)]
-        R = np.stack(modes, axis=1)
-        gram = grid.comm.allreduce(R.T @ R)
-        missing = len(modes) - np.linalg.matrix_rank(gram, tol=1e-12 * max(1.0, np.abs(gram).max()))
-        if missing:
-            raise ValueError(
-                f"fixed walls: the body is free to move as a rigid body in {missing} of {len(modes)} ways; "
-                "it must touch walls whose fixed components hold it, or have given displacements"
-            )
+        """Refuse a scene whose body can move as a rigid body; at the start of a stage, any part of it."""
+        momentum, holds = self.momentum, self.momentum.holds
+        held = (holds.cells, holds.x, holds.data["direction"]) if self.boundary.holds else None
+        check_held(self.grid, momentum.fill.x.array > 0, momentum.free, held, self._begins)
+        self._begins = False
 
     def _place_loads(self, t: float) -> None:
         """Put the loads and given displacements of time t on the surface."""
@@ -485,6 +471,7 @@ class Simulation:
         self.points, self._carried, self.t = points, carried, t
         self._prepared, self.placement = False, None
         self.reactions = np.full_like(self.reactions, np.nan)  # not in the file: until the next step
+        self._begins = False  # parts that have torn off since are what they are
         if self.active_cells:  # of a step that was taken before
             self.coupler.forget()
         self._migrate()

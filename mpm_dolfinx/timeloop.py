@@ -98,9 +98,16 @@ def log(comm: MPI.Intracomm, message: str, *values) -> None:
 
 
 class GaveUp(RuntimeError):
-    """A run could not go on; `result` holds the histories up to the last good step.
+    """A run could not go on: a step that does not converge however short, a point that has left the grid.
 
-    `history` lists the relative residuals (momentum, storage) of the failed step, if it was one.
+    The simulation is in the state of the last good step, from which other conditions or another step may go on.
+
+    Attributes
+    ----------
+    result
+        Histories up to the last good output time.
+    history
+        Relative residuals (momentum, storage) of the failed step's iterations, if it was one.
     """
 
     def __init__(self, message: str, result: Result, history: Sequence[tuple[float, float]] = ()):
@@ -143,6 +150,8 @@ def run(
 
     Raises
     ------
+    ValueError
+        An argument, or what a function of time gives, is none that is allowed.
     GaveUp
         With the histories so far; `points` and `t` are those of the last good step.
     """

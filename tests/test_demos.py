@@ -11,7 +11,15 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 QUICK = {
-    "poroelastic_beam": ("--h 0.03 --t-end 0.2 --reference", ["pressure.png", "deflection.png", "tip.csv"]),
+    "poroelastic_beam": (
+        "--h 0.03 --t-end 0.2 --reference --paraview",
+        [
+            "pressure.png",
+            "deflection.png",
+            "tip.csv",
+            *(f"paraview/{n}" for n in ("points.pvd", "grid.pvd", "history.csv")),
+        ],
+    ),
     "terzaghi": ("--cells 10 --steps 20", ["terzaghi.png"]),
     "self_weight_column": ("--cells 16", ["self_weight_column.png"]),
     "error_vs_runtime": ("--quick --cases column", ["column.png", "runs.csv", "comparison.md"]),

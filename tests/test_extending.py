@@ -382,3 +382,26 @@ def test_one_line_says_what_is_wrong(make, message):
     with pytest.raises(ValueError, match=message) as caught:
         make()
     assert "\n" not in str(caught.value)
+
+
+def test_a_term_of_nothing_changes_nothing_where_one_of_two_materials_is_a_field():
+    grid = mpm.Grid([0.5, 1.2], [5, 12])
+    bodies = [mpm.box(grid, [0, 0], [0.5, 0.5]), mpm.box(grid, [0, 0.5], [0.5, 1], material=1)]
+    materials = [mpm.Hencky(bulk=2e6, shear=1e6), mpm.Hencky(bulk=lambda X: 1e6 * (2 - X[:, 1]), shear=1e6)]
+
+    def nothing(points, v, t):
+        return (t - t) * points.value(v)[0] * points.dx
+
+    settled = []
+    for terms in ([], [nothing]):
+        s = mpm.Simulation(
+            grid,
+            bodies,
+            materials,
+            fixed={"left": "x", "right": "x", "bottom": "y"},
+            tractions=[mpm.Traction("top", lambda t: -1e5 * t)],
+            terms=terms,
+        )
+        s.run(1.0, 0.25, progress=False)
+        settled.append(s.points.corners)
+    assert np.abs(settled[1] - settled[0]).max() < 1e-12

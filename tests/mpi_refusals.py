@@ -1,0 +1,37 @@
+# SPDX-License-Identifier: MIT
+"""What only one of several processes can see is refused by all, in the same words."""
+
+import numpy as np
+
+import mpm_dolfinx as mpm
+
+grid = mpm.Grid([1.0, 1.0], [10, 10])
+body = mpm.box(grid, [0, 0.2], [0.5, 0.5])
+
+
+def scene(conductivity_law=None, **options):
+    soil = mpm.Hencky(bulk=1e6, shear=6e5, conductivity=1e-4, conductivity_law=conductivity_law)
+    return mpm.Simulation(grid, [body], [soil], fixed={"left": "xy"}, **options)
+
+
+def pulled(t, X):
+    return 1.2 * t, 0.0
+
+
+def torn(t, X):
+    return np.where(X > 0.4, np.nan, 0.0)
+
+
+CASES = {
+    "left the grid": scene(displacements=[mpm.Displacement("right", pulled)]),
+    "conductivity law: k": scene(lambda x: 0.4 - x[0], fluid=mpm.Fluid()),
+    "Displacement(side='top'": scene(displacements=[mpm.Displacement("top", torn)]),
+}
+for words, simulation in CASES.items():
+    try:
+        simulation.run(1.0, 0.1, progress=False)
+        message = "accepted"
+    except (ValueError, mpm.GaveUp) as error:
+        message = str(error)
+    said = grid.comm.allgather(message)
+    assert words in message and len(set(said)) == 1, said
