@@ -57,6 +57,7 @@ class Boundary:
     ):
         self.grid, self._bodies, self._present, self._modulus = grid, bodies, list(present), modulus
         self._found: dict[tuple[str, str], Surface] = {}
+        self._loaded: tuple[Placement, Exchange] | None = None
         self.plates = [(plate, self._faces(plate)) for plate in plates]
         tractions = [*tractions, *(plate.traction(faces.area0.sum(), grid.dim) for plate, faces in self.plates)]
         self.loads = [(load, self._faces(load)) for load in tractions]
@@ -85,16 +86,23 @@ class Boundary:
 
     def place_loads(self, place: Placement, momentum: Momentum, t: float) -> None:
         """Put the dead loads of time t (s) on the surface."""
-        rows = []
+        d = self.grid.dim
+        cells, places, forces = [np.empty(0, dtype=np.int64)], [np.empty((0, d))], [np.empty((0, d))]
         for load, faces in self.loads:
             patches = place.surface(faces)
+            cells.append(patches.cell)
+            places.append(patches.x)
             traction = load.at(t, self.grid.dim)
             if traction.ndim == 0:
                 area = patches.area(place.points)
                 traction = traction * area / np.linalg.norm(area, axis=1, keepdims=True)
-            rows.append((patches.cell, patches.x, patches.area0[:, None] * traction))
-        cell, x, force = self._gathered(rows, self.grid.dim)
-        momentum.loads.place(cell, x, np.ones(len(cell)), force=force)
+            forces.append(patches.area0[:, None] * traction)
+        if self._loaded is None or self._loaded[0] is not place:
+            cell, x = np.concatenate(cells), np.concatenate(places)
+            self._loaded = place, Exchange(self.grid.comm, self.grid.owner(cell))
+            cell, x = self._loaded[1].send(cell), self._loaded[1].send(x)
+            momentum.loads.place(self.grid.local(cell), x, np.ones(len(cell)), force=np.zeros_like(x))
+        momentum.loads.renew(force=self._loaded[1].send(np.concatenate(forces)))
 
     def place_plates(self, place: Placement, momentum: Momentum) -> None:
         """Put the plates on the surface."""

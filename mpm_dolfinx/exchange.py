@@ -79,6 +79,11 @@ class Exchange:
         return out
 
 
+def over_all(comm: MPI.Intracomm, value: T, op: MPI.Op = MPI.SUM) -> T:
+    """Return the sum of the processes' values, or their maximum...; of one process its own, at no cost."""
+    return value if comm.size == 1 else comm.allreduce(value, op=op)
+
+
 def to_root(comm: MPI.Intracomm, rows: int) -> Exchange:
     """Return the exchange that takes this process's rows to rank 0."""
     return Exchange(comm, np.zeros(rows, dtype=np.int32))

@@ -105,10 +105,12 @@ class FormPoints:
         self.data = {"offset": x - self.grid.midpoints[cells]}
         self.renew(weight, **data)
 
-    def renew(self, weight: NDArray[np.float64], **data) -> None:
-        """Give the points, which stay where they are, new weights and new values of some fields."""
+    def renew(self, weight: NDArray[np.float64] | None = None, **data) -> None:
+        """Give the points, which stay where they are, new values of some fields, or new weights too."""
         rows = {name: value.reshape(len(self.cells), self._size[name]) for name, value in data.items()}
-        self.data |= {"weight": (weight / self.grid.cell_volume)[:, None], **rows}
+        if weight is not None:
+            rows["weight"] = (weight / self.grid.cell_volume)[:, None]
+        self.data |= rows
         self.version += 1
 
     def take(self, points: FormPoints, rows: NDArray[np.int64]) -> None:

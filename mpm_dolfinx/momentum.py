@@ -26,6 +26,7 @@ from mpm_dolfinx import _compat
 from mpm_dolfinx.check import line
 from mpm_dolfinx.dilatation import MeanDilatation
 from mpm_dolfinx.elements import ElementForces, ElementMatrices, StackedElementMatrices
+from mpm_dolfinx.exchange import over_all
 from mpm_dolfinx.extend import compiling
 from mpm_dolfinx.extend import form as form_of
 from mpm_dolfinx.forms import FacetForm, FormPoints, PointForm
@@ -218,14 +219,14 @@ class Momentum:
         # a cell may become active between active nodes, so equal dofs do not mean equal cells
         now = (cells, dofs, facets)
         same = self._dofs is not None and all(map(np.array_equal, now, (self._cells, self._dofs, self._facets)))
-        changed = self.grid.comm.allreduce(not same) > 0
+        changed = over_all(self.grid.comm, not same) > 0
         if changed:
             self._cells, self._dofs, self._facets = now
             self.unknowns = Unknowns(self.u, dofs)
             self.K = matrix(self.unknowns, self.unknowns, 3**self.grid.dim * self.grid.dim)
             self._summed = False
             self.penalty = self._penalty_matrix()
-            self.residual = self.unknowns.vector()
+            self.residual, self._du = self.unknowns.vector(), self.unknowns.vector()
             self.ghost.place(facets)
         stiffness = float(self.modulus.x.array[cells].max(initial=0.0)) * self.grid.cell_volume / self.grid.h.min()
         self.round_off = 1e-14 * self.grid.comm.allreduce(stiffness) * np.sqrt(max(1, self.unknowns.global_size))
@@ -301,13 +302,12 @@ class Momentum:
             own = self._assemble_terms()[owned]
             squares.append(own @ own)
             b[owned] += own
-        if self.grid.comm.size > 1:
-            squares = self.grid.comm.allreduce(np.array(squares))
+        squares = over_all(self.grid.comm, np.array(squares))
         b[owned] -= self._external[owned]
         if self.holds is not None:  # no measure of forces: at the start of a step it is far above them
             b[owned] -= self._pulls.x.array[owned]
         r = self.unknowns.gather(b, self.residual)
-        du = self.unknowns.gather(self.u.x.array, self.K.createVecRight())
+        du = self.unknowns.gather(self.u.x.array, self._du)
         self.penalty.multAdd(du, r, r)
         return r, float(np.sqrt(max(squares)))
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from mpm_dolfinx.boundary import Boundary
 from mpm_dolfinx.coupling import NotConverged
 from mpm_dolfinx.domains import parallelepipeds, tangled
+from mpm_dolfinx.exchange import over_all
 from mpm_dolfinx.forms import FormPoints
 from mpm_dolfinx.laws import SceneMaterials
 from mpm_dolfinx.materials import Fluid
@@ -78,7 +79,8 @@ class Motion:
         if self._domains:
             points.corners = points.corners + moved
             points.x = points.corners.mean(axis=1)
-            folded = self._untangle(points, boundary)
+            if not place.serves():  # nor have they folded then
+                folded = self._untangle(points, boundary)
         else:
             points.x = points.x + moved
             points.corners = parallelepipeds(points.x, points.F, self._size[points.id])
@@ -92,7 +94,7 @@ class Motion:
         wet = self._storage is not None
         least = 1 - self._scene.table(points, lambda m: m.porosity) if wet else np.zeros(len(J))
         bad = np.flatnonzero(J <= least)
-        if self.grid.comm.allreduce(len(bad)):
+        if over_all(self.grid.comm, len(bad)):
             shown = [f"point {points.id[i]} at {points.x[i]} with J = {J[i]:.3g}" for i in bad[:1]]
             what = "the pores have closed" if wet else "the body is turned inside out"
             raise NotConverged(f"{what}, J <= {least.max(initial=0):.3g}: {', '.join(shown) or 'elsewhere'}", [])
@@ -106,7 +108,7 @@ class Motion:
             corners = boundary.under_held(points.id[bad], points.corners[bad], volume[bad], corners)
             points.corners[bad] = np.clip(corners, grid.lower, grid.upper)
             points.x[bad] = points.corners[bad].mean(axis=1)
-        return grid.comm.allreduce(len(bad))
+        return over_all(grid.comm, len(bad))
 
     def carry(self, points: MaterialPoints, place: Placement) -> Carried:
         """Return the pressures that the pieces take along when they leave the grid."""

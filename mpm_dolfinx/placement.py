@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.domains import Pieces, cut, cut_faces
-from mpm_dolfinx.exchange import Exchange, first
+from mpm_dolfinx.exchange import Exchange, first, over_all
 from mpm_dolfinx.forms import CHUNK
 from mpm_dolfinx.grid import Grid, sum_by
 from mpm_dolfinx.points import MaterialPoints, Surface, face_vectors, interpolate
@@ -119,7 +119,7 @@ class Placement:
     def serves(self) -> bool:
         """Return whether the points are still where they were, but for `STAYS`."""
         moved = np.abs((self.points.corners - self._corners) / self.grid.h).max(initial=0.0)
-        return self.grid.comm.allreduce(moved, op=MPI.MAX) <= STAYS
+        return over_all(self.grid.comm, moved, MPI.MAX) <= STAYS
 
     def to_cells(self, values: NDArray) -> NDArray:
         """Send values of the points (n, ...) to the owners of their pieces' cells (m, ...)."""

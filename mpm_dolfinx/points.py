@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from mpm_dolfinx.check import all_of, asked, instance, line, numbers, whole
 from mpm_dolfinx.domains import corner_bits, volumes
-from mpm_dolfinx.exchange import Exchange
+from mpm_dolfinx.exchange import Exchange, over_all
 from mpm_dolfinx.grid import Grid, side
 
 
@@ -452,7 +452,7 @@ class Probes:
         here, at = points.find(self.id)
         u = np.zeros_like(self.x0)
         u[here] = interpolate(points.corners[at] - points.origin[at], self.xi[here])
-        return comm.allreduce(u)
+        return over_all(comm, u)
 
 
 def _same(a: Body, b: Body) -> bool:

@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 from mpm_dolfinx import _compat
 from mpm_dolfinx.check import line
 from mpm_dolfinx.elements import ElementForces
+from mpm_dolfinx.exchange import over_all
 from mpm_dolfinx.extend import compiling
 from mpm_dolfinx.extend import form as form_of
 from mpm_dolfinx.forms import FacetForm, FormPoints, PointForm
@@ -258,7 +259,7 @@ class Storage:
         filled = self.unknowns.owned
         reach = 4 * self.grid.h.max() ** 2  # no two centroids are further apart than 2 h
         needed = self.damping.x.array[filled] * reach > dt * self.mobility.x.array[filled]
-        self.damped = self.grid.comm.allreduce(bool(needed.any())) > 0
+        self.damped = over_all(self.grid.comm, bool(needed.any())) > 0
         if self.damped:
             self._dt.value = dt
             zero(self.D)
@@ -307,7 +308,7 @@ class Storage:
         p = self.unknowns.gather(self.p.x.array, self._p)
         # what rounding may leave: of the volumes and of the fluxes that cancel
         turnover = dt * (np.abs(self._outflow) @ np.abs(p.array_r))
-        self.round_off = comm.allreduce(2e-15 * (self._volume + turnover))
+        self.round_off = over_all(comm, 2e-15 * (self._volume + turnover))
         flux = self.T * p
         flux.axpy(1.0, self._rate)
         r.axpy(dt, flux)
@@ -319,13 +320,13 @@ class Storage:
             r.array_w[:] -= gain
             self._change_total -= gain.sum()
             exchanged += np.abs(gain).sum()
-        return r, comm.allreduce(exchanged)
+        return r, over_all(comm, float(exchanged))
 
     def balance(self, dt: float) -> float:
         """Return the change of the fluid's volume, plus what left, less sources (m^d), at the last residual."""
         p = self.p.x.array[self.unknowns.owned]
         out = (self._conductance * p - self._inflow).sum()
-        return float(self.grid.comm.allreduce(self._change_total + dt * out))
+        return float(over_all(self.grid.comm, self._change_total + dt * out))
 
     def assemble_tangent(self, dt: float) -> None:
         """Assemble C = d/dp and B = d/du of the residual at (u, p)."""

@@ -183,7 +183,6 @@ def run(
             result.converged = k == intervals
             with Timer("mpm: output"):
                 _record(simulation, result, probes)
-                _measure(simulation, result)
                 stopwatch.read()
                 for observer in observers:
                     observer(simulation)
@@ -191,6 +190,7 @@ def run(
                 if checkpoint is not None:
                     checkpoint(simulation)
             bar.update()
+    _measure(simulation, result)
     stopwatch.read()
     return result
 
