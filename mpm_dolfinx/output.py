@@ -45,7 +45,8 @@ class Writer:
     pore pressure, effective stress (Pa), F, J and what else the points carry; `history.csv`, one row an output
     time with the counts of `Result` so far, least and largest pressure (Pa) and the displacements of the
     probes (m); if asked for `grid.pvd`, the last step's displacement (m), the pore pressure (Pa) and the
-    filled share of the cells.  Tensors: in 2D a field for each component (F_xy), in 3D row by row.
+    filled share of the cells.  Tensors: in 2D a field for each component (F_xy), in 3D row by row.  ParaView and VTK
+    read all of it, meshio the points.  Stress and pressure of points are those of their cell.
 
     What the folder holds up to the present time stays, and is continued: made after `resume`, a writer leaves
     the files of a run that was never interrupted.
