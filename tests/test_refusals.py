@@ -126,6 +126,11 @@ CASES = {
         "gives shape",
         "()",
     ),
+    "law with an energy and a stress": (
+        lambda: scene(materials=[law(energy=ENERGY, kirchhoff=lambda F, bulk: bulk * F)]),
+        "Law: has both",
+        "energy or kirchhoff",
+    ),
     "constant of nan": (lambda: scene(materials=[Scaled(1e6, 1e6, scale=NAN)]), "Scaled: scale", "nan"),
     "constant in words": (lambda: scene(materials=[Scaled(1e6, 1e6, scale="two")]), "Scaled: scale", "two"),
     "field of nan in a law": (
