@@ -4,8 +4,9 @@
 Two saturated bodies that creep through the grid: the beam of `poroelastic_beam.py` in 2D (direct solvers, in a
 background box that is six times as large), and a cube of 1 m that is sheared and pressed in 3D (multigrid).  Every
 run is a process of its own, or several under mpirun (--processes 1 2).  After a first step, which compiles and
-fills the caches, steps are taken one by one; the fastest counts, since other work on the machine only adds.  Memory
-is the peak since the start of the process, libraries and compiler included.
+fills the caches, steps are taken one by one; the fastest counts, since other work on the machine only adds.  Time is
+that of the clock on several processes; on one it is processor time, which has the shares of the clock's.  Memory is
+the peak since the start of the process, libraries and compiler included.
 
 The exponent of a part is the slope of log(time) over log(points), by least squares over the upper half of the
 sizes; `kB a point` is the slope of the memory.  Runs on several processes also say how even the work is (`imbalance`:
@@ -16,11 +17,12 @@ solvers; MUMPS's and dolfinx's own messages are not counted.
 With runs on one and on several processes, a cost model is fitted to the seconds of a step of n points on P
 processes,
 
-    T = e + a n / P + b (n / P)^((d - 1) / d) [P > 1] + c log2 P,
+    T = e + a n / P + b H + c log2 P,
 
 a fixed cost, work of the points, halo, and messages whose size does not matter; all >= 0, by least squares of
-relative errors.  Runs on more processes than the machine has processors count for messages only.  In 2D the solvers
-are left out: factors do not cost n / P.
+relative errors.  H is how many points lie along the faces that a process shares with others, where a cube is halved
+again and again.  Runs on more processes than the machine has processors count for messages only.  In 2D the
+solvers are left out: factors do not cost n / P.
 """
 
 from __future__ import annotations
@@ -92,8 +94,14 @@ def measure(dim: int, points: float) -> dict:
     simulation, dt = scene(dim, points)
     first = simulation.run(dt, dt, progress=False)
     comm, setup, before = simulation.grid.comm, time.perf_counter() - began, sent()
-    steps = [simulation.run(simulation.t + dt, dt, progress=False) for _ in range(STEPS)]
-    best = min(steps, key=lambda step: step.wall)
+    clock = time.process_time if comm.size == 1 else time.perf_counter
+    steps = []
+    for _ in range(STEPS):
+        start = clock()
+        result = simulation.run(simulation.t + dt, dt, progress=False)
+        steps.append((clock() - start, result))
+    seconds, best = min(steps, key=lambda step: step[0])
+    profile = {part: wall * seconds / best.wall for part, wall in best.profile.items()}
     most = np.max(comm.allgather((sent() - before) / STEPS), axis=0).tolist()
     names = ("exchange_messages", "exchange_bytes", "solver_messages", "solver_bytes", "solver_reductions")
     return {
@@ -105,11 +113,11 @@ def measure(dim: int, points: float) -> dict:
         "unknowns": simulation.momentum.unknowns.global_size + simulation.storage.unknowns.global_size,
         "newton": best.newton,
         "coupling": best.coupling,
-        "cuts": first.cuts + sum(step.cuts for step in steps),
+        "cuts": first.cuts + sum(result.cuts for _, result in steps),
         "setup_s": setup,
-        "step": best.wall,
-        **best.profile,
-        "rest": best.wall - sum(best.profile.values()),
+        "step": seconds,
+        **profile,
+        "rest": seconds - sum(profile.values()),
         "memory_MB": best.memory,
         "imbalance": best.imbalance.get("pieces", 1.0),
         **dict(zip(names, most, strict=True)),
@@ -142,10 +150,17 @@ def exponents(rows: list[dict]) -> dict[str, float]:
     return found
 
 
+def halo(dim: int, n: float, processes: int) -> float:
+    """Return how many points lie along the faces that a process shares with others; processes: a power of two."""
+    turn = round(np.log2(processes))
+    halved = np.array([turn // dim + (axis < turn % dim) for axis in range(dim)])
+    sides = n ** (1 / dim) / 2.0**halved
+    return float((np.minimum(halved, 2) * sides.prod() / sides).sum())
+
+
 def terms(dim: int, n: float, processes: int) -> list[float]:
     """Return the terms of the cost model."""
-    share = n / processes
-    return [1.0, share, share ** ((dim - 1) / dim) * (processes > 1), np.log2(processes)]
+    return [1.0, n / processes, halo(dim, n, processes), np.log2(processes)]
 
 
 def modelled(row: dict) -> float:
@@ -171,33 +186,41 @@ def predicted(model: dict[str, float], dim: int, n: float, processes: int) -> fl
 # ---- reporting -----------------------------------------------------------------------------------
 
 
-def table(rows: list[dict], found: dict[str, float]) -> str:
-    """Return times by part, s, and memory as a Markdown table."""
-    names = ("step", *PARTS, "rest")
-    lines = [f"| points | processes | cells | {' | '.join(names)} | MB | imbalance |", "|---" * (len(names) + 5) + "|"]
+def by_part(rows: list[dict], found: dict[str, float]) -> str:
+    """Return the seconds and the memory of runs on one number of processes, and the exponents, as a Markdown table."""
+    sizes = " | ".join(f"{row['points']}" for row in rows)
+    lines = [f"| seconds of a step | {sizes} | exponent |", "|---" * (len(rows) + 2) + "|"]
+    for part in ("step", *PARTS, "rest"):
+        seconds = " | ".join(f"{row[part]:.2g}" for row in rows)
+        lines.append(f"| {part} | {seconds} | {found.get(part, np.nan):.2f} |")
+    memory = " | ".join(f"{row['memory_MB']:.0f}" for row in rows)
+    return "\n".join([*lines, f"| memory (MB) | {memory} | {found['kB a point']:.1f} kB a point |"])
+
+
+def by_processes(rows: list[dict]) -> str:
+    """Return time, memory, imbalance and what a process sends in a step as a Markdown table."""
+    columns = {
+        "points": "points",
+        "processes": "processes",
+        "step (s)": "step",
+        "memory (MB)": "memory_MB",
+        "imbalance": "imbalance",
+        "exchange: messages": "exchange_messages",
+        "bytes": "exchange_bytes",
+        "solvers: messages": "solver_messages",
+        "bytes ": "solver_bytes",
+        "reductions": "solver_reductions",
+    }
+    lines = [f"| {' | '.join(columns)} |", "|---" * len(columns) + "|"]
     for row in rows:
-        seconds = " | ".join(f"{row[name]:.3g}" for name in names)
-        sizes = f"{row['points']} | {row['processes']} | {row['active_cells']}"
-        lines.append(f"| {sizes} | {seconds} | {row['memory_MB']:.0f} | {row['imbalance']:.2f} |")
-    slopes = " | ".join(f"{found.get(name, np.nan):.2f}" for name in names)
-    return "\n".join([*lines, f"| exponent | | | {slopes} | {found['kB a point']:.2f} kB a point | |"])
-
-
-def messages(rows: list[dict]) -> str:
-    """Return what a process sends in a step as a Markdown table."""
-    lines = ["| points | processes | exchange: messages | kB | solvers: messages | kB | reductions |", "|---" * 7 + "|"]
-    for r in (row for row in rows if row["processes"] > 1):
-        exchange = f"{r['exchange_messages']:.0f} | {r['exchange_bytes'] / 1024:.0f}"
-        solver = f"{r['solver_messages']:.0f} | {r['solver_bytes'] / 1024:.0f} | {r['solver_reductions']:.0f}"
-        lines.append(f"| {r['points']} | {r['processes']} | {exchange} | {solver} |")
+        values = (row[key] for key in columns.values())
+        lines.append(f"| {' | '.join(f'{v:.0f}' if v >= 100 else f'{v:.3g}' for v in values)} |")
     return "\n".join(lines)
 
 
 def prediction(model: dict[str, float], dim: int) -> str:
     """Return the cost model, and what it says of many processes."""
-    form = (
-        f"{model['e']:.2g} + {model['a']:.2g} n/P + {model['b']:.2g} (n/P)^({dim - 1}/{dim}) + {model['c']:.2g} log2 P"
-    )
+    form = f"{model['e']:.2g} + {model['a']:.2g} n/P + {model['b']:.2g} H + {model['c']:.2g} log2 P"
     lines = [f"{dim}D: T = {form} s, within {100 * model['worst']:.0f} % of the runs"]
     for share in (1e4, 1e5):
         times = [f"{predicted(model, dim, share * P, P):.2f} s on {P}" for P in (1, 2, 64, 1024, 4096)]
@@ -207,52 +230,34 @@ def prediction(model: dict[str, float], dim: int) -> str:
 
 def draw(out: Path, rows: list[dict]) -> None:
     """Draw the time of the parts and the memory against the number of points."""
-    dims = sorted({row["dim"] for row in rows})
+    dims, processes = (sorted({row[name] for row in rows}) for name in ("dim", "processes"))
     fig, axes = beam.figure(len(dims), 2, (12, 4.6 * len(dims)))
     for dim, (left, right) in zip(dims, axes, strict=True):
-        by_processes = {
-            p: [r for r in rows if (r["dim"], r["processes"]) == (dim, p)] for p in {r["processes"] for r in rows}
-        }
-        for k, p in enumerate(sorted(by_processes)):
-            n = [row["points"] for row in by_processes[p]]
-            label = f"{p} process" + "es" * (p > 1)
-            left.loglog(
-                n,
-                [row["step"] for row in by_processes[p]],
-                "ks-"[0] + "os^D"[k % 4] + "-",
-                lw=2,
-                label=f"step, {label}",
-            )
-            right.loglog(n, [row["memory_MB"] for row in by_processes[p]], "o-", label=label)
-        alone = by_processes[min(by_processes)]
-        n, found = np.array([row["points"] for row in alone]), exponents(alone)
-        for k, part in enumerate(sorted((*PARTS, "rest"), key=lambda part: -alone[-1][part])[:8]):
-            left.loglog(
-                n,
-                [row[part] for row in alone],
-                "osv^D*Pd"[k] + "-",
-                ms=3,
-                lw=1,
-                label=f"{part}, {found.get(part, np.nan):.2f}",
-            )
-        left.loglog(n, alone[-1]["step"] * n / n[-1], "k:", lw=1, label="slope 1")
-        base = alone[-1]["memory_MB"] - found["kB a point"] / 1024 * n[-1]
-        right.loglog(
-            n,
-            base + found["kB a point"] / 1024 * n,
-            "k:",
-            lw=1,
-            label=f"{base:.0f} MB + {found['kB a point']:.1f} kB a point",
-        )
-        left.set(
-            xlabel="material points", ylabel="time per step (s)", title=f"{dim}D: a step, and the exponent of each part"
-        )
-        right.set(xlabel="material points", ylabel="peak memory, all processes (MB)", title=f"{dim}D: memory")
-        left.legend(fontsize=8)
-        right.legend(fontsize=8)
+        for p, mark in zip(processes, "os^D*P", strict=False):
+            mine = [row for row in rows if (row["dim"], row["processes"]) == (dim, p)]
+            n, label = [row["points"] for row in mine], f"{p} process" + "es" * (p > 1)
+            left.loglog(n, [row["step"] for row in mine], f"k{mark}-", lw=2, label=f"step, {label}")
+            right.loglog(n, [row["memory_MB"] for row in mine], f"k{mark}-", label=label)
+        draw_parts(left, right, [row for row in rows if (row["dim"], row["processes"]) == (dim, processes[0])])
+        left.set(ylabel="time per step (s)", title=f"{dim}D: a step, its parts and their exponents")
+        right.set(ylabel="peak memory, all processes (MB)", title=f"{dim}D: memory")
         for ax in (left, right):
-            ax.grid(alpha=0.3, which="both")
+            ax.set(xlabel="material points")
+            ax.grid(alpha=0.3)
+            ax.legend(fontsize=8)
     fig.savefig(out / "scaling.png", dpi=120)
+
+
+def draw_parts(left, right, rows: list[dict]) -> None:
+    """Draw the parts that take longest, and what a time and a memory that go with the points would be."""
+    n, found = np.array([row["points"] for row in rows]), exponents(rows)
+    for k, part in enumerate(sorted((*PARTS, "rest"), key=lambda part: -rows[-1][part])[:8]):
+        label = f"{part}, {found.get(part, np.nan):.2f}"
+        left.loglog(n, [row[part] for row in rows], "osv^D*Pd"[k] + "-", ms=3, lw=1, label=label)
+    left.loglog(n, rows[-1]["step"] * n / n[-1], "k:", lw=1, label="exponent 1")
+    slope = found["kB a point"] / 1024
+    base = rows[-1]["memory_MB"] - slope * n[-1]
+    right.loglog(n, base + slope * n, "k:", lw=1, label=f"{base:.0f} MB + {1024 * slope:.1f} kB a point")
 
 
 def write(out: Path, rows: list[dict]) -> dict:
@@ -265,15 +270,20 @@ def write(out: Path, rows: list[dict]) -> dict:
     text, found = [], {}
     for dim in sorted({row["dim"] for row in rows}):
         mine = [row for row in rows if row["dim"] == dim]
-        fewest = min(row["processes"] for row in mine)
-        found[f"{dim}D"] = slopes = {"exponents": exponents([row for row in mine if row["processes"] == fewest])}
-        text += [f"{dim}D, seconds of a step:", "", table(mine, slopes["exponents"]), ""]
-        several = {row["processes"] for row in mine} - {1}
-        if several:
-            text += ["Sent by a process in a step:", "", messages(mine), ""]
-        if several and fewest == 1:
-            slopes["model"] = fit(mine)
-            text += [prediction(slopes["model"], dim), ""]
+        several = sorted({row["processes"] for row in mine})
+        fewest = [row for row in mine if row["processes"] == several[0]]
+        found[f"{dim}D"] = {"exponents": exponents(fewest)}
+        text += [
+            f"{dim}D on {several[0]} process{'es' * (several[0] > 1)}:",
+            "",
+            by_part(fewest, found[f"{dim}D"]["exponents"]),
+            "",
+        ]
+        if several[-1] > 1:
+            text += ["What a process sends in a step:", "", by_processes(mine), ""]
+        if several[0] == 1 < several[-1]:
+            found[f"{dim}D"]["model"] = fit(mine)
+            text += [prediction(found[f"{dim}D"]["model"], dim), ""]
     (out / "scaling.md").write_text("\n".join(text))
     print("\n".join(text))
     draw(out, rows)

@@ -19,7 +19,7 @@ from mpm_dolfinx.exchange import Exchange, first
 from mpm_dolfinx.grid import Grid, sum_by
 from mpm_dolfinx.momentum import Momentum
 from mpm_dolfinx.placement import Placement
-from mpm_dolfinx.points import Body, Surface, surface
+from mpm_dolfinx.points import Body, Surface, face_vectors, surface
 from mpm_dolfinx.storage import Storage
 
 
@@ -151,6 +151,22 @@ class Boundary:
         force = (holds.data["stiffness"][:, 0] * (holds.data["gap"][:, 0] - moved))[:, None] * direction
         sums = [sum_by(self._number, column, len(self.holds)) for column in force.T]
         return grid.comm.allreduce(np.stack(sums, axis=1))
+
+    def under_held(
+        self, ids: NDArray[np.int64], tracked: NDArray[np.float64], volume: NDArray[np.float64], corners: NDArray
+    ) -> NDArray[np.float64]:
+        """Return new corners (m, 2^d, d), m, of domains: prisms of their volume (m,) under faces that are held.
+
+        A held face stays where its tracked corners are: put elsewhere it would be pulled back, all at once.
+        """
+        index = np.arange(2**self.grid.dim)
+        for _, faces, _ in self.holds:
+            held = np.flatnonzero(np.isin(ids, faces.id))
+            outward = face_vectors(tracked[held], faces.axis, faces.end)
+            depth = volume[held, None] * outward / (outward**2).sum(axis=1, keepdims=True)
+            face = index ^ ((index >> faces.axis & 1 ^ faces.end) << faces.axis)  # of each corner: that on the face
+            corners[held] = tracked[held][:, face] - np.where((face != index)[:, None], depth[:, None], 0.0)
+        return corners
 
     def open_outlets(self, place: Placement, storage: Storage, weight: NDArray[np.float64] | None) -> None:
         """Set the conductances of drained sides and the inflows; weight: rho_w g (d,), N/m^3, if there is gravity."""

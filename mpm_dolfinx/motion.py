@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from mpm_dolfinx.boundary import Boundary
 from mpm_dolfinx.coupling import NotConverged
 from mpm_dolfinx.domains import parallelepipeds, tangled
 from mpm_dolfinx.forms import FormPoints
@@ -52,7 +53,7 @@ class Motion:
         self._momentum, self._storage, self._fluid, self._domains = momentum, storage, fluid, domains
         self._size = np.concatenate([body.size() for body in bodies])
 
-    def move(self, points: MaterialPoints, place: Placement) -> int:
+    def move(self, points: MaterialPoints, place: Placement, boundary: Boundary) -> int:
         """Move the corners, update F and the state, take the cells' pressures; return how many domains had folded.
 
         Raises
@@ -77,7 +78,7 @@ class Motion:
         if self._domains:
             points.corners = points.corners + moved
             points.x = points.corners.mean(axis=1)
-            folded = self._untangle(points)
+            folded = self._untangle(points, boundary)
         else:
             points.x = points.x + moved
             points.corners = parallelepipeds(points.x, points.F, self._size[points.id])
@@ -96,12 +97,13 @@ class Motion:
             what = "the pores have closed" if wet else "the body is turned inside out"
             raise NotConverged(f"{what}, J <= {least.max(initial=0):.3g}: {', '.join(shown) or 'elsewhere'}", [])
 
-    def _untangle(self, points: MaterialPoints) -> int:
+    def _untangle(self, points: MaterialPoints, boundary: Boundary) -> int:
         """Re-derive from F the domains that have folded: points whose neighbours went elsewhere."""
-        grid = self.grid
-        bad = np.flatnonzero(tangled(points.corners, points.volume0 * points.J))
+        grid, volume = self.grid, points.volume0 * points.J
+        bad = np.flatnonzero(tangled(points.corners, volume))
         if len(bad):
             corners = parallelepipeds(points.x[bad], points.F[bad], self._size[points.id[bad]])
+            corners = boundary.under_held(points.id[bad], points.corners[bad], volume[bad], corners)
             points.corners[bad] = np.clip(corners, grid.lower, grid.upper)
             points.x[bad] = points.corners[bad].mean(axis=1)
         return grid.comm.allreduce(len(bad))

@@ -41,34 +41,42 @@ COUNTS = ("steps", "newton", "coupling", "cuts", "rederived", "balance", "residu
 class Writer:
     """Writes points, histories and grid of a run: an observer of `Simulation.run`.
 
-    The folder receives `points.pvd`, the points' domains as solid cells with id, material, displacement (m),
-    pore pressure, effective stress (Pa), F, J and what else the points carry; `history.csv`, one row an output
-    time with the counts of `Result` so far, least and largest pressure (Pa) and the displacements of the
-    probes (m); if asked for `grid.pvd`, the last step's displacement (m), the pore pressure (Pa) and the
-    filled share of the cells.  Tensors: in 2D a field for each component (F_xy), in 3D row by row.  ParaView and VTK
-    read all of it, meshio the points.  Stress and pressure of points are those of their cell.
+        The folder receives `points.pvd`, the points' domains as solid cells with id, material, displacement (m),
+        pore pressure, effective stress (Pa), F, J and what else the points carry; `history.csv`, one row an output
+    <<<<<<< HEAD
+        time with the counts of `Result` so far, least and largest pressure (Pa) and the displacements of the
+        probes (m); if asked for `grid.pvd`, the last step's displacement (m), the pore pressure (Pa) and the
+        filled share of the cells.  Tensors: in 2D a field for each component (F_xy), in 3D row by row.  ParaView and VTK
+        read all of it, meshio the points.  Stress and pressure of points are those of their cell.
+    =======
+        time with the counts of `Result` so far, least and largest pressure (Pa), the displacements of the probes (m)
+        and the forces of the given displacements (N, in plane strain N/m; nan where no step has been taken since they
+        were set by a stage or the run was resumed); if asked for `grid.pvd`, the last step's displacement (m), the pore
+        pressure (Pa) and the filled share of the cells.  Tensors: in 2D a field for each component (F_xy), in
+        3D row by row.
+    >>>>>>> main
 
-    What the folder holds up to the present time stays, and is continued: made after `resume`, a writer leaves
-    the files of a run that was never interrupted.
+        What the folder holds up to the present time stays, and is continued: made after `resume`, a writer leaves
+        the files of a run that was never interrupted.
 
-    Parameters
-    ----------
-    simulation
-        The scene, in the state from which it is going to run.
-    folder
-        Folder of the files.
-    every
-        Output intervals between two files of points and grid, >= 1; start and end are always written.
-    grid
-        Write the fields of the grid too.
+        Parameters
+        ----------
+        simulation
+            The scene, in the state from which it is going to run.
+        folder
+            Folder of the files.
+        every
+            Output intervals between two files of points and grid, >= 1; start and end are always written.
+        grid
+            Write the fields of the grid too.
 
-    Raises
-    ------
-    ValueError
-        An argument of another kind, files in the folder that no writer has written or of other columns, a run of
-        another simulation or one that does not go on from where the writer was made.
-    OSError
-        A folder that cannot be written, a disk that is full: `simulation.run(..., after=simulation.result)` goes on.
+        Raises
+        ------
+        ValueError
+            An argument of another kind, files in the folder that no writer has written or of other columns, a run of
+            another simulation or one that does not go on from where the writer was made.
+        OSError
+            A folder that cannot be written, a disk that is full: `simulation.run(..., after=simulation.result)` goes on.
     """
 
     def __init__(self, simulation: Simulation, folder: str | os.PathLike, *, every: int = 1, grid: bool = False):
@@ -77,6 +85,7 @@ class Writer:
         flag("writer: grid", grid)
         folder, comm, self._t = path("writer: folder", folder), simulation.grid.comm, simulation.t
         self.every, self._started, self._simulation = whole("writer: every", every), False, simulation
+        self._reactions = simulation.reactions  # at the start
         with on_disk("writer: folder", "one that can be written"):
             self._table = Table(comm, folder / "history.csv", self._t)
             self._points = Series(comm, folder / "points.pvd", self._t)
@@ -95,7 +104,7 @@ class Writer:
         result = simulation.result
         if not self._started:
             self._start(result)
-        self._table.add(_row(result))
+        self._table.add(_row(result, simulation.reactions))
         if (len(result.t) - 1) % self.every and not result.converged:
             return
         self._write_points(simulation)
@@ -109,7 +118,7 @@ class Writer:
         if result.t[-2] != self._t:
             raise ValueError(f"writer: made at t = {self._t:g} s for a run that goes on from t = {result.t[-2]:g} s")
         first = Result(t=result.t[:1], displacement=result.displacement[:1], pressure=result.pressure[:1])
-        self._table.start(_row(first))
+        self._table.start(_row(first, self._reactions))
         self._points.write_index()
         if self._grid is not None:
             self._grid.write_index()
@@ -142,13 +151,15 @@ class Writer:
         self._grid.entries.append((simulation.t, pieces))
 
 
-def _row(result: Result) -> dict[str, float]:
-    """Return what the histories hold of the last output time."""
+def _row(result: Result, reactions: NDArray[np.float64]) -> dict[str, float]:
+    """Return what the histories hold of the last output time, and the forces of the given displacements then."""
     out = {"t": result.t[-1], **{name: getattr(result, name) for name in COUNTS}}
     if result.pressure:
         out["p_min"], out["p_max"] = result.pressure[-1]
     for i, u in enumerate(result.displacement[-1] if result.displacement else ()):
         out |= {f"u{axis}_{i}": value for axis, value in zip("xyz", u.tolist(), strict=False)}
+    for i, force in enumerate(reactions):
+        out |= {f"reaction_{axis}_{i}": value for axis, value in zip("xyz", force.tolist(), strict=False)}
     return out
 
 

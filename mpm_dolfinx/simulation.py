@@ -283,8 +283,13 @@ class Simulation:
             [*now["drained"], *now["inflows"]],
         )
         self._conditions, self._begins = now, True
-        self.reactions = np.zeros((len(now["displacements"]), self.grid.dim))
-        """(displacements, d): force by which each given displacement acts on the bodies, N (N/m in plane strain)."""
+        if "displacements" in conditions:
+            unknown = np.nan if self.active_cells else 0.0
+            self.reactions = np.full((len(side.holds), self.grid.dim), unknown)
+            """(displacements, d): force by which each given displacement acts on the bodies, N (N/m in plane strain).
+
+            Of the last step; nan where none has been taken since a stage set them or the state was restored.
+            """
         self.momentum.require(bool(side.loads), bool(side.plates), bool(side.holds))
         self.momentum.fix(fixed)
         self._leave_grid()
@@ -442,7 +447,7 @@ class Simulation:
     def _move_points(self) -> int:
         """Move the points; return how many domains had folded."""
         with Timer("mpm: move points"):
-            return self._motion.move(self.points, self.placement)
+            return self._motion.move(self.points, self.placement, self.boundary)
 
     def _migrate(self) -> None:
         """Send the points whose cell another process owns."""
@@ -465,6 +470,7 @@ class Simulation:
         """Put the scene into a state at time t, s: points and pieces, on whatever processes they are."""
         self.points, self._carried, self.t = points, carried, t
         self._prepared, self.placement = False, None
+        self.reactions = np.full_like(self.reactions, np.nan)  # not in the file: until the next step
         self._begins = False  # parts that have torn off since are what they are
         if self.active_cells:  # of a step that was taken before
             self.coupler.forget()

@@ -15,6 +15,8 @@ import meshio
 import numpy as np
 import pytest
 from helpers import beam
+from mpi_output import sheared
+from test_mpi import mpirun
 from test_restart import block, cut_beam
 
 import mpm_dolfinx as mpm
@@ -135,6 +137,51 @@ def test_the_table_holds_the_histories(written):
     for name in ("steps", "newton", "coupling", "cuts", "balance", "residual"):
         assert found[name][0] == 0 and found[name][-1] == getattr(result, name)
     assert (np.diff(found["wall"]) > 0).all()
+
+
+def reactions(file):
+    """Return the forces (rows, displacements, 2) that a table holds of two given displacements."""
+    found = table(file)
+    return np.stack([[found[f"reaction_{axis}_{i}"] for axis in "xy"] for i in (0, 1)]).transpose(2, 0, 1)
+
+
+def test_the_table_holds_the_forces_of_given_displacements(tmp_path):
+    """Of a run in one go, of one that was resumed and of one on two processes."""
+    (simulation, writer), forces = sheared(tmp_path / "whole"), [np.zeros((2, 2))]
+    simulation.run(1.0, 0.25, observe=[writer, lambda s: forces.append(s.reactions)])
+    whole = reactions(tmp_path / "whole" / "history.csv")
+    assert np.array_equal(whole, forces)
+    assert whole.sum(axis=1) == pytest.approx(0, abs=1e-6 * np.abs(whole).max())  # foot and top balance
+    assert np.abs(whole[1:]).min() > 1e4  # N/m
+
+    simulation, writer = sheared(tmp_path / "parts")
+    checkpoint = mpm.Checkpoint(tmp_path / "run.ckpt", every=2)
+    simulation.run(0.5, 0.25, observe=writer, checkpoint=checkpoint)
+    simulation, _ = sheared(tmp_path / "other")
+    after = mpm.resume(simulation, checkpoint.file)
+    writers = [mpm.Writer(simulation, tmp_path / name) for name in ("parts", "new")]
+    simulation.run(1.0, 0.25, observe=writers, after=after)
+    assert np.array_equal(reactions(tmp_path / "parts" / "history.csv"), whole)
+    new = reactions(tmp_path / "new" / "history.csv")
+    assert np.isnan(new[0]).all(), "what the forces were then is not in the checkpoint"
+    assert np.array_equal(new[1:], whole[3:])
+
+    mpirun(2, "mpi_output.py", str(tmp_path / "two"))
+    assert reactions(tmp_path / "two" / "history.csv") == pytest.approx(whole, abs=1e-8 * np.abs(whole).max())
+
+
+def test_forces_of_displacements_that_a_stage_sets_are_not_known_before_its_first_step(tmp_path):
+    simulation, writer = sheared(tmp_path / "first")
+    simulation.run(0.25, 0.25, observe=writer)
+    simulation.stage()
+    before = simulation.reactions
+    simulation.run(0.5, 0.25, observe=mpm.Writer(simulation, tmp_path / "kept"))
+    assert np.array_equal(reactions(tmp_path / "kept" / "history.csv")[0], before)
+    sides = [mpm.Displacement(side, (0, 0)) for side in ("left", "right")]
+    simulation.stage(displacements=sides, reset_displacement=True)
+    simulation.run(0.75, 0.25, observe=mpm.Writer(simulation, tmp_path / "set"))
+    found = reactions(tmp_path / "set" / "history.csv")
+    assert np.isnan(found[0]).all() and np.isfinite(found[1]).all()
 
 
 def test_an_interrupted_run_leaves_whole_files_which_another_continues(tmp_path):

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scaling
 from helpers import beam
 
 import mpm_dolfinx as mpm
@@ -24,6 +25,23 @@ def test_memory_does_not_grow_with_the_number_of_steps():
     before = memory()
     simulation.run(0.8, 0.02, progress=False)
     assert memory() - before < 3, "MB in 30 steps of 360 kB of matrices each"
+
+
+@pytest.mark.parametrize(("dim", "sizes", "most"), [(2, (2e3, 1e4), 7), (3, (3e3, 1e4), 10)])
+def test_memory_for_each_point_is_bounded(dim, sizes, most):
+    small, large = (scaling.in_own_process(dim, points, processes=1) for points in sizes)
+    per_point = (large["memory_MB"] - small["memory_MB"]) / (large["points"] - small["points"])
+    assert 0 < 1024 * per_point < most, "kB"
+
+
+def test_a_run_tells_its_memory_and_its_parts():
+    simulation, _ = beam(h=0.06)
+    result = simulation.run(0.04, 0.02, progress=False)
+    assert 50 < result.memory < 1e5 and result.points == len(simulation.points) and result.imbalance == {}
+    *parts, last = result.shares().splitlines()
+    assert len(parts) == len(result.profile) + 1 and last.endswith(f"kB for each of {result.points} points")
+    shown = float(last.split("MB, ")[1].split()[0])
+    assert shown == pytest.approx(1024 * result.memory / result.points, rel=0.01)
 
 
 def test_iterative_solvers_are_freed_with_the_matrices_they_were_made_for(monkeypatch):

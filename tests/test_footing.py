@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: MIT
+"""A footing pushed into soil: it carries what limit analysis says, and the domains that it folds stay with it."""
+
+import footing
+import numpy as np
+import pytest
+from helpers import SOFT
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.domains import corner_bits, tangled, volumes
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_held_domain_that_folds_keeps_its_face_and_its_volume(dim):
+    """A face put elsewhere is pulled back, all at once: no step is small enough for that."""
+    grid = mpm.Grid([1.0] * dim, [4] * dim)
+    body = mpm.box(grid, [0] * dim, [1] * (dim - 1) + [0.5])
+    held = mpm.Displacement("top", np.zeros(dim))
+    s = mpm.Simulation(grid, [body], [SOFT], fixed={"bottom": "xyz"[:dim]}, displacements=[held])
+    points, up = s.points, corner_bits(dim)[:, dim - 1] == 1
+    at_top = np.flatnonzero((points.corners[:, up, -1] == 0.5).all(axis=1))
+    inside = np.flatnonzero(points.corners[:, :, -1].max(axis=1) < 0.4)
+    folded = np.array([at_top[3], inside[5]])
+    points.F[folded] = np.diag([1.0] * (dim - 1) + [1.1])
+    corners = points.corners.copy()
+    points.corners[np.ix_(folded, ~up)] += 0.13 * np.eye(dim)[-1]  # above the upper ones
+    assert tangled(points.corners[folded], points.volume0[folded]).all()
+
+    assert s._motion._untangle(s.points, s.boundary) == 2
+    assert points.corners[folded[0], up] == pytest.approx(corners[folded[0], up], abs=1e-15)
+    assert volumes(points.corners[folded]) == pytest.approx(1.1 * points.volume0[folded], rel=1e-12)
+    rest = np.setdiff1d(np.arange(len(points)), folded)
+    assert np.array_equal(points.corners[rest], corners[rest])
+
+
+def test_the_undrained_limit_load_of_stiff_soil_tends_to_prandtls():
+    coarse, fine = (footing.limit_load("undrained", cells).load for cells in (5, 9))
+    assert coarse[-1] / coarse[30] < 1.001  # it flows
+    assert -0.065 < coarse[-1] - 1 < 2 * (fine[-1] - 1) < 0
+
+
+@pytest.mark.slow
+def test_the_drained_limit_load_of_stiff_soil_tends_to_prandtls():
+    coarse, fine = (footing.limit_load("drained", cells).load for cells in (9, 17))
+    assert 0 < fine[-1] - 1 < coarse[-1] - 1 < 0.05
+    assert fine[-1] / fine[30] < coarse[-1] / coarse[30] < 1.015  # what goes on rising is the error of the grid
+
+
+@pytest.mark.slow
+def test_a_footing_is_pushed_in_as_deep_as_it_is_wide():
+    """With the held faces of folded domains put elsewhere no step was small enough at 0.86 of the way."""
+    run = footing.push(footing.SOIL, 5, 1.0, footing.RATES["slow"])
+    assert run.total("rederived") and not run.total("cuts")
+    assert footing.SURFACE["drained, associated"] < run.load[-1] < 1.25 * footing.SURFACE["drained, associated"]
+    assert max(result.balance for result in run.results) < 1e-8
+
+
+@pytest.mark.slow
+def test_a_fast_push_carries_what_limit_analysis_says_of_an_embedded_base():
+    run = footing.push(footing.SOIL, 9, 0.3, footing.RATES["fast"])
+    depth = np.array(run.settlement)
+    deep = depth > 0.05
+    assert np.array(run.load)[deep] == pytest.approx(footing.embedded(depth[deep]), rel=0.04)
