@@ -41,42 +41,36 @@ COUNTS = ("steps", "newton", "coupling", "cuts", "rederived", "balance", "residu
 class Writer:
     """Writes points, histories and grid of a run: an observer of `Simulation.run`.
 
-        The folder receives `points.pvd`, the points' domains as solid cells with id, material, displacement (m),
-        pore pressure, effective stress (Pa), F, J and what else the points carry; `history.csv`, one row an output
-    <<<<<<< HEAD
-        time with the counts of `Result` so far, least and largest pressure (Pa) and the displacements of the
-        probes (m); if asked for `grid.pvd`, the last step's displacement (m), the pore pressure (Pa) and the
-        filled share of the cells.  Tensors: in 2D a field for each component (F_xy), in 3D row by row.  ParaView and VTK
-        read all of it, meshio the points.  Stress and pressure of points are those of their cell.
-    =======
-        time with the counts of `Result` so far, least and largest pressure (Pa), the displacements of the probes (m)
-        and the forces of the given displacements (N, in plane strain N/m; nan where no step has been taken since they
-        were set by a stage or the run was resumed); if asked for `grid.pvd`, the last step's displacement (m), the pore
-        pressure (Pa) and the filled share of the cells.  Tensors: in 2D a field for each component (F_xy), in
-        3D row by row.
-    >>>>>>> main
+    The folder receives `points.pvd`, the points' domains as solid cells with id, material, displacement (m),
+    pore pressure, effective stress (Pa), F, J and what else the points carry; `history.csv`, one row an output
+    time with the counts of `Result` so far, least and largest pressure (Pa), the displacements of the probes (m)
+    and the forces of the given displacements (N, in plane strain N/m; nan where no step has been taken since they
+    were set by a stage or the run was resumed); if asked for `grid.pvd`, the last step's displacement (m), the pore
+    pressure (Pa) and the filled share of the cells.  Tensors: in 2D a field for each component (F_xy), in
+    3D row by row.  ParaView and VTK read all of it, meshio the points.  Stress and pressure of points are those of
+    their cell.
 
-        What the folder holds up to the present time stays, and is continued: made after `resume`, a writer leaves
-        the files of a run that was never interrupted.
+    What the folder holds up to the present time stays, and is continued: made after `resume`, a writer leaves
+    the files of a run that was never interrupted.
 
-        Parameters
-        ----------
-        simulation
-            The scene, in the state from which it is going to run.
-        folder
-            Folder of the files.
-        every
-            Output intervals between two files of points and grid, >= 1; start and end are always written.
-        grid
-            Write the fields of the grid too.
+    Parameters
+    ----------
+    simulation
+        The scene, in the state from which it is going to run.
+    folder
+        Folder of the files.
+    every
+        Output intervals between two files of points and grid, >= 1; start and end are always written.
+    grid
+        Write the fields of the grid too.
 
-        Raises
-        ------
-        ValueError
-            An argument of another kind, files in the folder that no writer has written or of other columns, a run of
-            another simulation or one that does not go on from where the writer was made.
-        OSError
-            A folder that cannot be written, a disk that is full: `simulation.run(..., after=simulation.result)` goes on.
+    Raises
+    ------
+    ValueError
+        An argument of another kind, files in the folder that no writer has written or of other columns, a run of
+        another simulation or one that does not go on from where the writer was made.
+    OSError
+        A folder that cannot be written, a disk that is full: `simulation.run(..., after=simulation.result)` goes on.
     """
 
     def __init__(self, simulation: Simulation, folder: str | os.PathLike, *, every: int = 1, grid: bool = False):
