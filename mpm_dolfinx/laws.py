@@ -88,8 +88,9 @@ class SceneMaterials:
     def _add_shapes(self, m: Skeleton, points: MaterialPoints) -> None:
         """Note the shapes of what a material's law takes, and seed its state."""
         law = type(m)
-        if law.energy is None and law.kirchhoff is None:
-            raise ValueError(f"{law.__name__}: must define energy or kirchhoff")
+        if (law.energy is None) == (law.kirchhoff is None):
+            which = "neither" if law.energy is None else "both"
+            raise ValueError(f"{law.__name__}: has {which}, must define energy or kirchhoff")
         for name in law.parameters:
             if not hasattr(m, name):
                 known = ", ".join([*_names(m), *law.state])

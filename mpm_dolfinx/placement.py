@@ -113,6 +113,7 @@ class Placement:
         if len(out):
             i = out[0] // x.shape[1]
             message = f"point {points.id[i]} at {points.x[i]} left the grid {grid.lower} to {grid.upper} at t = {t:g} s"
+            message += ", must stay in it: take a larger grid"
         if message := first(grid.comm, message):
             raise LeftGrid(message)
 

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: MIT
 """What users' functions raise or give, wrong indices, files and contradictions get one line, and nothing is lost."""
 
-import logging
 import re
 import resource
 import signal
@@ -126,6 +125,11 @@ CASES = {
         lambda: scene(materials=[law(kirchhoff=lambda F, bulk: bulk * ufl.tr(F))]),
         "gives shape",
         "()",
+    ),
+    "law with an energy and a stress": (
+        lambda: scene(materials=[law(energy=ENERGY, kirchhoff=lambda F, bulk: bulk * F)]),
+        "Law: has both",
+        "energy or kirchhoff",
     ),
     "constant of nan": (lambda: scene(materials=[Scaled(1e6, 1e6, scale=NAN)]), "Scaled: scale", "nan"),
     "constant in words": (lambda: scene(materials=[Scaled(1e6, 1e6, scale="two")]), "Scaled: scale", "two"),
@@ -351,23 +355,6 @@ def test_a_path_that_cannot_be_names_the_object_and_the_path(make, tmp_path):
     with pytest.raises(OSError, match=r"(writer|resume): .* must be .*/") as caught:
         make(tmp_path)
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    "cells, per_cell, said", [(1, 1, "1 point over .* creeps"), (2, 1, "33% too much"), (1, 2, ""), (4, 1, "")]
-)
-def test_a_body_too_thin_to_bend_is_named(cells, per_cell, said, caplog):
-    with caplog.at_level(logging.WARNING, "mpm_dolfinx"):
-        scene([mpm.box(GRID, [0, 0.2], [1.0, 0.2 + 0.1 * cells], per_cell=per_cell)])
-    assert bool(caplog.records) == bool(said) and re.search(said, caplog.text)
-
-
-@pytest.mark.parametrize("fixed", [{"left": "x", "right": "x", "bottom": "y"}])
-def test_a_column_between_walls_or_a_layer_among_others_is_not_too_thin(fixed, caplog):
-    narrow = mpm.Grid([0.1, 1.0], [1, 10])
-    scene([mpm.box(narrow, [0, 0], [0.1, 1], per_cell=1)], grid=narrow, fixed=fixed)
-    scene([mpm.box(GRID, [0, y], [1, y + 0.1], per_cell=1) for y in (0, 0.1, 0.2)], fixed=fixed)
-    assert not caplog.records
 
 
 def test_a_result_is_shown_in_a_line():

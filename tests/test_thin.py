@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: MIT
+"""A slender body needs several points over its thickness; with too few, a warning names it and says what is lost."""
+
+import logging
+import re
+
+import pytest
+from test_bad_input import GRID, scene
+
+import mpm_dolfinx as mpm
+
+YOUNG, LENGTH, HEIGHT = 12e6, 1.0, 0.1  # Pa, m, m
+RUBBER = mpm.NeoHookean(bulk=YOUNG / 3, shear=YOUNG / 2)  # nu = 0: plane strain is plane stress
+
+
+def bent(cells, per_cell):
+    """Return the tip's deflection of a cantilever, so many cells thick, over that of a rod which shears."""
+    h = HEIGHT / cells
+    grid = mpm.Grid([11 * cells * h, 6 * cells * h], [11 * cells, 6 * cells])
+    bottom = 4 * HEIGHT
+    body = mpm.box(grid, [0, bottom], [LENGTH, bottom + HEIGHT], per_cell=per_cell)
+    inertia = HEIGHT**3 / 12
+    load = 0.05 * YOUNG * inertia / LENGTH**2
+    end = mpm.Traction("right", (0, -load / HEIGHT))
+    s = mpm.Simulation(grid, [body], [RUBBER], fixed={"left": "xy"}, tractions=[end])
+    result = s.run(1.0, 1.0, probes=mpm.probes([body], [[LENGTH, bottom + HEIGHT / 2]]), progress=False)
+    rod = load * LENGTH**3 / (3 * YOUNG * inertia) + load * LENGTH / (5 / 6 * RUBBER.shear * HEIGHT)
+    return -result.displacement[-1][0, 1] / rod
+
+
+@pytest.mark.parametrize("n", [2, 3, 4])
+def test_n_points_over_the_thickness_lack_one_part_in_n_squared_of_the_bending_stiffness(n):
+    assert bent(n, per_cell=1) == pytest.approx(1 / (1 - 1 / n**2), abs=0.01)
+    assert bent(n, per_cell=2) == pytest.approx(1, abs=0.04)
+
+
+@pytest.mark.parametrize(
+    "cells, per_cell, said", [(1, 1, "1 point over .* creeps"), (2, 1, "33% too much"), (1, 2, ""), (4, 1, "")]
+)
+def test_a_body_too_thin_to_bend_is_named(cells, per_cell, said, caplog):
+    with caplog.at_level(logging.WARNING, "mpm_dolfinx"):
+        scene([mpm.box(GRID, [0, 0.2], [1.0, 0.2 + 0.1 * cells], per_cell=per_cell)])
+    assert bool(caplog.records) == bool(said) and re.search(said, caplog.text)
+
+
+@pytest.mark.parametrize("fixed", [{"left": "x", "right": "x", "bottom": "y"}])
+def test_a_column_between_walls_or_a_layer_among_others_is_not_too_thin(fixed, caplog):
+    narrow = mpm.Grid([0.1, 1.0], [1, 10])
+    scene([mpm.box(narrow, [0, 0], [0.1, 1], per_cell=1)], grid=narrow, fixed=fixed)
+    scene([mpm.box(GRID, [0, y], [1, y + 0.1], per_cell=1) for y in (0, 0.1, 0.2)], fixed=fixed)
+    assert not caplog.records
