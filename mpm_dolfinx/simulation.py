@@ -55,7 +55,8 @@ class Simulation:
     materials
         Material of each index that the bodies name.
     fixed
-        Walls of the grid with the components that are zero there, such as {"left": "xy", "bottom": "y"}.
+        Walls of the grid ("left", "right", "bottom", "top", in 3D also "front", "back") with the components that
+        are zero there, such as {"left": "xy", "bottom": "y"}.
     fluid
         Pore fluid; without it there is no storage problem.
     tractions, displacements, drained, inflows, plates
@@ -63,7 +64,8 @@ class Simulation:
     gravity : (d,) or callable t -> (d,), m/s^2
         Acceleration of gravity.
     pressure
-        Pore pressure at the start, Pa.
+        Pore pressure at the start, Pa, the same everywhere; needs a fluid.  A hydrostatic one comes from a first
+        stage with gravity that is long enough to drain.
     quadrature
         "domain": exact pieces of the points' domains; "point": at the points, as in the seed paper.
     coupling, tolerance
@@ -71,7 +73,23 @@ class Simulation:
     terms, sources
         Functions that give terms of the user's own to the two balances in UFL: see `extend`.
     later
-        Indices of bodies that a later stage adds.
+        Indices of bodies that a later stage adds, each once.
+
+    Attributes
+    ----------
+    points
+        The material points of this process.
+    t
+        Time, s.
+    result
+        Histories of the last run, also while it runs.
+    reactions
+        Forces of the given displacements.
+
+    Raises
+    ------
+    ValueError
+        Naming the object, its value and what is allowed.
     """
 
     def __init__(
@@ -229,7 +247,13 @@ class Simulation:
         remove
             Indices of bodies: an excavation.
         reset_displacement
-            From now on displacements count from the present positions.
+            From now on displacements count from the present positions.  Conditions that are not named stay as they
+            are: a `Displacement` then counts from there too, and moves its side once more.
+
+        Raises
+        ------
+        ValueError
+            The scene is then what it was.
         """
         if gravity is not None and self.gravity is None:
             raise ValueError("gravity: the scene was made without, must be made with (0, 0) first")
@@ -493,6 +517,36 @@ class Simulation:
         after: Result | None = None,
         progress: bool = True,
     ) -> Result:
-        """Advance to t_end in steps of dt: see `timeloop.run`."""
+        """Advance to t_end in steps of dt; a step that does not converge is cut in two, and grows again.
+
+        Parameters
+        ----------
+        t_end
+            End time, s, not a duration: > t.
+        dt
+            Step and output interval, s, > 0; one step to t_end where it is longer than that.
+        probes
+            Particles whose displacement is recorded.
+        observe
+            Called with the simulation after each output interval, such as a `Writer`; its `result` then holds the
+            histories so far.
+        checkpoint
+            Called after all observers: a `Checkpoint`.
+        after
+            Histories to go on with, of a run with the same dt: what `resume` returns.
+        progress
+            Show a progress bar on a terminal.
+
+        Returns
+        -------
+        The histories.
+
+        Raises
+        ------
+        ValueError
+            An argument, or what a function of time gives, is none that is allowed.
+        GaveUp
+            With the histories so far; `points` and `t` are those of the last good step.
+        """
         options = {"probes": probes, "observe": observe, "checkpoint": checkpoint, "after": after}
         return run(self, t_end, dt, progress=progress, **options)

@@ -129,32 +129,7 @@ def run(
     after: Result | None = None,
     progress: bool = True,
 ) -> Result:
-    """Advance to t_end in steps of dt; a step that does not converge is cut in two, and grows again.
-
-    Parameters
-    ----------
-    t_end
-        End time, s.
-    dt
-        Step and output interval, s, > 0; one step to t_end where it is longer than that.
-    probes
-        Particles whose displacement is recorded.
-    observe
-        Called after each output interval, such as a `Writer`; `simulation.result` then holds the histories so far.
-    checkpoint
-        Called after all observers: a `Checkpoint`.
-    after
-        Histories to go on with, of a run with the same dt: what `resume` returns.
-    progress
-        Show a progress bar on a terminal.
-
-    Raises
-    ------
-    ValueError
-        An argument, or what a function of time gives, is none that is allowed.
-    GaveUp
-        With the histories so far; `points` and `t` are those of the last good step.
-    """
+    """Advance a simulation: see `Simulation.run`."""
     if probes is not None and not isinstance(probes, Probes):
         raise ValueError(f"probes = {line(probes)}, must be what `probes` gives")
     observers = [observe] if callable(observe) else observe

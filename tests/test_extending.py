@@ -353,7 +353,7 @@ class WrongUpdate(Damaged):
 
 
 CASES = {
-    "no law": (lambda: column(fluid=False, material=NoLaw(1, 1)), "NoLaw: has neither, must define energy or kirchhoff"),
+    "no law": (lambda: column(fluid=False, material=NoLaw(1, 1)), "NoLaw: has neither, must define energy or"),
     "unknown parameter": (lambda: column(fluid=False, material=Unknown(1, 1)), "law takes 'stiffness', must be F or"),
     "reserved name": (lambda: column(fluid=False, material=Taken(1, 1)), "the name 'weight' is taken"),
     "field of the wrong shape": (
