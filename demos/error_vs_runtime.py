@@ -18,6 +18,7 @@ import argparse
 import csv
 import json
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -251,15 +252,21 @@ def table(comparison: list[dict]) -> str:
 
 
 def draw(out: Path, case: str, rows: list[Row]) -> None:
-    """Draw error against time, a line a method."""
+    """Draw error against time: solid lines from coarse to fine cells, dashed ones from few to many steps."""
     fig, ((ax,),) = beam.figure(1, 1, (7.5, 5))
+    usual = Counter(r.steps for r in rows).most_common(1)[0][0]
     for i, method in enumerate(dict.fromkeys(r.method for r in rows)):
-        mine = sorted((r.wall_s, r.error) for r in rows if r.method == method and np.isfinite(r.error))
-        if mine:
-            style = {"color": "black" if method == TRUTH else f"C{i}", "lw": 2 if method == DEFAULT else 1}
-            ax.loglog(
-                *zip(*mine, strict=True), "os^Dvx*"[i % 7] + ("-" if len(mine) > 1 else ""), label=method, **style
-            )
+        mine = [r for r in rows if r.method == method and np.isfinite(r.error)]
+        cells = [r for r in mine if r.steps == usual]
+        steps = sorted([*cells[-1:], *(r for r in mine if r.steps != usual)], key=lambda r: r.steps)
+        style = {"color": "black" if method == TRUTH else f"C{i}", "lw": 2 if method == DEFAULT else 1}
+        style["marker"] = "os^Dvx*"[i % 7]
+        for sweep, line in ((cells, "-"), (steps, "--")):
+            label = method if line == "-" else None
+            if len(sweep) > 1 or label:
+                ax.loglog([r.wall_s for r in sweep], [r.error for r in sweep], ls=line, label=label, **style)
+    if len({r.steps for r in rows}) > 1:
+        ax.plot([], [], "k--", lw=1, label="the finest cells, other steps")
     ax.set(xlabel="time of the time loop (s)", ylabel="relative error (-)", title=f"{case}: error against run time")
     ax.grid(alpha=0.3, which="both")
     ax.legend(fontsize=8)
