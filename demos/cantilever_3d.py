@@ -40,7 +40,7 @@ def rod(alpha: float) -> tuple[float, float]:
     return LENGTH - x, y
 
 
-def scene(cells: int, alpha: float) -> tuple[mpm.Simulation, mpm.points.Probes]:
+def scene(cells: int, alpha: float) -> tuple[mpm.Simulation, mpm.surface.Probes]:
     """Return the beam, that many cells high, and the middle of its end; time 1 is the load alpha."""
     h = SIDE / cells
     reach = np.abs(ALONG) * rod(alpha)[1] * 1.05

@@ -17,9 +17,10 @@ from mpm_dolfinx.grid import Grid
 from mpm_dolfinx.materials import LAWS, Field, Fluid, Hencky, LinearElastic, NeoHookean, Skeleton, kozeny_carman
 from mpm_dolfinx.output import Writer
 from mpm_dolfinx.plasticity import DruckerPrager
-from mpm_dolfinx.points import box, mapped, probes, shape
+from mpm_dolfinx.points import box, mapped, shape
 from mpm_dolfinx.restart import Checkpoint, resume
 from mpm_dolfinx.simulation import Simulation
+from mpm_dolfinx.surface import probes
 from mpm_dolfinx.timeloop import GaveUp, Result
 
 __version__ = "0.1.0"

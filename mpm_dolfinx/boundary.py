@@ -19,8 +19,9 @@ from mpm_dolfinx.exchange import Exchange, first
 from mpm_dolfinx.grid import Grid, sum_by
 from mpm_dolfinx.momentum import Momentum
 from mpm_dolfinx.placement import Placement
-from mpm_dolfinx.points import Body, Surface, face_vectors, surface
+from mpm_dolfinx.points import Body
 from mpm_dolfinx.storage import Storage
+from mpm_dolfinx.surface import Surface, face_vectors, surface
 
 
 class Boundary:

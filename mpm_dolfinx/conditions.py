@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.check import asked, line, numbers
 from mpm_dolfinx.grid import side
-from mpm_dolfinx.points import Region
+from mpm_dolfinx.surface import Region
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,8 @@ from mpm_dolfinx.domains import Pieces, cut, cut_faces
 from mpm_dolfinx.exchange import Exchange, first, over_all
 from mpm_dolfinx.forms import CHUNK
 from mpm_dolfinx.grid import Grid, sum_by
-from mpm_dolfinx.points import MaterialPoints, Surface, face_vectors, interpolate
+from mpm_dolfinx.points import MaterialPoints
+from mpm_dolfinx.surface import Surface, face_vectors, interpolate
 
 STAYS = 3e-4
 """Cells by which corners may have moved since the domains were cut before they are cut anew.

@@ -34,7 +34,7 @@ from mpm_dolfinx.coupling import NotConverged
 from mpm_dolfinx.extend import call
 from mpm_dolfinx.grid import Grid, side
 from mpm_dolfinx.materials import Field, Fluid, Skeleton
-from mpm_dolfinx.points import Region, limits, positions
+from mpm_dolfinx.surface import Region, limits, positions
 from mpm_dolfinx.timeloop import GaveUp, Result
 
 ELEMENTS = {"taylor-hood": (2, ("Lagrange", 1, ())), "q1-dg0": (1, ("DG", 0, ()))}  # degree of u; space of p

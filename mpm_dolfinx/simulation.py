@@ -27,9 +27,10 @@ from mpm_dolfinx.materials import Fluid, Skeleton
 from mpm_dolfinx.momentum import FULL, Momentum
 from mpm_dolfinx.motion import Motion
 from mpm_dolfinx.placement import Placement
-from mpm_dolfinx.points import Body, MaterialPoints, Probes, check_apart, check_inside, material_points
+from mpm_dolfinx.points import Body, MaterialPoints, check_apart, check_inside, material_points
 from mpm_dolfinx.remap import Carried, at_start, remap
 from mpm_dolfinx.storage import Storage
+from mpm_dolfinx.surface import Probes
 from mpm_dolfinx.thin import warn_thin
 from mpm_dolfinx.timeloop import Observer, Result, run
 from mpm_dolfinx.unknowns import collect_garbage

@@ -9,7 +9,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from mpm_dolfinx.grid import SIDES, Grid
-from mpm_dolfinx.points import Body, surface
+from mpm_dolfinx.points import Body
+from mpm_dolfinx.surface import surface
 
 COARSE = 0.7  # of a cell: domains above this lack more stiffness than P1 cells have too much
 FEW = 3  # points over the thickness, up to which an eighth or more of the bending stiffness is lost

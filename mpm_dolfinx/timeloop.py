@@ -23,8 +23,8 @@ from mpm_dolfinx import _compat
 from mpm_dolfinx.check import functions, instance, line, numbers
 from mpm_dolfinx.coupling import NotConverged
 from mpm_dolfinx.placement import LeftGrid
-from mpm_dolfinx.points import Probes
 from mpm_dolfinx.summary import imbalance, peak_memory
+from mpm_dolfinx.surface import Probes
 
 if TYPE_CHECKING:
     from mpm_dolfinx.simulation import Simulation

@@ -12,7 +12,8 @@ import pytest
 import mpm_dolfinx as mpm
 from mpm_dolfinx import solvers
 from mpm_dolfinx.domains import volumes
-from mpm_dolfinx.points import face_vectors, material_points, surface
+from mpm_dolfinx.points import material_points
+from mpm_dolfinx.surface import face_vectors, surface
 
 SOIL = mpm.Hencky(bulk=1e7 / 3, shear=5e6, conductivity=1e-6)
 
