@@ -36,10 +36,11 @@ def check_held(
         Saying where the part is, and in how many ways it can move.
     """
     part, count = _parts(grid, active) if each else (active.astype(np.int64), 1)
-    of_node = np.zeros(len(grid.node_x), dtype=np.int64)
-    of_node[grid.cell_nodes[active]] = part[active, None]
-    node, axis = np.nonzero((of_node > 0)[:, None] & ~free)
-    x, direction, number = grid.node_x[node], np.eye(grid.dim)[axis], of_node[node]
+    cells = np.flatnonzero(active)
+    nodes, first = np.unique(grid.cell_nodes[cells], return_index=True)
+    row, axis = np.nonzero(~free[nodes])
+    x, direction = grid.node_x[nodes[row]], np.eye(grid.dim)[axis]
+    number = part[cells[first[row] // 2**grid.dim]]  # of any cell at the node: they hang together
     if holds is not None:
         number = np.concatenate([number, part[holds[0]]])
         x, direction = np.concatenate([x, holds[1]]), np.concatenate([direction, holds[2]])

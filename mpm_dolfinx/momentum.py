@@ -214,8 +214,9 @@ class Momentum:
         facets = facets[partly[self.grid.facet_cells[facets]].any(axis=1)]
         nodes = np.zeros(len(self.free), dtype=bool)
         nodes[self.grid.cell_nodes[cells]] = True
-        nodes = self._shared(nodes)
-        dofs = np.flatnonzero((self.free & nodes[:, None]).ravel())
+        nodes = np.flatnonzero(self._shared(nodes))
+        at_nodes = nodes[:, None] * self.grid.dim + np.arange(self.grid.dim)
+        dofs = at_nodes[self.free[nodes]]
         # a cell may become active between active nodes, so equal dofs do not mean equal cells
         now = (cells, dofs, facets)
         same = self._dofs is not None and all(map(np.array_equal, now, (self._cells, self._dofs, self._facets)))
@@ -223,6 +224,8 @@ class Momentum:
         if changed:
             self._cells, self._dofs, self._facets = now
             self.unknowns = Unknowns(self.u, dofs)
+            owned = self.u.function_space.dofmap.index_map.size_local
+            self._touched = at_nodes[nodes < owned].ravel()  # where forces may act, fixed or not
             self.K = matrix(self.unknowns, self.unknowns, 3**self.grid.dim * self.grid.dim)
             self._summed = False
             self.penalty = self._penalty_matrix()
@@ -296,16 +299,16 @@ class Momentum:
         for residual in self._residuals:
             residual.assemble_vector(b)
         sum_ghosts(self._b)
-        owned = self._owned()
-        squares = [b[owned] @ b[owned], self._external[owned] @ self._external[owned]]
+        forces, external = b[self._touched], self._external[self._touched]
+        squares = [forces @ forces, external @ external]
         if self.terms:
-            own = self._assemble_terms()[owned]
+            own = self._assemble_terms()[self._touched]
             squares.append(own @ own)
-            b[owned] += own
+            forces += own
         squares = over_all(self.grid.comm, np.array(squares))
-        b[owned] -= self._external[owned]
+        b[self._touched] = forces - external
         if self.holds is not None:  # no measure of forces: at the start of a step it is far above them
-            b[owned] -= self._pulls.x.array[owned]
+            b[self._touched] -= self._pulls.x.array[self._touched]
         r = self.unknowns.gather(b, self.residual)
         du = self.unknowns.gather(self.u.x.array, self._du)
         self.penalty.multAdd(du, r, r)
@@ -317,9 +320,6 @@ class Momentum:
         for term in self.terms:
             term.assemble_vector(self._own.x.array)
         return sum_ghosts(self._own)
-
-    def _owned(self) -> slice:
-        return slice(0, self.u.function_space.dofmap.index_map.size_local * self.grid.dim)
 
     def assemble_tangent(self) -> PETSc.Mat:
         """Return the tangent at u."""

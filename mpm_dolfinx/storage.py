@@ -93,6 +93,7 @@ class Storage:
         self.symmetric, self._pieces = symmetric, pieces
         self._reconstruction = Reconstruction(grid)
         self.sources: list[tuple[PointForm, PointForm | None]] = []
+        self._open = np.zeros((grid.num_local, grid.dim, 2))  # shares of faces, while slopes are drawn
         self._slot = np.empty(grid.num_local, dtype=np.int64)  # of active owned cells: place in the vectors
         self.flows, self.damped = flows, False
         self._fluxes(Q, q, dp, weight)
@@ -244,10 +245,10 @@ class Storage:
         weight = np.where(total[self._slot[cells]] > 0, store, points.data["weight"][:, 0])
         total = self._total(cells, weight)
         origin = np.stack([self._total(cells, weight * x) / total for x in offset.T], axis=1)
-        faces = np.zeros((grid.num_local, grid.dim, 2))
         centroid, lower, upper = (f.x.array.reshape(-1, grid.dim) for f in self._shapes())
-        faces[active] = np.stack([lower[active], upper[active]], axis=2)
-        slope, bounds = self._reconstruction(filled, self.p.x.array, centroid, faces, origin)
+        self._open[active] = np.stack([lower[active], upper[active]], axis=2)
+        slope, bounds = self._reconstruction(filled, self.p.x.array, centroid, self._open, origin)
+        self._open[active] = 0.0
         at = self._slot[cells]
         p = self.p.x.array[cells] + np.einsum("md,md->m", slope[at], offset - origin[at])
         return p, slope[at], bounds[at]
