@@ -9,10 +9,10 @@ processor time, on several processes the most of any, in which it waits for the 
 parts as the clock's.  Memory is the peak since the start of the process, libraries and compiler included.
 
 The exponent of a part is the slope of log(time) over log(points), by least squares over the upper half of the
-sizes; `kB a point` is the slope of the memory.  Runs on several processes also say how even the work is (`imbalance`:
-the most pieces that a process has over the mean) and what travels in a step, most of any process: `exchange_...` is
-what the package sends (pieces, corners, points), `solver_...` what PETSc counts in set-up and solution of its Krylov
-solvers; MUMPS's and dolfinx's own messages are not counted.
+sizes; the memory's slope, `kB a point`, is that of all sizes, by least squares of relative errors.  Runs on several
+processes also say how even the work is (`imbalance`: the most pieces that a process has over the mean) and what
+travels in a step, most of any process: `exchange` is what the package sends (pieces, corners, points), `solvers` what
+PETSc counts in set-up and solution of its Krylov solvers; MUMPS's and dolfinx's own messages are not counted.
 
 With runs on one and on several processes, a cost model is fitted to the seconds of a step of n points on P
 processes,
@@ -140,14 +140,15 @@ def in_own_process(dim: int, points: float, processes: int) -> dict:
 
 
 def exponents(rows: list[dict]) -> dict[str, float]:
-    """Return the exponents of the parts over the upper half of the sizes, and the memory's slope, kB a point."""
+    """Return the exponents of the parts over the upper half of the sizes, and the memory: MB at first, kB a point."""
     upper = rows[(len(rows) - 1) // 2 :]
-    n = np.array([row["points"] for row in upper], dtype=float)
-    found = {"kB a point": 1024 * float(np.polyfit(n, [row["memory_MB"] for row in upper], 1)[0])}
+    n, memory = (np.array([row[name] for row in rows], dtype=float) for name in ("points", "memory_MB"))
+    slope, base = np.polyfit(n, memory, 1, w=1 / memory)
+    found = {"MB at first": float(base), "kB a point": 1024 * float(slope)}
     for part in ("step", *PARTS, "rest"):
         seconds = np.array([row[part] for row in upper])
         if (seconds > 0).all():
-            found[part] = float(np.polyfit(np.log(n), np.log(seconds), 1)[0])
+            found[part] = float(np.polyfit(np.log(n[-len(upper) :]), np.log(seconds), 1)[0])
     return found
 
 
@@ -232,7 +233,7 @@ def prediction(model: dict[str, float], dim: int) -> str:
 def draw(out: Path, rows: list[dict]) -> None:
     """Draw the time of the parts and the memory against the number of points."""
     dims, processes = (sorted({row[name] for row in rows}) for name in ("dim", "processes"))
-    fig, axes = beam.figure(len(dims), 2, (12, 4.6 * len(dims)))
+    fig, axes = beam.figure(len(dims), 2, (13, 4.4 * len(dims)))
     for dim, (left, right) in zip(dims, axes, strict=True):
         for p, mark in zip(processes, "os^D*P", strict=False):
             mine = [row for row in rows if (row["dim"], row["processes"]) == (dim, p)]
@@ -241,11 +242,12 @@ def draw(out: Path, rows: list[dict]) -> None:
             right.loglog(n, [row["memory_MB"] for row in mine], f"k{mark}-", label=label)
         draw_parts(left, right, [row for row in rows if (row["dim"], row["processes"]) == (dim, processes[0])])
         left.set(ylabel="time per step (s)", title=f"{dim}D: a step, its parts and their exponents")
-        right.set(ylabel="peak memory, all processes (MB)", title=f"{dim}D: memory")
+        right.set(ylabel="peak memory, all processes (MB)", title=f"{dim}D: memory", ylim=(100, None))
         for ax in (left, right):
             ax.set(xlabel="material points")
             ax.grid(alpha=0.3)
-            ax.legend(fontsize=8)
+        left.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+        right.legend(fontsize=8)
     fig.savefig(out / "scaling.png", dpi=120)
 
 
@@ -255,10 +257,10 @@ def draw_parts(left, right, rows: list[dict]) -> None:
     for k, part in enumerate(sorted((*PARTS, "rest"), key=lambda part: -rows[-1][part])[:8]):
         label = f"{part}, {found.get(part, np.nan):.2f}"
         left.loglog(n, [row[part] for row in rows], "osv^D*Pd"[k] + "-", ms=3, lw=1, label=label)
-    left.loglog(n, rows[-1]["step"] * n / n[-1], "k:", lw=1, label="exponent 1")
-    slope = found["kB a point"] / 1024
-    base = rows[-1]["memory_MB"] - slope * n[-1]
-    right.loglog(n, base + slope * n, "k:", lw=1, label=f"{base:.0f} MB + {1024 * slope:.1f} kB a point")
+    middle = (len(rows) - 1) // 2
+    left.loglog(n, rows[middle]["step"] * n / n[middle], "k:", lw=1, label="exponent 1")
+    base, slope = found["MB at first"], found["kB a point"]
+    right.loglog(n, base + slope / 1024 * n, "k:", lw=1, label=f"{base:.0f} MB + {slope:.1f} kB a point")
 
 
 def write(out: Path, rows: list[dict]) -> dict:
