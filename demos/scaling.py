@@ -19,10 +19,10 @@ processes,
 
     T = e + a n / P + b H + c log2 P,
 
-a fixed cost, work of the points, halo, and messages whose size does not matter; all >= 0, by least squares of
-relative errors.  H is how many points lie along the faces that a process shares with others, where a cube is halved
-again and again.  Runs on more processes than the machine has processors count for messages only.  In 2D the
-solvers are left out: factors do not cost n / P.
+a fixed cost, work of the points (of a run, times its imbalance), halo, and messages whose size does not matter; all
+>= 0, by least squares of relative errors.  H is how many points lie along the faces that a process shares with
+others, where a cube is halved again and again.  Runs on more processes than the machine has processors count for
+messages only.  In 2D the solvers are left out: factors do not cost n / P.
 """
 
 from __future__ import annotations
@@ -160,9 +160,9 @@ def halo(dim: int, n: float, processes: int) -> float:
     return float((np.minimum(halved, 2) * sides.prod() / sides).sum())
 
 
-def terms(dim: int, n: float, processes: int) -> list[float]:
+def terms(dim: int, n: float, processes: int, imbalance: float = 1.0) -> list[float]:
     """Return the terms of the cost model."""
-    return [1.0, n / processes, halo(dim, n, processes), np.log2(processes)]
+    return [1.0, imbalance * n / processes, halo(dim, n, processes), np.log2(processes)]
 
 
 def modelled(row: dict) -> float:
@@ -173,7 +173,7 @@ def modelled(row: dict) -> float:
 def fit(rows: list[dict]) -> dict[str, float]:
     """Return the coefficients of the cost model, s, and its largest relative error on the runs."""
     timed = [row for row in rows if row["processes"] <= (os.cpu_count() or 1)]
-    A = np.array([terms(row["dim"], row["points"], row["processes"]) for row in timed])
+    A = np.array([terms(row["dim"], row["points"], row["processes"], row["imbalance"]) for row in timed])
     T = np.array([modelled(row) for row in timed])
     coefficients, _ = nnls(A / T[:, None], np.ones(len(T)))
     found = dict(zip("eabc", coefficients.tolist(), strict=True))
