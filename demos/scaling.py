@@ -6,7 +6,8 @@ background box that is six times as large), and a cube of 1 m that is sheared an
 run is a process of its own, or several under mpirun (--processes 1 2).  After a first step, which compiles and
 fills the caches, steps are taken one by one; the fastest counts, since other work on the machine only adds.  Time is
 processor time, on several processes the most of any, in which it waits for the others too; it is shared among the
-parts as the clock's.  Memory is the peak since the start of the process, libraries and compiler included.
+parts as the clock's.  Memory is the peak since the start of the process, libraries and compiler included.  Started
+under mpirun itself, all runs share its processes, and memory is the peak so far.
 
 The exponent of a part is the slope of log(time) over log(points), by least squares over the upper half of the
 sizes; the memory's slope, `kB a point`, is that of all sizes, by least squares of relative errors.  Runs on several
