@@ -109,7 +109,7 @@ PAIRS: dict[str, tuple[Make, Make]] = {
     "files of each step": (block, block),
     "16 times the background grid": (lambda n: block(n, box=1 + 2 / n), lambda n: block(n, box=4.0)),
 }
-QUICK = ("body force", "files of each step")
+QUICK = ("files of each step",)
 MAKES = [make for pair in PAIRS.values() for make in pair]
 
 
@@ -170,7 +170,7 @@ def main(argv: list[str] | None = None) -> dict:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cells", type=int, default=40, help="cells over the width of the block")
     parser.add_argument("--repeat", type=int, default=8, help="turns of a pair, after one that is not counted")
-    parser.add_argument("--quick", action="store_true", help="a few pairs of small blocks, one turn")
+    parser.add_argument("--quick", action="store_true", help="one pair of small blocks, one turn")
     parser.add_argument("--out", type=Path, default=Path("out/benchmark_pruning"), help="folder for the table")
     parser.add_argument("--one", type=int, help=argparse.SUPPRESS)  # of MAKES, in a process of its own
     parser.add_argument("--json", action="store_true", help="print the results as one line of JSON at the end")

@@ -5,24 +5,25 @@ Two saturated bodies that creep through the grid: the beam of `poroelastic_beam.
 background box that is six times as large), and a cube of 1 m that is sheared and pressed in 3D (multigrid).  Every
 run is a process of its own, or several under mpirun (--processes 1 2).  After a first step, which compiles and
 fills the caches, steps are taken one by one; the fastest counts, since other work on the machine only adds.  Time is
-that of the clock on several processes; on one it is processor time, which has the shares of the clock's.  Memory is
-the peak since the start of the process, libraries and compiler included.
+processor time, on several processes the most of any, in which it waits for the others too; it is shared among the
+parts as the clock's.  Memory is the peak since the start of the process, libraries and compiler included.  Started
+under mpirun itself, all runs share its processes, and memory is the peak so far.
 
 The exponent of a part is the slope of log(time) over log(points), by least squares over the upper half of the
-sizes; `kB a point` is the slope of the memory.  Runs on several processes also say how even the work is (`imbalance`:
-the most pieces that a process has over the mean) and what travels in a step, most of any process: `exchange_...` is
-what the package sends (pieces, corners, points), `solver_...` what PETSc counts in set-up and solution of its Krylov
-solvers; MUMPS's and dolfinx's own messages are not counted.
+sizes; the memory's slope, `kB a point`, is that of all sizes, by least squares of relative errors.  Runs on several
+processes also say how even the work is (`imbalance`: the most pieces that a process has over the mean) and what
+travels in a step, most of any process: `exchange` is what the package sends (pieces, corners, points), `solvers` what
+PETSc counts in set-up and solution of its Krylov solvers; MUMPS's and dolfinx's own messages are not counted.
 
 With runs on one and on several processes, a cost model is fitted to the seconds of a step of n points on P
 processes,
 
     T = e + a n / P + b H + c log2 P,
 
-a fixed cost, work of the points, halo, and messages whose size does not matter; all >= 0, by least squares of
-relative errors.  H is how many points lie along the faces that a process shares with others, where a cube is halved
-again and again.  Runs on more processes than the machine has processors count for messages only.  In 2D the
-solvers are left out: factors do not cost n / P.
+a fixed cost, work of the points (of a run, times its imbalance), halo, and messages whose size does not matter; all
+>= 0, by least squares of relative errors.  H is how many points lie along the faces that a process shares with
+others, where a cube is halved again and again.  Runs on more processes than the machine has processors count for
+messages only.  In 2D the solvers are left out: factors do not cost n / P.
 """
 
 from __future__ import annotations
@@ -94,12 +95,11 @@ def measure(dim: int, points: float) -> dict:
     simulation, dt = scene(dim, points)
     first = simulation.run(dt, dt, progress=False)
     comm, setup, before = simulation.grid.comm, time.perf_counter() - began, sent()
-    clock = time.process_time if comm.size == 1 else time.perf_counter
     steps = []
     for _ in range(STEPS):
-        start = clock()
+        start = time.process_time()
         result = simulation.run(simulation.t + dt, dt, progress=False)
-        steps.append((clock() - start, result))
+        steps.append((comm.allreduce(time.process_time() - start, MPI.MAX), result))
     seconds, best = min(steps, key=lambda step: step[0])
     profile = {part: wall * seconds / best.wall for part, wall in best.profile.items()}
     most = np.max(comm.allgather((sent() - before) / STEPS), axis=0).tolist()
@@ -129,7 +129,9 @@ def in_own_process(dim: int, points: float, processes: int) -> dict:
     command = [sys.executable, "-m", "mpi4py", __file__, "--one", str(dim), str(points)]
     if processes > 1:
         command = ["mpirun", "--oversubscribe", "-n", str(processes), *command]
-    done = subprocess.run(command, env=dict(os.environ), capture_output=True, text=True)
+    # Open MPI: who waits leaves the processor to others, so that the time does not depend on other work
+    environment = {**os.environ, "OMPI_MCA_mpi_yield_when_idle": "1"}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
     if done.returncode:
         raise RuntimeError(f"{dim}D, {points:g} points, {processes} processes: {done.stderr[-2000:]}")
     return json.loads(done.stdout.splitlines()[-1])
@@ -139,14 +141,15 @@ def in_own_process(dim: int, points: float, processes: int) -> dict:
 
 
 def exponents(rows: list[dict]) -> dict[str, float]:
-    """Return the exponents of the parts over the upper half of the sizes, and the memory's slope, kB a point."""
+    """Return the exponents of the parts over the upper half of the sizes, and the memory: MB at first, kB a point."""
     upper = rows[(len(rows) - 1) // 2 :]
-    n = np.array([row["points"] for row in upper], dtype=float)
-    found = {"kB a point": 1024 * float(np.polyfit(n, [row["memory_MB"] for row in upper], 1)[0])}
+    n, memory = (np.array([row[name] for row in rows], dtype=float) for name in ("points", "memory_MB"))
+    slope, base = np.polyfit(n, memory, 1, w=1 / memory)
+    found = {"MB at first": float(base), "kB a point": 1024 * float(slope)}
     for part in ("step", *PARTS, "rest"):
         seconds = np.array([row[part] for row in upper])
         if (seconds > 0).all():
-            found[part] = float(np.polyfit(np.log(n), np.log(seconds), 1)[0])
+            found[part] = float(np.polyfit(np.log(n[-len(upper) :]), np.log(seconds), 1)[0])
     return found
 
 
@@ -158,9 +161,9 @@ def halo(dim: int, n: float, processes: int) -> float:
     return float((np.minimum(halved, 2) * sides.prod() / sides).sum())
 
 
-def terms(dim: int, n: float, processes: int) -> list[float]:
+def terms(dim: int, n: float, processes: int, imbalance: float = 1.0) -> list[float]:
     """Return the terms of the cost model."""
-    return [1.0, n / processes, halo(dim, n, processes), np.log2(processes)]
+    return [1.0, imbalance * n / processes, halo(dim, n, processes), np.log2(processes)]
 
 
 def modelled(row: dict) -> float:
@@ -171,7 +174,7 @@ def modelled(row: dict) -> float:
 def fit(rows: list[dict]) -> dict[str, float]:
     """Return the coefficients of the cost model, s, and its largest relative error on the runs."""
     timed = [row for row in rows if row["processes"] <= (os.cpu_count() or 1)]
-    A = np.array([terms(row["dim"], row["points"], row["processes"]) for row in timed])
+    A = np.array([terms(row["dim"], row["points"], row["processes"], row["imbalance"]) for row in timed])
     T = np.array([modelled(row) for row in timed])
     coefficients, _ = nnls(A / T[:, None], np.ones(len(T)))
     found = dict(zip("eabc", coefficients.tolist(), strict=True))
@@ -231,7 +234,7 @@ def prediction(model: dict[str, float], dim: int) -> str:
 def draw(out: Path, rows: list[dict]) -> None:
     """Draw the time of the parts and the memory against the number of points."""
     dims, processes = (sorted({row[name] for row in rows}) for name in ("dim", "processes"))
-    fig, axes = beam.figure(len(dims), 2, (12, 4.6 * len(dims)))
+    fig, axes = beam.figure(len(dims), 2, (13, 4.4 * len(dims)))
     for dim, (left, right) in zip(dims, axes, strict=True):
         for p, mark in zip(processes, "os^D*P", strict=False):
             mine = [row for row in rows if (row["dim"], row["processes"]) == (dim, p)]
@@ -240,11 +243,12 @@ def draw(out: Path, rows: list[dict]) -> None:
             right.loglog(n, [row["memory_MB"] for row in mine], f"k{mark}-", label=label)
         draw_parts(left, right, [row for row in rows if (row["dim"], row["processes"]) == (dim, processes[0])])
         left.set(ylabel="time per step (s)", title=f"{dim}D: a step, its parts and their exponents")
-        right.set(ylabel="peak memory, all processes (MB)", title=f"{dim}D: memory")
+        right.set(ylabel="peak memory, all processes (MB)", title=f"{dim}D: memory", ylim=(100, None))
         for ax in (left, right):
             ax.set(xlabel="material points")
             ax.grid(alpha=0.3)
-            ax.legend(fontsize=8)
+        left.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+        right.legend(fontsize=8)
     fig.savefig(out / "scaling.png", dpi=120)
 
 
@@ -254,10 +258,10 @@ def draw_parts(left, right, rows: list[dict]) -> None:
     for k, part in enumerate(sorted((*PARTS, "rest"), key=lambda part: -rows[-1][part])[:8]):
         label = f"{part}, {found.get(part, np.nan):.2f}"
         left.loglog(n, [row[part] for row in rows], "osv^D*Pd"[k] + "-", ms=3, lw=1, label=label)
-    left.loglog(n, rows[-1]["step"] * n / n[-1], "k:", lw=1, label="exponent 1")
-    slope = found["kB a point"] / 1024
-    base = rows[-1]["memory_MB"] - slope * n[-1]
-    right.loglog(n, base + slope * n, "k:", lw=1, label=f"{base:.0f} MB + {1024 * slope:.1f} kB a point")
+    middle = (len(rows) - 1) // 2
+    left.loglog(n, rows[middle]["step"] * n / n[middle], "k:", lw=1, label="exponent 1")
+    base, slope = found["MB at first"], found["kB a point"]
+    right.loglog(n, base + slope / 1024 * n, "k:", lw=1, label=f"{base:.0f} MB + {slope:.1f} kB a point")
 
 
 def write(out: Path, rows: list[dict]) -> dict:

@@ -3,6 +3,7 @@
 
 import numpy as np
 import pytest
+from benchmark_pruning import PAIRS
 from helpers import SOFT, beam, column
 
 import mpm_dolfinx as mpm
@@ -71,3 +72,29 @@ def test_a_law_that_is_not_linear_is_linearised_in_every_step():
     s.coupler._linearise = lambda dt: (count.append(dt), linearise(dt))
     s.run(1.0, 0.25)
     assert len(count) >= 4 and np.isfinite(s.points.x).all()
+
+
+FLUX, DILATION = {"fluxes between cells"}, {"mean dilatation"}
+BENCHMARK = {
+    "pore fluid that drains at once": {"pore pressure", "coupling", "open sides"} | FLUX,
+    "flux form": FLUX,
+    "body force": {"body force"},
+    "ghost penalty on all faces": {"ghost penalty"},
+    "damping of pressure jumps": {"damping of pressure jumps"},
+    "mean dilatation": DILATION,
+    "plastic law, with mean dilatation": {"state of the law"} | DILATION,
+    "finite strain": {"one factorisation for many steps"},
+    "factors of a linear law in each step": {"one factorisation for many steps"},
+    "files of each step": set(),
+    "16 times the background grid": set(),
+}
+
+
+@pytest.mark.parametrize("name", PAIRS)
+def test_the_benchmarks_pairs_differ_in_nothing_but_their_feature(name):
+    used = []
+    for make in PAIRS[name]:
+        s = make(4)
+        s.step(1.0)
+        used.append({part.name for part in parts(s) if part.used})
+    assert used[0] ^ used[1] == BENCHMARK[name]
