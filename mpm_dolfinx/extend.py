@@ -41,6 +41,7 @@ from inspect import signature
 
 import ufl
 from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
+from ufl.algorithms.check_arities import ArityMismatch
 from ufl.corealg.traversal import unique_pre_traversal
 
 from mpm_dolfinx.check import asked, line, line_of
@@ -108,11 +109,19 @@ def compiling(what: str, allowed: str) -> Iterator[None]:
     """Name the object and the remedy where UFL or its compiler refuses an expression, with a ValueError."""
     try:
         yield
-    except ValueError:  # has its own
-        raise
-    except Exception as error:  # UFL and FFCx have many kinds
+    except (Exception, ArityMismatch) as error:  # UFL and FFCx have many kinds, one is no Exception
+        if isinstance(error, ValueError) and _is_ours(error):
+            raise
         why = f"{type(error).__name__}: {line_of(error)}"
         raise ValueError(f"{what}: does not compile ({why}), must be {allowed}") from error
+
+
+def _is_ours(error: Exception) -> bool:
+    """Whether an error was raised by this package, which has named the object."""
+    frames = error.__traceback__
+    while frames.tb_next is not None:
+        frames = frames.tb_next
+    return frames.tb_frame.f_globals["__name__"].startswith("mpm_dolfinx")
 
 
 def _name(function: Callable) -> str:

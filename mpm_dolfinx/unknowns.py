@@ -110,7 +110,8 @@ def matrix(rows: Unknowns, columns: Unknowns, row_length: int | NDArray[np.int64
     A.setSizes(((rows.size, None), (columns.size, None)))
     A.setType(PETSc.Mat.Type.AIJ)
     length = np.broadcast_to(row_length, (rows.size,)).astype(PETSc.IntType)
-    A.setPreallocationNNZ((np.minimum(length, columns.size), length if rows.comm.size > 1 else 0))
+    elsewhere = np.minimum(length, columns.global_size) if rows.comm.size > 1 else 0
+    A.setPreallocationNNZ((np.minimum(length, columns.size), elsewhere))
     A.setOption(PETSc.Mat.Option.NEW_NONZERO_ALLOCATION_ERR, False)
     A.setLGMap(rows.map, columns.map)
     return A
