@@ -64,6 +64,13 @@ def weighted(cells: int) -> mpm.Simulation:
     return simulation
 
 
+def restless(cells: int, **options) -> mpm.Simulation:
+    """Return the block with the grid reset in each step, as if it had moved."""
+    simulation = block(cells, **options)
+    simulation._stays = lambda: False
+    return simulation
+
+
 def refactorised(cells: int) -> mpm.Simulation:
     """Return the draining block of a linear law, taken for one that is not."""
     simulation = linear(cells)
@@ -107,7 +114,8 @@ PAIRS: dict[str, tuple[Make, Make]] = {
     "finite strain": (lambda n: block(n, soil(mpm.LinearElastic)), block),
     "factors of a linear law in each step": (linear, refactorised),
     "files of each step": (block, block),
-    "16 times the background grid": (lambda n: block(n, box=1 + 2 / n), lambda n: block(n, box=4.0)),
+    "grid reset in each step": (block, restless),
+    "16 times the background grid": (lambda n: restless(n, box=1 + 2 / n), lambda n: restless(n, box=4.0)),
 }
 QUICK = ("files of each step",)
 MAKES = [make for pair in PAIRS.values() for make in pair]
