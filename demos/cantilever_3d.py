@@ -157,19 +157,21 @@ def draw(o: argparse.Namespace, faces: np.ndarray, stretch: np.ndarray) -> None:
     from matplotlib.colors import Normalize
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
-    fig = plt.figure(figsize=(8, 4.5))
-    ax = fig.add_subplot(projection="3d", proj_type="ortho")
+    fig = plt.figure(figsize=(8, 4.6))
+    ax = fig.add_axes([-0.05, 0.12, 1.1, 0.95], projection="3d", proj_type="ortho")
     limit = np.abs(stretch - 1).max()
     colours = ScalarMappable(Normalize(1 - limit, 1 + limit), "RdBu_r")
     ax.add_collection3d(Poly3DCollection(faces, facecolors=colours.to_rgba(stretch), edgecolors="0.3", linewidths=0.1))
     low, high = faces.min(axis=(0, 1)), faces.max(axis=(0, 1))
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-    ax.set(xlabel="x (m)", ylabel="y (m)", zlabel="z (m)", title=rf"Square cantilever, $P L^2 / (E I)$ = {o.alpha:g}")
-    ax.set_box_aspect(high - low, zoom=1.2)
-    ax.locator_params(axis="y", nbins=3)
+    ax.set(xlabel="x (m)", ylabel="y (m)", zlabel="z (m)")
+    fig.text(0.5, 0.93, rf"Square cantilever, $P L^2 / (E I)$ = {o.alpha:g}", ha="center", fontsize=12)
+    ax.set_box_aspect(high - low, zoom=1.1)
+    ax.locator_params(axis="y", nbins=2)
     ax.locator_params(axis="z", nbins=4)
     ax.view_init(elev=25, azim=-70)
-    fig.colorbar(colours, ax=ax, shrink=0.7, pad=0.1, label="stretch along the beam (-)")
+    across = fig.add_axes([0.3, 0.13, 0.4, 0.03])
+    fig.colorbar(colours, cax=across, orientation="horizontal", label="stretch along the beam (-)")
     o.out.mkdir(parents=True, exist_ok=True)
     fig.savefig(o.out / "cantilever_3d.png", dpi=130)
 
