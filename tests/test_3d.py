@@ -182,6 +182,10 @@ def test_cryers_sphere_peaks_within_two_percent():
 
 
 @pytest.mark.slow
-def test_the_number_of_steps_does_not_move_a_cantilever():
-    tips = np.array([cantilever_3d.run(4, steps, 1.0)[0] for steps in (10, 40, 160)])
-    assert np.abs(tips - tips[-1]).max() < 1e-3 * np.linalg.norm(tips[-1])
+def test_the_number_of_steps_hardly_moves_a_cantilever_and_less_with_smaller_cells():
+    """Over 10 to 160 steps as much again: the difference is of first order in the step, of second in the cell."""
+    drift = []
+    for cells in (4, 8):
+        tips = [cantilever_3d.run(cells, steps, 1.0)[0] for steps in (10, 40)]
+        drift.append(np.linalg.norm(tips[0] - tips[1]) / np.linalg.norm(tips[1]))
+    assert drift[1] < 1e-3 and drift[1] < 0.35 * drift[0]
