@@ -173,6 +173,10 @@ class Coupler:
             report.balance = _relative(abs(self.storage.balance(dt)), self._exchanged, self.storage.round_off)
         return report
 
+    def easy(self, report: Report) -> bool:
+        """Return whether a step converged in a third of the iterations it may take: the next one may be longer."""
+        return 3 * (report.coupling if self.richardson else report.newton) <= self.max_iterations
+
     def _newton(self, dt: float, report: Report) -> None:
         """Newton's method on both problems at once; the tangent is kept while it serves, of linear laws over steps."""
         errors, fresh = self._errors(dt, report), not (self.momentum.linear and self._kept(dt))

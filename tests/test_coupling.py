@@ -9,6 +9,7 @@ import pytest
 from helpers import SOFT, beam
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx.coupling import Report
 from mpm_dolfinx.storage import FILTER
 
 
@@ -39,6 +40,23 @@ def test_beta_as_printed_in_the_paper_diverges_and_says_so():
         s.run(0.08, 0.02)
     assert len(caught.value.history) > 2 and caught.value.result.t == [0.0]
     assert (s.points.corners == before.corners).all() and s.t == 0, "the last good state is lost"
+
+
+@pytest.mark.parametrize(("newton", "steps"), [(8, [0.5, 0.5, 1, 1]), (9, [0.5] * 6)])
+def test_a_step_that_has_been_cut_grows_again_once_it_is_easy(newton, steps, monkeypatch):
+    s, _ = beam(h=0.06)
+    taken = []
+
+    def step(dt):
+        if not taken and dt > 0.6:
+            raise mpm.NotConverged("too long", [])
+        s.t += dt
+        taken.append(dt)
+        return Report(newton=newton, history=[(0.0, 0.0)])
+
+    monkeypatch.setattr(s, "step", step)
+    result = s.run(3.0, 1.0, progress=False)
+    assert result.cuts == 1 and taken == steps
 
 
 def test_a_step_that_does_not_converge_is_cut_and_grows_again():
