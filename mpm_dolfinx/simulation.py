@@ -341,7 +341,6 @@ class Simulation:
             self.reactions = self.boundary.reactions(self.momentum)
         report.rederived = self._move_points()
         self.t += dt
-        self._prepared = False
         return report
 
     def _begin(self, t: float) -> None:
@@ -384,8 +383,13 @@ class Simulation:
                 self.storage.p_n.x.array[:] = self.storage.p.x.array
 
     def _leave_grid(self) -> None:
-        """Let the points take the pressures of their pieces along; the domains are cut anew in the next step."""
-        if self.placement is not None and self.storage:
+        """Let the points take the pressures of their pieces along; the domains are cut anew in the next step.
+
+        Until a step has been taken in the cells, the points still carry what they brought.
+        """
+        if self.placement is not None and self.storage and self._carried is None:
+            if self._prepared:  # a step has failed: the pressures are those at its start
+                self.storage.p.x.array[:] = self.storage.p_n.x.array
             with Timer("mpm: remap"):
                 self._carried = self._motion.carry(self.points, self.placement)
         self.placement = None
@@ -472,7 +476,9 @@ class Simulation:
     def _move_points(self) -> int:
         """Move the points; return how many domains had folded."""
         with Timer("mpm: move points"):
-            return self._motion.move(self.points, self.placement, self.boundary)
+            folded = self._motion.move(self.points, self.placement, self.boundary)
+        self._carried, self._prepared = None, False  # the pressures are those of the cells
+        return folded
 
     def _migrate(self) -> None:
         """Send the points whose cell another process owns."""

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Domains that hardly move stay cut: the answer is that of cutting in every step, and a given side does not drift."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 
@@ -94,3 +96,26 @@ def test_a_run_goes_on_from_a_checkpoint_with_the_same_bits(tmp_path):
     s.run(20, 0.8, after=before, progress=False)
     assert np.array_equal(s.points.corners, whole.points.corners)
     assert np.array_equal(s.points.pressure, whole.points.pressure)
+
+
+@pytest.mark.parametrize("load", [1e4, 1e6], ids=["staying", "moving"])
+def test_a_stage_after_a_step_that_failed_begins_with_the_last_good_pressures(load, monkeypatch):
+    runs = []
+    for fails in (False, True):
+        s = column(load)
+        s.run(4, 0.8, progress=False)
+        if fails:
+            with monkeypatch.context() as patch:
+                patch.setattr(s.coupler, "solve", partial(fail, s))
+                with pytest.raises(mpm.GaveUp):
+                    s.run(8, 0.8, progress=False)
+        s.stage(tractions=[mpm.Traction("top", (0, -load))])
+        s.run(8, 0.8, progress=False)
+        runs.append((s.points.corners, s.points.pressure))
+    (x, p), (x2, p2) = runs
+    assert p2 == pytest.approx(p, abs=1e-6 * load) and x2 == pytest.approx(x, abs=1e-12)
+
+
+def fail(s, dt):
+    s.storage.p.x.array[:] = np.nan
+    raise mpm.NotConverged("made to fail", [])
