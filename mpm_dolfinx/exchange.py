@@ -80,7 +80,7 @@ class Exchange:
 
 
 def over_all(comm: MPI.Intracomm, value: T, op: MPI.Op = MPI.SUM) -> T:
-    """Return the sum of the processes' values, or their maximum...; of one process its own, at no cost."""
+    """Return the processes' values reduced by `op`; a single process has its own back, at no cost."""
     return value if comm.size == 1 else comm.allreduce(value, op=op)
 
 

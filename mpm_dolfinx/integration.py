@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -118,11 +118,11 @@ class IntegrationData:
 
     def _own(self, place: Placement, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
         """Return what differs from piece to piece of a point, where functions of the user's may ask for it."""
-        fields: Mapping[str, NDArray[np.float64]] = {}
+        fields = {}
         if self._extended or self._varies:
-            fields = {"position": place.pieces.x}
+            fields["position"] = place.pieces.x
         if self._extended:
-            fields = {**fields, "displacement": place.total_displacement()}
+            fields["displacement"] = place.total_displacement()
         return {name: place.pieces_to_cells(values) for name, values in fields.items()}
 
     @property

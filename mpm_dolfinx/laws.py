@@ -33,6 +33,9 @@ RESERVED = (
     "grid",
     "dx",
     "cells",
+    "filled",
+    "slots",
+    "places",
     "x",
     "data",
     "version",
@@ -147,10 +150,7 @@ class SceneMaterials:
 
     def values(self, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
         """Return all parameters and state at the points (n, ...), zero where a point's law does not know them."""
-        n, out = len(points), {}
-        for name, shape in self.shapes.items():
-            is_state = any(name in law.state for law in self.laws)
-            out[name] = points.data[name] if is_state else np.zeros((n, *shape))
+        out = {name: np.zeros((len(points), *shape)) for name, shape in self.shapes.items()} | self.state(points)
         for i, m in enumerate(self.materials):
             rows = np.flatnonzero(points.material == i)
             at = self._at(points, i, rows)

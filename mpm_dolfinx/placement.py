@@ -44,7 +44,7 @@ class Patches:
     """
 
     def __init__(self, faces: Surface, here, at, cell, x, xi, share):
-        self._faces, self._here, self._at, self._xi, self._share = faces, here, at, xi, share
+        self._faces, self._here, self._at, self._xi = faces, here, at, xi
         self.cell, self.x = cell, x
         self.area0 = share * faces.area0[here]
         """Reference areas (n,), m^(d-1)."""
@@ -102,11 +102,10 @@ class Placement:
         self._check_inside(points.corners if quadrature == "domain" else points.x[:, None], t)
         self.pieces = cut(grid, points.corners) if quadrature == "domain" else whole_points(grid, points.x)
         self._travel = Exchange(grid.comm, grid.owner(self.pieces.cell))
-        self.cells = grid.local(self._travel.send(self.pieces.cell))
+        self.cells, self.x = grid.local(self._travel.send(self.pieces.cell)), self._travel.send(self.pieces.x)
+        """Owned cells, and centroids (m, d), m, of the pieces that this process integrates."""
         self.moved = np.zeros_like(self.pieces.x)
         """Displacements (m, d), m, of the pieces since they were cut."""
-        self.x = self._travel.send(self.pieces.x)
-        """Owned cells, and centroids (m, d), m, of the pieces that this process integrates."""
 
     def _check_inside(self, x: NDArray[np.float64], t: float) -> None:
         grid, points, message = self.grid, self.points, ""

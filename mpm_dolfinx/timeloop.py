@@ -56,7 +56,7 @@ class Result:
     the steps so far: steps, newton, coupling (iterations), balance and residual (worst, relative), cuts,
     rederived (domains that had folded), wall (s), and profile: seconds of each part of the run on this
     process, from dolfinx's timers.  points: material points; memory: peak of all processes, libraries
-    included, MB; imbalance: the most that one of several processes has over their mean, at the last output time.
+    included, MB; imbalance: the most that one of several processes has over their mean, at the end of the run.
     dt: output interval, s; small: the step to try next, s; converged: the end has been reached.
     """
 
@@ -83,8 +83,9 @@ class Result:
         """Return seconds and share of the wall time of each part, memory and imbalance as a table."""
         rows = [*self.profile.items(), ("rest", self.wall - sum(self.profile.values()))]
         lines = [f"{name:18} {s:8.2f} s {100 * s / max(self.wall, 1e-9):5.1f} %" for name, s in rows]
-        per_point = 1024 * self.memory / max(self.points, 1)
-        lines.append(f"{'memory':18} {self.memory:8.0f} MB, {per_point:.3g} kB for each of {self.points} points")
+        if self.points:  # measured when a run has ended
+            each = 1024 * self.memory / self.points
+            lines.append(f"{'memory':18} {self.memory:8.0f} MB, {each:.3g} kB for each of {self.points} points")
         if self.imbalance:
             ratios = ", ".join(f"{name} {ratio:.2f}" for name, ratio in self.imbalance.items())
             lines.append(f"{'most over mean':18} {ratios} (1: perfect balance)")

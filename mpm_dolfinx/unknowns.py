@@ -63,7 +63,7 @@ class Unknowns:
 
     def rigid_body_modes(self) -> PETSc.NullSpace:
         """Return translations and rotations, as far as the unknowns allow them: what strain does not see."""
-        d = self._space.dofmap.bs
+        d = self.dim
         node, axis = self.nodes
         x, direction = self._space.tabulate_dof_coordinates()[node, :d], np.eye(d)[axis]
         modes = np.concatenate([direction, np.empty((self.size, d * (d - 1) // 2))], axis=1)

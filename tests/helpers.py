@@ -1,7 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Small scenes that several tests share."""
 
+import re
+
 import numpy as np
+import pytest
 
 import mpm_dolfinx as mpm
 
@@ -37,3 +40,12 @@ def column(*, cells=10, offset=0.0, width=1, fluid=True, height=1.0, bottom=0.0,
     options.setdefault("fixed", {"left": "x", "right": "x", "bottom": "y"})
     material = options.pop("material", SOFT)
     return mpm.Simulation(grid, [body], [material], **options)
+
+
+def refused_in_one_line(make, name, value, folder, longest):
+    """Assert that a ValueError names the object, the value and what is allowed in one line, shorter than `longest`."""
+    with pytest.raises(ValueError) as caught:
+        make(folder) if make.__code__.co_argcount else make()
+    line = str(caught.value)
+    assert "\n" not in line and len(line) < longest
+    assert name in line and value in line and re.search(r"\bmust\b|\bneeds?\b", line), line
