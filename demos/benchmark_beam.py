@@ -18,7 +18,7 @@ import numpy as np
 import poroelastic_beam as beam
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.reference import BiotFEM
+from mpm_dolfinx.verification.biot_fem import BiotFEM
 
 
 def run(name: str, o: argparse.Namespace):

@@ -28,8 +28,8 @@ from unittest.mock import patch
 import numpy as np
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.materials import LOCKING
-from mpm_dolfinx.summary import peak_memory
+from mpm_dolfinx.constitutive.skeleton import LOCKING
+from mpm_dolfinx.io.summary import peak_memory
 
 SHEAR, LOAD, DT, STEPS = 5e6, 20.0, 1.0, 4  # Pa, Pa a step, s, steps at a time
 WATER = {"fluid": mpm.Fluid(), "drained": [mpm.Drained("top")]}

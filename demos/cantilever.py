@@ -29,7 +29,7 @@ import numpy as np
 import poroelastic_beam as beam
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.exact import elastica_tip, shear_flexible_rod
+from mpm_dolfinx.verification.exact import elastica_tip, shear_flexible_rod
 
 LENGTH, HEIGHT, YOUNG = 1.0, 0.05, 12e6  # m, m, Pa
 BOX = np.array([1.05, 1.0])  # m

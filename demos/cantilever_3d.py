@@ -24,7 +24,7 @@ from mpi4py import MPI
 import numpy as np
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.exact import shear_flexible_rod
+from mpm_dolfinx.verification.exact import shear_flexible_rod
 
 LENGTH, SIDE, YOUNG = 1.0, 0.1, 12e6  # m, m, Pa
 ALONG, ACROSS = np.array([0, 3, -4]) / 5, np.array([0, 4, 3]) / 5

@@ -9,7 +9,7 @@ filtered fixed-stress operator C + beta (V - 3/4 L) and with the plain one, C + 
 fixed-stress iteration (Richardson's) with beta = 0.5, 0.75 and 1 times alpha²/K_dr and with 1/K_w as
 printed in the paper, which diverges.  An iteration is one solve of the storage and one of the momentum.
 
-Undrained, what P1 with DG0 does not see are checkers of the pressure; only the damping of jumps
+Undrained, what Q1 with DG0 does not see are checkers of the pressure; only the damping of jumps
 (`storage.py`) bounds them, and the count.  The second picture shows the pressure with and without it.
 """
 
@@ -29,8 +29,8 @@ import poroelastic_beam as beam
 from numpy.typing import NDArray
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.coupling import Report
-from mpm_dolfinx.storage import FILTER
+from mpm_dolfinx.solve.newton import Report
+from mpm_dolfinx.problems.storage import FILTER
 
 K_DT = np.array([-23, -16, -12, -10, -9, -8, -7, -6, -5, -4, -3, -2, 0, 3, 7, 11])  # log10 of k dt in m
 BULK = (1e4, 1e6, 2.2e9, np.inf)  # of the water, Pa

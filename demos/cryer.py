@@ -22,7 +22,7 @@ import numpy as np
 import poroelastic_beam as beam
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.exact import cryer_pressure
+from mpm_dolfinx.verification.exact import cryer_pressure
 
 RADIUS, LOAD, NU = 1.0, 100.0, 0.25  # m, Pa, -
 SHEAR, CONDUCTIVITY = 1e6, 1e-6  # Pa, m/s

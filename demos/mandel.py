@@ -28,7 +28,7 @@ import numpy as np
 import poroelastic_beam as beam
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.exact import Mandel
+from mpm_dolfinx.verification.exact import Mandel
 
 WIDTH, HEIGHT, STRAIN = 1.0, 1.0, 1e-5  # m, m, -
 SAMPLES = (0.01, 0.1, 0.5, 1.0)  # reduced times T at which stages of equal steps end

@@ -22,7 +22,7 @@ from mpi4py import MPI
 import numpy as np
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.reference import BiotFEM, euler_bernoulli
+from mpm_dolfinx.verification.biot_fem import BiotFEM, euler_bernoulli
 
 LENGTH, HEIGHT, DEPTH, CLAMP = 1.0, 0.3, 0.1, 0.05  # m; the load begins at x = CLAMP
 BOX = np.array([1.5, 1.2])  # m

@@ -45,7 +45,7 @@ import poroelastic_beam as beam
 from scipy.optimize import nnls
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.exchange import traffic
+from mpm_dolfinx.parallel.exchange import traffic
 from mpm_dolfinx.timeloop import PARTS
 
 SIZES = {

@@ -26,7 +26,7 @@ import numpy as np
 import poroelastic_beam as beam
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.exact import SelfWeightColumn
+from mpm_dolfinx.verification.exact import SelfWeightColumn
 
 YOUNG, POROSITY = 1e4, 0.4  # Pa, -
 EXACT = SelfWeightColumn(l0=50.0, bulk=YOUNG / 3, shear=YOUNG / 2, density=80.0, gravity=10.0)

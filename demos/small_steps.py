@@ -38,7 +38,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.exact import terzaghi_pressure
+from mpm_dolfinx.verification.exact import terzaghi_pressure
 
 HEIGHT, SOIL = terzaghi.HEIGHT, terzaghi.SOIL
 T_END = 0.1

@@ -25,7 +25,7 @@ import numpy as np
 import poroelastic_beam as beam
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.exact import terzaghi_consolidation, terzaghi_pressure
+from mpm_dolfinx.verification.exact import terzaghi_consolidation, terzaghi_pressure
 
 HEIGHT = 1.0  # m
 SOIL = mpm.LinearElastic(bulk=1e7 / 3, shear=5e6, porosity=0.4, conductivity=1e-4)

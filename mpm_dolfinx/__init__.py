@@ -11,16 +11,16 @@ SI units throughout.  Stress is positive in tension, pore pressure in compressio
 are those of a slice of 1 m.
 """
 
-from mpm_dolfinx.conditions import Displacement, Drained, Inflow, RigidPlate, Traction
-from mpm_dolfinx.coupling import COUPLINGS, NotConverged
-from mpm_dolfinx.grid import Grid
-from mpm_dolfinx.materials import LAWS, Field, Fluid, Hencky, LinearElastic, NeoHookean, Skeleton, kozeny_carman
-from mpm_dolfinx.output import Writer
-from mpm_dolfinx.plasticity import DruckerPrager
-from mpm_dolfinx.points import box, mapped, shape
-from mpm_dolfinx.restart import Checkpoint, resume
+from mpm_dolfinx.problems.conditions import Displacement, Drained, Inflow, RigidPlate, Traction
+from mpm_dolfinx.solve.newton import COUPLINGS, NotConverged
+from mpm_dolfinx.points.grid import Grid
+from mpm_dolfinx.constitutive.skeleton import LAWS, Field, Fluid, Hencky, LinearElastic, NeoHookean, Skeleton, kozeny_carman
+from mpm_dolfinx.io.writer import Writer
+from mpm_dolfinx.constitutive.drucker_prager import DruckerPrager
+from mpm_dolfinx.points.bodies import box, mapped, shape
+from mpm_dolfinx.io.checkpoint import Checkpoint, resume
 from mpm_dolfinx.simulation import Simulation
-from mpm_dolfinx.surface import probes
+from mpm_dolfinx.points.faces import probes
 from mpm_dolfinx.timeloop import GaveUp, Result
 
 __version__ = "0.1.0"

@@ -12,28 +12,28 @@ from dolfinx import fem
 from dolfinx.common import Timer
 from numpy.typing import ArrayLike, NDArray
 
-from mpm_dolfinx import summary
-from mpm_dolfinx.boundary import Boundary
-from mpm_dolfinx.check import all_of, asked, chosen, flag, functions, instance, line, numbers
-from mpm_dolfinx.conditions import Displacement, Drained, Inflow, RigidPlate, Traction
-from mpm_dolfinx.coupling import COUPLINGS, Coupler, Report
-from mpm_dolfinx.exchange import Exchange
-from mpm_dolfinx.extend import compiling
-from mpm_dolfinx.grid import Grid, sum_by
-from mpm_dolfinx.held import check_held
-from mpm_dolfinx.integration import IntegrationData
-from mpm_dolfinx.laws import SceneMaterials
-from mpm_dolfinx.materials import Fluid, Skeleton
-from mpm_dolfinx.momentum import FULL, Momentum
-from mpm_dolfinx.motion import Motion
-from mpm_dolfinx.placement import Placement
-from mpm_dolfinx.points import Body, MaterialPoints, check_apart, check_inside, material_points
-from mpm_dolfinx.remap import Carried, at_start, remap
-from mpm_dolfinx.storage import Storage
-from mpm_dolfinx.surface import Probes
-from mpm_dolfinx.thin import warn_thin
+from mpm_dolfinx.io import summary
+from mpm_dolfinx.problems.mechanical_boundary import Boundary
+from mpm_dolfinx.validation import all_of, asked, chosen, flag, functions, instance, line, numbers
+from mpm_dolfinx.problems.conditions import Displacement, Drained, Inflow, RigidPlate, Traction
+from mpm_dolfinx.solve.newton import COUPLINGS, Coupler, Report
+from mpm_dolfinx.parallel.exchange import Exchange
+from mpm_dolfinx.constitutive.user_functions import compiling
+from mpm_dolfinx.points.grid import Grid, sum_by
+from mpm_dolfinx.problems.scene_checks import check_held
+from mpm_dolfinx.forms.quadrature_data import IntegrationData
+from mpm_dolfinx.constitutive.fields import SceneMaterials
+from mpm_dolfinx.constitutive.skeleton import Fluid, Skeleton
+from mpm_dolfinx.problems.momentum import FULL, Momentum
+from mpm_dolfinx.points.advance import Motion
+from mpm_dolfinx.points.cut_domains import Placement
+from mpm_dolfinx.points.bodies import Body, MaterialPoints, check_apart, check_inside, material_points
+from mpm_dolfinx.points.pressure_transport import Carried, at_start, remap
+from mpm_dolfinx.problems.storage import Storage
+from mpm_dolfinx.points.faces import Probes
+from mpm_dolfinx.problems.thin import warn_thin
 from mpm_dolfinx.timeloop import Observer, Result, run
-from mpm_dolfinx.unknowns import collect_garbage
+from mpm_dolfinx.forms.unknowns import collect_garbage
 
 CONDITIONS = {
     "tractions": Traction,

@@ -20,11 +20,11 @@ from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
 from mpm_dolfinx import _compat
-from mpm_dolfinx.check import functions, instance, line, numbers
-from mpm_dolfinx.coupling import NotConverged
-from mpm_dolfinx.placement import LeftGrid
-from mpm_dolfinx.summary import imbalance, peak_memory
-from mpm_dolfinx.surface import Probes
+from mpm_dolfinx.validation import functions, instance, line, numbers
+from mpm_dolfinx.solve.newton import NotConverged
+from mpm_dolfinx.points.cut_domains import LeftGrid
+from mpm_dolfinx.io.summary import imbalance, peak_memory
+from mpm_dolfinx.points.faces import Probes
 
 if TYPE_CHECKING:
     from mpm_dolfinx.simulation import Simulation

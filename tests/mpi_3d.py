@@ -6,7 +6,7 @@ import sys
 import numpy as np
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx import solvers
+from mpm_dolfinx.solve import linear as solvers
 
 solvers.ITERATIVE = 0
 grid = mpm.Grid([1.2] * 3, [6] * 3)

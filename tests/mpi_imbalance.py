@@ -6,7 +6,7 @@ import sys
 import numpy as np
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.exchange import traffic
+from mpm_dolfinx.parallel.exchange import traffic
 
 grid = mpm.Grid([2.0, 0.6], [20, 6])
 bodies = [mpm.box(grid, [0, 0], [1, 0.5]), mpm.box(grid, [1, 0], [2, 0.5])]

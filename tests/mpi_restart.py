@@ -13,7 +13,7 @@ import numpy as np
 from helpers import beam
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.exchange import to_root
+from mpm_dolfinx.parallel.exchange import to_root
 
 T_END, DT = 0.12, 0.02
 

@@ -10,10 +10,10 @@ import poroelastic_beam as demo
 import pytest
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx import solvers
-from mpm_dolfinx.domains import volumes
-from mpm_dolfinx.points import material_points
-from mpm_dolfinx.surface import face_vectors, surface
+from mpm_dolfinx.solve import linear as solvers
+from mpm_dolfinx.points.cutting import volumes
+from mpm_dolfinx.points.bodies import material_points
+from mpm_dolfinx.points.faces import face_vectors, surface
 
 SOIL = mpm.Hencky(bulk=1e7 / 3, shear=5e6, conductivity=1e-6)
 

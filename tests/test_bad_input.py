@@ -6,7 +6,7 @@ import pytest
 from helpers import SOFT, beam, column, refused_in_one_line, top_load
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.reference import BiotFEM
+from mpm_dolfinx.verification.biot_fem import BiotFEM
 
 GRID = mpm.Grid([1.0, 1.0], [10, 10])
 GRID_3D = mpm.Grid([1.0, 1.0, 1.0], [2, 2, 2])

@@ -6,7 +6,7 @@ import poroelastic_beam as demo
 import pytest
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.reference import BiotFEM
+from mpm_dolfinx.verification.biot_fem import BiotFEM
 
 
 def run(arguments="", cells=demo.REFERENCE_CELLS, probe=((1.0, 0.15),)):

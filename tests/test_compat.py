@@ -10,7 +10,7 @@ import ufl
 from dolfinx import fem
 
 from mpm_dolfinx import Grid, _compat
-from mpm_dolfinx.forms import FormPoints, PointForm
+from mpm_dolfinx.forms.point_forms import FormPoints, PointForm
 
 GRID = Grid([2.0, 1.0], [4, 3])
 

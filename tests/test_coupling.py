@@ -9,8 +9,8 @@ import pytest
 from helpers import SOFT, beam
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.coupling import Report
-from mpm_dolfinx.storage import FILTER
+from mpm_dolfinx.solve.newton import Report
+from mpm_dolfinx.problems.storage import FILTER
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ import pytest
 from helpers import SOFT, beam, column
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.reference import BiotFEM
+from mpm_dolfinx.verification.biot_fem import BiotFEM
 
 YOUNG = 1e7
 
@@ -17,7 +17,7 @@ def skeleton(nu):
 
 @pytest.mark.parametrize("nu", [0.45, 0.499])
 def test_nearly_incompressible_beams_do_not_lock(nu):
-    """Plain P1 is 1.3 and 26 % too stiff on this grid of ten cells over the depth."""
+    """Plain Q1 is 1.3 and 26 % too stiff on this grid of ten cells over the depth."""
     s, probe = beam(material=skeleton(nu), fluid=False, ramp=1.0)
     tip = s.run(1.0, 0.1, probes=probe).displacement[-1][0, 1]
     load = mpm.Traction("top", lambda t: (0, -54e3 * min(1, t)), region=((0.05, -np.inf), (1.0, np.inf)))

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from mpm_dolfinx import Grid, box
-from mpm_dolfinx.domains import SNAP, corner_bits, cut, kuhn_simplices
+from mpm_dolfinx.points.cutting import SNAP, corner_bits, cut, kuhn_simplices
 
 GRIDS = {2: Grid([1.0, 1.2], [5, 6]), 3: Grid([1.0, 1.2, 0.8], [4, 3, 4])}
 
@@ -79,7 +79,7 @@ def test_a_domain_about_to_fold_is_cut_as_the_sum_of_its_simplices(grid):
 def test_every_chunk_of_domains_is_cut_alike(grid, monkeypatch):
     corners = domains(grid, 0.05)
     whole = cut(grid, corners)
-    monkeypatch.setattr("mpm_dolfinx.domains.CHUNK", 5 * 2**grid.dim)
+    monkeypatch.setattr("mpm_dolfinx.points.cutting.CHUNK", 5 * 2**grid.dim)
     parts = cut(grid, corners)
     assert all((getattr(whole, name) == getattr(parts, name)).all() for name in ("point", "cell", "fraction", "faces"))
 

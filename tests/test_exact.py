@@ -6,7 +6,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.linalg import expm
 
-from mpm_dolfinx import exact
+from mpm_dolfinx.verification import exact
 
 NU = 0.2
 PLAIN = exact.Mandel(a=1, b=1, bulk=2 * (1 + NU) / (3 * (1 - 2 * NU)), shear=1, mobility=1)

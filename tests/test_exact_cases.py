@@ -8,7 +8,7 @@ import mandel
 import numpy as np
 import pytest
 
-from mpm_dolfinx.reference import BiotFEM
+from mpm_dolfinx.verification.biot_fem import BiotFEM
 
 
 def rates(errors):

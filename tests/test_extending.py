@@ -10,7 +10,7 @@ import ufl
 from helpers import SOFT, beam, column
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.reference import BiotFEM
+from mpm_dolfinx.verification.biot_fem import BiotFEM
 
 
 def load(height):

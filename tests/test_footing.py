@@ -7,7 +7,7 @@ import pytest
 from helpers import SOFT
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.domains import corner_bits, tangled, volumes
+from mpm_dolfinx.points.cutting import corner_bits, tangled, volumes
 
 
 @pytest.mark.parametrize("dim", [2, 3])

@@ -7,9 +7,9 @@ import ufl
 from dolfinx import fem
 
 from mpm_dolfinx import Grid, Hencky, NeoHookean, _compat
-from mpm_dolfinx.elements import ElementForces, ElementMatrices, StackedElementMatrices
-from mpm_dolfinx.forms import FormPoints, PointExpression, PointForm
-from mpm_dolfinx.unknowns import Unknowns, matrix
+from mpm_dolfinx.forms.cell_matrices import ElementForces, ElementMatrices, StackedElementMatrices
+from mpm_dolfinx.forms.point_forms import FormPoints, PointExpression, PointForm
+from mpm_dolfinx.forms.unknowns import Unknowns, matrix
 
 GRIDS = {2: Grid([1.5, 1.0], [4, 3]), 3: Grid([1.0, 1.2, 0.9], [2, 3, 2])}
 

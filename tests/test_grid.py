@@ -63,4 +63,4 @@ def test_dolfinx_numbers_dg0_dofs_as_cells(grid):
 def test_dolfinx_numbers_vector_dofs_as_scalar_ones(grid):
     V = _compat.function_space(grid.mesh, "Lagrange", 1, (grid.dim,))
     assert V.dofmap.bs == grid.dim
-    assert (_compat.cell_dofs(V) == grid.cell_nodes).all(), "P1 vector and scalar dofmaps differ"
+    assert (_compat.cell_dofs(V) == grid.cell_nodes).all(), "Q1 vector and scalar dofmaps differ"

@@ -6,7 +6,7 @@ import pytest
 from helpers import SOFT, beam, column
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.momentum import GHOST
+from mpm_dolfinx.problems.momentum import GHOST
 
 
 @pytest.mark.parametrize("offset", [0.0, 0.3, 0.77])
@@ -94,7 +94,7 @@ def test_a_large_load_is_held_for_hundreds_of_steps_without_drift():
 def test_the_ghost_penalty_hardly_changes_the_tip(monkeypatch):
     tips = []
     for strength in (GHOST / 10, GHOST):
-        monkeypatch.setattr("mpm_dolfinx.momentum.GHOST", strength)
+        monkeypatch.setattr("mpm_dolfinx.problems.momentum.GHOST", strength)
         s, probe = beam(fluid=False, ramp=1.0)
         tips.append(s.run(1.0, 0.1, probes=probe).displacement[-1][0, 1])
     assert tips[0] != tips[1] and np.ptp(tips) < 2e-4 * abs(tips[0])

@@ -9,7 +9,7 @@ import ufl
 from helpers import column
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.forms import FormPoints, PointExpression
+from mpm_dolfinx.forms.point_forms import FormPoints, PointExpression
 
 SAND = mpm.DruckerPrager(bulk=2e7, shear=1e7, friction=30.0, dilation=10.0, cohesion=2e5, hardening=5e6)
 ELASTIC, CONE, APEX = range(3)

@@ -6,7 +6,7 @@ import pytest
 from helpers import SOFT, top_load
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.reference import BiotFEM, euler_bernoulli
+from mpm_dolfinx.verification.biot_fem import BiotFEM, euler_bernoulli
 
 SIZE, TIP = ([0, 0], [1, 0.3]), [[1.0, 0.15]]
 

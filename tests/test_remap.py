@@ -6,8 +6,8 @@ import pytest
 from helpers import beam
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.domains import cut
-from mpm_dolfinx.remap import Carried, Reconstruction, remap
+from mpm_dolfinx.points.cutting import cut
+from mpm_dolfinx.points.pressure_transport import Carried, Reconstruction, remap
 
 MOVES = [0.01, 0.3, 2.6]
 

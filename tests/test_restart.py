@@ -24,8 +24,9 @@ from helpers import beam, column
 from test_mpi import mpirun
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx import restart, solvers
-from mpm_dolfinx.output import Series
+from mpm_dolfinx.io import checkpoint as restart
+from mpm_dolfinx.solve import linear as solvers
+from mpm_dolfinx.io.writer import Series
 
 
 def cut_beam():

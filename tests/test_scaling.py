@@ -9,8 +9,8 @@ import scaling
 from helpers import beam
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx import solvers
-from mpm_dolfinx.domains import cut_faces
+from mpm_dolfinx.solve import linear as solvers
+from mpm_dolfinx.points.cutting import cut_faces
 
 
 def memory() -> float:

@@ -44,7 +44,7 @@ def test_soft_water_on_the_move_is_as_exact_as_hard_water():
 
 @pytest.mark.parametrize("dt", [1e-12, 1e-6, 1e-3, 1.0])
 def test_the_first_step_overshoots_by_nothing_however_small(dt):
-    """In s; the step for which P1 pressures stop overshooting, h^2 / (6 c_v), is 4e-3 s."""
+    """In s; the step for which Q1 pressures stop overshooting, h^2 / (6 c_v), is 4e-3 s."""
     load = mpm.Traction("top", (0, -100.0))
     s = column(cells=20, material=SOIL, fluid=WATER, drained=[mpm.Drained("top")], tractions=[load])
     s.step(dt)

@@ -6,7 +6,7 @@ import pytest
 from helpers import SOFT
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.solvers import direct_solver, nodal_solver
+from mpm_dolfinx.solve.linear import direct_solver, nodal_solver
 
 
 def momentum(dim: int):

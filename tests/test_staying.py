@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx import placement, simulation
-from mpm_dolfinx.summary import parts
+from mpm_dolfinx import simulation
+from mpm_dolfinx.points import cut_domains as placement
+from mpm_dolfinx.io.summary import parts
 
 SOIL = mpm.Hencky(bulk=2e7, shear=1e7, porosity=0.4, conductivity=1e-5)
 WATER = mpm.Fluid(bulk=1e8)

@@ -6,8 +6,8 @@ import pytest
 from helpers import SOFT, beam, column
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.domains import corner_bits
-from mpm_dolfinx.materials import STANDARD_GRAVITY
+from mpm_dolfinx.points.cutting import corner_bits
+from mpm_dolfinx.constitutive.skeleton import STANDARD_GRAVITY
 
 
 def hold(s):

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.domains import corner_bits, parallelepipeds, tangled
+from mpm_dolfinx.points.cutting import corner_bits, parallelepipeds, tangled
 
 SOFT = mpm.NeoHookean(bulk=1e7 / 3, shear=5e6)  # Hencky's law loses its stiffness at such shear
 

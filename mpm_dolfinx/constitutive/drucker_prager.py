@@ -1,0 +1,187 @@
+# SPDX-License-Identifier: MIT
+"""Drucker and Prager's elastoplasticity at finite strain: a law that gives its stress and has a state.
+
+Multiplicative, in principal logarithmic strains: the inverse plastic metric C_p^-1 is the state, the trial
+elastic strain is eps = ln(b)/2 with b = F C_p^-1 F^T, elasticity is Hencky's, tau = K tr(eps) I + 2G dev eps,
+and the return to the yield surface
+
+    f = sqrt(J_2) + eta p - xi c <= 0,   p = tr(tau)/3 (tension positive),  c = c_0 + H kappa,
+
+is that of small strain, in closed form, to the cone or to its apex (de Souza Neto, Peric and Owen 2008, 8.3 and
+14.6).  All of it is UFL; the consistent tangent is UFL's derivative of the stress.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import ufl
+
+from mpm_dolfinx.constitutive.skeleton import Field, Skeleton, _check, _eigenvalues
+
+MATCHES = {
+    "plane strain": lambda t, s, c: (3 * t / np.sqrt(9 + 12 * t**2), 3 / np.sqrt(9 + 12 * t**2)),
+    "compression": lambda t, s, c: (6 * s / np.sqrt(3) / (3 - s), 6 * c / np.sqrt(3) / (3 - s)),
+    "extension": lambda t, s, c: (6 * s / np.sqrt(3) / (3 + s), 6 * c / np.sqrt(3) / (3 + s)),
+}
+"""How the cone meets Mohr and Coulomb's pyramid: (eta, xi) from tangent, sine and cosine of the friction angle."""
+TINY = 1e-20  # under the root of the deviatoric strain's square: keeps its derivative finite
+
+
+@dataclass(frozen=True, kw_only=True)
+class DruckerPrager(Skeleton):
+    """Hencky elasticity with a Drucker-Prager yield surface in Kirchhoff stress, perfectly plastic or hardening.
+
+    Parameters
+    ----------
+    friction
+        Friction angle phi, degrees, in [0, 90).
+    dilation
+        Dilation angle psi, degrees, in [0, friction]; equal to the friction angle the flow is associated, and the
+        tangent symmetric.
+    cohesion
+        Cohesion c_0, Pa, >= 0.  Without any, points without pressure have no stiffness.
+    hardening
+        Linear hardening H, Pa, >= 0: c = c_0 + H kappa, kappa the accumulated plastic strain (the work conjugate
+        of c in associated flow).
+    match
+        The cone meets Mohr and Coulomb's surface in "plane strain" (the same collapse load there; for associated
+        flow exactly), triaxial "compression" (outer cone) or triaxial "extension" (inner cone).
+
+    The other parameters are those of `Skeleton`, all by name.  The state is `plastic`, C_p^-1 (3, 3), and
+    `hardened`, kappa, in `points.data`.  De Souza Neto, Peric and Owen (2008), 8.3 and 14.6.
+
+    Raises
+    ------
+    ValueError
+        Naming the constant that is out of its range.
+    """
+
+    friction: Field
+    dilation: Field
+    cohesion: Field
+    hardening: Field = 0.0
+    match: str = "plane strain"
+
+    state: ClassVar = {"plastic": np.eye(3), "hardened": 0.0}
+
+    def __post_init__(self):
+        super().__post_init__()
+        if self.match not in MATCHES:
+            raise ValueError(f"{type(self).__name__}: match = {self.match!r}, must be one of {', '.join(MATCHES)}")
+        _check(self, "friction", lambda v: (0 <= v) & (v < 90), "in [0, 90) degrees")
+        for name in ("cohesion", "hardening"):
+            _check(self, name, lambda v: 0 <= v, ">= 0")
+        if not callable(self.friction):
+            _check(self, "dilation", lambda v: (0 <= v) & (v <= self.friction), "in [0, friction] degrees")
+
+    @property
+    def symmetric(self) -> bool:
+        return self.dilation == self.friction
+
+    @property
+    def nearly_incompressible(self) -> bool:
+        return True  # plastic flow is
+
+    def _cone(self, angle):
+        angle = np.radians(angle)
+        return MATCHES[self.match](np.tan(angle), np.sin(angle), np.cos(angle))
+
+    @property
+    def eta(self):
+        """Slope of the cone."""
+        return self._cone(self.friction)[0]
+
+    @property
+    def xi(self):
+        """Factor of the cohesion."""
+        return self._cone(self.friction)[1]
+
+    @property
+    def eta_flow(self):
+        """Slope of the cone of the plastic potential."""
+        return self._cone(self.dilation)[0]
+
+    @staticmethod
+    def kirchhoff(F, bulk, shear, eta, xi, eta_flow, cohesion, hardening, plastic, hardened):
+        """Return the Kirchhoff stress (3, 3), Pa, as UFL."""
+        trial = _Trial(F, plastic)
+        to = _return(trial, bulk, shear, eta, xi, eta_flow, cohesion, hardening, hardened)
+        return to["p"] * ufl.Identity(3) + 2 * shear * to["ratio"] * trial.deviatoric
+
+    @staticmethod
+    def update(F, bulk, shear, eta, xi, eta_flow, cohesion, hardening, plastic, hardened):
+        """Return the state at the end of the step, name -> UFL."""
+        trial = _Trial(F, plastic)
+        to = _return(trial, bulk, shear, eta, xi, eta_flow, cohesion, hardening, hardened)
+        # b = exp(2 eps), the elastic strain now eps = p/(3K) I + ratio dev(trial eps)
+        mean, ratio = 2 * to["p"] / (3 * bulk), to["ratio"]
+        b = trial.isotropic(lambda e: ufl.exp(mean + ratio * (ufl.ln(e) - 2 * trial.volumetric / 3)))
+        back = ufl.inv(trial.F)
+        return {
+            "plastic": ufl.conditional(to["yields"], back * b * back.T, plastic),
+            "hardened": hardened + to["hardened"],
+        }
+
+
+class _Trial:
+    """The trial elastic strain of a deformation gradient, in UFL.
+
+    Isotropic functions of b are Newton's interpolation polynomials at its eigenvalues: exact, and smooth where
+    eigenvalues are equal, because nodes need not be eigenvalues and are kept apart.
+    """
+
+    def __init__(self, F, plastic):
+        self.plane = F.ufl_shape == (2, 2)
+        self.F = F
+        if self.plane:
+            self.F = ufl.as_matrix([[F[0, 0], F[0, 1], 0], [F[1, 0], F[1, 1], 0], [0, 0, 1]])
+        self.b = self.F * plastic * self.F.T
+        block = ufl.as_matrix([[self.b[i, j] for j in (0, 1)] for i in (0, 1)]) if self.plane else self.b
+        self.nodes = _eigenvalues(block, 1e-6)
+        strain = self.isotropic(lambda e: ufl.ln(e) / 2)
+        self.volumetric = ufl.tr(strain)
+        self.deviatoric = strain - self.volumetric / 3 * ufl.Identity(3)
+
+    def isotropic(self, f):
+        """Return f(b) (3, 3) for a function of the eigenvalues."""
+        b, I, x, y = self.b, ufl.Identity(3), self.nodes, [f(node) for node in self.nodes]
+        slope = (y[0] - y[1]) / (x[0] - x[1])
+        linear = y[0] * I + slope * (b - x[0] * I)
+        if self.plane:
+            rows = [[linear[i, j] if i < 2 and j < 2 else 0 for j in range(3)] for i in range(3)]
+            rows[2][2] = f(b[2, 2])
+            return ufl.as_matrix(rows)
+        bend = (slope - (y[1] - y[2]) / (x[1] - x[2])) / (x[0] - x[2])
+        return linear + bend * (b - x[0] * I) * (b - x[1] * I)
+
+
+def _return(trial: _Trial, bulk, shear, eta, xi, eta_flow, cohesion, hardening, hardened) -> dict:
+    """Return the stress of a trial elastic strain to the yield surface.
+
+    Returns
+    -------
+    p, ratio: pressure and ratio of the deviator to its trial value; yields: whether the trial stress is outside;
+    hardened: growth of the hardening variable.
+    """
+    p = bulk * trial.volumetric
+    q = shear * ufl.sqrt(2 * ufl.inner(trial.deviatoric, trial.deviatoric) + TINY)  # sqrt(J_2)
+    strength = xi * (cohesion + hardening * hardened)
+    f = q + eta * p - strength
+    cone = f / (shear + bulk * eta * eta_flow + xi**2 * hardening)
+    to_cone = ufl.le(shear * cone, q)
+    slope = xi / (eta + 1e-12)  # no friction has no apex, but every branch must be finite
+    apex = (p - strength / (eta + 1e-12)) / (bulk + slope**2 * hardening)
+    yields = ufl.gt(f, 0)
+
+    def choose(elastic, on_cone, at_apex):
+        return ufl.conditional(yields, ufl.conditional(to_cone, on_cone, at_apex), elastic)
+
+    return {
+        "p": p - choose(0.0, bulk * eta_flow * cone, bulk * apex),
+        "ratio": 1 - choose(0.0, shear * cone / q, 1.0),
+        "hardened": choose(0.0, xi * cone, slope * apex),
+        "yields": yields,
+    }

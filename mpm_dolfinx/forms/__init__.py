@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""UFL forms at material points and in cells: compiled, packed, summed."""

@@ -1,0 +1,186 @@
+# SPDX-License-Identifier: MIT
+"""Forces and matrices of cells: forms of Q1 vectors over points, summed in each cell before they are inserted.
+
+Inserting the matrix of every point costs more than computing it.
+"""
+
+from __future__ import annotations
+
+from math import prod
+
+from petsc4py import PETSc
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from numpy.typing import NDArray
+
+from mpm_dolfinx.forms.point_forms import BATCH, CellSums, FormPoints, PointExpression
+from mpm_dolfinx.points.grid import Grid, sum_by
+
+
+def shape_gradients(points: FormPoints) -> list:
+    """Return the gradients of the cell's Q1 shape functions at the point as UFL."""
+    grid, xi = points.grid, points.offset
+    h = fem.Constant(grid.mesh, grid.h)
+    out = []
+    for signs in grid.signs.tolist():
+        t = [0.5 + signs[a] * xi[a] / h[a] for a in range(grid.dim)]
+        slopes = [signs[a] / h[a] * prod(t[b] for b in range(grid.dim) if b != a) for a in range(grid.dim)]
+        out.append(ufl.as_vector(slopes))
+    return out
+
+
+def element_dofs(grid: Grid, cells: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Return the unrolled local dofs (cells, n) of Q1 vectors in cells."""
+    dofs = grid.cell_nodes[cells][:, :, None] * grid.dim + np.arange(grid.dim, dtype=grid.cell_nodes.dtype)
+    return dofs.reshape(len(cells), -1)
+
+
+def insert(A: PETSc.Mat, points: FormPoints, matrices: NDArray[np.float64], cells=None) -> None:
+    """Add the element matrices of Q1 vectors (cells, n, n) in cells, by default all filled ones, of `points` to `A`."""
+    grid, cells = points.grid, points.filled if cells is None else cells
+    if len(cells):
+        dofs = element_dofs(grid, cells).astype(PETSc.IntType)
+        A.setValuesLocalRCV(dofs, dofs, matrices, addv=True)
+
+
+def _entries(count: int, symmetric: bool) -> tuple[NDArray, NDArray, NDArray]:
+    """Return rows and columns of the entries of a matrix that are needed, and the place of every entry among them."""
+    rows, columns = np.triu_indices(count) if symmetric else np.divmod(np.arange(count**2), count)
+    place = np.empty((count, count), dtype=np.int64)
+    if symmetric:
+        place[columns, rows] = np.arange(len(rows))
+    place[rows, columns] = np.arange(len(rows))
+    return rows, columns, place
+
+
+class ElementForces:
+    """The linear form T : grad v of Q1 vectors over points, summed in each cell.
+
+    Parameters
+    ----------
+    stress : UFL tensor (d, d)
+        T[i, k] at the points.
+    points
+        The points.
+    """
+
+    def __init__(self, stress: ufl.core.expr.Expr, points: FormPoints):
+        self.points, dim = points, points.grid.dim
+        forces = [ufl.dot(stress, gradient) for gradient in shape_gradients(points)]
+        self._sums = CellSums([force[i] for force in forces for i in range(dim)], points)
+
+    def assemble_vector(self, b: NDArray[np.float64]) -> None:
+        """Add the vector to the local array `b`; contributions to ghosts stay there."""
+        dofs = element_dofs(self.points.grid, self.points.filled)
+        b += sum_by(dofs.ravel(), self._sums().ravel(), len(b))
+
+    def assemble_matrix(self, A: PETSc.Mat) -> None:
+        """Add to `A`, which has a row a cell, the vectors of the cells; the caller finalises it."""
+        cells = self.points.filled
+        if len(cells):
+            dofs = element_dofs(self.points.grid, cells).astype(PETSc.IntType)
+            A.setValuesLocalRCV(cells[:, None].astype(PETSc.IntType), dofs, self._sums()[:, None], addv=True)
+
+
+class ElementMatrices:
+    """The bilinear form grad v : A : grad u of Q1 vectors over points, summed in each cell before insertion.
+
+    Inserting the matrix of every point costs twice as much as computing it.  Here the entries of the
+    element matrix, A contracted with the gradients of the shape functions at the point, are tested
+    with DG0, so that the assembler sums them over the points of a cell; then each cell is inserted once.
+
+    Parameters
+    ----------
+    tangent : UFL tensor (d, d, d, d)
+        A[i, k, j, l] at the points.
+    points
+        The points.
+    symmetric
+        Whether A[i, k, j, l] = A[j, l, i, k]: half of the entries are then left out.
+    """
+
+    def __init__(self, tangent: ufl.core.expr.Expr, points: FormPoints, symmetric: bool = True):
+        self.points, dim = points, points.grid.dim
+        rows, columns, self._entry = _entries(2**dim * dim, symmetric)
+        gradients, entries = shape_gradients(points), []
+        for row, column in zip(rows, columns, strict=True):
+            (v, i), (u, j) = divmod(row, dim), divmod(column, dim)
+            block = ufl.as_matrix([[tangent[int(i), k, int(j), l] for l in range(dim)] for k in range(dim)])
+            entries.append(ufl.dot(gradients[v], ufl.dot(block, gradients[u])))
+        self._sums = CellSums(entries, points)
+
+    def assemble_matrix(self, A: PETSc.Mat) -> None:
+        """Add the matrix to `A`, by unrolled local dofs; the caller finalises it."""
+        insert(A, self.points, self._sums()[:, self._entry])
+
+
+class StackedElementMatrices:
+    """The bilinear form (grad v F) : A : (grad u F) of Q1 vectors over points: kernels give A, BLAS contracts it.
+
+    For 3D, where cells hold many points: with the gradients g of the shape functions, times F, stacked over the
+    n points of a cell, its matrix is one product of an 8 x 3n with a 3n x 72 matrix.  Cells are taken in
+    batches of about as many points.
+
+    Hencky's law with 20 points a cell takes 4.2 us a point and 86 us a cell: 2.3 the kernel, 1.4 the products, 0.4
+    the insertion.  Inserting 24 x 24 entries a point took 13.8 us, 300 sums a cell as in `ElementMatrices` take 4.8
+    and twice the time to compile (13 s against 7 s; the former 15 s).  With the points of each octant of a cell
+    merged, 8 in a cell, Newton's method on a bending beam no longer converges.
+
+    Parameters
+    ----------
+    tangent : UFL tensor (d, d, d, d)
+        A[i, k, j, l] at the points.
+    points
+        The points, with the field F (d, d).
+    symmetric
+        Whether A[i, k, j, l] = A[j, l, i, k]: half of the entries are then left out.
+    """
+
+    def __init__(self, tangent: ufl.core.expr.Expr, points: FormPoints, symmetric: bool = True):
+        self.points, self._d = points, points.grid.dim
+        d, (rows, columns, place) = self._d, _entries(self._d**2, symmetric)
+        self._entry = place.reshape(d, d, d, d).transpose(1, 0, 2, 3).ravel()  # (k, i, j, l)
+        pairs = [(*divmod(int(r), d), *divmod(int(c), d)) for r, c in zip(rows, columns, strict=True)]
+        self._tangent = PointExpression(ufl.as_vector([tangent[pair] for pair in pairs]), points)
+        self._places = -1
+
+    def _sort(self) -> None:
+        """Find batches of filled cells that hold about as many points, and their points (cells, most points)."""
+        cells, filled = self.points.cells, self.points.filled
+        order = np.argsort(cells, kind="stable")
+        start = np.searchsorted(cells[order], filled)
+        count = np.diff(start, append=len(cells))
+        self._batches, by_count = [], np.argsort(count, kind="stable")
+        while len(by_count):
+            size = max(1, BATCH // count[by_count[0]])
+            size = max(1, BATCH // count[by_count[min(size, len(by_count)) - 1]])
+            batch, by_count = by_count[:size], by_count[size:]
+            turn = np.arange(count[batch].max())
+            missing = turn >= count[batch, None]
+            points = order[np.where(missing, start[batch, None], start[batch, None] + turn)]
+            self._batches.append((filled[batch], points, missing))
+
+    def assemble_matrix(self, A: PETSc.Mat) -> None:
+        """Add the matrix to `A`, by unrolled local dofs; the caller finalises it."""
+        if self._places != self.points.places:
+            self._places = self.points.places
+            self._sort()
+        self.points.refresh()
+        for cells, points, missing in self._batches:
+            insert(A, self.points, self._matrices(points.ravel(), missing), cells)
+
+    def _matrices(self, chosen: NDArray[np.int64], missing: NDArray[np.bool_]) -> NDArray[np.float64]:
+        """Return the element matrices (cells, n, n) of a batch."""
+        points, d, (cells, most) = self.points, self._d, missing.shape
+        g = points.grid.shape_gradients(points.cells[chosen], points.x[chosen])
+        g = g @ points.values("F", chosen).reshape(-1, d, d)
+        nodes = g.shape[1]
+        tangent = self._tangent.evaluate(chosen)[:, self._entry].reshape(-1, d**3, d)
+        right = (tangent @ g.transpose(0, 2, 1)).reshape(cells, most * d, d * d * nodes)
+        weight = points.data["weight"][chosen, 0] * points.grid.cell_volume
+        g *= np.where(missing.ravel(), 0.0, weight)[:, None, None]
+        left = g.reshape(cells, most, nodes, d).transpose(0, 2, 1, 3).reshape(cells, nodes, most * d)
+        matrices = (left @ right).reshape(cells, nodes, d, d, nodes)
+        return matrices.transpose(0, 1, 2, 4, 3).reshape(cells, nodes * d, nodes * d)

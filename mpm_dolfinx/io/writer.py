@@ -1,0 +1,337 @@
+# SPDX-License-Identifier: MIT
+"""Files of a run: material points and grid for ParaView, histories as a table.
+
+Every output is a file of its own, and the index that names the files is replaced only by a whole one:
+whenever a run ends, what it has written until then can be read.
+"""
+
+from __future__ import annotations
+
+import csv
+import errno
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from xml.etree import ElementTree
+
+from mpi4py import MPI
+
+import meshio
+import numpy as np
+from dolfinx import fem, io
+from numpy.typing import NDArray
+
+from mpm_dolfinx.validation import flag, line, line_of, on_disk, path, whole
+from mpm_dolfinx.parallel.exchange import at_root, to_root
+from mpm_dolfinx.points.bodies import MaterialPoints
+from mpm_dolfinx.timeloop import Result
+
+if TYPE_CHECKING:
+    from mpm_dolfinx.simulation import Simulation
+
+VTK_CELLS = {2: ("quad", [0, 1, 3, 2]), 3: ("hexahedron", [0, 1, 3, 2, 4, 5, 7, 6])}
+"""VTK's cell for a domain, and the domain's corners in VTK's order."""
+WRITABLE = "in a folder that can be written, with room; the run goes on with `after=simulation.result`"
+COUNTS = ("steps", "newton", "coupling", "cuts", "rederived", "balance", "residual", "wall")
+
+
+class Writer:
+    """Writes points, histories and grid of a run: an observer of `Simulation.run`.
+
+    The folder receives `points.pvd`, the points' domains as solid cells with id, material, displacement (m),
+    pore pressure, effective stress (Pa), F, J and what else the points carry; `history.csv`, one row an output
+    time with the counts of `Result` so far, least and largest pressure (Pa), the displacements of the probes (m)
+    and the forces of the given displacements (N, in plane strain N/m; nan where no step has been taken since they
+    were set by a stage or the run was resumed); if asked for `grid.pvd`, the last step's displacement (m), the pore
+    pressure (Pa) and the filled share of the cells.  Tensors: in 2D a field for each component (F_xy), in
+    3D row by row.  ParaView and VTK read all of it, meshio the points.  Stress and pressure of points are those of
+    their cell.
+
+    What the folder holds up to the present time stays, and is continued: made after `resume`, a writer leaves
+    the files of a run that was never interrupted.
+
+    Parameters
+    ----------
+    simulation
+        The scene, in the state from which it is going to run.
+    folder
+        Folder of the files.
+    every
+        Output intervals between two files of points and grid, >= 1; start and end are always written.
+    grid
+        Write the fields of the grid too.
+
+    Raises
+    ------
+    ValueError
+        An argument of another kind, files in the folder that no writer has written or of other columns, a run of
+        another simulation or one that does not go on from where the writer was made.
+    OSError
+        A folder that cannot be written, a disk that is full: `simulation.run(..., after=simulation.result)` goes on.
+    """
+
+    def __init__(self, simulation: Simulation, folder: str | os.PathLike, *, every: int = 1, grid: bool = False):
+        if not hasattr(simulation, "effective_stress"):  # its class is defined later than this one
+            raise ValueError(f"writer: simulation = {line(simulation)}, must be a Simulation")
+        flag("writer: grid", grid)
+        folder, comm, self._t = path("writer: folder", folder), simulation.grid.comm, simulation.t
+        self.every, self._started, self._simulation = whole("writer: every", every), False, simulation
+        self._reactions = simulation.reactions  # at the start
+        with on_disk("writer: folder", "one that can be written"):
+            self._table = Table(comm, folder / "history.csv", self._t)
+            self._points = Series(comm, folder / "points.pvd", self._t)
+            self._grid = Series(comm, folder / "grid.pvd", self._t) if grid else None
+            if not self._points.entries:
+                self._write_points(simulation)
+
+    def __call__(self, simulation: Simulation) -> None:
+        """Write a row of the histories and, in its turn, the present state."""
+        if simulation is not self._simulation:
+            raise ValueError("writer: made for another simulation, must be made for the one that runs")
+        with on_disk(f"{self._points.file.parent}: writer at t = {simulation.t:g} s", WRITABLE):
+            self._write(simulation)
+
+    def _write(self, simulation: Simulation) -> None:
+        result = simulation.result
+        if not self._started:
+            self._start(result)
+        self._table.add(_row(result, simulation.reactions))
+        if (len(result.t) - 1) % self.every and not result.converged:
+            return
+        self._write_points(simulation)
+        self._points.write_index()
+        if self._grid is not None:
+            self._write_grid(simulation)
+            self._grid.write_index()
+
+    def _start(self, result: Result) -> None:
+        """Drop what the folder holds of later times: from here on the files are this run's."""
+        if result.t[-2] != self._t:
+            raise ValueError(f"writer: made at t = {self._t:g} s for a run that goes on from t = {result.t[-2]:g} s")
+        first = Result(t=result.t[:1], displacement=result.displacement[:1], pressure=result.pressure[:1])
+        self._table.start(_row(first, self._reactions))
+        self._points.write_index()
+        if self._grid is not None:
+            self._grid.write_index()
+        self._started = True
+
+    def _write_points(self, simulation: Simulation) -> None:
+        comm, file = simulation.grid.comm, self._points.next.with_suffix(".vtu")
+        points = simulation.points
+        data = {**points.data, "effective_stress": simulation.effective_stress()}
+        points = replace(points, data=data).migrated(to_root(comm, len(points)))
+
+        def write() -> None:
+            with replacing(file) as part:
+                solid(points, points.x - points.origin.mean(axis=1), simulation.fluid is not None).write(
+                    part, file_format="vtu"
+                )
+
+        at_root(comm, write)
+        self._points.entries.append((simulation.t, [file]))
+
+    def _write_grid(self, simulation: Simulation) -> None:
+        comm, stem = simulation.grid.comm, self._grid.next
+        _write_fields(comm, stem.with_suffix(".pvd"), _grid_fields(simulation), simulation.t)
+        if comm.rank == 0:  # our index names the pieces themselves: 0.5's own names each of them once a function
+            stem.with_suffix(".pvd").unlink(missing_ok=True)
+            stem.with_name(f"{stem.name}000000.pvtu").unlink(missing_ok=True)
+        pieces = [stem.with_name(f"{stem.name}_p{rank}_000000.vtu") for rank in range(comm.size)]
+        if not comm.allreduce(_ends(pieces[comm.rank]), op=MPI.LAND):  # dolfinx does not notice a full disk
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(stem))
+        self._grid.entries.append((simulation.t, pieces))
+
+
+def _row(result: Result, reactions: NDArray[np.float64]) -> dict[str, float]:
+    """Return what the histories hold of the last output time, and the forces of the given displacements then."""
+    out = {"t": result.t[-1], **{name: getattr(result, name) for name in COUNTS}}
+    if result.pressure:
+        out["p_min"], out["p_max"] = result.pressure[-1]
+    for i, u in enumerate(result.displacement[-1] if result.displacement else ()):
+        out |= {f"u{axis}_{i}": value for axis, value in zip("xyz", u.tolist(), strict=False)}
+    for i, force in enumerate(reactions):
+        out |= {f"reaction_{axis}_{i}": value for axis, value in zip("xyz", force.tolist(), strict=False)}
+    return out
+
+
+def solid(points: MaterialPoints, displacement: NDArray[np.float64], wet: bool) -> meshio.Mesh:
+    """Return the domains of points as cells of their own, with all that the points carry.
+
+    Parameters
+    ----------
+    points
+        All material points.
+    displacement : (n, d), m
+        Their displacements.
+    wet
+        Whether the points' pore pressure has a meaning.
+    """
+    n, d = points.x.shape
+    kind, order = VTK_CELLS[d]
+    corners = points.corners[:, order].reshape(-1, d)
+    fields = {"id": points.id, "material": points.material, "displacement": displacement, "J": points.J, "F": points.F}
+    if wet:
+        fields["pressure"] = points.pressure
+    fields = {
+        label: [column] for name, rows in {**fields, **points.data}.items() for label, column in _columns(name, rows)
+    }
+    cells = np.arange(len(corners)).reshape(n, -1)
+    return meshio.Mesh(_padded(corners), [(kind, cells)], cell_data=fields)
+
+
+def _padded(vectors: NDArray) -> NDArray:
+    """Return vectors (n, d) with three components, as VTK wants them."""
+    return np.pad(vectors, ((0, 0), (0, 3 - vectors.shape[1])))
+
+
+def _columns(name: str, rows: NDArray) -> Iterator[tuple[str, NDArray]]:
+    """Yield the fields by which VTK shows scalars, vectors or tensors (n, ...)."""
+    if rows.shape[1:] == (2, 2):  # not as 3 x 3: what is out of the plane is not known
+        for i, j in np.ndindex(2, 2):
+            yield f"{name}_{'xy'[i]}{'xy'[j]}", rows[:, i, j]
+    elif rows.shape[1:] == (2,):
+        yield name, _padded(rows)
+    else:
+        yield name, rows.reshape(len(rows), -1) if rows.ndim > 1 else rows
+
+
+def _grid_fields(simulation: Simulation) -> list[fem.Function]:
+    """Return copies, by their names in the file, of the fields of the last step."""
+    fill = simulation.momentum.fill
+    fields = {"step_displacement": simulation.momentum.u, "fill": fill}
+    if simulation.storage is not None:
+        fields["pressure"] = simulation.storage.p
+    out = []
+    for name, field in fields.items():
+        out.append(fem.Function(field.function_space, name=name))
+        out[-1].x.array[:] = field.x.array
+        if name == "pressure":
+            out[-1].x.array[fill.x.array == 0] = 0.0  # of cells that the body has left
+    return out
+
+
+def _write_fields(comm: MPI.Intracomm, file: Path, fields: list[fem.Function], t: float) -> None:
+    with io.VTKFile(comm, str(file), "w") as f:  # writes its index once more when it goes out of scope
+        f.write_function(fields, t)
+
+
+def _ends(file: Path) -> bool:
+    """Whether a file of VTK is there up to its end."""
+    if not file.exists():
+        return False
+    with open(file, "rb") as f:
+        f.seek(-min(64, file.stat().st_size), os.SEEK_END)
+        return f.read().rstrip().endswith(b"</VTKFile>")
+
+
+@contextmanager
+def replacing(file: Path) -> Iterator[Path]:
+    """Give the path of a file to write, which takes the place of `file` when it is whole and on the disk."""
+    part = file.with_name(file.name + ".part")
+    yield part
+    with open(part, "rb") as f:
+        os.fsync(f.fileno())
+    os.replace(part, file)
+
+
+@contextmanager
+def _ours(file: Path) -> Iterator[None]:
+    """Refuse a file that no `Writer` has written, with a ValueError."""
+    try:
+        yield
+    except (ElementTree.ParseError, KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{file}: not of a Writer ({line_of(error)}), must be, or take another folder") from error
+
+
+def kept(entries: Sequence[tuple[float, Any]], t: float) -> list[tuple[float, Any]]:
+    """Return what a run that goes on from time t leaves of earlier (time, ...): nothing if it is a new one."""
+    out = [entry for entry in entries if entry[0] <= t]
+    return out if any(entry[0] < t for entry in out) else []
+
+
+class Series:
+    """A time series for ParaView: an index (.pvd) and the files it names, in a folder beside it.
+
+    entries: (time, its files) so far, the same on every process; next: path of the next file, without suffix.
+    """
+
+    def __init__(self, comm: MPI.Intracomm, file: Path, t: float):
+        self.comm, self.file, self.folder = comm, file, file.with_suffix("")
+        self.entries: list[tuple[float, list[Path]]] = at_root(comm, lambda: kept(self._read(), t))
+
+    @property
+    def next(self) -> Path:
+        return self.folder / f"{len(self.entries):06d}"
+
+    def _read(self) -> list[tuple[float, list[Path]]]:
+        self.folder.mkdir(parents=True, exist_ok=True)
+        times: dict[float, list[Path]] = {}
+        if self.file.exists():
+            with _ours(self.file):
+                for item in ElementTree.parse(self.file).iter("DataSet"):
+                    times.setdefault(float(item.get("timestep")), []).append(self.file.parent / item.get("file"))
+        return list(times.items())
+
+    def write_index(self) -> None:
+        """Write the index of the files so far."""
+        root = ElementTree.Element("VTKFile", type="Collection", version="1.0")
+        collection = ElementTree.SubElement(root, "Collection")
+        for t, files in self.entries:
+            for part, file in enumerate(files):
+                where = file.relative_to(self.file.parent).as_posix()
+                ElementTree.SubElement(collection, "DataSet", timestep=repr(t), part=str(part), file=where)
+
+        def write() -> None:
+            with replacing(self.file) as part:
+                ElementTree.ElementTree(root).write(part)
+
+        at_root(self.comm, write)
+
+
+class Table:
+    """A table in a CSV file, to which rows are added one by one; the first column is the time."""
+
+    def __init__(self, comm: MPI.Intracomm, file: Path, t: float):
+        self.comm, self.file = comm, file
+        self._rows = at_root(comm, lambda: kept(self._read(), t))
+
+    def _read(self) -> list[tuple[float, dict[str, str]]]:
+        if not self.file.exists():
+            return []
+        with _ours(self.file):
+            text = self.file.read_text()
+            whole = text[: text.rfind("\n") + 1].splitlines()  # the last line may have been broken off
+            return [(float(row["t"]), row) for row in csv.DictReader(whole)]
+
+    def start(self, first: dict[str, float]) -> None:
+        """Write the rows that were kept, or else a first row."""
+        rows = [row for _, row in self._rows] or [first]
+        self._columns = list(rows[0])
+        self._check(first)
+
+        def write() -> None:
+            with replacing(self.file) as part:
+                self._append(part, rows, "w")
+
+        at_root(self.comm, write)
+
+    def add(self, row: dict[str, float]) -> None:
+        """Add a row."""
+        self._check(row)
+        at_root(self.comm, lambda: self._append(self.file, [row], "a"))
+
+    def _check(self, row: dict[str, float]) -> None:
+        if list(row) != self._columns:
+            both = f"{', '.join(self._columns)}, the run's {', '.join(row)}"
+            raise ValueError(f"{self.file}: its columns are {both}; must be the same, or in another folder")
+
+    @staticmethod
+    def _append(file: Path, rows: Sequence[dict], mode: str) -> None:
+        with open(file, mode, newline="") as f:
+            writer = csv.DictWriter(f, list(rows[0]), lineterminator="\n")
+            if mode == "w":
+                writer.writeheader()
+            writer.writerows(rows)

@@ -1,0 +1,307 @@
+# SPDX-License-Identifier: MIT
+"""Material points: what the body remembers while the grid is reset, and how bodies are seeded."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields, replace
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
+
+from mpm_dolfinx.validation import asked, instance, numbers, whole
+from mpm_dolfinx.points.cutting import corner_bits, volumes
+from mpm_dolfinx.parallel.exchange import Exchange
+from mpm_dolfinx.points.grid import Grid
+
+
+def determinant(F: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return det F (n,) of (n, d, d); numpy's own, by factors, takes twenty times as long."""
+    if F.shape[1] == 2:
+        return F[:, 0, 0] * F[:, 1, 1] - F[:, 0, 1] * F[:, 1, 0]
+    return np.einsum("ni,ni->n", F[:, 0], np.cross(F[:, 1], F[:, 2]))
+
+
+@dataclass
+class MaterialPoints:
+    """Material points of this process; arrays over its n points.
+
+    Attributes
+    ----------
+    id : (n,)
+        Number of the point in the body.
+    corners : (n, 2^d, d), m
+        Tracked corners of the point's domain, in the order of `domains.corner_bits`.
+    F : (n, d, d)
+        Deformation gradient.
+    volume0 : (n,), m^d
+        Reference volume.
+    material : (n,)
+        Index of the point's material in the scene's list.
+    pressure : (n,), Pa
+        Pore pressure, positive in compression.
+    x : (n, d), m
+        Position.
+    origin : (n, 2^d, d), m
+        Corners from which displacements count: as seeded, or when a stage reset them.
+    data : name -> (n, ...)
+        What else the points carry: parameters that differ from point to point, state of the law.
+    """
+
+    id: NDArray[np.int64]
+    corners: NDArray[np.float64]
+    F: NDArray[np.float64]
+    volume0: NDArray[np.float64]
+    material: NDArray[np.int32]
+    pressure: NDArray[np.float64]
+    x: NDArray[np.float64]
+    origin: NDArray[np.float64]
+    data: dict[str, NDArray[np.float64]] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.id)
+
+    @property
+    def J(self) -> NDArray[np.float64]:
+        """Volume ratio det F (n,)."""
+        return determinant(self.F)
+
+    def map(self, function: Callable[[NDArray], NDArray]) -> MaterialPoints:
+        """Return points with a function applied to each of their arrays: a choice of rows, a copy, a transfer."""
+        arrays = {f.name: function(getattr(self, f.name)) for f in fields(self) if f.name != "data"}
+        return MaterialPoints(**arrays, data={name: function(values) for name, values in self.data.items()})
+
+    def joined(self, other: MaterialPoints) -> MaterialPoints:
+        """Return these points and others, ordered by id."""
+        order = np.argsort(np.concatenate([self.id, other.id]))
+        pairs = {f.name: (getattr(self, f.name), getattr(other, f.name)) for f in fields(self) if f.name != "data"}
+        data = {name: np.concatenate([rows, other.data[name]])[order] for name, rows in self.data.items()}
+        return MaterialPoints(**{name: np.concatenate(pair)[order] for name, pair in pairs.items()}, data=data)
+
+    def copy(self) -> MaterialPoints:
+        """Return a copy that shares no array."""
+        return self.map(np.copy)
+
+    def migrated(self, exchange: Exchange) -> MaterialPoints:
+        """Return the points of this process after every point went to its destination, ordered by id."""
+        received = self.map(exchange.send)
+        order = np.argsort(received.id)
+        return received.map(lambda rows: rows[order])
+
+    def find(self, ids: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return (which of `ids` are points of this process, their indices); points are ordered by id."""
+        at = np.searchsorted(self.id, ids)
+        here = np.flatnonzero((at < len(self)) & (self.id[np.minimum(at, len(self) - 1)] == ids)) if len(self) else []
+        here = np.asarray(here, dtype=np.int64)
+        return here, at[here]
+
+
+@dataclass(frozen=True)
+class Body:
+    """A body as seeded: reference geometry of all its domains, the same on every process.
+
+    lower, spacing : (n, d), (d,), m — box of each domain; sides : (n, d, 2) — whether a face of the
+    domain lies on the surface of the body; map : where the corners of the boxes are put, see `mapped`.
+    """
+
+    lower: NDArray[np.float64]
+    spacing: NDArray[np.float64]
+    sides: NDArray[np.bool_]
+    material: int = 0
+    map: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None
+
+    def __len__(self) -> int:
+        return len(self.lower)
+
+    @property
+    def centre(self) -> NDArray[np.float64]:
+        """Centres of the boxes (n, d), m."""
+        return self.lower + 0.5 * self.spacing
+
+    def corners(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
+        """Return the reference corners (m, 2^d, d), m, of domains."""
+        lower = self.lower[chosen]
+        corners = lower[:, None] + corner_bits(lower.shape[1]) * self.spacing
+        if self.map is None:
+            return corners
+        x = corners.reshape(lower.shape[0] * corners.shape[1], -1)
+        images = numbers("body: the map", asked("body: the map", "a function of positions", self.map, x), None)
+        if images.shape != x.shape:
+            raise ValueError(f"body: the map gives shape {images.shape}, must be one position each, {x.shape}")
+        return images.reshape(corners.shape)
+
+    def size(self) -> NDArray[np.float64]:
+        """Return the edges (n, d), m, of boxes that are as large as the domains."""
+        boxes = np.broadcast_to(self.spacing, self.lower.shape)
+        if self.map is None:
+            return boxes
+        ratio = volumes(self.corners()) / self.spacing.prod()
+        return boxes * ratio[:, None] ** (1 / len(self.spacing))
+
+
+def box(grid: Grid, lower: ArrayLike, upper: ArrayLike, per_cell: int = 2, material: int = 0) -> Body:
+    """Seed the box [lower, upper] with a lattice of points that fills it exactly; return the body.
+
+    Parameters
+    ----------
+    grid
+        Background grid.
+    lower, upper : (d,), m
+        Corners of the box, inside the grid; they need not lie on grid lines.
+    per_cell
+        Points per cell and direction (rounded so that they fit the box), >= 1.  With 1, bodies of a few cells'
+        thickness bend too easily (a warning says so), and the error is about ten times that of 2.
+    material
+        Index of the material in the scene's list, >= 0.
+
+    Raises
+    ------
+    ValueError
+        A corner outside the grid, upper not above lower, or per_cell or material that is no such integer.
+    """
+    instance("body: grid", grid, Grid)
+    lower, upper = (
+        numbers(f"body: {name}", x, (grid.dim,), allowed=f"{grid.dim} finite coordinates")
+        for name, x in (("lower", lower), ("upper", upper))
+    )
+    if not (upper > lower).all():
+        raise ValueError(f"body: box {lower.tolist()} to {upper.tolist()}: upper must be > lower")
+    material, per_cell = whole("body: material", material, 0), whole("body: per_cell", per_cell)
+    count = np.maximum(1, np.rint((upper - lower) / (grid.h / per_cell))).astype(int)
+    spacing = (upper - lower) / count
+    index = np.stack(np.meshgrid(*map(np.arange, count), indexing="ij"), axis=-1).reshape(-1, grid.dim)
+    sides = np.stack([index == 0, index == count - 1], axis=-1)
+    return check_inside(grid, Body(lower + index * spacing, spacing, sides, material))
+
+
+def shape(
+    grid: Grid, inside: Callable[[NDArray[np.float64]], NDArray[np.bool_]], per_cell: int = 2, material: int = 0
+) -> Body:
+    """Seed the points of the grid's own lattice whose centres are inside a shape; return the body.
+
+    Its surface is made of steps of a point's size: for smooth sides take `mapped`.
+
+    Parameters
+    ----------
+    grid
+        Background grid.
+    inside
+        Maps positions (n, d), m, to booleans (n,).
+    per_cell
+        Points per cell and direction, >= 1.
+    material
+        Index of the material in the scene's list, >= 0.
+
+    Raises
+    ------
+    ValueError
+        `inside` raises, gives no booleans or holds nowhere; per_cell or material that is no such integer.
+    """
+    instance("body: grid", grid, Grid)
+    material, per_cell = whole("body: material", material, 0), whole("body: per_cell", per_cell)
+    spacing = grid.h / per_cell
+    count = grid.shape * per_cell
+    index = np.stack(np.meshgrid(*map(np.arange, count), indexing="ij"), axis=-1).reshape(-1, grid.dim)
+    allowed = f"one bool a position, ({len(index)},)"
+    filled = np.asarray(asked("body: inside(x)", allowed, inside, grid.lower + (index + 0.5) * spacing))
+    if filled.shape != (len(index),) or filled.dtype != bool:  # a distance is neither inside nor outside
+        raise ValueError(f"body: inside(x) has shape {filled.shape} of {filled.dtype}, must be {allowed}")
+    padded = np.pad(filled.reshape(count), 1)
+    index = index[filled]
+    if not len(index):
+        raise ValueError("body: inside(x) holds at no point of the grid, must hold at one; the body fits in no cell")
+    sides = np.empty((len(index), grid.dim, 2), dtype=bool)
+    for axis in range(grid.dim):
+        for end in (0, 1):
+            neighbour = index + 1
+            neighbour[:, axis] += 2 * end - 1
+            sides[:, axis, end] = ~padded[tuple(neighbour.T)]
+    return check_inside(grid, Body(grid.lower + index * spacing, spacing, sides, material))
+
+
+def mapped(grid: Grid, body: Body, map: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> Body:
+    """Bend a body: its boxes become the quadrilaterals or hexahedra between the images of their corners.
+
+    Sides keep their names; regions and probes are given by places before the map.  Returns the bent body.
+
+    Parameters
+    ----------
+    grid
+        Background grid.
+    body
+        Of `box` or `shape`.
+    map
+        Maps positions (n, d), m, to positions (n, d), m, inside the grid; smooth, and not turning boxes inside out.
+
+    Raises
+    ------
+    ValueError
+        The map raises, gives another shape or nan, leads out of the grid or turns a box inside out.
+    """
+    instance("body: grid", grid, Grid)
+    instance("body to bend", body, Body)
+    bent = replace(body, map=map)
+    corners = bent.corners()
+    out = np.flatnonzero(grid.outside(corners.reshape(-1, grid.dim)))
+    if len(out):
+        x = corners.reshape(-1, grid.dim)[out[0]]
+        raise ValueError(
+            f"body: the map takes a corner to {x}, must not be outside the grid {grid.lower} to {grid.upper}"
+        )
+    smallest = int(np.argmin(volumes(corners)))
+    if not volumes(corners)[smallest] > 0:
+        raise ValueError(f"body: the map turns the domain at {body.centre[smallest]} inside out, must not")
+    return bent
+
+
+def check_inside(grid: Grid, body: Body, name: str = "body") -> Body:
+    """Return a body; refuse one that is not wholly in the grid.  What a map has bent has been looked at."""
+    outside = grid.outside(body.lower) | grid.outside(body.lower + body.spacing)
+    out = np.flatnonzero(outside & (body.map is None))
+    if len(out):
+        raise ValueError(
+            f"{name}: {len(out)} points outside the grid, the first at {body.centre[out[0]]}, "
+            f"must be inside {grid.lower} to {grid.upper}"
+        )
+    return body
+
+
+def material_points(grid: Grid, bodies: Sequence[Body], pressure: float = 0.0) -> MaterialPoints:
+    """Return this process's material points of the bodies, at rest at pore pressure `pressure` (Pa)."""
+    d = grid.dim
+    corners = np.concatenate([b.corners() for b in bodies])
+    size = np.concatenate([b.size() for b in bodies])
+    material = np.concatenate([np.full(len(b), b.material, dtype=np.int32) for b in bodies])
+    x = corners.mean(axis=1)
+    mine = np.flatnonzero(grid.owner(grid.number(grid.index(x))) == grid.comm.rank)
+    n = len(mine)
+    return MaterialPoints(
+        id=mine,
+        corners=corners[mine],
+        F=np.tile(np.eye(d), (n, 1, 1)),
+        volume0=size[mine].prod(axis=1),
+        material=material[mine],
+        pressure=np.full(n, float(numbers("pressure", pressure))),
+        x=x[mine],
+        origin=corners[mine],
+    )
+
+
+def check_apart(bodies: Sequence[Body], present: Sequence[bool]) -> None:
+    """Refuse bodies of which domains lie in each other as seeded; those that a map has bent are not looked at."""
+    there = [i for i, body in enumerate(bodies) if present[i] and body.map is None]
+    for i, j in combinations(there, 2):
+        a, b = bodies[i], bodies[j]
+        low, high = (
+            np.maximum(a.lower.min(axis=0), b.lower.min(axis=0)),
+            [(body.lower.max(axis=0) + body.spacing) for body in (a, b)],
+        )
+        size = (a.spacing + b.spacing) / 2
+        if not (np.minimum(*high) - low > 1e-6 * size).all():
+            continue
+        distance, _ = cKDTree(a.centre / size).query(b.centre / size, p=np.inf, distance_upper_bound=1 - 1e-6)
+        inside = np.flatnonzero(distance < 1 - 1e-6)
+        if len(inside):
+            raise ValueError(f"bodies {i} and {j}: both are at {b.centre[inside[0]]}, must not lie in each other")

@@ -1,0 +1,217 @@
+# SPDX-License-Identifier: MIT
+"""Where the points lie on the grid of a step: their pieces, who owns the cells, values there and back."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+from mpi4py import MPI
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpm_dolfinx.points.cutting import Pieces, cut, cut_faces
+from mpm_dolfinx.parallel.exchange import Exchange, first, over_all
+from mpm_dolfinx.forms.point_forms import CHUNK
+from mpm_dolfinx.points.grid import Grid, sum_by
+from mpm_dolfinx.points.bodies import MaterialPoints
+from mpm_dolfinx.points.faces import Surface, face_vectors, interpolate
+
+STAYS = 3e-4
+"""Cells by which corners may have moved since the domains were cut before they are cut anew.
+
+A column of ten cells that consolidates then differs by 7e-5 of the load in its pressures and by 3e-5 of the
+settlement from one that is cut in every step; both are proportional to this number.
+"""
+DEPTH = 1e-6  # cells: how far under the surface the cell is looked up; of corners, share of the way to the middle
+
+
+class Patches:
+    """Points of integration on faces of the domains; arrays over n points.
+
+    Parameters
+    ----------
+    faces
+        The faces; and of each point:
+    here, at : (n,)
+        its face among these, and the material point;
+    cell : (n,)
+        lexicographic cell;
+    x, xi : (n, d), m, -
+        position when the domains were cut, and in the domain;
+    share : (n,)
+        of the face.
+    """
+
+    def __init__(self, faces: Surface, here, at, cell, x, xi, share):
+        self._faces, self._here, self._at, self._xi = faces, here, at, xi
+        self.cell, self.x = cell, x
+        self.area0 = share * faces.area0[here]
+        """Reference areas (n,), m^(d-1)."""
+
+    @cached_property
+    def X(self) -> NDArray[np.float64]:
+        """Reference positions (n, d), m."""
+        return self._faces.reference(self._here, self._xi)
+
+    def origin(self, points: MaterialPoints) -> NDArray[np.float64]:
+        """Return the positions (n, d), m, from which displacements count."""
+        return interpolate(points.origin[self._at], self._xi)
+
+    def now(self, points: MaterialPoints) -> NDArray[np.float64]:
+        """Return where the points of integration have moved to (n, d), m."""
+        return interpolate(points.corners[self._at], self._xi)
+
+    def area(self, points: MaterialPoints) -> NDArray[np.float64]:
+        """Return the outward area vectors (n, d), m^(d-1)."""
+        share = self.area0 / self._faces.whole0[self._here]
+        return face_vectors(points.corners[self._at], self._faces.axis, self._faces.end) * share[:, None]
+
+
+class LeftGrid(RuntimeError):
+    """A material point lies outside the grid."""
+
+
+class Placement:
+    """The points' domains cut by the cells, and the way of their data to the owners of the cells.
+
+    It serves until the points have moved: where they were when they were cut is what the grid sees.
+
+    Parameters
+    ----------
+    grid
+        Background grid.
+    points
+        The material points of this process.
+    quadrature
+        "domain": exact pieces of the points' domains; "point": one piece a point, as in the seed paper.
+    t
+        Time, s, for the message of a point that has left the grid.
+
+    Raises
+    ------
+    LeftGrid
+        Naming the first point outside the grid.
+    """
+
+    def __init__(self, grid: Grid, points: MaterialPoints, quadrature: str, t: float):
+        self.grid, self.points = grid, points
+        self._corners, self._x = points.corners.copy(), points.x
+        self._patches: dict[Surface, Patches] = {}
+        self._followed: tuple[Exchange, NDArray[np.int32], NDArray[np.float64]] | None = None
+        self._check_inside(points.corners if quadrature == "domain" else points.x[:, None], t)
+        self.pieces = cut(grid, points.corners) if quadrature == "domain" else whole_points(grid, points.x)
+        self._travel = Exchange(grid.comm, grid.owner(self.pieces.cell))
+        self.cells, self.x = grid.local(self._travel.send(self.pieces.cell)), self._travel.send(self.pieces.x)
+        """Owned cells, and centroids (m, d), m, of the pieces that this process integrates."""
+        self.moved = np.zeros_like(self.pieces.x)
+        """Displacements (m, d), m, of the pieces since they were cut."""
+
+    def _check_inside(self, x: NDArray[np.float64], t: float) -> None:
+        grid, points, message = self.grid, self.points, ""
+        out = np.flatnonzero(grid.outside(x.reshape(-1, grid.dim)))
+        if len(out):
+            i = out[0] // x.shape[1]
+            message = f"point {points.id[i]} at {points.x[i]} left the grid {grid.lower} to {grid.upper} at t = {t:g} s"
+            message += ", must stay in it: take a larger grid"
+        if message := first(grid.comm, message):
+            raise LeftGrid(message)
+
+    def serves(self) -> bool:
+        """Return whether the points are still where they were, but for `STAYS`."""
+        moved = np.abs((self.points.corners - self._corners) / self.grid.h).max(initial=0.0)
+        return over_all(self.grid.comm, moved, MPI.MAX) <= STAYS
+
+    def to_cells(self, values: NDArray) -> NDArray:
+        """Send values of the points (n, ...) to the owners of their pieces' cells (m, ...)."""
+        return self._travel.send(values[self.pieces.point])
+
+    def pieces_to_cells(self, values: NDArray) -> NDArray:
+        """Send values of the pieces to the owners of their cells."""
+        return self._travel.send(values)
+
+    def to_pieces(self, values: NDArray) -> NDArray:
+        """Bring values at the integrated pieces back to the pieces of this process's points."""
+        return self._travel.back(values)
+
+    def mean(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the volume means (n,) over the pieces of each point of values (m,) on the pieces."""
+        return sum_by(self.pieces.point, self.pieces.fraction * values, len(self.points))
+
+    def surface(self, faces: Surface) -> Patches:
+        """Return points of integration on the faces that this process's points have.
+
+        The cell is that of a place just under the surface, which holds a piece of the domain: its
+        shape functions, continued to the surface, put the load on nodes that have stiffness.
+        """
+        if faces not in self._patches:
+            self._patches[faces] = self._cut_surface(faces)
+        return self._patches[faces]
+
+    def _cut_surface(self, faces: Surface) -> Patches:
+        here, at = self.points.find(faces.id)
+        corners, xi = self._corners[at], faces.corners()[here]
+        count = xi.shape[1]
+        places = interpolate(np.repeat(corners, count, axis=0), xi.reshape(-1, self.grid.dim)).reshape(xi.shape)
+        face, x, xi, share, middle = cut_faces(self.grid, places, xi)
+        outward = face_vectors(corners, faces.axis, faces.end)
+        size = np.linalg.norm(outward, axis=1, keepdims=True)
+        inward = -DEPTH * self.grid.h.min() * np.divide(outward, size, out=np.zeros_like(outward), where=size > 0)
+        cell = self._filled_cell(at[face], middle + inward[face])
+        return Patches(faces, here[face], at[face], cell, x, xi, share)
+
+    def displacement(self, u: NDArray[np.float64], corners: bool) -> NDArray[np.float64]:
+        """Return the Q1 field u (nodes, d) at the corners (n, 2^d, d), or at the points (n, d), when they were cut."""
+        if self._followed is None:
+            self._followed = self._follow(corners)
+        travel, cells, x = self._followed
+        moved = np.empty_like(x)
+        for part in (slice(start, start + CHUNK) for start in range(0, len(x), CHUNK)):
+            N = self.grid.shape_values(cells[part], x[part])
+            moved[part] = np.einsum("mk,mkd->md", N, u[self.grid.cell_nodes[cells[part]]])
+        return travel.back(moved).reshape(self._corners.shape if corners else self._x.shape)
+
+    def _follow(self, corners: bool) -> tuple[Exchange, NDArray[np.int32], NDArray[np.float64]]:
+        """Return the way to the owners of the cells of corners or points, these cells, and the positions."""
+        grid, n, d = self.grid, len(self.points), self.grid.dim
+        at = np.repeat(np.arange(n), 2**d if corners else 1)
+        x = self._corners.reshape(-1, d) if corners else self._x
+        # of a corner on a grid line, rounding must not choose a cell in which the domain does not lie
+        cell = self._filled_cell(at, x + DEPTH * (self._x[at] - x))
+        travel = Exchange(grid.comm, grid.owner(cell))
+        return travel, grid.local(travel.send(cell)), travel.send(x)
+
+    def total_displacement(self) -> NDArray[np.float64]:
+        """Return the displacements (m, d), m, of the pieces' centroids, as those of their domains' corners."""
+        points, pieces = self.points, self.pieces
+        now, then = (c - c.mean(axis=1, keepdims=True) for c in (points.corners, points.origin))
+        stretch = np.linalg.solve(then.swapaxes(1, 2) @ then, then.swapaxes(1, 2) @ now)  # of the corners' pattern
+        off = pieces.x - points.x[pieces.point]
+        off0 = np.linalg.solve(stretch.swapaxes(1, 2)[pieces.point], off[:, :, None])[:, :, 0]
+        return off + (points.x - points.origin.mean(axis=1))[pieces.point] - off0
+
+    def _filled_cell(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Return the cells (m,) of positions in domains; where no piece of the domain lies, of its largest piece."""
+        pieces, cells = self.pieces, int(np.prod(self.grid.shape))
+        cell = self.grid.number(self.grid.index(x))
+        key, keys = at * cells + cell, pieces.point * cells + pieces.cell
+        if not len(key):
+            return cell
+        found = np.minimum(np.searchsorted(keys, key), len(keys) - 1)
+        empty = keys[found] != key
+        if empty.any():
+            cell[empty] = pieces.cell[self._largest()[at[empty]]]
+        return cell
+
+    def _largest(self) -> NDArray[np.int64]:
+        """Return the largest piece of each point (n,)."""
+        order = np.lexsort((self.pieces.fraction, self.pieces.point))
+        return order[np.cumsum(np.bincount(self.pieces.point, minlength=len(self.points))) - 1]
+
+
+def whole_points(grid: Grid, x: NDArray[np.float64]) -> Pieces:
+    """Return one piece a point, at the point; a cell that holds points has open faces."""
+    n, number = len(x), grid.number(grid.index(x))
+    _, cell, count = np.unique(number, return_inverse=True, return_counts=True)
+    share = (grid.cell_volume / grid.h) / count[cell][:, None]
+    return Pieces(np.arange(n), number, np.ones(n), x.copy(), np.stack([share, share], axis=2))

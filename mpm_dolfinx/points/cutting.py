@@ -1,0 +1,349 @@
+# SPDX-License-Identifier: MIT
+"""The points' domains, cut by the grid into pieces that lie in one cell each.
+
+A point stands for a quadrilateral or hexahedron of tracked corners.  Its pieces carry exact volumes
+and centroids: gradients of Q1 functions are linear within a cell, so one row of integration data a
+piece integrates them exactly, and the answer does not depend on how points lie on the grid.
+
+The surface of a domain (4 edges, or the 12 outer triangles of its 6 Kuhn tetrahedra, which match those of
+the neighbours) is sliced by the grid planes of one axis after the other.  Gauss's theorem turns the slices into
+volumes and first moments of what lies between them and the lower face of their cell and, below it, of whole
+columns of cells: nothing inside a domain is ever cut, and the faces of the pieces come for free.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from itertools import permutations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpm_dolfinx.points.grid import Grid, sum_by
+
+SNAP = 1e-10  # cells: vertices this close to a grid plane are taken to lie on it
+SLIVER = 1e-12  # of the domain: smaller pieces are dropped; less than a piece that is SNAP thin, whose face is open
+CHUNK = 2**15  # corners of domains that are cut at a time, in the processor's cache
+TANGLED = 0.2  # of its volume: a domain whose corners span less is re-derived from F
+
+
+@dataclass
+class Pieces:
+    """Domains cut by the cells; arrays over the pieces, ordered by point and cell.
+
+    point : (m,) index of the domain; cell : (m,) lexicographic number of the cell;
+    fraction : (m,) share of the domain's volume; x : (m, d) centroid, m;
+    faces : (m, d, 2) area of the piece on the lower and upper face of its cell, m^(d-1).
+    """
+
+    point: NDArray[np.int64]
+    cell: NDArray[np.int64]
+    fraction: NDArray[np.float64]
+    x: NDArray[np.float64]
+    faces: NDArray[np.float64]
+
+
+def corner_bits(dim: int) -> NDArray[np.int64]:
+    """Return the (2^d, d) ends (0 lower, 1 upper) of the corners of a domain along each axis."""
+    return (np.arange(2**dim)[:, None] >> np.arange(dim)) & 1
+
+
+def kuhn_simplices(dim: int) -> NDArray[np.int64]:
+    """Return the (d!, d+1) corners of the simplices that a domain is split into."""
+    return np.array([[sum(1 << a for a in p[:k]) for k in range(dim + 1)] for p in permutations(range(dim))])
+
+
+def volumes(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the volumes (n,), m^d, of domains (n, 2^d, d), negative if they are turned inside out."""
+    return sum(_simplex_volumes(np.ascontiguousarray(corners.transpose(1, 2, 0))))
+
+
+def _simplex_volumes(y: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    """Return the signed volumes (n,) of each simplex of domains (2^d, d, n)."""
+    d, out = y.shape[1], []
+    for simplex, sign in zip(kuhn_simplices(d), _ORIENTATION[d], strict=True):
+        height = y[simplex[-1]] - y[simplex[0]]
+        out.append((_area_vectors(y[simplex[:-1]]) * height).sum(axis=0) * (sign * (-1) ** (d + 1) / d))
+    return out
+
+
+def tangled(corners: NDArray[np.float64], volume: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which domains (n, 2^d, d) have folded: their corners span far less, or more, than their volume (n,)."""
+    ratio = volumes(corners) / volume
+    return (ratio < TANGLED) | (ratio > 1 / TANGLED)
+
+
+def parallelepipeds(
+    x: NDArray[np.float64], F: NDArray[np.float64], spacing: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the corners (n, 2^d, d), m, of boxes of size `spacing` (n, d) about x (n, d), deformed by F (n, d, d)."""
+    offset = (corner_bits(x.shape[1]) - 0.5) * spacing[:, None, :]
+    return x[:, None] + np.einsum("nab,nkb->nka", F, offset)
+
+
+_ORIENTATION = {d: np.sign(np.linalg.det(np.diff(corner_bits(d)[kuhn_simplices(d)], axis=1))) for d in (2, 3)}
+
+
+def cut(grid: Grid, corners: NDArray[np.float64]) -> Pieces:
+    """Cut the domains by the grid.
+
+    Parameters
+    ----------
+    corners : (n, 2^d, d), m
+        Corners of the domains, inside the grid; corner k has the ends `corner_bits(d)[k]`.
+
+    Returns
+    -------
+    The pieces, slivers below 1e-12 of their domain left out; fractions sum to one for every domain.
+    """
+    size = CHUNK // 2**grid.dim
+    starts = range(0, max(1, len(corners)), size)
+    parts = [_cut(grid, corners[start : start + size]) for start in starts]
+    for start, part in zip(starts, parts, strict=True):
+        part.point += start
+    columns = zip(*([getattr(part, f.name) for f in fields(Pieces)] for part in parts), strict=True)
+    return Pieces(*map(np.concatenate, columns))
+
+
+def _cut(grid: Grid, corners: NDArray[np.float64]) -> Pieces:
+    d, y = grid.dim, np.ascontiguousarray(((corners - grid.lower) / grid.h).transpose(1, 2, 0))
+    nearest = np.rint(y)
+    y = np.where(np.abs(y - nearest) < SNAP, nearest, y)
+    # segments or triangles (d, d, m): vertices and coordinates first, which keeps the loops in numpy's fast lanes
+    s = np.concatenate([y[facet] for facet in _FACETS[d][:, [0, -1]].reshape(-1, d)], axis=2)
+    outward, owner = _area_vectors(s), np.tile(np.arange(len(corners)), 2 * len(_FACETS[d]))
+    # a simplex that is turned inside out, in a domain about to fold, counts as positive: minus twice its volume
+    simplex, folded = np.nonzero(np.less(_simplex_volumes(y), 0))
+    if len(folded):
+        turned = y[_FACETS[d][simplex], :, folded[:, None, None]].transpose(2, 3, 0, 1).reshape(d, d, -1)
+        s = np.concatenate([s, turned, turned], axis=2)
+        outward = np.concatenate([outward, *[-_area_vectors(turned)] * 2], axis=1)
+        owner = np.concatenate([owner, *[np.repeat(folded, d + 1)] * 2])
+    facet = np.arange(s.shape[2])
+    for axis in range(d):
+        s, facet = _slice(s, facet, axis)
+    area = _area_vectors(s)
+    area *= np.sign((area * outward[:, facet]).sum(axis=0))  # slicing has shuffled the vertices
+    return _sum(grid, _Slots(grid, y), s, area, owner[facet])
+
+
+def _area_vectors(s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the normals (d, m) of segments or triangles (d, d, m), as long as these are large."""
+    e = s[1:] - s[0]
+    if len(e) == 1:
+        return np.stack([e[0, 1], -e[0, 0]])
+    (ax, ay, az), (bx, by, bz) = e
+    return 0.5 * np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
+
+
+def _facets(dim: int) -> NDArray[np.int64]:
+    """Return the (d!, d+1, d) corners of the facets of a domain's simplices, turned outward.
+
+    The k-th facet lacks the k-th corner; the first and the last are part of the domain's surface.
+    """
+    out = np.stack([np.delete(kuhn_simplices(dim), k, axis=1) for k in range(dim + 1)], axis=1)
+    bits = corner_bits(dim).astype(float)
+    for simplex, facets in zip(kuhn_simplices(dim), out, strict=True):
+        for facet in facets:
+            away = bits[facet].mean(axis=0) - bits[simplex].mean(axis=0)
+            if _area_vectors(bits[facet][:, :, None])[:, 0] @ away < 0:
+                facet[:2] = facet[1::-1].copy()
+    return out
+
+
+class _Slots:
+    """The cells that the bounding boxes of domains touch: a slot for each domain and cell, the last axis fastest."""
+
+    def __init__(self, grid: Grid, y: NDArray[np.float64]):
+        top = (grid.shape - 1)[:, None]
+        self.low = np.clip(np.floor(y.min(axis=0)).astype(np.int64), 0, top)
+        self.high = np.clip(np.ceil(y.max(axis=0)).astype(np.int64) - 1, self.low, top)
+        span = self.high - self.low + 1
+        stop = np.cumsum(span.prod(axis=0))
+        self.size = int(stop[-1]) if len(stop) else 0
+        self.point = np.repeat(np.arange(y.shape[2]), span.prod(axis=0))
+        self._stride = np.cumprod(np.concatenate([np.ones_like(span[:1]), span[:0:-1]]), axis=0)[::-1]
+        self._start, self._span = stop - span.prod(axis=0), span
+        number = np.arange(self.size) - self._start[self.point]
+        self._place = number // self._stride[:, self.point] % span[:, self.point]
+        self.cell = self.low[:, self.point] + self._place
+
+    def of(self, owner: NDArray[np.int64], index: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Return the slots (m,) of domains and cells (d, m)."""
+        place = index.astype(np.int64) - self.low[:, owner]
+        return self._start[owner] + (place * self._stride[:, owner]).sum(axis=0)
+
+    def beyond(self, values: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
+        """Return the sums of the values of slots over the cells further along an axis in the same column."""
+        out = np.zeros(self.size)
+        for steps in range(1, int(self._span[axis].max(initial=1))):
+            has = np.flatnonzero(self._place[axis] + steps < self._span[axis][self.point])
+            out[has] += values[has + steps * self._stride[axis][self.point[has]]]
+        return out
+
+
+def _sum(
+    grid: Grid, slots: _Slots, s: NDArray[np.float64], area: NDArray[np.float64], owner: NDArray[np.int64]
+) -> Pieces:
+    """Sum the slices of the surfaces by (point, cell) into pieces."""
+    d = grid.dim
+    index, least, most = np.floor(s.mean(axis=0)), s.min(axis=0), s.max(axis=0)
+    ends = []
+    for a in range(d):
+        # what lies on a grid plane belongs to the cell of the body behind it
+        index[a] -= (area[a] > 0) & (most[a] == index[a])
+        np.clip(index[a], slots.low[a][owner], slots.high[a][owner], out=index[a])
+        flat = most[a] - least[a] < SNAP  # of two domains that touch, rounding may snap one only: hence 2 SNAP
+        lower = np.flatnonzero(flat & (area[a] < 0) & (most[a] - index[a] < 2 * SNAP))
+        upper = np.flatnonzero(flat & (area[a] > 0) & (index[a] + 1 - least[a] < 2 * SNAP))
+        ends.append((lower, upper))
+    slot = slots.of(owner, index)
+
+    def total(values, chosen=slice(None)):
+        return sum_by(slot[chosen], values[chosen], slots.size)
+
+    # integrals over the slices of (x, x^2/2, xy, xz) n_x from the cell's lower face, and of the columns beyond
+    x = s - index
+    sums, products = x.sum(axis=0), area[0] / (d * (d + 1))
+    shadow = total(area[0])
+    beyond = slots.beyond(shadow, 0)
+    volume = total(area[0] * sums[0] / d) + beyond
+    moments = [total(products / 2 * (sums[0] ** 2 + (x[:, 0] ** 2).sum(axis=0))) + beyond / 2]
+    for a in range(1, d):
+        within = total(products * (sums[0] * sums[a] + (x[:, 0] * x[:, a]).sum(axis=0)))
+        moments.append(within + slots.beyond(total(area[0] * sums[a] / d), 0))
+
+    whole = sum_by(slots.point, volume, len(slots.low[0]))[slots.point]
+    kept = np.flatnonzero(volume / whole > SLIVER)
+    point, cell = slots.point[kept], slots.cell[:, kept].T
+    faces = np.empty((len(kept), d, 2))
+    for a in range(d):
+        shadow = total(area[a]) if a else shadow
+        beyond = slots.beyond(shadow, a)
+        lower, upper = (total(area[a], chosen) for chosen in ends[a])
+        # the section of the body just above the lower and just below the upper face
+        faces[:, a] = np.stack([beyond + shadow - lower, beyond + upper], axis=1)[kept]
+        faces[:, a] *= grid.cell_volume / grid.h[a]
+
+    # centroids stay off the grid lines, and inside the cell that they belong to
+    volume = volume[kept]
+    centroid = cell + np.clip(np.stack([m[kept] / volume for m in moments], axis=1), SNAP, 1 - SNAP)
+    fraction = volume / sum_by(point, volume, len(slots.low[0]))[point]
+    return Pieces(point, grid.number(cell), fraction, grid.lower + grid.h * centroid, np.abs(faces))
+
+
+def cut_faces(
+    grid: Grid, corners: NDArray[np.float64], local: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Cut faces of domains by the grid; return points of integration, exact for what Q1 makes of a face in a cell.
+
+    A force on a face that crosses a grid line belongs to the nodes on both sides by what lies there: with one
+    point a face, what is left over moves nodes of partly filled cells in every step, for ever.
+
+    Parameters
+    ----------
+    corners : (m, 2^(d-1), d), m
+        Corners of the faces.
+    local : (m, 2^(d-1), e)
+        Coordinates of the corners to be interpolated.
+
+    Returns
+    -------
+    Of each point: its face, its position (n, d), its local coordinates (n, e), its share of the face; and the
+    middle (n, d) of the part of the face in one cell that it belongs to.
+    """
+    d, m = grid.dim, len(corners)
+    y = (corners - grid.lower) / grid.h
+    nearest = np.rint(y)
+    y = np.where(np.abs(y - nearest) < SNAP, nearest, y)
+    both = np.concatenate([y, local], axis=2).transpose(1, 2, 0)
+    split = kuhn_simplices(d - 1)
+    s = np.concatenate([both[list(simplex)] for simplex in split], axis=2)
+    owner = np.arange(s.shape[2])
+    whole = s
+    for axis in range(d):
+        s, owner = _slice(s, owner, axis)
+    # the local coordinates tell sizes, for they are never degenerate
+    share = _size(s[:, d:]) / _size(whole[:, d:])[owner] / len(split)
+    kept = np.flatnonzero(share > SLIVER)  # what only touches a plane leaves nothing
+    s, owner, share = s[:, :, kept], owner[kept], share[kept]
+    points = np.einsum("qk,kam->qam", _RULES[d], s)
+    middle = np.tile((grid.lower + grid.h * s[:, :d].mean(axis=0).T), (len(points), 1))
+    points = points.transpose(0, 2, 1).reshape(-1, both.shape[1])
+    face = np.tile(owner % max(1, m), d)
+    return face, grid.lower + grid.h * points[:, :d], points[:, d:], np.tile(share / d, d), middle
+
+
+def _size(s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return lengths or areas, up to a factor, of segments or triangles (k+1, e, m)."""
+    e = s[1:] - s[0]
+    return np.sqrt(np.abs(np.linalg.det(np.einsum("iam,jam->mij", e, e))))
+
+
+_RULES = {  # barycentric points of equal weight, exact to second order on segments and triangles
+    2: 0.5 + np.array([[1, -1], [-1, 1]]) / np.sqrt(12),
+    3: (1 + 3 * np.eye(3)) / 6,
+}
+
+
+def _slice(s: NDArray[np.float64], owner: NDArray[np.int64], axis: int):
+    """Slice simplices by the integer planes of an axis until none crosses a plane."""
+    done_s, done_owner = [], []
+    while True:
+        t = s[:, axis]
+        plane = np.floor(t.min(axis=0)) + 1
+        crossing = t.max(axis=0) > plane
+        if not crossing.any():
+            break
+        done_s.append(s[:, :, ~crossing])
+        done_owner.append(owner[~crossing])
+        below, below_owner, s, owner = _cut_at(s[:, :, crossing], owner[crossing], axis, plane[crossing])
+        done_s.append(below)
+        done_owner.append(below_owner)
+    return (np.concatenate([s, *done_s], axis=2), np.concatenate([owner, *done_owner])) if done_s else (s, owner)
+
+
+def _cut_at(s, owner, axis: int, plane):
+    """Cut each simplex at its plane; return the parts below and above with their owners."""
+    order = np.argsort(s[:, axis], axis=0)
+    s = np.take_along_axis(s, order[:, None], axis=0)
+    count = (s[:, axis] < plane).sum(axis=0)  # vertices below the plane
+    dim = len(s) - 1
+    parts = {"below": [s[:, :, :0]], "above": [s[:, :, :0]]}
+    owners = {"below": [owner[:0]], "above": [owner[:0]]}
+    for k in range(1, dim + 1):
+        chosen = np.flatnonzero(count == k)
+        v, c = s[:, :, chosen], plane[chosen]
+        points = {(i,): v[i] for i in range(dim + 1)}
+        for i in range(k):
+            for j in range(k, dim + 1):
+                points[i, j] = _on_plane(v[i], v[j], axis, c)
+        for where, simplices in _CUTS[dim][k].items():
+            parts[where] += [np.stack([points[p] for p in simplex]) for simplex in simplices]
+            owners[where] += [owner[chosen]] * len(simplices)
+    return (
+        np.concatenate(parts["below"], axis=2),
+        np.concatenate(owners["below"]),
+        np.concatenate(parts["above"], axis=2),
+        np.concatenate(owners["above"]),
+    )
+
+
+def _on_plane(a, b, axis: int, plane):
+    """Return the points where the edges from a to b meet the plane, exactly on it."""
+    t = (plane - a[axis]) / (b[axis] - a[axis])
+    x = a + t * (b - a)
+    x[axis] = plane
+    return x
+
+
+_A, _B, _C = (0,), (1,), (2,)
+# vertices are sorted along the axis; (i, j) is the point where the edge from i to j meets the plane
+_CUTS = {
+    1: {1: {"below": [(_A, (0, 1))], "above": [((0, 1), _B)]}},
+    2: {
+        1: {"below": [(_A, (0, 1), (0, 2))], "above": [((0, 1), _B, _C), ((0, 1), _C, (0, 2))]},
+        2: {"below": [(_A, _B, (1, 2)), (_A, (1, 2), (0, 2))], "above": [((0, 2), (1, 2), _C)]},
+    },
+}
+_FACETS = {d: _facets(d) for d in (2, 3)}

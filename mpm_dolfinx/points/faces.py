@@ -1,0 +1,210 @@
+# SPDX-License-Identifier: MIT
+"""The surface of the bodies, and places in them whose displacement is wanted."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
+
+from mpm_dolfinx.validation import all_of, line, numbers
+from mpm_dolfinx.points.cutting import corner_bits
+from mpm_dolfinx.parallel.exchange import over_all
+from mpm_dolfinx.points.grid import side
+from mpm_dolfinx.points.bodies import Body, MaterialPoints
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Faces of domains on one side of the bodies, the same on every process; arrays over m faces.
+
+    id : (m,) number of the point; xi : (m, 2, d) ends of the part of the face that counts, in the domain's
+    coordinates from -1 to 1; X : (m, 2, d) their reference positions, before a map, m; whole0 : (m,) reference
+    area of the whole face, m^(d-1); axis, end : side of the domain.
+    """
+
+    id: NDArray[np.int64]
+    xi: NDArray[np.float64]
+    X: NDArray[np.float64]
+    whole0: NDArray[np.float64]
+    axis: int
+    end: int
+
+    def __len__(self) -> int:
+        return len(self.id)
+
+    @property
+    def area0(self) -> NDArray[np.float64]:
+        """Reference area (m,) of the parts that count, m^(d-1)."""
+        return self.whole0 * np.delete((self.xi[:, 1] - self.xi[:, 0]) / 2, self.axis, axis=1).prod(axis=1)
+
+    def corners(self) -> NDArray[np.float64]:
+        """Return the corners (m, 2^(d-1), d) of the parts in the domain's coordinates."""
+        dim = self.xi.shape[2]
+        bits = np.insert(corner_bits(dim - 1), self.axis, 0, axis=1)
+        return self.xi[:, bits, np.arange(dim)]
+
+    def reference(self, face: NDArray[np.int64], xi: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the reference positions (n, d), m, of places xi (n, d) on faces."""
+        (a, b), (A, B) = self.xi[face].swapaxes(0, 1), self.X[face].swapaxes(0, 1)
+        t = np.divide(xi - a, b - a, out=np.zeros_like(xi), where=b > a)
+        return A + t * (B - A)
+
+
+Region = tuple[ArrayLike, ArrayLike]
+
+
+def limits(region: Region | None, dim: int) -> NDArray[np.float64]:
+    """Return the corners (2, d) of a region, m; without one, of all space."""
+    if region is None:
+        return np.repeat([[-np.inf], [np.inf]], dim, axis=1)
+    allowed = f"two corners of {dim} coordinates each, the lower first"
+    return numbers("region", region, (2, dim), allowed=allowed, test=lambda x: x[0] <= x[1])
+
+
+def surface(
+    bodies: Sequence[Body], name: str, region: Region | None = None, present: Sequence[bool] | None = None
+) -> Surface:
+    """Return the faces on a named side of the bodies that are present, where no other of them touches.
+
+    Parameters
+    ----------
+    name
+        Side: "left", "right", "bottom", "top", in 3D also "front", "back".
+    region : ((d,), (d,)), m
+        Box of reference positions that limits the faces; faces partly in it count with that part.
+    present
+        Which bodies are there, by default all.
+    """
+    there = [body for i, body in enumerate(bodies) if present is None or present[i]]
+    dim = bodies[0].lower.shape[1]
+    axis, end = side(name, dim)
+    tangential = np.arange(dim) != axis
+    low, high = limits(region, dim)
+    start, ids, xis, Xs, wholes = 0, [], [], [], []
+    for body in bodies:
+        chosen = np.flatnonzero(body.sides[:, axis, end] & any(body is other for other in there))
+        box = np.stack([body.lower[chosen], body.lower[chosen] + body.spacing], axis=1)
+        face = box.copy()
+        face[:, :, axis] = box[:, end, None, axis]
+        part = np.stack([np.maximum(face[:, 0], low), np.minimum(face[:, 1], high)], axis=1)
+        on = (part[:, 1] > part[:, 0])[:, tangential].all(axis=1)
+        on &= ~_touched(face.mean(axis=1), axis, end, [other for other in there if other is not body])
+        on &= (face[:, 0, axis] >= low[axis] - 1e-12) & (face[:, 0, axis] <= high[axis] + 1e-12)
+        part[:, :, axis] = face[:, :, axis]
+        ids.append(start + chosen[on])
+        xis.append((2 * part - box.sum(axis=1, keepdims=True))[on] / body.spacing)
+        Xs.append(part[on])
+        wholes.append(np.linalg.norm(face_vectors(body.corners(chosen[on]), axis, end), axis=1))
+        start += len(body)
+    return Surface(*map(np.concatenate, (ids, xis, Xs, wholes)), axis, end)
+
+
+def _touched(centre: NDArray[np.float64], axis: int, end: int, others: Sequence[Body]) -> NDArray[np.bool_]:
+    """Return which faces, given by their centres (m, d) in the reference configuration, lie on one of other bodies."""
+    out = np.zeros(len(centre), dtype=bool)
+    for body in others:
+        just_outside = centre / body.spacing
+        just_outside[:, axis] += 1e-6 * (2 * end - 1)
+        distance, _ = cKDTree(body.centre / body.spacing).query(just_outside, p=np.inf, distance_upper_bound=0.5)
+        out |= distance < 0.5
+    return out
+
+
+def interpolate(corners: NDArray[np.float64], xi: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the positions (m, d) in domains (m, 2^d, d) at local coordinates (m, d) from -1 to 1."""
+    signs = 2 * corner_bits(xi.shape[1]) - 1
+    N = (0.5 * (1 + signs * xi[:, None, :])).prod(axis=2)
+    return np.einsum("mk,mkd->md", N, corners)
+
+
+def face_vectors(corners: NDArray[np.float64], axis: int, end: int) -> NDArray[np.float64]:
+    """Return the outward area vectors (m, d), m^(d-1), of one face of domains (m, 2^d, d)."""
+    dim = corners.shape[2]
+    face = corners[:, corner_bits(dim)[:, axis] == end]
+    if dim == 2:
+        t = face[:, 1] - face[:, 0]
+        n = np.stack([t[:, 1], -t[:, 0]], axis=1) * (1 if axis == 0 else -1)
+    else:
+        n = 0.5 * np.cross(face[:, 3] - face[:, 0], face[:, 2] - face[:, 1])
+        n *= 1 if axis != 1 else -1
+    return n * (1 if end else -1)
+
+
+@dataclass(frozen=True)
+class Probes:
+    """Tracked positions: material particles whose displacement is wanted; m of them.
+
+    x0 : (m, d) reference positions; id : (m,) the domain that holds each; xi : (m, d) place in it;
+    bodies: those of the scene that they are for.
+    """
+
+    x0: NDArray[np.float64]
+    id: NDArray[np.int64]
+    xi: NDArray[np.float64]
+    bodies: tuple[Body, ...] = ()
+
+    def check(self, bodies: Sequence[Body], present: Sequence[bool]) -> None:
+        """Refuse, with a ValueError, a scene of other bodies, or one from which a probed body has gone."""
+        if len(bodies) != len(self.bodies) or not all(map(_same, bodies, self.bodies)):
+            what = f"made for {len(self.bodies)} bodies, the scene has {len(bodies)}"
+            raise ValueError(f"probes: {what}; must be made with all bodies of the scene, in its order")
+        body = np.searchsorted(np.cumsum([len(b) for b in bodies]), self.id, side="right")
+        gone = np.flatnonzero(~np.asarray(present)[body])
+        if len(gone):
+            raise ValueError(f"probe at {self.x0[gone[0]]}: in body {body[gone[0]]}, must be in one that is there now")
+
+    def displacement(self, points: MaterialPoints, comm) -> NDArray[np.float64]:
+        """Return the displacements (m, d), m, on every process."""
+        here, at = points.find(self.id)
+        u = np.zeros_like(self.x0)
+        u[here] = interpolate(points.corners[at] - points.origin[at], self.xi[here])
+        return over_all(comm, u)
+
+
+def _same(a: Body, b: Body) -> bool:
+    """Whether two bodies have the same points."""
+    return a is b or (a.lower.shape == b.lower.shape and np.array_equal(a.lower, b.lower))
+
+
+def positions(x0: ArrayLike, dim: int) -> NDArray[np.float64]:
+    """Return places where something is probed, as an array (m, d), m."""
+    allowed = f"positions of {dim} finite coordinates"
+    x = np.atleast_2d(numbers("probes: x0", x0, None, allowed=allowed))
+    if x.shape[1:] != (dim,):
+        raise ValueError(f"probes: x0 = {line(x0)}, must be {allowed}")
+    return x
+
+
+def probes(bodies: Sequence[Body], x0: ArrayLike) -> Probes:
+    """Return probes: material particles whose displacement a run records, the `probes` of `Simulation.run`.
+
+    Parameters
+    ----------
+    bodies
+        All bodies of the scene, in its order.
+    x0 : (m, d), m
+        Reference positions, before a map, inside or on the surface of the bodies.  Where bodies touch, a position
+        belongs to the first of them: keep off by a little to have the other.
+
+    Raises
+    ------
+    ValueError
+        A position outside the bodies; from the run: other bodies than the scene's, or one that is not there now.
+    """
+    all_of("probes: bodies", bodies, Body, 1)
+    x0 = positions(x0, bodies[0].lower.shape[1])
+    centre = np.concatenate([b.centre for b in bodies])
+    spacing = np.concatenate([np.broadcast_to(b.spacing, b.lower.shape) for b in bodies])
+    ids = np.empty(len(x0), dtype=np.int64)
+    for i, x in enumerate(x0):  # a handful of positions, once a scene
+        far = np.abs((centre - x) / spacing).max(axis=1)
+        ids[i] = np.flatnonzero(far <= far.min() + 1e-9)[0]
+    xi = 2 * (x0 - centre[ids]) / spacing[ids]
+    far = np.flatnonzero((np.abs(xi) > 1 + 1e-9).any(axis=1))
+    if len(far):
+        raise ValueError(f"probe at {x0[far[0]]}: outside the bodies, must be in one or on its surface")
+    return Probes(x0, ids, xi, tuple(bodies))

@@ -1,0 +1,240 @@
+# SPDX-License-Identifier: MIT
+"""The background grid: a box of equal quadrilaterals or hexahedra, in which points are found by arithmetic.
+
+Its mesh is made when first it is needed: by then a simulation has shared out the cells by the points in them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import reduce
+
+from mpi4py import MPI
+
+import numpy as np
+from dolfinx import fem
+from numpy.typing import ArrayLike, NDArray
+
+from mpm_dolfinx import _compat
+from mpm_dolfinx.validation import instance, line, numbers
+from mpm_dolfinx.parallel.partition import destinations, owners
+
+SIDES = {
+    2: {"left": (0, 0), "right": (0, 1), "bottom": (1, 0), "top": (1, 1)},
+    3: {"left": (0, 0), "right": (0, 1), "front": (1, 0), "back": (1, 1), "bottom": (2, 0), "top": (2, 1)},
+}
+"""Names of the sides of a box: (axis, 0 for the lower or 1 for the upper end)."""
+
+
+MOST = 2**31 - 1
+"""Unknowns that PETSc's numbers of 32 bits count."""
+
+
+def side(name: str, dim: int) -> tuple[int, int]:
+    """Return (axis, end) of a named side of a box."""
+    if not isinstance(name, str) or name not in SIDES[dim]:
+        raise ValueError(f"side {name!r}: must be one of {', '.join(SIDES[dim])} in {dim}D")
+    return SIDES[dim][name]
+
+
+def sum_by(index: NDArray, values: NDArray[np.float64], size: int) -> NDArray[np.float64]:
+    """Return the sums (size,) of values by index (numpy's bincount, which gives integers for no values)."""
+    return np.bincount(index, weights=values, minlength=size).astype(float, copy=False)
+
+
+class Grid:
+    """Background grid of equal cells over the box [lower, upper].
+
+    Bodies must stay in it; what is empty of it costs next to nothing.  Its sides are the walls that `fixed` names:
+    "left", "right" (x), "bottom", "top" (y in 2D, z in 3D), in 3D also "front", "back" (y).
+
+    Parameters
+    ----------
+    upper : (d,), m
+        Upper corner; d = 2 (plane strain) or 3.
+    cells : (d,)
+        Number of cells along each axis, at least 1.
+    lower : (d,), m
+        Lower corner, by default the origin.
+    comm
+        Processes that share the grid.
+
+    Raises
+    ------
+    ValueError
+        Corners that are not finite or not in order, numbers of cells that are no integers >= 1, or more cells than
+        PETSc's numbers count.
+
+    Attributes
+    ----------
+    dim, shape, h, lower, upper
+        d; cells along each axis (d,); their edges (d,), m; corners (d,), m.
+    mesh
+        The dolfinx mesh; made when first it is needed.
+    """
+
+    def __init__(
+        self,
+        upper: ArrayLike,
+        cells: Sequence[int],
+        lower: ArrayLike | None = None,
+        comm: MPI.Intracomm = MPI.COMM_WORLD,
+    ):
+        self.upper = numbers("grid: upper", upper, (2,), (3,), allowed="2 or 3 finite coordinates")
+        self.dim = d = self.upper.size
+        lower = np.zeros(d) if lower is None else lower
+        self.lower = numbers("grid: lower", lower, (d,), allowed=f"{d} finite coordinates")
+        if not (self.upper > self.lower).all():
+            raise ValueError(f"grid: upper = {line(upper)}, must be > lower = {line(lower)}")
+        count = numbers(
+            "grid: cells", cells, (d,), allowed=f"{d} integers >= 1", test=lambda n: (n >= 1) & (n % 1 == 0)
+        )
+        instance("grid: comm", comm, MPI.Comm)
+        self.shape = count.astype(np.int64)
+        if d * np.prod(count + 1) > MOST:
+            raise ValueError(
+                f"grid: cells = {line(cells)}: has {np.prod(count + 1):.3g} nodes, must be below {MOST // d}"
+            )
+        self.h = (self.upper - self.lower) / self.shape
+        self.comm = comm
+        self._spaces: dict[tuple[int, ...], fem.FunctionSpace] = {}
+        self._coefficients: dict[tuple[int, ...], fem.Function] = {}
+
+    def __getattr__(self, name: str):
+        """Make the mesh when first something of it is asked for."""
+        if name.startswith("__") or "mesh" in self.__dict__:
+            raise AttributeError(f"the grid has no {name!r}")
+        self.share(np.zeros((0, self.dim)))
+        return getattr(self, name)
+
+    def share(self, x: NDArray[np.float64]) -> None:
+        """Make the mesh, its cells shared out among the processes by the points x (n, d), m; once."""
+        if "mesh" in self.__dict__:
+            return
+        load = sum_by(self.number(self.index(x)), np.ones(len(x)), int(np.prod(self.shape)))
+        owner = owners(load.reshape(self.shape), self.comm.size)
+        self._owner = owner.ravel()
+        own = np.flatnonzero(self._owner == self.comm.rank)
+        self.mesh = _compat.box_mesh(self.comm, self._corners(own), self._nodes(), *destinations(owner, own))
+        nodes = _compat.function_space(self.mesh, "Lagrange", 1)
+        self.num_owned, self.num_local = _compat.num_cells(self.mesh)
+        self.cell_nodes = _compat.cell_dofs(nodes)
+        """(cells, 2^d): nodes of the cells, numbered as the Q1 degrees of freedom."""
+        self.node_x = nodes.tabulate_dof_coordinates()[:, : self.dim]
+        corners = self.node_x[self.cell_nodes]
+        self.midpoints = corners.mean(axis=1)
+        # all cells list their vertices in the same order (tested), so one set of signs serves all
+        self.signs = np.sign(corners[0] - self.midpoints[0]) if len(corners) else np.zeros((2**self.dim, self.dim))
+        self._lookup()
+        self._facets()
+
+    def _corners(self, cells: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the lexicographic numbers of the nodes (n, 2^d) of cells."""
+        bits = np.arange(2**self.dim)[:, None] >> np.arange(self.dim) & 1
+        index = np.stack(np.unravel_index(cells, self.shape), axis=-1)[:, None] + bits
+        return np.ravel_multi_index(tuple(np.moveaxis(index, 2, 0)), tuple(self.shape + 1))
+
+    def _nodes(self) -> NDArray[np.float64]:
+        """Return the positions (n, d), m, of this process's share of the nodes, in lexicographic order."""
+        count = int(np.prod(self.shape + 1))
+        start, stop = (count * (self.comm.rank + end) // self.comm.size for end in (0, 1))
+        index = np.stack(np.unravel_index(np.arange(start, stop), self.shape + 1), axis=-1)
+        return self.lower + index * self.h
+
+    def cellwise(self, shape: tuple[int, ...] = ()):
+        """Return the space of functions of a shape that are constant in the cells (DG0), made once."""
+        if shape not in self._spaces:
+            self._spaces[shape] = _compat.function_space(self.mesh, "DG", 0, shape)
+        return self._spaces[shape]
+
+    def coefficient(self, shape: tuple[int, ...] = ()) -> fem.Function:
+        """Return a new cellwise function that stands in forms for rows of values; all of a shape share its memory."""
+        first = self._coefficients.get(shape)
+        out = fem.Function(self.cellwise(shape), None if first is None else first.x)
+        self._coefficients.setdefault(shape, out)
+        return out
+
+    @property
+    def cell_volume(self) -> float:
+        """Volume of a cell (m^d)."""
+        return float(np.prod(self.h))
+
+    def _lookup(self) -> None:
+        """Make the table from the lexicographic number of a cell to the local cell."""
+        self.cell_number = self.number(np.floor((self.midpoints - self.lower) / self.h).astype(np.int64))
+        self._local = np.full(int(np.prod(self.shape)), -1, dtype=np.int32)
+        self._local[self.cell_number] = np.arange(self.num_local)
+
+    def _facets(self) -> None:
+        topology, d = self.mesh.topology, self.dim
+        topology.create_connectivity(d, d - 1)
+        topology.create_connectivity(d - 1, d)
+        self.cell_facets = topology.connectivity(d, d - 1).array.reshape(-1, 2 * d)
+        adjacency = topology.connectivity(d - 1, d)
+        first = adjacency.offsets[:-1]
+        two = np.diff(adjacency.offsets) == 2
+        self.facet_cells = np.stack([adjacency.array[first], np.full(len(first), -1, dtype=np.int32)], axis=1)
+        self.facet_cells[two, 1] = adjacency.array[first[two] + 1]
+        self._facets_owned = topology.index_map(d - 1).size_local
+
+    def number(self, index: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the lexicographic numbers of cells from their (n, d) indices along the axes."""
+        return np.ravel_multi_index(tuple(index.T), tuple(self.shape))
+
+    def index(self, x: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Return the (n, d) indices of the cells that hold points, clamped into the grid."""
+        i = np.floor((x - self.lower) / self.h).astype(np.int64)
+        return np.clip(i, 0, self.shape - 1, out=i)
+
+    def owner(self, number: NDArray[np.int64]) -> NDArray[np.int32]:
+        """Return the rank that owns each cell, given by its lexicographic number."""
+        return self._owner[number]
+
+    def local(self, number: NDArray[np.int64]) -> NDArray[np.int32]:
+        """Return this process's index of each cell, -1 where it does not have the cell."""
+        return self._local[number]
+
+    def outside(self, x: NDArray[np.float64], tolerance: float = 1e-9) -> NDArray[np.bool_]:
+        """Return which points lie outside the grid by more than `tolerance` cells."""
+        y = (x - self.lower) / self.h
+        return ((y < -tolerance) | (y > self.shape + tolerance) | ~np.isfinite(y)).any(axis=1)
+
+    def shape_functions(
+        self, cells: NDArray[np.int32], x: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the Q1 shape functions (n, 2^d) of local cells at points and their gradients (n, 2^d, d), 1/m."""
+        t = self._hats(cells, x)
+        return reduce(np.multiply, t), self._slopes(t)
+
+    def shape_gradients(self, cells: NDArray[np.int32], x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the gradients (n, 2^d, d), 1/m, of the Q1 shape functions of local cells at points."""
+        return self._slopes(self._hats(cells, x))
+
+    def _slopes(self, hats: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+        dN = np.empty((*hats[0].shape, self.dim))
+        for a in range(self.dim):
+            others = reduce(np.multiply, [hats[b] for b in range(self.dim) if b != a])
+            np.multiply(others, self.signs[:, a] / self.h[a], out=dN[:, :, a])
+        return dN
+
+    def shape_values(self, cells: NDArray[np.int32], x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the Q1 shape functions (n, 2^d) of local cells at points."""
+        return reduce(np.multiply, self._hats(cells, x))
+
+    def _hats(self, cells: NDArray[np.int32], x: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+        """Return the linear factors (n, 2^d) of the shape functions, one an axis."""
+        y = (x - self.midpoints[cells]) / self.h
+        return [0.5 + y[:, a, None] * self.signs[:, a] for a in range(self.dim)]
+
+    def interior_facets(self, active: NDArray[np.bool_], cells: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Return the facets of this process between two active cells (`cells` = where `active` holds)."""
+        facets = np.unique(self.cell_facets[cells])
+        facets = facets[facets < self._facets_owned]
+        both = self.facet_cells[facets]
+        return facets[(both[:, 1] >= 0) & active[both[:, 0]] & active[both[:, 1]]]
+
+    def wall_nodes(self, name: str) -> NDArray[np.bool_]:
+        """Return which nodes lie on a side of the box."""
+        axis, end = side(name, self.dim)
+        plane = (self.lower, self.upper)[end][axis]
+        return np.abs(self.node_x[:, axis] - plane) < 1e-6 * self.h[axis]

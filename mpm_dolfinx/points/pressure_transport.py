@@ -1,0 +1,178 @@
+# SPDX-License-Identifier: MIT
+"""Conservative remap of the pore pressure from one grid to the next, of second order.
+
+In each cell the pressure is reconstructed as p + s . (x - c) about the centroid c of what the cell stores.  The
+slope s along an axis is van Leer's mean of the differences to the neighbours behind open faces, and nothing where
+one of them is missing; it is scaled so that nowhere in the cell the extremes of cell and neighbours are passed.
+
+A piece of a domain takes the pressure at its own centroid and moves with the domain.  When the domain is cut
+anew, each cell that it lay in and still lies in keeps its pressure for the part that stayed; what newly lies
+in a cell takes the mean pressure of what left the others.  The places of the pieces are passed on in the same way;
+how far they then are from the true ones tells, with the domain's mean slope, what is still amiss.  Shares of every
+domain sum to one, and so does this correction to nothing: nothing is lost; where nothing moves nothing changes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpm_dolfinx.points.cutting import Pieces
+from mpm_dolfinx.parallel.exchange import Exchange
+from mpm_dolfinx.points.grid import Grid, sum_by
+from mpm_dolfinx.points.bodies import MaterialPoints
+
+
+@dataclass
+class Carried:
+    """Pressures of the pieces between two steps; arrays over the pieces, ordered by point and cell.
+
+    id : (m,) number of the point; cell : (m,) lexicographic cell, -1 at the start;
+    fraction : (m,) share of the domain; pressure : (m,), Pa; x : (m, d) centroid, m; slope : (m, d) of the
+    pressure, Pa/m; bounds : (m, 2) least and largest pressure that any part of the piece may have, Pa.
+    """
+
+    id: NDArray[np.int64]
+    cell: NDArray[np.int64]
+    fraction: NDArray[np.float64]
+    pressure: NDArray[np.float64]
+    x: NDArray[np.float64]
+    slope: NDArray[np.float64]
+    bounds: NDArray[np.float64]
+
+    def migrated(self, exchange: Exchange) -> Carried:
+        """Return the pieces of this process after each went to where its point goes."""
+        return Carried(*(exchange.send(getattr(self, f.name)) for f in fields(self)))._ordered()
+
+    def kept(self, ids: NDArray[np.int64]) -> Carried:
+        """Return the pieces of some points, given by their ids in order."""
+        return self._rows(np.isin(self.id, ids))
+
+    def joined(self, other: Carried) -> Carried:
+        """Return these pieces and those of other points, ordered by point and cell."""
+        pairs = [(getattr(self, f.name), getattr(other, f.name)) for f in fields(self)]
+        return Carried(*map(np.concatenate, pairs))._ordered()
+
+    def _rows(self, rows: NDArray) -> Carried:
+        return Carried(*(getattr(self, f.name)[rows] for f in fields(self)))
+
+    def _ordered(self) -> Carried:
+        return self._rows(np.lexsort((self.cell, self.id)))
+
+
+def at_start(points: MaterialPoints) -> Carried:
+    """Return what points carry that have not been in a cell yet: one piece each, of even pressure."""
+    n, p = len(points), points.pressure
+    cell, slope, bounds = np.full(n, -1), np.zeros_like(points.x), np.stack([p, p], axis=1)
+    return Carried(points.id.copy(), cell, np.ones(n), p.copy(), points.x.copy(), slope, bounds)
+
+
+class Reconstruction:
+    """Limited slopes of cellwise values on the owned cells of a grid.
+
+    Parameters
+    ----------
+    grid
+        Background grid.
+    """
+
+    def __init__(self, grid: Grid):
+        self.grid = grid
+        index = np.stack(np.unravel_index(grid.cell_number[: grid.num_owned], tuple(grid.shape)), axis=1)
+        self._neighbour = np.empty((grid.num_owned, grid.dim, 2), dtype=np.int64)
+        for axis in range(grid.dim):
+            for end in (0, 1):
+                beside = index.copy()
+                beside[:, axis] += 2 * end - 1
+                inside = (beside[:, axis] >= 0) & (beside[:, axis] < grid.shape[axis])
+                local = grid.local(grid.number(np.clip(beside, 0, grid.shape - 1)))
+                self._neighbour[:, axis, end] = np.where(inside, local, -1)
+
+    def __call__(
+        self,
+        cells: NDArray[np.int64],
+        p: NDArray[np.float64],
+        centroid: NDArray[np.float64],
+        faces: NDArray[np.float64],
+        origin: NDArray[np.float64],
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return slopes (n, d) and bounds (n, 2) in owned cells (n,).
+
+        Parameters
+        ----------
+        p, centroid, faces
+            Of all local cells: values (c,), centroids (c, d) relative to the midpoints, m, open shares (c, d, 2)
+            of the faces, zero for empty cells.
+        origin : (n, d), m
+            Places relative to the midpoints, from which the slopes are drawn.
+        """
+        h, d = self.grid.h, self.grid.dim
+        there, here = self._neighbour[cells], p[cells]
+        difference = np.zeros((len(cells), d, 2))
+        slope = np.empty((len(cells), d))
+        for axis in range(d):
+            one_sided = np.zeros((len(cells), 2))
+            for end in (0, 1):
+                other = there[:, axis, end]
+                is_open = (other >= 0) & (faces[cells, axis, end] > 0) & (faces[other, axis, 1 - end] > 0)
+                jump = np.where(is_open, p[other] - here, 0.0)
+                apart = h[axis] + (2 * end - 1) * (centroid[other, axis] - centroid[cells, axis])
+                difference[:, axis, end] = jump
+                one_sided[:, end] = (2 * end - 1) * jump / np.where(is_open, apart, 1.0)
+            a, b = one_sided.T
+            same = a * b > 0
+            slope[:, axis] = np.divide(2 * a * b, a + b, out=np.zeros(len(a)), where=same)
+        spread = np.stack([difference.min(axis=(1, 2)), difference.max(axis=(1, 2))], axis=1)
+        low, high = spread.clip(max=0)[:, 0], spread.clip(min=0)[:, 1]
+        ends = slope[:, :, None] * (h[:, None] * [-0.5, 0.5] - origin[:, :, None])
+        scale = np.ones(len(cells))
+        for reach, room in ((ends.min(axis=2).sum(axis=1), low), (ends.max(axis=2).sum(axis=1), high)):
+            scale = np.minimum(scale, np.divide(room, reach, out=np.ones(len(cells)), where=reach != 0))
+        return slope * scale[:, None], here[:, None] + np.stack([low, high], axis=1)
+
+
+def remap(old: Carried, points: MaterialPoints, new: Pieces) -> NDArray[np.float64]:
+    """Return the pressures (m,), Pa, that the new pieces bring to their cells."""
+    n = len(points)
+    if not n:
+        return np.empty(0)
+    owner = np.searchsorted(points.id, old.id)
+    cells = 2 + max(old.cell.max(initial=-1), new.cell.max(initial=-1))
+    old_key, new_key = owner * cells + old.cell + 1, new.point * cells + new.cell + 1
+    at = np.minimum(np.searchsorted(old_key, new_key), max(len(old_key) - 1, 0))
+    match = np.flatnonzero(old_key[at] == new_key)
+    before = at[match]
+
+    stays = np.zeros(len(new_key))
+    stays[match] = np.minimum(new.fraction[match], old.fraction[before])
+    leaves = old.fraction.copy()
+    leaves[before] -= stays[match]
+    left = sum_by(owner, leaves, n)
+    share = stays / new.fraction
+
+    def passed_on(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return what the new pieces have of values of the old: their own, and the mean of what left."""
+        mean = np.divide(sum_by(owner, leaves * values, n), left, out=np.zeros(n), where=left > 0)
+        kept = np.zeros(len(new_key))
+        kept[match] = values[before]
+        return share * kept + (1 - share) * mean[new.point]
+
+    pressure = passed_on(old.pressure)
+    amiss = np.zeros(len(new_key))
+    for axis in range(old.x.shape[1]):
+        slope = sum_by(owner, old.fraction * old.slope[:, axis], n)
+        then = old.x[:, axis] - sum_by(owner, old.fraction * old.x[:, axis], n)[owner]
+        now = new.x[:, axis] - sum_by(new.point, new.fraction * new.x[:, axis], n)[new.point]
+        amiss += slope[new.point] * (now - passed_on(then))
+    return pressure + _within(amiss, pressure, old, owner, new) * amiss
+
+
+def _within(amiss, pressure, old: Carried, owner, new: Pieces) -> NDArray[np.float64]:
+    """Return the share (m,) of a correction, the same for all pieces of a domain, that keeps to the bounds."""
+    first = np.flatnonzero(np.diff(owner, prepend=-1))
+    low, high = np.minimum.reduceat(old.bounds[:, 0], first), np.maximum.reduceat(old.bounds[:, 1], first)
+    room = np.where(amiss > 0, high[new.point] - pressure, low[new.point] - pressure)
+    share = np.divide(room, amiss, out=np.ones(len(amiss)), where=amiss != 0).clip(0, 1)
+    return np.minimum.reduceat(share, np.flatnonzero(np.diff(new.point, prepend=-1)))[new.point]

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""The two balances, momentum and storage, with their boundaries and stabilisation."""

@@ -1,0 +1,204 @@
+# SPDX-License-Identifier: MIT
+"""Conditions on the sides of the bodies: tractions, displacements, rigid plates, drained sides, prescribed inflow.
+
+A side is named "left", "right", "bottom" or "top", in 3D also "front" (lower y) and "back" (upper y), by where it is
+in the seeded body; it moves with the body.  What is wrong with a condition is said, with a ValueError, when a
+scene or a stage is made with it, of functions of time at the step that asks for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mpm_dolfinx.validation import asked, line, numbers
+from mpm_dolfinx.points.grid import side
+from mpm_dolfinx.points.faces import Region
+
+
+@dataclass(frozen=True)
+class Traction:
+    """Dead traction on a side of the bodies.
+
+    Parameters
+    ----------
+    side
+        Side of the bodies: "left", "right", "bottom", "top", in 3D also "front" (lower y) and "back" (upper y).
+    value : (d,) or number, or callable t (s) -> (d,) or number, Pa
+        Force per reference area; a number acts along the outward normal at the start of the step, negative: presses.
+        Several tractions on one face add up.
+    region : ((d,), (d,)), m
+        Lower and upper corner of the box of reference positions to which the traction is limited; faces partly in
+        it count with that part.
+
+    Raises
+    ------
+    ValueError
+        From the scene or the step: no point has the side, or the value is none that is allowed.
+    """
+
+    side: str
+    value: ArrayLike | Callable[[float], ArrayLike]
+    region: Region | None = None
+
+    def at(self, t: float, dim: int) -> NDArray[np.float64]:
+        """Return the traction (d,), or () along the normal, at time t (s), Pa, in a dimension."""
+        name, allowed = f"{line(self)}: value at t = {t:g} s", f"a finite number or {dim} of them"
+        value = asked(name, f"{allowed} for a time", self.value, t) if callable(self.value) else self.value
+        return numbers(name, value, (), (dim,), allowed=allowed)
+
+
+@dataclass(frozen=True)
+class Drained:
+    """Side of the bodies, moving with them, at which the pore pressure is given.
+
+    Parameters
+    ----------
+    side
+        Side of the bodies, as for `Traction`.
+    pressure
+        Outer pore pressure, Pa, finite; the same on the whole side and at all times of a stage.
+    region : ((d,), (d,)), m
+        Box of reference positions to which the drained faces are limited.
+
+    Raises
+    ------
+    ValueError
+        The pressure is no finite number; from the scene: there is no fluid, no point has the side, or another
+        `Drained` or `Inflow` acts on the same part of a face.
+    """
+
+    side: str
+    pressure: float = 0.0
+    region: Region | None = None
+
+    def __post_init__(self):
+        numbers("Drained: pressure", self.pressure)
+
+
+@dataclass(frozen=True)
+class Inflow:
+    """Side of the bodies through which fluid is pressed in.
+
+    Parameters
+    ----------
+    side
+        Side of the bodies, as for `Traction`.
+    flux
+        Volume per present area and time into the body, m/s, finite; negative: out of it.
+    region : ((d,), (d,)), m
+        Box of reference positions to which the faces are limited.
+
+    Raises
+    ------
+    ValueError
+        As for `Drained`.
+    """
+
+    side: str
+    flux: float
+    region: Region | None = None
+
+    def __post_init__(self):
+        numbers("Inflow: flux", self.flux)
+
+
+RIGIDITY = 1e4
+"""Rigidity of a plate, in units of (oedometric modulus of the body) x (length of the side)."""
+HOLD = 1e4
+"""Stiffness of what holds a side with given displacement, in units of (oedometric modulus) / (cell size).
+
+The side gives way by strain x cell size / HOLD, always measured from its given place: nothing adds up.
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class Displacement:
+    """Side of the bodies whose displacement is given: a footing, a clamp that moves, a body carried along.
+
+    The forces that it takes are `reactions` of the simulation.
+
+    Parameters
+    ----------
+    side
+        Side of the bodies, as for `Traction`.
+    value : (d,) or callable (t, X) -> (d,) or (m, d), m
+        Displacement of the side since the start, or since a stage reset it, given the time (s) and the reference
+        positions X (m, d).  A number for every component, also for those that are free.
+    components
+        Components that are given, such as "y"; the others are free.  By default all.
+    region : ((d,), (d,)), m
+        Box of reference positions to which the condition is limited.
+
+    Raises
+    ------
+    ValueError
+        From the scene or the step: no point has the side, the value or the components are none that are allowed,
+        or another `Displacement` gives a component on the same part of a face.
+    """
+
+    side: str
+    value: ArrayLike | Callable[[float, NDArray[np.float64]], ArrayLike]
+    components: str = ""
+    region: Region | None = None
+
+    def axes(self, dim: int) -> list[int]:
+        """Return the axes of the given components."""
+        if not isinstance(self.components, str) or any(c not in "xyz"[:dim] for c in self.components):
+            raise ValueError(f"{line(self)}: components must be some of {'xyz'[:dim]!r}")
+        return sorted("xyz".index(c) for c in set(self.components or "xyz"[:dim]))
+
+    def at(self, t: float, X: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the displacement (m, d), m, at time t (s) of reference positions X (m, d)."""
+        m, d = X.shape
+        name, allowed = f"{line(self)}: value at t = {t:g} s", f"{d} finite numbers, or {d} for each of {m} places"
+        value = asked(name, f"{allowed}, for (t, X)", self.value, t, X) if callable(self.value) else self.value
+        return np.broadcast_to(numbers(name, value, (d,), X.shape, allowed=allowed), X.shape)
+
+
+@dataclass(frozen=True)
+class RigidPlate:
+    """Rigid, smooth plate on a flat side of the bodies: one displacement along the side's axis for all its faces.
+
+    The slope of the faces is penalised, kappa/2 int |grad_t x_n|^2 dA; an even displacement is free, so
+    the plate carries the given total force exactly.  It does not tilt.
+
+    Parameters
+    ----------
+    side
+        Side of the bodies, as for `Traction`; its faces lie in one plane normal to an axis, and hang together.
+    force : float or callable t (s) -> float, N (N/m in plane strain)
+        Total force that presses on the side; negative: pulls.
+    region : ((d,), (d,)), m
+        Box of reference positions to which the plate is limited.
+
+    Raises
+    ------
+    ValueError
+        The force is no finite number; from the scene or the step: no point has the side, or its faces do not hang
+        together or lie at different heights (take a plate with a region for each part).
+    """
+
+    side: str
+    force: float | Callable[[float], float]
+    region: Region | None = None
+
+    def __post_init__(self):
+        if not callable(self.force):
+            numbers("RigidPlate: force", self.force)
+
+    def traction(self, area: float, dim: int) -> Traction:
+        """Return the even traction of the plate on its reference area, m^(d-1)."""
+        axis, end = side(self.side, dim)
+        inward = np.zeros(dim)
+        inward[axis] = 1 - 2 * end
+
+        def even(t: float) -> NDArray[np.float64]:
+            name = f"{line(self)}: force at t = {t:g} s"
+            force = asked(name, "a finite number for a time", self.force, t) if callable(self.force) else self.force
+            return inward * numbers(name, force) / area
+
+        return Traction(self.side, even, self.region)

@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: MIT
+"""Whether what lies on the grid is held: parts that can move as rigid bodies make the tangent singular."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import label
+
+from mpm_dolfinx.points.grid import Grid
+
+
+def check_held(
+    grid: Grid,
+    active: NDArray[np.bool_],
+    free: NDArray[np.bool_],
+    holds: tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.float64]] | None,
+    each: bool,
+) -> None:
+    """Refuse a scene of which a part can move as a rigid body.
+
+    Parameters
+    ----------
+    active : (cells,)
+        Cells of this process that hold a piece.
+    free : (nodes, d)
+        Components that no wall holds.
+    holds
+        Cells (m,), positions (m, d) and directions (m, d) in which sides have given displacements.
+    each
+        Look at each part that hangs together, not only at all of them.
+
+    Raises
+    ------
+    ValueError
+        Saying where the part is, and in how many ways it can move.
+    """
+    part, count = _parts(grid, active) if each else (active.astype(np.int64), 1)
+    cells = np.flatnonzero(active)
+    nodes, first = np.unique(grid.cell_nodes[cells], return_index=True)
+    row, axis = np.nonzero(~free[nodes])
+    x, direction = grid.node_x[nodes[row]], np.eye(grid.dim)[axis]
+    number = part[cells[first[row] // 2**grid.dim]]  # of any cell at the node: they hang together
+    if holds is not None:
+        number = np.concatenate([number, part[holds[0]]])
+        x, direction = np.concatenate([x, holds[1]]), np.concatenate([direction, holds[2]])
+    x = x / (grid.upper - grid.lower).max()
+    modes = list(direction.T)
+    modes += [direction[:, a] * x[:, b] - direction[:, b] * x[:, a] for a in range(grid.dim) for b in range(a)]
+    R = np.stack(modes, axis=1)
+    grams = grid.comm.allreduce(np.stack([R[number == k].T @ R[number == k] for k in range(1, count + 1)]))
+    for k, gram in enumerate(grams, start=1):
+        missing = len(modes) - np.linalg.matrix_rank(gram, tol=1e-12 * max(1.0, np.abs(gram).max()))
+        if missing:
+            places = [p for p in grid.comm.allgather(grid.midpoints[active & (part == k)][:1].tolist()) if p]
+            where = f"the part at {np.round(places[0][0], 6)}" if count > 1 else "the body"
+            raise ValueError(
+                f"fixed walls: {where} is free to move as a rigid body in {missing} of {len(modes)} ways; "
+                "it must touch walls whose fixed components hold it, or have given displacements"
+            )
+
+
+def _parts(grid: Grid, active: NDArray[np.bool_]) -> tuple[NDArray[np.int64], int]:
+    """Return the part (cells,), from 1, that each active cell belongs to, by common nodes, and how many there are."""
+    index = grid.index(grid.midpoints[active])
+    everywhere = np.concatenate(grid.comm.allgather(index))
+    lowest = everywhere.min(axis=0)
+    filled = np.zeros(everywhere.max(axis=0) - lowest + 1, dtype=bool)
+    filled[tuple((everywhere - lowest).T)] = True
+    labels, count = label(filled, structure=np.ones((3,) * grid.dim))
+    out = np.zeros(len(active), dtype=np.int64)
+    out[active] = labels[tuple((index - lowest).T)]
+    return out, count

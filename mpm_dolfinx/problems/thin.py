@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: MIT
+"""Bodies that are seeded with too few points over their thickness to bend as they should."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from mpm_dolfinx.points.grid import SIDES, Grid
+from mpm_dolfinx.points.bodies import Body
+from mpm_dolfinx.points.faces import surface
+
+COARSE = 0.7  # of a cell: domains above this lack more stiffness than Q1 cells have too much
+FEW = 3  # points over the thickness, up to which an eighth or more of the bending stiffness is lost
+SLENDER = 4  # length over thickness from which a body bends
+logger = logging.getLogger("mpm_dolfinx")
+
+
+def warn_thin(grid: Grid, bodies: Sequence[Body], fixed: Mapping[str, str]) -> None:
+    """Log a warning for each slender body that is free to bend and has too few points over its thickness.
+
+    A law sees one F in a point's domain: n points over the thickness have 1 - 1/n^2 of the bending stiffness, as
+    n layers of constant stress do, however exactly their domains are integrated.  One point carries no moment at
+    all: what resists is each step's increment only, and the body creeps from step to step.
+    """
+    for i, body in enumerate(bodies):
+        for axis, letter in enumerate("xyz"[: grid.dim]):
+            n = len(body) / max(1, int(body.sides[:, axis, 0].sum()))
+            if body.spacing[axis] > COARSE * grid.h[axis] and n <= FEW and _bends(grid, bodies, i, axis, fixed):
+                much = f"it bends {1 / (n**2 - 1):.0%} too much" if n > 1 else "it carries no moment and creeps"
+                if grid.comm.rank == 0:
+                    logger.warning(
+                        "body %d: %.3g point%s over its thickness along %s, in cells of %.3g m: %s; take per_cell >= 2",
+                        *(i, n, "s" if n > 1 else "", letter, grid.h[axis], much),
+                    )
+
+
+def _bends(grid: Grid, bodies: Sequence[Body], i: int, axis: int, fixed: Mapping[str, str]) -> bool:
+    """Whether a body is slender across an axis, and neither a wall nor another body holds it from that side."""
+    body, start = bodies[i], sum(len(b) for b in bodies[:i])
+    size = (body.lower + body.spacing).max(axis=0) - body.lower.min(axis=0)
+    if size.max() < SLENDER * size[axis]:
+        return False
+    for name in (name for name, (a, _) in SIDES[grid.dim].items() if a == axis):
+        end = SIDES[grid.dim][name][1]
+        at = (body.lower + end * body.spacing)[:, axis]
+        wall = (grid.lower, grid.upper)[end][axis]
+        if "xyz"[axis] in fixed.get(name, "") and np.abs(at - wall).min() < 1e-9 * grid.h[axis]:
+            return False
+        free = surface(bodies, name).id - start
+        if ((free >= 0) & (free < len(body))).sum() < body.sides[:, axis, end].sum() / 2:
+            return False
+    return True

@@ -1,0 +1,205 @@
+# SPDX-License-Identifier: MIT
+"""Linear solvers: factors in 2D and of small bodies in 3D, multigrid of large ones.
+
+PETSc's own factors of displacements in blocks, a block a node, take a third of the time of those of single
+unknowns: with 44000 unknowns in 2D and minimum degree ordering 110 ms, 60 again with the same pattern (single 430 and
+150; nested dissection twice that; MUMPS 260 and 155, UMFPACK 290 and 265, CHOLMOD 285 and 290).  A solve takes 4 ms
+(MUMPS 15, CHOLMOD 9).  On two processes MUMPS takes as long, and 25 ms a solve: each of a few processes has all
+factors that many solves use.
+"""
+
+from __future__ import annotations
+
+from petsc4py import PETSc
+
+import numpy as np
+import scipy.sparse
+from numpy.typing import NDArray
+
+from mpm_dolfinx.forms.unknowns import Unknowns
+
+ITERATIVE = 1500
+"""Unknowns of a 3D problem from which on it is solved by iterations: see `multigrid_solver`.
+
+Seconds of five load steps of a square beam by factors and by iterations: 0.5 and 0.5 with 1200 unknowns, 2.5 and 1.4
+with 2600, 8.2 and 2.1 with 4900.  In a plate of one cell both cost the same up to 6000.
+"""
+REDUNDANT = 4
+"""Processes up to which each has the factors that are used often."""
+
+
+def iterative(unknowns: Unknowns) -> bool:
+    """Return whether displacements are better solved for by iterations than by factors."""
+    return unknowns.dim == 3 and unknowns.global_size >= ITERATIVE
+
+
+def direct_solver(A: PETSc.Mat, name: str, symmetric: bool = True, often: bool = False) -> PETSc.KSP:
+    """Return a solver that factorises A, a symmetric one as L D L^T, refactorised when A has changed.
+
+    Parameters
+    ----------
+    often
+        Whether the same factors solve many systems.
+    """
+    if symmetric:
+        A.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+    ksp = _preonly(A, name)
+    kind = PETSc.PC.Type.CHOLESKY if symmetric else PETSc.PC.Type.LU
+    options = PETSc.Options(ksp.getOptionsPrefix())
+    if often and 1 < A.comm.size <= REDUNDANT:
+        ksp.pc.setType(PETSc.PC.Type.REDUNDANT)
+        for option, value in {"type": kind, "factor_mat_ordering_type": "amd", "factor_zeropivot": 0.0}.items():
+            options.setValue(f"redundant_pc_{option}", value)
+    else:
+        ksp.pc.setType(kind)
+        if A.comm.size > 1:
+            options.setValue("mat_mumps_icntl_13", 1)  # counts negative pivots
+            ksp.pc.setFactorSolverType("mumps")
+        else:
+            ksp.pc.setFactorOrdering("amd")
+            ksp.pc.setFactorPivot(0.0)  # PETSc's 2e-14 refuses slivers of cells: rows of any scale are welcome
+    ksp.setOperators(A)
+    ksp.setFromOptions()
+    return ksp
+
+
+def _preonly(A: PETSc.Mat, name: str) -> PETSc.KSP:
+    ksp = PETSc.KSP().create(A.comm)
+    ksp.setType(PETSc.KSP.Type.PREONLY)
+    ksp.setOptionsPrefix(f"mpm_{name}_")
+    return ksp
+
+
+def negative_pivots(solver: PETSc.KSP) -> int:
+    """Return the number of negative eigenvalues of the matrix whose L D L^T factors a direct solver has."""
+    factors = solver.pc.getFactorMatrix()
+    return factors.getMumpsInfog(12) if factors.comm.size > 1 else factors.getInertia()[0]
+
+
+def nodal_solver(A: PETSc.Mat, name: str, unknowns: Unknowns, symmetric: bool) -> PETSc.KSP:
+    """Return a direct solver for many systems with the same A, a matrix of displacements: see `NodalFactors`."""
+    if A.comm.size > REDUNDANT:
+        return direct_solver(A, name, symmetric)
+    ksp = _preonly(A, name)
+    ksp.pc.setType(PETSc.PC.Type.PYTHON)
+    ksp.pc.setPythonContext(NodalFactors(unknowns, symmetric))
+    ksp.setOperators(A)
+    return ksp
+
+
+class NodalFactors:
+    """Preconditioner for PETSc: factors of a matrix of displacements in blocks, which every process has.
+
+    Parameters
+    ----------
+    unknowns
+        Displacements, those of a node one after the other.
+    symmetric
+        Factors are U^T D U; if not, L U.
+    """
+
+    def __init__(self, unknowns: Unknowns, symmetric: bool):
+        node, axis = unknowns.nodes
+        comm = unknowns.comm
+        counts = np.concatenate([[0], np.cumsum(comm.allgather(len(np.unique(node))))])
+        block = counts[comm.rank] + np.unique(node, return_inverse=True)[1]
+        self._block, self._axis = (np.concatenate(comm.allgather(rows)) for rows in (block, axis))
+        self._count, self._size = int(counts[-1]), unknowns.dim
+        start = int(comm.exscan(unknowns.size) or 0) if comm.size > 1 else 0
+        self._mine, self._symmetric = slice(start, start + unknowns.size), symmetric
+        self._gather = PETSc.Scatter.toAll(unknowns.vector()) if comm.size > 1 else None
+        self._rows = self._columns = np.empty(0, dtype=np.int32)
+        self._solver: PETSc.KSP | None = None
+
+    def setUp(self, pc: PETSc.PC) -> None:
+        """Factorise the present matrix."""
+        A, _ = pc.getOperators()
+        whole = A if A.comm.size == 1 else A.getRedundantMatrix(A.comm.size, PETSc.COMM_SELF)
+        rows, columns, values = whole.getValuesCSR()
+        if self._solver is None or not (np.array_equal(rows, self._rows) and np.array_equal(columns, self._columns)):
+            self._rows, self._columns = rows, columns
+            self._analyse(whole)
+        self._fill(values)
+        if whole is not A:
+            whole.destroy()
+
+    def _analyse(self, A: PETSc.Mat) -> None:
+        """Find the order of the blocks, and where the entries of A go."""
+        ordered = self._block[A.getOrdering("amd")[0].indices]
+        found, first = np.unique(ordered, return_index=True)
+        rank = np.empty(self._count, dtype=np.int64)
+        rank[found[np.argsort(first)]] = np.arange(self._count)
+        self._place = rank[self._block] * self._size + self._axis
+        i, j = np.repeat(self._place, np.diff(self._rows)), self._place[self._columns]
+        kept = np.arange(len(i))
+        if self._symmetric:  # the upper triangle
+            kept = np.flatnonzero(i // self._size <= j // self._size)
+        # 1 on the diagonal where a component of a node is no unknown
+        missing = np.setdiff1d(np.arange(self._count * self._size), self._place)
+        number = np.concatenate([kept, np.full(len(missing), len(i))]) + 1
+        where = np.concatenate([i[kept], missing]), np.concatenate([j[kept], missing])
+        n = self._count * self._size
+        blocks = scipy.sparse.coo_matrix((number, where), shape=(n, n)).tocsr().tobsr((self._size, self._size))
+        blocks.sort_indices()
+        self._source = blocks.data
+        self._pattern = blocks.indptr.astype(PETSc.IntType), blocks.indices.astype(PETSc.IntType)
+        make = PETSc.Mat().createSBAIJ if self._symmetric else PETSc.Mat().createBAIJ
+        self._matrix = make((n, n), self._size, csr=(*self._pattern, np.zeros(blocks.data.shape)), comm=PETSc.COMM_SELF)
+        self._solver = ksp = PETSc.KSP().create(PETSc.COMM_SELF)
+        ksp.setType(PETSc.KSP.Type.PREONLY)
+        ksp.pc.setType(PETSc.PC.Type.CHOLESKY if self._symmetric else PETSc.PC.Type.LU)
+        ksp.pc.setFactorOrdering("natural")
+        ksp.pc.setFactorPivot(0.0)  # see `direct_solver`
+        ksp.setOperators(self._matrix)
+        self._b, self._x = self._matrix.createVecs()
+        self._b.set(0.0)
+
+    def _fill(self, values: NDArray[np.float64]) -> None:
+        """Factorise the matrix of these entries."""
+        self._matrix.setValuesBlockedIJV(*self._pattern, np.concatenate([[0.0], values, [1.0]])[self._source])
+        self._matrix.assemble()
+        self._solver.setOperators(self._matrix)
+        self._solver.setUp()
+
+    def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """Solve with the factors."""
+        if self._gather is None:
+            self._b.array_w[self._place] = x.array_r
+        else:
+            scatter, whole = self._gather
+            scatter.scatter(x, whole)
+            self._b.array_w[self._place] = whole.array_r
+        self._solver.solve(self._b, self._x)
+        y.array_w[:] = self._x.array_r[self._place[self._mine]]
+
+
+def multigrid_solver(A: PETSc.Mat, name: str) -> PETSc.KSP:
+    """Return GMRES with smoothed aggregation multigrid (GAMG), set up anew when A has changed.
+
+    For elasticity A must have the rigid body modes as near-null space when it is set up.  GMRES because a
+    tangent may be unsymmetric or, where a body buckles, indefinite; on definite ones conjugate gradients
+    take as many iterations: about 20 to 1e-8, with 5000 unknowns as with 60000.  With 60000 the set-up takes 1.0 s,
+    for another tangent of the same unknowns 0.3 s, the solution 0.5 s; BoomerAMG (hypre) takes three to four times
+    as long, and ML cannot keep its set-up.  Unknowns in blocks of three, with rows of the identity for fixed ones,
+    would save a quarter.
+    """
+    prefix = f"mpm_{name}_"
+    options = PETSc.Options(prefix)
+    for option, value in _MULTIGRID.items():
+        if not options.hasName(option):
+            options.setValue(option, value)
+    ksp = PETSc.KSP().create(A.comm)
+    ksp.setType(PETSc.KSP.Type.GMRES)
+    ksp.setPCSide(PETSc.PC.Side.RIGHT)
+    ksp.setOptionsPrefix(prefix)
+    ksp.pc.setType(PETSc.PC.Type.GAMG)
+    ksp.setOperators(A)
+    ksp.setFromOptions()
+    return ksp
+
+
+_MULTIGRID = {
+    "pc_gamg_reuse_interpolation": "true",  # a new tangent of the same unknowns: a quarter of the time
+    "mg_levels_ksp_type": "chebyshev",
+    "mg_levels_pc_type": "jacobi",
+}

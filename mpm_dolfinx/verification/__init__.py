@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""Exact solutions, and the finite element reference."""

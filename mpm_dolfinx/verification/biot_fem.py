@@ -1,0 +1,380 @@
+# SPDX-License-Identifier: MIT
+"""References to compare with: body-fitted, total-Lagrangian finite elements for finite-strain Biot, and beam theory.
+
+With the total displacement u, F = I + grad u, J = det F and the pore pressure p (positive in compression)
+on the reference configuration of a box, backward Euler from state n:
+
+    momentum   int d/dF [psi(F) - alpha p J] : grad v dV  =  int t . v dA                 (dead tractions t)
+    storage    int [alpha (J - J_n) + S J (p - p_n)] q dV  +  dt int kappa J F^-1 F^-T grad p . grad q dV  =  0
+
+S = n/K_w + (alpha - n)/K_s with the porosity n = 1 - (1 - n0)/J_n, kappa = k/(rho_w g).  With pressures constant in
+the cells the flux is the two-point one, kappa J |F^-T N|^2 (p+ - p-)/h, h the distance of the cells' centres.
+The material objects are those of the material point method, so the two differ in discretisation only.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+
+from mpi4py import MPI
+from petsc4py import PETSc
+
+import dolfinx.fem.petsc as petsc
+import numpy as np
+import ufl
+from dolfinx import fem, mesh
+from numpy.typing import ArrayLike, NDArray
+from tqdm import tqdm
+
+from mpm_dolfinx import _compat
+from mpm_dolfinx.validation import all_of, line, numbers
+from mpm_dolfinx.problems.conditions import RIGIDITY, Drained, RigidPlate, Traction
+from mpm_dolfinx.solve.newton import NotConverged
+from mpm_dolfinx.constitutive.user_functions import call
+from mpm_dolfinx.points.grid import Grid, side
+from mpm_dolfinx.constitutive.skeleton import Field, Fluid, Skeleton
+from mpm_dolfinx.points.faces import Region, limits, positions
+from mpm_dolfinx.timeloop import GaveUp, Result
+
+ELEMENTS = {"taylor-hood": (2, ("Lagrange", 1, ())), "q1-dg0": (1, ("DG", 0, ()))}  # degree of u; space of p
+CUT_DEGREE = 20  # of quadrature on a side of which a region is loaded: the region's edge may cut facets
+
+
+class BiotFEM:
+    """A box body and its state; without fluid, the drained skeleton.
+
+    Parameters
+    ----------
+    lower, upper : (d,), m
+        Corners of the body; d = 2 (plane strain) or 3.
+    cells : (d,)
+        Number of cells along each axis, at least 1.
+    material, fluid
+        Skeleton without state, and pore fluid, whose pressure is zero at the start.
+    fixed
+        Sides with the components that are zero there, such as {"left": "xy"}.
+    tractions, drained, plates
+        Conditions on sides, nodal pressures on whole facets of a region; other sides are free and sealed.
+    gravity : callable t -> (d,), m/s^2
+        Acceleration of gravity, without fluid only.
+    element
+        "taylor-hood": Q2 displacement, Q1 pressure; "q1-dg0": Q1, constant in the cells with two-point fluxes.
+    tolerance
+        Residual relative to the loads or to the residual at the start of a step, > 0.
+    """
+
+    def __init__(
+        self,
+        lower: ArrayLike,
+        upper: ArrayLike,
+        cells: Sequence[int],
+        material: Skeleton,
+        *,
+        fixed: Mapping[str, str],
+        fluid: Fluid | None = None,
+        tractions: Sequence[Traction] = (),
+        drained: Sequence[Drained] = (),
+        plates: Sequence[RigidPlate] = (),
+        gravity: Callable[[float], ArrayLike] | None = None,
+        element: str = "taylor-hood",
+        comm: MPI.Intracomm = MPI.COMM_WORLD,
+        tolerance: float = 1e-8,
+    ):
+        all_of("material", [material], Skeleton)
+        all_of("fluid", [fluid] if fluid is not None else [], Fluid)
+        numbers("tolerance", tolerance, test=lambda v: (0 < v) & (v < 1), allowed="in (0, 1)")
+        if element not in ELEMENTS:
+            raise ValueError(f"element {element!r}: must be one of {', '.join(ELEMENTS)}")
+        if fluid is None and drained:
+            raise ValueError("drained sides need a fluid")
+        if fluid is not None and gravity is not None:
+            raise ValueError("gravity with a fluid: the reference has none, one of them must be left out")
+        if material.state or callable(material.porosity) or callable(material.biot) or callable(material.grain_bulk):
+            raise ValueError(
+                f"{type(material).__name__}: the reference has no state; only moduli, conductivity and "
+                "parameters of the law may be functions of place, the rest must be numbers"
+            )
+        self.grid, self.material, self.fluid = Grid(upper, cells, lower, comm), material, fluid
+        self.t, self.tolerance = 0.0, tolerance
+        self.scale = float(np.max(material.at(self.grid.midpoints).oedometric))
+        """Unit of the pressure among the unknowns, Pa; both equations are divided by it."""
+        self._make_spaces(*ELEMENTS[element])
+        self._bcs = self._conditions(fixed, drained if element == "taylor-hood" else ())
+        start = time.perf_counter()
+        self._gravity = gravity
+        self._plates = [(plate, self._area(plate)) for plate in plates]
+        for load in tractions:
+            if not callable(load.value):
+                self._traction(load, 0.0)
+        tractions = [*tractions, *(plate.traction(area, self.grid.dim) for plate, area in self._plates)]
+        self._compile(tractions, drained if element == "q1-dg0" else None)
+        self.jit = time.perf_counter() - start  # s, compiling or finding the forms
+        self._make_solver()
+
+    def _constant(self, value: ArrayLike) -> fem.Constant:
+        return fem.Constant(self.grid.mesh, np.asarray(value, dtype=float))
+
+    def _field(self, value: Field) -> fem.Constant | fem.Function:
+        """Return a parameter as UFL, one that is a function of place as its quadratic interpolant in the cells."""
+        if not callable(value):
+            return self._constant(value)
+        d = self.grid.dim
+        shape = np.shape(value(self.grid.midpoints[:1]))[1:]
+        f = fem.Function(_compat.function_space(self.grid.mesh, "DG", 2, shape))
+        f.interpolate(lambda x: np.asarray(value(x[:d].T), dtype=float).T)
+        return f
+
+    def _make_spaces(self, degree: int, pressure: tuple[str, int, tuple[int, ...]]) -> None:
+        """Make the space of the unknowns w = (u, p/scale), or of w = u."""
+        self._degree, msh, vector = degree, self.grid.mesh, ("Lagrange", degree, (self.grid.dim,))
+        if self.fluid:
+            self._W = _compat.mixed_space(msh, [vector, pressure])
+            self._p_dofs = np.asarray(self._W.sub(1).collapse()[1])
+        else:
+            self._W, self._p_dofs = _compat.function_space(msh, *vector), slice(0)
+        self.w, self._old, self._b, self._f = (fem.Function(self._W) for _ in range(4))
+        self._u = self.w.sub(0) if self.fluid else self.w
+
+    def _box(self, name: str, region: Region | None = None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the corners of a flat box around a side, or around the part of it in a region."""
+        grid, (axis, end) = self.grid, side(name, self.grid.dim)
+        low, high = limits(region, grid.dim)
+        plane, near = (grid.lower, grid.upper)[end][axis], 1e-6 * grid.h
+        low, high = np.maximum(low, grid.lower) - near, np.minimum(high, grid.upper) + near
+        if not (low[axis] <= plane <= high[axis] and (low < high).all()):
+            raise ValueError(f"side {name!r}: the region {line(region)} must have a part of it")
+        low[axis], high[axis] = plane - near[axis], plane + near[axis]
+        return low, high
+
+    def _prescribe(self, space, value: float, name: str, region: Region | None = None):
+        """Return the condition that a scalar subspace has a value on the facets of a side that lie in a region."""
+        msh, d, (low, high) = self.grid.mesh, self.grid.dim, np.array(self._box(name, region))[:, :, None]
+        facets = mesh.locate_entities_boundary(msh, d - 1, lambda x: ((x[:d] >= low) & (x[:d] <= high)).all(axis=0))
+        return fem.dirichletbc(PETSc.ScalarType(value), fem.locate_dofs_topological(space, d - 1, facets), space)
+
+    def _conditions(self, fixed: Mapping[str, str], drained: Sequence[Drained]) -> list:
+        """Return the conditions of zero displacement and of nodal pressure."""
+        axes, bcs, space = "xyz"[: self.grid.dim], [], self._u.function_space
+        for name, held in fixed.items():
+            if not isinstance(held, str) or not held or not set(held) <= set(axes):
+                raise ValueError(f"fixed side {name!r}: components {held!r}, must be some of {axes!r}")
+            bcs += [self._prescribe(space.sub(axes.index(a)), 0.0, name) for a in held]
+        return bcs + [self._prescribe(self._W.sub(1), o.pressure / self.scale, o.side, o.region) for o in drained]
+
+    def _area(self, condition: RigidPlate) -> float:
+        """Return the area of the part of a side that a condition names (m^(d-1))."""
+        low, high = self._box(condition.side, condition.region)
+        within = np.minimum(high, self.grid.upper) - np.maximum(low, self.grid.lower)
+        return float(np.delete(within, side(condition.side, self.grid.dim)[0]).prod())
+
+    def _on(self, condition: Traction | Drained | RigidPlate, integrand):
+        """Return the integral over the part of a side that a condition names, as UFL."""
+        low, high = map(self._constant, self._box(condition.side, condition.region))
+        for a, x in enumerate(ufl.SpatialCoordinate(self.grid.mesh)):
+            integrand = ufl.conditional(ufl.And(ufl.ge(x, low[a]), ufl.le(x, high[a])), integrand, 0.0)
+        degree = 2 * self._degree if condition.region is None else CUT_DEGREE
+        return integrand * ufl.ds(domain=self.grid.mesh, metadata={"quadrature_degree": degree})
+
+    def _compile(self, tractions: Sequence[Traction], outlets: Sequence[Drained] | None) -> None:
+        """Compile loads, residual and tangent; with `outlets` the pressure is constant in the cells."""
+        self._dt = self._constant(1.0)
+        self._loads = [(load, self._constant(np.zeros(self.grid.dim))) for load in tractions]
+        law, split = self.material, ufl.split if self.fluid else lambda f: (f, 0)
+        (u, p), (u_n, p_n), (v, q) = map(split, (self.w, self._old, ufl.TestFunction(self._W)))
+        dx = ufl.dx(domain=self.grid.mesh, metadata={"quadrature_degree": 2 * self._degree})
+        F, F_n = (ufl.variable(ufl.Identity(self.grid.dim) + ufl.grad(f)) for f in (u, u_n))
+        J, J_n, alpha = ufl.det(F), ufl.det(F_n), self._constant(law.biot)
+        parameters = {name: self._field(getattr(law, name)) for name in law.parameters}
+        P = law.first_piola(F, parameters) / self._constant(self.scale) - alpha * p * ufl.diff(J, F)
+        residual = ufl.inner(P, ufl.grad(v)) * dx
+        if self.fluid:
+            # S is linear in the porosity, and its constants stay finite where a bulk modulus is infinite
+            S_0, S_1 = (self.scale * law.storage(self.fluid.bulk, n) for n in (0.0, 1.0))
+            n = 1 - self._constant(1 - law.porosity) / J_n
+            S = self._constant(S_0) + self._constant(S_1 - S_0) * n
+            residual += (alpha * (J - J_n) + S * J * (p - p_n)) * q * dx
+            k = self._field(law.conductivity)
+            if law.conductivity_law is not None:
+                porosity = {"porosity": n, "porosity0": self._constant(law.porosity)}
+                x = ufl.SpatialCoordinate(self.grid.mesh) + u_n
+                k = call(law.conductivity_law, conductivity=k, F=F_n, J=J_n, x=x, **porosity)
+            kappa = self._dt * self._constant(self.scale / self.fluid.unit_weight) * k
+            pull = ufl.inv(F).T
+            if outlets is None:
+                residual += kappa * J * ufl.inner(pull * ufl.grad(p), pull * ufl.grad(q)) * dx
+            else:
+                residual += self._two_point(kappa, J, pull, p, q, outlets)
+        for plate, area in self._plates:
+            axis = side(plate.side, self.grid.dim)[0]
+            slope = [ufl.as_vector([f[axis].dx(a) for a in range(self.grid.dim) if a != axis]) for f in (u, v)]
+            residual += self._on(
+                plate, self._constant(RIGIDITY * area ** (1 / (self.grid.dim - 1))) * ufl.inner(*slope)
+            )
+        self._residual_form = _compat.compiled(residual)
+        self._tangent_form = _compat.compiled(ufl.derivative(residual, self.w, ufl.TrialFunction(self._W)))
+        loads = [self._on(load, ufl.inner(t, v) / self._constant(self.scale)) for load, t in self._loads]
+        if self._gravity is not None:
+            self._weight = self._constant(np.zeros(self.grid.dim))
+            loads.append(ufl.inner(self._weight, v) / self._constant(self.scale) * dx)
+        self._load_form = _compat.compiled(sum(loads)) if loads else None
+
+    def _two_point(self, kappa, J, pull, p, q, outlets: Sequence[Drained]):
+        """Return the two-point flux between cells and to drained sides, half a cell away, as UFL."""
+        normal, h = ufl.FacetNormal(self.grid.mesh), self._constant(self.grid.h)
+        stretch = J * ufl.inner(pull * normal, pull * normal)
+        across = sum(abs(normal[a]) * h[a] for a in range(self.grid.dim))
+        dS = ufl.dS(domain=self.grid.mesh, metadata={"quadrature_degree": 2})
+        harmonic = 2 * kappa("+") * kappa("-") / (kappa("+") + kappa("-") + 1e-300)
+        flux = harmonic * ufl.avg(stretch) / across("+") * ufl.jump(p) * ufl.jump(q) * dS
+        for o in outlets:
+            flux += self._on(o, 2 * kappa * stretch / across * (p - self._constant(o.pressure / self.scale)) * q)
+        return flux
+
+    def _make_solver(self) -> None:
+        """Set up Newton's method with full steps and a direct solver.
+
+        A line search on the residual crawls where a slender body turns: rotations stretch at first order.
+        """
+        options, prefix = PETSc.Options(), "mpm_reference_"
+        if not options.hasName(f"{prefix}snes_linesearch_type"):
+            options[f"{prefix}snes_linesearch_type"] = "basic"
+        self._snes = PETSc.SNES().create(self.grid.comm)
+        self._snes.setOptionsPrefix(prefix)
+        self._snes.setFunction(self._residual, _compat.petsc_vec(self._b).duplicate())
+        self._snes.setJacobian(self._tangent, petsc.create_matrix(self._tangent_form))
+        self._snes.ksp.setType("preonly")
+        self._snes.ksp.pc.setType("lu")
+        self._snes.ksp.pc.setFactorSolverType("mumps")
+        self._snes.setConvergenceHistory(reset=True)
+        self._snes.setFromOptions()
+
+    def _residual(self, _snes: PETSc.SNES, x: PETSc.Vec, out: PETSc.Vec) -> None:
+        self._take(x)
+        b = self._assemble(self._b, self._residual_form)
+        b.axpy(-1.0, _compat.petsc_vec(self._f))
+        # no lifting: every iterate has the prescribed values
+        petsc.set_bc(b, self._bcs, _compat.petsc_vec(self.w), -1.0)
+        b.copy(out)
+
+    def _tangent(self, _snes: PETSc.SNES, x: PETSc.Vec, A: PETSc.Mat, _P: PETSc.Mat) -> None:
+        self._take(x)
+        A.zeroEntries()
+        petsc.assemble_matrix(A, self._tangent_form, self._bcs)
+        A.assemble()
+
+    def _take(self, x: PETSc.Vec) -> None:
+        x.copy(_compat.petsc_vec(self.w))
+        self.w.x.scatter_forward()
+
+    def _assemble(self, out: fem.Function, form) -> PETSc.Vec:
+        out.x.array[:] = 0.0
+        petsc.assemble_vector(_compat.petsc_vec(out), form)
+        _compat.scatter_reverse_add(out)
+        return _compat.petsc_vec(out)
+
+    def step(self, dt: float) -> tuple[int, float]:
+        """Advance by dt (s, > 0); return Newton iterations, relative residual.  `NotConverged` keeps the state."""
+        numbers("dt", dt, test=lambda v: (0 < v) & (v < np.inf), allowed="> 0 and finite")
+        self._dt.value = dt
+        for traction, constant in self._loads:
+            constant.value[:] = self._traction(traction, self.t + dt)
+        if self._gravity is not None:
+            density = (1 - self.material.porosity) * self.material.grain_density
+            g = numbers(
+                "gravity", self._gravity(self.t + dt), (self.grid.dim,), allowed=f"{self.grid.dim} finite numbers"
+            )
+            self._weight.value = density * g
+        if self._load_form is not None:
+            self._assemble(self._f, self._load_form)
+        x, load, snes = _compat.petsc_vec(self.w).copy(), _compat.petsc_vec(self._f).norm(), self._snes
+        petsc.set_bc(x, self._bcs)
+        round_off = 1e-14 * self.grid.cell_volume / self.grid.h.min() * np.sqrt(x.getSize())
+        snes.setTolerances(self.tolerance, max(self.tolerance * load, round_off), 0.0)
+        snes.solve(None, x)
+        norms, _ = snes.getConvergenceHistory()
+        scale = max(load, norms[0], round_off / self.tolerance)
+        if snes.reason < 0:
+            parts = self._parts(x, scale)
+            self._take(_compat.petsc_vec(self._old))
+            raise NotConverged(f"PETSc SNES stopped with reason {snes.reason}", [parts])
+        self._take(x)
+        self._old.x.array[:] = self.w.x.array
+        self.t += dt
+        return snes.its, norms[-1] / scale
+
+    def _traction(self, load: Traction, t: float) -> NDArray[np.float64]:
+        """Return the components (d,), Pa, of a traction at time t, s."""
+        value = load.at(t, self.grid.dim)
+        if not value.ndim:
+            raise ValueError(
+                f"{line(load)}: value must have {self.grid.dim} components, the reference knows no normals"
+            )
+        return value
+
+    def _parts(self, x: PETSc.Vec, scale: float) -> tuple[float, float]:
+        """Return the norms of the residuals of momentum and storage at x, relative to `scale`."""
+        self._residual(self._snes, x, x.duplicate())
+        squares = (self._b.x.array / scale) ** 2
+        squares[_compat.petsc_vec(self._b).getLocalSize() :] = 0.0  # ghosts
+        storage = squares[self._p_dofs].sum()
+        return tuple(np.sqrt(self.grid.comm.allreduce(np.array([squares.sum() - storage, storage]))))
+
+    def run(self, t_end: float, dt: float, *, probes: ArrayLike, progress: bool = False) -> Result:
+        """Advance to t_end (s) in equal steps dt (s); `GaveUp` has the histories up to the last good step.
+
+        Parameters
+        ----------
+        probes : (m, d), m
+            Reference positions in the body at which the displacement is recorded.
+        progress
+            Show a progress bar on a terminal.
+        """
+        steps = round((t_end - self.t) / dt) if dt > 0 else 0
+        if steps < 1 or abs(steps * dt - (t_end - self.t)) > 1e-6 * dt:
+            raise ValueError(f"dt = {dt!r}, t_end = {t_end!r}: dt must divide the {t_end - self.t:g} s left")
+        x, result = positions(probes, self.grid.dim), Result()
+        out = np.flatnonzero(self.grid.outside(x))
+        if len(out):
+            raise ValueError(f"probe at {x[out[0]]}: outside the body, must be in it or on its surface")
+        self._record(result, x)
+        began = time.perf_counter()
+        for _ in tqdm(range(steps), disable=not progress or self.grid.comm.rank > 0 or None, unit="step"):
+            try:
+                newton, residual = self.step(dt)
+            except NotConverged as failed:
+                message = f"gave up at t = {self.t:g} s with dt = {dt:.3g} s: {failed}"
+                raise GaveUp(message, result, failed.history) from failed
+            result.steps += 1
+            result.newton += newton
+            result.residual = max(result.residual, residual)
+            self._record(result, x)
+            result.wall = time.perf_counter() - began
+        result.converged = True
+        return result
+
+    def displacement(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the displacements (m, d), m, at reference positions x (m, d) in the body, on every process."""
+        grid, out = self.grid, np.zeros(x.shape)
+        cells = grid.local(grid.number(grid.index(x)))
+        here = np.flatnonzero((cells >= 0) & (cells < grid.num_owned))
+        if len(here):
+            out[here] = self._u.eval(np.pad(x[here], ((0, 0), (0, 3 - grid.dim))), cells[here]).reshape(-1, grid.dim)
+        return grid.comm.allreduce(out)
+
+    def _record(self, result: Result, x: NDArray[np.float64]) -> None:
+        result.t.append(self.t)
+        result.displacement.append(self.displacement(x))
+        if self.fluid:
+            p, comm = self.scale * self.w.x.array[self._p_dofs], self.grid.comm
+            result.pressure.append((comm.allreduce(p.min(), op=MPI.MIN), comm.allreduce(p.max(), op=MPI.MAX)))
+
+
+def euler_bernoulli(x: ArrayLike, load: float, length: float, modulus: float, second_moment: float) -> NDArray:
+    """Return the deflection (n,), m, of a cantilever under a uniform load, at distances x (n,) from the clamp, m.
+
+    w x^2 (6 L^2 - 4 L x + x^2) / (24 E I): load w, N/m, of any sign, and with values > 0 length L, m, Young's modulus
+    E, Pa, second moment of area I, m^4.
+    """
+    x = np.asarray(x, dtype=float)
+    return load * x**2 * (6 * length**2 - 4 * length * x + x**2) / (24 * modulus * second_moment)
