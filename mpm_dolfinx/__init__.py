@@ -12,7 +12,7 @@ are those of a slice of 1 m.
 """
 
 from mpm_dolfinx.problems.conditions import Displacement, Drained, Inflow, RigidPlate, Traction
-from mpm_dolfinx.solve.newton import COUPLINGS, NotConverged
+from mpm_dolfinx.errors import GaveUp, LeftGrid, NotConverged
 from mpm_dolfinx.points.grid import Grid
 from mpm_dolfinx.constitutive.skeleton import LAWS, Field, Fluid, Hencky, LinearElastic, NeoHookean, Skeleton, kozeny_carman
 from mpm_dolfinx.io.writer import Writer
@@ -20,8 +20,10 @@ from mpm_dolfinx.constitutive.drucker_prager import DruckerPrager
 from mpm_dolfinx.points.bodies import box, mapped, shape
 from mpm_dolfinx.io.checkpoint import Checkpoint, resume
 from mpm_dolfinx.simulation import Simulation
-from mpm_dolfinx.points.faces import probes
-from mpm_dolfinx.timeloop import GaveUp, Result
+from mpm_dolfinx.points.probes import probes
+from mpm_dolfinx.result import Result
+from mpm_dolfinx.solve.scheme import COUPLINGS
+from mpm_dolfinx.state import State
 
 __version__ = "0.1.0"
 __all__ = [
@@ -37,6 +39,7 @@ __all__ = [
     "Grid",
     "Hencky",
     "Inflow",
+    "LeftGrid",
     "LinearElastic",
     "NeoHookean",
     "NotConverged",
@@ -44,6 +47,7 @@ __all__ = [
     "RigidPlate",
     "Simulation",
     "Skeleton",
+    "State",
     "Traction",
     "Writer",
     "box",

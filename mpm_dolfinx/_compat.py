@@ -186,24 +186,25 @@ class CompiledForm:
             self._bound, self.form = bound, bound._cpp_object
         return self.form
 
-    def packed(self) -> dict:
+    def packed(self, form=None) -> dict:
         """Return dolfinx's own packed coefficients, one row an entity."""
-        return _pack_coefficients(self.form) if OLD else cpp.fem.pack_coefficients(self.form)
+        form = form or self.form
+        return _pack_coefficients(form) if OLD else cpp.fem.pack_coefficients(form)
 
     def assemble_vector(self, b: NDArray[np.float64], rows: NDArray[np.float64] | None = None, form=None) -> None:
         """Add the vector to `b` (ghosts not accumulated), with own coefficient rows if given."""
         form = form or self.form
-        cpp.fem.assemble_vector(b, form, cpp.fem.pack_constants(form), self._coefficients(rows))
+        cpp.fem.assemble_vector(b, form, cpp.fem.pack_constants(form), self._coefficients(rows, form))
 
     def assemble_matrix(self, A: PETSc.Mat, rows: NDArray[np.float64] | None = None, form=None) -> None:
         """Add the matrix to `A` (not finalised), dofs unrolled, with own coefficient rows if given."""
         form = form or self.form
         constants = cpp.fem.pack_constants(form)
-        cpp.fem.petsc.assemble_matrix(A, form, constants, self._coefficients(rows), [], unrolled=True)
+        cpp.fem.petsc.assemble_matrix(A, form, constants, self._coefficients(rows, form), [], unrolled=True)
 
-    def _coefficients(self, rows) -> dict:
+    def _coefficients(self, rows, form) -> dict:
         if rows is None:
-            return self.packed()
+            return self.packed(form)
         # 0.11 counts the integrals where earlier releases name the subdomain
         return {(fem.IntegralType.cell, key): rows for key in self._keys()}
 

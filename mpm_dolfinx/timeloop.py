@@ -7,27 +7,25 @@ import logging
 import time
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, field
+from dataclasses import replace
 from math import inf
-from typing import TYPE_CHECKING
+from typing import Any, Protocol
 
 from mpi4py import MPI
 
 import numpy as np
 from dolfinx.common import Timer
-from numpy.typing import NDArray
 from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
 from mpm_dolfinx import _compat
-from mpm_dolfinx.validation import functions, instance, line, numbers
-from mpm_dolfinx.solve.newton import NotConverged
-from mpm_dolfinx.points.cut_domains import LeftGrid
+from mpm_dolfinx.errors import GaveUp, LeftGrid, StepFailed
 from mpm_dolfinx.io.summary import imbalance, peak_memory
-from mpm_dolfinx.points.faces import Probes
-
-if TYPE_CHECKING:
-    from mpm_dolfinx.simulation import Simulation
+from mpm_dolfinx.points.probes import Probes
+from mpm_dolfinx.result import Report, Result
+from mpm_dolfinx.scene import Scene
+from mpm_dolfinx.state import State
+from mpm_dolfinx.validation import functions, instance, line, numbers
 
 PARTS = (
     "cut domains",
@@ -47,49 +45,18 @@ MOST = 1e9
 """Output intervals of a run: with more, a step is lost in the rounding of the time."""
 logger = logging.getLogger("mpm_dolfinx")
 
+Observer = Callable[[Any], None]
+"""Called with the simulation."""
 
-@dataclass
-class Result:
-    """Histories of a run, and where its time loop is; one entry an output time, the start included.
 
-    t (s); displacement (m, d) of the probes, m; pressure: least and largest on the points, Pa; and of
-    the steps so far: steps, newton, coupling (iterations), balance and residual (worst, relative), cuts,
-    rederived (domains that had folded), wall (s), and profile: seconds of each part of the run on this
-    process, from dolfinx's timers.  points: material points; memory: peak of all processes, libraries
-    included, MB; imbalance: the most that one of several processes has over their mean, at the end of the run.
-    dt: output interval, s; small: the step to try next, s; converged: the end has been reached.
-    """
+class Simulated(Protocol):
+    """What the time loop drives: a `Simulation`, whose `state` it replaces."""
 
-    t: list[float] = field(default_factory=list, repr=False)
-    displacement: list[NDArray[np.float64]] = field(default_factory=list, repr=False)
-    pressure: list[tuple[float, float]] = field(default_factory=list, repr=False)
-    steps: int = 0
-    newton: int = 0
-    coupling: int = 0
-    cuts: int = 0
-    rederived: int = 0
-    balance: float = 0.0
-    residual: float = 0.0
-    wall: float = 0.0
-    dt: float = 0.0
-    small: float = 0.0
-    converged: bool = False
-    profile: dict[str, float] = field(default_factory=dict, repr=False)
-    points: int = 0
-    memory: float = 0.0
-    imbalance: dict[str, float] = field(default_factory=dict)
+    scene: Scene
+    state: State
 
-    def shares(self) -> str:
-        """Return seconds and share of the wall time of each part, memory and imbalance as a table."""
-        rows = [*self.profile.items(), ("rest", self.wall - sum(self.profile.values()))]
-        lines = [f"{name:18} {s:8.2f} s {100 * s / max(self.wall, 1e-9):5.1f} %" for name, s in rows]
-        if self.points:  # measured when a run has ended
-            each = 1024 * self.memory / self.points
-            lines.append(f"{'memory':18} {self.memory:8.0f} MB, {each:.3g} kB for each of {self.points} points")
-        if self.imbalance:
-            ratios = ", ".join(f"{name} {ratio:.2f}" for name, ratio in self.imbalance.items())
-            lines.append(f"{'most over mean':18} {ratios} (1: perfect balance)")
-        return "\n".join(lines)
+    def advanced(self, dt: float) -> tuple[State, Report]:
+        """Return the state after a step of dt, s, and what it took."""
 
 
 def log(comm: MPI.Intracomm, message: str, *values) -> None:
@@ -98,29 +65,8 @@ def log(comm: MPI.Intracomm, message: str, *values) -> None:
         logger.info(message, *values)
 
 
-class GaveUp(RuntimeError):
-    """A run could not go on: a step that does not converge however short, a point that has left the grid.
-
-    The simulation is in the state of the last good step, from which other conditions or another step may go on.
-
-    Attributes
-    ----------
-    result
-        Histories up to the last good output time.
-    history
-        Relative residuals (momentum, storage) of the failed step's iterations, if it was one.
-    """
-
-    def __init__(self, message: str, result: Result, history: Sequence[tuple[float, float]] = ()):
-        super().__init__(message)
-        self.result, self.history = result, history
-
-
-Observer = Callable[["Simulation"], None]
-
-
 def run(
-    simulation: Simulation,
+    simulation: Simulated,
     t_end: float,
     dt: float,
     *,
@@ -135,39 +81,43 @@ def run(
         raise ValueError(f"probes = {line(probes)}, must be what `probes` gives")
     observers = [observe] if callable(observe) else observe
     if probes is not None:
-        probes.check(simulation.bodies, simulation.present)
+        probes.check(simulation.scene.bodies, simulation.state.stage.present)
     functions("observe", observers)
     functions("checkpoint", [checkpoint] if checkpoint is not None else [])
     if after is not None:
         instance("after", after, Result)
-    t_end, dt = _times(simulation.t, t_end, dt, after is not None)
-    result = simulation.result = _histories(simulation, t_end, dt, probes, after)
-    dt, start, done = result.dt, result.t[0], len(result.t) - 1
+    t_end, dt = _times(simulation.state.t, t_end, dt, after is not None)
+    result = _histories(simulation, t_end, dt, probes, after)
+    dt, start, done = result.dt, result.rows[0][0], len(result.rows) - 1
     # a last interval that is a fraction of dt counts as one
-    intervals = max(done + (t_end - simulation.t > 1e-9 * dt), round((t_end - start) / dt))
-    result.converged = done == intervals
+    intervals = max(done + (t_end - simulation.state.t > 1e-9 * dt), round((t_end - start) / dt))
     stopwatch = _Stopwatch(result)
-    quiet = None if progress and simulation.grid.comm.rank == 0 else True
+    _note(simulation, replace(result, converged=done == intervals))
+    quiet = None if progress and simulation.scene.grid.comm.rank == 0 else True
     bar = tqdm(total=intervals, initial=done, disable=quiet, unit="step")
     with bar, nullcontext() if bar.disable else logging_redirect_tqdm():  # messages above the bar, not into it
         for k in range(done + 1, intervals + 1):
             target = t_end if k == intervals else start + k * dt
-            while target - simulation.t > 1e-9 * dt:
-                _advance(simulation, min(result.small, target - simulation.t), result)
-                bar.set_postfix(t=f"{simulation.t:.4g} s", newton=result.newton, coupling=result.coupling)
-            simulation.t = target
-            result.converged = k == intervals
+            while target - simulation.state.t > 1e-9 * dt:
+                _advance(simulation, target)
+                now = simulation.state.result
+                bar.set_postfix(t=f"{simulation.state.t:.4g} s", newton=now.newton, coupling=now.coupling)
             with Timer("mpm: output"):
-                _record(simulation, result, probes)
-                stopwatch.read()
+                ended = replace(simulation.state.result, converged=k == intervals)
+                simulation.state = replace(simulation.state, t=target, result=stopwatch.read(ended))
+                ended.rows.append(_row(simulation, probes))
                 for observer in observers:
                     observer(simulation)
-                stopwatch.read()
+                _note(simulation, stopwatch.read(simulation.state.result))
                 if checkpoint is not None:
                     checkpoint(simulation)
             bar.update()
-    _measure(simulation, result)
-    stopwatch.read()
+    return _note(simulation, stopwatch.read(_measured(simulation)))
+
+
+def _note(simulation: Simulated, result: Result) -> Result:
+    """Note the histories so far in the state."""
+    simulation.state = replace(simulation.state, result=result)
     return result
 
 
@@ -179,19 +129,19 @@ def _times(now: float, t_end: float, dt: float, goes_on: bool) -> tuple[float, f
     return float(end), float(numbers("dt", dt, allowed=allowed, test=lambda v: (v > 0) & (v * MOST >= end - now)))
 
 
-def _histories(simulation, t_end: float, dt: float, probes: Probes | None, after: Result | None) -> Result:
+def _histories(simulation: Simulated, t_end: float, dt: float, probes: Probes | None, after: Result | None) -> Result:
     """Return new histories that begin with the present state, or those to go on with."""
-    dt = min(dt, t_end - (after.t[0] if after else simulation.t))
+    now = simulation.state.t
+    dt = min(dt, t_end - (after.rows[0][0] if after else now))
     if after is None:
-        result = Result(dt=dt, small=dt)
-        _record(simulation, result, probes)
-        return result
-    if after.dt != dt or after.t[-1] != simulation.t:
-        raise ValueError(
-            f"dt = {dt!r} from t = {simulation.t!r}: the run to go on with has dt = {after.dt!r}, t = {after.t[-1]!r}"
-        )
-    recorded = len(after.displacement[0]) if after.displacement else 0
-    if recorded != (0 if probes is None else len(probes.id)):
+        return Result(dt=dt, small=dt, rows=[_row(simulation, probes)])
+    # a run that was broken off may have taken a part of its next interval
+    broken_off = after is simulation.state.result and after.rows[-1][0] <= now <= after.rows[-1][0] + (1 + 1e-9) * dt
+    if after.dt != dt or not (after.rows[-1][0] == now or broken_off):
+        last = after.rows[-1][0]
+        raise ValueError(f"dt = {dt!r} from t = {now!r}: the run to go on with has dt = {after.dt!r}, t = {last!r}")
+    shown = after.rows[0][1]
+    if (recorded := 0 if shown is None else len(shown)) != (0 if probes is None else len(probes.id)):
         raise ValueError(f"probes: the run to go on with has {recorded} of them")
     return after
 
@@ -200,65 +150,70 @@ class _Stopwatch:
     """Wall time and profile of a run, those that its histories have already included."""
 
     def __init__(self, result: Result):
-        self._result = result
         self._began = time.perf_counter() - result.wall
         self._timed = {part: seconds - result.profile.get(part, 0.0) for part, seconds in _timings().items()}
 
-    def read(self) -> None:
-        """Note the seconds so far."""
-        self._result.wall = time.perf_counter() - self._began
-        self._result.profile = {part: seconds - self._timed[part] for part, seconds in _timings().items()}
+    def read(self, result: Result) -> Result:
+        """Return the histories with the seconds so far."""
+        profile = {part: seconds - self._timed[part] for part, seconds in _timings().items()}
+        return replace(result, wall=time.perf_counter() - self._began, profile=profile)
 
 
 def _timings() -> dict[str, float]:
     return {part: _compat.seconds(f"mpm: {part}") for part in PARTS}
 
 
-def _advance(simulation: Simulation, small: float, result: Result) -> None:
-    """Take one step of at most `small`, cutting it until it converges."""
-    comm = simulation.grid.comm
+def _advance(simulation: Simulated, target: float) -> None:
+    """Take one step towards a time, s, cutting it until it converges."""
+    comm = simulation.scene.grid.comm
     while True:
+        state, result = simulation.state, simulation.state.result
+        left, small = target - state.t, result.small
+        if left < (1 + 1e-9) * small:  # steps that fit but for rounding are all of the same length
+            small = small if left > (1 - 1e-9) * small else left
         try:
-            report = simulation.step(small)
-        except NotConverged as failed:
-            result.cuts += 1
+            new, report = simulation.advanced(small)
+        except StepFailed as failed:
             if small / 2 < MIN_CUT * result.dt:
-                message = f"gave up at t = {simulation.t:g} s with dt = {small:.3g} s: {failed}"
-                raise GaveUp(message, result, failed.history) from failed
-            result.small = small = small / 2
-            log(comm, "t = %g s: step cut to %.3g s: %s", simulation.t, small, failed)
+                raise GaveUp(_why(state.t, small, failed), _cut(simulation, small), failed.history) from failed
+            _cut(simulation, small / 2)
+            log(comm, "t = %g s: step cut to %.3g s: %s", state.t, small / 2, failed)
             continue
-        except LeftGrid as failed:
-            raise GaveUp(str(failed), result) from failed
-        result.steps += 1
-        result.rederived += report.rederived
-        result.newton += report.newton
-        result.coupling += report.coupling
-        result.balance = max(result.balance, report.balance)
-        result.residual = max(result.residual, *report.history[-1])
         # a step as long as one that has just failed would mostly fail again: in soil that yields, 78 cuts instead of 1
-        easy = simulation.coupler.easy(report)
-        grown = max(result.small, min(2 * small, result.dt)) if easy else result.small
+        grown = max(result.small, min(2 * small, result.dt)) if report.easy else result.small
+        simulation.state = replace(new, result=result.after(report, grown))
         if grown > 1.01 * result.small:  # not by rounding only
-            log(comm, "t = %g s: step grows to %.3g s", simulation.t, grown)
-        result.small = grown
+            log(comm, "t = %g s: step grows to %.3g s", new.t, grown)
         return
 
 
-def _record(simulation: Simulation, result: Result, probes: Probes | None) -> None:
-    comm, points = simulation.grid.comm, simulation.points
-    result.t.append(simulation.t)
-    if probes is not None:
-        result.displacement.append(probes.displacement(points, comm))
-    if simulation.fluid:
+def _cut(simulation: Simulated, small: float) -> Result:
+    """Note a cut, and the step to try next, s."""
+    result = simulation.state.result
+    return _note(simulation, replace(result, cuts=result.cuts + 1, small=small))
+
+
+def _why(t: float, small: float, failed: StepFailed) -> str:
+    """Return why a run gave up at t with a step `small`, s."""
+    if isinstance(failed, LeftGrid):
+        return str(failed)
+    return f"gave up at t = {t:g} s with dt = {small:.3g} s: {failed}"
+
+
+def _row(simulation: Simulated, probes: Probes | None) -> tuple:
+    """Return what the histories hold of the present state."""
+    comm, points, pressure = simulation.scene.grid.comm, simulation.state.points, None
+    moved = None if probes is None else probes.displacement(points, comm)
+    if simulation.scene.fluid:
         p = points.pressure
         ends = comm.allgather((p.min(initial=np.inf), p.max(initial=-np.inf)))
-        result.pressure.append((min(e[0] for e in ends), max(e[1] for e in ends)))
+        pressure = (min(e[0] for e in ends), max(e[1] for e in ends))
+    return simulation.state.t, moved, pressure
 
 
-def _measure(simulation: Simulation, result: Result) -> None:
-    """Note the memory, and how evenly processes share the work."""
-    comm = simulation.grid.comm
-    points, result.memory = comm.allreduce(np.array([len(simulation.points), peak_memory()])).tolist()
-    result.points = int(points)
-    result.imbalance = imbalance(simulation) if comm.size > 1 else {}
+def _measured(simulation: Simulated) -> Result:
+    """Return the histories with the memory, and how evenly processes share the work."""
+    comm, state = simulation.scene.grid.comm, simulation.state
+    points, memory = comm.allreduce(np.array([len(state.points), peak_memory()])).tolist()
+    even = imbalance(simulation.scene, state) if comm.size > 1 else {}
+    return replace(state.result, points=int(points), memory=memory, imbalance=even)

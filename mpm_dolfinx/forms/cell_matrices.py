@@ -15,7 +15,8 @@ import ufl
 from dolfinx import fem
 from numpy.typing import NDArray
 
-from mpm_dolfinx.forms.point_forms import BATCH, CellSums, FormPoints, PointExpression
+from mpm_dolfinx.caching import Latest
+from mpm_dolfinx.forms.point_forms import BATCH, CellSums, FormPoints, Places, PointData, PointExpression
 from mpm_dolfinx.points.grid import Grid, sum_by
 
 
@@ -37,9 +38,8 @@ def element_dofs(grid: Grid, cells: NDArray[np.int32]) -> NDArray[np.int32]:
     return dofs.reshape(len(cells), -1)
 
 
-def insert(A: PETSc.Mat, points: FormPoints, matrices: NDArray[np.float64], cells=None) -> None:
-    """Add the element matrices of Q1 vectors (cells, n, n) in cells, by default all filled ones, of `points` to `A`."""
-    grid, cells = points.grid, points.filled if cells is None else cells
+def insert(A: PETSc.Mat, grid: Grid, cells: NDArray[np.int32], matrices: NDArray[np.float64]) -> None:
+    """Add the element matrices of Q1 vectors (cells, n, n) in cells to `A`."""
     if len(cells):
         dofs = element_dofs(grid, cells).astype(PETSc.IntType)
         A.setValuesLocalRCV(dofs, dofs, matrices, addv=True)
@@ -67,21 +67,21 @@ class ElementForces:
     """
 
     def __init__(self, stress: ufl.core.expr.Expr, points: FormPoints):
-        self.points, dim = points, points.grid.dim
+        self._grid, dim = points.grid, points.grid.dim
         forces = [ufl.dot(stress, gradient) for gradient in shape_gradients(points)]
         self._sums = CellSums([force[i] for force in forces for i in range(dim)], points)
 
-    def assemble_vector(self, b: NDArray[np.float64]) -> None:
+    def assemble_vector(self, b: NDArray[np.float64], data: PointData) -> None:
         """Add the vector to the local array `b`; contributions to ghosts stay there."""
-        dofs = element_dofs(self.points.grid, self.points.filled)
-        b += sum_by(dofs.ravel(), self._sums().ravel(), len(b))
+        dofs = element_dofs(self._grid, data.places.filled)
+        b += sum_by(dofs.ravel(), self._sums(data).ravel(), len(b))
 
-    def assemble_matrix(self, A: PETSc.Mat) -> None:
+    def assemble_matrix(self, A: PETSc.Mat, data: PointData) -> None:
         """Add to `A`, which has a row a cell, the vectors of the cells; the caller finalises it."""
-        cells = self.points.filled
+        cells = data.places.filled
         if len(cells):
-            dofs = element_dofs(self.points.grid, cells).astype(PETSc.IntType)
-            A.setValuesLocalRCV(cells[:, None].astype(PETSc.IntType), dofs, self._sums()[:, None], addv=True)
+            dofs = element_dofs(self._grid, cells).astype(PETSc.IntType)
+            A.setValuesLocalRCV(cells[:, None].astype(PETSc.IntType), dofs, self._sums(data)[:, None], addv=True)
 
 
 class ElementMatrices:
@@ -102,7 +102,7 @@ class ElementMatrices:
     """
 
     def __init__(self, tangent: ufl.core.expr.Expr, points: FormPoints, symmetric: bool = True):
-        self.points, dim = points, points.grid.dim
+        self._grid, dim = points.grid, points.grid.dim
         rows, columns, self._entry = _entries(2**dim * dim, symmetric)
         gradients, entries = shape_gradients(points), []
         for row, column in zip(rows, columns, strict=True):
@@ -111,9 +111,9 @@ class ElementMatrices:
             entries.append(ufl.dot(gradients[v], ufl.dot(block, gradients[u])))
         self._sums = CellSums(entries, points)
 
-    def assemble_matrix(self, A: PETSc.Mat) -> None:
+    def assemble_matrix(self, A: PETSc.Mat, data: PointData) -> None:
         """Add the matrix to `A`, by unrolled local dofs; the caller finalises it."""
-        insert(A, self.points, self._sums()[:, self._entry])
+        insert(A, self._grid, data.places.filled, self._sums(data)[:, self._entry])
 
 
 class StackedElementMatrices:
@@ -139,48 +139,47 @@ class StackedElementMatrices:
     """
 
     def __init__(self, tangent: ufl.core.expr.Expr, points: FormPoints, symmetric: bool = True):
-        self.points, self._d = points, points.grid.dim
+        self._grid, self._d = points.grid, points.grid.dim
         d, (rows, columns, place) = self._d, _entries(self._d**2, symmetric)
         self._entry = place.reshape(d, d, d, d).transpose(1, 0, 2, 3).ravel()  # (k, i, j, l)
         pairs = [(*divmod(int(r), d), *divmod(int(c), d)) for r, c in zip(rows, columns, strict=True)]
         self._tangent = PointExpression(ufl.as_vector([tangent[pair] for pair in pairs]), points)
-        self._places = -1
+        self._sorted: Latest[list] = Latest()
 
-    def _sort(self) -> None:
-        """Find batches of filled cells that hold about as many points, and their points (cells, most points)."""
-        cells, filled = self.points.cells, self.points.filled
-        order = np.argsort(cells, kind="stable")
-        start = np.searchsorted(cells[order], filled)
-        count = np.diff(start, append=len(cells))
-        self._batches, by_count = [], np.argsort(count, kind="stable")
-        while len(by_count):
-            size = max(1, BATCH // count[by_count[0]])
-            size = max(1, BATCH // count[by_count[min(size, len(by_count)) - 1]])
-            batch, by_count = by_count[:size], by_count[size:]
-            turn = np.arange(count[batch].max())
-            missing = turn >= count[batch, None]
-            points = order[np.where(missing, start[batch, None], start[batch, None] + turn)]
-            self._batches.append((filled[batch], points, missing))
-
-    def assemble_matrix(self, A: PETSc.Mat) -> None:
+    def assemble_matrix(self, A: PETSc.Mat, data: PointData) -> None:
         """Add the matrix to `A`, by unrolled local dofs; the caller finalises it."""
-        if self._places != self.points.places:
-            self._places = self.points.places
-            self._sort()
-        self.points.refresh()
-        for cells, points, missing in self._batches:
-            insert(A, self.points, self._matrices(points.ravel(), missing), cells)
+        live = data.live()
+        for cells, points, missing in self._sorted(data.places, lambda: batches(data.places)):
+            insert(A, self._grid, cells, self._matrices(data, live, points.ravel(), missing))
 
-    def _matrices(self, chosen: NDArray[np.int64], missing: NDArray[np.bool_]) -> NDArray[np.float64]:
+    def _matrices(self, data: PointData, live, chosen: NDArray[np.int64], missing: NDArray) -> NDArray[np.float64]:
         """Return the element matrices (cells, n, n) of a batch."""
-        points, d, (cells, most) = self.points, self._d, missing.shape
-        g = points.grid.shape_gradients(points.cells[chosen], points.x[chosen])
-        g = g @ points.values("F", chosen).reshape(-1, d, d)
+        d, (cells, most) = self._d, missing.shape
+        g = self._grid.shape_gradients(data.cells[chosen], data.x[chosen])
+        g = g @ data["F"][chosen].reshape(-1, d, d)
         nodes = g.shape[1]
-        tangent = self._tangent.evaluate(chosen)[:, self._entry].reshape(-1, d**3, d)
+        tangent = self._tangent.evaluate(data, chosen, live)[:, self._entry].reshape(-1, d**3, d)
         right = (tangent @ g.transpose(0, 2, 1)).reshape(cells, most * d, d * d * nodes)
-        weight = points.data["weight"][chosen, 0] * points.grid.cell_volume
+        weight = data["weight"][chosen, 0] * self._grid.cell_volume
         g *= np.where(missing.ravel(), 0.0, weight)[:, None, None]
         left = g.reshape(cells, most, nodes, d).transpose(0, 2, 1, 3).reshape(cells, nodes, most * d)
         matrices = (left @ right).reshape(cells, nodes, d, d, nodes)
         return matrices.transpose(0, 1, 2, 4, 3).reshape(cells, nodes * d, nodes * d)
+
+
+def batches(places: Places) -> list[tuple[NDArray[np.int32], NDArray[np.int64], NDArray[np.bool_]]]:
+    """Return batches of filled cells that hold about as many points: cells (c,), points (c, most), which are none."""
+    cells, filled, out = places.cells, places.filled, []
+    order = np.argsort(cells, kind="stable")
+    start = np.searchsorted(cells[order], filled)
+    count = np.diff(start, append=len(cells))
+    by_count = np.argsort(count, kind="stable")
+    while len(by_count):
+        size = max(1, BATCH // count[by_count[0]])
+        size = max(1, BATCH // count[by_count[min(size, len(by_count)) - 1]])
+        batch, by_count = by_count[:size], by_count[size:]
+        turn = np.arange(count[batch].max())
+        missing = turn >= count[batch, None]
+        points = order[np.where(missing, start[batch, None], start[batch, None] + turn)]
+        out.append((filled[batch], points, missing))
+    return out

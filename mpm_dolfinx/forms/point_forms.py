@@ -15,7 +15,8 @@ No generated code is touched.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from functools import cached_property
 from math import factorial
 
 from mpi4py import MPI
@@ -27,6 +28,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from mpm_dolfinx import _compat
+from mpm_dolfinx.caching import Latest
 from mpm_dolfinx.points.grid import Grid
 
 CHUNK = 2**14
@@ -52,7 +54,7 @@ class PointMeasure(ufl.Measure):
 
 
 class FormPoints:
-    """Points, weights and data of the points at which forms are evaluated.
+    """What forms see of the points at which they are evaluated: coefficients, whose values come with the data.
 
     Parameters
     ----------
@@ -65,67 +67,23 @@ class FormPoints:
 
     def __init__(self, grid: Grid, **fields: tuple[int, ...]):
         self.grid = grid
-        self._functions = {
+        self.functions = {
             name: grid.coefficient(shape) for name, shape in {"offset": (grid.dim,), "weight": (), **fields}.items()
         }
-        self._live: dict[str, fem.Function] = {}
-        self._of: tuple[int, NDArray[np.float64]] | None = None
-        self._gradients = np.empty((0, grid.dim**2))
-        self._taken: NDArray[np.int32] | None = None
-        self.dx = PointMeasure(grid, self._functions["weight"])
-        self._size = {name: int(np.prod(shape, dtype=int)) for name, shape in fields.items()}
-        self.cells = self.filled = self.slots = np.empty(0, dtype=np.int32)
-        """Cell of each point; the cells that hold points; and the place of each point's cell among these."""
-        self.data: dict[str, NDArray[np.float64]] = {}
-        self.version = self.places = 0
-        """Count of changes of the data, and of the cells too."""
+        self.live: dict[str, fem.Function] = {}
+        """Fields that are gradients of functions on the grid, which change while the points stay."""
+        self.dx = PointMeasure(grid, self.functions["weight"])
+        self.sizes = {name: int(np.prod(shape, dtype=int)) for name, shape in fields.items()}
 
     def __getattr__(self, name: str) -> fem.Function:
-        functions = self.__dict__.get("_functions", {})
+        functions = self.__dict__.get("functions", {})
         if name in functions:
             return functions[name]
         raise AttributeError(f"the points carry {', '.join(functions)}, not {name!r}")
 
-    def place(self, cells: NDArray[np.int32], x: NDArray[np.float64], weight: NDArray[np.float64], **data) -> None:
-        """Put the points into owned cells, with all their data.
-
-        Parameters
-        ----------
-        cells : (n,)
-            Owned local cell of each point.
-        x : (n, d), m
-            Positions.
-        weight : (n,), m^d
-            Volumes.
-        data : (n, ...)
-            Values of the fields.
-        """
-        self._put(cells)
-        self.x = x
-        self.data = {"offset": x - self.grid.midpoints[cells]}
-        self.renew(weight, **data)
-
-    def renew(self, weight: NDArray[np.float64] | None = None, **data) -> None:
-        """Give the points, which stay where they are, new values of some fields, or new weights too."""
-        rows = {name: value.reshape(len(self.cells), self._size[name]) for name, value in data.items()}
-        if weight is not None:
-            rows["weight"] = (weight / self.grid.cell_volume)[:, None]
-        self.data |= rows
-        self.version += 1
-
-    def take(self, points: FormPoints, rows: NDArray[np.int64]) -> None:
-        """Be some rows of other points, which carry the fields of these."""
-        if self._taken is not points.cells:
-            self._taken = points.cells
-            self._put(points.cells[rows])
-        self.x = points.x[rows]
-        self.data = {name: points.data[name][rows] for name in self._functions if name not in self._live}
-        self.version += 1
-
-    def _put(self, cells: NDArray[np.int32]) -> None:
-        self.cells = cells
-        self.filled, self.slots = np.unique(cells, return_inverse=True)
-        self.places += 1
+    def at(self, cells: NDArray[np.int32], x: NDArray[np.float64], weight: NDArray[np.float64], **fields) -> PointData:
+        """Return points in owned cells: see `PointData`; cells (n,), x (n, d) in m."""
+        return PointData(self, Places(self.grid, cells, x), weight, fields)
 
     def value(self, f):
         """Return f at the point, f a Q1 function, test or trial function (any shape)."""
@@ -141,12 +99,10 @@ class FormPoints:
         Derivatives by u do not see it.  In 3D, where the Taylor series has many terms, a kernel of Hencky's law
         takes half or a quarter of the time, and its compilation a fifth.
         """
-        if "gradient" in self._live:
-            return self._functions["gradient"]
-        shape = (self.grid.dim, self.grid.dim)
-        self._functions["gradient"] = self.grid.coefficient(shape)
-        self._live["gradient"] = u
-        return self._functions["gradient"]
+        if "gradient" not in self.live:
+            self.functions["gradient"] = self.grid.coefficient((self.grid.dim, self.grid.dim))
+            self.live["gradient"] = u
+        return self.functions["gradient"]
 
     def increment(self, u: fem.Function):
         """Return Delta = I + grad u at the points as UFL."""
@@ -155,33 +111,6 @@ class FormPoints:
     def deformation(self, u: fem.Function):
         """Return F = Delta F_n at the points, which carry F_n as F, as a UFL variable."""
         return ufl.variable(self.increment(u) * self.F)
-
-    def values(self, name: str, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return a field at the chosen points (m, size)."""
-        return self._gradients[chosen] if name in self._live else self.data[name][chosen]
-
-    def refresh(self) -> None:
-        """Set the gradients of u at the points, of which several forms ask, if u or the points have changed."""
-        for u in self._live.values():
-            self._update(u.x.array)
-
-    def _update(self, u: NDArray[np.float64]) -> None:
-        if self._of is not None and self._of[0] == self.version and np.array_equal(self._of[1], u):
-            return
-        self._of = (self.version, u.copy())
-        d, n = self.grid.dim, len(self.cells)
-        if len(self._gradients) != n:
-            self._gradients = np.empty((n, d * d))
-        nodal = u.reshape(-1, d)
-        for part in (slice(start, start + BATCH) for start in range(0, n, BATCH)):
-            cells = self.cells[part]
-            slopes = self.grid.shape_gradients(cells, self.x[part])
-            du = nodal[self.grid.cell_nodes[cells]].transpose(0, 2, 1) @ slopes
-            self._gradients[part] = du.reshape(len(cells), d * d)
-
-    def changes(self, name: str) -> bool:
-        """Return whether a field changes while the points stay."""
-        return name in self._live
 
     def _taylor(self, f, order: int):
         total = derivative = f
@@ -193,6 +122,77 @@ class FormPoints:
         return total
 
 
+class Places:
+    """Where points lie; nobody changes it.
+
+    Parameters
+    ----------
+    cells : (n,)
+        Owned local cell of each point.
+    x : (n, d), m
+        Positions.
+    """
+
+    def __init__(self, grid: Grid, cells: NDArray[np.int32], x: NDArray[np.float64]):
+        self.grid, self.cells, self.x = grid, cells, x
+        self.offset = x - grid.midpoints[cells]
+        self.filled, self.slots = np.unique(cells, return_inverse=True)
+        """The cells that hold points; and the place of each point's cell among these."""
+
+    def part(self, rows: NDArray[np.int64]) -> Places:
+        """Return some of the places."""
+        return Places(self.grid, self.cells[rows], self.x[rows])
+
+
+class PointData:
+    """Points with weights and fields, complete when made; nobody changes it.
+
+    Parameters
+    ----------
+    points
+        What forms see of them.
+    places
+        Their cells and positions.
+    weight : (n,), m^d
+        Volumes.
+    fields
+        Name and values (n, ...) of all fields of the points; those of other names are left out.
+    """
+
+    def __init__(self, points: FormPoints, places: Places, weight: NDArray[np.float64], fields: dict[str, NDArray]):
+        self.points, self.places, self.cells, self.x = points, places, places.cells, places.x
+        self.volume, n = weight, len(places.cells)
+        self._rows = {"offset": places.offset, "weight": (weight / points.grid.cell_volume)[:, None]}
+        self._rows |= {name: fields[name].reshape(n, size) for name, size in points.sizes.items()}
+        self._gradients: Latest[NDArray[np.float64]] = Latest()
+
+    def part(self, points: FormPoints, places: Places, rows: NDArray[np.int64]) -> PointData:
+        """Return some of the points, at `places`, with those fields that `points` have."""
+        fields = {name: self._rows[name][rows] for name in points.sizes}
+        return PointData(points, places, self.volume[rows], fields)
+
+    def __getitem__(self, name: str) -> NDArray[np.float64]:
+        """Return the values (n, size) of a field."""
+        return self._rows[name]
+
+    def live(self) -> dict[str, NDArray[np.float64]]:
+        """Return the gradients (n, d^2) of functions on the grid, at their present values."""
+        out = {}
+        for name, u in self.points.live.items():
+            now = u.x.array.copy()  # of the key nothing changes
+            out[name] = self._gradients(now, lambda u=now: self._gradients_of(u))
+        return out
+
+    def _gradients_of(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
+        grid, n = self.points.grid, len(self.cells)
+        out, nodal = np.empty((n, grid.dim**2)), u.reshape(-1, grid.dim)
+        for part in (slice(start, start + BATCH) for start in range(0, n, BATCH)):
+            cells = self.cells[part]
+            slopes = grid.shape_gradients(cells, self.x[part])
+            out[part] = (nodal[grid.cell_nodes[cells]].transpose(0, 2, 1) @ slopes).reshape(len(cells), -1)
+        return out
+
+
 class Rows:
     """Coefficients of a compiled form, one row a point.
 
@@ -201,12 +201,11 @@ class Rows:
     compiled
         The form.
     points
-        The points; their data and the nodal values of grid functions are read at each call.
+        The points.
     """
 
     def __init__(self, compiled: _compat.CompiledForm, points: FormPoints):
-        self.points = points
-        names = {f: name for name, f in points._functions.items()}
+        names = {f: name for name, f in points.functions.items()}
         self._columns, self._gathered, start = [], [], 0
         for f in compiled.coefficients:
             dofs, bs = _compat.cell_dofs(f.function_space), f.function_space.dofmap.bs
@@ -216,39 +215,52 @@ class Rows:
             else:
                 self._gathered.append((slice(start, stop), f, dofs))
             start = stop
-        self._room = np.zeros((0, start))
-        self._packed: tuple[int, slice | None] = (-1, None)
-        self._gathered_at: tuple[int, slice | None] = (-1, None)
+        self._width = start
+        self._room, self._dofs, self._packed = Latest(), Latest(), Latest()
 
     def room(self, size: int) -> NDArray[np.float64]:
         """Return the memory of the rows, at least `size` of them; what is kept saves the page faults of every step."""
-        if size > len(self._room):
-            self._room = np.zeros((size, self._room.shape[1]))
-            self._packed = (-1, None)
-        return self._room
+        if self._room.value is None or size > len(self._room.value):
+            self._packed.clear()
+            return self._room(size, lambda: np.zeros((size, self._width)))
+        return self._room.value
 
-    def __call__(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the rows of the chosen points, the first of the memory of all."""
-        cells = self.points.cells[chosen]
+    def __call__(
+        self, data: PointData, chosen: slice | NDArray[np.int64], live: dict[str, NDArray[np.float64]]
+    ) -> NDArray[np.float64]:
+        """Return the rows of the chosen points, the first of the memory of all; live: `data.live()`."""
+        cells = data.cells[chosen]
         rows = self.room(len(cells))[: len(cells)]
-        now = (self.points.version, chosen if isinstance(chosen, slice) else None)
-        fresh = now[1] is None or now != self._packed
+        if isinstance(chosen, slice):
+            key = (data, chosen.start)
+            dofs = self._dofs((data.places, chosen.start), lambda: self._dofs_of(cells))
+            self._packed(key, lambda: self._pack(rows, data, chosen))
+        else:
+            self._packed.clear()
+            dofs = self._dofs_of(cells)
+            self._pack(rows, data, chosen)
         for columns, name in self._columns:
-            if fresh or self.points.changes(name):
-                rows[:, columns] = self.points.values(name, chosen)
-        where = (self.points.places, now[1])
-        if where[1] is None or where != self._gathered_at:
-            self._dofs = [(columns, f, _unrolled(f, dofs[cells])) for columns, f, dofs in self._gathered]
-        self._packed, self._gathered_at = now, where
-        for columns, f, dofs in self._dofs:
-            rows[:, columns] = np.take(f.x.array, dofs, mode="wrap")  # "raise" checks every index
+            if name in live:
+                rows[:, columns] = live[name][chosen]
+        for columns, f, at in dofs:
+            rows[:, columns] = np.take(f.x.array, at, mode="wrap")  # "raise" checks every index
         return rows
 
+    def _pack(self, rows: NDArray[np.float64], data: PointData, chosen: slice | NDArray[np.int64]) -> bool:
+        """Set the columns that stay while the points do."""
+        for columns, name in self._columns:
+            if name not in data.points.live:
+                rows[:, columns] = data[name][chosen]
+        return True
 
-def _unrolled(f: fem.Function, dofs: NDArray[np.int32]) -> NDArray[np.intp]:
-    """Return unrolled (n, m) dofs, in numpy's own index type, which it would else convert to in every assembly."""
-    bs = f.function_space.dofmap.bs
-    return (dofs[:, :, None].astype(np.intp) * bs + np.arange(bs)).reshape(len(dofs), dofs.shape[1] * bs)
+    def _dofs_of(self, cells: NDArray[np.int32]) -> list[tuple[slice, fem.Function, NDArray[np.intp]]]:
+        """Return where the values of grid functions are: unrolled, in numpy's own index type, which it else makes."""
+        out = []
+        for columns, f, dofs in self._gathered:
+            bs = f.function_space.dofmap.bs
+            at = dofs[cells][:, :, None].astype(np.intp) * bs + np.arange(bs)
+            out.append((columns, f, at.reshape(len(cells), -1)))
+        return out
 
 
 class PointForm:
@@ -259,42 +271,37 @@ class PointForm:
     form
         Linear or bilinear UFL form whose integrals are all over `points.dx`.
     points
-        The points; their data and the nodal values of grid functions are read at each assembly.
+        The points.
     dense
-        Tested by DG0, it has a value for each of `points.filled` rather than for each cell of the grid: as
+        Tested by DG0, it has a value for each of the filled cells rather than for each cell of the grid: as
         `PointExpression`, it is called for other cells.
     """
 
     def __init__(self, form: ufl.Form, points: FormPoints, dense: bool = False):
-        self.points, self._dense = points, dense
-        self.compiled = _compat.CompiledForm(form)
-        self._rows, self._bound, self._places = Rows(self.compiled, points), [], -1
+        self._dense, self.compiled = dense, _compat.CompiledForm(form)
+        self._rows, self._bound = Rows(self.compiled, points), Latest()
 
-    def _parts(self):
+    def _parts(self, data: PointData) -> Iterator[tuple]:
         """Yield the form bound to CHUNK points after the other, with their rows."""
-        self.points.refresh()
-        if self._places != self.points.places:
-            self._places, cells = self.points.places, self.points.slots if self._dense else self.points.cells
-            parts = [slice(start, start + CHUNK) for start in range(0, len(cells), CHUNK)]
-            self._bound = [(part, self.compiled.bind(cells[part])) for part in parts]
-        for part, form in self._bound:
-            yield form, self._rows(part)
+        cells, live = data.places.slots if self._dense else data.cells, data.live()
+        parts = [slice(start, start + CHUNK) for start in range(0, len(cells), CHUNK)]
+        bound = self._bound(cells, lambda: [self.compiled.bind(cells[part]) for part in parts])
+        for part, form in zip(parts, bound, strict=True):
+            yield form, self._rows(data, part, live)
 
-    def assemble_vector(self, b: NDArray[np.float64]) -> None:
+    def assemble_vector(self, b: NDArray[np.float64], data: PointData) -> None:
         """Add the vector to the local array `b`; contributions to ghosts stay there."""
-        for form, rows in self._parts():
+        for form, rows in self._parts(data):
             self.compiled.assemble_vector(b, rows, form)
 
-    def assemble_matrix(self, A: PETSc.Mat) -> None:
+    def assemble_matrix(self, A: PETSc.Mat, data: PointData) -> None:
         """Add the matrix to `A`, by unrolled local dofs; the caller finalises it."""
-        for form, rows in self._parts():
+        for form, rows in self._parts(data):
             self.compiled.assemble_matrix(A, rows, form)
 
 
 class FacetForm:
     """A form over faces between active cells, compiled when first a process has such a face.
-
-    All processes assemble it together, for they compile it together.
 
     Parameters
     ----------
@@ -306,38 +313,38 @@ class FacetForm:
 
     def __init__(self, form: ufl.Form, comm: MPI.Intracomm):
         self._form, self._comm = form, comm
-        self._compiled: _compat.CompiledForm | None = None
-        self._facets = np.empty(0, dtype=np.int32)
-        self._bound = False
+
+    @cached_property
+    def _compiled(self) -> _compat.CompiledForm:
+        return _compat.CompiledForm(self._form)
 
     @property
     def used(self) -> bool:
         """Whether the form has been needed so far."""
-        return self._compiled is not None
+        return "_compiled" in vars(self)
 
-    def place(self, facets: NDArray[np.int32]) -> None:
-        """Set the facets of this process."""
-        self._facets, self._bound = facets, False
+    def on(self, facets: NDArray[np.int32]) -> FacetSum:
+        """Return the form over the facets of this process; all processes ask together, for they compile together."""
+        compiled = self._compiled if self._comm.allreduce(len(facets)) else None
+        return FacetSum(compiled, facets)
 
-    def _bind(self) -> bool:
-        """Compile and bind the form if need be; return whether this process has a facet."""
-        if not self._bound:
-            self._bound = True
-            if self._comm.allreduce(len(self._facets)) and self._compiled is None:
-                self._compiled = _compat.CompiledForm(self._form)
-            if len(self._facets):
-                self._compiled.bind(self._facets)
-        return len(self._facets) > 0
+
+class FacetSum:
+    """A compiled form over some facets; without facets, nothing."""
+
+    def __init__(self, compiled: _compat.CompiledForm | None, facets: NDArray[np.int32]):
+        self._compiled = compiled
+        self._form = compiled.bind(facets) if compiled is not None and len(facets) else None
 
     def assemble_matrix(self, A: PETSc.Mat) -> None:
         """Add the matrix to `A`, by unrolled local dofs; the caller finalises it."""
-        if self._bind():
-            self._compiled.assemble_matrix(A)
+        if self._form is not None:
+            self._compiled.assemble_matrix(A, None, self._form)
 
     def assemble_vector(self, b: NDArray[np.float64]) -> None:
         """Add the vector to the local array `b`; contributions to ghosts stay there."""
-        if self._bind():
-            self._compiled.assemble_vector(b)
+        if self._form is not None:
+            self._compiled.assemble_vector(b, None, self._form)
 
 
 class PointExpression:
@@ -355,29 +362,27 @@ class PointExpression:
     """
 
     def __init__(self, expression: ufl.core.expr.Expr, points: FormPoints):
-        self.points, self._shape = points, expression.ufl_shape
-        grid = points.grid
-        q = ufl.TestFunction(grid.cellwise(self._shape))
-        dx = ufl.dx(domain=grid.mesh, subdomain_id=_compat.SUBDOMAIN, metadata={"quadrature_degree": 0})
+        self._volume, self._shape = points.grid.cell_volume, expression.ufl_shape
+        q = ufl.TestFunction(points.grid.cellwise(self._shape))
+        dx = ufl.dx(domain=points.grid.mesh, subdomain_id=_compat.SUBDOMAIN, metadata={"quadrature_degree": 0})
         self._compiled = _compat.CompiledForm(ufl.inner(expression, q) * dx)
         self._rows = Rows(self._compiled, points)
-        self._many = min(BATCH, grid.num_owned)
+        self._many = min(BATCH, points.grid.num_owned)
         self._compiled.bind(np.arange(self._many))
-        self._rows.room(self._many)
         self._values = np.empty((self._many, int(np.prod(self._shape, dtype=int))))
 
-    def evaluate(self, chosen: NDArray[np.int64] | None = None) -> NDArray[np.float64]:
-        """Return the values (m, *shape) at the chosen points, after a `refresh`, or else at all, where they are now."""
-        if chosen is None:
-            self.points.refresh()
-            chosen = np.arange(len(self.points.cells))
+    def evaluate(
+        self, data: PointData, chosen: NDArray[np.int64] | None = None, live: dict[str, NDArray] | None = None
+    ) -> NDArray[np.float64]:
+        """Return the values (m, *shape) at the chosen points, by default all; `live`: `data.live()`, if it is known."""
+        live, chosen = data.live() if live is None else live, np.arange(len(data.cells)) if chosen is None else chosen
         out = np.empty((len(chosen), self._values.shape[1]))
         for start in range(0, len(chosen), max(1, self._many)):
             part = chosen[start : start + self._many]
-            self._rows(part)
+            self._rows(data, part, live)
             self._values[:] = 0.0
             self._compiled.assemble_vector(self._values.reshape(-1), self._rows.room(self._many))
-            np.divide(self._values[: len(part)], self.points.grid.cell_volume, out=out[start : start + len(part)])
+            np.divide(self._values[: len(part)], self._volume, out=out[start : start + len(part)])
         return out.reshape(len(chosen), *self._shape)
 
 
@@ -393,12 +398,12 @@ class CellSums:
     """
 
     def __init__(self, quantities: Sequence[ufl.core.expr.Expr], points: FormPoints):
-        self.points, self._count = points, len(quantities)
+        self._count = len(quantities)
         q = ufl.TestFunction(points.grid.cellwise((self._count,)))
         self._form = PointForm(ufl.inner(ufl.as_vector(quantities), q) * points.dx, points, dense=True)
 
-    def __call__(self) -> NDArray[np.float64]:
+    def __call__(self, data: PointData) -> NDArray[np.float64]:
         """Return the sums (cells, quantities) in the filled cells of the points."""
-        sums = np.zeros((len(self.points.filled), self._count))
-        self._form.assemble_vector(sums.reshape(-1))
+        sums = np.zeros((len(data.places.filled), self._count))
+        self._form.assemble_vector(sums.reshape(-1), data)
         return sums

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Checkpoints: a run that was broken off goes on where it was, on any number of processes.
 
-A checkpoint is numpy's archive of the state between two steps: the points, the pressures of their pieces,
-the time, the histories, and a description of the scene by which a file of another one is refused.
+A checkpoint is numpy's archive of the state between two steps (`State`), with a description of the scene by which a
+file of another one is refused.
 """
 
 from __future__ import annotations
@@ -10,28 +10,28 @@ from __future__ import annotations
 import json
 import os
 import time
-import zlib
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mpm_dolfinx.validation import line, numbers, on_disk, path, whole
-from mpm_dolfinx.parallel.exchange import at_root, to_root
 from mpm_dolfinx.io.writer import WRITABLE, replacing
-from mpm_dolfinx.points.bodies import MaterialPoints
-from mpm_dolfinx.points.pressure_transport import Carried
-from mpm_dolfinx.timeloop import Result, log
+from mpm_dolfinx.parallel.exchange import at_root
+from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.points.pressure_transport import PiecePressures
+from mpm_dolfinx.result import Result
+from mpm_dolfinx.simulation import Simulation
+from mpm_dolfinx.state import State, Stay
+from mpm_dolfinx.timeloop import log
+from mpm_dolfinx.validation import instance, line, numbers, on_disk, path, whole
 
-if TYPE_CHECKING:
-    from mpm_dolfinx.simulation import Simulation
-
-FORMAT, VERSION = "mpm_dolfinx checkpoint", 2
-LISTS = ("t", "displacement", "pressure")  # of Result
+FORMAT, VERSION = "mpm_dolfinx checkpoint", 3
 FOREIGN = "no checkpoint of mpm_dolfinx, must be one"
 ZIP = b"PK\3\4"  # how numpy's archives begin
+COLUMNS = {"t": 0, "displacement": 1, "pressure": 2}  # of the rows of a Result
+NOTE = {"t": float, "resets": int, "begins": bool, "scene": dict, "result": dict}  # and their kinds
 
 
 @dataclass
@@ -69,7 +69,7 @@ class Checkpoint:
     def __call__(self, simulation: Simulation) -> None:
         """Save the state if it is time."""
         result, comm = simulation.result, simulation.grid.comm
-        due = (len(result.t) - 1) % self.every == 0
+        due = (len(result.rows) - 1) % self.every == 0
         if due and self.seconds > 0:
             due = comm.bcast(time.monotonic() - self._last >= self.seconds)
         if due or result.converged:
@@ -78,27 +78,23 @@ class Checkpoint:
 
 
 def save(simulation: Simulation, file: Path) -> None:
-    """Write the state of a simulation between two steps of a run, and go on as after `resume`."""
-    comm, began = simulation.grid.comm, time.perf_counter()
-    points, carried, result = simulation.points, simulation.carried, vars(simulation.result)
-    state = {"points": vars(points.migrated(to_root(comm, len(points))))}
-    if carried is not None:
-        state["carried"] = vars(carried.migrated(to_root(comm, len(carried.id))))
-    state["result"] = {name: np.array(result[name]) for name in LISTS}
-    note = {"version": VERSION, "t": simulation.t, "scene": describe(simulation)}
-    note["result"] = {name: value for name, value in result.items() if name not in LISTS}
+    """Write the state of a simulation between two steps of a run."""
+    comm, began, state = simulation.grid.comm, time.perf_counter(), simulation.state
+    whole_state = state.migrated(np.zeros(len(state.points), dtype=np.int32), comm)
+    note = {"version": VERSION, "t": state.t, "resets": state.resets, "begins": state.begins}
+    note |= {"scene": describe(simulation), "result": _scalars(state.result)}
 
     def write() -> int:
         file.parent.mkdir(parents=True, exist_ok=True)
+        arrays = {"format": np.array(FORMAT), "note": np.array(json.dumps(note)), **_arrays(whole_state)}
         with replacing(file) as part, open(part, "wb") as f:
-            np.savez(f, format=np.array(FORMAT), note=np.array(json.dumps(note)), **_named("", state))
+            np.savez(f, **arrays)
         return file.stat().st_size
 
-    with on_disk(f"{file}: checkpoint at t = {simulation.t:g} s", WRITABLE):
+    with on_disk(f"{file}: checkpoint at t = {state.t:g} s", WRITABLE):
         size = at_root(comm, write)
-    simulation.coupler.forget()
     seconds = time.perf_counter() - began
-    log(comm, "t = %g s: checkpoint %s written: %.3g MB, %.2g s", simulation.t, file, size / 1e6, seconds)
+    log(comm, "t = %g s: checkpoint %s written: %.3g MB, %.2g s", state.t, file, size / 1e6, seconds)
 
 
 def resume(simulation: Simulation, file: str | os.PathLike) -> Result:
@@ -108,41 +104,116 @@ def resume(simulation: Simulation, file: str | os.PathLike) -> Result:
     ----------
     simulation
         The scene of the checkpoint, on any number of processes, in the stage of the checkpoint: call its `stage`
-        with what came and went first.  Grid, bodies, materials and fluid are compared with the file; loads,
-        boundary conditions, terms and sources may differ.  What observers have gathered for themselves is not in
-        the file.
+        with what came and went first.  Grid, bodies, materials with their fields and laws, and fluid are compared with
+        the file; loads, boundary conditions, terms and sources may differ.  What observers have gathered for
+        themselves is not in the file.
     file
         The checkpoint.
 
     Raises
     ------
     ValueError
-        The file is not a whole checkpoint, or one of another scene: says what differs.
+        The file is not a whole checkpoint, or one of another scene: says what differs.  The simulation is then what
+        it was.
     OSError
         The file is not there (FileNotFoundError) or cannot be read.
     """
-    file = path("checkpoint: file", file)
-    if not hasattr(simulation, "restore"):  # its class is defined later than this
-        raise ValueError(f"resume: simulation = {line(simulation)}, must be a Simulation")
-    comm, arrays = simulation.grid.comm, {}
+    file, comm = path("checkpoint: file", file), simulation.grid.comm
+    instance("resume: simulation", simulation, Simulation)
 
-    def read() -> tuple[dict, dict, dict]:
+    def read() -> State:
         with on_disk("resume", "a checkpoint that can be read"):
-            note = _read(file, arrays)
+            arrays, note = _read(file)
         _check_scene(file, note["scene"], describe(simulation))
-        lists = _part(arrays, "result/")
-        return note, lists, {name: (values.dtype, values.shape[1:]) for name, values in arrays.items()}
+        return _state(file, arrays, note, simulation)
 
-    note, lists, kinds = at_root(comm, read)
+    state = at_root(comm, read)
     if comm.rank > 0:  # rank 0 has all rows, and passes them on
-        arrays = {name: np.empty((0, *shape), dtype=dtype) for name, (dtype, shape) in kinds.items()}
-    data, points = _part(arrays, "points/data/"), _part(arrays, "points/")
-    carried = _part(arrays, "carried/")
-    simulation.restore(MaterialPoints(**points, data=data), Carried(**carried) if carried else None, note["t"])
-    result = Result(t=lists["t"].tolist(), displacement=list(lists["displacement"]), **note["result"])
-    result.pressure = [tuple(row) for row in lists["pressure"].tolist()]
-    log(comm, "t = %g s: resumed from %s after %d steps", simulation.t, file, result.steps)
-    return result
+        state = _without_rows(state)
+    simulation.state = replace(state, stage=simulation.state.stage).at_owners(simulation.grid)
+    log(comm, "t = %g s: resumed from %s after %d steps", state.t, file, state.result.steps)
+    return simulation.result
+
+
+def _scalars(result: Result) -> dict[str, Any]:
+    return {f.name: getattr(result, f.name) for f in fields(result) if f.name != "rows"}
+
+
+def _arrays(state: State) -> dict[str, NDArray]:
+    """Return the arrays of a state by names with slashes."""
+    rows = state.result.rows
+    named = {"points": vars(state.points), "reactions": state.reactions}
+    named["result"] = {name: np.array([row[i] for row in rows if row[i] is not None]) for name, i in COLUMNS.items()}
+    if state.transported is not None:
+        named["transported"] = vars(state.transported)
+    if state.stay is not None:
+        named["stay"] = {"points": vars(state.stay.points)}
+        if state.stay.id is not None:
+            named["stay"] |= {name: getattr(state.stay, name) for name in ("id", "pressure", "x")}
+    return _named("", named)
+
+
+def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulation: Simulation) -> State:
+    """Return the state in a file, all of it; ValueError where it is none of the simulation's."""
+    now, dim = simulation.state, simulation.grid.dim
+    wet, damaged = simulation.scene.fluid is not None, f"{file}: is cut short or damaged"
+    ids = simulation.scene.all_ids(now.stage.present)
+    try:
+        points = _points(_part(arrays, "points/"), now.points, ids)
+        stay, transported, of_stay = None, None, _part(arrays, "stay/")
+        if of_stay:
+            own = [of_stay.pop(name) for name in ("id", "pressure", "x")] if wet else [None] * 3
+            stay = Stay(_points(_part(of_stay, "points/"), now.points, ids), *own)
+            if wet:
+                _check_pieces({"id": stay.id, "pressure": stay.pressure, "x": stay.x}, ids, dim)
+        elif wet:
+            transported = PiecePressures(**_part(arrays, "transported/"))
+            _check_pieces(vars(transported), ids, dim)
+        histories = _part(arrays, "result/")
+        times = histories.pop("t").tolist()
+        columns = [histories.get(name, np.empty(0)) for name in ("displacement", "pressure")]
+        moved, pressure = ([*column] if len(column) else [None] * len(times) for column in columns)
+        ends = [None if p is None else tuple(p.tolist()) for p in pressure]
+        result = Result(rows=list(zip(times, moved, ends, strict=True)), **note["result"])
+        reactions = arrays.pop("reactions")
+        if arrays or reactions.shape[1:] != (dim,) or not all(np.isfinite([note["t"], *times])):
+            raise ValueError(f"has {', '.join(arrays) or 'other reactions or times'}")
+        return State(note["t"], points, transported, stay, note["resets"], reactions, None, note["begins"], result)
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+        raise ValueError(f"{damaged} ({line(error)}), must be a whole checkpoint") from error
+
+
+def _points(arrays: dict[str, NDArray], like: MaterialPoints, ids: NDArray[np.int64]) -> MaterialPoints:
+    """Return points of these ids from arrays as those of others; ValueError where they are not."""
+    data = _part(arrays, "data/")
+    points = MaterialPoints(**arrays, data=data)
+    for name, rows, kind in zip([*arrays, *data], points.arrays, like.arrays, strict=True):
+        if rows.dtype != kind.dtype or rows.shape != (len(ids), *kind.shape[1:]) or not np.isfinite(rows).all():
+            raise ValueError(f"points/{name}: {rows.dtype} of shape {rows.shape}, or not finite")
+    if not np.array_equal(points.id, ids):
+        raise ValueError("points/id: other points than the bodies'")
+    return points
+
+
+def _check_pieces(arrays: dict[str, NDArray], ids: NDArray[np.int64], dim: int) -> None:
+    """Refuse, with a ValueError, arrays that are none of the pieces of points of these ids."""
+    shapes, count = {"x": (dim,), "slope": (dim,), "bounds": (2,)}, len(arrays["id"])
+    for name, rows in arrays.items():
+        kind = np.int64 if name in ("id", "cell") else np.float64
+        if rows.dtype != kind or rows.shape != (count, *shapes.get(name, ())) or not np.isfinite(rows).all():
+            raise ValueError(f"pieces: {name}: {rows.dtype} of shape {rows.shape}, or not finite")
+    if not np.array_equal(np.unique(arrays["id"]), ids) or (np.diff(arrays["id"]) < 0).any():
+        raise ValueError("pieces: id: other points than the bodies'")
+
+
+def _without_rows(state: State) -> State:
+    """Return a state without points and pieces."""
+    none = np.empty(0, np.int64)
+    points, transported, stay = state.points.of(none), state.transported, state.stay
+    if stay is not None:
+        rows = [None if rows is None else rows[:0] for rows in (stay.id, stay.pressure, stay.x)]
+        stay = Stay(stay.points.of(none), *rows)
+    return replace(state, points=points, transported=transported and transported.of(none), stay=stay)
 
 
 def _named(prefix: str, values: dict) -> dict[str, NDArray]:
@@ -158,42 +229,33 @@ def _part(arrays: dict[str, NDArray], prefix: str) -> dict[str, NDArray]:
     return {name.removeprefix(prefix): arrays.pop(name) for name in list(arrays) if name.startswith(prefix)}
 
 
-def _read(file: Path, arrays: dict[str, NDArray]) -> dict:
-    """Read the arrays of a checkpoint into `arrays`; return its note."""
+def _read(file: Path) -> tuple[dict[str, NDArray], dict[str, Any]]:
+    """Return the arrays of a checkpoint and its note."""
     with open(file, "rb") as f:
         begin = f.read(4)
+    what = "is cut short or damaged, must be a whole checkpoint" if begin == ZIP else FOREIGN
     try:
         with np.load(file, allow_pickle=False) as archive:
-            arrays.update({name: archive[name] for name in archive.files})
+            arrays = {name: archive[name] for name in archive.files}
     except Exception as error:  # numpy and zipfile have many for bytes that are not what they expect
-        what = "is cut short or damaged, must be a whole checkpoint" if begin == ZIP else FOREIGN
         raise ValueError(f"{file}: {what}") from error
     if str(arrays.pop("format", None)) != FORMAT or "note" not in arrays:
         raise ValueError(f"{file}: {FOREIGN}")
-    note = json.loads(str(arrays.pop("note")))
-    if note.get("version") != VERSION:
-        raise ValueError(f"{file}: checkpoint of version {note.get('version')}, must be {VERSION} for this mpm_dolfinx")
-    return note
+    try:
+        note = json.loads(str(arrays.pop("note")))
+        version, kinds = note.get("version"), {name: type(note.get(name)) for name in NOTE}
+    except (ValueError, AttributeError) as error:
+        raise ValueError(f"{file}: {what}") from error
+    if version != VERSION:
+        raise ValueError(f"{file}: checkpoint of version {version}, must be {VERSION} for this mpm_dolfinx")
+    if kinds != NOTE:
+        raise ValueError(f"{file}: {what}")
+    return arrays, note
 
 
 def describe(simulation: Simulation) -> dict[str, Any]:
     """Return the constants that make the scene, by name, as a checkpoint holds them."""
-    grid = simulation.grid
-    scene = {"grid cells": grid.shape.tolist(), "grid lower": grid.lower.tolist(), "grid upper": grid.upper.tolist()}
-    scene["quadrature"] = simulation.quadrature
-    scene["bodies present"] = list(simulation.present)
-    for i, body in enumerate(simulation.bodies):
-        scene[f"points of body {i}"] = len(body)
-        scene[f"material of body {i}"] = int(body.material)
-        scene[f"volume of body {i}"] = float(np.broadcast_to(body.spacing, body.lower.shape).prod(axis=1).sum())
-        scene[f"checksum of the positions of body {i}"] = zlib.crc32(np.ascontiguousarray(body.centre).tobytes())
-    for name, one in [(f"material {i}", m) for i, m in enumerate(simulation.materials)] + [("fluid", simulation.fluid)]:
-        scene[name] = None if one is None else type(one).__name__
-        constants = {f.name: getattr(one, f.name) for f in fields(one)} if one is not None else {}
-        constants = {key: value for key, value in constants.items() if value is not None and not callable(value)}
-        scene |= {f"{key} of {name}": np.asarray(value).tolist() for key, value in constants.items()}
-    scene["data of the points"] = sorted(simulation.points.data)
-    return scene
+    return {**simulation.scene.description, "bodies present": list(simulation.present)}
 
 
 def _check_scene(file: Path, there: dict[str, Any], here: dict[str, Any]) -> None:

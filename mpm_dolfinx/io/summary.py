@@ -7,16 +7,14 @@ import resource
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from mpi4py import MPI
 
 import numpy as np
 
 from mpm_dolfinx.constitutive.skeleton import LOCKING
-
-if TYPE_CHECKING:
-    from mpm_dolfinx.simulation import Simulation
+from mpm_dolfinx.scene import Scene
+from mpm_dolfinx.state import State
 
 
 @dataclass(frozen=True)
@@ -28,79 +26,79 @@ class Part:
     why: str
 
 
-def parts(simulation: Simulation) -> list[Part]:
+def parts(scene: Scene, state: State) -> list[Part]:
     """Return the terms and solvers of a scene, as they are so far: some are compiled when first they are needed."""
-    return [*_momentum(simulation), *_storage(simulation), *_solvers(simulation)]
+    return [*_momentum(scene, state), *_storage(scene, state), *_solvers(scene)]
 
 
 def _either(name: str, used, what: str, otherwise: str) -> Part:
     return Part(name, bool(used), what if used else otherwise)
 
 
-def _momentum(s: Simulation) -> list[Part]:
-    m, side = s.momentum, s.boundary
-    laws = ", ".join(law.__name__ for law, _ in s.laws)
-    state = ", ".join(name for law, _ in s.laws for name in law.state)
+def _momentum(s: Scene, state: State) -> list[Part]:
+    m, side = s.momentum, state.stage.mechanical
+    laws, evolves = ", ".join(law.__name__ for law in s.materials.laws), ", ".join(s.materials.state_names)
     return [
-        _either("reset of the grid", s.resets > 1, f"{s.resets} so far", "nothing has moved so far"),
+        _either("reset of the grid", state.resets > 1, f"{state.resets} so far", "nothing has moved so far"),
         Part("stress", True, f"{laws}; integrated over {'exact domains' if s.quadrature == 'domain' else 'points'}"),
         _either(
             "mean dilatation", m.dilatation, f"nu > {LOCKING}, or plastic flow", f"nu <= {LOCKING}, no plastic flow"
         ),
-        _either("state of the law", state, state, "the stress depends on F only"),
+        _either("state of the law", evolves, evolves, "the stress depends on F only"),
         _either("body force", s.gravity is not None, "gravity", "no gravity"),
         _either("tractions", side.loads, f"on {len(side.loads)} sides", "no tractions"),
         _either("given displacements", side.holds, f"on {len(side.holds)} sides", "no given displacements"),
         _either("rigid plates", side.plates, f"on {len(side.plates)} sides", "no plates"),
-        _either("ghost penalty", m.ghost.used, "faces of partly filled cells", "no partly filled cell so far"),
+        _either("ghost penalty", m.ghost.form.used, "faces of partly filled cells", "no partly filled cell so far"),
         _either("terms of the user's", m.terms, f"{len(m.terms)}", "none given"),
     ]
 
 
-def _storage(s: Simulation) -> list[Part]:
-    storage, outlets = s.storage, s.boundary.outlets
+def _storage(s: Scene, state: State) -> list[Part]:
+    storage, outlets = s.storage, state.stage.hydraulic.outlets
     names = ("pore pressure", "fluxes between cells", "weight of the fluid", "open sides", "damping of pressure jumps")
     if storage is None:
         return [Part(name, False, "no fluid") for name in (*names, "sources")]
-    still = "nothing conducts"
+    still, f = "nothing conducts", storage.fluxes
     return [
         Part(names[0], True, "finite volumes, coupled"),
-        _either(names[1], storage.flows, "two-point", still),
-        _either(names[2], storage.gravity, "gravity", "no gravity" if storage.flows else still),
+        _either(names[1], f.flux, "two-point", still),
+        _either(names[2], f.gravity, "gravity", "no gravity" if f.flux else still),
         _either(names[3], outlets, f"{len(outlets)} drained or with inflow", "sealed"),
-        _either(names[4], storage.damp.used, "little flows within a step", "enough flows within a step, so far"),
+        _either(names[4], f.damp.used, "little flows within a step", "enough flows within a step, so far"),
         _either("sources", storage.sources, f"{len(storage.sources)}", "none given"),
     ]
 
 
-def _solvers(s: Simulation) -> list[Part]:
-    m, coupling = s.momentum, s.coupler.coupling
-    kind = "symmetric" if m.symmetric else "unsymmetric: LU and FGMRES"
+def _solvers(s: Scene) -> list[Part]:
+    kind = "symmetric" if s.momentum.symmetric else "unsymmetric: LU and FGMRES"
     return [
-        _either("coupling", s.storage, f"{coupling}, {kind}", "no fluid: Newton on the momentum"),
+        _either("coupling", s.storage, f"{s.scheme.coupling}, {kind}", "no fluid: Newton on the momentum"),
         _either(
             "one factorisation for many steps",
-            m.linear,
+            s.momentum.linear,
             "linear law: until active cells or time step change",
             "the tangent depends on the strain",
         ),
     ]
 
 
-def table(simulation: Simulation) -> str:
+def table(scene: Scene, state: State) -> str:
     """Return the parts of a scene as a table."""
-    rows = parts(simulation)
+    rows = parts(scene, state)
     width = max(len(part.name) for part in rows)
     return "\n".join(f"{part.name:{width}}  {'yes' if part.used else 'no ':3}  {part.why}" for part in rows)
 
 
-def imbalance(simulation: Simulation) -> dict[str, float]:
+def imbalance(scene: Scene, state: State) -> dict[str, float]:
     """Return the most that one process has over the mean of all: points, pieces, active cells; after the first step.
 
     1 is perfect; the time of a step goes with the pieces.  Called on all processes together.
     """
-    comm, pieces = simulation.grid.comm, simulation.pieces
-    mine = np.array([len(simulation.points), len(pieces.cells), len(pieces.filled)], dtype=float)
+    comm, (on_grid, _) = scene.grid.comm, scene.last
+    pieces = on_grid.data.pieces if on_grid else None
+    mine = [len(state.points), len(pieces.cells), len(pieces.places.filled)] if pieces else [len(state.points), 0, 0]
+    mine = np.array(mine, dtype=float)
     total, most = np.empty_like(mine), np.empty_like(mine)
     comm.Allreduce(mine, total)
     comm.Allreduce(mine, most, MPI.MAX)

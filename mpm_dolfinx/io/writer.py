@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from xml.etree import ElementTree
 
 from mpi4py import MPI
@@ -24,13 +24,11 @@ import numpy as np
 from dolfinx import fem, io
 from numpy.typing import NDArray
 
-from mpm_dolfinx.validation import flag, line, line_of, on_disk, path, whole
+from mpm_dolfinx.validation import flag, instance, line_of, on_disk, path, whole
 from mpm_dolfinx.parallel.exchange import at_root, to_root
-from mpm_dolfinx.points.bodies import MaterialPoints
-from mpm_dolfinx.timeloop import Result
-
-if TYPE_CHECKING:
-    from mpm_dolfinx.simulation import Simulation
+from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.result import Result
+from mpm_dolfinx.simulation import Simulation
 
 VTK_CELLS = {2: ("quad", [0, 1, 3, 2]), 3: ("hexahedron", [0, 1, 3, 2, 4, 5, 7, 6])}
 """VTK's cell for a domain, and the domain's corners in VTK's order."""
@@ -74,8 +72,7 @@ class Writer:
     """
 
     def __init__(self, simulation: Simulation, folder: str | os.PathLike, *, every: int = 1, grid: bool = False):
-        if not hasattr(simulation, "effective_stress"):  # its class is defined later than this one
-            raise ValueError(f"writer: simulation = {line(simulation)}, must be a Simulation")
+        instance("writer: simulation", simulation, Simulation)
         flag("writer: grid", grid)
         folder, comm, self._t = path("writer: folder", folder), simulation.grid.comm, simulation.t
         self.every, self._started, self._simulation = whole("writer: every", every), False, simulation
@@ -99,7 +96,7 @@ class Writer:
         if not self._started:
             self._start(result)
         self._table.add(_row(result, simulation.reactions))
-        if (len(result.t) - 1) % self.every and not result.converged:
+        if (len(result.rows) - 1) % self.every and not result.converged:
             return
         self._write_points(simulation)
         self._points.write_index()
@@ -109,10 +106,9 @@ class Writer:
 
     def _start(self, result: Result) -> None:
         """Drop what the folder holds of later times: from here on the files are this run's."""
-        if result.t[-2] != self._t:
-            raise ValueError(f"writer: made at t = {self._t:g} s for a run that goes on from t = {result.t[-2]:g} s")
-        first = Result(t=result.t[:1], displacement=result.displacement[:1], pressure=result.pressure[:1])
-        self._table.start(_row(first, self._reactions))
+        if (began := result.rows[-2][0]) != self._t:
+            raise ValueError(f"writer: made at t = {self._t:g} s for a run that goes on from t = {began:g} s")
+        self._table.start(_row(Result(rows=result.rows[:1]), self._reactions))
         self._points.write_index()
         if self._grid is not None:
             self._grid.write_index()
@@ -126,7 +122,7 @@ class Writer:
 
         def write() -> None:
             with replacing(file) as part:
-                solid(points, points.x - points.origin.mean(axis=1), simulation.fluid is not None).write(
+                solid(points, points.x - points.origin.mean(axis=1), simulation.scene.fluid is not None).write(
                     part, file_format="vtu"
                 )
 
@@ -147,10 +143,11 @@ class Writer:
 
 def _row(result: Result, reactions: NDArray[np.float64]) -> dict[str, float]:
     """Return what the histories hold of the last output time, and the forces of the given displacements then."""
-    out = {"t": result.t[-1], **{name: getattr(result, name) for name in COUNTS}}
-    if result.pressure:
-        out["p_min"], out["p_max"] = result.pressure[-1]
-    for i, u in enumerate(result.displacement[-1] if result.displacement else ()):
+    t, displacement, pressure = result.rows[-1]
+    out = {"t": t, **{name: getattr(result, name) for name in COUNTS}}
+    if pressure is not None:
+        out["p_min"], out["p_max"] = pressure
+    for i, u in enumerate(() if displacement is None else displacement):
         out |= {f"u{axis}_{i}": value for axis, value in zip("xyz", u.tolist(), strict=False)}
     for i, force in enumerate(reactions):
         out |= {f"reaction_{axis}_{i}": value for axis, value in zip("xyz", force.tolist(), strict=False)}
@@ -200,10 +197,11 @@ def _columns(name: str, rows: NDArray) -> Iterator[tuple[str, NDArray]]:
 
 def _grid_fields(simulation: Simulation) -> list[fem.Function]:
     """Return copies, by their names in the file, of the fields of the last step."""
-    fill = simulation.momentum.fill
-    fields = {"step_displacement": simulation.momentum.u, "fill": fill}
-    if simulation.storage is not None:
-        fields["pressure"] = simulation.storage.p
+    scene = simulation.scene
+    fill = scene.momentum.ghost.fill
+    fields = {"step_displacement": scene.momentum.u, "fill": fill}
+    if scene.storage is not None:
+        fields["pressure"] = scene.storage.p
     out = []
     for name, field in fields.items():
         out.append(fem.Function(field.function_space, name=name))

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.points.cutting import Pieces, cut, cut_faces
-from mpm_dolfinx.parallel.exchange import Exchange, first, over_all
+from mpm_dolfinx.parallel.exchange import Exchange, over_all
 from mpm_dolfinx.forms.point_forms import CHUNK
 from mpm_dolfinx.points.grid import Grid, sum_by
-from mpm_dolfinx.points.bodies import MaterialPoints
+from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.points.faces import Surface, face_vectors, interpolate
 
 STAYS = 3e-4
@@ -68,11 +68,7 @@ class Patches:
         return face_vectors(points.corners[self._at], self._faces.axis, self._faces.end) * share[:, None]
 
 
-class LeftGrid(RuntimeError):
-    """A material point lies outside the grid."""
-
-
-class Placement:
+class CutDomains:
     """The points' domains cut by the cells, and the way of their data to the owners of the cells.
 
     It serves until the points have moved: where they were when they were cut is what the grid sees.
@@ -82,44 +78,22 @@ class Placement:
     grid
         Background grid.
     points
-        The material points of this process.
-    quadrature
-        "domain": exact pieces of the points' domains; "point": one piece a point, as in the seed paper.
-    t
-        Time, s, for the message of a point that has left the grid.
-
-    Raises
-    ------
-    LeftGrid
-        Naming the first point outside the grid.
+        The material points of this process, in the grid.
+    domains
+        Exact pieces of the points' domains; else one piece a point, as in standard MPM.
     """
 
-    def __init__(self, grid: Grid, points: MaterialPoints, quadrature: str, t: float):
-        self.grid, self.points = grid, points
-        self._corners, self._x = points.corners.copy(), points.x
+    def __init__(self, grid: Grid, points: MaterialPoints, domains: bool):
+        self.grid, self.points, self.domains = grid, points, domains
         self._patches: dict[Surface, Patches] = {}
-        self._followed: tuple[Exchange, NDArray[np.int32], NDArray[np.float64]] | None = None
-        self._check_inside(points.corners if quadrature == "domain" else points.x[:, None], t)
-        self.pieces = cut(grid, points.corners) if quadrature == "domain" else whole_points(grid, points.x)
+        self.pieces = cut(grid, points.corners) if domains else whole_points(grid, points.x)
         self._travel = Exchange(grid.comm, grid.owner(self.pieces.cell))
         self.cells, self.x = grid.local(self._travel.send(self.pieces.cell)), self._travel.send(self.pieces.x)
         """Owned cells, and centroids (m, d), m, of the pieces that this process integrates."""
-        self.moved = np.zeros_like(self.pieces.x)
-        """Displacements (m, d), m, of the pieces since they were cut."""
 
-    def _check_inside(self, x: NDArray[np.float64], t: float) -> None:
-        grid, points, message = self.grid, self.points, ""
-        out = np.flatnonzero(grid.outside(x.reshape(-1, grid.dim)))
-        if len(out):
-            i = out[0] // x.shape[1]
-            message = f"point {points.id[i]} at {points.x[i]} left the grid {grid.lower} to {grid.upper} at t = {t:g} s"
-            message += ", must stay in it: take a larger grid"
-        if message := first(grid.comm, message):
-            raise LeftGrid(message)
-
-    def serves(self) -> bool:
-        """Return whether the points are still where they were, but for `STAYS`."""
-        moved = np.abs((self.points.corners - self._corners) / self.grid.h).max(initial=0.0)
+    def serves(self, points: MaterialPoints) -> bool:
+        """Return whether the points are still where they were cut, but for `STAYS`."""
+        moved = np.abs((points.corners - self.points.corners) / self.grid.h).max(initial=0.0)
         return over_all(self.grid.comm, moved, MPI.MAX) <= STAYS
 
     def to_cells(self, values: NDArray) -> NDArray:
@@ -150,7 +124,7 @@ class Placement:
 
     def _cut_surface(self, faces: Surface) -> Patches:
         here, at = self.points.find(faces.id)
-        corners, xi = self._corners[at], faces.corners()[here]
+        corners, xi = self.points.corners[at], faces.corners()[here]
         count = xi.shape[1]
         places = interpolate(np.repeat(corners, count, axis=0), xi.reshape(-1, self.grid.dim)).reshape(xi.shape)
         face, x, xi, share, middle = cut_faces(self.grid, places, xi)
@@ -160,30 +134,29 @@ class Placement:
         cell = self._filled_cell(at[face], middle + inward[face])
         return Patches(faces, here[face], at[face], cell, x, xi, share)
 
-    def displacement(self, u: NDArray[np.float64], corners: bool) -> NDArray[np.float64]:
-        """Return the Q1 field u (nodes, d) at the corners (n, 2^d, d), or at the points (n, d), when they were cut."""
-        if self._followed is None:
-            self._followed = self._follow(corners)
+    def displacement(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the Q1 field u (nodes, d) at the corners (n, 2^d, d), or at points without domains (n, d)."""
         travel, cells, x = self._followed
         moved = np.empty_like(x)
         for part in (slice(start, start + CHUNK) for start in range(0, len(x), CHUNK)):
             N = self.grid.shape_values(cells[part], x[part])
             moved[part] = np.einsum("mk,mkd->md", N, u[self.grid.cell_nodes[cells[part]]])
-        return travel.back(moved).reshape(self._corners.shape if corners else self._x.shape)
+        return travel.back(moved).reshape((self.points.corners if self.domains else self.points.x).shape)
 
-    def _follow(self, corners: bool) -> tuple[Exchange, NDArray[np.int32], NDArray[np.float64]]:
-        """Return the way to the owners of the cells of corners or points, these cells, and the positions."""
+    @cached_property
+    def _followed(self) -> tuple[Exchange, NDArray[np.int32], NDArray[np.float64]]:
+        """The way to the owners of the cells of corners or points, these cells, and the positions."""
         grid, n, d = self.grid, len(self.points), self.grid.dim
-        at = np.repeat(np.arange(n), 2**d if corners else 1)
-        x = self._corners.reshape(-1, d) if corners else self._x
+        at = np.repeat(np.arange(n), 2**d if self.domains else 1)
+        x = self.points.corners.reshape(-1, d) if self.domains else self.points.x
         # of a corner on a grid line, rounding must not choose a cell in which the domain does not lie
-        cell = self._filled_cell(at, x + DEPTH * (self._x[at] - x))
+        cell = self._filled_cell(at, x + DEPTH * (self.points.x[at] - x))
         travel = Exchange(grid.comm, grid.owner(cell))
         return travel, grid.local(travel.send(cell)), travel.send(x)
 
-    def total_displacement(self) -> NDArray[np.float64]:
+    def total_displacement(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the displacements (m, d), m, of the pieces' centroids, as those of their domains' corners."""
-        points, pieces = self.points, self.pieces
+        pieces = self.pieces
         now, then = (c - c.mean(axis=1, keepdims=True) for c in (points.corners, points.origin))
         stretch = np.linalg.solve(then.swapaxes(1, 2) @ then, then.swapaxes(1, 2) @ now)  # of the corners' pattern
         off = pieces.x - points.x[pieces.point]

@@ -22,12 +22,12 @@ from numpy.typing import NDArray
 from mpm_dolfinx.points.cutting import Pieces
 from mpm_dolfinx.parallel.exchange import Exchange
 from mpm_dolfinx.points.grid import Grid, sum_by
-from mpm_dolfinx.points.bodies import MaterialPoints
+from mpm_dolfinx.points.material_points import MaterialPoints
 
 
-@dataclass
-class Carried:
-    """Pressures of the pieces between two steps; arrays over the pieces, ordered by point and cell.
+@dataclass(frozen=True, eq=False)
+class PiecePressures:
+    """Pressures that pieces take from one grid to the next; arrays over the pieces, ordered by point and cell.
 
     id : (m,) number of the point; cell : (m,) lexicographic cell, -1 at the start;
     fraction : (m,) share of the domain; pressure : (m,), Pa; x : (m, d) centroid, m; slope : (m, d) of the
@@ -42,31 +42,35 @@ class Carried:
     slope: NDArray[np.float64]
     bounds: NDArray[np.float64]
 
-    def migrated(self, exchange: Exchange) -> Carried:
+    def __post_init__(self):
+        for f in fields(self):
+            getattr(self, f.name).flags.writeable = False
+
+    def migrated(self, exchange: Exchange) -> PiecePressures:
         """Return the pieces of this process after each went to where its point goes."""
-        return Carried(*(exchange.send(getattr(self, f.name)) for f in fields(self)))._ordered()
+        return PiecePressures(*(exchange.send(getattr(self, f.name)) for f in fields(self)))._ordered()
 
-    def kept(self, ids: NDArray[np.int64]) -> Carried:
-        """Return the pieces of some points, given by their ids in order."""
-        return self._rows(np.isin(self.id, ids))
+    def of(self, ids: NDArray[np.int64], kept: bool = True) -> PiecePressures:
+        """Return the pieces of the points of these ids, or of all others."""
+        return self._rows(np.isin(self.id, ids) == kept)
 
-    def joined(self, other: Carried) -> Carried:
+    def joined(self, other: PiecePressures) -> PiecePressures:
         """Return these pieces and those of other points, ordered by point and cell."""
         pairs = [(getattr(self, f.name), getattr(other, f.name)) for f in fields(self)]
-        return Carried(*map(np.concatenate, pairs))._ordered()
+        return PiecePressures(*map(np.concatenate, pairs))._ordered()
 
-    def _rows(self, rows: NDArray) -> Carried:
-        return Carried(*(getattr(self, f.name)[rows] for f in fields(self)))
+    def _rows(self, rows: NDArray) -> PiecePressures:
+        return PiecePressures(*(getattr(self, f.name)[rows] for f in fields(self)))
 
-    def _ordered(self) -> Carried:
+    def _ordered(self) -> PiecePressures:
         return self._rows(np.lexsort((self.cell, self.id)))
 
 
-def at_start(points: MaterialPoints) -> Carried:
+def at_start(points: MaterialPoints) -> PiecePressures:
     """Return what points carry that have not been in a cell yet: one piece each, of even pressure."""
     n, p = len(points), points.pressure
     cell, slope, bounds = np.full(n, -1), np.zeros_like(points.x), np.stack([p, p], axis=1)
-    return Carried(points.id.copy(), cell, np.ones(n), p.copy(), points.x.copy(), slope, bounds)
+    return PiecePressures(points.id, cell, np.ones(n), p, points.x, slope, bounds)
 
 
 class Reconstruction:
@@ -133,7 +137,7 @@ class Reconstruction:
         return slope * scale[:, None], here[:, None] + np.stack([low, high], axis=1)
 
 
-def remap(old: Carried, points: MaterialPoints, new: Pieces) -> NDArray[np.float64]:
+def transport(old: PiecePressures, points: MaterialPoints, new: Pieces) -> NDArray[np.float64]:
     """Return the pressures (m,), Pa, that the new pieces bring to their cells."""
     n = len(points)
     if not n:
@@ -169,7 +173,7 @@ def remap(old: Carried, points: MaterialPoints, new: Pieces) -> NDArray[np.float
     return pressure + _within(amiss, pressure, old, owner, new) * amiss
 
 
-def _within(amiss, pressure, old: Carried, owner, new: Pieces) -> NDArray[np.float64]:
+def _within(amiss, pressure, old: PiecePressures, owner, new: Pieces) -> NDArray[np.float64]:
     """Return the share (m,) of a correction, the same for all pieces of a domain, that keeps to the bounds."""
     first = np.flatnonzero(np.diff(owner, prepend=-1))
     low, high = np.minimum.reduceat(old.bounds[:, 0], first), np.maximum.reduceat(old.bounds[:, 1], first)

@@ -29,7 +29,8 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.forms.cell_matrices import insert, shape_gradients
 from mpm_dolfinx.constitutive.user_functions import expression
-from mpm_dolfinx.forms.point_forms import CellSums, FormPoints
+from mpm_dolfinx.forms.point_forms import CellSums, FormPoints, PointData
+from mpm_dolfinx.caching import Latest
 from mpm_dolfinx.constitutive.skeleton import Skeleton
 
 
@@ -47,13 +48,14 @@ class MeanDilatation:
     """
 
     def __init__(self, pieces: FormPoints, u: fem.Function, symmetric: bool = True):
-        self.pieces, self._d, self._symmetric = pieces, pieces.grid.dim, symmetric
+        self._grid, self._d, self._symmetric = pieces.grid, pieces.grid.dim, symmetric
         cellwise = pieces.grid.cellwise()
         self.theta, self.pi = fem.Function(cellwise), fem.Function(cellwise)
         F = pieces.deformation(u)
         ratio = ufl.det(F) / ufl.det(pieces.F)
         self._weight, self._ratio = CellSums([ufl.as_ufl(1.0)], pieces), CellSums([ratio], pieces)
         self._ratio_slope = CellSums(self._along_shapes(ufl.diff(ratio, F), pieces), pieces)
+        self._volume: Latest[NDArray[np.float64]] = Latest()
         self._slopes: list[CellSums] = []
         self._derivatives: list[CellSums] = []
 
@@ -99,39 +101,43 @@ class MeanDilatation:
         mean = ufl.tr(tau) / self._d
         return (tau - mean * ufl.Identity(self._d)) * ufl.inv(F).T, mean / theta
 
-    def start(self) -> None:
-        """Begin a step: the volumes of the cells' contents."""
-        self._volume = self._weight()[:, 0]
+    def update(self, data: PointData, parts: Sequence[PointData]) -> None:
+        """Set theta and pi at the present displacement; parts: the pieces of each law."""
+        cells, volume = data.places.filled, self._volume_of(data)[:, 0]
+        self.theta.x.array[cells] = self._ratio(data)[:, 0] / volume
+        self.pi.x.array[cells] = _total(self._slopes, data, parts)[:, 0] / volume
 
-    def update(self) -> None:
-        """Set theta and pi at the present displacement."""
-        cells = self.pieces.filled
-        self.theta.x.array[cells] = self._ratio()[:, 0] / self._volume
-        self.pi.x.array[cells] = self._total(self._slopes)[:, 0] / self._volume
-
-    def _total(self, sums: Sequence[CellSums]) -> NDArray[np.float64]:
-        """Return the sums over all laws (cells, quantities)."""
-        total = 0.0
-        for of_law in sums:
-            part = of_law()
-            if of_law.points is not self.pieces:
-                values, part = part, np.zeros((len(self.pieces.filled), part.shape[1]))
-                part[np.searchsorted(self.pieces.filled, of_law.points.filled)] = values
-            total = total + part
-        return total
-
-    def assemble_matrix(self, A: PETSc.Mat) -> None:
+    def assemble_matrix(self, A: PETSc.Mat, data: PointData, parts: Sequence[PointData]) -> None:
         """Add what theta and pi contribute to the tangent at the last update; the caller finalises it."""
-        count, volume = 2**self._d * self._d, self._volume[:, None]
-        derivatives = self._total(self._derivatives)
-        b, c, e = self._ratio_slope() / volume, derivatives[:, :count] / volume, derivatives[:, count, None] / volume
+        count, volume = 2**self._d * self._d, self._volume_of(data)
+        derivatives = _total(self._derivatives, data, parts)
+        b, c = self._ratio_slope(data) / volume, derivatives[:, :count] / volume
+        e = derivatives[:, count, None] / volume
         d = c if self._symmetric else derivatives[:, count + 1 :] / volume
         # (d b^T + b c^T + e b b^T) V with the means b, c, d, e of the derivatives of det(Delta), dPsi/dtheta, P
         e *= 0.5
         columns, rows = (c + e * b) * volume, (d + e * b) * volume
-        insert(A, self.pieces, b[:, :, None] * columns[:, None, :] + rows[:, :, None] * b[:, None, :])
+        matrices = b[:, :, None] * columns[:, None, :] + rows[:, :, None] * b[:, None, :]
+        insert(A, self._grid, data.places.filled, matrices)
 
-    def averaged(self, delta: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the gradients Delta (m, d, d) of the pieces with the volume ratio of their cell."""
-        theta = self.theta.x.array[self.pieces.cells]
+    def _volume_of(self, data: PointData) -> NDArray[np.float64]:
+        """Return the volumes (cells, 1) of what the filled cells hold."""
+        return self._volume(data, lambda: self._weight(data))
+
+    def averaged(self, delta: NDArray[np.float64], cells: NDArray[np.int32]) -> NDArray[np.float64]:
+        """Return the gradients Delta (m, d, d) of pieces in cells (m,) with the volume ratio of their cell."""
+        theta = self.theta.x.array[cells]
         return delta * ((theta / np.linalg.det(delta)) ** (1 / self._d))[:, None, None]
+
+
+def _total(sums: Sequence[CellSums], data: PointData, parts: Sequence[PointData]) -> NDArray[np.float64]:
+    """Return the sums over all laws (cells, quantities) in the cells of `data`."""
+    total = 0.0
+    for of_law, part in zip(sums, parts, strict=True):
+        values = of_law(part)
+        if part is not data:
+            everywhere = np.zeros((len(data.places.filled), values.shape[1]))
+            everywhere[np.searchsorted(data.places.filled, part.places.filled)] = values
+            values = everywhere
+        total = total + values
+    return total

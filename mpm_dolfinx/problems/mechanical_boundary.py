@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The conditions on the sides of the bodies, put where the sides are at the start of a step."""
+"""What acts on the sides of the bodies in the balance of momentum, put where the sides are at the start of a step."""
 
 from __future__ import annotations
 
@@ -12,121 +12,106 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from mpm_dolfinx.validation import line
-from mpm_dolfinx.problems.conditions import HOLD, RIGIDITY, Displacement, Drained, Inflow, RigidPlate, Traction
-from mpm_dolfinx.points.cutting import SNAP
+from mpm_dolfinx.caching import Latest
+from mpm_dolfinx.forms.point_forms import Places, PointData
 from mpm_dolfinx.parallel.exchange import Exchange, first
-from mpm_dolfinx.points.grid import Grid, sum_by
-from mpm_dolfinx.problems.momentum import Momentum
-from mpm_dolfinx.points.cut_domains import Placement
-from mpm_dolfinx.points.bodies import Body
-from mpm_dolfinx.problems.storage import Storage
-from mpm_dolfinx.points.faces import Surface, face_vectors, surface
+from mpm_dolfinx.points.cut_domains import CutDomains, Patches
+from mpm_dolfinx.points.faces import Surface, face_vectors
+from mpm_dolfinx.points.grid import sum_by
+from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.problems.conditions import HOLD, RIGIDITY, Displacement, RigidPlate, Traction
+from mpm_dolfinx.problems.side_forms import SideData, SideForms
+from mpm_dolfinx.problems.sides import Sides, check_apart, gathered
+from mpm_dolfinx.validation import line
 
 
-class Boundary:
-    """The sides of a scene's bodies and what acts on them.
+class MechanicalBoundary:
+    """Tractions, rigid plates and given displacements of a stage.
 
     Parameters
     ----------
-    grid, bodies
-        Background grid and all bodies of the scene.
-    present
-        Which bodies are there.
+    sides
+        The sides of the bodies.
     modulus
         Oedometric modulus of the stiffest material, Pa, by which plates and held sides are rigid.
-    tractions, displacements, plates, outlets
-        The conditions; outlets are drained sides and prescribed inflows.
+    tractions, displacements, plates
+        The conditions.
 
     Raises
     ------
     ValueError
-        Naming a condition whose side no point has, a plate whose faces are not one flat side, or two conditions
-        that contradict each other on the same faces.
+        Naming a condition whose side no point has, a plate whose faces are not one flat side, or two given
+        displacements that contradict each other on the same faces.
     """
 
     def __init__(
         self,
-        grid: Grid,
-        bodies: Sequence[Body],
-        present: Sequence[bool],
+        sides: Sides,
         modulus: float,
         tractions: Sequence[Traction],
         displacements: Sequence[Displacement],
         plates: Sequence[RigidPlate],
-        outlets: Sequence[Drained | Inflow],
     ):
-        self.grid, self._bodies, self._present, self._modulus = grid, bodies, list(present), modulus
-        self._found: dict[tuple[str, str], Surface] = {}
-        self._loaded: tuple[Placement, Exchange] | None = None
-        self.plates = [(plate, self._faces(plate)) for plate in plates]
-        tractions = [*tractions, *(plate.traction(faces.area0.sum(), grid.dim) for plate, faces in self.plates)]
-        self.loads = [(load, self._faces(load)) for load in tractions]
-        self.holds = [(hold, self._faces(hold), hold.axes(grid.dim)) for hold in displacements]
-        self.outlets = [(outlet, self._faces(outlet)) for outlet in outlets]
+        self.grid, self._modulus, d = sides.grid, modulus, sides.grid.dim
+        self.plates = [(plate, sides.of(plate)) for plate in plates]
+        tractions = [*tractions, *(plate.traction(faces.area0.sum(), d) for plate, faces in self.plates)]
+        self.loads = [(load, sides.of(load)) for load in tractions]
+        self.holds = [(hold, sides.of(hold), hold.axes(d)) for hold in displacements]
+        self._loaded: Latest[tuple[Exchange, Places]] = Latest()
         for plate, faces in self.plates:
             _check_flat(plate, faces)
-        for one, other in combinations(self.outlets, 2):
-            _check_apart(*one, *other)
         for (one, faces, axes), (other, others, more) in combinations(self.holds, 2):
             if set(axes) & set(more):
-                _check_apart(one, faces, other, others)
+                check_apart(one, faces, other, others)
         for condition in [*tractions, *displacements]:
             if not callable(condition.value):  # what a function gives is checked when it is called
-                condition.at(0.0, *([grid.dim] if isinstance(condition, Traction) else [np.empty((1, grid.dim))]))
+                condition.at(0.0, *([d] if isinstance(condition, Traction) else [np.empty((1, d))]))
 
-    def _faces(self, condition) -> Surface:
-        """Return the faces of a condition's side, the same object for conditions on the same faces."""
-        key = (str(condition.side), str(condition.region))
-        if key not in self._found:
-            self._found[key] = surface(self._bodies, condition.side, condition.region, self._present)
-        if not len(self._found[key]):
-            where = " in the region" if condition.region else ""
-            raise ValueError(f"{line(condition)}: no point has this side{where}, must be one of a body")
-        return self._found[key]
+    def data(self, forms: SideForms, cut: CutDomains, points: MaterialPoints, t: float) -> SideData:
+        """Return what acts at time t (s) on the points where they are now."""
+        loads = self._load_data(forms, cut, points, t) if self.loads else None
+        plates = self._plate_data(forms, cut, points) if self.plates else None
+        holds, number = self._hold_data(forms, cut, points, t) if self.holds else (None, np.empty(0, dtype=np.int64))
+        return SideData(loads, plates, holds, number)
 
-    def place_loads(self, place: Placement, momentum: Momentum, t: float) -> None:
-        """Put the dead loads of time t (s) on the surface."""
-        d = self.grid.dim
-        cells, places, forces = [np.empty(0, dtype=np.int64)], [np.empty((0, d))], [np.empty((0, d))]
-        for load, faces in self.loads:
-            patches = place.surface(faces)
-            cells.append(patches.cell)
-            places.append(patches.x)
-            traction = load.at(t, self.grid.dim)
-            if traction.ndim == 0:
-                area = patches.area(place.points)
-                traction = traction * area / np.linalg.norm(area, axis=1, keepdims=True)
-            forces.append(patches.area0[:, None] * traction)
-        if self._loaded is None or self._loaded[0] is not place:
-            cell, x = np.concatenate(cells), np.concatenate(places)
-            self._loaded = place, Exchange(self.grid.comm, self.grid.owner(cell))
-            cell, x = self._loaded[1].send(cell), self._loaded[1].send(x)
-            momentum.loads.place(self.grid.local(cell), x, np.ones(len(cell)), force=np.zeros_like(x))
-        momentum.loads.renew(force=self._loaded[1].send(np.concatenate(forces)))
+    def _load_data(self, forms: SideForms, cut: CutDomains, points: MaterialPoints, t: float) -> PointData:
+        """Return the dead loads on the surface."""
+        patches = [cut.surface(faces) for _, faces in self.loads]
+        travel, places = self._loaded(cut, lambda: self._loaded_places(patches), self.grid.comm)
+        forces = [_force(load, t, p, points) for (load, _), p in zip(self.loads, patches, strict=True)]
+        force = travel.send(np.concatenate(forces))
+        return PointData(forms.loads, places, np.ones(len(force)), {"force": force})
 
-    def place_plates(self, place: Placement, momentum: Momentum) -> None:
-        """Put the plates on the surface."""
-        grid, rows = self.grid, []
+    def _loaded_places(self, patches: Sequence[Patches]) -> tuple[Exchange, Places]:
+        """Return the way of loads to the owners of their cells, and where they act."""
+        cell, x = (np.concatenate([getattr(p, name) for p in patches]) for name in ("cell", "x"))
+        travel = Exchange(self.grid.comm, self.grid.owner(cell))
+        return travel, Places(self.grid, self.grid.local(travel.send(cell)), travel.send(x))
+
+    def _plate_data(self, forms: SideForms, cut: CutDomains, points: MaterialPoints) -> PointData:
+        """Return the plates on the surface."""
+        d, rows = self.grid.dim, []
         for _, faces in self.plates:
-            patches = place.surface(faces)
-            area = patches.area(place.points)
-            length = faces.area0.sum() ** (1 / (grid.dim - 1))
+            patches = cut.surface(faces)
+            area = patches.area(points)
+            length = faces.area0.sum() ** (1 / (d - 1))
             rigidity = RIGIDITY * self._modulus * length * np.linalg.norm(area, axis=1, keepdims=True)
-            normal = np.tile(np.eye(grid.dim)[faces.axis], (len(area), 1))
+            normal = np.tile(np.eye(d)[faces.axis], (len(area), 1))
             tilt = normal - area / area[:, [faces.axis]]  # slope of the face: its normal is (-slope, 1)
             rows.append((patches.cell, patches.x, np.concatenate([rigidity, normal, tilt], axis=1)))
-        cell, x, values = self._gathered(rows, 1 + 2 * grid.dim)
-        rigidity, normal, tilt = np.split(values, [1, 1 + grid.dim], axis=1)
-        momentum.plates.place(cell, x, np.ones(len(cell)), rigidity=rigidity, normal=normal, tilt=tilt)
+        cell, x, values = gathered(self.grid, rows, 1 + 2 * d)
+        rigidity, normal, tilt = np.split(values, [1, 1 + d], axis=1)
+        return forms.plates.at(cell, x, np.ones(len(cell)), rigidity=rigidity, normal=normal, tilt=tilt)
 
-    def place_holds(self, place: Placement, momentum: Momentum, t: float) -> None:
-        """Put the given displacements of time t (s) on the surface: one row a place and component."""
+    def _hold_data(
+        self, forms: SideForms, cut: CutDomains, points: MaterialPoints, t: float
+    ) -> tuple[PointData, NDArray[np.int64]]:
+        """Return the given displacements on the surface, one row a place and component, and whose each row is."""
         d, rows = self.grid.dim, []
         stiffness = HOLD * self._modulus / self.grid.h.min()
         for number, (hold, faces, axes) in enumerate(self.holds):
-            patches = place.surface(faces)
-            gap = patches.origin(place.points) + self._given(hold, t, patches.X) - patches.now(place.points)
+            patches = cut.surface(faces)
+            gap = patches.origin(points) + self._given(hold, t, patches.X) - patches.now(points)
             for axis in axes:
                 values = np.zeros((len(gap), 3 + d))
                 values[:, 0] = number
@@ -134,10 +119,10 @@ class Boundary:
                 values[:, 2] = gap[:, axis]
                 values[:, 3 + axis] = 1.0
                 rows.append((patches.cell, patches.x, values))
-        cell, x, values = self._gathered(rows, 3 + d)
+        cell, x, values = gathered(self.grid, rows, 3 + d)
         number, stiffness, gap, direction = np.split(values, [1, 2, 3], axis=1)
-        self._number = number[:, 0].astype(np.int64)
-        momentum.holds.place(cell, x, np.ones(len(cell)), stiffness=stiffness, gap=gap, direction=direction)
+        data = forms.holds.at(cell, x, np.ones(len(cell)), stiffness=stiffness, gap=gap, direction=direction)
+        return data, number[:, 0].astype(np.int64)
 
     def _given(self, hold: Displacement, t: float, X: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the displacements (m, d), m, that a side is given at places X (m, d) of this process."""
@@ -150,15 +135,15 @@ class Boundary:
             raise ValueError(message)
         return value
 
-    def reactions(self, momentum: Momentum) -> NDArray[np.float64]:
-        """Return the forces (holds, d), N, by which the given displacements act at the present displacement."""
-        grid, holds = self.grid, momentum.holds
+    def reactions(self, sides: SideData, u: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the forces (displacements, d), N, by which the given displacements act at nodal values u (nodes, d)."""
+        grid, holds = self.grid, sides.holds
+        if holds is None:
+            return np.zeros((0, grid.dim))
         N = grid.shape_values(holds.cells, holds.x)
-        u = momentum.u.x.array.reshape(-1, grid.dim)[grid.cell_nodes[holds.cells]]
-        direction = holds.data["direction"]
-        moved = np.einsum("mk,mkd,md->m", N, u, direction)
-        force = (holds.data["stiffness"][:, 0] * (holds.data["gap"][:, 0] - moved))[:, None] * direction
-        sums = [sum_by(self._number, column, len(self.holds)) for column in force.T]
+        moved = np.einsum("mk,mkd,md->m", N, u[grid.cell_nodes[holds.cells]], holds["direction"])
+        force = (holds["stiffness"][:, 0] * (holds["gap"][:, 0] - moved))[:, None] * holds["direction"]
+        sums = [sum_by(sides.number, column, len(self.holds)) for column in force.T]
         return grid.comm.allreduce(np.stack(sums, axis=1))
 
     def under_held(
@@ -177,38 +162,14 @@ class Boundary:
             corners[held] = tracked[held][:, face] - np.where((face != index)[:, None], depth[:, None], 0.0)
         return corners
 
-    def open_outlets(self, place: Placement, storage: Storage, weight: NDArray[np.float64] | None) -> None:
-        """Set the conductances of drained sides and the inflows; weight: rho_w g (d,), N/m^3, if there is gravity."""
-        grid, d = self.grid, self.grid.dim
-        cells, conductances, inflows = [np.empty(0, dtype=np.int32)], [np.empty(0)], [np.empty(0)]
-        for outlet, faces in self.outlets:
-            patches = place.surface(faces)
-            travel = Exchange(grid.comm, grid.owner(patches.cell))
-            cell = grid.local(travel.send(patches.cell))
-            area, x = travel.send(patches.area(place.points)), travel.send(patches.x)
-            size = np.linalg.norm(area, axis=1)
-            cells.append(cell)
-            if isinstance(outlet, Inflow):
-                conductances.append(np.zeros(len(cell)))
-                inflows.append(outlet.flux * size)
-                continue
-            centre = grid.midpoints[cell] + storage.centroid.x.array.reshape(-1, d)[cell]
-            distance = np.einsum("md,md->m", x - centre, area) / size
-            conductance = storage.mobility.x.array[cell] * size / np.maximum(distance, SNAP * grid.h.min())
-            outer = np.full(len(cell), outlet.pressure)
-            if weight is not None:
-                outer -= (x - centre) @ weight
-            conductances.append(conductance)
-            inflows.append(conductance * outer)
-        storage.set_fluxes(np.concatenate(cells), np.concatenate(conductances), np.concatenate(inflows))
 
-    def _gathered(self, rows: list, width: int) -> tuple[NDArray, NDArray, NDArray]:
-        """Send (cells, positions, values) to the owners of the cells; return (owned cells, positions, values)."""
-        empty = (np.empty(0, dtype=np.int64), np.empty((0, self.grid.dim)), np.empty((0, width)))
-        parts = [np.concatenate(column) for column in zip(empty, *rows, strict=True)]
-        travel = Exchange(self.grid.comm, self.grid.owner(parts[0]))
-        cell, x, values = map(travel.send, parts)
-        return self.grid.local(cell), x, values
+def _force(load: Traction, t: float, patches: Patches, points: MaterialPoints) -> NDArray[np.float64]:
+    """Return the forces (n, d), N, of a traction at time t (s) on the points of integration of its side."""
+    traction = load.at(t, points.x.shape[1])
+    if traction.ndim == 0:
+        area = patches.area(points)
+        traction = traction * area / np.linalg.norm(area, axis=1, keepdims=True)
+    return patches.area0[:, None] * traction
 
 
 def _check_flat(plate: RigidPlate, faces: Surface) -> None:
@@ -224,17 +185,3 @@ def _check_flat(plate: RigidPlate, faces: Surface) -> None:
     if len(apart):
         where = f"faces at {X[0]} and {X[apart[0]]} do not hang together"
         raise ValueError(f"{line(plate)}: {where}, must be one flat side; take a plate with a region for each")
-
-
-def _check_apart(one, faces: Surface, other, others: Surface) -> None:
-    """Refuse two conditions, of a kind that excludes the other, on the same part of a face."""
-    if (faces.axis, faces.end) != (others.axis, others.end):
-        return
-    _, a, b = np.intersect1d(faces.id, others.id, return_indices=True)
-    low, high = np.maximum(faces.X[a, 0], others.X[b, 0]), np.minimum(faces.X[a, 1], others.X[b, 1])
-    common = high - low > 1e-9 * (faces.X[a, 1] - faces.X[a, 0])
-    common[:, faces.axis] = True
-    both = np.flatnonzero(common.all(axis=1))
-    if len(both):
-        x = (low[both[0]] + high[both[0]]) / 2
-        raise ValueError(f"{line(one)} and {line(other)}: both act at {x}, must not; limit them by regions")

@@ -23,84 +23,80 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from mpm_dolfinx import _compat
-from mpm_dolfinx.validation import line
-from mpm_dolfinx.problems.mean_dilatation import MeanDilatation
-from mpm_dolfinx.forms.cell_matrices import ElementForces, ElementMatrices, StackedElementMatrices
-from mpm_dolfinx.parallel.exchange import over_all
+from mpm_dolfinx.constitutive.skeleton import Skeleton
 from mpm_dolfinx.constitutive.user_functions import compiling
 from mpm_dolfinx.constitutive.user_functions import form as form_of
-from mpm_dolfinx.forms.point_forms import FacetForm, FormPoints, PointForm
-from mpm_dolfinx.points.grid import Grid
-from mpm_dolfinx.constitutive.skeleton import Skeleton
+from mpm_dolfinx.forms.cell_matrices import ElementForces, ElementMatrices, StackedElementMatrices
+from mpm_dolfinx.forms.point_forms import FormPoints, PointForm
+from mpm_dolfinx.problems.quadrature_data import QuadratureData
 from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts, zero
+from mpm_dolfinx.parallel.exchange import over_all
+from mpm_dolfinx.problems.ghost_penalty import GhostPenalty
+from mpm_dolfinx.problems.mean_dilatation import MeanDilatation
+from mpm_dolfinx.problems.side_forms import SideData, SideForms
+from mpm_dolfinx.validation import line
 
-GHOST = 1e-2
-"""Strength of the ghost penalty; 1e-3 to 1/30 changes the beam's tip by 1e-5."""
-FULL = 0.9
-"""A cell filled less than this is partly filled: its faces carry the ghost penalty."""
 
-
-class Momentum:
-    """The momentum problem of a scene.
+class MomentumForms:
+    """The compiled forms of the balance of momentum of a scene.
 
     Parameters
     ----------
-    grid
-        Background grid.
     pieces
         All points of integration.
     laws
         Classes of the skeletons' laws, each with the pieces that follow it; they carry F, what the law takes
         and, with fluid, biot.
-    fixed : (nodes, d)
-        Which components of the displacement are zero at which nodes of the grid.
     pressure
         DG0 pore pressure, None without fluid.
     gravity : (d,), m/s^2
         Acceleration, a UFL constant; the pieces then carry `density`, kg/m^3.
     mean_dilatation
-        Whether the laws see one volume change per cell, see `dilatation`.
+        Whether the laws see one volume change per cell, see `MeanDilatation`.
     symmetric
         Whether the tangents of all laws are symmetric.
+    terms
+        The user's, see `user_functions`.
+    t, dt : s
+        Time at the end of the step and its length, UFL constants.
     """
 
     def __init__(
         self,
-        grid: Grid,
         pieces: FormPoints,
         laws: Sequence[tuple[type[Skeleton], FormPoints]],
-        fixed: NDArray[np.bool_],
-        pressure: fem.Function | None = None,
-        gravity: fem.Constant | None = None,
-        mean_dilatation: bool = False,
-        symmetric: bool = True,
+        pressure: fem.Function | None,
+        gravity: fem.Constant | None,
+        mean_dilatation: bool,
+        symmetric: bool,
+        terms: Sequence[Callable],
+        t: fem.Constant,
+        dt: fem.Constant,
     ):
-        self.grid, self.pieces = grid, pieces
+        self.grid = grid = pieces.grid
         V = _compat.function_space(grid.mesh, "Lagrange", 1, (grid.dim,))
-        self.u, self._b, self._f, self._pulls = (fem.Function(V) for _ in range(4))
-        self.fix(fixed)
-        v, du = ufl.TestFunction(V), ufl.TrialFunction(V)
-
+        self.u = fem.Function(V)
+        """Increment of the displacement since the start of the step, m."""
+        self._work = [fem.Function(V) for _ in range(4)]  # internal, own, external forces, and pulls of given sides
         self.symmetric, self.holding = symmetric, False
         self.linear = not mean_dilatation and all(law.linear for law, _ in laws)
         """Whether the tangent changes with the places of the points only."""
         self.dilatation = MeanDilatation(pieces, self.u, symmetric) if mean_dilatation else None
-        self._residuals, self._tangents = [], []
+        self._residuals, self._tangents, self._own_tangents = [], [], []
         self.terms: list[PointForm] = []
         for law, points in laws:
-            self._add_law(law, points, v, pressure)
-
-        self.loads = FormPoints(grid, force=(grid.dim,))
-        self._weight = None
+            self._add_law(law, points, pressure)
+        for term in terms:
+            self._add_term(term, pieces, t, dt)
+        self.weight = None
         if gravity is not None:
-            self._weight = PointForm(pieces.density * ufl.inner(gravity, pieces.value(v)) * pieces.dx, pieces)
-        self.loads = self.plates = self.holds = None
-        self._ghost(V, v, du)
+            v = ufl.TestFunction(V)
+            self.weight = PointForm(pieces.density * ufl.inner(gravity, pieces.value(v)) * pieces.dx, pieces)
+        self.sides, self.ghost = SideForms(grid, V), GhostPenalty(grid, V)
 
-    def _add_law(self, law: type[Skeleton], points: FormPoints, v, pressure: fem.Function | None) -> None:
+    def _add_law(self, law: type[Skeleton], points: FormPoints, pressure: fem.Function | None) -> None:
         """Compile residual and tangent of the pieces that follow a law."""
-        grid = self.grid
-        F = points.deformation(self.u)
+        F, v = points.deformation(self.u), ufl.TestFunction(self.u.function_space)
         values = {name: getattr(points, name) for name in (*law.parameters, *law.state)}
         if self.dilatation is not None:
             P = self.dilatation.add(law, points, F, values)
@@ -112,7 +108,7 @@ class Momentum:
         P /= ufl.det(points.F)
         A = ufl.diff(P, F)
         i, j, k, l, m, n = ufl.indices(6)
-        if grid.dim == 2:
+        if self.grid.dim == 2:
             self._residuals.append(PointForm(ufl.inner(P, points.grad(v) * points.F) * points.dx, points))
             A = ufl.as_tensor(A[i, m, j, n] * points.F[k, m] * points.F[l, n], (i, k, j, l))
             self._tangents.append(ElementMatrices(A, points, self.symmetric))
@@ -120,217 +116,179 @@ class Momentum:
             self._residuals.append(ElementForces(P * points.F.T, points))
             self._tangents.append(StackedElementMatrices(A, points, self.symmetric))
 
-    def add(self, term: Callable, t: fem.Constant, dt: fem.Constant) -> None:
-        """Add a term of the user's: see `extend`."""
+    def _add_term(self, term: Callable, pieces: FormPoints, t: fem.Constant, dt: fem.Constant) -> None:
+        """Add a term of the user's: see `user_functions`."""
         V = self.u.function_space
         v, du = ufl.TestFunction(V), ufl.TrialFunction(V)
-        form = form_of("terms", term, points=self.pieces, u=self.u, v=v, t=t, dt=dt)
+        form = form_of("terms", term, points=pieces, u=self.u, v=v, t=t, dt=dt)
         potential = not form.arguments()
         if potential and self.u not in form.coefficients():
             raise ValueError(f"terms: {line(form)}: depends on neither u nor v, must be a form in one of them")
         if potential:
             form = ufl.derivative(form, self.u, v)
         with compiling(f"terms: {line(term)}", "linear in v, or an energy of u"):
-            self.terms.append(PointForm(form, self.pieces))
-        self._own = fem.Function(V)
+            self.terms.append(PointForm(form, pieces))
         if self.u in form.coefficients():
-            self._tangents.append(PointForm(ufl.derivative(form, self.u, du), self.pieces))
+            self._own_tangents.append(PointForm(ufl.derivative(form, self.u, du), pieces))
             self.holding, self.linear = True, False
             self.symmetric = self.symmetric and potential
 
-    def require(self, loaded: bool, plates: bool, held: bool) -> None:
-        """Compile what conditions on sides of the bodies need and has not been compiled yet.
+    def external(self, data: QuadratureData, sides: SideData) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the nodal forces of dead loads, weight and tilted plates, and of given displacements, local arrays."""
+        _, _, external, pulls = self._work
+        external.x.array[:] = pulls.x.array[:] = 0.0
+        if sides.loads is not None:
+            self.sides.traction.assemble_vector(external.x.array, sides.loads)
+        if self.weight is not None:
+            self.weight.assemble_vector(external.x.array, data.pieces)
+        if sides.plates is not None:
+            self.sides.tilt.assemble_vector(external.x.array, sides.plates)
+        if sides.holds is not None:
+            self.sides.pull.assemble_vector(pulls.x.array, sides.holds)
+        return sum_ghosts(external), sum_ghosts(pulls)
 
-        Parameters
-        ----------
-        loaded
-            There are tractions: points `loads` with their force.
-        plates
-            There are rigid plates: points `plates` with their rigidity, normal and present tilt.
-        held
-            Sides have given displacements: points `holds` with stiffness, direction and gap.
-        """
-        grid, V = self.grid, self.u.function_space
-        v, du = ufl.TestFunction(V), ufl.TrialFunction(V)
-        if loaded and self.loads is None:
-            self.loads = FormPoints(grid, force=(grid.dim,))
-            self._traction = PointForm(ufl.inner(self.loads.force, self.loads.value(v)) * self.loads.dx, self.loads)
-        if plates and self.plates is None:
-            self.plates = FormPoints(grid, rigidity=(), normal=(grid.dim,), tilt=(grid.dim,))
-            self._plate = PointForm(self._bend(v, self._slope(du)), self.plates)
-            self._tilt = PointForm(-self._bend(v, self.plates.tilt), self.plates)
-        if held and self.holds is None:
-            self.holds = h = FormPoints(grid, stiffness=(), direction=(grid.dim,), gap=())
-            along = ufl.dot(h.value(v), h.direction)
-            self._hold = PointForm(h.stiffness * ufl.dot(h.value(du), h.direction) * along * h.dx, h)
-            self._pull = PointForm(h.stiffness * h.gap * along * h.dx, h)
+    def internal(self, data: QuadratureData) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the nodal forces of the stresses, and of the user's terms, at u, local arrays."""
+        internal, own, _, _ = self._work
+        internal.x.array[:] = own.x.array[:] = 0.0
+        if self.dilatation is not None:
+            self.dilatation.update(data.pieces, data.parts)
+        for residual, part in zip(self._residuals, data.parts, strict=True):
+            residual.assemble_vector(internal.x.array, part)
+        for term in self.terms:
+            term.assemble_vector(own.x.array, data.pieces)
+        return sum_ghosts(internal), sum_ghosts(own) if self.terms else own.x.array
 
-    def fix(self, fixed: NDArray[np.bool_]) -> None:
-        """Set which components are zero at which nodes (nodes, d); unknowns are numbered anew."""
-        self.free, self._dofs = ~fixed, None
+    def assemble_tangent(self, K: PETSc.Mat, data: QuadratureData) -> None:
+        """Add the tangent at u to K, which the caller finalises."""
+        for tangent, part in zip(self._tangents, data.parts, strict=True):
+            tangent.assemble_matrix(K, part)
+        for tangent in self._own_tangents:
+            tangent.assemble_matrix(K, data.pieces)
+        if self.dilatation is not None:
+            self.dilatation.assemble_matrix(K, data.pieces, data.parts)
 
-    def _slope(self, w):
-        """Return the tangential gradient of the normal displacement, grad_t(w_n), at the plates."""
-        n = self.plates.normal
-        gradient = ufl.dot(n, self.plates.grad(w))
-        return gradient - ufl.dot(gradient, n) * n
-
-    def _bend(self, v, slope) -> ufl.Form:
-        """Return the work of plates that bend or turn by a slope: kappa slope . grad_t(v_n)."""
-        return self.plates.rigidity * ufl.inner(slope, self._slope(v)) * self.plates.dx
-
-    def _ghost(self, V, v, du) -> None:
-        """Penalise jumps of the normal derivative on faces of partly filled cells (Burman 2010, Coombs 2023).
-
-        gamma M h/3 int [d_n u].[d_n v] dS, M = lambda + 2G, on the step's increment only.
-        """
-        cellwise = self.grid.cellwise()
-        self.modulus, self.fill = fem.Function(cellwise), fem.Function(cellwise)
-        n = ufl.FacetNormal(self.grid.mesh)
-        h = fem.Constant(self.grid.mesh, self.grid.h)
-        across = sum(abs(n("+")[a]) * h[a] for a in range(self.grid.dim))
-        dS = ufl.Measure("dS", domain=self.grid.mesh, subdomain_id=_compat.SUBDOMAIN, metadata={"quadrature_degree": 2})
-
-        def kink(w):
-            return ufl.dot(ufl.grad(w)("+") - ufl.grad(w)("-"), n("+"))
-
-        form = GHOST / 3 * ufl.avg(self.modulus) * across * ufl.inner(kink(du), kink(v)) * dS
-        self.ghost = FacetForm(form, self.grid.comm)
-
-    def set_active(self, cells: NDArray[np.int32], facets: NDArray[np.int32], partly: NDArray[np.bool_]) -> bool:
-        """Number the unknowns of the active cells.
-
-        Parameters
-        ----------
-        cells, facets
-            Active local cells, ghosts included, and the faces between two of them.
-        partly : (cells,)
-            Which local cells are partly filled.
-
-        Returns
-        -------
-        Whether cells or unknowns differ from those before, so that matrices have been made anew.
-        """
-        facets = facets[partly[self.grid.facet_cells[facets]].any(axis=1)]
-        nodes = np.zeros(len(self.free), dtype=bool)
+    def active_nodes(self, cells: NDArray[np.int32]) -> NDArray[np.bool_]:
+        """Return which nodes belong to some active cells of any process."""
+        nodes = np.zeros(len(self.grid.node_x), dtype=bool)
         nodes[self.grid.cell_nodes[cells]] = True
-        nodes = np.flatnonzero(self._shared(nodes))
-        at_nodes = nodes[:, None] * self.grid.dim + np.arange(self.grid.dim)
-        dofs = at_nodes[self.free[nodes]]
-        # a cell may become active between active nodes, so equal dofs do not mean equal cells
-        now = (cells, dofs, facets)
-        same = self._dofs is not None and all(map(np.array_equal, now, (self._cells, self._dofs, self._facets)))
-        changed = over_all(self.grid.comm, not same) > 0
-        if changed:
-            self._cells, self._dofs, self._facets = now
-            self.unknowns = Unknowns(self.u, dofs)
-            owned = self.u.function_space.dofmap.index_map.size_local
-            self._touched = at_nodes[nodes < owned].ravel()  # where forces may act, fixed or not
-            self.K = matrix(self.unknowns, self.unknowns, 3**self.grid.dim * self.grid.dim)
-            self._summed = False
-            self.penalty = self._penalty_matrix()
-            self.residual, self._du = self.unknowns.vector(), self.unknowns.vector()
-            self.ghost.place(facets)
-        stiffness = float(self.modulus.x.array[cells].max(initial=0.0)) * self.grid.cell_volume / self.grid.h.min()
-        self.round_off = 1e-14 * self.grid.comm.allreduce(stiffness) * np.sqrt(max(1, self.unknowns.global_size))
-        return changed
+        if self.grid.comm.size == 1:
+            return nodes
+        shared = self._work[0]
+        shared.x.array[:] = np.repeat(nodes, self.grid.dim)
+        _compat.scatter_reverse_add(shared)
+        shared.x.scatter_forward()
+        return shared.x.array[:: self.grid.dim] > 0
 
-    def _penalty_matrix(self) -> PETSc.Mat:
+
+class MomentumSystem:
+    """Vectors and matrices of the displacements of one active set, complete when made.
+
+    Parameters
+    ----------
+    forms
+        The forms.
+    dofs
+        Unrolled local degrees of freedom, ghosts included, that are unknowns.
+    nodes
+        Active local nodes, ghosts included.
+    facets
+        Faces of this process that carry the ghost penalty.
+    stiff
+        Whether sides have plates or given displacements.
+    """
+
+    def __init__(
+        self,
+        forms: MomentumForms,
+        dofs: NDArray[np.int64],
+        nodes: NDArray[np.int64],
+        facets: NDArray[np.int32],
+        stiff: bool,
+    ):
+        self._forms, d = forms, forms.grid.dim
+        self.unknowns = Unknowns(forms.u, dofs)
+        owned = nodes[nodes < forms.u.function_space.dofmap.index_map.size_local]
+        self.touched = (owned[:, None] * d + np.arange(d)).ravel()
+        """Where forces may act, fixed or not."""
+        self.K = matrix(self.unknowns, self.unknowns, 3**d * d)
+        self.penalty = self._penalty_matrix(facets, stiff)
+        self.residual, self.step = self.unknowns.vector(), self.unknowns.vector()
+        self._ghost = forms.ghost.form.on(facets)
+
+    def _penalty_matrix(self, facets: NDArray[np.int32], stiff: bool) -> PETSc.Mat:
         """Return an empty matrix for the penalties: the ghost penalty couples like components, of two cells."""
-        d = self.grid.dim
+        grid = self._forms.grid
+        d = grid.dim
         length = 3**d + 2 * d * 3 ** (d - 1)
-        if self.plates is not None or self.holds is not None:
+        if stiff:
             return matrix(self.unknowns, self.unknowns, d * length)
-        touched = np.zeros(len(self.free), dtype=bool)
-        touched[self.grid.cell_nodes[self.grid.facet_cells[self._facets]]] = True
-        A = matrix(self.unknowns, self.unknowns, np.where(self._shared(touched)[self.unknowns.owned // d], length, 1))
+        touched = self._forms.active_nodes(grid.facet_cells[facets])
+        A = matrix(self.unknowns, self.unknowns, np.where(touched[self.unknowns.owned // d], length, 1))
         A.setOption(PETSc.Mat.Option.IGNORE_ZERO_ENTRIES, True)
         return A
 
-    def set_penalty(self) -> None:
-        """Assemble what is linear in the step's increment: ghost penalty, and plates and holds at their places."""
+    def set_penalty(self, sides: SideData) -> None:
+        """Assemble what is linear in the step's increment: ghost penalty, plates and given displacements."""
         zero(self.penalty)
-        self.ghost.assemble_matrix(self.penalty)
-        if self.plates is not None:
-            self._plate.assemble_matrix(self.penalty)
-        if self.holds is not None:
-            self._hold.assemble_matrix(self.penalty)
-            stiffest = self.holds.data["stiffness"].max(initial=0.0)  # what rounding of places makes of it
-            reach = np.abs(np.concatenate([self.grid.lower, self.grid.upper])).max()
-            self.round_off += 1e-15 * self.grid.comm.allreduce(stiffest) * reach
+        self._ghost.assemble_matrix(self.penalty)
+        if sides.plates is not None:
+            self._forms.sides.plate.assemble_matrix(self.penalty, sides.plates)
+        if sides.holds is not None:
+            self._forms.sides.hold.assemble_matrix(self.penalty, sides.holds)
         self.penalty.assemble()
 
-    def _shared(self, nodes: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Return which nodes are active on any process."""
-        if self.grid.comm.size == 1:
-            return nodes
-        self._b.x.array[:] = np.repeat(nodes, self.grid.dim)
-        _compat.scatter_reverse_add(self._b)
-        self._b.x.scatter_forward()
-        return self._b.x.array[:: self.grid.dim] > 0
 
-    def set_loads(self) -> None:
-        """Assemble the dead loads and the weight at the present places of points and `loads`."""
-        self._f.x.array[:] = 0.0
-        if self.loads is not None:
-            self._traction.assemble_vector(self._f.x.array)
-        if self._weight is not None:
-            self._weight.assemble_vector(self._f.x.array)
-        if self.plates is not None:
-            self._tilt.assemble_vector(self._f.x.array)
-        self._external = sum_ghosts(self._f)
-        if self.holds is not None:
-            self._pulls.x.array[:] = 0.0
-            self._pull.assemble_vector(self._pulls.x.array)
-            sum_ghosts(self._pulls)
+class MomentumProblem:
+    """The balance of momentum of one step.
 
-    def start(self) -> None:
-        """Begin a step: no displacement."""
-        self.u.x.array[:] = 0.0
-        if self.dilatation is not None:
-            self.dilatation.start()
+    Parameters
+    ----------
+    forms, system
+        Compiled forms; vectors and matrices, with the penalties in them.
+    data
+        The pieces.
+    sides
+        What acts on the sides of the bodies.
+    round_off
+        Norm of the residual that rounding leaves, N.
+    """
+
+    def __init__(
+        self, forms: MomentumForms, system: MomentumSystem, data: QuadratureData, sides: SideData, round_off: float
+    ):
+        self.forms, self.system, self.data, self.round_off = forms, system, data, round_off
+        self._external, self._pulls = forms.external(data, sides)
+        self._held = sides.holds is not None
+        forms.u.x.array[:] = 0.0
 
     def assemble_residual(self) -> tuple[PETSc.Vec, float]:
         """Return the out-of-balance nodal forces at u and their scale, the largest of internal, external, terms (N)."""
-        if self.dilatation is not None:
-            self.dilatation.update()
-        b = self._b.x.array
-        b[:] = 0.0
-        for residual in self._residuals:
-            residual.assemble_vector(b)
-        sum_ghosts(self._b)
-        forces, external = b[self._touched], self._external[self._touched]
+        forms, system = self.forms, self.system
+        b, own = forms.internal(self.data)
+        forces, external = b[system.touched], self._external[system.touched]
         squares = [forces @ forces, external @ external]
-        if self.terms:
-            own = self._assemble_terms()[self._touched]
+        if forms.terms:
+            own = own[system.touched]
             squares.append(own @ own)
             forces += own
-        squares = over_all(self.grid.comm, np.array(squares))
-        b[self._touched] = forces - external
-        if self.holds is not None:  # no measure of forces: at the start of a step it is far above them
-            b[self._touched] -= self._pulls.x.array[self._touched]
-        r = self.unknowns.gather(b, self.residual)
-        du = self.unknowns.gather(self.u.x.array, self._du)
-        self.penalty.multAdd(du, r, r)
+        squares = over_all(forms.grid.comm, np.array(squares))
+        b[system.touched] = forces - external
+        if self._held:  # no measure of forces: at the start of a step it is far above them
+            b[system.touched] -= self._pulls[system.touched]
+        r = system.unknowns.gather(b, system.residual)
+        step = system.unknowns.gather(forms.u.x.array, system.step)
+        system.penalty.multAdd(step, r, r)
         return r, float(np.sqrt(max(squares)))
 
-    def _assemble_terms(self) -> NDArray[np.float64]:
-        """Return the nodal forces of the user's terms at u."""
-        self._own.x.array[:] = 0.0
-        for term in self.terms:
-            term.assemble_vector(self._own.x.array)
-        return sum_ghosts(self._own)
-
-    def assemble_tangent(self) -> PETSc.Mat:
-        """Return the tangent at u."""
-        zero(self.K)
-        for tangent in self._tangents:
-            tangent.assemble_matrix(self.K)
-        if self.dilatation is not None:
-            self.dilatation.assemble_matrix(self.K)
-        self.K.assemble()
+    def assemble_tangent(self, data: QuadratureData | None = None) -> PETSc.Mat:
+        """Return the tangent at u, of these pieces or of others."""
+        K = self.system.K
         # the first sum gives K the pattern of both
+        first = not K.assembled
+        zero(K)
+        self.forms.assemble_tangent(K, data or self.data)
+        K.assemble()
         pattern = PETSc.Mat.Structure
-        self.K.axpy(1.0, self.penalty, pattern.SUBSET_NONZERO_PATTERN if self._summed else pattern.UNKNOWN)
-        self._summed = True
-        return self.K
+        K.axpy(1.0, self.system.penalty, pattern.UNKNOWN if first else pattern.SUBSET_NONZERO_PATTERN)
+        return K

@@ -1,0 +1,163 @@
+# SPDX-License-Identifier: MIT
+"""The end of a step: points move with the grid, their F follows, and pressures travel along."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from dolfinx.common import Timer
+from numpy.typing import NDArray
+
+from mpm_dolfinx.constitutive.fields import SceneMaterials
+from mpm_dolfinx.constitutive.skeleton import Fluid
+from mpm_dolfinx.errors import LeftGrid, NotConverged
+from mpm_dolfinx.parallel.exchange import first, over_all
+from mpm_dolfinx.points.bodies import Body
+from mpm_dolfinx.points.cut_domains import CutDomains
+from mpm_dolfinx.points.cutting import parallelepipeds, tangled
+from mpm_dolfinx.points.material_points import MaterialPoints, determinant
+from mpm_dolfinx.points.pressure_transport import PiecePressures, Reconstruction
+from mpm_dolfinx.problems.mechanical_boundary import MechanicalBoundary
+from mpm_dolfinx.problems.momentum import MomentumForms
+from mpm_dolfinx.problems.on_grid import OnGrid
+from mpm_dolfinx.problems.storage import StorageForms
+from mpm_dolfinx.state import State, Stay
+
+
+class Motion:
+    """Moves the points of a scene.
+
+    Parameters
+    ----------
+    materials
+        The materials of the scene.
+    bodies
+        All bodies of the scene.
+    momentum, storage, fluid
+        Forms of the two problems, which hold the u and p of a solved step, and the pore fluid; storage and fluid are
+        None without.
+    """
+
+    def __init__(
+        self,
+        materials: SceneMaterials,
+        bodies: Sequence[Body],
+        momentum: MomentumForms,
+        storage: StorageForms | None,
+        fluid: Fluid | None,
+    ):
+        self._materials, self._momentum, self._storage, self._fluid = materials, momentum, storage, fluid
+        self._size = np.concatenate([body.size() for body in bodies])
+        self._reconstruction = Reconstruction(momentum.grid) if storage is not None else None
+
+    def advanced(self, state: State, on_grid: OnGrid, t: float, stays: bool) -> tuple[State, int]:
+        """Return the state at time t (s) after a solved step, and how many domains had folded.
+
+        Parameters
+        ----------
+        state
+            At the start of the step.
+        on_grid
+            The bodies on the grid.
+        stays
+            Whether pieces may stay in their cells where points hardly move.
+
+        Raises
+        ------
+        NotConverged
+            A point is turned inside out, or its pores have closed.
+        LeftGrid
+            A point has left the grid.
+        """
+        with Timer("mpm: move points"):
+            cut, pieces, points = on_grid.cut, on_grid.data.pieces, state.points
+            grid, d = cut.grid, cut.grid.dim
+            nodal = self._momentum.u.x.array.reshape(-1, d)
+            N, dN = grid.shape_functions(pieces.cells, pieces.x)
+            at_nodes = nodal[grid.cell_nodes[pieces.cells]].transpose(0, 2, 1)
+            points = self._deformed(points, cut, np.eye(d) + at_nodes @ dN, pieces.cells)
+            points = self._moved(points, cut, cut.displacement(nodal))
+            ids, pressure, x, folded = None, None, None, 0
+            serves = cut.serves(points)
+            if cut.domains and not serves:  # where they serve, none has folded
+                points, folded = self._untangled(points, cut, state.stage.mechanical)
+            if self._storage is not None:
+                pressure = cut.to_pieces(self._storage.p.x.array[pieces.cells])
+                x = (state.stay.x if state.stay else cut.pieces.x) + cut.to_pieces((at_nodes @ N[:, :, None])[:, :, 0])
+                points, ids = replace(points, pressure=cut.mean(pressure)), points.id[cut.pieces.point]
+            _check_inside(cut, points, t)
+        new = replace(state, t=t, points=points, transported=None, stay=Stay(cut.points, ids, pressure, x))
+        return new if serves and stays else self.left_grid(new, on_grid), folded
+
+    def _deformed(self, points: MaterialPoints, cut: CutDomains, delta: NDArray, cells: NDArray) -> MaterialPoints:
+        """Return the points with F and state after a step, delta (m, d, d) the deformation of the pieces."""
+        n, d = len(points), cut.grid.dim
+        if self._momentum.dilatation is not None:
+            delta = self._momentum.dilatation.averaged(delta, cells)
+        # F_p <- (sum_k w_k Delta_k / V_p) F_p
+        mean = [cut.mean(column) for column in cut.to_pieces(delta).reshape(-1, d * d).T]
+        F = np.stack(mean, axis=1).reshape(n, d, d) @ points.F
+        self._check_volumes(points, determinant(F), cut)
+        points = replace(points, F=F)
+        return replace(points, data=self._materials.updated_state(points))
+
+    def _moved(self, points: MaterialPoints, cut: CutDomains, moved: NDArray[np.float64]) -> MaterialPoints:
+        """Return the points where corners (n, 2^d, d), or points without domains (n, d), have moved by so much, m."""
+        if cut.domains:
+            corners = points.corners + moved
+            return replace(points, corners=corners, x=corners.mean(axis=1))
+        x = points.x + moved
+        return replace(points, x=x, corners=parallelepipeds(x, points.F, self._size[points.id]))
+
+    def _check_volumes(self, points: MaterialPoints, J: NDArray[np.float64], cut: CutDomains) -> None:
+        """Refuse what a law may allow and a body does not: points turned inside out, pores of no volume."""
+        wet = self._storage is not None
+        least = 1 - self._materials.table(points, lambda m: m.porosity) if wet else np.zeros(len(J))
+        bad = np.flatnonzero(J <= least)
+        if over_all(cut.grid.comm, len(bad)):
+            shown = [f"point {points.id[i]} at {points.x[i]} with J = {J[i]:.3g}" for i in bad[:1]]
+            what = "the pores have closed" if wet else "the body is turned inside out"
+            raise NotConverged(f"{what}, J <= {least.max(initial=0):.3g}: {', '.join(shown) or 'elsewhere'}")
+
+    def _untangled(
+        self, points: MaterialPoints, cut: CutDomains, boundary: MechanicalBoundary
+    ) -> tuple[MaterialPoints, int]:
+        """Return the points with domains that have folded re-derived from F, whose neighbours went elsewhere."""
+        grid, volume = cut.grid, points.volume0 * points.J
+        bad = np.flatnonzero(tangled(points.corners, volume))
+        if len(bad):
+            all_corners, x = points.corners.copy(), points.x.copy()
+            corners = parallelepipeds(x[bad], points.F[bad], self._size[points.id[bad]])
+            corners = boundary.under_held(points.id[bad], all_corners[bad], volume[bad], corners)
+            all_corners[bad] = np.clip(corners, grid.lower, grid.upper)
+            x[bad] = all_corners[bad].mean(axis=1)
+            points = replace(points, corners=all_corners, x=x)
+        return points, over_all(grid.comm, len(bad))
+
+    def left_grid(self, state: State, on_grid: OnGrid) -> State:
+        """Return a state whose points take the pressures of their pieces along: the next step resets the grid."""
+        transported, points, cut = None, state.points, on_grid.cut
+        if self._storage is not None:
+            with Timer("mpm: remap"):
+                pieces, stay = cut.pieces, state.stay
+                store = self._materials.storage(points, self._fluid) * points.volume0 * points.J
+                on_grid.set_pressures(stay.pressure)
+                pressure, slope, bounds = on_grid.pressures_at_pieces(
+                    self._reconstruction, pieces.fraction * store[pieces.point]
+                )
+                transported = PiecePressures(stay.id, pieces.cell, pieces.fraction, pressure, stay.x, slope, bounds)
+        return replace(state, transported=transported, stay=None)
+
+
+def _check_inside(cut: CutDomains, points: MaterialPoints, t: float) -> None:
+    """Refuse points that have left the grid."""
+    grid, x, message = cut.grid, points.corners if cut.domains else points.x[:, None], ""
+    out = np.flatnonzero(grid.outside(x.reshape(-1, grid.dim)))
+    if len(out):
+        i = out[0] // x.shape[1]
+        message = f"point {points.id[i]} at {points.x[i]} left the grid {grid.lower} to {grid.upper} at t = {t:g} s"
+        message += ", must stay in it: take a larger grid"
+    if message := first(grid.comm, message):
+        raise LeftGrid(message)

@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: MIT
+"""Laws evaluated at points: stresses and new state at the material points, conductivities at the pieces."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import cached_property
+
+import numpy as np
+import ufl
+from numpy.typing import NDArray
+from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
+
+from mpm_dolfinx.constitutive.skeleton import Skeleton
+from mpm_dolfinx.constitutive.user_functions import call, expression
+from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointExpression
+from mpm_dolfinx.parallel.exchange import first
+from mpm_dolfinx.points.grid import Grid
+from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.validation import instance
+
+
+class LawAtPoints:
+    """A law evaluated at the material points that follow it.
+
+    Parameters
+    ----------
+    grid
+        Background grid.
+    law
+        Class of the law.
+    shapes
+        Shape of each of its parameters and of its variables of state.
+    """
+
+    def __init__(self, grid: Grid, law: type[Skeleton], shapes: dict[str, tuple[int, ...]]):
+        self.grid, self.law, self._shapes = grid, law, shapes
+
+    @cached_property
+    def points(self) -> FormPoints:
+        """The points, with F and what the law takes."""
+        return FormPoints(self.grid, F=(self.grid.dim, self.grid.dim), **self._shapes)
+
+    @cached_property
+    def _values(self) -> dict:
+        return {name: getattr(self.points, name) for name in self._shapes}
+
+    def data(
+        self, points: MaterialPoints, rows: NDArray[np.int64], values: dict[str, NDArray[np.float64]]
+    ) -> PointData:
+        """Return some of the material points, with values (n, ...) of F and of what the law takes."""
+        x = points.x[rows]
+        cells = self.grid.local(self.grid.number(self.grid.index(x)))
+        taken = {name: values[name][rows] for name in ("F", *self._shapes)}
+        return self.points.at(cells, x, points.volume0[rows], **taken)
+
+    @cached_property
+    def _stress(self) -> PointExpression:
+        F = ufl.variable(self.points.F)
+        return PointExpression(self.law.first_piola(F, self._values) * F.T / ufl.det(F), self.points)
+
+    def stress(self, data: PointData) -> NDArray[np.float64]:
+        """Return the effective Cauchy stress (n, d, d), Pa."""
+        return self._stress.evaluate(data)
+
+    @cached_property
+    def _update(self) -> tuple[PointExpression, dict[str, tuple[int, ...]]]:
+        """All components of the new state in one vector, and the shapes of its parts."""
+        given = call(self.law.update, F=self.points.F, **self._values)
+        instance(f"{self.law.__name__}.update: the new state", given, dict)
+        new = {name: ufl.as_ufl(f) for name, f in given.items()}
+        for name, f in new.items():
+            if name not in self.law.state or f.ufl_shape != np.shape(self.law.state[name]):
+                raise ValueError(f"{self.law.__name__}.update: {name!r} of shape {f.ufl_shape} is not in its state")
+        parts = [f[i] if i else f for f in new.values() for i in np.ndindex(f.ufl_shape)]
+        return PointExpression(ufl.as_vector(parts), self.points), {name: f.ufl_shape for name, f in new.items()}
+
+    def new_state(self, data: PointData) -> list[tuple[str, NDArray[np.float64]]]:
+        """Return the names and values (n, ...) of the state that follows from the F of the end of a step."""
+        if self.law.update is None:
+            return []
+        expression, shapes = self._update
+        values, out, start = expression.evaluate(data), [], 0
+        for name, shape in shapes.items():
+            stop = start + int(np.prod(shape, dtype=int))
+            out.append((name, values[:, start:stop].reshape(-1, *shape)))
+            start = stop
+        return out
+
+
+class ConductivityAtPieces:
+    """Conductivities that depend on deformation and place, evaluated at the pieces at the start of a step.
+
+    Parameters
+    ----------
+    materials
+        The scene's materials.
+    laws
+        Their different conductivity laws.
+    pieces
+        Points with the fields F, position, conductivity and porosity0, where a material has a conductivity law.
+    """
+
+    def __init__(self, materials: Sequence[Skeleton], laws: Sequence[Callable], pieces: FormPoints):
+        self._points, self._materials = pieces, materials
+        self._laws = {law: PointExpression(self._in_ufl(law), pieces) for law in laws}
+
+    def _in_ufl(self, law: Callable):
+        points, J = self._points, ufl.det(self._points.F)
+        return expression(
+            law,
+            [()],
+            conductivity=points.conductivity,
+            F=points.F,
+            J=J,
+            porosity=1 - (1 - points.porosity0) / J,
+            porosity0=points.porosity0,
+            x=points.position,
+        )
+
+    def evaluate(self, data: PointData, material: NDArray[np.int32]) -> NDArray[np.float64]:
+        """Return the conductivities (m,), m/s, of pieces of the given materials (m,)."""
+        out = data["conductivity"][:, 0].copy()
+        for law, k in self._laws.items():
+            rows = np.flatnonzero([m.conductivity_law is law for m in self._materials])
+            chosen = np.isin(material, rows)
+            out[chosen] = k.evaluate(data)[chosen]
+            bad = np.flatnonzero(chosen & ~((out >= 0) & (out < np.inf)))[:1]
+            shown = [f"k = {out[i]:g} at {data.x[i]}" for i in bad]
+            if where := first(self._points.grid.comm, "".join(shown)):
+                raise ValueError(f"conductivity law: {where}, must be >= 0 and finite")
+        return out
+
+
+def sampled(law: Callable) -> list[float]:
+    """Return the conductivities that a law gives in three states, which tell it from another law."""
+    out = []
+    for J in (0.8, 1.0, 1.25):
+        F = ufl.as_matrix([[J, 0.1 * J], [0.0, 1.0]])
+        state = {"J": J, "porosity": 1 - 0.6 / J, "porosity0": 0.4, "conductivity": 1e-5}
+        given = {name: ufl.as_ufl(value) for name, value in state.items()}
+        k = expression(law, [()], F=F, x=ufl.as_vector([0.3, 0.7]), **given)
+        out.append(float(apply_algebra_lowering(k)(())))
+    return out

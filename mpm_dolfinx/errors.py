@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: MIT
+"""What ends a step or a run."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from mpm_dolfinx.result import Result
+
+
+class StepFailed(RuntimeError):
+    """A step could not be taken; a shorter one may succeed.
+
+    Attributes
+    ----------
+    history
+        Relative residuals (momentum, storage) of its iterations, if it came to any.
+    """
+
+    history: Sequence[tuple[float, float]] = ()
+
+
+class NotConverged(StepFailed):
+    """A step's equations could not be solved; `history` lists (momentum, storage) relative residuals."""
+
+    def __init__(self, reason: str, history: Sequence[tuple[float, float]] = ()):
+        finite = [h for h in history if np.isfinite(h).all()]
+        worst = "momentum" if not finite or finite[-1][0] >= finite[-1][1] else "storage"
+        shown = ", ".join(f"({u:.1e}, {p:.1e})" for u, p in finite[-4:])
+        super().__init__(reason + (f"; worst in {worst}; last residuals (momentum, storage): {shown}" if shown else ""))
+        self.reason, self.field, self.history = reason, worst, history
+
+
+class LeftGrid(StepFailed):
+    """A material point has left the grid in a step."""
+
+
+class GaveUp(RuntimeError):
+    """A run could not go on: a step that fails however short.
+
+    The simulation is in the state of the last good step, from which other conditions or another step may go on.
+
+    Attributes
+    ----------
+    result
+        Histories up to the last good output time.
+    history
+        Relative residuals (momentum, storage) of the failed step's iterations, if it came to any.
+    """
+
+    def __init__(self, message: str, result: Result, history: Sequence[tuple[float, float]] = ()):
+        super().__init__(message)
+        self.result, self.history = result, history

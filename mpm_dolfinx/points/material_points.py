@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: MIT
+"""Material points: what a body remembers while the grid is reset."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpm_dolfinx.parallel.exchange import Exchange
+
+
+def determinant(F: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return det F (n,) of (n, d, d); numpy's own, by factors, takes twenty times as long."""
+    if F.shape[1] == 2:
+        return F[:, 0, 0] * F[:, 1, 1] - F[:, 0, 1] * F[:, 1, 0]
+    return np.einsum("ni,ni->n", F[:, 0], np.cross(F[:, 1], F[:, 2]))
+
+
+@dataclass(frozen=True, eq=False)
+class MaterialPoints:
+    """Material points of this process; arrays over its n points, that nobody changes.
+
+    Attributes
+    ----------
+    id : (n,)
+        Number of the point in the body.
+    corners : (n, 2^d, d), m
+        Tracked corners of the point's domain, in the order of `domains.corner_bits`.
+    F : (n, d, d)
+        Deformation gradient.
+    volume0 : (n,), m^d
+        Reference volume.
+    material : (n,)
+        Index of the point's material in the scene's list.
+    pressure : (n,), Pa
+        Pore pressure, positive in compression.
+    x : (n, d), m
+        Position.
+    origin : (n, 2^d, d), m
+        Corners from which displacements count: as seeded, or when a stage reset them.
+    data : name -> (n, ...)
+        What else the points carry: parameters that differ from point to point, state of the law.
+    """
+
+    id: NDArray[np.int64]
+    corners: NDArray[np.float64]
+    F: NDArray[np.float64]
+    volume0: NDArray[np.float64]
+    material: NDArray[np.int32]
+    pressure: NDArray[np.float64]
+    x: NDArray[np.float64]
+    origin: NDArray[np.float64]
+    data: dict[str, NDArray[np.float64]] = field(default_factory=dict)
+
+    def __post_init__(self):
+        for values in self.arrays:
+            values.flags.writeable = False
+
+    @property
+    def arrays(self) -> tuple[NDArray, ...]:
+        """All arrays."""
+        return (*(getattr(self, f.name) for f in fields(self) if f.name != "data"), *self.data.values())
+
+    def __len__(self) -> int:
+        return len(self.id)
+
+    @property
+    def J(self) -> NDArray[np.float64]:
+        """Volume ratio det F (n,)."""
+        return determinant(self.F)
+
+    def map(self, function: Callable[[NDArray], NDArray]) -> MaterialPoints:
+        """Return points with a function applied to each of their arrays: a choice of rows, a copy, a transfer."""
+        arrays = {f.name: function(getattr(self, f.name)) for f in fields(self) if f.name != "data"}
+        return MaterialPoints(**arrays, data={name: function(values) for name, values in self.data.items()})
+
+    def joined(self, other: MaterialPoints) -> MaterialPoints:
+        """Return these points and others, ordered by id."""
+        order = np.argsort(np.concatenate([self.id, other.id]))
+        pairs = {f.name: (getattr(self, f.name), getattr(other, f.name)) for f in fields(self) if f.name != "data"}
+        data = {name: np.concatenate([rows, other.data[name]])[order] for name, rows in self.data.items()}
+        return MaterialPoints(**{name: np.concatenate(pair)[order] for name, pair in pairs.items()}, data=data)
+
+    def of(self, ids: NDArray[np.int64], kept: bool = True) -> MaterialPoints:
+        """Return the points of these ids, or all others."""
+        rows = np.isin(self.id, ids) == kept
+        return self.map(lambda values: values[rows])
+
+    def migrated(self, exchange: Exchange) -> MaterialPoints:
+        """Return the points of this process after every point went to its destination, ordered by id."""
+        received = self.map(exchange.send)
+        order = np.argsort(received.id)
+        return received.map(lambda rows: rows[order])
+
+    def find(self, ids: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return (which of `ids` are points of this process, their indices); points are ordered by id."""
+        at = np.searchsorted(self.id, ids)
+        here = np.flatnonzero((at < len(self)) & (self.id[np.minimum(at, len(self) - 1)] == ids)) if len(self) else []
+        here = np.asarray(here, dtype=np.int64)
+        return here, at[here]

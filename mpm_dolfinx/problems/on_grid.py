@@ -1,0 +1,260 @@
+# SPDX-License-Identifier: MIT
+"""What a reset of the grid makes: bodies cut by the cells, the active set, and matrices that stay while a cut serves."""
+
+from __future__ import annotations
+
+from mpi4py import MPI
+
+import numpy as np
+from dolfinx.common import Timer
+from numpy.typing import NDArray
+
+from mpm_dolfinx.caching import Latest
+from mpm_dolfinx.constitutive.fields import SceneMaterials
+from mpm_dolfinx.parallel.exchange import over_all
+from mpm_dolfinx.points.cut_domains import CutDomains
+from mpm_dolfinx.points.grid import sum_by
+from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.points.pressure_transport import Reconstruction
+from mpm_dolfinx.problems.fluxes import CellContents, PieceContents
+from mpm_dolfinx.problems.momentum import MomentumForms, MomentumSystem
+from mpm_dolfinx.problems.quadrature_data import QuadratureData, QuadraturePoints
+from mpm_dolfinx.problems.scene_checks import check_held
+from mpm_dolfinx.problems.side_forms import SideData
+from mpm_dolfinx.problems.stage import Stage
+from mpm_dolfinx.problems.storage import Outflow, StorageForms, StorageSystem
+from mpm_dolfinx.solve.scheme import Scheme
+from mpm_dolfinx.solve.schur import LinearSolvers
+
+
+class OnGrid:
+    """The bodies on the grid since it was reset.
+
+    Parameters
+    ----------
+    quadrature, materials
+        Points of integration and materials of the scene.
+    momentum, storage
+        Forms, whose coefficients are set to what the cells hold; storage is None without fluid.
+    cut
+        The domains of the points, cut.
+    as_printed
+        Whether beta is 1/K_w, see `Scheme`.
+    """
+
+    def __init__(
+        self,
+        quadrature: QuadraturePoints,
+        materials: SceneMaterials,
+        momentum: MomentumForms,
+        storage: StorageForms | None,
+        cut: CutDomains,
+        as_printed: bool,
+    ):
+        grid, points, self.cut, self._quadrature, self._storage = cut.grid, cut.points, cut, quadrature, storage
+        self._places = quadrature.places(cut)
+        self.data = quadrature.data(cut, self._places, points)
+        """The pieces when the grid was reset."""
+        pieces = self.data.pieces
+        self.weight = weight = pieces["weight"][:, 0] * grid.cell_volume
+        """Volumes (m,) of the pieces, m^d."""
+        stiffness = weight * quadrature.rows(cut, points, lambda m: m.oedometric)
+        momentum.ghost.set_contents(*(sum_by(cut.cells, rows, grid.num_local) for rows in (weight, stiffness)))
+        self.active = momentum.ghost.fill.x.array > 0
+        """Which local cells hold something, ghosts included."""
+        self.cells = np.flatnonzero(self.active)
+        self.facets = grid.interior_facets(self.active, self.cells)
+        """Faces of this process between two active cells."""
+        self.penalised = momentum.ghost.facets(self.facets)
+        """Those of partly filled cells."""
+        self.stiffness = float(momentum.ghost.modulus.x.array[self.cells].max(initial=0.0))
+        """Largest oedometric modulus of a cell, Pa."""
+        self.contents = None
+        if storage is not None:
+            brought = PieceContents(
+                cells=cut.cells,
+                weight=weight,
+                x=cut.x,
+                mobility=quadrature.mobility(cut, points, pieces),
+                faces=cut.pieces_to_cells(cut.pieces.faces),
+                fixed_stress=quadrature.fixed_stress(cut, points, as_printed),
+                damping=quadrature.rows(cut, points, lambda m: m.pressure_damping(grid.dim)),
+            )
+            self.contents = CellContents(storage.fluxes, brought, self.cells[self.cells < grid.num_owned])
+
+    def data_of(self, points: MaterialPoints) -> QuadratureData:
+        """Return the pieces with what the points, which have hardly moved since, carry now."""
+        return self.data if points is self.cut.points else self._quadrature.data(self.cut, self._places, points)
+
+    def set_pressures(self, at_pieces: NDArray[np.float64]) -> None:
+        """Set the pressures at the start of a step to those (m,), Pa, that the pieces have of their cells."""
+        p_n = self._storage.p_n.x
+        p_n.array[self.cut.cells] = self.cut.pieces_to_cells(at_pieces)
+        p_n.scatter_forward()
+
+    def average_pressures(self, at_pieces: NDArray[np.float64]) -> None:
+        """Set the pressures at the start of a step to the means of those (m,), Pa, that pieces bring to their cells.
+
+        Means are by what is stored, or by volume in a cell that stores nothing.
+        """
+        contents, cells, weight, p_n = self.contents, self.cut.cells, self.weight, self._storage.p_n.x
+        pressure, store = self.cut.pieces_to_cells(at_pieces), weight * self.data.pieces["storage"][:, 0]
+        held = contents.total(cells, store)
+        mean = contents.total(cells, weight * pressure) / contents.total(cells, weight)
+        np.divide(contents.total(cells, store * pressure), held, out=mean, where=held > 0)
+        p_n.array[contents.filled] = mean
+        p_n.scatter_forward()
+
+    def pressures_at_pieces(
+        self, reconstruction: Reconstruction, store: NDArray[np.float64]
+    ) -> list[NDArray[np.float64]]:
+        """Return the pressures (m,), their slopes (m, d) and bounds (m, 2) at the pieces, as `set_pressures` has set.
+
+        Their mean in a cell is the cell's pressure: by `store` (m,), m^d/Pa, what the pieces store, or by their volumes
+        in a cell that stores nothing.
+        """
+        pieces, contents, p = self.data.pieces, self.contents, self._storage.p_n.x.array
+        cells, offset, at = pieces.cells, pieces.places.offset, contents.slot(pieces.cells)
+        store = self.cut.pieces_to_cells(store)
+        weight = np.where(contents.total(cells, store)[at] > 0, store, self.weight)
+        total = contents.total(cells, weight)
+        origin = np.stack([contents.total(cells, weight * x) / total for x in offset.T], axis=1)
+        slope, bounds = reconstruction(contents.filled, p, contents.centroid, contents.open, origin)
+        pressure = p[cells] + np.einsum("md,md->m", slope[at], offset - origin[at])
+        return [self.cut.to_pieces(values) for values in (pressure, slope[at], bounds[at])]
+
+    @property
+    def active_cells(self) -> int:
+        """Number of active cells of all processes."""
+        grid = self.cut.grid
+        return int(grid.comm.allreduce(int(self.active[: grid.num_owned].sum())))
+
+
+class System:
+    """Vectors, matrices and solvers of one active set, complete when made.
+
+    Parameters
+    ----------
+    momentum, storage
+        Compiled forms; storage is None without fluid.
+    scheme
+        How they are coupled.
+    on_grid
+        The bodies on the grid.
+    dofs, nodes
+        Unrolled local unknowns of the displacement, and active nodes.
+    stiff
+        Whether sides have plates or given displacements.
+    """
+
+    def __init__(
+        self,
+        momentum: MomentumForms,
+        storage: StorageForms | None,
+        scheme: Scheme,
+        on_grid: OnGrid,
+        dofs: NDArray[np.int64],
+        nodes: NDArray[np.int64],
+        stiff: bool,
+    ):
+        self._scheme, self._symmetric = scheme, momentum.symmetric
+        self.momentum, self.storage = MomentumSystem(momentum, dofs, nodes, on_grid.penalised, stiff), None
+        if storage is not None:
+            unknowns = self.momentum.unknowns
+            self.storage = StorageSystem(storage, on_grid.cells, on_grid.facets, unknowns)
+        self._solvers: Latest[LinearSolvers] = Latest()
+
+    def solvers(self) -> LinearSolvers:
+        """Return the solvers; those that iterate are made anew in every step, to depend on none before."""
+        made = self._solvers.value
+        if made is not None and not made.iterative:
+            return made
+        make = (self._scheme, self.momentum, self.storage, self._symmetric)
+        return self._solvers(object(), lambda: LinearSolvers(*make))
+
+
+class Assembled:
+    """What stays while a cut serves and a stage lasts: penalties and fluxes, in the matrices of a system.
+
+    Parameters
+    ----------
+    momentum, storage
+        Compiled forms.
+    system
+        The matrices.
+    on_grid
+        The bodies on the grid.
+    stage
+        The conditions.
+    sides
+        What acts on the sides, placed where the points were cut.
+    """
+
+    def __init__(
+        self,
+        momentum: MomentumForms,
+        storage: StorageForms | None,
+        system: System,
+        on_grid: OnGrid,
+        stage: Stage,
+        sides: SideData,
+    ):
+        self.momentum, self.storage, self.solvers = system.momentum, system.storage, system.solvers
+        self._on_grid, self._stage, grid = on_grid, stage, on_grid.cut.grid
+        self._outflow: Latest[Outflow] = Latest()
+        self.momentum.set_penalty(sides)
+        stiffness = over_all(grid.comm, on_grid.stiffness, MPI.MAX) * grid.cell_volume / grid.h.min()
+        self.round_off = 1e-14 * stiffness * np.sqrt(max(1, self.momentum.unknowns.global_size))
+        """Norm of the momentum's residual that rounding leaves, N."""
+        if sides.holds is not None:  # what rounding of coordinates makes of their stiffness
+            reach = np.abs(np.concatenate([grid.lower, grid.upper])).max()
+            stiffest = float(sides.holds["stiffness"].max(initial=0.0))
+            self.round_off += 1e-15 * over_all(grid.comm, stiffest, MPI.MAX) * reach
+        if self.storage is not None:
+            self.storage.set_alternation()
+
+    def outflow(self, points: MaterialPoints, weight: NDArray[np.float64] | None) -> Outflow:
+        """Return the fluxes, assembled; weight: of the fluid (d,), N/m^3, if there is gravity."""
+        at = self._on_grid.cut.points if weight is None else points  # gravity may change with time
+
+        def make() -> Outflow:
+            contents = self._on_grid.contents
+            sides = self._stage.hydraulic.data(self._on_grid.cut, at, contents, weight)
+            return self.storage.set_fluxes(contents, sides)
+
+        return self._outflow((at, weight), make, self._on_grid.cut.grid.comm)
+
+
+def assembled(
+    momentum: MomentumForms,
+    storage: StorageForms | None,
+    scheme: Scheme,
+    systems: Latest[System],
+    on_grid: OnGrid,
+    stage: Stage,
+    sides: SideData,
+    begins: bool,
+) -> Assembled:
+    """Return the matrices of a cut and a stage; begins: refuse all parts of the bodies that are not held.
+
+    Raises
+    ------
+    ValueError
+        A body, or at the start of a stage a part of one, is free to move as a rigid body.
+    """
+    grid, free = on_grid.cut.grid, stage.free
+    nodes = np.flatnonzero(momentum.active_nodes(on_grid.cells))
+    dofs = (nodes[:, None] * grid.dim + np.arange(grid.dim))[free[nodes]]
+    stiff = sides.plates is not None or sides.holds is not None
+
+    def make() -> System:
+        if not momentum.holding:
+            holds = sides.holds
+            held = None if holds is None else (holds.cells, holds.x, holds["direction"])
+            check_held(grid, on_grid.active, free, held, begins)
+        return System(momentum, storage, scheme, on_grid, dofs, nodes, stiff)
+
+    # a cell may become active between active nodes, so equal dofs do not mean equal cells
+    with Timer("mpm: integration data"):
+        system = systems((stage, on_grid.cells, dofs, on_grid.penalised), make, grid.comm)
+        return Assembled(momentum, storage, system, on_grid, stage, sides)

@@ -1,0 +1,159 @@
+# SPDX-License-Identifier: MIT
+"""What the pieces of a step carry: fields of the points and constants of their materials."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpm_dolfinx.caching import Latest
+from mpm_dolfinx.constitutive.evaluate import ConductivityAtPieces
+from mpm_dolfinx.constitutive.fields import SceneMaterials
+from mpm_dolfinx.constitutive.skeleton import Fluid, Skeleton
+from mpm_dolfinx.forms.point_forms import FormPoints, Places, PointData
+from mpm_dolfinx.points.cut_domains import CutDomains
+from mpm_dolfinx.points.grid import Grid
+from mpm_dolfinx.points.material_points import MaterialPoints
+
+
+@dataclass(frozen=True)
+class QuadratureData:
+    """The pieces of a step, and those of each law."""
+
+    pieces: PointData
+    parts: tuple[PointData, ...]
+
+
+@dataclass(frozen=True)
+class PiecePlaces:
+    """Where the pieces of a cut lie, and which rows of them follow each of several laws, with their places."""
+
+    pieces: Places
+    parts: tuple[tuple[NDArray[np.int64], Places], ...]
+
+
+class QuadraturePoints:
+    """The pieces as points of integration, with the fields that the scene's forms take.
+
+    Parameters
+    ----------
+    grid
+        Background grid.
+    scene
+        The materials of the scene.
+    fluid
+        Pore fluid, if any.
+    weighs
+        Whether there is gravity.
+    extended
+        Whether functions of the user's may ask for anything that the points carry.
+
+    Attributes
+    ----------
+    pieces
+        The points of integration.
+    laws
+        Each law with the pieces that follow it.
+    varies
+        Whether mobilities change with the deformation: then the grid is reset in every step.
+    """
+
+    def __init__(self, grid: Grid, scene: SceneMaterials, fluid: Fluid | None, weighs: bool, extended: bool):
+        self._grid, self._fluid = grid, fluid
+        self._scene, self._weighs, self._extended = scene, weighs, extended
+        self.varies = bool(fluid and scene.conductivity_laws)
+        d = grid.dim
+        shapes: dict[str, tuple[int, ...]] = {"F": (d, d), **scene.shapes}
+        if fluid:
+            shapes |= {"biot": (), "storage": ()}
+        if weighs:
+            shapes |= {"density": ()}
+        if extended:
+            data = {name: values.shape[1:] for name, values in scene.seeded.data.items()}
+            shapes |= {"position": (d,), "displacement": (d,), **data}
+        if self.varies:
+            shapes |= {"position": (d,), "conductivity": (), "porosity0": ()}
+        self.pieces = FormPoints(grid, **shapes)
+        self.laws = scene.parts(self.pieces, ["F", "biot"] if fluid else ["F"])
+        self._constants: Latest[dict[str, NDArray[np.float64]]] = Latest()
+        laws = scene.conductivity_laws if fluid else []
+        self._conductivity = ConductivityAtPieces(scene.materials, laws, self.pieces)
+
+    def places(self, cut: CutDomains) -> PiecePlaces:
+        """Return where the pieces of a cut lie."""
+        pieces, parts = Places(self._grid, cut.cells, cut.x), []
+        if len(self.laws) > 1:
+            law = cut.to_cells(self._scene.law_of(cut.points))
+            rows = [np.flatnonzero(law == number) for number in range(len(self.laws))]
+            parts = [(own, pieces.part(own)) for own in rows]
+        return PiecePlaces(pieces, tuple(parts))
+
+    def data(self, cut: CutDomains, places: PiecePlaces, points: MaterialPoints) -> QuadratureData:
+        """Return the pieces with all their data: those of a cut, with what the points carry now."""
+        changing = {name: cut.to_cells(values) for name, values in self._changing(points).items()}
+        fields = {**self._constant(cut, points), **changing, **self._own(cut, points)}
+        weight = cut.pieces_to_cells(cut.pieces.fraction * (points.volume0 * points.J)[cut.pieces.point])
+        pieces = PointData(self.pieces, places.pieces, weight, fields)
+        if not places.parts:
+            return QuadratureData(pieces, (pieces,))
+        parts = zip(self.laws, places.parts, strict=True)
+        return QuadratureData(pieces, tuple(pieces.part(of, where, rows) for (_, of), (rows, where) in parts))
+
+    def _constant(self, cut: CutDomains, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
+        """Return what the materials bring to their pieces for good."""
+        values = tuple(points.data[name] for name in self._scene.field_names)
+
+        def make() -> dict[str, NDArray[np.float64]]:
+            fields = self._scene.parameters(points)
+            if self._fluid:
+                fields["biot"] = self._scene.table(points, lambda m: m.biot)
+            if self.varies:
+                fields["conductivity"] = self._scene.table(points, lambda m: m.conductivity)
+                fields["porosity0"] = self._scene.table(points, lambda m: m.porosity)
+            return {name: cut.to_cells(rows) for name, rows in fields.items()}
+
+        return self._constants((cut, values), make, self._grid.comm)
+
+    def _changing(self, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
+        """Return what the points bring to their pieces and what changes with them."""
+        fields = {"F": points.F, **self._scene.state(points)}
+        if self._extended:  # what laws take is known for all materials, and zero in `data` for those of other points
+            fields |= {name: rows for name, rows in points.data.items() if name not in self._scene.shapes}
+        if self._fluid:
+            fields["storage"] = self._scene.storage(points, self._fluid)
+        if self._weighs:
+            n, wet = self._scene.porosity(points), self._fluid.density if self._fluid else 0.0
+            fields["density"] = (1 - n) * self._scene.table(points, lambda m: m.grain_density) + n * wet
+        return fields
+
+    def _own(self, cut: CutDomains, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
+        """Return what differs from piece to piece of a point, where functions of the user's may ask for it."""
+        fields = {}
+        if self._extended or self.varies:
+            fields["position"] = cut.pieces.x
+        if self._extended:
+            fields["displacement"] = cut.total_displacement(points)
+        return {name: cut.pieces_to_cells(values) for name, values in fields.items()}
+
+    def rows(self, cut: CutDomains, points: MaterialPoints, value: Callable[[Skeleton], float]) -> NDArray[np.float64]:
+        """Return a constant of the materials at the pieces (m,)."""
+        return cut.to_cells(self._scene.table(points, value))
+
+    def mobility(self, cut: CutDomains, points: MaterialPoints, data: PointData) -> NDArray[np.float64]:
+        """Return the mobility k / (rho_w g) at the pieces (m,), m^2/(Pa s)."""
+        if not self.varies:
+            return self.rows(cut, points, lambda m: m.conductivity) / self._fluid.unit_weight
+        return self._conductivity.evaluate(data, cut.to_cells(points.material)) / self._fluid.unit_weight
+
+    def fixed_stress(self, cut: CutDomains, points: MaterialPoints, as_printed: bool) -> NDArray[np.float64]:
+        """Return beta of the fixed-stress operator at the pieces, 1/Pa, before the scheme's factor.
+
+        `as_printed`: 1/K_w, as in the seed paper.
+        """
+        if as_printed:
+            return np.full(len(cut.cells), 1 / self._fluid.bulk)
+        beta = self._scene.table(points, lambda m: m.biot**2 / m.drained_modulus(self._grid.dim)) * points.J
+        return cut.to_cells(beta)

@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: MIT
+"""Forms on the sides of the bodies: tractions, rigid plates, given displacements; each compiled when first asked for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from numpy.typing import NDArray
+
+from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointForm
+from mpm_dolfinx.points.grid import Grid
+
+
+@dataclass(frozen=True)
+class SideData:
+    """What acts on the sides of the bodies in a step; None where there is no such condition.
+
+    loads: with their force; plates: with their rigidity, normal and present tilt; holds: sides with given
+    displacements, with stiffness, direction and gap; number: the condition that each of these belongs to.
+    """
+
+    loads: PointData | None
+    plates: PointData | None
+    holds: PointData | None
+    number: NDArray[np.int64]
+
+
+class SideForms:
+    """The forms, with the points at which they are evaluated.
+
+    Parameters
+    ----------
+    grid
+        Background grid.
+    V
+        Space of the displacement.
+    """
+
+    def __init__(self, grid: Grid, V: fem.FunctionSpace):
+        self._grid, self._v, self._du = grid, ufl.TestFunction(V), ufl.TrialFunction(V)
+
+    @cached_property
+    def loads(self) -> FormPoints:
+        """Points with a force."""
+        return FormPoints(self._grid, force=(self._grid.dim,))
+
+    @cached_property
+    def traction(self) -> PointForm:
+        """Work of dead loads."""
+        p = self.loads
+        return PointForm(ufl.inner(p.force, p.value(self._v)) * p.dx, p)
+
+    @cached_property
+    def plates(self) -> FormPoints:
+        """Points under rigid plates."""
+        return FormPoints(self._grid, rigidity=(), normal=(self._grid.dim,), tilt=(self._grid.dim,))
+
+    @cached_property
+    def plate(self) -> PointForm:
+        """Stiffness of plates against a slope of their normal displacement."""
+        return PointForm(self._bend(self._slope(self._du)), self.plates)
+
+    @cached_property
+    def tilt(self) -> PointForm:
+        """What turns plates back that are tilted."""
+        return PointForm(-self._bend(self.plates.tilt), self.plates)
+
+    def _slope(self, w):
+        """Return the tangential gradient of the normal displacement, grad_t(w_n), at the plates."""
+        n = self.plates.normal
+        gradient = ufl.dot(n, self.plates.grad(w))
+        return gradient - ufl.dot(gradient, n) * n
+
+    def _bend(self, slope) -> ufl.Form:
+        """Return the work of plates that bend or turn by a slope: kappa slope . grad_t(v_n)."""
+        return self.plates.rigidity * ufl.inner(slope, self._slope(self._v)) * self.plates.dx
+
+    @cached_property
+    def holds(self) -> FormPoints:
+        """Points with a given displacement along a direction."""
+        return FormPoints(self._grid, stiffness=(), direction=(self._grid.dim,), gap=())
+
+    @cached_property
+    def hold(self) -> PointForm:
+        """Stiffness that holds the given displacement."""
+        h = self.holds
+        return PointForm(h.stiffness * ufl.dot(h.value(self._du), h.direction) * self._along * h.dx, h)
+
+    @cached_property
+    def pull(self) -> PointForm:
+        """Force towards the given displacement."""
+        return PointForm(self.holds.stiffness * self.holds.gap * self._along * self.holds.dx, self.holds)
+
+    @property
+    def _along(self):
+        return ufl.dot(self.holds.value(self._v), self.holds.direction)

@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: MIT
+"""The sides of the bodies that conditions name."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpm_dolfinx.parallel.exchange import Exchange
+from mpm_dolfinx.points.bodies import Body
+from mpm_dolfinx.points.faces import Surface, limits, surface
+from mpm_dolfinx.points.grid import Grid
+from mpm_dolfinx.validation import line
+
+
+class Sides:
+    """Finds the faces of conditions, the same object for conditions on the same faces.
+
+    Parameters
+    ----------
+    grid, bodies
+        Background grid and all bodies of the scene.
+    present
+        Which bodies are there.
+    """
+
+    def __init__(self, grid: Grid, bodies: Sequence[Body], present: Sequence[bool]):
+        self.grid, self.bodies, self.present = grid, bodies, present
+        self._found: dict[tuple[str, bytes], Surface] = {}
+
+    def of(self, condition) -> Surface:
+        """Return the faces of a condition's side and region; ValueError where there are none."""
+        key = (str(condition.side), limits(condition.region, self.grid.dim).tobytes())
+        if key not in self._found:
+            self._found[key] = surface(self.bodies, condition.side, condition.region, self.present)
+        if not len(self._found[key]):
+            where = " in the region" if condition.region is not None else ""
+            raise ValueError(f"{line(condition)}: no point has this side{where}, must be one of a body")
+        return self._found[key]
+
+
+def gathered(grid: Grid, rows: Sequence[tuple], width: int) -> tuple[NDArray, NDArray, NDArray]:
+    """Send (cells, positions, values) to the owners of the cells; return (owned cells, positions, values)."""
+    empty = (np.empty(0, dtype=np.int64), np.empty((0, grid.dim)), np.empty((0, width)))
+    parts = [np.concatenate(column) for column in zip(empty, *rows, strict=True)]
+    travel = Exchange(grid.comm, grid.owner(parts[0]))
+    cell, x, values = map(travel.send, parts)
+    return grid.local(cell), x, values
+
+
+def check_apart(one, faces: Surface, other, others: Surface) -> None:
+    """Refuse two conditions, of a kind that excludes the other, on the same part of a face."""
+    if (faces.axis, faces.end) != (others.axis, others.end):
+        return
+    _, a, b = np.intersect1d(faces.id, others.id, return_indices=True)
+    low, high = np.maximum(faces.X[a, 0], others.X[b, 0]), np.minimum(faces.X[a, 1], others.X[b, 1])
+    common = high - low > 1e-9 * (faces.X[a, 1] - faces.X[a, 0])
+    common[:, faces.axis] = True
+    both = np.flatnonzero(common.all(axis=1))
+    if len(both):
+        x = (low[both[0]] + high[both[0]]) / 2
+        raise ValueError(f"{line(one)} and {line(other)}: both act at {x}, must not; limit them by regions")

@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: MIT
+"""A stage: which bodies are there and what acts on them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mpm_dolfinx.points.bodies import Body, check_apart
+from mpm_dolfinx.points.grid import Grid
+from mpm_dolfinx.problems.conditions import Displacement, Drained, Inflow, RigidPlate, Traction
+from mpm_dolfinx.problems.hydraulic_boundary import HydraulicBoundary
+from mpm_dolfinx.problems.mechanical_boundary import MechanicalBoundary
+from mpm_dolfinx.problems.sides import Sides
+from mpm_dolfinx.validation import all_of, asked, line, numbers
+
+CONDITIONS = {
+    "tractions": Traction,
+    "displacements": Displacement,
+    "drained": Drained,
+    "inflows": Inflow,
+    "plates": RigidPlate,
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """The conditions in force.
+
+    conditions: as they were given, by name; present: which bodies are there; later: those that may still come;
+    free: (nodes, d), components that no wall holds; mechanical, hydraulic: what acts on the sides of the bodies.
+    """
+
+    conditions: Mapping[str, Any]
+    present: tuple[bool, ...]
+    later: tuple[int, ...]
+    free: NDArray[np.bool_]
+    mechanical: MechanicalBoundary
+    hydraulic: HydraulicBoundary
+
+    def gravity_at(self, t: float) -> NDArray[np.float64] | None:
+        """Return the acceleration of gravity (d,) at time t (s), m/s^2; None without."""
+        given, name = self.conditions["gravity"], f"gravity at t = {t:g} s"
+        if given is None:
+            return None
+        d = self.free.shape[1]
+        return _gravity(asked(name, f"{d} numbers for a time", given, t) if callable(given) else given, name, d)
+
+
+def stage(
+    grid: Grid,
+    bodies: Sequence[Body],
+    stiffest: float,
+    wet: bool,
+    conditions: Mapping[str, Any],
+    present: Sequence[bool],
+    later: Sequence[int],
+) -> Stage:
+    """Return a stage.
+
+    Parameters
+    ----------
+    grid, bodies
+        Background grid, and all bodies of the scene.
+    stiffest
+        Oedometric modulus of the stiffest material, Pa.
+    wet
+        Whether there is a fluid.
+    conditions
+        fixed, tractions, displacements, drained, inflows, plates, gravity: see `Simulation`.
+    present, later
+        Which bodies are there, and which may still come.
+
+    Raises
+    ------
+    ValueError
+        Naming the condition, its value and what is allowed.
+    """
+    for name, kind in CONDITIONS.items():
+        all_of(name, conditions[name], kind)
+    if not wet and (conditions["drained"] or conditions["inflows"]):
+        raise ValueError("drained and inflow sides need a fluid")
+    gravity = conditions["gravity"]
+    if gravity is not None and not callable(gravity):
+        _gravity(gravity, "gravity", grid.dim)
+    if not any(present):
+        raise ValueError("bodies: none is there, must be at least one")
+    check_apart(bodies, present)
+    free, sides = ~_fixed(grid, conditions["fixed"]), Sides(grid, bodies, present)
+    acting = (conditions[name] for name in ("tractions", "displacements", "plates"))
+    mechanical = MechanicalBoundary(sides, stiffest, *acting)
+    hydraulic = HydraulicBoundary(sides, [*conditions["drained"], *conditions["inflows"]])
+    return Stage(dict(conditions), tuple(present), tuple(later), free, mechanical, hydraulic)
+
+
+def _gravity(value: ArrayLike, name: str, dim: int) -> NDArray[np.float64]:
+    return numbers(name, value, (dim,), allowed=f"{dim} finite numbers")
+
+
+def _fixed(grid: Grid, fixed: Mapping[str, str]) -> NDArray[np.bool_]:
+    """Return which components (nodes, d) are held by walls."""
+    d = grid.dim
+    out = np.zeros((len(grid.node_x), d), dtype=bool)
+    if not isinstance(fixed, Mapping):
+        raise ValueError(f"fixed = {line(fixed)}, must be walls with their components, such as {{'left': 'xy'}}")
+    for wall, axes in fixed.items():
+        if not isinstance(axes, str) or not axes or any(a not in "xyz"[:d] for a in axes):
+            raise ValueError(f"fixed wall {wall!r}: components {axes!r}, must be some of {'xyz'[:d]!r}")
+        for a in axes:
+            out[grid.wall_nodes(wall), "xyz".index(a)] = True
+    return out

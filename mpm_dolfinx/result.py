@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: MIT
+"""Histories of a run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass
+class Report:
+    """What a converged step took: Newton and coupling iterations, relative residuals, fluid balance, and mending.
+
+    rederived: domains that had folded and were re-derived from F; easy: whether the next step may be longer.
+    """
+
+    newton: int = 0
+    coupling: int = 0
+    history: list[tuple[float, float]] = field(default_factory=list)
+    balance: float = 0.0
+    rederived: int = 0
+    easy: bool = False
+
+
+@dataclass(frozen=True)
+class Result:
+    """Histories of a run, and where its time loop is; one row an output time, the start included.
+
+    t (s); displacement (m, d) of the probes, m; pressure: least and largest on the points, Pa; and of
+    the steps so far: steps, newton, coupling (iterations), balance and residual (worst, relative), cuts,
+    rederived (domains that had folded), wall (s), and profile: seconds of each part of the run on this
+    process, from dolfinx's timers.  points: material points; memory: peak of all processes, libraries
+    included, MB; imbalance: the most that one of several processes has over their mean, at the end of the run.
+    dt: output interval, s; small: the step to try next, s; converged: the end has been reached.
+    """
+
+    rows: list[tuple[float, NDArray[np.float64] | None, tuple[float, float] | None]] = field(
+        default_factory=list, repr=False
+    )
+    """(time, displacement, pressure) of each output time; grows while the run goes on."""
+    steps: int = 0
+    newton: int = 0
+    coupling: int = 0
+    cuts: int = 0
+    rederived: int = 0
+    balance: float = 0.0
+    residual: float = 0.0
+    wall: float = 0.0
+    dt: float = 0.0
+    small: float = 0.0
+    converged: bool = False
+    profile: dict[str, float] = field(default_factory=dict, repr=False)
+    points: int = 0
+    memory: float = 0.0
+    imbalance: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def t(self) -> list[float]:
+        """Output times, s."""
+        return [row[0] for row in self.rows]
+
+    @property
+    def displacement(self) -> list[NDArray[np.float64]]:
+        """Displacements (m, d) of the probes at the output times, m."""
+        return [row[1] for row in self.rows if row[1] is not None]
+
+    @property
+    def pressure(self) -> list[tuple[float, float]]:
+        """Least and largest pore pressure on the points at the output times, Pa."""
+        return [row[2] for row in self.rows if row[2] is not None]
+
+    def after(self, report: Report, small: float) -> Result:
+        """Return the histories after one more step; small: the step to try next, s."""
+        return replace(
+            self,
+            steps=self.steps + 1,
+            newton=self.newton + report.newton,
+            coupling=self.coupling + report.coupling,
+            rederived=self.rederived + report.rederived,
+            balance=max(self.balance, report.balance),
+            residual=max(self.residual, *report.history[-1]),
+            small=small,
+        )
+
+    def shares(self) -> str:
+        """Return seconds and share of the wall time of each part, memory and imbalance as a table."""
+        rows = [*self.profile.items(), ("rest", self.wall - sum(self.profile.values()))]
+        lines = [f"{name:18} {s:8.2f} s {100 * s / max(self.wall, 1e-9):5.1f} %" for name, s in rows]
+        if self.points:  # measured when a run has ended
+            each = 1024 * self.memory / self.points
+            lines.append(f"{'memory':18} {self.memory:8.0f} MB, {each:.3g} kB for each of {self.points} points")
+        if self.imbalance:
+            ratios = ", ".join(f"{name} {ratio:.2f}" for name, ratio in self.imbalance.items())
+            lines.append(f"{'most over mean':18} {ratios} (1: perfect balance)")
+        return "\n".join(lines)

@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: MIT
+"""A scene as it is compiled: grid, bodies, materials and forms; all that lasts from its first step to its last."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable, Sequence
+from dataclasses import fields
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from dolfinx import fem
+from dolfinx.common import Timer
+from numpy.typing import NDArray
+
+from mpm_dolfinx.advance import Motion
+from mpm_dolfinx.caching import Latest
+from mpm_dolfinx.constitutive.fields import SceneMaterials
+from mpm_dolfinx.constitutive.skeleton import Fluid, Skeleton
+from mpm_dolfinx.constitutive.user_functions import compiling
+from mpm_dolfinx.points.bodies import Body, material_points
+from mpm_dolfinx.points.cut_domains import CutDomains
+from mpm_dolfinx.points.grid import Grid
+from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.problems.momentum import MomentumForms
+from mpm_dolfinx.problems.on_grid import Assembled, OnGrid, System, assembled
+from mpm_dolfinx.problems.quadrature_data import QuadraturePoints
+from mpm_dolfinx.problems.side_forms import SideData
+from mpm_dolfinx.problems.stage import Stage
+from mpm_dolfinx.problems.storage import StorageForms
+from mpm_dolfinx.solve.scheme import Scheme
+
+
+class Scene:
+    """A scene.  Nothing of it tells one step from another: what a step depends on is in its `State`.
+
+    Parameters
+    ----------
+    grid, bodies, materials, fluid, quadrature, terms, sources
+        See `Simulation`.
+    scheme
+        How the two problems are coupled.
+    weighs
+        Whether there is gravity.
+    pressure
+        Pore pressure at the start, Pa.
+    """
+
+    def __init__(
+        self,
+        grid: Grid,
+        bodies: Sequence[Body],
+        materials: Sequence[Skeleton],
+        fluid: Fluid | None,
+        quadrature: str,
+        scheme: Scheme,
+        weighs: bool,
+        pressure: float,
+        terms: Sequence[Callable],
+        sources: Sequence[Callable],
+    ):
+        self.grid, self.bodies, self.fluid, self.quadrature = grid, tuple(bodies), fluid, quadrature
+        self.materials = scene = SceneMaterials(grid, materials, bodies, material_points(grid, bodies, pressure))
+        self.gravity = fem.Constant(grid.mesh, np.zeros(grid.dim)) if weighs else None
+        self.t, self.dt = fem.Constant(grid.mesh, 0.0), fem.Constant(grid.mesh, 1.0)
+        """Time at the end of the step and its length, s, for forms."""
+        self.pieces = QuadraturePoints(grid, scene, fluid, weighs, bool(terms or sources))
+        laws, p = self.pieces.laws, fem.Function(grid.cellwise()) if fluid else None
+        with compiling(f"materials: {', '.join(law.__name__ for law in scene.laws)}", "laws in UFL of these shapes"):
+            options = (self.gravity, scene.nearly_incompressible, scene.symmetric, terms, self.t, self.dt)
+            self.momentum = MomentumForms(self.pieces.pieces, laws, p, *options)
+        if not self.momentum.symmetric and scheme.coupling == "schur-cg":
+            scheme = Scheme("schur-fgmres", scheme.tolerance)
+        self.scheme, self.storage = scheme, None
+        if fluid:
+            weight = fluid.density * self.gravity if weighs else None
+            symmetric = scheme.coupling != "schur-fgmres"
+            options = (weight, symmetric, scene.conducts, sources, self.t)
+            self.storage = StorageForms(self.pieces.pieces, self.momentum.u, p, *options)
+        self.motion = Motion(scene, bodies, self.momentum, self.storage, fluid)
+        self._on_grid: Latest[OnGrid] = Latest()
+        self._systems: Latest[System] = Latest()
+        self._assembled: Latest[Assembled] = Latest()
+
+    def set_time(self, t: float, dt: float, gravity: NDArray[np.float64] | None) -> None:
+        """Set what forms see of the end of a step: time and length, s, and gravity (d,), m/s^2."""
+        self.t.value, self.dt.value = t, dt
+        if gravity is not None:
+            self.gravity.value = gravity
+
+    def on_grid(self, points: MaterialPoints) -> OnGrid:
+        """Return the bodies on the grid, reset for these points."""
+        grid = self.grid
+
+        def make() -> OnGrid:
+            self._assembled.clear()  # of coefficients that change now
+            with Timer("mpm: cut domains"):
+                cut = CutDomains(grid, points, self.quadrature == "domain")
+            with Timer("mpm: integration data"):
+                problems = (self.momentum, self.storage)
+                return OnGrid(self.pieces, self.materials, *problems, cut, self.scheme.as_printed)
+
+        return self._on_grid(points.arrays, make, grid.comm)
+
+    def assembled(self, on_grid: OnGrid, stage: Stage, sides: Callable[[], SideData], begins: bool) -> Assembled:
+        """Return the matrices for a stage of the bodies on the grid.
+
+        Parameters
+        ----------
+        sides
+            Returns what acts on the sides, placed where the points were cut.
+        begins
+            Whether all parts of the bodies must be held.
+        """
+
+        def make() -> Assembled:
+            problems = (self.momentum, self.storage, self.scheme, self._systems)
+            return assembled(*problems, on_grid, stage, sides(), begins)
+
+        return self._assembled((on_grid, stage), make, self.grid.comm)
+
+    def all_ids(self, present: Sequence[bool]) -> NDArray[np.int64]:
+        """Return the numbers of all points of the bodies that are there."""
+        return np.flatnonzero(np.concatenate([np.full(len(b), here) for b, here in zip(self.bodies, present)]))
+
+    @cached_property
+    def description(self) -> dict[str, Any]:
+        """The constants that make the scene, by name: what a checkpoint of it is known by."""
+        grid = self.grid
+        out = {"grid cells": grid.shape.tolist(), "grid lower": grid.lower.tolist(), "grid upper": grid.upper.tolist()}
+        out["quadrature"] = self.quadrature
+        for i, body in enumerate(self.bodies):
+            out[f"points of body {i}"], out[f"material of body {i}"] = len(body), int(body.material)
+            out[f"volume of body {i}"] = float(np.broadcast_to(body.spacing, body.lower.shape).prod(axis=1).sum())
+            corners = np.ascontiguousarray(body.corners())
+            out[f"checksum of the positions of body {i}"] = zlib.crc32(corners.tobytes())
+        for name, one in [*((f"material {i}", m) for i, m in enumerate(self.materials.materials)), ("fluid", self.fluid)]:
+            out[name] = None if one is None else type(one).__name__
+            constants = {f.name: getattr(one, f.name) for f in fields(one)} if one is not None else {}
+            constants = {key: value for key, value in constants.items() if value is not None and not callable(value)}
+            out |= {f"{key} of {name}": np.asarray(value).tolist() for key, value in constants.items()}
+        return {**out, **self.materials.checksums, "data of the points": sorted(self.materials.seeded.data)}
+
+    @property
+    def last(self) -> tuple[OnGrid | None, Assembled | None]:
+        """The bodies on the grid and the matrices of the last step, to be looked at."""
+        return self._on_grid.value, self._assembled.value
+
+    def forget(self) -> None:
+        """Drop all that was made for a step: it may have been broken off anywhere."""
+        for made in (self._assembled, self._systems, self._on_grid):
+            made.clear()

@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: MIT
+"""How momentum and storage are coupled."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from mpm_dolfinx.validation import numbers
+
+COUPLINGS = {
+    "schur-cg": 0.75,
+    "schur-fgmres": 0.75,
+    "fixed-stress": 0.75,
+    "fixed-stress-full": 1.0,
+    "fixed-stress-paper": None,
+}
+"""Coupling schemes and the multiple of alpha^2/K_dr that they take as beta; None: 1/K_w, as printed in the paper."""
+MOST = {"newton": 25, "coupling": 200}
+"""Newton steps, or coupling iterations of `fixed-stress`, before a step is given up."""
+
+
+@dataclass(frozen=True)
+class Scheme:
+    """A coupling scheme and its accuracy.
+
+    Parameters
+    ----------
+    coupling
+        Name in `COUPLINGS`.
+    tolerance
+        Both residuals fall below this, relative to the forces and to the fluid that changes places; in (0, 1).
+
+    Raises
+    ------
+    ValueError
+        Naming what is out of its range.
+    """
+
+    coupling: str
+    tolerance: float
+
+    def __post_init__(self):
+        if not isinstance(self.coupling, str) or self.coupling not in COUPLINGS:
+            raise ValueError(f"coupling {self.coupling!r}: must be one of {', '.join(COUPLINGS)}")
+        numbers("tolerance", self.tolerance, test=lambda v: (0 < v) & (v < 1), allowed="in (0, 1)")
+
+    @property
+    def richardson(self) -> bool:
+        """Whether the two problems are solved in turn."""
+        return self.coupling.startswith("fixed-stress")
+
+    @property
+    def as_printed(self) -> bool:
+        """Whether beta is 1/K_w."""
+        return COUPLINGS[self.coupling] is None
+
+    @property
+    def beta(self) -> float:
+        """Multiple of beta."""
+        return COUPLINGS[self.coupling] or 1.0

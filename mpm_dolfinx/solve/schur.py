@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: MIT
+"""Solvers of the linearised problem, made once for the matrices of an active set.
+
+    [ K  -B^T ] [du]     [R_u]
+    [ B   C   ] [dp] = - [R_p]
+
+du is eliminated: S = C + B K^-1 B^T is solved with by conjugate gradients (or FGMRES), preconditioned with the
+fixed-stress operator.  Large bodies in 3D solve both at once, see `monolithic`.
+"""
+
+from __future__ import annotations
+
+from petsc4py import PETSc
+
+from dolfinx.common import Timer
+
+from mpm_dolfinx.caching import Latest
+from mpm_dolfinx.problems.momentum import MomentumProblem, MomentumSystem
+from mpm_dolfinx.problems.storage import FILTER, StorageProblem, StorageSystem
+from mpm_dolfinx.solve.linear import direct_solver, iterative, multigrid_solver, nodal_solver
+from mpm_dolfinx.solve.monolithic import BlockSolver
+from mpm_dolfinx.solve.scheme import Scheme
+
+
+class SchurComplement:
+    """Matrix-free S = C + B K^-1 B^T for PETSc's Krylov solvers."""
+
+    def __init__(self, storage: StorageSystem, solve_momentum: PETSc.KSP):
+        self.storage, self.solve = storage, solve_momentum
+        self.f, self.v = storage.B.createVecRight(), storage.B.createVecRight()
+
+    def mult(self, A: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """Multiply."""
+        s = self.storage
+        s.B_momentum.multTranspose(x, self.f)
+        self.solve.solve(self.f, self.v)
+        s.B.mult(self.v, y)
+        s.C.multAdd(x, y, y)
+
+
+class LinearSolvers:
+    """Solvers for the matrices of one active set, complete when made.
+
+    Parameters
+    ----------
+    scheme
+        How the two problems are coupled.
+    momentum, storage
+        Matrices and vectors; storage is None without fluid.
+    symmetric
+        Whether the momentum's tangent is symmetric.
+    """
+
+    def __init__(
+        self, scheme: Scheme, momentum: MomentumSystem, storage: StorageSystem | None, symmetric: bool
+    ):
+        self.scheme, self._momentum, self._storage = scheme, momentum, storage
+        self.iterative = iterative(momentum.unknowns)
+        """Whether displacements are solved for by iterations."""
+        self.tangent: Latest[bool] = Latest()
+        """What the matrices hold the tangent of, where it is kept."""
+        self._solve_s = self._schur = self._block = None
+        if self.iterative:
+            self.solve_u, self._modes = multigrid_solver(momentum.K, "momentum"), momentum.unknowns.rigid_body_modes()
+        elif storage is None:
+            self.solve_u = direct_solver(momentum.K, "momentum", symmetric)
+        else:
+            self.solve_u = nodal_solver(momentum.K, "momentum", momentum.unknowns, symmetric)
+        self.du, self._rhs = momentum.unknowns.vector(), momentum.unknowns.vector()
+        """Direction of the displacements."""
+        if storage is None:
+            return
+        self.dp, self._g = storage.unknowns.vector(), storage.unknowns.vector()
+        """Direction of the pressures."""
+        if self.iterative and not scheme.richardson:
+            self._block = BlockSolver(momentum, storage, self.solve_u.pc)
+            return
+        n = (storage.unknowns.size, None)
+        self._schur = PETSc.Mat().createPython((n, n), SchurComplement(storage, self.solve_u), storage.unknowns.comm)
+        self._schur.setUp()
+        self._solve_s = direct_solver(storage.P, "storage", often=True)
+        kind = {"schur-cg": PETSc.KSP.Type.CG, "schur-fgmres": PETSc.KSP.Type.FGMRES}
+        self._solve_s.setType(kind.get(scheme.coupling, PETSc.KSP.Type.PREONLY))
+
+    @property
+    def schur(self) -> tuple[PETSc.Mat, PETSc.KSP]:
+        """The Schur complement, and the solver with its preconditioner."""
+        return self._schur, self._solve_s
+
+    def linearise(self, momentum: MomentumProblem, storage: StorageProblem | None, data=None) -> bool:
+        """Set the tangents at (u, p), of the problems' pieces or of others, and factorise them."""
+        with Timer("mpm: tangent"):
+            K = momentum.assemble_tangent(data)
+            if storage is not None:
+                storage.assemble_tangent(data and data.pieces)
+        with Timer("mpm: factorisation"):
+            if self.iterative:
+                K.setNearNullSpace(self._modes)
+            self.solve_u.setOperators(K)
+            self.solve_u.setUp()
+            if storage is not None:
+                P = storage.assemble_preconditioner(self.scheme.beta, 0.0 if self.scheme.richardson else FILTER)
+                if self._block is not None:
+                    self._block.set_preconditioner(P)
+                else:
+                    self._solve_s.setOperators(self._schur, P)
+                    self._solve_s.setUp()
+        return True
+
+    def solve(self, rtol: float, scale_u: float, exchanged: float) -> int:
+        """Solve for (du, dp) with the present residuals; return the coupling iterations.
+
+        Parameters
+        ----------
+        rtol
+            Relative accuracy.
+        scale_u, exchanged
+            What the residuals are measured by: forces, N, and fluid that changes places, m^d.
+        """
+        residual = self._momentum.residual
+        if self._storage is None:
+            self.solve_u.setTolerances(rtol=rtol, atol=0.0, max_it=500)
+            self.solve_u.solve(residual, self.du)
+            return self.solve_u.getIterationNumber() if self.iterative else 0
+        if self._block is not None:
+            r = self._storage.residual  # scales of Euclidean norms that make them the errors
+            size, total = r.norm(), r.norm(PETSc.NormType.N1)
+            scale_p = (exchanged or 1.0) * (size / total if total > 0 else 1.0)
+            return self._block.solve(self.du, self.dp, (scale_u or 1.0, scale_p), rtol)
+        g = self.condense()
+        self._solve_s.setTolerances(rtol=rtol, atol=0.0, max_it=500)
+        self._solve_s.solve(g, self.dp)
+        self._storage.B_momentum.multTranspose(self.dp, self._rhs)
+        self._rhs.axpy(1.0, residual)
+        self.solve_u.solve(self._rhs, self.du)
+        return self._solve_s.getIterationNumber()
+
+    def condense(self) -> PETSc.Vec:
+        """Return the residual of the Schur complement's system, R_p - B K^-1 R_u."""
+        self.solve_u.solve(self._momentum.residual, self.du)
+        self._storage.B.mult(self.du, self._g)
+        self._g.aypx(-1.0, self._storage.residual)
+        return self._g
+
+    def solve_momentum(self) -> None:
+        """Solve for du alone, pressures kept."""
+        self.dp.set(0.0)
+        self.solve_u.solve(self._momentum.residual, self.du)
+
+    def solve_storage(self) -> PETSc.Vec:
+        """Return dp, solved for at fixed stress."""
+        self._solve_s.solve(self._storage.residual, self.dp)
+        return self.dp

@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: MIT
+"""The state of a scene: all that it remembers between two steps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from mpi4py import MPI
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpm_dolfinx.parallel.exchange import Exchange
+from mpm_dolfinx.points.grid import Grid
+from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.points.pressure_transport import PiecePressures
+from mpm_dolfinx.problems.stage import Stage
+from mpm_dolfinx.result import Result
+
+
+@dataclass(frozen=True, eq=False)
+class Stay:
+    """What still holds of the last reset of the grid: points that hardly move since stay in the cells that cut them.
+
+    points
+        The material points when the grid was reset.
+    id, pressure, x : (m,), (m,) in Pa, (m, d) in m
+        Of each piece of their domains, ordered by point and cell: number of its point, pressure of its cell, where
+        its centroid has moved to.  None without fluid.
+    """
+
+    points: MaterialPoints
+    id: NDArray[np.int64] | None
+    pressure: NDArray[np.float64] | None
+    x: NDArray[np.float64] | None
+
+    def migrated(self, exchange: Exchange, destination: NDArray[np.int32]) -> Stay:
+        """Return what holds for points that go to their destinations, by the exchange of points."""
+        points = self.points.migrated(exchange)
+        if self.id is None:
+            return replace(self, points=points)
+        travel = Exchange(exchange.comm, destination[np.searchsorted(self.points.id, self.id)])
+        id, pressure, x = map(travel.send, (self.id, self.pressure, self.x))
+        order = np.argsort(id, kind="stable")
+        return Stay(points, id[order], pressure[order], x[order])
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """All that a scene remembers between two steps.  A step makes a new one; nobody changes one.
+
+    A checkpoint holds all of it but the stage, which the script gives.
+
+    t
+        Time, s.
+    points
+        The material points of this process.
+    transported
+        Pressures that the pieces of the points' domains take to the next grid; None without fluid, or with a stay.
+    stay
+        What holds of the last reset of the grid; None where the next step resets it.
+    resets
+        How often the grid has been reset.
+    reactions : (displacements, d), N (N/m in plane strain)
+        Forces of the given displacements in the last step; nan before the first one of a stage.
+    stage
+        The conditions in force.
+    begins
+        Whether no step of the stage has been taken.
+    result
+        Histories of the last run, None before the first one.
+    """
+
+    t: float
+    points: MaterialPoints
+    transported: PiecePressures | None
+    stay: Stay | None
+    resets: int
+    reactions: NDArray[np.float64]
+    stage: Stage
+    begins: bool
+    result: Result | None
+
+    def migrated(self, destination: NDArray[np.int32], comm: MPI.Intracomm) -> State:
+        """Return the state after every point, with its pieces, went to its destination (n,), a rank."""
+        exchange, pressures, stay = Exchange(comm, destination), self.transported, self.stay
+        if pressures is not None:
+            pressures = pressures.migrated(Exchange(comm, destination[np.searchsorted(self.points.id, pressures.id)]))
+        stay = stay and stay.migrated(exchange, destination)
+        return replace(self, points=self.points.migrated(exchange), transported=pressures, stay=stay)
+
+    def at_owners(self, grid: Grid) -> State:
+        """Return the state with points and pieces at the processes that own the points' cells."""
+        if grid.comm.size == 1:
+            return self
+        placed = self.stay.points if self.stay else self.points
+        return self.migrated(grid.owner(grid.number(grid.index(placed.x))), grid.comm)
