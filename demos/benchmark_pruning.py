@@ -20,10 +20,9 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from unittest.mock import patch
 
 import numpy as np
 
@@ -54,27 +53,22 @@ def block(cells: int, material: mpm.Skeleton | None = None, box: float = 1.0, **
 def weighted(cells: int) -> mpm.Simulation:
     """Return the block with the ghost penalty on all faces: every cell passes for partly filled."""
     simulation = block(cells)
-    activate = simulation._activate
-
-    def all_partly(J):
-        with patch("mpm_dolfinx.simulation.FULL", 2.0):
-            activate(J)
-
-    simulation._activate = all_partly
+    simulation.scene.momentum.ghost.facets = lambda facets: facets
     return simulation
 
 
 def restless(cells: int, **options) -> mpm.Simulation:
     """Return the block with the grid reset in each step, as if it had moved."""
     simulation = block(cells, **options)
-    simulation._stays = lambda: False
+    motion = simulation.scene.motion
+    motion.advanced = partial(motion.advanced, stays=False)
     return simulation
 
 
 def refactorised(cells: int) -> mpm.Simulation:
     """Return the draining block of a linear law, taken for one that is not."""
     simulation = linear(cells)
-    simulation.momentum.linear = False
+    simulation.scene.momentum.linear = False
     return simulation
 
 

@@ -24,6 +24,7 @@ from mpi4py import MPI
 import numpy as np
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx.points.cutting import corner_bits
 from mpm_dolfinx.verification.exact import shear_flexible_rod
 
 LENGTH, SIDE, YOUNG = 1.0, 0.1, 12e6  # m, m, Pa
@@ -63,13 +64,13 @@ def run(cells: int, steps: int, alpha: float, taken: int | None = None) -> tuple
     """Return the tip's displacement (3,), m, the result and the costs of a run; only `taken` of the steps."""
     simulation, tip = scene(cells, alpha)
     result = simulation.run((taken or steps) / steps, 1 / steps, probes=tip)
-    comm = simulation.grid.comm
+    comm, (on_grid, matrices) = simulation.grid.comm, simulation.scene.last
     memory = comm.allreduce(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss) / 1024
     costs = {
         "steps": result.steps,
-        "active_cells": simulation.active_cells,
+        "active_cells": on_grid.active_cells,
         "grid_cells": int(simulation.grid.shape.prod()),
-        "unknowns": simulation.momentum.unknowns.global_size,
+        "unknowns": matrices.momentum.unknowns.global_size,
         "newton_iterations": result.newton,
         "linear_iterations": result.coupling,
         "seconds_per_step": result.wall / result.steps,
@@ -83,7 +84,7 @@ def run(cells: int, steps: int, alpha: float, taken: int | None = None) -> tuple
 def surface(simulation: mpm.Simulation) -> tuple[np.ndarray, np.ndarray]:
     """Return the faces (m, 4, 3) of the body's domains on this process, m, and their stretch along the beam."""
     points, (body,) = simulation.points, simulation.bodies
-    bits, faces, stretch = mpm.domains.corner_bits(3), [], []
+    bits, faces, stretch = corner_bits(3), [], []
     for axis in range(3):
         for end in (0, 1):
             on = body.sides[points.id, axis, end]

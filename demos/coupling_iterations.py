@@ -19,7 +19,7 @@ import argparse
 import csv
 import json
 import sys
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from petsc4py import PETSc
@@ -29,8 +29,9 @@ import poroelastic_beam as beam
 from numpy.typing import NDArray
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.solve.newton import Report
-from mpm_dolfinx.problems.storage import FILTER
+from mpm_dolfinx import step
+from mpm_dolfinx.problems.storage import FILTER, StorageProblem
+from mpm_dolfinx.solve.schur import LinearSolvers
 
 K_DT = np.array([-23, -16, -12, -10, -9, -8, -7, -6, -5, -4, -3, -2, 0, 3, 7, 11])  # log10 of k dt in m
 BULK = (1e4, 1e6, 2.2e9, np.inf)  # of the water, Pa
@@ -106,31 +107,51 @@ def column(h: float) -> mpm.Simulation:
 SCENES = {"beam": cantilever, "bent beam": bent, "column": column}
 
 
-def linearise(s: mpm.Simulation, dt: float, bulk: float) -> None:
-    """Set up the first linear system of a step of dt with water of another bulk, at the load of the next RAMP_STEP."""
-    s.fluid = mpm.Fluid(bulk=bulk)
-    s._prepared = False
-    s._begin(s.t + RAMP_STEP)
-    s.storage.start(dt)
-    s.coupler._scale_u = 0.0
-    s.coupler._errors(dt, Report())
-    s.coupler._linearise(dt)
+@dataclass(frozen=True)
+class System:
+    """The linear system of a Newton step: its solvers, the storage problem, the water's bulk modulus, and the soil."""
+
+    solvers: LinearSolvers
+    storage: StorageProblem
+    bulk: float
+    soil: mpm.Skeleton
 
 
-def count(s: mpm.Simulation, scheme: str) -> tuple[int | None, float, float]:
+def with_water(s: mpm.Simulation, bulk: float) -> mpm.Simulation:
+    """Return the scene in its present state with water of another bulk modulus, Pa."""
+    soils, conditions = s.scene.materials.materials, s.state.stage.conditions
+    other = mpm.Simulation(s.grid, s.bodies, soils, fluid=mpm.Fluid(bulk=bulk), **conditions)
+    other.state = replace(s.state, stage=other.state.stage)
+    return other
+
+
+def linearise(s: mpm.Simulation, dt: float) -> System:
+    """Return the first linear system of a step of dt, at the load of the next RAMP_STEP."""
+    balances = step.set_up(s.scene, s.state, RAMP_STEP)
+    on_grid, storage = balances.on_grid, balances.storage
+    matrices, contents = balances.matrices, on_grid.contents
+    outflow = matrices.outflow(s.points, None)
+    storage = StorageProblem(s.scene.storage, matrices.storage, storage.data, contents, outflow, dt)
+    balances.momentum.assemble_residual()
+    storage.assemble_residual()
+    solvers = matrices.solvers()
+    solvers.linearise(balances.momentum, storage)
+    return System(solvers, storage, s.scene.fluid.bulk, s.scene.materials.materials[0])
+
+
+def count(s: System, scheme: str) -> tuple[int | None, float, float]:
     """Solve the linear system of `linearise` to 1e-8; return iterations and the extreme eigenvalues of P^-1 S."""
     method, factor, share = SCHEMES[scheme]
     if factor is None:
-        soil = s.materials[0]
-        factor = soil.drained_modulus(s.grid.dim) / soil.biot**2 / s.fluid.bulk
-    coupler, g = s.coupler, s.coupler._condense()
+        factor = s.soil.drained_modulus(2) / s.soil.biot**2 / s.bulk
+    g, (schur, preconditioned) = s.solvers.condense(), s.solvers.schur
     solver = PETSc.KSP().create(g.comm)
     solver.setType(method)
-    solver.setPC(coupler._solve_s.pc)
+    solver.setPC(preconditioned.pc)
     solver.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
     solver.setTolerances(rtol=1e-8, atol=0.0, divtol=1e5, max_it=MOST)
     solver.setComputeEigenvalues(method == "cg")
-    solver.setOperators(coupler._schur, s.storage.assemble_preconditioner(factor, share))
+    solver.setOperators(schur, s.storage.assemble_preconditioner(factor, share))
     solver.solve(g, g.duplicate())
     iterations = solver.getIterationNumber() if solver.getConvergedReason() > 0 else None
     if method != "cg":
@@ -141,11 +162,12 @@ def count(s: mpm.Simulation, scheme: str) -> tuple[int | None, float, float]:
 
 def scan(scene: str, h: float, bulks=BULK, k_dt=K_DT, schemes=tuple(SCHEMES)) -> list[Count]:
     """Count the iterations of the schemes over the range of fluids and of k dt."""
-    s, out = SCENES[scene](h), []
+    start, out = SCENES[scene](h), []
     for bulk in bulks:
+        s = with_water(start, bulk)
         for exponent in k_dt:
-            linearise(s, 10.0**exponent / s.materials[0].conductivity, bulk)
-            out += [Count(scene, h, bulk, 10.0**exponent, scheme, *count(s, scheme)) for scheme in schemes]
+            system = linearise(s, 10.0**exponent / s.scene.materials.materials[0].conductivity)
+            out += [Count(scene, h, bulk, 10.0**exponent, scheme, *count(system, scheme)) for scheme in schemes]
     return out
 
 
@@ -160,9 +182,9 @@ def cells(s: mpm.Simulation) -> NDArray[np.float64]:
     body = s.bodies[0]
     corners = [[0, body.lower[:, 1].min()], [0, (body.lower + body.spacing)[:, 1].max()]]
     apart = np.linalg.norm(s.grid.midpoints[:, None] - corners, axis=2).min(axis=1)
-    filled = s.storage.unknowns.owned
+    filled = s.scene.last[0].contents.filled
     shown = filled[apart[filled] > CLEAR]
-    p[s.grid.cell_number[shown]] = s.storage.p.x.array[shown]
+    p[s.grid.cell_number[shown]] = s.scene.storage.p.x.array[shown]
     return p.reshape(s.grid.shape)
 
 

@@ -73,7 +73,9 @@ def run(cells: int = 20, steps: int = 100) -> tuple[dict[str, float], Outcome]:
 
     end = END * RADIUS**2 / CV
     result = simulation.run(end, end / steps, observe=observe)
-    out = Outcome(END * np.arange(1, steps + 1) / steps, np.array(history), result, simulation.active_cells)
+    out = Outcome(
+        END * np.arange(1, steps + 1) / steps, np.array(history), result, simulation.scene.last[0].active_cells
+    )
     return errors(out), out
 
 

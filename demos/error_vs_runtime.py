@@ -29,8 +29,8 @@ import self_weight_column as column
 import terzaghi
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.verification.exact import Mandel, terzaghi_consolidation
 from mpm_dolfinx.verification.biot_fem import BiotFEM
+from mpm_dolfinx.verification.exact import Mandel, terzaghi_consolidation
 
 PEER, TRUTH = "FEM Q1/DG0, same grid", "FEM Taylor-Hood"
 DEFAULT = "MPM, defaults"

@@ -68,10 +68,11 @@ def displacements(s: mpm.Simulation) -> tuple[np.ndarray, np.ndarray]:
 
 def pressures(s: mpm.Simulation) -> tuple[np.ndarray, np.ndarray]:
     """Return the heights of what the cells hold (m), upwards, and the cells' pore pressures (Pa)."""
-    held = s.storage.unknowns.owned
-    y = (s.grid.midpoints + s.storage.centroid.x.array.reshape(-1, 2))[held, 1]
+    contents = s.scene.last[0].contents
+    held = contents.filled
+    y = (s.grid.midpoints + contents.centroid)[held, 1]
     order = np.argsort(y)
-    return y[order], s.storage.p.x.array[held][order]
+    return y[order], s.scene.storage.p.x.array[held][order]
 
 
 def stretch(stress: Callable[[float], float]) -> float:

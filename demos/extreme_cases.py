@@ -94,7 +94,7 @@ def judge(row: Row, make: Make, bound: float) -> Row:
 def check(row: Row, scene: Scene, result: mpm.Result, bound: float) -> None:
     """Compare a run that came to its end with its reference."""
     points, s = scene.simulation.points, scene.simulation
-    row.condition = condition(s.momentum.K)
+    row.condition = condition(s.scene.last[1].momentum.K)
     try:
         row.error = nan if scene.error is None else scene.error(s, result)
     except mpm.GaveUp as failed:

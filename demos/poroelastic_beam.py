@@ -15,6 +15,7 @@ import argparse
 import csv
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 from mpi4py import MPI
@@ -134,7 +135,7 @@ def main(argv: list[str] | None = None) -> dict:
         result = simulation.run(o.t_end, o.dt, probes=mpm.probes(simulation.bodies, places), observe=observers)
     except mpm.GaveUp as error:
         failure, result = error, error.result
-    result.displacement = [u[:, [0, -1]] for u in result.displacement]
+    result = replace(result, rows=[(t, u[:, [0, -1]], p) for t, u, p in result.rows])
     fem = None
     if o.reference:
         fem = BiotFEM([0, 0], [LENGTH, HEIGHT], REFERENCE_CELLS, material(o), **physics(o)).run(
@@ -169,7 +170,7 @@ def summary(simulation: mpm.Simulation, result: mpm.Result) -> dict:
         "fluid_balance": result.balance,
         "residual": result.residual,
         "points": comm.allreduce(len(simulation.points)),
-        "active_cells": simulation.active_cells,
+        "active_cells": simulation.scene.last[0].active_cells,
         "converged": result.converged,
     }
 

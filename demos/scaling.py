@@ -102,15 +102,16 @@ def measure(dim: int, points: float) -> dict:
         steps.append((comm.allreduce(time.process_time() - start, MPI.MAX), result))
     seconds, best = min(steps, key=lambda step: step[0])
     profile = {part: wall * seconds / best.wall for part, wall in best.profile.items()}
+    on_grid, matrices = simulation.scene.last
     most = np.max(comm.allgather((sent() - before) / STEPS), axis=0).tolist()
     names = ("exchange_messages", "exchange_bytes", "solver_messages", "solver_bytes", "solver_reductions")
     return {
         "dim": dim,
         "processes": comm.size,
         "points": best.points,
-        "active_cells": simulation.active_cells,
+        "active_cells": on_grid.active_cells,
         "grid_cells": int(simulation.grid.shape.prod()),
-        "unknowns": simulation.momentum.unknowns.global_size + simulation.storage.unknowns.global_size,
+        "unknowns": matrices.momentum.unknowns.global_size + matrices.storage.unknowns.global_size,
         "newton": best.newton,
         "coupling": best.coupling,
         "cuts": first.cuts + sum(result.cuts for _, result in steps),

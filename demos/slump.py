@@ -107,7 +107,7 @@ def fail(cells: int, start: float = 3.0, ratio: float = 0.99) -> Failure:
     s, crest = bank(cells, 2 * HEIGHT, HEIGHT / 2, 0.0, SCALE / start, 0.0, terms=[weight])
     number, settlement, rate = [start], [0.0], np.zeros(0)
     while len(rate) < 10 or rate[-1] < 2 * RUNAWAY:
-        s.points.data["cohesion"] *= ratio
+        s.stage(fields={"cohesion": ratio * s.points.data["cohesion"]})
         s.run(s.t + 1, 1, progress=False)
         number.append(number[-1] / ratio)
         settlement.append(-crest.displacement(s.points, s.grid.comm)[0, 1])
@@ -184,7 +184,7 @@ def slump(cells: int, steps: int) -> Slump:
     def weaken(s: mpm.Simulation) -> None:
         """Give the next step the strength of its end."""
         lost = min(1.0, (s.t + dt) / DURATION)
-        s.points.data["cohesion"][:] = STRONG + lost * (WEAK - STRONG)
+        s.stage(fields={"cohesion": STRONG + lost * (WEAK - STRONG)})
 
     def go(t_end: float, dt: float, *observers: Callable) -> int:
         result = s.run(t_end, dt, observe=observers)

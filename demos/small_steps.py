@@ -78,12 +78,12 @@ def column(cells: int, steps: int, way: float = 0.0, softness: float = 0.0, stra
     )
     highest = []
     simulation.run(t_end, t_end / steps, observe=lambda s: highest.append(s.points.pressure.max() / p0))
-    storage = simulation.storage
-    here = storage.unknowns.owned
+    scene, (on_grid, _) = simulation.scene, simulation.scene.last
+    here = on_grid.contents.filled
     # the cells hold what they held at the start of the last step
-    y = grid.midpoints[here, 1] + storage.centroid.x.array.reshape(-1, 2)[here, 1] + way * HEIGHT * (1 - 1 / steps)
-    z, p = np.clip(1 - y / HEIGHT, 0, 1), storage.p.x.array[here] / p0
-    volume = simulation.momentum.fill.x.array[here]
+    y = grid.midpoints[here, 1] + on_grid.contents.centroid[here, 1] + way * HEIGHT * (1 - 1 / steps)
+    z, p = np.clip(1 - y / HEIGHT, 0, 1), scene.storage.p.x.array[here] / p0
+    volume = scene.momentum.ghost.fill.x.array[here]
     error = np.sqrt(volume @ (p - terzaghi_pressure(z, T_END, 1.0, 1.0)) ** 2 / volume.sum())
     order = np.argsort(z)
     return Run(z[order], p[order], float(error), max(highest))
@@ -117,7 +117,7 @@ def strip(cells: int, dt: float, law: type[mpm.Skeleton]) -> NDArray[np.float64]
     )
     simulation.step(dt * HEIGHT**2 / terzaghi.CV)
     p = np.empty(grid.shape.prod())
-    p[grid.cell_number] = simulation.storage.p.x.array / load
+    p[grid.cell_number] = simulation.scene.storage.p.x.array / load
     return p.reshape(grid.shape)
 
 

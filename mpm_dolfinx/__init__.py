@@ -11,17 +11,26 @@ SI units throughout.  Stress is positive in tension, pore pressure in compressio
 are those of a slice of 1 m.
 """
 
-from mpm_dolfinx.problems.conditions import Displacement, Drained, Inflow, RigidPlate, Traction
-from mpm_dolfinx.errors import GaveUp, LeftGrid, NotConverged
-from mpm_dolfinx.points.grid import Grid
-from mpm_dolfinx.constitutive.skeleton import LAWS, Field, Fluid, Hencky, LinearElastic, NeoHookean, Skeleton, kozeny_carman
-from mpm_dolfinx.io.writer import Writer
 from mpm_dolfinx.constitutive.drucker_prager import DruckerPrager
-from mpm_dolfinx.points.bodies import box, mapped, shape
+from mpm_dolfinx.constitutive.skeleton import (
+    LAWS,
+    Field,
+    Fluid,
+    Hencky,
+    LinearElastic,
+    NeoHookean,
+    Skeleton,
+    kozeny_carman,
+)
+from mpm_dolfinx.errors import GaveUp, LeftGrid, NotConverged
 from mpm_dolfinx.io.checkpoint import Checkpoint, resume
-from mpm_dolfinx.simulation import Simulation
+from mpm_dolfinx.io.writer import Writer
+from mpm_dolfinx.points.bodies import box, mapped, shape
+from mpm_dolfinx.points.grid import Grid
 from mpm_dolfinx.points.probes import probes
+from mpm_dolfinx.problems.conditions import Displacement, Drained, Inflow, RigidPlate, Traction
 from mpm_dolfinx.result import Result
+from mpm_dolfinx.simulation import Simulation
 from mpm_dolfinx.solve.scheme import COUPLINGS
 from mpm_dolfinx.state import State
 

@@ -25,6 +25,8 @@ from mpm_dolfinx.problems.on_grid import OnGrid
 from mpm_dolfinx.problems.storage import StorageForms
 from mpm_dolfinx.state import State, Stay
 
+REACH = 1e-4  # cells: a side that is given its way to the wall of the grid gives way by as much
+
 
 class Motion:
     """Moves the points of a scene.
@@ -52,7 +54,7 @@ class Motion:
         self._size = np.concatenate([body.size() for body in bodies])
         self._reconstruction = Reconstruction(momentum.grid) if storage is not None else None
 
-    def advanced(self, state: State, on_grid: OnGrid, t: float, stays: bool) -> tuple[State, int]:
+    def advanced(self, state: State, on_grid: OnGrid, t: float, stays: bool = True) -> tuple[State, int]:
         """Return the state at time t (s) after a solved step, and how many domains had folded.
 
         Parameters
@@ -62,7 +64,7 @@ class Motion:
         on_grid
             The bodies on the grid.
         stays
-            Whether pieces may stay in their cells where points hardly move.
+            Whether pieces stay in their cells where points hardly move.
 
         Raises
         ------
@@ -89,7 +91,7 @@ class Motion:
                 points, ids = replace(points, pressure=cut.mean(pressure)), points.id[cut.pieces.point]
             _check_inside(cut, points, t)
         new = replace(state, t=t, points=points, transported=None, stay=Stay(cut.points, ids, pressure, x))
-        return new if serves and stays else self.left_grid(new, on_grid), folded
+        return new if serves and stays and on_grid.stays else self.left_grid(new, on_grid), folded
 
     def _deformed(self, points: MaterialPoints, cut: CutDomains, delta: NDArray, cells: NDArray) -> MaterialPoints:
         """Return the points with F and state after a step, delta (m, d, d) the deformation of the pieces."""
@@ -154,7 +156,7 @@ class Motion:
 def _check_inside(cut: CutDomains, points: MaterialPoints, t: float) -> None:
     """Refuse points that have left the grid."""
     grid, x, message = cut.grid, points.corners if cut.domains else points.x[:, None], ""
-    out = np.flatnonzero(grid.outside(x.reshape(-1, grid.dim)))
+    out = np.flatnonzero(grid.outside(x.reshape(-1, grid.dim), REACH))
     if len(out):
         i = out[0] // x.shape[1]
         message = f"point {points.id[i]} at {points.x[i]} left the grid {grid.lower} to {grid.upper} at t = {t:g} s"

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cached_property
 from typing import Any, Generic, TypeVar
 
 from mpi4py import MPI
@@ -51,6 +52,15 @@ class Latest(Generic[T]):
     def clear(self) -> None:
         """Forget the value."""
         self._entry.clear()
+
+
+class Keyed:
+    """What may be part of a key without being kept alive by it: its `key` stands for it."""
+
+    @cached_property
+    def key(self) -> object:
+        """An object that nothing else has."""
+        return object()
 
 
 def same(a: Any, b: Any) -> bool:

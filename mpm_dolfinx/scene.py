@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import cached_property
 from typing import Any
 
@@ -71,7 +71,7 @@ class Scene:
             options = (self.gravity, scene.nearly_incompressible, scene.symmetric, terms, self.t, self.dt)
             self.momentum = MomentumForms(self.pieces.pieces, laws, p, *options)
         if not self.momentum.symmetric and scheme.coupling == "schur-cg":
-            scheme = Scheme("schur-fgmres", scheme.tolerance)
+            scheme = replace(scheme, coupling="schur-fgmres")
         self.scheme, self.storage = scheme, None
         if fluid:
             weight = fluid.density * self.gravity if weighs else None
@@ -118,11 +118,11 @@ class Scene:
             problems = (self.momentum, self.storage, self.scheme, self._systems)
             return assembled(*problems, on_grid, stage, sides(), begins)
 
-        return self._assembled((on_grid, stage), make, self.grid.comm)
+        return self._assembled((on_grid.key, stage), make, self.grid.comm)
 
     def all_ids(self, present: Sequence[bool]) -> NDArray[np.int64]:
         """Return the numbers of all points of the bodies that are there."""
-        return np.flatnonzero(np.concatenate([np.full(len(b), here) for b, here in zip(self.bodies, present)]))
+        return np.flatnonzero(np.repeat(present, [len(body) for body in self.bodies]))
 
     @cached_property
     def description(self) -> dict[str, Any]:
@@ -135,7 +135,8 @@ class Scene:
             out[f"volume of body {i}"] = float(np.broadcast_to(body.spacing, body.lower.shape).prod(axis=1).sum())
             corners = np.ascontiguousarray(body.corners())
             out[f"checksum of the positions of body {i}"] = zlib.crc32(corners.tobytes())
-        for name, one in [*((f"material {i}", m) for i, m in enumerate(self.materials.materials)), ("fluid", self.fluid)]:
+        materials = {f"material {i}": m for i, m in enumerate(self.materials.materials)}
+        for name, one in {**materials, "fluid": self.fluid}.items():
             out[name] = None if one is None else type(one).__name__
             constants = {f.name: getattr(one, f.name) for f in fields(one)} if one is not None else {}
             constants = {key: value for key, value in constants.items() if value is not None and not callable(value)}

@@ -218,7 +218,8 @@ class Simulation:
 
         fields
             New values (n, ...) at the points of this process, or one for all, of what they carry in `points.data`:
-            constants of materials that were given as functions of place, and state of laws.
+            constants of materials that were given as functions of place, and state of laws; or data of your own, that
+            the points take along.
 
         Raises
         ------

@@ -78,8 +78,11 @@ def _changed(points: MaterialPoints, fields: Mapping[str, ArrayLike]) -> Materia
     """Return points with new values of some of their data."""
     data = dict(points.data)
     for name, value in fields.items():
-        if name not in data:
-            raise ValueError(f"stage: fields: {name!r}, must be some of {', '.join(data) or 'none, for there are none'}")
-        new = numbers(f"stage: fields: {name}", value, data[name].shape[1:], data[name].shape, allowed="finite numbers")
-        data[name] = np.broadcast_to(new, data[name].shape).copy()
+        new, what = numbers(f"stage: fields: {name}", value, None, allowed="finite numbers"), f"stage: fields: {name!r}"
+        if name in data and new.shape == data[name].shape[1:]:
+            new = np.broadcast_to(new, data[name].shape)
+        if new.shape != (data[name].shape if name in data else (len(points), *new.shape[1:])):
+            each = "one value for all, or " if name in data else ""
+            raise ValueError(f"{what} of shape {new.shape}, must be {each}one for each of {len(points)} points")
+        data[name] = new.copy()
     return replace(points, data=data)

@@ -135,8 +135,11 @@ def _histories(simulation: Simulated, t_end: float, dt: float, probes: Probes | 
     dt = min(dt, t_end - (after.rows[0][0] if after else now))
     if after is None:
         return Result(dt=dt, small=dt, rows=[_row(simulation, probes)])
-    # a run that was broken off may have taken a part of its next interval
-    broken_off = after is simulation.state.result and after.rows[-1][0] <= now <= after.rows[-1][0] + (1 + 1e-9) * dt
+    latest, broken_off = simulation.state.result, False
+    if latest is not None and after.rows is latest.rows:  # of the same run, which may have gone on since
+        after = latest
+        # and, broken off, have taken a part of its next interval
+        broken_off = after.rows[-1][0] <= now <= after.rows[-1][0] + (1 + 1e-9) * dt
     if after.dt != dt or not (after.rows[-1][0] == now or broken_off):
         last = after.rows[-1][0]
         raise ValueError(f"dt = {dt!r} from t = {now!r}: the run to go on with has dt = {after.dt!r}, t = {last!r}")

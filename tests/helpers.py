@@ -2,11 +2,13 @@
 """Small scenes that several tests share."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx import step
 
 SOFT = mpm.Hencky(bulk=1e7 / 3, shear=5e6, porosity=0.4, conductivity=1e-4)
 
@@ -23,6 +25,18 @@ def beam(*, fluid=True, ramp=0.06, load=54e3, offset=0.5, h=0.03, material=SOFT,
         grid, [body], [material], fixed={"left": "xy"}, tractions=[top_load(load, ramp)], **options
     )
     return simulation, mpm.probes([body], [[1.0, bottom + 0.15]])
+
+
+def limit(simulation, newton):
+    """Let a simulation take so many Newton steps before a step is cut; before its first step."""
+    simulation.scene.scheme = replace(simulation.scene.scheme, most_newton=newton)
+    simulation.scene.forget()
+    return simulation
+
+
+def set_up(simulation, dt):
+    """Return the balances of a simulation's next step, set up and not solved."""
+    return step.set_up(simulation.scene, simulation.state, dt)
 
 
 def top_load(load=54e3, ramp=0.06):

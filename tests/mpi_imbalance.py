@@ -19,7 +19,8 @@ simulation = mpm.Simulation(
 def measured(t_end):
     """Return the reported imbalance and memory of a run, and on rank 0 what all processes have."""
     result = simulation.run(t_end, 0.5, progress=False)
-    mine = (len(simulation.points), len(simulation.pieces.cells), len(simulation.pieces.filled))
+    pieces = simulation.scene.last[0].data.pieces
+    mine = (len(simulation.points), len(pieces.cells), len(pieces.places.filled))
     print(result.shares())
     return list(result.imbalance.values()), result.memory, result.points, grid.comm.gather(mine)
 

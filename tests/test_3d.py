@@ -8,12 +8,13 @@ import cryer
 import numpy as np
 import poroelastic_beam as demo
 import pytest
+from helpers import set_up
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.solve import linear as solvers
-from mpm_dolfinx.points.cutting import volumes
 from mpm_dolfinx.points.bodies import material_points
+from mpm_dolfinx.points.cutting import volumes
 from mpm_dolfinx.points.faces import face_vectors, surface
+from mpm_dolfinx.solve import linear as solvers
 
 SOIL = mpm.Hencky(bulk=1e7 / 3, shear=5e6, conductivity=1e-6)
 
@@ -86,10 +87,10 @@ def test_iterations_do_not_grow_where_cells_are_nearly_empty(monkeypatch, fluid,
 def test_rigid_body_modes_are_what_the_stiffness_does_not_see(monkeypatch):
     """Of the ghost penalty and the tangent of a block at rest, before it is fixed."""
     s = block()
-    monkeypatch.setattr(s, "_check_held", lambda: None)
-    s.momentum.free[:] = True
-    s._begin(1.0)
-    K, modes = s.momentum.assemble_tangent(), s.momentum.unknowns.rigid_body_modes()
+    monkeypatch.setattr("mpm_dolfinx.problems.on_grid.check_held", lambda *_: None)
+    s.state.stage.free[:] = True
+    momentum = set_up(s, 1.0).momentum
+    K, modes = momentum.assemble_tangent(), momentum.system.unknowns.rigid_body_modes()
     vectors = modes.getVecs()
     gram = np.array([[v.dot(w) for v in vectors] for w in vectors])
     assert gram == pytest.approx(np.eye(6), abs=1e-12)

@@ -15,9 +15,9 @@ from mpm_dolfinx.forms.point_forms import FormPoints, PointForm
 GRID = Grid([2.0, 1.0], [4, 3])
 
 
-def assembled(points, integrand, space):
+def assembled(points, data, integrand, space):
     b = np.zeros_like(fem.Function(space).x.array)
-    PointForm(integrand * points.dx, points).assemble_vector(b)
+    PointForm(integrand * points.dx, points).assemble_vector(b, data)
     return b
 
 
@@ -25,8 +25,8 @@ def test_the_kernel_is_called_once_for_every_entry_of_the_list():
     space = _compat.function_space(GRID.mesh, "DG", 0)
     points = FormPoints(GRID, load=())
     cells = np.array([5, 2, 5, 5, 0, 2], dtype=np.int32)
-    points.place(cells, GRID.midpoints[cells], np.ones(6), load=np.array([1.0, 10, 100, 1000, 7, 20]))
-    b = assembled(points, points.load * ufl.TestFunction(space), space)
+    at = points.at(cells, GRID.midpoints[cells], np.ones(6), load=np.array([1.0, 10, 100, 1000, 7, 20]))
+    b = assembled(points, at, points.load * ufl.TestFunction(space), space)
     expected = np.zeros(GRID.num_local)
     expected[[5, 2, 0]] = 1101, 30, 7
     assert b == pytest.approx(expected), "a cell listed several times is no longer integrated as often, row by row"
@@ -37,9 +37,9 @@ def test_coefficients_are_packed_in_the_kernels_order():
     points = FormPoints(GRID, a=(), b=(2,), c=(2, 2))
     cells = np.array([1, 1, 3], dtype=np.int32)
     data = {"a": np.array([1.0, 2, 3]), "b": np.arange(6.0).reshape(3, 2), "c": 10 * np.arange(12.0).reshape(3, 2, 2)}
-    points.place(cells, GRID.midpoints[cells], np.ones(3), **data)
+    at = points.at(cells, GRID.midpoints[cells], np.ones(3), **data)
     q = ufl.TestFunction(space)
-    found = assembled(points, (points.c[0, 1] + 1e3 * points.b[1] + 1e6 * points.a) * q, space)
+    found = assembled(points, at, (points.c[0, 1] + 1e3 * points.b[1] + 1e6 * points.a) * q, space)
     each = data["c"][:, 0, 1] + 1e3 * data["b"][:, 1] + 1e6 * data["a"]
     message = "the columns of packed coefficients are no longer in the order of the kernel's coefficients"
     assert found[1] == pytest.approx(each[0] + each[1]) and found[3] == pytest.approx(each[2]), message

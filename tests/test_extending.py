@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 import ufl
-from helpers import SOFT, beam, column
+from helpers import SOFT, beam, column, limit, set_up
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.verification.biot_fem import BiotFEM
@@ -125,7 +125,7 @@ def test_several_laws_in_one_scene_share_it_as_one_law_would():
         one, two = two_halves(stiff, stiff, **water), two_halves(stiff, own, **water)
         for s in (one, two):
             s.run(1.0, 0.25)
-        assert len(two.momentum._residuals) == 2 and len(one.momentum._residuals) == 1
+        assert len(two.scene.momentum._residuals) == 2 and len(one.scene.momentum._residuals) == 1
         assert np.abs(one.points.x - two.points.x).max() < 1e-12
         assert np.abs(one.effective_stress() - two.effective_stress()).max() < 1e-7 * SOFT.shear
 
@@ -153,7 +153,7 @@ def test_state_changes_once_a_step_and_only_if_it_converged():
     s.run(0.2, 0.05)
     assert s.points.data["damage"] == pytest.approx(-np.log(0.8), abs=1e-4)
     before = {name: values.copy() for name, values in s.points.data.items()}
-    s.coupler.max_iterations = 1
+    limit(s, 1)
     with pytest.raises(mpm.NotConverged):
         s.step(0.5)
     assert (s.points.data["damage"] == before["damage"]).all()
@@ -245,7 +245,7 @@ def test_an_energy_and_its_forces_give_the_same_and_may_hold_a_body_alone():
         s = mpm.Simulation(grid, [body], [SOFT], fixed={}, terms=[term], tractions=[pull])
         s.run(1.0, 0.5)
         positions.append(s.points.x)
-        assert s.momentum.symmetric == (term is foundation)
+        assert s.scene.momentum.symmetric == (term is foundation)
     assert np.abs(positions[0] - positions[1]).max() < 1e-10
     # the springs balance the load: 4e6 N/m^3 times the mean displacement and the height
     assert (positions[0] - body.centre).mean(axis=0) * 4e6 * 0.67 == pytest.approx([1e3, -1e3], rel=2e-5)
@@ -259,19 +259,19 @@ def test_a_term_without_symmetry_has_a_consistent_tangent_coupled_too():
         return -ufl.inner(F * ufl.as_vector([2e5, 0]), points.value(v)) / ufl.det(points.F) * points.dx
 
     s, _ = beam(h=0.06, terms=[follower])
-    assert s.coupler.coupling == "schur-fgmres"
+    assert s.scene.scheme.coupling == "schur-fgmres"
     s.run(0.1, 0.02)
-    s._begin(0.12)
-    m, rng = s.momentum, np.random.default_rng(0)
-    u, w = (1e-3 * rng.normal(size=m.unknowns.size) for _ in range(2))
+    m, rng = set_up(s, 0.02).momentum, np.random.default_rng(0)
+    unknowns = m.system.unknowns
+    u, w = (1e-3 * rng.normal(size=unknowns.size) for _ in range(2))
 
     def residual(x):
-        m.u.x.array[m.unknowns.owned] = x
+        m.forms.u.x.array[unknowns.owned] = x
         return m.assemble_residual()[0].array.copy()
 
     slope = (residual(u + 1e-4 * w) - residual(u - 1e-4 * w)) / 2e-4
     residual(u)
-    x = m.unknowns.vector()
+    x = unknowns.vector()
     x.array[:] = w
     assert (m.assemble_tangent() * x).array == pytest.approx(slope, abs=1e-7 * np.abs(slope).max())
 

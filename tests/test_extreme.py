@@ -2,6 +2,7 @@
 """At the edge of what can be asked results are right or refused, and the demo would notice if they were not."""
 
 import time
+from dataclasses import replace
 from math import nan
 
 import extreme_cases as demo
@@ -119,10 +120,16 @@ def raising(error):
     return make
 
 
+def spoilt(s, result):
+    """Make the positions nan."""
+    s.state = replace(s.state, points=replace(s.points, x=np.full_like(s.points.x, nan)))
+    return 0.0
+
+
 OUTCOMES = {
     "converged": lambda: squeezed(settled(stretch(0.1) - 1)),
     "wrong": lambda: squeezed(settled(0.99 * (stretch(0.1) - 1))),
-    "nan": lambda: squeezed(lambda s, r: s.points.x.fill(nan)),
+    "nan": lambda: squeezed(spoilt),
     "refused": lambda: raising(ValueError("bulk = -1")),
     "hung": lambda: lambda: time.sleep(5),
 }

@@ -1,13 +1,17 @@
 # SPDX-License-Identifier: MIT
 """The pressure's remap changes nothing at rest, loses nothing in motion, and is exact for what is linear."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers import beam
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx import step
+from mpm_dolfinx.points.bodies import material_points
 from mpm_dolfinx.points.cutting import cut
-from mpm_dolfinx.points.pressure_transport import Carried, Reconstruction, remap
+from mpm_dolfinx.points.pressure_transport import PiecePressures, Reconstruction, transport
 
 MOVES = [0.01, 0.3, 2.6]
 
@@ -15,59 +19,57 @@ MOVES = [0.01, 0.3, 2.6]
 def random_beam():
     """Return a beam at the start of a step, with random pressures of its cells and soft water."""
     s, _ = beam(offset=0.3, fluid=mpm.Fluid(bulk=1e6))
-    s._begin(0.0)
     pressure = np.random.default_rng(0).normal(size=s.grid.num_local) * 1e5
-    s.storage.p.x.array[:] = pressure
     return s, pressure
+
+
+def moved(s, state, pressure, way):
+    """Return a state on a grid whose cells have a pressure (cells,), after a rigid move (in cells) and a new reset."""
+    state, on_grid, *_ = step.set_up(s.scene, state, 1.0)
+    s.scene.storage.p.x.array[:] = pressure
+    s.scene.momentum.u.x.array[:] = np.tile(way * s.grid.h, len(s.grid.node_x))
+    before = stored(on_grid, pressure)
+    state, _ = s.scene.motion.advanced(state, on_grid, 0.0, stays=False)
+    s.scene.on_grid(state.points).start(state)
+    s.scene.storage.p.x.array[:] = s.scene.storage.p_n.x.array
+    return state, before
 
 
 def moving_body(move, pressure, slope, bounds):
     """Return what pieces of a rigid body carry, how they lie after a move (in cells), and the move (m)."""
     grid = mpm.Grid([2.0, 2.0], [20, 20])
-    points = mpm.points.material_points(grid, [mpm.box(grid, [0.33, 0.41], [1.2, 1.0])])
+    points = material_points(grid, [mpm.box(grid, [0.33, 0.41], [1.2, 1.0])])
     old, way = cut(grid, points.corners), move * grid.h * [0.8, 1.0]
     p, s = pressure(old.x), slope(old.x)
-    carried = Carried(points.id[old.point], old.cell, old.fraction, p, old.x + way, s, bounds(p))
+    carried = PiecePressures(points.id[old.point], old.cell, old.fraction, p, old.x + way, s, bounds(p))
     return carried, points, cut(grid, points.corners + way), way
 
 
 def test_a_thousand_resets_of_a_body_at_rest_change_nothing():
     s, pressure = random_beam()
-    cells = s.storage.unknowns.owned
+    state, now = s.state, pressure
     for _ in range(1000):
-        s._move_points()
-        s._reset_grid()
-        s.storage.start(1.0)
-    assert np.abs(s.storage.p.x.array[cells] - pressure[cells]).max() < 1e-12 * np.abs(pressure).max()
+        state, _ = moved(s, state, now, 0.0)
+        now = s.scene.storage.p.x.array.copy()
+    cells = s.scene.last[0].contents.filled
+    assert state.resets == 0 and np.abs(now[cells] - pressure[cells]).max() < 1e-12 * np.abs(pressure).max()
 
 
 @pytest.mark.parametrize("way", [0.0, 0.4, 1.7])
 def test_the_fluid_stored_in_all_cells_is_kept_without_new_extremes(way):
     """`way` in cells; the storage coefficient differs from point to point with the porosity."""
     s, pressure = random_beam()
-    s.points.F *= (1 + 0.1 * np.sin(s.points.x[:, :1] * 9))[:, :, None]
-    s._prepared = False
-    s._begin(0.0)
-    s.storage.p.x.array[:] = pressure
-    before, (low, high) = stored(s), extremes(s)
-    s.momentum.u.x.array[:] = np.tile(way * s.grid.h, len(s.grid.node_x))
-    s._move_points()
-    s._reset_grid()
-    s.storage.start(1.0)
-    assert stored(s) == pytest.approx(before, rel=1e-12)
-    assert extremes(s)[0] >= low - 1e-6 and extremes(s)[1] <= high + 1e-6
+    F = s.points.F * (1 + 0.1 * np.sin(s.points.x[:, :1] * 9))[:, :, None]
+    _, before = moved(s, replace(s.state, points=replace(s.points, F=F)), pressure, way)
+    on_grid, after = s.scene.last[0], s.scene.storage.p.x.array
+    assert stored(on_grid, after) == pytest.approx(before, rel=1e-12)
+    cells = on_grid.contents.filled
+    assert after[cells].min() >= pressure.min() - 1e-6 and after[cells].max() <= pressure.max() + 1e-6
 
 
-def stored(s):
+def stored(on_grid, p):
     """Return sum w S |p| with the sign of p: the volume of fluid that the pressure stores."""
-    pieces = s.pieces
-    p = s.storage.p.x.array[pieces.cells]
-    return (pieces.data["weight"][:, 0] * pieces.data["storage"][:, 0]) @ p * s.grid.cell_volume
-
-
-def extremes(s):
-    p = s.storage.p.x.array[s.storage.unknowns.owned]
-    return p.min(), p.max()
+    return (on_grid.weight * on_grid.data.pieces["storage"][:, 0]) @ p[on_grid.cut.cells]
 
 
 @pytest.mark.parametrize("move", MOVES)
@@ -79,7 +81,7 @@ def test_a_moving_body_keeps_the_mean_of_each_point_and_the_bounds(move):
         slope=lambda x: 100 * random(size=x.shape),
         bounds=lambda p: np.stack([p - 0.1, p + 0.1], axis=1),
     )
-    after = remap(old, points, new)
+    after = transport(old, points, new)
     assert after.min() >= old.bounds.min() - 1e-12 and after.max() <= old.bounds.max() + 1e-12
     total = np.bincount(old.id, old.fraction * old.pressure)
     assert np.bincount(new.point, new.fraction * after) == pytest.approx(total, abs=1e-12)
@@ -94,7 +96,7 @@ def test_a_linear_pressure_moves_with_the_body(move):
         slope=lambda x: np.tile(slope, (len(x), 1)),
         bounds=lambda p: np.tile([-9.0, 9.0], (len(p), 1)),
     )
-    assert remap(old, points, new) == pytest.approx((new.x - way) @ slope, abs=1e-12)
+    assert transport(old, points, new) == pytest.approx((new.x - way) @ slope, abs=1e-12)
 
 
 def reconstruct(p, filled=None):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.problems.momentum import GHOST
+from mpm_dolfinx.problems.ghost_penalty import GHOST
 
 SHEAR, LOAD, K = 1e6, 1e2, np.pi  # Pa, Pa, 1/m
 CELLS = (8, 16, 32)
@@ -60,7 +60,7 @@ def layer(cells, damping=1.0, ghost=1.0):
     walls = {"left": "x", "right": "x", "bottom": "y"}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Soil, "strength", damping)
-        patch.setattr("mpm_dolfinx.problems.momentum.GHOST", ghost * GHOST)
+        patch.setattr("mpm_dolfinx.problems.ghost_penalty.GHOST", ghost * GHOST)
         s = mpm.Simulation(grid, [body], [soil], fluid=mpm.Fluid(bulk=np.inf), fixed=walls, tractions=tractions)
         s.run(1.0, 1.0, progress=False)
     return s.points.x - body.centre, s.points.pressure, *exact(body.centre)

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx import simulation
-from mpm_dolfinx.points import cut_domains as placement
+from mpm_dolfinx import scene
 from mpm_dolfinx.io.summary import parts
+from mpm_dolfinx.points import cut_domains
 
 SOIL = mpm.Hencky(bulk=2e7, shear=1e7, porosity=0.4, conductivity=1e-5)
 WATER = mpm.Fluid(bulk=1e8)
@@ -30,19 +30,19 @@ def cuts(monkeypatch):
     """Return a list that grows whenever domains are cut."""
     made = []
 
-    class Counted(placement.Placement):
+    class Counted(cut_domains.CutDomains):
         def __init__(self, *arguments):
             made.append(arguments)
             super().__init__(*arguments)
 
-    monkeypatch.setattr(simulation, "Placement", Counted)
+    monkeypatch.setattr(scene, "CutDomains", Counted)
     return made
 
 
 def test_the_answer_is_that_of_cutting_in_every_step(cuts, monkeypatch):
     runs = []
-    for stays in (-1.0, placement.STAYS):
-        monkeypatch.setattr(placement, "STAYS", stays)
+    for stays in (-1.0, cut_domains.STAYS):
+        monkeypatch.setattr(cut_domains, "STAYS", stays)
         s = column(1e4)  # it settles by 3e-3 of a cell
         s.run(40, 0.8, progress=False)
         runs.append((s.points.x, s.points.pressure, s.points.F, len(cuts)))
@@ -57,9 +57,9 @@ def test_the_answer_is_that_of_cutting_in_every_step(cuts, monkeypatch):
 def test_a_body_at_rest_is_cut_once_and_one_that_moves_in_every_step(cuts):
     rest, moving = column(0.0), column(1e6)
     rest.run(100, 10, progress=False)
-    assert len(cuts) == 1 and not parts(rest)[0].used
+    assert len(cuts) == 1 and not parts(rest.scene, rest.state)[0].used
     moving.run(10, 1, progress=False)
-    assert len(cuts) == 11 and parts(moving)[0].used
+    assert len(cuts) == 11 and parts(moving.scene, moving.state)[0].used
 
 
 def test_a_given_displacement_and_a_plate_do_not_drift(cuts):
@@ -107,7 +107,7 @@ def test_a_stage_after_a_step_that_failed_begins_with_the_last_good_pressures(lo
         s.run(4, 0.8, progress=False)
         if fails:
             with monkeypatch.context() as patch:
-                patch.setattr(s.coupler, "solve", partial(fail, s))
+                patch.setattr("mpm_dolfinx.step.solve_step", partial(fail, s))
                 with pytest.raises(mpm.GaveUp):
                     s.run(8, 0.8, progress=False)
         s.stage(tractions=[mpm.Traction("top", (0, -load))])
@@ -117,6 +117,6 @@ def test_a_stage_after_a_step_that_failed_begins_with_the_last_good_pressures(lo
     assert p2 == pytest.approx(p, abs=1e-6 * load) and x2 == pytest.approx(x, abs=1e-12)
 
 
-def fail(s, dt):
-    s.storage.p.x.array[:] = np.nan
+def fail(s, *_):
+    s.scene.storage.p.x.array[:] = np.nan
     raise mpm.NotConverged("made to fail", [])

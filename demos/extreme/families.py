@@ -29,7 +29,7 @@ from extreme.scenes import (
 from scipy.optimize import brentq
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.exact import SelfWeightColumn
+from mpm_dolfinx.verification.exact import SelfWeightColumn
 
 
 @dataclass(frozen=True)

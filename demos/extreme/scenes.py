@@ -13,7 +13,7 @@ import numpy as np
 from scipy.special import lambertw
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.reference import BiotFEM
+from mpm_dolfinx.verification.biot_fem import BiotFEM
 
 
 def soil(young: float = 1e7, nu: float = 0.0, conductivity: float = 1e-4, law=mpm.Hencky):
@@ -66,7 +66,8 @@ def turned(x: np.ndarray, angle: float) -> np.ndarray:
 
 def place(s: mpm.Simulation, corners: np.ndarray) -> None:
     """Put the undeformed body elsewhere, turned: the corners (n, 4, 2) of its points' domains."""
-    s.points.corners, s.points.origin, s.points.x = corners, corners.copy(), corners.mean(axis=1)
+    points = replace(s.points, corners=corners, origin=corners, x=corners.mean(axis=1))
+    s.state = replace(s.state, points=points)
 
 
 @dataclass(frozen=True)

@@ -132,13 +132,16 @@ class ConductivityAtPieces:
         return out
 
 
-def sampled(law: Callable) -> list[float]:
+def sampled(law: Callable) -> list[float | None]:
     """Return the conductivities that a law gives in three states, which tell it from another law."""
     out = []
     for J in (0.8, 1.0, 1.25):
         F = ufl.as_matrix([[J, 0.1 * J], [0.0, 1.0]])
         state = {"J": J, "porosity": 1 - 0.6 / J, "porosity0": 0.4, "conductivity": 1e-5}
         given = {name: ufl.as_ufl(value) for name, value in state.items()}
-        k = expression(law, [()], F=F, x=ufl.as_vector([0.3, 0.7]), **given)
-        out.append(float(apply_algebra_lowering(k)(())))
+        try:
+            k = expression(law, [()], F=F, x=ufl.as_vector([0.3, 0.7]), **given)
+            out.append(float(apply_algebra_lowering(k)(())))
+        except Exception:  # a law need not know numbers, nor these
+            out.append(None)
     return out

@@ -73,7 +73,8 @@ class SceneMaterials:
             values = {name: getattr(m, name) for name in self._fields[i]}
             self._add_shapes(_spread(m, values, len(rows)), seeded, len(points))
             for name, value in values.items():
-                self.checksums[f"checksum of {name} of material {i}"] = zlib.crc32(np.ascontiguousarray(value).tobytes())
+                content = np.ascontiguousarray(value).tobytes()
+                self.checksums[f"checksum of {name} of material {i}"] = zlib.crc32(content)
                 everywhere = np.zeros((len(X), *value.shape[1:]))
                 everywhere[rows] = value
                 mine = everywhere[points.id]
@@ -126,7 +127,8 @@ class SceneMaterials:
     def table(self, points: MaterialPoints, value: Callable[..., float], *columns: NDArray) -> NDArray[np.float64]:
         """Return value(material, *columns) at the points (n, ...); columns (n,) are values at the points."""
         if not columns and not any(self._fields[i] for i in self._used):
-            return np.array([value(m) if i in self._used else 0.0 for i, m in enumerate(self.materials)])[points.material]
+            each = [value(m) if i in self._used else 0.0 for i, m in enumerate(self.materials)]
+            return np.array(each)[points.material]
         out = None
         for i in self._used:
             rows = np.flatnonzero(points.material == i)

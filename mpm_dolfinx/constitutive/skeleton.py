@@ -17,8 +17,8 @@ import numpy as np
 import ufl
 from numpy.typing import ArrayLike, NDArray
 
-from mpm_dolfinx.validation import asked, functions, line, numbers
 from mpm_dolfinx.constitutive.user_functions import expression
+from mpm_dolfinx.validation import asked, functions, line, numbers
 
 Field = float | Sequence[float] | Callable[[NDArray[np.float64]], ArrayLike]
 """A constant (number or vector), or a function of the reference positions X (n, d), m, that gives (n, ...)."""

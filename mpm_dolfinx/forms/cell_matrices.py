@@ -149,7 +149,7 @@ class StackedElementMatrices:
     def assemble_matrix(self, A: PETSc.Mat, data: PointData) -> None:
         """Add the matrix to `A`, by unrolled local dofs; the caller finalises it."""
         live = data.live()
-        for cells, points, missing in self._sorted(data.places, lambda: batches(data.places)):
+        for cells, points, missing in self._sorted(data.places.key, lambda: batches(data.places)):
             insert(A, self._grid, cells, self._matrices(data, live, points.ravel(), missing))
 
     def _matrices(self, data: PointData, live, chosen: NDArray[np.int64], missing: NDArray) -> NDArray[np.float64]:

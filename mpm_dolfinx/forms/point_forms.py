@@ -28,7 +28,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from mpm_dolfinx import _compat
-from mpm_dolfinx.caching import Latest
+from mpm_dolfinx.caching import Keyed, Latest
 from mpm_dolfinx.points.grid import Grid
 
 CHUNK = 2**14
@@ -122,7 +122,7 @@ class FormPoints:
         return total
 
 
-class Places:
+class Places(Keyed):
     """Where points lie; nobody changes it.
 
     Parameters
@@ -144,7 +144,7 @@ class Places:
         return Places(self.grid, self.cells[rows], self.x[rows])
 
 
-class PointData:
+class PointData(Keyed):
     """Points with weights and fields, complete when made; nobody changes it.
 
     Parameters
@@ -232,8 +232,8 @@ class Rows:
         cells = data.cells[chosen]
         rows = self.room(len(cells))[: len(cells)]
         if isinstance(chosen, slice):
-            key = (data, chosen.start)
-            dofs = self._dofs((data.places, chosen.start), lambda: self._dofs_of(cells))
+            key = (data.key, chosen.start)
+            dofs = self._dofs((data.places.key, chosen.start), lambda: self._dofs_of(cells))
             self._packed(key, lambda: self._pack(rows, data, chosen))
         else:
             self._packed.clear()
@@ -314,37 +314,41 @@ class FacetForm:
     def __init__(self, form: ufl.Form, comm: MPI.Intracomm):
         self._form, self._comm = form, comm
 
-    @cached_property
-    def _compiled(self) -> _compat.CompiledForm:
-        return _compat.CompiledForm(self._form)
-
     @property
     def used(self) -> bool:
         """Whether the form has been needed so far."""
-        return "_compiled" in vars(self)
+        return "compiled" in vars(self)
 
     def on(self, facets: NDArray[np.int32]) -> FacetSum:
         """Return the form over the facets of this process; all processes ask together, for they compile together."""
-        compiled = self._compiled if self._comm.allreduce(len(facets)) else None
-        return FacetSum(compiled, facets)
+        return FacetSum(self, facets, self._comm.allreduce(len(facets)) > 0)
+
+    @cached_property
+    def compiled(self) -> _compat.CompiledForm:
+        """The compiled form."""
+        return _compat.CompiledForm(self._form)
 
 
 class FacetSum:
-    """A compiled form over some facets; without facets, nothing."""
+    """A form over some facets; some: whether any process has one."""
 
-    def __init__(self, compiled: _compat.CompiledForm | None, facets: NDArray[np.int32]):
-        self._compiled = compiled
-        self._form = compiled.bind(facets) if compiled is not None and len(facets) else None
+    def __init__(self, form: FacetForm, facets: NDArray[np.int32], some: bool):
+        self._of, self._facets, self._some = form, facets, some
+
+    @cached_property
+    def _bound(self):
+        compiled = self._of.compiled if self._some else None
+        return compiled.bind(self._facets) if len(self._facets) else None
 
     def assemble_matrix(self, A: PETSc.Mat) -> None:
         """Add the matrix to `A`, by unrolled local dofs; the caller finalises it."""
-        if self._form is not None:
-            self._compiled.assemble_matrix(A, None, self._form)
+        if self._bound is not None:
+            self._of.compiled.assemble_matrix(A, None, self._bound)
 
     def assemble_vector(self, b: NDArray[np.float64]) -> None:
         """Add the vector to the local array `b`; contributions to ghosts stay there."""
-        if self._form is not None:
-            self._compiled.assemble_vector(b, None, self._form)
+        if self._bound is not None:
+            self._of.compiled.assemble_vector(b, None, self._bound)
 
 
 class PointExpression:
@@ -369,6 +373,7 @@ class PointExpression:
         self._rows = Rows(self._compiled, points)
         self._many = min(BATCH, points.grid.num_owned)
         self._compiled.bind(np.arange(self._many))
+        self._rows.room(self._many)
         self._values = np.empty((self._many, int(np.prod(self._shape, dtype=int))))
 
     def evaluate(

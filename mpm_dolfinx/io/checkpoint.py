@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import os
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -118,18 +119,19 @@ def resume(simulation: Simulation, file: str | os.PathLike) -> Result:
     OSError
         The file is not there (FileNotFoundError) or cannot be read.
     """
-    file, comm = path("checkpoint: file", file), simulation.grid.comm
     instance("resume: simulation", simulation, Simulation)
+    file, comm = path("checkpoint: file", file), simulation.grid.comm
 
     def read() -> State:
         with on_disk("resume", "a checkpoint that can be read"):
             arrays, note = _read(file)
         _check_scene(file, note["scene"], describe(simulation))
-        return _state(file, arrays, note, simulation)
+        found.append(_state(file, arrays, note, simulation))
+        return _without_rows(found[0])
 
-    state = at_root(comm, read)
-    if comm.rank > 0:  # rank 0 has all rows, and passes them on
-        state = _without_rows(state)
+    found: list[State] = []  # rank 0 has all rows, and passes them on
+    bare = at_root(comm, read)
+    state = found[0] if found else bare
     simulation.state = replace(state, stage=simulation.state.stage).at_owners(simulation.grid)
     log(comm, "t = %g s: resumed from %s after %d steps", state.t, file, state.result.steps)
     return simulation.result
@@ -187,10 +189,12 @@ def _points(arrays: dict[str, NDArray], like: MaterialPoints, ids: NDArray[np.in
     """Return points of these ids from arrays as those of others; ValueError where they are not."""
     data = _part(arrays, "data/")
     points = MaterialPoints(**arrays, data=data)
-    for name, rows, kind in zip([*arrays, *data], points.arrays, like.arrays, strict=True):
+    kinds = {**vars(like), **like.data}
+    for name, rows in {**arrays, **data}.items():
+        kind = kinds[name]
         if rows.dtype != kind.dtype or rows.shape != (len(ids), *kind.shape[1:]) or not np.isfinite(rows).all():
             raise ValueError(f"points/{name}: {rows.dtype} of shape {rows.shape}, or not finite")
-    if not np.array_equal(points.id, ids):
+    if set(data) != set(like.data) or not np.array_equal(points.id, ids):
         raise ValueError("points/id: other points than the bodies'")
     return points
 
@@ -220,7 +224,7 @@ def _named(prefix: str, values: dict) -> dict[str, NDArray]:
     """Return arrays in dictionaries of dictionaries by names with slashes."""
     out = {}
     for name, value in values.items():
-        out |= _named(f"{prefix}{name}/", value) if isinstance(value, dict) else {prefix + name: value}
+        out |= _named(f"{prefix}{name}/", value) if isinstance(value, Mapping) else {prefix + name: value}
     return out
 
 

@@ -24,11 +24,11 @@ import numpy as np
 from dolfinx import fem, io
 from numpy.typing import NDArray
 
-from mpm_dolfinx.validation import flag, instance, line_of, on_disk, path, whole
 from mpm_dolfinx.parallel.exchange import at_root, to_root
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.result import Result
 from mpm_dolfinx.simulation import Simulation
+from mpm_dolfinx.validation import flag, instance, line_of, on_disk, path, whole
 
 VTK_CELLS = {2: ("quad", [0, 1, 3, 2]), 3: ("hexahedron", [0, 1, 3, 2, 4, 5, 7, 6])}
 """VTK's cell for a domain, and the domain's corners in VTK's order."""

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from mpm_dolfinx.validation import asked, instance, numbers, whole
 from mpm_dolfinx.points.cutting import corner_bits, volumes
 from mpm_dolfinx.points.grid import Grid
 from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.validation import asked, instance, numbers, whole
 
 
 @dataclass(frozen=True)

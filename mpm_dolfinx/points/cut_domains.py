@@ -10,12 +10,13 @@ from mpi4py import MPI
 import numpy as np
 from numpy.typing import NDArray
 
-from mpm_dolfinx.points.cutting import Pieces, cut, cut_faces
-from mpm_dolfinx.parallel.exchange import Exchange, over_all
+from mpm_dolfinx.caching import Keyed
 from mpm_dolfinx.forms.point_forms import CHUNK
+from mpm_dolfinx.parallel.exchange import Exchange, over_all
+from mpm_dolfinx.points.cutting import Pieces, cut, cut_faces
+from mpm_dolfinx.points.faces import Surface, face_vectors, interpolate
 from mpm_dolfinx.points.grid import Grid, sum_by
 from mpm_dolfinx.points.material_points import MaterialPoints
-from mpm_dolfinx.points.faces import Surface, face_vectors, interpolate
 
 STAYS = 3e-4
 """Cells by which corners may have moved since the domains were cut before they are cut anew.
@@ -68,7 +69,7 @@ class Patches:
         return face_vectors(points.corners[self._at], self._faces.axis, self._faces.end) * share[:, None]
 
 
-class CutDomains:
+class CutDomains(Keyed):
     """The points' domains cut by the cells, and the way of their data to the owners of the cells.
 
     It serves until the points have moved: where they were when they were cut is what the grid sees.

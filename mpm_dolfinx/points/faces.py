@@ -10,12 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from mpm_dolfinx.validation import all_of, line, numbers
-from mpm_dolfinx.points.cutting import corner_bits
-from mpm_dolfinx.parallel.exchange import over_all
-from mpm_dolfinx.points.grid import side
 from mpm_dolfinx.points.bodies import Body
-from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.points.cutting import corner_bits
+from mpm_dolfinx.points.grid import side
+from mpm_dolfinx.validation import numbers
 
 
 @dataclass(frozen=True, eq=False)

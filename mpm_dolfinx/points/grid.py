@@ -16,8 +16,8 @@ from dolfinx import fem
 from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx import _compat
-from mpm_dolfinx.validation import instance, line, numbers
 from mpm_dolfinx.parallel.partition import destinations, owners
+from mpm_dolfinx.validation import instance, line, numbers
 
 SIDES = {
     2: {"left": (0, 0), "right": (0, 1), "bottom": (1, 0), "top": (1, 1)},

@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,11 +54,15 @@ class MaterialPoints:
     pressure: NDArray[np.float64]
     x: NDArray[np.float64]
     origin: NDArray[np.float64]
-    data: dict[str, NDArray[np.float64]] = field(default_factory=dict)
+    data: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
 
     def __post_init__(self):
+        object.__setattr__(self, "data", MappingProxyType(dict(self.data)))
         for values in self.arrays:
             values.flags.writeable = False
+
+    def __reduce__(self):  # a read-only mapping cannot be sent to other processes
+        return MaterialPoints, (*(getattr(self, f.name) for f in fields(self) if f.name != "data"), dict(self.data))
 
     @property
     def arrays(self) -> tuple[NDArray, ...]:

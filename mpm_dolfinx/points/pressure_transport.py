@@ -19,8 +19,8 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from mpm_dolfinx.points.cutting import Pieces
 from mpm_dolfinx.parallel.exchange import Exchange
+from mpm_dolfinx.points.cutting import Pieces
 from mpm_dolfinx.points.grid import Grid, sum_by
 from mpm_dolfinx.points.material_points import MaterialPoints
 

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mpm_dolfinx.validation import asked, line, numbers
-from mpm_dolfinx.points.grid import side
 from mpm_dolfinx.points.faces import Region
+from mpm_dolfinx.points.grid import side
+from mpm_dolfinx.validation import asked, line, numbers
 
 
 @dataclass(frozen=True)

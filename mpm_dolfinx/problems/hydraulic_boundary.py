@@ -44,7 +44,7 @@ class HydraulicBoundary:
         self, cut: CutDomains, points: MaterialPoints, contents: CellContents, weight: NDArray[np.float64] | None
     ) -> OpenSides:
         """Return the open sides where they were cut; weight: rho_w g (d,), N/m^3, if there is gravity."""
-        grid, d = self._grid, self._grid.dim
+        grid = self._grid
         cells, conductances, inflows = [np.empty(0, dtype=np.int32)], [np.empty(0)], [np.empty(0)]
         for outlet, faces in self.outlets:
             patches = cut.surface(faces)

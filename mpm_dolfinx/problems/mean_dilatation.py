@@ -27,11 +27,11 @@ import ufl
 from dolfinx import fem
 from numpy.typing import NDArray
 
-from mpm_dolfinx.forms.cell_matrices import insert, shape_gradients
-from mpm_dolfinx.constitutive.user_functions import expression
-from mpm_dolfinx.forms.point_forms import CellSums, FormPoints, PointData
 from mpm_dolfinx.caching import Latest
 from mpm_dolfinx.constitutive.skeleton import Skeleton
+from mpm_dolfinx.constitutive.user_functions import expression
+from mpm_dolfinx.forms.cell_matrices import insert, shape_gradients
+from mpm_dolfinx.forms.point_forms import CellSums, FormPoints, PointData
 
 
 class MeanDilatation:
@@ -122,7 +122,7 @@ class MeanDilatation:
 
     def _volume_of(self, data: PointData) -> NDArray[np.float64]:
         """Return the volumes (cells, 1) of what the filled cells hold."""
-        return self._volume(data, lambda: self._weight(data))
+        return self._volume(data.key, lambda: self._weight(data))
 
     def averaged(self, delta: NDArray[np.float64], cells: NDArray[np.int32]) -> NDArray[np.float64]:
         """Return the gradients Delta (m, d, d) of pieces in cells (m,) with the volume ratio of their cell."""

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from itertools import combinations
 
 import numpy as np
+from dolfinx.common import Timer
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -67,17 +68,18 @@ class MechanicalBoundary:
             if not callable(condition.value):  # what a function gives is checked when it is called
                 condition.at(0.0, *([d] if isinstance(condition, Traction) else [np.empty((1, d))]))
 
-    def data(self, forms: SideForms, cut: CutDomains, points: MaterialPoints, t: float) -> SideData:
+    def data(self, forms: SideForms, cut: CutDomains, t: float, points: MaterialPoints) -> SideData:
         """Return what acts at time t (s) on the points where they are now."""
-        loads = self._load_data(forms, cut, points, t) if self.loads else None
-        plates = self._plate_data(forms, cut, points) if self.plates else None
-        holds, number = self._hold_data(forms, cut, points, t) if self.holds else (None, np.empty(0, dtype=np.int64))
-        return SideData(loads, plates, holds, number)
+        with Timer("mpm: loads"):
+            loads = self._load_data(forms, cut, points, t) if self.loads else None
+            plates = self._plate_data(forms, cut, points) if self.plates else None
+            none = (None, np.empty(0, dtype=np.int64))
+            return SideData(loads, plates, *(self._hold_data(forms, cut, points, t) if self.holds else none))
 
     def _load_data(self, forms: SideForms, cut: CutDomains, points: MaterialPoints, t: float) -> PointData:
         """Return the dead loads on the surface."""
         patches = [cut.surface(faces) for _, faces in self.loads]
-        travel, places = self._loaded(cut, lambda: self._loaded_places(patches), self.grid.comm)
+        travel, places = self._loaded(cut.key, lambda: self._loaded_places(patches), self.grid.comm)
         forces = [_force(load, t, p, points) for (load, _), p in zip(self.loads, patches, strict=True)]
         force = travel.send(np.concatenate(forces))
         return PointData(forms.loads, places, np.ones(len(force)), {"force": force})
@@ -136,7 +138,7 @@ class MechanicalBoundary:
         return value
 
     def reactions(self, sides: SideData, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the forces (displacements, d), N, by which the given displacements act at nodal values u (nodes, d)."""
+        """Return the forces (displacements, d), N, of the given displacements at nodal values u (nodes, d), m."""
         grid, holds = self.grid, sides.holds
         if holds is None:
             return np.zeros((0, grid.dim))

@@ -20,6 +20,7 @@ from petsc4py import PETSc
 import numpy as np
 import ufl
 from dolfinx import fem
+from dolfinx.common import Timer
 from numpy.typing import NDArray
 
 from mpm_dolfinx import _compat
@@ -28,11 +29,11 @@ from mpm_dolfinx.constitutive.user_functions import compiling
 from mpm_dolfinx.constitutive.user_functions import form as form_of
 from mpm_dolfinx.forms.cell_matrices import ElementForces, ElementMatrices, StackedElementMatrices
 from mpm_dolfinx.forms.point_forms import FormPoints, PointForm
-from mpm_dolfinx.problems.quadrature_data import QuadratureData
 from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts, zero
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.problems.ghost_penalty import GhostPenalty
 from mpm_dolfinx.problems.mean_dilatation import MeanDilatation
+from mpm_dolfinx.problems.quadrature_data import QuadratureData
 from mpm_dolfinx.problems.side_forms import SideData, SideForms
 from mpm_dolfinx.validation import line
 
@@ -258,7 +259,8 @@ class MomentumProblem:
         self, forms: MomentumForms, system: MomentumSystem, data: QuadratureData, sides: SideData, round_off: float
     ):
         self.forms, self.system, self.data, self.round_off = forms, system, data, round_off
-        self._external, self._pulls = forms.external(data, sides)
+        with Timer("mpm: loads"):
+            self._external, self._pulls = forms.external(data, sides)
         self._held = sides.holds is not None
         forms.u.x.array[:] = 0.0
 

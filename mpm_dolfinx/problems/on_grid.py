@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a reset of the grid makes: bodies cut by the cells, the active set, and matrices that stay while a cut serves."""
+"""What a reset of the grid makes: bodies cut by the cells, the active set, matrices that stay while a cut serves."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ import numpy as np
 from dolfinx.common import Timer
 from numpy.typing import NDArray
 
-from mpm_dolfinx.caching import Latest
+from mpm_dolfinx.caching import Keyed, Latest
 from mpm_dolfinx.constitutive.fields import SceneMaterials
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.cut_domains import CutDomains
 from mpm_dolfinx.points.grid import sum_by
 from mpm_dolfinx.points.material_points import MaterialPoints
-from mpm_dolfinx.points.pressure_transport import Reconstruction
+from mpm_dolfinx.points.pressure_transport import Reconstruction, transport
 from mpm_dolfinx.problems.fluxes import CellContents, PieceContents
 from mpm_dolfinx.problems.momentum import MomentumForms, MomentumSystem
 from mpm_dolfinx.problems.quadrature_data import QuadratureData, QuadraturePoints
@@ -25,9 +25,10 @@ from mpm_dolfinx.problems.stage import Stage
 from mpm_dolfinx.problems.storage import Outflow, StorageForms, StorageSystem
 from mpm_dolfinx.solve.scheme import Scheme
 from mpm_dolfinx.solve.schur import LinearSolvers
+from mpm_dolfinx.state import State
 
 
-class OnGrid:
+class OnGrid(Keyed):
     """The bodies on the grid since it was reset.
 
     Parameters
@@ -82,17 +83,28 @@ class OnGrid:
             )
             self.contents = CellContents(storage.fluxes, brought, self.cells[self.cells < grid.num_owned])
 
-    def data_of(self, points: MaterialPoints) -> QuadratureData:
+    def data_of(self, state: State) -> QuadratureData:
         """Return the pieces with what the points, which have hardly moved since, carry now."""
-        return self.data if points is self.cut.points else self._quadrature.data(self.cut, self._places, points)
+        if not state.stay:
+            return self.data
+        with Timer("mpm: integration data"):
+            return self._quadrature.data(self.cut, self._places, state.points)
+
+    def start(self, state: State) -> None:
+        """Set the pressures at the start of a step."""
+        with Timer("mpm: remap"):
+            if state.stay:
+                self.set_pressures(state.stay.pressure)
+            else:
+                self._average_pressures(transport(state.transported, self.cut.points, self.cut.pieces))
 
     def set_pressures(self, at_pieces: NDArray[np.float64]) -> None:
-        """Set the pressures at the start of a step to those (m,), Pa, that the pieces have of their cells."""
+        """Set the pressures at the start of a step to those (m,), Pa, that pieces have of their cells."""
         p_n = self._storage.p_n.x
         p_n.array[self.cut.cells] = self.cut.pieces_to_cells(at_pieces)
         p_n.scatter_forward()
 
-    def average_pressures(self, at_pieces: NDArray[np.float64]) -> None:
+    def _average_pressures(self, at_pieces: NDArray[np.float64]) -> None:
         """Set the pressures at the start of a step to the means of those (m,), Pa, that pieces bring to their cells.
 
         Means are by what is stored, or by volume in a cell that stores nothing.
@@ -122,6 +134,11 @@ class OnGrid:
         slope, bounds = reconstruction(contents.filled, p, contents.centroid, contents.open, origin)
         pressure = p[cells] + np.einsum("md,md->m", slope[at], offset - origin[at])
         return [self.cut.to_pieces(values) for values in (pressure, slope[at], bounds[at])]
+
+    @property
+    def stays(self) -> bool:
+        """Whether it serves as long as the points hardly move: no mobilities change with the deformation."""
+        return not self._quadrature.varies
 
     @property
     def active_cells(self) -> int:

@@ -115,7 +115,7 @@ class QuadraturePoints:
                 fields["porosity0"] = self._scene.table(points, lambda m: m.porosity)
             return {name: cut.to_cells(rows) for name, rows in fields.items()}
 
-        return self._constants((cut, values), make, self._grid.comm)
+        return self._constants((cut.key, values), make, self._grid.comm)
 
     def _changing(self, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
         """Return what the points bring to their pieces and what changes with them."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Forms on the sides of the bodies: tractions, rigid plates, given displacements; each compiled when first asked for."""
+"""Forms on the sides of the bodies: tractions, rigid plates, given displacements; compiled when first asked for."""
 
 from __future__ import annotations
 

@@ -162,9 +162,7 @@ class StorageSystem:
         Unknowns of the displacement.
     """
 
-    def __init__(
-        self, forms: StorageForms, cells: NDArray[np.int32], facets: NDArray[np.int32], momentum: Unknowns
-    ):
+    def __init__(self, forms: StorageForms, cells: NDArray[np.int32], facets: NDArray[np.int32], momentum: Unknowns):
         self._forms, d, fluxes = forms, forms.grid.dim, forms.fluxes
         self.unknowns = own = Unknowns(forms.p, cells.astype(np.int64))
         self.T, self.D, self.L = (matrix(own, own, 2 * d + 1) for _ in range(3))

@@ -8,9 +8,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from mpm_dolfinx.points.grid import SIDES, Grid
 from mpm_dolfinx.points.bodies import Body
 from mpm_dolfinx.points.faces import surface
+from mpm_dolfinx.points.grid import SIDES, Grid
 
 COARSE = 0.7  # of a cell: domains above this lack more stiffness than Q1 cells have too much
 FEW = 3  # points over the thickness, up to which an eighth or more of the bending stiffness is lost

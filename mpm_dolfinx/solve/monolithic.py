@@ -14,6 +14,8 @@ cycles, MINRES with the diagonal blocks 17 to 23 and leaves five times the resid
 
 from __future__ import annotations
 
+from weakref import finalize
+
 from petsc4py import PETSc
 
 import numpy as np
@@ -88,6 +90,7 @@ class BlockSolver:
         self._momentum, self._storage = momentum, storage
         self._storage_solver = multigrid_solver(storage.P, "storage")
         self._operator = BlockOperator(momentum, storage, cycle, self._storage_solver.pc)
+        finalize(self, vars(self._operator).clear)  # PETSc keeps contexts, and what they refer to
         size = (momentum.unknowns.size + storage.unknowns.size, None)
         self._A = PETSc.Mat().createPython((size, size), self._operator, comm=momentum.unknowns.comm)
         self._A.setUp()

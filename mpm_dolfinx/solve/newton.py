@@ -32,7 +32,6 @@ from mpm_dolfinx.problems.storage import StorageProblem, StorageResidual
 from mpm_dolfinx.result import Report
 from mpm_dolfinx.solve.linear import negative_pivots
 from mpm_dolfinx.solve.schur import LinearSolvers
-from mpm_dolfinx.solve.scheme import MOST
 
 KEEP = 0.05  # the tangent is kept while a Newton step reduces the residual to less than this
 FORCING = 1e-3  # relative accuracy of the linear solve
@@ -94,8 +93,9 @@ def solve_step(
         step.check_stable()
     if storage is not None:
         report.balance = _relative(abs(storage.balance(errors.fluid)), errors.exchanged, errors.fluid.round_off)
-    count, most = (report.coupling, "coupling") if storage and solvers.scheme.richardson else (report.newton, "newton")
-    report.easy = 3 * count <= MOST[most]
+    in_turn = storage is not None and solvers.scheme.richardson
+    count, most = (report.coupling, "coupling") if in_turn else (report.newton, "newton")
+    report.easy = 3 * count <= getattr(solvers.scheme, f"most_{most}")
     return report
 
 
@@ -172,7 +172,7 @@ class Newton:
                 self._linearise()
 
     def _check(self, count: int, kind: str) -> None:
-        if count >= MOST[kind]:
+        if count >= getattr(self._scheme, f"most_{kind}"):
             raise NotConverged(f"no convergence in {count} iterations", self.report.history)
 
     def _errors(self, scale_u: float = 0.0) -> Errors:

@@ -15,8 +15,6 @@ COUPLINGS = {
     "fixed-stress-paper": None,
 }
 """Coupling schemes and the multiple of alpha^2/K_dr that they take as beta; None: 1/K_w, as printed in the paper."""
-MOST = {"newton": 25, "coupling": 200}
-"""Newton steps, or coupling iterations of `fixed-stress`, before a step is given up."""
 
 
 @dataclass(frozen=True)
@@ -29,6 +27,8 @@ class Scheme:
         Name in `COUPLINGS`.
     tolerance
         Both residuals fall below this, relative to the forces and to the fluid that changes places; in (0, 1).
+    most_newton, most_coupling
+        Newton steps, or coupling iterations of `fixed-stress`, before a step is given up.
 
     Raises
     ------
@@ -38,6 +38,8 @@ class Scheme:
 
     coupling: str
     tolerance: float
+    most_newton: int = 25
+    most_coupling: int = 200
 
     def __post_init__(self):
         if not isinstance(self.coupling, str) or self.coupling not in COUPLINGS:

@@ -10,6 +10,8 @@ fixed-stress operator.  Large bodies in 3D solve both at once, see `monolithic`.
 
 from __future__ import annotations
 
+from weakref import finalize
+
 from petsc4py import PETSc
 
 from dolfinx.common import Timer
@@ -51,9 +53,7 @@ class LinearSolvers:
         Whether the momentum's tangent is symmetric.
     """
 
-    def __init__(
-        self, scheme: Scheme, momentum: MomentumSystem, storage: StorageSystem | None, symmetric: bool
-    ):
+    def __init__(self, scheme: Scheme, momentum: MomentumSystem, storage: StorageSystem | None, symmetric: bool):
         self.scheme, self._momentum, self._storage = scheme, momentum, storage
         self.iterative = iterative(momentum.unknowns)
         """Whether displacements are solved for by iterations."""
@@ -75,8 +75,9 @@ class LinearSolvers:
         if self.iterative and not scheme.richardson:
             self._block = BlockSolver(momentum, storage, self.solve_u.pc)
             return
-        n = (storage.unknowns.size, None)
-        self._schur = PETSc.Mat().createPython((n, n), SchurComplement(storage, self.solve_u), storage.unknowns.comm)
+        n, context = (storage.unknowns.size, None), SchurComplement(storage, self.solve_u)
+        finalize(self, vars(context).clear)  # PETSc keeps contexts of its matrices, and what they refer to
+        self._schur = PETSc.Mat().createPython((n, n), context, storage.unknowns.comm)
         self._schur.setUp()
         self._solve_s = direct_solver(storage.P, "storage", often=True)
         kind = {"schur-cg": PETSc.KSP.Type.CG, "schur-fgmres": PETSc.KSP.Type.FGMRES}

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -28,14 +29,15 @@ from numpy.typing import ArrayLike, NDArray
 from tqdm import tqdm
 
 from mpm_dolfinx import _compat
-from mpm_dolfinx.validation import all_of, line, numbers
-from mpm_dolfinx.problems.conditions import RIGIDITY, Drained, RigidPlate, Traction
-from mpm_dolfinx.solve.newton import NotConverged
-from mpm_dolfinx.constitutive.user_functions import call
-from mpm_dolfinx.points.grid import Grid, side
 from mpm_dolfinx.constitutive.skeleton import Field, Fluid, Skeleton
-from mpm_dolfinx.points.faces import Region, limits, positions
-from mpm_dolfinx.timeloop import GaveUp, Result
+from mpm_dolfinx.constitutive.user_functions import call
+from mpm_dolfinx.errors import GaveUp, NotConverged
+from mpm_dolfinx.points.faces import Region, limits
+from mpm_dolfinx.points.grid import Grid, side
+from mpm_dolfinx.points.probes import positions
+from mpm_dolfinx.problems.conditions import RIGIDITY, Drained, RigidPlate, Traction
+from mpm_dolfinx.result import Report, Result
+from mpm_dolfinx.validation import all_of, line, numbers
 
 ELEMENTS = {"taylor-hood": (2, ("Lagrange", 1, ())), "q1-dg0": (1, ("DG", 0, ()))}  # degree of u; space of p
 CUT_DEGREE = 20  # of quadrature on a side of which a region is loaded: the region's edge may cut facets
@@ -333,25 +335,20 @@ class BiotFEM:
         steps = round((t_end - self.t) / dt) if dt > 0 else 0
         if steps < 1 or abs(steps * dt - (t_end - self.t)) > 1e-6 * dt:
             raise ValueError(f"dt = {dt!r}, t_end = {t_end!r}: dt must divide the {t_end - self.t:g} s left")
-        x, result = positions(probes, self.grid.dim), Result()
+        x = positions(probes, self.grid.dim)
         out = np.flatnonzero(self.grid.outside(x))
         if len(out):
             raise ValueError(f"probe at {x[out[0]]}: outside the body, must be in it or on its surface")
-        self._record(result, x)
-        began = time.perf_counter()
+        result, began = Result(rows=[self._row(x)]), time.perf_counter()
         for _ in tqdm(range(steps), disable=not progress or self.grid.comm.rank > 0 or None, unit="step"):
             try:
                 newton, residual = self.step(dt)
             except NotConverged as failed:
                 message = f"gave up at t = {self.t:g} s with dt = {dt:.3g} s: {failed}"
                 raise GaveUp(message, result, failed.history) from failed
-            result.steps += 1
-            result.newton += newton
-            result.residual = max(result.residual, residual)
-            self._record(result, x)
-            result.wall = time.perf_counter() - began
-        result.converged = True
-        return result
+            result = result.after(Report(newton=newton, history=[(residual, 0.0)]), dt)
+            result.rows.append(self._row(x))
+        return replace(result, wall=time.perf_counter() - began, converged=True)
 
     def displacement(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the displacements (m, d), m, at reference positions x (m, d) in the body, on every process."""
@@ -362,12 +359,13 @@ class BiotFEM:
             out[here] = self._u.eval(np.pad(x[here], ((0, 0), (0, 3 - grid.dim))), cells[here]).reshape(-1, grid.dim)
         return grid.comm.allreduce(out)
 
-    def _record(self, result: Result, x: NDArray[np.float64]) -> None:
-        result.t.append(self.t)
-        result.displacement.append(self.displacement(x))
+    def _row(self, x: NDArray[np.float64]) -> tuple:
+        """Return what the histories hold of the present state."""
+        pressure = None
         if self.fluid:
             p, comm = self.scale * self.w.x.array[self._p_dofs], self.grid.comm
-            result.pressure.append((comm.allreduce(p.min(), op=MPI.MIN), comm.allreduce(p.max(), op=MPI.MAX)))
+            pressure = (comm.allreduce(p.min(), op=MPI.MIN), comm.allreduce(p.max(), op=MPI.MAX))
+        return self.t, self.displacement(x), pressure
 
 
 def euler_bernoulli(x: ArrayLike, load: float, length: float, modulus: float, second_moment: float) -> NDArray:

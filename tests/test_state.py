@@ -1,0 +1,212 @@
+# SPDX-License-Identifier: MIT
+"""The state is all that a scene remembers: whatever is tried in between, the same accepted steps give the same bits."""
+
+from dataclasses import fields, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import pytest
+from helpers import beam, limit
+from hypothesis import HealthCheck, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition, rule
+from interrupting import interrupted
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.io.checkpoint import save
+
+SAND = mpm.DruckerPrager(
+    bulk=2e7,
+    shear=1e7,
+    friction=20.0,
+    dilation=0.0,
+    cohesion=lambda X: 2e4 + 0 * X[:, 0],
+    porosity=0.6,
+    conductivity=1e-5,
+)
+CLAY = mpm.Hencky(bulk=lambda X: 2e7 + 0 * X[:, 0], shear=1e7, conductivity=1e-6)
+LINEAR = mpm.LinearElastic(bulk=2e7, shear=1e7, conductivity=1e-6)
+LAWS = {"sand": SAND, "clay": CLAY, "linear": LINEAR}
+FIELD = {"sand": "cohesion", "clay": "bulk"}
+
+
+class Refusal(Exception):
+    """Of a user's function."""
+
+
+def scene(law, wet, held):
+    """Return a column off the grid lines, and the dictionary that its load looks into."""
+    grid = mpm.Grid([0.3, 0.8], [3, 8])
+    asked = {"load": 0.0, "refuses": False}
+
+    def load(t):
+        if asked["refuses"]:
+            raise Refusal
+        return 0.0, -asked["load"]
+
+    options = {"tractions": [mpm.Traction("top", load)]}
+    if held:
+        options = {"displacements": [mpm.Displacement("top", lambda t, X: (0, 1e-7 * load(t)[1]), "y")]}
+    if wet:
+        options |= {"fluid": mpm.Fluid(bulk=1e8), "drained": [mpm.Drained("top")]}
+    walls = {"left": "x", "right": "x", "bottom": "y"}
+    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [0.3, 0.63])], [LAWS[law]], fixed=walls, **options)
+    return s, asked
+
+
+def same_bits(a: mpm.State, b: mpm.State) -> None:
+    """Assert that two states are equal, bit for bit."""
+    assert (a.t, a.resets, a.begins) == (b.t, b.resets, b.begins)
+    one, other = contents(a), contents(b)
+    assert one.keys() == other.keys()
+    for name in one:
+        assert np.array_equal(one[name], other[name], equal_nan=True), name
+
+
+def contents(state):
+    """Return all arrays of a state by their names."""
+    out = {f"points {k}": v for k, v in {**vars(state.points), **state.points.data}.items() if k != "data"}
+    out["reactions"] = state.reactions
+    if state.transported is not None:
+        out |= {f.name: getattr(state.transported, f.name) for f in fields(state.transported)}
+    if state.stay is not None:
+        out |= {f"stay {k}": v for k, v in {**vars(state.stay.points), **state.stay.points.data}.items() if k != "data"}
+        out |= {f"stay of pieces {k}": v for k, v in vars(state.stay).items() if k != "points" and v is not None}
+    return out
+
+
+class Driven(RuleBasedStateMachine):
+    """Drives a scene at random; a fresh one that takes the accepted steps alone must end in the same state."""
+
+    @initialize(law=st.sampled_from(sorted(LAWS)), wet=st.booleans(), held=st.booleans())
+    def begin(self, law, wet, held):
+        self.made, self.accepted = (law, wet, held), []
+        self.s, self.asked = scene(*self.made)
+
+    def act(self, name, *arguments):
+        """Do something that counts, if it succeeds."""
+        perform(self.s, self.asked, name, *arguments)
+        self.accepted.append((name, *arguments))
+
+    @rule(dt=st.sampled_from([0.5, 3.0]))
+    def step(self, dt):
+        before = self.s.state
+        try:
+            self.act("step", dt)
+        except mpm.NotConverged:
+            assert self.s.state is before
+
+    @rule(load=st.sampled_from([0.0, 300.0, 2e4, 3e5]))
+    def load(self, load):
+        self.act("load", load)
+
+    @precondition(lambda self: self.made[0] in FIELD)
+    @rule(factor=st.sampled_from([0.5, 1.5]))
+    def change_of_a_material_field(self, factor):
+        self.act("field", FIELD[self.made[0]], factor)
+
+    @rule(reset=st.booleans())
+    def stage(self, reset):
+        self.act("stage", reset)
+
+    @rule()
+    def refused_step(self):
+        before, self.asked["refuses"] = self.s.state, True
+        with pytest.raises(ValueError, match="Refusal"):
+            self.s.step(0.5)
+        self.asked["refuses"] = False
+        assert self.s.state is before
+
+    @rule(newton=st.integers(0, 1))
+    def step_that_does_not_converge(self, newton):
+        before, scheme = self.s.state, self.s.scene.scheme
+        load, self.asked["load"] = self.asked["load"], 1e7
+        limit(self.s, newton if self.made[0] != "linear" else 0)
+        with pytest.raises((mpm.NotConverged, mpm.LeftGrid)):
+            self.s.step(5.0)
+        self.asked["load"], self.s.scene.scheme = load, scheme
+        self.s.scene.forget()
+        assert self.s.state is before
+
+    @rule(after=st.integers(0, 4000))
+    def interrupt(self, after):
+        before = self.s.state
+        with interrupted(after):
+            self.s.step(0.5)
+        if self.s.state is not before:  # it was over by then
+            self.accepted.append(("step", 0.5))
+
+    @rule()
+    def look(self):
+        """Reading changes nothing."""
+        str(self.s), self.s.effective_stress(), self.s.reactions, self.s.points.pressure
+        with pytest.raises(ValueError, match="read-only"):
+            self.s.points.pressure[:] = 5e4
+
+    @rule(resume=st.booleans())
+    def checkpoint(self, resume):
+        s = self.s
+        with TemporaryDirectory() as folder:
+            file, before = Path(folder) / "run.ckpt", s.state
+            if s.result is None:
+                s.state = replace(s.state, result=mpm.Result(rows=[(s.t, None, None)]))
+            save(s, file)
+            if not resume:
+                s.state = before
+                return
+            asked = dict(self.asked)
+            self.s, self.asked = scene(*self.made)
+            self.asked |= asked
+            mpm.resume(self.s, file)
+
+    def teardown(self):
+        fresh, asked = scene(*self.made)
+        for name, *arguments in self.accepted:
+            perform(fresh, asked, name, *arguments)
+        same_bits(self.s.state, fresh.state)
+
+
+def perform(s, asked, name, *arguments):
+    """Do something to a scene."""
+    if name == "step":
+        s.step(*arguments)
+    elif name == "load":
+        asked["load"] = arguments[0]
+    elif name == "field":
+        field, factor = arguments
+        s.stage(fields={field: factor * s.points.data[field]})
+    else:
+        s.stage(reset_displacement=arguments[0])
+
+
+TestDriven = Driven.TestCase
+TestDriven.settings = settings(
+    max_examples=25, stateful_step_count=12, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck)
+)
+
+
+def interrupted_runs(count):
+    """Return the state of a run that was left alone, and those of runs that were interrupted once and went on."""
+    s, probe = beam(h=0.1, offset=0.3)
+    s.run(0.1, 0.02, probes=probe, progress=False)
+    states, moments = [], np.random.default_rng(0).integers(0, 9000, count)
+    for after in moments:
+        one, probe = beam(h=0.1, offset=0.3)
+        with interrupted(int(after)):
+            one.run(0.1, 0.02, probes=probe, progress=False)
+        if one.result is not None and one.result.converged:
+            states.append(one.state)
+            continue
+        one.run(0.1, 0.02, probes=probe, progress=False, after=one.result)
+        states.append(one.state)
+    return s.state, states
+
+
+@pytest.mark.parametrize("count", [15, pytest.param(200, marks=pytest.mark.slow)])
+def test_a_run_that_is_interrupted_anywhere_goes_on_to_the_same_end(count):
+    alone, states = interrupted_runs(count)
+    for state in states:
+        same_bits(state, alone)
+        assert state.result.t == alone.result.t
+        assert np.array_equal(state.result.displacement, alone.result.displacement)
