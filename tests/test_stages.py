@@ -123,3 +123,31 @@ def test_what_cannot_be_is_refused(stage, message):
 def test_a_body_that_is_to_come_must_exist():
     with pytest.raises(ValueError, match="later: body 5, must be one of the indices of the bodies, each once: 0, 1"):
         blocks(later=[5])
+
+
+def bent(**options):
+    """Return a simulation of two bodies that a map has bent, one on the other, pressed from above."""
+    grid = mpm.Grid([1.0, 1.4], [10, 14])
+    boxes = [mpm.box(grid, [0, a], [0.5, a + 0.5]) for a in (0.0, 0.5)]
+    bodies = [mpm.mapped(grid, body, lambda x: x + [0.1, 0] * np.sin(x[:, [1]])) for body in boxes]
+    load = [mpm.Traction("top", -1e3)]
+    return mpm.Simulation(grid, bodies, [DENSE], fixed={"bottom": "xy"}, tractions=load, **options)
+
+
+def test_a_mapped_body_comes_later_and_goes():
+    s = bent(later=[1])
+    assert s.run(1.0, 1.0, progress=False).converged
+    low = s.points.x[:, 1].max()
+    s.stage(add=[1])
+    assert s.run(2.0, 1.0, progress=False).converged and s.points.x[:, 1].max() > 0.9
+    s.stage(remove=[1])
+    assert s.run(3.0, 1.0, progress=False).converged
+    assert s.points.x[:, 1].max() == pytest.approx(low, abs=1e-4)
+
+
+def test_a_mapped_body_has_no_face_where_a_region_is():
+    s = bent()
+    s.stage(tractions=[mpm.Traction("right", -1e3, region=((0, 0), (1, 0.3)))])
+    assert s.run(1.0, 1.0, progress=False).converged
+    with pytest.raises(ValueError, match="no point has this side in the region"):
+        s.stage(tractions=[mpm.Traction("top", -1e3, region=((0.8, 0), (1, 2)))])

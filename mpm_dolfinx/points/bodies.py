@@ -43,9 +43,9 @@ class Body:
         """Return the reference corners (m, 2^d, d), m, of domains."""
         lower = self.lower[chosen]
         corners = lower[:, None] + corner_bits(lower.shape[1]) * self.spacing
-        if self.map is None:
+        if self.map is None or not len(lower):  # a map need not have an answer for no positions
             return corners
-        x = corners.reshape(lower.shape[0] * corners.shape[1], -1)
+        x = corners.reshape(-1, lower.shape[1])
         images = numbers("body: the map", asked("body: the map", "a function of positions", self.map, x), None)
         if images.shape != x.shape:
             raise ValueError(f"body: the map gives shape {images.shape}, must be one position each, {x.shape}")
