@@ -57,11 +57,15 @@ Region = tuple[ArrayLike, ArrayLike]
 
 
 def limits(region: Region | None, dim: int) -> NDArray[np.float64]:
-    """Return the corners (2, d) of a region, m; without one, of all space."""
+    """Return the corners (2, d) of a region, m; without one, of all space.
+
+    Equal regions have equal bytes (`tobytes`), however they are given: by these they are compared.
+    """
     if region is None:
         return np.repeat([[-np.inf], [np.inf]], dim, axis=1)
     allowed = f"two corners of {dim} coordinates each, the lower first"
-    return numbers("region", region, (2, dim), allowed=allowed, test=lambda x: x[0] <= x[1])
+    corners = numbers("region", region, (2, dim), allowed=allowed, test=lambda x: x[0] <= x[1])
+    return np.ascontiguousarray(corners) + 0.0  # no -0
 
 
 def surface(
