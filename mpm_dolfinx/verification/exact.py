@@ -204,13 +204,13 @@ def cryer_pressure(t: ArrayLike, radius: float, cv: float, nu: float, p0: float 
     ----------
     t : (...), s, > 0; time
     radius, cv : m and m²/s, > 0; radius, and kappa (K + 4G/3): fluid and grains are incompressible
-    nu : in (0, 0.5); drained Poisson ratio
+    nu : in (-1, 0.5); drained Poisson ratio
     p0 : Pa; uniform load on the surface, and the pressure at t = 0+
 
     Returns (...), Pa. Source: Cryer (1963), Q. J. Mech. Appl. Math. 16; Verruijt.
     """
     _positive(radius=radius, cv=cv, t=t)
-    _check(0 < nu < 0.5, "nu", nu, "in (0, 0.5)")
+    _check(-1 < nu < 0.5, "nu", nu, "in (-1, 0.5)")
     mu = 2 * (1 - 2 * nu) / (1 - nu)  # 4G/(K + 4G/3)
     T = cv * np.asarray(t, dtype=float) / radius**2
     return p0 * _by_time(lambda T: _cryer_short(mu, T), lambda T: _cryer_long(mu, T), T)
