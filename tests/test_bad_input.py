@@ -130,6 +130,17 @@ CASES = {
     "field of words": (lambda: scene(materials=[soil(shear=lambda X: ["a"] * len(X))]), "Hencky: shear(X)", "'a'"),
     "friction angle of 90 degrees": (lambda: sand(friction=90), "DruckerPrager: friction", "= 90"),
     "dilation above friction": (lambda: sand(dilation=31), "DruckerPrager: dilation", "= 31"),
+    "no friction angle": (lambda: sand(friction=None), "DruckerPrager: friction", "is not given"),
+    "no dilation angle": (
+        lambda: mpm.DruckerPrager(bulk=1e7, shear=5e6, friction=30, cohesion=0),
+        "DruckerPrager: dilation",
+        "is not given",
+    ),
+    "no cohesion": (
+        lambda: mpm.DruckerPrager(bulk=1e7, shear=5e6, friction=30, dilation=0),
+        "DruckerPrager: cohesion",
+        "is not given",
+    ),
     "cohesion of nan": (lambda: sand(cohesion=NAN), "DruckerPrager: cohesion", "= nan"),
     "unknown cone": (lambda: sand(match="square"), "DruckerPrager: match", "'square'"),
     "law without energy": (lambda: scene(materials=[law()]), "Law", "energy or kirchhoff"),

@@ -27,6 +27,12 @@ MATCHES = {
     "extension": lambda t, s, c: (6 * s / np.sqrt(3) / (3 + s), 6 * c / np.sqrt(3) / (3 + s)),
 }
 """How the cone meets Mohr and Coulomb's pyramid: (eta, xi) from tangent, sine and cosine of the friction angle."""
+GIVEN = {
+    "friction": "in [0, 90) degrees",
+    "dilation": "in [0, friction] degrees; 0 for flow without a change of volume, friction for associated flow",
+    "cohesion": ">= 0 Pa",
+}
+"""Constants that must be given, and what they may be."""
 TINY = 1e-20  # under the root of the deviatoric strain's square: keeps its derivative finite
 
 
@@ -56,12 +62,13 @@ class DruckerPrager(Skeleton):
     Raises
     ------
     ValueError
-        Naming the constant that is out of its range.
+        Naming the constant that is out of its range, or is not given: friction, dilation and cohesion have no
+        values that are safe to assume.
     """
 
-    friction: Field
-    dilation: Field
-    cohesion: Field
+    friction: Field = None  # given always: without it a message says what it may be
+    dilation: Field = None
+    cohesion: Field = None
     hardening: Field = 0.0
     match: str = "plane strain"
 
@@ -69,6 +76,9 @@ class DruckerPrager(Skeleton):
 
     def __post_init__(self):
         super().__post_init__()
+        for name, allowed in GIVEN.items():
+            if getattr(self, name) is None:
+                raise ValueError(f"{type(self).__name__}: {name} is not given, must be {allowed}")
         if self.match not in MATCHES:
             raise ValueError(f"{type(self).__name__}: match = {self.match!r}, must be one of {', '.join(MATCHES)}")
         _check(self, "friction", lambda v: (0 <= v) & (v < 90), "in [0, 90) degrees")
