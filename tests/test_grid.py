@@ -64,3 +64,16 @@ def test_dolfinx_numbers_vector_dofs_as_scalar_ones(grid):
     V = _compat.function_space(grid.mesh, "Lagrange", 1, (grid.dim,))
     assert V.dofmap.bs == grid.dim
     assert (_compat.cell_dofs(V) == grid.cell_nodes).all(), "Q1 vector and scalar dofmaps differ"
+
+
+def test_only_what_is_made_with_the_mesh_makes_it():
+    """Notebooks, debuggers and `copy` ask any object for names of their own."""
+    grid, shared = Grid([1.0, 1.0], [2, 2]), Grid([1.0, 1.0], [2, 2])
+    for name in ("_repr_html_", "_ipython_display_", "shape_", "__array__"):
+        assert not hasattr(grid, name)
+    assert "mesh" not in vars(grid)
+    assert shared.mesh is not None
+    made = vars(shared).keys() - vars(grid).keys()
+    assert {"mesh", "cell_nodes"} <= made
+    for name in made:
+        assert hasattr(Grid([1.0, 1.0], [2, 2]), name), f"{name} is made with the mesh, but is not there before"

@@ -26,6 +26,11 @@ SIDES = {
 """Names of the sides of a box: (axis, 0 for the lower or 1 for the upper end)."""
 
 
+SHARED = frozenset(
+    "mesh num_owned num_local cell_nodes node_x midpoints signs cell_number cell_facets facet_cells "
+    "_owner _local _facets_owned".split()
+)
+"""What of a grid is made with its mesh."""
 MOST = 2**31 - 1
 """Unknowns that PETSc's numbers of 32 bits count."""
 
@@ -102,7 +107,7 @@ class Grid:
 
     def __getattr__(self, name: str):
         """Make the mesh when first something of it is asked for."""
-        if name.startswith("__") or "mesh" in self.__dict__:
+        if name not in SHARED or "mesh" in self.__dict__:  # notebooks ask for `_repr_html_`, `copy` for other names
             raise AttributeError(f"the grid has no {name!r}")
         self.share(np.zeros((0, self.dim)))
         return getattr(self, name)
