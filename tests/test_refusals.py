@@ -13,6 +13,7 @@ from test_bad_input import BODY, GRID, NAN, WATER, law, run, sand, scene, sides,
 from test_mpi import mpirun
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx.points.bodies import check_different
 
 UPPER = mpm.box(GRID, [0, 0.5], [0.5, 0.6])  # on BODY
 LOAD = {"tractions": [mpm.Traction("top", -1e3)]}
@@ -351,6 +352,13 @@ def test_a_path_that_cannot_be_names_the_object_and_the_path(make, tmp_path):
     with pytest.raises(OSError, match=r"(writer|resume): .* must be .*/") as caught:
         make(tmp_path)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("body", [BODY, mpm.mapped(GRID, BODY, lambda x: 1.1 * x)], ids=["box", "mapped"])
+def test_a_body_that_is_named_twice_is_refused(body):
+    check_different([body, UPPER, mpm.box(GRID, [0, 0.2], [0.5, 0.5])])  # as large and in the same place: to come later
+    with pytest.raises(ValueError, match=r"^bodies 0 and 2: are one and the same, must be two[^\n]*$"):
+        check_different([body, UPPER, body])
 
 
 def test_a_result_is_shown_in_a_line():

@@ -208,6 +208,14 @@ def material_points(grid: Grid, bodies: Sequence[Body], pressure: float = 0.0) -
     )
 
 
+def check_different(bodies: Sequence[Body]) -> None:
+    """Refuse a list that names a body twice: conditions would count its faces twice and act on one of the two."""
+    for j, body in enumerate(bodies):
+        for i in range(j):
+            if bodies[i] is body:
+                raise ValueError(f"bodies {i} and {j}: are one and the same, must be two; seed the second one anew")
+
+
 def check_apart(bodies: Sequence[Body], present: Sequence[bool]) -> None:
     """Refuse bodies of which domains lie in each other as seeded; those that a map has bent are not looked at."""
     there = [i for i, body in enumerate(bodies) if present[i] and body.map is None]
