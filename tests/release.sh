@@ -83,7 +83,7 @@ cat /etc/resolv.conf >"$tree/etc/resolv.conf" 2>/dev/null || true
 } >"$tree/etc/apt/apt.conf.d/99mpm-dolfinx"
 within=(in_tree)
 in_tree dpkg --configure -a >&2 || true
-debian_install "${modules[@]/#/python3-}" python3-pytest
+debian_install "${modules[@]/#/python3-}" python3-pytest python3-hypothesis
 in_tree apt-get clean
 exec 9>&-
 trap - EXIT

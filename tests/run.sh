@@ -10,5 +10,5 @@ cd "$root"
 if [ "${1-}" = --release ]; then
     exec bash tests/release.sh "${@:2}"
 fi
-setup pytest
+setup pytest hypothesis
 exec "$python" -m pytest "$@" # of tests/, says pyproject.toml
