@@ -14,7 +14,7 @@ columns of cells: nothing inside a domain is ever cut, and the faces of the piec
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from itertools import permutations
+from itertools import combinations, permutations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -106,14 +106,19 @@ def cut(grid: Grid, corners: NDArray[np.float64]) -> Pieces:
 
 
 def _cut(grid: Grid, corners: NDArray[np.float64]) -> Pieces:
-    d, y = grid.dim, np.ascontiguousarray(((corners - grid.lower) / grid.h).transpose(1, 2, 0))
-    nearest = np.rint(y)
-    y = np.where(np.abs(y - nearest) < SNAP, nearest, y)
+    d, true = grid.dim, np.ascontiguousarray(((corners - grid.lower) / grid.h).transpose(1, 2, 0))
+    nearest = np.rint(true)
+    y = np.where(np.abs(true - nearest) < SNAP, nearest, true)
+    volume = np.stack(_simplex_volumes(y))
+    flat = np.flatnonzero(~volume.any(axis=0))
+    if len(flat):  # thinner than SNAP, and on a plane: nothing would be left of them
+        y[:, :, flat] = true[:, :, flat]
+        volume = np.stack(_simplex_volumes(y))
     # segments or triangles (d, d, m): vertices and coordinates first, which keeps the loops in numpy's fast lanes
     s = np.concatenate([y[facet] for facet in _FACETS[d][:, [0, -1]].reshape(-1, d)], axis=2)
     outward, owner = _area_vectors(s), np.tile(np.arange(len(corners)), 2 * len(_FACETS[d]))
     # a simplex that is turned inside out, in a domain about to fold, counts as positive: minus twice its volume
-    simplex, folded = np.nonzero(np.less(_simplex_volumes(y), 0))
+    simplex, folded = np.nonzero(volume < 0)
     if len(folded):
         turned = y[_FACETS[d][simplex], :, folded[:, None, None]].transpose(2, 3, 0, 1).reshape(d, d, -1)
         s = np.concatenate([s, turned, turned], axis=2)
@@ -277,7 +282,10 @@ def cut_faces(
 def _size(s: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return lengths or areas, up to a factor, of segments or triangles (k+1, e, m)."""
     e = s[1:] - s[0]
-    return np.sqrt(np.abs(np.linalg.det(np.einsum("iam,jam->mij", e, e))))
+    if len(e) == 1:
+        return np.sqrt((e[0] ** 2).sum(axis=0))
+    a, b = e  # no determinant of a . b, in which thin triangles drown
+    return np.sqrt(sum((a[i] * b[j] - a[j] * b[i]) ** 2 for i, j in combinations(range(len(a)), 2)))
 
 
 _RULES = {  # barycentric points of equal weight, exact to second order on segments and triangles
