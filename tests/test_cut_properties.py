@@ -3,15 +3,15 @@
 
 from dataclasses import fields
 from fractions import Fraction
-from functools import cache
 from itertools import pairwise, permutations, product
 from math import ceil, factorial, floor
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.interpolate import BSpline
+from strategies import numbers, orders, repeatable, turned
 
 from mpm_dolfinx import Grid
 from mpm_dolfinx.points.cutting import Pieces, cut, cut_faces
@@ -23,37 +23,11 @@ KUHN = {d: [np.cumsum([0, *(1 << a for a in p)]) for p in permutations(range(d))
 RING = [0, 1, 3, 2]  # corners of a quadrilateral, counterclockwise
 
 
-def repeatable(examples):
-    return settings(max_examples=examples, deadline=None, derandomize=True)
-
-
 # ---- random domains --------------------------------------------------------------------------------
-
-
-@cache
-def lists(low, high, count):
-    return st.lists(st.floats(low, high, allow_subnormal=False), min_size=count, max_size=count)
-
-
-def numbers(draw, low, high, *shape):
-    return np.reshape(draw(lists(low, high, int(np.prod(shape)))), shape)
-
-
-def orders(draw, low, high, *shape):
-    """Return numbers from 10^low to 10^high."""
-    return 10.0 ** numbers(draw, low, high, *shape)
 
 
 NEAR = st.sampled_from([sign * e for e in (0, 1e-12, 1e-11, 9e-11, 1.2e-10, 2.5e-10, 1e-9, 1e-7) for sign in (1, -1)])
 """How far a vertex may be from a grid plane that it is near to, cells."""
-
-
-def turned(draw, y):
-    """Return y (k, d) turned somehow, or not at all."""
-    if draw(st.booleans()):
-        return y
-    q, _ = np.linalg.qr(numbers(draw, -1, 1, y.shape[1], y.shape[1]) + 1e-3 * np.eye(y.shape[1]))
-    return y @ (q * [np.linalg.det(q), *[1] * (len(q) - 1)])
 
 
 def put_near_planes(draw, y, near=NEAR):
