@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: MIT
+"""Newton's method: steps that explode are shortened; what is above round-off is solved for, however little it is."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import ufl
+from scipy.optimize import brentq
+
+import mpm_dolfinx as mpm
+
+SOIL = mpm.Hencky(bulk=1e5, shear=1e5)
+SIDES = {"left": "x", "right": "x"}
+
+
+@dataclass(frozen=True)
+class Stiffening(mpm.Skeleton):
+    """Linear in all components of F - I but the last, along y, of which the stress is soft e exp(exponent e^2)."""
+
+    soft: mpm.Field = 1.0
+    exponent: mpm.Field = 1.0
+
+    @staticmethod
+    def energy(F, bulk, soft, exponent):
+        H = F - ufl.Identity(2)
+        e = H[1, 1]
+        return bulk / 2 * (ufl.inner(H, H) - e**2) + soft / (2 * exponent) * (ufl.exp(exponent * e**2) - 1)
+
+
+@pytest.mark.parametrize(("exponent", "shortened"), [(8, False), (14, True)])
+def test_a_newton_step_is_shortened_where_the_residual_grows_more_than_ten_thousandfold(exponent, shortened):
+    """A body under tension across is pulled upward 1e5 times less, as it lets go of: along y its tangent is that soft.
+
+    The first step overshoots to e = 1, where the residual is 3e3 or 1e6 times what it was.  From there Newton's method
+    comes back in about as many iterations as the exponent, and some.
+    """
+    grid, across = mpm.Grid([1.2, 1.5], [12, 15]), 1e5
+    pulls = [mpm.Traction("right", (across, 0)), mpm.Traction("top", lambda t: (0, float(t > 1)))]
+    law = Stiffening(bulk=1e3 * across, shear=1e3 * across, exponent=exponent)
+    walls = {"left": "x", "bottom": "y"}
+    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 1])], [law], fixed=walls, tractions=pulls, tolerance=1e-12)
+    s.step(1.0)
+    report = s.step(1.0)
+    residuals = np.array([momentum for momentum, _ in report.history])
+    assert (residuals[1] > 1e4 * residuals[0]) == shortened and residuals[1] > 3e2 * residuals[0]
+    assert len(report.history) - 1 - report.newton == shortened, "steps that were shortened"
+    assert report.newton <= (10 if shortened else 16)
+    e = brentq(lambda e: e * np.exp(exponent * e**2) - 1, 0, 1)
+    assert s.points.F[:, 1, 1] - 1 == pytest.approx(np.full(len(s.points), e), rel=1e-5)
+
+
+def stretch(load):
+    """Return the stretch of a bar of SOIL, held across, by a load over its modulus (dead): ln a / a."""
+    return brentq(lambda a: np.log(a) / a - load, 1, 2)
+
+
+@pytest.mark.parametrize(("stiffer", "load", "error"), [(1e7, 0.01, 1e-4), (1e8, 0.03, 1e-5)])
+def test_what_round_off_in_a_stiff_part_does_not_hide_is_solved_for(stiffer, load, error):
+    """What Newton's first step leaves of the soft part's residual is 100 times the round-off of the stiff part."""
+    grid = mpm.Grid([0.1, 1.0], [1, 10])
+    bodies = [mpm.box(grid, [0, 0], [0.1, 0.5]), mpm.box(grid, [0, 0.5], [0.1, 0.9], material=1)]
+    hard = mpm.Hencky(bulk=stiffer * SOIL.bulk, shear=stiffer * SOIL.shear)
+    pull = mpm.Traction("top", (0, load * SOIL.oedometric), region=((-np.inf, 0.8), (np.inf, np.inf)))
+    s = mpm.Simulation(grid, bodies, [hard, SOIL], fixed=SIDES | {"bottom": "y"}, tractions=[pull])
+    s.step(1.0)
+    a = s.points.F[s.points.material == 1, 1, 1]
+    assert a - 1 == pytest.approx(np.full(len(a), stretch(load) - 1), rel=error)
+
+
+def test_what_the_rounding_of_places_far_from_the_origin_does_not_hide_is_solved_for():
+    """A bar that a given displacement holds, a thousand cells from the origin."""
+    grid = mpm.Grid([100.1, 1.2], [1, 12], lower=[100.0, 0.0])
+    foot, pull = mpm.Displacement("bottom", (0, 0), "y"), mpm.Traction("top", (0, 0.2 * SOIL.oedometric))
+    bar = mpm.box(grid, [100.0, 0.1], [100.1, 0.9])
+    s = mpm.Simulation(grid, [bar], [SOIL], fixed=SIDES, displacements=[foot], tractions=[pull])
+    s.step(1.0)
+    assert s.points.F[:, 1, 1] - 1 == pytest.approx(np.full(len(s.points), stretch(0.2) - 1), rel=1e-6)
+
+
+@pytest.mark.parametrize("share", [1e-12, 2e-13])
+def test_fluid_that_comes_in_is_stored_however_little_it_is(share):
+    """Of the body's volume; its rounding leaves 2e-15."""
+    grid, water = mpm.Grid([0.1, 1.0], [1, 10]), mpm.Fluid(bulk=1e7)
+    body, fixed = mpm.box(grid, [0, 0], [0.1, 0.8]), SIDES | {"bottom": "y"}
+    filling = [lambda points, q: share * q * points.dx]
+    s = mpm.Simulation(grid, [body], [SOIL], fixed=fixed, fluid=water, sources=filling)
+    s.step(1.0)
+    exact = share / (1 / SOIL.oedometric + SOIL.porosity / water.bulk)
+    assert s.points.pressure == pytest.approx(np.full(len(s.points), exact), rel=1e-3)
+
+
+@pytest.mark.parametrize("difference", [1e-11, 2e-12])
+def test_fluid_flows_between_sides_however_little_their_pressures_differ(difference):
+    """Of the pressure; to the cells' fluxes, which cancel, rounding may add 2e-15 of each."""
+    grid, high = mpm.Grid([0.1, 1.0], [1, 10]), 1e5
+    soil = mpm.Hencky(bulk=1e7, shear=1e7, conductivity=1e-4)
+    sides = [mpm.Drained("top", high), mpm.Drained("bottom", high * (1 + difference))]
+    fixed = SIDES | {"bottom": "y", "top": "y"}
+    body = mpm.box(grid, [0, 0], [0.1, 1.0])
+    s = mpm.Simulation(grid, [body], [soil], fixed=fixed, fluid=mpm.Fluid(), pressure=high, drained=sides)
+    s.step(1e9)
+    cell = np.floor(s.points.x[:, 1] * 10)  # points have the pressure of their cell
+    found = (s.points.pressure - high) / (high * difference)
+    assert found == pytest.approx(1 - (cell + 0.5) / 10, abs=0.01)
