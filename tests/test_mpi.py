@@ -34,6 +34,11 @@ def test_the_state_is_the_same_on_several_processes(scene, tmp_path):
             assert other[name] == pytest.approx(states[0][name], abs=1e-8 * np.abs(states[0][name]).max())
 
 
+@pytest.mark.parametrize("processes", [1, 2, 3])
+def test_rows_of_any_kind_travel_and_are_counted_whole(processes):
+    mpirun(processes, "mpi_exchange.py")
+
+
 def test_imbalance_memory_and_traffic_are_those_of_the_processes(tmp_path):
     found = {}
     for processes in (1, 2):

@@ -68,14 +68,15 @@ class Exchange:
 
     def _transfer(self, rows: NDArray, counts, received) -> NDArray:
         rows = np.ascontiguousarray(rows)
-        width = int(np.prod(rows.shape[1:], dtype=int))
         out = np.empty((int(received.sum()), *rows.shape[1:]), dtype=rows.dtype)
-        kind = MPI._typedict[rows.dtype.char]
+        width = int(np.prod(rows.shape[1:], dtype=int))
+        row = MPI._typedict[rows.dtype.char].Create_contiguous(width).Commit()  # entries may be more than an int counts
         away = np.delete(counts, self.comm.rank)
         traffic.transfers += 1
         traffic.messages += int(np.count_nonzero(away))
-        traffic.bytes += int(away.sum()) * width * rows.itemsize
-        self.comm.Alltoallv([rows, counts * width, kind], [out, received * width, kind])
+        traffic.bytes += int(away.sum()) * row.size
+        self.comm.Alltoallv([rows, counts, row], [out, received, row])
+        row.Free()
         return out
 
 

@@ -1,0 +1,38 @@
+# SPDX-License-Identifier: MIT
+"""Rows of any kind and width travel to other processes and come back; what MPI counts is rows, never entries."""
+
+from mpi4py import MPI
+
+import numpy as np
+
+from mpm_dolfinx.parallel.exchange import Exchange, traffic
+
+
+class Counted(MPI.Intracomm):
+    """All processes, and the counts of the last transfer."""
+
+    def Alltoallv(self, sent, received):
+        Counted.sent, Counted.received = sent[1], received[1]
+        super().Alltoallv(sent, received)
+
+
+comm = Counted(MPI.COMM_WORLD)
+for n in (0, 1, 500):
+    destination = np.random.default_rng(comm.rank).integers(0, comm.size, n).astype(np.int32)
+    travel = Exchange(comm, destination)
+    sender, number = travel.send(np.full(n, comm.rank)), travel.send(np.arange(n))
+    expected = [
+        (rank, i) for rank, ends in enumerate(comm.allgather(destination)) for i in np.flatnonzero(ends == comm.rank)
+    ]
+    assert list(zip(sender, number, strict=True)) == expected
+    for dtype in (np.float64, np.int64, np.int32, np.int8, np.bool_):
+        for shape in ((), (2,), (3, 3), (0,)):
+            rows = np.random.default_rng(n).integers(0, 100, (n, *shape)).astype(dtype)[::-1]
+            there = travel.send(rows)
+            assert there.dtype == dtype and there.shape == (len(expected), *shape)
+            assert np.array_equal(travel.back(there), rows)
+            if comm.size > 1:
+                assert (Counted.received == np.bincount(destination, minlength=comm.size)).all()
+                assert Counted.sent.sum() == len(expected)
+    if comm.size == 1:
+        assert there is rows and traffic.bytes == 0
