@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from mpm_dolfinx.points.bodies import Body
 from mpm_dolfinx.points.cutting import corner_bits
-from mpm_dolfinx.points.grid import side
+from mpm_dolfinx.points.grid import rounding, side
 from mpm_dolfinx.validation import numbers
 
 
@@ -96,7 +96,8 @@ def surface(
         part = np.stack([np.maximum(face[:, 0], low), np.minimum(face[:, 1], high)], axis=1)
         on = (part[:, 1] > part[:, 0])[:, tangential].all(axis=1)
         on &= ~_touched(face.mean(axis=1), axis, end, [other for other in there if other is not body])
-        on &= (face[:, 0, axis] >= low[axis] - 1e-12) & (face[:, 0, axis] <= high[axis] + 1e-12)
+        at, slack = face[:, 0, axis], 1e-9 * body.spacing[axis] + rounding(face)
+        on &= (at >= low[axis] - slack) & (at <= high[axis] + slack)
         part[:, :, axis] = face[:, :, axis]
         ids.append(start + chosen[on])
         xis.append((2 * part - box.sum(axis=1, keepdims=True))[on] / body.spacing)

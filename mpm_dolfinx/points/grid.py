@@ -47,6 +47,11 @@ def sum_by(index: NDArray, values: NDArray[np.float64], size: int) -> NDArray[np
     return np.bincount(index, weights=values, minlength=size).astype(float, copy=False)
 
 
+def rounding(x: NDArray[np.float64]) -> float:
+    """Return by how much coordinates of this size, m, may differ although they should be equal."""
+    return 8 * np.finfo(float).eps * float(np.abs(x).max(initial=0.0))
+
+
 class Grid:
     """Background grid of equal cells over the box [lower, upper].
 
@@ -200,8 +205,9 @@ class Grid:
         return self._local[number]
 
     def outside(self, x: NDArray[np.float64], tolerance: float = 1e-9) -> NDArray[np.bool_]:
-        """Return which points lie outside the grid by more than `tolerance` cells."""
+        """Return which points lie outside the grid by more than `tolerance` cells, and what is lost in rounding."""
         y = (x - self.lower) / self.h
+        tolerance = tolerance + rounding(np.stack([self.lower, self.upper])) / self.h
         return ((y < -tolerance) | (y > self.shape + tolerance) | ~np.isfinite(y)).any(axis=1)
 
     def shape_functions(

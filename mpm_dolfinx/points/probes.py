@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.bodies import Body
 from mpm_dolfinx.points.faces import interpolate
+from mpm_dolfinx.points.grid import rounding
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.validation import all_of, line, numbers
 
@@ -86,7 +87,7 @@ def probes(bodies: Sequence[Body], x0: ArrayLike) -> Probes:
         far = np.abs((centre - x) / spacing).max(axis=1)
         ids[i] = np.flatnonzero(far <= far.min() + 1e-9)[0]
     xi = 2 * (x0 - centre[ids]) / spacing[ids]
-    far = np.flatnonzero((np.abs(xi) > 1 + 1e-9).any(axis=1))
+    far = np.flatnonzero((np.abs(xi) > 1 + 1e-9 + 2 * rounding(x0) / spacing[ids]).any(axis=1))
     if len(far):
         raise ValueError(f"probe at {x0[far[0]]}: outside the bodies, must be in one or on its surface")
     return Probes(x0, ids, xi, tuple(bodies))

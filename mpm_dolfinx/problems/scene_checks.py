@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from mpi4py import MPI
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import label
@@ -36,6 +38,7 @@ def check_held(
         Saying where the part is, and in how many ways it can move.
     """
     part, count = _parts(grid, active) if each else (active.astype(np.int64), 1)
+    centre, size = _extents(grid, part, count)
     cells = np.flatnonzero(active)
     nodes, first = np.unique(grid.cell_nodes[cells], return_index=True)
     row, axis = np.nonzero(~free[nodes])
@@ -44,7 +47,7 @@ def check_held(
     if holds is not None:
         number = np.concatenate([number, part[holds[0]]])
         x, direction = np.concatenate([x, holds[1]]), np.concatenate([direction, holds[2]])
-    x = x / (grid.upper - grid.lower).max()
+    x = (x - centre[number - 1]) / size[number - 1, None]  # else a small part far from the origin would not turn
     modes = list(direction.T)
     modes += [direction[:, a] * x[:, b] - direction[:, b] * x[:, a] for a in range(grid.dim) for b in range(a)]
     R = np.stack(modes, axis=1)
@@ -53,11 +56,20 @@ def check_held(
         missing = len(modes) - np.linalg.matrix_rank(gram, tol=1e-12 * max(1.0, np.abs(gram).max()))
         if missing:
             places = [p for p in grid.comm.allgather(grid.midpoints[active & (part == k)][:1].tolist()) if p]
-            where = f"the part at {np.round(places[0][0], 6)}" if count > 1 else "the body"
+            where = f"the part at [{' '.join(f'{x:.9g}' for x in places[0][0])}]" if count > 1 else "the body"
             raise ValueError(
                 f"fixed walls: {where} is free to move as a rigid body in {missing} of {len(modes)} ways; "
                 "it must touch walls whose fixed components hold it, or have given displacements"
             )
+
+
+def _extents(grid: Grid, part: NDArray[np.int64], count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the centres (count, d), m, and the largest edges (count,), m, of the boxes around the parts."""
+    low, high = np.full((2, count, grid.dim), np.inf)  # the higher ends with a minus
+    for sign, ends in ((1, low), (-1, high)):
+        np.minimum.at(ends, part[part > 0] - 1, sign * grid.midpoints[part > 0])
+        grid.comm.Allreduce(MPI.IN_PLACE, ends, op=MPI.MIN)
+    return (low - high) / 2, (-high - low + grid.h).max(axis=1)
 
 
 def _parts(grid: Grid, active: NDArray[np.bool_]) -> tuple[NDArray[np.int64], int]:

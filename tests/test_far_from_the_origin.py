@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: MIT
+"""Where the origin of the coordinates is does not matter: metres a kilometre away, national coordinates."""
+
+import numpy as np
+import pytest
+
+import mpm_dolfinx as mpm
+
+SOIL = mpm.Hencky(bulk=1e8, shear=6e7, grain_density=2600.0, conductivity=1e-5)
+FREE = "free to move as a rigid body in {} of 3 ways"
+SIZES = {"1 m, 500 m away": (500.0, 1.0), "100 m in national coordinates": (5.123456789e6, 100.0)}
+NAMES = {"argvalues": SIZES.values(), "ids": SIZES}
+
+
+def block(origin, size, fixed, **options):
+    """Return a simulation of a block, half as high as wide and pressed on a part of its top, and probes on it."""
+    lower = np.array([origin, 0.9 * origin])
+    grid = mpm.Grid(lower + [size, size], [10, 10], lower=lower)
+    body = mpm.box(grid, lower, lower + [size, 0.53 * size])
+    part = (lower + [0.2 * size, 0.53 * size], lower + [0.61 * size, 0.53 * size])
+    load = mpm.Traction("top", -1e4, region=part)
+    s = mpm.Simulation(grid, [body], [SOIL], fixed=fixed, tractions=[load], **options)
+    return s, mpm.probes([body], lower + np.array([[0, 0.53], [0.5, 0.53], [1, 0.2]]) * size)
+
+
+@pytest.mark.parametrize("origin, size", **NAMES)
+@pytest.mark.parametrize("fixed", [{"bottom": "xy"}, {"left": "x", "bottom": "y"}, {"right": "xy"}])
+def test_a_body_that_is_held_is_held_anywhere(origin, size, fixed):
+    u = []
+    for where in (0.0, origin):
+        s, probes = block(where, size, fixed, gravity=(0, -9.81), fluid=mpm.Fluid())
+        u.append(s.run(1.0, 1.0, probes=probes, progress=False).displacement[-1])
+    assert u[1] == pytest.approx(u[0], abs=1e-6 * size)
+
+
+@pytest.mark.parametrize("origin, size", [(0.0, 1.0), *SIZES.values()], ids=["at the origin", *SIZES])
+@pytest.mark.parametrize("fixed, ways", [({"left": "x"}, 1), ({"left": "y", "bottom": "x"}, 1), ({"top": "xy"}, 3)])
+def test_a_body_that_is_free_is_free_anywhere(origin, size, fixed, ways):
+    s, _ = block(origin, size, fixed)
+    with pytest.raises(ValueError, match=FREE.format(ways)):
+        s.run(1.0, 1.0, progress=False)
+
+
+def test_each_of_two_bodies_far_from_each_other_is_looked_at():
+    grid = mpm.Grid([600.0, 1.0], [1200, 2])
+    bodies = [mpm.box(grid, [x, 0], [x + 1, 1]) for x in (0.0, 599.0)]
+    for fixed, free in (({"left": "xy", "right": "xy"}, False), ({"left": "xy", "right": "x"}, True)):
+        s = mpm.Simulation(grid, bodies, [SOIL], fixed=fixed)
+        if free:
+            with pytest.raises(ValueError, match=r"the part at \[599.25 .*" + FREE.format(1)):
+                s.run(1.0, 1.0, progress=False)
+        else:
+            assert s.run(1.0, 1.0, progress=False).converged
+
+
+@pytest.mark.parametrize("origin", [0.0, 500.0, 5.123456789e6])
+def test_what_ends_at_a_side_reaches_it_anywhere(origin):
+    """A body up to the walls, a region that ends at the side's own height, probes on the corners."""
+    for size in (0.7, 0.9, 1.3):
+        lower = np.array([origin, 0.9 * origin])
+        upper = lower + size
+        grid = mpm.Grid(upper, [7, 11], lower=lower)
+        body = mpm.box(grid, lower, upper)
+        load = mpm.Traction("top", -1e3, region=([lower[0], upper[1]], upper))
+        s = mpm.Simulation(grid, [body], [SOIL], fixed={"left": "x", "right": "x", "bottom": "y"}, tractions=[load])
+        result = s.run(1.0, 1.0, probes=mpm.probes([body], [lower, upper]), progress=False)
+        assert result.displacement[-1] == pytest.approx(np.array([[0, 0], [0, -1e3 * size / SOIL.oedometric]]), rel=1e-3)
