@@ -361,6 +361,23 @@ def test_a_body_that_is_named_twice_is_refused(body):
         check_different([body, UPPER, body])
 
 
+def test_conditions_bodies_and_probes_equal_only_themselves():
+    """Their values may be arrays or functions; `in`, `index` and dictionaries ask for equality and a hash."""
+    load, region = np.array([0.0, -1.0]), np.array([[0.0, 0.0], [1.0, 1.0]])
+    makes = {
+        "Traction": lambda: mpm.Traction("top", load, region),
+        "Displacement": lambda: mpm.Displacement("top", load, region=region),
+        "Drained": lambda: mpm.Drained("top", region=region),
+        "Inflow": lambda: mpm.Inflow("top", 1.0, region),
+        "RigidPlate": lambda: mpm.RigidPlate("top", 1.0, region),
+        "Body": lambda: mpm.box(GRID, [0, 0], [1, 1]),
+        "Probes": lambda: mpm.probes([BODY], [[0.1, 0.3]]),
+    }
+    for name, make in makes.items():
+        one, other = make(), make()
+        assert one == one and one != other and [other, one].index(one) == 1 and {one: name}[one] == name
+
+
 def test_a_result_is_shown_in_a_line():
     assert len(repr(run(1.0, 0.01))) < 400
 

@@ -17,7 +17,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.validation import asked, instance, numbers, whole
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Body:
     """A body as seeded: reference geometry of all its domains, the same on every process.
 

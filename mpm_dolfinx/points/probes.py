@@ -17,7 +17,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.validation import all_of, line, numbers
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Probes:
     """Tracked positions: material particles whose displacement is wanted; m of them.
 

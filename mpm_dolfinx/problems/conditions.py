@@ -3,7 +3,8 @@
 
 A side is named "left", "right", "bottom" or "top", in 3D also "front" (lower y) and "back" (upper y), by where it is
 in the seeded body; it moves with the body.  What is wrong with a condition is said, with a ValueError, when a
-scene or a stage is made with it, of functions of time at the step that asks for it.
+scene or a stage is made with it, of functions of time at the step that asks for it.  A condition equals only itself:
+values and regions may be arrays and functions, which have no equality of their own.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from mpm_dolfinx.points.grid import side
 from mpm_dolfinx.validation import asked, line, numbers
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Traction:
     """Dead traction on a side of the bodies.
 
@@ -51,7 +52,7 @@ class Traction:
         return numbers(name, value, (), (dim,), allowed=allowed)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Drained:
     """Side of the bodies, moving with them, at which the pore pressure is given.
 
@@ -79,7 +80,7 @@ class Drained:
         numbers("Drained: pressure", self.pressure)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Inflow:
     """Side of the bodies through which fluid is pressed in.
 
@@ -159,7 +160,7 @@ class Displacement:
         return np.broadcast_to(numbers(name, value, (d,), X.shape, allowed=allowed), X.shape)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RigidPlate:
     """Rigid, smooth plate on a flat side of the bodies: one displacement along the side's axis for all its faces.
 
