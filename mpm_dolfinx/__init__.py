@@ -11,6 +11,7 @@ SI units throughout.  Stress is positive in tension, pore pressure in compressio
 are those of a slice of 1 m.
 """
 
+from mpm_dolfinx import _environment  # noqa: F401 - first: it says what is missing
 from mpm_dolfinx.constitutive.drucker_prager import DruckerPrager
 from mpm_dolfinx.constitutive.skeleton import (
     LAWS,

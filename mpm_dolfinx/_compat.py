@@ -13,15 +13,11 @@ from collections.abc import Sequence
 from mpi4py import MPI
 from petsc4py import PETSc
 
-import dolfinx
 import numpy as np
 import ufl
 from dolfinx import common, cpp, fem, la, mesh
 from numpy.typing import NDArray
 
-SUPPORTED = ((0, 5), (0, 9), (0, 10), (0, 11))
-if tuple(map(int, dolfinx.__version__.split(".")[:2])) not in SUPPORTED:
-    raise ImportError(f"dolfinx {dolfinx.__version__} is not supported; mpm_dolfinx needs 0.5.2, 0.9, 0.10 or 0.11")
 OLD = not hasattr(fem, "functionspace")
 SUBDOMAIN = 1  # the one subdomain id of our measures
 

@@ -1,0 +1,49 @@
+# SPDX-License-Identifier: MIT
+"""What must be there, looked at before anything of it is imported: one line says what is missing and what to do."""
+
+from __future__ import annotations
+
+import os
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+PACKAGES = {"dolfinx": "fenics-dolfinx", "scipy": "scipy", "tqdm": "tqdm", "meshio": "meshio"}
+"""Names that conda-forge has for what is to be installed; Debian's begin with python3-."""
+BROUGHT = ("mpi4py", "petsc4py", "basix", "ffcx", "ufl")  # by dolfinx
+SUPPORTED = ((0, 5), (0, 9), (0, 10), (0, 11))
+
+
+def _check() -> None:
+    missing = [name for name in (*PACKAGES, *BROUGHT) if find_spec(name) is None]
+    if missing:
+        where = f", nor in PETSC_DIR = {os.environ['PETSC_DIR']}" if os.environ.get("PETSC_DIR") else ""
+        get = dict.fromkeys("dolfinx" if name in BROUGHT else name for name in missing)
+        raise ImportError(
+            f"{', '.join(missing)}: not found by {sys.executable}{where}; mpm_dolfinx needs: on Debian, with "
+            f"/usr/bin/python3, `apt install {' '.join(f'python3-{name}' for name in get)}`, "
+            f"elsewhere `conda install -c conda-forge {' '.join(map(PACKAGES.get, get))}`",
+            name=missing[0],
+        )
+    try:
+        Path.home()
+    except RuntimeError as error:  # without it Open MPI breaks down, and then dolfinx
+        raise ImportError("HOME is not set, dolfinx needs it: set it to a folder that can be written") from error
+
+    from mpi4py import MPI  # noqa: F401 - begins MPI, before PETSc does
+    from petsc4py import PETSc
+
+    import numpy as np
+
+    if np.issubdtype(PETSc.ScalarType, np.complexfloating):
+        raise ImportError(
+            "PETSc: its numbers are complex, mpm_dolfinx needs real ones: on Debian, PETSC_DIR unset or ending in "
+            "-real and `apt install python3-dolfinx-real`, elsewhere `conda install -c conda-forge 'petsc=*=real*'`"
+        )
+    import dolfinx  # which looks for libraries of PETSc's kind of numbers
+
+    if tuple(map(int, dolfinx.__version__.split(".")[:2])) not in SUPPORTED:
+        raise ImportError(f"dolfinx {dolfinx.__version__} is not supported; mpm_dolfinx needs 0.5.2, 0.9, 0.10 or 0.11")
+
+
+_check()
