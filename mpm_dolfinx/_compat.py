@@ -7,7 +7,6 @@ it goes; the branches marked OLD are those of 0.5.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 
 from mpi4py import MPI
@@ -17,6 +16,8 @@ import numpy as np
 import ufl
 from dolfinx import common, cpp, fem, la, mesh
 from numpy.typing import NDArray
+
+from mpm_dolfinx._compiler import compiler
 
 OLD = not hasattr(fem, "functionspace")
 SUBDOMAIN = 1  # the one subdomain id of our measures
@@ -64,7 +65,8 @@ def function_space(msh: mesh.Mesh, family: str, degree: int, shape: tuple[int, .
     """Return the space of `shape`-valued functions of a family ("DG", "Lagrange") and degree."""
     if not OLD:
         return fem.functionspace(msh, (family, degree, shape) if shape else (family, degree))
-    return fem.FunctionSpace(msh, _old_element(msh, family, degree, shape))
+    with compiler(msh.comm):
+        return fem.FunctionSpace(msh, _old_element(msh, family, degree, shape))
 
 
 def _old_element(msh, family: str, degree: int, shape: tuple[int, ...]):
@@ -79,7 +81,8 @@ def _old_element(msh, family: str, degree: int, shape: tuple[int, ...]):
 def mixed_space(msh: mesh.Mesh, parts: Sequence[tuple[str, int, tuple[int, ...]]]):
     """Return the mixed space of several (family, degree, shape)."""
     if OLD:
-        return fem.FunctionSpace(msh, ufl.MixedElement(*[_old_element(msh, *p) for p in parts]))
+        with compiler(msh.comm):
+            return fem.FunctionSpace(msh, ufl.MixedElement(*[_old_element(msh, *p) for p in parts]))
     elements = [basix.ufl.element(f, msh.basix_cell(), k, shape=s) for f, k, s in parts]
     return fem.functionspace(msh, basix.ufl.mixed_element(elements))
 
@@ -130,17 +133,17 @@ class CompiledForm:
 
     def __init__(self, form: ufl.Form):
         (self.integral_type,) = {i.integral_type() for i in form.integrals()}
-        self.mesh = form.ufl_domain().ufl_cargo() if OLD else _mesh_of(form)
+        self.mesh = _mesh_of(form)
         self._spaces = [a.ufl_function_space() for a in form.arguments()]
         coefficients, self._constants = form.coefficients(), form.constants()
         if OLD:
-            logging.disable(logging.INFO)  # 0.5 logs every compiler call
-            self._ufcx, self._module, _ = jit.ffcx_jit(self.mesh.comm, form)
-            logging.disable(logging.NOTSET)
+            with compiler(self.mesh.comm):
+                self._ufcx, self._module, _ = jit.ffcx_jit(self.mesh.comm, form)
             position = self._ufcx.original_coefficient_position
             count = self._ufcx.num_coefficients
         else:
-            self._compiled = fem.compile_form(self.mesh.comm, form)
+            with compiler(self.mesh.comm):
+                self._compiled = fem.compile_form(self.mesh.comm, form)
             position = self._compiled.ufcx_form.original_coefficient_positions
             count = self._compiled.ufcx_form.num_coefficients
             self._all = coefficients
@@ -211,6 +214,8 @@ class CompiledForm:
 
 
 def _mesh_of(form: ufl.Form):
+    if OLD:
+        return form.ufl_domain().ufl_cargo()
     spaces = [a.ufl_function_space() for a in form.arguments()]
     return spaces[0].mesh
 
@@ -225,11 +230,6 @@ def _facet_cells(msh, facets, dim: int) -> NDArray[np.int32]:
 
 
 def compiled(form: ufl.Form):
-    """Return `fem.form`, without the compiler calls that 0.5 logs."""
-    if not OLD:
+    """Return `fem.form`."""
+    with compiler(_mesh_of(form).comm):
         return fem.form(form)
-    logging.disable(logging.INFO)
-    try:
-        return fem.form(form)
-    finally:
-        logging.disable(logging.NOTSET)

@@ -1,14 +1,27 @@
 # SPDX-License-Identifier: MIT
-"""What the package finds around it: what is installed."""
+"""What the package finds around it: what is installed, folders that cannot be written, what other runs have left."""
 
 import os
+import shutil
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
+from test_mpi import mpirun
 
+SCENE = """
+import mpm_dolfinx as mpm
+grid = mpm.Grid([1, 1], [4, 4])
+body = mpm.box(grid, [0, 0], [1, 0.5])
+load = mpm.Traction("top", -1e3)
+s = mpm.Simulation(grid, [body], [mpm.Hencky(1e6, 6e5)], fixed={"bottom": "xy"}, tractions=[load])
+print("ran" if s.run(1, 1, progress=False).converged else "did not")
+"""
 ROOT = Path(__file__).parent.parent
+ONE = {"returncode": 0, "stdout": "ran\n", "stderr": ""}
 
 
 def environment(**changes):
@@ -17,7 +30,7 @@ def environment(**changes):
     return {name: str(value) for name, value in out.items() if value is not None}
 
 
-def start(code, **changes):
+def start(code=SCENE, **changes):
     return subprocess.Popen(
         [sys.executable, "-c", code],
         env=environment(**changes),
@@ -70,3 +83,147 @@ def test_petsc_with_complex_numbers_is_refused():
 def test_a_user_without_a_home_is_told_to_set_one():
     code = f"import os; os.setuid(54321); os.environ.pop('HOME'); exec({'import mpm_dolfinx'!r})"
     assert last_line(code).startswith("ImportError: HOME is not set")
+
+
+# ---- folders that cannot be written
+
+
+def test_without_a_folder_for_what_is_compiled_a_run_says_so_once_and_goes_on(tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    (tmp_path / "tmp").mkdir()
+    cache = tmp_path / "file" / "fenics"
+    end = ended(start(XDG_CACHE_HOME=tmp_path / "file", TMPDIR=tmp_path / "tmp"))
+    assert end["stdout"] == "ran\n" and end["returncode"] == 0
+    assert end["stderr"].count("\n") == 1 and f"{cache}: Not a directory" in end["stderr"]
+    assert "set XDG_CACHE_HOME to another" in end["stderr"] and str(tmp_path / "tmp") in end["stderr"]
+    assert not list((tmp_path / "tmp").glob("mpm_dolfinx-*")), "what was compiled is removed at the end"
+
+
+def test_settings_of_dolfinx_that_cannot_be_read_are_named(tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    line = last_line(SCENE, XDG_CONFIG_HOME=tmp_path / "file")
+    assert line.startswith(f"OSError: {tmp_path / 'file'}/") and "set HOME or XDG_CONFIG_HOME" in line
+
+
+def test_a_c_compiler_that_fails_is_named_and_not_the_law(tmp_path):
+    line = last_line(SCENE, XDG_CACHE_HOME=tmp_path, CC="false")
+    assert line.startswith("OSError: C compiler: CompileError: command ") and "false' failed" in line
+    assert not list((tmp_path / "fenics").iterdir())
+
+
+def test_what_is_wrong_around_one_process_all_of_them_say(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setenv("CC", "false")
+    scene = "\n    ".join(SCENE.splitlines())
+    (tmp_path / "scene.py").write_text(
+        f"try:{scene}\nexcept OSError as error:\n    assert str(error).startswith('C compiler: CompileError: ')\n"
+        "else:\n    raise AssertionError('ran without a compiler')"
+    )
+    mpirun(2, str(tmp_path / "scene.py"))
+
+
+# ---- what other runs have left
+
+
+@pytest.fixture(scope="module")
+def compiled(tmp_path_factory):
+    """Return a cache in which there is what the scene needs."""
+    cache = tmp_path_factory.mktemp("compiled")
+    assert ended(start(XDG_CACHE_HOME=cache)) == ONE, "the compiler's calls are not to be seen"
+    return cache
+
+
+def unfinished(age):
+    def damage(library, source):
+        source.with_suffix(".c.cached").unlink()
+        os.utime(source, (time.time() - age,) * 2)
+
+    return damage
+
+
+def cut(share):
+    return lambda library, source: os.truncate(library, int(share * library.stat().st_size))
+
+
+DAMAGE = {
+    "unfinished since a second": unfinished(1),
+    "unfinished since a day": unfinished(86400),
+    "empty": cut(0),
+    "cut in the head": cut(0.001),
+    "cut in two": cut(0.5),
+    "cut near the end": cut(0.8),
+    "no library": lambda library, source: library.unlink(),
+    "no source": lambda library, source: source.unlink(),
+    "another library": lambda library, source: shutil.copy(sys.modules["_ctypes"].__file__, library),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE.values(), ids=DAMAGE)
+def test_what_a_run_that_was_broken_off_has_left_ends_no_later_one(damage, compiled, tmp_path):
+    cache = shutil.copytree(compiled, tmp_path / "cache")
+    for kind in ("elements", "forms"):  # of later releases there are forms only
+        for source in sorted(cache.glob(f"fenics/*{kind}*.c"), key=lambda file: file.stat().st_size)[-1:]:
+            damage(next(cache.glob(f"fenics/{source.stem}.*so")), source)
+    assert ended(start(XDG_CACHE_HOME=cache)) == ONE
+    assert not list(cache.glob("fenics/.*"))
+
+
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_a_run_may_be_broken_off_while_it_compiles(how, tmp_path):
+    process, folder = start(XDG_CACHE_HOME=tmp_path), tmp_path / "fenics"
+    while process.poll() is None and not list(folder.glob(".mpm_dolfinx-*/*.c")):
+        time.sleep(0.002)
+    time.sleep(0.2)
+    os.killpg(process.pid, how)
+    assert ended(process)["returncode"] != 0
+    ready = {mark.name.removesuffix(".cached") for mark in folder.glob("*.cached")}
+    assert {file.name for file in folder.glob("*.c")} == ready, "what is in the cache is whole"
+    assert how != signal.SIGINT or not list(folder.glob(".*")), "Ctrl-C leaves nothing"
+    assert ended(start(XDG_CACHE_HOME=tmp_path)) == ONE
+
+
+def test_two_runs_compile_at_once_and_remove_what_was_killed_a_day_ago(tmp_path):
+    left = [tmp_path / "fenics" / f".mpm_dolfinx-{name}" for name in ("old", "new")]
+    for folder in left:
+        folder.mkdir(parents=True)
+    os.utime(left[0], (time.time() - 2 * 86400,) * 2)
+    runs = [start(XDG_CACHE_HOME=tmp_path) for _ in range(2)]
+    assert [ended(run) for run in runs] == [ONE, ONE]
+    assert not left[0].exists() and left[1].exists()
+
+
+@pytest.mark.parametrize("writable", [True, False])
+def test_two_processes_compile_together(writable, tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("in the way")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path if writable else tmp_path / "file"))
+    (tmp_path / "scene.py").write_text(SCENE)
+    mpirun(2, str(tmp_path / "scene.py"))
+
+
+# ---- logging
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_logging_is_left_as_it_was(fails, tmp_path):
+    code = """
+import logging
+import mpm_dolfinx as mpm
+logging.disable(logging.WARNING)
+root = logging.getLogger()
+root.handlers[:] = [logging.StreamHandler()]
+root.setLevel(logging.DEBUG)
+before = list(root.handlers), root.level, list(root.filters), root.manager.disable
+try:
+    exec({scene!r})
+except OSError:
+    print("failed")
+assert (root.handlers, root.level, root.filters, root.manager.disable) == before
+"""
+    end = ended(start(code.format(scene=SCENE), XDG_CACHE_HOME=tmp_path, **({"CC": "false"} if fails else {})))
+    assert (end["returncode"], end["stdout"]) == (0, "failed\n" if fails else "ran\n"), end["stderr"]
+
+
+def test_the_users_own_messages_are_not_kept_back(tmp_path):
+    code = f"import logging; logging.basicConfig(level=logging.INFO, force=True)\n{SCENE}\nlogging.info('done')"
+    end = ended(start(code, XDG_CACHE_HOME=tmp_path))
+    assert end["stderr"].splitlines()[-1] == "INFO:root:done" and "gcc" not in end["stderr"]

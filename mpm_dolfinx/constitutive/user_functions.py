@@ -110,7 +110,7 @@ def compiling(what: str, allowed: str) -> Iterator[None]:
     try:
         yield
     except (Exception, ArityMismatch) as error:  # UFL and FFCx have many kinds, one is no Exception
-        if isinstance(error, ValueError) and _is_ours(error):
+        if isinstance(error, (ValueError, OSError)) and _is_ours(error):  # an OSError: the compiler is at fault
             raise
         why = f"{type(error).__name__}: {line_of(error)}"
         raise ValueError(f"{what}: does not compile ({why}), must be {allowed}") from error
