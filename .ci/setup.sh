@@ -10,11 +10,13 @@ root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 modules=(dolfinx scipy tqdm meshio matplotlib)
 
 # One thread per process; pictures without a display; mpirun as root, as in a container; messages
-# through shared memory, for everything runs on one machine (and Open MPI 5 warns about its network).
+# through shared memory, for everything runs on one machine (and Open MPI 5 warns about its network); more
+# processes than cores are allowed (Open MPI 4's name for it, and 5's).
 export OMP_NUM_THREADS="${OMP_NUM_THREADS:-1}"
 export MPLBACKEND="${MPLBACKEND:-Agg}"
 export OMPI_ALLOW_RUN_AS_ROOT=1 OMPI_ALLOW_RUN_AS_ROOT_CONFIRM=1
-export OMPI_MCA_btl="${OMPI_MCA_btl:-^tcp}"
+export OMPI_MCA_btl="${OMPI_MCA_btl:-^tcp}" OMPI_MCA_rmaps_base_oversubscribe=1
+export PRTE_MCA_rmaps_default_mapping_policy="${PRTE_MCA_rmaps_default_mapping_policy:-:oversubscribe}"
 
 say() { echo "$*" >&2; }
 
@@ -69,7 +71,8 @@ debian_install() {
 }
 
 # A .venv on the system's own python, whichever comes first in PATH, for dolfinx belongs to that one.
-# It sees Debian's modules, and this package by a .pth file: an editable installation without pip.
+# It sees Debian's modules, and this package by a .pth file: an editable installation without pip. Where the
+# project's folder cannot be written, the system's python serves, and sees this package by PYTHONPATH.
 make_venv() {
     local venv=$root/.venv site
     python=$venv/bin/python
@@ -79,6 +82,12 @@ make_venv() {
         if [ -x "$python" ] && [ "$(readlink -f "$python")" != "$(readlink -f /usr/bin/python3)" ]; then
             say "$venv is of another python than /usr/bin/python3: move it away, please"
             exit 1
+        fi
+        if ! { mkdir -p "$venv" && [ -w "$venv" ]; } 2>/dev/null; then
+            say "$venv cannot be made: taking /usr/bin/python3. Results go to out/ in the present folder, or to --out."
+            python=/usr/bin/python3
+            export PYTHONPATH="$root${PYTHONPATH:+:$PYTHONPATH}"
+            return
         fi
         /usr/bin/python3 -m venv --without-pip --system-site-packages "$venv"
         echo "$root" >"$venv/$site/mpm_dolfinx.pth"

@@ -1,11 +1,18 @@
 #!/usr/bin/env bash
-# bash demos/run.sh [DEMO] [ARGUMENTS OF THE DEMO]
+# bash demos/run.sh [-n PROCESSES] [DEMO] [ARGUMENTS OF THE DEMO]
 #
 # Installs what is missing (on Debian, as root or with sudo) and runs demos/DEMO.py; without a name,
-# the poroelastic beam. ARGUMENTS: see --help of the demo.
+# the poroelastic beam. ARGUMENTS: see --help of the demo. With -n on so many processes, by mpirun.
 set -euo pipefail
 . "$(dirname "${BASH_SOURCE[0]}")/../.ci/setup.sh"
 
+processes=
+if [ "${1-}" = -n ]; then
+    case ${2-} in
+        "" | 0* | *[!0-9]*) say "-n ${2-}: must be a number of processes, such as -n 2"; exit 2 ;;
+    esac
+    processes=$2 && shift 2
+fi
 demo=poroelastic_beam
 case ${1-} in
     "" | -*) ;;
@@ -18,4 +25,9 @@ if [ ! -f "$root/demos/$demo.py" ]; then
 fi
 
 setup
-exec "$python" "$root/demos/$demo.py" "$@"
+run=("$python" "$root/demos/$demo.py")
+if [ -n "$processes" ]; then
+    command -v mpirun >/dev/null || { say "mpirun is missing: on Debian, apt-get install openmpi-bin"; exit 1; }
+    run=(mpirun -n "$processes" "$python" -m mpi4py "$root/demos/$demo.py") # where one process fails, all end
+fi
+exec "${run[@]}" "$@"

@@ -227,3 +227,35 @@ def test_the_users_own_messages_are_not_kept_back(tmp_path):
     code = f"import logging; logging.basicConfig(level=logging.INFO, force=True)\n{SCENE}\nlogging.info('done')"
     end = ended(start(code, XDG_CACHE_HOME=tmp_path))
     assert end["stderr"].splitlines()[-1] == "INFO:root:done" and "gcc" not in end["stderr"]
+
+
+# ---- the shell's scripts
+
+
+def script(*arguments, **options):
+    clean = environment(PYTHONPATH=None, **{name: None for name in os.environ if name.startswith("OMPI_")})
+    done = subprocess.run(["bash", *map(str, arguments)], env=clean, capture_output=True, text=True, **options)
+    return {"returncode": done.returncode, "stdout": done.stdout, "stderr": done.stderr}
+
+
+def test_a_demo_runs_on_two_processes_also_as_root(tmp_path):
+    beam = ("poroelastic_beam", "--h", "0.1", "--t-end", "0.1", "--out", tmp_path)
+    end = script(ROOT / "demos" / "run.sh", "-n", "2", *beam)
+    assert end["returncode"] == 0, end["stderr"]
+    assert (tmp_path / "pressure.png").exists()
+
+
+@pytest.mark.parametrize("processes", ["0", "two", ""])
+def test_a_number_of_processes_that_is_none_is_refused(processes):
+    end = script(ROOT / "demos" / "run.sh", "-n", processes)
+    assert end["returncode"] == 2 and end["stderr"] == f"-n {processes}: must be a number of processes, such as -n 2\n"
+
+
+@pytest.mark.skipif(shutil.which("apt-get") is None, reason="a .venv is made on Debian only")
+def test_a_demo_runs_from_a_folder_that_cannot_be_written(tmp_path):
+    for part in (".ci", "demos", "mpm_dolfinx"):
+        shutil.copytree(ROOT / part, tmp_path / "project" / part)
+    (tmp_path / "project" / ".venv").write_text("in the way, also root's")
+    end = script(tmp_path / "project" / "demos" / "run.sh", "terzaghi", "--cells", "2", "--steps", "10", cwd=tmp_path)
+    assert end["returncode"] == 0 and (tmp_path / "out" / "terzaghi" / "terzaghi.png").exists(), end["stderr"]
+    assert "/project/.venv cannot be made: taking /usr/bin/python3" in end["stderr"]
