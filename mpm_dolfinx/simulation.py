@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from mpm_dolfinx.constitutive.skeleton import Fluid, Skeleton
 from mpm_dolfinx.errors import StepFailed
 from mpm_dolfinx.io import summary
-from mpm_dolfinx.points.bodies import Body, check_inside
+from mpm_dolfinx.points.bodies import Body, check_different, check_inside
 from mpm_dolfinx.points.grid import Grid
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.points.probes import Probes
@@ -109,6 +109,7 @@ class Simulation:
             raise ValueError(f"pressure = {line(pressure)}: needs a fluid")
         elif sources:
             raise ValueError("sources need a fluid")
+        check_different(bodies)
         chosen("later", later, range(len(bodies)), "indices of the bodies")
         functions("terms", terms)
         functions("sources", sources)

@@ -15,9 +15,9 @@ NAMES = {"argvalues": SIZES.values(), "ids": SIZES}
 def block(origin, size, fixed, **options):
     """Return a simulation of a block, half as high as wide and pressed on a part of its top, and probes on it."""
     lower = np.array([origin, 0.9 * origin])
-    grid = mpm.Grid(lower + [size, size], [10, 10], lower=lower)
-    body = mpm.box(grid, lower, lower + [size, 0.53 * size])
-    part = (lower + [0.2 * size, 0.53 * size], lower + [0.61 * size, 0.53 * size])
+    grid = mpm.Grid(lower + size, [10, 10], lower=lower)
+    body = mpm.box(grid, lower, lower + size * np.array([1, 0.53]))
+    part = (lower + size * np.array([0.2, 0.53]), lower + size * np.array([0.61, 0.53]))
     load = mpm.Traction("top", -1e4, region=part)
     s = mpm.Simulation(grid, [body], [SOIL], fixed=fixed, tractions=[load], **options)
     return s, mpm.probes([body], lower + np.array([[0, 0.53], [0.5, 0.53], [1, 0.2]]) * size)
@@ -64,4 +64,6 @@ def test_what_ends_at_a_side_reaches_it_anywhere(origin):
         load = mpm.Traction("top", -1e3, region=([lower[0], upper[1]], upper))
         s = mpm.Simulation(grid, [body], [SOIL], fixed={"left": "x", "right": "x", "bottom": "y"}, tractions=[load])
         result = s.run(1.0, 1.0, probes=mpm.probes([body], [lower, upper]), progress=False)
-        assert result.displacement[-1] == pytest.approx(np.array([[0, 0], [0, -1e3 * size / SOIL.oedometric]]), rel=1e-3)
+        assert result.displacement[-1] == pytest.approx(
+            np.array([[0, 0], [0, -1e3 * size / SOIL.oedometric]]), rel=1e-3
+        )

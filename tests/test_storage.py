@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import ufl
 from helpers import SOFT, beam, column, set_up
 
 import mpm_dolfinx as mpm
@@ -110,6 +111,30 @@ def test_pressure_jumps_are_damped_only_where_next_to_nothing_flows():
     # flow and damping together carry tau d A on every inner face: here each one half
     row = -np.array([v for v in damping.getRow(3)[1] if v < 0])
     assert len(row) and row == pytest.approx(0.5 * tau * s.grid.h[0] ** 2 * np.ones(len(row)), rel=1e-9)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_jump_between_two_cells_is_damped_by_a_quarter_of_the_published_stabilisation(dim):
+    """S dp V = Q dt - tau h A [dp] where fluid comes into one of them and none flows; the skeleton sees the sum of dp.
+
+    Published: 3 alpha^2 / (8 (lambda + 3G)) in 2D, 9 alpha^2 / (32 (lambda + 4G)) in 3D, for a patch of 2^dim cells.
+    """
+    lam, shear, biot, brought = 2e6, 5e6, 0.8, 1e-6  # the last: share of a cell's volume
+    soil = mpm.Hencky(bulk=lam + 2 * shear / 3, shear=shear, porosity=0.4, biot=biot)
+    grid = mpm.Grid([1.0, *[0.5] * (dim - 1)], [2, *[1] * (dim - 1)])
+    fixed = {side: "xyz"[:dim] for side in ("left", "right", "bottom")} | {"top": "xyz"[: dim - 1]}
+    fixed |= {"front": "xy", "back": "xy"} if dim == 3 else {}
+    body, water = mpm.box(grid, [0] * dim, grid.upper), mpm.Fluid(bulk=1e7)
+
+    def filling(points, q):
+        return brought * ufl.conditional(ufl.lt(points.position[0], 0.5), 1.0, 0.0) * q * points.dx
+
+    s = mpm.Simulation(grid, [body], [soil], fixed=fixed, fluid=water, sources=[filling])
+    s.step(1.0)
+    left, p = s.points.x[:, 0] < 0.5, s.points.pressure
+    patch = 3 * biot**2 / (8 * (lam + 3 * shear)) if dim == 2 else 9 * biot**2 / (32 * (lam + 4 * shear))
+    jump = brought / (0.4 / water.bulk + 2 * patch / 4)
+    assert p[left].mean() - p[~left].mean() == pytest.approx(jump, rel=1e-5)
 
 
 def test_a_cell_that_becomes_active_between_active_nodes_gets_an_unknown():

@@ -12,7 +12,7 @@ from strategies import numbers, orders, repeatable, turned
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.points.cutting import Pieces, cut
-from mpm_dolfinx.points.pressure_transport import Carried, Reconstruction, remap
+from mpm_dolfinx.points.pressure_transport import PiecePressures, Reconstruction, transport
 
 # ---- random motions --------------------------------------------------------------------------------
 
@@ -43,8 +43,8 @@ class Motion:
     def brought(self, pressure, slope, bounds):
         """Return what the pieces after bring, if those before take this along: what is tested, by its names."""
         old = self.before
-        carried = Carried(self.points.id[old.point], old.cell, old.fraction, pressure, self.x, slope, bounds)
-        return remap(carried, self.points, self.after)
+        carried = PiecePressures(self.points.id[old.point], old.cell, old.fraction, pressure, self.x, slope, bounds)
+        return transport(carried, self.points, self.after)
 
     def mean(self, values):
         """Return the mean in each point of values of the pieces before."""

@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: MIT
+"""The package has no hidden state and no circle: what is made is complete, and only the state is replaced."""
+
+import ast
+from graphlib import TopologicalSorter
+from pathlib import Path
+
+import mpm_dolfinx
+
+ROOT = Path(mpm_dolfinx.__file__).parent
+TREES = {path: ast.parse(path.read_text()) for path in ROOT.rglob("*.py")}
+
+
+def assigned(tree):
+    """Yield (class, method, attribute) of what methods set on their own object."""
+    for cls in (node for node in ast.walk(tree) if isinstance(node, ast.ClassDef)):
+        for method in (node for node in cls.body if isinstance(node, ast.FunctionDef)):
+            for node in ast.walk(method):
+                if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store):
+                    if isinstance(node.value, ast.Name) and node.value.id == "self":
+                        yield cls.name, method.name, node.attr
+
+
+def module(path):
+    return ".".join(["mpm_dolfinx", *path.relative_to(ROOT).with_suffix("").parts]).removesuffix(".__init__")
+
+
+def test_imports_make_no_circle():
+    names = {module(path) for path in TREES}
+    arrows = {name: set() for name in names}
+    for path, tree in TREES.items():
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("mpm_dolfinx"):
+                inner = {f"{node.module}.{alias.name}" for alias in node.names} & names
+                arrows[module(path)] |= inner or {node.module}
+    assert tuple(TopologicalSorter(arrows).static_order())
+
+
+def test_nothing_but_the_state_is_set_outside_of_init():
+    late = {(cls, name) for tree in TREES.values() for cls, method, name in assigned(tree) if method != "__init__"}
+    assert late <= {("Simulation", "state")}, "and, at import, fields of a Checkpoint"
+
+
+def test_no_class_has_more_than_twenty_attributes():
+    found = {}
+    for path, tree in TREES.items():
+        for cls, _, name in assigned(tree):
+            found.setdefault((path.name, cls), set()).add(name)
+    assert {cls: len(names) for cls, names in found.items() if len(names) > 20} == {}
+
+
+def test_the_step_is_a_page():
+    assert len((ROOT / "step.py").read_text().splitlines()) <= 60
+    assert len((ROOT / "simulation.py").read_text().splitlines()) <= 300
