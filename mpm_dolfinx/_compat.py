@@ -8,6 +8,7 @@ it goes; the branches marked OLD are those of 0.5.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -148,7 +149,12 @@ class CompiledForm:
             count = self._compiled.ufcx_form.num_coefficients
             self._all = coefficients
         self.coefficients = [coefficients[position[i]] for i in range(count)]
-        self.form = None
+        self._last: list = []
+
+    @property
+    def form(self):
+        """The form as it was bound last."""
+        return self._last[0]
 
     def bind(self, entities: NDArray[np.int32]):
         """Set the cells (repeats allowed) or the interior facets over which the form is integrated; return it so bound.
@@ -163,7 +169,7 @@ class CompiledForm:
             values = np.full(len(entities), SUBDOMAIN, dtype=np.int32)
             tags = cpp.mesh.MeshTags_int32(self.mesh, dim, entities, values)
             ffi = self._module.ffi
-            self.form = cpp.fem.Form_float64(
+            form = cpp.fem.Form_float64(
                 int(ffi.cast("uintptr_t", ffi.addressof(self._ufcx))),
                 [V._cpp_object for V in self._spaces],
                 [c._cpp_object for c in self.coefficients],
@@ -171,6 +177,7 @@ class CompiledForm:
                 {kind: tags},
                 self.mesh,
             )
+            self._last[:] = [form]
         else:
             if not cells:
                 entities = _facet_cells(self.mesh, entities, dim)
@@ -182,7 +189,7 @@ class CompiledForm:
                 {c: c for c in self._all},
                 {c: c for c in self._constants},
             )
-            self._bound, self.form = bound, bound._cpp_object
+            self._last[:] = bound._cpp_object, bound
         return self.form
 
     def packed(self, form=None) -> dict:
@@ -205,12 +212,11 @@ class CompiledForm:
         if rows is None:
             return self.packed(form)
         # 0.11 counts the integrals where earlier releases name the subdomain
-        return {(fem.IntegralType.cell, key): rows for key in self._keys()}
+        return {(fem.IntegralType.cell, key): rows for key in self._keys}
 
+    @cached_property
     def _keys(self) -> list[int]:
-        if not hasattr(self, "_key"):
-            self._key = [key for _, key in self.packed()] or [SUBDOMAIN]
-        return self._key
+        return [key for _, key in self.packed()] or [SUBDOMAIN]
 
 
 def _mesh_of(form: ufl.Form):

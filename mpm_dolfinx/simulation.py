@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from mpm_dolfinx.constitutive.skeleton import Fluid, Skeleton
 from mpm_dolfinx.errors import StepFailed
 from mpm_dolfinx.io import summary
-from mpm_dolfinx.points.bodies import Body, check_different, check_inside
+from mpm_dolfinx.points.bodies import Body, check_bodies
 from mpm_dolfinx.points.grid import Grid
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.points.probes import Probes
@@ -109,18 +109,13 @@ class Simulation:
             raise ValueError(f"pressure = {line(pressure)}: needs a fluid")
         elif sources:
             raise ValueError("sources need a fluid")
-        check_different(bodies)
+        check_bodies(grid, bodies)
         chosen("later", later, range(len(bodies)), "indices of the bodies")
         functions("terms", terms)
         functions("sources", sources)
-        for i, body in enumerate(bodies):
-            if body.lower.shape[1] != grid.dim:
-                raise ValueError(f"body {i}: has {body.lower.shape[1]} coordinates, must have the grid's {grid.dim}")
-            check_inside(grid, body, f"body {i}")
         grid.share(np.concatenate([body.centre for body in bodies]))
         warn_thin(grid, bodies, fixed)
-        began = time.perf_counter()
-        weighs = gravity is not None
+        began, weighs = time.perf_counter(), gravity is not None
         self.scene = Scene(grid, bodies, materials, fluid, quadrature, scheme, weighs, pressure, terms, sources)
         conditions = {"fixed": fixed, "tractions": tractions, "displacements": displacements, "drained": drained}
         conditions |= {"inflows": inflows, "plates": plates, "gravity": gravity}

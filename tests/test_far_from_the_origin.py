@@ -13,9 +13,14 @@ NAMES = {"argvalues": SIZES.values(), "ids": SIZES}
 
 
 def block(origin, size, fixed, **options):
-    """Return a simulation of a block, half as high as wide and pressed on a part of its top, and probes on it."""
+    """Return a simulation of a block, half as high as wide and pressed on a part of its top, and probes on it.
+
+    There is room beside it, but where a wall holds it.
+    """
     lower = np.array([origin, 0.9 * origin])
-    grid = mpm.Grid(lower + size, [10, 10], lower=lower)
+    room = [[side not in fixed for side in sides] for sides in (("left", "bottom"), ("right", "top"))]
+    least, most = lower - 0.1 * size * np.array(room[0]), lower + size + 0.1 * size * np.array(room[1])
+    grid = mpm.Grid(most, np.rint((most - least) / size * 10), lower=least)
     body = mpm.box(grid, lower, lower + size * np.array([1, 0.53]))
     part = (lower + size * np.array([0.2, 0.53]), lower + size * np.array([0.61, 0.53]))
     load = mpm.Traction("top", -1e4, region=part)

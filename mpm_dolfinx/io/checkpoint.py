@@ -59,7 +59,7 @@ class Checkpoint:
     file: str | os.PathLike
     every: int = 1
     seconds: float = 0.0
-    _last: float = field(default_factory=time.monotonic, init=False, repr=False)
+    _written: list[float] = field(default_factory=lambda: [time.monotonic()], init=False, repr=False)
 
     def __post_init__(self):
         if path("checkpoint: file", self.file).is_dir():
@@ -72,10 +72,10 @@ class Checkpoint:
         result, comm = simulation.result, simulation.grid.comm
         due = (len(result.rows) - 1) % self.every == 0
         if due and self.seconds > 0:
-            due = comm.bcast(time.monotonic() - self._last >= self.seconds)
+            due = comm.bcast(time.monotonic() - self._written[0] >= self.seconds)
         if due or result.converged:
             save(simulation, Path(self.file))
-            self._last = time.monotonic()
+            self._written[0] = time.monotonic()
 
 
 def save(simulation: Simulation, file: Path) -> None:

@@ -75,7 +75,7 @@ class Writer:
         instance("writer: simulation", simulation, Simulation)
         flag("writer: grid", grid)
         folder, comm, self._t = path("writer: folder", folder), simulation.grid.comm, simulation.t
-        self.every, self._started, self._simulation = whole("writer: every", every), False, simulation
+        self.every, self._simulation = whole("writer: every", every), simulation
         self._reactions = simulation.reactions  # at the start
         with on_disk("writer: folder", "one that can be written"):
             self._table = Table(comm, folder / "history.csv", self._t)
@@ -93,7 +93,7 @@ class Writer:
 
     def _write(self, simulation: Simulation) -> None:
         result = simulation.result
-        if not self._started:
+        if not self._table.columns:
             self._start(result)
         self._table.add(_row(result, simulation.reactions))
         if (len(result.rows) - 1) % self.every and not result.converged:
@@ -112,7 +112,6 @@ class Writer:
         self._points.write_index()
         if self._grid is not None:
             self._grid.write_index()
-        self._started = True
 
     def _write_points(self, simulation: Simulation) -> None:
         comm, file = simulation.grid.comm, self._points.next.with_suffix(".vtu")
@@ -295,6 +294,8 @@ class Table:
     def __init__(self, comm: MPI.Intracomm, file: Path, t: float):
         self.comm, self.file = comm, file
         self._rows = at_root(comm, lambda: kept(self._read(), t))
+        self.columns: list[str] = []
+        """Names of the columns, once it has been started."""
 
     def _read(self) -> list[tuple[float, dict[str, str]]]:
         if not self.file.exists():
@@ -307,7 +308,7 @@ class Table:
     def start(self, first: dict[str, float]) -> None:
         """Write the rows that were kept, or else a first row."""
         rows = [row for _, row in self._rows] or [first]
-        self._columns = list(rows[0])
+        self.columns[:] = rows[0]
         self._check(first)
 
         def write() -> None:
@@ -322,8 +323,8 @@ class Table:
         at_root(self.comm, lambda: self._append(self.file, [row], "a"))
 
     def _check(self, row: dict[str, float]) -> None:
-        if list(row) != self._columns:
-            both = f"{', '.join(self._columns)}, the run's {', '.join(row)}"
+        if list(row) != self.columns:
+            both = f"{', '.join(self.columns)}, the run's {', '.join(row)}"
             raise ValueError(f"{self.file}: its columns are {both}; must be the same, or in another folder")
 
     @staticmethod

@@ -208,6 +208,15 @@ def material_points(grid: Grid, bodies: Sequence[Body], pressure: float = 0.0) -
     )
 
 
+def check_bodies(grid: Grid, bodies: Sequence[Body]) -> None:
+    """Refuse bodies of another dimension or outside of the grid, and a list that names one twice."""
+    check_different(bodies)
+    for i, body in enumerate(bodies):
+        if body.lower.shape[1] != grid.dim:
+            raise ValueError(f"body {i}: has {body.lower.shape[1]} coordinates, must have the grid's {grid.dim}")
+        check_inside(grid, body, f"body {i}")
+
+
 def check_different(bodies: Sequence[Body]) -> None:
     """Refuse a list that names a body twice: conditions would count its faces twice and act on one of the two."""
     for j, body in enumerate(bodies):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import reduce
+from typing import Any
 
 from mpi4py import MPI
 
@@ -27,10 +28,10 @@ SIDES = {
 
 
 SHARED = frozenset(
-    "mesh num_owned num_local cell_nodes node_x midpoints signs cell_number cell_facets facet_cells "
-    "_owner _local _facets_owned".split()
+    "mesh num_owned num_local cell_nodes node_x midpoints signs cell_number cell_facets facet_cells facets_owned "
+    "owners locals".split()
 )
-"""What of a grid is made with its mesh."""
+"""What of a grid is made with its mesh, see `Cells`."""
 MOST = 2**31 - 1
 """Unknowns that PETSc's numbers of 32 bits count."""
 
@@ -50,6 +51,40 @@ def sum_by(index: NDArray, values: NDArray[np.float64], size: int) -> NDArray[np
 def rounding(x: NDArray[np.float64]) -> float:
     """Return by how much coordinates of this size, m, may differ although they should be equal."""
     return 8 * np.finfo(float).eps * float(np.abs(x).max(initial=0.0))
+
+
+class Cells:
+    """The cells of a grid that this process has, ghosts included, as the mesh numbers them; complete when made.
+
+    num_owned, num_local: number of cells without and with ghosts; cell_nodes (cells, 2^d): their nodes, numbered as
+    the Q1 degrees of freedom; node_x (nodes, d), midpoints (cells, d): positions, m; signs (2^d, d): on which side of
+    the midpoint a node lies; cell_number (cells,): lexicographic numbers; locals: the way back, -1 where there is none;
+    owners: ranks of all cells of the grid; cell_facets (cells, 2d); facet_cells (facets, 2): -1 where there is none.
+    """
+
+    def __init__(self, grid: Grid, mesh: Any, owners: NDArray[np.int32]):
+        self.mesh, self.owners, d = mesh, owners, grid.dim
+        nodes = _compat.function_space(mesh, "Lagrange", 1)
+        self.num_owned, self.num_local = _compat.num_cells(mesh)
+        self.cell_nodes = _compat.cell_dofs(nodes)
+        self.node_x = nodes.tabulate_dof_coordinates()[:, :d]
+        corners = self.node_x[self.cell_nodes]
+        self.midpoints = corners.mean(axis=1)
+        # all cells list their vertices in the same order (tested), so one set of signs serves all
+        self.signs = np.sign(corners[0] - self.midpoints[0]) if len(corners) else np.zeros((2**d, d))
+        self.cell_number = grid.number(np.floor((self.midpoints - grid.lower) / grid.h).astype(np.int64))
+        self.locals = np.full(len(owners), -1, dtype=np.int32)
+        self.locals[self.cell_number] = np.arange(self.num_local)
+        topology = mesh.topology
+        topology.create_connectivity(d, d - 1)
+        topology.create_connectivity(d - 1, d)
+        self.cell_facets = topology.connectivity(d, d - 1).array.reshape(-1, 2 * d)
+        adjacency = topology.connectivity(d - 1, d)
+        first = adjacency.offsets[:-1]
+        two = np.diff(adjacency.offsets) == 2
+        self.facet_cells = np.stack([adjacency.array[first], np.full(len(first), -1, dtype=np.int32)], axis=1)
+        self.facet_cells[two, 1] = adjacency.array[first[two] + 1]
+        self.facets_owned = topology.index_map(d - 1).size_local
 
 
 class Grid:
@@ -107,36 +142,25 @@ class Grid:
             )
         self.h = (self.upper - self.lower) / self.shape
         self.comm = comm
+        self._made: list[Cells] = []
         self._spaces: dict[tuple[int, ...], fem.FunctionSpace] = {}
         self._coefficients: dict[tuple[int, ...], fem.Function] = {}
 
     def __getattr__(self, name: str):
         """Make the mesh when first something of it is asked for."""
-        if name not in SHARED or "mesh" in self.__dict__:  # notebooks ask for `_repr_html_`, `copy` for other names
+        if name not in SHARED:  # notebooks ask for `_repr_html_`, `copy` for other names
             raise AttributeError(f"the grid has no {name!r}")
         self.share(np.zeros((0, self.dim)))
-        return getattr(self, name)
+        return getattr(self._made[0], name)
 
     def share(self, x: NDArray[np.float64]) -> None:
         """Make the mesh, its cells shared out among the processes by the points x (n, d), m; once."""
-        if "mesh" in self.__dict__:
-            return
-        load = sum_by(self.number(self.index(x)), np.ones(len(x)), int(np.prod(self.shape)))
-        owner = owners(load.reshape(self.shape), self.comm.size)
-        self._owner = owner.ravel()
-        own = np.flatnonzero(self._owner == self.comm.rank)
-        self.mesh = _compat.box_mesh(self.comm, self._corners(own), self._nodes(), *destinations(owner, own))
-        nodes = _compat.function_space(self.mesh, "Lagrange", 1)
-        self.num_owned, self.num_local = _compat.num_cells(self.mesh)
-        self.cell_nodes = _compat.cell_dofs(nodes)
-        """(cells, 2^d): nodes of the cells, numbered as the Q1 degrees of freedom."""
-        self.node_x = nodes.tabulate_dof_coordinates()[:, : self.dim]
-        corners = self.node_x[self.cell_nodes]
-        self.midpoints = corners.mean(axis=1)
-        # all cells list their vertices in the same order (tested), so one set of signs serves all
-        self.signs = np.sign(corners[0] - self.midpoints[0]) if len(corners) else np.zeros((2**self.dim, self.dim))
-        self._lookup()
-        self._facets()
+        if not self._made:
+            load = sum_by(self.number(self.index(x)), np.ones(len(x)), int(np.prod(self.shape)))
+            owner = owners(load.reshape(self.shape), self.comm.size)
+            own = np.flatnonzero(owner.ravel() == self.comm.rank)
+            mesh = _compat.box_mesh(self.comm, self._corners(own), self._nodes(), *destinations(owner, own))
+            self._made.append(Cells(self, mesh, owner.ravel()))
 
     def _corners(self, cells: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return the lexicographic numbers of the nodes (n, 2^d) of cells."""
@@ -169,24 +193,6 @@ class Grid:
         """Volume of a cell (m^d)."""
         return float(np.prod(self.h))
 
-    def _lookup(self) -> None:
-        """Make the table from the lexicographic number of a cell to the local cell."""
-        self.cell_number = self.number(np.floor((self.midpoints - self.lower) / self.h).astype(np.int64))
-        self._local = np.full(int(np.prod(self.shape)), -1, dtype=np.int32)
-        self._local[self.cell_number] = np.arange(self.num_local)
-
-    def _facets(self) -> None:
-        topology, d = self.mesh.topology, self.dim
-        topology.create_connectivity(d, d - 1)
-        topology.create_connectivity(d - 1, d)
-        self.cell_facets = topology.connectivity(d, d - 1).array.reshape(-1, 2 * d)
-        adjacency = topology.connectivity(d - 1, d)
-        first = adjacency.offsets[:-1]
-        two = np.diff(adjacency.offsets) == 2
-        self.facet_cells = np.stack([adjacency.array[first], np.full(len(first), -1, dtype=np.int32)], axis=1)
-        self.facet_cells[two, 1] = adjacency.array[first[two] + 1]
-        self._facets_owned = topology.index_map(d - 1).size_local
-
     def number(self, index: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return the lexicographic numbers of cells from their (n, d) indices along the axes."""
         return np.ravel_multi_index(tuple(index.T), tuple(self.shape))
@@ -198,11 +204,11 @@ class Grid:
 
     def owner(self, number: NDArray[np.int64]) -> NDArray[np.int32]:
         """Return the rank that owns each cell, given by its lexicographic number."""
-        return self._owner[number]
+        return self.owners[number]
 
     def local(self, number: NDArray[np.int64]) -> NDArray[np.int32]:
         """Return this process's index of each cell, -1 where it does not have the cell."""
-        return self._local[number]
+        return self.locals[number]
 
     def outside(self, x: NDArray[np.float64], tolerance: float = 1e-9) -> NDArray[np.bool_]:
         """Return which points lie outside the grid by more than `tolerance` cells, and what is lost in rounding."""
@@ -240,7 +246,7 @@ class Grid:
     def interior_facets(self, active: NDArray[np.bool_], cells: NDArray[np.int32]) -> NDArray[np.int32]:
         """Return the facets of this process between two active cells (`cells` = where `active` holds)."""
         facets = np.unique(self.cell_facets[cells])
-        facets = facets[facets < self._facets_owned]
+        facets = facets[facets < self.facets_owned]
         both = self.facet_cells[facets]
         return facets[(both[:, 1] >= 0) & active[both[:, 0]] & active[both[:, 1]]]
 

@@ -79,23 +79,24 @@ class MomentumForms:
         self.u = fem.Function(V)
         """Increment of the displacement since the start of the step, m."""
         self._work = [fem.Function(V) for _ in range(4)]  # internal, own, external forces, and pulls of given sides
-        self.symmetric, self.holding = symmetric, False
-        self.linear = not mean_dilatation and all(law.linear for law, _ in laws)
-        """Whether the tangent changes with the places of the points only."""
         self.dilatation = MeanDilatation(pieces, self.u, symmetric) if mean_dilatation else None
         self._residuals, self._tangents, self._own_tangents = [], [], []
         self.terms: list[PointForm] = []
         for law, points in laws:
-            self._add_law(law, points, pressure)
-        for term in terms:
-            self._add_term(term, pieces, t, dt)
+            self._add_law(law, points, pressure, symmetric)
+        kept = [self._add_term(term, pieces, t, dt) for term in terms]
+        self.symmetric = symmetric and all(potential or not holds for potential, holds in kept)
+        self.holding = any(holds for _, holds in kept)
+        """Whether terms of the user's depend on u."""
+        self.linear = not mean_dilatation and not self.holding and all(law.linear for law, _ in laws)
+        """Whether the tangent changes with the places of the points only."""
         self.weight = None
         if gravity is not None:
             v = ufl.TestFunction(V)
             self.weight = PointForm(pieces.density * ufl.inner(gravity, pieces.value(v)) * pieces.dx, pieces)
         self.sides, self.ghost = SideForms(grid, V), GhostPenalty(grid, V)
 
-    def _add_law(self, law: type[Skeleton], points: FormPoints, pressure: fem.Function | None) -> None:
+    def _add_law(self, law: type[Skeleton], points: FormPoints, pressure: fem.Function | None, symmetric: bool) -> None:
         """Compile residual and tangent of the pieces that follow a law."""
         F, v = points.deformation(self.u), ufl.TestFunction(self.u.function_space)
         values = {name: getattr(points, name) for name in (*law.parameters, *law.state)}
@@ -112,13 +113,13 @@ class MomentumForms:
         if self.grid.dim == 2:
             self._residuals.append(PointForm(ufl.inner(P, points.grad(v) * points.F) * points.dx, points))
             A = ufl.as_tensor(A[i, m, j, n] * points.F[k, m] * points.F[l, n], (i, k, j, l))
-            self._tangents.append(ElementMatrices(A, points, self.symmetric))
+            self._tangents.append(ElementMatrices(A, points, symmetric))
         else:
             self._residuals.append(ElementForces(P * points.F.T, points))
-            self._tangents.append(StackedElementMatrices(A, points, self.symmetric))
+            self._tangents.append(StackedElementMatrices(A, points, symmetric))
 
-    def _add_term(self, term: Callable, pieces: FormPoints, t: fem.Constant, dt: fem.Constant) -> None:
-        """Add a term of the user's: see `user_functions`."""
+    def _add_term(self, term: Callable, pieces: FormPoints, t: fem.Constant, dt: fem.Constant) -> tuple[bool, bool]:
+        """Add a term of the user's; return whether it has a potential, and whether it depends on u."""
         V = self.u.function_space
         v, du = ufl.TestFunction(V), ufl.TrialFunction(V)
         form = form_of("terms", term, points=pieces, u=self.u, v=v, t=t, dt=dt)
@@ -129,10 +130,10 @@ class MomentumForms:
             form = ufl.derivative(form, self.u, v)
         with compiling(f"terms: {line(term)}", "linear in v, or an energy of u"):
             self.terms.append(PointForm(form, pieces))
-        if self.u in form.coefficients():
+        holds = self.u in form.coefficients()
+        if holds:
             self._own_tangents.append(PointForm(ufl.derivative(form, self.u, du), pieces))
-            self.holding, self.linear = True, False
-            self.symmetric = self.symmetric and potential
+        return potential, holds
 
     def external(self, data: QuadratureData, sides: SideData) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the nodal forces of dead loads, weight and tilted plates, and of given displacements, local arrays."""

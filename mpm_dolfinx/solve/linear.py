@@ -16,6 +16,7 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
+from mpm_dolfinx.caching import Latest
 from mpm_dolfinx.forms.unknowns import Unknowns
 
 ITERATIVE = 1500
@@ -103,74 +104,89 @@ class NodalFactors:
         comm = unknowns.comm
         counts = np.concatenate([[0], np.cumsum(comm.allgather(len(np.unique(node))))])
         block = counts[comm.rank] + np.unique(node, return_inverse=True)[1]
-        self._block, self._axis = (np.concatenate(comm.allgather(rows)) for rows in (block, axis))
-        self._count, self._size = int(counts[-1]), unknowns.dim
+        self._nodes = tuple(np.concatenate(comm.allgather(rows)) for rows in (block, axis))
+        self._dim, self._symmetric = unknowns.dim, symmetric
         start = int(comm.exscan(unknowns.size) or 0) if comm.size > 1 else 0
-        self._mine, self._symmetric = slice(start, start + unknowns.size), symmetric
+        self._mine = slice(start, start + unknowns.size)
         self._gather = PETSc.Scatter.toAll(unknowns.vector()) if comm.size > 1 else None
-        self._rows = self._columns = np.empty(0, dtype=np.int32)
-        self._solver: PETSc.KSP | None = None
+        self._factors: Latest[BlockFactors] = Latest()
 
     def setUp(self, pc: PETSc.PC) -> None:
         """Factorise the present matrix."""
         A, _ = pc.getOperators()
         whole = A if A.comm.size == 1 else A.getRedundantMatrix(A.comm.size, PETSc.COMM_SELF)
         rows, columns, values = whole.getValuesCSR()
-        if self._solver is None or not (np.array_equal(rows, self._rows) and np.array_equal(columns, self._columns)):
-            self._rows, self._columns = rows, columns
-            self._analyse(whole)
-        self._fill(values)
+        make = (whole, rows, columns, *self._nodes, self._dim, self._symmetric)
+        self._factors((rows, columns), lambda: BlockFactors(*make)).factorise(values)
         if whole is not A:
             whole.destroy()
 
-    def _analyse(self, A: PETSc.Mat) -> None:
-        """Find the order of the blocks, and where the entries of A go."""
-        ordered = self._block[A.getOrdering("amd")[0].indices]
+    def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """Solve with the factors."""
+        whole = x
+        if self._gather is not None:
+            scatter, whole = self._gather
+            scatter.scatter(x, whole)
+        y.array_w[:] = self._factors.value.solve(whole.array_r)[self._mine]
+
+
+class BlockFactors:
+    """Factors of matrices of one pattern, with a block a node.
+
+    Parameters
+    ----------
+    A, rows, columns
+        A matrix, and its pattern.
+    block, axis
+        Node and component of each unknown.
+    dim
+        Components of a node.
+    symmetric
+        Factors are U^T D U; if not, L U.
+    """
+
+    def __init__(self, A: PETSc.Mat, rows, columns, block, axis, dim: int, symmetric: bool):
+        count = int(block.max(initial=-1)) + 1
+        ordered = block[A.getOrdering("amd")[0].indices]
         found, first = np.unique(ordered, return_index=True)
-        rank = np.empty(self._count, dtype=np.int64)
-        rank[found[np.argsort(first)]] = np.arange(self._count)
-        self._place = rank[self._block] * self._size + self._axis
-        i, j = np.repeat(self._place, np.diff(self._rows)), self._place[self._columns]
+        rank = np.empty(count, dtype=np.int64)
+        rank[found[np.argsort(first)]] = np.arange(count)
+        self._place = rank[block] * dim + axis
+        i, j = np.repeat(self._place, np.diff(rows)), self._place[columns]
         kept = np.arange(len(i))
-        if self._symmetric:  # the upper triangle
-            kept = np.flatnonzero(i // self._size <= j // self._size)
+        if symmetric:  # the upper triangle
+            kept = np.flatnonzero(i // dim <= j // dim)
         # 1 on the diagonal where a component of a node is no unknown
-        missing = np.setdiff1d(np.arange(self._count * self._size), self._place)
+        missing = np.setdiff1d(np.arange(count * dim), self._place)
         number = np.concatenate([kept, np.full(len(missing), len(i))]) + 1
-        where = np.concatenate([i[kept], missing]), np.concatenate([j[kept], missing])
-        n = self._count * self._size
-        blocks = scipy.sparse.coo_matrix((number, where), shape=(n, n)).tocsr().tobsr((self._size, self._size))
+        where, n = (np.concatenate([i[kept], missing]), np.concatenate([j[kept], missing])), count * dim
+        blocks = scipy.sparse.coo_matrix((number, where), shape=(n, n)).tocsr().tobsr((dim, dim))
         blocks.sort_indices()
         self._source = blocks.data
         self._pattern = blocks.indptr.astype(PETSc.IntType), blocks.indices.astype(PETSc.IntType)
-        make = PETSc.Mat().createSBAIJ if self._symmetric else PETSc.Mat().createBAIJ
-        self._matrix = make((n, n), self._size, csr=(*self._pattern, np.zeros(blocks.data.shape)), comm=PETSc.COMM_SELF)
+        make = PETSc.Mat().createSBAIJ if symmetric else PETSc.Mat().createBAIJ
+        self._matrix = make((n, n), dim, csr=(*self._pattern, np.zeros(blocks.data.shape)), comm=PETSc.COMM_SELF)
         self._solver = ksp = PETSc.KSP().create(PETSc.COMM_SELF)
         ksp.setType(PETSc.KSP.Type.PREONLY)
-        ksp.pc.setType(PETSc.PC.Type.CHOLESKY if self._symmetric else PETSc.PC.Type.LU)
+        ksp.pc.setType(PETSc.PC.Type.CHOLESKY if symmetric else PETSc.PC.Type.LU)
         ksp.pc.setFactorOrdering("natural")
         ksp.pc.setFactorPivot(0.0)  # see `direct_solver`
         ksp.setOperators(self._matrix)
         self._b, self._x = self._matrix.createVecs()
         self._b.set(0.0)
 
-    def _fill(self, values: NDArray[np.float64]) -> None:
+    def factorise(self, values: NDArray[np.float64]) -> None:
         """Factorise the matrix of these entries."""
         self._matrix.setValuesBlockedIJV(*self._pattern, np.concatenate([[0.0], values, [1.0]])[self._source])
         self._matrix.assemble()
         self._solver.setOperators(self._matrix)
         self._solver.setUp()
 
-    def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """Solve with the factors."""
-        if self._gather is None:
-            self._b.array_w[self._place] = x.array_r
-        else:
-            scatter, whole = self._gather
-            scatter.scatter(x, whole)
-            self._b.array_w[self._place] = whole.array_r
+    def solve(self, b: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the solution for all unknowns."""
+        self._b.array_w[self._place] = b
         self._solver.solve(self._b, self._x)
-        y.array_w[:] = self._x.array_r[self._place[self._mine]]
+        return self._x.array_r[self._place]
 
 
 def multigrid_solver(A: PETSc.Mat, name: str) -> PETSc.KSP:

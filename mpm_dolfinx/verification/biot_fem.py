@@ -17,6 +17,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import Any, NamedTuple
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -41,6 +42,34 @@ from mpm_dolfinx.validation import all_of, line, numbers
 
 ELEMENTS = {"taylor-hood": (2, ("Lagrange", 1, ())), "q1-dg0": (1, ("DG", 0, ()))}  # degree of u; space of p
 CUT_DEGREE = 20  # of quadrature on a side of which a region is loaded: the region's edge may cut facets
+
+
+class Space:
+    """The space W of the unknowns w = (u, p/scale), or of w = u, and functions in it.
+
+    old: w at the start of the step; b, f: residual and loads; u: the displacement; p_dofs: where the pressures are.
+    """
+
+    def __init__(self, grid: Grid, wet: bool, degree: int, pressure: tuple[str, int, tuple[int, ...]]):
+        self.degree, vector = degree, ("Lagrange", degree, (grid.dim,))
+        if wet:
+            self.W = _compat.mixed_space(grid.mesh, [vector, pressure])
+            self.p_dofs = np.asarray(self.W.sub(1).collapse()[1])
+        else:
+            self.W, self.p_dofs = _compat.function_space(grid.mesh, *vector), slice(0)
+        self.w, self.old, self.b, self.f = (fem.Function(self.W) for _ in range(4))
+        self.u = self.w.sub(0) if wet else self.w
+
+
+class Forms(NamedTuple):
+    """Compiled residual, tangent and loads, and the constants in them: length of the step, tractions, weight."""
+
+    residual: Any
+    tangent: Any
+    load: Any | None
+    dt: fem.Constant
+    tractions: list[tuple[Traction, fem.Constant]]
+    weight: fem.Constant
 
 
 class BiotFEM:
@@ -98,10 +127,10 @@ class BiotFEM:
                 "parameters of the law may be functions of place, the rest must be numbers"
             )
         self.grid, self.material, self.fluid = Grid(upper, cells, lower, comm), material, fluid
-        self.t, self.tolerance = 0.0, tolerance
+        self.tolerance, self._t = tolerance, fem.Constant(self.grid.mesh, 0.0)
         self.scale = float(np.max(material.at(self.grid.midpoints).oedometric))
         """Unit of the pressure among the unknowns, Pa; both equations are divided by it."""
-        self._make_spaces(*ELEMENTS[element])
+        self._space = Space(self.grid, fluid is not None, *ELEMENTS[element])
         self._bcs = self._conditions(fixed, drained if element == "taylor-hood" else ())
         start = time.perf_counter()
         self._gravity = gravity
@@ -110,9 +139,14 @@ class BiotFEM:
             if not callable(load.value):
                 self._traction(load, 0.0)
         tractions = [*tractions, *(plate.traction(area, self.grid.dim) for plate, area in self._plates)]
-        self._compile(tractions, drained if element == "q1-dg0" else None)
+        self._forms = self._compile(tractions, drained if element == "q1-dg0" else None)
         self.jit = time.perf_counter() - start  # s, compiling or finding the forms
-        self._make_solver()
+        self._snes = self._solver()
+
+    @property
+    def t(self) -> float:
+        """Time, s."""
+        return float(self._t.value)
 
     def _constant(self, value: ArrayLike) -> fem.Constant:
         return fem.Constant(self.grid.mesh, np.asarray(value, dtype=float))
@@ -126,17 +160,6 @@ class BiotFEM:
         f = fem.Function(_compat.function_space(self.grid.mesh, "DG", 2, shape))
         f.interpolate(lambda x: np.asarray(value(x[:d].T), dtype=float).T)
         return f
-
-    def _make_spaces(self, degree: int, pressure: tuple[str, int, tuple[int, ...]]) -> None:
-        """Make the space of the unknowns w = (u, p/scale), or of w = u."""
-        self._degree, msh, vector = degree, self.grid.mesh, ("Lagrange", degree, (self.grid.dim,))
-        if self.fluid:
-            self._W = _compat.mixed_space(msh, [vector, pressure])
-            self._p_dofs = np.asarray(self._W.sub(1).collapse()[1])
-        else:
-            self._W, self._p_dofs = _compat.function_space(msh, *vector), slice(0)
-        self.w, self._old, self._b, self._f = (fem.Function(self._W) for _ in range(4))
-        self._u = self.w.sub(0) if self.fluid else self.w
 
     def _box(self, name: str, region: Region | None = None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the corners of a flat box around a side, or around the part of it in a region."""
@@ -157,12 +180,12 @@ class BiotFEM:
 
     def _conditions(self, fixed: Mapping[str, str], drained: Sequence[Drained]) -> list:
         """Return the conditions of zero displacement and of nodal pressure."""
-        axes, bcs, space = "xyz"[: self.grid.dim], [], self._u.function_space
+        axes, bcs, space = "xyz"[: self.grid.dim], [], self._space.u.function_space
         for name, held in fixed.items():
             if not isinstance(held, str) or not held or not set(held) <= set(axes):
                 raise ValueError(f"fixed side {name!r}: components {held!r}, must be some of {axes!r}")
             bcs += [self._prescribe(space.sub(axes.index(a)), 0.0, name) for a in held]
-        return bcs + [self._prescribe(self._W.sub(1), o.pressure / self.scale, o.side, o.region) for o in drained]
+        return bcs + [self._prescribe(self._space.W.sub(1), o.pressure / self.scale, o.side, o.region) for o in drained]
 
     def _area(self, condition: RigidPlate) -> float:
         """Return the area of the part of a side that a condition names (m^(d-1))."""
@@ -175,16 +198,16 @@ class BiotFEM:
         low, high = map(self._constant, self._box(condition.side, condition.region))
         for a, x in enumerate(ufl.SpatialCoordinate(self.grid.mesh)):
             integrand = ufl.conditional(ufl.And(ufl.ge(x, low[a]), ufl.le(x, high[a])), integrand, 0.0)
-        degree = 2 * self._degree if condition.region is None else CUT_DEGREE
+        degree = 2 * self._space.degree if condition.region is None else CUT_DEGREE
         return integrand * ufl.ds(domain=self.grid.mesh, metadata={"quadrature_degree": degree})
 
-    def _compile(self, tractions: Sequence[Traction], outlets: Sequence[Drained] | None) -> None:
+    def _compile(self, tractions: Sequence[Traction], outlets: Sequence[Drained] | None) -> Forms:
         """Compile loads, residual and tangent; with `outlets` the pressure is constant in the cells."""
-        self._dt = self._constant(1.0)
-        self._loads = [(load, self._constant(np.zeros(self.grid.dim))) for load in tractions]
+        dt, weight = self._constant(1.0), self._constant(np.zeros(self.grid.dim))
+        given = [(load, self._constant(np.zeros(self.grid.dim))) for load in tractions]
         law, split = self.material, ufl.split if self.fluid else lambda f: (f, 0)
-        (u, p), (u_n, p_n), (v, q) = map(split, (self.w, self._old, ufl.TestFunction(self._W)))
-        dx = ufl.dx(domain=self.grid.mesh, metadata={"quadrature_degree": 2 * self._degree})
+        (u, p), (u_n, p_n), (v, q) = map(split, (self._space.w, self._space.old, ufl.TestFunction(self._space.W)))
+        dx = ufl.dx(domain=self.grid.mesh, metadata={"quadrature_degree": 2 * self._space.degree})
         F, F_n = (ufl.variable(ufl.Identity(self.grid.dim) + ufl.grad(f)) for f in (u, u_n))
         J, J_n, alpha = ufl.det(F), ufl.det(F_n), self._constant(law.biot)
         parameters = {name: self._field(getattr(law, name)) for name in law.parameters}
@@ -201,7 +224,7 @@ class BiotFEM:
                 porosity = {"porosity": n, "porosity0": self._constant(law.porosity)}
                 x = ufl.SpatialCoordinate(self.grid.mesh) + u_n
                 k = call(law.conductivity_law, conductivity=k, F=F_n, J=J_n, x=x, **porosity)
-            kappa = self._dt * self._constant(self.scale / self.fluid.unit_weight) * k
+            kappa = dt * self._constant(self.scale / self.fluid.unit_weight) * k
             pull = ufl.inv(F).T
             if outlets is None:
                 residual += kappa * J * ufl.inner(pull * ufl.grad(p), pull * ufl.grad(q)) * dx
@@ -213,13 +236,12 @@ class BiotFEM:
             residual += self._on(
                 plate, self._constant(RIGIDITY * area ** (1 / (self.grid.dim - 1))) * ufl.inner(*slope)
             )
-        self._residual_form = _compat.compiled(residual)
-        self._tangent_form = _compat.compiled(ufl.derivative(residual, self.w, ufl.TrialFunction(self._W)))
-        loads = [self._on(load, ufl.inner(t, v) / self._constant(self.scale)) for load, t in self._loads]
+        tangent = ufl.derivative(residual, self._space.w, ufl.TrialFunction(self._space.W))
+        loads = [self._on(load, ufl.inner(t, v) / self._constant(self.scale)) for load, t in given]
         if self._gravity is not None:
-            self._weight = self._constant(np.zeros(self.grid.dim))
-            loads.append(ufl.inner(self._weight, v) / self._constant(self.scale) * dx)
-        self._load_form = _compat.compiled(sum(loads)) if loads else None
+            loads.append(ufl.inner(weight, v) / self._constant(self.scale) * dx)
+        compiled = [_compat.compiled(form) if form else None for form in (residual, tangent, sum(loads))]
+        return Forms(*compiled, dt, given, weight)
 
     def _two_point(self, kappa, J, pull, p, q, outlets: Sequence[Drained]):
         """Return the two-point flux between cells and to drained sides, half a cell away, as UFL."""
@@ -233,41 +255,42 @@ class BiotFEM:
             flux += self._on(o, 2 * kappa * stretch / across * (p - self._constant(o.pressure / self.scale)) * q)
         return flux
 
-    def _make_solver(self) -> None:
-        """Set up Newton's method with full steps and a direct solver.
+    def _solver(self) -> PETSc.SNES:
+        """Return Newton's method with full steps and a direct solver.
 
         A line search on the residual crawls where a slender body turns: rotations stretch at first order.
         """
         options, prefix = PETSc.Options(), "mpm_reference_"
         if not options.hasName(f"{prefix}snes_linesearch_type"):
             options[f"{prefix}snes_linesearch_type"] = "basic"
-        self._snes = PETSc.SNES().create(self.grid.comm)
-        self._snes.setOptionsPrefix(prefix)
-        self._snes.setFunction(self._residual, _compat.petsc_vec(self._b).duplicate())
-        self._snes.setJacobian(self._tangent, petsc.create_matrix(self._tangent_form))
-        self._snes.ksp.setType("preonly")
-        self._snes.ksp.pc.setType("lu")
-        self._snes.ksp.pc.setFactorSolverType("mumps")
-        self._snes.setConvergenceHistory(reset=True)
-        self._snes.setFromOptions()
+        snes = PETSc.SNES().create(self.grid.comm)
+        snes.setOptionsPrefix(prefix)
+        snes.setFunction(self._residual, _compat.petsc_vec(self._space.b).duplicate())
+        snes.setJacobian(self._tangent, petsc.create_matrix(self._forms.tangent))
+        snes.ksp.setType("preonly")
+        snes.ksp.pc.setType("lu")
+        snes.ksp.pc.setFactorSolverType("mumps")
+        snes.setConvergenceHistory(reset=True)
+        snes.setFromOptions()
+        return snes
 
     def _residual(self, _snes: PETSc.SNES, x: PETSc.Vec, out: PETSc.Vec) -> None:
         self._take(x)
-        b = self._assemble(self._b, self._residual_form)
-        b.axpy(-1.0, _compat.petsc_vec(self._f))
+        b = self._assemble(self._space.b, self._forms.residual)
+        b.axpy(-1.0, _compat.petsc_vec(self._space.f))
         # no lifting: every iterate has the prescribed values
-        petsc.set_bc(b, self._bcs, _compat.petsc_vec(self.w), -1.0)
+        petsc.set_bc(b, self._bcs, _compat.petsc_vec(self._space.w), -1.0)
         b.copy(out)
 
     def _tangent(self, _snes: PETSc.SNES, x: PETSc.Vec, A: PETSc.Mat, _P: PETSc.Mat) -> None:
         self._take(x)
         A.zeroEntries()
-        petsc.assemble_matrix(A, self._tangent_form, self._bcs)
+        petsc.assemble_matrix(A, self._forms.tangent, self._bcs)
         A.assemble()
 
     def _take(self, x: PETSc.Vec) -> None:
-        x.copy(_compat.petsc_vec(self.w))
-        self.w.x.scatter_forward()
+        x.copy(_compat.petsc_vec(self._space.w))
+        self._space.w.x.scatter_forward()
 
     def _assemble(self, out: fem.Function, form) -> PETSc.Vec:
         out.x.array[:] = 0.0
@@ -278,18 +301,18 @@ class BiotFEM:
     def step(self, dt: float) -> tuple[int, float]:
         """Advance by dt (s, > 0); return Newton iterations, relative residual.  `NotConverged` keeps the state."""
         numbers("dt", dt, test=lambda v: (0 < v) & (v < np.inf), allowed="> 0 and finite")
-        self._dt.value = dt
-        for traction, constant in self._loads:
+        self._forms.dt.value = dt
+        for traction, constant in self._forms.tractions:
             constant.value[:] = self._traction(traction, self.t + dt)
         if self._gravity is not None:
             density = (1 - self.material.porosity) * self.material.grain_density
             g = numbers(
                 "gravity", self._gravity(self.t + dt), (self.grid.dim,), allowed=f"{self.grid.dim} finite numbers"
             )
-            self._weight.value = density * g
-        if self._load_form is not None:
-            self._assemble(self._f, self._load_form)
-        x, load, snes = _compat.petsc_vec(self.w).copy(), _compat.petsc_vec(self._f).norm(), self._snes
+            self._forms.weight.value = density * g
+        if self._forms.load is not None:
+            self._assemble(self._space.f, self._forms.load)
+        x, load, snes = _compat.petsc_vec(self._space.w).copy(), _compat.petsc_vec(self._space.f).norm(), self._snes
         petsc.set_bc(x, self._bcs)
         round_off = 1e-14 * self.grid.cell_volume / self.grid.h.min() * np.sqrt(x.getSize())
         snes.setTolerances(self.tolerance, max(self.tolerance * load, round_off), 0.0)
@@ -298,11 +321,11 @@ class BiotFEM:
         scale = max(load, norms[0], round_off / self.tolerance)
         if snes.reason < 0:
             parts = self._parts(x, scale)
-            self._take(_compat.petsc_vec(self._old))
+            self._take(_compat.petsc_vec(self._space.old))
             raise NotConverged(f"PETSc SNES stopped with reason {snes.reason}", [parts])
         self._take(x)
-        self._old.x.array[:] = self.w.x.array
-        self.t += dt
+        self._space.old.x.array[:] = self._space.w.x.array
+        self._t.value += dt
         return snes.its, norms[-1] / scale
 
     def _traction(self, load: Traction, t: float) -> NDArray[np.float64]:
@@ -317,9 +340,9 @@ class BiotFEM:
     def _parts(self, x: PETSc.Vec, scale: float) -> tuple[float, float]:
         """Return the norms of the residuals of momentum and storage at x, relative to `scale`."""
         self._residual(self._snes, x, x.duplicate())
-        squares = (self._b.x.array / scale) ** 2
-        squares[_compat.petsc_vec(self._b).getLocalSize() :] = 0.0  # ghosts
-        storage = squares[self._p_dofs].sum()
+        squares = (self._space.b.x.array / scale) ** 2
+        squares[_compat.petsc_vec(self._space.b).getLocalSize() :] = 0.0  # ghosts
+        storage = squares[self._space.p_dofs].sum()
         return tuple(np.sqrt(self.grid.comm.allreduce(np.array([squares.sum() - storage, storage]))))
 
     def run(self, t_end: float, dt: float, *, probes: ArrayLike, progress: bool = False) -> Result:
@@ -356,14 +379,16 @@ class BiotFEM:
         cells = grid.local(grid.number(grid.index(x)))
         here = np.flatnonzero((cells >= 0) & (cells < grid.num_owned))
         if len(here):
-            out[here] = self._u.eval(np.pad(x[here], ((0, 0), (0, 3 - grid.dim))), cells[here]).reshape(-1, grid.dim)
+            out[here] = self._space.u.eval(np.pad(x[here], ((0, 0), (0, 3 - grid.dim))), cells[here]).reshape(
+                -1, grid.dim
+            )
         return grid.comm.allreduce(out)
 
     def _row(self, x: NDArray[np.float64]) -> tuple:
         """Return what the histories hold of the present state."""
         pressure = None
         if self.fluid:
-            p, comm = self.scale * self.w.x.array[self._p_dofs], self.grid.comm
+            p, comm = self.scale * self._space.w.x.array[self._space.p_dofs], self.grid.comm
             pressure = (comm.allreduce(p.min(), op=MPI.MIN), comm.allreduce(p.max(), op=MPI.MAX))
         return self.t, self.displacement(x), pressure
 
