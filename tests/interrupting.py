@@ -12,7 +12,10 @@ PACKAGE = str(Path(mpm_dolfinx.__file__).parent)
 
 @contextmanager
 def interrupted(after: int):
-    """Raise KeyboardInterrupt once so many lines of the package have been run, and go on behind the block."""
+    """Raise KeyboardInterrupt once so many lines of the package have been run, and go on behind the block.
+
+    Gives a function that returns how many lines have been run.
+    """
     left = after
 
     def in_package(frame, event, arg):
@@ -30,6 +33,6 @@ def interrupted(after: int):
     with suppress(KeyboardInterrupt):
         sys.settrace(trace)
         try:
-            yield
+            yield lambda: after - left
         finally:
             sys.settrace(before)

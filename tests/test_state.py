@@ -129,12 +129,17 @@ class Driven(RuleBasedStateMachine):
         self.s.scene.forget()
         assert self.s.state is before
 
-    @rule(after=st.integers(0, 4000))
-    def interrupt(self, after):
+    @rule(share=st.one_of(st.floats(0, 1), st.just(1.0)), lines=st.integers(0, 8))
+    def interrupt(self, share, lines):
+        """Break off a step at any line, or near its end."""
         before = self.s.state
-        with interrupted(after):
+        with interrupted(10**9) as counted:
+            self.s.step(0.5)
+        after, self.s.state = self.s.state, before  # a state can be taken back
+        with interrupted(max(0, int(share * counted()) - lines)):
             self.s.step(0.5)
         if self.s.state is not before:  # it was over by then
+            same_bits(self.s.state, after)
             self.accepted.append(("step", 0.5))
 
     @rule()
@@ -163,6 +168,7 @@ class Driven(RuleBasedStateMachine):
     def teardown(self):
         fresh, asked = scene(*self.made)
         for name, *arguments in self.accepted:
+            fresh.scene.forget()  # what is kept from step to step changes nothing
             perform(fresh, asked, name, *arguments)
         same_bits(self.s.state, fresh.state)
 
