@@ -38,7 +38,7 @@ class Refusal(Exception):
 def scene(law, wet, held):
     """Return a column off the grid lines, and the dictionary that its load looks into."""
     grid = mpm.Grid([0.3, 0.8], [3, 8])
-    asked = {"load": 0.0, "refuses": False}
+    asked = {"load": 300.0, "refuses": False}
 
     def load(t):
         if asked["refuses"]:
@@ -133,9 +133,11 @@ class Driven(RuleBasedStateMachine):
     def interrupt(self, share, lines):
         """Break off a step at any line, or near its end."""
         before = self.s.state
+        self.s.scene.forget()  # as many lines in both
         with interrupted(10**9) as counted:
             self.s.step(0.5)
         after, self.s.state = self.s.state, before  # a state can be taken back
+        self.s.scene.forget()
         with interrupted(max(0, int(share * counted()) - lines)):
             self.s.step(0.5)
         if self.s.state is not before:  # it was over by then
@@ -188,7 +190,7 @@ def perform(s, asked, name, *arguments):
 
 TestDriven = Driven.TestCase
 TestDriven.settings = settings(
-    max_examples=25, stateful_step_count=12, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck)
+    max_examples=30, stateful_step_count=16, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck)
 )
 
 

@@ -42,11 +42,15 @@ MOMENTUM_STEPS = 10
 
 @dataclass(frozen=True)
 class Errors:
-    """Relative residuals of momentum and storage; scale_u: the forces they are measured by, N; fluid: the residual."""
+    """Relative residuals of momentum and storage; forces: what the first is measured by, N; fluid: the other residual.
+
+    start: forces at the start of the step, N.
+    """
 
     u: float
     p: float
-    scale_u: float
+    forces: float
+    start: float
     fluid: StorageResidual | None
 
     @property
@@ -156,7 +160,7 @@ class Newton:
                 dp = self._solvers.solve_storage()
             self._storage.system.unknowns.add(self._storage.forms.p, -1.0, dp)
             report.coupling += 1
-            errors = self._errors(errors.scale_u)
+            errors = self._errors(errors.start)
         return errors
 
     def _balance_momentum(self, errors: Errors) -> None:
@@ -176,15 +180,19 @@ class Newton:
             raise NotConverged(f"no convergence in {count} iterations", self.report.history)
 
     def _errors(self, scale_u: float = 0.0) -> Errors:
-        """Assemble both residuals; return and note their norms relative to their scales; scale_u: the one so far, N."""
+        """Assemble both residuals; return and note their norms relative to their scales.
+
+        scale_u: forces at the start of the step, N.  Those of other iterates do not count: after one that has gone far
+        astray everything would seem to balance.
+        """
         history = self.report.history
         with Timer("mpm: residual"):
             r, scale = self._momentum.assemble_residual()
-            scale_u = max(scale_u, scale)
+            measure = max(scale_u, scale)
             # a tiny load drowns in the round-off of a stiff part: that is no reason not to solve for it once
             round_off = self._momentum.round_off if history else 0.0
             norm, norm_p, fluid = r.norm(), 0.0, None
-            u, p = _relative(norm, scale_u, round_off), 0.0
+            u, p = _relative(norm, measure, round_off), 0.0
             if self._storage is not None:
                 fluid = self._storage.assemble_residual()
                 norm_p = fluid.vector.norm(PETSc.NormType.N1)
@@ -193,7 +201,7 @@ class Newton:
             where = "storage: a source" if norm == norm else "momentum: a law or term"
             raise NotConverged(f"nan in the residual of the {where} gives it, must be finite")
         history.append((u, p))
-        return Errors(u, p, scale_u, fluid)
+        return Errors(u, p, measure, scale_u or scale, fluid)
 
     def _linearise(self) -> None:
         """Set the tangent at the present (u, p), which no other step is to use."""
@@ -206,19 +214,19 @@ class Newton:
         linear = self._momentum.forms.linear and not self._solvers.iterative
         rtol = min(1e-2, max(0.0 if linear else FORCING, 0.05 * self._scheme.tolerance / min(1.0, errors.worst)))
         with Timer("mpm: linear solve"):
-            return self._solvers.solve(rtol, errors.scale_u, errors.exchanged)
+            return self._solvers.solve(rtol, errors.forces, errors.exchanged)
 
     def _line_search(self, before: Errors) -> Errors:
         """Go against the direction, backtracking while the residual is not finite or explodes."""
         self.report.newton += 1
-        step, moved, scale_u = 1.0, 0.0, before.scale_u
+        step, moved = 1.0, 0.0
         while True:
             self._move(moved - step)
             moved = step
-            errors = self._errors(scale_u)
+            errors = self._errors(before.start)
             if np.isfinite(errors.worst) and errors.worst < EXPLODES * before.worst:
                 return errors
-            step, scale_u = step / 2, errors.scale_u
+            step /= 2
             if step < 1e-3:
                 raise NotConverged("no descent along the Newton direction", self.report.history)
 
