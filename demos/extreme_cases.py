@@ -93,13 +93,14 @@ def judge(row: Row, make: Make, bound: float) -> Row:
 
 def check(row: Row, scene: Scene, result: mpm.Result, bound: float) -> None:
     """Compare a run that came to its end with its reference."""
-    points, s = scene.simulation.points, scene.simulation
+    s = scene.simulation
     row.condition = condition(s.scene.last[1].momentum.K)
     try:
         row.error = nan if scene.error is None else scene.error(s, result)
     except mpm.GaveUp as failed:
         row.outcome, row.note = "wrong", f"the reference {failed}"
         return
+    points = s.points
     values = (points.x, points.F, points.pressure, result.residual, result.balance, *result.displacement[-1:])
     if not all(np.isfinite(v).all() for v in values):
         row.outcome = "nan"

@@ -81,16 +81,17 @@ class Motion:
             at_nodes = nodal[grid.cell_nodes[pieces.cells]].transpose(0, 2, 1)
             points = self._deformed(points, cut, np.eye(d) + at_nodes @ dN, pieces.cells)
             points = self._moved(points, cut, cut.displacement(nodal))
-            ids, pressure, x, folded = None, None, None, 0
+            ids, pressure, x, start, folded = None, None, None, None, 0
             serves = cut.serves(points)
             if cut.domains and not serves:  # where they serve, none has folded
                 points, folded = self._untangled(points, cut, state.stage.mechanical)
             if self._storage is not None:
                 pressure = cut.to_pieces(self._storage.p.x.array[pieces.cells])
                 x = (state.stay.x if state.stay else cut.pieces.x) + cut.to_pieces((at_nodes @ N[:, :, None])[:, :, 0])
+                start = state.stay.start if state.stay else cut.to_pieces(self._storage.p_n.x.array[pieces.cells])
                 points, ids = replace(points, pressure=cut.mean(pressure)), points.id[cut.pieces.point]
             _check_inside(cut, points, t)
-        new = replace(state, t=t, points=points, transported=None, stay=Stay(cut.points, ids, pressure, x))
+        new = replace(state, t=t, points=points, transported=None, stay=Stay(cut.points, ids, pressure, x, start))
         return new if serves and stays and on_grid.stays else self.left_grid(new, on_grid), folded
 
     def _deformed(self, points: MaterialPoints, cut: CutDomains, delta: NDArray, cells: NDArray) -> MaterialPoints:

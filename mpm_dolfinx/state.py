@@ -24,15 +24,16 @@ class Stay:
 
     points
         The material points when the grid was reset.
-    id, pressure, x : (m,), (m,) in Pa, (m, d) in m
+    id, pressure, x, start : (m,), (m,) in Pa, (m, d) in m, (m,) in Pa
         Of each piece of their domains, ordered by point and cell: number of its point, pressure of its cell, where
-        its centroid has moved to.  None without fluid.
+        its centroid has moved to, pressure of its cell when the grid was reset.  None without fluid.
     """
 
     points: MaterialPoints
     id: NDArray[np.int64] | None
     pressure: NDArray[np.float64] | None
     x: NDArray[np.float64] | None
+    start: NDArray[np.float64] | None
 
     def migrated(self, exchange: Exchange, destination: NDArray[np.int32]) -> Stay:
         """Return what holds for points that go to their destinations, by the exchange of points."""
@@ -40,9 +41,9 @@ class Stay:
         if self.id is None:
             return replace(self, points=points)
         travel = Exchange(exchange.comm, destination[np.searchsorted(self.points.id, self.id)])
-        id, pressure, x = map(travel.send, (self.id, self.pressure, self.x))
-        order = np.argsort(id, kind="stable")
-        return Stay(points, id[order], pressure[order], x[order])
+        rows = [travel.send(values) for values in (self.id, self.pressure, self.x, self.start)]
+        order = np.argsort(rows[0], kind="stable")
+        return Stay(points, *(values[order] for values in rows))
 
 
 @dataclass(frozen=True, eq=False)

@@ -51,9 +51,9 @@ def set_up(scene: Scene, state: State, dt: float) -> Balances:
 
 def step(scene: Scene, state: State, dt: float) -> tuple[State, Report]:
     """Return the state after a step of dt (s), and what it took; `state` stays what it is, whatever is raised."""
-    stage = state.stage
     state, on_grid, sides, matrices, momentum, storage = set_up(scene, state, dt)
-    report = solve_step(matrices.solvers(), momentum, storage, on_grid.data, (on_grid.key, stage, dt))
+    key, as_reset, stage = (on_grid.key, state.stage, dt), partial(on_grid.as_reset, state), state.stage
+    report = solve_step(matrices.solvers(), momentum, storage, as_reset, key)
     reactions = stage.mechanical.reactions(sides, scene.momentum.u.x.array.reshape(-1, scene.grid.dim))
     new, report.rederived = scene.motion.advanced(state, on_grid, state.t + dt)
     return replace(new, reactions=reactions, resets=state.resets + (state.stay is None), begins=False), report

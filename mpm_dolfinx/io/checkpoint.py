@@ -32,6 +32,7 @@ FORMAT, VERSION = "mpm_dolfinx checkpoint", 3
 FOREIGN = "no checkpoint of mpm_dolfinx, must be one"
 ZIP = b"PK\3\4"  # how numpy's archives begin
 COLUMNS = {"t": 0, "displacement": 1, "pressure": 2}  # of the rows of a Result
+PIECES = ("id", "pressure", "x", "start")  # of a Stay
 NOTE = {"t": float, "resets": int, "begins": bool, "scene": dict, "result": dict}  # and their kinds
 
 
@@ -151,7 +152,7 @@ def _arrays(state: State) -> dict[str, NDArray]:
     if state.stay is not None:
         named["stay"] = {"points": vars(state.stay.points)}
         if state.stay.id is not None:
-            named["stay"] |= {name: getattr(state.stay, name) for name in ("id", "pressure", "x")}
+            named["stay"] |= {name: getattr(state.stay, name) for name in PIECES}
     return _named("", named)
 
 
@@ -164,10 +165,10 @@ def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulat
         points = _points(_part(arrays, "points/"), now.points, ids)
         stay, transported, of_stay = None, None, _part(arrays, "stay/")
         if of_stay:
-            own = [of_stay.pop(name) for name in ("id", "pressure", "x")] if wet else [None] * 3
+            own = [of_stay.pop(name) for name in PIECES] if wet else [None] * len(PIECES)
             stay = Stay(_points(_part(of_stay, "points/"), now.points, ids), *own)
             if wet:
-                _check_pieces({"id": stay.id, "pressure": stay.pressure, "x": stay.x}, ids, dim)
+                _check_pieces(dict(zip(PIECES, own, strict=True)), ids, dim)
         elif wet:
             transported = PiecePressures(**_part(arrays, "transported/"))
             _check_pieces(vars(transported), ids, dim)
@@ -215,7 +216,7 @@ def _without_rows(state: State) -> State:
     none = np.empty(0, np.int64)
     points, transported, stay = state.points.of(none), state.transported, state.stay
     if stay is not None:
-        rows = [None if rows is None else rows[:0] for rows in (stay.id, stay.pressure, stay.x)]
+        rows = [None if rows is None else rows[:0] for rows in (getattr(stay, name) for name in PIECES)]
         stay = Stay(stay.points.of(none), *rows)
     return replace(state, points=points, transported=transported and transported.of(none), stay=stay)
 

@@ -98,6 +98,17 @@ class OnGrid(Keyed):
             else:
                 self._average_pressures(transport(state.transported, self.cut.points, self.cut.pieces))
 
+    def as_reset(self, state: State) -> QuadratureData:
+        """Return the pieces when the grid was reset, and set the present pressures to those of then."""
+        if self._storage is not None:
+            p = self._storage.p.x
+            if state.stay:
+                p.array[self.cut.cells] = self.cut.pieces_to_cells(state.stay.start)
+                p.scatter_forward()
+            else:
+                p.array[:] = self._storage.p_n.x.array
+        return self.data
+
     def set_pressures(self, at_pieces: NDArray[np.float64]) -> None:
         """Set the pressures at the start of a step to those (m,), Pa, that pieces have of their cells."""
         p_n = self._storage.p_n.x

@@ -17,7 +17,7 @@ iterations: `schur-...` then solve both problems at once, see `monolithic`.
 
 from __future__ import annotations
 
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 
 from petsc4py import PETSc
@@ -68,7 +68,7 @@ def solve_step(
     solvers: LinearSolvers,
     momentum: MomentumProblem,
     storage: StorageProblem | None,
-    start: QuadratureData,
+    as_reset: Callable[[], QuadratureData],
     key: Hashable,
 ) -> Report:
     """Solve the equations of a step for (u, p), which the forms then hold.
@@ -79,8 +79,9 @@ def solve_step(
         Of the active set.
     momentum, storage
         The problems; storage is None without fluid.
-    start, key
-        Pieces when the grid was reset, whose tangent serves linear laws while the key stays the same.
+    as_reset, key
+        Returns the pieces when the grid was reset, and sets the pressures of then: their tangent serves linear laws
+        while the key stays the same.
 
     Raises
     ------
@@ -91,7 +92,7 @@ def solve_step(
     if solvers.scheme.richardson and storage is not None:
         errors = step.alternate()
     else:
-        errors = step.newton(start, key)
+        errors = step.newton(as_reset, key)
     report = step.report
     if report.newton and storage is None and momentum.forms.symmetric and not solvers.iterative:
         step.check_stable()
@@ -117,13 +118,13 @@ class Newton:
         self.report = Report()
         self._linear = momentum.forms.linear and (storage is None or storage.forms.linear)
 
-    def newton(self, start: QuadratureData, key: Hashable) -> Errors:
+    def newton(self, as_reset: Callable[[], QuadratureData], key: Hashable) -> Errors:
         """Solve both problems at once; the tangent is kept while it serves, of linear laws over steps."""
         errors, fresh = self._errors(), True
         while errors.worst > self._scheme.tolerance:
             self._check(self.report.newton, "newton")
             if fresh and self._linear and not self.report.newton:
-                self._solvers.tangent(key, lambda: self._solvers.linearise(self._momentum, self._storage, start))
+                self._solvers.tangent(key, lambda: self._linearise_as_reset(as_reset))
             elif fresh:
                 self._linearise()
             self.report.coupling += self._direction(errors)
@@ -207,6 +208,15 @@ class Newton:
         """Set the tangent at the present (u, p), which no other step is to use."""
         self._solvers.tangent.clear()
         self._solvers.linearise(self._momentum, self._storage)
+
+    def _linearise_as_reset(self, as_reset: Callable[[], QuadratureData]) -> bool:
+        """Set the tangent of the pieces and pressures when the grid was reset, whatever steps have been taken since."""
+        p = None if self._storage is None else self._storage.forms.p.x.array
+        now = None if p is None else p.copy()
+        done = self._solvers.linearise(self._momentum, self._storage, as_reset())
+        if p is not None:
+            p[:] = now
+        return done
 
     def _direction(self, errors: Errors) -> int:
         """Solve the linearised problem; return the coupling iterations."""
