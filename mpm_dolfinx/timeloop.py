@@ -200,7 +200,8 @@ def _why(t: float, small: float, failed: StepFailed) -> str:
     """Return why a run gave up at t with a step `small`, s."""
     if isinstance(failed, LeftGrid):
         return str(failed)
-    return f"gave up at t = {t:g} s with dt = {small:.3g} s: {failed}"
+    why = "shorter steps help only where loads grow with time, as functions of t; the soil may have no equilibrium"
+    return f"gave up at t = {t:g} s with dt = {small:.3g} s: {failed}; {why} (collapse, buckling)"
 
 
 def _row(simulation: Simulated, probes: Probes | None) -> tuple:

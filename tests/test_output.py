@@ -276,3 +276,14 @@ def test_nonsense_gets_the_usage(arguments, capsys):
         main(arguments)
     assert ended.value.code == 2
     assert capsys.readouterr().err.startswith("usage: python -m mpm_dolfinx [-h] {info}")
+
+
+def test_two_runs_do_not_write_into_one_folder(tmp_path):
+    simulation, _ = beam(h=0.06)
+    mpm.Writer(simulation, tmp_path / "out")
+    script = "import sys; from helpers import beam; import mpm_dolfinx as mpm; mpm.Writer(beam(h=0.06)[0], sys.argv[1])"
+    here = {"cwd": Path(__file__).parent, "capture_output": True, "text": True}
+    other = subprocess.run([sys.executable, "-c", script, str(tmp_path / "out")], **here)
+    assert other.returncode == 1 and "another run writes into it, must be one of its own" in other.stderr
+    mpm.Writer(simulation, tmp_path / "out")
+    assert subprocess.run([sys.executable, "-c", script, str(tmp_path / "new")], **here).returncode == 0

@@ -174,7 +174,7 @@ def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulat
             _check_pieces(vars(transported), ids, dim)
         histories = _part(arrays, "result/")
         times = histories.pop("t").tolist()
-        columns = [histories.get(name, np.empty(0)) for name in ("displacement", "pressure")]
+        columns = [histories[name] for name in ("displacement", "pressure")]
         moved, pressure = ([*column] if len(column) else [None] * len(times) for column in columns)
         ends = [None if p is None else tuple(p.tolist()) for p in pressure]
         result = Result(rows=list(zip(times, moved, ends, strict=True)), **note["result"])

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import csv
 import errno
+import fcntl
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 from xml.etree import ElementTree
 
 from mpi4py import MPI
@@ -78,6 +79,7 @@ class Writer:
         self.every, self._simulation = whole("writer: every", every), simulation
         self._reactions = simulation.reactions  # at the start
         with on_disk("writer: folder", "one that can be written"):
+            at_root(comm, lambda: _lock(folder))
             self._table = Table(comm, folder / "history.csv", self._t)
             self._points = Series(comm, folder / "points.pvd", self._t)
             self._grid = Series(comm, folder / "grid.pvd", self._t) if grid else None
@@ -138,6 +140,24 @@ class Writer:
         if not comm.allreduce(_ends(pieces[comm.rank]), op=MPI.LAND):  # dolfinx does not notice a full disk
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(stem))
         self._grid.entries.append((simulation.t, pieces))
+
+
+_LOCKS: dict[Path, IO] = {}  # of the folders that this process writes into, for as long as it lives
+
+
+def _lock(folder: Path) -> None:
+    """Refuse a folder that another process writes into, with a ValueError."""
+    folder.mkdir(parents=True, exist_ok=True)
+    file = folder.resolve() / ".lock"
+    if file not in _LOCKS:
+        handle = open(file, "w")
+        try:
+            fcntl.lockf(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except (BlockingIOError, PermissionError) as error:
+            raise ValueError(
+                f"writer: folder = {folder}: another run writes into it, must be one of its own"
+            ) from error
+        _LOCKS[file] = handle
 
 
 def _row(result: Result, reactions: NDArray[np.float64]) -> dict[str, float]:
