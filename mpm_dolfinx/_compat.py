@@ -91,7 +91,7 @@ def mixed_space(msh: mesh.Mesh, parts: Sequence[tuple[str, int, tuple[int, ...]]
 def cell_dofs(V) -> NDArray[np.int32]:
     """Return the blocked degrees of freedom of the cells, ghosts included, (cells, n)."""
     dofs = V.dofmap.list
-    return dofs.array.reshape(dofs.num_nodes, -1) if OLD else np.asarray(dofs)
+    return dofs.array.reshape(-1, V.dofmap.dof_layout.num_dofs) if OLD else np.asarray(dofs)
 
 
 def petsc_vec(u: fem.Function) -> PETSc.Vec:

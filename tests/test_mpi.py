@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mpm_dolfinx.parallel.partition import owners
+
 
 def mpirun(processes: int, script: str, *arguments: str) -> None:
     """Run a script of this folder by mpirun; a failing rank aborts all."""
@@ -37,6 +39,23 @@ def test_the_state_is_the_same_on_several_processes(scene, tmp_path):
 @pytest.mark.parametrize("processes", [1, 2, 3])
 def test_rows_of_any_kind_travel_and_are_counted_whole(processes):
     mpirun(processes, "mpi_exchange.py")
+
+
+def test_a_process_may_have_no_cell_and_no_face(tmp_path):
+    for processes in (1, 3):
+        mpirun(processes, "mpi_few_cells.py", str(tmp_path / f"{processes}.npz"))
+    one, three = (dict(np.load(tmp_path / f"{processes}.npz")) for processes in (1, 3))
+    assert len(one) == 3 and all(top < -1e-6 for top in one.values())
+    assert three == pytest.approx(one, rel=1e-7)
+
+
+def test_no_process_is_left_without_a_cell_where_there_are_as_many():
+    rng = np.random.default_rng(5)
+    for _ in range(400):
+        shape, processes = tuple(rng.integers(1, 6, rng.integers(2, 4))), int(rng.integers(2, 9))
+        load = rng.integers(0, 5, shape) * (rng.random(shape) < rng.random())
+        counts = np.bincount(owners(load.astype(float), processes).ravel(), minlength=processes)
+        assert len(counts) == processes and np.count_nonzero(counts) == min(processes, load.size), (shape, processes)
 
 
 def test_imbalance_memory_and_traffic_are_those_of_the_processes(tmp_path):

@@ -33,7 +33,10 @@ def owners(load: NDArray[np.float64], processes: int) -> NDArray[np.int32]:
 
 
 def _bisect(weight: NDArray[np.float64], filled: NDArray[np.bool_], out: NDArray[np.int32], first: int, count: int):
-    """Share out a box of cells among `count` ranks from `first` on; the arrays are views of the whole grid's."""
+    """Share out a box of cells among `count` ranks from `first` on; the arrays are views of the whole grid's.
+
+    Each of them has a cell if there are as many: that comes before equal loads.
+    """
     out[...] = first
     if count == 1 or weight.size == 1:
         return
@@ -42,8 +45,12 @@ def _bisect(weight: NDArray[np.float64], filled: NDArray[np.bool_], out: NDArray
     if len(layers) == 1:  # what it holds is one cell
         axis = int(np.argmax(weight.shape))
         layers = weight.sum(axis=tuple(a for a in range(weight.ndim) if a != axis))
-    below, half = np.cumsum(layers)[:-1], count // 2
-    plane = 1 + int(np.argmin(np.abs(below - layers.sum() * half / count)))
+    cells = np.arange(1, len(layers)) * (weight.size // len(layers))  # below each plane
+    ranks = np.clip(count // 2, count - (weight.size - cells), cells)  # for them: half, or what leaves none idle
+    even = (ranks == count // 2) | (ranks != count // 2).all()
+    off = np.abs(np.cumsum(layers)[:-1] - layers.sum() * ranks / count)
+    plane = int(np.argmin(np.where(even, off, np.inf)))
+    half, plane = int(ranks[plane]), plane + 1
     parts = [np.moveaxis(array, axis, 0) for array in (weight, filled, out)]
     lower, upper = ([np.moveaxis(p[side], 0, axis) for p in parts] for side in (slice(plane), slice(plane, None)))
     _bisect(*lower, first, half)

@@ -70,14 +70,17 @@ class Cells:
         self.node_x = nodes.tabulate_dof_coordinates()[:, :d]
         corners = self.node_x[self.cell_nodes]
         self.midpoints = corners.mean(axis=1)
-        # all cells list their vertices in the same order (tested), so one set of signs serves all
-        self.signs = np.sign(corners[0] - self.midpoints[0]) if len(corners) else np.zeros((2**d, d))
+        # all cells list their vertices in the same order (tested), so one set of signs serves all, also a process
+        # without a cell: it compiles the same forms
+        self.signs = np.concatenate(grid.comm.allgather(np.sign(corners[:1] - self.midpoints[:1, None])))[0]
         self.cell_number = grid.number(np.floor((self.midpoints - grid.lower) / grid.h).astype(np.int64))
         self.locals = np.full(len(owners), -1, dtype=np.int32)
         self.locals[self.cell_number] = np.arange(self.num_local)
         topology = mesh.topology
         topology.create_connectivity(d, d - 1)
         topology.create_connectivity(d - 1, d)
+        if d == 3 and grid.comm.size > 1:  # all together: else who first integrates over a facet waits for who has none
+            topology.create_entity_permutations()
         self.cell_facets = topology.connectivity(d, d - 1).array.reshape(-1, 2 * d)
         adjacency = topology.connectivity(d - 1, d)
         first = adjacency.offsets[:-1]

@@ -1,0 +1,34 @@
+# SPDX-License-Identifier: MIT
+"""Run blocks on grids of few cells, of which a process may have none, or none with a face; write where they end."""
+
+import sys
+
+import numpy as np
+
+import mpm_dolfinx as mpm
+
+SHAPES = [(1, 2), (2, 2), (1, 1, 3)]
+soil = mpm.Hencky(bulk=1e8, shear=6e7, conductivity=1e-4)
+tops = {}
+for shape in SHAPES:
+    dim = len(shape)
+    grid = mpm.Grid(np.array(shape, dtype=float), shape)
+    top = np.array([*shape[:-1], shape[-1] - 0.4])
+    body = mpm.box(grid, [0] * dim, top)
+    walls = {"left": "x", "right": "x", "bottom": "xyz"[:dim]} | ({"front": "y", "back": "y"} if dim == 3 else {})
+    s = mpm.Simulation(
+        grid,
+        [body],
+        [soil],
+        fluid=mpm.Fluid(),
+        fixed=walls,
+        tractions=[mpm.Traction("top", -1e4)],
+        drained=[mpm.Drained("top")],
+        gravity=(0,) * (dim - 1) + (-9.81,),
+    )
+    result = s.run(2.0, 1.0, progress=False, probes=mpm.probes([body], [top]))
+    tops["x".join(map(str, shape))] = result.displacement[-1][0, -1]
+    counts = grid.comm.allgather(grid.num_owned)
+    assert min(counts) > 0 or sum(counts) < grid.comm.size, counts
+if grid.comm.rank == 0:
+    np.savez(sys.argv[1], **tops)
