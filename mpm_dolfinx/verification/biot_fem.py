@@ -240,8 +240,8 @@ class BiotFEM:
         loads = [self._on(load, ufl.inner(t, v) / self._constant(self.scale)) for load, t in given]
         if self._gravity is not None:
             loads.append(ufl.inner(weight, v) / self._constant(self.scale) * dx)
-        compiled = [_compat.compiled(form) if form else None for form in (residual, tangent, sum(loads))]
-        return Forms(*compiled, dt, given, weight)
+        load = _compat.compiled(sum(loads)) if loads else None
+        return Forms(_compat.compiled(residual), _compat.compiled(tangent), load, dt, given, weight)
 
     def _two_point(self, kappa, J, pull, p, q, outlets: Sequence[Drained]):
         """Return the two-point flux between cells and to drained sides, half a cell away, as UFL."""
