@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx import step
+from mpm_dolfinx.problems.balances import balances
 from mpm_dolfinx.problems.storage import FILTER, StorageProblem
 from mpm_dolfinx.solve.schur import LinearSolvers
 
@@ -127,15 +128,15 @@ def with_water(s: mpm.Simulation, bulk: float) -> mpm.Simulation:
 
 def linearise(s: mpm.Simulation, dt: float) -> System:
     """Return the first linear system of a step of dt, at the load of the next RAMP_STEP."""
-    balances = step.set_up(s.scene, s.state, RAMP_STEP)
-    on_grid, storage = balances.on_grid, balances.storage
-    matrices, contents = balances.matrices, on_grid.contents
-    outflow = matrices.outflow(s.points, None)
-    storage = StorageProblem(s.scene.storage, matrices.storage, storage.data, contents, outflow, dt)
-    balances.momentum.assemble_residual()
+    start = step.set_up(s.scene, s.state, RAMP_STEP)
+    momentum, _ = balances(s.scene, start, start.acting[-1])
+    matrices, pieces, contents = start.matrices, start.data.pieces, start.on_grid.contents
+    flow = matrices.flow(start.state, None, start.data)
+    storage = StorageProblem(s.scene.storage, matrices.storage, pieces, contents, flow, dt)
+    momentum.assemble_residual()
     storage.assemble_residual()
     solvers = matrices.solvers()
-    solvers.linearise(balances.momentum, storage)
+    solvers.linearise(momentum, storage)
     return System(solvers, storage, s.scene.fluid.bulk, s.scene.materials.materials[0])
 
 

@@ -92,7 +92,7 @@ class Motion:
                 points, ids = replace(points, pressure=cut.mean(pressure)), points.id[cut.pieces.point]
             _check_inside(cut, points, t)
         new = replace(state, t=t, points=points, transported=None, stay=Stay(cut.points, ids, pressure, x, start))
-        return new if serves and stays and on_grid.stays else self.left_grid(new, on_grid), folded
+        return new if serves and stays else self.left_grid(new, on_grid), folded
 
     def _deformed(self, points: MaterialPoints, cut: CutDomains, delta: NDArray, cells: NDArray) -> MaterialPoints:
         """Return the points with F and state after a step, delta (m, d, d) the deformation of the pieces."""

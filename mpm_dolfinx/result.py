@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 class Report:
     """What a converged step took: Newton and coupling iterations, relative residuals, fluid balance, and mending.
 
-    rederived: domains that had folded and were re-derived from F; easy: whether the next step may be longer.
+    rederived: domains that had folded and were re-derived from F; easy: whether the next step may be longer; error,
+    change, extremes: estimated error, and largest change, of the cells' pressures in the step, and the least and the
+    largest of them, Pa; sudden: change in the first substep, where it is so fast that the step may overshoot, Pa.
     """
 
     newton: int = 0
@@ -21,7 +23,11 @@ class Report:
     history: list[tuple[float, float]] = field(default_factory=list)
     balance: float = 0.0
     rederived: int = 0
-    easy: bool = False
+    easy: bool = True
+    error: float = 0.0
+    change: float = 0.0
+    extremes: tuple[float, float] | None = None
+    sudden: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -29,11 +35,12 @@ class Result:
     """Histories of a run, and where its time loop is; one row an output time, the start included.
 
     t (s); displacement (m, d) of the probes, m; pressure: least and largest on the points, Pa; and of
-    the steps so far: steps, newton, coupling (iterations), balance and residual (worst, relative), cuts,
-    rederived (domains that had folded), wall (s), and profile: seconds of each part of the run on this
-    process, from dolfinx's timers.  points: material points; memory: peak of all processes, libraries
-    included, MB; imbalance: the most that one of several processes has over their mean, at the end of the run.
-    dt: output interval, s; small: the step to try next, s; converged: the end has been reached.
+    the steps so far: steps, newton, coupling (iterations), balance and residual (worst, relative), cuts (for want of
+    convergence), rejected (for their error), change (largest of the pressures since the run began, Pa), rederived
+    (domains that had folded), wall (s), and profile: seconds of each part of the run on this process, from dolfinx's
+    timers.  points: material points; memory: peak of all processes, libraries included, MB; imbalance: the most that
+    one of several processes has over their mean, at the end of the run.
+    dt: output interval, s, 0 without one; small: the step to try next, s; converged: the end has been reached.
     """
 
     rows: list[tuple[float, NDArray[np.float64] | None, tuple[float, float] | None]] = field(
@@ -44,6 +51,8 @@ class Result:
     newton: int = 0
     coupling: int = 0
     cuts: int = 0
+    rejected: int = 0
+    change: float = 0.0
     rederived: int = 0
     balance: float = 0.0
     residual: float = 0.0

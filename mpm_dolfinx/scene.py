@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.advance import Motion
 from mpm_dolfinx.caching import Latest
+from mpm_dolfinx.constitutive.evaluate import ConductivityAtPieces
 from mpm_dolfinx.constitutive.fields import SceneMaterials
 from mpm_dolfinx.constitutive.skeleton import Fluid, Skeleton
 from mpm_dolfinx.constitutive.user_functions import compiling
@@ -30,6 +31,7 @@ from mpm_dolfinx.problems.side_forms import SideData
 from mpm_dolfinx.problems.stage import Stage
 from mpm_dolfinx.problems.storage import StorageForms
 from mpm_dolfinx.solve.scheme import Scheme
+from mpm_dolfinx.time_integration import substeps
 
 
 class Scene:
@@ -41,6 +43,8 @@ class Scene:
         See `Simulation`.
     scheme
         How the two problems are coupled.
+    method
+        Of time integration, see `time_integration`.
     weighs
         Whether there is gravity.
     pressure
@@ -55,6 +59,7 @@ class Scene:
         fluid: Fluid | None,
         quadrature: str,
         scheme: Scheme,
+        method: str,
         weighs: bool,
         pressure: float,
         terms: Sequence[Callable],
@@ -64,11 +69,12 @@ class Scene:
         self.materials = scene = SceneMaterials(grid, materials, bodies, material_points(grid, bodies, pressure))
         self.gravity = fem.Constant(grid.mesh, np.zeros(grid.dim)) if weighs else None
         self.t, self.dt = fem.Constant(grid.mesh, 0.0), fem.Constant(grid.mesh, 1.0)
-        """Time at the end of the step and its length, s, for forms."""
+        """Time at the end of the substep, and since the start of the step, s, for forms."""
         self.pieces = QuadraturePoints(grid, scene, fluid, weighs, bool(terms or sources))
         laws, p = self.pieces.laws, fem.Function(grid.cellwise()) if fluid else None
         with compiling(f"materials: {', '.join(law.__name__ for law in scene.laws)}", "laws in UFL of these shapes"):
-            options = (self.gravity, scene.nearly_incompressible, scene.symmetric, terms, self.t, self.dt)
+            wet = fluid.density if fluid else None
+            options = (self.gravity, wet, scene.nearly_incompressible, scene.symmetric, terms, self.t, self.dt)
             self.momentum = MomentumForms(self.pieces.pieces, laws, p, *options)
         if not self.momentum.symmetric and scheme.coupling == "schur-cg":
             scheme = replace(scheme, coupling="schur-fgmres")
@@ -76,15 +82,19 @@ class Scene:
         if fluid:
             weight = fluid.density * self.gravity if weighs else None
             symmetric = scheme.coupling != "schur-fgmres"
-            options = (weight, symmetric, scene.conducts, sources, self.t)
-            self.storage = StorageForms(self.pieces.pieces, self.momentum.u, p, *options)
+            pieces, u, laws = self.pieces.pieces, self.momentum.u, scene.conductivity_laws
+            law = ConductivityAtPieces(scene.materials, laws, pieces, u) if laws else None
+            self.storage = StorageForms(pieces, u, p, weight, symmetric, scene.conducts, law, sources, self.t)
+        flows = fluid is not None and (scene.conducts or bool(sources))
+        self.method, self.substeps = method, substeps(method, flows or self.momentum.rates)
+        """Of time integration, and its substeps in a step."""
         self.motion = Motion(scene, bodies, self.momentum, self.storage, fluid)
         self._on_grid: Latest[OnGrid] = Latest()
         self._systems: Latest[System] = Latest()
         self._assembled: Latest[Assembled] = Latest()
 
     def set_time(self, t: float, dt: float, gravity: NDArray[np.float64] | None) -> None:
-        """Set what forms see of the end of a step: time and length, s, and gravity (d,), m/s^2."""
+        """Set what forms see of a substep: time, and time since the start of the step, s; gravity (d,), m/s^2."""
         self.t.value, self.dt.value = t, dt
         if gravity is not None:
             self.gravity.value = gravity

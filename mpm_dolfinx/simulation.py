@@ -16,7 +16,6 @@ from mpm_dolfinx.io import summary
 from mpm_dolfinx.points.bodies import Body, check_bodies
 from mpm_dolfinx.points.grid import Grid
 from mpm_dolfinx.points.material_points import MaterialPoints
-from mpm_dolfinx.points.probes import Probes
 from mpm_dolfinx.problems.conditions import Displacement, Drained, Inflow, RigidPlate, Traction
 from mpm_dolfinx.problems.thin import warn_thin
 from mpm_dolfinx.result import Report, Result
@@ -25,7 +24,7 @@ from mpm_dolfinx.solve.scheme import Scheme
 from mpm_dolfinx.stages import begin_stage, first_state
 from mpm_dolfinx.state import State
 from mpm_dolfinx.step import step
-from mpm_dolfinx.timeloop import Observer, run
+from mpm_dolfinx.timeloop import run
 from mpm_dolfinx.validation import all_of, chosen, functions, instance, line, numbers
 
 
@@ -56,6 +55,8 @@ class Simulation:
         "domain": exact pieces of the points' domains; "point": at the points, as in standard MPM.
     coupling, tolerance
         See `Scheme`.
+    method
+        Of time integration: "sdirk2", of second order, or "backward-euler"; see `time_integration`.
     terms, sources
         Functions that give terms of the user's own to the two balances in UFL: see `user_functions`.
     later
@@ -93,6 +94,7 @@ class Simulation:
         quadrature: str = "domain",
         coupling: str = "schur-cg",
         tolerance: float = 1e-8,
+        method: str = "sdirk2",
         terms: Sequence[Callable] = (),
         sources: Sequence[Callable] = (),
         later: Sequence[int] = (),
@@ -116,7 +118,8 @@ class Simulation:
         grid.share(np.concatenate([body.centre for body in bodies]))
         warn_thin(grid, bodies, fixed)
         began, weighs = time.perf_counter(), gravity is not None
-        self.scene = Scene(grid, bodies, materials, fluid, quadrature, scheme, weighs, pressure, terms, sources)
+        options = (quadrature, scheme, method, weighs, pressure, terms, sources)
+        self.scene = Scene(grid, bodies, materials, fluid, *options)
         conditions = {"fixed": fixed, "tractions": tractions, "displacements": displacements, "drained": drained}
         conditions |= {"inflows": inflows, "plates": plates, "gravity": gravity}
         self.state = first_state(self.scene, conditions, later)
@@ -253,48 +256,4 @@ class Simulation:
             self.scene.forget()
             raise
 
-    def run(
-        self,
-        t_end: float,
-        dt: float,
-        *,
-        probes: Probes | None = None,
-        observe: Observer | Sequence[Observer] = (),
-        checkpoint: Observer | None = None,
-        after: Result | None = None,
-        progress: bool = True,
-    ) -> Result:
-        """Advance to t_end in steps of dt; a step that does not converge is cut in two, and grows again.
-
-        Parameters
-        ----------
-        t_end
-            End time, s, not a duration: > t.
-        dt
-            Step and output interval, s, > 0; one step to t_end where it is longer than that.
-        probes
-            Particles whose displacement is recorded.
-        observe
-            Called with the simulation after each output interval, such as a `Writer`; its `result` then holds the
-            histories so far.
-        checkpoint
-            Called after all observers: a `Checkpoint`.
-        after
-            Histories to go on with, of a run with the same dt: what `resume` returns, or `result` of a run that was
-            interrupted.
-        progress
-            Show a progress bar on a terminal.
-
-        Returns
-        -------
-        The histories.
-
-        Raises
-        ------
-        ValueError
-            An argument, or what a function of time gives, is none that is allowed.
-        GaveUp
-            With the histories so far; `points` and `t` are those of the last good step.
-        """
-        options = {"probes": probes, "observe": observe, "checkpoint": checkpoint, "after": after}
-        return run(self, t_end, dt, progress=progress, **options)
+    run = run

@@ -25,7 +25,8 @@ from mpm_dolfinx.points.probes import Probes
 from mpm_dolfinx.result import Report, Result
 from mpm_dolfinx.scene import Scene
 from mpm_dolfinx.state import State
-from mpm_dolfinx.validation import functions, instance, line, numbers
+from mpm_dolfinx.step_size import MIN_CUT, StepSize, Times, measured, step_rule
+from mpm_dolfinx.validation import functions, instance, line
 
 PARTS = (
     "cut domains",
@@ -40,9 +41,6 @@ PARTS = (
     "output",
 )
 """Parts of a run that are timed, as `mpm: ...` in dolfinx's own list of timings."""
-MIN_CUT = 2.0**-10  # of dt: a step is not cut below this
-MOST = 1e9
-"""Output intervals of a run: with more, a step is lost in the rounding of the time."""
 logger = logging.getLogger("mpm_dolfinx")
 
 Observer = Callable[[Any], None]
@@ -68,15 +66,60 @@ def log(comm: MPI.Intracomm, message: str, *values) -> None:
 def run(
     simulation: Simulated,
     t_end: float,
-    dt: float,
+    dt: float | None = None,
     *,
+    rtol: float | None = None,
+    t_eval: Sequence[float] | None = None,
+    first_step: float | None = None,
+    max_step: float = inf,
     probes: Probes | None = None,
     observe: Observer | Sequence[Observer] = (),
     checkpoint: Observer | None = None,
     after: Result | None = None,
     progress: bool = True,
 ) -> Result:
-    """Advance a simulation: see `Simulation.run`."""
+    """Advance to t_end, in steps of dt or in steps chosen by their error.
+
+    A step that does not converge is cut in two; steps then grow again.
+
+    Parameters
+    ----------
+    t_end
+        End time, s, not a duration: > t.
+    dt
+        Step and output interval, s, > 0; one step to t_end where it is longer than that.  With `rtol` the output
+        interval only; without it and `t_eval` every step is an output.
+    rtol
+        Choose the steps by their error: that of the pore pressures stays below about rtol of their largest change
+        since the run began; in (0, 1).  Where nothing flows the steps are as long as the output intervals.
+    t_eval : (m,), s
+        Output times, increasing, in (t, t_end]; t_end is one of them in any case.  Steps end at output times.
+    first_step, max_step
+        With `rtol`: the first step to try, and the longest, s, > 0.
+    probes
+        Particles whose displacement is recorded.
+    observe
+        Called with the simulation at each output time, such as a `Writer`; its `result` then holds the histories so
+        far.
+    checkpoint
+        Called after all observers: a `Checkpoint`.
+    after
+        Histories to go on with, of a run with the same steps: what `resume` returns, or `result` of a run that was
+        interrupted.
+    progress
+        Show a progress bar on a terminal.
+
+    Returns
+    -------
+    The histories.
+
+    Raises
+    ------
+    ValueError
+        An argument, or what a function of time gives, is none that is allowed.
+    GaveUp
+        With the histories so far; `points` and `t` are those of the last good step.
+    """
     if probes is not None and not isinstance(probes, Probes):
         raise ValueError(f"probes = {line(probes)}, must be what `probes` gives")
     observers = [observe] if callable(observe) else observe
@@ -86,33 +129,53 @@ def run(
     functions("checkpoint", [checkpoint] if checkpoint is not None else [])
     if after is not None:
         instance("after", after, Result)
-    t_end, dt = _times(simulation.state.t, t_end, dt, after is not None)
-    result = _histories(simulation, t_end, dt, probes, after)
-    dt, start, done = result.dt, result.rows[0][0], len(result.rows) - 1
-    # a last interval that is a fraction of dt counts as one
-    intervals = max(done + (t_end - simulation.state.t > 1e-9 * dt), round((t_end - start) / dt))
+    now, comm = simulation.state.t, simulation.scene.grid.comm
+    start = now if after is None else after.rows[0][0]
+    times = Times(start, now, t_end, dt, t_eval, rtol, after is not None)
+    rule = step_rule(times, rtol, first_step, max_step, simulation.scene)
+    result = _histories(simulation, times, rule, probes, after)
     stopwatch = _Stopwatch(result)
-    _note(simulation, replace(result, converged=done == intervals))
-    quiet = None if progress and simulation.scene.grid.comm.rank == 0 else True
-    bar = tqdm(total=intervals, initial=done, disable=quiet, unit="step")
+    targets = times.after(result.rows[-1][0])
+    _note(simulation, replace(result, converged=not targets))
+    bar = _bar(start, result.rows[-1][0], times.end, progress and comm.rank == 0)
+
+    def output(converged: bool) -> None:
+        with Timer("mpm: output"):
+            ended = replace(simulation.state.result, converged=converged)
+            simulation.state = replace(simulation.state, result=stopwatch.read(ended))
+            ended.rows.append(_row(simulation, probes))
+            for observer in observers:
+                observer(simulation)
+            _note(simulation, stopwatch.read(simulation.state.result))
+            if checkpoint is not None:
+                checkpoint(simulation)
+
     with bar, nullcontext() if bar.disable else logging_redirect_tqdm():  # messages above the bar, not into it
-        for k in range(done + 1, intervals + 1):
-            target = t_end if k == intervals else start + k * dt
-            while target - simulation.state.t > 1e-9 * dt:
-                _advance(simulation, target)
-                now = simulation.state.result
-                bar.set_postfix(t=f"{simulation.state.t:.4g} s", newton=now.newton, coupling=now.coupling)
-            with Timer("mpm: output"):
-                ended = replace(simulation.state.result, converged=k == intervals)
-                simulation.state = replace(simulation.state, t=target, result=stopwatch.read(ended))
-                ended.rows.append(_row(simulation, probes))
-                for observer in observers:
-                    observer(simulation)
-                _note(simulation, stopwatch.read(simulation.state.result))
-                if checkpoint is not None:
-                    checkpoint(simulation)
-            bar.update()
+        for target in targets:
+            while not rule.ended(simulation.state.t, target, simulation.state.result):
+                before = simulation.state.t
+                _advance(simulation, rule, target)
+                there = rule.ended(simulation.state.t, target, simulation.state.result)
+                if times.each and not there:
+                    output(False)
+                _show(bar, simulation.state, before)
+            simulation.state = replace(simulation.state, t=target)
+            output(target == times.end)
     return _note(simulation, stopwatch.read(_measured(simulation)))
+
+
+def _bar(start: float, now: float, end: float, shown: bool) -> tqdm:
+    """Return a progress bar in time."""
+    form = "{percentage:3.0f}%|{bar}| {elapsed}<{remaining}{postfix}"
+    return tqdm(total=end - start, initial=now - start, bar_format=form, disable=None if shown else True)
+
+
+def _show(bar: tqdm, state: State, before: float) -> None:
+    """Show where a run is."""
+    result = state.result
+    bar.update(state.t - before)
+    counts = {"t": f"{state.t:.4g} s", "steps": result.steps, "newton": result.newton, "coupling": result.coupling}
+    bar.set_postfix(counts | ({"refused": result.rejected} if result.rejected else {}))
 
 
 def _note(simulation: Simulated, result: Result) -> Result:
@@ -121,28 +184,21 @@ def _note(simulation: Simulated, result: Result) -> Result:
     return result
 
 
-def _times(now: float, t_end: float, dt: float, goes_on: bool) -> tuple[float, float]:
-    """Return end and step of a run from `now`, s; ValueError if there are none, or too many steps to tell apart."""
-    more, least = (">=", now) if goes_on else (">", np.nextafter(now, inf))
-    end = numbers("t_end", t_end, allowed=f"{more} {now:g} s and finite", test=lambda v: (v >= least) & (v < inf))
-    allowed = f"> 0, and not below {(end - now) / MOST:g} s"
-    return float(end), float(numbers("dt", dt, allowed=allowed, test=lambda v: (v > 0) & (v * MOST >= end - now)))
-
-
-def _histories(simulation: Simulated, t_end: float, dt: float, probes: Probes | None, after: Result | None) -> Result:
+def _histories(
+    simulation: Simulated, times: Times, rule: StepSize, probes: Probes | None, after: Result | None
+) -> Result:
     """Return new histories that begin with the present state, or those to go on with."""
-    now = simulation.state.t
-    dt = min(dt, t_end - (after.rows[0][0] if after else now))
+    now, latest = simulation.state.t, simulation.state.result
     if after is None:
-        return Result(dt=dt, small=dt, rows=[_row(simulation, probes)])
-    latest, broken_off = simulation.state.result, False
+        return Result(dt=times.interval, small=rule.first, rows=[_row(simulation, probes)])
     if latest is not None and after.rows is latest.rows:  # of the same run, which may have gone on since
         after = latest
-        # and, broken off, have taken a part of its next interval
-        broken_off = after.rows[-1][0] <= now <= after.rows[-1][0] + (1 + 1e-9) * dt
-    if after.dt != dt or not (after.rows[-1][0] == now or broken_off):
-        last = after.rows[-1][0]
-        raise ValueError(f"dt = {dt!r} from t = {now!r}: the run to go on with has dt = {after.dt!r}, t = {last!r}")
+    last = after.rows[-1][0]
+    # a run that was broken off has taken a part of its next interval
+    if after.dt != times.interval or not last <= now <= times.next(last):
+        raise ValueError(
+            f"dt = {times.interval!r} from t = {now!r}: the run to go on with has dt = {after.dt!r}, t = {last!r}"
+        )
     shown = after.rows[0][1]
     if (recorded := 0 if shown is None else len(shown)) != (0 if probes is None else len(probes.id)):
         raise ValueError(f"probes: the run to go on with has {recorded} of them")
@@ -166,26 +222,32 @@ def _timings() -> dict[str, float]:
     return {part: _compat.seconds(f"mpm: {part}") for part in PARTS}
 
 
-def _advance(simulation: Simulated, target: float) -> None:
-    """Take one step towards a time, s, cutting it until it converges."""
-    comm = simulation.scene.grid.comm
+def _advance(simulation: Simulated, rule: StepSize, target: float) -> None:
+    """Take one step towards a time, s, cutting it until it converges and is exact enough."""
+    comm, wanted = simulation.scene.grid.comm, None
     while True:
         state, result = simulation.state, simulation.state.result
-        left, small = target - state.t, result.small
-        if left < (1 + 1e-9) * small:  # steps that fit but for rounding are all of the same length
-            small = small if left > (1 - 1e-9) * small else left
+        taken = rule.fitted(target - state.t, result.small)
+        wanted = wanted or rule.wanted(taken)
         try:
-            new, report = simulation.advanced(small)
+            new, report = simulation.advanced(taken)
         except StepFailed as failed:
-            if small / 2 < MIN_CUT * result.dt:
-                raise GaveUp(_why(state.t, small, failed), _cut(simulation, small), failed.history) from failed
-            _cut(simulation, small / 2)
-            log(comm, "t = %g s: step cut to %.3g s: %s", state.t, small / 2, failed)
+            if taken / 2 < MIN_CUT * wanted:
+                raise GaveUp(_why(state.t, taken, failed), _cut(simulation, taken), failed.history) from failed
+            _cut(simulation, taken / 2)
+            log(comm, "t = %g s: step cut to %.3g s: %s", state.t, taken / 2, failed)
             continue
-        # a step as long as one that has just failed would mostly fail again: in soil that yields, 78 cuts instead of 1
-        grown = max(result.small, min(2 * small, result.dt)) if report.easy else result.small
+        known, result = result, measured(result, report)
+        if (shrinks := rule.refused(taken, report, result)) < 1:
+            small = wanted = taken * shrinks
+            if state.t + small == state.t:
+                why = f"gave up at t = {state.t:g} s: no step is short enough for rtol = {rule.rtol:g}"
+                raise GaveUp(why, known, report.history)
+            _note(simulation, replace(known, rejected=known.rejected + 1, small=small))
+            continue
+        grown = rule.next(taken, report, result, failed=taken < 0.99 * wanted)
         simulation.state = replace(new, result=result.after(report, grown))
-        if grown > 1.01 * result.small:  # not by rounding only
+        if not rule.by_error and grown > 1.01 * result.small:  # not by rounding only
             log(comm, "t = %g s: step grows to %.3g s", new.t, grown)
         return
 

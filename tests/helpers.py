@@ -3,12 +3,17 @@
 
 import re
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx import step
+from mpm_dolfinx.problems.balances import Start, balances
+from mpm_dolfinx.problems.momentum import MomentumProblem
+from mpm_dolfinx.problems.storage import StorageProblem
+from mpm_dolfinx.time_integration import METHODS
 
 SOFT = mpm.Hencky(bulk=1e7 / 3, shear=5e6, porosity=0.4, conductivity=1e-4)
 
@@ -34,9 +39,23 @@ def limit(simulation, newton):
     return simulation
 
 
+class SetUp(NamedTuple):
+    """The balances at the end of a step's last substep, as if it were the only one, with what it starts from."""
+
+    start: Start
+    momentum: MomentumProblem
+    storage: StorageProblem | None
+
+    @property
+    def matrices(self):
+        return self.start.matrices
+
+
 def set_up(simulation, dt):
-    """Return the balances of a simulation's next step, set up and not solved."""
-    return step.set_up(simulation.scene, simulation.state, dt)
+    """Return the balances of a simulation's next step by backward Euler, set up and not solved."""
+    start = step.set_up(simulation.scene, simulation.state, dt)
+    whole = start.acting[-1]._replace(substep=METHODS["backward-euler"][0])
+    return SetUp(start, *balances(simulation.scene, start, whole))
 
 
 def top_load(load=54e3, ramp=0.06):

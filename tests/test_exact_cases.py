@@ -31,13 +31,13 @@ def backward_euler(x, stages, steps):
 
 
 @cache
-def slab(cells, steps):
-    return mandel.run(cells, steps)
+def slab(cells, steps, method="sdirk2"):
+    return mandel.run(cells, steps, method)
 
 
 def error_in_space(cells, stage, steps=10):
     """Return the largest error of p a / force over the cells at the end of a stage."""
-    out = slab(cells, steps)[1]
+    out = slab(cells, steps, "backward-euler")[1]
     k = (stage + 1) * steps - 1
     assert out.time[k] == pytest.approx(mandel.SAMPLES[stage])
     error = out.p[k] - backward_euler(out.x[k], stage + 1, steps)
@@ -58,24 +58,18 @@ def test_the_slabs_pressure_is_of_second_order_in_the_cell_size(stage, ceiling):
     assert rates(errors).min() > 1.8 and errors[-1] < ceiling, errors
 
 
-@pytest.mark.parametrize("name, ceiling", [("p_0.5", 1.8e-3), ("p_1", 1.9e-3), ("p_max", 2.2e-3)])
-def test_the_slabs_pressure_is_of_first_order_in_the_time_step(name, ceiling):
-    errors = [slab(40, steps)[0][name] for steps in (10, 20, 40)]
-    assert rates(errors).min() > 0.85 and errors[-1] < ceiling, errors
-
-
-def test_the_pressure_rise_in_the_middle_is_exact_within_a_percent():
+def test_the_pressure_rise_in_the_middle_is_exact_within_three_per_mille():
     errors, out = mandel.run()
     peak = max(p[0, 0] for p in out.p) * mandel.WIDTH / mandel.FORCE
     assert peak > 0.55  # 0.5 at first
-    assert errors["p_max"] < 1e-3 and errors["p_rise"] < 1e-2
-    assert max(error for name, error in errors.items() if name != "p_rise") < 2e-3
+    assert errors["p_max"] < 3e-4 and errors["p_rise"] < 3e-3
+    assert max(error for name, error in errors.items() if name != "p_rise") < 1.2e-3
 
 
 def test_the_plate_stays_even_and_settles_as_exact():
-    errors, out = slab(40, 40)
+    errors, out = slab(40, 30)
     spread = [np.ptp(top) / top.mean() for top in out.settlement]
-    assert max(spread) < 1e-5 and errors["settlement"] < 1.2e-3
+    assert max(spread) < 1e-5 and errors["settlement"] < 4e-4
 
 
 # ---- cantilever ----

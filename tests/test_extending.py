@@ -320,8 +320,8 @@ def test_a_source_may_depend_on_the_pressure_and_on_time():
     assert result.newton < 3 * result.steps and result.balance < 1e-8
     closed = column(sources=[lambda points, q, t: 1e-9 * t * q * points.dx], material=soil)
     closed.run(4.0, 1.0)
-    # 1e-9 (1 + 2 + 3 + 4) of water into what gives way by M
-    assert closed.points.J - 1 == pytest.approx(1e-8 / (1 + 0.4 * SOFT.oedometric / 2.2e9), rel=1e-3)
+    # 1e-9 4^2 / 2 of water into what gives way by M
+    assert closed.points.J - 1 == pytest.approx(8e-9 / (1 + 0.4 * SOFT.oedometric / 2.2e9), rel=1e-3)
 
 
 # ---- bad input ------------------------------------------------------------------------------------

@@ -82,10 +82,10 @@ def test_time_steps_of_any_size_give_the_layers_consolidation(dt):
 
 
 @pytest.mark.parametrize("nu", [0.0, 0.499])
-def test_water_that_flows_freely_costs_an_iteration_a_step_at_most(nu):
+def test_water_that_flows_freely_costs_an_iteration_a_substep_at_most(nu):
     dry, wet = judged(Beam(soil(nu=nu))), judged(Beam(soil(nu=nu, conductivity=1e2), WATER, end=8e9))
     assert dry.outcome == wet.outcome == "converged", "no step is cut"
-    assert wet.newton <= dry.newton + wet.steps
+    assert wet.newton <= 2 * (dry.newton + wet.steps)
 
 
 def test_a_slender_beam_buckles_in_one_step():

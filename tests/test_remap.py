@@ -31,7 +31,6 @@ def moved(s, state, pressure, way):
     before = stored(on_grid, pressure)
     state, _ = s.scene.motion.advanced(state, on_grid, 0.0, stays=False)
     s.scene.on_grid(state.points).start(state)
-    s.scene.storage.p.x.array[:] = s.scene.storage.p_n.x.array
     return state, before
 
 

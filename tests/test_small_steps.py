@@ -10,12 +10,10 @@ from terzaghi import SOIL, WATER
 import mpm_dolfinx as mpm
 
 
-def test_at_rest_the_error_falls_with_the_step_to_that_of_the_cells_and_stays():
-    errors = np.array([demo.column(10, steps).error for steps in (10, 100, 1000)])
-    limit = demo.error_of_cells(10)
-    assert (errors[:-1] / errors[1:])[0] > 3
+def test_at_rest_the_error_is_that_of_the_cells_from_ten_steps_on():
+    errors, limit = [demo.column(10, steps).error for steps in (10, 100, 1000)], demo.error_of_cells(10)
+    assert max(errors) < 1.01 * limit, "long steps are damped less"
     assert errors[-1] == pytest.approx(limit, rel=0.03)
-    assert errors[1] - limit < 0.1 * (errors[0] - limit), "the step's part is not of first order"
 
 
 def test_the_error_of_the_cells_is_of_second_order():
@@ -24,7 +22,7 @@ def test_the_error_of_the_cells_is_of_second_order():
 
 
 def test_on_the_move_the_error_does_not_grow_with_the_number_of_steps():
-    few, many = (demo.column(10, steps, way=0.5).error for steps in (100, 400))
+    few, many = (demo.column(10, steps, way=0.5).error for steps in (200, 800))
     assert many < 1.1 * few and many < 3 * demo.error_of_cells(10)
 
 
@@ -47,7 +45,7 @@ def test_the_first_step_overshoots_by_nothing_however_small(dt):
     """In s; the step for which Q1 pressures stop overshooting, h^2 / (6 c_v), is 4e-3 s."""
     load = mpm.Traction("top", (0, -100.0))
     s = column(cells=20, material=SOIL, fluid=WATER, drained=[mpm.Drained("top")], tractions=[load])
-    s.step(dt)
+    s.run(dt, dt)
     assert s.points.pressure.max() < 100 * (1 + 1e-6) and s.points.pressure.min() > 0
 
 

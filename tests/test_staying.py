@@ -107,7 +107,7 @@ def test_a_stage_after_a_step_that_failed_begins_with_the_last_good_pressures(lo
         s.run(4, 0.8, progress=False)
         if fails:
             with monkeypatch.context() as patch:
-                patch.setattr("mpm_dolfinx.step.solve_step", partial(fail, s))
+                patch.setattr("mpm_dolfinx.step.solve_substep", partial(fail, s))
                 with pytest.raises(mpm.GaveUp):
                     s.run(8, 0.8, progress=False)
         s.stage(tractions=[mpm.Traction("top", (0, -load))])

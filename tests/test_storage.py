@@ -11,18 +11,14 @@ from helpers import SOFT, beam, column, set_up
 import mpm_dolfinx as mpm
 from mpm_dolfinx.constitutive.skeleton import STANDARD_GRAVITY
 from mpm_dolfinx.points.cutting import corner_bits
-from mpm_dolfinx.problems.storage import StorageProblem
 
 
 def residual(s, pressure, dt=1.0):
     """Return the storage's residual at rest, the cells' pressures those that `pressure` gives for their heights."""
-    balances = set_up(s, dt)
-    on_grid, matrices = balances.on_grid, balances.matrices
-    y = (s.grid.midpoints + on_grid.contents.centroid)[:, 1]
-    s.scene.storage.p_n.x.array[:] = pressure(y)
-    outflow = matrices.outflow(s.points, None if s.scene.gravity is None else 1000 * s.scene.gravity.value)
-    parts = (s.scene.storage, matrices.storage, balances.storage.data, on_grid.contents, outflow)
-    return StorageProblem(*parts, dt).assemble_residual().vector.array
+    storage, forms = set_up(s, dt).storage, s.scene.storage
+    y = (s.grid.midpoints + s.scene.last[0].contents.centroid)[:, 1]
+    forms.p.x.array[:] = forms.p_n.x.array[:] = pressure(y)
+    return storage.assemble_residual().vector.array
 
 
 @pytest.mark.parametrize("offset", [0.0, 0.1, 0.5])

@@ -8,11 +8,13 @@ from functools import cached_property
 
 import numpy as np
 import ufl
+from dolfinx import fem
 from numpy.typing import NDArray
 from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
 
 from mpm_dolfinx.constitutive.skeleton import Skeleton
 from mpm_dolfinx.constitutive.user_functions import call, expression
+from mpm_dolfinx.errors import NotConverged
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointExpression
 from mpm_dolfinx.parallel.exchange import first
 from mpm_dolfinx.points.grid import Grid
@@ -89,7 +91,7 @@ class LawAtPoints:
 
 
 class ConductivityAtPieces:
-    """Conductivities that depend on deformation and place, evaluated at the pieces at the start of a step.
+    """Conductivities that depend on deformation and place, evaluated at the pieces.
 
     Parameters
     ----------
@@ -99,27 +101,42 @@ class ConductivityAtPieces:
         Their different conductivity laws.
     pieces
         Points with the fields F, position, conductivity and porosity0, where a material has a conductivity law.
+    displacement
+        Increment of the displacement since the start of the step.
     """
 
-    def __init__(self, materials: Sequence[Skeleton], laws: Sequence[Callable], pieces: FormPoints):
-        self._points, self._materials = pieces, materials
+    def __init__(
+        self,
+        materials: Sequence[Skeleton],
+        laws: Sequence[Callable],
+        pieces: FormPoints,
+        displacement: fem.Function,
+    ):
+        self._points, self._materials, self._u = pieces, materials, displacement
         self._laws = {law: PointExpression(self._in_ufl(law), pieces) for law in laws}
 
     def _in_ufl(self, law: Callable):
-        points, J = self._points, ufl.det(self._points.F)
+        points, F = self._points, self._points.increment(self._u) * self._points.F
+        J = ufl.det(F)
         return expression(
             law,
             [()],
             conductivity=points.conductivity,
-            F=points.F,
+            F=F,
             J=J,
             porosity=1 - (1 - points.porosity0) / J,
             porosity0=points.porosity0,
-            x=points.position,
+            x=points.position + points.value(self._u),
         )
 
-    def evaluate(self, data: PointData, material: NDArray[np.int32]) -> NDArray[np.float64]:
-        """Return the conductivities (m,), m/s, of pieces of the given materials (m,)."""
+    def evaluate(self, data: PointData, material: NDArray[np.int32], begins: bool) -> NDArray[np.float64]:
+        """Return the conductivities (m,), m/s, at u of pieces of the given materials (m,).
+
+        Raises
+        ------
+        ValueError, NotConverged
+            A law gives what is no conductivity: the first when a step begins, the other at an iterate.
+        """
         out = data["conductivity"][:, 0].copy()
         for law, k in self._laws.items():
             rows = np.flatnonzero([m.conductivity_law is law for m in self._materials])
@@ -128,7 +145,8 @@ class ConductivityAtPieces:
             bad = np.flatnonzero(chosen & ~((out >= 0) & (out < np.inf)))[:1]
             shown = [f"k = {out[i]:g} at {data.x[i]}" for i in bad]
             if where := first(self._points.grid.comm, "".join(shown)):
-                raise ValueError(f"conductivity law: {where}, must be >= 0 and finite")
+                kind = ValueError if begins else NotConverged
+                raise kind(f"conductivity law: {where}, must be >= 0 and finite")
         return out
 
 

@@ -21,7 +21,7 @@ from mpm_dolfinx.points.grid import Grid
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.validation import numbers
 
-RESERVED = ("F", "storage", "density", "position", "displacement", "porosity0", "gradient")
+RESERVED = ("F", "storage", "storage_at_one", "density", "position", "displacement", "porosity0", "gradient")
 """Names of what points of integration carry beside parameters and state."""
 
 

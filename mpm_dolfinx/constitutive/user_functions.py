@@ -11,7 +11,7 @@ points
     both at the start of the step; and what the material points carry in `points.data`: fields of the materials
     that are functions of place, and the laws' state.
 t
-    Time at the end of the step, s, a UFL constant.
+    Time at which the balances are taken, s, a UFL constant: at the end of the step, and of its first substep.
 
 A function in `terms` adds to the balance of momentum, int P : grad v dV - loads + term = 0:
 
@@ -20,8 +20,10 @@ u
 v
     Test function.  The term is a linear form in v, such as -inner(b, points.value(v)) * points.dx for a
     body force b; or a stored energy without v, whose derivative is added.
+velocity
+    Rate of the displacement, m/s, of the order of the time integration: for what resists motion.
 dt
-    Length of the step, s, a UFL constant: for what resists the rate u / dt.
+    Time since the start of the step, s, a UFL constant: u / dt is the mean rate since then.
 
 A term that is linear in v and depends on u is taken to have an unsymmetric tangent.
 

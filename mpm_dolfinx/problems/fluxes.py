@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Two-point fluxes of the pore fluid between cells, through what the bodies cover of the faces, and their damping.
 
-The coefficients of the forms are what cells hold, set anew whenever the grid is reset.
+The coefficients of the forms are what cells hold, set anew whenever the grid is reset.  In a step in which a body moves
+the fluxes are those through the deformed cells, pulled back to the start of the step: with F = I + grad u at the
+centroid of what a cell holds its mobility kappa becomes J F^-1 kappa F^-T.
 """
 
 from __future__ import annotations
@@ -16,34 +18,80 @@ from numpy.typing import NDArray
 from mpm_dolfinx import _compat
 from mpm_dolfinx.forms.point_forms import FacetForm
 from mpm_dolfinx.points.grid import Grid, sum_by
+from mpm_dolfinx.points.material_points import determinant
+
+
+@dataclass(frozen=True)
+class Conduction:
+    """How the filled owned cells conduct: mobility kappa (n,), m^2/(Pa s), and what has become of them in the step.
+
+    F (n, d, d), moved (n, d): deformation since the start of the step, and displacement, m, at the centroids; None
+    where the body hardly moves.  weight (d,): of the fluid, N/m^3, if there is gravity.
+    """
+
+    kappa: NDArray[np.float64]
+    F: NDArray[np.float64] | None
+    moved: NDArray[np.float64] | None
+    weight: NDArray[np.float64] | None
+
+    def along(self, dim: int) -> NDArray[np.float64]:
+        """Return the mobilities (n, d) along the axes, pulled back."""
+        axes = [np.broadcast_to(normal, (len(self.kappa), dim)) for normal in np.eye(dim)]
+        return np.stack([self.across(slice(None), normal) for normal in axes], axis=1)
+
+    def across(self, at: slice | NDArray[np.int64], normal: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the mobilities (m,) of some cells along normals (m, d), pulled back: n . J F^-1 kappa F^-T n."""
+        if self.F is None:
+            return self.kappa[at].copy()
+        F = self.F[at]
+        pulled = np.linalg.solve(F.swapaxes(1, 2), normal[:, :, None])[:, :, 0]
+        return self.kappa[at] * determinant(F) * (pulled**2).sum(axis=1)
+
+    def deformed(self, at: NDArray[np.int64], way: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return ways (m, d) in some of the cells, m, as they are now."""
+        return way if self.F is None else np.einsum("mij,mj->mi", self.F[at], way)
 
 
 @dataclass(frozen=True)
 class OpenSides:
-    """Open sides of the bodies: owned cell behind each face (m,), conductance (m^d/(Pa s)) and inflow (m^d/s).
+    """Open sides of the bodies; arrays over m faces.
 
-    conductance: outflow per unit of the cell's pressure; inflow: prescribed, or driven in by an outer
-    pressure and gravity.
+    cells (m,): owned cell behind each; shape: area over distance from the cell's centroid, m^(d-2), zero where the
+    inflow is prescribed; pressure: beyond it, Pa; given: prescribed inflow, m^d/s; normal (m, d); reach (m, d): way
+    from the cell's centroid, m.
     """
 
     cells: NDArray[np.int32]
-    conductance: NDArray[np.float64]
-    inflow: NDArray[np.float64]
+    shape: NDArray[np.float64]
+    pressure: NDArray[np.float64]
+    given: NDArray[np.float64]
+    normal: NDArray[np.float64]
+    reach: NDArray[np.float64]
+
+    def driven(self, at: NDArray[np.int64], flow: Conduction) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the outflow (m,) per unit of the cell's pressure, m^d/(Pa s), and the inflow (m,), m^d/s.
+
+        The inflow is prescribed, or driven in by the outer pressure and gravity; at (m,): place of the cells among the
+        filled ones.
+        """
+        conductance, outer = flow.across(at, self.normal) * self.shape, self.pressure
+        if flow.weight is not None:
+            outer = outer - flow.deformed(at, self.reach) @ flow.weight
+        return conductance, self.given + conductance * outer
 
 
 @dataclass(frozen=True)
 class PieceContents:
     """What pieces bring to their owned cells; arrays over m pieces.
 
-    cells (m,); weight: volumes, m^d; x (m, d): centroids, m; mobility kappa, m^2/(Pa s); faces (m, d, 2): areas on
-    the lower and upper faces of the cell, m^(d-1); fixed_stress: the coefficient beta, 1/Pa; damping: the strength
-    tau of the damping of pressure jumps, 1/Pa.
+    cells (m,); weight: volumes, m^d; x (m, d): centroids, m; faces (m, d, 2): areas on the lower and upper faces of
+    the cell, m^(d-1); fixed_stress: the coefficient beta, 1/Pa; damping: the strength tau of the damping of pressure
+    jumps, 1/Pa.
     """
 
     cells: NDArray[np.int32]
     weight: NDArray[np.float64]
     x: NDArray[np.float64]
-    mobility: NDArray[np.float64]
     faces: NDArray[np.float64]
     fixed_stress: NDArray[np.float64]
     damping: NDArray[np.float64]
@@ -63,18 +111,19 @@ class CellContents:
     """
 
     def __init__(self, forms: FluxForms, pieces: PieceContents, filled: NDArray[np.int64]):
-        grid = forms.grid
+        self._grid = grid = forms.grid
         self.filled, self._slot = filled, np.zeros(grid.num_local, dtype=np.int64)
         self._slot[filled] = np.arange(len(filled))
-        cells, weight = pieces.cells, pieces.weight
+        self._cells, self._weight = cells, weight = pieces.cells, pieces.weight
         volume = self.total(cells, weight)
+        self.fill = np.minimum(volume / grid.cell_volume, 1.0)
+        """Filled share of the filled cells."""
         self.volume = volume.sum()
         """Volume of all that this process's cells hold, m^d."""
         shapes = (forms.centroid, forms.lower_face, forms.upper_face)
-        for f in (forms.mobility, forms.damping, forms.fixed_stress, *shapes):
+        for f in (forms.damping, forms.fixed_stress, *shapes):
             f.x.array[:] = 0.0
-        values = {forms.mobility: self.total(cells, weight * pieces.mobility) / volume}
-        values[forms.damping] = self.total(cells, weight * pieces.damping) / volume
+        values = {forms.damping: self.total(cells, weight * pieces.damping) / volume}
         values[forms.fixed_stress] = self.total(cells, weight * pieces.fixed_stress)
         for f, rows in values.items():
             f.x.array[filled] = rows
@@ -85,14 +134,25 @@ class CellContents:
                 target[filled, a] = self.total(cells, pieces.faces[:, a, end]) * grid.h[a] / grid.cell_volume
         for f in (*values, *shapes):
             f.x.scatter_forward()
-        self.mobility, self.damping, self.fixed_stress = (f.x.array.copy() for f in values)
-        """Mobility kappa, m^2/(Pa s); strength tau of the damping, 1/Pa; fixed-stress coefficient times volume."""
+        self.damping, self.fixed_stress = (f.x.array.copy() for f in values)
+        """Strength tau of the damping, 1/Pa; fixed-stress coefficient times volume."""
+        self._slopes = grid.shape_gradients(filled, grid.midpoints[filled] + centroid[filled])
+        self._values = grid.shape_values(filled, grid.midpoints[filled] + centroid[filled])
         self.centroid, self.open = centroid.copy(), np.stack([lower, upper], axis=2)
         """Centroids (c, d) of what the cells hold from their midpoints, m; open shares of their faces (c, d, 2)."""
 
     def total(self, cells: NDArray[np.int32], values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Sum values over the rows of each filled cell."""
         return sum_by(self._slot[cells], values, len(self.filled))
+
+    def mean(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the means over the pieces (m,) of each filled cell."""
+        return self.total(self._cells, self._weight * values) / self.total(self._cells, self._weight)
+
+    def motion(self, u: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return F (n, d, d) and displacement (n, d), m, at the centroids of the filled cells, of nodal u."""
+        nodal = u[self._grid.cell_nodes[self.filled]].transpose(0, 2, 1)
+        return np.eye(self._grid.dim) + nodal @ self._slopes, np.einsum("ndk,nk->nd", nodal, self._values)
 
     def slot(self, cells: NDArray[np.int32]) -> NDArray[np.int64]:
         """Return the places of cells among the filled ones."""
@@ -115,8 +175,9 @@ class FluxForms:
     def __init__(self, grid: Grid, weight: ufl.core.expr.Expr | None, flows: bool):
         self.grid, mesh, d, Q = grid, grid.mesh, grid.dim, grid.cellwise()
         q, dp = ufl.TestFunction(Q), ufl.TrialFunction(Q)
-        self.mobility, self.damping, self.fixed_stress = (fem.Function(Q) for _ in range(3))
-        self.centroid, self.lower_face, self.upper_face = (fem.Function(grid.cellwise((d,))) for _ in range(3))
+        self.damping, self.fixed_stress = (fem.Function(Q) for _ in range(2))
+        vectors = (fem.Function(grid.cellwise((d,))) for _ in range(5))
+        self.mobility, self.moved, self.centroid, self.lower_face, self.upper_face = vectors
         n, h = ufl.FacetNormal(mesh), fem.Constant(mesh, grid.h)
         n0 = n("+")
         across = sum(abs(n0[a]) * h[a] for a in range(d))
@@ -133,7 +194,7 @@ class FluxForms:
         share = ufl.min_value(opening("+", 1), opening("-", -1))
         d0 = across / 2 - ufl.dot(self.centroid("+"), n0)
         d1 = across / 2 + ufl.dot(self.centroid("-"), n0)
-        k0, k1 = self.mobility("+"), self.mobility("-")
+        k0, k1 = (sum(abs(n0[a]) * self.mobility(side)[a] for a in range(d)) for side in "+-")
         T = share * k0 * k1 / (d0 * k1 + d1 * k0 + 1e-300)
         dS = ufl.Measure("dS", domain=mesh, subdomain_id=_compat.SUBDOMAIN, metadata={"quadrature_degree": 0})
         self.flux = FacetForm(T * ufl.jump(dp) * ufl.jump(q) * dS, grid.comm) if flows else None
@@ -145,5 +206,16 @@ class FluxForms:
         self.alternation = FacetForm(smaller / (4 * d) * across / volume * ufl.jump(dp) * ufl.jump(q) * dS, grid.comm)
         self.gravity = None
         if weight is not None and flows:
-            apart = across * n0 + self.centroid("-") - self.centroid("+")
+            apart = across * n0 - ufl.jump(self.centroid + self.moved)
             self.gravity = FacetForm(T * ufl.dot(weight, apart) * ufl.jump(q) * dS, grid.comm)
+
+    def set_conduction(self, filled: NDArray[np.int64], flow: Conduction) -> NDArray[np.float64]:
+        """Set the coefficients for how the filled owned cells conduct; return their mobilities (n, d) by axis."""
+        d = self.grid.dim
+        mobility = flow.along(d)
+        for f, rows in ((self.mobility, mobility), (self.moved, flow.moved if self.gravity else None)):
+            if rows is not None:
+                f.x.array[:] = 0.0
+                f.x.array.reshape(-1, d)[filled] = rows
+                f.x.scatter_forward()
+        return mobility

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mpm_dolfinx.parallel.exchange import Exchange
 from mpm_dolfinx.points.cut_domains import CutDomains
@@ -40,29 +39,22 @@ class HydraulicBoundary:
         for one, other in combinations(self.outlets, 2):
             check_apart(*one, *other)
 
-    def data(
-        self, cut: CutDomains, points: MaterialPoints, contents: CellContents, weight: NDArray[np.float64] | None
-    ) -> OpenSides:
-        """Return the open sides where they were cut; weight: rho_w g (d,), N/m^3, if there is gravity."""
+    def data(self, cut: CutDomains, points: MaterialPoints, contents: CellContents) -> OpenSides:
+        """Return the open sides where they were cut."""
         grid = self._grid
-        cells, conductances, inflows = [np.empty(0, dtype=np.int32)], [np.empty(0)], [np.empty(0)]
+        rows = [(np.empty(0, dtype=np.int32), *[np.empty(0)] * 3, *[np.empty((0, grid.dim))] * 2)]
         for outlet, faces in self.outlets:
             patches = cut.surface(faces)
             travel = Exchange(grid.comm, grid.owner(patches.cell))
             cell = grid.local(travel.send(patches.cell))
             area, x = travel.send(patches.area(points)), travel.send(patches.x)
             size = np.linalg.norm(area, axis=1)
-            cells.append(cell)
+            none, normal = np.zeros(len(cell)), area / size[:, None]
+            reach = x - grid.midpoints[cell] - contents.centroid[cell]
             if isinstance(outlet, Inflow):
-                conductances.append(np.zeros(len(cell)))
-                inflows.append(outlet.flux * size)
+                rows.append((cell, none, none, outlet.flux * size, normal, reach))
                 continue
-            centre = grid.midpoints[cell] + contents.centroid[cell]
-            distance = np.einsum("md,md->m", x - centre, area) / size
-            conductance = contents.mobility[cell] * size / np.maximum(distance, SNAP * grid.h.min())
-            outer = np.full(len(cell), outlet.pressure)
-            if weight is not None:
-                outer -= (x - centre) @ weight
-            conductances.append(conductance)
-            inflows.append(conductance * outer)
-        return OpenSides(*map(np.concatenate, (cells, conductances, inflows)))
+            distance = np.einsum("md,md->m", reach, normal)
+            shape, outer = size / np.maximum(distance, SNAP * grid.h.min()), np.full(len(cell), outlet.pressure)
+            rows.append((cell, shape, outer, none, normal, reach))
+        return OpenSides(*map(np.concatenate, zip(*rows, strict=True)))

@@ -51,7 +51,9 @@ class MomentumForms:
     pressure
         DG0 pore pressure, None without fluid.
     gravity : (d,), m/s^2
-        Acceleration, a UFL constant; the pieces then carry `density`, kg/m^3.
+        Acceleration, a UFL constant; the pieces then carry `density`, kg/m^3, at the start of the step.
+    fluid_density : kg/m^3
+        Of the pore fluid, which pores that widen take up; None without.
     mean_dilatation
         Whether the laws see one volume change per cell, see `MeanDilatation`.
     symmetric
@@ -59,7 +61,7 @@ class MomentumForms:
     terms
         The user's, see `user_functions`.
     t, dt : s
-        Time at the end of the step and its length, UFL constants.
+        Time at the end of the substep, and time since the start of the step, UFL constants.
     """
 
     def __init__(
@@ -68,6 +70,7 @@ class MomentumForms:
         laws: Sequence[tuple[type[Skeleton], FormPoints]],
         pressure: fem.Function | None,
         gravity: fem.Constant | None,
+        fluid_density: float | None,
         mean_dilatation: bool,
         symmetric: bool,
         terms: Sequence[Callable],
@@ -80,20 +83,29 @@ class MomentumForms:
         """Increment of the displacement since the start of the step, m."""
         self._work = [fem.Function(V) for _ in range(4)]  # internal, own, external forces, and pulls of given sides
         self.dilatation = MeanDilatation(pieces, self.u, symmetric) if mean_dilatation else None
+        # a rate is (u - past) / own: of backward Euler past is 0, and own the step
+        self._past, self._own = fem.Function(V), fem.Constant(grid.mesh, 1.0)
         self._residuals, self._tangents, self._own_tangents = [], [], []
+        self._residuals_of_all: list[PointForm] = []
         self.terms: list[PointForm] = []
         for law, points in laws:
             self._add_law(law, points, pressure, symmetric)
         kept = [self._add_term(term, pieces, t, dt) for term in terms]
-        self.symmetric = symmetric and all(potential or not holds for potential, holds in kept)
-        self.holding = any(holds for _, holds in kept)
+        self.symmetric = symmetric and all(potential or not holds for potential, holds, _ in kept)
+        self.holding = any(holds for _, holds, _ in kept)
         """Whether terms of the user's depend on u."""
+        self.rates = any(rate for _, _, rate in kept)
+        """Whether terms of the user's depend on the velocity."""
         self.linear = not mean_dilatation and not self.holding and all(law.linear for law, _ in laws)
         """Whether the tangent changes with the places of the points only."""
         self.weight = None
         if gravity is not None:
             v = ufl.TestFunction(V)
-            self.weight = PointForm(pieces.density * ufl.inner(gravity, pieces.value(v)) * pieces.dx, pieces)
+            pull = ufl.inner(gravity, pieces.value(v))
+            self.weight = PointForm(pieces.density * pull * pieces.dx, pieces)
+            if fluid_density is not None:
+                taken_up = fem.Constant(grid.mesh, fluid_density) * (ufl.det(pieces.increment(self.u)) - 1)
+                self._residuals_of_all.append(PointForm(-taken_up * pull * pieces.dx, pieces))
         self.sides, self.ghost = SideForms(grid, V), GhostPenalty(grid, V)
 
     def _add_law(self, law: type[Skeleton], points: FormPoints, pressure: fem.Function | None, symmetric: bool) -> None:
@@ -118,11 +130,12 @@ class MomentumForms:
             self._residuals.append(ElementForces(P * points.F.T, points))
             self._tangents.append(StackedElementMatrices(A, points, symmetric))
 
-    def _add_term(self, term: Callable, pieces: FormPoints, t: fem.Constant, dt: fem.Constant) -> tuple[bool, bool]:
-        """Add a term of the user's; return whether it has a potential, and whether it depends on u."""
+    def _add_term(self, term: Callable, pieces: FormPoints, t: fem.Constant, dt: fem.Constant) -> tuple:
+        """Add a term of the user's; return whether it has a potential, depends on u, and on the velocity."""
         V = self.u.function_space
         v, du = ufl.TestFunction(V), ufl.TrialFunction(V)
-        form = form_of("terms", term, points=pieces, u=self.u, v=v, t=t, dt=dt)
+        velocity = (self.u - self._past) / self._own
+        form = form_of("terms", term, points=pieces, u=self.u, v=v, t=t, dt=dt, velocity=velocity)
         potential = not form.arguments()
         if potential and self.u not in form.coefficients():
             raise ValueError(f"terms: {line(form)}: depends on neither u nor v, must be a form in one of them")
@@ -133,7 +146,13 @@ class MomentumForms:
         holds = self.u in form.coefficients()
         if holds:
             self._own_tangents.append(PointForm(ufl.derivative(form, self.u, du), pieces))
-        return potential, holds
+        return potential, holds, self._past in form.coefficients()
+
+    def set_rate(self, own: float, past: float) -> None:
+        """Set the rate at the end of a substep: time in which it counts, s, and share of the present u before it."""
+        self._own.value = own
+        if self.rates:
+            self._past.x.array[:] = past * self.u.x.array
 
     def external(self, data: QuadratureData, sides: SideData) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the nodal forces of dead loads, weight and tilted plates, and of given displacements, local arrays."""
@@ -157,6 +176,8 @@ class MomentumForms:
             self.dilatation.update(data.pieces, data.parts)
         for residual, part in zip(self._residuals, data.parts, strict=True):
             residual.assemble_vector(internal.x.array, part)
+        for residual in self._residuals_of_all:
+            residual.assemble_vector(internal.x.array, data.pieces)
         for term in self.terms:
             term.assemble_vector(own.x.array, data.pieces)
         return sum_ghosts(internal), sum_ghosts(own) if self.terms else own.x.array
@@ -263,7 +284,6 @@ class MomentumProblem:
         with Timer("mpm: loads"):
             self._external, self._pulls = forms.external(data, sides)
         self._held = sides.holds is not None
-        forms.u.x.array[:] = 0.0
 
     def assemble_residual(self) -> tuple[PETSc.Vec, float]:
         """Return the out-of-balance nodal forces at u and their scale, the largest of internal, external, terms (N)."""

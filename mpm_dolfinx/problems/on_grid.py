@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+
 from mpi4py import MPI
 
 import numpy as np
@@ -14,9 +17,8 @@ from mpm_dolfinx.constitutive.fields import SceneMaterials
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.cut_domains import CutDomains
 from mpm_dolfinx.points.grid import sum_by
-from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.points.pressure_transport import Reconstruction, transport
-from mpm_dolfinx.problems.fluxes import CellContents, PieceContents
+from mpm_dolfinx.problems.fluxes import CellContents, Conduction, OpenSides, PieceContents
 from mpm_dolfinx.problems.momentum import MomentumForms, MomentumSystem
 from mpm_dolfinx.problems.quadrature_data import QuadratureData, QuadraturePoints
 from mpm_dolfinx.problems.scene_checks import check_held
@@ -76,7 +78,6 @@ class OnGrid(Keyed):
                 cells=cut.cells,
                 weight=weight,
                 x=cut.x,
-                mobility=quadrature.mobility(cut, points, pieces),
                 faces=cut.pieces_to_cells(cut.pieces.faces),
                 fixed_stress=quadrature.fixed_stress(cut, points, as_printed),
                 damping=quadrature.rows(cut, points, lambda m: m.pressure_damping(grid.dim)),
@@ -92,21 +93,21 @@ class OnGrid(Keyed):
 
     def start(self, state: State) -> None:
         """Set the pressures at the start of a step."""
+        if self._storage is None:
+            return
         with Timer("mpm: remap"):
             if state.stay:
                 self.set_pressures(state.stay.pressure)
             else:
                 self._average_pressures(transport(state.transported, self.cut.points, self.cut.pieces))
+        self._storage.p.x.array[:] = self._storage.p_n.x.array
 
     def as_reset(self, state: State) -> QuadratureData:
         """Return the pieces when the grid was reset, and set the present pressures to those of then."""
         if self._storage is not None:
-            p = self._storage.p.x
             if state.stay:
-                p.array[self.cut.cells] = self.cut.pieces_to_cells(state.stay.start)
-                p.scatter_forward()
-            else:
-                p.array[:] = self._storage.p_n.x.array
+                self.set_pressures(state.stay.start)
+            self._storage.p.x.array[:] = self._storage.p_n.x.array
         return self.data
 
     def set_pressures(self, at_pieces: NDArray[np.float64]) -> None:
@@ -146,10 +147,10 @@ class OnGrid(Keyed):
         pressure = p[cells] + np.einsum("md,md->m", slope[at], offset - origin[at])
         return [self.cut.to_pieces(values) for values in (pressure, slope[at], bounds[at])]
 
-    @property
-    def stays(self) -> bool:
-        """Whether it serves as long as the points hardly move: no mobilities change with the deformation."""
-        return not self._quadrature.varies
+    def mobility(self, data: QuadratureData, begins: bool) -> NDArray[np.float64]:
+        """Return the mobility of the filled owned cells, m^2/(Pa s), at u; begins: refuse for good what is none."""
+        at_pieces = self._quadrature.mobility(self.cut, self._storage.conductivity, data.pieces, begins)
+        return self.contents.mean(at_pieces)
 
     @property
     def active_cells(self) -> int:
@@ -229,6 +230,8 @@ class Assembled:
     ):
         self.momentum, self.storage, self.solvers = system.momentum, system.storage, system.solvers
         self._on_grid, self._stage, grid = on_grid, stage, on_grid.cut.grid
+        self._u, self._varies = momentum.u, storage is not None and storage.conductivity is not None
+        self._mobility: Latest[NDArray[np.float64]] = Latest()
         self._outflow: Latest[Outflow] = Latest()
         self.momentum.set_penalty(sides)
         stiffness = over_all(grid.comm, on_grid.stiffness, MPI.MAX) * grid.cell_volume / grid.h.min()
@@ -241,16 +244,37 @@ class Assembled:
         if self.storage is not None:
             self.storage.set_alternation()
 
-    def outflow(self, points: MaterialPoints, weight: NDArray[np.float64] | None) -> Outflow:
-        """Return the fluxes, assembled; weight: of the fluid (d,), N/m^3, if there is gravity."""
-        at = self._on_grid.cut.points if weight is None else points  # gravity may change with time
+    def flow(self, state: State, weight: NDArray[np.float64] | None, data: QuadratureData) -> Callable[[bool], Outflow]:
+        """Return what assembles the fluxes at u, called with whether a step begins.
 
-        def make() -> Outflow:
-            contents = self._on_grid.contents
-            sides = self._stage.hydraulic.data(self._on_grid.cut, at, contents, weight)
-            return self.storage.set_fluxes(contents, sides)
+        Where points stay in their cells, and nothing but u would change the fluxes, they are those of the start.
 
-        return self._outflow((at, weight), make, self._on_grid.cut.grid.comm)
+        Parameters
+        ----------
+        state
+            At the start of the step.
+        weight : (d,), N/m^3
+            Of the fluid, if there is gravity.
+        data
+            The pieces.
+        """
+        on_grid, contents, u = self._on_grid, self._on_grid.contents, self._u
+        at = on_grid.cut.points if weight is None else state.points  # gravity may change with time
+        sides = partial(self._stage.hydraulic.data, on_grid.cut, at, contents)
+
+        def set_fluxes(at_sides: OpenSides, kappa: NDArray[np.float64], moves: bool) -> Outflow:
+            motion = contents.motion(u.x.array.reshape(-1, len(on_grid.cut.grid.h))) if moves else (None, None)
+            return self.storage.set_fluxes(contents, at_sides, Conduction(kappa, *motion, weight))
+
+        if self._varies:
+            placed = sides()
+            return lambda begins: set_fluxes(placed, on_grid.mobility(data, begins), moves=True)
+        kappa = self._mobility((), lambda: on_grid.mobility(data, True))
+        if not state.stay:
+            placed = sides()
+            return lambda begins: set_fluxes(placed, kappa, moves=True)
+        outflow = self._outflow((at, weight), lambda: set_fluxes(sides(), kappa, moves=False), on_grid.cut.grid.comm)
+        return lambda begins: outflow
 
 
 def assembled(

@@ -58,7 +58,7 @@ class QuadraturePoints:
     laws
         Each law with the pieces that follow it.
     varies
-        Whether mobilities change with the deformation: then the grid is reset in every step.
+        Whether mobilities change with the deformation.
     """
 
     def __init__(self, grid: Grid, scene: SceneMaterials, fluid: Fluid | None, weighs: bool, extended: bool):
@@ -68,7 +68,7 @@ class QuadraturePoints:
         d = grid.dim
         shapes: dict[str, tuple[int, ...]] = {"F": (d, d), **scene.shapes}
         if fluid:
-            shapes |= {"biot": (), "storage": ()}
+            shapes |= {"biot": (), "storage": (), "storage_at_one": ()}
         if weighs:
             shapes |= {"density": ()}
         if extended:
@@ -79,8 +79,6 @@ class QuadraturePoints:
         self.pieces = FormPoints(grid, **shapes)
         self.laws = scene.parts(self.pieces, ["F", "biot"] if fluid else ["F"])
         self._constants: Latest[dict[str, NDArray[np.float64]]] = Latest()
-        laws = scene.conductivity_laws if fluid else []
-        self._conductivity = ConductivityAtPieces(scene.materials, laws, self.pieces)
 
     def places(self, cut: CutDomains) -> PiecePlaces:
         """Return where the pieces of a cut lie."""
@@ -110,6 +108,7 @@ class QuadraturePoints:
             fields = self._scene.parameters(points)
             if self._fluid:
                 fields["biot"] = self._scene.table(points, lambda m: m.biot)
+                fields["storage_at_one"] = self._scene.table(points, lambda m: m.storage(self._fluid.bulk, 1.0))
             if self.varies:
                 fields["conductivity"] = self._scene.table(points, lambda m: m.conductivity)
                 fields["porosity0"] = self._scene.table(points, lambda m: m.porosity)
@@ -142,11 +141,13 @@ class QuadraturePoints:
         """Return a constant of the materials at the pieces (m,)."""
         return cut.to_cells(self._scene.table(points, value))
 
-    def mobility(self, cut: CutDomains, points: MaterialPoints, data: PointData) -> NDArray[np.float64]:
-        """Return the mobility k / (rho_w g) at the pieces (m,), m^2/(Pa s)."""
-        if not self.varies:
-            return self.rows(cut, points, lambda m: m.conductivity) / self._fluid.unit_weight
-        return self._conductivity.evaluate(data, cut.to_cells(points.material)) / self._fluid.unit_weight
+    def mobility(
+        self, cut: CutDomains, law: ConductivityAtPieces | None, data: PointData, begins: bool
+    ) -> NDArray[np.float64]:
+        """Return the mobility k / (rho_w g) at the pieces (m,), m^2/(Pa s), by a law at the present u."""
+        if law is None:
+            return self.rows(cut, cut.points, lambda m: m.conductivity) / self._fluid.unit_weight
+        return law.evaluate(data, cut.to_cells(cut.points.material), begins) / self._fluid.unit_weight
 
     def fixed_stress(self, cut: CutDomains, points: MaterialPoints, as_printed: bool) -> NDArray[np.float64]:
         """Return beta of the fixed-stress operator at the pieces, 1/Pa, before the scheme's factor.

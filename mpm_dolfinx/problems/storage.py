@@ -3,15 +3,17 @@
 
 In each active cell, with J_Delta = det(I + grad u) (never div u: a rotation would fake a compression),
 
-    int alpha (J_Delta - 1) + S J_Delta (p - p_n) dV_n  +  dt sum_faces Q  =  0,
+    int zeta(J_Delta, p) - zeta_n dV_n  +  int sum_faces Q dt  =  0,      d zeta = alpha dJ + S J dp,
     Q = T [p+ - p- + rho_w g . (x- - x+)],   T = A / (d+ / kappa+ + d- / kappa-),   kappa = k / (rho_w g),
 
 where A is the exact overlap of the body with the face, x+- are the centroids of what the cells hold
 and d+- their distances from the face.  Distances from the centroids keep the error at 0.2 % for any
-filling, where half the cell size reaches 12 %.  The sum over the cells is the fluid balance.
+filling, where half the cell size reaches 12 %.  The sum over the cells is the fluid balance.  The change of the
+content is that of `fluid_content`, the integral over the step that of a substep of `time_integration`.
 
 Q1 with DG0 is not inf-sup stable: where next to nothing flows within a step, checkers of p go unseen.
-Jumps of the step's increment are damped by max(0, tau d - dt kappa / d) A [p - p_n], d = d+ + d-, so that a
+Jumps of the step's increment are damped by max(0, tau d - dt kappa / d) A [p - p_n], d = d+ + d-, dt the share of
+the step in which the rate at p counts, so that a
 face carries at least tau d A: nothing is added where the flow suffices, nothing is left in a steady
 state, and no fluid is lost.  tau is a quarter of Silvester and Kechkar's patch value (Camargo, White
 and Borja 2021).
@@ -29,13 +31,15 @@ import ufl
 from dolfinx import fem
 from numpy.typing import NDArray
 
+from mpm_dolfinx.constitutive.evaluate import ConductivityAtPieces
+from mpm_dolfinx.constitutive.fluid_content import change_of_content
 from mpm_dolfinx.constitutive.user_functions import compiling
 from mpm_dolfinx.constitutive.user_functions import form as form_of
 from mpm_dolfinx.forms.cell_matrices import ElementForces
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointForm
 from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts, zero
 from mpm_dolfinx.parallel.exchange import over_all
-from mpm_dolfinx.problems.fluxes import CellContents, FluxForms, OpenSides
+from mpm_dolfinx.problems.fluxes import CellContents, Conduction, FluxForms, OpenSides
 from mpm_dolfinx.validation import line
 
 FILTER = 0.75
@@ -48,7 +52,7 @@ class StorageForms:
     Parameters
     ----------
     pieces
-        Points of integration with the fields biot and storage (1/Pa).
+        Points of integration with the fields biot, storage and storage_at_one (1/Pa), see `change_of_content`.
     displacement
         Increment of the displacement since the start of the step.
     pressure
@@ -56,14 +60,16 @@ class StorageForms:
     weight : (d,), N/m^3
         Weight of the pore fluid rho_w g as UFL, None without gravity.
     symmetric
-        Leave S (p - p_n) dJ_Delta out of the Jacobian, which then is symmetric; it is of the order of
-        (p - p_n) / K_w, so Newton's method converges as fast.
+        Take alpha dJ_Delta for the derivative of the content by J_Delta, for a symmetric Jacobian: the rest is of the
+        order of (p - p_n) / K_w, so Newton's method converges as fast.
     flows
         Whether anything conducts; without, there are no fluxes.
+    conductivity
+        Laws of the conductivity, None where no material has one.
     sources
         The user's, see `user_functions`.
     t : s
-        Time at the end of the step, a UFL constant.
+        Time at the end of the substep, a UFL constant.
     """
 
     def __init__(
@@ -74,17 +80,19 @@ class StorageForms:
         weight: ufl.core.expr.Expr | None,
         symmetric: bool,
         flows: bool,
+        conductivity: ConductivityAtPieces | None,
         sources: Sequence[Callable],
         t: fem.Constant,
     ):
         self.grid, self.p, Q = pieces.grid, pressure, pressure.function_space
+        self.conductivity = conductivity
         self.p_n, self._work = fem.Function(Q), fem.Function(Q)
         q, one = ufl.TestFunction(Q), fem.Function(Q)
         one.x.array[:] = 1.0
         delta = ufl.variable(pieces.increment(displacement))
         J = ufl.det(delta)
         strain = pieces.biot * (J - 1)
-        stored = strain + pieces.storage * J * (pressure - self.p_n)
+        stored = change_of_content(pieces.biot, pieces.storage_at_one, pieces.storage, J, pressure - self.p_n)
         change = stored * q * pieces.dx
         self._change = PointForm(change, pieces)
         self._capacity = PointForm(ufl.derivative(change, pressure, one), pieces)
@@ -141,12 +149,34 @@ class StorageForms:
 class Outflow:
     """Outflow of the active owned cells: conductance of open sides (m^d/(Pa s)), inflow (m^d/s), and the sum of all.
 
-    total: outflow per unit of the cell's own pressure through all its faces, m^d/(Pa s).
+    total: outflow per unit of the cell's own pressure through all its faces, m^d/(Pa s).  mobility (n, d): along the
+    axes, m^2/(Pa s).
     """
 
     conductance: NDArray[np.float64]
     inflow: NDArray[np.float64]
     total: NDArray[np.float64]
+    mobility: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Rates:
+    """Rates at which the owned cells lose fluid, m^d/s, or with `taken` what they lose in a time, m^d.
+
+    pressure: of the cells, Pa; cells: outflow less sources of each; lost: what leaves the bodies from all cells of this
+    process, less sources; turnover: sum of what goes in and out; gain: sum of what sources bring or take.
+    """
+
+    pressure: NDArray[np.float64]
+    cells: NDArray[np.float64]
+    lost: float
+    turnover: float
+    gain: float
+
+    def taken(self, seconds: float) -> Rates:
+        """Return what the cells lose in a time."""
+        sums = (seconds * value for value in (self.lost, self.turnover, self.gain))
+        return Rates(self.pressure, seconds * self.cells, *sums)
 
 
 class StorageSystem:
@@ -181,9 +211,11 @@ class StorageSystem:
         self._alternation.assemble_matrix(self.L)
         self.L.assemble()
 
-    def set_fluxes(self, contents: CellContents, sides: OpenSides) -> Outflow:
-        """Assemble the fluxes of what the cells hold: through inner faces and open sides."""
-        conductance, inflow = (contents.total(sides.cells, values) for values in (sides.conductance, sides.inflow))
+    def set_fluxes(self, contents: CellContents, sides: OpenSides, flow: Conduction) -> Outflow:
+        """Assemble the fluxes through inner faces and open sides."""
+        driven = sides.driven(contents.slot(sides.cells), flow)
+        conductance, inflow = (contents.total(sides.cells, values) for values in driven)
+        mobility = self._forms.fluxes.set_conduction(contents.filled, flow)
         zero(self.T)
         if self._flux is not None:
             self._flux.assemble_matrix(self.T)
@@ -191,25 +223,26 @@ class StorageSystem:
         self.rate.array_w[:] -= inflow
         self.T.assemble()
         _add_diagonal(self.T, conductance)
-        return Outflow(conductance, inflow, self.T.getDiagonal().array.copy())
+        return Outflow(conductance, inflow, self.T.getDiagonal().array.copy(), mobility)
 
 
 @dataclass(frozen=True)
 class StorageResidual:
     """Fluid volume out of balance in each cell (m^d), and what it is measured by, m^d.
 
-    exchanged: sum of all changes; round_off: what rounding may leave; gained: change of this process's cells, less
-    sources.
+    exchanged: sum of all changes; round_off: what rounding may leave; change: of this process's cells; rates: at
+    (u, p).
     """
 
     vector: PETSc.Vec
     exchanged: float
     round_off: float
-    gained: float
+    change: float
+    rates: Rates
 
 
 class StorageProblem:
-    """The storage of the pore fluid in one step.
+    """The storage of the pore fluid in one substep.
 
     Parameters
     ----------
@@ -217,10 +250,14 @@ class StorageProblem:
         Compiled forms; vectors and matrices, with the fluxes in them.
     data
         The pieces.
-    contents, outflow
-        What the cells hold, and what leaves them.
+    contents
+        What the cells hold.
+    flow
+        Assembles what leaves them at (u, p); called with whether this is the start of the substep.
     dt
-        Length of the step, s.
+        Share of the step in which the rate at (u, p) counts, s.
+    before
+        What the cells lose by the rate of the substep before.
 
     The pressure at the start of the step is that of `forms.p_n`.
     """
@@ -231,16 +268,18 @@ class StorageProblem:
         system: StorageSystem,
         data: PointData,
         contents: CellContents,
-        outflow: Outflow,
+        flow: Callable[[bool], Outflow],
         dt: float,
+        before: Rates | None = None,
     ):
         self.forms, self.system, self.data = forms, system, data
-        self._contents, self._outflow, self.dt = contents, outflow, dt
-        forms.p.x.array[:] = forms.p_n.x.array
+        self._contents, self._flow, self.dt = contents, flow, dt
+        self._before = before or Rates(np.empty(0), np.zeros(system.unknowns.size), 0.0, 0.0, 0.0)
+        outflow = flow(before is None)
         system.unknowns.gather(forms.p_n.x.array, system.p_start)
         filled = contents.filled
         reach = 4 * forms.grid.h.max() ** 2  # no two centroids are further apart than 2 h
-        needed = contents.damping[filled] * reach > dt * contents.mobility[filled]
+        needed = contents.damping[filled] * reach > dt * outflow.mobility.min(axis=1)
         self.damped = over_all(forms.grid.comm, bool(needed.any())) > 0
         """Whether jumps of the pressure are damped somewhere."""
         if self.damped:
@@ -249,35 +288,50 @@ class StorageProblem:
             system.damp.assemble_matrix(system.D)
             system.D.assemble()
 
+    @property
+    def fill(self) -> NDArray[np.float64]:
+        """Filled share of the cells, which is what their pressures count for."""
+        return self._contents.fill
+
+    def set_fluxes(self) -> None:
+        """Assemble the fluxes at u."""
+        self._flow(False)
+
     def assemble_residual(self) -> StorageResidual:
         """Return the fluid volume out of balance in each cell at (u, p)."""
-        forms, system, dt, owned = self.forms, self.system, self.dt, self.system.unknowns.owned
+        forms, system, before = self.forms, self.system, self._before
+        outflow = self._flow(False)
         b = forms.change(self.data)
-        change = b[owned]
-        gained = change.sum()
-        r = system.unknowns.gather(b, system.residual)
-        p = system.unknowns.gather(forms.p.x.array, system.p)
-        # what rounding may leave: of the volumes and of the fluxes that cancel
-        turnover = dt * (np.abs(self._outflow.total) @ np.abs(p.array_r))
-        round_off = over_all(forms.grid.comm, 2e-15 * (self._contents.volume + turnover))
-        flux = system.T * p
-        flux.axpy(1.0, system.rate)
-        r.axpy(dt, flux)
+        change = b[system.unknowns.owned]
+        exchanged, total = float(np.abs(change).sum()), float(change.sum())
+        r, p = system.unknowns.gather(b, system.residual), system.unknowns.gather(forms.p.x.array, system.p)
         if self.damped:
             system.D.multAdd(p - system.p_start, r, r)
-        exchanged = float(np.abs(change).sum())
+        rates = self._rates(outflow, p)
+        now = rates.taken(self.dt)
+        r.array_w[:] += now.cells + before.cells
+        # what rounding may leave: of the volumes and of the fluxes that cancel
+        round_off = 2e-15 * (self._contents.volume + now.turnover + before.turnover)
+        sums = over_all(forms.grid.comm, np.array([exchanged + now.gain + before.gain, round_off]))
+        return StorageResidual(r, *sums.tolist(), total, rates)
+
+    def _rates(self, outflow: Outflow, p: PETSc.Vec) -> Rates:
+        """Return the rates at (u, p)."""
+        forms, system, gain = self.forms, self.system, np.zeros(1)
+        flux = system.T * p
+        flux.axpy(1.0, system.rate)
+        cells, values = flux.array_r.copy(), p.array_r
         if forms.sources:
-            gain = dt * forms.gain(self.data)[owned]
-            r.array_w[:] -= gain
-            gained -= gain.sum()
-            exchanged += np.abs(gain).sum()
-        return StorageResidual(r, over_all(forms.grid.comm, float(exchanged)), round_off, gained)
+            gain = forms.gain(self.data)[system.unknowns.owned]
+            cells -= gain
+        lost = (outflow.conductance * values - outflow.inflow).sum() - gain.sum()
+        turnover = np.abs(outflow.total) @ np.abs(values)
+        return Rates(values.copy(), cells, float(lost), float(turnover), float(np.abs(gain).sum()))
 
     def balance(self, residual: StorageResidual) -> float:
         """Return the change of the fluid's volume, plus what left, less sources (m^d), at the last residual."""
-        p = self.forms.p.x.array[self.system.unknowns.owned]
-        out = (self._outflow.conductance * p - self._outflow.inflow).sum()
-        return float(over_all(self.forms.grid.comm, residual.gained + self.dt * out))
+        lost = residual.rates.taken(self.dt).lost + self._before.lost
+        return float(over_all(self.forms.grid.comm, residual.change + lost))
 
     def assemble_tangent(self, data: PointData | None = None) -> None:
         """Assemble C = d/dp and B = d/du of the residual at (u, p), of these pieces or of others."""

@@ -105,6 +105,11 @@ class BlockSolver:
         self._ksp.setOperators(self._A)
         self._ksp.setFromOptions()
 
+    @property
+    def preconditioner(self) -> PETSc.PC:
+        """One cycle on the fixed-stress operator."""
+        return self._storage_solver.pc
+
     def set_preconditioner(self, P: PETSc.Mat) -> None:
         """Take the present fixed-stress operator."""
         self._storage_solver.pc.setOperators(P, P)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A step's equations: momentum and storage exchange u and p until both balance.
+"""A substep's equations: momentum and storage exchange u and p until both balance.
 
 A Newton step of the two problems reads
 
@@ -17,18 +17,20 @@ iterations: `schur-...` then solve both problems at once, see `monolithic`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 
+from mpi4py import MPI
 from petsc4py import PETSc
 
 import numpy as np
 from dolfinx.common import Timer
 
 from mpm_dolfinx.errors import NotConverged
+from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.problems.momentum import MomentumProblem
 from mpm_dolfinx.problems.quadrature_data import QuadratureData
-from mpm_dolfinx.problems.storage import StorageProblem, StorageResidual
+from mpm_dolfinx.problems.storage import Rates, StorageProblem, StorageResidual
 from mpm_dolfinx.result import Report
 from mpm_dolfinx.solve.linear import negative_pivots
 from mpm_dolfinx.solve.schur import LinearSolvers
@@ -38,6 +40,14 @@ FORCING = 1e-3  # relative accuracy of the linear solve
 EXPLODES = 1e4  # a bending body's residual may grow this much in a good step: rotations stretch at first order
 INNER = 1e-3  # the momentum is solved to this share of the storage's error: rotations fake volume changes
 MOMENTUM_STEPS = 10
+ERROR = 1 / 20
+"""Share of the estimate of first order that the pressures of a run are off by: of consolidations, see tests."""
+SUDDEN = np.sqrt(2)
+"""Change in the second substep over that in the first below which pressures decay so fast that sdirk2 overshoots.
+
+The stability function (1 + (1 - 2 gamma) z) / (1 - gamma z)^2 changes its sign at z = -1 - sqrt(2), where the
+changes are -gamma z / (1 - gamma z) = sqrt(2) - 1 and 2 - sqrt(2).  What follows the loads has (1 - gamma) / gamma.
+"""
 
 
 @dataclass(frozen=True)
@@ -64,14 +74,15 @@ class Errors:
         return self.fluid.exchanged if self.fluid is not None else 0.0
 
 
-def solve_step(
+def solve_substep(
     solvers: LinearSolvers,
     momentum: MomentumProblem,
     storage: StorageProblem | None,
     as_reset: Callable[[], QuadratureData],
     key: Hashable,
-) -> Report:
-    """Solve the equations of a step for (u, p), which the forms then hold.
+    report: Report,
+) -> Rates | None:
+    """Solve the equations of a substep for (u, p), which the forms then hold; return the rates of the storage.
 
     Parameters
     ----------
@@ -82,35 +93,59 @@ def solve_step(
     as_reset, key
         Returns the pieces when the grid was reset, and sets the pressures of then: their tangent serves linear laws
         while the key stays the same.
+    report
+        Of the step: what the substep took is added.
 
     Raises
     ------
     NotConverged
         With the residual history.
     """
-    step = Newton(solvers, momentum, storage)
-    if solvers.scheme.richardson and storage is not None:
-        errors = step.alternate()
-    else:
-        errors = step.newton(as_reset, key)
-    report = step.report
-    if report.newton and storage is None and momentum.forms.symmetric and not solvers.iterative:
-        step.check_stable()
-    if storage is not None:
-        report.balance = _relative(abs(storage.balance(errors.fluid)), errors.exchanged, errors.fluid.round_off)
-    in_turn = storage is not None and solvers.scheme.richardson
-    count, most = (report.coupling, "coupling") if in_turn else (report.newton, "newton")
-    report.easy = 3 * count <= getattr(solvers.scheme, f"most_{most}")
-    return report
+    newton = Newton(solvers, momentum, storage)
+    in_turn = solvers.scheme.richardson and storage is not None
+    errors = newton.alternate() if in_turn else newton.newton(as_reset, key, serves=report.newton > 0)
+    took = newton.report
+    if took.newton and storage is None and momentum.forms.symmetric and not solvers.iterative:
+        newton.check_stable()
+    report.newton, report.coupling = report.newton + took.newton, report.coupling + took.coupling
+    report.history += took.history
+    count, most = (took.coupling, "coupling") if in_turn else (took.newton, "newton")
+    report.easy = report.easy and 3 * count <= getattr(solvers.scheme, f"most_{most}")
+    if storage is None:
+        return None
+    report.balance = _relative(abs(storage.balance(errors.fluid)), errors.exchanged, errors.fluid.round_off)
+    return errors.fluid.rates
+
+
+def note_pressures(
+    report: Report, solvers: LinearSolvers, storage: StorageProblem | None, seconds: float, rates: Sequence[Rates]
+) -> None:
+    """Note what the cells' pressures have done in a step, and the estimated error of it.
+
+    The difference of the step to one of first order is seconds (Q2 - Q1), a fluid volume.  The fixed-stress operator
+    makes it a pressure that stays bounded for stiff modes, as in Hosea and Shampine (1996).  Cells count with what they
+    hold.
+    """
+    if storage is None or not report.newton:
+        return
+    error, start, p = np.zeros(len(storage.fill)), storage.system.p_start.array_r, rates[-1].pressure
+    first, second = rates[0].pressure - start, p - rates[0].pressure
+    if len(rates) > 1:
+        error = ERROR * np.abs(solvers.filtered(seconds * (rates[1].cells - rates[0].cells)))
+    largest = [np.abs(storage.fill * values).max(initial=0.0) for values in (error, p - start, first, second)]
+    largest += [values.max(initial=-np.inf) for values in (-p, p)]
+    error, report.change, first, second, low, high = over_all(storage.forms.grid.comm, np.array(largest), MPI.MAX)
+    report.error, report.extremes = error, (-low, high)
+    report.sudden = first if len(rates) > 1 and second < SUDDEN * first else 0.0
 
 
 class Newton:
-    """Newton's method on the problems of one step.
+    """Newton's method on the problems of one substep.
 
     Parameters
     ----------
     solvers, momentum, storage
-        See `solve_step`.
+        See `solve_substep`.
     """
 
     def __init__(self, solvers: LinearSolvers, momentum: MomentumProblem, storage: StorageProblem | None):
@@ -118,9 +153,12 @@ class Newton:
         self.report = Report()
         self._linear = momentum.forms.linear and (storage is None or storage.forms.linear)
 
-    def newton(self, as_reset: Callable[[], QuadratureData], key: Hashable) -> Errors:
-        """Solve both problems at once; the tangent is kept while it serves, of linear laws over steps."""
-        errors, fresh = self._errors(), True
+    def newton(self, as_reset: Callable[[], QuadratureData], key: Hashable, serves: bool) -> Errors:
+        """Solve both problems at once; the tangent is kept while it serves, of linear laws over steps.
+
+        serves: whether the tangent of the substep before may serve.
+        """
+        errors, fresh = self._errors(), self._linear or not serves
         while errors.worst > self._scheme.tolerance:
             self._check(self.report.newton, "newton")
             if fresh and self._linear and not self.report.newton:
@@ -211,11 +249,17 @@ class Newton:
 
     def _linearise_as_reset(self, as_reset: Callable[[], QuadratureData]) -> bool:
         """Set the tangent of the pieces and pressures when the grid was reset, whatever steps have been taken since."""
-        p = None if self._storage is None else self._storage.forms.p.x.array
-        now = None if p is None else p.copy()
-        done = self._solvers.linearise(self._momentum, self._storage, as_reset())
-        if p is not None:
-            p[:] = now
+        functions = [self._momentum.forms.u]
+        if self._storage is not None:
+            functions += [self._storage.forms.p, self._storage.forms.p_n]
+        now = [f.x.array.copy() for f in functions]
+        self._momentum.forms.u.x.array[:] = 0.0
+        pieces = as_reset()
+        if self._storage is not None:
+            self._storage.set_fluxes()
+        done = self._solvers.linearise(self._momentum, self._storage, pieces)
+        for f, values in zip(functions, now, strict=True):
+            f.x.array[:] = values
         return done
 
     def _direction(self, errors: Errors) -> int:

@@ -14,7 +14,9 @@ from weakref import finalize
 
 from petsc4py import PETSc
 
+import numpy as np
 from dolfinx.common import Timer
+from numpy.typing import NDArray
 
 from mpm_dolfinx.caching import Latest
 from mpm_dolfinx.problems.momentum import MomentumProblem, MomentumSystem
@@ -74,6 +76,7 @@ class LinearSolvers:
         """Direction of the pressures."""
         if self.iterative and not scheme.richardson:
             self._block = BlockSolver(momentum, storage, self.solve_u.pc)
+            self._preconditioner = self._block.preconditioner
             return
         n, context = (storage.unknowns.size, None), SchurComplement(storage, self.solve_u)
         finalize(self, vars(context).clear)  # PETSc keeps contexts of its matrices, and what they refer to
@@ -82,6 +85,7 @@ class LinearSolvers:
         self._solve_s = direct_solver(storage.P, "storage", often=True)
         kind = {"schur-cg": PETSc.KSP.Type.CG, "schur-fgmres": PETSc.KSP.Type.FGMRES}
         self._solve_s.setType(kind.get(scheme.coupling, PETSc.KSP.Type.PREONLY))
+        self._preconditioner = self._solve_s.pc
 
     @property
     def schur(self) -> tuple[PETSc.Mat, PETSc.KSP]:
@@ -142,6 +146,12 @@ class LinearSolvers:
         self._storage.B.mult(self.du, self._g)
         self._g.aypx(-1.0, self._storage.residual)
         return self._g
+
+    def filtered(self, volumes: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the pressures, Pa, that the fixed-stress operator makes of fluid volumes of the owned cells, m^d."""
+        self._g.array_w[:] = volumes
+        self._preconditioner.apply(self._g, self.dp)
+        return self.dp.array_r
 
     def solve_momentum(self) -> None:
         """Solve for du alone, pressures kept."""

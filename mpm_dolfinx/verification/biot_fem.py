@@ -2,14 +2,15 @@
 """References to compare with: body-fitted, total-Lagrangian finite elements for finite-strain Biot, and beam theory.
 
 With the total displacement u, F = I + grad u, J = det F and the pore pressure p (positive in compression)
-on the reference configuration of a box, backward Euler from state n:
+on the reference configuration of a box, from state n:
 
     momentum   int d/dF [psi(F) - alpha p J] : grad v dV  =  int t . v dA                 (dead tractions t)
-    storage    int [alpha (J - J_n) + S J (p - p_n)] q dV  +  dt int kappa J F^-1 F^-T grad p . grad q dV  =  0
+    storage    int [zeta(J, p) - zeta_n] q dV  +  int int kappa J F^-1 F^-T grad p . grad q dV dt  =  0
 
-S = n/K_w + (alpha - n)/K_s with the porosity n = 1 - (1 - n0)/J_n, kappa = k/(rho_w g).  With pressures constant in
-the cells the flux is the two-point one, kappa J |F^-T N|^2 (p+ - p-)/h, h the distance of the cells' centres.
-The material objects are those of the material point method, so the two differ in discretisation only.
+kappa = k/(rho_w g), the content zeta that of `fluid_content`, the integral over the step that of `time_integration`.
+With pressures constant in the cells the flux is the two-point one, kappa J |F^-T N|^2 (p+ - p-)/h, h the distance of
+the cells' centres.  Materials and time integration are those of the material point method, so the two differ in
+discretisation only.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from numpy.typing import ArrayLike, NDArray
 from tqdm import tqdm
 
 from mpm_dolfinx import _compat
+from mpm_dolfinx.constitutive.fluid_content import change_of_content
 from mpm_dolfinx.constitutive.skeleton import Field, Fluid, Skeleton
 from mpm_dolfinx.constitutive.user_functions import call
 from mpm_dolfinx.errors import GaveUp, NotConverged
@@ -38,6 +40,7 @@ from mpm_dolfinx.points.grid import Grid, side
 from mpm_dolfinx.points.probes import positions
 from mpm_dolfinx.problems.conditions import RIGIDITY, Drained, RigidPlate, Traction
 from mpm_dolfinx.result import Report, Result
+from mpm_dolfinx.time_integration import Substep, substeps
 from mpm_dolfinx.validation import all_of, line, numbers
 
 ELEMENTS = {"taylor-hood": (2, ("Lagrange", 1, ())), "q1-dg0": (1, ("DG", 0, ()))}  # degree of u; space of p
@@ -62,10 +65,11 @@ class Space:
 
 
 class Forms(NamedTuple):
-    """Compiled residual, tangent and loads, and the constants in them: length of the step, tractions, weight."""
+    """Compiled residual, tangent, flux and loads, and their constants: time of the flux, tractions, weight."""
 
     residual: Any
     tangent: Any
+    flux: Any | None
     load: Any | None
     dt: fem.Constant
     tractions: list[tuple[Traction, fem.Constant]]
@@ -91,6 +95,8 @@ class BiotFEM:
         Acceleration of gravity, without fluid only.
     element
         "taylor-hood": Q2 displacement, Q1 pressure; "q1-dg0": Q1, constant in the cells with two-point fluxes.
+    method
+        Of time integration: "sdirk2" or "backward-euler".
     tolerance
         Residual relative to the loads or to the residual at the start of a step, > 0.
     """
@@ -111,6 +117,7 @@ class BiotFEM:
         element: str = "taylor-hood",
         comm: MPI.Intracomm = MPI.COMM_WORLD,
         tolerance: float = 1e-8,
+        method: str = "sdirk2",
     ):
         all_of("material", [material], Skeleton)
         all_of("fluid", [fluid] if fluid is not None else [], Fluid)
@@ -128,6 +135,7 @@ class BiotFEM:
             )
         self.grid, self.material, self.fluid = Grid(upper, cells, lower, comm), material, fluid
         self.tolerance, self._t = tolerance, fem.Constant(self.grid.mesh, 0.0)
+        self._substeps = substeps(method, fluid is not None)
         self.scale = float(np.max(material.at(self.grid.midpoints).oedometric))
         """Unit of the pressure among the unknowns, Pa; both equations are divided by it."""
         self._space = Space(self.grid, fluid is not None, *ELEMENTS[element])
@@ -212,24 +220,26 @@ class BiotFEM:
         J, J_n, alpha = ufl.det(F), ufl.det(F_n), self._constant(law.biot)
         parameters = {name: self._field(getattr(law, name)) for name in law.parameters}
         P = law.first_piola(F, parameters) / self._constant(self.scale) - alpha * p * ufl.diff(J, F)
-        residual = ufl.inner(P, ufl.grad(v)) * dx
+        residual, flux = ufl.inner(P, ufl.grad(v)) * dx, None
         if self.fluid:
             # S is linear in the porosity, and its constants stay finite where a bulk modulus is infinite
             S_0, S_1 = (self.scale * law.storage(self.fluid.bulk, n) for n in (0.0, 1.0))
-            n = 1 - self._constant(1 - law.porosity) / J_n
-            S = self._constant(S_0) + self._constant(S_1 - S_0) * n
-            residual += (alpha * (J - J_n) + S * J * (p - p_n)) * q * dx
+            n, n_n = (1 - self._constant(1 - law.porosity) / volume for volume in (J, J_n))
+            a, S = self._constant(S_1), self._constant(S_0) + self._constant(S_1 - S_0) * n_n
+            residual += J_n * change_of_content(alpha, a, S, J / J_n, p - p_n) * q * dx
             k = self._field(law.conductivity)
             if law.conductivity_law is not None:
                 porosity = {"porosity": n, "porosity0": self._constant(law.porosity)}
-                x = ufl.SpatialCoordinate(self.grid.mesh) + u_n
-                k = call(law.conductivity_law, conductivity=k, F=F_n, J=J_n, x=x, **porosity)
+                x = ufl.SpatialCoordinate(self.grid.mesh) + u
+                k = call(law.conductivity_law, conductivity=k, F=F, J=J, x=x, **porosity)
             kappa = dt * self._constant(self.scale / self.fluid.unit_weight) * k
             pull = ufl.inv(F).T
             if outlets is None:
-                residual += kappa * J * ufl.inner(pull * ufl.grad(p), pull * ufl.grad(q)) * dx
+                flux = kappa * J * ufl.inner(pull * ufl.grad(p), pull * ufl.grad(q)) * dx
             else:
-                residual += self._two_point(kappa, J, pull, p, q, outlets)
+                flux = self._two_point(kappa, J, pull, p, q, outlets)
+            residual += flux
+            flux = _compat.compiled(flux) if len(self._substeps) > 1 else None
         for plate, area in self._plates:
             axis = side(plate.side, self.grid.dim)[0]
             slope = [ufl.as_vector([f[axis].dx(a) for a in range(self.grid.dim) if a != axis]) for f in (u, v)]
@@ -241,7 +251,7 @@ class BiotFEM:
         if self._gravity is not None:
             loads.append(ufl.inner(weight, v) / self._constant(self.scale) * dx)
         load = _compat.compiled(sum(loads)) if loads else None
-        return Forms(_compat.compiled(residual), _compat.compiled(tangent), load, dt, given, weight)
+        return Forms(_compat.compiled(residual), _compat.compiled(tangent), flux, load, dt, given, weight)
 
     def _two_point(self, kappa, J, pull, p, q, outlets: Sequence[Drained]):
         """Return the two-point flux between cells and to drained sides, half a cell away, as UFL."""
@@ -301,18 +311,36 @@ class BiotFEM:
     def step(self, dt: float) -> tuple[int, float]:
         """Advance by dt (s, > 0); return Newton iterations, relative residual.  `NotConverged` keeps the state."""
         numbers("dt", dt, test=lambda v: (0 < v) & (v < np.inf), allowed="> 0 and finite")
-        self._forms.dt.value = dt
+        newton, worst = 0, 0.0
+        for substep in self._substeps:
+            took, residual = self._solve(substep, dt)
+            newton, worst = newton + took, max(worst, residual)
+        self._space.old.x.array[:] = self._space.w.x.array
+        self._t.value += dt
+        return newton, worst
+
+    def _load(self, t: float) -> float:
+        """Assemble the loads at time t (s); return their norm."""
         for traction, constant in self._forms.tractions:
-            constant.value[:] = self._traction(traction, self.t + dt)
+            constant.value[:] = self._traction(traction, t)
         if self._gravity is not None:
             density = (1 - self.material.porosity) * self.material.grain_density
-            g = numbers(
-                "gravity", self._gravity(self.t + dt), (self.grid.dim,), allowed=f"{self.grid.dim} finite numbers"
-            )
+            d = self.grid.dim
+            g = numbers("gravity", self._gravity(t), (d,), allowed=f"{d} finite numbers")
             self._forms.weight.value = density * g
+        self._space.f.x.array[:] = 0.0
         if self._forms.load is not None:
             self._assemble(self._space.f, self._forms.load)
-        x, load, snes = _compat.petsc_vec(self._space.w).copy(), _compat.petsc_vec(self._space.f).norm(), self._snes
+        return _compat.petsc_vec(self._space.f).norm()
+
+    def _solve(self, substep: Substep, dt: float) -> tuple[int, float]:
+        """Solve for the end of a substep of a step dt, s; return Newton iterations, relative residual."""
+        load, snes = self._load(self.t + substep.end * dt), self._snes
+        if substep.before:
+            self._forms.dt.value = substep.before * dt
+            _compat.petsc_vec(self._space.f).axpy(-1.0, self._assemble(self._space.b, self._forms.flux))
+        self._forms.dt.value = substep.own * dt
+        x = _compat.petsc_vec(self._space.w).copy()
         petsc.set_bc(x, self._bcs)
         round_off = 1e-14 * self.grid.cell_volume / self.grid.h.min() * np.sqrt(x.getSize())
         snes.setTolerances(self.tolerance, max(self.tolerance * load, round_off), 0.0)
@@ -324,8 +352,6 @@ class BiotFEM:
             self._take(_compat.petsc_vec(self._space.old))
             raise NotConverged(f"PETSc SNES stopped with reason {snes.reason}", [parts])
         self._take(x)
-        self._space.old.x.array[:] = self._space.w.x.array
-        self._t.value += dt
         return snes.its, norms[-1] / scale
 
     def _traction(self, load: Traction, t: float) -> NDArray[np.float64]:

@@ -1,0 +1,34 @@
+# SPDX-License-Identifier: MIT
+"""The content of pore fluid, whose change the storage balances.
+
+Per volume of the reference, d zeta = alpha dJ + S J dp.  With n = 1 - (1 - n0) / J the storage coefficient
+S = n / K_w + (alpha - n) / K_s makes S J = a J + b linear in J, with a = S(n = 1).  Then
+
+    d zeta = (alpha / rho) d[(J + b / a) rho],    rho = exp(a p / alpha):
+
+a mass, of a fluid of the density rho that fills J + b / a.  Divided by rho halfway between start and end, its change
+is of second order for any path, and nothing where no fluid flows, however long the step.
+"""
+
+from __future__ import annotations
+
+import ufl
+
+
+def change_of_content(alpha, a, storage, J, dp):
+    """Return the change of the content in a step as UFL, per volume at its start.
+
+    Parameters
+    ----------
+    alpha, a, storage
+        Biot coefficient; storage coefficient at a porosity of one, and at the start of the step, 1/Pa.
+    J
+        Volume ratio since the start of the step.
+    dp
+        Change of the pore pressure, Pa.
+    """
+    z = a * dp / (2 * alpha)
+    small = ufl.lt(abs(z), 1e-3)
+    away = ufl.conditional(small, 1.0, z)  # both branches are evaluated, and differentiated
+    sinhc = ufl.conditional(small, 1 + z**2 / 6, ufl.sinh(away) / away)
+    return alpha * (J - 1) * ufl.cosh(z) + (storage + a * (J - 1) / 2) * dp * sinhc

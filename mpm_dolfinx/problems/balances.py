@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: MIT
+"""The start of a step, and the two balances at the end of each of its substeps."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpm_dolfinx.problems.momentum import MomentumProblem
+from mpm_dolfinx.problems.on_grid import Assembled, OnGrid
+from mpm_dolfinx.problems.quadrature_data import QuadratureData
+from mpm_dolfinx.problems.side_forms import SideData
+from mpm_dolfinx.problems.storage import Rates, StorageProblem
+from mpm_dolfinx.scene import Scene
+from mpm_dolfinx.state import State
+from mpm_dolfinx.time_integration import Substep
+
+
+class Acting(NamedTuple):
+    """What acts in a substep: its shares of the step, time, s, sides, and gravity (d,), m/s^2, if there is any."""
+
+    substep: Substep
+    t: float
+    sides: SideData
+    gravity: NDArray[np.float64] | None
+
+
+class Start(NamedTuple):
+    """The start of a step of dt (s): the state on the grid, with the pieces' data, matrices, and what acts."""
+
+    state: State
+    on_grid: OnGrid
+    data: QuadratureData
+    matrices: Assembled
+    dt: float
+    acting: list[Acting]
+
+
+class Balances(NamedTuple):
+    """The two balances at the end of a substep; storage is None without fluid."""
+
+    momentum: MomentumProblem
+    storage: StorageProblem | None
+
+
+def balances(scene: Scene, start: Start, acting: Acting, before: Rates | None = None) -> Balances:
+    """Return the balances at the end of a substep, with u and p as they are; before: rates of the substep before."""
+    substep, on_grid, matrices, dt = acting.substep, start.on_grid, start.matrices, start.dt
+    scene.set_time(acting.t, substep.end * dt, acting.gravity)
+    scene.momentum.set_rate(substep.own * dt, substep.before / substep.own)
+    momentum = MomentumProblem(scene.momentum, matrices.momentum, start.data, acting.sides, matrices.round_off)
+    if scene.storage is None:
+        return Balances(momentum, None)
+    weight = None if acting.gravity is None else scene.fluid.density * acting.gravity
+    flow = matrices.flow(start.state, weight, start.data)
+    lost = before and before.taken(substep.before * dt)
+    options = (on_grid.contents, flow, substep.own * dt, lost)
+    return Balances(momentum, StorageProblem(scene.storage, matrices.storage, start.data.pieces, *options))

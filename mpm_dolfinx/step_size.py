@@ -1,0 +1,177 @@
+# SPDX-License-Identifier: MIT
+"""How long the steps of a run are: all alike, or by the error that each has made."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from math import inf, sqrt
+
+import numpy as np
+
+from mpm_dolfinx.result import Report, Result
+from mpm_dolfinx.scene import Scene
+from mpm_dolfinx.validation import line, numbers
+
+MIN_CUT = 2.0**-10
+"""Share of what a step should be long below which it is not cut."""
+SAFETY, SHRINKS, GROWS, KEEPS = 0.9, 0.2, 5.0, 1.2
+"""A step by error follows SAFETY times its error's root, by SHRINKS to GROWS; below KEEPS it stays as it is."""
+RINGS = 5e-3
+"""Sudden change of the pressures, in proportion to the largest so far, from which on a step is taken in two halves.
+
+The stability function is never below -0.21: what goes unseen overshoots by a thousandth.
+"""
+MOST = 1e9
+"""Output intervals of a run: with more, a step is lost in the rounding of the time."""
+FIRST = 1e-3
+"""Share of the first output interval that a step by error is first tried with."""
+
+
+@dataclass(frozen=True)
+class StepSize:
+    """The rule for the length of a run's steps.
+
+    Parameters
+    ----------
+    first, longest : s
+        The step to begin with; the step where all are alike, else the longest.
+    rtol
+        Largest error of the pressures in proportion to their largest change since the run began; None: equal steps.
+    """
+
+    first: float
+    longest: float
+    rtol: float | None = None
+
+    @property
+    def by_error(self) -> bool:
+        """Whether steps are chosen by their error."""
+        return self.rtol is not None
+
+    def ended(self, t: float, target: float, result: Result) -> bool:
+        """Return whether a time, s, is the target but for rounding."""
+        slack = 1e-14 * abs(target) if self.by_error else 1e-9 * min(result.small, self.longest)
+        return target - t <= slack
+
+    def wanted(self, taken: float) -> float:
+        """Return what a step should be that is first tried with a length, s: below a share of it it is not cut."""
+        return taken if self.by_error else self.longest
+
+    def fitted(self, left: float, small: float) -> float:
+        """Return the length of the next step, s: `small`, fitted to the time that is left to the next output."""
+        if self.by_error:  # no scrap of a step before an output
+            return left if left < 1.05 * small else min(small, left / 2)
+        # steps that fit but for rounding are all of the same length
+        return left if not left > (1 - 1e-9) * small else small
+
+    def refused(self, taken: float, report: Report, result: Result) -> float:
+        """Return by how much its error has to shrink a step that has been solved; 1 where it is accepted.
+
+        After a jump of the loads one long step may overshoot by a fifth of what is left, two halves of it do not: the
+        stability function is squared.
+        """
+        if not self.by_error:
+            return 0.5 if taken > 0.75 * self.longest and report.sudden > RINGS * result.change else 1.0
+        if report.error <= self.rtol * result.change:
+            return 1.0
+        return max(SHRINKS, SAFETY * sqrt(self.rtol * result.change / report.error))
+
+    def next(self, taken: float, report: Report, result: Result, failed: bool) -> float:
+        """Return the step to try after one that was taken, s; failed: after a longer one had not converged."""
+        if not self.by_error:
+            return max(result.small, min(2 * taken, self.longest)) if report.easy else result.small
+        goal = self.rtol * result.change
+        factor = SAFETY * sqrt(goal / report.error) if report.error > 0 else GROWS
+        factor = min(GROWS, max(SHRINKS, factor))
+        if factor >= 1:
+            # a step as long as one that has just failed would mostly fail again: in soil that yields, 78 cuts, not 1
+            factor = 1.0 if factor < KEEPS or failed or not report.easy else factor
+            return min(max(taken * factor, result.small), self.longest)  # it may have been short for an output's sake
+        return taken * factor
+
+
+def measured(result: Result, report: Report) -> Result:
+    """Return the histories with the largest change of the pressures so far, that of a step that was solved included."""
+    change = max(result.change, report.change)
+    if result.rows and result.rows[0][2] is not None and report.extremes is not None:
+        start = result.rows[0][2]
+        change = max(change, *(abs(now - then) for now, then in zip(report.extremes, start, strict=True)))
+    return replace(result, change=change)
+
+
+class Times:
+    """The output times of a run.
+
+    Parameters
+    ----------
+    start, now : s
+        Where the run began, and where it goes on.
+    end, interval, given, rtol
+        t_end, dt, t_eval and rtol of `run`.
+    goes_on
+        Whether the run goes on with histories.
+
+    Raises
+    ------
+    ValueError
+        Naming what is not allowed: no time left, or more steps than times can tell apart.
+    """
+
+    def __init__(self, start: float, now: float, end, interval, given, rtol, goes_on: bool):
+        more, least = (">=", now) if goes_on else (">", np.nextafter(now, inf))
+        test, allowed = lambda v: (v >= least) & (v < inf), f"{more} {now:g} s and finite"
+        self.end = float(numbers("t_end", end, allowed=allowed, test=test))
+        if interval is None and rtol is None:
+            raise ValueError("dt = None: must be given, or rtol for steps that are chosen by their error")
+        if given is not None and interval is not None and rtol is not None:
+            raise ValueError(
+                f"dt = {line(interval)}: with rtol and t_eval there is no output interval, must be left out"
+            )
+        self.interval, self.each = 0.0, given is None and interval is None
+        """Output interval, s, 0 without; whether every step is an output."""
+        if interval is not None:
+            allowed = f"> 0, and not below {(self.end - now) / MOST:g} s"
+            test = lambda v: (v > 0) & (v * MOST >= self.end - now)  # noqa: E731
+            self.interval = min(float(numbers("dt", interval, allowed=allowed, test=test)), self.end - start)
+        self._times = None
+        if given is not None:
+            times = numbers("t_eval", given, None, allowed="times, s")
+            if times.ndim != 1 or not (np.diff(times, prepend=start) > 0).all() or not (times <= self.end).all():
+                raise ValueError(f"t_eval = {line(given)}: must be increasing times in ({start:g}, {self.end:g}] s")
+            self._times = times.tolist()
+        elif self.each:
+            self._times = []
+        self.start = start
+
+    def after(self, t: float) -> list[float]:
+        """Return the output times after one, s, the end included."""
+        if self._times is not None:
+            return [*(time for time in self._times if t < time < self.end), *[self.end] * (t < self.end)]
+        # a last interval that is a fraction of dt counts as one
+        start, dt = self.start, self.interval
+        done = round((t - start) / dt)
+        count = max(done + (self.end - t > 1e-9 * dt), round((self.end - start) / dt))
+        return [start + k * dt for k in range(done + 1, count)] + [self.end] * (count > done)
+
+    def next(self, t: float) -> float:
+        """Return until when a run that has been broken off after an output time may have got, s."""
+        return max([*self.after(t)[:1], t]) + 1e-9 * self.interval
+
+
+def step_rule(times: Times, rtol, first_step, max_step: float, scene: Scene) -> StepSize:
+    """Return the rule of a run: see `run`; ValueError naming what is not allowed."""
+    positive = {"test": lambda v: v > 0, "allowed": "> 0"}
+    if rtol is None:
+        for name, value in {"first_step": first_step, "max_step": max_step if max_step != inf else None}.items():
+            if value is not None:
+                raise ValueError(f"{name} = {line(value)}: needs rtol, for steps that are chosen by their error")
+        return StepSize(times.interval, times.interval)
+    numbers("rtol", rtol, test=lambda v: (0 < v) & (v < 1), allowed="in (0, 1)")
+    if scene.method == "backward-euler":
+        raise ValueError(f"rtol = {line(rtol)}: backward-euler knows no error of a step, must be sdirk2")
+    longest = float(numbers("max_step", max_step, **positive)) if max_step != inf else inf
+    share = FIRST if len(scene.substeps) > 1 else 1.0  # without a rate no step has an error
+    first = share * (times.after(times.start)[0] - times.start)
+    if first_step is not None:
+        first = float(numbers("first_step", first_step, **positive))
+    return StepSize(min(first, longest), longest, float(rtol))

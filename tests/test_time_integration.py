@@ -1,0 +1,232 @@
+# SPDX-License-Identifier: MIT
+"""Time: order of the steps, laws within them, jumps, steps chosen by their error, output times."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import ufl
+from helpers import SOFT, beam, column
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.verification.exact import terzaghi_consolidation
+
+DRAINED = {"drained": [mpm.Drained("top")]}
+
+
+def rates(errors):
+    """Return the orders between errors at steps that are halved each time."""
+    return np.log2(np.array(errors[:-1]) / np.array(errors[1:]))
+
+
+def loaded(load, **options):
+    return column(tractions=[mpm.Traction("top", (0, -load))], **options)
+
+
+def ramp(load, end):
+    return [mpm.Traction("top", lambda t: (0, -load * min(1.0, t / end) ** 2))]
+
+
+SOFT_WATER = mpm.Fluid(bulk=5e6)
+HALVING = replace(SOFT, conductivity_law=lambda conductivity, J: conductivity * ufl.exp(5 * (J - 1)))
+SCENES = {
+    "compressible fluid and grains": {"fluid": SOFT_WATER, "material": replace(SOFT, grain_bulk=5e7, biot=0.9)},
+    "conductivity law": {"material": HALVING},
+    "gravity of time": {"gravity": lambda t: (0, -500.0 * min(1.0, t / 40) ** 2)},
+    "source of time": {"sources": [lambda points, q, t: 1e-4 * ufl.sin(t / 20) * q * points.dx]},
+}
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_what_changes_within_a_step_is_of_second_order(name):
+    """A column of one metre that settles by a tenth, through cells of a fifth."""
+
+    def end(steps):
+        s = column(cells=5, tractions=ramp(1e6, 40), **DRAINED, **SCENES[name])
+        top = mpm.probes(s.bodies, [[0.1, 1.0]])
+        return s.run(40.0, 40 / steps, probes=top, progress=False).displacement[-1][0, 1]
+
+    runs = [end(steps) for steps in (4, 8, 16, 64)]
+    errors = [abs(u - runs[-1]) for u in runs[:-1]]
+    assert rates(errors).min() > 1.7 and errors[-1] < 3e-5, errors
+
+
+@pytest.mark.parametrize("steps", [1, 7, 100])
+def test_a_sealed_bodys_fluid_keeps_its_mass_whatever_the_steps(steps):
+    """rho V of the pores stays: (n0 + J - 1) exp(p / K_w) = n0, for water as soft as the skeleton at large strain."""
+    s = column(cells=4, tractions=ramp(3e6, 1.0), fluid=SOFT_WATER)
+    s.run(1.0, 1 / steps, progress=False)
+    J, p = s.points.J, s.points.pressure
+    assert J.max() < 0.9
+    assert (SOFT.porosity + J - 1) * np.exp(p / SOFT_WATER.bulk) == pytest.approx(SOFT.porosity, rel=1e-7)
+
+
+def test_a_conductivity_law_is_taken_at_the_stages_of_the_step():
+    """Hencky column, k = k0 J^3 / (1 - ln J): the stretch diffuses linearly, at any strain."""
+    h, soil = 1 / 50, mpm.Hencky(1e6 / 3, 5e5, porosity=0.7, conductivity=1e-4, conductivity_law=linear_diffusion)
+    grid = mpm.Grid([h, 1.0], [1, 50])
+    body, load = mpm.box(grid, [0, 0], [h, 1.0]), [mpm.Traction("top", (0, -soil.oedometric))]
+    walls = {"left": "x", "right": "x", "bottom": "y"}
+    s = mpm.Simulation(grid, [body], [soil], fluid=mpm.Fluid(bulk=np.inf), fixed=walls, tractions=load, **DRAINED)
+    cv, final = 1e-4 * soil.oedometric / 9810, 1 - 0.5671432904097838  # ln J / J = -1 at the end
+    result = s.run(0.1 / cv, 0.1 / cv / 20, probes=mpm.probes([body], [[h / 2, 1.0]]), progress=False)
+    u, T = -np.array(result.displacement)[1:, 0, 1], np.array(result.t[1:]) * cv
+    error = u / (final * terzaghi_consolidation(T, 1.0, 1.0)) - 1
+    assert abs(error[T > 0.0499][0]) < 8e-3 and abs(error[-1]) < 5e-3 and result.balance < 1e-8, "of the cells, mostly"
+
+
+def linear_diffusion(conductivity, J):
+    return conductivity * J**3 / (1 - ufl.ln(J))
+
+
+@pytest.mark.parametrize("dt", [0.3, 3.0, 30.0, 300.0])
+def test_a_body_that_is_loaded_sealed_and_then_drained_does_not_ring(dt):
+    s = loaded(100.0, cells=20)
+    s.run(1.0, 1.0, progress=False)
+    p0 = s.points.pressure.max()
+    s.stage(drained=[mpm.Drained("top")])
+    extremes = np.array(s.run(1 + 3 * dt, dt, progress=False).pressure)
+    assert extremes.min() > -1e-3 * p0 and extremes.max() < p0 * (1 + 1e-3)
+
+
+def test_backward_euler_is_an_option_and_of_first_order():
+    def end(steps, method):
+        s = column(cells=5, tractions=ramp(1e4, 40), method=method, **DRAINED)
+        s.run(40.0, 40 / steps, progress=False)
+        return s.points.pressure
+
+    true = end(128, "sdirk2")
+    errors = [np.abs(end(steps, "backward-euler") - true).max() for steps in (4, 8, 16)]
+    assert 0.8 < rates(errors).min() < 1.3
+
+
+def test_a_term_of_the_velocity_makes_a_dry_body_creep_exactly():
+    """Kelvin-Voigt: strain = q / M (1 - exp(-M t / eta)), for a load that stays."""
+    eta, load = 1e8, 1e3
+
+    def damper(points, velocity, v):
+        return eta * ufl.inner(ufl.sym(points.grad(velocity)), ufl.sym(points.grad(v))) * points.dx
+
+    def error(steps):
+        s = loaded(load, cells=2, fluid=False, terms=[damper])
+        s.run(20.0, 20 / steps, progress=False)
+        exact = load / SOFT.oedometric * (1 - np.exp(-SOFT.oedometric * 20.0 / eta))
+        return np.abs((1 - s.points.J) / exact - 1).max()
+
+    errors = [error(steps) for steps in (10, 20, 40)]
+    assert rates(errors).min() > 1.9 and errors[-1] < 2e-3
+
+
+# ---- steps chosen by their error -----------------------------------------------------------------
+
+
+def test_output_times_are_hit_whatever_the_steps():
+    times, seen = [1e-3, 0.5, 7.0, 100.0], []
+    result = loaded(100.0, **DRAINED).run(
+        300.0, rtol=1e-3, t_eval=times, observe=lambda s: seen.append(s.t), progress=False
+    )
+    assert result.t == [0.0, *times, 300.0] and seen == result.t[1:] and result.converged
+    assert result.steps > 10
+
+
+def test_steps_grow_over_six_decades_of_consolidation():
+    """From T_v = 1e-6 to 1, against steps so short that time costs nothing; most is the first steps' damping."""
+    cv = SOFT.conductivity / 9810 * SOFT.oedometric
+
+    def run(rtol):
+        s, p = loaded(100.0, cells=20, **DRAINED), []
+        times = np.logspace(-6, 0, 7) / cv
+        result = s.run(
+            times[-1], rtol=rtol, t_eval=times, observe=lambda s: p.append(s.points.pressure), progress=False
+        )
+        return result.steps, np.array(p)
+
+    (steps, p), (_, true) = run(1e-4), run(1e-5)
+    assert steps <= 100 and np.abs(p - true).max() < 1e-3 * 100
+
+
+def test_a_jump_of_the_load_within_the_run_is_found():
+    """The load doubles at 7.3 s, between outputs: steps shrink towards it, and the error stays what was asked for."""
+    jump = [mpm.Traction("top", lambda t: (0, -100.0 if t < 7.3 else -200.0))]
+
+    def run(times, **options):
+        s = column(cells=10, tractions=jump, **DRAINED)
+        s.run(7.3 - 1e-9, 0.05, progress=False) if not options else None
+        return s, s.run(20.0, *times, **options, progress=False)
+
+    s, result = run((), rtol=1e-3, t_eval=[20.0])
+    true, _ = run((0.01,))
+    assert result.rejected > 3 and result.steps < 60
+    assert np.abs(s.points.pressure - true.points.pressure).max() < 2e-3 * 200
+
+
+def test_the_first_step_and_the_longest_are_what_was_asked_for():
+    times = []
+    s = loaded(100.0, **DRAINED)
+    s.run(50.0, rtol=0.1, first_step=1e-4, max_step=2.0, observe=lambda s: times.append(s.t), progress=False)
+    steps = np.diff([0.0, *times])
+    assert steps[0] == 1e-4 and steps.max() <= 2.0 * (1 + 1e-12) and times[-1] == 50.0
+
+
+def test_where_nothing_flows_a_step_is_as_long_as_an_output_interval():
+    s, _ = beam(fluid=False, load=54.0)
+    assert s.run(0.3, 0.1, rtol=1e-3, progress=False).steps == 3
+
+
+def test_a_run_with_steps_by_their_error_resumes_with_the_same_bits(tmp_path):
+    file, times = tmp_path / "half.npz", np.linspace(0.02, 0.3, 8)
+
+    def scene():
+        s, _ = beam(h=0.06)
+        return s
+
+    whole = scene()
+    end = whole.run(0.3, rtol=5e-3, t_eval=times, checkpoint=mpm.Checkpoint(file, every=4), progress=False)
+    half = scene()
+    half.run(0.3, rtol=5e-3, t_eval=times, observe=Stop(4), checkpoint=mpm.Checkpoint(file, every=4), progress=False)
+    resumed = scene()
+    again = resumed.run(0.3, rtol=5e-3, t_eval=times, after=mpm.resume(resumed, file), progress=False)
+    assert np.array_equal(resumed.points.corners, whole.points.corners)
+    assert np.array_equal(resumed.points.pressure, whole.points.pressure)
+    assert (again.t, again.steps, again.rejected) == (end.t, end.steps, end.rejected)
+
+
+BAD = {
+    "no step": ({}, r"dt = None: must be given, or rtol"),
+    "rtol too large": ({"rtol": 1.0}, r"rtol = 1\.0, must be in \(0, 1\)"),
+    "both output rules": ({"dt": 1.0, "rtol": 1e-3, "t_eval": [1.0]}, r"dt = 1\.0: .* must be left out"),
+    "first step of equal steps": ({"dt": 1.0, "first_step": 0.1}, r"first_step = 0\.1: needs rtol"),
+    "longest of equal steps": ({"dt": 1.0, "max_step": 0.1}, r"max_step = 0\.1: needs rtol"),
+    "negative first step": ({"rtol": 1e-3, "first_step": -1.0}, r"first_step = -1\.0, must be > 0"),
+    "times that fall": ({"rtol": 1e-3, "t_eval": [2.0, 1.0]}, r"t_eval = .*must be increasing times in \(0, 4\] s"),
+    "times after the end": ({"dt": 1.0, "t_eval": [2.0, 9.0]}, r"t_eval = .*must be increasing times in \(0, 4\] s"),
+    "times of words": ({"dt": 1.0, "t_eval": ["a"]}, r"t_eval = "),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_steps_that_cannot_be_are_refused_in_a_line(name):
+    options, message = BAD[name]
+    s = column(cells=2, **DRAINED)
+    with pytest.raises(ValueError, match=message) as caught:
+        s.run(4.0, **options, progress=False)
+    assert "\n" not in str(caught.value) and s.t == 0
+
+
+def test_a_method_that_has_no_error_cannot_choose_its_steps():
+    s = column(cells=2, method="backward-euler", **DRAINED)
+    with pytest.raises(ValueError, match=r"rtol = 0\.001: backward-euler knows no error of a step, must be sdirk2"):
+        s.run(4.0, rtol=1e-3, progress=False)
+    with pytest.raises(ValueError, match=r"method 'rk4': must be one of sdirk2, backward-euler"):
+        column(cells=2, method="rk4")
+
+
+class Stop:
+    """Interrupts a run after so many outputs."""
+
+    def __init__(self, count):
+        self.count = count
+
+    def __call__(self, simulation):
+        if len(simulation.result.rows) - 1 > self.count:
+            raise KeyboardInterrupt
