@@ -17,12 +17,19 @@ def skeleton(nu):
 
 @pytest.mark.parametrize("nu", [0.45, 0.499])
 def test_nearly_incompressible_beams_do_not_lock(nu):
-    """Plain Q1 is 1.3 and 26 % too stiff on this grid of ten cells over the depth."""
+    """Plain Q1 is 1.3 and 26 % too stiff on this grid of ten cells over the depth.
+
+    So are the finite elements, at first order in their size: by 0.9 % with 60 over the length at nu = 0.499.
+    """
     s, probe = beam(material=skeleton(nu), fluid=False, ramp=1.0)
     tip = s.run(1.0, 0.1, probes=probe).displacement[-1][0, 1]
     load = mpm.Traction("top", lambda t: (0, -54e3 * min(1, t)), region=((0.05, -np.inf), (1.0, np.inf)))
-    fem = BiotFEM([0, 0], [1, 0.3], (60, 18), skeleton(nu), fixed={"left": "xy"}, tractions=[load])
-    assert tip == pytest.approx(fem.run(1.0, 0.1, probes=[[1.0, 0.15]]).displacement[-1][0, 1], rel=1e-2)
+
+    def reference(n):
+        fem = BiotFEM([0, 0], [1, 0.3], (n, 3 * n // 10), skeleton(nu), fixed={"left": "xy"}, tractions=[load])
+        return fem.run(1.0, 0.1, probes=[[1.0, 0.15]]).displacement[-1][0, 1]
+
+    assert tip == pytest.approx(2 * reference(60) - reference(30), rel=1e-2)
 
 
 def test_the_tangent_is_the_derivative_of_the_residual():

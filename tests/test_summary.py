@@ -17,8 +17,11 @@ STIFF = mpm.NeoHookean(bulk=1e9, shear=5e6)
 ALWAYS = {"stress"}
 FLUID = {"pore pressure", "coupling"}
 SCENES = {
-    "drained beam": (lambda: beam(fluid=False, load=1e3)[0], {"tractions", "ghost penalty"}),
-    "beam": (lambda: beam(load=1e3)[0], FLUID | {"tractions", "ghost penalty", "fluxes between cells", "open sides"}),
+    "drained beam": (lambda: beam(fluid=False, load=1e3, offset=0.1)[0], {"tractions", "ghost penalty"}),
+    "beam": (
+        lambda: beam(load=1e3, offset=0.1)[0],
+        FLUID | {"tractions", "ghost penalty", "fluxes between cells", "open sides"},
+    ),
     "sealed column": (
         lambda: column(material=SEALED, displacements=[mpm.Displacement("top", (0, -0.01), "y")]),
         FLUID | {"given displacements", "damping of pressure jumps"},

@@ -49,7 +49,7 @@ def _momentum(s: Scene, state: State) -> list[Part]:
         _either("tractions", side.loads, f"on {len(side.loads)} sides", "no tractions"),
         _either("given displacements", side.holds, f"on {len(side.holds)} sides", "no given displacements"),
         _either("rigid plates", side.plates, f"on {len(side.plates)} sides", "no plates"),
-        _either("ghost penalty", m.ghost.form.used, "faces of partly filled cells", "no partly filled cell so far"),
+        _either("ghost penalty", m.ghost.form.used, "faces of nearly empty cells", "no nearly empty cell so far"),
         _either("terms of the user's", m.terms, f"{len(m.terms)}", "none given"),
     ]
 

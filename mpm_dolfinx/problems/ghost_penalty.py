@@ -1,8 +1,15 @@
 # SPDX-License-Identifier: MIT
-"""Ghost penalty: jumps of the normal derivative on faces of partly filled cells (Burman 2010, Coombs 2023).
+"""Ghost penalty: nearly empty cells deform as the fuller ones beside them (Burman 2010, Coombs 2023).
 
-gamma M h/3 int [d_n u].[d_n v] dS, M = lambda + 2G, on the step's increment only: cells that are hardly filled
-then spoil neither the conditioning nor the answer.
+gamma s 2G h/3 int [d_n u].[d_n v] dS on the step's increment: cells that are hardly filled then spoil neither the
+conditioning nor the answer.  It acts like a viscosity of the step where it acts on what carries the body, so it is
+kept from there:
+
+* The strength s of a face falls from 1 to 0 as the emptier cell's share of the fuller one's filling rises to RATIO, and
+  with the square of the fuller one's share of the fullest cell's beside the emptier: it leads from full cells to empty
+  ones, whose free nodes follow at next to no work.  Faces between alike cells would resist kinks of the body itself.
+* Its scale is the shear modulus.  With lambda + 2G nearly empty cells of nearly incompressible bodies would have to
+  stretch as the cell beside them does, whatever their own volume asks for.
 """
 
 from __future__ import annotations
@@ -16,14 +23,14 @@ from mpm_dolfinx import _compat
 from mpm_dolfinx.forms.point_forms import FacetForm
 from mpm_dolfinx.points.grid import Grid
 
-GHOST = 1e-2
-"""Strength gamma of the ghost penalty; 1e-3 to 1/30 changes the beam's tip by 1e-5."""
-FULL = 0.9
-"""A cell filled less than this is partly filled: its faces carry the ghost penalty."""
+GHOST = 0.05
+"""Strength gamma of the ghost penalty."""
+RATIO = 0.3
+"""A cell filled less than this share of a neighbour is nearly empty: faces between the two carry the penalty."""
 
 
 class GhostPenalty:
-    """The form, with the modulus M (Pa) and the filled share of the cells.
+    """The form, with modulus and filled share of the cells.
 
     Parameters
     ----------
@@ -31,29 +38,50 @@ class GhostPenalty:
         Background grid.
     V
         Space of the displacement.
+
+    Attributes
+    ----------
+    modulus
+        2G of what the cells hold, Pa.
+    fill, beside
+        Filled share of each cell, and of the fullest of its neighbours.
     """
 
     def __init__(self, grid: Grid, V: fem.FunctionSpace):
         self.grid, cellwise = grid, grid.cellwise()
-        self.modulus, self.fill = fem.Function(cellwise), fem.Function(cellwise)
-        v, du, n = ufl.TestFunction(V), ufl.TrialFunction(V), ufl.FacetNormal(grid.mesh)
+        self.modulus, self.fill, self.beside = (fem.Function(cellwise) for _ in range(3))
+        v, du, n = ufl.TestFunction(V), ufl.TrialFunction(V), ufl.FacetNormal(grid.mesh)("+")
         h = fem.Constant(grid.mesh, grid.h)
-        across = sum(abs(n("+")[a]) * h[a] for a in range(grid.dim))
+        across = sum(abs(n[a]) * h[a] for a in range(grid.dim))
         dS = ufl.Measure("dS", domain=grid.mesh, subdomain_id=_compat.SUBDOMAIN, metadata={"quadrature_degree": 2})
 
         def kink(w):
-            return ufl.dot(ufl.grad(w)("+") - ufl.grad(w)("-"), n("+"))
+            return ufl.dot(ufl.grad(w)("+") - ufl.grad(w)("-"), n)
 
-        form = GHOST / 3 * ufl.avg(self.modulus) * across * ufl.inner(kink(du), kink(v)) * dS
+        form = GHOST / 3 * self._scale() * across * ufl.inner(kink(du), kink(v)) * dS
         self.form = FacetForm(form, grid.comm)
 
+    def _scale(self):
+        """Return the strength of a face times its modulus, the harmonic mean of both cells', Pa, as UFL."""
+        fills, moduli, beside = ([f("+"), f("-")] for f in (self.fill, self.modulus, self.beside))
+        full, little = ufl.max_value(*fills), ufl.min_value(*fills)
+        fullest = ufl.conditional(ufl.lt(*fills), *beside)  # beside the emptier one
+        strength = ufl.max_value(0.0, 1 - little / (RATIO * full)) * (full / fullest) ** 2
+        return strength * 2 * moduli[0] * moduli[1] / (moduli[0] + moduli[1])
+
     def set_contents(self, volume: NDArray[np.float64], stiffness: NDArray[np.float64]) -> None:
-        """Set volumes (cells,), m^d, of what the owned cells hold, and their oedometric moduli times volume."""
-        self.fill.x.array[:] = volume / self.grid.cell_volume
+        """Set volumes (cells,), m^d, of what the owned cells hold, and their moduli 2G, Pa, times volume."""
+        grid, fill = self.grid, self.fill.x.array
+        fill[:] = volume / grid.cell_volume
         self.modulus.x.array[:] = np.divide(stiffness, volume, out=np.zeros_like(stiffness), where=volume > 0)
         for f in (self.fill, self.modulus):
             f.x.scatter_forward()
+        own = np.arange(grid.num_owned)
+        neighbours = grid.facet_cells[grid.cell_facets[own]].sum(axis=2) - own[:, None]  # -1 where there is none
+        self.beside.x.array[own] = np.where(neighbours >= 0, fill[neighbours], 0.0).max(axis=1, initial=0.0)
+        self.beside.x.scatter_forward()
 
     def facets(self, facets: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Return those of the inner faces that belong to a partly filled cell."""
-        return facets[(self.fill.x.array < FULL)[self.grid.facet_cells[facets]].any(axis=1)]
+        """Return those of the inner faces that carry the penalty."""
+        fill = self.fill.x.array[self.grid.facet_cells[facets]]
+        return facets[fill.min(axis=1) < RATIO * fill.max(axis=1)]

@@ -61,17 +61,17 @@ class OnGrid(Keyed):
         pieces = self.data.pieces
         self.weight = weight = pieces["weight"][:, 0] * grid.cell_volume
         """Volumes (m,) of the pieces, m^d."""
-        stiffness = weight * quadrature.rows(cut, points, lambda m: m.oedometric)
-        momentum.ghost.set_contents(*(sum_by(cut.cells, rows, grid.num_local) for rows in (weight, stiffness)))
+        shear = weight * quadrature.rows(cut, points, lambda m: 2 * m.shear)
+        momentum.ghost.set_contents(*(sum_by(cut.cells, rows, grid.num_local) for rows in (weight, shear)))
         self.active = momentum.ghost.fill.x.array > 0
         """Which local cells hold something, ghosts included."""
         self.cells = np.flatnonzero(self.active)
         self.facets = grid.interior_facets(self.active, self.cells)
         """Faces of this process between two active cells."""
         self.penalised = momentum.ghost.facets(self.facets)
-        """Those of partly filled cells."""
-        self.stiffness = float(momentum.ghost.modulus.x.array[self.cells].max(initial=0.0))
-        """Largest oedometric modulus of a cell, Pa."""
+        """Those of nearly empty cells."""
+        self.stiffness = float(quadrature.rows(cut, points, lambda m: m.oedometric).max(initial=0.0))
+        """Largest oedometric modulus, Pa."""
         self.contents = None
         if storage is not None:
             brought = PieceContents(
