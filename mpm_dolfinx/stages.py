@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.points.bodies import Body
+from mpm_dolfinx.points.contact import check_apart
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.points.pressure_transport import at_start
 from mpm_dolfinx.problems.stage import Stage, stage
@@ -21,7 +22,9 @@ from mpm_dolfinx.validation import chosen, flag, numbers
 
 def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int]) -> State:
     """Return the state of a scene at rest, in its first stage."""
-    begun = _stage(scene, conditions, [body not in later for body in range(len(scene.bodies))], later)
+    present = [body not in later for body in range(len(scene.bodies))]
+    check_apart(scene.grid, scene.bodies, present)
+    begun = _stage(scene, conditions, present, later)
     points = scene.materials.seeded.of(_ids(scene.bodies, later), kept=False)
     transported = at_start(points) if scene.fluid else None
     reactions = np.zeros((len(begun.mechanical.holds), scene.grid.dim))
