@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.points.bodies import Body
 from mpm_dolfinx.points.contact import check_apart
+from mpm_dolfinx.points.fills import put, touches
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.points.pressure_transport import at_start
 from mpm_dolfinx.problems.stage import Stage, stage
@@ -52,8 +53,9 @@ def begin_stage(
     begun = _stage(scene, {**before.conditions, **named}, present, later)
     if state.stay:  # pressures are those of the cells
         state = scene.motion.left_grid(state, scene.on_grid(state.stay.points))
-    gone, new = _ids(scene.bodies, remove), scene.materials.seeded.of(_ids(scene.bodies, add))
-    points, transported = state.points.of(gone, kept=False).joined(new), state.transported
+    gone, transported = _ids(scene.bodies, remove), state.transported
+    there = [body for body, here in enumerate(before.present) if here and body not in remove]
+    points, new = _filled(scene, state.points.of(gone, kept=False), there, add)
     if transported is not None:
         transported = transported.of(gone, kept=False).joined(at_start(new))
     points = _changed(points, fields)
@@ -69,6 +71,21 @@ def begin_stage(
 def _stage(scene: Scene, conditions: Mapping[str, Any], present: Sequence[bool], later: Sequence[int]) -> Stage:
     stiffest, wet = scene.materials.stiffest, scene.fluid is not None
     return stage(scene.grid, scene.bodies, stiffest, wet, conditions, present, later)
+
+
+def _filled(
+    scene: Scene, points: MaterialPoints, there: Sequence[int], add: Sequence[int]
+) -> tuple[MaterialPoints, MaterialPoints]:
+    """Return the points with those of bodies that come, and these alone; what lies on another comes after it."""
+    there, waiting, new = list(there), list(add), scene.materials.seeded.of(_ids(scene.bodies, []))
+    while waiting:
+        fill = next((body for body in waiting if touches(scene.bodies, there, body)), waiting[0])
+        placed = scene.materials.seeded.of(_ids(scene.bodies, [fill]))
+        placed = put(scene.grid, scene.bodies, there, fill, points, placed)
+        points, new = points.joined(placed), new.joined(placed)
+        there.append(fill)
+        waiting.remove(fill)
+    return points, new
 
 
 def _ids(bodies: Sequence[Body], chosen: Sequence[int]) -> NDArray[np.int64]:

@@ -27,13 +27,14 @@ logger = logging.getLogger("mpm_dolfinx")
 
 @dataclass
 class Faces:
-    """Faces on one side of a body, after its map; arrays over m faces.
+    """Faces of a body, after its map; arrays over m faces.
 
-    row : (m,) domain of each; corners : (m, 4, 3), m; outward : (m, 3), m^2, area vector; bend : (m,), m, see
-    `Body.bend`.
+    row : (m,) domain of each; index : (m, 4) corners of the domain; corners : (m, 4, 3), m; outward : (m, 3), m^2, area
+    vector; bend : (m,), m, see `Body.bend`.
     """
 
     row: NDArray[np.int64]
+    index: NDArray[np.int64]
     corners: NDArray[np.float64]
     outward: NDArray[np.float64]
     bend: NDArray[np.float64]
@@ -41,10 +42,13 @@ class Faces:
     @classmethod
     def of(cls, body: Body, axis: int, end: int, row: NDArray[np.int64]) -> Faces:
         """Return faces on a side of a body, of some of its domains."""
-        domains = body.corners(row)
-        outward = face_vectors(domains, axis, end)
-        outward = np.pad(outward, ((0, 0), (0, 3 - outward.shape[1])))
-        return cls(row, quadrilaterals(domains, axis, end), outward, body.bend(row))
+        domains, dim = body.corners(row), len(body.spacing)
+        outward = np.pad(face_vectors(domains, axis, end), ((0, 0), (0, 3 - dim)))
+        index = face_index(dim, axis, end)
+        corners = domains[:, index]
+        if dim == 2:
+            corners = np.concatenate([corners, np.broadcast_to(BITS[:, 1:], (len(row), 4, 1))], axis=2)
+        return cls(row, np.tile(index, (len(row), 1)), corners, outward, body.bend(row))
 
     @classmethod
     def around(cls, body: Body) -> Faces:
@@ -96,14 +100,10 @@ def face_vectors(corners: NDArray[np.float64], axis: int, end: int) -> NDArray[n
     return n * (1 if end else -1)
 
 
-def quadrilaterals(corners: NDArray[np.float64], axis: int, end: int) -> NDArray[np.float64]:
-    """Return the corners (m, 4, 3), m, of one face of domains (m, 2^d, d)."""
-    dim = corners.shape[2]
-    face = corners[:, corner_bits(dim)[:, axis] == end]
-    if dim == 3:
-        return face
-    width = np.broadcast_to(BITS[:, 1:], (len(face), 4, 1))
-    return np.concatenate([face[:, BITS[:, 0]], width], axis=2)
+def face_index(dim: int, axis: int, end: int) -> NDArray[np.int64]:
+    """Return which corners of a domain (4,) a face has; in plane strain each twice, at both ends of the third axis."""
+    index = np.flatnonzero(corner_bits(dim)[:, axis] == end)
+    return index if dim == 3 else index[BITS[:, 0]]
 
 
 def weights(t: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -136,7 +136,7 @@ def covers(own: Faces, other: Faces) -> Cover:
     n, m = (f.outward / np.linalg.norm(f.outward, axis=1, keepdims=True) for f in (own, other))
     back = np.einsum("nd,nd->n", n[i], m[j]) < -0.5
     i, j = i[back], j[back]
-    t, off = _local(own.corners[i], other.corners[j], n[i])
+    t, off = local(own.corners[i], other.corners[j], n[i])
     low, high = t.min(axis=1), t.max(axis=1)
     edge, bend = own.edge()[i], own.bend[i] + other.bend[j]
     lost = 4 * rounding(own.corners)
@@ -157,7 +157,7 @@ def covers(own: Faces, other: Faces) -> Cover:
     return Cover(*(getattr(out, name)[on] for name in Cover.__dataclass_fields__))
 
 
-def _local(corners: NDArray, x: NDArray, normal: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def local(corners: NDArray, x: NDArray, normal: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the coordinates (n, c, 2) of places x (n, c, 3) in faces (n, 4, 3), and how far they are before them."""
     t = np.full((*x.shape[:2], 2), 0.5)
     c0, c1, c2, c3 = (corners[:, k, None] for k in range(4))
@@ -285,7 +285,7 @@ def solids(body: Body) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     corners = body.corners()
     warp = np.zeros(len(body))
     if len(size) == 3 and body.map is not None:
-        faces = [quadrilaterals(corners, axis, end) for axis in range(3) for end in (0, 1)]
+        faces = [corners[:, face_index(3, axis, end)] for axis in range(3) for end in (0, 1)]
         warp = np.max([np.linalg.norm(f[:, 0] - f[:, 1] - f[:, 2] + f[:, 3], axis=1) / 4 for f in faces], axis=0)
     edge = np.ptp(corners, axis=1).min(axis=1)
     return corners, allowance(edge) + 2 * body.bend(np.arange(len(body))) + warp
