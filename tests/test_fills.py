@@ -69,7 +69,7 @@ def test_an_embankment_in_lifts_has_its_crest_and_the_ground_beside_it_free_and_
     assert face(s, 0, 1)[:, 1].min() < 5.6, "the ground has settled by half a metre"
 
 
-def settled(dim=2, per_cell=2, quadrature="domain", **options):
+def settled(dim=2, per_cell=2, quadrature="domain", until=1.0, **options):
     """Return ground that settles more on its left than on its right, and a fill as high as 1 m to come."""
     grid = mpm.Grid([4.0] * dim, [8] * dim)
     ground = mpm.box(grid, [0] * dim, [*[4] * (dim - 1), 2])
@@ -78,7 +78,8 @@ def settled(dim=2, per_cell=2, quadrature="domain", **options):
     walls = {name: "xyz"[:dim] for name in ("left", "right", "bottom", *["front", "back"][: 2 * dim - 4])}
     options = {"tractions": [half], "quadrature": quadrature} | options
     s = mpm.Simulation(grid, [ground, fill], [SOFT], fixed=walls, later=[1], gravity=[0.0] * dim, **options)
-    s.run(1.0, 0.5, progress=False)
+    if until:
+        s.run(until, 0.5, progress=False)
     return s
 
 
@@ -162,3 +163,16 @@ def test_edges_that_cannot_follow_a_bend_are_named_with_the_distance(caplog):
         strip = mpm.Traction("top", (0, -4e5), region=((1.7, 0), (2.3, 2)))
         settled(per_cell=1, tractions=[strip]).stage(add=[1], tractions=[])
     assert "body 1: its straight edges are up to 0.0058 m" in caplog.records[-1].getMessage()
+
+
+@pytest.mark.parametrize("quadrature", ["domain", "point"])
+def test_a_run_resumed_after_a_fill_came_has_the_same_bits(quadrature, tmp_path):
+    one, other = (settled(quadrature=quadrature, until=until) for until in (1.0, 0.0))
+    for s in (one, other):
+        s.stage(add=[1], tractions=[])
+    one.run(2.0, 0.5, progress=False, checkpoint=mpm.Checkpoint(tmp_path / "a.ckpt"))
+    one.run(3.0, 0.5, progress=False)
+    mpm.resume(other, tmp_path / "a.ckpt")
+    other.run(3.0, 0.5, progress=False)
+    assert other.t == 3.0 and (one.points.corners == other.points.corners).all()
+    assert one.points.volume0.sum() > 8.0 + 2.0 + 0.1

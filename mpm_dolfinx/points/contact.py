@@ -7,7 +7,7 @@ Faces are quadrilaterals in space; in plane strain they are a unit of length wid
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -259,20 +259,28 @@ def uncovered(
 def separation(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return how far convex domains a, b (n, 2^d, d), m, are apart (n,), m; negative: how deep they lie in each other.
 
-    Exact for parallelepipeds that overlap; the distance of others is that of the planes between them.
+    Domains do not overlap if a plane lies between them: along a face of one, or in 3D along an edge of each.
     """
-    d, out = a.shape[2], np.full(len(a), -np.inf)
-    normals = [face_vectors(c, axis, end) for c in (a, b) for axis in range(d) for end in (0, 1)]
+    d = a.shape[2]
+    out = _between_planes(a, b, (face_vectors(c, axis, end) for c in (a, b) for axis in range(d) for end in (0, 1)))
     if d == 3:
-        edges = [[c[:, 1 << k] - c[:, 0] for k in range(3)] for c in (a, b)]
-        normals += [np.cross(e, f) for e in edges[0] for f in edges[1]]
-    size = np.ptp(a, axis=1).max(axis=1)
+        k = np.flatnonzero(out < 0)
+        bits = corner_bits(3)
+        edges = [(i, i + (1 << axis)) for axis in range(3) for i in np.flatnonzero(bits[:, axis] == 0)]
+        e, f = ([c[k, j] - c[k, i] for i, j in edges] for c in (a, b))
+        out[k] = np.maximum(out[k], _between_planes(a[k], b[k], (np.cross(x, y) for x in e for y in f)))
+    return out
+
+
+def _between_planes(a: NDArray, b: NDArray, normals: Iterable[NDArray]) -> NDArray[np.float64]:
+    """Return how far planes of these normals (n, d) can be apart between domains (n,), m."""
+    out, size = np.full(len(a), -np.inf), np.ptp(a, axis=1).max(axis=1)
     for n in normals:
         length = np.linalg.norm(n, axis=1)
         n = n / np.where(length > 0, length, 1.0)[:, None]
         pa, pb = (np.einsum("nkd,nd->nk", c, n) for c in (a, b))
         gap = np.maximum(pb.min(axis=1) - pa.max(axis=1), pa.min(axis=1) - pb.max(axis=1))
-        out = np.maximum(out, np.where(length > 1e-9 * size ** (d - 1), gap, -np.inf))
+        out = np.maximum(out, np.where(length > 1e-9 * size ** (a.shape[2] - 1), gap, -np.inf))
     return out
 
 
@@ -288,7 +296,7 @@ def solids(body: Body) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         faces = [corners[:, face_index(3, axis, end)] for axis in range(3) for end in (0, 1)]
         warp = np.max([np.linalg.norm(f[:, 0] - f[:, 1] - f[:, 2] + f[:, 3], axis=1) / 4 for f in faces], axis=0)
     edge = np.ptp(corners, axis=1).min(axis=1)
-    return corners, allowance(edge) + 2 * body.bend(np.arange(len(body))) + warp
+    return corners, allowance(edge) + 2 * (body.bend(np.arange(len(body))) + warp)
 
 
 def allowance(edge: NDArray[np.float64]) -> NDArray[np.float64]:

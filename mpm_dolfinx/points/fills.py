@@ -92,7 +92,7 @@ def put(
     found = {other: _contacts(grid, bodies, other, body, points) for other in there}
     contacts = [contact for one in found.values() for contact in one]
     if any(contact.moved.any() for contact in contacts):
-        u = _follow(body, contacts)
+        u = _follow(grid, body, corners, contacts)
         misfit = max(contact.misfit(u) for contact in contacts)
         _check_shape(grid, fill, body, corners, u)
         corners = corners + u
@@ -135,14 +135,15 @@ def _contacts(grid: Grid, bodies: Sequence[Body], other: int, fill: Body, points
     return out
 
 
-def _follow(body: Body, contacts: Sequence[Contact]) -> NDArray[np.float64]:
+def _follow(grid: Grid, body: Body, corners: NDArray[np.float64], contacts: Sequence[Contact]) -> NDArray[np.float64]:
     """Return the displacement (n, 2^d, d), m, of the corners of a fill that follows what it lies on."""
-    bits = corner_bits(len(body.spacing))
+    bits = corner_bits(grid.dim)
     index = np.rint((body.lower - body.lower.min(axis=0)) / body.spacing).astype(np.int64)[:, None] + bits
     number = np.ravel_multi_index(tuple(np.moveaxis(index, 2, 0)), tuple(index.max(axis=(0, 1)) + 1))
     nodes, node = np.unique(number, return_inverse=True)
     node = node.reshape(number.shape)
-    u, hits = np.zeros((len(nodes), len(body.spacing))), np.zeros(len(nodes))
+    u, hits, x = np.zeros((len(nodes), grid.dim)), np.zeros(len(nodes)), np.empty((len(nodes), grid.dim))
+    x[node] = corners
     for contact in contacts:
         on, moved = contact.given()
         at = node[contact.corners()]
@@ -154,9 +155,11 @@ def _follow(body: Body, contacts: Sequence[Contact]) -> NDArray[np.float64]:
         sides[contact.side] = sides.get(contact.side, 0.0) + contact.area()
     axis, end = max(sides, key=sides.get)
     opposite = Faces.of(body, axis, 1 - end, np.flatnonzero(body.sides[:, axis, 1 - end]))
-    fixed = hits > 0
+    fixed = np.minimum(np.abs(x - grid.lower), np.abs(x - grid.upper)) < 1e-9 * grid.h  # along a wall it only slides
+    fixed[hits > 0] = True
     fixed[node[opposite.row[:, None], opposite.index]] = True
-    return _between(_springs(body, node, len(nodes)), fixed, u)[node]
+    K = _springs(body, node, len(nodes))
+    return np.stack([_between(K, *column) for column in zip(fixed.T, u.T, strict=True)], axis=1)[node]
 
 
 def _springs(body: Body, node: NDArray[np.int64], count: int) -> csr_array:
@@ -171,12 +174,11 @@ def _springs(body: Body, node: NDArray[np.int64], count: int) -> csr_array:
 
 
 def _between(K: csr_array, fixed: NDArray[np.bool_], u: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return displacements (n, d) in balance of springs with those that are fixed."""
+    """Return displacements (n,) along an axis, those that are fixed and the others in balance with them."""
     out, free = u.copy(), np.flatnonzero(~fixed)
     if len(free):
         held = np.flatnonzero(fixed)
-        load = -(K[free][:, held] @ u[held])
-        out[free] = spsolve(K[free][:, free].tocsc(), load).reshape(load.shape)
+        out[free] = spsolve(K[free][:, free].tocsc(), -(K[free][:, held] @ u[held]))
     return out
 
 
