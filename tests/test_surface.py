@@ -102,17 +102,35 @@ def test_a_curve_that_two_bodies_follow_with_other_domains_is_no_surface(per_cel
     assert [X[0], X[-1], np.abs(np.diff(X)).max()] == pytest.approx([0.2, 2.0, 0.8], abs=2e-3)
 
 
-def test_turned_faces_in_3d_count_where_they_are_free_or_covered_and_are_refused_where_neither():
+@pytest.mark.parametrize("per_cell", [1, 2, 5])
+def test_under_a_body_that_is_turned_in_3d_exactly_what_it_covers_is_not_free(per_cell):
     grid = mpm.Grid([4.0, 4.0, 2.0], [8, 8, 4])
-    below = mpm.box(grid, [0, 0, 0], [4, 4, 1], per_cell=1)
+    below, above = mpm.box(grid, [0, 0, 0], [4, 4, 1], 2), mpm.box(grid, [0, 0, 1], [2, 1.5, 1.5], per_cell)
     c, s = np.cos(0.5), np.sin(0.5)
-    above = mpm.mapped(
-        grid, mpm.box(grid, [0, 0, 1], [2, 2, 1.5]), lambda x: (x - 1) @ [[c, s, 0], [-s, c, 0], [0, 0, 1]] + [2, 2, 1]
-    )
-    assert surface([below, above], "top", ((1.6, 1.6, 0), (2.4, 2.4, 1))).area0.sum() == 0
-    assert surface([below, above], "bottom").area0.sum() == pytest.approx(16.0)
-    with pytest.raises(ValueError, match=r"side 'top': .* of the face at .* must be all, nothing, or rectangles"):
-        surface([below, above], "top")
+    turned = mpm.mapped(grid, above, lambda x: (x - [1, 0.75, 0]) @ [[c, s, 0], [-s, c, 0], [0, 0, 1]] + [2.1, 1.9, 0])
+    top = surface([below, turned], "top")
+    own = top.id < len(below)
+    area, middle = top.area0[own], top.places()[own][:, :, :2]
+    a, b, d = middle[:, 1] - middle[:, 0], middle[:, 2] - middle[:, 0], middle[:, 3] - middle[:, 0]
+    triangles = np.stack([np.cross(a, d), np.cross(d, b)]) / 2  # of each part
+    centre = np.stack([middle[:, [0, 1, 3]].mean(axis=1), middle[:, [0, 2, 3]].mean(axis=1)])
+    assert np.abs(triangles).sum(axis=0) == pytest.approx(area, rel=1e-9)
+    moment = (np.abs(triangles)[..., None] * centre).sum(axis=(0, 1))
+    assert area.sum() == pytest.approx(16 - 3, rel=1e-10) and moment == pytest.approx([32 - 6.3, 32 - 5.7], rel=1e-10)
+    assert surface([below, turned], "top", ((0, 0, 0), (2.1, 4, 1))).area0.sum() == pytest.approx(8.4 - 1.5, rel=1e-10)
+    assert surface([below, turned], "bottom").area0.sum() == pytest.approx(16.0, rel=1e-10), "nothing of it is free"
+
+
+def test_a_load_on_what_is_free_beside_a_turned_body_carries_its_whole_force():
+    grid = mpm.Grid([4.5, 4.5, 2.0], [10, 10, 5], lower=[-0.5] * 3)
+    below, above = mpm.box(grid, [0, 0, 0], [4, 4, 1], 2), mpm.box(grid, [0, 0, 1], [2, 1.5, 1.5], 2)
+    c, s = np.cos(0.5), np.sin(0.5)
+    turned = mpm.mapped(grid, above, lambda x: (x - [1, 0.75, 0]) @ [[c, s, 0], [-s, c, 0], [0, 0, 1]] + [2.1, 1.9, 0])
+    ground = ((0, 0, 0), (4, 4, 0))
+    hold, load = mpm.Displacement("bottom", (0, 0, 0), region=ground), mpm.Traction("top", (0, 0, -1e3))
+    s = mpm.Simulation(grid, [below, turned], [SOIL], fixed={}, displacements=[hold], tractions=[load])
+    s.run(1.0, 1.0, progress=False)
+    assert s.reactions[0, 2] == pytest.approx(16e3, rel=1e-6)
 
 
 def test_a_second_map_comes_after_the_first():

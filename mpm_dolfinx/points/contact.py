@@ -176,21 +176,72 @@ def local(corners: NDArray, x: NDArray, normal: NDArray) -> tuple[NDArray[np.flo
 
 def covered(count: int, cover: Cover) -> NDArray[np.float64]:
     """Return the share of each of so many faces (m,), in its coordinates, that lies under others."""
-    s = np.concatenate([cover.t[:, list(simplex)].transpose(1, 2, 0) for simplex in kuhn_simplices(2)], axis=2)
-    owner = np.tile(cover.face, 2)
+    s, owner = within(*_triangles(cover.t, cover.face), np.zeros(2), np.ones(2))
+    return sum_by(owner, _areas(s), count)
+
+
+def uncovered_triangles(cover: Cover, faces: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return what is free of faces (m,) as triangles: the face (n,) of each, and its corners (n, 3, 2), from 0 to 1."""
+    of = np.flatnonzero(np.isin(cover.face, faces))
+    of = of[np.argsort(cover.face[of], kind="stable")]
+    first = np.searchsorted(cover.face[of], faces)
+    count = np.searchsorted(cover.face[of], faces, "right") - first
+    s, owner = _triangles(np.tile(BITS, (len(faces), 1, 1)), np.arange(len(faces)))
+    for k in range(count.max()):  # take the k-th of the faces that lie on each away
+        has = count[owner] > k
+        free, whose = [s[:, :, ~has]], [owner[~has]]
+        s, owner = s[:, :, has], owner[has]
+        quad = cover.t[of[np.minimum(first + k, len(of) - 1)]][:, [0, 1, 3, 2]]  # around
+        turn = np.sign(_cross(quad[:, 2] - quad[:, 0], quad[:, 3] - quad[:, 1]))
+        for a in range(4):
+            p, q = quad[owner, a].T, quad[owner, (a + 1) % 4].T
+            inside = turn[owner] * _cross((q - p).T, (s - p).transpose(0, 2, 1))
+            s3 = np.concatenate([s, inside[:, None]], axis=1)
+            out, out_owner, s3, owner = _split(s3, owner, 2, 0.0)
+            free.append(out[:, :2])
+            whose.append(out_owner)
+            s = s3[:, :2]
+        s, owner = np.concatenate(free, axis=2), np.concatenate(whose)
+        some = _areas(s) > SAME
+        s, owner = s[:, :, some], owner[some]
+    return faces[owner], s.transpose(2, 0, 1)
+
+
+def within(s: NDArray, owner: NDArray, low: NDArray, high: NDArray) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return what of triangles (3, 2, n) lies in boxes (2,) or (n, 2), and their owners."""
+    low, high = (np.broadcast_to(x, (s.shape[2], 2)) for x in (low, high))
+    index = np.arange(s.shape[2])
     for axis in (0, 1):
-        for plane, above in ((0.0, True), (1.0, False)):
-            s, owner = _beyond(s, owner, axis, plane, above)
-    (ax, ay), (bx, by) = s[1:] - s[0]
-    return sum_by(owner, 0.5 * np.abs(ax * by - ay * bx), count)
+        _, _, s, index = _split(s, index, axis, low[index, axis])
+        s, index, _, _ = _split(s, index, axis, high[index, axis])
+    return s, owner[index]
 
 
-def _beyond(s: NDArray, owner: NDArray, axis: int, plane: float, above: bool) -> tuple[NDArray, NDArray]:
-    """Return what of triangles (3, 2, n) lies above a plane of an axis, or below it, and their owners."""
+def _triangles(quads: NDArray, owner: NDArray) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return two triangles each (3, 2, 2n) of quadrilaterals (n, 4, 2), and their owners."""
+    both = [quads[:, list(simplex)].transpose(1, 2, 0) for simplex in kuhn_simplices(2)]
+    return np.concatenate(both, axis=2).astype(float), np.tile(owner, 2)
+
+
+def _cross(a: NDArray, b: NDArray) -> NDArray[np.float64]:
+    """Return the cross products (...) of vectors (..., 2)."""
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+
+
+def _areas(s: NDArray) -> NDArray[np.float64]:
+    """Return the areas (n,) of triangles (3, 2, n)."""
+    return 0.5 * np.abs(_cross(*(s[1:] - s[0]).swapaxes(1, 2)))
+
+
+def _split(s: NDArray, owner: NDArray, axis: int, plane) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+    """Return what of triangles (3, e, n) lies below a plane of an axis, and above it, each with its owners."""
+    plane = np.broadcast_to(plane, len(owner))
     low, high = s[:, axis].min(axis=0) < plane, s[:, axis].max(axis=0) > plane
-    both, kept = np.flatnonzero(low & high), np.flatnonzero(~low if above else ~high)
-    parts = cut_at(s[:, :, both], owner[both], axis, np.full(len(both), plane))[2 * above :][:2]
-    return np.concatenate([s[:, :, kept], parts[0]], axis=2), np.concatenate([owner[kept], parts[1]])
+    both = np.flatnonzero(low & high)
+    below, below_owner, above, above_owner = cut_at(s[:, :, both], owner[both], axis, plane[both])
+    parts = (below, below_owner, low & ~high), (above, above_owner, high & ~low)  # what lies in the plane has no area
+    out = [(np.concatenate([c, s[:, :, k]], axis=2), np.concatenate([o, owner[k]])) for c, o, k in parts]
+    return *out[0], *out[1]
 
 
 def uncovered(

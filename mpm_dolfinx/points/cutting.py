@@ -268,8 +268,9 @@ def cut_faces(
     whole = s
     for axis in range(d):
         s, owner = _slice(s, owner, axis)
-    # the local coordinates tell sizes, for they are never degenerate
-    share = _size(s[:, d:]) / _size(whole[:, d:])[owner] / len(split)
+    # the local coordinates tell sizes: those of a face are never degenerate, but a triangle is half of it
+    total = _size(whole[:, d:]).reshape(len(split), m).sum(axis=0)
+    share = _size(s[:, d:]) / total[owner % max(1, m)]
     kept = np.flatnonzero(share > SLIVER)  # what only touches a plane leaves nothing
     s, owner, share = s[:, :, kept], owner[kept], share[kept]
     points = np.einsum("qk,kam->qam", _RULES[d], s)

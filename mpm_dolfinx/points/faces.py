@@ -4,14 +4,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.points.bodies import Body
-from mpm_dolfinx.points.contact import Faces, covered, covers, face_vectors, uncovered
+from mpm_dolfinx.points.contact import (
+    BITS,
+    Cover,
+    Faces,
+    covers,
+    face_vectors,
+    uncovered,
+    uncovered_triangles,
+    within,
+)
 from mpm_dolfinx.points.cutting import corner_bits
 from mpm_dolfinx.points.grid import rounding, side
 from mpm_dolfinx.validation import numbers
@@ -23,9 +32,9 @@ class Surface:
 
     A face of which several parts count has a row for each.
 
-    id : (m,) number of the point; xi : (m, 2, d) ends of the part of the face that counts, in the domain's
-    coordinates from -1 to 1; X : (m, 2, d) their reference positions, before all maps, m; domain : (m, 2^d, d)
-    corners of the domain as seeded, after them, m; axis, end : side of the domain.
+    id : (m,) number of the point; xi : (m, 2^(d-1), d) corners of the part of the face that counts, in the domain's
+    coordinates from -1 to 1, of a triangle the last one twice; X : (m, 2, d) the box around it in reference positions,
+    before all maps, m; domain : (m, 2^d, d) corners of the domain as seeded, after them, m; axis, end : side of it.
     """
 
     id: NDArray[np.int64]
@@ -46,23 +55,20 @@ class Surface:
     @property
     def area0(self) -> NDArray[np.float64]:
         """Area (m,) of the parts that count as seeded, m^(d-1)."""
-        return self.whole0 * np.delete((self.xi[:, 1] - self.xi[:, 0]) / 2, self.axis, axis=1).prod(axis=1)
+        t = np.delete(self.xi, self.axis, axis=2) / 2
+        if self.xi.shape[2] == 2:
+            return self.whole0 * np.abs(t[:, 1, 0] - t[:, 0, 0])
+        (a, b), (c, d) = (t[:, 3] - t[:, 0]).T, (t[:, 2] - t[:, 1]).T
+        return self.whole0 * np.abs(a * d - b * c) / 2
 
     def places(self) -> NDArray[np.float64]:
         """Return where the corners of the parts (m, 2^(d-1), d) are as seeded, m."""
-        xi = self.corners()
-        domain = np.repeat(self.domain, xi.shape[1], axis=0)
-        return interpolate(domain, xi.reshape(-1, xi.shape[2])).reshape(xi.shape)
-
-    def corners(self) -> NDArray[np.float64]:
-        """Return the corners (m, 2^(d-1), d) of the parts in the domain's coordinates."""
-        dim = self.xi.shape[2]
-        bits = np.insert(corner_bits(dim - 1), self.axis, 0, axis=1)
-        return self.xi[:, bits, np.arange(dim)]
+        domain = np.repeat(self.domain, self.xi.shape[1], axis=0)
+        return interpolate(domain, self.xi.reshape(-1, self.xi.shape[2])).reshape(self.xi.shape)
 
     def reference(self, face: NDArray[np.int64], xi: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the reference positions (n, d), m, of places xi (n, d) on faces."""
-        (a, b), (A, B) = self.xi[face].swapaxes(0, 1), self.X[face].swapaxes(0, 1)
+        (A, B), a, b = self.X[face].swapaxes(0, 1), self.xi.min(axis=1)[face], self.xi.max(axis=1)[face]
         t = np.divide(xi - a, b - a, out=np.zeros_like(xi), where=b > a)
         return A + t * (B - A)
 
@@ -97,23 +103,18 @@ def surface(
         Box of reference positions that limits the faces; faces partly in it count with that part.
     present
         Which bodies are there, by default all.
-
-    Raises
-    ------
-    ValueError
-        A face of which others cover a part that is no union of rectangles.
     """
     there = [present is None or bool(present[i]) for i in range(len(bodies))]
     dim = bodies[0].lower.shape[1]
     axis, end = side(name, dim)
     box = limits(region, dim)
     around = [Faces.around(body) if here and sum(there) > 1 else None for body, here in zip(bodies, there, strict=True)]
-    start, found = 0, [(np.empty(0, np.int64), *np.empty((2, 0, 2, dim)), np.empty((0, 2**dim, dim)))]
+    start, found = 0, [(np.empty(0, np.int64), *(np.empty((0, n, dim)) for n in (2 ** (dim - 1), 2, 2**dim)))]
     for i, body in enumerate(bodies):
         chosen = _in_region(body, axis, end, box) if there[i] else np.empty(0, np.int64)
         others = [faces for j, faces in enumerate(around) if faces is not None and j != i]
-        row, ends = _free(Faces.of(body, axis, end, chosen), others, name)
-        row, xi, X = _limited(body, axis, end, chosen[row], ends, box)
+        row, t = _free(Faces.of(body, axis, end, chosen), others)
+        row, xi, X = _limited(body, axis, end, chosen[row], t, box)
         found.append((start + row, xi, X, body.corners(row)))
         start += len(body)
     return Surface(*map(np.concatenate, zip(*found, strict=True)), axis, end)
@@ -129,42 +130,46 @@ def _in_region(body: Body, axis: int, end: int, region: NDArray[np.float64]) -> 
 
 
 def _limited(
-    body: Body, axis: int, end: int, row: NDArray[np.int64], ends: NDArray[np.float64], region: NDArray[np.float64]
+    body: Body, axis: int, end: int, row: NDArray[np.int64], t: NDArray[np.float64], region: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return what of rectangles lies in a region: domains (m,), ends (m, 2, d) in them and reference positions."""
+    """Return what of parts t (n, 4, 2) of faces lies in a region: domains (m,), xi and X as of a `Surface`."""
     dim = len(body.spacing)
-    tangential, lower = np.arange(dim) != axis, body.lower[row][:, None]
-    t = np.full((len(row), 2, dim), float(end))
-    t[:, :, tangential] = ends[:, :, : dim - 1]
-    X = np.where(t == 1, lower + body.spacing, lower + t * body.spacing)
-    part = np.stack([np.maximum(X[:, 0], region[0]), np.minimum(X[:, 1], region[1])], axis=1)
-    part[:, :, axis] = X[:, :, axis]
-    t = np.where(part == X, t, (part - lower) / body.spacing)
-    kept = (part[:, 1] > part[:, 0])[:, tangential].all(axis=1)
-    return row[kept], 2 * t[kept] - 1, part[kept]
+    tangential = np.flatnonzero(np.arange(dim) != axis)
+    low, high = ((region[k, tangential] - body.lower[row][:, tangential]) / body.spacing[tangential] for k in (0, 1))
+    if dim == 2:
+        low, high = (np.pad(x, ((0, 0), (0, 1)), constant_values=c) for x, c in ((low, 0.0), (high, 1.0)))
+    three = (t[:, 2] == t[:, 3]).all(axis=1)
+    triangles, at = within(t[three, :3].transpose(1, 2, 0), np.flatnonzero(three), low[three], high[three])
+    triangles = triangles.transpose(2, 0, 1)[:, [0, 1, 2, 2]]
+    at = np.concatenate([np.flatnonzero(~three), at])
+    t = np.concatenate([np.clip(t[~three], low[~three, None], high[~three, None]), triangles])
+    kept = np.flatnonzero((np.ptp(t, axis=1) > 0).all(axis=1))
+    kept = kept[np.argsort(at[kept], kind="stable")]
+    row, t = row[at[kept]], t[kept][:, : 2 ** (dim - 1), : dim - 1]
+    xi = np.insert(2 * t - 1, axis, 2.0 * end - 1, axis=2)
+    ends, lower = np.stack([xi.min(axis=1), xi.max(axis=1)], axis=1), body.lower[row][:, None]
+    X = np.where(ends == 1, lower + body.spacing, lower + (ends + 1) / 2 * body.spacing)
+    X[:, :, tangential] = np.clip(X[:, :, tangential], *region[:, tangential])
+    return row, xi, X
 
 
-def _free(own: Faces, others: Sequence[Faces], name: str) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the free rectangles of faces: the face (n,) of each, and its ends (n, 2, 2), from 0 to 1 over the face."""
+def _free(own: Faces, others: Sequence[Faces]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return the free parts of faces: the face (n,) of each, and its corners (n, 4, 2), from 0 to 1 over the face.
+
+    They are rectangles where boxes lie along the face's edges, else triangles, whose last corner comes twice.
+    """
     on = [covers(own, other) for other in others]
-    none = np.empty(0, np.int64), np.empty((0, 2)), np.empty((0, 2)), np.empty(0)
-    boxes = [none, *((c.face[s], c.low[s], c.high[s], c.slack[s]) for c in on for s in [c.corner[:, 0] >= 0])]
-    turned = np.zeros(len(own.row), dtype=bool)
-    for c in on:
-        turned[c.face[c.corner[:, 0] < 0]] = True
-    if turned.any():
-        share = sum(covered(len(own.row), c) for c in on)
-        whole = np.flatnonzero(turned & (share > 1 - 1e-6))
-        boxes.append((whole, np.zeros((len(whole), 2)), np.ones((len(whole), 2)), np.zeros(len(whole))))
-        unclear = np.flatnonzero(turned & (share > 1e-6) & (share <= 1 - 1e-6))
-        if len(unclear):
-            x = own.corners[unclear[0]].mean(axis=0)
-            raise ValueError(
-                f"side {name!r}: {share[unclear[0]]:.2g} of the face at {x} lies under faces that are turned against "
-                "it, must be all, nothing, or rectangles; leave it out by a region"
-            )
-    row, low, high = uncovered(len(own.row), *map(np.concatenate, zip(*boxes, strict=True)))
-    return row, np.stack([low, high], axis=1)
+    if not on:
+        return np.arange(len(own.row)), np.tile(BITS, (len(own.row), 1, 1)).astype(float)
+    cover = Cover(*(np.concatenate([getattr(c, f.name) for c in on]) for f in fields(Cover)))
+    turned = np.isin(cover.face, cover.face[cover.corner[:, 0] < 0])
+    row, low, high = uncovered(len(own.row), *(x[~turned] for x in (cover.face, cover.low, cover.high, cover.slack)))
+    whole = ~np.isin(row, cover.face[turned])
+    quads = np.where(BITS, high[whole, None], low[whole, None])
+    if not turned.any():
+        return row, quads
+    split, triangles = uncovered_triangles(cover, np.unique(cover.face[turned]))
+    return np.concatenate([row[whole], split]), np.concatenate([quads, triangles[:, [0, 1, 2, 2]]])
 
 
 def interpolate(corners: NDArray[np.float64], xi: NDArray[np.float64]) -> NDArray[np.float64]:
