@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from strategies import numbers, repeatable
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.points.faces import surface
+from mpm_dolfinx.points.faces import face_vectors, surface
 
 SOIL = mpm.Hencky(bulk=1e6, shear=6e5)
 
@@ -131,6 +131,38 @@ def test_a_load_on_what_is_free_beside_a_turned_body_carries_its_whole_force():
     s = mpm.Simulation(grid, [below, turned], [SOIL], fixed={}, displacements=[hold], tractions=[load])
     s.run(1.0, 1.0, progress=False)
     assert s.reactions[0, 2] == pytest.approx(16e3, rel=1e-6)
+
+
+def test_a_curved_interface_in_3d_between_other_lattices_is_no_surface():
+    """Where chords leave slivers between them, drained ones would empty the bodies."""
+    errors = []
+    for cells in (10, 20):
+        grid = mpm.Grid([1.6] * 3, [cells] * 3)
+
+        def bend(x):
+            u = [np.sin(3 * x[:, 1]) + x[:, 1] / 2, np.sin(2 * x[:, 0]), np.sin(3 * x[:, 0]) * np.cos(2 * x[:, 1])]
+            return x + 0.2 + 0.05 * np.stack(u, axis=1)
+
+        boxes = mpm.box(grid, [0.1] * 3, [1, 1, 0.5]), mpm.box(grid, [0.3, 0.3, 0.5], [0.9] * 3, per_cell=3)
+        bodies = [mpm.mapped(grid, body, bend) for body in boxes]
+        top = surface(bodies, "top")
+        part = top.X[top.id < len(bodies[0]), :, :2]
+        assert not ((part[:, 0] > 0.31) & (part[:, 1] < 0.89)).all(axis=1).any()
+        sides = [
+            (body.corners(np.flatnonzero(body.sides[:, 2, end])), end) for body, end in zip(bodies, (1, 0), strict=True)
+        ]
+        whole, under = (np.linalg.norm(face_vectors(corners, 2, end), axis=1).sum() for corners, end in sides)
+        errors.append(top.area0[top.id < len(bodies[0])].sum() / (whole - under) - 1)
+    assert abs(errors[1]) < 4e-4 and abs(errors[1] / errors[0]) < 0.6
+
+
+def test_a_body_that_a_map_has_drawn_to_a_point_has_sides():
+    grid = mpm.Grid([2.0] * 3, [4] * 3)
+    box = mpm.box(grid, [0, 0, 0], [1, 1, 1])
+    cone = mpm.mapped(grid, box, lambda x: np.stack([x[:, 0] * (1.5 - x[:, 2]), x[:, 1] * x[:, 0], x[:, 2]], axis=1))
+    bodies = [cone, mpm.mapped(grid, mpm.box(grid, [0, 0, 1], [1, 1, 2]), lambda x: x * [0.5, 0.5, 1])]
+    assert surface(bodies, "left").area0[: len(cone)].sum() < 1e-12 + 1.0
+    assert np.isfinite(surface(bodies, "top").area0).all() and len(surface(bodies, "bottom"))
 
 
 def test_a_second_map_comes_after_the_first():

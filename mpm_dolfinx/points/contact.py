@@ -21,6 +21,7 @@ from mpm_dolfinx.points.grid import Grid, rounding, sum_by
 
 TOUCH = 1e-6  # of the shortest edge: faces nearer than this touch
 SAME = 1e-11  # of an edge: ends nearer than this are one
+TINY = 1e-300  # in place of the length of an edge that a map has shrunk to nothing
 BITS = corner_bits(2)
 logger = logging.getLogger("mpm_dolfinx")
 
@@ -133,14 +134,14 @@ def near(a: NDArray[np.float64], b: NDArray[np.float64], reach: float = 0.0) -> 
 def covers(own: Faces, other: Faces) -> Cover:
     """Return where faces of another body lie on faces of one, each seen from the other side."""
     i, j = near(own.corners, other.corners)
-    n, m = (f.outward / np.linalg.norm(f.outward, axis=1, keepdims=True) for f in (own, other))
+    n, m = (f.outward / np.maximum(np.linalg.norm(f.outward, axis=1, keepdims=True), TINY) for f in (own, other))
     back = np.einsum("nd,nd->n", n[i], m[j]) < -0.5
     i, j = i[back], j[back]
     t, off = local(own.corners[i], other.corners[j], n[i])
     low, high = t.min(axis=1), t.max(axis=1)
     edge, bend = own.edge()[i], own.bend[i] + other.bend[j]
     lost = 4 * rounding(own.corners)
-    slack = np.minimum(SAME + (lost + bend) / edge.min(axis=1), (high - low).min(axis=1) / 4)
+    slack = np.minimum(SAME + (lost + bend) / np.maximum(edge.min(axis=1), TINY), (high - low).min(axis=1) / 4)
     upper = t > ((low + high) / 2)[:, None]
     corner = upper @ [1, 2]
     straight = np.abs(t - np.where(upper, high[:, None], low[:, None])).max(axis=(1, 2)) <= np.maximum(slack, 1e-9)
@@ -148,7 +149,9 @@ def covers(own: Faces, other: Faces) -> Cover:
     out = Cover(i, j, low, high, np.where(straight[:, None], corner, -1), t, slack)
     ends = np.clip(low, 0, 1), np.clip(high, 0, 1)
     on = ((ends[1] - ends[0]) > slack[:, None]).all(axis=1)
-    gap = np.where(straight, 0.0, np.abs(off).max(axis=1))
+    middle = np.einsum("nk,nkd->nd", weights((ends[0] + ends[1]) / 2), own.corners[i])
+    _, beside = local(other.corners[j], middle[:, None], m[j])
+    gap = np.where(straight, 0.0, np.abs(beside[:, 0]))  # of those that are turned, between their middles
     with np.errstate(divide="ignore", invalid="ignore"):  # of boxes without a width, which are not on
         for bits in BITS:
             at = out.at(np.where(bits, ends[1], ends[0]))
@@ -167,7 +170,7 @@ def local(corners: NDArray, x: NDArray, normal: NDArray) -> tuple[NDArray[np.flo
         r = x - (c0 * (1 - a) * (1 - b) + c1 * a * (1 - b) + c2 * (1 - a) * b + c3 * a * b)
         aa, ab, bb = (np.einsum("ncd,ncd->nc", *p) for p in ((e[0], e[0]), (e[0], e[1]), (e[1], e[1])))
         ra, rb = (np.einsum("ncd,ncd->nc", r, v) for v in e)
-        step = np.stack([bb * ra - ab * rb, aa * rb - ab * ra], axis=2) / (aa * bb - ab**2)[..., None]
+        step = np.stack([bb * ra - ab * rb, aa * rb - ab * ra], axis=2) / np.maximum(aa * bb - ab**2, TINY)[..., None]
         t = np.clip(t + step, -1e3, 1e3)
         if np.abs(step).max(initial=0.0) < 1e-12:
             break
@@ -204,7 +207,11 @@ def uncovered_triangles(cover: Cover, faces: NDArray[np.int64]) -> tuple[NDArray
         s, owner = np.concatenate(free, axis=2), np.concatenate(whose)
         some = _areas(s) > SAME
         s, owner = s[:, :, some], owner[some]
-    return faces[owner], s.transpose(2, 0, 1)
+    slack = np.zeros(len(faces))
+    np.maximum.at(slack, np.searchsorted(faces, cover.face[of]), cover.slack[of])
+    edge = np.linalg.norm(s - s[[1, 2, 0]], axis=1).max(axis=0)
+    some = 2 * _areas(s) > 2 * slack[owner] * edge  # chords of a curve that differ leave slivers, which would drain it
+    return faces[owner[some]], s[:, :, some].transpose(2, 0, 1)
 
 
 def within(s: NDArray, owner: NDArray, low: NDArray, high: NDArray) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
