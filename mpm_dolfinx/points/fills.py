@@ -7,10 +7,12 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from mpi4py import MPI
+from petsc4py import PETSc
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array, diags
-from scipy.sparse.linalg import spsolve
 
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.bodies import Body
@@ -178,7 +180,23 @@ def _between(K: csr_array, fixed: NDArray[np.bool_], u: NDArray[np.float64]) -> 
     out, free = u.copy(), np.flatnonzero(~fixed)
     if len(free):
         held = np.flatnonzero(fixed)
-        out[free] = spsolve(K[free][:, free].tocsc(), -(K[free][:, held] @ u[held]))
+        rows = K[free]
+        A = rows[:, free].tocsr()
+        csr = (A.indptr.astype(PETSc.IntType), A.indices.astype(PETSc.IntType), A.data)
+        matrix = PETSc.Mat().createAIJ(
+            A.shape, csr=csr, comm=MPI.COMM_SELF
+        )  # every process has all of a body as seeded
+        solver = PETSc.KSP().create(MPI.COMM_SELF)
+        solver.setOperators(matrix)
+        solver.setType("cg")
+        solver.getPC().setType("icc")
+        solver.setTolerances(rtol=1e-12)
+        x, b = matrix.createVecs()
+        b.array[:] = -(rows[:, held] @ u[held])
+        solver.solve(b, x)
+        out[free] = x.array
+        for made in (solver, matrix, x, b):
+            made.destroy()
     return out
 
 
