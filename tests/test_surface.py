@@ -112,7 +112,7 @@ def test_under_a_body_that_is_turned_in_3d_exactly_what_it_covers_is_not_free(pe
     own = top.id < len(below)
     area, middle = top.area0[own], top.places()[own][:, :, :2]
     a, b, d = middle[:, 1] - middle[:, 0], middle[:, 2] - middle[:, 0], middle[:, 3] - middle[:, 0]
-    triangles = np.stack([np.cross(a, d), np.cross(d, b)]) / 2  # of each part
+    triangles = np.stack([np.linalg.det(np.stack(two, axis=1)) for two in ((a, d), (d, b))]) / 2  # of each part
     centre = np.stack([middle[:, [0, 1, 3]].mean(axis=1), middle[:, [0, 2, 3]].mean(axis=1)])
     assert np.abs(triangles).sum(axis=0) == pytest.approx(area, rel=1e-9)
     moment = (np.abs(triangles)[..., None] * centre).sum(axis=(0, 1))

@@ -183,10 +183,9 @@ def _between(K: csr_array, fixed: NDArray[np.bool_], u: NDArray[np.float64]) -> 
         rows = K[free]
         A = rows[:, free].tocsr()
         csr = (A.indptr.astype(PETSc.IntType), A.indices.astype(PETSc.IntType), A.data)
-        matrix = PETSc.Mat().createAIJ(
-            A.shape, csr=csr, comm=MPI.COMM_SELF
-        )  # every process has all of a body as seeded
+        matrix = PETSc.Mat().createAIJ(A.shape, csr=csr, comm=MPI.COMM_SELF)  # all processes have all seeded bodies
         solver = PETSc.KSP().create(MPI.COMM_SELF)
+        solver.setErrorIfNotConverged(True)
         solver.setOperators(matrix)
         solver.setType("cg")
         solver.getPC().setType("icc")
