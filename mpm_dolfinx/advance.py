@@ -17,6 +17,7 @@ from mpm_dolfinx.parallel.exchange import first, over_all
 from mpm_dolfinx.points.bodies import Body
 from mpm_dolfinx.points.cut_domains import CutDomains
 from mpm_dolfinx.points.cutting import parallelepipeds, tangled
+from mpm_dolfinx.points.grid import REACH
 from mpm_dolfinx.points.material_points import MaterialPoints, determinant
 from mpm_dolfinx.points.pressure_transport import PiecePressures, Reconstruction
 from mpm_dolfinx.problems.mechanical_boundary import MechanicalBoundary
@@ -24,8 +25,6 @@ from mpm_dolfinx.problems.momentum import MomentumForms
 from mpm_dolfinx.problems.on_grid import OnGrid
 from mpm_dolfinx.problems.storage import StorageForms
 from mpm_dolfinx.state import State, Stay
-
-REACH = 1e-4  # cells: a side that is given its way to the wall of the grid gives way by as much
 
 
 class Motion:
@@ -112,7 +111,12 @@ class Motion:
             corners = points.corners + moved
             return replace(points, corners=corners, x=corners.mean(axis=1))
         x = points.x + moved
-        return replace(points, x=x, corners=parallelepipeds(x, points.F, self._size[points.id]))
+        return replace(points, x=x, corners=parallelepipeds(x, points.F, self._sizes(points)))
+
+    def _sizes(self, points: MaterialPoints) -> NDArray[np.float64]:
+        """Return the edges (n, d), m, of boxes as large as the points' domains at rest, as seeded or put on others."""
+        size = self._size[points.id]
+        return size * (points.volume0 / size.prod(axis=1))[:, None] ** (1 / size.shape[1])
 
     def _check_volumes(self, points: MaterialPoints, J: NDArray[np.float64], cut: CutDomains) -> None:
         """Refuse what a law may allow and a body does not: points turned inside out, pores of no volume."""
@@ -132,7 +136,7 @@ class Motion:
         bad = np.flatnonzero(tangled(points.corners, volume))
         if len(bad):
             all_corners, x = points.corners.copy(), points.x.copy()
-            corners = parallelepipeds(x[bad], points.F[bad], self._size[points.id[bad]])
+            corners = parallelepipeds(x[bad], points.F[bad], self._sizes(points)[bad])
             corners = boundary.under_held(points.id[bad], all_corners[bad], volume[bad], corners)
             all_corners[bad] = np.clip(corners, grid.lower, grid.upper)
             x[bad] = all_corners[bad].mean(axis=1)

@@ -208,13 +208,13 @@ class Simulation:
         fixed, tractions, displacements, drained, inflows, plates, gravity
             As for the scene; `gravity` only if the scene had it.
         add
-            Indices of bodies that were to come `later`: a fill, at rest and without stress where it was seeded.
+            Indices of bodies that were to come `later`: a fill, at rest and without stress, put onto the
+            present surface of what it touches as seeded; the side opposite to it stays where it was seeded.
         remove
             Indices of bodies: an excavation.
         reset_displacement
             From now on displacements count from the present positions.  Conditions that are not named stay as they
             are: a `Displacement` then counts from there too, and moves its side once more.
-
         fields
             New values (n, ...) at the points of this process, or one for all, of what they carry in `points.data`:
             constants of materials that were given as functions of place, and state of laws; or data of your own, that

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -11,17 +12,25 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.points.bodies import Body
+from mpm_dolfinx.points.contact import check_apart
+from mpm_dolfinx.points.faces import surface
+from mpm_dolfinx.points.fills import put, touches
+from mpm_dolfinx.points.grid import sum_by
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.points.pressure_transport import at_start
-from mpm_dolfinx.problems.stage import Stage, stage
+from mpm_dolfinx.problems.stage import CONDITIONS, Stage, stage
 from mpm_dolfinx.scene import Scene
 from mpm_dolfinx.state import State
-from mpm_dolfinx.validation import chosen, flag, numbers
+from mpm_dolfinx.validation import chosen, flag, line, numbers
+
+logger = logging.getLogger("mpm_dolfinx")
 
 
 def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int]) -> State:
     """Return the state of a scene at rest, in its first stage."""
-    begun = _stage(scene, conditions, [body not in later for body in range(len(scene.bodies))], later)
+    present = [body not in later for body in range(len(scene.bodies))]
+    check_apart(scene.grid, scene.bodies, present)
+    begun = _stage(scene, conditions, present, later)
     points = scene.materials.seeded.of(_ids(scene.bodies, later), kept=False)
     transported = at_start(points) if scene.fluid else None
     reactions = np.zeros((len(begun.mechanical.holds), scene.grid.dim))
@@ -47,10 +56,13 @@ def begin_stage(
     present = [(here and body not in remove) or body in add for body, here in enumerate(before.present)]
     later = [body for body in before.later if body not in add]
     begun = _stage(scene, {**before.conditions, **named}, present, later)
+    if remove:
+        _warn_moved_on(scene, before, begun, [name for name in CONDITIONS if name not in named])
     if state.stay:  # pressures are those of the cells
         state = scene.motion.left_grid(state, scene.on_grid(state.stay.points))
-    gone, new = _ids(scene.bodies, remove), scene.materials.seeded.of(_ids(scene.bodies, add))
-    points, transported = state.points.of(gone, kept=False).joined(new), state.transported
+    gone, transported = _ids(scene.bodies, remove), state.transported
+    there = [body for body, here in enumerate(before.present) if here and body not in remove]
+    points, new = _filled(scene, state.points.of(gone, kept=False), there, add)
     if transported is not None:
         transported = transported.of(gone, kept=False).joined(at_start(new))
     points = _changed(points, fields)
@@ -66,6 +78,35 @@ def begin_stage(
 def _stage(scene: Scene, conditions: Mapping[str, Any], present: Sequence[bool], later: Sequence[int]) -> Stage:
     stiffest, wet = scene.materials.stiffest, scene.fluid is not None
     return stage(scene.grid, scene.bodies, stiffest, wet, conditions, present, later)
+
+
+def _warn_moved_on(scene: Scene, before: Stage, begun: Stage, kept: Sequence[str]) -> None:
+    """Log a warning for each condition that was not given anew and acts on what an excavation has laid bare."""
+    stop = np.cumsum([len(body) for body in scene.bodies])
+    for condition in (condition for name in kept for condition in begun.conditions[name]):
+        was, now = (surface(scene.bodies, condition.side, condition.region, s.present) for s in (before, begun))
+        bare = sum_by(now.id, now.area0, stop[-1]) - sum_by(was.id, was.area0, stop[-1])
+        here = np.repeat(before.present, [len(body) for body in scene.bodies])
+        new = np.flatnonzero(here[now.id] & (bare[now.id] > 1e-9 * now.whole0))
+        if len(new) and scene.grid.comm.rank == 0:
+            area = bare[np.unique(now.id[new])].sum()
+            what = "stage: remove: %s was not given anew and now also acts on %.3g m^%d that were laid bare, from %s on"
+            logger.warning(what, line(condition), area, scene.grid.dim - 1, now.X[new[0]].mean(axis=0))
+
+
+def _filled(
+    scene: Scene, points: MaterialPoints, there: Sequence[int], add: Sequence[int]
+) -> tuple[MaterialPoints, MaterialPoints]:
+    """Return the points with those of bodies that come, and these alone; what lies on another comes after it."""
+    there, waiting, new = list(there), list(add), scene.materials.seeded.of(_ids(scene.bodies, []))
+    while waiting:
+        fill = next((body for body in waiting if touches(scene.bodies, there, body)), waiting[0])
+        placed = scene.materials.seeded.of(_ids(scene.bodies, [fill]))
+        placed = put(scene.grid, scene.bodies, there, fill, points, placed)
+        points, new = points.joined(placed), new.joined(placed)
+        there.append(fill)
+        waiting.remove(fill)
+    return points, new
 
 
 def _ids(bodies: Sequence[Body], chosen: Sequence[int]) -> NDArray[np.int64]:

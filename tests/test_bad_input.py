@@ -109,7 +109,7 @@ CASES = {
     "bodies in each other": (
         lambda: scene([BODY, mpm.box(GRID, [0.4, 0.4], [0.7, 0.7])]),
         "bodies 0 and 1",
-        "[0.425 0.425]",
+        "[0.45 0.45]",
     ),
     "probe outside": (lambda: mpm.probes([BODY], [[0.9, 0.9]]), "probe at", "[0.9 0.9]"),
     "probe at nan": (lambda: mpm.probes([BODY], [[0.1, 0.3], [NAN, 0.3]]), "probes: x0", "nan"),

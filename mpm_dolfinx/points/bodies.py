@@ -5,11 +5,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import cKDTree
 
 from mpm_dolfinx.points.cutting import corner_bits, volumes
 from mpm_dolfinx.points.grid import Grid
@@ -40,16 +38,36 @@ class Body:
         return self.lower + 0.5 * self.spacing
 
     def corners(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
-        """Return the reference corners (m, 2^d, d), m, of domains."""
+        """Return the corners (m, 2^d, d), m, of domains, after the map."""
         lower = self.lower[chosen]
-        corners = lower[:, None] + corner_bits(lower.shape[1]) * self.spacing
-        if self.map is None or not len(lower):  # a map need not have an answer for no positions
-            return corners
-        x = corners.reshape(-1, lower.shape[1])
+        return self.images(lower[:, None] + corner_bits(lower.shape[1]) * self.spacing)
+
+    def images(self, X: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return where the map puts reference positions (..., d), m."""
+        if self.map is None or not X.size:  # a map need not have an answer for no positions
+            return X
+        x = X.reshape(-1, X.shape[-1])
         images = numbers("body: the map", asked("body: the map", "a function of positions", self.map, x), None)
         if images.shape != x.shape:
             raise ValueError(f"body: the map gives shape {images.shape}, must be one position each, {x.shape}")
-        return images.reshape(corners.shape)
+        return images.reshape(X.shape)
+
+    def bend(self, chosen: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return how far the middles of the domains' edges lie from the images of their middles (m,), m.
+
+        By so much the straight edges of two domains may differ that follow the same curve.
+        """
+        out, lower = np.zeros(len(chosen)), self.lower[chosen]
+        if self.map is None:
+            return out
+        corners, bits = self.corners(chosen), corner_bits(lower.shape[1])
+        for axis in range(lower.shape[1]):
+            first = np.flatnonzero(bits[:, axis] == 0)
+            other = first + (1 << axis)
+            middle = self.images(lower[:, None] + (bits[first] + bits[other]) / 2 * self.spacing)
+            off = np.linalg.norm((corners[:, first] + corners[:, other]) / 2 - middle, axis=2)
+            out = np.maximum(out, off.max(axis=1))
+        return out
 
     def size(self) -> NDArray[np.float64]:
         """Return the edges (n, d), m, of boxes that are as large as the domains."""
@@ -143,14 +161,16 @@ def shape(
 def mapped(grid: Grid, body: Body, map: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> Body:
     """Bend a body: its boxes become the quadrilaterals or hexahedra between the images of their corners.
 
-    Sides keep their names; regions and probes are given by places before the map.  Returns the bent body.
+    Reference positions are those before all maps: regions, probes, X of fields of materials and of displacements.
+    All else is judged after them: what touches, lies in one another, is flat, is loaded.  Sides keep their names.
+    Returns the bent body.
 
     Parameters
     ----------
     grid
         Background grid.
     body
-        Of `box` or `shape`.
+        Of `box`, `shape` or `mapped`: then its own map comes first.
     map
         Maps positions (n, d), m, to positions (n, d), m, inside the grid; smooth, and not turning boxes inside out.
 
@@ -161,7 +181,8 @@ def mapped(grid: Grid, body: Body, map: Callable[[NDArray[np.float64]], NDArray[
     """
     instance("body: grid", grid, Grid)
     instance("body to bend", body, Body)
-    bent = replace(body, map=map)
+    inner = body.map
+    bent = replace(body, map=map if inner is None else lambda x: map(np.asarray(inner(x), dtype=float)))
     corners = bent.corners()
     out = np.flatnonzero(grid.outside(corners.reshape(-1, grid.dim)))
     if len(out):
@@ -223,21 +244,3 @@ def check_different(bodies: Sequence[Body]) -> None:
         for i in range(j):
             if bodies[i] is body:
                 raise ValueError(f"bodies {i} and {j}: are one and the same, must be two; seed the second one anew")
-
-
-def check_apart(bodies: Sequence[Body], present: Sequence[bool]) -> None:
-    """Refuse bodies of which domains lie in each other as seeded; those that a map has bent are not looked at."""
-    there = [i for i, body in enumerate(bodies) if present[i] and body.map is None]
-    for i, j in combinations(there, 2):
-        a, b = bodies[i], bodies[j]
-        low, high = (
-            np.maximum(a.lower.min(axis=0), b.lower.min(axis=0)),
-            [(body.lower.max(axis=0) + body.spacing) for body in (a, b)],
-        )
-        size = (a.spacing + b.spacing) / 2
-        if not (np.minimum(*high) - low > 1e-6 * size).all():
-            continue
-        distance, _ = cKDTree(a.centre / size).query(b.centre / size, p=np.inf, distance_upper_bound=1 - 1e-6)
-        inside = np.flatnonzero(distance < 1 - 1e-6)
-        if len(inside):
-            raise ValueError(f"bodies {i} and {j}: both are at {b.centre[inside[0]]}, must not lie in each other")

@@ -125,7 +125,7 @@ class CutDomains(Keyed):
 
     def _cut_surface(self, faces: Surface) -> Patches:
         here, at = self.points.find(faces.id)
-        corners, xi = self.points.corners[at], faces.corners()[here]
+        corners, xi = self.points.corners[at], faces.xi[here]
         count = xi.shape[1]
         places = interpolate(np.repeat(corners, count, axis=0), xi.reshape(-1, self.grid.dim)).reshape(xi.shape)
         face, x, xi, share, middle = cut_faces(self.grid, places, xi)

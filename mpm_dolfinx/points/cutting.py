@@ -268,8 +268,9 @@ def cut_faces(
     whole = s
     for axis in range(d):
         s, owner = _slice(s, owner, axis)
-    # the local coordinates tell sizes, for they are never degenerate
-    share = _size(s[:, d:]) / _size(whole[:, d:])[owner] / len(split)
+    # the local coordinates tell sizes: those of a face are never degenerate, but a triangle is half of it
+    total = _size(whole[:, d:]).reshape(len(split), m).sum(axis=0)
+    share = _size(s[:, d:]) / total[owner % max(1, m)]
     kept = np.flatnonzero(share > SLIVER)  # what only touches a plane leaves nothing
     s, owner, share = s[:, :, kept], owner[kept], share[kept]
     points = np.einsum("qk,kam->qam", _RULES[d], s)
@@ -305,13 +306,13 @@ def _slice(s: NDArray[np.float64], owner: NDArray[np.int64], axis: int):
             break
         done_s.append(s[:, :, ~crossing])
         done_owner.append(owner[~crossing])
-        below, below_owner, s, owner = _cut_at(s[:, :, crossing], owner[crossing], axis, plane[crossing])
+        below, below_owner, s, owner = cut_at(s[:, :, crossing], owner[crossing], axis, plane[crossing])
         done_s.append(below)
         done_owner.append(below_owner)
     return (np.concatenate([s, *done_s], axis=2), np.concatenate([owner, *done_owner])) if done_s else (s, owner)
 
 
-def _cut_at(s, owner, axis: int, plane):
+def cut_at(s, owner, axis: int, plane):
     """Cut each simplex at its plane; return the parts below and above with their owners."""
     order = np.argsort(s[:, axis], axis=0)
     s = np.take_along_axis(s, order[:, None], axis=0)

@@ -4,13 +4,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import cKDTree
 
 from mpm_dolfinx.points.bodies import Body
+from mpm_dolfinx.points.contact import (
+    BITS,
+    Cover,
+    Faces,
+    covers,
+    face_vectors,
+    uncovered,
+    uncovered_triangles,
+    within,
+)
 from mpm_dolfinx.points.cutting import corner_bits
 from mpm_dolfinx.points.grid import rounding, side
 from mpm_dolfinx.validation import numbers
@@ -20,35 +30,45 @@ from mpm_dolfinx.validation import numbers
 class Surface:
     """Faces of domains on one side of the bodies, the same on every process; arrays over m faces.
 
-    id : (m,) number of the point; xi : (m, 2, d) ends of the part of the face that counts, in the domain's
-    coordinates from -1 to 1; X : (m, 2, d) their reference positions, before a map, m; whole0 : (m,) reference
-    area of the whole face, m^(d-1); axis, end : side of the domain.
+    A face of which several parts count has a row for each.
+
+    id : (m,) number of the point; xi : (m, 2^(d-1), d) corners of the part of the face that counts, in the domain's
+    coordinates from -1 to 1, of a triangle the last one twice; X : (m, 2, d) the box around it in reference positions,
+    before all maps, m; domain : (m, 2^d, d) corners of the domain as seeded, after them, m; axis, end : side of it.
     """
 
     id: NDArray[np.int64]
     xi: NDArray[np.float64]
     X: NDArray[np.float64]
-    whole0: NDArray[np.float64]
+    domain: NDArray[np.float64]
     axis: int
     end: int
 
     def __len__(self) -> int:
         return len(self.id)
 
+    @cached_property
+    def whole0(self) -> NDArray[np.float64]:
+        """Area (m,) of the whole faces as seeded, m^(d-1)."""
+        return np.linalg.norm(face_vectors(self.domain, self.axis, self.end), axis=1)
+
     @property
     def area0(self) -> NDArray[np.float64]:
-        """Reference area (m,) of the parts that count, m^(d-1)."""
-        return self.whole0 * np.delete((self.xi[:, 1] - self.xi[:, 0]) / 2, self.axis, axis=1).prod(axis=1)
+        """Area (m,) of the parts that count as seeded, m^(d-1)."""
+        t = np.delete(self.xi, self.axis, axis=2) / 2
+        if self.xi.shape[2] == 2:
+            return self.whole0 * np.abs(t[:, 1, 0] - t[:, 0, 0])
+        (a, b), (c, d) = (t[:, 3] - t[:, 0]).T, (t[:, 2] - t[:, 1]).T
+        return self.whole0 * np.abs(a * d - b * c) / 2
 
-    def corners(self) -> NDArray[np.float64]:
-        """Return the corners (m, 2^(d-1), d) of the parts in the domain's coordinates."""
-        dim = self.xi.shape[2]
-        bits = np.insert(corner_bits(dim - 1), self.axis, 0, axis=1)
-        return self.xi[:, bits, np.arange(dim)]
+    def places(self) -> NDArray[np.float64]:
+        """Return where the corners of the parts (m, 2^(d-1), d) are as seeded, m."""
+        domain = np.repeat(self.domain, self.xi.shape[1], axis=0)
+        return interpolate(domain, self.xi.reshape(-1, self.xi.shape[2])).reshape(self.xi.shape)
 
     def reference(self, face: NDArray[np.int64], xi: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the reference positions (n, d), m, of places xi (n, d) on faces."""
-        (a, b), (A, B) = self.xi[face].swapaxes(0, 1), self.X[face].swapaxes(0, 1)
+        (A, B), a, b = self.X[face].swapaxes(0, 1), self.xi.min(axis=1)[face], self.xi.max(axis=1)[face]
         t = np.divide(xi - a, b - a, out=np.zeros_like(xi), where=b > a)
         return A + t * (B - A)
 
@@ -71,7 +91,9 @@ def limits(region: Region | None, dim: int) -> NDArray[np.float64]:
 def surface(
     bodies: Sequence[Body], name: str, region: Region | None = None, present: Sequence[bool] | None = None
 ) -> Surface:
-    """Return the faces on a named side of the bodies that are present, where no other of them touches.
+    """Return the faces on a named side of the bodies that are present, but for what of them lies on another body.
+
+    Bodies lie on one another as they are seeded, after their maps, and from then on: bodies that touch stick.
 
     Parameters
     ----------
@@ -82,40 +104,72 @@ def surface(
     present
         Which bodies are there, by default all.
     """
-    there = [body for i, body in enumerate(bodies) if present is None or present[i]]
+    there = [present is None or bool(present[i]) for i in range(len(bodies))]
     dim = bodies[0].lower.shape[1]
     axis, end = side(name, dim)
-    tangential = np.arange(dim) != axis
-    low, high = limits(region, dim)
-    start, ids, xis, Xs, wholes = 0, [], [], [], []
-    for body in bodies:
-        chosen = np.flatnonzero(body.sides[:, axis, end] & any(body is other for other in there))
-        box = np.stack([body.lower[chosen], body.lower[chosen] + body.spacing], axis=1)
-        face = box.copy()
-        face[:, :, axis] = box[:, end, None, axis]
-        part = np.stack([np.maximum(face[:, 0], low), np.minimum(face[:, 1], high)], axis=1)
-        on = (part[:, 1] > part[:, 0])[:, tangential].all(axis=1)
-        on &= ~_touched(face.mean(axis=1), axis, end, [other for other in there if other is not body])
-        at, slack = face[:, 0, axis], 1e-9 * body.spacing[axis] + rounding(face)
-        on &= (at >= low[axis] - slack) & (at <= high[axis] + slack)
-        part[:, :, axis] = face[:, :, axis]
-        ids.append(start + chosen[on])
-        xis.append((2 * part - box.sum(axis=1, keepdims=True))[on] / body.spacing)
-        Xs.append(part[on])
-        wholes.append(np.linalg.norm(face_vectors(body.corners(chosen[on]), axis, end), axis=1))
+    box = limits(region, dim)
+    around = [Faces.around(body) if here and sum(there) > 1 else None for body, here in zip(bodies, there, strict=True)]
+    start, found = 0, [(np.empty(0, np.int64), *(np.empty((0, n, dim)) for n in (2 ** (dim - 1), 2, 2**dim)))]
+    for i, body in enumerate(bodies):
+        chosen = _in_region(body, axis, end, box) if there[i] else np.empty(0, np.int64)
+        others = [faces for j, faces in enumerate(around) if faces is not None and j != i]
+        row, t = _free(Faces.of(body, axis, end, chosen), others)
+        row, xi, X = _limited(body, axis, end, chosen[row], t, box)
+        found.append((start + row, xi, X, body.corners(row)))
         start += len(body)
-    return Surface(*map(np.concatenate, (ids, xis, Xs, wholes)), axis, end)
+    return Surface(*map(np.concatenate, zip(*found, strict=True)), axis, end)
 
 
-def _touched(centre: NDArray[np.float64], axis: int, end: int, others: Sequence[Body]) -> NDArray[np.bool_]:
-    """Return which faces, given by their centres (m, d) in the reference configuration, lie on one of other bodies."""
-    out = np.zeros(len(centre), dtype=bool)
-    for body in others:
-        just_outside = centre / body.spacing
-        just_outside[:, axis] += 1e-6 * (2 * end - 1)
-        distance, _ = cKDTree(body.centre / body.spacing).query(just_outside, p=np.inf, distance_upper_bound=0.5)
-        out |= distance < 0.5
-    return out
+def _in_region(body: Body, axis: int, end: int, region: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return the domains of a body that have a face on a side of which a part lies in a box (2, d) of all space."""
+    box, tangential = np.stack([body.lower, body.lower + body.spacing], axis=1), np.arange(len(body.spacing)) != axis
+    at, slack = box[:, end, axis], 1e-9 * body.spacing[axis] + rounding(box)
+    on = body.sides[:, axis, end] & (at >= region[0, axis] - slack) & (at <= region[1, axis] + slack)
+    on &= (np.minimum(box[:, 1], region[1]) > np.maximum(box[:, 0], region[0]))[:, tangential].all(axis=1)
+    return np.flatnonzero(on)
+
+
+def _limited(
+    body: Body, axis: int, end: int, row: NDArray[np.int64], t: NDArray[np.float64], region: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return what of parts t (n, 4, 2) of faces lies in a region: domains (m,), xi and X as of a `Surface`."""
+    dim = len(body.spacing)
+    tangential = np.flatnonzero(np.arange(dim) != axis)
+    low, high = ((region[k, tangential] - body.lower[row][:, tangential]) / body.spacing[tangential] for k in (0, 1))
+    if dim == 2:
+        low, high = (np.pad(x, ((0, 0), (0, 1)), constant_values=c) for x, c in ((low, 0.0), (high, 1.0)))
+    three = (t[:, 2] == t[:, 3]).all(axis=1)
+    triangles, at = within(t[three, :3].transpose(1, 2, 0), np.flatnonzero(three), low[three], high[three])
+    triangles = triangles.transpose(2, 0, 1)[:, [0, 1, 2, 2]]
+    at = np.concatenate([np.flatnonzero(~three), at])
+    t = np.concatenate([np.clip(t[~three], low[~three, None], high[~three, None]), triangles])
+    kept = np.flatnonzero((np.ptp(t, axis=1) > 0).all(axis=1))
+    kept = kept[np.argsort(at[kept], kind="stable")]
+    row, t = row[at[kept]], t[kept][:, : 2 ** (dim - 1), : dim - 1]
+    xi = np.insert(2 * t - 1, axis, 2.0 * end - 1, axis=2)
+    ends, lower = np.stack([xi.min(axis=1), xi.max(axis=1)], axis=1), body.lower[row][:, None]
+    X = np.where(ends == 1, lower + body.spacing, lower + (ends + 1) / 2 * body.spacing)
+    X[:, :, tangential] = np.clip(X[:, :, tangential], *region[:, tangential])
+    return row, xi, X
+
+
+def _free(own: Faces, others: Sequence[Faces]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return the free parts of faces: the face (n,) of each, and its corners (n, 4, 2), from 0 to 1 over the face.
+
+    They are rectangles where boxes lie along the face's edges, else triangles, whose last corner comes twice.
+    """
+    on = [covers(own, other) for other in others]
+    if not on:
+        return np.arange(len(own.row)), np.tile(BITS, (len(own.row), 1, 1)).astype(float)
+    cover = Cover(*(np.concatenate([getattr(c, f.name) for c in on]) for f in fields(Cover)))
+    turned = np.isin(cover.face, cover.face[cover.corner[:, 0] < 0])
+    row, low, high = uncovered(len(own.row), *(x[~turned] for x in (cover.face, cover.low, cover.high, cover.slack)))
+    whole = ~np.isin(row, cover.face[turned])
+    quads = np.where(BITS, high[whole, None], low[whole, None])
+    if not turned.any():
+        return row, quads
+    split, triangles = uncovered_triangles(cover, np.unique(cover.face[turned]))
+    return np.concatenate([row[whole], split]), np.concatenate([quads, triangles[:, [0, 1, 2, 2]]])
 
 
 def interpolate(corners: NDArray[np.float64], xi: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -123,16 +177,3 @@ def interpolate(corners: NDArray[np.float64], xi: NDArray[np.float64]) -> NDArra
     signs = 2 * corner_bits(xi.shape[1]) - 1
     N = (0.5 * (1 + signs * xi[:, None, :])).prod(axis=2)
     return np.einsum("mk,mkd->md", N, corners)
-
-
-def face_vectors(corners: NDArray[np.float64], axis: int, end: int) -> NDArray[np.float64]:
-    """Return the outward area vectors (m, d), m^(d-1), of one face of domains (m, 2^d, d)."""
-    dim = corners.shape[2]
-    face = corners[:, corner_bits(dim)[:, axis] == end]
-    if dim == 2:
-        t = face[:, 1] - face[:, 0]
-        n = np.stack([t[:, 1], -t[:, 0]], axis=1) * (1 if axis == 0 else -1)
-    else:
-        n = 0.5 * np.cross(face[:, 3] - face[:, 0], face[:, 2] - face[:, 1])
-        n *= 1 if axis != 1 else -1
-    return n * (1 if end else -1)

@@ -25,7 +25,7 @@ SIDES = {
     3: {"left": (0, 0), "right": (0, 1), "front": (1, 0), "back": (1, 1), "bottom": (2, 0), "top": (2, 1)},
 }
 """Names of the sides of a box: (axis, 0 for the lower or 1 for the upper end)."""
-
+REACH = 1e-4  # cells: a side that is given its way to the wall of the grid gives way by as much
 
 SHARED = frozenset(
     "mesh num_owned num_local cell_nodes node_x midpoints signs cell_number cell_facets facet_cells facets_owned "

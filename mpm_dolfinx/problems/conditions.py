@@ -2,9 +2,12 @@
 """Conditions on the sides of the bodies: tractions, displacements, rigid plates, drained sides, prescribed inflow.
 
 A side is named "left", "right", "bottom" or "top", in 3D also "front" (lower y) and "back" (upper y), by where it is
-in the seeded body; it moves with the body.  What is wrong with a condition is said, with a ValueError, when a
-scene or a stage is made with it, of functions of time at the step that asks for it.  A condition equals only itself:
-values and regions may be arrays and functions, which have no equality of their own.
+in the seeded body, before a map; it moves with the body.  What of it lies on another body, as seeded, does not count.
+Regions and X are reference positions, before all maps (`mapped`); areas are those as seeded, after them.
+
+What is wrong with a condition is said, with a ValueError, when a scene or a stage is made with it, of functions of time
+at the step that asks for it.  A condition equals only itself: values and regions may be arrays and functions, which
+have no equality of their own.
 """
 
 from __future__ import annotations
@@ -128,7 +131,8 @@ class Displacement:
         Side of the bodies, as for `Traction`.
     value : (d,) or callable (t, X) -> (d,) or (m, d), m
         Displacement of the side since the start, or since a stage reset it, given the time (s) and the reference
-        positions X (m, d).  A number for every component, also for those that are free.
+        positions X (m, d), of which a bent body's map gives the places as seeded.  A number for every component, also
+        for those that are free.
     components
         Components that are given, such as "y"; the others are free.  By default all.
     region : ((d,), (d,)), m
@@ -170,7 +174,8 @@ class RigidPlate:
     Parameters
     ----------
     side
-        Side of the bodies, as for `Traction`; its faces lie in one plane normal to an axis, and hang together.
+        Side of the bodies, as for `Traction`; its faces, as seeded, lie in one plane normal to an axis and hang
+        together.
     force : float or callable t (s) -> float, N (N/m in plane strain)
         Total force that presses on the side; negative: pulls.
     region : ((d,), (d,)), m

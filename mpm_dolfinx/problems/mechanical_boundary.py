@@ -175,15 +175,23 @@ def _force(load: Traction, t: float, patches: Patches, points: MaterialPoints) -
 
 
 def _check_flat(plate: RigidPlate, faces: Surface) -> None:
-    """Refuse a plate on faces that are not one flat, connected side: each part would move by itself."""
-    height, tangential = faces.X[:, 0, faces.axis], np.arange(faces.X.shape[2]) != faces.axis
-    X, size = faces.X.mean(axis=1), np.ptp(faces.X, axis=1)[:, tangential].max(axis=0)
-    apart = np.flatnonzero(np.abs(height - height[0]) > 1e-6 * size.min())
+    """Refuse a plate on faces that are not one flat, connected side as seeded: each part would move by itself."""
+    corners, tangential = faces.places(), np.arange(faces.X.shape[2]) != faces.axis
+    low, high, height = corners.min(axis=1)[:, tangential], corners.max(axis=1)[:, tangential], corners[..., faces.axis]
+    X, extent = (low + high) / 2, high - low
+    size = extent.max(axis=0)
+    apart = np.flatnonzero(np.abs(height - height[0, 0]).max(axis=1) > 1e-6 * size.min())
     if not len(apart):
-        pairs = cKDTree(X[:, tangential] / size).query_pairs(1 + 1e-6, p=np.inf, output_type="ndarray")
+        pairs = cKDTree(X / size).query_pairs(1 + 1e-6, p=np.inf, output_type="ndarray")
+        i, j = pairs.T
+        pairs = pairs[(np.abs(X[i] - X[j]) <= (extent[i] + extent[j]) / 2 + 1e-6 * size).all(axis=1)]
         graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(X), len(X)))
         _, part = connected_components(graph, directed=False)
         apart = np.flatnonzero(part != part[0])
     if len(apart):
-        where = f"faces at {X[0]} and {X[apart[0]]} do not hang together"
-        raise ValueError(f"{line(plate)}: {where}, must be one flat side; take a plate with a region for each")
+        one, other = corners.mean(axis=1)[[0, apart[0]]]
+        where = "slope" if apart[0] == 0 else f"and {other} do not hang together at one height"
+        raise ValueError(
+            f"{line(plate)}: faces at {one} {where}, must be one flat side normal to an axis; "
+            "take a plate with a region for each"
+        )

@@ -54,7 +54,9 @@ def check_apart(one, faces: Surface, other, others: Surface) -> None:
     """Refuse two conditions, of a kind that excludes the other, on the same part of a face."""
     if (faces.axis, faces.end) != (others.axis, others.end):
         return
-    _, a, b = np.intersect1d(faces.id, others.id, return_indices=True)
+    first, stop = (np.searchsorted(others.id, faces.id, end) for end in ("left", "right"))
+    a = np.repeat(np.arange(len(faces)), stop - first)  # all pairs of parts of one face
+    b = np.arange(len(a)) - np.repeat(np.cumsum(stop - first) - stop, stop - first)
     low, high = np.maximum(faces.X[a, 0], others.X[b, 0]), np.minimum(faces.X[a, 1], others.X[b, 1])
     common = high - low > 1e-9 * (faces.X[a, 1] - faces.X[a, 0])
     common[:, faces.axis] = True

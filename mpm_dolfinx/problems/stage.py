@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mpm_dolfinx.points.bodies import Body, check_apart
+from mpm_dolfinx.points.bodies import Body
 from mpm_dolfinx.points.grid import Grid
 from mpm_dolfinx.problems.conditions import Displacement, Drained, Inflow, RigidPlate, Traction
 from mpm_dolfinx.problems.hydraulic_boundary import HydraulicBoundary
@@ -89,7 +89,6 @@ def stage(
         _gravity(gravity, "gravity", grid.dim)
     if not any(present):
         raise ValueError("bodies: none is there, must be at least one")
-    check_apart(bodies, present)
     free, sides = ~_fixed(grid, conditions["fixed"]), Sides(grid, bodies, present)
     acting = (conditions[name] for name in ("tractions", "displacements", "plates"))
     mechanical = MechanicalBoundary(sides, stiffest, *acting)

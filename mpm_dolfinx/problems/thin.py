@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from mpm_dolfinx.points.bodies import Body
-from mpm_dolfinx.points.faces import surface
+from mpm_dolfinx.points.contact import Faces, covered, covers
 from mpm_dolfinx.points.grid import SIDES, Grid
 
 COARSE = 0.7  # of a cell: domains above this lack more stiffness than Q1 cells have too much
@@ -39,7 +39,7 @@ def warn_thin(grid: Grid, bodies: Sequence[Body], fixed: Mapping[str, str]) -> N
 
 def _bends(grid: Grid, bodies: Sequence[Body], i: int, axis: int, fixed: Mapping[str, str]) -> bool:
     """Whether a body is slender across an axis, and neither a wall nor another body holds it from that side."""
-    body, start = bodies[i], sum(len(b) for b in bodies[:i])
+    body = bodies[i]
     size = (body.lower + body.spacing).max(axis=0) - body.lower.min(axis=0)
     if size.max() < SLENDER * size[axis]:
         return False
@@ -49,7 +49,8 @@ def _bends(grid: Grid, bodies: Sequence[Body], i: int, axis: int, fixed: Mapping
         wall = (grid.lower, grid.upper)[end][axis]
         if "xyz"[axis] in fixed.get(name, "") and np.abs(at - wall).min() < 1e-9 * grid.h[axis]:
             return False
-        free = surface(bodies, name).id - start
-        if ((free >= 0) & (free < len(body))).sum() < body.sides[:, axis, end].sum() / 2:
+        own = Faces.of(body, axis, end, np.flatnonzero(body.sides[:, axis, end]))
+        others = (Faces.around(other) for other in bodies if other is not body)
+        if sum(covered(len(own.row), covers(own, other)).sum() for other in others) > len(own.row) / 2:
             return False
     return True
