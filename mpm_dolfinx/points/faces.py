@@ -42,9 +42,16 @@ class Surface:
 
     def corners(self) -> NDArray[np.float64]:
         """Return the corners (m, 2^(d-1), d) of the parts in the domain's coordinates."""
-        dim = self.xi.shape[2]
+        return self._at_corners(self.xi)
+
+    def reference_corners(self) -> NDArray[np.float64]:
+        """Return the reference positions (m, 2^(d-1), d), m, of the corners of the parts."""
+        return self._at_corners(self.X)
+
+    def _at_corners(self, ends: NDArray[np.float64]) -> NDArray[np.float64]:
+        dim = ends.shape[2]
         bits = np.insert(corner_bits(dim - 1), self.axis, 0, axis=1)
-        return self.xi[:, bits, np.arange(dim)]
+        return ends[:, bits, np.arange(dim)]
 
     def reference(self, face: NDArray[np.int64], xi: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the reference positions (n, d), m, of places xi (n, d) on faces."""
