@@ -25,6 +25,7 @@ from mpm_dolfinx.points.grid import Grid
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.problems.momentum import MomentumForms
 from mpm_dolfinx.problems.on_grid import Assembled, OnGrid, System, assembled
+from mpm_dolfinx.problems.overfilled import warn_overfilled
 from mpm_dolfinx.problems.quadrature_data import QuadraturePoints
 from mpm_dolfinx.problems.side_forms import SideData
 from mpm_dolfinx.problems.stage import Stage
@@ -79,6 +80,7 @@ class Scene:
             options = (weight, symmetric, scene.conducts, sources, self.t)
             self.storage = StorageForms(self.pieces.pieces, self.momentum.u, p, *options)
         self.motion = Motion(scene, bodies, self.momentum, self.storage, fluid)
+        self._told: list[bool] = []  # whether a cell was overfilled, of which nothing but the log knows
         self._on_grid: Latest[OnGrid] = Latest()
         self._systems: Latest[System] = Latest()
         self._assembled: Latest[Assembled] = Latest()
@@ -97,6 +99,8 @@ class Scene:
             self._assembled.clear()  # of coefficients that change now
             with Timer("mpm: cut domains"):
                 cut = CutDomains(grid, points, self.quadrature == "domain")
+                if not self._told:
+                    self._told.extend([True] * warn_overfilled(cut, self.bodies))
             with Timer("mpm: integration data"):
                 problems = (self.momentum, self.storage)
                 return OnGrid(self.pieces, self.materials, *problems, cut, self.scheme.as_printed)

@@ -80,8 +80,7 @@ class HeldCells:
 
         x, gap, normal, N = mean(p.x), mean(p.gap), total(p.normal), grid.shape_values(p.cell, p.x)
         off = p.x - x[at]
-        spread = mean(off[:, :, None] * off[:, None, :]) + FLAT * np.diag(grid.h**2)
-        slope = np.linalg.solve(spread, mean(off[:, :, None] * (p.gap - gap[at])[:, None, :]))
+        slope = mean(off[:, :, None] * (p.gap - gap[at])[:, None, :]) / (mean(off**2) + FLAT * grid.h**2)[:, :, None]
         along = 2 * normal**2 <= (normal**2).sum(axis=1, keepdims=True)
         self.number, self.cell = both(key // grid.num_local, p.number), both(key % grid.num_local, p.cell)
         self.x, self.shape = both(x, p.x), both(mean(N), N)
@@ -93,7 +92,8 @@ class HeldCells:
         against = p.modulus + 10 * p.tension  # a stressed side buckles if it is held with less than its stress
         h = grid.h.min()
         self.stiffness = both(HOLD / h * total(p.modulus), WEAK / h * against)
-        self.limit = CARRIED * total(against)
+        # at the end of a side a node's force may come by a small part of a cell
+        self.limit = CARRIED * total(against) * np.maximum(1.0, grid.cell_volume / grid.h.max() / whole)
         self._gap, self._force = both(gap, p.gap), both(0 * gap, p.force)
         self._slope, self._along = both(slope, slope[at]), both(along, along[at])
 
@@ -120,11 +120,12 @@ class HeldCells:
         nodes, x, gap, N = (v[chosen] for v in (grid.cell_nodes[self.cell], self.x, self._gap[:, axis], self.shape))
         walled = ~free[nodes]
         held = ((N * ~walled).sum(axis=1) < FREE) & (np.abs(gap) > SAME * grid.h.min())
-        stuck = np.zeros_like(walled)
+        stuck, asked = np.zeros_like(walled), np.repeat(gap[:, None], N.shape[1], axis=1)
         for b in range(grid.dim):
             for sign in (-1, 1):
                 here = grid.signs[:, b] == sign
-                stuck |= (walled[:, here].all(axis=1) & self._along[chosen, b])[:, None] & here
-        asked = gap[:, None] + np.einsum("mki,mi->mk", grid.node_x[nodes] - x[:, None], self._slope[chosen, :, axis])
+                at_wall = (walled[:, here].all(axis=1) & self._along[chosen, b])[:, None] & here
+                asked += at_wall * ((grid.node_x[nodes, b] - x[:, b, None]) * self._slope[chosen, b, axis, None])
+                stuck |= at_wall
         gap = gap - (N * stuck * asked).sum(axis=1) + self._force[chosen, axis] / self.stiffness[chosen]
         return chosen, gap, chosen[held][0] if held.any() else -1
