@@ -182,3 +182,21 @@ def test_a_held_region_may_end_anywhere_in_domains_and_cells():
     loads = np.array([footing_load(width) for width in (22 / 9, 2.40, 2.46)])
     assert loads[:, 1] == pytest.approx(loads[0, 1], rel=0.015)
     assert np.abs(loads[:, 0]).max() < 0.15
+
+
+def test_a_block_turned_in_space_is_pressed_exactly():
+    """Aslant to all axes, nu = 0: by 2 % in two steps, and a step at rest in which the sides come where they are to be."""
+    grid = mpm.Grid([1, 1, 1], [5] * 3)
+    R, _ = np.linalg.qr([[3.0, 1, 0.5], [-1, 3, 0.7], [0.2, -0.9, 3]])
+    R *= np.sign(np.diag(R))
+    body = mpm.mapped(grid, mpm.box(grid, [0.3] * 3, [0.7, 0.7, 0.7]), lambda x: (x - 0.5) @ R.T + 0.5)
+    sides = [
+        mpm.Displacement("bottom", (0, 0, 0)),
+        mpm.Displacement("top", lambda t, X: np.tile(R @ [0, 0, -0.008 * min(t, 1)], (len(X), 1))),
+    ]
+    s = mpm.Simulation(grid, [body], [SOFT], fixed={}, displacements=sides)
+    s.run(1.5, 0.5)
+    stretch = 1 - 0.02
+    force = R @ [0, 0, 1e7 * np.log(stretch) / stretch * 0.16]
+    assert s.reactions[1] == pytest.approx(force, abs=1e-3 * np.linalg.norm(force))
+    assert s.reactions[0] == pytest.approx(-s.reactions[1], abs=1e-6 * np.linalg.norm(force))

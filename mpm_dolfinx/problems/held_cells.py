@@ -55,8 +55,8 @@ class HeldCells:
     Attributes
     ----------
     number, cell, x, shape, moments
-        Of each row: condition, cell, mean position (m), mean shape functions, mean powers of the offset from the
-        cell's midpoint.
+        Of each row: condition, cell, mean position (m), mean shape functions, means of products of
+        the components of the offset from the cell's midpoint.
     stiffness, limit
         N/m; and force beyond which it is an artefact, N, for means.
     """
@@ -84,11 +84,9 @@ class HeldCells:
         along = 2 * normal**2 <= (normal**2).sum(axis=1, keepdims=True)
         self.number, self.cell = both(key // grid.num_local, p.number), both(key % grid.num_local, p.cell)
         self.x, self.shape = both(x, p.x), both(mean(N), N)
-        self.moments: dict[str, NDArray[np.float64]] = {}
-        moment = local = p.x - grid.midpoints[p.cell]
-        for k in range(2, grid.dim + 1):
-            moment = moment[..., None] * local.reshape(len(local), *(1,) * (k - 1), grid.dim)
-            self.moments[f"moment{k}"] = both(mean(moment), moment)
+        local = p.x - grid.midpoints[p.cell]
+        moments = {"squares": local[:, :, None] * local[:, None, :], "product": local.prod(axis=1)}
+        self.moments = {name: both(mean(values), values) for name, values in moments.items()}
         against = p.modulus + 10 * p.tension  # a stressed side buckles if it is held with less than its stress
         h = grid.h.min()
         self.stiffness = both(HOLD / h * total(p.modulus), WEAK / h * against)

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from math import factorial
 
 import numpy as np
 import ufl
@@ -86,7 +85,7 @@ class SideForms:
     def holds(self) -> FormPoints:
         """Points, or means over points, with a given displacement along a direction."""
         d = self._grid.dim
-        moments = {f"moment{k}": (d,) * k for k in range(2, d + 1)}
+        moments = {"squares": (d, d), **({"product": ()} if d == 3 else {})}
         return FormPoints(self._grid, stiffness=(), direction=(d,), gap=(), **moments)
 
     @cached_property
@@ -102,11 +101,9 @@ class SideForms:
 
     def _along(self, w):
         """Return the mean of a Q1 field, along the direction that is held, by the moments of the places it is over."""
-        h, derivative = self.holds, ufl.grad(w)
-        mean = w + ufl.dot(derivative, h.offset)
-        for k in range(2, self._grid.dim + 1):
-            derivative = ufl.grad(derivative)
-            i, *rest = ufl.indices(k + 1)
-            moment = getattr(h, f"moment{k}")
-            mean += ufl.as_vector(derivative[(i, *rest)] * moment[tuple(rest)], i) / factorial(k)
+        h, second = self.holds, ufl.grad(ufl.grad(w))
+        i, j, k = ufl.indices(3)
+        mean = w + ufl.dot(ufl.grad(w), h.offset) + ufl.as_vector(second[i, j, k] * h.squares[j, k], i) / 2
+        if self._grid.dim == 3:  # of third derivatives of a trilinear function one is not zero
+            mean += ufl.grad(second)[:, 0, 1, 2] * h.product
         return ufl.dot(mean, h.direction)
