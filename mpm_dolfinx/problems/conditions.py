@@ -114,7 +114,7 @@ HOLD = 3e2
 
 The side gives way by (strain of the step) x cell size / HOLD, always measured from its given place: nothing adds up.
 """
-WEAK = 3.0
+WEAK = 8.0
 """The same for what is left of it at the points of integration, of (oedometric modulus + 10 stress) / (cell size)."""
 
 
