@@ -185,7 +185,7 @@ def test_a_held_region_may_end_anywhere_in_domains_and_cells():
 
 
 def test_a_block_turned_in_space_is_pressed_exactly():
-    """Aslant to all axes, nu = 0: by 2 % in two steps, and a step at rest in which the sides come where they are to be."""
+    """Aslant to all axes, nu = 0: by 2 % in two steps, and one at rest in which the sides come where they are to be."""
     grid = mpm.Grid([1, 1, 1], [5] * 3)
     R, _ = np.linalg.qr([[3.0, 1, 0.5], [-1, 3, 0.7], [0.2, -0.9, 3]])
     R *= np.sign(np.diag(R))
