@@ -26,6 +26,7 @@ from mpm_dolfinx.points.grid import Grid
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.problems.momentum import MomentumForms
 from mpm_dolfinx.problems.on_grid import Assembled, OnGrid, System, assembled
+from mpm_dolfinx.problems.overfilled import warn_overfilled
 from mpm_dolfinx.problems.quadrature_data import QuadraturePoints
 from mpm_dolfinx.problems.side_forms import SideData
 from mpm_dolfinx.problems.stage import Stage
@@ -89,6 +90,7 @@ class Scene:
         self.method, self.substeps = method, substeps(method, flows or self.momentum.rates)
         """Of time integration, and its substeps in a step."""
         self.motion = Motion(scene, bodies, self.momentum, self.storage, fluid)
+        self._told: list[bool] = []  # whether a cell was overfilled, of which nothing but the log knows
         self._on_grid: Latest[OnGrid] = Latest()
         self._systems: Latest[System] = Latest()
         self._assembled: Latest[Assembled] = Latest()
@@ -107,6 +109,8 @@ class Scene:
             self._assembled.clear()  # of coefficients that change now
             with Timer("mpm: cut domains"):
                 cut = CutDomains(grid, points, self.quadrature == "domain")
+                if not self._told:
+                    self._told.extend([True] * warn_overfilled(cut, self.bodies))
             with Timer("mpm: integration data"):
                 problems = (self.momentum, self.storage)
                 return OnGrid(self.pieces, self.materials, *problems, cut, self.scheme.as_printed)

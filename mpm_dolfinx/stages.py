@@ -76,8 +76,8 @@ def begin_stage(
 
 
 def _stage(scene: Scene, conditions: Mapping[str, Any], present: Sequence[bool], later: Sequence[int]) -> Stage:
-    stiffest, wet = scene.materials.stiffest, scene.fluid is not None
-    return stage(scene.grid, scene.bodies, stiffest, wet, conditions, present, later)
+    wet = scene.fluid is not None
+    return stage(scene.grid, scene.bodies, scene.materials, wet, conditions, present, later)
 
 
 def _warn_moved_on(scene: Scene, before: Stage, begun: Stage, kept: Sequence[str]) -> None:

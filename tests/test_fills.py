@@ -136,7 +136,7 @@ def test_what_has_risen_into_a_fill_makes_it_thinner_or_is_refused_with_how_far(
 
     s = risen(0.3)
     s.stage(add=[1], displacements=[])
-    assert s.points.volume0[-16:].sum() == pytest.approx(2 * 0.2, rel=1e-4)
+    assert s.points.volume0[-16:].sum() == pytest.approx(2 * 0.2, rel=3e-4)  # the lift gives way by 1 / 300 of a strain
     with pytest.raises(
         ValueError, match=r"body 1: what it was seeded to touch has moved by up to 0.45 m; to its domain"
     ):
@@ -162,7 +162,7 @@ def test_edges_that_cannot_follow_a_bend_are_named_with_the_distance(caplog):
     with caplog.at_level(logging.WARNING, "mpm_dolfinx"):
         strip = mpm.Traction("top", (0, -4e5), region=((1.7, 0), (2.3, 2)))
         settled(per_cell=1, tractions=[strip]).stage(add=[1], tractions=[])
-    assert "body 1: its straight edges are up to 0.0058 m" in caplog.records[-1].getMessage()
+    assert "body 1: its straight edges are up to 0.0061 m" in caplog.records[-1].getMessage()
 
 
 @pytest.mark.parametrize("quadrature", ["domain", "point"])

@@ -180,6 +180,11 @@ class SceneMaterials:
             out[rows] = law.stress(data)
         return out
 
+    def total_stress(self, points: MaterialPoints) -> NDArray[np.float64]:
+        """Return the Cauchy stress (n, d, d), Pa, of skeleton and fluid at the points; on all processes together."""
+        pressure = self.table(points, lambda m: m.biot) * points.pressure
+        return self.effective_stress(points) - pressure[:, None, None] * np.eye(self._grid.dim)
+
     def updated_state(self, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
         """Return what the points, given with the F of the end of a step, carry from then on.
 

@@ -81,8 +81,14 @@ class Exchange:
 
 
 def over_all(comm: MPI.Intracomm, value: T, op: MPI.Op = MPI.SUM) -> T:
-    """Return the processes' values reduced by `op`; a single process has its own back, at no cost."""
-    return value if comm.size == 1 else comm.allreduce(value, op=op)
+    """Return the processes' values, arrays entry by entry, reduced by `op`; a single process has its own back."""
+    if comm.size == 1:
+        return value
+    if not isinstance(value, np.ndarray):
+        return comm.allreduce(value, op=op)
+    out = np.empty_like(value)
+    comm.Allreduce(value, out, op=op)
+    return out
 
 
 def to_root(comm: MPI.Intracomm, rows: int) -> Exchange:

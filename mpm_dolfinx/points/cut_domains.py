@@ -45,7 +45,7 @@ class Patches:
     """
 
     def __init__(self, faces: Surface, here, at, cell, x, xi, share):
-        self._faces, self._here, self._at, self._xi = faces, here, at, xi
+        self._faces, self._here, self.at, self._xi = faces, here, at, xi
         self.cell, self.x = cell, x
         self.area0 = share * faces.area0[here]
         """Reference areas (n,), m^(d-1)."""
@@ -57,16 +57,16 @@ class Patches:
 
     def origin(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the positions (n, d), m, from which displacements count."""
-        return interpolate(points.origin[self._at], self._xi)
+        return interpolate(points.origin[self.at], self._xi)
 
     def now(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return where the points of integration have moved to (n, d), m."""
-        return interpolate(points.corners[self._at], self._xi)
+        return interpolate(points.corners[self.at], self._xi)
 
     def area(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the outward area vectors (n, d), m^(d-1)."""
         share = self.area0 / self._faces.whole0[self._here]
-        return face_vectors(points.corners[self._at], self._faces.axis, self._faces.end) * share[:, None]
+        return face_vectors(points.corners[self.at], self._faces.axis, self._faces.end) * share[:, None]
 
 
 class CutDomains(Keyed):

@@ -66,6 +66,11 @@ class Surface:
         domain = np.repeat(self.domain, self.xi.shape[1], axis=0)
         return interpolate(domain, self.xi.reshape(-1, self.xi.shape[2])).reshape(self.xi.shape)
 
+    def reference_corners(self) -> NDArray[np.float64]:
+        """Return the corners (m, 2^(d-1), d) of the boxes around the parts in reference positions, m."""
+        bits = np.insert(corner_bits(self.X.shape[2] - 1), self.axis, 0, axis=1)
+        return self.X[:, bits, np.arange(self.X.shape[2])]
+
     def reference(self, face: NDArray[np.int64], xi: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the reference positions (n, d), m, of places xi (n, d) on faces."""
         (A, B), a, b = self.X[face].swapaxes(0, 1), self.xi.min(axis=1)[face], self.xi.max(axis=1)[face]

@@ -112,11 +112,13 @@ class Inflow:
 
 RIGIDITY = 1e4
 """Rigidity of a plate, in units of (oedometric modulus of the body) x (length of the side)."""
-HOLD = 1e4
-"""Stiffness of what holds a side with given displacement, in units of (oedometric modulus) / (cell size).
+HOLD = 3e2
+"""Stiffness of what holds the mean of a given displacement in a cell, in units of (oedometric modulus) / (cell size).
 
-The side gives way by strain x cell size / HOLD, always measured from its given place: nothing adds up.
+The side gives way by (strain of the step) x cell size / HOLD, always measured from its given place: nothing adds up.
 """
+WEAK = 8.0
+"""The same for what is left of it at the points of integration, of (oedometric modulus + 10 stress) / (cell size)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,8 +143,9 @@ class Displacement:
     Raises
     ------
     ValueError
-        From the scene or the step: no point has the side, the value or the components are none that are allowed,
-        or another `Displacement` gives a component on the same part of a face.
+        From the scene or the step: no point has the side, the value or the components are none that are allowed, a wall
+        holds what is to move, another `Displacement` gives a component on the same part of a face, or another value of
+        it where the two meet.
     """
 
     side: str

@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
-from itertools import combinations
+from itertools import chain, combinations
 
 import numpy as np
 from dolfinx.common import Timer
@@ -14,16 +15,20 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from mpm_dolfinx.caching import Latest
+from mpm_dolfinx.constitutive.fields import SceneMaterials
 from mpm_dolfinx.forms.point_forms import Places, PointData
 from mpm_dolfinx.parallel.exchange import Exchange, first
 from mpm_dolfinx.points.cut_domains import CutDomains, Patches
 from mpm_dolfinx.points.faces import Surface, face_vectors
 from mpm_dolfinx.points.grid import sum_by
 from mpm_dolfinx.points.material_points import MaterialPoints
-from mpm_dolfinx.problems.conditions import HOLD, RIGIDITY, Displacement, RigidPlate, Traction
+from mpm_dolfinx.problems.conditions import RIGIDITY, Displacement, RigidPlate, Traction
+from mpm_dolfinx.problems.held_cells import SAME, HeldCells, HeldPoints
 from mpm_dolfinx.problems.side_forms import SideData, SideForms
-from mpm_dolfinx.problems.sides import Sides, check_apart, gathered
+from mpm_dolfinx.problems.sides import Sides, check_apart, gathered, meeting
 from mpm_dolfinx.validation import line
+
+logger = logging.getLogger("mpm_dolfinx")
 
 
 class MechanicalBoundary:
@@ -33,8 +38,10 @@ class MechanicalBoundary:
     ----------
     sides
         The sides of the bodies.
-    modulus
-        Oedometric modulus of the stiffest material, Pa, by which plates and held sides are rigid.
+    free : (nodes, d)
+        Components that no wall holds.
+    materials
+        Those of the scene: plates are rigid by the stiffest one, held sides by their own.
     tractions, displacements, plates
         The conditions.
 
@@ -48,22 +55,26 @@ class MechanicalBoundary:
     def __init__(
         self,
         sides: Sides,
-        modulus: float,
+        free: NDArray[np.bool_],
+        materials: SceneMaterials,
         tractions: Sequence[Traction],
         displacements: Sequence[Displacement],
         plates: Sequence[RigidPlate],
     ):
-        self.grid, self._modulus, d = sides.grid, modulus, sides.grid.dim
+        self.grid, self._free, self._materials, d = sides.grid, free, materials, sides.grid.dim
         self.plates = [(plate, sides.of(plate)) for plate in plates]
         tractions = [*tractions, *(plate.traction(faces.area0.sum(), d) for plate, faces in self.plates)]
         self.loads = [(load, sides.of(load)) for load in tractions]
         self.holds = [(hold, sides.of(hold), hold.axes(d)) for hold in displacements]
+        self._meeting: list[tuple[Displacement, Displacement, list[int], NDArray[np.float64]]] = []
+        self._warned: set[int] = set()  # numbers of the conditions, of which nothing but the log knows
         self._loaded: Latest[tuple[Exchange, Places]] = Latest()
         for plate, faces in self.plates:
             _check_flat(plate, faces)
         for (one, faces, axes), (other, others, more) in combinations(self.holds, 2):
-            if set(axes) & set(more):
+            if common := sorted(set(axes) & set(more)):
                 check_apart(one, faces, other, others)
+                self._meeting.append((one, other, common, meeting(sides.bodies, faces, others)))
         for condition in [*tractions, *displacements]:
             if not callable(condition.value):  # what a function gives is checked when it is called
                 condition.at(0.0, *([d] if isinstance(condition, Traction) else [np.empty((1, d))]))
@@ -73,7 +84,7 @@ class MechanicalBoundary:
         with Timer("mpm: loads"):
             loads = self._load_data(forms, cut, points, t) if self.loads else None
             plates = self._plate_data(forms, cut, points) if self.plates else None
-            none = (None, np.empty(0, dtype=np.int64))
+            none = (None, np.empty(0, dtype=np.int64), np.empty((0, 2**self.grid.dim)))
             return SideData(loads, plates, *(self._hold_data(forms, cut, points, t) if self.holds else none))
 
     def _load_data(self, forms: SideForms, cut: CutDomains, points: MaterialPoints, t: float) -> PointData:
@@ -97,7 +108,7 @@ class MechanicalBoundary:
             patches = cut.surface(faces)
             area = patches.area(points)
             length = faces.area0.sum() ** (1 / (d - 1))
-            rigidity = RIGIDITY * self._modulus * length * np.linalg.norm(area, axis=1, keepdims=True)
+            rigidity = RIGIDITY * self._materials.stiffest * length * np.linalg.norm(area, axis=1, keepdims=True)
             normal = np.tile(np.eye(d)[faces.axis], (len(area), 1))
             tilt = normal - area / area[:, [faces.axis]]  # slope of the face: its normal is (-slope, 1)
             rows.append((patches.cell, patches.x, np.concatenate([rigidity, normal, tilt], axis=1)))
@@ -107,24 +118,51 @@ class MechanicalBoundary:
 
     def _hold_data(
         self, forms: SideForms, cut: CutDomains, points: MaterialPoints, t: float
-    ) -> tuple[PointData, NDArray[np.int64]]:
-        """Return the given displacements on the surface, one row a place and component, and whose each row is."""
+    ) -> tuple[PointData, HeldCells, NDArray[np.int64]]:
+        """Return what holds given displacements, a row a component; by cells and points; and which of these each is."""
+        d, comm = self.grid.dim, self.grid.comm
+        self._check_meeting(t)
+        held = HeldCells(self.grid, self._held_points(cut, points, t))
+        placed, message = [], ""
+        for axis in range(d):
+            given = np.array([axis in axes for *_, axes in self.holds])
+            row, gap, wrong = held.rows(axis, given, self._free[:, axis])
+            placed.append((row, gap, np.tile(np.eye(d)[axis], (len(row), 1))))
+            if wrong >= 0:
+                what = f"{line(self.holds[held.number[wrong]][0])}: moves {'xyz'[axis]} at {held.x[wrong]}"
+                message = f"{what}, where a fixed wall holds it; must be 0 there, or the wall must leave it free"
+        if message := first(comm, message):
+            raise ValueError(message)
+        row, gap, direction = map(np.concatenate, zip(*placed, strict=True))
+        fields = {name: values[row] for name, values in held.moments.items()}
+        fields |= {"stiffness": held.stiffness[row], "gap": gap, "direction": direction}
+        return forms.holds.at(held.cell[row], held.x[row], np.ones(len(row)), **fields), held, row
+
+    def _held_points(self, cut: CutDomains, points: MaterialPoints, t: float) -> HeldPoints:
+        """Return the points of integration on held sides, at the owners of their cells."""
         d, rows = self.grid.dim, []
-        stiffness = HOLD * self._modulus / self.grid.h.min()
-        for number, (hold, faces, axes) in enumerate(self.holds):
-            patches = cut.surface(faces)
-            gap = patches.origin(points) + self._given(hold, t, patches.X) - patches.now(points)
-            for axis in axes:
-                values = np.zeros((len(gap), 3 + d))
-                values[:, 0] = number
-                values[:, 1] = stiffness * patches.area0
-                values[:, 2] = gap[:, axis]
-                values[:, 3 + axis] = 1.0
-                rows.append((patches.cell, patches.x, values))
-        cell, x, values = gathered(self.grid, rows, 3 + d)
-        number, stiffness, gap, direction = np.split(values, [1, 2, 3], axis=1)
-        data = forms.holds.at(cell, x, np.ones(len(cell)), stiffness=stiffness, gap=gap, direction=direction)
-        return data, number[:, 0].astype(np.int64)
+        patches = [cut.surface(faces) for _, faces, _ in self.holds]
+        chosen = np.unique(np.concatenate([p.at for p in patches]))
+        now, before = (of.map(lambda values: values[chosen]) for of in (points, cut.points))
+        stress, modulus = self._materials.total_stress(now), self._materials.table(before, lambda m: m.oedometric)
+        # of when the grid was reset, as the stiffnesses: they stay as long as the cut serves
+        tension = np.linalg.norm(stress if points is cut.points else self._materials.total_stress(before), axis=(1, 2))
+        for number, ((hold, *_), p) in enumerate(zip(self.holds, patches, strict=True)):
+            at, gap = np.searchsorted(chosen, p.at), p.origin(points) + self._given(hold, t, p.X) - p.now(points)
+            force = np.einsum("nij,nj->ni", stress[at], p.area(points))
+            each = np.stack([np.full(len(gap), number), *(p.area0 * v for v in (1, modulus[at], tension[at]))], axis=1)
+            rows.append((p.cell, p.x, np.concatenate([each, gap, p.area(cut.points), force], axis=1)))
+        cell, x, values = gathered(self.grid, rows, 4 + 3 * d)
+        number, area, modulus, tension = values[:, :4].T
+        return HeldPoints(number.astype(np.int64), cell, area, modulus, tension, x, *np.split(values[:, 4:], 3, axis=1))
+
+    def _check_meeting(self, t: float) -> None:
+        """Refuse given displacements that differ where they meet: no body's stress is finite there."""
+        for one, other, axes, X in self._meeting:
+            jump = np.abs(self._given(one, t, X) - self._given(other, t, X))[:, axes].max(axis=1)
+            if jump.max(initial=0.0) > SAME * self.grid.h.min():
+                what = f"{line(one)} and {line(other)}: differ by {jump.max():.3g} m at t = {t:g} s where they meet"
+                raise ValueError(f"{what}, at {X[jump.argmax()]}; must agree there, or leave two cells between them")
 
     def _given(self, hold: Displacement, t: float, X: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the displacements (m, d), m, that a side is given at places X (m, d) of this process."""
@@ -139,14 +177,27 @@ class MechanicalBoundary:
 
     def reactions(self, sides: SideData, u: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the forces (displacements, d), N, of the given displacements at nodal values u (nodes, d), m."""
-        grid, holds = self.grid, sides.holds
-        if holds is None:
+        grid, data, held = self.grid, sides.holds, sides.held
+        if data is None:
             return np.zeros((0, grid.dim))
-        N = grid.shape_values(holds.cells, holds.x)
-        moved = np.einsum("mk,mkd,md->m", N, u[grid.cell_nodes[holds.cells]], holds["direction"])
-        force = (holds["stiffness"][:, 0] * (holds["gap"][:, 0] - moved))[:, None] * holds["direction"]
-        sums = [sum_by(sides.number, column, len(self.holds)) for column in force.T]
-        return grid.comm.allreduce(np.stack(sums, axis=1))
+        moved = np.einsum("mk,mkd,md->m", held.shape[sides.row], u[grid.cell_nodes[data.cells]], data["direction"])
+        force = data["stiffness"][:, 0] * (data["gap"][:, 0] - moved)
+        self._warn(held, sides.row, force)
+        number, force = held.number[sides.row], force[:, None] * data["direction"]
+        return grid.comm.allreduce(np.stack([sum_by(number, column, len(self.holds)) for column in force.T], axis=1))
+
+    def _warn(self, held: HeldCells, row: NDArray[np.int64], force: NDArray[np.float64]) -> None:
+        """Log a warning, once a condition, of forces that no change of the body's stress balances."""
+        firm = np.flatnonzero(row < len(held.limit))
+        firm = firm[~np.isin(held.number[row[firm]], list(self._warned))]
+        ratio = np.abs(force[firm]) / held.limit[row[firm]]
+        worst = row[firm[ratio == ratio.max(initial=1.0)][:1]]  # beyond the limit only
+        found = [(ratio.max(), int(held.number[k]), held.x[k].tolist()) for k in worst]
+        for _, number, x in list(chain(*self.grid.comm.allgather(found)))[:1]:
+            self._warned.add(number)
+            if self.grid.comm.rank == 0:
+                why = "its reaction is an artefact; does something else hold it, or is the step too large?"
+                logger.warning("%s: not where it is to be at %s: %s", line(self.holds[number][0]), np.array(x), why)
 
     def under_held(
         self, ids: NDArray[np.int64], tracked: NDArray[np.float64], volume: NDArray[np.float64], corners: NDArray

@@ -13,20 +13,22 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointForm
 from mpm_dolfinx.points.grid import Grid
+from mpm_dolfinx.problems.held_cells import HeldCells
 
 
 @dataclass(frozen=True)
 class SideData:
     """What acts on the sides of the bodies in a step; None where there is no such condition.
 
-    loads: with their force; plates: with their rigidity, normal and present tilt; holds: sides with given
-    displacements, with stiffness, direction and gap; number: the condition that each of these belongs to.
+    loads: with their force; plates: with their rigidity, normal and present tilt; holds: components of given
+    displacements, with stiffness, direction and gap; held: what holds them; row: which of it each component is.
     """
 
     loads: PointData | None
     plates: PointData | None
     holds: PointData | None
-    number: NDArray[np.int64]
+    held: HeldCells | None
+    row: NDArray[np.int64]
 
 
 class SideForms:
@@ -81,20 +83,27 @@ class SideForms:
 
     @cached_property
     def holds(self) -> FormPoints:
-        """Points with a given displacement along a direction."""
-        return FormPoints(self._grid, stiffness=(), direction=(self._grid.dim,), gap=())
+        """Points, or means over points, with a given displacement along a direction."""
+        d = self._grid.dim
+        moments = {"squares": (d, d), **({"product": ()} if d == 3 else {})}
+        return FormPoints(self._grid, stiffness=(), direction=(d,), gap=(), **moments)
 
     @cached_property
     def hold(self) -> PointForm:
         """Stiffness that holds the given displacement."""
         h = self.holds
-        return PointForm(h.stiffness * ufl.dot(h.value(self._du), h.direction) * self._along * h.dx, h)
+        return PointForm(h.stiffness * self._along(self._du) * self._along(self._v) * h.dx, h)
 
     @cached_property
     def pull(self) -> PointForm:
         """Force towards the given displacement."""
-        return PointForm(self.holds.stiffness * self.holds.gap * self._along * self.holds.dx, self.holds)
+        return PointForm(self.holds.stiffness * self.holds.gap * self._along(self._v) * self.holds.dx, self.holds)
 
-    @property
-    def _along(self):
-        return ufl.dot(self.holds.value(self._v), self.holds.direction)
+    def _along(self, w):
+        """Return the mean of a Q1 field, along the direction that is held, by the moments of the places it is over."""
+        h, second = self.holds, ufl.grad(ufl.grad(w))
+        i, j, k = ufl.indices(3)
+        mean = w + ufl.dot(ufl.grad(w), h.offset) + ufl.as_vector(second[i, j, k] * h.squares[j, k], i) / 2
+        if self._grid.dim == 3:  # of third derivatives of a trilinear function one is not zero
+            mean += ufl.grad(second)[:, 0, 1, 2] * h.product
+        return ufl.dot(mean, h.direction)

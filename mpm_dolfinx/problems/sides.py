@@ -7,11 +7,12 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from mpm_dolfinx.parallel.exchange import Exchange
 from mpm_dolfinx.points.bodies import Body
 from mpm_dolfinx.points.faces import Surface, limits, surface
-from mpm_dolfinx.points.grid import Grid
+from mpm_dolfinx.points.grid import Grid, rounding
 from mpm_dolfinx.validation import line
 
 
@@ -64,3 +65,23 @@ def check_apart(one, faces: Surface, other, others: Surface) -> None:
     if len(both):
         x = (low[both[0]] + high[both[0]]) / 2
         raise ValueError(f"{line(one)} and {line(other)}: both act at {x}, must not; limit them by regions")
+
+
+def meeting(bodies: Sequence[Body], one: Surface, other: Surface) -> NDArray[np.float64]:
+    """Return the reference positions (k, d), m, of corners that faces of two conditions have in common.
+
+    Bodies that a map has put elsewhere have corners in common with themselves only.
+    """
+
+    def corners(faces: Surface) -> NDArray[np.float64]:
+        body = np.searchsorted(np.cumsum([len(b) for b in bodies]), faces.id, side="right")
+        moved = np.array([i if b.map is not None else -1 for i, b in enumerate(bodies)])[body]
+        X = faces.reference_corners()
+        return np.concatenate([X, np.broadcast_to(moved[:, None, None], (*X.shape[:2], 1))], axis=2).reshape(
+            -1, dim + 1
+        )
+
+    dim = bodies[0].lower.shape[1]
+    x, near = corners(other), 1e-9 * min(b.spacing.min() for b in bodies) + rounding(one.X)
+    distance, _ = cKDTree(corners(one)).query(x, distance_upper_bound=near)
+    return x[distance <= near, :dim]

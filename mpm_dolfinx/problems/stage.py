@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mpm_dolfinx.constitutive.fields import SceneMaterials
 from mpm_dolfinx.points.bodies import Body
 from mpm_dolfinx.points.grid import Grid
 from mpm_dolfinx.problems.conditions import Displacement, Drained, Inflow, RigidPlate, Traction
@@ -54,7 +55,7 @@ class Stage:
 def stage(
     grid: Grid,
     bodies: Sequence[Body],
-    stiffest: float,
+    materials: SceneMaterials,
     wet: bool,
     conditions: Mapping[str, Any],
     present: Sequence[bool],
@@ -66,8 +67,8 @@ def stage(
     ----------
     grid, bodies
         Background grid, and all bodies of the scene.
-    stiffest
-        Oedometric modulus of the stiffest material, Pa.
+    materials
+        Those of the scene.
     wet
         Whether there is a fluid.
     conditions
@@ -91,7 +92,7 @@ def stage(
         raise ValueError("bodies: none is there, must be at least one")
     free, sides = ~_fixed(grid, conditions["fixed"]), Sides(grid, bodies, present)
     acting = (conditions[name] for name in ("tractions", "displacements", "plates"))
-    mechanical = MechanicalBoundary(sides, stiffest, *acting)
+    mechanical = MechanicalBoundary(sides, free, materials, *acting)
     hydraulic = HydraulicBoundary(sides, [*conditions["drained"], *conditions["inflows"]])
     return Stage(dict(conditions), tuple(present), tuple(later), free, mechanical, hydraulic)
 

@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: MIT
+"""Given displacements of sides in the cells: their means are held firmly, what is left of them weakly.
+
+A Q1 field cannot follow a side at more places than it has nodes for: held firmly at each of them, sides that are curved
+or lie aslant to the grid would lock.  The weak part leaves no wave to itself that the means do not see.  It carries
+the stress that the body has there, so what holds takes the step's change of stress only, and gives way by so much less.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpm_dolfinx.points.grid import Grid, sum_by
+from mpm_dolfinx.problems.conditions import HOLD, WEAK
+
+FLAT = 1e-6  # cells^2: variance of places far below which a side has no extent in a cell
+FREE = 1e-6  # below this share of the nodes that may move in what moves a side, a wall holds it
+SAME = 1e-6  # cells: displacements that differ by less are the same
+CARRIED = 0.3  # change of traction in a step, in units of what the side is held with: no body's stress changes so much
+
+
+class HeldPoints(NamedTuple):
+    """Points of integration on sides with given displacements; arrays over n points in owned cells.
+
+    number, cell : (n,) condition, and local cell; area : (n,) reference area, m^(d-1); modulus, tension : (n,)
+    oedometric modulus and norm of the stress when the grid was reset, times area, N; x, gap : (n, d) position, and how
+    far it is from where it is to be, m; normal : (n, d) area vector when the grid was reset, m^(d-1); force : (n, d) of
+    the body's present stress, N.
+    """
+
+    number: NDArray[np.int64]
+    cell: NDArray[np.int32]
+    area: NDArray[np.float64]
+    modulus: NDArray[np.float64]
+    tension: NDArray[np.float64]
+    x: NDArray[np.float64]
+    gap: NDArray[np.float64]
+    normal: NDArray[np.float64]
+    force: NDArray[np.float64]
+
+
+class HeldCells:
+    """What holds given displacements: rows of means, one a condition and cell, and after these one a point.
+
+    Parameters
+    ----------
+    grid
+        Background grid.
+    points
+        The points of integration.
+
+    Attributes
+    ----------
+    number, cell, x, shape, moments
+        Of each row: condition, cell, mean position (m), mean shape functions, means of products of
+        the components of the offset from the cell's midpoint.
+    stiffness, limit
+        N/m; and force beyond which it is an artefact, N, for means.
+    """
+
+    def __init__(self, grid: Grid, points: HeldPoints):
+        self.grid, p = grid, points
+        key, at = np.unique(p.number * grid.num_local + p.cell, return_inverse=True)
+        whole = sum_by(at, p.area, len(key))
+
+        def total(values: NDArray[np.float64]) -> NDArray[np.float64]:
+            columns = values.reshape(len(values), int(np.prod(values.shape[1:]))).T
+            columns = [sum_by(at, column, len(key)) for column in columns]
+            return np.stack(columns, axis=1).reshape(len(key), *values.shape[1:])
+
+        def mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
+            each = (slice(None), *(None,) * (values.ndim - 1))
+            return total(p.area[each] * values) / whole[each]
+
+        def both(means: NDArray, values: NDArray) -> NDArray:
+            return np.concatenate([means, values])
+
+        x, gap, normal, N = mean(p.x), mean(p.gap), total(p.normal), grid.shape_values(p.cell, p.x)
+        off = p.x - x[at]
+        slope = mean(off[:, :, None] * (p.gap - gap[at])[:, None, :]) / (mean(off**2) + FLAT * grid.h**2)[:, :, None]
+        along = 2 * normal**2 <= (normal**2).sum(axis=1, keepdims=True)
+        self.number, self.cell = both(key // grid.num_local, p.number), both(key % grid.num_local, p.cell)
+        self.x, self.shape = both(x, p.x), both(mean(N), N)
+        local = p.x - grid.midpoints[p.cell]
+        moments = {"squares": local[:, :, None] * local[:, None, :], "product": local.prod(axis=1)}
+        self.moments = {name: both(mean(values), values) for name, values in moments.items()}
+        against = p.modulus + 10 * p.tension  # a stressed side buckles if it is held with less than its stress
+        h = grid.h.min()
+        self.stiffness = both(HOLD / h * total(p.modulus), WEAK / h * against)
+        # at the end of a side a node's force may come by a small part of a cell
+        self.limit = CARRIED * total(against) * np.maximum(1.0, grid.cell_volume / grid.h.max() / whole)
+        self._gap, self._force = both(gap, p.gap), both(0 * gap, p.force)
+        self._slope, self._along = both(slope, slope[at]), both(along, along[at])
+
+    def rows(self, axis: int, given: NDArray[np.bool_], free: NDArray[np.bool_]) -> tuple:
+        """Return which rows give a component, their gaps (k,), m, with what their force makes of them; what is refused.
+
+        Where a wall that the side runs into holds nodes of the cell, these are asked for nothing: else its other nodes
+        would make up for them, and others for these, to and fro along the side.
+
+        Parameters
+        ----------
+        axis
+            The component.
+        given : (conditions,)
+            Which conditions give it.
+        free : (nodes,)
+            Which nodes no wall holds.
+
+        Returns
+        -------
+        Rows (k,) and gaps (k,); of a row that walls hold and that has to move, its index or -1.
+        """
+        grid, chosen = self.grid, np.flatnonzero(given[self.number])
+        nodes, x, gap, N = (v[chosen] for v in (grid.cell_nodes[self.cell], self.x, self._gap[:, axis], self.shape))
+        walled = ~free[nodes]
+        held = ((N * ~walled).sum(axis=1) < FREE) & (np.abs(gap) > SAME * grid.h.min())
+        stuck, asked = np.zeros_like(walled), np.repeat(gap[:, None], N.shape[1], axis=1)
+        for b in range(grid.dim):
+            for sign in (-1, 1):
+                here = grid.signs[:, b] == sign
+                at_wall = (walled[:, here].all(axis=1) & self._along[chosen, b])[:, None] & here
+                asked += at_wall * ((grid.node_x[nodes, b] - x[:, b, None]) * self._slope[chosen, b, axis, None])
+                stuck |= at_wall
+        gap = gap - (N * stuck * asked).sum(axis=1) + self._force[chosen, axis] / self.stiffness[chosen]
+        return chosen, gap, chosen[held][0] if held.any() else -1

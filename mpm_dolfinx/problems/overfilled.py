@@ -1,0 +1,39 @@
+# SPDX-License-Identifier: MIT
+"""Cells that hold more than they have room for: bodies overlap, or domains that folded lie on their neighbours."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+
+from mpi4py import MPI
+
+import numpy as np
+
+from mpm_dolfinx.parallel.exchange import over_all
+from mpm_dolfinx.points.bodies import Body
+from mpm_dolfinx.points.cut_domains import CutDomains
+from mpm_dolfinx.points.grid import sum_by
+
+FULL = 1.2
+"""Of a cell: domains that have not folded stay below 1.08 where soil is pushed aside by half a footing's width."""
+logger = logging.getLogger("mpm_dolfinx")
+
+
+def warn_overfilled(cut: CutDomains, bodies: Sequence[Body]) -> bool:
+    """Log a warning of the fullest cell, with the bodies in it, if it is overfilled; return whether it is."""
+    grid, points, pieces = cut.grid, cut.points, cut.pieces
+    volume = cut.to_cells(points.volume0 * points.J) * cut.pieces_to_cells(pieces.fraction)
+    fill = sum_by(cut.cells, volume, grid.num_owned) / grid.cell_volume
+    most = over_all(grid.comm, float(fill.max(initial=0.0)), MPI.MAX)
+    if not cut.domains or most <= FULL:
+        return False
+    number = over_all(grid.comm, int(grid.cell_number[fill.argmax()]) if most in fill else -1, MPI.MAX)
+    ids = points.id[pieces.point[pieces.cell == number]]
+    own = np.searchsorted(np.cumsum([len(body) for body in bodies]), ids, side="right")
+    found = sorted({int(i) for rows in grid.comm.allgather(own) for i in rows})
+    x = grid.lower + (np.array(np.unravel_index(number, grid.shape)) + 0.5) * grid.h
+    if grid.comm.rank == 0:
+        who = f"bodies {', '.join(map(str, found))}" if len(found) > 1 else f"domains of body {found[0]}"
+        logger.warning("the cell at %s is filled to %.0f %%, more than it holds: %s overlap", x, 100 * most, who)
+    return True

@@ -1,0 +1,207 @@
+# SPDX-License-Identifier: MIT
+"""Given displacements: on curved and slanted sides, beside walls and each other, and what is said where they fail."""
+
+import logging
+from dataclasses import replace
+
+import footing
+import numpy as np
+import pytest
+from helpers import SOFT
+from scipy.integrate import solve_bvp
+
+import mpm_dolfinx as mpm
+
+NEO = mpm.NeoHookean(bulk=1e7 / 3, shear=5e6)
+SOIL = mpm.Hencky(bulk=1e6 / 1.2, shear=1e6 / 2.6)  # E = 1 MPa, nu = 0.3
+WALLS = {"left": "x", "right": "x", "bottom": "xy"}
+
+
+def radial_stress(widened):
+    """Return the nominal radial stress at the hole, Pa, of a cylinder from radius 1 to 2 m: quadrature of its ODE."""
+    G, lam = NEO.shear, NEO.bulk - 2 * NEO.shear / 3
+
+    def nominal(s, q):
+        return G * (s - 1 / s) + lam * np.log(s * q) / s
+
+    def slopes(R, y):
+        s, q = y[1], y[0] / R
+        by_s = G * (1 + 1 / s**2) + lam * (1 - np.log(s * q)) / s**2
+        return np.array([s, ((nominal(q, s) - nominal(s, q)) / R - lam / (s * q) * (s - q) / R) / by_s])
+
+    def ends(a, b):
+        return np.array([a[0] - 1 - widened, nominal(b[1], b[0] / 2)])
+
+    R = np.linspace(1, 2, 200)
+    y = solve_bvp(slopes, ends, R, np.stack([R, np.ones_like(R)]), tol=1e-10).sol(1.0)
+    return nominal(y[1], y[0])
+
+
+def widened_hole(cells, widened=1e-3, steps=1):
+    """Return the reaction over the exact one of a quarter of a thick-walled cylinder, so many cells over its wall."""
+    grid = mpm.Grid([2 + 2 / cells] * 2, [2 * cells + 2] * 2)
+
+    def angle(X):
+        return X[:, 1] * np.pi / 4
+
+    def polar(X):
+        return (1 + X[:, :1]) * np.stack([np.cos(angle(X)), np.sin(angle(X))], axis=1)
+
+    def out(t, X):
+        return widened * t * np.stack([np.cos(angle(X)), np.sin(angle(X))], axis=1)
+
+    body = mpm.mapped(grid, mpm.box(grid, [0, 0], [1, 2]), polar)
+    s = mpm.Simulation(
+        grid, [body], [NEO], fixed={"left": "x", "bottom": "y"}, displacements=[mpm.Displacement("left", out)]
+    )
+    s.run(1.0, 1 / steps)
+    return s.reactions[0] / -radial_stress(widened)
+
+
+@pytest.mark.parametrize(("cells", "error"), [(6, 1e-2), (12, 2.5e-3), (24, 1e-3)])
+def test_a_widened_hole_pushes_back_as_the_exact_solution_does(cells, error):
+    assert widened_hole(cells) == pytest.approx([1, 1], rel=error)
+
+
+def test_a_hole_widened_by_a_tenth_in_steps_pushes_back_as_the_exact_solution_does():
+    assert widened_hole(12, 0.1, 10) == pytest.approx([1, 1], rel=5e-3)
+
+
+def pressed(cells, angle):
+    """Return the reaction of a rough block, 1 m high, nu = 0.3, pressed by 1 % along its own axis."""
+    grid = mpm.Grid([1.6, 1.6], [round(1.6 * cells)] * 2)
+    R = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    body = mpm.mapped(grid, mpm.box(grid, [0, 0], [0.5, 1]), lambda x: x @ R.T + [0.7, 0.2])
+    sides = [mpm.Displacement("bottom", (0, 0)), mpm.Displacement("top", R @ [0, -0.01])]
+    s = mpm.Simulation(grid, [body], [SOIL], fixed={}, displacements=sides)
+    s.run(1.0, 1.0)
+    return s.reactions[1] @ R
+
+
+@pytest.mark.parametrize(("cells", "error"), [(10, 2e-3), (20, 1e-3), (40, 5e-4)])
+def test_a_block_pressed_aslant_to_the_grid_resists_as_one_along_it(cells, error):
+    along, aslant = pressed(cells, 0.0), pressed(cells, 0.3)
+    assert aslant == pytest.approx(along, abs=error * abs(along[1]))
+
+
+def test_a_slanted_block_under_uniform_stress_is_exact():
+    """Sheared by 50 % in steps, all sides given: nothing of the grid is seen."""
+    grid = mpm.Grid([2.0, 1.0], [20, 10])
+    body = mpm.box(grid, [0.2, 0.13], [0.7, 0.63])
+
+    def value(t, X):
+        return np.stack([0.5 * t * (X[:, 1] - 0.13), 0 * t * X[:, 0]], axis=1)
+
+    held = [mpm.Displacement(side, value) for side in ("left", "right", "bottom", "top")]
+    s = mpm.Simulation(grid, [body], [NEO], fixed={}, displacements=held)
+    s.run(1.0, 0.1)
+    F = np.array([[1, 0.5], [0, 1]])
+    stress = NEO.shear * (F @ F.T - np.eye(2))
+    assert s.effective_stress() == pytest.approx(
+        np.broadcast_to(stress, (len(s.points), 2, 2)), abs=1e-2 * stress.max()
+    )
+
+
+def rough_base(h, steps=1):
+    """Return the reaction of soil on a rough base that a wall is pushed into by 1 cm."""
+    grid = mpm.Grid([2, 1 + h], [round(2.2 / h), round(1 / h) + 1], lower=[-0.2, 0])
+    wall = mpm.Displacement("left", lambda t, X: (0.01 * t, 0))
+    fixed = {"bottom": "xy", "right": "x"}
+    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [2, 1])], [SOIL], fixed=fixed, displacements=[wall])
+    s.run(1.0, 1 / steps)
+    return s.reactions[0, 0]
+
+
+@pytest.mark.parametrize("steps", [1, 10])
+def test_a_wall_pushed_along_a_rough_base_carries_what_the_soil_resists(steps):
+    coarse, fine = rough_base(0.1, steps), rough_base(0.05, steps)
+    assert 1.5e4 < coarse < 2.9e4
+    assert fine == pytest.approx(coarse, rel=0.3)
+
+
+def on_top(*regions, h=0.1, fixed=WALLS, side="top"):
+    """Return soil, 2 m by 1 m, with given displacements (region, value) of its top."""
+    grid = mpm.Grid([2, 1 + h], [round(2 / h), round(1 / h) + 1])
+    held = [mpm.Displacement(side, value, region=((low, -9), (high, 9))) for low, high, value in regions]
+    return mpm.Simulation(grid, [mpm.box(grid, [0, 0], [2, 1])], [SOIL], fixed=fixed, displacements=held)
+
+
+def test_displacements_that_differ_where_they_meet_are_refused():
+    with pytest.raises(ValueError, match=r"differ by 0.002 m at t = 1 s where they meet, at \[1. 1.\]; must agree"):
+        on_top((0, 1, (0, 0)), (1, 2, (0, -0.002))).run(1, 1)
+    whole, halves = on_top((0, 2, (0, -0.002))), on_top((0, 1, (0, -0.002)), (1, 2, (0, -0.002)))
+    whole.run(1, 1), halves.run(1, 1)
+    assert halves.reactions.sum(axis=0) == pytest.approx(whole.reactions[0], abs=2e-4 * abs(whole.reactions[0, 1]))
+
+
+def test_a_motion_that_a_wall_forbids_is_refused():
+    with pytest.raises(ValueError, match=r"Displacement\(side='bottom'.*moves y at .*, where a fixed wall holds it"):
+        on_top((0, 2, (0, 0.01)), side="bottom").run(1, 1)
+    assert on_top((0, 2, (0, 0)), side="bottom").run(1, 1).converged
+
+
+def said(caplog):
+    return [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
+
+
+def test_a_side_that_something_else_holds_is_named(caplog):
+    s = on_top((0, 0.95, (0, 0)), (1.0, 2, lambda t, X: (0, -0.02 * t)))  # they share a cell, and do not meet
+    s.run(1, 0.5)
+    messages = said(caplog)
+    assert messages and all("not where it is to be at [" in m and "artefact" in m for m in messages)
+    assert len(messages) == len(set(messages)) <= 2
+    caplog.clear()
+    on_top((0, 0.8, (0, 0)), (1.0, 2, lambda t, X: (0, -0.02 * t))).run(1, 0.5)
+    assert not said(caplog)
+
+
+def test_bodies_that_overlap_are_named(caplog):
+    grid = mpm.Grid([1, 1], [10, 10])
+    bodies = [mpm.box(grid, [0, 0], [1, 0.3]), mpm.box(grid, [0, 0.5], [1, 0.8])]
+    s = mpm.Simulation(grid, bodies, [SOFT], fixed=WALLS)
+    points = s.points
+    down = np.where(points.id < len(bodies[0]), 0.0, 0.3)[:, None] * [0, 1]
+    moved = replace(points, corners=points.corners - down[:, None], x=points.x - down)
+    s.state = replace(s.state, points=moved)
+    s.run(1.0, 0.5)
+    (message,) = said(caplog)
+    assert "filled to 200 %" in message and "bodies 0, 1 overlap" in message
+
+
+def footing_load(width):
+    """Return the mean load over c, sideways and down, of a rough strip on 0 ... 4/9, pushed into soil of a width."""
+    h, end = 1 / 9, 0.0012
+    columns, rows = int(np.ceil(width / h - 1e-9)), 11
+    grid = mpm.Grid(lower=[0, -rows * h], upper=[columns * h, 3 * h], cells=[columns, rows + 3])
+    stiff = {"bulk": 100 * footing.SOIL.bulk, "shear": 100 * footing.SOIL.shear}
+    soil = mpm.DruckerPrager(friction=0.0, dilation=0.0, cohesion=footing.COHESION, **stiff)
+    strip = mpm.Displacement("top", lambda t, X: (0, -end * t), region=((0, -np.inf), (4 / 9, np.inf)))
+    body = mpm.box(grid, [0, -rows * h], [width, 0])
+    s = mpm.Simulation(grid, [body], [soil], fixed=WALLS, displacements=[strip])
+    assert s.run(1.0, 1 / 40).cuts == 0
+    return s.reactions[0] / footing.COHESION
+
+
+def test_a_held_region_may_end_anywhere_in_domains_and_cells():
+    """Lines of the points that lie on those of the grid, and that do not."""
+    loads = np.array([footing_load(width) for width in (22 / 9, 2.40, 2.46)])
+    assert loads[:, 1] == pytest.approx(loads[0, 1], rel=0.015)
+    assert np.abs(loads[:, 0]).max() < 0.15
+
+
+def test_a_block_turned_in_space_is_pressed_exactly():
+    """Aslant to all axes, nu = 0: by 2 % in two steps, and one at rest in which the sides come where they are to be."""
+    grid = mpm.Grid([1, 1, 1], [5] * 3)
+    R, _ = np.linalg.qr([[3.0, 1, 0.5], [-1, 3, 0.7], [0.2, -0.9, 3]])
+    R *= np.sign(np.diag(R))
+    body = mpm.mapped(grid, mpm.box(grid, [0.3] * 3, [0.7, 0.7, 0.7]), lambda x: (x - 0.5) @ R.T + 0.5)
+    sides = [
+        mpm.Displacement("bottom", (0, 0, 0)),
+        mpm.Displacement("top", lambda t, X: np.tile(R @ [0, 0, -0.008 * min(t, 1)], (len(X), 1))),
+    ]
+    s = mpm.Simulation(grid, [body], [SOFT], fixed={}, displacements=sides)
+    s.run(1.5, 0.5)
+    stretch = 1 - 0.02
+    force = R @ [0, 0, 1e7 * np.log(stretch) / stretch * 0.16]
+    assert s.reactions[1] == pytest.approx(force, abs=1e-3 * np.linalg.norm(force))
+    assert s.reactions[0] == pytest.approx(-s.reactions[1], abs=1e-6 * np.linalg.norm(force))
