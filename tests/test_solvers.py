@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: MIT
 """Factors in blocks solve what they are given."""
 
+from petsc4py import PETSc
+
 import numpy as np
 import pytest
 from helpers import SOFT
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.solve.linear import direct_solver, nodal_solver
+from mpm_dolfinx.solve.linear import direct_solver, nodal_solver, solved
 
 
 def momentum(dim: int):
@@ -40,3 +42,16 @@ def test_blocks_of_nodes_solve_as_single_unknowns_do_also_when_the_matrix_change
         direct_solver(K, "single", symmetric).solve(b, single)
         assert x.array == pytest.approx(single.array, rel=1e-9, abs=1e-9 * abs(single.array).max())
         assert (K * x).array == pytest.approx(b.array, abs=1e-9)
+
+
+def test_a_linear_solver_that_breaks_off_fails_the_step():
+    K = momentum(2).K
+    ksp = PETSc.KSP().create(K.comm)
+    ksp.setType(PETSc.KSP.Type.CG)
+    ksp.setOperators(K)
+    ksp.setTolerances(rtol=1e-12, max_it=1)
+    b, x = K.createVecs()
+    b.set(1.0)
+    ksp.solve(b, x)
+    with pytest.raises(mpm.NotConverged, match="linear solver of the storage broke off .* reason -3"):
+        solved(ksp, "storage")

@@ -52,7 +52,7 @@ class Skeleton:
     grain_density
         Density of the grains, kg/m^3, >= 0; used with gravity only.
     conductivity_law
-        Function that gives the conductivity k, m/s, in UFL, at the start of every step.  It is called with
+        Function that gives the conductivity k, m/s, in UFL, at the present deformation.  It is called with
         those of these arguments that it names: conductivity (the field above), F, J = det F, porosity,
         porosity0, x (present position).
 

@@ -17,6 +17,7 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from mpm_dolfinx.caching import Latest
+from mpm_dolfinx.errors import NotConverged
 from mpm_dolfinx.forms.unknowns import Unknowns
 
 ITERATIVE = 1500
@@ -69,6 +70,16 @@ def _preonly(A: PETSc.Mat, name: str) -> PETSc.KSP:
     ksp.setType(PETSc.KSP.Type.PREONLY)
     ksp.setOptionsPrefix(f"mpm_{name}_")
     return ksp
+
+
+def solved(ksp: PETSc.KSP, name: str) -> int:
+    """Return the iterations of a solver's last solve; NotConverged where it broke off."""
+    count, reason = ksp.getIterationNumber(), ksp.getConvergedReason()
+    if reason < 0:
+        raise NotConverged(
+            f"the linear solver of the {name} broke off after {count} iterations (PETSc reason {reason})"
+        )
+    return count
 
 
 def negative_pivots(solver: PETSc.KSP) -> int:

@@ -22,7 +22,7 @@ import numpy as np
 
 from mpm_dolfinx.problems.momentum import MomentumSystem
 from mpm_dolfinx.problems.storage import StorageSystem
-from mpm_dolfinx.solve.linear import multigrid_solver
+from mpm_dolfinx.solve.linear import multigrid_solver, solved
 
 
 class BlockOperator:
@@ -130,4 +130,4 @@ class BlockSolver:
         self._ksp.setTolerances(rtol=rtol, atol=0.0, max_it=500)
         self._ksp.solve(self._b, self._x)
         self._operator.part(self._x, du, dp)
-        return self._ksp.getIterationNumber()
+        return solved(self._ksp, "momentum and storage")

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from mpm_dolfinx.caching import Latest
 from mpm_dolfinx.problems.momentum import MomentumProblem, MomentumSystem
 from mpm_dolfinx.problems.storage import FILTER, StorageProblem, StorageSystem
-from mpm_dolfinx.solve.linear import direct_solver, iterative, multigrid_solver, nodal_solver
+from mpm_dolfinx.solve.linear import direct_solver, iterative, multigrid_solver, nodal_solver, solved
 from mpm_dolfinx.solve.monolithic import BlockSolver
 from mpm_dolfinx.solve.scheme import Scheme
 
@@ -126,7 +126,8 @@ class LinearSolvers:
         if self._storage is None:
             self.solve_u.setTolerances(rtol=rtol, atol=0.0, max_it=500)
             self.solve_u.solve(residual, self.du)
-            return self.solve_u.getIterationNumber() if self.iterative else 0
+            count = solved(self.solve_u, "momentum")
+            return count if self.iterative else 0
         if self._block is not None:
             r = self._storage.residual  # scales of Euclidean norms that make them the errors
             size, total = r.norm(), r.norm(PETSc.NormType.N1)
@@ -138,7 +139,7 @@ class LinearSolvers:
         self._storage.B_momentum.multTranspose(self.dp, self._rhs)
         self._rhs.axpy(1.0, residual)
         self.solve_u.solve(self._rhs, self.du)
-        return self._solve_s.getIterationNumber()
+        return solved(self._solve_s, "storage")
 
     def condense(self) -> PETSc.Vec:
         """Return the residual of the Schur complement's system, R_p - B K^-1 R_u."""
