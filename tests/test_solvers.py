@@ -53,5 +53,5 @@ def test_a_linear_solver_that_breaks_off_fails_the_step():
     b, x = K.createVecs()
     b.set(1.0)
     ksp.solve(b, x)
-    with pytest.raises(mpm.NotConverged, match="linear solver of the storage broke off .* reason -3"):
+    with pytest.raises(mpm.NotConverged, match=r"linear solver of the storage broke off .* reason -3"):
         solved(ksp, "storage")

@@ -44,10 +44,10 @@ def test_the_answer_is_that_of_cutting_in_every_step(cuts, monkeypatch):
     for stays in (-1.0, cut_domains.STAYS):
         monkeypatch.setattr(cut_domains, "STAYS", stays)
         s = column(1e4)  # it settles by 3e-3 of a cell
-        s.run(40, 0.8, progress=False)
+        steps = s.run(40, 0.8, progress=False).steps
         runs.append((s.points.x, s.points.pressure, s.points.F, len(cuts)))
     (x, p, F, often), (x2, p2, F2, total) = runs
-    assert often == 50 and 5 <= total - often <= 15
+    assert often >= steps >= 50 and 5 <= total - often <= 15
     settled = np.abs(x[:, 1] - column(0.0).points.x[:, 1]).max()
     assert np.abs(x2 - x).max() < 1e-4 * settled
     assert np.abs(p2 - p).max() < 1e-4 * 1e4
@@ -58,8 +58,8 @@ def test_a_body_at_rest_is_cut_once_and_one_that_moves_in_every_step(cuts):
     rest, moving = column(0.0), column(1e6)
     rest.run(100, 10, progress=False)
     assert len(cuts) == 1 and not parts(rest.scene, rest.state)[0].used
-    moving.run(10, 1, progress=False)
-    assert len(cuts) == 11 and parts(moving.scene, moving.state)[0].used
+    steps = moving.run(10, 1, progress=False).steps
+    assert len(cuts) == 1 + steps and parts(moving.scene, moving.state)[0].used
 
 
 def test_a_given_displacement_and_a_plate_do_not_drift(cuts):
