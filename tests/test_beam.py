@@ -9,7 +9,7 @@ import mpm_dolfinx as mpm
 from mpm_dolfinx.verification.biot_fem import BiotFEM
 
 
-def run(arguments="", cells=demo.REFERENCE_CELLS, probe=((1.0, 0.15),)):
+def run(arguments="", cells=(40, 12), probe=((1.0, 0.15),)):
     """Return (material points' result, finite elements' result) of the demo's scene."""
     o = demo.arguments(arguments.split())
     simulation, bottom = demo.scene(o)
@@ -45,10 +45,6 @@ def test_the_tip_is_as_exact_in_half_the_steps_if_their_error_chooses_them():
     probe = mpm.probes(simulation.bodies, [[1.0, bottom + 0.15]])
     result = simulation.run(o.t_end, **demo.output_times(o), probes=probe)
     assert off(result)[3:].max() < 1e-3 and result.steps <= 30, (off(result), result.steps)
-
-
-def test_the_tip_follows_finite_elements_of_the_same_steps(beam):
-    assert error(*beam)[np.array(beam[0].t[1:]) > 0.0599].max() < 0.0025
 
 
 def test_the_pressure_extremes_follow_the_finite_elements(beam):
