@@ -183,7 +183,10 @@ def test_a_run_with_steps_by_their_error_resumes_with_the_same_bits(tmp_path):
     whole = scene()
     end = whole.run(0.3, rtol=5e-3, t_eval=times, checkpoint=mpm.Checkpoint(file, every=4), progress=False)
     half = scene()
-    half.run(0.3, rtol=5e-3, t_eval=times, observe=Stop(4), checkpoint=mpm.Checkpoint(file, every=4), progress=False)
+    with pytest.raises(KeyboardInterrupt):
+        half.run(
+            0.3, rtol=5e-3, t_eval=times, observe=Stop(4), checkpoint=mpm.Checkpoint(file, every=4), progress=False
+        )
     resumed = scene()
     again = resumed.run(0.3, rtol=5e-3, t_eval=times, after=mpm.resume(resumed, file), progress=False)
     assert np.array_equal(resumed.points.corners, whole.points.corners)

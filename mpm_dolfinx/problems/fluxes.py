@@ -212,10 +212,9 @@ class FluxForms:
     def set_conduction(self, filled: NDArray[np.int64], flow: Conduction) -> NDArray[np.float64]:
         """Set the coefficients for how the filled owned cells conduct; return their mobilities (n, d) by axis."""
         d = self.grid.dim
-        mobility = flow.along(d)
-        for f, rows in ((self.mobility, mobility), (self.moved, flow.moved if self.gravity else None)):
-            if rows is not None:
-                f.x.array[:] = 0.0
-                f.x.array.reshape(-1, d)[filled] = rows
-                f.x.scatter_forward()
+        mobility, moved = flow.along(d), 0.0 if flow.moved is None else flow.moved
+        for f, rows in [(self.mobility, mobility), (self.moved, moved)][: 2 if self.gravity else 1]:
+            f.x.array[:] = 0.0
+            f.x.array.reshape(-1, d)[filled] = rows
+            f.x.scatter_forward()
         return mobility
