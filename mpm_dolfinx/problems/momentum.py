@@ -98,6 +98,8 @@ class MomentumForms:
         """Whether terms of the user's depend on the velocity."""
         self.linear = not mean_dilatation and not self.holding and all(law.linear for law, _ in laws)
         """Whether the tangent changes with the places of the points only."""
+        self.elastic = not any(law.state for law, _ in laws)
+        """Whether no law has a history: where soil yields, the tangent of one substep leads the next astray."""
         self.weight = None
         if gravity is not None:
             v = ufl.TestFunction(V)
