@@ -10,6 +10,9 @@ kept from there:
   ones, whose free nodes follow at next to no work.  Faces between alike cells would resist kinks of the body itself.
 * Its scale is the shear modulus.  With lambda + 2G nearly empty cells of nearly incompressible bodies would have to
   stretch as the cell beside them does, whatever their own volume asks for.
+
+Bodies that are integrated at their points have cells with too few points for their nodes anywhere: there all faces of
+cells that are not full carry a fifth of the penalty.
 """
 
 from __future__ import annotations
@@ -27,6 +30,8 @@ GHOST = 0.05
 """Strength gamma of the ghost penalty."""
 RATIO = 0.3
 """A cell filled less than this share of a neighbour is nearly empty: faces between the two carry the penalty."""
+SPARSE, FULL = 0.2, 0.9
+"""Strength where bodies are integrated at their points, and filling below which cells carry it."""
 
 
 class GhostPenalty:
@@ -38,6 +43,8 @@ class GhostPenalty:
         Background grid.
     V
         Space of the displacement.
+    at_points
+        Whether bodies are integrated at their points.
 
     Attributes
     ----------
@@ -47,8 +54,8 @@ class GhostPenalty:
         Filled share of each cell, and of the fullest of its neighbours.
     """
 
-    def __init__(self, grid: Grid, V: fem.FunctionSpace):
-        self.grid, cellwise = grid, grid.cellwise()
+    def __init__(self, grid: Grid, V: fem.FunctionSpace, at_points: bool):
+        self.grid, self._at_points, cellwise = grid, at_points, grid.cellwise()
         self.modulus, self.fill, self.beside = (fem.Function(cellwise) for _ in range(3))
         v, du, n = ufl.TestFunction(V), ufl.TrialFunction(V), ufl.FacetNormal(grid.mesh)("+")
         h = fem.Constant(grid.mesh, grid.h)
@@ -67,6 +74,8 @@ class GhostPenalty:
         full, little = ufl.max_value(*fills), ufl.min_value(*fills)
         fullest = ufl.conditional(ufl.lt(*fills), *beside)  # beside the emptier one
         strength = ufl.max_value(0.0, 1 - little / (RATIO * full)) * (full / fullest) ** 2
+        if self._at_points:
+            strength = SPARSE
         return strength * 2 * moduli[0] * moduli[1] / (moduli[0] + moduli[1])
 
     def set_contents(self, volume: NDArray[np.float64], stiffness: NDArray[np.float64]) -> None:
@@ -84,4 +93,4 @@ class GhostPenalty:
     def facets(self, facets: NDArray[np.int32]) -> NDArray[np.int32]:
         """Return those of the inner faces that carry the penalty."""
         fill = self.fill.x.array[self.grid.facet_cells[facets]]
-        return facets[fill.min(axis=1) < RATIO * fill.max(axis=1)]
+        return facets[fill.min(axis=1) < (FULL if self._at_points else RATIO * fill.max(axis=1))]

@@ -58,6 +58,8 @@ class MomentumForms:
         Whether the laws see one volume change per cell, see `MeanDilatation`.
     symmetric
         Whether the tangents of all laws are symmetric.
+    at_points
+        Whether bodies are integrated at their points.
     terms
         The user's, see `user_functions`.
     t, dt : s
@@ -73,6 +75,7 @@ class MomentumForms:
         fluid_density: float | None,
         mean_dilatation: bool,
         symmetric: bool,
+        at_points: bool,
         terms: Sequence[Callable],
         t: fem.Constant,
         dt: fem.Constant,
@@ -108,7 +111,7 @@ class MomentumForms:
             if fluid_density is not None:
                 taken_up = fem.Constant(grid.mesh, fluid_density) * (ufl.det(pieces.increment(self.u)) - 1)
                 self._residuals_of_all.append(PointForm(-taken_up * pull * pieces.dx, pieces))
-        self.sides, self.ghost = SideForms(grid, V), GhostPenalty(grid, V)
+        self.sides, self.ghost = SideForms(grid, V), GhostPenalty(grid, V, at_points)
 
     def _add_law(self, law: type[Skeleton], points: FormPoints, pressure: fem.Function | None, symmetric: bool) -> None:
         """Compile residual and tangent of the pieces that follow a law."""
