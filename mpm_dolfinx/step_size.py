@@ -21,6 +21,8 @@ RINGS = 5e-3
 
 The stability function is never below -0.21: what goes unseen overshoots by a thousandth.
 """
+SMALLEST = 1e-6
+"""Pressures that count, in proportion to the stress: where water flows freely the rest is rounding."""
 MOST = 1e9
 """Output intervals of a run: with more, a step is lost in the rounding of the time."""
 FIRST = 1e-3
@@ -92,7 +94,7 @@ class StepSize:
 
 def measured(result: Result, report: Report) -> Result:
     """Return the histories with the largest change of the pressures so far, that of a step that was solved included."""
-    change = max(result.change, report.change)
+    change = max(result.change, report.change, SMALLEST * report.stress)
     if result.rows and result.rows[0][2] is not None and report.extremes is not None:
         start = result.rows[0][2]
         change = max(change, *(abs(now - then) for now, then in zip(report.extremes, start, strict=True)))

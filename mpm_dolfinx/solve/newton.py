@@ -115,6 +115,8 @@ def solve_substep(
     report.easy = report.easy and 3 * count <= getattr(solvers.scheme, f"most_{most}")
     if storage is None:
         return None
+    grid, nodes = momentum.forms.grid, momentum.system.unknowns.global_size
+    report.stress = errors.forces / (grid.cell_volume / grid.h.max() * np.sqrt(max(1, nodes)))
     report.balance = _relative(abs(storage.balance(errors.fluid)), errors.exchanged, errors.fluid.round_off)
     return errors.fluid.rates
 
