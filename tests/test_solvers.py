@@ -49,9 +49,8 @@ def test_a_linear_solver_that_breaks_off_fails_the_step():
     ksp = PETSc.KSP().create(K.comm)
     ksp.setType(PETSc.KSP.Type.CG)
     ksp.setOperators(K)
-    ksp.setTolerances(rtol=1e-12, max_it=1)
     b, x = K.createVecs()
-    b.set(1.0)
+    b.set(np.nan)
     ksp.solve(b, x)
-    with pytest.raises(mpm.NotConverged, match=r"linear solver of the storage broke off .* reason -3"):
+    with pytest.raises(mpm.NotConverged, match=r"linear solver of the storage broke off .* reason -9"):
         solved(ksp, "storage")

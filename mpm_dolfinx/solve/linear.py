@@ -26,7 +26,7 @@ ITERATIVE = 1500
 Seconds of five load steps of a square beam by factors and by iterations: 0.5 and 0.5 with 1200 unknowns, 2.5 and 1.4
 with 2600, 8.2 and 2.1 with 4900.  In a plate of one cell both cost the same up to 6000.
 """
-INDEFINITE = (-8, -10)  # PETSc's names for them differ between releases
+TOLERABLE = (-3, -8, -10)  # PETSc's reasons: too many iterations; indefinite preconditioner, matrix
 REDUNDANT = 4
 """Processes up to which each has the factors that are used often."""
 
@@ -76,10 +76,10 @@ def _preonly(A: PETSc.Mat, name: str) -> PETSc.KSP:
 def solved(ksp: PETSc.KSP, name: str) -> int:
     """Return the iterations of a solver's last solve; NotConverged where it broke off.
 
-    What an indefinite tangent gives is left to the line search.
+    What the most iterations, or an indefinite tangent, give is left to the line search.
     """
     count, reason = ksp.getIterationNumber(), ksp.getConvergedReason()
-    if reason < 0 and reason not in INDEFINITE:
+    if reason < 0 and reason not in TOLERABLE:
         raise NotConverged(
             f"the linear solver of the {name} broke off after {count} iterations (PETSc reason {reason})"
         )
