@@ -66,16 +66,16 @@ def conductivity():
 
 @family(0.02)
 def time_step():
-    """Terzaghi's layer, dt = 1e-9 ... 1e9 s: mean error of the pressures, settlement, backward Euler exact in space."""
+    """Terzaghi's layer, dt = 1e-9 ... 1e9 s: mean error of the pressures, settlement, exact."""
     water = {"fluid": INCOMPRESSIBLE, "drained": [mpm.Drained("top")], "load": 1e-5 * M}
     for dt in decades(-9, 9):
-        yield f"dt = {dt:.0e} s", column(partial(terzaghi, 0.05, dt), (SOIL, 1.0), end=10 * dt, steps=10, **water)
+        yield f"dt = {dt:.0e} s", column(partial(terzaghi, 0.05), (SOIL, 1.0), end=10 * dt, steps=10, **water)
 
 
-def terzaghi(h: float, dt: float, s: mpm.Simulation, r: mpm.Result) -> float:
+def terzaghi(h: float, s: mpm.Simulation, r: mpm.Result) -> float:
     """Return the error relative to the load, 1e-5 M: a sum of modes, averaged over the cells."""
     m = (np.arange(20000) + 0.5) * np.pi
-    left = (1 + m**2 * dt * SOIL.conductivity / INCOMPRESSIBLE.unit_weight * M) ** -float(r.steps)
+    left = np.exp(-(m**2) * s.t * SOIL.conductivity / INCOMPRESSIBLE.unit_weight * M)
     middle = (np.floor(s.points.x[:, 1:] / h) + 0.5) * h
     p = (2 / m * left * np.sin(m * (1 - middle)) * np.sinc(m * h / (2 * np.pi))).sum(axis=1)
     return max(
@@ -300,10 +300,11 @@ def suction():
 
 @family(0.02)
 def buckling():
-    """Slender cantilever under 0.5 ... 3 times its buckling load: tip, finite elements in 40 steps."""
+    """Slender cantilever under 0.5 ... 2 times its buckling load: tip, finite elements in 40 steps."""
+    # under more it curls back behind its clamp, where the grid ends
     critical = np.pi**2 * M * 0.1**2 / 12 / 4
     slender = Beam(load=200.0, size=(1.0, 0.1), truth=(40, 4), truth_steps=40, h=(0.0125, 0.0125), ramp=1.0)
-    for ratio, n in ((0.5, 40), (0.9, 40), (1.1, 40), (1.1, 1), (1.5, 40), (1.5, 1), (2.0, 40), (2.0, 1), (3.0, 1)):
+    for ratio, n in ((0.5, 40), (0.9, 40), (1.1, 40), (1.1, 1), (1.5, 40), (1.5, 1), (2.0, 40), (2.0, 1)):
         yield f"{ratio} times, {n} steps", replace(slender, thrust=ratio * critical, steps=n)
 
 
