@@ -83,6 +83,11 @@ def linear(cells: int) -> mpm.Simulation:
     return block(cells, soil(mpm.LinearElastic, conductivity=1e-4), **WATER)
 
 
+def draining(cells: int, **options) -> mpm.Simulation:
+    """Return the draining block."""
+    return block(cells, soil(conductivity=1e-4), **WATER, **options)
+
+
 class Watched(mpm.Hencky):
     """A skeleton whose pressure jumps are looked after at four times the flow."""
 
@@ -100,6 +105,7 @@ Make = Callable[[int], mpm.Simulation]
 PAIRS: dict[str, tuple[Make, Make]] = {
     "pore fluid that drains at once": (block, lambda n: block(n, soil(conductivity=1e3), **WATER)),
     "flux form": (lambda n: block(n, **SEALED), lambda n: block(n, soil(conductivity=1e-30), **SEALED)),
+    "second order in time": (lambda n: draining(n, method="backward-euler"), draining),
     "body force": (block, lambda n: block(n, gravity=(0, 0))),
     "ghost penalty on all faces": (block, weighted),
     "damping of pressure jumps": (lambda n: conducting(n, mpm.Hencky), lambda n: conducting(n, Watched)),

@@ -80,7 +80,12 @@ def _solvers(s: Scene) -> list[Part]:
             "linear law: until active cells or time step change",
             "the tangent depends on the strain",
         ),
+        _either("second substep", len(s.substeps) > 1, "second order in time", _one_substep(s)),
     ]
+
+
+def _one_substep(s: Scene) -> str:
+    return "first order in time" if s.method == "backward-euler" else "nothing has a rate"
 
 
 def table(scene: Scene, state: State) -> str:
