@@ -252,8 +252,13 @@ class Simulation:
             return step(self.scene, self.state, dt)
         except StepFailed:
             raise
-        except BaseException:  # broken off anywhere
+        except BaseException as error:  # broken off anywhere
             self.scene.forget()
+            cause = error
+            while cause is not None and not isinstance(cause, KeyboardInterrupt):
+                cause = cause.__cause__ or cause.__context__
+            if cause is not None and cause is not error:  # within a solver: some PETSc make an error of their own of it
+                raise cause from None
             raise
 
     run = run
