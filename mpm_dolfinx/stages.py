@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mpm_dolfinx.parallel.messages import warn
 from mpm_dolfinx.points.bodies import Body
 from mpm_dolfinx.points.contact import check_apart
 from mpm_dolfinx.points.faces import surface
@@ -22,8 +22,6 @@ from mpm_dolfinx.problems.stage import CONDITIONS, Stage, stage
 from mpm_dolfinx.scene import Scene
 from mpm_dolfinx.state import State
 from mpm_dolfinx.validation import chosen, flag, line, numbers
-
-logger = logging.getLogger("mpm_dolfinx")
 
 
 def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int]) -> State:
@@ -88,10 +86,10 @@ def _warn_moved_on(scene: Scene, before: Stage, begun: Stage, kept: Sequence[str
         bare = sum_by(now.id, now.area0, stop[-1]) - sum_by(was.id, was.area0, stop[-1])
         here = np.repeat(before.present, [len(body) for body in scene.bodies])
         new = np.flatnonzero(here[now.id] & (bare[now.id] > 1e-9 * now.whole0))
-        if len(new) and scene.grid.comm.rank == 0:
+        if len(new):
             area = bare[np.unique(now.id[new])].sum()
             what = "stage: remove: %s was not given anew and now also acts on %.3g m^%d that were laid bare, from %s on"
-            logger.warning(what, line(condition), area, scene.grid.dim - 1, now.X[new[0]].mean(axis=0))
+            warn(scene.grid.comm, what, line(condition), area, scene.grid.dim - 1, now.X[new[0]].mean(axis=0))
 
 
 def _filled(

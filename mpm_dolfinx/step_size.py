@@ -74,22 +74,23 @@ class StepSize:
         """
         if not self.by_error:
             return 0.5 if taken > 0.75 * self.longest and report.sudden > RINGS * result.change else 1.0
-        if report.error <= self.rtol * result.change:
-            return 1.0
-        return max(SHRINKS, SAFETY * sqrt(self.rtol * result.change / report.error))
+        return 1.0 if report.error <= self.rtol * result.change else self._factor(report, result)
 
     def next(self, taken: float, report: Report, result: Result, failed: bool) -> float:
         """Return the step to try after one that was taken, s; failed: after a longer one had not converged."""
         if not self.by_error:
             return max(result.small, min(2 * taken, self.longest)) if report.easy else result.small
-        goal = self.rtol * result.change
-        factor = SAFETY * sqrt(goal / report.error) if report.error > 0 else GROWS
-        factor = min(GROWS, max(SHRINKS, factor))
+        factor = self._factor(report, result)
         if factor >= 1:
             # a step as long as one that has just failed would mostly fail again: in soil that yields, 78 cuts, not 1
             factor = 1.0 if factor < KEEPS or failed or not report.easy else factor
             return min(max(taken * factor, result.small), self.longest)  # it may have been short for an output's sake
         return taken * factor
+
+    def _factor(self, report: Report, result: Result) -> float:
+        """Return the step whose error would be as large as it may be, in proportion to one that was solved."""
+        factor = SAFETY * sqrt(self.rtol * result.change / report.error) if report.error > 0 else GROWS
+        return min(GROWS, max(SHRINKS, factor))
 
 
 def measured(result: Result, report: Report) -> Result:

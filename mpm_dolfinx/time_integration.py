@@ -7,9 +7,10 @@ The momentum has no rate.  The content zeta of a cell has: zeta' + Q(u, p) = 0. 
     sdirk2           zeta(u1, p1) - zeta_n + gamma dt Q(u1, p1) = 0                               loads at t + gamma dt,
                      zeta(u2, p2) - zeta_n + gamma dt Q(u2, p2) + (1 - gamma) dt Q(u1, p1) = 0    loads at t + dt,
 
-with gamma = 1 - 1 / sqrt(2): Alexander's method (1977), of second order and L-stable, so that jumps of the loads do
-not ring; it needs no rate at the start, which the remap has made noisy.  (u2, p2) is the end of the step.  The rates
-of the two substeps tell the error of the step: see `error_of`.
+with gamma = 1 - 1 / sqrt(2): Alexander's method (1977), of second order and L-stable; it needs no rate at the start,
+which the remap has made noisy.  (u2, p2) is the end of the step.  After a jump of the loads one long step overshoots
+by a fifth, two halves of it do not: see `step_size`.  The rates of the two substeps tell the error of the step: see
+`solve.newton.note_pressures`.
 """
 
 from __future__ import annotations

@@ -3,15 +3,12 @@
 
 from __future__ import annotations
 
-import logging
 import time
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from math import inf
 from typing import Any, Protocol
-
-from mpi4py import MPI
 
 import numpy as np
 from dolfinx.common import Timer
@@ -21,6 +18,7 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 from mpm_dolfinx import _compat
 from mpm_dolfinx.errors import GaveUp, LeftGrid, StepFailed
 from mpm_dolfinx.io.summary import imbalance, peak_memory
+from mpm_dolfinx.parallel.messages import log
 from mpm_dolfinx.points.probes import Probes
 from mpm_dolfinx.result import Report, Result
 from mpm_dolfinx.scene import Scene
@@ -41,7 +39,6 @@ PARTS = (
     "output",
 )
 """Parts of a run that are timed, as `mpm: ...` in dolfinx's own list of timings."""
-logger = logging.getLogger("mpm_dolfinx")
 
 Observer = Callable[[Any], None]
 """Called with the simulation."""
@@ -55,12 +52,6 @@ class Simulated(Protocol):
 
     def advanced(self, dt: float) -> tuple[State, Report]:
         """Return the state after a step of dt, s, and what it took."""
-
-
-def log(comm: MPI.Intracomm, message: str, *values) -> None:
-    """Log a message of the package, once for all processes."""
-    if comm.rank == 0:
-        logger.info(message, *values)
 
 
 def run(

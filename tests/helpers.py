@@ -18,6 +18,11 @@ from mpm_dolfinx.time_integration import METHODS
 SOFT = mpm.Hencky(bulk=1e7 / 3, shear=5e6, porosity=0.4, conductivity=1e-4)
 
 
+def rates(errors):
+    """Return the orders between errors at sizes that are halved each time."""
+    return np.log2(np.array(errors[:-1]) / np.array(errors[1:]))
+
+
 def beam(*, fluid=True, ramp=0.06, load=54e3, offset=0.5, h=0.03, material=SOFT, box=1.2, **options):
     """Return (simulation, probe at the tip) of the paper's beam on a coarse grid."""
     grid = mpm.Grid([1.2, box], [round(1.2 / h), round(box / h)])

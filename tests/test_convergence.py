@@ -7,12 +7,7 @@ import numpy as np
 import pytest
 import self_weight_column
 import terzaghi
-
-
-def rates(errors):
-    """Return the orders between errors at sizes that are halved each time."""
-    return np.log2(np.array(errors[:-1]) / np.array(errors[1:]))
-
+from helpers import rates
 
 # ---- Terzaghi: in space, against the exact solution of what backward Euler leaves of the equation ----
 

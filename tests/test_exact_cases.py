@@ -7,14 +7,9 @@ import cantilever
 import mandel
 import numpy as np
 import pytest
+from helpers import rates
 
 from mpm_dolfinx.verification.biot_fem import BiotFEM
-
-
-def rates(errors):
-    """Return the orders between errors at sizes that are halved each time."""
-    return np.log2(np.array(errors[:-1]) / np.array(errors[1:]))
-
 
 # ---- Mandel: in space, against the exact solution of what backward Euler leaves of the equation ----
 

@@ -6,17 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import ufl
-from helpers import SOFT, beam, column
+from helpers import SOFT, beam, column, rates
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.verification.exact import terzaghi_consolidation
 
 DRAINED = {"drained": [mpm.Drained("top")]}
-
-
-def rates(errors):
-    """Return the orders between errors at steps that are halved each time."""
-    return np.log2(np.array(errors[:-1]) / np.array(errors[1:]))
 
 
 def loaded(load, **options):

@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.io.writer import WRITABLE, replacing
 from mpm_dolfinx.parallel.exchange import at_root
+from mpm_dolfinx.parallel.messages import log
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.points.pressure_transport import PiecePressures
 from mpm_dolfinx.result import Result
 from mpm_dolfinx.simulation import Simulation
 from mpm_dolfinx.state import State, Stay
-from mpm_dolfinx.timeloop import log
 from mpm_dolfinx.validation import instance, line, numbers, on_disk, path, whole
 
 FORMAT, VERSION = "mpm_dolfinx checkpoint", 3

@@ -13,6 +13,7 @@ from mpi4py import MPI
 import numpy as np
 
 from mpm_dolfinx.constitutive.skeleton import LOCKING
+from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.scene import Scene
 from mpm_dolfinx.state import State
 
@@ -104,9 +105,7 @@ def imbalance(scene: Scene, state: State) -> dict[str, float]:
     pieces = on_grid.data.pieces if on_grid else None
     mine = [len(state.points), len(pieces.cells), len(pieces.places.filled)] if pieces else [len(state.points), 0, 0]
     mine = np.array(mine, dtype=float)
-    total, most = np.empty_like(mine), np.empty_like(mine)
-    comm.Allreduce(mine, total)
-    comm.Allreduce(mine, most, MPI.MAX)
+    total, most = over_all(comm, mine), over_all(comm, mine, MPI.MAX)
     ratio = np.divide(most * comm.size, total, out=np.ones_like(mine), where=total > 0)
     return dict(zip(("points", "pieces", "active cells"), ratio.tolist(), strict=True))
 

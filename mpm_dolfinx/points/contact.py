@@ -6,7 +6,6 @@ Faces are quadrilaterals in space; in plane strain they are a unit of length wid
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -15,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from mpm_dolfinx.parallel.messages import warn
 from mpm_dolfinx.points.bodies import Body
 from mpm_dolfinx.points.cutting import corner_bits, cut_at, kuhn_simplices
 from mpm_dolfinx.points.grid import Grid, rounding, sum_by
@@ -23,7 +23,6 @@ TOUCH = 1e-6  # of the shortest edge: faces nearer than this touch
 SAME = 1e-11  # of an edge: ends nearer than this are one
 TINY = 1e-300  # in place of the length of an edge that a map has shrunk to nothing
 BITS = corner_bits(2)
-logger = logging.getLogger("mpm_dolfinx")
 
 
 @dataclass
@@ -401,6 +400,6 @@ def check_apart(grid: Grid, bodies: Sequence[Body], present: Sequence[bool]) -> 
 
 def warn_near(grid: Grid, names: str, gap: float, x: NDArray[np.float64]) -> None:
     """Log a warning for bodies that do not touch but are less than a cell apart: they share nodes, and so stick."""
-    if 0 < gap < 1 and grid.comm.rank == 0:
+    if 0 < gap < 1:
         where = "%s: %.2g cells apart at %s, and yet they stick, as they share nodes of the grid"
-        logger.warning(where + "; seed them in contact, or take cells smaller than the gap", names, gap, x)
+        warn(grid.comm, where + "; seed them in contact, or take cells smaller than the gap", names, gap, x)

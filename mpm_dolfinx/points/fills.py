@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array, diags
 
 from mpm_dolfinx.parallel.exchange import over_all
+from mpm_dolfinx.parallel.messages import warn
 from mpm_dolfinx.points.bodies import Body
 from mpm_dolfinx.points.contact import Cover, Faces, covered, covers, local, meeting, warn_near, weights
 from mpm_dolfinx.points.cutting import TANGLED, corner_bits, volumes
@@ -23,7 +23,6 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 
 MISFIT = 0.01  # cells: fills whose straight edges are further off a bent surface are named in a warning
 INSIDE = 0.05  # of a domain's shortest edge: what lies deeper in a fill is in its way
-logger = logging.getLogger("mpm_dolfinx")
 
 
 @dataclass
@@ -98,9 +97,9 @@ def put(
         misfit = max(contact.misfit(u) for contact in contacts)
         _check_shape(grid, fill, body, corners, u)
         corners = corners + u
-    if misfit > MISFIT * grid.h.min() and grid.comm.rank == 0:
+    if misfit > MISFIT * grid.h.min():
         what = "stage: add: body %d: its straight edges are up to %.2g m off the surface that it is put on"
-        logger.warning(what + "; seed it with the spacing of what it lies on", fill, misfit)
+        warn(grid.comm, what + "; seed it with the spacing of what it lies on", fill, misfit)
     for other, touching in found.items():
         depth, gap, x = _room(grid, bodies, other, corners, points, misfit)
         if depth:

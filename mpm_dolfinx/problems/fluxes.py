@@ -115,7 +115,7 @@ class CellContents:
         self.filled, self._slot = filled, np.zeros(grid.num_local, dtype=np.int64)
         self._slot[filled] = np.arange(len(filled))
         self._cells, self._weight = cells, weight = pieces.cells, pieces.weight
-        volume = self.total(cells, weight)
+        self._volume = volume = self.total(cells, weight)
         self.fill = np.minimum(volume / grid.cell_volume, 1.0)
         """Filled share of the filled cells."""
         self.volume = volume.sum()
@@ -123,13 +123,13 @@ class CellContents:
         shapes = (forms.centroid, forms.lower_face, forms.upper_face)
         for f in (forms.damping, forms.fixed_stress, *shapes):
             f.x.array[:] = 0.0
-        values = {forms.damping: self.total(cells, weight * pieces.damping) / volume}
+        values = {forms.damping: self.mean(pieces.damping)}
         values[forms.fixed_stress] = self.total(cells, weight * pieces.fixed_stress)
         for f, rows in values.items():
             f.x.array[filled] = rows
         centroid, lower, upper = (f.x.array.reshape(-1, grid.dim) for f in shapes)
         for a in range(grid.dim):
-            centroid[filled, a] = self.total(cells, weight * pieces.x[:, a]) / volume - grid.midpoints[filled, a]
+            centroid[filled, a] = self.mean(pieces.x[:, a]) - grid.midpoints[filled, a]
             for target, end in ((lower, 0), (upper, 1)):
                 target[filled, a] = self.total(cells, pieces.faces[:, a, end]) * grid.h[a] / grid.cell_volume
         for f in (*values, *shapes):
@@ -147,7 +147,7 @@ class CellContents:
 
     def mean(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the means over the pieces (m,) of each filled cell."""
-        return self.total(self._cells, self._weight * values) / self.total(self._cells, self._weight)
+        return self.total(self._cells, self._weight * values) / self._volume
 
     def motion(self, u: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return F (n, d, d) and displacement (n, d), m, at the centroids of the filled cells, of nodal u."""

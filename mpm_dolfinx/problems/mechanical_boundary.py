@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from itertools import chain, combinations
 
@@ -18,6 +17,7 @@ from mpm_dolfinx.caching import Latest
 from mpm_dolfinx.constitutive.fields import SceneMaterials
 from mpm_dolfinx.forms.point_forms import Places, PointData
 from mpm_dolfinx.parallel.exchange import Exchange, first
+from mpm_dolfinx.parallel.messages import warn
 from mpm_dolfinx.points.cut_domains import CutDomains, Patches
 from mpm_dolfinx.points.faces import Surface, face_vectors
 from mpm_dolfinx.points.grid import sum_by
@@ -27,8 +27,6 @@ from mpm_dolfinx.problems.held_cells import SAME, HeldCells, HeldPoints
 from mpm_dolfinx.problems.side_forms import SideData, SideForms
 from mpm_dolfinx.problems.sides import Sides, check_apart, gathered, meeting
 from mpm_dolfinx.validation import line
-
-logger = logging.getLogger("mpm_dolfinx")
 
 
 class MechanicalBoundary:
@@ -195,9 +193,9 @@ class MechanicalBoundary:
         found = [(ratio.max(), int(held.number[k]), held.x[k].tolist()) for k in worst]
         for _, number, x in list(chain(*self.grid.comm.allgather(found)))[:1]:
             self._warned.add(number)
-            if self.grid.comm.rank == 0:
-                why = "its reaction is an artefact; does something else hold it, or is the step too large?"
-                logger.warning("%s: not where it is to be at %s: %s", line(self.holds[number][0]), np.array(x), why)
+            why = "its reaction is an artefact; does something else hold it, or is the step too large?"
+            what = "%s: not where it is to be at %s: %s"
+            warn(self.grid.comm, what, line(self.holds[number][0]), np.array(x), why)
 
     def under_held(
         self, ids: NDArray[np.int64], tracked: NDArray[np.float64], volume: NDArray[np.float64], corners: NDArray

@@ -121,10 +121,10 @@ class OnGrid(Keyed):
 
         Means are by what is stored, or by volume in a cell that stores nothing.
         """
-        contents, cells, weight, p_n = self.contents, self.cut.cells, self.weight, self._storage.p_n.x
-        pressure, store = self.cut.pieces_to_cells(at_pieces), weight * self.data.pieces["storage"][:, 0]
+        contents, cells, p_n = self.contents, self.cut.cells, self._storage.p_n.x
+        pressure, store = self.cut.pieces_to_cells(at_pieces), self.weight * self.data.pieces["storage"][:, 0]
         held = contents.total(cells, store)
-        mean = contents.total(cells, weight * pressure) / contents.total(cells, weight)
+        mean = contents.mean(pressure)
         np.divide(contents.total(cells, store * pressure), held, out=mean, where=held > 0)
         p_n.array[contents.filled] = mean
         p_n.scatter_forward()
@@ -258,23 +258,24 @@ class Assembled:
         data
             The pieces.
         """
-        on_grid, contents, u = self._on_grid, self._on_grid.contents, self._u
+        on_grid, contents, grid, u = self._on_grid, self._on_grid.contents, self._on_grid.cut.grid, self._u
         at = on_grid.cut.points if weight is None else state.points  # gravity may change with time
         sides = partial(self._stage.hydraulic.data, on_grid.cut, at, contents)
 
-        def set_fluxes(at_sides: OpenSides, kappa: NDArray[np.float64], moves: bool) -> Outflow:
-            motion = contents.motion(u.x.array.reshape(-1, len(on_grid.cut.grid.h))) if moves else (None, None)
+        def mobility(begins: bool) -> NDArray[np.float64]:
+            if self._varies:
+                return on_grid.mobility(data, begins)
+            return self._mobility((), lambda: on_grid.mobility(data, True))
+
+        def set_fluxes(at_sides: OpenSides, kappa: NDArray[np.float64], *motion: NDArray | None) -> Outflow:
             return self.storage.set_fluxes(contents, at_sides, Conduction(kappa, *motion, weight))
 
-        if self._varies:
-            placed = sides()
-            return lambda begins: set_fluxes(placed, on_grid.mobility(data, begins), moves=True)
-        kappa = self._mobility((), lambda: on_grid.mobility(data, True))
-        if not state.stay:
-            placed = sides()
-            return lambda begins: set_fluxes(placed, kappa, moves=True)
-        outflow = self._outflow((at, weight), lambda: set_fluxes(sides(), kappa, moves=False), on_grid.cut.grid.comm)
-        return lambda begins: outflow
+        if state.stay and not self._varies:
+            stays = (None, None)
+            outflow = self._outflow((at, weight), lambda: set_fluxes(sides(), mobility(True), *stays), grid.comm)
+            return lambda begins: outflow
+        placed = sides()
+        return lambda begins: set_fluxes(placed, mobility(begins), *contents.motion(u.x.array.reshape(-1, grid.dim)))
 
 
 def assembled(

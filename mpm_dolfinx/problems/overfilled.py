@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 
 from mpi4py import MPI
@@ -11,13 +10,13 @@ from mpi4py import MPI
 import numpy as np
 
 from mpm_dolfinx.parallel.exchange import over_all
+from mpm_dolfinx.parallel.messages import warn
 from mpm_dolfinx.points.bodies import Body
 from mpm_dolfinx.points.cut_domains import CutDomains
 from mpm_dolfinx.points.grid import sum_by
 
 FULL = 1.2
 """Of a cell: domains that have not folded stay below 1.08 where soil is pushed aside by half a footing's width."""
-logger = logging.getLogger("mpm_dolfinx")
 
 
 def warn_overfilled(cut: CutDomains, bodies: Sequence[Body]) -> bool:
@@ -33,7 +32,6 @@ def warn_overfilled(cut: CutDomains, bodies: Sequence[Body]) -> bool:
     own = np.searchsorted(np.cumsum([len(body) for body in bodies]), ids, side="right")
     found = sorted({int(i) for rows in grid.comm.allgather(own) for i in rows})
     x = grid.lower + (np.array(np.unravel_index(number, grid.shape)) + 0.5) * grid.h
-    if grid.comm.rank == 0:
-        who = f"bodies {', '.join(map(str, found))}" if len(found) > 1 else f"domains of body {found[0]}"
-        logger.warning("the cell at %s is filled to %.0f %%, more than it holds: %s overlap", x, 100 * most, who)
+    who = f"bodies {', '.join(map(str, found))}" if len(found) > 1 else f"domains of body {found[0]}"
+    warn(grid.comm, "the cell at %s is filled to %.0f %%, more than it holds: %s overlap", x, 100 * most, who)
     return True

@@ -3,11 +3,11 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from mpm_dolfinx.parallel.messages import warn
 from mpm_dolfinx.points.bodies import Body
 from mpm_dolfinx.points.contact import Faces, covered, covers
 from mpm_dolfinx.points.grid import SIDES, Grid
@@ -15,7 +15,6 @@ from mpm_dolfinx.points.grid import SIDES, Grid
 COARSE = 0.7  # of a cell: domains above this lack more stiffness than Q1 cells have too much
 FEW = 3  # points over the thickness, up to which an eighth or more of the bending stiffness is lost
 SLENDER = 4  # length over thickness from which a body bends
-logger = logging.getLogger("mpm_dolfinx")
 
 
 def warn_thin(grid: Grid, bodies: Sequence[Body], fixed: Mapping[str, str]) -> None:
@@ -30,11 +29,8 @@ def warn_thin(grid: Grid, bodies: Sequence[Body], fixed: Mapping[str, str]) -> N
             n = len(body) / max(1, int(body.sides[:, axis, 0].sum()))
             if body.spacing[axis] > COARSE * grid.h[axis] and n <= FEW and _bends(grid, bodies, i, axis, fixed):
                 much = f"it bends {1 / (n**2 - 1):.0%} too much" if n > 1 else "it carries no moment and creeps"
-                if grid.comm.rank == 0:
-                    logger.warning(
-                        "body %d: %.3g point%s over its thickness along %s, in cells of %.3g m: %s; take per_cell >= 2",
-                        *(i, n, "s" if n > 1 else "", letter, grid.h[axis], much),
-                    )
+                what = "body %d: %.3g point%s over its thickness along %s, in cells of %.3g m: %s; take per_cell >= 2"
+                warn(grid.comm, what, i, n, "s" if n > 1 else "", letter, grid.h[axis], much)
 
 
 def _bends(grid: Grid, bodies: Sequence[Body], i: int, axis: int, fixed: Mapping[str, str]) -> bool:

@@ -103,9 +103,8 @@ def solve_substep(
     """
     newton = Newton(solvers, momentum, storage)
     in_turn = solvers.scheme.richardson and storage is not None
-    errors = (
-        newton.alternate() if in_turn else newton.newton(as_reset, key, report.newton > 0 and momentum.forms.elastic)
-    )
+    serves = report.newton > 0 and momentum.forms.elastic
+    errors = newton.alternate() if in_turn else newton.newton(as_reset, key, serves)
     took = newton.report
     if took.newton and storage is None and momentum.forms.symmetric and not solvers.iterative:
         newton.check_stable()
