@@ -25,6 +25,8 @@ SMALLEST = 1e-6
 """Pressures that count, in proportion to the stress: where water flows freely the rest is rounding."""
 MOST = 1e9
 """Output intervals of a run: with more, a step is lost in the rounding of the time."""
+RESOLVED = 10
+"""Errors that can be told from what the solver leaves, in proportion to its tolerance."""
 FIRST = 1e-3
 """Share of the first output interval that a step by error is first tried with."""
 
@@ -169,7 +171,8 @@ def step_rule(times: Times, rtol, first_step, max_step: float, scene: Scene) -> 
             if value is not None:
                 raise ValueError(f"{name} = {line(value)}: needs rtol, for steps that are chosen by their error")
         return StepSize(times.interval, times.interval)
-    numbers("rtol", rtol, test=lambda v: (0 < v) & (v < 1), allowed="in (0, 1)")
+    least = RESOLVED * scene.scheme.tolerance
+    numbers("rtol", rtol, test=lambda v: (least <= v) & (v < 1), allowed=f"in [{least:g}, 1): the solver's tolerance")
     if scene.method == "backward-euler":
         raise ValueError(f"rtol = {line(rtol)}: backward-euler knows no error of a step, must be sdirk2")
     longest = float(numbers("max_step", max_step, **positive)) if max_step != inf else inf

@@ -82,7 +82,8 @@ def run(
         interval only; without it and `t_eval` every step is an output.
     rtol
         Choose the steps by their error: that of the pore pressures stays below about rtol of their largest change
-        since the run began; in (0, 1).  Where nothing flows the steps are as long as the output intervals.
+        since the run began; at least ten times `tolerance`, and < 1.  Where nothing flows the steps are as long as the
+        output intervals.
     t_eval : (m,), s
         Output times, increasing, in (t, t_end]; t_end is one of them in any case.  Steps end at output times.
     first_step, max_step

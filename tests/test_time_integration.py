@@ -191,7 +191,8 @@ def test_a_run_with_steps_by_their_error_resumes_with_the_same_bits(tmp_path):
 
 BAD = {
     "no step": ({}, r"dt = None: must be given, or rtol"),
-    "rtol too large": ({"rtol": 1.0}, r"rtol = 1\.0, must be in \(0, 1\)"),
+    "rtol too large": ({"rtol": 1.0}, r"rtol = 1\.0, must be in \[1e-07, 1\)"),
+    "rtol below the solver's": ({"rtol": 1e-9}, r"rtol = 1e-09, must be in \[1e-07, 1\)"),
     "both output rules": ({"dt": 1.0, "rtol": 1e-3, "t_eval": [1.0]}, r"dt = 1\.0: .* must be left out"),
     "first step of equal steps": ({"dt": 1.0, "first_step": 0.1}, r"first_step = 0\.1: needs rtol"),
     "longest of equal steps": ({"dt": 1.0, "max_step": 0.1}, r"max_step = 0\.1: needs rtol"),
