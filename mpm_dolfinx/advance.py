@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""The end of a step: points move with the grid, their F follows, and pressures travel along."""
+"""The end of a step: domains move with the grid, F is what their corners tell, and pressures travel along."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from dolfinx.common import Timer
@@ -17,7 +18,9 @@ from mpm_dolfinx.parallel.exchange import first, over_all
 from mpm_dolfinx.points.bodies import Body
 from mpm_dolfinx.points.cut_domains import CutDomains
 from mpm_dolfinx.points.cutting import parallelepipeds, tangled
-from mpm_dolfinx.points.grid import REACH
+from mpm_dolfinx.points.domain_gradient import gradient
+from mpm_dolfinx.points.grid import REACH, Grid
+from mpm_dolfinx.points.lattice import filtered, filtered_ratios, given
 from mpm_dolfinx.points.material_points import MaterialPoints, determinant
 from mpm_dolfinx.points.pressure_transport import PiecePressures, Reconstruction
 from mpm_dolfinx.problems.mechanical_boundary import MechanicalBoundary
@@ -73,17 +76,23 @@ class Motion:
             A point has left the grid.
         """
         with Timer("mpm: move points"):
-            cut, pieces, points = on_grid.cut, on_grid.data.pieces, state.points
+            cut, pieces = on_grid.cut, on_grid.data.pieces
             grid, d = cut.grid, cut.grid.dim
             nodal = self._momentum.u.x.array.reshape(-1, d)
             N, dN = grid.shape_functions(pieces.cells, pieces.x)
             at_nodes = nodal[grid.cell_nodes[pieces.cells]].transpose(0, 2, 1)
-            points = self._deformed(points, cut, np.eye(d) + at_nodes @ dN, pieces.cells)
-            points = self._moved(points, cut, cut.displacement(nodal))
-            ids, pressure, x, start, folded = None, None, None, None, 0
-            serves = cut.serves(points)
-            if cut.domains and not serves:  # where they serve, none has folded
-                points, folded = self._untangled(points, cut, state.stage.mechanical)
+            deformed = partial(self._deformed, state.points, cut, np.eye(d) + at_nodes @ dN, pieces.cells)
+            moved = cut.displacement(nodal)
+            if cut.domains:
+                bend = cut.bend(nodal, self._momentum.active_nodes(on_grid.cells))
+                points, serves, folded = self._shaped(state, cut, moved, bend, deformed)
+            else:
+                x, F = state.points.x + moved, deformed()
+                points = replace(state.points, x=x, F=F, corners=parallelepipeds(x, F, self._sizes(state.points)))
+                serves, folded = cut.serves(points), 0
+            self._check_volumes(points, cut)
+            points = replace(points, data=self._materials.updated_state(points))
+            ids, pressure, x, start = None, None, None, None
             if self._storage is not None:
                 pressure = cut.to_pieces(self._storage.p.x.array[pieces.cells])
                 x = (state.stay.x if state.stay else cut.pieces.x) + cut.to_pieces((at_nodes @ N[:, :, None])[:, :, 0])
@@ -93,55 +102,86 @@ class Motion:
         new = replace(state, t=t, points=points, transported=None, stay=Stay(cut.points, ids, pressure, x, start))
         return new if serves and stays else self.left_grid(new, on_grid), folded
 
-    def _deformed(self, points: MaterialPoints, cut: CutDomains, delta: NDArray, cells: NDArray) -> MaterialPoints:
-        """Return the points with F and state after a step, delta (m, d, d) the deformation of the pieces."""
+    def _deformed(
+        self, points: MaterialPoints, cut: CutDomains, delta: NDArray[np.float64], cells: NDArray[np.int32]
+    ) -> NDArray[np.float64]:
+        """Return F (n, d, d) of the points after a step, delta (m, d, d) the deformation of their pieces in cells (m,).
+
+        F_p <- (sum_k w_k Delta_k / V_p) F_p.
+        """
         n, d = len(points), cut.grid.dim
         if self._momentum.dilatation is not None:
             delta = self._momentum.dilatation.averaged(delta, cells)
-        # F_p <- (sum_k w_k Delta_k / V_p) F_p
         mean = [cut.mean(column) for column in cut.to_pieces(delta).reshape(-1, d * d).T]
-        F = np.stack(mean, axis=1).reshape(n, d, d) @ points.F
-        self._check_volumes(points, determinant(F), cut)
-        points = replace(points, F=F)
-        return replace(points, data=self._materials.updated_state(points))
+        return np.stack(mean, axis=1).reshape(n, d, d) @ points.F
 
-    def _moved(self, points: MaterialPoints, cut: CutDomains, moved: NDArray[np.float64]) -> MaterialPoints:
-        """Return the points where corners (n, 2^d, d), or points without domains (n, d), have moved by so much, m."""
-        if cut.domains:
-            corners = points.corners + moved
-            return replace(points, corners=corners, x=corners.mean(axis=1))
-        x = points.x + moved
-        return replace(points, x=x, corners=parallelepipeds(x, points.F, self._sizes(points)))
+    def _shaped(
+        self,
+        state: State,
+        cut: CutDomains,
+        moved: NDArray[np.float64],
+        bend: NDArray[np.float64],
+        deformed: Callable[[], NDArray[np.float64]],
+    ) -> tuple[MaterialPoints, bool, int]:
+        """Return the points after their corners have moved (n, 2^d, d) and bent, m, with the F that these tell.
+
+        With mean dilatation the volume ratio is that of the cells, which `deformed` has in its F.
+
+        Returns
+        -------
+        The points; whether they are still where they were cut; how many domains had folded.
+        """
+        grid, stage, d, folded = cut.grid, state.stage, cut.grid.dim, 0
+        free = ~given(grid, stage.lattices, stage.conditions["fixed"], state.points)
+        corners = state.points.corners + moved + free * bend
+        points = replace(state.points, corners=corners)
+        serves = cut.serves(points)
+        if not serves:
+            corners = corners + free * filtered(grid, stage.lattices, points, cut.points)
+            bad = tangled(corners, points.volume0 * points.J)
+            folded = over_all(grid.comm, int(bad.sum()))
+            if folded:
+                corners = self._untangled(points, corners, bad, deformed(), grid, stage.mechanical)
+        F = gradient(corners, points.reference)
+        if self._momentum.dilatation is not None:
+            J = determinant(deformed())
+            if not serves:
+                J = filtered_ratios(grid, stage.lattices, points, cut.points, J)
+            ratio = J / determinant(F)
+            F = F * (np.sign(ratio) * np.abs(ratio) ** (1 / d))[:, None, None]
+        return replace(points, corners=corners, x=corners.mean(axis=1), F=F), serves, folded
 
     def _sizes(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the edges (n, d), m, of boxes as large as the points' domains at rest, as seeded or put on others."""
         size = self._size[points.id]
         return size * (points.volume0 / size.prod(axis=1))[:, None] ** (1 / size.shape[1])
 
-    def _check_volumes(self, points: MaterialPoints, J: NDArray[np.float64], cut: CutDomains) -> None:
+    def _check_volumes(self, points: MaterialPoints, cut: CutDomains) -> None:
         """Refuse what a law may allow and a body does not: points turned inside out, pores of no volume."""
-        wet = self._storage is not None
+        wet, J = self._storage is not None, points.J
         least = 1 - self._materials.table(points, lambda m: m.porosity) if wet else np.zeros(len(J))
-        bad = np.flatnonzero(J <= least)
+        bad = np.flatnonzero(~(J > least))
         if over_all(cut.grid.comm, len(bad)):
             shown = [f"point {points.id[i]} at {points.x[i]} with J = {J[i]:.3g}" for i in bad[:1]]
             what = "the pores have closed" if wet else "the body is turned inside out"
             raise NotConverged(f"{what}, J <= {least.max(initial=0):.3g}: {', '.join(shown) or 'elsewhere'}")
 
     def _untangled(
-        self, points: MaterialPoints, cut: CutDomains, boundary: MechanicalBoundary
-    ) -> tuple[MaterialPoints, int]:
-        """Return the points with domains that have folded re-derived from F, whose neighbours went elsewhere."""
-        grid, volume = cut.grid, points.volume0 * points.J
-        bad = np.flatnonzero(tangled(points.corners, volume))
-        if len(bad):
-            all_corners, x = points.corners.copy(), points.x.copy()
-            corners = parallelepipeds(x[bad], points.F[bad], self._sizes(points)[bad])
-            corners = boundary.under_held(points.id[bad], all_corners[bad], volume[bad], corners)
-            all_corners[bad] = np.clip(corners, grid.lower, grid.upper)
-            x[bad] = all_corners[bad].mean(axis=1)
-            points = replace(points, corners=all_corners, x=x)
-        return points, over_all(grid.comm, len(bad))
+        self,
+        points: MaterialPoints,
+        corners: NDArray[np.float64],
+        bad: NDArray[np.bool_],
+        F: NDArray[np.float64],
+        grid: Grid,
+        boundary: MechanicalBoundary,
+    ) -> NDArray[np.float64]:
+        """Return corners of which those of domains that have folded, whose neighbours went elsewhere, are of F."""
+        at, X = np.flatnonzero(bad), points.reference[bad]
+        x, X = corners[at].mean(axis=1), X - X.mean(axis=1, keepdims=True)
+        new = x[:, None] + np.einsum("nab,nkb->nka", F[at], X)
+        new = boundary.under_held(points.id[at], corners[at], points.volume0[at] * determinant(F[at]), new)
+        corners[at] = np.clip(new, grid.lower, grid.upper)
+        return corners
 
     def left_grid(self, state: State, on_grid: OnGrid) -> State:
         """Return a state whose points take the pressures of their pieces along: the next step resets the grid."""

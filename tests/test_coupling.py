@@ -138,7 +138,7 @@ def test_the_undrained_pressure_has_no_checkers():
         (h, name): demo.roughness(demo.undrained(h, law)[0]) for h in (0.06, 0.03) for name, law in demo.LAWS.items()
     }
     for h in (0.06, 0.03):
-        assert rough[h, "damped"] < 0.4 * rough[h, "undamped"]
+        assert rough[h, "damped"] < 0.5 * rough[h, "undamped"]
     assert rough[0.03, "damped"] < 0.006
     assert rough[0.03, "damped"] < 0.35 * rough[0.06, "damped"], "what is left is not the curvature of the pressure"
 

@@ -29,6 +29,7 @@ QUICK = {
     "cantilever_3d": ("--cells 2 --steps 2 4", ["cantilever_3d.png"]),
     "cryer": ("--cells 6 --steps 12", ["cryer.png"]),
     "cantilever": ("--cells 2 --steps 20", ["cantilever.png"]),
+    "cycles": ("--h 0.1 --cycles 2 --turn 0.25", ["cycles.png", "cycles.csv"]),
     "quadrature": ("--h 0.05 --steps 5 10", ["quadrature.png", "tip.csv"]),
     "extending_with_ufl": ("--cells 8", ["extending_with_ufl.png"]),
     "extreme_cases": (

@@ -248,7 +248,7 @@ def test_a_foreign_file_is_refused(checkpoint, tmp_path):
 
 def test_a_checkpoint_of_another_version_is_refused(checkpoint, monkeypatch):
     monkeypatch.setattr(restart, "VERSION", restart.VERSION + 1)
-    refused(checkpoint, "checkpoint of version 3, must be 4")
+    refused(checkpoint, "checkpoint of version 4, must be 5")
 
 
 OTHER_SCENES = {

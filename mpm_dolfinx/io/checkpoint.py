@@ -28,7 +28,7 @@ from mpm_dolfinx.simulation import Simulation
 from mpm_dolfinx.state import State, Stay
 from mpm_dolfinx.validation import instance, line, numbers, on_disk, path, whole
 
-FORMAT, VERSION = "mpm_dolfinx checkpoint", 3
+FORMAT, VERSION = "mpm_dolfinx checkpoint", 4
 FOREIGN = "no checkpoint of mpm_dolfinx, must be one"
 ZIP = b"PK\3\4"  # how numpy's archives begin
 COLUMNS = {"t": 0, "displacement": 1, "pressure": 2}  # of the rows of a Result

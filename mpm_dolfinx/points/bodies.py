@@ -226,6 +226,7 @@ def material_points(grid: Grid, bodies: Sequence[Body], pressure: float = 0.0) -
         pressure=np.full(n, float(numbers("pressure", pressure))),
         x=x[mine],
         origin=corners[mine],
+        reference=corners[mine],
     )
 
 

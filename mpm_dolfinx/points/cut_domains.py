@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from mpm_dolfinx.caching import Keyed
 from mpm_dolfinx.forms.point_forms import CHUNK
 from mpm_dolfinx.parallel.exchange import Exchange, over_all
+from mpm_dolfinx.points.bending import bend
 from mpm_dolfinx.points.cutting import Pieces, cut, cut_faces
 from mpm_dolfinx.points.faces import Surface, face_vectors, interpolate
 from mpm_dolfinx.points.grid import Grid, sum_by
@@ -143,6 +144,11 @@ class CutDomains(Keyed):
             N = self.grid.shape_values(cells[part], x[part])
             moved[part] = np.einsum("mk,mkd->md", N, u[self.grid.cell_nodes[cells[part]]])
         return travel.back(moved).reshape((self.points.corners if self.domains else self.points.x).shape)
+
+    def bend(self, u: NDArray[np.float64], active: NDArray[np.bool_]) -> NDArray[np.float64]:
+        """Return what the corners (n, 2^d, d) follow besides the Q1 field, m; active: nodes of filled cells."""
+        travel, cells, x = self._followed
+        return travel.back(bend(self.grid, cells, x, u, active)).reshape(self.points.corners.shape)
 
     @cached_property
     def _followed(self) -> tuple[Exchange, NDArray[np.int32], NDArray[np.float64]]:

@@ -61,7 +61,7 @@ def volumes(corners: NDArray[np.float64]) -> NDArray[np.float64]:
 def _simplex_volumes(y: NDArray[np.float64]) -> list[NDArray[np.float64]]:
     """Return the signed volumes (n,) of each simplex of domains (2^d, d, n)."""
     d, out = y.shape[1], []
-    for simplex, sign in zip(kuhn_simplices(d), _ORIENTATION[d], strict=True):
+    for simplex, sign in zip(kuhn_simplices(d), ORIENTATION[d], strict=True):
         height = y[simplex[-1]] - y[simplex[0]]
         out.append((_area_vectors(y[simplex[:-1]]) * height).sum(axis=0) * (sign * (-1) ** (d + 1) / d))
     return out
@@ -81,7 +81,7 @@ def parallelepipeds(
     return x[:, None] + np.einsum("nab,nkb->nka", F, offset)
 
 
-_ORIENTATION = {d: np.sign(np.linalg.det(np.diff(corner_bits(d)[kuhn_simplices(d)], axis=1))) for d in (2, 3)}
+ORIENTATION = {d: np.sign(np.linalg.det(np.diff(corner_bits(d)[kuhn_simplices(d)], axis=1))) for d in (2, 3)}
 
 
 def cut(grid: Grid, corners: NDArray[np.float64]) -> Pieces:

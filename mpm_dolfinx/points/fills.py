@@ -110,7 +110,7 @@ def put(
     mine = corners[new.id - _start(bodies, fill)]
     if (mine == new.corners).all():
         return new
-    return replace(new, corners=mine, x=mine.mean(axis=1), volume0=volumes(mine), origin=mine)
+    return replace(new, corners=mine, x=mine.mean(axis=1), volume0=volumes(mine), origin=mine, reference=mine)
 
 
 def _start(bodies: Sequence[Body], body: int) -> int:

@@ -42,6 +42,8 @@ class MaterialPoints:
         Position.
     origin : (n, 2^d, d), m
         Corners from which displacements count: as seeded, or when a stage reset them.
+    reference : (n, 2^d, d), m
+        Corners of the domain at rest, from which F counts: as seeded, or as put on others.
     data : name -> (n, ...)
         What else the points carry: parameters that differ from point to point, state of the law.
     """
@@ -54,6 +56,7 @@ class MaterialPoints:
     pressure: NDArray[np.float64]
     x: NDArray[np.float64]
     origin: NDArray[np.float64]
+    reference: NDArray[np.float64]
     data: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
 
     def __post_init__(self):

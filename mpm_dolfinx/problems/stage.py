@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from mpm_dolfinx.constitutive.fields import SceneMaterials
 from mpm_dolfinx.points.bodies import Body
 from mpm_dolfinx.points.grid import Grid
+from mpm_dolfinx.points.lattice import Lattice, lattices
 from mpm_dolfinx.problems.conditions import Displacement, Drained, Inflow, RigidPlate, Traction
 from mpm_dolfinx.problems.hydraulic_boundary import HydraulicBoundary
 from mpm_dolfinx.problems.mechanical_boundary import MechanicalBoundary
@@ -33,13 +34,15 @@ class Stage:
     """The conditions in force.
 
     conditions: as they were given, by name; present: which bodies are there; later: those that may still come;
-    free: (nodes, d), components that no wall holds; mechanical, hydraulic: what acts on the sides of the bodies.
+    free: (nodes, d), components that no wall holds; lattices: of the bodies that are there; mechanical, hydraulic:
+    what acts on the sides of the bodies.
     """
 
     conditions: Mapping[str, Any]
     present: tuple[bool, ...]
     later: tuple[int, ...]
     free: NDArray[np.bool_]
+    lattices: Sequence[Lattice]
     mechanical: MechanicalBoundary
     hydraulic: HydraulicBoundary
 
@@ -94,7 +97,10 @@ def stage(
     acting = (conditions[name] for name in ("tractions", "displacements", "plates"))
     mechanical = MechanicalBoundary(sides, free, materials, *acting)
     hydraulic = HydraulicBoundary(sides, [*conditions["drained"], *conditions["inflows"]])
-    return Stage(dict(conditions), tuple(present), tuple(later), free, mechanical, hydraulic)
+    given = [(faces, axes) for _, faces, axes in mechanical.holds]
+    given += [(faces, range(grid.dim)) for _, faces in mechanical.plates]
+    lattice = lattices(bodies, present, given)
+    return Stage(dict(conditions), tuple(present), tuple(later), free, lattice, mechanical, hydraulic)
 
 
 def _gravity(value: ArrayLike, name: str, dim: int) -> NDArray[np.float64]:

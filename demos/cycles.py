@@ -1,0 +1,203 @@
+# SPDX-License-Identifier: MIT
+"""A body that comes back: what load cycles and a turn by 360 degrees leave in it.
+
+The drained beam of `poroelastic_beam.py` is loaded and unloaded again and again.  It is elastic: without load it must
+be free of stress.  Domains that followed the kinks of the grid's field would collect a part of them with every grid
+line that they cross; standard MPM collects them at its points.  A block that is stretched between two held sides and
+then turned by 360 degrees must end with the stresses that it began with.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import poroelastic_beam as beam
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.verification.biot_fem import BiotFEM
+
+STRETCH = 0.1  # of the block, before it turns
+BLOCK = 1.0  # m
+COLORS = ("C1", "C0", "C2", "C4", "C5")  # of the cell sizes
+
+
+def options(h: float, load: float, quadrature: str = "domain") -> argparse.Namespace:
+    """Return the beam's options."""
+    return beam.arguments(f"--drained --h {h} --load {load} --quadrature {quadrature}".split())
+
+
+def conditions(o: argparse.Namespace) -> dict:
+    """Return the beam's conditions, with a load that rises and falls once a second."""
+    region = ((beam.CLAMP, -np.inf), (beam.LENGTH, np.inf))
+    load = mpm.Traction("top", lambda t: (0.0, -o.load * (1 - abs(2 * (t % 1) - 1))), region=region)
+    return {"fixed": {"left": "xy"}, "tractions": [load]}
+
+
+def rms(simulation: mpm.Simulation) -> float:
+    """Return the root mean square of the points' stress, Pa."""
+    stress, volume = simulation.effective_stress(), simulation.points.volume0
+    total = simulation.grid.comm.allreduce(np.array([(volume * (stress**2).sum(axis=(1, 2))).sum(), volume.sum()]))
+    return float(np.sqrt(total[0] / total[1]))
+
+
+def cycle(h: float, load: float, cycles: int, steps: int, quadrature: str = "domain", material=None) -> dict:
+    """Load and unload the beam; return what is left of it, and how it has moved.
+
+    Parameters
+    ----------
+    h, load
+        Cell size, m; largest load, Pa.
+    cycles, steps
+        Cycles, and steps in each, even.
+    quadrature
+        Of the material points.
+    material
+        By default that of the beam.
+
+    Returns
+    -------
+    left: rms of the stress after each cycle over that at the first peak; times, tips (m): of each step; lost: work
+    that the load has done in each cycle over that up to the first peak.
+    """
+    o = options(h, load, quadrature)
+    cells = np.rint(beam.BOX / h).astype(int)
+    grid = mpm.Grid(beam.BOX, cells)
+    bottom = (round(0.5 * beam.BOX[1] / h) + o.offset) * grid.h[1]
+    body = mpm.box(grid, [0, bottom], [beam.LENGTH, bottom + beam.HEIGHT], per_cell=o.points_per_cell)
+    simulation = mpm.Simulation(grid, [body], [material or beam.material(o)], quadrature=quadrature, **conditions(o))
+    loaded = np.linspace(beam.CLAMP, beam.LENGTH, 201)[:-1] + (beam.LENGTH - beam.CLAMP) / 400
+    places = [[beam.LENGTH, bottom + beam.HEIGHT / 2], *([x, bottom + beam.HEIGHT] for x in loaded)]
+    stress = [0.0]
+
+    def observe(s: mpm.Simulation) -> None:
+        stress.append(rms(s) if round(s.t * steps) % steps in (0, steps // 2) else np.nan)
+
+    try:
+        result = simulation.run(float(cycles), 1 / steps, probes=mpm.probes([body], places), observe=observe)
+    except mpm.GaveUp as error:
+        print(f"{quadrature}, h = {h:g} m: {error}", file=sys.stderr)
+        result = error.result
+    times = np.array(result.t)
+    u, force = np.array(result.displacement)[:, :, 1], 1 - np.abs(2 * (times % 1) - 1)
+    work = -load * (force[1:] + force[:-1]) / 2 * np.diff(u[:, 1:].mean(axis=1))
+    done = (len(times) - 1) // steps
+    lost = work[: done * steps].reshape(done, steps).sum(axis=1) / work[: steps // 2].sum()
+    left = np.array(stress)[steps::steps] / stress[steps // 2] if done else np.zeros(0)
+    return {"left": left, "times": times, "tips": u[:, 0], "lost": lost, "force": load * force, "cuts": result.cuts}
+
+
+def turn(h: float, nu: float = 0.3, steps: int = 90) -> float:
+    """Return by how much a turn by 360 degrees changes the stress in the middle of the stretched block, rms."""
+    cells = round(1.8 * BLOCK / h)
+    grid = mpm.Grid([cells * h] * 2, [cells] * 2)
+    lower = 0.4 * BLOCK + 0.37 * h
+    block = mpm.box(grid, [lower] * 2, [lower + BLOCK] * 2)
+    centre = lower + BLOCK / 2
+
+    def given(sign: int):
+        def displacement(t, X):
+            c, s = np.cos(2 * np.pi * max(0.0, t - 1)), np.sin(2 * np.pi * max(0.0, t - 1))
+            x = X - centre + [sign * STRETCH / 2 * BLOCK * min(t, 1.0), 0]
+            return x @ np.array([[c, s], [-s, c]]) + centre - X
+
+        return displacement
+
+    held = [mpm.Displacement(side, given(sign)) for side, sign in (("left", -1), ("right", 1))]
+    law = mpm.Hencky(bulk=1e6 / (3 * (1 - 2 * nu)), shear=1e6 / (2 * (1 + nu)))
+    simulation = mpm.Simulation(grid, [block], [law], fixed={}, displacements=held)
+    middle = (np.abs(simulation.points.x - centre) < BLOCK / 4).all(axis=1)
+    simulation.run(1.0, 0.2)
+    before = simulation.effective_stress()[middle]
+    simulation.run(2.0, 1 / steps)
+    change = simulation.effective_stress()[middle] - before
+    return float(np.sqrt((change**2).sum() / (before**2).sum()))
+
+
+def reference(o: argparse.Namespace) -> tuple[np.ndarray, np.ndarray]:
+    """Return the deflection of the tip (m) in a cycle by finite elements, and the load (Pa)."""
+    case = options(o.h[-1], o.load)
+    size = [0, 0], [beam.LENGTH, beam.HEIGHT], beam.REFERENCE_CELLS
+    fem = BiotFEM(*size, beam.material(case), **conditions(case))
+    result = fem.run(1.0, 1 / o.steps, probes=np.array([[beam.LENGTH, beam.HEIGHT / 2]]))
+    return np.array(result.displacement)[:, 0, 1], o.load * (1 - np.abs(2 * (np.array(result.t) % 1) - 1))
+
+
+def main(argv: list[str] | None = None) -> dict:
+    """Run the demo; return what --json prints."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser.add_argument(
+        "--h", type=float, nargs="+", default=[0.06, 0.03], help="cell sizes, m; standard MPM: the last"
+    )
+    parser.add_argument("--load", type=float, default=54e3, help="largest load, Pa")
+    parser.add_argument("--cycles", type=int, default=20, help="load cycles")
+    parser.add_argument("--steps", type=int, default=10, help="steps in a cycle, even")
+    parser.add_argument("--turn", type=float, nargs="*", default=[0.05, 0.025], help="cell sizes of the block, m")
+    parser.add_argument("--out", type=Path, default=Path("out/cycles"), help="folder for the picture and the table")
+    parser.add_argument("--json", action="store_true", help="print the results as one line of JSON at the end")
+    o = parser.parse_args(argv)
+    if not 0 < len(o.h) <= len(COLORS):
+        parser.error(f"--h: {len(o.h)} cell sizes, must be 1 to {len(COLORS)}")
+    if o.steps < 2 or o.steps % 2 or o.cycles < 1:
+        parser.error(f"--steps {o.steps} --cycles {o.cycles}: must be even and >= 2, and >= 1")
+    runs = {h: cycle(h, o.load, o.cycles, o.steps) for h in o.h}
+    points = cycle(o.h[-1], o.load, o.cycles, o.steps, "point")
+    fem = reference(o)
+    turned = {h: turn(h) for h in o.turn}
+
+    print(
+        f"{'':24}{'stress left / peak':>20}{'work lost a cycle':>20}{'drift of the peaks':>20}{'tip without load':>18}"
+    )
+    rows = {f"h = {h:g} m": run for h, run in runs.items()} | {f"at points, {o.h[-1]:g} m": points}
+    for name, run in rows.items():
+        peaks, rest = run["tips"][o.steps // 2 :: o.steps], run["tips"][:: o.steps]
+        cycles = f"{name}, {len(run['left'])} cycles"
+        numbers = (run["left"][-1], run["lost"][-1], peaks[-1] / peaks[0] - 1, rest[-1] / peaks[0])
+        print(f"{cycles:24}" + "".join(f"{x:{w}.4%}" for x, w in zip(numbers, (20, 20, 20, 18), strict=True)))
+    for h, change in turned.items():
+        print(f"turned by 360 degrees, h = {h:g} m: the stress in the middle changes by {change:.4%}")
+    o.out.mkdir(parents=True, exist_ok=True)
+    with (o.out / "cycles.csv").open("w", newline="") as file:
+        table = csv.writer(file)
+        table.writerow(["cycle", *(f"left_h_{h:g}" for h in o.h), "left_at_points"])
+        columns = [*(run["left"] for run in runs.values()), points["left"]]
+        table.writerows([k + 1, *(c[k] if k < len(c) else "" for c in columns)] for k in range(o.cycles))
+    draw(o, runs, points, fem)
+    out = {"left": {f"{h:g}": run["left"].tolist() for h, run in runs.items()}, "points": points["left"].tolist()}
+    out |= {"lost": {f"{h:g}": run["lost"].tolist() for h, run in runs.items()}}
+    out |= {"turned": {f"{h:g}": change for h, change in turned.items()}}
+    out["converged"] = all(len(run["left"]) == o.cycles for run in runs.values())
+    if o.json:
+        print(json.dumps(out))
+    return out
+
+
+def draw(o: argparse.Namespace, runs: dict[float, dict], points: dict, fem: tuple[np.ndarray, np.ndarray]) -> None:
+    """Draw the stress that is left against the cycles, and the last cycle beside the finite elements."""
+    fig, ((left, loop),) = beam.figure(1, 2, (11, 4.2))
+    for (h, run), color in zip(runs.items(), COLORS, strict=False):
+        left.plot(np.arange(len(run["left"])) + 1, run["left"], "o-", ms=3, color=color, label=f"domains, h = {h:g} m")
+    label = f"standard MPM, h = {o.h[-1]:g} m"
+    left.plot(np.arange(len(points["left"])) + 1, points["left"], "s--", ms=3, color="crimson", label=label)
+    left.set(xlabel="cycles", ylabel="stress left at zero load / at the peak", xscale="log", yscale="log")
+    left.set_title("What is left of the stress")
+    last = runs[o.h[-1]]
+    for run, style, color in ((last, "-", COLORS[len(runs) - 1]), (points, "s--", "crimson")):
+        end = len(run["left"]) * o.steps
+        part = slice(max(0, end - o.steps), end + 1)
+        loop.plot(-run["tips"][part], run["force"][part] / 1e3, style, ms=3, color=color)
+    loop.plot(-fem[0], fem[1] / 1e3, "k:", lw=2.5, label="Taylor-Hood FEM, first cycle")
+    loop.set(xlabel="deflection of the tip (m)", ylabel="load (kPa)")
+    loop.set_title(f"Load and deflection, cycle {o.cycles}, h = {o.h[-1]:g} m")
+    for ax in (left, loop):
+        ax.legend()
+        ax.grid(alpha=0.3)
+    fig.savefig(o.out / "cycles.png", dpi=130)
+
+
+if __name__ == "__main__":
+    sys.exit(0 if main()["converged"] else 1)

@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: MIT
+"""The displacement that corners of domains follow: the Q1 field of the grid, without its kinks.
+
+In bending the true strain varies linearly over a cell, that of a Q1 field does not: it jumps at the grid lines.
+Domains that followed it would take along a sawtooth, and on the way back, with other grid lines across the body, leave
+it as stress.  So corners follow the field with its second differences along each axis,
+
+    u(x) = sum_i N_i(x) [u_i - 1/2 sum_a t_a (1 - t_a) D_a],
+
+t_a in [0, 1] the place in the cell: exact for quadratic fields, Q1 at the nodes, and continuous.  D_a is the second
+difference along the edge of the cell that node i ends: the smaller one of those at its two ends, zero where their signs
+differ, and that of one end where the other has none.  So a kink that is no error of the grid, as between materials,
+stays one.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpm_dolfinx.forms.point_forms import CHUNK
+from mpm_dolfinx.points.cutting import corner_bits
+from mpm_dolfinx.points.grid import Grid
+
+
+def bend(
+    grid: Grid, cells: NDArray[np.int32], x: NDArray[np.float64], u: NDArray[np.float64], active: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    """Return what corners follow besides the Q1 field (m, d), m.
+
+    Parameters
+    ----------
+    cells, x : (m,), (m, d), m
+        Owned cells that the corners lie in, and their positions.
+    u : (nodes, d), m
+        Nodal displacements.
+    active : (nodes,)
+        Which nodes belong to cells that hold something.
+    """
+    used, slot = np.unique(cells, return_inverse=True)
+    differences = _second_differences(grid, used, u, active)
+    out = np.zeros_like(x)
+    for part in (slice(start, start + CHUNK) for start in range(0, len(x), CHUNK)):
+        at, here = slot[part], cells[part]
+        N, t = grid.shape_values(here, x[part]), (x[part] - grid.midpoints[here]) / grid.h + 0.5
+        for a, D in enumerate(differences):
+            out[part] -= np.einsum("mk,mkd->md", 0.5 * (t[:, a] * (1 - t[:, a]))[:, None] * N, D[at])
+    return out
+
+
+def _second_differences(
+    grid: Grid, cells: NDArray[np.int32], u: NDArray[np.float64], active: NDArray[np.bool_]
+) -> list[NDArray[np.float64]]:
+    """Return the second differences (cells, 2^d, d), m, along the edges of owned cells, an array an axis."""
+    d, bits, out = grid.dim, corner_bits(grid.dim), []
+    order = np.array([np.flatnonzero((grid.signs == 2 * b - 1).all(axis=1))[0] for b in bits])
+    index = np.stack(np.unravel_index(grid.cell_number[cells], grid.shape), axis=1)
+    nodes = grid.cell_nodes[cells]
+    for a in range(d):
+        low, high = (order[bits[:, a] == end] for end in (0, 1))
+        along = u[nodes[:, high]] - u[nodes[:, low]]
+        ends, known = [], []
+        for end, step in ((low, -1), (high, 1)):
+            there = index.copy()
+            there[:, a] = np.clip(there[:, a] + step, 0, grid.shape[a] - 1)
+            local = grid.local(grid.number(there))
+            beyond = grid.cell_nodes[local][:, end]
+            known.append(((there != index).any(axis=1) & (local >= 0))[:, None] & active[beyond])
+            ends.append(u[beyond] - u[nodes[:, end]] - step * along)
+        first, last = (np.where(known[k][:, :, None], ends[k], ends[1 - k]) for k in (0, 1))
+        smaller = np.where(first * last > 0, np.sign(first) * np.minimum(np.abs(first), np.abs(last)), 0.0)
+        bend = np.empty((len(cells), 2**d, d))
+        bend[:, low] = bend[:, high] = np.where((known[0] | known[1])[:, :, None], smaller, 0.0)
+        out.append(bend)
+    return out

@@ -1,0 +1,224 @@
+# SPDX-License-Identifier: MIT
+"""The lattice of corners that a body was seeded with, and the filter of what only neighbouring domains can see.
+
+A wave of two domains in the displacement of the corners moves no node of the grid, so that no stress acts against it:
+what crossing grid lines leaves of it would add up from cycle to cycle.  When the grid is reset the corners lose it,
+
+    d <- d - D_a^T s / 64 D_a d     for one axis a after the other,
+
+d their displacement since they were at rest, D_a the third difference along axis a where the lattice has four corners
+in a row, s = `FAST` times the cells that they have crossed, at most 1: what hardly moves is left alone.  Quadratic
+fields stay as they are, also at the surface; along its axis a wave of two domains is taken away by the share s, one of
+eight by 0.003 s.  Where domains have parted from their neighbours nothing is filtered across.  Corners that a wall, a
+given displacement, a plate or another body holds stay where they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+from mpi4py import MPI
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpm_dolfinx.parallel.exchange import Exchange
+from mpm_dolfinx.points.bodies import Body
+from mpm_dolfinx.points.contact import Faces, covers
+from mpm_dolfinx.points.cutting import corner_bits
+from mpm_dolfinx.points.faces import Surface
+from mpm_dolfinx.points.grid import SIDES, Grid
+from mpm_dolfinx.points.material_points import MaterialPoints
+
+FAST = 10
+"""Share of a wave of two domains that is taken away, over the cells that it has crossed; at most all of it."""
+THIRD = (-1.0, 3.0, -3.0, 1.0)
+MARGIN = 3
+"""Layers of a lattice on both sides that the change of one depends on."""
+PARTED = 1e-6
+"""Of a domain's edge: corners of neighbours that are further apart have parted."""
+
+
+class Lattice:
+    """The domains and corners of a body that is there, numbered lexicographically, and which corners are held.
+
+    Parameters
+    ----------
+    body, start
+        The body, and the number of its first point.
+    given : (faces, axes)
+        Faces of a side, and the components that a condition gives them.
+    joined : (rows, corners)
+        Domains (m,) that touch other bodies, and which of their corners (m, 4) do.
+    """
+
+    def __init__(
+        self,
+        body: Body,
+        start: int,
+        given: Iterable[tuple[Surface, Iterable[int]]],
+        joined: tuple[NDArray[np.int64], NDArray[np.int64]],
+    ):
+        self._body, self._start, self._stop = body, start, start + len(body)
+        self._lower, self._dim = body.lower.min(axis=0), len(body.spacing)
+        self._parted = PARTED * body.spacing.min()
+        self._count = self._index(np.arange(len(body))).max(axis=0) + 1
+        self._joined = np.take_along_axis(self._number(joined[0]), joined[1], axis=1)
+        self._given = []
+        for faces, axes in given:
+            rows = faces.id[(faces.id >= self._start) & (faces.id < self._stop)] - self._start
+            on = corner_bits(self._dim)[:, faces.axis] == faces.end
+            self._given.append((self._number(rows)[:, on], list(axes)))
+
+    def _index(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the places (m, d) of domains along the axes."""
+        return np.rint((self._body.lower[rows] - self._lower) / self._body.spacing).astype(np.int64)
+
+    def _number(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the numbers (m, 2^d) of the corners of domains."""
+        corners = self._index(rows)[:, None] + corner_bits(self._dim)
+        return np.ravel_multi_index(tuple(np.moveaxis(corners, 2, 0)), tuple(self._count + 1))
+
+    def rows(self, points: MaterialPoints) -> NDArray[np.int64]:
+        """Return which points are the body's."""
+        return np.flatnonzero((points.id >= self._start) & (points.id < self._stop))
+
+    def given(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return which components (m, 2^d, d) of the corners of domains conditions give."""
+        number = self._number(ids - self._start)
+        out = np.zeros((*number.shape, self._dim), dtype=bool)
+        for at, axes in self._given:
+            out[:, :, axes] |= np.isin(number, at)[:, :, None]
+        return out
+
+    def corners_change(
+        self, comm: MPI.Intracomm, ids: NDArray[np.int64], d: NDArray[np.float64], crossed: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return what the filter adds (m, 2^d, d), m, to the displacements d, alike, of the corners of domains.
+
+        crossed (m, 2^d): cells that they have crossed since the grid was reset.
+        """
+        number = self._number(ids - self._start)
+        values = np.concatenate([d, crossed[:, :, None]], axis=2).reshape(-1, self._dim + 1)
+        change = _change(comm, tuple(self._count + 1), number.ravel(), values, self._parted).reshape(d.shape)
+        change[np.isin(number, self._joined)] = 0.0
+        return change
+
+    def domains_change(
+        self, comm: MPI.Intracomm, ids: NDArray[np.int64], d: NDArray[np.float64], crossed: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return what the filter adds (m,) to values d (m,) of domains that have crossed some cells (m,)."""
+        shape = tuple(self._count)
+        number = np.ravel_multi_index(tuple(self._index(ids - self._start).T), shape)
+        return _change(comm, shape, number, np.stack([d, crossed], axis=1), np.inf)[:, 0]
+
+
+def _change(
+    comm: MPI.Intracomm,
+    shape: tuple[int, ...],
+    number: NDArray[np.int64],
+    values: NDArray[np.float64],
+    parted: float,
+) -> NDArray[np.float64]:
+    """Return what the filter adds (m, k) to values at places of a lattice.
+
+    Processes share out the lattice by slabs across its first axis.
+
+    Parameters
+    ----------
+    shape, number
+        Places along each axis; lexicographic number (m,) of each row's place, which may have several.
+    values : (m, k + 1)
+        Values, and last how many cells their place has crossed.
+    parted
+        Values of one place that differ by more are nobody's neighbours.
+    """
+    across, starts = int(np.prod(shape[1:])), np.arange(comm.size + 1) * shape[0] // comm.size
+    layer = number // across
+    home = np.searchsorted(starts, layer, side="right") - 1
+    to_home = Exchange(comm, home)
+    rows = [(to_home.send(number), to_home.send(values))]
+    for other in range(-MARGIN, MARGIN + 1) if comm.size > 1 else ():  # a slab may be one layer thin
+        to = np.clip(home + other, 0, comm.size - 1)
+        near = (to != home) & (to == home + other) & (layer >= starts[to] - MARGIN) & (layer < starts[to + 1] + MARGIN)
+        halo = Exchange(comm, to[near])
+        rows.append((halo.send(number[near]), halo.send(values[near])))
+    first = max(0, starts[comm.rank] - MARGIN)
+    last = min(shape[0], starts[comm.rank + 1] + MARGIN)
+    rows = [(at - first * across, d) for at, d in rows]
+    field = np.full(((last - first) * across, values.shape[1]), np.nan)
+    for at, d in rows:
+        field[at] = d
+    for at, d in rows:
+        field[at[(np.abs(field[at] - d) > parted).any(axis=1)]] = np.nan
+    field = field.reshape(-1, *shape[1:], values.shape[1])
+    change = np.nan_to_num(_filtered(field[..., :-1], field[..., -1:]) - field[..., :-1])
+    return to_home.back(change.reshape(-1, values.shape[1] - 1)[rows[0][0]])
+
+
+def _filtered(d: NDArray[np.float64], crossed: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return a box (..., k) of values after the filter; nan stands for places that are not there."""
+    for axis, count in enumerate(d.shape[:-1]):
+        if count < len(THIRD):
+            continue
+        d = d.copy()
+        along, cells = np.moveaxis(d, axis, 0), np.moveaxis(crossed, axis, 0)
+        share = np.minimum(1.0, FAST * (cells[1 : count - 2] + cells[2 : count - 1]) / 2)
+        third = np.nan_to_num(share / 64 * np.diff(along, 3, axis=0))
+        for k, factor in enumerate(THIRD):
+            along[k : count - 3 + k] -= factor * third
+    return d
+
+
+def lattices(
+    bodies: Sequence[Body], present: Sequence[bool], given: Sequence[tuple[Surface, Iterable[int]]]
+) -> list[Lattice]:
+    """Return the lattices of the bodies that are there; given: faces that conditions hold, and their components."""
+    start = np.cumsum([0, *map(len, bodies)])
+    around = {i: Faces.around(body) for i, body in enumerate(bodies) if present[i]}
+    out = []
+    for i, own in around.items():
+        touching = [covers(own, other).face for j, other in around.items() if j != i]
+        covered = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *touching]))
+        out.append(Lattice(bodies[i], int(start[i]), given, (own.row[covered], own.index[covered])))
+    return out
+
+
+def given(
+    grid: Grid, lattices: Sequence[Lattice], walls: Mapping[str, str], points: MaterialPoints
+) -> NDArray[np.bool_]:
+    """Return which components (n, 2^d, d) of corners conditions or walls give; walls: components that these hold."""
+    out = np.zeros(points.corners.shape, dtype=bool)
+    for lattice in lattices:
+        rows = lattice.rows(points)
+        out[rows] = lattice.given(points.id[rows])
+    for name, axes in walls.items():
+        axis, end = SIDES[grid.dim][name]
+        at_wall = np.abs(points.corners[:, :, axis] - (grid.lower, grid.upper)[end][axis]) < 1e-6 * grid.h[axis]
+        for letter in axes:
+            out[:, :, "xyz".index(letter)] |= at_wall
+    return out
+
+
+def filtered(
+    grid: Grid, lattices: Sequence[Lattice], points: MaterialPoints, then: MaterialPoints
+) -> NDArray[np.float64]:
+    """Return what the filter adds to the corners (n, 2^d, d), m; then: the points when the grid was reset."""
+    out, crossed = np.zeros_like(points.corners), np.abs((points.corners - then.corners) / grid.h).sum(axis=2)
+    for lattice in lattices:
+        rows = lattice.rows(points)
+        moved = points.corners[rows] - points.reference[rows]
+        out[rows] = lattice.corners_change(grid.comm, points.id[rows], moved, crossed[rows])
+    return out
+
+
+def filtered_ratios(
+    grid: Grid, lattices: Sequence[Lattice], points: MaterialPoints, then: MaterialPoints, J: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the volume ratios (n,) of points after the filter of their logarithms."""
+    log = np.log(np.where(J > 0, J, np.nan))  # those that are turned inside out are refused later
+    crossed = np.abs((points.corners - then.corners) / grid.h).sum(axis=2).mean(axis=1)
+    for lattice in lattices:
+        rows = lattice.rows(points)
+        log[rows] += lattice.domains_change(grid.comm, points.id[rows], log[rows], crossed[rows])
+    return np.exp(log)

@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: MIT
+"""A body that comes back is the body that left: cycles, turns, and what moves the domains' corners."""
+
+from dataclasses import replace
+
+import cycles
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.points.bending import bend
+from mpm_dolfinx.points.cutting import corner_bits, volumes
+from mpm_dolfinx.points.domain_gradient import gradient
+from mpm_dolfinx.points.lattice import filtered, lattices
+
+MATRICES = st.lists(st.floats(-0.3, 0.3), min_size=9, max_size=9)
+
+
+def test_a_beam_is_free_of_stress_after_twenty_cycles():
+    run = cycles.cycle(0.03, 54e3, 20, 10)
+    assert run["left"][-1] < 5e-3
+    peaks, rest = run["tips"][5::10], run["tips"][::10]
+    assert abs(peaks[-1] / peaks[0] - 1) < 5e-5 and abs(rest[-1] / peaks[0]) < 1e-3
+    assert (run["lost"] > 0).all() and run["cuts"] == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("load", [5.4e3, 54e3])
+def test_after_two_hundred_cycles_as_after_a_hundred(load):
+    run = cycles.cycle(0.03, load, 200, 10)
+    assert run["left"][-1] < 5e-3 and run["left"][-1] < 1.01 * run["left"][99]
+    peaks, rest = run["tips"][5::10], run["tips"][::10]
+    assert abs(peaks[-1] / peaks[0] - 1) < 5e-5 and abs(rest[-1] / peaks[0]) < 1e-3
+
+
+def test_what_cycles_leave_falls_with_the_cell_size():
+    left = [cycles.cycle(h, 54e3, 3, 10)["left"][-1] for h in (0.06, 0.03)]
+    assert np.log2(left[0] / left[1]) > 1.2, left
+
+
+def test_a_body_that_turns_by_360_degrees_has_its_stresses_back():
+    assert cycles.turn(0.1) < 1e-3
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@settings(max_examples=20, deadline=None)
+@given(numbers=MATRICES, curvature=st.floats(-0.2, 0.2))
+def test_corners_tell_a_homogeneous_deformation_and_in_all_others_the_volume(dim, numbers, curvature):
+    corners = (corner_bits(dim) * np.linspace(0.5, 1.2, dim))[None] + 0.1 * np.sin(np.arange(2**dim * dim)).reshape(
+        1, 2**dim, dim
+    )
+    A = np.eye(dim) + np.array(numbers)[: dim * dim].reshape(dim, dim)
+    if np.linalg.det(A) < 0.1:
+        return
+    assert gradient(corners @ A.T, corners) == pytest.approx(A[None], abs=1e-12)
+    bent = corners @ A.T
+    bent[..., 0] += curvature * bent[..., -1] ** 2
+    F = gradient(bent, corners)
+    assert np.linalg.det(F) == pytest.approx(volumes(bent) / volumes(corners), rel=1e-12)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_corners_follow_quadratic_fields_exactly_and_kinks_at_grid_lines(dim):
+    grid = mpm.Grid([1.0] * dim, [5] * dim)
+    rng = np.random.default_rng(1)
+    x = rng.uniform(0, 1, (200, dim))
+    Q = rng.normal(size=(dim, dim, dim))
+    active = np.ones(len(grid.node_x), dtype=bool)
+    cells = grid.local(grid.number(grid.index(x)))
+
+    def moved(field):
+        u = field(grid.node_x)
+        N = grid.shape_values(cells, x)
+        return np.einsum("mk,mkd->md", N, u[grid.cell_nodes[cells]]) + bend(grid, cells, x, u, active)
+
+    def quadratic(x):  # without mixed terms, which Q1 has
+        return np.einsum("iaa,na->ni", Q, x**2) + x @ Q[0] + np.prod(x, axis=1)[:, None]
+
+    def kinked(x):
+        return np.maximum(x[:, :1] - 0.4, 0) * np.ones(dim)
+
+    for field in (quadratic, kinked):
+        assert moved(field) == pytest.approx(field(x), abs=1e-13)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_the_filter_leaves_quadratic_fields_and_what_has_not_moved_and_takes_the_wave_of_two_domains(dim):
+    grid = mpm.Grid([2.0] * dim, [4] * dim)
+    body = mpm.box(grid, [0.1] * dim, [1.7] * dim)
+    points = mpm.Simulation(
+        grid, [body], [mpm.Hencky(bulk=1e6, shear=1e6)], fixed={}, displacements=[mpm.Displacement("top", [0] * dim)]
+    ).points
+    found = lattices([body], [True], [])
+    X = points.reference
+    at = np.rint((X - 0.1) / body.spacing)
+    far = np.full_like(X, 0.3)
+
+    def change(d, then=0.0):
+        now = replace(points, corners=X + d)
+        return filtered(grid, found, now, replace(points, corners=X + d - then))
+
+    quadratic = 0.1 * X**2 + 0.2 * X[..., ::-1] * X
+    assert np.abs(change(quadratic, far)).max() < 1e-15
+    wave = 1e-3 * (-1.0) ** at[..., :1] * np.ones(dim)
+    assert np.abs(change(wave)).max() == 0
+    inner = (at[..., 0] >= 3) & (at[..., 0] <= at[..., 0].max() - 3)
+    assert (wave + change(wave, far))[inner] == pytest.approx(0, abs=1e-15)
+    part = change(wave, 0.02 / dim * grid.h)  # crosses two hundredths of a cell
+    assert part[inner] == pytest.approx(-0.2 * wave[inner], rel=1e-9)
+    apart = wave.copy()
+    apart[0] += 0.01  # the first domain parts from its neighbours
+    assert np.abs(change(apart, far)[0]).max() <= 4 / 64 * 8e-3 and np.isfinite(change(apart, far)).all()
