@@ -194,3 +194,39 @@ def test_cells_that_conduct_alike_are_treated_as_ever():
     mobility = on_grid.mobility(on_grid.data, True)
     assert mobility.share is None and mobility.shift is None
     assert mobility.mean == pytest.approx(SAND.conductivity / 9810, rel=1e-15, abs=0)
+
+
+def settled(ratio, offset, thickness=1):
+    """Return the settlement of a column with a layer so many times softer, some cells thick, over the exact one."""
+    soft = mpm.Hencky(bulk=SAND.bulk / ratio, shear=SAND.shear / ratio)
+    load = [mpm.Traction("top", (0, -1.0), ([0, 1], [H, 1]))]
+    s = column([((3 + offset) * H, (3 + offset + thickness) * H)], [SAND, soft], tractions=load)
+    for _ in range(2):
+        s.step(1.0)
+    exact = (1 + thickness * H * (ratio - 1)) / SAND.oedometric
+    return (1 - s.points.corners[:, :, 1].max()) / exact
+
+
+@pytest.mark.parametrize(
+    ("ratio", "offset", "thickness", "lost"),
+    [(10, 0.5, 1, 0.736), (100, 0.5, 1, 0.97), (100, 0.25, 1, 0.96), (10, 0.5, 4, 0.184), (0.01, 0.5, 1, 0.109)],
+)
+def test_a_soft_layer_off_the_grid_lines_is_named_once_with_what_it_loses(ratio, offset, thickness, lost, caplog):
+    with caplog.at_level("WARNING", "mpm_dolfinx"):
+        error = 1 - settled(ratio, offset, thickness)
+    (record,) = caplog.records
+    message = record.getMessage()
+    contrast = max(ratio, 1 / ratio)
+    assert "bodies 0 and 1" in message and f"up to {contrast:g} times" in message and "grid lines" in message
+    assert f"material {int(ratio > 1)}" in message
+    said = float(message.split("about ")[1].split(" %")[0]) / 100
+    assert said == pytest.approx(lost, abs=0.006)
+    gives = max(thickness * H * ratio, 0) if ratio > 1 else 1 - thickness * H
+    assert error == pytest.approx(said * gives / (1 + thickness * H * (ratio - 1)), rel=0.05)
+
+
+@pytest.mark.parametrize(("ratio", "offset"), [(100, 0.0), (100, 1e-3), (2, 0.5), (0.5, 0.5)])
+def test_layers_that_lose_little_are_not_named(ratio, offset, caplog):
+    with caplog.at_level("WARNING", "mpm_dolfinx"):
+        assert settled(ratio, offset) == pytest.approx(1, abs=0.031)
+    assert not caplog.records

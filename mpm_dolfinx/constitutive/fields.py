@@ -56,6 +56,11 @@ class SceneMaterials:
         """Whether the tangents of all materials are symmetric."""
         self.stiffest = max(float(np.max(m.oedometric, initial=0.0)) for m in evaluated)
         """Largest oedometric modulus, Pa."""
+        self.uneven = any(
+            max(float(np.max(y)) for y in moduli) > 2 * min(float(np.min(y)) for y in moduli)
+            for moduli in ([m.oedometric for m in evaluated], [m.shear for m in evaluated])
+        )
+        """Whether points differ in stiffness by more than a factor of two."""
         self.conducts = any(m.conductivity_law or np.any(np.asarray(m.conductivity) > 0) for m in evaluated)
         """Whether fluid flows anywhere."""
         conductivity = np.concatenate([np.ravel(m.conductivity) for m in evaluated])
