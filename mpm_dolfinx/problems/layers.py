@@ -15,6 +15,7 @@ cells to the next.  A piece counts as a box, the part of its domain's bounding b
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,8 @@ BLUR = 1e-6
 """Cells within which a line at the edge of a piece counts half for it."""
 ASLANT = 0.01
 """Slope of layers on the grid from which a cell's pressure is rather that of its most conductive part."""
+PAIRS = 2**16
+"""Pairs of pieces in a cell that are looked at, at a time."""
 INSIDE = 1e-12  # of half a cell: how near to a face the place of a cell's pressure may come
 
 
@@ -71,20 +74,34 @@ class MixedCells:
         own, first, self._at, count = np.unique(cells, return_index=True, return_inverse=True, return_counts=True)
         self._filled, middle = contents.slot(own), contents.centroid[own] / h
         self._room = np.minimum(INSIDE - 0.5 - middle, 0.0), np.maximum(0.5 - INSIDE - middle, 0.0)
-        size = np.maximum(high - low, BLUR)
-        line = np.repeat(np.arange(len(cells)), count[self._at])
-        begin = np.cumsum(count[self._at]) - count[self._at]
-        piece = np.repeat(first[self._at] - begin, count[self._at]) + np.arange(len(line))
-        inside = np.minimum(x[line] - low[piece], high[piece] - x[line]) / BLUR + 0.5
-        self._lines, share = [], volume / h.prod()
-        for axis in range(x.shape[1]):
+        count, first = count[self._at], first[self._at]
+        ends = 1 + np.flatnonzero(np.diff(np.cumsum(count) // PAIRS, append=-1))
+        met = [self._crossed(slice(a, b), first, count, low, high) for a, b in pairwise([0, *ends])]
+        size, share = np.maximum(high - low, BLUR), volume / h.prod()
+        self._lines = []
+        for axis, found in enumerate(zip(*met, strict=True)):
+            line, piece, meets = (np.concatenate(rows) for rows in zip(*found, strict=True))
+            length = (share / np.delete(size, axis, axis=1).prod(axis=1))[piece] * meets
+            total, place = (sum_by(line, length * y, len(cells)) for y in (1.0, x[piece, axis]))
+            before = 0.5 + ((place / total)[line] - x[piece, axis]) / total[line]
+            self._lines.append(Lines(line, piece, length, before, total))
+
+    def _crossed(self, rows: slice, first, count, low, high) -> list[tuple[NDArray, NDArray, NDArray]]:
+        """Return, for each axis, lines of some pieces, the pieces that they cross, and the share in which they do.
+
+        first, count (m,): of the pieces in each piece's cell.
+        """
+        own = np.arange(rows.start, rows.stop)
+        line = np.repeat(own, count[rows])
+        begin = np.cumsum(count[rows]) - count[rows]
+        piece = np.repeat(first[rows] - begin, count[rows]) + np.arange(len(line))
+        inside = np.minimum(self._x[line] - low[piece], high[piece] - self._x[line]) / BLUR + 0.5
+        out = []
+        for axis in range(self._x.shape[1]):
             meets = np.delete(inside, axis, axis=1).clip(0, 1).prod(axis=1)
             kept = np.flatnonzero(meets)
-            own, other = line[kept], piece[kept]
-            length = (share / np.delete(size, axis, axis=1).prod(axis=1))[other] * meets[kept]
-            total, place = (sum_by(own, length * y, len(cells)) for y in (1.0, x[other, axis]))
-            before = 0.5 + ((place / total)[own] - x[other, axis]) / total[own]
-            self._lines.append(Lines(own, other, length, before, total))
+            out.append((line[kept], piece[kept], meets[kept]))
+        return out
 
     def mobility(self, kappa: NDArray[np.float64], mean: NDArray[np.float64]) -> Mobility:
         """Return the mobility of all filled cells, of their means (n,) and of those of all pieces, m^2/(Pa s)."""
