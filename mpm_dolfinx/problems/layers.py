@@ -20,6 +20,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.cut_domains import CutDomains
 from mpm_dolfinx.points.grid import sum_by
 from mpm_dolfinx.problems.fluxes import CellContents, Mobility
@@ -148,7 +149,7 @@ class MixedCells:
 
 
 def mixed_cells(cut: CutDomains, alike: NDArray[np.float64], contents: CellContents) -> MixedCells | None:
-    """Return the owned cells that hold pieces that do not conduct alike, if any; on all processes together.
+    """Return the owned cells that hold pieces that do not conduct alike, None if no process has any.
 
     alike: (m, k) what those pieces have in common that do.
     """
@@ -158,7 +159,7 @@ def mixed_cells(cut: CutDomains, alike: NDArray[np.float64], contents: CellConte
     mixed = sum_by(cells, (alike != some[cells]).any(axis=1), grid.num_local) > 0
     corners = cut.points.corners
     low, high = (cut.to_cells(rows) for rows in (corners.min(axis=1), corners.max(axis=1)))
-    if not mixed.any():
+    if over_all(grid.comm, bool(mixed.any())) == 0:
         return None
     rows = np.flatnonzero(mixed[cells])
     rows = rows[np.argsort(cells[rows], kind="stable")]
