@@ -22,9 +22,10 @@ def mpirun(processes: int, script: str, *arguments: str) -> None:
     assert done.returncode == 0, done.stderr[-3000:]
 
 
-@pytest.mark.parametrize(
-    "scene", ["mpi_beam.py", "mpi_slab.py", "mpi_stages.py", "mpi_laws.py", "mpi_3d.py", "mpi_cycles.py"]
-)
+SCENES = [f"mpi_{name}.py" for name in ("beam", "slab", "stages", "laws", "layers", "3d", "cycles")]
+
+
+@pytest.mark.parametrize("scene", SCENES)
 def test_the_state_is_the_same_on_several_processes(scene, tmp_path):
     states = []
     for processes in (1, 2, 3):

@@ -35,7 +35,7 @@ def shape_gradients(points: FormPoints) -> list:
 def element_dofs(grid: Grid, cells: NDArray[np.int32]) -> NDArray[np.int32]:
     """Return the unrolled local dofs (cells, n) of Q1 vectors in cells."""
     dofs = grid.cell_nodes[cells][:, :, None] * grid.dim + np.arange(grid.dim, dtype=grid.cell_nodes.dtype)
-    return dofs.reshape(len(cells), -1)
+    return dofs.reshape(len(cells), dofs.shape[1] * grid.dim)
 
 
 def insert(A: PETSc.Mat, grid: Grid, cells: NDArray[np.int32], matrices: NDArray[np.float64]) -> None:

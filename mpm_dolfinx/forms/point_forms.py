@@ -259,7 +259,7 @@ class Rows:
         for columns, f, dofs in self._gathered:
             bs = f.function_space.dofmap.bs
             at = dofs[cells][:, :, None].astype(np.intp) * bs + np.arange(bs)
-            out.append((columns, f, at.reshape(len(cells), -1)))
+            out.append((columns, f, at.reshape(len(cells), at.shape[1] * bs)))
         return out
 
 

@@ -1,0 +1,34 @@
+# SPDX-License-Identifier: MIT
+"""Run a seam off the grid lines, of a law of its own, which not every process has a part of; write the state."""
+
+import sys
+
+import numpy as np
+
+import mpm_dolfinx as mpm
+
+grid = mpm.Grid([0.25, 0.25, 1.25], [2, 2, 10])
+seams = [(0, 0.76, 0), (0.76, 0.87, 1), (0.87, 1, 0)]
+bodies = [mpm.box(grid, [0, 0, low], [0.25, 0.25, high], material=m) for low, high, m in seams]
+sand = mpm.Hencky(bulk=1e6, shear=6e5, conductivity=1e-4, conductivity_law=mpm.kozeny_carman)
+clay = mpm.NeoHookean(bulk=5e5, shear=3e5, conductivity=1e-9)
+top = [-np.inf, -np.inf, 0.95], [np.inf, np.inf, 1.05]
+simulation = mpm.Simulation(
+    grid,
+    bodies,
+    [sand, clay],
+    fluid=mpm.Fluid(),
+    fixed={"left": "x", "right": "x", "front": "y", "back": "y", "bottom": "z"},
+    drained=[mpm.Drained("top", 0.0, top)],
+    tractions=[mpm.Traction("top", (0, 0, -1e5), top)],
+    gravity=(0, 0, -10),
+)
+result = simulation.run(2.0, 1.0, progress=False)
+points = simulation.points
+parts = simulation.grid.comm.gather((points.id, points.x, points.pressure))
+if parts:
+    ids, x, p = (np.concatenate(a) for a in zip(*parts, strict=True))
+    order = np.argsort(ids)
+    assert p[x[:, 2] < 0.7].min() > 5e4, "the seam holds nothing back"
+    counts = [len(part[0]) for part in parts]
+    np.savez(sys.argv[1], x=x[order], p=p[order], balance=result.balance, counts=counts)
