@@ -23,6 +23,7 @@ from mpm_dolfinx.points.pressure_transport import PiecePressures, Reconstruction
 from mpm_dolfinx.problems.mechanical_boundary import MechanicalBoundary
 from mpm_dolfinx.problems.momentum import MomentumForms
 from mpm_dolfinx.problems.on_grid import OnGrid
+from mpm_dolfinx.problems.quadrature_data import QuadratureData
 from mpm_dolfinx.problems.storage import StorageForms
 from mpm_dolfinx.state import State, Stay
 
@@ -78,7 +79,7 @@ class Motion:
             nodal = self._momentum.u.x.array.reshape(-1, d)
             N, dN = grid.shape_functions(pieces.cells, pieces.x)
             at_nodes = nodal[grid.cell_nodes[pieces.cells]].transpose(0, 2, 1)
-            points = self._deformed(points, cut, np.eye(d) + at_nodes @ dN, pieces.cells)
+            points = self._deformed(points, cut, np.eye(d) + at_nodes @ dN, on_grid.data)
             points = self._moved(points, cut, cut.displacement(nodal))
             ids, pressure, x, start, folded = None, None, None, None, 0
             serves = cut.serves(points)
@@ -93,11 +94,13 @@ class Motion:
         new = replace(state, t=t, points=points, transported=None, stay=Stay(cut.points, ids, pressure, x, start))
         return new if serves and stays else self.left_grid(new, on_grid), folded
 
-    def _deformed(self, points: MaterialPoints, cut: CutDomains, delta: NDArray, cells: NDArray) -> MaterialPoints:
+    def _deformed(
+        self, points: MaterialPoints, cut: CutDomains, delta: NDArray, data: QuadratureData
+    ) -> MaterialPoints:
         """Return the points with F and state after a step, delta (m, d, d) the deformation of the pieces."""
         n, d = len(points), cut.grid.dim
         if self._momentum.dilatation is not None:
-            delta = self._momentum.dilatation.averaged(delta, cells)
+            delta = self._momentum.dilatation.averaged(delta, data)
         # F_p <- (sum_k w_k Delta_k / V_p) F_p
         mean = [cut.mean(column) for column in cut.to_pieces(delta).reshape(-1, d * d).T]
         F = np.stack(mean, axis=1).reshape(n, d, d) @ points.F

@@ -75,7 +75,7 @@ class Scene:
         laws, p = self.pieces.laws, fem.Function(grid.cellwise()) if fluid else None
         with compiling(f"materials: {', '.join(law.__name__ for law in scene.laws)}", "laws in UFL of these shapes"):
             wet = fluid.density if fluid else None
-            options = (self.gravity, wet, scene.nearly_incompressible, scene.symmetric)
+            options = (self.gravity, wet, scene.symmetric)
             options = (*options, quadrature == "point", terms, self.t, self.dt)
             self.momentum = MomentumForms(self.pieces.pieces, laws, p, *options)
         if not self.momentum.symmetric and scheme.coupling == "schur-cg":

@@ -51,14 +51,16 @@ class SceneMaterials:
         self.conductivity_laws = list(dict.fromkeys(m.conductivity_law for m in used if m.conductivity_law))
         """The different conductivity laws of the scene."""
         self._law = np.array([self.laws.index(type(m)) if type(m) in self.laws else 0 for m in materials])
+        locks = [bool(np.any(m.nearly_incompressible)) for m in evaluated]
+        self._parts = list(dict.fromkeys(zip(map(type, used), locks, strict=True)))
+        own = dict(zip(self._used, zip(map(type, used), locks, strict=True), strict=True))
+        self._part = np.array([self._parts.index(own[i]) if i in own else 0 for i in range(len(materials))])
         self.symmetric = all(m.symmetric for m in used)
         """Whether the tangents of all materials are symmetric."""
         self.stiffest = max(float(np.max(m.oedometric, initial=0.0)) for m in evaluated)
         """Largest oedometric modulus, Pa."""
         self.conducts = any(m.conductivity_law or np.any(np.asarray(m.conductivity) > 0) for m in evaluated)
         """Whether fluid flows anywhere."""
-        self.nearly_incompressible = any(np.any(m.nearly_incompressible) for m in evaluated)
-        """Whether Q1 cells would lock somewhere."""
         self._fields = [[name for name in _names(m) if callable(getattr(m, name))] for m in materials]
         self.checksums: dict[str, int | list[float]] = {
             f"conductivity law of material {i}": sampled(m.conductivity_law)
@@ -109,20 +111,22 @@ class SceneMaterials:
         if other != shape:
             raise ValueError(f"{law.__name__}: {name} has shape {shape}, in another law {other}; must agree")
 
-    def parts(self, pieces: FormPoints, common: Sequence[str]) -> list[tuple[type[Skeleton], FormPoints]]:
-        """Return each law with points for the pieces that follow it; a single law's are all `pieces`.
+    def parts(self, pieces: FormPoints, common: Sequence[str]) -> list[tuple[type[Skeleton], FormPoints, bool]]:
+        """Return each law with points for the pieces that follow it, and whether Q1 cells would lock with these.
 
-        The points of several laws have the fields `common` of the pieces and what their law takes.
+        Materials of one law of which some lock and others do not are two parts; a single part's points are all
+        `pieces`, those of several have the fields `common` of the pieces and what their law takes.
         """
-        if len(self.laws) == 1:
-            return [(self.laws[0], pieces)]
-        names = [dict.fromkeys([*common, *_takes(law)]) for law in self.laws]
+        if len(self._parts) == 1:
+            return [(law, pieces, locks) for law, locks in self._parts]
+        names = [dict.fromkeys([*common, *_takes(law)]) for law, _ in self._parts]
         shapes = [{name: getattr(pieces, name).ufl_shape for name in taken} for taken in names]
-        return [(law, FormPoints(pieces.grid, **s)) for law, s in zip(self.laws, shapes, strict=True)]
+        points = [FormPoints(pieces.grid, **s) for s in shapes]
+        return [(law, own, locks) for (law, locks), own in zip(self._parts, points, strict=True)]
 
-    def law_of(self, points: MaterialPoints) -> NDArray[np.int64]:
-        """Return the number of each point's law (n,)."""
-        return self._law[points.material]
+    def part_of(self, points: MaterialPoints) -> NDArray[np.int64]:
+        """Return the number of each point's part (n,), see `parts`."""
+        return self._part[points.material]
 
     def table(self, points: MaterialPoints, value: Callable[..., float], *columns: NDArray) -> NDArray[np.float64]:
         """Return value(material, *columns) at the points (n, ...); columns (n,) are values at the points."""
@@ -207,7 +211,7 @@ class SceneMaterials:
 
     def _placed(self, points: MaterialPoints) -> list[tuple[LawAtPoints, NDArray[np.int64], PointData]]:
         """Return every law with the indices and the data of the points that follow it."""
-        number, values = self.law_of(points), {"F": points.F, **self.parameters(points), **self.state(points)}
+        number, values = self._law[points.material], {"F": points.F, **self.parameters(points), **self.state(points)}
         rows = [np.flatnonzero(number == k) for k in range(len(self.laws))]
         return [(law, own, law.data(points, own, values)) for law, own in zip(self._at_points, rows, strict=True)]
 

@@ -42,7 +42,10 @@ def _momentum(s: Scene, state: State) -> list[Part]:
         _either("reset of the grid", state.resets > 1, f"{state.resets} so far", "nothing has moved so far"),
         Part("stress", True, f"{laws}; integrated over {'exact domains' if s.quadrature == 'domain' else 'points'}"),
         _either(
-            "mean dilatation", m.dilatation, f"nu > {LOCKING}, or plastic flow", f"nu <= {LOCKING}, no plastic flow"
+            "mean dilatation",
+            m.dilatation,
+            f"of what has nu > {LOCKING}, or plastic flow",
+            f"nu <= {LOCKING}, no plastic flow",
         ),
         _either("state of the law", evolves, evolves, "the stress depends on F only"),
         _either("body force", s.gravity is not None, "gravity", "no gravity"),
