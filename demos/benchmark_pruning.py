@@ -46,10 +46,10 @@ def block(cells: int, material: mpm.Skeleton | None = None, box: float = 1.0, **
     """Return the block, that many cells wide; the grid reaches to `box`, m, and two cells above it."""
     h = 1 / cells
     grid = mpm.Grid([box, box + 2 * h], [round(box * cells), round(box * cells) + 2])
-    load = mpm.Traction("top", lambda t: (0, -LOAD * t))
+    options.setdefault("tractions", [mpm.Traction("top", lambda t: (0, -LOAD * t))])
     fixed = {"left": "x", "right": "x", "bottom": "y"}
     body = mpm.box(grid, [0, 0], [1, 1])
-    return mpm.Simulation(grid, [body], [material or soil()], fixed=fixed, tractions=[load], **options)
+    return mpm.Simulation(grid, [body], [material or soil()], fixed=fixed, **options)
 
 
 def weighted(cells: int) -> mpm.Simulation:
@@ -107,6 +107,10 @@ PAIRS: dict[str, tuple[Make, Make]] = {
     "flux form": (lambda n: block(n, **SEALED), lambda n: block(n, soil(conductivity=1e-30), **SEALED)),
     "second order in time": (lambda n: draining(n, method="backward-euler"), draining),
     "body force": (block, lambda n: block(n, gravity=(0, 0))),
+    "pressure that follows the surface": (
+        block,
+        lambda n: block(n, tractions=[mpm.Pressure("top", lambda t: LOAD * t)]),
+    ),
     "ghost penalty on all faces": (block, weighted),
     "damping of pressure jumps": (lambda n: conducting(n, mpm.Hencky), lambda n: conducting(n, Watched)),
     "mean dilatation": (

@@ -109,7 +109,7 @@ class MomentumForms:
             if fluid_density is not None:
                 taken_up = fem.Constant(grid.mesh, fluid_density) * (ufl.det(pieces.increment(self.u)) - 1)
                 self._residuals_of_all.append(PointForm(-taken_up * pull * pieces.dx, pieces))
-        self.sides, self.ghost = SideForms(grid, V), GhostPenalty(grid, V, at_points)
+        self.sides, self.ghost = SideForms(grid, self.u), GhostPenalty(grid, V, at_points)
 
     def _add_law(
         self, law: type[Skeleton], points: FormPoints, locks: bool, pressure: fem.Function | None, symmetric: bool
@@ -173,6 +173,13 @@ class MomentumForms:
             self.sides.pull.assemble_vector(pulls.x.array, sides.holds)
         return sum_ghosts(external), sum_ghosts(pulls)
 
+    def pressures(self, sides: SideData) -> NDArray[np.float64]:
+        """Return the nodal forces of pressures at u, a local array."""
+        forces = self.sides.forces
+        forces.x.array[:] = 0.0
+        self.sides.pressed.assemble_vector(forces.x.array, sides.pressures)
+        return sum_ghosts(forces)
+
     def internal(self, data: QuadratureData) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the nodal forces of the stresses, and of the user's terms, at u, local arrays."""
         internal, own, _, _ = self._work
@@ -187,7 +194,7 @@ class MomentumForms:
             term.assemble_vector(own.x.array, data.pieces)
         return sum_ghosts(internal), sum_ghosts(own) if self.terms else own.x.array
 
-    def assemble_tangent(self, K: PETSc.Mat, data: QuadratureData) -> None:
+    def assemble_tangent(self, K: PETSc.Mat, data: QuadratureData, sides: SideData) -> None:
         """Add the tangent at u to K, which the caller finalises."""
         for tangent, part in zip(self._tangents, data.parts, strict=True):
             tangent.assemble_matrix(K, part)
@@ -195,6 +202,8 @@ class MomentumForms:
             tangent.assemble_matrix(K, data.pieces)
         if self.dilatation is not None:
             self.dilatation.assemble_matrix(K, data)
+        if sides.pressures is not None:
+            self.sides.pressed_slope.assemble_matrix(K, sides.pressures)
 
     def active_nodes(self, cells: NDArray[np.int32]) -> NDArray[np.bool_]:
         """Return which nodes belong to some active cells of any process."""
@@ -286,15 +295,22 @@ class MomentumProblem:
         self, forms: MomentumForms, system: MomentumSystem, data: QuadratureData, sides: SideData, round_off: float
     ):
         self.forms, self.system, self.data, self.round_off = forms, system, data, round_off
+        self._sides = sides
         with Timer("mpm: loads"):
             self._external, self._pulls = forms.external(data, sides)
-        self._held = sides.holds is not None
+
+    @property
+    def linear(self) -> bool:
+        """Whether the tangent changes with the places of the points only."""
+        return self.forms.linear and self._sides.pressures is None
 
     def assemble_residual(self) -> tuple[PETSc.Vec, float]:
         """Return the out-of-balance nodal forces at u and their scale, the largest of internal, external, terms (N)."""
         forms, system = self.forms, self.system
         b, own = forms.internal(self.data)
         forces, external = b[system.touched], self._external[system.touched]
+        if self._sides.pressures is not None:
+            external = external + forms.pressures(self._sides)[system.touched]
         squares = [forces @ forces, external @ external]
         if forms.terms:
             own = own[system.touched]
@@ -302,7 +318,7 @@ class MomentumProblem:
             forces += own
         squares = over_all(forms.grid.comm, np.array(squares))
         b[system.touched] = forces - external
-        if self._held:  # no measure of forces: at the start of a step it is far above them
+        if self._sides.holds is not None:  # no measure of forces: at the start of a step it is far above them
             b[system.touched] -= self._pulls[system.touched]
         r = system.unknowns.gather(b, system.residual)
         step = system.unknowns.gather(forms.u.x.array, system.step)
@@ -315,7 +331,7 @@ class MomentumProblem:
         # the first sum gives K the pattern of both
         first = not K.assembled
         zero(K)
-        self.forms.assemble_tangent(K, data or self.data)
+        self.forms.assemble_tangent(K, data or self.data, self._sides)
         K.assemble()
         pattern = PETSc.Mat.Structure
         K.axpy(1.0, self.system.penalty, pattern.UNKNOWN if first else pattern.SUBSET_NONZERO_PATTERN)
