@@ -101,6 +101,14 @@ def conducting(cells: int, law: type[mpm.Skeleton]) -> mpm.Simulation:
     return block(cells, soil(law, conductivity=kappa * WATER["fluid"].unit_weight), **WATER)
 
 
+def sealed_soil(cells: int, yields: bool = True) -> mpm.Simulation:
+    """Return the sealed block of plastic soil, with the damping of pressure jumps of what yields or of elastic soil."""
+    simulation = block(cells, soil(mpm.DruckerPrager, friction=0.0, dilation=0.0, cohesion=LOAD), **SEALED)
+    if not yields:
+        simulation.scene.materials._softness.clear()
+    return simulation
+
+
 Make = Callable[[int], mpm.Simulation]
 PAIRS: dict[str, tuple[Make, Make]] = {
     "pore fluid that drains at once": (block, lambda n: block(n, soil(conductivity=1e3), **WATER)),
@@ -113,6 +121,7 @@ PAIRS: dict[str, tuple[Make, Make]] = {
     ),
     "ghost penalty on all faces": (block, weighted),
     "damping of pressure jumps": (lambda n: conducting(n, mpm.Hencky), lambda n: conducting(n, Watched)),
+    "damping of what yields": (lambda n: sealed_soil(n, yields=False), sealed_soil),
     "mean dilatation": (
         lambda n: block(n, soil(nu=LOCKING - 1e-3)),
         lambda n: block(n, soil(nu=LOCKING + 1e-3)),

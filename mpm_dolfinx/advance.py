@@ -105,8 +105,8 @@ class Motion:
         mean = [cut.mean(column) for column in cut.to_pieces(delta).reshape(-1, d * d).T]
         F = np.stack(mean, axis=1).reshape(n, d, d) @ points.F
         self._check_volumes(points, determinant(F), cut)
-        points = replace(points, F=F)
-        return replace(points, data=self._materials.updated_state(points))
+        moved = replace(points, F=F)
+        return replace(moved, data=self._materials.updated_state(moved, points))
 
     def _moved(self, points: MaterialPoints, cut: CutDomains, moved: NDArray[np.float64]) -> MaterialPoints:
         """Return the points where corners (n, 2^d, d), or points without domains (n, d), have moved by so much, m."""

@@ -94,6 +94,7 @@ BENCHMARK = {
     "pressure that follows the surface": {"tractions", "pressures"},
     "ghost penalty on all faces": {"ghost penalty"},
     "damping of pressure jumps": {"damping of pressure jumps"},
+    "damping of what yields": set(),
     "mean dilatation": DILATION,
     "plastic law, with mean dilatation": {"state of the law"} | DILATION,
     "finite strain": {"one factorisation for many steps"},

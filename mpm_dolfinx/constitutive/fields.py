@@ -11,7 +11,7 @@ from dataclasses import fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mpm_dolfinx.constitutive.evaluate import LawAtPoints, sampled
+from mpm_dolfinx.constitutive.evaluate import LawAtPoints, SoftnessAtPoints, sampled
 from mpm_dolfinx.constitutive.skeleton import Fluid, Skeleton
 from mpm_dolfinx.errors import NotConverged
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData
@@ -21,7 +21,7 @@ from mpm_dolfinx.points.grid import Grid
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.validation import numbers
 
-RESERVED = ("F", "storage", "storage_at_one", "density", "position", "displacement", "porosity0", "gradient")
+RESERVED = frozenset("F dF softness storage storage_at_one density position displacement porosity0 gradient".split())
 """Names of what points of integration carry beside parameters and state."""
 
 
@@ -38,9 +38,13 @@ class SceneMaterials:
         All bodies; their reference positions are where fields are evaluated.
     points
         The points of this process, as seeded.
+    wet
+        Whether there is a fluid.
     """
 
-    def __init__(self, grid: Grid, materials: Sequence[Skeleton], bodies: Sequence[Body], points: MaterialPoints):
+    def __init__(
+        self, grid: Grid, materials: Sequence[Skeleton], bodies: Sequence[Body], points: MaterialPoints, wet: bool
+    ):
         self._grid, self.materials = grid, materials
         seeded: dict[str, NDArray[np.float64]] = {}
         X, index = _reference(bodies, len(materials))
@@ -81,6 +85,13 @@ class SceneMaterials:
                 everywhere[rows] = value
                 mine = everywhere[points.id]
                 seeded[name] = mine + seeded[name] if name in seeded else mine
+        self._softness: dict[int, SoftnessAtPoints] = {}
+        if wet and any(law.state for law in self.laws):
+            seeded["softness"] = np.ones(len(points))
+            for number, law in enumerate(self.laws):
+                if law.state:
+                    shapes = {name: self.shapes[name] for name in _takes(law)}
+                    self._softness[number] = SoftnessAtPoints(grid, law, shapes)
         self.seeded = replace(points, data=seeded)
         """The points with what they carry at the start: parameters that differ from place to place, state."""
         self._at_points = [
@@ -189,17 +200,18 @@ class SceneMaterials:
         pressure = self.table(points, lambda m: m.biot) * points.pressure
         return self.effective_stress(points) - pressure[:, None, None] * np.eye(self._grid.dim)
 
-    def updated_state(self, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
-        """Return what the points, given with the F of the end of a step, carry from then on.
+    def updated_state(self, points: MaterialPoints, before: MaterialPoints) -> dict[str, NDArray[np.float64]]:
+        """Return what the points, given with the F of the end of a step, carry from then on; before: at its start.
 
         Raises
         ------
         NotConverged
             The new state is not finite.
         """
-        if all(law.update is None for law in self.laws):
+        if all(law.update is None for law in self.laws) and not self._softness:
             return points.data
-        new = [(law.law, rows, name, v) for law, rows, at in self._placed(points) for name, v in law.new_state(at)]
+        placed = self._placed(points)
+        new = [(law.law, rows, name, v) for law, rows, at in placed for name, v in law.new_state(at)]
         bad = [(law, name, rows[~_finite(values)]) for law, rows, name, values in new]
         shown = [f"{law.__name__}.update: {name!r} is not finite at {points.x[i[0]]}" for law, name, i in bad if len(i)]
         if message := first(self._grid.comm, "".join(shown[:1])):
@@ -207,6 +219,12 @@ class SceneMaterials:
         out = {name: values.copy() if name in self.state_names else values for name, values in points.data.items()}
         for _, rows, name, values in new:
             out[name][rows] = values
+        if self._softness:
+            out["softness"], dF = np.ones(len(points)), points.F - before.F
+            shear = self.table(points, lambda m: m.shear)
+            for number, softness in self._softness.items():
+                _, rows, at = placed[number]
+                out["softness"][rows] = softness(at, dF[rows], shear[rows])
         return out
 
     def _placed(self, points: MaterialPoints) -> list[tuple[LawAtPoints, NDArray[np.int64], PointData]]:

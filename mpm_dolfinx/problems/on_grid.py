@@ -147,6 +147,11 @@ class OnGrid(Keyed):
         pressure = p[cells] + np.einsum("md,md->m", slope[at], offset - origin[at])
         return [self.cut.to_pieces(values) for values in (pressure, slope[at], bounds[at])]
 
+    def softness(self, state: State) -> NDArray[np.float64] | float:
+        """Return by how much the pieces (m,) are softer than elastic ones at the start of the step."""
+        data = state.points.data
+        return self.cut.to_cells(data["softness"]) if "softness" in data else 1.0
+
     def mobility(self, data: QuadratureData, begins: bool) -> NDArray[np.float64]:
         """Return the mobility of the filled owned cells, m^2/(Pa s), at u; begins: refuse for good what is none."""
         at_pieces = self._quadrature.mobility(self.cut, self._storage.conductivity, data.pieces, begins)
