@@ -47,10 +47,10 @@ def block(cells: int, material: mpm.Skeleton | None = None, box: float = 1.0, **
     """Return the block, that many cells wide; the grid reaches to `box`, m, and two cells above it."""
     h = 1 / cells
     grid = mpm.Grid([box, box + 2 * h], [round(box * cells), round(box * cells) + 2])
-    load = mpm.Traction("top", lambda t: (0, -LOAD * t))
+    options.setdefault("tractions", [mpm.Traction("top", lambda t: (0, -LOAD * t))])
     fixed = {"left": "x", "right": "x", "bottom": "y"}
     body = mpm.box(grid, [0, 0], [1, 1])
-    return mpm.Simulation(grid, [body], [material or soil()], fixed=fixed, tractions=[load], **options)
+    return mpm.Simulation(grid, [body], [material or soil()], fixed=fixed, **options)
 
 
 def weighted(cells: int) -> mpm.Simulation:
@@ -114,6 +114,14 @@ def conducting(cells: int, law: type[mpm.Skeleton]) -> mpm.Simulation:
     return block(cells, soil(law, conductivity=kappa * WATER["fluid"].unit_weight), **WATER)
 
 
+def sealed_soil(cells: int, yields: bool = True) -> mpm.Simulation:
+    """Return the sealed block of plastic soil, with the damping of pressure jumps of what yields or of elastic soil."""
+    simulation = block(cells, soil(mpm.DruckerPrager, friction=0.0, dilation=0.0, cohesion=LOAD), **SEALED)
+    if not yields:
+        simulation.scene.materials._softness.clear()
+    return simulation
+
+
 Make = Callable[[int], mpm.Simulation]
 PAIRS: dict[str, tuple[Make, Make]] = {
     "pore fluid that drains at once": (block, lambda n: block(n, soil(conductivity=1e3), **WATER)),
@@ -121,8 +129,13 @@ PAIRS: dict[str, tuple[Make, Make]] = {
     "layers off the grid lines": (partial(layered, off=0.0), partial(layered, off=0.5)),
     "second order in time": (lambda n: draining(n, method="backward-euler"), draining),
     "body force": (block, lambda n: block(n, gravity=(0, 0))),
+    "pressure that follows the surface": (
+        block,
+        lambda n: block(n, tractions=[mpm.Pressure("top", lambda t: LOAD * t)]),
+    ),
     "ghost penalty on all faces": (block, weighted),
     "damping of pressure jumps": (lambda n: conducting(n, mpm.Hencky), lambda n: conducting(n, Watched)),
+    "damping of what yields": (lambda n: sealed_soil(n, yields=False), sealed_soil),
     "mean dilatation": (
         lambda n: block(n, soil(nu=LOCKING - 1e-3)),
         lambda n: block(n, soil(nu=LOCKING + 1e-3)),

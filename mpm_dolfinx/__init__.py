@@ -3,9 +3,9 @@
 
 A scene is a `Simulation` of a `Grid`, bodies (`box`, `shape`, `mapped`), materials (`Hencky`, `NeoHookean`,
 `LinearElastic`, `DruckerPrager`, or your own `Skeleton`), a `Fluid` and conditions on the sides of the bodies
-(`Traction`, `Displacement`, `RigidPlate`, `Drained`, `Inflow`).  Its `run` gives a `Result` with the displacements
-of `probes`, and feeds a `Writer` and a `Checkpoint`, from which `resume` goes on; `stage` changes the scene between
-two runs.  Terms and sources in UFL: see `mpm_dolfinx.extend`.
+(`Traction`, `Pressure`, `Displacement`, `RigidPlate`, `Drained`, `Inflow`).  Its `run` gives a `Result` with the
+displacements of `probes`, and feeds a `Writer` and a `Checkpoint`, from which `resume` goes on; `stage` changes the
+scene between two runs.  Terms and sources in UFL: see `mpm_dolfinx.extend`.
 
 SI units throughout.  Stress is positive in tension, pore pressure in compression; 2D is plane strain, and forces
 are those of a slice of 1 m.
@@ -29,7 +29,7 @@ from mpm_dolfinx.io.writer import Writer
 from mpm_dolfinx.points.bodies import box, mapped, shape
 from mpm_dolfinx.points.grid import Grid
 from mpm_dolfinx.points.probes import probes
-from mpm_dolfinx.problems.conditions import Displacement, Drained, Inflow, RigidPlate, Traction
+from mpm_dolfinx.problems.conditions import Displacement, Drained, Inflow, Pressure, RigidPlate, Traction
 from mpm_dolfinx.result import Result
 from mpm_dolfinx.simulation import Simulation
 from mpm_dolfinx.solve.scheme import COUPLINGS
@@ -53,6 +53,7 @@ __all__ = [
     "LinearElastic",
     "NeoHookean",
     "NotConverged",
+    "Pressure",
     "Result",
     "RigidPlate",
     "Simulation",

@@ -26,6 +26,7 @@ from mpm_dolfinx.points.pressure_transport import PiecePressures, Reconstruction
 from mpm_dolfinx.problems.mechanical_boundary import MechanicalBoundary
 from mpm_dolfinx.problems.momentum import MomentumForms
 from mpm_dolfinx.problems.on_grid import OnGrid
+from mpm_dolfinx.problems.quadrature_data import QuadratureData
 from mpm_dolfinx.problems.storage import StorageForms
 from mpm_dolfinx.state import State, Stay
 
@@ -81,7 +82,7 @@ class Motion:
             nodal = self._momentum.u.x.array.reshape(-1, d)
             N, dN = grid.shape_functions(pieces.cells, pieces.x)
             at_nodes = nodal[grid.cell_nodes[pieces.cells]].transpose(0, 2, 1)
-            deformed = partial(self._deformed, state.points, cut, np.eye(d) + at_nodes @ dN, pieces.cells)
+            deformed = partial(self._deformed, state.points, cut, np.eye(d) + at_nodes @ dN, on_grid.data)
             moved = cut.displacement(nodal)
             if cut.domains:
                 bend = cut.bend(nodal, self._momentum.active_nodes(on_grid.cells))
@@ -91,7 +92,7 @@ class Motion:
                 points = replace(state.points, x=x, F=F, corners=parallelepipeds(x, F, self._sizes(state.points)))
                 serves, folded = cut.serves(points), 0
             self._check_volumes(points, cut)
-            points = replace(points, data=self._materials.updated_state(points))
+            points = replace(points, data=self._materials.updated_state(points, state.points))
             ids, pressure, x, start = None, None, None, None
             if self._storage is not None:
                 pressure = cut.to_pieces(self._storage.p.x.array[pieces.cells])
@@ -103,15 +104,15 @@ class Motion:
         return new if serves and stays else self.left_grid(new, on_grid), folded
 
     def _deformed(
-        self, points: MaterialPoints, cut: CutDomains, delta: NDArray[np.float64], cells: NDArray[np.int32]
+        self, points: MaterialPoints, cut: CutDomains, delta: NDArray[np.float64], data: QuadratureData
     ) -> NDArray[np.float64]:
-        """Return F (n, d, d) of the points after a step, delta (m, d, d) the deformation of their pieces in cells (m,).
+        """Return F (n, d, d) of the points after a step, delta (m, d, d) the deformation of their pieces.
 
         F_p <- (sum_k w_k Delta_k / V_p) F_p.
         """
         n, d = len(points), cut.grid.dim
         if self._momentum.dilatation is not None:
-            delta = self._momentum.dilatation.averaged(delta, cells)
+            delta = self._momentum.dilatation.averaged(delta, data)
         mean = [cut.mean(column) for column in cut.to_pieces(delta).reshape(-1, d * d).T]
         return np.stack(mean, axis=1).reshape(n, d, d) @ points.F
 
@@ -125,7 +126,7 @@ class Motion:
     ) -> tuple[MaterialPoints, bool, int]:
         """Return the points after their corners have moved (n, 2^d, d) and bent, m, with the F that these tell.
 
-        With mean dilatation the volume ratio is that of the cells, which `deformed` has in its F.
+        Where Q1 cells would lock the volume ratio is that of the cells, which `deformed` has in its F.
 
         Returns
         -------
@@ -147,7 +148,7 @@ class Motion:
             J = determinant(deformed())
             if not serves:
                 J = filtered_ratios(grid, stage.lattices, points, cut.points, J)
-            ratio = J / determinant(F)
+            ratio = np.where(self._materials.locking(points), J / determinant(F), 1.0)
             F = F * (np.sign(ratio) * np.abs(ratio) ** (1 / d))[:, None, None]
         return replace(points, corners=corners, x=corners.mean(axis=1), F=F), serves, folded
 

@@ -68,7 +68,9 @@ class Scene:
         sources: Sequence[Callable],
     ):
         self.grid, self.bodies, self.fluid, self.quadrature = grid, tuple(bodies), fluid, quadrature
-        self.materials = scene = SceneMaterials(grid, materials, bodies, material_points(grid, bodies, pressure))
+        self.materials = scene = SceneMaterials(
+            grid, materials, bodies, material_points(grid, bodies, pressure), fluid is not None
+        )
         self.gravity = fem.Constant(grid.mesh, np.zeros(grid.dim)) if weighs else None
         self.t, self.dt = fem.Constant(grid.mesh, 0.0), fem.Constant(grid.mesh, 1.0)
         """Time at the end of the substep, and since the start of the step, s, for forms."""
@@ -76,7 +78,7 @@ class Scene:
         laws, p = self.pieces.laws, fem.Function(grid.cellwise()) if fluid else None
         with compiling(f"materials: {', '.join(law.__name__ for law in scene.laws)}", "laws in UFL of these shapes"):
             wet = fluid.density if fluid else None
-            options = (self.gravity, wet, scene.nearly_incompressible, scene.symmetric)
+            options = (self.gravity, wet, scene.symmetric)
             options = (*options, quadrature == "point", terms, self.t, self.dt)
             self.momentum = MomentumForms(self.pieces.pieces, laws, p, *options)
         if not self.momentum.symmetric and scheme.coupling == "schur-cg":

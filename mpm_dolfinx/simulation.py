@@ -16,7 +16,7 @@ from mpm_dolfinx.io import summary
 from mpm_dolfinx.points.bodies import Body, check_bodies
 from mpm_dolfinx.points.grid import Grid
 from mpm_dolfinx.points.material_points import MaterialPoints
-from mpm_dolfinx.problems.conditions import Displacement, Drained, Inflow, RigidPlate, Traction
+from mpm_dolfinx.problems.conditions import Displacement, Drained, Inflow, Pressure, RigidPlate, Traction
 from mpm_dolfinx.problems.thin import warn_thin
 from mpm_dolfinx.result import Report, Result
 from mpm_dolfinx.scene import Scene
@@ -84,7 +84,7 @@ class Simulation:
         *,
         fixed: Mapping[str, str],
         fluid: Fluid | None = None,
-        tractions: Sequence[Traction] = (),
+        tractions: Sequence[Traction | Pressure] = (),
         displacements: Sequence[Displacement] = (),
         drained: Sequence[Drained] = (),
         inflows: Sequence[Inflow] = (),
@@ -187,7 +187,7 @@ class Simulation:
         self,
         *,
         fixed: Mapping[str, str] | None = None,
-        tractions: Sequence[Traction] | None = None,
+        tractions: Sequence[Traction | Pressure] | None = None,
         displacements: Sequence[Displacement] | None = None,
         drained: Sequence[Drained] | None = None,
         inflows: Sequence[Inflow] | None = None,

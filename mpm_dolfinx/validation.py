@@ -94,9 +94,10 @@ def chosen(name: str, values, among: Sequence[int], what: str) -> None:
             raise ValueError(f"{name}: body {line(value)}, must be one of the {what}, each once: {there}")
 
 
-def all_of(name: str, values, kind: type, least: int = 0) -> None:
+def all_of(name: str, values, kind: type | tuple[type, ...], least: int = 0) -> None:
     """Refuse what is not a sequence of at least so many objects of a kind, with a ValueError."""
-    allowed = f"a list of {'at least one ' if least else ''}{kind.__name__}"
+    kinds = " or ".join(k.__name__ for k in (kind if isinstance(kind, tuple) else (kind,)))
+    allowed = f"a list of {'at least one ' if least else ''}{kinds}"
     if isinstance(values, str) or not isinstance(values, Sequence) or len(values) < least:
         raise ValueError(f"{name} = {line(values)}, must be {allowed}")
     for value in values:

@@ -20,6 +20,7 @@ simulation = mpm.Simulation(
     inflows=[mpm.Inflow("left", 1e-9)],
     plates=[mpm.RigidPlate("top", lambda t: 2e4 * t)],
     gravity=lambda t: (0, -9.81 * t),
+    tractions=[mpm.Pressure("right", 50.0)],
 )
 result = simulation.run(1.0, 0.25, progress=False)
 stress, points = simulation.effective_stress(), simulation.points

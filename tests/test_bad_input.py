@@ -208,6 +208,19 @@ CASES = {
     ),
     "region of nan": (lambda: sides("Inflow", "top", 1.0, region=((0, 0), (NAN, 1))), "region", "nan"),
     "traction of another dimension": (lambda: sides("Traction", "top", (0, 0, 1)), "Traction(side='top'", "(0, 0, 1)"),
+    "pressing nan": (lambda: sides("Pressure", "top", NAN), "Pressure(side='top'", "nan"),
+    "pressure with components": (lambda: sides("Pressure", "top", (0, 1)), "Pressure(side='top'", "(0, 1)"),
+    "pressure that is nan later": (
+        lambda: sides("Pressure", "top", lambda t: NAN if t > 0.5 else 1.0).run(1, 0.25),
+        "Pressure(side='top'",
+        "nan",
+    ),
+    "pressure on no side": (lambda: sides("Pressure", "lid", 1.0), "side 'lid'", "left, right, bottom, top"),
+    "pressure in no region": (
+        lambda: sides("Pressure", "top", 1.0, region=((0.8, 0), (1, 1))),
+        "Pressure(side='top'",
+        "must be one of a body",
+    ),
     "traction of nan": (lambda: sides("Traction", "top", (0, NAN)), "Traction(side='top'", "nan"),
     "traction that goes wrong": (
         lambda: sides("Traction", "top", later((0, NAN))).run(1, 0.25),

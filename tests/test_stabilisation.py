@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Ghost penalty and damping of pressure jumps vanish with the cell size as fast as the scheme's own error."""
+"""Ghost penalty and damping of pressure jumps vanish with the cell size as fast as the scheme's own error.
+
+Where soil yields the damping is that of the tangent.
+"""
 
 from functools import cache
 
@@ -7,6 +10,7 @@ import numpy as np
 import pytest
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx.constitutive.evaluate import MOST
 from mpm_dolfinx.problems.ghost_penalty import GHOST
 
 SHEAR, LOAD, K = 1e6, 1e2, np.pi  # Pa, Pa, 1/m
@@ -103,3 +107,51 @@ def test_what_the_ghost_penalty_changes_vanishes_faster_than_the_error(strength,
     u, p = changes(0, 0.1, ghost=strength), changes(1, 0.1, ghost=strength)
     assert orders(u).min() > 2.3 and (0 < u).all() and (u < share * errors(0, filled=0.1)).all()
     assert orders(p).min() > 1.2
+
+
+def pushed(monkeypatch, most, law=mpm.DruckerPrager, **strength):
+    """Return load and pressures (columns, rows), Pa, under a footing pushed into an undrained layer of flat cells."""
+    monkeypatch.setattr("mpm_dolfinx.constitutive.evaluate.MOST", most)
+    grid = mpm.Grid(lower=[0, -1], upper=[1.6, 0.2], cells=[24, 6])
+    soil = law(bulk=13 / 6 * 1e8, shear=1e8, **strength)
+    under, beside = ((0, -1), (7 / 15, 1)), ((7 / 15, -1), (2, 1))
+    foot = mpm.Displacement("top", lambda t, X: (0, -6e-4 * t), region=under)
+    walls, open_side = {"left": "x", "right": "x", "bottom": "xy"}, mpm.Drained("top", region=beside)
+    scene = {"fixed": walls, "fluid": mpm.Fluid(), "drained": [open_side], "displacements": [foot]}
+    s = mpm.Simulation(grid, [mpm.box(grid, [0, -1], [1.6, 0])], [soil], **scene)
+    s.run(1.0, 0.05)
+    column, row = grid.index(s.points.x).T
+    p = np.zeros((24, 5))
+    p[column, row] = s.points.pressure
+    return s.reactions[0, 1], p
+
+
+def alternating(p):
+    """Return the rms of the part of pressures that alternates along both axes."""
+    for axis in (0, 1):
+        q = np.moveaxis(p, axis, 0)
+        p = np.moveaxis((2 * q[1:-1] - q[:-2] - q[2:]) / 4, 0, axis)
+    return rms(p)
+
+
+def test_pressures_do_not_alternate_where_soil_flows(monkeypatch):
+    """The cells are three times as high as wide; the footing's load stays."""
+    (_, plain), (load, p) = (
+        pushed(monkeypatch, most, friction=0.0, dilation=0.0, cohesion=1e4) for most in (1.0, MOST)
+    )
+    assert alternating(plain) > 0.35e4 and alternating(p) < 0.09e4
+    assert load == pytest.approx(-(2 + np.pi) * 1e4 * 0.5, rel=0.1)
+
+
+def test_soil_that_could_yield_and_does_not_is_damped_as_elastic_soil(monkeypatch):
+    strength = {"friction": 0.0, "dilation": 0.0, "cohesion": 1e9}
+    (one, plain), (other, p) = (pushed(monkeypatch, most, **strength) for most in (1.0, MOST))
+    assert other == pytest.approx(one, rel=1e-5) and np.abs(p - plain).max() < 1e-4 * np.abs(plain).max()
+
+
+def test_only_points_in_water_of_laws_with_a_state_carry_their_softness():
+    grid, walls = mpm.Grid([0.2, 0.4], [2, 4]), {"left": "x", "right": "x", "bottom": "y"}
+    sand = mpm.DruckerPrager(1e7, 5e6, friction=0.0, dilation=0.0, cohesion=1e3)
+    for soil, fluid in ((mpm.Hencky(1e7, 5e6), mpm.Fluid()), (sand, None), (sand, mpm.Fluid())):
+        s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [0.2, 0.3])], [soil], fluid=fluid, fixed=walls)
+        assert ("softness" in s.points.data) == bool(soil.state and fluid)

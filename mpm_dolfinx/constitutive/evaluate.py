@@ -90,6 +90,50 @@ class LawAtPoints:
         return out
 
 
+MOST = 100.0
+"""The most by which a skeleton counts as softer than elastic: perfectly plastic flow has no stiffness at all."""
+LEAST = 1e-12  # strain of a step below which it counts as elastic
+
+
+class SoftnessAtPoints:
+    """By how much material points that yield are softer in shear than elastic, along the strain of the last step.
+
+    What alternates from cell to cell in the volume changes grows with the strain; the pressures that balance it are
+    this over the strength tau of their damping, 1/Pa, that of the elastic moduli.  Where soil flows the strain grows
+    and the stress does not: tau must be that of the tangent, else pressures alternate by as much as the soil is strong.
+    With the strain of a step e = dev sym dF F^-1 and the Kirchhoff stress at F - (1 - s) dF, the tangent's shear
+    modulus is G_t = (d tau / ds) : e / (2 e : e) at s = 1.  It is that of the step before: one of the present iterate
+    would keep Newton's method from converging, or make the answer depend on its way.
+
+    Parameters
+    ----------
+    grid, law, shapes
+        See `LawAtPoints`.
+    """
+
+    def __init__(self, grid: Grid, law: type[Skeleton], shapes: dict[str, tuple[int, ...]]):
+        self._law, self._grid, self._shapes, d = law, grid, shapes, grid.dim
+        self._points = points = FormPoints(grid, F=(d, d), dF=(d, d), **shapes)
+        s = ufl.variable(fem.Constant(grid.mesh, 1.0))
+        F = ufl.variable(points.F - (1 - s) * points.dF)
+        tau = law.first_piola(F, {name: getattr(points, name) for name in shapes}) * F.T
+        e = ufl.sym(points.dF * ufl.inv(points.F))
+        e -= ufl.tr(e) / d * ufl.Identity(d)
+        size = ufl.sqrt(ufl.inner(e, e) + LEAST**2)
+        self._along = PointExpression(ufl.as_vector([size, ufl.inner(ufl.diff(tau, s), e) / size]), points)
+
+    def __call__(self, at: PointData, dF: NDArray[np.float64], shear: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the softness (n,) of points with F and what the law takes, in [1, MOST].
+
+        dF (n, d, d): change of F in the step; shear (n,): elastic shear modulus, Pa.
+        """
+        fields = {name: at[name] for name in ("F", *self._shapes)}
+        strain, change = self._along.evaluate(PointData(self._points, at.places, at.volume, {"dF": dF, **fields})).T
+        elastic = 2 * shear * strain
+        soft = elastic / np.maximum(change, elastic / MOST)
+        return np.where(strain > 10 * LEAST, np.maximum(soft, 1.0), 1.0)
+
+
 class ConductivityAtPieces:
     """Conductivities that depend on deformation and place, evaluated at the pieces.
 

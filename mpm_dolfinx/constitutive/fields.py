@@ -12,7 +12,7 @@ from inspect import signature
 import numpy as np
 from numpy.typing import NDArray
 
-from mpm_dolfinx.constitutive.evaluate import LawAtPoints, sampled
+from mpm_dolfinx.constitutive.evaluate import LawAtPoints, SoftnessAtPoints, sampled
 from mpm_dolfinx.constitutive.skeleton import Fluid, Skeleton
 from mpm_dolfinx.errors import NotConverged
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData
@@ -22,7 +22,7 @@ from mpm_dolfinx.points.grid import Grid
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.validation import numbers
 
-RESERVED = ("F", "storage", "storage_at_one", "density", "position", "displacement", "porosity0", "gradient")
+RESERVED = frozenset("F dF softness storage storage_at_one density position displacement porosity0 gradient".split())
 """Names of what points of integration carry beside parameters and state."""
 
 
@@ -39,9 +39,13 @@ class SceneMaterials:
         All bodies; their reference positions are where fields are evaluated.
     points
         The points of this process, as seeded.
+    wet
+        Whether there is a fluid.
     """
 
-    def __init__(self, grid: Grid, materials: Sequence[Skeleton], bodies: Sequence[Body], points: MaterialPoints):
+    def __init__(
+        self, grid: Grid, materials: Sequence[Skeleton], bodies: Sequence[Body], points: MaterialPoints, wet: bool
+    ):
         self._grid, self.materials = grid, materials
         seeded: dict[str, NDArray[np.float64]] = {}
         X, index = _reference(bodies, len(materials))
@@ -52,6 +56,10 @@ class SceneMaterials:
         self.conductivity_laws = list(dict.fromkeys(m.conductivity_law for m in used if m.conductivity_law))
         """The different conductivity laws of the scene."""
         self._law = np.array([self.laws.index(type(m)) if type(m) in self.laws else 0 for m in materials])
+        locks = [bool(np.any(m.nearly_incompressible)) for m in evaluated]
+        self._parts = list(dict.fromkeys(zip(map(type, used), locks, strict=True)))
+        own = dict(zip(self._used, zip(map(type, used), locks, strict=True), strict=True))
+        self._part = np.array([self._parts.index(own[i]) if i in own else 0 for i in range(len(materials))])
         self.symmetric = all(m.symmetric for m in used)
         """Whether the tangents of all materials are symmetric."""
         self.stiffest = max(float(np.max(m.oedometric, initial=0.0)) for m in evaluated)
@@ -67,8 +75,6 @@ class SceneMaterials:
         by_place = any(callable(m.conductivity) for m in materials) or any(map(_names_place, self.conductivity_laws))
         self.layered = by_place or len({m.conductivity_law for m in used}) > 1 or bool(np.ptp(conductivity))
         """Whether points may differ in what they conduct."""
-        self.nearly_incompressible = any(np.any(m.nearly_incompressible) for m in evaluated)
-        """Whether Q1 cells would lock somewhere."""
         self._fields = [[name for name in _names(m) if callable(getattr(m, name))] for m in materials]
         self.checksums: dict[str, int | list[float]] = {
             f"conductivity law of material {i}": sampled(m.conductivity_law)
@@ -89,6 +95,13 @@ class SceneMaterials:
                 everywhere[rows] = value
                 mine = everywhere[points.id]
                 seeded[name] = mine + seeded[name] if name in seeded else mine
+        self._softness: dict[int, SoftnessAtPoints] = {}
+        if wet and any(law.state for law in self.laws):
+            seeded["softness"] = np.ones(len(points))
+            for number, law in enumerate(self.laws):
+                if law.state:
+                    shapes = {name: self.shapes[name] for name in _takes(law)}
+                    self._softness[number] = SoftnessAtPoints(grid, law, shapes)
         self.seeded = replace(points, data=seeded)
         """The points with what they carry at the start: parameters that differ from place to place, state."""
         self._at_points = [
@@ -119,20 +132,26 @@ class SceneMaterials:
         if other != shape:
             raise ValueError(f"{law.__name__}: {name} has shape {shape}, in another law {other}; must agree")
 
-    def parts(self, pieces: FormPoints, common: Sequence[str]) -> list[tuple[type[Skeleton], FormPoints]]:
-        """Return each law with points for the pieces that follow it; a single law's are all `pieces`.
+    def parts(self, pieces: FormPoints, common: Sequence[str]) -> list[tuple[type[Skeleton], FormPoints, bool]]:
+        """Return each law with points for the pieces that follow it, and whether Q1 cells would lock with these.
 
-        The points of several laws have the fields `common` of the pieces and what their law takes.
+        Materials of one law of which some lock and others do not are two parts; a single part's points are all
+        `pieces`, those of several have the fields `common` of the pieces and what their law takes.
         """
-        if len(self.laws) == 1:
-            return [(self.laws[0], pieces)]
-        names = [dict.fromkeys([*common, *_takes(law)]) for law in self.laws]
+        if len(self._parts) == 1:
+            return [(law, pieces, locks) for law, locks in self._parts]
+        names = [dict.fromkeys([*common, *_takes(law)]) for law, _ in self._parts]
         shapes = [{name: getattr(pieces, name).ufl_shape for name in taken} for taken in names]
-        return [(law, FormPoints(pieces.grid, **s)) for law, s in zip(self.laws, shapes, strict=True)]
+        points = [FormPoints(pieces.grid, **s) for s in shapes]
+        return [(law, own, locks) for (law, locks), own in zip(self._parts, points, strict=True)]
 
-    def law_of(self, points: MaterialPoints) -> NDArray[np.int64]:
-        """Return the number of each point's law (n,)."""
-        return self._law[points.material]
+    def part_of(self, points: MaterialPoints) -> NDArray[np.int64]:
+        """Return the number of each point's part (n,), see `parts`."""
+        return self._part[points.material]
+
+    def locking(self, points: MaterialPoints) -> NDArray[np.bool_]:
+        """Return at which points (n,) Q1 cells would lock."""
+        return np.array([locks for _, locks in self._parts])[self.part_of(points)]
 
     def conducting(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return what points (n, 2) that conduct alike have in common: conductivity, m/s, and number of their law.
@@ -206,17 +225,18 @@ class SceneMaterials:
         pressure = self.table(points, lambda m: m.biot) * points.pressure
         return self.effective_stress(points) - pressure[:, None, None] * np.eye(self._grid.dim)
 
-    def updated_state(self, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
-        """Return what the points, given with the F of the end of a step, carry from then on.
+    def updated_state(self, points: MaterialPoints, before: MaterialPoints) -> dict[str, NDArray[np.float64]]:
+        """Return what the points, given with the F of the end of a step, carry from then on; before: at its start.
 
         Raises
         ------
         NotConverged
             The new state is not finite.
         """
-        if all(law.update is None for law in self.laws):
+        if all(law.update is None for law in self.laws) and not self._softness:
             return points.data
-        new = [(law.law, rows, name, v) for law, rows, at in self._placed(points) for name, v in law.new_state(at)]
+        placed = self._placed(points)
+        new = [(law.law, rows, name, v) for law, rows, at in placed for name, v in law.new_state(at)]
         bad = [(law, name, rows[~_finite(values)]) for law, rows, name, values in new]
         shown = [f"{law.__name__}.update: {name!r} is not finite at {points.x[i[0]]}" for law, name, i in bad if len(i)]
         if message := first(self._grid.comm, "".join(shown[:1])):
@@ -224,11 +244,17 @@ class SceneMaterials:
         out = {name: values.copy() if name in self.state_names else values for name, values in points.data.items()}
         for _, rows, name, values in new:
             out[name][rows] = values
+        if self._softness:
+            out["softness"], dF = np.ones(len(points)), points.F - before.F
+            shear = self.table(points, lambda m: m.shear)
+            for number, softness in self._softness.items():
+                _, rows, at = placed[number]
+                out["softness"][rows] = softness(at, dF[rows], shear[rows])
         return out
 
     def _placed(self, points: MaterialPoints) -> list[tuple[LawAtPoints, NDArray[np.int64], PointData]]:
         """Return every law with the indices and the data of the points that follow it."""
-        number, values = self.law_of(points), {"F": points.F, **self.parameters(points), **self.state(points)}
+        number, values = self._law[points.material], {"F": points.F, **self.parameters(points), **self.state(points)}
         rows = [np.flatnonzero(number == k) for k in range(len(self.laws))]
         return [(law, own, law.data(points, own, values)) for law, own in zip(self._at_points, rows, strict=True)]
 

@@ -29,7 +29,7 @@ class Part:
 
 def parts(scene: Scene, state: State) -> list[Part]:
     """Return the terms and solvers of a scene, as they are so far: some are compiled when first they are needed."""
-    return [*_momentum(scene, state), *_storage(scene, state), *_solvers(scene)]
+    return [*_momentum(scene, state), *_storage(scene, state), *_solvers(scene, state)]
 
 
 def _either(name: str, used, what: str, otherwise: str) -> Part:
@@ -43,11 +43,15 @@ def _momentum(s: Scene, state: State) -> list[Part]:
         _either("reset of the grid", state.resets > 1, f"{state.resets} so far", "nothing has moved so far"),
         Part("stress", True, f"{laws}; integrated over {'exact domains' if s.quadrature == 'domain' else 'points'}"),
         _either(
-            "mean dilatation", m.dilatation, f"nu > {LOCKING}, or plastic flow", f"nu <= {LOCKING}, no plastic flow"
+            "mean dilatation",
+            m.dilatation,
+            f"of what has nu > {LOCKING}, or plastic flow",
+            f"nu <= {LOCKING}, no plastic flow",
         ),
         _either("state of the law", evolves, evolves, "the stress depends on F only"),
         _either("body force", s.gravity is not None, "gravity", "no gravity"),
         _either("tractions", side.loads, f"on {len(side.loads)} sides", "no tractions"),
+        _either("pressures", side.pressures, f"on {len(side.pressures)} sides", "no pressures"),
         _either("given displacements", side.holds, f"on {len(side.holds)} sides", "no given displacements"),
         _either("rigid plates", side.plates, f"on {len(side.plates)} sides", "no plates"),
         _either("ghost penalty", m.ghost.form.used, "faces of nearly empty cells", "no nearly empty cell so far"),
@@ -71,13 +75,14 @@ def _storage(s: Scene, state: State) -> list[Part]:
     ]
 
 
-def _solvers(s: Scene) -> list[Part]:
-    kind = "symmetric" if s.momentum.symmetric else "unsymmetric: LU and FGMRES"
+def _solvers(s: Scene, state: State) -> list[Part]:
+    side = state.stage.mechanical
+    kind = "symmetric" if s.momentum.symmetric and side.symmetric else "unsymmetric: LU and FGMRES"
     return [
         _either("coupling", s.storage, f"{s.scheme.coupling}, {kind}", "no fluid: Newton on the momentum"),
         _either(
             "one factorisation for many steps",
-            s.momentum.linear,
+            s.momentum.linear and not side.pressures,
             "linear law: until active cells or time step change",
             "the tangent depends on the strain",
         ),

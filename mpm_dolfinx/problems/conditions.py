@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Conditions on the sides of the bodies: tractions, displacements, rigid plates, drained sides, prescribed inflow.
+"""Conditions on the sides of the bodies: tractions, pressures, displacements, plates, drained sides, prescribed inflow.
 
 A side is named "left", "right", "bottom" or "top", in 3D also "front" (lower y) and "back" (upper y), by where it is
 in the seeded body, before a map; it moves with the body.  What of it lies on another body, as seeded, does not count.
@@ -53,6 +53,41 @@ class Traction:
         name, allowed = f"{line(self)}: value at t = {t:g} s", f"a finite number or {dim} of them"
         value = asked(name, f"{allowed} for a time", self.value, t) if callable(self.value) else self.value
         return numbers(name, value, (), (dim,), allowed=allowed)
+
+
+@dataclass(frozen=True, eq=False)
+class Pressure:
+    """Pressure on a side of the bodies, wherever it goes: normal to the present surface, per present area.
+
+    Given among the tractions, with which it adds up.  It acts on skeleton and pore fluid together: of water that also
+    enters the pores, `Drained` gives the pressure.  Where pressures of one value meet walls that hold the surface's
+    ends, or one another all around the body, they have a potential; else the tangent is unsymmetric (LU, FGMRES), and
+    nothing tells whether an equilibrium without pore fluid is stable.
+
+    Parameters
+    ----------
+    side
+        Side of the bodies, as for `Traction`.
+    value : float or callable t (s) -> float, Pa
+        Finite; positive: presses, negative: sucks.
+    region : ((d,), (d,)), m
+        As for `Traction`.
+
+    Raises
+    ------
+    ValueError
+        As for `Traction`.
+    """
+
+    side: str
+    value: float | Callable[[float], float]
+    region: Region | None = None
+
+    def at(self, t: float) -> float:
+        """Return the pressure at time t (s), Pa."""
+        name, allowed = f"{line(self)}: value at t = {t:g} s", "a finite number"
+        value = asked(name, f"{allowed} for a time", self.value, t) if callable(self.value) else self.value
+        return float(numbers(name, value, allowed=allowed))
 
 
 @dataclass(frozen=True, eq=False)

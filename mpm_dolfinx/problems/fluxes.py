@@ -147,21 +147,19 @@ class CellContents:
         self.volume = volume.sum()
         """Volume of all that this process's cells hold, m^d."""
         shapes = (forms.centroid, forms.lower_face, forms.upper_face)
-        for f in (forms.damping, forms.fixed_stress, *shapes):
+        self._damped, self._damping = forms.damping, pieces.damping
+        for f in (forms.fixed_stress, *shapes):
             f.x.array[:] = 0.0
-        values = {forms.damping: self.mean(pieces.damping)}
-        values[forms.fixed_stress] = self.total(cells, weight * pieces.fixed_stress)
-        for f, rows in values.items():
-            f.x.array[filled] = rows
+        forms.fixed_stress.x.array[filled] = self.total(cells, weight * pieces.fixed_stress)
         centroid, lower, upper = (f.x.array.reshape(-1, grid.dim) for f in shapes)
         for a in range(grid.dim):
             centroid[filled, a] = self.mean(pieces.x[:, a]) - grid.midpoints[filled, a]
             for target, end in ((lower, 0), (upper, 1)):
                 target[filled, a] = self.total(cells, pieces.faces[:, a, end]) * grid.h[a] / grid.cell_volume
-        for f in (*values, *shapes):
+        for f in (forms.fixed_stress, *shapes):
             f.x.scatter_forward()
-        self.damping, self.fixed_stress = (f.x.array.copy() for f in values)
-        """Strength tau of the damping, 1/Pa; fixed-stress coefficient times volume."""
+        self.fixed_stress = forms.fixed_stress.x.array.copy()
+        """Fixed-stress coefficient times volume."""
         self._slopes = grid.shape_gradients(filled, grid.midpoints[filled] + centroid[filled])
         self._values = grid.shape_values(filled, grid.midpoints[filled] + centroid[filled])
         self.centroid, self.open = centroid.copy(), np.stack([lower, upper], axis=2)
@@ -170,6 +168,21 @@ class CellContents:
     def total(self, cells: NDArray[np.int32], values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Sum values over the rows of each filled cell."""
         return sum_by(self._slot[cells], values, len(self.filled))
+
+    def set_damping(self, softness: NDArray[np.float64] | float) -> NDArray[np.float64]:
+        """Set the strength tau of the damping for pieces (m,) that are so much softer in shear; return it, 1/Pa.
+
+        A cell is as soft as its softest piece: it is the one that flows.
+        """
+        tau, values = self._damped.x, self.mean(self._damping)
+        if np.ndim(softness):
+            softest = np.ones(len(values))
+            np.maximum.at(softest, self._slot[self._cells], softness)
+            values *= softest
+        tau.array[:] = 0.0
+        tau.array[self.filled] = values
+        tau.scatter_forward()
+        return values
 
     def mean(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the means over the pieces (m,) of each filled cell."""

@@ -4,9 +4,11 @@
 Four constraints of volume a cell leave a Q1 quadrilateral no freedom to bend: with nu = 0.499 it is up to half
 too stiff.  Here the law sees the deformation gradient with the volume ratio of the step averaged over the cell,
 
-    Fbar = (theta J_n / det F)^(1/d) F,     theta = sum w det(Delta) / sum w   over the cell's pieces,
+    Fbar = (theta J_n / det F)^(1/d) F,     theta = sum w det(Delta) / sum w   over the cell's pieces that lock,
 
-d = 2 in plane strain.  The energy sum w psi(Fbar) / J_n has the derivative
+d = 2 in plane strain.  Which do is a matter of their material (`Skeleton.nearly_incompressible`).  In a cell that these
+share with others the others see their own F: one constraint a cell is left, and neither kind of material knows of
+the other but by the displacements that they share.  The energy sum w psi(Fbar) / J_n has the derivative
 
     sum w [dPsi/dF : dF + pi d(det Delta)],   pi = (sum w dPsi/dtheta) / (sum w),
 
@@ -32,6 +34,8 @@ from mpm_dolfinx.constitutive.skeleton import Skeleton
 from mpm_dolfinx.constitutive.user_functions import expression
 from mpm_dolfinx.forms.cell_matrices import insert, shape_gradients
 from mpm_dolfinx.forms.point_forms import CellSums, FormPoints, PointData
+from mpm_dolfinx.points.grid import Grid, sum_by
+from mpm_dolfinx.problems.quadrature_data import QuadratureData
 
 
 class MeanDilatation:
@@ -39,23 +43,21 @@ class MeanDilatation:
 
     Parameters
     ----------
-    pieces
-        All points of integration, with the field F (d, d), the deformation gradient at the start of the step.
-    u
-        Increment of the displacement in the step.
+    grid
+        Background grid.
+    numbers
+        Which parts of the pieces lock, see `QuadratureData`, in the order in which they are added.
     symmetric
         Whether the tangents of all laws are symmetric.
     """
 
-    def __init__(self, pieces: FormPoints, u: fem.Function, symmetric: bool = True):
-        self._grid, self._d, self._symmetric = pieces.grid, pieces.grid.dim, symmetric
-        cellwise = pieces.grid.cellwise()
-        self.theta, self.pi = fem.Function(cellwise), fem.Function(cellwise)
-        F = pieces.deformation(u)
-        ratio = ufl.det(F) / ufl.det(pieces.F)
-        self._weight, self._ratio = CellSums([ufl.as_ufl(1.0)], pieces), CellSums([ratio], pieces)
-        self._ratio_slope = CellSums(self._along_shapes(ufl.diff(ratio, F), pieces), pieces)
+    def __init__(self, grid: Grid, numbers: Sequence[int], symmetric: bool = True):
+        self._grid, self._d, self._symmetric, self._numbers = grid, grid.dim, symmetric, numbers
+        self.theta, self.pi = fem.Function(grid.cellwise()), fem.Function(grid.cellwise())
+        self._filled: Latest[Cells] = Latest()
         self._volume: Latest[NDArray[np.float64]] = Latest()
+        self._ratios: list[CellSums] = []
+        self._ratio_slopes: list[CellSums] = []
         self._slopes: list[CellSums] = []
         self._derivatives: list[CellSums] = []
 
@@ -65,14 +67,14 @@ class MeanDilatation:
         return [ufl.dot(T, g)[i] for g in shape_gradients(points) for i in range(self._d)]
 
     def add(self, law: type[Skeleton], points: FormPoints, F, values: Mapping[str, object]):
-        """Add the pieces that follow a law.
+        """Add the pieces of a part that locks.
 
         Parameters
         ----------
         law
-            Class of the law.
+            Class of its law.
         points
-            Its pieces; theirs are the cells of `pieces`.
+            Its pieces, with the field F (d, d), the deformation gradient at the start of the step.
         F
             Deformation gradient (d, d), a UFL variable.
         values
@@ -83,6 +85,9 @@ class MeanDilatation:
         The first Piola-Kirchhoff stress that the residual takes, Pa, as UFL of F, theta and pi.
         """
         J_n, theta = ufl.det(points.F), ufl.variable(self.theta)
+        ratio = ufl.det(F) / J_n
+        self._ratios.append(CellSums([ratio], points))
+        self._ratio_slopes.append(CellSums(self._along_shapes(ufl.diff(ratio, F), points), points))
         P, slope = self._stress(law, F, theta, J_n, values)
         self._slopes.append(CellSums([slope / J_n], points))
         derivatives = [*self._along_shapes(ufl.diff(slope / J_n, F), points), ufl.diff(slope / J_n, theta)]
@@ -101,43 +106,70 @@ class MeanDilatation:
         mean = ufl.tr(tau) / self._d
         return (tau - mean * ufl.Identity(self._d)) * ufl.inv(F).T, mean / theta
 
-    def update(self, data: PointData, parts: Sequence[PointData]) -> None:
-        """Set theta and pi at the present displacement; parts: the pieces of each law."""
-        cells, volume = data.places.filled, self._volume_of(data)[:, 0]
-        self.theta.x.array[cells] = self._ratio(data)[:, 0] / volume
-        self.pi.x.array[cells] = _total(self._slopes, data, parts)[:, 0] / volume
+    def update(self, data: QuadratureData) -> None:
+        """Set theta and pi at the present displacement."""
+        cells, volume = self._cells(data).filled, self._volume_of(data)[:, 0]
+        self.theta.x.array[cells] = self._total(self._ratios, data)[:, 0] / volume
+        self.pi.x.array[cells] = self._total(self._slopes, data)[:, 0] / volume
 
-    def assemble_matrix(self, A: PETSc.Mat, data: PointData, parts: Sequence[PointData]) -> None:
+    def assemble_matrix(self, A: PETSc.Mat, data: QuadratureData) -> None:
         """Add what theta and pi contribute to the tangent at the last update; the caller finalises it."""
         count, volume = 2**self._d * self._d, self._volume_of(data)
-        derivatives = _total(self._derivatives, data, parts)
-        b, c = self._ratio_slope(data) / volume, derivatives[:, :count] / volume
+        derivatives = self._total(self._derivatives, data)
+        b, c = self._total(self._ratio_slopes, data) / volume, derivatives[:, :count] / volume
         e = derivatives[:, count, None] / volume
         d = c if self._symmetric else derivatives[:, count + 1 :] / volume
         # (d b^T + b c^T + e b b^T) V with the means b, c, d, e of the derivatives of det(Delta), dPsi/dtheta, P
         e *= 0.5
         columns, rows = (c + e * b) * volume, (d + e * b) * volume
         matrices = b[:, :, None] * columns[:, None, :] + rows[:, :, None] * b[:, None, :]
-        insert(A, self._grid, data.places.filled, matrices)
+        insert(A, self._grid, self._cells(data).filled, matrices)
 
-    def _volume_of(self, data: PointData) -> NDArray[np.float64]:
-        """Return the volumes (cells, 1) of what the filled cells hold."""
-        return self._volume(data.key, lambda: self._weight(data))
+    def averaged(self, delta: NDArray[np.float64], data: QuadratureData) -> NDArray[np.float64]:
+        """Return the gradients Delta (m, d, d) of the pieces, those that lock with the volume ratio of their cell."""
+        delta = delta.copy()
+        for number in self._numbers:
+            rows = data.rows[number]
+            theta, own = self.theta.x.array[data.parts[number].cells], delta[rows]
+            delta[rows] = own * ((theta / np.linalg.det(own)) ** (1 / self._d))[:, None, None]
+        return delta
 
-    def averaged(self, delta: NDArray[np.float64], cells: NDArray[np.int32]) -> NDArray[np.float64]:
-        """Return the gradients Delta (m, d, d) of pieces in cells (m,) with the volume ratio of their cell."""
-        theta = self.theta.x.array[cells]
-        return delta * ((theta / np.linalg.det(delta)) ** (1 / self._d))[:, None, None]
+    def _parts(self, data: QuadratureData) -> list[PointData]:
+        return [data.parts[number] for number in self._numbers]
+
+    def _cells(self, data: QuadratureData) -> Cells:
+        """Return the cells that hold pieces that lock."""
+        places = [part.places for part in self._parts(data)]
+        return self._filled(tuple(p.key for p in places), lambda: Cells([p.filled for p in places]))
+
+    def _volume_of(self, data: QuadratureData) -> NDArray[np.float64]:
+        """Return the volumes (cells, 1) of the pieces that lock."""
+        key = tuple(part.key for part in self._parts(data))
+
+        def volumes() -> NDArray[np.float64]:
+            sums = [sum_by(p.places.slots, p.volume, len(p.places.filled))[:, None] for p in self._parts(data)]
+            return self._cells(data).total(sums)
+
+        return self._volume(key, volumes)
+
+    def _total(self, sums: Sequence[CellSums], data: QuadratureData) -> NDArray[np.float64]:
+        """Return the sums (cells, quantities) over all pieces that lock."""
+        values = [of_part(part) for of_part, part in zip(sums, self._parts(data), strict=True)]
+        return self._cells(data).total(values)
 
 
-def _total(sums: Sequence[CellSums], data: PointData, parts: Sequence[PointData]) -> NDArray[np.float64]:
-    """Return the sums over all laws (cells, quantities) in the cells of `data`."""
-    total = 0.0
-    for of_law, part in zip(sums, parts, strict=True):
-        values = of_law(part)
-        if part is not data:
-            everywhere = np.zeros((len(data.places.filled), values.shape[1]))
-            everywhere[np.searchsorted(data.places.filled, part.places.filled)] = values
-            values = everywhere
-        total = total + values
-    return total
+class Cells:
+    """The cells of several parts; filled: all, where: the place of each part's among these."""
+
+    def __init__(self, of_parts: Sequence[NDArray[np.int32]]):
+        self.filled = np.unique(np.concatenate(of_parts))
+        self.where = [np.searchsorted(self.filled, cells) for cells in of_parts]
+
+    def total(self, values: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+        """Return the sums over all parts of what the cells of each hold."""
+        if len(values) == 1:
+            return values[0]
+        out = np.zeros((len(self.filled), values[0].shape[1]))
+        for where, of_part in zip(self.where, values, strict=True):
+            out[where] += of_part
+        return out

@@ -22,7 +22,8 @@ from mpm_dolfinx.points.cut_domains import CutDomains, Patches
 from mpm_dolfinx.points.faces import Surface, face_vectors
 from mpm_dolfinx.points.grid import sum_by
 from mpm_dolfinx.points.material_points import MaterialPoints
-from mpm_dolfinx.problems.conditions import RIGIDITY, Displacement, RigidPlate, Traction
+from mpm_dolfinx.problems.closed import closed
+from mpm_dolfinx.problems.conditions import RIGIDITY, Displacement, Pressure, RigidPlate, Traction
 from mpm_dolfinx.problems.held_cells import SAME, HeldCells, HeldPoints
 from mpm_dolfinx.problems.side_forms import SideData, SideForms
 from mpm_dolfinx.problems.sides import Sides, check_apart, gathered, meeting
@@ -30,7 +31,7 @@ from mpm_dolfinx.validation import line
 
 
 class MechanicalBoundary:
-    """Tractions, rigid plates and given displacements of a stage.
+    """Tractions, pressures, rigid plates and given displacements of a stage.
 
     Parameters
     ----------
@@ -55,35 +56,43 @@ class MechanicalBoundary:
         sides: Sides,
         free: NDArray[np.bool_],
         materials: SceneMaterials,
-        tractions: Sequence[Traction],
+        tractions: Sequence[Traction | Pressure],
         displacements: Sequence[Displacement],
         plates: Sequence[RigidPlate],
     ):
         self.grid, self._free, self._materials, d = sides.grid, free, materials, sides.grid.dim
         self.plates = [(plate, sides.of(plate)) for plate in plates]
-        tractions = [*tractions, *(plate.traction(faces.area0.sum(), d) for plate, faces in self.plates)]
+        self.pressures = [(load, sides.of(load)) for load in tractions if isinstance(load, Pressure)]
+        tractions = [load for load in tractions if not isinstance(load, Pressure)]
+        tractions += [plate.traction(faces.area0.sum(), d) for plate, faces in self.plates]
         self.loads = [(load, sides.of(load)) for load in tractions]
         self.holds = [(hold, sides.of(hold), hold.axes(d)) for hold in displacements]
         self._meeting: list[tuple[Displacement, Displacement, list[int], NDArray[np.float64]]] = []
         self._warned: set[int] = set()  # numbers of the conditions, of which nothing but the log knows
         self._loaded: Latest[tuple[Exchange, Places]] = Latest()
+        self._pressed: Latest[tuple[Exchange, Places]] = Latest()
         for plate, faces in self.plates:
             _check_flat(plate, faces)
         for (one, faces, axes), (other, others, more) in combinations(self.holds, 2):
             if common := sorted(set(axes) & set(more)):
                 check_apart(one, faces, other, others)
                 self._meeting.append((one, other, common, meeting(sides.bodies, faces, others)))
-        for condition in [*tractions, *displacements]:
+        pressures = [pressure for pressure, _ in self.pressures]
+        for condition in [*tractions, *pressures, *displacements]:
             if not callable(condition.value):  # what a function gives is checked when it is called
-                condition.at(0.0, *([d] if isinstance(condition, Traction) else [np.empty((1, d))]))
+                more = {Traction: [d], Pressure: [], Displacement: [np.empty((1, d))]}
+                condition.at(0.0, *more[type(condition)])
+        self.symmetric = closed(self.grid, free, self.pressures)
+        """Whether the tangent of the pressures is symmetric."""
 
     def data(self, forms: SideForms, cut: CutDomains, t: float, points: MaterialPoints) -> SideData:
         """Return what acts at time t (s) on the points where they are now."""
         with Timer("mpm: loads"):
             loads = self._load_data(forms, cut, points, t) if self.loads else None
+            pressures = self._pressure_data(forms, cut, points, t) if self.pressures else None
             plates = self._plate_data(forms, cut, points) if self.plates else None
             none = (None, np.empty(0, dtype=np.int64), np.empty((0, 2**self.grid.dim)))
-            return SideData(loads, plates, *(self._hold_data(forms, cut, points, t) if self.holds else none))
+            return SideData(loads, pressures, plates, *(self._hold_data(forms, cut, points, t) if self.holds else none))
 
     def _load_data(self, forms: SideForms, cut: CutDomains, points: MaterialPoints, t: float) -> PointData:
         """Return the dead loads on the surface."""
@@ -92,6 +101,14 @@ class MechanicalBoundary:
         forces = [_force(load, t, p, points) for (load, _), p in zip(self.loads, patches, strict=True)]
         force = travel.send(np.concatenate(forces))
         return PointData(forms.loads, places, np.ones(len(force)), {"force": force})
+
+    def _pressure_data(self, forms: SideForms, cut: CutDomains, points: MaterialPoints, t: float) -> PointData:
+        """Return the pressures on the surface, with their forces on its area at the start of the step."""
+        patches = [cut.surface(faces) for _, faces in self.pressures]
+        travel, places = self._pressed(cut.key, lambda: self._loaded_places(patches), self.grid.comm)
+        forces = [-pressure.at(t) * p.area(points) for (pressure, _), p in zip(self.pressures, patches, strict=True)]
+        push = travel.send(np.concatenate(forces))
+        return PointData(forms.pressures, places, np.ones(len(push)), {"push": push})
 
     def _loaded_places(self, patches: Sequence[Patches]) -> tuple[Exchange, Places]:
         """Return the way of loads to the owners of their cells, and where they act."""

@@ -46,16 +46,14 @@ class MomentumForms:
     pieces
         All points of integration.
     laws
-        Classes of the skeletons' laws, each with the pieces that follow it; they carry F, what the law takes
-        and, with fluid, biot.
+        Classes of the skeletons' laws, each with the pieces that follow it and whether these see the mean dilatation of
+        their cell, see `MeanDilatation`; they carry F, what the law takes and, with fluid, biot.
     pressure
         DG0 pore pressure, None without fluid.
     gravity : (d,), m/s^2
         Acceleration, a UFL constant; the pieces then carry `density`, kg/m^3, at the start of the step.
     fluid_density : kg/m^3
         Of the pore fluid, which pores that widen take up; None without.
-    mean_dilatation
-        Whether the laws see one volume change per cell, see `MeanDilatation`.
     symmetric
         Whether the tangents of all laws are symmetric.
     at_points
@@ -69,11 +67,10 @@ class MomentumForms:
     def __init__(
         self,
         pieces: FormPoints,
-        laws: Sequence[tuple[type[Skeleton], FormPoints]],
+        laws: Sequence[tuple[type[Skeleton], FormPoints, bool]],
         pressure: fem.Function | None,
         gravity: fem.Constant | None,
         fluid_density: float | None,
-        mean_dilatation: bool,
         symmetric: bool,
         at_points: bool,
         terms: Sequence[Callable],
@@ -85,23 +82,24 @@ class MomentumForms:
         self.u = fem.Function(V)
         """Increment of the displacement since the start of the step, m."""
         self._work = [fem.Function(V) for _ in range(4)]  # internal, own, external forces, and pulls of given sides
-        self.dilatation = MeanDilatation(pieces, self.u, symmetric) if mean_dilatation else None
+        averaged = [number for number, (_, _, locks) in enumerate(laws) if locks]
+        self.dilatation = MeanDilatation(grid, averaged, symmetric) if averaged else None
         # a rate is (u - past) / own: of backward Euler past is 0, and own the step
         self._past, self._own = fem.Function(V), fem.Constant(grid.mesh, 1.0)
         self._residuals, self._tangents, self._own_tangents = [], [], []
         self._residuals_of_all: list[PointForm] = []
         self.terms: list[PointForm] = []
-        for law, points in laws:
-            self._add_law(law, points, pressure, symmetric)
+        for law, points, locks in laws:
+            self._add_law(law, points, locks, pressure, symmetric)
         kept = [self._add_term(term, pieces, t, dt) for term in terms]
         self.symmetric = symmetric and all(potential or not holds for potential, holds, _ in kept)
         self.holding = any(holds for _, holds, _ in kept)
         """Whether terms of the user's depend on u."""
         self.rates = any(rate for _, _, rate in kept)
         """Whether terms of the user's depend on the velocity."""
-        self.linear = not mean_dilatation and not self.holding and all(law.linear for law, _ in laws)
+        self.linear = not averaged and not self.holding and all(law.linear for law, *_ in laws)
         """Whether the tangent changes with the places of the points only."""
-        self.elastic = not any(law.state for law, _ in laws)
+        self.elastic = not any(law.state for law, *_ in laws)
         """Whether no law has a history: where soil yields, the tangent of one substep leads the next astray."""
         self.weight = None
         if gravity is not None:
@@ -111,13 +109,15 @@ class MomentumForms:
             if fluid_density is not None:
                 taken_up = fem.Constant(grid.mesh, fluid_density) * (ufl.det(pieces.increment(self.u)) - 1)
                 self._residuals_of_all.append(PointForm(-taken_up * pull * pieces.dx, pieces))
-        self.sides, self.ghost = SideForms(grid, V), GhostPenalty(grid, V, at_points)
+        self.sides, self.ghost = SideForms(grid, self.u), GhostPenalty(grid, V, at_points)
 
-    def _add_law(self, law: type[Skeleton], points: FormPoints, pressure: fem.Function | None, symmetric: bool) -> None:
+    def _add_law(
+        self, law: type[Skeleton], points: FormPoints, locks: bool, pressure: fem.Function | None, symmetric: bool
+    ) -> None:
         """Compile residual and tangent of the pieces that follow a law."""
         F, v = points.deformation(self.u), ufl.TestFunction(self.u.function_space)
         values = {name: getattr(points, name) for name in (*law.parameters, *law.state)}
-        if self.dilatation is not None:
+        if locks:
             P = self.dilatation.add(law, points, F, values)
         else:
             P = law.first_piola(F, values)
@@ -173,12 +173,19 @@ class MomentumForms:
             self.sides.pull.assemble_vector(pulls.x.array, sides.holds)
         return sum_ghosts(external), sum_ghosts(pulls)
 
+    def pressures(self, sides: SideData) -> NDArray[np.float64]:
+        """Return the nodal forces of pressures at u, a local array."""
+        forces = self.sides.forces
+        forces.x.array[:] = 0.0
+        self.sides.pressed.assemble_vector(forces.x.array, sides.pressures)
+        return sum_ghosts(forces)
+
     def internal(self, data: QuadratureData) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the nodal forces of the stresses, and of the user's terms, at u, local arrays."""
         internal, own, _, _ = self._work
         internal.x.array[:] = own.x.array[:] = 0.0
         if self.dilatation is not None:
-            self.dilatation.update(data.pieces, data.parts)
+            self.dilatation.update(data)
         for residual, part in zip(self._residuals, data.parts, strict=True):
             residual.assemble_vector(internal.x.array, part)
         for residual in self._residuals_of_all:
@@ -187,14 +194,16 @@ class MomentumForms:
             term.assemble_vector(own.x.array, data.pieces)
         return sum_ghosts(internal), sum_ghosts(own) if self.terms else own.x.array
 
-    def assemble_tangent(self, K: PETSc.Mat, data: QuadratureData) -> None:
+    def assemble_tangent(self, K: PETSc.Mat, data: QuadratureData, sides: SideData) -> None:
         """Add the tangent at u to K, which the caller finalises."""
         for tangent, part in zip(self._tangents, data.parts, strict=True):
             tangent.assemble_matrix(K, part)
         for tangent in self._own_tangents:
             tangent.assemble_matrix(K, data.pieces)
         if self.dilatation is not None:
-            self.dilatation.assemble_matrix(K, data.pieces, data.parts)
+            self.dilatation.assemble_matrix(K, data)
+        if sides.pressures is not None:
+            self.sides.pressed_slope.assemble_matrix(K, sides.pressures)
 
     def active_nodes(self, cells: NDArray[np.int32]) -> NDArray[np.bool_]:
         """Return which nodes belong to some active cells of any process."""
@@ -286,15 +295,22 @@ class MomentumProblem:
         self, forms: MomentumForms, system: MomentumSystem, data: QuadratureData, sides: SideData, round_off: float
     ):
         self.forms, self.system, self.data, self.round_off = forms, system, data, round_off
+        self._sides = sides
         with Timer("mpm: loads"):
             self._external, self._pulls = forms.external(data, sides)
-        self._held = sides.holds is not None
+
+    @property
+    def linear(self) -> bool:
+        """Whether the tangent changes with the places of the points only."""
+        return self.forms.linear and self._sides.pressures is None
 
     def assemble_residual(self) -> tuple[PETSc.Vec, float]:
         """Return the out-of-balance nodal forces at u and their scale, the largest of internal, external, terms (N)."""
         forms, system = self.forms, self.system
         b, own = forms.internal(self.data)
         forces, external = b[system.touched], self._external[system.touched]
+        if self._sides.pressures is not None:
+            external = external + forms.pressures(self._sides)[system.touched]
         squares = [forces @ forces, external @ external]
         if forms.terms:
             own = own[system.touched]
@@ -302,7 +318,7 @@ class MomentumProblem:
             forces += own
         squares = over_all(forms.grid.comm, np.array(squares))
         b[system.touched] = forces - external
-        if self._held:  # no measure of forces: at the start of a step it is far above them
+        if self._sides.holds is not None:  # no measure of forces: at the start of a step it is far above them
             b[system.touched] -= self._pulls[system.touched]
         r = system.unknowns.gather(b, system.residual)
         step = system.unknowns.gather(forms.u.x.array, system.step)
@@ -315,7 +331,7 @@ class MomentumProblem:
         # the first sum gives K the pattern of both
         first = not K.assembled
         zero(K)
-        self.forms.assemble_tangent(K, data or self.data)
+        self.forms.assemble_tangent(K, data or self.data, self._sides)
         K.assemble()
         pattern = PETSc.Mat.Structure
         K.axpy(1.0, self.system.penalty, pattern.UNKNOWN if first else pattern.SUBSET_NONZERO_PATTERN)

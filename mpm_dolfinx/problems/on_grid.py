@@ -150,6 +150,11 @@ class OnGrid(Keyed):
         pressure = p[cells] + np.einsum("md,md->m", slope[at], offset - origin[at])
         return [self.cut.to_pieces(values) for values in (pressure, slope[at], bounds[at])]
 
+    def softness(self, state: State) -> NDArray[np.float64] | float:
+        """Return by how much the pieces (m,) are softer than elastic ones at the start of the step."""
+        data = state.points.data
+        return self.cut.to_cells(data["softness"]) if "softness" in data else 1.0
+
     def mobility(self, data: QuadratureData, begins: bool) -> Mobility:
         """Return the mobility of the filled owned cells at u; begins: refuse for good what is none."""
         at_pieces = self._quadrature.mobility(self.cut, self._storage.conductivity, data.pieces, begins)
@@ -178,6 +183,8 @@ class System:
         Unrolled local unknowns of the displacement, and active nodes.
     stiff
         Whether sides have plates or given displacements.
+    symmetric
+        Whether the momentum's tangent is.
     """
 
     def __init__(
@@ -189,8 +196,9 @@ class System:
         dofs: NDArray[np.int64],
         nodes: NDArray[np.int64],
         stiff: bool,
+        symmetric: bool,
     ):
-        self._scheme, self._symmetric = scheme, momentum.symmetric
+        self._scheme, self._symmetric = scheme, symmetric
         self.momentum, self.storage = MomentumSystem(momentum, dofs, nodes, on_grid.penalised, stiff), None
         if storage is not None:
             unknowns = self.momentum.unknowns
@@ -302,14 +310,14 @@ def assembled(
     grid, free = on_grid.cut.grid, stage.free
     nodes = np.flatnonzero(momentum.active_nodes(on_grid.cells))
     dofs = (nodes[:, None] * grid.dim + np.arange(grid.dim))[free[nodes]]
-    stiff = sides.plates is not None or sides.holds is not None
+    stiff, symmetric = sides.plates is not None or sides.holds is not None, stage.mechanical.symmetric
 
     def make() -> System:
         if not momentum.holding:
             holds = sides.holds
             held = None if holds is None else (holds.cells, holds.x, holds["direction"])
             check_held(grid, on_grid.active, free, held, begins)
-        return System(momentum, storage, scheme, on_grid, dofs, nodes, stiff)
+        return System(momentum, storage, scheme, on_grid, dofs, nodes, stiff, momentum.symmetric and symmetric)
 
     # a cell may become active between active nodes, so equal dofs do not mean equal cells
     with Timer("mpm: integration data"):

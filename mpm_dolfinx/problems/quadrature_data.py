@@ -21,15 +21,16 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 
 @dataclass(frozen=True)
 class QuadratureData:
-    """The pieces of a step, and those of each law."""
+    """The pieces of a step, those of each part of them (`SceneMaterials.parts`), and which these are."""
 
     pieces: PointData
     parts: tuple[PointData, ...]
+    rows: tuple[NDArray[np.int64] | slice, ...]
 
 
 @dataclass(frozen=True)
 class PiecePlaces:
-    """Where the pieces of a cut lie, and which rows of them follow each of several laws, with their places."""
+    """Where the pieces of a cut lie, and which rows of them belong to each of several parts, with their places."""
 
     pieces: Places
     parts: tuple[tuple[NDArray[np.int64], Places], ...]
@@ -56,7 +57,7 @@ class QuadraturePoints:
     pieces
         The points of integration.
     laws
-        Each law with the pieces that follow it.
+        Each law with the pieces that follow it, and whether they see the mean dilatation, see `SceneMaterials.parts`.
     varies
         Whether mobilities change with the deformation.
     layered
@@ -87,8 +88,8 @@ class QuadraturePoints:
         """Return where the pieces of a cut lie."""
         pieces, parts = Places(self._grid, cut.cells, cut.x), []
         if len(self.laws) > 1:
-            law = cut.to_cells(self._scene.law_of(cut.points))
-            rows = [np.flatnonzero(law == number) for number in range(len(self.laws))]
+            part = cut.to_cells(self._scene.part_of(cut.points))
+            rows = [np.flatnonzero(part == number) for number in range(len(self.laws))]
             parts = [(own, pieces.part(own)) for own in rows]
         return PiecePlaces(pieces, tuple(parts))
 
@@ -99,9 +100,10 @@ class QuadraturePoints:
         weight = cut.pieces_to_cells(cut.pieces.fraction * (points.volume0 * points.J)[cut.pieces.point])
         pieces = PointData(self.pieces, places.pieces, weight, fields)
         if not places.parts:
-            return QuadratureData(pieces, (pieces,))
+            return QuadratureData(pieces, (pieces,), (slice(None),))
         parts = zip(self.laws, places.parts, strict=True)
-        return QuadratureData(pieces, tuple(pieces.part(of, where, rows) for (_, of), (rows, where) in parts))
+        data = tuple(pieces.part(of, where, rows) for (_, of, _), (rows, where) in parts)
+        return QuadratureData(pieces, data, tuple(rows for rows, _ in places.parts))
 
     def _constant(self, cut: CutDomains, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
         """Return what the materials bring to their pieces for good."""

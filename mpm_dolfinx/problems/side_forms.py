@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Forms on the sides of the bodies: tractions, rigid plates, given displacements; compiled when first asked for."""
+"""Forms on the sides of the bodies, compiled when first asked for: loads, pressures, plates, given displacements."""
 
 from __future__ import annotations
 
@@ -20,11 +20,13 @@ from mpm_dolfinx.problems.held_cells import HeldCells
 class SideData:
     """What acts on the sides of the bodies in a step; None where there is no such condition.
 
-    loads: with their force; plates: with their rigidity, normal and present tilt; holds: components of given
-    displacements, with stiffness, direction and gap; held: what holds them; row: which of it each component is.
+    loads: with their force; pressures: with their force on the area at the start of the step; plates: with their
+    rigidity, normal and present tilt; holds: components of given displacements, with stiffness, direction and gap;
+    held: what holds them; row: which of it each component is.
     """
 
     loads: PointData | None
+    pressures: PointData | None
     plates: PointData | None
     holds: PointData | None
     held: HeldCells | None
@@ -38,12 +40,13 @@ class SideForms:
     ----------
     grid
         Background grid.
-    V
-        Space of the displacement.
+    u
+        Increment of the displacement in the step.
     """
 
-    def __init__(self, grid: Grid, V: fem.FunctionSpace):
-        self._grid, self._v, self._du = grid, ufl.TestFunction(V), ufl.TrialFunction(V)
+    def __init__(self, grid: Grid, u: fem.Function):
+        V = u.function_space
+        self._grid, self._u, self._v, self._du = grid, u, ufl.TestFunction(V), ufl.TrialFunction(V)
 
     @cached_property
     def loads(self) -> FormPoints:
@@ -55,6 +58,32 @@ class SideForms:
         """Work of dead loads."""
         p = self.loads
         return PointForm(ufl.inner(p.force, p.value(self._v)) * p.dx, p)
+
+    @cached_property
+    def pressures(self) -> FormPoints:
+        """Points with a pressure."""
+        return FormPoints(self._grid, push=(self._grid.dim,))
+
+    @cached_property
+    def forces(self) -> fem.Function:
+        """Room for the nodal forces of pressures."""
+        return fem.Function(self._u.function_space)
+
+    @cached_property
+    def pressed(self) -> PointForm:
+        """Work of pressures on the present area."""
+        return PointForm(self._pressed(), self.pressures)
+
+    @cached_property
+    def pressed_slope(self) -> PointForm:
+        """Their tangent: as the surface moves it turns and stretches."""
+        return PointForm(-ufl.derivative(self._pressed(), self._u, self._du), self.pressures)
+
+    def _pressed(self) -> ufl.Form:
+        """Return -p n da . v, n da = det(Delta) Delta^-T n_n da_n (Nanson) at the present iterate."""
+        p = self.pressures
+        delta = ufl.variable(ufl.Identity(self._grid.dim) + p.grad(self._u))
+        return ufl.inner(ufl.diff(ufl.det(delta), delta) * p.push, p.value(self._v)) * p.dx
 
     @cached_property
     def plates(self) -> FormPoints:

@@ -14,14 +14,14 @@ from mpm_dolfinx.constitutive.fields import SceneMaterials
 from mpm_dolfinx.points.bodies import Body
 from mpm_dolfinx.points.grid import Grid
 from mpm_dolfinx.points.lattice import Lattice, lattices
-from mpm_dolfinx.problems.conditions import Displacement, Drained, Inflow, RigidPlate, Traction
+from mpm_dolfinx.problems.conditions import Displacement, Drained, Inflow, Pressure, RigidPlate, Traction
 from mpm_dolfinx.problems.hydraulic_boundary import HydraulicBoundary
 from mpm_dolfinx.problems.mechanical_boundary import MechanicalBoundary
 from mpm_dolfinx.problems.sides import Sides
 from mpm_dolfinx.validation import all_of, asked, line, numbers
 
 CONDITIONS = {
-    "tractions": Traction,
+    "tractions": (Traction, Pressure),
     "displacements": Displacement,
     "drained": Drained,
     "inflows": Inflow,

@@ -259,6 +259,8 @@ class StorageProblem:
         Share of the step in which the rate at (u, p) counts, s.
     before
         What the cells lose by the rate of the substep before.
+    softness : (m,)
+        By how much the pieces are softer than elastic ones.
 
     The pressure at the start of the step is that of `forms.p_n`.
     """
@@ -272,15 +274,15 @@ class StorageProblem:
         flow: Callable[[bool], Outflow],
         dt: float,
         before: Rates | None = None,
+        softness: NDArray[np.float64] | float = 1.0,
     ):
         self.forms, self.system, self.data = forms, system, data
         self._contents, self._flow, self.dt = contents, flow, dt
         self._before = before or Rates(np.empty(0), np.zeros(system.unknowns.size), 0.0, 0.0, 0.0)
         outflow = flow(before is None)
         system.unknowns.gather(forms.p_n.x.array, system.p_start)
-        filled = contents.filled
         reach = 4 * forms.grid.h.max() ** 2  # no two centroids are further apart than 2 h
-        needed = contents.damping[filled] * reach > dt * outflow.mobility.min(axis=1)
+        needed = contents.set_damping(softness) * reach > dt * outflow.mobility.min(axis=1)
         self.damped = over_all(forms.grid.comm, bool(needed.any())) > 0
         """Whether jumps of the pressure are damped somewhere."""
         if self.damped:

@@ -106,7 +106,7 @@ def solve_substep(
     serves = report.newton > 0 and momentum.forms.elastic
     errors = newton.alternate() if in_turn else newton.newton(as_reset, key, serves)
     took = newton.report
-    if took.newton and storage is None and momentum.forms.symmetric and not solvers.iterative:
+    if took.newton and storage is None and solvers.symmetric and not solvers.iterative:
         newton.check_stable()
     report.newton, report.coupling = report.newton + took.newton, report.coupling + took.coupling
     report.history += took.history
@@ -154,7 +154,7 @@ class Newton:
     def __init__(self, solvers: LinearSolvers, momentum: MomentumProblem, storage: StorageProblem | None):
         self._solvers, self._scheme, self._momentum, self._storage = solvers, solvers.scheme, momentum, storage
         self.report = Report()
-        self._linear = momentum.forms.linear and (storage is None or storage.forms.linear)
+        self._linear = momentum.linear and (storage is None or storage.forms.linear)
 
     def newton(self, as_reset: Callable[[], QuadratureData], key: Hashable, serves: bool) -> Errors:
         """Solve both problems at once; the tangent is kept while it serves, of linear laws over steps.
@@ -268,7 +268,7 @@ class Newton:
     def _direction(self, errors: Errors) -> int:
         """Solve the linearised problem; return the coupling iterations."""
         # no more accuracy than the next residual can use
-        linear = self._momentum.forms.linear and not self._solvers.iterative
+        linear = self._momentum.linear and not self._solvers.iterative
         rtol = min(1e-2, max(0.0 if linear else FORCING, 0.05 * self._scheme.tolerance / min(1.0, errors.worst)))
         with Timer("mpm: linear solve"):
             return self._solvers.solve(rtol, errors.forces, errors.exchanged)

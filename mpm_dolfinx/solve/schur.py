@@ -56,7 +56,7 @@ class LinearSolvers:
     """
 
     def __init__(self, scheme: Scheme, momentum: MomentumSystem, storage: StorageSystem | None, symmetric: bool):
-        self.scheme, self._momentum, self._storage = scheme, momentum, storage
+        self.scheme, self._momentum, self._storage, self.symmetric = scheme, momentum, storage, symmetric
         self.iterative = iterative(momentum.unknowns)
         """Whether displacements are solved for by iterations."""
         self.tangent: Latest[bool] = Latest()
@@ -83,7 +83,8 @@ class LinearSolvers:
         self._schur = PETSc.Mat().createPython((n, n), context, storage.unknowns.comm)
         self._schur.setUp()
         self._solve_s = direct_solver(storage.P, "storage", often=True)
-        kind = {"schur-cg": PETSc.KSP.Type.CG, "schur-fgmres": PETSc.KSP.Type.FGMRES}
+        krylov = PETSc.KSP.Type.CG if symmetric else PETSc.KSP.Type.FGMRES
+        kind = {"schur-cg": krylov, "schur-fgmres": PETSc.KSP.Type.FGMRES}
         self._solve_s.setType(kind.get(scheme.coupling, PETSc.KSP.Type.PREONLY))
         self._preconditioner = self._solve_s.pc
 

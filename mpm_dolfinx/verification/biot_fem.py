@@ -4,7 +4,7 @@
 With the total displacement u, F = I + grad u, J = det F and the pore pressure p (positive in compression)
 on the reference configuration of a box, from state n:
 
-    momentum   int d/dF [psi(F) - alpha p J] : grad v dV  =  int t . v dA                 (dead tractions t)
+    momentum   int d/dF [psi(F) - alpha p J] : grad v dV  =  int t . v dA    (tractions t: dead, or pressures)
     storage    int [zeta(J, p) - zeta_n] q dV  +  int int kappa J F^-1 F^-T grad p . grad q dV dt  =  0
 
 kappa = k/(rho_w g), the content zeta that of `fluid_content`, the integral over the step that of `time_integration`.
@@ -38,7 +38,7 @@ from mpm_dolfinx.errors import GaveUp, NotConverged
 from mpm_dolfinx.points.faces import Region, limits
 from mpm_dolfinx.points.grid import Grid, side
 from mpm_dolfinx.points.probes import positions
-from mpm_dolfinx.problems.conditions import RIGIDITY, Drained, RigidPlate, Traction
+from mpm_dolfinx.problems.conditions import RIGIDITY, Drained, Pressure, RigidPlate, Traction
 from mpm_dolfinx.result import Report, Result
 from mpm_dolfinx.time_integration import Substep, substeps
 from mpm_dolfinx.validation import all_of, line, numbers
@@ -72,7 +72,7 @@ class Forms(NamedTuple):
     flux: Any | None
     load: Any | None
     dt: fem.Constant
-    tractions: list[tuple[Traction, fem.Constant]]
+    tractions: list[tuple[Traction | Pressure, fem.Constant]]
     weight: fem.Constant
 
 
@@ -110,7 +110,7 @@ class BiotFEM:
         *,
         fixed: Mapping[str, str],
         fluid: Fluid | None = None,
-        tractions: Sequence[Traction] = (),
+        tractions: Sequence[Traction | Pressure] = (),
         drained: Sequence[Drained] = (),
         plates: Sequence[RigidPlate] = (),
         gravity: Callable[[float], ArrayLike] | None = None,
@@ -201,7 +201,7 @@ class BiotFEM:
         within = np.minimum(high, self.grid.upper) - np.maximum(low, self.grid.lower)
         return float(np.delete(within, side(condition.side, self.grid.dim)[0]).prod())
 
-    def _on(self, condition: Traction | Drained | RigidPlate, integrand):
+    def _on(self, condition: Traction | Pressure | Drained | RigidPlate, integrand):
         """Return the integral over the part of a side that a condition names, as UFL."""
         low, high = map(self._constant, self._box(condition.side, condition.region))
         for a, x in enumerate(ufl.SpatialCoordinate(self.grid.mesh)):
@@ -209,10 +209,11 @@ class BiotFEM:
         degree = 2 * self._space.degree if condition.region is None else CUT_DEGREE
         return integrand * ufl.ds(domain=self.grid.mesh, metadata={"quadrature_degree": degree})
 
-    def _compile(self, tractions: Sequence[Traction], outlets: Sequence[Drained] | None) -> Forms:
+    def _compile(self, tractions: Sequence[Traction | Pressure], outlets: Sequence[Drained] | None) -> Forms:
         """Compile loads, residual and tangent; with `outlets` the pressure is constant in the cells."""
         dt, weight = self._constant(1.0), self._constant(np.zeros(self.grid.dim))
-        given = [(load, self._constant(np.zeros(self.grid.dim))) for load in tractions]
+        zero = {Traction: np.zeros(self.grid.dim), Pressure: 0.0}
+        given = [(load, self._constant(zero[type(load)])) for load in tractions]
         law, split = self.material, ufl.split if self.fluid else lambda f: (f, 0)
         (u, p), (u_n, p_n), (v, q) = map(split, (self._space.w, self._space.old, ufl.TestFunction(self._space.W)))
         dx = ufl.dx(domain=self.grid.mesh, metadata={"quadrature_degree": 2 * self._space.degree})
@@ -246,8 +247,13 @@ class BiotFEM:
             residual += self._on(
                 plate, self._constant(RIGIDITY * area ** (1 / (self.grid.dim - 1))) * ufl.inner(*slope)
             )
+        along = ufl.diff(J, F) * ufl.FacetNormal(self.grid.mesh)
+        for load, value in given:
+            if isinstance(load, Pressure):
+                residual += self._on(load, value / self._constant(self.scale) * ufl.inner(along, v))
         tangent = ufl.derivative(residual, self._space.w, ufl.TrialFunction(self._space.W))
-        loads = [self._on(load, ufl.inner(t, v) / self._constant(self.scale)) for load, t in given]
+        dead = [(load, t) for load, t in given if isinstance(load, Traction)]
+        loads = [self._on(load, ufl.inner(t, v) / self._constant(self.scale)) for load, t in dead]
         if self._gravity is not None:
             loads.append(ufl.inner(weight, v) / self._constant(self.scale) * dx)
         load = _compat.compiled(sum(loads)) if loads else None
@@ -322,7 +328,7 @@ class BiotFEM:
     def _load(self, t: float) -> float:
         """Assemble the loads at time t (s); return their norm."""
         for traction, constant in self._forms.tractions:
-            constant.value[:] = self._traction(traction, t)
+            constant.value = self._traction(traction, t)
         if self._gravity is not None:
             density = (1 - self.material.porosity) * self.material.grain_density
             d = self.grid.dim
@@ -354,8 +360,10 @@ class BiotFEM:
         self._take(x)
         return snes.its, norms[-1] / scale
 
-    def _traction(self, load: Traction, t: float) -> NDArray[np.float64]:
-        """Return the components (d,), Pa, of a traction at time t, s."""
+    def _traction(self, load: Traction | Pressure, t: float) -> NDArray[np.float64] | float:
+        """Return the components (d,), Pa, of a traction at time t, s, or a pressure."""
+        if isinstance(load, Pressure):
+            return load.at(t)
         value = load.at(t, self.grid.dim)
         if not value.ndim:
             raise ValueError(
