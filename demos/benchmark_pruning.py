@@ -90,8 +90,8 @@ def draining(cells: int, **options) -> mpm.Simulation:
 
 
 def layered(cells: int, off: float) -> mpm.Simulation:
-    """Return the draining block with eight layers, of two conductivities in turn, so many cells off the grid lines."""
-    h, heights = 1 / cells, np.arange(9) / 8
+    """Return the draining block with four layers, of two conductivities in turn, so many cells off the grid lines."""
+    h, heights = 1 / cells, np.arange(5) / 4
     heights[1:-1] += off * h
     grid = mpm.Grid([1, 1 + 2 * h], [cells, cells + 2])
     bodies = [mpm.box(grid, [0, a], [1, b], material=k % 2) for k, (a, b) in enumerate(pairwise(heights))]
