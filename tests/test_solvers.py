@@ -56,3 +56,22 @@ def test_a_linear_solver_that_breaks_off_fails_the_step():
     ksp.solve(b, x)
     with pytest.raises(mpm.NotConverged, match=r"linear solver of the storage broke off .* reason -9"):
         solved(ksp, "storage")
+
+
+def pushed(bulk: float) -> list[mpm.result.Report]:
+    """Return what two steps take of a saturated cube, of which a given displacement pushes a quarter of the top."""
+    n = 8
+    grid = mpm.Grid([1.0, 1.0, 1.25], [n, n, n + 2])
+    walls = dict.fromkeys(("left", "right"), "x") | dict.fromkeys(("front", "back"), "y") | {"bottom": "xyz"}
+    quarter, beside = ((-np.inf,) * 3, (0.45, 0.45, np.inf)), ((0.5, 0, 0), (np.inf,) * 3)
+    push = mpm.Displacement("top", lambda t, X: (0, 0, -0.01 * t), region=quarter)
+    soil = mpm.Hencky(bulk=bulk, shear=1e6, conductivity=1e-7)
+    drained, body = mpm.Drained("top", region=beside), mpm.box(grid, [0, 0, 0], [1, 1, 1])
+    s = mpm.Simulation(grid, [body], [soil], fixed=walls, displacements=[push], drained=[drained], fluid=mpm.Fluid())
+    return [s.step(1.0), s.step(1.0)]
+
+
+def test_the_first_solve_of_a_step_leaves_little_of_both_residuals_whatever_given_displacements_pull():
+    """A thousandth of their pull, which is the first residual, is as much as all forces: it cost two more steps."""
+    for report in pushed(2e6):
+        assert max(report.history[0]) > 100 and max(report.history[1]) < 0.5 and report.newton <= 8

@@ -36,7 +36,7 @@ from mpm_dolfinx.solve.linear import negative_pivots
 from mpm_dolfinx.solve.schur import LinearSolvers
 
 KEEP = 0.05  # the tangent is kept while a Newton step reduces the residual to less than this
-FORCING = 1e-3  # relative accuracy of the linear solve
+FORCING, FINEST = 1e-3, 1e-9  # relative accuracy of the linear solve, and the best that is asked for
 EXPLODES = 1e4  # a bending body's residual may grow this much in a good step: rotations stretch at first order
 INNER = 1e-3  # the momentum is solved to this share of the storage's error: rotations fake volume changes
 MOMENTUM_STEPS = 10
@@ -271,6 +271,8 @@ class Newton:
         # no more accuracy than the next residual can use
         linear = self._momentum.forms.linear and not self._solvers.iterative
         rtol = min(1e-2, max(0.0 if linear else FORCING, 0.05 * self._scheme.tolerance / min(1.0, errors.worst)))
+        if self._solvers.iterative:  # the pull of given displacements, which is all of a first residual, hides the rest
+            rtol = max(FINEST, rtol / max(1.0, errors.worst))
         with Timer("mpm: linear solve"):
             return self._solvers.solve(rtol, errors.forces, errors.exchanged)
 
