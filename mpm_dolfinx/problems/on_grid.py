@@ -186,7 +186,7 @@ class System:
         nodes: NDArray[np.int64],
         stiff: bool,
     ):
-        self._scheme, self._symmetric = scheme, momentum.symmetric
+        self._scheme, self._kind = scheme, (momentum.symmetric, momentum.dilatation is not None)
         self.momentum, self.storage = MomentumSystem(momentum, dofs, nodes, on_grid.penalised, stiff), None
         if storage is not None:
             unknowns = self.momentum.unknowns
@@ -198,7 +198,7 @@ class System:
         made = self._solvers.value
         if made is not None and not made.iterative:
             return made
-        make = (self._scheme, self.momentum, self.storage, self._symmetric)
+        make = (self._scheme, self.momentum, self.storage, *self._kind)
         return self._solvers(object(), lambda: LinearSolvers(*make))
 
 
