@@ -198,7 +198,7 @@ class System:
         stiff: bool,
         symmetric: bool,
     ):
-        self._scheme, self._symmetric = scheme, symmetric
+        self._scheme, self._kind = scheme, (symmetric, momentum.dilatation is not None)
         self.momentum, self.storage = MomentumSystem(momentum, dofs, nodes, on_grid.penalised, stiff), None
         if storage is not None:
             unknowns = self.momentum.unknowns
@@ -210,7 +210,7 @@ class System:
         made = self._solvers.value
         if made is not None and not made.iterative:
             return made
-        make = (self._scheme, self.momentum, self.storage, self._symmetric)
+        make = (self._scheme, self.momentum, self.storage, *self._kind)
         return self._solvers(object(), lambda: LinearSolvers(*make))
 
 

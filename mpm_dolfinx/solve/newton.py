@@ -36,8 +36,9 @@ from mpm_dolfinx.solve.linear import negative_pivots
 from mpm_dolfinx.solve.schur import LinearSolvers
 
 KEEP = 0.05  # the tangent is kept while a Newton step reduces the residual to less than this
-FORCING = 1e-3  # relative accuracy of the linear solve
+FORCING, FINEST = 1e-3, 1e-9  # relative accuracy of the linear solve, and the best that is asked for
 EXPLODES = 1e4  # a bending body's residual may grow this much in a good step: rotations stretch at first order
+SHORTEST = 0.1  # where soil yields it may not grow at all, unless that takes a shorter step: it would circle
 INNER = 1e-3  # the momentum is solved to this share of the storage's error: rotations fake volume changes
 MOMENTUM_STEPS = 10
 ERROR = 1 / 20
@@ -270,22 +271,32 @@ class Newton:
         # no more accuracy than the next residual can use
         linear = self._momentum.linear and not self._solvers.iterative
         rtol = min(1e-2, max(0.0 if linear else FORCING, 0.05 * self._scheme.tolerance / min(1.0, errors.worst)))
+        if self._solvers.iterative:  # the pull of given displacements, which is all of a first residual, hides the rest
+            rtol = max(FINEST, rtol / max(1.0, errors.worst))
         with Timer("mpm: linear solve"):
             return self._solvers.solve(rtol, errors.forces, errors.exchanged)
 
     def _line_search(self, before: Errors) -> Errors:
-        """Go against the direction, backtracking while the residual is not finite or explodes."""
+        """Go against the direction, backtracking while the residual is not finite or explodes.
+
+        Where soil yields, while it grows; where that would take too short a step, the best of those tried is taken.
+        """
         self.report.newton += 1
-        step, moved = 1.0, 0.0
-        while True:
+        step, moved, tried = 1.0, 0.0, {}
+        grows, shortest = (EXPLODES, 1e-3) if self._momentum.forms.elastic else (1.0, SHORTEST)
+        while step >= shortest:
             self._move(moved - step)
             moved = step
             errors = self._errors(before.start)
-            if np.isfinite(errors.worst) and errors.worst < EXPLODES * before.worst:
+            if np.isfinite(errors.worst) and errors.worst < grows * before.worst:
                 return errors
+            if errors.worst < EXPLODES * before.worst:  # not nan
+                tried[errors.worst] = step
             step /= 2
-            if step < 1e-3:
-                raise NotConverged("no descent along the Newton direction", self.report.history)
+        if not tried:
+            raise NotConverged("no descent along the Newton direction", self.report.history)
+        self._move(moved - tried[min(tried)])
+        return self._errors(before.start)
 
     def _move(self, scale: float) -> None:
         self._momentum.system.unknowns.add(self._momentum.forms.u, scale, self._solvers.du)

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from mpm_dolfinx.caching import Latest
 from mpm_dolfinx.problems.momentum import MomentumProblem, MomentumSystem
 from mpm_dolfinx.problems.storage import FILTER, StorageProblem, StorageSystem
-from mpm_dolfinx.solve.linear import direct_solver, iterative, multigrid_solver, nodal_solver, solved
+from mpm_dolfinx.solve.linear import allow_no_diagonal, direct_solver, iterative, multigrid_solver, nodal_solver, solved
 from mpm_dolfinx.solve.monolithic import BlockSolver
 from mpm_dolfinx.solve.scheme import Scheme
 
@@ -53,9 +53,18 @@ class LinearSolvers:
         Matrices and vectors; storage is None without fluid.
     symmetric
         Whether the momentum's tangent is symmetric.
+    yields
+        Whether the skeleton yields or hardly changes its volume.
     """
 
-    def __init__(self, scheme: Scheme, momentum: MomentumSystem, storage: StorageSystem | None, symmetric: bool):
+    def __init__(
+        self,
+        scheme: Scheme,
+        momentum: MomentumSystem,
+        storage: StorageSystem | None,
+        symmetric: bool,
+        yields: bool,
+    ):
         self.scheme, self._momentum, self._storage, self.symmetric = scheme, momentum, storage, symmetric
         self.iterative = iterative(momentum.unknowns)
         """Whether displacements are solved for by iterations."""
@@ -63,7 +72,9 @@ class LinearSolvers:
         """What the matrices hold the tangent of, where it is kept."""
         self._solve_s = self._schur = self._block = None
         if self.iterative:
-            self.solve_u, self._modes = multigrid_solver(momentum.K, "momentum"), momentum.unknowns.rigid_body_modes()
+            smoother = "sor" if yields or storage is not None else "jacobi"
+            self.solve_u = multigrid_solver(momentum.K, "momentum", smoother)
+            self._modes = momentum.unknowns.rigid_body_modes()
         elif storage is None:
             self.solve_u = direct_solver(momentum.K, "momentum", symmetric)
         else:
@@ -102,6 +113,7 @@ class LinearSolvers:
         with Timer("mpm: factorisation"):
             if self.iterative:
                 K.setNearNullSpace(self._modes)
+                allow_no_diagonal(self.solve_u, K)
             self.solve_u.setOperators(K)
             self.solve_u.setUp()
             if storage is not None:
