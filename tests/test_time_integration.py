@@ -130,7 +130,10 @@ def test_output_times_are_hit_whatever_the_steps():
 
 
 def test_steps_grow_over_six_decades_of_consolidation():
-    """From T_v = 1e-6 to 1, against steps so short that time costs nothing; most is the first steps' damping."""
+    """From T_v = 1e-6 to 1, in the cells, against steps so short that time costs nothing.
+
+    Most is the first steps' damping.
+    """
     cv = SOFT.conductivity / 9810 * SOFT.oedometric
 
     def run(rtol):
@@ -139,7 +142,7 @@ def test_steps_grow_over_six_decades_of_consolidation():
         result = s.run(
             times[-1], rtol=rtol, t_eval=times, observe=lambda s: p.append(s.points.pressure), progress=False
         )
-        return result.steps, np.array(p)
+        return result.steps, np.array(p).reshape(-1, 2, 20, 2).mean(axis=(1, 3))
 
     (steps, p), (_, true) = run(1e-4), run(1e-5)
     assert steps <= 100 and np.abs(p - true).max() < 1e-3 * 100

@@ -46,8 +46,8 @@ class Writer:
     and the forces of the given displacements (N, in plane strain N/m; nan where no step has been taken since they
     were set by a stage or the run was resumed); if asked for `grid.pvd`, the last step's displacement (m), the pore
     pressure (Pa) and the filled share of the cells.  Tensors: in 2D a field for each component (F_xy), in
-    3D row by row.  ParaView and VTK read all of it, meshio the points.  Stress and pressure of points are those of
-    their cell.
+    3D row by row.  ParaView and VTK read all of it, meshio the points.  The stress of points is that of their
+    cell; their pressure is of second order.
 
     What the folder holds up to the present time stays, and is continued: made after `resume`, a writer leaves
     the files of a run that was never interrupted.

@@ -79,6 +79,31 @@ class OpenSides:
             outer = outer - flow.deformed(at, self.reach) @ flow.weight
         return conductance, self.given + conductance * outer
 
+    def ahead(self, at: NDArray[np.int64], p: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return what lies ahead of the filled cells (n, d, 2, 2): on drained sides, by axis and end of the cell.
+
+        Difference (Pa) of the pressure there to that of the cell, and slope (Pa/m) towards it; nan where there is none.
+
+        Parameters
+        ----------
+        at : (m,)
+            Place of the faces' cells among the filled ones.
+        p : (n,), Pa
+            Pressures of the filled cells.
+        """
+        out = np.full((len(p), self.normal.shape[1], 2, 2), np.nan)
+        distance = np.einsum("md,md->m", self.reach, self.normal)
+        drained = np.flatnonzero((self.shape > 0) & (distance > 0))  # sides of an inflow have no conductance
+        at, normal, distance = at[drained], self.normal[drained], distance[drained]
+        area, jump = self.shape[drained] * distance, self.pressure[drained] - p[at]
+        for axis, end in np.ndindex(out.shape[1:3]):
+            share = area * np.maximum((2 * end - 1) * normal[:, axis], 0.0)
+            total = sum_by(at, share, len(p))
+            # along the side the pressure does not change, so its gradient is normal to it
+            for k, values in enumerate((jump, jump * normal[:, axis] / distance)):
+                np.divide(sum_by(at, share * values, len(p)), total, out=out[:, axis, end, k], where=total > 0)
+        return out
+
 
 @dataclass(frozen=True)
 class PieceContents:

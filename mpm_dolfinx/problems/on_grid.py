@@ -147,6 +147,16 @@ class OnGrid(Keyed):
         pressure = p[cells] + np.einsum("md,md->m", slope[at], offset - origin[at])
         return [self.cut.to_pieces(values) for values in (pressure, slope[at], bounds[at])]
 
+    def pressures_up_to_surface(self, reconstruction: Reconstruction, stage: Stage) -> NDArray[np.float64]:
+        """Return the pressures (m,), Pa, at the pieces' centroids; their mean by volume in a cell is the cell's."""
+        places, contents, p = self._places.pieces, self.contents, self._storage.p.x.array
+        sides = stage.hydraulic.data(self.cut, self.cut.points, contents)
+        ahead = sides.ahead(contents.slot(sides.cells), p[contents.filled])
+        held = (contents.filled, p, contents.centroid, contents.open)
+        return self.cut.to_pieces(
+            reconstruction.up_to_surface(*held, ahead, places.offset, contents.slot(places.cells))
+        )
+
     def mobility(self, data: QuadratureData, begins: bool) -> NDArray[np.float64]:
         """Return the mobility of the filled owned cells, m^2/(Pa s), at u; begins: refuse for good what is none."""
         at_pieces = self._quadrature.mobility(self.cut, self._storage.conductivity, data.pieces, begins)
