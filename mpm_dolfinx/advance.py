@@ -153,7 +153,7 @@ class Motion:
                 store = self._materials.storage(points, self._fluid) * points.volume0 * points.J
                 on_grid.set_pressures(stay.pressure)
                 pressure, slope, bounds = on_grid.pressures_at_pieces(
-                    self._reconstruction, pieces.fraction * store[pieces.point]
+                    self._reconstruction, pieces.fraction * store[pieces.point], state.stage
                 )
                 transported = PiecePressures(stay.id, pieces.cell, pieces.fraction, pressure, stay.x, slope, bounds)
         return replace(state, transported=transported, stay=None)

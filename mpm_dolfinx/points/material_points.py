@@ -37,8 +37,8 @@ class MaterialPoints:
     material : (n,)
         Index of the point's material in the scene's list.
     pressure : (n,), Pa
-        Pore pressure, positive in compression: the mean over the domain, of second order; told, and used by no step
-        but the first.
+        Pore pressure, positive in compression: the mean over the domain, of second order; what cells and
+        domains take along is the state's.
     x : (n, d), m
         Position.
     origin : (n, 2^d, d), m

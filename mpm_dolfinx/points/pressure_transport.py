@@ -2,8 +2,9 @@
 """Conservative remap of the pore pressure from one grid to the next, of second order.
 
 In each cell the pressure is reconstructed as p + s . (x - c) about the centroid c of what the cell stores.  The
-slope s along an axis is van Leer's mean of the differences to the neighbours behind open faces, and nothing where
-one of them is missing; it is scaled so that nowhere in the cell the extremes of cell and neighbours are passed.
+slope s along an axis is van Leer's mean of the differences to the neighbours behind open faces, or to the pressure of
+a drained side, and nothing where one of them is missing; it is scaled so that nowhere in the cell the extremes of
+cell, neighbours and drained sides are passed.
 
 A piece of a domain takes the pressure at its own centroid and moves with the domain.  When the domain is cut
 anew, each cell that it lay in and still lies in keeps its pressure for the part that stayed; what newly lies
@@ -11,7 +12,7 @@ in a cell takes the mean pressure of what left the others.  The places of the pi
 how far they then are from the true ones tells, with the domain's mean slope, what is still amiss.  Shares of every
 domain sum to one, and so does this correction to nothing: nothing is lost; where nothing moves nothing changes.
 
-What is told of the points, and taken along by none, is reconstructed up to the surface as well: see `up_to_surface`.
+What is told of the points, and taken along by none, is reconstructed up to sealed sides as well: see `up_to_surface`.
 """
 
 from __future__ import annotations
@@ -104,6 +105,7 @@ class Reconstruction:
         p: NDArray[np.float64],
         centroid: NDArray[np.float64],
         faces: NDArray[np.float64],
+        outer: NDArray[np.float64],
         origin: NDArray[np.float64],
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return slopes (n, d) and bounds (n, 2) in owned cells (n,).
@@ -113,22 +115,26 @@ class Reconstruction:
         p, centroid, faces
             Of all local cells: values (c,), centroids (c, d) relative to the midpoints, m, open shares (c, d, 2)
             of the faces, zero for empty cells.
+        outer : (n, d, 2, 2)
+            By axis and end: difference to the pressure on drained sides ahead, Pa, and slope to them, Pa/m; nan where
+            there is none.
         origin : (n, d), m
             Places relative to the midpoints, from which the slopes are drawn.
         """
-        h = self.grid.h
-        jump, one_sided, _ = self._differences(cells, p, centroid, faces)
+        jump, one_sided, _, drained = self._differences(cells, p, centroid, faces, outer)
         slope, low, high = van_leer(one_sided), *_spread(jump)
-        ends = slope[:, :, None] * (h[:, None] * [-0.5, 0.5] - origin[:, :, None])
+        whole = self.grid.h[:, None] * [-0.5, 0.5]
+        filled = (2 * centroid[cells][:, :, None] - whole[:, ::-1]).clip(whole[:, :1], whole[:, 1:])
+        ends = slope[:, :, None] * (np.where(drained, filled, whole) - origin[:, :, None])
         scale = np.ones(len(cells))
         for reach, room in ((ends.min(axis=2).sum(axis=1), low), (ends.max(axis=2).sum(axis=1), high)):
             scale = np.minimum(scale, np.divide(room, reach, out=np.ones(len(cells)), where=reach != 0))
         return slope * scale[:, None], p[cells, None] + np.stack([low, high], axis=1)
 
-    def _differences(self, cells, p, centroid, faces) -> tuple[NDArray, NDArray, NDArray]:
-        """Return the differences to the neighbours behind open faces, the slopes to them, and where faces are open.
+    def _differences(self, cells, p, centroid, faces, outer) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+        """Return differences and slopes to neighbours and drained sides, and where there is the one or the other.
 
-        All (n, d, 2), by axis and end, zero behind closed faces.
+        All (n, d, 2), by axis and end, zero where there is neither.
         """
         h, there, here = self.grid.h, self._neighbour[cells], p[cells]
         jump, one_sided = np.zeros(there.shape), np.zeros(there.shape)
@@ -142,7 +148,9 @@ class Reconstruction:
                 jump[:, axis, end] = np.where(inside, p[other] - here, 0.0)
                 apart = h[axis] + way * (centroid[other, axis] - centroid[cells, axis])
                 one_sided[:, axis, end] = way * jump[:, axis, end] / np.where(inside, apart, 1.0)
-        return jump, one_sided, is_open
+        drained = ~is_open & np.isfinite(outer[..., 0])
+        jump, one_sided = np.where(drained, outer[..., 0], jump), np.where(drained, outer[..., 1], one_sided)
+        return jump, one_sided, is_open, drained
 
     def up_to_surface(
         self,
@@ -156,25 +164,20 @@ class Reconstruction:
     ) -> NDArray[np.float64]:
         """Return pressures (m,), Pa, at places in owned cells (n,), also of second order in cells at the surface.
 
-        Where a neighbour is missing, the pressure at the drained side there takes its place; at another side the
-        slope is that of the cell before it, or what its change leaves if that is less: linear values are met, and steep
-        ones not carried on.  No place passes cell, neighbours, drained sides, or what this slope has at the surface.
+        At a sealed side the slope is that of the cell before it, or what its change leaves if that is less: linear
+        values are met, and steep ones not carried on.  No place passes cell, neighbours, drained sides, or what this
+        slope has at the surface.
 
         Parameters
         ----------
-        p, centroid, faces
-            As for slopes within the body.
-        outer : (n, d, 2, 2)
-            By axis and end: difference to the pressure on the drained sides, Pa, and slope to them, Pa/m; nan where
-            there is none.
+        p, centroid, faces, outer
+            As for slopes.
         x : (m, d), m
             Places, relative to the cells' midpoints.
         slot : (m,)
             Place of each one's cell among `cells`.
         """
-        jump, one_sided, is_open = self._differences(cells, p, centroid, faces)
-        drained = ~is_open & np.isfinite(outer[..., 0])
-        jump, one_sided = np.where(drained, outer[..., 0], jump), np.where(drained, outer[..., 1], one_sided)
+        jump, one_sided, is_open, drained = self._differences(cells, p, centroid, faces, outer)
         slope = van_leer(one_sided)
         at, axis = np.nonzero(is_open.any(axis=2) & ~(is_open | drained).all(axis=2))
         end = is_open[at, axis, 1].astype(int)
@@ -188,10 +191,7 @@ class Reconstruction:
         low, high = _spread(jump)
         low, high = low + sum_by(at, np.minimum(on, 0), len(cells)), high + sum_by(at, np.maximum(on, 0), len(cells))
         rise = np.einsum("md,md->m", slope[slot], x - centroid[cells[slot]])
-        room = np.where(rise > 0, high[slot], low[slot])
-        beyond, share = np.flatnonzero(np.abs(rise) > np.abs(room)), np.ones(len(cells))
-        np.minimum.at(share, slot[beyond], room[beyond] / rise[beyond])
-        return p[cells[slot]] + share[slot] * rise
+        return p[cells[slot]] + share_within(rise, low, high, slot)[slot] * rise
 
     def _everywhere(self, cells: NDArray[np.int64], slope: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return slopes of owned cells (n, d) in all local cells, ghosts included, zero in the others."""
@@ -206,6 +206,16 @@ def van_leer(one_sided: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the harmonic means (n, d) of slopes to both sides (n, d, 2), zero where their signs differ."""
     a, b = one_sided[..., 0], one_sided[..., 1]
     return np.divide(2 * a * b, a + b, out=np.zeros(a.shape), where=a * b > 0)
+
+
+def share_within(
+    rise: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64], slot: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Return the largest shares (n,) of rises (m,) in cells by which none passes the cell's low or high (n,)."""
+    room, share = np.where(rise > 0, high[slot], low[slot]), np.ones(len(low))
+    beyond = np.flatnonzero(np.abs(rise) > np.abs(room))
+    np.minimum.at(share, slot[beyond], room[beyond] / rise[beyond])
+    return share
 
 
 def _spread(jump: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
