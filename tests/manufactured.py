@@ -96,3 +96,26 @@ def errors(s):
     u, p = solution(X.T, s.t)
     u = np.stack(u, axis=1)
     return np.array([rms(s.points.x - X - u) / np.abs(u).max(), rms(s.points.pressure - p) / np.abs(p).max()])
+
+
+def stress(X, t):
+    """Return the exact effective Cauchy stress (n, 2, 2), Pa, at reference positions (n, 2), by differences of u."""
+    step, slopes = 1e-6, []
+    for e in np.eye(2):
+        ahead, behind = (np.stack(solution((X + way * step * e).T, t)[0], axis=1) for way in (1, -1))
+        slopes.append((ahead - behind) / (2 * step))
+    F = np.eye(2) + np.stack(slopes, axis=2)
+    J, lam = np.linalg.det(F)[:, None, None], SOIL.bulk - 2 * SOIL.shear / 3
+    return (SOIL.shear * (F @ F.swapaxes(1, 2) - np.eye(2)) + lam * np.log(J) * np.eye(2)) / J
+
+
+def errors_of_cells(s):
+    """Return the errors of the cells' displacement, pressure and both stresses where they are, as `errors` does."""
+    cells = s.cells()
+    X = cells.x - cells.displacement
+    u, p = solution(X.T, s.t)
+    effective = stress(X, s.t)
+    total = effective - p[:, None, None] * np.eye(2)
+    pairs = [(cells.displacement, np.stack(u, axis=1)), (cells.pressure, p)]
+    pairs += [(cells.effective_stress, effective), (cells.stress, total)]
+    return np.array([rms(found - exact) / np.abs(exact).max() for found, exact in pairs])
