@@ -280,18 +280,23 @@ class Assembled:
         on_grid, contents, u = self._on_grid, self._on_grid.contents, self._u
         at = on_grid.cut.points if weight is None else state.points  # gravity may change with time
         sides = partial(self._stage.hydraulic.data, on_grid.cut, at, contents)
+        uniform = partial(on_grid.mobility, data, True)
 
         def set_fluxes(at_sides: OpenSides, kappa: NDArray[np.float64], moves: bool) -> Outflow:
             motion = contents.motion(u.x.array.reshape(-1, len(on_grid.cut.grid.h))) if moves else (None, None)
             return self.storage.set_fluxes(contents, at_sides, Conduction(kappa, *motion, weight))
 
-        if self._varies:
+        if self._varies or not state.stay:
             placed = sides()
-            return lambda begins: set_fluxes(placed, on_grid.mobility(data, begins), moves=True)
-        kappa = self._mobility((), lambda: on_grid.mobility(data, True))
-        if not state.stay:
-            placed = sides()
-            return lambda begins: set_fluxes(placed, kappa, moves=True)
+
+            def at_present(begins: bool) -> Outflow:
+                kappa = on_grid.mobility(data, begins) if self._varies else self._mobility((), uniform)
+                return set_fluxes(placed, kappa, moves=True)
+
+            # a substep begins where the one before it has ended
+            at_u, comm = (data.pieces.key, weight), on_grid.cut.grid.comm
+            return lambda begins: self._outflow((*at_u, u.x.array.copy()), lambda: at_present(begins), comm)
+        kappa = self._mobility((), uniform)
         outflow = self._outflow((at, weight), lambda: set_fluxes(sides(), kappa, moves=False), on_grid.cut.grid.comm)
         return lambda begins: outflow
 
