@@ -21,6 +21,7 @@ import sys
 import time
 from collections.abc import Callable
 from functools import cache, partial
+from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -88,6 +89,18 @@ def draining(cells: int, **options) -> mpm.Simulation:
     return block(cells, soil(conductivity=1e-4), **WATER, **options)
 
 
+def layered(cells: int, off: float) -> mpm.Simulation:
+    """Return the draining block with eight layers, of two conductivities in turn, so many cells off the grid lines."""
+    h, heights = 1 / cells, np.arange(9) / 8
+    heights[1:-1] += off * h
+    grid = mpm.Grid([1, 1 + 2 * h], [cells, cells + 2])
+    bodies = [mpm.box(grid, [0, a], [1, b], material=k % 2) for k, (a, b) in enumerate(pairwise(heights))]
+    soils = [soil(conductivity=k) for k in (1e-4, 1e-6)]
+    load = mpm.Traction("top", lambda t: (0, -LOAD * t))
+    fixed = {"left": "x", "right": "x", "bottom": "y"}
+    return mpm.Simulation(grid, bodies, soils, fixed=fixed, tractions=[load], **WATER)
+
+
 class Watched(mpm.Hencky):
     """A skeleton whose pressure jumps are looked after at four times the flow."""
 
@@ -105,6 +118,7 @@ Make = Callable[[int], mpm.Simulation]
 PAIRS: dict[str, tuple[Make, Make]] = {
     "pore fluid that drains at once": (block, lambda n: block(n, soil(conductivity=1e3), **WATER)),
     "flux form": (lambda n: block(n, **SEALED), lambda n: block(n, soil(conductivity=1e-30), **SEALED)),
+    "layers off the grid lines": (partial(layered, off=0.0), partial(layered, off=0.5)),
     "second order in time": (lambda n: draining(n, method="backward-euler"), draining),
     "body force": (block, lambda n: block(n, gravity=(0, 0))),
     "ghost penalty on all faces": (block, weighted),

@@ -6,7 +6,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -29,6 +29,7 @@ from mpm_dolfinx.problems.on_grid import Assembled, OnGrid, System, assembled
 from mpm_dolfinx.problems.overfilled import warn_overfilled
 from mpm_dolfinx.problems.quadrature_data import QuadraturePoints
 from mpm_dolfinx.problems.side_forms import SideData
+from mpm_dolfinx.problems.smeared import warn_smeared
 from mpm_dolfinx.problems.stage import Stage
 from mpm_dolfinx.problems.storage import StorageForms
 from mpm_dolfinx.solve.scheme import Scheme
@@ -91,7 +92,8 @@ class Scene:
         self.method, self.substeps = method, substeps(method, flows or self.momentum.rates)
         """Of time integration, and its substeps in a step."""
         self.motion = Motion(scene, bodies, self.momentum, self.storage, fluid)
-        self._told: list[bool] = []  # whether a cell was overfilled, of which nothing but the log knows
+        # what is still to be looked for, to be warned of once, of which nothing but the log knows
+        self._looked_for = [warn_overfilled, *[partial(warn_smeared, materials=scene)] * scene.uneven]
         self._on_grid: Latest[OnGrid] = Latest()
         self._systems: Latest[System] = Latest()
         self._assembled: Latest[Assembled] = Latest()
@@ -110,8 +112,7 @@ class Scene:
             self._assembled.clear()  # of coefficients that change now
             with Timer("mpm: cut domains"):
                 cut = CutDomains(grid, points, self.quadrature == "domain")
-                if not self._told:
-                    self._told.extend([True] * warn_overfilled(cut, self.bodies))
+                self._looked_for[:] = [warn for warn in self._looked_for if not warn(cut, bodies=self.bodies)]
             with Timer("mpm: integration data"):
                 problems = (self.momentum, self.storage)
                 return OnGrid(self.pieces, self.materials, *problems, cut, self.scheme.as_printed)

@@ -208,3 +208,7 @@ def test_bodies_that_do_not_touch_and_yet_will_stick_are_named_with_their_distan
 
     assert "bodies 0 and 1: 0.4 cells apart at" in warnings(1.2)[0]
     assert warnings(1.0) == [] and warnings(1.6) == []
+    caplog.clear()
+    with caplog.at_level(logging.WARNING, "mpm_dolfinx"):
+        scene(grid, [below, mpm.box(grid, [0, 1], [4, 1.2]), mpm.box(grid, [1, 1.2], [2, 2])])
+    assert not caplog.records, "what lies between holds them apart"

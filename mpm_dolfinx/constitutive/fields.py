@@ -7,6 +7,7 @@ import zlib
 from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import fields, replace
+from inspect import signature
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,8 +56,17 @@ class SceneMaterials:
         """Whether the tangents of all materials are symmetric."""
         self.stiffest = max(float(np.max(m.oedometric, initial=0.0)) for m in evaluated)
         """Largest oedometric modulus, Pa."""
+        self.uneven = any(
+            max(float(np.max(y)) for y in moduli) > 2 * min(float(np.min(y)) for y in moduli)
+            for moduli in ([m.oedometric for m in evaluated], [m.shear for m in evaluated])
+        )
+        """Whether points differ in stiffness by more than a factor of two."""
         self.conducts = any(m.conductivity_law or np.any(np.asarray(m.conductivity) > 0) for m in evaluated)
         """Whether fluid flows anywhere."""
+        conductivity = np.concatenate([np.ravel(m.conductivity) for m in evaluated])
+        by_place = any(callable(m.conductivity) for m in materials) or any(map(_names_place, self.conductivity_laws))
+        self.layered = by_place or len({m.conductivity_law for m in used}) > 1 or bool(np.ptp(conductivity))
+        """Whether points may differ in what they conduct."""
         self.nearly_incompressible = any(np.any(m.nearly_incompressible) for m in evaluated)
         """Whether Q1 cells would lock somewhere."""
         self._fields = [[name for name in _names(m) if callable(getattr(m, name))] for m in materials]
@@ -123,6 +133,17 @@ class SceneMaterials:
     def law_of(self, points: MaterialPoints) -> NDArray[np.int64]:
         """Return the number of each point's law (n,)."""
         return self._law[points.material]
+
+    def conducting(self, points: MaterialPoints) -> NDArray[np.float64]:
+        """Return what points (n, 2) that conduct alike have in common: conductivity, m/s, and number of their law.
+
+        By a law of the place none does.
+        """
+        laws, known = [m.conductivity_law for m in self.materials], self.conductivity_laws
+        law = np.array([known.index(law) if law in known else -1 for law in laws])[points.material]
+        by_place = np.array([law is not None and _names_place(law) for law in laws])[points.material]
+        conductivity = self.table(points, lambda m: m.conductivity)
+        return np.stack([conductivity, np.where(by_place, len(known) + points.id, law)], axis=1)
 
     def table(self, points: MaterialPoints, value: Callable[..., float], *columns: NDArray) -> NDArray[np.float64]:
         """Return value(material, *columns) at the points (n, ...); columns (n,) are values at the points."""
@@ -218,6 +239,10 @@ def _known(name: str, value) -> NDArray[np.float64]:
     if np.isnan(out).any():
         raise ValueError(f"{name} = nan, must be numbers")
     return out
+
+
+def _names_place(law: Callable) -> bool:
+    return "x" in signature(law).parameters
 
 
 def _finite(values: NDArray[np.float64]) -> NDArray[np.bool_]:

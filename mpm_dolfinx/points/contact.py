@@ -396,7 +396,15 @@ def check_apart(grid: Grid, bodies: Sequence[Body], present: Sequence[bool]) -> 
         depth, gap, x = meeting(found[i], found[j], grid.h)
         if depth:
             raise ValueError(f"bodies {i} and {j}: both are at {x}, {depth:.3g} m deep, must not lie in each other")
-        warn_near(grid, f"bodies {i} and {j}", gap, x)
+        if 0 < gap < 1 and not any(_lies_in(x, found[k][0]) for k in there if k not in (i, j)):
+            warn_near(grid, f"bodies {i} and {j}", gap, x)
+
+
+def _lies_in(x: NDArray[np.float64], domains: NDArray[np.float64]) -> bool:
+    """Return whether a position (d,), m, lies in one of the domains (n, 2^d, d), m."""
+    point = np.broadcast_to(x, (1, *domains.shape[1:]))
+    which, _ = near(domains, point)
+    return bool((separation(domains[which], np.repeat(point, len(which), axis=0)) <= 0).any())
 
 
 def warn_near(grid: Grid, names: str, gap: float, x: NDArray[np.float64]) -> None:

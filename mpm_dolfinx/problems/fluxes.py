@@ -22,30 +22,55 @@ from mpm_dolfinx.points.material_points import determinant
 
 
 @dataclass(frozen=True)
+class Mobility:
+    """Mobility of the filled owned cells.
+
+    mean (n,): of the pieces, m^2/(Pa s); share (n, d): of it along each axis; shift (n, d): way, m, from the centroid
+    to the place from which the resistance to the faces counts.  The last two are None where no cell holds several
+    conductivities.
+    """
+
+    mean: NDArray[np.float64]
+    share: NDArray[np.float64] | None = None
+    shift: NDArray[np.float64] | None = None
+
+
+@dataclass(frozen=True)
 class Conduction:
-    """How the filled owned cells conduct: mobility kappa (n,), m^2/(Pa s), and what has become of them in the step.
+    """How the filled owned cells conduct, and what has become of them in the step.
 
     F (n, d, d), moved (n, d): deformation since the start of the step, and displacement, m, at the centroids; None
     where the body hardly moves.  weight (d,): of the fluid, N/m^3, if there is gravity.
     """
 
-    kappa: NDArray[np.float64]
+    mobility: Mobility
     F: NDArray[np.float64] | None
     moved: NDArray[np.float64] | None
     weight: NDArray[np.float64] | None
 
     def along(self, dim: int) -> NDArray[np.float64]:
         """Return the mobilities (n, d) along the axes, pulled back."""
-        axes = [np.broadcast_to(normal, (len(self.kappa), dim)) for normal in np.eye(dim)]
+        axes = [np.broadcast_to(normal, (len(self.mobility.mean), dim)) for normal in np.eye(dim)]
         return np.stack([self.across(slice(None), normal) for normal in axes], axis=1)
 
     def across(self, at: slice | NDArray[np.int64], normal: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the mobilities (m,) of some cells along normals (m, d), pulled back: n . J F^-1 kappa F^-T n."""
+        kappa, share = self.mobility.mean[at], self.mobility.share
+        if share is not None:
+            kappa = kappa * (share[at] * normal**2).sum(axis=1)
         if self.F is None:
-            return self.kappa[at].copy()
+            return kappa.copy()
         F = self.F[at]
         pulled = np.linalg.solve(F.swapaxes(1, 2), normal[:, :, None])[:, :, 0]
-        return self.kappa[at] * determinant(F) * (pulled**2).sum(axis=1)
+        return kappa * determinant(F) * (pulled**2).sum(axis=1)
+
+    def nearer(self, at: NDArray[np.int64], normal: NDArray[np.float64], reach: NDArray[np.float64]) -> NDArray | float:
+        """Return ways (m, d) to faces over those from which the resistance counts, along normals (m, d)."""
+        if self.mobility.shift is None:
+            return 1.0
+        way = (reach * normal).sum(axis=1)
+        rest = way - (self.mobility.shift[at] * normal).sum(axis=1)
+        return np.divide(way, rest, out=np.ones(len(way)), where=rest > 0)
 
     def deformed(self, at: NDArray[np.int64], way: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return ways (m, d) in some of the cells, m, as they are now."""
@@ -74,7 +99,8 @@ class OpenSides:
         The inflow is prescribed, or driven in by the outer pressure and gravity; at (m,): place of the cells among the
         filled ones.
         """
-        conductance, outer = flow.across(at, self.normal) * self.shape, self.pressure
+        shape = self.shape * flow.nearer(at, self.normal, self.reach)
+        conductance, outer = flow.across(at, self.normal) * shape, self.pressure
         if flow.weight is not None:
             outer = outer - flow.deformed(at, self.reach) @ flow.weight
         return conductance, self.given + conductance * outer
@@ -139,7 +165,7 @@ class CellContents:
         self._grid = grid = forms.grid
         self.filled, self._slot = filled, np.zeros(grid.num_local, dtype=np.int64)
         self._slot[filled] = np.arange(len(filled))
-        self._cells, self._weight = cells, weight = pieces.cells, pieces.weight
+        self._cells, self.weight = cells, weight = pieces.cells, pieces.weight
         volume = self.total(cells, weight)
         self.fill = np.minimum(volume / grid.cell_volume, 1.0)
         """Filled share of the filled cells."""
@@ -172,7 +198,7 @@ class CellContents:
 
     def mean(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the means over the pieces (m,) of each filled cell."""
-        return self.total(self._cells, self._weight * values) / self.total(self._cells, self._weight)
+        return self.total(self._cells, self.weight * values) / self.total(self._cells, self.weight)
 
     def motion(self, u: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return F (n, d, d) and displacement (n, d), m, at the centroids of the filled cells, of nodal u."""
@@ -234,11 +260,16 @@ class FluxForms:
             apart = across * n0 - ufl.jump(self.centroid + self.moved)
             self.gravity = FacetForm(T * ufl.dot(weight, apart) * ufl.jump(q) * dS, grid.comm)
 
-    def set_conduction(self, filled: NDArray[np.int64], flow: Conduction) -> NDArray[np.float64]:
+    def set_conduction(self, contents: CellContents, flow: Conduction) -> NDArray[np.float64]:
         """Set the coefficients for how the filled owned cells conduct; return their mobilities (n, d) by axis."""
-        d = self.grid.dim
-        mobility, moved = flow.along(d), 0.0 if flow.moved is None else flow.moved
-        for f, rows in [(self.mobility, mobility), (self.moved, moved)][: 2 if self.gravity else 1]:
+        d, filled, shift = self.grid.dim, contents.filled, flow.mobility.shift
+        mobility, moved = flow.along(d), np.zeros((len(filled), d)) if flow.moved is None else flow.moved
+        values = {self.mobility: mobility}
+        if shift is not None:  # the fluid's weight is that at the centroids nevertheless
+            values[self.centroid] = contents.centroid[filled] + shift
+        if self.gravity:
+            values[self.moved] = moved if shift is None else moved - shift
+        for f, rows in values.items():
             f.x.array[:] = 0.0
             f.x.array.reshape(-1, d)[filled] = rows
             f.x.scatter_forward()

@@ -18,7 +18,8 @@ from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.cut_domains import CutDomains
 from mpm_dolfinx.points.grid import sum_by
 from mpm_dolfinx.points.pressure_transport import Reconstruction, share_within, transport
-from mpm_dolfinx.problems.fluxes import CellContents, Conduction, OpenSides, PieceContents
+from mpm_dolfinx.problems.fluxes import CellContents, Conduction, Mobility, OpenSides, PieceContents
+from mpm_dolfinx.problems.layers import mixed_cells
 from mpm_dolfinx.problems.momentum import MomentumForms, MomentumSystem
 from mpm_dolfinx.problems.quadrature_data import QuadratureData, QuadraturePoints
 from mpm_dolfinx.problems.scene_checks import check_held
@@ -72,7 +73,7 @@ class OnGrid(Keyed):
         """Those of nearly empty cells."""
         self.stiffness = float(quadrature.rows(cut, points, lambda m: m.oedometric).max(initial=0.0))
         """Largest oedometric modulus, Pa."""
-        self.contents = None
+        self.contents, self._mixed = None, None
         if storage is not None:
             brought = PieceContents(
                 cells=cut.cells,
@@ -83,6 +84,8 @@ class OnGrid(Keyed):
                 damping=quadrature.rows(cut, points, lambda m: m.pressure_damping(grid.dim)),
             )
             self.contents = CellContents(storage.fluxes, brought, self.cells[self.cells < grid.num_owned])
+            if quadrature.layered:
+                self._mixed = mixed_cells(cut, quadrature.conducting(cut), self.contents)
 
     def data_of(self, state: State) -> QuadratureData:
         """Return the pieces with what the points, which have hardly moved since, carry now."""
@@ -166,10 +169,11 @@ class OnGrid(Keyed):
         outer = sides.ahead(contents.slot(sides.cells), p[contents.filled])
         return contents.filled, p, contents.centroid, contents.open, outer
 
-    def mobility(self, data: QuadratureData, begins: bool) -> NDArray[np.float64]:
-        """Return the mobility of the filled owned cells, m^2/(Pa s), at u; begins: refuse for good what is none."""
+    def mobility(self, data: QuadratureData, begins: bool) -> Mobility:
+        """Return the mobility of the filled owned cells at u; begins: refuse for good what is none."""
         at_pieces = self._quadrature.mobility(self.cut, self._storage.conductivity, data.pieces, begins)
-        return self.contents.mean(at_pieces)
+        mean = self.contents.mean(at_pieces)
+        return Mobility(mean) if self._mixed is None else self._mixed.mobility(at_pieces, mean)
 
     @property
     def active_cells(self) -> int:
@@ -250,7 +254,7 @@ class Assembled:
         self.momentum, self.storage, self.solvers = system.momentum, system.storage, system.solvers
         self._on_grid, self._stage, grid = on_grid, stage, on_grid.cut.grid
         self._u, self._varies = momentum.u, storage is not None and storage.conductivity is not None
-        self._mobility: Latest[NDArray[np.float64]] = Latest()
+        self._mobility: Latest[Mobility] = Latest()
         self._outflow: Latest[Outflow] = Latest()
         self.momentum.set_penalty(sides)
         stiffness = over_all(grid.comm, on_grid.stiffness, MPI.MAX) * grid.cell_volume / grid.h.min()
@@ -282,22 +286,22 @@ class Assembled:
         sides = partial(self._stage.hydraulic.data, on_grid.cut, at, contents)
         uniform = partial(on_grid.mobility, data, True)
 
-        def set_fluxes(at_sides: OpenSides, kappa: NDArray[np.float64], moves: bool) -> Outflow:
+        def set_fluxes(at_sides: OpenSides, mobility: Mobility, moves: bool) -> Outflow:
             motion = contents.motion(u.x.array.reshape(-1, len(on_grid.cut.grid.h))) if moves else (None, None)
-            return self.storage.set_fluxes(contents, at_sides, Conduction(kappa, *motion, weight))
+            return self.storage.set_fluxes(contents, at_sides, Conduction(mobility, *motion, weight))
 
         if self._varies or not state.stay:
             placed = sides()
 
             def at_present(begins: bool) -> Outflow:
-                kappa = on_grid.mobility(data, begins) if self._varies else self._mobility((), uniform)
-                return set_fluxes(placed, kappa, moves=True)
+                mobility = on_grid.mobility(data, begins) if self._varies else self._mobility((), uniform)
+                return set_fluxes(placed, mobility, moves=True)
 
             # a substep begins where the one before it has ended
             at_u, comm = (data.pieces.key, weight), on_grid.cut.grid.comm
             return lambda begins: self._outflow((*at_u, u.x.array.copy()), lambda: at_present(begins), comm)
-        kappa = self._mobility((), uniform)
-        outflow = self._outflow((at, weight), lambda: set_fluxes(sides(), kappa, moves=False), on_grid.cut.grid.comm)
+        mobility = self._mobility((), uniform)
+        outflow = self._outflow((at, weight), lambda: set_fluxes(sides(), mobility, moves=False), on_grid.cut.grid.comm)
         return lambda begins: outflow
 
 

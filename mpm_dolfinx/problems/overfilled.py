@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from mpi4py import MPI
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.bodies import Body
@@ -22,18 +23,23 @@ logger = logging.getLogger("mpm_dolfinx")
 
 def warn_overfilled(cut: CutDomains, bodies: Sequence[Body]) -> bool:
     """Log a warning of the fullest cell, with the bodies in it, if it is overfilled; return whether it is."""
-    grid, points, pieces = cut.grid, cut.points, cut.pieces
-    volume = cut.to_cells(points.volume0 * points.J) * cut.pieces_to_cells(pieces.fraction)
+    grid, points = cut.grid, cut.points
+    volume = cut.to_cells(points.volume0 * points.J) * cut.pieces_to_cells(cut.pieces.fraction)
     fill = sum_by(cut.cells, volume, grid.num_owned) / grid.cell_volume
     most = over_all(grid.comm, float(fill.max(initial=0.0)), MPI.MAX)
     if not cut.domains or most <= FULL:
         return False
     number = over_all(grid.comm, int(grid.cell_number[fill.argmax()]) if most in fill else -1, MPI.MAX)
-    ids = points.id[pieces.point[pieces.cell == number]]
-    own = np.searchsorted(np.cumsum([len(body) for body in bodies]), ids, side="right")
-    found = sorted({int(i) for rows in grid.comm.allgather(own) for i in rows})
-    x = grid.lower + (np.array(np.unravel_index(number, grid.shape)) + 0.5) * grid.h
+    found, x = bodies_in(cut, bodies, number)
     if grid.comm.rank == 0:
         who = f"bodies {', '.join(map(str, found))}" if len(found) > 1 else f"domains of body {found[0]}"
         logger.warning("the cell at %s is filled to %.0f %%, more than it holds: %s overlap", x, 100 * most, who)
     return True
+
+
+def bodies_in(cut: CutDomains, bodies: Sequence[Body], cell: int) -> tuple[list[int], NDArray[np.float64]]:
+    """Return the bodies in a lexicographic cell, and its midpoint (d,), m; on all processes together."""
+    grid, ids = cut.grid, cut.points.id[cut.pieces.point[cut.pieces.cell == cell]]
+    own = np.searchsorted(np.cumsum([len(body) for body in bodies]), ids, side="right")
+    found = sorted({int(i) for rows in grid.comm.allgather(own) for i in rows})
+    return found, grid.lower + (np.array(np.unravel_index(cell, grid.shape)) + 0.5) * grid.h

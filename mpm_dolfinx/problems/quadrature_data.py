@@ -59,12 +59,15 @@ class QuadraturePoints:
         Each law with the pieces that follow it.
     varies
         Whether mobilities change with the deformation.
+    layered
+        Whether points differ in what they conduct.
     """
 
     def __init__(self, grid: Grid, scene: SceneMaterials, fluid: Fluid | None, weighs: bool, extended: bool):
         self._grid, self._fluid = grid, fluid
         self._scene, self._weighs, self._extended = scene, weighs, extended
         self.varies = bool(fluid and scene.conductivity_laws)
+        self.layered = bool(fluid and scene.conducts and scene.layered)
         d = grid.dim
         shapes: dict[str, tuple[int, ...]] = {"F": (d, d), **scene.shapes}
         if fluid:
@@ -148,6 +151,10 @@ class QuadraturePoints:
         if law is None:
             return self.rows(cut, cut.points, lambda m: m.conductivity) / self._fluid.unit_weight
         return law.evaluate(data, cut.to_cells(cut.points.material), begins) / self._fluid.unit_weight
+
+    def conducting(self, cut: CutDomains) -> NDArray[np.float64]:
+        """Return what pieces (m, 2) that conduct alike have in common."""
+        return cut.to_cells(self._scene.conducting(cut.points))
 
     def fixed_stress(self, cut: CutDomains, points: MaterialPoints, as_printed: bool) -> NDArray[np.float64]:
         """Return beta of the fixed-stress operator at the pieces, 1/Pa, before the scheme's factor.

@@ -7,9 +7,10 @@ In each active cell, with J_Delta = det(I + grad u) (never div u: a rotation wou
     Q = T [p+ - p- + rho_w g . (x- - x+)],   T = A / (d+ / kappa+ + d- / kappa-),   kappa = k / (rho_w g),
 
 where A is the exact overlap of the body with the face, x+- are the centroids of what the cells hold
-and d+- their distances from the face.  Distances from the centroids keep the error at 0.2 % for any
-filling, where half the cell size reaches 12 %.  The sum over the cells is the fluid balance.  The change of the
-content is that of `fluid_content`, the integral over the step that of a substep of `time_integration`.
+and d+- their distances from the face; `layers` has kappa and d of cells that hold several conductivities.  Distances
+from the centroids keep the error at 0.2 % for any filling, where half the cell size reaches 12 %.  The sum over the
+cells is the fluid balance.  The change of the content is that of `fluid_content`, the integral over the step that of a
+substep of `time_integration`.
 
 Q1 with DG0 is not inf-sup stable: where next to nothing flows within a step, checkers of p go unseen.
 Jumps of the step's increment are damped by max(0, tau d - dt kappa / d) A [p - p_n], d = d+ + d-, dt the share of
@@ -215,7 +216,7 @@ class StorageSystem:
         """Assemble the fluxes through inner faces and open sides."""
         driven = sides.driven(contents.slot(sides.cells), flow)
         conductance, inflow = (contents.total(sides.cells, values) for values in driven)
-        mobility = self._forms.fluxes.set_conduction(contents.filled, flow)
+        mobility = self._forms.fluxes.set_conduction(contents, flow)
         zero(self.T)
         if self._flux is not None:
             self._flux.assemble_matrix(self.T)
