@@ -162,7 +162,7 @@ class CellContents:
     """
 
     def __init__(self, forms: FluxForms, pieces: PieceContents, filled: NDArray[np.int64]):
-        self._grid = grid = forms.grid
+        self.grid = grid = forms.grid
         self.filled, self._slot = filled, np.zeros(grid.num_local, dtype=np.int64)
         self._slot[filled] = np.arange(len(filled))
         self._cells, self.weight = cells, weight = pieces.cells, pieces.weight
@@ -202,8 +202,8 @@ class CellContents:
 
     def motion(self, u: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return F (n, d, d) and displacement (n, d), m, at the centroids of the filled cells, of nodal u."""
-        nodal = u[self._grid.cell_nodes[self.filled]].transpose(0, 2, 1)
-        return np.eye(self._grid.dim) + nodal @ self._slopes, np.einsum("ndk,nk->nd", nodal, self._values)
+        nodal = u[self.grid.cell_nodes[self.filled]].transpose(0, 2, 1)
+        return np.eye(self.grid.dim) + nodal @ self._slopes, np.einsum("ndk,nk->nd", nodal, self._values)
 
     def slot(self, cells: NDArray[np.int32]) -> NDArray[np.int64]:
         """Return the places of cells among the filled ones."""

@@ -19,7 +19,7 @@ from mpm_dolfinx.points.cut_domains import CutDomains
 from mpm_dolfinx.points.grid import sum_by
 from mpm_dolfinx.points.pressure_transport import Reconstruction, share_within, transport
 from mpm_dolfinx.problems.fluxes import CellContents, Conduction, Mobility, OpenSides, PieceContents
-from mpm_dolfinx.problems.layers import mixed_cells
+from mpm_dolfinx.problems.layers import graded, mixed_cells
 from mpm_dolfinx.problems.momentum import MomentumForms, MomentumSystem
 from mpm_dolfinx.problems.quadrature_data import QuadratureData, QuadraturePoints
 from mpm_dolfinx.problems.scene_checks import check_held
@@ -172,8 +172,10 @@ class OnGrid(Keyed):
     def mobility(self, data: QuadratureData, begins: bool) -> Mobility:
         """Return the mobility of the filled owned cells at u; begins: refuse for good what is none."""
         at_pieces = self._quadrature.mobility(self.cut, self._storage.conductivity, data.pieces, begins)
-        mean = self.contents.mean(at_pieces)
-        return Mobility(mean) if self._mixed is None else self._mixed.mobility(at_pieces, mean)
+        mean, share = self.contents.mean(at_pieces), None
+        if self._storage.conductivity is not None:
+            share = graded(self.contents, self._places.pieces.offset, at_pieces, mean)
+        return Mobility(mean, share) if self._mixed is None else self._mixed.mobility(at_pieces, mean, share)
 
     @property
     def active_cells(self) -> int:
