@@ -9,6 +9,7 @@ from helpers import SOFT
 from test_time_integration import linear_diffusion
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx.points.material_points import cofactor
 from mpm_dolfinx.verification.exact import terzaghi_consolidation
 
 
@@ -63,3 +64,10 @@ def test_a_column_that_shrinks_to_half_with_a_conductivity_law_settles_in_its_ti
     u, T = -np.array(result.displacement)[1:, 0, 1], np.array(result.t[1:]) * cv
     error = u / (final * terzaghi_consolidation(T, 1.0, 1.0)) - 1
     assert abs(error[T > 0.0499][0]) < 3e-3 and abs(error[-1]) < 2e-3, error
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_cofactors_are_those_of_the_inverse(dim):
+    F = np.eye(dim) + 0.3 * np.random.default_rng(0).normal(size=(20, dim, dim))
+    exact = np.linalg.det(F)[:, None, None] * np.linalg.inv(F).swapaxes(1, 2)
+    assert cofactor(F) == pytest.approx(exact, abs=1e-14)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from mpm_dolfinx import _compat
 from mpm_dolfinx.forms.point_forms import FacetForm
 from mpm_dolfinx.points.grid import Grid, sum_by
-from mpm_dolfinx.points.material_points import determinant
+from mpm_dolfinx.points.material_points import cofactor, determinant
 
 
 @dataclass(frozen=True)
@@ -61,8 +61,8 @@ class Conduction:
         if self.F is None:
             return kappa.copy()
         F = self.F[at]
-        pulled = np.linalg.solve(F.swapaxes(1, 2), normal[:, :, None])[:, :, 0]
-        return kappa * determinant(F) * (pulled**2).sum(axis=1)
+        pulled = np.einsum("mij,mj->mi", cofactor(F), normal)
+        return kappa / determinant(F) * (pulled**2).sum(axis=1)
 
     def nearer(self, at: NDArray[np.int64], normal: NDArray[np.float64], reach: NDArray[np.float64]) -> NDArray | float:
         """Return ways (m, d) to faces over those from which the resistance counts, along normals (m, d)."""
