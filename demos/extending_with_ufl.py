@@ -7,9 +7,9 @@ elastic foundation, a source of fluid, a law with a state of its own, plastic fl
 from the names of its arguments; `mpm_dolfinx/materials.py` and `mpm_dolfinx/extend.py` list them.
 
 Error: the largest difference from the exact solution, over its largest value.  With 20 cells: 7e-10 and 5e-9 for
-energy and fibres, whose layers are cells in the one step that they take; 3e-3 for both conductivities, 1.4e-3 for
-the foundation and 5e-4 for the source, which fall with the cell size; 2e-6 for the damage, whose top gives way a
-little; 2e-10 for plastic flow.
+energy and fibres, whose layers are cells in the one step that they take; 2e-3 for both conductivities, 1.4e-3 for
+the foundation and 5e-4 for the source, which fall with the cell size; 1e-5 for the damage, whose top gives way a
+little; 1e-11 for plastic flow.
 """
 
 from __future__ import annotations
@@ -68,11 +68,9 @@ def displacements(s: mpm.Simulation) -> tuple[np.ndarray, np.ndarray]:
 
 def pressures(s: mpm.Simulation) -> tuple[np.ndarray, np.ndarray]:
     """Return the heights of what the cells hold (m), upwards, and the cells' pore pressures (Pa)."""
-    contents = s.scene.last[0].contents
-    held = contents.filled
-    y = (s.grid.midpoints + contents.centroid)[held, 1]
-    order = np.argsort(y)
-    return y[order], s.scene.storage.p.x.array[held][order]
+    cells = s.cells()
+    order = np.argsort(cells.x[:, 1])
+    return cells.x[order, 1], cells.pressure[order]
 
 
 def stretch(stress: Callable[[float], float]) -> float:

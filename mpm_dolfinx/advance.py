@@ -98,7 +98,8 @@ class Motion:
                 pressure = cut.to_pieces(self._storage.p.x.array[pieces.cells])
                 x = (state.stay.x if state.stay else cut.pieces.x) + cut.to_pieces((at_nodes @ N[:, :, None])[:, :, 0])
                 start = state.stay.start if state.stay else cut.to_pieces(self._storage.p_n.x.array[pieces.cells])
-                points, ids = replace(points, pressure=cut.mean(pressure)), points.id[cut.pieces.point]
+                own = on_grid.pressures_up_to_surface(self._reconstruction, state.stage)
+                points, ids = replace(points, pressure=cut.mean(own)), points.id[cut.pieces.point]
             _check_inside(cut, points, t)
         new = replace(state, t=t, points=points, transported=None, stay=Stay(cut.points, ids, pressure, x, start))
         return new if serves and stays else self.left_grid(new, on_grid), folded
@@ -193,7 +194,7 @@ class Motion:
                 store = self._materials.storage(points, self._fluid) * points.volume0 * points.J
                 on_grid.set_pressures(stay.pressure)
                 pressure, slope, bounds = on_grid.pressures_at_pieces(
-                    self._reconstruction, pieces.fraction * store[pieces.point]
+                    self._reconstruction, pieces.fraction * store[pieces.point], state.stage
                 )
                 transported = PiecePressures(stay.id, pieces.cell, pieces.fraction, pressure, stay.x, slope, bounds)
         return replace(state, transported=transported, stay=None)

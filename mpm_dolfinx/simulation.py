@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mpm_dolfinx.cell_fields import CellFields, cell_fields
 from mpm_dolfinx.constitutive.skeleton import Fluid, Skeleton
 from mpm_dolfinx.errors import StepFailed
 from mpm_dolfinx.io import summary
@@ -180,6 +181,13 @@ class Simulation:
         On several processes all call it together.
         """
         return self.scene.materials.effective_stress(self.points)
+
+    def cells(self) -> CellFields:
+        """Return centroids, displacements, pressures and stresses of the cells at present: see `CellFields`.
+
+        On several processes all call it together.
+        """
+        return cell_fields(self.scene, self.state)
 
     # ---- stages ---------------------------------------------------------------------------------
 

@@ -24,6 +24,7 @@ simulation = mpm.Simulation(
 )
 result = simulation.run(1.0, 0.25, progress=False)
 points = simulation.points
+simulation.cells()
 parts = simulation.grid.comm.gather((points.id, points.x, points.pressure))
 if parts:
     ids, x, p = (np.concatenate(a) for a in zip(*parts, strict=True))

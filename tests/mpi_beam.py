@@ -8,9 +8,15 @@ from helpers import beam
 
 simulation, probe = beam(load=54e3)
 result = simulation.run(0.1, 0.02, probes=probe, progress=False)
+cells, number = simulation.cells(), simulation.grid.cell_number
+held = simulation.grid.comm.gather((number[cells.cell], cells.pressure, cells.stress, cells.volume))
 parts = simulation.grid.comm.gather((simulation.points.id, simulation.points.x, simulation.points.pressure))
 if parts:
     ids, x, p = (np.concatenate(a) for a in zip(*parts, strict=True))
     order = np.argsort(ids)
     tip = np.array([u[0] for u in result.displacement])
-    np.savez(sys.argv[1], tip=tip, x=x[order], p=p[order], balance=result.balance, counts=[len(q[0]) for q in parts])
+    at, pressure, stress, volume = (np.concatenate(a) for a in zip(*held, strict=True))
+    by_cell = np.argsort(at)
+    held = {"pressure": pressure[by_cell], "stress": stress[by_cell], "volume": volume[by_cell]}
+    held |= {"x": x[order], "p": p[order], "counts": [len(q[0]) for q in parts]}
+    np.savez(sys.argv[1], tip=tip, balance=result.balance, **held)

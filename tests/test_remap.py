@@ -105,7 +105,8 @@ def reconstruct(p, filled=None):
     if filled is not None:
         faces[~filled(grid.midpoints)] = 0.0
     nowhere, cells = np.zeros((grid.num_local, 2)), np.arange(grid.num_owned)
-    slope, bounds = Reconstruction(grid)(cells, p(grid.midpoints), nowhere, faces, nowhere)
+    sealed = np.full((grid.num_owned, 2, 2, 2), np.nan)
+    slope, bounds = Reconstruction(grid)(cells, p(grid.midpoints), nowhere, faces, sealed, nowhere)
     return grid.midpoints, slope, bounds
 
 

@@ -67,7 +67,7 @@ def test_a_conductivity_law_is_taken_at_the_stages_of_the_step():
     result = s.run(0.1 / cv, 0.1 / cv / 20, probes=mpm.probes([body], [[h / 2, 1.0]]), progress=False)
     u, T = -np.array(result.displacement)[1:, 0, 1], np.array(result.t[1:]) * cv
     error = u / (final * terzaghi_consolidation(T, 1.0, 1.0)) - 1
-    assert abs(error[T > 0.0499][0]) < 8e-3 and abs(error[-1]) < 5e-3 and result.balance < 1e-8, "of the cells, mostly"
+    assert abs(error[T > 0.0499][0]) < 1e-3 and abs(error[-1]) < 1e-3 and result.balance < 1e-8
 
 
 def linear_diffusion(conductivity, J):
@@ -125,7 +125,10 @@ def test_output_times_are_hit_whatever_the_steps():
 
 
 def test_steps_grow_over_six_decades_of_consolidation():
-    """From T_v = 1e-6 to 1, against steps so short that time costs nothing; most is the first steps' damping."""
+    """From T_v = 1e-6 to 1, in the cells, against steps so short that time costs nothing.
+
+    Most is the first steps' damping.
+    """
     cv = SOFT.conductivity / 9810 * SOFT.oedometric
 
     def run(rtol):
@@ -134,7 +137,7 @@ def test_steps_grow_over_six_decades_of_consolidation():
         result = s.run(
             times[-1], rtol=rtol, t_eval=times, observe=lambda s: p.append(s.points.pressure), progress=False
         )
-        return result.steps, np.array(p)
+        return result.steps, np.array(p).reshape(-1, 2, 20, 2).mean(axis=(1, 3))
 
     (steps, p), (_, true) = run(1e-4), run(1e-5)
     assert steps <= 100 and np.abs(p - true).max() < 1e-3 * 100

@@ -201,7 +201,8 @@ class Cells:
         """Return slopes (n, d), per cell, and bounds (n, 2) of all cells (what is tested, by its names)."""
         h, cells = self.grid.h, np.arange(self.grid.num_owned)
         p = self.p if p is None else p
-        slope, bounds = self.reconstruction(cells, p, self.centroid * h, self.faces, self.origin * h)
+        sealed = np.full((len(cells), len(h), 2, 2), np.nan)
+        slope, bounds = self.reconstruction(cells, p, self.centroid * h, self.faces, sealed, self.origin * h)
         return slope * h, bounds
 
     @property

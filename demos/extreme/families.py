@@ -155,9 +155,10 @@ def contrast_of_conductivity():
 
 def series(cut: float, ratio: float, s: mpm.Simulation, r: mpm.Result) -> float:
     """Return the error of the pressures in the cells for two layers in series."""
-    y = (np.floor(s.points.x[:, 1] * 80) + 0.5) / 80
+    cells = s.cells()
+    y = cells.x[:, 1]
     lost = np.where(y < cut, y, cut + (y - cut) / ratio) / (cut + (1 - cut) / ratio)
-    return off(s.points.pressure / DROP, 1 - lost, 1)
+    return off(cells.pressure / DROP, 1 - lost, 1)
 
 
 @family(0.02)

@@ -44,10 +44,11 @@ class Writer:
     pore pressure, effective stress (Pa), F, J and what else the points carry; `history.csv`, one row an output
     time with the counts of `Result` so far, least and largest pressure (Pa), the displacements of the probes (m)
     and the forces of the given displacements (N, in plane strain N/m; nan where no step has been taken since they
-    were set by a stage or the run was resumed); if asked for `grid.pvd`, the last step's displacement (m), the pore
-    pressure (Pa) and the filled share of the cells.  Tensors: in 2D a field for each component (F_xy), in
-    3D row by row.  ParaView and VTK read all of it, meshio the points.  Stress and pressure of points are those of
-    their cell.
+    were set by a stage or the run was resumed); if asked for `grid.pvd`, what the cells hold (`Simulation.cells`):
+    filled share, centroid x and displacement (m), pore pressure, effective and total stress (Pa), by components, zero
+    in empty cells; and the last step's displacement (m) of the nodes.  Tensors: in 2D a field for each component
+    (F_xy), in 3D row by row.  ParaView and VTK read all of it, meshio the points.  The stress of points is that of
+    their cell; their pressure is of second order.
 
     What the folder holds up to the present time stays, and is continued: made after `resume`, a writer leaves
     the files of a run that was never interrupted.
@@ -215,18 +216,24 @@ def _columns(name: str, rows: NDArray) -> Iterator[tuple[str, NDArray]]:
 
 
 def _grid_fields(simulation: Simulation) -> list[fem.Function]:
-    """Return copies, by their names in the file, of the fields of the last step."""
-    scene = simulation.scene
-    fill = scene.momentum.ghost.fill
-    fields = {"step_displacement": scene.momentum.u, "fill": fill}
-    if scene.storage is not None:
-        fields["pressure"] = scene.storage.p
-    out = []
-    for name, field in fields.items():
-        out.append(fem.Function(field.function_space, name=name))
-        out[-1].x.array[:] = field.x.array
-        if name == "pressure":
-            out[-1].x.array[fill.x.array == 0] = 0.0  # of cells that the body has left
+    """Return copies, by their names in the file, of the step's displacement and of what the cells hold."""
+    scene, d = simulation.scene, simulation.grid.dim
+    cells, u = simulation.cells(), scene.momentum.u
+    moved = fem.Function(u.function_space, name="step_displacement")
+    moved.x.array[:] = u.x.array
+    fields = {"fill": scene.momentum.ghost.fill.x.array[cells.cell]}
+    for i in range(d):
+        fields |= {f"{name}_{'xyz'[i]}": getattr(cells, name)[:, i] for name in ("displacement", "x")}
+    if cells.pressure is not None:
+        fields["pressure"] = cells.pressure
+    for i, j in zip(*np.triu_indices(d), strict=True):
+        for name in ("effective_stress", "stress")[: 1 if cells.pressure is None else 2]:
+            fields[f"{name}_{'xyz'[i]}{'xyz'[j]}"] = getattr(cells, name)[:, i, j]
+    out = [moved]
+    for name, rows in fields.items():  # of numbers only: 0.5 takes vectors for nodal ones
+        out.append(fem.Function(simulation.grid.cellwise(), name=name))
+        out[-1].x.array[cells.cell] = rows
+        out[-1].x.scatter_forward()
     return out
 
 

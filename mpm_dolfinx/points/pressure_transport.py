@@ -2,14 +2,17 @@
 """Conservative remap of the pore pressure from one grid to the next, of second order.
 
 In each cell the pressure is reconstructed as p + s . (x - c) about the centroid c of what the cell stores.  The
-slope s along an axis is van Leer's mean of the differences to the neighbours behind open faces, and nothing where
-one of them is missing; it is scaled so that nowhere in the cell the extremes of cell and neighbours are passed.
+slope s along an axis is van Leer's mean of the differences to the neighbours behind open faces, or to the pressure of
+a drained side, and nothing where one of them is missing; it is scaled so that nowhere in the cell the extremes of
+cell, neighbours and drained sides are passed.
 
 A piece of a domain takes the pressure at its own centroid and moves with the domain.  When the domain is cut
 anew, each cell that it lay in and still lies in keeps its pressure for the part that stayed; what newly lies
 in a cell takes the mean pressure of what left the others.  The places of the pieces are passed on in the same way;
 how far they then are from the true ones tells, with the domain's mean slope, what is still amiss.  Shares of every
 domain sum to one, and so does this correction to nothing: nothing is lost; where nothing moves nothing changes.
+
+What is told of the points, and taken along by none, is reconstructed up to sealed sides as well: see `up_to_surface`.
 """
 
 from __future__ import annotations
@@ -17,6 +20,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 import numpy as np
+from dolfinx import fem
 from numpy.typing import NDArray
 
 from mpm_dolfinx.parallel.exchange import Exchange
@@ -84,6 +88,7 @@ class Reconstruction:
 
     def __init__(self, grid: Grid):
         self.grid = grid
+        self._slope = fem.Function(grid.cellwise((grid.dim,)))
         index = np.stack(np.unravel_index(grid.cell_number[: grid.num_owned], tuple(grid.shape)), axis=1)
         self._neighbour = np.empty((grid.num_owned, grid.dim, 2), dtype=np.int64)
         for axis in range(grid.dim):
@@ -100,6 +105,7 @@ class Reconstruction:
         p: NDArray[np.float64],
         centroid: NDArray[np.float64],
         faces: NDArray[np.float64],
+        outer: NDArray[np.float64],
         origin: NDArray[np.float64],
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return slopes (n, d) and bounds (n, 2) in owned cells (n,).
@@ -109,32 +115,112 @@ class Reconstruction:
         p, centroid, faces
             Of all local cells: values (c,), centroids (c, d) relative to the midpoints, m, open shares (c, d, 2)
             of the faces, zero for empty cells.
+        outer : (n, d, 2, 2)
+            By axis and end: difference to the pressure on drained sides ahead, Pa, and slope to them, Pa/m; nan where
+            there is none.
         origin : (n, d), m
             Places relative to the midpoints, from which the slopes are drawn.
         """
-        h, d = self.grid.h, self.grid.dim
-        there, here = self._neighbour[cells], p[cells]
-        difference = np.zeros((len(cells), d, 2))
-        slope = np.empty((len(cells), d))
-        for axis in range(d):
-            one_sided = np.zeros((len(cells), 2))
-            for end in (0, 1):
-                other = there[:, axis, end]
-                is_open = (other >= 0) & (faces[cells, axis, end] > 0) & (faces[other, axis, 1 - end] > 0)
-                jump = np.where(is_open, p[other] - here, 0.0)
-                apart = h[axis] + (2 * end - 1) * (centroid[other, axis] - centroid[cells, axis])
-                difference[:, axis, end] = jump
-                one_sided[:, end] = (2 * end - 1) * jump / np.where(is_open, apart, 1.0)
-            a, b = one_sided.T
-            same = a * b > 0
-            slope[:, axis] = np.divide(2 * a * b, a + b, out=np.zeros(len(a)), where=same)
-        spread = np.stack([difference.min(axis=(1, 2)), difference.max(axis=(1, 2))], axis=1)
-        low, high = spread.clip(max=0)[:, 0], spread.clip(min=0)[:, 1]
-        ends = slope[:, :, None] * (h[:, None] * [-0.5, 0.5] - origin[:, :, None])
+        jump, one_sided, _, drained = self._differences(cells, p, centroid, faces, outer)
+        slope, low, high = van_leer(one_sided), *_spread(jump)
+        whole = self.grid.h[:, None] * [-0.5, 0.5]
+        filled = (2 * centroid[cells][:, :, None] - whole[:, ::-1]).clip(whole[:, :1], whole[:, 1:])
+        ends = slope[:, :, None] * (np.where(drained, filled, whole) - origin[:, :, None])
         scale = np.ones(len(cells))
         for reach, room in ((ends.min(axis=2).sum(axis=1), low), (ends.max(axis=2).sum(axis=1), high)):
             scale = np.minimum(scale, np.divide(room, reach, out=np.ones(len(cells)), where=reach != 0))
-        return slope * scale[:, None], here[:, None] + np.stack([low, high], axis=1)
+        return slope * scale[:, None], p[cells, None] + np.stack([low, high], axis=1)
+
+    def _differences(self, cells, p, centroid, faces, outer) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+        """Return differences and slopes to neighbours and drained sides, and where there is the one or the other.
+
+        All (n, d, 2), by axis and end, zero where there is neither.
+        """
+        h, there, here = self.grid.h, self._neighbour[cells], p[cells]
+        jump, one_sided = np.zeros(there.shape), np.zeros(there.shape)
+        is_open = np.zeros(there.shape, dtype=bool)
+        for axis in range(self.grid.dim):
+            for end in (0, 1):
+                other, way = there[:, axis, end], 2 * end - 1
+                is_open[:, axis, end] = inside = (
+                    (other >= 0) & (faces[cells, axis, end] > 0) & (faces[other, axis, 1 - end] > 0)
+                )
+                jump[:, axis, end] = np.where(inside, p[other] - here, 0.0)
+                apart = h[axis] + way * (centroid[other, axis] - centroid[cells, axis])
+                one_sided[:, axis, end] = way * jump[:, axis, end] / np.where(inside, apart, 1.0)
+        drained = ~is_open & np.isfinite(outer[..., 0])
+        jump, one_sided = np.where(drained, outer[..., 0], jump), np.where(drained, outer[..., 1], one_sided)
+        return jump, one_sided, is_open, drained
+
+    def up_to_surface(
+        self,
+        cells: NDArray[np.int64],
+        p: NDArray[np.float64],
+        centroid: NDArray[np.float64],
+        faces: NDArray[np.float64],
+        outer: NDArray[np.float64],
+        x: NDArray[np.float64],
+        slot: NDArray[np.int64],
+    ) -> NDArray[np.float64]:
+        """Return pressures (m,), Pa, at places in owned cells (n,), also of second order in cells at the surface.
+
+        At a sealed side the slope is that of the cell before it, or what its change leaves if that is less: linear
+        values are met, and steep ones not carried on.  No place passes cell, neighbours, drained sides, or what this
+        slope has at the surface.
+
+        Parameters
+        ----------
+        p, centroid, faces, outer
+            As for slopes.
+        x : (m, d), m
+            Places, relative to the cells' midpoints.
+        slot : (m,)
+            Place of each one's cell among `cells`.
+        """
+        jump, one_sided, is_open, drained = self._differences(cells, p, centroid, faces, outer)
+        slope = van_leer(one_sided)
+        at, axis = np.nonzero(is_open.any(axis=2) & ~(is_open | drained).all(axis=2))
+        end = is_open[at, axis, 1].astype(int)
+        to, there = one_sided[at, axis, end], self._neighbour[cells][at, axis, end]
+        before = self._everywhere(cells, slope)[there, axis]
+        same = before * to > 0
+        slope[at, axis] = np.where(same, np.sign(to) * np.minimum(np.abs(before), np.abs(2 * to - before)), 0.0)
+        way = 1 - 2 * end
+        reach = self.grid.h[axis] / 2 - way * centroid[cells[at], axis]
+        on = way * slope[at, axis] * reach
+        low, high = _spread(jump)
+        low, high = low + sum_by(at, np.minimum(on, 0), len(cells)), high + sum_by(at, np.maximum(on, 0), len(cells))
+        rise = np.einsum("md,md->m", slope[slot], x - centroid[cells[slot]])
+        return p[cells[slot]] + share_within(rise, low, high, slot)[slot] * rise
+
+    def _everywhere(self, cells: NDArray[np.int64], slope: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return slopes of owned cells (n, d) in all local cells, ghosts included, zero in the others."""
+        out = self._slope.x.array.reshape(-1, self.grid.dim)
+        out[:] = 0.0
+        out[cells] = slope
+        self._slope.x.scatter_forward()
+        return out
+
+
+def van_leer(one_sided: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the harmonic means (n, d) of slopes to both sides (n, d, 2), zero where their signs differ."""
+    a, b = one_sided[..., 0], one_sided[..., 1]
+    return np.divide(2 * a * b, a + b, out=np.zeros(a.shape), where=a * b > 0)
+
+
+def share_within(
+    rise: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64], slot: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Return the largest shares (n,) of rises (m,) in cells by which none passes the cell's low or high (n,)."""
+    room, share = np.where(rise > 0, high[slot], low[slot]), np.ones(len(low))
+    beyond = np.flatnonzero(np.abs(rise) > np.abs(room))
+    np.minimum.at(share, slot[beyond], room[beyond] / rise[beyond])
+    return share
+
+
+def _spread(jump: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return how far the least and the largest of neighbours are from the cells (n,), from differences (n, d, 2)."""
+    return jump.min(axis=(1, 2)).clip(max=0), jump.max(axis=(1, 2)).clip(min=0)
 
 
 def transport(old: PiecePressures, points: MaterialPoints, new: Pieces) -> NDArray[np.float64]:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from mpm_dolfinx import _compat
 from mpm_dolfinx.forms.point_forms import FacetForm
 from mpm_dolfinx.points.grid import Grid, sum_by
-from mpm_dolfinx.points.material_points import determinant
+from mpm_dolfinx.points.material_points import cofactor, determinant
 
 
 @dataclass(frozen=True)
@@ -61,8 +61,8 @@ class Conduction:
         if self.F is None:
             return kappa.copy()
         F = self.F[at]
-        pulled = np.linalg.solve(F.swapaxes(1, 2), normal[:, :, None])[:, :, 0]
-        return kappa * determinant(F) * (pulled**2).sum(axis=1)
+        pulled = np.einsum("mij,mj->mi", cofactor(F), normal)
+        return kappa / determinant(F) * (pulled**2).sum(axis=1)
 
     def nearer(self, at: NDArray[np.int64], normal: NDArray[np.float64], reach: NDArray[np.float64]) -> NDArray | float:
         """Return ways (m, d) to faces over those from which the resistance counts, along normals (m, d)."""
@@ -105,6 +105,31 @@ class OpenSides:
             outer = outer - flow.deformed(at, self.reach) @ flow.weight
         return conductance, self.given + conductance * outer
 
+    def ahead(self, at: NDArray[np.int64], p: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return what lies ahead of the filled cells (n, d, 2, 2): on drained sides, by axis and end of the cell.
+
+        Difference (Pa) of the pressure there to that of the cell, and slope (Pa/m) towards it; nan where there is none.
+
+        Parameters
+        ----------
+        at : (m,)
+            Place of the faces' cells among the filled ones.
+        p : (n,), Pa
+            Pressures of the filled cells.
+        """
+        out = np.full((len(p), self.normal.shape[1], 2, 2), np.nan)
+        distance = np.einsum("md,md->m", self.reach, self.normal)
+        drained = np.flatnonzero((self.shape > 0) & (distance > 0))  # sides of an inflow have no conductance
+        at, normal, distance = at[drained], self.normal[drained], distance[drained]
+        area, jump = self.shape[drained] * distance, self.pressure[drained] - p[at]
+        for axis, end in np.ndindex(out.shape[1:3]):
+            share = area * np.maximum((2 * end - 1) * normal[:, axis], 0.0)
+            total = sum_by(at, share, len(p))
+            # along the side the pressure does not change, so its gradient is normal to it
+            for k, values in enumerate((jump, jump * normal[:, axis] / distance)):
+                np.divide(sum_by(at, share * values, len(p)), total, out=out[:, axis, end, k], where=total > 0)
+        return out
+
 
 @dataclass(frozen=True)
 class PieceContents:
@@ -137,7 +162,7 @@ class CellContents:
     """
 
     def __init__(self, forms: FluxForms, pieces: PieceContents, filled: NDArray[np.int64]):
-        self._grid = grid = forms.grid
+        self.grid = grid = forms.grid
         self.filled, self._slot = filled, np.zeros(grid.num_local, dtype=np.int64)
         self._slot[filled] = np.arange(len(filled))
         self._cells, self.weight = cells, weight = pieces.cells, pieces.weight
@@ -190,8 +215,8 @@ class CellContents:
 
     def motion(self, u: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return F (n, d, d) and displacement (n, d), m, at the centroids of the filled cells, of nodal u."""
-        nodal = u[self._grid.cell_nodes[self.filled]].transpose(0, 2, 1)
-        return np.eye(self._grid.dim) + nodal @ self._slopes, np.einsum("ndk,nk->nd", nodal, self._values)
+        nodal = u[self.grid.cell_nodes[self.filled]].transpose(0, 2, 1)
+        return np.eye(self.grid.dim) + nodal @ self._slopes, np.einsum("ndk,nk->nd", nodal, self._values)
 
     def slot(self, cells: NDArray[np.int32]) -> NDArray[np.int64]:
         """Return the places of cells among the filled ones."""

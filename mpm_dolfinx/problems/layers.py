@@ -10,6 +10,8 @@ Resistance counts from where the pressure is the mean of a line in steady flow: 
 int s dR to the upper one, s in [0, 1] along the line.  Their sum over faces is exact.  Where layers lie aslant by more
 than `ASLANT` the place moves to the more conductive end, or a drain would be cut wherever it passes from one row of
 cells to the next.  A piece counts as a box, the part of its domain's bounding box in the cell.
+
+Of a material whose conductivity depends on its deformation a cell holds many, but no layers: see `graded`.
 """
 
 from __future__ import annotations
@@ -104,10 +106,16 @@ class MixedCells:
             out.append((line[kept], piece[kept], meets[kept]))
         return out
 
-    def mobility(self, kappa: NDArray[np.float64], mean: NDArray[np.float64]) -> Mobility:
-        """Return the mobility of all filled cells, of their means (n,) and of those of all pieces, m^2/(Pa s)."""
+    def mobility(
+        self, kappa: NDArray[np.float64], mean: NDArray[np.float64], share: NDArray[np.float64] | None
+    ) -> Mobility:
+        """Return the mobility of all filled cells, of their means (n,) and of those of all pieces, m^2/(Pa s).
+
+        share (n, d): along the axes in the other cells, which is changed here.
+        """
         along, off = self._along(kappa[self._rows])
-        share, shift = np.ones((len(mean), along.shape[1])), np.zeros((len(mean), along.shape[1]))
+        shift = np.zeros((len(mean), along.shape[1]))
+        share = np.ones_like(shift) if share is None else share
         share[self._filled] = np.divide(along, mean[self._filled, None], out=np.zeros_like(along), where=along > 0)
         shift[self._filled] = off.clip(*self._room) * self._h
         return Mobility(mean, share, shift)
@@ -146,6 +154,35 @@ class MixedCells:
         whole = moment.sum(axis=1) ** 2
         aslant = np.divide(whole - (moment**2).sum(axis=1), 2 * whole, out=np.zeros(n), where=whole > 0)
         return 1 + aslant / ASLANT**2
+
+
+def graded(
+    contents: CellContents, offset: NDArray[np.float64], kappa: NDArray[np.float64], mean: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the share (n, d) of the mean along each axis, where the mobility changes steadily through a cell.
+
+    Along its gradient the pieces resist in series, across it they conduct in parallel.  Aslant, the difference of the
+    two means counts along each axis by the variance that the linear change there explains, as for lines.
+
+    Parameters
+    ----------
+    offset, kappa
+        Of the pieces: places (m, d) from the cells' midpoints, m, and mobilities (m,), m^2/(Pa s).
+    mean
+        Mean mobility of the filled cells (n,).
+    """
+    with np.errstate(divide="ignore"):
+        series = 1 / contents.mean(1 / kappa)
+    parts = []  # of the variance, by the linear change along each axis
+    for x, least in zip(offset.T, (BLUR * contents.grid.h) ** 2, strict=True):
+        middle, moment = contents.mean(x), contents.mean(x * kappa)
+        spread = contents.mean(x**2) - middle**2
+        parts.append(np.divide((moment - middle * mean) ** 2, spread, out=np.zeros(len(mean)), where=spread > least))
+    parts = np.stack(parts, axis=1)
+    whole = parts.sum(axis=1, keepdims=True)
+    along = np.divide(parts, whole, out=np.full(parts.shape, 1 / parts.shape[1]), where=whole > 0)
+    less = np.divide(mean - series, mean, out=np.zeros(len(mean)), where=mean > 0)
+    return 1 - less[:, None] * along
 
 
 def mixed_cells(cut: CutDomains, alike: NDArray[np.float64], contents: CellContents) -> MixedCells | None:

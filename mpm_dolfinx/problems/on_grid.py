@@ -17,9 +17,9 @@ from mpm_dolfinx.constitutive.fields import SceneMaterials
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.cut_domains import CutDomains
 from mpm_dolfinx.points.grid import sum_by
-from mpm_dolfinx.points.pressure_transport import Reconstruction, transport
+from mpm_dolfinx.points.pressure_transport import Reconstruction, share_within, transport
 from mpm_dolfinx.problems.fluxes import CellContents, Conduction, Mobility, OpenSides, PieceContents
-from mpm_dolfinx.problems.layers import mixed_cells
+from mpm_dolfinx.problems.layers import graded, mixed_cells
 from mpm_dolfinx.problems.momentum import MomentumForms, MomentumSystem
 from mpm_dolfinx.problems.quadrature_data import QuadratureData, QuadraturePoints
 from mpm_dolfinx.problems.scene_checks import check_held
@@ -99,11 +99,18 @@ class OnGrid(Keyed):
         if self._storage is None:
             return
         with Timer("mpm: remap"):
-            if state.stay:
-                self.set_pressures(state.stay.pressure)
-            else:
-                self._average_pressures(transport(state.transported, self.cut.points, self.cut.pieces))
-        self._storage.p.x.array[:] = self._storage.p_n.x.array
+            p_n = self._storage.p_n.x
+            p_n.array[self.contents.filled] = self.pressures(state)
+            p_n.scatter_forward()
+        self._storage.p.x.array[:] = p_n.array
+
+    def pressures(self, state: State) -> NDArray[np.float64]:
+        """Return the pressures of the filled owned cells at the start of a step, Pa."""
+        if not state.stay:
+            return self._mean_pressures(transport(state.transported, self.cut.points, self.cut.pieces))
+        p = np.zeros(self.cut.grid.num_local)
+        p[self.cut.cells] = self.cut.pieces_to_cells(state.stay.pressure)
+        return p[self.contents.filled]
 
     def as_reset(self, state: State) -> QuadratureData:
         """Return the pieces when the grid was reset, and set the present pressures to those of then."""
@@ -119,21 +126,18 @@ class OnGrid(Keyed):
         p_n.array[self.cut.cells] = self.cut.pieces_to_cells(at_pieces)
         p_n.scatter_forward()
 
-    def _average_pressures(self, at_pieces: NDArray[np.float64]) -> None:
-        """Set the pressures at the start of a step to the means of those (m,), Pa, that pieces bring to their cells.
+    def _mean_pressures(self, at_pieces: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the means in the filled owned cells of the pressures (m,), Pa, that pieces bring to them.
 
-        Means are by what is stored, or by volume in a cell that stores nothing.
+        By what is stored, or by volume in a cell that stores nothing.
         """
-        contents, cells, p_n = self.contents, self.cut.cells, self._storage.p_n.x
+        contents, cells = self.contents, self.cut.cells
         pressure, store = self.cut.pieces_to_cells(at_pieces), self.weight * self.data.pieces["storage"][:, 0]
-        held = contents.total(cells, store)
-        mean = contents.mean(pressure)
-        np.divide(contents.total(cells, store * pressure), held, out=mean, where=held > 0)
-        p_n.array[contents.filled] = mean
-        p_n.scatter_forward()
+        held, mean = contents.total(cells, store), contents.mean(pressure)
+        return np.divide(contents.total(cells, store * pressure), held, out=mean, where=held > 0)
 
     def pressures_at_pieces(
-        self, reconstruction: Reconstruction, store: NDArray[np.float64]
+        self, reconstruction: Reconstruction, store: NDArray[np.float64], stage: Stage
     ) -> list[NDArray[np.float64]]:
         """Return the pressures (m,), their slopes (m, d) and bounds (m, 2) at the pieces, as `set_pressures` has set.
 
@@ -146,8 +150,10 @@ class OnGrid(Keyed):
         weight = np.where(contents.total(cells, store)[at] > 0, store, self.weight)
         total = contents.total(cells, weight)
         origin = np.stack([contents.total(cells, weight * x) / total for x in offset.T], axis=1)
-        slope, bounds = reconstruction(contents.filled, p, contents.centroid, contents.open, origin)
-        pressure = p[cells] + np.einsum("md,md->m", slope[at], offset - origin[at])
+        slope, bounds = reconstruction(*self._held(p, stage), origin)
+        rise, here = np.einsum("md,md->m", slope[at], offset - origin[at]), p[contents.filled]
+        share = share_within(rise, *(bounds.T - here), at)  # drained sides may be aslant in their cells
+        slope, pressure = slope * share[:, None], p[cells] + share[at] * rise
         return [self.cut.to_pieces(values) for values in (pressure, slope[at], bounds[at])]
 
     def softness(self, state: State) -> NDArray[np.float64] | float:
@@ -155,11 +161,25 @@ class OnGrid(Keyed):
         data = state.points.data
         return self.cut.to_cells(data["softness"]) if "softness" in data else 1.0
 
+    def pressures_up_to_surface(self, reconstruction: Reconstruction, stage: Stage) -> NDArray[np.float64]:
+        """Return the pressures (m,), Pa, at the pieces' centroids; their mean by volume in a cell is the cell's."""
+        places, held = self._places.pieces, self._held(self._storage.p.x.array, stage)
+        return self.cut.to_pieces(reconstruction.up_to_surface(*held, places.offset, places.slots))
+
+    def _held(self, p: NDArray[np.float64], stage: Stage) -> tuple:
+        """Return what slopes of cells with these pressures are drawn from."""
+        contents = self.contents
+        sides = stage.hydraulic.data(self.cut, self.cut.points, contents)
+        outer = sides.ahead(contents.slot(sides.cells), p[contents.filled])
+        return contents.filled, p, contents.centroid, contents.open, outer
+
     def mobility(self, data: QuadratureData, begins: bool) -> Mobility:
         """Return the mobility of the filled owned cells at u; begins: refuse for good what is none."""
         at_pieces = self._quadrature.mobility(self.cut, self._storage.conductivity, data.pieces, begins)
-        mean = self.contents.mean(at_pieces)
-        return Mobility(mean) if self._mixed is None else self._mixed.mobility(at_pieces, mean)
+        mean, share = self.contents.mean(at_pieces), None
+        if self._storage.conductivity is not None:
+            share = graded(self.contents, self._places.pieces.offset, at_pieces, mean)
+        return Mobility(mean, share) if self._mixed is None else self._mixed.mobility(at_pieces, mean, share)
 
     @property
     def active_cells(self) -> int:
@@ -287,7 +307,13 @@ class Assembled:
             outflow = self._outflow((at, weight), lambda: set_fluxes(sides(), mobility(True), *stays), grid.comm)
             return lambda begins: outflow
         placed = sides()
-        return lambda begins: set_fluxes(placed, mobility(begins), *contents.motion(u.x.array.reshape(-1, grid.dim)))
+
+        def at_present(begins: bool) -> Outflow:
+            return set_fluxes(placed, mobility(begins), *contents.motion(u.x.array.reshape(-1, grid.dim)))
+
+        # a substep begins where the one before it has ended
+        at_u = (data.pieces.key, weight)
+        return lambda begins: self._outflow((*at_u, u.x.array.copy()), lambda: at_present(begins), grid.comm)
 
 
 def assembled(

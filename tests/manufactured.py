@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: MIT
+"""A large-strain solution (u, p) that is chosen, with the body force and the source that it needs, in UFL.
+
+A block of one metre with soft water and a conductivity that depends on its volume stands between smooth walls.  Its
+top, which is drained, sinks by a third; inside it bulges and turns.  Everything is a function of X and t.
+"""
+
+import numpy as np
+import ufl
+
+import mpm_dolfinx as mpm
+
+SOIL = mpm.NeoHookean(
+    bulk=1e6,
+    shear=6e5,
+    porosity=0.6,
+    conductivity=1e-4,
+    conductivity_law=lambda conductivity, J: conductivity * ufl.exp(3 * (J - 1)),
+)
+WATER = mpm.Fluid(bulk=5e6)
+SINK, BULGE, LOAD, TIME = 0.3, 0.08, 2e5, 20.0  # m, m, Pa, s
+WALLS = {"left": "x", "right": "x", "bottom": "y"}
+
+
+def sunk(t, sin):
+    """Return the share of SINK by which the top has sunk."""
+    return sin(np.pi / 2 * t / TIME) ** 2
+
+
+def solution(X, t, sin=np.sin, cos=np.cos):
+    """Return (u, p) at reference positions (x, y), m, at time t, s, of numbers or UFL.
+
+    The walls are free of shear and flow, and so is the floor; at the top p = 0, and the traction is even.
+    """
+    (x, y), part = X, sunk(t, sin)
+    across = BULGE * part * sin(np.pi * x) * (1 - y) ** 2 * (1 + 2 * y)
+    down = SINK * part * (y + 0.5 * cos(np.pi * x) * y * (1 - y) ** 2)
+    return (across, -down), LOAD * sin(0.8 * np.pi * t / TIME) * (1 - y**2) * (1 + 0.4 * cos(np.pi * x))
+
+
+def traction(t):
+    """Return the traction of the top, Pa."""
+    stretch = 1 - SINK * sunk(t, np.sin)
+    lam = SOIL.bulk - 2 * SOIL.shear / 3
+    return 0, SOIL.shear * (stretch - 1 / stretch) + lam * np.log(stretch) / stretch
+
+
+def _at(points, t):
+    """Return X and t as UFL variables, F and p."""
+    X, t = ufl.variable(points.position - points.displacement), ufl.variable(t)
+    u, p = solution(X, t, ufl.sin, ufl.cos)
+    return X, t, ufl.variable(ufl.Identity(2) + ufl.diff(ufl.as_vector(u), X)), p
+
+
+def _divergence(f, X):
+    """Return the divergence by X of a vector or tensor."""
+    slope = ufl.diff(f, X)
+    if len(f.ufl_shape) == 1:
+        return slope[0, 0] + slope[1, 1]
+    return ufl.as_vector([slope[i, 0, 0] + slope[i, 1, 1] for i in range(2)])
+
+
+def body_force(points, v, t):
+    """Return the work of -Div P of effective stress and pore pressure, a term."""
+    X, _, F, p = _at(points, t)
+    P = ufl.diff(SOIL.energy(F, SOIL.bulk, SOIL.shear), F) - p * ufl.det(F) * ufl.inv(F).T
+    return ufl.inner(_divergence(P, X), points.value(v)) / ufl.det(points.F) * points.dx
+
+
+def source(points, q, t):
+    """Return the rate of the content and the divergence of the flow."""
+    X, t, F, p = _at(points, t)
+    J = ufl.det(F)
+    stored = (J - 1 + SOIL.porosity) / WATER.bulk
+    kappa = SOIL.conductivity_law(SOIL.conductivity, J) / WATER.unit_weight
+    flow = -kappa * J * ufl.inv(F) * ufl.inv(F).T * ufl.diff(p, X)
+    rate = ufl.diff(J, t) + stored * ufl.diff(p, t) + _divergence(flow, X)
+    return rate * q / ufl.det(points.F) * points.dx
+
+
+def scene(cells):
+    """Return the block on a grid of that many cells a metre."""
+    grid = mpm.Grid([1.0, 1 + 2 / cells], [cells, cells + 2])
+    top, drained = [mpm.Traction("top", traction)], [mpm.Drained("top")]
+    options = {"fixed": WALLS, "tractions": top, "drained": drained, "terms": [body_force], "sources": [source]}
+    return mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 1])], [SOIL], fluid=WATER, **options)
+
+
+def rms(values):
+    return np.sqrt(np.mean(np.square(values)))
+
+
+def errors(s):
+    """Return the errors of the points' displacement and pressure, over the largest exact ones, in the rms."""
+    X = s.bodies[0].centre
+    u, p = solution(X.T, s.t)
+    u = np.stack(u, axis=1)
+    return np.array([rms(s.points.x - X - u) / np.abs(u).max(), rms(s.points.pressure - p) / np.abs(p).max()])
+
+
+def stress(X, t):
+    """Return the exact effective Cauchy stress (n, 2, 2), Pa, at reference positions (n, 2), by differences of u."""
+    step, slopes = 1e-6, []
+    for e in np.eye(2):
+        ahead, behind = (np.stack(solution((X + way * step * e).T, t)[0], axis=1) for way in (1, -1))
+        slopes.append((ahead - behind) / (2 * step))
+    F = np.eye(2) + np.stack(slopes, axis=2)
+    J, lam = np.linalg.det(F)[:, None, None], SOIL.bulk - 2 * SOIL.shear / 3
+    return (SOIL.shear * (F @ F.swapaxes(1, 2) - np.eye(2)) + lam * np.log(J) * np.eye(2)) / J
+
+
+def errors_of_cells(s):
+    """Return the errors of the cells' displacement, pressure and both stresses where they are, as `errors` does."""
+    cells = s.cells()
+    X = cells.x - cells.displacement
+    u, p = solution(X.T, s.t)
+    effective = stress(X, s.t)
+    total = effective - p[:, None, None] * np.eye(2)
+    pairs = [(cells.displacement, np.stack(u, axis=1)), (cells.pressure, p)]
+    pairs += [(cells.effective_stress, effective), (cells.stress, total)]
+    return np.array([rms(found - exact) / np.abs(exact).max() for found, exact in pairs])

@@ -1,0 +1,30 @@
+# SPDX-License-Identifier: MIT
+"""Second order in space and time at large strain, for a chosen solution in a body that moves through the grid."""
+
+import manufactured as made
+import numpy as np
+
+
+def after(cells, steps, t):
+    """Return the errors of displacement and pressure after equal steps to time t."""
+    s = made.scene(cells)
+    for _ in range(steps):
+        assert s.step(t / steps).balance < 1e-8
+    return made.errors(s)
+
+
+def rates(errors):
+    """Return the orders between errors at sizes that are halved each time."""
+    return np.log2(errors[:-1] / errors[1:])
+
+
+def test_displacement_and_pressure_of_the_points_are_of_second_order_in_the_cell_size():
+    """In twice as many steps as cells, while the top passes four of 24 of them."""
+    errors = np.array([after(cells, 2 * cells, 12.0) for cells in (6, 12, 24)])
+    assert rates(errors).min() > 1.9 and (errors[-1] < [1e-4, 5e-4]).all(), errors
+
+
+def test_displacement_and_pressure_of_the_points_are_of_second_order_in_the_step():
+    """In steps so long that space costs little: the top passes up to four cells in one."""
+    errors = np.array([after(24, steps, 20.0) for steps in (2, 4, 8)])
+    assert rates(errors).min() > 1.9 and (errors[-1] < [5e-4, 8e-3]).all(), errors

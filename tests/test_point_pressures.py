@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: MIT
+"""What is told of the points' pressures: exact where they are linear, means kept, nothing that is not there."""
+
+import numpy as np
+import pytest
+from helpers import SOFT, beam, column
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.points.pressure_transport import Reconstruction
+
+RANDOM = np.random.default_rng(3)
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.1, 0.9])
+def test_a_steady_pressure_between_two_drained_sides_is_linear(offset):
+    """The top cell is full, or nearly empty, or nearly full."""
+    s = column(offset=offset, drained=[mpm.Drained("top"), mpm.Drained("bottom", pressure=1.0)])
+    s.step(1e9)
+    assert s.points.pressure == pytest.approx(1 - s.points.x[:, 1] / (1 + offset / 10), abs=1e-6)
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.1, 0.9])
+def test_a_hydrostatic_pressure_is_linear_down_to_the_sealed_floor(offset):
+    s = column(offset=offset, gravity=[0, -10.0], drained=[mpm.Drained("top", pressure=50.0)])
+    s.step(1e9)
+    top = s.points.corners[..., 1].max()
+    assert s.points.pressure == pytest.approx(50 + 1e4 * (top - s.points.x[:, 1]), abs=1e-2)
+
+
+def cells(shape, filled):
+    """Return a grid, its reconstruction, and centroids of cells that are filled so far in their last layer."""
+    grid = mpm.Grid(0.1 * np.array(shape), shape)
+    centroid, faces = np.zeros((grid.num_local, grid.dim)), np.ones((grid.num_local, grid.dim, 2))
+    last = grid.midpoints[:, -1] > grid.upper[-1] - grid.h[-1]
+    centroid[last, -1] = -0.5 * (1 - filled) * grid.h[-1]
+    faces[last, -1, 1] = 0.0
+    return grid, Reconstruction(grid), centroid, faces
+
+
+def outer(grid):
+    """Return no drained sides."""
+    return np.full((grid.num_owned, grid.dim, 2, 2), np.nan)
+
+
+@pytest.mark.parametrize("shape", [(5, 4), (4, 3, 5)], ids=["2D", "3D"])
+@pytest.mark.parametrize("filled", [1.0, 0.3, 0.01])
+def test_a_linear_pressure_aslant_is_exact_also_at_sealed_sides(shape, filled):
+    grid, reconstruction, centroid, faces = cells(shape, filled)
+    slope, each, n = np.array([3.0, -2.0, 5.0])[: grid.dim], 7, grid.num_owned
+    slot = np.repeat(np.arange(n), each)
+    x = centroid[slot] + 0.3 * grid.h * RANDOM.uniform(-1, 1, (len(slot), grid.dim))
+    p = (grid.midpoints + centroid) @ slope
+    found = reconstruction.up_to_surface(np.arange(n), p, centroid, faces, outer(grid), x, slot)
+    assert found == pytest.approx((grid.midpoints[slot] + x) @ slope, abs=1e-13)
+
+
+def test_a_steep_pressure_is_not_carried_on_beyond_the_last_cell():
+    """Ten times less from cell to cell: carried on it would be negative at the sealed end."""
+    grid, reconstruction, centroid, faces = cells((1, 8), 1.0)
+    order = np.argsort(grid.midpoints[:, 1])
+    p = np.empty(8)
+    p[order] = 10.0 ** np.arange(8)
+    x = np.tile([0.0, -0.5 * grid.h[1]], (8, 1))
+    found = reconstruction.up_to_surface(np.arange(8), p, centroid, faces, outer(grid), x, np.arange(8))
+    assert (found > 0).all()
+
+
+def test_points_of_a_cell_keep_its_mean_pressure_and_pass_no_neighbour_nor_drained_side():
+    s, _ = beam(offset=0.3, drained=[mpm.Drained("left", pressure=3e5), mpm.Drained("right")])
+    on_grid, scene = s.scene.on_grid(s.points), s.scene
+    contents, pieces = on_grid.contents, on_grid.data.pieces
+    scene.storage.p.x.array[:] = p = RANDOM.normal(size=s.grid.num_local) * 1e5
+    found = on_grid.pressures_up_to_surface(scene.motion._reconstruction, s.state.stage)
+    assert contents.mean(on_grid.cut.pieces_to_cells(found)) == pytest.approx(p[contents.filled], abs=1e-7)
+    assert np.abs(found - p[pieces.cells]).max() > 1e4
+    assert found.min() > min(p[contents.filled].min(), 0) - 1e-6
+    assert found.max() < max(p[contents.filled].max(), 3e5) + 1e-6
+
+
+def test_a_body_of_one_cell_has_its_pressure():
+    grid = mpm.Grid([1.0, 1.0], [2, 2])
+    body = mpm.box(grid, [0, 0], [0.5, 0.5])
+    load, walls = [mpm.Traction("top", (0, -1e2))], {"left": "x", "bottom": "y"}
+    s = mpm.Simulation(grid, [body], [SOFT], fluid=mpm.Fluid(), fixed=walls, tractions=load)
+    s.step(1.0)
+    assert np.ptp(s.points.pressure) == 0 and s.points.pressure[0] > 10
