@@ -46,12 +46,6 @@ def test_the_undrained_limit_load_of_stiff_soil_tends_to_prandtls():
     assert -0.07 < coarse[-1] - 1 < 2 * (fine[-1] - 1) < 0
 
 
-def test_soil_that_begins_to_yield_under_a_footing_takes_no_cut_step():
-    """Where Newton's residuals could grow, steps circled: four were cut."""
-    run = footing.push(footing.SOIL, 11, 0.06, footing.RATES["fast"], box=(2.0, 1.2), steps=2)
-    assert not run.total("cuts") and run.total("newton") < 80
-
-
 @pytest.mark.slow
 def test_the_drained_limit_load_of_stiff_soil_tends_to_prandtls():
     coarse, fine = (footing.limit_load("drained", cells).load for cells in (9, 17))

@@ -38,7 +38,6 @@ from mpm_dolfinx.solve.schur import LinearSolvers
 KEEP = 0.05  # the tangent is kept while a Newton step reduces the residual to less than this
 FORCING, FINEST = 1e-3, 1e-9  # relative accuracy of the linear solve, and the best that is asked for
 EXPLODES = 1e4  # a bending body's residual may grow this much in a good step: rotations stretch at first order
-SHORTEST = 0.1  # where soil yields it may not grow at all, unless that takes a shorter step: it would circle
 INNER = 1e-3  # the momentum is solved to this share of the storage's error: rotations fake volume changes
 MOMENTUM_STEPS = 10
 ERROR = 1 / 20
@@ -277,26 +276,18 @@ class Newton:
             return self._solvers.solve(rtol, errors.forces, errors.exchanged)
 
     def _line_search(self, before: Errors) -> Errors:
-        """Go against the direction, backtracking while the residual is not finite or explodes.
-
-        Where soil yields, while it grows; where that would take too short a step, the best of those tried is taken.
-        """
+        """Go against the direction, backtracking while the residual is not finite or explodes."""
         self.report.newton += 1
-        step, moved, tried = 1.0, 0.0, {}
-        grows, shortest = (EXPLODES, 1e-3) if self._momentum.forms.elastic else (1.0, SHORTEST)
-        while step >= shortest:
+        step, moved = 1.0, 0.0
+        while True:
             self._move(moved - step)
             moved = step
             errors = self._errors(before.start)
-            if np.isfinite(errors.worst) and errors.worst < grows * before.worst:
+            if np.isfinite(errors.worst) and errors.worst < EXPLODES * before.worst:
                 return errors
-            if errors.worst < EXPLODES * before.worst:  # not nan
-                tried[errors.worst] = step
             step /= 2
-        if not tried:
-            raise NotConverged("no descent along the Newton direction", self.report.history)
-        self._move(moved - tried[min(tried)])
-        return self._errors(before.start)
+            if step < 1e-3:
+                raise NotConverged("no descent along the Newton direction", self.report.history)
 
     def _move(self, scale: float) -> None:
         self._momentum.system.unknowns.add(self._momentum.forms.u, scale, self._solvers.du)
