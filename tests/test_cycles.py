@@ -112,3 +112,47 @@ def test_the_filter_leaves_quadratic_fields_and_what_has_not_moved_and_takes_the
     apart = wave.copy()
     apart[0] += 0.01  # the first domain parts from its neighbours
     assert np.abs(change(apart, far)[0]).max() <= 4 / 64 * 8e-3 and np.isfinite(change(apart, far)).all()
+
+
+SAND = mpm.DruckerPrager(bulk=8.3e6, shear=3.8e6, cohesion=1e3, friction=0.5, dilation=0.0, conductivity=1e-5)
+
+
+@pytest.mark.parametrize(("dim", "fluid"), [(2, None), (2, mpm.Fluid()), (3, None)])
+def test_weak_soil_that_only_turns_stays_free_of_stress_and_takes_no_cut_step(dim, fluid):
+    """Its strength is that of a turn by 2 degrees, taken as a linearised displacement."""
+    grid = mpm.Grid([1.6] * dim, [8] * dim)
+    centre = np.full(dim, 0.81)
+    block = mpm.box(grid, centre - 0.3, centre + 0.3)
+
+    def turned(t, X):
+        c, s, x = np.cos(t), np.sin(t), X - centre
+        out = np.zeros_like(X)
+        out[:, 0], out[:, -1] = c * x[:, 0] - s * x[:, -1] - x[:, 0], s * x[:, 0] + c * x[:, -1] - x[:, -1]
+        return out
+
+    held = mpm.Displacement("bottom", turned)
+    s = mpm.Simulation(grid, [block], [SAND], fluid=fluid, fixed={}, displacements=[held])
+    result = s.run(0.4, 0.1, progress=False)
+    assert result.cuts == 0 and result.newton <= 3 * result.steps
+    assert np.abs(s.effective_stress()).max() < 1e-3 * 1e3
+
+
+def test_a_turn_is_found_where_walls_hold_a_part_of_the_body():
+    """A block hinged at a wall is no rigid body: Newton begins where it would have begun."""
+    grid = mpm.Grid([1.0, 1.0], [10, 10])
+    block = mpm.box(grid, [0.0, 0.3], [0.8, 0.7])
+
+    def value(t, X):
+        c, s, x = np.cos(0.2 * t), np.sin(0.2 * t), X - [0, 0.5]
+        return x @ np.array([[c, s], [-s, c]]) - x
+
+    def run():
+        held = [mpm.Displacement("right", value)]
+        s = mpm.Simulation(grid, [block], [mpm.Hencky(bulk=1e6, shear=1e6)], fixed={"left": "xy"}, displacements=held)
+        s.run(1.0, 0.5, progress=False)
+        return s
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("mpm_dolfinx.problems.rigid_motion.TURNS", np.inf)
+        other = run()
+    assert run().points.x == pytest.approx(other.points.x, abs=1e-8)

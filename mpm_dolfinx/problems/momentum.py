@@ -34,6 +34,7 @@ from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.problems.ghost_penalty import GhostPenalty
 from mpm_dolfinx.problems.mean_dilatation import MeanDilatation
 from mpm_dolfinx.problems.quadrature_data import QuadratureData
+from mpm_dolfinx.problems.rigid_motion import rigid_motion
 from mpm_dolfinx.problems.side_forms import SideData, SideForms
 from mpm_dolfinx.validation import line
 
@@ -303,6 +304,14 @@ class MomentumProblem:
     def linear(self) -> bool:
         """Whether the tangent changes with the places of the points only."""
         return self.forms.linear and self._sides.pressures is None
+
+    def turned(self) -> NDArray[np.float64] | None:
+        """Return the displacements (local unknowns,), m, if given displacements turn the bodies as one; else None."""
+        forms, holds = self.forms, self._sides.holds
+        motion = None if holds is None else rigid_motion(forms.grid.comm, holds, forms.grid.node_x)
+        if motion is None:
+            return None
+        return np.where(self.system.unknowns.map.indices >= 0, motion.ravel(), 0.0)
 
     def assemble_residual(self) -> tuple[PETSc.Vec, float]:
         """Return the out-of-balance nodal forces at u and their scale, the largest of internal, external, terms (N)."""

@@ -161,7 +161,7 @@ class Newton:
 
         serves: whether the tangent of the substep before may serve.
         """
-        errors, fresh = self._errors(), self._linear or not serves
+        errors, fresh = self._begin(), self._linear or not serves
         while errors.worst > self._scheme.tolerance:
             self._check(self.report.newton, "newton")
             if fresh and self._linear and not self.report.newton:
@@ -172,6 +172,23 @@ class Newton:
             before, errors = errors, self._line_search(errors)
             fresh = errors.worst > KEEP * min(1.0, before.worst)  # inf where no fluid has moved yet
         return errors
+
+    def _begin(self) -> Errors:
+        """Return the errors where the iterations begin: where the bodies are turned, if that balances better."""
+        errors, u = self._errors(), self._momentum.forms.u.x.array
+        turned = None if self._linear else self._momentum.turned()
+        if turned is None:
+            return errors
+        before = u.copy()
+        u[:] = turned
+        try:
+            begun = self._errors(errors.start)
+        except NotConverged:
+            begun = None
+        if begun is not None and begun.worst < errors.worst:
+            return begun
+        u[:] = before
+        return self._errors(errors.start)
 
     def check_stable(self) -> None:
         """Refuse an equilibrium that the body leaves at the least disturbance: smaller steps find where it goes.

@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: MIT
+"""The rigid motion that given displacements ask for: where Newton's method begins when a body is turned.
+
+A rotation by an angle a stretches a linearised field by a^2 / 2: soil that yields at less would take that for the
+motion, and no step would be short enough.
+"""
+
+from __future__ import annotations
+
+from mpi4py import MPI
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from mpm_dolfinx.forms.point_forms import PointData
+from mpm_dolfinx.parallel.exchange import over_all
+
+TURNS = 1e-3
+"""Angle below which a body is not turned, rad."""
+ITERATIONS = 8
+
+
+def rigid_motion(comm: MPI.Intracomm, holds: PointData, x: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """Return the displacements (n, d), m, of places in the rigid motion nearest to given displacements.
+
+    Parameters
+    ----------
+    comm
+        The processes; all call it together.
+    holds
+        Rows of given displacements: a direction, the gap along it, m, and the stiffness that it counts with.
+    x : (n, d), m
+        The places.
+
+    Returns
+    -------
+    None where nothing is turned.
+    """
+    d, e, gap, weight = x.shape[1], holds["direction"], holds["gap"][:, 0], holds["stiffness"]
+    moments = over_all(comm, np.concatenate([[weight.sum()], (weight * holds.x).sum(axis=0)]))
+    if not moments[0] > 0:
+        return None
+    centre = moments[1:] / moments[0]
+    arm, shift, turn = holds.x - centre, np.zeros(d), Rotation.identity()
+    size = np.sqrt(over_all(comm, float((weight[:, 0] * (arm**2).sum(axis=1)).sum())) / moments[0])
+    for _ in range(ITERATIONS):
+        turned = _apply(turn, arm)
+        off = gap - np.einsum("nd,nd->n", e, shift + turned - arm)
+        slope = np.concatenate([e, _spin(turned, e) / max(size, 1e-300)], axis=1)
+        normal = over_all(comm, np.concatenate([slope.T @ (weight * slope), [slope.T @ (weight[:, 0] * off)]]))
+        step = np.linalg.lstsq(normal[:-1] / moments[0], normal[-1] / moments[0], rcond=1e-9)[0]
+        shift = shift + step[:d]
+        angles = step[d:] / max(size, 1e-300)
+        turn = Rotation.from_rotvec(angles if d == 3 else [0.0, 0.0, angles[0]]) * turn
+    if turn.magnitude() < TURNS:
+        return None
+    return shift + _apply(turn, x - centre) - (x - centre)
+
+
+def _apply(turn: Rotation, x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return vectors (n, d) turned, in the plane about its normal."""
+    d = x.shape[1]
+    return x @ turn.as_matrix()[:d, :d].T
+
+
+def _spin(x: NDArray[np.float64], e: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return how far places (n, d) move along directions e (n, d) as they are turned by a unit about each axis."""
+    if x.shape[1] == 2:
+        return (x[:, :1] * e[:, 1:] - x[:, 1:] * e[:, :1]).copy()
+    return np.cross(x, e)
