@@ -89,20 +89,20 @@ def tip_error(cells, alpha):
     return np.linalg.norm(tip - finite_elements()[alpha]) / cantilever.LENGTH
 
 
-@pytest.mark.parametrize("alpha, ceiling", [(1, 3e-4), (5, 1.3e-3)])
+@pytest.mark.parametrize("alpha, ceiling", [(1, 6e-4), (5, 1.5e-3)])
 def test_the_cantilevers_tip_is_the_rods(alpha, ceiling):
     errors = bent(8)[0]
     assert max(errors[f"v_{alpha}"], errors[f"u_{alpha}"]) < ceiling
 
 
-@pytest.mark.parametrize("alpha, ceiling", [(1, 2.5e-4), (5, 1e-3)])
+@pytest.mark.parametrize("alpha, ceiling", [(1, 5.5e-4), (5, 1.2e-3)])
 def test_the_cantilevers_tip_is_the_finite_elements(alpha, ceiling):
     assert tip_error(8, alpha) < ceiling
 
 
 def test_the_cantilevers_tip_converges_to_the_finite_elements():
     errors = [tip_error(cells, 5) for cells in (4, 8, 16)]
-    assert rates(errors).min() > 1.6 and errors[-1] < 3e-4, errors
+    assert rates(errors).min() > 1.9 and errors[-1] < 3.1e-4, errors
 
 
 def test_the_finite_elements_differ_from_the_rod_by_the_rods_own_error():

@@ -247,7 +247,7 @@ def test_an_energy_and_its_forces_give_the_same_and_may_hold_a_body_alone():
         assert s.scene.momentum.symmetric == (term is foundation)
     assert np.abs(positions[0] - positions[1]).max() < 1e-10
     # the springs balance the load: 4e6 N/m^3 times the mean displacement and the height
-    assert (positions[0] - body.centre).mean(axis=0) * 4e6 * 0.67 == pytest.approx([1e3, -1e3], rel=2e-5)
+    assert (positions[0] - body.centre).mean(axis=0) * 4e6 * 0.67 == pytest.approx([1e3, -1e3], rel=5e-5)
 
 
 def test_a_term_without_symmetry_has_a_consistent_tangent_coupled_too():

@@ -46,7 +46,7 @@ def test_the_tip_is_the_same_wherever_the_beam_lies_on_the_grid():
         scene = Beam(h=(1 / (19 + float(x)), 0.05), offset=float(y))()
         tips.append(scene.simulation.run(1.0, 1 / 8, probes=scene.probes).displacement[-1][0, 1])
     assert np.ptp(tips) < 2e-3 * abs(tips[0]), tips
-    assert tips == pytest.approx([Beam().elements()[1]] * 6, rel=2e-3)
+    assert tips == pytest.approx([Beam().elements()[1]] * 6, rel=4e-3)
 
 
 @pytest.mark.parametrize("strain", [1e-2, 1e-9])

@@ -24,7 +24,7 @@ def test_a_hydrostatic_pressure_is_linear_down_to_the_sealed_floor(offset):
     s = column(offset=offset, gravity=[0, -10.0], drained=[mpm.Drained("top", pressure=50.0)])
     s.step(1e9)
     top = s.points.corners[..., 1].max()
-    assert s.points.pressure == pytest.approx(50 + 1e4 * (top - s.points.x[:, 1]), abs=1e-2)
+    assert s.points.pressure == pytest.approx(50 + 1e4 * (top - s.points.x[:, 1]), abs=2e-2)
 
 
 def cells(shape, filled):
