@@ -143,7 +143,7 @@ class Motion:
             bad = tangled(corners, points.volume0 * points.J)
             folded = over_all(grid.comm, int(bad.sum()))
             if folded:
-                corners = self._untangled(points, corners, bad, deformed(), grid, stage.mechanical)
+                corners = untangled(points, corners, bad, deformed(), grid, stage.mechanical)
         F = gradient(corners, points.reference)
         if self._momentum.dilatation is not None:
             J = determinant(deformed())
@@ -167,23 +167,6 @@ class Motion:
             shown = [f"point {points.id[i]} at {points.x[i]} with J = {J[i]:.3g}" for i in bad[:1]]
             what = "the pores have closed" if wet else "the body is turned inside out"
             raise NotConverged(f"{what}, J <= {least.max(initial=0):.3g}: {', '.join(shown) or 'elsewhere'}")
-
-    def _untangled(
-        self,
-        points: MaterialPoints,
-        corners: NDArray[np.float64],
-        bad: NDArray[np.bool_],
-        F: NDArray[np.float64],
-        grid: Grid,
-        boundary: MechanicalBoundary,
-    ) -> NDArray[np.float64]:
-        """Return corners of which those of domains that have folded, whose neighbours went elsewhere, are of F."""
-        at, X = np.flatnonzero(bad), points.reference[bad]
-        x, X = corners[at].mean(axis=1), X - X.mean(axis=1, keepdims=True)
-        new = x[:, None] + np.einsum("nab,nkb->nka", F[at], X)
-        new = boundary.under_held(points.id[at], corners[at], points.volume0[at] * determinant(F[at]), new)
-        corners[at] = np.clip(new, grid.lower, grid.upper)
-        return corners
 
     def left_grid(self, state: State, on_grid: OnGrid) -> State:
         """Return a state whose points take the pressures of their pieces along: the next step resets the grid."""
@@ -210,3 +193,21 @@ def _check_inside(cut: CutDomains, points: MaterialPoints, t: float) -> None:
         message += ", must stay in it: take a larger grid"
     if message := first(grid.comm, message):
         raise LeftGrid(message)
+
+
+def untangled(
+    points: MaterialPoints,
+    corners: NDArray[np.float64],
+    bad: NDArray[np.bool_],
+    F: NDArray[np.float64],
+    grid: Grid,
+    boundary: MechanicalBoundary,
+) -> NDArray[np.float64]:
+    """Return corners (n, 2^d, d), m, where domains that have folded, whose neighbours went elsewhere, are of F."""
+    at, X = np.flatnonzero(bad), points.reference[bad]
+    new = corners[at].mean(axis=1, keepdims=True)
+    new = new + np.einsum("nab,nkb->nka", F[at], X - X.mean(axis=1, keepdims=True))
+    new = boundary.under_held(points.id[at], corners[at], points.volume0[at] * determinant(F[at]), new)
+    out = corners.copy()
+    out[at] = np.clip(new, grid.lower, grid.upper)
+    return out

@@ -9,6 +9,7 @@ import pytest
 from helpers import SOFT
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx.advance import untangled
 from mpm_dolfinx.points.cutting import corner_bits, tangled, volumes
 from mpm_dolfinx.points.domain_gradient import gradient
 
@@ -32,7 +33,7 @@ def test_a_held_domain_that_folds_keeps_its_face_and_its_volume(dim):
     bad = tangled(moved, points.volume0)
     assert np.flatnonzero(bad).tolist() == sorted(folded)
 
-    new = s.scene.motion._untangled(points, moved.copy(), bad, F, grid, s.state.stage.mechanical)
+    new = untangled(points, moved, bad, F, grid, s.state.stage.mechanical)
     assert new[folded[0], up] == pytest.approx(corners[folded[0], up], abs=1e-15)
     assert volumes(new[folded]) == pytest.approx(1.1 * points.volume0[folded], rel=1e-12)
     assert gradient(new[folded[1:]], points.reference[folded[1:]]) == pytest.approx(F[folded[1:]], abs=1e-12)
