@@ -18,7 +18,9 @@ from mpm_dolfinx.parallel.exchange import over_all
 
 TURNS = 1e-3
 """Angle below which a body is not turned, rad."""
-ITERATIONS = 8
+MEETS = 0.1
+"""Share of the gaps, as a shift of the body leaves them, that a turn may leave."""
+ITERATIONS = 9
 
 
 def rigid_motion(comm: MPI.Intracomm, holds: PointData, x: NDArray[np.float64]) -> NDArray[np.float64] | None:
@@ -35,7 +37,7 @@ def rigid_motion(comm: MPI.Intracomm, holds: PointData, x: NDArray[np.float64]) 
 
     Returns
     -------
-    None where nothing is turned.
+    None where nothing is turned, or where a shift meets the given displacements nearly as well.
     """
     d, e, gap, weight = x.shape[1], holds["direction"], holds["gap"][:, 0], holds["stiffness"]
     moments = over_all(comm, np.concatenate([[weight.sum()], (weight * holds.x).sum(axis=0)]))
@@ -44,16 +46,20 @@ def rigid_motion(comm: MPI.Intracomm, holds: PointData, x: NDArray[np.float64]) 
     centre = moments[1:] / moments[0]
     arm, shift, turn = holds.x - centre, np.zeros(d), Rotation.identity()
     size = np.sqrt(over_all(comm, float((weight[:, 0] * (arm**2).sum(axis=1)).sum())) / moments[0])
-    for _ in range(ITERATIONS):
+    left = []  # sum of the squares of the gaps: of no turn at the second, of the nearest one at the end
+    for iteration in range(ITERATIONS):
         turned = _apply(turn, arm)
         off = gap - np.einsum("nd,nd->n", e, shift + turned - arm)
+        left.append(over_all(comm, float(weight[:, 0] @ off**2)))
         slope = np.concatenate([e, _spin(turned, e) / max(size, 1e-300)], axis=1)
         normal = over_all(comm, np.concatenate([slope.T @ (weight * slope), [slope.T @ (weight[:, 0] * off)]]))
-        step = np.linalg.lstsq(normal[:-1] / moments[0], normal[-1] / moments[0], rcond=1e-9)[0]
+        part = slice(None) if iteration else slice(d)  # first without a turn
+        step = np.zeros(len(normal) - 1)
+        step[part] = np.linalg.lstsq(normal[:-1][part, part] / moments[0], normal[-1][part] / moments[0], rcond=1e-9)[0]
         shift = shift + step[:d]
         angles = step[d:] / max(size, 1e-300)
         turn = Rotation.from_rotvec(angles if d == 3 else [0.0, 0.0, angles[0]]) * turn
-    if turn.magnitude() < TURNS:
+    if turn.magnitude() < TURNS or not left[-1] < MEETS**2 * left[1]:
         return None
     return shift + _apply(turn, x - centre) - (x - centre)
 
