@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 from dolfinx.common import Timer
@@ -26,7 +26,6 @@ from mpm_dolfinx.points.pressure_transport import PiecePressures, Reconstruction
 from mpm_dolfinx.problems.mechanical_boundary import MechanicalBoundary
 from mpm_dolfinx.problems.momentum import MomentumForms
 from mpm_dolfinx.problems.on_grid import OnGrid
-from mpm_dolfinx.problems.quadrature_data import QuadratureData
 from mpm_dolfinx.problems.storage import StorageForms
 from mpm_dolfinx.state import State, Stay
 
@@ -80,9 +79,7 @@ class Motion:
             cut, pieces = on_grid.cut, on_grid.data.pieces
             grid, d = cut.grid, cut.grid.dim
             nodal = self._momentum.u.x.array.reshape(-1, d)
-            N, dN = grid.shape_functions(pieces.cells, pieces.x)
-            at_nodes = nodal[grid.cell_nodes[pieces.cells]].transpose(0, 2, 1)
-            deformed = partial(self._deformed, state.points, cut, np.eye(d) + at_nodes @ dN, on_grid.data)
+            deformed = cache(partial(self._deformed, state.points, on_grid, nodal))
             moved = cut.displacement(nodal)
             if cut.domains:
                 bend = cut.bend(nodal, self._momentum.active_nodes(on_grid.cells))
@@ -96,7 +93,8 @@ class Motion:
             ids, pressure, x, start = None, None, None, None
             if self._storage is not None:
                 pressure = cut.to_pieces(self._storage.p.x.array[pieces.cells])
-                x = (state.stay.x if state.stay else cut.pieces.x) + cut.to_pieces((at_nodes @ N[:, :, None])[:, :, 0])
+                N, at_nodes = grid.shape_values(pieces.cells, pieces.x), nodal[grid.cell_nodes[pieces.cells]]
+                x = (state.stay.x if state.stay else cut.pieces.x) + cut.to_pieces(np.einsum("mk,mkd->md", N, at_nodes))
                 start = state.stay.start if state.stay else cut.to_pieces(self._storage.p_n.x.array[pieces.cells])
                 own = on_grid.pressures_up_to_surface(self._reconstruction, state.stage)
                 points, ids = replace(points, pressure=cut.mean(own)), points.id[cut.pieces.point]
@@ -104,16 +102,14 @@ class Motion:
         new = replace(state, t=t, points=points, transported=None, stay=Stay(cut.points, ids, pressure, x, start))
         return new if serves and stays else self.left_grid(new, on_grid), folded
 
-    def _deformed(
-        self, points: MaterialPoints, cut: CutDomains, delta: NDArray[np.float64], data: QuadratureData
-    ) -> NDArray[np.float64]:
-        """Return F (n, d, d) of the points after a step, delta (m, d, d) the deformation of their pieces.
-
-        F_p <- (sum_k w_k Delta_k / V_p) F_p.
-        """
-        n, d = len(points), cut.grid.dim
+    def _deformed(self, points: MaterialPoints, on_grid: OnGrid, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return F (n, d, d) of the points after a step, F_p <- (sum_k w_k Delta_k / V_p) F_p over their pieces."""
+        cut, pieces = on_grid.cut, on_grid.data.pieces
+        grid, n, d = cut.grid, len(points), cut.grid.dim
+        at_nodes = nodal[grid.cell_nodes[pieces.cells]].transpose(0, 2, 1)
+        delta = np.eye(d) + at_nodes @ grid.shape_gradients(pieces.cells, pieces.x)
         if self._momentum.dilatation is not None:
-            delta = self._momentum.dilatation.averaged(delta, data)
+            delta = self._momentum.dilatation.averaged(delta, on_grid.data)
         mean = [cut.mean(column) for column in cut.to_pieces(delta).reshape(-1, d * d).T]
         return np.stack(mean, axis=1).reshape(n, d, d) @ points.F
 
