@@ -135,7 +135,8 @@ class Motion:
         points = replace(state.points, corners=corners)
         serves = cut.serves(points)
         if not serves:
-            corners = corners + free * filtered(grid, stage.lattices, points, cut.points)
+            elastic = ~self._materials.evolved(points)
+            corners = corners + free * filtered(grid, stage.lattices, points, cut.points, elastic)
             bad = tangled(corners, points.volume0 * points.J)
             folded = over_all(grid.comm, int(bad.sum()))
             if folded:
@@ -144,7 +145,7 @@ class Motion:
         if self._momentum.dilatation is not None:
             J = determinant(deformed())
             if not serves:
-                J = filtered_ratios(grid, stage.lattices, points, cut.points, J)
+                J = filtered_ratios(grid, stage.lattices, points, cut.points, elastic, J)
             ratio = np.where(self._materials.locking(points), J / determinant(F), 1.0)
             F = F * (np.sign(ratio) * np.abs(ratio) ** (1 / d))[:, None, None]
         return replace(points, corners=corners, x=corners.mean(axis=1), F=F), serves, folded

@@ -26,6 +26,10 @@ RESERVED = frozenset("F dF softness storage storage_at_one density position disp
 """Names of what points of integration carry beside parameters and state."""
 
 
+EVOLVED = 1e-3
+"""By how much the state of a law differs from that at rest where it counts as another."""
+
+
 class SceneMaterials:
     """The materials of a scene; what differs from point to point is put into `points.data`, and found there.
 
@@ -212,6 +216,16 @@ class SceneMaterials:
     def state(self, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
         """Return the state at the points (n, ...)."""
         return {name: points.data[name] for name in self.state_names}
+
+    def evolved(self, points: MaterialPoints) -> NDArray[np.bool_]:
+        """Return at which points (n,) the state of a law is no longer that at rest."""
+        out, law_of = np.zeros(len(points), dtype=bool), self._law[points.material]
+        for number, law in enumerate(self.laws):
+            rows = np.flatnonzero(law_of == number)
+            for name, at_rest in law.state.items():
+                off = np.abs(points.data[name][rows] - np.asarray(at_rest)).reshape(len(rows), -1)
+                out[rows] |= off.max(axis=1, initial=0.0) > EVOLVED
+        return out
 
     def effective_stress(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the effective Cauchy stress (n, d, d), Pa, at the points; on all processes together."""

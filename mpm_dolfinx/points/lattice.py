@@ -9,8 +9,9 @@ what crossing grid lines leaves of it would add up from cycle to cycle.  When th
 d their displacement since they were at rest, D_a the third difference along axis a where the lattice has four corners
 in a row, s = `FAST` times the cells that they have crossed, at most 1: what hardly moves is left alone.  Quadratic
 fields stay as they are, also at the surface; along its axis a wave of two domains is taken away by the share s, one of
-eight by 0.003 s.  Where domains have parted from their neighbours nothing is filtered across.  Corners that a wall, a
-given displacement, a plate or another body holds stay where they are.
+eight by 0.003 s.  Nothing is filtered where domains have parted from their neighbours, and where soil has yielded: it
+does not come back, and its kinks are its own.  Corners that a wall, a given displacement, a plate or another body holds
+stay where they are.
 """
 
 from __future__ import annotations
@@ -201,10 +202,13 @@ def given(
 
 
 def filtered(
-    grid: Grid, lattices: Sequence[Lattice], points: MaterialPoints, then: MaterialPoints
+    grid: Grid, lattices: Sequence[Lattice], points: MaterialPoints, then: MaterialPoints, free: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """Return what the filter adds to the corners (n, 2^d, d), m; then: the points when the grid was reset."""
-    out, crossed = np.zeros_like(points.corners), np.abs((points.corners - then.corners) / grid.h).sum(axis=2)
+    """Return what the filter adds to the corners (n, 2^d, d), m.
+
+    then: the points when the grid was reset; free (n,): which of them are filtered.
+    """
+    out, crossed = np.zeros_like(points.corners), _crossed(grid, points, then, free)
     for lattice in lattices:
         rows = lattice.rows(points)
         moved = points.corners[rows] - points.reference[rows]
@@ -212,12 +216,22 @@ def filtered(
     return out
 
 
+def _crossed(grid: Grid, points: MaterialPoints, then: MaterialPoints, free: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Return how many cells the corners (n, 2^d) have crossed; none of points that are not filtered."""
+    return np.abs((points.corners - then.corners) / grid.h).sum(axis=2) * free[:, None]
+
+
 def filtered_ratios(
-    grid: Grid, lattices: Sequence[Lattice], points: MaterialPoints, then: MaterialPoints, J: NDArray[np.float64]
+    grid: Grid,
+    lattices: Sequence[Lattice],
+    points: MaterialPoints,
+    then: MaterialPoints,
+    free: NDArray[np.bool_],
+    J: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return the volume ratios (n,) of points after the filter of their logarithms."""
+    """Return the volume ratios (n,) of points after the filter of their logarithms; as for `filtered`."""
     log = np.log(np.where(J > 0, J, np.nan))  # those that are turned inside out are refused later
-    crossed = np.abs((points.corners - then.corners) / grid.h).sum(axis=2).mean(axis=1)
+    crossed = _crossed(grid, points, then, free).mean(axis=1)
     for lattice in lattices:
         rows = lattice.rows(points)
         log[rows] += lattice.domains_change(grid.comm, points.id[rows], log[rows], crossed[rows])
