@@ -123,7 +123,8 @@ class Motion:
     ) -> tuple[MaterialPoints, bool, int]:
         """Return the points after their corners have moved (n, 2^d, d) and bent, m, with the F that these tell.
 
-        Where Q1 cells would lock the volume ratio is that of the cells, which `deformed` has in its F.
+        Where Q1 cells would lock the volume ratio is that of the cells, which `deformed` has in its F.  Soil that has
+        yielded keeps all of that F: it does not come back, and domains in its kinks would tell too much.
 
         Returns
         -------
@@ -133,10 +134,9 @@ class Motion:
         free = ~given(grid, stage.lattices, stage.conditions["fixed"], state.points)
         corners = state.points.corners + moved + free * bend
         points = replace(state.points, corners=corners)
-        serves = cut.serves(points)
+        serves, evolved = cut.serves(points), self._materials.evolved(points)
         if not serves:
-            elastic = ~self._materials.evolved(points)
-            corners = corners + free * filtered(grid, stage.lattices, points, cut.points, elastic)
+            corners = corners + free * filtered(grid, stage.lattices, points, cut.points, ~evolved)
             bad = tangled(corners, points.volume0 * points.J)
             folded = over_all(grid.comm, int(bad.sum()))
             if folded:
@@ -145,9 +145,11 @@ class Motion:
         if self._momentum.dilatation is not None:
             J = determinant(deformed())
             if not serves:
-                J = filtered_ratios(grid, stage.lattices, points, cut.points, elastic, J)
+                J = filtered_ratios(grid, stage.lattices, points, cut.points, ~evolved, J)
             ratio = np.where(self._materials.locking(points), J / determinant(F), 1.0)
             F = F * (np.sign(ratio) * np.abs(ratio) ** (1 / d))[:, None, None]
+        if self._materials.evolves:
+            F = np.where(evolved[:, None, None], deformed(), F)
         return replace(points, corners=corners, x=corners.mean(axis=1), F=F), serves, folded
 
     def _sizes(self, points: MaterialPoints) -> NDArray[np.float64]:

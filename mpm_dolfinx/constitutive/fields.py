@@ -75,6 +75,8 @@ class SceneMaterials:
         """Whether points differ in stiffness by more than a factor of two."""
         self.conducts = any(m.conductivity_law or np.any(np.asarray(m.conductivity) > 0) for m in evaluated)
         """Whether fluid flows anywhere."""
+        self.evolves = any(law.state for law in self.laws)
+        """Whether a law has a state."""
         conductivity = np.concatenate([np.ravel(m.conductivity) for m in evaluated])
         by_place = any(callable(m.conductivity) for m in materials) or any(map(_names_place, self.conductivity_laws))
         self.layered = by_place or len({m.conductivity_law for m in used}) > 1 or bool(np.ptp(conductivity))
