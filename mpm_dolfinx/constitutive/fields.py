@@ -225,8 +225,8 @@ class SceneMaterials:
         for number, law in enumerate(self.laws):
             rows = np.flatnonzero(law_of == number)
             for name, at_rest in law.state.items():
-                off = np.abs(points.data[name][rows] - np.asarray(at_rest)).reshape(len(rows), -1)
-                out[rows] |= off.max(axis=1, initial=0.0) > EVOLVED
+                off = np.abs(points.data[name][rows] - np.asarray(at_rest))
+                out[rows] |= off.max(axis=tuple(range(1, off.ndim)), initial=0.0) > EVOLVED
         return out
 
     def effective_stress(self, points: MaterialPoints) -> NDArray[np.float64]:
