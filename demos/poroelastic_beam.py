@@ -153,7 +153,7 @@ def main(argv: list[str] | None = None) -> dict:
         result = simulation.run(o.t_end, **output_times(o), probes=probes, observe=observers)
     except mpm.GaveUp as error:
         failure, result = error, error.result
-    result = replace(result, rows=[(t, u[:, [0, -1]], p) for t, u, p in result.rows])
+    result = replace(result, rows=[row._replace(displacement=row.displacement[:, [0, -1]]) for row in result.rows])
     fem = None
     if o.reference:
         fem = BiotFEM([0, 0], [LENGTH, HEIGHT], REFERENCE_CELLS, material(o), **physics(o)).run(

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,11 +33,27 @@ class Report:
     stress: float = 0.0
 
 
+class Row(NamedTuple):
+    """What the histories hold of an output time; None where nothing is asked for, or there is no fluid.
+
+    t, s; displacement (m, d), m, and present position (m, d), m, of the m probes; pressure: least and largest on the
+    points, Pa; probe_pressure (m,), Pa, and probe_stress (m, 3, 3), Pa: pore pressure and effective stress, tension
+    positive, of the material points whose domains hold the probes.
+    """
+
+    t: float
+    displacement: NDArray[np.float64] | None = None
+    pressure: tuple[float, float] | None = None
+    position: NDArray[np.float64] | None = None
+    probe_pressure: NDArray[np.float64] | None = None
+    probe_stress: NDArray[np.float64] | None = None
+
+
 @dataclass(frozen=True)
 class Result:
     """Histories of a run, and where its time loop is; one row an output time, the start included.
 
-    t (s); displacement (m, d) of the probes, m; pressure: least and largest on the points, Pa; and of
+    rows: what is recorded at the output times, see `Row`; each column is a property too.  Of
     the steps so far: steps, newton, coupling (iterations), balance and residual (worst, relative), cuts (for want of
     convergence), rejected (for their error), change (largest of the pressures since the run began, Pa), rederived
     (domains that had folded), wall (s), and profile: seconds of each part of the run on this process, from dolfinx's
@@ -45,10 +62,8 @@ class Result:
     dt: output interval, s, 0 without one; small: the step to try next, s; converged: the end has been reached.
     """
 
-    rows: list[tuple[float, NDArray[np.float64] | None, tuple[float, float] | None]] = field(
-        default_factory=list, repr=False
-    )
-    """(time, displacement, pressure) of each output time; grows while the run goes on."""
+    rows: list[Row] = field(default_factory=list, repr=False)
+    """One an output time; grows while the run goes on."""
     steps: int = 0
     newton: int = 0
     coupling: int = 0
@@ -70,17 +85,36 @@ class Result:
     @property
     def t(self) -> list[float]:
         """Output times, s."""
-        return [row[0] for row in self.rows]
+        return self.column("t")
 
     @property
     def displacement(self) -> list[NDArray[np.float64]]:
         """Displacements (m, d) of the probes at the output times, m."""
-        return [row[1] for row in self.rows if row[1] is not None]
+        return self.column("displacement")
+
+    @property
+    def position(self) -> list[NDArray[np.float64]]:
+        """Positions (m, d) of the probes at the output times, m."""
+        return self.column("position")
+
+    @property
+    def probe_pressure(self) -> list[NDArray[np.float64]]:
+        """Pore pressures (m,) at the probes at the output times, Pa."""
+        return self.column("probe_pressure")
+
+    @property
+    def probe_stress(self) -> list[NDArray[np.float64]]:
+        """Effective stresses (m, 3, 3) at the probes at the output times, Pa, tension positive."""
+        return self.column("probe_stress")
 
     @property
     def pressure(self) -> list[tuple[float, float]]:
         """Least and largest pore pressure on the points at the output times, Pa."""
-        return [row[2] for row in self.rows if row[2] is not None]
+        return self.column("pressure")
+
+    def column(self, name: str) -> list:
+        """Return one quantity of the rows, where it is recorded."""
+        return [value for row in self.rows if (value := getattr(row, name)) is not None]
 
     def after(self, report: Report, small: float) -> Result:
         """Return the histories after one more step; small: the step to try next, s."""

@@ -14,6 +14,7 @@ from mpm_dolfinx.cell_fields import CellFields, cell_fields
 from mpm_dolfinx.constitutive.skeleton import Fluid, Skeleton
 from mpm_dolfinx.errors import StepFailed
 from mpm_dolfinx.io import summary
+from mpm_dolfinx.point_fields import PointFields, point_fields
 from mpm_dolfinx.points.bodies import Body, check_bodies
 from mpm_dolfinx.points.grid import Grid
 from mpm_dolfinx.points.material_points import MaterialPoints
@@ -181,6 +182,13 @@ class Simulation:
         On several processes all call it together.
         """
         return self.scene.materials.effective_stress(self.points)
+
+    def point_fields(self) -> PointFields:
+        """Return stresses with their part across the plane, p', q and porosity of the points: see `PointFields`.
+
+        On several processes all call it together.
+        """
+        return point_fields(self.scene, self.points)
 
     def cells(self) -> CellFields:
         """Return centroids, displacements, pressures and stresses of the cells at present: see `CellFields`.

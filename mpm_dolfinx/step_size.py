@@ -98,8 +98,7 @@ class StepSize:
 def measured(result: Result, report: Report) -> Result:
     """Return the histories with the largest change of the pressures so far, that of a step that was solved included."""
     change = max(result.change, report.change, SMALLEST * report.stress)
-    if result.rows and result.rows[0][2] is not None and report.extremes is not None:
-        start = result.rows[0][2]
+    if result.rows and (start := result.rows[0].pressure) is not None and report.extremes is not None:
         change = max(change, *(abs(now - then) for now, then in zip(report.extremes, start, strict=True)))
     return replace(result, change=change)
 

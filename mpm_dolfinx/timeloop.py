@@ -20,7 +20,7 @@ from mpm_dolfinx.errors import GaveUp, LeftGrid, StepFailed
 from mpm_dolfinx.io.summary import imbalance, peak_memory
 from mpm_dolfinx.parallel.messages import log
 from mpm_dolfinx.points.probes import Probes
-from mpm_dolfinx.result import Report, Result
+from mpm_dolfinx.result import Report, Result, Row
 from mpm_dolfinx.scene import Scene
 from mpm_dolfinx.state import State
 from mpm_dolfinx.step_size import MIN_CUT, StepSize, Times, measured, step_rule
@@ -89,7 +89,7 @@ def run(
     first_step, max_step
         With `rtol`: the first step to try, and the longest, s, > 0.
     probes
-        Particles whose displacement is recorded.
+        Particles that are recorded.
     observe
         Called with the simulation at each output time, such as a `Writer`; its `result` then holds the histories so
         far.
@@ -191,9 +191,11 @@ def _histories(
         raise ValueError(
             f"dt = {times.interval!r} from t = {now!r}: the run to go on with has dt = {after.dt!r}, t = {last!r}"
         )
-    shown = after.rows[0][1]
+    shown = after.rows[0].displacement
     if (recorded := 0 if shown is None else len(shown)) != (0 if probes is None else len(probes.id)):
         raise ValueError(f"probes: the run to go on with has {recorded} of them")
+    if probes is not None and probes.stressed != (after.rows[0].probe_stress is not None):
+        raise ValueError(f"probes: stress = {probes.stressed}, must be what the run to go on with has")
     return after
 
 
@@ -258,15 +260,20 @@ def _why(t: float, small: float, failed: StepFailed) -> str:
     return f"gave up at t = {t:g} s with dt = {small:.3g} s: {failed}; {why} (collapse, buckling)"
 
 
-def _row(simulation: Simulated, probes: Probes | None) -> tuple:
+def _row(simulation: Simulated, probes: Probes | None) -> Row:
     """Return what the histories hold of the present state."""
-    comm, points, pressure = simulation.scene.grid.comm, simulation.state.points, None
-    moved = None if probes is None else probes.displacement(points, comm)
-    if simulation.scene.fluid:
-        p = points.pressure
-        ends = comm.allgather((p.min(initial=np.inf), p.max(initial=-np.inf)))
-        pressure = (min(e[0] for e in ends), max(e[1] for e in ends))
-    return simulation.state.t, moved, pressure
+    scene, points = simulation.scene, simulation.state.points
+    comm, out, wet = scene.grid.comm, {}, scene.fluid is not None
+    if wet:
+        ends = comm.allgather((points.pressure.min(initial=np.inf), points.pressure.max(initial=-np.inf)))
+        out["pressure"] = (min(e[0] for e in ends), max(e[1] for e in ends))
+    if probes is not None:
+        out |= {name: getattr(probes, name)(points, comm) for name in ("displacement", "position")}
+    if probes is not None and wet:
+        out["probe_pressure"] = probes.at_points(points, comm, lambda held: held.pressure)
+    if probes is not None and probes.stressed:
+        out["probe_stress"] = probes.at_points(points, comm, scene.materials.effective_stress_3d)
+    return Row(simulation.state.t, **out)
 
 
 def _measured(simulation: Simulated) -> Result:

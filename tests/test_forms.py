@@ -25,7 +25,7 @@ class Scene:
         self.cells = grid.local(grid.number(grid.index(x)))
         self.weight = rng.uniform(0.5, 2, n)
         self.x, self.rng = x, rng
-        self.N, self.dN = grid.shape_functions(self.cells, x)
+        self.N, self.dN = grid.shape_values(self.cells, x), grid.shape_gradients(self.cells, x)
         self.nodes = grid.cell_nodes[self.cells]
         self.V = _compat.function_space(grid.mesh, "Lagrange", 1, (dim,))
         self.S = _compat.function_space(grid.mesh, "Lagrange", 1)

@@ -15,6 +15,7 @@ from interrupting import interrupted
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.io.checkpoint import save
+from mpm_dolfinx.result import Row
 
 SAND = mpm.DruckerPrager(
     bulk=2e7,
@@ -167,7 +168,7 @@ class Driven(RuleBasedStateMachine):
         with TemporaryDirectory() as folder:
             file, before = Path(folder) / "run.ckpt", s.state
             if s.result is None:
-                s.state = replace(s.state, result=mpm.Result(rows=[(s.t, None, None)]))
+                s.state = replace(s.state, result=mpm.Result(rows=[Row(s.t)]))
             save(s, file)
             if not resume:
                 s.state = before

@@ -66,6 +66,20 @@ class LawAtPoints:
         return self._stress.evaluate(data)
 
     @cached_property
+    def _out_of_plane(self) -> PointExpression | None:
+        across = self.law.out_of_plane(ufl.variable(self.points.F), self._values)
+        return None if across is None else PointExpression(across, self.points)
+
+    def stress_3d(self, data: PointData) -> NDArray[np.float64]:
+        """Return the effective Cauchy stress (n, 3, 3), Pa; nan across the plane where the law does not know it."""
+        if self.grid.dim == 3:
+            return self.stress(data)
+        out = np.zeros((len(data.cells), 3, 3))
+        out[:, :2, :2], across = self.stress(data), self._out_of_plane
+        out[:, 2, 2] = np.nan if across is None else across.evaluate(data)
+        return out
+
+    @cached_property
     def _update(self) -> tuple[PointExpression, dict[str, tuple[int, ...]]]:
         """All components of the new state in one vector, and the shapes of its parts."""
         given = call(self.law.update, F=self.points.F, **self._values)

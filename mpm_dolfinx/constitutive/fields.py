@@ -102,7 +102,7 @@ class SceneMaterials:
                 mine = everywhere[points.id]
                 seeded[name] = mine + seeded[name] if name in seeded else mine
         self._softness: dict[int, SoftnessAtPoints] = {}
-        if wet and any(law.state for law in self.laws):
+        if wet and self.evolves:
             seeded["softness"] = np.ones(len(points))
             for number, law in enumerate(self.laws):
                 if law.state:
@@ -234,6 +234,13 @@ class SceneMaterials:
         out = np.zeros_like(points.F)
         for law, rows, data in self._placed(points):
             out[rows] = law.stress(data)
+        return out
+
+    def effective_stress_3d(self, points: MaterialPoints) -> NDArray[np.float64]:
+        """Return the effective Cauchy stress (n, 3, 3), Pa, also across the plane; on all processes together."""
+        out = np.zeros((len(points), 3, 3))
+        for law, rows, data in self._placed(points):
+            out[rows] = law.stress_3d(data)
         return out
 
     def total_stress(self, points: MaterialPoints) -> NDArray[np.float64]:

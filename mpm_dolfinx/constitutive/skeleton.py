@@ -171,6 +171,27 @@ class Skeleton:
         tau = expression(cls.kirchhoff, [(d, d), (3, 3)], "F", F=F, **values)
         return ufl.as_matrix([[tau[a, b] for b in range(d)] for a in range(d)])
 
+    @classmethod
+    def out_of_plane(cls, F, values: Mapping[str, object]):
+        """Return the effective Cauchy stress across the plane of plane strain, Pa, as UFL; None if the law has none.
+
+        Parameters
+        ----------
+        F
+            Deformation gradient (2, 2), a UFL variable.
+        values
+            UFL values of the parameters and of the state.
+        """
+        if cls.kirchhoff is not None:
+            tau = expression(cls.kirchhoff, [(2, 2), (3, 3)], "F", F=F, **values)
+            return tau[2, 2] / ufl.det(F) if tau.ufl_shape == (3, 3) else None
+        whole = ufl.variable(ufl.as_matrix([[F[0, 0], F[0, 1], 0], [F[1, 0], F[1, 1], 0], [0, 0, 1]]))
+        try:
+            energy = expression(cls.energy, [()], "F", F=whole, **values)
+        except ValueError:  # a law of the user's for the plane only
+            return None
+        return ufl.diff(energy, whole)[2, 2] / ufl.det(F)
+
     def drained_modulus(self, dim: int) -> float:
         """Return the drained bulk modulus of the dimension K_dr, Pa: K in 3D, lambda + G in plane strain."""
         return self.bulk if dim == 3 else self.bulk + self.shear / 3

@@ -23,15 +23,14 @@ from mpm_dolfinx.parallel.exchange import at_root
 from mpm_dolfinx.parallel.messages import log
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.points.pressure_transport import PiecePressures
-from mpm_dolfinx.result import Result
+from mpm_dolfinx.result import Result, Row
 from mpm_dolfinx.simulation import Simulation
 from mpm_dolfinx.state import State, Stay
 from mpm_dolfinx.validation import instance, line, numbers, on_disk, path, whole
 
-FORMAT, VERSION = "mpm_dolfinx checkpoint", 4
+FORMAT, VERSION = "mpm_dolfinx checkpoint", 5
 FOREIGN = "no checkpoint of mpm_dolfinx, must be one"
 ZIP = b"PK\3\4"  # how numpy's archives begin
-COLUMNS = {"t": 0, "displacement": 1, "pressure": 2}  # of the rows of a Result
 PIECES = ("id", "pressure", "x", "start")  # of a Stay
 NOTE = {"t": float, "resets": int, "begins": bool, "scene": dict, "result": dict}  # and their kinds
 
@@ -144,9 +143,8 @@ def _scalars(result: Result) -> dict[str, Any]:
 
 def _arrays(state: State) -> dict[str, NDArray]:
     """Return the arrays of a state by names with slashes."""
-    rows = state.result.rows
     named = {"points": vars(state.points), "reactions": state.reactions}
-    named["result"] = {name: np.array([row[i] for row in rows if row[i] is not None]) for name, i in COLUMNS.items()}
+    named["result"] = {name: np.array(state.result.column(name)) for name in Row._fields}
     if state.transported is not None:
         named["transported"] = vars(state.transported)
     if state.stay is not None:
@@ -173,11 +171,10 @@ def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulat
             transported = PiecePressures(**_part(arrays, "transported/"))
             _check_pieces(vars(transported), ids, dim)
         histories = _part(arrays, "result/")
-        times = histories.pop("t").tolist()
-        columns = [histories[name] for name in ("displacement", "pressure")]
-        moved, pressure = ([*column] if len(column) else [None] * len(times) for column in columns)
-        ends = [None if p is None else tuple(p.tolist()) for p in pressure]
-        result = Result(rows=list(zip(times, moved, ends, strict=True)), **note["result"])
+        times = histories["t"] = histories["t"].tolist()
+        histories["pressure"] = [*map(tuple, histories["pressure"].tolist())]
+        columns = [[*histories[name]] or [None] * len(times) for name in Row._fields]
+        result = Result(rows=[Row(*row) for row in zip(*columns, strict=True)], **note["result"])
         reactions = arrays.pop("reactions")
         if arrays or reactions.shape[1:] != (dim,) or not all(np.isfinite([note["t"], *times])):
             raise ValueError(f"has {', '.join(arrays) or 'other reactions or times'}")

@@ -25,12 +25,15 @@ import numpy as np
 from dolfinx import fem, io
 from numpy.typing import NDArray
 
+from mpm_dolfinx.io.units import text
 from mpm_dolfinx.parallel.exchange import at_root, to_root
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.result import Result
 from mpm_dolfinx.simulation import Simulation
 from mpm_dolfinx.validation import flag, instance, line_of, on_disk, path, whole
 
+SYMMETRIC = {"xx": (0, 0), "yy": (1, 1), "zz": (2, 2), "xy": (0, 1), "xz": (0, 2), "yz": (1, 2)}
+"""Components of a symmetric tensor, the first four those of plane strain."""
 VTK_CELLS = {2: ("quad", [0, 1, 3, 2]), 3: ("hexahedron", [0, 1, 3, 2, 4, 5, 7, 6])}
 """VTK's cell for a domain, and the domain's corners in VTK's order."""
 WRITABLE = "in a folder that can be written, with room; the run goes on with `after=simulation.result`"
@@ -40,15 +43,17 @@ COUNTS = ("steps", "newton", "coupling", "cuts", "rederived", "balance", "residu
 class Writer:
     """Writes points, histories and grid of a run: an observer of `Simulation.run`.
 
-    The folder receives `points.pvd`, the points' domains as solid cells with id, material, displacement (m),
-    pore pressure, effective stress (Pa), F, J and what else the points carry; `history.csv`, one row an output
-    time with the counts of `Result` so far, least and largest pressure (Pa), the displacements of the probes (m)
-    and the forces of the given displacements (N, in plane strain N/m; nan where no step has been taken since they
-    were set by a stage or the run was resumed); if asked for `grid.pvd`, what the cells hold (`Simulation.cells`):
-    filled share, centroid x and displacement (m), pore pressure, effective and total stress (Pa), by components, zero
-    in empty cells; and the last step's displacement (m) of the nodes.  Tensors: in 2D a field for each component
-    (F_xy), in 3D row by row.  ParaView and VTK read all of it, meshio the points.  The stress of points is that of
-    their cell; their pressure is of second order.
+    The folder receives
+
+    * `points.pvd`, the points' domains as solid cells with displacement, pore pressure, F, J, what else the points
+      carry, and what `Simulation.point_fields` gives: stresses, p', q, porosity;
+    * `history.csv`, one row an output time with the counts of `Result` so far, least and largest pressure, what is
+      recorded of the probes, and the forces of the given displacements (nan where no step has been taken since they
+      were set by a stage or the run was resumed);
+    * `fields.txt`, which says what each of these is, and its unit;
+    * if asked for `grid.pvd`, what the cells hold (`Simulation.cells`), by components, zero in empty cells.
+
+    ParaView and VTK read all of it, meshio the points.
 
     What the folder holds up to the present time stays, and is continued: made after `resume`, a writer leaves
     the files of a run that was never interrupted.
@@ -84,6 +89,7 @@ class Writer:
             self._table = Table(comm, folder / "history.csv", self._t)
             self._points = Series(comm, folder / "points.pvd", self._t)
             self._grid = Series(comm, folder / "grid.pvd", self._t) if grid else None
+            at_root(comm, lambda: (folder / "fields.txt").write_text(text()))
             if not self._points.entries:
                 self._write_points(simulation)
 
@@ -118,15 +124,18 @@ class Writer:
 
     def _write_points(self, simulation: Simulation) -> None:
         comm, file = simulation.grid.comm, self._points.next.with_suffix(".vtu")
-        points = simulation.points
-        data = {**points.data, "effective_stress": simulation.effective_stress()}
+        points, wet, asked = simulation.points, simulation.scene.fluid is not None, simulation.point_fields()
+        data = {**points.data, "porosity": asked.porosity}
+        for name in ("effective_stress", "stress")[: 1 + wet]:
+            components = _components(getattr(asked, name), simulation.grid.dim)
+            data |= {f"{name}_{each}": values for each, values in components.items()}
+        data |= {name: getattr(asked, name) for name in ("mean_effective_stress", "deviatoric_stress")}
         points = replace(points, data=data).migrated(to_root(comm, len(points)))
 
         def write() -> None:
             with replacing(file) as part:
-                solid(points, points.x - points.origin.mean(axis=1), simulation.scene.fluid is not None).write(
-                    part, file_format="vtu"
-                )
+                mesh = solid(points, points.x - points.origin.mean(axis=1), wet)
+                mesh.write(part, file_format="vtu")
 
         at_root(comm, write)
         self._points.entries.append((simulation.t, [file]))
@@ -163,15 +172,25 @@ def _lock(folder: Path) -> None:
 
 def _row(result: Result, reactions: NDArray[np.float64]) -> dict[str, float]:
     """Return what the histories hold of the last output time, and the forces of the given displacements then."""
-    t, displacement, pressure = result.rows[-1]
-    out = {"t": t, **{name: getattr(result, name) for name in COUNTS}}
-    if pressure is not None:
-        out["p_min"], out["p_max"] = pressure
-    for i, u in enumerate(() if displacement is None else displacement):
+    row = result.rows[-1]
+    out = {"t": row.t, **{name: getattr(result, name) for name in COUNTS}}
+    if row.pressure is not None:
+        out["p_min"], out["p_max"] = row.pressure
+    for i, u in enumerate(() if row.displacement is None else row.displacement):
+        out |= {f"{axis}_{i}": value for axis, value in zip("xyz", row.position[i].tolist(), strict=False)}
         out |= {f"u{axis}_{i}": value for axis, value in zip("xyz", u.tolist(), strict=False)}
+        if row.probe_pressure is not None:
+            out[f"p_{i}"] = float(row.probe_pressure[i])
+        if row.probe_stress is not None:
+            out |= {f"s{name}_{i}": value for name, value in _components(row.probe_stress[i], len(u)).items()}
     for i, force in enumerate(reactions):
         out |= {f"reaction_{axis}_{i}": value for axis, value in zip("xyz", force.tolist(), strict=False)}
     return out
+
+
+def _components(tensors: NDArray[np.float64], dim: int) -> dict[str, NDArray[np.float64]]:
+    """Return the components of symmetric tensors (..., 3, 3) that are not zero for any body, by name."""
+    return {name: tensors[..., i, j] for name, (i, j) in list(SYMMETRIC.items())[: 4 if dim == 2 else 6]}
 
 
 def solid(points: MaterialPoints, displacement: NDArray[np.float64], wet: bool) -> meshio.Mesh:

@@ -219,18 +219,9 @@ class Grid:
         tolerance = tolerance + rounding(np.stack([self.lower, self.upper])) / self.h
         return ((y < -tolerance) | (y > self.shape + tolerance) | ~np.isfinite(y)).any(axis=1)
 
-    def shape_functions(
-        self, cells: NDArray[np.int32], x: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the Q1 shape functions (n, 2^d) of local cells at points and their gradients (n, 2^d, d), 1/m."""
-        t = self._hats(cells, x)
-        return reduce(np.multiply, t), self._slopes(t)
-
     def shape_gradients(self, cells: NDArray[np.int32], x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the gradients (n, 2^d, d), 1/m, of the Q1 shape functions of local cells at points."""
-        return self._slopes(self._hats(cells, x))
-
-    def _slopes(self, hats: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+        hats = self._hats(cells, x)
         dN = np.empty((*hats[0].shape, self.dim))
         for a in range(self.dim):
             others = reduce(np.multiply, [hats[b] for b in range(self.dim) if b != a])

@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""Places in the bodies whose displacement is wanted."""
+"""Places in the bodies whose displacement, pressure and stress are wanted."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+
+from mpi4py import MPI
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,7 +16,7 @@ from mpm_dolfinx.points.bodies import Body
 from mpm_dolfinx.points.faces import interpolate
 from mpm_dolfinx.points.grid import rounding
 from mpm_dolfinx.points.material_points import MaterialPoints
-from mpm_dolfinx.validation import all_of, line, numbers
+from mpm_dolfinx.validation import all_of, flag, line, numbers
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,13 +24,14 @@ class Probes:
     """Tracked positions: material particles whose displacement is wanted; m of them.
 
     x0 : (m, d) reference positions; id : (m,) the domain that holds each; xi : (m, d) place in it;
-    bodies: those of the scene that they are for.
+    bodies: those of the scene that they are for; stressed: whether their stress is wanted too.
     """
 
     x0: NDArray[np.float64]
     id: NDArray[np.int64]
     xi: NDArray[np.float64]
     bodies: tuple[Body, ...] = ()
+    stressed: bool = False
 
     def check(self, bodies: Sequence[Body], present: Sequence[bool]) -> None:
         """Refuse, with a ValueError, a scene of other bodies, or one from which a probed body has gone."""
@@ -40,12 +43,28 @@ class Probes:
         if len(gone):
             raise ValueError(f"probe at {self.x0[gone[0]]}: in body {body[gone[0]]}, must be in one that is there now")
 
-    def displacement(self, points: MaterialPoints, comm) -> NDArray[np.float64]:
+    def displacement(self, points: MaterialPoints, comm: MPI.Intracomm) -> NDArray[np.float64]:
         """Return the displacements (m, d), m, on every process."""
         here, at = points.find(self.id)
-        u = np.zeros_like(self.x0)
-        u[here] = interpolate(points.corners[at] - points.origin[at], self.xi[here])
-        return over_all(comm, u)
+        return self._shared(comm, here, interpolate(points.corners[at] - points.origin[at], self.xi[here]))
+
+    def position(self, points: MaterialPoints, comm: MPI.Intracomm) -> NDArray[np.float64]:
+        """Return the present positions (m, d), m, on every process."""
+        here, at = points.find(self.id)
+        return self._shared(comm, here, interpolate(points.corners[at], self.xi[here]))
+
+    def at_points(
+        self, points: MaterialPoints, comm: MPI.Intracomm, value: Callable[[MaterialPoints], NDArray[np.float64]]
+    ) -> NDArray[np.float64]:
+        """Return what a function gives of the points whose domains hold the probes, (m, ...), on every process."""
+        here, at = points.find(self.id)
+        return self._shared(comm, here, value(points.map(lambda rows: rows[at])))
+
+    def _shared(self, comm: MPI.Intracomm, here: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return values (m, ...) on every process of those of the probes that are here."""
+        out = np.zeros((len(self.id), *values.shape[1:]))
+        out[here] = values
+        return over_all(comm, out)
 
 
 def _same(a: Body, b: Body) -> bool:
@@ -62,8 +81,11 @@ def positions(x0: ArrayLike, dim: int) -> NDArray[np.float64]:
     return x
 
 
-def probes(bodies: Sequence[Body], x0: ArrayLike) -> Probes:
-    """Return probes: material particles whose displacement a run records, the `probes` of `Simulation.run`.
+def probes(bodies: Sequence[Body], x0: ArrayLike, *, stress: bool = False) -> Probes:
+    """Return probes: material particles that a run records, the `probes` of `Simulation.run`.
+
+    Recorded are displacement and position, with a fluid the pore pressure and, if asked for, the effective stress; see
+    `Row`.
 
     Parameters
     ----------
@@ -72,6 +94,8 @@ def probes(bodies: Sequence[Body], x0: ArrayLike) -> Probes:
     x0 : (m, d), m
         Reference positions, before a map, inside or on the surface of the bodies.  Where bodies touch, a position
         belongs to the first of them: keep off by a little to have the other.
+    stress
+        Record the effective stress too.
 
     Raises
     ------
@@ -79,6 +103,7 @@ def probes(bodies: Sequence[Body], x0: ArrayLike) -> Probes:
         A position outside the bodies; from the run: other bodies than the scene's, or one that is not there now.
     """
     all_of("probes: bodies", bodies, Body, 1)
+    flag("probes: stress", stress)
     x0 = positions(x0, bodies[0].lower.shape[1])
     centre = np.concatenate([b.centre for b in bodies])
     spacing = np.concatenate([np.broadcast_to(b.spacing, b.lower.shape) for b in bodies])
@@ -90,4 +115,4 @@ def probes(bodies: Sequence[Body], x0: ArrayLike) -> Probes:
     far = np.flatnonzero((np.abs(xi) > 1 + 1e-9 + 2 * rounding(x0) / spacing[ids]).any(axis=1))
     if len(far):
         raise ValueError(f"probe at {x0[far[0]]}: outside the bodies, must be in one or on its surface")
-    return Probes(x0, ids, xi, tuple(bodies))
+    return Probes(x0, ids, xi, tuple(bodies), stress)

@@ -217,8 +217,8 @@ def multigrid_solver(A: PETSc.Mat, name: str, smoother: str = "jacobi") -> PETSc
     tangent may be unsymmetric or, where a body buckles, indefinite; on definite ones conjugate gradients
     take as many iterations: about 20 to 1e-8, with 5000 unknowns as with 60000.  With 60000 the set-up takes 1.0 s,
     for another tangent of the same unknowns 0.3 s, the solution 0.5 s; BoomerAMG (hypre) takes three to four times
-    as long, and ML cannot keep its set-up.  Unknowns in blocks of three, with rows of the identity for fixed ones,
-    would save a quarter.
+    as long, and ML cannot keep its set-up.  Unknowns in blocks of three, with rows of the identity for fixed ones, take
+    as many iterations and as long.
     """
     prefix = f"mpm_{name}_{smoother}_"
     options = PETSc.Options(prefix)

@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: MIT
+"""What the files of a run hold, and its units: a text that lies beside them."""
+
+from __future__ import annotations
+
+FIELDS = {
+    "points.pvd: the domains of the material points": {
+        "id, material": "number of the point; index of its material",
+        "displacement": "m, since the start, or since a stage reset it",
+        "F, J": "-, deformation gradient, by components F_xy in 2D; its determinant, the volume ratio",
+        "pressure": "Pa, pore pressure, positive in compression",
+        "effective_stress": "Pa, Cauchy stress of the skeleton, tension positive; zz: across the plane of plane strain",
+        "stress": "Pa, Cauchy stress of skeleton and fluid together",
+        "mean_effective_stress": "Pa, p' = -(xx + yy + zz) / 3, positive in compression",
+        "deviatoric_stress": "Pa, q = sqrt(3/2 s : s), s the deviator of the stress",
+        "porosity": "-, present volume fraction of the pores",
+        "softness": "-, elastic over present shear stiffness where a law yields, 1 to 100",
+        "others": "state of the law (see its documentation), constants that differ from point to point, the user's own",
+    },
+    "grid.pvd: what the cells hold": {
+        "fill": "-, filled share of the cell",
+        "x": "m, centroid of what it holds, by components",
+        "step_displacement": "m, of the nodes in the last step",
+    },
+    "history.csv: a row an output time": {
+        "t, wall": "s, time of the scene, and of the clock so far",
+        "steps, newton, coupling, cuts, rederived": "numbers so far: steps, iterations, steps cut, domains mended",
+        "balance, residual": "-, worst relative error so far of the fluid's balance, and of the two problems",
+        "p_min, p_max": "Pa, least and largest pore pressure of the material points",
+        "x_0, y_0, z_0": "m, present position of probe 0; and so on for the others",
+        "ux_0, uy_0, uz_0": "m, its displacement",
+        "p_0": "Pa, pore pressure there",
+        "sxx_0, syy_0, szz_0, sxy_0, sxz_0, syz_0": "Pa, effective stress there, tension positive",
+        "reaction_x_0, reaction_y_0, reaction_z_0": "N, in plane strain N/m, force of given displacement 0 on the body",
+    },
+}
+"""Names, units and meaning of what is written, by file."""
+
+
+def text() -> str:
+    """Return the table as text."""
+    out = []
+    for file, rows in FIELDS.items():
+        width = max(map(len, rows))
+        out += [file, *(f"  {name:{width}}  {meaning}" for name, meaning in rows.items()), ""]
+    return "\n".join(out)
