@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.points.faces import Region
 from mpm_dolfinx.points.grid import side
-from mpm_dolfinx.validation import asked, line, numbers
+from mpm_dolfinx.validation import asked, flag, line, numbers
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,6 +102,9 @@ class Drained:
         Outer pore pressure, Pa, finite; the same on the whole side and at all times of a stage.
     region : ((d,), (d,)), m
         Box of reference positions to which the drained faces are limited.
+    seepage
+        A seepage face: where the outer pressure is not positive, as above a water level, water leaves but does not
+        enter.  There the pressure is at most the outer one, or nothing flows.
 
     Raises
     ------
@@ -113,8 +116,10 @@ class Drained:
     side: str
     pressure: float = 0.0
     region: Region | None = None
+    seepage: bool = False
 
     def __post_init__(self):
+        flag("Drained: seepage", self.seepage)
         numbers("Drained: pressure", self.pressure)
 
 

@@ -82,14 +82,15 @@ class OpenSides:
     """Open sides of the bodies; arrays over m faces.
 
     cells (m,): owned cell behind each; shape: area over distance from the cell's centroid, m^(d-2), zero where the
-    inflow is prescribed; pressure: beyond it, Pa; given: prescribed inflow, m^d/s; normal (m, d); reach (m, d): way
-    from the cell's centroid, m.
+    inflow is prescribed; pressure: beyond it, Pa; given: prescribed inflow, m^d/s; seeps: whether nothing may flow in;
+    normal (m, d); reach (m, d): way from the cell's centroid, m.
     """
 
     cells: NDArray[np.int32]
     shape: NDArray[np.float64]
     pressure: NDArray[np.float64]
     given: NDArray[np.float64]
+    seeps: NDArray[np.bool_]
     normal: NDArray[np.float64]
     reach: NDArray[np.float64]
 
@@ -119,7 +120,8 @@ class OpenSides:
         """
         out = np.full((len(p), self.normal.shape[1], 2, 2), np.nan)
         distance = np.einsum("md,md->m", self.reach, self.normal)
-        drained = np.flatnonzero((self.shape > 0) & (distance > 0))  # sides of an inflow have no conductance
+        # sides of an inflow have no conductance, seepage faces that let nothing out no pressure
+        drained = np.flatnonzero((self.shape > 0) & (distance > 0) & ~(self.seeps & (p[at] <= self.pressure)))
         at, normal, distance = at[drained], self.normal[drained], distance[drained]
         area, jump = self.shape[drained] * distance, self.pressure[drained] - p[at]
         for axis, end in np.ndindex(out.shape[1:3]):

@@ -42,7 +42,8 @@ class HydraulicBoundary:
     def data(self, cut: CutDomains, points: MaterialPoints, contents: CellContents) -> OpenSides:
         """Return the open sides where they were cut."""
         grid = self._grid
-        rows = [(np.empty(0, dtype=np.int32), *[np.empty(0)] * 3, *[np.empty((0, grid.dim))] * 2)]
+        none, vectors = np.empty(0), np.empty((0, grid.dim))
+        rows = [(np.empty(0, dtype=np.int32), none, none, none, np.empty(0, dtype=bool), vectors, vectors)]
         for outlet, faces in self.outlets:
             patches = cut.surface(faces)
             travel = Exchange(grid.comm, grid.owner(patches.cell))
@@ -52,9 +53,9 @@ class HydraulicBoundary:
             none, normal = np.zeros(len(cell)), area / size[:, None]
             reach = x - grid.midpoints[cell] - contents.centroid[cell]
             if isinstance(outlet, Inflow):
-                rows.append((cell, none, none, outlet.flux * size, normal, reach))
+                rows.append((cell, none, none, outlet.flux * size, none > 0, normal, reach))
                 continue
             distance = np.einsum("md,md->m", reach, normal)
             shape, outer = size / np.maximum(distance, SNAP * grid.h.min()), np.full(len(cell), outlet.pressure)
-            rows.append((cell, shape, outer, none, normal, reach))
+            rows.append((cell, shape, outer, none, outlet.seepage & (outer <= 0), normal, reach))
         return OpenSides(*map(np.concatenate, zip(*rows, strict=True)))

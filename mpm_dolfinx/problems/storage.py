@@ -40,6 +40,7 @@ from mpm_dolfinx.forms.cell_matrices import ElementForces
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointForm
 from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts, zero
 from mpm_dolfinx.parallel.exchange import over_all
+from mpm_dolfinx.points.grid import sum_by
 from mpm_dolfinx.problems.fluxes import CellContents, Conduction, FluxForms, OpenSides
 from mpm_dolfinx.validation import line
 
@@ -147,15 +148,41 @@ class StorageForms:
 
 
 @dataclass(frozen=True)
+class Seepage:
+    """Seepage faces, from which water leaves only; arrays over k faces.
+
+    at (k,): place of the cell among the active owned ones; conductance, inflow (k,): outflow per unit of the cell's
+    pressure, m^d/(Pa s), and what the outer pressure would drive in, m^d/s.
+    """
+
+    at: NDArray[np.int64]
+    conductance: NDArray[np.float64]
+    inflow: NDArray[np.float64]
+
+    def driven(self, p: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the outflow (k,), m^d/s, that cells at pressures (n,), Pa, would drive through open faces."""
+        return self.conductance * p[self.at] - self.inflow
+
+    def outflow(self, p: NDArray[np.float64], flows: NDArray[np.bool_]) -> tuple[NDArray, NDArray]:
+        """Return the outflow (n,) of cells at pressures (n,), Pa, in m^d/s, and its derivative, m^d/(Pa s).
+
+        flows (k,): through which of the faces.
+        """
+        parts = (np.where(flows, values, 0.0) for values in (self.driven(p), self.conductance))
+        return tuple(sum_by(self.at, values, len(p)) for values in parts)
+
+
+@dataclass(frozen=True)
 class Outflow:
     """Outflow of the active owned cells: conductance of open sides (m^d/(Pa s)), inflow (m^d/s), and the sum of all.
 
-    total: outflow per unit of the cell's own pressure through all its faces, m^d/(Pa s).  mobility (n, d): along the
-    axes, m^2/(Pa s).
+    seepage: of the faces from which water leaves only, which is not in these; total: outflow per unit of the cell's own
+    pressure through all its other faces, m^d/(Pa s).  mobility (n, d): along the axes, m^2/(Pa s).
     """
 
     conductance: NDArray[np.float64]
     inflow: NDArray[np.float64]
+    seepage: Seepage
     total: NDArray[np.float64]
     mobility: NDArray[np.float64]
 
@@ -214,8 +241,10 @@ class StorageSystem:
 
     def set_fluxes(self, contents: CellContents, sides: OpenSides, flow: Conduction) -> Outflow:
         """Assemble the fluxes through inner faces and open sides."""
-        driven = sides.driven(contents.slot(sides.cells), flow)
-        conductance, inflow = (contents.total(sides.cells, values) for values in driven)
+        at = contents.slot(sides.cells)
+        driven, seeps = sides.driven(at, flow), sides.seeps
+        conductance, inflow = (contents.total(sides.cells[~seeps], values[~seeps]) for values in driven)
+        seepage = Seepage(at[seeps], *(values[seeps] for values in driven))
         mobility = self._forms.fluxes.set_conduction(contents, flow)
         zero(self.T)
         if self._flux is not None:
@@ -224,7 +253,7 @@ class StorageSystem:
         self.rate.array_w[:] -= inflow
         self.T.assemble()
         _add_diagonal(self.T, conductance)
-        return Outflow(conductance, inflow, self.T.getDiagonal().array.copy(), mobility)
+        return Outflow(conductance, inflow, seepage, self.T.getDiagonal().array.copy(), mobility)
 
 
 @dataclass(frozen=True)
@@ -283,8 +312,10 @@ class StorageProblem:
         system.unknowns.gather(forms.p_n.x.array, system.p_start)
         reach = 4 * forms.grid.h.max() ** 2  # no two centroids are further apart than 2 h
         needed = contents.set_damping(softness) * reach > dt * outflow.mobility.min(axis=1)
-        self.damped = over_all(forms.grid.comm, bool(needed.any())) > 0
+        somewhere = over_all(forms.grid.comm, np.array([needed.any(), outflow.seepage.at.size], dtype=float)) > 0
+        self.damped, self._seeps = somewhere.tolist()
         """Whether jumps of the pressure are damped somewhere."""
+        self._flowing = outflow.seepage.driven(forms.p.x.array[system.unknowns.owned]) >= 0
         if self.damped:
             forms.fluxes.dt.value = dt
             zero(system.D)
@@ -292,9 +323,27 @@ class StorageProblem:
             system.D.assemble()
 
     @property
+    def linear(self) -> bool:
+        """Whether the tangent does not depend on the pressure."""
+        return self.forms.linear and not self._seeps
+
+    @property
     def fill(self) -> NDArray[np.float64]:
         """Filled share of the cells, which is what their pressures count for."""
         return self._contents.fill
+
+    def settle_seepage(self) -> bool:
+        """Open and close seepage faces as the flow at (u, p) asks for; return whether that has changed anything.
+
+        Newton's method solves for (u, p) with the faces as they are, and then settles them: a primal-dual active set
+        (Hintermueller, Ito and Kunisch 2002).
+        """
+        if not self._seeps:
+            return False
+        flows = self._flow(False).seepage.driven(self.forms.p.x.array[self.system.unknowns.owned]) > 0
+        changes = over_all(self.forms.grid.comm, int(np.count_nonzero(flows != self._flowing)))
+        self._flowing[:] = flows
+        return changes > 0
 
     def set_fluxes(self) -> None:
         """Assemble the fluxes at u."""
@@ -327,8 +376,10 @@ class StorageProblem:
         if forms.sources:
             gain = forms.gain(self.data)[system.unknowns.owned]
             cells -= gain
-        lost = (outflow.conductance * values - outflow.inflow).sum() - gain.sum()
-        turnover = np.abs(outflow.total) @ np.abs(values)
+        seeping, slope = outflow.seepage.outflow(values, self._flowing)
+        cells += seeping
+        lost = (outflow.conductance * values - outflow.inflow + seeping).sum() - gain.sum()
+        turnover = (np.abs(outflow.total) + slope) @ np.abs(values)
         return Rates(values.copy(), cells, float(lost), float(turnover), float(np.abs(gain).sum()))
 
     def balance(self, residual: StorageResidual) -> float:
@@ -350,6 +401,9 @@ class StorageProblem:
             system.C.axpy(1.0, system.D, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
         owned = system.unknowns.owned
         _add_diagonal(system.C, forms.capacity(data)[owned])
+        if self._seeps:
+            slope = self._flow(False).seepage.outflow(forms.p.x.array[owned], self._flowing)[1]
+            _add_diagonal(system.C, self.dt * slope)
         if forms.sources:
             _add_diagonal(system.C, -self.dt * forms.gain_slope(data)[owned])
 

@@ -154,7 +154,7 @@ class Newton:
     def __init__(self, solvers: LinearSolvers, momentum: MomentumProblem, storage: StorageProblem | None):
         self._solvers, self._scheme, self._momentum, self._storage = solvers, solvers.scheme, momentum, storage
         self.report = Report()
-        self._linear = momentum.linear and (storage is None or storage.forms.linear)
+        self._linear = momentum.linear and (storage is None or storage.linear)
 
     def newton(self, as_reset: Callable[[], QuadratureData], key: Hashable, serves: bool) -> Errors:
         """Solve both problems at once; the tangent is kept while it serves, of linear laws over steps.
@@ -171,6 +171,8 @@ class Newton:
             self.report.coupling += self._direction(errors)
             before, errors = errors, self._line_search(errors)
             fresh = errors.worst > KEEP * min(1.0, before.worst)  # inf where no fluid has moved yet
+            if self._storage is not None and self._storage.settle_seepage():
+                errors, fresh = self._errors(errors.start), True
         return errors
 
     def _begin(self) -> Errors:
@@ -219,6 +221,8 @@ class Newton:
                 dp = self._solvers.solve_storage()
             self._storage.system.unknowns.add(self._storage.forms.p, -1.0, dp)
             report.coupling += 1
+            if self._storage.settle_seepage():
+                self._linearise()
             errors = self._errors(errors.start)
         return errors
 

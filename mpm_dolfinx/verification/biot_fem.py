@@ -126,6 +126,8 @@ class BiotFEM:
             raise ValueError(f"element {element!r}: must be one of {', '.join(ELEMENTS)}")
         if fluid is None and drained:
             raise ValueError("drained sides need a fluid")
+        if any(outlet.seepage for outlet in drained):
+            raise ValueError("drained: seepage = True, must be False: the reference has no seepage faces")
         if fluid is not None and gravity is not None:
             raise ValueError("gravity with a fluid: the reference has none, one of them must be left out")
         if material.state or callable(material.porosity) or callable(material.biot) or callable(material.grain_bulk):
