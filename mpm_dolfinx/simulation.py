@@ -172,6 +172,14 @@ class Simulation:
         return self.state.reactions
 
     @property
+    def outflows(self) -> NDArray[np.float64]:
+        """(drained sides, then inflows): what leaves the bodies through each, m^3/s (m^2/s in plane strain).
+
+        At the end of the last step; nan where none has been taken since a stage set them.
+        """
+        return self.state.outflows
+
+    @property
     def present(self) -> tuple[bool, ...]:
         """Which bodies are there."""
         return self.state.stage.present

@@ -32,7 +32,8 @@ def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int
     points = scene.materials.seeded.of(_ids(scene.bodies, later), kept=False)
     transported = at_start(points) if scene.fluid else None
     reactions = np.zeros((len(begun.mechanical.holds), scene.grid.dim))
-    return State(0.0, points, transported, None, 0, reactions, begun, True, None)
+    outflows = np.zeros(len(begun.hydraulic.outlets))
+    return State(0.0, points, transported, None, 0, reactions, outflows, begun, True, None)
 
 
 def begin_stage(
@@ -66,11 +67,12 @@ def begin_stage(
     points = _changed(points, fields)
     if reset_displacement:
         points = replace(points, origin=points.corners)
-    reactions = state.reactions
+    unknown, new = np.nan if state.resets else 0.0, {}
     if "displacements" in named:
-        unknown = np.nan if state.resets else 0.0
-        reactions = np.full((len(begun.mechanical.holds), scene.grid.dim), unknown)
-    return replace(state, points=points, transported=transported, stage=begun, reactions=reactions, begins=True)
+        new["reactions"] = np.full((len(begun.mechanical.holds), scene.grid.dim), unknown)
+    if named.keys() & {"drained", "inflows"}:
+        new["outflows"] = np.full(len(begun.hydraulic.outlets), unknown)
+    return replace(state, points=points, transported=transported, stage=begun, begins=True, **new)
 
 
 def _stage(scene: Scene, conditions: Mapping[str, Any], present: Sequence[bool], later: Sequence[int]) -> Stage:

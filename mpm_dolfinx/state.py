@@ -64,6 +64,8 @@ class State:
         How often the grid has been reset.
     reactions : (displacements, d), N (N/m in plane strain)
         Forces of the given displacements in the last step; nan before the first one of a stage.
+    outflows : (drained sides, then inflows), m^3/s (m^2/s in plane strain)
+        What leaves the bodies through them at the end of the last step; nan before the first one of a stage.
     stage
         The conditions in force.
     begins
@@ -78,6 +80,7 @@ class State:
     stay: Stay | None
     resets: int
     reactions: NDArray[np.float64]
+    outflows: NDArray[np.float64]
     stage: Stage
     begins: bool
     result: Result | None

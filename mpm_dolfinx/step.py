@@ -42,5 +42,7 @@ def step(scene: Scene, state: State, dt: float) -> tuple[State, Report]:
         rates.append(solve_substep(solvers, *both, as_reset, key, report))
     note_pressures(report, solvers, both.storage, acting.substep.before * dt, rates)
     reactions = state.stage.mechanical.reactions(acting.sides, scene.momentum.u.x.array.reshape(-1, scene.grid.dim))
+    outflows = both.storage.outflows(len(state.stage.hydraulic.outlets)) if both.storage else state.outflows
     new, report.rederived = scene.motion.advanced(state, on_grid, state.t + dt)
-    return replace(new, reactions=reactions, resets=state.resets + (state.stay is None), begins=False), report
+    now = {"reactions": reactions, "outflows": outflows}
+    return replace(new, **now, resets=state.resets + (state.stay is None), begins=False), report

@@ -143,7 +143,7 @@ def _scalars(result: Result) -> dict[str, Any]:
 
 def _arrays(state: State) -> dict[str, NDArray]:
     """Return the arrays of a state by names with slashes."""
-    named = {"points": vars(state.points), "reactions": state.reactions}
+    named = {"points": vars(state.points), "reactions": state.reactions, "outflows": state.outflows}
     named["result"] = {name: np.array(state.result.column(name)) for name in Row._fields}
     if state.transported is not None:
         named["transported"] = vars(state.transported)
@@ -175,10 +175,10 @@ def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulat
         histories["pressure"] = [*map(tuple, histories["pressure"].tolist())]
         columns = [[*histories[name]] or [None] * len(times) for name in Row._fields]
         result = Result(rows=[Row(*row) for row in zip(*columns, strict=True)], **note["result"])
-        reactions = arrays.pop("reactions")
-        if arrays or reactions.shape[1:] != (dim,) or not all(np.isfinite([note["t"], *times])):
-            raise ValueError(f"has {', '.join(arrays) or 'other reactions or times'}")
-        return State(note["t"], points, transported, stay, note["resets"], reactions, None, note["begins"], result)
+        acting = reactions, outflows = arrays.pop("reactions"), arrays.pop("outflows")
+        if arrays or reactions.shape[1:] != (dim,) or outflows.ndim != 1 or not all(np.isfinite([note["t"], *times])):
+            raise ValueError(f"has {', '.join(arrays) or 'other reactions, outflows or times'}")
+        return State(note["t"], points, transported, stay, note["resets"], *acting, None, note["begins"], result)
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         raise ValueError(f"{damaged} ({line(error)}), must be a whole checkpoint") from error
 

@@ -32,6 +32,7 @@ FIELDS = {
         "p_0": "Pa, pore pressure there",
         "sxx_0, syy_0, szz_0, sxy_0, sxz_0, syz_0": "Pa, effective stress there, tension positive",
         "reaction_x_0, reaction_y_0, reaction_z_0": "N, in plane strain N/m, force of given displacement 0 on the body",
+        "outflow_0": "m^3/s, in plane strain m^2/s, what leaves through drained side 0; then through inflows",
     },
 }
 """Names, units and meaning of what is written, by file."""

@@ -48,8 +48,8 @@ class Writer:
     * `points.pvd`, the points' domains as solid cells with displacement, pore pressure, F, J, what else the points
       carry, and what `Simulation.point_fields` gives: stresses, p', q, porosity;
     * `history.csv`, one row an output time with the counts of `Result` so far, least and largest pressure, what is
-      recorded of the probes, and the forces of the given displacements (nan where no step has been taken since they
-      were set by a stage or the run was resumed);
+      recorded of the probes, the forces of the given displacements and the outflow through open sides (nan where no
+      step has been taken since they were set by a stage);
     * `fields.txt`, which says what each of these is, and its unit;
     * if asked for `grid.pvd`, what the cells hold (`Simulation.cells`), by components, zero in empty cells.
 
@@ -83,7 +83,7 @@ class Writer:
         flag("writer: grid", grid)
         folder, comm, self._t = path("writer: folder", folder), simulation.grid.comm, simulation.t
         self.every, self._simulation = whole("writer: every", every), simulation
-        self._reactions = simulation.reactions  # at the start
+        self._acting = simulation.reactions, simulation.outflows  # at the start
         with on_disk("writer: folder", "one that can be written"):
             at_root(comm, lambda: _lock(folder))
             self._table = Table(comm, folder / "history.csv", self._t)
@@ -104,7 +104,7 @@ class Writer:
         result = simulation.result
         if not self._table.columns:
             self._start(result)
-        self._table.add(_row(result, simulation.reactions))
+        self._table.add(_row(result, simulation.reactions, simulation.outflows))
         if (len(result.rows) - 1) % self.every and not result.converged:
             return
         self._write_points(simulation)
@@ -117,7 +117,7 @@ class Writer:
         """Drop what the folder holds of later times: from here on the files are this run's."""
         if (began := result.rows[-2][0]) != self._t:
             raise ValueError(f"writer: made at t = {self._t:g} s for a run that goes on from t = {began:g} s")
-        self._table.start(_row(Result(rows=result.rows[:1]), self._reactions))
+        self._table.start(_row(Result(rows=result.rows[:1]), *self._acting))
         self._points.write_index()
         if self._grid is not None:
             self._grid.write_index()
@@ -170,8 +170,8 @@ def _lock(folder: Path) -> None:
         _LOCKS[file] = handle
 
 
-def _row(result: Result, reactions: NDArray[np.float64]) -> dict[str, float]:
-    """Return what the histories hold of the last output time, and the forces of the given displacements then."""
+def _row(result: Result, reactions: NDArray[np.float64], outflows: NDArray[np.float64]) -> dict[str, float]:
+    """Return what the histories hold of the last output time, and what acts at the conditions then."""
     row = result.rows[-1]
     out = {"t": row.t, **{name: getattr(result, name) for name in COUNTS}}
     if row.pressure is not None:
@@ -185,7 +185,7 @@ def _row(result: Result, reactions: NDArray[np.float64]) -> dict[str, float]:
             out |= {f"s{name}_{i}": value for name, value in _components(row.probe_stress[i], len(u)).items()}
     for i, force in enumerate(reactions):
         out |= {f"reaction_{axis}_{i}": value for axis, value in zip("xyz", force.tolist(), strict=False)}
-    return out
+    return out | {f"outflow_{i}": float(flow) for i, flow in enumerate(outflows)}
 
 
 def _components(tensors: NDArray[np.float64], dim: int) -> dict[str, NDArray[np.float64]]:

@@ -102,6 +102,7 @@ class Drained:
         Outer pore pressure, Pa, finite; the same on the whole side and at all times of a stage.
     region : ((d,), (d,)), m
         Box of reference positions to which the drained faces are limited.
+        What leaves through it is in `outflows` of the simulation.
     seepage
         A seepage face: where the outer pressure is not positive, as above a water level, water leaves but does not
         enter.  There the pressure is at most the outer one, or nothing flows.

@@ -81,11 +81,12 @@ class Conduction:
 class OpenSides:
     """Open sides of the bodies; arrays over m faces.
 
-    cells (m,): owned cell behind each; shape: area over distance from the cell's centroid, m^(d-2), zero where the
-    inflow is prescribed; pressure: beyond it, Pa; given: prescribed inflow, m^d/s; seeps: whether nothing may flow in;
-    normal (m, d); reach (m, d): way from the cell's centroid, m.
+    number (m,): of the condition; cells (m,): owned cell behind each; shape: area over distance from the cell's
+    centroid, m^(d-2), zero where the inflow is prescribed; pressure: beyond it, Pa; given: prescribed inflow, m^d/s;
+    seeps: whether nothing may flow in; normal (m, d); reach (m, d): way from the cell's centroid, m.
     """
 
+    number: NDArray[np.int64]
     cells: NDArray[np.int32]
     shape: NDArray[np.float64]
     pressure: NDArray[np.float64]

@@ -43,19 +43,20 @@ class HydraulicBoundary:
         """Return the open sides where they were cut."""
         grid = self._grid
         none, vectors = np.empty(0), np.empty((0, grid.dim))
-        rows = [(np.empty(0, dtype=np.int32), none, none, none, np.empty(0, dtype=bool), vectors, vectors)]
-        for outlet, faces in self.outlets:
+        whole, cells = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int32)
+        rows = [(whole, cells, none, none, none, np.empty(0, dtype=bool), vectors, vectors)]
+        for i, (outlet, faces) in enumerate(self.outlets):
             patches = cut.surface(faces)
             travel = Exchange(grid.comm, grid.owner(patches.cell))
             cell = grid.local(travel.send(patches.cell))
             area, x = travel.send(patches.area(points)), travel.send(patches.x)
             size = np.linalg.norm(area, axis=1)
-            none, normal = np.zeros(len(cell)), area / size[:, None]
+            number, none, normal = np.full(len(cell), i), np.zeros(len(cell)), area / size[:, None]
             reach = x - grid.midpoints[cell] - contents.centroid[cell]
             if isinstance(outlet, Inflow):
-                rows.append((cell, none, none, outlet.flux * size, none > 0, normal, reach))
+                rows.append((number, cell, none, none, outlet.flux * size, none > 0, normal, reach))
                 continue
             distance = np.einsum("md,md->m", reach, normal)
             shape, outer = size / np.maximum(distance, SNAP * grid.h.min()), np.full(len(cell), outlet.pressure)
-            rows.append((cell, shape, outer, none, outlet.seepage & (outer <= 0), normal, reach))
+            rows.append((number, cell, shape, outer, none, outlet.seepage & (outer <= 0), normal, reach))
         return OpenSides(*map(np.concatenate, zip(*rows, strict=True)))

@@ -148,27 +148,27 @@ class StorageForms:
 
 
 @dataclass(frozen=True)
-class Seepage:
-    """Seepage faces, from which water leaves only; arrays over k faces.
+class OpenFaces:
+    """Faces on open sides; arrays over m faces.
 
-    at (k,): place of the cell among the active owned ones; conductance, inflow (k,): outflow per unit of the cell's
-    pressure, m^d/(Pa s), and what the outer pressure would drive in, m^d/s.
+    number (m,): of the condition; at (m,): place of the cell among the active owned ones; conductance, inflow (m,):
+    outflow per unit of the cell's pressure, m^d/(Pa s), and what is prescribed or driven in, m^d/s; seeps (m,): whether
+    nothing may flow in.
     """
 
+    number: NDArray[np.int64]
     at: NDArray[np.int64]
     conductance: NDArray[np.float64]
     inflow: NDArray[np.float64]
+    seeps: NDArray[np.bool_]
 
-    def driven(self, p: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the outflow (k,), m^d/s, that cells at pressures (n,), Pa, would drive through open faces."""
+    def outflow(self, p: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return what leaves through each face, were it open both ways, from cells at pressures (n,), Pa; m^d/s."""
         return self.conductance * p[self.at] - self.inflow
 
-    def outflow(self, p: NDArray[np.float64], flows: NDArray[np.bool_]) -> tuple[NDArray, NDArray]:
-        """Return the outflow (n,) of cells at pressures (n,), Pa, in m^d/s, and its derivative, m^d/(Pa s).
-
-        flows (k,): through which of the faces.
-        """
-        parts = (np.where(flows, values, 0.0) for values in (self.driven(p), self.conductance))
+    def seepage(self, p: NDArray[np.float64], flows: NDArray[np.bool_]) -> tuple[NDArray, NDArray]:
+        """Return what seeps out of cells (n,), m^d/s, and its derivative, m^d/(Pa s); flows (m,): where."""
+        parts = (np.where(flows & self.seeps, values, 0.0) for values in (self.outflow(p), self.conductance))
         return tuple(sum_by(self.at, values, len(p)) for values in parts)
 
 
@@ -176,13 +176,13 @@ class Seepage:
 class Outflow:
     """Outflow of the active owned cells: conductance of open sides (m^d/(Pa s)), inflow (m^d/s), and the sum of all.
 
-    seepage: of the faces from which water leaves only, which is not in these; total: outflow per unit of the cell's own
+    faces: one by one; of those that seep nothing is in these sums; total: outflow per unit of the cell's own
     pressure through all its other faces, m^d/(Pa s).  mobility (n, d): along the axes, m^2/(Pa s).
     """
 
     conductance: NDArray[np.float64]
     inflow: NDArray[np.float64]
-    seepage: Seepage
+    faces: OpenFaces
     total: NDArray[np.float64]
     mobility: NDArray[np.float64]
 
@@ -242,9 +242,9 @@ class StorageSystem:
     def set_fluxes(self, contents: CellContents, sides: OpenSides, flow: Conduction) -> Outflow:
         """Assemble the fluxes through inner faces and open sides."""
         at = contents.slot(sides.cells)
-        driven, seeps = sides.driven(at, flow), sides.seeps
-        conductance, inflow = (contents.total(sides.cells[~seeps], values[~seeps]) for values in driven)
-        seepage = Seepage(at[seeps], *(values[seeps] for values in driven))
+        faces = OpenFaces(sides.number, at, *sides.driven(at, flow), sides.seeps)
+        both = ~faces.seeps
+        conductance, inflow = (contents.total(sides.cells[both], v[both]) for v in (faces.conductance, faces.inflow))
         mobility = self._forms.fluxes.set_conduction(contents, flow)
         zero(self.T)
         if self._flux is not None:
@@ -253,7 +253,7 @@ class StorageSystem:
         self.rate.array_w[:] -= inflow
         self.T.assemble()
         _add_diagonal(self.T, conductance)
-        return Outflow(conductance, inflow, seepage, self.T.getDiagonal().array.copy(), mobility)
+        return Outflow(conductance, inflow, faces, self.T.getDiagonal().array.copy(), mobility)
 
 
 @dataclass(frozen=True)
@@ -312,15 +312,26 @@ class StorageProblem:
         system.unknowns.gather(forms.p_n.x.array, system.p_start)
         reach = 4 * forms.grid.h.max() ** 2  # no two centroids are further apart than 2 h
         needed = contents.set_damping(softness) * reach > dt * outflow.mobility.min(axis=1)
-        somewhere = over_all(forms.grid.comm, np.array([needed.any(), outflow.seepage.at.size], dtype=float)) > 0
+        somewhere = over_all(forms.grid.comm, np.array([needed.any(), outflow.faces.seeps.any()], dtype=float)) > 0
         self.damped, self._seeps = somewhere.tolist()
         """Whether jumps of the pressure are damped somewhere."""
-        self._flowing = outflow.seepage.driven(forms.p.x.array[system.unknowns.owned]) >= 0
+        self._flowing = outflow.faces.outflow(self._pressures) >= 0
         if self.damped:
             forms.fluxes.dt.value = dt
             zero(system.D)
             system.damp.assemble_matrix(system.D)
             system.D.assemble()
+
+    @property
+    def _pressures(self) -> NDArray[np.float64]:
+        """Pressures of the active owned cells, Pa."""
+        return self.forms.p.x.array[self.system.unknowns.owned]
+
+    def outflows(self, count: int) -> NDArray[np.float64]:
+        """Return what leaves through the sides of each of so many conditions (count,) at (u, p), m^d/s."""
+        faces = self._flow(False).faces
+        leaves = np.where(self._flowing | ~faces.seeps, faces.outflow(self._pressures), 0.0)
+        return over_all(self.forms.grid.comm, sum_by(faces.number, leaves, count))
 
     @property
     def linear(self) -> bool:
@@ -340,8 +351,9 @@ class StorageProblem:
         """
         if not self._seeps:
             return False
-        flows = self._flow(False).seepage.driven(self.forms.p.x.array[self.system.unknowns.owned]) > 0
-        changes = over_all(self.forms.grid.comm, int(np.count_nonzero(flows != self._flowing)))
+        faces = self._flow(False).faces
+        flows = faces.outflow(self._pressures) > 0
+        changes = over_all(self.forms.grid.comm, int(np.count_nonzero((flows != self._flowing) & faces.seeps)))
         self._flowing[:] = flows
         return changes > 0
 
@@ -376,7 +388,7 @@ class StorageProblem:
         if forms.sources:
             gain = forms.gain(self.data)[system.unknowns.owned]
             cells -= gain
-        seeping, slope = outflow.seepage.outflow(values, self._flowing)
+        seeping, slope = outflow.faces.seepage(values, self._flowing)
         cells += seeping
         lost = (outflow.conductance * values - outflow.inflow + seeping).sum() - gain.sum()
         turnover = (np.abs(outflow.total) + slope) @ np.abs(values)
@@ -402,7 +414,7 @@ class StorageProblem:
         owned = system.unknowns.owned
         _add_diagonal(system.C, forms.capacity(data)[owned])
         if self._seeps:
-            slope = self._flow(False).seepage.outflow(forms.p.x.array[owned], self._flowing)[1]
+            slope = self._flow(False).faces.seepage(self._pressures, self._flowing)[1]
             _add_diagonal(system.C, self.dt * slope)
         if forms.sources:
             _add_diagonal(system.C, -self.dt * forms.gain_slope(data)[owned])
