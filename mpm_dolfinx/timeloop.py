@@ -124,7 +124,7 @@ def run(
     now, comm = simulation.state.t, simulation.scene.grid.comm
     start = now if after is None else after.rows[0][0]
     times = Times(start, now, t_end, dt, t_eval, rtol, after is not None)
-    rule = step_rule(times, rtol, first_step, max_step, simulation.scene)
+    rule = step_rule(times, rtol, first_step, max_step, simulation.scene, simulation.state.points)
     result = _histories(simulation, times, rule, probes, after)
     stopwatch = _Stopwatch(result)
     targets = times.after(result.rows[-1][0])
