@@ -69,7 +69,8 @@ class StepSize:
     def fitted(self, left: float, small: float) -> float:
         """Return the length of the next step, s: `small`, fitted to the time that is left to the next output."""
         if self.by_error:  # no scrap of a step before an output
-            return left if left < 1.05 * small else min(small, left / 2)
+            small = min(small, self.longest)  # of a run that went on with other steps it may be longer
+            return left if left <= min(1.05 * small, (1 + 1e-9) * self.longest) else min(small, left / 2)
         # steps that fit but for rounding are all of the same length
         return left if not left > (1 - 1e-9) * small else small
 
@@ -157,7 +158,7 @@ class Times:
     def after(self, t: float) -> list[float]:
         """Return the output times after one, s, the end included."""
         if self._times is not None:
-            return [*(time for time in self._times if t < time < self.end), *[self.end] * (t < self.end)]
+            return [*(time for time in self._times if t < time < self.end), *([self.end] if t < self.end else [])]
         # a last interval that is a fraction of dt counts as one
         start, dt = self.start, self.interval
         done = round((t - start) / dt)
@@ -194,6 +195,8 @@ def step_rule(times: Times, rtol, first_step, max_step: float, scene: Scene, poi
     numbers("rtol", rtol, test=lambda v: (least <= v) & (v < 1), allowed=f"in [{least:g}, 1): the solver's tolerance")
     if scene.method == "backward-euler":
         raise ValueError(f"rtol = {line(rtol)}: backward-euler knows no error of a step, must be sdirk2")
+    if scene.fluid is None and len(scene.substeps) > 1:
+        raise ValueError(f"rtol = {line(rtol)}: without fluid no error of terms of the velocity is known, must be dt")
     longest = float(numbers("max_step", max_step, **positive)) if max_step != inf else inf
     first = times.after(times.start)[0] - times.start
     if len(scene.substeps) > 1:  # without a rate no step has an error
