@@ -24,7 +24,8 @@ import numpy as np
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.time_integration import METHODS
-from mpm_dolfinx.verification.biot_fem import BiotFEM, euler_bernoulli
+from mpm_dolfinx.verification.biot_fem import BiotFEM
+from mpm_dolfinx.verification.exact import euler_bernoulli
 
 LENGTH, HEIGHT, DEPTH, CLAMP = 1.0, 0.3, 0.1, 0.05  # m; the load begins at x = CLAMP
 BOX = np.array([1.5, 1.2])  # m

@@ -4,12 +4,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from math import inf, sqrt
+from math import inf, isfinite
+
+from mpi4py import MPI
 
 import numpy as np
 
+from mpm_dolfinx.parallel.exchange import over_all
+from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.result import Report, Result
 from mpm_dolfinx.scene import Scene
+from mpm_dolfinx.solve.newton import ERROR
 from mpm_dolfinx.validation import line, numbers
 
 MIN_CUT = 2.0**-10
@@ -28,7 +33,7 @@ MOST = 1e9
 RESOLVED = 10
 """Errors that can be told from what the solver leaves, in proportion to its tolerance."""
 FIRST = 1e-3
-"""Share of the first output interval that a step by error is first tried with."""
+"""Share of the first output interval that a step by error is first tried with at least."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +69,8 @@ class StepSize:
     def fitted(self, left: float, small: float) -> float:
         """Return the length of the next step, s: `small`, fitted to the time that is left to the next output."""
         if self.by_error:  # no scrap of a step before an output
-            return left if left < 1.05 * small else min(small, left / 2)
+            small = min(small, self.longest)  # of a run that went on with other steps it may be longer
+            return left if left <= min(1.05 * small, (1 + 1e-9) * self.longest) else min(small, left / 2)
         # steps that fit but for rounding are all of the same length
         return left if not left > (1 - 1e-9) * small else small
 
@@ -76,22 +82,23 @@ class StepSize:
         """
         if not self.by_error:
             return 0.5 if taken > 0.75 * self.longest and report.sudden > RINGS * result.change else 1.0
-        return 1.0 if report.error <= self.rtol * result.change else self._factor(report, result)
+        # steps are refused where loads jump or bend, mostly: there the error is of first order
+        return 1.0 if report.error <= self.rtol * result.change else self._factor(report, result, 1.0)
 
     def next(self, taken: float, report: Report, result: Result, failed: bool) -> float:
         """Return the step to try after one that was taken, s; failed: after a longer one had not converged."""
         if not self.by_error:
             return max(result.small, min(2 * taken, self.longest)) if report.easy else result.small
-        factor = self._factor(report, result)
+        factor = self._factor(report, result, 0.5)
         if factor >= 1:
             # a step as long as one that has just failed would mostly fail again: in soil that yields, 78 cuts, not 1
             factor = 1.0 if factor < KEEPS or failed or not report.easy else factor
             return min(max(taken * factor, result.small), self.longest)  # it may have been short for an output's sake
         return taken * factor
 
-    def _factor(self, report: Report, result: Result) -> float:
+    def _factor(self, report: Report, result: Result, power: float) -> float:
         """Return the step whose error would be as large as it may be, in proportion to one that was solved."""
-        factor = SAFETY * sqrt(self.rtol * result.change / report.error) if report.error > 0 else GROWS
+        factor = SAFETY * (self.rtol * result.change / report.error) ** power if report.error > 0 else GROWS
         return min(GROWS, max(SHRINKS, factor))
 
 
@@ -150,7 +157,7 @@ class Times:
     def after(self, t: float) -> list[float]:
         """Return the output times after one, s, the end included."""
         if self._times is not None:
-            return [*(time for time in self._times if t < time < self.end), *[self.end] * (t < self.end)]
+            return [*(time for time in self._times if t < time < self.end), *([self.end] if t < self.end else [])]
         # a last interval that is a fraction of dt counts as one
         start, dt = self.start, self.interval
         done = round((t - start) / dt)
@@ -162,7 +169,20 @@ class Times:
         return max([*self.after(t)[:1], t]) + 1e-9 * self.interval
 
 
-def step_rule(times: Times, rtol, first_step, max_step: float, scene: Scene) -> StepSize:
+def sealed(scene: Scene, points: MaterialPoints) -> float:
+    """Return the time in which a cell hardly loses fluid, the least h^2 / c_v, s; 0 where there is none."""
+    if scene.fluid is None:
+        return 0.0
+    stored = scene.materials.table(points, lambda m: m.biot**2 / m.oedometric)
+    stored = stored + scene.materials.storage(points, scene.fluid)
+    mobility = scene.materials.table(points, lambda m: m.conductivity) / scene.fluid.unit_weight
+    at = mobility > 0
+    least = scene.grid.h.min() ** 2 * (stored[at] / mobility[at]).min(initial=inf)
+    least = float(over_all(scene.grid.comm, least, MPI.MIN))
+    return least if isfinite(least) else 0.0
+
+
+def step_rule(times: Times, rtol, first_step, max_step: float, scene: Scene, points: MaterialPoints) -> StepSize:
     """Return the rule of a run: see `run`; ValueError naming what is not allowed."""
     positive = {"test": lambda v: v > 0, "allowed": "> 0"}
     if rtol is None:
@@ -174,9 +194,13 @@ def step_rule(times: Times, rtol, first_step, max_step: float, scene: Scene) -> 
     numbers("rtol", rtol, test=lambda v: (least <= v) & (v < 1), allowed=f"in [{least:g}, 1): the solver's tolerance")
     if scene.method == "backward-euler":
         raise ValueError(f"rtol = {line(rtol)}: backward-euler knows no error of a step, must be sdirk2")
+    if scene.fluid is None and len(scene.substeps) > 1:
+        raise ValueError(f"rtol = {line(rtol)}: without fluid no error of terms of the velocity is known, must be dt")
     longest = float(numbers("max_step", max_step, **positive)) if max_step != inf else inf
-    share = FIRST if len(scene.substeps) > 1 else 1.0  # without a rate no step has an error
-    first = share * (times.after(times.start)[0] - times.start)
+    first = times.after(times.start)[0] - times.start
+    if len(scene.substeps) > 1:  # without a rate no step has an error
+        # under a load that grows from nothing the error is ERROR dt c_v / h^2 of the change
+        first = min(first, max(FIRST * first, SAFETY * rtol / ERROR * sealed(scene, points)))
     if first_step is not None:
         first = float(numbers("first_step", first_step, **positive))
     return StepSize(min(first, longest), longest, float(rtol))

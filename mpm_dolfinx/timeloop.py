@@ -83,11 +83,11 @@ def run(
     rtol
         Choose the steps by their error: that of the pore pressures stays below about rtol of their largest change
         since the run began; at least ten times `tolerance`, and < 1.  Where nothing flows the steps are as long as the
-        output intervals.
+        output intervals; refused for dry bodies with terms of the velocity, of which no error is known.
     t_eval : (m,), s
         Output times, increasing, in (t, t_end]; t_end is one of them in any case.  Steps end at output times.
     first_step, max_step
-        With `rtol`: the first step to try, and the longest, s, > 0.
+        With `rtol`: the first step to try, not of a run that goes on, and the longest, s, > 0.
     probes
         Particles that are recorded.
     observe
@@ -124,7 +124,7 @@ def run(
     now, comm = simulation.state.t, simulation.scene.grid.comm
     start = now if after is None else after.rows[0][0]
     times = Times(start, now, t_end, dt, t_eval, rtol, after is not None)
-    rule = step_rule(times, rtol, first_step, max_step, simulation.scene)
+    rule = step_rule(times, rtol, first_step, max_step, simulation.scene, simulation.state.points)
     result = _histories(simulation, times, rule, probes, after)
     stopwatch = _Stopwatch(result)
     targets = times.after(result.rows[-1][0])

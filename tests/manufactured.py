@@ -9,6 +9,7 @@ import numpy as np
 import ufl
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx.verification.biot_fem import BiotFEM
 
 SOIL = mpm.NeoHookean(
     bulk=1e6,
@@ -78,12 +79,25 @@ def source(points, q, t):
     return rate * q / ufl.det(points.F) * points.dx
 
 
+PHYSICS = {
+    "fluid": WATER,
+    "fixed": WALLS,
+    "tractions": [mpm.Traction("top", traction)],
+    "drained": [mpm.Drained("top")],
+    "terms": [body_force],
+    "sources": [source],
+}
+
+
 def scene(cells):
     """Return the block on a grid of that many cells a metre."""
     grid = mpm.Grid([1.0, 1 + 2 / cells], [cells, cells + 2])
-    top, drained = [mpm.Traction("top", traction)], [mpm.Drained("top")]
-    options = {"fixed": WALLS, "tractions": top, "drained": drained, "terms": [body_force], "sources": [source]}
-    return mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 1])], [SOIL], fluid=WATER, **options)
+    return mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 1])], [SOIL], **PHYSICS)
+
+
+def reference(cells):
+    """Return the block by Taylor-Hood elements."""
+    return BiotFEM([0, 0], [1, 1], (cells, cells), SOIL, **PHYSICS)
 
 
 def rms(values):
@@ -91,11 +105,16 @@ def rms(values):
 
 
 def errors(s):
-    """Return the errors of the points' displacement and pressure, over the largest exact ones, in the rms."""
-    X = s.bodies[0].centre
+    """Return the errors of displacement and pressure, at points or in cells' centres, over the largest exact ones.
+
+    In the rms.
+    """
+    fem = isinstance(s, BiotFEM)
+    X = s.grid.midpoints[: s.grid.num_owned] if fem else s.bodies[0].centre
+    found, pressure = (s.displacement(X), s.pressure(X)) if fem else (s.points.x - X, s.points.pressure)
     u, p = solution(X.T, s.t)
     u = np.stack(u, axis=1)
-    return np.array([rms(s.points.x - X - u) / np.abs(u).max(), rms(s.points.pressure - p) / np.abs(p).max()])
+    return np.array([rms(found - u) / np.abs(u).max(), rms(pressure - p) / np.abs(p).max()])
 
 
 def stress(X, t):

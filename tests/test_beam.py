@@ -47,6 +47,21 @@ def test_the_tip_is_as_exact_in_half_the_steps_if_their_error_chooses_them():
     assert off(result)[3:].max() < 1e-3 and result.steps <= 30, (off(result), result.steps)
 
 
+@pytest.mark.slow
+def test_the_tip_after_the_ramp_is_of_second_order_in_the_step():
+    """Differences of three runs, under all of the load, which carries the tip through fifteen cells."""
+
+    def tip(dt):
+        o = demo.arguments(f"--ramp 0.08 --t-end 0.24 --dt {dt}".split())
+        simulation, bottom = demo.scene(o)
+        probe = mpm.probes(simulation.bodies, [[1.0, bottom + 0.15]])
+        return simulation.run(o.t_end, o.dt, probes=probe).displacement[-1][0, 1]
+
+    tips = [tip(dt) for dt in (0.04, 0.02, 0.01)]
+    first, second = np.abs(np.diff(tips))
+    assert np.log2(first / second) > 1.9 and second < 2e-4 * abs(tips[-1]), tips
+
+
 def test_the_pressure_extremes_follow_the_finite_elements(beam):
     p, exact = (np.array(r.pressure)[1:] for r in beam)
     largest = np.maximum.accumulate(np.abs(exact).max(axis=1))

@@ -3,10 +3,12 @@
 
 import numpy as np
 import pytest
+import ufl
 from helpers import SOFT, top_load
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.verification.biot_fem import BiotFEM, euler_bernoulli
+from mpm_dolfinx.verification.biot_fem import BiotFEM
+from mpm_dolfinx.verification.exact import euler_bernoulli
 
 SIZE, TIP = ([0, 0], [1, 0.3]), [[1.0, 0.15]]
 
@@ -42,3 +44,36 @@ def test_one_dimensional_consolidation_follows_terzaghi(element):
     settlement = -result.displacement[-1][0, 1] / (100 / SOFT.oedometric)
     assert settlement == pytest.approx(0.7639503, rel=4e-3)  # degree of consolidation at T_v = 0.5
     assert result.pressure[-1][1] == pytest.approx(37.07774, rel=1e-2)
+
+
+def test_a_term_of_the_velocity_and_a_spring_make_a_dry_block_creep_exactly():
+    """Kelvin-Voigt, its spring doubled by an energy: strain = q / 2M (1 - exp(-2M t / eta))."""
+    eta, load, modulus = 1e8, 1e3, SOFT.oedometric
+
+    def damper(points, velocity, v):
+        return eta * ufl.inner(ufl.sym(points.grad(velocity)), ufl.sym(points.grad(v))) * points.dx
+
+    def stiffer(points, u):  # an energy: as much again as the oedometric modulus
+        strain = points.grad(points.displacement + u)
+        return modulus / 2 * strain[1, 1] ** 2 / ufl.det(points.F) * points.dx
+
+    walls = {"left": "x", "right": "x", "bottom": "y"}
+    top = mpm.Traction("top", (0, -load))
+    fem = BiotFEM([0, 0], [1, 1], (2, 2), SOFT, fixed=walls, tractions=[top], terms=[damper, stiffer])
+    result = fem.run(20.0, 0.5, probes=[[0.5, 1.0]])
+    exact = load / (2 * modulus) * (1 - np.exp(-2 * modulus * 20.0 / eta))
+    assert -result.displacement[-1][0, 1] == pytest.approx(exact, rel=2e-3)
+
+
+def test_terms_that_the_reference_cannot_take_are_refused_in_a_line():
+    def reference(**options):
+        return BiotFEM([0, 0], [1, 1], (2, 2), SOFT, fixed={"left": "xy"}, **options)
+
+    with pytest.raises(ValueError, match="drained sides and sources need a fluid"):
+        reference(sources=[lambda points, q: q * points.dx])
+    with pytest.raises(ValueError, match=r"terms = .*, must be a list of functions"):
+        reference(terms=5)
+    with pytest.raises(ValueError, match=r"argument 'w', must be some of points, t, u, v, dt, velocity"):
+        reference(terms=[lambda w: w])
+    with pytest.raises(ValueError, match="depends on neither u nor v"):
+        reference(terms=[lambda points, t: t * points.dx])

@@ -106,6 +106,22 @@ def form(kind: str, function: Callable, **available) -> ufl.Form:
     return out
 
 
+def term_of(term: Callable, unknown: ufl.Coefficient, test: ufl.Argument, **available) -> tuple[ufl.Form, bool]:
+    """Return a term of the user's as a linear form in the test function, and whether it is the slope of an energy.
+
+    Raises
+    ------
+    ValueError
+        As `form`; or it depends on neither the unknown nor v.
+    """
+    out = form("terms", term, **available)
+    if out.arguments():
+        return out, False
+    if unknown not in out.coefficients():
+        raise ValueError(f"terms: {line(out)}: depends on neither u nor v, must be a form in one of them")
+    return ufl.derivative(out, unknown, test), True
+
+
 @contextmanager
 def compiling(what: str, allowed: str) -> Iterator[None]:
     """Name the object and the remedy where UFL or its compiler refuses an expression, with a ValueError."""

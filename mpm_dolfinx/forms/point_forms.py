@@ -25,6 +25,7 @@ from petsc4py import PETSc
 import numpy as np
 import ufl
 from dolfinx import fem
+from dolfinx.mesh import Mesh
 from numpy.typing import NDArray
 
 from mpm_dolfinx import _compat
@@ -38,15 +39,10 @@ BATCH = 2**10
 
 
 class PointMeasure(ufl.Measure):
-    """Measure of a sum over points: `f * dx` stands for sum_p w_p f(x_p)."""
+    """Measure with a weight; of a sum over points, `f * dx` stands for sum_p w_p f(x_p)."""
 
-    def __init__(self, grid: Grid, weight: ufl.core.expr.Expr):
-        super().__init__(
-            "dx",
-            domain=grid.mesh,
-            subdomain_id=_compat.SUBDOMAIN,
-            metadata={"quadrature_degree": 0},
-        )
+    def __init__(self, mesh: Mesh, weight: ufl.core.expr.Expr, subdomain=_compat.SUBDOMAIN, degree: int = 0):
+        super().__init__("dx", domain=mesh, subdomain_id=subdomain, metadata={"quadrature_degree": degree})
         self._weight = weight
 
     def __rmul__(self, integrand) -> ufl.Form:
@@ -72,7 +68,7 @@ class FormPoints:
         }
         self.live: dict[str, fem.Function] = {}
         """Fields that are gradients of functions on the grid, which change while the points stay."""
-        self.dx = PointMeasure(grid, self.functions["weight"])
+        self.dx = PointMeasure(grid.mesh, self.functions["weight"])
         self.sizes = {name: int(np.prod(shape, dtype=int)) for name, shape in fields.items()}
 
     def __getattr__(self, name: str) -> fem.Function:

@@ -25,8 +25,7 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx import _compat
 from mpm_dolfinx.constitutive.skeleton import Skeleton
-from mpm_dolfinx.constitutive.user_functions import compiling
-from mpm_dolfinx.constitutive.user_functions import form as form_of
+from mpm_dolfinx.constitutive.user_functions import compiling, term_of
 from mpm_dolfinx.forms.cell_matrices import ElementForces, ElementMatrices, StackedElementMatrices
 from mpm_dolfinx.forms.point_forms import FormPoints, PointForm
 from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts, zero
@@ -141,12 +140,8 @@ class MomentumForms:
         V = self.u.function_space
         v, du = ufl.TestFunction(V), ufl.TrialFunction(V)
         velocity = (self.u - self._past) / self._own
-        form = form_of("terms", term, points=pieces, u=self.u, v=v, t=t, dt=dt, velocity=velocity)
-        potential = not form.arguments()
-        if potential and self.u not in form.coefficients():
-            raise ValueError(f"terms: {line(form)}: depends on neither u nor v, must be a form in one of them")
-        if potential:
-            form = ufl.derivative(form, self.u, v)
+        more = {"t": t, "dt": dt, "velocity": velocity}
+        form, potential = term_of(term, self.u, v, points=pieces, u=self.u, v=v, **more)
         with compiling(f"terms: {line(term)}", "linear in v, or an energy of u"):
             self.terms.append(PointForm(form, pieces))
         holds = self.u in form.coefficients()

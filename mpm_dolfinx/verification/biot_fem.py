@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""References to compare with: body-fitted, total-Lagrangian finite elements for finite-strain Biot, and beam theory.
+"""The reference to compare with: body-fitted, total-Lagrangian finite elements for finite-strain Biot.
 
 With the total displacement u, F = I + grad u, J = det F and the pore pressure p (positive in compression)
 on the reference configuration of a box, from state n:
@@ -9,8 +9,8 @@ on the reference configuration of a box, from state n:
 
 kappa = k/(rho_w g), the content zeta that of `fluid_content`, the integral over the step that of `time_integration`.
 With pressures constant in the cells the flux is the two-point one, kappa J |F^-T N|^2 (p+ - p-)/h, h the distance of
-the cells' centres.  Materials and time integration are those of the material point method, so the two differ in
-discretisation only.
+the cells' centres; it is not consistent where the body shears.  Materials, the user's terms and sources, and time
+integration are those of the material point method, so the two differ in discretisation only.
 """
 
 from __future__ import annotations
@@ -18,6 +18,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 from mpi4py import MPI
@@ -33,15 +35,17 @@ from tqdm import tqdm
 from mpm_dolfinx import _compat
 from mpm_dolfinx.constitutive.fluid_content import change_of_content
 from mpm_dolfinx.constitutive.skeleton import Field, Fluid, Skeleton
-from mpm_dolfinx.constitutive.user_functions import call
+from mpm_dolfinx.constitutive.user_functions import call, compiling, term_of
+from mpm_dolfinx.constitutive.user_functions import form as form_of
 from mpm_dolfinx.errors import GaveUp, NotConverged
+from mpm_dolfinx.forms.point_forms import PointMeasure
 from mpm_dolfinx.points.faces import Region, limits
 from mpm_dolfinx.points.grid import Grid, side
 from mpm_dolfinx.points.probes import positions
 from mpm_dolfinx.problems.conditions import RIGIDITY, Drained, Pressure, RigidPlate, Traction
-from mpm_dolfinx.result import Report, Result
+from mpm_dolfinx.result import Report, Result, Row
 from mpm_dolfinx.time_integration import Substep, substeps
-from mpm_dolfinx.validation import all_of, line, numbers
+from mpm_dolfinx.validation import all_of, functions, line, numbers
 
 ELEMENTS = {"taylor-hood": (2, ("Lagrange", 1, ())), "q1-dg0": (1, ("DG", 0, ()))}  # degree of u; space of p
 CUT_DEGREE = 20  # of quadrature on a side of which a region is loaded: the region's edge may cut facets
@@ -50,7 +54,8 @@ CUT_DEGREE = 20  # of quadrature on a side of which a region is loaded: the regi
 class Space:
     """The space W of the unknowns w = (u, p/scale), or of w = u, and functions in it.
 
-    old: w at the start of the step; b, f: residual and loads; u: the displacement; p_dofs: where the pressures are.
+    old: w at the start of the step; past: its change that the rate of a substep begins with; b, f: residual and loads;
+    u, p: displacement and pressure; p_dofs: where the pressures are.
     """
 
     def __init__(self, grid: Grid, wet: bool, degree: int, pressure: tuple[str, int, tuple[int, ...]]):
@@ -60,20 +65,25 @@ class Space:
             self.p_dofs = np.asarray(self.W.sub(1).collapse()[1])
         else:
             self.W, self.p_dofs = _compat.function_space(grid.mesh, *vector), slice(0)
-        self.w, self.old, self.b, self.f = (fem.Function(self.W) for _ in range(4))
-        self.u = self.w.sub(0) if wet else self.w
+        self.w, self.old, self.past, self.b, self.f = (fem.Function(self.W) for _ in range(5))
+        self.u, self.p = (self.w.sub(0), self.w.sub(1)) if wet else (self.w, None)
 
 
 class Forms(NamedTuple):
-    """Compiled residual, tangent, flux and loads, and their constants: time of the flux, tractions, weight."""
+    """Compiled residual, tangent, flux and loads, and their constants.
+
+    dt, since, t: time of the flux, since the start of the step, and at the end of the substep, s; given: functions of
+    time.
+    """
 
     residual: Any
     tangent: Any
     flux: Any | None
     load: Any | None
     dt: fem.Constant
-    tractions: list[tuple[Traction | Pressure, fem.Constant]]
-    weight: fem.Constant
+    since: fem.Constant
+    t: fem.Constant
+    given: list[tuple[Callable[[float], ArrayLike], fem.Constant]]
 
 
 class BiotFEM:
@@ -93,6 +103,8 @@ class BiotFEM:
         Conditions on sides, nodal pressures on whole facets of a region; other sides are free and sealed.
     gravity : callable t -> (d,), m/s^2
         Acceleration of gravity, without fluid only.
+    terms, sources
+        The user's, as those of `Simulation`: see `user_functions`.  q is a test function of the pressure's elements.
     element
         "taylor-hood": Q2 displacement, Q1 pressure; "q1-dg0": Q1, constant in the cells with two-point fluxes.
     method
@@ -114,6 +126,8 @@ class BiotFEM:
         drained: Sequence[Drained] = (),
         plates: Sequence[RigidPlate] = (),
         gravity: Callable[[float], ArrayLike] | None = None,
+        terms: Sequence[Callable] = (),
+        sources: Sequence[Callable] = (),
         element: str = "taylor-hood",
         comm: MPI.Intracomm = MPI.COMM_WORLD,
         tolerance: float = 1e-8,
@@ -124,8 +138,10 @@ class BiotFEM:
         numbers("tolerance", tolerance, test=lambda v: (0 < v) & (v < 1), allowed="in (0, 1)")
         if element not in ELEMENTS:
             raise ValueError(f"element {element!r}: must be one of {', '.join(ELEMENTS)}")
-        if fluid is None and drained:
-            raise ValueError("drained sides need a fluid")
+        functions("terms", terms)
+        functions("sources", sources)
+        if fluid is None and (drained or sources):
+            raise ValueError("drained sides and sources need a fluid")
         if any(outlet.seepage for outlet in drained):
             raise ValueError("drained: seepage = True, must be False: the reference has no seepage faces")
         if fluid is not None and gravity is not None:
@@ -136,27 +152,24 @@ class BiotFEM:
                 "parameters of the law may be functions of place, the rest must be numbers"
             )
         self.grid, self.material, self.fluid = Grid(upper, cells, lower, comm), material, fluid
-        self.tolerance, self._t = tolerance, fem.Constant(self.grid.mesh, 0.0)
-        self._substeps = substeps(method, fluid is not None)
+        self.tolerance, self.t = tolerance, 0.0
+        """Largest residual; time, s."""
+        self._substeps = substeps(method, fluid is not None or bool(terms))  # terms may depend on the velocity
         self.scale = float(np.max(material.at(self.grid.midpoints).oedometric))
         """Unit of the pressure among the unknowns, Pa; both equations are divided by it."""
         self._space = Space(self.grid, fluid is not None, *ELEMENTS[element])
         self._bcs = self._conditions(fixed, drained if element == "taylor-hood" else ())
         start = time.perf_counter()
-        self._gravity = gravity
         self._plates = [(plate, self._area(plate)) for plate in plates]
         for load in tractions:
             if not callable(load.value):
                 self._traction(load, 0.0)
         tractions = [*tractions, *(plate.traction(area, self.grid.dim) for plate, area in self._plates)]
-        self._forms = self._compile(tractions, drained if element == "q1-dg0" else None)
+        outlets = drained if element == "q1-dg0" else None
+        with compiling(f"{type(material).__name__}, terms, sources", "UFL, terms linear in v or energies of u"):
+            self._forms = self._compile(tractions, outlets, gravity, terms, sources)
         self.jit = time.perf_counter() - start  # s, compiling or finding the forms
         self._snes = self._solver()
-
-    @property
-    def t(self) -> float:
-        """Time, s."""
-        return float(self._t.value)
 
     def _constant(self, value: ArrayLike) -> fem.Constant:
         return fem.Constant(self.grid.mesh, np.asarray(value, dtype=float))
@@ -211,55 +224,77 @@ class BiotFEM:
         degree = 2 * self._space.degree if condition.region is None else CUT_DEGREE
         return integrand * ufl.ds(domain=self.grid.mesh, metadata={"quadrature_degree": degree})
 
-    def _compile(self, tractions: Sequence[Traction | Pressure], outlets: Sequence[Drained] | None) -> Forms:
+    def _compile(
+        self, loads: Sequence, outlets: Sequence | None, gravity: Callable | None, terms: Sequence, sources: Sequence
+    ) -> Forms:
         """Compile loads, residual and tangent; with `outlets` the pressure is constant in the cells."""
-        dt, weight = self._constant(1.0), self._constant(np.zeros(self.grid.dim))
-        zero = {Traction: np.zeros(self.grid.dim), Pressure: 0.0}
-        given = [(load, self._constant(zero[type(load)])) for load in tractions]
-        law, split = self.material, ufl.split if self.fluid else lambda f: (f, 0)
-        (u, p), (u_n, p_n), (v, q) = map(split, (self._space.w, self._space.old, ufl.TestFunction(self._space.W)))
-        dx = ufl.dx(domain=self.grid.mesh, metadata={"quadrature_degree": 2 * self._space.degree})
+        dt, since, t = (self._constant(1.0) for _ in range(3))
+        law, space, split = self.material, self._space, ufl.split if self.fluid else lambda f: (f, 0)
+        test = ufl.TestFunction(space.W)
+        (u, p), (u_n, p_n), (past, _), (v, q) = map(split, (space.w, space.old, space.past, test))
+        degree, scale = 2 * space.degree, self._constant(self.scale)
+        dx = ufl.dx(domain=self.grid.mesh, metadata={"quadrature_degree": degree})
         F, F_n = (ufl.variable(ufl.Identity(self.grid.dim) + ufl.grad(f)) for f in (u, u_n))
-        J, J_n, alpha = ufl.det(F), ufl.det(F_n), self._constant(law.biot)
+        J, J_n = ufl.det(F), ufl.det(F_n)
         parameters = {name: self._field(getattr(law, name)) for name in law.parameters}
-        P = law.first_piola(F, parameters) / self._constant(self.scale) - alpha * p * ufl.diff(J, F)
+        P = law.first_piola(F, parameters) / scale - self._constant(law.biot) * p * ufl.diff(J, F)
         residual, flux = ufl.inner(P, ufl.grad(v)) * dx, None
+        points = SimpleNamespace(  # the configuration at the start of the step
+            dx=PointMeasure(self.grid.mesh, J_n, "everywhere", degree),
+            value=lambda f: f,
+            grad=lambda f: ufl.dot(ufl.grad(f), ufl.inv(F_n)),
+            F=F_n,
+            displacement=u_n,
+            position=ufl.SpatialCoordinate(self.grid.mesh) + u_n,
+            **parameters,
+        )
+        seen = {"points": points, "t": t}
+        for term in terms:
+            more = {"u": u - u_n, "v": v, "dt": since, "velocity": (u - u_n - past) / dt}
+            residual += 1 / scale * term_of(term, space.w, test, **seen, **more)[0]
         if self.fluid:
-            # S is linear in the porosity, and its constants stay finite where a bulk modulus is infinite
-            S_0, S_1 = (self.scale * law.storage(self.fluid.bulk, n) for n in (0.0, 1.0))
-            n, n_n = (1 - self._constant(1 - law.porosity) / volume for volume in (J, J_n))
-            a, S = self._constant(S_1), self._constant(S_0) + self._constant(S_1 - S_0) * n_n
-            residual += J_n * change_of_content(alpha, a, S, J / J_n, p - p_n) * q * dx
-            k = self._field(law.conductivity)
-            if law.conductivity_law is not None:
-                porosity = {"porosity": n, "porosity0": self._constant(law.porosity)}
-                x = ufl.SpatialCoordinate(self.grid.mesh) + u
-                k = call(law.conductivity_law, conductivity=k, F=F, J=J, x=x, **porosity)
-            kappa = dt * self._constant(self.scale / self.fluid.unit_weight) * k
-            pull = ufl.inv(F).T
-            if outlets is None:
-                flux = kappa * J * ufl.inner(pull * ufl.grad(p), pull * ufl.grad(q)) * dx
-            else:
-                flux = self._two_point(kappa, J, pull, p, q, outlets)
-            residual += flux
-            flux = _compat.compiled(flux) if len(self._substeps) > 1 else None
+            content, flux = self._storage(F, u, J_n, p, p_n, q, dt, outlets)
+            flux -= sum(dt * form_of("sources", source, **seen, q=q, p=scale * p) for source in sources)
+            residual += content * dx + flux
+            flux = _compat.compiled(flux)
         for plate, area in self._plates:
-            axis = side(plate.side, self.grid.dim)[0]
-            slope = [ufl.as_vector([f[axis].dx(a) for a in range(self.grid.dim) if a != axis]) for f in (u, v)]
-            residual += self._on(
-                plate, self._constant(RIGIDITY * area ** (1 / (self.grid.dim - 1))) * ufl.inner(*slope)
-            )
-        along = ufl.diff(J, F) * ufl.FacetNormal(self.grid.mesh)
-        for load, value in given:
+            axis, d = side(plate.side, self.grid.dim)[0], self.grid.dim
+            slope = [ufl.as_vector([f[axis].dx(a) for a in range(d) if a != axis]) for f in (u, v)]
+            residual += self._on(plate, self._constant(RIGIDITY * area ** (1 / (d - 1))) * ufl.inner(*slope))
+        given, dead = [], []
+        for load in loads:
+            value = self._constant(0.0 if isinstance(load, Pressure) else np.zeros(self.grid.dim))
+            given.append((partial(self._traction, load), value))
             if isinstance(load, Pressure):
-                residual += self._on(load, value / self._constant(self.scale) * ufl.inner(along, v))
-        tangent = ufl.derivative(residual, self._space.w, ufl.TrialFunction(self._space.W))
-        dead = [(load, t) for load, t in given if isinstance(load, Traction)]
-        loads = [self._on(load, ufl.inner(t, v) / self._constant(self.scale)) for load, t in dead]
-        if self._gravity is not None:
-            loads.append(ufl.inner(weight, v) / self._constant(self.scale) * dx)
-        load = _compat.compiled(sum(loads)) if loads else None
-        return Forms(_compat.compiled(residual), _compat.compiled(tangent), flux, load, dt, given, weight)
+                along = ufl.diff(J, F) * ufl.FacetNormal(self.grid.mesh)
+                residual += self._on(load, value / scale * ufl.inner(along, v))
+            else:
+                dead.append(self._on(load, ufl.inner(value, v) / scale))
+        if gravity is not None:
+            given.append((partial(self._weight, gravity), weight := self._constant(np.zeros(self.grid.dim))))
+            dead.append(ufl.inner(weight, v) / scale * dx)
+        tangent = ufl.derivative(residual, space.w, ufl.TrialFunction(space.W))
+        load = _compat.compiled(sum(dead)) if dead else None
+        return Forms(_compat.compiled(residual), _compat.compiled(tangent), flux, load, dt, since, t, given)
+
+    def _storage(self, F, u, J_n, p, p_n, q, dt: fem.Constant, outlets: Sequence[Drained] | None):
+        """Return the change of the content, weighted by q, and the flux in a time dt, s, as UFL."""
+        law, J = self.material, ufl.det(F)
+        # S is linear in the porosity, and its constants stay finite where a bulk modulus is infinite
+        S_0, S_1 = (self.scale * law.storage(self.fluid.bulk, n) for n in (0.0, 1.0))
+        n, n_n = (1 - self._constant(1 - law.porosity) / volume for volume in (J, J_n))
+        a, S = self._constant(S_1), self._constant(S_0) + self._constant(S_1 - S_0) * n_n
+        content = J_n * change_of_content(self._constant(law.biot), a, S, J / J_n, p - p_n) * q
+        k = self._field(law.conductivity)
+        if law.conductivity_law is not None:
+            porosity = {"porosity": n, "porosity0": self._constant(law.porosity)}
+            x = ufl.SpatialCoordinate(self.grid.mesh) + u
+            k = call(law.conductivity_law, conductivity=k, F=F, J=J, x=x, **porosity)
+        kappa, pull = dt * self._constant(self.scale / self.fluid.unit_weight) * k, ufl.inv(F).T
+        if outlets is not None:
+            return content, self._two_point(kappa, J, pull, p, q, outlets)
+        dx = ufl.dx(domain=self.grid.mesh, metadata={"quadrature_degree": 2 * self._space.degree})
+        return content, kappa * J * ufl.inner(pull * ufl.grad(p), pull * ufl.grad(q)) * dx
 
     def _two_point(self, kappa, J, pull, p, q, outlets: Sequence[Drained]):
         """Return the two-point flux between cells and to drained sides, half a cell away, as UFL."""
@@ -324,30 +359,29 @@ class BiotFEM:
             took, residual = self._solve(substep, dt)
             newton, worst = newton + took, max(worst, residual)
         self._space.old.x.array[:] = self._space.w.x.array
-        self._t.value += dt
+        self.t += dt
         return newton, worst
 
-    def _load(self, t: float) -> float:
-        """Assemble the loads at time t (s); return their norm."""
-        for traction, constant in self._forms.tractions:
-            constant.value = self._traction(traction, t)
-        if self._gravity is not None:
-            density = (1 - self.material.porosity) * self.material.grain_density
-            d = self.grid.dim
-            g = numbers("gravity", self._gravity(t), (d,), allowed=f"{d} finite numbers")
-            self._forms.weight.value = density * g
-        self._space.f.x.array[:] = 0.0
-        if self._forms.load is not None:
-            self._assemble(self._space.f, self._forms.load)
-        return _compat.petsc_vec(self._space.f).norm()
+    def _weight(self, gravity: Callable[[float], ArrayLike], t: float) -> NDArray[np.float64]:
+        """Return the weight (d,), N/m^3, at time t, s."""
+        d, density = self.grid.dim, (1 - self.material.porosity) * self.material.grain_density
+        return density * numbers("gravity", gravity(t), (d,), allowed=f"{d} finite numbers")
 
     def _solve(self, substep: Substep, dt: float) -> tuple[int, float]:
         """Solve for the end of a substep of a step dt, s; return Newton iterations, relative residual."""
-        load, snes = self._load(self.t + substep.end * dt), self._snes
-        if substep.before:
-            self._forms.dt.value = substep.before * dt
-            _compat.petsc_vec(self._space.f).axpy(-1.0, self._assemble(self._space.b, self._forms.flux))
-        self._forms.dt.value = substep.own * dt
+        forms, space, snes = self._forms, self._space, self._snes
+        space.past.x.array[:] = substep.before / substep.own * (space.w.x.array - space.old.x.array)
+        space.f.x.array[:] = 0.0
+        if substep.before and forms.flux is not None:  # by the rate at the end of the substep before
+            forms.dt.value = substep.before * dt
+            self._assemble(space.f, forms.flux).scale(-1.0)
+        forms.dt.value, forms.since.value, forms.t.value = substep.own * dt, substep.end * dt, self.t + substep.end * dt
+        for value, constant in forms.given:
+            constant.value = value(self.t + substep.end * dt)
+        load = 0.0
+        if forms.load is not None:
+            load = self._assemble(space.b, forms.load).norm()
+            space.f.x.array[:] += space.b.x.array
         x = _compat.petsc_vec(self._space.w).copy()
         petsc.set_bc(x, self._bcs)
         round_off = 1e-14 * self.grid.cell_volume / self.grid.h.min() * np.sqrt(x.getSize())
@@ -411,29 +445,25 @@ class BiotFEM:
 
     def displacement(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the displacements (m, d), m, at reference positions x (m, d) in the body, on every process."""
-        grid, out = self.grid, np.zeros(x.shape)
+        return self._at(self._space.u, x, self.grid.dim)
+
+    def pressure(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the pore pressures (m,), Pa, at reference positions x (m, d) in the body, on every process."""
+        return self.scale * self._at(self._space.p, x, 1)[:, 0]
+
+    def _at(self, f: fem.Function, x: NDArray[np.float64], size: int) -> NDArray[np.float64]:
+        """Return a function's values (m, size) at reference positions x (m, d) in the body, on every process."""
+        grid, out = self.grid, np.zeros((len(x), size))
         cells = grid.local(grid.number(grid.index(x)))
         here = np.flatnonzero((cells >= 0) & (cells < grid.num_owned))
         if len(here):
-            out[here] = self._space.u.eval(np.pad(x[here], ((0, 0), (0, 3 - grid.dim))), cells[here]).reshape(
-                -1, grid.dim
-            )
+            out[here] = f.eval(np.pad(x[here], ((0, 0), (0, 3 - grid.dim))), cells[here]).reshape(-1, size)
         return grid.comm.allreduce(out)
 
-    def _row(self, x: NDArray[np.float64]) -> tuple:
+    def _row(self, x: NDArray[np.float64]) -> Row:
         """Return what the histories hold of the present state."""
         pressure = None
         if self.fluid:
             p, comm = self.scale * self._space.w.x.array[self._space.p_dofs], self.grid.comm
             pressure = (comm.allreduce(p.min(), op=MPI.MIN), comm.allreduce(p.max(), op=MPI.MAX))
-        return self.t, self.displacement(x), pressure
-
-
-def euler_bernoulli(x: ArrayLike, load: float, length: float, modulus: float, second_moment: float) -> NDArray:
-    """Return the deflection (n,), m, of a cantilever under a uniform load, at distances x (n,) from the clamp, m.
-
-    w x^2 (6 L^2 - 4 L x + x^2) / (24 E I): load w, N/m, of any sign, and with values > 0 length L, m, Young's modulus
-    E, Pa, second moment of area I, m^4.
-    """
-    x = np.asarray(x, dtype=float)
-    return load * x**2 * (6 * length**2 - 4 * length * x + x**2) / (24 * modulus * second_moment)
+        return Row(self.t, self.displacement(x), pressure)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Exact solutions that results can be compared with: consolidation, columns and rods.  No dolfinx.
+"""Exact solutions that results can be compared with: consolidation, columns, beams and rods.  No dolfinx.
 
 Stress is positive in tension, pore pressure in compression, as in the rest of the package.  Times are
 reduced to T = c_v t / length².  The series of exponentials converges slowly for small T; below `SWITCH`
@@ -347,3 +347,13 @@ def _rod(loads: Array, axial: float, shear: float):
             raise RuntimeError(f"rod under {part:.3g} of its load: {solution.message}")
         s, state = solution.x, solution.y
     return solution.sol
+
+
+def euler_bernoulli(x: ArrayLike, load: float, length: float, modulus: float, second_moment: float) -> NDArray:
+    """Return the deflection (n,), m, of a cantilever under a uniform load, at distances x (n,) from the clamp, m.
+
+    w x^2 (6 L^2 - 4 L x + x^2) / (24 E I): load w, N/m, of any sign, and with values > 0 length L, m, Young's modulus
+    E, Pa, second moment of area I, m^4.
+    """
+    x = np.asarray(x, dtype=float)
+    return load * x**2 * (6 * length**2 - 4 * length * x + x**2) / (24 * modulus * second_moment)
