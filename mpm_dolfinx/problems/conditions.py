@@ -2,7 +2,8 @@
 """Conditions on the sides of the bodies: tractions, pressures, displacements, plates, drained sides, prescribed inflow.
 
 A side is named "left", "right", "bottom" or "top", in 3D also "front" (lower y) and "back" (upper y), by where it is
-in the seeded body, before a map; it moves with the body.  What of it lies on another body, as seeded, does not count.
+in the seeded body, before a map; sides of a mesh as it names them (`from_mesh`).  It moves with the body.  What of it
+lies on another body, as seeded, does not count.
 Regions and X are reference positions, before all maps (`mapped`); areas are those as seeded, after them.
 
 What is wrong with a condition is said, with a ValueError, when a scene or a stage is made with it, of functions of time
@@ -18,8 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mpm_dolfinx.points.faces import Region
-from mpm_dolfinx.points.grid import side
+from mpm_dolfinx.points.faces import Region, Surface
 from mpm_dolfinx.validation import asked, line, numbers
 
 
@@ -30,7 +30,8 @@ class Traction:
     Parameters
     ----------
     side
-        Side of the bodies: "left", "right", "bottom", "top", in 3D also "front" (lower y) and "back" (upper y).
+        Side of the bodies: "left", "right", "bottom", "top", in 3D also "front" (lower y) and "back" (upper y); of
+        bodies from meshes as these name it.  Where several bodies have one of this name it is all of them.
     value : (d,) or number, or callable t (s) -> (d,) or number, Pa
         Force per reference area; a number acts along the outward normal at the start of the step, negative: presses.
         Several tractions on one face add up.
@@ -234,11 +235,11 @@ class RigidPlate:
         if not callable(self.force):
             numbers("RigidPlate: force", self.force)
 
-    def traction(self, area: float, dim: int) -> Traction:
-        """Return the even traction of the plate on its reference area, m^(d-1)."""
-        axis, end = side(self.side, dim)
-        inward = np.zeros(dim)
-        inward[axis] = 1 - 2 * end
+    def traction(self, faces: Surface) -> Traction:
+        """Return the even traction of the plate on the reference area of its faces."""
+        (axis, sign), area = facing(faces), faces.area0.sum()
+        inward = np.zeros(faces.outward.shape[1])
+        inward[axis] = -sign
 
         def even(t: float) -> NDArray[np.float64]:
             name = f"{line(self)}: force at t = {t:g} s"
@@ -246,3 +247,10 @@ class RigidPlate:
             return inward * numbers(name, force) / area
 
         return Traction(self.side, even, self.region)
+
+
+def facing(faces: Surface) -> tuple[int, int]:
+    """Return along which axis faces look, as seeded, and with which sign."""
+    outward = faces.outward.sum(axis=0)
+    axis = int(np.abs(outward).argmax())
+    return axis, int(np.sign(outward[axis]))

@@ -23,7 +23,7 @@ from mpm_dolfinx.points.faces import Surface, face_vectors
 from mpm_dolfinx.points.grid import sum_by
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.problems.closed import closed
-from mpm_dolfinx.problems.conditions import RIGIDITY, Displacement, Pressure, RigidPlate, Traction
+from mpm_dolfinx.problems.conditions import RIGIDITY, Displacement, Pressure, RigidPlate, Traction, facing
 from mpm_dolfinx.problems.held_cells import SAME, HeldCells, HeldPoints
 from mpm_dolfinx.problems.side_forms import SideData, SideForms
 from mpm_dolfinx.problems.sides import Sides, check_apart, gathered, meeting
@@ -64,7 +64,7 @@ class MechanicalBoundary:
         self.plates = [(plate, sides.of(plate)) for plate in plates]
         self.pressures = [(load, sides.of(load)) for load in tractions if isinstance(load, Pressure)]
         tractions = [load for load in tractions if not isinstance(load, Pressure)]
-        tractions += [plate.traction(faces.area0.sum(), d) for plate, faces in self.plates]
+        tractions += [plate.traction(faces) for plate, faces in self.plates]
         self.loads = [(load, sides.of(load)) for load in tractions]
         self.holds = [(hold, sides.of(hold), hold.axes(d)) for hold in displacements]
         self._meeting: list[tuple[Displacement, Displacement, list[int], NDArray[np.float64]]] = []
@@ -124,8 +124,9 @@ class MechanicalBoundary:
             area = patches.area(points)
             length = faces.area0.sum() ** (1 / (d - 1))
             rigidity = RIGIDITY * self._materials.stiffest * length * np.linalg.norm(area, axis=1, keepdims=True)
-            normal = np.tile(np.eye(d)[faces.axis], (len(area), 1))
-            tilt = normal - area / area[:, [faces.axis]]  # slope of the face: its normal is (-slope, 1)
+            axis = facing(faces)[0]
+            normal = np.tile(np.eye(d)[axis], (len(area), 1))
+            tilt = normal - area / area[:, [axis]]  # slope of the face: its normal is (-slope, 1)
             rows.append((patches.cell, patches.x, np.concatenate([rigidity, normal, tilt], axis=1)))
         cell, x, values = gathered(self.grid, rows, 1 + 2 * d)
         rigidity, normal, tilt = np.split(values, [1, 1 + d], axis=1)
@@ -224,10 +225,13 @@ class MechanicalBoundary:
         index = np.arange(2**self.grid.dim)
         for _, faces, _ in self.holds:
             held = np.flatnonzero(np.isin(ids, faces.id))
-            outward = face_vectors(tracked[held], faces.axis, faces.end)
+            number = faces.face[np.searchsorted(faces.id, ids[held])]  # of a domain with two held faces the first
+            axis, end = (k[:, None] for k in np.divmod(number, 2))
+            outward = face_vectors(tracked[held], number)
             depth = volume[held, None] * outward / (outward**2).sum(axis=1, keepdims=True)
-            face = index ^ ((index >> faces.axis & 1 ^ faces.end) << faces.axis)  # of each corner: that on the face
-            corners[held] = tracked[held][:, face] - np.where((face != index)[:, None], depth[:, None], 0.0)
+            face = index ^ ((index >> axis & 1 ^ end) << axis)  # of each corner: that on the face
+            there = np.take_along_axis(tracked[held], face[:, :, None], axis=1)
+            corners[held] = there - np.where((face != index)[:, :, None], depth[:, None], 0.0)
         return corners
 
 
@@ -242,8 +246,9 @@ def _force(load: Traction, t: float, patches: Patches, points: MaterialPoints) -
 
 def _check_flat(plate: RigidPlate, faces: Surface) -> None:
     """Refuse a plate on faces that are not one flat, connected side as seeded: each part would move by itself."""
-    corners, tangential = faces.places(), np.arange(faces.X.shape[2]) != faces.axis
-    low, high, height = corners.min(axis=1)[:, tangential], corners.max(axis=1)[:, tangential], corners[..., faces.axis]
+    corners, axis = faces.places(), facing(faces)[0]
+    tangential = np.arange(corners.shape[2]) != axis
+    low, high, height = corners.min(axis=1)[:, tangential], corners.max(axis=1)[:, tangential], corners[..., axis]
     X, extent = (low + high) / 2, high - low
     size = extent.max(axis=0)
     apart = np.flatnonzero(np.abs(height - height[0, 0]).max(axis=1) > 1e-6 * size.min())

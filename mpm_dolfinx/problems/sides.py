@@ -53,14 +53,14 @@ def gathered(grid: Grid, rows: Sequence[tuple], width: int) -> tuple[NDArray, ND
 
 def check_apart(one, faces: Surface, other, others: Surface) -> None:
     """Refuse two conditions, of a kind that excludes the other, on the same part of a face."""
-    if (faces.axis, faces.end) != (others.axis, others.end):
-        return
     first, stop = (np.searchsorted(others.id, faces.id, end) for end in ("left", "right"))
-    a = np.repeat(np.arange(len(faces)), stop - first)  # all pairs of parts of one face
+    a = np.repeat(np.arange(len(faces)), stop - first)  # all pairs of parts of one domain's faces
     b = np.arange(len(a)) - np.repeat(np.cumsum(stop - first) - stop, stop - first)
+    same = faces.face[a] == others.face[b]
+    a, b = a[same], b[same]
     low, high = np.maximum(faces.X[a, 0], others.X[b, 0]), np.minimum(faces.X[a, 1], others.X[b, 1])
-    common = high - low > 1e-9 * (faces.X[a, 1] - faces.X[a, 0])
-    common[:, faces.axis] = True
+    size = faces.X[a, 1] - faces.X[a, 0]
+    common = (high - low > 1e-9 * size) | (size <= 1e-9 * size.max(axis=1, keepdims=True))  # they lie across this axis
     both = np.flatnonzero(common.all(axis=1))
     if len(both):
         x = (low[both[0]] + high[both[0]]) / 2
@@ -76,12 +76,12 @@ def meeting(bodies: Sequence[Body], one: Surface, other: Surface) -> NDArray[np.
     def corners(faces: Surface) -> NDArray[np.float64]:
         body = np.searchsorted(np.cumsum([len(b) for b in bodies]), faces.id, side="right")
         moved = np.array([i if b.map is not None else -1 for i, b in enumerate(bodies)])[body]
-        X = faces.reference_corners()
+        X = faces.corners
         return np.concatenate([X, np.broadcast_to(moved[:, None, None], (*X.shape[:2], 1))], axis=2).reshape(
             -1, dim + 1
         )
 
-    dim = bodies[0].lower.shape[1]
+    dim = bodies[0].dim
     x, near = corners(other), 1e-9 * min(b.spacing.min() for b in bodies) + rounding(one.X)
     distance, _ = cKDTree(corners(one)).query(x, distance_upper_bound=near)
     return x[distance <= near, :dim]
