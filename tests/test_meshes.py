@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Bodies from meshes: cells are the points' domains, facets the sides."""
 
+import signal
+
 from mpi4py import MPI
 
 import dolfinx.mesh
@@ -270,6 +272,19 @@ BAD = {
     ),
     "names that are no numbers": (lambda: mpm.from_mesh(GRID, BOX, names={"top": "3"}), "mesh: names", "'3'"),
     "tags of meshio": (lambda: mpm.from_mesh(GRID, BOX, facet_tags=1), "mesh: ", "dolfinx"),
+    "an edge without a name": (lambda: outlined(sides=["a"] * 3), "polygon: sides", "4 edges"),
+    "a polygon that crosses itself": (
+        lambda: outlined([(0, 0), (1, 1), (1, 0), (0, 1)]),
+        "polygon: the edges",
+        "[[0.0, 0.0], [1.0, 1.0]]",
+    ),
+    "a hole outside": (
+        lambda: outlined([(0, 0), (1, 0), (1, 1), (0, 1)], holes={"a": [(1.2, 0), (1.4, 0), (1.3, 1)]}),
+        "polygon: the hole",
+        "[1.2 0. ]",
+    ),
+    "a polygon of two corners": (lambda: outlined([(0, 0), (1, 1)]), "polygon: corners", "(2, 2)"),
+    "triangles of no size": (lambda: outlined(size=0.0), "polygon: size", "0.0"),
     "points a cell": (lambda: mpm.from_mesh(GRID, BOX, per_cell=0), "body: per_cell", "0"),
 }
 
@@ -277,6 +292,36 @@ BAD = {
 @pytest.mark.parametrize(("make", "name", "value"), BAD.values(), ids=BAD)
 def test_a_bad_mesh_is_refused_in_one_line(make, name, value, tmp_path):
     refused_in_one_line(make, name, value, tmp_path, 400)
+
+
+def outlined(corners=((0, 0), (2, 0), (1, 1), (0, 1)), sides=("base", "slope", "crest", ""), **options):
+    pytest.importorskip("gmsh")
+    return mpm.polygon(GRID, corners, sides, **options)
+
+
+def test_a_polygon_has_the_names_of_its_edges_and_lies_on_others():
+    hears = signal.getsignal(signal.SIGINT)
+    slope, ground = outlined(np.add([(0, 0), (2, 0), (1, 1), (0, 1)], (0, 0.5))), mpm.box(GRID, [0, 0], [2, 0.5])
+    assert signal.getsignal(signal.SIGINT) is hears, "gmsh takes Ctrl-C to itself"
+    assert volumes(slope.corners()).sum() == pytest.approx(1.5) and set(slope.names) == {"base", "slope", "crest"}
+    areas = {name: surface([slope, ground], name).area0.sum() for name in ("base", "slope", "crest", "top")}
+    assert areas == pytest.approx({"base": 0, "slope": np.sqrt(2), "crest": 1, "top": 0}, abs=1e-9)
+    size = np.sqrt(volumes(slope.corners()) / GRID.cell_volume)
+    assert 0.38 < size.mean() < 0.6, "two points a cell and direction"
+
+
+def test_holes_are_sides_and_other_gmsh_models_stay():
+    gmsh = pytest.importorskip("gmsh")
+    angle = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    ring = np.stack([1 + 0.3 * np.cos(angle), 0.6 + 0.3 * np.sin(angle)], axis=1)
+    gmsh.initialize()
+    gmsh.model.add("own")
+    body = outlined([(0, 0), (2, 0), (2, 1.2), (0, 1.2)], "wall", holes={"lining": ring}, size=0.1)
+    assert gmsh.model.getCurrent() == "own"
+    lining = surface([body], "lining")
+    assert lining.area0.sum() == pytest.approx(24 * 0.6 * np.sin(np.pi / 24))
+    assert np.einsum("md,md->m", lining.outward, lining.places().mean(axis=1) - (1, 0.6)).max() < 0
+    gmsh.finalize()
 
 
 def test_domains_that_are_far_too_small_are_named(caplog):
