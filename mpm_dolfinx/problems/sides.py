@@ -3,16 +3,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from mpm_dolfinx.parallel.exchange import Exchange
+from mpm_dolfinx.parallel.exchange import Exchange, first
 from mpm_dolfinx.points.bodies import Body
+from mpm_dolfinx.points.cut_domains import Patches
 from mpm_dolfinx.points.faces import Surface, limits, surface
 from mpm_dolfinx.points.grid import Grid, rounding
+from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.problems.conditions import Places
 from mpm_dolfinx.validation import line
 
 
@@ -40,6 +43,23 @@ class Sides:
             where = " in the region" if condition.region is not None else ""
             raise ValueError(f"{line(condition)}: no point has this side{where}, must be one of a body")
         return self._found[key]
+
+
+def everywhere(grid: Grid, ask: Callable[[], NDArray[np.float64]]) -> NDArray[np.float64]:
+    """Return what functions of the user's give on this process; raise on all what is raised on one."""
+    message, value = "", None
+    try:
+        value = ask()
+    except ValueError as error:
+        message = str(error)
+    if message := first(grid.comm, message):
+        raise ValueError(message)
+    return value
+
+
+def on_side(patches: Patches, points: MaterialPoints) -> Places:
+    """Return what gives the places at which functions of the user's are asked on a side."""
+    return lambda name: patches.X if name == "X" else patches.now(points)
 
 
 def gathered(grid: Grid, rows: Sequence[tuple], width: int) -> tuple[NDArray, NDArray, NDArray]:
