@@ -38,7 +38,9 @@ has_dolfinx_of_its_own() {
 use_python_as_is() {
     local module missing=()
     for module in "${modules[@]}"; do
-        python3 -c "import $module" >/dev/null 2>&1 || missing+=("${module/#dolfinx/fenics-dolfinx}")
+        python3 -c "import $module" >/dev/null 2>&1 && continue
+        case $module in dolfinx) module=fenics-dolfinx ;; gmsh) module=python-gmsh ;; esac
+        missing+=("$module")
     done
     if [ ${#missing[@]} -gt 0 ]; then
         say "Missing in python3: ${missing[*]}. Where there is no apt-get, install them first, for instance by"

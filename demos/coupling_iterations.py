@@ -131,7 +131,7 @@ def linearise(s: mpm.Simulation, dt: float) -> System:
     start = step.set_up(s.scene, s.state, RAMP_STEP)
     momentum, _ = balances(s.scene, start, start.acting[-1])
     matrices, pieces, contents = start.matrices, start.data.pieces, start.on_grid.contents
-    flow = matrices.flow(start.state, None, start.data)
+    flow = matrices.flow(start.state, None, start.data, start.acting[-1].t)
     storage = StorageProblem(s.scene.storage, matrices.storage, pieces, contents, flow, dt)
     momentum.assemble_residual()
     storage.assemble_residual()

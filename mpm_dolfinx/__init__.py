@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Implicit, iteratively coupled material point / finite volume poromechanics on FEniCSx.
 
-A scene is a `Simulation` of a `Grid`, bodies (`box`, `shape`, `mapped`), materials (`Hencky`, `NeoHookean`,
-`LinearElastic`, `DruckerPrager`, or your own `Skeleton`), a `Fluid` and conditions on the sides of the bodies
-(`Traction`, `Pressure`, `Displacement`, `RigidPlate`, `Drained`, `Inflow`).  Its `run` gives a `Result` with the
+A scene is a `Simulation` of a `Grid`, bodies (`box`, `shape`, `mapped`, `from_mesh`, `polygon`), materials (`Hencky`,
+`NeoHookean`, `LinearElastic`, `DruckerPrager`, or your own `Skeleton`), a `Fluid` and conditions on the sides of the
+bodies (`Traction`, `Pressure`, `Displacement`, `RigidPlate`, `Drained`, `Inflow`).  Its `run` gives a `Result` with the
 displacements of `probes`, and feeds a `Writer` and a `Checkpoint`, from which `resume` goes on; `stage` changes the
 scene between two runs.  Terms and sources in UFL: see `mpm_dolfinx.extend`.
 
@@ -28,6 +28,8 @@ from mpm_dolfinx.io.checkpoint import Checkpoint, resume
 from mpm_dolfinx.io.writer import Writer
 from mpm_dolfinx.points.bodies import box, mapped, shape
 from mpm_dolfinx.points.grid import Grid
+from mpm_dolfinx.points.mesh_files import from_mesh
+from mpm_dolfinx.points.polygon import polygon
 from mpm_dolfinx.points.probes import probes
 from mpm_dolfinx.problems.conditions import Displacement, Drained, Inflow, Pressure, RigidPlate, Traction
 from mpm_dolfinx.result import Result
@@ -62,8 +64,10 @@ __all__ = [
     "Traction",
     "Writer",
     "box",
+    "from_mesh",
     "kozeny_carman",
     "mapped",
+    "polygon",
     "probes",
     "resume",
     "shape",

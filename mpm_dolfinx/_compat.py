@@ -105,6 +105,17 @@ def num_cells(msh: mesh.Mesh) -> tuple[int, int]:
     return index_map.size_local, index_map.size_local + index_map.num_ghosts
 
 
+def cell_kind(msh: mesh.Mesh) -> str:
+    """Return the name of the mesh's kind of cell, such as "tetrahedron"."""
+    return msh.topology.cell_name()
+
+
+def geometry_dofs(msh: mesh.Mesh) -> NDArray[np.int32]:
+    """Return the nodes of the cells, ghosts included, (cells, n)."""
+    dofs = msh.geometry.dofmap
+    return dofs.array.reshape(len(dofs), -1) if OLD else np.asarray(dofs)
+
+
 def scatter_reverse_add(u: fem.Function) -> None:
     """Add the values at ghosts to those of their owners."""
     u.x.scatter_reverse(la.ScatterMode.add if OLD else la.InsertMode.add)

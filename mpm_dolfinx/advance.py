@@ -96,7 +96,7 @@ class Motion:
                 N, at_nodes = grid.shape_values(pieces.cells, pieces.x), nodal[grid.cell_nodes[pieces.cells]]
                 x = (state.stay.x if state.stay else cut.pieces.x) + cut.to_pieces(np.einsum("mk,mkd->md", N, at_nodes))
                 start = state.stay.start if state.stay else cut.to_pieces(self._storage.p_n.x.array[pieces.cells])
-                own = on_grid.pressures_up_to_surface(self._reconstruction, state.stage)
+                own = on_grid.pressures_up_to_surface(self._reconstruction, state.stage, t)
                 points, ids = replace(points, pressure=cut.mean(own)), points.id[cut.pieces.point]
             _check_inside(cut, points, t)
         new = replace(state, t=t, points=points, transported=None, stay=Stay(cut.points, ids, pressure, x, start))
@@ -176,7 +176,7 @@ class Motion:
                 store = self._materials.storage(points, self._fluid) * points.volume0 * points.J
                 on_grid.set_pressures(stay.pressure)
                 pressure, slope, bounds = on_grid.pressures_at_pieces(
-                    self._reconstruction, pieces.fraction * store[pieces.point], state.stage
+                    self._reconstruction, pieces.fraction * store[pieces.point], state.stage, state.t
                 )
                 transported = PiecePressures(stay.id, pieces.cell, pieces.fraction, pressure, stay.x, slope, bounds)
         return replace(state, transported=transported, stay=None)

@@ -22,6 +22,7 @@ from mpm_dolfinx.constitutive.skeleton import Fluid, Skeleton
 from mpm_dolfinx.constitutive.user_functions import compiling
 from mpm_dolfinx.points.bodies import Body, material_points
 from mpm_dolfinx.points.cut_domains import CutDomains
+from mpm_dolfinx.points.cutting import volumes
 from mpm_dolfinx.points.grid import Grid
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.problems.momentum import MomentumForms
@@ -150,7 +151,7 @@ class Scene:
         out["quadrature"] = self.quadrature
         for i, body in enumerate(self.bodies):
             out[f"points of body {i}"], out[f"material of body {i}"] = len(body), int(body.material)
-            out[f"volume of body {i}"] = float(np.broadcast_to(body.spacing, body.lower.shape).prod(axis=1).sum())
+            out[f"volume of body {i}"] = float(np.abs(volumes(body.reference())).sum())
             corners = np.ascontiguousarray(body.corners())
             out[f"checksum of the positions of body {i}"] = zlib.crc32(corners.tobytes())
         materials = {f"material {i}": m for i, m in enumerate(self.materials.materials)}

@@ -84,6 +84,7 @@ cat /etc/resolv.conf >"$tree/etc/resolv.conf" 2>/dev/null || true
 within=(in_tree)
 in_tree dpkg --configure -a >&2 || true
 debian_install "${modules[@]/#/python3-}" python3-pytest python3-hypothesis
+debian_install python3-gmsh || say "No gmsh: its tests are skipped"
 in_tree apt-get clean
 exec 9>&-
 trap - EXIT

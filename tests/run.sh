@@ -10,5 +10,5 @@ cd "$root"
 if [ "${1-}" = --release ]; then
     exec bash tests/release.sh "${@:2}"
 fi
-setup pytest hypothesis
+setup pytest hypothesis gmsh
 exec "$python" -m pytest "$@" # of tests/, says pyproject.toml

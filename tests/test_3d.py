@@ -128,7 +128,7 @@ def test_a_bent_body_has_the_volume_and_the_surface_of_its_image():
         volume = material_points(grid, [body]).volume0.sum()
         faces = [surface([body], side) for side in ("right", "back", "top")]
         area = sum(f.area0.sum() for f in faces)
-        outward = sum(face_vectors(body.corners(f.id), f.axis, f.end).sum(axis=0) for f in faces)
+        outward = sum(face_vectors(body.corners(f.id), f.face).sum(axis=0) for f in faces)
         assert outward == pytest.approx(np.full(3, np.pi / 4), rel=2 / n**2)
         errors.append([1 - volume / (np.pi / 6), 1 - area / (np.pi / 2)])
     assert (np.abs(errors[1]) < [3e-3, 2e-3]).all()

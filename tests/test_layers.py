@@ -52,7 +52,7 @@ def outflow(simulation):
     """Return what flows out of the open sides at the end of the last step, m^d/s."""
     on_grid, matrices = simulation.scene.last
     state, unknowns = simulation.state, matrices.storage.unknowns
-    out = matrices.flow(state, None, on_grid.data_of(state))(False)
+    out = matrices.flow(state, None, on_grid.data_of(state), 0.0)(False)
     p = unknowns.gather(simulation.scene.storage.p.x.array, unknowns.vector()).array
     return (out.conductance * p - out.inflow).clip(min=0).sum()
 

@@ -70,7 +70,7 @@ def test_points_of_a_cell_keep_its_mean_pressure_and_pass_no_neighbour_nor_drain
     on_grid, scene = s.scene.on_grid(s.points), s.scene
     contents, pieces = on_grid.contents, on_grid.data.pieces
     scene.storage.p.x.array[:] = p = RANDOM.normal(size=s.grid.num_local) * 1e5
-    found = on_grid.pressures_up_to_surface(scene.motion._reconstruction, s.state.stage)
+    found = on_grid.pressures_up_to_surface(scene.motion._reconstruction, s.state.stage, s.t)
     assert contents.mean(on_grid.cut.pieces_to_cells(found)) == pytest.approx(p[contents.filled], abs=1e-7)
     assert np.abs(found - p[pieces.cells]).max() > 1e4
     assert found.min() > min(p[contents.filled].min(), 0) - 1e-6

@@ -149,7 +149,7 @@ def test_a_curved_interface_in_3d_between_other_lattices_is_no_surface():
         part = top.X[top.id < len(bodies[0]), :, :2]
         assert not ((part[:, 0] > 0.31) & (part[:, 1] < 0.89)).all(axis=1).any()
         sides = [body.corners(np.flatnonzero(body.sides[:, 2, 1 - k])) for k, body in enumerate(bodies)]
-        whole, under = (np.linalg.norm(face_vectors(c, 2, 1 - k), axis=1).sum() for k, c in enumerate(sides))
+        whole, under = (np.linalg.norm(face_vectors(c, 5 - k), axis=1).sum() for k, c in enumerate(sides))
         errors.append(top.area0[top.id < len(bodies[0])].sum() / (whole - under) - 1)
     assert abs(errors[1]) < 4e-4 and abs(errors[1] / errors[0]) < 0.6
 

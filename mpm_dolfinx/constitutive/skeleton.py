@@ -349,6 +349,7 @@ class Fluid:
     def __post_init__(self):
         _check(self, "bulk", lambda v: 0 < v, "> 0")
         _check(self, "density", lambda v: (0 < v) & (v < inf), "> 0 and finite")
+        object.__setattr__(self, "density", float(self.density))  # an integer times gravity is no form that compiles
 
     @property
     def unit_weight(self) -> float:

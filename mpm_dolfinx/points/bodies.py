@@ -5,12 +5,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mpm_dolfinx.points.cutting import corner_bits, volumes
-from mpm_dolfinx.points.grid import Grid
+from mpm_dolfinx.points.cutting import FACES, corner_bits, volumes
+from mpm_dolfinx.points.grid import SIDES, Grid
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.validation import asked, instance, numbers, whole
 
@@ -33,14 +34,72 @@ class Body:
         return len(self.lower)
 
     @property
+    def dim(self) -> int:
+        """Number d of coordinates."""
+        return self.lower.shape[1]
+
+    @property
     def centre(self) -> NDArray[np.float64]:
-        """Centres of the boxes (n, d), m."""
+        """Reference positions (n, d), m, of the centres of the domains."""
         return self.lower + 0.5 * self.spacing
+
+    @property
+    def aligned(self) -> bool:
+        """Whether the domains are boxes along the axes."""
+        return self.map is None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the sides."""
+        return tuple(SIDES[self.dim])
+
+    def named(self, name: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the domains (m,) that have a face on a side, ascending, and the numbers (m,) of these faces."""
+        return self.facing(*SIDES[self.dim][name]) if name in self.names else (np.empty(0, np.int64),) * 2
+
+    def facing(self, axis: int, end: int, least: float = 0.0) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the domains (m,) with a face on the surface that looks towards an end of an axis, and its numbers.
+
+        Of unstructured bodies, whose normal has its largest component there, and not below `least`.
+        """
+        row = np.flatnonzero(self.sides[:, axis, end])
+        return row, np.full(len(row), 2 * axis + end)
+
+    def across(self, axis: int) -> tuple[float, float]:
+        """Return how many domains the body has across an axis, and their edge, m; means."""
+        return len(self) / max(1, int(self.sides[:, axis, 0].sum())), float(self.spacing[axis])
+
+    def outer(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the domains (m,) and numbers (m,) of all faces on the surface, by their numbers."""
+        face, row = np.nonzero(self.sides.reshape(len(self), 2 * self.dim).T)
+        return row, face
+
+    def reference(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
+        """Return the reference positions (m, 2^d, d), m, of the corners of domains: those before the map."""
+        lower = self.lower[chosen]
+        return lower[:, None] + corner_bits(self.dim) * self.spacing
 
     def corners(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
         """Return the corners (m, 2^d, d), m, of domains, after the map."""
-        lower = self.lower[chosen]
-        return self.images(lower[:, None] + corner_bits(lower.shape[1]) * self.spacing)
+        return self.images(self.reference(chosen))
+
+    @cached_property
+    def lattice(self) -> tuple[int, ...] | None:
+        """Domains along the axes of the lattice that they lie on, some of which may be empty; None without."""
+        return tuple(self.place(np.arange(len(self))).max(axis=0) + 1)
+
+    def place(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the places (m, d) of domains on the lattice."""
+        return np.rint((self.lower[rows] - self._lowest) / self.spacing).astype(np.int64)
+
+    @cached_property
+    def _lowest(self) -> NDArray[np.float64]:
+        return self.lower.min(axis=0)
+
+    def nodes(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the numbers (m, 2^d) of the corners of domains, the same for a corner of several; lexicographic."""
+        corners = self.place(rows)[:, None] + corner_bits(self.dim)
+        return np.ravel_multi_index(tuple(np.moveaxis(corners, 2, 0)), tuple(np.add(self.lattice, 1)))
 
     def images(self, X: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return where the map puts reference positions (..., d), m."""
@@ -57,14 +116,13 @@ class Body:
 
         By so much the straight edges of two domains may differ that follow the same curve.
         """
-        out, lower = np.zeros(len(chosen)), self.lower[chosen]
+        out = np.zeros(len(chosen))
         if self.map is None:
             return out
-        corners, bits = self.corners(chosen), corner_bits(lower.shape[1])
-        for axis in range(lower.shape[1]):
-            first = np.flatnonzero(bits[:, axis] == 0)
-            other = first + (1 << axis)
-            middle = self.images(lower[:, None] + (bits[first] + bits[other]) / 2 * self.spacing)
+        corners, X = self.corners(chosen), self.reference(chosen)
+        for axis in range(self.dim):
+            first, other = FACES[self.dim][2 * axis], FACES[self.dim][2 * axis + 1]
+            middle = self.images((X[:, first] + X[:, other]) / 2)
             off = np.linalg.norm((corners[:, first] + corners[:, other]) / 2 - middle, axis=2)
             out = np.maximum(out, off.max(axis=1))
         return out
@@ -72,10 +130,10 @@ class Body:
     def size(self) -> NDArray[np.float64]:
         """Return the edges (n, d), m, of boxes that are as large as the domains."""
         boxes = np.broadcast_to(self.spacing, self.lower.shape)
-        if self.map is None:
+        if self.aligned:
             return boxes
-        ratio = volumes(self.corners()) / self.spacing.prod()
-        return boxes * ratio[:, None] ** (1 / len(self.spacing))
+        ratio = volumes(self.corners()) / self.spacing.prod(axis=-1)
+        return boxes * ratio[:, None] ** (1 / self.dim)
 
 
 def box(grid: Grid, lower: ArrayLike, upper: ArrayLike, per_cell: int = 2, material: int = 0) -> Body:
@@ -170,7 +228,7 @@ def mapped(grid: Grid, body: Body, map: Callable[[NDArray[np.float64]], NDArray[
     grid
         Background grid.
     body
-        Of `box`, `shape` or `mapped`: then its own map comes first.
+        Of `box`, `shape`, `from_mesh` or `polygon`, or of `mapped`: then its own map comes first.
     map
         Maps positions (n, d), m, to positions (n, d), m, inside the grid; smooth, and not turning boxes inside out.
 
@@ -234,8 +292,8 @@ def check_bodies(grid: Grid, bodies: Sequence[Body]) -> None:
     """Refuse bodies of another dimension or outside of the grid, and a list that names one twice."""
     check_different(bodies)
     for i, body in enumerate(bodies):
-        if body.lower.shape[1] != grid.dim:
-            raise ValueError(f"body {i}: has {body.lower.shape[1]} coordinates, must have the grid's {grid.dim}")
+        if body.dim != grid.dim:
+            raise ValueError(f"body {i}: has {body.dim} coordinates, must have the grid's {grid.dim}")
         check_inside(grid, body, f"body {i}")
 
 

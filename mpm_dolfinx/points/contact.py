@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from mpm_dolfinx.parallel.messages import warn
 from mpm_dolfinx.points.bodies import Body
-from mpm_dolfinx.points.cutting import corner_bits, cut_at, kuhn_simplices
+from mpm_dolfinx.points.cutting import FACES, corner_bits, cut_at, kuhn_simplices
 from mpm_dolfinx.points.grid import Grid, rounding, sum_by
 
 TOUCH = 1e-6  # of the shortest edge: faces nearer than this touch
@@ -40,22 +40,20 @@ class Faces:
     bend: NDArray[np.float64]
 
     @classmethod
-    def of(cls, body: Body, axis: int, end: int, row: NDArray[np.int64]) -> Faces:
-        """Return faces on a side of a body, of some of its domains."""
-        domains, dim = body.corners(row), len(body.spacing)
-        outward = np.pad(face_vectors(domains, axis, end), ((0, 0), (0, 3 - dim)))
-        index = face_index(dim, axis, end)
-        corners = domains[:, index]
+    def of(cls, body: Body, row: NDArray[np.int64], face: NDArray[np.int64]) -> Faces:
+        """Return faces of a body: those of some domains (m,), by their numbers (m,) in these."""
+        domains, dim = body.corners(row), body.dim
+        outward = np.pad(face_vectors(domains, face), ((0, 0), (0, 3 - dim)))
+        index = face_index(dim)[face]
+        corners = np.take_along_axis(domains, index[:, :, None], axis=1)
         if dim == 2:
             corners = np.concatenate([corners, np.broadcast_to(BITS[:, 1:], (len(row), 4, 1))], axis=2)
-        return cls(row, np.tile(index, (len(row), 1)), corners, outward, body.bend(row))
+        return cls(row, index, corners, outward, body.bend(row))
 
     @classmethod
     def around(cls, body: Body) -> Faces:
         """Return the faces on all sides of a body."""
-        sides = [(axis, end) for axis in range(len(body.spacing)) for end in (0, 1)]
-        all_of = [cls.of(body, *side, np.flatnonzero(body.sides[:, side[0], side[1]])) for side in sides]
-        return cls(*(np.concatenate([getattr(f, name) for f in all_of]) for name in cls.__dataclass_fields__))
+        return cls.of(body, *body.outer())
 
     def edge(self) -> NDArray[np.float64]:
         """Return the shorter of the two edges (m, 2), m, along each of a face's axes."""
@@ -71,7 +69,8 @@ class Cover:
 
     face : (n,) the covered one; by : (n,) the covering one; low, high : (n, 2) its box in the coordinates of the
     former, which go from 0 to 1; corner : (n, 4) corner of this box that each of its corners is, -1 where it is
-    turned against the box; t : (n, 4, 2) its corners; slack : (n,) error of the coordinates.
+    turned against the box; t : (n, 4, 2) its corners; slack : (n,) error of the coordinates; plane : (n, 4, 2) its
+    corners in the coordinates of a parallelogram, along two edges of the former: in these what is straight is straight.
     """
 
     face: NDArray[np.int64]
@@ -81,29 +80,33 @@ class Cover:
     corner: NDArray[np.int64]
     t: NDArray[np.float64]
     slack: NDArray[np.float64]
+    plane: NDArray[np.float64]
 
     def at(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return what each corner of the covering faces counts (n, 4) at coordinates t (n, 2) of the covered ones."""
         return np.take_along_axis(weights((t - self.low) / (self.high - self.low)), self.corner, axis=1)
 
 
-def face_vectors(corners: NDArray[np.float64], axis: int, end: int) -> NDArray[np.float64]:
-    """Return the outward area vectors (m, d), m^(d-1), of one face of domains (m, 2^d, d)."""
+def face_vectors(corners: NDArray[np.float64], face: NDArray[np.int64] | int) -> NDArray[np.float64]:
+    """Return the outward area vectors (m, d), m^(d-1), of the faces of domains (m, 2^d, d) with numbers (m,) or one."""
     dim = corners.shape[2]
-    face = corners[:, corner_bits(dim)[:, axis] == end]
+    index = np.broadcast_to(FACES[dim][face], (len(corners), 2 ** (dim - 1)))
+    x = np.take_along_axis(corners, index[:, :, None], axis=1)
     if dim == 2:
-        t = face[:, 1] - face[:, 0]
-        n = np.stack([t[:, 1], -t[:, 0]], axis=1) * (1 if axis == 0 else -1)
+        t = x[:, 1] - x[:, 0]
+        n = np.stack([t[:, 1], -t[:, 0]], axis=1)
     else:
-        n = 0.5 * np.cross(face[:, 3] - face[:, 0], face[:, 2] - face[:, 1])
-        n *= 1 if axis != 1 else -1
-    return n * (1 if end else -1)
+        n = 0.5 * np.cross(x[:, 3] - x[:, 0], x[:, 2] - x[:, 1])
+    return n * np.broadcast_to(_OUTWARD[dim][face], len(n))[:, None]
 
 
-def face_index(dim: int, axis: int, end: int) -> NDArray[np.int64]:
-    """Return which corners of a domain (4,) a face has; in plane strain each twice, at both ends of the third axis."""
-    index = np.flatnonzero(corner_bits(dim)[:, axis] == end)
-    return index if dim == 3 else index[BITS[:, 0]]
+_OUTWARD = {2: np.array([-1, 1, 1, -1]), 3: np.array([-1, 1, 1, -1, -1, 1])}
+"""Signs of the cross products of the faces' edges."""
+
+
+def face_index(dim: int) -> NDArray[np.int64]:
+    """Return which corners of a domain (2d, 4) its faces have; in plane strain each twice, at both ends of axis 3."""
+    return FACES[dim] if dim == 3 else FACES[dim][:, BITS[:, 0]]
 
 
 def weights(t: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -145,10 +148,17 @@ def covers(own: Faces, other: Faces) -> Cover:
     corner = upper @ [1, 2]
     straight = np.abs(t - np.where(upper, high[:, None], low[:, None])).max(axis=(1, 2)) <= np.maximum(slack, 1e-9)
     straight &= (np.sort(corner, axis=1) == np.arange(4)).all(axis=1)
-    out = Cover(i, j, low, high, np.where(straight[:, None], corner, -1), t, slack)
-    ends = np.clip(low, 0, 1), np.clip(high, 0, 1)
+    flat = _parallelograms(own.corners[i])
+    plane, whole = (local(flat, corners, n[i])[0] for corners in (other.corners[j], own.corners[i]))
+    out = Cover(i, j, low, high, np.where(straight[:, None], corner, -1), t, slack, plane)
+    box = [np.where(straight[:, None], one, two) for one, two in ((low, plane.min(axis=1)), (high, plane.max(axis=1)))]
+    within = [np.where(straight[:, None], k, x) for k, x in enumerate((whole.min(axis=1), whole.max(axis=1)))]
+    ends = [np.clip(x, *within) for x in box]
     on = ((ends[1] - ends[0]) > slack[:, None]).all(axis=1)
-    middle = np.einsum("nk,nkd->nd", weights((ends[0] + ends[1]) / 2), own.corners[i])
+    at = (ends[0] + ends[1]) / 2
+    off_edges = np.einsum("nk,nkd->nd", weights(at), flat)  # the same place but for faces that are no parallelograms
+    at = np.where(straight[:, None], at, local(own.corners[i], off_edges[:, None], n[i])[0][:, 0])
+    middle = np.einsum("nk,nkd->nd", weights(at), own.corners[i])
     _, beside = local(other.corners[j], middle[:, None], m[j])
     gap = np.where(straight, 0.0, np.abs(beside[:, 0]))  # of those that are turned, between their middles
     with np.errstate(divide="ignore", invalid="ignore"):  # of boxes without a width, which are not on
@@ -157,6 +167,11 @@ def covers(own: Faces, other: Faces) -> Cover:
             gap = np.where(straight, np.maximum(gap, np.abs((at * off).sum(axis=1))), gap)
     on &= gap <= TOUCH * np.minimum(edge.min(axis=1), other.edge()[j].min(axis=1)) + lost + 2 * bend
     return Cover(*(getattr(out, name)[on] for name in Cover.__dataclass_fields__))
+
+
+def _parallelograms(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return faces (n, 4, 3) with their last corner put where two edges of the others tell."""
+    return np.stack([*(corners[:, k] for k in range(3)), corners[:, 1] + corners[:, 2] - corners[:, 0]], axis=1)
 
 
 def local(corners: NDArray, x: NDArray, normal: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -182,24 +197,29 @@ def covered(count: int, cover: Cover) -> NDArray[np.float64]:
     return sum_by(owner, _areas(s), count)
 
 
-def uncovered_triangles(cover: Cover, faces: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def uncovered_triangles(
+    own: Faces, cover: Cover, faces: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return what is free of faces (m,) as triangles: the face (n,) of each, and its corners (n, 3, 2), from 0 to 1."""
+    corners = own.corners[faces]
+    normal = own.outward[faces] / np.linalg.norm(own.outward[faces], axis=1, keepdims=True)
+    whole, _ = local(_parallelograms(corners), corners, normal)
     of = np.flatnonzero(np.isin(cover.face, faces))
     of = of[np.argsort(cover.face[of], kind="stable")]
     first = np.searchsorted(cover.face[of], faces)
     count = np.searchsorted(cover.face[of], faces, "right") - first
-    s, owner = _triangles(np.tile(BITS, (len(faces), 1, 1)), np.arange(len(faces)))
+    s, owner = _triangles(whole, np.arange(len(faces)))
     for k in range(count.max()):  # take the k-th of the faces that lie on each away
         has = count[owner] > k
         free, whose = [s[:, :, ~has]], [owner[~has]]
         s, owner = s[:, :, has], owner[has]
-        quad = cover.t[of[np.minimum(first + k, len(of) - 1)]][:, [0, 1, 3, 2]]  # around
+        quad = cover.plane[of[np.minimum(first + k, len(of) - 1)]][:, [0, 1, 3, 2]]  # around
         turn = np.sign(_cross(quad[:, 2] - quad[:, 0], quad[:, 3] - quad[:, 1]))
         for a in range(4):
             p, q = quad[owner, a].T, quad[owner, (a + 1) % 4].T
             inside = turn[owner] * _cross((q - p).T, (s - p).transpose(0, 2, 1))
             s3 = np.concatenate([s, inside[:, None]], axis=1)
-            out, out_owner, s3, owner = _split(s3, owner, 2, 0.0)
+            out, out_owner, s3, owner = split(s3, owner, 2, 0.0)
             free.append(out[:, :2])
             whose.append(out_owner)
             s = s3[:, :2]
@@ -210,7 +230,13 @@ def uncovered_triangles(cover: Cover, faces: NDArray[np.int64]) -> tuple[NDArray
     np.maximum.at(slack, np.searchsorted(faces, cover.face[of]), cover.slack[of])
     edge = np.linalg.norm(s - s[[1, 2, 0]], axis=1).max(axis=0)
     some = 2 * _areas(s) > 2 * slack[owner] * edge  # chords of a curve that differ leave slivers, which would drain it
-    return faces[owner[some]], s[:, :, some].transpose(2, 0, 1)
+    s, owner = s[:, :, some].transpose(2, 0, 1), owner[some]
+    kites = np.abs(whole[owner] - BITS).max(axis=(1, 2), initial=0.0) > SAME
+    x = np.einsum(
+        "nck,nkd->ncd", weights(s[kites].reshape(-1, 2)).reshape(-1, 3, 4), _parallelograms(corners)[owner[kites]]
+    )
+    s[kites] = np.clip(local(corners[owner[kites]], x, normal[owner[kites]])[0], 0.0, 1.0)
+    return faces[owner], s
 
 
 def within(s: NDArray, owner: NDArray, low: NDArray, high: NDArray) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
@@ -218,8 +244,8 @@ def within(s: NDArray, owner: NDArray, low: NDArray, high: NDArray) -> tuple[NDA
     low, high = (np.broadcast_to(x, (s.shape[2], 2)) for x in (low, high))
     index = np.arange(s.shape[2])
     for axis in (0, 1):
-        _, _, s, index = _split(s, index, axis, low[index, axis])
-        s, index, _, _ = _split(s, index, axis, high[index, axis])
+        _, _, s, index = split(s, index, axis, low[index, axis])
+        s, index, _, _ = split(s, index, axis, high[index, axis])
     return s, owner[index]
 
 
@@ -239,7 +265,7 @@ def _areas(s: NDArray) -> NDArray[np.float64]:
     return 0.5 * np.abs(_cross(*(s[1:] - s[0]).swapaxes(1, 2)))
 
 
-def _split(s: NDArray, owner: NDArray, axis: int, plane) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+def split(s: NDArray, owner: NDArray, axis: int, plane) -> tuple[NDArray, NDArray, NDArray, NDArray]:
     """Return what of triangles (3, e, n) lies below a plane of an axis, and above it, each with its owners."""
     plane = np.broadcast_to(plane, len(owner))
     low, high = s[:, axis].min(axis=0) < plane, s[:, axis].max(axis=0) > plane
@@ -319,7 +345,7 @@ def separation(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.flo
     Domains do not overlap if a plane lies between them: along a face of one, or in 3D along an edge of each.
     """
     d = a.shape[2]
-    out = _between_planes(a, b, (face_vectors(c, axis, end) for c in (a, b) for axis in range(d) for end in (0, 1)))
+    out = _between_planes(a, b, (face_vectors(c, face) for c in (a, b) for face in range(2 * d)))
     if d == 3:
         k = np.flatnonzero(out < 0)
         bits = corner_bits(3)
@@ -345,12 +371,12 @@ def solids(body: Body) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return convex domains (m, 2^d, d), m, that fill a body, a box as one, and their allowances (m,), m."""
     low, high = body.lower.min(axis=0), (body.lower + body.spacing).max(axis=0)
     size, edge = high - low, body.spacing.min()
-    if body.map is None and np.isclose(size.prod(), len(body) * body.spacing.prod(), rtol=1e-9, atol=0):
+    if body.aligned and np.isclose(size.prod(), len(body) * body.spacing.prod(), rtol=1e-9, atol=0):
         return (low + corner_bits(len(size)) * size)[None], allowance(np.full(1, edge))
     corners = body.corners()
     warp = np.zeros(len(body))
-    if len(size) == 3 and body.map is not None:
-        faces = [corners[:, face_index(3, axis, end)] for axis in range(3) for end in (0, 1)]
+    if len(size) == 3 and not body.aligned:
+        faces = [corners[:, index] for index in FACES[3]]
         warp = np.max([np.linalg.norm(f[:, 0] - f[:, 1] - f[:, 2] + f[:, 3], axis=1) / 4 for f in faces], axis=0)
     edge = np.ptp(corners, axis=1).min(axis=1)
     return corners, allowance(edge) + 2 * (body.bend(np.arange(len(body))) + warp)

@@ -15,7 +15,7 @@ from mpm_dolfinx.forms.point_forms import CHUNK
 from mpm_dolfinx.parallel.exchange import Exchange, over_all
 from mpm_dolfinx.points.bending import bend
 from mpm_dolfinx.points.cutting import Pieces, cut, cut_faces
-from mpm_dolfinx.points.faces import Surface, face_vectors, interpolate
+from mpm_dolfinx.points.faces import Surface, face_vectors, interpolate, on_face
 from mpm_dolfinx.points.grid import Grid, sum_by
 from mpm_dolfinx.points.material_points import MaterialPoints
 
@@ -67,7 +67,7 @@ class Patches:
     def area(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the outward area vectors (n, d), m^(d-1)."""
         share = self.area0 / self._faces.whole0[self._here]
-        return face_vectors(points.corners[self.at], self._faces.axis, self._faces.end) * share[:, None]
+        return face_vectors(points.corners[self.at], self._faces.face[self._here]) * share[:, None]
 
 
 class CutDomains(Keyed):
@@ -130,8 +130,10 @@ class CutDomains(Keyed):
         count = xi.shape[1]
         places = interpolate(np.repeat(corners, count, axis=0), xi.reshape(-1, self.grid.dim)).reshape(xi.shape)
         face, x, xi, share, middle = cut_faces(self.grid, places, xi)
-        outward = face_vectors(corners, faces.axis, faces.end)
+        outward = face_vectors(corners, faces.face[here])
         size = np.linalg.norm(outward, axis=1, keepdims=True)
+        skew = np.flatnonzero(faces.skew[here][face])  # xi is linear over a triangle, and places are not in xi
+        xi[skew] = on_face(corners[face[skew]], faces.face[here][face[skew]], x[skew], xi[skew])
         inward = -DEPTH * self.grid.h.min() * np.divide(outward, size, out=np.zeros_like(outward), where=size > 0)
         cell = self._filled_cell(at[face], middle + inward[face])
         return Patches(faces, here[face], at[face], cell, x, xi, share)

@@ -48,6 +48,16 @@ def corner_bits(dim: int) -> NDArray[np.int64]:
     return (np.arange(2**dim)[:, None] >> np.arange(dim)) & 1
 
 
+def _faces(dim: int) -> NDArray[np.int64]:
+    """Return the corners (2d, 2^(d-1)) of the faces of a domain; face 2 a + e is the one at end e of axis a."""
+    bits = corner_bits(dim)
+    return np.stack([np.flatnonzero(bits[:, axis] == end) for axis in range(dim) for end in (0, 1)])
+
+
+FACES = {d: _faces(d) for d in (2, 3)}
+"""Corners (2d, 2^(d-1)) of the faces of a domain."""
+
+
 def kuhn_simplices(dim: int) -> NDArray[np.int64]:
     """Return the (d!, d+1) corners of the simplices that a domain is split into."""
     return np.array([[sum(1 << a for a in p[:k]) for k in range(dim + 1)] for p in permutations(range(dim))])

@@ -13,17 +13,25 @@ from numpy.typing import ArrayLike, NDArray
 from mpm_dolfinx.points.bodies import Body
 from mpm_dolfinx.points.contact import (
     BITS,
+    SAME,
+    TINY,
     Cover,
     Faces,
     covers,
     face_vectors,
+    local,
+    split,
     uncovered,
     uncovered_triangles,
+    weights,
     within,
 )
-from mpm_dolfinx.points.cutting import corner_bits
-from mpm_dolfinx.points.grid import rounding, side
+from mpm_dolfinx.points.cutting import FACES, corner_bits, kuhn_simplices
+from mpm_dolfinx.points.grid import rounding
 from mpm_dolfinx.validation import numbers
+
+TANGENTIAL = {d: np.array([[a for a in range(d) if a != axis] for axis in range(d)]) for d in (2, 3)}
+"""Axes (d, d-1) along the faces of a domain that are across each axis."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,50 +40,66 @@ class Surface:
 
     A face of which several parts count has a row for each.
 
-    id : (m,) number of the point; xi : (m, 2^(d-1), d) corners of the part of the face that counts, in the domain's
-    coordinates from -1 to 1, of a triangle the last one twice; X : (m, 2, d) the box around it in reference positions,
-    before all maps, m; domain : (m, 2^d, d) corners of the domain as seeded, after them, m; axis, end : side of it.
+    id : (m,) number of the point, ascending; face : (m,) number of the face in its domain, see `cutting.FACES`;
+    xi : (m, 2^(d-1), d) corners of the part of the face that counts, in the domain's coordinates from -1 to 1, of a
+    triangle the last one twice; domain, before : (m, 2^d, d) corners of the domain as seeded, after all maps and before
+    them (reference positions), m; region : (2, d) box of reference positions to which the faces are limited, m.
     """
 
     id: NDArray[np.int64]
+    face: NDArray[np.int64]
     xi: NDArray[np.float64]
-    X: NDArray[np.float64]
     domain: NDArray[np.float64]
-    axis: int
-    end: int
+    before: NDArray[np.float64]
+    region: NDArray[np.float64]
 
     def __len__(self) -> int:
         return len(self.id)
 
     @cached_property
+    def outward(self) -> NDArray[np.float64]:
+        """Outward area vectors (m, d) of the whole faces as seeded, m^(d-1)."""
+        return face_vectors(self.domain, self.face)
+
+    @cached_property
     def whole0(self) -> NDArray[np.float64]:
         """Area (m,) of the whole faces as seeded, m^(d-1)."""
-        return np.linalg.norm(face_vectors(self.domain, self.axis, self.end), axis=1)
+        return np.linalg.norm(self.outward, axis=1)
 
     @property
     def area0(self) -> NDArray[np.float64]:
         """Area (m,) of the parts that count as seeded, m^(d-1)."""
-        t = np.delete(self.xi, self.axis, axis=2) / 2
-        if self.xi.shape[2] == 2:
-            return self.whole0 * np.abs(t[:, 1, 0] - t[:, 0, 0])
-        (a, b), (c, d) = (t[:, 3] - t[:, 0]).T, (t[:, 2] - t[:, 1]).T
-        return self.whole0 * np.abs(a * d - b * c) / 2
+        x = self.places()
+        if x.shape[2] == 2:
+            return np.linalg.norm(x[:, 1] - x[:, 0], axis=1)
+        return np.linalg.norm(np.cross(x[:, 3] - x[:, 0], x[:, 2] - x[:, 1]), axis=1) / 2
+
+    @cached_property
+    def skew(self) -> NDArray[np.bool_]:
+        """Which faces (m,) are no parallelograms as seeded."""
+        x = np.take_along_axis(self.domain, FACES[self.xi.shape[2]][self.face][:, :, None], axis=1)
+        off = np.linalg.norm(x[:, -1] - x[:, 1] - x[:, -2] + x[:, 0], axis=1) if x.shape[2] == 3 else np.zeros(len(x))
+        return off > SAME * np.ptp(x, axis=1).max(axis=1)
 
     def places(self) -> NDArray[np.float64]:
         """Return where the corners of the parts (m, 2^(d-1), d) are as seeded, m."""
         domain = np.repeat(self.domain, self.xi.shape[1], axis=0)
         return interpolate(domain, self.xi.reshape(-1, self.xi.shape[2])).reshape(self.xi.shape)
 
-    def reference_corners(self) -> NDArray[np.float64]:
-        """Return the corners (m, 2^(d-1), d) of the boxes around the parts in reference positions, m."""
-        bits = np.insert(corner_bits(self.X.shape[2] - 1), self.axis, 0, axis=1)
-        return self.X[:, bits, np.arange(self.X.shape[2])]
-
-    def reference(self, face: NDArray[np.int64], xi: NDArray[np.float64]) -> NDArray[np.float64]:
+    def reference(self, at: NDArray[np.int64], xi: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the reference positions (n, d), m, of places xi (n, d) on faces."""
-        (A, B), a, b = self.X[face].swapaxes(0, 1), self.xi.min(axis=1)[face], self.xi.max(axis=1)[face]
-        t = np.divide(xi - a, b - a, out=np.zeros_like(xi), where=b > a)
-        return A + t * (B - A)
+        return np.clip(interpolate(self.before[at], xi), *self.region)
+
+    @cached_property
+    def corners(self) -> NDArray[np.float64]:
+        """Reference positions (m, 2^(d-1), d) of the corners of the parts, m."""
+        at = np.repeat(np.arange(len(self)), self.xi.shape[1])
+        return self.reference(at, self.xi.reshape(len(at), self.xi.shape[2])).reshape(self.xi.shape)
+
+    @property
+    def X(self) -> NDArray[np.float64]:
+        """Boxes (m, 2, d) around the parts in reference positions, m."""
+        return np.stack([self.corners.min(axis=1), self.corners.max(axis=1)], axis=1)
 
 
 Region = tuple[ArrayLike, ArrayLike]
@@ -103,59 +127,112 @@ def surface(
     Parameters
     ----------
     name
-        Side: "left", "right", "bottom", "top", in 3D also "front", "back".
+        Side: of lattices "left", "right", "bottom", "top", in 3D also "front", "back"; of meshes as these name it.
     region : ((d,), (d,)), m
         Box of reference positions that limits the faces; faces partly in it count with that part.
     present
         Which bodies are there, by default all.
     """
     there = [present is None or bool(present[i]) for i in range(len(bodies))]
-    dim = bodies[0].lower.shape[1]
-    axis, end = side(name, dim)
+    dim, known = bodies[0].dim, dict.fromkeys(name for body in bodies for name in body.names)
+    if not isinstance(name, str) or name not in known:
+        raise ValueError(f"side {name!r}: must be one of {', '.join(known) or 'none: no body has a side with a name'}")
     box = limits(region, dim)
     around = [Faces.around(body) if here and sum(there) > 1 else None for body, here in zip(bodies, there, strict=True)]
-    start, found = 0, [(np.empty(0, np.int64), *(np.empty((0, n, dim)) for n in (2 ** (dim - 1), 2, 2**dim)))]
+    none = np.empty(0, np.int64)
+    start, found = 0, [(none, none, *(np.empty((0, n, dim)) for n in (2 ** (dim - 1), 2**dim, 2**dim)))]
     for i, body in enumerate(bodies):
-        chosen = _in_region(body, axis, end, box) if there[i] else np.empty(0, np.int64)
+        row, face = _in_region(body, *body.named(name), box) if there[i] else (none, none)
         others = [faces for j, faces in enumerate(around) if faces is not None and j != i]
-        row, t = _free(Faces.of(body, axis, end, chosen), others)
-        row, xi, X = _limited(body, axis, end, chosen[row], t, box)
-        found.append((start + row, xi, X, body.corners(row)))
+        part, t = _free(Faces.of(body, row, face), others)
+        part, xi = _limited(body, row, face, part, t, box)
+        row, face = row[part], face[part]
+        found.append((start + row, face, xi, body.corners(row), body.reference(row)))
         start += len(body)
-    return Surface(*map(np.concatenate, zip(*found, strict=True)), axis, end)
+    return Surface(*map(np.concatenate, zip(*found, strict=True)), box)
 
 
-def _in_region(body: Body, axis: int, end: int, region: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the domains of a body that have a face on a side of which a part lies in a box (2, d) of all space."""
-    box, tangential = np.stack([body.lower, body.lower + body.spacing], axis=1), np.arange(len(body.spacing)) != axis
-    at, slack = box[:, end, axis], 1e-9 * body.spacing[axis] + rounding(box)
-    on = body.sides[:, axis, end] & (at >= region[0, axis] - slack) & (at <= region[1, axis] + slack)
-    on &= (np.minimum(box[:, 1], region[1]) > np.maximum(box[:, 0], region[0]))[:, tangential].all(axis=1)
-    return np.flatnonzero(on)
+def _face_corners(body: Body, row: NDArray[np.int64], face: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the reference positions (m, 2^(d-1), d), m, of the corners of faces."""
+    return np.take_along_axis(body.reference(row), FACES[body.dim][face][:, :, None], axis=1)
+
+
+def _in_region(
+    body: Body, row: NDArray[np.int64], face: NDArray[np.int64], region: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return those of a body's faces that may have a part in a box (2, d) of all space."""
+    x = _face_corners(body, row, face)
+    low, high = x.min(axis=1), x.max(axis=1)
+    size = high - low
+    flat, slack = size <= rounding(x), 1e-9 * size.max(axis=1, keepdims=True) + rounding(x)
+    within = (low >= region[0] - slack) & (high <= region[1] + slack)
+    on = np.where(flat, within, np.minimum(high, region[1]) > np.maximum(low, region[0])).all(axis=1)
+    return row[on], face[on]
 
 
 def _limited(
-    body: Body, axis: int, end: int, row: NDArray[np.int64], t: NDArray[np.float64], region: NDArray[np.float64]
-) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return what of parts t (n, 4, 2) of faces lies in a region: domains (m,), xi and X as of a `Surface`."""
-    dim = len(body.spacing)
-    tangential = np.flatnonzero(np.arange(dim) != axis)
-    low, high = ((region[k, tangential] - body.lower[row][:, tangential]) / body.spacing[tangential] for k in (0, 1))
-    if dim == 2:
-        low, high = (np.pad(x, ((0, 0), (0, 1)), constant_values=c) for x, c in ((low, 0.0), (high, 1.0)))
-    three = (t[:, 2] == t[:, 3]).all(axis=1)
-    triangles, at = within(t[three, :3].transpose(1, 2, 0), np.flatnonzero(three), low[three], high[three])
-    triangles = triangles.transpose(2, 0, 1)[:, [0, 1, 2, 2]]
-    at = np.concatenate([np.flatnonzero(~three), at])
-    t = np.concatenate([np.clip(t[~three], low[~three, None], high[~three, None]), triangles])
+    body: Body,
+    row: NDArray[np.int64],
+    face: NDArray[np.int64],
+    part: NDArray[np.int64],
+    t: NDArray[np.float64],
+    region: NDArray[np.float64],
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return what of parts t (n, 4, 2) of faces part (n,) lies in a region: their faces (m,), and xi as of a `Surface`.
+
+    row, face (k,): domains, and numbers in them, of all faces.
+    """
+    dim, three = body.dim, (t[:, 2] == t[:, 3]).all(axis=1)
+    X = _face_corners(body, row[part], face[part])
+    if dim == 3 and body.lattice is None:
+        some = ((X.min(axis=1) < region[0]) | (X.max(axis=1) > region[1])).any(axis=1)  # of a face that is not whole
+        triangles, at = _clipped(X[some], t[some], region)
+        quads, at = t[~some], np.concatenate([np.flatnonzero(~some), np.flatnonzero(some)[at]])
+    else:
+        low, high = _interval(X, region)
+        triangles, at = within(t[three, :3].transpose(1, 2, 0), np.flatnonzero(three), low[three], high[three])
+        triangles = triangles.transpose(2, 0, 1)
+        quads = np.clip(t[~three], low[~three, None], high[~three, None])
+        at = np.concatenate([np.flatnonzero(~three), at])
+    t = np.concatenate([quads, triangles[:, [0, 1, 2, 2]]])
     kept = np.flatnonzero((np.ptp(t, axis=1) > 0).all(axis=1))
-    kept = kept[np.argsort(at[kept], kind="stable")]
-    row, t = row[at[kept]], t[kept][:, : 2 ** (dim - 1), : dim - 1]
-    xi = np.insert(2 * t - 1, axis, 2.0 * end - 1, axis=2)
-    ends, lower = np.stack([xi.min(axis=1), xi.max(axis=1)], axis=1), body.lower[row][:, None]
-    X = np.where(ends == 1, lower + body.spacing, lower + (ends + 1) / 2 * body.spacing)
-    X[:, :, tangential] = np.clip(X[:, :, tangential], *region[:, tangential])
-    return row, xi, X
+    kept = kept[np.lexsort((at[kept], row[part[at[kept]]]))]
+    part, t = part[at[kept]], t[kept][:, : 2 ** (dim - 1), : dim - 1]
+    axis, end = (k[:, None] for k in np.divmod(face[part], 2))
+    xi = np.empty((*t.shape[:2], dim))
+    np.put_along_axis(xi, np.broadcast_to(TANGENTIAL[dim][axis], t.shape), 2 * t - 1, axis=2)
+    np.put_along_axis(xi, np.broadcast_to(axis[:, None], xi[:, :, :1].shape), 2.0 * end[:, None] - 1, axis=2)
+    return part, xi
+
+
+def _interval(X: NDArray[np.float64], region: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return from where to where (n, 2), in the coordinates of faces, these lie in a region.
+
+    X (n, 2^(d-1), d), m: reference positions of the corners of edges, or of rectangles along the axes.
+    """
+    low, high = np.zeros((len(X), 2)), np.ones((len(X), 2))
+    for k in range(X.shape[2] - 1):
+        way = X[:, 1 << k] - X[:, 0]
+        with np.errstate(divide="ignore", invalid="ignore"):  # along an axis that does not limit them
+            ends = np.where(np.abs(way) > rounding(X), (region[:, None] - X[:, 0]) / way, [[[-np.inf]], [[np.inf]]])
+        low[:, k] = np.maximum(0.0, ends.min(axis=0).max(axis=1))
+        high[:, k] = np.minimum(1.0, ends.max(axis=0).min(axis=1))
+    return low, np.maximum(low, high)
+
+
+def _clipped(
+    X: NDArray[np.float64], t: NDArray[np.float64], region: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return what lies in a region of parts t (n, 4, 2) of faces X (n, 4, 3): triangles, and the parts they are of."""
+    places = np.einsum("npk,nkd->npd", weights(t.reshape(-1, 2)).reshape(*t.shape[:2], 4), X)
+    s = np.concatenate([places[:, list(simplex)].transpose(1, 2, 0) for simplex in kuhn_simplices(2)], axis=2)
+    at = np.tile(np.arange(len(X)), 2)
+    for axis in range(3):
+        _, _, s, at = split(s, at, axis, region[0, axis])
+        s, at, _, _ = split(s, at, axis, region[1, axis])
+    diagonals = np.cross(X[:, 3] - X[:, 0], X[:, 2] - X[:, 1])
+    normal = diagonals / np.maximum(np.linalg.norm(diagonals, axis=1, keepdims=True), TINY)
+    return np.clip(local(X[at], s.transpose(2, 0, 1), normal[at])[0], 0.0, 1.0), at
 
 
 def _free(own: Faces, others: Sequence[Faces]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
@@ -173,7 +250,7 @@ def _free(own: Faces, others: Sequence[Faces]) -> tuple[NDArray[np.int64], NDArr
     quads = np.where(BITS, high[whole, None], low[whole, None])
     if not turned.any():
         return row, quads
-    split, triangles = uncovered_triangles(cover, np.unique(cover.face[turned]))
+    split, triangles = uncovered_triangles(own, cover, np.unique(cover.face[turned]))
     return np.concatenate([row[whole], split]), np.concatenate([quads, triangles[:, [0, 1, 2, 2]]])
 
 
@@ -182,3 +259,15 @@ def interpolate(corners: NDArray[np.float64], xi: NDArray[np.float64]) -> NDArra
     signs = 2 * corner_bits(xi.shape[1]) - 1
     N = (0.5 * (1 + signs * xi[:, None, :])).prod(axis=2)
     return np.einsum("mk,mkd->md", N, corners)
+
+
+def on_face(
+    corners: NDArray[np.float64], face: NDArray[np.int64], x: NDArray[np.float64], xi: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return coordinates xi (n, 3) in domains (n, 8, 3) with those along faces (n,) put to places x (n, 3) on these."""
+    quads = np.take_along_axis(corners, FACES[3][face][:, :, None], axis=1)
+    normal = face_vectors(corners, face)
+    t, _ = local(quads, x[:, None], normal)
+    out = xi.copy()
+    np.put_along_axis(out, TANGENTIAL[3][face // 2], 2 * t[:, 0] - 1, axis=1)
+    return out

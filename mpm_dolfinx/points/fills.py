@@ -17,11 +17,12 @@ from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.parallel.messages import warn
 from mpm_dolfinx.points.bodies import Body
 from mpm_dolfinx.points.contact import Cover, Faces, covered, covers, local, meeting, warn_near, weights
-from mpm_dolfinx.points.cutting import TANGLED, corner_bits, volumes
+from mpm_dolfinx.points.cutting import FACES, TANGLED, volumes
 from mpm_dolfinx.points.grid import REACH, Grid
 from mpm_dolfinx.points.material_points import MaterialPoints
 
 MISFIT = 0.01  # cells: fills whose straight edges are further off a bent surface are named in a warning
+UPRIGHT = 0.95  # cosine: what of a mesh looks that straight away from what it lies on stays where it was seeded
 INSIDE = 0.05  # of a domain's shortest edge: what lies deeper in a fill is in its way
 
 
@@ -123,7 +124,7 @@ def _contacts(grid: Grid, bodies: Sequence[Body], other: int, fill: Body, points
     around, out = Faces.around(bodies[other]), []
     for axis in range(grid.dim):
         for end in (0, 1):
-            own = Faces.of(fill, axis, end, np.flatnonzero(fill.sides[:, axis, end]))
+            own = Faces.of(fill, *fill.facing(axis, end))
             cover = covers(own, around)
             if len(cover.face):
                 rows, pair = np.unique(around.row[cover.by], return_inverse=True)
@@ -138,9 +139,7 @@ def _contacts(grid: Grid, bodies: Sequence[Body], other: int, fill: Body, points
 
 def _follow(grid: Grid, body: Body, corners: NDArray[np.float64], contacts: Sequence[Contact]) -> NDArray[np.float64]:
     """Return the displacement (n, 2^d, d), m, of the corners of a fill that follows what it lies on."""
-    bits = corner_bits(grid.dim)
-    index = np.rint((body.lower - body.lower.min(axis=0)) / body.spacing).astype(np.int64)[:, None] + bits
-    number = np.ravel_multi_index(tuple(np.moveaxis(index, 2, 0)), tuple(index.max(axis=(0, 1)) + 1))
+    number = body.nodes(np.arange(len(body)))
     nodes, node = np.unique(number, return_inverse=True)
     node = node.reshape(number.shape)
     u, hits, x = np.zeros((len(nodes), grid.dim)), np.zeros(len(nodes)), np.empty((len(nodes), grid.dim))
@@ -155,7 +154,7 @@ def _follow(grid: Grid, body: Body, corners: NDArray[np.float64], contacts: Sequ
     for contact in contacts:
         sides[contact.side] = sides.get(contact.side, 0.0) + contact.area()
     axis, end = max(sides, key=sides.get)
-    opposite = Faces.of(body, axis, 1 - end, np.flatnonzero(body.sides[:, axis, 1 - end]))
+    opposite = Faces.of(body, *body.facing(axis, 1 - end, UPRIGHT))
     fixed = np.minimum(np.abs(x - grid.lower), np.abs(x - grid.upper)) < 1e-9 * grid.h  # along a wall it only slides
     fixed[hits > 0] = True
     fixed[node[opposite.row[:, None], opposite.index]] = True
@@ -164,12 +163,11 @@ def _follow(grid: Grid, body: Body, corners: NDArray[np.float64], contacts: Sequ
 
 
 def _springs(body: Body, node: NDArray[np.int64], count: int) -> csr_array:
-    """Return the matrix (count, count) of springs along the edges of a body's lattice."""
-    bits = corner_bits(len(body.spacing))
-    first = [np.flatnonzero(bits[:, axis] == 0) for axis in range(len(body.spacing))]
-    a = np.concatenate([node[:, f].ravel() for f in first])
-    b = np.concatenate([node[:, f + (1 << axis)].ravel() for axis, f in enumerate(first)])
-    stiffness = np.repeat(body.spacing.min() ** 2 / body.spacing**2, first[0].size * len(body))
+    """Return the matrix (count, count) of springs along the edges of a body's domains."""
+    X, ends = body.reference(), [(FACES[body.dim][2 * axis], FACES[body.dim][2 * axis + 1]) for axis in range(body.dim)]
+    a, b = (np.concatenate([node[:, pair[k]].ravel() for pair in ends]) for k in (0, 1))
+    length = np.concatenate([((X[:, f] - X[:, g]) ** 2).sum(axis=2).ravel() for f, g in ends])
+    stiffness = length.min() / length
     W = coo_array((np.tile(stiffness, 2), (np.concatenate([a, b]), np.concatenate([b, a]))), shape=(count, count))
     return (diags(W.sum(axis=1)) - W).tocsr()
 

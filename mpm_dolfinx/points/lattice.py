@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from mpm_dolfinx.parallel.exchange import Exchange
 from mpm_dolfinx.points.bodies import Body
 from mpm_dolfinx.points.contact import Faces, covers
-from mpm_dolfinx.points.cutting import corner_bits
+from mpm_dolfinx.points.cutting import FACES
 from mpm_dolfinx.points.faces import Surface
 from mpm_dolfinx.points.grid import SIDES, Grid
 from mpm_dolfinx.points.material_points import MaterialPoints
@@ -41,7 +41,7 @@ PARTED = 1e-6
 
 
 class Lattice:
-    """The domains and corners of a body that is there, numbered lexicographically, and which corners are held.
+    """The domains and corners of a body that is there, and which corners are held; a mesh is not filtered.
 
     Parameters
     ----------
@@ -61,24 +61,14 @@ class Lattice:
         joined: tuple[NDArray[np.int64], NDArray[np.int64]],
     ):
         self._body, self._start, self._stop = body, start, start + len(body)
-        self._lower, self._dim = body.lower.min(axis=0), len(body.spacing)
+        self._dim, self._count = body.dim, body.lattice
         self._parted = PARTED * body.spacing.min()
-        self._count = self._index(np.arange(len(body))).max(axis=0) + 1
-        self._joined = np.take_along_axis(self._number(joined[0]), joined[1], axis=1)
+        self._joined = np.take_along_axis(body.nodes(joined[0]), joined[1], axis=1)
         self._given = []
         for faces, axes in given:
-            rows = faces.id[(faces.id >= self._start) & (faces.id < self._stop)] - self._start
-            on = corner_bits(self._dim)[:, faces.axis] == faces.end
-            self._given.append((self._number(rows)[:, on], list(axes)))
-
-    def _index(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the places (m, d) of domains along the axes."""
-        return np.rint((self._body.lower[rows] - self._lower) / self._body.spacing).astype(np.int64)
-
-    def _number(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the numbers (m, 2^d) of the corners of domains."""
-        corners = self._index(rows)[:, None] + corner_bits(self._dim)
-        return np.ravel_multi_index(tuple(np.moveaxis(corners, 2, 0)), tuple(self._count + 1))
+            here = (faces.id >= self._start) & (faces.id < self._stop)
+            corners = body.nodes(faces.id[here] - self._start), FACES[self._dim][faces.face[here]]
+            self._given.append((np.take_along_axis(*corners, axis=1), list(axes)))
 
     def rows(self, points: MaterialPoints) -> NDArray[np.int64]:
         """Return which points are the body's."""
@@ -86,7 +76,7 @@ class Lattice:
 
     def given(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return which components (m, 2^d, d) of the corners of domains conditions give."""
-        number = self._number(ids - self._start)
+        number = self._body.nodes(ids - self._start)
         out = np.zeros((*number.shape, self._dim), dtype=bool)
         for at, axes in self._given:
             out[:, :, axes] |= np.isin(number, at)[:, :, None]
@@ -99,9 +89,12 @@ class Lattice:
 
         crossed (m, 2^d): cells that they have crossed since the grid was reset.
         """
-        number = self._number(ids - self._start)
+        if self._count is None:
+            return np.zeros_like(d)
+        number = self._body.nodes(ids - self._start)
         values = np.concatenate([d, crossed[:, :, None]], axis=2).reshape(-1, self._dim + 1)
-        change = _change(comm, tuple(self._count + 1), number.ravel(), values, self._parted).reshape(d.shape)
+        shape = tuple(np.add(self._count, 1))
+        change = _change(comm, shape, number.ravel(), values, self._parted).reshape(d.shape)
         change[np.isin(number, self._joined)] = 0.0
         return change
 
@@ -109,9 +102,10 @@ class Lattice:
         self, comm: MPI.Intracomm, ids: NDArray[np.int64], d: NDArray[np.float64], crossed: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """Return what the filter adds (m,) to values d (m,) of domains that have crossed some cells (m,)."""
-        shape = tuple(self._count)
-        number = np.ravel_multi_index(tuple(self._index(ids - self._start).T), shape)
-        return _change(comm, shape, number, np.stack([d, crossed], axis=1), np.inf)[:, 0]
+        if self._count is None:
+            return np.zeros_like(d)
+        number = np.ravel_multi_index(tuple(self._body.place(ids - self._start).T), self._count)
+        return _change(comm, self._count, number, np.stack([d, crossed], axis=1), np.inf)[:, 0]
 
 
 def _change(

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.bodies import Body
+from mpm_dolfinx.points.cutting import corner_bits
 from mpm_dolfinx.points.faces import interpolate
 from mpm_dolfinx.points.grid import rounding
 from mpm_dolfinx.points.material_points import MaterialPoints
@@ -104,15 +105,33 @@ def probes(bodies: Sequence[Body], x0: ArrayLike, *, stress: bool = False) -> Pr
     """
     all_of("probes: bodies", bodies, Body, 1)
     flag("probes: stress", stress)
-    x0 = positions(x0, bodies[0].lower.shape[1])
-    centre = np.concatenate([b.centre for b in bodies])
+    x0 = positions(x0, bodies[0].dim)
+    lower = np.concatenate([b.lower for b in bodies])
     spacing = np.concatenate([np.broadcast_to(b.spacing, b.lower.shape) for b in bodies])
-    ids = np.empty(len(x0), dtype=np.int64)
+    start = np.cumsum([0, *map(len, bodies)])
+    ids, xi = np.empty(len(x0), dtype=np.int64), np.empty(x0.shape)
     for i, x in enumerate(x0):  # a handful of positions, once a scene
-        far = np.abs((centre - x) / spacing).max(axis=1)
-        ids[i] = np.flatnonzero(far <= far.min() + 1e-9)[0]
-    xi = 2 * (x0 - centre[ids]) / spacing[ids]
-    far = np.flatnonzero((np.abs(xi) > 1 + 1e-9 + 2 * rounding(x0) / spacing[ids]).any(axis=1))
-    if len(far):
-        raise ValueError(f"probe at {x0[far[0]]}: outside the bodies, must be in one or on its surface")
+        slack = 1e-9 + 2 * rounding(x0) / spacing
+        near = np.flatnonzero((np.abs((x - lower) / spacing - 0.5) <= 0.5 + slack).all(axis=1))
+        of = np.searchsorted(start, near, side="right") - 1
+        corners = [bodies[k].reference(near[of == k] - start[k]) for k in np.unique(of)]
+        place = coordinates(np.concatenate([*corners, np.empty((0, 2 ** len(x), len(x)))]), x)
+        on = np.flatnonzero((np.abs(place) <= 1 + 2 * slack[near]).all(axis=1))
+        if not len(on):
+            raise ValueError(f"probe at {x}: outside the bodies, must be in one or on its surface")
+        ids[i], xi[i] = near[on[0]], place[on[0]]
     return Probes(x0, ids, xi, tuple(bodies), stress)
+
+
+def coordinates(corners: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the coordinates (n, d), from -1 to 1, of a place x (d,), m, in each of some domains (n, 2^d, d), m."""
+    signs, xi = 2 * corner_bits(len(x)) - 1, np.zeros((len(corners), len(x)))
+    for _ in range(20):  # Newton's method; of parallelepipeds the first step is exact
+        hats = 0.5 * (1 + signs * xi[:, None, :])
+        dN = np.stack([0.5 * signs[:, a] * np.delete(hats, a, axis=2).prod(axis=2) for a in range(len(x))], axis=2)
+        slope, off = np.einsum("nkd,nka->nda", corners, dN), x - interpolate(corners, xi)
+        step = (np.linalg.pinv(slope) @ off[:, :, None])[:, :, 0]  # outside a domain there may be no place
+        xi = np.clip(xi + step, -2.0, 2.0)
+        if np.abs(step).max(initial=0.0) < 1e-14:
+            break
+    return xi

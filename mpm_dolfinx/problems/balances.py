@@ -54,7 +54,7 @@ def balances(scene: Scene, start: Start, acting: Acting, before: Rates | None = 
     if scene.storage is None:
         return Balances(momentum, None)
     weight = None if acting.gravity is None else scene.fluid.density * acting.gravity
-    flow = matrices.flow(start.state, weight, start.data)
+    flow = matrices.flow(start.state, weight, start.data, acting.t)
     lost = before and before.taken(substep.before * dt)
     options = (on_grid.contents, flow, substep.own * dt, lost, on_grid.softness(start.state))
     return Balances(momentum, StorageProblem(scene.storage, matrices.storage, start.data.pieces, *options))

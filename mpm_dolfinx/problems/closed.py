@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.faces import Surface
 from mpm_dolfinx.points.grid import SIDES, Grid
-from mpm_dolfinx.problems.conditions import Pressure
+from mpm_dolfinx.problems.conditions import Pressure, by_place
 
 SAME = 1e-6  # cells: corners this close are one
 
@@ -35,6 +35,8 @@ def closed(grid: Grid, free: NDArray[np.bool_], pressures: Sequence[tuple[Pressu
     """
     if not pressures:
         return True
+    if any(by_place(pressure.value) for pressure, _ in pressures):
+        return False
     groups: dict[float, list[Surface]] = {}
     for pressure, faces in pressures:
         groups.setdefault(id(pressure.value) if callable(pressure.value) else float(pressure.value), []).append(faces)

@@ -2,8 +2,20 @@
 """Conditions on the sides of the bodies: tractions, pressures, displacements, plates, drained sides, prescribed inflow.
 
 A side is named "left", "right", "bottom" or "top", in 3D also "front" (lower y) and "back" (upper y), by where it is
-in the seeded body, before a map; it moves with the body.  What of it lies on another body, as seeded, does not count.
+in the seeded body, before a map; sides of a mesh as it names them (`from_mesh`).  It moves with the body.  What of it
+lies on another body, as seeded, does not count.
 Regions and X are reference positions, before all maps (`mapped`); areas are those as seeded, after them.
+
+Functions are called with those of these arguments that they name; one of a single argument, of another name, has t:
+
+t
+    Time, s: the ends of the substeps, see `time_integration`.
+X : (m, d), m
+    Reference positions of m places on the side.
+x : (m, d), m
+    Where these are at the start of the step, as for a water level.
+
+A function of places gives a number, or one for each place (m,), of tractions also vectors (m, d).
 
 What is wrong with a condition is said, with a ValueError, when a scene or a stage is made with it, of functions of time
 at the step that asks for it.  A condition equals only itself: values and regions may be arrays and functions, which
@@ -14,13 +26,68 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from inspect import signature
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mpm_dolfinx.points.faces import Region
-from mpm_dolfinx.points.grid import side
+from mpm_dolfinx.points.faces import Region, Surface
 from mpm_dolfinx.validation import asked, flag, line, numbers
+
+Places = Callable[[str], NDArray[np.float64]]
+"""Gives positions (m, d), m, on a side by their name, "X" or "x"."""
+PLACES = ("X", "x")
+
+
+def arguments(function: Callable) -> list[str]:
+    """Return those of t, X and x with which a function is called; ["t"] where its only argument has another name."""
+    try:
+        wanted = [
+            p.name for p in signature(function).parameters.values() if p.default is p.empty and p.kind != p.VAR_KEYWORD
+        ]
+    except ValueError:  # numpy's functions have none
+        return ["t"]
+    names = [name for name in wanted if name in ("t", *PLACES)]
+    return names if len(names) == len(wanted) else ["t"] * len(wanted)
+
+
+def by_place(value) -> bool:
+    """Return whether a value is a function of places."""
+    return callable(value) and bool(set(PLACES) & set(arguments(value)))
+
+
+def given(condition, name: str, t: float, side: Places | None, dim: int = 0) -> NDArray[np.float64]:
+    """Return a value of a condition at time t (s): of shape (), or (m,) of m places; with a dimension (d,), or (m, d).
+
+    Parameters
+    ----------
+    condition, name
+        The condition, and which of its values.
+    side
+        Gives the places; None where there are none.
+    dim
+        Number of components that it may have.
+
+    Raises
+    ------
+    ValueError
+        Naming the condition, what its value is, and what is allowed.
+    """
+    value, what = getattr(condition, name), f"{line(condition)}: {name} at t = {t:g} s"
+    vectors = f" or {dim} of them" if dim else ""
+    allowed, shapes = f"a finite number{vectors}", [(), *[(dim,)] * bool(dim)]
+    if callable(value):
+        wanted = arguments(value)
+        if wanted.count("t") > 1 or (by_place(value) and side is None):
+            raise ValueError(f"{what}: must be a function of t" + (", X and x" if side is not None else " alone"))
+        places = [side(k) for k in wanted if k in PLACES]
+        if places and not len(places[0]):  # a function need not have an answer for no places
+            return np.zeros(0)
+        if places:
+            allowed = f"a finite number{vectors} for each of {len(places[0])} places, or a number"
+            shapes = [(), (len(places[0]),), *[places[0].shape] * bool(dim)]
+        value = asked(what, allowed, value, *(t if k == "t" else side(k) for k in wanted))
+    return numbers(what, value, *shapes, allowed=allowed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,8 +97,9 @@ class Traction:
     Parameters
     ----------
     side
-        Side of the bodies: "left", "right", "bottom", "top", in 3D also "front" (lower y) and "back" (upper y).
-    value : (d,) or number, or callable t (s) -> (d,) or number, Pa
+        Side of the bodies: "left", "right", "bottom", "top", in 3D also "front" (lower y) and "back" (upper y); of
+        bodies from meshes as these name it.  Where several bodies have one of this name it is all of them.
+    value : (d,) or number, or callable (t, X, x) -> (d,) or number, Pa
         Force per reference area; a number acts along the outward normal at the start of the step, negative: presses.
         Several tractions on one face add up.
     region : ((d,), (d,)), m
@@ -45,14 +113,12 @@ class Traction:
     """
 
     side: str
-    value: ArrayLike | Callable[[float], ArrayLike]
+    value: ArrayLike | Callable[..., ArrayLike]
     region: Region | None = None
 
-    def at(self, t: float, dim: int) -> NDArray[np.float64]:
-        """Return the traction (d,), or () along the normal, at time t (s), Pa, in a dimension."""
-        name, allowed = f"{line(self)}: value at t = {t:g} s", f"a finite number or {dim} of them"
-        value = asked(name, f"{allowed} for a time", self.value, t) if callable(self.value) else self.value
-        return numbers(name, value, (), (dim,), allowed=allowed)
+    def at(self, t: float, dim: int, side: Places | None = None) -> NDArray[np.float64]:
+        """Return the traction (d,) or (m, d), or () or (m,) along the normal, at time t (s), Pa, in a dimension."""
+        return given(self, "value", t, side, dim)
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,8 +134,8 @@ class Pressure:
     ----------
     side
         Side of the bodies, as for `Traction`.
-    value : float or callable t (s) -> float, Pa
-        Finite; positive: presses, negative: sucks.
+    value : float or callable (t, X, x) -> float, Pa
+        Finite; positive: presses, negative: sucks.  With functions of places the tangent is unsymmetric.
     region : ((d,), (d,)), m
         As for `Traction`.
 
@@ -80,29 +146,28 @@ class Pressure:
     """
 
     side: str
-    value: float | Callable[[float], float]
+    value: float | Callable[..., ArrayLike]
     region: Region | None = None
 
-    def at(self, t: float) -> float:
-        """Return the pressure at time t (s), Pa."""
-        name, allowed = f"{line(self)}: value at t = {t:g} s", "a finite number"
-        value = asked(name, f"{allowed} for a time", self.value, t) if callable(self.value) else self.value
-        return float(numbers(name, value, allowed=allowed))
+    def at(self, t: float, side: Places | None = None) -> NDArray[np.float64]:
+        """Return the pressure () or (m,) at time t (s), Pa."""
+        return given(self, "value", t, side)
 
 
 @dataclass(frozen=True, eq=False)
 class Drained:
     """Side of the bodies, moving with them, at which the pore pressure is given.
 
+    What leaves through it is in the simulation's `outflows`.
+
     Parameters
     ----------
     side
         Side of the bodies, as for `Traction`.
-    pressure
-        Outer pore pressure, Pa, finite; the same on the whole side and at all times of a stage.
+    pressure : float or callable (t, X, x) -> float, Pa
+        Outer pore pressure, finite: under a water level, lambda t, x: 9810 * np.maximum(level(t) - x[:, 1], 0).
     region : ((d,), (d,)), m
         Box of reference positions to which the drained faces are limited.
-        What leaves through it is in `outflows` of the simulation.
     seepage
         A seepage face: where the outer pressure is not positive, as above a water level, water leaves but does not
         enter.  There the pressure is at most the outer one, or nothing flows.
@@ -115,13 +180,18 @@ class Drained:
     """
 
     side: str
-    pressure: float = 0.0
+    pressure: float | Callable[..., ArrayLike] = 0.0
     region: Region | None = None
     seepage: bool = False
 
     def __post_init__(self):
         flag("Drained: seepage", self.seepage)
-        numbers("Drained: pressure", self.pressure)
+        if not callable(self.pressure):
+            numbers("Drained: pressure", self.pressure)
+
+    def at(self, t: float, side: Places | None = None) -> NDArray[np.float64]:
+        """Return the pressure () or (m,) at time t (s), Pa."""
+        return given(self, "pressure", t, side)
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,8 +202,8 @@ class Inflow:
     ----------
     side
         Side of the bodies, as for `Traction`.
-    flux
-        Volume per present area and time into the body, m/s, finite; negative: out of it.
+    flux : float or callable (t, X, x) -> float, m/s
+        Volume per present area and time into the body, finite; negative: out of it.
     region : ((d,), (d,)), m
         Box of reference positions to which the faces are limited.
 
@@ -144,11 +214,16 @@ class Inflow:
     """
 
     side: str
-    flux: float
+    flux: float | Callable[..., ArrayLike]
     region: Region | None = None
 
     def __post_init__(self):
-        numbers("Inflow: flux", self.flux)
+        if not callable(self.flux):
+            numbers("Inflow: flux", self.flux)
+
+    def at(self, t: float, side: Places | None = None) -> NDArray[np.float64]:
+        """Return the flux () or (m,) at time t (s), m/s."""
+        return given(self, "flux", t, side)
 
 
 RIGIDITY = 1e4
@@ -240,11 +315,8 @@ class RigidPlate:
         if not callable(self.force):
             numbers("RigidPlate: force", self.force)
 
-    def traction(self, area: float, dim: int) -> Traction:
-        """Return the even traction of the plate on its reference area, m^(d-1)."""
-        axis, end = side(self.side, dim)
-        inward = np.zeros(dim)
-        inward[axis] = 1 - 2 * end
+    def traction(self, area: float, inward: NDArray[np.float64]) -> Traction:
+        """Return the even traction of the plate, along a direction (d,), on its reference area, m^(d-1)."""
 
         def even(t: float) -> NDArray[np.float64]:
             name = f"{line(self)}: force at t = {t:g} s"
@@ -252,3 +324,16 @@ class RigidPlate:
             return inward * numbers(name, force) / area
 
         return Traction(self.side, even, self.region)
+
+
+def facing(faces: Surface) -> tuple[int, int]:
+    """Return along which axis faces look, as seeded, and with which sign."""
+    outward = faces.outward.sum(axis=0)
+    axis = int(np.abs(outward).argmax())
+    return axis, int(np.sign(outward[axis]))
+
+
+def inward(faces: Surface) -> NDArray[np.float64]:
+    """Return the direction (d,) along an axis that faces look away from, as seeded."""
+    axis, sign = facing(faces)
+    return -sign * np.eye(faces.outward.shape[1])[axis]

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from itertools import combinations
 
 import numpy as np
@@ -14,7 +15,7 @@ from mpm_dolfinx.points.cutting import SNAP
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.problems.conditions import Drained, Inflow
 from mpm_dolfinx.problems.fluxes import CellContents, OpenSides
-from mpm_dolfinx.problems.sides import Sides, check_apart
+from mpm_dolfinx.problems.sides import Sides, check_apart, everywhere, on_side
 
 
 class HydraulicBoundary:
@@ -36,11 +37,13 @@ class HydraulicBoundary:
     def __init__(self, sides: Sides, outlets: Sequence[Drained | Inflow]):
         self._grid = sides.grid
         self.outlets = [(outlet, sides.of(outlet)) for outlet in outlets]
+        self.varies = any(callable(o.flux if isinstance(o, Inflow) else o.pressure) for o in outlets)
+        """Whether what the sides give depends on time or place."""
         for one, other in combinations(self.outlets, 2):
             check_apart(*one, *other)
 
-    def data(self, cut: CutDomains, points: MaterialPoints, contents: CellContents) -> OpenSides:
-        """Return the open sides where they were cut."""
+    def data(self, cut: CutDomains, points: MaterialPoints, contents: CellContents, t: float) -> OpenSides:
+        """Return the open sides where they were cut, with what they give at time t (s)."""
         grid = self._grid
         none, vectors = np.empty(0), np.empty((0, grid.dim))
         whole, cells = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int32)
@@ -50,13 +53,15 @@ class HydraulicBoundary:
             travel = Exchange(grid.comm, grid.owner(patches.cell))
             cell = grid.local(travel.send(patches.cell))
             area, x = travel.send(patches.area(points)), travel.send(patches.x)
+            value = partial(outlet.at, t, on_side(patches, points))
+            value = travel.send(np.resize(everywhere(grid, value), len(patches.x)))
             size = np.linalg.norm(area, axis=1)
             number, none, normal = np.full(len(cell), i), np.zeros(len(cell)), area / size[:, None]
             reach = x - grid.midpoints[cell] - contents.centroid[cell]
             if isinstance(outlet, Inflow):
-                rows.append((number, cell, none, none, outlet.flux * size, none > 0, normal, reach))
+                rows.append((number, cell, none, none, value * size, none > 0, normal, reach))
                 continue
             distance = np.einsum("md,md->m", reach, normal)
-            shape, outer = size / np.maximum(distance, SNAP * grid.h.min()), np.full(len(cell), outlet.pressure)
-            rows.append((number, cell, shape, outer, none, outlet.seepage & (outer <= 0), normal, reach))
+            shape = size / np.maximum(distance, SNAP * grid.h.min())
+            rows.append((number, cell, shape, value, none, outlet.seepage & (value <= 0), normal, reach))
         return OpenSides(*map(np.concatenate, zip(*rows, strict=True)))

@@ -23,10 +23,19 @@ from mpm_dolfinx.points.faces import Surface, face_vectors
 from mpm_dolfinx.points.grid import sum_by
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.problems.closed import closed
-from mpm_dolfinx.problems.conditions import RIGIDITY, Displacement, Pressure, RigidPlate, Traction
+from mpm_dolfinx.problems.conditions import (
+    RIGIDITY,
+    Displacement,
+    Pressure,
+    RigidPlate,
+    Traction,
+    by_place,
+    facing,
+    inward,
+)
 from mpm_dolfinx.problems.held_cells import SAME, HeldCells, HeldPoints
 from mpm_dolfinx.problems.side_forms import SideData, SideForms
-from mpm_dolfinx.problems.sides import Sides, check_apart, gathered, meeting
+from mpm_dolfinx.problems.sides import Sides, check_apart, everywhere, gathered, meeting, on_side
 from mpm_dolfinx.validation import line
 
 
@@ -64,7 +73,7 @@ class MechanicalBoundary:
         self.plates = [(plate, sides.of(plate)) for plate in plates]
         self.pressures = [(load, sides.of(load)) for load in tractions if isinstance(load, Pressure)]
         tractions = [load for load in tractions if not isinstance(load, Pressure)]
-        tractions += [plate.traction(faces.area0.sum(), d) for plate, faces in self.plates]
+        tractions += [plate.traction(faces.area0.sum(), inward(faces)) for plate, faces in self.plates]
         self.loads = [(load, sides.of(load)) for load in tractions]
         self.holds = [(hold, sides.of(hold), hold.axes(d)) for hold in displacements]
         self._meeting: list[tuple[Displacement, Displacement, list[int], NDArray[np.float64]]] = []
@@ -98,15 +107,18 @@ class MechanicalBoundary:
         """Return the dead loads on the surface."""
         patches = [cut.surface(faces) for _, faces in self.loads]
         travel, places = self._loaded(cut.key, lambda: self._loaded_places(patches), self.grid.comm)
-        forces = [_force(load, t, p, points) for (load, _), p in zip(self.loads, patches, strict=True)]
-        force = travel.send(np.concatenate(forces))
+        loads = zip(self.loads, patches, strict=True)
+        forces = everywhere(self.grid, lambda: np.concatenate([_force(load, t, p, points) for (load, _), p in loads]))
+        force = travel.send(forces)
         return PointData(forms.loads, places, np.ones(len(force)), {"force": force})
 
     def _pressure_data(self, forms: SideForms, cut: CutDomains, points: MaterialPoints, t: float) -> PointData:
         """Return the pressures on the surface, with their forces on its area at the start of the step."""
         patches = [cut.surface(faces) for _, faces in self.pressures]
         travel, places = self._pressed(cut.key, lambda: self._loaded_places(patches), self.grid.comm)
-        forces = [-pressure.at(t) * p.area(points) for (pressure, _), p in zip(self.pressures, patches, strict=True)]
+        pressures = zip(self.pressures, patches, strict=True)
+        values = everywhere(self.grid, lambda: [of.at(t, on_side(p, points)) for (of, _), p in pressures])
+        forces = [-value[..., None] * p.area(points) for value, p in zip(values, patches, strict=True)]
         push = travel.send(np.concatenate(forces))
         return PointData(forms.pressures, places, np.ones(len(push)), {"push": push})
 
@@ -124,8 +136,9 @@ class MechanicalBoundary:
             area = patches.area(points)
             length = faces.area0.sum() ** (1 / (d - 1))
             rigidity = RIGIDITY * self._materials.stiffest * length * np.linalg.norm(area, axis=1, keepdims=True)
-            normal = np.tile(np.eye(d)[faces.axis], (len(area), 1))
-            tilt = normal - area / area[:, [faces.axis]]  # slope of the face: its normal is (-slope, 1)
+            axis = facing(faces)[0]
+            normal = np.tile(np.eye(d)[axis], (len(area), 1))
+            tilt = normal - area / area[:, [axis]]  # slope of the face: its normal is (-slope, 1)
             rows.append((patches.cell, patches.x, np.concatenate([rigidity, normal, tilt], axis=1)))
         cell, x, values = gathered(self.grid, rows, 1 + 2 * d)
         rigidity, normal, tilt = np.split(values, [1, 1 + d], axis=1)
@@ -181,14 +194,7 @@ class MechanicalBoundary:
 
     def _given(self, hold: Displacement, t: float, X: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the displacements (m, d), m, that a side is given at places X (m, d) of this process."""
-        message, value = "", None
-        try:
-            value = hold.at(t, X)
-        except ValueError as error:
-            message = str(error)
-        if message := first(self.grid.comm, message):
-            raise ValueError(message)
-        return value
+        return everywhere(self.grid, lambda: hold.at(t, X))
 
     def reactions(self, sides: SideData, u: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the forces (displacements, d), N, of the given displacements at nodal values u (nodes, d), m."""
@@ -224,26 +230,30 @@ class MechanicalBoundary:
         index = np.arange(2**self.grid.dim)
         for _, faces, _ in self.holds:
             held = np.flatnonzero(np.isin(ids, faces.id))
-            outward = face_vectors(tracked[held], faces.axis, faces.end)
+            number = faces.face[np.searchsorted(faces.id, ids[held])]  # of a domain with two held faces the first
+            axis, end = (k[:, None] for k in np.divmod(number, 2))
+            outward = face_vectors(tracked[held], number)
             depth = volume[held, None] * outward / (outward**2).sum(axis=1, keepdims=True)
-            face = index ^ ((index >> faces.axis & 1 ^ faces.end) << faces.axis)  # of each corner: that on the face
-            corners[held] = tracked[held][:, face] - np.where((face != index)[:, None], depth[:, None], 0.0)
+            face = index ^ ((index >> axis & 1 ^ end) << axis)  # of each corner: that on the face
+            there = np.take_along_axis(tracked[held], face[:, :, None], axis=1)
+            corners[held] = there - np.where((face != index)[:, :, None], depth[:, None], 0.0)
         return corners
 
 
 def _force(load: Traction, t: float, patches: Patches, points: MaterialPoints) -> NDArray[np.float64]:
     """Return the forces (n, d), N, of a traction at time t (s) on the points of integration of its side."""
-    traction = load.at(t, points.x.shape[1])
-    if traction.ndim == 0:
+    traction = load.at(t, points.x.shape[1], on_side(patches, points))
+    if traction.ndim == 0 or (traction.ndim == 1 and by_place(load.value)):  # along the normal
         area = patches.area(points)
-        traction = traction * area / np.linalg.norm(area, axis=1, keepdims=True)
+        traction = traction[..., None] * area / np.linalg.norm(area, axis=1, keepdims=True)
     return patches.area0[:, None] * traction
 
 
 def _check_flat(plate: RigidPlate, faces: Surface) -> None:
     """Refuse a plate on faces that are not one flat, connected side as seeded: each part would move by itself."""
-    corners, tangential = faces.places(), np.arange(faces.X.shape[2]) != faces.axis
-    low, high, height = corners.min(axis=1)[:, tangential], corners.max(axis=1)[:, tangential], corners[..., faces.axis]
+    corners, axis = faces.places(), facing(faces)[0]
+    tangential = np.arange(corners.shape[2]) != axis
+    low, high, height = corners.min(axis=1)[:, tangential], corners.max(axis=1)[:, tangential], corners[..., axis]
     X, extent = (low + high) / 2, high - low
     size = extent.max(axis=0)
     apart = np.flatnonzero(np.abs(height - height[0, 0]).max(axis=1) > 1e-6 * size.min())

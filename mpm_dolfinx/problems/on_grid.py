@@ -137,12 +137,12 @@ class OnGrid(Keyed):
         return np.divide(contents.total(cells, store * pressure), held, out=mean, where=held > 0)
 
     def pressures_at_pieces(
-        self, reconstruction: Reconstruction, store: NDArray[np.float64], stage: Stage
+        self, reconstruction: Reconstruction, store: NDArray[np.float64], stage: Stage, t: float
     ) -> list[NDArray[np.float64]]:
         """Return the pressures (m,), their slopes (m, d) and bounds (m, 2) at the pieces, as `set_pressures` has set.
 
         Their mean in a cell is the cell's pressure: by `store` (m,), m^d/Pa, what the pieces store, or by their volumes
-        in a cell that stores nothing.
+        in a cell that stores nothing.  t, s: time at which drained sides have their pressures.
         """
         pieces, contents, p = self.data.pieces, self.contents, self._storage.p_n.x.array
         cells, offset, at = pieces.cells, pieces.places.offset, contents.slot(pieces.cells)
@@ -150,7 +150,7 @@ class OnGrid(Keyed):
         weight = np.where(contents.total(cells, store)[at] > 0, store, self.weight)
         total = contents.total(cells, weight)
         origin = np.stack([contents.total(cells, weight * x) / total for x in offset.T], axis=1)
-        slope, bounds = reconstruction(*self._held(p, stage), origin)
+        slope, bounds = reconstruction(*self._held(p, stage, t), origin)
         rise, here = np.einsum("md,md->m", slope[at], offset - origin[at]), p[contents.filled]
         share = share_within(rise, *(bounds.T - here), at)  # drained sides may be aslant in their cells
         slope, pressure = slope * share[:, None], p[cells] + share[at] * rise
@@ -161,15 +161,18 @@ class OnGrid(Keyed):
         data = state.points.data
         return self.cut.to_cells(data["softness"]) if "softness" in data else 1.0
 
-    def pressures_up_to_surface(self, reconstruction: Reconstruction, stage: Stage) -> NDArray[np.float64]:
-        """Return the pressures (m,), Pa, at the pieces' centroids; their mean by volume in a cell is the cell's."""
-        places, held = self._places.pieces, self._held(self._storage.p.x.array, stage)
+    def pressures_up_to_surface(self, reconstruction: Reconstruction, stage: Stage, t: float) -> NDArray[np.float64]:
+        """Return the pressures (m,), Pa, at the pieces' centroids; their mean by volume in a cell is the cell's.
+
+        t, s: time at which drained sides have their pressures.
+        """
+        places, held = self._places.pieces, self._held(self._storage.p.x.array, stage, t)
         return self.cut.to_pieces(reconstruction.up_to_surface(*held, places.offset, places.slots))
 
-    def _held(self, p: NDArray[np.float64], stage: Stage) -> tuple:
+    def _held(self, p: NDArray[np.float64], stage: Stage, t: float) -> tuple:
         """Return what slopes of cells with these pressures are drawn from."""
         contents = self.contents
-        sides = stage.hydraulic.data(self.cut, self.cut.points, contents)
+        sides = stage.hydraulic.data(self.cut, self.cut.points, contents, t)
         outer = sides.ahead(contents.slot(sides.cells), p[contents.filled])
         return contents.filled, p, contents.centroid, contents.open, outer
 
@@ -276,7 +279,9 @@ class Assembled:
         if self.storage is not None:
             self.storage.set_alternation()
 
-    def flow(self, state: State, weight: NDArray[np.float64] | None, data: QuadratureData) -> Callable[[bool], Outflow]:
+    def flow(
+        self, state: State, weight: NDArray[np.float64] | None, data: QuadratureData, t: float
+    ) -> Callable[[bool], Outflow]:
         """Return what assembles the fluxes at u, called with whether a step begins.
 
         Where points stay in their cells, and nothing but u would change the fluxes, they are those of the start.
@@ -289,10 +294,13 @@ class Assembled:
             Of the fluid, if there is gravity.
         data
             The pieces.
+        t
+            Time at which open sides have their pressures and fluxes, s.
         """
         on_grid, contents, grid, u = self._on_grid, self._on_grid.contents, self._on_grid.cut.grid, self._u
-        at = on_grid.cut.points if weight is None else state.points  # gravity may change with time
-        sides = partial(self._stage.hydraulic.data, on_grid.cut, at, contents)
+        hydraulic, varies = self._stage.hydraulic, (t,) if self._stage.hydraulic.varies else ()
+        at = state.points if weight is not None or varies else on_grid.cut.points  # gravity may change with time
+        sides = partial(hydraulic.data, on_grid.cut, at, contents, t)
 
         def mobility(begins: bool) -> Mobility:
             if self._varies:
@@ -304,7 +312,9 @@ class Assembled:
 
         if state.stay and not self._varies:
             stays = (None, None)
-            outflow = self._outflow((at, weight), lambda: set_fluxes(sides(), mobility(True), *stays), grid.comm)
+            outflow = self._outflow(
+                (at, weight, *varies), lambda: set_fluxes(sides(), mobility(True), *stays), grid.comm
+            )
             return lambda begins: outflow
         placed = sides()
 
@@ -312,7 +322,7 @@ class Assembled:
             return set_fluxes(placed, mobility(begins), *contents.motion(u.x.array.reshape(-1, grid.dim)))
 
         # a substep begins where the one before it has ended
-        at_u = (data.pieces.key, weight)
+        at_u = (data.pieces.key, weight, *varies)
         return lambda begins: self._outflow((*at_u, u.x.array.copy()), lambda: at_present(begins), grid.comm)
 
 

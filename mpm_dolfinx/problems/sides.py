@@ -3,16 +3,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from mpm_dolfinx.parallel.exchange import Exchange
+from mpm_dolfinx.parallel.exchange import Exchange, first
 from mpm_dolfinx.points.bodies import Body
+from mpm_dolfinx.points.cut_domains import Patches
 from mpm_dolfinx.points.faces import Surface, limits, surface
 from mpm_dolfinx.points.grid import Grid, rounding
+from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.problems.conditions import Places
 from mpm_dolfinx.validation import line
 
 
@@ -42,6 +45,23 @@ class Sides:
         return self._found[key]
 
 
+def everywhere(grid: Grid, ask: Callable[[], NDArray[np.float64]]) -> NDArray[np.float64]:
+    """Return what functions of the user's give on this process; raise on all what is raised on one."""
+    message, value = "", None
+    try:
+        value = ask()
+    except ValueError as error:
+        message = str(error)
+    if message := first(grid.comm, message):
+        raise ValueError(message)
+    return value
+
+
+def on_side(patches: Patches, points: MaterialPoints) -> Places:
+    """Return what gives the places at which functions of the user's are asked on a side."""
+    return lambda name: patches.X if name == "X" else patches.now(points)
+
+
 def gathered(grid: Grid, rows: Sequence[tuple], width: int) -> tuple[NDArray, NDArray, NDArray]:
     """Send (cells, positions, values) to the owners of the cells; return (owned cells, positions, values)."""
     empty = (np.empty(0, dtype=np.int64), np.empty((0, grid.dim)), np.empty((0, width)))
@@ -53,14 +73,14 @@ def gathered(grid: Grid, rows: Sequence[tuple], width: int) -> tuple[NDArray, ND
 
 def check_apart(one, faces: Surface, other, others: Surface) -> None:
     """Refuse two conditions, of a kind that excludes the other, on the same part of a face."""
-    if (faces.axis, faces.end) != (others.axis, others.end):
-        return
     first, stop = (np.searchsorted(others.id, faces.id, end) for end in ("left", "right"))
-    a = np.repeat(np.arange(len(faces)), stop - first)  # all pairs of parts of one face
+    a = np.repeat(np.arange(len(faces)), stop - first)  # all pairs of parts of one domain's faces
     b = np.arange(len(a)) - np.repeat(np.cumsum(stop - first) - stop, stop - first)
+    same = faces.face[a] == others.face[b]
+    a, b = a[same], b[same]
     low, high = np.maximum(faces.X[a, 0], others.X[b, 0]), np.minimum(faces.X[a, 1], others.X[b, 1])
-    common = high - low > 1e-9 * (faces.X[a, 1] - faces.X[a, 0])
-    common[:, faces.axis] = True
+    size = faces.X[a, 1] - faces.X[a, 0]
+    common = (high - low > 1e-9 * size) | (size <= 1e-9 * size.max(axis=1, keepdims=True))  # they lie across this axis
     both = np.flatnonzero(common.all(axis=1))
     if len(both):
         x = (low[both[0]] + high[both[0]]) / 2
@@ -76,12 +96,12 @@ def meeting(bodies: Sequence[Body], one: Surface, other: Surface) -> NDArray[np.
     def corners(faces: Surface) -> NDArray[np.float64]:
         body = np.searchsorted(np.cumsum([len(b) for b in bodies]), faces.id, side="right")
         moved = np.array([i if b.map is not None else -1 for i, b in enumerate(bodies)])[body]
-        X = faces.reference_corners()
+        X = faces.corners
         return np.concatenate([X, np.broadcast_to(moved[:, None, None], (*X.shape[:2], 1))], axis=2).reshape(
             -1, dim + 1
         )
 
-    dim = bodies[0].lower.shape[1]
+    dim = bodies[0].dim
     x, near = corners(other), 1e-9 * min(b.spacing.min() for b in bodies) + rounding(one.X)
     distance, _ = cKDTree(corners(one)).query(x, distance_upper_bound=near)
     return x[distance <= near, :dim]

@@ -26,8 +26,8 @@ def warn_thin(grid: Grid, bodies: Sequence[Body], fixed: Mapping[str, str]) -> N
     """
     for i, body in enumerate(bodies):
         for axis, letter in enumerate("xyz"[: grid.dim]):
-            n = len(body) / max(1, int(body.sides[:, axis, 0].sum()))
-            if body.spacing[axis] > COARSE * grid.h[axis] and n <= FEW and _bends(grid, bodies, i, axis, fixed):
+            n, spacing = body.across(axis)
+            if spacing > COARSE * grid.h[axis] and n <= FEW and _bends(grid, bodies, i, axis, fixed):
                 much = f"it bends {1 / (n**2 - 1):.0%} too much" if n > 1 else "it carries no moment and creeps"
                 what = "body %d: %.3g point%s over its thickness along %s, in cells of %.3g m: %s; take per_cell >= 2"
                 warn(grid.comm, what, i, n, "s" if n > 1 else "", letter, grid.h[axis], much)
@@ -45,7 +45,7 @@ def _bends(grid: Grid, bodies: Sequence[Body], i: int, axis: int, fixed: Mapping
         wall = (grid.lower, grid.upper)[end][axis]
         if "xyz"[axis] in fixed.get(name, "") and np.abs(at - wall).min() < 1e-9 * grid.h[axis]:
             return False
-        own = Faces.of(body, axis, end, np.flatnonzero(body.sides[:, axis, end]))
+        own = Faces.of(body, *body.facing(axis, end))
         others = (Faces.around(other) for other in bodies if other is not body)
         if sum(covered(len(own.row), covers(own, other)).sum() for other in others) > len(own.row) / 2:
             return False

@@ -164,7 +164,10 @@ class BiotFEM:
         for load in tractions:
             if not callable(load.value):
                 self._traction(load, 0.0)
-        tractions = [*tractions, *(plate.traction(area, self.grid.dim) for plate, area in self._plates)]
+        tractions = [*tractions, *(plate.traction(area, self._inward(plate.side)) for plate, area in self._plates)]
+        for outlet in drained:
+            if callable(outlet.pressure):
+                raise ValueError(f"{line(outlet)}: the reference's pressures must be numbers")
         outlets = drained if element == "q1-dg0" else None
         with compiling(f"{type(material).__name__}, terms, sources", "UFL, terms linear in v or energies of u"):
             self._forms = self._compile(tractions, outlets, gravity, terms, sources)
@@ -209,6 +212,11 @@ class BiotFEM:
                 raise ValueError(f"fixed side {name!r}: components {held!r}, must be some of {axes!r}")
             bcs += [self._prescribe(space.sub(axes.index(a)), 0.0, name) for a in held]
         return bcs + [self._prescribe(self._space.W.sub(1), o.pressure / self.scale, o.side, o.region) for o in drained]
+
+    def _inward(self, name: str) -> NDArray[np.float64]:
+        """Return the direction (d,) that a side looks away from."""
+        axis, end = side(name, self.grid.dim)
+        return (1 - 2 * end) * np.eye(self.grid.dim)[axis]
 
     def _area(self, condition: RigidPlate) -> float:
         """Return the area of the part of a side that a condition names (m^(d-1))."""
@@ -399,7 +407,7 @@ class BiotFEM:
     def _traction(self, load: Traction | Pressure, t: float) -> NDArray[np.float64] | float:
         """Return the components (d,), Pa, of a traction at time t, s, or a pressure."""
         if isinstance(load, Pressure):
-            return load.at(t)
+            return float(load.at(t))
         value = load.at(t, self.grid.dim)
         if not value.ndim:
             raise ValueError(

@@ -1,0 +1,34 @@
+# SPDX-License-Identifier: MIT
+"""Run a slope of triangles on a layer of quadrilaterals on however many processes there are; write the state."""
+
+import sys
+
+import numpy as np
+from meshes import box_mesh
+
+import mpm_dolfinx as mpm
+
+grid = mpm.Grid([1.2, 1.2], [12, 12])
+slope = box_mesh(
+    "triangle", (6, 4), (0, 0), (1, 1), place=lambda x: np.stack([x[:, 0] * (1 - 0.4 * x[:, 1]), x[:, 1] / 2 + 0.4], 1)
+)
+bodies = [mpm.from_mesh(grid, box_mesh("quad", (13, 4), (0, 0), (1.2, 0.4))), mpm.from_mesh(grid, slope)]
+soil = mpm.Hencky(bulk=1e6, shear=6e5, conductivity=1e-5)
+simulation = mpm.Simulation(
+    grid,
+    bodies,
+    [soil],
+    fluid=mpm.Fluid(),
+    fixed={"left": "x", "right": "x", "bottom": "y"},
+    tractions=[mpm.Traction("top", lambda t: -1e5 * t)],
+    drained=[mpm.Drained("right")],
+)
+result = simulation.run(1.0, 0.25, probes=mpm.probes(bodies, [[0.3, 0.4], [0.3, 0.8]]), progress=False)
+points = simulation.points
+parts = grid.comm.gather((points.id, points.x, points.pressure, simulation.effective_stress()))
+if parts:
+    ids, x, p, s = (np.concatenate(a) for a in zip(*parts, strict=True))
+    order = np.argsort(ids)
+    counts = [len(part[0]) for part in parts]
+    out = {"x": x[order], "p": p[order], "stress": s[order], "probes": result.displacement[-1]}
+    np.savez(sys.argv[1], **out, balance=result.balance, counts=counts)
