@@ -128,10 +128,11 @@ class BiotFEM:
             raise ValueError("drained sides need a fluid")
         if fluid is not None and gravity is not None:
             raise ValueError("gravity with a fluid: the reference has none, one of them must be left out")
-        if material.state or callable(material.porosity) or callable(material.biot) or callable(material.grain_bulk):
+        fields = (material.porosity, material.biot, material.grain_bulk)
+        if material.state or material.unknowns or any(map(callable, fields)):
             raise ValueError(
-                f"{type(material).__name__}: the reference has no state; only moduli, conductivity and "
-                "parameters of the law may be functions of place, the rest must be numbers"
+                f"{type(material).__name__}: the reference has no state and no local unknowns; only moduli, "
+                "conductivity and parameters of the law may be functions of place, the rest must be numbers"
             )
         self.grid, self.material, self.fluid = Grid(upper, cells, lower, comm), material, fluid
         self.tolerance, self._t = tolerance, fem.Constant(self.grid.mesh, 0.0)
