@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Versions and solvers that a report of a bug should name."""
+"""Versions and solvers that a report of a bug should name, and laboratory tests of soil laws."""
 
 from __future__ import annotations
 
@@ -41,13 +41,50 @@ def _version(package: str) -> str:
         return "not found"
 
 
+def number(text: str) -> float | list[float]:
+    """Return a number, or several with commas between them."""
+    values = [float(part) for part in text.split(",")]
+    return values if len(values) > 1 else values[0]
+
+
+def run_element_test(o: argparse.Namespace) -> None:
+    """Drive a law through a laboratory test, print a table of it and draw it."""
+    law = getattr(mpm_dolfinx, o.law, None)
+    if not (isinstance(law, type) and issubclass(law, mpm_dolfinx.Skeleton)):
+        raise ValueError(f"law = {o.law!r}, must be the name of a law, such as ModifiedCamClay")
+    constants = dict(text.split("=", 1) for text in o.constants)
+    soil = law(**{name: number(value) for name, value in constants.items()})
+    r = mpm_dolfinx.element_test(soil, o.test, number(o.strain), steps=o.steps, confinement=o.confinement)
+    print(f"{'strain':>10} {'p (Pa)':>12} {'q (Pa)':>12} {'pore p. (Pa)':>12} {'volume strain':>13}")
+    for k in np.unique(np.linspace(0, len(r.strain) - 1, 21, dtype=int)):
+        print(f"{r.strain[k]:10.5f} {r.p[k]:12.5g} {r.q[k]:12.5g} {r.pressure[k]:12.5g} {r.volume_strain[k]:13.5g}")
+    if o.draw:
+        r.draw(o.draw, f"{o.law}, {o.test}")
+
+
 def main(argv: list[str] | None = None) -> None:
     """Run `python -m mpm_dolfinx`."""
     parser = argparse.ArgumentParser(prog="python -m mpm_dolfinx", description=__doc__)
-    parser.add_argument("command", choices=["info"], help="print versions and solvers")
-    parser.parse_args(argv)
-    if MPI.COMM_WORLD.rank == 0:
+    commands = parser.add_subparsers(dest="command", required=True)
+    commands.add_parser("info", help="print versions and solvers")
+    lab = commands.add_parser("element-test", help="drive a soil law through a laboratory test")
+    lab.add_argument("law", help="name of the law, such as ModifiedCamClay")
+    lab.add_argument("test", help=", ".join(mpm_dolfinx.ElementTest.KINDS))
+    lab.add_argument("strain", help="axial strain, compression positive, or shear; turning points with commas")
+    lab.add_argument("constants", nargs="*", metavar="name=value", help="of the law; vectors with commas")
+    lab.add_argument("--steps", type=int, default=100, help="to each turning point (100)")
+    lab.add_argument("--confinement", type=float, default=0.0, help="isotropic effective stress before, Pa (0)")
+    lab.add_argument("--draw", help="file of a picture")
+    o = parser.parse_args(argv)
+    if MPI.COMM_WORLD.rank > 0:
+        return
+    if o.command == "info":
         print("\n".join(f"{name:14}{value}" for name, value in info().items()))
+        return
+    try:
+        run_element_test(o)
+    except (ValueError, TypeError, mpm_dolfinx.NotConverged) as error:
+        lab.error(" ".join(str(error).split()))
 
 
 if __name__ == "__main__":

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Run two laws, one with state, fields and terms of the user's on however many processes there are; write the state."""
+"""Run three laws, two with state, with fields and terms of the user's, on any number of processes; write the state."""
 
 import sys
 
@@ -16,7 +16,11 @@ def push(points, u, v, t):
 
 
 grid = mpm.Grid([1.6, 1.3], [16, 13])
-bodies = [mpm.box(grid, [0, 0], [1, 0.5]), mpm.box(grid, [0, 0.5], [1, 1.03], material=1)]
+bodies = [
+    mpm.box(grid, [0, 0], [1, 0.5]),
+    mpm.box(grid, [0, 0.5], [1, 0.8], material=1),
+    mpm.box(grid, [0, 0.8], [1, 1.03], material=2),
+]
 sand = mpm.DruckerPrager(
     bulk=lambda X: 4e6 * (2 - X[:, 1]),
     shear=2e6,
@@ -27,14 +31,18 @@ sand = mpm.DruckerPrager(
     conductivity_law=mpm.kozeny_carman,
 )
 gel = mpm.NeoHookean(bulk=2e6, shear=1e6, conductivity=lambda X: 1e-5 * (1 + X[:, 0]))
+clay = mpm.ModifiedCamClay(M=1.1, lambda_=0.1, kappa=0.03, shear=1e6, initial_stress=(-1e5,) * 3, conductivity=1e-5)
 simulation = mpm.Simulation(
     grid,
     bodies,
-    [sand, gel],
+    [sand, gel, clay],
     fluid=mpm.Fluid(),
     fixed={"left": "x", "bottom": "y"},
     drained=[mpm.Drained("right")],
-    tractions=[mpm.Traction("top", lambda t: (0, -2e5 * t), region=((0, 1), (1, 2)))],
+    tractions=[
+        mpm.Traction("top", lambda t: (0, -1e5 - 6e4 * t), region=((0, 1), (1, 2))),
+        mpm.Traction("right", (-1e5, 0)),
+    ],
     terms=[push],
     sources=[lambda points, q, t: 1e-3 * t * points.displacement[0] * q * points.dx],
 )

@@ -136,3 +136,11 @@ def test_what_is_recorded_of_probes_outlives_a_checkpoint(tmp_path):
     read = mpm.resume(again, file)
     for name in ("position", "probe_pressure", "probe_stress", "displacement", "pressure"):
         assert np.array_equal(read.column(name), result.column(name)), name
+
+
+def test_cam_clay_has_its_initial_stress_across_the_plane_too():
+    stress = (-5e4, -1e5, -6e4)
+    clay = mpm.ModifiedCamClay(shear=2e6, M=1.2, lambda_=0.1, kappa=0.02, initial_stress=stress, OCR=2.0)
+    simulation, _ = column(clay)
+    found = simulation.point_fields().effective_stress
+    assert found == pytest.approx(np.broadcast_to(np.diag(stress), found.shape), abs=1e-3)

@@ -19,7 +19,8 @@ from typing import ClassVar
 import numpy as np
 import ufl
 
-from mpm_dolfinx.constitutive.skeleton import Field, Skeleton, _check, _eigenvalues
+from mpm_dolfinx.constitutive.skeleton import Field, Skeleton, _check
+from mpm_dolfinx.constitutive.trial import Trial
 
 MATCHES = {
     "plane strain": lambda t, s, c: (3 * t / np.sqrt(9 + 12 * t**2), 3 / np.sqrt(9 + 12 * t**2)),
@@ -117,14 +118,14 @@ class DruckerPrager(Skeleton):
     @staticmethod
     def kirchhoff(F, bulk, shear, eta, xi, eta_flow, cohesion, hardening, plastic, hardened):
         """Return the Kirchhoff stress (3, 3), Pa, as UFL."""
-        trial = _Trial(F, plastic)
+        trial = Trial(F, plastic)
         to = _return(trial, bulk, shear, eta, xi, eta_flow, cohesion, hardening, hardened)
         return to["p"] * ufl.Identity(3) + 2 * shear * to["ratio"] * trial.deviatoric
 
     @staticmethod
     def update(F, bulk, shear, eta, xi, eta_flow, cohesion, hardening, plastic, hardened):
         """Return the state at the end of the step, name -> UFL."""
-        trial = _Trial(F, plastic)
+        trial = Trial(F, plastic)
         to = _return(trial, bulk, shear, eta, xi, eta_flow, cohesion, hardening, hardened)
         # b = exp(2 eps), the elastic strain now eps = p/(3K) I + ratio dev(trial eps)
         mean, ratio = 2 * to["p"] / (3 * bulk), to["ratio"]
@@ -136,39 +137,7 @@ class DruckerPrager(Skeleton):
         }
 
 
-class _Trial:
-    """The trial elastic strain of a deformation gradient, in UFL.
-
-    Isotropic functions of b are Newton's interpolation polynomials at its eigenvalues: exact, and smooth where
-    eigenvalues are equal, because nodes need not be eigenvalues and are kept apart.
-    """
-
-    def __init__(self, F, plastic):
-        self.plane = F.ufl_shape == (2, 2)
-        self.F = F
-        if self.plane:
-            self.F = ufl.as_matrix([[F[0, 0], F[0, 1], 0], [F[1, 0], F[1, 1], 0], [0, 0, 1]])
-        self.b = self.F * plastic * self.F.T
-        block = ufl.as_matrix([[self.b[i, j] for j in (0, 1)] for i in (0, 1)]) if self.plane else self.b
-        self.nodes = _eigenvalues(block, 1e-6)
-        strain = self.isotropic(lambda e: ufl.ln(e) / 2)
-        self.volumetric = ufl.tr(strain)
-        self.deviatoric = strain - self.volumetric / 3 * ufl.Identity(3)
-
-    def isotropic(self, f):
-        """Return f(b) (3, 3) for a function of the eigenvalues."""
-        b, I, x, y = self.b, ufl.Identity(3), self.nodes, [f(node) for node in self.nodes]
-        slope = (y[0] - y[1]) / (x[0] - x[1])
-        linear = y[0] * I + slope * (b - x[0] * I)
-        if self.plane:
-            rows = [[linear[i, j] if i < 2 and j < 2 else 0 for j in range(3)] for i in range(3)]
-            rows[2][2] = f(b[2, 2])
-            return ufl.as_matrix(rows)
-        bend = (slope - (y[1] - y[2]) / (x[1] - x[2])) / (x[0] - x[2])
-        return linear + bend * (b - x[0] * I) * (b - x[1] * I)
-
-
-def _return(trial: _Trial, bulk, shear, eta, xi, eta_flow, cohesion, hardening, hardened) -> dict:
+def _return(trial: Trial, bulk, shear, eta, xi, eta_flow, cohesion, hardening, hardened) -> dict:
     """Return the stress of a trial elastic strain to the yield surface.
 
     Returns

@@ -12,6 +12,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
 
+from mpm_dolfinx.constitutive.local_unknowns import LocalUnknowns
 from mpm_dolfinx.constitutive.skeleton import Skeleton
 from mpm_dolfinx.constitutive.user_functions import call, expression
 from mpm_dolfinx.errors import NotConverged
@@ -44,8 +45,22 @@ class LawAtPoints:
         return FormPoints(self.grid, F=(self.grid.dim, self.grid.dim), **self._shapes)
 
     @cached_property
+    def _F(self):
+        return ufl.variable(self.points.F)
+
+    @cached_property
+    def _local(self) -> LocalUnknowns | None:
+        given = {name: getattr(self.points, name) for name in self._shapes}
+        return LocalUnknowns(self.law, self.points, self._F, given) if self.law.unknowns else None
+
+    @cached_property
     def _values(self) -> dict:
-        return {name: getattr(self.points, name) for name in self._shapes}
+        own = self._local.values if self._local is not None else {}
+        return {**{name: getattr(self.points, name) for name in self._shapes}, **own}
+
+    def _solve(self, data: PointData) -> None:
+        if self._local is not None:
+            self._local.update(data)
 
     def data(
         self, points: MaterialPoints, rows: NDArray[np.int64], values: dict[str, NDArray[np.float64]]
@@ -58,16 +73,18 @@ class LawAtPoints:
 
     @cached_property
     def _stress(self) -> PointExpression:
-        F = ufl.variable(self.points.F)
+        F = self._F
         return PointExpression(self.law.first_piola(F, self._values) * F.T / ufl.det(F), self.points)
 
     def stress(self, data: PointData) -> NDArray[np.float64]:
         """Return the effective Cauchy stress (n, d, d), Pa."""
-        return self._stress.evaluate(data)
+        stress = self._stress
+        self._solve(data)
+        return stress.evaluate(data)
 
     @cached_property
     def _out_of_plane(self) -> PointExpression | None:
-        across = self.law.out_of_plane(ufl.variable(self.points.F), self._values)
+        across = self.law.out_of_plane(self._F, self._values)
         return None if across is None else PointExpression(across, self.points)
 
     def stress_3d(self, data: PointData) -> NDArray[np.float64]:
@@ -82,7 +99,7 @@ class LawAtPoints:
     @cached_property
     def _update(self) -> tuple[PointExpression, dict[str, tuple[int, ...]]]:
         """All components of the new state in one vector, and the shapes of its parts."""
-        given = call(self.law.update, F=self.points.F, **self._values)
+        given = call(self.law.update, F=self._F, **self._values)
         instance(f"{self.law.__name__}.update: the new state", given, dict)
         new = {name: ufl.as_ufl(f) for name, f in given.items()}
         for name, f in new.items():
@@ -96,6 +113,7 @@ class LawAtPoints:
         if self.law.update is None:
             return []
         expression, shapes = self._update
+        self._solve(data)
         values, out, start = expression.evaluate(data), [], 0
         for name, shape in shapes.items():
             stop = start + int(np.prod(shape, dtype=int))
@@ -130,7 +148,11 @@ class SoftnessAtPoints:
         self._points = points = FormPoints(grid, F=(d, d), dF=(d, d), **shapes)
         s = ufl.variable(fem.Constant(grid.mesh, 1.0))
         F = ufl.variable(points.F - (1 - s) * points.dF)
-        tau = law.first_piola(F, {name: getattr(points, name) for name in shapes}) * F.T
+        values = {name: getattr(points, name) for name in shapes}
+        self._local = LocalUnknowns(law, points, F, values) if law.unknowns else None
+        if self._local is not None:
+            values |= self._local.values
+        tau = law.first_piola(F, values) * F.T
         e = ufl.sym(points.dF * ufl.inv(points.F))
         e -= ufl.tr(e) / d * ufl.Identity(d)
         size = ufl.sqrt(ufl.inner(e, e) + LEAST**2)
@@ -142,7 +164,10 @@ class SoftnessAtPoints:
         dF (n, d, d): change of F in the step; shear (n,): elastic shear modulus, Pa.
         """
         fields = {name: at[name] for name in ("F", *self._shapes)}
-        strain, change = self._along.evaluate(PointData(self._points, at.places, at.volume, {"dF": dF, **fields})).T
+        data = PointData(self._points, at.places, at.volume, {"dF": dF, **fields})
+        if self._local is not None:
+            self._local.update(data)
+        strain, change = self._along.evaluate(data).T
         elastic = 2 * shear * strain
         soft = elastic / np.maximum(change, elastic / MOST)
         return np.where(strain > 10 * LEAST, np.maximum(soft, 1.0), 1.0)

@@ -120,6 +120,9 @@ class SceneMaterials:
         if (law.energy is None) == (law.kirchhoff is None):
             which = "neither" if law.energy is None else "both"
             raise ValueError(f"{law.__name__}: has {which}, must define energy or kirchhoff")
+        if bool(law.unknowns) != (law.residual is not None):
+            which = "unknowns and no residual" if law.unknowns else "a residual and no unknowns"
+            raise ValueError(f"{law.__name__}: has {which}, must have both or neither")
         for name in law.parameters:
             if not hasattr(m, name):
                 known = ", ".join([*_names(m), *law.state])

@@ -65,7 +65,19 @@ class Skeleton:
         Kirchhoff stress tau = J sigma', Pa, (d, d) or (3, 3), where there is no energy; the tangent is UFL's.
 
     What evolves is the law's `state`, name -> value at the start, which `update` (F, ...) -> {name: UFL}
-    sets anew at the points after every converged step; a state that is not finite cuts the step.  bulk and shear
+    sets anew at the points after every converged step; a state that is not finite cuts the step.
+
+    Stresses that no closed formula gives have local `unknowns`, name -> value where their iteration begins, which
+    `kirchhoff` and `update` may name.  They are of order one, and so are their equations:
+
+    residual
+        Called with the law's fields, its state, its unknowns, and `trial`; gives name -> UFL of the unknown's shape,
+        which Newton's method makes zero at each point.
+    trial
+        (F, ...) -> {name: UFL}: all by which the residuals depend on F; without it they name F itself.  What is no UFL
+        in it the residuals do not see; `kirchhoff` and `update` may name `trial` too, and see all of it.
+
+    bulk and shear
     are also what the scheme takes its scales from (ghost penalty, fixed-stress coefficient, damping of pressures),
     for every law.
 
@@ -100,6 +112,9 @@ class Skeleton:
     energy: ClassVar[Callable | None] = None
     kirchhoff: ClassVar[Callable | None] = None
     update: ClassVar[Callable | None] = None
+    unknowns: ClassVar[Mapping[str, ArrayLike]] = {}
+    trial: ClassVar[Callable | None] = None
+    residual: ClassVar[Callable | None] = None
     linear: ClassVar[bool] = False
     """Whether the stress is linear in F: one factorisation then serves for as long as the active cells stay."""
     state: ClassVar[Mapping[str, ArrayLike]] = {}
@@ -108,11 +123,17 @@ class Skeleton:
 
     def __init_subclass__(cls, **options):
         super().__init_subclass__(**options)
-        functions = [f for f in (cls.energy, cls.kirchhoff, cls.update) if f is not None]
-        names = dict.fromkeys(name for f in functions for name in signature(f).parameters)
-        cls.parameters = tuple(name for name in names if name != "F" and name not in cls.state)
+        functions = (cls.energy, cls.kirchhoff, cls.update, cls.trial, cls.residual)
+        names = dict.fromkeys(name for f in functions for name in cls.taken_by(f))
+        own = {"F", *cls.state, *cls.unknowns, *(["trial"] if cls.residual is not None else [])}
+        cls.parameters = tuple(name for name in names if name not in own)
         if "energy" in vars(cls) and "linear" not in vars(cls):
             cls.linear = False  # not what the law had that this one is derived from
+
+    @staticmethod
+    def taken_by(function: Callable | None) -> list[str]:
+        """Return the names of the arguments of one of the law's functions."""
+        return [] if function is None else list(signature(function).parameters)
 
     def __post_init__(self):
         functions(

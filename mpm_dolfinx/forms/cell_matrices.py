@@ -148,7 +148,7 @@ class StackedElementMatrices:
 
     def assemble_matrix(self, A: PETSc.Mat, data: PointData) -> None:
         """Add the matrix to `A`, by unrolled local dofs; the caller finalises it."""
-        live = data.live()
+        live = self._tangent.live(data)
         for cells, points, missing in self._sorted(data.places.key, lambda: batches(data.places)):
             insert(A, self._grid, cells, self._matrices(data, live, points.ravel(), missing))
 

@@ -15,7 +15,7 @@ No generated code is touched.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 from math import factorial
 
@@ -66,8 +66,8 @@ class FormPoints:
         self.functions = {
             name: grid.coefficient(shape) for name, shape in {"offset": (grid.dim,), "weight": (), **fields}.items()
         }
-        self.live: dict[str, fem.Function] = {}
-        """Fields that are gradients of functions on the grid, which change while the points stay."""
+        self.live: dict[str, Callable[[PointData], NDArray[np.float64]]] = {}
+        """What gives the values (n, size) of fields that change while the points stay."""
         self.dx = PointMeasure(grid.mesh, self.functions["weight"])
         self.sizes = {name: int(np.prod(shape, dtype=int)) for name, shape in fields.items()}
 
@@ -96,9 +96,14 @@ class FormPoints:
         takes half or a quarter of the time, and its compilation a fifth.
         """
         if "gradient" not in self.live:
-            self.functions["gradient"] = self.grid.coefficient((self.grid.dim, self.grid.dim))
-            self.live["gradient"] = u
+            self.follow("gradient", (self.grid.dim, self.grid.dim), lambda data: data.gradients(u))
         return self.functions["gradient"]
+
+    def follow(self, name: str, shape: tuple[int, ...], values: Callable[[PointData], NDArray]) -> fem.Function:
+        """Return a new field as a coefficient; `values` gives those (n, size) of the points whenever a form is made."""
+        self.functions[name] = self.grid.coefficient(shape)
+        self.live[name] = values
+        return self.functions[name]
 
     def increment(self, u: fem.Function):
         """Return Delta = I + grad u at the points as UFL."""
@@ -171,13 +176,10 @@ class PointData(Keyed):
         """Return the values (n, size) of a field."""
         return self._rows[name]
 
-    def live(self) -> dict[str, NDArray[np.float64]]:
-        """Return the gradients (n, d^2) of functions on the grid, at their present values."""
-        out = {}
-        for name, u in self.points.live.items():
-            now = u.x.array.copy()  # of the key nothing changes
-            out[name] = self._gradients(now, lambda u=now: self._gradients_of(u))
-        return out
+    def gradients(self, u: fem.Function) -> NDArray[np.float64]:
+        """Return the gradients (n, d^2) of a Q1 vector function at its present values."""
+        now = u.x.array.copy()  # of the key nothing changes
+        return self._gradients(now, lambda: self._gradients_of(now))
 
     def _gradients_of(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
         grid, n = self.points.grid, len(self.cells)
@@ -212,7 +214,12 @@ class Rows:
                 self._gathered.append((slice(start, stop), f, dofs))
             start = stop
         self._width = start
+        self._live = {name: points.live[name] for _, name in self._columns if name in points.live}
         self._room, self._dofs, self._packed = Latest(), Latest(), Latest()
+
+    def live(self, data: PointData) -> dict[str, NDArray[np.float64]]:
+        """Return the present values of those fields of the form that change while the points stay."""
+        return {name: values(data) for name, values in self._live.items()}
 
     def room(self, size: int) -> NDArray[np.float64]:
         """Return the memory of the rows, at least `size` of them; what is kept saves the page faults of every step."""
@@ -224,7 +231,7 @@ class Rows:
     def __call__(
         self, data: PointData, chosen: slice | NDArray[np.int64], live: dict[str, NDArray[np.float64]]
     ) -> NDArray[np.float64]:
-        """Return the rows of the chosen points, the first of the memory of all; live: `data.live()`."""
+        """Return the rows of the chosen points, the first of the memory of all; live: as `live` gives it."""
         cells = data.cells[chosen]
         rows = self.room(len(cells))[: len(cells)]
         if isinstance(chosen, slice):
@@ -245,7 +252,7 @@ class Rows:
     def _pack(self, rows: NDArray[np.float64], data: PointData, chosen: slice | NDArray[np.int64]) -> bool:
         """Set the columns that stay while the points do."""
         for columns, name in self._columns:
-            if name not in data.points.live:
+            if name not in self._live:
                 rows[:, columns] = data[name][chosen]
         return True
 
@@ -279,7 +286,7 @@ class PointForm:
 
     def _parts(self, data: PointData) -> Iterator[tuple]:
         """Yield the form bound to CHUNK points after the other, with their rows."""
-        cells, live = data.places.slots if self._dense else data.cells, data.live()
+        cells, live = data.places.slots if self._dense else data.cells, self._rows.live(data)
         parts = [slice(start, start + CHUNK) for start in range(0, len(cells), CHUNK)]
         bound = self._bound(cells, lambda: [self.compiled.bind(cells[part]) for part in parts])
         for part, form in zip(parts, bound, strict=True):
@@ -372,19 +379,24 @@ class PointExpression:
         self._rows.room(self._many)
         self._values = np.empty((self._many, int(np.prod(self._shape, dtype=int))))
 
+    def live(self, data: PointData) -> dict[str, NDArray[np.float64]]:
+        """Return the present values of the fields that change while the points stay."""
+        return self._rows.live(data)
+
     def evaluate(
         self, data: PointData, chosen: NDArray[np.int64] | None = None, live: dict[str, NDArray] | None = None
     ) -> NDArray[np.float64]:
-        """Return the values (m, *shape) at the chosen points, by default all; `live`: `data.live()`, if it is known."""
-        live, chosen = data.live() if live is None else live, np.arange(len(data.cells)) if chosen is None else chosen
-        out = np.empty((len(chosen), self._values.shape[1]))
-        for start in range(0, len(chosen), max(1, self._many)):
-            part = chosen[start : start + self._many]
-            self._rows(data, part, live)
+        """Return the values (m, *shape) at the chosen points, by default all; live: as `live` gives it."""
+        live = self.live(data) if live is None else live
+        count = len(data.cells if chosen is None else chosen)
+        out = np.empty((count, self._values.shape[1]))
+        for start in range(0, count, max(1, self._many)):
+            stop = min(start + self._many, count)
+            self._rows(data, slice(start, stop) if chosen is None else chosen[start:stop], live)
             self._values[:] = 0.0
             self._compiled.assemble_vector(self._values.reshape(-1), self._rows.room(self._many))
-            np.divide(self._values[: len(part)], self._volume, out=out[start : start + len(part)])
-        return out.reshape(len(chosen), *self._shape)
+            np.divide(self._values[: stop - start], self._volume, out=out[start:stop])
+        return out.reshape(count, *self._shape)
 
 
 class CellSums:

@@ -54,6 +54,7 @@ class MeanDilatation:
     def __init__(self, grid: Grid, numbers: Sequence[int], symmetric: bool = True):
         self._grid, self._d, self._symmetric, self._numbers = grid, grid.dim, symmetric, numbers
         self.theta, self.pi = fem.Function(grid.cellwise()), fem.Function(grid.cellwise())
+        self._theta = ufl.variable(self.theta)
         self._filled: Latest[Cells] = Latest()
         self._volume: Latest[NDArray[np.float64]] = Latest()
         self._ratios: list[CellSums] = []
@@ -66,7 +67,11 @@ class MeanDilatation:
         T = T * points.F.T
         return [ufl.dot(T, g)[i] for g in shape_gradients(points) for i in range(self._d)]
 
-    def add(self, law: type[Skeleton], points: FormPoints, F, values: Mapping[str, object]):
+    def seen(self, points: FormPoints, F):
+        """Return Fbar (d, d), what laws see of F, as UFL."""
+        return (self._theta * ufl.det(points.F) / ufl.det(F)) ** (1 / self._d) * F
+
+    def add(self, law: type[Skeleton], points: FormPoints, F, Fbar, values: Mapping[str, object]):
         """Add the pieces of a part that locks.
 
         Parameters
@@ -77,6 +82,8 @@ class MeanDilatation:
             Its pieces, with the field F (d, d), the deformation gradient at the start of the step.
         F
             Deformation gradient (d, d), a UFL variable.
+        Fbar
+            What the law sees of it, see `seen`.
         values
             UFL values of the law's parameters and state.
 
@@ -84,11 +91,11 @@ class MeanDilatation:
         -------
         The first Piola-Kirchhoff stress that the residual takes, Pa, as UFL of F, theta and pi.
         """
-        J_n, theta = ufl.det(points.F), ufl.variable(self.theta)
+        J_n, theta = ufl.det(points.F), self._theta
         ratio = ufl.det(F) / J_n
         self._ratios.append(CellSums([ratio], points))
         self._ratio_slopes.append(CellSums(self._along_shapes(ufl.diff(ratio, F), points), points))
-        P, slope = self._stress(law, F, theta, J_n, values)
+        P, slope = self._stress(law, F, Fbar, values)
         self._slopes.append(CellSums([slope / J_n], points))
         derivatives = [*self._along_shapes(ufl.diff(slope / J_n, F), points), ufl.diff(slope / J_n, theta)]
         if not self._symmetric:
@@ -96,21 +103,26 @@ class MeanDilatation:
         self._derivatives.append(CellSums(derivatives, points))
         return P + self.pi * ufl.diff(ufl.det(F), F)
 
-    def _stress(self, law: type[Skeleton], F, theta, J_n, values: Mapping[str, object]):
+    def _stress(self, law: type[Skeleton], F, Fbar, values: Mapping[str, object]):
         """Return the derivatives by F and by theta of psi(Fbar); of a law without energy, of its work."""
-        Fbar = (theta * J_n / ufl.det(F)) ** (1 / self._d) * F
         if law.kirchhoff is None:
             energy = expression(law.energy, [()], F=Fbar, **values)
-            return ufl.diff(energy, F), ufl.diff(energy, theta)
+            return ufl.diff(energy, F), ufl.diff(energy, self._theta)
         tau = law.kirchhoff_in_plane(Fbar, values)  # dFbar Fbar^-1 = dev(dF F^-1) + dtheta / (d theta) I
         mean = ufl.tr(tau) / self._d
-        return (tau - mean * ufl.Identity(self._d)) * ufl.inv(F).T, mean / theta
+        return (tau - mean * ufl.Identity(self._d)) * ufl.inv(F).T, mean / self._theta
 
-    def update(self, data: QuadratureData) -> None:
-        """Set theta and pi at the present displacement."""
-        cells, volume = self._cells(data).filled, self._volume_of(data)[:, 0]
-        self.theta.x.array[cells] = self._total(self._ratios, data)[:, 0] / volume
-        self.pi.x.array[cells] = self._total(self._slopes, data)[:, 0] / volume
+    def set_ratios(self, data: QuadratureData) -> None:
+        """Set theta at the present displacement."""
+        self.theta.x.array[self._cells(data).filled] = self._mean(self._ratios, data)
+
+    def set_stresses(self, data: QuadratureData) -> None:
+        """Set pi at the present displacement and theta."""
+        self.pi.x.array[self._cells(data).filled] = self._mean(self._slopes, data)
+
+    def _mean(self, sums: Sequence[CellSums], data: QuadratureData) -> NDArray[np.float64]:
+        """Return the means (cells,) of a quantity over the pieces that lock."""
+        return self._total(sums, data)[:, 0] / self._volume_of(data)[:, 0]
 
     def assemble_matrix(self, A: PETSc.Mat, data: QuadratureData) -> None:
         """Add what theta and pi contribute to the tangent at the last update; the caller finalises it."""

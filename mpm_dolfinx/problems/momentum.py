@@ -24,6 +24,7 @@ from dolfinx.common import Timer
 from numpy.typing import NDArray
 
 from mpm_dolfinx import _compat
+from mpm_dolfinx.constitutive.local_unknowns import LocalUnknowns
 from mpm_dolfinx.constitutive.skeleton import Skeleton
 from mpm_dolfinx.constitutive.user_functions import compiling, term_of
 from mpm_dolfinx.forms.cell_matrices import ElementForces, ElementMatrices, StackedElementMatrices
@@ -88,9 +89,10 @@ class MomentumForms:
         self._past, self._own = fem.Function(V), fem.Constant(grid.mesh, 1.0)
         self._residuals, self._tangents, self._own_tangents = [], [], []
         self._residuals_of_all: list[PointForm] = []
+        self._local: dict[int, LocalUnknowns] = {}  # by the number of their part
         self.terms: list[PointForm] = []
-        for law, points, locks in laws:
-            self._add_law(law, points, locks, pressure, symmetric)
+        for number, (law, points, locks) in enumerate(laws):
+            self._add_law(number, law, points, locks, pressure, symmetric)
         kept = [self._add_term(term, pieces, t, dt) for term in terms]
         self.symmetric = symmetric and all(potential or not holds for potential, holds, _ in kept)
         self.holding = any(holds for _, holds, _ in kept)
@@ -112,13 +114,23 @@ class MomentumForms:
         self.sides, self.ghost = SideForms(grid, self.u), GhostPenalty(grid, V, at_points)
 
     def _add_law(
-        self, law: type[Skeleton], points: FormPoints, locks: bool, pressure: fem.Function | None, symmetric: bool
+        self,
+        number: int,
+        law: type[Skeleton],
+        points: FormPoints,
+        locks: bool,
+        pressure: fem.Function | None,
+        symmetric: bool,
     ) -> None:
         """Compile residual and tangent of the pieces that follow a law."""
         F, v = points.deformation(self.u), ufl.TestFunction(self.u.function_space)
         values = {name: getattr(points, name) for name in (*law.parameters, *law.state)}
+        seen = self.dilatation.seen(points, F) if locks else F
+        if law.unknowns:
+            self._local[number] = local = LocalUnknowns(law, points, seen, values)
+            values |= local.values
         if locks:
-            P = self.dilatation.add(law, points, F, values)
+            P = self.dilatation.add(law, points, F, seen, values)
         else:
             P = law.first_piola(F, values)
         if pressure is not None:
@@ -181,7 +193,11 @@ class MomentumForms:
         internal, own, _, _ = self._work
         internal.x.array[:] = own.x.array[:] = 0.0
         if self.dilatation is not None:
-            self.dilatation.update(data)
+            self.dilatation.set_ratios(data)
+        for number, local in self._local.items():
+            local.update(data.parts[number])
+        if self.dilatation is not None:
+            self.dilatation.set_stresses(data)
         for residual, part in zip(self._residuals, data.parts, strict=True):
             residual.assemble_vector(internal.x.array, part)
         for residual in self._residuals_of_all:

@@ -146,13 +146,14 @@ class BiotFEM:
             raise ValueError("drained: seepage = True, must be False: the reference has no seepage faces")
         if fluid is not None and gravity is not None:
             raise ValueError("gravity with a fluid: the reference has none, one of them must be left out")
-        if material.state or callable(material.porosity) or callable(material.biot) or callable(material.grain_bulk):
+        fields = (material.porosity, material.biot, material.grain_bulk)
+        if material.state or material.unknowns or any(map(callable, fields)):
             raise ValueError(
-                f"{type(material).__name__}: the reference has no state; only moduli, conductivity and "
-                "parameters of the law may be functions of place, the rest must be numbers"
+                f"{type(material).__name__}: the reference has no state and no local unknowns; only moduli, "
+                "conductivity and parameters of the law may be functions of place, the rest must be numbers"
             )
         self.grid, self.material, self.fluid = Grid(upper, cells, lower, comm), material, fluid
-        self.tolerance, self.t = tolerance, 0.0
+        self.tolerance, self._t = tolerance, fem.Constant(self.grid.mesh, 0.0)
         """Largest residual; time, s."""
         self._substeps = substeps(method, fluid is not None or bool(terms))  # terms may depend on the velocity
         self.scale = float(np.max(material.at(self.grid.midpoints).oedometric))
@@ -173,6 +174,11 @@ class BiotFEM:
             self._forms = self._compile(tractions, outlets, gravity, terms, sources)
         self.jit = time.perf_counter() - start  # s, compiling or finding the forms
         self._snes = self._solver()
+
+    @property
+    def t(self) -> float:
+        """Time, s."""
+        return float(self._t.value)
 
     def _constant(self, value: ArrayLike) -> fem.Constant:
         return fem.Constant(self.grid.mesh, np.asarray(value, dtype=float))
@@ -367,7 +373,7 @@ class BiotFEM:
             took, residual = self._solve(substep, dt)
             newton, worst = newton + took, max(worst, residual)
         self._space.old.x.array[:] = self._space.w.x.array
-        self.t += dt
+        self._t.value += dt
         return newton, worst
 
     def _weight(self, gravity: Callable[[float], ArrayLike], t: float) -> NDArray[np.float64]:

@@ -1,0 +1,219 @@
+# SPDX-License-Identifier: MIT
+"""Local unknowns: what a law's stress depends on beside F, and what equations at each point determine.
+
+A law names unknowns y, trial values z(F) and residuals f(y, z); f = 0 is solved by Newton's method at all points at
+once, to round-off.  The forms see
+
+    y = y* + Y (z(F) - z*),     Y = -(df/dy)^-1 df/dz  at the solution (y*, z*),
+
+whose value is y* and whose derivative by F is that of the solution: UFL's derivative of a stress that is a function of
+y and F is the consistent tangent, and no iteration is unrolled.  y*, z* and Y are coefficients at the points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+import ufl
+from numpy.typing import NDArray
+
+from mpm_dolfinx.caching import Latest
+from mpm_dolfinx.constitutive.skeleton import Skeleton
+from mpm_dolfinx.constitutive.user_functions import call
+from mpm_dolfinx.errors import NotConverged
+from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointExpression
+from mpm_dolfinx.parallel.exchange import first
+from mpm_dolfinx.validation import instance
+
+MOST, HALVINGS = 60, 25  # iterations, and halvings of their steps in all
+CLOSE = 1e-9  # a Newton step below this, relative to unknowns of order one, leaves round-off
+ROUND_OFF = 1e-15  # of residuals of order one
+
+
+class Solved(NamedTuple):
+    """Solution at some points: key of their data; unknowns (n, m), trial values (n, k) and slopes Y (n, m k)."""
+
+    key: object
+    unknowns: NDArray[np.float64]
+    trial: NDArray[np.float64]
+    slopes: NDArray[np.float64]
+
+
+class LocalUnknowns:
+    """The local unknowns of a law at some points, as coefficients of forms.
+
+    Parameters
+    ----------
+    law
+        Class of the law.
+    points
+        The points, which carry what the law takes.
+    F
+        Deformation gradient (d, d) that the law sees, as UFL.
+    values
+        UFL values of the law's parameters and state.
+    """
+
+    def __init__(self, law: type[Skeleton], points: FormPoints, F, values: Mapping[str, object]):
+        self._law, self._comm = law, points.grid.comm
+        trial = call(law.trial, F=F, **values) if law.trial is not None else {"F": F}
+        instance(f"{law.__name__}.trial: what it gives", trial, dict)
+        given = {"trial": trial}
+        trial = {name: value for name, value in trial.items() if isinstance(value, ufl.core.expr.Expr)}
+        z = _parts(trial.values())
+        self._trial, self._solved = PointExpression(ufl.as_vector(z), points), Latest()
+        self._equations = _Equations(law, points, trial)
+        m, k = self._equations.count, len(z)
+        shapes = {"unknowns": (m,), "trial": (k,), "slopes": (m, k)}
+        at = {
+            what: points.follow(f"local {what}", s, lambda data, w=what: self._now(data, w))
+            for what, s in shapes.items()
+        }
+        # component by component: in 3D products of tensors take ten times as long to compile
+        off = [z[j] - at["trial"][j] for j in range(k)]
+        y = [at["unknowns"][i] + sum(at["slopes"][i, j] * off[j] for j in range(k)) for i in range(m)]
+        self.values = given | _named({name: np.shape(start) for name, start in law.unknowns.items()}, y)
+        """The unknowns by name, as UFL that depends on F, and `trial`."""
+
+    def update(self, data: PointData) -> None:
+        """Solve for the unknowns of points at their present F; all processes together.
+
+        Raises
+        ------
+        NotConverged
+            Naming the first point where the equations could not be solved.
+        """
+        trial = self._trial.evaluate(data)
+        self._solved((data.key, trial), lambda: self._equations.solve(data, trial), self._comm)
+
+    def _now(self, data: PointData, what: str) -> NDArray[np.float64]:
+        solved = self._solved.value
+        if solved is None or solved.key is not data.key:
+            raise RuntimeError(f"{self._law.__name__}: local unknowns are asked for before they are solved")
+        return getattr(solved, what)
+
+
+class _Equations:
+    """The equations f(y, z) = 0 of a law at points that carry what they take."""
+
+    def __init__(self, law: type[Skeleton], points: FormPoints, trial: Mapping[str, object]):
+        self._law, self._grid = law, points.grid
+        self._names = [name for name in (*law.parameters, *law.state) if name in law.taken_by(law.residual)]
+        self._points = own = FormPoints(points.grid, **{name: getattr(points, name).ufl_shape for name in self._names})
+        starts = {name: np.asarray(start, dtype=float) for name, start in law.unknowns.items()}
+        self._start = np.concatenate([start.ravel() for start in starts.values()])
+        self.count = m = len(self._start)
+        shapes = {name: value.ufl_shape for name, value in trial.items()}
+        k = sum(int(np.prod(s, dtype=int)) for s in shapes.values())
+        y, z = (ufl.variable(own.follow(name, (size,), _given)) for name, size in (("unknowns", m), ("trial", k)))
+        z_named = _named(shapes, z)
+        given = {"trial": z_named} if law.trial is not None else z_named
+        given |= _named({name: s.shape for name, s in starts.items()}, y)
+        residual = call(law.residual, **given, **{name: getattr(own, name) for name in self._names})
+        f = _checked(law, residual, {name: s.shape for name, s in starts.items()})
+        by_y, by_z = ufl.diff(f, y), ufl.diff(f, z)
+        steps = [by_y[i, j] for i in range(m) for j in range(m)]
+        self._newton = PointExpression(ufl.as_vector([*(f[i] for i in range(m)), *steps]), own)
+        self._slopes = PointExpression(ufl.as_vector([*steps, *(by_z[i, j] for i in range(m) for j in range(k))]), own)
+
+    def solve(self, data: PointData, trial: NDArray[np.float64]) -> Solved:
+        """Return the solution at points with trial values (n, k); all processes together."""
+        m, n = self.count, len(trial)
+        at = PointData(self._points, data.places, data.volume, {name: data[name] for name in self._names})
+        y = np.tile(self._start, (n, 1))
+
+        def system(rows: NDArray[np.int64], values: NDArray[np.float64]):
+            y[rows] = values
+            out = self._newton.evaluate(at, None if len(rows) == n else rows, {"unknowns": y, "trial": trial})
+            f, norm = out[:, :m], np.abs(out[:, :m]).max(axis=1)
+            return f, out[:, m:].reshape(-1, m, m), np.where(norm < np.inf, norm, np.inf)
+
+        failed = _newton(system, y)
+        shown = [f"{self._law.__name__}: local equations have no solution at {data.x[i]}" for i in failed[:1]]
+        if message := first(self._grid.comm, "".join(shown)):
+            raise NotConverged(message)
+        out = self._slopes.evaluate(at, None, {"unknowns": y, "trial": trial})
+        by_y, by_z = out[:, : m * m].reshape(-1, m, m), out[:, m * m :].reshape(n, m, trial.shape[1])
+        return Solved(data.key, y, trial, -_solve(by_y, by_z).reshape(n, m * trial.shape[1]))
+
+
+def _newton(system, y: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Solve f(y) = 0 at all points, in place: Newton's method with a line search; return the points where it fails.
+
+    system: called with rows (r,) and values (r, m), sets these and returns f (r, m), df/dy (r, m, m) and norms (r,).
+    """
+    rows, lost = np.arange(len(y)), np.zeros(len(y), dtype=bool)
+    f, slope, norm = system(rows, y)
+    halvings = np.zeros(len(y), dtype=int)
+    for _ in range(MOST):
+        step, begun = _solve(slope, f[:, :, None])[:, :, 0], y[rows]
+        close = (np.abs(step) <= CLOSE * np.maximum(1.0, np.abs(begun))).all(axis=1) | (norm <= ROUND_OFF)
+        lost[rows] = ~np.isfinite(step).all(axis=1)
+        y[rows] = begun - step  # of those that are close this is the solution
+        on = ~(close | lost[rows])
+        rows, step, begun, norm, length = rows[on], step[on], begun[on], norm[on], np.ones(int(on.sum()))
+        if not len(rows):
+            break
+        f, slope, new = system(rows, begun - step)
+        while len(worse := np.flatnonzero(~(new < norm) & (halvings[rows] < HALVINGS))):
+            length[worse] /= 2
+            halvings[rows[worse]] += 1
+            f[worse], slope[worse], new[worse] = system(rows[worse], begun[worse] - length[worse, None] * step[worse])
+        lost[rows] = ~(new < norm)
+        on = ~lost[rows]
+        rows, f, slope, norm = rows[on], f[on], slope[on], new[on]
+    lost[rows] = True  # after so many iterations
+    return np.flatnonzero(lost)
+
+
+def _solve(A: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return A^-1 b (n, m, k) of matrices (n, m, m); not finite where there is none."""
+    with np.errstate(all="ignore"):
+        if A.shape[1] == 1:
+            return b / A
+        if A.shape[1] == 2:  # a tenth of LAPACK's time
+            (a11, a12), (a21, a22) = A.transpose(1, 2, 0)[..., None]
+            det = a11 * a22 - a12 * a21
+            return np.stack([a22 * b[:, 0] - a12 * b[:, 1], a11 * b[:, 1] - a21 * b[:, 0]], axis=1) / det[:, None]
+        try:
+            return np.linalg.solve(A, b)
+        except np.linalg.LinAlgError:
+            singular = ~(np.abs(np.linalg.det(A)) > 0)
+            return np.linalg.solve(np.where(singular[:, None, None], np.nan, A), b)
+
+
+def _parts(values) -> list:
+    """Return all components of UFL values."""
+    return [value[i] if i else value for value in values for i in np.ndindex(value.ufl_shape)]
+
+
+def _named(shapes: Mapping[str, tuple[int, ...]], vector) -> dict:
+    """Return tensors of given shapes that a UFL vector holds one after the other."""
+    out, start = {}, 0
+    for name, shape in shapes.items():
+        index = np.arange(start, start + int(np.prod(shape, dtype=int))).reshape(shape)
+        out[name] = ufl.as_tensor(_nested(vector, index)) if shape else vector[start]
+        start += index.size
+    return out
+
+
+def _nested(vector, index: NDArray[np.int64]):
+    return [_nested(vector, row) for row in index] if index.ndim else vector[int(index)]
+
+
+def _checked(law: type[Skeleton], residual, shapes: Mapping[str, tuple[int, ...]]):
+    """Return the residuals of all unknowns as one UFL vector, in their order."""
+    instance(f"{law.__name__}.residual: what it gives", residual, dict)
+    found = {name: ufl.as_ufl(value) for name, value in residual.items()}
+    given = {name: value.ufl_shape for name, value in found.items()}
+    if given != dict(shapes):
+        raise ValueError(
+            f"{law.__name__}.residual: gives {given}, must have the unknowns' names and shapes {dict(shapes)}"
+        )
+    return ufl.as_vector(_parts(found[name] for name in shapes))
+
+
+def _given(data: PointData) -> NDArray[np.float64]:
+    raise RuntimeError("trial values and unknowns are given with each evaluation")

@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: MIT
+"""Laws with local unknowns: exact values and tangents, failures that name the point, refusals."""
+
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+import pytest
+import ufl
+from helpers import column
+from laws import LawAtPoints
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.verification.biot_fem import BiotFEM
+
+
+@dataclass(frozen=True)
+class Stiffening(mpm.Skeleton):
+    """Pressure K y of y + power y^3 = ln J, shear by a vector (b_12, b_21): both have closed forms."""
+
+    power: float = 50.0
+
+    unknowns: ClassVar = {"y": 0.0, "shears": (0.0, 0.0)}
+
+    @staticmethod
+    def trial(F):
+        b = F * F.T
+        return {"volume": ufl.ln(ufl.det(F)), "b": ufl.as_vector([b[0, 1], b[1, 0]]), "what is no UFL": F.ufl_shape}
+
+    @staticmethod
+    def residual(trial, power, y, shears):
+        return {"y": y + power * y**3 - trial["volume"], "shears": 2 * shears - 2 * trial["b"] + (y - y) * shears}
+
+    @staticmethod
+    def kirchhoff(trial, bulk, shear, y, shears):
+        d = trial["what is no UFL"][0]
+        S = [[shears[i] if (i, j) == (i, 1 - i) and i < 2 and j < 2 else 0 for j in range(d)] for i in range(d)]
+        return bulk * y * ufl.Identity(d) + shear * ufl.as_matrix(S)
+
+
+class Named(Stiffening):
+    """The same without trial values: the residuals name F."""
+
+    trial = None
+
+    @staticmethod
+    def residual(F, power, y, shears):
+        return Stiffening.residual(Stiffening.trial(F), power, y, shears)
+
+    @staticmethod
+    def kirchhoff(F, bulk, shear, y, shears):
+        return Stiffening.kirchhoff(Stiffening.trial(F), bulk, shear, y, shears)
+
+
+SOIL = Stiffening(bulk=2e6, shear=1e6)
+
+
+def exact(F, m=SOIL):
+    """Return the Kirchhoff stress (n, d, d), Pa, by Cardano's formula."""
+    b, d, q = F @ F.transpose(0, 2, 1), F.shape[1], np.log(np.linalg.det(F)) / m.power
+    root = np.sqrt(q**2 / 4 + 1 / (27 * m.power**3))
+    tau = m.bulk * (np.cbrt(q / 2 + root) + np.cbrt(q / 2 - root))[:, None, None] * np.eye(d)
+    tau[:, 0, 1] += m.shear * b[:, 0, 1]
+    tau[:, 1, 0] += m.shear * b[:, 1, 0]
+    return tau
+
+
+@pytest.mark.parametrize(("law", "dim"), [(Stiffening, 2), (Stiffening, 3), (Named, 2)])
+def test_stress_and_tangent_are_those_of_the_closed_form(law, dim):
+    rng = np.random.default_rng(dim)
+    F = np.eye(dim) + 0.15 * rng.normal(size=(40, dim, dim))
+    at = LawAtPoints(law(bulk=2e6, shear=1e6), dim)
+    assert np.abs(at.kirchhoff(F) - exact(F)).max() < 1e-13 * SOIL.bulk
+    found, differences = at.tangent(F)
+    assert np.abs(found - differences).max() < 1e-8 * np.abs(found).max()
+
+
+def settled(material, **options):
+    """Return the displacement of the top of a column under a load that grows; it has a fluid or none."""
+    s = column(cells=4, material=material, tractions=[mpm.Traction("top", lambda t: (0, -2e5 * t))], **options)
+    result = s.run(1.0, 0.25, probes=mpm.probes(s.bodies, [[0.125, 1.0]]))
+    return s, result, result.displacement[-1][0, 1]
+
+
+@pytest.mark.parametrize("locks", [False, True], ids=["plain", "mean dilatation"])
+def test_a_column_balances_its_load(locks):
+    """P = tau / J of uniform compression; Newton's method keeps its order."""
+    s, result, u = settled(SOIL if not locks else replace(SOIL, shear=1e4), fluid=False)
+    m = s.materials[0] if hasattr(s, "materials") else s.scene.materials.materials[0]
+    assert m.nearly_incompressible == locks
+    stretch = 1 + u
+    assert exact(np.array([[[1, 0], [0, stretch]]]), m)[0, 1, 1] / stretch == pytest.approx(-2e5, rel=1e-7)
+    assert result.newton <= 5 * result.steps and result.cuts == 0
+
+
+def test_a_column_with_water_ends_where_the_dry_one_does():
+    dry = settled(SOIL, fluid=False)[2]
+    wet = settled(replace(SOIL, conductivity=1e3), fluid=True, drained=[mpm.Drained("top")])[2]
+    assert wet == pytest.approx(dry, rel=1e-4)
+
+
+@dataclass(frozen=True)
+class Brittle(Stiffening):
+    """The same, but without a solution beyond a compression."""
+
+    least: mpm.Field = -0.05
+
+    @staticmethod
+    def residual(trial, least, y, shears):
+        over = ufl.conditional(ufl.lt(trial["volume"], least), 1.0, 0.0)
+        return {"y": (y - trial["volume"]) * (1 - over) + over * (1 + y**2), "shears": shears - trial["b"]}
+
+
+def test_a_step_without_a_local_solution_is_cut_and_names_the_first_point():
+    """ln J = -0.05 is reached at about half of the load; only the upper half of the column is weak."""
+    weak = Brittle(bulk=2e6, shear=1e6, least=lambda X: np.where(X[:, 1] > 0.5, -0.05, -9.0))
+    s = column(cells=4, fluid=False, material=weak, tractions=[mpm.Traction("top", lambda t: (0, -2e5 * t))])
+    with pytest.raises(mpm.GaveUp, match=r"Brittle: local equations have no solution at \[0\.\d+ +0\.(4[5-9]|[5-9])"):
+        s.run(1.0, 0.25)
+    assert s.result.cuts > 2 and np.log(s.points.J).min() == pytest.approx(-0.05, rel=0.05)
+
+
+class Misnamed(Stiffening):
+    @staticmethod
+    def residual(trial, power, y):
+        return {"x": y - trial["volume"]}
+
+
+def test_one_line_says_what_is_wrong():
+    with pytest.raises(
+        ValueError, match=r"Misnamed.residual: gives .*must have the unknowns' names and shapes"
+    ) as caught:
+        column(fluid=False, material=Misnamed(bulk=1e6, shear=1e6))
+    assert "\n" not in str(caught.value)
+    with pytest.raises(ValueError, match="the reference has no state"):
+        BiotFEM([0, 0], [1, 1], (2, 2), SOIL, fixed={})
+    half = type("Half", (Stiffening,), {"residual": None})
+    with pytest.raises(ValueError, match="Half: has unknowns and no residual, must have both or neither"):
+        column(fluid=False, material=half(bulk=1e6, shear=1e6))
