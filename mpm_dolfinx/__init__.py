@@ -32,6 +32,7 @@ from mpm_dolfinx.points.mesh_files import from_mesh
 from mpm_dolfinx.points.polygon import polygon
 from mpm_dolfinx.points.probes import probes
 from mpm_dolfinx.problems.conditions import Displacement, Drained, Inflow, Pressure, RigidPlate, Traction
+from mpm_dolfinx.problems.water import water
 from mpm_dolfinx.result import Result
 from mpm_dolfinx.simulation import Simulation
 from mpm_dolfinx.solve.scheme import COUPLINGS
@@ -74,4 +75,5 @@ __all__ = [
     "probes",
     "resume",
     "shape",
+    "water",
 ]

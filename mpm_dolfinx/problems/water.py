@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: MIT
+"""Free water against a side of the bodies: its pressure and its head on what it wets, a seepage face above."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpm_dolfinx.constitutive.skeleton import STANDARD_GRAVITY
+from mpm_dolfinx.points.faces import Region
+from mpm_dolfinx.problems.conditions import Drained, Pressure
+from mpm_dolfinx.validation import asked, numbers
+
+
+def water(
+    side: str,
+    level: float | Callable[[float], float],
+    *,
+    region: Region | None = None,
+    unit_weight: float = 1000 * STANDARD_GRAVITY,
+) -> tuple[Pressure, Drained]:
+    """Return the two conditions by which still water acts on a side: one of the `tractions`, one of the `drained`.
+
+    Below its level it presses on the side and is open to the pores, with the hydrostatic pressure; above, the side is
+    a seepage face.  Both follow the side as it moves, from step to step.
+
+    Parameters
+    ----------
+    side
+        Side of the bodies, as for `Traction`.
+    level : float or callable t (s) -> float, m
+        Height of the free surface, along the last axis; finite.
+    region : ((d,), (d,)), m
+        Box of reference positions to which the faces are limited.
+    unit_weight
+        Of the water, N/m^3, > 0; that of the pores is the fluid's density times the gravity of the scene.
+
+    Raises
+    ------
+    ValueError
+        Naming what is out of its range; of a function, at the step that asks for it.
+    """
+    numbers("water: unit_weight", unit_weight, test=lambda v: (0 < v) & (v < np.inf), allowed="> 0 and finite")
+    if not callable(level):
+        numbers("water: level", level)
+
+    def pressure(t: float, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        name = f"water at {side!r}: level at t = {t:g} s"
+        height = numbers(name, asked(name, "a finite number for a time", level, t) if callable(level) else level)
+        return unit_weight * np.maximum(height - x[:, -1], 0.0)
+
+    return Pressure(side, pressure, region), Drained(side, pressure, region, seepage=True)
