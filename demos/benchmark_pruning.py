@@ -86,7 +86,7 @@ def linear(cells: int) -> mpm.Simulation:
 
 def draining(cells: int, **options) -> mpm.Simulation:
     """Return the draining block."""
-    return block(cells, soil(conductivity=1e-4), **WATER, **options)
+    return block(cells, soil(conductivity=1e-4), **{**WATER, **options})
 
 
 def layered(cells: int, off: float) -> mpm.Simulation:
@@ -126,6 +126,7 @@ Make = Callable[[int], mpm.Simulation]
 PAIRS: dict[str, tuple[Make, Make]] = {
     "pore fluid that drains at once": (block, lambda n: block(n, soil(conductivity=1e3), **WATER)),
     "flux form": (lambda n: block(n, **SEALED), lambda n: block(n, soil(conductivity=1e-30), **SEALED)),
+    "seepage face": (draining, lambda n: draining(n, drained=[mpm.Drained("top", seepage=True)])),
     "layers off the grid lines": (partial(layered, off=0.0), partial(layered, off=0.5)),
     "second order in time": (lambda n: draining(n, method="backward-euler"), draining),
     "body force": (block, lambda n: block(n, gravity=(0, 0))),
