@@ -31,6 +31,7 @@ from inspect import signature
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mpm_dolfinx.constitutive.skeleton import Skeleton
 from mpm_dolfinx.points.faces import Region, Surface
 from mpm_dolfinx.validation import asked, flag, line, numbers
 
@@ -229,12 +230,30 @@ class Inflow:
 RIGIDITY = 1e4
 """Rigidity of a plate, in units of (oedometric modulus of the body) x (length of the side)."""
 HOLD = 3e2
-"""Stiffness of what holds the mean of a given displacement in a cell, in units of (oedometric modulus) / (cell size).
+"""Stiffness of what holds the mean of a given displacement in a cell, in units of (modulus by `holding`) / (cell size).
 
-The side gives way by (strain of the step) x cell size / HOLD, always measured from its given place: nothing adds up.
+The side gives way by (change of stress in the step) / (modulus) x cell size / HOLD, always measured from its given
+place: nothing adds up.
 """
 WEAK = 8.0
-"""The same for what is left of it at the points of integration, of (oedometric modulus + 10 stress) / (cell size)."""
+"""The same for what is left of it at the points of integration, of (modulus + 10 stress) / (cell size)."""
+YIELDING = 0.1
+"""Share of the elastic modulus that sides are held by where the law has a state: soil bears little beside it."""
+
+
+def resistance(material: Skeleton) -> NDArray[np.float64]:
+    """Return what a side resists with, Pa: the oedometric modulus, at most that of nu = 1/3, which is 4G."""
+    return np.minimum(material.oedometric, 4 * material.shear)
+
+
+def holding(material: Skeleton) -> NDArray[np.float64]:
+    """Return the modulus, Pa, in units of which a side is held.
+
+    By as much as a Q1 field whose cells keep their volume cannot follow a curved side it is pushed by what holds it.
+    That must not be stiff beside the body's shear: an undrained cavity in soil, widened with 3e2 (lambda + 2G), has up
+    to 1.9 times the pressure that it should have, with 30 times 4G 1.01.
+    """
+    return (YIELDING if material.state else 1.0) * resistance(material)
 
 
 @dataclass(frozen=True, eq=False)

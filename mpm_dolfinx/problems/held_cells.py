@@ -19,16 +19,16 @@ from mpm_dolfinx.problems.conditions import HOLD, WEAK
 FLAT = 1e-6  # cells^2: variance of places far below which a side has no extent in a cell
 FREE = 1e-6  # below this share of the nodes that may move in what moves a side, a wall holds it
 SAME = 1e-6  # cells: displacements that differ by less are the same
-CARRIED = 0.3  # change of traction in a step, in units of what the side is held with: no body's stress changes so much
+CARRIED = 0.3  # change of traction in a step, in units of what resists and stress: no body's stress changes so much
 
 
 class HeldPoints(NamedTuple):
     """Points of integration on sides with given displacements; arrays over n points in owned cells.
 
-    number, cell : (n,) condition, and local cell; area : (n,) reference area, m^(d-1); modulus, tension : (n,)
-    oedometric modulus and norm of the stress when the grid was reset, times area, N; x, gap : (n, d) position, and how
-    far it is from where it is to be, m; normal : (n, d) area vector when the grid was reset, m^(d-1); force : (n, d) of
-    the body's present stress, N.
+    number, cell : (n,) condition, and local cell; area : (n,) reference area, m^(d-1); modulus, tension, resistance :
+    (n,) modulus to hold with, norm of the stress when the grid was reset, and what resists, times area, N; x, gap :
+    (n, d) position, and how far it is from where it is to be, m; normal : (n, d) area vector when the grid was reset,
+    m^(d-1); force : (n, d) of the body's present stress, N.
     """
 
     number: NDArray[np.int64]
@@ -36,6 +36,7 @@ class HeldPoints(NamedTuple):
     area: NDArray[np.float64]
     modulus: NDArray[np.float64]
     tension: NDArray[np.float64]
+    resistance: NDArray[np.float64]
     x: NDArray[np.float64]
     gap: NDArray[np.float64]
     normal: NDArray[np.float64]
@@ -91,7 +92,8 @@ class HeldCells:
         h = grid.h.min()
         self.stiffness = both(HOLD / h * total(p.modulus), WEAK / h * against)
         # at the end of a side a node's force may come by a small part of a cell
-        self.limit = CARRIED * total(against) * np.maximum(1.0, grid.cell_volume / grid.h.max() / whole)
+        short = np.maximum(1.0, grid.cell_volume / grid.h.max() / whole)
+        self.limit = CARRIED * total(p.resistance + 10 * p.tension) * short
         self._gap, self._force = both(gap, p.gap), both(0 * gap, p.force)
         self._slope, self._along = both(slope, slope[at]), both(along, along[at])
 

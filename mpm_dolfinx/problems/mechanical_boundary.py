@@ -31,7 +31,9 @@ from mpm_dolfinx.problems.conditions import (
     Traction,
     by_place,
     facing,
+    holding,
     inward,
+    resistance,
 )
 from mpm_dolfinx.problems.held_cells import SAME, HeldCells, HeldPoints
 from mpm_dolfinx.problems.side_forms import SideData, SideForms
@@ -172,17 +174,19 @@ class MechanicalBoundary:
         patches = [cut.surface(faces) for _, faces, _ in self.holds]
         chosen = np.unique(np.concatenate([p.at for p in patches]))
         now, before = (of.map(lambda values: values[chosen]) for of in (points, cut.points))
-        stress, modulus = self._materials.total_stress(now), self._materials.table(before, lambda m: m.oedometric)
+        stress = self._materials.total_stress(now)
+        modulus, resists = (self._materials.table(before, of) for of in (holding, resistance))
         # of when the grid was reset, as the stiffnesses: they stay as long as the cut serves
         tension = np.linalg.norm(stress if points is cut.points else self._materials.total_stress(before), axis=(1, 2))
         for number, ((hold, *_), p) in enumerate(zip(self.holds, patches, strict=True)):
             at, gap = np.searchsorted(chosen, p.at), p.origin(points) + self._given(hold, t, p.X) - p.now(points)
             force = np.einsum("nij,nj->ni", stress[at], p.area(points))
-            each = np.stack([np.full(len(gap), number), *(p.area0 * v for v in (1, modulus[at], tension[at]))], axis=1)
+            own = (p.area0 * v for v in (1, modulus[at], tension[at], resists[at]))
+            each = np.stack([np.full(len(gap), number), *own], axis=1)
             rows.append((p.cell, p.x, np.concatenate([each, gap, p.area(cut.points), force], axis=1)))
-        cell, x, values = gathered(self.grid, rows, 4 + 3 * d)
-        number, area, modulus, tension = values[:, :4].T
-        return HeldPoints(number.astype(np.int64), cell, area, modulus, tension, x, *np.split(values[:, 4:], 3, axis=1))
+        cell, x, values = gathered(self.grid, rows, 5 + 3 * d)
+        number, *own = values[:, :5].T
+        return HeldPoints(number.astype(np.int64), cell, *own, x, *np.split(values[:, 5:], 3, axis=1))
 
     def _check_meeting(self, t: float) -> None:
         """Refuse given displacements that differ where they meet: no body's stress is finite there."""

@@ -19,6 +19,7 @@ from mpm_dolfinx.points.cut_domains import CutDomains
 from mpm_dolfinx.points.grid import sum_by
 from mpm_dolfinx.points.pressure_transport import Reconstruction, share_within, transport
 from mpm_dolfinx.problems.fluxes import CellContents, Conduction, Mobility, OpenSides, PieceContents
+from mpm_dolfinx.problems.ghost_penalty import stiffness
 from mpm_dolfinx.problems.layers import graded, mixed_cells
 from mpm_dolfinx.problems.momentum import MomentumForms, MomentumSystem
 from mpm_dolfinx.problems.quadrature_data import QuadratureData, QuadraturePoints
@@ -62,8 +63,8 @@ class OnGrid(Keyed):
         pieces = self.data.pieces
         self.weight = weight = pieces["weight"][:, 0] * grid.cell_volume
         """Volumes (m,) of the pieces, m^d."""
-        shear = weight * quadrature.rows(cut, points, lambda m: 2 * m.shear)
-        momentum.ghost.set_contents(*(sum_by(cut.cells, rows, grid.num_local) for rows in (weight, shear)))
+        stiff = weight * quadrature.rows(cut, points, stiffness)
+        momentum.ghost.set_contents(*(sum_by(cut.cells, rows, grid.num_local) for rows in (weight, stiff)))
         self.active = momentum.ghost.fill.x.array > 0
         """Which local cells hold something, ghosts included."""
         self.cells = np.flatnonzero(self.active)
