@@ -32,7 +32,7 @@ def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int
     points = scene.materials.seeded.of(_ids(scene.bodies, later), kept=False)
     transported = at_start(points) if scene.fluid else None
     reactions = np.zeros((len(begun.mechanical.holds), scene.grid.dim))
-    return State(0.0, points, transported, None, 0, reactions, begun, True, None)
+    return State(0.0, points, transported, None, 0, reactions, begun, True, None, None)
 
 
 def begin_stage(

@@ -43,4 +43,6 @@ def step(scene: Scene, state: State, dt: float) -> tuple[State, Report]:
     note_pressures(report, solvers, both.storage, acting.substep.before * dt, rates)
     reactions = state.stage.mechanical.reactions(acting.sides, scene.momentum.u.x.array.reshape(-1, scene.grid.dim))
     new, report.rederived = scene.motion.advanced(state, on_grid, state.t + dt)
-    return replace(new, reactions=reactions, resets=state.resets + (state.stay is None), begins=False), report
+    velocity = None if scene.momentum.elastic else scene.momentum.u.x.array / dt
+    resets = state.resets + (state.stay is None)
+    return replace(new, reactions=reactions, resets=resets, begins=False, velocity=velocity), report
