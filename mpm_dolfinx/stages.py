@@ -33,7 +33,7 @@ def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int
     transported = at_start(points) if scene.fluid else None
     reactions = np.zeros((len(begun.mechanical.holds), scene.grid.dim))
     outflows = np.zeros(len(begun.hydraulic.outlets))
-    return State(0.0, points, transported, None, 0, reactions, outflows, begun, True, None)
+    return State(0.0, points, transported, None, 0, reactions, outflows, begun, True, None, None)
 
 
 def begin_stage(

@@ -70,6 +70,9 @@ class State:
         The conditions in force.
     begins
         Whether no step of the stage has been taken.
+    velocity : (unknowns,), m/s
+        Of the nodes of this process in the last step, ghosts included: where Newton's method may begin in soil that
+        yields.  None before the first step, and without such soil.
     result
         Histories of the last run, None before the first one.
     """
@@ -83,6 +86,7 @@ class State:
     outflows: NDArray[np.float64]
     stage: Stage
     begins: bool
+    velocity: NDArray[np.float64] | None
     result: Result | None
 
     def migrated(self, destination: NDArray[np.int32], comm: MPI.Intracomm) -> State:

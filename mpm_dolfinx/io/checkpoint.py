@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from mpm_dolfinx.io.writer import WRITABLE, replacing
 from mpm_dolfinx.parallel.exchange import at_root
 from mpm_dolfinx.parallel.messages import log
+from mpm_dolfinx.points.grid import Grid
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.points.pressure_transport import PiecePressures
 from mpm_dolfinx.result import Result, Row
@@ -82,12 +83,13 @@ def save(simulation: Simulation, file: Path) -> None:
     """Write the state of a simulation between two steps of a run."""
     comm, began, state = simulation.grid.comm, time.perf_counter(), simulation.state
     whole_state = state.migrated(np.zeros(len(state.points), dtype=np.int32), comm)
+    velocity = _velocity_of_all(simulation.grid, state.velocity)
     note = {"version": VERSION, "t": state.t, "resets": state.resets, "begins": state.begins}
     note |= {"scene": describe(simulation), "result": _scalars(state.result)}
 
     def write() -> int:
         file.parent.mkdir(parents=True, exist_ok=True)
-        arrays = {"format": np.array(FORMAT), "note": np.array(json.dumps(note)), **_arrays(whole_state)}
+        arrays = {"format": np.array(FORMAT), "note": np.array(json.dumps(note)), **_arrays(whole_state), **velocity}
         with replacing(file) as part, open(part, "wb") as f:
             np.savez(f, **arrays)
         return file.stat().st_size
@@ -132,7 +134,8 @@ def resume(simulation: Simulation, file: str | os.PathLike) -> Result:
     found: list[State] = []  # rank 0 has all rows, and passes them on
     bare = at_root(comm, read)
     state = found[0] if found else bare
-    simulation.state = replace(state, stage=simulation.state.stage).at_owners(simulation.grid)
+    velocity = _velocity_here(simulation.grid, state.velocity)
+    simulation.state = replace(state, stage=simulation.state.stage, velocity=velocity).at_owners(simulation.grid)
     log(comm, "t = %g s: resumed from %s after %d steps", state.t, file, state.result.steps)
     return simulation.result
 
@@ -176,9 +179,13 @@ def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulat
         columns = [[*histories[name]] or [None] * len(times) for name in Row._fields]
         result = Result(rows=[Row(*row) for row in zip(*columns, strict=True)], **note["result"])
         acting = reactions, outflows = arrays.pop("reactions"), arrays.pop("outflows")
+        velocity = _part(arrays, "velocity/") or None
+        if velocity is not None:
+            _check_velocity(velocity, simulation.grid)
         if arrays or reactions.shape[1:] != (dim,) or outflows.ndim != 1 or not all(np.isfinite([note["t"], *times])):
             raise ValueError(f"has {', '.join(arrays) or 'other reactions, outflows or times'}")
-        return State(note["t"], points, transported, stay, note["resets"], *acting, None, note["begins"], result)
+        start = note["t"], points, transported, stay, note["resets"], *acting, None, note["begins"]
+        return State(*start, velocity, result)
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         raise ValueError(f"{damaged} ({line(error)}), must be a whole checkpoint") from error
 
@@ -195,6 +202,46 @@ def _points(arrays: dict[str, NDArray], like: MaterialPoints, ids: NDArray[np.in
     if set(data) != set(like.data) or not np.array_equal(points.id, ids):
         raise ValueError("points/id: other points than the bodies'")
     return points
+
+
+def _nodes(grid: Grid) -> NDArray[np.int64]:
+    """Return the lexicographic numbers of the nodes of this process."""
+    index = np.rint((grid.node_x - grid.lower) / grid.h).astype(np.int64)
+    return np.ravel_multi_index(tuple(index.T), tuple(grid.shape + 1))
+
+
+def _velocity_of_all(grid: Grid, velocity: NDArray[np.float64] | None) -> dict[str, NDArray]:
+    """Return numbers and velocities of the nodes that move, of all processes, on rank 0; of none without."""
+    if velocity is None:
+        return {}
+    velocity = velocity.reshape(-1, grid.dim)
+    moves = velocity.any(axis=1)
+    parts = grid.comm.gather((_nodes(grid)[moves], velocity[moves])) or [(np.empty(0, np.int64), velocity[:0])]
+    node, rows = (np.concatenate(values) for values in zip(*parts, strict=True))
+    node, first = np.unique(node, return_index=True)
+    return {"velocity/node": node, "velocity/values": rows[first]}
+
+
+def _velocity_here(grid: Grid, moving: dict[str, NDArray] | None) -> NDArray[np.float64] | None:
+    """Return the velocities of this process's nodes from those of all that move; None without."""
+    if moving is None:
+        return None
+    node, values = moving["node"], np.concatenate([moving["values"], np.zeros((1, grid.dim))])
+    here = _nodes(grid)
+    at = np.searchsorted(node, here)
+    found = np.append(node, -1)[at] == here
+    return values[np.where(found, at, len(node))].ravel()
+
+
+def _check_velocity(arrays: dict[str, NDArray], grid: Grid) -> None:
+    """Refuse, with a ValueError, arrays that are no velocities of nodes of a grid."""
+    node, values = arrays.pop("node"), arrays.pop("values")
+    right = node.dtype == np.int64 and values.dtype == np.float64 and values.shape == (len(node), grid.dim)
+    if arrays or not right or not np.isfinite(values).all() or (np.diff(node) <= 0).any():
+        raise ValueError("velocity: none of nodes of the grid, or not finite")
+    if len(node) and not 0 <= node[0] <= node[-1] < np.prod(grid.shape + 1):
+        raise ValueError("velocity: of other nodes than the grid's")
+    arrays |= {"node": node, "values": values}
 
 
 def _check_pieces(arrays: dict[str, NDArray], ids: NDArray[np.int64], dim: int) -> None:

@@ -50,7 +50,9 @@ def balances(scene: Scene, start: Start, acting: Acting, before: Rates | None = 
     substep, on_grid, matrices, dt = acting.substep, start.on_grid, start.matrices, start.dt
     scene.set_time(acting.t, substep.end * dt, acting.gravity)
     scene.momentum.set_rate(substep.own * dt, substep.before / substep.own)
-    momentum = MomentumProblem(scene.momentum, matrices.momentum, start.data, acting.sides, matrices.round_off)
+    velocity = start.state.velocity if substep.before == 0.0 else None  # else the substep before tells more
+    goes_on = None if velocity is None else substep.end * dt * velocity
+    momentum = MomentumProblem(scene.momentum, matrices.momentum, start.data, acting.sides, matrices.round_off, goes_on)
     if scene.storage is None:
         return Balances(momentum, None)
     weight = None if acting.gravity is None else scene.fluid.density * acting.gravity

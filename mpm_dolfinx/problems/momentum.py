@@ -301,13 +301,21 @@ class MomentumProblem:
         What acts on the sides of the bodies.
     round_off
         Norm of the residual that rounding leaves, N.
+    goes_on : (unknowns,)
+        Displacements if the bodies moved on as in the last step, a local array, m; None where that is not known.
     """
 
     def __init__(
-        self, forms: MomentumForms, system: MomentumSystem, data: QuadratureData, sides: SideData, round_off: float
+        self,
+        forms: MomentumForms,
+        system: MomentumSystem,
+        data: QuadratureData,
+        sides: SideData,
+        round_off: float,
+        goes_on: NDArray[np.float64] | None = None,
     ):
         self.forms, self.system, self.data, self.round_off = forms, system, data, round_off
-        self._sides = sides
+        self._sides, self._goes_on = sides, goes_on
         with Timer("mpm: loads"):
             self._external, self._pulls = forms.external(data, sides)
 
@@ -316,13 +324,15 @@ class MomentumProblem:
         """Whether the tangent changes with the places of the points only."""
         return self.forms.linear and self._sides.pressures is None
 
-    def turned(self) -> NDArray[np.float64] | None:
-        """Return the displacements (local unknowns,), m, if given displacements turn the bodies as one; else None."""
+    def guesses(self) -> list[NDArray[np.float64]]:
+        """Return displacements (local unknowns,), m, at which Newton's method may begin.
+
+        Those of a turn, if given displacements turn the bodies as one, and those of the last step gone on with.
+        """
         forms, holds = self.forms, self._sides.holds
         motion = None if holds is None else rigid_motion(forms.grid.comm, holds, forms.grid.node_x)
-        if motion is None:
-            return None
-        return np.where(self.system.unknowns.map.indices >= 0, motion.ravel(), 0.0)
+        found = [values.ravel() for values in (motion, self._goes_on) if values is not None]
+        return [np.where(self.system.unknowns.map.indices >= 0, values, 0.0) for values in found]
 
     def assemble_residual(self) -> tuple[PETSc.Vec, float]:
         """Return the out-of-balance nodal forces at u and their scale, the largest of internal, external, terms (N)."""

@@ -18,13 +18,14 @@ iterations: `schur-...` then solve both problems at once, see `monolithic`.
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from mpi4py import MPI
 from petsc4py import PETSc
 
 import numpy as np
 from dolfinx.common import Timer
+from numpy.typing import NDArray
 
 from mpm_dolfinx.errors import NotConverged
 from mpm_dolfinx.parallel.exchange import over_all
@@ -34,10 +35,11 @@ from mpm_dolfinx.problems.storage import Rates, StorageProblem, StorageResidual
 from mpm_dolfinx.result import Report
 from mpm_dolfinx.solve.linear import negative_pivots
 from mpm_dolfinx.solve.schur import LinearSolvers
+from mpm_dolfinx.solve.watchdog import EXPLODES, LARGEST, SHORTEST_DESCENT, Watchdog, shortened
 
 KEEP = 0.05  # the tangent is kept while a Newton step reduces the residual to less than this
 FORCING, FINEST = 1e-3, 1e-9  # relative accuracy of the linear solve, and the best that is asked for
-EXPLODES = 1e4  # a bending body's residual may grow this much in a good step: rotations stretch at first order
+SHORTEST = 1e-3  # share of a Newton step below which it is not shortened
 INNER = 1e-3  # the momentum is solved to this share of the storage's error: rotations fake volume changes
 MOMENTUM_STEPS = 10
 ERROR = 1 / 20
@@ -111,7 +113,7 @@ def solve_substep(
     report.newton, report.coupling = report.newton + took.newton, report.coupling + took.coupling
     report.history += took.history
     count, most = (took.coupling, "coupling") if in_turn else (took.newton, "newton")
-    report.easy = report.easy and 3 * count <= getattr(solvers.scheme, f"most_{most}")
+    report.easy = report.easy and 2 * count <= getattr(solvers.scheme, f"most_{most}")
     if storage is None:
         return None
     grid, nodes = momentum.forms.grid, momentum.system.unknowns.global_size
@@ -155,42 +157,76 @@ class Newton:
         self._solvers, self._scheme, self._momentum, self._storage = solvers, solvers.scheme, momentum, storage
         self.report = Report()
         self._linear = momentum.linear and (storage is None or storage.linear)
+        self._functions = [momentum.forms.u] + ([storage.forms.p] if storage is not None else [])
 
     def newton(self, as_reset: Callable[[], QuadratureData], key: Hashable, serves: bool) -> Errors:
         """Solve both problems at once; the tangent is kept while it serves, of linear laws over steps.
 
         serves: whether the tangent of the substep before may serve.
         """
-        errors, fresh = self._begin(), self._linear or not serves
+        errors, other = self._begin()
+        fresh = self._linear or not serves
+        try:
+            return self._iterations(errors, as_reset, key, fresh)
+        except NotConverged:
+            if other is None:
+                raise
+        self._go_to(other)
+        return self._iterations(self._errors(errors.start), as_reset, key, True)
+
+    def _iterations(self, errors: Errors, as_reset: Callable[[], QuadratureData], key: Hashable, fresh: bool) -> Errors:
+        """Iterate from the present (u, p), of these errors; fresh: with its own tangent."""
+        dog, count = None if self._momentum.forms.elastic else Watchdog(errors.worst, self._iterate()), 0
         while errors.worst > self._scheme.tolerance:
-            self._check(self.report.newton, "newton")
+            self._check(count, "newton")
             if fresh and self._linear and not self.report.newton:
                 self._solvers.tangent(key, lambda: self._linearise_as_reset(as_reset))
             elif fresh:
                 self._linearise()
             self.report.coupling += self._direction(errors)
-            before, errors = errors, self._line_search(errors)
-            fresh = errors.worst > KEEP * min(1.0, before.worst)  # inf where no fluid has moved yet
+            before, errors = errors, self._line_search(errors, dog)
+            count, fresh = count + 1, errors.worst > KEEP * min(1.0, before.worst)  # inf where no fluid has moved yet
+            dog = dog and dog.after(errors.worst, self._iterate)
+            if dog and dog.strays(errors.worst):
+                self._go_to(dog.where)
+                errors, fresh, dog = self._errors(errors.start), True, replace(dog, since=0, descends=True)
             if self._storage is not None and self._storage.settle_seepage():
                 errors, fresh = self._errors(errors.start), True
         return errors
 
-    def _begin(self) -> Errors:
-        """Return the errors where the iterations begin: where the bodies are turned, if that balances better."""
-        errors, u = self._errors(), self._momentum.forms.u.x.array
-        turned = None if self._linear else self._momentum.turned()
-        if turned is None:
-            return errors
-        before = u.copy()
-        u[:] = turned
-        try:
-            begun = self._errors(errors.start)
-        except NotConverged:
-            begun = None
-        if begun is not None and begun.worst < errors.worst:
-            return begun
-        u[:] = before
-        return self._errors(errors.start)
+    def _begin(self) -> tuple[Errors, list[NDArray[np.float64]] | None]:
+        """Return the errors where the iterations begin: at a guess that balances better than where (u, p) are.
+
+        Also where else they may begin, if there is another place.
+        """
+        errors, start, best = self._errors(), self._iterate(), None
+        guesses = [] if self._linear else self._momentum.guesses()
+        for guess in guesses:
+            self._go_to([guess, *start[1:]])
+            try:
+                found = self._errors(errors.start)
+            except NotConverged:
+                continue
+            if found.u < (best or errors).u:  # of no other p: where no fluid has moved yet the storage tells nothing
+                best, at = found, guess
+        if best is None:
+            if guesses:
+                self._go_to(start)
+                errors = self._errors(errors.start)
+            return errors, None
+        if guess is not at:
+            self._go_to([at, *start[1:]])
+            best = self._errors(errors.start)
+        return best, start
+
+    def _iterate(self) -> list[NDArray[np.float64]]:
+        """Return a copy of the present (u, p), local arrays, m and Pa."""
+        return [f.x.array.copy() for f in self._functions]
+
+    def _go_to(self, iterate: Sequence[NDArray[np.float64]]) -> None:
+        """Set (u, p)."""
+        for f, values in zip(self._functions, iterate, strict=True):
+            f.x.array[:] = values
 
     def check_stable(self) -> None:
         """Refuse an equilibrium that the body leaves at the least disturbance: smaller steps find where it goes.
@@ -296,19 +332,26 @@ class Newton:
         with Timer("mpm: linear solve"):
             return self._solvers.solve(rtol, errors.forces, errors.exchanged)
 
-    def _line_search(self, before: Errors) -> Errors:
-        """Go against the direction, backtracking while the residual is not finite or explodes."""
+    def _line_search(self, before: Errors, dog: Watchdog | None = None) -> Errors:
+        """Go against the direction, backtracking while the residual is not finite or explodes, or as a watchdog says.
+
+        Where soil yields and no residual is as low as that wants, the lowest is taken.
+        """
         self.report.newton += 1
-        step, moved = 1.0, 0.0
-        while True:
+        step, moved, tried = 1.0, 0.0, {}
+        explodes = min(EXPLODES * before.worst, LARGEST)
+        limit, shortest = (explodes, SHORTEST) if dog is None else (dog.limit(before.worst), SHORTEST_DESCENT)
+        while step >= shortest:
             self._move(moved - step)
-            moved = step
-            errors = self._errors(before.start)
-            if np.isfinite(errors.worst) and errors.worst < EXPLODES * before.worst:
+            moved, errors = step, self._errors(before.start)
+            if errors.worst <= limit:
                 return errors
-            step /= 2
-            if step < 1e-3:
-                raise NotConverged("no descent along the Newton direction", self.report.history)
+            tried[errors.worst] = step
+            step *= 0.5 if dog is None else shortened(errors.worst / before.worst, step)
+        if not min(tried) <= explodes:
+            raise NotConverged("no descent along the Newton direction", self.report.history)
+        self._move(moved - tried[min(tried)])
+        return self._errors(before.start)
 
     def _move(self, scale: float) -> None:
         self._momentum.system.unknowns.add(self._momentum.forms.u, scale, self._solvers.du)

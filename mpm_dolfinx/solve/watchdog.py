@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: MIT
+"""How far Newton's iterations may stray before they are called back.
+
+The residual of a body that bends grows in good steps, for rotations stretch at first order.  Where soil yields it grows
+too, mostly for the better, but iterations may also circle or run away.  Full steps are taken until the least residual
+so far has stood for some of them; then the iterations go back to it and descend from there until they are below it
+(watchdog technique: Chamberlain, Powell, Lemarechal and Pedersen 1982).
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+EXPLODES = 1e4
+"""Growth of the residual from which on a step is shortened: that of a bending body may grow as much in a good one."""
+PATIENCE = 3
+"""Full steps that may pass without a residual below the least so far."""
+SHORTEST_DESCENT = 0.1
+"""Share of a step below which a descent does not shorten it."""
+LARGEST = sys.float_info.max
+
+
+@dataclass(frozen=True)
+class Watchdog:
+    """Watches the iterations where soil yields.
+
+    least: least residual so far; where: (u, p) there; since: full steps since; descends: whether they were called back.
+    """
+
+    least: float
+    where: list[NDArray[np.float64]]
+    since: int = 0
+    descends: bool = False
+
+    def limit(self, residual: float) -> float:
+        """Return what the next step may make of a residual."""
+        return min(residual, LARGEST) if self.descends else np.inf
+
+    def after(self, residual: float, iterate: Callable[[], list[NDArray[np.float64]]]) -> Watchdog:
+        """Return what is known after a step to a residual at (u, p) = iterate()."""
+        if residual < self.least:
+            return Watchdog(residual, iterate())
+        return replace(self, since=self.since + 1)
+
+    def strays(self, residual: float) -> bool:
+        """Return whether the iterations are to go back to the least residual, and to descend from there."""
+        runs_away = not residual <= min(EXPLODES * self.least, LARGEST)
+        return not self.descends and (runs_away or self.since >= PATIENCE)
+
+
+def shortened(growth: float, step: float) -> float:
+    """Return by how much to shorten a step after which the residual has grown by a factor, from a tenth to a half.
+
+    To where the parabola through both squared residuals is least whose slope at first is Newton's, -2.
+    """
+    if not growth < LARGEST:
+        return 0.5
+    return min(0.5, max(0.1, step / (growth**2 - 1 + 2 * step)))

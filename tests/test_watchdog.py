@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: MIT
+"""Newton's iterations where soil yields: they may stray for a while, are called back, and go on as in the last step."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.solve.watchdog import PATIENCE, Watchdog, shortened
+
+
+def test_the_residual_may_grow_for_some_full_steps_and_descends_after_them():
+    where = [np.zeros(1)]
+    dog = Watchdog(1.0, where)
+    for count in range(PATIENCE):
+        assert not dog.strays(2.0) and dog.limit(2.0) == np.inf
+        dog = dog.after(2.0 + count, list)
+    assert dog.strays(2.0) and dog.where is where
+    down = replace(dog, since=0, descends=True)
+    assert down.limit(1.0) == 1.0 and not down.strays(np.inf)
+    assert down.after(0.5, list) == Watchdog(0.5, [])  # full steps again
+
+
+@pytest.mark.parametrize("residual", [1e5, np.inf])
+def test_iterations_that_run_away_are_called_back_at_once(residual):
+    assert Watchdog(1.0, []).strays(residual)
+    assert Watchdog(np.inf, []).strays(np.inf) and not Watchdog(np.inf, []).strays(1e9)
+
+
+@pytest.mark.parametrize("share", [0.2, 0.4])
+def test_a_step_is_shortened_to_where_a_parabola_of_the_squared_residual_is_least(share):
+    curvature = 1 / share  # r^2 = 1 - 2 s + curvature s^2
+    assert shortened(np.sqrt(1 - 2 + curvature), 1.0) == pytest.approx(share)
+    assert shortened(np.inf, 1.0) == 0.5 and shortened(1e9, 1.0) == 0.1 and shortened(1.0, 1.0) == 0.5
+
+
+def pushed(dim: int = 2) -> mpm.Simulation:
+    """Return soft ground, of which a given displacement pushes half of the top, beyond its limit load."""
+    n, free = 6, [np.inf] * (dim - 1)
+    grid = mpm.Grid([1.0] * (dim - 1) + [1.25], [n] * (dim - 1) + [n + 2])
+    soil = mpm.DruckerPrager(bulk=2e6, shear=1e6, friction=20.0, dilation=0.0, cohesion=1e4, conductivity=1e-7)
+    push = [0.0] * (dim - 1) + [-0.02]
+    region = ([-np.inf] * dim, [0.45, *free])
+    footing = mpm.Displacement("top", lambda t, X: np.multiply(t, push), region=region)
+    walls = {"left": "x", "right": "x", "bottom": "xyz"[:dim]} | ({"front": "y", "back": "y"} if dim == 3 else {})
+    body = mpm.box(grid, [0] * dim, [1] * dim)
+    drained = mpm.Drained("top", region=([0.5, *[-np.inf] * (dim - 1)], [np.inf] * dim))
+    bodies = {"displacements": [footing], "drained": [drained], "fluid": mpm.Fluid()}
+    return mpm.Simulation(grid, [body], [soil], fixed=walls, **bodies)
+
+
+def test_a_step_goes_on_as_the_last_one_where_soil_flows():
+    s = pushed()
+    s.run(3, 1)
+    before = s.state
+    goes_on = s.step(1.0)
+    s.state = replace(before, velocity=None)
+    at_rest = s.step(1.0)
+    assert goes_on.newton < at_rest.newton
+    # the second entry is where the iterations begin: less out of balance than a tenth of where they would at rest
+    assert goes_on.history[1][0] < 0.1 * at_rest.history[0][0]
+
+
+def test_a_run_resumed_where_soil_flows_ends_with_the_same_bits(tmp_path):
+    whole, part = pushed(), pushed()
+    whole.run(4, 1)
+    part.run(2, 1, checkpoint=mpm.Checkpoint(tmp_path / "run.ckpt"))
+    new = pushed()
+    mpm.resume(new, tmp_path / "run.ckpt")
+    assert np.array_equal(new.state.velocity, part.state.velocity)
+    new.run(4, 1)
+    assert np.array_equal(new.points.x, whole.points.x) and np.array_equal(new.points.pressure, whole.points.pressure)
+
+
+def test_bodies_that_do_not_yield_remember_no_velocities():
+    grid = mpm.Grid([1.0, 1.0], [4, 4])
+    body, load = mpm.box(grid, [0, 0], [0.5, 0.5]), mpm.Traction("top", (0, -1e3))
+    s = mpm.Simulation(grid, [body], [mpm.Hencky(bulk=1e6, shear=1e6)], fixed={"bottom": "xy"}, tractions=[load])
+    s.step(1.0)
+    assert s.state.velocity is None
