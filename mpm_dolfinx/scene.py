@@ -69,9 +69,7 @@ class Scene:
         sources: Sequence[Callable],
     ):
         self.grid, self.bodies, self.fluid, self.quadrature = grid, tuple(bodies), fluid, quadrature
-        self.materials = scene = SceneMaterials(
-            grid, materials, bodies, material_points(grid, bodies, pressure), fluid is not None
-        )
+        self.materials = scene = SceneMaterials(grid, materials, bodies, material_points(grid, bodies, pressure), fluid)
         self.gravity = fem.Constant(grid.mesh, np.zeros(grid.dim)) if weighs else None
         self.t, self.dt = fem.Constant(grid.mesh, 0.0), fem.Constant(grid.mesh, 1.0)
         """Time at the end of the substep, and since the start of the step, s, for forms."""

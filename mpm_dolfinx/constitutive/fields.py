@@ -24,10 +24,10 @@ from mpm_dolfinx.validation import numbers
 
 RESERVED = frozenset("F dF softness storage storage_at_one density position displacement porosity0 gradient".split())
 """Names of what points of integration carry beside parameters and state."""
-
-
 EVOLVED = 1e-3
 """By how much the state of a law differs from that at rest where it counts as another."""
+STIFFEST = 100.0
+"""How much stiffer than the skeleton pore fluid that cannot flow is taken to be, at most: rounding grows with it."""
 
 
 class SceneMaterials:
@@ -43,14 +43,19 @@ class SceneMaterials:
         All bodies; their reference positions are where fields are evaluated.
     points
         The points of this process, as seeded.
-    wet
-        Whether there is a fluid.
+    fluid
+        Pore fluid, if there is one.
     """
 
     def __init__(
-        self, grid: Grid, materials: Sequence[Skeleton], bodies: Sequence[Body], points: MaterialPoints, wet: bool
+        self,
+        grid: Grid,
+        materials: Sequence[Skeleton],
+        bodies: Sequence[Body],
+        points: MaterialPoints,
+        fluid: Fluid | None,
     ):
-        self._grid, self.materials = grid, materials
+        self._grid, self.materials, self._fluid = grid, materials, fluid
         seeded: dict[str, NDArray[np.float64]] = {}
         X, index = _reference(bodies, len(materials))
         self._used = np.unique(index).tolist()  # a material that no body is of changes nothing
@@ -75,8 +80,6 @@ class SceneMaterials:
         """Whether points differ in stiffness by more than a factor of two."""
         self.conducts = any(m.conductivity_law or np.any(np.asarray(m.conductivity) > 0) for m in evaluated)
         """Whether fluid flows anywhere."""
-        self.evolves = any(law.state for law in self.laws)
-        """Whether a law has a state."""
         conductivity = np.concatenate([np.ravel(m.conductivity) for m in evaluated])
         by_place = any(callable(m.conductivity) for m in materials) or any(map(_names_place, self.conductivity_laws))
         self.layered = by_place or len({m.conductivity_law for m in used}) > 1 or bool(np.ptp(conductivity))
@@ -102,7 +105,7 @@ class SceneMaterials:
                 mine = everywhere[points.id]
                 seeded[name] = mine + seeded[name] if name in seeded else mine
         self._softness: dict[int, SoftnessAtPoints] = {}
-        if wet and self.evolves:
+        if fluid is not None and self.evolves:
             seeded["softness"] = np.ones(len(points))
             for number, law in enumerate(self.laws):
                 if law.state:
@@ -206,6 +209,11 @@ class SceneMaterials:
         return list(dict.fromkeys(name for i in self._used for name in self._fields[i]))
 
     @property
+    def evolves(self) -> bool:
+        """Whether a law has a state."""
+        return any(law.state for law in self.laws)
+
+    @property
     def state_names(self) -> list[str]:
         """Names of what evolves with a law."""
         return list(dict.fromkeys(name for law in self.laws for name in law.state))
@@ -217,6 +225,17 @@ class SceneMaterials:
     def storage(self, points: MaterialPoints, fluid: Fluid) -> NDArray[np.float64]:
         """Return the storage coefficient at the points (n,), 1/Pa."""
         return self.table(points, lambda m, n: m.storage(fluid.bulk, n), self.porosity(points))
+
+    def confined_modulus(self, points: MaterialPoints) -> NDArray[np.float64]:
+        """Return what resists where neither skeleton nor pore fluid can give way (n,), Pa: lambda + 2G + alpha^2 / S.
+
+        At most so many times lambda + 2G as `STIFFEST` says.
+        """
+        modulus = self.table(points, lambda m: m.oedometric)
+        if self._fluid is None:
+            return modulus
+        fluid = self.table(points, lambda m: m.biot) ** 2 / np.maximum(self.storage(points, self._fluid), 1e-300)
+        return modulus + np.minimum(fluid, STIFFEST * modulus)
 
     def state(self, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
         """Return the state at the points (n, ...)."""

@@ -19,14 +19,17 @@ from mpm_dolfinx.problems.conditions import HOLD, WEAK
 FLAT = 1e-6  # cells^2: variance of places far below which a side has no extent in a cell
 FREE = 1e-6  # below this share of the nodes that may move in what moves a side, a wall holds it
 SAME = 1e-6  # cells: displacements that differ by less are the same
+ALIGNED = 5e-3
+"""Slope of a side in a cell to an axis below which its cells can follow it, whatever they keep their volume."""
 CARRIED = 0.3  # change of traction in a step, in units of what resists and stress: no body's stress changes so much
 
 
 class HeldPoints(NamedTuple):
     """Points of integration on sides with given displacements; arrays over n points in owned cells.
 
-    number, cell : (n,) condition, and local cell; area : (n,) reference area, m^(d-1); modulus, tension, resistance :
-    (n,) modulus to hold with, norm of the stress when the grid was reset, and what resists, times area, N; x, gap :
+    number, cell : (n,) condition, and local cell; area : (n,) reference area, m^(d-1); modulus, tension, resistance,
+    firm : (n,) modulus to hold with, norm of the stress when the grid was reset, what resists, and what resists where
+    nothing can give way, times area, N; x, gap :
     (n, d) position, and how far it is from where it is to be, m; normal : (n, d) area vector when the grid was reset,
     m^(d-1); force : (n, d) of the body's present stress, N.
     """
@@ -37,6 +40,7 @@ class HeldPoints(NamedTuple):
     modulus: NDArray[np.float64]
     tension: NDArray[np.float64]
     resistance: NDArray[np.float64]
+    firm: NDArray[np.float64]
     x: NDArray[np.float64]
     gap: NDArray[np.float64]
     normal: NDArray[np.float64]
@@ -59,7 +63,8 @@ class HeldCells:
         Of each row: condition, cell, mean position (m), mean shape functions, means of products of
         the components of the offset from the cell's midpoint.
     stiffness, limit
-        N/m; and force beyond which it is an artefact, N, for means.
+        By component, N/m: across a flat side along the grid that of what cannot give way; and force beyond which it is
+        an artefact, N, for means.
     """
 
     def __init__(self, grid: Grid, points: HeldPoints):
@@ -90,7 +95,9 @@ class HeldCells:
         self.moments = {name: both(mean(values), values) for name, values in moments.items()}
         against = p.modulus + 10 * p.tension  # a stressed side buckles if it is held with less than its stress
         h = grid.h.min()
-        self.stiffness = both(HOLD / h * total(p.modulus), WEAK / h * against)
+        flat = normal**2 > (1 - ALIGNED**2) * (normal**2).sum(axis=1, keepdims=True)
+        modulus = np.where(flat, total(p.firm)[:, None], total(p.modulus)[:, None])
+        self.stiffness = both(HOLD / h * modulus, np.repeat(WEAK / h * against[:, None], grid.dim, axis=1))
         # at the end of a side a node's force may come by a small part of a cell
         short = np.maximum(1.0, grid.cell_volume / grid.h.max() / whole)
         self.limit = CARRIED * total(p.resistance + 10 * p.tension) * short
@@ -114,7 +121,7 @@ class HeldCells:
 
         Returns
         -------
-        Rows (k,) and gaps (k,); of a row that walls hold and that has to move, its index or -1.
+        Rows (k,), their stiffnesses (k,) and gaps (k,); of a row that walls hold and that has to move, its index or -1.
         """
         grid, chosen = self.grid, np.flatnonzero(given[self.number])
         nodes, x, gap, N = (v[chosen] for v in (grid.cell_nodes[self.cell], self.x, self._gap[:, axis], self.shape))
@@ -127,5 +134,6 @@ class HeldCells:
                 at_wall = (walled[:, here].all(axis=1) & self._along[chosen, b])[:, None] & here
                 asked += at_wall * ((grid.node_x[nodes, b] - x[:, b, None]) * self._slope[chosen, b, axis, None])
                 stuck |= at_wall
-        gap = gap - (N * stuck * asked).sum(axis=1) + self._force[chosen, axis] / self.stiffness[chosen]
-        return chosen, gap, chosen[held][0] if held.any() else -1
+        stiffness = self.stiffness[chosen, axis]
+        gap = gap - (N * stuck * asked).sum(axis=1) + self._force[chosen, axis] / stiffness
+        return chosen, stiffness, gap, chosen[held][0] if held.any() else -1

@@ -156,16 +156,16 @@ class MechanicalBoundary:
         placed, message = [], ""
         for axis in range(d):
             given = np.array([axis in axes for *_, axes in self.holds])
-            row, gap, wrong = held.rows(axis, given, self._free[:, axis])
-            placed.append((row, gap, np.tile(np.eye(d)[axis], (len(row), 1))))
+            *rows, wrong = held.rows(axis, given, self._free[:, axis])
+            placed.append((*rows, np.tile(np.eye(d)[axis], (len(rows[0]), 1))))
             if wrong >= 0:
                 what = f"{line(self.holds[held.number[wrong]][0])}: moves {'xyz'[axis]} at {held.x[wrong]}"
                 message = f"{what}, where a fixed wall holds it; must be 0 there, or the wall must leave it free"
         if message := first(comm, message):
             raise ValueError(message)
-        row, gap, direction = map(np.concatenate, zip(*placed, strict=True))
+        row, stiffness, gap, direction = map(np.concatenate, zip(*placed, strict=True))
         fields = {name: values[row] for name, values in held.moments.items()}
-        fields |= {"stiffness": held.stiffness[row], "gap": gap, "direction": direction}
+        fields |= {"stiffness": stiffness, "gap": gap, "direction": direction}
         return forms.holds.at(held.cell[row], held.x[row], np.ones(len(row)), **fields), held, row
 
     def _held_points(self, cut: CutDomains, points: MaterialPoints, t: float) -> HeldPoints:
@@ -176,17 +176,18 @@ class MechanicalBoundary:
         now, before = (of.map(lambda values: values[chosen]) for of in (points, cut.points))
         stress = self._materials.total_stress(now)
         modulus, resists = (self._materials.table(before, of) for of in (holding, resistance))
+        firm = self._materials.confined_modulus(before)
         # of when the grid was reset, as the stiffnesses: they stay as long as the cut serves
         tension = np.linalg.norm(stress if points is cut.points else self._materials.total_stress(before), axis=(1, 2))
         for number, ((hold, *_), p) in enumerate(zip(self.holds, patches, strict=True)):
             at, gap = np.searchsorted(chosen, p.at), p.origin(points) + self._given(hold, t, p.X) - p.now(points)
             force = np.einsum("nij,nj->ni", stress[at], p.area(points))
-            own = (p.area0 * v for v in (1, modulus[at], tension[at], resists[at]))
+            own = (p.area0 * v for v in (1, modulus[at], tension[at], resists[at], firm[at]))
             each = np.stack([np.full(len(gap), number), *own], axis=1)
             rows.append((p.cell, p.x, np.concatenate([each, gap, p.area(cut.points), force], axis=1)))
-        cell, x, values = gathered(self.grid, rows, 5 + 3 * d)
-        number, *own = values[:, :5].T
-        return HeldPoints(number.astype(np.int64), cell, *own, x, *np.split(values[:, 5:], 3, axis=1))
+        cell, x, values = gathered(self.grid, rows, 6 + 3 * d)
+        number, *own = values[:, :6].T
+        return HeldPoints(number.astype(np.int64), cell, *own, x, *np.split(values[:, 6:], 3, axis=1))
 
     def _check_meeting(self, t: float) -> None:
         """Refuse given displacements that differ where they meet: no body's stress is finite there."""
