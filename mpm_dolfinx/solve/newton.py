@@ -165,18 +165,21 @@ class Newton:
         serves: whether the tangent of the substep before may serve.
         """
         errors, other = self._begin()
-        fresh = self._linear or not serves
-        try:
-            return self._iterations(errors, as_reset, key, fresh)
-        except NotConverged:
-            if other is None:
-                raise
-        self._go_to(other)
-        return self._iterations(self._errors(errors.start), as_reset, key, True)
+        fresh, watched = self._linear or not serves, not self._momentum.forms.elastic
+        again = [(other, True)] * (other is not None) + [(other or self._iterate(), False)] * watched
+        for start, watches in again:
+            try:
+                return self._iterations(errors, as_reset, key, fresh, watched)
+            except NotConverged:
+                self._go_to(start)
+                errors, fresh, watched = self._errors(errors.start), True, watches
+        return self._iterations(errors, as_reset, key, fresh, watched)
 
-    def _iterations(self, errors: Errors, as_reset: Callable[[], QuadratureData], key: Hashable, fresh: bool) -> Errors:
-        """Iterate from the present (u, p), of these errors; fresh: with its own tangent."""
-        dog, count = None if self._momentum.forms.elastic else Watchdog(errors.worst, self._iterate()), 0
+    def _iterations(
+        self, errors: Errors, as_reset: Callable[[], QuadratureData], key: Hashable, fresh: bool, watched: bool
+    ) -> Errors:
+        """Iterate from the present (u, p), of these errors; fresh: with its own tangent; watched: by a watchdog."""
+        dog, count = Watchdog(errors.worst, self._iterate()) if watched else None, 0
         while errors.worst > self._scheme.tolerance:
             self._check(count, "newton")
             if fresh and self._linear and not self.report.newton:
