@@ -81,20 +81,25 @@ class StepSize:
         stability function is squared.
         """
         if not self.by_error:
-            return 0.5 if taken > 0.75 * self.longest and report.sudden > RINGS * result.change else 1.0
+            return 0.5 if taken > 0.75 * self.longest and self._rings(report, result) else 1.0
         # steps are refused where loads jump or bend, mostly: there the error is of first order
         return 1.0 if report.error <= self.rtol * result.change else self._factor(report, result, 1.0)
 
     def next(self, taken: float, report: Report, result: Result, failed: bool) -> float:
         """Return the step to try after one that was taken, s; failed: after a longer one had not converged."""
         if not self.by_error:
-            return max(result.small, min(2 * taken, self.longest)) if report.easy else result.small
+            grows = report.easy and not self._rings(report, result)  # twice as long it would be refused
+            return max(result.small, min(2 * taken, self.longest)) if grows else result.small
         factor = self._factor(report, result, 0.5)
         if factor >= 1:
             # a step as long as one that has just failed would mostly fail again: in soil that yields, 78 cuts, not 1
             factor = 1.0 if factor < KEEPS or failed or not report.easy else factor
             return min(max(taken * factor, result.small), self.longest)  # it may have been short for an output's sake
         return taken * factor
+
+    def _rings(self, report: Report, result: Result) -> bool:
+        """Return whether a step may have overshot."""
+        return report.sudden > RINGS * result.change
 
     def _factor(self, report: Report, result: Result, power: float) -> float:
         """Return the step whose error would be as large as it may be, in proportion to one that was solved."""

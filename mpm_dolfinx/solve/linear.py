@@ -36,13 +36,17 @@ def iterative(unknowns: Unknowns) -> bool:
     return unknowns.dim == 3 and unknowns.global_size >= ITERATIVE
 
 
-def direct_solver(A: PETSc.Mat, name: str, symmetric: bool = True, often: bool = False) -> PETSc.KSP:
+def direct_solver(
+    A: PETSc.Mat, name: str, symmetric: bool = True, often: bool = False, package: str | None = None
+) -> PETSc.KSP:
     """Return a solver that factorises A, a symmetric one as L D L^T, refactorised when A has changed.
 
     Parameters
     ----------
     often
         Whether the same factors solve many systems.
+    package
+        What factorises, on several processes MUMPS in any case; None: PETSc.
     """
     if symmetric:
         A.setOption(PETSc.Mat.Option.SYMMETRIC, True)
@@ -58,6 +62,8 @@ def direct_solver(A: PETSc.Mat, name: str, symmetric: bool = True, often: bool =
         if A.comm.size > 1:
             options.setValue("mat_mumps_icntl_13", 1)  # counts negative pivots
             ksp.pc.setFactorSolverType("mumps")
+        elif package is not None:
+            ksp.pc.setFactorSolverType(package)
         else:
             ksp.pc.setFactorOrdering("amd")
             ksp.pc.setFactorPivot(0.0)  # PETSc's 2e-14 refuses slivers of cells: rows of any scale are welcome

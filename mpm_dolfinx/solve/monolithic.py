@@ -11,6 +11,12 @@ To 1e-3 it takes 7 to 12 iterations, each with one cycle on K, 11 to 26 at nu = 
 Jacobi's smoothing of K (10 to 15, and 100 at nu = 0.49), conjugate gradients on the Schur complement took 3, but with
 35 to 60 cycles in their inner solves; flexible GMRES with inner solves to 0.1 or 0.01 12 to 24 cycles, MINRES with the
 diagonal blocks 17 to 23, leaving five times the residual.
+
+At nu = 0.499 the cycle is poor: 53 to 146 iterations with 14^3 cells.  A solve that takes `MANY` goes on with factors
+of K in place of the cycle, which serve until they take as many: for the other tangents of the step 4 to 6 iterations,
+and all its linear solves take 8 s, not 18.  MUMPS factorises 3190 unknowns in 0.2 s, 8610 in 1.4 s (PETSc in 3.4 s).
+To give the storage what of K resists changes of volume, p -> p + k B u, leaves K as at nu = 0.3, but pressures that
+alternate almost free: 500 iterations.
 """
 
 from __future__ import annotations
@@ -20,10 +26,17 @@ from weakref import finalize
 from petsc4py import PETSc
 
 import numpy as np
+from dolfinx.common import Timer
 
+from mpm_dolfinx.caching import Latest
 from mpm_dolfinx.problems.momentum import MomentumSystem
 from mpm_dolfinx.problems.storage import StorageSystem
-from mpm_dolfinx.solve.linear import multigrid_solver, solved
+from mpm_dolfinx.solve.linear import direct_solver, multigrid_solver, solved
+
+MANY, MOST = 40, 500
+"""Iterations after which factors take the place of the multigrid cycle on K, and most of all."""
+FACTORISED = 20000
+"""Unknown displacements up to which K is factorised where the multigrid takes many iterations: 4 GB."""
 
 
 class BlockOperator:
@@ -35,10 +48,19 @@ class BlockOperator:
         The matrices.
     momentum_cycle, storage_cycle
         One multigrid cycle each on K and P.
+    factors : Latest
+        Solver with factors of a K, which take the place of its cycle where there are some.
     """
 
-    def __init__(self, momentum: MomentumSystem, storage: StorageSystem, momentum_cycle: PETSc.PC, storage_cycle):
-        self._momentum, self._storage = momentum, storage
+    def __init__(
+        self,
+        momentum: MomentumSystem,
+        storage: StorageSystem,
+        momentum_cycle: PETSc.PC,
+        storage_cycle: PETSc.PC,
+        factors: Latest[PETSc.KSP],
+    ):
+        self._momentum, self._storage, self._factors = momentum, storage, factors
         self._cycle_u, self._cycle_p, self._split = momentum_cycle, storage_cycle, momentum.unknowns.size
         self._u, self._f = momentum.unknowns.vector(), momentum.unknowns.vector()
         self._p, self._g = storage.unknowns.vector(), storage.unknowns.vector()
@@ -60,7 +82,7 @@ class BlockOperator:
         self.part(x, self._f, self._g, *self.scale)
         self._cycle_p.apply(self._g, self._p)
         self._storage.B_momentum.multTransposeAdd(self._p, self._f, self._f)
-        self._cycle_u.apply(self._f, self._u)
+        (self._factors.value.pc if self._factors.value else self._cycle_u).apply(self._f, self._u)
         self.join(self._u, self._p, y)
 
     def part(self, x: PETSc.Vec, u: PETSc.Vec, p: PETSc.Vec, scale_u: float = 1.0, scale_p: float = 1.0) -> None:
@@ -85,12 +107,15 @@ class BlockSolver:
         The matrices.
     cycle
         One multigrid cycle on K.
+    symmetric
+        Whether K is.
     """
 
-    def __init__(self, momentum: MomentumSystem, storage: StorageSystem, cycle: PETSc.PC):
-        self._momentum, self._storage = momentum, storage
+    def __init__(self, momentum: MomentumSystem, storage: StorageSystem, cycle: PETSc.PC, symmetric: bool):
+        self._momentum, self._storage, self._symmetric = momentum, storage, symmetric
         self._storage_solver = multigrid_solver(storage.P, "storage")
-        self._operator = BlockOperator(momentum, storage, cycle, self._storage_solver.pc)
+        self._factors: Latest[PETSc.KSP] = Latest()
+        self._operator = BlockOperator(momentum, storage, cycle, self._storage_solver.pc, self._factors)
         finalize(self, vars(self._operator).clear)  # PETSc keeps contexts, and what they refer to
         size = (momentum.unknowns.size + storage.unknowns.size, None)
         self._A = PETSc.Mat().createPython((size, size), self._operator, comm=momentum.unknowns.comm)
@@ -105,6 +130,11 @@ class BlockSolver:
         self._ksp.pc.setPythonContext(self._operator)
         self._ksp.setOperators(self._A)
         self._ksp.setFromOptions()
+
+    @property
+    def factorised(self) -> bool:
+        """Whether factors take the place of the multigrid cycle."""
+        return self._factors.value is not None
 
     @property
     def preconditioner(self) -> PETSc.PC:
@@ -128,7 +158,23 @@ class BlockSolver:
         """
         self._operator.scale[:] = scale
         self._operator.join(self._momentum.residual, self._storage.residual, self._b, *(1 / s for s in scale))
-        self._ksp.setTolerances(rtol=rtol, atol=0.0, max_it=500)
+        few = self._momentum.unknowns.global_size <= FACTORISED
+        self._ksp.setTolerances(rtol=rtol, atol=0.0, max_it=MANY if few else MOST)
         self._ksp.solve(self._b, self._x)
+        count = solved(self._ksp, "momentum and storage")
+        if few and self._ksp.getConvergedReason() < 0:
+            with Timer("mpm: factorisation"):
+                self._factors(object(), self._factorised)
+            self._ksp.setTolerances(rtol=rtol, atol=0.0, max_it=MOST)
+            self._ksp.setInitialGuessNonzero(True)
+            self._ksp.solve(self._b, self._x)
+            self._ksp.setInitialGuessNonzero(False)
+            count += solved(self._ksp, "momentum and storage")
         self._operator.part(self._x, du, dp)
-        return solved(self._ksp, "momentum and storage")
+        return count
+
+    def _factorised(self) -> PETSc.KSP:
+        """Return a solver with factors of the present K, which may change."""
+        ksp = direct_solver(self._momentum.K, "factors", self._symmetric, package="mumps")
+        ksp.setUp()
+        return ksp

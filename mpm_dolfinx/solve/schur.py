@@ -86,7 +86,7 @@ class LinearSolvers:
         self.dp, self._g = storage.unknowns.vector(), storage.unknowns.vector()
         """Direction of the pressures."""
         if self.iterative and not scheme.richardson:
-            self._block = BlockSolver(momentum, storage, self.solve_u.pc)
+            self._block = BlockSolver(momentum, storage, self.solve_u.pc, symmetric)
             self._preconditioner = self._block.preconditioner
             return
         n, context = (storage.unknowns.size, None), SchurComplement(storage, self.solve_u)
@@ -114,8 +114,9 @@ class LinearSolvers:
             if self.iterative:
                 K.setNearNullSpace(self._modes)
                 allow_no_diagonal(self.solve_u, K)
-            self.solve_u.setOperators(K)
-            self.solve_u.setUp()
+            if self._block is None or not self._block.factorised:
+                self.solve_u.setOperators(K)
+                self.solve_u.setUp()
             if storage is not None:
                 P = storage.assemble_preconditioner(self.scheme.beta, 0.0 if self.scheme.richardson else FILTER)
                 if self._block is not None:
