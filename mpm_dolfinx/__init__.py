@@ -2,10 +2,10 @@
 """Implicit, iteratively coupled material point / finite volume poromechanics on FEniCSx.
 
 A scene is a `Simulation` of a `Grid`, bodies (`box`, `shape`, `mapped`), materials (`Hencky`, `NeoHookean`,
-`LinearElastic`, `DruckerPrager`, `ModifiedCamClay`, or your own `Skeleton`), a `Fluid` and conditions on the sides of
-the bodies (`Traction`, `Pressure`, `Displacement`, `RigidPlate`, `Drained`, `Inflow`).  Its `run` gives a `Result` with the
-displacements of `probes`, and feeds a `Writer` and a `Checkpoint`, from which `resume` goes on; `stage` changes the
-scene between two runs.  Terms and sources in UFL: see `mpm_dolfinx.extend`.
+`LinearElastic`, `DruckerPrager`, `MohrCoulomb`, `ModifiedCamClay`, or your own `Skeleton`), a `Fluid` and conditions
+on the sides of the bodies (`Traction`, `Pressure`, `Displacement`, `RigidPlate`, `Drained`, `Inflow`).  Its `run`
+gives a `Result` with the displacements of `probes`, and feeds a `Writer` and a `Checkpoint`, from which `resume` goes
+on; `stage` changes the scene between two runs.  Terms and sources in UFL: see `mpm_dolfinx.extend`.
 
 SI units throughout.  Stress is positive in tension, pore pressure in compression; 2D is plane strain, and forces
 are those of a slice of 1 m.
@@ -15,6 +15,7 @@ from mpm_dolfinx import _environment  # noqa: F401 - first: it says what is miss
 from mpm_dolfinx.constitutive.cam_clay import ModifiedCamClay
 from mpm_dolfinx.constitutive.drucker_prager import DruckerPrager
 from mpm_dolfinx.constitutive.element_test import ElementTest, element_test
+from mpm_dolfinx.constitutive.mohr_coulomb import MohrCoulomb
 from mpm_dolfinx.constitutive.skeleton import (
     LAWS,
     Field,
@@ -55,6 +56,7 @@ __all__ = [
     "LeftGrid",
     "LinearElastic",
     "ModifiedCamClay",
+    "MohrCoulomb",
     "NeoHookean",
     "NotConverged",
     "Pressure",
