@@ -122,6 +122,19 @@ def sealed_soil(cells: int, yields: bool = True) -> mpm.Simulation:
     return simulation
 
 
+def plastic(cells: int, law: type[mpm.Skeleton]) -> mpm.Simulation:
+    """Return the block of plastic soil that is far from yielding."""
+    return block(cells, soil(law, friction=30.0, dilation=0.0, cohesion=1e9))
+
+
+def clayey(cells: int) -> mpm.Simulation:
+    """Return the block of overconsolidated clay of the same bulk modulus, pressed as it was at the start and more."""
+    p = 1e5  # Pa
+    moduli = {"shear": SHEAR, "kappa": p / soil().bulk, "lambda_": 5 * p / soil().bulk}
+    clay = mpm.ModifiedCamClay(M=1.2, OCR=4.0, initial_stress=(-p, -p, -p), **moduli)
+    return block(cells, clay, tractions=[mpm.Traction("top", lambda t: (0, -p - LOAD * t))])
+
+
 Make = Callable[[int], mpm.Simulation]
 PAIRS: dict[str, tuple[Make, Make]] = {
     "pore fluid that drains at once": (block, lambda n: block(n, soil(conductivity=1e3), **WATER)),
@@ -143,8 +156,13 @@ PAIRS: dict[str, tuple[Make, Make]] = {
     ),
     "plastic law, with mean dilatation": (
         block,
-        lambda n: block(n, soil(mpm.DruckerPrager, friction=30.0, dilation=0.0, cohesion=1e9)),
+        partial(plastic, law=mpm.DruckerPrager),
     ),
+    "Mohr-Coulomb beside Drucker-Prager": (
+        partial(plastic, law=mpm.DruckerPrager),
+        partial(plastic, law=mpm.MohrCoulomb),
+    ),
+    "Modified Cam Clay beside Drucker-Prager": (partial(plastic, law=mpm.DruckerPrager), clayey),
     "finite strain": (lambda n: block(n, soil(mpm.LinearElastic)), block),
     "factors of a linear law in each step": (linear, refactorised),
     "files of each step": (block, block),

@@ -2,17 +2,21 @@
 """Implicit, iteratively coupled material point / finite volume poromechanics on FEniCSx.
 
 A scene is a `Simulation` of a `Grid`, bodies (`box`, `shape`, `mapped`, `from_mesh`, `polygon`), materials (`Hencky`,
-`NeoHookean`, `LinearElastic`, `DruckerPrager`, `ModifiedCamClay`, or your own `Skeleton`), a `Fluid` and conditions on
-the sides of the bodies (`Traction`, `Pressure`, `Displacement`, `RigidPlate`, `Drained`, `Inflow`).  Its `run` gives a
-`Result` with the displacements of `probes`, and feeds a `Writer` and a `Checkpoint`, from which `resume` goes on;
-`stage` changes the scene between two runs.  Terms and sources in UFL: see
+`NeoHookean`, `LinearElastic`, `DruckerPrager`, `MohrCoulomb`, `ModifiedCamClay`, or your own `Skeleton`), a `Fluid` and
+conditions on the sides of the bodies (`Traction`, `Pressure`, `Displacement`, `RigidPlate`, `Drained`, `Inflow`,
+`water`).  Its `run` gives a `Result` with what `probes` record, and feeds a `Writer` and a `Checkpoint`, from which
+`resume` goes on; `stage` changes the scene between two runs.  Terms and sources in UFL: see
 `mpm_dolfinx.constitutive.user_functions`.
+
+SI units throughout.  Stress is positive in tension, pore pressure in compression; 2D is plane strain, and forces
+are those of a slice of 1 m.
 """
 
 from mpm_dolfinx import _environment  # noqa: F401 - first: it says what is missing
 from mpm_dolfinx.constitutive.cam_clay import ModifiedCamClay
 from mpm_dolfinx.constitutive.drucker_prager import DruckerPrager
 from mpm_dolfinx.constitutive.element_test import ElementTest, element_test
+from mpm_dolfinx.constitutive.mohr_coulomb import MohrCoulomb
 from mpm_dolfinx.constitutive.skeleton import (
     LAWS,
     Field,
@@ -56,6 +60,7 @@ __all__ = [
     "LeftGrid",
     "LinearElastic",
     "ModifiedCamClay",
+    "MohrCoulomb",
     "NeoHookean",
     "NotConverged",
     "Pressure",

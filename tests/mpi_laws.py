@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Run three laws, two with state, with fields and terms of the user's, on any number of processes; write the state."""
+"""Run four laws, three with state, with fields and terms of the user's, on any number of processes; write the state."""
 
 import sys
 
@@ -17,7 +17,8 @@ def push(points, u, v, t):
 
 grid = mpm.Grid([1.6, 1.3], [16, 13])
 bodies = [
-    mpm.box(grid, [0, 0], [1, 0.5]),
+    mpm.box(grid, [0, 0], [0.5, 0.5]),
+    mpm.box(grid, [0.5, 0], [1, 0.5], material=3),
     mpm.box(grid, [0, 0.5], [1, 0.8], material=1),
     mpm.box(grid, [0, 0.8], [1, 1.03], material=2),
 ]
@@ -30,12 +31,13 @@ sand = mpm.DruckerPrager(
     conductivity=1e-4,
     conductivity_law=mpm.kozeny_carman,
 )
+weak = mpm.MohrCoulomb(bulk=4e6, shear=2e6, friction=30.0, dilation=5.0, cohesion=1e4, tension=5e3, conductivity=1e-4)
 gel = mpm.NeoHookean(bulk=2e6, shear=1e6, conductivity=lambda X: 1e-5 * (1 + X[:, 0]))
 clay = mpm.ModifiedCamClay(M=1.1, lambda_=0.1, kappa=0.03, shear=1e6, initial_stress=(-1e5,) * 3, conductivity=1e-5)
 simulation = mpm.Simulation(
     grid,
     bodies,
-    [sand, gel, clay],
+    [sand, gel, clay, weak],
     fluid=mpm.Fluid(),
     fixed={"left": "x", "bottom": "y"},
     drained=[mpm.Drained("right")],

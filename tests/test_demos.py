@@ -37,6 +37,7 @@ QUICK = {
         ["extreme_cases.png", "cases.csv", "cases.md", "summary.md"],
     ),
     "slump": ("--cells 6 --steps 10", ["slump.png", "failure.png", "slump.gif"]),
+    "triaxial": ("--steps 20", ["triaxial.png"]),
     "footing": ("--cells 3 --depth 0.1", ["footing.png", "footing.gif"]),
     "benchmark_beam": ("--h 0.05 --t-end 0.1 --repeat 1", []),
     "benchmark_pruning": ("--quick", ["pruning.md"]),

@@ -51,8 +51,8 @@ class ModifiedCamClay(Skeleton):
     M
         Slope of the critical state line Q = M P, -, > 0.
     lambda_, kappa
-        Slopes lambda* and kappa* of ln v over ln P, first loading and unloading, -, 0 < kappa < lambda_: the indices of
-        v over ln P divided by the specific volume.
+        Slopes lambda* and kappa* of ln v over ln P, first loading and unloading, -, 0 < kappa < lambda_, in Kirchhoff
+        stress.  An index C of v over the logarithm of the Cauchy stress, at the specific volume v, is C / (v - C) here.
     initial_stress : (3,), Pa
         Normal effective stresses at F = I, the last one out of plane in 2D; tension positive, their mean < 0.  The
         loads have to balance them.

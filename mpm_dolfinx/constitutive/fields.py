@@ -123,9 +123,10 @@ class SceneMaterials:
         if (law.energy is None) == (law.kirchhoff is None):
             which = "neither" if law.energy is None else "both"
             raise ValueError(f"{law.__name__}: has {which}, must define energy or kirchhoff")
-        if bool(law.unknowns) != (law.residual is not None):
-            which = "unknowns and no residual" if law.unknowns else "a residual and no unknowns"
-            raise ValueError(f"{law.__name__}: has {which}, must have both or neither")
+        given = (law.residual is not None) + (law.solution is not None)
+        if given != bool(law.unknowns):
+            has = f"{'' if law.unknowns else 'no '}unknowns and {given} of residual and solution"
+            raise ValueError(f"{law.__name__}: has {has}, must have unknowns and one of these, or neither")
         for name in law.parameters:
             if not hasattr(m, name):
                 known = ", ".join([*_names(m), *law.state])

@@ -7,7 +7,8 @@ once, to round-off.  The forms see
     y = y* + Y (z(F) - z*),     Y = -(df/dy)^-1 df/dz  at the solution (y*, z*),
 
 whose value is y* and whose derivative by F is that of the solution: UFL's derivative of a stress that is a function of
-y and F is the consistent tangent, and no iteration is unrolled.  y*, z* and Y are coefficients at the points.
+y and F is the consistent tangent, and no iteration is unrolled.  y*, z* and Y are coefficients at the points.  A law
+may also give y(z) and its derivative in numpy.
 """
 
 from __future__ import annotations
@@ -100,26 +101,43 @@ class _Equations:
 
     def __init__(self, law: type[Skeleton], points: FormPoints, trial: Mapping[str, object]):
         self._law, self._grid = law, points.grid
-        self._names = [name for name in (*law.parameters, *law.state) if name in law.taken_by(law.residual)]
+        equations = law.residual or law.solution
+        self._names = [name for name in (*law.parameters, *law.state) if name in law.taken_by(equations)]
         self._points = own = FormPoints(points.grid, **{name: getattr(points, name).ufl_shape for name in self._names})
         starts = {name: np.asarray(start, dtype=float) for name, start in law.unknowns.items()}
         self._start = np.concatenate([start.ravel() for start in starts.values()])
         self.count = m = len(self._start)
-        shapes = {name: value.ufl_shape for name, value in trial.items()}
-        k = sum(int(np.prod(s, dtype=int)) for s in shapes.values())
+        self._unknowns = {name: start.shape for name, start in starts.items()}
+        self._trial = {name: value.ufl_shape for name, value in trial.items()}
+        if law.residual is None:
+            return
+        k = sum(_size(s) for s in self._trial.values())
         y, z = (ufl.variable(own.follow(name, (size,), _given)) for name, size in (("unknowns", m), ("trial", k)))
-        z_named = _named(shapes, z)
-        given = {"trial": z_named} if law.trial is not None else z_named
-        given |= _named({name: s.shape for name, s in starts.items()}, y)
-        residual = call(law.residual, **given, **{name: getattr(own, name) for name in self._names})
-        f = _checked(law, residual, {name: s.shape for name, s in starts.items()})
+        given = {name: getattr(own, name) for name in self._names} | _named(self._unknowns, y)
+        residual = call(law.residual, **self._with_trial(_named(self._trial, z)), **given)
+        instance(f"{law.__name__}.residual: what it gives", residual, dict)
+        found = {name: ufl.as_ufl(value) for name, value in residual.items()}
+        self._check("residual", {name: value.ufl_shape for name, value in found.items()})
+        f = ufl.as_vector(_parts(found[name] for name in self._unknowns))
         by_y, by_z = ufl.diff(f, y), ufl.diff(f, z)
         steps = [by_y[i, j] for i in range(m) for j in range(m)]
         self._newton = PointExpression(ufl.as_vector([*(f[i] for i in range(m)), *steps]), own)
         self._slopes = PointExpression(ufl.as_vector([*steps, *(by_z[i, j] for i in range(m) for j in range(k))]), own)
 
+    def _with_trial(self, values: dict) -> dict:
+        """Return trial values as the law's equations name them."""
+        return {"trial": values} if self._law.trial is not None else values
+
+    def _check(self, function: str, shapes: dict[str, tuple[int, ...]]) -> None:
+        """Refuse equations that do not give what the unknowns are."""
+        if shapes != self._unknowns:
+            allowed = f"the unknowns' names and shapes {self._unknowns}"
+            raise ValueError(f"{self._law.__name__}.{function}: gives {shapes}, must have {allowed}")
+
     def solve(self, data: PointData, trial: NDArray[np.float64]) -> Solved:
         """Return the solution at points with trial values (n, k); all processes together."""
+        if self._law.residual is None:
+            return self._in_numpy(data, trial)
         m, n = self.count, len(trial)
         at = PointData(self._points, data.places, data.volume, {name: data[name] for name in self._names})
         y = np.tile(self._start, (n, 1))
@@ -137,6 +155,33 @@ class _Equations:
         out = self._slopes.evaluate(at, None, {"unknowns": y, "trial": trial})
         by_y, by_z = out[:, : m * m].reshape(-1, m, m), out[:, m * m :].reshape(n, m, trial.shape[1])
         return Solved(data.key, y, trial, -_solve(by_y, by_z).reshape(n, m * trial.shape[1]))
+
+    def _in_numpy(self, data: PointData, trial: NDArray[np.float64]) -> Solved:
+        """Return the solution of a law that gives it in numpy."""
+        n, values, start = len(trial), {}, 0
+        for name, shape in self._trial.items():
+            values[name] = trial[:, start : start + _size(shape)].reshape(n, *shape)
+            start += _size(shape)
+        given = {name: data[name].reshape(n, *getattr(self._points, name).ufl_shape) for name in self._names}
+        found = call(self._law.solution, **self._with_trial(values), **given)
+        instance(f"{self._law.__name__}.solution: what it gives", found, dict)
+        self._check("solution", {name: np.shape(value)[1:] for name, (value, _) in found.items()})
+        columns, rows = [], []
+        for name, shape in self._unknowns.items():
+            value, slopes = found[name]
+            columns.append(value.reshape(n, _size(shape)))
+            for of, by in self._trial.items():
+                slope = slopes.get(of)
+                wanted = (n, *shape, *by)
+                if slope is not None and np.shape(slope) != wanted:
+                    what = f"{self._law.__name__}.solution: derivative of {name} by {of}"
+                    raise ValueError(f"{what} has shape {np.shape(slope)}, must be {wanted}")
+                slope = np.zeros(wanted) if slope is None else slope
+                rows.append(slope.reshape(n, _size(shape), _size(by)))
+        count = len(self._trial)
+        slopes = [np.concatenate(rows[i : i + count], axis=2) for i in range(0, len(rows), count)]
+        flat = np.concatenate(slopes, axis=1).reshape(n, self.count * trial.shape[1])
+        return Solved(data.key, np.concatenate(columns, axis=1), trial, flat)
 
 
 def _newton(system, y: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -189,11 +234,15 @@ def _parts(values) -> list:
     return [value[i] if i else value for value in values for i in np.ndindex(value.ufl_shape)]
 
 
+def _size(shape: tuple[int, ...]) -> int:
+    return int(np.prod(shape, dtype=int))
+
+
 def _named(shapes: Mapping[str, tuple[int, ...]], vector) -> dict:
     """Return tensors of given shapes that a UFL vector holds one after the other."""
     out, start = {}, 0
     for name, shape in shapes.items():
-        index = np.arange(start, start + int(np.prod(shape, dtype=int))).reshape(shape)
+        index = np.arange(start, start + _size(shape)).reshape(shape)
         out[name] = ufl.as_tensor(_nested(vector, index)) if shape else vector[start]
         start += index.size
     return out
@@ -201,18 +250,6 @@ def _named(shapes: Mapping[str, tuple[int, ...]], vector) -> dict:
 
 def _nested(vector, index: NDArray[np.int64]):
     return [_nested(vector, row) for row in index] if index.ndim else vector[int(index)]
-
-
-def _checked(law: type[Skeleton], residual, shapes: Mapping[str, tuple[int, ...]]):
-    """Return the residuals of all unknowns as one UFL vector, in their order."""
-    instance(f"{law.__name__}.residual: what it gives", residual, dict)
-    found = {name: ufl.as_ufl(value) for name, value in residual.items()}
-    given = {name: value.ufl_shape for name, value in found.items()}
-    if given != dict(shapes):
-        raise ValueError(
-            f"{law.__name__}.residual: gives {given}, must have the unknowns' names and shapes {dict(shapes)}"
-        )
-    return ufl.as_vector(_parts(found[name] for name in shapes))
 
 
 def _given(data: PointData) -> NDArray[np.float64]:

@@ -73,6 +73,10 @@ class Skeleton:
     residual
         Called with the law's fields, its state, its unknowns, and `trial`; gives name -> UFL of the unknown's shape,
         which Newton's method makes zero at each point.
+    solution
+        In place of residual, in numpy: called with arrays (n, ...) of the law's fields, its state and `trial`, gives
+        name -> (the unknown (n, ...), {name of a trial value: its derivative by it (n, ..., ...)}).  For returns with
+        many cases, and laws that exist elsewhere: their stress, and what `update` sets the state to, are the unknowns.
     trial
         (F, ...) -> {name: UFL}: all by which the residuals depend on F; without it they name F itself.  What is no UFL
         in it the residuals do not see; `kirchhoff` and `update` may name `trial` too, and see all of it.
@@ -115,6 +119,7 @@ class Skeleton:
     unknowns: ClassVar[Mapping[str, ArrayLike]] = {}
     trial: ClassVar[Callable | None] = None
     residual: ClassVar[Callable | None] = None
+    solution: ClassVar[Callable | None] = None
     linear: ClassVar[bool] = False
     """Whether the stress is linear in F: one factorisation then serves for as long as the active cells stay."""
     state: ClassVar[Mapping[str, ArrayLike]] = {}
@@ -123,9 +128,9 @@ class Skeleton:
 
     def __init_subclass__(cls, **options):
         super().__init_subclass__(**options)
-        functions = (cls.energy, cls.kirchhoff, cls.update, cls.trial, cls.residual)
+        functions = (cls.energy, cls.kirchhoff, cls.update, cls.trial, cls.residual, cls.solution)
         names = dict.fromkeys(name for f in functions for name in cls.taken_by(f))
-        own = {"F", *cls.state, *cls.unknowns, *(["trial"] if cls.residual is not None else [])}
+        own = {"F", *cls.state, *cls.unknowns, *(["trial"] if cls.unknowns else [])}
         cls.parameters = tuple(name for name in names if name not in own)
         if "energy" in vars(cls) and "linear" not in vars(cls):
             cls.linear = False  # not what the law had that this one is derived from

@@ -1,42 +1,145 @@
 # SPDX-License-Identifier: MIT
-"""The trial elastic strain of multiplicative plasticity, and isotropic functions of it, in UFL."""
+"""The trial elastic strain of multiplicative plasticity, and isotropic functions: in UFL, and in numpy.
+
+In UFL isotropic functions of a tensor are Newton's interpolation polynomials at its eigenvalues: exact for smooth
+functions of each eigenvalue, and smooth where eigenvalues are equal, because nodes need not be eigenvalues and are
+kept apart. Principal values that are functions of all three, with kinks, need the eigenvalues themselves: they are
+found in numpy, with the exact derivative, see `coaxial`.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
+import numpy as np
 import ufl
+from numpy.typing import NDArray
 
 from mpm_dolfinx.constitutive.skeleton import _eigenvalues
 
+EQUAL = 1e-8  # relative distance below which two eigenvalues count as equal
+PLANE, SPACE = ((0, 0), (1, 1), (2, 2), (0, 1)), ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+"""Components of a symmetric tensor in plane strain and in 3D."""
 
-class Trial:
-    """The trial elastic strain of a deformation gradient, in UFL.
 
-    Isotropic functions of b are Newton's interpolation polynomials at its eigenvalues: exact, and smooth where
-    eigenvalues are equal, because nodes need not be eigenvalues and are kept apart.
-    """
+def embedded(F):
+    """Return a deformation gradient (3, 3): that of plane strain, or itself."""
+    if F.ufl_shape == (3, 3):
+        return F
+    return ufl.as_matrix([[F[0, 0], F[0, 1], 0], [F[1, 0], F[1, 1], 0], [0, 0, 1]])
 
-    def __init__(self, F, plastic, prestretch=None):
-        self.plane = F.ufl_shape == (2, 2)
-        self.F = F
-        if self.plane:
-            self.F = ufl.as_matrix([[F[0, 0], F[0, 1], 0], [F[1, 0], F[1, 1], 0], [0, 0, 1]])
-        if prestretch is not None:
-            self.F = self.F * ufl.diag(prestretch)
-        self.b = self.F * plastic * self.F.T
-        block = ufl.as_matrix([[self.b[i, j] for j in (0, 1)] for i in (0, 1)]) if self.plane else self.b
-        self.nodes = _eigenvalues(block, 1e-6)
-        strain = self.isotropic(lambda e: ufl.ln(e) / 2)
-        self.volumetric = ufl.tr(strain)
-        self.deviatoric = strain - self.volumetric / 3 * ufl.Identity(3)
 
-    def isotropic(self, f):
+class Isotropic:
+    """Isotropic functions of a symmetric UFL tensor b (3, 3); plane: whether its third axis is the third of space."""
+
+    def __init__(self, b, plane: bool):
+        self._b, self._plane = b, plane
+        block = ufl.as_matrix([[b[i, j] for j in (0, 1)] for i in (0, 1)]) if plane else b
+        self._nodes = _eigenvalues(block, 1e-6)
+
+    def __call__(self, f: Callable):
         """Return f(b) (3, 3) for a function of the eigenvalues."""
-        b, I, x, y = self.b, ufl.Identity(3), self.nodes, [f(node) for node in self.nodes]
+        b, I, x, y = self._b, ufl.Identity(3), self._nodes, [f(node) for node in self._nodes]
         slope = (y[0] - y[1]) / (x[0] - x[1])
         linear = y[0] * I + slope * (b - x[0] * I)
-        if self.plane:
+        if self._plane:
             rows = [[linear[i, j] if i < 2 and j < 2 else 0 for j in range(3)] for i in range(3)]
             rows[2][2] = f(b[2, 2])
             return ufl.as_matrix(rows)
         bend = (slope - (y[1] - y[2]) / (x[1] - x[2])) / (x[0] - x[2])
         return linear + bend * (b - x[0] * I) * (b - x[1] * I)
+
+
+class Trial:
+    """The trial elastic strain of a deformation gradient, in UFL.
+
+    Parameters
+    ----------
+    F
+        Deformation gradient (d, d).
+    plastic
+        C_p^-1 (3, 3).
+    prestretch
+        Principal elastic stretches (3,) at F = I, if there are any.
+    """
+
+    def __init__(self, F, plastic, prestretch=None):
+        self.F = embedded(F)
+        if prestretch is not None:
+            self.F = self.F * ufl.diag(prestretch)
+        self.isotropic = Isotropic(self.F * plastic * self.F.T, F.ufl_shape == (2, 2))
+        strain = self.isotropic(lambda e: ufl.ln(e) / 2)
+        self.volumetric = ufl.tr(strain)
+        self.deviatoric = strain - self.volumetric / 3 * ufl.Identity(3)
+
+
+def components(b, plane: bool):
+    """Return the components of a symmetric UFL tensor (3, 3) as a vector, those that plane strain has or all."""
+    return ufl.as_vector([b[i] for i in (PLANE if plane else SPACE)])
+
+
+def symmetric(values):
+    """Return the symmetric UFL tensor (3, 3) of all its six components."""
+    place = {}
+    for k, (i, j) in enumerate(SPACE):
+        place[i, j] = place[j, i] = values[k]
+    return ufl.as_matrix([[place[i, j] for j in range(3)] for i in range(3)])
+
+
+def eigen(b: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return eigenvalues (n, 3) and axes (n, 3, 3), a column each, of tensors with components b (n, 4 or 6)."""
+    n = len(b)
+    if b.shape[1] == len(SPACE):
+        full = np.empty((n, 3, 3))
+        for k, (i, j) in enumerate(SPACE):
+            full[:, i, j] = full[:, j, i] = b[:, k]
+        lost = ~np.isfinite(b).all(axis=1)  # of an iterate gone astray
+        full[lost] = np.eye(3)
+        x, axes = np.linalg.eigh(full)
+        return np.where(lost[:, None], np.nan, x), axes
+    mean, half = (b[:, 0] + b[:, 1]) / 2, (b[:, 0] - b[:, 1]) / 2
+    radius, angle = np.hypot(half, b[:, 3]), np.arctan2(b[:, 3], half) / 2
+    axes, (c, s) = np.zeros((n, 3, 3)), (np.cos(angle), np.sin(angle))
+    axes[:, 0, 0], axes[:, 1, 0], axes[:, 0, 1], axes[:, 1, 1], axes[:, 2, 2] = c, s, -s, c, 1.0
+    return np.stack([mean + radius, mean - radius, b[:, 2]], axis=1), axes
+
+
+def coaxial(
+    x: NDArray[np.float64], axes: NDArray[np.float64], y: NDArray[np.float64], slopes: NDArray[np.float64], plane: bool
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return tensors with the axes of others, and their derivatives by these.
+
+    In the axes dy_ij = (y_i - y_j) / (x_i - x_j) dx_ij beside the diagonal; where x_i = x_j it is
+    (dy_i/dx_i - dy_i/dx_j) dx_ij, for an isotropic function has y_i = y_j there.
+
+    Parameters
+    ----------
+    x, axes : (n, 3), (n, 3, 3)
+        Eigenvalues and axes, see `eigen`.
+    y, slopes : (n, 3), (n, 3, 3)
+        Principal values, and their derivatives by x.
+    plane
+        Whether tensors are those of plane strain.
+
+    Returns
+    -------
+    Components (n, 6) of the tensors, and their derivatives (n, 6, 4 or 6) by the components of the others.
+    """
+    inner = PLANE if plane else SPACE
+    twice = np.array([1.0 if i == j else 2.0 for i, j in inner])
+    pairs = ((0, 1), (0, 2), (1, 2))
+
+    def dyads(of, a: int, b: int) -> NDArray[np.float64]:
+        """Return the components of the symmetric dyad of two axes."""
+        return np.stack([(axes[:, i, a] * axes[:, j, b] + axes[:, j, a] * axes[:, i, b]) / 2 for i, j in of], axis=1)
+
+    outer = np.stack([dyads(SPACE, a, a) for a in range(3)], axis=2)
+    along = np.stack([dyads(inner, a, a) * twice for a in range(3)], axis=1)
+    tangent = outer @ slopes @ along
+    for a, b in pairs:
+        apart = x[:, a] - x[:, b]
+        equal = np.abs(apart) <= EQUAL * np.abs(x[:, a])
+        turn = np.where(equal, slopes[:, a, a] - slopes[:, a, b], (y[:, a] - y[:, b]) / np.where(equal, 1.0, apart))
+        sides = 2 * turn[:, None] * dyads(SPACE, a, b)
+        tangent += sides[:, :, None] * (dyads(inner, a, b) * twice)[:, None, :]
+    return np.einsum("nva,na->nv", outer, y), tangent

@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: MIT
+"""Cylindrical cavities that are widened in Modified Cam Clay and Mohr-Coulomb soil, beside exact pressures.
+
+The laws on radial grids: what they are in a scene is a matter of the grid.
+"""
+
+import numpy as np
+import pytest
+from cavity import Cavity, undrained
+
+import mpm_dolfinx as mpm
+
+P0 = 1e5
+
+
+@pytest.mark.parametrize(
+    ("OCR", "exact"),
+    [(1.0001, {1.1: (1.2755, 1.3034), 1.5: (1.4604, 1.4882)}), (2.0, {1.1: (2.0313, 1.3385), 1.5: (2.5287, 1.8359)})],
+)
+def test_an_undrained_cavity_in_cam_clay(OCR, exact):
+    """Ring b = 10 a: difference of the total pressures, and pore pressure at the wall, over p_0."""
+    clay = mpm.ModifiedCamClay(M=1.2, lambda_=0.0726, kappa=0.0145, shear=30 * P0, initial_stress=(-P0,) * 3, OCR=OCR)
+    for a, (pressure, water) in exact.items():
+        drop, wall = undrained(clay, 10.0, np.geomspace(1, a, 41)[1:], 300)
+        assert drop / P0 == pytest.approx(pressure, rel=2e-3)
+        assert 1 + (drop + wall) / P0 == pytest.approx(water, rel=2e-3)
+
+
+def test_a_drained_well_in_cam_clay():
+    """Chen and Abousleiman (2013), whose indices are those of v over the Cauchy stress."""
+    v, stress = 2.064, (-100e3, -100e3, -160e3)
+    lambda_, kappa = (index / v / (1 - index / v) for index in (0.15, 0.03))
+    clay = mpm.ModifiedCamClay(M=1.2, lambda_=lambda_, kappa=kappa, shear=4302e3, initial_stress=stress)
+    clay = mpm.ModifiedCamClay(**{**vars(clay), "OCR": 169e3 / clay.yield_pressure})
+    assert clay.yield_pressure == pytest.approx(169e3)
+    well, found = Cavity(clay, 100.0, 150), {}
+    for a in np.unique([*np.geomspace(1, 1.5, 60)[1:], 1.02, 1.08293]):
+        found[a] = well.widen(a) / 1e3
+    for a, exact in ((1.02, 206.85), (1.08293, 289.28), (1.5, 440.63)):
+        assert found[a] == pytest.approx(exact, rel=0.005)
+
+
+@pytest.mark.parametrize(
+    ("dilation", "exact", "within"),
+    [(0.0, {1.02: 2.812, 1.1: 4.489, 1.5: 6.531}, 0.002), (30.0, {1.02: 3.170, 1.1: 6.041, 1.5: 10.710}, 0.012)],
+)
+def test_a_drained_cavity_in_mohr_coulomb_soil(dilation, exact, within):
+    """Yu and Houlsby (1991), without cohesion: the soil begins with its pressure as an elastic strain."""
+    G = 100 * P0
+    K = G * 2 * 1.3 / (3 * 0.4)
+    sand = mpm.MohrCoulomb(bulk=K, shear=G, friction=30.0, dilation=dilation, cohesion=0.0)
+    cavity = Cavity(sand, 1000.0, 200, state={"plastic": np.exp(-2 * P0 / (3 * K)) * np.eye(3)})
+    found = {}
+    for a in np.unique([*np.geomspace(1, 1.5, 70)[1:], *exact]):
+        found[a] = cavity.widen(a) / P0
+    for a, pressure in exact.items():
+        assert found[a] == pytest.approx(pressure, rel=within)
