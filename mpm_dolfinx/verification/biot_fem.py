@@ -150,8 +150,7 @@ class BiotFEM:
                 "parameters of the law may be functions of place, the rest must be numbers"
             )
         self.grid, self.material, self.fluid = Grid(upper, cells, lower, comm), material, fluid
-        self.tolerance, self.t = tolerance, 0.0
-        """Largest residual; time, s."""
+        self.tolerance, self._t = tolerance, fem.Constant(self.grid.mesh, 0.0)
         self._substeps = substeps(method, fluid is not None or bool(terms))  # terms may depend on the velocity
         self.scale = float(np.max(material.at(self.grid.midpoints).oedometric))
         """Unit of the pressure among the unknowns, Pa; both equations are divided by it."""
@@ -168,6 +167,11 @@ class BiotFEM:
             self._forms = self._compile(tractions, outlets, gravity, terms, sources)
         self.jit = time.perf_counter() - start  # s, compiling or finding the forms
         self._snes = self._solver()
+
+    @property
+    def t(self) -> float:
+        """Time, s."""
+        return float(self._t.value)
 
     def _constant(self, value: ArrayLike) -> fem.Constant:
         return fem.Constant(self.grid.mesh, np.asarray(value, dtype=float))
@@ -357,7 +361,7 @@ class BiotFEM:
             took, residual = self._solve(substep, dt)
             newton, worst = newton + took, max(worst, residual)
         self._space.old.x.array[:] = self._space.w.x.array
-        self.t += dt
+        self._t.value += dt
         return newton, worst
 
     def _weight(self, gravity: Callable[[float], ArrayLike], t: float) -> NDArray[np.float64]:
