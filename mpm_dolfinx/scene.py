@@ -89,8 +89,7 @@ class Scene:
             pieces, u, laws = self.pieces.pieces, self.momentum.u, scene.conductivity_laws
             law = ConductivityAtPieces(scene.materials, laws, pieces, u) if laws else None
             self.storage = StorageForms(pieces, u, p, weight, symmetric, scene.conducts, law, sources, self.t)
-        flows = fluid is not None and (scene.conducts or bool(sources))
-        self.method, self.substeps = method, substeps(method, flows or self.momentum.rates)
+        self.method, self.substeps = method, substeps(method, self.flows or self.momentum.rates)
         """Of time integration, and its substeps in a step."""
         self.motion = Motion(scene, bodies, self.momentum, self.storage, fluid)
         # what is still to be looked for, to be warned of once, of which nothing but the log knows
@@ -98,6 +97,11 @@ class Scene:
         self._on_grid: Latest[OnGrid] = Latest()
         self._systems: Latest[System] = Latest()
         self._assembled: Latest[Assembled] = Latest()
+
+    @property
+    def flows(self) -> bool:
+        """Whether fluid moves, or is brought by sources."""
+        return self.storage is not None and (self.materials.conducts or bool(self.storage.sources))
 
     def set_time(self, t: float, dt: float, gravity: NDArray[np.float64] | None) -> None:
         """Set what forms see of a substep: time, and time since the start of the step, s; gravity (d,), m/s^2."""

@@ -174,8 +174,8 @@ class Times:
         return max([*self.after(t)[:1], t]) + 1e-9 * self.interval
 
 
-def sealed(scene: Scene, points: MaterialPoints) -> float:
-    """Return the time in which a cell hardly loses fluid, the least h^2 / c_v, s; 0 where there is none."""
+def diffusion_time(scene: Scene, points: MaterialPoints) -> float:
+    """Return the least time in which pressures diffuse through a cell, h^2 / c_v, s; 0 where nothing conducts."""
     if scene.fluid is None:
         return 0.0
     stored = scene.materials.table(points, lambda m: m.biot**2 / m.oedometric)
@@ -199,13 +199,13 @@ def step_rule(times: Times, rtol, first_step, max_step: float, scene: Scene, poi
     numbers("rtol", rtol, test=lambda v: (least <= v) & (v < 1), allowed=f"in [{least:g}, 1): the solver's tolerance")
     if scene.method == "backward-euler":
         raise ValueError(f"rtol = {line(rtol)}: backward-euler knows no error of a step, must be sdirk2")
-    if scene.fluid is None and len(scene.substeps) > 1:
-        raise ValueError(f"rtol = {line(rtol)}: without fluid no error of terms of the velocity is known, must be dt")
+    if scene.momentum.rates and not scene.flows:
+        raise ValueError(f"rtol = {line(rtol)}: where nothing flows no error of a velocity is known, must be dt")
     longest = float(numbers("max_step", max_step, **positive)) if max_step != inf else inf
     first = times.after(times.start)[0] - times.start
     if len(scene.substeps) > 1:  # without a rate no step has an error
         # under a load that grows from nothing the error is ERROR dt c_v / h^2 of the change
-        first = min(first, max(FIRST * first, SAFETY * rtol / ERROR * sealed(scene, points)))
+        first = min(first, max(FIRST * first, SAFETY * rtol / ERROR * diffusion_time(scene, points)))
     if first_step is not None:
         first = float(numbers("first_step", first_step, **positive))
     return StepSize(min(first, longest), longest, float(rtol))

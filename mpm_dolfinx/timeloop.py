@@ -83,11 +83,12 @@ def run(
     rtol
         Choose the steps by their error: that of the pore pressures stays below about rtol of their largest change
         since the run began; at least ten times `tolerance`, and < 1.  Where nothing flows the steps are as long as the
-        output intervals; refused for dry bodies with terms of the velocity, of which no error is known.
+        output intervals; refused there with terms of the velocity, of which no error is known.
     t_eval : (m,), s
         Output times, increasing, in (t, t_end]; t_end is one of them in any case.  Steps end at output times.
     first_step, max_step
-        With `rtol`: the first step to try, not of a run that goes on, and the longest, s, > 0.
+        With `rtol`: the first step to try, not of a run that goes on, and the longest, s, > 0.  By default the first is
+        about the time in which pressures diffuse through a cell, times 20 rtol, or a thousandth of the first output.
     probes
         Particles that are recorded.
     observe

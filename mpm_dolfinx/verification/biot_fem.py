@@ -154,7 +154,6 @@ class BiotFEM:
             )
         self.grid, self.material, self.fluid = Grid(upper, cells, lower, comm), material, fluid
         self.tolerance, self._t = tolerance, fem.Constant(self.grid.mesh, 0.0)
-        """Largest residual; time, s."""
         self._substeps = substeps(method, fluid is not None or bool(terms))  # terms may depend on the velocity
         self.scale = float(np.max(material.at(self.grid.midpoints).oedometric))
         """Unit of the pressure among the unknowns, Pa; both equations are divided by it."""
