@@ -99,9 +99,9 @@ def test_the_return_is_on_the_yield_surface_by_an_associated_flow(law):
 
 def test_the_tangent_is_the_derivative_of_the_stress(law):
     F = gradients(law.dim)
-    found, differences = law.tangent(F, h=1e-7)
+    found, differences = law.tangent(F, h=3e-7)
     error = np.abs(found - differences).max(axis=(1, 2, 3, 4)) / np.abs(found).max(axis=(1, 2, 3, 4))
-    assert np.sort(error)[-1] < 2e-7
+    assert error.max() < 1e-7
 
 
 def test_a_rotation_turns_the_stress_and_leaves_the_state(law):

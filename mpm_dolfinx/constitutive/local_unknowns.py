@@ -163,9 +163,15 @@ class _Equations:
             values[name] = trial[:, start : start + _size(shape)].reshape(n, *shape)
             start += _size(shape)
         given = {name: data[name].reshape(n, *getattr(self._points, name).ufl_shape) for name in self._names}
-        found = call(self._law.solution, **self._with_trial(values), **given)
-        instance(f"{self._law.__name__}.solution: what it gives", found, dict)
-        self._check("solution", {name: np.shape(value)[1:] for name, (value, _) in found.items()})
+        found, refused = None, ""
+        try:
+            found = call(self._law.solution, **self._with_trial(values), **given)
+            instance(f"{self._law.__name__}.solution: what it gives", found, dict)
+            self._check("solution", {name: np.shape(value)[1:] for name, (value, _) in found.items()})
+        except ValueError as error:
+            refused = str(error)
+        if message := first(self._grid.comm, refused):  # what one process refuses, all must
+            raise ValueError(message)
         columns, rows = [], []
         for name, shape in self._unknowns.items():
             value, slopes = found[name]

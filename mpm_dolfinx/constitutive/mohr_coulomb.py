@@ -28,6 +28,7 @@ from mpm_dolfinx.constitutive.drucker_prager import GIVEN
 from mpm_dolfinx.constitutive.skeleton import Field, Skeleton, _check
 from mpm_dolfinx.constitutive.trial import PLANE, Isotropic, coaxial, components, eigen, embedded, symmetric
 
+ROUND_OFF = 1e-12  # of stresses over the shear modulus
 NEVER = 1e6  # tensile strength over the bulk modulus where none is given
 
 
@@ -156,9 +157,17 @@ def _returned(e: NDArray, bulk: NDArray, shear: NDArray, sine: NDArray, sine_flo
     t, slopes = np.einsum("nij,nj->ni", elastic, e), elastic
     flows = _Surface(sine, *limits).outside(t) > 0
     if flows.any():
-        chosen = [v[flows] for v in (elastic, shear, sine, sine_flow, *limits)]
-        t[flows], of_trial = _Return(t[flows], *chosen).end()
-        slopes[flows] = of_trial @ elastic[flows]
+        parameters = elastic, bulk, shear, sine, sine_flow, *limits
+
+        def at(rows: NDArray) -> _Return:
+            return _Return(t[rows], *(v[rows] for v in parameters))
+
+        rows = np.flatnonzero(flows)
+        ends, of_trial, offence = at(rows).on_main_face()
+        others = ~(offence <= ROUND_OFF * shear[rows])
+        if others.any():
+            ends[others], of_trial[others] = at(rows[others]).end()
+        t[rows], slopes[rows] = ends, of_trial @ elastic[rows]
     return t, slopes, flows.astype(float)
 
 
@@ -176,8 +185,8 @@ class _Surface:
 class _Return:
     """The return of ordered trial stresses t (n, 3), Pa, that are outside."""
 
-    def __init__(self, t, elastic, shear, sine, sine_flow, strength, cutoff):
-        self._trial, self._elastic, self._G = t, elastic, shear
+    def __init__(self, t, elastic, bulk, shear, sine, sine_flow, strength, cutoff):
+        self._trial, self._elastic, self._K, self._G = t, elastic, bulk, shear
         self._surface = s = _Surface(sine, strength, cutoff)
         self._p, self._q = 1 + sine_flow, 1 - sine_flow
         zero, one = np.zeros_like(sine), np.ones_like(sine)
@@ -194,6 +203,10 @@ class _Return:
             (_rows(s.T, lowest, lowest), self._in_triaxial),
             (_rows(s.T, s.T, lowest), self._in_extension),
         )
+
+    def on_main_face(self) -> tuple[NDArray, NDArray, NDArray]:
+        """Return stresses on the face of the largest and smallest, where most end, see `_on`."""
+        return self._on(self._faces[0])
 
     def end(self) -> tuple[NDArray, NDArray]:
         """Return the stresses at the end (n, 3), Pa, and their derivatives by the trial stresses (n, 3, 3)."""
@@ -213,7 +226,8 @@ class _Return:
         """Return stresses on a face or on the edge of two, their derivatives, and their offence."""
         normals, limits, flows = (np.stack(part, axis=1) for part in zip(*faces, strict=True))
         drops = np.einsum("nij,nfj->nif", self._elastic, flows)
-        inverse = np.linalg.inv(normals @ drops)
+        gram = normals @ drops
+        inverse = 1 / gram if len(faces) == 1 else np.linalg.inv(gram)
         slopes = np.eye(3) - drops @ inverse @ normals
         over = np.einsum("nfi,ni->nf", normals, self._trial) - limits
         multipliers = np.einsum("nfg,ng->nf", inverse, over)
@@ -222,7 +236,9 @@ class _Return:
 
     def _at(self, t: NDArray, conditions: Callable) -> tuple[NDArray, NDArray, NDArray]:
         """Return the stresses of a vertex, no derivatives, and the offence; conditions: what must be >= 0 in flow."""
-        plastic = np.linalg.solve(self._elastic, (self._trial - t)[:, :, None])[:, :, 0]
+        drop = self._trial - t
+        mean = drop.mean(axis=1)
+        plastic = drop / (2 * self._G)[:, None] + (mean / (3 * self._K) - mean / (2 * self._G))[:, None]
         return t, np.zeros((len(t), 3, 3)), self._offence(t, conditions(plastic))
 
     def _in_apex(self, x: NDArray) -> list[NDArray]:

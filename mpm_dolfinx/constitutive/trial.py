@@ -125,21 +125,23 @@ def coaxial(
     -------
     Components (n, 6) of the tensors, and their derivatives (n, 6, 4 or 6) by the components of the others.
     """
-    inner = PLANE if plane else SPACE
+    inner, pairs = (PLANE, ((0, 1),)) if plane else (SPACE, ((0, 1), (0, 2), (1, 2)))
     twice = np.array([1.0 if i == j else 2.0 for i, j in inner])
-    pairs = ((0, 1), (0, 2), (1, 2))
 
-    def dyads(of, a: int, b: int) -> NDArray[np.float64]:
+    def dyad(a: int, b: int) -> NDArray[np.float64]:
         """Return the components of the symmetric dyad of two axes."""
-        return np.stack([(axes[:, i, a] * axes[:, j, b] + axes[:, j, a] * axes[:, i, b]) / 2 for i, j in of], axis=1)
+        return np.stack([(axes[:, i, a] * axes[:, j, b] + axes[:, j, a] * axes[:, i, b]) / 2 for i, j in inner], axis=1)
 
-    outer = np.stack([dyads(SPACE, a, a) for a in range(3)], axis=2)
-    along = np.stack([dyads(inner, a, a) * twice for a in range(3)], axis=1)
-    tangent = outer @ slopes @ along
+    outer = np.stack([dyad(a, a) for a in range(3)], axis=2)
+    found = np.zeros((len(x), len(SPACE), len(inner)))
+    tangent = found[:, : len(inner)]  # in plane strain the rest is zero
+    tangent[:] = outer @ slopes @ (outer * twice[:, None]).transpose(0, 2, 1)
     for a, b in pairs:
         apart = x[:, a] - x[:, b]
         equal = np.abs(apart) <= EQUAL * np.abs(x[:, a])
         turn = np.where(equal, slopes[:, a, a] - slopes[:, a, b], (y[:, a] - y[:, b]) / np.where(equal, 1.0, apart))
-        sides = 2 * turn[:, None] * dyads(SPACE, a, b)
-        tangent += sides[:, :, None] * (dyads(inner, a, b) * twice)[:, None, :]
-    return np.einsum("nva,na->nv", outer, y), tangent
+        side = dyad(a, b)
+        tangent += (2 * turn[:, None] * side)[:, :, None] * (side * twice)[:, None, :]
+    values = np.zeros((len(x), len(SPACE)))
+    values[:, : len(inner)] = np.einsum("nva,na->nv", outer, y)
+    return values, found
