@@ -25,7 +25,10 @@ from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from mpi4py import MPI
+
 import numpy as np
+from dolfinx import mesh
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.constitutive.skeleton import LOCKING
@@ -43,14 +46,24 @@ def soil(law: type[mpm.Skeleton] = mpm.Hencky, nu: float = 0.0, **options) -> mp
     return law(bulk=2 * SHEAR * (1 + nu) / (3 * (1 - 2 * nu)), shear=SHEAR, **options)
 
 
-def block(cells: int, material: mpm.Skeleton | None = None, box: float = 1.0, **options) -> mpm.Simulation:
+def block(
+    cells: int, material: mpm.Skeleton | None = None, box: float = 1.0, from_mesh: bool = False, **options
+) -> mpm.Simulation:
     """Return the block, that many cells wide; the grid reaches to `box`, m, and two cells above it."""
     h = 1 / cells
     grid = mpm.Grid([box, box + 2 * h], [round(box * cells), round(box * cells) + 2])
     options.setdefault("tractions", [mpm.Traction("top", lambda t: (0, -LOAD * t))])
     fixed = {"left": "x", "right": "x", "bottom": "y"}
-    body = mpm.box(grid, [0, 0], [1, 1])
+    body = meshed(grid, cells) if from_mesh else mpm.box(grid, [0, 0], [1, 1])
     return mpm.Simulation(grid, [body], [material or soil()], fixed=fixed, **options)
+
+
+def meshed(grid: mpm.Grid, cells: int):
+    """Return the block's domains as they are, from a mesh."""
+    square = mesh.create_rectangle(MPI.COMM_SELF, [[0, 0], [1, 1]], [2 * cells] * 2, mesh.CellType.quadrilateral)
+    top = np.sort(mesh.locate_entities_boundary(square, 1, lambda x: np.isclose(x[1], 1)))
+    tags = mesh.meshtags(square, 1, top, np.ones(len(top), dtype=np.int32))
+    return mpm.from_mesh(grid, square, facet_tags=tags, names={"top": 1})
 
 
 def weighted(cells: int) -> mpm.Simulation:
@@ -167,6 +180,7 @@ PAIRS: dict[str, tuple[Make, Make]] = {
     "factors of a linear law in each step": (linear, refactorised),
     "files of each step": (block, block),
     "grid reset in each step": (block, restless),
+    "body from a mesh": (block, lambda n: block(n, from_mesh=True)),
     "16 times the background grid": (lambda n: restless(n, box=1 + 2 / n), lambda n: restless(n, box=4.0)),
 }
 QUICK = ("files of each step",)

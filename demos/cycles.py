@@ -13,6 +13,7 @@ import argparse
 import csv
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -45,7 +46,9 @@ def rms(simulation: mpm.Simulation) -> float:
     return float(np.sqrt(total[0] / total[1]))
 
 
-def cycle(h: float, load: float, cycles: int, steps: int, quadrature: str = "domain", material=None) -> dict:
+def cycle(
+    h: float, load: float, cycles: int, steps: int, quadrature: str = "domain", material=None, seed: Callable = mpm.box
+) -> dict:
     """Load and unload the beam; return what is left of it, and how it has moved.
 
     Parameters
@@ -58,6 +61,8 @@ def cycle(h: float, load: float, cycles: int, steps: int, quadrature: str = "dom
         Of the material points.
     material
         By default that of the beam.
+    seed
+        Returns the body, called with grid, lower and upper corner, and points per cell and direction.
 
     Returns
     -------
@@ -68,7 +73,7 @@ def cycle(h: float, load: float, cycles: int, steps: int, quadrature: str = "dom
     cells = np.rint(beam.BOX / h).astype(int)
     grid = mpm.Grid(beam.BOX, cells)
     bottom = (round(0.5 * beam.BOX[1] / h) + o.offset) * grid.h[1]
-    body = mpm.box(grid, [0, bottom], [beam.LENGTH, bottom + beam.HEIGHT], per_cell=o.points_per_cell)
+    body = seed(grid, [0, bottom], [beam.LENGTH, bottom + beam.HEIGHT], o.points_per_cell)
     simulation = mpm.Simulation(grid, [body], [material or beam.material(o)], quadrature=quadrature, **conditions(o))
     loaded = np.linspace(beam.CLAMP, beam.LENGTH, 201)[:-1] + (beam.LENGTH - beam.CLAMP) / 400
     places = [[beam.LENGTH, bottom + beam.HEIGHT / 2], *([x, bottom + beam.HEIGHT] for x in loaded)]

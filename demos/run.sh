@@ -24,6 +24,7 @@ if [ ! -f "$root/demos/$demo.py" ]; then
     exit 2
 fi
 
+[ "$demo" != embankment ] || modules+=(gmsh)
 setup
 run=("$python" "$root/demos/$demo.py")
 if [ -n "$processes" ]; then

@@ -231,7 +231,7 @@ CASES = {
     "condition alone": (lambda: scene(tractions=mpm.Traction("top", (0, 1))), "tractions", "Traction"),
     "drained to nan": (lambda: sides("Drained", "top", NAN), "Drained: pressure", "= nan"),
     "inflow of nan": (lambda: sides("Inflow", "top", NAN), "Inflow: flux", "= nan"),
-    "inflow of a function": (lambda: sides("Inflow", "top", lambda t: t), "Inflow: flux", "function"),
+    "inflow of a word": (lambda: sides("Inflow", "top", "much"), "Inflow: flux", "much"),
     "plate under nan": (lambda: sides("RigidPlate", "top", NAN), "RigidPlate: force", "= nan"),
     "plate under a vector": (lambda: sides("RigidPlate", "top", (0, 1)), "RigidPlate: force", "(0, 1)"),
     "plate that goes wrong": (

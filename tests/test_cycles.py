@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from meshes import box_mesh
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.points.bending import bend
@@ -33,6 +34,16 @@ def test_after_two_hundred_cycles_as_after_a_hundred(load):
     assert run["left"][-1] < 5e-3 and run["left"][-1] < 1.01 * run["left"][99]
     peaks, rest = run["tips"][5::10], run["tips"][::10]
     assert abs(peaks[-1] / peaks[0] - 1) < 5e-5 and abs(rest[-1] / peaks[0]) < 1e-3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "size", "left"), [("quad", 1.0, 0.031), ("triangle", 1.75, 0.049)])
+def test_without_a_lattice_twenty_cycles_leave_some_of_the_stress(kind, size, left):
+    def seed(grid, lower, upper, per_cell):
+        cells = np.maximum(1, np.rint((np.array(upper) - lower) / (grid.h / per_cell) / size)).astype(int)
+        return mpm.from_mesh(grid, box_mesh(kind, tuple(cells), lower, upper))
+
+    assert cycles.cycle(0.03, 54e3, 20, 10, seed=seed)["left"][-1] == pytest.approx(left, rel=0.1)
 
 
 def test_what_cycles_leave_falls_with_the_cell_size():

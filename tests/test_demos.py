@@ -38,6 +38,7 @@ QUICK = {
     ),
     "slump": ("--cells 6 --steps 10", ["slump.png", "failure.png", "slump.gif"]),
     "triaxial": ("--steps 20", ["triaxial.png"]),
+    "embankment": ("--h 1 --steps 1", ["embankment.png"]),
     "footing": ("--cells 3 --depth 0.1", ["footing.png", "footing.gif"]),
     "benchmark_beam": ("--h 0.05 --t-end 0.1 --repeat 1", []),
     "benchmark_pruning": ("--quick", ["pruning.md"]),
@@ -57,6 +58,8 @@ def test_every_demo_is_run():
 
 @pytest.mark.parametrize("demo", QUICK)
 def test_the_demo_runs(demo, tmp_path):
+    if demo == "embankment":
+        pytest.importorskip("gmsh")
     arguments, files = QUICK[demo]
     done = run(demo, f"{arguments} --json" + (f" --out {tmp_path}" if files else ""))
     assert done.returncode == 0, done.stderr[-3000:]

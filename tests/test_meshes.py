@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from helpers import refused_in_one_line
 from meshes import box_mesh
+from scipy.integrate import solve_bvp
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.points.cutting import volumes
@@ -112,6 +113,68 @@ def test_a_beam_of_a_mesh_in_3d_bends_as_one_of_boxes():
     tetrahedra = mpm.from_mesh(grid, box_mesh("tetra", (11, 3, 3), low, high))
     assert tip(hexahedra, grid, 3e3, x) == pytest.approx(boxes[2], rel=1e-3)
     assert tip(tetrahedra, grid, 3e3, x) == pytest.approx(boxes[4], rel=1e-3), "19008 points, 15360"
+
+
+def cylinder(p, bulk, shear):
+    """Return what gives u, sigma_r, sigma_t at radii R of a cylinder from 1 to 2 m, Hencky's law, with p inside."""
+
+    def stresses(R, r, slope):
+        strain = np.array([np.log(slope), np.log(r / R), 0 * R])
+        tau = 2 * shear * (strain - strain.sum(axis=0) / 3) + bulk * strain.sum(axis=0)
+        return tau[0] / slope, tau[1] / (r / R)  # nominal
+
+    def slope_of(R, r, P):
+        slope = np.ones_like(R)
+        for _ in range(30):
+            at, beyond = (stresses(R, r, s)[0] for s in (slope, slope * (1 + 1e-7)))
+            slope = slope - (at - P) / ((beyond - at) / (slope * 1e-7))
+        return slope
+
+    def slopes(R, y):
+        slope = slope_of(R, *y)
+        radial, hoop = stresses(R, y[0], slope)
+        return np.stack([slope, -(radial - hoop) / R])
+
+    R = np.linspace(1, 2, 101)
+    start = np.stack([R + p / shear / R, 0 * R - p / 2])
+    y = solve_bvp(slopes, lambda a, b: np.array([a[1] + p * a[0], b[1]]), R, start, tol=1e-9).sol
+
+    def at(R):
+        r, P = y(R)
+        slope = slope_of(R, r, P)
+        hoop = stresses(R, r, slope)[1]
+        return r - R, P / (r / R), hoop / slope
+
+    return at
+
+
+@pytest.mark.parametrize(("p", "steps"), [(1e3, 1), (2e5, 5)])
+def test_a_pressed_hole_has_the_exact_displacements_and_stresses(p, steps):
+    polar = lambda x: (1 + x[:, :1]) * np.stack([np.cos(x[:, 1]), np.sin(x[:, 1])], axis=1)  # noqa: E731
+    cells, bulk, shear = 24, 2e6, 1e6
+    grid = mpm.Grid([2.6] * 2, [round(2.6 * cells)] * 2)
+    ring = box_mesh("quad", (2 * cells, 3 * cells), (0, 0), (1, np.pi / 2), place=polar)
+    body = mpm.from_mesh(grid, ring)
+    load = mpm.Pressure("left", lambda t: p * t)
+    s = mpm.Simulation(grid, [body], [mpm.Hencky(bulk, shear)], fixed={"left": "x", "bottom": "y"}, tractions=[load])
+    s.run(1.0, 1 / steps, progress=False)
+    u, radial, hoop = cylinder(p, bulk, shear)(np.linalg.norm(body.centre, axis=1).clip(1, 2))
+    x, stress, volume = s.points.x, s.effective_stress(), s.points.volume0
+    out = x / np.linalg.norm(x, axis=1)[:, None]
+    around = np.stack([-out[:, 1], out[:, 0]], axis=1)
+    along, across = (np.einsum("ni,nij,nj->n", e, stress, e) for e in (out, around))
+    moved = np.einsum("ni,ni->n", x - s.points.reference.mean(axis=1), out)
+    assert np.sqrt(volume @ (moved - u) ** 2 / (volume @ u**2)) < 5e-4
+    wrong = (along - radial) ** 2 + (across - hoop) ** 2
+    assert np.sqrt(volume @ wrong / (volume @ (radial**2 + hoop**2))) < 5e-3
+
+
+def test_a_slope_of_triangles_under_an_even_pressure_has_an_even_stress():
+    body = outlined([(0, 0), (1.8, 0), (0.6, 1), (0, 1)], ["base", "slope", "crest", "axis"])
+    loads = [mpm.Pressure(side, lambda t: 5e5 * t) for side in ("slope", "crest")]
+    s = mpm.Simulation(GRID, [body], [SOIL], fixed={"left": "x", "bottom": "y"}, tractions=loads)
+    s.run(1.0, 0.2, progress=False)
+    assert s.effective_stress() == pytest.approx(np.tile(-5e5 * np.eye(2), (len(body), 1, 1)), abs=1.0)
 
 
 @pytest.mark.parametrize("kind", ["triangle", "quad"])

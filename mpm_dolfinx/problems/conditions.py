@@ -44,12 +44,14 @@ def arguments(function: Callable) -> list[str]:
     """Return those of t, X and x with which a function is called; ["t"] where its only argument has another name."""
     try:
         wanted = [
-            p.name for p in signature(function).parameters.values() if p.default is p.empty and p.kind != p.VAR_KEYWORD
+            p.name
+            for p in signature(function).parameters.values()
+            if p.default is p.empty and p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)
         ]
     except ValueError:  # numpy's functions have none
         return ["t"]
     names = [name for name in wanted if name in ("t", *PLACES)]
-    return names if len(names) == len(wanted) else ["t"] * len(wanted)
+    return names if names and len(names) == len(wanted) else ["t"] * max(1, len(wanted))
 
 
 def by_place(value) -> bool:

@@ -1,0 +1,183 @@
+# SPDX-License-Identifier: MIT
+"""A bund under water, raised in lifts on soft clay that settles as it drains.
+
+Half of it (x = 0 is a plane of symmetry): 6 m of clay, on which four lifts of 1 m with slopes of 1:2 are put, one
+every 90 days, then ten years.  Each lift is a polygon with named edges (`mpm.polygon`, by gmsh) that comes onto the
+ground as it lies by then, and fills it up to its design level: what has settled is made up for.  Pressures are those
+in excess of the sea above, and weights are buoyant: the lifts' is a term in UFL, the clay's was in balance before.
+Where a lift comes to lie the ground is no open side any more; its slope and crest are.  On one process.
+
+Check: at the end the clay's lowest points carry the weight of the lifts, what they make up for included: `carried` is
+the integral of their effective stress over that weight, 1 in balance.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import poroelastic_beam as beam
+import ufl
+
+import mpm_dolfinx as mpm
+
+DAY = 86400.0  # s
+CLAY, CREST, SLOPE, LIFTS = (
+    6.0,
+    4.0,
+    2.0,
+    4,
+)  # m: depth of the clay, half the crest's width; run over rise; lifts of 1 m
+WIDTH = 24.0  # m: of the section
+PAUSE, END = 90 * DAY, 3650 * DAY  # between two lifts; after the last one
+BUOYANT = 0.6 * (2650 - 1000) * 9.81  # N/m^3
+
+
+@dataclass(frozen=True)
+class Weighed(mpm.Hencky):
+    """Hencky's law for soil with a buoyant weight, N/m^3, that its points carry for the term `weight`."""
+
+    unit_weight: mpm.Field = 0.0
+
+    @staticmethod
+    def energy(F, bulk, shear, unit_weight):
+        """Return psi, Pa, as UFL of F (d, d)."""
+        return mpm.Hencky.energy(F, bulk, shear)
+
+
+SOFT = Weighed(bulk=3e5, shear=1.5e5, porosity=0.5, conductivity=5e-9, unit_weight=lambda X: np.zeros(len(X)))
+SAND = Weighed(bulk=1e7, shear=6e6, conductivity=1e-6, unit_weight=lambda X: np.full(len(X), BUOYANT))
+
+
+def weight(points, v):
+    """Return the work of the weights against a test function."""
+    return points.unit_weight / ufl.det(points.F) * points.value(v)[1] * points.dx
+
+
+def lift(grid: mpm.Grid, k: int):
+    """Return the k-th lift: a polygon with named edges."""
+    low, high = (CREST + SLOPE * (LIFTS - k - end) for end in (0, 1))
+    y = CLAY + k
+    edges = ["base", "slope", "crest", "axis"]
+    return mpm.polygon(grid, [(0, y), (low, y), (high, y + 1), (0, y + 1)], edges, material=1)
+
+
+@dataclass
+class Bund:
+    """What has been seen: times (s), settlements of axis and toe (m), excess pressure (Pa) in mid-clay, and sections.
+
+    frames: title, corners (n, 4, 2), m, and excess pressures (n,), Pa; carried: share of the lifts' weight that the
+    lowest points carry at the end.
+    """
+
+    t: list[float] = field(default_factory=list)
+    axis: list[float] = field(default_factory=list)
+    toe: list[float] = field(default_factory=list)
+    excess: list[float] = field(default_factory=list)
+    frames: list[tuple[str, np.ndarray, np.ndarray]] = field(default_factory=list)
+    carried: float = 0.0
+    wall: float = 0.0
+    steps: int = 0
+
+
+def run(h: float = 0.5, steps: int = 6) -> Bund:
+    """Build the bund on cells of size h, m, with so many steps between two lifts, 6 times as many after."""
+    grid = mpm.Grid([WIDTH, CLAY + LIFTS + 1], np.rint(np.array([WIDTH, CLAY + LIFTS + 1]) / h).astype(int))
+    bodies = [mpm.box(grid, [0, 0], [WIDTH, CLAY]), *[lift(grid, k) for k in range(LIFTS)]]
+    simulation = mpm.Simulation(
+        grid,
+        bodies,
+        [SOFT, SAND],
+        fixed={"left": "x", "right": "x", "bottom": "xy"},
+        fluid=mpm.Fluid(),
+        terms=[weight],
+        drained=[mpm.Drained("top")],
+        later=range(1, LIFTS + 1),
+    )
+    out = Bund()
+    probes = mpm.probes(bodies, [[0.0, CLAY - 1e-6], [CREST + SLOPE * LIFTS, CLAY - 1e-6]])
+    middle = int(np.argmin(np.linalg.norm(bodies[0].centre - (0.0, CLAY / 2), axis=1)))
+
+    def observe(s: mpm.Simulation) -> None:
+        u = s.result.displacement[-1][:, 1]
+        p = s.points.pressure
+        for values, value in zip((out.t, out.axis, out.toe, out.excess), (s.t, *u, p[middle]), strict=True):
+            values.append(float(value))
+
+    for k in range(LIFTS):
+        simulation.stage(add=[k + 1], drained=[mpm.Drained(side) for side in ("top", "slope", "crest")])
+        last, now = k == LIFTS - 1, simulation.t
+        times = [(now + 5 * DAY, 1), (now + PAUSE, steps), (now + END, 5 * steps)] if last else [(now + PAUSE, steps)]
+        for end, count in times:
+            dt = (end - simulation.t) / count
+            result = simulation.run(end, dt, probes=probes, observe=observe, progress=False)
+            out.wall, out.steps = out.wall + result.wall, out.steps + result.steps
+            if last and (count == 1 or end > now + PAUSE):
+                points = simulation.points
+                title = f"{simulation.t / DAY:.0f} days after the first lift"
+                out.frames.append((title, points.corners.copy(), points.pressure))
+    bottom = bodies[0].named("bottom")[0]
+    points, stress = simulation.points, simulation.effective_stress()[:, 1, 1]
+    width = points.corners[bottom, 1, 0] - points.corners[bottom, 0, 0]
+    lifted = BUOYANT * points.volume0[len(bodies[0]) :].sum()
+    out.carried = float(-(stress[bottom] * width).sum() / lifted)
+    return out
+
+
+def main(argv: list[str] | None = None) -> dict:
+    """Run the demo; return what --json prints."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser.add_argument("--h", type=float, default=0.5, help="cell size, m")
+    parser.add_argument("--steps", type=int, default=6, help="steps between two lifts")
+    parser.add_argument("--out", type=Path, default=Path("out/embankment"), help="folder for the picture")
+    parser.add_argument("--json", action="store_true", help="print the results as one line of JSON at the end")
+    o = parser.parse_args(argv)
+    if not 0.1 <= o.h <= 1 or o.steps < 1:
+        parser.error(f"--h {o.h} --steps {o.steps}: must be between 0.1 and 1 m, and >= 1")
+    bund = run(o.h, o.steps)
+    out = {"carried": bund.carried, "settlement": -bund.axis[-1], "wall_s": bund.wall, "converged": True}
+    print(f"the clay's lowest points carry {bund.carried:.4f} of the weight of the lifts")
+    print(f"settlement on the axis: {-bund.axis[-1]:.3f} m, at the toe {-bund.toe[-1]:.3f} m")
+    print(
+        f"excess pressure in mid-clay: {max(bund.excess) / 1e3:.1f} kPa at most, {bund.excess[-1] / 1e3:.2f} at the end"
+    )
+    draw(o, bund)
+    print(f"{bund.steps} steps, {bund.wall:.1f} s; picture: {o.out}/embankment.png")
+    if o.json:
+        print(json.dumps(out))
+    return out
+
+
+def draw(o: argparse.Namespace, bund: Bund) -> None:
+    """Draw the section after the last lift and at the end, and settlements and excess pressure in time."""
+    from matplotlib.collections import PolyCollection
+
+    fig, axes = beam.figure(3, 1, (9, 9.5))
+    most = max(np.quantile(np.abs(p), 0.995) for _, _, p in bund.frames) / 1e3
+    for ax, (title, corners, excess) in zip(axes[:2, 0], bund.frames, strict=True):
+        domains = PolyCollection(corners[:, [0, 1, 3, 2]], edgecolors="face", linewidth=0.2, cmap="viridis")
+        domains.set(array=excess / 1e3, clim=(0, most))
+        ax.add_collection(domains)
+        ax.plot([CREST + SLOPE * LIFTS, CREST, 0], [CLAY, CLAY + LIFTS, CLAY + LIFTS], color="grey", lw=0.8, ls=":")
+        ax.plot([0, WIDTH], [CLAY, CLAY], color="grey", lw=0.8, ls=":")
+        ax.set(aspect="equal", xlim=(0, WIDTH), ylim=(0, CLAY + LIFTS + 0.5), title=title, ylabel="m")
+        fig.colorbar(domains, ax=ax, label="excess pressure (kPa)", shrink=0.8)
+    ax, days = axes[2, 0], np.array(bund.t) / DAY
+    ax.plot(days, bund.axis, color="C0", label="settlement on the axis")
+    ax.plot(days, bund.toe, color="C0", ls="--", label="at the toe")
+    ax.set(xlim=(0, None), xlabel="days after the first lift", ylabel="m")
+    ax.set_xscale("symlog", linthresh=100)
+    twin = ax.twinx()
+    twin.plot(days, np.array(bund.excess) / 1e3, color="C1", label="excess pressure in mid-clay")
+    twin.set_ylabel("kPa", color="C1")
+    ax.legend(loc="lower left")
+    ax.grid(alpha=0.3)
+    o.out.mkdir(parents=True, exist_ok=True)
+    fig.savefig(o.out / "embankment.png", dpi=130)
+
+
+if __name__ == "__main__":
+    main()
