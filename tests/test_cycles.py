@@ -35,6 +35,22 @@ def test_after_two_hundred_cycles_as_after_a_hundred(load):
     assert abs(peaks[-1] / peaks[0] - 1) < 5e-5 and abs(rest[-1] / peaks[0]) < 1e-3
 
 
+CLAY = mpm.Hencky(bulk=1e7 / (3 * (1 - 2 * 0.49)), shear=1e7 / (2 * (1 + 0.49)))
+
+
+def test_what_cycles_leave_of_a_nearly_incompressible_beam_soon_stays_the_same():
+    """With volumes remembered by increments alone it was 6.0 and 7.3 % after 5 and 10 cycles."""
+    left = cycles.cycle(0.06, 54e3, 10, 10, material=CLAY)["left"]
+    assert left[-1] < 0.042 and left[-1] < 1.1 * left[4]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("load", "most"), [(5.4e3, 0.022), (54e3, 0.027)])
+def test_nearly_incompressible_after_two_hundred_cycles_as_after_a_hundred(load, most):
+    left = cycles.cycle(0.03, load, 200, 10, material=CLAY)["left"]
+    assert left[-1] < most and left[-1] < 1.01 * left[99]
+
+
 def test_what_cycles_leave_falls_with_the_cell_size():
     left = [cycles.cycle(h, 54e3, 3, 10)["left"][-1] for h in (0.06, 0.03)]
     assert np.log2(left[0] / left[1]) > 1.2, left

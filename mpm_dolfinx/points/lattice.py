@@ -105,14 +105,6 @@ class Lattice:
         change[np.isin(number, self._joined)] = 0.0
         return change
 
-    def domains_change(
-        self, comm: MPI.Intracomm, ids: NDArray[np.int64], d: NDArray[np.float64], crossed: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Return what the filter adds (m,) to values d (m,) of domains that have crossed some cells (m,)."""
-        shape = tuple(self._count)
-        number = np.ravel_multi_index(tuple(self._index(ids - self._start).T), shape)
-        return _change(comm, shape, number, np.stack([d, crossed], axis=1), np.inf)[:, 0]
-
 
 def _change(
     comm: MPI.Intracomm,
@@ -208,31 +200,14 @@ def filtered(
 
     then: the points when the grid was reset; free (n,): which of them are filtered.
     """
-    out, crossed = np.zeros_like(points.corners), _crossed(grid, points, then, free)
+    out, cells = np.zeros_like(points.corners), crossed(grid, points, then, free)
     for lattice in lattices:
         rows = lattice.rows(points)
         moved = points.corners[rows] - points.reference[rows]
-        out[rows] = lattice.corners_change(grid.comm, points.id[rows], moved, crossed[rows])
+        out[rows] = lattice.corners_change(grid.comm, points.id[rows], moved, cells[rows])
     return out
 
 
-def _crossed(grid: Grid, points: MaterialPoints, then: MaterialPoints, free: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return how many cells the corners (n, 2^d) have crossed; none of points that are not filtered."""
+def crossed(grid: Grid, points: MaterialPoints, then: MaterialPoints, free: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Return how many cells the corners (n, 2^d) have crossed since the grid was reset; of points not free none."""
     return np.abs((points.corners - then.corners) / grid.h).sum(axis=2) * free[:, None]
-
-
-def filtered_ratios(
-    grid: Grid,
-    lattices: Sequence[Lattice],
-    points: MaterialPoints,
-    then: MaterialPoints,
-    free: NDArray[np.bool_],
-    J: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    """Return the volume ratios (n,) of points after the filter of their logarithms; as for `filtered`."""
-    log = np.log(np.where(J > 0, J, np.nan))  # those that are turned inside out are refused later
-    crossed = _crossed(grid, points, then, free).mean(axis=1)
-    for lattice in lattices:
-        rows = lattice.rows(points)
-        log[rows] += lattice.domains_change(grid.comm, points.id[rows], log[rows], crossed[rows])
-    return np.exp(log)
