@@ -81,12 +81,11 @@ class Motion:
             grid, d = cut.grid, cut.grid.dim
             nodal = self._momentum.u.x.array.reshape(-1, d)
             deformed = cache(partial(self._deformed, state.points, on_grid, nodal))
-            moved = cut.displacement(nodal)
             if cut.domains:
-                bend = cut.bend(nodal, self._momentum.active_nodes(on_grid.cells))
+                moved, bend = cut.followed(nodal, self._momentum.active_nodes(on_grid.cells))
                 points, serves, folded = self._shaped(state, cut, moved, bend, deformed)
             else:
-                x, F = state.points.x + moved, deformed()
+                x, F = state.points.x + cut.displacement(nodal), deformed()
                 points = replace(state.points, x=x, F=F, corners=parallelepipeds(x, F, self._sizes(state.points)))
                 serves, folded = cut.serves(points), 0
             self._check_volumes(points, cut)
