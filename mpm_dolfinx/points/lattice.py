@@ -64,12 +64,13 @@ class Lattice:
         self._lower, self._dim = body.lower.min(axis=0), len(body.spacing)
         self._parted = PARTED * body.spacing.min()
         self._count = self._index(np.arange(len(body))).max(axis=0) + 1
-        self._joined = np.take_along_axis(self._number(joined[0]), joined[1], axis=1)
-        self._given = []
+        self._joined = np.zeros(np.prod(self._count + 1), dtype=bool)
+        self._joined[np.take_along_axis(self._number(joined[0]), joined[1], axis=1)] = True
+        self._given = np.zeros((len(self._joined), self._dim), dtype=bool)
         for faces, axes in given:
             rows = faces.id[(faces.id >= self._start) & (faces.id < self._stop)] - self._start
             on = corner_bits(self._dim)[:, faces.axis] == faces.end
-            self._given.append((self._number(rows)[:, on], list(axes)))
+            self._given[self._number(rows)[:, on].reshape(-1, 1), list(axes)] = True
 
     def _index(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return the places (m, d) of domains along the axes."""
@@ -86,11 +87,7 @@ class Lattice:
 
     def given(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return which components (m, 2^d, d) of the corners of domains conditions give."""
-        number = self._number(ids - self._start)
-        out = np.zeros((*number.shape, self._dim), dtype=bool)
-        for at, axes in self._given:
-            out[:, :, axes] |= np.isin(number, at)[:, :, None]
-        return out
+        return self._given[self._number(ids - self._start)]
 
     def corners_change(
         self, comm: MPI.Intracomm, ids: NDArray[np.int64], d: NDArray[np.float64], crossed: NDArray[np.float64]
@@ -102,7 +99,7 @@ class Lattice:
         number = self._number(ids - self._start)
         values = np.concatenate([d, crossed[:, :, None]], axis=2).reshape(-1, self._dim + 1)
         change = _change(comm, tuple(self._count + 1), number.ravel(), values, self._parted).reshape(d.shape)
-        change[np.isin(number, self._joined)] = 0.0
+        change[self._joined[number]] = 0.0
         return change
 
 
