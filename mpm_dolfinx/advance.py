@@ -20,9 +20,10 @@ from mpm_dolfinx.points.cut_domains import CutDomains
 from mpm_dolfinx.points.cutting import parallelepipeds, tangled
 from mpm_dolfinx.points.domain_gradient import gradient
 from mpm_dolfinx.points.grid import REACH, Grid
-from mpm_dolfinx.points.lattice import filtered, filtered_ratios, given
+from mpm_dolfinx.points.lattice import crossed, filtered, given
 from mpm_dolfinx.points.material_points import MaterialPoints, determinant
 from mpm_dolfinx.points.pressure_transport import PiecePressures, Reconstruction
+from mpm_dolfinx.problems.mean_dilatation import PULL, remembered
 from mpm_dolfinx.problems.mechanical_boundary import MechanicalBoundary
 from mpm_dolfinx.problems.momentum import MomentumForms
 from mpm_dolfinx.problems.on_grid import OnGrid
@@ -80,12 +81,11 @@ class Motion:
             grid, d = cut.grid, cut.grid.dim
             nodal = self._momentum.u.x.array.reshape(-1, d)
             deformed = cache(partial(self._deformed, state.points, on_grid, nodal))
-            moved = cut.displacement(nodal)
             if cut.domains:
-                bend = cut.bend(nodal, self._momentum.active_nodes(on_grid.cells))
+                moved, bend = cut.followed(nodal, self._momentum.active_nodes(on_grid.cells))
                 points, serves, folded = self._shaped(state, cut, moved, bend, deformed)
             else:
-                x, F = state.points.x + moved, deformed()
+                x, F = state.points.x + cut.displacement(nodal), deformed()
                 points = replace(state.points, x=x, F=F, corners=parallelepipeds(x, F, self._sizes(state.points)))
                 serves, folded = cut.serves(points), 0
             self._check_volumes(points, cut)
@@ -123,8 +123,8 @@ class Motion:
     ) -> tuple[MaterialPoints, bool, int]:
         """Return the points after their corners have moved (n, 2^d, d) and bent, m, with the F that these tell.
 
-        Where Q1 cells would lock the volume ratio is that of the cells, which `deformed` has in its F.  Soil that has
-        yielded keeps all of that F: it does not come back, and domains in its kinks would tell too much.
+        Where Q1 cells would lock the volume ratio is that of the cells, which `deformed` has in its F (`remembered`).
+        Soil that has yielded keeps all of that F: it does not come back, and domains in its kinks would tell too much.
 
         Returns
         -------
@@ -143,10 +143,11 @@ class Motion:
                 corners = untangled(points, corners, bad, deformed(), grid, stage.mechanical)
         F = gradient(corners, points.reference)
         if self._momentum.dilatation is not None:
-            J = determinant(deformed())
+            J, told, locks = determinant(deformed()), determinant(F), self._materials.locking(points)
             if not serves:
-                J = filtered_ratios(grid, stage.lattices, points, cut.points, ~evolved, J)
-            ratio = np.where(self._materials.locking(points), J / determinant(F), 1.0)
+                pull = PULL * (over_all(grid.comm, int(evolved.sum())) == 0)  # beside what flows volumes tell nothing
+                J = remembered(cut, J, told, locks, crossed(grid, points, cut.points, ~evolved).mean(axis=1), pull)
+            ratio = np.where(locks, J / told, 1.0)
             F = F * (np.sign(ratio) * np.abs(ratio) ** (1 / d))[:, None, None]
         if self._materials.evolves:
             F = np.where(evolved[:, None, None], deformed(), F)

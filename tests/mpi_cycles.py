@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Load, unload and load a beam of two bodies, in plane strain and 3D, on however many processes; write its state."""
+"""Load, unload and load a beam of two bodies, one of clay in plane strain, and one in 3D, on however many processes."""
 
 import sys
 
@@ -8,14 +8,16 @@ from helpers import SOFT
 
 import mpm_dolfinx as mpm
 
+CLAY = mpm.Hencky(bulk=1.7e8, shear=3.4e6)  # nu = 0.49
+
 
 def cycled(dim):
     """Return a simulation after a load cycle and a half."""
     grid = mpm.Grid([1.3, *[0.4] * (dim - 2), 1.0], [13, *[4] * (dim - 2), 10])
     lower, upper = [0.0, *[0.13] * (dim - 2), 0.43], [1.0, *[0.33] * (dim - 2), 0.63]
-    bodies = [mpm.box(grid, lower, [0.55, *upper[1:]]), mpm.box(grid, [0.55, *lower[1:]], upper)]
+    bodies = [mpm.box(grid, lower, [0.55, *upper[1:]]), mpm.box(grid, [0.55, *lower[1:]], upper, material=3 - dim)]
     load = mpm.Traction("top", lambda t: [0.0] * (dim - 1) + [-8e3 * (1 - abs(2 * (t % 1) - 1))])
-    s = mpm.Simulation(grid, bodies, [SOFT], fixed={"left": "xyz"[:dim]}, tractions=[load])
+    s = mpm.Simulation(grid, bodies, [SOFT, CLAY], fixed={"left": "xyz"[:dim]}, tractions=[load])
     s.run(1.5, 0.125, progress=False)
     return s
 

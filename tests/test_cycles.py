@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from meshes import box_mesh
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.points.bending import bend
+from mpm_dolfinx.points.bending import followed
 from mpm_dolfinx.points.cutting import corner_bits, volumes
 from mpm_dolfinx.points.domain_gradient import gradient
 from mpm_dolfinx.points.lattice import filtered, lattices
@@ -44,6 +44,22 @@ def test_without_a_lattice_twenty_cycles_leave_some_of_the_stress(kind, size, le
         return mpm.from_mesh(grid, box_mesh(kind, tuple(cells), lower, upper))
 
     assert cycles.cycle(0.03, 54e3, 20, 10, seed=seed)["left"][-1] == pytest.approx(left, rel=0.1)
+
+
+CLAY = mpm.Hencky(bulk=1e7 / (3 * (1 - 2 * 0.49)), shear=1e7 / (2 * (1 + 0.49)))
+
+
+def test_what_cycles_leave_of_a_nearly_incompressible_beam_soon_stays_the_same():
+    """With volumes remembered by increments alone it was 6.0 and 7.3 % after 5 and 10 cycles."""
+    left = cycles.cycle(0.06, 54e3, 10, 10, material=CLAY)["left"]
+    assert left[-1] < 0.042 and left[-1] < 1.1 * left[4]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("load", "most"), [(5.4e3, 0.022), (54e3, 0.027)])
+def test_nearly_incompressible_after_two_hundred_cycles_as_after_a_hundred(load, most):
+    left = cycles.cycle(0.03, load, 200, 10, material=CLAY)["left"]
+    assert left[-1] < most and left[-1] < 1.01 * left[99]
 
 
 def test_what_cycles_leave_falls_with_the_cell_size():
@@ -82,9 +98,7 @@ def test_corners_follow_quadratic_fields_exactly_and_kinks_at_grid_lines(dim):
     cells = grid.local(grid.number(grid.index(x)))
 
     def moved(field):
-        u = field(grid.node_x)
-        N = grid.shape_values(cells, x)
-        return np.einsum("mk,mkd->md", N, u[grid.cell_nodes[cells]]) + bend(grid, cells, x, u, active)
+        return followed(grid, cells, x, field(grid.node_x), active).sum(axis=0)
 
     def quadratic(x):  # without mixed terms, which Q1 has
         return np.einsum("iaa,na->ni", Q, x**2) + x @ Q[0] + np.prod(x, axis=1)[:, None]

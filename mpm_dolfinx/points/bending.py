@@ -23,10 +23,10 @@ from mpm_dolfinx.points.cutting import corner_bits
 from mpm_dolfinx.points.grid import Grid
 
 
-def bend(
+def followed(
     grid: Grid, cells: NDArray[np.int32], x: NDArray[np.float64], u: NDArray[np.float64], active: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """Return what corners follow besides the Q1 field (m, d), m.
+    """Return the Q1 field at corners, and what they follow besides (2, m, d), m.
 
     Parameters
     ----------
@@ -37,15 +37,23 @@ def bend(
     active : (nodes,)
         Which nodes belong to cells that hold something.
     """
-    used, slot = np.unique(cells, return_inverse=True)
-    differences = _second_differences(grid, used, u, active)
-    out = np.zeros_like(x)
+    used = np.flatnonzero(np.bincount(cells, minlength=1))
+    slot = np.zeros(used.max(initial=0) + 1, dtype=np.intp)
+    slot[used] = np.arange(len(used))
+    nodal, differences = u[grid.cell_nodes[used]], _second_differences(grid, used, u, active)
+    out = np.zeros((2, *x.shape))
     for part in (slice(start, start + CHUNK) for start in range(0, len(x), CHUNK)):
-        at, here = slot[part], cells[part]
-        N, t = grid.shape_values(here, x[part]), (x[part] - grid.midpoints[here]) / grid.h + 0.5
+        here = cells[part]
+        at, N, t = slot[here], grid.shape_values(here, x[part]), (x[part] - grid.midpoints[here]) / grid.h + 0.5
+        out[0, part] = _sum(N, nodal, at)
         for a, D in enumerate(differences):
-            out[part] -= np.einsum("mk,mkd->md", 0.5 * (t[:, a] * (1 - t[:, a]))[:, None] * N, D[at])
+            out[1, part] -= _sum((0.5 * t[:, a] * (1 - t[:, a]))[:, None] * N, D, at)
     return out
+
+
+def _sum(N: NDArray[np.float64], values: NDArray[np.float64], at: NDArray[np.intp]) -> NDArray[np.float64]:
+    """Return the sums (m, d) over the nodes of cells of N (m, 2^d) times values (cells, 2^d, d)."""
+    return np.einsum("mk,mkd->md", N, np.take(values, at, axis=0))
 
 
 def _second_differences(
@@ -54,21 +62,18 @@ def _second_differences(
     """Return the second differences (cells, 2^d, d), m, along the edges of owned cells, an array an axis."""
     d, bits, out = grid.dim, corner_bits(grid.dim), []
     order = np.array([np.flatnonzero((grid.signs == 2 * b - 1).all(axis=1))[0] for b in bits])
-    index = np.stack(np.unravel_index(grid.cell_number[cells], grid.shape), axis=1)
-    nodes = grid.cell_nodes[cells]
+    nodes, beside = grid.cell_nodes[cells], grid.beside(cells)
     for a in range(d):
         low, high = (order[bits[:, a] == end] for end in (0, 1))
         along = u[nodes[:, high]] - u[nodes[:, low]]
         ends, known = [], []
-        for end, step in ((low, -1), (high, 1)):
-            there = index.copy()
-            there[:, a] = np.clip(there[:, a] + step, 0, grid.shape[a] - 1)
-            local = grid.local(grid.number(there))
+        for k, end in enumerate((low, high)):
+            local = beside[:, a, k]
             beyond = grid.cell_nodes[local][:, end]
-            known.append(((there != index).any(axis=1) & (local >= 0))[:, None] & active[beyond])
-            ends.append(u[beyond] - u[nodes[:, end]] - step * along)
+            known.append((local >= 0)[:, None] & active[beyond])
+            ends.append(u[beyond] - u[nodes[:, end]] - (2 * k - 1) * along)
         first, last = (np.where(known[k][:, :, None], ends[k], ends[1 - k]) for k in (0, 1))
-        smaller = np.where(first * last > 0, np.sign(first) * np.minimum(np.abs(first), np.abs(last)), 0.0)
+        smaller = np.where(first * last > 0, np.where(np.abs(first) < np.abs(last), first, last), 0.0)
         bend = np.empty((len(cells), 2**d, d))
         bend[:, low] = bend[:, high] = np.where((known[0] | known[1])[:, :, None], smaller, 0.0)
         out.append(bend)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import cached_property
 
 from mpi4py import MPI
@@ -11,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.caching import Keyed
-from mpm_dolfinx.forms.point_forms import CHUNK
 from mpm_dolfinx.parallel.exchange import Exchange, over_all
-from mpm_dolfinx.points.bending import bend
+from mpm_dolfinx.points.bending import followed
 from mpm_dolfinx.points.cutting import Pieces, cut, cut_faces
 from mpm_dolfinx.points.faces import Surface, face_vectors, interpolate, on_face
 from mpm_dolfinx.points.grid import Grid, sum_by
@@ -139,18 +139,17 @@ class CutDomains(Keyed):
         return Patches(faces, here[face], at[face], cell, x, xi, share)
 
     def displacement(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the Q1 field u (nodes, d) at the corners (n, 2^d, d), or at points without domains (n, d)."""
+        """Return the Q1 field u (nodes, d) at the points (n, d), which have no domains."""
         travel, cells, x = self._followed
-        moved = np.empty_like(x)
-        for part in (slice(start, start + CHUNK) for start in range(0, len(x), CHUNK)):
-            N = self.grid.shape_values(cells[part], x[part])
-            moved[part] = np.einsum("mk,mkd->md", N, u[self.grid.cell_nodes[cells[part]]])
-        return travel.back(moved).reshape((self.points.corners if self.domains else self.points.x).shape)
+        return travel.back(np.einsum("mk,mkd->md", self.grid.shape_values(cells, x), u[self.grid.cell_nodes[cells]]))
 
-    def bend(self, u: NDArray[np.float64], active: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """Return what the corners (n, 2^d, d) follow besides the Q1 field, m; active: nodes of filled cells."""
+    def followed(self, u: NDArray[np.float64], active: NDArray[np.bool_]) -> Iterator[NDArray[np.float64]]:
+        """Yield the Q1 field u (nodes, d) at the corners (n, 2^d, d), and what they follow besides, m.
+
+        active: nodes of filled cells.
+        """
         travel, cells, x = self._followed
-        return travel.back(bend(self.grid, cells, x, u, active)).reshape(self.points.corners.shape)
+        return (travel.back(v).reshape(self.points.corners.shape) for v in followed(self.grid, cells, x, u, active))
 
     @cached_property
     def _followed(self) -> tuple[Exchange, NDArray[np.int32], NDArray[np.float64]]:

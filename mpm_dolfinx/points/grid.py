@@ -213,6 +213,16 @@ class Grid:
         """Return this process's index of each cell, -1 where it does not have the cell."""
         return self.locals[number]
 
+    def beside(self, cells: NDArray[np.integer]) -> NDArray[np.int64]:
+        """Return the local cells (n, d, 2) beside local cells, by axis and end, -1 where this process has none."""
+        index = np.stack(np.unravel_index(self.cell_number[cells], tuple(self.shape)), axis=1)
+        out = np.full((len(cells), self.dim, 2), -1, dtype=np.int64)
+        for axis in range(self.dim):
+            stride = int(np.prod(self.shape[axis + 1 :]))
+            for end, inside in enumerate((index[:, axis] > 0, index[:, axis] < self.shape[axis] - 1)):
+                out[inside, axis, end] = self.locals[self.cell_number[cells[inside]] + (2 * end - 1) * stride]
+        return out
+
     def outside(self, x: NDArray[np.float64], tolerance: float = 1e-9) -> NDArray[np.bool_]:
         """Return which points lie outside the grid by more than `tolerance` cells, and what is lost in rounding."""
         y = (x - self.lower) / self.h

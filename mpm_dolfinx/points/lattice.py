@@ -63,12 +63,13 @@ class Lattice:
         self._body, self._start, self._stop = body, start, start + len(body)
         self._dim, self._count = body.dim, body.lattice
         self._parted = PARTED * body.spacing.min()
-        self._joined = np.take_along_axis(body.nodes(joined[0]), joined[1], axis=1)
-        self._given = []
+        self._joined = np.zeros(body.nodes(np.arange(len(body))).max() + 1, dtype=bool)
+        self._joined[np.take_along_axis(body.nodes(joined[0]), joined[1], axis=1)] = True
+        self._given = np.zeros((len(self._joined), self._dim), dtype=bool)
         for faces, axes in given:
             here = (faces.id >= self._start) & (faces.id < self._stop)
             corners = body.nodes(faces.id[here] - self._start), FACES[self._dim][faces.face[here]]
-            self._given.append((np.take_along_axis(*corners, axis=1), list(axes)))
+            self._given[np.take_along_axis(*corners, axis=1).reshape(-1, 1), list(axes)] = True
 
     def rows(self, points: MaterialPoints) -> NDArray[np.int64]:
         """Return which points are the body's."""
@@ -76,11 +77,7 @@ class Lattice:
 
     def given(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return which components (m, 2^d, d) of the corners of domains conditions give."""
-        number = self._body.nodes(ids - self._start)
-        out = np.zeros((*number.shape, self._dim), dtype=bool)
-        for at, axes in self._given:
-            out[:, :, axes] |= np.isin(number, at)[:, :, None]
-        return out
+        return self._given[self._body.nodes(ids - self._start)]
 
     def corners_change(
         self, comm: MPI.Intracomm, ids: NDArray[np.int64], d: NDArray[np.float64], crossed: NDArray[np.float64]
@@ -93,19 +90,9 @@ class Lattice:
             return np.zeros_like(d)
         number = self._body.nodes(ids - self._start)
         values = np.concatenate([d, crossed[:, :, None]], axis=2).reshape(-1, self._dim + 1)
-        shape = tuple(np.add(self._count, 1))
-        change = _change(comm, shape, number.ravel(), values, self._parted).reshape(d.shape)
-        change[np.isin(number, self._joined)] = 0.0
+        change = _change(comm, tuple(np.add(self._count, 1)), number.ravel(), values, self._parted).reshape(d.shape)
+        change[self._joined[number]] = 0.0
         return change
-
-    def domains_change(
-        self, comm: MPI.Intracomm, ids: NDArray[np.int64], d: NDArray[np.float64], crossed: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Return what the filter adds (m,) to values d (m,) of domains that have crossed some cells (m,)."""
-        if self._count is None:
-            return np.zeros_like(d)
-        number = np.ravel_multi_index(tuple(self._body.place(ids - self._start).T), self._count)
-        return _change(comm, self._count, number, np.stack([d, crossed], axis=1), np.inf)[:, 0]
 
 
 def _change(
@@ -202,31 +189,14 @@ def filtered(
 
     then: the points when the grid was reset; free (n,): which of them are filtered.
     """
-    out, crossed = np.zeros_like(points.corners), _crossed(grid, points, then, free)
+    out, cells = np.zeros_like(points.corners), crossed(grid, points, then, free)
     for lattice in lattices:
         rows = lattice.rows(points)
         moved = points.corners[rows] - points.reference[rows]
-        out[rows] = lattice.corners_change(grid.comm, points.id[rows], moved, crossed[rows])
+        out[rows] = lattice.corners_change(grid.comm, points.id[rows], moved, cells[rows])
     return out
 
 
-def _crossed(grid: Grid, points: MaterialPoints, then: MaterialPoints, free: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return how many cells the corners (n, 2^d) have crossed; none of points that are not filtered."""
+def crossed(grid: Grid, points: MaterialPoints, then: MaterialPoints, free: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Return how many cells the corners (n, 2^d) have crossed since the grid was reset; of points not free none."""
     return np.abs((points.corners - then.corners) / grid.h).sum(axis=2) * free[:, None]
-
-
-def filtered_ratios(
-    grid: Grid,
-    lattices: Sequence[Lattice],
-    points: MaterialPoints,
-    then: MaterialPoints,
-    free: NDArray[np.bool_],
-    J: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    """Return the volume ratios (n,) of points after the filter of their logarithms; as for `filtered`."""
-    log = np.log(np.where(J > 0, J, np.nan))  # those that are turned inside out are refused later
-    crossed = _crossed(grid, points, then, free).mean(axis=1)
-    for lattice in lattices:
-        rows = lattice.rows(points)
-        log[rows] += lattice.domains_change(grid.comm, points.id[rows], log[rows], crossed[rows])
-    return np.exp(log)

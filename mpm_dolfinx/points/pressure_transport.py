@@ -89,15 +89,7 @@ class Reconstruction:
     def __init__(self, grid: Grid):
         self.grid = grid
         self._slope = fem.Function(grid.cellwise((grid.dim,)))
-        index = np.stack(np.unravel_index(grid.cell_number[: grid.num_owned], tuple(grid.shape)), axis=1)
-        self._neighbour = np.empty((grid.num_owned, grid.dim, 2), dtype=np.int64)
-        for axis in range(grid.dim):
-            for end in (0, 1):
-                beside = index.copy()
-                beside[:, axis] += 2 * end - 1
-                inside = (beside[:, axis] >= 0) & (beside[:, axis] < grid.shape[axis])
-                local = grid.local(grid.number(np.clip(beside, 0, grid.shape - 1)))
-                self._neighbour[:, axis, end] = np.where(inside, local, -1)
+        self._neighbour = grid.beside(np.arange(grid.num_owned))
 
     def __call__(
         self,
