@@ -17,8 +17,11 @@ from mpm_dolfinx.scene import Scene
 from mpm_dolfinx.solve.newton import ERROR
 from mpm_dolfinx.validation import line, numbers
 
-MIN_CUT = 2.0**-10
-"""Share of what a step should be long below which it is not cut."""
+MIN_CUT, MIN_CUT_BY_ERROR = 2.0**-10, 2.0**-30
+"""Share of what a step should be long below which it is not cut.
+
+Steps by error grow over decades: where soil begins to slide they have to come down to the time that this takes.
+"""
 SAFETY, SHRINKS, GROWS, KEEPS = 0.9, 0.2, 5.0, 1.2
 """A step by error follows SAFETY times its error's root, by SHRINKS to GROWS; below KEEPS it stays as it is."""
 RINGS = 5e-3
@@ -61,6 +64,11 @@ class StepSize:
         """Return whether a time, s, is the target but for rounding."""
         slack = 1e-14 * abs(target) if self.by_error else 1e-9 * min(result.small, self.longest)
         return target - t <= slack
+
+    @property
+    def least(self) -> float:
+        """Share of what a step should be long below which it is not cut."""
+        return MIN_CUT_BY_ERROR if self.by_error else MIN_CUT
 
     def wanted(self, taken: float) -> float:
         """Return what a step should be that is first tried with a length, s: below a share of it it is not cut."""

@@ -23,7 +23,7 @@ from mpm_dolfinx.points.probes import Probes
 from mpm_dolfinx.result import Report, Result, Row
 from mpm_dolfinx.scene import Scene
 from mpm_dolfinx.state import State
-from mpm_dolfinx.step_size import MIN_CUT, StepSize, Times, measured, step_rule
+from mpm_dolfinx.step_size import StepSize, Times, measured, step_rule
 from mpm_dolfinx.validation import functions, instance, line
 
 PARTS = (
@@ -227,7 +227,7 @@ def _advance(simulation: Simulated, rule: StepSize, target: float) -> None:
         try:
             new, report = simulation.advanced(taken)
         except StepFailed as failed:
-            if taken / 2 < MIN_CUT * wanted:
+            if taken / 2 < rule.least * wanted:
                 raise GaveUp(_why(state.t, taken, failed), _cut(simulation, taken), failed.history) from failed
             _cut(simulation, taken / 2)
             log(comm, "t = %g s: step cut to %.3g s: %s", state.t, taken / 2, failed)
