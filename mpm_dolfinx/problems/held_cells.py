@@ -19,8 +19,10 @@ from mpm_dolfinx.problems.conditions import HOLD, WEAK
 FLAT = 1e-6  # cells^2: variance of places far below which a side has no extent in a cell
 FREE = 1e-6  # below this share of the nodes that may move in what moves a side, a wall holds it
 SAME = 1e-6  # cells: displacements that differ by less are the same
-ALIGNED = 5e-3
+ALIGNED = 1e-2
 """Slope of a side in a cell to an axis below which its cells can follow it, whatever they keep their volume."""
+EVERYWHERE = 1e2
+"""Stiffness of what holds each point of such a side across it, in units of (what resists) / (cell size)."""
 CARRIED = 0.3  # change of traction in a step, in units of what resists and stress: no body's stress changes so much
 
 
@@ -97,7 +99,8 @@ class HeldCells:
         h = grid.h.min()
         flat = normal**2 > (1 - ALIGNED**2) * (normal**2).sum(axis=1, keepdims=True)
         modulus = np.where(flat, total(p.firm)[:, None], total(p.modulus)[:, None])
-        self.stiffness = both(HOLD / h * modulus, np.repeat(WEAK / h * against[:, None], grid.dim, axis=1))
+        each = np.where(flat[at], EVERYWHERE * p.resistance[:, None], WEAK * against[:, None])
+        self.stiffness = both(HOLD / h * modulus, each / h)
         # at the end of a side a node's force may come by a small part of a cell
         short = np.maximum(1.0, grid.cell_volume / grid.h.max() / whole)
         self.limit = CARRIED * total(p.resistance + 10 * p.tension) * short
