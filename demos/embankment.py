@@ -111,11 +111,11 @@ def run(h: float = 0.5, steps: int = 6) -> Bund:
         simulation.stage(add=[k + 1], drained=[mpm.Drained(side) for side in ("top", "slope", "crest")])
         last, now = k == LIFTS - 1, simulation.t
         times = [(now + 5 * DAY, 1), (now + PAUSE, steps), (now + END, 5 * steps)] if last else [(now + PAUSE, steps)]
-        for end, count in times:
+        for part, (end, count) in enumerate(times):
             dt = (end - simulation.t) / count
             result = simulation.run(end, dt, probes=probes, observe=observe, progress=False)
             out.wall, out.steps = out.wall + result.wall, out.steps + result.steps
-            if last and (count == 1 or end > now + PAUSE):
+            if last and part != 1:  # just after the last lift, and in the end
                 points = simulation.points
                 title = f"{simulation.t / DAY:.0f} days after the first lift"
                 out.frames.append((title, points.corners.copy(), points.pressure))
