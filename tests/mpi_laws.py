@@ -42,7 +42,7 @@ simulation = mpm.Simulation(
     fixed={"left": "x", "bottom": "y"},
     drained=[mpm.Drained("right")],
     tractions=[
-        mpm.Traction("top", lambda t: (0, -1e5 - 6e4 * t), region=((0, 1), (1, 2))),
+        mpm.Traction("top", lambda t: (0, -1e5 - 3e4 * t), region=((0, 1), (1, 2))),
         mpm.Traction("right", (-1e5, 0)),
     ],
     terms=[push],
