@@ -12,7 +12,6 @@ from dolfinx.common import Timer
 from numpy.typing import NDArray
 
 from mpm_dolfinx.constitutive.fields import SceneMaterials
-from mpm_dolfinx.constitutive.skeleton import Fluid
 from mpm_dolfinx.errors import LeftGrid, NotConverged
 from mpm_dolfinx.parallel.exchange import first, over_all
 from mpm_dolfinx.points.bodies import Body
@@ -40,9 +39,8 @@ class Motion:
         The materials of the scene.
     bodies
         All bodies of the scene.
-    momentum, storage, fluid
-        Forms of the two problems, which hold the u and p of a solved step, and the pore fluid; storage and fluid are
-        None without.
+    momentum, storage
+        Forms of the two problems, which hold the u and p of a solved step; storage is None without fluid.
     """
 
     def __init__(
@@ -51,9 +49,8 @@ class Motion:
         bodies: Sequence[Body],
         momentum: MomentumForms,
         storage: StorageForms | None,
-        fluid: Fluid | None,
     ):
-        self._materials, self._momentum, self._storage, self._fluid = materials, momentum, storage, fluid
+        self._materials, self._momentum, self._storage = materials, momentum, storage
         self._size = np.concatenate([body.size() for body in bodies])
         self._reconstruction = Reconstruction(momentum.grid) if storage is not None else None
 
@@ -174,7 +171,7 @@ class Motion:
         if self._storage is not None:
             with Timer("mpm: remap"):
                 pieces, stay = cut.pieces, state.stay
-                store = self._materials.storage(points, self._fluid) * points.volume0 * points.J
+                store = self._materials.storage(points) * points.volume0 * points.J
                 on_grid.set_pressures(stay.pressure)
                 pressure, slope, bounds = on_grid.pressures_at_pieces(
                     self._reconstruction, pieces.fraction * store[pieces.point], state.stage, state.t

@@ -91,7 +91,7 @@ class Scene:
             self.storage = StorageForms(pieces, u, p, weight, symmetric, scene.conducts, law, sources, self.t)
         self.method, self.substeps = method, substeps(method, self.flows or self.momentum.rates)
         """Of time integration, and its substeps in a step."""
-        self.motion = Motion(scene, bodies, self.momentum, self.storage, fluid)
+        self.motion = Motion(scene, bodies, self.momentum, self.storage)
         # what is still to be looked for, to be warned of once, of which nothing but the log knows
         self._looked_for = [warn_overfilled, *[partial(warn_smeared, materials=scene)] * scene.uneven]
         self._on_grid: Latest[OnGrid] = Latest()

@@ -187,7 +187,7 @@ def diffusion_time(scene: Scene, points: MaterialPoints) -> float:
     if scene.fluid is None:
         return 0.0
     stored = scene.materials.table(points, lambda m: m.biot**2 / m.oedometric)
-    stored = stored + scene.materials.storage(points, scene.fluid)
+    stored = stored + scene.materials.storage(points)
     mobility = scene.materials.table(points, lambda m: m.conductivity) / scene.fluid.unit_weight
     at = mobility > 0
     least = scene.grid.h.min() ** 2 * (stored[at] / mobility[at]).min(initial=inf)

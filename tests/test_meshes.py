@@ -385,6 +385,7 @@ def test_holes_are_sides_and_other_gmsh_models_stay():
     assert lining.area0.sum() == pytest.approx(24 * 0.6 * np.sin(np.pi / 24))
     assert np.einsum("md,md->m", lining.outward, lining.places().mean(axis=1) - (1, 0.6)).max() < 0
     gmsh.finalize()
+    outlined(size=0.5)  # after somebody has ended it
 
 
 def test_domains_that_are_far_too_small_are_named(caplog):

@@ -29,7 +29,7 @@ from typing import ClassVar
 import numpy as np
 import ufl
 
-from mpm_dolfinx.constitutive.skeleton import Field, Skeleton, _check
+from mpm_dolfinx.constitutive.skeleton import Field, Skeleton, _check, check_given
 from mpm_dolfinx.constitutive.trial import Trial
 
 GIVEN = {
@@ -84,9 +84,7 @@ class ModifiedCamClay(Skeleton):
     unknowns: ClassVar = {"steeper": 0.0}
 
     def __post_init__(self):
-        for name, allowed in GIVEN.items():
-            if getattr(self, name) is None:
-                raise ValueError(f"{type(self).__name__}: {name} is not given, must be {allowed}")
+        check_given(self, GIVEN)
         for name in ("M", "kappa"):
             _check(self, name, lambda v: (0 < np.asarray(v)) & np.isfinite(v), "> 0 and finite")
         if not callable(self.kappa):

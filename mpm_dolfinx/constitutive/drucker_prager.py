@@ -19,7 +19,8 @@ from typing import ClassVar
 import numpy as np
 import ufl
 
-from mpm_dolfinx.constitutive.skeleton import Field, Skeleton, _check
+from mpm_dolfinx.constitutive.frictional import Frictional
+from mpm_dolfinx.constitutive.skeleton import Field, _check
 from mpm_dolfinx.constitutive.trial import Trial
 
 MATCHES = {
@@ -28,17 +29,11 @@ MATCHES = {
     "extension": lambda t, s, c: (6 * s / np.sqrt(3) / (3 + s), 6 * c / np.sqrt(3) / (3 + s)),
 }
 """How the cone meets Mohr and Coulomb's pyramid: (eta, xi) from tangent, sine and cosine of the friction angle."""
-GIVEN = {
-    "friction": "in [0, 90) degrees",
-    "dilation": "in [0, friction] degrees; 0 for flow without a change of volume, friction for associated flow",
-    "cohesion": ">= 0 Pa",
-}
-"""Constants that must be given, and what they may be."""
 TINY = 1e-20  # under the root of the deviatoric strain's square: keeps its derivative finite
 
 
 @dataclass(frozen=True, kw_only=True)
-class DruckerPrager(Skeleton):
+class DruckerPrager(Frictional):
     """Hencky elasticity with a Drucker-Prager yield surface in Kirchhoff stress, perfectly plastic or hardening.
 
     Parameters
@@ -67,9 +62,6 @@ class DruckerPrager(Skeleton):
         values that are safe to assume.
     """
 
-    friction: Field = None  # given always: without it a message says what it may be
-    dilation: Field = None
-    cohesion: Field = None
     hardening: Field = 0.0
     match: str = "plane strain"
 
@@ -77,24 +69,9 @@ class DruckerPrager(Skeleton):
 
     def __post_init__(self):
         super().__post_init__()
-        for name, allowed in GIVEN.items():
-            if getattr(self, name) is None:
-                raise ValueError(f"{type(self).__name__}: {name} is not given, must be {allowed}")
         if self.match not in MATCHES:
             raise ValueError(f"{type(self).__name__}: match = {self.match!r}, must be one of {', '.join(MATCHES)}")
-        _check(self, "friction", lambda v: (0 <= v) & (v < 90), "in [0, 90) degrees")
-        for name in ("cohesion", "hardening"):
-            _check(self, name, lambda v: 0 <= v, ">= 0")
-        if not callable(self.friction):
-            _check(self, "dilation", lambda v: (0 <= v) & (v <= self.friction), "in [0, friction] degrees")
-
-    @property
-    def symmetric(self) -> bool:
-        return self.dilation == self.friction
-
-    @property
-    def nearly_incompressible(self) -> bool:
-        return True  # plastic flow is
+        _check(self, "hardening", lambda v: 0 <= v, ">= 0")
 
     def _cone(self, angle):
         angle = np.radians(angle)

@@ -223,9 +223,9 @@ class SceneMaterials:
         """Return the porosity n = 1 - (1 - n_0) / J at the points (n,)."""
         return 1 - (1 - self.table(points, lambda m: m.porosity)) / points.J
 
-    def storage(self, points: MaterialPoints, fluid: Fluid) -> NDArray[np.float64]:
-        """Return the storage coefficient at the points (n,), 1/Pa."""
-        return self.table(points, lambda m, n: m.storage(fluid.bulk, n), self.porosity(points))
+    def storage(self, points: MaterialPoints) -> NDArray[np.float64]:
+        """Return the storage coefficient at the points (n,), 1/Pa, of a scene with fluid."""
+        return self.table(points, lambda m, n: m.storage(self._fluid.bulk, n), self.porosity(points))
 
     def confined_modulus(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return what resists where neither skeleton nor pore fluid can give way (n,), Pa: lambda + 2G + alpha^2 / S.
@@ -235,7 +235,7 @@ class SceneMaterials:
         modulus = self.table(points, lambda m: m.oedometric)
         if self._fluid is None:
             return modulus
-        fluid = self.table(points, lambda m: m.biot) ** 2 / np.maximum(self.storage(points, self._fluid), 1e-300)
+        fluid = self.table(points, lambda m: m.biot) ** 2 / np.maximum(self.storage(points), 1e-300)
         return modulus + np.minimum(fluid, STIFFEST * modulus)
 
     def state(self, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:

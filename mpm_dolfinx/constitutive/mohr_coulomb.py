@@ -24,8 +24,8 @@ import numpy as np
 import ufl
 from numpy.typing import NDArray
 
-from mpm_dolfinx.constitutive.drucker_prager import GIVEN
-from mpm_dolfinx.constitutive.skeleton import Field, Skeleton, _check
+from mpm_dolfinx.constitutive.frictional import Frictional
+from mpm_dolfinx.constitutive.skeleton import Field, _check
 from mpm_dolfinx.constitutive.trial import PLANE, Isotropic, coaxial, components, eigen, embedded, symmetric
 
 ROUND_OFF = 1e-12  # of stresses over the shear modulus
@@ -33,7 +33,7 @@ NEVER = 1e6  # tensile strength over the bulk modulus where none is given
 
 
 @dataclass(frozen=True, kw_only=True)
-class MohrCoulomb(Skeleton):
+class MohrCoulomb(Frictional):
     """Hencky elasticity with Mohr and Coulomb's yield surface in Kirchhoff stress, perfectly plastic.
 
     Parameters
@@ -57,9 +57,6 @@ class MohrCoulomb(Skeleton):
         values that are safe to assume.
     """
 
-    friction: Field = None  # given always: without it a message says what it may be
-    dilation: Field = None
-    cohesion: Field = None
     tension: Field = np.inf
 
     state: ClassVar = {"plastic": np.eye(3)}
@@ -67,22 +64,7 @@ class MohrCoulomb(Skeleton):
 
     def __post_init__(self):
         super().__post_init__()
-        for name, allowed in GIVEN.items():
-            if getattr(self, name) is None:
-                raise ValueError(f"{type(self).__name__}: {name} is not given, must be {allowed}")
-        _check(self, "friction", lambda v: (0 <= v) & (v < 90), "in [0, 90) degrees")
-        for name in ("cohesion", "tension"):
-            _check(self, name, lambda v: 0 <= v, ">= 0")
-        if not callable(self.friction):
-            _check(self, "dilation", lambda v: (0 <= v) & (v <= self.friction), "in [0, friction] degrees")
-
-    @property
-    def symmetric(self) -> bool:
-        return self.dilation == self.friction
-
-    @property
-    def nearly_incompressible(self) -> bool:
-        return True  # plastic flow is
+        _check(self, "tension", lambda v: 0 <= v, ">= 0")
 
     @property
     def sine(self):

@@ -253,6 +253,13 @@ class Skeleton:
         return porosity / fluid_bulk + (self.biot - porosity) / self.grain_bulk
 
 
+def check_given(obj, allowed: Mapping[str, str]) -> None:
+    """Refuse a material without one of the constants that have no values safe to assume; allowed: what they may be."""
+    for name, what in allowed.items():
+        if getattr(obj, name) is None:
+            raise ValueError(f"{type(obj).__name__}: {name} is not given, must be {what}")
+
+
 def _check(obj, name: str, test: Callable, allowed: str) -> None:
     """Refuse a constant, or the first value of an array, that fails a test; fields wait until they are evaluated."""
     value = getattr(obj, name)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -136,8 +136,9 @@ def _gmsh() -> Iterator:
     tells = hasattr(gmsh, "isInitialized")  # before 4.9 it cannot be asked: it is begun again, and never ended
     begun, talks = tells and gmsh.isInitialized(), 0.0
     if begun or not tells:
-        talks = gmsh.option.getNumber("General.Terminal")
-        gmsh.option.setNumber("General.Terminal", 0)  # of being begun again
+        with suppress(Exception):  # before 4.9 it raises once somebody has ended it
+            talks = gmsh.option.getNumber("General.Terminal")
+            gmsh.option.setNumber("General.Terminal", 0)  # of being begun again
     if not begun:
         gmsh.initialize()
     before = gmsh.model.getCurrent()

@@ -127,7 +127,7 @@ class QuadraturePoints:
         if self._extended:  # what laws take is known for all materials, and zero in `data` for those of other points
             fields |= {name: rows for name, rows in points.data.items() if name not in self._scene.shapes}
         if self._fluid:
-            fields["storage"] = self._scene.storage(points, self._fluid)
+            fields["storage"] = self._scene.storage(points)
         if self._weighs:
             n, wet = self._scene.porosity(points), self._fluid.density if self._fluid else 0.0
             fields["density"] = (1 - n) * self._scene.table(points, lambda m: m.grain_density) + n * wet

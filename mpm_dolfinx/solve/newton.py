@@ -166,7 +166,9 @@ class Newton:
         """
         errors, other = self._begin()
         fresh, watched = self._linear or not serves, not self._momentum.forms.elastic
-        again = [(other, True)] * (other is not None) + [(other or self._iterate(), False)] * watched
+        again = [(other, True)] if other is not None else []
+        if watched:
+            again.append((other or self._iterate(), False))
         for start, watches in again:
             try:
                 return self._iterations(errors, as_reset, key, fresh, watched)
