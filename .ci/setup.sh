@@ -3,19 +3,19 @@
 #   setup [MODULE...]   installs what is missing and sets $python, the interpreter that has dolfinx,
 #                       this package, what the demos import and the MODULEs
 #
-# A module's Debian package is python3-MODULE. Nothing comes by pip: another numpy than Debian's
-# would break Debian's petsc4py.
+# A module's Debian package is python3-MODULE, also that of a plugin of pytest (pytest-xdist, whose module is
+# xdist). Nothing comes by pip: another numpy than Debian's would break Debian's petsc4py.
 
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 modules=(dolfinx scipy tqdm meshio matplotlib)
 
 # One thread per process; pictures without a display; mpirun as root, as in a container; messages
 # through shared memory, for everything runs on one machine (and Open MPI 5 warns about its network); more
-# processes than cores are allowed (Open MPI 4's name for it, and 5's).
+# processes than cores are allowed (Open MPI 4's name for it, and 5's), and those that wait leave the core to others.
 export OMP_NUM_THREADS="${OMP_NUM_THREADS:-1}"
 export MPLBACKEND="${MPLBACKEND:-Agg}"
 export OMPI_ALLOW_RUN_AS_ROOT=1 OMPI_ALLOW_RUN_AS_ROOT_CONFIRM=1
-export OMPI_MCA_btl="${OMPI_MCA_btl:-^tcp}" OMPI_MCA_rmaps_base_oversubscribe=1
+export OMPI_MCA_btl="${OMPI_MCA_btl:-^tcp}" OMPI_MCA_rmaps_base_oversubscribe=1 OMPI_MCA_mpi_yield_when_idle=1
 export PRTE_MCA_rmaps_default_mapping_policy="${PRTE_MCA_rmaps_default_mapping_policy:-:oversubscribe}"
 
 say() { echo "$*" >&2; }
@@ -38,7 +38,7 @@ has_dolfinx_of_its_own() {
 use_python_as_is() {
     local module missing=()
     for module in "${modules[@]}"; do
-        python3 -c "import $module" >/dev/null 2>&1 && continue
+        python3 -c "import ${module#pytest-}" >/dev/null 2>&1 && continue
         case $module in dolfinx) module=fenics-dolfinx ;; gmsh) module=python-gmsh ;; esac
         missing+=("$module")
     done

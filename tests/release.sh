@@ -83,12 +83,13 @@ cat /etc/resolv.conf >"$tree/etc/resolv.conf" 2>/dev/null || true
 } >"$tree/etc/apt/apt.conf.d/99mpm-dolfinx"
 within=(in_tree)
 in_tree dpkg --configure -a >&2 || true
-debian_install "${modules[@]/#/python3-}" python3-pytest python3-hypothesis
+debian_install "${modules[@]/#/python3-}" python3-pytest python3-pytest-xdist python3-hypothesis
 debian_install python3-gmsh || say "No gmsh: its tests are skipped"
 in_tree apt-get clean
 exec 9>&-
 trap - EXIT
 
+[ $# -gt 0 ] || set -- -n "$(nproc)" --dist loadfile
 in_tree OMP_NUM_THREADS="$OMP_NUM_THREADS" MPLBACKEND="$MPLBACKEND" OMPI_MCA_btl="$OMPI_MCA_btl" \
-    OMPI_ALLOW_RUN_AS_ROOT=1 OMPI_ALLOW_RUN_AS_ROOT_CONFIRM=1 PYTHONPATH=/src PYTHONDONTWRITEBYTECODE=1 \
+    OMPI_ALLOW_RUN_AS_ROOT=1 OMPI_ALLOW_RUN_AS_ROOT_CONFIRM=1 OMPI_MCA_mpi_yield_when_idle=1 PYTHONPATH=/src PYTHONDONTWRITEBYTECODE=1 \
     python3 -m pytest -p no:cacheprovider "$@"
