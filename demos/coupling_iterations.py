@@ -2,12 +2,12 @@
 """How many iterations the coupling of displacement and pore pressure takes, from drained to undrained.
 
 The linear systems of Newton's first step are solved to 1e-8 (true residual) for a cantilever (the
-paper's, at rest and bent) and a footing on a column.  The product of conductivity and step, which alone
+poroelastic beam, at rest and bent) and a footing on a column.  The product of conductivity and step, which alone
 matters, goes from 1e-23 m (1e-14 m/s, 1e-9 s) to 1e11 m (1e2 m/s, 1e9 s), the water from soft (1e4 Pa)
 to incompressible.  Compared are the package's conjugate gradients on the Schur complement, S = C + B K^-1 B^T, with the
 filtered fixed-stress operator C + beta (V - 3/4 L) and with the plain one, C + beta V; and the plain
-fixed-stress iteration (Richardson's) with beta = 0.5, 0.75 and 1 times alpha²/K_dr and with 1/K_w as
-printed in the paper, which diverges.  An iteration is one solve of the storage and one of the momentum.
+fixed-stress iteration (Richardson's) with beta = 0.5, 0.75 and 1 times alpha²/K_dr and with 1/K_w,
+which diverges.  An iteration is one solve of the storage and one of the momentum.
 
 Undrained, what Q1 with DG0 does not see are checkers of the pressure; only the damping of jumps
 (`storage.py`) bounds them, and the count.  The second picture shows the pressure with and without it.
@@ -77,12 +77,12 @@ class Count:
 
 
 def cantilever(h: float) -> mpm.Simulation:
-    """Return the paper's beam with cells of h."""
+    """Return the poroelastic beam with cells of h."""
     return beam.scene(beam.arguments(["--h", str(h)]))[0]
 
 
 def bent(h: float) -> mpm.Simulation:
-    """Return the paper's beam after two steps, its tip deflected by half its height."""
+    """Return the poroelastic beam after two steps, its tip deflected by half its height."""
     simulation = cantilever(h)
     simulation.run(2 * RAMP_STEP, RAMP_STEP, progress=False)
     return simulation

@@ -3,7 +3,7 @@
 
 The beam of `poroelastic_beam.py` without water takes its whole load in n equal steps.  The material
 is elastic, so the answer must not depend on n.  Integrated over the exact pieces of the points'
-domains it does not; integrated at the points, as the paper does, it drifts with every cell that a
+domains it does not; integrated at the points, as standard MPM does, it drifts with every cell that a
 point crosses.  The finite element reference takes the load in ten steps.
 """
 
@@ -76,7 +76,7 @@ def draw(o: argparse.Namespace, tips: dict[str, list[float]], exact: float) -> N
     fig, ((ax,),) = beam.figure(1, 1, (7, 4.2))
     ax.axhline(exact, color="black", lw=1, label="Taylor-Hood FEM")
     ax.plot(o.steps, tips["domain"], "o-", label="exact pieces of the points' domains")
-    ax.plot(o.steps, tips["point"], "s--", label="at the points, as in the paper")
+    ax.plot(o.steps, tips["point"], "s--", label="at the points, as in standard MPM")
     failed = [n for n, u in zip(o.steps, tips["point"], strict=True) if not np.isfinite(u)]
     if failed:
         level = np.nanmin(tips["point"]) if np.isfinite(tips["point"]).any() else 1.2 * exact

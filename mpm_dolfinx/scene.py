@@ -120,7 +120,7 @@ class Scene:
                 self._looked_for[:] = [warn for warn in self._looked_for if not warn(cut, bodies=self.bodies)]
             with Timer("mpm: integration data"):
                 problems = (self.momentum, self.storage)
-                return OnGrid(self.pieces, self.materials, *problems, cut, self.scheme.as_printed)
+                return OnGrid(self.pieces, self.materials, *problems, cut, self.scheme.of_fluid)
 
         return self._on_grid(points.arrays, make, grid.comm)
 

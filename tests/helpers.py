@@ -24,7 +24,7 @@ def rates(errors):
 
 
 def beam(*, fluid=True, ramp=0.06, load=54e3, offset=0.5, h=0.03, material=SOFT, box=1.2, **options):
-    """Return (simulation, probe at the tip) of the paper's beam on a coarse grid."""
+    """Return (simulation, probe at the tip) of the poroelastic beam on a coarse grid."""
     grid = mpm.Grid([1.2, box], [round(1.2 / h), round(box / h)])
     bottom = (round(box / 2 / h) + offset) * grid.h[1]
     body = mpm.box(grid, [0, bottom], [1, bottom + 0.3])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The paper's beam against body-fitted Taylor-Hood finite elements with the same time step."""
+"""The poroelastic beam against body-fitted Taylor-Hood finite elements with the same time step."""
 
 import numpy as np
 import poroelastic_beam as demo

@@ -33,8 +33,8 @@ def test_the_krylov_scheme_needs_few_iterations(tip):
     assert result.coupling <= 20 * 2 * result.steps
 
 
-def test_beta_as_printed_in_the_paper_diverges_and_says_so():
-    s, _ = beam(coupling="fixed-stress-paper")
+def test_the_fluid_s_compressibility_as_beta_diverges_and_says_so():
+    s, _ = beam(coupling="fixed-stress-fluid")
     before = s.points
     with pytest.raises(mpm.GaveUp, match=r"gave up at t = 0 s with dt = .* diverges \(beta is below") as caught:
         s.run(0.08, 0.02)
@@ -106,12 +106,12 @@ def test_only_the_product_of_conductivity_and_step_matters():
     assert len(set(counts[:3])) == len(set(counts[3:])) == 1 and counts[0] > counts[3]
 
 
-def test_the_plain_fixed_stress_iteration_needs_more_and_the_papers_beta_diverges():
-    own, plain, paper = (
+def test_the_plain_fixed_stress_iteration_needs_more_and_the_fluid_s_compressibility_as_beta_diverges():
+    own, plain, fluid = (
         demo.worst(demo.scan("beam", 0.06, bulks=[2.2e9], k_dt=[-23, -8, -6], schemes=[scheme]))
         for scheme in ("Schur-CG", "fixed stress, 3/4", "fixed stress, 1/K_w")
     )
-    assert own < plain / 2 < np.inf and paper == np.inf
+    assert own < plain / 2 < np.inf and fluid == np.inf
 
 
 def test_the_filter_takes_at_most_what_the_fixed_stress_operator_has():

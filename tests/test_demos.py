@@ -53,7 +53,13 @@ def run(demo, arguments):
 
 
 def test_every_demo_is_run():
-    assert {p.stem for p in (ROOT / "demos").glob("*.py")} == set(QUICK)
+    assert {p.stem for p in (ROOT / "demos").glob("*.py")} == {*QUICK, "tutorial", "tables"}
+
+
+def test_the_tutorial_s_assertions_hold(tmp_path):
+    done = run("tutorial", f"--out {tmp_path}")
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert (tmp_path / "cut_domain.png").exists()
 
 
 @pytest.mark.parametrize("demo", QUICK)
@@ -77,10 +83,10 @@ def test_the_beam_prints_all_that_it_promises(tmp_path):
     assert out["newton_iterations"] > 2 and out["coupling_iterations"] > 2
 
 
-def test_the_beam_says_how_the_papers_beta_fails_and_keeps_its_results(tmp_path):
-    done = run("poroelastic_beam", f"--h 0.05 --t-end 0.06 --json --coupling fixed-stress-paper --out {tmp_path}")
+def test_the_beam_says_how_too_small_a_beta_fails_and_keeps_its_results(tmp_path):
+    done = run("poroelastic_beam", f"--h 0.05 --t-end 0.06 --json --coupling fixed-stress-fluid --out {tmp_path}")
     assert done.returncode == 1
-    assert "the fixed-stress-paper iteration diverges (beta is below alpha^2 / (2 K_dr))" in done.stderr
+    assert "the fixed-stress-fluid iteration diverges (beta is below alpha^2 / (2 K_dr))" in done.stderr
     assert json.loads(done.stdout.splitlines()[-1])["converged"] is False
 
 

@@ -1,14 +1,22 @@
 # SPDX-License-Identifier: MIT
-"""The README's code runs as it stands, and names only what exists."""
+"""The pages' code runs as it stands, they name only what exists, and their figures are those that the demos print."""
 
+import json
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
+import tables
 
 ROOT = Path(__file__).parent.parent
-README = (ROOT / "README.md").read_text()
-BLOCKS = re.findall(r"```python\n(.*?)```", README, flags=re.S)
+PAGES = {name: (ROOT / name).read_text() for name in ("README.md", "demos/README.md", "mpm_dolfinx/README.md")}
+BLOCKS = [
+    pytest.param(code, id=f"{name.removesuffix('/README.md')}-{k}")
+    for name, page in PAGES.items()
+    for k, code in enumerate(re.findall(r"```python\n(.*?)```", page, flags=re.S))
+]
 
 
 @pytest.mark.parametrize("code", BLOCKS)
@@ -19,12 +27,31 @@ def test_code_blocks_run(code, capsys):
     assert capsys.readouterr().out
 
 
-def test_named_files_exist():
-    files = re.findall(r"\]\(([^)]+)\)", README) + re.findall(r"`(mpm_dolfinx/[\w.]+|tests/\w+\.\w+)`", README)
-    assert len(files) > 3
-    for file in files:
+@pytest.mark.parametrize("name", PAGES)
+def test_named_files_exist(name):
+    page, folder = PAGES[name], (ROOT / name).parent
+    links = [link.split("#")[0] for link in re.findall(r"\]\(([^)]+)\)", page) + re.findall(r'src="([^"]+)"', page)]
+    assert len(links) > 1
+    for link in filter(None, links):
+        assert link.startswith("http") or (folder / link).exists(), link
+    for file in re.findall(r"`([\w/]+\.(?:py|cff|md))`", page):
+        assert any((start / file).exists() for start in (ROOT, ROOT / "mpm_dolfinx")) or file == "my_scene.py", file
+    for file in re.findall(r"tests/test_\w+\.py", page):
         assert (ROOT / file).exists(), file
-    for module in re.findall(r"\(`(\w+\.py)`", README):
-        assert (ROOT / "mpm_dolfinx" / module).exists(), module
-    for demo in re.findall(r"demos/run\.sh (\w+)", README):
+    for demo in re.findall(r"demos/run\.sh (?:-n \d )?([a-z]\w+)", page):
         assert (ROOT / "demos" / f"{demo}.py").exists(), demo
+
+
+@pytest.mark.parametrize("page", tables.PAGES, ids=["front", "demos"])
+def test_figures_are_those_that_the_demos_have_printed(page):
+    text = page.read_text()
+    assert tables.written(text) == text, "bash demos/run.sh tables"
+
+
+@pytest.mark.parametrize("run", ["terzaghi --rtol 1e-3", "self_weight_column"])
+def test_what_a_demo_hof_fluid_it_prints_again(run, tmp_path):
+    demo, *options = run.split()
+    command = [sys.executable, str(tables.DEMOS / f"{demo}.py"), *options, "--json", "--out", str(tmp_path)]
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
+    again, kept = json.loads(done.stdout.splitlines()[-1]), json.loads(tables.kept(run).read_text())
+    assert again["errors"] == pytest.approx(kept["errors"], rel=0.02, abs=1e-6)

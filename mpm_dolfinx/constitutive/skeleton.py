@@ -330,7 +330,7 @@ class NeoHookean(Skeleton):
 class LinearElastic(Skeleton):
     """Linear elasticity of small strain: psi = lambda/2 (tr eps)^2 + G eps:eps, eps = sym F - I.
 
-    The law of the seed paper; not objective, so only for small rotations.  Parameters as for `Skeleton`.
+    Not objective, so only for small rotations.  Parameters as for `Skeleton`.
     """
 
     linear: ClassVar[bool] = True

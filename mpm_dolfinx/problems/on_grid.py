@@ -43,7 +43,7 @@ class OnGrid(Keyed):
         Forms, whose coefficients are set to what the cells hold; storage is None without fluid.
     cut
         The domains of the points, cut.
-    as_printed
+    of_fluid
         Whether beta is 1/K_w, see `Scheme`.
     """
 
@@ -54,7 +54,7 @@ class OnGrid(Keyed):
         momentum: MomentumForms,
         storage: StorageForms | None,
         cut: CutDomains,
-        as_printed: bool,
+        of_fluid: bool,
     ):
         grid, points, self.cut, self._quadrature, self._storage = cut.grid, cut.points, cut, quadrature, storage
         self._places = quadrature.places(cut)
@@ -81,7 +81,7 @@ class OnGrid(Keyed):
                 weight=weight,
                 x=cut.x,
                 faces=cut.pieces_to_cells(cut.pieces.faces),
-                fixed_stress=quadrature.fixed_stress(cut, points, as_printed),
+                fixed_stress=quadrature.fixed_stress(cut, points, of_fluid),
                 damping=quadrature.rows(cut, points, lambda m: m.pressure_damping(grid.dim)),
             )
             self.contents = CellContents(storage.fluxes, brought, self.cells[self.cells < grid.num_owned])

@@ -158,12 +158,12 @@ class QuadraturePoints:
         """Return what pieces (m, 2) that conduct alike have in common."""
         return cut.to_cells(self._scene.conducting(cut.points))
 
-    def fixed_stress(self, cut: CutDomains, points: MaterialPoints, as_printed: bool) -> NDArray[np.float64]:
+    def fixed_stress(self, cut: CutDomains, points: MaterialPoints, of_fluid: bool) -> NDArray[np.float64]:
         """Return beta of the fixed-stress operator at the pieces, 1/Pa, before the scheme's factor.
 
-        `as_printed`: 1/K_w, as in the seed paper.
+        `of_fluid`: 1/K_w, with which the plain iteration converges for stiff skeletons only.
         """
-        if as_printed:
+        if of_fluid:
             return np.full(len(cut.cells), 1 / self._fluid.bulk)
         beta = self._scene.table(points, lambda m: m.biot**2 / m.drained_modulus(self._grid.dim)) * points.J
         return cut.to_cells(beta)

@@ -8,9 +8,9 @@ A Newton step of the two problems reads
 
 `schur-cg` eliminates du and solves with S = C + B K^-1 B^T by conjugate gradients, preconditioned
 with the fixed-stress operator C + beta V (beta = 0.75 alpha^2 / K_dr), filtered: less beta V for pressures
-that alternate from cell to cell (`StorageProblem.assemble_preconditioner`).  These are the paper's two separate
+that alternate from cell to cell (`StorageProblem.assemble_preconditioner`).  These are two separate
 solvers, accelerated.  `schur-fgmres` does the same with the full, slightly unsymmetric Jacobian.
-`fixed-stress` is the paper's Richardson iteration: a storage solve with C + beta V at frozen stress,
+`fixed-stress` is the Richardson iteration of the fixed-stress split: a storage solve with C + beta V at frozen stress,
 then a momentum solve, in turn.  Large bodies in 3D, of which factors of K cost too much, are solved by
 iterations: `schur-...` then solve both problems at once, see `monolithic`.
 """
@@ -247,7 +247,7 @@ class Newton:
             raise NotConverged(why, self.report.history)
 
     def alternate(self) -> Errors:
-        """The paper's iteration: momentum at fixed pressure, then storage at fixed stress, until both balance."""
+        """Fixed-stress iteration: momentum at fixed pressure, then storage at fixed stress, until both balance."""
         errors, report = self._errors(), self.report
         self._linearise()
         while errors.worst > self._scheme.tolerance:
@@ -255,7 +255,7 @@ class Newton:
             try:
                 self._balance_momentum(errors)
             except NotConverged as failed:
-                why = "beta is below alpha^2 / (2 K_dr)" if self._scheme.as_printed else "cut the step"
+                why = "beta is below alpha^2 / (2 K_dr)" if self._scheme.of_fluid else "cut the step"
                 name = self._scheme.coupling
                 raise NotConverged(f"the {name} iteration diverges ({why})", report.history) from failed
             with Timer("mpm: linear solve"):

@@ -12,9 +12,9 @@ COUPLINGS = {
     "schur-fgmres": 0.75,
     "fixed-stress": 0.75,
     "fixed-stress-full": 1.0,
-    "fixed-stress-paper": None,
+    "fixed-stress-fluid": None,
 }
-"""Coupling schemes and the multiple of alpha^2/K_dr that they take as beta; None: 1/K_w, as printed in the paper."""
+"""Coupling schemes and the multiple of alpha^2/K_dr that they take as beta; None: 1/K_w."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Scheme:
         return self.coupling.startswith("fixed-stress")
 
     @property
-    def as_printed(self) -> bool:
+    def of_fluid(self) -> bool:
         """Whether beta is 1/K_w."""
         return COUPLINGS[self.coupling] is None
 

@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: MIT
+"""Write the figures of README.md and demos/README.md from what the demos print.
+
+A figure is followed by a comment that names the run of a demo, the entries of what it prints as JSON, and a format:
+
+    | Terzaghi, p at T_v = 0.5 | 0.004 % <!-- terzaghi --cells 50; errors/p_0.5; % --> |
+
+What a demo has printed is kept in demos/results, with its run time in `seconds` and the release of dolfinx.  A table
+that a demo writes as a file stands between `<!-- error_vs_runtime; comparison.md -->` and `<!-- end -->`.
+
+    bash demos/run.sh tables                        # writes the figures anew from demos/results
+    bash demos/run.sh tables --run terzaghi mandel  # runs these demos first; `--run all` takes hours
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import shlex
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterable
+from pathlib import Path
+
+DEMOS = Path(__file__).parent
+RESULTS = DEMOS / "results"
+PAGES = (DEMOS.parent / "README.md", DEMOS / "README.md")
+FIGURE = re.compile(r"(?<=\| )[^|\n]*?(?P<comment><!-- (?P<run>\w[^;>]*); (?P<entries>[^;>]*); (?P<form>\S+) -->)")
+TABLE = re.compile(
+    r"(?P<begin><!-- (?P<run>\w[^;>]*); (?P<file>\w+\.md) -->\n)(?P<rows>.*?)(?P<end><!-- end -->)", re.S
+)
+
+
+def kept(run: str) -> Path:
+    """Return the file that keeps what a run has printed."""
+    return RESULTS / (re.sub(r"\W+", "_", run) + ".json")
+
+
+def figure(value: float, form: str) -> str:
+    """Return a number in one of the forms of the pages: %, +%, min (a time), or a format of Python."""
+    if form.endswith("%"):
+        return f"{100 * value:{form[:-1]}.2g}"
+    if form == "min":
+        return f"{value:.0f} s" if value < 100 else f"{value / 60:.0f} min"
+    return f"{value:{form}}"
+
+
+def figures(run: str, entries: str, form: str) -> str:
+    """Return the figures that a comment asks for."""
+    if not kept(run).exists():
+        sys.exit(f"{kept(run)}: missing: bash demos/run.sh tables --run {run.split()[0]}")
+    printed, values = json.loads(kept(run).read_text()), []
+    for entry in entries.split(" and "):
+        value = printed
+        for key in entry.split("/"):
+            value = value[int(key) if isinstance(value, list) else key]
+        values += value if isinstance(value, list) else [value]
+    return ", ".join(figure(value, form) for value in values) + (" %" if form.endswith("%") else "")
+
+
+def written(page: str) -> str:
+    """Return a page with its figures and tables written anew."""
+    page = FIGURE.sub(lambda m: f"{figures(m['run'], m['entries'], m['form'])} {m['comment']}", page)
+    return TABLE.sub(lambda m: m["begin"] + kept(m["run"]).with_suffix(".md").read_text() + m["end"], page)
+
+
+def runs(pages: Iterable[str]) -> dict[str, str]:
+    """Return the runs that pages tell of, with the tables that they write, or nothing."""
+    found = {}
+    for page in pages:
+        found |= {m["run"]: "" for m in FIGURE.finditer(page) if m["run"] not in found}
+        found |= {m["run"]: m["file"] for m in TABLE.finditer(page)}
+    return found
+
+
+def take(run: str, table: str) -> None:
+    """Run a demo, and keep what it prints and the table that it writes."""
+    import dolfinx
+
+    demo, *options = shlex.split(run)
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, str(DEMOS / f"{demo}.py"), *options, "--json", "--out", folder]
+        if demo == "benchmark_beam":  # draws nothing
+            command = command[:-2]
+        start = time.perf_counter()
+        done = subprocess.run(command, stdout=subprocess.PIPE, text=True)
+        if done.returncode:
+            sys.exit(f"{run}: ended with {done.returncode}")
+        printed = {"run": run, "dolfinx": dolfinx.__version__, "seconds": round(time.perf_counter() - start, 1)}
+        printed |= json.loads(done.stdout.splitlines()[-1])
+        RESULTS.mkdir(exist_ok=True)
+        kept(run).write_text(json.dumps(printed, indent=1) + "\n")
+        if table:
+            kept(run).with_suffix(".md").write_text((Path(folder) / table).read_text())
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Run demos if asked to, and write the pages."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--run", nargs="+", default=[], metavar="DEMO", help="run what is told of these first, or all")
+    o = parser.parse_args(argv)
+    told = runs(page.read_text() for page in PAGES)
+    demos = {shlex.split(run)[0] for run in told}
+    for name in o.run:
+        if name not in demos | {"all"}:
+            parser.error(f"--run {name}: must be all, or among {', '.join(sorted(demos))}")
+    for run, table in told.items():
+        if "all" in o.run or shlex.split(run)[0] in o.run:
+            print(run, flush=True)
+            take(run, table)
+    for page in PAGES:
+        page.write_text(written(page.read_text()))
+    print(f"written: {', '.join(str(page) for page in PAGES)}")
+
+
+if __name__ == "__main__":
+    main()
