@@ -28,15 +28,15 @@ SCENES = [f"mpi_{name}.py" for name in ("beam", "slab", "stages", "laws", "layer
 @pytest.mark.parametrize("scene", SCENES)
 def test_the_state_is_the_same_on_several_processes(scene, tmp_path):
     states = []
-    for processes in (1, 2, 3):
+    for processes in (1, 3):
         file = tmp_path / f"{processes}.npz"
         mpirun(processes, scene, str(file))
         states.append(np.load(file))
         assert len(states[-1]["counts"]) == processes and states[-1]["balance"] <= 1e-8
-    for other in states[1:]:
-        assert other["x"] == pytest.approx(states[0]["x"], abs=1e-10)
-        for name in set(other.files) - {"x", "tip", "balance", "counts"}:
-            assert other[name] == pytest.approx(states[0][name], abs=1e-8 * np.abs(states[0][name]).max())
+    one, three = states
+    assert three["x"] == pytest.approx(one["x"], abs=1e-10)
+    for name in set(three.files) - {"x", "tip", "balance", "counts"}:
+        assert three[name] == pytest.approx(one[name], abs=1e-8 * np.abs(one[name]).max())
 
 
 @pytest.mark.parametrize("processes", [1, 2, 3])

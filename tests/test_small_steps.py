@@ -22,13 +22,13 @@ def test_the_error_of_the_cells_is_of_second_order():
 
 
 def test_on_the_move_the_error_does_not_grow_with_the_number_of_steps():
-    few, many = (demo.column(10, steps, way=0.5).error for steps in (200, 800))
+    few, many = (demo.column(10, steps, way=0.5).error for steps in (200, 400))
     assert many < 1.25 * few and many < 2 * demo.error_of_cells(10)
 
 
 def test_what_the_remap_does_to_soft_water_is_of_second_order_and_not_of_the_steps():
     """Water so soft that the skeleton stores next to nothing: all of the pressure goes through the remap."""
-    runs = ((20, 100), (40, 100), (10, 100), (10, 400))
+    runs = ((20, 100), (40, 100), (10, 100), (10, 200))
     coarse, fine, few, many = (demo.column(cells, steps, way=0.5, softness=20.0).error for cells, steps in runs)
     assert np.log2(coarse / fine) > 1.9
     assert many < 1.1 * few and many < demo.error_of_cells(10)
