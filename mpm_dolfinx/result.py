@@ -16,8 +16,8 @@ class Report:
 
     rederived: domains that had folded and were re-derived from F; easy: whether the next step may be longer; error,
     change, extremes: estimated error, and largest change, of the cells' pressures in the step, and the least and the
-    largest of them, Pa; sudden: change in the first substep, where it is so fast that the step may overshoot, Pa;
-    stress: what forces of the nodes stand for, Pa.
+    largest of them, Pa; sealed: largest change had no fluid flowed, Pa; sudden: change in the first substep, where it
+    is so fast that the step may overshoot, Pa; stress: what forces of the nodes stand for, Pa.
     """
 
     newton: int = 0
@@ -29,6 +29,7 @@ class Report:
     error: float = 0.0
     change: float = 0.0
     extremes: tuple[float, float] | None = None
+    sealed: float = 0.0
     sudden: float = 0.0
     stress: float = 0.0
 

@@ -40,7 +40,7 @@ def step(scene: Scene, state: State, dt: float) -> tuple[State, Report]:
     for acting in start.acting:
         both, key = balances(scene, start, acting, *rates[-1:]), (on_grid.key, state.stage, acting.substep.own * dt)
         rates.append(solve_substep(solvers, *both, as_reset, key, report))
-    note_pressures(report, solvers, both.storage, acting.substep.before * dt, rates)
+    note_pressures(report, solvers, both.storage, acting.substep.before * dt, dt, rates)
     reactions = state.stage.mechanical.reactions(acting.sides, scene.momentum.u.x.array.reshape(-1, scene.grid.dim))
     outflows = both.storage.outflows(len(state.stage.hydraulic.outlets)) if both.storage else state.outflows
     new, report.rederived = scene.motion.advanced(state, on_grid, state.t + dt)

@@ -48,7 +48,8 @@ class StepSize:
     first, longest : s
         The step to begin with; the step where all are alike, else the longest.
     rtol
-        Largest error of the pressures in proportion to their largest change since the run began; None: equal steps.
+        Largest error of the pressures in proportion to their largest change since the run began, or to what it would
+        be in the step if no fluid flowed; None: equal steps.
     """
 
     first: float
@@ -91,7 +92,7 @@ class StepSize:
         if not self.by_error:
             return 0.5 if taken > 0.75 * self.longest and self._rings(report, result) else 1.0
         # steps are refused where loads jump or bend, mostly: there the error is of first order
-        return 1.0 if report.error <= self.rtol * result.change else self._factor(report, result, 1.0)
+        return 1.0 if report.error <= self._allowed(report, result) else self._factor(report, result, 1.0)
 
     def next(self, taken: float, report: Report, result: Result, failed: bool) -> float:
         """Return the step to try after one that was taken, s; failed: after a longer one had not converged."""
@@ -111,8 +112,16 @@ class StepSize:
 
     def _factor(self, report: Report, result: Result, power: float) -> float:
         """Return the step whose error would be as large as it may be, in proportion to one that was solved."""
-        factor = SAFETY * (self.rtol * result.change / report.error) ** power if report.error > 0 else GROWS
+        factor = SAFETY * (self._allowed(report, result) / report.error) ** power if report.error > 0 else GROWS
         return min(GROWS, max(SHRINKS, factor))
+
+    def _allowed(self, report: Report, result: Result) -> float:
+        """Return how large the error of the pressures may be in a step, Pa.
+
+        Where water flows freely pressures follow the motion of the bodies: what time steps make of them moves nothing,
+        and what the grid makes of them, some percent, no shorter step mends.
+        """
+        return self.rtol * max(result.change, report.sealed)
 
 
 def measured(result: Result, report: Report) -> Result:

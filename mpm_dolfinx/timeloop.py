@@ -82,8 +82,9 @@ def run(
         interval only; without it and `t_eval` every step is an output.
     rtol
         Choose the steps by their error: that of the pore pressures stays below about rtol of their largest change
-        since the run began; at least ten times `tolerance`, and < 1.  Where nothing flows the steps are as long as the
-        output intervals; refused there with terms of the velocity, of which no error is known.
+        since the run began, or of what they would change by in the step if no fluid flowed, which is more where it
+        flows away within the step; at least ten times `tolerance`, and < 1.  Where nothing flows the steps are as long
+        as the output intervals; refused there with terms of the velocity, of which no error is known.
     t_eval : (m,), s
         Output times, increasing, in (t, t_end]; t_end is one of them in any case.  Steps end at output times.
     first_step, max_step

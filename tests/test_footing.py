@@ -65,10 +65,12 @@ def test_a_footing_is_pushed_in_as_deep_as_it_is_wide():
 
 @pytest.mark.slow
 def test_a_fast_push_carries_what_limit_analysis_says_of_an_embedded_base():
-    run = footing.push(footing.SOIL, 9, 0.3, footing.RATES["fast"])
+    """From 0.37 widths on it was a sixth too much: the wall beside it, over its base by a hair, drained that soil."""
+    run = footing.push(footing.SOIL, 9, 0.5, footing.RATES["fast"])
     depth = np.array(run.settlement)
-    deep = depth > 0.05
-    assert np.array(run.load)[deep] == pytest.approx(footing.embedded(depth[deep]), rel=0.04)
+    for low, high, error in ((0.05, 0.3, 0.04), (0.3, 0.5, 0.07)):
+        part = (depth > low) & (depth <= high)
+        assert np.array(run.load)[part] == pytest.approx(footing.embedded(depth[part]), rel=error)
 
 
 def test_a_footing_is_pushed_through_soil_that_yields_without_cut_steps():

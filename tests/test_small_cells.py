@@ -30,6 +30,29 @@ def test_nearly_incompressible_beams_bend_wherever_they_lie_on_the_grid(nu):
         assert 0.96 < tip(4, offset, nu) / fine < 1.03
 
 
+@pytest.mark.parametrize("reach", [1e-4, 1e-2])
+def test_an_open_side_that_reaches_into_the_next_cell_does_not_drain_what_else_is_in_it(reach):
+    """As the wall of a pit over its base: the side lies behind the centroid, and all water was gone in one step."""
+    grid, soil = mpm.Grid([4.0, 4.0], [4, 4]), mpm.Hencky(bulk=1e6, shear=6e5, conductivity=1e-8)
+    overhang = mpm.box(grid, [2, 0], [4, 3])
+    overhang = mpm.mapped(grid, overhang, lambda X: X - np.outer(np.maximum(0, X[:, 1] - 1.5), [reach, 0]))
+    pressures = []
+    for drained in ([], [mpm.Drained("left", region=((1.5, 1.5), (2.5, 3)))]):
+        s = mpm.Simulation(
+            grid,
+            [mpm.box(grid, [0, 0], [2, 1.5]), overhang],
+            [soil],
+            fluid=mpm.Fluid(),
+            fixed={"left": "x", "right": "x", "bottom": "y"},
+            tractions=[mpm.Traction("top", (0, -10.0))],
+            drained=drained,
+        )
+        s.run(1.0, 1.0, progress=False)
+        cells = s.cells()
+        pressures.append(cells.pressure[(cells.x < [2, 1.5]).all(axis=1)])
+    assert len(pressures[0]) == 4 and pressures[1] == pytest.approx(pressures[0], rel=2e-3)  # hardly any flows in 1 s
+
+
 def settled(nu, ratio):
     """Return gamma H / c at which the crest of a vertical cut in soil of G = ratio c has settled H / 50."""
     cohesion, height, cells, most = 1e4, 1.0, 10, 5.0

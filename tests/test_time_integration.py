@@ -163,6 +163,16 @@ def test_a_jump_of_the_load_within_the_run_is_found():
     assert np.abs(s.points.pressure - true.points.pressure).max() < 2e-3 * 200
 
 
+def test_pressures_that_flow_away_within_a_step_do_not_hold_it_up():
+    """A beam of gravel bends as without water: its pressures are 1e-4 of the load.  It took 1466 steps, not 23."""
+    material = replace(SOFT, conductivity=1.0)
+    wet, tip = beam(h=0.06, material=material)
+    result = wet.run(0.3, rtol=3e-3, t_eval=[0.06], probes=tip, progress=False)
+    dry, tip = beam(h=0.06, fluid=False)
+    drained = dry.run(0.3, 0.02, probes=tip, progress=False)
+    assert result.steps < 40 and result.displacement[-1] == pytest.approx(drained.displacement[-1], rel=2e-3)
+
+
 def test_the_first_step_and_the_longest_are_what_was_asked_for():
     times = []
     s = loaded(100.0, **DRAINED)

@@ -8,6 +8,7 @@ the stress that the body has there, so what holds takes the step's change of str
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import NamedTuple
 
 import numpy as np
@@ -140,3 +141,42 @@ class HeldCells:
         stiffness = self.stiffness[chosen, axis]
         gap = gap - (N * stuck * asked).sum(axis=1) + self._force[chosen, axis] / stiffness
         return chosen, stiffness, gap, chosen[held][0] if held.any() else -1
+
+    def beyond(
+        self, row: NDArray[np.int64], axis: NDArray[np.int64], force: NDArray[np.float64], told: Collection[int]
+    ) -> list[tuple[int, NDArray[np.float64]]]:
+        """Return the conditions, but those told of, whose force is beyond its limit, and where (d,), m, it is most.
+
+        A Q1 field that cannot have the means of two cells at once is pulled to and fro between them, as where a side
+        lies along a grid line.  The body feels their sum at the nodes, and so does the reaction: a row is beyond its
+        limit where what its condition does to its nodes is, besides its own force.
+
+        Parameters
+        ----------
+        row, axis, force : (k,)
+            Rows, their components, and their forces, N.
+        told
+            Numbers of conditions.
+        """
+        grid, comm, asked = self.grid, self.grid.comm, ~np.isin(self.number[row], list(told))
+        row, axis, force = row[asked], axis[asked], force[asked]
+        limit = np.append(self.limit, np.zeros(len(self.number) - len(self.limit)))[row]
+        far = np.unique(self.number[row[np.abs(force) > np.where(limit > 0, limit, np.inf)]])
+        suspected = sorted({int(k) for numbers in comm.allgather(far) for k in numbers})
+        if not suspected:
+            return []
+        mine = np.isin(self.number[row], suspected)
+        node = np.rint((grid.node_x[grid.cell_nodes[self.cell[row[mine]]]] - grid.lower) / grid.h)
+        columns = (self.number[row[mine]], axis[mine], force[mine], limit[mine], node, self.shape[row[mine]])
+        rows = (*columns, self.x[row[mine]])
+        number, axis, force, limit, node, N, x = map(np.concatenate, zip(*comm.allgather(rows), strict=True))
+        key = np.concatenate([np.tile(np.stack([number, axis], axis=1)[:, None], (1, N.shape[1], 1)), node], axis=2)
+        _, at = np.unique(key.reshape(-1, key.shape[2]), axis=0, return_inverse=True)
+        size = at.max() + 1
+        at = at.reshape(N.shape)
+        on_nodes, most = (sum_by(at.ravel(), (N * v[:, None]).ravel(), size) for v in (force, limit))
+        ratio = np.divide(np.abs(on_nodes), most, out=np.zeros(size), where=most > 0)
+        net = (N * ratio[at]).sum(axis=1)
+        net = np.where((np.abs(force) > limit) & (limit > 0), net, 0.0)
+        worst = [np.where(number == k, net, 0.0).argmax() for k in suspected]
+        return [(k, x[i]) for k, i in zip(suspected, worst, strict=True) if number[i] == k and net[i] > 1]

@@ -11,11 +11,17 @@ import numpy as np
 
 from mpm_dolfinx.parallel.exchange import Exchange
 from mpm_dolfinx.points.cut_domains import CutDomains
-from mpm_dolfinx.points.cutting import SNAP
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.problems.conditions import Drained, Inflow
 from mpm_dolfinx.problems.fluxes import CellContents, OpenSides
 from mpm_dolfinx.problems.sides import Sides, check_apart, everywhere, on_side
+
+THICK = np.sqrt(2)
+"""Largest section of a cube over its face.
+
+A convex body behind a plane has its centroid at least its volume / ((d + 1) THICK h^(d-1)) behind it.  A face that is
+closer to the centroid of what its cell holds, or behind it, bounds a part of that only, and must not drain it at once.
+"""
 
 
 class HydraulicBoundary:
@@ -61,7 +67,7 @@ class HydraulicBoundary:
             if isinstance(outlet, Inflow):
                 rows.append((number, cell, none, none, value * size, none > 0, normal, reach))
                 continue
-            distance = np.einsum("md,md->m", reach, normal)
-            shape = size / np.maximum(distance, SNAP * grid.h.min())
+            least = contents.fill[contents.slot(cell)] * grid.h.min() / THICK / (grid.dim + 1)
+            shape = size / np.maximum(np.einsum("md,md->m", reach, normal), least)
             rows.append((number, cell, shape, value, none, outlet.seepage & (value <= 0), normal, reach))
         return OpenSides(*map(np.concatenate, zip(*rows, strict=True)))

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import chain, combinations
+from itertools import combinations
 
 import numpy as np
 from dolfinx.common import Timer
@@ -208,22 +208,19 @@ class MechanicalBoundary:
             return np.zeros((0, grid.dim))
         moved = np.einsum("mk,mkd,md->m", held.shape[sides.row], u[grid.cell_nodes[data.cells]], data["direction"])
         force = data["stiffness"][:, 0] * (data["gap"][:, 0] - moved)
-        self._warn(held, sides.row, force)
+        self._warn(held, sides.row, data["direction"].argmax(axis=1), force)
         number, force = held.number[sides.row], force[:, None] * data["direction"]
         return grid.comm.allreduce(np.stack([sum_by(number, column, len(self.holds)) for column in force.T], axis=1))
 
-    def _warn(self, held: HeldCells, row: NDArray[np.int64], force: NDArray[np.float64]) -> None:
+    def _warn(
+        self, held: HeldCells, row: NDArray[np.int64], axis: NDArray[np.int64], force: NDArray[np.float64]
+    ) -> None:
         """Log a warning, once a condition, of forces that no change of the body's stress balances."""
-        firm = np.flatnonzero(row < len(held.limit))
-        firm = firm[~np.isin(held.number[row[firm]], list(self._warned))]
-        ratio = np.abs(force[firm]) / held.limit[row[firm]]
-        worst = row[firm[ratio == ratio.max(initial=1.0)][:1]]  # beyond the limit only
-        found = [(ratio.max(), int(held.number[k]), held.x[k].tolist()) for k in worst]
-        for _, number, x in list(chain(*self.grid.comm.allgather(found)))[:1]:
+        for number, x in held.beyond(row, axis, force, self._warned):
             self._warned.add(number)
             why = "its reaction is an artefact; does something else hold it, or is the step too large?"
             what = "%s: not where it is to be at %s: %s"
-            warn(self.grid.comm, what, line(self.holds[number][0]), np.array(x), why)
+            warn(self.grid.comm, what, line(self.holds[number][0]), x, why)
 
     def under_held(
         self, ids: NDArray[np.int64], tracked: NDArray[np.float64], volume: NDArray[np.float64], corners: NDArray

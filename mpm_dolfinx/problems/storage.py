@@ -343,6 +343,11 @@ class StorageProblem:
         """Filled share of the cells, which is what their pressures count for."""
         return self._contents.fill
 
+    def sealed(self, lost: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return by how much the cells' pressures would have risen, Pa, at fixed stress, by what they lost, m^d."""
+        owned = self.system.unknowns.owned
+        return lost / (self.forms.capacity(self.data) + self._contents.fixed_stress)[owned]
+
     def settle_seepage(self) -> bool:
         """Open and close seepage faces as the flow at (u, p) asks for; return whether that has changed anything.
 

@@ -123,24 +123,39 @@ def solve_substep(
 
 
 def note_pressures(
-    report: Report, solvers: LinearSolvers, storage: StorageProblem | None, seconds: float, rates: Sequence[Rates]
+    report: Report,
+    solvers: LinearSolvers,
+    storage: StorageProblem | None,
+    seconds: float,
+    dt: float,
+    rates: Sequence[Rates],
 ) -> None:
     """Note what the cells' pressures have done in a step, and the estimated error of it.
 
     The difference of the step to one of first order is seconds (Q2 - Q1), a fluid volume.  The fixed-stress operator
     makes it a pressure that stays bounded for stiff modes, as in Hosea and Shampine (1996).  Cells count with what they
     hold.
+
+    Parameters
+    ----------
+    seconds
+        Time in which the first of the rates counts, s.
+    dt
+        The step, s.
     """
     if storage is None or not report.newton:
         return
-    error, start, p = np.zeros(len(storage.fill)), storage.system.p_start.array_r, rates[-1].pressure
+    start, p = storage.system.p_start.array_r, rates[-1].pressure
+    error, sealed = np.zeros((2, len(p)))
     first, second = rates[0].pressure - start, p - rates[0].pressure
     if len(rates) > 1:
         error = ERROR * np.abs(solvers.filtered(seconds * (rates[1].cells - rates[0].cells)))
-    largest = [np.abs(storage.fill * values).max(initial=0.0) for values in (error, p - start, first, second)]
+        sealed = storage.sealed(seconds * rates[0].cells + (dt - seconds) * rates[1].cells)
+    largest = [np.abs(storage.fill * values).max(initial=0.0) for values in (error, p - start, first, second, sealed)]
     largest += [values.max(initial=-np.inf) for values in (-p, p)]
-    error, report.change, first, second, low, high = over_all(storage.forms.grid.comm, np.array(largest), MPI.MAX)
-    report.error, report.extremes = error, (-low, high)
+    largest = over_all(storage.forms.grid.comm, np.array(largest), MPI.MAX).tolist()
+    report.error, report.change, first, second, report.sealed, low, high = largest
+    report.extremes = (-low, high)
     report.sudden = first if len(rates) > 1 and second < SUDDEN * first else 0.0
 
 
