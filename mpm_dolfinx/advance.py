@@ -19,13 +19,13 @@ from mpm_dolfinx.points.cut_domains import CutDomains
 from mpm_dolfinx.points.cutting import parallelepipeds, tangled
 from mpm_dolfinx.points.domain_gradient import gradient
 from mpm_dolfinx.points.grid import REACH, Grid
-from mpm_dolfinx.points.lattice import crossed, filtered, given
-from mpm_dolfinx.points.material_points import MaterialPoints, determinant
+from mpm_dolfinx.points.lattice import filtered, given
+from mpm_dolfinx.points.material_points import MaterialPoints, determinant, with_ratio
 from mpm_dolfinx.points.pressure_transport import PiecePressures, Reconstruction
-from mpm_dolfinx.problems.mean_dilatation import PULL, remembered
 from mpm_dolfinx.problems.mechanical_boundary import MechanicalBoundary
 from mpm_dolfinx.problems.momentum import MomentumForms
 from mpm_dolfinx.problems.on_grid import OnGrid
+from mpm_dolfinx.problems.quadrature_data import QuadratureData
 from mpm_dolfinx.problems.storage import StorageForms
 from mpm_dolfinx.state import State, Stay
 
@@ -54,15 +54,17 @@ class Motion:
         self._size = np.concatenate([body.size() for body in bodies])
         self._reconstruction = Reconstruction(momentum.grid) if storage is not None else None
 
-    def advanced(self, state: State, on_grid: OnGrid, t: float, stays: bool = True) -> tuple[State, int]:
+    def advanced(
+        self, state: State, on_grid: OnGrid, data: QuadratureData, t: float, stays: bool = True
+    ) -> tuple[State, int]:
         """Return the state at time t (s) after a solved step, and how many domains had folded.
 
         Parameters
         ----------
         state
             At the start of the step.
-        on_grid
-            The bodies on the grid.
+        on_grid, data
+            The bodies on the grid, and their pieces at the start of the step.
         stays
             Whether pieces stay in their cells where points hardly move.
 
@@ -74,10 +76,10 @@ class Motion:
             A point has left the grid.
         """
         with Timer("mpm: move points"):
-            cut, pieces = on_grid.cut, on_grid.data.pieces
+            cut, pieces = on_grid.cut, data.pieces
             grid, d = cut.grid, cut.grid.dim
             nodal = self._momentum.u.x.array.reshape(-1, d)
-            deformed = cache(partial(self._deformed, state.points, on_grid, nodal))
+            deformed = cache(partial(self._deformed, cut, data, nodal))
             if cut.domains:
                 moved, bend = cut.followed(nodal, self._momentum.active_nodes(on_grid.cells))
                 points, serves, folded = self._shaped(state, cut, moved, bend, deformed)
@@ -99,16 +101,18 @@ class Motion:
         new = replace(state, t=t, points=points, transported=None, stay=Stay(cut.points, ids, pressure, x, start))
         return new if serves and stays else self.left_grid(new, on_grid), folded
 
-    def _deformed(self, points: MaterialPoints, on_grid: OnGrid, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return F (n, d, d) of the points after a step, F_p <- (sum_k w_k Delta_k / V_p) F_p over their pieces."""
-        cut, pieces = on_grid.cut, on_grid.data.pieces
-        grid, n, d = cut.grid, len(points), cut.grid.dim
+    def _deformed(self, cut: CutDomains, data: QuadratureData, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return F (n, d, d) of the points after a step: the means of Delta F and of its det over their pieces."""
+        pieces, grid, n, d = data.pieces, cut.grid, len(cut.points), cut.grid.dim
         at_nodes = nodal[grid.cell_nodes[pieces.cells]].transpose(0, 2, 1)
         delta = np.eye(d) + at_nodes @ grid.shape_gradients(pieces.cells, pieces.x)
         if self._momentum.dilatation is not None:
-            delta = self._momentum.dilatation.averaged(delta, on_grid.data)
-        mean = [cut.mean(column) for column in cut.to_pieces(delta).reshape(-1, d * d).T]
-        return np.stack(mean, axis=1).reshape(n, d, d) @ points.F
+            delta = self._momentum.dilatation.averaged(delta, data)
+        F = delta @ pieces["F"].reshape(-1, d, d)
+        columns = np.concatenate([F.reshape(-1, d * d), determinant(F)[:, None]], axis=1)
+        mean = np.stack([cut.mean(column) for column in cut.to_pieces(columns).T], axis=1)
+        F, J = mean[:, :-1].reshape(n, d, d), mean[:, -1]
+        return with_ratio(F, J)
 
     def _shaped(
         self,
@@ -120,14 +124,14 @@ class Motion:
     ) -> tuple[MaterialPoints, bool, int]:
         """Return the points after their corners have moved (n, 2^d, d) and bent, m, with the F that these tell.
 
-        Where Q1 cells would lock the volume ratio is that of the cells, which `deformed` has in its F (`remembered`).
+        Where Q1 cells would lock the volume ratio is that of the cells, which `deformed` has in its F.
         Soil that has yielded keeps all of that F: it does not come back, and domains in its kinks would tell too much.
 
         Returns
         -------
         The points; whether they are still where they were cut; how many domains had folded.
         """
-        grid, stage, d, folded = cut.grid, state.stage, cut.grid.dim, 0
+        grid, stage, folded = cut.grid, state.stage, 0
         free = ~given(grid, stage.lattices, stage.conditions["fixed"], state.points)
         corners = state.points.corners + moved + free * bend
         points = replace(state.points, corners=corners)
@@ -140,12 +144,8 @@ class Motion:
                 corners = untangled(points, corners, bad, deformed(), grid, stage.mechanical)
         F = gradient(corners, points.reference)
         if self._momentum.dilatation is not None:
-            J, told, locks = determinant(deformed()), determinant(F), self._materials.locking(points)
-            if not serves:
-                pull = PULL * (over_all(grid.comm, int(evolved.sum())) == 0)  # beside what flows volumes tell nothing
-                J = remembered(cut, J, told, locks, crossed(grid, points, cut.points, ~evolved).mean(axis=1), pull)
-            ratio = np.where(locks, J / told, 1.0)
-            F = F * (np.sign(ratio) * np.abs(ratio) ** (1 / d))[:, None, None]
+            locks = self._materials.locking(points)
+            F = with_ratio(F, np.where(locks, determinant(deformed()), determinant(F)))
         if self._materials.evolves:
             F = np.where(evolved[:, None, None], deformed(), F)
         return replace(points, corners=corners, x=corners.mean(axis=1), F=F), serves, folded

@@ -43,7 +43,7 @@ def step(scene: Scene, state: State, dt: float) -> tuple[State, Report]:
     note_pressures(report, solvers, both.storage, acting.substep.before * dt, dt, rates)
     reactions = state.stage.mechanical.reactions(acting.sides, scene.momentum.u.x.array.reshape(-1, scene.grid.dim))
     outflows = both.storage.outflows(len(state.stage.hydraulic.outlets)) if both.storage else state.outflows
-    new, report.rederived = scene.motion.advanced(state, on_grid, state.t + dt)
+    new, report.rederived = scene.motion.advanced(state, on_grid, start.data, state.t + dt)
     velocity = None if scene.momentum.elastic else scene.momentum.u.x.array / dt
     now = {"reactions": reactions, "outflows": outflows, "velocity": velocity}
     return replace(new, **now, resets=state.resets + (state.stay is None), begins=False), report

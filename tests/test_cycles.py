@@ -46,20 +46,28 @@ def test_without_a_lattice_twenty_cycles_leave_some_of_the_stress(kind, size, le
     assert cycles.cycle(0.03, 54e3, 20, 10, seed=seed)["left"][-1] == pytest.approx(left, rel=0.1)
 
 
-CLAY = mpm.Hencky(bulk=1e7 / (3 * (1 - 2 * 0.49)), shear=1e7 / (2 * (1 + 0.49)))
+def clay(nu):
+    return mpm.Hencky(bulk=1e7 / (3 * (1 - 2 * nu)), shear=1e7 / (2 * (1 + nu)))
 
 
-def test_what_cycles_leave_of_a_nearly_incompressible_beam_soon_stays_the_same():
-    """With volumes remembered by increments alone it was 6.0 and 7.3 % after 5 and 10 cycles."""
-    left = cycles.cycle(0.06, 54e3, 10, 10, material=CLAY)["left"]
-    assert left[-1] < 0.042 and left[-1] < 1.1 * left[4]
+@pytest.mark.parametrize(("nu", "count", "most"), [(0.49, 8, 0.031), (0.499, 2, 0.037)])
+def test_what_cycles_leave_of_a_nearly_incompressible_beam_soon_stays_the_same(nu, count, most):
+    """With volumes remembered by increments alone it was 7 % after 10 cycles, and 18 % after 2 with nu = 0.499."""
+    left = cycles.cycle(0.06, 54e3, count, 10, material=clay(nu))["left"]
+    assert left[-1] < most and left[-1] < 1.2 * left[count // 2 - 1]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("load", "most"), [(5.4e3, 0.022), (54e3, 0.027)])
-def test_nearly_incompressible_after_two_hundred_cycles_as_after_a_hundred(load, most):
-    left = cycles.cycle(0.03, load, 200, 10, material=CLAY)["left"]
-    assert left[-1] < most and left[-1] < 1.01 * left[99]
+@pytest.mark.parametrize("load", [5.4e3, 54e3])
+def test_nearly_incompressible_after_two_hundred_cycles_as_after_a_hundred(load):
+    left = cycles.cycle(0.03, load, 200, 10, material=clay(0.49))["left"]
+    assert left[-1] < 0.02 and left[-1] < 1.01 * left[99]
+
+
+@pytest.mark.slow
+def test_soil_far_from_yield_comes_back_as_what_is_elastic():
+    soil = mpm.DruckerPrager(bulk=8.3e6, shear=3.8e6, cohesion=2e6, friction=0.5, dilation=0.0)
+    assert cycles.cycle(0.03, 54e3, 20, 10, material=soil)["left"][-1] < 0.02
 
 
 def test_what_cycles_leave_falls_with_the_cell_size():

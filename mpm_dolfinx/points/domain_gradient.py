@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: MIT
-"""The deformation gradient of a domain as its corners tell it, whichever way they have taken."""
+"""Deformation gradients of domains, and volume ratios of cells, as corners tell them, whichever way they have taken."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mpm_dolfinx.points.cut_domains import CutDomains
 from mpm_dolfinx.points.cutting import ORIENTATION, kuhn_simplices
-from mpm_dolfinx.points.material_points import cofactor, determinant
+from mpm_dolfinx.points.grid import sum_by
+from mpm_dolfinx.points.material_points import MaterialPoints, cofactor, determinant
 
 
 def gradient(corners: NDArray[np.float64], reference: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -33,3 +35,33 @@ def gradient(corners: NDArray[np.float64], reference: NDArray[np.float64]) -> ND
         now = now + sign * determinant(dx)
     F = F / then[:, None, None]
     return F * np.cbrt(now / then / determinant(F))[:, None, None]
+
+
+def cell_ratios(
+    cut: CutDomains, points: MaterialPoints, share: NDArray[np.float64], flows: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    """Return the volume ratios (m,) with which the pieces of a cut begin a step where cells see one.
+
+    That of a cell is the volume that the corners of its domains tell over that at rest: it remembers no path, and what
+    the cell does not see of it does no work.  By increments alone points would drift from the volumes of their domains,
+    which nothing would bring back.  All others begin with the points' own, and so do cells in which soil has yielded:
+    beside what flows volumes of domains tell nothing.
+
+    Parameters
+    ----------
+    cut, points
+        The domains as cut by the cells, and the points as they are now.
+    share : (n,)
+        Of what corners tell in the logarithm of the ratio, the rest is the points' own; 0 at those that see their own.
+    flows : (n,)
+        Which points have yielded.
+    """
+    cells, size = cut.cells, cut.grid.num_local
+    told = cut.to_cells(determinant(gradient(points.corners, points.reference)))
+    J, share = cut.to_cells(points.J), cut.to_cells(share)
+    weight = (share > 0) * cut.to_cells(points.volume0) * cut.pieces_to_cells(cut.pieces.fraction)
+    terms = weight, weight * share, weight * J, weight * told, cut.to_cells(1.0 * flows)
+    rest, part, own, now, yielded = (sum_by(cells, term, size)[cells] for term in terms)
+    sees = (weight > 0) & (yielded == 0)
+    rest, own, now = (np.where(sees, total, 1.0) for total in (rest, own, now))
+    return np.where(sees, own / rest * (now / own) ** (part / rest), J)

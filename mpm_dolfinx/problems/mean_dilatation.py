@@ -15,7 +15,7 @@ the other but by the displacements that they share.  The energy sum w psi(Fbar) 
 so for given (theta, pi) the residual is that of one more term in the energy, and the tangent is symmetric:
 what theta and pi contribute has rank two in each cell (Simo, Taylor and Pister 1985; F-bar of the material point
 method by increments: Coombs et al. 2018).  A law that gives its stress has P(Fbar) : dFbar in place of dPsi.  The
-points keep Fbar, so regrouping them into other cells changes nothing but what `remembered` says.
+points keep Fbar; the J_n with which the next step begins is that of the cell's domains (`cell_ratios`).
 """
 
 from __future__ import annotations
@@ -34,61 +34,8 @@ from mpm_dolfinx.constitutive.skeleton import Skeleton
 from mpm_dolfinx.constitutive.user_functions import expression
 from mpm_dolfinx.forms.cell_matrices import insert, shape_gradients
 from mpm_dolfinx.forms.point_forms import CellSums, FormPoints, PointData
-from mpm_dolfinx.points.cut_domains import CutDomains
 from mpm_dolfinx.points.grid import Grid, sum_by
 from mpm_dolfinx.problems.quadrature_data import QuadratureData
-
-SOON = 100
-"""Share of `PULL` and `MIX` over the cells that a domain has crossed since the grid was reset; at most all of them."""
-PULL = 0.04
-"""Share of the difference between what corners and points tell of the volume in a cell that these lose in a reset."""
-MIX = 0.3
-"""Share of what no cell sees, the points' differences from the mean of their cell, that they lose in a reset."""
-
-
-def remembered(
-    cut: CutDomains,
-    J: NDArray[np.float64],
-    told: NDArray[np.float64],
-    locks: NDArray[np.bool_],
-    crossed: NDArray[np.float64],
-    pull: float,
-) -> NDArray[np.float64]:
-    """Return the volume ratios (n,) that points take to the next grid, where the grid has been reset.
-
-    By increments alone they would drift from the volumes of the domains, which nothing then brings back: after
-    20 load cycles of a beam those at its surface have lost a hundredth.  The corners' volumes alone carry errors of a
-    step, times a large bulk modulus.  So the means over cells are pulled towards the corners', whose change the next
-    step balances, and what the cells do not see fades:
-
-        ln J <- ln J + s [pull mean_c ln(told / J) + MIX (mean_c ln J - ln J)],    s = min(1, SOON crossed)
-
-    Parameters
-    ----------
-    cut
-        The domains, cut by the cells.
-    J, told : (n,)
-        Volume ratios by increments, and of the domains' corners.
-    locks : (n,)
-        Which points see the mean dilatation.
-    crossed : (n,)
-        Cells that the domains have crossed since the grid was reset; soil that has yielded none.
-    pull
-        `PULL`, or 0 in a scene in which soil has yielded: beside it volumes of domains tell nothing.
-    """
-    known = locks & (crossed > 0) & (J > 0) & (told > 0)  # what is turned inside out is refused later
-    log, corners = (np.log(np.where(known, ratio, 1.0)) for ratio in (J, told))
-    cells, size = cut.cells, cut.grid.num_local
-    weight = cut.to_cells(cut.points.volume0 * known) * cut.pieces_to_cells(cut.pieces.fraction)
-    whole = sum_by(cells, weight, size)
-
-    def in_cells(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        total = sum_by(cells, weight * cut.to_cells(values), size)
-        mean = np.divide(total, whole, out=np.zeros(size), where=whole > 0)
-        return cut.mean(cut.to_pieces(mean[cells]))
-
-    share = np.minimum(1.0, SOON * crossed) * known
-    return J * np.exp(share * (pull * in_cells(corners - log) + MIX * (in_cells(log) - log)))
 
 
 class MeanDilatation:

@@ -15,8 +15,21 @@ from mpm_dolfinx.constitutive.fields import SceneMaterials
 from mpm_dolfinx.constitutive.skeleton import Fluid, Skeleton
 from mpm_dolfinx.forms.point_forms import FormPoints, Places, PointData
 from mpm_dolfinx.points.cut_domains import CutDomains
+from mpm_dolfinx.points.domain_gradient import cell_ratios
 from mpm_dolfinx.points.grid import Grid
 from mpm_dolfinx.points.material_points import MaterialPoints
+
+TOLD = 50
+"""Share of what corners tell in the volume ratios with which cells begin a step, over G / (lambda + 2G); at most all.
+
+The rest is what the points of a cell have: with nu = 0.4999 all of what corners tell would change stresses at a reset
+by more than bodies bear.
+"""
+
+
+def told_share(material: Skeleton) -> NDArray[np.float64]:
+    """Return how much of the volume ratio with which its cells begin a step is what the domains' corners tell."""
+    return np.minimum(1.0, TOLD * material.shear / material.oedometric)
 
 
 @dataclass(frozen=True)
@@ -82,6 +95,7 @@ class QuadraturePoints:
             shapes |= {"position": (d,), "conductivity": (), "porosity0": ()}
         self.pieces = FormPoints(grid, **shapes)
         self.laws = scene.parts(self.pieces, ["F", "biot"] if fluid else ["F"])
+        self._locks = any(locks for *_, locks in self.laws)
         self._constants: Latest[dict[str, NDArray[np.float64]]] = Latest()
 
     def places(self, cut: CutDomains) -> PiecePlaces:
@@ -98,6 +112,10 @@ class QuadraturePoints:
         changing = {name: cut.to_cells(values) for name, values in self._changing(points).items()}
         fields = {**self._constant(cut, points), **changing, **self._own(cut, points)}
         weight = cut.pieces_to_cells(cut.pieces.fraction * (points.volume0 * points.J)[cut.pieces.point])
+        if self._locks and cut.domains:
+            share = self._scene.locking(points) * self._scene.table(points, told_share)
+            factor = cell_ratios(cut, points, share, self._scene.evolved(points)) / cut.to_cells(points.J)
+            weight, fields["F"] = factor * weight, factor[:, None, None] ** (1 / cut.grid.dim) * fields["F"]
         pieces = PointData(self.pieces, places.pieces, weight, fields)
         if not places.parts:
             return QuadratureData(pieces, (pieces,), (slice(None),))
