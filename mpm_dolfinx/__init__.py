@@ -41,6 +41,7 @@ from mpm_dolfinx.result import Result
 from mpm_dolfinx.simulation import Simulation
 from mpm_dolfinx.solve.scheme import COUPLINGS
 from mpm_dolfinx.state import State
+from mpm_dolfinx.strength_reduction import Safety, factor_of_safety
 
 __version__ = "0.1.0"
 __all__ = [
@@ -66,6 +67,7 @@ __all__ = [
     "Pressure",
     "Result",
     "RigidPlate",
+    "Safety",
     "Simulation",
     "Skeleton",
     "State",
@@ -73,6 +75,7 @@ __all__ = [
     "Writer",
     "box",
     "element_test",
+    "factor_of_safety",
     "from_mesh",
     "kozeny_carman",
     "mapped",
