@@ -2,11 +2,11 @@
 """Implicit, iteratively coupled material point / finite volume poromechanics on FEniCSx.
 
 A scene is a `Simulation` of a `Grid`, bodies (`box`, `shape`, `mapped`, `from_mesh`, `polygon`), materials (`Hencky`,
-`NeoHookean`, `LinearElastic`, `DruckerPrager`, `MohrCoulomb`, `ModifiedCamClay`, or your own `Skeleton`), a `Fluid` and
-conditions on the sides of the bodies (`Traction`, `Pressure`, `Displacement`, `RigidPlate`, `Drained`, `Inflow`,
-`water`).  Its `run` gives a `Result` with what `probes` record, and feeds a `Writer` and a `Checkpoint`, from which
-`resume` goes on; `stage` changes the scene between two runs.  Terms and sources in UFL: see
-`mpm_dolfinx.constitutive.user_functions`.
+`NeoHookean`, `LinearElastic`, `DruckerPrager`, `SofteningDruckerPrager`, `MohrCoulomb`, `ModifiedCamClay`, or your own
+`Skeleton`), a `Fluid` and conditions on the sides of the bodies (`Traction`, `Pressure`, `Displacement`, `RigidPlate`,
+`Drained`, `Inflow`, `water`).  Its `run` gives a `Result` with what `probes` record, and feeds a `Writer` and a
+`Checkpoint`, from which `resume` goes on; `stage` changes the scene between two runs, and `factor_of_safety` weakens
+it until it slides.  Terms and sources in UFL: see `mpm_dolfinx.constitutive.user_functions`.
 
 SI units throughout.  Stress is positive in tension, pore pressure in compression; 2D is plane strain, and forces
 are those of a slice of 1 m.
@@ -27,6 +27,7 @@ from mpm_dolfinx.constitutive.skeleton import (
     Skeleton,
     kozeny_carman,
 )
+from mpm_dolfinx.constitutive.softening import SofteningDruckerPrager
 from mpm_dolfinx.errors import GaveUp, LeftGrid, NotConverged
 from mpm_dolfinx.io.checkpoint import Checkpoint, resume
 from mpm_dolfinx.io.writer import Writer
@@ -70,6 +71,7 @@ __all__ = [
     "Safety",
     "Simulation",
     "Skeleton",
+    "SofteningDruckerPrager",
     "State",
     "Traction",
     "Writer",
