@@ -135,9 +135,9 @@ def sealed_soil(cells: int, yields: bool = True) -> mpm.Simulation:
     return simulation
 
 
-def plastic(cells: int, law: type[mpm.Skeleton]) -> mpm.Simulation:
+def plastic(cells: int, law: type[mpm.Skeleton], **constants) -> mpm.Simulation:
     """Return the block of plastic soil that is far from yielding."""
-    return block(cells, soil(law, friction=30.0, dilation=0.0, cohesion=1e9))
+    return block(cells, soil(law, friction=30.0, dilation=0.0, cohesion=1e9, **constants))
 
 
 def clayey(cells: int) -> mpm.Simulation:
@@ -174,6 +174,10 @@ PAIRS: dict[str, tuple[Make, Make]] = {
     "Mohr-Coulomb beside Drucker-Prager": (
         partial(plastic, law=mpm.DruckerPrager),
         partial(plastic, law=mpm.MohrCoulomb),
+    ),
+    "softening beside Drucker-Prager": (
+        partial(plastic, law=mpm.DruckerPrager),
+        partial(plastic, law=mpm.SofteningDruckerPrager, residual=1e8, slip=1e3, viscosity=1.0),
     ),
     "Modified Cam Clay beside Drucker-Prager": (partial(plastic, law=mpm.DruckerPrager), clayey),
     "finite strain": (lambda n: block(n, soil(mpm.LinearElastic)), block),

@@ -2,11 +2,11 @@
 """Implicit, iteratively coupled material point / finite volume poromechanics on FEniCSx.
 
 A scene is a `Simulation` of a `Grid`, bodies (`box`, `shape`, `mapped`, `from_mesh`, `polygon`), materials (`Hencky`,
-`NeoHookean`, `LinearElastic`, `DruckerPrager`, `MohrCoulomb`, `ModifiedCamClay`, or your own `Skeleton`), a `Fluid` and
-conditions on the sides of the bodies (`Traction`, `Pressure`, `Displacement`, `RigidPlate`, `Drained`, `Inflow`,
-`water`).  Its `run` gives a `Result` with what `probes` record, and feeds a `Writer` and a `Checkpoint`, from which
-`resume` goes on; `stage` changes the scene between two runs.  Terms and sources in UFL: see
-`mpm_dolfinx.constitutive.user_functions`.
+`NeoHookean`, `LinearElastic`, `DruckerPrager`, `SofteningDruckerPrager`, `MohrCoulomb`, `ModifiedCamClay`, or your own
+`Skeleton`), a `Fluid` and conditions on the sides of the bodies (`Traction`, `Pressure`, `Displacement`, `RigidPlate`,
+`Drained`, `Inflow`, `water`).  Its `run` gives a `Result` with what `probes` record, and feeds a `Writer` and a
+`Checkpoint`, from which `resume` goes on; `stage` changes the scene between two runs, and `factor_of_safety` weakens
+it until it slides.  Terms and sources in UFL: see `mpm_dolfinx.constitutive.user_functions`.
 
 SI units throughout.  Stress is positive in tension, pore pressure in compression; 2D is plane strain, and forces
 are those of a slice of 1 m.
@@ -27,6 +27,7 @@ from mpm_dolfinx.constitutive.skeleton import (
     Skeleton,
     kozeny_carman,
 )
+from mpm_dolfinx.constitutive.softening import SofteningDruckerPrager
 from mpm_dolfinx.errors import GaveUp, LeftGrid, NotConverged
 from mpm_dolfinx.io.checkpoint import Checkpoint, resume
 from mpm_dolfinx.io.writer import Writer
@@ -41,6 +42,7 @@ from mpm_dolfinx.result import Result
 from mpm_dolfinx.simulation import Simulation
 from mpm_dolfinx.solve.scheme import COUPLINGS
 from mpm_dolfinx.state import State
+from mpm_dolfinx.strength_reduction import Safety, factor_of_safety
 
 __version__ = "0.1.0"
 __all__ = [
@@ -66,13 +68,16 @@ __all__ = [
     "Pressure",
     "Result",
     "RigidPlate",
+    "Safety",
     "Simulation",
     "Skeleton",
+    "SofteningDruckerPrager",
     "State",
     "Traction",
     "Writer",
     "box",
     "element_test",
+    "factor_of_safety",
     "from_mesh",
     "kozeny_carman",
     "mapped",

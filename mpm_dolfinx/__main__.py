@@ -54,7 +54,8 @@ def run_element_test(o: argparse.Namespace) -> None:
         raise ValueError(f"law = {o.law!r}, must be the name of a law, such as ModifiedCamClay")
     constants = dict(text.split("=", 1) for text in o.constants)
     soil = law(**{name: number(value) for name, value in constants.items()})
-    r = mpm_dolfinx.element_test(soil, o.test, number(o.strain), steps=o.steps, confinement=o.confinement)
+    options = {name: getattr(o, name) for name in ("steps", "confinement", "rate", "cell_size")}
+    r = mpm_dolfinx.element_test(soil, o.test, number(o.strain), **options)
     print(f"{'strain':>10} {'p (Pa)':>12} {'q (Pa)':>12} {'pore p. (Pa)':>12} {'volume strain':>13}")
     for k in np.unique(np.linspace(0, len(r.strain) - 1, 21, dtype=int)):
         print(f"{r.strain[k]:10.5f} {r.p[k]:12.5g} {r.q[k]:12.5g} {r.pressure[k]:12.5g} {r.volume_strain[k]:13.5g}")
@@ -74,6 +75,8 @@ def main(argv: list[str] | None = None) -> None:
     lab.add_argument("constants", nargs="*", metavar="name=value", help="of the law; vectors with commas")
     lab.add_argument("--steps", type=int, default=100, help="to each turning point (100)")
     lab.add_argument("--confinement", type=float, default=0.0, help="isotropic effective stress before, Pa (0)")
+    lab.add_argument("--rate", type=float, help="strain in a second, of laws that depend on it, 1/s")
+    lab.add_argument("--cell-size", type=float, help="size of cells, of laws that soften, m")
     lab.add_argument("--draw", help="file of a picture")
     o = parser.parse_args(argv)
     if MPI.COMM_WORLD.rank > 0:

@@ -88,7 +88,7 @@ class Motion:
                 points = replace(state.points, x=x, F=F, corners=parallelepipeds(x, F, self._sizes(state.points)))
                 serves, folded = cut.serves(points), 0
             self._check_volumes(points, cut)
-            points = replace(points, data=self._materials.updated_state(points, state.points))
+            points = replace(points, data=self._materials.updated_state(points, state.points, t - state.t))
             ids, pressure, x, start = None, None, None, None
             if self._storage is not None:
                 pressure = cut.to_pieces(self._storage.p.x.array[pieces.cells])

@@ -89,6 +89,8 @@ class Scene:
             pieces, u, laws = self.pieces.pieces, self.momentum.u, scene.conductivity_laws
             law = ConductivityAtPieces(scene.materials, laws, pieces, u) if laws else None
             self.storage = StorageForms(pieces, u, p, weight, symmetric, scene.conducts, law, sources, self.t)
+        self.extensions = terms, sources
+        """The user's terms and sources."""
         self.method, self.substeps = method, substeps(method, self.flows or self.momentum.rates)
         """Of time integration, and its substeps in a step."""
         self.motion = Motion(scene, bodies, self.momentum, self.storage)

@@ -216,7 +216,8 @@ def step_rule(times: Times, rtol, first_step, max_step: float, scene: Scene, poi
     numbers("rtol", rtol, test=lambda v: (least <= v) & (v < 1), allowed=f"in [{least:g}, 1): the solver's tolerance")
     if scene.method == "backward-euler":
         raise ValueError(f"rtol = {line(rtol)}: backward-euler knows no error of a step, must be sdirk2")
-    if scene.momentum.rates and not scene.flows:
+    timed = any("dt" in law.by_scene for law in scene.materials.laws)
+    if (scene.momentum.rates or timed) and not scene.flows:
         raise ValueError(f"rtol = {line(rtol)}: where nothing flows no error of a velocity is known, must be dt")
     longest = float(numbers("max_step", max_step, **positive)) if max_step != inf else inf
     first = times.after(times.start)[0] - times.start

@@ -7,6 +7,7 @@ import numpy as np
 import ufl
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx.constitutive.evaluate import by_scene
 from mpm_dolfinx.constitutive.local_unknowns import LocalUnknowns
 from mpm_dolfinx.forms.point_forms import FormPoints, PointExpression
 
@@ -21,7 +22,7 @@ class LawAtPoints:
         taken |= {name: np.shape(value) for name, value in self.law.state.items()}
         self.points = FormPoints(self.grid, F=(dim, dim), **taken)
         self.F = ufl.variable(self.points.F)
-        values = {name: getattr(self.points, name) for name in taken}
+        values = {name: getattr(self.points, name) for name in taken} | by_scene(self.grid)
         self.local = LocalUnknowns(self.law, self.points, self.F, values) if self.law.unknowns else None
         self.values = values | (self.local.values if self.local is not None else {})
         self.P = self.law.first_piola(self.F, self.values)

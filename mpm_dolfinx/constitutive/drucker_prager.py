@@ -96,37 +96,44 @@ class DruckerPrager(Frictional):
     def kirchhoff(F, bulk, shear, eta, xi, eta_flow, cohesion, hardening, plastic, hardened):
         """Return the Kirchhoff stress (3, 3), Pa, as UFL."""
         trial = Trial(F, plastic)
-        to = _return(trial, bulk, shear, eta, xi, eta_flow, cohesion, hardening, hardened)
-        return to["p"] * ufl.Identity(3) + 2 * shear * to["ratio"] * trial.deviatoric
+        to = returned(trial, bulk, shear, eta, xi, eta_flow, cohesion, hardening, hardened)
+        return stress(trial, to, shear)
 
     @staticmethod
     def update(F, bulk, shear, eta, xi, eta_flow, cohesion, hardening, plastic, hardened):
         """Return the state at the end of the step, name -> UFL."""
         trial = Trial(F, plastic)
-        to = _return(trial, bulk, shear, eta, xi, eta_flow, cohesion, hardening, hardened)
-        # b = exp(2 eps), the elastic strain now eps = p/(3K) I + ratio dev(trial eps)
-        mean, ratio = 2 * to["p"] / (3 * bulk), to["ratio"]
-        b = trial.isotropic(lambda e: ufl.exp(mean + ratio * (ufl.ln(e) - 2 * trial.volumetric / 3)))
-        back = ufl.inv(trial.F)
-        return {
-            "plastic": ufl.conditional(to["yields"], back * b * back.T, plastic),
-            "hardened": hardened + to["hardened"],
-        }
+        to = returned(trial, bulk, shear, eta, xi, eta_flow, cohesion, hardening, hardened)
+        return {"plastic": metric(trial, to, bulk, plastic), "hardened": hardened + to["hardened"]}
 
 
-def _return(trial: Trial, bulk, shear, eta, xi, eta_flow, cohesion, hardening, hardened) -> dict:
-    """Return the stress of a trial elastic strain to the yield surface.
+def stress(trial: Trial, to: dict, shear):
+    """Return the Kirchhoff stress (3, 3), Pa, of what `returned` gives."""
+    return to["p"] * ufl.Identity(3) + 2 * shear * to["ratio"] * trial.deviatoric
+
+
+def metric(trial: Trial, to: dict, bulk, plastic):
+    """Return C_p^-1 (3, 3) at the end of the step of what `returned` gives."""
+    # b = exp(2 eps), the elastic strain now eps = p/(3K) I + ratio dev(trial eps)
+    mean, ratio = 2 * to["p"] / (3 * bulk), to["ratio"]
+    b = trial.isotropic(lambda e: ufl.exp(mean + ratio * (ufl.ln(e) - 2 * trial.volumetric / 3)))
+    back = ufl.inv(trial.F)
+    return ufl.conditional(to["yields"], back * b * back.T, plastic)
+
+
+def returned(trial: Trial, bulk, shear, eta, xi, eta_flow, cohesion, hardening, hardened, drag=0.0) -> dict:
+    """Return the stress of a trial elastic strain to the yield surface; drag: viscosity over time, Pa.
 
     Returns
     -------
     p, ratio: pressure and ratio of the deviator to its trial value; yields: whether the trial stress is outside;
-    hardened: growth of the hardening variable.
+    apex: 1 where it returns to the apex, else 0; hardened: growth of the hardening variable.
     """
     p = bulk * trial.volumetric
     q = shear * ufl.sqrt(2 * ufl.inner(trial.deviatoric, trial.deviatoric) + TINY)  # sqrt(J_2)
     strength = xi * (cohesion + hardening * hardened)
     f = q + eta * p - strength
-    cone = f / (shear + bulk * eta * eta_flow + xi**2 * hardening)
+    cone = f / (shear + bulk * eta * eta_flow + xi**2 * hardening + drag)
     to_cone = ufl.le(shear * cone, q)
     slope = xi / (eta + 1e-12)  # no friction has no apex, but every branch must be finite
     apex = (p - strength / (eta + 1e-12)) / (bulk + slope**2 * hardening)
@@ -140,4 +147,5 @@ def _return(trial: Trial, bulk, shear, eta, xi, eta_flow, cohesion, hardening, h
         "ratio": 1 - choose(0.0, shear * cone / q, 1.0),
         "hardened": choose(0.0, xi * cone, slope * apex),
         "yields": yields,
+        "apex": choose(0.0, 0.0, 1.0),
     }

@@ -21,6 +21,7 @@ from mpm_dolfinx.validation import instance, numbers, whole
 
 KINDS = ("isotropic", "oedometer", "triaxial drained", "triaxial undrained", "shear drained", "shear undrained")
 AXIAL, LATERAL, SHEAR = (2, 2), ((0, 0), (1, 1)), (0, 1)
+LONG = 1e30  # s: in which nothing is left of a viscosity
 ITERATIONS, CUTS, NEAR, NUDGE = 30, 12, 1e-11, 1e-6  # of Newton's method; relative accuracy; difference of stretches
 
 
@@ -81,7 +82,14 @@ class ElementTest:
 
 
 def element_test(
-    material: Skeleton, test: str, strain: float | Sequence[float], *, steps: int = 100, confinement: float = 0.0
+    material: Skeleton,
+    test: str,
+    strain: float | Sequence[float],
+    *,
+    steps: int = 100,
+    confinement: float = 0.0,
+    rate: float | None = None,
+    cell_size: float | None = None,
 ) -> ElementTest:
     """Drive a law through a laboratory test.
 
@@ -99,7 +107,12 @@ def element_test(
     steps
         Equal steps to each turning point.
     confinement
-        Isotropic effective stress, Pa, >= 0, to which the soil is brought before, drained; 0: what its law begins with.
+        Isotropic effective stress, Pa, >= 0, to which the soil is brought before, drained and slowly; 0: what its law
+        begins with.
+    rate
+        Strain in a second, 1/s, > 0, of laws that depend on the time step.
+    cell_size
+        Size of the cells, m, > 0, of laws that depend on it.
 
     Raises
     ------
@@ -113,7 +126,14 @@ def element_test(
         raise ValueError(f"test = {test!r}, must be one of {', '.join(KINDS)}")
     ends = numbers("strain", strain, None, allowed="a finite number, or several").ravel()
     confinement = float(numbers("confinement", confinement, allowed=">= 0 Pa and finite", test=_not_negative))
-    steps, point = whole("steps", steps), _Point(material)
+    for name, value in (("rate", rate), ("cell_size", cell_size)):
+        if value is not None:
+            numbers(name, value, allowed="> 0 and finite", test=lambda v: (0 < v) & (v < np.inf))
+        elif {"rate": "dt", "cell_size": "cell_size"}[name] in material.by_scene:
+            raise ValueError(f"{name} is not given, must be > 0: {type(material).__name__} depends on it")
+    if cell_size is not None:
+        material.check_cells(cell_size)
+    steps, point = whole("steps", steps), _Point(material, rate, cell_size)
     start = point.compressed(confinement) if confinement else point.at_rest()
     path = np.concatenate([np.linspace(a, b, steps + 1)[1:] for a, b in zip([0.0, *ends], ends, strict=False)])
     out = [start]
@@ -143,15 +163,15 @@ class _At:
 class _Point:
     """A law at a single point."""
 
-    def __init__(self, material: Skeleton):
-        law = type(material)
+    def __init__(self, material: Skeleton, rate: float | None, cell_size: float | None):
+        self._rate, law = rate or 1.0, type(material)
         for field in fields(material):
             if callable(getattr(material, field.name)) and field.name != "conductivity_law":
                 raise ValueError(f"{law.__name__}: {field.name} is a function, must be a number in an element test")
         self._parameters = {name: np.asarray(getattr(material, name), dtype=float) for name in law.parameters}
         self._rest = {name: np.asarray(value, dtype=float) for name, value in law.state.items()}
         shapes = {name: value.shape for name, value in (self._parameters | self._rest).items()}
-        self._law = LawAtPoints(Grid([1.0] * 3, [2] * 3, comm=MPI.COMM_SELF), law, shapes)
+        self._law = LawAtPoints(Grid([1.0] * 3, [2] * 3, comm=MPI.COMM_SELF), law, shapes, cell_size)
         self._bulk = float(material.bulk)
 
     def _data(self, F: NDArray[np.float64], state: dict[str, NDArray[np.float64]]):
@@ -161,12 +181,14 @@ class _Point:
         cells = np.arange(m, dtype=np.int32) % 8
         return self._law.points.at(cells, grid.midpoints[cells], np.ones(m), F=F, **taken)
 
-    def _stress(self, F: NDArray[np.float64], state: dict[str, NDArray[np.float64]]) -> NDArray[np.float64]:
-        return self._law.stress(self._data(F, state))
+    def _stress(
+        self, F: NDArray[np.float64], state: dict[str, NDArray[np.float64]], dt: float = 0.0
+    ) -> NDArray[np.float64]:
+        return self._law.stress(self._data(F, state), dt)
 
-    def _updated(self, F: NDArray[np.float64], strain: float, before: _At) -> _At:
-        new = {name: values[0] for name, values in self._law.new_state(self._data(F[None], before.state))}
-        return _At(F, self._stress(F[None], before.state)[0], strain, before.state | new)
+    def _updated(self, F: NDArray[np.float64], strain: float, before: _At, dt: float) -> _At:
+        new = {name: values[0] for name, values in self._law.new_state(self._data(F[None], before.state), dt)}
+        return _At(F, self._stress(F[None], before.state, dt)[0], strain, before.state | new)
 
     def at_rest(self) -> _At:
         """Return the soil as its law begins."""
@@ -178,7 +200,7 @@ class _Point:
         first = -np.trace(at.stress) / 3
         for share in np.linspace(0, 1, 21)[1:]:
             goal = -(first + share * (confinement - first)) * np.ones(3)
-            at = self._balanced(at, at.F, [(0, 0), (1, 1), (2, 2)], goal, 0.0)
+            at = self._balanced(at, at.F, [(0, 0), (1, 1), (2, 2)], goal, 0.0, LONG)
         return at
 
     def moved(self, at: _At, test: str, start: _At, strain: float) -> _At:
@@ -197,10 +219,11 @@ class _Point:
 
     def _step(self, at: _At, test: str, start: _At, strain: float) -> _At:
         kind, _, drainage = test.partition(" ")
-        F = at.F.copy()
+        F, dt = at.F.copy(), abs(strain - at.strain) / self._rate
         if kind == "shear":
             F[SHEAR] = start.F[1, 1] * strain
-            return self._balanced(at, F, [(1, 1)] if drainage == "drained" else [], start.stress[[1], [1]], strain)
+            free = [(1, 1)] if drainage == "drained" else []
+            return self._balanced(at, F, free, start.stress[[1], [1]], strain, dt)
         stretch = np.exp(-strain)
         F[AXIAL] = start.F[AXIAL] * stretch
         if kind == "isotropic":
@@ -209,24 +232,26 @@ class _Point:
             for axis in LATERAL:
                 F[axis] = start.F[axis] / np.sqrt(stretch)
         free = list(LATERAL) if drainage == "drained" else []
-        return self._balanced(at, F, free, start.stress[[0, 1], [0, 1]], strain)
+        return self._balanced(at, F, free, start.stress[[0, 1], [0, 1]], strain, dt)
 
-    def _balanced(self, at: _At, F: NDArray[np.float64], free: Sequence, goal: ArrayLike, strain: float) -> _At:
-        """Return the soil where the free components of F give Cauchy stresses their goal, Pa: Newton's method."""
+    def _balanced(
+        self, at: _At, F: NDArray[np.float64], free: Sequence, goal: ArrayLike, strain: float, dt: float
+    ) -> _At:
+        """Return the soil after dt, s, where the free components of F give Cauchy stresses their goal, Pa."""
         if not free:
-            return self._updated(F, strain, at)
+            return self._updated(F, strain, at, dt)
         F, rows, columns = F.copy(), *np.array(free).T
         nudges = np.zeros((1 + 2 * len(free), 3, 3))
         for k, (i, j) in enumerate(free):
             nudges[1 + 2 * k, i, j], nudges[2 + 2 * k, i, j] = NUDGE, -NUDGE
         near = NEAR * np.abs(goal).max() + 1e-14 * self._bulk  # the second is round-off
         for _ in range(ITERATIONS):
-            found = self._stress(F + nudges, at.state)[:, rows, columns]
+            found = self._stress(F + nudges, at.state, dt)[:, rows, columns]
             error = found[0] - goal
             if not np.isfinite(found).all():
                 break
             if np.abs(error).max() <= near:
-                return self._updated(F, strain, at)
+                return self._updated(F, strain, at, dt)
             slope = (found[1::2] - found[2::2]).T / (2 * NUDGE)
             step = np.linalg.lstsq(slope, error, rcond=1e-14)[0]
             F[rows, columns] -= step * min(1.0, 0.2 / np.abs(step).max(initial=1e-300))

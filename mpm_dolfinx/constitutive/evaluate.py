@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
 
 from mpm_dolfinx.constitutive.local_unknowns import LocalUnknowns
-from mpm_dolfinx.constitutive.skeleton import Skeleton
+from mpm_dolfinx.constitutive.skeleton import BY_SCENE, Skeleton
 from mpm_dolfinx.constitutive.user_functions import call, expression
 from mpm_dolfinx.errors import NotConverged
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointExpression
@@ -34,10 +34,14 @@ class LawAtPoints:
         Class of the law.
     shapes
         Shape of each of its parameters and of its variables of state.
+    cell_size
+        That laws are given, m; by default that of the grid.
     """
 
-    def __init__(self, grid: Grid, law: type[Skeleton], shapes: dict[str, tuple[int, ...]]):
-        self.grid, self.law, self._shapes = grid, law, shapes
+    def __init__(
+        self, grid: Grid, law: type[Skeleton], shapes: dict[str, tuple[int, ...]], cell_size: float | None = None
+    ):
+        self.grid, self.law, self._shapes, self._by_scene = grid, law, shapes, by_scene(grid, cell_size)
 
     @cached_property
     def points(self) -> FormPoints:
@@ -50,15 +54,20 @@ class LawAtPoints:
 
     @cached_property
     def _local(self) -> LocalUnknowns | None:
-        given = {name: getattr(self.points, name) for name in self._shapes}
-        return LocalUnknowns(self.law, self.points, self._F, given) if self.law.unknowns else None
+        return LocalUnknowns(self.law, self.points, self._F, self._given) if self.law.unknowns else None
+
+    @property
+    def _given(self) -> dict:
+        return {**{name: getattr(self.points, name) for name in self._shapes}, **self._by_scene}
 
     @cached_property
     def _values(self) -> dict:
         own = self._local.values if self._local is not None else {}
-        return {**{name: getattr(self.points, name) for name in self._shapes}, **own}
+        return {**self._given, **own}
 
-    def _solve(self, data: PointData) -> None:
+    def _solve(self, data: PointData, dt: float) -> None:
+        """Set the time since the start of the step, s, and solve for local unknowns."""
+        self._by_scene["dt"].value = dt
         if self._local is not None:
             self._local.update(data)
 
@@ -76,10 +85,10 @@ class LawAtPoints:
         F = self._F
         return PointExpression(self.law.first_piola(F, self._values) * F.T / ufl.det(F), self.points)
 
-    def stress(self, data: PointData) -> NDArray[np.float64]:
-        """Return the effective Cauchy stress (n, d, d), Pa."""
+    def stress(self, data: PointData, dt: float = 0.0) -> NDArray[np.float64]:
+        """Return the effective Cauchy stress (n, d, d), Pa, so long after the state, s."""
         stress = self._stress
-        self._solve(data)
+        self._solve(data, dt)
         return stress.evaluate(data)
 
     @cached_property
@@ -108,18 +117,29 @@ class LawAtPoints:
         parts = [f[i] if i else f for f in new.values() for i in np.ndindex(f.ufl_shape)]
         return PointExpression(ufl.as_vector(parts), self.points), {name: f.ufl_shape for name, f in new.items()}
 
-    def new_state(self, data: PointData) -> list[tuple[str, NDArray[np.float64]]]:
-        """Return the names and values (n, ...) of the state that follows from the F of the end of a step."""
+    def new_state(self, data: PointData, dt: float) -> list[tuple[str, NDArray[np.float64]]]:
+        """Return the names and values (n, ...) of the state that follows from the F of the end of a step of dt, s."""
         if self.law.update is None:
             return []
         expression, shapes = self._update
-        self._solve(data)
+        self._solve(data, dt)
         values, out, start = expression.evaluate(data), [], 0
         for name, shape in shapes.items():
             stop = start + int(np.prod(shape, dtype=int))
             out.append((name, values[:, start:stop].reshape(-1, *shape)))
             start = stop
         return out
+
+
+def by_scene(grid: Grid, cell_size: float | None = None) -> dict[str, fem.Constant]:
+    """Return what the scene gives to laws, see `BY_SCENE`, as UFL constants; the time is to be set."""
+    size = mean_size(grid) if cell_size is None else cell_size
+    return dict(zip(BY_SCENE, (fem.Constant(grid.mesh, 0.0), fem.Constant(grid.mesh, float(size))), strict=True))
+
+
+def mean_size(grid: Grid) -> float:
+    """Return the mean length of a cell, m: that of a square or cube of its size."""
+    return float(np.prod(grid.h) ** (1 / grid.dim))
 
 
 MOST = 100.0
@@ -148,7 +168,8 @@ class SoftnessAtPoints:
         self._points = points = FormPoints(grid, F=(d, d), dF=(d, d), **shapes)
         s = ufl.variable(fem.Constant(grid.mesh, 1.0))
         F = ufl.variable(points.F - (1 - s) * points.dF)
-        values = {name: getattr(points, name) for name in shapes}
+        self._by_scene = by_scene(grid)
+        values = {**{name: getattr(points, name) for name in shapes}, **self._by_scene}
         self._local = LocalUnknowns(law, points, F, values) if law.unknowns else None
         if self._local is not None:
             values |= self._local.values
@@ -158,11 +179,14 @@ class SoftnessAtPoints:
         size = ufl.sqrt(ufl.inner(e, e) + LEAST**2)
         self._along = PointExpression(ufl.as_vector([size, ufl.inner(ufl.diff(tau, s), e) / size]), points)
 
-    def __call__(self, at: PointData, dF: NDArray[np.float64], shear: NDArray[np.float64]) -> NDArray[np.float64]:
+    def __call__(
+        self, at: PointData, dF: NDArray[np.float64], shear: NDArray[np.float64], dt: float
+    ) -> NDArray[np.float64]:
         """Return the softness (n,) of points with F and what the law takes, in [1, MOST].
 
-        dF (n, d, d): change of F in the step; shear (n,): elastic shear modulus, Pa.
+        dF (n, d, d): change of F in the step; shear (n,): elastic shear modulus, Pa; dt: length of the step, s.
         """
+        self._by_scene["dt"].value = dt
         fields = {name: at[name] for name in ("F", *self._shapes)}
         data = PointData(self._points, at.places, at.volume, {"dF": dF, **fields})
         if self._local is not None:

@@ -12,8 +12,8 @@ from inspect import signature
 import numpy as np
 from numpy.typing import NDArray
 
-from mpm_dolfinx.constitutive.evaluate import LawAtPoints, SoftnessAtPoints, sampled
-from mpm_dolfinx.constitutive.skeleton import Fluid, Skeleton
+from mpm_dolfinx.constitutive.evaluate import LawAtPoints, SoftnessAtPoints, mean_size, sampled
+from mpm_dolfinx.constitutive.skeleton import BY_SCENE, Fluid, Skeleton
 from mpm_dolfinx.errors import NotConverged
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData
 from mpm_dolfinx.parallel.exchange import first
@@ -127,6 +127,9 @@ class SceneMaterials:
         if given != bool(law.unknowns):
             has = f"{'' if law.unknowns else 'no '}unknowns and {given} of residual and solution"
             raise ValueError(f"{law.__name__}: has {has}, must have unknowns and one of these, or neither")
+        if taken := [name for name in (*_names(m), *law.state) if name in BY_SCENE]:
+            raise ValueError(f"{law.__name__}: the name {taken[0]!r} is taken; parameters and state must have another")
+        m.check_cells(mean_size(self._grid))
         for name in law.parameters:
             if not hasattr(m, name):
                 known = ", ".join([*_names(m), *law.state])
@@ -271,8 +274,10 @@ class SceneMaterials:
         pressure = self.table(points, lambda m: m.biot) * points.pressure
         return self.effective_stress(points) - pressure[:, None, None] * np.eye(self._grid.dim)
 
-    def updated_state(self, points: MaterialPoints, before: MaterialPoints) -> dict[str, NDArray[np.float64]]:
-        """Return what the points, given with the F of the end of a step, carry from then on; before: at its start.
+    def updated_state(
+        self, points: MaterialPoints, before: MaterialPoints, dt: float
+    ) -> dict[str, NDArray[np.float64]]:
+        """Return what the points, with the F of the end of a step of dt, s, carry from then on; before: at its start.
 
         Raises
         ------
@@ -282,7 +287,7 @@ class SceneMaterials:
         if all(law.update is None for law in self.laws) and not self._softness:
             return points.data
         placed = self._placed(points)
-        new = [(law.law, rows, name, v) for law, rows, at in placed for name, v in law.new_state(at)]
+        new = [(law.law, rows, name, v) for law, rows, at in placed for name, v in law.new_state(at, dt)]
         bad = [(law, name, rows[~_finite(values)]) for law, rows, name, values in new]
         shown = [f"{law.__name__}.update: {name!r} is not finite at {points.x[i[0]]}" for law, name, i in bad if len(i)]
         if message := first(self._grid.comm, "".join(shown[:1])):
@@ -295,7 +300,7 @@ class SceneMaterials:
             shear = self.table(points, lambda m: m.shear)
             for number, softness in self._softness.items():
                 _, rows, at = placed[number]
-                out["softness"][rows] = softness(at, dF[rows], shear[rows])
+                out["softness"][rows] = softness(at, dF[rows], shear[rows], dt)
         return out
 
     def _placed(self, points: MaterialPoints) -> list[tuple[LawAtPoints, NDArray[np.int64], PointData]]:

@@ -18,10 +18,11 @@ from typing import NamedTuple
 
 import numpy as np
 import ufl
+from dolfinx import fem
 from numpy.typing import NDArray
 
 from mpm_dolfinx.caching import Latest
-from mpm_dolfinx.constitutive.skeleton import Skeleton
+from mpm_dolfinx.constitutive.skeleton import BY_SCENE, Skeleton
 from mpm_dolfinx.constitutive.user_functions import call
 from mpm_dolfinx.errors import NotConverged
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointExpression
@@ -54,7 +55,7 @@ class LocalUnknowns:
     F
         Deformation gradient (d, d) that the law sees, as UFL.
     values
-        UFL values of the law's parameters and state.
+        UFL values of the law's parameters and state, and the constants that the scene gives to laws.
     """
 
     def __init__(self, law: type[Skeleton], points: FormPoints, F, values: Mapping[str, object]):
@@ -65,7 +66,8 @@ class LocalUnknowns:
         trial = {name: value for name, value in trial.items() if isinstance(value, ufl.core.expr.Expr)}
         z = _parts(trial.values())
         self._trial, self._solved = PointExpression(ufl.as_vector(z), points), Latest()
-        self._equations = _Equations(law, points, trial)
+        self._dt = values["dt"]
+        self._equations = _Equations(law, points, trial, {name: values[name] for name in BY_SCENE})
         m, k = self._equations.count, len(z)
         shapes = {"unknowns": (m,), "trial": (k,), "slopes": (m, k)}
         at = {
@@ -87,7 +89,7 @@ class LocalUnknowns:
             Naming the first point where the equations could not be solved.
         """
         trial = self._trial.evaluate(data)
-        self._solved((data.key, trial), lambda: self._equations.solve(data, trial), self._comm)
+        self._solved((data.key, trial, float(self._dt.value)), lambda: self._equations.solve(data, trial), self._comm)
 
     def _now(self, data: PointData, what: str) -> NDArray[np.float64]:
         solved = self._solved.value
@@ -99,8 +101,10 @@ class LocalUnknowns:
 class _Equations:
     """The equations f(y, z) = 0 of a law at points that carry what they take."""
 
-    def __init__(self, law: type[Skeleton], points: FormPoints, trial: Mapping[str, object]):
-        self._law, self._grid = law, points.grid
+    def __init__(
+        self, law: type[Skeleton], points: FormPoints, trial: Mapping[str, object], by_scene: Mapping[str, fem.Constant]
+    ):
+        self._law, self._grid, self._by_scene = law, points.grid, by_scene
         equations = law.residual or law.solution
         self._names = [name for name in (*law.parameters, *law.state) if name in law.taken_by(equations)]
         self._points = own = FormPoints(points.grid, **{name: getattr(points, name).ufl_shape for name in self._names})
@@ -113,7 +117,7 @@ class _Equations:
             return
         k = sum(_size(s) for s in self._trial.values())
         y, z = (ufl.variable(own.follow(name, (size,), _given)) for name, size in (("unknowns", m), ("trial", k)))
-        given = {name: getattr(own, name) for name in self._names} | _named(self._unknowns, y)
+        given = {name: getattr(own, name) for name in self._names} | _named(self._unknowns, y) | self._by_scene
         residual = call(law.residual, **self._with_trial(_named(self._trial, z)), **given)
         instance(f"{law.__name__}.residual: what it gives", residual, dict)
         found = {name: ufl.as_ufl(value) for name, value in residual.items()}
@@ -163,6 +167,7 @@ class _Equations:
             values[name] = trial[:, start : start + _size(shape)].reshape(n, *shape)
             start += _size(shape)
         given = {name: data[name].reshape(n, *getattr(self._points, name).ufl_shape) for name in self._names}
+        given |= {name: float(constant.value) for name, constant in self._by_scene.items()}
         found, refused = None, ""
         try:
             found = call(self._law.solution, **self._with_trial(values), **given)

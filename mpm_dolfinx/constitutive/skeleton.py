@@ -23,6 +23,9 @@ from mpm_dolfinx.validation import asked, functions, line, numbers
 Field = float | Sequence[float] | Callable[[NDArray[np.float64]], ArrayLike]
 """A constant (number or vector), or a function of the reference positions X (n, d), m, that gives (n, ...)."""
 
+BY_SCENE = ("dt", "cell_size")
+"""What the scene gives to laws: time since the start of the step, s, and mean length of a cell, m."""
+
 LOCKING = 0.43
 """Poisson's ratio above which the mean dilatation of a cell is used, at twice the cost of a step.
 
@@ -81,6 +84,10 @@ class Skeleton:
         (F, ...) -> {name: UFL}: all by which the residuals depend on F; without it they name F itself.  What is no UFL
         in it the residuals do not see; `kirchhoff` and `update` may name `trial` too, and see all of it.
 
+    All of these functions may name `dt`, the time since the start of the step, s: laws of rates, whose state at the end
+    of a step has to give its stress at dt = 0.  And `cell_size`, the mean length of a cell of the grid, m: by this what
+    softens is made independent of the grid.
+
     bulk and shear
     are also what the scheme takes its scales from (ghost penalty, fixed-stress coefficient, damping of pressures),
     for every law.
@@ -123,6 +130,8 @@ class Skeleton:
     linear: ClassVar[bool] = False
     """Whether the stress is linear in F: one factorisation then serves for as long as the active cells stay."""
     state: ClassVar[Mapping[str, ArrayLike]] = {}
+    by_scene: ClassVar[tuple[str, ...]] = ()
+    """Which of `BY_SCENE` the law's functions take."""
     parameters: ClassVar[tuple[str, ...]] = ()
     """Names of the fields and properties that the law's functions take."""
 
@@ -130,7 +139,8 @@ class Skeleton:
         super().__init_subclass__(**options)
         functions = (cls.energy, cls.kirchhoff, cls.update, cls.trial, cls.residual, cls.solution)
         names = dict.fromkeys(name for f in functions for name in cls.taken_by(f))
-        own = {"F", *cls.state, *cls.unknowns, *(["trial"] if cls.unknowns else [])}
+        cls.by_scene = tuple(name for name in BY_SCENE if name in names)
+        own = {"F", *BY_SCENE, *cls.state, *cls.unknowns, *(["trial"] if cls.unknowns else [])}
         cls.parameters = tuple(name for name in names if name not in own)
         if "energy" in vars(cls) and "linear" not in vars(cls):
             cls.linear = False  # not what the law had that this one is derived from
@@ -174,6 +184,9 @@ class Skeleton:
     def symmetric(self) -> bool:
         """Whether the tangent is symmetric; laws that give the stress are taken not to be."""
         return self.kirchhoff is None
+
+    def check_cells(self, cell_size: float) -> None:
+        """Refuse cells too large for a law that softens, with a ValueError; cell_size: m."""
 
     @classmethod
     def first_piola(cls, F, values: Mapping[str, object]):

@@ -13,7 +13,7 @@ itself.  The derivatives are UFL's.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from petsc4py import PETSc
 
@@ -24,6 +24,7 @@ from dolfinx.common import Timer
 from numpy.typing import NDArray
 
 from mpm_dolfinx import _compat
+from mpm_dolfinx.constitutive.evaluate import by_scene
 from mpm_dolfinx.constitutive.local_unknowns import LocalUnknowns
 from mpm_dolfinx.constitutive.skeleton import Skeleton
 from mpm_dolfinx.constitutive.user_functions import compiling, term_of
@@ -92,7 +93,7 @@ class MomentumForms:
         self._local: dict[int, LocalUnknowns] = {}  # by the number of their part
         self.terms: list[PointForm] = []
         for number, (law, points, locks) in enumerate(laws):
-            self._add_law(number, law, points, locks, pressure, symmetric)
+            self._add_law(number, law, points, locks, pressure, symmetric, by_scene(grid) | {"dt": dt})
         kept = [self._add_term(term, pieces, t, dt) for term in terms]
         self.symmetric = symmetric and all(potential or not holds for potential, holds, _ in kept)
         self.holding = any(holds for _, holds, _ in kept)
@@ -121,10 +122,11 @@ class MomentumForms:
         locks: bool,
         pressure: fem.Function | None,
         symmetric: bool,
+        given: Mapping[str, fem.Constant],
     ) -> None:
         """Compile residual and tangent of the pieces that follow a law."""
         F, v = points.deformation(self.u), ufl.TestFunction(self.u.function_space)
-        values = {name: getattr(points, name) for name in (*law.parameters, *law.state)}
+        values = {name: getattr(points, name) for name in (*law.parameters, *law.state)} | given
         seen = self.dilatation.seen(points, F) if locks else F
         if law.unknowns:
             self._local[number] = local = LocalUnknowns(law, points, seen, values)

@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: MIT
+"""Factor of safety of a slope, and its run-out when it loses more strength than that.
+
+A slope of 2:1, 10 m high, on 5 m of the same Mohr-Coulomb soil: phi = 20 degrees, c / (gamma H) = 0.05, no dilation.
+
+1. By what may c and tan(phi) be divided?  `mpm.factor_of_safety` weakens the slope at rest and looks whether its motion
+   dies away.  The best log-spiral mechanism gives 1.368, finite elements 1.4 (Griffiths and Lane 1999).
+2. The strength is divided by 1.6 at once, in soil with the viscosity eta: the slope slides until it has found another
+   shape, which it is just strong enough for: its factor of safety is then one, to a tenth.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import poroelastic_beam as beam
+import ufl
+
+import mpm_dolfinx as mpm
+
+HEIGHT, CREST, RUN, DEPTH, BEFORE = 10.0, 12.0, 20.0, 5.0, 14.0  # m
+WEIGHT, FRICTION, COHESION = 20e3, 20.0, 10e3  # N/m³, degrees, Pa
+YOUNG, POISSON = 1e8, 0.3  # Pa, -
+LOG_SPIRAL, PUBLISHED = 1.368, 1.4
+WEAKER = 1.6
+VISCOSITY = 0.1 * WEIGHT * HEIGHT  # Pa s
+
+
+def weight(points, v):
+    """Weight of the soil, downwards, N/m³ of the ground as it was."""
+    return WEIGHT / ufl.det(points.F) * points.value(v)[1] * points.dx
+
+
+def viscous(points, u, dt):
+    """Potential of the stress 2 eta D of the rate of strain D = sym grad u / dt."""
+    strain = ufl.sym(points.grad(u))
+    return VISCOSITY / dt * ufl.inner(strain, strain) * points.dx
+
+
+def slope(cells: int) -> mpm.Simulation:
+    """Return the slope at rest, with so many cells over its height; t is zero."""
+    h, middle = HEIGHT / cells, CREST + RUN / 2
+    columns, rows = round((CREST + RUN + BEFORE) / h), round(DEPTH / h)
+    length = columns * h
+    grid = mpm.Grid(lower=[0, -rows * h], upper=[length, HEIGHT + h], cells=[columns, rows + cells + 1])
+
+    def shape(X: np.ndarray) -> np.ndarray:
+        return np.stack([X[:, 0] / middle * (CREST + RUN * (1 - X[:, 1] / HEIGHT)), X[:, 1]], axis=1)
+
+    ground = mpm.box(grid, [0, -rows * h], [length, 0])
+    bank = mpm.mapped(grid, mpm.box(grid, [0, 0], [middle, HEIGHT]), shape)
+    soil = mpm.MohrCoulomb(
+        bulk=YOUNG / (3 - 6 * POISSON),
+        shear=YOUNG / (2 + 2 * POISSON),
+        friction=lambda X: np.full(len(X), FRICTION),
+        dilation=0.0,
+        cohesion=lambda X: np.full(len(X), COHESION),
+    )
+    walls = {"left": "x", "right": "x", "bottom": "xy"}
+    s = mpm.Simulation(grid, [ground, bank], [soil], fixed=walls, terms=[weight, viscous])
+    s.run(1e9, 1e9, progress=False)  # time in which nothing of the viscosity is left
+    s.stage(reset_displacement=True)
+    s.t = 0.0
+    return s
+
+
+def slide(s: mpm.Simulation, steps: int) -> mpm.Result:
+    """Divide the strength and let the slope run out: half of the steps of half a second each, then longer ones."""
+    friction = np.degrees(np.arctan(np.tan(np.radians(FRICTION)) / WEAKER))
+    s.stage(fields={"friction": friction, "cohesion": COHESION / WEAKER})
+    s.run(0.5 * steps, 0.5, progress=False)
+    return s.run(1e3 * steps, 250.0 * steps, progress=False)
+
+
+def main(argv: list[str] | None = None) -> dict:
+    """Run the demo; return what --json prints."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--cells", type=int, default=10, help="cells over the slope's height, even (10)")
+    parser.add_argument("--steps", type=int, default=40, help="steps of the slide (40)")
+    parser.add_argument("--rtol", type=float, default=0.01, help="accuracy of the factor of safety (0.01)")
+    parser.add_argument("--out", type=Path, default=Path("out/slope"), help="folder for the picture (out/slope)")
+    parser.add_argument("--json", action="store_true", help="print the results as one line of JSON at the end")
+    o = parser.parse_args(argv)
+    if o.cells < 2 or o.cells % 2 or o.steps < 1 or not 1e-3 <= o.rtol <= 0.1:
+        options = f"--cells {o.cells} --steps {o.steps} --rtol {o.rtol:g}"
+        parser.error(f"{options}: must be even and >= 2, >= 1, and in [1e-3, 0.1]")
+    out = {"converged": False}
+    try:
+        s = slope(o.cells)
+        before = s.points.corners.copy()
+        safety = mpm.factor_of_safety(s, rtol=o.rtol)
+        out["factor"] = safety.factor
+        print(f"factor of safety {safety.factor:.3f}; log-spiral {LOG_SPIRAL}, published {PUBLISHED}", flush=True)
+        slide(s, o.steps)
+        corners, moved = s.points.corners, np.linalg.norm((s.points.corners - before).mean(axis=1), axis=1)
+        out["moved"] = float(moved.max())
+        after = mpm.factor_of_safety(s, rtol=3 * o.rtol)
+        out |= {"factor_after": after.factor, "converged": abs(after.factor - 1) < 0.1}
+        print(f"strength over {WEAKER}: moves by {moved.max():.2f} m; its factor of safety is then {after.factor:.3f}")
+        draw(o.out, safety, before, corners, moved)
+        print(f"picture: {o.out}/slope.png")
+    except mpm.GaveUp as error:
+        print(f"error: {error}", file=sys.stderr)
+    if o.json:
+        print(json.dumps(out))
+    return out
+
+
+def draw(out: Path, safety: mpm.Safety, before: np.ndarray, corners: np.ndarray, moved: np.ndarray) -> None:
+    """Draw the motions of the trials, and the slope before and after its slide."""
+    from matplotlib.collections import PolyCollection
+
+    fig, ((trials, after),) = beam.figure(1, 2, (13, 4.2))
+    for factor, motion in sorted(safety.motions.items()):
+        style = {"color": "C2" if factor <= safety.bounds[0] else "C3", "marker": "o", "ms": 3, "lw": 1}
+        trials.semilogy(np.arange(1, len(motion) + 1), motion, **style)
+        trials.annotate(
+            f"{factor:.3f}", (len(motion), motion[-1]), fontsize=7, xytext=(3, 0), textcoords="offset points"
+        )
+    trials.set(
+        xlabel="step",
+        ylabel="motion in the step (m)",
+        title=f"Strength over 1 to 2: factor of safety {safety.factor:.3f}",
+    )
+    order = [0, 1, 3, 2]
+    quads = PolyCollection(corners[:, order], array=moved, cmap="viridis", edgecolors="face", linewidth=0.1)
+    after.add_collection(quads)
+    after.add_collection(PolyCollection(before[:, order], facecolor="none", edgecolor="grey", linewidth=0.1, alpha=0.5))
+    fig.colorbar(quads, ax=after, label="displacement (m)", shrink=0.7)
+    after.set(xlabel="x (m)", ylabel="y (m)", aspect="equal", title=f"Strength over {WEAKER}: at rest again")
+    after.autoscale_view()
+    out.mkdir(parents=True, exist_ok=True)
+    fig.savefig(out / "slope.png", dpi=90)
+
+
+if __name__ == "__main__":
+    sys.exit(0 if main()["converged"] else 1)
