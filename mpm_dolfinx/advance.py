@@ -16,7 +16,7 @@ from mpm_dolfinx.errors import LeftGrid, NotConverged
 from mpm_dolfinx.parallel.exchange import first, over_all
 from mpm_dolfinx.points.bodies import Body
 from mpm_dolfinx.points.cut_domains import CutDomains
-from mpm_dolfinx.points.cutting import parallelepipeds, tangled
+from mpm_dolfinx.points.cutting import parallelepipeds, tangled, volumes
 from mpm_dolfinx.points.domain_gradient import gradient
 from mpm_dolfinx.points.grid import REACH, Grid
 from mpm_dolfinx.points.lattice import crossed, filtered, given
@@ -102,9 +102,12 @@ class Motion:
     def _deformed(self, points: MaterialPoints, on_grid: OnGrid, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return F (n, d, d) of the points after a step, F_p <- (sum_k w_k Delta_k / V_p) F_p over their pieces."""
         cut, pieces = on_grid.cut, on_grid.data.pieces
-        grid, n, d = cut.grid, len(points), cut.grid.dim
+        grid, n, d = cut.grid, len(points), cut.grid.stretches
         at_nodes = nodal[grid.cell_nodes[pieces.cells]].transpose(0, 2, 1)
-        delta = np.eye(d) + at_nodes @ grid.shape_gradients(pieces.cells, pieces.x)
+        delta = np.eye(grid.dim) + at_nodes @ grid.shape_gradients(pieces.cells, pieces.x)
+        if grid.axisymmetric:
+            delta = np.pad(delta, ((0, 0), (0, 1), (0, 1)))
+            delta[:, 2, 2] = pieces.places.stretch(nodal)
         if self._momentum.dilatation is not None:
             delta = self._momentum.dilatation.averaged(delta, on_grid.data)
         mean = [cut.mean(column) for column in cut.to_pieces(delta).reshape(-1, d * d).T]
@@ -127,25 +130,25 @@ class Motion:
         -------
         The points; whether they are still where they were cut; how many domains had folded.
         """
-        grid, stage, d, folded = cut.grid, state.stage, cut.grid.dim, 0
+        grid, stage, folded = cut.grid, state.stage, 0
         free = ~given(grid, stage.lattices, stage.conditions["fixed"], state.points)
         corners = state.points.corners + moved + free * bend
         points = replace(state.points, corners=corners)
         serves, evolved = cut.serves(points), self._materials.evolved(points)
         if not serves:
             corners = corners + free * filtered(grid, stage.lattices, points, cut.points, ~evolved)
-            bad = tangled(corners, points.volume0 * points.J)
+            bad = tangled(corners, points.volume0 * points.J, grid.axisymmetric)
             folded = over_all(grid.comm, int(bad.sum()))
             if folded:
                 corners = untangled(points, corners, bad, deformed(), grid, stage.mechanical)
-        F = gradient(corners, points.reference)
+        F = gradient(corners, points.reference, grid.axisymmetric)
         if self._momentum.dilatation is not None:
             J, told, locks = determinant(deformed()), determinant(F), self._materials.locking(points)
             if not serves:
                 pull = PULL * (over_all(grid.comm, int(evolved.sum())) == 0)  # beside what flows volumes tell nothing
                 J = remembered(cut, J, told, locks, crossed(grid, points, cut.points, ~evolved).mean(axis=1), pull)
             ratio = np.where(locks, J / told, 1.0)
-            F = F * (np.sign(ratio) * np.abs(ratio) ** (1 / d))[:, None, None]
+            F = F * (np.sign(ratio) * np.abs(ratio) ** (1 / grid.stretches))[:, None, None]
         if self._materials.evolves:
             F = np.where(evolved[:, None, None], deformed(), F)
         return replace(points, corners=corners, x=corners.mean(axis=1), F=F), serves, folded
@@ -201,10 +204,11 @@ def untangled(
     boundary: MechanicalBoundary,
 ) -> NDArray[np.float64]:
     """Return corners (n, 2^d, d), m, where domains that have folded, whose neighbours went elsewhere, are of F."""
-    at, X = np.flatnonzero(bad), points.reference[bad]
-    new = corners[at].mean(axis=1, keepdims=True)
-    new = new + np.einsum("nab,nkb->nka", F[at], X - X.mean(axis=1, keepdims=True))
-    new = boundary.under_held(points.id[at], corners[at], points.volume0[at] * determinant(F[at]), new)
+    at, X, d = np.flatnonzero(bad), points.reference[bad], grid.dim
+    volume0 = volumes(X) if grid.axisymmetric else points.volume0[at]
+    F, new = F[at, :d, :d], corners[at].mean(axis=1, keepdims=True)
+    new = new + np.einsum("nab,nkb->nka", F, X - X.mean(axis=1, keepdims=True))
+    new = boundary.under_held(points.id[at], corners[at], volume0 * determinant(F), new)
     out = corners.copy()
     out[at] = np.clip(new, grid.lower, grid.upper)
     return out

@@ -6,13 +6,16 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from mpm_dolfinx.points.cutting import ORIENTATION, kuhn_simplices
+from mpm_dolfinx.points.cutting import ORIENTATION, domain_volumes, kuhn_simplices, volumes
 from mpm_dolfinx.points.material_points import cofactor, determinant
 
 
-def gradient(corners: NDArray[np.float64], reference: NDArray[np.float64]) -> NDArray[np.float64]:
+def gradient(
+    corners: NDArray[np.float64], reference: NDArray[np.float64], axisymmetric: bool = False
+) -> NDArray[np.float64]:
     """Return the mean deformation gradient (n, d, d) of domains over the simplices that the cut knows.
 
+    In axisymmetry (n, 3, 3): hoops stretch as the radius of the centroid, so det F is the ratio of the rings' volumes.
     In 2D the diagonals tell all of it, and det F is the ratio of the areas.  In 3D F is scaled to that of the volumes,
     from which the determinant of the mean of a twisted hexahedron differs by second order.
 
@@ -23,7 +26,14 @@ def gradient(corners: NDArray[np.float64], reference: NDArray[np.float64]) -> ND
     """
     if corners.shape[2] == 2:
         dx, dX = (y[:, [3, 2]] - y[:, [0, 1]] for y in (corners, reference))
-        return np.einsum("nki,nkj->nij", dx, cofactor(dX)) / determinant(dX)[:, None, None]
+        F = np.einsum("nki,nkj->nij", dx, cofactor(dX)) / determinant(dX)[:, None, None]
+        if not axisymmetric:
+            return F
+        out = np.zeros((len(F), 3, 3))
+        out[:, :2, :2] = F
+        now, then = (domain_volumes(y, True) / volumes(y) for y in (corners, reference))
+        out[:, 2, 2] = now / then
+        return out
     F, now, then = 0.0, 0.0, 0.0
     for simplex, sign in zip(kuhn_simplices(3), ORIENTATION[3], strict=True):
         dx, dX = (np.diff(y[:, simplex], axis=1) for y in (corners, reference))  # edges as rows

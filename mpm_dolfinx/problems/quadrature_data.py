@@ -70,7 +70,7 @@ class QuadraturePoints:
         self.varies = bool(fluid and scene.conductivity_laws)
         self.layered = bool(fluid and scene.conducts and scene.layered)
         d = grid.dim
-        shapes: dict[str, tuple[int, ...]] = {"F": (d, d), **scene.shapes}
+        shapes: dict[str, tuple[int, ...]] = {"F": (grid.stretches, grid.stretches), **scene.shapes}
         if fluid:
             shapes |= {"biot": (), "storage": (), "storage_at_one": ()}
         if weighs:
@@ -86,7 +86,7 @@ class QuadraturePoints:
 
     def places(self, cut: CutDomains) -> PiecePlaces:
         """Return where the pieces of a cut lie."""
-        pieces, parts = Places(self._grid, cut.cells, cut.x), []
+        pieces, parts = Places(self._grid, cut.cells, cut.x, cut.hoop if self._grid.axisymmetric else None), []
         if len(self.laws) > 1:
             part = cut.to_cells(self._scene.part_of(cut.points))
             rows = [np.flatnonzero(part == number) for number in range(len(self.laws))]
@@ -165,5 +165,5 @@ class QuadraturePoints:
         """
         if as_printed:
             return np.full(len(cut.cells), 1 / self._fluid.bulk)
-        beta = self._scene.table(points, lambda m: m.biot**2 / m.drained_modulus(self._grid.dim)) * points.J
+        beta = self._scene.table(points, lambda m: m.biot**2 / m.drained_modulus(self._grid.stretches)) * points.J
         return cut.to_cells(beta)

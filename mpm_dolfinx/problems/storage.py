@@ -343,6 +343,12 @@ class StorageProblem:
         """Filled share of the cells, which is what their pressures count for."""
         return self._contents.fill
 
+    @property
+    def ring(self) -> float:
+        """Mean length of the rings that the cells' contents are in axisymmetry, m."""
+        whole, area = over_all(self.forms.grid.comm, np.array([self._contents.volume, self._contents.area.sum()]))
+        return float(whole / area)
+
     def settle_seepage(self) -> bool:
         """Open and close seepage faces as the flow at (u, p) asks for; return whether that has changed anything.
 
