@@ -4,7 +4,8 @@
 A saturated ball is loaded by an even normal traction p0 at once, and kept; its surface is drained.  The outer
 shell gives up its water, shrinks and presses on the core: the pressure at the centre rises by nearly a third above
 p0 before it falls (Cryer 1963), which no uncoupled theory of consolidation can show.  Fluid and grains are
-incompressible, nu = 0.25.  One octant is computed: a lattice of boxes, bent into the ball by a smooth map.
+incompressible, nu = 0.25.  One octant is computed: a lattice of boxes, bent into the ball by a smooth map; or, with
+--axisymmetric, a quarter of a disc.
 
 Errors, of the pressure at the centre against the exact one at reduced times T = c_v t / R²: `peak`, of its
 greatest value, and `curve`, the greatest over T from 0.02 on, over p0.
@@ -31,6 +32,7 @@ WATER = mpm.Fluid(bulk=np.inf)
 CV = CONDUCTIVITY / WATER.unit_weight * SAND.oedometric  # m²/s
 END = 0.12  # reduced time
 CUBE = 0.8 * RADIUS  # m; edge of the lattice: an octant has the volume of a cube of 0.81 R
+SQUARE = 0.85 * RADIUS  # m; edge of that of a quarter disc
 OUTER = ("right", "back", "top")  # sides of the lattice that become the surface of the ball
 
 
@@ -41,9 +43,21 @@ def ball(x: np.ndarray) -> np.ndarray:
     return RADIUS * a * np.sqrt(1 - b / 2 - c / 2 + b * c / 3)
 
 
-def scene(cells: int) -> mpm.Simulation:
-    """Return the octant with that many cells to the radius."""
+def disc(x: np.ndarray) -> np.ndarray:
+    """Return where a map from the square [-SQUARE, SQUARE]^2 onto the disc takes positions (n, 2), m."""
+    a = x / SQUARE
+    return RADIUS * a * np.sqrt(1 - a[:, ::-1] ** 2 / 2)
+
+
+def scene(cells: int, axisymmetric: bool = False) -> mpm.Simulation:
+    """Return the octant, or the quarter disc, with that many cells to the radius."""
     h = RADIUS / cells
+    if axisymmetric:
+        grid, sides = mpm.Grid([RADIUS + h] * 2, [cells + 1] * 2, axisymmetric=True), ("right", "top")
+        quarter = mpm.mapped(grid, mpm.box(grid, [0, 0], [SQUARE] * 2), disc)
+        pressed, drained = [mpm.Traction(s, -LOAD) for s in sides], [mpm.Drained(s) for s in sides]
+        acting = {"fixed": {"bottom": "y"}, "tractions": pressed, "drained": drained}
+        return mpm.Simulation(grid, [quarter], [SAND], fluid=WATER, **acting)
     grid = mpm.Grid([RADIUS + h] * 3, [cells + 1] * 3)
     octant = mpm.mapped(grid, mpm.box(grid, [0] * 3, [CUBE] * 3), ball)
     walls = {"left": "x", "front": "y", "bottom": "z"}
@@ -61,9 +75,9 @@ class Outcome:
     cells: int
 
 
-def run(cells: int = 20, steps: int = 100) -> tuple[dict[str, float], Outcome]:
+def run(cells: int = 20, steps: int = 100, axisymmetric: bool = False) -> tuple[dict[str, float], Outcome]:
     """Run to reduced time END in equal steps; return the errors that the module's docstring defines."""
-    simulation, history = scene(cells), []
+    simulation, history = scene(cells, axisymmetric), []
 
     def observe(s: mpm.Simulation) -> None:
         nearest = np.square(s.points.x).sum(axis=1)
@@ -99,6 +113,7 @@ def main(argv: list[str] | None = None) -> dict:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     parser.add_argument("--cells", type=int, default=20, help="cells to the radius")
     parser.add_argument("--steps", type=int, default=100, help=f"equal steps to the reduced time {END}")
+    parser.add_argument("--axisymmetric", action="store_true", help="a quarter of a disc instead of the octant")
     parser.add_argument("--out", type=Path, default=Path("out/cryer"), help="folder for the picture")
     parser.add_argument("--profile", action="store_true", help="print where the time went")
     parser.add_argument("--json", action="store_true", help="print the results as one line of JSON at the end")
@@ -106,7 +121,7 @@ def main(argv: list[str] | None = None) -> dict:
     if o.cells < 2 or o.steps < 1:
         parser.error(f"--cells {o.cells} --steps {o.steps}: must be >= 2 and >= 1")
     try:
-        found, outcome = run(o.cells, o.steps)
+        found, outcome = run(o.cells, o.steps, o.axisymmetric)
         result = outcome.result
         out = {"errors": found, "active_cells": outcome.cells, "wall_s": result.wall, "converged": True}
         report(outcome, found)

@@ -20,6 +20,8 @@ first order.
 
 In associated flow each place of a cell has to dilate with its own shear, but the cell has one mean dilatation: the
 load goes on rising a little, less on finer grids (de Borst and Groen 1995): +4.6, +4.6, +3.5, +2.4 %.
+
+A rough circular footing on Tresca's soil carries 6.05 s_u (Cox, Eason and Hopkins 1961), axisymmetric.
 """
 
 from __future__ import annotations
@@ -57,7 +59,9 @@ STIFF = 100  # times stiffer is the soil that meets the theory
 LIMITS_OF = {  # how: depth of the push over B, box
     "undrained": (0.0012, (2.0, 1.2)),
     "drained": (0.003, (4.0, 1.7)),
+    "circular": (0.0012, (2.0, 1.2)),
 }
+ROUND = 6.05  # limit load of a rough circular footing over its area and s_u
 
 
 def capacity(friction: float) -> float:
@@ -117,7 +121,7 @@ class Push:
 
 
 def push(
-    soil: mpm.DruckerPrager,
+    soil: mpm.DruckerPrager | mpm.MohrCoulomb,
     cells: int,
     depth: float,
     rate: float | None,
@@ -125,6 +129,7 @@ def push(
     box=BOX,
     rest=0.0,
     steps: int | None = None,
+    circular: bool = False,
 ) -> Push:
     """Push the footing.
 
@@ -142,10 +147,13 @@ def push(
         Time of consolidation after the push, over B²/c_v.
     steps
         Equal steps of the push; by default those of `STEP`.
+    circular
+        A disc of the diameter B, not a strip.
     """
     h = WIDTH / cells
     columns, rows, air = (round(size * cells) for size in (*box, 0.25 + 0.5 * depth))
-    grid = mpm.Grid(lower=[0, -rows * h], upper=[columns * h, air * h], cells=[columns, rows + air])
+    size, cells_of = {"lower": [0, -rows * h], "upper": [columns * h, air * h]}, [columns, rows + air]
+    grid = mpm.Grid(**size, cells=cells_of, axisymmetric=circular)
     body = mpm.box(grid, [0, -rows * h], [columns * h, 0])
     end, edge = (depth * WIDTH**2 / (CV * rate) if rate else 1.0), (WIDTH - h) / 2
     under, beside = ((0, -np.inf), (edge, np.inf)), ((edge, -np.inf), (np.inf, np.inf))
@@ -157,7 +165,8 @@ def push(
 
     def observe(s: mpm.Simulation) -> None:
         out.settlement.append(depth * min(1, s.t / end))
-        out.load.append(-2 * s.reactions[0, 1] / (WIDTH * COHESION))
+        area = np.pi / 4 * WIDTH**2 if circular else WIDTH / 2  # of half of the strip
+        out.load.append(-s.reactions[0, 1] / (area * COHESION))
         if len(out.load) % 5 == 0 or s.result.converged:
             p = s.points
             top = p.corners[body.sides[:, 1, 1]][:, 2:].reshape(-1, 2)
@@ -175,11 +184,14 @@ def push(
 def limit_load(how: str, cells: int) -> Push:
     """Push the footing into very stiff soil; its loads are over those of the theory."""
     soil, (depth, box) = replace(SOIL, bulk=STIFF * SOIL.bulk, shear=STIFF * SOIL.shear), LIMITS_OF[how]
-    if how == "undrained":
+    if how == "circular":
+        tresca = mpm.MohrCoulomb(bulk=soil.bulk, shear=soil.shear, friction=0, dilation=0, cohesion=COHESION)
+        out = push(tresca, cells, depth, None, box=box, steps=40, circular=True)
+    elif how == "undrained":
         out = push(replace(soil, friction=0.0, conductivity=0.0), cells, depth, RATES["fast"], box=box, steps=40)
     else:
         out = push(replace(soil, dilation=FRICTION), cells, depth, None, box=box, steps=40)
-    limit = capacity(0.0 if how == "undrained" else FRICTION)
+    limit = {"undrained": capacity(0.0), "drained": capacity(FRICTION), "circular": ROUND}[how]
     out.load = [load / limit for load in out.load]
     return out
 
@@ -301,7 +313,7 @@ def draw(out: Path, runs: dict[str, Push], stiff: dict[tuple[str, int], Push]) -
     for (how, cells), each in stiff.items():
         fine = cells == max(c for _, c in stiff)
         style = {
-            "color": COLOURS[0 if how == "undrained" else 2],
+            "color": COLOURS[list(LIMITS_OF).index(how)],
             "lw": 1.5 if fine else 0.8,
             "ls": "-" if fine else "--",
         }

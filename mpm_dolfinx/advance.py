@@ -16,7 +16,7 @@ from mpm_dolfinx.errors import LeftGrid, NotConverged
 from mpm_dolfinx.parallel.exchange import first, over_all
 from mpm_dolfinx.points.bodies import Body
 from mpm_dolfinx.points.cut_domains import CutDomains
-from mpm_dolfinx.points.cutting import parallelepipeds, tangled
+from mpm_dolfinx.points.cutting import parallelepipeds, tangled, volumes
 from mpm_dolfinx.points.domain_gradient import gradient
 from mpm_dolfinx.points.grid import REACH, Grid
 from mpm_dolfinx.points.lattice import filtered, given
@@ -103,9 +103,12 @@ class Motion:
 
     def _deformed(self, cut: CutDomains, data: QuadratureData, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return F (n, d, d) of the points after a step: the means of Delta F and of its det over their pieces."""
-        pieces, grid, n, d = data.pieces, cut.grid, len(cut.points), cut.grid.dim
+        pieces, grid, n, d = data.pieces, cut.grid, len(cut.points), cut.grid.stretches
         at_nodes = nodal[grid.cell_nodes[pieces.cells]].transpose(0, 2, 1)
-        delta = np.eye(d) + at_nodes @ grid.shape_gradients(pieces.cells, pieces.x)
+        delta = np.eye(grid.dim) + at_nodes @ grid.shape_gradients(pieces.cells, pieces.x)
+        if grid.axisymmetric:
+            delta = np.pad(delta, ((0, 0), (0, 1), (0, 1)))
+            delta[:, 2, 2] = pieces.places.stretch(nodal)
         if self._momentum.dilatation is not None:
             delta = self._momentum.dilatation.averaged(delta, data)
         F = delta @ pieces["F"].reshape(-1, d, d)
@@ -138,11 +141,11 @@ class Motion:
         serves, evolved = cut.serves(points), self._materials.evolved(points)
         if not serves:
             corners = corners + free * filtered(grid, stage.lattices, points, cut.points, ~evolved)
-            bad = tangled(corners, points.volume0 * points.J)
+            bad = tangled(corners, points.volume0 * points.J, grid.axisymmetric)
             folded = over_all(grid.comm, int(bad.sum()))
             if folded:
                 corners = untangled(points, corners, bad, deformed(), grid, stage.mechanical)
-        F = gradient(corners, points.reference)
+        F = gradient(corners, points.reference, grid.axisymmetric)
         if self._momentum.dilatation is not None:
             locks = self._materials.locking(points)
             F = with_ratio(F, np.where(locks, determinant(deformed()), determinant(F)))
@@ -201,10 +204,11 @@ def untangled(
     boundary: MechanicalBoundary,
 ) -> NDArray[np.float64]:
     """Return corners (n, 2^d, d), m, where domains that have folded, whose neighbours went elsewhere, are of F."""
-    at, X = np.flatnonzero(bad), points.reference[bad]
-    new = corners[at].mean(axis=1, keepdims=True)
-    new = new + np.einsum("nab,nkb->nka", F[at], X - X.mean(axis=1, keepdims=True))
-    new = boundary.under_held(points.id[at], corners[at], points.volume0[at] * determinant(F[at]), new)
+    at, X, d = np.flatnonzero(bad), points.reference[bad], grid.dim
+    volume0 = volumes(X) if grid.axisymmetric else points.volume0[at]
+    F, new = F[at, :d, :d], corners[at].mean(axis=1, keepdims=True)
+    new = new + np.einsum("nab,nkb->nka", F, X - X.mean(axis=1, keepdims=True))
+    new = boundary.under_held(points.id[at], corners[at], volume0 * determinant(F), new)
     out = corners.copy()
     out[at] = np.clip(new, grid.lower, grid.upper)
     return out

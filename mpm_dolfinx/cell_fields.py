@@ -30,7 +30,7 @@ class CellFields:
         Of what it holds.
     displacement : (n, d), m
         Mean since the start, or since a stage reset it.
-    effective_stress, stress : (n, d, d), Pa
+    effective_stress, stress : (n, d, d), in axisymmetry (n, 3, 3), Pa
         Mean Cauchy stress of the skeleton, and of skeleton and fluid together; tension is positive.
     pressure : (n,), Pa
         Pore pressure, positive in compression; None without fluid.
@@ -48,7 +48,7 @@ class CellFields:
 def cell_fields(scene: Scene, state: State) -> CellFields:
     """Return what the cells hold in a state; on all processes together."""
     state = state if state.stay else state.at_owners(scene.grid)
-    points, d = state.points, scene.grid.dim
+    points = state.points
     on_grid = scene.on_grid(state.stay.points if state.stay else points)  # the next step has use for it
     cut, places = on_grid.cut, on_grid.data.pieces.places
     weight = cut.pieces_to_cells(cut.pieces.fraction * (points.volume0 * points.J)[cut.pieces.point])
@@ -66,5 +66,5 @@ def cell_fields(scene: Scene, state: State) -> CellFields:
     if scene.fluid is not None:
         pressure = on_grid.pressures(state)
         biot = mean(cut.to_cells(scene.materials.table(points, lambda m: m.biot)))
-        stress = effective - (biot * pressure)[:, None, None] * np.eye(d)
+        stress = effective - (biot * pressure)[:, None, None] * np.eye(scene.grid.stretches)
     return CellFields(places.filled, mean(cut.x), volume, moved, effective, stress, pressure)

@@ -152,7 +152,7 @@ class Scene:
         """The constants that make the scene, by name: what a checkpoint of it is known by."""
         grid = self.grid
         out = {"grid cells": grid.shape.tolist(), "grid lower": grid.lower.tolist(), "grid upper": grid.upper.tolist()}
-        out["quadrature"] = self.quadrature
+        out |= {"quadrature": self.quadrature, **({"axisymmetric": True} if grid.axisymmetric else {})}
         for i, body in enumerate(self.bodies):
             out[f"points of body {i}"], out[f"material of body {i}"] = len(body), int(body.material)
             out[f"volume of body {i}"] = float(np.abs(volumes(body.reference())).sum())

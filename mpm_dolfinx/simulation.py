@@ -18,6 +18,7 @@ from mpm_dolfinx.point_fields import PointFields, point_fields
 from mpm_dolfinx.points.bodies import Body, check_bodies
 from mpm_dolfinx.points.grid import Grid
 from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.problems.axis import warn_narrow_hole
 from mpm_dolfinx.problems.conditions import Displacement, Drained, Inflow, Pressure, RigidPlate, Traction
 from mpm_dolfinx.problems.thin import warn_thin
 from mpm_dolfinx.result import Report, Result
@@ -105,6 +106,8 @@ class Simulation:
             raise ValueError(f"quadrature {quadrature!r}: must be domain or point")
         scheme = Scheme(coupling, tolerance)
         instance("grid", grid, Grid)
+        if grid.axisymmetric and quadrature == "point":
+            raise ValueError("quadrature 'point': must be domain in axisymmetry")
         all_of("bodies", bodies, Body, 1)
         all_of("materials", materials, Skeleton, 1)
         if fluid is not None:
@@ -119,6 +122,7 @@ class Simulation:
         functions("sources", sources)
         grid.share(np.concatenate([body.centre for body in bodies]))
         warn_thin(grid, bodies, fixed)
+        warn_narrow_hole(grid, bodies)
         began, weighs = time.perf_counter(), gravity is not None
         options = (quadrature, scheme, method, weighs, pressure, terms, sources)
         self.scene = Scene(grid, bodies, materials, fluid, *options)

@@ -12,6 +12,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
 
+from mpm_dolfinx.constitutive.axes import block
 from mpm_dolfinx.constitutive.local_unknowns import LocalUnknowns
 from mpm_dolfinx.constitutive.skeleton import BY_SCENE, Skeleton
 from mpm_dolfinx.constitutive.user_functions import call, expression
@@ -46,7 +47,7 @@ class LawAtPoints:
     @cached_property
     def points(self) -> FormPoints:
         """The points, with F and what the law takes."""
-        return FormPoints(self.grid, F=(self.grid.dim, self.grid.dim), **self._shapes)
+        return FormPoints(self.grid, F=(self.grid.stretches, self.grid.stretches), **self._shapes)
 
     @cached_property
     def _F(self):
@@ -86,7 +87,7 @@ class LawAtPoints:
         return PointExpression(self.law.first_piola(F, self._values) * F.T / ufl.det(F), self.points)
 
     def stress(self, data: PointData, dt: float = 0.0) -> NDArray[np.float64]:
-        """Return the effective Cauchy stress (n, d, d), Pa, so long after the state, s."""
+        """Return the effective Cauchy stress of the shape of F (n, d, d), Pa, so long after the state, s."""
         stress = self._stress
         self._solve(data, dt)
         return stress.evaluate(data)
@@ -98,7 +99,7 @@ class LawAtPoints:
 
     def stress_3d(self, data: PointData) -> NDArray[np.float64]:
         """Return the effective Cauchy stress (n, 3, 3), Pa; nan across the plane where the law does not know it."""
-        if self.grid.dim == 3:
+        if self.grid.stretches == 3:
             return self.stress(data)
         out = np.zeros((len(data.cells), 3, 3))
         out[:, :2, :2], across = self.stress(data), self._out_of_plane
@@ -164,10 +165,11 @@ class SoftnessAtPoints:
     """
 
     def __init__(self, grid: Grid, law: type[Skeleton], shapes: dict[str, tuple[int, ...]]):
-        self._law, self._grid, self._shapes, d = law, grid, shapes, grid.dim
+        self._law, self._grid, self._shapes, d = law, grid, shapes, grid.stretches
         self._points = points = FormPoints(grid, F=(d, d), dF=(d, d), **shapes)
         s = ufl.variable(fem.Constant(grid.mesh, 1.0))
-        F = ufl.variable(points.F - (1 - s) * points.dF)
+        F = points.F - (1 - s) * points.dF
+        F = ufl.variable(block(F) if grid.axisymmetric else F)
         self._by_scene = by_scene(grid)
         values = {**{name: getattr(points, name) for name in shapes}, **self._by_scene}
         self._local = LocalUnknowns(law, points, F, values) if law.unknowns else None

@@ -256,7 +256,10 @@ class SceneMaterials:
         return out
 
     def effective_stress(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the effective Cauchy stress (n, d, d), Pa, at the points; on all processes together."""
+        """Return the effective Cauchy stress (n, d, d), Pa, at the points; on all processes together.
+
+        In axisymmetry (n, 3, 3).
+        """
         out = np.zeros_like(points.F)
         for law, rows, data in self._placed(points):
             out[rows] = law.stress(data)
@@ -270,9 +273,9 @@ class SceneMaterials:
         return out
 
     def total_stress(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the Cauchy stress (n, d, d), Pa, of skeleton and fluid at the points; on all processes together."""
+        """Return the Cauchy stress of skeleton and fluid, Pa, as `effective_stress`; on all processes together."""
         pressure = self.table(points, lambda m: m.biot) * points.pressure
-        return self.effective_stress(points) - pressure[:, None, None] * np.eye(self._grid.dim)
+        return self.effective_stress(points) - pressure[:, None, None] * np.eye(self._grid.stretches)
 
     def updated_state(
         self, points: MaterialPoints, before: MaterialPoints, dt: float

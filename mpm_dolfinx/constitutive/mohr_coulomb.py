@@ -24,9 +24,10 @@ import numpy as np
 import ufl
 from numpy.typing import NDArray
 
+from mpm_dolfinx.constitutive.axes import embedded, planar
 from mpm_dolfinx.constitutive.frictional import Frictional
 from mpm_dolfinx.constitutive.skeleton import Field, _check
-from mpm_dolfinx.constitutive.trial import PLANE, Isotropic, coaxial, components, eigen, embedded, symmetric
+from mpm_dolfinx.constitutive.trial import PLANE, Isotropic, coaxial, components, eigen, symmetric
 
 ROUND_OFF = 1e-12  # of stresses over the shear modulus
 NEVER = 1e6  # tensile strength over the bulk modulus where none is given
@@ -90,7 +91,7 @@ class MohrCoulomb(Frictional):
     def trial(F, plastic):
         """Return the components of the trial elastic strain b."""
         F3 = embedded(F)
-        b, plane = F3 * plastic * F3.T, F.ufl_shape == (2, 2)
+        b, plane = F3 * plastic * F3.T, planar(F)
         return {"b": components(b, plane), "F": (F3, plane)}
 
     @staticmethod

@@ -17,6 +17,7 @@ import numpy as np
 import ufl
 from numpy.typing import ArrayLike, NDArray
 
+from mpm_dolfinx.constitutive.axes import planar
 from mpm_dolfinx.constitutive.user_functions import expression
 from mpm_dolfinx.validation import asked, functions, line, numbers
 
@@ -205,7 +206,7 @@ class Skeleton:
 
     @classmethod
     def kirchhoff_in_plane(cls, F, values: Mapping[str, object]):
-        """Return the Kirchhoff stress (d, d), Pa, as UFL, of a law that gives it."""
+        """Return the Kirchhoff stress of the shape of F, Pa, as UFL, of a law that gives it."""
         d = F.ufl_shape[0]
         tau = expression(cls.kirchhoff, [(d, d), (3, 3)], "F", F=F, **values)
         return ufl.as_matrix([[tau[a, b] for b in range(d)] for a in range(d)])
@@ -300,9 +301,19 @@ class Hencky(Skeleton):
     def energy(F, bulk, shear):
         """Return psi, Pa, as UFL of F (d, d)."""
         d, ln_J = F.ufl_shape[0], ufl.ln(ufl.det(F))
+        if d == 3 and planar(F):
+            return bulk / 2 * ln_J**2 + shear * _deviatoric(F)
         logs = [ufl.ln(e) / 2 for e in _eigenvalues_over_mean(F.T * F)]
         deviatoric = sum(l**2 for l in logs) - sum(logs) ** 2 / d
         return ((bulk - 2 * shear / 3) / 2 + shear / d) * ln_J**2 + shear * deviatoric
+
+
+def _deviatoric(F):
+    """Return sum l_i^2 - (sum l_i)^2 / 3 of the logarithmic stretches l_i of an axisymmetric F, as UFL."""
+    whole = F.T * F
+    C = ufl.as_matrix([[whole[i, j] for j in (0, 1)] for i in (0, 1)])
+    high, low = (ufl.ln(e) / 2 for e in _eigenvalues_over_mean(C))
+    return (high - low) ** 2 / 2 + (ufl.ln(ufl.det(C)) / 2 - ufl.ln(whole[2, 2])) ** 2 / 6
 
 
 def _eigenvalues_over_mean(C):

@@ -15,22 +15,16 @@ import numpy as np
 import ufl
 from numpy.typing import NDArray
 
+from mpm_dolfinx.constitutive.axes import embedded, planar
 from mpm_dolfinx.constitutive.skeleton import _eigenvalues
 
 EQUAL = 1e-8  # relative distance below which two eigenvalues count as equal
 PLANE, SPACE = ((0, 0), (1, 1), (2, 2), (0, 1)), ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-"""Components of a symmetric tensor in plane strain and in 3D."""
-
-
-def embedded(F):
-    """Return a deformation gradient (3, 3): that of plane strain, or itself."""
-    if F.ufl_shape == (3, 3):
-        return F
-    return ufl.as_matrix([[F[0, 0], F[0, 1], 0], [F[1, 0], F[1, 1], 0], [0, 0, 1]])
+"""Components of a symmetric tensor in plane strain or axisymmetry, and in 3D."""
 
 
 class Isotropic:
-    """Isotropic functions of a symmetric UFL tensor b (3, 3); plane: whether its third axis is the third of space."""
+    """Isotropic functions of a symmetric UFL tensor b (3, 3); plane: whether its third axis is principal."""
 
     def __init__(self, b, plane: bool):
         self._b, self._plane = b, plane
@@ -67,14 +61,14 @@ class Trial:
         self.F = embedded(F)
         if prestretch is not None:
             self.F = self.F * ufl.diag(prestretch)
-        self.isotropic = Isotropic(self.F * plastic * self.F.T, F.ufl_shape == (2, 2))
+        self.isotropic = Isotropic(self.F * plastic * self.F.T, planar(F))
         strain = self.isotropic(lambda e: ufl.ln(e) / 2)
         self.volumetric = ufl.tr(strain)
         self.deviatoric = strain - self.volumetric / 3 * ufl.Identity(3)
 
 
 def components(b, plane: bool):
-    """Return the components of a symmetric UFL tensor (3, 3) as a vector, those that plane strain has or all."""
+    """Return the components of a symmetric UFL tensor (3, 3) as a vector: all, or `PLANE`."""
     return ufl.as_vector([b[i] for i in (PLANE if plane else SPACE)])
 
 
@@ -119,7 +113,7 @@ def coaxial(
     y, slopes : (n, 3), (n, 3, 3)
         Principal values, and their derivatives by x.
     plane
-        Whether tensors are those of plane strain.
+        Whether tensors are those of plane strain or axisymmetry.
 
     Returns
     -------
@@ -134,7 +128,7 @@ def coaxial(
 
     outer = np.stack([dyad(a, a) for a in range(3)], axis=2)
     found = np.zeros((len(x), len(SPACE), len(inner)))
-    tangent = found[:, : len(inner)]  # in plane strain the rest is zero
+    tangent = found[:, : len(inner)]  # in the plane the rest is zero
     tangent[:] = outer @ slopes @ (outer * twice[:, None]).transpose(0, 2, 1)
     for a, b in pairs:
         apart = x[:, a] - x[:, b]

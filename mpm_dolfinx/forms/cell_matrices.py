@@ -32,6 +32,26 @@ def shape_gradients(points: FormPoints) -> list:
     return out
 
 
+def shape_hoops(points: FormPoints) -> list:
+    """Return N / r of the cell's Q1 shape functions N as UFL, in axisymmetry: their means, see `FormPoints.hoop`."""
+    grid, hoop = points.grid, points.functions["hoop"]
+    h, out = fem.Constant(grid.mesh, grid.h), []
+    for s in grid.signs.tolist():
+        linear = (0.5 + s[0] * hoop[0] / h[0]) * (0.5 + s[1] * hoop[1] / h[1])
+        out.append((linear + s[0] * s[1] * (hoop[2] - hoop[0] * hoop[1]) / (h[0] * h[1])) / hoop[3])
+    return out
+
+
+def along_shapes(T, points: FormPoints) -> list:
+    """Return T : grad v at the points as UFL, for the unit displacements v of each node along each axis."""
+    gradients, d = shape_gradients(points), points.grid.dim
+    if not points.grid.axisymmetric:
+        return [ufl.dot(T, g)[i] for g in gradients for i in range(d)]
+    along = [[sum(T[i, k] * g[k] for k in range(d)) for i in range(d)] for g in gradients]
+    hoops = [T[2, 2] * h for h in shape_hoops(points)]
+    return [radial_axial[i] + (0, h)[i == 0] for radial_axial, h in zip(along, hoops, strict=True) for i in range(d)]
+
+
 def element_dofs(grid: Grid, cells: NDArray[np.int32]) -> NDArray[np.int32]:
     """Return the unrolled local dofs (cells, n) of Q1 vectors in cells."""
     dofs = grid.cell_nodes[cells][:, :, None] * grid.dim + np.arange(grid.dim, dtype=grid.cell_nodes.dtype)
@@ -67,9 +87,8 @@ class ElementForces:
     """
 
     def __init__(self, stress: ufl.core.expr.Expr, points: FormPoints):
-        self._grid, dim = points.grid, points.grid.dim
-        forces = [ufl.dot(stress, gradient) for gradient in shape_gradients(points)]
-        self._sums = CellSums([force[i] for force in forces for i in range(dim)], points)
+        self._grid = points.grid
+        self._sums = CellSums(along_shapes(stress, points), points)
 
     def assemble_vector(self, b: NDArray[np.float64], data: PointData) -> None:
         """Add the vector to the local array `b`; contributions to ghosts stay there."""
@@ -105,15 +124,33 @@ class ElementMatrices:
         self._grid, dim = points.grid, points.grid.dim
         rows, columns, self._entry = _entries(2**dim * dim, symmetric)
         gradients, entries = shape_gradients(points), []
+        hoops = shape_hoops(points) if points.grid.axisymmetric else []
         for row, column in zip(rows, columns, strict=True):
             (v, i), (u, j) = divmod(row, dim), divmod(column, dim)
             block = ufl.as_matrix([[tangent[int(i), k, int(j), l] for l in range(dim)] for k in range(dim)])
             entries.append(ufl.dot(gradients[v], ufl.dot(block, gradients[u])))
+            if points.grid.axisymmetric:
+                entries[-1] += _of_hoops(tangent, gradients, hoops, (int(v), int(i)), (int(u), int(j)))
         self._sums = CellSums(entries, points)
 
     def assemble_matrix(self, A: PETSc.Mat, data: PointData) -> None:
         """Add the matrix to `A`, by unrolled local dofs; the caller finalises it."""
         insert(A, self._grid, data.places.filled, self._sums(data)[:, self._entry])
+
+
+def _of_hoops(tangent, gradients: list, hoops: list, row: tuple[int, int], column: tuple[int, int]):
+    """Return what hoops add to an entry of an element matrix as UFL; row, column: node and axis of both displacements.
+
+    tangent (3, 3, 3, 3): as for `ElementMatrices`; gradients, hoops: of the shape functions.
+    """
+    (v, i), (u, j), out = row, column, 0
+    if i == 0:
+        out += hoops[v] * sum(tangent[2, 2, j, l] * gradients[u][l] for l in range(2))
+    if j == 0:
+        out += sum(tangent[i, k, 2, 2] * gradients[v][k] for k in range(2)) * hoops[u]
+    if i == j == 0:
+        out += hoops[v] * tangent[2, 2, 2, 2] * hoops[u]
+    return out
 
 
 class StackedElementMatrices:

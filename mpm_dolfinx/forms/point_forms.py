@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx import _compat
 from mpm_dolfinx.caching import Keyed, Latest
+from mpm_dolfinx.constitutive.axes import block
 from mpm_dolfinx.points.grid import Grid
 
 CHUNK = 2**14
@@ -64,7 +65,8 @@ class FormPoints:
     def __init__(self, grid: Grid, **fields: tuple[int, ...]):
         self.grid = grid
         self.functions = {
-            name: grid.coefficient(shape) for name, shape in {"offset": (grid.dim,), "weight": (), **fields}.items()
+            name: grid.coefficient(shape)
+            for name, shape in {"offset": (grid.dim,), "weight": (), **_hoop(grid), **fields}.items()
         }
         self.live: dict[str, Callable[[PointData], NDArray[np.float64]]] = {}
         """What gives the values (n, size) of fields that change while the points stay."""
@@ -74,7 +76,8 @@ class FormPoints:
     def __getattr__(self, name: str) -> fem.Function:
         functions = self.__dict__.get("functions", {})
         if name in functions:
-            return functions[name]
+            own = self.grid.axisymmetric and name in ("F", "dF")
+            return block(functions[name]) if own else functions[name]
         raise AttributeError(f"the points carry {', '.join(functions)}, not {name!r}")
 
     def at(self, cells: NDArray[np.int32], x: NDArray[np.float64], weight: NDArray[np.float64], **fields) -> PointData:
@@ -86,8 +89,24 @@ class FormPoints:
         return self._taylor(f, self.grid.dim)
 
     def grad(self, f):
-        """Return grad f at the point, f a Q1 function, test or trial function (any shape)."""
+        """Return grad f at the point, f a Q1 function, test or trial function (any shape).
+
+        Of a vector in axisymmetry (3, 3), with f_r / r.
+        """
+        plane = self.plane_grad(f)
+        if not (self.grid.axisymmetric and f.ufl_shape):
+            return plane
+        return ufl.as_matrix([[plane[0, 0], plane[0, 1], 0], [plane[1, 0], plane[1, 1], 0], [0, 0, self.hoop(f)]])
+
+    def plane_grad(self, f):
+        """Return grad f at the point, f a Q1 function, test or trial function, in axisymmetry in the plane."""
         return self._taylor(ufl.grad(f), self.grid.dim - 1)
+
+    def hoop(self, f):
+        """Return f_r / r, f a Q1 vector, in axisymmetry: its mean over what the point stands for."""
+        *offset, product, radius = (self.functions["hoop"][i] for i in range(4))
+        slope = ufl.grad(f[0])
+        return (f[0] + ufl.dot(slope, ufl.as_vector(offset)) + ufl.grad(slope)[0, 1] * product) / radius
 
     def gradient(self, u: fem.Function) -> fem.Function:
         """Return grad u at the point, u a Q1 vector function, as a coefficient that numpy computes for the kernels.
@@ -107,11 +126,12 @@ class FormPoints:
 
     def increment(self, u: fem.Function):
         """Return Delta = I + grad u at the points as UFL."""
-        return ufl.Identity(self.grid.dim) + (self.grad(u) if self.grid.dim == 2 else self.gradient(u))
+        return ufl.Identity(self.grid.stretches) + (self.grad(u) if self.grid.dim == 2 else self.gradient(u))
 
     def deformation(self, u: fem.Function):
         """Return F = Delta F_n at the points, which carry F_n as F, as a UFL variable."""
-        return ufl.variable(self.increment(u) * self.F)
+        F = self.increment(u) * self.F
+        return ufl.variable(block(F) if self.grid.axisymmetric else F)
 
     def _taylor(self, f, order: int):
         total = derivative = f
@@ -123,6 +143,11 @@ class FormPoints:
         return total
 
 
+def _hoop(grid: Grid) -> dict[str, tuple[int, ...]]:
+    """Return name and shape of what points of axisymmetric scenes carry besides, see `cutting.Pieces`."""
+    return {"hoop": (4,)} if grid.axisymmetric else {}
+
+
 class Places(Keyed):
     """Where points lie; nobody changes it.
 
@@ -132,17 +157,35 @@ class Places(Keyed):
         Owned local cell of each point.
     x : (n, d), m
         Positions.
+    hoop : (n, 4)
+        Of axisymmetric pieces their moments in the plane, see `cutting.Pieces`; without it, those of points.
     """
 
-    def __init__(self, grid: Grid, cells: NDArray[np.int32], x: NDArray[np.float64]):
+    def __init__(
+        self,
+        grid: Grid,
+        cells: NDArray[np.int32],
+        x: NDArray[np.float64],
+        hoop: NDArray[np.float64] | None = None,
+    ):
         self.grid, self.cells, self.x = grid, cells, x
-        self.offset = x - grid.midpoints[cells]
+        self.offset = offset = x - grid.midpoints[cells]
+        if grid.axisymmetric and hoop is None:
+            hoop = np.column_stack([offset, offset.prod(axis=1), x[:, 0]])
+        self.hoop = hoop
         self.filled, self.slots = np.unique(cells, return_inverse=True)
         """The cells that hold points; and the place of each point's cell among these."""
 
     def part(self, rows: NDArray[np.int64]) -> Places:
         """Return some of the places."""
-        return Places(self.grid, self.cells[rows], self.x[rows])
+        return Places(self.grid, self.cells[rows], self.x[rows], self.hoop[rows] if self.grid.axisymmetric else None)
+
+    def stretch(self, u: NDArray[np.float64], rows: slice = slice(None)) -> NDArray[np.float64]:
+        """Return 1 + u_r / r (n,) of nodal displacements u (nodes, d), m, in axisymmetry: see `FormPoints.hoop`."""
+        grid, cells, (*offset, product, radius) = self.grid, self.cells[rows], self.hoop[rows].T
+        hats = [0.5 + x[:, None] * grid.signs[:, a] / grid.h[a] for a, x in enumerate(offset)]
+        uneven = (product - offset[0] * offset[1])[:, None] * grid.signs.prod(axis=1) / grid.h.prod()
+        return 1 + ((hats[0] * hats[1] + uneven) * u[grid.cell_nodes[cells], 0]).sum(axis=1) / radius
 
 
 class PointData(Keyed):
@@ -164,6 +207,8 @@ class PointData(Keyed):
         self.points, self.places, self.cells, self.x = points, places, places.cells, places.x
         self.volume, n = weight, len(places.cells)
         self._rows = {"offset": places.offset, "weight": (weight / points.grid.cell_volume)[:, None]}
+        if points.grid.axisymmetric:
+            self._rows["hoop"] = places.hoop
         self._rows |= {name: fields[name].reshape(n, size) for name, size in points.sizes.items()}
         self._gradients: Latest[NDArray[np.float64]] = Latest()
 

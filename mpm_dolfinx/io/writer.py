@@ -245,7 +245,8 @@ def _grid_fields(simulation: Simulation) -> list[fem.Function]:
         fields |= {f"{name}_{'xyz'[i]}": getattr(cells, name)[:, i] for name in ("displacement", "x")}
     if cells.pressure is not None:
         fields["pressure"] = cells.pressure
-    for i, j in zip(*np.triu_indices(d), strict=True):
+    pairs = list(zip(*np.triu_indices(d), strict=True)) + [(2, 2)] * simulation.grid.axisymmetric
+    for i, j in pairs:
         for name in ("effective_stress", "stress")[: 1 if cells.pressure is None else 2]:
             fields[f"{name}_{'xyz'[i]}{'xyz'[j]}"] = getattr(cells, name)[:, i, j]
     out = [moved]

@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mpm_dolfinx.points.cutting import FACES, corner_bits, volumes
+from mpm_dolfinx.points.cutting import FACES, corner_bits, domain_volumes, volumes
 from mpm_dolfinx.points.grid import SIDES, Grid
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.validation import asked, instance, numbers, whole
@@ -268,7 +268,6 @@ def check_inside(grid: Grid, body: Body, name: str = "body") -> Body:
 
 def material_points(grid: Grid, bodies: Sequence[Body], pressure: float = 0.0) -> MaterialPoints:
     """Return this process's material points of the bodies, at rest at pore pressure `pressure` (Pa)."""
-    d = grid.dim
     corners = np.concatenate([b.corners() for b in bodies])
     size = np.concatenate([b.size() for b in bodies])
     material = np.concatenate([np.full(len(b), b.material, dtype=np.int32) for b in bodies])
@@ -278,8 +277,8 @@ def material_points(grid: Grid, bodies: Sequence[Body], pressure: float = 0.0) -
     return MaterialPoints(
         id=mine,
         corners=corners[mine],
-        F=np.tile(np.eye(d), (n, 1, 1)),
-        volume0=size[mine].prod(axis=1),
+        F=np.tile(np.eye(grid.stretches), (n, 1, 1)),
+        volume0=domain_volumes(corners[mine], True) if grid.axisymmetric else size[mine].prod(axis=1),
         material=material[mine],
         pressure=np.full(n, float(numbers("pressure", pressure))),
         x=x[mine],

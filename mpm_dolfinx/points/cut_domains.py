@@ -16,7 +16,7 @@ from mpm_dolfinx.parallel.exchange import Exchange, over_all
 from mpm_dolfinx.points.bending import followed
 from mpm_dolfinx.points.cutting import Pieces, cut, cut_faces
 from mpm_dolfinx.points.faces import Surface, face_vectors, interpolate, on_face
-from mpm_dolfinx.points.grid import Grid, sum_by
+from mpm_dolfinx.points.grid import TURN, Grid, sum_by
 from mpm_dolfinx.points.material_points import MaterialPoints
 
 STAYS = 3e-4
@@ -33,6 +33,8 @@ class Patches:
 
     Parameters
     ----------
+    grid
+        Background grid.
     faces
         The faces; and of each point:
     here, at : (n,)
@@ -45,10 +47,11 @@ class Patches:
         of the face.
     """
 
-    def __init__(self, faces: Surface, here, at, cell, x, xi, share):
+    def __init__(self, grid: Grid, faces: Surface, here, at, cell, x, xi, share):
         self._faces, self._here, self.at, self._xi = faces, here, at, xi
-        self.cell, self.x = cell, x
-        self.area0 = share * faces.area0[here]
+        self.cell, self.x, self._grid = cell, x, grid
+        self._share0 = share * faces.area0[here]
+        self.area0 = self._share0 * grid.around(interpolate(faces.domain[here], xi))
         """Reference areas (n,), m^(d-1)."""
 
     @cached_property
@@ -66,7 +69,9 @@ class Patches:
 
     def area(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the outward area vectors (n, d), m^(d-1)."""
-        share = self.area0 / self._faces.whole0[self._here]
+        share = self._share0 / self._faces.whole0[self._here]
+        if self._grid.axisymmetric:
+            share = share * self._grid.around(self.now(points))
         return face_vectors(points.corners[self.at], self._faces.face[self._here]) * share[:, None]
 
 
@@ -92,6 +97,8 @@ class CutDomains(Keyed):
         self._travel = Exchange(grid.comm, grid.owner(self.pieces.cell))
         self.cells, self.x = grid.local(self._travel.send(self.pieces.cell)), self._travel.send(self.pieces.x)
         """Owned cells, and centroids (m, d), m, of the pieces that this process integrates."""
+        self.hoop = self._travel.send(self.pieces.hoop) if grid.axisymmetric else np.empty((len(self.cells), 0))
+        """Their moments in the plane (m, 4) in axisymmetry, see `Pieces`; else (m, 0)."""
 
     def serves(self, points: MaterialPoints) -> bool:
         """Return whether the points are still where they were cut, but for `STAYS`."""
@@ -109,6 +116,12 @@ class CutDomains(Keyed):
     def to_pieces(self, values: NDArray) -> NDArray:
         """Bring values at the integrated pieces back to the pieces of this process's points."""
         return self._travel.back(values)
+
+    def plane(self, volume: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return volumes (m,) and centroids (m, d), m, of pieces of given volumes, m^d; in axisymmetry in the plane."""
+        if not self.grid.axisymmetric:
+            return volume, self.x
+        return volume / (TURN * self.hoop[:, 3]), self.grid.midpoints[self.cells] + self.hoop[:, :2]
 
     def mean(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the volume means (n,) over the pieces of each point of values (m,) on the pieces."""
@@ -136,7 +149,7 @@ class CutDomains(Keyed):
         xi[skew] = on_face(corners[face[skew]], faces.face[here][face[skew]], x[skew], xi[skew])
         inward = -DEPTH * self.grid.h.min() * np.divide(outward, size, out=np.zeros_like(outward), where=size > 0)
         cell = self._filled_cell(at[face], middle + inward[face])
-        return Patches(faces, here[face], at[face], cell, x, xi, share)
+        return Patches(self.grid, faces, here[face], at[face], cell, x, xi, share)
 
     def displacement(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the Q1 field u (nodes, d) at the points (n, d), which have no domains."""

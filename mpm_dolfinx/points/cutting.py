@@ -9,17 +9,21 @@ The surface of a domain (4 edges, or the 12 outer triangles of its 6 Kuhn tetrah
 the neighbours) is sliced by the grid planes of one axis after the other.  Gauss's theorem turns the slices into
 volumes and first moments of what lies between them and the lower face of their cell and, below it, of whole
 columns of cells: nothing inside a domain is ever cut, and the faces of the pieces come for free.
+
+In axisymmetry pieces are rings.  Their volumes are 2 pi r_c times the area, r_c the radius of its centroid (Pappus).
+Gradients are taken at the volume's centroid, (mean r^2 / r_c, mean r z / r_c), and u_r / r is (mean u_r) / r_c, means
+over the area: the forces of even stresses are then exact.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from itertools import combinations, permutations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mpm_dolfinx.points.grid import Grid, sum_by
+from mpm_dolfinx.points.grid import TURN, Grid, sum_by
 
 SNAP = 1e-10  # cells: vertices this close to a grid plane are taken to lie on it
 SLIVER = 1e-12  # of the domain: smaller pieces are dropped; less than a piece that is SNAP thin, whose face is open
@@ -34,6 +38,8 @@ class Pieces:
     point : (m,) index of the domain; cell : (m,) lexicographic number of the cell;
     fraction : (m,) share of the domain's volume; x : (m, d) centroid, m;
     faces : (m, d, 2) area of the piece on the lower and upper face of its cell, m^(d-1).
+    hoop : (m, 4), in axisymmetry only, else (m, 0): in the plane, offset (2,) of the centroid from the cell's
+    midpoint, m, mean product of the offset's components, m^2, and radius of the centroid, m.
     """
 
     point: NDArray[np.int64]
@@ -41,6 +47,7 @@ class Pieces:
     fraction: NDArray[np.float64]
     x: NDArray[np.float64]
     faces: NDArray[np.float64]
+    hoop: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
 
 
 def corner_bits(dim: int) -> NDArray[np.int64]:
@@ -68,6 +75,15 @@ def volumes(corners: NDArray[np.float64]) -> NDArray[np.float64]:
     return sum(_simplex_volumes(np.ascontiguousarray(corners.transpose(1, 2, 0))))
 
 
+def domain_volumes(corners: NDArray[np.float64], axisymmetric: bool) -> NDArray[np.float64]:
+    """Return the volumes (n,), m^d, of domains (n, 2^d, d), in axisymmetry of the rings that they stand for, m^3."""
+    if not axisymmetric:
+        return volumes(corners)
+    y = np.ascontiguousarray(corners.transpose(1, 2, 0))
+    areas = zip(_simplex_volumes(y), kuhn_simplices(2), strict=True)
+    return TURN * sum(area * y[simplex, 0].mean(axis=0) for area, simplex in areas)
+
+
 def _simplex_volumes(y: NDArray[np.float64]) -> list[NDArray[np.float64]]:
     """Return the signed volumes (n,) of each simplex of domains (2^d, d, n)."""
     d, out = y.shape[1], []
@@ -77,9 +93,9 @@ def _simplex_volumes(y: NDArray[np.float64]) -> list[NDArray[np.float64]]:
     return out
 
 
-def tangled(corners: NDArray[np.float64], volume: NDArray[np.float64]) -> NDArray[np.bool_]:
+def tangled(corners: NDArray[np.float64], volume: NDArray[np.float64], axisymmetric: bool = False) -> NDArray[np.bool_]:
     """Return which domains (n, 2^d, d) have folded: their corners span far less, or more, than their volume (n,)."""
-    ratio = volumes(corners) / volume
+    ratio = domain_volumes(corners, axisymmetric) / volume
     return (ratio < TANGLED) | (ratio > 1 / TANGLED)
 
 
@@ -231,6 +247,13 @@ def _sum(
     whole = sum_by(slots.point, volume, len(slots.low[0]))[slots.point]
     kept = np.flatnonzero(volume / whole > SLIVER)
     point, cell = slots.point[kept], slots.cell[:, kept].T
+    if grid.axisymmetric:
+        x0, x1 = x[:, 0]
+        squares = total(area[0] / 12 * (x0 + x1) * (x0**2 + x1**2)) + beyond / 3
+        products = area[0] / 24 * (x0**2 * (3 * x[0, 1] + x[1, 1]) + x1**2 * (x[0, 1] + 3 * x[1, 1]))
+        products = total(products + area[0] / 12 * x0 * x1 * sums[1])
+        products += slots.beyond(total(area[0] * sums[1] / 2), 0) / 2
+        area[1] *= grid.lower[0] + grid.h[0] * s[:, 0].mean(axis=0)  # sections across the axis are rings too
     faces = np.empty((len(kept), d, 2))
     for a in range(d):
         shadow = total(area[a]) if a else shadow
@@ -241,10 +264,33 @@ def _sum(
         faces[:, a] *= grid.cell_volume / grid.h[a]
 
     # centroids stay off the grid lines, and inside the cell that they belong to
-    volume = volume[kept]
-    centroid = cell + np.clip(np.stack([m[kept] / volume for m in moments], axis=1), SNAP, 1 - SNAP)
+    volume, hoop = volume[kept], np.empty((len(kept), 0))
+    centroid = np.clip(np.stack([m[kept] / volume for m in moments], axis=1), SNAP, 1 - SNAP)
+    if grid.axisymmetric:
+        faces[:, 0] *= TURN * (grid.lower[0] + grid.h[0] * (cell[:, [0]] + [0, 1]))
+        faces[:, 1] *= TURN
+        radius, centroid, hoop = _rings(grid, cell, centroid, squares[kept] / volume, products[kept] / volume)
+        volume = volume * radius
     fraction = volume / sum_by(point, volume, len(slots.low[0]))[point]
-    return Pieces(point, grid.number(cell), fraction, grid.lower + grid.h * centroid, np.abs(faces))
+    return Pieces(point, grid.number(cell), fraction, grid.lower + grid.h * (cell + centroid), np.abs(faces), hoop)
+
+
+def _rings(
+    grid: Grid, cell: NDArray[np.int64], c: NDArray[np.float64], squares: NDArray, products: NDArray
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return radii (m,), m, centroids of the volumes (m, 2) in their cells, from 0 to 1, and `hoop` of pieces.
+
+    cell (m, 2): indices; c (m, 2): centroids in the plane, from 0 to 1; squares, products (m,): means of r^2 and r z.
+    """
+    (h, height), (x, z) = grid.h, c.T
+    squares = np.clip(squares, x**2, x)  # of slivers little is left in rounding
+    products = np.clip(products, np.maximum(0.0, x + z - 1), np.minimum(x, z))
+    inner = grid.lower[0] + h * cell[:, 0]
+    radius = inner + h * x
+    of_volume = np.stack([inner * x + h * squares, inner * z + h * products], axis=1) / radius[:, None]
+    product = h * height * (products - (x + z) / 2 + 0.25)
+    hoop = np.stack([h * (x - 0.5), height * (z - 0.5), product, radius], axis=1)
+    return radius, np.clip(of_volume, SNAP, 1 - SNAP), hoop
 
 
 def cut_faces(

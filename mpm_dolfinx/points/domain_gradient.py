@@ -7,14 +7,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.points.cut_domains import CutDomains
-from mpm_dolfinx.points.cutting import ORIENTATION, kuhn_simplices
+from mpm_dolfinx.points.cutting import ORIENTATION, domain_volumes, kuhn_simplices, volumes
 from mpm_dolfinx.points.grid import sum_by
 from mpm_dolfinx.points.material_points import MaterialPoints, cofactor, determinant
 
 
-def gradient(corners: NDArray[np.float64], reference: NDArray[np.float64]) -> NDArray[np.float64]:
+def gradient(
+    corners: NDArray[np.float64], reference: NDArray[np.float64], axisymmetric: bool = False
+) -> NDArray[np.float64]:
     """Return the mean deformation gradient (n, d, d) of domains over the simplices that the cut knows.
 
+    In axisymmetry (n, 3, 3): hoops stretch as the radius of the centroid, so det F is the ratio of the rings' volumes.
     In 2D the diagonals tell all of it, and det F is the ratio of the areas.  In 3D F is scaled to that of the volumes,
     from which the determinant of the mean of a twisted hexahedron differs by second order.
 
@@ -25,7 +28,14 @@ def gradient(corners: NDArray[np.float64], reference: NDArray[np.float64]) -> ND
     """
     if corners.shape[2] == 2:
         dx, dX = (y[:, [3, 2]] - y[:, [0, 1]] for y in (corners, reference))
-        return np.einsum("nki,nkj->nij", dx, cofactor(dX)) / determinant(dX)[:, None, None]
+        F = np.einsum("nki,nkj->nij", dx, cofactor(dX)) / determinant(dX)[:, None, None]
+        if not axisymmetric:
+            return F
+        out = np.zeros((len(F), 3, 3))
+        out[:, :2, :2] = F
+        now, then = (domain_volumes(y, True) / volumes(y) for y in (corners, reference))
+        out[:, 2, 2] = now / then
+        return out
     F, now, then = 0.0, 0.0, 0.0
     for simplex, sign in zip(kuhn_simplices(3), ORIENTATION[3], strict=True):
         dx, dX = (np.diff(y[:, simplex], axis=1) for y in (corners, reference))  # edges as rows
@@ -57,7 +67,7 @@ def cell_ratios(
         Which points have yielded.
     """
     cells, size = cut.cells, cut.grid.num_local
-    told = cut.to_cells(determinant(gradient(points.corners, points.reference)))
+    told = cut.to_cells(determinant(gradient(points.corners, points.reference, cut.grid.axisymmetric)))
     J, share = cut.to_cells(points.J), cut.to_cells(share)
     weight = (share > 0) * cut.to_cells(points.volume0) * cut.pieces_to_cells(cut.pieces.fraction)
     terms = weight, weight * share, weight * J, weight * told, cut.to_cells(1.0 * flows)

@@ -56,6 +56,14 @@ class Surface:
     def __len__(self) -> int:
         return len(self.id)
 
+    def off_axis(self) -> Surface:
+        """Return the faces but for those that lie on the axis of revolution, where they have no area."""
+        off = self.places()[:, :, 0].max(axis=1, initial=0.0) > 1e-9 * self.whole0
+        if off.all():
+            return self
+        rows = {f.name: getattr(self, f.name)[off] for f in fields(self) if f.name != "region"}
+        return Surface(**rows, region=self.region)
+
     @cached_property
     def outward(self) -> NDArray[np.float64]:
         """Outward area vectors (m, d) of the whole faces as seeded, m^(d-1)."""

@@ -17,7 +17,7 @@ from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.parallel.messages import warn
 from mpm_dolfinx.points.bodies import Body
 from mpm_dolfinx.points.contact import Cover, Faces, covered, covers, local, meeting, warn_near, weights
-from mpm_dolfinx.points.cutting import FACES, TANGLED, volumes
+from mpm_dolfinx.points.cutting import FACES, TANGLED, domain_volumes, volumes
 from mpm_dolfinx.points.grid import REACH, Grid
 from mpm_dolfinx.points.material_points import MaterialPoints
 
@@ -111,7 +111,8 @@ def put(
     mine = corners[new.id - _start(bodies, fill)]
     if (mine == new.corners).all():
         return new
-    return replace(new, corners=mine, x=mine.mean(axis=1), volume0=volumes(mine), origin=mine, reference=mine)
+    volume = domain_volumes(mine, grid.axisymmetric)
+    return replace(new, corners=mine, x=mine.mean(axis=1), volume0=volume, origin=mine, reference=mine)
 
 
 def _start(bodies: Sequence[Body], body: int) -> int:

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx import _compat
 from mpm_dolfinx.parallel.partition import destinations, owners
-from mpm_dolfinx.validation import instance, line, numbers
+from mpm_dolfinx.validation import flag, instance, line, numbers
 
 SIDES = {
     2: {"left": (0, 0), "right": (0, 1), "bottom": (1, 0), "top": (1, 1)},
@@ -32,6 +32,8 @@ SHARED = frozenset(
     "owners locals".split()
 )
 """What of a grid is made with its mesh, see `Cells`."""
+TURN = 2 * np.pi
+"""The angle of the revolution that volumes, forces and outflows of axisymmetric scenes are of."""
 MOST = 2**31 - 1
 """Unknowns that PETSc's numbers of 32 bits count."""
 
@@ -106,17 +108,23 @@ class Grid:
         Lower corner, by default the origin.
     comm
         Processes that share the grid.
+    axisymmetric
+        The first axis is the radius r >= 0 and the second the axis of revolution: bodies are what the plane sweeps as
+        it turns once, without torsion.  Volumes, forces and outflows are those of the whole revolution, m^3, N, m^3/s.
+        Where the grid begins at r = 0 its side "left" is the axis, which stays where it is.
 
     Raises
     ------
     ValueError
-        Corners that are not finite or not in order, numbers of cells that are no integers >= 1, or more cells than
-        PETSc's numbers count.
+        Corners that are not finite or not in order, numbers of cells that are no integers >= 1, more cells than
+        PETSc's numbers count, or an axisymmetric grid in 3D or beyond its axis.
 
     Attributes
     ----------
     dim, shape, h, lower, upper
         d; cells along each axis (d,); their edges (d,), m; corners (d,), m.
+    stretches
+        Number of axes of deformation gradients: d, in axisymmetry 3, the third one that of the hoops.
     mesh
         The dolfinx mesh; made when first it is needed.
     """
@@ -127,6 +135,8 @@ class Grid:
         cells: Sequence[int],
         lower: ArrayLike | None = None,
         comm: MPI.Intracomm = MPI.COMM_WORLD,
+        *,
+        axisymmetric: bool = False,
     ):
         self.upper = numbers("grid: upper", upper, (2,), (3,), allowed="2 or 3 finite coordinates")
         self.dim = d = self.upper.size
@@ -134,6 +144,11 @@ class Grid:
         self.lower = numbers("grid: lower", lower, (d,), allowed=f"{d} finite coordinates")
         if not (self.upper > self.lower).all():
             raise ValueError(f"grid: upper = {line(upper)}, must be > lower = {line(lower)}")
+        flag("grid: axisymmetric", axisymmetric)
+        if axisymmetric and (d != 2 or self.lower[0] < 0):
+            what = f"lower = {line(lower)}, must begin at a radius >= 0" if d == 2 else f"{d} coordinates, must have 2"
+            raise ValueError(f"grid: axisymmetric = True: {what}")
+        self.axisymmetric, self.stretches = axisymmetric, 3 if axisymmetric else d
         count = numbers(
             "grid: cells", cells, (d,), allowed=f"{d} integers >= 1", test=lambda n: (n >= 1) & (n % 1 == 0)
         )
@@ -193,8 +208,17 @@ class Grid:
 
     @property
     def cell_volume(self) -> float:
-        """Volume of a cell (m^d)."""
+        """Volume of a cell, in axisymmetry its area in the plane (m^d)."""
         return float(np.prod(self.h))
+
+    @property
+    def has_axis(self) -> bool:
+        """Whether its side "left" is the axis of revolution."""
+        return self.axisymmetric and self.lower[0] == 0.0
+
+    def around(self, x: NDArray[np.float64]) -> NDArray[np.float64] | float:
+        """Return by what measures in the plane at places (n, d), m, count: 2 pi r (n,), m, in axisymmetry, else 1."""
+        return TURN * x[:, 0] if self.axisymmetric else 1.0
 
     def number(self, index: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return the lexicographic numbers of cells from their (n, d) indices along the axes."""

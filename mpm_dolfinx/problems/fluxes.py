@@ -9,6 +9,7 @@ centroid of what a cell holds its mobility kappa becomes J F^-1 kappa F^-T.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import ufl
@@ -35,17 +36,24 @@ class Mobility:
     shift: NDArray[np.float64] | None = None
 
 
+class Motion(NamedTuple):
+    """What becomes of n cells in a step: F (n, d, d), displacement (n, d), m; hoops' stretch (n,) in axisymmetry."""
+
+    F: NDArray[np.float64]
+    moved: NDArray[np.float64]
+    hoop: NDArray[np.float64] | None
+
+
 @dataclass(frozen=True)
 class Conduction:
     """How the filled owned cells conduct, and what has become of them in the step.
 
-    F (n, d, d), moved (n, d): deformation since the start of the step, and displacement, m, at the centroids; None
-    where the body hardly moves.  weight (d,): of the fluid, N/m^3, if there is gravity.
+    motion: since the start of the step, at the centroids; None where the body hardly moves.  weight (d,): of the fluid,
+    N/m^3, if there is gravity.
     """
 
     mobility: Mobility
-    F: NDArray[np.float64] | None
-    moved: NDArray[np.float64] | None
+    motion: Motion | None
     weight: NDArray[np.float64] | None
 
     def along(self, dim: int) -> NDArray[np.float64]:
@@ -58,11 +66,12 @@ class Conduction:
         kappa, share = self.mobility.mean[at], self.mobility.share
         if share is not None:
             kappa = kappa * (share[at] * normal**2).sum(axis=1)
-        if self.F is None:
+        if self.motion is None:
             return kappa.copy()
-        F = self.F[at]
+        F, hoop = self.motion.F[at], self.motion.hoop
         pulled = np.einsum("mij,mj->mi", cofactor(F), normal)
-        return kappa / determinant(F) * (pulled**2).sum(axis=1)
+        across = kappa / determinant(F) * (pulled**2).sum(axis=1)
+        return across if hoop is None else across * hoop[at]
 
     def nearer(self, at: NDArray[np.int64], normal: NDArray[np.float64], reach: NDArray[np.float64]) -> NDArray | float:
         """Return ways (m, d) to faces over those from which the resistance counts, along normals (m, d)."""
@@ -74,7 +83,7 @@ class Conduction:
 
     def deformed(self, at: NDArray[np.int64], way: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return ways (m, d) in some of the cells, m, as they are now."""
-        return way if self.F is None else np.einsum("mij,mj->mi", self.F[at], way)
+        return way if self.motion is None else np.einsum("mij,mj->mi", self.motion.F[at], way)
 
 
 @dataclass(frozen=True)
@@ -138,13 +147,14 @@ class OpenSides:
 class PieceContents:
     """What pieces bring to their owned cells; arrays over m pieces.
 
-    cells (m,); weight: volumes, m^d; x (m, d): centroids, m; faces (m, d, 2): areas on the lower and upper faces of
-    the cell, m^(d-1); fixed_stress: the coefficient beta, 1/Pa; damping: the strength tau of the damping of pressure
-    jumps, 1/Pa.
+    cells (m,); weight: volumes, m^d; area, x (m, d): volumes and centroids, m, in axisymmetry in the plane; faces
+    (m, d, 2): areas on the lower and upper faces of the cell, m^(d-1); fixed_stress: the coefficient beta, 1/Pa;
+    damping: the strength tau of the damping of pressure jumps, 1/Pa.
     """
 
     cells: NDArray[np.int32]
     weight: NDArray[np.float64]
+    area: NDArray[np.float64]
     x: NDArray[np.float64]
     faces: NDArray[np.float64]
     fixed_stress: NDArray[np.float64]
@@ -170,7 +180,9 @@ class CellContents:
         self._slot[filled] = np.arange(len(filled))
         self._cells, self.weight = cells, weight = pieces.cells, pieces.weight
         self._volume = volume = self.total(cells, weight)
-        self.fill = np.minimum(volume / grid.cell_volume, 1.0)
+        self.area, area = pieces.area, self.total(cells, pieces.area)
+        """Of the pieces (m,), m^d; in axisymmetry in the plane, m^2."""
+        self.fill = np.minimum(area / grid.cell_volume, 1.0)
         """Filled share of the filled cells."""
         self.volume = volume.sum()
         """Volume of all that this process's cells hold, m^d."""
@@ -181,7 +193,8 @@ class CellContents:
         forms.fixed_stress.x.array[filled] = self.total(cells, weight * pieces.fixed_stress)
         centroid, lower, upper = (f.x.array.reshape(-1, grid.dim) for f in shapes)
         for a in range(grid.dim):
-            centroid[filled, a] = self.mean(pieces.x[:, a]) - grid.midpoints[filled, a]
+            mean = self.total(cells, pieces.area * pieces.x[:, a]) / area
+            centroid[filled, a] = mean - grid.midpoints[filled, a]
             for target, end in ((lower, 0), (upper, 1)):
                 target[filled, a] = self.total(cells, pieces.faces[:, a, end]) * grid.h[a] / grid.cell_volume
         for f in (forms.fixed_stress, *shapes):
@@ -216,10 +229,13 @@ class CellContents:
         """Return the means over the pieces (m,) of each filled cell."""
         return self.total(self._cells, self.weight * values) / self._volume
 
-    def motion(self, u: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return F (n, d, d) and displacement (n, d), m, at the centroids of the filled cells, of nodal u."""
-        nodal = u[self.grid.cell_nodes[self.filled]].transpose(0, 2, 1)
-        return np.eye(self.grid.dim) + nodal @ self._slopes, np.einsum("ndk,nk->nd", nodal, self._values)
+    def motion(self, u: NDArray[np.float64]) -> Motion:
+        """Return what becomes of the filled cells, at their centroids, by nodal u (nodes, d), m."""
+        nodal, hoop = u[self.grid.cell_nodes[self.filled]].transpose(0, 2, 1), None
+        moved = np.einsum("ndk,nk->nd", nodal, self._values)
+        if self.grid.axisymmetric:
+            hoop = 1 + moved[:, 0] / (self.grid.midpoints[self.filled, 0] + self.centroid[self.filled, 0])
+        return Motion(np.eye(self.grid.dim) + nodal @ self._slopes, moved, hoop)
 
     def slot(self, cells: NDArray[np.int32]) -> NDArray[np.int64]:
         """Return the places of cells among the filled ones."""
@@ -279,7 +295,7 @@ class FluxForms:
     def set_conduction(self, contents: CellContents, flow: Conduction) -> NDArray[np.float64]:
         """Set the coefficients for how the filled owned cells conduct; return their mobilities (n, d) by axis."""
         d, filled, shift = self.grid.dim, contents.filled, flow.mobility.shift
-        mobility, moved = flow.along(d), np.zeros((len(filled), d)) if flow.moved is None else flow.moved
+        mobility, moved = flow.along(d), np.zeros((len(filled), d)) if flow.motion is None else flow.motion.moved
         values = {self.mobility: mobility}
         if shift is not None:  # the fluid's weight is that at the centroids nevertheless
             values[self.centroid] = contents.centroid[filled] + shift

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from mpm_dolfinx import _compat
 from mpm_dolfinx.constitutive.skeleton import Skeleton
 from mpm_dolfinx.forms.point_forms import FacetForm
-from mpm_dolfinx.points.grid import Grid
+from mpm_dolfinx.points.grid import TURN, Grid
 
 GHOST = 0.05
 """Strength gamma of the ghost penalty."""
@@ -79,7 +79,10 @@ class GhostPenalty:
         def kink(w):
             return ufl.dot(ufl.grad(w)("+") - ufl.grad(w)("-"), n)
 
-        form = GHOST / 3 * self._scale() * across * ufl.inner(kink(du), kink(v)) * dS
+        scale = self._scale()
+        if grid.axisymmetric:
+            scale *= TURN * ufl.SpatialCoordinate(grid.mesh)("+")[0]
+        form = GHOST / 3 * scale * across * ufl.inner(kink(du), kink(v)) * dS
         self.form = FacetForm(form, grid.comm)
 
     def _scale(self):

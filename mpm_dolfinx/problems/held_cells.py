@@ -103,7 +103,7 @@ class HeldCells:
         each = np.where(flat[at], EVERYWHERE * p.resistance[:, None], WEAK * against[:, None])
         self.stiffness = both(HOLD / h * modulus, each / h)
         # at the end of a side a node's force may come by a small part of a cell
-        short = np.maximum(1.0, grid.cell_volume / grid.h.max() / whole)
+        short = np.maximum(1.0, grid.cell_volume / grid.h.max() * grid.around(x) / whole)
         self.limit = CARRIED * total(p.resistance + 10 * p.tension) * short
         self._gap, self._force = both(gap, p.gap), both(0 * gap, p.force)
         self._slope, self._along = both(slope, slope[at]), both(along, along[at])

@@ -190,7 +190,7 @@ def mixed_cells(cut: CutDomains, alike: NDArray[np.float64], contents: CellConte
 
     alike: (m, k) what those pieces have in common that do.
     """
-    grid, cells, volume = cut.grid, cut.cells, contents.weight
+    grid, cells, volume = cut.grid, cut.cells, contents.area
     some = np.zeros((grid.num_local, alike.shape[1]))
     some[cells] = alike  # of any of the cell's pieces
     mixed = sum_by(cells, (alike != some[cells]).any(axis=1), grid.num_local) > 0

@@ -30,9 +30,10 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from mpm_dolfinx.caching import Latest
+from mpm_dolfinx.constitutive.axes import block
 from mpm_dolfinx.constitutive.skeleton import Skeleton
 from mpm_dolfinx.constitutive.user_functions import expression
-from mpm_dolfinx.forms.cell_matrices import insert, shape_gradients
+from mpm_dolfinx.forms.cell_matrices import along_shapes, insert
 from mpm_dolfinx.forms.point_forms import CellSums, FormPoints, PointData
 from mpm_dolfinx.points.grid import Grid, sum_by
 from mpm_dolfinx.problems.quadrature_data import QuadratureData
@@ -52,7 +53,7 @@ class MeanDilatation:
     """
 
     def __init__(self, grid: Grid, numbers: Sequence[int], symmetric: bool = True):
-        self._grid, self._d, self._symmetric, self._numbers = grid, grid.dim, symmetric, numbers
+        self._grid, self._d, self._symmetric, self._numbers = grid, grid.stretches, symmetric, numbers
         self.theta, self.pi = fem.Function(grid.cellwise()), fem.Function(grid.cellwise())
         self._theta = ufl.variable(self.theta)
         self._filled: Latest[Cells] = Latest()
@@ -64,12 +65,12 @@ class MeanDilatation:
 
     def _along_shapes(self, T, points: FormPoints) -> list:
         """Return T : dF for the displacement of each node, whose dF is grad(v) F_n."""
-        T = T * points.F.T
-        return [ufl.dot(T, g)[i] for g in shape_gradients(points) for i in range(self._d)]
+        return along_shapes(T * points.F.T, points)
 
     def seen(self, points: FormPoints, F):
         """Return Fbar (d, d), what laws see of F, as UFL."""
-        return (self._theta * ufl.det(points.F) / ufl.det(F)) ** (1 / self._d) * F
+        Fbar = (self._theta * ufl.det(points.F) / ufl.det(F)) ** (1 / self._d) * F
+        return block(Fbar) if self._grid.axisymmetric else Fbar
 
     def add(self, law: type[Skeleton], points: FormPoints, F, Fbar, values: Mapping[str, object]):
         """Add the pieces of a part that locks.
@@ -126,7 +127,7 @@ class MeanDilatation:
 
     def assemble_matrix(self, A: PETSc.Mat, data: QuadratureData) -> None:
         """Add what theta and pi contribute to the tangent at the last update; the caller finalises it."""
-        count, volume = 2**self._d * self._d, self._volume_of(data)
+        count, volume = 2**self._grid.dim * self._grid.dim, self._volume_of(data)
         derivatives = self._total(self._derivatives, data)
         b, c = self._total(self._ratio_slopes, data) / volume, derivatives[:, :count] / volume
         e = derivatives[:, count, None] / volume

@@ -75,7 +75,9 @@ class MechanicalBoundary:
         self.plates = [(plate, sides.of(plate)) for plate in plates]
         self.pressures = [(load, sides.of(load)) for load in tractions if isinstance(load, Pressure)]
         tractions = [load for load in tractions if not isinstance(load, Pressure)]
-        tractions += [plate.traction(faces.area0.sum(), inward(faces)) for plate, faces in self.plates]
+        for plate, faces in self.plates:
+            area = faces.area0 * self.grid.around(faces.places().mean(axis=1))
+            tractions.append(plate.traction(area.sum(), inward(faces)))
         self.loads = [(load, sides.of(load)) for load in tractions]
         self.holds = [(hold, sides.of(hold), hold.axes(d)) for hold in displacements]
         self._meeting: list[tuple[Displacement, Displacement, list[int], NDArray[np.float64]]] = []
@@ -181,7 +183,7 @@ class MechanicalBoundary:
         tension = np.linalg.norm(stress if points is cut.points else self._materials.total_stress(before), axis=(1, 2))
         for number, ((hold, *_), p) in enumerate(zip(self.holds, patches, strict=True)):
             at, gap = np.searchsorted(chosen, p.at), p.origin(points) + self._given(hold, t, p.X) - p.now(points)
-            force = np.einsum("nij,nj->ni", stress[at], p.area(points))
+            force = np.einsum("nij,nj->ni", stress[at, :d, :d], p.area(points))
             own = (p.area0 * v for v in (1, modulus[at], tension[at], resists[at], firm[at]))
             each = np.stack([np.full(len(gap), number), *own], axis=1)
             rows.append((p.cell, p.x, np.concatenate([each, gap, p.area(cut.points), force], axis=1)))
@@ -227,6 +229,7 @@ class MechanicalBoundary:
     ) -> NDArray[np.float64]:
         """Return new corners (m, 2^d, d), m, of domains: prisms of their volume (m,) under faces that are held.
 
+        In axisymmetry the volume is the area in the plane.
         A held face stays where its tracked corners are: put elsewhere it would be pulled back, all at once.
         """
         index = np.arange(2**self.grid.dim)

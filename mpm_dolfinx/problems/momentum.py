@@ -332,7 +332,8 @@ class MomentumProblem:
         Those of a turn, if given displacements turn the bodies as one, and those of the last step gone on with.
         """
         forms, holds = self.forms, self._sides.holds
-        motion = None if holds is None else rigid_motion(forms.grid.comm, holds, forms.grid.node_x)
+        turns = holds is not None and not forms.grid.axisymmetric
+        motion = rigid_motion(forms.grid.comm, holds, forms.grid.node_x) if turns else None
         found = [values.ravel() for values in (motion, self._goes_on) if values is not None]
         return [np.where(self.system.unknowns.map.indices >= 0, values, 0.0) for values in found]
 

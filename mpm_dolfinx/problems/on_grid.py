@@ -18,7 +18,7 @@ from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.cut_domains import CutDomains
 from mpm_dolfinx.points.grid import sum_by
 from mpm_dolfinx.points.pressure_transport import Reconstruction, share_within, transport
-from mpm_dolfinx.problems.fluxes import CellContents, Conduction, Mobility, OpenSides, PieceContents
+from mpm_dolfinx.problems.fluxes import CellContents, Conduction, Mobility, Motion, OpenSides, PieceContents
 from mpm_dolfinx.problems.ghost_penalty import stiffness
 from mpm_dolfinx.problems.layers import graded, mixed_cells
 from mpm_dolfinx.problems.momentum import MomentumForms, MomentumSystem
@@ -63,8 +63,9 @@ class OnGrid(Keyed):
         pieces = self.data.pieces
         self.weight = weight = pieces["weight"][:, 0] * grid.cell_volume
         """Volumes (m,) of the pieces, m^d."""
-        stiff = weight * quadrature.rows(cut, points, stiffness)
-        momentum.ghost.set_contents(*(sum_by(cut.cells, rows, grid.num_local) for rows in (weight, stiff)))
+        area, x = cut.plane(weight)
+        stiff = area * quadrature.rows(cut, points, stiffness)
+        momentum.ghost.set_contents(*(sum_by(cut.cells, rows, grid.num_local) for rows in (area, stiff)))
         self.active = momentum.ghost.fill.x.array > 0
         """Which local cells hold something, ghosts included."""
         self.cells = np.flatnonzero(self.active)
@@ -72,14 +73,16 @@ class OnGrid(Keyed):
         """Faces of this process between two active cells."""
         self.penalised = momentum.ghost.facets(self.facets)
         """Those of nearly empty cells."""
-        self.stiffness = float(quadrature.rows(cut, points, lambda m: m.oedometric).max(initial=0.0))
-        """Largest oedometric modulus, Pa."""
+        rows = quadrature.rows(cut, points, lambda m: m.oedometric) * grid.around(cut.x)
+        self.stiffness = float(rows.max(initial=0.0))
+        """Largest oedometric modulus, Pa; in axisymmetry times the length of its ring, N/m."""
         self.contents, self._mixed = None, None
         if storage is not None:
             brought = PieceContents(
                 cells=cut.cells,
                 weight=weight,
-                x=cut.x,
+                area=area,
+                x=x,
                 faces=cut.pieces_to_cells(cut.pieces.faces),
                 fixed_stress=quadrature.fixed_stress(cut, points, of_fluid),
                 damping=quadrature.rows(cut, points, lambda m: m.pressure_damping(grid.dim)),
@@ -308,19 +311,16 @@ class Assembled:
                 return on_grid.mobility(data, begins)
             return self._mobility((), lambda: on_grid.mobility(data, True))
 
-        def set_fluxes(at_sides: OpenSides, kappa: Mobility, *motion: NDArray | None) -> Outflow:
-            return self.storage.set_fluxes(contents, at_sides, Conduction(kappa, *motion, weight))
+        def set_fluxes(at_sides: OpenSides, kappa: Mobility, motion: Motion | None = None) -> Outflow:
+            return self.storage.set_fluxes(contents, at_sides, Conduction(kappa, motion, weight))
 
         if state.stay and not self._varies:
-            stays = (None, None)
-            outflow = self._outflow(
-                (at, weight, *varies), lambda: set_fluxes(sides(), mobility(True), *stays), grid.comm
-            )
+            outflow = self._outflow((at, weight, *varies), lambda: set_fluxes(sides(), mobility(True)), grid.comm)
             return lambda begins: outflow
         placed = sides()
 
         def at_present(begins: bool) -> Outflow:
-            return set_fluxes(placed, mobility(begins), *contents.motion(u.x.array.reshape(-1, grid.dim)))
+            return set_fluxes(placed, mobility(begins), contents.motion(u.x.array.reshape(-1, grid.dim)))
 
         # a substep begins where the one before it has ended
         at_u = (data.pieces.key, weight, *varies)

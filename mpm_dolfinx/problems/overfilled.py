@@ -24,7 +24,7 @@ def warn_overfilled(cut: CutDomains, bodies: Sequence[Body]) -> bool:
     """Log a warning of the fullest cell, with the bodies in it, if it is overfilled; return whether it is."""
     grid, points = cut.grid, cut.points
     volume = cut.to_cells(points.volume0 * points.J) * cut.pieces_to_cells(cut.pieces.fraction)
-    fill = sum_by(cut.cells, volume, grid.num_owned) / grid.cell_volume
+    fill = sum_by(cut.cells, cut.plane(volume)[0], grid.num_owned) / grid.cell_volume
     most = over_all(grid.comm, float(fill.max(initial=0.0)), MPI.MAX)
     if not cut.domains or most <= FULL:
         return False

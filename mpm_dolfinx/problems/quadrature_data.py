@@ -83,7 +83,7 @@ class QuadraturePoints:
         self.varies = bool(fluid and scene.conductivity_laws)
         self.layered = bool(fluid and scene.conducts and scene.layered)
         d = grid.dim
-        shapes: dict[str, tuple[int, ...]] = {"F": (d, d), **scene.shapes}
+        shapes: dict[str, tuple[int, ...]] = {"F": (grid.stretches, grid.stretches), **scene.shapes}
         if fluid:
             shapes |= {"biot": (), "storage": (), "storage_at_one": ()}
         if weighs:
@@ -100,7 +100,7 @@ class QuadraturePoints:
 
     def places(self, cut: CutDomains) -> PiecePlaces:
         """Return where the pieces of a cut lie."""
-        pieces, parts = Places(self._grid, cut.cells, cut.x), []
+        pieces, parts = Places(self._grid, cut.cells, cut.x, cut.hoop if self._grid.axisymmetric else None), []
         if len(self.laws) > 1:
             part = cut.to_cells(self._scene.part_of(cut.points))
             rows = [np.flatnonzero(part == number) for number in range(len(self.laws))]
@@ -115,7 +115,7 @@ class QuadraturePoints:
         if self._locks and cut.domains:
             share = self._scene.locking(points) * self._scene.table(points, told_share)
             factor = cell_ratios(cut, points, share, self._scene.evolved(points)) / cut.to_cells(points.J)
-            weight, fields["F"] = factor * weight, factor[:, None, None] ** (1 / cut.grid.dim) * fields["F"]
+            weight, fields["F"] = factor * weight, factor[:, None, None] ** (1 / cut.grid.stretches) * fields["F"]
         pieces = PointData(self.pieces, places.pieces, weight, fields)
         if not places.parts:
             return QuadratureData(pieces, (pieces,), (slice(None),))
@@ -183,5 +183,5 @@ class QuadraturePoints:
         """
         if of_fluid:
             return np.full(len(cut.cells), 1 / self._fluid.bulk)
-        beta = self._scene.table(points, lambda m: m.biot**2 / m.drained_modulus(self._grid.dim)) * points.J
+        beta = self._scene.table(points, lambda m: m.biot**2 / m.drained_modulus(self._grid.stretches)) * points.J
         return cut.to_cells(beta)

@@ -50,6 +50,8 @@ def check_held(
     x = (x - centre[number - 1]) / size[number - 1, None]  # else a small part far from the origin would not turn
     modes = list(direction.T)
     modes += [direction[:, a] * x[:, b] - direction[:, b] * x[:, a] for a in range(grid.dim) for b in range(a)]
+    if grid.axisymmetric:  # rings move rigidly along the axis only
+        modes = [direction[:, 1]]
     R = np.stack(modes, axis=1)
     grams = grid.comm.allreduce(np.stack([R[number == k].T @ R[number == k] for k in range(1, count + 1)]))
     for k, gram in enumerate(grams, start=1):

@@ -82,8 +82,11 @@ class SideForms:
     def _pressed(self) -> ufl.Form:
         """Return -p n da . v, n da = det(Delta) Delta^-T n_n da_n (Nanson) at the present iterate."""
         p = self.pressures
-        delta = ufl.variable(ufl.Identity(self._grid.dim) + p.grad(self._u))
-        return ufl.inner(ufl.diff(ufl.det(delta), delta) * p.push, p.value(self._v)) * p.dx
+        delta = ufl.variable(ufl.Identity(self._grid.stretches) + p.grad(self._u))
+        turned = ufl.diff(ufl.det(delta), delta)
+        if self._grid.axisymmetric:
+            turned = ufl.as_matrix([[turned[i, j] for j in (0, 1)] for i in (0, 1)])
+        return ufl.inner(turned * p.push, p.value(self._v)) * p.dx
 
     @cached_property
     def plates(self) -> FormPoints:
@@ -103,7 +106,7 @@ class SideForms:
     def _slope(self, w):
         """Return the tangential gradient of the normal displacement, grad_t(w_n), at the plates."""
         n = self.plates.normal
-        gradient = ufl.dot(n, self.plates.grad(w))
+        gradient = ufl.dot(n, self.plates.plane_grad(w))
         return gradient - ufl.dot(gradient, n) * n
 
     def _bend(self, slope) -> ufl.Form:

@@ -38,9 +38,11 @@ class Sides:
         """Return the faces of a condition's side and region; ValueError where there are none."""
         key = (str(condition.side), limits(condition.region, self.grid.dim).tobytes())
         if key not in self._found:
-            self._found[key] = surface(self.bodies, condition.side, condition.region, self.present)
+            found = surface(self.bodies, condition.side, condition.region, self.present)
+            self._found[key] = found.off_axis() if self.grid.has_axis else found
         if not len(self._found[key]):
             where = " in the region" if condition.region is not None else ""
+            where += " off the axis" if self.grid.has_axis else ""
             raise ValueError(f"{line(condition)}: no point has this side{where}, must be one of a body")
         return self._found[key]
 

@@ -14,6 +14,7 @@ from mpm_dolfinx.constitutive.fields import SceneMaterials
 from mpm_dolfinx.points.bodies import Body
 from mpm_dolfinx.points.grid import Grid
 from mpm_dolfinx.points.lattice import Lattice, lattices
+from mpm_dolfinx.problems.axis import with_axis
 from mpm_dolfinx.problems.conditions import Displacement, Drained, Inflow, Pressure, RigidPlate, Traction
 from mpm_dolfinx.problems.hydraulic_boundary import HydraulicBoundary
 from mpm_dolfinx.problems.mechanical_boundary import MechanicalBoundary
@@ -33,15 +34,16 @@ CONDITIONS = {
 class Stage:
     """The conditions in force.
 
-    conditions: as they were given, by name; present: which bodies are there; later: those that may still come;
-    free: (nodes, d), components that no wall holds; lattices: of the bodies that are there; mechanical, hydraulic:
-    what acts on the sides of the bodies.
+    conditions: as they were given, by name, the axis among the fixed walls; present: which bodies are there; later:
+    those that may still come; free: (nodes, d), components that no wall holds; axisymmetric: as the grid; lattices: of
+    the bodies that are there; mechanical, hydraulic: what acts on the sides of the bodies.
     """
 
     conditions: Mapping[str, Any]
     present: tuple[bool, ...]
     later: tuple[int, ...]
     free: NDArray[np.bool_]
+    axisymmetric: bool
     lattices: Sequence[Lattice]
     mechanical: MechanicalBoundary
     hydraulic: HydraulicBoundary
@@ -52,7 +54,8 @@ class Stage:
         if given is None:
             return None
         d = self.free.shape[1]
-        return _gravity(asked(name, f"{d} numbers for a time", given, t) if callable(given) else given, name, d)
+        given = asked(name, f"{d} numbers for a time", given, t) if callable(given) else given
+        return _gravity(given, name, d, self.axisymmetric)
 
 
 def stage(
@@ -90,9 +93,10 @@ def stage(
         raise ValueError("drained and inflow sides need a fluid")
     gravity = conditions["gravity"]
     if gravity is not None and not callable(gravity):
-        _gravity(gravity, "gravity", grid.dim)
+        _gravity(gravity, "gravity", grid.dim, grid.axisymmetric)
     if not any(present):
         raise ValueError("bodies: none is there, must be at least one")
+    conditions = {**conditions, "fixed": with_axis(grid, conditions["fixed"])}
     free, sides = ~_fixed(grid, conditions["fixed"]), Sides(grid, bodies, present)
     acting = (conditions[name] for name in ("tractions", "displacements", "plates"))
     mechanical = MechanicalBoundary(sides, free, materials, *acting)
@@ -100,11 +104,14 @@ def stage(
     given = [(faces, axes) for _, faces, axes in mechanical.holds]
     given += [(faces, range(grid.dim)) for _, faces in mechanical.plates]
     lattice = lattices(bodies, present, given)
-    return Stage(dict(conditions), tuple(present), tuple(later), free, lattice, mechanical, hydraulic)
+    return Stage(conditions, tuple(present), tuple(later), free, grid.axisymmetric, lattice, mechanical, hydraulic)
 
 
-def _gravity(value: ArrayLike, name: str, dim: int) -> NDArray[np.float64]:
-    return numbers(name, value, (dim,), allowed=f"{dim} finite numbers")
+def _gravity(value: ArrayLike, name: str, dim: int, axisymmetric: bool) -> NDArray[np.float64]:
+    out = numbers(name, value, (dim,), allowed=f"{dim} finite numbers")
+    if axisymmetric and out[0]:
+        raise ValueError(f"{name} = {line(value)}, must be (0, g): axisymmetric bodies have weight along the axis only")
+    return out
 
 
 def _fixed(grid: Grid, fixed: Mapping[str, str]) -> NDArray[np.bool_]:

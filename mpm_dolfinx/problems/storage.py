@@ -348,6 +348,12 @@ class StorageProblem:
         owned = self.system.unknowns.owned
         return lost / (self.forms.capacity(self.data) + self._contents.fixed_stress)[owned]
 
+    @property
+    def ring(self) -> float:
+        """Mean length of the rings that the cells' contents are in axisymmetry, m."""
+        whole, area = over_all(self.forms.grid.comm, np.array([self._contents.volume, self._contents.area.sum()]))
+        return float(whole / area)
+
     def settle_seepage(self) -> bool:
         """Open and close seepage faces as the flow at (u, p) asks for; return whether that has changed anything.
 

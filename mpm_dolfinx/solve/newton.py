@@ -117,7 +117,8 @@ def solve_substep(
     if storage is None:
         return None
     grid, nodes = momentum.forms.grid, momentum.system.unknowns.global_size
-    report.stress = errors.forces / (grid.cell_volume / grid.h.max() * np.sqrt(max(1, nodes)))
+    area = grid.cell_volume / grid.h.max() * (storage.ring if grid.axisymmetric else 1.0)
+    report.stress = errors.forces / (area * np.sqrt(max(1, nodes)))
     report.balance = _relative(abs(storage.balance(errors.fluid)), errors.exchanged, errors.fluid.round_off)
     return errors.fluid.rates
 

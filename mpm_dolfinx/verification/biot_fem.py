@@ -9,7 +9,8 @@ on the reference configuration of a box, from state n:
 
 kappa = k/(rho_w g), the content zeta that of `fluid_content`, the integral over the step that of `time_integration`.
 With pressures constant in the cells the flux is the two-point one, kappa J |F^-T N|^2 (p+ - p-)/h, h the distance of
-the cells' centres; it is not consistent where the body shears.  Materials, the user's terms and sources, and time
+the cells' centres; it is not consistent where the body shears.  In axisymmetry F has the hoops' stretch and integrals
+are those of the whole revolution.  Materials, the user's terms and sources, and time
 integration are those of the material point method, so the two differ in discretisation only.
 """
 
@@ -33,6 +34,7 @@ from numpy.typing import ArrayLike, NDArray
 from tqdm import tqdm
 
 from mpm_dolfinx import _compat
+from mpm_dolfinx.constitutive.axes import block
 from mpm_dolfinx.constitutive.fluid_content import change_of_content
 from mpm_dolfinx.constitutive.skeleton import Field, Fluid, Skeleton
 from mpm_dolfinx.constitutive.user_functions import call, compiling, term_of
@@ -40,8 +42,9 @@ from mpm_dolfinx.constitutive.user_functions import form as form_of
 from mpm_dolfinx.errors import GaveUp, NotConverged
 from mpm_dolfinx.forms.point_forms import PointMeasure
 from mpm_dolfinx.points.faces import Region, limits
-from mpm_dolfinx.points.grid import Grid, side
+from mpm_dolfinx.points.grid import TURN, Grid, side
 from mpm_dolfinx.points.probes import positions
+from mpm_dolfinx.problems.axis import with_axis
 from mpm_dolfinx.problems.conditions import RIGIDITY, Drained, Pressure, RigidPlate, Traction
 from mpm_dolfinx.result import Report, Result, Row
 from mpm_dolfinx.time_integration import Substep, substeps
@@ -111,6 +114,8 @@ class BiotFEM:
         Of time integration: "sdirk2" or "backward-euler".
     tolerance
         Residual relative to the loads or to the residual at the start of a step, > 0.
+    axisymmetric
+        As that of `Grid`.
     """
 
     def __init__(
@@ -132,6 +137,7 @@ class BiotFEM:
         comm: MPI.Intracomm = MPI.COMM_WORLD,
         tolerance: float = 1e-8,
         method: str = "sdirk2",
+        axisymmetric: bool = False,
     ):
         all_of("material", [material], Skeleton)
         all_of("fluid", [fluid] if fluid is not None else [], Fluid)
@@ -152,13 +158,16 @@ class BiotFEM:
                 f"{type(material).__name__}: the reference has no state and no local unknowns; only moduli, "
                 "conductivity and parameters of the law may be functions of place, the rest must be numbers"
             )
-        self.grid, self.material, self.fluid = Grid(upper, cells, lower, comm), material, fluid
+        self.grid = Grid(upper, cells, lower, comm, axisymmetric=axisymmetric)
+        self.material, self.fluid = material, fluid
+        radius = ufl.SpatialCoordinate(self.grid.mesh)[0]
+        self._around = TURN * radius if axisymmetric else 1.0  # what measures in the plane count by
         self.tolerance, self._t = tolerance, fem.Constant(self.grid.mesh, 0.0)
         self._substeps = substeps(method, fluid is not None or bool(terms))  # terms may depend on the velocity
         self.scale = float(np.max(material.at(self.grid.midpoints).oedometric))
         """Unit of the pressure among the unknowns, Pa; both equations are divided by it."""
         self._space = Space(self.grid, fluid is not None, *ELEMENTS[element])
-        self._bcs = self._conditions(fixed, drained if element == "taylor-hood" else ())
+        self._bcs = self._conditions(with_axis(self.grid, fixed), drained if element == "taylor-hood" else ())
         start = time.perf_counter()
         self._plates = [(plate, self._area(plate)) for plate in plates]
         for load in tractions:
@@ -227,7 +236,9 @@ class BiotFEM:
         """Return the area of the part of a side that a condition names (m^(d-1))."""
         low, high = self._box(condition.side, condition.region)
         within = np.minimum(high, self.grid.upper) - np.maximum(low, self.grid.lower)
-        return float(np.delete(within, side(condition.side, self.grid.dim)[0]).prod())
+        area = float(np.delete(within, side(condition.side, self.grid.dim)[0]).prod())
+        middle = (np.maximum(low, self.grid.lower) + np.minimum(high, self.grid.upper)) / 2
+        return area * float(np.squeeze(self.grid.around(middle[None])))
 
     def _on(self, condition: Traction | Pressure | Drained | RigidPlate, integrand):
         """Return the integral over the part of a side that a condition names, as UFL."""
@@ -235,7 +246,7 @@ class BiotFEM:
         for a, x in enumerate(ufl.SpatialCoordinate(self.grid.mesh)):
             integrand = ufl.conditional(ufl.And(ufl.ge(x, low[a]), ufl.le(x, high[a])), integrand, 0.0)
         degree = 2 * self._space.degree if condition.region is None else CUT_DEGREE
-        return integrand * ufl.ds(domain=self.grid.mesh, metadata={"quadrature_degree": degree})
+        return self._around * integrand * ufl.ds(domain=self.grid.mesh, metadata={"quadrature_degree": degree})
 
     def _compile(
         self, loads: Sequence, outlets: Sequence | None, gravity: Callable | None, terms: Sequence, sources: Sequence
@@ -246,16 +257,16 @@ class BiotFEM:
         test = ufl.TestFunction(space.W)
         (u, p), (u_n, p_n), (past, _), (v, q) = map(split, (space.w, space.old, space.past, test))
         degree, scale = 2 * space.degree, self._constant(self.scale)
-        dx = ufl.dx(domain=self.grid.mesh, metadata={"quadrature_degree": degree})
-        F, F_n = (ufl.variable(ufl.Identity(self.grid.dim) + ufl.grad(f)) for f in (u, u_n))
+        around, dx = self._around, ufl.dx(domain=self.grid.mesh, metadata={"quadrature_degree": degree})
+        F, F_n = (ufl.variable(self._deformation(f)) for f in (u, u_n))
         J, J_n = ufl.det(F), ufl.det(F_n)
         parameters = {name: self._field(getattr(law, name)) for name in law.parameters}
         P = law.first_piola(F, parameters) / scale - self._constant(law.biot) * p * ufl.diff(J, F)
-        residual, flux = ufl.inner(P, ufl.grad(v)) * dx, None
+        residual, flux = around * ufl.inner(P, self._grad(v)) * dx, None
         points = SimpleNamespace(  # the configuration at the start of the step
-            dx=PointMeasure(self.grid.mesh, J_n, "everywhere", degree),
+            dx=PointMeasure(self.grid.mesh, around * J_n, "everywhere", degree),
             value=lambda f: f,
-            grad=lambda f: ufl.dot(ufl.grad(f), ufl.inv(F_n)),
+            grad=lambda f: ufl.dot(self._grad(f), ufl.inv(F_n)),
             F=F_n,
             displacement=u_n,
             position=ufl.SpatialCoordinate(self.grid.mesh) + u_n,
@@ -268,7 +279,7 @@ class BiotFEM:
         if self.fluid:
             content, flux = self._storage(F, u, J_n, p, p_n, q, dt, outlets)
             flux -= sum(dt * form_of("sources", source, **seen, q=q, p=scale * p) for source in sources)
-            residual += content * dx + flux
+            residual += around * content * dx + flux
             flux = _compat.compiled(flux)
         for plate, area in self._plates:
             axis, d = side(plate.side, self.grid.dim)[0], self.grid.dim
@@ -279,16 +290,33 @@ class BiotFEM:
             value = self._constant(0.0 if isinstance(load, Pressure) else np.zeros(self.grid.dim))
             given.append((partial(self._traction, load), value))
             if isinstance(load, Pressure):
-                along = ufl.diff(J, F) * ufl.FacetNormal(self.grid.mesh)
+                along = self._in_plane(ufl.diff(J, F)) * ufl.FacetNormal(self.grid.mesh)
                 residual += self._on(load, value / scale * ufl.inner(along, v))
             else:
                 dead.append(self._on(load, ufl.inner(value, v) / scale))
         if gravity is not None:
             given.append((partial(self._weight, gravity), weight := self._constant(np.zeros(self.grid.dim))))
-            dead.append(ufl.inner(weight, v) / scale * dx)
+            dead.append(around * ufl.inner(weight, v) / scale * dx)
         tangent = ufl.derivative(residual, space.w, ufl.TrialFunction(space.W))
         load = _compat.compiled(sum(dead)) if dead else None
         return Forms(_compat.compiled(residual), _compat.compiled(tangent), flux, load, dt, since, t, given)
+
+    def _grad(self, f):
+        """Return grad f, of a vector in axisymmetry (3, 3)."""
+        grad = ufl.grad(f)
+        if not (self.grid.axisymmetric and f.ufl_shape):
+            return grad
+        hoop = f[0] / ufl.SpatialCoordinate(self.grid.mesh)[0]
+        return ufl.as_matrix([[grad[0, 0], grad[0, 1], 0], [grad[1, 0], grad[1, 1], 0], [0, 0, hoop]])
+
+    def _deformation(self, u):
+        """Return F = I + grad u as UFL."""
+        F = ufl.Identity(self.grid.stretches) + self._grad(u)
+        return block(F) if self.grid.axisymmetric else F
+
+    def _in_plane(self, T):
+        """Return the components of a tensor along the axes of the grid."""
+        return ufl.as_matrix([[T[i, j] for j in (0, 1)] for i in (0, 1)]) if self.grid.axisymmetric else T
 
     def _storage(self, F, u, J_n, p, p_n, q, dt: fem.Constant, outlets: Sequence[Drained] | None):
         """Return the change of the content, weighted by q, and the flux in a time dt, s, as UFL."""
@@ -303,11 +331,12 @@ class BiotFEM:
             porosity = {"porosity": n, "porosity0": self._constant(law.porosity)}
             x = ufl.SpatialCoordinate(self.grid.mesh) + u
             k = call(law.conductivity_law, conductivity=k, F=F, J=J, x=x, **porosity)
-        kappa, pull = dt * self._constant(self.scale / self.fluid.unit_weight) * k, ufl.inv(F).T
+        kappa = dt * self._constant(self.scale / self.fluid.unit_weight) * k
+        pull = self._in_plane(ufl.inv(F).T)
         if outlets is not None:
             return content, self._two_point(kappa, J, pull, p, q, outlets)
         dx = ufl.dx(domain=self.grid.mesh, metadata={"quadrature_degree": 2 * self._space.degree})
-        return content, kappa * J * ufl.inner(pull * ufl.grad(p), pull * ufl.grad(q)) * dx
+        return content, self._around * kappa * J * ufl.inner(pull * ufl.grad(p), pull * ufl.grad(q)) * dx
 
     def _two_point(self, kappa, J, pull, p, q, outlets: Sequence[Drained]):
         """Return the two-point flux between cells and to drained sides, half a cell away, as UFL."""
@@ -316,7 +345,8 @@ class BiotFEM:
         across = sum(abs(normal[a]) * h[a] for a in range(self.grid.dim))
         dS = ufl.dS(domain=self.grid.mesh, metadata={"quadrature_degree": 2})
         harmonic = 2 * kappa("+") * kappa("-") / (kappa("+") + kappa("-") + 1e-300)
-        flux = harmonic * ufl.avg(stretch) / across("+") * ufl.jump(p) * ufl.jump(q) * dS
+        around = self._around("+") if self.grid.axisymmetric else 1.0
+        flux = around * harmonic * ufl.avg(stretch) / across("+") * ufl.jump(p) * ufl.jump(q) * dS
         for o in outlets:
             flux += self._on(o, 2 * kappa * stretch / across * (p - self._constant(o.pressure / self.scale)) * q)
         return flux

@@ -1,0 +1,30 @@
+# SPDX-License-Identifier: MIT
+"""Tensors whose third axis is principal: those of plane strain and of axisymmetry, whose third axis is the hoops'."""
+
+from __future__ import annotations
+
+import ufl
+
+
+def block(T):
+    """Return a UFL tensor (3, 3) of axisymmetry, written with zeros beside its third axis: `planar` sees these."""
+    return ufl.as_matrix([[T[0, 0], T[0, 1], 0], [T[1, 0], T[1, 1], 0], [0, 0, T[2, 2]]])
+
+
+def planar(F) -> bool:
+    """Return whether the third axis of a UFL deformation gradient is principal: it is (2, 2), or a `block`."""
+    if isinstance(F, ufl.classes.Variable):
+        F = F.ufl_operands[0]
+    if F.ufl_shape == (2, 2):
+        return True
+    if not isinstance(F, ufl.classes.ListTensor):
+        return False
+    beside = (F.ufl_operands[i].ufl_operands[j] for i, j in ((0, 2), (1, 2), (2, 0), (2, 1)))
+    return all(isinstance(part, ufl.classes.Zero) for part in beside)
+
+
+def embedded(F):
+    """Return a deformation gradient (3, 3): that of plane strain, or itself."""
+    if F.ufl_shape == (3, 3):
+        return F
+    return ufl.as_matrix([[F[0, 0], F[0, 1], 0], [F[1, 0], F[1, 1], 0], [0, 0, 1]])

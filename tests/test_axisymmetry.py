@@ -1,0 +1,306 @@
+# SPDX-License-Identifier: MIT
+"""Axisymmetric scenes: exact where stresses are even, of second order, and of the whole revolution."""
+
+from dataclasses import replace
+
+import cryer
+import footing
+import numpy as np
+import pytest
+from helpers import rates, refused_in_one_line
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
+from scipy.special import j0, j1, jn_zeros
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.points.cutting import cut, domain_volumes
+from mpm_dolfinx.verification.biot_fem import BiotFEM
+
+ELASTIC = mpm.NeoHookean(bulk=2e6, shear=1e6)
+LAME = ELASTIC.bulk - 2 * ELASTIC.shear / 3
+
+
+def plane(upper=(1.5, 1.5), cells=(7, 9), lower=None):
+    return mpm.Grid(upper, cells, lower, axisymmetric=True)
+
+
+def pressed(radial, axial, inner=0.0, upper=(1.03, 1.01), material=ELASTIC, **options):
+    """Return a cylinder, or a ring, on a smooth floor under pressures on its sides and its top, Pa."""
+    grid = options.pop("grid", None) or plane()
+    body = mpm.box(grid, [inner, 0], upper)
+    sides = ["right"] + ["left"] * (inner > 0)
+    loads = [mpm.Pressure(side, radial) for side in sides] + [mpm.Pressure("top", axial)]
+    return mpm.Simulation(grid, [body], [material], fixed={"bottom": "y"}, tractions=loads, **options)
+
+
+@pytest.mark.parametrize("inner", [0.0, 0.33])
+def test_even_stresses_are_exact_at_any_place_on_the_grid(inner):
+    s = pressed(1e5, 8e5, inner)
+    s.scene.scheme = replace(s.scene.scheme, tolerance=1e-12)
+    s.step(1.0)
+    stress = s.effective_stress()
+    exact = np.diag([-1e5, -8e5, -1e5])
+    assert np.abs(stress - exact).max() < 1e-8 * 8e5
+    assert np.abs(s.points.F[:, 0, 0] - s.points.F[:, 2, 2]).max() < 1e-10
+
+
+@pytest.mark.parametrize("inner", [0.0, 0.2])
+def test_a_body_that_is_blown_up_stretches_evenly(inner):
+    grid, pull = plane((2.2, 2.2), (13, 13)), lambda t: -6e5 * t
+    s = pressed(pull, pull, inner, (0.6, 1.0), grid=grid)
+    s.run(1, 0.1)
+    stretch = np.cbrt(s.points.J)
+    assert stretch[0] > 1.15
+    assert np.abs(s.points.F - stretch[0] * np.eye(3)).max() < 1e-9
+    volume = domain_volumes(s.points.corners, True)
+    assert volume == pytest.approx(s.points.volume0 * s.points.J, rel=1e-9)
+    assert volume.sum() == pytest.approx(np.pi * (0.36 - inner**2) * stretch[0] ** 3, rel=1e-9)
+
+
+def test_pieces_have_exact_moments_of_rings():
+    rng = np.random.default_rng(3)
+    grid = plane((1.0, 1.0), (5, 4), (0.1, 0.0))
+    box = np.array([[0, 0], [1, 0], [0, 1], [1, 1]])
+    corners = (
+        0.2
+        + 0.5 * rng.random((30, 1, 2))
+        + (0.05 + 0.2 * rng.random((30, 1, 1))) * (box + 0.2 * rng.random((30, 4, 2)))
+    )
+    pieces = cut(grid, corners)
+    index = np.stack(np.unravel_index(pieces.cell, grid.shape), axis=1)
+    x = grid.lower + (index + 0.5) * grid.h + pieces.hoop[:, :2]
+    volume = domain_volumes(corners, True)[pieces.point] * pieces.fraction
+    area = volume / (2 * np.pi * x[:, 0])
+    assert pieces.hoop[:, 3] == pytest.approx(x[:, 0], rel=1e-12)
+
+    def total(values):
+        return np.bincount(pieces.point, values, len(corners))
+
+    # over each domain by a rule on its two triangles
+    t = corners[:, [[0, 1, 3], [0, 2, 3]]]
+    size = np.abs(np.linalg.det(t[:, :, 1:] - t[:, :, :1])) / 2
+    nodes = (t.sum(axis=2, keepdims=True) + 3 * t) / 6  # of degree 2
+    offsets = pieces.hoop[:, 2] + 0 * area
+    middle = x - pieces.hoop[:, :2]
+    product = offsets + middle[:, 0] * x[:, 1] + middle[:, 1] * x[:, 0] - middle.prod(axis=1)
+    for mine, theirs in (
+        (area, lambda r, z: 1 + 0 * r),
+        (area * x[:, 0], lambda r, z: r),
+        (area * x[:, 1], lambda r, z: z),
+        (area * product, lambda r, z: r * z),
+        (area * x[:, 0] * pieces.x[:, 1], lambda r, z: r * z),
+        (area * x[:, 0] * pieces.x[:, 0], lambda r, z: r**2),
+    ):
+        exact = (theirs(nodes[..., 0], nodes[..., 1]).mean(axis=2) * size).sum(axis=1)
+        assert total(mine) == pytest.approx(exact, rel=1e-9)
+
+
+def widened(inner, outer, pressure):
+    """Return how far both sides of a cylinder of `ELASTIC` move under a pressure inside, in plane strain, m."""
+    G, ln = ELASTIC.shear, np.log
+
+    def radial(a, b):  # first Piola-Kirchhoff stress, of stretches a and b
+        return G * (a - 1 / a) + LAME * ln(a * b) / a
+
+    def slopes(R, y):
+        hoop = y[0] / R
+        along = brentq(lambda a: radial(a, hoop) - y[1], 0.2, 3, xtol=1e-14)
+        return [along, (radial(hoop, along) - y[1]) / R]
+
+    def at_inside(r):
+        return solve_ivp(slopes, (outer, inner), [r, 0.0], rtol=1e-10, atol=1e-10, method="DOP853").y[:, -1]
+
+    def miss(r):
+        inside, stress = at_inside(r)
+        return stress / pressure + inside / inner
+
+    r = brentq(miss, outer * 1.0001, outer * 1.3, xtol=1e-12)
+    return np.array([at_inside(r)[0] - inner, r - outer])
+
+
+def test_a_thick_cylinder_is_widened_as_the_exact_one_at_second_order():
+    """Its hole by half, at finite strain; elements of the reference agree to 1e-6."""
+    load, probes, errors = lambda t: 4e5 * t, [[0.5, 0.05], [1.0, 0.05]], []
+    exact = widened(0.5, 1.0, 4e5)
+    walls = {"bottom": "y", "top": "y"}
+    for cells in (4, 16):
+        h = 0.5 / cells
+        grid = plane((1.5, 2 * h), (3 * cells, 2))
+        body = mpm.box(grid, [0.5, 0], [1, 2 * h])
+        s = mpm.Simulation(grid, [body], [ELASTIC], fixed=walls, tractions=[mpm.Pressure("left", load)])
+        places = [[x, h] for x, _ in probes]
+        found = s.run(1, 0.25, probes=mpm.probes([body], places)).displacement[-1][:, 0]
+        errors.append(np.abs(found / exact - 1).max())
+    assert errors[1] < 3e-4 and rates(errors)[0] / 2 > 1.8
+    loads = [mpm.Pressure("left", load)]
+    fem = BiotFEM([0.5, 0], [1, 0.1], [8, 1], ELASTIC, fixed=walls, tractions=loads, axisymmetric=True)
+    assert fem.run(1, 0.5, probes=probes).displacement[-1][:, 0] == pytest.approx(exact, rel=1e-6)
+
+
+def test_a_cylinder_drains_to_its_side_as_the_exact_one_at_second_order():
+    """A stiff skeleton and soft water: p = sum 2 / (a J_1(a)) J_0(a r / R) exp(-a^2 T)."""
+    soil, water = mpm.Hencky(bulk=1e9, shear=1e9, conductivity=1e-5), mpm.Fluid(bulk=1e4)
+    mobility, T, errors = soil.conductivity / water.unit_weight, 0.1, []
+    a = jn_zeros(0, 30)
+    for cells in (6, 12, 24):
+        h = 1 / cells
+        grid, outer = plane((1 + 2 * h, 2 * h), (cells + 2, 2)), 1 + 0.4 * h
+        body, walls = mpm.box(grid, [0, 0], [outer, 2 * h]), {"bottom": "y", "top": "y"}
+        s = mpm.Simulation(
+            grid, [body], [soil], fluid=water, fixed=walls, drained=[mpm.Drained("right")], pressure=100.0
+        )
+        s.run(t := T * outer**2 * 0.4 / (mobility * water.bulk), t / 20)
+        decay, r = np.exp(-(a**2) * T), s.points.x[:, :1] / outer
+        p = 100 * (2 / (a * j1(a)) * j0(a * r) * decay).sum(axis=1)
+        out = 100 * 4 * np.pi * mobility * 2 * h * decay.sum()  # m^3/s through all of the side
+        errors.append((np.abs(s.points.pressure - p).max() / 100, abs(s.outflows[0] / out - 1)))
+    assert (np.array(errors[-1]) < (2e-3, 6e-3)).all() and (rates(np.array(errors)) > 1.8).all()
+
+
+def test_cryers_sphere_needs_a_quarter_disc():
+    errors, _ = cryer.run(12, 24, axisymmetric=True)
+    assert errors["peak"] < 0.01 and errors["curve"] < 0.015
+
+
+@pytest.mark.slow
+def test_cryers_sphere_peaks_within_half_a_percent():
+    errors, _ = cryer.run(40, 100, axisymmetric=True)
+    assert errors["peak"] < 0.005
+
+
+@pytest.mark.slow
+def test_a_rough_circular_footing_carries_what_limit_analysis_says():
+    """On Tresca's soil 6.05 c (Cox, Eason and Hopkins 1961)."""
+    coarse, fine = (footing.limit_load("circular", cells).load for cells in (9, 17))
+    assert -0.03 < fine[-1] - 1 < 0 and coarse[-1] < fine[-1]
+    assert fine[-1] / fine[30] < 1.002  # it flows
+
+
+@pytest.mark.parametrize(
+    "material, confinement",
+    [
+        (mpm.MohrCoulomb(bulk=2e7, shear=1e7, friction=30, dilation=5, cohesion=1e3), 1e5),
+        (mpm.ModifiedCamClay(M=1.2, lambda_=0.07, kappa=0.015, shear=3e6, initial_stress=(-1e5,) * 3, OCR=1.5), 0.0),
+    ],
+)
+def test_laws_with_a_state_see_the_hoops(material, confinement):
+    """A triaxial test of a cylinder is that of a point; its strain is given at the top, to 1e-6."""
+    s = pressed(1e5, 1e5, 0.0, (0.038, 0.1), material, grid=plane((0.05, 0.12), (3, 8)))
+    s.step(1.0)
+    height, bottom = s.points.corners[:, :, 1].max(), s.state.stage.conditions["tractions"][:1]
+    push = mpm.Displacement("top", lambda t, X: (0, height * np.exp(-0.05 * (t - 1)) - 0.1), "y")
+    s.stage(tractions=bottom, displacements=[push])
+    s.run(2.0, 0.1)
+    exact = mpm.element_test(material, "triaxial drained", 0.05, steps=10, confinement=confinement)
+    fields = s.point_fields()
+    assert fields.deviatoric_stress == pytest.approx(exact.q[-1], rel=3e-6)
+    assert fields.mean_effective_stress == pytest.approx(exact.p[-1], rel=3e-6)
+    area = np.pi * (0.038 * s.points.F[0, 0, 0]) ** 2
+    assert -s.reactions[0, 1] == pytest.approx((exact.q[-1] + 1e5) * area, rel=1e-5)
+
+
+@pytest.mark.parametrize("bulk", [2e6, 1e8])
+def test_a_body_carried_along_its_axis_over_ten_cells_is_at_rest(bulk):
+    grid, soil = plane((1.0, 3.0), (8, 24)), mpm.Hencky(bulk=bulk, shear=1e6, conductivity=1e-4)
+    body, carried = mpm.box(grid, [0, 0.1], [0.7, 0.9]), mpm.Displacement("bottom", lambda t, X: (0, 1.25 * t), "y")
+    water = {"fluid": mpm.Fluid(), "drained": [mpm.Drained("top")]}
+    s = mpm.Simulation(grid, [body], [soil], fixed={}, displacements=[carried], **water)
+    s.run(1, 0.2)
+    assert s.points.corners[:, :, 1].max() == pytest.approx(0.9 + 1.25)
+    assert np.abs(s.effective_stress()).max() < 1e-8 * soil.shear
+
+
+def footed(folder, steps):
+    """Return a run of soil under a circular footing, under its own weight, by a checkpoint half way or without."""
+    grid = plane((1.0, 1.5), (8, 12))
+    body, sand = mpm.box(grid, [0, 0], [0.7, 1.2]), mpm.DruckerPrager(bulk=2e7, shear=1e7, conductivity=1e-6, **WEAK)
+    load = mpm.Traction("top", lambda t: (0, -1e5 * t), region=((0, 0), (0.35, 9)))
+    sides = [mpm.Drained("top"), mpm.Drained("right")]
+    options = {"fluid": mpm.Fluid(), "gravity": (0, -9.81), "tractions": [load], "drained": sides}
+    s = mpm.Simulation(grid, [body], [sand], fixed={"bottom": "xy"}, **options)
+    file = folder / "run.ckpt"
+    after = mpm.resume(s, file) if file.exists() else None
+    s.run(0.1 * steps, 0.1, after=after, checkpoint=mpm.Checkpoint(file) if steps == 2 else None)
+    return s
+
+
+WEAK = {"friction": 20, "dilation": 0, "cohesion": 2e4}
+
+
+def test_a_run_goes_on_from_a_checkpoint_with_the_same_bits_and_keeps_its_water(tmp_path):
+    whole = footed(tmp_path, 4)
+    footed(tmp_path, 2)
+    resumed = footed(tmp_path, 4)
+    assert whole.result.balance < 1e-8 and whole.points.data["hardened"].max() > 1e-4
+    for name in ("F", "corners", "pressure"):
+        assert np.array_equal(getattr(whole.points, name), getattr(resumed.points, name))
+    with pytest.raises(ValueError, match="axisymmetric: True there, None here"):
+        grid = mpm.Grid([1.0, 1.5], [8, 12])
+        body = mpm.box(grid, [0, 0], [0.7, 1.2])
+        sand = mpm.DruckerPrager(bulk=2e7, shear=1e7, conductivity=1e-6, **WEAK)
+        flat = mpm.Simulation(grid, [body], [sand], fluid=mpm.Fluid(), fixed={"bottom": "xy"}, gravity=(0, -9.81))
+        mpm.resume(flat, tmp_path / "run.ckpt")
+
+
+def test_the_hoops_carry_what_the_radii_do_at_the_axis_at_second_order():
+    errors = []
+    for cells in (8, 16):
+        h = 1 / cells
+        grid = plane((1 + h, 1 + 2 * h), (cells + 1, cells + 2))
+        body = mpm.box(grid, [0, 0], [1, 1 + 0.3 * h])
+        load = mpm.Traction("top", lambda t, X: np.stack([0 * X[:, 0], -3e5 * np.exp(-4 * X[:, 0] ** 2)], axis=1))
+        s = mpm.Simulation(grid, [body], [ELASTIC], fixed={"bottom": "xy", "right": "x"}, tractions=[load])
+        s.run(1, 0.5)
+        stress = s.point_fields().stress
+        off = np.abs(stress[:, 0, 0] - stress[:, 2, 2])[s.points.x[:, 0] < 0.3 * h]
+        errors.append(off.max() / np.abs(stress).max())
+    assert errors[1] < 1e-3 and rates(errors)[0] > 1.8
+
+
+def test_water_under_a_load_flows_as_in_finite_elements():
+    soil, load = replace(ELASTIC, conductivity=1e-6), mpm.Traction("top", (0, -1e5), region=((0, -9), (0.5, 9)))
+    common = {"fluid": mpm.Fluid(), "fixed": {"left": "x", "right": "x", "bottom": "y"}, "tractions": [load]}
+    common["drained"] = [mpm.Drained("top")]
+    probes = [[0, 0.5], [1, 1.0]]
+    fem = BiotFEM([0, 0], [1, 1], [16, 16], soil, axisymmetric=True, **common)
+    truth = np.array(fem.run(20, 2, probes=probes).displacement)[:, :, 1]
+    grid = plane((1.0, 1.125), (16, 18))
+    body = mpm.box(grid, [0, 0], [1, 1])
+    s = mpm.Simulation(grid, [body], [soil], **common)
+    found = np.array(s.run(20, 2, probes=mpm.probes([body], probes)).displacement)[:, :, 1]
+    assert found[2:] == pytest.approx(truth[2:], rel=0.02)
+
+
+def hole(radius, caplog):
+    grid = plane((1.0, 1.0), (10, 10))
+    body = mpm.box(grid, [radius, 0], [0.5, 0.5])
+    mpm.Simulation(grid, [body], [ELASTIC], fixed={"bottom": "y"})
+    return "narrower than a cell" in caplog.text
+
+
+def test_a_hole_narrower_than_a_cell_is_warned_of(caplog):
+    assert not hole(0.0, caplog) and not hole(0.1, caplog)
+    assert hole(0.04, caplog)
+
+
+def scene(**options):
+    grid = options.pop("grid", None) or plane()
+    body = mpm.box(grid, [0, 0], [1, 1])
+    return mpm.Simulation(grid, [body], [ELASTIC], **{"fixed": {"bottom": "y"}, **options})
+
+
+@pytest.mark.parametrize(
+    "make, name, value",
+    [
+        (lambda: mpm.Grid([1, 1, 1], [2, 2, 2], axisymmetric=True), "axisymmetric", "3"),
+        (lambda: mpm.Grid([1, 1], [2, 2], [-0.5, 0], axisymmetric=True), "axisymmetric", "-0.5"),
+        (lambda: mpm.Grid([1, 1], [2, 2], axisymmetric=1), "axisymmetric", "1"),
+        (lambda: scene(quadrature="point"), "quadrature", "point"),
+        (lambda: scene(gravity=(1, -9.81)), "gravity", "1"),
+        (lambda: scene(gravity=lambda t: (t, 0)).step(1.0), "gravity", "1"),
+        (lambda: scene(tractions=[mpm.Traction("left", (1, 0))]), "Traction", "axis"),
+        (lambda: scene(fixed={}).step(1.0), "fixed", "1 of 1"),
+    ],
+)
+def test_what_axisymmetry_does_not_allow_is_refused_in_one_line(make, name, value):
+    refused_in_one_line(make, name, value, None, 250)
