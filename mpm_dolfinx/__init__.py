@@ -16,6 +16,7 @@ from mpm_dolfinx import _environment  # noqa: F401 - first: it says what is miss
 from mpm_dolfinx.constitutive.cam_clay import ModifiedCamClay
 from mpm_dolfinx.constitutive.drucker_prager import DruckerPrager
 from mpm_dolfinx.constitutive.element_test import ElementTest, element_test
+from mpm_dolfinx.constitutive.initial_stress import K0, hydrostatic
 from mpm_dolfinx.constitutive.mohr_coulomb import MohrCoulomb
 from mpm_dolfinx.constitutive.skeleton import (
     LAWS,
@@ -45,6 +46,7 @@ from mpm_dolfinx.state import State
 __version__ = "0.1.0"
 __all__ = [
     "COUPLINGS",
+    "K0",
     "LAWS",
     "Checkpoint",
     "Displacement",
@@ -74,6 +76,7 @@ __all__ = [
     "box",
     "element_test",
     "from_mesh",
+    "hydrostatic",
     "kozeny_carman",
     "mapped",
     "polygon",

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, replace
 from functools import cached_property, partial
 from typing import Any
@@ -18,6 +18,7 @@ from mpm_dolfinx.advance import Motion
 from mpm_dolfinx.caching import Latest
 from mpm_dolfinx.constitutive.evaluate import ConductivityAtPieces
 from mpm_dolfinx.constitutive.fields import SceneMaterials
+from mpm_dolfinx.constitutive.initial_stress import InitialStresses
 from mpm_dolfinx.constitutive.skeleton import Fluid, Skeleton
 from mpm_dolfinx.constitutive.user_functions import compiling
 from mpm_dolfinx.points.bodies import Body, material_points
@@ -51,7 +52,9 @@ class Scene:
     weighs
         Whether there is gravity.
     pressure
-        Pore pressure at the start, Pa.
+        Pore pressure at the start, Pa, or a function of places.
+    initial
+        Stresses of bodies as seeded, see `initial_state.by_body`.
     """
 
     def __init__(
@@ -64,12 +67,15 @@ class Scene:
         scheme: Scheme,
         method: str,
         weighs: bool,
-        pressure: float,
+        pressure: float | Callable,
         terms: Sequence[Callable],
         sources: Sequence[Callable],
+        initial: Mapping[int, Any],
     ):
         self.grid, self.bodies, self.fluid, self.quadrature = grid, tuple(bodies), fluid, quadrature
-        self.materials = scene = SceneMaterials(grid, materials, bodies, material_points(grid, bodies, pressure), fluid)
+        self.initial = InitialStresses(self.bodies, initial, pressure)
+        seeded = material_points(grid, bodies, pressure)
+        self.materials = scene = SceneMaterials(grid, materials, bodies, seeded, fluid, bool(initial))
         self.gravity = fem.Constant(grid.mesh, np.zeros(grid.dim)) if weighs else None
         self.t, self.dt = fem.Constant(grid.mesh, 0.0), fem.Constant(grid.mesh, 1.0)
         """Time at the end of the substep, and since the start of the step, s, for forms."""
