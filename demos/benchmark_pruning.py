@@ -156,6 +156,7 @@ PAIRS: dict[str, tuple[Make, Make]] = {
     "layers off the grid lines": (partial(layered, off=0.0), partial(layered, off=0.5)),
     "second order in time": (lambda n: draining(n, method="backward-euler"), draining),
     "body force": (block, lambda n: block(n, gravity=(0, 0))),
+    "initial stress": (block, lambda n: block(n, initial_stress=lambda x: np.zeros((len(x), 3)))),
     "pressure that follows the surface": (
         block,
         lambda n: block(n, tractions=[mpm.Pressure("top", lambda t: LOAD * t)]),

@@ -16,6 +16,7 @@ from mpm_dolfinx import _environment  # noqa: F401 - first: it says what is miss
 from mpm_dolfinx.constitutive.cam_clay import ModifiedCamClay
 from mpm_dolfinx.constitutive.drucker_prager import DruckerPrager
 from mpm_dolfinx.constitutive.element_test import ElementTest, element_test
+from mpm_dolfinx.constitutive.initial_stress import K0, hydrostatic
 from mpm_dolfinx.constitutive.mohr_coulomb import MohrCoulomb
 from mpm_dolfinx.constitutive.skeleton import (
     LAWS,
@@ -47,6 +48,7 @@ from mpm_dolfinx.strength_reduction import Safety, factor_of_safety
 __version__ = "0.1.0"
 __all__ = [
     "COUPLINGS",
+    "K0",
     "LAWS",
     "Checkpoint",
     "Displacement",
@@ -79,6 +81,7 @@ __all__ = [
     "element_test",
     "factor_of_safety",
     "from_mesh",
+    "hydrostatic",
     "kozeny_carman",
     "mapped",
     "polygon",

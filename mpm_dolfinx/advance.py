@@ -98,7 +98,8 @@ class Motion:
                 own = on_grid.pressures_up_to_surface(self._reconstruction, state.stage, t)
                 points, ids = replace(points, pressure=cut.mean(own)), points.id[cut.pieces.point]
             _check_inside(cut, points, t)
-        new = replace(state, t=t, points=points, transported=None, stay=Stay(cut.points, ids, pressure, x, start))
+        stay, held = Stay(cut.points, ids, pressure, x, start), state.held if serves else None
+        new = replace(state, t=t, points=points, transported=None, stay=stay, held=held)
         return new if serves and stays else self.left_grid(new, on_grid), folded
 
     def _deformed(self, cut: CutDomains, data: QuadratureData, nodal: NDArray[np.float64]) -> NDArray[np.float64]:

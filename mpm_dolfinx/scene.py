@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, replace
 from functools import cached_property, partial
 from typing import Any
@@ -18,6 +18,7 @@ from mpm_dolfinx.advance import Motion
 from mpm_dolfinx.caching import Latest
 from mpm_dolfinx.constitutive.evaluate import ConductivityAtPieces
 from mpm_dolfinx.constitutive.fields import SceneMaterials
+from mpm_dolfinx.constitutive.initial_stress import InitialStresses
 from mpm_dolfinx.constitutive.skeleton import Fluid, Skeleton
 from mpm_dolfinx.constitutive.user_functions import compiling
 from mpm_dolfinx.points.bodies import Body, material_points
@@ -34,7 +35,7 @@ from mpm_dolfinx.problems.smeared import warn_smeared
 from mpm_dolfinx.problems.stage import Stage
 from mpm_dolfinx.problems.storage import StorageForms
 from mpm_dolfinx.solve.scheme import Scheme
-from mpm_dolfinx.time_integration import substeps
+from mpm_dolfinx.time_integration import Substep, substeps
 
 
 class Scene:
@@ -51,7 +52,9 @@ class Scene:
     weighs
         Whether there is gravity.
     pressure
-        Pore pressure at the start, Pa.
+        Pore pressure at the start, Pa, or a function of places.
+    initial
+        Stresses of bodies as seeded, see `initial_state.by_body`.
     """
 
     def __init__(
@@ -64,12 +67,15 @@ class Scene:
         scheme: Scheme,
         method: str,
         weighs: bool,
-        pressure: float,
+        pressure: float | Callable,
         terms: Sequence[Callable],
         sources: Sequence[Callable],
+        initial: Mapping[int, Any],
     ):
         self.grid, self.bodies, self.fluid, self.quadrature = grid, tuple(bodies), fluid, quadrature
-        self.materials = scene = SceneMaterials(grid, materials, bodies, material_points(grid, bodies, pressure), fluid)
+        self.initial = InitialStresses(self.bodies, initial, pressure)
+        seeded = material_points(grid, bodies, pressure)
+        self.materials = scene = SceneMaterials(grid, materials, bodies, seeded, fluid, bool(initial))
         self.gravity = fem.Constant(grid.mesh, np.zeros(grid.dim)) if weighs else None
         self.t, self.dt = fem.Constant(grid.mesh, 0.0), fem.Constant(grid.mesh, 1.0)
         """Time at the end of the substep, and since the start of the step, s, for forms."""
@@ -91,8 +97,9 @@ class Scene:
             self.storage = StorageForms(pieces, u, p, weight, symmetric, scene.conducts, law, sources, self.t)
         self.extensions = terms, sources
         """The user's terms and sources."""
-        self.method, self.substeps = method, substeps(method, self.flows or self.momentum.rates)
-        """Of time integration, and its substeps in a step."""
+        self.method = method
+        """Of time integration."""
+        substeps(method, True)  # refuses what is none
         self.motion = Motion(scene, bodies, self.momentum, self.storage)
         # what is still to be looked for, to be warned of once, of which nothing but the log knows
         self._looked_for = [warn_overfilled, *[partial(warn_smeared, materials=scene)] * scene.uneven]
@@ -104,6 +111,11 @@ class Scene:
     def flows(self) -> bool:
         """Whether fluid moves, or is brought by sources."""
         return self.storage is not None and (self.materials.conducts or bool(self.storage.sources))
+
+    @property
+    def substeps(self) -> tuple[Substep, ...]:
+        """Substeps of a step."""
+        return substeps(self.method, self.flows or self.momentum.rates)
 
     def set_time(self, t: float, dt: float, gravity: NDArray[np.float64] | None) -> None:
         """Set what forms see of a substep: time, and time since the start of the step, s; gravity (d,), m/s^2."""

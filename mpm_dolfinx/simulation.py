@@ -11,14 +11,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.cell_fields import CellFields, cell_fields
+from mpm_dolfinx.constitutive.initial_stress import InitialStress, by_body
 from mpm_dolfinx.constitutive.skeleton import Fluid, Skeleton
 from mpm_dolfinx.errors import StepFailed
+from mpm_dolfinx.initial_state import balanced
 from mpm_dolfinx.io import summary
 from mpm_dolfinx.point_fields import PointFields, point_fields
 from mpm_dolfinx.points.bodies import Body, check_bodies
 from mpm_dolfinx.points.grid import Grid
 from mpm_dolfinx.points.material_points import MaterialPoints
-from mpm_dolfinx.problems.axis import warn_narrow_hole
+from mpm_dolfinx.problems.axis import check_axisymmetry
 from mpm_dolfinx.problems.conditions import Displacement, Drained, Inflow, Pressure, RigidPlate, Traction
 from mpm_dolfinx.problems.thin import warn_thin
 from mpm_dolfinx.result import Report, Result
@@ -52,8 +54,12 @@ class Simulation:
     gravity : (d,) or callable t -> (d,), m/s^2
         Acceleration of gravity.
     pressure
-        Pore pressure at the start, Pa, the same everywhere; needs a fluid.  A hydrostatic one comes from a first
-        stage with gravity that is long enough to drain.
+        Pore pressure at the start, Pa, needs a fluid: a number, or a function of places x (n, d) as of `hydrostatic`.
+    initial_stress
+        Effective stress at the start, tension positive: `K0`, a function of places x (n, d) that gives normal stresses
+        (n, 3) or tensors (n, 3, 3), Pa, or one of these for each of some bodies, {index: ...}; of fills too, which
+        otherwise have none.  It is brought into balance with what acts at the start, at the pore pressures given,
+        so that a first step in which nothing changes moves nothing.
     quadrature
         "domain": exact pieces of the points' domains; "point": at the points, as in standard MPM.
     coupling, tolerance
@@ -93,7 +99,8 @@ class Simulation:
         inflows: Sequence[Inflow] = (),
         plates: Sequence[RigidPlate] = (),
         gravity: ArrayLike | Callable[[float], ArrayLike] | None = None,
-        pressure: float = 0.0,
+        pressure: float | Callable[[NDArray], ArrayLike] = 0.0,
+        initial_stress: InitialStress | Mapping[int, InitialStress] | None = None,
         quadrature: str = "domain",
         coupling: str = "schur-cg",
         tolerance: float = 1e-8,
@@ -106,13 +113,11 @@ class Simulation:
             raise ValueError(f"quadrature {quadrature!r}: must be domain or point")
         scheme = Scheme(coupling, tolerance)
         instance("grid", grid, Grid)
-        if grid.axisymmetric and quadrature == "point":
-            raise ValueError("quadrature 'point': must be domain in axisymmetry")
         all_of("bodies", bodies, Body, 1)
         all_of("materials", materials, Skeleton, 1)
         if fluid is not None:
             instance("fluid", fluid, Fluid)
-        elif numbers("pressure", pressure):
+        elif callable(pressure) or numbers("pressure", pressure):
             raise ValueError(f"pressure = {line(pressure)}: needs a fluid")
         elif sources:
             raise ValueError("sources need a fluid")
@@ -122,13 +127,16 @@ class Simulation:
         functions("sources", sources)
         grid.share(np.concatenate([body.centre for body in bodies]))
         warn_thin(grid, bodies, fixed)
-        warn_narrow_hole(grid, bodies)
+        check_axisymmetry(grid, bodies, quadrature, initial_stress)
         began, weighs = time.perf_counter(), gravity is not None
         options = (quadrature, scheme, method, weighs, pressure, terms, sources)
-        self.scene = Scene(grid, bodies, materials, fluid, *options)
+        initial = by_body(initial_stress, bodies, later)
+        self.scene = Scene(grid, bodies, materials, fluid, *options, initial)
         conditions = {"fixed": fixed, "tractions": tractions, "displacements": displacements, "drained": drained}
         conditions |= {"inflows": inflows, "plates": plates, "gravity": gravity}
         self.state = first_state(self.scene, conditions, later)
+        if initial:
+            self.state = balanced(self.scene, self.state)
         self.jit = time.perf_counter() - began
         """Seconds spent on compiling or finding the forms."""
 

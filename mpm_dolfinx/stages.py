@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mpm_dolfinx.initial_state import pieces_at_start
 from mpm_dolfinx.parallel.messages import warn
 from mpm_dolfinx.points.bodies import Body
 from mpm_dolfinx.points.contact import check_apart
@@ -25,15 +26,18 @@ from mpm_dolfinx.validation import chosen, flag, line, numbers
 
 
 def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int]) -> State:
-    """Return the state of a scene at rest, in its first stage."""
+    """Return the state of a scene at rest, in its first stage; its stresses as given, not yet in balance."""
     present = [body not in later for body in range(len(scene.bodies))]
     check_apart(scene.grid, scene.bodies, present)
     begun = _stage(scene, conditions, present, later)
     points = scene.materials.seeded.of(_ids(scene.bodies, later), kept=False)
-    transported = at_start(points) if scene.fluid else None
+    points = scene.initial.of(scene.materials, points, present, begun.gravity_at(0.0))
+    transported = None
+    if scene.fluid:
+        transported = pieces_at_start(scene, points) if callable(scene.initial.pressure) else at_start(points)
     reactions = np.zeros((len(begun.mechanical.holds), scene.grid.dim))
     outflows = np.zeros(len(begun.hydraulic.outlets))
-    return State(0.0, points, transported, None, 0, reactions, outflows, begun, True, None, None)
+    return State(0.0, points, transported, None, 0, reactions, outflows, begun, True, None, None, None)
 
 
 def begin_stage(
@@ -61,10 +65,11 @@ def begin_stage(
         state = scene.motion.left_grid(state, scene.on_grid(state.stay.points))
     gone, transported = _ids(scene.bodies, remove), state.transported
     there = [body for body, here in enumerate(before.present) if here and body not in remove]
-    points, new = _filled(scene, state.points.of(gone, kept=False), there, add)
+    gravity = begun.gravity_at(state.t)
+    points, new = _filled(scene, state.points.of(gone, kept=False), there, add, gravity)
     if transported is not None:
         transported = transported.of(gone, kept=False).joined(at_start(new))
-    points = _changed(points, fields)
+    points = _changed(scene, points, fields)
     if reset_displacement:
         points = replace(points, origin=points.corners)
     unknown, new = np.nan if state.resets else 0.0, {}
@@ -72,6 +77,8 @@ def begin_stage(
         new["reactions"] = np.full((len(begun.mechanical.holds), scene.grid.dim), unknown)
     if named.keys() & {"drained", "inflows"}:
         new["outflows"] = np.full(len(begun.hydraulic.outlets), unknown)
+    if add or remove:
+        new["held"] = None
     return replace(state, points=points, transported=transported, stage=begun, begins=True, **new)
 
 
@@ -95,7 +102,7 @@ def _warn_moved_on(scene: Scene, before: Stage, begun: Stage, kept: Sequence[str
 
 
 def _filled(
-    scene: Scene, points: MaterialPoints, there: Sequence[int], add: Sequence[int]
+    scene: Scene, points: MaterialPoints, there: Sequence[int], add: Sequence[int], gravity: NDArray | None
 ) -> tuple[MaterialPoints, MaterialPoints]:
     """Return the points with those of bodies that come, and these alone; what lies on another comes after it."""
     there, waiting, new = list(there), list(add), scene.materials.seeded.of(_ids(scene.bodies, []))
@@ -103,6 +110,9 @@ def _filled(
         fill = next((body for body in waiting if touches(scene.bodies, there, body)), waiting[0])
         placed = scene.materials.seeded.of(_ids(scene.bodies, [fill]))
         placed = put(scene.grid, scene.bodies, there, fill, points, placed)
+        placed = scene.initial.of(
+            scene.materials, placed, [i in (*there, *add) for i in range(len(scene.bodies))], gravity
+        )
         points, new = points.joined(placed), new.joined(placed)
         there.append(fill)
         waiting.remove(fill)
@@ -115,10 +125,14 @@ def _ids(bodies: Sequence[Body], chosen: Sequence[int]) -> NDArray[np.int64]:
     return np.concatenate([np.empty(0, np.int64), *(np.arange(stop[i] - len(bodies[i]), stop[i]) for i in chosen)])
 
 
-def _changed(points: MaterialPoints, fields: Mapping[str, ArrayLike]) -> MaterialPoints:
+def _changed(scene: Scene, points: MaterialPoints, fields: Mapping[str, ArrayLike]) -> MaterialPoints:
     """Return points with new values of some of their data."""
     data = dict(points.data)
     for name, value in fields.items():
+        if name not in data and name in scene.materials.constants:
+            law, value = type(scene.materials.constants[name]).__name__, getattr(scene.materials.constants[name], name)
+            allowed = f"given to it as a function of place, lambda X: np.full(len(X), {value}), to be changed"
+            raise ValueError(f"stage: fields: {name!r}: a constant of {law}, must be {allowed}")
         new, what = numbers(f"stage: fields: {name}", value, None, allowed="finite numbers"), f"stage: fields: {name!r}"
         if name in data and new.shape == data[name].shape[1:]:
             new = np.broadcast_to(new, data[name].shape)

@@ -73,6 +73,9 @@ class State:
     velocity : (unknowns,), m/s
         Of the nodes of this process in the last step, ghosts included: where Newton's method may begin in soil that
         yields.  None before the first step, and without such soil.
+    held : (unknowns,), N
+        Forces on the nodes of this process, ghosts included, that hold what the scheme's error leaves out of balance of
+        an initial stress; None without, and from when the bodies have moved so far that the grid is reset.
     result
         Histories of the last run, None before the first one.
     """
@@ -87,6 +90,7 @@ class State:
     stage: Stage
     begins: bool
     velocity: NDArray[np.float64] | None
+    held: NDArray[np.float64] | None
     result: Result | None
 
     def migrated(self, destination: NDArray[np.int32], comm: MPI.Intracomm) -> State:

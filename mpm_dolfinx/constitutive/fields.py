@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.constitutive.evaluate import LawAtPoints, SoftnessAtPoints, mean_size, sampled
+from mpm_dolfinx.constitutive.prestressed import AT_REST, stressed
 from mpm_dolfinx.constitutive.skeleton import BY_SCENE, Fluid, Skeleton
 from mpm_dolfinx.errors import NotConverged
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData
@@ -45,6 +46,8 @@ class SceneMaterials:
         The points of this process, as seeded.
     fluid
         Pore fluid, if there is one.
+    prestressed
+        Whether points may have a stress as seeded.
     """
 
     def __init__(
@@ -54,8 +57,10 @@ class SceneMaterials:
         bodies: Sequence[Body],
         points: MaterialPoints,
         fluid: Fluid | None,
+        prestressed: bool = False,
     ):
-        self._grid, self.materials, self._fluid = grid, materials, fluid
+        materials = [stressed(m, grid.dim) for m in materials] if prestressed else materials
+        self.grid, self.materials, self._fluid = grid, materials, fluid
         seeded: dict[str, NDArray[np.float64]] = {}
         X, index = _reference(bodies, len(materials))
         self._used = np.unique(index).tolist()  # a material that no body is of changes nothing
@@ -78,8 +83,10 @@ class SceneMaterials:
             for moduli in ([m.oedometric for m in evaluated], [m.shear for m in evaluated])
         )
         """Whether points differ in stiffness by more than a factor of two."""
-        self.conducts = any(m.conductivity_law or np.any(np.asarray(m.conductivity) > 0) for m in evaluated)
-        """Whether fluid flows anywhere."""
+        self.conducts = any(m.conductivity_law or np.any(np.asarray(m.conductivity) > 0) for m in evaluated) or any(
+            callable(m.conductivity) for m in used
+        )
+        """Whether fluid flows anywhere, or may in a later stage."""
         conductivity = np.concatenate([np.ravel(m.conductivity) for m in evaluated])
         by_place = any(callable(m.conductivity) for m in materials) or any(map(_names_place, self.conductivity_laws))
         self.layered = by_place or len({m.conductivity_law for m in used}) > 1 or bool(np.ptp(conductivity))
@@ -104,6 +111,8 @@ class SceneMaterials:
                 everywhere[rows] = value
                 mine = everywhere[points.id]
                 seeded[name] = mine + seeded[name] if name in seeded else mine
+        if prestressed and "plastic" in seeded:
+            seeded["plastic" + AT_REST] = seeded["plastic"]
         self._softness: dict[int, SoftnessAtPoints] = {}
         if fluid is not None and self.evolves:
             seeded["softness"] = np.ones(len(points))
@@ -129,7 +138,7 @@ class SceneMaterials:
             raise ValueError(f"{law.__name__}: has {has}, must have unknowns and one of these, or neither")
         if taken := [name for name in (*_names(m), *law.state) if name in BY_SCENE]:
             raise ValueError(f"{law.__name__}: the name {taken[0]!r} is taken; parameters and state must have another")
-        m.check_cells(mean_size(self._grid))
+        m.check_cells(mean_size(self.grid))
         for name in law.parameters:
             if not hasattr(m, name):
                 known = ", ".join([*_names(m), *law.state])
@@ -142,7 +151,7 @@ class SceneMaterials:
             seeded[name] = np.tile(value, (count, *[1] * value.ndim))
 
     def _set_shape(self, law, name: str, shape: tuple[int, ...]) -> None:
-        if name in RESERVED or hasattr(FormPoints(self._grid), name):
+        if name in RESERVED or hasattr(FormPoints(self.grid), name):
             raise ValueError(f"{law.__name__}: the name {name!r} is taken; parameters and state must have another")
         other = self.shapes.setdefault(name, shape)
         if other != shape:
@@ -164,6 +173,10 @@ class SceneMaterials:
     def part_of(self, points: MaterialPoints) -> NDArray[np.int64]:
         """Return the number of each point's part (n,), see `parts`."""
         return self._part[points.material]
+
+    def law_of(self, points: MaterialPoints) -> NDArray[np.int64]:
+        """Return the number of each point's law (n,)."""
+        return self._law[points.material]
 
     def locking(self, points: MaterialPoints) -> NDArray[np.bool_]:
         """Return at which points (n,) Q1 cells would lock."""
@@ -208,6 +221,11 @@ class SceneMaterials:
         return out
 
     @property
+    def constants(self) -> dict[str, Skeleton]:
+        """Names of the constants of materials, each with a material that has it."""
+        return {name: self.materials[i] for i in self._used for name in _names(self.materials[i])}
+
+    @property
     def field_names(self) -> list[str]:
         """Names of the constants of materials that differ from place to place."""
         return list(dict.fromkeys(name for i in self._used for name in self._fields[i]))
@@ -230,6 +248,11 @@ class SceneMaterials:
         """Return the storage coefficient at the points (n,), 1/Pa, of a scene with fluid."""
         return self.table(points, lambda m, n: m.storage(self._fluid.bulk, n), self.porosity(points))
 
+    def density(self, points: MaterialPoints) -> NDArray[np.float64]:
+        """Return the density of soil and pore fluid at the points (n,), kg/m^3."""
+        n, wet = self.porosity(points), self._fluid.density if self._fluid else 0.0
+        return (1 - n) * self.table(points, lambda m: m.grain_density) + n * wet
+
     def confined_modulus(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return what resists where neither skeleton nor pore fluid can give way (n,), Pa: lambda + 2G + alpha^2 / S.
 
@@ -247,11 +270,12 @@ class SceneMaterials:
 
     def evolved(self, points: MaterialPoints) -> NDArray[np.bool_]:
         """Return at which points (n,) the state of a law is no longer that at rest."""
-        out, law_of = np.zeros(len(points), dtype=bool), self._law[points.material]
+        out, law_of = np.zeros(len(points), dtype=bool), self.law_of(points)
         for number, law in enumerate(self.laws):
             rows = np.flatnonzero(law_of == number)
             for name, at_rest in law.state.items():
-                off = np.abs(points.data[name][rows] - np.asarray(at_rest))
+                rest = points.data[name + AT_REST][rows] if name + AT_REST in points.data else at_rest
+                off = np.abs(points.data[name][rows] - np.asarray(rest))
                 out[rows] |= off.max(axis=tuple(range(1, off.ndim)), initial=0.0) > EVOLVED
         return out
 
@@ -275,7 +299,7 @@ class SceneMaterials:
     def total_stress(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the Cauchy stress of skeleton and fluid, Pa, as `effective_stress`; on all processes together."""
         pressure = self.table(points, lambda m: m.biot) * points.pressure
-        return self.effective_stress(points) - pressure[:, None, None] * np.eye(self._grid.stretches)
+        return self.effective_stress(points) - pressure[:, None, None] * np.eye(self.grid.stretches)
 
     def updated_state(
         self, points: MaterialPoints, before: MaterialPoints, dt: float
@@ -293,7 +317,7 @@ class SceneMaterials:
         new = [(law.law, rows, name, v) for law, rows, at in placed for name, v in law.new_state(at, dt)]
         bad = [(law, name, rows[~_finite(values)]) for law, rows, name, values in new]
         shown = [f"{law.__name__}.update: {name!r} is not finite at {points.x[i[0]]}" for law, name, i in bad if len(i)]
-        if message := first(self._grid.comm, "".join(shown[:1])):
+        if message := first(self.grid.comm, "".join(shown[:1])):
             raise NotConverged(message)
         out = {name: values.copy() if name in self.state_names else values for name, values in points.data.items()}
         for _, rows, name, values in new:
@@ -308,7 +332,7 @@ class SceneMaterials:
 
     def _placed(self, points: MaterialPoints) -> list[tuple[LawAtPoints, NDArray[np.int64], PointData]]:
         """Return every law with the indices and the data of the points that follow it."""
-        number, values = self._law[points.material], {"F": points.F, **self.parameters(points), **self.state(points)}
+        number, values = self.law_of(points), {"F": points.F, **self.parameters(points), **self.state(points)}
         rows = [np.flatnonzero(number == k) for k in range(len(self.laws))]
         return [(law, own, law.data(points, own, values)) for law, own in zip(self._at_points, rows, strict=True)]
 

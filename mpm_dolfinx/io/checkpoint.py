@@ -29,10 +29,11 @@ from mpm_dolfinx.simulation import Simulation
 from mpm_dolfinx.state import State, Stay
 from mpm_dolfinx.validation import instance, line, numbers, on_disk, path, whole
 
-FORMAT, VERSION = "mpm_dolfinx checkpoint", 5
+FORMAT, VERSION = "mpm_dolfinx checkpoint", 6
 FOREIGN = "no checkpoint of mpm_dolfinx, must be one"
 ZIP = b"PK\3\4"  # how numpy's archives begin
 PIECES = ("id", "pressure", "x", "start")  # of a Stay
+NODAL = ("velocity", "held")  # of a State
 NOTE = {"t": float, "resets": int, "begins": bool, "scene": dict, "result": dict}  # and their kinds
 
 
@@ -83,13 +84,15 @@ def save(simulation: Simulation, file: Path) -> None:
     """Write the state of a simulation between two steps of a run."""
     comm, began, state = simulation.grid.comm, time.perf_counter(), simulation.state
     whole_state = state.migrated(np.zeros(len(state.points), dtype=np.int32), comm)
-    velocity = _velocity_of_all(simulation.grid, state.velocity)
+    nodal = {}
+    for name in NODAL:
+        nodal |= _nodal_of_all(simulation.grid, name, getattr(state, name))
     note = {"version": VERSION, "t": state.t, "resets": state.resets, "begins": state.begins}
     note |= {"scene": describe(simulation), "result": _scalars(state.result)}
 
     def write() -> int:
         file.parent.mkdir(parents=True, exist_ok=True)
-        arrays = {"format": np.array(FORMAT), "note": np.array(json.dumps(note)), **_arrays(whole_state), **velocity}
+        arrays = {"format": np.array(FORMAT), "note": np.array(json.dumps(note)), **_arrays(whole_state), **nodal}
         with replacing(file) as part, open(part, "wb") as f:
             np.savez(f, **arrays)
         return file.stat().st_size
@@ -134,8 +137,8 @@ def resume(simulation: Simulation, file: str | os.PathLike) -> Result:
     found: list[State] = []  # rank 0 has all rows, and passes them on
     bare = at_root(comm, read)
     state = found[0] if found else bare
-    velocity = _velocity_here(simulation.grid, state.velocity)
-    simulation.state = replace(state, stage=simulation.state.stage, velocity=velocity).at_owners(simulation.grid)
+    nodal = {name: _nodal_here(simulation.grid, getattr(state, name)) for name in NODAL}
+    simulation.state = replace(state, stage=simulation.state.stage, **nodal).at_owners(simulation.grid)
     log(comm, "t = %g s: resumed from %s after %d steps", state.t, file, state.result.steps)
     return simulation.result
 
@@ -179,13 +182,14 @@ def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulat
         columns = [[*histories[name]] or [None] * len(times) for name in Row._fields]
         result = Result(rows=[Row(*row) for row in zip(*columns, strict=True)], **note["result"])
         acting = reactions, outflows = arrays.pop("reactions"), arrays.pop("outflows")
-        velocity = _part(arrays, "velocity/") or None
-        if velocity is not None:
-            _check_velocity(velocity, simulation.grid)
+        nodal = [_part(arrays, f"{name}/") or None for name in NODAL]
+        for name, given in zip(NODAL, nodal, strict=True):
+            if given is not None:
+                _check_nodal(name, given, simulation.grid)
         if arrays or reactions.shape[1:] != (dim,) or outflows.ndim != 1 or not all(np.isfinite([note["t"], *times])):
             raise ValueError(f"has {', '.join(arrays) or 'other reactions, outflows or times'}")
         start = note["t"], points, transported, stay, note["resets"], *acting, None, note["begins"]
-        return State(*start, velocity, result)
+        return State(*start, *nodal, result)
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         raise ValueError(f"{damaged} ({line(error)}), must be a whole checkpoint") from error
 
@@ -210,37 +214,37 @@ def _nodes(grid: Grid) -> NDArray[np.int64]:
     return np.ravel_multi_index(tuple(index.T), tuple(grid.shape + 1))
 
 
-def _velocity_of_all(grid: Grid, velocity: NDArray[np.float64] | None) -> dict[str, NDArray]:
-    """Return numbers and velocities of the nodes that move, of all processes, on rank 0; of none without."""
-    if velocity is None:
+def _nodal_of_all(grid: Grid, name: str, nodal: NDArray[np.float64] | None) -> dict[str, NDArray]:
+    """Return numbers and values of the nodes that have any, of all processes, on rank 0; of none without."""
+    if nodal is None:
         return {}
-    velocity = velocity.reshape(-1, grid.dim)
-    moves = velocity.any(axis=1)
-    parts = grid.comm.gather((_nodes(grid)[moves], velocity[moves])) or [(np.empty(0, np.int64), velocity[:0])]
+    nodal = nodal.reshape(-1, grid.dim)
+    some = nodal.any(axis=1)
+    parts = grid.comm.gather((_nodes(grid)[some], nodal[some])) or [(np.empty(0, np.int64), nodal[:0])]
     node, rows = (np.concatenate(values) for values in zip(*parts, strict=True))
     node, first = np.unique(node, return_index=True)
-    return {"velocity/node": node, "velocity/values": rows[first]}
+    return {f"{name}/node": node, f"{name}/values": rows[first]}
 
 
-def _velocity_here(grid: Grid, moving: dict[str, NDArray] | None) -> NDArray[np.float64] | None:
-    """Return the velocities of this process's nodes from those of all that move; None without."""
-    if moving is None:
+def _nodal_here(grid: Grid, given: dict[str, NDArray] | None) -> NDArray[np.float64] | None:
+    """Return the values of this process's nodes from those of all that have any; None without."""
+    if given is None:
         return None
-    node, values = moving["node"], np.concatenate([moving["values"], np.zeros((1, grid.dim))])
+    node, values = given["node"], np.concatenate([given["values"], np.zeros((1, grid.dim))])
     here = _nodes(grid)
     at = np.searchsorted(node, here)
     found = np.append(node, -1)[at] == here
     return values[np.where(found, at, len(node))].ravel()
 
 
-def _check_velocity(arrays: dict[str, NDArray], grid: Grid) -> None:
-    """Refuse, with a ValueError, arrays that are no velocities of nodes of a grid."""
+def _check_nodal(name: str, arrays: dict[str, NDArray], grid: Grid) -> None:
+    """Refuse, with a ValueError, arrays that are no values of nodes of a grid."""
     node, values = arrays.pop("node"), arrays.pop("values")
     right = node.dtype == np.int64 and values.dtype == np.float64 and values.shape == (len(node), grid.dim)
     if arrays or not right or not np.isfinite(values).all() or (np.diff(node) <= 0).any():
-        raise ValueError("velocity: none of nodes of the grid, or not finite")
+        raise ValueError(f"{name}: none of nodes of the grid, or not finite")
     if len(node) and not 0 <= node[0] <= node[-1] < np.prod(grid.shape + 1):
-        raise ValueError("velocity: of other nodes than the grid's")
+        raise ValueError(f"{name}: of other nodes than the grid's")
     arrays |= {"node": node, "values": values}
 
 

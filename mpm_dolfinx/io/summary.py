@@ -49,6 +49,7 @@ def _momentum(s: Scene, state: State) -> list[Part]:
             f"nu <= {LOCKING}, no plastic flow",
         ),
         _either("state of the law", evolves, evolves, "the stress depends on F only"),
+        _either("initial stress", s.initial.given, f"of {len(s.initial.given)} bodies", "none given"),
         _either("body force", s.gravity is not None, "gravity", "no gravity"),
         _either("tractions", side.loads, f"on {len(side.loads)} sides", "no tractions"),
         _either("pressures", side.pressures, f"on {len(side.pressures)} sides", "no pressures"),

@@ -10,6 +10,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mpm_dolfinx.parallel.exchange import first
 from mpm_dolfinx.points.cutting import FACES, corner_bits, domain_volumes, volumes
 from mpm_dolfinx.points.grid import SIDES, Grid
 from mpm_dolfinx.points.material_points import MaterialPoints
@@ -266,21 +267,38 @@ def check_inside(grid: Grid, body: Body, name: str = "body") -> Body:
     return body
 
 
-def material_points(grid: Grid, bodies: Sequence[Body], pressure: float = 0.0) -> MaterialPoints:
-    """Return this process's material points of the bodies, at rest at pore pressure `pressure` (Pa)."""
+def pressure_at(pressure: float | Callable[[NDArray], ArrayLike], x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the pore pressure as seeded (n,), Pa, a number or a function of places, at places x (n, d), m."""
+    if callable(pressure) and len(x):
+        allowed = f"a finite number, or one for each of {len(x)} places"
+        given = asked("pressure(x)", allowed, pressure, x)
+        return np.broadcast_to(numbers("pressure(x)", given, (), (len(x),), allowed=allowed), len(x)).copy()
+    return np.full(len(x), 0.0 if callable(pressure) else float(numbers("pressure", pressure)))
+
+
+def material_points(
+    grid: Grid, bodies: Sequence[Body], pressure: float | Callable[[NDArray], ArrayLike] = 0.0
+) -> MaterialPoints:
+    """Return this process's material points of the bodies, at rest at a pore pressure: see `pressure_at`."""
     corners = np.concatenate([b.corners() for b in bodies])
     size = np.concatenate([b.size() for b in bodies])
     material = np.concatenate([np.full(len(b), b.material, dtype=np.int32) for b in bodies])
     x = corners.mean(axis=1)
     mine = np.flatnonzero(grid.owner(grid.number(grid.index(x))) == grid.comm.rank)
-    n = len(mine)
+    n, pressures, refused = len(mine), np.empty(0), ""
+    try:
+        pressures = pressure_at(pressure, x[mine])
+    except ValueError as error:
+        refused = str(error)
+    if refused := first(grid.comm, refused):
+        raise ValueError(refused)
     return MaterialPoints(
         id=mine,
         corners=corners[mine],
         F=np.tile(np.eye(grid.stretches), (n, 1, 1)),
         volume0=domain_volumes(corners[mine], True) if grid.axisymmetric else size[mine].prod(axis=1),
         material=material[mine],
-        pressure=np.full(n, float(numbers("pressure", pressure))),
+        pressure=pressures,
         x=x[mine],
         origin=corners[mine],
         reference=corners[mine],

@@ -22,7 +22,16 @@ def with_axis(grid: Grid, fixed: Mapping[str, str]) -> Mapping[str, str]:
     return {**fixed, "left": "x" + left}
 
 
-def warn_narrow_hole(grid: Grid, bodies: Sequence[Body]) -> None:
+def check_axisymmetry(grid: Grid, bodies: Sequence[Body], quadrature: str, initial_stress) -> None:
+    """Refuse what axisymmetric scenes cannot have, and warn of holes about the axis that are too narrow."""
+    if grid.axisymmetric and quadrature == "point":
+        raise ValueError("quadrature 'point': must be domain in axisymmetry")
+    if grid.axisymmetric and initial_stress is not None:
+        raise ValueError("initial_stress: must be None in axisymmetry: let the bodies come to rest in a first stage")
+    _warn_narrow_hole(grid, bodies)
+
+
+def _warn_narrow_hole(grid: Grid, bodies: Sequence[Body]) -> None:
     """Log a warning of a hole about the axis that ends within the cells beside it, whose nodes on the axis are held."""
     if not grid.has_axis:
         return

@@ -52,7 +52,8 @@ def balances(scene: Scene, start: Start, acting: Acting, before: Rates | None = 
     scene.momentum.set_rate(substep.own * dt, substep.before / substep.own)
     velocity = start.state.velocity if substep.before == 0.0 else None  # else the substep before tells more
     goes_on = None if velocity is None else substep.end * dt * velocity
-    momentum = MomentumProblem(scene.momentum, matrices.momentum, start.data, acting.sides, matrices.round_off, goes_on)
+    forces = (matrices.round_off, goes_on, start.state.held)
+    momentum = MomentumProblem(scene.momentum, matrices.momentum, start.data, acting.sides, *forces)
     if scene.storage is None:
         return Balances(momentum, None)
     weight = None if acting.gravity is None else scene.fluid.density * acting.gravity

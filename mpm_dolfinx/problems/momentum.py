@@ -305,6 +305,8 @@ class MomentumProblem:
         Norm of the residual that rounding leaves, N.
     goes_on : (unknowns,)
         Displacements if the bodies moved on as in the last step, a local array, m; None where that is not known.
+    held : (unknowns,)
+        Forces that hold what is out of balance of an initial stress, a local array, N, if there are any.
     """
 
     def __init__(
@@ -315,11 +317,14 @@ class MomentumProblem:
         sides: SideData,
         round_off: float,
         goes_on: NDArray[np.float64] | None = None,
+        held: NDArray[np.float64] | None = None,
     ):
         self.forms, self.system, self.data, self.round_off = forms, system, data, round_off
         self._sides, self._goes_on = sides, goes_on
         with Timer("mpm: loads"):
             self._external, self._pulls = forms.external(data, sides)
+            if held is not None:
+                self._external += held
 
     @property
     def linear(self) -> bool:

@@ -225,7 +225,8 @@ class System:
         stiff: bool,
         symmetric: bool,
     ):
-        self._scheme, self._kind = scheme, (symmetric, momentum.dilatation is not None)
+        self._scheme, self.kind = scheme, (symmetric, momentum.dilatation is not None)
+        """Whether the momentum's tangent is symmetric, and whether skeletons yield or hardly change their volume."""
         self.momentum, self.storage = MomentumSystem(momentum, dofs, nodes, on_grid.penalised, stiff), None
         if storage is not None:
             unknowns = self.momentum.unknowns
@@ -237,7 +238,7 @@ class System:
         made = self._solvers.value
         if made is not None and not made.iterative:
             return made
-        make = (self._scheme, self.momentum, self.storage, *self._kind)
+        make = (self._scheme, self.momentum, self.storage, *self.kind)
         return self._solvers(object(), lambda: LinearSolvers(*make))
 
 
@@ -267,7 +268,12 @@ class Assembled:
         stage: Stage,
         sides: SideData,
     ):
-        self.momentum, self.storage, self.solvers = system.momentum, system.storage, system.solvers
+        self.momentum, self.storage, self.solvers, self.kind = (
+            system.momentum,
+            system.storage,
+            system.solvers,
+            system.kind,
+        )
         self._on_grid, self._stage, grid = on_grid, stage, on_grid.cut.grid
         self._u, self._varies = momentum.u, storage is not None and storage.conductivity is not None
         self._mobility: Latest[Mobility] = Latest()

@@ -147,8 +147,7 @@ class QuadraturePoints:
         if self._fluid:
             fields["storage"] = self._scene.storage(points)
         if self._weighs:
-            n, wet = self._scene.porosity(points), self._fluid.density if self._fluid else 0.0
-            fields["density"] = (1 - n) * self._scene.table(points, lambda m: m.grain_density) + n * wet
+            fields["density"] = self._scene.density(points)
         return fields
 
     def _own(self, cut: CutDomains, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:

@@ -1,0 +1,317 @@
+# SPDX-License-Identifier: MIT
+"""Effective stresses of soil as seeded, given or by the weight above, and the elastic strains that go with them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from mpi4py import MPI
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mpm_dolfinx.constitutive.cam_clay import ModifiedCamClay
+from mpm_dolfinx.constitutive.fields import SceneMaterials
+from mpm_dolfinx.constitutive.prestressed import AT_REST
+from mpm_dolfinx.constitutive.skeleton import STANDARD_GRAVITY, Field
+from mpm_dolfinx.constitutive.trial import PLANE, SPACE
+from mpm_dolfinx.errors import NotConverged
+from mpm_dolfinx.parallel.exchange import first, over_all
+from mpm_dolfinx.points.bodies import Body
+from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.points.overburden import overburden
+from mpm_dolfinx.validation import asked, line, numbers
+
+EXACT, CLOSE = 1e-13, 1e-8  # of the largest given stress: to which laws are solved, and have to be
+MOST = 30  # iterations
+DIFFERENCE = 1e-7  # of strains, for derivatives
+LARGEST = 0.2  # change of a strain in an iteration
+
+
+@dataclass(frozen=True, eq=False)
+class K0:
+    """Initial effective stress of soil at rest under its own weight.
+
+    The vertical one is the weight above, soil and fluid, and the surcharge, less biot times the pore pressure; the
+    horizontal ones are K0 times that.  Exact where ground and layers are level; elsewhere a start for the balance.
+
+    Parameters
+    ----------
+    ratio
+        K0, >= 0: a number, or a function of the reference positions X (n, d), m.
+    surcharge : number or callable x (n, d) -> (n,), Pa
+        What acts on the surface, >= 0, at places x on it, as for still water above it.
+    """
+
+    ratio: Field
+    surcharge: float | Callable[[NDArray[np.float64]], ArrayLike] = 0.0
+
+    def __post_init__(self):
+        for name in ("ratio", "surcharge"):
+            if not callable(getattr(self, name)):
+                self._checked(name, getattr(self, name))
+
+    def _checked(self, name: str, value, *shapes) -> NDArray[np.float64]:
+        test = {"test": lambda v: (0 <= v) & (v < np.inf), "allowed": ">= 0 and finite, one value or one a place"}
+        return numbers(f"K0: {name}", value, (), *shapes, **test)
+
+    def values(self, name: str, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return ratio or surcharge at places (n, d), m: one or (n,)."""
+        value = getattr(self, name)
+        given = asked(f"K0: {name}", "one value a place", value, x) if callable(value) else value
+        return self._checked(name, given, (len(x),))
+
+
+InitialStress = K0 | Callable[[NDArray[np.float64]], ArrayLike]
+
+
+def hydrostatic(level: float, unit_weight: float = 1000 * STANDARD_GRAVITY) -> Callable[[NDArray], NDArray]:
+    """Return the pore pressure at rest of a phreatic level, as the scene's `pressure`: a function of places x (n, d).
+
+    Pores are full above it too, and hold their water by suction: the pressure there is negative.
+
+    Parameters
+    ----------
+    level
+        Height, m, along the last axis.
+    unit_weight
+        Of the fluid, N/m^3, > 0.
+    """
+    numbers("hydrostatic: level", level)
+    numbers("hydrostatic: unit_weight", unit_weight, test=lambda v: (0 < v) & (v < np.inf), allowed="> 0 and finite")
+    return lambda x: unit_weight * (level - x[:, -1])
+
+
+def by_body(given, bodies: Sequence[Body], later: Sequence[int]) -> dict[int, InitialStress]:
+    """Return the initial stress of each body that has one; one for all is that of the bodies that are there."""
+    allowed = "a K0, a function of x, or one of these for each of some bodies, {index: ...}"
+    if given is None:
+        return {}
+    if not isinstance(given, Mapping):
+        given = {i: given for i in range(len(bodies)) if i not in later}
+    for body, value in given.items():
+        if body not in range(len(bodies)) or not (isinstance(value, K0) or callable(value)):
+            raise ValueError(f"initial_stress: {line({body: value})}, must be {allowed}")
+    return {int(body): value for body, value in given.items()}
+
+
+class InitialStresses:
+    """The stresses that bodies of a scene have as seeded.
+
+    Parameters
+    ----------
+    bodies
+        All bodies.
+    given
+        See `by_body`.
+    pressure
+        Pore pressure as seeded, Pa, a number or a function of places.
+    """
+
+    def __init__(self, bodies: Sequence[Body], given: Mapping[int, InitialStress], pressure: float | Callable):
+        self._bodies, self.given, self.pressure = bodies, given, pressure
+        self._start = np.cumsum([0, *(len(body) for body in bodies)])
+
+    def of(self, materials: SceneMaterials, points: MaterialPoints, present: Sequence[bool], gravity) -> MaterialPoints:
+        """Return points whose elastic strain is that of the stress given; on all processes together.
+
+        Parameters
+        ----------
+        present
+            Which bodies lie on one another, as seeded.
+        gravity : (d,), m/s^2
+            None without.
+        """
+        if not self.given:
+            return points
+        target, rows, refused = np.zeros((len(points), 3, 3)), np.zeros(len(points), dtype=bool), ""
+        above = self._above(materials, points, present, gravity)
+        try:
+            for body, stress in self.given.items():
+                own = (points.id >= self._start[body]) & (points.id < self._start[body + 1])
+                if own.any():
+                    target[own] = self._at(stress, body, points.map(lambda v, own=own: v[own]), [a[own] for a in above])
+                rows |= own
+        except ValueError as error:
+            refused = str(error)
+        if refused := first(materials.grid.comm, refused):
+            raise ValueError(refused)
+        return stressed(materials, points, rows, target)
+
+    def _at(self, stress: InitialStress, body: int, points: MaterialPoints, above: list[NDArray]) -> NDArray:
+        """Return the effective stress (n, 3, 3), Pa, of some points of a body."""
+        n, d = points.x.shape
+        if not isinstance(stress, K0):
+            name = f"initial_stress of body {body}: {line(stress)}"
+            allowed = f"three normal stresses or a symmetric tensor (3, 3), finite, for each of {n} places"
+            value = numbers(name, asked(name, allowed, stress, points.x), (n, 3), (n, 3, 3), allowed=allowed)
+            value = value if value.ndim == 3 else value[:, :, None] * np.eye(3)
+            wrong = np.abs(value - value.swapaxes(1, 2)).max(axis=(1, 2)) > 1e-9 * np.abs(value).max(initial=0)
+            if d == 2:
+                wrong |= (value[:, :2, 2] != 0).any(axis=1)
+            if wrong.any():
+                raise ValueError(f"{name} = {value[wrong][0].tolist()}, must be {allowed}, without shear out of plane")
+            return value
+        weight, surface, pore = above
+        on = np.concatenate([points.x[:, :-1], surface[:, None]], axis=1)
+        X = self._bodies[body].centre[points.id - self._start[body]]
+        vertical = -(weight + stress.values("surcharge", on) - pore)
+        horizontal = stress.values("ratio", X) * vertical
+        normal = np.stack([horizontal] * 3, axis=1)
+        normal[:, d - 1] = vertical
+        return normal[:, :, None] * np.eye(3)
+
+    def _above(self, materials: SceneMaterials, points: MaterialPoints, present, gravity) -> list[NDArray]:
+        """Return weight above, Pa, height of the surface, m, and biot times pressure, Pa, of points, where asked."""
+        if not any(isinstance(stress, K0) for stress in self.given.values()):
+            return [points.pressure] * 3
+        if gravity is None or np.any(gravity[:-1]) or not gravity[-1] <= 0:
+            g = None if gravity is None else np.asarray(gravity).tolist()
+            raise ValueError(f"initial_stress: K0 with gravity = {g}, must be down along the last axis at the start")
+        # the densities of all points on all processes
+        n, seeded, total = self._start[-1], materials.seeded, np.zeros(self._start[-1])
+        total[seeded.id] = materials.density(seeded)
+        total = over_all(materials.grid.comm, total)
+        here = np.repeat(present, [len(body) for body in self._bodies])
+        corners = np.concatenate([body.corners() for body, there in zip(self._bodies, present, strict=True) if there])
+        weight, surface = overburden(corners, -gravity[-1] * total[:n][here], points.x)
+        return [weight, surface, materials.table(points, lambda m: m.biot) * points.pressure]
+
+
+def stressed(materials: SceneMaterials, points: MaterialPoints, chosen: NDArray[np.bool_], target: NDArray):
+    """Return points of which the chosen ones (n,) have target stresses (n, 3, 3), Pa; on all processes together.
+
+    Newton's method for symmetric elastic strains: of the prestretch (in plane strain without that across the plane,
+    whose stress the law is given), or of C_p^-1.  Modified Cam Clay has the stress among its constants.
+
+    Raises
+    ------
+    ValueError
+        Naming the first place where a law cannot bear its stress.
+    """
+    comm, rows, law = materials.grid.comm, np.flatnonzero(chosen), materials.law_of(points)
+    part, target = points.map(lambda values: values[rows]), target[rows]
+    given = np.isin(law[rows], [k for k, one in enumerate(materials.laws) if issubclass(one, ModifiedCamClay)])
+    plastic = np.isin(law[rows], [k for k, one in enumerate(materials.laws) if "plastic" in one.state])
+    message = _no_constants(part, target, given)
+    if message := first(comm, message):
+        raise ValueError(message)
+    if given.any():
+        normal, kappa = np.diagonal(target, axis1=1, axis2=2), materials.table(part, _kappa)
+        part = _with(part, given, initial_stress=normal, bulk=-normal.mean(axis=1) / kappa)
+    which = PLANE if points.x.shape[1] == 2 else SPACE
+    axes = tuple(np.array(which).T)
+    free = np.repeat(~given[:, None], len(which), axis=1)
+    if points.x.shape[1] == 2:
+        free[:, 2] &= plastic  # across the plane
+
+    def off(strain: NDArray[np.float64]) -> tuple[MaterialPoints, NDArray[np.float64], NDArray[np.float64]]:
+        """Return points with elastic strains (n, k), their stresses, and what is missing of the target (n, k)."""
+        tensor = np.zeros((len(strain), 3, 3))
+        for value, (i, j) in zip(strain.T, which, strict=True):
+            tensor[:, i, j] = tensor[:, j, i] = value
+        logs, turn = np.linalg.eigh(tensor)
+        now = _with(part, plastic & ~given, plastic=(turn * np.exp(2 * logs)[:, None]) @ turn.swapaxes(1, 2))
+        stretch = (turn * np.exp(logs)[:, None]) @ turn.swapaxes(1, 2)
+        d = points.x.shape[1]
+        now = _with(now, ~plastic & ~given, prestretch=stretch[:, :d, :d])
+        stress = materials.effective_stress_3d(now)
+        return now, stress, np.where(free, (stress - target)[(slice(None), *axes)], 0.0)
+
+    largest = over_all(comm, float(np.abs(target).max(initial=0.0)), MPI.MAX)
+    bulk, shear = (materials.table(part, lambda m, name=name: getattr(m, name)) for name in ("bulk", "shear"))
+    mean = np.trace(target, axis1=1, axis2=2) / 3
+    elastic = (target - mean[:, None, None] * np.eye(3)) / (2 * shear)[:, None, None]
+    elastic += (mean / (3 * bulk))[:, None, None] * np.eye(3)
+    if points.x.shape[1] == 2:  # laws without a strain across the plane
+        plane, lam = np.trace(target[:, :2, :2], axis1=1, axis2=2), bulk - 2 * shear / 3
+        alone = target / (2 * shear)[:, None, None] - (lam * plane / (4 * shear * (lam + shear)))[
+            :, None, None
+        ] * np.eye(3)
+        elastic = np.where(plastic[:, None, None], elastic, alone)
+    strain = np.where(free, elastic[(slice(None), *axes)], 0.0)
+    try:
+        for _ in range(MOST):
+            now, stress, missing = off(strain)
+            bad = ~(np.abs(missing).max(axis=1, initial=0.0) <= CLOSE * largest)
+            if not over_all(comm, float(np.nan_to_num(np.abs(missing), nan=np.inf).max(initial=0.0)), MPI.MAX) > (
+                EXACT * largest
+            ):
+                break
+            slopes = np.tile(np.eye(len(which)) * (2 * shear)[:, None, None], (1, 1, 1))
+            for k in range(len(which)):
+                moved = strain + DIFFERENCE * np.eye(len(which))[k]
+                change = (off(moved)[2] - missing) / DIFFERENCE
+                slopes[:, :, k] = np.where(free & free[:, [k]], change, slopes[:, :, k])
+            slopes, missing = (np.nan_to_num(values) for values in (slopes, missing))
+            singular = ~(np.abs(np.linalg.det(slopes / shear[:, None, None])) > 1e-12)
+            slopes[singular] = np.eye(len(which)) * (2 * shear[singular])[:, None, None]
+            strain = np.clip(
+                strain - np.linalg.solve(slopes, missing[:, :, None])[:, :, 0].clip(-LARGEST, LARGEST), -1, 1
+            )
+    except NotConverged:
+        bad = np.ones(len(rows), dtype=bool)
+    message = "".join(_not_borne(materials, part, target, law[rows], i) for i in np.flatnonzero(bad)[:1])
+    if message := first(comm, message):
+        raise ValueError(message)
+    if "across" in points.data:
+        own = np.nan_to_num(target[:, 2, 2] - stress[:, 2, 2]) if points.x.shape[1] == 2 else 0.0
+        now = _with(now, ~plastic & ~given, across=own)
+    if "plastic" in points.data:
+        now = _with(now, plastic, **{"plastic" + AT_REST: now.data["plastic"]})
+    data = {name: values.copy() for name, values in points.data.items()}
+    for name, values in now.data.items():
+        data[name][rows] = values
+    return replace(points, data=data)
+
+
+def strained(materials: SceneMaterials, points: MaterialPoints, moved: MaterialPoints) -> MaterialPoints:
+    """Return points with the elastic strains of others, to which these have been deformed from where they are."""
+    F, d, law = moved.F, points.x.shape[1], materials.law_of(points)
+    data = {name: values for name, values in moved.data.items() if name != "softness"}
+    data |= {name: values for name, values in points.data.items() if name == "softness"}
+    out = replace(points, data=data)
+    if "prestretch" in data:
+        out = _with(out, np.ones(len(F), dtype=bool), prestretch=F @ data["prestretch"])
+    if "plastic" in data:
+        stretch = materials.table(points, _prestretch)
+        whole = np.tile(np.eye(3), (len(F), 1, 1))
+        whole[:, :d, :d] = F
+        whole = whole * (stretch[:, None, :] / stretch[:, :, None])  # D^-1 F D
+        own = np.isin(law, [k for k, one in enumerate(materials.laws) if "plastic" in one.state])
+        elastic = whole @ data["plastic"] @ whole.swapaxes(1, 2)
+        out = _with(out, own, plastic=elastic, **{"plastic" + AT_REST: elastic})
+    return out
+
+
+def _with(points: MaterialPoints, chosen: NDArray[np.bool_], **values: NDArray) -> MaterialPoints:
+    """Return points of which the chosen ones (n,) carry other values (n, ...), if they carry any of this name."""
+    data = dict(points.data)
+    for name, new in values.items():
+        if name in data and chosen.any():
+            data[name] = data[name].copy()
+            data[name][chosen] = np.broadcast_to(new, data[name].shape)[chosen]
+    return replace(points, data=data)
+
+
+def _kappa(m) -> NDArray[np.float64]:
+    return m.kappa if isinstance(m, ModifiedCamClay) else np.ones(np.shape(m.bulk))
+
+
+def _prestretch(m) -> NDArray[np.float64]:
+    return m.prestretch if isinstance(m, ModifiedCamClay) else np.ones((*np.shape(m.bulk), 3))
+
+
+def _no_constants(points: MaterialPoints, target: NDArray[np.float64], given: NDArray[np.bool_]) -> str:
+    """Return what is wrong with stresses (n, 3, 3) as constants of Modified Cam Clay."""
+    shear = np.abs(target - np.diagonal(target, axis1=1, axis2=2)[:, :, None] * np.eye(3)).max(axis=(1, 2), initial=0.0)
+    bad = given & ((shear > 0) | ~(np.trace(target, axis1=1, axis2=2) < 0))
+    what = "must be without shear, of compressive mean, for ModifiedCamClay"
+    return "".join(f"initial_stress at {points.x[i]}: {target[i].tolist()} Pa, {what}" for i in np.flatnonzero(bad)[:1])
+
+
+def _not_borne(materials: SceneMaterials, points: MaterialPoints, target: NDArray, law: NDArray, i: int) -> str:
+    name = materials.laws[law[i]].__name__
+    allowed = f"what {name} can bear: inside its yield surface"
+    return f"initial_stress at {points.x[i]}: {target[i].tolist()} Pa, must be {allowed}"
