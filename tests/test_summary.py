@@ -99,6 +99,7 @@ BENCHMARK = {
     "initial stress": {"initial stress"},
     "body from a mesh": set(),
     "Mohr-Coulomb beside Drucker-Prager": set(),
+    "softening beside Drucker-Prager": set(),
     "Modified Cam Clay beside Drucker-Prager": set(),
     "mean dilatation": DILATION,
     "plastic law, with mean dilatation": {"state of the law"} | DILATION,
