@@ -7,6 +7,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 import ufl
+from extending_with_ufl import Crushable
 from helpers import column
 from laws import LawAtPoints
 
@@ -118,6 +119,40 @@ def test_a_step_without_a_local_solution_is_cut_and_names_the_first_point():
     with pytest.raises(mpm.GaveUp, match=r"Brittle: local equations have no solution at \[0\.\d+ +0\.(4[5-9]|[5-9])"):
         s.run(1.0, 0.25)
     assert s.result.cuts > 2 and np.log(s.points.J).min() == pytest.approx(-0.05, rel=0.05)
+
+
+FOAM = Crushable(bulk=1e6, shear=2e5)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_law_in_numpy_has_the_stress_the_tangent_and_the_state_that_it_gives(dim):
+    F = np.eye(dim) + 0.1 * np.random.default_rng(dim).normal(size=(40, dim, dim))
+    crushed = {"crushed": np.linspace(-0.1, 0, 40)}
+    at, log = LawAtPoints(FOAM, dim), np.log(np.linalg.det(F))
+    pressure = np.maximum(-FOAM.limit, FOAM.bulk * (log - crushed["crushed"]))
+    assert (pressure == -FOAM.limit).any() and (pressure > -FOAM.limit).any()
+    exact = pressure[:, None, None] * np.eye(dim) + FOAM.shear * (F @ F.transpose(0, 2, 1) - np.eye(dim))
+    assert np.abs(at.kirchhoff(F, crushed) - exact).max() < 1e-13 * FOAM.bulk
+    found, differences = at.tangent(F, crushed)
+    assert np.abs(found - differences).max() < 1e-7 * np.abs(found).max()
+    assert at.update(F, crushed)["crushed"] == pytest.approx(log - pressure / FOAM.bulk, abs=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("solution", "message"),
+    [
+        (lambda trial: {"p": (trial["volume"], {})}, r"gives \{'p': \(\)\}, must have the unknowns' names and shapes"),
+        (lambda trial: {"pressure": (trial["volume"], {"volume": np.eye(2)})}, r"derivative of pressure by volume has"),
+        (lambda trial: trial["volume"], "what it gives = .* must be a dict"),
+        (lambda trial: trial["strain"], "raises KeyError: 'strain'"),
+    ],
+)
+def test_one_line_says_what_is_wrong_with_a_law_in_numpy(solution, message):
+    law = type("Wrong", (Crushable,), {"solution": staticmethod(solution)})
+    s = column(cells=2, fluid=False, material=law(bulk=1e6, shear=2e5))
+    with pytest.raises(ValueError, match=message) as caught:
+        s.step(1.0)
+    assert "\n" not in str(caught.value)
 
 
 class Misnamed(Stiffening):
