@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 import tables
 
+import mpm_dolfinx as mpm
+
 ROOT = Path(__file__).parent.parent
 PAGES = {name: (ROOT / name).read_text() for name in ("README.md", "demos/README.md", "mpm_dolfinx/README.md")}
 BLOCKS = [
@@ -40,6 +42,11 @@ def test_named_files_exist(name):
         assert (ROOT / file).exists(), file
     for demo in re.findall(r"demos/run\.sh (?:-n \d )?([a-z]\w+)", page):
         assert (ROOT / "demos" / f"{demo}.py").exists(), demo
+
+
+def test_the_version_is_everywhere_the_same():
+    for file in ("CITATION.cff", ".ci/conda/meta.yaml"):
+        assert f"version: {mpm.__version__}\n" in (ROOT / file).read_text(), file
 
 
 @pytest.mark.parametrize("page", tables.PAGES, ids=["front", "demos"])
