@@ -59,9 +59,9 @@ class HydraulicBoundary:
             number, none, normal = np.full(len(cell), i), np.zeros(len(cell)), area / size[:, None]
             reach = x - grid.midpoints[cell] - contents.centroid[cell]
             if isinstance(outlet, Inflow):
-                rows.append((number, cell, none, none, value * size, none > 0, normal, reach))
+                rows.append((number, cell, none, none, value * size, none > 0, area, reach))
                 continue
             distance = np.einsum("md,md->m", reach, normal)
             shape = size / np.maximum(distance, SNAP * grid.h.min())
-            rows.append((number, cell, shape, value, none, outlet.seepage & (value <= 0), normal, reach))
+            rows.append((number, cell, shape, value, none, outlet.seepage & (value <= 0), area, reach))
         return OpenSides(*map(np.concatenate, zip(*rows, strict=True)))
