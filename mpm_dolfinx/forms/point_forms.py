@@ -381,11 +381,11 @@ class FacetSum:
     """A form over some facets; some: whether any process has one."""
 
     def __init__(self, form: FacetForm, facets: NDArray[np.int32], some: bool):
-        self._of, self._facets, self._some = form, facets, some
+        self._of, self._facets, self.some = form, facets, some
 
     @cached_property
     def _bound(self):
-        compiled = self._of.compiled if self._some else None
+        compiled = self._of.compiled if self.some else None
         return compiled.bind(self._facets) if len(self._facets) else None
 
     def assemble_matrix(self, A: PETSc.Mat) -> None:

@@ -17,7 +17,8 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from mpm_dolfinx import _compat
-from mpm_dolfinx.forms.point_forms import FacetForm
+from mpm_dolfinx.forms.point_forms import FacetForm, FacetSum
+from mpm_dolfinx.forms.unknowns import sum_ghosts
 from mpm_dolfinx.points.grid import Grid, sum_by
 from mpm_dolfinx.points.material_points import cofactor, determinant
 
@@ -92,7 +93,7 @@ class OpenSides:
 
     number (m,): of the condition; cells (m,): owned cell behind each; shape: area over distance from the cell's
     centroid, m^(d-2), zero where the inflow is prescribed; pressure: beyond it, Pa; given: prescribed inflow, m^d/s;
-    seeps: whether nothing may flow in; normal (m, d); reach (m, d): way from the cell's centroid, m.
+    seeps: whether nothing may flow in; area (m, d): outward, m^(d-1); reach (m, d): way from the cell's centroid, m.
     """
 
     number: NDArray[np.int64]
@@ -101,8 +102,13 @@ class OpenSides:
     pressure: NDArray[np.float64]
     given: NDArray[np.float64]
     seeps: NDArray[np.bool_]
-    normal: NDArray[np.float64]
+    area: NDArray[np.float64]
     reach: NDArray[np.float64]
+
+    @property
+    def normal(self) -> NDArray[np.float64]:
+        """Unit vectors (m, d)."""
+        return self.area / np.linalg.norm(self.area, axis=1, keepdims=True)
 
     def driven(self, at: NDArray[np.int64], flow: Conduction) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the outflow (m,) per unit of the cell's pressure, m^d/(Pa s), and the inflow (m,), m^d/s.
@@ -287,10 +293,24 @@ class FluxForms:
         smaller = ufl.min_value(self.fixed_stress("+"), self.fixed_stress("-"))
         volume = fem.Constant(mesh, grid.cell_volume)  # not a number: each would be compiled anew
         self.alternation = FacetForm(smaller / (4 * d) * across / volume * ufl.jump(dp) * ufl.jump(q) * dS, grid.comm)
+        self.slope, self._sum = fem.Function(grid.cellwise((d,))), fem.Function(Q)
+        apart = ufl.jump(self.centroid)
+        along = apart - ufl.dot(apart, n0) * n0
+        self.aslant = None
+        if flows and not grid.axisymmetric:
+            self.aslant = FacetForm(-T * ufl.dot(ufl.avg(self.slope), along) * ufl.jump(q) * dS, grid.comm)
         self.gravity = None
         if weight is not None and flows:
             apart = across * n0 - ufl.jump(self.centroid + self.moved)
             self.gravity = FacetForm(T * ufl.dot(weight, apart) * ufl.jump(q) * dS, grid.comm)
+
+    def along(self, slope: NDArray[np.float64], cells: NDArray[np.int64], facets: FacetSum) -> NDArray[np.float64]:
+        """Return the outflow of the local cells (c,), m^d/s, by gradients (n, d), Pa/m, of some along some faces."""
+        self.slope.x.array[:] = self._sum.x.array[:] = 0.0
+        self.slope.x.array.reshape(-1, self.grid.dim)[cells] = slope
+        self.slope.x.scatter_forward()
+        facets.assemble_vector(self._sum.x.array)
+        return sum_ghosts(self._sum)
 
     def set_conduction(self, contents: CellContents, flow: Conduction) -> NDArray[np.float64]:
         """Set the coefficients for how the filled owned cells conduct; return their mobilities (n, d) by axis."""

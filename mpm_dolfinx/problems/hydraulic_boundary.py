@@ -65,9 +65,9 @@ class HydraulicBoundary:
             number, none, normal = np.full(len(cell), i), np.zeros(len(cell)), area / size[:, None]
             reach = x - grid.midpoints[cell] - contents.centroid[cell]
             if isinstance(outlet, Inflow):
-                rows.append((number, cell, none, none, value * size, none > 0, normal, reach))
+                rows.append((number, cell, none, none, value * size, none > 0, area, reach))
                 continue
             least = contents.fill[contents.slot(cell)] * grid.h.min() / THICK / (grid.dim + 1)
             shape = size / np.maximum(np.einsum("md,md->m", reach, normal), least)
-            rows.append((number, cell, shape, value, none, outlet.seepage & (value <= 0), normal, reach))
+            rows.append((number, cell, shape, value, none, outlet.seepage & (value <= 0), area, reach))
         return OpenSides(*map(np.concatenate, zip(*rows, strict=True)))

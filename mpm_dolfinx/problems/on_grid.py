@@ -18,6 +18,7 @@ from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.cut_domains import CutDomains
 from mpm_dolfinx.points.grid import sum_by
 from mpm_dolfinx.points.pressure_transport import Reconstruction, share_within, transport
+from mpm_dolfinx.problems.aslant import Gradients, off_facets
 from mpm_dolfinx.problems.fluxes import CellContents, Conduction, Mobility, Motion, OpenSides, PieceContents
 from mpm_dolfinx.problems.ghost_penalty import stiffness
 from mpm_dolfinx.problems.layers import graded, mixed_cells
@@ -286,8 +287,13 @@ class Assembled:
             reach = np.abs(np.concatenate([grid.lower, grid.upper])).max()
             stiffest = float(sides.holds["stiffness"].max(initial=0.0))
             self.round_off += 1e-15 * over_all(grid.comm, stiffest, MPI.MAX) * reach
+        self._off = None
         if self.storage is not None:
             self.storage.set_alternation()
+            if (form := storage.fluxes.aslant) is not None:
+                facets = form.on(off_facets(on_grid.contents, on_grid.facets))
+                self._off = facets if facets.some else None
+        self._gradients: Latest[Gradients] = Latest()
 
     def flow(
         self, state: State, weight: NDArray[np.float64] | None, data: QuadratureData, t: float
@@ -318,7 +324,11 @@ class Assembled:
             return self._mobility((), lambda: on_grid.mobility(data, True))
 
         def set_fluxes(at_sides: OpenSides, kappa: Mobility, motion: Motion | None = None) -> Outflow:
-            return self.storage.set_fluxes(contents, at_sides, Conduction(kappa, motion, weight))
+            off = self._off and (
+                self._off,
+                self._gradients((at_sides.cells, at_sides.seeps), lambda: Gradients(contents, at_sides)),
+            )
+            return self.storage.set_fluxes(contents, at_sides, Conduction(kappa, motion, weight), off)
 
         if state.stay and not self._varies:
             outflow = self._outflow((at, weight, *varies), lambda: set_fluxes(sides(), mobility(True)), grid.comm)
