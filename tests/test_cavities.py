@@ -1,14 +1,17 @@
 # SPDX-License-Identifier: MIT
 """Cylindrical cavities that are widened in Modified Cam Clay and Mohr-Coulomb soil, beside exact pressures.
 
-The laws on radial grids: what they are in a scene is a matter of the grid.
+The laws on radial grids, and scenes on a grid that knows nothing of circles.
 """
 
+from dataclasses import replace
+
+import cavity as scenes
 import numpy as np
 import pytest
-from cavity import Cavity, undrained
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx.verification.cavity import cavity, undrained
 
 P0 = 1e5
 
@@ -33,9 +36,10 @@ def test_a_drained_well_in_cam_clay():
     clay = mpm.ModifiedCamClay(M=1.2, lambda_=lambda_, kappa=kappa, shear=4302e3, initial_stress=stress)
     clay = mpm.ModifiedCamClay(**{**vars(clay), "OCR": 169e3 / clay.yield_pressure})
     assert clay.yield_pressure == pytest.approx(169e3)
-    well, found = Cavity(clay, 100.0, 150), {}
-    for a in np.unique([*np.geomspace(1, 1.5, 60)[1:], 1.02, 1.08293]):
-        found[a] = well.widen(a) / 1e3
+    well, found = cavity(clay, 100.0, 100), {}
+    for a in np.unique([*np.geomspace(1, 1.5, 50)[1:], 1.02, 1.08293]):
+        well = well.widened(a)
+        found[a] = well.pressure / 1e3
     for a, exact in ((1.02, 206.85), (1.08293, 289.28), (1.5, 440.63)):
         assert found[a] == pytest.approx(exact, rel=0.005)
 
@@ -49,9 +53,38 @@ def test_a_drained_cavity_in_mohr_coulomb_soil(dilation, exact, within):
     G = 100 * P0
     K = G * 2 * 1.3 / (3 * 0.4)
     sand = mpm.MohrCoulomb(bulk=K, shear=G, friction=30.0, dilation=dilation, cohesion=0.0)
-    cavity = Cavity(sand, 1000.0, 200, state={"plastic": np.exp(-2 * P0 / (3 * K)) * np.eye(3)})
+    hole = cavity(sand, 1000.0, 150, state={"plastic": np.exp(-2 * P0 / (3 * K)) * np.eye(3)})
     found = {}
-    for a in np.unique([*np.geomspace(1, 1.5, 70)[1:], *exact]):
-        found[a] = cavity.widen(a) / P0
+    for a in np.unique([*np.geomspace(1, 1.5, 60)[1:], *exact]):
+        hole = hole.widened(a)
+        found[a] = hole.pressure / P0
     for a, pressure in exact.items():
         assert found[a] == pytest.approx(pressure, rel=within)
+
+
+# ---- on the grid ----------------------------------------------------------------------------------
+
+
+def test_a_well_is_widened_on_the_grid(monkeypatch):
+    """Four cells over its radius, three steps."""
+    known = {a: scenes.DRAINED["well"].known[a] for a in (1.02, 1.08293)}
+    monkeypatch.setitem(scenes.DRAINED, "well", replace(scenes.DRAINED["well"], known=known))
+    for a, (found, _) in scenes.drained("well", 4).items():
+        assert found == pytest.approx(known[a], rel=0.01)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "within"), [("well", 0.012), ("sand-0", 0.015), ("sand-30", 0.03)])
+def test_drained_cavities_on_the_grid(name, within):
+    """Eight cells over the radius; the first mark of the well, in one step, is the worst."""
+    for a, (found, _) in scenes.drained(name, 8).items():
+        assert found == pytest.approx(scenes.DRAINED[name].known[a], rel=within), a
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("OCR", scenes.RATIOS)
+def test_an_undrained_cavity_on_the_grid_consolidates(OCR):
+    run = scenes.push(OCR, 8)
+    assert run.total[0] == pytest.approx(run.total[1], rel=0.02)
+    assert run.water[0] == pytest.approx(run.water[1], rel=0.02)
+    assert np.abs(run.profiles[-1][2]).max() < 1e-3 and run.balance < 1e-7

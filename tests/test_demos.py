@@ -38,6 +38,7 @@ QUICK = {
     ),
     "slump": ("--cells 6 --steps 10", ["slump.png", "failure.png", "slump.gif"]),
     "triaxial": ("--steps 20", ["triaxial.png"]),
+    "cavity": ("--cells 4 --cases well --ratios 2", ["cavity.png"]),
     "slope": ("--cells 4 --steps 4 --rtol 0.1", ["slope.png"]),
     "embankment": ("--h 1 --steps 1", ["embankment.png"]),
     "footing": ("--cells 3 --depth 0.1", ["footing.png", "footing.gif"]),
@@ -45,6 +46,7 @@ QUICK = {
     "benchmark_pruning": ("--quick", ["pruning.md"]),
     "scaling": ("--quick --dims 2 --processes 1 2", ["scaling.png", "scaling.csv", "scaling.md"]),
 }
+LONG = {"cavity", "slope"}  # what they show has tests of its own
 
 
 def run(demo, arguments):
@@ -57,7 +59,7 @@ def test_every_demo_is_run():
     assert {p.stem for p in (ROOT / "demos").glob("*.py")} == set(QUICK)
 
 
-@pytest.mark.parametrize("demo", QUICK)
+@pytest.mark.parametrize("demo", [pytest.param(d, marks=[pytest.mark.slow] if d in LONG else []) for d in QUICK])
 def test_the_demo_runs(demo, tmp_path):
     if demo == "embankment":
         pytest.importorskip("gmsh")

@@ -1,0 +1,227 @@
+# SPDX-License-Identifier: MIT
+"""A cylindrical cavity is widened in clay and in sand, on a grid that knows nothing of circles.
+
+A quarter of a ring of soil, b = 5 a0, its wall a given displacement that goes a fifth of a cell in a step.
+
+1. Undrained: saturated Modified Cam Clay at two overconsolidation ratios, so fast that no water moves, its outside
+   under the pressure that it began with.  Incompressible soil has an exact solution: r^2 - a^2 = R^2 - a0^2.
+2. Then the wall is held and the clay drains at its outside: its excess pressures dissipate.
+3. Drained: a well in Modified Cam Clay (Chen and Abousleiman 2013) and cavities in Mohr and Coulomb's sand, phi = 30
+   degrees, without and with associated dilation (Yu and Houlsby 1991).  These are in soil without end: the outside of
+   the ring goes where a radial solution has it (`mpm_dolfinx.verification.cavity`).
+
+Pressures are over p_0.  Errors are those at the marks, relative.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import poroelastic_beam as beam
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.verification.cavity import cavity, undrained
+
+P0, OUTER = 1e5, 5.0  # Pa, outer radius over that of the cavity
+PUSH = 0.2  # of a cell, in a step
+CLAY = mpm.ModifiedCamClay(
+    M=1.2, lambda_=0.0726, kappa=0.0145, shear=30 * P0, initial_stress=(-P0,) * 3, conductivity=1e-9
+)
+RATIOS, MARK = (1.0001, 2.0), 1.5
+CV = CLAY.conductivity / mpm.Fluid().unit_weight * CLAY.oedometric  # m²/s
+G = 100 * P0
+SAND = mpm.MohrCoulomb(bulk=G * 2.6 / 1.2, shear=G, friction=30.0, dilation=0.0, cohesion=0.0)
+
+
+def well() -> mpm.ModifiedCamClay:
+    """Return the clay of Chen and Abousleiman, whose indices are those of v over the Cauchy stress."""
+    lambda_, kappa = (index / 2.064 / (1 - index / 2.064) for index in (0.15, 0.03))
+    stress = (-P0, -P0, -1.6 * P0)
+    clay = mpm.ModifiedCamClay(M=1.2, lambda_=lambda_, kappa=kappa, shear=43.02 * P0, initial_stress=stress)
+    return mpm.ModifiedCamClay(**{**vars(clay), "OCR": 1.69 * P0 / clay.yield_pressure})
+
+
+@dataclass(frozen=True)
+class Drained:
+    """A drained cavity in soil without end.
+
+    soil, state: with the state that it begins with; known: radius -> pressure over p_0; reach: of the radial solution.
+    """
+
+    soil: mpm.Skeleton
+    known: Mapping[float, float]
+    reach: float = 1000.0
+    state: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+
+PRESSED = {"plastic": np.exp(-2 * P0 / (3 * SAND.bulk)) * np.eye(3)}  # sand begins with its pressure as elastic strain
+DRAINED = {
+    "well": Drained(well(), {1.02: 2.0685, 1.08293: 2.8928, 1.5: 4.4063}, 100.0),
+    "sand-0": Drained(SAND, {1.02: 2.812, 1.1: 4.489}, state=PRESSED),
+    "sand-30": Drained(replace(SAND, dilation=30.0), {1.02: 3.170, 1.1: 6.041, 1.5: 10.710}, state=PRESSED),
+}
+
+
+def ray(X: np.ndarray) -> np.ndarray:
+    """Return the direction outwards (n, 2) of reference positions (n, 2) in the box that becomes the ring."""
+    angle = X[:, 1:] * np.pi / (2 * (OUTER - 1))
+    return np.concatenate([np.cos(angle), np.sin(angle)], axis=1)
+
+
+def ring(cells: int, soil: mpm.Skeleton, widest: float, outside: Callable | None = None, **scene) -> mpm.Simulation:
+    """Return a quarter of the ring, with so many cells over the hole's radius, which is 1 + t.
+
+    outside: displacement of its outside, m, at a time; widest: the largest radius of the hole.
+    """
+    h = 1 / cells
+    size = int(np.ceil(np.sqrt(OUTER**2 + widest**2 - 1) / h)) + 2
+    grid = mpm.Grid([size * h] * 2, [size] * 2)
+    body = mpm.mapped(grid, mpm.box(grid, [0, 0], [OUTER - 1] * 2), lambda X: (1 + X[:, :1]) * ray(X))
+    moved = [mpm.Displacement("left", lambda t, X: min(t, widest - 1) * ray(X))]
+    if outside is not None:
+        moved.append(mpm.Displacement("right", lambda t, X: outside(t) * ray(X)))
+    return mpm.Simulation(grid, [body], [soil], fixed={"left": "x", "bottom": "y"}, displacements=moved, **scene)
+
+
+def widen(s: mpm.Simulation, cells: int, radius: float, seen: Callable | None = None) -> float:
+    """Widen the hole to a radius, m; return the total pressure in it over p_0."""
+    steps = max(1, int(np.ceil((radius - 1 - s.t) * cells / PUSH - 1e-6)))
+    s.run(radius - 1, (radius - 1 - s.t) / steps, observe=[seen] if seen else [], progress=False)
+    return pressure(s, radius)
+
+
+def pressure(s: mpm.Simulation, radius: float) -> float:
+    """Return the pressure in the hole over p_0."""
+    return float(s.reactions[0].mean() / radius / P0)
+
+
+def drained(name: str, cells: int) -> dict[float, tuple[float, float]]:
+    """Return radius -> pressures over p_0: that in the hole, and that of the radial solution."""
+    case = DRAINED[name]
+    widest = max(case.known)
+    reference, radii, out, p = cavity(case.soil, case.reach, 150, state=case.state), [1.0], [0.0], {}
+    for a in np.unique([*np.geomspace(1, widest, 12 + int(120 * np.log(widest)))[1:], *case.known]):
+        reference = reference.widened(a)
+        p[a] = reference.pressure / P0
+        radii.append(a)
+        out.append(np.interp(OUTER, reference.R, reference.r) - OUTER)
+    s = ring(cells, case.soil, widest + 1 / cells, lambda t: np.interp(1 + t, radii, out))
+    if case.state:
+        s.stage(fields=case.state)
+    return {a: (widen(s, cells, a), p[a]) for a in case.known}
+
+
+@dataclass
+class Undrained:
+    """What an undrained push and the consolidation after it give.
+
+    total, water: pressure in the hole less p_0, and pore pressure at its wall, over p_0, with the exact ones; profiles:
+    (time after the push, s, radii of the points, m, pore pressures over p_0); balance: of the fluid.
+    """
+
+    total: tuple[float, float]
+    water: tuple[float, float]
+    profiles: list[tuple[float, np.ndarray, np.ndarray]]
+    balance: float
+
+
+def at_wall(s: mpm.Simulation, radius: float, h: float) -> float:
+    """Return the pore pressure over p_0 at the wall: a parabola in ln r through the cells beside it."""
+    r = np.linalg.norm(s.points.x, axis=1)
+    near = r < radius + 1.5 * h
+    return float(np.polyfit(np.log(r[near] / radius), s.points.pressure[near] / P0, 2)[-1])
+
+
+def push(OCR: float, cells: int) -> Undrained:
+    """Widen the hole in clay to `MARK`, fast, then let the clay drain."""
+    soil = replace(CLAY, OCR=OCR, bulk=None)
+    water = {"fluid": mpm.Fluid(), "tractions": [mpm.Pressure("right", P0)], "drained": [mpm.Drained("right")]}
+    s = ring(cells, soil, MARK, **water)
+    found = widen(s, cells, MARK) - 1
+    drop, stress = undrained(soil, OUTER, np.geomspace(1, MARK, 101)[1:], 400)
+    out = Undrained((found, drop / P0), (at_wall(s, MARK, 1 / cells), 1 + (drop + stress) / P0), [], 0.0)
+
+    def look(s: mpm.Simulation) -> None:
+        r = np.linalg.norm(s.points.x, axis=1)
+        order = np.argsort(r)
+        out.profiles.append((s.t - MARK + 1, r[order], s.points.pressure[order] / P0))
+
+    look(s)
+    result = s.result
+    s.t = 0.0
+    s.stage(displacements=[mpm.Displacement("left", lambda t, X: (MARK - 1) * ray(X))])
+    times = OUTER**2 / CV * np.array([0.003, 0.03, 0.1, 0.3, 3.0])
+    before = out.balance = result.balance
+    after = s.run(times[-1], rtol=2e-2, t_eval=times, observe=look, progress=False)
+    out.balance = max(before, after.balance)
+    return out
+
+
+def main(argv: list[str] | None = None) -> dict:
+    """Run the demo; return what --json prints."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--cells", type=int, default=8, help="cells over the hole's radius (8)")
+    parser.add_argument("--cases", nargs="*", default=list(DRAINED), choices=list(DRAINED), help="drained ones (all)")
+    parser.add_argument("--ratios", nargs="*", type=float, default=RATIOS, help="overconsolidation, undrained (1, 2)")
+    parser.add_argument("--out", type=Path, default=Path("out/cavity"), help="folder for the picture (out/cavity)")
+    parser.add_argument("--json", action="store_true", help="print the results as one line of JSON at the end")
+    o = parser.parse_args(argv)
+    if o.cells < 2 or any(not 1 <= ratio < 10 for ratio in o.ratios):
+        parser.error(f"--cells {o.cells} --ratios {o.ratios}: must be >= 2, and in [1, 10)")
+    out = {"converged": False, "errors": {}, "balance": 0.0}
+    try:
+        dry = {name: drained(name, o.cells) for name in o.cases}
+        for name, found in dry.items():
+            for a, (p, radial) in found.items():
+                out["errors"][f"{name}, a/a0 = {a}"] = p / DRAINED[name].known[a] - 1
+                print(f"{name}, a/a0 = {a}: {p:.3f} p0, known {DRAINED[name].known[a]:.3f}, radial {radial:.3f}")
+        wet = {ratio: push(ratio, o.cells) for ratio in o.ratios}
+        for ratio, run in wet.items():
+            for what, (p, exact) in (("total", run.total), ("pore", run.water)):
+                out["errors"][f"clay, OCR {ratio:g}, {what}"] = p / exact - 1
+                print(f"undrained clay, OCR {ratio:g}, a/a0 = {MARK}: {what} pressure {p:.3f} p0, exact {exact:.3f}")
+            left = np.abs(run.profiles[-1][2]).max()
+            out["balance"] = max(out["balance"], run.balance)
+            print(f"  consolidated: pore pressures up to {left:.1e} p0, fluid balance {run.balance:.0e}")
+        worst = max(map(abs, out["errors"].values()), default=0.0)
+        out["converged"] = worst < 0.4 / o.cells and out["balance"] < 1e-6
+        print(f"largest error {worst:.2%}")
+        draw(o.out, dry, wet)
+        print(f"picture: {o.out}/cavity.png")
+    except mpm.GaveUp as error:
+        print(f"error: {error}", file=sys.stderr)
+    if o.json:
+        print(json.dumps(out))
+    return out
+
+
+def draw(out: Path, dry: dict, wet: dict[float, Undrained]) -> None:
+    """Draw pressures in drained cavities, and pore pressures around undrained ones as they dissipate."""
+    fig, ((left, right),) = beam.figure(1, 2, (12, 4.2))
+    for k, (name, found) in enumerate(dry.items()):
+        known = DRAINED[name].known
+        left.plot(list(known), list(known.values()), "o", color=f"C{k}", mfc="white", ms=8)
+        left.plot(list(found), [p for p, _ in found.values()], "x--", color=f"C{k}", lw=0.8, label=name)
+    left.set(xlabel="a / a0 (-)", ylabel="p / p0 (-)", title="Drained cavities (crosses), published (circles)")
+    for k, (ratio, run) in enumerate(wet.items()):
+        for i, (t, r, p) in enumerate(run.profiles):
+            label = f"OCR {ratio:.0f}, T = {t * CV / OUTER**2:.2g}" if i else f"OCR {ratio:.0f}, undrained"
+            shade = 1 - 0.8 * i / len(run.profiles)
+            right.plot(r, p, ".", ms=1.5, color=f"C{k}", alpha=shade, label=label)
+    right.set(xlabel="r / a0 (-)", ylabel="pore pressure / p0 (-)", title=f"Undrained to a / a0 = {MARK}, then drained")
+    for ax in (left, right):
+        if ax.has_data():
+            ax.legend(fontsize=7, markerscale=4 if ax is right else 1)
+        ax.grid(alpha=0.3)
+    out.mkdir(parents=True, exist_ok=True)
+    fig.savefig(out / "cavity.png", dpi=90)
+
+
+if __name__ == "__main__":
+    sys.exit(0 if main()["converged"] else 1)
