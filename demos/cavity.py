@@ -26,7 +26,7 @@ import numpy as np
 import poroelastic_beam as beam
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.verification.cavity import Cavity, undrained
+from mpm_dolfinx.verification.cavity import cavity, undrained
 
 P0, OUTER = 1e5, 5.0  # Pa, outer radius over that of the cavity
 PUSH = 0.2  # of a cell, in a step
@@ -105,9 +105,10 @@ def drained(name: str, cells: int) -> dict[float, tuple[float, float]]:
     """Return radius -> pressures over p_0: that in the hole, and that of the radial solution."""
     case = DRAINED[name]
     widest = max(case.known)
-    reference, radii, out, p = Cavity(case.soil, case.reach, 150, state=case.state), [1.0], [0.0], {}
+    reference, radii, out, p = cavity(case.soil, case.reach, 150, state=case.state), [1.0], [0.0], {}
     for a in np.unique([*np.geomspace(1, widest, 12 + int(120 * np.log(widest)))[1:], *case.known]):
-        p[a] = reference.widen(a) / P0
+        reference = reference.widened(a)
+        p[a] = reference.pressure / P0
         radii.append(a)
         out.append(np.interp(OUTER, reference.R, reference.r) - OUTER)
     s = ring(cells, case.soil, widest + 1 / cells, lambda t: np.interp(1 + t, radii, out))

@@ -30,6 +30,7 @@ from mpm_dolfinx.constitutive.skeleton import Field, _check
 from mpm_dolfinx.constitutive.trial import PLANE, Isotropic, coaxial, components, eigen, symmetric
 
 ROUND_OFF = 1e-12  # of stresses over the shear modulus
+FACE, EDGES, ALL = slice(0, 1), slice(1, 3), slice(None)  # of the faces of a return
 NEVER = 1e6  # tensile strength over the bulk modulus where none is given
 
 
@@ -142,15 +143,15 @@ def _returned(e: NDArray, bulk: NDArray, shear: NDArray, sine: NDArray, sine_flo
     if flows.any():
         parameters = elastic, bulk, shear, sine, sine_flow, *limits
 
-        def at(rows: NDArray) -> _Return:
-            return _Return(t[rows], *(v[rows] for v in parameters))
-
-        rows = np.flatnonzero(flows)
-        ends, of_trial, offence = at(rows).on_main_face()
-        others = ~(offence <= ROUND_OFF * shear[rows])
-        if others.any():
-            ends[others], of_trial[others] = at(rows[others]).end()
-        t[rows], slopes[rows] = ends, of_trial @ elastic[rows]
+        trial, rows = t.copy(), np.flatnonzero(flows)
+        for few in (FACE, EDGES, ALL):  # most end on the first, most others on the next
+            at = _Return(trial[rows], *(v[rows] for v in parameters))
+            ends, of_trial, offence = at.end(few)
+            there = offence <= ROUND_OFF * shear[rows] if few is not ALL else slice(None)
+            t[rows[there]], slopes[rows[there]] = ends[there], of_trial[there] @ elastic[rows[there]]
+            rows = np.delete(rows, there)
+            if not len(rows):
+                break
     return t, slopes, flows.astype(float)
 
 
@@ -187,18 +188,18 @@ class _Return:
             (_rows(s.T, s.T, lowest), self._in_extension),
         )
 
-    def on_main_face(self) -> tuple[NDArray, NDArray, NDArray]:
-        """Return stresses on the face of the largest and smallest, where most end, see `_on`."""
-        return self._on(self._faces[0])
-
-    def end(self) -> tuple[NDArray, NDArray]:
-        """Return the stresses at the end (n, 3), Pa, and their derivatives by the trial stresses (n, 3, 3)."""
+    def end(self, few: slice) -> tuple[NDArray, NDArray, NDArray]:
+        """Return the stresses that offend least of some ends (n, 3), Pa, their derivatives (n, 3, 3), their offence."""
         with np.errstate(all="ignore"):  # vertices that are nowhere
-            ends = [self._on(faces) for faces in self._faces] + [self._at(*vertex) for vertex in self._vertices]
+            ends = [self._on(faces) for faces in self._faces[few]]
+            if few is ALL:
+                ends += [self._at(*vertex) for vertex in self._vertices]
+        if len(ends) == 1:
+            return ends[0]
         offence = np.array([np.nan_to_num(offends, nan=np.inf) for _, _, offends in ends])
         best, n = offence.argmin(axis=0), np.arange(len(self._trial))
         stresses, slopes = (np.array([end[i] for end in ends])[best, n] for i in (0, 1))
-        return stresses, slopes
+        return stresses, slopes, offence[best, n]
 
     def _offence(self, t: NDArray, multipliers: Sequence[NDArray]) -> NDArray:
         """Return by how much stresses, and multipliers that must be >= 0, offend (n,), Pa."""
@@ -210,7 +211,7 @@ class _Return:
         normals, limits, flows = (np.stack(part, axis=1) for part in zip(*faces, strict=True))
         drops = np.einsum("nij,nfj->nif", self._elastic, flows)
         gram = normals @ drops
-        inverse = 1 / gram if len(faces) == 1 else np.linalg.inv(gram)
+        inverse = 1 / gram if len(faces) == 1 else _inverse(gram)
         slopes = np.eye(3) - drops @ inverse @ normals
         over = np.einsum("nfi,ni->nf", normals, self._trial) - limits
         multipliers = np.einsum("nfg,ng->nf", inverse, over)
@@ -236,6 +237,12 @@ class _Return:
     def _in_extension(self, x: NDArray) -> list[NDArray]:
         """The same of two faces that meet where t_1 = t_2, and of the cut-off of both."""
         return [x[:, 0], x[:, 1], -x[:, 2], x[:, 0] + x[:, 1] + self._p / self._q * x[:, 2]]
+
+
+def _inverse(A: NDArray) -> NDArray:
+    """Return the inverses of matrices (n, 2, 2), in a tenth of LAPACK's time."""
+    adjugate = A[:, ::-1, ::-1].transpose(0, 2, 1) * [[1, -1], [-1, 1]]
+    return adjugate / (A[:, 0, 0] * A[:, 1, 1] - A[:, 0, 1] * A[:, 1, 0])[:, None, None]
 
 
 def _rows(*columns: NDArray) -> NDArray:

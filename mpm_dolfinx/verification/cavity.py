@@ -7,6 +7,7 @@ The hole has the radius 1; the soil begins in equilibrium with the same pressure
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 from mpi4py import MPI
 
@@ -18,11 +19,12 @@ from mpm_dolfinx.constitutive.evaluate import LawAtPoints
 from mpm_dolfinx.constitutive.skeleton import Skeleton
 from mpm_dolfinx.points.grid import Grid
 
+State = dict[str, NDArray[np.float64]]
 NUDGE, NEAR, MOST = 1e-7, 1e-10, 60  # of stretches; relative residual; iterations
 
 
 class _Rings:
-    """A law at rings of which each has its own state; stretches (n, 2) are radial and along the ring."""
+    """A law at rings; stretches (n, 2) are radial and along the ring, states name -> (n, ...), `start` is the first."""
 
     def __init__(self, material: Skeleton, count: int, state: Mapping[str, ArrayLike] | None = None):
         law = type(material)
@@ -30,67 +32,57 @@ class _Rings:
         start = {name: np.asarray(v, dtype=float) for name, v in (dict(law.state) | dict(state or {})).items()}
         grid = Grid([1.0] * 3, [2] * 3, comm=MPI.COMM_SELF)
         self._law = LawAtPoints(grid, law, {name: v.shape for name, v in (values | start).items()})
-        self._values, self.state = _tiled(values, count), _tiled(start, count)
+        self._values, self.start = _tiled(values, count), _tiled(start, count)
 
-    def _data(self, stretches: NDArray[np.float64], repeat: int = 1):
+    def _data(self, stretches: NDArray[np.float64], state: State, repeat: int = 1):
         F = np.tile(np.eye(3), (len(stretches), 1, 1))
         F[:, 0, 0], F[:, 1, 1] = stretches.T
         cells = np.arange(len(F), dtype=np.int32) % 8
-        taken = {name: np.concatenate([v] * repeat) for name, v in (self._values | self.state).items()}
+        taken = {name: np.concatenate([v] * repeat) for name, v in (self._values | state).items()}
         return self._law.points.at(cells, self._law.grid.midpoints[cells], np.ones(len(F)), F=F, **taken)
 
-    def kirchhoff(self, stretches: NDArray[np.float64], repeat: int = 1) -> NDArray[np.float64]:
+    def kirchhoff(self, stretches: NDArray[np.float64], state: State, repeat: int = 1) -> NDArray[np.float64]:
         """Return the normal Kirchhoff stresses (n, 2), Pa; repeat: how often all rings are in the stretches."""
-        stress = self._law.stress(self._data(stretches, repeat))
+        stress = self._law.stress(self._data(stretches, state, repeat))
         return stress[:, [0, 1], [0, 1]] * stretches.prod(axis=1, keepdims=True)
 
-    def nominal(self, stretches: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def nominal(self, stretches: NDArray[np.float64], state: State) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the nominal stresses (n, 2), Pa, and their derivatives by the stretches (n, 2, 2)."""
         nudges = NUDGE * np.array([[0, 0], [1, 0], [0, 1]])
         near = (stretches + nudges[:, None, :]).reshape(-1, 2)
-        P = (self.kirchhoff(near, len(nudges)) / near).reshape(len(nudges), -1, 2)
+        P = (self.kirchhoff(near, state, len(nudges)) / near).reshape(len(nudges), -1, 2)
         return P[0], (P[1:] - P[0]).transpose(1, 2, 0) / NUDGE
 
-    def accept(self, stretches: NDArray[np.float64]) -> None:
-        """Take the state to the end of a step."""
-        self.state = self.state | dict(self._law.new_state(self._data(stretches), 0.0))
+    def updated(self, stretches: NDArray[np.float64], state: State) -> State:
+        """Return the state at the end of a step."""
+        return state | dict(self._law.new_state(self._data(stretches, state), 0.0))
 
 
+@dataclass(frozen=True)
 class Cavity:
     """A ring of soil in plane strain, linear elements with one point each, its hole widened, its outside pressed.
 
-    Parameters
-    ----------
-    material
-        The soil.
-    outer
-        Outer radius over that of the hole; a hundred times and more stands for soil without end.
-    elements
-        Over the ring, in geometric progression.
-    state
-        What the law's state is at the start, if not that at rest.
+    rings: the law; R, r: radii of the nodes at the start and now; state: of the law; far: pressure outside, Pa;
+    pressure: that in the hole, Pa.
     """
 
-    def __init__(
-        self, material: Skeleton, outer: float, elements: int = 300, state: Mapping[str, ArrayLike] | None = None
-    ):
-        self.R = np.geomspace(1, outer, elements + 1)
-        self.r, self._rings = self.R.copy(), _Rings(material, elements, state)
-        self._middle, self._h = (self.R[1:] + self.R[:-1]) / 2, np.diff(self.R)
-        self.far = -self._rings.kirchhoff(self._stretches(self.r))[-1, 0]
+    rings: _Rings
+    R: NDArray[np.float64]
+    r: NDArray[np.float64]
+    state: State
+    far: float
+    pressure: float
 
-    def _stretches(self, r: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.stack([np.diff(r) / self._h, (r[1:] + r[:-1]) / (2 * self._middle)], axis=1)
-
-    def widen(self, radius: float) -> float:
-        """Widen the hole to a radius in one step, drained; return the pressure in it, Pa."""
+    def widened(self, radius: float) -> Cavity:
+        """Return what becomes of the ring as its hole is widened to a radius in one step, drained."""
         n, r = len(self.R), self.r.copy()
         r += (radius - r[0]) * r[0] / r  # as if incompressible
         r[0] = radius
-        weight, g, t = self._middle * self._h, 1 / self._h, 1 / (2 * self._middle)
+        middle, h = (self.R[1:] + self.R[:-1]) / 2, np.diff(self.R)
+        weight, g, t = middle * h, 1 / h, 1 / (2 * middle)
         B = np.array([[-g, t], [g, t]])  # (node, stretch, element)
         for _ in range(MOST):
-            P, D = self._rings.nominal(self._stretches(r))
+            P, D = self.rings.nominal(_stretches(self.R, r), self.state)
             forces = np.einsum("ase,es->ae", B, P) * weight
             force = np.append(forces[0], 0.0) + np.append(0.0, forces[1])
             inside = force[0]
@@ -98,9 +90,8 @@ class Cavity:
             scale = np.abs(forces).max() + self.far * r[-1]
             force[0] = 0.0
             if np.abs(force).max() < NEAR * scale:
-                self._rings.accept(self._stretches(r))
-                self.r = r
-                return inside / r[0]
+                state = self.rings.updated(_stretches(self.R, r), self.state)
+                return replace(self, r=r, state=state, pressure=inside / r[0])
             K = np.einsum("ase,est,bte->eab", B, D, B) * weight[:, None, None]
             bands = np.zeros((3, n))
             bands[1, :-1] += K[:, 0, 0]
@@ -115,6 +106,27 @@ class Cavity:
         raise RuntimeError(f"no equilibrium at a radius of {radius:g}")
 
 
+def cavity(
+    material: Skeleton, outer: float, elements: int = 300, state: Mapping[str, ArrayLike] | None = None
+) -> Cavity:
+    """Return a cavity at the start.
+
+    Parameters
+    ----------
+    material
+        The soil.
+    outer
+        Outer radius over that of the hole; a hundred times and more stands for soil without end.
+    elements
+        Over the ring, in geometric progression.
+    state
+        What the law's state is at the start, if not that at rest.
+    """
+    R, rings = np.geomspace(1, outer, elements + 1), _Rings(material, elements, state)
+    far = -float(rings.kirchhoff(np.ones((elements, 2)), rings.start)[-1, 0])
+    return Cavity(rings, R, R, rings.start, far, far)
+
+
 def undrained(material: Skeleton, outer: float, radii: Sequence[float], rings: int = 2000) -> tuple[float, float]:
     """Return the difference of total pressures over a ring, and the effective radial stress at its wall, Pa.
 
@@ -123,14 +135,18 @@ def undrained(material: Skeleton, outer: float, radii: Sequence[float], rings: i
     """
     edges = np.geomspace(1, outer, rings + 1)
     R, law = np.sqrt((edges[1:] ** 2 + edges[:-1] ** 2) / 2), _Rings(material, rings)
+    state = law.start
     for a in radii:
         r = np.sqrt(R**2 + a**2 - 1)
         stretches = np.stack([R / r, r / R], axis=1)
-        tau = law.kirchhoff(stretches)
-        law.accept(stretches)
+        tau, state = law.kirchhoff(stretches, state), law.updated(stretches, state)
     ends = np.sqrt(edges**2 + a**2 - 1)
     drop = np.sum((tau[:, 1] - tau[:, 0]) * np.log(ends[1:] / ends[:-1]))
     return float(drop), float(np.polyfit(R[:3] - 1, tau[:3, 0], 2)[-1])
+
+
+def _stretches(R: NDArray[np.float64], r: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.stack([np.diff(r) / np.diff(R), (r[1:] + r[:-1]) / (R[1:] + R[:-1])], axis=1)
 
 
 def _tiled(values: Mapping[str, NDArray[np.float64]], count: int) -> dict[str, NDArray[np.float64]]:
