@@ -96,8 +96,11 @@ def cycle(
     return {"left": left, "times": times, "tips": u[:, 0], "lost": lost, "force": load * force, "cuts": result.cuts}
 
 
-def turn(h: float, nu: float = 0.3, steps: int = 90) -> float:
-    """Return by how much a turn by 360 degrees changes the stress in the middle of the stretched block, rms."""
+def turn(h: float, nu: float = 0.3, steps: int = 90, fluid: mpm.Fluid | None = None) -> float:
+    """Return by how much a turn by 360 degrees changes the total stress in the middle of the stretched block, rms.
+
+    With a fluid the block is undrained.
+    """
     cells = round(1.8 * BLOCK / h)
     grid = mpm.Grid([cells * h] * 2, [cells] * 2)
     lower = 0.4 * BLOCK + 0.37 * h
@@ -114,12 +117,17 @@ def turn(h: float, nu: float = 0.3, steps: int = 90) -> float:
 
     held = [mpm.Displacement(side, given(sign)) for side, sign in (("left", -1), ("right", 1))]
     law = mpm.Hencky(bulk=1e6 / (3 * (1 - 2 * nu)), shear=1e6 / (2 * (1 + nu)))
-    simulation = mpm.Simulation(grid, [block], [law], fixed={}, displacements=held)
+    simulation = mpm.Simulation(grid, [block], [law], fluid=fluid, fixed={}, displacements=held)
     middle = (np.abs(simulation.points.x - centre) < BLOCK / 4).all(axis=1)
+
+    def stress() -> np.ndarray:
+        pressure = simulation.points.pressure if fluid else np.zeros(len(middle))
+        return (simulation.effective_stress() - pressure[:, None, None] * np.eye(2))[middle]
+
     simulation.run(1.0, 0.2)
-    before = simulation.effective_stress()[middle]
+    before = stress()
     simulation.run(2.0, 1 / steps)
-    change = simulation.effective_stress()[middle] - before
+    change = stress() - before
     return float(np.sqrt((change**2).sum() / (before**2).sum()))
 
 
@@ -141,7 +149,13 @@ def main(argv: list[str] | None = None) -> dict:
     parser.add_argument("--load", type=float, default=54e3, help="largest load, Pa")
     parser.add_argument("--cycles", type=int, default=20, help="load cycles")
     parser.add_argument("--steps", type=int, default=10, help="steps in a cycle, even")
-    parser.add_argument("--turn", type=float, nargs="*", default=[0.05, 0.025], help="cell sizes of the block, m")
+    parser.add_argument(
+        "--turn",
+        type=float,
+        nargs="*",
+        default=[0.05, 0.025],
+        help="cell sizes of the block, m; last one undrained too",
+    )
     parser.add_argument("--out", type=Path, default=Path("out/cycles"), help="folder for the picture and the table")
     parser.add_argument("--json", action="store_true", help="print the results as one line of JSON at the end")
     o = parser.parse_args(argv)
@@ -153,6 +167,7 @@ def main(argv: list[str] | None = None) -> dict:
     points = cycle(o.h[-1], o.load, o.cycles, o.steps, "point")
     fem = reference(o)
     turned = {h: turn(h) for h in o.turn}
+    undrained = {h: turn(h, fluid=mpm.Fluid()) for h in o.turn[-1:]}
 
     print(
         f"{'':24}{'stress left / peak':>20}{'work lost a cycle':>20}{'drift of the peaks':>20}{'tip without load':>18}"
@@ -163,8 +178,9 @@ def main(argv: list[str] | None = None) -> dict:
         cycles = f"{name}, {len(run['left'])} cycles"
         numbers = (run["left"][-1], run["lost"][-1], peaks[-1] / peaks[0] - 1, rest[-1] / peaks[0])
         print(f"{cycles:24}" + "".join(f"{x:{w}.4%}" for x, w in zip(numbers, (20, 20, 20, 18), strict=True)))
-    for h, change in turned.items():
-        print(f"turned by 360 degrees, h = {h:g} m: the stress in the middle changes by {change:.4%}")
+    for what, changes in (("", turned), (" undrained", undrained)):
+        for h, change in changes.items():
+            print(f"turned by 360 degrees{what}, h = {h:g} m: the stress in the middle changes by {change:.4%}")
     o.out.mkdir(parents=True, exist_ok=True)
     with (o.out / "cycles.csv").open("w", newline="") as file:
         table = csv.writer(file)
@@ -175,6 +191,7 @@ def main(argv: list[str] | None = None) -> dict:
     out = {"left": {f"{h:g}": run["left"].tolist() for h, run in runs.items()}, "points": points["left"].tolist()}
     out |= {"lost": {f"{h:g}": run["lost"].tolist() for h, run in runs.items()}}
     out |= {"turned": {f"{h:g}": change for h, change in turned.items()}}
+    out |= {"undrained": {f"{h:g}": change for h, change in undrained.items()}}
     out["converged"] = all(len(run["left"]) == o.cycles for run in runs.values())
     if o.json:
         print(json.dumps(out))
