@@ -27,6 +27,7 @@ from mpm_dolfinx.constitutive.skeleton import (
     NeoHookean,
     Skeleton,
     kozeny_carman,
+    unsaturated,
 )
 from mpm_dolfinx.errors import GaveUp, LeftGrid, NotConverged
 from mpm_dolfinx.io.checkpoint import Checkpoint, resume
@@ -83,5 +84,6 @@ __all__ = [
     "probes",
     "resume",
     "shape",
+    "unsaturated",
     "water",
 ]
