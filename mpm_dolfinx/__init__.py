@@ -27,6 +27,7 @@ from mpm_dolfinx.constitutive.skeleton import (
     NeoHookean,
     Skeleton,
     kozeny_carman,
+    unsaturated,
 )
 from mpm_dolfinx.constitutive.softening import SofteningDruckerPrager
 from mpm_dolfinx.errors import GaveUp, LeftGrid, NotConverged
@@ -88,5 +89,6 @@ __all__ = [
     "probes",
     "resume",
     "shape",
+    "unsaturated",
     "water",
 ]

@@ -93,7 +93,9 @@ class Scene:
             weight = fluid.density * self.gravity if weighs else None
             symmetric = scheme.coupling != "schur-fgmres"
             pieces, u, laws = self.pieces.pieces, self.momentum.u, scene.conductivity_laws
-            law = ConductivityAtPieces(scene.materials, laws, pieces, u) if laws else None
+            law = (
+                ConductivityAtPieces(scene.materials, laws, pieces, u, fem.Function(grid.cellwise())) if laws else None
+            )
             self.storage = StorageForms(pieces, u, p, weight, symmetric, scene.conducts, law, sources, self.t)
         self.extensions = terms, sources
         """The user's terms and sources."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import cached_property
+from inspect import signature
 
 import numpy as np
 import ufl
@@ -212,6 +213,8 @@ class ConductivityAtPieces:
         Points with the fields F, position, conductivity and porosity0, where a material has a conductivity law.
     displacement
         Increment of the displacement since the start of the step.
+    pressure
+        DG0 pressure of the cells, Pa, at the start of the substep.
     """
 
     def __init__(
@@ -220,8 +223,12 @@ class ConductivityAtPieces:
         laws: Sequence[Callable],
         pieces: FormPoints,
         displacement: fem.Function,
+        pressure: fem.Function,
     ):
         self._points, self._materials, self._u = pieces, materials, displacement
+        self.pressure = pressure if any("p" in signature(law).parameters for law in laws) else None
+        """What laws are given for p, None where none names it."""
+        self._p = pressure
         self._laws = {law: PointExpression(self._in_ufl(law), pieces) for law in laws}
 
     def _in_ufl(self, law: Callable):
@@ -236,6 +243,7 @@ class ConductivityAtPieces:
             porosity=1 - (1 - points.porosity0) / J,
             porosity0=points.porosity0,
             x=points.position + points.value(self._u),
+            p=self._p,
         )
 
     def evaluate(self, data: PointData, material: NDArray[np.int32], begins: bool) -> NDArray[np.float64]:
@@ -264,7 +272,7 @@ def sampled(law: Callable) -> list[float | None]:
     out = []
     for J in (0.8, 1.0, 1.25):
         F = ufl.as_matrix([[J, 0.1 * J], [0.0, 1.0]])
-        state = {"J": J, "porosity": 1 - 0.6 / J, "porosity0": 0.4, "conductivity": 1e-5}
+        state = {"J": J, "porosity": 1 - 0.6 / J, "porosity0": 0.4, "conductivity": 1e-5, "p": 1e4 * (J - 1)}
         given = {name: ufl.as_ufl(value) for name, value in state.items()}
         try:
             k = expression(law, [()], F=F, x=ufl.as_vector([0.3, 0.7]), **given)

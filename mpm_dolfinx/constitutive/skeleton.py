@@ -58,7 +58,7 @@ class Skeleton:
     conductivity_law
         Function that gives the conductivity k, m/s, in UFL, at the present deformation.  It is called with
         those of these arguments that it names: conductivity (the field above), F, J = det F, porosity,
-        porosity0, x (present position).
+        porosity0, x (present position), p (pore pressure of the cell at the start of the substep, Pa).
 
     A law adds its own parameters as fields of the dataclass and defines one of these static methods, which
     are called with those arguments that they name: F, the law's fields and properties, its state.
@@ -379,6 +379,31 @@ def kozeny_carman(conductivity, porosity, porosity0):
         Porosity now and at the start, n and n0, in (0, 1).
     """
     return conductivity * (porosity / porosity0) ** 3 * ((1 - porosity0) / (1 - porosity)) ** 2
+
+
+def unsaturated(suction: float, least: float = 1e-4) -> Callable:
+    """Return a conductivity law by which water flows below a free surface only: to be given as `conductivity_law`.
+
+    The conductivity falls from k at p = `suction` to `least` k at p = -`suction`, by a cubic without kinks.  Pores
+    count as full all the same, and hold their water by suction: the law gives steady flow with a free surface (Bathe
+    and Khoshgoftaar 1979), not how much water drains as that falls.  The conductivity is that of the pressure at the
+    start of each substep: steady flow is reached in steps of some (cell size)^2 / (coefficient of consolidation).
+
+    Parameters
+    ----------
+    suction
+        Pa, > 0: half to once the weight of water over a cell's height.
+    least
+        In (0, 1).
+    """
+    numbers("unsaturated: suction", suction, test=lambda v: (0 < v) & (v < inf), allowed="> 0 and finite")
+    numbers("unsaturated: least", least, test=lambda v: (0 < v) & (v < 1), allowed="in (0, 1)")
+
+    def law(conductivity, p):
+        x = ufl.max_value(0.0, ufl.min_value(1.0, (1 + p / suction) / 2))
+        return conductivity * (least + (1 - least) * x**2 * (3 - 2 * x))
+
+    return law
 
 
 LAWS = {"hencky": Hencky, "neo-hookean": NeoHookean, "linear": LinearElastic}

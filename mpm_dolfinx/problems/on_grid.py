@@ -277,6 +277,7 @@ class Assembled:
         )
         self._on_grid, self._stage, grid = on_grid, stage, on_grid.cut.grid
         self._u, self._varies = momentum.u, storage is not None and storage.conductivity is not None
+        self._by_pressure = storage if self._varies and storage.conductivity.pressure is not None else None
         self._mobility: Latest[Mobility] = Latest()
         self._outflow: Latest[Outflow] = Latest()
         self.momentum.set_penalty(sides)
@@ -330,6 +331,9 @@ class Assembled:
             )
             return self.storage.set_fluxes(contents, at_sides, Conduction(kappa, motion, weight), off)
 
+        if (storage := self._by_pressure) is not None:
+            varies = (*varies, storage.p.x.array.copy())
+            storage.conductivity.pressure.x.array[:] = storage.p.x.array  # of the start of the substep
         if state.stay and not self._varies:
             outflow = self._outflow((at, weight, *varies), lambda: set_fluxes(sides(), mobility(True)), grid.comm)
             return lambda begins: outflow

@@ -7,10 +7,10 @@ In each active cell, with J_Delta = det(I + grad u) (never div u: a rotation wou
     Q = T [p+ - p- + rho_w g . (x- - x+)],   T = A / (d+ / kappa+ + d- / kappa-),   kappa = k / (rho_w g),
 
 where A is the exact overlap of the body with the face, x+- are the centroids of what the cells hold
-and d+- their distances from the face; `layers` has kappa and d of cells that hold several conductivities.  Where
-bodies lie aslant `aslant` adds what centroids that are not across from one another leave out.  Distances from the
-centroids keep the error at 0.2 % for any filling, where half the cell size reaches 12 %.  The sum over the
-cells is the fluid balance.  The change of the content is that of `fluid_content`, the integral over the step that of a
+and d+- their distances from the face; `layers` has kappa and d of cells that hold several conductivities.  Distances
+from the centroids keep the error at 0.2 % for any filling, where half the cell size reaches 12 %.  Where bodies lie
+aslant, `aslant` adds what centroids that are not across from one another leave out.  The sum over the cells is the
+fluid balance.  The change of the content is that of `fluid_content`, the integral over the step that of a
 substep of `time_integration`.
 
 Q1 with DG0 is not inf-sup stable: where next to nothing flows within a step, checkers of p go unseen.
