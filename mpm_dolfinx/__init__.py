@@ -4,9 +4,9 @@
 A scene is a `Simulation` of a `Grid`, bodies (`box`, `shape`, `mapped`, `from_mesh`, `polygon`), materials (`Hencky`,
 `NeoHookean`, `LinearElastic`, `DruckerPrager`, `MohrCoulomb`, `ModifiedCamClay`, or your own `Skeleton`), a `Fluid` and
 conditions on the sides of the bodies (`Traction`, `Pressure`, `Displacement`, `RigidPlate`, `Drained`, `Inflow`,
-`water`).  Its `run` gives a `Result` with what `probes` record, and feeds a `Writer` and a `Checkpoint`, from which
-`resume` goes on; `stage` changes the scene between two runs.  Terms and sources in UFL: see
-`mpm_dolfinx.constitutive.user_functions`.
+`water`), and rigid tools (`Tool` of a `HalfSpace`, `Ball`, `Convex`, `Cone`).  Its `run` gives a `Result` with what
+`probes` record, and feeds a `Writer` and a `Checkpoint`, from which `resume` goes on; `stage` changes the scene between
+two runs.  Terms and sources in UFL: see `mpm_dolfinx.constitutive.user_functions`.
 
 SI units throughout.  Stress is positive in tension, pore pressure in compression; 2D is plane strain, and forces
 are those of a slice of 1 m.
@@ -36,6 +36,7 @@ from mpm_dolfinx.points.mesh_files import from_mesh
 from mpm_dolfinx.points.polygon import polygon
 from mpm_dolfinx.points.probes import probes
 from mpm_dolfinx.problems.conditions import Displacement, Drained, Inflow, Pressure, RigidPlate, Traction
+from mpm_dolfinx.problems.tools import Ball, Cone, Convex, HalfSpace, Tool
 from mpm_dolfinx.problems.water import water
 from mpm_dolfinx.result import Result
 from mpm_dolfinx.simulation import Simulation
@@ -46,7 +47,10 @@ __version__ = "0.1.0"
 __all__ = [
     "COUPLINGS",
     "LAWS",
+    "Ball",
     "Checkpoint",
+    "Cone",
+    "Convex",
     "Displacement",
     "Drained",
     "DruckerPrager",
@@ -55,6 +59,7 @@ __all__ = [
     "Fluid",
     "GaveUp",
     "Grid",
+    "HalfSpace",
     "Hencky",
     "Inflow",
     "LeftGrid",
@@ -69,6 +74,7 @@ __all__ = [
     "Simulation",
     "Skeleton",
     "State",
+    "Tool",
     "Traction",
     "Writer",
     "box",

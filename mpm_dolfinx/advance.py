@@ -80,7 +80,7 @@ class Motion:
             deformed = cache(partial(self._deformed, state.points, on_grid, nodal))
             if cut.domains:
                 moved, bend = cut.followed(nodal, self._momentum.active_nodes(on_grid.cells))
-                points, serves, folded = self._shaped(state, cut, moved, bend, deformed)
+                points, serves, folded = self._shaped(state, t, cut, moved, bend, deformed)
             else:
                 x, F = state.points.x + cut.displacement(nodal), deformed()
                 points = replace(state.points, x=x, F=F, corners=parallelepipeds(x, F, self._sizes(state.points)))
@@ -113,6 +113,7 @@ class Motion:
     def _shaped(
         self,
         state: State,
+        t: float,
         cut: CutDomains,
         moved: NDArray[np.float64],
         bend: NDArray[np.float64],
@@ -129,6 +130,7 @@ class Motion:
         """
         grid, stage, d, folded = cut.grid, state.stage, cut.grid.dim, 0
         free = ~given(grid, stage.lattices, stage.conditions["fixed"], state.points)
+        free &= ~stage.mechanical.tools.near(state.points.corners + moved, t)[:, :, None]
         corners = state.points.corners + moved + free * bend
         points = replace(state.points, corners=corners)
         serves, evolved = cut.serves(points), self._materials.evolved(points)

@@ -20,6 +20,7 @@ from mpm_dolfinx.points.grid import Grid
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.problems.conditions import Displacement, Drained, Inflow, Pressure, RigidPlate, Traction
 from mpm_dolfinx.problems.thin import warn_thin
+from mpm_dolfinx.problems.tools import Tool
 from mpm_dolfinx.result import Report, Result
 from mpm_dolfinx.scene import Scene
 from mpm_dolfinx.solve.scheme import Scheme
@@ -48,6 +49,8 @@ class Simulation:
         Pore fluid; without it there is no storage problem.
     tractions, displacements, drained, inflows, plates
         Boundary conditions on sides of the bodies; other sides are free and sealed.
+    tools
+        Rigid tools that press on the bodies.
     gravity : (d,) or callable t -> (d,), m/s^2
         Acceleration of gravity.
     pressure
@@ -91,6 +94,7 @@ class Simulation:
         drained: Sequence[Drained] = (),
         inflows: Sequence[Inflow] = (),
         plates: Sequence[RigidPlate] = (),
+        tools: Sequence[Tool] = (),
         gravity: ArrayLike | Callable[[float], ArrayLike] | None = None,
         pressure: float = 0.0,
         quadrature: str = "domain",
@@ -123,7 +127,7 @@ class Simulation:
         options = (quadrature, scheme, method, weighs, pressure, terms, sources)
         self.scene = Scene(grid, bodies, materials, fluid, *options)
         conditions = {"fixed": fixed, "tractions": tractions, "displacements": displacements, "drained": drained}
-        conditions |= {"inflows": inflows, "plates": plates, "gravity": gravity}
+        conditions |= {"inflows": inflows, "plates": plates, "tools": tools, "gravity": gravity}
         self.state = first_state(self.scene, conditions, later)
         self.jit = time.perf_counter() - began
         """Seconds spent on compiling or finding the forms."""
@@ -180,6 +184,11 @@ class Simulation:
         return self.state.outflows
 
     @property
+    def tool_forces(self) -> NDArray[np.float64]:
+        """(tools, d + 1), in 3D (tools, 6): force and moment of each tool on the bodies, as `reactions`: see `Tool`."""
+        return self.state.tool_forces
+
+    @property
     def present(self) -> tuple[bool, ...]:
         """Which bodies are there."""
         return self.state.stage.present
@@ -216,6 +225,7 @@ class Simulation:
         drained: Sequence[Drained] | None = None,
         inflows: Sequence[Inflow] | None = None,
         plates: Sequence[RigidPlate] | None = None,
+        tools: Sequence[Tool] | None = None,
         gravity: ArrayLike | Callable[[float], ArrayLike] | None = None,
         add: Sequence[int] = (),
         remove: Sequence[int] = (),
@@ -229,7 +239,7 @@ class Simulation:
 
         Parameters
         ----------
-        fixed, tractions, displacements, drained, inflows, plates, gravity
+        fixed, tractions, displacements, drained, inflows, plates, tools, gravity
             As for the scene; `gravity` only if the scene had it.
         add
             Indices of bodies that were to come `later`: a fill, at rest and without stress, put onto the
@@ -250,7 +260,7 @@ class Simulation:
             The scene is then what it was.
         """
         conditions = {"fixed": fixed, "tractions": tractions, "displacements": displacements, "drained": drained}
-        conditions |= {"inflows": inflows, "plates": plates, "gravity": gravity}
+        conditions |= {"inflows": inflows, "plates": plates, "tools": tools, "gravity": gravity}
         named = {name: value for name, value in conditions.items() if value is not None}
         self.state = begin_stage(self.scene, self.state, named, add, remove, reset_displacement, fields or {})
 

@@ -250,7 +250,7 @@ def test_a_foreign_file_is_refused(checkpoint, tmp_path):
 
 def test_a_checkpoint_of_another_version_is_refused(checkpoint, monkeypatch):
     monkeypatch.setattr(restart, "VERSION", restart.VERSION + 1)
-    refused(checkpoint, "checkpoint of version 5, must be 6")
+    refused(checkpoint, "checkpoint of version 6, must be 7")
 
 
 OTHER_SCENES = {

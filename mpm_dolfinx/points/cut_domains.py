@@ -46,7 +46,7 @@ class Patches:
     """
 
     def __init__(self, faces: Surface, here, at, cell, x, xi, share):
-        self._faces, self._here, self.at, self._xi = faces, here, at, xi
+        self._faces, self.here, self.at, self._xi = faces, here, at, xi
         self.cell, self.x = cell, x
         self.area0 = share * faces.area0[here]
         """Reference areas (n,), m^(d-1)."""
@@ -54,7 +54,7 @@ class Patches:
     @cached_property
     def X(self) -> NDArray[np.float64]:
         """Reference positions (n, d), m."""
-        return self._faces.reference(self._here, self._xi)
+        return self._faces.reference(self.here, self._xi)
 
     def origin(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the positions (n, d), m, from which displacements count."""
@@ -66,8 +66,8 @@ class Patches:
 
     def area(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the outward area vectors (n, d), m^(d-1)."""
-        share = self.area0 / self._faces.whole0[self._here]
-        return face_vectors(points.corners[self.at], self._faces.face[self._here]) * share[:, None]
+        share = self.area0 / self._faces.whole0[self.here]
+        return face_vectors(points.corners[self.at], self._faces.face[self.here]) * share[:, None]
 
 
 class CutDomains(Keyed):
