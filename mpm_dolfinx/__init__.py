@@ -4,9 +4,10 @@
 A scene is a `Simulation` of a `Grid`, bodies (`box`, `shape`, `mapped`, `from_mesh`, `polygon`), materials (`Hencky`,
 `NeoHookean`, `LinearElastic`, `DruckerPrager`, `SofteningDruckerPrager`, `MohrCoulomb`, `ModifiedCamClay`, or your own
 `Skeleton`), a `Fluid` and conditions on the sides of the bodies (`Traction`, `Pressure`, `Displacement`, `RigidPlate`,
-`Drained`, `Inflow`, `water`).  Its `run` gives a `Result` with what `probes` record, and feeds a `Writer` and a
-`Checkpoint`, from which `resume` goes on; `stage` changes the scene between two runs, and `factor_of_safety` weakens
-it until it slides.  Terms and sources in UFL: see `mpm_dolfinx.constitutive.user_functions`.
+`Drained`, `Inflow`, `water`), and rigid tools (`Tool` of a `HalfSpace`, `Ball`, `Convex`, `Cone`).  Its `run` gives a
+`Result` with what `probes` record, and feeds a `Writer` and a `Checkpoint`, from which `resume` goes on; `stage`
+changes the scene between two runs, and `factor_of_safety` weakens it until it slides.  Terms and sources in UFL: see
+`mpm_dolfinx.constitutive.user_functions`.
 
 SI units throughout.  Stress is positive in tension, pore pressure in compression; 2D is plane strain, and forces
 are those of a slice of 1 m.
@@ -39,6 +40,7 @@ from mpm_dolfinx.points.mesh_files import from_mesh
 from mpm_dolfinx.points.polygon import polygon
 from mpm_dolfinx.points.probes import probes
 from mpm_dolfinx.problems.conditions import Displacement, Drained, Inflow, Pressure, RigidPlate, Traction
+from mpm_dolfinx.problems.tools import Ball, Cone, Convex, HalfSpace, Tool
 from mpm_dolfinx.problems.water import water
 from mpm_dolfinx.result import Result
 from mpm_dolfinx.simulation import Simulation
@@ -51,7 +53,10 @@ __all__ = [
     "COUPLINGS",
     "K0",
     "LAWS",
+    "Ball",
     "Checkpoint",
+    "Cone",
+    "Convex",
     "Displacement",
     "Drained",
     "DruckerPrager",
@@ -60,6 +65,7 @@ __all__ = [
     "Fluid",
     "GaveUp",
     "Grid",
+    "HalfSpace",
     "Hencky",
     "Inflow",
     "LeftGrid",
@@ -76,6 +82,7 @@ __all__ = [
     "Skeleton",
     "SofteningDruckerPrager",
     "State",
+    "Tool",
     "Traction",
     "Writer",
     "box",

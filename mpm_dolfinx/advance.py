@@ -82,7 +82,7 @@ class Motion:
             deformed = cache(partial(self._deformed, cut, data, nodal))
             if cut.domains:
                 moved, bend = cut.followed(nodal, self._momentum.active_nodes(on_grid.cells))
-                points, serves, folded = self._shaped(state, cut, moved, bend, deformed)
+                points, serves, folded = self._shaped(state, t, cut, moved, bend, deformed)
             else:
                 x, F = state.points.x + cut.displacement(nodal), deformed()
                 points = replace(state.points, x=x, F=F, corners=parallelepipeds(x, F, self._sizes(state.points)))
@@ -121,6 +121,7 @@ class Motion:
     def _shaped(
         self,
         state: State,
+        t: float,
         cut: CutDomains,
         moved: NDArray[np.float64],
         bend: NDArray[np.float64],
@@ -137,6 +138,7 @@ class Motion:
         """
         grid, stage, folded = cut.grid, state.stage, 0
         free = ~given(grid, stage.lattices, stage.conditions["fixed"], state.points)
+        free &= ~stage.mechanical.tools.near(state.points.corners + moved, t)[:, :, None]
         corners = state.points.corners + moved + free * bend
         points = replace(state.points, corners=corners)
         serves, evolved = cut.serves(points), self._materials.evolved(points)

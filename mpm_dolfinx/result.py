@@ -39,7 +39,8 @@ class Row(NamedTuple):
 
     t, s; displacement (m, d), m, and present position (m, d), m, of the m probes; pressure: least and largest on the
     points, Pa; probe_pressure (m,), Pa, and probe_stress (m, 3, 3), Pa: pore pressure and effective stress, tension
-    positive, of the material points whose domains hold the probes.
+    positive, of the material points whose domains hold the probes; tools (k, d + 1) or (k, 6), N and N m: forces and
+    moments of tools on the bodies.
     """
 
     t: float
@@ -48,6 +49,7 @@ class Row(NamedTuple):
     position: NDArray[np.float64] | None = None
     probe_pressure: NDArray[np.float64] | None = None
     probe_stress: NDArray[np.float64] | None = None
+    tools: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True)
@@ -107,6 +109,11 @@ class Result:
     def probe_stress(self) -> list[NDArray[np.float64]]:
         """Effective stresses (m, 3, 3) at the probes at the output times, Pa, tension positive."""
         return self.column("probe_stress")
+
+    @property
+    def tools(self) -> list[NDArray[np.float64]]:
+        """Forces and moments (k, d + 1), in 3D (k, 6), of tools on the bodies at the output times, N and N m."""
+        return self.column("tools")
 
     @property
     def pressure(self) -> list[tuple[float, float]]:

@@ -17,12 +17,14 @@ from mpm_dolfinx.errors import StepFailed
 from mpm_dolfinx.initial_state import balanced
 from mpm_dolfinx.io import summary
 from mpm_dolfinx.point_fields import PointFields, point_fields
-from mpm_dolfinx.points.bodies import Body, check_bodies
+from mpm_dolfinx.points.bodies import Body
 from mpm_dolfinx.points.grid import Grid
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.problems.axis import check_axisymmetry
 from mpm_dolfinx.problems.conditions import Displacement, Drained, Inflow, Pressure, RigidPlate, Traction
+from mpm_dolfinx.problems.scene_parts import check_parts, check_physics
 from mpm_dolfinx.problems.thin import warn_thin
+from mpm_dolfinx.problems.tools import Tool
 from mpm_dolfinx.result import Report, Result
 from mpm_dolfinx.scene import Scene
 from mpm_dolfinx.solve.scheme import Scheme
@@ -30,7 +32,7 @@ from mpm_dolfinx.stages import begin_stage, first_state
 from mpm_dolfinx.state import State
 from mpm_dolfinx.step import step
 from mpm_dolfinx.timeloop import run
-from mpm_dolfinx.validation import all_of, chosen, functions, instance, line, numbers
+from mpm_dolfinx.validation import numbers
 
 
 class Simulation:
@@ -51,6 +53,8 @@ class Simulation:
         Pore fluid; without it there is no storage problem.
     tractions, displacements, drained, inflows, plates
         Boundary conditions on sides of the bodies; other sides are free and sealed.
+    tools
+        Rigid tools that press on the bodies.
     gravity : (d,) or callable t -> (d,), m/s^2
         Acceleration of gravity.
     pressure
@@ -98,6 +102,7 @@ class Simulation:
         drained: Sequence[Drained] = (),
         inflows: Sequence[Inflow] = (),
         plates: Sequence[RigidPlate] = (),
+        tools: Sequence[Tool] = (),
         gravity: ArrayLike | Callable[[float], ArrayLike] | None = None,
         pressure: float | Callable[[NDArray], ArrayLike] = 0.0,
         initial_stress: InitialStress | Mapping[int, InitialStress] | None = None,
@@ -112,19 +117,8 @@ class Simulation:
         if quadrature not in ("domain", "point"):
             raise ValueError(f"quadrature {quadrature!r}: must be domain or point")
         scheme = Scheme(coupling, tolerance)
-        instance("grid", grid, Grid)
-        all_of("bodies", bodies, Body, 1)
-        all_of("materials", materials, Skeleton, 1)
-        if fluid is not None:
-            instance("fluid", fluid, Fluid)
-        elif callable(pressure) or numbers("pressure", pressure):
-            raise ValueError(f"pressure = {line(pressure)}: needs a fluid")
-        elif sources:
-            raise ValueError("sources need a fluid")
-        check_bodies(grid, bodies)
-        chosen("later", later, range(len(bodies)), "indices of the bodies")
-        functions("terms", terms)
-        functions("sources", sources)
+        check_parts(grid, bodies, materials, later)
+        check_physics(fluid, pressure, terms, sources)
         grid.share(np.concatenate([body.centre for body in bodies]))
         warn_thin(grid, bodies, fixed)
         check_axisymmetry(grid, bodies, quadrature, initial_stress)
@@ -133,7 +127,7 @@ class Simulation:
         initial = by_body(initial_stress, bodies, later)
         self.scene = Scene(grid, bodies, materials, fluid, *options, initial)
         conditions = {"fixed": fixed, "tractions": tractions, "displacements": displacements, "drained": drained}
-        conditions |= {"inflows": inflows, "plates": plates, "gravity": gravity}
+        conditions |= {"inflows": inflows, "plates": plates, "tools": tools, "gravity": gravity}
         self.state = first_state(self.scene, conditions, later)
         if initial:
             self.state = balanced(self.scene, self.state)
@@ -192,6 +186,11 @@ class Simulation:
         return self.state.outflows
 
     @property
+    def tool_forces(self) -> NDArray[np.float64]:
+        """(tools, d + 1), in 3D (tools, 6): force and moment of each tool on the bodies, as `reactions`: see `Tool`."""
+        return self.state.tool_forces
+
+    @property
     def present(self) -> tuple[bool, ...]:
         """Which bodies are there."""
         return self.state.stage.present
@@ -228,6 +227,7 @@ class Simulation:
         drained: Sequence[Drained] | None = None,
         inflows: Sequence[Inflow] | None = None,
         plates: Sequence[RigidPlate] | None = None,
+        tools: Sequence[Tool] | None = None,
         gravity: ArrayLike | Callable[[float], ArrayLike] | None = None,
         add: Sequence[int] = (),
         remove: Sequence[int] = (),
@@ -241,7 +241,7 @@ class Simulation:
 
         Parameters
         ----------
-        fixed, tractions, displacements, drained, inflows, plates, gravity
+        fixed, tractions, displacements, drained, inflows, plates, tools, gravity
             As for the scene; `gravity` only if the scene had it.
         add
             Indices of bodies that were to come `later`: a fill, at rest and without stress, put onto the
@@ -262,7 +262,7 @@ class Simulation:
             The scene is then what it was.
         """
         conditions = {"fixed": fixed, "tractions": tractions, "displacements": displacements, "drained": drained}
-        conditions |= {"inflows": inflows, "plates": plates, "gravity": gravity}
+        conditions |= {"inflows": inflows, "plates": plates, "tools": tools, "gravity": gravity}
         named = {name: value for name, value in conditions.items() if value is not None}
         self.state = begin_stage(self.scene, self.state, named, add, remove, reset_displacement, fields or {})
 

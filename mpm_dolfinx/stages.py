@@ -37,7 +37,8 @@ def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int
         transported = pieces_at_start(scene, points) if callable(scene.initial.pressure) else at_start(points)
     reactions = np.zeros((len(begun.mechanical.holds), scene.grid.dim))
     outflows = np.zeros(len(begun.hydraulic.outlets))
-    return State(0.0, points, transported, None, 0, reactions, outflows, begun, True, None, None, None)
+    points, forces = begun.mechanical.tools.grip(points), begun.mechanical.tools.forces(0.0)
+    return State(0.0, points, transported, None, 0, reactions, outflows, forces, begun, True, None, None, None)
 
 
 def begin_stage(
@@ -60,13 +61,14 @@ def begin_stage(
     later = [body for body in before.later if body not in add]
     begun = _stage(scene, {**before.conditions, **named}, present, later)
     if remove:
-        _warn_moved_on(scene, before, begun, [name for name in CONDITIONS if name not in named])
+        _warn_moved_on(scene, before, begun, [name for name in CONDITIONS if name not in {*named, "tools"}])
     if state.stay:  # pressures are those of the cells
         state = scene.motion.left_grid(state, scene.on_grid(state.stay.points))
     gone, transported = _ids(scene.bodies, remove), state.transported
     there = [body for body, here in enumerate(before.present) if here and body not in remove]
-    gravity = begun.gravity_at(state.t)
-    points, new = _filled(scene, state.points.of(gone, kept=False), there, add, gravity)
+    bare, gravity = before.mechanical.tools.let_go(state.points), begun.gravity_at(state.t)
+    points, new = _filled(scene, bare.of(gone, kept=False), there, add, gravity)
+    points = begun.mechanical.tools.grip(points, None if "tools" in named else state.points)
     if transported is not None:
         transported = transported.of(gone, kept=False).joined(at_start(new))
     points = _changed(scene, points, fields)
@@ -75,6 +77,8 @@ def begin_stage(
     unknown, new = np.nan if state.resets else 0.0, {}
     if "displacements" in named:
         new["reactions"] = np.full((len(begun.mechanical.holds), scene.grid.dim), unknown)
+    if "tools" in named:
+        new["tool_forces"] = begun.mechanical.tools.forces(unknown)
     if named.keys() & {"drained", "inflows"}:
         new["outflows"] = np.full(len(begun.hydraulic.outlets), unknown)
     if add or remove:

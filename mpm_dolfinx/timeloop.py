@@ -196,6 +196,9 @@ def _histories(
     shown = after.rows[0].displacement
     if (recorded := 0 if shown is None else len(shown)) != (0 if probes is None else len(probes.id)):
         raise ValueError(f"probes: the run to go on with has {recorded} of them")
+    tools = 0 if after.rows[0].tools is None else len(after.rows[0].tools)
+    if tools != len(simulation.state.tool_forces):
+        raise ValueError(f"tools: the run to go on with has {tools} of them")
     if probes is not None and probes.stressed != (after.rows[0].probe_stress is not None):
         raise ValueError(f"probes: stress = {probes.stressed}, must be what the run to go on with has")
     return after
@@ -275,6 +278,8 @@ def _row(simulation: Simulated, probes: Probes | None) -> Row:
         out["probe_pressure"] = probes.at_points(points, comm, lambda held: held.pressure)
     if probes is not None and probes.stressed:
         out["probe_stress"] = probes.at_points(points, comm, scene.materials.effective_stress_3d)
+    if len(simulation.state.tool_forces):
+        out["tools"] = simulation.state.tool_forces
     return Row(simulation.state.t, **out)
 
 

@@ -22,7 +22,8 @@ def mpirun(processes: int, script: str, *arguments: str) -> None:
     assert done.returncode == 0, done.stderr[-3000:]
 
 
-SCENES = [f"mpi_{name}.py" for name in ("beam", "slab", "stages", "laws", "layers", "initial", "3d", "cycles", "mesh")]
+NAMES = ("beam", "slab", "stages", "laws", "layers", "initial", "3d", "cycles", "mesh", "tools")
+SCENES = [f"mpi_{name}.py" for name in NAMES]
 
 
 @pytest.mark.parametrize("scene", SCENES)

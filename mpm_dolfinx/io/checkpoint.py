@@ -32,6 +32,7 @@ from mpm_dolfinx.validation import instance, line, numbers, on_disk, path, whole
 FORMAT, VERSION = "mpm_dolfinx checkpoint", 6
 FOREIGN = "no checkpoint of mpm_dolfinx, must be one"
 ZIP = b"PK\3\4"  # how numpy's archives begin
+ACTING = ("reactions", "outflows", "tool_forces")
 PIECES = ("id", "pressure", "x", "start")  # of a Stay
 NODAL = ("velocity", "held")  # of a State
 NOTE = {"t": float, "resets": int, "begins": bool, "scene": dict, "result": dict}  # and their kinds
@@ -149,7 +150,7 @@ def _scalars(result: Result) -> dict[str, Any]:
 
 def _arrays(state: State) -> dict[str, NDArray]:
     """Return the arrays of a state by names with slashes."""
-    named = {"points": vars(state.points), "reactions": state.reactions, "outflows": state.outflows}
+    named = {"points": vars(state.points), **{name: getattr(state, name) for name in ACTING}}
     named["result"] = {name: np.array(state.result.column(name)) for name in Row._fields}
     if state.transported is not None:
         named["transported"] = vars(state.transported)
@@ -181,13 +182,15 @@ def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulat
         histories["pressure"] = [*map(tuple, histories["pressure"].tolist())]
         columns = [[*histories[name]] or [None] * len(times) for name in Row._fields]
         result = Result(rows=[Row(*row) for row in zip(*columns, strict=True)], **note["result"])
-        acting = reactions, outflows = arrays.pop("reactions"), arrays.pop("outflows")
+        acting = reactions, outflows, forces = [arrays.pop(name) for name in ACTING]
         nodal = [_part(arrays, f"{name}/") or None for name in NODAL]
         for name, given in zip(NODAL, nodal, strict=True):
             if given is not None:
                 _check_nodal(name, given, simulation.grid)
         if arrays or reactions.shape[1:] != (dim,) or outflows.ndim != 1 or not all(np.isfinite([note["t"], *times])):
             raise ValueError(f"has {', '.join(arrays) or 'other reactions, outflows or times'}")
+        if forces.shape != now.tool_forces.shape:
+            raise ValueError(f"has forces of {len(forces)} tools")
         start = note["t"], points, transported, stay, note["resets"], *acting, None, note["begins"]
         return State(*start, *nodal, result)
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:

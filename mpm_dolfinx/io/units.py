@@ -15,6 +15,7 @@ FIELDS = {
         "deviatoric_stress": "Pa, q = sqrt(3/2 s : s), s the deviator of the stress",
         "porosity": "-, present volume fraction of the pores",
         "softness": "-, elastic over present shear stiffness where a law yields, 1 to 100",
+        "tool_0_pressure, tool_0_shear": "Pa, pressure and shear traction of tool 0 on the surface of the domain",
         "others": "state of the law (see its documentation), constants that differ from point to point, the user's own",
     },
     "grid.pvd: what the cells hold": {
@@ -32,6 +33,8 @@ FIELDS = {
         "p_0": "Pa, pore pressure there",
         "sxx_0, syy_0, szz_0, sxy_0, sxz_0, syz_0": "Pa, effective stress there, tension positive",
         "reaction_x_0, reaction_y_0, reaction_z_0": "N, in plane strain N/m, force of given displacement 0 on the body",
+        "tool_x_0, tool_y_0, tool_z_0": "N, in plane strain N/m, force of tool 0 on the bodies",
+        "tool_moment_0": "N, plane strain: moment of tool 0 about its centre for each m; in 3D _x, _y, _z, N m",
         "outflow_0": "m^3/s, in plane strain m^2/s, what leaves through drained side 0; then through inflows",
     },
 }

@@ -48,8 +48,8 @@ class Writer:
     * `points.pvd`, the points' domains as solid cells with displacement, pore pressure, F, J, what else the points
       carry, and what `Simulation.point_fields` gives: stresses, p', q, porosity;
     * `history.csv`, one row an output time with the counts of `Result` so far, least and largest pressure, what is
-      recorded of the probes, the forces of the given displacements and the outflow through open sides (nan where no
-      step has been taken since they were set by a stage);
+      recorded of the probes, the forces of the given displacements and of tools, and the outflow through open sides
+      (nan where no step has been taken since they were set by a stage);
     * `fields.txt`, which says what each of these is, and its unit;
     * if asked for `grid.pvd`, what the cells hold (`Simulation.cells`), by components, zero in empty cells.
 
@@ -83,7 +83,7 @@ class Writer:
         flag("writer: grid", grid)
         folder, comm, self._t = path("writer: folder", folder), simulation.grid.comm, simulation.t
         self.every, self._simulation = whole("writer: every", every), simulation
-        self._acting = simulation.reactions, simulation.outflows  # at the start
+        self._acting = simulation.reactions, simulation.outflows, simulation.tool_forces  # at the start
         with on_disk("writer: folder", "one that can be written"):
             at_root(comm, lambda: _lock(folder))
             self._table = Table(comm, folder / "history.csv", self._t)
@@ -104,7 +104,7 @@ class Writer:
         result = simulation.result
         if not self._table.columns:
             self._start(result)
-        self._table.add(_row(result, simulation.reactions, simulation.outflows))
+        self._table.add(_row(result, simulation.reactions, simulation.outflows, simulation.tool_forces))
         if (len(result.rows) - 1) % self.every and not result.converged:
             return
         self._write_points(simulation)
@@ -170,7 +170,9 @@ def _lock(folder: Path) -> None:
         _LOCKS[file] = handle
 
 
-def _row(result: Result, reactions: NDArray[np.float64], outflows: NDArray[np.float64]) -> dict[str, float]:
+def _row(
+    result: Result, reactions: NDArray[np.float64], outflows: NDArray[np.float64], tools: NDArray[np.float64]
+) -> dict[str, float]:
     """Return what the histories hold of the last output time, and what acts at the conditions then."""
     row = result.rows[-1]
     out = {"t": row.t, **{name: getattr(result, name) for name in COUNTS}}
@@ -185,6 +187,9 @@ def _row(result: Result, reactions: NDArray[np.float64], outflows: NDArray[np.fl
             out |= {f"s{name}_{i}": value for name, value in _components(row.probe_stress[i], len(u)).items()}
     for i, force in enumerate(reactions):
         out |= {f"reaction_{axis}_{i}": value for axis, value in zip("xyz", force.tolist(), strict=False)}
+    names = ["x", "y", "moment"] if tools.shape[1] == 3 else ["x", "y", "z", "moment_x", "moment_y", "moment_z"]
+    for i, forces in enumerate(tools):
+        out |= {f"tool_{name}_{i}": value for name, value in zip(names, forces.tolist(), strict=True)}
     return out | {f"outflow_{i}": float(flow) for i, flow in enumerate(outflows)}
 
 

@@ -48,7 +48,7 @@ class Patches:
     """
 
     def __init__(self, grid: Grid, faces: Surface, here, at, cell, x, xi, share):
-        self._faces, self._here, self.at, self._xi = faces, here, at, xi
+        self._faces, self.here, self.at, self._xi = faces, here, at, xi
         self.cell, self.x, self._grid = cell, x, grid
         self._share0 = share * faces.area0[here]
         self.area0 = self._share0 * grid.around(interpolate(faces.domain[here], xi))
@@ -57,7 +57,7 @@ class Patches:
     @cached_property
     def X(self) -> NDArray[np.float64]:
         """Reference positions (n, d), m."""
-        return self._faces.reference(self._here, self._xi)
+        return self._faces.reference(self.here, self._xi)
 
     def origin(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the positions (n, d), m, from which displacements count."""
@@ -69,10 +69,10 @@ class Patches:
 
     def area(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the outward area vectors (n, d), m^(d-1)."""
-        share = self._share0 / self._faces.whole0[self._here]
+        share = self._share0 / self._faces.whole0[self.here]
         if self._grid.axisymmetric:
             share = share * self._grid.around(self.now(points))
-        return face_vectors(points.corners[self.at], self._faces.face[self._here]) * share[:, None]
+        return face_vectors(points.corners[self.at], self._faces.face[self.here]) * share[:, None]
 
 
 class CutDomains(Keyed):

@@ -126,7 +126,7 @@ def limits(region: Region | None, dim: int) -> NDArray[np.float64]:
 
 
 def surface(
-    bodies: Sequence[Body], name: str, region: Region | None = None, present: Sequence[bool] | None = None
+    bodies: Sequence[Body], name: str | None, region: Region | None = None, present: Sequence[bool] | None = None
 ) -> Surface:
     """Return the faces on a named side of the bodies that are present, but for what of them lies on another body.
 
@@ -136,6 +136,7 @@ def surface(
     ----------
     name
         Side: of lattices "left", "right", "bottom", "top", in 3D also "front", "back"; of meshes as these name it.
+        None: all sides.
     region : ((d,), (d,)), m
         Box of reference positions that limits the faces; faces partly in it count with that part.
     present
@@ -143,14 +144,15 @@ def surface(
     """
     there = [present is None or bool(present[i]) for i in range(len(bodies))]
     dim, known = bodies[0].dim, dict.fromkeys(name for body in bodies for name in body.names)
-    if not isinstance(name, str) or name not in known:
+    if name is not None and (not isinstance(name, str) or name not in known):
         raise ValueError(f"side {name!r}: must be one of {', '.join(known) or 'none: no body has a side with a name'}")
     box = limits(region, dim)
     around = [Faces.around(body) if here and sum(there) > 1 else None for body, here in zip(bodies, there, strict=True)]
     none = np.empty(0, np.int64)
     start, found = 0, [(none, none, *(np.empty((0, n, dim)) for n in (2 ** (dim - 1), 2**dim, 2**dim)))]
     for i, body in enumerate(bodies):
-        row, face = _in_region(body, *body.named(name), box) if there[i] else (none, none)
+        on = body.outer() if name is None else body.named(name)
+        row, face = _in_region(body, *on, box) if there[i] else (none, none)
         others = [faces for j, faces in enumerate(around) if faces is not None and j != i]
         part, t = _free(Faces.of(body, row, face), others)
         part, xi = _limited(body, row, face, part, t, box)

@@ -28,6 +28,8 @@ ALONG = 1e-4
 """Share of a cell below which centroids lie across from one another."""
 NEAREST = 0.1
 """Share of a cell: what is nearer counts as if it were as far in the least squares."""
+SLACK = 1e-6
+"""Share of the differences of pressure between neighbours by which limited pressures may pass them."""
 FLAT = 1e-6
 """Share of the best known direction's weight below which a gradient along another one is unknown, and taken as none."""
 
@@ -130,9 +132,10 @@ class Gradients:
         np.minimum.at(low, at, to_sides)
         np.maximum.at(high, at, to_sides)
         rise = np.einsum("nd,nkd->nk", out, self._along)
-        share = np.ones(len(out))
-        for room, most in ((low, rise.min(axis=1)), (high, rise.max(axis=1))):
-            share = np.minimum(share, np.divide(room, most, out=np.ones(len(out)), where=np.abs(most) > np.abs(room)))
+        share, slack = np.ones(len(out)), SLACK * (high - low)  # else rounding would decide where nothing rises
+        for room, most in ((-low, -rise.min(axis=1)), (high, rise.max(axis=1))):
+            room = room + slack
+            share = np.minimum(share, np.divide(room, most, out=np.ones(len(out)), where=most > room))
         return out * share[:, None]
 
     def through_sides(self, slope: NDArray[np.float64], count: int) -> NDArray[np.float64]:

@@ -38,11 +38,13 @@ from mpm_dolfinx.problems.conditions import (
 from mpm_dolfinx.problems.held_cells import SAME, HeldCells, HeldPoints
 from mpm_dolfinx.problems.side_forms import SideData, SideForms
 from mpm_dolfinx.problems.sides import Sides, check_apart, everywhere, gathered, meeting, on_side
+from mpm_dolfinx.problems.tool_contact import Tools
+from mpm_dolfinx.problems.tools import Tool
 from mpm_dolfinx.validation import line
 
 
 class MechanicalBoundary:
-    """Tractions, pressures, rigid plates and given displacements of a stage.
+    """Tractions, pressures, rigid plates, given displacements and tools of a stage.
 
     Parameters
     ----------
@@ -52,7 +54,7 @@ class MechanicalBoundary:
         Components that no wall holds.
     materials
         Those of the scene: plates are rigid by the stiffest one, held sides by their own.
-    tractions, displacements, plates
+    tractions, displacements, plates, tools
         The conditions.
 
     Raises
@@ -70,6 +72,7 @@ class MechanicalBoundary:
         tractions: Sequence[Traction | Pressure],
         displacements: Sequence[Displacement],
         plates: Sequence[RigidPlate],
+        tools: Sequence[Tool],
     ):
         self.grid, self._free, self._materials, d = sides.grid, free, materials, sides.grid.dim
         self.plates = [(plate, sides.of(plate)) for plate in plates]
@@ -95,17 +98,21 @@ class MechanicalBoundary:
             if not callable(condition.value):  # what a function gives is checked when it is called
                 more = {Traction: [d], Pressure: [], Displacement: [np.empty((1, d))]}
                 condition.at(0.0, *more[type(condition)])
-        self.symmetric = closed(self.grid, free, self.pressures)
-        """Whether the tangent of the pressures is symmetric."""
+        if self.grid.axisymmetric and tools:
+            raise ValueError("tools: must be none in axisymmetry")
+        self.tools = Tools(self.grid, materials, tools, sides.all, [(hold, faces) for hold, faces, _ in self.holds])
+        self.symmetric = closed(self.grid, free, self.pressures) and self.tools.symmetric
+        """Whether the tangent of pressures and tools is symmetric."""
 
-    def data(self, forms: SideForms, cut: CutDomains, t: float, points: MaterialPoints) -> SideData:
-        """Return what acts at time t (s) on the points where they are now."""
+    def data(self, forms: SideForms, cut: CutDomains, start: float, t: float, points: MaterialPoints) -> SideData:
+        """Return what acts at time t (s) of a step that began at `start` on the points where they are now."""
         with Timer("mpm: loads"):
             loads = self._load_data(forms, cut, points, t) if self.loads else None
             pressures = self._pressure_data(forms, cut, points, t) if self.pressures else None
             plates = self._plate_data(forms, cut, points) if self.plates else None
             none = (None, np.empty(0, dtype=np.int64), np.empty((0, 2**self.grid.dim)))
-            return SideData(loads, pressures, plates, *(self._hold_data(forms, cut, points, t) if self.holds else none))
+            holds = self._hold_data(forms, cut, points, t) if self.holds else none
+            return SideData(loads, pressures, plates, *holds, self.tools.placed(cut, points, start, t))
 
     def _load_data(self, forms: SideForms, cut: CutDomains, points: MaterialPoints, t: float) -> PointData:
         """Return the dead loads on the surface."""

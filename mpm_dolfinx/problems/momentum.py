@@ -29,7 +29,7 @@ from mpm_dolfinx.constitutive.local_unknowns import LocalUnknowns
 from mpm_dolfinx.constitutive.skeleton import Skeleton
 from mpm_dolfinx.constitutive.user_functions import compiling, term_of
 from mpm_dolfinx.forms.cell_matrices import ElementForces, ElementMatrices, StackedElementMatrices
-from mpm_dolfinx.forms.point_forms import FormPoints, PointForm
+from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointForm
 from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts, zero
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.problems.ghost_penalty import GhostPenalty
@@ -37,6 +37,7 @@ from mpm_dolfinx.problems.mean_dilatation import MeanDilatation
 from mpm_dolfinx.problems.quadrature_data import QuadratureData
 from mpm_dolfinx.problems.rigid_motion import rigid_motion
 from mpm_dolfinx.problems.side_forms import SideData, SideForms
+from mpm_dolfinx.problems.tool_contact import ToolContact
 from mpm_dolfinx.validation import line
 
 
@@ -190,6 +191,21 @@ class MomentumForms:
         self.sides.pressed.assemble_vector(forces.x.array, sides.pressures)
         return sum_ghosts(forces)
 
+    def pushed(self, contact: ToolContact) -> NDArray[np.float64]:
+        """Return the nodal forces of tools at u, a local array."""
+        sides, places = self.sides, contact.places
+        sides.forces.x.array[:] = 0.0
+        force = contact.at(self.nodal).force
+        sides.traction.assemble_vector(
+            sides.forces.x.array, PointData(sides.loads, places, np.ones(len(force)), {"force": force})
+        )
+        return sum_ghosts(sides.forces)
+
+    @property
+    def nodal(self) -> NDArray[np.float64]:
+        """u by nodes (nodes, d), m."""
+        return self.u.x.array.reshape(-1, self.grid.dim)
+
     def internal(self, data: QuadratureData) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the nodal forces of the stresses, and of the user's terms, at u, local arrays."""
         internal, own, _, _ = self._work
@@ -218,6 +234,11 @@ class MomentumForms:
             self.dilatation.assemble_matrix(K, data)
         if sides.pressures is not None:
             self.sides.pressed_slope.assemble_matrix(K, sides.pressures)
+        if sides.tools is not None:
+            places, slope = sides.tools.places, sides.tools.at(self.nodal).slope
+            of_rows = PointData(self.sides.slopes, places, np.ones(len(slope)), {"slope": slope})
+            self.sides.pushed_slope.assemble_matrix(K, of_rows)
+            sides.tools.assemble_matrix(K, self.nodal)
 
     def active_nodes(self, cells: NDArray[np.int32]) -> NDArray[np.bool_]:
         """Return which nodes belong to some active cells of any process."""
@@ -329,7 +350,20 @@ class MomentumProblem:
     @property
     def linear(self) -> bool:
         """Whether the tangent changes with the places of the points only."""
-        return self.forms.linear and self._sides.pressures is None
+        return self.forms.linear and self._sides.pressures is None and self._sides.tools is None
+
+    @property
+    def smooth(self) -> bool:
+        """Whether the tangent of one substep may lead the next."""
+        return self.forms.elastic and self._sides.tools is None
+
+    def settle_tools(self, sticks: bool) -> bool:
+        """Choose what slips on tools at u, and if asked for what sticks again; return whether it is another choice."""
+        return self._sides.tools is not None and self._sides.tools.settle(self.forms.nodal, sticks)
+
+    def augment_tools(self) -> bool:
+        """Shift the pressures of tools that penetrate too deep; return whether the balance is another one since."""
+        return self._sides.tools is not None and self._sides.tools.augment(self.forms.nodal)
 
     def guesses(self) -> list[NDArray[np.float64]]:
         """Return displacements (local unknowns,), m, at which Newton's method may begin.
@@ -358,6 +392,8 @@ class MomentumProblem:
         b[system.touched] = forces - external
         if self._sides.holds is not None:  # no measure of forces: at the start of a step it is far above them
             b[system.touched] -= self._pulls[system.touched]
+        if self._sides.tools is not None:
+            b[system.touched] -= forms.pushed(self._sides.tools)[system.touched]
         r = system.unknowns.gather(b, system.residual)
         step = system.unknowns.gather(forms.u.x.array, system.step)
         system.penalty.multAdd(step, r, r)

@@ -289,6 +289,8 @@ class Assembled:
             stiffest = float(sides.holds["stiffness"].max(initial=0.0))
             self.round_off += 1e-15 * over_all(grid.comm, stiffest, MPI.MAX) * reach
         self._off = None
+        if sides.tools is not None:
+            self.round_off += over_all(grid.comm, sides.tools.rounding, MPI.MAX)
         if self.storage is not None:
             self.storage.set_alternation()
             if (form := storage.fluxes.aslant) is not None:
@@ -371,8 +373,11 @@ def assembled(
 
     def make() -> System:
         if not momentum.holding:
-            holds = sides.holds
-            held = None if holds is None else (holds.cells, holds.x, holds["direction"])
+            holds, held = sides.holds, []
+            if holds is not None:
+                held.append((holds.cells, holds.x, holds["direction"]))
+            if sides.tools is not None:
+                held.append(sides.tools.touching())
             check_held(grid, on_grid.active, free, held, begins)
         return System(momentum, storage, scheme, on_grid, dofs, nodes, stiff, momentum.symmetric and symmetric)
 

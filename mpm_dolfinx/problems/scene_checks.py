@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from mpi4py import MPI
 
 import numpy as np
@@ -16,7 +18,7 @@ def check_held(
     grid: Grid,
     active: NDArray[np.bool_],
     free: NDArray[np.bool_],
-    holds: tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.float64]] | None,
+    holds: Sequence[tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.float64]]],
     each: bool,
 ) -> None:
     """Refuse a scene of which a part can move as a rigid body.
@@ -28,7 +30,7 @@ def check_held(
     free : (nodes, d)
         Components that no wall holds.
     holds
-        Cells (m,), positions (m, d) and directions (m, d) in which sides have given displacements.
+        Cells (m,), positions (m, d) and directions (m, d) in which sides have given displacements, or touch tools.
     each
         Look at each part that hangs together, not only at all of them.
 
@@ -44,9 +46,9 @@ def check_held(
     row, axis = np.nonzero(~free[nodes])
     x, direction = grid.node_x[nodes[row]], np.eye(grid.dim)[axis]
     number = part[cells[first[row] // 2**grid.dim]]  # of any cell at the node: they hang together
-    if holds is not None:
-        number = np.concatenate([number, part[holds[0]]])
-        x, direction = np.concatenate([x, holds[1]]), np.concatenate([direction, holds[2]])
+    for cell, place, along in holds:
+        number = np.concatenate([number, part[cell]])
+        x, direction = np.concatenate([x, place]), np.concatenate([direction, along])
     x = (x - centre[number - 1]) / size[number - 1, None]  # else a small part far from the origin would not turn
     modes = list(direction.T)
     modes += [direction[:, a] * x[:, b] - direction[:, b] * x[:, a] for a in range(grid.dim) for b in range(a)]
@@ -61,7 +63,7 @@ def check_held(
             where = f"the part at [{' '.join(f'{x:.9g}' for x in places[0][0])}]" if count > 1 else "the body"
             raise ValueError(
                 f"fixed walls: {where} is free to move as a rigid body in {missing} of {len(modes)} ways; "
-                "it must touch walls whose fixed components hold it, or have given displacements"
+                "it must touch walls whose fixed components hold it, have given displacements, or touch tools"
             )
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointForm
 from mpm_dolfinx.points.grid import Grid
 from mpm_dolfinx.problems.held_cells import HeldCells
+from mpm_dolfinx.problems.tool_contact import ToolContact
 
 
 @dataclass(frozen=True)
@@ -22,7 +23,7 @@ class SideData:
 
     loads: with their force; pressures: with their force on the area at the start of the step; plates: with their
     rigidity, normal and present tilt; holds: components of given displacements, with stiffness, direction and gap;
-    held: what holds them; row: which of it each component is.
+    held: what holds them; row: which of it each component is; tools: contact with them.
     """
 
     loads: PointData | None
@@ -31,6 +32,7 @@ class SideData:
     holds: PointData | None
     held: HeldCells | None
     row: NDArray[np.int64]
+    tools: ToolContact | None = None
 
 
 class SideForms:
@@ -112,6 +114,17 @@ class SideForms:
     def _bend(self, slope) -> ufl.Form:
         """Return the work of plates that bend or turn by a slope: kappa slope . grad_t(v_n)."""
         return self.plates.rigidity * ufl.inner(slope, self._slope(self._v)) * self.plates.dx
+
+    @cached_property
+    def slopes(self) -> FormPoints:
+        """Points with a force that changes with their displacement."""
+        return FormPoints(self._grid, slope=(self._grid.dim, self._grid.dim))
+
+    @cached_property
+    def pushed_slope(self) -> PointForm:
+        """Minus the derivative of such forces."""
+        p = self.slopes
+        return PointForm(ufl.inner(p.slope * p.value(self._du), p.value(self._v)) * p.dx, p)
 
     @cached_property
     def holds(self) -> FormPoints:

@@ -46,6 +46,10 @@ class Sides:
             raise ValueError(f"{line(condition)}: no point has this side{where}, must be one of a body")
         return self._found[key]
 
+    def all(self) -> Surface:
+        """Return the faces on all sides."""
+        return surface(self.bodies, None, None, self.present)
+
 
 def everywhere(grid: Grid, ask: Callable[[], NDArray[np.float64]]) -> NDArray[np.float64]:
     """Return what functions of the user's give on this process; raise on all what is raised on one."""

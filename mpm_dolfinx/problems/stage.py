@@ -19,6 +19,7 @@ from mpm_dolfinx.problems.conditions import Displacement, Drained, Inflow, Press
 from mpm_dolfinx.problems.hydraulic_boundary import HydraulicBoundary
 from mpm_dolfinx.problems.mechanical_boundary import MechanicalBoundary
 from mpm_dolfinx.problems.sides import Sides
+from mpm_dolfinx.problems.tools import Tool
 from mpm_dolfinx.validation import all_of, asked, line, numbers
 
 CONDITIONS = {
@@ -27,6 +28,7 @@ CONDITIONS = {
     "drained": Drained,
     "inflows": Inflow,
     "plates": RigidPlate,
+    "tools": Tool,
 }
 
 
@@ -78,7 +80,7 @@ def stage(
     wet
         Whether there is a fluid.
     conditions
-        fixed, tractions, displacements, drained, inflows, plates, gravity: see `Simulation`.
+        fixed, tractions, displacements, drained, inflows, plates, tools, gravity: see `Simulation`.
     present, later
         Which bodies are there, and which may still come.
 
@@ -98,7 +100,7 @@ def stage(
         raise ValueError("bodies: none is there, must be at least one")
     conditions = {**conditions, "fixed": with_axis(grid, conditions["fixed"])}
     free, sides = ~_fixed(grid, conditions["fixed"]), Sides(grid, bodies, present)
-    acting = (conditions[name] for name in ("tractions", "displacements", "plates"))
+    acting = (conditions[name] for name in ("tractions", "displacements", "plates", "tools"))
     mechanical = MechanicalBoundary(sides, free, materials, *acting)
     hydraulic = HydraulicBoundary(sides, [*conditions["drained"], *conditions["inflows"]])
     given = [(faces, axes) for _, faces, axes in mechanical.holds]

@@ -42,6 +42,7 @@ FORCING, FINEST = 1e-3, 1e-9  # relative accuracy of the linear solve, and the b
 SHORTEST = 1e-3  # share of a Newton step below which it is not shortened
 INNER = 1e-3  # the momentum is solved to this share of the storage's error: rotations fake volume changes
 MOMENTUM_STEPS = 10
+SETTLED = 1e-2  # residual from which on what slips on tools may stick: before, what touches them still changes
 ERROR = 1 / 20
 """Share of the estimate of first order that the pressures of a run are off by: of consolidations, see tests."""
 SUDDEN = np.sqrt(2)
@@ -105,7 +106,7 @@ def solve_substep(
     """
     newton = Newton(solvers, momentum, storage)
     in_turn = solvers.scheme.richardson and storage is not None
-    serves = report.newton > 0 and momentum.forms.elastic
+    serves = report.newton > 0 and momentum.smooth
     errors = newton.alternate() if in_turn else newton.newton(as_reset, key, serves)
     took = newton.report
     if took.newton and storage is None and solvers.symmetric and not solvers.iterative:
@@ -198,7 +199,7 @@ class Newton:
     ) -> Errors:
         """Iterate from the present (u, p), of these errors; fresh: with its own tangent; watched: by a watchdog."""
         dog, count = Watchdog(errors.worst, self._iterate()) if watched else None, 0
-        while errors.worst > self._scheme.tolerance:
+        while (errors := self._augmented(errors)).worst > self._scheme.tolerance:
             self._check(count, "newton")
             if fresh and self._linear and not self.report.newton:
                 self._solvers.tangent(key, lambda: self._linearise_as_reset(as_reset))
@@ -211,9 +212,18 @@ class Newton:
             if dog and dog.strays(errors.worst):
                 self._go_to(dog.where)
                 errors, fresh, dog = self._errors(errors.start), True, replace(dog, since=0, descends=True)
-            if self._storage is not None and self._storage.settle_seepage():
+            seeps = self._storage is not None and self._storage.settle_seepage()
+            if self._momentum.settle_tools(errors.worst <= SETTLED) or seeps:
                 errors, fresh = self._errors(errors.start), True
         return errors
+
+    def _augmented(self, errors: Errors) -> Errors:
+        """Return the errors, of what balances with the pressures of tools that penetrate too deep shifted."""
+        if errors.worst > self._scheme.tolerance:
+            return errors
+        if not self._momentum.settle_tools(True) and not self._momentum.augment_tools():
+            return errors
+        return self._errors(errors.start)
 
     def _begin(self) -> tuple[Errors, list[NDArray[np.float64]] | None]:
         """Return the errors where the iterations begin: at a guess that balances better than where (u, p) are.
@@ -266,7 +276,7 @@ class Newton:
         """Fixed-stress iteration: momentum at fixed pressure, then storage at fixed stress, until both balance."""
         errors, report = self._errors(), self.report
         self._linearise()
-        while errors.worst > self._scheme.tolerance:
+        while (errors := self._augmented(errors)).worst > self._scheme.tolerance:
             self._check(report.coupling, "coupling")
             try:
                 self._balance_momentum(errors)
@@ -293,7 +303,9 @@ class Newton:
             with Timer("mpm: linear solve"):
                 self._solvers.solve_momentum()
             before, errors = errors.u, self._line_search(errors)
-            if errors.u > max(goal, KEEP * before):
+            settled = self._momentum.settle_tools(errors.u <= SETTLED)
+            errors = self._errors(errors.start) if settled else errors
+            if settled or errors.u > max(goal, KEEP * before):
                 self._linearise()
 
     def _check(self, count: int, kind: str) -> None:

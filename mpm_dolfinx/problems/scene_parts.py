@@ -1,0 +1,34 @@
+# SPDX-License-Identifier: MIT
+"""Whether the parts of which a scene is made go together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from mpm_dolfinx.constitutive.skeleton import Fluid, Skeleton
+from mpm_dolfinx.points.bodies import Body, check_bodies
+from mpm_dolfinx.points.grid import Grid
+from mpm_dolfinx.validation import all_of, chosen, functions, instance, line, numbers
+
+
+def check_parts(grid: Grid, bodies: Sequence[Body], materials: Sequence[Skeleton], later: Sequence[int]) -> None:
+    """Refuse what is no grid, bodies or materials, bodies outside of the grid, and `later` ones that are none."""
+    instance("grid", grid, Grid)
+    all_of("bodies", bodies, Body, 1)
+    all_of("materials", materials, Skeleton, 1)
+    check_bodies(grid, bodies)
+    chosen("later", later, range(len(bodies)), "indices of the bodies")
+
+
+def check_physics(
+    fluid: Fluid | None, pressure: float | Callable, terms: Sequence[Callable], sources: Sequence[Callable]
+) -> None:
+    """Refuse terms and sources that are no functions, what is no fluid, and pressures and sources without one."""
+    functions("terms", terms)
+    functions("sources", sources)
+    if fluid is not None:
+        instance("fluid", fluid, Fluid)
+    elif callable(pressure) or numbers("pressure", pressure):
+        raise ValueError(f"pressure = {line(pressure)}: needs a fluid")
+    elif sources:
+        raise ValueError("sources need a fluid")

@@ -1,0 +1,325 @@
+# SPDX-License-Identifier: MIT
+"""Rigid tools: exact pressures, sticking and slipping, energy, refusals, restart."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers import set_up
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.problems.momentum import MomentumProblem
+
+E = 1e6  # Pa
+SOIL = mpm.Hencky(bulk=E / 3, shear=E / 2)  # nu = 0
+GEL = mpm.Hencky(bulk=1e6, shear=6e5, grain_density=2000, porosity=0.5)
+
+
+def turned(angle):
+    """Return the matrix of a turn."""
+    return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+
+
+def deepest(simulation):
+    """Return how deep corners are in the tools, in cells."""
+    t, d = simulation.t, simulation.grid.dim
+    x = simulation.points.corners.reshape(-1, d)
+    tools = simulation.state.stage.conditions["tools"]
+    return max(-tool.shape.distance(tool.pose(t, d).own(x)).min() for tool in tools) / simulation.grid.h.min()
+
+
+def pressed(angle, offset, cells=4):
+    """Return a cube of 0.8 m between two plates, along a turned axis, pressed by 0.2 m."""
+    R, h = turned(angle), 0.8 / cells
+    grid = mpm.Grid([2.0, 2.0], [round(2 / h)] * 2)
+    middle = np.array([1.0, 1.0 + offset * h])
+    body = mpm.mapped(grid, mpm.box(grid, [0, 0], [0.8, 0.8]), lambda x: (x - 0.4) @ R.T + middle)
+    plates = [mpm.HalfSpace(middle + R @ [0, side * 0.4], R @ [0, -side]) for side in (-1, 1)]
+    tools = [mpm.Tool(plates[0], friction=0.3), mpm.Tool(plates[1], displacement=lambda t: R @ [0, -0.2 * t])]
+    s = mpm.Simulation(grid, [body], [SOIL], fixed={}, tools=tools)
+    worst = []
+    s.run(1.0, 0.25, observe=lambda s: worst.append(deepest(s)))
+    return s, R, max(worst)
+
+
+@pytest.mark.parametrize(("angle", "offset", "error"), [(0.0, 0.0, 1e-3), (0.0, 0.37, 1e-3), (0.3, 0.2, 1e-2)])
+def test_a_plate_presses_a_cube_evenly_wherever_it_lies(angle, offset, error):
+    s, R, worst = pressed(angle, offset)
+    exact = E * np.log(0.75) / 0.75
+    stress = np.einsum("ia,nij,jb->nab", R, s.effective_stress(), R)
+    assert stress[:, 1, 1] == pytest.approx(np.full(len(stress), exact), rel=error)
+    assert s.tool_forces[:, :2] @ R == pytest.approx(np.array([[0, -1], [0, 1]]) * 0.8 * exact, abs=-error * exact)
+    assert worst < 1e-3
+
+
+def test_a_disc_presses_as_hertz_says():
+    """16 cells over the half-width: this, force and pressure."""
+    cells, R, L, nu = 16, 20.0, 5.0, 0.3
+    stiff = E / (1 - nu**2)
+    grid = mpm.Grid([L, L + 1], [round(L * cells), round((L + 1) * cells)])
+    top = L + 0.3 / cells
+    soil = mpm.Hencky(bulk=E / (3 - 6 * nu), shear=E / (2 + 2 * nu))
+    disc = mpm.Tool(mpm.Ball((0, top + R), R), displacement=lambda t: (0, -0.055 * t))
+    walls = {"left": "x", "right": "x", "bottom": "xy"}
+    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [L, top])], [soil], fixed=walls, tools=[disc])
+    s.run(1.0, 1.0)
+    force = -2 * s.tool_forces[0, 1]
+    half, most = 2 * np.sqrt(force * R / (np.pi * stiff)), np.sqrt(force * stiff / (np.pi * R))
+    p, x = s.points.data["tool_0_pressure"], s.points.x[:, 0]
+    on = (p > 0) & (x < 0.8 * half)
+    slope, square = np.polyfit(x[on] ** 2, p[on] ** 2, 1)
+    assert half * cells == pytest.approx(16, rel=0.1)
+    assert [np.sqrt(square), np.sqrt(-square / slope)] == pytest.approx([most, half], rel=0.02)
+    assert deepest(s) < 1e-3
+
+
+def on_a_plane(angle, reach, steps=8, mu=0.5):
+    """Return a block on a plane, gravity turned to a share of the angle at which it slips, then held; with its run."""
+    R, slips = turned(angle), np.arctan(mu)
+    grid = mpm.Grid([2, 2], [8, 8])
+    body = mpm.mapped(grid, mpm.box(grid, [0, 0], [1, 0.5]), lambda x: (x - [0.5, 0]) @ R.T + [1, 0.7])
+
+    def gravity(t):
+        turn = slips * reach * min(1, t)
+        return 9.81 * R @ [np.sin(turn), -np.cos(turn)]
+
+    plane = mpm.Tool(mpm.HalfSpace((1, 0.7), R @ [0, 1]), friction=mu)
+    s = mpm.Simulation(grid, [body], [GEL], fixed={}, gravity=gravity, tools=[plane])
+    return s, mpm.probes([body], [[0.0, 0.0], [1.0, 0.0]])
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.3])
+def test_a_block_on_a_plane_sticks_until_it_slips(angle):
+    s, probes = on_a_plane(angle, 0.995)
+    moved = s.run(1.0, 0.125, probes=probes).displacement[-1]
+    assert np.abs(moved).max() < 0.01 * s.grid.h.min()
+    weight = 1000 * 9.81 * 0.5
+    turn = np.arctan(0.5) * 0.995
+    assert s.tool_forces[0, :2] @ turned(angle) == pytest.approx(weight * np.array([-np.sin(turn), np.cos(turn)]))
+    s, probes = on_a_plane(angle, 1.005)
+    with pytest.raises(mpm.GaveUp):
+        s.run(1.0, 0.125)
+    assert s.t > 0.97
+
+
+@pytest.mark.parametrize("angle", [0.0, pytest.param(0.3, marks=pytest.mark.slow)])
+def test_a_block_that_sticks_does_not_creep(angle):
+    s, probes = on_a_plane(angle, 0.9)
+    moved = np.array(s.run(26.0, 0.125, probes=probes).displacement)
+    assert np.abs(moved[-1] - moved[8]).max() < 1e-3 * s.grid.h.min()
+
+
+def work(friction, path, end, steps):
+    """Return the work, J/m, that a plate does on a block along a path (t) -> m, and the sum of its parts' sizes."""
+    grid = mpm.Grid([1.5, 0.75], [12, 6])
+    body = mpm.box(grid, [0.25, 0], [1.25, 0.53])
+    plate = mpm.Tool(mpm.HalfSpace((0, 0.53), (0, -1)), displacement=path, friction=friction)
+    s = mpm.Simulation(grid, [body], [GEL], fixed={"bottom": "xy"}, tools=[plate])
+    result = s.run(end, 1 / steps)
+    force, x = np.array(result.tools)[:, 0, :2], np.array([path(t) for t in result.t])
+    parts = ((force[1:] + force[:-1]) / 2 * np.diff(x, axis=0)).sum(axis=1)
+    return parts.sum(), np.abs(parts).sum(), force
+
+
+def to_and_fro(t):
+    """Down, to the right, to the left, to the right, up."""
+    corners = np.array([[0, 0], [0, -0.03], [0.05, -0.03], [-0.05, -0.03], [0, -0.03], [0, 0.01]])
+    return np.stack([np.interp(t, [0, 1, 2, 4, 5, 6], column) for column in corners.T])
+
+
+def test_friction_takes_energy_and_slips_at_its_coefficient():
+    total, gross, force = work(0.3, to_and_fro, 6.0, 6)
+    assert total > 0.2 * gross
+    sliding = force[11:13]
+    assert np.abs(sliding[:, 0] / sliding[:, 1]) == pytest.approx([0.3, 0.3], rel=1e-6)
+    assert force[-1] == pytest.approx([0, 0], abs=1e-6 * np.abs(force).max())
+
+
+def test_adhesion_bounds_the_shear():
+    """A rough plate that is pushed along clay takes alpha s_u on the area that it touches."""
+    grid = mpm.Grid([1.5, 0.75], [12, 6])
+    body = mpm.box(grid, [0.25, 0], [1.25, 0.5])
+    plate = mpm.Tool(mpm.HalfSpace((0, 0.5), (0, -1)), lambda t: (0.1 * max(0, t - 1), -0.01 * min(t, 1)), adhesion=2e3)
+    s = mpm.Simulation(grid, [body], [GEL], fixed={"bottom": "xy"}, tools=[plate])
+    s.run(2.0, 0.25)
+    assert s.tool_forces[0, 0] == pytest.approx(2e3, rel=0.02)
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.4])
+def test_the_tangent_of_the_contact_is_its_derivative(friction):
+    """In a step in which a disc turns and slips."""
+    grid = mpm.Grid([1.25, 1], [12, 8], lower=[-0.25, 0])
+    disc = mpm.Ball((0.5, 0.71), 0.2)
+    motion = {"displacement": lambda t: (0.02 * t, -0.01 * t), "rotation": lambda t: 0.2 * t, "centre": (0.5, 0.7)}
+    tool = mpm.Tool(disc, **motion, friction=friction)
+    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 0.51])], [GEL], fixed={"bottom": "xy"}, tools=[tool])
+    s.step(0.5)
+    momentum: MomentumProblem = set_up(s, 0.5).momentum
+    rng, forms, unknowns = np.random.default_rng(1), momentum.forms, momentum.system.unknowns
+    contact = momentum._sides.tools
+
+    def residual(values):
+        forms.u.x.array[unknowns.owned] = values
+        forms.u.x.scatter_forward()
+        return momentum.assemble_residual()[0].array.copy()
+
+    at = 1e-4 * rng.normal(size=unknowns.size)
+    residual(at), contact.settle(forms.nodal, True)
+    way = rng.normal(size=unknowns.size)
+    residual(at)
+    x, y = unknowns.vector(), unknowns.vector()
+    x.array[:] = way
+    momentum.assemble_tangent().mult(x, y)
+    eps = 1e-7
+    difference = (residual(at + eps * way) - residual(at - eps * way)) / (2 * eps)
+    curved = 0.02 if friction else 1e-6  # shear turns with the surface: that is left out
+    assert y.array == pytest.approx(difference, abs=curved * np.abs(difference).max())
+
+
+def simple(**options):
+    """Return a block under a plate."""
+    grid = mpm.Grid([1.2, 1], [7, 5], lower=[-0.2, 0])
+    plate = options.pop("shape", mpm.HalfSpace((0, 0.6), (0, -1)))
+    tool = mpm.Tool(plate, **options.pop("tool", {"displacement": lambda t: (0, -0.1 * t)}))
+    options.setdefault("fixed", {"bottom": "xy"})
+    return mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 0.6])], [GEL], tools=[tool], **options)
+
+
+def shallow(y):
+    return 0.5 * (0.6 - y[:, 1])
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: mpm.Tool("plate"), "shape = 'plate', must be"),
+        (lambda: mpm.Tool(mpm.Ball((0, 0), -1)), "radius = -1, must be > 0"),
+        (lambda: mpm.Tool(mpm.Ball((0, 0), 1), friction=-0.1), "friction = -0.1, must be >= 0"),
+        (lambda: mpm.HalfSpace((0, 0), (0, 0)), "outward = .*, must be a vector"),
+        (lambda: mpm.Convex([(0, 0), (1, 1), (2, 2)]), "corners = .*must be at least"),
+        (lambda: mpm.Cone((0, 0), (0, 1), 90), "angle = 90, must be in"),
+        (lambda: simple(shape=mpm.Ball((0, 0, 0), 1)), "in 3D, must be in 2D"),
+        (lambda: simple(tool={"displacement": 1.0}).run(1, 1), "displacement .* must be 2 finite numbers"),
+        (lambda: simple(tool={"displacement": lambda t: (0, np.nan)}).run(1, 1), "displacement at t = 0 s.*must be"),
+        (lambda: simple(shape=mpm.Ball((0.5, 0.55), 0.2)).run(1, 1), "cells inside of a body.*must be outside"),
+        (lambda: simple(shape=shallow).run(1, 1), "slope 0.5 at .*must be a signed distance"),
+        (lambda: simple(fixed={}).run(1, 1), "free to move"),
+        (
+            lambda: simple(displacements=[mpm.Displacement("top", (0, 0))]).run(1, 1),
+            "HalfSpace.* and Displacement.*both act at",
+        ),
+    ],
+)
+def test_a_tool_that_is_none_is_refused_in_one_line(make, said):
+    with pytest.raises(ValueError, match=said) as caught:
+        make()
+    assert "\n" not in str(caught.value)
+
+
+def test_a_tool_that_outruns_the_body_cuts_the_step():
+    s = simple(tool={"displacement": lambda t: (0, -0.58 * t)})
+    with pytest.raises(mpm.NotConverged):
+        s.step(1.0)
+    assert s.t == 0 and s.step(0.05).newton > 0
+
+
+def test_a_function_is_a_shape_like_another():
+    forces = []
+    for shape in (mpm.Ball((0.5, 0.8), 0.2), lambda y: np.hypot(y[:, 0] - 0.5, y[:, 1] - 0.8) - 0.2):
+        s = simple(shape=shape, tool={"displacement": lambda t: (0, -0.03 * t), "friction": 0.2})
+        s.run(1.0, 0.5)
+        forces.append(s.tool_forces)
+    assert forces[1] == pytest.approx(forces[0], rel=1e-5, abs=1e-5 * np.abs(forces[0]).max())
+
+
+def test_a_run_with_tools_that_is_resumed_ends_with_the_same_bits(tmp_path):
+    def make():
+        shape = mpm.Ball((0.5, 0.8), 0.2)
+        path = {"displacement": lambda t: (0.02 * t, -0.03 * min(t, 1)), "friction": 0.3}
+        return simple(shape=shape, tool=path)
+
+    whole, half = make(), make()
+    whole.run(2.0, 0.25)
+    half.run(1.25, 0.25, checkpoint=mpm.Checkpoint(tmp_path / "half"))
+    again = make()
+    result = again.run(2.0, 0.25, after=mpm.resume(again, tmp_path / "half"))
+    assert np.array_equal(again.points.corners, whole.points.corners)
+    assert np.array_equal(again.tool_forces, whole.tool_forces)
+    assert np.array_equal(result.tools, whole.result.tools)
+
+
+def test_a_refused_step_leaves_the_contact():
+    def make(refuses):
+        asked = iter([True, *[False] * 9]) if refuses else iter([False] * 9)
+
+        def load(t):
+            if t > 0.6 and next(asked):
+                raise RuntimeError("not now")
+            return 0.0
+
+        s = simple(tool={"displacement": lambda t: (0.02 * t, -0.03 * t), "friction": 0.3})
+        s.stage(tractions=[mpm.Pressure("right", load)])
+        s.step(0.5)
+        if refuses:
+            with pytest.raises(ValueError, match="not now"):
+                s.step(0.5)
+        s.step(0.5)
+        return s
+
+    one, other = make(True), make(False)
+    assert np.array_equal(one.points.corners, other.points.corners)
+    assert np.array_equal(one.tool_forces, other.tool_forces)
+
+
+def test_a_stage_takes_tools_away_and_brings_others():
+    s = simple(tool={"displacement": lambda t: (0, -0.05 * t), "friction": 0.3})
+    s.run(1.0, 0.5)
+    before = -s.tool_forces[0, 1]
+    s.stage(tools=[])
+    assert s.tool_forces.shape == (0, 3) and not any(name.startswith("tool") for name in s.points.data)
+    s.run(2.0, 1.0)
+    assert np.abs(s.effective_stress()).max() < 0.05 * before
+    s.stage(tools=[mpm.Tool(mpm.Ball((0.5, 0.81), 0.2), displacement=lambda t: (0, -0.05 * (t - 2)))])
+    assert np.isnan(s.tool_forces).all()
+    s.run(3.0, 0.5)
+    assert s.tool_forces[0, 1] < 0
+
+
+def test_a_plate_presses_a_cube_evenly_in_space():
+    """On a rough floor, which it does not slip on: nu = 0."""
+    grid = mpm.Grid([1.2, 1.2, 1], [6, 6, 5])
+    body = mpm.box(grid, [0.17, 0.2, 0], [0.97, 1, 0.8])
+    floor = mpm.Tool(mpm.HalfSpace((0, 0, 0), (0, 0, 1)), friction=0.2)
+    plate = mpm.Tool(mpm.HalfSpace((0, 0, 0.8), (0, 0, -1)), displacement=lambda t: (0.1 * t, 0, -0.2 * t))
+    s = mpm.Simulation(grid, [body], [SOIL], fixed={}, tools=[floor, plate])
+    s.run(1.0, 0.5)
+    exact = E * np.log(0.75) / 0.75
+    assert s.effective_stress()[:, 2, 2] == pytest.approx(np.full(len(s.points), exact), rel=1e-3)
+    force = 0.64 * exact
+    assert s.tool_forces[:, :3] == pytest.approx(force * np.array([[0, 0, -1], [0, 0, 1]]), abs=-1e-3 * force)
+    assert s.tool_forces[0, 3:] == pytest.approx(-force * np.array([0.6, -0.57, 0]), abs=-1e-3 * force)
+    assert deepest(s) < 1e-3
+
+
+def test_a_cone_and_a_polygon_press_as_their_planes_do():
+    wedges = [mpm.Cone((0.5, 0.6), (0, 1), 70.0)]
+    slope = np.tan(np.radians(20))
+    wedges.append(mpm.Convex([(0.5, 0.6), (-1.5, 0.6 + 2 * slope), (2.5, 0.6 + 2 * slope)]))
+    forces = []
+    for wedge in wedges:
+        s = simple(shape=wedge, tool={"displacement": lambda t: (0, -0.04 * t)})
+        s.run(1.0, 0.5)
+        forces.append(s.tool_forces[0])
+    assert forces[0][1] < 0
+    assert forces[1] == pytest.approx(forces[0], rel=1e-6, abs=1e-6 * abs(forces[0][1]))
+
+
+def test_a_state_with_tools_may_be_put_back():
+    s = simple(tool={"displacement": lambda t: (0.02 * t, -0.03 * t), "friction": 0.3})
+    s.step(0.5)
+    before = s.state
+    s.step(0.5)
+    once = s.points.corners
+    s.state = replace(before)
+    s.step(0.5)
+    assert np.array_equal(once, s.points.corners)
