@@ -118,7 +118,7 @@ class Simulation:
         functions("terms", terms)
         functions("sources", sources)
         grid.share(np.concatenate([body.centre for body in bodies]))
-        warn_thin(grid, bodies, fixed)
+        warn_thin(grid, bodies, fixed, fluid is not None)
         began, weighs = time.perf_counter(), gravity is not None
         options = (quadrature, scheme, method, weighs, pressure, terms, sources)
         self.scene = Scene(grid, bodies, materials, fluid, *options)
