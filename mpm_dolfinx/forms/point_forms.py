@@ -64,7 +64,8 @@ class FormPoints:
     def __init__(self, grid: Grid, **fields: tuple[int, ...]):
         self.grid = grid
         self.functions = {
-            name: grid.coefficient(shape) for name, shape in {"offset": (grid.dim,), "weight": (), **fields}.items()
+            name: grid.coefficient(shape)
+            for name, shape in {"offset": (grid.dim,), "weight": (), "mixed": (grid.dim,), **fields}.items()
         }
         self.live: dict[str, Callable[[PointData], NDArray[np.float64]]] = {}
         """What gives the values (n, size) of fields that change while the points stay."""
@@ -132,17 +133,26 @@ class Places(Keyed):
         Owned local cell of each point.
     x : (n, d), m
         Positions.
+    mixed : (n, d), m^2
+        In 3D mean products of offsets of pieces about them, see `Pieces`; None for points.
     """
 
-    def __init__(self, grid: Grid, cells: NDArray[np.int32], x: NDArray[np.float64]):
-        self.grid, self.cells, self.x = grid, cells, x
+    def __init__(
+        self, grid: Grid, cells: NDArray[np.int32], x: NDArray[np.float64], mixed: NDArray[np.float64] | None = None
+    ):
+        self.grid, self.cells, self.x, self.mixed = grid, cells, x, mixed
         self.offset = x - grid.midpoints[cells]
         self.filled, self.slots = np.unique(cells, return_inverse=True)
         """The cells that hold points; and the place of each point's cell among these."""
 
     def part(self, rows: NDArray[np.int64]) -> Places:
         """Return some of the places."""
-        return Places(self.grid, self.cells[rows], self.x[rows])
+        return Places(self.grid, self.cells[rows], self.x[rows], None if self.mixed is None else self.mixed[rows])
+
+    def shape_gradients(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the gradients (m, 2^d, d), 1/m, of the shape functions at some of the points, or means over pieces."""
+        mixed = None if self.mixed is None else self.mixed[chosen]
+        return self.grid.shape_gradients(self.cells[chosen], self.x[chosen], mixed)
 
 
 class PointData(Keyed):
@@ -163,7 +173,8 @@ class PointData(Keyed):
     def __init__(self, points: FormPoints, places: Places, weight: NDArray[np.float64], fields: dict[str, NDArray]):
         self.points, self.places, self.cells, self.x = points, places, places.cells, places.x
         self.volume, n = weight, len(places.cells)
-        self._rows = {"offset": places.offset, "weight": (weight / points.grid.cell_volume)[:, None]}
+        mixed = np.zeros_like(places.x) if places.mixed is None else places.mixed
+        self._rows = {"offset": places.offset, "weight": (weight / points.grid.cell_volume)[:, None], "mixed": mixed}
         self._rows |= {name: fields[name].reshape(n, size) for name, size in points.sizes.items()}
         self._gradients: Latest[NDArray[np.float64]] = Latest()
 
@@ -186,7 +197,7 @@ class PointData(Keyed):
         out, nodal = np.empty((n, grid.dim**2)), u.reshape(-1, grid.dim)
         for part in (slice(start, start + BATCH) for start in range(0, n, BATCH)):
             cells = self.cells[part]
-            slopes = grid.shape_gradients(cells, self.x[part])
+            slopes = self.places.shape_gradients(part)
             out[part] = (nodal[grid.cell_nodes[cells]].transpose(0, 2, 1) @ slopes).reshape(len(cells), -1)
         return out
 

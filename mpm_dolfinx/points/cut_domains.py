@@ -92,6 +92,8 @@ class CutDomains(Keyed):
         self._travel = Exchange(grid.comm, grid.owner(self.pieces.cell))
         self.cells, self.x = grid.local(self._travel.send(self.pieces.cell)), self._travel.send(self.pieces.x)
         """Owned cells, and centroids (m, d), m, of the pieces that this process integrates."""
+        self.mixed = self._travel.send(self.pieces.mixed) if self.pieces.mixed.shape[1] else None
+        """Their mean products of offsets, see `Pieces`, if any."""
 
     def serves(self, points: MaterialPoints) -> bool:
         """Return whether the points are still where they were cut, but for `STAYS`."""
@@ -195,4 +197,4 @@ def whole_points(grid: Grid, x: NDArray[np.float64]) -> Pieces:
     n, number = len(x), grid.number(grid.index(x))
     _, cell, count = np.unique(number, return_inverse=True, return_counts=True)
     share = (grid.cell_volume / grid.h) / count[cell][:, None]
-    return Pieces(np.arange(n), number, np.ones(n), x.copy(), np.stack([share, share], axis=2))
+    return Pieces(np.arange(n), number, np.ones(n), x.copy(), np.stack([share, share], axis=2), np.zeros((n, 0)))
