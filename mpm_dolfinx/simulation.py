@@ -120,7 +120,7 @@ class Simulation:
         check_parts(grid, bodies, materials, later)
         check_physics(fluid, pressure, terms, sources)
         grid.share(np.concatenate([body.centre for body in bodies]))
-        warn_thin(grid, bodies, fixed)
+        warn_thin(grid, bodies, fixed, fluid is not None)
         check_axisymmetry(grid, bodies, quadrature, initial_stress)
         began, weighs = time.perf_counter(), gravity is not None
         options = (quadrature, scheme, method, weighs, pressure, terms, sources)

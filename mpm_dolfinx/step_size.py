@@ -22,6 +22,8 @@ MIN_CUT, MIN_CUT_BY_ERROR = 2.0**-10, 2.0**-30
 
 Steps by error grow over decades: where soil begins to slide they have to come down to the time that this takes.
 """
+FINEST = 1e-12
+"""Share of the time below which steps by error are not cut: bodies that burst would take ever shorter ones."""
 SAFETY, SHRINKS, GROWS, KEEPS = 0.9, 0.2, 5.0, 1.2
 """A step by error follows SAFETY times its error's root, by SHRINKS to GROWS; below KEEPS it stays as it is."""
 RINGS = 5e-3
@@ -66,10 +68,9 @@ class StepSize:
         slack = 1e-14 * abs(target) if self.by_error else 1e-9 * min(result.small, self.longest)
         return target - t <= slack
 
-    @property
-    def least(self) -> float:
-        """Share of what a step should be long below which it is not cut."""
-        return MIN_CUT_BY_ERROR if self.by_error else MIN_CUT
+    def least(self, wanted: float, t: float) -> float:
+        """Return the length, s, below which a step is not cut at a time, s, that should be so long."""
+        return max(MIN_CUT_BY_ERROR * wanted, FINEST * abs(t)) if self.by_error else MIN_CUT * wanted
 
     def wanted(self, taken: float) -> float:
         """Return what a step should be that is first tried with a length, s: below a share of it it is not cut."""

@@ -231,7 +231,7 @@ def _advance(simulation: Simulated, rule: StepSize, target: float) -> None:
         try:
             new, report = simulation.advanced(taken)
         except StepFailed as failed:
-            if taken / 2 < rule.least * wanted:
+            if taken / 2 < rule.least(wanted, state.t):
                 raise GaveUp(_why(state.t, taken, failed), _cut(simulation, taken), failed.history) from failed
             _cut(simulation, taken / 2)
             log(comm, "t = %g s: step cut to %.3g s: %s", state.t, taken / 2, failed)

@@ -14,7 +14,7 @@ from scipy.interpolate import BSpline
 from strategies import numbers, orders, repeatable, turned
 
 from mpm_dolfinx import Grid
-from mpm_dolfinx.points.cutting import Pieces, cut, cut_faces
+from mpm_dolfinx.points.cutting import Pieces, cut, cut_faces, parallelepipeds
 
 SNAP = 1e-10  # cells: a vertex that is nearer to a grid plane is taken to lie on it
 LOST = 5e-12  # share of a domain, or of a face, in slivers that are left out
@@ -414,3 +414,19 @@ def test_points_on_a_face_integrate_what_is_quadratic_in_each_cell(d):
             assert np.abs(z[here].T @ (share[here, None] * z[here]) - squares(parts, d)).max() < slack, cell
 
     check()
+
+
+def test_pieces_in_3d_have_the_moments_of_products_of_what_they_are():
+    """Those of a turned box, and those of its eight parts summed in each cell."""
+    rng = np.random.default_rng(0)
+    grid, F = Grid([3.0, 2.0, 4.0], [3, 4, 5]), np.eye(3) + 0.3 * rng.normal(size=(3, 3))
+    x, whole = np.array([[1.4, 1.1, 1.9]]), np.full((1, 3), 0.7)
+    parts = x + 0.25 * 0.7 * (2 * BITS[3] - 1) @ F.T
+    found = []
+    for middle, size in ((x, whole), (parts, np.repeat(whole / 2, 8, axis=0))):
+        p = cut(grid, parallelepipeds(middle, np.repeat(F[None], len(middle), axis=0), size))
+        weight, y = p.fraction / len(middle), p.x - x
+        moments = [p.mixed[:, a] + y[:, a - 2] * y[:, a - 1] for a in range(3)]
+        found.append([np.bincount(p.cell, weight * m, grid.shape.prod()) for m in moments])
+        assert len(np.unique(p.cell)) == 8
+    assert found[0] == pytest.approx(np.array(found[1]), abs=1e-14) and np.abs(found[0]).max() > 1e-3

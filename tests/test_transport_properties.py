@@ -106,7 +106,7 @@ def test_each_point_keeps_its_mean_pressure_whatever_the_motion(motion, wide):
 def test_points_that_were_in_no_cell_yet_bring_their_own_pressure(motion):
     n = len(motion.points)
     p, x = motion.random.normal(size=n), motion.random.normal(size=(n, len(motion.h)))
-    whole = Pieces(np.arange(n), np.full(n, -1), np.ones(n), x, np.zeros((n, len(motion.h), 2)))
+    whole = Pieces(np.arange(n), np.full(n, -1), np.ones(n), x, np.zeros((n, len(motion.h), 2)), np.zeros((n, 0)))
     start = Motion(motion.h, motion.points, whole, x, motion.after, motion.random)
     assert (start.brought(p, np.zeros_like(x), np.stack([p, p], axis=1)) == p[motion.after.point]).all()
 
@@ -169,7 +169,7 @@ def test_a_point_does_not_see_the_others(motion, wide):
 
     def only(pieces, rows):
         return Pieces(
-            pieces.point[rows] - last, *(getattr(pieces, f)[rows] for f in ("cell", "fraction", "x", "faces"))
+            pieces.point[rows] - last, *(getattr(pieces, f)[rows] for f in ("cell", "fraction", "x", "faces", "mixed"))
         )
 
     pieces = only(motion.before, old), motion.x[old], only(motion.after, new)

@@ -21,13 +21,19 @@ from mpm_dolfinx.points.grid import Grid, sum_by
 
 
 def shape_gradients(points: FormPoints) -> list:
-    """Return the gradients of the cell's Q1 shape functions at the point as UFL."""
+    """Return the gradients of the cell's Q1 shape functions at the point as UFL, in 3D their means over a piece."""
     grid, xi = points.grid, points.offset
     h = fem.Constant(grid.mesh, grid.h)
     out = []
     for signs in grid.signs.tolist():
         t = [0.5 + signs[a] * xi[a] / h[a] for a in range(grid.dim)]
-        slopes = [signs[a] / h[a] * prod(t[b] for b in range(grid.dim) if b != a) for a in range(grid.dim)]
+        slopes = []
+        for a in range(grid.dim):
+            b, *more = [k for k in range(grid.dim) if k != a]
+            mean = prod(t[k] for k in (b, *more))
+            for c in more:
+                mean += signs[b] * signs[c] / (h[b] * h[c]) * points.mixed[a]
+            slopes.append(signs[a] / h[a] * mean)
         out.append(ufl.as_vector(slopes))
     return out
 
@@ -192,7 +198,7 @@ class StackedElementMatrices:
     def _matrices(self, data: PointData, live, chosen: NDArray[np.int64], missing: NDArray) -> NDArray[np.float64]:
         """Return the element matrices (cells, n, n) of a batch."""
         d, (cells, most) = self._d, missing.shape
-        g = self._grid.shape_gradients(data.cells[chosen], data.x[chosen])
+        g = data.places.shape_gradients(chosen)
         g = g @ data["F"][chosen].reshape(-1, d, d)
         nodes = g.shape[1]
         tangent = self._tangent.evaluate(data, chosen, live)[:, self._entry].reshape(-1, d**3, d)

@@ -66,7 +66,7 @@ class FormPoints:
         self.grid = grid
         self.functions = {
             name: grid.coefficient(shape)
-            for name, shape in {"offset": (grid.dim,), "weight": (), **_hoop(grid), **fields}.items()
+            for name, shape in {"offset": (grid.dim,), "weight": (), **_moments(grid), **fields}.items()
         }
         self.live: dict[str, Callable[[PointData], NDArray[np.float64]]] = {}
         """What gives the values (n, size) of fields that change while the points stay."""
@@ -143,9 +143,9 @@ class FormPoints:
         return total
 
 
-def _hoop(grid: Grid) -> dict[str, tuple[int, ...]]:
-    """Return name and shape of what points of axisymmetric scenes carry besides, see `cutting.Pieces`."""
-    return {"hoop": (4,)} if grid.axisymmetric else {}
+def _moments(grid: Grid) -> dict[str, tuple[int, ...]]:
+    """Return name and shape of the moments that points carry in 3D and in axisymmetry, see `cutting.Pieces`."""
+    return {"mixed": (3,)} if grid.dim == 3 else {"hoop": (4,)} if grid.axisymmetric else {}
 
 
 class Places(Keyed):
@@ -157,8 +157,10 @@ class Places(Keyed):
         Owned local cell of each point.
     x : (n, d), m
         Positions.
+    mixed : (n, d), m^2
+        In 3D mean products of offsets of pieces about them, see `Pieces`; None for points.
     hoop : (n, 4)
-        Of axisymmetric pieces their moments in the plane, see `cutting.Pieces`; without it, those of points.
+        Of axisymmetric pieces their moments in the plane, see `Pieces`; without it, those of points.
     """
 
     def __init__(
@@ -166,9 +168,10 @@ class Places(Keyed):
         grid: Grid,
         cells: NDArray[np.int32],
         x: NDArray[np.float64],
+        mixed: NDArray[np.float64] | None = None,
         hoop: NDArray[np.float64] | None = None,
     ):
-        self.grid, self.cells, self.x = grid, cells, x
+        self.grid, self.cells, self.x, self.mixed = grid, cells, x, mixed
         self.offset = offset = x - grid.midpoints[cells]
         if grid.axisymmetric and hoop is None:
             hoop = np.column_stack([offset, offset.prod(axis=1), x[:, 0]])
@@ -178,7 +181,13 @@ class Places(Keyed):
 
     def part(self, rows: NDArray[np.int64]) -> Places:
         """Return some of the places."""
-        return Places(self.grid, self.cells[rows], self.x[rows], self.hoop[rows] if self.grid.axisymmetric else None)
+        mixed, hoop = (None if values is None else values[rows] for values in (self.mixed, self.hoop))
+        return Places(self.grid, self.cells[rows], self.x[rows], mixed, hoop)
+
+    def shape_gradients(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the gradients (m, 2^d, d), 1/m, of the shape functions at some of the points, or means over pieces."""
+        mixed = None if self.mixed is None else self.mixed[chosen]
+        return self.grid.shape_gradients(self.cells[chosen], self.x[chosen], mixed)
 
     def stretch(self, u: NDArray[np.float64], rows: slice = slice(None)) -> NDArray[np.float64]:
         """Return 1 + u_r / r (n,) of nodal displacements u (nodes, d), m, in axisymmetry: see `FormPoints.hoop`."""
@@ -207,6 +216,8 @@ class PointData(Keyed):
         self.points, self.places, self.cells, self.x = points, places, places.cells, places.x
         self.volume, n = weight, len(places.cells)
         self._rows = {"offset": places.offset, "weight": (weight / points.grid.cell_volume)[:, None]}
+        if points.grid.dim == 3:
+            self._rows["mixed"] = np.zeros_like(places.x) if places.mixed is None else places.mixed
         if points.grid.axisymmetric:
             self._rows["hoop"] = places.hoop
         self._rows |= {name: fields[name].reshape(n, size) for name, size in points.sizes.items()}
@@ -231,7 +242,7 @@ class PointData(Keyed):
         out, nodal = np.empty((n, grid.dim**2)), u.reshape(-1, grid.dim)
         for part in (slice(start, start + BATCH) for start in range(0, n, BATCH)):
             cells = self.cells[part]
-            slopes = grid.shape_gradients(cells, self.x[part])
+            slopes = self.places.shape_gradients(part)
             out[part] = (nodal[grid.cell_nodes[cells]].transpose(0, 2, 1) @ slopes).reshape(len(cells), -1)
         return out
 

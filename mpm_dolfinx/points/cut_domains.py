@@ -97,6 +97,8 @@ class CutDomains(Keyed):
         self._travel = Exchange(grid.comm, grid.owner(self.pieces.cell))
         self.cells, self.x = grid.local(self._travel.send(self.pieces.cell)), self._travel.send(self.pieces.x)
         """Owned cells, and centroids (m, d), m, of the pieces that this process integrates."""
+        self.mixed = self._travel.send(self.pieces.mixed) if grid.dim == 3 and domains else None
+        """Their mean products of offsets in 3D, see `Pieces`."""
         self.hoop = self._travel.send(self.pieces.hoop) if grid.axisymmetric else np.empty((len(self.cells), 0))
         """Their moments in the plane (m, 4) in axisymmetry, see `Pieces`; else (m, 0)."""
 
@@ -208,4 +210,4 @@ def whole_points(grid: Grid, x: NDArray[np.float64]) -> Pieces:
     n, number = len(x), grid.number(grid.index(x))
     _, cell, count = np.unique(number, return_inverse=True, return_counts=True)
     share = (grid.cell_volume / grid.h) / count[cell][:, None]
-    return Pieces(np.arange(n), number, np.ones(n), x.copy(), np.stack([share, share], axis=2))
+    return Pieces(np.arange(n), number, np.ones(n), x.copy(), np.stack([share, share], axis=2), np.zeros((n, 0)))

@@ -2,8 +2,9 @@
 """The points' domains, cut by the grid into pieces that lie in one cell each.
 
 A point stands for a quadrilateral or hexahedron of tracked corners.  Its pieces carry exact volumes
-and centroids: gradients of Q1 functions are linear within a cell, so one row of integration data a
-piece integrates them exactly, and the answer does not depend on how points lie on the grid.
+and centroids, in 3D also their moments of products: gradients of Q1 functions are linear within a cell, in 3D bilinear,
+so one row of integration data a piece integrates them exactly, and the answer does not depend on how points lie on the
+grid.
 
 The surface of a domain (4 edges, or the 12 outer triangles of its 6 Kuhn tetrahedra, which match those of
 the neighbours) is sliced by the grid planes of one axis after the other.  Gauss's theorem turns the slices into
@@ -17,6 +18,7 @@ over the area: the forces of even stresses are then exact.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from itertools import combinations, permutations
 
@@ -37,9 +39,11 @@ class Pieces:
 
     point : (m,) index of the domain; cell : (m,) lexicographic number of the cell;
     fraction : (m,) share of the domain's volume; x : (m, d) centroid, m;
-    faces : (m, d, 2) area of the piece on the lower and upper face of its cell, m^(d-1).
-    hoop : (m, 4), in axisymmetry only, else (m, 0): in the plane, offset (2,) of the centroid from the cell's
-    midpoint, m, mean product of the offset's components, m^2, and radius of the centroid, m.
+    faces : (m, d, 2) area of the piece on the lower and upper face of its cell, m^(d-1);
+    mixed : (m, d) in 3D, else (m, 0): mean product of the offsets from the centroid along the axes other than each,
+    m^2;
+    hoop : (m, 4) in axisymmetry, else (m, 0): in the plane, offset (2,) of the centroid from the cell's midpoint, m,
+    mean product of the offset's components, m^2, and radius of the centroid, m.
     """
 
     point: NDArray[np.int64]
@@ -47,6 +51,7 @@ class Pieces:
     fraction: NDArray[np.float64]
     x: NDArray[np.float64]
     faces: NDArray[np.float64]
+    mixed: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
     hoop: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
 
 
@@ -243,6 +248,7 @@ def _sum(
     for a in range(1, d):
         within = total(products * (sums[0] * sums[a] + (x[:, 0] * x[:, a]).sum(axis=0)))
         moments.append(within + slots.beyond(total(area[0] * sums[a] / d), 0))
+    uneven = _mean_products(x, sums, area[0], total, slots) if d == 3 else []
 
     whole = sum_by(slots.point, volume, len(slots.low[0]))[slots.point]
     kept = np.flatnonzero(volume / whole > SLIVER)
@@ -264,15 +270,20 @@ def _sum(
         faces[:, a] *= grid.cell_volume / grid.h[a]
 
     # centroids stay off the grid lines, and inside the cell that they belong to
-    volume, hoop = volume[kept], np.empty((len(kept), 0))
-    centroid = np.clip(np.stack([m[kept] / volume for m in moments], axis=1), SNAP, 1 - SNAP)
+    volume, hoop, mixed = volume[kept], np.empty((len(kept), 0)), np.zeros((len(kept), len(uneven)))
+    middle = np.stack([m[kept] / volume for m in moments], axis=1)
+    centroid = np.clip(middle, SNAP, 1 - SNAP)
+    for a, product in enumerate(uneven):
+        b, c = (k for k in range(d) if k != a)
+        # of a piece thinner than rounding allows for it is not known, and at most this
+        mixed[:, a] = np.clip(product[kept] / volume - middle[:, b] * middle[:, c], -0.25, 0.25) * grid.h[b] * grid.h[c]
     if grid.axisymmetric:
         faces[:, 0] *= TURN * (grid.lower[0] + grid.h[0] * (cell[:, [0]] + [0, 1]))
         faces[:, 1] *= TURN
         radius, centroid, hoop = _rings(grid, cell, centroid, squares[kept] / volume, products[kept] / volume)
         volume = volume * radius
-    fraction = volume / sum_by(point, volume, len(slots.low[0]))[point]
-    return Pieces(point, grid.number(cell), fraction, grid.lower + grid.h * (cell + centroid), np.abs(faces), hoop)
+    fraction, x = volume / sum_by(point, volume, len(slots.low[0]))[point], grid.lower + grid.h * (cell + centroid)
+    return Pieces(point, grid.number(cell), fraction, x, np.abs(faces), mixed, hoop)
 
 
 def _rings(
@@ -291,6 +302,38 @@ def _rings(
     product = h * height * (products - (x + z) / 2 + 0.25)
     hoop = np.stack([h * (x - 0.5), height * (z - 0.5), product, radius], axis=1)
     return radius, np.clip(of_volume, SNAP, 1 - SNAP), hoop
+
+
+def _mean_products(
+    x: NDArray[np.float64],
+    sums: NDArray[np.float64],
+    area: NDArray[np.float64],
+    total: Callable[[NDArray[np.float64]], NDArray[np.float64]],
+    slots: _Slots,
+) -> list[NDArray[np.float64]]:
+    """Return the integrals of yz, xz and xy over the pieces of slots, from the lower corners of their cells.
+
+    Parameters
+    ----------
+    x, sums, area
+        Vertices (3, 3, m) of slices, their sums (3, m), and the area of the slices that the first axis sees (m,).
+    total
+        Sums values of slices over slots.
+    """
+
+    def mean(*factors: int) -> NDArray[np.float64]:
+        """Return the integrals over the slices of a product of two or three coordinates."""
+        if len(factors) == 2:
+            (a, b), of = factors, sums
+            return area / 12 * (of[a] * of[b] + (x[:, a] * x[:, b]).sum(axis=0))
+        a, b, c = factors
+        pairs = sum(sums[i] * (x[:, j] * x[:, k]).sum(axis=0) for i, j, k in ((a, b, c), (b, a, c), (c, a, b)))
+        return area / 60 * (sums[a] * sums[b] * sums[c] + pairs + 2 * (x[:, a] * x[:, b] * x[:, c]).sum(axis=0))
+
+    out = [total(mean(0, 1, 2)) + slots.beyond(total(mean(1, 2)), 0)]
+    for a in (2, 1):
+        out.append(total(mean(0, 0, a)) / 2 + slots.beyond(total(area * sums[a] / 3), 0) / 2)
+    return out
 
 
 def cut_faces(
@@ -332,8 +375,9 @@ def cut_faces(
     points = np.einsum("qk,kam->qam", _RULES[d], s)
     middle = np.tile((grid.lower + grid.h * s[:, :d].mean(axis=0).T), (len(points), 1))
     points = points.transpose(0, 2, 1).reshape(-1, both.shape[1])
-    face = np.tile(owner % max(1, m), d)
-    return face, grid.lower + grid.h * points[:, :d], points[:, d:], np.tile(share / d, d), middle
+    count = len(_RULES[d])
+    face = np.tile(owner % max(1, m), count)
+    return face, grid.lower + grid.h * points[:, :d], points[:, d:], np.tile(share / count, count), middle
 
 
 def _size(s: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -345,9 +389,10 @@ def _size(s: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.sqrt(sum((a[i] * b[j] - a[j] * b[i]) ** 2 for i, j in combinations(range(len(a)), 2)))
 
 
-_RULES = {  # barycentric points of equal weight, exact to second order on segments and triangles
+_CUBIC = (0.659027622374092, 0.231933368553031, 0.109039009072877)  # Strang and Fix (1973)
+_RULES = {  # barycentric points of equal weight, exact to third order on segments and triangles
     2: 0.5 + np.array([[1, -1], [-1, 1]]) / np.sqrt(12),
-    3: (1 + 3 * np.eye(3)) / 6,
+    3: np.array(list(permutations(_CUBIC))),
 }
 
 

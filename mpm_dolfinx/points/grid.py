@@ -253,12 +253,21 @@ class Grid:
         tolerance = tolerance + rounding(np.stack([self.lower, self.upper])) / self.h
         return ((y < -tolerance) | (y > self.shape + tolerance) | ~np.isfinite(y)).any(axis=1)
 
-    def shape_gradients(self, cells: NDArray[np.int32], x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the gradients (n, 2^d, d), 1/m, of the Q1 shape functions of local cells at points."""
+    def shape_gradients(
+        self, cells: NDArray[np.int32], x: NDArray[np.float64], mixed: NDArray[np.float64] | None = None
+    ) -> NDArray[np.float64]:
+        """Return the gradients (n, 2^d, d), 1/m, of the Q1 shape functions of local cells at points.
+
+        mixed (n, 3), m^2: in 3D the means over pieces about these points, by their mean products of offsets.
+        """
         hats = self._hats(cells, x)
         dN = np.empty((*hats[0].shape, self.dim))
         for a in range(self.dim):
-            others = reduce(np.multiply, [hats[b] for b in range(self.dim) if b != a])
+            b, *more = [k for k in range(self.dim) if k != a]
+            others = reduce(np.multiply, [hats[k] for k in (b, *more)])
+            if mixed is not None and more:
+                c = more[0]
+                others = others + mixed[:, a, None] * (self.signs[:, b] * self.signs[:, c] / (self.h[b] * self.h[c]))
             np.multiply(others, self.signs[:, a] / self.h[a], out=dN[:, :, a])
         return dN
 
