@@ -38,6 +38,7 @@ QUICK = {
     ),
     "slump": ("--cells 6 --steps 10", ["slump.png", "failure.png", "slump.gif"]),
     "triaxial": ("--steps 20", ["triaxial.png"]),
+    "dam": ("--h 1 --steps 3 --cells 10", ["dam.png"]),
     "embankment": ("--h 1 --steps 1", ["embankment.png"]),
     "footing": ("--cells 3 --depth 0.1", ["footing.png", "footing.gif"]),
     "benchmark_beam": ("--h 0.05 --t-end 0.1 --repeat 1", []),
