@@ -20,7 +20,7 @@ from mpm_dolfinx.point_fields import PointFields, point_fields
 from mpm_dolfinx.points.bodies import Body, check_bodies
 from mpm_dolfinx.points.grid import Grid
 from mpm_dolfinx.points.material_points import MaterialPoints
-from mpm_dolfinx.problems.conditions import Displacement, Drained, Inflow, Pressure, RigidPlate, Traction
+from mpm_dolfinx.problems.conditions import Displacement, Drained, Inflow, OnSide, Pressure, RigidPlate, Traction
 from mpm_dolfinx.problems.thin import warn_thin
 from mpm_dolfinx.result import Report, Result
 from mpm_dolfinx.scene import Scene
@@ -66,7 +66,7 @@ class Simulation:
     method
         Of time integration: "sdirk2", of second order, or "backward-euler"; see `time_integration`.
     terms, sources
-        Functions that give terms of the user's own to the two balances in UFL: see `user_functions`.
+        Functions that give terms of the user's own to the two balances in UFL: see `user_functions`, `OnSide`.
     later
         Indices of bodies that a later stage adds, each once.
 
@@ -104,7 +104,7 @@ class Simulation:
         coupling: str = "schur-cg",
         tolerance: float = 1e-8,
         method: str = "sdirk2",
-        terms: Sequence[Callable] = (),
+        terms: Sequence[Callable | OnSide] = (),
         sources: Sequence[Callable] = (),
         later: Sequence[int] = (),
     ):
@@ -122,7 +122,7 @@ class Simulation:
             raise ValueError("sources need a fluid")
         check_bodies(grid, bodies)
         chosen("later", later, range(len(bodies)), "indices of the bodies")
-        functions("terms", terms)
+        functions("terms", [term.term if isinstance(term, OnSide) else term for term in terms])
         functions("sources", sources)
         grid.share(np.concatenate([body.centre for body in bodies]))
         warn_thin(grid, bodies, fixed)

@@ -29,7 +29,7 @@ def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int
     """Return the state of a scene at rest, in its first stage; its stresses as given, not yet in balance."""
     present = [body not in later for body in range(len(scene.bodies))]
     check_apart(scene.grid, scene.bodies, present)
-    begun = _stage(scene, conditions, present, later)
+    begun = _stage(scene, {**conditions, "terms": [term.given for term in scene.momentum.sides.own]}, present, later)
     points = scene.materials.seeded.of(_ids(scene.bodies, later), kept=False)
     points = scene.initial.of(scene.materials, points, present, begun.gravity_at(0.0))
     transported = None

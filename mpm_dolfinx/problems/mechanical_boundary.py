@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from mpm_dolfinx.caching import Latest
 from mpm_dolfinx.constitutive.fields import SceneMaterials
-from mpm_dolfinx.forms.point_forms import Places, PointData
+from mpm_dolfinx.forms.point_forms import FormPoints, Places, PointData
 from mpm_dolfinx.parallel.exchange import Exchange, first
 from mpm_dolfinx.parallel.messages import warn
 from mpm_dolfinx.points.cut_domains import CutDomains, Patches
@@ -26,6 +26,7 @@ from mpm_dolfinx.problems.closed import closed
 from mpm_dolfinx.problems.conditions import (
     RIGIDITY,
     Displacement,
+    OnSide,
     Pressure,
     RigidPlate,
     Traction,
@@ -54,6 +55,8 @@ class MechanicalBoundary:
         Those of the scene: plates are rigid by the stiffest one, held sides by their own.
     tractions, displacements, plates
         The conditions.
+    terms
+        Those of the user's own on sides.
 
     Raises
     ------
@@ -70,9 +73,11 @@ class MechanicalBoundary:
         tractions: Sequence[Traction | Pressure],
         displacements: Sequence[Displacement],
         plates: Sequence[RigidPlate],
+        terms: Sequence[OnSide] = (),
     ):
         self.grid, self._free, self._materials, d = sides.grid, free, materials, sides.grid.dim
         self.plates = [(plate, sides.of(plate)) for plate in plates]
+        self._terms = [sides.of(term) for term in terms]
         self.pressures = [(load, sides.of(load)) for load in tractions if isinstance(load, Pressure)]
         tractions = [load for load in tractions if not isinstance(load, Pressure)]
         tractions += [plate.traction(faces.area0.sum(), inward(faces)) for plate, faces in self.plates]
@@ -103,7 +108,15 @@ class MechanicalBoundary:
             pressures = self._pressure_data(forms, cut, points, t) if self.pressures else None
             plates = self._plate_data(forms, cut, points) if self.plates else None
             none = (None, np.empty(0, dtype=np.int64), np.empty((0, 2**self.grid.dim)))
-            return SideData(loads, pressures, plates, *(self._hold_data(forms, cut, points, t) if self.holds else none))
+            holds = self._hold_data(forms, cut, points, t) if self.holds else none
+            own = zip(forms.own, self._terms, strict=True)
+            return SideData(
+                loads,
+                pressures,
+                plates,
+                *holds,
+                tuple(self._own_data(term.points, faces, cut, points) for term, faces in own),
+            )
 
     def _load_data(self, forms: SideForms, cut: CutDomains, points: MaterialPoints, t: float) -> PointData:
         """Return the dead loads on the surface."""
@@ -129,6 +142,16 @@ class MechanicalBoundary:
         cell, x = (np.concatenate([getattr(p, name) for p in patches]) for name in ("cell", "x"))
         travel = Exchange(self.grid.comm, self.grid.owner(cell))
         return travel, Places(self.grid, self.grid.local(travel.send(cell)), travel.send(x))
+
+    def _own_data(self, of: FormPoints, faces: Surface, cut: CutDomains, points: MaterialPoints) -> PointData:
+        """Return the points of a term of the user's on a side."""
+        p = cut.surface(faces)
+        area, now = p.area(points), p.now(points)
+        size = np.linalg.norm(area, axis=1, keepdims=True)
+        rows = np.concatenate([size, area / size, now, now - p.origin(points)], axis=1)
+        cell, x, values = gathered(self.grid, [(p.cell, p.x, rows)], 1 + 3 * self.grid.dim)
+        normal, position, displacement = np.split(values[:, 1:], 3, axis=1)
+        return of.at(cell, x, values[:, 0], normal=normal, position=position, displacement=displacement)
 
     def _plate_data(self, forms: SideForms, cut: CutDomains, points: MaterialPoints) -> PointData:
         """Return the plates on the surface."""

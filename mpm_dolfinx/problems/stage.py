@@ -75,7 +75,7 @@ def stage(
     wet
         Whether there is a fluid.
     conditions
-        fixed, tractions, displacements, drained, inflows, plates, gravity: see `Simulation`.
+        fixed, tractions, displacements, drained, inflows, plates, gravity: see `Simulation`; terms: on sides.
     present, later
         Which bodies are there, and which may still come.
 
@@ -94,7 +94,7 @@ def stage(
     if not any(present):
         raise ValueError("bodies: none is there, must be at least one")
     free, sides = ~_fixed(grid, conditions["fixed"]), Sides(grid, bodies, present)
-    acting = (conditions[name] for name in ("tractions", "displacements", "plates"))
+    acting = (conditions[name] for name in ("tractions", "displacements", "plates", "terms"))
     mechanical = MechanicalBoundary(sides, free, materials, *acting)
     hydraulic = HydraulicBoundary(sides, [*conditions["drained"], *conditions["inflows"]])
     given = [(faces, axes) for _, faces, axes in mechanical.holds]
