@@ -21,6 +21,7 @@ from mpm_dolfinx.points.bodies import Body, check_bodies
 from mpm_dolfinx.points.grid import Grid
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.problems.conditions import Displacement, Drained, Inflow, OnSide, Pressure, RigidPlate, Traction
+from mpm_dolfinx.problems.side_forms import functions_of
 from mpm_dolfinx.problems.thin import warn_thin
 from mpm_dolfinx.result import Report, Result
 from mpm_dolfinx.scene import Scene
@@ -122,7 +123,7 @@ class Simulation:
             raise ValueError("sources need a fluid")
         check_bodies(grid, bodies)
         chosen("later", later, range(len(bodies)), "indices of the bodies")
-        functions("terms", [term.term if isinstance(term, OnSide) else term for term in terms])
+        functions("terms", functions_of(terms))
         functions("sources", sources)
         grid.share(np.concatenate([body.centre for body in bodies]))
         warn_thin(grid, bodies, fixed)

@@ -31,7 +31,7 @@ def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int
     check_apart(scene.grid, scene.bodies, present)
     begun = _stage(scene, {**conditions, "terms": [term.given for term in scene.momentum.sides.own]}, present, later)
     points = scene.materials.seeded.of(_ids(scene.bodies, later), kept=False)
-    points = scene.initial.of(scene.materials, points, present, begun.gravity_at(0.0))
+    points = scene.initial.of(scene.materials, points, present, begun.gravity_at(0.0) if scene.initial.given else None)
     transported = None
     if scene.fluid:
         transported = pieces_at_start(scene, points) if callable(scene.initial.pressure) else at_start(points)
@@ -65,7 +65,7 @@ def begin_stage(
         state = scene.motion.left_grid(state, scene.on_grid(state.stay.points))
     gone, transported = _ids(scene.bodies, remove), state.transported
     there = [body for body, here in enumerate(before.present) if here and body not in remove]
-    gravity = begun.gravity_at(state.t)
+    gravity = begun.gravity_at(state.t) if scene.initial.given else None
     points, new = _filled(scene, state.points.of(gone, kept=False), there, add, gravity)
     if transported is not None:
         transported = transported.of(gone, kept=False).joined(at_start(new))

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -37,6 +38,13 @@ class SideData:
     held: HeldCells | None
     row: NDArray[np.int64]
     own: tuple[PointData, ...] = ()
+
+
+def functions_of(terms):
+    """Return the functions of terms in bodies and on sides; what is no list of them as it is."""
+    if isinstance(terms, str) or not isinstance(terms, Sequence):
+        return terms
+    return [term.term if isinstance(term, OnSide) else term for term in terms]
 
 
 class OwnTerm(NamedTuple):
