@@ -39,7 +39,7 @@ from mpm_dolfinx.points.grid import Grid
 from mpm_dolfinx.points.mesh_files import from_mesh
 from mpm_dolfinx.points.polygon import polygon
 from mpm_dolfinx.points.probes import probes
-from mpm_dolfinx.problems.conditions import Displacement, Drained, Inflow, Pressure, RigidPlate, Traction
+from mpm_dolfinx.problems.conditions import Displacement, Drained, Inflow, OnSide, Pressure, RigidPlate, Traction
 from mpm_dolfinx.problems.tools import Ball, Cone, Convex, HalfSpace, Tool
 from mpm_dolfinx.problems.water import water
 from mpm_dolfinx.result import Result
@@ -74,6 +74,7 @@ __all__ = [
     "MohrCoulomb",
     "NeoHookean",
     "NotConverged",
+    "OnSide",
     "Pressure",
     "Result",
     "RigidPlate",

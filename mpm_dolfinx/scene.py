@@ -26,6 +26,7 @@ from mpm_dolfinx.points.cut_domains import CutDomains
 from mpm_dolfinx.points.cutting import volumes
 from mpm_dolfinx.points.grid import Grid
 from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.problems.conditions import OnSide
 from mpm_dolfinx.problems.momentum import MomentumForms
 from mpm_dolfinx.problems.on_grid import Assembled, OnGrid, System, assembled
 from mpm_dolfinx.problems.overfilled import warn_overfilled
@@ -79,7 +80,8 @@ class Scene:
         self.gravity = fem.Constant(grid.mesh, np.zeros(grid.dim)) if weighs else None
         self.t, self.dt = fem.Constant(grid.mesh, 0.0), fem.Constant(grid.mesh, 1.0)
         """Time at the end of the substep, and since the start of the step, s, for forms."""
-        self.pieces = QuadraturePoints(grid, scene, fluid, weighs, bool(terms or sources))
+        inside = [term for term in terms if not isinstance(term, OnSide)]
+        self.pieces = QuadraturePoints(grid, scene, fluid, weighs, bool(len(inside) + len(sources)))
         laws, p = self.pieces.laws, fem.Function(grid.cellwise()) if fluid else None
         with compiling(f"materials: {', '.join(law.__name__ for law in scene.laws)}", "laws in UFL of these shapes"):
             wet = fluid.density if fluid else None

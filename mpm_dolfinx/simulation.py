@@ -21,7 +21,7 @@ from mpm_dolfinx.points.bodies import Body
 from mpm_dolfinx.points.grid import Grid
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.problems.axis import check_axisymmetry
-from mpm_dolfinx.problems.conditions import Displacement, Drained, Inflow, Pressure, RigidPlate, Traction
+from mpm_dolfinx.problems.conditions import Displacement, Drained, Inflow, OnSide, Pressure, RigidPlate, Traction
 from mpm_dolfinx.problems.scene_parts import check_parts, check_physics
 from mpm_dolfinx.problems.thin import warn_thin
 from mpm_dolfinx.problems.tools import Tool
@@ -71,7 +71,7 @@ class Simulation:
     method
         Of time integration: "sdirk2", of second order, or "backward-euler"; see `time_integration`.
     terms, sources
-        Functions that give terms of the user's own to the two balances in UFL: see `user_functions`.
+        Functions that give terms of the user's own to the two balances in UFL: see `user_functions`, `OnSide`.
     later
         Indices of bodies that a later stage adds, each once.
 
@@ -110,7 +110,7 @@ class Simulation:
         coupling: str = "schur-cg",
         tolerance: float = 1e-8,
         method: str = "sdirk2",
-        terms: Sequence[Callable] = (),
+        terms: Sequence[Callable | OnSide] = (),
         sources: Sequence[Callable] = (),
         later: Sequence[int] = (),
     ):

@@ -29,9 +29,9 @@ def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int
     """Return the state of a scene at rest, in its first stage; its stresses as given, not yet in balance."""
     present = [body not in later for body in range(len(scene.bodies))]
     check_apart(scene.grid, scene.bodies, present)
-    begun = _stage(scene, conditions, present, later)
+    begun = _stage(scene, {**conditions, "terms": [term.given for term in scene.momentum.sides.own]}, present, later)
     points = scene.materials.seeded.of(_ids(scene.bodies, later), kept=False)
-    points = scene.initial.of(scene.materials, points, present, begun.gravity_at(0.0))
+    points = scene.initial.of(scene.materials, points, present, begun.gravity_at(0.0) if scene.initial.given else None)
     transported = None
     if scene.fluid:
         transported = pieces_at_start(scene, points) if callable(scene.initial.pressure) else at_start(points)
@@ -66,7 +66,9 @@ def begin_stage(
         state = scene.motion.left_grid(state, scene.on_grid(state.stay.points))
     gone, transported = _ids(scene.bodies, remove), state.transported
     there = [body for body, here in enumerate(before.present) if here and body not in remove]
-    bare, gravity = before.mechanical.tools.let_go(state.points), begun.gravity_at(state.t)
+    bare, gravity = before.mechanical.tools.let_go(state.points), None
+    if scene.initial.given:
+        gravity = begun.gravity_at(state.t)
     points, new = _filled(scene, bare.of(gone, kept=False), there, add, gravity)
     points = begun.mechanical.tools.grip(points, None if "tools" in named else state.points)
     if transported is not None:

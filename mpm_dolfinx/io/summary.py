@@ -57,7 +57,7 @@ def _momentum(s: Scene, state: State) -> list[Part]:
         _either("rigid plates", side.plates, f"on {len(side.plates)} sides", "no plates"),
         _either("tools", side.tools.tools, f"{len(side.tools.tools)}", "no tools"),
         _either("ghost penalty", m.ghost.form.used, "faces of nearly empty cells", "no nearly empty cell so far"),
-        _either("terms of the user's", m.terms, f"{len(m.terms)}", "none given"),
+        _either("terms of the user's", m.terms or m.sides.own, f"{len(m.terms) + len(m.sides.own)}", "none given"),
     ]
 
 

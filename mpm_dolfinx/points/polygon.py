@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A body from a polygon whose edges have names: gmsh fills it with triangles."""
+"""A body from a polygon whose edges have names: gmsh fills it with triangles or quadrilaterals."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.parallel.exchange import at_root
 from mpm_dolfinx.points.grid import Grid
+from mpm_dolfinx.points.mesh_files import AS_LATTICE
 from mpm_dolfinx.points.meshes import Mesh, MeshBody, seeded
-from mpm_dolfinx.validation import instance, line, numbers, whole
+from mpm_dolfinx.validation import flag, instance, line, numbers, whole
 
 EDGE = 2.7  # cells over points a cell and direction: edge of triangles whose thirds are as large as those of a `box`
 FLAT = 1e-12  # of its size squared: areas below which three corners of a polygon lie on one line
@@ -28,6 +29,7 @@ def polygon(
     size: float | None = None,
     per_cell: int = 2,
     material: int = 0,
+    quadrilaterals: bool = False,
 ) -> MeshBody:
     """Seed a polygon, such as a slope or a layer, with points; return the body.
 
@@ -45,9 +47,11 @@ def polygon(
     holes : name -> (k, 2), m
         Corners of holes, such as a tunnel, by the names of their sides.
     size
-        Edge of the triangles, m; by default such that there are per_cell points per cell and direction.
+        Edge of the triangles or quadrilaterals, m; by default there are per_cell points per cell and direction.
     per_cell, material
         As for `from_mesh`.
+    quadrilaterals
+        Whether triangles are joined to quadrilaterals, whose stresses are nearer to those of boxes.
 
     Raises
     ------
@@ -71,10 +75,11 @@ def polygon(
     for name, inner in (holes or {}).items():
         inner = _outline(f"hole {name!r}", inner)
         loops.append((inner, [name] * len(inner)))
-    default = EDGE * grid.h.min() / whole("body: per_cell", per_cell)
+    flag("polygon: quadrilaterals", quadrilaterals)
+    default = (1.0 if quadrilaterals else EDGE) * grid.h.min() / whole("body: per_cell", per_cell)
     edge = float(numbers("polygon: size", default if size is None else size, test=lambda v: (v > 0) & np.isfinite(v)))
     _check_simple([corners for corners, _ in loops])
-    mesh = at_root(grid.comm, lambda: _triangles(loops, edge))
+    mesh = at_root(grid.comm, lambda: _filled(loops, edge, quadrilaterals))
     return seeded(grid, mesh, None, per_cell, material, "polygon")
 
 
@@ -156,8 +161,8 @@ def _gmsh() -> Iterator:
             signal.signal(signal.SIGINT, hears)
 
 
-def _triangles(loops: Sequence[tuple[NDArray[np.float64], Sequence[str]]], size: float) -> Mesh:
-    """Return a polygon, and holes after it, filled with triangles of a size, m."""
+def _filled(loops: Sequence[tuple[NDArray[np.float64], Sequence[str]]], size: float, quadrilaterals: bool) -> Mesh:
+    """Return a polygon, and holes after it, filled with triangles of a size, m, or with quadrilaterals."""
     with _gmsh() as gmsh:
         geo, named, curves = gmsh.model.geo, {}, []
         for corners, names in loops:
@@ -166,16 +171,21 @@ def _triangles(loops: Sequence[tuple[NDArray[np.float64], Sequence[str]]], size:
             curves.append(geo.addCurveLoop(lines))
             for tag, name in zip(lines, names, strict=True):
                 named.setdefault(name, []).append(tag)
-        geo.addPlaneSurface(curves)
+        surface = geo.addPlaneSurface(curves)
         geo.synchronize()
+        if quadrilaterals:
+            gmsh.model.mesh.setRecombine(2, surface)
         gmsh.model.mesh.generate(2)
         tags, x, _ = gmsh.model.mesh.getNodes()
         number = np.zeros(int(max(tags, default=0)) + 1, dtype=np.int64)
         number[tags] = np.arange(len(tags))
-        cells = number[gmsh.model.mesh.getElementsByType(2)[1]].reshape(-1, 3)
+        triangles, squares = (
+            number[gmsh.model.mesh.getElementsByType(kind)[1]].reshape(-1, kind + 1) for kind in (2, 3)
+        )
+        cells = {"triangle": triangles, "quad": squares[:, AS_LATTICE["quad"]]}
         sides = {
             name: [number[gmsh.model.mesh.getElementsByType(1, tag)[1]].reshape(-1, 2) for tag in lines]
             for name, lines in named.items()
             if name
         }
-    return Mesh(x.reshape(-1, 3)[:, :2].copy(), {"triangle": cells}, {}, sides)
+    return Mesh(x.reshape(-1, 3)[:, :2].copy(), {kind: rows for kind, rows in cells.items() if len(rows)}, {}, sides)

@@ -158,6 +158,33 @@ class Pressure:
 
 
 @dataclass(frozen=True, eq=False)
+class OnSide:
+    """Term of the user's own on a side of the bodies, in UFL: springs, dashpots, loads that depend on what moves.
+
+    Given among the `terms` of the scene, for all of its stages.
+
+    Parameters
+    ----------
+    side
+        Side of the bodies, as for `Traction`.
+    term
+        Function as those of `terms`, see `user_functions`; its `points` are those of integration on the side:
+        `points.dx` measures the area at the start of the step, and `points.normal` is the outward normal then.
+    region : ((d,), (d,)), m
+        As for `Traction`.
+
+    Raises
+    ------
+    ValueError
+        From the scene: it is no such function, or no point has the side.
+    """
+
+    side: str
+    term: Callable
+    region: Region | None = None
+
+
+@dataclass(frozen=True, eq=False)
 class Drained:
     """Side of the bodies, moving with them, at which the pore pressure is given.
 

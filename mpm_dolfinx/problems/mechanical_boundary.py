@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from mpm_dolfinx.caching import Latest
 from mpm_dolfinx.constitutive.fields import SceneMaterials
-from mpm_dolfinx.forms.point_forms import Places, PointData
+from mpm_dolfinx.forms.point_forms import FormPoints, Places, PointData
 from mpm_dolfinx.parallel.exchange import Exchange, first
 from mpm_dolfinx.parallel.messages import warn
 from mpm_dolfinx.points.cut_domains import CutDomains, Patches
@@ -26,6 +26,7 @@ from mpm_dolfinx.problems.closed import closed
 from mpm_dolfinx.problems.conditions import (
     RIGIDITY,
     Displacement,
+    OnSide,
     Pressure,
     RigidPlate,
     Traction,
@@ -56,6 +57,8 @@ class MechanicalBoundary:
         Those of the scene: plates are rigid by the stiffest one, held sides by their own.
     tractions, displacements, plates, tools
         The conditions.
+    terms
+        Those of the user's own on sides.
 
     Raises
     ------
@@ -73,9 +76,11 @@ class MechanicalBoundary:
         displacements: Sequence[Displacement],
         plates: Sequence[RigidPlate],
         tools: Sequence[Tool],
+        terms: Sequence[OnSide],
     ):
         self.grid, self._free, self._materials, d = sides.grid, free, materials, sides.grid.dim
         self.plates = [(plate, sides.of(plate)) for plate in plates]
+        self._terms = [sides.of(term) for term in terms]
         self.pressures = [(load, sides.of(load)) for load in tractions if isinstance(load, Pressure)]
         tractions = [load for load in tractions if not isinstance(load, Pressure)]
         for plate, faces in self.plates:
@@ -98,8 +103,8 @@ class MechanicalBoundary:
             if not callable(condition.value):  # what a function gives is checked when it is called
                 more = {Traction: [d], Pressure: [], Displacement: [np.empty((1, d))]}
                 condition.at(0.0, *more[type(condition)])
-        if self.grid.axisymmetric and tools:
-            raise ValueError("tools: must be none in axisymmetry")
+        if self.grid.axisymmetric and (tools or terms):
+            raise ValueError(f"{'tools' if tools else 'terms on sides'}: must be none in axisymmetry")
         self.tools = Tools(self.grid, materials, tools, sides.all, [(hold, faces) for hold, faces, _ in self.holds])
         self.symmetric = closed(self.grid, free, self.pressures) and self.tools.symmetric
         """Whether the tangent of pressures and tools is symmetric."""
@@ -112,7 +117,12 @@ class MechanicalBoundary:
             plates = self._plate_data(forms, cut, points) if self.plates else None
             none = (None, np.empty(0, dtype=np.int64), np.empty((0, 2**self.grid.dim)))
             holds = self._hold_data(forms, cut, points, t) if self.holds else none
-            return SideData(loads, pressures, plates, *holds, self.tools.placed(cut, points, start, t))
+            own = [
+                self._own_data(term.points, faces, cut, points)
+                for term, faces in zip(forms.own, self._terms, strict=True)
+            ]
+            tools = self.tools.placed(cut, points, start, t)
+            return SideData(loads, pressures, plates, *holds, tools, tuple(own))
 
     def _load_data(self, forms: SideForms, cut: CutDomains, points: MaterialPoints, t: float) -> PointData:
         """Return the dead loads on the surface."""
@@ -138,6 +148,16 @@ class MechanicalBoundary:
         cell, x = (np.concatenate([getattr(p, name) for p in patches]) for name in ("cell", "x"))
         travel = Exchange(self.grid.comm, self.grid.owner(cell))
         return travel, Places(self.grid, self.grid.local(travel.send(cell)), travel.send(x))
+
+    def _own_data(self, of: FormPoints, faces: Surface, cut: CutDomains, points: MaterialPoints) -> PointData:
+        """Return the points of a term of the user's on a side."""
+        p = cut.surface(faces)
+        area, now = p.area(points), p.now(points)
+        size = np.linalg.norm(area, axis=1, keepdims=True)
+        rows = np.concatenate([size, area / size, now, now - p.origin(points)], axis=1)
+        cell, x, values = gathered(self.grid, [(p.cell, p.x, rows)], 1 + 3 * self.grid.dim)
+        normal, position, displacement = np.split(values[:, 1:], 3, axis=1)
+        return of.at(cell, x, values[:, 0], normal=normal, position=position, displacement=displacement)
 
     def _plate_data(self, forms: SideForms, cut: CutDomains, points: MaterialPoints) -> PointData:
         """Return the plates on the surface."""

@@ -32,11 +32,12 @@ from mpm_dolfinx.forms.cell_matrices import ElementForces, ElementMatrices, Stac
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointForm
 from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts, zero
 from mpm_dolfinx.parallel.exchange import over_all
+from mpm_dolfinx.problems.conditions import OnSide
 from mpm_dolfinx.problems.ghost_penalty import GhostPenalty
 from mpm_dolfinx.problems.mean_dilatation import MeanDilatation
 from mpm_dolfinx.problems.quadrature_data import QuadratureData
 from mpm_dolfinx.problems.rigid_motion import rigid_motion
-from mpm_dolfinx.problems.side_forms import SideData, SideForms
+from mpm_dolfinx.problems.side_forms import OwnTerm, SideData, SideForms
 from mpm_dolfinx.problems.tool_contact import ToolContact
 from mpm_dolfinx.validation import line
 
@@ -95,6 +96,7 @@ class MomentumForms:
         self.terms: list[PointForm] = []
         for number, (law, points, locks) in enumerate(laws):
             self._add_law(number, law, points, locks, pressure, symmetric, by_scene(grid) | {"dt": dt})
+        self.sides = SideForms(grid, self.u)
         kept = [self._add_term(term, pieces, t, dt) for term in terms]
         self.symmetric = symmetric and all(potential or not holds for potential, holds, _ in kept)
         self.holding = any(holds for _, holds, _ in kept)
@@ -113,7 +115,7 @@ class MomentumForms:
             if fluid_density is not None:
                 taken_up = fem.Constant(grid.mesh, fluid_density) * (ufl.det(pieces.increment(self.u)) - 1)
                 self._residuals_of_all.append(PointForm(-taken_up * pull * pieces.dx, pieces))
-        self.sides, self.ghost = SideForms(grid, self.u), GhostPenalty(grid, V, at_points)
+        self.ghost = GhostPenalty(grid, V, at_points)
 
     def _add_law(
         self,
@@ -156,12 +158,17 @@ class MomentumForms:
         v, du = ufl.TestFunction(V), ufl.TrialFunction(V)
         velocity = (self.u - self._past) / self._own
         more = {"t": t, "dt": dt, "velocity": velocity}
-        form, potential = term_of(term, self.u, v, points=pieces, u=self.u, v=v, **more)
-        with compiling(f"terms: {line(term)}", "linear in v, or an energy of u"):
-            self.terms.append(PointForm(form, pieces))
+        function, points = (term.term, self.sides.own_points()) if isinstance(term, OnSide) else (term, pieces)
+        form, potential = term_of(function, self.u, v, points=points, u=self.u, v=v, **more)
         holds = self.u in form.coefficients()
-        if holds:
-            self._own_tangents.append(PointForm(ufl.derivative(form, self.u, du), pieces))
+        with compiling(f"terms: {line(term)}", "linear in v, or an energy of u"):
+            own = PointForm(form, points)
+            slope = PointForm(ufl.derivative(form, self.u, du), points) if holds else None
+        if points is not pieces:
+            self.sides.own.append(OwnTerm(term, points, own, slope))
+        else:
+            self.terms.append(own)
+            self._own_tangents.extend([slope] * holds)
         return potential, holds, self._past in form.coefficients()
 
     def set_rate(self, own: float, past: float) -> None:
@@ -234,6 +241,7 @@ class MomentumForms:
             self.dilatation.assemble_matrix(K, data)
         if sides.pressures is not None:
             self.sides.pressed_slope.assemble_matrix(K, sides.pressures)
+        self.sides.assemble_own(K, sides)
         if sides.tools is not None:
             places, slope = sides.tools.places, sides.tools.at(self.nodal).slope
             of_rows = PointData(self.sides.slopes, places, np.ones(len(slope)), {"slope": slope})
@@ -384,8 +392,10 @@ class MomentumProblem:
         if self._sides.pressures is not None:
             external = external + forms.pressures(self._sides)[system.touched]
         squares = [forces @ forces, external @ external]
-        if forms.terms:
+        if forms.terms or forms.sides.own:
             own = own[system.touched]
+            if forms.sides.own:
+                own = own + forms.sides.own_forces(self._sides)[system.touched]
             squares.append(own @ own)
             forces += own
         squares = over_all(forms.grid.comm, np.array(squares))

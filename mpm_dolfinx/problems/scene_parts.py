@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from mpm_dolfinx.constitutive.skeleton import Fluid, Skeleton
 from mpm_dolfinx.points.bodies import Body, check_bodies
 from mpm_dolfinx.points.grid import Grid
+from mpm_dolfinx.problems.side_forms import functions_of
 from mpm_dolfinx.validation import all_of, chosen, functions, instance, line, numbers
 
 
@@ -24,7 +25,7 @@ def check_physics(
     fluid: Fluid | None, pressure: float | Callable, terms: Sequence[Callable], sources: Sequence[Callable]
 ) -> None:
     """Refuse terms and sources that are no functions, what is no fluid, and pressures and sources without one."""
-    functions("terms", terms)
+    functions("terms", functions_of(terms))
     functions("sources", sources)
     if fluid is not None:
         instance("fluid", fluid, Fluid)

@@ -3,8 +3,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
+
+from petsc4py import PETSc
 
 import numpy as np
 import ufl
@@ -12,7 +16,9 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointForm
+from mpm_dolfinx.forms.unknowns import sum_ghosts
 from mpm_dolfinx.points.grid import Grid
+from mpm_dolfinx.problems.conditions import OnSide
 from mpm_dolfinx.problems.held_cells import HeldCells
 from mpm_dolfinx.problems.tool_contact import ToolContact
 
@@ -23,7 +29,8 @@ class SideData:
 
     loads: with their force; pressures: with their force on the area at the start of the step; plates: with their
     rigidity, normal and present tilt; holds: components of given displacements, with stiffness, direction and gap;
-    held: what holds them; row: which of it each component is; tools: contact with them.
+    held: what holds them; row: which of it each component is; tools: contact with them; own: of each term of the
+    user's own.
     """
 
     loads: PointData | None
@@ -33,6 +40,23 @@ class SideData:
     held: HeldCells | None
     row: NDArray[np.int64]
     tools: ToolContact | None = None
+    own: tuple[PointData, ...] = ()
+
+
+def functions_of(terms):
+    """Return the functions of terms in bodies and on sides; what is no list of them as it is."""
+    if isinstance(terms, str) or not isinstance(terms, Sequence):
+        return terms
+    return [term.term if isinstance(term, OnSide) else term for term in terms]
+
+
+class OwnTerm(NamedTuple):
+    """A term of the user's on a side: as it was given, its points, its form, and the tangent of that if it has one."""
+
+    given: OnSide
+    points: FormPoints
+    form: PointForm
+    slope: PointForm | None
 
 
 class SideForms:
@@ -49,6 +73,26 @@ class SideForms:
     def __init__(self, grid: Grid, u: fem.Function):
         V = u.function_space
         self._grid, self._u, self._v, self._du = grid, u, ufl.TestFunction(V), ufl.TrialFunction(V)
+        self.own: list[OwnTerm] = []
+        """The user's terms on sides."""
+
+    def own_points(self) -> FormPoints:
+        """Return new points for a term of the user's, with what it may ask for."""
+        d = self._grid.dim
+        return FormPoints(self._grid, normal=(d,), position=(d,), displacement=(d,))
+
+    def own_forces(self, sides: SideData) -> NDArray[np.float64]:
+        """Return the nodal forces of the user's terms at u, a local array."""
+        self.forces.x.array[:] = 0.0
+        for term, points in zip(self.own, sides.own, strict=True):
+            term.form.assemble_vector(self.forces.x.array, points)
+        return sum_ghosts(self.forces)
+
+    def assemble_own(self, K: PETSc.Mat, sides: SideData) -> None:
+        """Add the tangent of the user's terms at u to K, which the caller finalises."""
+        for term, points in zip(self.own, sides.own, strict=True):
+            if term.slope is not None:
+                term.slope.assemble_matrix(K, points)
 
     @cached_property
     def loads(self) -> FormPoints:

@@ -80,7 +80,7 @@ def stage(
     wet
         Whether there is a fluid.
     conditions
-        fixed, tractions, displacements, drained, inflows, plates, tools, gravity: see `Simulation`.
+        fixed, tractions, displacements, drained, inflows, plates, tools, gravity: see `Simulation`; terms: on sides.
     present, later
         Which bodies are there, and which may still come.
 
@@ -100,7 +100,7 @@ def stage(
         raise ValueError("bodies: none is there, must be at least one")
     conditions = {**conditions, "fixed": with_axis(grid, conditions["fixed"])}
     free, sides = ~_fixed(grid, conditions["fixed"]), Sides(grid, bodies, present)
-    acting = (conditions[name] for name in ("tractions", "displacements", "plates", "tools"))
+    acting = (conditions[name] for name in ("tractions", "displacements", "plates", "tools", "terms"))
     mechanical = MechanicalBoundary(sides, free, materials, *acting)
     hydraulic = HydraulicBoundary(sides, [*conditions["drained"], *conditions["inflows"]])
     given = [(faces, axes) for _, faces, axes in mechanical.holds]

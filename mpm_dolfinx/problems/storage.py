@@ -332,7 +332,7 @@ class StorageProblem:
         self.damped, self._seeps = somewhere.tolist()
         """Whether jumps of the pressure are damped somewhere."""
         self._flowing = outflow.faces.outflow(self._pressures) >= 0
-        self._aslant = [self._aslant_now(outflow)]
+        self._aslant = self._aslant_now(outflow)
         if self.damped:
             forms.fluxes.dt.value = dt
             zero(system.D)
@@ -348,7 +348,7 @@ class StorageProblem:
         """Return what leaves through the sides of each of so many conditions (count,) at (u, p), m^d/s."""
         faces = self._flow(False).faces
         leaves = np.where(self._flowing | ~faces.seeps, faces.outflow(self._pressures), 0.0)
-        leaves = leaves + self._aslant[-1].faces
+        leaves = leaves + self._aslant.faces
         return over_all(self.forms.grid.comm, sum_by(faces.number, leaves, count))
 
     @property
@@ -373,24 +373,12 @@ class StorageProblem:
         return float(whole / area)
 
     def _aslant_now(self, outflow: Outflow) -> Aslant:
-        """Return what flows beside the two-point fluxes at (u, p)."""
+        """Return what flows beside the two-point fluxes at the start of the substep: no tangent sees it."""
         if outflow.aslant is None:
             return Aslant(0.0, 0.0, 0.0)
         between, faces = outflow.aslant(self.forms.p.x.array)
         leaving = sum_by(outflow.faces.at, faces, len(between))
         return Aslant(between + leaving, faces, float(leaving.sum()))
-
-    def update_aslant(self) -> None:
-        """Take what flows beside the two-point fluxes at (u, p), Newton's first iterate, in place of that at the start.
-
-        What it lacks then is of second order in the step.  No tangent sees it.
-        """
-        outflow = self._flow(False)
-        if len(self._aslant) > 1 or outflow.aslant is None:
-            return
-        now = self._aslant_now(outflow)
-        finite = np.isfinite(now.cells).all() and np.isfinite(now.lost)
-        self._aslant.append(now if over_all(self.forms.grid.comm, int(not finite)) == 0 else self._aslant[0])
 
     def settle_seepage(self) -> bool:
         """Open and close seepage faces as the flow at (u, p) asks for; return whether that has changed anything.
@@ -434,13 +422,13 @@ class StorageProblem:
         flux = system.T * p
         flux.axpy(1.0, system.rate)
         cells, values = flux.array_r.copy(), p.array_r
-        cells += self._aslant[-1].cells
+        cells += self._aslant.cells
         if forms.sources:
             gain = forms.gain(self.data)[system.unknowns.owned]
             cells -= gain
         seeping, slope = outflow.faces.seepage(values, self._flowing)
         cells += seeping
-        lost = (outflow.conductance * values - outflow.inflow + seeping).sum() + self._aslant[-1].lost - gain.sum()
+        lost = (outflow.conductance * values - outflow.inflow + seeping).sum() + self._aslant.lost - gain.sum()
         turnover = (np.abs(outflow.total) + slope) @ np.abs(values)
         return Rates(values.copy(), cells, float(lost), float(turnover), float(np.abs(gain).sum()))
 

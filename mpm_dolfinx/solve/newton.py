@@ -288,7 +288,6 @@ class Newton:
                 dp = self._solvers.solve_storage()
             self._storage.system.unknowns.add(self._storage.forms.p, -1.0, dp)
             report.coupling += 1
-            self._storage.update_aslant()
             if self._storage.settle_seepage():
                 self._linearise()
             errors = self._errors(errors.start)
@@ -377,8 +376,6 @@ class Newton:
         limit, shortest = (explodes, SHORTEST) if dog is None else (dog.limit(before.worst), SHORTEST_DESCENT)
         while step >= shortest:
             self._move(moved - step)
-            if self._storage is not None:
-                self._storage.update_aslant()
             moved, errors = step, self._errors(before.start)
             if errors.worst <= limit:
                 return errors
