@@ -63,8 +63,8 @@ class OnGrid(Keyed):
         pieces = self.data.pieces
         self.weight = weight = pieces["weight"][:, 0] * grid.cell_volume
         """Volumes (m,) of the pieces, m^d."""
-        stiff = weight * quadrature.rows(cut, points, stiffness)
-        momentum.ghost.set_contents(*(sum_by(cut.cells, rows, grid.num_local) for rows in (weight, stiff)))
+        moduli = [weight * quadrature.rows(cut, points, scale) for scale in (stiffness, lambda m: m.shear)]
+        momentum.ghost.set_contents(*(sum_by(cut.cells, rows, grid.num_local) for rows in (weight, *moduli)))
         self.active = momentum.ghost.fill.x.array > 0
         """Which local cells hold something, ghosts included."""
         self.cells = np.flatnonzero(self.active)
@@ -223,7 +223,8 @@ class System:
         symmetric: bool,
     ):
         self._scheme, self._kind = scheme, (symmetric, momentum.dilatation is not None)
-        self.momentum, self.storage = MomentumSystem(momentum, dofs, nodes, on_grid.penalised, stiff), None
+        own = on_grid.cells[on_grid.cells < momentum.grid.num_owned]
+        self.momentum, self.storage = MomentumSystem(momentum, dofs, nodes, own, on_grid.penalised, stiff), None
         if storage is not None:
             unknowns = self.momentum.unknowns
             self.storage = StorageSystem(storage, on_grid.cells, on_grid.facets, unknowns)

@@ -35,7 +35,7 @@ from mpm_dolfinx.problems.storage import Rates, StorageProblem, StorageResidual
 from mpm_dolfinx.result import Report
 from mpm_dolfinx.solve.linear import negative_pivots
 from mpm_dolfinx.solve.schur import LinearSolvers
-from mpm_dolfinx.solve.watchdog import EXPLODES, LARGEST, SHORTEST_DESCENT, Watchdog, shortened
+from mpm_dolfinx.solve.watchdog import EXPLODES, LARGEST, SHORTEST_DESCENT, Watchdog, firmness, shortened
 
 KEEP = 0.05  # the tangent is kept while a Newton step reduces the residual to less than this
 FORCING, FINEST = 1e-3, 1e-9  # relative accuracy of the linear solve, and the best that is asked for
@@ -187,7 +187,7 @@ class Newton:
             if fresh and self._linear and not self.report.newton:
                 self._solvers.tangent(key, lambda: self._linearise_as_reset(as_reset))
             elif fresh:
-                self._linearise()
+                self._linearise(firmness(errors.worst) if dog else 0.0)
             self.report.coupling += self._direction(errors)
             before, errors = errors, self._line_search(errors, dog)
             count, fresh = count + 1, errors.worst > KEEP * min(1.0, before.worst)  # inf where no fluid has moved yet
@@ -307,10 +307,10 @@ class Newton:
         history.append((u, p))
         return Errors(u, p, measure, scale_u or scale, fluid)
 
-    def _linearise(self) -> None:
-        """Set the tangent at the present (u, p), which no other step is to use."""
+    def _linearise(self, firmness: float = 0.0) -> None:
+        """Set the tangent at the present (u, p), which no other step is to use; firmness: see `LinearSolvers`."""
         self._solvers.tangent.clear()
-        self._solvers.linearise(self._momentum, self._storage)
+        self._solvers.linearise(self._momentum, self._storage, firmness=firmness)
 
     def _linearise_as_reset(self, as_reset: Callable[[], QuadratureData]) -> bool:
         """Set the tangent of the pieces and pressures when the grid was reset, whatever steps have been taken since."""
