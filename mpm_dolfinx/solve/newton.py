@@ -139,9 +139,11 @@ def note_pressures(
         error = ERROR * np.abs(solvers.filtered(seconds * (rates[1].cells - rates[0].cells)))
     largest = [np.abs(storage.fill * values).max(initial=0.0) for values in (error, p - start, first, second)]
     largest += [values.max(initial=-np.inf) for values in (-p, p)]
-    error, report.change, first, second, low, high = over_all(storage.forms.grid.comm, np.array(largest), MPI.MAX)
+    error, report.change, report.first, second, low, high = over_all(
+        storage.forms.grid.comm, np.array(largest), MPI.MAX
+    )
     report.error, report.extremes = error, (-low, high)
-    report.sudden = first if len(rates) > 1 and second < SUDDEN * first else 0.0
+    report.sudden = report.first if len(rates) > 1 and second < SUDDEN * report.first else 0.0
 
 
 class Newton:
