@@ -118,7 +118,8 @@ def solve_substep(
         return None
     grid, nodes = momentum.forms.grid, momentum.system.unknowns.global_size
     report.stress = errors.forces / (grid.cell_volume / grid.h.max() * np.sqrt(max(1, nodes)))
-    report.balance = _relative(abs(storage.balance(errors.fluid)), errors.exchanged, errors.fluid.round_off)
+    told = errors.fluid.round_off / solvers.scheme.tolerance
+    report.balance = _relative(abs(storage.balance(errors.fluid)), max(errors.exchanged, told))
     return errors.fluid.rates
 
 
@@ -290,23 +291,27 @@ class Newton:
 
         scale_u: forces at the start of the step, N.  Those of other iterates do not count: after one that has gone far
         astray everything would seem to balance.
+
+        What is round-off counts as 0.  It is noted as it is, relative to no less than what makes it the tolerance.
         """
-        history = self.report.history
+        history, tolerance = self.report.history, self._scheme.tolerance
         with Timer("mpm: residual"):
             r, scale = self._momentum.assemble_residual()
             measure = max(scale_u, scale)
             # a tiny load drowns in the round-off of a stiff part: that is no reason not to solve for it once
             round_off = self._momentum.round_off if history else 0.0
-            norm, norm_p, fluid = r.norm(), 0.0, None
-            u, p = _relative(norm, measure, round_off), 0.0
+            norm, norm_p, fluid, p, noted_p = r.norm(), 0.0, None, 0.0, 0.0
+            u = _relative(norm, measure, round_off)
+            noted_u = _relative(norm, max(measure, self._momentum.round_off / tolerance))
             if self._storage is not None:
                 fluid = self._storage.assemble_residual()
                 norm_p = fluid.vector.norm(PETSc.NormType.N1)
                 p = _relative(norm_p, fluid.exchanged, fluid.round_off)
+                noted_p = _relative(norm_p, max(fluid.exchanged, fluid.round_off / tolerance))
         if not history and np.isnan(norm + norm_p):
             where = "storage: a source" if norm == norm else "momentum: a law or term"
             raise NotConverged(f"nan in the residual of the {where} gives it, must be finite")
-        history.append((u, p))
+        history.append((noted_u, noted_p))
         return Errors(u, p, measure, scale_u or scale, fluid)
 
     def _linearise(self, firmness: float = 0.0) -> None:
@@ -366,7 +371,7 @@ class Newton:
             self._storage.system.unknowns.add(self._storage.forms.p, scale, self._solvers.dp)
 
 
-def _relative(norm: float, scale: float, round_off: float) -> float:
+def _relative(norm: float, scale: float, round_off: float = 0.0) -> float:
     """Return norm / scale; 0 where the norm is round-off, never nan, which no comparison would notice."""
     if norm <= round_off:
         return 0.0
