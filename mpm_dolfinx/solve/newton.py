@@ -113,7 +113,7 @@ def solve_substep(
     report.newton, report.coupling = report.newton + took.newton, report.coupling + took.coupling
     report.history += took.history
     count, most = (took.coupling, "coupling") if in_turn else (took.newton, "newton")
-    report.easy = report.easy and 2 * count <= getattr(solvers.scheme, f"most_{most}")
+    report.easy = report.easy and 3 * count <= 2 * getattr(solvers.scheme, f"most_{most}")
     if storage is None:
         return None
     grid, nodes = momentum.forms.grid, momentum.system.unknowns.global_size
