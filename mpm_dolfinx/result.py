@@ -16,8 +16,8 @@ class Report:
 
     rederived: domains that had folded and were re-derived from F; easy: whether the next step may be longer; error,
     change, extremes: estimated error, and largest change, of the cells' pressures in the step, and the least and the
-    largest of them, Pa; sealed: largest change had no fluid flowed, Pa; sudden: change in the first substep, where it
-    is so fast that the step may overshoot, Pa; stress: what forces of the nodes stand for, Pa.
+    largest of them, Pa; sealed: largest change had no fluid flowed, Pa; first: change in the first substep, Pa; sudden:
+    the same where it is so fast that the step may overshoot, Pa; stress: what forces of the nodes stand for, Pa.
     """
 
     newton: int = 0
@@ -30,6 +30,7 @@ class Report:
     change: float = 0.0
     extremes: tuple[float, float] | None = None
     sealed: float = 0.0
+    first: float = 0.0
     sudden: float = 0.0
     stress: float = 0.0
 
@@ -62,7 +63,8 @@ class Result:
     (domains that had folded), wall (s), and profile: seconds of each part of the run on this process, from dolfinx's
     timers.  points: material points; memory: peak of all processes, libraries included, MB; imbalance: the most that
     one of several processes has over their mean, at the end of the run.
-    dt: output interval, s, 0 without one; small: the step to try next, s; converged: the end has been reached.
+    dt: output interval, s, 0 without one; small: the step to try next, s; converged: the end has been reached; first:
+    see `Report`, of the last step over its length where the grid is reset, Pa/s.
     """
 
     rows: list[Row] = field(default_factory=list, repr=False)
@@ -73,6 +75,7 @@ class Result:
     cuts: int = 0
     rejected: int = 0
     change: float = 0.0
+    first: float = 0.0
     rederived: int = 0
     balance: float = 0.0
     residual: float = 0.0
@@ -124,8 +127,8 @@ class Result:
         """Return one quantity of the rows, where it is recorded."""
         return [value for row in self.rows if (value := getattr(row, name)) is not None]
 
-    def after(self, report: Report, small: float) -> Result:
-        """Return the histories after one more step; small: the step to try next, s."""
+    def after(self, report: Report, small: float, first: float) -> Result:
+        """Return the histories after one more step; small: the step to try next, s; first: see `Result`."""
         return replace(
             self,
             steps=self.steps + 1,
@@ -135,6 +138,7 @@ class Result:
             balance=max(self.balance, report.balance),
             residual=max(self.residual, *report.history[-1]),
             small=small,
+            first=first,
         )
 
     def shares(self) -> str:

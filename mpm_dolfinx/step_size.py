@@ -31,6 +31,8 @@ RINGS = 5e-3
 
 The stability function is never below -0.21: what goes unseen overshoots by a thousandth.
 """
+AGAIN = 2.0
+"""Sudden changes, in proportion to those in the step before and its length, that need not be those of jumps."""
 SMALLEST = 1e-6
 """Pressures that count, in proportion to the stress: where water flows freely the rest is rounding."""
 MOST = 1e9
@@ -91,14 +93,14 @@ class StepSize:
         stability function is squared.
         """
         if not self.by_error:
-            return 0.5 if taken > 0.75 * self.longest and self._rings(report, result) else 1.0
+            return 0.5 if taken > 0.75 * self.longest and self._rings(taken, report, result) else 1.0
         # steps are refused where loads jump or bend, mostly: there the error is of first order
         return 1.0 if report.error <= self._allowed(report, result) else self._factor(report, result, 1.0)
 
     def next(self, taken: float, report: Report, result: Result, failed: bool) -> float:
         """Return the step to try after one that was taken, s; failed: after a longer one had not converged."""
         if not self.by_error:
-            grows = report.easy and not self._rings(report, result)  # twice as long it would be refused
+            grows = report.easy and not self._rings(taken, report, result)  # twice as long it would be refused
             return max(result.small, min(2 * taken, self.longest)) if grows else result.small
         factor = self._factor(report, result, 0.5)
         if factor >= 1:
@@ -107,9 +109,13 @@ class StepSize:
             return min(max(taken * factor, result.small), self.longest)  # it may have been short for an output's sake
         return taken * factor
 
-    def _rings(self, report: Report, result: Result) -> bool:
-        """Return whether a step may have overshot."""
-        return report.sudden > RINGS * result.change
+    def _rings(self, taken: float, report: Report, result: Result) -> bool:
+        """Return whether a step may have overshot.
+
+        What is as sudden in step after step is no jump of the loads, of which a step leaves a fifth at most: where the
+        grid is reset in every step, pressures beside an edge that is pushed into a body change in the first substep.
+        """
+        return report.sudden - AGAIN * result.first * taken > RINGS * result.change
 
     def _factor(self, report: Report, result: Result, power: float) -> float:
         """Return the step whose error would be as large as it may be, in proportion to one that was solved."""

@@ -184,7 +184,8 @@ def _histories(
     """Return new histories that begin with the present state, or those to go on with."""
     now, latest = simulation.state.t, simulation.state.result
     if after is None:
-        return Result(dt=times.interval, small=rule.first, rows=[_row(simulation, probes)])
+        first = 0.0 if latest is None else latest.first
+        return Result(dt=times.interval, small=rule.first, first=first, rows=[_row(simulation, probes)])
     if latest is not None and after.rows is latest.rows:  # of the same run, which may have gone on since
         after = latest
     last = after.rows[-1][0]
@@ -245,7 +246,8 @@ def _advance(simulation: Simulated, rule: StepSize, target: float) -> None:
             _note(simulation, replace(known, rejected=known.rejected + 1, small=small))
             continue
         grown = rule.next(taken, report, result, failed=taken < 0.99 * wanted)
-        simulation.state = replace(new, result=result.after(report, grown))
+        first = report.first / taken if new.stay is None else 0.0
+        simulation.state = replace(new, result=result.after(report, grown, first))
         if not rule.by_error and grown > 1.01 * result.small:  # not by rounding only
             log(comm, "t = %g s: step grows to %.3g s", new.t, grown)
         return

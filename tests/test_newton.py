@@ -68,6 +68,16 @@ def test_what_round_off_in_a_stiff_part_does_not_hide_is_solved_for(stiffer, loa
     assert a - 1 == pytest.approx(np.full(len(a), stretch(load) - 1), rel=error)
 
 
+@pytest.mark.parametrize("load", [1e-9, 1e-3])
+def test_residuals_and_balance_are_told_as_they_are_also_where_they_are_round_off(load):
+    grid = mpm.Grid([0.1, 1.0], [1, 10])
+    pull = [mpm.Traction("top", (0, load * SOIL.oedometric))]
+    options = {"fixed": SIDES | {"bottom": "y"}, "tractions": pull, "drained": [mpm.Drained("top")]}
+    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [0.1, 0.85])], [SOIL], **options, fluid=mpm.Fluid())
+    report = s.step(1.0)
+    assert all(0 < residual <= 1e-8 for residual in report.history[-1]) and 0 < report.balance <= 1e-8
+
+
 def test_what_the_rounding_of_places_far_from_the_origin_does_not_hide_is_solved_for():
     """A bar that a given displacement holds, a thousand cells from the origin."""
     grid = mpm.Grid([100.1, 1.2], [1, 12], lower=[100.0, 0.0])

@@ -59,17 +59,44 @@ def test_a_linear_solver_that_breaks_off_fails_the_step():
         solved(ksp, "storage")
 
 
-def pushed(bulk: float) -> list[mpm.result.Report]:
-    """Return what two steps take of a saturated cube, of which a given displacement pushes a quarter of the top."""
-    n = 8
-    grid = mpm.Grid([1.0, 1.0, 1.25], [n, n, n + 2])
+def quarter_pushed(soil: mpm.Skeleton, n: int, step: float) -> mpm.Simulation:
+    """Return a saturated cube, of which a given displacement, `step` (m) a second, pushes a quarter of the top."""
+    air = n // 4
+    grid = mpm.Grid([1.0, 1.0, 1 + air / n], [n, n, n + air])
     walls = dict.fromkeys(("left", "right"), "x") | dict.fromkeys(("front", "back"), "y") | {"bottom": "xyz"}
     quarter, beside = ((-np.inf,) * 3, (0.45, 0.45, np.inf)), ((0.5, 0, 0), (np.inf,) * 3)
-    push = mpm.Displacement("top", lambda t, X: (0, 0, -0.01 * t), region=quarter)
-    soil = mpm.Hencky(bulk=bulk, shear=1e6, conductivity=1e-7)
+    push = mpm.Displacement("top", lambda t, X: (0, 0, -step * t), region=quarter)
     drained, body = mpm.Drained("top", region=beside), mpm.box(grid, [0, 0, 0], [1, 1, 1])
-    s = mpm.Simulation(grid, [body], [soil], fixed=walls, displacements=[push], drained=[drained], fluid=mpm.Fluid())
+    return mpm.Simulation(grid, [body], [soil], fixed=walls, displacements=[push], drained=[drained], fluid=mpm.Fluid())
+
+
+def pushed(bulk: float) -> list[mpm.result.Report]:
+    """Return what two steps of such a cube take."""
+    s = quarter_pushed(mpm.Hencky(bulk=bulk, shear=1e6, conductivity=1e-7), 8, 0.01)
     return [s.step(1.0), s.step(1.0)]
+
+
+FRICTIONAL = mpm.DruckerPrager(bulk=2e6, shear=1e6, friction=20.0, dilation=0.0, cohesion=1e4, conductivity=1e-7)
+BLOCKS = {  # soil, cells, step, m, steps, most iterations
+    "nu = 0.499": (mpm.Hencky(bulk=500e6, shear=1e6, conductivity=1e-7), 14, 0.01, 2, 30),
+    "beyond the limit load": (FRICTIONAL, 12, 0.005, 10, 60),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("block", BLOCKS)
+def test_no_linear_solve_of_a_wet_block_takes_many_iterations(block, monkeypatch):
+    """Printed with -s: `tests/run.sh -m slow -s tests/test_solvers.py`."""
+    counts, solve = [], monolithic.BlockSolver.solve
+    monkeypatch.setattr(monolithic.BlockSolver, "solve", lambda *a: counts.append(solve(*a)) or counts[-1])
+    soil, n, step, steps, most = BLOCKS[block]
+    s, forces = quarter_pushed(soil, n, step), []
+    result = s.run(steps, 1, observe=lambda s: forces.append(-s.reactions[0, 2]), progress=False)
+    took = f"{result.steps} steps, {result.cuts} cuts, {result.newton} Newton steps, {result.wall:.0f} s"
+    print(f"{block}, {n}^3: {took}, iterations {np.mean(counts):.1f}, at most {max(counts)}; load {forces} N")
+    assert max(counts) <= most and result.cuts == 0
+    if soil.state:
+        assert forces[-1] < 1.1 * forces[len(forces) // 2], "the load hardly rises any more"
 
 
 def test_the_first_solve_of_a_step_leaves_little_of_both_residuals_whatever_given_displacements_pull():

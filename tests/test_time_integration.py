@@ -9,6 +9,8 @@ import ufl
 from helpers import SOFT, beam, column, rates
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx.result import Report, Result
+from mpm_dolfinx.step_size import StepSize
 from mpm_dolfinx.verification.exact import terzaghi_consolidation
 
 DRAINED = {"drained": [mpm.Drained("top")]}
@@ -259,3 +261,12 @@ class Stop:
     def __call__(self, simulation):
         if len(simulation.result.rows) - 1 > self.count:
             raise KeyboardInterrupt
+
+
+def test_what_is_as_sudden_in_every_step_is_no_jump_of_the_loads():
+    rule, found = StepSize(1.0, 1.0), Result(change=100.0)
+    report = Report(first=10.0, sudden=10.0)
+    assert rule.refused(1.0, report, found) == 0.5 and rule.next(0.5, report, replace(found, small=0.5), False) == 0.5
+    again = replace(found, first=10.0, small=0.5)  # Pa/s, in the step before
+    assert rule.refused(1.0, report, again) == 1.0 and rule.next(0.5, replace(report, sudden=5.0), again, False) == 1.0
+    assert rule.refused(1.0, replace(report, sudden=21.0), again) == 0.5

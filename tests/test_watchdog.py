@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx.solve import watchdog
 from mpm_dolfinx.solve.watchdog import PATIENCE, Watchdog, shortened
 
 
@@ -79,3 +80,45 @@ def test_bodies_that_do_not_yield_remember_no_velocities():
     s = mpm.Simulation(grid, [body], [mpm.Hencky(bulk=1e6, shear=1e6)], fixed={"bottom": "xy"}, tractions=[load])
     s.step(1.0)
     assert s.state.velocity is None
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_firmness_resists_shear_as_elastic_soil_does_and_neither_turns_nor_shifts(dim):
+    """The entries of inner nodes of full cells are exact."""
+    s = pushed(dim)
+    s.step(1.0)
+    m = s.scene.last[1].momentum
+    at, axis = m.unknowns.nodes
+    x = s.scene.grid.node_x[at]
+    inner = (np.abs(x[:, :-1] - 0.5) < 0.3).all(axis=1) & (x[:, -1] > 0.2) & (x[:, -1] < 0.6)
+    h = s.scene.grid.h
+    slopes = np.prod(2 * h / 3) * 3 / h**2  # squared, of a node's shape function, integrated
+    exact = 1e6 * (slopes + slopes.sum())[axis[inner]]
+    assert inner.sum() > 8 and m.firm.getDiagonal().array_r[inner] == pytest.approx(exact)
+    crossed = x[:, [1, 0, *range(2, dim)]] * [1, 1, *[0] * (dim - 2)]
+    for field in (crossed * ([-1, 1, 0][:dim]), crossed, np.ones_like(x)):  # uniform stress: no force inside
+        forces = m.firm * m.unknowns.gather_owned(field[np.arange(len(at)), axis])
+        assert np.abs(forces.array_r[inner]).max() < 1e-9 * 1e6
+
+
+@pytest.mark.parametrize("firm", [watchdog.FIRM, 0.0])
+def test_firmer_tangents_take_steps_that_fail_without(monkeypatch, firm):
+    monkeypatch.setattr(watchdog, "FIRM", firm)
+    s = pushed()
+    if firm:
+        assert max(s.step(1.0).newton for _ in range(3)) < 25
+    else:
+        with pytest.raises(mpm.NotConverged):
+            [s.step(1.0) for _ in range(3)]
+
+
+def test_a_firmer_tangent_leads_to_the_same_equilibrium(monkeypatch):
+    found = []
+    for firm in (1.0, 0.0):
+        monkeypatch.setattr(watchdog, "FIRM", firm)
+        s = pushed()
+        for _ in range(3):
+            s.step(0.25)
+        found.append(s.points)
+    assert found[0].x == pytest.approx(found[1].x, abs=1e-9)
+    assert found[0].pressure == pytest.approx(found[1].pressure, abs=1e-5 * np.abs(found[1].pressure).max())

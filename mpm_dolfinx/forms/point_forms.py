@@ -360,12 +360,12 @@ class PointForm:
 
 
 class FacetForm:
-    """A form over faces between active cells, compiled when first a process has such a face.
+    """A form over faces between active cells, or over these, compiled when first a process has such an entity.
 
     Parameters
     ----------
     form
-        Linear or bilinear UFL form over interior facets.
+        Linear or bilinear UFL form over interior facets or cells.
     comm
         The processes.
     """

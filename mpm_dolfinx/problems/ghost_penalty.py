@@ -64,13 +64,17 @@ class GhostPenalty:
     ----------
     modulus
         Scale of the penalty by what the cells hold, Pa, see `stiffness`.
+    shear
+        Mean shear modulus of what the cells hold, Pa.
+    firmness
+        Form of the elastic shear stiffness over whole cells, times their filled share: what makes tangents firmer.
     fill, beside
         Filled share of each cell, and of the fullest of its neighbours.
     """
 
     def __init__(self, grid: Grid, V: fem.FunctionSpace, at_points: bool):
         self.grid, self._at_points, cellwise = grid, at_points, grid.cellwise()
-        self.modulus, self.fill, self.beside = (fem.Function(cellwise) for _ in range(3))
+        self.modulus, self.shear, self.fill, self.beside = (fem.Function(cellwise) for _ in range(4))
         v, du, n = ufl.TestFunction(V), ufl.TrialFunction(V), ufl.FacetNormal(grid.mesh)("+")
         h = fem.Constant(grid.mesh, grid.h)
         across = sum(abs(n[a]) * h[a] for a in range(grid.dim))
@@ -84,6 +88,9 @@ class GhostPenalty:
             scale *= TURN * ufl.SpatialCoordinate(grid.mesh)("+")[0]
         form = GHOST / 3 * scale * across * ufl.inner(kink(du), kink(v)) * dS
         self.form = FacetForm(form, grid.comm)
+        dx = ufl.Measure("dx", domain=grid.mesh, subdomain_id=_compat.SUBDOMAIN, metadata={"quadrature_degree": 2})
+        strains = [ufl.sym(ufl.grad(w)) for w in (du, v)]
+        self.firmness = FacetForm(2 * self.fill * self.shear * ufl.inner(*strains) * dx, grid.comm)
 
     def _scale(self):
         """Return the strength of a face times its modulus, the harmonic mean of both cells', Pa, as UFL."""
@@ -95,11 +102,12 @@ class GhostPenalty:
             strength = SPARSE
         return strength * 2 * moduli[0] * moduli[1] / (moduli[0] + moduli[1])
 
-    def set_contents(self, volume: NDArray[np.float64], stiffness: NDArray[np.float64]) -> None:
-        """Set volumes (cells,), m^d, of what the owned cells hold, and their moduli, Pa, times volume."""
+    def set_contents(self, volume: NDArray[np.float64], *moduli: NDArray[np.float64]) -> None:
+        """Set volumes (cells,), m^d, of what the owned cells hold, and `modulus` and `shear`, Pa, times volume."""
         grid, fill = self.grid, self.fill.x.array
         fill[:] = volume / grid.cell_volume
-        self.modulus.x.array[:] = np.divide(stiffness, volume, out=np.zeros_like(stiffness), where=volume > 0)
+        for f, total in zip((self.modulus, self.shear), moduli, strict=True):
+            f.x.array[:] = np.divide(total, volume, out=np.zeros_like(total), where=volume > 0)
         for f in (self.fill, self.modulus):
             f.x.scatter_forward()
         own = np.arange(grid.num_owned)

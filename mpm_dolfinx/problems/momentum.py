@@ -272,6 +272,8 @@ class MomentumSystem:
         Unrolled local degrees of freedom, ghosts included, that are unknowns.
     nodes
         Active local nodes, ghosts included.
+    cells
+        Active cells of this process.
     facets
         Faces of this process that carry the ghost penalty.
     stiff
@@ -283,6 +285,7 @@ class MomentumSystem:
         forms: MomentumForms,
         dofs: NDArray[np.int64],
         nodes: NDArray[np.int64],
+        cells: NDArray[np.int32],
         facets: NDArray[np.int32],
         stiff: bool,
     ):
@@ -295,6 +298,9 @@ class MomentumSystem:
         self.penalty = self._penalty_matrix(facets, stiff)
         self.residual, self.step = self.unknowns.vector(), self.unknowns.vector()
         self._ghost = forms.ghost.form.on(facets)
+        self.firm, self._firmness = None, None  # where nothing yields
+        if not forms.elastic:
+            self.firm, self._firmness = matrix(self.unknowns, self.unknowns, 3**d * d), forms.ghost.firmness.on(cells)
 
     def _penalty_matrix(self, facets: NDArray[np.int32], stiff: bool) -> PETSc.Mat:
         """Return an empty matrix for the penalties: the ghost penalty couples like components, of two cells."""
@@ -309,7 +315,7 @@ class MomentumSystem:
         return A
 
     def set_penalty(self, sides: SideData) -> None:
-        """Assemble what is linear in the step's increment: ghost penalty, plates and given displacements."""
+        """Assemble what is linear in the step's increment, ghost penalty, plates, given displacements, and firmness."""
         zero(self.penalty)
         self._ghost.assemble_matrix(self.penalty)
         if sides.plates is not None:
@@ -317,6 +323,10 @@ class MomentumSystem:
         if sides.holds is not None:
             self._forms.sides.hold.assemble_matrix(self.penalty, sides.holds)
         self.penalty.assemble()
+        if self.firm is not None:
+            zero(self.firm)
+            self._firmness.assemble_matrix(self.firm)
+            self.firm.assemble()
 
 
 class MomentumProblem:
@@ -409,8 +419,8 @@ class MomentumProblem:
         system.penalty.multAdd(step, r, r)
         return r, float(np.sqrt(max(squares)))
 
-    def assemble_tangent(self, data: QuadratureData | None = None) -> PETSc.Mat:
-        """Return the tangent at u, of these pieces or of others."""
+    def assemble_tangent(self, data: QuadratureData | None = None, firmness: float = 0.0) -> PETSc.Mat:
+        """Return the tangent at u, of these pieces or of others, with a share of the elastic shear stiffness."""
         K = self.system.K
         # the first sum gives K the pattern of both
         first = not K.assembled
@@ -419,4 +429,6 @@ class MomentumProblem:
         K.assemble()
         pattern = PETSc.Mat.Structure
         K.axpy(1.0, self.system.penalty, pattern.UNKNOWN if first else pattern.SUBSET_NONZERO_PATTERN)
+        if firmness > 0:
+            K.axpy(firmness, self.system.firm, pattern.SUBSET_NONZERO_PATTERN)
         return K

@@ -65,8 +65,8 @@ class OnGrid(Keyed):
         self.weight = weight = pieces["weight"][:, 0] * grid.cell_volume
         """Volumes (m,) of the pieces, m^d."""
         area, x = cut.plane(weight)
-        stiff = area * quadrature.rows(cut, points, stiffness)
-        momentum.ghost.set_contents(*(sum_by(cut.cells, rows, grid.num_local) for rows in (area, stiff)))
+        moduli = [area * quadrature.rows(cut, points, scale) for scale in (stiffness, lambda m: m.shear)]
+        momentum.ghost.set_contents(*(sum_by(cut.cells, rows, grid.num_local) for rows in (area, *moduli)))
         self.active = momentum.ghost.fill.x.array > 0
         """Which local cells hold something, ghosts included."""
         self.cells = np.flatnonzero(self.active)
@@ -228,7 +228,8 @@ class System:
     ):
         self._scheme, self.kind = scheme, (symmetric, momentum.dilatation is not None)
         """Whether the momentum's tangent is symmetric, and whether skeletons yield or hardly change their volume."""
-        self.momentum, self.storage = MomentumSystem(momentum, dofs, nodes, on_grid.penalised, stiff), None
+        own = on_grid.cells[on_grid.cells < momentum.grid.num_owned]
+        self.momentum, self.storage = MomentumSystem(momentum, dofs, nodes, own, on_grid.penalised, stiff), None
         if storage is not None:
             unknowns = self.momentum.unknowns
             self.storage = StorageSystem(storage, on_grid.cells, on_grid.facets, unknowns)

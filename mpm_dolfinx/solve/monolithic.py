@@ -15,6 +15,7 @@ diagonal blocks 17 to 23, leaving five times the residual.
 At nu = 0.499 the cycle is poor: 53 to 146 iterations with 14^3 cells.  A solve that takes `MANY` goes on with factors
 of K in place of the cycle, which serve until they take as many: for the other tangents of the step 4 to 6 iterations,
 and all its linear solves take 8 s, not 18.  MUMPS factorises 3190 unknowns in 0.2 s, 8610 in 1.4 s (PETSc in 3.4 s).
+No solve takes more than 30 then.
 To give the storage what of K resists changes of volume, p -> p + k B u, leaves K as at nu = 0.3, but pressures that
 alternate almost free: 500 iterations.
 """
@@ -33,7 +34,7 @@ from mpm_dolfinx.problems.momentum import MomentumSystem
 from mpm_dolfinx.problems.storage import StorageSystem
 from mpm_dolfinx.solve.linear import direct_solver, multigrid_solver, solved
 
-MANY, MOST = 40, 500
+MANY, MOST = 29, 500
 """Iterations after which factors take the place of the multigrid cycle on K, and most of all."""
 FACTORISED = 20000
 """Unknown displacements up to which K is factorised where the multigrid takes many iterations.

@@ -35,7 +35,7 @@ from mpm_dolfinx.problems.storage import Rates, StorageProblem, StorageResidual
 from mpm_dolfinx.result import Report
 from mpm_dolfinx.solve.linear import negative_pivots
 from mpm_dolfinx.solve.schur import LinearSolvers
-from mpm_dolfinx.solve.watchdog import EXPLODES, LARGEST, SHORTEST_DESCENT, Watchdog, shortened
+from mpm_dolfinx.solve.watchdog import EXPLODES, LARGEST, SHORTEST_DESCENT, Watchdog, firmness, shortened
 
 KEEP = 0.05  # the tangent is kept while a Newton step reduces the residual to less than this
 FORCING, FINEST = 1e-3, 1e-9  # relative accuracy of the linear solve, and the best that is asked for
@@ -114,13 +114,14 @@ def solve_substep(
     report.newton, report.coupling = report.newton + took.newton, report.coupling + took.coupling
     report.history += took.history
     count, most = (took.coupling, "coupling") if in_turn else (took.newton, "newton")
-    report.easy = report.easy and 2 * count <= getattr(solvers.scheme, f"most_{most}")
+    report.easy = report.easy and 3 * count <= 2 * getattr(solvers.scheme, f"most_{most}")
     if storage is None:
         return None
     grid, nodes = momentum.forms.grid, momentum.system.unknowns.global_size
     area = grid.cell_volume / grid.h.max() * (storage.ring if grid.axisymmetric else 1.0)
     report.stress = errors.forces / (area * np.sqrt(max(1, nodes)))
-    report.balance = _relative(abs(storage.balance(errors.fluid)), errors.exchanged, errors.fluid.round_off)
+    told = errors.fluid.round_off / solvers.scheme.tolerance
+    report.balance = _relative(abs(storage.balance(errors.fluid)), max(errors.exchanged, told))
     return errors.fluid.rates
 
 
@@ -156,9 +157,9 @@ def note_pressures(
     largest = [np.abs(storage.fill * values).max(initial=0.0) for values in (error, p - start, first, second, sealed)]
     largest += [values.max(initial=-np.inf) for values in (-p, p)]
     largest = over_all(storage.forms.grid.comm, np.array(largest), MPI.MAX).tolist()
-    report.error, report.change, first, second, report.sealed, low, high = largest
+    report.error, report.change, report.first, second, report.sealed, low, high = largest
     report.extremes = (-low, high)
-    report.sudden = first if len(rates) > 1 and second < SUDDEN * first else 0.0
+    report.sudden = report.first if len(rates) > 1 and second < SUDDEN * report.first else 0.0
 
 
 class Newton:
@@ -204,7 +205,7 @@ class Newton:
             if fresh and self._linear and not self.report.newton:
                 self._solvers.tangent(key, lambda: self._linearise_as_reset(as_reset))
             elif fresh:
-                self._linearise()
+                self._linearise(firmness(errors.worst) if dog else 0.0)
             self.report.coupling += self._direction(errors)
             before, errors = errors, self._line_search(errors, dog)
             count, fresh = count + 1, errors.worst > KEEP * min(1.0, before.worst)  # inf where no fluid has moved yet
@@ -316,29 +317,33 @@ class Newton:
 
         scale_u: forces at the start of the step, N.  Those of other iterates do not count: after one that has gone far
         astray everything would seem to balance.
+
+        What is round-off counts as 0.  It is noted as it is, relative to no less than what makes it the tolerance.
         """
-        history = self.report.history
+        history, tolerance = self.report.history, self._scheme.tolerance
         with Timer("mpm: residual"):
             r, scale = self._momentum.assemble_residual()
             measure = max(scale_u, scale)
             # a tiny load drowns in the round-off of a stiff part: that is no reason not to solve for it once
             round_off = self._momentum.round_off if history else 0.0
-            norm, norm_p, fluid = r.norm(), 0.0, None
-            u, p = _relative(norm, measure, round_off), 0.0
+            norm, norm_p, fluid, p, noted_p = r.norm(), 0.0, None, 0.0, 0.0
+            u = _relative(norm, measure, round_off)
+            noted_u = _relative(norm, max(measure, self._momentum.round_off / tolerance))
             if self._storage is not None:
                 fluid = self._storage.assemble_residual()
                 norm_p = fluid.vector.norm(PETSc.NormType.N1)
                 p = _relative(norm_p, fluid.exchanged, fluid.round_off)
+                noted_p = _relative(norm_p, max(fluid.exchanged, fluid.round_off / tolerance))
         if not history and np.isnan(norm + norm_p):
             where = "storage: a source" if norm == norm else "momentum: a law or term"
             raise NotConverged(f"nan in the residual of the {where} gives it, must be finite")
-        history.append((u, p))
+        history.append((noted_u, noted_p))
         return Errors(u, p, measure, scale_u or scale, fluid)
 
-    def _linearise(self) -> None:
-        """Set the tangent at the present (u, p), which no other step is to use."""
+    def _linearise(self, firmness: float = 0.0) -> None:
+        """Set the tangent at the present (u, p), which no other step is to use; firmness: see `LinearSolvers`."""
         self._solvers.tangent.clear()
-        self._solvers.linearise(self._momentum, self._storage)
+        self._solvers.linearise(self._momentum, self._storage, firmness=firmness)
 
     def _linearise_as_reset(self, as_reset: Callable[[], QuadratureData]) -> bool:
         """Set the tangent of the pieces and pressures when the grid was reset, whatever steps have been taken since."""
@@ -392,7 +397,7 @@ class Newton:
             self._storage.system.unknowns.add(self._storage.forms.p, scale, self._solvers.dp)
 
 
-def _relative(norm: float, scale: float, round_off: float) -> float:
+def _relative(norm: float, scale: float, round_off: float = 0.0) -> float:
     """Return norm / scale; 0 where the norm is round-off, never nan, which no comparison would notice."""
     if norm <= round_off:
         return 0.0

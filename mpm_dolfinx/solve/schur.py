@@ -104,10 +104,15 @@ class LinearSolvers:
         """The Schur complement, and the solver with its preconditioner."""
         return self._schur, self._solve_s
 
-    def linearise(self, momentum: MomentumProblem, storage: StorageProblem | None, data=None) -> bool:
-        """Set the tangents at (u, p), of the problems' pieces or of others, and factorise them."""
+    def linearise(
+        self, momentum: MomentumProblem, storage: StorageProblem | None, data=None, firmness: float = 0.0
+    ) -> bool:
+        """Set the tangents at (u, p), of the problems' pieces or of others, and factorise them.
+
+        firmness: share of the elastic shear stiffness that is added.
+        """
         with Timer("mpm: tangent"):
-            K = momentum.assemble_tangent(data)
+            K = momentum.assemble_tangent(data, firmness)
             if storage is not None:
                 storage.assemble_tangent(data and data.pieces)
         with Timer("mpm: factorisation"):
