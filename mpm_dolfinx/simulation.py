@@ -18,7 +18,7 @@ from mpm_dolfinx.point_fields import PointFields, point_fields
 from mpm_dolfinx.points.bodies import Body, check_bodies
 from mpm_dolfinx.points.grid import Grid
 from mpm_dolfinx.points.material_points import MaterialPoints
-from mpm_dolfinx.problems.axis import warn_narrow_hole
+from mpm_dolfinx.problems.axis import warn_narrow_hole, with_axis
 from mpm_dolfinx.problems.conditions import Displacement, Drained, Inflow, Pressure, RigidPlate, Traction
 from mpm_dolfinx.problems.thin import warn_thin
 from mpm_dolfinx.result import Report, Result
@@ -50,12 +50,12 @@ class Simulation:
     tractions, displacements, drained, inflows, plates
         Boundary conditions on sides of the bodies; other sides are free and sealed.
     gravity : (d,) or callable t -> (d,), m/s^2
-        Acceleration of gravity.
+        Acceleration of gravity; in axisymmetry along the axis.
     pressure
         Pore pressure at the start, Pa, the same everywhere; needs a fluid.  A hydrostatic one comes from a first
         stage with gravity that is long enough to drain.
     quadrature
-        "domain": exact pieces of the points' domains; "point": at the points, as in standard MPM.
+        "domain": exact pieces of the points' domains; "point": at the points, as in standard MPM, not in axisymmetry.
     coupling, tolerance
         See `Scheme`.
     method
@@ -121,7 +121,7 @@ class Simulation:
         functions("terms", terms)
         functions("sources", sources)
         grid.share(np.concatenate([body.centre for body in bodies]))
-        warn_thin(grid, bodies, fixed)
+        warn_thin(grid, bodies, with_axis(grid, fixed))
         warn_narrow_hole(grid, bodies)
         began, weighs = time.perf_counter(), gravity is not None
         options = (quadrature, scheme, method, weighs, pressure, terms, sources)
@@ -171,7 +171,8 @@ class Simulation:
     def reactions(self) -> NDArray[np.float64]:
         """(displacements, d): force by which each given displacement acts on the bodies, N (N/m in plane strain).
 
-        Of the last step; nan where none has been taken since a stage set them.
+        In axisymmetry all around, the radial one the sum of what acts outward.  Of the last step; nan where none has
+        been taken since a stage set them.
         """
         return self.state.reactions
 
@@ -191,6 +192,7 @@ class Simulation:
     def effective_stress(self) -> NDArray[np.float64]:
         """Return the effective Cauchy stress (n, d, d), Pa, tension positive, at the material points.
 
+        In axisymmetry (n, 3, 3), the axes those of radius, axis and hoops.
         On several processes all call it together.
         """
         return self.scene.materials.effective_stress(self.points)

@@ -171,8 +171,8 @@ def test_cryers_sphere_peaks_within_half_a_percent():
 @pytest.mark.slow
 def test_a_rough_circular_footing_carries_what_limit_analysis_says():
     """On Tresca's soil 6.05 c (Cox, Eason and Hopkins 1961)."""
-    coarse, fine = (footing.limit_load("circular", cells).load for cells in (9, 17))
-    assert -0.03 < fine[-1] - 1 < 0 and coarse[-1] < fine[-1]
+    coarse, fine = (footing.limit_load("circular", cells).load for cells in (9, 25))
+    assert -0.02 < fine[-1] - 1 < 0 and coarse[-1] < fine[-1]
     assert fine[-1] / fine[30] < 1.002  # it flows
 
 
@@ -184,19 +184,22 @@ def test_a_rough_circular_footing_carries_what_limit_analysis_says():
     ],
 )
 def test_laws_with_a_state_see_the_hoops(material, confinement):
-    """A triaxial test of a cylinder is that of a point; its strain is given at the top, to 1e-6."""
-    s = pressed(1e5, 1e5, 0.0, (0.038, 0.1), material, grid=plane((0.05, 0.12), (3, 8)))
+    """A triaxial test of a cylinder is that of a point, but for what its top gives way within the push."""
+    s = pressed(1e5, 1e5, 0.0, (0.038, 0.1), material, grid=plane((0.05, 0.12), (3, 4)))
     s.step(1.0)
-    height, bottom = s.points.corners[:, :, 1].max(), s.state.stage.conditions["tractions"][:1]
-    push = mpm.Displacement("top", lambda t, X: (0, height * np.exp(-0.05 * (t - 1)) - 0.1), "y")
-    s.stage(tractions=bottom, displacements=[push])
-    s.run(2.0, 0.1)
-    exact = mpm.element_test(material, "triaxial drained", 0.05, steps=10, confinement=confinement)
+    height, side = s.points.corners[:, :, 1].max(), s.state.stage.conditions["tractions"][:1]
+    confined = s.points.F[0, 1, 1]
+    push = mpm.Displacement("top", lambda t, X: (0, height * np.exp(-0.02 * (t - 1)) - 0.1), "y")
+    s.stage(tractions=side, displacements=[push])
+    s.run(2.0, 0.25)
+    strain = -np.log(s.points.F[0, 1, 1] / confined)
+    assert strain == pytest.approx(0.02, rel=1e-4)
+    exact = mpm.element_test(material, "triaxial drained", strain, steps=4, confinement=confinement)
     fields = s.point_fields()
     assert fields.deviatoric_stress == pytest.approx(exact.q[-1], rel=3e-6)
     assert fields.mean_effective_stress == pytest.approx(exact.p[-1], rel=3e-6)
     area = np.pi * (0.038 * s.points.F[0, 0, 0]) ** 2
-    assert -s.reactions[0, 1] == pytest.approx((exact.q[-1] + 1e5) * area, rel=1e-5)
+    assert -s.reactions[0, 1] == pytest.approx((exact.q[-1] + 1e5) * area, rel=1e-4)
 
 
 @pytest.mark.parametrize("bulk", [2e6, 1e8])
@@ -205,14 +208,50 @@ def test_a_body_carried_along_its_axis_over_ten_cells_is_at_rest(bulk):
     body, carried = mpm.box(grid, [0, 0.1], [0.7, 0.9]), mpm.Displacement("bottom", lambda t, X: (0, 1.25 * t), "y")
     water = {"fluid": mpm.Fluid(), "drained": [mpm.Drained("top")]}
     s = mpm.Simulation(grid, [body], [soil], fixed={}, displacements=[carried], **water)
-    s.run(1, 0.2)
+    s.run(1, 0.25)
     assert s.points.corners[:, :, 1].max() == pytest.approx(0.9 + 1.25)
     assert np.abs(s.effective_stress()).max() < 1e-8 * soil.shear
 
 
+RADIUS = 1e6  # m; of a ring that is a slice
+
+
+def slice_or_ring(inner):
+    """Return soil that moves, drains and is loaded, in plane strain or, far from the axis, as a ring."""
+    low, high = inner, inner + 1.3
+    grid = mpm.Grid([high, 1.5], [13, 15], [low, 0], axisymmetric=inner > 0)
+    body = mpm.box(grid, [low + 0.24, 0], [low + 1.07, 1.03])
+    soil = mpm.NeoHookean(bulk=4e6, shear=2e6, conductivity=1e-4, conductivity_law=mpm.kozeny_carman)
+    half = ((low, 0), (low + 0.7, 9))
+    around = 2 * np.pi * (low + 0.655) if inner else 1.0
+    s = mpm.Simulation(
+        grid,
+        [body],
+        [soil],
+        fixed={"bottom": "xy"},
+        fluid=mpm.Fluid(bulk=1e8),
+        gravity=(0, -9.81),
+        tractions=[mpm.Pressure("left", 2e3), mpm.Traction("right", lambda t: (1e3 * t, 0))],
+        plates=[mpm.RigidPlate("top", lambda t: 3e4 * t * around)],
+        drained=[mpm.Drained("top", region=half), mpm.Drained("right", 2e3)],
+        inflows=[mpm.Inflow("left", 1e-6)],
+    )
+    s.run(0.4, 0.1)
+    return s
+
+
+def test_a_ring_far_from_the_axis_is_a_slice():
+    flat, ring = slice_or_ring(0.0), slice_or_ring(RADIUS)
+    moved = [s.points.x - s.points.origin.mean(axis=1) for s in (flat, ring)]
+    stress = [s.point_fields().effective_stress for s in (flat, ring)]
+    for one, other in (moved, stress, (flat.points.pressure, ring.points.pressure)):
+        assert other == pytest.approx(one, abs=1e-5 * np.abs(one).max())
+    assert ring.outflows == pytest.approx(2 * np.pi * RADIUS * flat.outflows, rel=1e-5)
+
+
 def footed(folder, steps):
     """Return a run of soil under a circular footing, under its own weight, by a checkpoint half way or without."""
-    grid = plane((1.0, 1.5), (8, 12))
+    grid = plane((1.0, 1.5), (6, 9))
     body, sand = mpm.box(grid, [0, 0], [0.7, 1.2]), mpm.DruckerPrager(bulk=2e7, shear=1e7, conductivity=1e-6, **WEAK)
     load = mpm.Traction("top", lambda t: (0, -1e5 * t), region=((0, 0), (0.35, 9)))
     sides = [mpm.Drained("top"), mpm.Drained("right")]
@@ -235,7 +274,7 @@ def test_a_run_goes_on_from_a_checkpoint_with_the_same_bits_and_keeps_its_water(
     for name in ("F", "corners", "pressure"):
         assert np.array_equal(getattr(whole.points, name), getattr(resumed.points, name))
     with pytest.raises(ValueError, match="axisymmetric: True there, None here"):
-        grid = mpm.Grid([1.0, 1.5], [8, 12])
+        grid = mpm.Grid([1.0, 1.5], [6, 9])
         body = mpm.box(grid, [0, 0], [0.7, 1.2])
         sand = mpm.DruckerPrager(bulk=2e7, shear=1e7, conductivity=1e-6, **WEAK)
         flat = mpm.Simulation(grid, [body], [sand], fluid=mpm.Fluid(), fixed={"bottom": "xy"}, gravity=(0, -9.81))
@@ -262,13 +301,22 @@ def test_water_under_a_load_flows_as_in_finite_elements():
     common = {"fluid": mpm.Fluid(), "fixed": {"left": "x", "right": "x", "bottom": "y"}, "tractions": [load]}
     common["drained"] = [mpm.Drained("top")]
     probes = [[0, 0.5], [1, 1.0]]
-    fem = BiotFEM([0, 0], [1, 1], [16, 16], soil, axisymmetric=True, **common)
-    truth = np.array(fem.run(20, 2, probes=probes).displacement)[:, :, 1]
+    fem = BiotFEM([0, 0], [1, 1], [12, 12], soil, axisymmetric=True, **common)
+    truth = np.array(fem.run(20, 4, probes=probes).displacement)[:, :, 1]
     grid = plane((1.0, 1.125), (16, 18))
     body = mpm.box(grid, [0, 0], [1, 1])
     s = mpm.Simulation(grid, [body], [soil], **common)
-    found = np.array(s.run(20, 2, probes=mpm.probes([body], probes)).displacement)[:, :, 1]
+    found = np.array(s.run(20, 4, probes=mpm.probes([body], probes)).displacement)[:, :, 1]
     assert found[2:] == pytest.approx(truth[2:], rel=0.02)
+
+
+def test_scenes_of_plane_strain_carry_nothing_of_it():
+    grid = mpm.Grid([1.0, 1.0], [4, 4])
+    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 0.5])], [ELASTIC], fixed={"bottom": "xy"})
+    s.step(1.0)
+    pieces = s.scene.last[0].data.pieces
+    assert "hoop" not in s.scene.pieces.pieces.functions and pieces.places.hoop is None
+    assert s.points.F.shape[1:] == (2, 2)
 
 
 def hole(radius, caplog):

@@ -22,7 +22,9 @@ def mpirun(processes: int, script: str, *arguments: str) -> None:
     assert done.returncode == 0, done.stderr[-3000:]
 
 
-SCENES = [f"mpi_{name}.py" for name in ("beam", "slab", "stages", "laws", "layers", "3d", "cycles", "mesh")]
+SCENES = [
+    f"mpi_{name}.py" for name in ("beam", "slab", "stages", "laws", "layers", "3d", "cycles", "mesh", "axisymmetric")
+]
 
 
 @pytest.mark.parametrize("scene", SCENES)

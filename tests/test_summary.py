@@ -96,6 +96,7 @@ BENCHMARK = {
     "damping of pressure jumps": {"damping of pressure jumps"},
     "damping of what yields": set(),
     "seepage face": set(),
+    "axisymmetry": {"axisymmetry"},
     "body from a mesh": set(),
     "Mohr-Coulomb beside Drucker-Prager": set(),
     "Modified Cam Clay beside Drucker-Prager": set(),

@@ -9,7 +9,7 @@ FIELDS = {
         "displacement": "m, since the start, or since a stage reset it",
         "F, J": "-, deformation gradient, by components F_xy in 2D; its determinant, the volume ratio",
         "pressure": "Pa, pore pressure, positive in compression",
-        "effective_stress": "Pa, Cauchy stress of the skeleton, tension positive; zz: across the plane of plane strain",
+        "effective_stress": "Pa, Cauchy stress of the skeleton, tension positive; zz: across the plane, or along hoops",
         "stress": "Pa, Cauchy stress of skeleton and fluid together",
         "mean_effective_stress": "Pa, p' = -(xx + yy + zz) / 3, positive in compression",
         "deviatoric_stress": "Pa, q = sqrt(3/2 s : s), s the deviator of the stress",
@@ -31,7 +31,7 @@ FIELDS = {
         "ux_0, uy_0, uz_0": "m, its displacement",
         "p_0": "Pa, pore pressure there",
         "sxx_0, syy_0, szz_0, sxy_0, sxz_0, syz_0": "Pa, effective stress there, tension positive",
-        "reaction_x_0, reaction_y_0, reaction_z_0": "N, in plane strain N/m, force of given displacement 0 on the body",
+        "reaction_x_0, reaction_y_0, reaction_z_0": "N, in plane strain N/m, force of given displacement 0",
         "outflow_0": "m^3/s, in plane strain m^2/s, what leaves through drained side 0; then through inflows",
     },
 }

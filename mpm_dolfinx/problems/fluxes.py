@@ -36,7 +36,7 @@ class Mobility:
     shift: NDArray[np.float64] | None = None
 
 
-class Motion(NamedTuple):
+class CellMotion(NamedTuple):
     """What becomes of n cells in a step: F (n, d, d), displacement (n, d), m; hoops' stretch (n,) in axisymmetry."""
 
     F: NDArray[np.float64]
@@ -53,7 +53,7 @@ class Conduction:
     """
 
     mobility: Mobility
-    motion: Motion | None
+    motion: CellMotion | None
     weight: NDArray[np.float64] | None
 
     def along(self, dim: int) -> NDArray[np.float64]:
@@ -229,13 +229,13 @@ class CellContents:
         """Return the means over the pieces (m,) of each filled cell."""
         return self.total(self._cells, self.weight * values) / self._volume
 
-    def motion(self, u: NDArray[np.float64]) -> Motion:
+    def motion(self, u: NDArray[np.float64]) -> CellMotion:
         """Return what becomes of the filled cells, at their centroids, by nodal u (nodes, d), m."""
         nodal, hoop = u[self.grid.cell_nodes[self.filled]].transpose(0, 2, 1), None
         moved = np.einsum("ndk,nk->nd", nodal, self._values)
         if self.grid.axisymmetric:
             hoop = 1 + moved[:, 0] / (self.grid.midpoints[self.filled, 0] + self.centroid[self.filled, 0])
-        return Motion(np.eye(self.grid.dim) + nodal @ self._slopes, moved, hoop)
+        return CellMotion(np.eye(self.grid.dim) + nodal @ self._slopes, moved, hoop)
 
     def slot(self, cells: NDArray[np.int32]) -> NDArray[np.int64]:
         """Return the places of cells among the filled ones."""
