@@ -157,6 +157,33 @@ def test_a_cylinder_drains_to_its_side_as_the_exact_one_at_second_order():
     assert (np.array(errors[-1]) < (2e-3, 6e-3)).all() and (rates(np.array(errors)) > 1.8).all()
 
 
+def test_flow_to_a_drain_crosses_a_smeared_zone_at_second_order():
+    """A hundred times less permeable than the soil, its edge half a cell off the grid lines."""
+    errors, soils = [], [mpm.Hencky(bulk=2e9, shear=1e9, conductivity=k) for k in (1e-7, 1e-5)]
+    for cells in (10, 20):
+        h = 1 / cells
+        grid, edge = plane((1.3, 2 * h), (13 * cells // 10, 2)), 0.5 + 0.5 * h
+        bodies = [mpm.box(grid, [0.2, 0], [edge, 2 * h]), mpm.box(grid, [edge, 0], [1.2, 2 * h], material=1)]
+        sides, walls = [mpm.Drained("left"), mpm.Drained("right", 1e4)], {"bottom": "y", "top": "y"}
+        s = mpm.Simulation(grid, bodies, soils, fluid=mpm.Fluid(), fixed=walls, drained=sides)
+        s.run(1e8, 5e7)
+        resistance = np.log(edge / 0.2) / 1e-7 + np.log(1.2 / edge) / 1e-5
+        errors.append(abs(s.outflows[0] * resistance / (4 * np.pi * h * 1e4 / 9810) - 1))
+    assert errors[1] < 5e-3 and rates(errors)[0] > 1.8
+
+
+def test_a_cavity_in_undrained_soil_has_the_exact_pressure():
+    """Of von Mises's, incompressible, G = 50 s_u, widened to 1.5 times its radius in a ring ten times as wide."""
+    strength, h, widened = 1e4, 0.25, 0.5
+    soil = mpm.DruckerPrager(bulk=5e4 * strength, shear=50 * strength, friction=0, dilation=0, cohesion=strength)
+    grid = plane((11.0, 2 * h), (44, 2))
+    body, push = mpm.box(grid, [1, 0], [10, 2 * h]), mpm.Displacement("left", lambda t, X: (t, 0), "x")
+    s = mpm.Simulation(grid, [body], [soil], fixed={"bottom": "y", "top": "y"}, displacements=[push])
+    s.run(widened, 0.05)
+    pressure = s.reactions[0, 0] / (2 * np.pi * (1 + widened) * 2 * h)
+    assert pressure == pytest.approx(3.7100 * strength, rel=2e-3)
+
+
 def test_cryers_sphere_needs_a_quarter_disc():
     errors, _ = cryer.run(12, 24, axisymmetric=True)
     assert errors["peak"] < 0.01 and errors["curve"] < 0.015

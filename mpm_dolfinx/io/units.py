@@ -7,7 +7,7 @@ FIELDS = {
     "points.pvd: the domains of the material points": {
         "id, material": "number of the point; index of its material",
         "displacement": "m, since the start, or since a stage reset it",
-        "F, J": "-, deformation gradient, by components F_xy in 2D; its determinant, the volume ratio",
+        "F, J": "-, deformation gradient, by components F_xy in plane strain; its determinant, the volume ratio",
         "pressure": "Pa, pore pressure, positive in compression",
         "effective_stress": "Pa, Cauchy stress of the skeleton, tension positive; zz: across the plane, or along hoops",
         "stress": "Pa, Cauchy stress of skeleton and fluid together",

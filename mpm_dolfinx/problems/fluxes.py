@@ -266,7 +266,7 @@ class FluxForms:
         across = sum(abs(n0[a]) * h[a] for a in range(d))
 
         def opening(side, sign):
-            """Share of the face that the body covers, on the side of the cell that sign * n0 points to."""
+            """Share of the face that the body covers, times `Grid.around`, on the side that sign * n0 looks to."""
             lower, upper = self.lower_face(side), self.upper_face(side)
             return sum(
                 ufl.conditional(ufl.gt(sign * n0[a], 0.5), upper[a], 0.0)
