@@ -97,8 +97,8 @@ class CutDomains(Keyed):
         self._travel = Exchange(grid.comm, grid.owner(self.pieces.cell))
         self.cells, self.x = grid.local(self._travel.send(self.pieces.cell)), self._travel.send(self.pieces.x)
         """Owned cells, and centroids (m, d), m, of the pieces that this process integrates."""
-        self.hoop = self._travel.send(self.pieces.hoop) if grid.axisymmetric else np.empty((len(self.cells), 0))
-        """Their moments in the plane (m, 4) in axisymmetry, see `Pieces`; else (m, 0)."""
+        self.hoop = self._travel.send(self.pieces.hoop) if grid.axisymmetric else None
+        """Their moments in the plane (m, 4) in axisymmetry, see `Pieces`."""
 
     def serves(self, points: MaterialPoints) -> bool:
         """Return whether the points are still where they were cut, but for `STAYS`."""
