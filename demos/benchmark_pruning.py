@@ -47,11 +47,17 @@ def soil(law: type[mpm.Skeleton] = mpm.Hencky, nu: float = 0.0, **options) -> mp
 
 
 def block(
-    cells: int, material: mpm.Skeleton | None = None, box: float = 1.0, from_mesh: bool = False, **options
+    cells: int,
+    material: mpm.Skeleton | None = None,
+    box: float = 1.0,
+    from_mesh: bool = False,
+    axisymmetric: bool = False,
+    **options,
 ) -> mpm.Simulation:
     """Return the block, that many cells wide; the grid reaches to `box`, m, and two cells above it."""
     h = 1 / cells
-    grid = mpm.Grid([box, box + 2 * h], [round(box * cells), round(box * cells) + 2])
+    count = [round(box * cells), round(box * cells) + 2]
+    grid = mpm.Grid([box, box + 2 * h], count, axisymmetric=axisymmetric)
     options.setdefault("tractions", [mpm.Traction("top", lambda t: (0, -LOAD * t))])
     fixed = {"left": "x", "right": "x", "bottom": "y"}
     body = meshed(grid, cells) if from_mesh else mpm.box(grid, [0, 0], [1, 1])
@@ -186,6 +192,10 @@ PAIRS: dict[str, tuple[Make, Make]] = {
     "files of each step": (block, block),
     "grid reset in each step": (block, restless),
     "body from a mesh": (block, lambda n: block(n, from_mesh=True)),
+    "axisymmetry": (
+        lambda n: restless(n, material=soil(conductivity=1e-4), **WATER),
+        lambda n: restless(n, material=soil(conductivity=1e-4), axisymmetric=True, **WATER),
+    ),
     "16 times the background grid": (lambda n: restless(n, box=1 + 2 / n), lambda n: restless(n, box=4.0)),
 }
 QUICK = ("files of each step",)

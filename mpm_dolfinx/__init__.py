@@ -10,7 +10,7 @@ changes the scene between two runs, and `factor_of_safety` weakens it until it s
 `mpm_dolfinx.constitutive.user_functions`.
 
 SI units throughout.  Stress is positive in tension, pore pressure in compression; 2D is plane strain, and forces
-are those of a slice of 1 m.
+are those of a slice of 1 m, or axisymmetric (`Grid`), and forces are those all around.
 """
 
 from mpm_dolfinx import _environment  # noqa: F401 - first: it says what is missing

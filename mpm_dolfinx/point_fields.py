@@ -19,7 +19,8 @@ class PointFields:
     Attributes
     ----------
     effective_stress, stress : (n, 3, 3), Pa
-        Of the skeleton, and of skeleton and fluid together.  In plane strain zz acts across the plane; it is nan where
+        Of the skeleton, and of skeleton and fluid together.  In axisymmetry x is the radius, y the axis, and zz acts
+        along the hoops.  In plane strain zz acts across the plane; it is nan where
         the law is one of the user's for the plane only, and so are the invariants.
     mean_effective_stress : (n,), Pa
         p' = -tr(effective stress) / 3: compression is positive.

@@ -20,7 +20,7 @@ from mpm_dolfinx.point_fields import PointFields, point_fields
 from mpm_dolfinx.points.bodies import Body
 from mpm_dolfinx.points.grid import Grid
 from mpm_dolfinx.points.material_points import MaterialPoints
-from mpm_dolfinx.problems.axis import check_axisymmetry
+from mpm_dolfinx.problems.axis import check_axisymmetry, with_axis
 from mpm_dolfinx.problems.conditions import Displacement, Drained, Inflow, OnSide, Pressure, RigidPlate, Traction
 from mpm_dolfinx.problems.scene_parts import check_parts, check_physics
 from mpm_dolfinx.problems.thin import warn_thin
@@ -56,7 +56,7 @@ class Simulation:
     tools
         Rigid tools that press on the bodies.
     gravity : (d,) or callable t -> (d,), m/s^2
-        Acceleration of gravity.
+        Acceleration of gravity; in axisymmetry along the axis.
     pressure
         Pore pressure at the start, Pa, needs a fluid: a number, or a function of places x (n, d) as of `hydrostatic`.
     initial_stress
@@ -65,7 +65,7 @@ class Simulation:
         otherwise have none.  It is brought into balance with what acts at the start, at the pore pressures given,
         so that a first step in which nothing changes moves nothing.
     quadrature
-        "domain": exact pieces of the points' domains; "point": at the points, as in standard MPM.
+        "domain": exact pieces of the points' domains; "point": at the points, as in standard MPM, not in axisymmetry.
     coupling, tolerance
         See `Scheme`.
     method
@@ -120,7 +120,7 @@ class Simulation:
         check_parts(grid, bodies, materials, later)
         check_physics(fluid, pressure, terms, sources)
         grid.share(np.concatenate([body.centre for body in bodies]))
-        warn_thin(grid, bodies, fixed, fluid is not None)
+        warn_thin(grid, bodies, with_axis(grid, fixed), fluid is not None)
         check_axisymmetry(grid, bodies, quadrature, initial_stress)
         began, weighs = time.perf_counter(), gravity is not None
         options = (quadrature, scheme, method, weighs, pressure, terms, sources)
@@ -173,7 +173,8 @@ class Simulation:
     def reactions(self) -> NDArray[np.float64]:
         """(displacements, d): force by which each given displacement acts on the bodies, N (N/m in plane strain).
 
-        Of the last step; nan where none has been taken since a stage set them.
+        In axisymmetry all around, the radial one the sum of what acts outward.  Of the last step; nan where none has
+        been taken since a stage set them.
         """
         return self.state.reactions
 
@@ -198,6 +199,7 @@ class Simulation:
     def effective_stress(self) -> NDArray[np.float64]:
         """Return the effective Cauchy stress (n, d, d), Pa, tension positive, at the material points.
 
+        In axisymmetry (n, 3, 3), the axes those of radius, axis and hoops.
         On several processes all call it together.
         """
         return self.scene.materials.effective_stress(self.points)

@@ -173,6 +173,7 @@ def test_a_normal_traction_on_a_closed_surface_has_no_resultant_and_squeezes_eve
     assert np.mean(s.points.J * s.points.volume0) / s.points.volume0.mean() == pytest.approx(1 - 1e-3, abs=5e-6)
 
 
+@pytest.mark.slow
 def test_cryers_sphere_comes_near_the_exact_pressure_and_nearer_with_smaller_cells():
     peaks = [cryer.run(cells, 16)[0]["peak"] for cells in (3, 6)]
     assert peaks[1] < 0.07 and peaks[1] < 0.6 * peaks[0]

@@ -57,6 +57,23 @@ def test_a_body_that_is_blown_up_stretches_evenly(inner):
     assert volume.sum() == pytest.approx(np.pi * (0.36 - inner**2) * stretch[0] ** 3, rel=1e-9)
 
 
+def test_a_pressure_on_curved_sides_is_even_but_for_the_faces_rule():
+    """A body a fifth smaller: 1.3e-4, afloat but for a spring that has next to nothing to hold."""
+
+    def bend(x):
+        r, z = x.T
+        return np.stack([r * (1 + 0.2 * np.sin(2 * z)), z + 0.15 * r + 0.1 * r**2], axis=1)
+
+    grid = plane((1.7, 1.7), (9, 11))
+    body = mpm.mapped(grid, mpm.box(grid, [0.0, 0.1], [1.0, 1.2]), bend)
+    loads = [mpm.Pressure(side, 5e5) for side in ("right", "top", "bottom")]
+    spring = [lambda points, u: 10.0 * points.value(u)[1] ** 2 * points.dx]
+    s = mpm.Simulation(grid, [body], [ELASTIC], fixed={}, tractions=loads, terms=spring)
+    s.step(1.0)
+    assert s.points.J.max() < 0.82
+    assert np.abs(s.effective_stress() + 5e5 * np.eye(3)).max() < 3e-4 * 5e5
+
+
 def test_pieces_have_exact_moments_of_rings():
     rng = np.random.default_rng(3)
     grid = plane((1.0, 1.0), (5, 4), (0.1, 0.0))
@@ -149,12 +166,39 @@ def test_a_cylinder_drains_to_its_side_as_the_exact_one_at_second_order():
         s = mpm.Simulation(
             grid, [body], [soil], fluid=water, fixed=walls, drained=[mpm.Drained("right")], pressure=100.0
         )
-        s.run(t := T * outer**2 * 0.4 / (mobility * water.bulk), t / 20)
+        s.run(t := T * outer**2 * 0.4 / (mobility * water.bulk), t / 10)
         decay, r = np.exp(-(a**2) * T), s.points.x[:, :1] / outer
         p = 100 * (2 / (a * j1(a)) * j0(a * r) * decay).sum(axis=1)
         out = 100 * 4 * np.pi * mobility * 2 * h * decay.sum()  # m^3/s through all of the side
         errors.append((np.abs(s.points.pressure - p).max() / 100, abs(s.outflows[0] / out - 1)))
     assert (np.array(errors[-1]) < (2e-3, 6e-3)).all() and (rates(np.array(errors)) > 1.8).all()
+
+
+def test_flow_to_a_drain_crosses_a_smeared_zone_at_second_order():
+    """A hundred times less permeable than the soil, its edge half a cell off the grid lines."""
+    errors, soils = [], [mpm.Hencky(bulk=2e9, shear=1e9, conductivity=k) for k in (1e-7, 1e-5)]
+    for cells in (10, 20):
+        h = 1 / cells
+        grid, edge = plane((1.3, 2 * h), (13 * cells // 10, 2)), 0.5 + 0.5 * h
+        bodies = [mpm.box(grid, [0.2, 0], [edge, 2 * h]), mpm.box(grid, [edge, 0], [1.2, 2 * h], material=1)]
+        sides, walls = [mpm.Drained("left"), mpm.Drained("right", 1e4)], {"bottom": "y", "top": "y"}
+        s = mpm.Simulation(grid, bodies, soils, fluid=mpm.Fluid(), fixed=walls, drained=sides)
+        s.run(1e8, 5e7)
+        resistance = np.log(edge / 0.2) / 1e-7 + np.log(1.2 / edge) / 1e-5
+        errors.append(abs(s.outflows[0] * resistance / (4 * np.pi * h * 1e4 / 9810) - 1))
+    assert errors[1] < 5e-3 and rates(errors)[0] > 1.8
+
+
+def test_a_cavity_in_undrained_soil_has_the_exact_pressure():
+    """Of von Mises's, incompressible, G = 50 s_u, widened to 1.5 times its radius in a ring ten times as wide."""
+    strength, h, widened = 1e4, 0.25, 0.5
+    soil = mpm.DruckerPrager(bulk=5e4 * strength, shear=50 * strength, friction=0, dilation=0, cohesion=strength)
+    grid = plane((11.0, 2 * h), (44, 2))
+    body, push = mpm.box(grid, [1, 0], [10, 2 * h]), mpm.Displacement("left", lambda t, X: (t, 0), "x")
+    s = mpm.Simulation(grid, [body], [soil], fixed={"bottom": "y", "top": "y"}, displacements=[push])
+    s.run(widened, 0.05)
+    pressure = s.reactions[0, 0] / (2 * np.pi * (1 + widened) * 2 * h)
+    assert pressure == pytest.approx(3.7100 * strength, rel=2e-3)
 
 
 def test_cryers_sphere_needs_a_quarter_disc():
@@ -171,8 +215,8 @@ def test_cryers_sphere_peaks_within_half_a_percent():
 @pytest.mark.slow
 def test_a_rough_circular_footing_carries_what_limit_analysis_says():
     """On Tresca's soil 6.05 c (Cox, Eason and Hopkins 1961)."""
-    coarse, fine = (footing.limit_load("circular", cells).load for cells in (9, 17))
-    assert -0.03 < fine[-1] - 1 < 0 and coarse[-1] < fine[-1]
+    coarse, fine = (footing.limit_load("circular", cells).load for cells in (9, 25))
+    assert -0.02 < fine[-1] - 1 < 0 and coarse[-1] < fine[-1]
     assert fine[-1] / fine[30] < 1.002  # it flows
 
 
@@ -184,19 +228,22 @@ def test_a_rough_circular_footing_carries_what_limit_analysis_says():
     ],
 )
 def test_laws_with_a_state_see_the_hoops(material, confinement):
-    """A triaxial test of a cylinder is that of a point; its strain is given at the top, to 1e-6."""
-    s = pressed(1e5, 1e5, 0.0, (0.038, 0.1), material, grid=plane((0.05, 0.12), (3, 8)))
+    """A triaxial test of a cylinder is that of a point, but for what its top gives way within the push."""
+    s = pressed(1e5, 1e5, 0.0, (0.038, 0.1), material, grid=plane((0.05, 0.12), (3, 4)))
     s.step(1.0)
-    height, bottom = s.points.corners[:, :, 1].max(), s.state.stage.conditions["tractions"][:1]
-    push = mpm.Displacement("top", lambda t, X: (0, height * np.exp(-0.05 * (t - 1)) - 0.1), "y")
-    s.stage(tractions=bottom, displacements=[push])
-    s.run(2.0, 0.1)
-    exact = mpm.element_test(material, "triaxial drained", 0.05, steps=10, confinement=confinement)
+    height, side = s.points.corners[:, :, 1].max(), s.state.stage.conditions["tractions"][:1]
+    confined = s.points.F[0, 1, 1]
+    push = mpm.Displacement("top", lambda t, X: (0, height * np.exp(-0.02 * (t - 1)) - 0.1), "y")
+    s.stage(tractions=side, displacements=[push])
+    s.run(2.0, 0.25)
+    strain = -np.log(s.points.F[0, 1, 1] / confined)
+    assert strain == pytest.approx(0.02, rel=1e-4)
+    exact = mpm.element_test(material, "triaxial drained", strain, steps=4, confinement=confinement)
     fields = s.point_fields()
     assert fields.deviatoric_stress == pytest.approx(exact.q[-1], rel=3e-6)
     assert fields.mean_effective_stress == pytest.approx(exact.p[-1], rel=3e-6)
     area = np.pi * (0.038 * s.points.F[0, 0, 0]) ** 2
-    assert -s.reactions[0, 1] == pytest.approx((exact.q[-1] + 1e5) * area, rel=1e-5)
+    assert -s.reactions[0, 1] == pytest.approx((exact.q[-1] + 1e5) * area, rel=1e-4)
 
 
 @pytest.mark.parametrize("bulk", [2e6, 1e8])
@@ -205,14 +252,50 @@ def test_a_body_carried_along_its_axis_over_ten_cells_is_at_rest(bulk):
     body, carried = mpm.box(grid, [0, 0.1], [0.7, 0.9]), mpm.Displacement("bottom", lambda t, X: (0, 1.25 * t), "y")
     water = {"fluid": mpm.Fluid(), "drained": [mpm.Drained("top")]}
     s = mpm.Simulation(grid, [body], [soil], fixed={}, displacements=[carried], **water)
-    s.run(1, 0.2)
+    s.run(1, 0.25)
     assert s.points.corners[:, :, 1].max() == pytest.approx(0.9 + 1.25)
     assert np.abs(s.effective_stress()).max() < 1e-8 * soil.shear
 
 
+RADIUS = 1e6  # m; of a ring that is a slice
+
+
+def slice_or_ring(inner):
+    """Return soil that moves, drains and is loaded, in plane strain or, far from the axis, as a ring."""
+    low, high = inner, inner + 1.3
+    grid = mpm.Grid([high, 1.5], [13, 15], [low, 0], axisymmetric=inner > 0)
+    body = mpm.box(grid, [low + 0.24, 0], [low + 1.07, 1.03])
+    soil = mpm.NeoHookean(bulk=4e6, shear=2e6, conductivity=1e-4, conductivity_law=mpm.kozeny_carman)
+    half = ((low, 0), (low + 0.7, 9))
+    around = 2 * np.pi * (low + 0.655) if inner else 1.0
+    s = mpm.Simulation(
+        grid,
+        [body],
+        [soil],
+        fixed={"bottom": "xy"},
+        fluid=mpm.Fluid(bulk=1e8),
+        gravity=(0, -9.81),
+        tractions=[mpm.Pressure("left", 2e3), mpm.Traction("right", lambda t: (1e3 * t, 0))],
+        plates=[mpm.RigidPlate("top", lambda t: 3e4 * t * around)],
+        drained=[mpm.Drained("top", region=half), mpm.Drained("right", 2e3)],
+        inflows=[mpm.Inflow("left", 1e-6)],
+    )
+    s.run(0.2, 0.1)
+    return s
+
+
+def test_a_ring_far_from_the_axis_is_a_slice():
+    flat, ring = slice_or_ring(0.0), slice_or_ring(RADIUS)
+    moved = [s.points.x - s.points.origin.mean(axis=1) for s in (flat, ring)]
+    stress = [s.point_fields().effective_stress for s in (flat, ring)]
+    for one, other in (moved, stress, (flat.points.pressure, ring.points.pressure)):
+        assert other == pytest.approx(one, abs=1e-5 * np.abs(one).max())
+    assert ring.outflows == pytest.approx(2 * np.pi * RADIUS * flat.outflows, rel=1e-5)
+
+
 def footed(folder, steps):
     """Return a run of soil under a circular footing, under its own weight, by a checkpoint half way or without."""
-    grid = plane((1.0, 1.5), (8, 12))
+    grid = plane((1.0, 1.5), (6, 9))
     body, sand = mpm.box(grid, [0, 0], [0.7, 1.2]), mpm.DruckerPrager(bulk=2e7, shear=1e7, conductivity=1e-6, **WEAK)
     load = mpm.Traction("top", lambda t: (0, -1e5 * t), region=((0, 0), (0.35, 9)))
     sides = [mpm.Drained("top"), mpm.Drained("right")]
@@ -235,7 +318,7 @@ def test_a_run_goes_on_from_a_checkpoint_with_the_same_bits_and_keeps_its_water(
     for name in ("F", "corners", "pressure"):
         assert np.array_equal(getattr(whole.points, name), getattr(resumed.points, name))
     with pytest.raises(ValueError, match="axisymmetric: True there, None here"):
-        grid = mpm.Grid([1.0, 1.5], [8, 12])
+        grid = mpm.Grid([1.0, 1.5], [6, 9])
         body = mpm.box(grid, [0, 0], [0.7, 1.2])
         sand = mpm.DruckerPrager(bulk=2e7, shear=1e7, conductivity=1e-6, **WEAK)
         flat = mpm.Simulation(grid, [body], [sand], fluid=mpm.Fluid(), fixed={"bottom": "xy"}, gravity=(0, -9.81))
@@ -262,13 +345,22 @@ def test_water_under_a_load_flows_as_in_finite_elements():
     common = {"fluid": mpm.Fluid(), "fixed": {"left": "x", "right": "x", "bottom": "y"}, "tractions": [load]}
     common["drained"] = [mpm.Drained("top")]
     probes = [[0, 0.5], [1, 1.0]]
-    fem = BiotFEM([0, 0], [1, 1], [16, 16], soil, axisymmetric=True, **common)
-    truth = np.array(fem.run(20, 2, probes=probes).displacement)[:, :, 1]
+    fem = BiotFEM([0, 0], [1, 1], [12, 12], soil, axisymmetric=True, **common)
+    truth = np.array(fem.run(20, 4, probes=probes).displacement)[:, :, 1]
     grid = plane((1.0, 1.125), (16, 18))
     body = mpm.box(grid, [0, 0], [1, 1])
     s = mpm.Simulation(grid, [body], [soil], **common)
-    found = np.array(s.run(20, 2, probes=mpm.probes([body], probes)).displacement)[:, :, 1]
+    found = np.array(s.run(20, 4, probes=mpm.probes([body], probes)).displacement)[:, :, 1]
     assert found[2:] == pytest.approx(truth[2:], rel=0.02)
+
+
+def test_scenes_of_plane_strain_carry_nothing_of_it():
+    grid = mpm.Grid([1.0, 1.0], [4, 4])
+    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 0.5])], [ELASTIC], fixed={"bottom": "xy"})
+    s.step(1.0)
+    pieces = s.scene.last[0].data.pieces
+    assert "hoop" not in s.scene.pieces.pieces.functions and pieces.places.hoop is None
+    assert s.points.F.shape[1:] == (2, 2)
 
 
 def hole(radius, caplog):

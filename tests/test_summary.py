@@ -97,6 +97,7 @@ BENCHMARK = {
     "damping of what yields": set(),
     "seepage face": set(),
     "initial stress": {"initial stress"},
+    "axisymmetry": {"axisymmetry"},
     "body from a mesh": set(),
     "Mohr-Coulomb beside Drucker-Prager": set(),
     "softening beside Drucker-Prager": set(),

@@ -54,8 +54,8 @@ class ModifiedCamClay(Skeleton):
         Slopes lambda* and kappa* of ln v over ln P, first loading and unloading, -, 0 < kappa < lambda_, in Kirchhoff
         stress.  An index C of v over the logarithm of the Cauchy stress, at the specific volume v, is C / (v - C) here.
     initial_stress : (3,), Pa
-        Normal effective stresses at F = I, the last one out of plane in 2D; tension positive, their mean < 0.  The
-        loads have to balance them.
+        Normal effective stresses at F = I, the last one out of plane in 2D, in axisymmetry along the hoops; tension
+        positive, their mean < 0.  The loads have to balance them.
     OCR
         Overconsolidation ratio, -, >= 1: how much larger the yield surface is at the start than that through the
         initial stress.

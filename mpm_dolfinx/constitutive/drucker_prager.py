@@ -50,7 +50,8 @@ class DruckerPrager(Frictional):
         of c in associated flow).
     match
         The cone meets Mohr and Coulomb's surface in "plane strain" (the same collapse load there; for associated
-        flow exactly), triaxial "compression" (outer cone) or triaxial "extension" (inner cone).
+        flow exactly), triaxial "compression" (outer cone) or triaxial "extension" (inner cone).  In axisymmetry none
+        is Mohr and Coulomb's at all places: von Mises's circular footing carries a tenth less than Tresca's.
 
     The other parameters are those of `Skeleton`, all by name.  The state is `plastic`, C_p^-1 (3, 3), and
     `hardened`, kappa, in `points.data`.  De Souza Neto, Peric and Owen (2008), 8.3 and 14.6.

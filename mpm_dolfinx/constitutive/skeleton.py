@@ -61,7 +61,8 @@ class Skeleton:
         porosity0, x (present position), p (pore pressure of the cell at the start of the substep, Pa).
 
     A law adds its own parameters as fields of the dataclass and defines one of these static methods, which
-    are called with those arguments that they name: F, the law's fields and properties, its state.
+    are called with those arguments that they name: F, the law's fields and properties, its state.  F is (d, d), in
+    axisymmetry (3, 3) with the hoops' stretch last, see `axes`.
 
     energy
         Stored energy psi per reference volume, Pa.  Stress and tangent are UFL's derivatives.
@@ -233,7 +234,7 @@ class Skeleton:
         return ufl.diff(energy, whole)[2, 2] / ufl.det(F)
 
     def drained_modulus(self, dim: int) -> float:
-        """Return the drained bulk modulus of the dimension K_dr, Pa: K in 3D, lambda + G in plane strain."""
+        """Return the drained bulk modulus K_dr, Pa, of so many axes of F: K of three, lambda + G in plane strain."""
         return self.bulk if dim == 3 else self.bulk + self.shear / 3
 
     @property

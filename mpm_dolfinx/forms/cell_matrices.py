@@ -53,9 +53,11 @@ def along_shapes(T, points: FormPoints) -> list:
     gradients, d = shape_gradients(points), points.grid.dim
     if not points.grid.axisymmetric:
         return [ufl.dot(T, g)[i] for g in gradients for i in range(d)]
-    along = [[sum(T[i, k] * g[k] for k in range(d)) for i in range(d)] for g in gradients]
-    hoops = [T[2, 2] * h for h in shape_hoops(points)]
-    return [radial_axial[i] + (0, h)[i == 0] for radial_axial, h in zip(along, hoops, strict=True) for i in range(d)]
+    out = []
+    for g, h in zip(gradients, shape_hoops(points), strict=True):
+        radial, axial = (T[i, 0] * g[0] + T[i, 1] * g[1] for i in range(d))
+        out += [radial + T[2, 2] * h, axial]
+    return out
 
 
 def element_dofs(grid: Grid, cells: NDArray[np.int32]) -> NDArray[np.int32]:

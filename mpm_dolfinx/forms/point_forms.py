@@ -189,12 +189,12 @@ class Places(Keyed):
         mixed = None if self.mixed is None else self.mixed[chosen]
         return self.grid.shape_gradients(self.cells[chosen], self.x[chosen], mixed)
 
-    def stretch(self, u: NDArray[np.float64], rows: slice = slice(None)) -> NDArray[np.float64]:
+    def stretch(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return 1 + u_r / r (n,) of nodal displacements u (nodes, d), m, in axisymmetry: see `FormPoints.hoop`."""
-        grid, cells, (*offset, product, radius) = self.grid, self.cells[rows], self.hoop[rows].T
+        grid, (*offset, product, radius) = self.grid, self.hoop.T
         hats = [0.5 + x[:, None] * grid.signs[:, a] / grid.h[a] for a, x in enumerate(offset)]
         uneven = (product - offset[0] * offset[1])[:, None] * grid.signs.prod(axis=1) / grid.h.prod()
-        return 1 + ((hats[0] * hats[1] + uneven) * u[grid.cell_nodes[cells], 0]).sum(axis=1) / radius
+        return 1 + ((hats[0] * hats[1] + uneven) * u[grid.cell_nodes[self.cells], 0]).sum(axis=1) / radius
 
 
 class PointData(Keyed):

@@ -41,6 +41,7 @@ def _momentum(s: Scene, state: State) -> list[Part]:
     laws, evolves = ", ".join(law.__name__ for law in s.materials.laws), ", ".join(s.materials.state_names)
     return [
         _either("reset of the grid", state.resets > 1, f"{state.resets} so far", "nothing has moved so far"),
+        _either("axisymmetry", s.grid.axisymmetric, "rings about r = 0", "plane strain" if s.grid.dim == 2 else "3D"),
         Part("stress", True, f"{laws}; integrated over {'exact domains' if s.quadrature == 'domain' else 'points'}"),
         _either(
             "mean dilatation",

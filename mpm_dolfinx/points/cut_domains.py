@@ -99,8 +99,8 @@ class CutDomains(Keyed):
         """Owned cells, and centroids (m, d), m, of the pieces that this process integrates."""
         self.mixed = self._travel.send(self.pieces.mixed) if grid.dim == 3 and domains else None
         """Their mean products of offsets in 3D, see `Pieces`."""
-        self.hoop = self._travel.send(self.pieces.hoop) if grid.axisymmetric else np.empty((len(self.cells), 0))
-        """Their moments in the plane (m, 4) in axisymmetry, see `Pieces`; else (m, 0)."""
+        self.hoop = self._travel.send(self.pieces.hoop) if grid.axisymmetric else None
+        """Their moments in the plane (m, 4) in axisymmetry, see `Pieces`."""
 
     def serves(self, points: MaterialPoints) -> bool:
         """Return whether the points are still where they were cut, but for `STAYS`."""

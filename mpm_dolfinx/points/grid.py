@@ -214,7 +214,7 @@ class Grid:
     @property
     def has_axis(self) -> bool:
         """Whether its side "left" is the axis of revolution."""
-        return self.axisymmetric and self.lower[0] == 0.0
+        return self.axisymmetric and bool(self.lower[0] <= 1e-9 * self.h[0])
 
     def around(self, x: NDArray[np.float64]) -> NDArray[np.float64] | float:
         """Return by what measures in the plane at places (n, d), m, count: 2 pi r (n,), m, in axisymmetry, else 1."""

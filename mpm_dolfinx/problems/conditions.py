@@ -344,7 +344,7 @@ class RigidPlate:
         Side of the bodies, as for `Traction`; its faces, as seeded, lie in one plane normal to an axis and hang
         together.
     force : float or callable t (s) -> float, N (N/m in plane strain)
-        Total force that presses on the side; negative: pulls.
+        Total force that presses on the side, in axisymmetry all around; negative: pulls.
     region : ((d,), (d,)), m
         Box of reference positions to which the plate is limited.
 

@@ -37,7 +37,7 @@ class Mobility:
     shift: NDArray[np.float64] | None = None
 
 
-class Motion(NamedTuple):
+class CellMotion(NamedTuple):
     """What becomes of n cells in a step: F (n, d, d), displacement (n, d), m; hoops' stretch (n,) in axisymmetry."""
 
     F: NDArray[np.float64]
@@ -54,7 +54,7 @@ class Conduction:
     """
 
     mobility: Mobility
-    motion: Motion | None
+    motion: CellMotion | None
     weight: NDArray[np.float64] | None
 
     def along(self, dim: int) -> NDArray[np.float64]:
@@ -235,13 +235,13 @@ class CellContents:
         """Return the means over the pieces (m,) of each filled cell."""
         return self.total(self._cells, self.weight * values) / self._volume
 
-    def motion(self, u: NDArray[np.float64]) -> Motion:
+    def motion(self, u: NDArray[np.float64]) -> CellMotion:
         """Return what becomes of the filled cells, at their centroids, by nodal u (nodes, d), m."""
         nodal, hoop = u[self.grid.cell_nodes[self.filled]].transpose(0, 2, 1), None
         moved = np.einsum("ndk,nk->nd", nodal, self._values)
         if self.grid.axisymmetric:
             hoop = 1 + moved[:, 0] / (self.grid.midpoints[self.filled, 0] + self.centroid[self.filled, 0])
-        return Motion(np.eye(self.grid.dim) + nodal @ self._slopes, moved, hoop)
+        return CellMotion(np.eye(self.grid.dim) + nodal @ self._slopes, moved, hoop)
 
     def slot(self, cells: NDArray[np.int32]) -> NDArray[np.int64]:
         """Return the places of cells among the filled ones."""
@@ -272,7 +272,7 @@ class FluxForms:
         across = sum(abs(n0[a]) * h[a] for a in range(d))
 
         def opening(side, sign):
-            """Share of the face that the body covers, on the side of the cell that sign * n0 points to."""
+            """Share of the face that the body covers, times `Grid.around`, on the side that sign * n0 looks to."""
             lower, upper = self.lower_face(side), self.upper_face(side)
             return sum(
                 ufl.conditional(ufl.gt(sign * n0[a], 0.5), upper[a], 0.0)

@@ -6,9 +6,10 @@ too stiff.  Here the law sees the deformation gradient with the volume ratio of 
 
     Fbar = (theta J_n / det F)^(1/d) F,     theta = sum w det(Delta) / sum w   over the cell's pieces that lock,
 
-d = 2 in plane strain.  Which do is a matter of their material (`Skeleton.nearly_incompressible`).  In a cell that these
-share with others the others see their own F: one constraint a cell is left, and neither kind of material knows of
-the other but by the displacements that they share.  The energy sum w psi(Fbar) / J_n has the derivative
+d = 2 in plane strain, 3 in axisymmetry.  Which do is a matter of their material (`Skeleton.nearly_incompressible`).  In
+a cell that these share with others the others see their own F: one constraint a cell is left, and neither kind of
+material knows of the other but by the displacements that they share.  The energy sum w psi(Fbar) / J_n has the
+derivative
 
     sum w [dPsi/dF : dF + pi d(det Delta)],   pi = (sum w dPsi/dtheta) / (sum w),
 
@@ -70,7 +71,7 @@ class MeanDilatation:
     def seen(self, points: FormPoints, F):
         """Return Fbar (d, d), what laws see of F, as UFL."""
         Fbar = (self._theta * ufl.det(points.F) / ufl.det(F)) ** (1 / self._d) * F
-        return block(Fbar) if self._grid.axisymmetric else Fbar
+        return ufl.variable(block(Fbar)) if self._grid.axisymmetric else Fbar
 
     def add(self, law: type[Skeleton], points: FormPoints, F, Fbar, values: Mapping[str, object]):
         """Add the pieces of a part that locks.

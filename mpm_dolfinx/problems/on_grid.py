@@ -19,7 +19,7 @@ from mpm_dolfinx.points.cut_domains import CutDomains
 from mpm_dolfinx.points.grid import sum_by
 from mpm_dolfinx.points.pressure_transport import Reconstruction, share_within, transport
 from mpm_dolfinx.problems.aslant import Gradients, off_facets
-from mpm_dolfinx.problems.fluxes import CellContents, Conduction, Mobility, Motion, OpenSides, PieceContents
+from mpm_dolfinx.problems.fluxes import CellContents, CellMotion, Conduction, Mobility, OpenSides, PieceContents
 from mpm_dolfinx.problems.ghost_penalty import stiffness
 from mpm_dolfinx.problems.layers import graded, mixed_cells
 from mpm_dolfinx.problems.momentum import MomentumForms, MomentumSystem
@@ -327,7 +327,7 @@ class Assembled:
                 return on_grid.mobility(data, begins)
             return self._mobility((), lambda: on_grid.mobility(data, True))
 
-        def set_fluxes(at_sides: OpenSides, kappa: Mobility, motion: Motion | None = None) -> Outflow:
+        def set_fluxes(at_sides: OpenSides, kappa: Mobility, motion: CellMotion | None = None) -> Outflow:
             off = self._off and (
                 self._off,
                 self._gradients((at_sides.cells, at_sides.seeps), lambda: Gradients(contents, at_sides)),

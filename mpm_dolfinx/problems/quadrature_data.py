@@ -100,8 +100,7 @@ class QuadraturePoints:
 
     def places(self, cut: CutDomains) -> PiecePlaces:
         """Return where the pieces of a cut lie."""
-        hoop = cut.hoop if self._grid.axisymmetric else None
-        pieces, parts = Places(self._grid, cut.cells, cut.x, cut.mixed, hoop), []
+        pieces, parts = Places(self._grid, cut.cells, cut.x, cut.mixed, cut.hoop), []
         if len(self.laws) > 1:
             part = cut.to_cells(self._scene.part_of(cut.points))
             rows = [np.flatnonzero(part == number) for number in range(len(self.laws))]
