@@ -102,11 +102,29 @@ def test_a_block_on_a_plane_sticks_until_it_slips(angle):
     assert s.t > 0.97
 
 
-@pytest.mark.parametrize("angle", [0.0, pytest.param(0.3, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("angle", [0.0, 0.3])
 def test_a_block_that_sticks_does_not_creep(angle):
     s, probes = on_a_plane(angle, 0.9)
     moved = np.array(s.run(26.0, 0.125, probes=probes).displacement)
     assert np.abs(moved[-1] - moved[8]).max() < 1e-3 * s.grid.h.min()
+
+
+@pytest.mark.parametrize(("way", "length"), [(-0.003, 1.5), (0.006, 3.0)], ids=["active", "passive"])
+def test_a_smooth_retaining_wall_has_the_pressure_of_rankine(way, length):
+    h = 1 / 8
+    grid = mpm.Grid([length, 1.25], [round(length / h) + 2, 10], lower=[-2 * h, 0])
+    strength = {"friction": 30.0, "dilation": 30.0, "cohesion": 20.0}
+    soil = mpm.MohrCoulomb(bulk=2e7, shear=1.2e7, grain_density=4000, porosity=0.5, **strength)
+    wall = mpm.Tool(mpm.HalfSpace((0, 0), (1, 0)), displacement=lambda t: (way * max(0, t - 1), 0))
+    walls = {"bottom": "y", "right": "x"}
+    weight = {"gravity": lambda t: (0, -9.81 * min(1, t))}
+    body = mpm.box(grid, [0, 0], [length, 1])
+    s = mpm.Simulation(grid, [body], [soil], fixed=walls, tools=[wall], **weight)
+    s.run(2.0, 0.25)
+    K = 3.0 ** np.sign(way)
+    exact = K * 0.5 * 2000 * 9.81 + np.sign(way) * 2 * 20 * np.sqrt(K)
+    assert s.tool_forces[0, 0] == pytest.approx(exact, rel=0.03)
 
 
 def work(friction, path, end, steps):
