@@ -341,3 +341,13 @@ def test_a_state_with_tools_may_be_put_back():
     s.state = replace(before)
     s.step(0.5)
     assert np.array_equal(once, s.points.corners)
+
+
+def test_a_disc_that_turns_drives_the_body_by_friction():
+    """Anti-clockwise on its top: to the right; its moment is mu times what it presses with, times its radius."""
+    turn = {"rotation": lambda t: 0.3 * max(0, t - 1), "centre": (0.5, 0.8), "friction": 0.3}
+    s = simple(shape=mpm.Ball((0.5, 0.8), 0.2), tool={"displacement": lambda t: (0, -0.01 * min(t, 1)), **turn})
+    s.run(2.0, 0.25)
+    along, down, moment = s.tool_forces[0]
+    assert along > 0
+    assert moment == pytest.approx(-0.2 * 0.3 * down, rel=1e-2)
