@@ -145,6 +145,17 @@ def to_and_fro(t):
     return np.stack([np.interp(t, [0, 1, 2, 4, 5, 6], column) for column in corners.T])
 
 
+def test_a_smooth_plate_gives_back_what_it_took():
+    """Down, along, and up, by less than resets the grid: but for the depth to which pressures are augmented."""
+
+    def path(t):
+        corners = np.array([[0, 0], [0, -3e-5], [3e-5, -3e-5], [0, 0]])
+        return np.stack([np.interp(t, [0, 1, 2, 3], column) for column in corners.T])
+
+    total, gross, _ = work(0.0, path, 3.0, 5)
+    assert abs(total) < 4e-4 * gross
+
+
 def test_friction_takes_energy_and_slips_at_its_coefficient():
     total, gross, force = work(0.3, to_and_fro, 6.0, 6)
     assert total > 0.2 * gross
