@@ -54,12 +54,12 @@ def test_a_plate_presses_a_cube_evenly_wherever_it_lies(angle, offset, error):
 
 def test_a_disc_presses_as_hertz_says():
     """16 cells over the half-width: this, force and pressure."""
-    cells, R, L, nu = 16, 20.0, 5.0, 0.3
+    cells, R, L, nu = 16, 20.0, 4.0, 0.3
     stiff = E / (1 - nu**2)
     grid = mpm.Grid([L, L + 1], [round(L * cells), round((L + 1) * cells)])
     top = L + 0.3 / cells
     soil = mpm.Hencky(bulk=E / (3 - 6 * nu), shear=E / (2 + 2 * nu))
-    disc = mpm.Tool(mpm.Ball((0, top + R), R), displacement=lambda t: (0, -0.055 * t))
+    disc = mpm.Tool(mpm.Ball((0, top + R), R), displacement=lambda t: (0, -0.05 * t))
     walls = {"left": "x", "right": "x", "bottom": "xy"}
     s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [L, top])], [soil], fixed=walls, tools=[disc])
     s.run(1.0, 1.0)
@@ -88,7 +88,7 @@ def on_a_plane(angle, reach, steps=8, mu=0.5):
     return s, mpm.probes([body], [[0.0, 0.0], [1.0, 0.0]])
 
 
-@pytest.mark.parametrize("angle", [0.0, 0.3])
+@pytest.mark.parametrize("angle", [pytest.param(0.0, marks=pytest.mark.slow), 0.3])
 def test_a_block_on_a_plane_sticks_until_it_slips(angle):
     s, probes = on_a_plane(angle, 0.995)
     moved = s.run(1.0, 0.125, probes=probes).displacement[-1]
@@ -110,7 +110,7 @@ def test_a_block_that_sticks_does_not_creep(angle):
     assert np.abs(moved[-1] - moved[8]).max() < 1e-3 * s.grid.h.min()
 
 
-@pytest.mark.parametrize(("way", "length"), [(-0.003, 1.5), (0.006, 3.0)], ids=["active", "passive"])
+@pytest.mark.parametrize(("way", "length"), [(-0.003, 1.5), pytest.param(0.006, 3.0, marks=pytest.mark.slow)])
 def test_a_smooth_retaining_wall_has_the_pressure_of_rankine(way, length):
     h = 1 / 8
     grid = mpm.Grid([length, 1.25], [round(length / h) + 2, 10], lower=[-2 * h, 0])
