@@ -167,6 +167,10 @@ PAIRS: dict[str, tuple[Make, Make]] = {
         block,
         lambda n: block(n, tractions=[mpm.Pressure("top", lambda t: LOAD * t)]),
     ),
+    "rough tool that touches nothing": (
+        block,
+        lambda n: block(n, tools=[mpm.Tool(mpm.HalfSpace((0, 2), (0, -1)), friction=0.3)]),
+    ),
     "ghost penalty on all faces": (block, weighted),
     "damping of pressure jumps": (lambda n: conducting(n, mpm.Hencky), lambda n: conducting(n, Watched)),
     "damping of what yields": (lambda n: sealed_soil(n, yields=False), sealed_soil),

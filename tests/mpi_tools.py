@@ -10,15 +10,15 @@ import mpm_dolfinx as mpm
 grid = mpm.Grid([1.3, 1.0], [13, 10])
 block = mpm.box(grid, [0.13, 0], [1.17, 0.73])
 soil = mpm.Hencky(bulk=4e6 / 3, shear=1e6, conductivity=1e-5)
-disc = mpm.Ball((0.65, 0.99), 0.25)
+disc = mpm.Ball((0.65, 0.98), 0.25)
 tools = [
-    mpm.Tool(disc, displacement=lambda t: (0.02 * t, -0.05 * t), friction=0.3),
+    mpm.Tool(disc, displacement=lambda t: (0.008 * t, -0.02 * t), friction=0.3),
     mpm.Tool(mpm.HalfSpace((1.17, 0), (-1, 0))),
 ]
 simulation = mpm.Simulation(
     grid, [block], [soil], fluid=mpm.Fluid(), fixed={"bottom": "xy"}, drained=[mpm.Drained("left")], tools=tools
 )
-result = simulation.run(1.0, 0.25, progress=False)
+result = simulation.run(1.0, 0.5, progress=False)
 points = simulation.points
 parts = simulation.grid.comm.gather((points.id, points.x, points.pressure, points.data["tool_0_shear"]))
 if parts:

@@ -93,6 +93,7 @@ BENCHMARK = {
     "body force": {"body force"},
     "pressure that follows the surface": {"tractions", "pressures"},
     "ghost penalty on all faces": {"ghost penalty"},
+    "rough tool that touches nothing": {"tools"},
     "damping of pressure jumps": {"damping of pressure jumps"},
     "damping of what yields": set(),
     "seepage face": set(),

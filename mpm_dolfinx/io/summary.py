@@ -85,7 +85,7 @@ def _solvers(s: Scene, state: State) -> list[Part]:
         _either("coupling", s.storage, f"{s.scheme.coupling}, {kind}", "no fluid: Newton on the momentum"),
         _either(
             "one factorisation for many steps",
-            s.momentum.linear and not side.pressures,
+            s.momentum.linear and not side.pressures and not side.tools.tools,
             "linear law: until active cells or time step change",
             "the tangent depends on the strain",
         ),

@@ -13,9 +13,9 @@ the step, from the traction t_n of the step before, which the points keep,
     t = P (t_n - k_t s),     |t| <= mu p + min(adhesion, 10 p)      by radial return,
 
 P the projection on the tangent plane: what sticks is elastic with a stiffness k_t, and gives back what it took.
-What slips is chosen after each Newton step (active sets): at first all sticks, whatever it would bear, and what slips
-to and fro sticks for the next step.  Decided in each residual anew all would slip to and fro, for there is no
-stiffness in slip.
+What slips is chosen after each Newton step (active sets): at first all sticks, whatever it would bear; what slips back
+sticks again, as soon as the balance is near, and then for as long.  Decided in each residual anew all would slip to and
+fro, for there is no stiffness in slip.
 """
 
 from __future__ import annotations
@@ -157,6 +157,7 @@ class ToolContact:
         self._strength = strength[self._number]
         self.grips = any(tool.grips for tool in tools)
         self._along = np.zeros((len(key), grid.dim))  # direction of the shear of what slips, else zero
+        self._turned = np.zeros(len(key), dtype=bool)  # what has slipped, and stuck again
         self._lambda, self._rounds = self._mean(rows.pressure), np.zeros(1, dtype=np.int64)
         self._touch: Latest[Touch] = Latest()
 
@@ -238,7 +239,9 @@ class ToolContact:
         touch, before = self.at(u), self._slips
         size = np.linalg.norm(touch.trial, axis=1)
         goes_on = (size > (1 - CLOSE) * touch.most) & (np.einsum("kd,kd->k", touch.trial, self._along) > 0)
-        slips = np.where(before, goes_on if sticks else True, size > (1 + CLOSE) * touch.most)
+        exceeds = (size > (1 + CLOSE) * touch.most) & (sticks | ~self._turned)
+        slips = np.where(before, goes_on if sticks else True, exceeds)
+        self._turned[:] |= before & ~slips
         new = (slips & (goes_on | ~before))[:, None]
         self._along[:] = np.where(new, touch.trial / np.maximum(size, LEAST)[:, None], slips[:, None] * self._along)
         return over_all(self.grid.comm, int((slips != before).sum())) > 0
