@@ -104,7 +104,7 @@ class Motion:
         cut, pieces = on_grid.cut, on_grid.data.pieces
         grid, n, d = cut.grid, len(points), cut.grid.dim
         at_nodes = nodal[grid.cell_nodes[pieces.cells]].transpose(0, 2, 1)
-        delta = np.eye(d) + at_nodes @ grid.shape_gradients(pieces.cells, pieces.x)
+        delta = np.eye(d) + at_nodes @ grid.shape_gradients(pieces.cells, on_grid.data.seen)
         if self._momentum.dilatation is not None:
             delta = self._momentum.dilatation.averaged(delta, on_grid.data)
         mean = [cut.mean(column) for column in cut.to_pieces(delta).reshape(-1, d * d).T]

@@ -15,8 +15,16 @@ from mpm_dolfinx.constitutive.fields import SceneMaterials
 from mpm_dolfinx.constitutive.skeleton import Fluid, Skeleton
 from mpm_dolfinx.forms.point_forms import FormPoints, Places, PointData
 from mpm_dolfinx.points.cut_domains import CutDomains
-from mpm_dolfinx.points.grid import Grid
+from mpm_dolfinx.points.grid import Grid, sum_by
 from mpm_dolfinx.points.material_points import MaterialPoints
+
+SHARE = 0.5
+"""Share of what a cell's gradient differs from its mean that laws see where all soil in it flows and dilates.
+
+Flow that dilates by sin psi of its shear at four points asks too much of a Q1 cell also where the volume is its mean:
+a footing with associated flow, phi = 20 degrees, 9 and 17 cells over its width, then carries 4.4 and 3.4 % too much,
+and the load still rises.  With one point a cell it carries 6.6 and 3.2 % too little, and flows.
+"""
 
 
 @dataclass(frozen=True)
@@ -26,6 +34,14 @@ class QuadratureData:
     pieces: PointData
     parts: tuple[PointData, ...]
     rows: tuple[NDArray[np.int64] | slice, ...]
+
+    @property
+    def seen(self) -> NDArray[np.float64]:
+        """Where laws see the gradient (m, d), m."""
+        x = self.pieces.x.copy()
+        for rows, part in zip(self.rows, self.parts, strict=True):
+            x[rows] = part.x
+        return x
 
 
 @dataclass(frozen=True)
@@ -87,11 +103,28 @@ class QuadraturePoints:
     def places(self, cut: CutDomains) -> PiecePlaces:
         """Return where the pieces of a cut lie."""
         pieces, parts = Places(self._grid, cut.cells, cut.x), []
-        if len(self.laws) > 1:
+        seen = self._seen(cut)
+        if len(self.laws) > 1 or seen is not None:
             part = cut.to_cells(self._scene.part_of(cut.points))
             rows = [np.flatnonzero(part == number) for number in range(len(self.laws))]
-            parts = [(own, pieces.part(own)) for own in rows]
+            x = cut.x if seen is None else seen
+            parts = [(own, Places(self._grid, cut.cells[own], x[own])) for own in rows]
         return PiecePlaces(pieces, tuple(parts))
+
+    def _seen(self, cut: CutDomains) -> NDArray[np.float64] | None:
+        """Return where laws see the gradient, if it is not at the pieces (m, d), m: see `SHARE`."""
+        if not self._scene.dilates:
+            return None
+        flows = cut.to_cells(self._scene.dilating(cut.points))
+        size, volume = self._grid.num_local, (cut.points.volume0 * cut.points.J)[cut.pieces.point]
+        weight = cut.pieces_to_cells(cut.pieces.fraction * volume)
+        whole = sum_by(cut.cells, weight, size)
+        all_flow = sum_by(cut.cells, weight * ~flows, size)[cut.cells] == 0
+        if not all_flow.any():
+            return None
+        columns = [sum_by(cut.cells, weight * column, size)[cut.cells] for column in cut.x.T]
+        middle = np.stack(columns, axis=1) / whole[cut.cells, None]
+        return np.where(all_flow[:, None], middle + SHARE * (cut.x - middle), cut.x)
 
     def data(self, cut: CutDomains, places: PiecePlaces, points: MaterialPoints) -> QuadratureData:
         """Return the pieces with all their data: those of a cut, with what the points carry now."""
