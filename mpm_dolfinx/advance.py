@@ -106,7 +106,7 @@ class Motion:
         """Return F (n, d, d) of the points after a step: the means of Delta F and of its det over their pieces."""
         pieces, grid, n, d = data.pieces, cut.grid, len(cut.points), cut.grid.stretches
         at_nodes = nodal[grid.cell_nodes[pieces.cells]].transpose(0, 2, 1)
-        delta = np.eye(grid.dim) + at_nodes @ pieces.places.shape_gradients(slice(None))
+        delta = np.eye(grid.dim) + at_nodes @ data.shape_gradients()
         if grid.axisymmetric:
             delta = np.pad(delta, ((0, 0), (0, 1), (0, 1)))
             delta[:, 2, 2] = pieces.places.stretch(nodal)

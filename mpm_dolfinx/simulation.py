@@ -22,7 +22,7 @@ from mpm_dolfinx.points.grid import Grid
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.problems.axis import check_axisymmetry, with_axis
 from mpm_dolfinx.problems.conditions import Displacement, Drained, Inflow, OnSide, Pressure, RigidPlate, Traction
-from mpm_dolfinx.problems.scene_parts import check_parts, check_physics
+from mpm_dolfinx.problems.scene_parts import check_options, check_parts
 from mpm_dolfinx.problems.thin import warn_thin
 from mpm_dolfinx.problems.tools import Tool
 from mpm_dolfinx.result import Report, Result
@@ -114,11 +114,9 @@ class Simulation:
         sources: Sequence[Callable] = (),
         later: Sequence[int] = (),
     ):
-        if quadrature not in ("domain", "point"):
-            raise ValueError(f"quadrature {quadrature!r}: must be domain or point")
         scheme = Scheme(coupling, tolerance)
         check_parts(grid, bodies, materials, later)
-        check_physics(fluid, pressure, terms, sources)
+        check_options(fluid, pressure, terms, sources, quadrature)
         grid.share(np.concatenate([body.centre for body in bodies]))
         warn_thin(grid, bodies, with_axis(grid, fixed), fluid is not None)
         check_axisymmetry(grid, bodies, quadrature, initial_stress)

@@ -279,6 +279,16 @@ class SceneMaterials:
                 out[rows] |= off.max(axis=tuple(range(1, off.ndim)), initial=0.0) > EVOLVED
         return out
 
+    @property
+    def dilates(self) -> bool:
+        """Whether the plastic flow of any soil may change its volume; the same on all processes."""
+        used = [self.materials[i] for i in self._used]
+        return any(m.dilates and (callable(m.dilation) or np.any(m.dilation)) for m in used)
+
+    def dilating(self, points: MaterialPoints) -> NDArray[np.bool_]:
+        """Return at which points (n,) soil has yielded whose plastic flow changes the volume."""
+        return self.evolved(points) & (self.table(points, lambda m: m.dilation if m.dilates else 0.0) > 0)
+
     def effective_stress(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the effective Cauchy stress (n, d, d), Pa, at the points; on all processes together.
 

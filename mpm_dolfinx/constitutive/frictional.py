@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from mpm_dolfinx.constitutive.skeleton import Field, Skeleton, _check, check_given
 
@@ -31,6 +32,8 @@ class Frictional(Skeleton):
     ValueError
         Naming the constant that is out of its range, or is not given.
     """
+
+    dilates: ClassVar = True
 
     friction: Field = None  # given always: without it a message says what it may be
     dilation: Field = None

@@ -129,6 +129,8 @@ class Skeleton:
     trial: ClassVar[Callable | None] = None
     residual: ClassVar[Callable | None] = None
     solution: ClassVar[Callable | None] = None
+    dilates: ClassVar[bool] = False
+    """Whether the law has an angle of `dilation`."""
     linear: ClassVar[bool] = False
     """Whether the stress is linear in F: one factorisation then serves for as long as the active cells stay."""
     state: ClassVar[Mapping[str, ArrayLike]] = {}

@@ -21,10 +21,16 @@ def check_parts(grid: Grid, bodies: Sequence[Body], materials: Sequence[Skeleton
     chosen("later", later, range(len(bodies)), "indices of the bodies")
 
 
-def check_physics(
-    fluid: Fluid | None, pressure: float | Callable, terms: Sequence[Callable], sources: Sequence[Callable]
+def check_options(
+    fluid: Fluid | None,
+    pressure: float | Callable,
+    terms: Sequence[Callable],
+    sources: Sequence[Callable],
+    quadrature: str,
 ) -> None:
-    """Refuse terms and sources that are no functions, what is no fluid, and pressures and sources without one."""
+    """Refuse terms and sources that are no functions, pressures and sources without fluid, and other quadratures."""
+    if quadrature not in ("domain", "point"):
+        raise ValueError(f"quadrature {quadrature!r}: must be domain or point")
     functions("terms", functions_of(terms))
     functions("sources", sources)
     if fluid is not None:
