@@ -127,7 +127,7 @@ class Result:
         """Return one quantity of the rows, where it is recorded."""
         return [value for row in self.rows if (value := getattr(row, name)) is not None]
 
-    def after(self, report: Report, small: float, first: float) -> Result:
+    def after(self, report: Report, small: float, first: float = 0.0) -> Result:
         """Return the histories after one more step; small: the step to try next, s; first: see `Result`."""
         return replace(
             self,

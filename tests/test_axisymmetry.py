@@ -14,6 +14,7 @@ from scipy.special import j0, j1, jn_zeros
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.points.cutting import cut, domain_volumes
+from mpm_dolfinx.problems import on_grid
 from mpm_dolfinx.verification.biot_fem import BiotFEM
 
 ELASTIC = mpm.NeoHookean(bulk=2e6, shear=1e6)
@@ -284,7 +285,9 @@ def slice_or_ring(inner):
     return s
 
 
-def test_a_ring_far_from_the_axis_is_a_slice():
+def test_a_ring_far_from_the_axis_is_a_slice(monkeypatch):
+    """But for the flow beside the two-point fluxes where bodies lie aslant, which rings do without."""
+    monkeypatch.setattr(on_grid, "off_facets", lambda contents, facets: facets[:0])
     flat, ring = slice_or_ring(0.0), slice_or_ring(RADIUS)
     moved = [s.points.x - s.points.origin.mean(axis=1) for s in (flat, ring)]
     stress = [s.point_fields().effective_stress for s in (flat, ring)]

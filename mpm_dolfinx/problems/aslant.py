@@ -30,6 +30,8 @@ NEAREST = 0.1
 """Share of a cell: what is nearer counts as if it were as far in the least squares."""
 SLACK = 1e-6
 """Share of the differences of pressure between neighbours by which limited pressures may pass them."""
+SIDES = 2.0
+"""Weight of all that is known beyond a cell's open sides in its least squares, by their areas, over a neighbour's."""
 FLAT = 1e-6
 """Share of the best known direction's weight below which a gradient along another one is unknown, and taken as none."""
 
@@ -79,8 +81,12 @@ class Gradients:
         place[rows] = np.arange(len(rows))
         self._faces = np.flatnonzero(off[at])
         self._at, self._reach, self._foot = place[at[self._faces]], sides.reach[self._faces], foot[self._faces]
+        self._normal = normal[self._faces]
         self._known = np.flatnonzero(((sides.shape > 0) & ~sides.seeps)[self._faces])
-        self._of_cells, self._of_sides = self._units(self._sealed(contents, sides)[rows], h.min())
+        size = np.linalg.norm(sides.area, axis=1)[self._faces[self._known]]
+        at_sides = self._at[self._known]
+        weight = SIDES * size / sum_by(at_sides, size, len(rows))[at_sides]
+        self._of_cells, self._of_sides = self._units(self._sealed(contents, sides)[rows], weight, h.min())
 
     def _sealed(self, contents: CellContents, sides: OpenSides) -> NDArray[np.float64]:
         """Return the area vectors (n, d) of sealed sides in the filled cells, over that of a cell's face."""
@@ -91,12 +97,15 @@ class Gradients:
             out[:, axis] -= area * grid.h[axis] / grid.cell_volume
         return np.where(np.linalg.norm(out, axis=1, keepdims=True) > ALONG, out, 0.0)
 
-    def _units(self, sealed: NDArray[np.float64], h: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _units(
+        self, sealed: NDArray[np.float64], weight: NDArray[np.float64], h: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the gradients by a unit of difference to each neighbour (n, 2 d, d), and to each side (m, d), 1/m."""
         known, d = self._known, self._way.shape[2]
         at, reach, near = self._at[known], self._reach[known], (NEAREST * h) ** 2
         to_cells = self._inside[:, :, None] * self._way / np.maximum((self._way**2).sum(axis=2), near)[:, :, None]
-        to_sides = reach / np.maximum((reach**2).sum(axis=1), near)[:, None]
+        distance = np.einsum("md,md->m", reach, self._normal[known])
+        to_sides = (weight / np.maximum(distance**2, near))[:, None] * reach
         size = np.linalg.norm(sealed, axis=1, keepdims=True)
         closed = np.divide(sealed, h * np.sqrt(np.maximum(size, size**2)), out=np.zeros_like(sealed), where=size > 0)
         A = np.einsum("nki,nkj->nij", to_cells, self._way) + closed[:, :, None] * closed[:, None, :]
