@@ -177,7 +177,8 @@ class _Weakened:
         materials = [_as_fields(m) for m in scene.materials.materials]
         options = scene.quadrature, scene.scheme, scene.method, scene.gravity is not None, 0.0
         terms, sources = scene.extensions
-        self._scene = Scene(scene.grid, scene.bodies, materials, scene.fluid, *options, [*terms, resistance], sources)
+        options = *options, [*terms, resistance], sources, {}  # what initial stresses need the materials have
+        self._scene = Scene(scene.grid, scene.bodies, materials, scene.fluid, *options)
         self._strengths = _strengths(scene, at_rest.points)
 
     def motion(self, factor: float, steps: int) -> NDArray[np.float64]:

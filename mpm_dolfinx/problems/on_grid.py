@@ -66,6 +66,7 @@ class OnGrid(Keyed):
         """Volumes (m,) of the pieces, m^d."""
         area, x = cut.plane(weight)
         moduli = [area * quadrature.rows(cut, points, scale) for scale in (stiffness, lambda m: m.shear)]
+        moduli[1] *= cut.to_cells(1.0 * materials.evolved(points))  # soil that has not yielded is firm enough
         momentum.ghost.set_contents(*(sum_by(cut.cells, rows, grid.num_local) for rows in (area, *moduli)))
         self.active = momentum.ghost.fill.x.array > 0
         """Which local cells hold something, ghosts included."""
