@@ -217,7 +217,7 @@ def draw(out: Path, dry: dict, wet: dict[float, Undrained]) -> None:
     right.set(xlabel="r / a0 (-)", ylabel="pore pressure / p0 (-)", title=f"Undrained to a / a0 = {MARK}, then drained")
     for ax in (left, right):
         if ax.has_data():
-            ax.legend(fontsize=7, markerscale=4 if ax is right else 1)
+            ax.legend(fontsize=8, markerscale=4 if ax is right else 1, ncol=2 if ax is right else 1)
         ax.grid(alpha=0.3)
     out.mkdir(parents=True, exist_ok=True)
     fig.savefig(out / "cavity.png", dpi=90)

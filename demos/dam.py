@@ -144,10 +144,10 @@ def draw(o: argparse.Namespace, dam: Dam) -> None:
             color = "w" if ax is axes[0, 0] else f"C{k}"
             ax.tricontour(*corners.mean(axis=1).T, p, levels=[0.0], colors=color, linewidths=1.5)
             ax.plot([0, 1 + SLOPE * level], [level, level], color=f"C{k}", label=f"{1e6 * flows[1]:.2f}")
-            ax.set(aspect="equal", xlim=(0, BASE + 2), ylim=(0, HEIGHT + 0.5), ylabel="m")
+            ax.set(aspect="equal", xlim=(0, BASE + 2), ylim=(0, HEIGHT + 0.5), xlabel="x (m)", ylabel="y (m)")
     axes[0, 0].set_title("seepage through the dam")
     axes[1, 0].set_title("free surfaces as the reservoir falls")
-    axes[1, 0].legend(title="10⁻⁶ m²/s seep out", fontsize="small", loc="upper right")
+    axes[1, 0].legend(title="10⁻⁶ m²/s seep out", fontsize=9, loc="upper right")
     o.out.mkdir(parents=True, exist_ok=True)
     fig.savefig(o.out / "dam.png", dpi=130)
 

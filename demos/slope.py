@@ -119,7 +119,7 @@ def draw(out: Path, safety: mpm.Safety, before: np.ndarray, corners: np.ndarray,
         style = {"color": "C2" if factor <= safety.bounds[0] else "C3", "marker": "o", "ms": 3, "lw": 1}
         trials.semilogy(np.arange(1, len(motion) + 1), motion, **style)
         trials.annotate(
-            f"{factor:.3f}", (len(motion), motion[-1]), fontsize=7, xytext=(3, 0), textcoords="offset points"
+            f"{factor:.3f}", (len(motion), motion[-1]), fontsize=8, xytext=(3, 0), textcoords="offset points"
         )
     trials.set(
         xlabel="step",

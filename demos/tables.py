@@ -5,8 +5,9 @@ A figure is followed by a comment that names the run of a demo, the entries of w
 
     | Terzaghi, p at T_v = 0.5 | 0.004 % <!-- terzaghi --cells 50; errors/p_0.5; % --> |
 
-What a demo has printed is kept in demos/results, with its run time in `seconds` and the release of dolfinx.  A table
-that a demo writes as a file stands between `<!-- error_vs_runtime; comparison.md -->` and `<!-- end -->`.
+What a demo has printed is kept in demos/results, with its run time in `seconds` and the release of dolfinx, its
+pictures in demos/pictures.  A table that a demo writes as a file stands between
+`<!-- error_vs_runtime; comparison.md -->` and `<!-- end -->`.
 
     bash demos/run.sh tables                        # writes the figures anew from demos/results
     bash demos/run.sh tables --run terzaghi mandel  # runs these demos first; `--run all` takes hours
@@ -18,6 +19,7 @@ import argparse
 import json
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -77,7 +79,7 @@ def runs(pages: Iterable[str]) -> dict[str, str]:
 
 
 def take(run: str, table: str) -> None:
-    """Run a demo, and keep what it prints and the table that it writes."""
+    """Run a demo, and keep what it prints, the table that it writes, and its pictures on the pages."""
     import dolfinx
 
     demo, *options = shlex.split(run)
@@ -95,6 +97,9 @@ def take(run: str, table: str) -> None:
         kept(run).write_text(json.dumps(printed, indent=1) + "\n")
         if table:
             kept(run).with_suffix(".md").write_text((Path(folder) / table).read_text())
+        for picture in (DEMOS / "pictures").iterdir():  # those of the pages
+            if (Path(folder) / picture.name).exists():
+                shutil.copy(Path(folder) / picture.name, picture)
 
 
 def main(argv: list[str] | None = None) -> None:
