@@ -119,14 +119,19 @@ def _check_simple(outlines: Sequence[NDArray[np.float64]]) -> None:
 
 def _turn(a: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return on which side of the lines from a to b places c (n, 2) lie, and how far, times the way."""
-    return np.cross(b - a, c - a)
+    return _cross(b - a, c - a)
+
+
+def _cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the products (n,), across the plane, of vectors (n, 2)."""
+    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
 
 
 def _inside(x: NDArray[np.float64], outline: NDArray[np.float64]) -> bool:
     """Return whether a place (2,) is inside of a polygon: a ray from it crosses an odd number of edges."""
     a, b = outline - x, np.roll(outline, -1, axis=0) - x
     crosses = (a[:, 1] > 0) != (b[:, 1] > 0)
-    return bool((crosses & ((np.cross(a, b) > 0) == (b[:, 1] > a[:, 1]))).sum() % 2)
+    return bool((crosses & ((_cross(a, b) > 0) == (b[:, 1] > a[:, 1]))).sum() % 2)
 
 
 @contextmanager
