@@ -117,12 +117,9 @@ class MechanicalBoundary:
             plates = self._plate_data(forms, cut, points) if self.plates else None
             none = (None, np.empty(0, dtype=np.int64), np.empty((0, 2**self.grid.dim)))
             holds = self._hold_data(forms, cut, points, t) if self.holds else none
-            own = [
-                self._own_data(term.points, faces, cut, points)
-                for term, faces in zip(forms.own, self._terms, strict=True)
-            ]
-            tools = self.tools.placed(cut, points, start, t)
-            return SideData(loads, pressures, plates, *holds, tools, tuple(own))
+            pairs = zip(forms.own, self._terms, strict=True)
+            own = tuple(self._own_data(term.points, faces, cut, points) for term, faces in pairs)
+            return SideData(loads, pressures, plates, *holds, self.tools.placed(cut, points, start, t), own)
 
     def _load_data(self, forms: SideForms, cut: CutDomains, points: MaterialPoints, t: float) -> PointData:
         """Return the dead loads on the surface."""

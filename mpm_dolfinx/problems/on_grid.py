@@ -290,9 +290,9 @@ class Assembled:
             reach = np.abs(np.concatenate([grid.lower, grid.upper])).max()
             stiffest = float(sides.holds["stiffness"].max(initial=0.0))
             self.round_off += 1e-15 * over_all(grid.comm, stiffest, MPI.MAX) * reach
-        self._off = None
         if sides.tools is not None:
             self.round_off += over_all(grid.comm, sides.tools.rounding, MPI.MAX)
+        self._off = None
         if self.storage is not None:
             self.storage.set_alternation()
             if (form := storage.fluxes.aslant) is not None:
