@@ -142,7 +142,7 @@ def draw(o: Namespace, out: Outcome) -> None:
     T = np.linspace(1e-3, out.T[-1], 400)
     ax.plot(T, exact(T), color="black", lw=1, label="Cryer (1963)")
     ax.plot(out.T, out.pressure, "o", ms=4, mfc="none", label=f"material points, {o.cells} cells to the radius")
-    ax.axhline(1, color="grey", lw=0.6, ls="--")
+    ax.axhline(1, color="grey", lw=0.6, ls="--", label="the load")
     ax.set(xlabel="reduced time $c_v t / R^2$ (-)", ylabel="pressure at the centre / load (-)", title="Cryer's sphere")
     ax.set(xlim=(0, out.T[-1]), ylim=(0.9, 1.4))
     ax.legend(loc="lower left")

@@ -198,10 +198,11 @@ def draw(o: Namespace, runs: dict[float, dict], points: dict, fem: tuple[np.ndar
     left.set(xlabel="cycles", ylabel="stress left at zero load / at the peak", xscale="log", yscale="log")
     left.set_title("What is left of the stress")
     last = runs[o.h[-1]]
-    for run, style, color in ((last, "-", COLORS[len(runs) - 1]), (points, "s--", "crimson")):
+    both = ("domains", last, "-", COLORS[len(runs) - 1]), ("standard MPM", points, "s--", "crimson")
+    for name, run, style, color in both:
         end = len(run["left"]) * o.steps
         part = slice(max(0, end - o.steps), end + 1)
-        loop.plot(-run["tips"][part], run["force"][part] / 1e3, style, ms=3, color=color)
+        loop.plot(-run["tips"][part], run["force"][part] / 1e3, style, ms=3, color=color, label=name)
     loop.plot(-fem[0], fem[1] / 1e3, "k:", lw=2.5, label="Taylor-Hood FEM, first cycle")
     loop.set(xlabel="deflection of the tip (m)", ylabel="load (kPa)")
     loop.set_title(f"Load and deflection, cycle {o.cycles}, h = {o.h[-1]:g} m")

@@ -139,7 +139,7 @@ def draw(o: Namespace, dam: Dam) -> None:
             ax.tricontour(*corners.mean(axis=1).T, p, levels=[0.0], colors=color, linewidths=1.5)
             ax.plot([0, 1 + SLOPE * level], [level, level], color=f"C{k}", label=f"{1e6 * flows[1]:.2f}")
             ax.set(aspect="equal", xlim=(0, BASE + 2), ylim=(0, HEIGHT + 0.5), xlabel="x (m)", ylabel="y (m)")
-    axes[0, 0].set_title("seepage through the dam")
+    axes[0, 0].set_title("seepage through the dam; white: its free surface, p = 0")
     axes[1, 0].set_title("free surfaces as the reservoir falls")
     axes[1, 0].legend(title="10⁻⁶ m²/s seep out", fontsize=9, loc="upper right")
     common.save(fig, o.out / "dam.png")

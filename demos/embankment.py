@@ -154,7 +154,12 @@ def draw(o: Namespace, bund: Bund) -> None:
         ax.plot([CREST + SLOPE * LIFTS, CREST, 0], [CLAY, CLAY + LIFTS, CLAY + LIFTS], color="grey", lw=0.8, ls=":")
         ax.plot([0, WIDTH], [CLAY, CLAY], color="grey", lw=0.8, ls=":")
         ax.set(
-            aspect="equal", xlim=(0, WIDTH), ylim=(0, CLAY + LIFTS + 0.5), title=title, xlabel="x (m)", ylabel="y (m)"
+            aspect="equal",
+            xlim=(0, WIDTH),
+            ylim=(0, CLAY + LIFTS + 0.5),
+            title=f"{title}; dotted: as built",
+            xlabel="x (m)",
+            ylabel="y (m)",
         )
         fig.colorbar(domains, ax=ax, label="excess pressure (kPa)", shrink=0.8)
     ax, days = axes[2, 0], np.array(bund.t) / DAY

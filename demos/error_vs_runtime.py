@@ -262,7 +262,7 @@ def table(comparison: list[dict]) -> list[list[str]]:
 
 def draw(out: Path, case: str, rows: list[Row]) -> None:
     """Draw error against time: solid lines from coarse to fine cells, dashed ones from few to many steps."""
-    fig, ((ax,),) = common.figure(1, 1, (7.5, 5))
+    fig, ((ax,),) = common.figure(1, 1, (9.5, 5))
     usual = Counter(r.steps for r in rows).most_common(1)[0][0]
     for i, method in enumerate(dict.fromkeys(r.method for r in rows)):
         mine = [r for r in rows if r.method == method and np.isfinite(r.error)]
@@ -278,7 +278,7 @@ def draw(out: Path, case: str, rows: list[Row]) -> None:
         ax.plot([], [], "k--", lw=1, label="the finest cells, other steps")
     ax.set(xlabel="time of the time loop (s)", ylabel="relative error (-)", title=f"{case}: error against run time")
     ax.grid(alpha=0.3, which="both")
-    ax.legend(fontsize=8)
+    ax.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0))
     common.save(fig, out / f"{case}.png", dpi=120)
 
 

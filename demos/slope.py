@@ -111,12 +111,14 @@ def draw(out: Path, safety: mpm.Safety, before: np.ndarray, corners: np.ndarray,
     trials.set(
         xlabel="step",
         ylabel="motion in the step (m)",
-        title=f"Strength over 1 to 2: factor of safety {safety.factor:.3f}",
+        title=f"Factor of safety {safety.factor:.3f}: trials that come to rest (green), or fail (red)",
     )
     quads = common.domains(after, corners, moved, cmap="viridis", linewidth=0.1)
     common.domains(after, before, facecolor="none", edgecolors="grey", linewidth=0.1, alpha=0.5)
     fig.colorbar(quads, ax=after, label="displacement (m)", shrink=0.7)
-    after.set(xlabel="x (m)", ylabel="y (m)", aspect="equal", title=f"Strength over {WEAKER}: at rest again")
+    after.set(
+        xlabel="x (m)", ylabel="y (m)", aspect="equal", title=f"Strength over {WEAKER}: at rest again; grey: before"
+    )
     after.autoscale_view()
     common.save(fig, out / "slope.png", dpi=90)
 

@@ -307,7 +307,8 @@ def draw(path: Path, run: Slump) -> None:
     for row, (name, k) in zip(axes, chosen.items(), strict=True):
         frame = run.frames[k]
         left, right = panels(row, run, frame)
-        row[0].set(title=f"{name}, t = {time(frame.t)}", ylabel="y (m)")
+        first = " (dotted: at the start)" if row is axes[0] else ""
+        row[0].set(title=f"{name}, t = {time(frame.t)}{first}", ylabel="y (m)")
         row[1].set(title=rf"$\gamma' H / c$ = {SCALE / frame.cohesion:.3g}, slope {frame.slope:.0f}°")
     for ax in axes[-1]:
         ax.set(xlabel="x (m)")
