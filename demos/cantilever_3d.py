@@ -10,8 +10,8 @@ the test of the domains' exact pieces.  Runs on any number of processes; --profi
 Errors, over L: `v` and `u`, the distance of the tip's deflection and shortening from the rod's, `w`, its
 displacement across the load, and `drift`, the tip's greatest distance from that of most steps.
 
-The tip goes too far as stress is constant in a point's domain: n of them over the height bend by 1/n² too much.  `v` with
-2, 4 and 8 cells (n = 4, 8, 16), in 10 steps: 0.0129, 0.0034, 0.0010; in the plane 0.0127, 0.0033, 0.0010.
+The tip goes too far as stress is constant in a point's domain: n of them over the height bend by 1/n² too much.
+`v` with 2, 4 and 8 cells (n = 4, 8, 16), in 10 steps: 0.0129, 0.0034, 0.0010; in the plane 0.0127, 0.0033, 0.0010.
 """
 
 from __future__ import annotations
