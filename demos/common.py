@@ -54,10 +54,12 @@ def results(o: argparse.Namespace) -> Iterator[dict]:
     """
     out, start = {}, time.perf_counter()
     if first() and o.takes:
-        print(f"It takes about {o.takes}.", flush=True)
+        print(f"It takes about {o.takes}, and longer the first time, when its forms are compiled.", flush=True)
     try:
         yield out
         out.setdefault("converged", True)
+        if first() and not out["converged"]:
+            print("error: not within the bounds that the demo keeps with its usual options", file=sys.stderr)
     except mpm.GaveUp as error:
         out |= {"wall_s": error.result.wall, "converged": False}
         if first():
