@@ -5,9 +5,9 @@ A scene is a `Simulation` of a `Grid`, bodies (`box`, `shape`, `mapped`, `from_m
 `NeoHookean`, `LinearElastic`, `DruckerPrager`, `SofteningDruckerPrager`, `MohrCoulomb`, `ModifiedCamClay`, or your own
 `Skeleton`), a `Fluid` and conditions on the sides of the bodies (`Traction`, `Pressure`, `Displacement`, `RigidPlate`,
 `Drained`, `Inflow`, `water`), and rigid tools (`Tool` of a `HalfSpace`, `Ball`, `Convex`, `Cone`).  Its `run` gives a
-`Result` with what `probes` record, and feeds a `Writer` and a `Checkpoint`, from which `resume` goes on; `stage`
-changes the scene between two runs, and `factor_of_safety` weakens it until it slides.  Terms and sources in UFL: see
-`mpm_dolfinx.constitutive.user_functions`.
+`Result` with what `probes` record, and feeds a `Writer`, whose files `one_file` joins, and a `Checkpoint`, from which
+`resume` goes on; `stage` changes the scene between two runs, and `factor_of_safety` weakens it until it slides.  Terms
+and sources in UFL: see `mpm_dolfinx.constitutive.user_functions`.
 
 SI units throughout.  Stress is positive in tension, pore pressure in compression; 2D is plane strain, and forces
 are those of a slice of 1 m, or axisymmetric (`Grid`), and forces are those all around.
@@ -33,6 +33,7 @@ from mpm_dolfinx.constitutive.skeleton import (
 from mpm_dolfinx.constitutive.softening import SofteningDruckerPrager
 from mpm_dolfinx.errors import GaveUp, LeftGrid, NotConverged
 from mpm_dolfinx.io.checkpoint import Checkpoint, resume
+from mpm_dolfinx.io.one_file import one_file
 from mpm_dolfinx.io.writer import Writer
 from mpm_dolfinx.points.bodies import box, mapped, shape
 from mpm_dolfinx.points.grid import Grid
@@ -93,6 +94,7 @@ __all__ = [
     "hydrostatic",
     "kozeny_carman",
     "mapped",
+    "one_file",
     "polygon",
     "probes",
     "resume",

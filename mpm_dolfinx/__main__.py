@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Versions and solvers that a report of a bug should name, and laboratory tests of soil laws."""
+"""Versions and solvers that a report of a bug should name, laboratory tests of soil laws, and files of a run as one."""
 
 from __future__ import annotations
 
@@ -78,6 +78,8 @@ def main(argv: list[str] | None = None) -> None:
     lab.add_argument("--rate", type=float, help="strain in a second, of laws that depend on it, 1/s")
     lab.add_argument("--cell-size", type=float, help="size of cells, of laws that soften, m")
     lab.add_argument("--draw", help="file of a picture")
+    one = commands.add_parser("one-file", help="write the points of a run as one file of ParaView's, points.xdmf")
+    one.add_argument("folder", help="that of the Writer")
     o = parser.parse_args(argv)
     if MPI.COMM_WORLD.rank > 0:
         return
@@ -85,9 +87,12 @@ def main(argv: list[str] | None = None) -> None:
         print("\n".join(f"{name:14}{value}" for name, value in info().items()))
         return
     try:
-        run_element_test(o)
-    except (ValueError, TypeError, mpm_dolfinx.NotConverged) as error:
-        lab.error(" ".join(str(error).split()))
+        if o.command == "one-file":
+            print(mpm_dolfinx.one_file(o.folder))
+        else:
+            run_element_test(o)
+    except (ValueError, TypeError, OSError, mpm_dolfinx.NotConverged) as error:
+        {"one-file": one, "element-test": lab}[o.command].error(" ".join(str(error).split()))
 
 
 if __name__ == "__main__":

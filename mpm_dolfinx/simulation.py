@@ -119,7 +119,7 @@ class Simulation:
         check_options(fluid, pressure, terms, sources, quadrature)
         grid.share(np.concatenate([body.centre for body in bodies]))
         warn_thin(grid, bodies, with_axis(grid, fixed), fluid is not None)
-        check_axisymmetry(grid, bodies, quadrature, initial_stress)
+        check_axisymmetry(grid, bodies, quadrature)
         began, weighs = time.perf_counter(), gravity is not None
         options = (quadrature, scheme, method, weighs, pressure, terms, sources)
         initial = by_body(initial_stress, bodies, later)

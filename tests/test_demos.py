@@ -27,6 +27,8 @@ QUICK = {
     "coupling_iterations": ("--quick --h 0.06", ["iterations.png", "iterations.csv", "iterations.md", "roughness.md"]),
     "small_steps": ("--cells 10 --steps 1 10 40 --strip-cells 10", ["small_steps.png", "strip.png"]),
     "cantilever_3d": ("--cells 2 --steps 2 4", ["cantilever_3d.png"]),
+    "image": ("--pixels 12", ["image.png"]),
+    "strip": ("--cells 8 --steps 4", ["strip.png"]),
     "cryer": ("--cells 6 --steps 12", ["cryer.png"]),
     "cantilever": ("--cells 2 --steps 20", ["cantilever.png"]),
     "cycles": ("--h 0.1 --cycles 2 --turn 0.25", ["cycles.png", "cycles.csv"]),
