@@ -69,6 +69,7 @@ def begin_stage(
     bare, gravity = before.mechanical.tools.let_go(state.points), None
     if scene.initial.given:
         gravity = begun.gravity_at(state.t)
+    bare = _without_extra(scene, bare, add, fields) if add else bare
     points, new = _filled(scene, bare.of(gone, kept=False), there, add, gravity)
     points = begun.mechanical.tools.grip(points, None if "tools" in named else state.points)
     if transported is not None:
@@ -123,6 +124,17 @@ def _filled(
         there.append(fill)
         waiting.remove(fill)
     return points, new
+
+
+def _without_extra(
+    scene: Scene, points: MaterialPoints, add: Sequence[int], fields: Mapping[str, ArrayLike]
+) -> MaterialPoints:
+    """Return points without the data that only a stage gave them, which bodies that come have not."""
+    extra = points.data.keys() - scene.materials.seeded.data.keys()
+    for name in sorted(extra - fields.keys()):
+        what = f"stage: add: body {add[0]}: its points have no {name!r}"
+        raise ValueError(f"{what}, must be given anew for all in fields=")
+    return replace(points, data={name: rows for name, rows in points.data.items() if name not in extra})
 
 
 def _ids(bodies: Sequence[Body], chosen: Sequence[int]) -> NDArray[np.int64]:

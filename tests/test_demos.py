@@ -59,7 +59,7 @@ def run(demo, arguments):
 
 
 def test_every_demo_is_run():
-    assert {p.stem for p in (ROOT / "demos").glob("*.py")} == {*QUICK, "tutorial", "tables"}
+    assert {p.stem for p in (ROOT / "demos").glob("*.py")} == {*QUICK, "tutorial", "tables", "common"}
 
 
 def test_the_tutorial_s_assertions_hold(tmp_path):

@@ -176,3 +176,14 @@ def test_a_run_resumed_after_a_fill_came_has_the_same_bits(quadrature, tmp_path)
     other.run(3.0, 0.5, progress=False)
     assert other.t == 3.0 and (one.points.corners == other.points.corners).all()
     assert one.points.volume0.sum() > 8.0 + 2.0 + 0.1
+
+
+def test_what_a_stage_gave_the_points_must_be_given_anew_when_a_body_comes():
+    grid = mpm.Grid([1, 1], [4, 4])
+    bodies = [mpm.box(grid, [0, 0], [1, 0.5]), mpm.box(grid, [0, 0.5], [1, 1])]
+    s = mpm.Simulation(grid, bodies, [SOFT], fixed={"bottom": "xy"}, later=[1])
+    s.stage(fields={"damage": np.arange(len(s.points))})
+    with pytest.raises(ValueError, match=r"stage: add: body 1: its points have no 'damage', must be given anew"):
+        s.stage(add=[1])
+    s.stage(add=[1], fields={"damage": np.arange(sum(map(len, bodies)))})
+    assert (s.points.data["damage"] == np.arange(len(s.points))).all()

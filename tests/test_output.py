@@ -24,6 +24,7 @@ from test_restart import block, cut_beam
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.__main__ import main
+from mpm_dolfinx.points.cutting import volumes
 from mpm_dolfinx.result import Report
 
 
@@ -347,3 +348,30 @@ def test_two_runs_do_not_write_into_one_folder(tmp_path):
     assert other.returncode == 1 and "another run writes into it, must be one of its own" in other.stderr
     mpm.Writer(simulation, tmp_path / "out")
     assert subprocess.run([sys.executable, "-c", script, str(tmp_path / "new")], **here).returncode == 0
+
+
+def test_tools_are_written_where_they_are(tmp_path):
+    """A disc that goes down, and a plate beside the grid, of which nothing is to be seen."""
+    grid = mpm.Grid([1.0, 1.0], [8, 8])
+    disc = mpm.Tool(mpm.Ball((0.5, 0.75), 0.25), displacement=lambda t: (0, -0.06 * t))
+    walls = {"left": "x", "right": "x", "bottom": "xy"}
+    soil, beside = mpm.Hencky(bulk=1e6, shear=6e5), mpm.Tool(mpm.HalfSpace((0, 1.5), (0, -1)))
+    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 0.5])], [soil], fixed=walls, tools=[disc, beside])
+    s.run(1.0, 1.0, observe=mpm.Writer(s, tmp_path))
+    files = index(tmp_path / "tools.pvd")
+    assert list(files) == [0.0, 1.0]
+    drawn = meshio.read(files[1.0][0])
+    assert not drawn.cell_data["tool"][0].any()
+    assert drawn.cell_data["force"][0] == pytest.approx(np.tile([*s.tool_forces[0, :2], 0.0], (len(drawn.cells[0]), 1)))
+    r = np.linalg.norm(drawn.points[:, :2] - [0.5, 0.69], axis=1)
+    assert r.max() == pytest.approx(0.25, rel=1e-6) and (r > 0.24).sum() > 16
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_tools_are_drawn_up_to_their_surface(dim):
+    grid, up = mpm.Grid([1.0] * dim, [8] * dim), np.eye(dim)[-1]
+    edges = np.array(np.meshgrid(*[[0.0, 0.4]] * dim)).reshape(dim, -1).T
+    drawn = mpm.Tool(mpm.Convex(edges), displacement=0.33 * up).drawn(grid, 0.0)
+    assert drawn.min(axis=(0, 1)) == pytest.approx(0.33 * up, abs=1e-9)
+    assert drawn.max(axis=(0, 1)) == pytest.approx(0.4 + 0.33 * up)
+    assert volumes(drawn).sum() == pytest.approx(0.4**dim, rel=0.01)

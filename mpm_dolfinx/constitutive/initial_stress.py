@@ -314,4 +314,6 @@ def _no_constants(points: MaterialPoints, target: NDArray[np.float64], given: ND
 def _not_borne(materials: SceneMaterials, points: MaterialPoints, target: NDArray, law: NDArray, i: int) -> str:
     name = materials.laws[law[i]].__name__
     allowed = f"what {name} can bear: inside its yield surface"
-    return f"initial_stress at {points.x[i]}: {target[i].tolist()} Pa, must be {allowed}"
+    tension = np.trace(target[i]) > 0  # pores press by more than the weight above
+    more = "; of open water above it K0 takes the weight as surcharge" if tension and points.pressure[i] > 0 else ""
+    return f"initial_stress at {points.x[i]}: {target[i].tolist()} Pa, must be {allowed}{more}"

@@ -177,10 +177,10 @@ class Grid:
             load = sum_by(self.number(self.index(x)), np.ones(len(x)), int(np.prod(self.shape)))
             owner = owners(load.reshape(self.shape), self.comm.size)
             own = np.flatnonzero(owner.ravel() == self.comm.rank)
-            mesh = _compat.box_mesh(self.comm, self._corners(own), self._nodes(), *destinations(owner, own))
+            mesh = _compat.box_mesh(self.comm, self.corners(own), self._nodes(), *destinations(owner, own))
             self._made.append(Cells(self, mesh, owner.ravel()))
 
-    def _corners(self, cells: NDArray[np.int64]) -> NDArray[np.int64]:
+    def corners(self, cells: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return the lexicographic numbers of the nodes (n, 2^d) of cells."""
         bits = np.arange(2**self.dim)[:, None] >> np.arange(self.dim) & 1
         index = np.stack(np.unravel_index(cells, self.shape), axis=-1)[:, None] + bits
