@@ -80,10 +80,9 @@ def constants_of(law: type[mpm_dolfinx.Skeleton], texts: Sequence[str]) -> dict[
     out, known = {}, [f.name for f in fields(law) if f.init]
     for text in texts:
         name, equals, value = text.partition("=")
+        names = f"must be name=value, name one of {', '.join(known)}"
         if not equals or name not in known or name in out:
-            wrong = (
-                "is given twice" if equals and name in out else f"must be name=value, name one of {', '.join(known)}"
-            )
+            wrong = "is given twice" if equals and name in out else names
             raise ValueError(f"{law.__name__}: {text!r} {wrong}")
         out[name] = number(f"{law.__name__}: {name}", value)
     for f in fields(law):
