@@ -20,7 +20,6 @@ from mpm_dolfinx.constitutive.element_test import ElementTest, element_test
 from mpm_dolfinx.constitutive.initial_stress import K0, hydrostatic
 from mpm_dolfinx.constitutive.mohr_coulomb import MohrCoulomb
 from mpm_dolfinx.constitutive.skeleton import (
-    LAWS,
     Field,
     Fluid,
     Hencky,
@@ -53,7 +52,6 @@ __version__ = "0.1.0"
 __all__ = [
     "COUPLINGS",
     "K0",
-    "LAWS",
     "Ball",
     "Checkpoint",
     "Cone",
