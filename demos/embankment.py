@@ -163,7 +163,9 @@ def draw(o: argparse.Namespace, bund: Bund) -> None:
         ax.add_collection(domains)
         ax.plot([CREST + SLOPE * LIFTS, CREST, 0], [CLAY, CLAY + LIFTS, CLAY + LIFTS], color="grey", lw=0.8, ls=":")
         ax.plot([0, WIDTH], [CLAY, CLAY], color="grey", lw=0.8, ls=":")
-        ax.set(aspect="equal", xlim=(0, WIDTH), ylim=(0, CLAY + LIFTS + 0.5), title=title, xlabel="x (m)", ylabel="y (m)")
+        ax.set(
+            aspect="equal", xlim=(0, WIDTH), ylim=(0, CLAY + LIFTS + 0.5), title=title, xlabel="x (m)", ylabel="y (m)"
+        )
         fig.colorbar(domains, ax=ax, label="excess pressure (kPa)", shrink=0.8)
     ax, days = axes[2, 0], np.array(bund.t) / DAY
     ax.plot(days, bund.axis, color="C0", label="on the axis")
