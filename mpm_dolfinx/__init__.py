@@ -40,6 +40,7 @@ from mpm_dolfinx.points.mesh_files import from_mesh
 from mpm_dolfinx.points.polygon import polygon
 from mpm_dolfinx.points.probes import probes
 from mpm_dolfinx.problems.conditions import Displacement, Drained, Inflow, OnSide, Pressure, RigidPlate, Traction
+from mpm_dolfinx.problems.contacts import Contact
 from mpm_dolfinx.problems.tools import Ball, Cone, Convex, HalfSpace, Tool
 from mpm_dolfinx.problems.water import water
 from mpm_dolfinx.result import Result
@@ -55,6 +56,7 @@ __all__ = [
     "Ball",
     "Checkpoint",
     "Cone",
+    "Contact",
     "Convex",
     "Displacement",
     "Drained",
