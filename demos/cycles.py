@@ -203,11 +203,11 @@ def draw(o: Namespace, runs: dict[float, dict], points: dict, fem: tuple[np.ndar
         end = len(run["left"]) * o.steps
         part = slice(max(0, end - o.steps), end + 1)
         loop.plot(-run["tips"][part], run["force"][part] / 1e3, style, ms=3, color=color, label=name)
-    loop.plot(-fem[0], fem[1] / 1e3, "k:", lw=2.5, label="Taylor-Hood FEM, first cycle")
+    loop.plot(-fem[0], fem[1] / 1e3, "k:", lw=2.5, label="FEM, first cycle")
     loop.set(xlabel="deflection of the tip (m)", ylabel="load (kPa)")
     loop.set_title(f"Load and deflection, cycle {o.cycles}, h = {o.h[-1]:g} m")
-    for ax in (left, loop):
-        ax.legend()
+    for ax, place in ((left, "best"), (loop, "upper left")):
+        ax.legend(loc=place)
         ax.grid(alpha=0.3)
     common.save(fig, o.out / "cycles.png")
 
