@@ -15,13 +15,11 @@ cylinder, which goes down at once.
 
 from __future__ import annotations
 
-import argparse
-import json
+from argparse import Namespace
 from dataclasses import dataclass
-from pathlib import Path
 
+import common
 import numpy as np
-import poroelastic_beam as beam
 
 import mpm_dolfinx as mpm
 
@@ -39,7 +37,7 @@ TIMES = np.geomspace(1e-4, 10, 21)  # over it: at which the force is recorded
 class Contact:
     """The contact at a time: force (N/m), places (m,), m, and pressures (m,), Pa, of the gel's points at the surface.
 
-    mean, half: largest pressure, Pa, and half-width, m, of the ellipse that fits them.
+    most, half: largest pressure, Pa, and half-width, m, of the ellipse that fits them.
     """
 
     force: float
@@ -108,42 +106,34 @@ def pressed(cells: int, wet: bool) -> Pressed:
 
 def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return what --json prints."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cells", type=int, default=12, help="cells to a metre, about half of the contact (12)")
-    parser.add_argument("--out", type=Path, default=Path("out/indentation"), help="folder (out/indentation)")
-    parser.add_argument("--json", action="store_true", help="print the results as one line of JSON at the end")
+    parser = common.Parser(__doc__, __file__)
+    parser.add_argument("--cells", type=int, default=12, help="cells to a metre, about half of the contact")
     o = parser.parse_args(argv)
     if not 4 <= o.cells <= 64:
         parser.error(f"--cells {o.cells}: must be 4 to 64")
-    coarse, wet, dry = pressed(o.cells // 2, True), pressed(o.cells, True), pressed(o.cells, False)
-    at_once, end = wet.contacts[0], dry.contacts[0]
-    force, rough = np.array(wet.forces), np.array(coarse.forces)
-    errors = dict(zip(["half, at once", "pressure, at once"], at_once.errors(UNDRAINED), strict=True))
-    errors |= dict(zip(["half, drained", "pressure, drained"], end.errors(DRAINED), strict=True))
-    errors["force in the end, beside a dry gel"] = force[-1] / end.force - 1
-    errors["force at any time, beside half as many cells"] = np.abs(rough - force).max() / force[0]
-    for name, error in errors.items():
-        print(f"{name}: {error:+.2%}")
-    out = {"errors": errors, "balance": wet.balance, "force": wet.forces, "cuts": wet.cuts}
-    print(f"force at once {force[0]:.0f} N/m, drained {force[-1]:.0f} N/m, fluid balance {out['balance']:.0e}")
-    draw(o, wet, (at_once, end))
-    worst = max(abs(error) for name, error in errors.items() if not name.startswith("half"))  # rough with few cells
-    out["converged"] = bool(worst < 0.03 and out["balance"] < 1e-8)
-    print(f"picture: {o.out}/indentation.png")
-    if o.json:
-        print(json.dumps(out))
+    with common.results(o) as out:
+        coarse, wet, dry = pressed(o.cells // 2, True), pressed(o.cells, True), pressed(o.cells, False)
+        at_once, end = wet.contacts[0], dry.contacts[0]
+        force, rough = np.array(wet.forces), np.array(coarse.forces)
+        errors = dict(zip(["half, at once", "pressure, at once"], at_once.errors(UNDRAINED), strict=True))
+        errors |= dict(zip(["half, drained", "pressure, drained"], end.errors(DRAINED), strict=True))
+        errors["force in the end, beside a dry gel"] = force[-1] / end.force - 1
+        errors["force at any time, beside half as many cells"] = np.abs(rough - force).max() / force[0]
+        common.table([["what", "error"], *([name, f"{error:+.2%}"] for name, error in errors.items())])
+        out |= {"errors": errors, "balance": wet.balance, "force": wet.forces, "cuts": wet.cuts}
+        print(f"force at once {force[0]:.0f} N/m, drained {force[-1]:.0f} N/m, fluid balance {out['balance']:.0e}")
+        draw(o, wet, (at_once, end))
+        worst = max(abs(error) for name, error in errors.items() if not name.startswith("half"))  # rough with few cells
+        out["converged"] = bool(worst < 0.03 and out["balance"] < 1e-8)
     return out
 
 
-def draw(o: argparse.Namespace, wet: Pressed, contacts: tuple[Contact, Contact]) -> None:
+def draw(o: Namespace, wet: Pressed, contacts: tuple[Contact, Contact]) -> None:
     """Draw pore pressures at once, pressures under the cylinder beside Hertz's, and the force in time."""
-    from matplotlib.collections import PolyCollection
-
-    fig, ((left, middle, right),) = beam.figure(1, 3, (13, 4))
+    fig, ((left, middle, right),) = common.figure(1, 3, (13, 4))
     corners, p, tool = wet.frame
-    domains = PolyCollection(corners[:, [0, 1, 3, 2]], array=p / 1e3, cmap="viridis", edgecolors="face", linewidth=0.1)
-    left.add_collection(domains)
-    left.add_collection(PolyCollection(tool[:, [0, 1, 3, 2]], facecolor="0.8", edgecolor="0.8"))
+    domains = common.domains(left, corners, p / 1e3, cmap="viridis")
+    common.domains(left, tool, facecolor="0.8", edgecolor="0.8")
     fig.colorbar(domains, ax=left, label="pore pressure (kPa)", shrink=0.8)
     left.set(aspect="equal", xlim=(0, SIZE), ylim=(0, SIZE + 0.25), title="at once", xlabel="x (m)", ylabel="y (m)")
     named = zip(("at once", "drained"), contacts, (UNDRAINED, DRAINED), strict=True)
@@ -160,8 +150,7 @@ def draw(o: argparse.Namespace, wet: Pressed, contacts: tuple[Contact, Contact])
     for ax in (middle, right):
         ax.legend(fontsize=9)
         ax.grid(alpha=0.3)
-    o.out.mkdir(parents=True, exist_ok=True)
-    fig.savefig(o.out / "indentation.png", dpi=100)
+    common.save(fig, o.out / "indentation.png", dpi=100)
 
 
 if __name__ == "__main__":

@@ -15,13 +15,11 @@ Errors are those of the mean of N over the last quarter of the push; `spread` is
 
 from __future__ import annotations
 
-import argparse
-import json
+from argparse import Namespace
 from dataclasses import dataclass, field
-from pathlib import Path
 
+import common
 import numpy as np
-import poroelastic_beam as beam
 
 import mpm_dolfinx as mpm
 
@@ -97,56 +95,48 @@ def push(alpha: float, cells: int, depth: float, steps: int) -> Push:
 
 def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return what --json prints."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cells", type=int, default=8, help="cells over the diameter (8)")
-    parser.add_argument("--rough", nargs="*", type=float, default=list(ROUGH), help="alpha, undrained (0, 0.5, 1)")
-    parser.add_argument("--depth", type=float, default=0.16, help="of the pushes, over the diameter (0.16)")
-    parser.add_argument("--out", type=Path, default=Path("out/penetration"), help="folder (out/penetration)")
-    parser.add_argument("--json", action="store_true", help="print the results as one line of JSON at the end")
+    parser = common.Parser(__doc__, __file__)
+    parser.add_argument("--cells", type=int, default=8, help="cells over the diameter")
+    parser.add_argument("--rough", nargs="*", type=float, default=list(ROUGH), help="alpha")
+    parser.add_argument("--depth", type=float, default=0.16, help="of the pushes, over the diameter")
     o = parser.parse_args(argv)
     if not 4 <= o.cells <= 32 or not 0 < o.depth <= 1 or any(not 0 <= alpha <= 1 for alpha in o.rough):
         parser.error(f"--cells {o.cells} --depth {o.depth} --rough {o.rough}: must be 4 to 32, in (0, 1], in [0, 1]")
-    out, runs = {"errors": {}, "cuts": 0, "steps": 0}, {}
-    steps = max(2, round(o.depth * o.cells / STEP))
-    for alpha in o.rough:
-        run = runs[alpha] = push(alpha, o.cells, o.depth, steps)
-        last = np.array(run.N[-max(1, steps // 4) :])
-        out["errors"][f"alpha {alpha:g}"] = float(last.mean() / exact(alpha) - 1)
-        out[f"spread {alpha:g}"] = float(np.ptp(last) / last.mean())
-        out["cuts"], out["steps"] = out["cuts"] + run.cuts, out["steps"] + run.steps
-        print(
-            f"alpha = {alpha:g}: N = {last.mean():.3f}, exact {exact(alpha):.3f}; {run.cuts} of {run.steps} steps cut"
-        )
-    draw(o, runs)
-    out["converged"] = out["cuts"] <= 0.1 * out["steps"]
-    print(f"picture: {o.out}/penetration.png")
-    if o.json:
-        print(json.dumps(out))
+    steps, runs = max(2, round(o.depth * o.cells / STEP)), {}
+    with common.results(o) as out:
+        out |= {"errors": {}, "cuts": 0, "steps": 0}
+        for alpha in o.rough:
+            run = runs[alpha] = push(alpha, o.cells, o.depth, steps)
+            last = np.array(run.N[-max(1, steps // 4) :])
+            out["errors"][f"alpha {alpha:g}"] = float(last.mean() / exact(alpha) - 1)
+            out[f"spread {alpha:g}"] = float(np.ptp(last) / last.mean())
+            out["cuts"], out["steps"] = out["cuts"] + run.cuts, out["steps"] + run.steps
+            found = f"alpha = {alpha:g}: N = {last.mean():.3f}, exact {exact(alpha):.3f}"
+            print(f"{found}; {run.cuts} of {run.steps} steps cut", flush=True)
+        draw(o, runs)
+        out["converged"] = out["cuts"] <= 0.1 * out["steps"]
     return out
 
 
-def draw(o: argparse.Namespace, runs: dict[float, Push]) -> None:
+def draw(o: Namespace, runs: dict[float, Push]) -> None:
     """Draw resistances, and how far the clay has moved around the smoothest and the roughest bar."""
-    from matplotlib.collections import PolyCollection
-
     ends = dict.fromkeys([*list(runs)[:1], *list(runs)[-1:]])
-    fig, axes = beam.figure(1, 1 + len(ends), (13, 4))
+    fig, axes = common.figure(1, 1 + len(ends), (13, 4))
     for k, (alpha, run) in enumerate(runs.items()):
         axes[0, 0].plot(run.depth, run.N, color=f"C{k}", label=f"α = {alpha:g}")
         axes[0, 0].axhline(exact(alpha), color=f"C{k}", ls="--", lw=0.8)
-    axes[0, 0].set(xlabel="depth / D (-)", ylabel="F / (s_u D) (-)", title="resistance; dashed: exact")
+    axes[0, 0].set(
+        xlabel="depth / D (-)", ylabel="F / (s_u D) (-)", title="resistance, from the settled clay on; dashed: exact"
+    )
     axes[0, 0].legend(fontsize=9)
     axes[0, 0].grid(alpha=0.3)
     for ax, alpha in zip(axes[0, 1:], ends, strict=True):
         corners, moved, bar = runs[alpha].frame
-        domains = PolyCollection(corners[:, [0, 1, 3, 2]], array=moved / (o.depth * D), cmap="viridis")
-        domains.set(edgecolors="face", linewidth=0.1, clim=(0, 1.5))
-        ax.add_collection(domains)
-        ax.add_collection(PolyCollection(bar[:, [0, 1, 3, 2]], facecolor="0.6", edgecolor="0.6"))
+        domains = common.domains(ax, corners, moved / (o.depth * D), cmap="viridis", clim=(0, 1.5))
+        common.domains(ax, bar, facecolor="0.6", edgecolor="0.6")
         ax.set(aspect="equal", xlim=(0, 2), ylim=(-2, 2), xlabel="x (m)", ylabel="y (m)", title=f"α = {alpha:g}")
         fig.colorbar(domains, ax=ax, label="displacement / depth (-)", shrink=0.8)
-    o.out.mkdir(parents=True, exist_ok=True)
-    fig.savefig(o.out / "penetration.png", dpi=100)
+    common.save(fig, o.out / "penetration.png", dpi=100)
 
 
 if __name__ == "__main__":

@@ -127,6 +127,44 @@ def test_a_smooth_retaining_wall_has_the_pressure_of_rankine(way, length):
     assert s.tool_forces[0, 0] == pytest.approx(exact, rel=0.03)
 
 
+def on_a_floor(way, cells, length, delta, floor, steps):
+    """Return K of a wall of 1 m that is moved against weightless sand, phi = 30 degrees, under a surcharge of 10 kPa.
+
+    K: normal pressures over the surcharge, both with c cot(phi) added; an entry a step.
+    """
+    h, load, c, mu = 1 / cells, 1e4, 1e3, np.tan(np.radians(delta))
+    rest = c / np.tan(np.radians(30))
+    grid = mpm.Grid([length + h / 2, 1 + 5.5 * h], [round(length / h) + 4, cells + 8], lower=[-3.5 * h, -2.5 * h])
+    soil = mpm.MohrCoulomb(bulk=2e7, shear=1.2e7, friction=30.0, dilation=30.0, cohesion=c)
+    tools = [
+        mpm.Tool(mpm.HalfSpace((0, 0), (1, 0)), lambda t: (way * max(0, t - 1), 0), friction=mu, adhesion=rest * mu),
+        mpm.Tool(mpm.HalfSpace((0, 0), (0, 1)), **floor),
+    ]
+    options = {"tractions": [mpm.Pressure("top", lambda t: load * min(1, t))], "fixed": {}, "tools": tools}
+    far = [mpm.Displacement("right", (0, 0), "x")]
+    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [length, 1])], [soil], displacements=far, **options)
+    s.run(1.0, 1 / steps)
+    return (np.array(s.run(2.0, 1 / steps).tools)[1:, 0, 0] + rest) / (load + rest)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("cells", "error"), [(10, 0.11), (20, 0.06)])
+def test_a_wall_that_gives_way_on_a_rough_floor_nears_rankine_s_pressure(cells, error):
+    """To first order in h: the wedge's toe is in the last cell."""
+    K = on_a_floor(-0.001, cells, 1.5, 0.0, {"friction": 0.8}, 5)
+    assert K[-1] == pytest.approx(1 / 3, rel=error)
+
+
+@pytest.mark.slow
+def test_a_rough_wall_pushes_with_the_exact_pressure():
+    """Prandtl's fan between Rankine's zone and the wall, whose friction is half of the sand's angle."""
+    phi, delta = np.radians([30, 15])
+    turn = delta + np.arcsin(np.sin(delta) / np.sin(phi))
+    exact = (1 + np.sin(phi) * np.cos(turn)) / (1 - np.sin(phi)) * np.exp(turn * np.tan(phi))
+    K = on_a_floor(0.01, 10, 4.0, 15.0, {"friction": np.tan(phi), "adhesion": 1e3}, 10)
+    assert K[-1] == pytest.approx(exact, rel=0.03)
+
+
 def work(friction, path, end, steps):
     """Return the work, J/m, that a plate does on a block along a path (t) -> m, and the sum of its parts' sizes."""
     grid = mpm.Grid([1.5, 0.75], [12, 6])

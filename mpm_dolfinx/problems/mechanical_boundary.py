@@ -41,7 +41,7 @@ from mpm_dolfinx.problems.contacts import Contact
 from mpm_dolfinx.problems.held_cells import SAME, HeldCells, HeldPoints
 from mpm_dolfinx.problems.side_forms import SideData, SideForms
 from mpm_dolfinx.problems.sides import Sides, check_apart, everywhere, gathered, meeting, on_side
-from mpm_dolfinx.problems.tool_contact import Tools
+from mpm_dolfinx.problems.stage_tools import Tools
 from mpm_dolfinx.problems.tools import Tool
 from mpm_dolfinx.validation import line
 

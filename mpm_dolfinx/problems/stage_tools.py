@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: MIT
+"""The rigid tools of a stage: where they touch the bodies in a step, and what points keep of them.
+
+The contact itself is in `tool_contact`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+from mpi4py import MPI
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpm_dolfinx.constitutive.fields import SceneMaterials
+from mpm_dolfinx.errors import NotConverged
+from mpm_dolfinx.forms.point_forms import Places
+from mpm_dolfinx.parallel.exchange import Exchange, first, over_all
+from mpm_dolfinx.points.cut_domains import CutDomains
+from mpm_dolfinx.points.faces import Surface
+from mpm_dolfinx.points.grid import Grid
+from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.problems.conditions import Displacement, holding, resistance
+from mpm_dolfinx.problems.sides import everywhere
+from mpm_dolfinx.problems.tool_contact import Rows, ToolContact, pressure_name, shear_name
+from mpm_dolfinx.problems.tools import Tool
+from mpm_dolfinx.validation import line
+
+BEGINS = 1e-2  # cells: how deep a tool may be in a body as it begins, and where a displacement is given
+NEAR = 0.1  # cells: corners that are nearer go with the tool
+FACING = 0.5  # cosine between a face's normal and the way to the tool above which it looks at the tool
+
+
+class Tools:
+    """The tools of a stage.
+
+    Parameters
+    ----------
+    grid, materials
+        Background grid, and the materials of the scene.
+    tools
+        The tools.
+    outside
+        The surface of the bodies; called where there are tools.
+    held
+        Given displacements with their faces, on which tools do not act.
+    """
+
+    def __init__(
+        self,
+        grid: Grid,
+        materials: SceneMaterials,
+        tools: Sequence[Tool],
+        outside: Callable[[], Surface],
+        held: Sequence[tuple[Displacement, Surface]],
+    ):
+        self.grid, self._materials, self.tools, self._held = grid, materials, tuple(tools), held
+        for tool in self.tools:
+            tool.check(grid.dim)
+        self.faces = outside() if self.tools else None
+        if self.tools:
+            sides = 2 * grid.dim
+            taken = [faces.id * sides + faces.face for _, faces in held]
+            own = self.faces.id * sides + self.faces.face
+            self._free = ~np.isin(own, np.concatenate([np.zeros(0, np.int64), *taken]))
+
+    @property
+    def symmetric(self) -> bool:
+        """Whether the tangent is symmetric."""
+        return not any(tool.grips for tool in self.tools)
+
+    def _kept(self, n: int) -> dict[str, NDArray[np.float64]]:
+        """Return what n points keep of the tools, zero."""
+        out = {pressure_name(i): np.zeros(n) for i in range(len(self.tools))}
+        return out | {shear_name(i): np.zeros((n, self.grid.dim)) for i, tool in enumerate(self.tools) if tool.grips}
+
+    def let_go(self, points: MaterialPoints) -> MaterialPoints:
+        """Return points without the tractions of the tools."""
+        return replace(points, data={name: rows for name, rows in points.data.items() if name not in self._kept(0)})
+
+    def grip(self, points: MaterialPoints, before: MaterialPoints | None = None) -> MaterialPoints:
+        """Return points with tractions of the tools: zero, or those of the same points `before`."""
+        new = self._kept(len(points))
+        if before is not None:
+            here, at = before.find(points.id)
+            for name, rows in new.items():
+                rows[here] = before.data[name][at]
+        return replace(points, data={**points.data, **new}) if new else points
+
+    def placed(self, cut: CutDomains, points: MaterialPoints, start: float, t: float) -> ToolContact | None:
+        """Return the contact at time t (s) of a step that began at `start`, with the points where they are now."""
+        if not self.tools:
+            return None
+        grid, d = self.grid, self.grid.dim
+        patches = cut.surface(self.faces)
+        x, area = patches.now(points), patches.area(points)
+        size, free = np.linalg.norm(area, axis=1), self._free[patches.here]
+        own = [self._materials.table(cut.points, of)[patches.at] for of in (resistance, holding)]
+        poses, found = [tool.pose(t, d) for tool in self.tools], []
+        for number, (tool, pose) in enumerate(zip(self.tools, poses, strict=True)):
+            before = tool.pose(start, d)
+            n = everywhere(grid, lambda tool=tool, pose=pose: tool.solid(grid.h.min()).normal(pose.own(x)) @ pose.R.T)
+            at = np.flatnonzero(free & (np.einsum("md,md->m", area, n) < -FACING * size))
+            old = points.data[shear_name(number)][patches.at[at]] if tool.grips else np.zeros((len(at), d))
+            vectors = [x[at], pose.put(before.own(x[at])), old @ (pose.R @ before.R.T).T]
+            pressure = points.data[pressure_name(number)][patches.at[at]]
+            scalars = [np.full(len(at), number), size[at], *(values[at] for values in own), pressure]
+            found.append((at, np.concatenate([np.stack(scalars, axis=1), *vectors], axis=1)))
+        at, values = (np.concatenate(column) for column in zip(*found, strict=True))
+        travel = Exchange(grid.comm, grid.owner(patches.cell[at]))
+        cell, place, sent = (travel.send(rows) for rows in (patches.cell[at], patches.x[at], values))
+        number, *own = sent[:, :5].T
+        rows = Rows(number.astype(np.int64), grid.local(cell), *own, *np.split(sent[:, 5:], 3, axis=1))
+        back = (travel, patches.at[at], values[:, 0].astype(np.int64), values[:, 1])
+        return ToolContact(grid, self.tools, poses, rows, Places(grid, rows.cell, place), back)
+
+    def check_start(self, cut: CutDomains, points: MaterialPoints, t: float) -> None:
+        """Refuse tools that are inside of a body at time t (s)."""
+        if not self.tools:
+            return
+        x = np.concatenate([cut.surface(self.faces).now(points), points.x])
+        for tool in self.tools:
+            deep, where = self._deepest(tool, x, t)
+            if deep > BEGINS:
+                what = f"{line(tool)}: is {deep:.3g} cells inside of a body, at {where}, at t = {t:g} s as it begins"
+                raise ValueError(f"{what}, must be outside of all bodies, or touch them")
+
+    def check_end(self, cut: CutDomains, points: MaterialPoints, t: float) -> None:
+        """Refuse a step after which tools have points in them, or meet what is given."""
+        for tool in self.tools:
+            for hold, faces in self._held:
+                deep, where = self._deepest(tool, cut.surface(faces).now(points), t)
+                if deep > BEGINS:
+                    what = f"{line(tool)} and {line(hold)}: both act at {where} at t = {t:g} s"
+                    raise ValueError(f"{what}, must not; limit the displacement by a region, or move the tool")
+            deep, where = self._deepest(tool, points.x, t)
+            if deep > 0:
+                raise NotConverged(f"{line(tool)}: has passed through the surface, to the point at {where}")
+
+    def near(self, corners: NDArray[np.float64], t: float) -> NDArray[np.bool_]:
+        """Return which corners (n, 2^d, d) of domains touch tools at time t (s): these follow the Q1 field alone.
+
+        What else they follow would be pushed back by the tool in the next step, and roughen the pressure.
+        """
+        out, h = np.zeros(corners.shape[:2], dtype=bool), self.grid.h.min()
+        x = corners.reshape(-1, self.grid.dim)
+        for tool in self.tools:
+            own = tool.pose(t, self.grid.dim).own(x)
+            gap = everywhere(self.grid, lambda tool=tool, own=own: tool.solid(h).distance(own))
+            out |= (gap < NEAR * h).reshape(out.shape)
+        return out
+
+    def _deepest(self, tool: Tool, x: NDArray[np.float64], t: float) -> tuple[float, str]:
+        """Return how deep places x (m, d) are in a tool at most, in cells, and where."""
+        h, pose = self.grid.h.min(), tool.pose(t, self.grid.dim)
+        gap = everywhere(self.grid, lambda: tool.solid(h).distance(pose.own(x)))
+        deepest = over_all(self.grid.comm, float(gap.min(initial=np.inf)), MPI.MIN)
+        here = np.array2string(x[gap.argmin()], precision=6) if len(gap) and gap.min() == deepest else ""
+        return -deepest / h, first(self.grid.comm, here)
