@@ -40,18 +40,8 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.problems.conditions import HOLD, holding, resistance
 from mpm_dolfinx.problems.contacts import Contact
 from mpm_dolfinx.problems.sides import Sides
-from mpm_dolfinx.problems.tool_contact import (
-    BEGINS,
-    CLOSE,
-    DEPTH,
-    FACING,
-    LEAST,
-    RAMP,
-    ROUNDS,
-    SLIVER,
-    STIFF,
-    TOUCH,
-)
+from mpm_dolfinx.problems.stage_tools import BEGINS, FACING
+from mpm_dolfinx.problems.tool_contact import CLOSE, DEPTH, LEAST, RAMP, ROUNDS, SLIVER, STIFF, TOUCH
 from mpm_dolfinx.validation import line
 
 REACH = 2.0
