@@ -170,6 +170,9 @@ class Scene:
         grid = self.grid
         out = {"grid cells": grid.shape.tolist(), "grid lower": grid.lower.tolist(), "grid upper": grid.upper.tolist()}
         out |= {"quadrature": self.quadrature, **({"axisymmetric": True} if grid.axisymmetric else {})}
+        if grid.copies > 1:
+            first = np.cumsum([0, *(len(body) for body in self.bodies[:-1])])
+            out["groups of the bodies"] = (grid.copy(first) // grid.cells).tolist()
         for i, body in enumerate(self.bodies):
             out[f"points of body {i}"], out[f"material of body {i}"] = len(body), int(body.material)
             out[f"volume of body {i}"] = float(np.abs(volumes(body.reference())).sum())

@@ -168,6 +168,8 @@ class _Weakened:
                 raise ValueError(f"{what}, must be a law with friction and cohesion")
         if not any(isinstance(m, Frictional) for m in scene.materials.materials):
             raise ValueError("factor_of_safety: no material has a strength, must have friction and cohesion")
+        if simulation.state.stage.conditions["contacts"]:
+            raise ValueError("factor_of_safety: contacts: must be none")
         self._at_rest = at_rest = begin_stage(scene, simulation.state, {}, [], [], False, {})  # free of its grid
         viscosity = fem.Constant(scene.grid.mesh, VISCOUS * _mean_stress(scene, at_rest.points) * dt)  # Pa s
 

@@ -129,3 +129,9 @@ def test_what_are_no_contacts_is_refused():
         scene(boxes[:2], mpm.Contact(0, 1), gravity=[0, -10]).step(1.0)  # slides
     with pytest.raises(ValueError, match=r"is free to move as a rigid body in 3 of 3 ways"):
         scene(boxes[::2], mpm.Contact(0, 1, friction=0.3), gravity=[0, -10]).step(1.0)
+    sand = mpm.MohrCoulomb(bulk=2e7, shear=1e7, friction=30.0, dilation=10.0, cohesion=5e3)
+    s = mpm.Simulation(grid, boxes[:2], [sand], fixed={"bottom": "xy"}, contacts=[mpm.Contact(0, 1)], gravity=[0, -10])
+    with pytest.raises(ValueError, match=r"factor_of_safety: contacts: must be none"):
+        mpm.factor_of_safety(s)
+    with pytest.raises(ValueError, match=r"stage: remove: must be none in a scene with contacts"):
+        s.stage(remove=[1])

@@ -45,6 +45,7 @@ QUICK = {
     "penetration": ("--cells 4 --rough 0.5 --depth 0.1", ["penetration.png"]),
     "slope": ("--cells 4 --steps 4 --rtol 0.1", ["slope.png"]),
     "dam": ("--h 1 --steps 3 --cells 10", ["dam.png"]),
+    "two_gels": ("--cells 4 --hertz 4", ["two_gels.png"]),
     "embankment": ("--h 1 --steps 1", ["embankment.png"]),
     "footing": ("--cells 3 --depth 0.1", ["footing.png", "footing.gif"]),
     "benchmark_beam": ("--h 0.05 --t-end 0.1 --repeat 1", []),

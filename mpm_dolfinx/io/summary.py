@@ -57,6 +57,7 @@ def _momentum(s: Scene, state: State) -> list[Part]:
         _either("given displacements", side.holds, f"on {len(side.holds)} sides", "no given displacements"),
         _either("rigid plates", side.plates, f"on {len(side.plates)} sides", "no plates"),
         _either("tools", side.tools.tools, f"{len(side.tools.tools)}", "no tools"),
+        _either("contacts", side.contacts.contacts, f"of {s.grid.copies} groups", "bodies that touch stick"),
         _either("ghost penalty", m.ghost.form.used, "faces of nearly empty cells", "no nearly empty cell so far"),
         _either("terms of the user's", m.terms or m.sides.own, f"{len(m.terms) + len(m.sides.own)}", "none given"),
     ]
@@ -85,7 +86,7 @@ def _solvers(s: Scene, state: State) -> list[Part]:
         _either("coupling", s.storage, f"{s.scheme.coupling}, {kind}", "no fluid: Newton on the momentum"),
         _either(
             "one factorisation for many steps",
-            s.momentum.linear and not side.pressures and not side.tools.tools,
+            s.momentum.linear and not (side.pressures or side.tools.tools or side.contacts.contacts),
             "linear law: until active cells or time step change",
             "the tangent depends on the strain",
         ),

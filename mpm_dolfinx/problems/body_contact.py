@@ -46,11 +46,13 @@ from mpm_dolfinx.validation import line
 
 REACH = 2.0
 """Cells: what is farther apart cannot touch within a step; steps in which bodies move farther are refused."""
+DEEP = 0.25
+"""Cells: what is deeper is behind a thin body."""
 CANDIDATES = {2: 8, 3: 24}
 """Nearest points of the other surface whose faces are tried."""
 BESIDE = 0.6
 """Cells from points on the other surface: corners that are nearer go with it."""
-SLOW, STIFFER = 0.3, 10.0
+SLOW, STIFFER = 0.6, 10.0
 """Where a round leaves more than this share of the penetration, k is made so many times larger."""
 EDGE = 1e-6
 """Of a face: what passes beside it by less meets it."""
@@ -482,7 +484,8 @@ class Contacts:
         facing = np.einsum("md,md->m", n[row], facets.outward[other]) < -FACING
         row, other = row[facing], other[facing]
         t, gap = _along(facets.corners[other], x[row], n[row])
-        met = ((t >= -EDGE) & (t <= 1 + EDGE)).all(axis=1) & (np.abs(gap) <= REACH * self.grid.h.min())
+        met = ((t >= -EDGE) & (t <= 1 + EDGE)).all(axis=1) & (gap <= REACH * self.grid.h.min())
+        met &= gap >= -DEEP * self.grid.h.min()
         row, other, t, gap = row[met], other[met], t[met], gap[met]
         order = np.lexsort((np.abs(gap), row))
         order = order[np.append(True, np.diff(row[order]) > 0)[: len(order)]]

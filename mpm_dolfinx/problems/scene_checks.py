@@ -75,7 +75,7 @@ def check_held(
         ranks = [np.linalg.matrix_rank(gram, tol=1e-12 * max(1.0, np.abs(gram).max())) for gram in grams]
         missing = len(modes) - np.array(ranks)
         held[1:] = missing == 0
-        if (missing == before).all():
+        if meeting is None or (missing == before).all():
             break
     for k in range(1, count + 1):
         if missing[k - 1]:

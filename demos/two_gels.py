@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: MIT
+"""Two gels meet: they are pressed together, slide over each other with friction, and part.
+
+Half-discs of two groups of bodies, each with displacements of its own.  The lower one is held, the upper one follows a
+path.  While they are apart nothing acts between them, however narrow the gap.
+
+Beside it the contact of a curved and a flat elastic body: pressure and half-width after Hertz, for the force that the
+contact takes.  Both are off by what a few cells over the half-width cannot resolve.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import poroelastic_beam as beam
+from matplotlib.collections import PolyCollection
+
+import mpm_dolfinx as mpm
+
+FRICTION, RADIUS, GAP = 0.3, 1.0, 0.05
+GEL = mpm.Hencky(bulk=8e4, shear=4e4)
+DOWN, ALONG, UP = 0.12, 0.4, 0.3  # m
+TIMES = (1.0, 2.0, 3.0)  # s: pressed, slid, lifted
+SHOWN = (0.0, 1.0, 2.0, 3.0)
+
+
+def half_disc(grid: mpm.Grid, centre: tuple[float, float], up: float):
+    """Return a half-disc with its flat side at its centre, whose round side looks up (1) or down (-1)."""
+    flat = mpm.box(grid, [centre[0] - RADIUS, min(centre[1], centre[1] + up)], np.add(centre, [RADIUS, max(up, 0)]))
+    return mpm.mapped(grid, flat, lambda x: centre + _round((x - centre) / RADIUS) * RADIUS)
+
+
+def _round(x: np.ndarray) -> np.ndarray:
+    return x * np.sqrt(1 - x[:, ::-1] ** 2 / 2)
+
+
+def path(t: float) -> tuple[float, float]:
+    """Return the displacement of the upper gel, m: down, along, up."""
+    down = -DOWN * min(t / TIMES[0], 1) - GAP * min(t / TIMES[0], 1)
+    along = ALONG * np.clip((t - TIMES[0]) / (TIMES[1] - TIMES[0]), 0, 1)
+    return along, down + UP * np.clip((t - TIMES[1]) / (TIMES[2] - TIMES[1]), 0, 1)
+
+
+def scene(cells: int) -> mpm.Simulation:
+    """Return the two gels, with so many cells over a radius."""
+    grid = mpm.Grid([4.5, 2.25], [round(4.5 * cells), round(2.25 * cells)])
+    low, high = (1.5, 0.0), (1.5, 2 * RADIUS + GAP)
+    bodies = [half_disc(grid, low, 1.0), half_disc(grid, high, -1.0)]
+    above = ([0, high[1]], [4.5, 2.25])
+    return mpm.Simulation(
+        grid,
+        bodies,
+        [GEL],
+        fixed={"bottom": "xy"},
+        displacements=[mpm.Displacement("top", lambda t, X: path(t), region=above)],
+        contacts=[mpm.Contact(1, 0, friction=FRICTION)],
+    )
+
+
+def hertz(cells: int) -> dict[str, float]:
+    """Return cells over the half-width, and the errors of the largest pressure and the half-width, relative."""
+    E, nu, R, L = 1e6, 0.3, 20.0, 4.0
+    stiff, top, n = E / (1 - nu**2) / 2, L + 0.3 / cells, [round(L * cells), round((2 * L + 2) * cells)]
+    grid = mpm.Grid([L, 2 * L + 2], n)
+
+    def bend(x: np.ndarray) -> np.ndarray:
+        return x + np.column_stack([0 * x[:, 0], (1 - (x[:, 1] - top) / L) * x[:, 0] ** 2 / (2 * R)])
+
+    bodies = [mpm.box(grid, [0, 0], [L, top]), mpm.mapped(grid, mpm.box(grid, [0, top], [L, top + L]), bend)]
+    held = mpm.Displacement("top", lambda t, X: (0, -0.041 * t), components="y", region=([0, top + L / 2], [L, 10]))
+    soil = mpm.Hencky(bulk=E / (3 - 6 * nu), shear=E / (2 + 2 * nu))
+    walls = {"left": "x", "right": "x", "bottom": "xy"}
+    s = mpm.Simulation(grid, bodies, [soil], fixed=walls, displacements=[held], contacts=[mpm.Contact(0, 1)])
+    s.run(1.0, 1.0, progress=False)
+    force = 2 * abs(s.tool_forces[0, 1])
+    half, most = 2 * np.sqrt(force * R / (np.pi * stiff)), np.sqrt(force * stiff / (np.pi * R))
+    p, x = s.points.data["contact_0_pressure"], s.points.x[:, 0]
+    on = (p > 0) & (x < 0.8 * half)
+    slope, square = np.polyfit(x[on] ** 2, p[on] ** 2, 1)
+    off = {"pressure": np.sqrt(square) / most - 1, "half_width": np.sqrt(-square / slope) / half - 1}
+    return {"cells": float(half * cells), **{name: float(value) for name, value in off.items()}}
+
+
+def main(argv: list[str] | None = None) -> dict:
+    """Run the demo; return what --json prints."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--cells", type=int, default=10, help="cells over the radius of a gel (10)")
+    parser.add_argument("--hertz", type=int, default=18, help="cells a metre of the elastic bodies (18)")
+    parser.add_argument("--out", type=Path, default=Path("out/two_gels"), help="folder for the picture (out/two_gels)")
+    parser.add_argument("--json", action="store_true", help="print the results as one line of JSON at the end")
+    o = parser.parse_args(argv)
+    if min(o.cells, o.hertz) < 4:
+        parser.error(f"--cells {o.cells} --hertz {o.hertz}: must be >= 4")
+    began, s, shown = time.perf_counter(), scene(o.cells), []
+
+    def see(s: mpm.Simulation) -> None:
+        if min(abs(s.t - t) for t in SHOWN) < 1e-6:
+            shown.append((s.t, s.points.corners.copy(), -s.effective_stress()[:, 1, 1]))
+
+    see(s)
+    result = s.run(TIMES[-1], 0.05, observe=see)
+    force = np.array(result.tools)[:, 0, :2]
+    t = np.array(result.t)
+    slides = (t > 1.5) & (t <= 2.0)
+    ratio = float(np.abs(force[slides, 0]).sum() / force[slides, 1].sum())
+    out = {"seconds": time.perf_counter() - began, "steps": result.steps, "ratio": ratio}
+    out |= {"largest": float(force[:, 1].max()), "parted": float(np.abs(force[-1]).max()), "hertz": hertz(o.hertz)}
+    print(f"largest force {out['largest']:.4g} N/m; parted {out['parted']:.3g}")
+    print("Hertz, {cells:.1f} cells: pressure {pressure:+.1%}, half-width {half_width:+.1%}".format(**out["hertz"]))
+    draw(o.out, shown, t, force)
+    print(f"picture: {o.out}/two_gels.png")
+    out["converged"] = bool(result.converged and out["parted"] == 0)
+    if o.json:
+        print(json.dumps(out))
+    return out
+
+
+def draw(out: Path, shown: list, t: np.ndarray, force: np.ndarray) -> None:
+    """Draw the gels with their stresses, and the forces."""
+    fig, axes = beam.figure(3, 2, (11, 9))
+    most = np.quantile(shown[1][2], 0.998) / 1e3
+    for ax, (when, corners, p) in zip(axes.ravel(), shown, strict=False):
+        domains = PolyCollection(corners[:, [0, 1, 3, 2]], array=p / 1e3, cmap="viridis", clim=(-most / 4, most))
+        ax.add_collection(domains)
+        ax.set(aspect="equal", xlim=(0.3, 4.0), ylim=(0, 2.25), title=f"t = {when:g} s", xlabel="x (m)", ylabel="y (m)")
+    fig.colorbar(domains, ax=axes[:2].ravel().tolist(), label="vertical pressure (kPa)", shrink=0.7)
+    axes[2, 0].plot(t, force[:, 1] / 1e3, label="normal to the path")
+    axes[2, 0].plot(t, force[:, 0] / 1e3, label="along the path")
+    axes[2, 0].set(xlabel="time (s)", ylabel="force on the upper gel (kN/m)")
+    with np.errstate(invalid="ignore", divide="ignore"):
+        axes[2, 1].plot(t, np.where(force[:, 1] > 0, -force[:, 0] / force[:, 1], np.nan))
+    axes[2, 1].set(xlabel="time (s)", ylabel="force along over force normal (-)")
+    for ax in axes[2]:
+        ax.grid(alpha=0.3)
+    axes[2, 0].legend(fontsize=8)
+    out.mkdir(parents=True, exist_ok=True)
+    fig.savefig(out / "two_gels.png", dpi=90)
+
+
+if __name__ == "__main__":
+    sys.exit(0 if main()["converged"] else 1)
