@@ -6,7 +6,7 @@ A figure is followed by a comment that names the run of a demo, the entries of w
     | Terzaghi, p at T_v = 0.5 | 0.004 % <!-- terzaghi --cells 50; errors/p_0.5; % --> |
 
 What a demo has printed is kept in demos/results, with its run time in `seconds` and the release of dolfinx, its
-pictures in demos/pictures.  A table that a demo writes as a file stands between
+pictures in demos/pictures (those of its first run on the pages).  A table that a demo writes as a file stands between
 `<!-- error_vs_runtime; comparison.md -->` and `<!-- end -->`.
 
     bash demos/run.sh tables                        # writes the figures anew from demos/results

@@ -20,7 +20,6 @@ from mpm_dolfinx.constitutive.element_test import ElementTest, element_test
 from mpm_dolfinx.constitutive.initial_stress import K0, hydrostatic
 from mpm_dolfinx.constitutive.mohr_coulomb import MohrCoulomb
 from mpm_dolfinx.constitutive.skeleton import (
-    LAWS,
     Field,
     Fluid,
     Hencky,
@@ -41,6 +40,7 @@ from mpm_dolfinx.points.mesh_files import from_mesh
 from mpm_dolfinx.points.polygon import polygon
 from mpm_dolfinx.points.probes import probes
 from mpm_dolfinx.problems.conditions import Displacement, Drained, Inflow, OnSide, Pressure, RigidPlate, Traction
+from mpm_dolfinx.problems.contacts import Contact
 from mpm_dolfinx.problems.tools import Ball, Cone, Convex, HalfSpace, Tool
 from mpm_dolfinx.problems.water import water
 from mpm_dolfinx.result import Result
@@ -53,10 +53,10 @@ __version__ = "0.1.0"
 __all__ = [
     "COUPLINGS",
     "K0",
-    "LAWS",
     "Ball",
     "Checkpoint",
     "Cone",
+    "Contact",
     "Convex",
     "Displacement",
     "Drained",

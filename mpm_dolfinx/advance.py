@@ -96,7 +96,9 @@ class Motion:
                 x = (state.stay.x if state.stay else cut.pieces.x) + cut.to_pieces(np.einsum("mk,mkd->md", N, at_nodes))
                 start = state.stay.start if state.stay else cut.to_pieces(self._storage.p_n.x.array[pieces.cells])
                 own = on_grid.pressures_up_to_surface(self._reconstruction, state.stage, t)
-                points, ids = replace(points, pressure=cut.mean(own)), points.id[cut.pieces.point]
+                gained = 1 - determinant(deformed()) / points.J if cut.domains else np.zeros(len(points))
+                points = replace(points, pressure=cut.mean(own), data=points.data | {"gained": gained})
+                ids = points.id[cut.pieces.point]
             _check_inside(cut, points, t)
         stay, held = Stay(cut.points, ids, pressure, x, start), state.held if serves else None
         new = replace(state, t=t, points=points, transported=None, stay=stay, held=held)
@@ -139,6 +141,9 @@ class Motion:
         grid, stage, folded = cut.grid, state.stage, 0
         free = ~given(grid, stage.lattices, stage.conditions["fixed"], state.points)
         free &= ~stage.mechanical.tools.near(state.points.corners + moved, t)[:, :, None]
+        if stage.mechanical.contacts.contacts:
+            beside = stage.mechanical.contacts.near(cut, state.points, state.points.corners + moved)
+            free &= ~beside[:, :, None]
         corners = state.points.corners + moved + free * bend
         points = replace(state.points, corners=corners)
         serves, evolved = cut.serves(points), self._materials.evolved(points)

@@ -41,6 +41,7 @@ QUICK = {
     "slump": ("--cells 6 --steps 10", ["slump.png", "failure.png", "slump.gif"]),
     "triaxial": ("--steps 20", ["triaxial.png"]),
     "cavity": ("--cells 4 --cases well --ratios 2", ["cavity.png"]),
+    "indentation": ("--cells 6", ["indentation.png"]),
     "slope": ("--cells 4 --steps 4 --rtol 0.1", ["slope.png"]),
     "dam": ("--h 1 --steps 3 --cells 10", ["dam.png"]),
     "embankment": ("--h 1 --steps 1", ["embankment.png"]),

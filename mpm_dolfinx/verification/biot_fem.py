@@ -483,7 +483,8 @@ class BiotFEM:
         if len(out):
             raise ValueError(f"probe at {x[out[0]]}: outside the body, must be in it or on its surface")
         result, began = Result(rows=[self._row(x)]), time.perf_counter()
-        for _ in tqdm(range(steps), disable=not progress or self.grid.comm.rank > 0 or None, unit="step"):
+        shown = {"disable": not progress or self.grid.comm.rank > 0 or None, "unit": "step", "desc": "finite elements"}
+        for _ in tqdm(range(steps), **shown):
             try:
                 newton, residual = self.step(dt)
             except NotConverged as failed:
