@@ -145,17 +145,19 @@ def main(argv: list[str] | None = None) -> dict:
     with common.results(o) as out:
         tissue = Tissue(picture(o.pixels, o.seed))
         points, elements, voigt = modulus(tissue)
-        moduli = {"material points": points, "finite elements": elements, "even strain (Voigt)": voigt}
-        common.table([["drained modulus", "kPa"], *([name, f"{value / 1e3:.2f}"] for name, value in moduli.items())])
+        moduli = (("material points", points), ("finite elements", elements), ("even strain (Voigt)", voigt))
+        rows = ([name, f"{value / 1e3:.2f}"] for name, value in moduli)
+        common.table([["modulus of the drained tissue", "(kPa)"], *rows])
         seen = run(tissue, o.rtol)
         final = seen.settlement[-1]
-        print(f"settlement over height: {seen.settlement[3]:.4f} loaded, {final:.4f} drained, {seen.drained:.4f} dry")
+        settlements = (("when loaded", seen.settlement[3]), ("drained", final), ("dry tissue", seen.drained))
+        common.table([["settlement", "(% of the height)"], *([name, f"{100 * v:.2f}"] for name, v in settlements)])
         draw(o, tissue, seen)
         print(f"{seen.steps} steps, {seen.wall:.1f} s")
-        out["errors"] = {"modulus": float(points / elements - 1), "drained": float(final / seen.drained - 1)}
+        errors = {"modulus": points / elements - 1, "drained": final / seen.drained - 1}
         if (o.pixels, o.seed, o.rtol) == (48, 9, 1e-2):
-            out["converged"] = bool(max(map(abs, out["errors"].values())) < 0.02)
-        out |= {"over_voigt": points / voigt, "settlement": final, "wall_s": seen.wall}
+            out["converged"] = bool(max(map(abs, errors.values())) < 0.02)
+        out |= {"errors": errors, "over_voigt": points / voigt, "settlement": final, "wall_s": seen.wall}
     return out
 
 
@@ -167,8 +169,8 @@ def draw(o: Namespace, tissue: Tissue, out: Outcome) -> None:
     axes[0].imshow(grey.T, origin="lower", extent=(0, mm, 0, mm), cmap="cividis", clim=(0, 1))
     shown = ((1, loaded, 2, 1e-3, "viridis", "pore pressure (kPa)"), (2, last, 3, 1.0, "cividis", "grey value (-)"))
     for k, frame, values, scale, colours, name in shown:
-        domains = common.domains(axes[k], 1e3 * frame[1], scale * frame[values], cmap=colours)
-        domains.set_clim((0, 1) if k == 2 else None)
+        limits = (0, 1) if k == 2 else None
+        domains = common.domains(axes[k], 1e3 * frame[1], scale * frame[values], cmap=colours, clim=limits)
         fig.colorbar(domains, ax=axes[k], label=name, shrink=0.8)
     for ax, title in zip(
         axes, ("the picture", f"loaded, t = {loaded[0]:.2g} s", f"drained, t = {last[0]:.0f} s"), strict=False
