@@ -15,6 +15,7 @@ Pressures are over p_0.  Errors are those at the marks, relative.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -30,7 +31,7 @@ PUSH = 0.2  # of a cell, in a step
 CLAY = mpm.ModifiedCamClay(
     M=1.2, lambda_=0.0726, kappa=0.0145, shear=30 * P0, initial_stress=(-P0,) * 3, conductivity=1e-9
 )
-RATIOS, MARK = (1.0001, 2.0), 1.5
+RATIOS, MARKS = (1.0001, 2.0), (1.1, 1.5)
 CV = CLAY.conductivity / mpm.Fluid().unit_weight * CLAY.oedometric  # m²/s
 G = 100 * P0
 SAND = mpm.MohrCoulomb(bulk=G * 2.6 / 1.2, shear=G, friction=30.0, dilation=0.0, cohesion=0.0)
@@ -60,7 +61,7 @@ class Drained:
 PRESSED = {"plastic": np.exp(-2 * P0 / (3 * SAND.bulk)) * np.eye(3)}  # sand begins with its pressure as elastic strain
 DRAINED = {
     "well": Drained(well(), {1.02: 2.0685, 1.08293: 2.8928, 1.5: 4.4063}, 100.0),
-    "sand-0": Drained(SAND, {1.02: 2.812, 1.1: 4.489}, state=PRESSED),
+    "sand-0": Drained(SAND, {1.02: 2.812, 1.1: 4.489, 1.5: 6.531}, state=PRESSED),
     "sand-30": Drained(replace(SAND, dilation=30.0), {1.02: 3.170, 1.1: 6.041, 1.5: 10.710}, state=PRESSED),
 }
 
@@ -118,41 +119,44 @@ def drained(name: str, cells: int) -> dict[float, tuple[float, float]]:
 class Undrained:
     """What an undrained push and the consolidation after it give.
 
-    total, water: pressure in the hole less p_0, and pore pressure at its wall, over p_0, with the exact ones; profiles:
-    (time after the push, s, radii of the points, m, pore pressures over p_0); balance: of the fluid.
+    total, water: radius -> pressure in the hole less p_0, and pore pressure at its wall, over p_0, with the exact ones;
+    profiles: (time after the push, s, radii of the points, m, pore pressures over p_0); balance: of the fluid.
     """
 
-    total: tuple[float, float]
-    water: tuple[float, float]
+    total: dict[float, tuple[float, float]]
+    water: dict[float, tuple[float, float]]
     profiles: list[tuple[float, np.ndarray, np.ndarray]]
     balance: float
 
 
 def at_wall(s: mpm.Simulation, radius: float, h: float) -> float:
-    """Return the pore pressure over p_0 at the wall: a parabola in ln r through the cells beside it."""
+    """Return the pore pressure over p_0 at the wall: a line in ln r, as soil that flows has it, through two cells."""
     r = np.linalg.norm(s.points.x, axis=1)
-    near = r < radius + 1.5 * h
-    return float(np.polyfit(np.log(r[near] / radius), s.points.pressure[near] / P0, 2)[-1])
+    near = r < radius + 2 * h
+    return float(np.polyfit(np.log(r[near] / radius), s.points.pressure[near] / P0, 1)[-1])
 
 
 def push(OCR: float, cells: int) -> Undrained:
-    """Widen the hole in clay to `MARK`, fast, then let the clay drain."""
+    """Widen the hole in clay to the last of `MARKS`, fast, then let the clay drain."""
     soil = replace(CLAY, OCR=OCR, bulk=None)
     water = {"fluid": mpm.Fluid(), "tractions": [mpm.Pressure("right", P0)], "drained": [mpm.Drained("right")]}
-    s = ring(cells, soil, MARK, **water)
-    found = widen(s, cells, MARK) - 1
-    drop, stress = undrained(soil, OUTER, np.geomspace(1, MARK, 101)[1:], 400)
-    out = Undrained((found, drop / P0), (at_wall(s, MARK, 1 / cells), 1 + (drop + stress) / P0), [], 0.0)
+    widest = MARKS[-1]
+    s, out = ring(cells, soil, widest, **water), Undrained({}, {}, [], 0.0)
+    for a in MARKS:
+        found = widen(s, cells, a) - 1
+        drop, stress = undrained(soil, OUTER, np.geomspace(1, a, 41)[1:], 400)
+        out.total[a] = found, drop / P0
+        out.water[a] = at_wall(s, a, 1 / cells), 1 + (drop + stress) / P0
 
     def look(s: mpm.Simulation) -> None:
         r = np.linalg.norm(s.points.x, axis=1)
         order = np.argsort(r)
-        out.profiles.append((s.t - MARK + 1, r[order], s.points.pressure[order] / P0))
+        out.profiles.append((s.t - widest + 1, r[order], s.points.pressure[order] / P0))
 
     look(s)
     result = s.result
     s.t = 0.0
-    s.stage(displacements=[mpm.Displacement("left", lambda t, X: (MARK - 1) * ray(X))])
+    s.stage(displacements=[mpm.Displacement("left", lambda t, X: (widest - 1) * ray(X))])
     times = OUTER**2 / CV * np.array([0.003, 0.03, 0.1, 0.3, 3.0])
     before = out.balance = result.balance
     after = s.run(times[-1], rtol=2e-2, t_eval=times, observe=look, progress=False)
@@ -180,9 +184,10 @@ def main(argv: list[str] | None = None) -> dict:
                 print(f"{name}, a/a0 = {a}: {p:.3f} p0, {known}", flush=True)
         for ratio in o.ratios:
             run = wet[ratio] = push(ratio, o.cells)
-            for what, (p, exact) in (("total", run.total), ("pore", run.water)):
-                out["errors"][f"clay, OCR {ratio:g}, {what}"] = p / exact - 1
-                print(f"undrained clay, OCR {ratio:g}, a/a0 = {MARK}: {what} pressure {p:.3f} p0, exact {exact:.3f}")
+            for what, a in itertools.product(("total", "water"), MARKS):
+                p, exact = getattr(run, what)[a]
+                out["errors"][f"clay, OCR {ratio:g}, a/a0 = {a}, {what}"] = p / exact - 1
+                print(f"undrained clay, OCR {ratio:g}, a/a0 = {a}: {what} pressure {p:.4f} p0, exact {exact:.4f}")
             left = np.abs(run.profiles[-1][2]).max()
             out["balance"] = max(out["balance"], run.balance)
             print(f"  consolidated: pore pressures up to {left:.1e} p0, fluid balance {run.balance:.0e}", flush=True)
@@ -206,7 +211,9 @@ def draw(out: Path, dry: dict, wet: dict[float, Undrained]) -> None:
             label = f"OCR {ratio:.0f}, T = {t * CV / OUTER**2:.2g}" if i else f"OCR {ratio:.0f}, undrained"
             shade = 1 - 0.8 * i / len(run.profiles)
             right.plot(r, p, ".", ms=1.5, color=f"C{k}", alpha=shade, label=label)
-    right.set(xlabel="r / a0 (-)", ylabel="pore pressure / p0 (-)", title=f"Undrained to a / a0 = {MARK}, then drained")
+    right.set(
+        xlabel="r / a0 (-)", ylabel="pore pressure / p0 (-)", title=f"Undrained to a / a0 = {MARKS[-1]}, then drained"
+    )
     for ax in (left, right):
         if ax.has_data():
             ax.legend(fontsize=8, markerscale=4 if ax is right else 1, ncol=2 if ax is right else 1)
