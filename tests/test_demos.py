@@ -47,7 +47,7 @@ QUICK = {
     "benchmark_pruning": ("--quick", ["pruning.md"]),
     "scaling": ("--quick --dims 2 --processes 1 2", ["scaling.png", "scaling.csv", "scaling.md"]),
 }
-LONG = {"cavity", "slope"}  # what they show has tests of its own
+LONG = {"cavity", "footing", "slope"}  # what they show has tests of its own
 
 
 def run(demo, arguments):
