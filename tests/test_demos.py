@@ -52,7 +52,7 @@ QUICK = {
     "benchmark_pruning": ("--quick", ["pruning.md"]),
     "scaling": ("--quick --dims 2 --processes 1 2", ["scaling.png", "scaling.csv", "scaling.md"]),
 }
-LONG = {"cavity", "slope", "image"}  # what they show has tests of its own, or takes long to compile
+LONG = {"cavity", "footing", "slope", "image"}  # what they show has tests of its own, or takes long to compile
 
 
 def run(demo, arguments):

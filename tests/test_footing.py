@@ -66,7 +66,7 @@ def test_a_footing_is_pushed_in_as_deep_as_it_is_wide():
 @pytest.mark.slow
 def test_a_fast_push_carries_what_limit_analysis_says_of_an_embedded_base():
     """From 0.37 widths on it was a sixth too much: the wall beside it, over its base by a hair, drained that soil."""
-    run = footing.push(footing.SOIL, 9, 0.5, footing.RATES["fast"])
+    run = footing.push(footing.SOIL, 9, 0.5, footing.RATES["fast"], box=(4.0, 2.5), steps=126)
     depth = np.array(run.settlement)
     for low, high, error in ((0.058, 0.3, 0.04), (0.3, 0.5, 0.07)):
         part = (depth > low) & (depth <= high)
@@ -75,5 +75,5 @@ def test_a_fast_push_carries_what_limit_analysis_says_of_an_embedded_base():
 
 def test_a_footing_is_pushed_through_soil_that_yields_without_cut_steps():
     """With full Newton steps alone, each from rest: one cut step, 103 Newton steps."""
-    run = footing.push(footing.SOIL, 11, 0.1, footing.RATES["intermediate"], steps=4)
+    run = footing.push(footing.SOIL, 11, 0.1, footing.RATES["intermediate"], box=(4.0, 2.5), steps=4)
     assert run.total("cuts") == 0 and run.total("newton") < 98
