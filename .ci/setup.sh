@@ -61,15 +61,20 @@ debian_install() {
     done
     [ ${#missing[@]} -gt 0 ] || return 0
     if [ "$(id -u)" != 0 ]; then
-        command -v sudo >/dev/null || { say "As root: apt-get install ${missing[*]}"; exit 1; }
+        command -v sudo >/dev/null || { without_root "${missing[@]}"; exit 1; }
         as_root=(sudo)
     fi
-    say "Installing ${missing[*]}"
+    say "Installing Debian's packages that are missing, by apt-get: ${missing[*]}"
     # A source that is out of reach need not matter: the installation tells.
     "${as_root[@]}" apt-get update -q >&2 || say "apt-get update failed, trying all the same"
     "${as_root[@]}" env DEBIAN_FRONTEND=noninteractive \
         apt-get install -q -y --no-install-recommends -o DPkg::Lock::Timeout=600 -o Dpkg::Use-Pty=0 \
         "${missing[@]}" </dev/null >&2
+}
+
+without_root() {
+    say "Missing: $*. As root: apt-get install $*"
+    say "Without root: conda install -c conda-forge fenics-dolfinx scipy tqdm meshio matplotlib python-gmsh, then the same"
 }
 
 # A .venv on the system's own python, whichever comes first in PATH, for dolfinx belongs to that one.

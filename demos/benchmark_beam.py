@@ -11,10 +11,7 @@ converged in time (`beam.TRUTH`).
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
-
+import common
 import numpy as np
 import poroelastic_beam as beam
 
@@ -54,29 +51,28 @@ def errors(result: mpm.Result) -> list[float]:
 
 def main(argv: list[str] | None = None) -> dict:
     """Run the benchmark; return what --json prints."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser = common.Parser(__doc__, __file__, writes=False)
     parser.add_argument("--h", type=float, default=0.015, help="cell size, m")
     parser.add_argument("--t-end", type=float, default=1.2, help="end time, s")
     parser.add_argument("--repeat", type=int, default=2, help="runs of each case")
-    parser.add_argument("--json", action="store_true", help="print the results as one line of JSON at the end")
     o = parser.parse_args(argv)
-    options = f"--h {o.h} --t-end {o.t_end}"
-    rounds = [{name: run(name, options) for name in CASES} for _ in range(o.repeat)]
-    times = {name: min(one[name][0].wall for one in rounds) for name in CASES}
-    print(f"{'case':18} {'steps':>5} {'Newton':>6} {'compile (s)':>11} {'time (s)':>8} {'/ q1-dg0':>8}", end="")
-    print(f" {'/ backward Euler':>16} {'tip, 0.02 s':>11} {'0.06 s':>7} {'0.1 s on':>8}")
-    out = {"h": o.h, "cases": {}, "converged": True}
-    for name, wall in times.items():
-        result, jit = rounds[0][name][0], max(one[name][1] for one in rounds)
-        ratios, off = [wall / times[other] for other in ("q1-dg0", "mpm backward-euler")], errors(result)
-        print(f"{name:18} {result.steps:5} {result.newton:6} {jit:11.2f} {wall:8.2f} {ratios[0]:8.2f}", end="")
-        print(f" {ratios[1]:16.2f} {off[0]:11.2%} {off[1]:7.2%} {off[2]:8.3%}")
-        out["cases"][name] = {"wall_s": wall, "ratios": ratios, "jit_s": jit, "tip_errors": off}
-        out["converged"] &= result.converged
-    if o.json:
-        print(json.dumps(out))
+    with common.results(o) as out:
+        options = f"--h {o.h} --t-end {o.t_end}"
+        rounds = [{name: run(name, options) for name in CASES} for _ in range(o.repeat)]
+        times = {name: min(one[name][0].wall for one in rounds) for name in CASES}
+        rows = [["case", "steps", "Newton", "compile (s)", "time (s)", "/ q1-dg0", "/ backward Euler"]]
+        rows[0] += ["tip, 0.02 s", "0.06 s", "0.1 s on"]
+        out |= {"h": o.h, "cases": {}, "converged": True}
+        for name, wall in times.items():
+            result, jit = rounds[0][name][0], max(one[name][1] for one in rounds)
+            ratios, off = [wall / times[other] for other in ("q1-dg0", "mpm backward-euler")], errors(result)
+            numbers = [f"{x:.2f}" for x in (jit, wall, *ratios)] + [f"{x:.3%}" for x in off]
+            rows.append([name, f"{result.steps}", f"{result.newton}", *numbers])
+            out["cases"][name] = {"wall_s": wall, "ratios": ratios, "jit_s": jit, "tip_errors": off}
+            out["converged"] &= result.converged
+        common.table(rows)
     return out
 
 
 if __name__ == "__main__":
-    sys.exit(0 if main()["converged"] else 1)
+    raise SystemExit(0 if main()["converged"] else 1)

@@ -22,11 +22,11 @@ import time
 from collections.abc import Callable
 from functools import cache, partial
 from itertools import pairwise
-from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from mpi4py import MPI
 
+import common
 import numpy as np
 from dolfinx import mesh
 
@@ -260,36 +260,31 @@ def line(name: str, row: dict) -> str:
 
 def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return what --json prints."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=40, help="cells over the width of the block")
     parser.add_argument("--repeat", type=int, default=8, help="turns of a pair, after one that is not counted")
     parser.add_argument("--quick", action="store_true", help="one pair of small blocks, one turn")
-    parser.add_argument("--out", type=Path, default=Path("out/benchmark_pruning"), help="folder for the table")
     parser.add_argument("--one", type=int, help=argparse.SUPPRESS)  # of MAKES, in a process of its own
-    parser.add_argument("--json", action="store_true", help="print the results as one line of JSON at the end")
     o = parser.parse_args(argv)
     if min(o.cells, o.repeat) < 1:
         parser.error(f"--cells {o.cells} --repeat {o.repeat}: must be >= 1")
     if o.one is not None:
         print(json.dumps(first_step(MAKES[o.one], o.cells)))
         return {"converged": True}
-    cells, repeat = (10, 1) if o.quick else (o.cells, o.repeat)
-    lines = [
-        "| feature | step without (ms) | with (ms) | ratio | compile without (s) | with (s) | MB more | settlement |"
-    ]
-    lines.append("|---" * 8 + "|")
-    print("\n".join(lines), flush=True)
-    out = {"cells": cells, "pairs": {}, "converged": True}
-    for name in QUICK if o.quick else PAIRS:
-        out["pairs"][name] = measure(name, cells, repeat)
-        lines.append(line(name, out["pairs"][name]))
-        print(lines[-1], flush=True)
-    o.out.mkdir(parents=True, exist_ok=True)
-    (o.out / "pruning.md").write_text("\n".join(lines) + "\n")
-    if o.json:
-        print(json.dumps(out))
+    with common.results(o) as out:
+        cells, repeat = (10, 1) if o.quick else (o.cells, o.repeat)
+        head = ["feature", "step without (ms)", "with (ms)", "ratio", "compile without (s)", "with (s)"]
+        lines = [common.markdown([[*head, "MB more", "settlement"]])]
+        print(lines[0], flush=True)
+        out |= {"cells": cells, "pairs": {}}
+        for name in QUICK if o.quick else PAIRS:
+            out["pairs"][name] = measure(name, cells, repeat)
+            lines.append(line(name, out["pairs"][name]))
+            print(lines[-1], flush=True)
+        o.out.mkdir(parents=True, exist_ok=True)
+        (o.out / "pruning.md").write_text("\n".join(lines) + "\n")
     return out
 
 
 if __name__ == "__main__":
-    sys.exit(0 if main()["converged"] else 1)
+    raise SystemExit(0 if main()["converged"] else 1)

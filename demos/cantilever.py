@@ -19,14 +19,11 @@ To those the material points converge, with the square of the cell size in the e
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
+from argparse import Namespace
 from dataclasses import dataclass
-from pathlib import Path
 
+import common
 import numpy as np
-import poroelastic_beam as beam
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.verification.exact import elastica_tip, shear_flexible_rod
@@ -87,25 +84,18 @@ def errors(out: Outcome) -> dict[str, float]:
 
 def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return what --json prints."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=8, help="cells over the height")
     parser.add_argument("--steps", type=int, default=40, help="equal increments of the load to alpha = 10")
-    parser.add_argument("--out", type=Path, default=Path("out/cantilever"), help="folder for the picture")
-    parser.add_argument("--json", action="store_true", help="print the results as one line of JSON at the end")
     o = parser.parse_args(argv)
     if o.cells < 1 or o.steps < 10 or o.steps % 10:
         parser.error(f"--cells {o.cells} --steps {o.steps}: must be >= 1, and a multiple of 10")
-    try:
+    with common.results(o) as out:
         found, outcome = run(o.cells, o.steps)
-        out = {"errors": found, "wall_s": outcome.result.wall, "converged": True}
+        out |= {"errors": found, "wall_s": outcome.result.wall}
+        print(f"{o.cells} cells, {o.steps} steps, {out['wall_s']:.1f} s")
         report(outcome, found)
         draw(o, outcome)
-        print(f"{o.cells} cells, {o.steps} steps, {out['wall_s']:.1f} s; picture: {o.out}/cantilever.png")
-    except mpm.GaveUp as error:
-        print(f"error: {error}", file=sys.stderr)
-        out = {"errors": {}, "wall_s": error.result.wall, "converged": False}
-    if o.json:
-        print(json.dumps(out))
     return out
 
 
@@ -118,9 +108,9 @@ def report(out: Outcome, found: dict[str, float]) -> None:
         print(f"{1 - x:7.5f} {1 - rod_x:8.5f} {u:8.5f} {found[f'u_{alpha}']:8.3%}")
 
 
-def draw(o: argparse.Namespace, out: Outcome) -> None:
+def draw(o: Namespace, out: Outcome) -> None:
     """Draw the deformed axes beside the rod's, and the tips beside those of the elastica."""
-    fig, ((left, right),) = beam.figure(1, 2, (11, 4.8))
+    fig, ((left, right),) = common.figure(1, 2, (11, 4.8))
     for i, (alpha, axis) in enumerate(out.axis.items()):
         left.plot(*rod(alpha).T, color="black", lw=1, label=None if i else "shear-flexible rod")
         left.plot(*axis.T, "o", ms=3, color=f"C{i}", markevery=2, label=rf"points, $\alpha$ = {alpha}")
@@ -136,9 +126,8 @@ def draw(o: argparse.Namespace, out: Outcome) -> None:
     right.legend(loc="lower right")
     for ax in (left, right):
         ax.grid(alpha=0.3)
-    o.out.mkdir(parents=True, exist_ok=True)
-    fig.savefig(o.out / "cantilever.png", dpi=130)
+    common.save(fig, o.out / "cantilever.png")
 
 
 if __name__ == "__main__":
-    sys.exit(0 if main()["converged"] else 1)
+    raise SystemExit(0 if main()["converged"] else 1)

@@ -9,18 +9,17 @@ the test of the domains' exact pieces.  Runs on any number of processes; --profi
 
 Errors, over L: `v` and `u`, the distance of the tip's deflection and shortening from the rod's, `w`, its
 displacement across the load, and `drift`, the tip's greatest distance from that of most steps.
+
+The tip goes too far as stress is constant in a point's domain: n of them over the height bend by 1/n² too much.
+`v` with 2, 4 and 8 cells (n = 4, 8, 16), in 10 steps: 0.0129, 0.0034, 0.0010; in the plane 0.0127, 0.0033, 0.0010.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import resource
-import sys
-from pathlib import Path
+from argparse import Namespace
 
-from mpi4py import MPI
-
+import common
 import numpy as np
 
 import mpm_dolfinx as mpm
@@ -96,39 +95,32 @@ def surface(simulation: mpm.Simulation) -> tuple[np.ndarray, np.ndarray]:
 
 def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return what --json prints."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser = common.Parser(__doc__, __file__)
     add = parser.add_argument
     add("--cells", type=int, default=4, help="cells over the height")
     add("--steps", type=int, nargs="+", default=[10, 20, 40], help="numbers of load steps")
     add("--taken", type=int, default=None, help="take only so many of the steps: no errors, but costs")
     add("--alpha", type=float, default=1.0, help="load parameter")
-    add("--out", type=Path, default=Path("out/cantilever_3d"), help="folder for the picture")
     add("--profile", action="store_true", help="print where the time went")
-    add("--json", action="store_true", help="print the results as one line of JSON at the end")
     o = parser.parse_args(argv)
     if o.cells < 1 or min(o.steps) < 1 or not 0 < o.alpha <= 10:
         parser.error(f"--cells {o.cells} --steps {o.steps} --alpha {o.alpha}: must be >= 1, >= 1 and in (0, 10]")
-    out = {"errors": {}, "runs": [], "converged": True}
-    talk = MPI.COMM_WORLD.rank == 0
-    tips, picture = [], None
-    try:
+    with common.results(o) as out:
+        out |= {"errors": {}, "runs": []}
+        tips, picture = [], None
         for steps in o.steps:
             tip, result, costs = run(o.cells, steps, o.alpha, o.taken)
             picture = costs.pop("surface", None)
             tips.append(tip)
             out["runs"].append({"load_steps": steps, "tip": tip.tolist(), **costs, "wall_s": result.wall})
-            if talk:
-                print(f"{steps} steps, {costs}" + (f"\n{result.shares()}" if o.profile else ""))
-    except mpm.GaveUp as error:
-        print(f"error: {error}", file=sys.stderr)
-        out["converged"] = False
-    if talk and out["converged"] and o.taken is None:
-        out["errors"] = errors(np.array(tips), o.alpha)
-        report(o, np.array(tips), out["errors"])
-        if picture:
-            draw(o, *picture)
-    if talk and o.json:
-        print(json.dumps(out))
+            if common.first():
+                found = ", ".join(f"{value:.4g} {name.replace('_', ' ')}" for name, value in costs.items())
+                print(found + (f"\n{result.shares()}" if o.profile else ""), flush=True)
+        if common.first() and o.taken is None:
+            out["errors"] = errors(np.array(tips), o.alpha)
+            report(o, np.array(tips), out["errors"])
+            if picture:
+                draw(o, *picture)
     return out
 
 
@@ -141,17 +133,16 @@ def errors(tips: np.ndarray, alpha: float) -> dict[str, float]:
     return {name: float(abs(d)) / LENGTH for name, d in distances.items()}
 
 
-def report(o: argparse.Namespace, tips: np.ndarray, found: dict[str, float]) -> None:
+def report(o: Namespace, tips: np.ndarray, found: dict[str, float]) -> None:
     """Print the tips beside the rod's."""
     u, v = rod(o.alpha)
-    print(f"{'steps':>6} {'along':>10} {'across':>10} {'shortening':>10}")
-    for steps, tip in zip(o.steps, tips, strict=True):
-        print(f"{steps:6} {tip @ ALONG:10.6f} {tip @ ACROSS:10.6f} {-tip[0]:10.6f}")
-    print(f"{'rod':>6} {v:10.6f} {0:10.6f} {u:10.6f}")
-    print(", ".join(f"{name} {100 * e:.3f} %" for name, e in found.items()))
+    rows = {steps: (tip @ ALONG, tip @ ACROSS, -tip[0]) for steps, tip in zip(o.steps, tips, strict=True)}
+    head = ["load steps", "along (m)", "across (m)", "shortening (m)"]
+    common.table([head, *([f"{name}", *(f"{x:.6f}" for x in row)] for name, row in {**rows, "rod": (v, 0, u)}.items())])
+    print("errors over L: " + ", ".join(f"{name} {e:.3%}" for name, e in found.items()))
 
 
-def draw(o: argparse.Namespace, faces: np.ndarray, stretch: np.ndarray) -> None:
+def draw(o: Namespace, faces: np.ndarray, stretch: np.ndarray) -> None:
     """Draw the deformed beam, coloured by the stretch along it."""
     import matplotlib.pyplot as plt
     from matplotlib.cm import ScalarMappable
@@ -173,9 +164,8 @@ def draw(o: argparse.Namespace, faces: np.ndarray, stretch: np.ndarray) -> None:
     ax.view_init(elev=25, azim=-70)
     across = fig.add_axes([0.3, 0.13, 0.4, 0.03])
     fig.colorbar(colours, cax=across, orientation="horizontal", label="stretch along the beam (-)")
-    o.out.mkdir(parents=True, exist_ok=True)
-    fig.savefig(o.out / "cantilever_3d.png", dpi=130)
+    common.save(fig, o.out / "cantilever_3d.png")
 
 
 if __name__ == "__main__":
-    sys.exit(0 if main()["converged"] else 1)
+    raise SystemExit(0 if main()["converged"] else 1)

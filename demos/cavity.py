@@ -15,15 +15,12 @@ Pressures are over p_0.  Errors are those at the marks, relative.
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import common
 import numpy as np
-import poroelastic_beam as beam
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.verification.cavity import cavity, undrained
@@ -165,45 +162,40 @@ def push(OCR: float, cells: int) -> Undrained:
 
 def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return what --json prints."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cells", type=int, default=8, help="cells over the hole's radius (8)")
-    parser.add_argument("--cases", nargs="*", default=list(DRAINED), choices=list(DRAINED), help="drained ones (all)")
-    parser.add_argument("--ratios", nargs="*", type=float, default=RATIOS, help="overconsolidation, undrained (1, 2)")
-    parser.add_argument("--out", type=Path, default=Path("out/cavity"), help="folder for the picture (out/cavity)")
-    parser.add_argument("--json", action="store_true", help="print the results as one line of JSON at the end")
+    parser = common.Parser(__doc__, __file__)
+    parser.add_argument("--cells", type=int, default=8, help="cells over the hole's radius")
+    parser.add_argument("--cases", nargs="*", default=list(DRAINED), choices=list(DRAINED), help="drained ones")
+    parser.add_argument("--ratios", nargs="*", type=float, default=RATIOS, help="overconsolidation, undrained")
     o = parser.parse_args(argv)
     if o.cells < 2 or any(not 1 <= ratio < 10 for ratio in o.ratios):
         parser.error(f"--cells {o.cells} --ratios {o.ratios}: must be >= 2, and in [1, 10)")
-    out = {"converged": False, "errors": {}, "balance": 0.0}
-    try:
-        dry = {name: drained(name, o.cells) for name in o.cases}
-        for name, found in dry.items():
-            for a, (p, radial) in found.items():
+    with common.results(o) as out:
+        out |= {"errors": {}, "balance": 0.0}
+        dry, wet = {}, {}
+        for name in o.cases:
+            dry[name] = drained(name, o.cells)
+            for a, (p, radial) in dry[name].items():
                 out["errors"][f"{name}, a/a0 = {a}"] = p / DRAINED[name].known[a] - 1
-                print(f"{name}, a/a0 = {a}: {p:.3f} p0, known {DRAINED[name].known[a]:.3f}, radial {radial:.3f}")
-        wet = {ratio: push(ratio, o.cells) for ratio in o.ratios}
-        for ratio, run in wet.items():
+                known = f"known {DRAINED[name].known[a]:.3f}, radial {radial:.3f}"
+                print(f"{name}, a/a0 = {a}: {p:.3f} p0, {known}", flush=True)
+        for ratio in o.ratios:
+            run = wet[ratio] = push(ratio, o.cells)
             for what, (p, exact) in (("total", run.total), ("pore", run.water)):
                 out["errors"][f"clay, OCR {ratio:g}, {what}"] = p / exact - 1
                 print(f"undrained clay, OCR {ratio:g}, a/a0 = {MARK}: {what} pressure {p:.3f} p0, exact {exact:.3f}")
             left = np.abs(run.profiles[-1][2]).max()
             out["balance"] = max(out["balance"], run.balance)
-            print(f"  consolidated: pore pressures up to {left:.1e} p0, fluid balance {run.balance:.0e}")
+            print(f"  consolidated: pore pressures up to {left:.1e} p0, fluid balance {run.balance:.0e}", flush=True)
         worst = out["worst"] = max(map(abs, out["errors"].values()), default=0.0)
         out["converged"] = worst < 0.4 / o.cells and out["balance"] < 1e-6
         print(f"largest error {worst:.2%}")
         draw(o.out, dry, wet)
-        print(f"picture: {o.out}/cavity.png")
-    except mpm.GaveUp as error:
-        print(f"error: {error}", file=sys.stderr)
-    if o.json:
-        print(json.dumps(out))
     return out
 
 
 def draw(out: Path, dry: dict, wet: dict[float, Undrained]) -> None:
     """Draw pressures in drained cavities, and pore pressures around undrained ones as they dissipate."""
-    fig, ((left, right),) = beam.figure(1, 2, (12, 4.2))
+    fig, ((left, right),) = common.figure(1, 2, (12, 4.2))
     for k, (name, found) in enumerate(dry.items()):
         known = DRAINED[name].known
         left.plot(list(known), list(known.values()), "o", color=f"C{k}", mfc="white", ms=8)
@@ -219,9 +211,8 @@ def draw(out: Path, dry: dict, wet: dict[float, Undrained]) -> None:
         if ax.has_data():
             ax.legend(fontsize=8, markerscale=4 if ax is right else 1, ncol=2 if ax is right else 1)
         ax.grid(alpha=0.3)
-    out.mkdir(parents=True, exist_ok=True)
-    fig.savefig(out / "cavity.png", dpi=90)
+    common.save(fig, out / "cavity.png", dpi=90)
 
 
 if __name__ == "__main__":
-    sys.exit(0 if main()["converged"] else 1)
+    raise SystemExit(0 if main()["converged"] else 1)

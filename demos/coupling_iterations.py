@@ -15,15 +15,13 @@ Undrained, what Q1 with DG0 does not see are checkers of the pressure; only the 
 
 from __future__ import annotations
 
-import argparse
-import csv
-import json
-import sys
+from argparse import Namespace
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from petsc4py import PETSc
 
+import common
 import numpy as np
 import poroelastic_beam as beam
 from numpy.typing import NDArray
@@ -206,32 +204,27 @@ def undrained(h: float, law: type[mpm.Hencky]) -> tuple[mpm.Simulation, mpm.Resu
 
 def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return what --json prints."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser = common.Parser(__doc__, __file__)
     parser.add_argument("--h", type=float, nargs="+", default=[0.06, 0.03, 0.015], help="cell sizes, m")
     parser.add_argument("--quick", action="store_true", help="coarser: every other k dt, hard water only")
-    parser.add_argument("--out", type=Path, default=Path("out/coupling_iterations"), help="folder for tables, pictures")
-    parser.add_argument("--json", action="store_true", help="print the results as one line of JSON at the end")
     o = parser.parse_args(argv)
     if not min(o.h) > 0:
         parser.error(f"--h {min(o.h)}: must be > 0")
-    bulks, k_dt = (BULK[2:], K_DT[::2]) if o.quick else (BULK, K_DT)
-    counts = [c for scene in SCENES for h in o.h for c in scan(scene, h, bulks, k_dt)]
-    runs = {(h, name): undrained(h, law) for h in o.h for name, law in LAWS.items()}
-    o.out.mkdir(parents=True, exist_ok=True)
-    write(o, counts)
-    write_roughness(o, runs)
-    draw(o, counts)
-    draw_pressure(o, runs)
-    print(f"tables and pictures: {o.out}/")
-    own = worst([c for c in counts if c.scheme == "Schur-CG"])
-    out = {
-        "worst_iterations": own if np.isfinite(own) else None,
-        "worst_plain_operator": worst([c for c in counts if c.scheme == "Schur-CG, plain operator"]),
-        "roughness": {name: [roughness(runs[h, name][0]) for h in o.h] for name in LAWS},
-        "converged": bool(own <= GOAL),
-    }
-    if o.json:
-        print(json.dumps(out))
+    with common.results(o) as out:
+        bulks, k_dt = (BULK[2:], K_DT[::2]) if o.quick else (BULK, K_DT)
+        counts = [c for scene in SCENES for h in o.h for c in scan(scene, h, bulks, k_dt)]
+        runs = {(h, name): undrained(h, law) for h in o.h for name, law in LAWS.items()}
+        write(o, counts)
+        write_roughness(o, runs)
+        draw(o, counts)
+        draw_pressure(o, runs)
+        own = worst([c for c in counts if c.scheme == "Schur-CG"])
+        out |= {
+            "worst_iterations": own if np.isfinite(own) else None,
+            "worst_plain_operator": worst([c for c in counts if c.scheme == "Schur-CG, plain operator"]),
+            "roughness": {name: [roughness(runs[h, name][0]) for h in o.h] for name in LAWS},
+            "converged": bool(own <= GOAL),
+        }
     return out
 
 
@@ -240,12 +233,10 @@ def shown(iterations: float) -> str:
     return f"{iterations:.0f}" if np.isfinite(iterations) else "none"
 
 
-def write(o: argparse.Namespace, counts: list[Count]) -> None:
+def write(o: Namespace, counts: list[Count]) -> None:
     """Write all counts as CSV, and the worst of each scene and cell size as Markdown."""
-    with (o.out / "iterations.csv").open("w", newline="") as file:
-        table = csv.writer(file)
-        table.writerow(["scene", "h_m", "fluid_bulk_Pa", "k_dt_m", "scheme", "iterations", "lowest", "highest"])
-        table.writerows(asdict(c).values() for c in counts)
+    head = ["scene", "h_m", "fluid_bulk_Pa", "k_dt_m", "scheme", "iterations", "lowest", "highest"]
+    common.write_csv(o.out / "iterations.csv", head, (asdict(c).values() for c in counts))
     rows = [["scene", "h (m)", *SCHEMES, "eigenvalues of P⁻¹S"]]
     for scene, h in dict.fromkeys((c.scene, c.h) for c in counts):
         here = [c for c in counts if (c.scene, c.h) == (scene, h)]
@@ -256,7 +247,7 @@ def write(o: argparse.Namespace, counts: list[Count]) -> None:
     tabulate(o.out / "iterations.md", rows)
 
 
-def write_roughness(o: argparse.Namespace, runs: dict) -> None:
+def write_roughness(o: Namespace, runs: dict) -> None:
     """Write the roughness of the undrained pressure and the iterations of a linear solve as Markdown."""
     rows = [["h (m)", *(f"roughness, {name}" for name in LAWS), *(f"iterations to 1e-3, {name}" for name in LAWS)]]
     for h in o.h:
@@ -268,16 +259,15 @@ def write_roughness(o: argparse.Namespace, runs: dict) -> None:
 
 
 def tabulate(path: Path, rows: list[list[str]]) -> None:
-    """Print and write a Markdown table."""
-    rows.insert(1, ["---"] * len(rows[0]))
-    text = "\n".join("| " + " | ".join(row) + " |" for row in rows)
-    path.write_text(text + "\n")
-    print(text + "\n")
+    """Print a table, and write it as Markdown."""
+    path.write_text(common.markdown(rows) + "\n")
+    common.table(rows)
+    print()
 
 
-def draw(o: argparse.Namespace, counts: list[Count]) -> None:
+def draw(o: Namespace, counts: list[Count]) -> None:
     """Draw iterations against k dt: the scenes beside each other, a colour a scheme, a line style a cell size."""
-    fig, ((*axes, side),) = beam.figure(1, len(SCENES) + 1, (16, 4.6))
+    fig, ((*axes, side),) = common.figure(1, len(SCENES) + 1, (16, 4.6))
     styles = dict(zip(o.h, ("-", "--", ":", "-."), strict=False))
     for ax, scene in zip(axes, SCENES, strict=True):
         for colour, scheme in enumerate(SCHEMES):
@@ -293,13 +283,13 @@ def draw(o: argparse.Namespace, counts: list[Count]) -> None:
     side.legend(handles=[*handles, goal], loc="center left")
     side.set_axis_off()
     fig.suptitle("Iterations of a linear solve, water of 2.2 GPa; a line ends where the scheme diverges")
-    fig.savefig(o.out / "iterations.png", dpi=130)
+    common.save(fig, o.out / "iterations.png")
 
 
-def draw_pressure(o: argparse.Namespace, runs: dict) -> None:
+def draw_pressure(o: Namespace, runs: dict) -> None:
     """Draw the undrained pressure of the cells beside each other, for the middle one of the cell sizes."""
     h = o.h[len(o.h) // 2]
-    fig, (axes,) = beam.figure(1, len(LAWS), (13, 3.9))
+    fig, (axes,) = common.figure(1, len(LAWS), (13, 3.9))
     limit = np.nanmax(np.abs(cells(runs[h, "damped"][0]))) / 1e3
     for ax, name in zip(axes, LAWS, strict=True):
         s = runs[h, name][0]
@@ -310,8 +300,8 @@ def draw_pressure(o: argparse.Namespace, runs: dict) -> None:
         ax.set(xlabel="x (m)", ylabel="y (m)", title=f"{name}, h = {h:g} m: roughness {roughness(s):.2%}")
         fig.colorbar(image, ax=ax, shrink=0.8).set_label("pore pressure (kPa)")
     fig.suptitle("Undrained beam after three steps, without the corners of the clamp")
-    fig.savefig(o.out / "checkerboard.png", dpi=130)
+    common.save(fig, o.out / "checkerboard.png")
 
 
 if __name__ == "__main__":
-    sys.exit(0 if main()["converged"] else 1)
+    raise SystemExit(0 if main()["converged"] else 1)

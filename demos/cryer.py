@@ -13,14 +13,11 @@ greatest value, and `curve`, the greatest over T from 0.02 on, over p0.
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
+from argparse import Namespace
 from dataclasses import dataclass
-from pathlib import Path
 
+import common
 import numpy as np
-import poroelastic_beam as beam
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.verification.exact import cryer_pressure
@@ -110,56 +107,48 @@ def errors(out: Outcome) -> dict[str, float]:
 
 def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return what --json prints."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=20, help="cells to the radius")
     parser.add_argument("--steps", type=int, default=100, help=f"equal steps to the reduced time {END}")
     parser.add_argument("--axisymmetric", action="store_true", help="a quarter of a disc instead of the octant")
-    parser.add_argument("--out", type=Path, default=Path("out/cryer"), help="folder for the picture")
     parser.add_argument("--profile", action="store_true", help="print where the time went")
-    parser.add_argument("--json", action="store_true", help="print the results as one line of JSON at the end")
     o = parser.parse_args(argv)
     if o.cells < 2 or o.steps < 1:
         parser.error(f"--cells {o.cells} --steps {o.steps}: must be >= 2 and >= 1")
-    try:
+    with common.results(o) as out:
         found, outcome = run(o.cells, o.steps, o.axisymmetric)
         result = outcome.result
-        out = {"errors": found, "active_cells": outcome.cells, "wall_s": result.wall, "converged": True}
+        out |= {"errors": found, "active_cells": outcome.cells, "wall_s": result.wall}
         report(outcome, found)
         if o.profile:
             print(result.shares())
         draw(o, outcome)
-    except mpm.GaveUp as error:
-        print(f"error: {error}", file=sys.stderr)
-        out = {"errors": {}, "wall_s": error.result.wall, "converged": False}
-    if o.json:
-        print(json.dumps(out))
     return out
 
 
 def report(out: Outcome, found: dict[str, float]) -> None:
     """Print the pressure at the centre beside the exact one."""
-    print(f"{'T':>6} {'p/p0':>8} {'exact':>8}")
-    for k in np.unique(np.linspace(0, len(out.T) - 1, 13).astype(int)):
-        print(f"{out.T[k]:6.4f} {out.pressure[k]:8.4f} {exact(out.T[k]):8.4f}")
+    shown = np.unique(np.linspace(0, len(out.T) - 1, 13).astype(int))
+    rows = ([f"{x:.4f}" for x in (out.T[k], out.pressure[k], exact(out.T[k]))] for k in shown)
+    common.table([["T", "p/p0", "exact"], *rows])
     r = out.result
     print(f"{out.cells} cells, {r.steps} steps, {r.newton} Newton and {r.coupling} linear iterations, {r.wall:.1f} s")
     print(f"errors: peak {found['peak']:.2%}, curve {found['curve']:.2%}")
 
 
-def draw(o: argparse.Namespace, out: Outcome) -> None:
+def draw(o: Namespace, out: Outcome) -> None:
     """Draw the pressure at the centre beside the exact one."""
-    fig, ((ax,),) = beam.figure(1, 1, (7, 4.5))
+    fig, ((ax,),) = common.figure(1, 1, (7, 4.5))
     T = np.linspace(1e-3, out.T[-1], 400)
     ax.plot(T, exact(T), color="black", lw=1, label="Cryer (1963)")
     ax.plot(out.T, out.pressure, "o", ms=4, mfc="none", label=f"material points, {o.cells} cells to the radius")
-    ax.axhline(1, color="grey", lw=0.6, ls="--")
+    ax.axhline(1, color="grey", lw=0.6, ls="--", label="the load")
     ax.set(xlabel="reduced time $c_v t / R^2$ (-)", ylabel="pressure at the centre / load (-)", title="Cryer's sphere")
     ax.set(xlim=(0, out.T[-1]), ylim=(0.9, 1.4))
     ax.legend(loc="lower left")
     ax.grid(alpha=0.3)
-    o.out.mkdir(parents=True, exist_ok=True)
-    fig.savefig(o.out / "cryer.png", dpi=130)
+    common.save(fig, o.out / "cryer.png")
 
 
 if __name__ == "__main__":
-    sys.exit(0 if main()["converged"] else 1)
+    raise SystemExit(0 if main()["converged"] else 1)

@@ -10,14 +10,12 @@ edges: what is left there falls slowly with the cell size, so it is told with th
 
 from __future__ import annotations
 
-import argparse
-import csv
-import json
 import sys
+from argparse import Namespace
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
+import common
 import numpy as np
 import poroelastic_beam as beam
 
@@ -30,12 +28,12 @@ AWAY = 0.1  # m, from the wall: where the edges of the clamp do not tell
 COLORS = ("C1", "C0", "C2", "C4", "C5")  # of the cell sizes
 
 
-def options(h: float, load: float, quadrature: str = "domain") -> argparse.Namespace:
+def options(h: float, load: float, quadrature: str = "domain") -> Namespace:
     """Return the beam's options."""
     return beam.arguments(f"--drained --h {h} --load {load} --quadrature {quadrature}".split())
 
 
-def conditions(o: argparse.Namespace) -> dict:
+def conditions(o: Namespace) -> dict:
     """Return the beam's conditions, with a load that rises and falls once a second."""
     region = ((beam.CLAMP, -np.inf), (beam.LENGTH, np.inf))
     load = mpm.Traction("top", lambda t: (0.0, -o.load * (1 - abs(2 * (t % 1) - 1))), region=region)
@@ -160,7 +158,7 @@ def orders(h: list[float], left: list[float]) -> list[float]:
     return [float(np.log(a / b) / np.log(c / d)) for a, b, c, d in zip(left, left[1:], h, h[1:], strict=False)]
 
 
-def reference(o: argparse.Namespace) -> tuple[np.ndarray, np.ndarray]:
+def reference(o: Namespace) -> tuple[np.ndarray, np.ndarray]:
     """Return the deflection of the tip (m) in a cycle by finite elements, and the load (Pa)."""
     case = options(o.h[-1], o.load)
     size = [0, 0], [beam.LENGTH, beam.HEIGHT], beam.REFERENCE_CELLS
@@ -171,7 +169,7 @@ def reference(o: argparse.Namespace) -> tuple[np.ndarray, np.ndarray]:
 
 def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return what --json prints."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser = common.Parser(__doc__, __file__)
     parser.add_argument(
         "--h", type=float, nargs="+", default=[0.06, 0.03], help="cell sizes, m; standard MPM: the last"
     )
@@ -186,62 +184,54 @@ def main(argv: list[str] | None = None) -> dict:
         help="cell sizes of the block, m; last one undrained too",
     )
     parser.add_argument("--undrained", type=int, default=3, help="load cycles of the undrained beam; 0: none")
-    parser.add_argument("--out", type=Path, default=Path("out/cycles"), help="folder for the picture and the table")
-    parser.add_argument("--json", action="store_true", help="print the results as one line of JSON at the end")
     o = parser.parse_args(argv)
     if not 0 < len(o.h) <= len(COLORS):
         parser.error(f"--h: {len(o.h)} cell sizes, must be 1 to {len(COLORS)}")
     if o.steps < 2 or o.steps % 2 or o.cycles < 1:
         parser.error(f"--steps {o.steps} --cycles {o.cycles}: must be even and >= 2, and >= 1")
-    runs = {h: cycle(h, o.load, o.cycles, o.steps) for h in o.h}
-    points = cycle(o.h[-1], o.load, o.cycles, o.steps, "point")
-    fem = reference(o)
-    turned = {h: turn(h) for h in o.turn}
-    undrained = {h: turn(h, fluid=mpm.Fluid()) for h in o.turn[-1:]}
-    sealed = replace(beam.material(options(o.h[-1], o.load)), conductivity=0.0)
-    wet = [cycle(h, o.load, o.undrained, o.steps, material=sealed, fluid=mpm.Fluid()) for h in o.h if o.undrained > 0]
+    with common.results(o) as out:
+        runs = {h: cycle(h, o.load, o.cycles, o.steps) for h in o.h}
+        points = cycle(o.h[-1], o.load, o.cycles, o.steps, "point")
+        fem = reference(o)
+        turned = {h: turn(h) for h in o.turn}
+        undrained = {h: turn(h, fluid=mpm.Fluid()) for h in o.turn[-1:]}
+        sealed = {"material": replace(beam.material(options(o.h[-1], o.load)), conductivity=0.0), "fluid": mpm.Fluid()}
+        wet = [cycle(h, o.load, o.undrained, o.steps, **sealed) for h in o.h if o.undrained > 0]
 
-    print(
-        f"{'':24}{'stress left / peak':>20}{'work lost a cycle':>20}{'drift of the peaks':>20}{'tip without load':>18}"
-    )
-    rows = {f"h = {h:g} m": run for h, run in runs.items()} | {f"at points, {o.h[-1]:g} m": points}
-    for name, run in rows.items():
-        peaks, rest = run["tips"][o.steps // 2 :: o.steps], run["tips"][:: o.steps]
-        cycles = f"{name}, {len(run['left'])} cycles"
-        numbers = (run["left"][-1], run["lost"][-1], peaks[-1] / peaks[0] - 1, rest[-1] / peaks[0])
-        print(f"{cycles:24}" + "".join(f"{x:{w}.4%}" for x, w in zip(numbers, (20, 20, 20, 18), strict=True)))
-    series = {"drained": ("left", list(runs.values())), "undrained": ("left", wet), "away": ("away", wet)}
-    last = {name: [float(run[key][-1]) for run in of if len(run[key])] for name, (key, of) in series.items()}
-    order = {name: orders(o.h, left) for name, left in last.items()}
-    what = {"drained": f"drained, {o.cycles} cycles", "undrained": f"undrained, {o.undrained} cycles"}
-    for name, left in last.items():
-        numbers = ", ".join(f"{x:.4%}" for x in left)
-        steps = ", of order " + ", ".join(f"{x:.2f}" for x in order[name]) if order[name] else ""
-        print(f"{what.get(name, 'the same but at the wall')}: stress left {numbers}{steps}")
-    for what, changes in (("", turned), (" undrained", undrained)):
-        for h, change in changes.items():
-            print(f"turned by 360 degrees{what}, h = {h:g} m: the stress in the middle changes by {change:.4%}")
-    o.out.mkdir(parents=True, exist_ok=True)
-    with (o.out / "cycles.csv").open("w", newline="") as file:
-        table = csv.writer(file)
-        table.writerow(["cycle", *(f"left_h_{h:g}" for h in o.h), "left_at_points"])
+        lines = [["", "stress left / peak", "work lost a cycle", "drift of the peaks", "tip without load"]]
+        rows = {f"h = {h:g} m": run for h, run in runs.items()} | {f"at points, {o.h[-1]:g} m": points}
+        for name, run in rows.items():
+            peaks, rest = run["tips"][o.steps // 2 :: o.steps], run["tips"][:: o.steps]
+            numbers = (run["left"][-1], run["lost"][-1], peaks[-1] / peaks[0] - 1, rest[-1] / peaks[0])
+            lines.append([f"{name}, {len(run['left'])} cycles", *(f"{x:.4%}" for x in numbers)])
+        common.table(lines)
+        series = {"drained": ("left", list(runs.values())), "undrained": ("left", wet), "away": ("away", wet)}
+        last = {name: [float(run[key][-1]) for run in of if len(run[key])] for name, (key, of) in series.items()}
+        order = {name: orders(o.h, left) for name, left in last.items()}
+        what = {"drained": f"drained, {o.cycles} cycles", "undrained": f"undrained, {o.undrained} cycles"}
+        for name, left in last.items():
+            numbers = ", ".join(f"{x:.4%}" for x in left)
+            steps = ", of order " + ", ".join(f"{x:.2f}" for x in order[name]) if order[name] else ""
+            print(f"{what.get(name, 'the same but at the wall')}: stress left {numbers}{steps}")
+        for what, changes in (("", turned), (" undrained", undrained)):
+            for h, change in changes.items():
+                print(f"turned by 360 degrees{what}, h = {h:g} m: the stress in the middle changes by {change:.4%}")
         columns = [*(run["left"] for run in runs.values()), points["left"]]
-        table.writerows([k + 1, *(c[k] if k < len(c) else "" for c in columns)] for k in range(o.cycles))
-    draw(o, runs, points, fem)
-    out = {"left": {f"{h:g}": run["left"].tolist() for h, run in runs.items()}, "points": points["left"].tolist()}
-    out |= {"lost": {f"{h:g}": run["lost"].tolist() for h, run in runs.items()}}
-    out |= {"turned": {f"{h:g}": change for h, change in turned.items()}}
-    out |= {"undrained": {f"{h:g}": change for h, change in undrained.items()}}
-    out |= {"last": last, "orders": order}
-    out["converged"] = all(len(run["left"]) == o.cycles for run in runs.values())
-    if o.json:
-        print(json.dumps(out))
+        numbers = ([k + 1, *(c[k] if k < len(c) else "" for c in columns)] for k in range(o.cycles))
+        common.write_csv(o.out / "cycles.csv", ["cycle", *(f"left_h_{h:g}" for h in o.h), "left_at_points"], numbers)
+        draw(o, runs, points, fem)
+        out |= {"left": {f"{h:g}": run["left"].tolist() for h, run in runs.items()}, "points": points["left"].tolist()}
+        out |= {"lost": {f"{h:g}": run["lost"].tolist() for h, run in runs.items()}}
+        out |= {"turned": {f"{h:g}": change for h, change in turned.items()}}
+        out |= {"undrained": {f"{h:g}": change for h, change in undrained.items()}}
+        out |= {"last": last, "orders": order}
+        out["converged"] = all(len(run["left"]) == o.cycles for run in runs.values())
     return out
 
 
-def draw(o: argparse.Namespace, runs: dict[float, dict], points: dict, fem: tuple[np.ndarray, np.ndarray]) -> None:
+def draw(o: Namespace, runs: dict[float, dict], points: dict, fem: tuple[np.ndarray, np.ndarray]) -> None:
     """Draw the stress that is left against the cycles, and the last cycle beside the finite elements."""
-    fig, ((left, loop),) = beam.figure(1, 2, (11, 4.2))
+    fig, ((left, loop),) = common.figure(1, 2, (11, 4.2))
     for (h, run), color in zip(runs.items(), COLORS, strict=False):
         left.plot(np.arange(len(run["left"])) + 1, run["left"], "o-", ms=3, color=color, label=f"domains, h = {h:g} m")
     label = f"standard MPM, h = {o.h[-1]:g} m"
@@ -249,18 +239,19 @@ def draw(o: argparse.Namespace, runs: dict[float, dict], points: dict, fem: tupl
     left.set(xlabel="cycles", ylabel="stress left at zero load / at the peak", xscale="log", yscale="log")
     left.set_title("What is left of the stress")
     last = runs[o.h[-1]]
-    for run, style, color in ((last, "-", COLORS[len(runs) - 1]), (points, "s--", "crimson")):
+    both = ("domains", last, "-", COLORS[len(runs) - 1]), ("standard MPM", points, "s--", "crimson")
+    for name, run, style, color in both:
         end = len(run["left"]) * o.steps
         part = slice(max(0, end - o.steps), end + 1)
-        loop.plot(-run["tips"][part], run["force"][part] / 1e3, style, ms=3, color=color)
-    loop.plot(-fem[0], fem[1] / 1e3, "k:", lw=2.5, label="Taylor-Hood FEM, first cycle")
+        loop.plot(-run["tips"][part], run["force"][part] / 1e3, style, ms=3, color=color, label=name)
+    loop.plot(-fem[0], fem[1] / 1e3, "k:", lw=2.5, label="FEM, first cycle")
     loop.set(xlabel="deflection of the tip (m)", ylabel="load (kPa)")
     loop.set_title(f"Load and deflection, cycle {o.cycles}, h = {o.h[-1]:g} m")
-    for ax in (left, loop):
-        ax.legend()
+    for ax, place in ((left, "best"), (loop, "upper left")):
+        ax.legend(loc=place)
         ax.grid(alpha=0.3)
-    fig.savefig(o.out / "cycles.png", dpi=130)
+    common.save(fig, o.out / "cycles.png")
 
 
 if __name__ == "__main__":
-    sys.exit(0 if main()["converged"] else 1)
+    raise SystemExit(0 if main()["converged"] else 1)

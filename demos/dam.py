@@ -15,13 +15,11 @@ leaves it, at the highest level.
 
 from __future__ import annotations
 
-import argparse
-import json
+from argparse import Namespace
 from dataclasses import dataclass, field
-from pathlib import Path
 
+import common
 import numpy as np
-import poroelastic_beam as beam
 
 import mpm_dolfinx as mpm
 
@@ -106,37 +104,33 @@ def rectangular(cells: int) -> float:
 
 def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return what --json prints."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser = common.Parser(__doc__, __file__)
     parser.add_argument("--h", type=float, default=0.5, help="cell size, m")
     parser.add_argument("--steps", type=int, default=15, help="steps of each length at each level")
     parser.add_argument("--cells", type=int, default=40, help="cells over the height of the rectangular dam")
-    parser.add_argument("--out", type=Path, default=Path("out/dam"), help="folder for the picture")
-    parser.add_argument("--json", action="store_true", help="print the results as one line of JSON at the end")
     o = parser.parse_args(argv)
     if not 0.1 <= o.h <= 1 or o.steps < 1 or not 10 <= o.cells <= 200:
         parser.error(f"--h {o.h} --steps {o.steps} --cells {o.cells}: must be 0.1 to 1 m, >= 1, and 10 to 200")
-    flow, dam = rectangular(o.cells), run(o.h, o.steps)
-    print(f"rectangular dam, {o.cells} cells high: flow over the exact one {flow:.4f}")
-    for level, (enters, leaves) in zip(LEVELS, dam.flows, strict=True):
-        print(f"reservoir at {level:g} m: {-enters:.3e} m^2/s enter, {leaves:.3e} m^2/s seep out")
-    steady = float(-dam.flows[0][0] / dam.flows[0][1])
-    draw(o, dam)
-    print(f"{dam.steps} steps, {dam.wall:.1f} s, fluid balance {dam.balance:.1e}; picture: {o.out}/dam.png")
-    out = {"flow": flow, "balance": dam.balance, "steady": steady, "wall_s": dam.wall, "converged": True}
-    if o.json:
-        print(json.dumps(out))
+    with common.results(o) as out:
+        flow = rectangular(o.cells)
+        print(f"rectangular dam, {o.cells} cells high: flow over the exact one {flow:.4f}", flush=True)
+        dam = run(o.h, o.steps)
+        flows = (
+            [f"{level:g}", *(f"{q:.3e}" for q in (-q[0], q[1]))] for level, q in zip(LEVELS, dam.flows, strict=True)
+        )
+        common.table([["reservoir at (m)", "flow in (m²/s)", "flow out (m²/s)"], *flows])
+        steady = float(-dam.flows[0][0] / dam.flows[0][1])
+        draw(o, dam)
+        print(f"{dam.steps} steps, {dam.wall:.1f} s, fluid balance {dam.balance:.1e}")
+        out |= {"flow": flow, "balance": dam.balance, "steady": steady, "wall_s": dam.wall}
     return out
 
 
-def draw(o: argparse.Namespace, dam: Dam) -> None:
+def draw(o: Namespace, dam: Dam) -> None:
     """Draw pressures at the highest level, and the free surfaces of all."""
-    from matplotlib.collections import PolyCollection
-
-    fig, axes = beam.figure(2, 1, (9, 6))
+    fig, axes = common.figure(2, 1, (9, 6))
     (corners, p), ax = dam.frames[0], axes[0, 0]
-    domains = PolyCollection(corners[:, [0, 1, 3, 2]], edgecolors="face", linewidth=0.2, cmap="viridis")
-    domains.set(array=p / 1e3, clim=(0, WEIGHT * LEVELS[0] / 1e3))
-    ax.add_collection(domains)
+    domains = common.domains(ax, corners, p / 1e3, cmap="viridis", clim=(0, WEIGHT * LEVELS[0] / 1e3))
     fig.colorbar(domains, ax=ax, label="pore pressure (kPa)", shrink=0.8)
     axes[1, 0].plot(*np.array([[1, 0], [13, HEIGHT], [16, HEIGHT], [28, 0], [1, 0]]).T, color="grey", lw=0.8)
     for k, (level, (corners, p), flows) in enumerate(zip(LEVELS, dam.frames, dam.flows, strict=True)):
@@ -145,11 +139,10 @@ def draw(o: argparse.Namespace, dam: Dam) -> None:
             ax.tricontour(*corners.mean(axis=1).T, p, levels=[0.0], colors=color, linewidths=1.5)
             ax.plot([0, 1 + SLOPE * level], [level, level], color=f"C{k}", label=f"{1e6 * flows[1]:.2f}")
             ax.set(aspect="equal", xlim=(0, BASE + 2), ylim=(0, HEIGHT + 0.5), xlabel="x (m)", ylabel="y (m)")
-    axes[0, 0].set_title("seepage through the dam")
+    axes[0, 0].set_title("seepage through the dam; white: its free surface, p = 0")
     axes[1, 0].set_title("free surfaces as the reservoir falls")
     axes[1, 0].legend(title="10⁻⁶ m²/s seep out", fontsize=9, loc="upper right")
-    o.out.mkdir(parents=True, exist_ok=True)
-    fig.savefig(o.out / "dam.png", dpi=130)
+    common.save(fig, o.out / "dam.png")
 
 
 if __name__ == "__main__":

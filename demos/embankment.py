@@ -13,13 +13,11 @@ the integral of their effective stress over that weight, 1 in balance.
 
 from __future__ import annotations
 
-import argparse
-import json
+from argparse import Namespace
 from dataclasses import dataclass, field
-from pathlib import Path
 
+import common
 import numpy as np
-import poroelastic_beam as beam
 import ufl
 
 import mpm_dolfinx as mpm
@@ -129,42 +127,40 @@ def run(h: float = 0.5, steps: int = 6) -> Bund:
 
 def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return what --json prints."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser = common.Parser(__doc__, __file__)
     parser.add_argument("--h", type=float, default=0.5, help="cell size, m")
     parser.add_argument("--steps", type=int, default=6, help="steps between two lifts")
-    parser.add_argument("--out", type=Path, default=Path("out/embankment"), help="folder for the picture")
-    parser.add_argument("--json", action="store_true", help="print the results as one line of JSON at the end")
     o = parser.parse_args(argv)
     if not 0.1 <= o.h <= 1 or o.steps < 1:
         parser.error(f"--h {o.h} --steps {o.steps}: must be between 0.1 and 1 m, and >= 1")
-    bund = run(o.h, o.steps)
-    out = {"carried": bund.carried, "settlement": -bund.axis[-1], "wall_s": bund.wall, "converged": True}
-    print(f"the clay's lowest points carry {bund.carried:.4f} of the weight of the lifts")
-    print(f"settlement on the axis: {-bund.axis[-1]:.3f} m, at the toe {-bund.toe[-1]:.3f} m")
-    print(
-        f"excess pressure in mid-clay: {max(bund.excess) / 1e3:.1f} kPa at most, {bund.excess[-1] / 1e3:.2f} at the end"
-    )
-    draw(o, bund)
-    print(f"{bund.steps} steps, {bund.wall:.1f} s; picture: {o.out}/embankment.png")
-    if o.json:
-        print(json.dumps(out))
+    with common.results(o) as out:
+        bund = run(o.h, o.steps)
+        out |= {"carried": bund.carried, "settlement": -bund.axis[-1], "wall_s": bund.wall}
+        print(f"the clay's lowest points carry {bund.carried:.4f} of the weight of the lifts")
+        print(f"settlement on the axis: {-bund.axis[-1]:.3f} m, at the toe {-bund.toe[-1]:.3f} m")
+        most, end = max(bund.excess) / 1e3, bund.excess[-1] / 1e3
+        print(f"excess pressure in mid-clay: {most:.1f} kPa at most, {end:.2f} at the end")
+        draw(o, bund)
+        print(f"{bund.steps} steps, {bund.wall:.1f} s")
     return out
 
 
-def draw(o: argparse.Namespace, bund: Bund) -> None:
+def draw(o: Namespace, bund: Bund) -> None:
     """Draw the section after the last lift and at the end, and settlements and excess pressure in time."""
-    from matplotlib.collections import PolyCollection
-
-    fig, axes = beam.figure(3, 1, (9, 9.5))
+    fig, axes = common.figure(3, 1, (9, 9.5))
     most = max(np.quantile(np.abs(p), 0.995) for _, _, p in bund.frames) / 1e3
     for ax, (title, corners, excess) in zip(axes[:2, 0], bund.frames, strict=True):
-        domains = PolyCollection(corners[:, [0, 1, 3, 2]], edgecolors="face", linewidth=0.2, cmap="viridis")
-        domains.set(array=excess / 1e3, clim=(0, most))
-        ax.add_collection(domains)
+        domains = common.domains(ax, corners, excess / 1e3, cmap="viridis", clim=(0, most))
         ax.plot([CREST + SLOPE * LIFTS, CREST, 0], [CLAY, CLAY + LIFTS, CLAY + LIFTS], color="grey", lw=0.8, ls=":")
         ax.plot([0, WIDTH], [CLAY, CLAY], color="grey", lw=0.8, ls=":")
-        ax.set(aspect="equal", xlim=(0, WIDTH), ylim=(0, CLAY + LIFTS + 0.5), title=title)
-        ax.set(xlabel="x (m)", ylabel="y (m)")
+        ax.set(
+            aspect="equal",
+            xlim=(0, WIDTH),
+            ylim=(0, CLAY + LIFTS + 0.5),
+            title=f"{title}; dotted: as built",
+            xlabel="x (m)",
+            ylabel="y (m)",
+        )
         fig.colorbar(domains, ax=ax, label="excess pressure (kPa)", shrink=0.8)
     ax, days = axes[2, 0], np.array(bund.t) / DAY
     ax.plot(days, bund.axis, color="C0", label="on the axis")
@@ -176,8 +172,7 @@ def draw(o: argparse.Namespace, bund: Bund) -> None:
     twin.set_ylabel("excess pressure in mid-clay (kPa)", color="C1")
     ax.legend(loc="lower left")
     ax.grid(alpha=0.3)
-    o.out.mkdir(parents=True, exist_ok=True)
-    fig.savefig(o.out / "embankment.png", dpi=130)
+    common.save(fig, o.out / "embankment.png")
 
 
 if __name__ == "__main__":

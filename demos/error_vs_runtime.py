@@ -15,15 +15,13 @@ runs; compile times are listed apart.  Truths are converged in space and in time
 
 from __future__ import annotations
 
-import argparse
-import csv
-import json
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+import common
 import numpy as np
 import poroelastic_beam as beam
 import self_weight_column as column
@@ -252,22 +250,19 @@ def compare(rows: list[Row]) -> list[dict]:
     return out
 
 
-def table(comparison: list[dict]) -> str:
-    """Return the comparison as a Markdown table."""
-    lines = [
-        "| case | setting | error | same-grid FEM's error | time / same-grid FEM's | at equal error |",
-        "|---|---|---|---|---|---|",
-    ]
+def table(comparison: list[dict]) -> list[list[str]]:
+    """Return the comparison as rows of text."""
+    rows = [["case", "setting", "error", "same-grid FEM's error", "time / same-grid FEM's", "at equal error"]]
     for c in comparison:
         equal = "none so exact" if np.isnan(c["time_ratio_at_equal_error"]) else f"{c['time_ratio_at_equal_error']:.2f}"
-        numbers = f"{c['error']:.1e} | {c['peer_error']:.1e} | {c['time_ratio']:.2f} | {equal}"
-        lines.append(f"| {c['case']} | {c['setting']} | {numbers} |")
-    return "\n".join(lines)
+        numbers = f"{c['error']:.1e}", f"{c['peer_error']:.1e}", f"{c['time_ratio']:.2f}"
+        rows.append([c["case"], c["setting"], *numbers, equal])
+    return rows
 
 
 def draw(out: Path, case: str, rows: list[Row]) -> None:
     """Draw error against time: solid lines from coarse to fine cells, dashed ones from few to many steps."""
-    fig, ((ax,),) = beam.figure(1, 1, (7.5, 5))
+    fig, ((ax,),) = common.figure(1, 1, (9.5, 5))
     usual = Counter(r.steps for r in rows).most_common(1)[0][0]
     for i, method in enumerate(dict.fromkeys(r.method for r in rows)):
         mine = [r for r in rows if r.method == method and np.isfinite(r.error)]
@@ -283,37 +278,29 @@ def draw(out: Path, case: str, rows: list[Row]) -> None:
         ax.plot([], [], "k--", lw=1, label="the finest cells, other steps")
     ax.set(xlabel="time of the time loop (s)", ylabel="relative error (-)", title=f"{case}: error against run time")
     ax.grid(alpha=0.3, which="both")
-    ax.legend(fontsize=8)
-    fig.savefig(out / f"{case}.png", dpi=120)
+    ax.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    common.save(fig, out / f"{case}.png", dpi=120)
 
 
 def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return what --json prints."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cases", nargs="+", choices=tuple(CASES), default=list(CASES), help="cases to run")
     parser.add_argument("--quick", action="store_true", help="a few coarse runs of each case")
-    parser.add_argument("--repeat", type=int, default=None, help="runs of each setting (default 2, with --quick 1)")
-    parser.add_argument("--out", type=Path, default=Path("out/error_vs_runtime"), help="folder for pictures and tables")
-    parser.add_argument("--json", action="store_true", help="print the results as one line of JSON at the end")
+    parser.add_argument("--repeat", type=int, default=None, help="runs of each setting; by default 2, with --quick 1")
     o = parser.parse_args(argv)
-    o.out.mkdir(parents=True, exist_ok=True)
-    rows = []
-    for case in o.cases:
-        rows += measure(case, o.quick, o.repeat or (1 if o.quick else 2))
-        draw(o.out, case, [r for r in rows if r.case == case])
-        with (o.out / "runs.csv").open("w", newline="") as file:
-            writer = csv.DictWriter(file, fieldnames=list(asdict(rows[0])))
-            writer.writeheader()
-            writer.writerows(map(asdict, rows))
-    comparison = compare(rows)
-    (o.out / "comparison.md").write_text(table(comparison) + "\n")
-    print(table(comparison))
-    print(f"pictures and tables: {o.out}/")
-    out = {"comparison": comparison, "converged": all(np.isfinite(r.error) for r in rows if r.method == DEFAULT)}
-    if o.json:
-        print(json.dumps(out))
+    with common.results(o) as out:
+        rows = []
+        for case in o.cases:
+            rows += measure(case, o.quick, o.repeat or (1 if o.quick else 2))
+            draw(o.out, case, [r for r in rows if r.case == case])
+            common.write_csv(o.out / "runs.csv", asdict(rows[0]), (asdict(row).values() for row in rows))
+        comparison = compare(rows)
+        (o.out / "comparison.md").write_text(common.markdown(table(comparison)) + "\n")
+        common.table(table(comparison))
+        out |= {"comparison": comparison, "converged": all(np.isfinite(r.error) for r in rows if r.method == DEFAULT)}
     return out
 
 
 if __name__ == "__main__":
-    sys.exit(0 if main()["converged"] else 1)
+    raise SystemExit(0 if main()["converged"] else 1)

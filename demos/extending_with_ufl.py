@@ -15,16 +15,13 @@ little; 1e-11 for plastic flow, the equation and the return.
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
+from argparse import Namespace
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import ClassVar
 
+import common
 import numpy as np
-import poroelastic_beam as beam
 import ufl
 from scipy.optimize import brentq
 
@@ -364,40 +361,30 @@ EXAMPLES = (energy, fibres, kozeny_carman, strain_law, springs, well, damage, pl
 
 def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return what --json prints."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=20, help="cells over the height, a multiple of 4")
-    parser.add_argument("--out", type=Path, default=Path("out/extending_with_ufl"), help="folder for the picture")
-    parser.add_argument("--json", action="store_true", help="print the results as one line of JSON at the end")
     o = parser.parse_args(argv)
     if o.cells < 4 or o.cells % 4:
         parser.error(f"--cells {o.cells}: must be a multiple of 4, >= 4")
-    try:
+    with common.results(o) as out:
         examples = [example(o.cells) for example in EXAMPLES]
-        out = {"errors": {f.__name__: e.error for f, e in zip(EXAMPLES, examples, strict=True)}, "converged": True}
-        for e in examples:
-            print(f"{e.title:>28}: {e.error:.1e}")
+        out["errors"] = {f.__name__: e.error for f, e in zip(EXAMPLES, examples, strict=True)}
+        common.table([[f"{o.cells} cells", "error"], *([e.title, f"{e.error:.1e}"] for e in examples)])
         draw(o, examples)
-        print(f"{o.cells} cells; picture: {o.out}/extending_with_ufl.png")
-    except mpm.GaveUp as error:
-        print(f"error: {error}", file=sys.stderr)
-        out = {"errors": {}, "converged": False}
-    if o.json:
-        print(json.dumps(out))
     return out
 
 
-def draw(o: argparse.Namespace, examples: list[Example]) -> None:
+def draw(o: Namespace, examples: list[Example]) -> None:
     """Draw every example beside its exact solution."""
-    fig, axes = beam.figure(2, 5, (20, 7))
+    fig, axes = common.figure(2, 5, (20, 7))
     for ax, e in zip(axes.flat, examples, strict=True):
         ax.plot(e.x, e.exact, color="black", lw=1, label="exact")
         ax.plot(e.x, e.found, "o", ms=3, label="material points")
         ax.set(xlabel=e.xlabel, ylabel=e.ylabel, title=f"{e.title} (error {e.error:.0e})")
         ax.grid(alpha=0.3)
     axes[0, 0].legend()
-    o.out.mkdir(parents=True, exist_ok=True)
-    fig.savefig(o.out / "extending_with_ufl.png", dpi=130)
+    common.save(fig, o.out / "extending_with_ufl.png")
 
 
 if __name__ == "__main__":
-    sys.exit(0 if main()["converged"] else 1)
+    raise SystemExit(0 if main()["converged"] else 1)

@@ -17,20 +17,16 @@ On one process.
 
 from __future__ import annotations
 
-import argparse
-import csv
-import json
 import logging
 import signal
-import sys
 import time
 from collections import Counter
 from dataclasses import asdict, dataclass, fields
 from math import isnan, nan
 from pathlib import Path
 
+import common
 import numpy as np
-import poroelastic_beam
 from extreme.families import FAMILIES
 from extreme.scenes import Make, Scene
 from scipy.sparse import csr_matrix
@@ -156,8 +152,7 @@ def table(head: list[str], rows: list[list]) -> str:
             return "" if isnan(v) else f"{v:.2g}"
         return str(v).replace("|", "/")
 
-    lines = [head, ["---"] * len(head), *[[cell(v) for v in row] for row in rows]]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    return common.markdown([head, *([cell(v) for v in row] for row in rows)])
 
 
 def summary(rows: list[Row]) -> str:
@@ -174,10 +169,8 @@ def summary(rows: list[Row]) -> str:
 
 def write(out: Path, rows: list[Row]) -> None:
     """Write the tables."""
-    out.mkdir(parents=True, exist_ok=True)
     head = [f.name for f in fields(Row)]
-    with (out / "cases.csv").open("w", newline="") as file:
-        csv.writer(file).writerows([head, *[asdict(r).values() for r in rows]])
+    common.write_csv(out / "cases.csv", head, (asdict(r).values() for r in rows))
     (out / "cases.md").write_text(table(head, [list(asdict(r).values()) for r in rows]) + "\n")
     (out / "summary.md").write_text(summary(rows) + "\n")
 
@@ -186,7 +179,7 @@ def draw(out: Path, rows: list[Row]) -> None:
     """Draw the errors, condition numbers and Newton iterations a step of all cases, a row a family."""
     names = [name for name in FAMILIES if any(r.family == name for r in rows)]
     colours = dict(zip(OUTCOMES, ("C0", "C2", "0.5", "C1", "C3", "black", "C4"), strict=True))
-    fig, (axes,) = poroelastic_beam.figure(1, 3, (13, 1.5 + 0.34 * len(names)))
+    fig, (axes,) = common.figure(1, 3, (13, 1.5 + 0.34 * len(names)))
     rng = np.random.default_rng(1)
     for r in rows:
         y = -names.index(r.family) + rng.uniform(-0.28, 0.28)
@@ -211,36 +204,34 @@ def draw(out: Path, rows: list[Row]) -> None:
     for name, n in Counter(r.outcome for r in rows).items():
         axes[1].plot([], [], "s" if name == "refused" else "o", color=colours[name], label=f"{name}: {n}")
     axes[1].legend(loc="upper right", fontsize=9)
-    fig.savefig(out / "extreme_cases.png", dpi=130)
+    common.save(fig, out / "extreme_cases.png")
 
 
 def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return what --json prints."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = common.Parser(__doc__, __file__)
     parser.add_argument("--families", nargs="+", choices=tuple(FAMILIES), default=list(FAMILIES), metavar="NAME")
     parser.add_argument("--quick", action="store_true", help="four cases of each family, the first and last among them")
     parser.add_argument("--rtol", type=float, help="choose the steps by their error, none longer than the scene's")
-    parser.add_argument("--out", type=Path, default=Path("out/extreme_cases"), help="folder for picture and tables")
-    parser.add_argument("--json", action="store_true", help="print the results as one line of JSON at the end")
     o = parser.parse_args(argv)
-    rows = []
-    for name in o.families:
-        cases = list(FAMILIES[name].cases())
-        chosen = sorted({round(i) for i in np.linspace(0, len(cases) - 1, 4 if o.quick else len(cases))})
-        for setting, make in (cases[i] for i in chosen):
-            rows.append(r := judge(Row(name, setting), make, FAMILIES[name].bound, o.rtol))
-            print(f"{name:25} {setting:44} {r.outcome:10} {r.error:8.1e} {r.seconds:6.2f} s {r.note[:90]}", flush=True)
-        write(o.out, rows)
-    draw(o.out, rows)
-    print(summary(rows))
-    print(f"picture and tables: {o.out}/")
-    counts = Counter(r.outcome for r in rows)
-    out = {"cases": len(rows), **{name: counts[name] for name in OUTCOMES}}
-    if o.json:
-        print(json.dumps(out))
+    with common.results(o) as out:
+        rows = []
+        for name in o.families:
+            cases = list(FAMILIES[name].cases())
+            chosen = sorted({round(i) for i in np.linspace(0, len(cases) - 1, 4 if o.quick else len(cases))})
+            for setting, make in (cases[i] for i in chosen):
+                rows.append(r := judge(Row(name, setting), make, FAMILIES[name].bound, o.rtol))
+                print(
+                    f"{name:25} {setting:44} {r.outcome:10} {r.error:8.1e} {r.seconds:6.2f} s {r.note[:90]}", flush=True
+                )
+            write(o.out, rows)
+        draw(o.out, rows)
+        print(summary(rows))
+        counts = Counter(r.outcome for r in rows)
+        out |= {"cases": len(rows), **{name: counts[name] for name in OUTCOMES}}
+        out["converged"] = not out["wrong"] + out["nan"] + out["hung"]
     return out
 
 
 if __name__ == "__main__":
-    found = main()
-    sys.exit(1 if found["wrong"] + found["nan"] + found["hung"] else 0)
+    raise SystemExit(0 if main()["converged"] else 1)

@@ -27,14 +27,11 @@ A rough circular footing on Tresca's soil carries 6.05 s_u (Cox, Eason and Hopki
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import common
 import numpy as np
-import poroelastic_beam as beam
 
 import mpm_dolfinx as mpm
 
@@ -199,29 +196,21 @@ def limit_load(how: str, cells: int) -> Push:
 
 def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return what --json prints."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cells", type=int, default=9, help="cells over the footing's width, odd (9)")
-    parser.add_argument("--depth", type=float, default=1.0, help="depth of the push over the footing's width (1)")
-    parser.add_argument("--out", type=Path, default=Path("out/footing"), help="folder for the pictures (out/footing)")
-    parser.add_argument("--json", action="store_true", help="print the results as one line of JSON at the end")
+    parser = common.Parser(__doc__, __file__)
+    parser.add_argument("--cells", type=int, default=9, help="cells over the footing's width, odd")
+    parser.add_argument("--depth", type=float, default=1.0, help="depth of the push over the footing's width")
     o = parser.parse_args(argv)
     if o.cells < 3 or o.cells % 2 == 0 or not 0 < o.depth <= 1.5:
         parser.error(f"--cells {o.cells} --depth {o.depth:g}: must be odd and >= 3, and in (0, 1.5]")
-    out = {"converged": False}
-    try:
+    with common.results(o) as out:
         stiff = {(how, cells): limit_load(how, cells) for how in LIMITS_OF for cells in (o.cells, 2 * o.cells - 1)}
         out["errors"] = errors(stiff)
         runs = {}
         for name, rate in RATES.items():
             runs[name] = push(SOIL, o.cells, o.depth, rate, rest=10.0 if name == "intermediate" else 0.0)
-        out |= report(runs) | {"converged": True}
+        out |= report(runs)
         draw(o.out, runs, stiff)
         animate(o.out, runs["intermediate"])
-        print(f"pictures: {o.out}/footing.png, footing.gif")
-    except mpm.GaveUp as error:
-        print(f"error: {error}", file=sys.stderr)
-    if o.json:
-        print(json.dumps(out))
     return out
 
 
@@ -296,7 +285,7 @@ def scale(run: Push) -> tuple[float, float]:
 
 def draw(out: Path, runs: dict[str, Push], stiff: dict[tuple[str, int], Push]) -> None:
     """Draw pressures, load over settlement, the soil's surface, and the limit loads of stiff soil."""
-    fig, ((soil, curve), (surface, limit)) = beam.figure(2, 2, (12, 7.5))
+    fig, ((soil, curve), (surface, limit)) = common.figure(2, 2, (12, 7.5))
     run = runs["intermediate"]
     quads = view(soil, (run.at_end, run.frames[-1]), scale(run))
     fig.colorbar(quads, ax=soil, label="pore pressure / c (-)", shrink=0.8, extend="both")
@@ -325,8 +314,7 @@ def draw(out: Path, runs: dict[str, Push], stiff: dict[tuple[str, int], Push]) -
     limit.set_title("Very stiff soil beside the theory")
     limit.legend(fontsize=8, loc="lower right")
     limit.grid(alpha=0.3)
-    out.mkdir(parents=True, exist_ok=True)
-    fig.savefig(out / "footing.png", dpi=90)
+    common.save(fig, out / "footing.png", dpi=90)
 
 
 def draw_loads(ax, runs: dict[str, Push]) -> None:
@@ -353,7 +341,7 @@ def animate(out: Path, run: Push) -> None:
     """Draw the push and what follows as an animation."""
     from matplotlib.animation import FuncAnimation, PillowWriter
 
-    fig, ((ax,),) = beam.figure(1, 1, (6.4, 3.9))
+    fig, ((ax,),) = common.figure(1, 1, (6.4, 3.9))
     quads = view(ax, (run.frames[0], run.frames[0]), scale(run))
     fig.colorbar(quads, ax=ax, label="pore pressure / c (-)", shrink=0.8, extend="both")
     ax.set_title(" ")
@@ -371,4 +359,4 @@ def animate(out: Path, run: Push) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(0 if main()["converged"] else 1)
+    raise SystemExit(0 if main()["converged"] else 1)

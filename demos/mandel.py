@@ -18,14 +18,11 @@ cells: it falls with the square of their size.
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
+from argparse import Namespace
 from dataclasses import dataclass, field
-from pathlib import Path
 
+import common
 import numpy as np
-import poroelastic_beam as beam
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.verification.exact import Mandel
@@ -111,32 +108,25 @@ def errors(out: Outcome) -> dict[str, float]:
 
 def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return what --json prints."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=40, help="cells over the width, four times those over the height")
     parser.add_argument("--steps", type=int, default=30, help="equal steps to each of T = 0.01, 0.1, 0.5, 1")
-    parser.add_argument("--out", type=Path, default=Path("out/mandel"), help="folder for the picture")
-    parser.add_argument("--json", action="store_true", help="print the results as one line of JSON at the end")
     o = parser.parse_args(argv)
     if o.cells < 1 or o.steps < 1:
         parser.error(f"--cells {o.cells} --steps {o.steps}: must be >= 1")
-    try:
+    with common.results(o) as out:
         found, outcome = run(o.cells, o.steps)
-        out = {"errors": found, "wall_s": sum(stage.wall for stage in outcome.stages), "converged": True}
-        for name, error in found.items():
-            print(f"{name:>10}: {error:.3%}" + (" of force/a" if name[2:3].isdigit() else ""))
+        out |= {"errors": found, "wall_s": sum(stage.wall for stage in outcome.stages)}
+        print(f"{o.cells} cells, {4 * o.steps} steps, {out['wall_s']:.1f} s")
+        of = {name: "force / a" if name[2:3].isdigit() else "itself" for name in found}
+        common.table([["error", "", "of"], *([name, f"{error:.3%}", of[name]] for name, error in found.items())])
         draw(o, outcome)
-        print(f"{o.cells} cells, {4 * o.steps} steps, {out['wall_s']:.1f} s; picture: {o.out}/mandel.png")
-    except mpm.GaveUp as error:
-        print(f"error: {error}", file=sys.stderr)
-        out = {"errors": {}, "wall_s": error.result.wall, "converged": False}
-    if o.json:
-        print(json.dumps(out))
     return out
 
 
-def draw(o: argparse.Namespace, out: Outcome) -> None:
+def draw(o: Namespace, out: Outcome) -> None:
     """Draw the pressure over the width, and in the middle over time, beside the exact curves."""
-    fig, ((left, right),) = beam.figure(1, 2, (11, 4.6))
+    fig, ((left, right),) = common.figure(1, 2, (11, 4.6))
     unit, scale, x = WIDTH**2 / EXACT.cv, FORCE / WIDTH, np.linspace(0, WIDTH, 201)
     for i, k in enumerate(map(out.at, SAMPLES)):
         left.plot(x, EXACT.pressure(x, out.time[k] * unit) / scale, "k", lw=1, label=None if i else "exact")
@@ -156,9 +146,8 @@ def draw(o: argparse.Namespace, out: Outcome) -> None:
     right.legend(loc="lower left")
     for ax in (left, right):
         ax.grid(alpha=0.3)
-    o.out.mkdir(parents=True, exist_ok=True)
-    fig.savefig(o.out / "mandel.png", dpi=130)
+    common.save(fig, o.out / "mandel.png")
 
 
 if __name__ == "__main__":
-    sys.exit(0 if main()["converged"] else 1)
+    raise SystemExit(0 if main()["converged"] else 1)

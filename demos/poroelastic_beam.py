@@ -11,15 +11,11 @@ finite element solution of the same finite-strain Biot problem, in steps of a qu
 
 from __future__ import annotations
 
-import argparse
-import csv
-import json
 import sys
+from argparse import Namespace
 from dataclasses import replace
-from pathlib import Path
 
-from mpi4py import MPI
-
+import common
 import numpy as np
 
 import mpm_dolfinx as mpm
@@ -39,9 +35,9 @@ Steps of 0.0025 s change the last digit but one, 100 x 30 cells the fifth.
 """
 
 
-def arguments(argv: list[str] | None = None) -> argparse.Namespace:
+def arguments(argv: list[str] | None = None) -> Namespace:
     """Parse the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser = common.Parser(__doc__, __file__)
     add = parser.add_argument
     add("--dim", type=int, choices=(2, 3), default=2, help="plane strain, or one cell deep between smooth walls")
     add("--h", type=float, default=0.015, help="cell size, m")
@@ -68,10 +64,8 @@ def arguments(argv: list[str] | None = None) -> argparse.Namespace:
     add("--coupling", choices=tuple(mpm.COUPLINGS), default="schur-cg", help="coupling scheme")
     add("--drained", action="store_true", help="no fluid at all")
     add("--reference", action="store_true", help="run the Taylor-Hood finite elements beside it")
-    add("--out", type=Path, default=Path("out/poroelastic_beam"), help="folder for pictures and tables")
     add("--paraview", action="store_true", help="write points, grid and histories of every step to OUT/paraview")
     add("--profile", action="store_true", help="print where the time went")
-    add("--json", action="store_true", help="print the results as one line of JSON at the end")
     options = parser.parse_args(argv)
     for name in ("h", "dt", "t_end", "ramp", "load", "box_scale"):
         if not getattr(options, name) > 0:
@@ -79,7 +73,7 @@ def arguments(argv: list[str] | None = None) -> argparse.Namespace:
     return options
 
 
-def physics(o: argparse.Namespace, dim: int = 2) -> dict:
+def physics(o: Namespace, dim: int = 2) -> dict:
     """Return what material points and finite elements share: boundary conditions and fluid."""
     inner = [np.inf] * (dim - 1)
     load = mpm.Traction(
@@ -95,12 +89,12 @@ def physics(o: argparse.Namespace, dim: int = 2) -> dict:
     return {"fixed": fixed, "tractions": [load], "fluid": fluid, "drained": ends}
 
 
-def material(o: argparse.Namespace) -> mpm.Hencky:
+def material(o: Namespace) -> mpm.Hencky:
     """Return the skeleton."""
     return mpm.Hencky(bulk=o.bulk, shear=o.shear, porosity=o.porosity, conductivity=o.conductivity)
 
 
-def scene(o: argparse.Namespace) -> tuple[mpm.Simulation, float]:
+def scene(o: Namespace) -> tuple[mpm.Simulation, float]:
     """Return the simulation and the height of the beam's underside."""
     cells = np.rint(BOX / o.h).astype(int)
     h = BOX / cells
@@ -121,7 +115,7 @@ def scene(o: argparse.Namespace) -> tuple[mpm.Simulation, float]:
     return mpm.Simulation(grid, [beam], [material(o)], **options, **conditions), bottom
 
 
-def output_times(o: argparse.Namespace) -> dict:
+def output_times(o: Namespace) -> dict:
     """Return the steps and output times for `run`: equal steps, or those of TIMES with steps by their error."""
     if o.rtol is None:
         return {"dt": o.dt}
@@ -150,36 +144,36 @@ def main(argv: list[str] | None = None) -> dict:
                     corners, pressure = corners[front][:, [0, 1, 4, 5]][..., [0, 2]], pressure[front]
                 snapshots.append((s.t, corners, pressure))
 
-    failure, observers = None, [observe]
+    observers = [observe]
     if o.paraview:
         observers.append(mpm.Writer(simulation, o.out / "paraview", grid=True))
-    places = axis if o.dim == 2 else np.insert(axis, 1, DEPTH / 2, axis=1)
-    try:
-        probes = mpm.probes(simulation.bodies, places)
-        result = simulation.run(o.t_end, **output_times(o), probes=probes, observe=observers)
-    except mpm.GaveUp as error:
-        failure, result = error, error.result
-    result = replace(result, rows=[row._replace(displacement=row.displacement[:, [0, -1]]) for row in result.rows])
-    fem = None
-    if o.reference:
-        fem = BiotFEM([0, 0], [LENGTH, HEIGHT], REFERENCE_CELLS, material(o), **physics(o)).run(
-            o.t_end, o.dt / 4, probes=axis - [0, bottom], progress=True
-        )
-        at = [int(np.argmin(np.abs(np.array(fem.t) - t))) for t in result.t]
-        fem = replace(fem, rows=[fem.rows[k] for k in at])
-    if simulation.grid.comm.rank == 0:
-        o.out.mkdir(parents=True, exist_ok=True)
-        write_tables(o, axis, result, fem)
-        draw_deflection(o, axis, result, fem, shown)
-        if snapshots:
-            draw_pressure(o, snapshots)
-        report(o, result, fem)
-    out = summary(simulation, result)
-    if failure is not None and MPI.COMM_WORLD.rank == 0:
-        print(f"error: {failure}", file=sys.stderr)
-    if o.json and MPI.COMM_WORLD.rank == 0:
-        print(json.dumps(out))
+    probes = mpm.probes(simulation.bodies, axis if o.dim == 2 else np.insert(axis, 1, DEPTH / 2, axis=1))
+    with common.results(o) as out:
+        failure = None
+        try:
+            result = simulation.run(o.t_end, **output_times(o), probes=probes, observe=observers)
+        except mpm.GaveUp as error:  # what was found until then is shown
+            failure, result = error, error.result
+        result = replace(result, rows=[r._replace(displacement=r.displacement[:, [0, -1]]) for r in result.rows])
+        out |= summary(simulation, result)
+        fem = reference(o, result, axis - [0, bottom]) if o.reference else None
+        if common.first():
+            report(o, result, fem)
+            write_tables(o, axis, result, fem)
+            draw_deflection(o, axis, result, fem, shown)
+            if snapshots:
+                draw_pressure(o, snapshots)
+        if failure:
+            raise failure
     return out
+
+
+def reference(o: Namespace, result: mpm.Result, axis: np.ndarray) -> mpm.Result:
+    """Return the finite elements' result at the times of another, of the places (n, 2), m, of the beam's axis."""
+    fem = BiotFEM([0, 0], [LENGTH, HEIGHT], REFERENCE_CELLS, material(o), **physics(o))
+    found = fem.run(o.t_end, o.dt / 4, probes=axis, progress=True)
+    at = [int(np.argmin(np.abs(np.array(found.t) - t))) for t in result.t]
+    return replace(found, rows=[found.rows[k] for k in at])
 
 
 def summary(simulation: mpm.Simulation, result: mpm.Result) -> dict:
@@ -201,66 +195,51 @@ def summary(simulation: mpm.Simulation, result: mpm.Result) -> dict:
     }
 
 
-def report(o: argparse.Namespace, result: mpm.Result, fem) -> None:
+def report(o: Namespace, result: mpm.Result, fem) -> None:
     """Print the tip's deflection, beside the reference where there is one."""
-    print(f"\n{'t (s)':>8} {'u_x (m)':>10} {'u_y (m)':>10}" + (f" {'FEM':>10} {'difference':>11}" if fem else ""))
+    rows = [["tip: t (s)", "u_x (m)", "u_y (m)", *(["FEM (m)", "difference"] if fem else [])]]
     every = max(1, len(result.t) // 12)
     for k in sorted({*range(1, min(4, len(result.t))), *range(every, len(result.t), every), len(result.t) - 1}):
         u = result.displacement[k][-1]
-        line = f"{result.t[k]:8.3f} {u[0]:10.5f} {u[1]:10.5f}"
+        rows.append([f"{result.t[k]:.3f}", f"{u[0]:.5f}", f"{u[1]:.5f}"])
         if fem:
             exact = fem.displacement[k][-1][1]
-            line += f" {exact:10.5f} {100 * (u[1] / exact - 1):10.3f}%"
-        print(line)
+            rows[-1] += [f"{exact:.5f}", f"{u[1] / exact - 1:.3%}"]
+    common.table(rows)
     print(
         f"{result.steps} steps, {result.newton} Newton and {result.coupling} coupling iterations, "
         f"fluid balance {result.balance:.1e}, {result.wall:.1f} s"
     )
     if o.profile:
         print(result.shares())
-    print(f"pictures and tables: {o.out}/" + (f", for ParaView: {o.out}/paraview/points.pvd" if o.paraview else ""))
+    if o.paraview:
+        print(f"for ParaView: {o.out}/paraview/points.pvd")
 
 
-def write_tables(o: argparse.Namespace, axis: np.ndarray, result: mpm.Result, fem) -> None:
+def write_tables(o: Namespace, axis: np.ndarray, result: mpm.Result, fem) -> None:
     """Write the tip's history and the deflection curves as CSV."""
-    with (o.out / "tip.csv").open("w", newline="") as file:
-        table = csv.writer(file)
-        names = ["t_s", "ux_m", "uy_m", *([] if o.drained else ["p_min_Pa", "p_max_Pa"])]
-        table.writerow([*names, *(["fem_ux_m", "fem_uy_m"] if fem else [])])
-        for k, t in enumerate(result.t):
-            row = [t, *result.displacement[k][-1], *([] if o.drained else result.pressure[k])]
-            table.writerow([*row, *(fem.displacement[k][-1] if fem else [])])
-    with (o.out / "deflection.csv").open("w", newline="") as file:
-        table = csv.writer(file)
-        table.writerow(["t_s", "x_m", "ux_m", "uy_m"])
-        for t, u in zip(result.t, result.displacement, strict=True):
-            table.writerows([t, x, *v] for x, v in zip(axis[:, 0], u, strict=True))
+    names = ["t_s", "ux_m", "uy_m", *([] if o.drained else ["p_min_Pa", "p_max_Pa"])]
+    rows = []
+    for k, t in enumerate(result.t):
+        rows.append([t, *result.displacement[k][-1], *([] if o.drained else result.pressure[k])])
+        rows[-1] += [*fem.displacement[k][-1]] if fem else []
+    common.write_csv(o.out / "tip.csv", [*names, *(["fem_ux_m", "fem_uy_m"] if fem else [])], rows)
+    histories = zip(result.t, result.displacement, strict=True)
+    rows = ([t, x, *v] for t, u in histories for x, v in zip(axis[:, 0], u, strict=True))
+    common.write_csv(o.out / "deflection.csv", ["t_s", "x_m", "ux_m", "uy_m"], rows)
 
 
-def figure(rows: int, columns: int, size: tuple[float, float]):
-    """Return (figure, axes) of matplotlib without a display."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    return plt.subplots(rows, columns, figsize=size, layout="constrained", squeeze=False)
-
-
-def draw_pressure(o: argparse.Namespace, snapshots: list) -> None:
+def draw_pressure(o: Namespace, snapshots: list) -> None:
     """Draw the pore pressure on the material points at six times, in one range of colours."""
-    from matplotlib.collections import PolyCollection
     from matplotlib.colors import SymLogNorm
 
     rows = 1 + (len(snapshots) > 3)
-    fig, axes = figure(rows, 3, (13, 3 * rows))
+    fig, axes = common.figure(rows, 3, (13, 3 * rows))
     limit = max(np.abs(pressure).max() for _, _, pressure in snapshots) / 1e3
     colours = SymLogNorm(limit / 30, vmin=-limit, vmax=limit)  # what is left in the end is a fortieth
     low, high = snapshots[-1][1].min(axis=(0, 1)), snapshots[0][1].max(axis=(0, 1))
     for ax, (t, corners, pressure) in zip(axes.ravel(), snapshots, strict=False):
-        domains = PolyCollection(corners[:, [0, 1, 3, 2]], array=pressure / 1e3, cmap="RdBu_r", edgecolors="face")
-        domains.set(linewidth=0.1, norm=colours)
-        ax.add_collection(domains)
+        domains = common.domains(ax, corners, pressure / 1e3, cmap="RdBu_r", linewidth=0.1, norm=colours)
         ax.set(aspect="equal", title=f"t = {t:.3g} s", xlabel="x (m)", ylabel="y (m)")
         ax.set(xlim=(-0.03, high[0] + 0.05), ylim=(low[1] - 0.03, high[1] + 0.03))
     bar = fig.colorbar(domains, ax=axes, shrink=0.8, aspect=30, format="%g")
@@ -268,14 +247,14 @@ def draw_pressure(o: argparse.Namespace, snapshots: list) -> None:
     bar.set_ticks([sign * x for x in (300, 100, 30, 10) for sign in (-1, 1) if x < limit] + [0])
     for ax in axes.ravel()[len(snapshots) :]:
         ax.set_axis_off()
-    fig.savefig(o.out / "pressure.png", dpi=130)
+    common.save(fig, o.out / "pressure.png")
 
 
-def draw_deflection(o: argparse.Namespace, axis: np.ndarray, result: mpm.Result, fem, shown) -> None:
+def draw_deflection(o: Namespace, axis: np.ndarray, result: mpm.Result, fem, shown) -> None:
     """Draw the beam's axis at several times beside Euler-Bernoulli and the finite elements."""
     import matplotlib
 
-    fig, ((ax,),) = figure(1, 1, (8, 5))
+    fig, ((ax,),) = common.figure(1, 1, (8, 5))
     shown = [k for k in shown if k < len(result.t)]
     colours = matplotlib.colormaps["viridis"](np.linspace(0.9, 0, len(shown)))
     y0 = axis[0, 1]
@@ -294,8 +273,8 @@ def draw_deflection(o: argparse.Namespace, axis: np.ndarray, result: mpm.Result,
     ax.set(xlabel="x (m)", ylabel="height of the beam's axis (m)", title="Deflection of the beam's axis")
     ax.legend(loc="lower left")
     ax.grid(alpha=0.3)
-    fig.savefig(o.out / "deflection.png", dpi=130)
+    common.save(fig, o.out / "deflection.png")
 
 
 if __name__ == "__main__":
-    sys.exit(0 if main()["converged"] else 1)
+    raise SystemExit(0 if main()["converged"] else 1)

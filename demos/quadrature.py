@@ -9,12 +9,10 @@ point crosses.  The finite element reference takes the load in ten steps.
 
 from __future__ import annotations
 
-import argparse
-import csv
-import json
 import sys
-from pathlib import Path
+from argparse import Namespace
 
+import common
 import numpy as np
 import poroelastic_beam as beam
 
@@ -36,7 +34,7 @@ def tip(h: float, steps: int, quadrature: str) -> tuple[float, float]:
     return float(result.displacement[-1][0, 1]), result.wall
 
 
-def options(h: float, steps: int, quadrature: str = "domain") -> argparse.Namespace:
+def options(h: float, steps: int, quadrature: str = "domain") -> Namespace:
     """Return the beam's options for a drained run in equal steps."""
     command = f"--drained --ramp 1 --t-end 1 --dt {1 / steps} --h {h} --quadrature {quadrature}"
     return beam.arguments(command.split())
@@ -44,36 +42,31 @@ def options(h: float, steps: int, quadrature: str = "domain") -> argparse.Namesp
 
 def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return what --json prints."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser = common.Parser(__doc__, __file__)
     parser.add_argument("--h", type=float, default=0.015, help="cell size, m")
     parser.add_argument("--steps", type=int, nargs="+", default=[10, 20, 40, 80, 160], help="numbers of load steps")
-    parser.add_argument("--out", type=Path, default=Path("out/quadrature"), help="folder for the picture and the table")
-    parser.add_argument("--json", action="store_true", help="print the results as one line of JSON at the end")
     o = parser.parse_args(argv)
-    ten = options(o.h, 10)
-    fem = BiotFEM([0, 0], [beam.LENGTH, beam.HEIGHT], beam.REFERENCE_CELLS, beam.material(ten), **beam.physics(ten))
-    exact = float(fem.run(1.0, 0.1, probes=PROBE).displacement[-1][0, 1])
-    runs = {q: [tip(o.h, n, q) for n in o.steps] for q in ("domain", "point")}
-    tips = {q: [u for u, _ in run] for q, run in runs.items()}
-
-    o.out.mkdir(parents=True, exist_ok=True)
-    with (o.out / "tip.csv").open("w", newline="") as file:
-        table = csv.writer(file)
-        table.writerow(["steps", "domain_m", "domain_s", "point_m", "point_s", "fem_m"])
-        table.writerows([n, *d, *p, exact] for n, d, p in zip(o.steps, *runs.values(), strict=True))
-    draw(o, tips, exact)
-    for n, d, p in zip(o.steps, *tips.values(), strict=True):
-        print(f"{n:5d} steps: domains {d:.5f} ({d / exact - 1:+.3%}), points {p:.5f} ({p / exact - 1:+.2%})")
-    print(f"FEM {exact:.5f}; picture and table: {o.out}/")
-    out = {"steps": o.steps, **tips, "fem": exact, "converged": bool(np.isfinite(tips["domain"]).all())}
-    if o.json:
-        print(json.dumps(out))
+    with common.results(o) as out:
+        ten = options(o.h, 10)
+        fem = BiotFEM([0, 0], [beam.LENGTH, beam.HEIGHT], beam.REFERENCE_CELLS, beam.material(ten), **beam.physics(ten))
+        exact = float(fem.run(1.0, 0.1, probes=PROBE).displacement[-1][0, 1])
+        runs = {q: [tip(o.h, n, q) for n in o.steps] for q in ("domain", "point")}
+        tips = {q: [u for u, _ in run] for q, run in runs.items()}
+        rows = [["load steps", "tip, domains (m)", "to FEM", "tip, points (m)", "to FEM"]]
+        for n, pair in zip(o.steps, zip(*tips.values(), strict=True), strict=True):
+            rows.append([str(n), *(x for u in pair for x in (f"{u:.5f}", f"{u / exact - 1:+.3%}"))])
+        common.table([*rows, ["FEM", f"{exact:.5f}", "", "", ""]])
+        head = ["steps", "domain_m", "domain_s", "point_m", "point_s", "fem_m"]
+        numbers = ([n, *d, *p, exact] for n, d, p in zip(o.steps, *runs.values(), strict=True))
+        common.write_csv(o.out / "tip.csv", head, numbers)
+        draw(o, tips, exact)
+        out |= {"steps": o.steps, **tips, "fem": exact, "converged": bool(np.isfinite(tips["domain"]).all())}
     return out
 
 
-def draw(o: argparse.Namespace, tips: dict[str, list[float]], exact: float) -> None:
+def draw(o: Namespace, tips: dict[str, list[float]], exact: float) -> None:
     """Draw the tip's deflection against the number of steps."""
-    fig, ((ax,),) = beam.figure(1, 1, (7, 4.2))
+    fig, ((ax,),) = common.figure(1, 1, (7, 4.2))
     ax.axhline(exact, color="black", lw=1, label="Taylor-Hood FEM")
     ax.plot(o.steps, tips["domain"], "o-", label="exact pieces of the points' domains")
     ax.plot(o.steps, tips["point"], "s--", label="at the points, as in standard MPM")
@@ -87,8 +80,8 @@ def draw(o: argparse.Namespace, tips: dict[str, list[float]], exact: float) -> N
     ax.set_title("Drained beam: the tip must not depend on the number of steps")
     ax.legend()
     ax.grid(alpha=0.3)
-    fig.savefig(o.out / "quadrature.png", dpi=130)
+    common.save(fig, o.out / "quadrature.png")
 
 
 if __name__ == "__main__":
-    sys.exit(0 if main()["converged"] else 1)
+    raise SystemExit(0 if main()["converged"] else 1)

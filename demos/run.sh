@@ -18,9 +18,9 @@ case ${1-} in
     "" | -*) ;;
     *) demo=$1 && shift ;;
 esac
-if [ ! -f "$root/demos/$demo.py" ]; then
+if [ ! -f "$root/demos/$demo.py" ] || [ "$demo" = common ]; then
     say "There is no demo $demo. There are:"
-    (cd "$root/demos" && printf '    %s\n' *.py | sed 's/\.py$//') >&2
+    (cd "$root/demos" && printf '    %s\n' *.py | sed 's/\.py$//; /^ *common$/d') >&2
     exit 2
 fi
 

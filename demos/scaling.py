@@ -29,7 +29,6 @@ messages only.  In 2D the solvers are left out: factors do not cost n / P.
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import os
 import subprocess
@@ -40,6 +39,7 @@ from pathlib import Path
 from mpi4py import MPI
 from petsc4py import PETSc
 
+import common
 import numpy as np
 import poroelastic_beam as beam
 from scipy.optimize import nnls
@@ -192,13 +192,11 @@ def predicted(model: dict[str, float], dim: int, n: float, processes: int) -> fl
 
 def by_part(rows: list[dict], found: dict[str, float]) -> str:
     """Return the seconds and the memory of runs on one number of processes, and the exponents, as a Markdown table."""
-    sizes = " | ".join(f"{row['points']}" for row in rows)
-    lines = [f"| seconds of a step | {sizes} | exponent |", "|---" * (len(rows) + 2) + "|"]
+    lines = [["seconds of a step", *(f"{row['points']}" for row in rows), "exponent"]]
     for part in ("step", *PARTS, "rest"):
-        seconds = " | ".join(f"{row[part]:.2g}" for row in rows)
-        lines.append(f"| {part} | {seconds} | {found.get(part, np.nan):.2f} |")
-    memory = " | ".join(f"{row['memory_MB']:.0f}" for row in rows)
-    return "\n".join([*lines, f"| memory (MB) | {memory} | {found['kB a point']:.1f} kB a point |"])
+        lines.append([part, *(f"{row[part]:.2g}" for row in rows), f"{found.get(part, np.nan):.2f}"])
+    memory = [f"{row['memory_MB']:.0f}" for row in rows]
+    return common.markdown([*lines, ["memory (MB)", *memory, f"{found['kB a point']:.1f} kB a point"]])
 
 
 def by_processes(rows: list[dict]) -> str:
@@ -215,11 +213,8 @@ def by_processes(rows: list[dict]) -> str:
         "bytes ": "solver_bytes",
         "reductions": "solver_reductions",
     }
-    lines = [f"| {' | '.join(columns)} |", "|---" * len(columns) + "|"]
-    for row in rows:
-        values = (row[key] for key in columns.values())
-        lines.append(f"| {' | '.join(f'{v:.0f}' if v >= 100 else f'{v:.3g}' for v in values)} |")
-    return "\n".join(lines)
+    values = ([row[key] for key in columns.values()] for row in rows)
+    return common.markdown([list(columns), *([f"{v:.0f}" if v >= 100 else f"{v:.3g}" for v in row] for row in values)])
 
 
 def prediction(model: dict[str, float], dim: int) -> str:
@@ -235,7 +230,7 @@ def prediction(model: dict[str, float], dim: int) -> str:
 def draw(out: Path, rows: list[dict]) -> None:
     """Draw the time of the parts and the memory against the number of points."""
     dims, processes = (sorted({row[name] for row in rows}) for name in ("dim", "processes"))
-    fig, axes = beam.figure(len(dims), 2, (13, 4.4 * len(dims)))
+    fig, axes = common.figure(len(dims), 2, (13, 4.4 * len(dims)))
     for dim, (left, right) in zip(dims, axes, strict=True):
         for p, mark in zip(processes, "os^D*P", strict=False):
             mine = [row for row in rows if (row["dim"], row["processes"]) == (dim, p)]
@@ -250,7 +245,7 @@ def draw(out: Path, rows: list[dict]) -> None:
             ax.grid(alpha=0.3)
         left.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0))
         right.legend(fontsize=8)
-    fig.savefig(out / "scaling.png", dpi=120)
+    common.save(fig, out / "scaling.png", dpi=120)
 
 
 def draw_parts(left, right, rows: list[dict]) -> None:
@@ -267,11 +262,7 @@ def draw_parts(left, right, rows: list[dict]) -> None:
 
 def write(out: Path, rows: list[dict]) -> dict:
     """Write tables and pictures, print what they say; return exponents and cost models, by dimension."""
-    out.mkdir(parents=True, exist_ok=True)
-    with (out / "scaling.csv").open("w", newline="") as file:
-        writer = csv.DictWriter(file, fieldnames=list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
+    common.write_csv(out / "scaling.csv", rows[0], (row.values() for row in rows))
     text, found = [], {}
     for dim in sorted({row["dim"] for row in rows}):
         mine = [row for row in rows if row["dim"] == dim]
@@ -292,13 +283,12 @@ def write(out: Path, rows: list[dict]) -> dict:
     (out / "scaling.md").write_text("\n".join(text))
     print("\n".join(text))
     draw(out, rows)
-    print(f"pictures and tables: {out}/")
     return found
 
 
 def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return what --json prints."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = common.Parser(__doc__, __file__)
     add = parser.add_argument
     add("--dims", type=int, nargs="+", choices=(2, 3), default=[2, 3], help="dimensions")
     size = parser.add_mutually_exclusive_group()
@@ -306,8 +296,6 @@ def main(argv: list[str] | None = None) -> dict:
     size.add_argument("--largest", action="store_true", help="up to 1e6 points in 2D, 3e5 in 3D: a quarter of an hour")
     add("--processes", type=int, nargs="+", default=[1], help="numbers of processes; under mpirun: its own")
     add("--one", nargs=2, help=argparse.SUPPRESS)  # a run in a process of its own: dimension, points
-    add("--out", type=Path, default=Path("out/scaling"), help="folder for the picture and the tables")
-    add("--json", action="store_true", help="print the results as one line of JSON at the end")
     o = parser.parse_args(argv)
     if min(o.processes) < 1:
         parser.error(f"--processes {min(o.processes)}: must be >= 1")
@@ -318,22 +306,19 @@ def main(argv: list[str] | None = None) -> dict:
             print(json.dumps(row))
         return {"converged": True}
     sizes = SIZES["quick" if o.quick else "largest" if o.largest else "default"]
-    rows = []
-    for dim in o.dims:
-        for points in sizes[dim]:
+    with common.results(o) as out:
+        rows = out["rows"] = []
+        for dim, points in [(each, points) for each in o.dims for points in sizes[each]]:
             for processes in o.processes if comm.size == 1 else [comm.size]:
                 row = measure(dim, points) if comm.size > 1 else in_own_process(dim, points, processes)
                 rows.append(row)
                 if comm.rank == 0:
                     what = f"{dim}D, {row['points']:8} points, {processes} processes"
                     print(f"{what}: {row['step']:.3g} s a step, {row['memory_MB']:.0f} MB", flush=True)
-    out = {"rows": rows, "converged": True}
-    if comm.rank == 0:
-        out |= write(o.out, rows)
-        if o.json:
-            print(json.dumps(out))
+        if comm.rank == 0:
+            out |= write(o.out, rows)
     return out
 
 
 if __name__ == "__main__":
-    sys.exit(0 if main()["converged"] else 1)
+    raise SystemExit(0 if main()["converged"] else 1)

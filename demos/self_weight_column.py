@@ -16,14 +16,11 @@ instead of over the pieces of their domains: its error stays at some 8 % whateve
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
+from argparse import Namespace
 from dataclasses import dataclass
-from pathlib import Path
 
+import common
 import numpy as np
-import poroelastic_beam as beam
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.verification.exact import SelfWeightColumn
@@ -74,34 +71,27 @@ def errors(out: Outcome) -> dict[str, float]:
 
 def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return what --json prints."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=64, help="cells over the first height")
     parser.add_argument("--steps", type=int, default=40, help="equal steps of gravity")
-    parser.add_argument("--out", type=Path, default=Path("out/self_weight_column"), help="folder for the picture")
-    parser.add_argument("--json", action="store_true", help="print the results as one line of JSON at the end")
     o = parser.parse_args(argv)
     if o.cells < 1 or o.steps < 1:
         parser.error(f"--cells {o.cells} --steps {o.steps}: must be >= 1")
-    try:
+    with common.results(o) as out:
         outcome, rival = run(o.cells, o.steps), run(o.cells, o.steps, "point")
-        out = {"errors": errors(outcome), "wall_s": outcome.result.wall, "converged": True}
-        out["standard_mpm"] = errors(rival)
-        for what, found in {"exact domains": out["errors"], "standard MPM": out["standard_mpm"]}.items():
-            print(f"stress, {what}: {found['stress']:.2e} of rho0 g l0, mean over the points")
-        print(f"height: {outcome.height:.4f} m, exact {EXACT.height:.4f} m ({out['errors']['height']:.1e})")
+        out |= {"errors": errors(outcome), "wall_s": outcome.result.wall, "standard_mpm": errors(rival)}
+        print(f"{o.cells} cells, {o.steps} steps, {out['wall_s']:.1f} s; exact height {EXACT.height:.4f} m")
+        both = {"exact domains": (outcome, out["errors"]), "standard MPM": (rival, out["standard_mpm"])}
+        head = ["", "error of stress / (rho0 g l0), mean", "height (m)", "its error"]
+        rows = ([name, f"{e['stress']:.2e}", f"{x.height:.4f}", f"{e['height']:.1e}"] for name, (x, e) in both.items())
+        common.table([head, *rows])
         draw(o, outcome, rival)
-        print(f"{o.cells} cells, {o.steps} steps, {out['wall_s']:.1f} s; picture: {o.out}/self_weight_column.png")
-    except mpm.GaveUp as error:
-        print(f"error: {error}", file=sys.stderr)
-        out = {"errors": {}, "wall_s": error.result.wall, "converged": False}
-    if o.json:
-        print(json.dumps(out))
     return out
 
 
-def draw(o: argparse.Namespace, out: Outcome, rival: Outcome) -> None:
+def draw(o: Namespace, out: Outcome, rival: Outcome) -> None:
     """Draw the stress over the present height beside the exact curve and that of standard MPM."""
-    fig, ((ax,),) = beam.figure(1, 1, (6.5, 5))
+    fig, ((ax,),) = common.figure(1, 1, (6.5, 5))
     Y = np.linspace(0, EXACT.l0, 201)
     ax.plot(EXACT.stress(Y) / 1e3, EXACT.position(Y), color="black", lw=1, label="exact")
     ax.plot(rival.stress / 1e3, rival.y, "s", ms=2.5, color="C3", alpha=0.5, label="standard MPM, at the points")
@@ -110,9 +100,8 @@ def draw(o: argparse.Namespace, out: Outcome, rival: Outcome) -> None:
     ax.set_title(f"Column under its own weight: {EXACT.l0:g} m sink to {out.height:.2f} m")
     ax.legend()
     ax.grid(alpha=0.3)
-    o.out.mkdir(parents=True, exist_ok=True)
-    fig.savefig(o.out / "self_weight_column.png", dpi=130)
+    common.save(fig, o.out / "self_weight_column.png")
 
 
 if __name__ == "__main__":
-    sys.exit(0 if main()["converged"] else 1)
+    raise SystemExit(0 if main()["converged"] else 1)

@@ -11,13 +11,10 @@ A slope of 2:1, 10 m high, on 5 m of the same Mohr-Coulomb soil: phi = 20 degree
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
 from pathlib import Path
 
+import common
 import numpy as np
-import poroelastic_beam as beam
 import ufl
 
 import mpm_dolfinx as mpm
@@ -78,18 +75,15 @@ def slide(s: mpm.Simulation, steps: int) -> mpm.Result:
 
 def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return what --json prints."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cells", type=int, default=10, help="cells over the slope's height, even (10)")
-    parser.add_argument("--steps", type=int, default=40, help="steps of the slide (40)")
-    parser.add_argument("--rtol", type=float, default=0.01, help="accuracy of the factor of safety (0.01)")
-    parser.add_argument("--out", type=Path, default=Path("out/slope"), help="folder for the picture (out/slope)")
-    parser.add_argument("--json", action="store_true", help="print the results as one line of JSON at the end")
+    parser = common.Parser(__doc__, __file__)
+    parser.add_argument("--cells", type=int, default=10, help="cells over the slope's height, even")
+    parser.add_argument("--steps", type=int, default=40, help="steps of the slide")
+    parser.add_argument("--rtol", type=float, default=0.01, help="accuracy of the factor of safety")
     o = parser.parse_args(argv)
     if o.cells < 2 or o.cells % 2 or o.steps < 1 or not 1e-3 <= o.rtol <= 0.1:
         options = f"--cells {o.cells} --steps {o.steps} --rtol {o.rtol:g}"
         parser.error(f"{options}: must be even and >= 2, >= 1, and in [1e-3, 0.1]")
-    out = {"converged": False}
-    try:
+    with common.results(o) as out:
         s = slope(o.cells)
         before = s.points.corners.copy()
         safety = mpm.factor_of_safety(s, rtol=o.rtol)
@@ -102,19 +96,12 @@ def main(argv: list[str] | None = None) -> dict:
         out |= {"factor_after": after.factor, "converged": abs(after.factor - 1) < 0.1}
         print(f"strength over {WEAKER}: moves by {moved.max():.2f} m; its factor of safety is then {after.factor:.3f}")
         draw(o.out, safety, before, corners, moved)
-        print(f"picture: {o.out}/slope.png")
-    except mpm.GaveUp as error:
-        print(f"error: {error}", file=sys.stderr)
-    if o.json:
-        print(json.dumps(out))
     return out
 
 
 def draw(out: Path, safety: mpm.Safety, before: np.ndarray, corners: np.ndarray, moved: np.ndarray) -> None:
     """Draw the motions of the trials, and the slope before and after its slide."""
-    from matplotlib.collections import PolyCollection
-
-    fig, ((trials, after),) = beam.figure(1, 2, (13, 4.2))
+    fig, ((trials, after),) = common.figure(1, 2, (13, 4.2))
     for factor, motion in sorted(safety.motions.items()):
         style = {"color": "C2" if factor <= safety.bounds[0] else "C3", "marker": "o", "ms": 3, "lw": 1}
         trials.semilogy(np.arange(1, len(motion) + 1), motion, **style)
@@ -124,18 +111,17 @@ def draw(out: Path, safety: mpm.Safety, before: np.ndarray, corners: np.ndarray,
     trials.set(
         xlabel="step",
         ylabel="motion in the step (m)",
-        title=f"Strength over 1 to 2: factor of safety {safety.factor:.3f}",
+        title=f"Factor of safety {safety.factor:.3f}: trials that come to rest (green), or fail (red)",
     )
-    order = [0, 1, 3, 2]
-    quads = PolyCollection(corners[:, order], array=moved, cmap="viridis", edgecolors="face", linewidth=0.1)
-    after.add_collection(quads)
-    after.add_collection(PolyCollection(before[:, order], facecolor="none", edgecolor="grey", linewidth=0.1, alpha=0.5))
+    quads = common.domains(after, corners, moved, cmap="viridis", linewidth=0.1)
+    common.domains(after, before, facecolor="none", edgecolors="grey", linewidth=0.1, alpha=0.5)
     fig.colorbar(quads, ax=after, label="displacement (m)", shrink=0.7)
-    after.set(xlabel="x (m)", ylabel="y (m)", aspect="equal", title=f"Strength over {WEAKER}: at rest again")
+    after.set(
+        xlabel="x (m)", ylabel="y (m)", aspect="equal", title=f"Strength over {WEAKER}: at rest again; grey: before"
+    )
     after.autoscale_view()
-    out.mkdir(parents=True, exist_ok=True)
-    fig.savefig(out / "slope.png", dpi=90)
+    common.save(fig, out / "slope.png", dpi=90)
 
 
 if __name__ == "__main__":
-    sys.exit(0 if main()["converged"] else 1)
+    raise SystemExit(0 if main()["converged"] else 1)

@@ -27,15 +27,12 @@ on the floor, at plastic strains of several hundred per cent.
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import common
 import numpy as np
-import poroelastic_beam as beam
 import ufl
 
 import mpm_dolfinx as mpm
@@ -224,42 +221,38 @@ def errors(failures: list[Failure], run: Slump) -> dict[str, float]:
 
 def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return what --json prints."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cells", type=int, default=20, help="cells over the height (20)")
-    parser.add_argument("--steps", type=int, default=100, help="steps in which the cohesion is lost (100)")
-    parser.add_argument("--out", type=Path, default=Path("out/slump"), help="folder for the pictures (out/slump)")
-    parser.add_argument("--json", action="store_true", help="print the results as one line of JSON at the end")
+    parser = common.Parser(__doc__, __file__)
+    parser.add_argument("--cells", type=int, default=20, help="cells over the height")
+    parser.add_argument("--steps", type=int, default=100, help="steps in which the cohesion is lost")
     o = parser.parse_args(argv)
     if o.cells < 4 or o.cells % 2 or o.steps < 10:
         parser.error(f"--cells {o.cells} --steps {o.steps}: must be even and >= 4, and >= 10")
-    try:
-        failures = [fail(cells) for cells in (o.cells // 2, o.cells)]
-        for f in failures:
-            print(f"{f.cells:>3} cells: fails at gamma' H / c = {f.critical:.3f} ({f.critical / THEORY - 1:+.1%})")
+    with common.results(o) as out:
+        failures = []
+        for cells in (o.cells // 2, o.cells):
+            failures.append(f := fail(cells))
+            print(
+                f"{cells} cells: fails at gamma' H / c = {f.critical:.3f} ({f.critical / THEORY - 1:+.1%})", flush=True
+            )
         run = slump(o.cells, o.steps)
-        out = {"errors": errors(failures, run), "wall_s": run.wall, "converged": True}
+        out |= {"errors": errors(failures, run), "wall_s": run.wall}
         report(run, out["errors"])
-        o.out.mkdir(parents=True, exist_ok=True)
         draw(o.out / "slump.png", run)
         draw_failure(o.out / "failure.png", failures)
         animate(o.out / "slump.gif", run)
-        print(f"{run.steps} steps, {run.cuts} cuts, {run.wall:.1f} s; pictures: {o.out}/")
-    except mpm.GaveUp as error:
-        print(f"error: {error}", file=sys.stderr)
-        out = {"errors": {}, "wall_s": error.result.wall, "converged": False}
-    if o.json:
-        print(json.dumps(out))
+        print(f"{run.steps} steps, {run.cuts} cuts, {run.wall:.1f} s")
     return out
 
 
 def report(run: Slump, found: dict[str, float]) -> None:
     """Print the stages of the slump and what the errors say."""
-    print(f"{'':>10} {'t (s)':>8} {'run-out (m)':>11} {'height (m)':>10} {'slope':>6} {'p (kPa)':>14}")
+    rows = [["", "t (s)", "run-out (m)", "height (m)", "slope", "p (kPa)"]]
     for name, k in stages(run).items():
         f = run.frames[k]
         p = f"{f.pressure.min() / 1e3:.2f} to {f.pressure.max() / 1e3:.2f}"
         height = f.surface[:, 1].max()
-        print(f"{name:>10} {f.t:8.3g} {f.run_out:11.2f} {height:10.2f} {f.slope:5.1f}° {p:>14}")
+        rows.append([name, f"{f.t:.3g}", f"{f.run_out:.2f}", f"{height:.2f}", f"{f.slope:.1f}°", p])
+    common.table(rows)
     print(f"critical strength, extrapolated to h = 0: {found['critical_extrapolated']:+.1%} of gamma' H / c")
     print(f"volume until at rest: {found['volume']:+.1e}; fluid balance {found['fluid_balance']:.1e}")
     steepest = run.frames[run.drained].steepest(HEIGHT / 3)
@@ -310,18 +303,19 @@ def panels(axes, run: Slump, frame: Frame) -> list[Panel]:
 def draw(path: Path, run: Slump) -> None:
     """Draw pressures and plastic strain at several stages."""
     chosen = stages(run)
-    fig, axes = beam.figure(len(chosen), 2, (10, 2.55 * len(chosen)))
+    fig, axes = common.figure(len(chosen), 2, (10, 2.55 * len(chosen)))
     for row, (name, k) in zip(axes, chosen.items(), strict=True):
         frame = run.frames[k]
         left, right = panels(row, run, frame)
-        row[0].set(title=f"{name}, t = {time(frame.t)}", ylabel="y (m)")
+        first = " (dotted: at the start)" if row is axes[0] else ""
+        row[0].set(title=f"{name}, t = {time(frame.t)}{first}", ylabel="y (m)")
         row[1].set(title=rf"$\gamma' H / c$ = {SCALE / frame.cohesion:.3g}, slope {frame.slope:.0f}°")
     for ax in axes[-1]:
         ax.set(xlabel="x (m)")
     bars = {"location": "bottom", "shrink": 0.8, "aspect": 40, "pad": 0.02}
     fig.colorbar(left.domains, ax=axes[:, 0], label="excess pore pressure (kPa)", extend="both", **bars)
     fig.colorbar(right.domains, ax=axes[:, 1], label="accumulated plastic strain (-)", extend="both", **bars)
-    fig.savefig(path, dpi=85)
+    common.save(fig, path, dpi=85)
 
 
 def time(seconds: float) -> str:
@@ -333,7 +327,7 @@ def time(seconds: float) -> str:
 
 def draw_failure(path: Path, failures: list[Failure]) -> None:
     """Draw how fast the crest settles over the stability number."""
-    fig, ((ax,),) = beam.figure(1, 1, (6.5, 4))
+    fig, ((ax,),) = common.figure(1, 1, (6.5, 4))
     for f in failures:
         (line,) = ax.semilogy(f.number, f.rate, ".-", label=f"{f.cells} cells over the height")
         ax.plot(f.critical, RUNAWAY, "o", mfc="none", ms=9, color=line.get_color(), label=f"fails at {f.critical:.2f}")
@@ -342,7 +336,7 @@ def draw_failure(path: Path, failures: list[Failure]) -> None:
     ax.set_title("The strength is lowered by 1 % a step, undrained, without friction", fontsize=11)
     ax.grid(alpha=0.3)
     ax.legend()
-    fig.savefig(path, dpi=110)
+    common.save(fig, path, dpi=110)
 
 
 def animate(path: Path, run: Slump) -> None:
@@ -352,7 +346,7 @@ def animate(path: Path, run: Slump) -> None:
     weak = int(np.argmax([f.cohesion <= 1.001 * WEAK for f in run.frames]))
     ends = (weak // 2, weak, 3 * weak // 2, run.rest, run.drained)
     parts = [np.linspace(a, b, n, dtype=int) for a, b, n in zip(ends, ends[1:], (20, 10, 12, 6), strict=False)]
-    fig, axes = beam.figure(2, 1, (6, 6))
+    fig, axes = common.figure(2, 1, (6, 6))
     axes = axes[:, 0]
     both = panels(axes, run, run.frames[0])
     for ax, panel, label in zip(axes, both, ("excess pore pressure (kPa)", "plastic strain (-)"), strict=True):
@@ -373,4 +367,4 @@ def animate(path: Path, run: Slump) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(0 if main()["converged"] else 1)
+    raise SystemExit(0 if main()["converged"] else 1)

@@ -24,14 +24,11 @@ process.
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
+from argparse import Namespace
 from dataclasses import dataclass
-from pathlib import Path
 
+import common
 import numpy as np
-import poroelastic_beam as beam
 import terzaghi
 from coupling_iterations import Undamped
 from numpy.typing import NDArray
@@ -132,50 +129,42 @@ LAWS = {"damped": mpm.Hencky, "undamped": Undamped}
 
 def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return what --json prints."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=25, help="cells over the height of the column")
     parser.add_argument("--steps", type=int, nargs="+", default=[1, 10, 100, 1000, 10000], help="to T_v = 0.1")
     parser.add_argument("--strip-cells", type=int, default=20, help="cells over the height of the layer")
-    parser.add_argument("--out", type=Path, default=Path("out/small_steps"), help="folder for the pictures")
-    parser.add_argument("--json", action="store_true", help="print the results as one line of JSON at the end")
     o = parser.parse_args(argv)
     for name in ("cells", "steps", "strip_cells"):
         if np.min(getattr(o, name)) < 1:
             parser.error(f"--{name.replace('_', '-')} {np.min(getattr(o, name))}: must be >= 1")
-    try:
+    with common.results(o) as out:
         runs = {name: [column(o.cells, n, *case) for n in o.steps] for name, case in CASES.items()}
+        limit = error_of_cells(o.cells)
+        rows = (
+            [f"{n}", f"{T_END / n:.0e}", *(f"{r[k].error:.2e}" for r in runs.values())] for k, n in enumerate(o.steps)
+        )
+        common.table([["steps", "dt (T_v)", *(f"error, {name}" for name in runs)], *rows])
+        print(f"error of {o.cells} cells, exact in time: {limit:.2e}")
+        overshoot = {name: max(run.overshoot for run in case) - 1 for name, case in runs.items()}
+        print("largest p / p0 - 1 of all steps: " + ", ".join(f"{name} {x:.1e}" for name, x in overshoot.items()))
         strips = {name: [strip(o.strip_cells, dt, law) for dt in STRIP_STEPS] for name, law in LAWS.items()}
-    except mpm.GaveUp as error:
-        sys.exit(f"error: {error}")
-    limit = error_of_cells(o.cells)
-    print(f"{'steps':>7} {'dt (T_v)':>9} " + " ".join(f"{name:>19}" for name in runs))
-    for k, n in enumerate(o.steps):
-        print(f"{n:7} {T_END / n:9.0e} " + " ".join(f"{r[k].error:19.2e}" for r in runs.values()))
-    print(f"error of {o.cells} cells, exact in time: {limit:.2e}")
-    overshoot = {name: max(run.overshoot for run in case) - 1 for name, case in runs.items()}
-    print("largest p / p0 - 1 of all steps: " + ", ".join(f"{name} {x:.1e}" for name, x in overshoot.items()))
-    for name, fields in strips.items():
-        print(f"strip load, {name:>8}: roughness " + ", ".join(f"{roughness(p):.2%}" for p in fields))
-    o.out.mkdir(parents=True, exist_ok=True)
-    draw(o, runs, limit)
-    draw_strip(o, strips)
-    print(f"pictures: {o.out}/")
-    out = {
-        "steps": o.steps,
-        "errors": {name: [run.error for run in case] for name, case in runs.items()},
-        "error_of_cells": limit,
-        "overshoot": overshoot,
-        "roughness": {name: [roughness(p) for p in fields] for name, fields in strips.items()},
-        "converged": True,
-    }
-    if o.json:
-        print(json.dumps(out))
+        for name, fields in strips.items():
+            print(f"strip load, {name:>8}: roughness " + ", ".join(f"{roughness(p):.2%}" for p in fields))
+        draw(o, runs, limit)
+        draw_strip(o, strips)
+        out |= {
+            "steps": o.steps,
+            "errors": {name: [run.error for run in case] for name, case in runs.items()},
+            "error_of_cells": limit,
+            "overshoot": overshoot,
+            "roughness": {name: [roughness(p) for p in fields] for name, fields in strips.items()},
+        }
     return out
 
 
-def draw(o: argparse.Namespace, runs: dict[str, list[Run]], limit: float) -> None:
+def draw(o: Namespace, runs: dict[str, list[Run]], limit: float) -> None:
     """Draw the error against the step, and the pressure over the depth of the longest and the shortest steps."""
-    fig, ((left, right),) = beam.figure(1, 2, (11.5, 4.8))
+    fig, ((left, right),) = common.figure(1, 2, (11.5, 4.8))
     dt = T_END / np.array(o.steps)
     for name, case in runs.items():
         left.loglog(dt, [run.error for run in case], "o-", ms=4, label=name)
@@ -193,12 +182,12 @@ def draw(o: argparse.Namespace, runs: dict[str, list[Run]], limit: float) -> Non
     right.legend(loc="lower left")
     for ax in (left, right):
         ax.grid(alpha=0.3)
-    fig.savefig(o.out / "small_steps.png", dpi=130)
+    common.save(fig, o.out / "small_steps.png")
 
 
-def draw_strip(o: argparse.Namespace, strips: dict[str, list[NDArray[np.float64]]]) -> None:
+def draw_strip(o: Namespace, strips: dict[str, list[NDArray[np.float64]]]) -> None:
     """Draw the pressure after the smallest first step, and the roughness against the step."""
-    fig, ((*axes, right),) = beam.figure(1, len(strips) + 1, (15, 3.8))
+    fig, ((*axes, right),) = common.figure(1, len(strips) + 1, (15, 3.8))
     for ax, (name, fields) in zip(axes, strips.items(), strict=True):
         extent = (0, 2 * HEIGHT, 0, HEIGHT)
         image = ax.imshow(
@@ -211,8 +200,8 @@ def draw_strip(o: argparse.Namespace, strips: dict[str, list[NDArray[np.float64]
     right.set(xlabel="step / time of consolidation (-)", ylabel="roughness (% of the largest p)", ylim=(0, None))
     right.legend()
     right.grid(alpha=0.3)
-    fig.savefig(o.out / "strip.png", dpi=130)
+    common.save(fig, o.out / "strip.png")
 
 
 if __name__ == "__main__":
-    sys.exit(0 if main()["converged"] else 1)
+    raise SystemExit(0 if main()["converged"] else 1)

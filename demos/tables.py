@@ -6,7 +6,7 @@ A figure is followed by a comment that names the run of a demo, the entries of w
     | Terzaghi, p at T_v = 0.5 | 0.004 % <!-- terzaghi --cells 50; errors/p_0.5; % --> |
 
 What a demo has printed is kept in demos/results, with its run time in `seconds` and the release of dolfinx, its
-pictures in demos/pictures.  A table that a demo writes as a file stands between
+pictures in demos/pictures (those of its first run on the pages).  A table that a demo writes as a file stands between
 `<!-- error_vs_runtime; comparison.md -->` and `<!-- end -->`.
 
     bash demos/run.sh tables                        # writes the figures anew from demos/results
@@ -78,8 +78,8 @@ def runs(pages: Iterable[str]) -> dict[str, str]:
     return found
 
 
-def take(run: str, table: str) -> None:
-    """Run a demo, and keep what it prints, the table that it writes, and its pictures on the pages."""
+def take(run: str, table: str, pictures: bool) -> None:
+    """Run a demo, and keep what it prints, the table that it writes, and, if asked to, its pictures on the pages."""
     import dolfinx
 
     demo, *options = shlex.split(run)
@@ -98,7 +98,7 @@ def take(run: str, table: str) -> None:
         if table:
             kept(run).with_suffix(".md").write_text((Path(folder) / table).read_text())
         for picture in (DEMOS / "pictures").iterdir():  # those of the pages
-            if (Path(folder) / picture.name).exists():
+            if pictures and (Path(folder) / picture.name).exists():
                 shutil.copy(Path(folder) / picture.name, picture)
 
 
@@ -112,10 +112,11 @@ def main(argv: list[str] | None = None) -> None:
     for name in o.run:
         if name not in demos | {"all"}:
             parser.error(f"--run {name}: must be all, or among {', '.join(sorted(demos))}")
+    drawn = {demo: run for run in reversed(told) for demo in shlex.split(run)[:1]}  # a demo's first run draws
     for run, table in told.items():
-        if "all" in o.run or shlex.split(run)[0] in o.run:
+        if {"all", demo := shlex.split(run)[0]} & {*o.run}:
             print(run, flush=True)
-            take(run, table)
+            take(run, table, drawn[demo] == run)
     for page in PAGES:
         page.write_text(written(page.read_text()))
     print(f"written: {', '.join(str(page) for page in PAGES)}")

@@ -14,14 +14,11 @@ alike, or with --rtol chosen by their error.
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
+from argparse import Namespace
 from dataclasses import dataclass, field
-from pathlib import Path
 
+import common
 import numpy as np
-import poroelastic_beam as beam
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.time_integration import METHODS
@@ -97,35 +94,27 @@ def errors(out: Outcome) -> dict[str, float]:
 
 def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return what --json prints."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=50, help="cells over the height")
     parser.add_argument("--steps", type=int, default=100, help="equal steps to T_v = 1")
     parser.add_argument("--rtol", type=float, help="choose the steps by their error instead")
     parser.add_argument("--method", choices=tuple(METHODS), default="sdirk2", help="time integration")
-    parser.add_argument("--out", type=Path, default=Path("out/terzaghi"), help="folder for the picture")
-    parser.add_argument("--json", action="store_true", help="print the results as one line of JSON at the end")
     o = parser.parse_args(argv)
     if o.cells < 1 or o.steps < 10:
         parser.error(f"--cells {o.cells} --steps {o.steps}: must be >= 1 and >= 10")
-    try:
+    with common.results(o) as out:
         outcome = run(o.cells, o.steps, method=o.method, rtol=o.rtol)
-        out = {"errors": errors(outcome), "steps": outcome.result.steps}
-        out |= {"wall_s": outcome.result.wall, "converged": True}
-        for name, error in out["errors"].items():
-            print(f"{name:>10}: {error:.3%}" + (" of p0" if name.startswith("p_") else " at T_v = 0.5"))
+        out |= {"errors": errors(outcome), "steps": outcome.result.steps, "wall_s": outcome.result.wall}
+        print(f"{o.cells} cells, {out['steps']} steps, {out['wall_s']:.1f} s")
+        scales = {"p_0.1": "p0", "p_0.5": "p0", "p_1": "p0", "settlement": "itself at T_v = 0.5"}
+        common.table([["error", "", "of"], *([name, f"{out['errors'][name]:.4%}", of] for name, of in scales.items())])
         draw(o, outcome)
-        print(f"{o.cells} cells, {out['steps']} steps, {out['wall_s']:.1f} s; picture: {o.out}/terzaghi.png")
-    except mpm.GaveUp as error:
-        print(f"error: {error}", file=sys.stderr)
-        out = {"errors": {}, "wall_s": error.result.wall, "converged": False}
-    if o.json:
-        print(json.dumps(out))
     return out
 
 
-def draw(o: argparse.Namespace, out: Outcome) -> None:
+def draw(o: Namespace, out: Outcome) -> None:
     """Draw the pressure over the depth and the settlement over time beside the exact curves."""
-    fig, ((left, right),) = beam.figure(1, 2, (11, 4.6))
+    fig, ((left, right),) = common.figure(1, 2, (11, 4.6))
     z = np.linspace(0, 1, 201)
     for i, time in enumerate(SAMPLES):
         k = out.at(time)
@@ -143,9 +132,8 @@ def draw(o: argparse.Namespace, out: Outcome) -> None:
     right.legend()
     for ax in (left, right):
         ax.grid(alpha=0.3)
-    o.out.mkdir(parents=True, exist_ok=True)
-    fig.savefig(o.out / "terzaghi.png", dpi=130)
+    common.save(fig, o.out / "terzaghi.png")
 
 
 if __name__ == "__main__":
-    sys.exit(0 if main()["converged"] else 1)
+    raise SystemExit(0 if main()["converged"] else 1)

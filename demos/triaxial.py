@@ -11,14 +11,11 @@ Errors are those of the ends, relative.
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
 from dataclasses import replace
 from pathlib import Path
 
+import common
 import numpy as np
-import poroelastic_beam as beam
 
 import mpm_dolfinx as mpm
 
@@ -54,30 +51,25 @@ def sand_errors(tests: dict[float, mpm.ElementTest]) -> dict[str, float]:
 
 def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return what --json prints."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--steps", type=int, default=100, help="steps of a test (100)")
-    parser.add_argument("--out", type=Path, default=Path("out/triaxial"), help="folder for the picture (out/triaxial)")
-    parser.add_argument("--json", action="store_true", help="print the results as one line of JSON at the end")
+    parser = common.Parser(__doc__, __file__)
+    parser.add_argument("--steps", type=int, default=100, help="steps of a test")
     o = parser.parse_args(argv)
     if o.steps < 1:
         parser.error(f"--steps {o.steps}: must be >= 1")
-    tests = clays(o.steps)
-    sands = {e: mpm.element_test(SAND, KINDS[0], e, steps=o.steps, confinement=P0) for e in (0.1, -0.1)}
-    errors = {f"{k}, OCR {R:g}": float(abs(r.p[-1] / end_of(k, R) - 1)) for (k, R), r in tests.items()}
-    errors |= sand_errors(sands)
-    for name, error in errors.items():
-        print(f"{name:32} off by {error:.0e}")
-    draw(o.out, tests, sands)
-    print(f"picture: {o.out}/triaxial.png")
-    out = {"errors": errors, "converged": max(errors.values()) < 1e-6}
-    if o.json:
-        print(json.dumps(out))
+    with common.results(o) as out:
+        tests = clays(o.steps)
+        sands = {e: mpm.element_test(SAND, KINDS[0], e, steps=o.steps, confinement=P0) for e in (0.1, -0.1)}
+        errors = {f"{k}, OCR {R:g}": float(abs(r.p[-1] / end_of(k, R) - 1)) for (k, R), r in tests.items()}
+        errors |= sand_errors(sands)
+        common.table([["", "error"], *([name, f"{error:.0e}"] for name, error in errors.items())])
+        draw(o.out, tests, sands)
+        out |= {"errors": errors, "converged": max(errors.values()) < 1e-6}
     return out
 
 
 def draw(out: Path, tests: dict[tuple[str, float], mpm.ElementTest], sands: dict[float, mpm.ElementTest]) -> None:
     """Draw stress paths, stress and strain, pore pressures and volumes."""
-    fig, ((path, curve), (water, sand)) = beam.figure(2, 2, (11, 7.5))
+    fig, ((path, curve), (water, sand)) = common.figure(2, 2, (11, 7.5))
     for (kind, R), r in tests.items():
         drained, colour = kind == KINDS[0], f"C{RATIOS.index(R)}"
         style = {"color": colour, "ls": "-" if drained else "--", "label": f"OCR {R:g}, {kind.split()[1]}"}
@@ -98,9 +90,8 @@ def draw(out: Path, tests: dict[tuple[str, float], mpm.ElementTest], sands: dict
     for ax in (path, curve, water, sand):
         ax.legend(fontsize=8)
         ax.grid(alpha=0.3)
-    out.mkdir(parents=True, exist_ok=True)
-    fig.savefig(out / "triaxial.png", dpi=90)
+    common.save(fig, out / "triaxial.png", dpi=90)
 
 
 if __name__ == "__main__":
-    sys.exit(0 if main()["converged"] else 1)
+    raise SystemExit(0 if main()["converged"] else 1)

@@ -5,9 +5,9 @@ A scene is a `Simulation` of a `Grid`, bodies (`box`, `shape`, `mapped`, `from_m
 `NeoHookean`, `LinearElastic`, `DruckerPrager`, `SofteningDruckerPrager`, `MohrCoulomb`, `ModifiedCamClay`, or your own
 `Skeleton`), a `Fluid` and conditions on the sides of the bodies (`Traction`, `Pressure`, `Displacement`, `RigidPlate`,
 `Drained`, `Inflow`, `water`), and rigid tools (`Tool` of a `HalfSpace`, `Ball`, `Convex`, `Cone`).  Its `run` gives a
-`Result` with what `probes` record, and feeds a `Writer` and a `Checkpoint`, from which `resume` goes on; `stage`
-changes the scene between two runs, and `factor_of_safety` weakens it until it slides.  Terms and sources in UFL: see
-`mpm_dolfinx.constitutive.user_functions`.
+`Result` with what `probes` record, and feeds a `Writer`, whose files `one_file` joins, and a `Checkpoint`, from which
+`resume` goes on; `stage` changes the scene between two runs, and `factor_of_safety` weakens it until it slides.  Terms
+and sources in UFL: see `mpm_dolfinx.constitutive.user_functions`.
 
 SI units throughout.  Stress is positive in tension, pore pressure in compression; 2D is plane strain, and forces
 are those of a slice of 1 m, or axisymmetric (`Grid`), and forces are those all around.
@@ -20,7 +20,6 @@ from mpm_dolfinx.constitutive.element_test import ElementTest, element_test
 from mpm_dolfinx.constitutive.initial_stress import K0, hydrostatic
 from mpm_dolfinx.constitutive.mohr_coulomb import MohrCoulomb
 from mpm_dolfinx.constitutive.skeleton import (
-    LAWS,
     Field,
     Fluid,
     Hencky,
@@ -33,6 +32,7 @@ from mpm_dolfinx.constitutive.skeleton import (
 from mpm_dolfinx.constitutive.softening import SofteningDruckerPrager
 from mpm_dolfinx.errors import GaveUp, LeftGrid, NotConverged
 from mpm_dolfinx.io.checkpoint import Checkpoint, resume
+from mpm_dolfinx.io.one_file import one_file
 from mpm_dolfinx.io.writer import Writer
 from mpm_dolfinx.points.bodies import box, mapped, shape
 from mpm_dolfinx.points.grid import Grid
@@ -40,6 +40,7 @@ from mpm_dolfinx.points.mesh_files import from_mesh
 from mpm_dolfinx.points.polygon import polygon
 from mpm_dolfinx.points.probes import probes
 from mpm_dolfinx.problems.conditions import Displacement, Drained, Inflow, OnSide, Pressure, RigidPlate, Traction
+from mpm_dolfinx.problems.contacts import Contact
 from mpm_dolfinx.problems.tools import Ball, Cone, Convex, HalfSpace, Tool
 from mpm_dolfinx.problems.water import water
 from mpm_dolfinx.result import Result
@@ -52,10 +53,10 @@ __version__ = "0.1.0"
 __all__ = [
     "COUPLINGS",
     "K0",
-    "LAWS",
     "Ball",
     "Checkpoint",
     "Cone",
+    "Contact",
     "Convex",
     "Displacement",
     "Drained",
@@ -93,6 +94,7 @@ __all__ = [
     "hydrostatic",
     "kozeny_carman",
     "mapped",
+    "one_file",
     "polygon",
     "probes",
     "resume",

@@ -1,11 +1,16 @@
 # SPDX-License-Identifier: MIT
-"""Versions and solvers that a report of a bug should name, and laboratory tests of soil laws."""
+"""Versions and solvers that a report of a bug should name, laboratory tests of soil laws, and files of a run as one."""
 
 from __future__ import annotations
 
 import argparse
 import platform
+import runpy
+import sys
+from collections.abc import Sequence
+from dataclasses import MISSING, fields
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -41,21 +46,59 @@ def _version(package: str) -> str:
         return "not found"
 
 
-def number(text: str) -> float | list[float]:
-    """Return a number, or several with commas between them."""
-    values = [float(part) for part in text.split(",")]
+def number(name: str, text: str) -> float | list[float]:
+    """Return the number, or the several with commas between them, that a text says."""
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        raise ValueError(f"{name} = {text!r}, must be a number, or several with commas, in SI units") from None
     return values if len(values) > 1 else values[0]
+
+
+def law_of(name: str) -> type[mpm_dolfinx.Skeleton]:
+    """Return a law of the package by its name, or by file.py:name one of a user's."""
+    file, _, own = name.rpartition(":")
+    if not file:
+        found = getattr(mpm_dolfinx, name, None)
+    elif not Path(file).is_file():
+        raise ValueError(f"law = {name!r}: there is no file {file}")
+    else:
+        sys.path.insert(0, str(Path(file).parent))  # as a script finds what lies beside it
+        found = runpy.run_path(file).get(own)
+    if _is_law(found):
+        return found
+    known = [n for n in mpm_dolfinx.__all__ if _is_law(getattr(mpm_dolfinx, n)) and n != "Skeleton"]
+    raise ValueError(f"law = {name!r}, must be one of {', '.join(known)}, or file.py:name of your own")
+
+
+def _is_law(value: object) -> bool:
+    return isinstance(value, type) and issubclass(value, mpm_dolfinx.Skeleton)
+
+
+def constants_of(law: type[mpm_dolfinx.Skeleton], texts: Sequence[str]) -> dict[str, float | list[float]]:
+    """Return the constants that texts name=value say, each of which the law has, once."""
+    out, known = {}, [f.name for f in fields(law) if f.init]
+    for text in texts:
+        name, equals, value = text.partition("=")
+        names = f"must be name=value, name one of {', '.join(known)}"
+        if not equals or name not in known or name in out:
+            wrong = "is given twice" if equals and name in out else names
+            raise ValueError(f"{law.__name__}: {text!r} {wrong}")
+        out[name] = number(f"{law.__name__}: {name}", value)
+    for f in fields(law):
+        if f.name not in out and f.init and f.default is MISSING and f.default_factory is MISSING:
+            raise ValueError(f"{law.__name__}: {f.name} is not given")
+    return out
 
 
 def run_element_test(o: argparse.Namespace) -> None:
     """Drive a law through a laboratory test, print a table of it and draw it."""
-    law = getattr(mpm_dolfinx, o.law, None)
-    if not (isinstance(law, type) and issubclass(law, mpm_dolfinx.Skeleton)):
-        raise ValueError(f"law = {o.law!r}, must be the name of a law, such as ModifiedCamClay")
-    constants = dict(text.split("=", 1) for text in o.constants)
-    soil = law(**{name: number(value) for name, value in constants.items()})
+    if o.draw and not Path(o.draw).parent.is_dir():
+        raise ValueError(f"--draw {o.draw}: there is no folder {Path(o.draw).parent}")
+    law, strain = law_of(o.law), number("strain", o.strain)
+    soil = law(**constants_of(law, o.constants))
     options = {name: getattr(o, name) for name in ("steps", "confinement", "rate", "cell_size")}
-    r = mpm_dolfinx.element_test(soil, o.test, number(o.strain), **options)
+    r = mpm_dolfinx.element_test(soil, o.test, strain, **options)
     print(f"{'strain':>10} {'p (Pa)':>12} {'q (Pa)':>12} {'pore p. (Pa)':>12} {'volume strain':>13}")
     for k in np.unique(np.linspace(0, len(r.strain) - 1, 21, dtype=int)):
         print(f"{r.strain[k]:10.5f} {r.p[k]:12.5g} {r.q[k]:12.5g} {r.pressure[k]:12.5g} {r.volume_strain[k]:13.5g}")
@@ -69,7 +112,7 @@ def main(argv: list[str] | None = None) -> None:
     commands = parser.add_subparsers(dest="command", required=True)
     commands.add_parser("info", help="print versions and solvers")
     lab = commands.add_parser("element-test", help="drive a soil law through a laboratory test")
-    lab.add_argument("law", help="name of the law, such as ModifiedCamClay")
+    lab.add_argument("law", help="name of the law, such as ModifiedCamClay, or file.py:name")
     lab.add_argument("test", help=", ".join(mpm_dolfinx.ElementTest.KINDS))
     lab.add_argument("strain", help="axial strain, compression positive, or shear; turning points with commas")
     lab.add_argument("constants", nargs="*", metavar="name=value", help="of the law; vectors with commas")
@@ -78,6 +121,8 @@ def main(argv: list[str] | None = None) -> None:
     lab.add_argument("--rate", type=float, help="strain in a second, of laws that depend on it, 1/s")
     lab.add_argument("--cell-size", type=float, help="size of cells, of laws that soften, m")
     lab.add_argument("--draw", help="file of a picture")
+    one = commands.add_parser("one-file", help="write the points of a run as one file of ParaView's, points.xdmf")
+    one.add_argument("folder", help="that of the Writer")
     o = parser.parse_args(argv)
     if MPI.COMM_WORLD.rank > 0:
         return
@@ -85,9 +130,12 @@ def main(argv: list[str] | None = None) -> None:
         print("\n".join(f"{name:14}{value}" for name, value in info().items()))
         return
     try:
-        run_element_test(o)
-    except (ValueError, TypeError, mpm_dolfinx.NotConverged) as error:
-        lab.error(" ".join(str(error).split()))
+        if o.command == "one-file":
+            print(mpm_dolfinx.one_file(o.folder))
+        else:
+            run_element_test(o)
+    except (ValueError, TypeError, OSError, mpm_dolfinx.NotConverged) as error:
+        {"one-file": one, "element-test": lab}[o.command].error(" ".join(str(error).split()))
 
 
 if __name__ == "__main__":

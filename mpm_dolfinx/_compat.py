@@ -72,6 +72,8 @@ def function_space(msh: mesh.Mesh, family: str, degree: int, shape: tuple[int, .
 
 def _old_element(msh, family: str, degree: int, shape: tuple[int, ...]):
     cell = msh.ufl_cell()
+    if family == "DG" and cell.cellname() in ("quadrilateral", "hexahedron"):
+        family = "DQ"  # as ufl calls it there, after a line on the console
     if len(shape) == 2:
         return ufl.TensorElement(family, cell, degree, shape=shape)
     if len(shape) == 1:

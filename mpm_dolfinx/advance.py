@@ -141,6 +141,9 @@ class Motion:
         grid, stage, folded = cut.grid, state.stage, 0
         free = ~given(grid, stage.lattices, stage.conditions["fixed"], state.points)
         free &= ~stage.mechanical.tools.near(state.points.corners + moved, t)[:, :, None]
+        if stage.mechanical.contacts.contacts:
+            beside = stage.mechanical.contacts.near(cut, state.points, state.points.corners + moved)
+            free &= ~beside[:, :, None]
         corners = state.points.corners + moved + free * bend
         points = replace(state.points, corners=corners)
         serves, evolved = cut.serves(points), self._materials.evolved(points)

@@ -98,7 +98,8 @@ class Scene:
             law = (
                 ConductivityAtPieces(scene.materials, laws, pieces, u, fem.Function(grid.cellwise())) if laws else None
             )
-            self.storage = StorageForms(pieces, u, p, weight, symmetric, scene.conducts, law, sources, self.t)
+            kind = (symmetric, scene.conducts, scene.evolves)
+            self.storage = StorageForms(pieces, u, p, weight, *kind, law, sources, self.t)
         self.extensions = terms, sources
         """The user's terms and sources."""
         self.method = method

@@ -22,6 +22,7 @@ from mpm_dolfinx.points.grid import Grid
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.problems.axis import check_axisymmetry, with_axis
 from mpm_dolfinx.problems.conditions import Displacement, Drained, Inflow, OnSide, Pressure, RigidPlate, Traction
+from mpm_dolfinx.problems.contacts import Contact, grouped
 from mpm_dolfinx.problems.scene_parts import check_options, check_parts
 from mpm_dolfinx.problems.thin import warn_thin
 from mpm_dolfinx.problems.tools import Tool
@@ -40,10 +41,8 @@ class Simulation:
 
     Parameters
     ----------
-    grid
-        Background grid.
-    bodies
-        Seeded bodies.
+    grid, bodies
+        Background grid, and seeded bodies.
     materials
         Material of each index that the bodies name.
     fixed
@@ -53,8 +52,8 @@ class Simulation:
         Pore fluid; without it there is no storage problem.
     tractions, displacements, drained, inflows, plates
         Boundary conditions on sides of the bodies; other sides are free and sealed.
-    tools
-        Rigid tools that press on the bodies.
+    tools, contacts
+        Rigid tools that press on the bodies; or groups of bodies that press on each other, see `Contact`.
     gravity : (d,) or callable t -> (d,), m/s^2
         Acceleration of gravity; in axisymmetry along the axis.
     pressure
@@ -66,14 +65,11 @@ class Simulation:
         so that a first step in which nothing changes moves nothing.
     quadrature
         "domain": exact pieces of the points' domains; "point": at the points, as in standard MPM, not in axisymmetry.
-    coupling, tolerance
-        See `Scheme`.
-    method
-        Of time integration: "sdirk2", of second order, or "backward-euler"; see `time_integration`.
-    terms, sources
-        Functions that give terms of the user's own to the two balances in UFL: see `user_functions`, `OnSide`.
-    later
-        Indices of bodies that a later stage adds, each once.
+    coupling, tolerance, method
+        See `Scheme`; method of time integration: "sdirk2", of second order, or "backward-euler".
+    terms, sources, later
+        Functions that give terms of the user's own to the two balances in UFL: see `user_functions`, `OnSide`.  Indices
+        of bodies that a later stage adds, each once.
 
     Attributes
     ----------
@@ -103,6 +99,7 @@ class Simulation:
         inflows: Sequence[Inflow] = (),
         plates: Sequence[RigidPlate] = (),
         tools: Sequence[Tool] = (),
+        contacts: Sequence[Contact] = (),
         gravity: ArrayLike | Callable[[float], ArrayLike] | None = None,
         pressure: float | Callable[[NDArray], ArrayLike] = 0.0,
         initial_stress: InitialStress | Mapping[int, InitialStress] | None = None,
@@ -117,15 +114,17 @@ class Simulation:
         scheme = Scheme(coupling, tolerance)
         check_parts(grid, bodies, materials, later)
         check_options(fluid, pressure, terms, sources, quadrature)
+        other = {"tools": tools, "initial_stress": initial_stress, "later": later, "terms": terms, "sources": sources}
+        grid = grouped(grid, bodies, contacts, quadrature, other)
         grid.share(np.concatenate([body.centre for body in bodies]))
         warn_thin(grid, bodies, with_axis(grid, fixed), fluid is not None)
-        check_axisymmetry(grid, bodies, quadrature, initial_stress)
-        began, weighs = time.perf_counter(), gravity is not None
-        options = (quadrature, scheme, method, weighs, pressure, terms, sources)
+        check_axisymmetry(grid, bodies, quadrature)
+        began = time.perf_counter()
+        options = (quadrature, scheme, method, gravity is not None, pressure, terms, sources)
         initial = by_body(initial_stress, bodies, later)
         self.scene = Scene(grid, bodies, materials, fluid, *options, initial)
         conditions = {"fixed": fixed, "tractions": tractions, "displacements": displacements, "drained": drained}
-        conditions |= {"inflows": inflows, "plates": plates, "tools": tools, "gravity": gravity}
+        conditions |= {"inflows": inflows, "plates": plates, "tools": tools, "gravity": gravity, "contacts": contacts}
         self.state = first_state(self.scene, conditions, later)
         if initial:
             self.state = balanced(self.scene, self.state)
@@ -186,7 +185,7 @@ class Simulation:
 
     @property
     def tool_forces(self) -> NDArray[np.float64]:
-        """(tools, d + 1), in 3D (tools, 6): force and moment of each tool on the bodies, as `reactions`: see `Tool`."""
+        """(tools, d + 1), in 3D (tools, 6): force and moment of each `Tool`, or `Contact`, on the bodies."""
         return self.state.tool_forces
 
     @property

@@ -37,7 +37,7 @@ def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int
         transported = pieces_at_start(scene, points) if callable(scene.initial.pressure) else at_start(points)
     reactions = np.zeros((len(begun.mechanical.holds), scene.grid.dim))
     outflows = np.zeros(len(begun.hydraulic.outlets))
-    points, forces = begun.mechanical.tools.grip(points), begun.mechanical.tools.forces(0.0)
+    points, forces = begun.mechanical.contacts.grip(begun.mechanical.tools.grip(points)), begun.mechanical.forces(0.0)
     return State(0.0, points, transported, None, 0, reactions, outflows, forces, begun, True, None, None, None)
 
 
@@ -57,6 +57,8 @@ def begin_stage(
     chosen("stage: remove", remove, np.flatnonzero(before.present).tolist(), "bodies that are present")
     chosen("stage: add", add, list(before.later), "bodies that are to come later")
     flag("stage: reset_displacement", reset_displacement)
+    if before.conditions["contacts"] and (remove or named.get("tools")):
+        raise ValueError(f"stage: {'remove' if remove else 'tools'}: must be none in a scene with contacts")
     present = [(here and body not in remove) or body in add for body, here in enumerate(before.present)]
     later = [body for body in before.later if body not in add]
     begun = _stage(scene, {**before.conditions, **named}, present, later)
@@ -81,7 +83,7 @@ def begin_stage(
     if "displacements" in named:
         new["reactions"] = np.full((len(begun.mechanical.holds), scene.grid.dim), unknown)
     if "tools" in named:
-        new["tool_forces"] = begun.mechanical.tools.forces(unknown)
+        new["tool_forces"] = begun.mechanical.forces(unknown)
     if named.keys() & {"drained", "inflows"}:
         new["outflows"] = np.full(len(begun.hydraulic.outlets), unknown)
     if add or remove:

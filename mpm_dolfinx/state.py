@@ -109,4 +109,4 @@ class State:
         if grid.comm.size == 1:
             return self
         placed = self.stay.points if self.stay else self.points
-        return self.migrated(grid.owner(grid.number(grid.index(placed.x))), grid.comm)
+        return self.migrated(grid.owner(grid.number(grid.index(placed.x)) + grid.copy(placed.id)), grid.comm)

@@ -52,4 +52,8 @@ def step(scene: Scene, state: State, dt: float) -> tuple[State, Report]:
     if (contact := acting.sides.tools) is not None:
         tools.check_end(on_grid.cut, new.points, new.t)
         now |= {"tool_forces": contact.forces(nodal), "points": contact.gripped(nodal, new.points)}
+    if (contact := acting.sides.contact) is not None:
+        state.stage.mechanical.contacts.check_end(on_grid.cut, new.points, state.points)
+        at = start.matrices.momentum.unknowns, scene.momentum.u.x.array
+        now |= {"tool_forces": contact.forces(*at), "points": contact.gripped(*at, new.points)}
     return replace(new, **now, resets=state.resets + (state.stay is None), begins=False), report

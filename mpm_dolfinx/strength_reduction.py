@@ -123,7 +123,8 @@ def _bracket(rests: Callable[[float], bool]) -> tuple[float, float]:
             return min(known, trial), max(known, trial)
         known = trial
     found = "come to rest" if begins else "slide"
-    raise ValueError(f"factor_of_safety: the bodies {found} with strength / {known:.3g}, must not at some factor")
+    more = "" if begins else "; what acts on them must not change in time"
+    raise ValueError(f"factor_of_safety: the bodies {found} with strength / {known:.3g}, must not at some factor{more}")
 
 
 def _step_of(simulation: Simulation, dt: float | None) -> float:

@@ -11,8 +11,11 @@ SOIL = mpm.LinearElastic(bulk=1e12, shear=1e12, porosity=0.4, conductivity=1e-5)
 CONSOLIDATION = 1e-5 / 9810 / (0.4 / WATER)  # m^2/s
 
 
-def turned(cells, angle, drained, off=0.0, dim=2, **options):
-    """Return a column of hard soil with soft water, so many cells high, turned about the last corner of its base."""
+def turned(cells, angle, drained, off=0.0, dim=2, seepage=False, **options):
+    """Return a column of hard soil with soft water, so many cells high, turned about the last corner of its base.
+
+    seepage: whether the top is a seepage face.
+    """
     h = HEIGHT / cells
     grid = mpm.Grid([*[1.6, 1.6][:2], *[2 * h] * (dim - 2)], [*[round(1.6 / h)] * 2, *[2] * (dim - 2)])
     turn = np.eye(dim)
@@ -28,7 +31,7 @@ def turned(cells, angle, drained, off=0.0, dim=2, **options):
         fluid=mpm.Fluid(bulk=WATER),
         fixed={},
         displacements=[mpm.Displacement(sides[0], (0.0,) * dim)],
-        drained=[mpm.Drained(sides[end], p) for end, p in drained],
+        drained=[mpm.Drained(sides[end], p, seepage=seepage and end == 1) for end, p in drained],
         **options,
     )
     return simulation, lambda x: ((x - foot) @ turn)[:, 1]
@@ -64,6 +67,15 @@ def test_steady_flow_through_a_turned_column_is_the_linear_one(angle, off, dim):
     through = 1e-5 / 9810 * 1e3 * WIDTH * (1 if dim == 2 else 0.25)
     assert cell.pressure == pytest.approx(2e3 - 1e3 * along(cell.x), abs=2.0)
     assert s.outflows == pytest.approx([-through, through], rel=2e-3)
+
+
+@pytest.mark.parametrize("angle", [0.2, np.pi / 6])
+def test_a_slanted_seepage_face_lets_out_what_flows_to_it(angle):
+    s, along = turned(20, angle, [(0, 1e3), (1, 0.0)], seepage=True)
+    s.run(1e8, 1e7, progress=False)
+    cell = s.cells()
+    assert s.outflows == pytest.approx([-1e-5 / 9810 * 1e3 * WIDTH, 1e-5 / 9810 * 1e3 * WIDTH], rel=1e-3)
+    assert cell.pressure == pytest.approx(1e3 * (1 - along(cell.x)), abs=2.0)
 
 
 def test_a_body_along_the_grid_has_no_flow_besides():

@@ -27,6 +27,8 @@ QUICK = {
     "coupling_iterations": ("--quick --h 0.06", ["iterations.png", "iterations.csv", "iterations.md", "roughness.md"]),
     "small_steps": ("--cells 10 --steps 1 10 40 --strip-cells 10", ["small_steps.png", "strip.png"]),
     "cantilever_3d": ("--cells 2 --steps 2 4", ["cantilever_3d.png"]),
+    "image": ("--pixels 12", ["image.png"]),
+    "strip": ("--cells 8 --steps 4", ["strip.png"]),
     "cryer": ("--cells 6 --steps 12", ["cryer.png"]),
     "cantilever": ("--cells 2 --steps 20", ["cantilever.png"]),
     "cycles": ("--h 0.1 --cycles 2 --turn 0.25", ["cycles.png", "cycles.csv"]),
@@ -39,6 +41,8 @@ QUICK = {
     "slump": ("--cells 6 --steps 10", ["slump.png", "failure.png", "slump.gif"]),
     "triaxial": ("--steps 20", ["triaxial.png"]),
     "cavity": ("--cells 4 --cases well --ratios 2", ["cavity.png"]),
+    "indentation": ("--cells 6", ["indentation.png"]),
+    "penetration": ("--cells 4 --rough 0.5 --depth 0.1", ["penetration.png"]),
     "slope": ("--cells 4 --steps 4 --rtol 0.1", ["slope.png"]),
     "dam": ("--h 1 --steps 3 --cells 10", ["dam.png"]),
     "embankment": ("--h 1 --steps 1", ["embankment.png"]),
@@ -47,7 +51,7 @@ QUICK = {
     "benchmark_pruning": ("--quick", ["pruning.md"]),
     "scaling": ("--quick --dims 2 --processes 1 2", ["scaling.png", "scaling.csv", "scaling.md"]),
 }
-LONG = {"cavity", "slope"}  # what they show has tests of its own
+LONG = {"cavity", "slope", "image"}  # what they show has tests of its own, or takes long to compile
 
 
 def run(demo, arguments):
@@ -57,7 +61,7 @@ def run(demo, arguments):
 
 
 def test_every_demo_is_run():
-    assert {p.stem for p in (ROOT / "demos").glob("*.py")} == {*QUICK, "tutorial", "tables"}
+    assert {p.stem for p in (ROOT / "demos").glob("*.py")} == {*QUICK, "tutorial", "tables", "common"}
 
 
 def test_the_tutorial_s_assertions_hold(tmp_path):

@@ -77,3 +77,34 @@ def test_the_command_prints_and_draws(tmp_path, capsys):
     with pytest.raises(SystemExit):
         main(["element-test", "ModifiedCamClay", "oedometer", "0.1", "shear=3e6"])
     assert "M is not given" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["CamClay", "oedometer", "0.1"], "law = 'CamClay', must be one of DruckerPrager, "),
+        (["laws.py:Clay", "oedometer", "0.1"], "law = 'laws.py:Clay': there is no file laws.py"),
+        (["Hencky", "oedometer", "10%"], "strain = '10%', must be a number"),
+        (["Hencky", "oedometer", "0.1", "shear=3MPa"], "Hencky: shear = '3MPa', must be a number"),
+        (["Hencky", "oedometer", "0.1", "shear"], "Hencky: 'shear' must be name=value, name one of bulk, shear, "),
+        (["Hencky", "oedometer", "0.1", "G=3e6"], "Hencky: 'G=3e6' must be name=value"),
+        (["Hencky", "oedometer", "0.1", "shear=3e6", "shear=4e6"], "Hencky: 'shear=4e6' is given twice"),
+        (["Hencky", "oedometer", "0.1", "shear=3e6"], "Hencky: bulk is not given"),
+        (["Hencky", "oedometer", "0.1", "--draw", "nowhere/a.png"], "--draw nowhere/a.png: there is no folder nowhere"),
+    ],
+)
+def test_the_command_says_in_a_line_what_is_wrong(arguments, message, capsys, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit):
+        main(["element-test", *arguments])
+    assert message in capsys.readouterr().err
+
+
+def test_the_command_drives_a_law_of_the_user(tmp_path, capsys):
+    file = tmp_path / "soil.py"
+    file.write_text("import mpm_dolfinx\n\nclass Own(mpm_dolfinx.Hencky):\n    pass\n")
+    ends = []
+    for law in ("Hencky", f"{file}:Own"):
+        main(["element-test", law, "oedometer", "0.1", "bulk=2e7", "shear=1e7", "--steps", "1"])
+        ends.append(capsys.readouterr().out)
+    assert ends[0] == ends[1]

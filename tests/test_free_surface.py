@@ -50,6 +50,17 @@ def test_between_equal_levels_water_is_at_rest():
     assert cell.pressure == pytest.approx(9810 * (UPPER - cell.x[:, 1]), abs=1e-6 * 9810)
 
 
+def test_what_drains_above_a_surface_that_falls_is_not_known():
+    """It falls at once: pores above it count as full. A limit that the pages tell of."""
+    s = dam(10, heads=(UPPER, UPPER))
+    s.run(20, 20, progress=False)
+    s.stage(drained=[mpm.water(side, lambda t: max(LOWER, UPPER - (t - 20) / 10))[1] for side in ("left", "right")])
+    s.run(120, 10, progress=False)
+    cell = s.cells()
+    assert cell.x[cell.pressure > 0, 1].max() < LOWER + 2 * TOP / 10
+    assert s.outflows.sum() * 100 < 0.01 * 0.3 * WIDTH * (UPPER - LOWER), "the last flow, for all of the time"
+
+
 @pytest.mark.parametrize("arguments, said", [((0.0,), "suction = 0.0"), ((1e3, 1.0), "least = 1.0")])
 def test_what_is_no_such_law_is_refused(arguments, said):
     with pytest.raises(ValueError, match=f"unsaturated: {said}"):

@@ -19,10 +19,10 @@ LAWS = {
 }
 
 
-def ground(law="hencky", dim=2, off=0.13, level=2.0, **options):
+def ground(law="hencky", dim=2, off=0.13, level=2.0, axisymmetric=False, **options):
     """Return two layers, 3 m, whose interface and surface are off the grid lines, with a phreatic level in them."""
     width = [2.0] if dim == 2 else [1.0, 1.0]
-    grid = mpm.Grid([*width, 4.0], [*(round(2 * w) for w in width), 8])
+    grid = mpm.Grid([*width, 4.0], [*(round(2 * w) for w in width), 8], axisymmetric=axisymmetric)
     bodies = [
         mpm.box(grid, [*[0.0] * (dim - 1), low], [*width, high], material=m)
         for m, (low, high) in enumerate([(0.0, 1 + off), (1 + off, 3 + off)])
@@ -57,9 +57,19 @@ def moved(s):
     return np.abs(s.points.corners - s.points.origin).max()
 
 
-@pytest.mark.parametrize("law, dim", [*((law, 2) for law in LAWS), pytest.param("hencky", 3, marks=pytest.mark.slow)])
-def test_layered_soil_at_rest_is_not_moved_by_a_first_step(law, dim):
-    s = ground(law, dim)
+@pytest.mark.parametrize(
+    "law, dim, axisymmetric",
+    [
+        *((law, 2, False) for law in LAWS),
+        ("hencky", 2, True),
+        ("mohr-coulomb", 2, True),
+        pytest.param("hencky", 3, False, marks=pytest.mark.slow),
+        pytest.param("linear", 2, True, marks=pytest.mark.slow),
+        pytest.param("cam clay", 2, True, marks=pytest.mark.slow),
+    ],
+)
+def test_layered_soil_at_rest_is_not_moved_by_a_first_step(law, dim, axisymmetric):
+    s = ground(law, dim, axisymmetric=axisymmetric)
     fields, y = s.point_fields(), s.points.x[:, -1]
     exact = vertical(y)
     stress = fields.effective_stress
@@ -69,7 +79,7 @@ def test_layered_soil_at_rest_is_not_moved_by_a_first_step(law, dim):
     for dt in (1.0, 1e4):
         s.run(s.t + dt, dt, progress=False)
         assert moved(s) < 1e-9
-    assert s.points.F == pytest.approx(np.tile(np.eye(dim), (len(s.points), 1, 1)), abs=1e-12)
+    assert s.points.F == pytest.approx(np.tile(np.eye(s.grid.stretches), (len(s.points), 1, 1)), abs=1e-12)
 
 
 def test_along_the_grid_stresses_at_rest_are_the_exact_ones():
@@ -80,9 +90,9 @@ def test_along_the_grid_stresses_at_rest_are_the_exact_ones():
     assert stress[:, 2, 2] == pytest.approx(exact / 2, rel=1e-9)
 
 
-def slope(level, soil, h=0.25, **options):
-    """Return a bank with a slanted side, wet up to a level."""
-    grid = mpm.Grid([5.5, 3.0], [round(5.5 / h), round(3 / h)])
+def slope(level, soil, h=0.25, axisymmetric=False, **options):
+    """Return a bank with a slanted side, wet up to a level, or a mound."""
+    grid = mpm.Grid([5.5, 3.0], [round(5.5 / h), round(3 / h)], axisymmetric=axisymmetric)
     bank = mpm.mapped(
         grid, mpm.box(grid, [0, 0], [5.1, 2.2]), lambda X: np.stack([X[:, 0] * (1 - X[:, 1] / 4.4), X[:, 1]], axis=1)
     )
@@ -102,11 +112,11 @@ def slope(level, soil, h=0.25, **options):
     )
 
 
-@pytest.mark.parametrize("level", [0.83, 3.0])
-def test_a_bank_in_still_water_stays_where_it_is(level):
+@pytest.mark.parametrize("level, axisymmetric", [(0.83, False), (3.0, False), (0.83, True)])
+def test_a_bank_in_still_water_stays_where_it_is(level, axisymmetric):
     """Partly emerged and submerged: neither soil nor water moves."""
     soil = mpm.MohrCoulomb(bulk=5e6, shear=2.5e6, friction=35, dilation=0, cohesion=5e3, **WATER)
-    s = slope(level, soil)
+    s = slope(level, soil, axisymmetric=axisymmetric)
     for dt in (1.0, 1e4):
         s.run(s.t + dt, dt, progress=False)
         assert moved(s) < 1e-9 * 2.2 and np.abs(s.outflows).max() < 1e-9 * 1e-6
@@ -126,10 +136,10 @@ def oedometric(stress, law):
     return np.interp(stress, of(x), x)
 
 
-@pytest.mark.parametrize("law", ["hencky", "linear"])
-def test_soil_is_loaded_on_as_if_its_stress_had_come_by_loading(law):
+@pytest.mark.parametrize("law, axisymmetric", [("hencky", False), ("linear", False), ("hencky", True)])
+def test_soil_is_loaded_on_as_if_its_stress_had_come_by_loading(law, axisymmetric):
     """A stress of a tenth of the modulus as seeded, and then half as much again: the exact stretch between the two."""
-    grid = mpm.Grid([0.5, 1.2], [2, 12])
+    grid = mpm.Grid([0.5, 1.2], [2, 12], axisymmetric=axisymmetric)
     column, first, second = mpm.box(grid, [0, 0], [0.5, 1.0]), -3e5, -4.5e5
     material = {"hencky": mpm.Hencky, "linear": mpm.LinearElastic}[law](bulk=2e6, shear=1e6, porosity=0.4)
     stretch = oedometric(first, law)
@@ -203,6 +213,7 @@ def test_forces_that_hold_a_rest_go_where_the_body_moves_or_is_dug_away():
         ({"gravity": (1.0, -9.81)}, r"K0 with gravity = \[1.0, -9.81\], must be down"),
         ({"pressure": lambda x: np.nan}, r"pressure\(x\) = nan, must be a finite number, or one for each"),
         ({"law": "mohr-coulomb", "initial_stress": mpm.K0(0.1)}, "must be what MohrCoulomb can bear"),
+        ({"law": "mohr-coulomb", "level": 6.0}, "of open water above it K0 takes the weight as surcharge"),
         ({"law": "cam clay", "initial_stress": lambda x: np.tile([0, 1e4, 0], (len(x), 1))}, "of compressive mean"),
     ],
 )

@@ -9,7 +9,7 @@ import ufl
 from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
 from ufl.algorithms.apply_derivatives import apply_derivatives
 
-from mpm_dolfinx import LAWS, Fluid, Hencky, LinearElastic, NeoHookean, kozeny_carman
+from mpm_dolfinx import Fluid, Hencky, LinearElastic, NeoHookean, kozeny_carman
 
 
 def energy(law, F):
@@ -71,7 +71,7 @@ def test_a_tiny_strain_gives_a_tiny_stress(law, dim):
         ({"grain_bulk": 0.0}, "grain_bulk = 0.0, must be > 0"),
     ],
 )
-@pytest.mark.parametrize("law", LAWS.values())
+@pytest.mark.parametrize("law", [Hencky, NeoHookean, LinearElastic])
 def test_constants_out_of_range_are_refused(law, constants, message):
     with pytest.raises(ValueError, match=message):
         law(**{"bulk": 1e6, "shear": 1e6, **constants})

@@ -177,14 +177,19 @@ def test_a_pressed_hole_has_the_exact_displacements_and_stresses(p, steps):
 
 
 @pytest.mark.slow
-def test_a_polygon_of_quadrilaterals_is_as_exact():
+@pytest.mark.parametrize("options", [{"quadrilaterals": True}, {"size": 0.6 / 24}])
+def test_a_polygon_is_as_exact(options):
+    """Triangles have to be smaller: the diagonals of a third of one tell F at two places.
+
+    With triangles of the default size, 1.35 cells, stresses are within 0.73 %, with 48 cells over the wall 0.32 %.
+    """
     pytest.importorskip("gmsh")
     inner, outer = (np.linspace(0, np.pi / 2, 1 + n) for n in (48, 96))
     inner, outer = (r * np.stack([np.cos(a), np.sin(a)], axis=1).clip(0) for r, a in ((1, inner), (2, outer[::-1])))
     sides = [*["hole"] * 48, "axis", *["out"] * 96, "floor"]
 
     def ring(grid):
-        return mpm.polygon(grid, np.concatenate([inner, outer]), sides, quadrilaterals=True)
+        return mpm.polygon(grid, np.concatenate([inner, outer]), sides, **options)
 
     moved, stress = pressed_hole(ring, "hole", 1e3, 1, 24)
     assert moved < 5e-4 and stress < 5e-3

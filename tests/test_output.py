@@ -2,6 +2,7 @@
 """What a run leaves on the disk and on the terminal."""
 
 import csv
+import importlib
 import io
 import logging
 import re
@@ -9,6 +10,8 @@ import subprocess
 import sys
 from pathlib import Path
 from xml.etree import ElementTree
+
+from mpi4py import MPI
 
 import dolfinx
 import meshio
@@ -21,7 +24,16 @@ from test_restart import block, cut_beam
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.__main__ import main
+from mpm_dolfinx.points.cutting import volumes
 from mpm_dolfinx.result import Report
+
+
+def with_h5py():
+    """Skip where no h5py can be loaded beside dolfinx, such as PyPI's with an HDF5 of its own."""
+    try:
+        importlib.import_module("h5py")
+    except Exception as error:
+        pytest.skip(f"h5py: {error}")
 
 
 def index(file):
@@ -133,6 +145,48 @@ def test_fields_of_the_grid_are_read_back_as_they_were(written):
         assert found["fill"].sum() * simulation.grid.cell_volume == pytest.approx(0.3, rel=1e-3)
         here, there = (np.lexsort(np.rint(y / simulation.grid.h).T) for y in (x, simulation.grid.node_x))
         assert found["step_displacement"].reshape(-1, 3)[here, :2] == pytest.approx(u.reshape(-1, 2)[there], rel=1e-12)
+
+
+def test_all_times_are_in_one_file(tmp_path, capsys):
+    """Also where a body has been dug away between two of them, and without the h5py that it needs."""
+    with_h5py()
+    grid = mpm.Grid([1.4, 1.2], [7, 8], [0, -0.4])
+    bodies = [mpm.box(grid, [0, y], [1, y + 0.4]) for y in (0, 0.4)]
+    loads = [mpm.Traction("right", (0, -1e4))]
+    scene = mpm.Simulation(grid, bodies, [mpm.Hencky(1e6, 1e6)], fixed={"left": "xy"}, tractions=loads)
+    scene.run(1, 1, observe=mpm.Writer(scene, tmp_path))
+    scene.stage(remove=[1])
+    after = scene.run(2, 1, observe=mpm.Writer(scene, tmp_path))
+    main(["one-file", str(tmp_path)])
+    assert capsys.readouterr().out == f"{tmp_path / 'points.xdmf'}\n" and after.converged
+    files = index(tmp_path / "points.pvd")
+    with meshio.xdmf.TimeSeriesReader(tmp_path / "points.xdmf") as series:
+        assert series.num_steps == len(files) == 3
+        for k, (t, (file,)) in enumerate(files.items()):
+            mesh, series.mesh_grid = meshio.read(file), series.collection[k]
+            x, cells = series.read_points_cells()
+            found = series.read_data(k)
+            assert np.array_equal(x, mesh.points) and np.array_equal(cells[0].data, mesh.cells[0].data)
+            assert found[0] == t and found[2].keys() == mesh.cell_data.keys() > {"effective_stress_yy", "J"}
+            assert all(np.array_equal(found[2][name], rows) for name, rows in mesh.cell_data.items())
+    xpath = {"name": "2", "xpath": "/Xdmf/Domain/Grid"}
+    with dolfinx.io.XDMFFile(MPI.COMM_SELF, str(tmp_path / "points.xdmf"), "r") as file:
+        domains = file.read_mesh(dolfinx.mesh.GhostMode.none, **xpath)
+    assert domains.topology.index_map(2).size_local == len(scene.points) < len(after.t) * len(bodies[0])
+    assert domains.geometry.x[:, 1].min() == scene.points.corners[..., 1].min() < 0
+    said = ElementTree.parse(tmp_path / "points.xdmf").iter("Information")
+    assert {item.get("Name"): item.get("Value") for item in said}["displacement"].startswith("m, ")
+
+
+def test_one_file_says_what_it_cannot_do(tmp_path, monkeypatch, capsys):
+    with pytest.raises(ValueError, match=r"one_file: folder = .*: has no points\.pvd, must be that of a Writer"):
+        mpm.one_file(tmp_path)
+    (tmp_path / "points.pvd").touch()
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    with pytest.raises(SystemExit):
+        main(["one-file", str(tmp_path)])
+    assert "one_file: h5py: import of h5py halted; None in sys.modules; must be Debian's" in capsys.readouterr().err
+    assert not list(tmp_path.glob("*.xdmf"))
 
 
 def test_the_table_holds_the_histories(written):
@@ -294,3 +348,30 @@ def test_two_runs_do_not_write_into_one_folder(tmp_path):
     assert other.returncode == 1 and "another run writes into it, must be one of its own" in other.stderr
     mpm.Writer(simulation, tmp_path / "out")
     assert subprocess.run([sys.executable, "-c", script, str(tmp_path / "new")], **here).returncode == 0
+
+
+def test_tools_are_written_where_they_are(tmp_path):
+    """A disc that goes down, and a plate beside the grid, of which nothing is to be seen."""
+    grid = mpm.Grid([1.0, 1.0], [8, 8])
+    disc = mpm.Tool(mpm.Ball((0.5, 0.75), 0.25), displacement=lambda t: (0, -0.06 * t))
+    walls = {"left": "x", "right": "x", "bottom": "xy"}
+    soil, beside = mpm.Hencky(bulk=1e6, shear=6e5), mpm.Tool(mpm.HalfSpace((0, 1.5), (0, -1)))
+    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 0.5])], [soil], fixed=walls, tools=[disc, beside])
+    s.run(1.0, 1.0, observe=mpm.Writer(s, tmp_path))
+    files = index(tmp_path / "tools.pvd")
+    assert list(files) == [0.0, 1.0]
+    drawn = meshio.read(files[1.0][0])
+    assert not drawn.cell_data["tool"][0].any()
+    assert drawn.cell_data["force"][0] == pytest.approx(np.tile([*s.tool_forces[0, :2], 0.0], (len(drawn.cells[0]), 1)))
+    r = np.linalg.norm(drawn.points[:, :2] - [0.5, 0.69], axis=1)
+    assert r.max() == pytest.approx(0.25, rel=1e-6) and (r > 0.24).sum() > 16
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_tools_are_drawn_up_to_their_surface(dim):
+    grid, up = mpm.Grid([1.0] * dim, [8] * dim), np.eye(dim)[-1]
+    edges = np.array(np.meshgrid(*[[0.0, 0.4]] * dim)).reshape(dim, -1).T
+    drawn = mpm.Tool(mpm.Convex(edges), displacement=0.33 * up).drawn(grid, 0.0)
+    assert drawn.min(axis=(0, 1)) == pytest.approx(0.33 * up, abs=1e-9)
+    assert drawn.max(axis=(0, 1)) == pytest.approx(0.4 + 0.33 * up)
+    assert volumes(drawn).sum() == pytest.approx(0.4**dim, rel=0.01)

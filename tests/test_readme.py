@@ -56,7 +56,7 @@ def test_figures_are_those_that_the_demos_have_printed(page):
 
 
 @pytest.mark.parametrize("run", ["terzaghi --rtol 1e-3", "self_weight_column"])
-def test_what_a_demo_hof_fluid_it_prints_again(run, tmp_path):
+def test_what_a_demo_has_printed_it_prints_again(run, tmp_path):
     demo, *options = run.split()
     command = [sys.executable, str(tables.DEMOS / f"{demo}.py"), *options, "--json", "--out", str(tmp_path)]
     done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)

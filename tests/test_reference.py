@@ -77,3 +77,13 @@ def test_terms_that_the_reference_cannot_take_are_refused_in_a_line():
         reference(terms=[lambda w: w])
     with pytest.raises(ValueError, match="depends on neither u nor v"):
         reference(terms=[lambda points, t: t * points.dx])
+
+
+def test_a_modulus_that_jumps_between_cells_is_that_of_each_cell():
+    stiff = lambda X: np.where(X[:, 1] > 0.5, 4e6, 1e6)  # noqa: E731
+    law = mpm.LinearElastic(bulk=lambda X: stiff(X) / 3, shear=lambda X: stiff(X) / 2)
+    load = mpm.Traction("top", (0, -1.0))
+    walls = {"left": "x", "right": "x", "bottom": "y"}
+    column = BiotFEM([0, 0], [0.5, 1], [1, 2], law, fixed=walls, tractions=[load])
+    column.step(1.0)
+    assert column.displacement(np.array([[0.25, 1.0]]))[0, 1] == pytest.approx(-0.5e-6 - 0.125e-6, rel=1e-6)

@@ -8,10 +8,13 @@ from functools import cache
 
 import numpy as np
 import pytest
+from dolfinx import fem
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.constitutive.evaluate import MOST
+from mpm_dolfinx.forms.unknowns import Unknowns
 from mpm_dolfinx.problems.ghost_penalty import GHOST
+from mpm_dolfinx.problems.second_differences import second_differences
 
 SHEAR, LOAD, K = 1e6, 1e2, np.pi  # Pa, Pa, 1/m
 CELLS = (8, 16, 32)
@@ -146,6 +149,28 @@ def test_pressures_do_not_alternate_where_soil_flows(monkeypatch):
     )
     assert alternating(plain) > 0.15e4 and alternating(p) < 0.05e4
     assert load == pytest.approx(-(2 + np.pi) * 1e4 * 0.5, rel=0.1)
+
+
+def test_what_damps_soft_soil_meets_no_even_gradient_and_loses_no_fluid():
+    """Cells that alternate along both axes meet what a damping of jumps gives them, away from the sides."""
+    grid = mpm.Grid([6.0, 4.0], [6, 4])
+    cells, index, rng = np.arange(grid.num_local), grid.index(grid.midpoints), np.random.default_rng(0)
+    own, opening = Unknowns(fem.Function(grid.cellwise()), cells), np.ones((grid.num_local, 2, 2))
+    shift = rng.uniform(-0.2, 0.2, size=6)[index[:, :1]] * [1, 0]  # of centroids
+    H = second_differences(own, grid, rng.uniform(1, 9, size=(len(cells), 2)), shift, opening)
+    even = own.gather_owned((grid.midpoints + shift)[:, 0])
+    assert np.abs((H * even).array).max() < 1e-12
+    assert abs((H * own.gather_owned(rng.normal(size=len(cells)))).array.sum()) < 1e-11
+    H = second_differences(own, grid, np.ones((len(cells), 2)), 0 * shift, opening)
+    signs = 1.0 - 2 * (index.sum(axis=1) % 2)
+    inner = (index[:, 0] == 2) | (index[:, 0] == 3)
+    force = (H * own.gather_owned(signs)).array / signs
+    assert force[inner & (index[:, 1] % 3 != 0)] == pytest.approx(4 + 3)  # a jump: 4 along each axis; y has 2 rows
+    with_gap = opening.copy()
+    with_gap[index[:, 0] == 2, 0, 1] = 0.0
+    H = second_differences(own, grid, np.ones((len(cells), 2)), 0 * shift, with_gap)
+    step = own.gather_owned((index[:, 0] > 2).astype(float))
+    assert np.abs((H * step).array).max() < 1e-12, "what does not touch is not coupled"
 
 
 def test_soil_that_could_yield_and_does_not_is_damped_as_elastic_soil(monkeypatch):

@@ -8,7 +8,7 @@ import pytest
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.solve import watchdog
-from mpm_dolfinx.solve.watchdog import PATIENCE, Watchdog, shortened
+from mpm_dolfinx.solve.watchdog import PATIENCE, WORK, Search, Watchdog, shortened
 
 
 def test_the_residual_may_grow_for_some_full_steps_and_descends_after_them():
@@ -103,15 +103,31 @@ def test_firmness_resists_shear_as_elastic_soil_does_and_neither_turns_nor_shift
         assert np.abs(forces.array_r[inner]).max() < 1e-9 * 1e6
 
 
-@pytest.mark.parametrize("firm", [watchdog.FIRM, 0.0])
-def test_firmer_tangents_take_steps_that_fail_without(monkeypatch, firm):
-    monkeypatch.setattr(watchdog, "FIRM", firm)
-    s = pushed()
-    if firm:
-        assert max(s.step(1.0).newton for _ in range(3)) < 25
-    else:
-        with pytest.raises(mpm.NotConverged):
-            [s.step(1.0) for _ in range(3)]
+def test_a_step_that_goes_too_far_is_shortened_to_where_the_forces_do_no_work():
+    for end in (0.01, 0.1, 0.5):  # where the work is zero, then it grows steeply
+        search, work = Search(), np.inf
+        while search is not None:
+            step = search.step
+            work = 1 - step / end if step < end else -10 * (step / end - 1)
+            search = search.after(work)
+        assert abs(work) <= WORK and step <= 1.1 * end
+    assert Search().after(0.5) is None and Search().after(1.5) is None  # full steps
+    assert Search().after(np.nan).step == Search().after(100.0).step == 0.2
+
+
+def steps_taken(monkeypatch, **values) -> int:
+    """Return the Newton steps of three steps of pushed ground with other constants of the watchdog."""
+    with monkeypatch.context() as patched:
+        for name, value in values.items():
+            patched.setattr(watchdog, name, value)
+        s = pushed()
+        return sum(s.step(1.0).newton for _ in range(3))
+
+
+def test_steps_to_where_forces_do_no_work_save_newton_steps_and_those_without_firmness_fail_without(monkeypatch):
+    assert steps_taken(monkeypatch) < 0.9 * steps_taken(monkeypatch, TRIES=1)
+    with pytest.raises(mpm.NotConverged):
+        steps_taken(monkeypatch, TRIES=1, FIRM=0.0)
 
 
 def test_a_firmer_tangent_leads_to_the_same_equilibrium(monkeypatch):

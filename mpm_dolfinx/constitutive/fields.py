@@ -61,7 +61,7 @@ class SceneMaterials:
         fluid: Fluid | None,
         prestressed: bool = False,
     ):
-        materials = [stressed(m, grid.dim) for m in materials] if prestressed else materials
+        materials = [stressed(m, grid.stretches) for m in materials] if prestressed else materials
         self.grid, self.materials, self._fluid = grid, materials, fluid
         seeded: dict[str, NDArray[np.float64]] = {}
         X, index = _reference(bodies, len(materials))

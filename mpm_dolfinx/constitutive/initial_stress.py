@@ -34,7 +34,8 @@ class K0:
     """Initial effective stress of soil at rest under its own weight.
 
     The vertical one is the weight above, soil and fluid, and the surcharge, less biot times the pore pressure; the
-    horizontal ones are K0 times that.  Exact where ground and layers are level; elsewhere a start for the balance.
+    horizontal ones, in axisymmetry along radius and hoops, are K0 times that.  Exact where ground and layers are
+    level; elsewhere a start for the balance.
 
     Parameters
     ----------
@@ -202,8 +203,8 @@ def stressed(materials: SceneMaterials, points: MaterialPoints, chosen: NDArray[
         part = _with(part, given, initial_stress=normal, bulk=-normal.mean(axis=1) / kappa)
     which = PLANE if points.x.shape[1] == 2 else SPACE
     axes = tuple(np.array(which).T)
-    free = np.repeat(~given[:, None], len(which), axis=1)
-    if points.x.shape[1] == 2:
+    free, stretches = np.repeat(~given[:, None], len(which), axis=1), materials.grid.stretches
+    if stretches == 2:
         free[:, 2] &= plastic  # across the plane
 
     def off(strain: NDArray[np.float64]) -> tuple[MaterialPoints, NDArray[np.float64], NDArray[np.float64]]:
@@ -214,8 +215,7 @@ def stressed(materials: SceneMaterials, points: MaterialPoints, chosen: NDArray[
         logs, turn = np.linalg.eigh(tensor)
         now = _with(part, plastic & ~given, plastic=(turn * np.exp(2 * logs)[:, None]) @ turn.swapaxes(1, 2))
         stretch = (turn * np.exp(logs)[:, None]) @ turn.swapaxes(1, 2)
-        d = points.x.shape[1]
-        now = _with(now, ~plastic & ~given, prestretch=stretch[:, :d, :d])
+        now = _with(now, ~plastic & ~given, prestretch=stretch[:, :stretches, :stretches])
         stress = materials.effective_stress_3d(now)
         return now, stress, np.where(free, (stress - target)[(slice(None), *axes)], 0.0)
 
@@ -224,7 +224,7 @@ def stressed(materials: SceneMaterials, points: MaterialPoints, chosen: NDArray[
     mean = np.trace(target, axis1=1, axis2=2) / 3
     elastic = (target - mean[:, None, None] * np.eye(3)) / (2 * shear)[:, None, None]
     elastic += (mean / (3 * bulk))[:, None, None] * np.eye(3)
-    if points.x.shape[1] == 2:  # laws without a strain across the plane
+    if stretches == 2:  # laws without a strain across the plane
         plane, lam = np.trace(target[:, :2, :2], axis1=1, axis2=2), bulk - 2 * shear / 3
         alone = target / (2 * shear)[:, None, None] - (lam * plane / (4 * shear * (lam + shear)))[
             :, None, None
@@ -256,7 +256,7 @@ def stressed(materials: SceneMaterials, points: MaterialPoints, chosen: NDArray[
     if message := first(comm, message):
         raise ValueError(message)
     if "across" in points.data:
-        own = np.nan_to_num(target[:, 2, 2] - stress[:, 2, 2]) if points.x.shape[1] == 2 else 0.0
+        own = np.nan_to_num(target[:, 2, 2] - stress[:, 2, 2]) if stretches == 2 else 0.0
         now = _with(now, ~plastic & ~given, across=own)
     if "plastic" in points.data:
         now = _with(now, plastic, **{"plastic" + AT_REST: now.data["plastic"]})
@@ -268,7 +268,7 @@ def stressed(materials: SceneMaterials, points: MaterialPoints, chosen: NDArray[
 
 def strained(materials: SceneMaterials, points: MaterialPoints, moved: MaterialPoints) -> MaterialPoints:
     """Return points with the elastic strains of others, to which these have been deformed from where they are."""
-    F, d, law = moved.F, points.x.shape[1], materials.law_of(points)
+    F, d, law = moved.F, moved.F.shape[1], materials.law_of(points)
     own = {name: points.data[name] for name in ("softness", "gained") if name in points.data}
     data = {**moved.data, **own}
     out = replace(points, data=data)
@@ -314,4 +314,6 @@ def _no_constants(points: MaterialPoints, target: NDArray[np.float64], given: ND
 def _not_borne(materials: SceneMaterials, points: MaterialPoints, target: NDArray, law: NDArray, i: int) -> str:
     name = materials.laws[law[i]].__name__
     allowed = f"what {name} can bear: inside its yield surface"
-    return f"initial_stress at {points.x[i]}: {target[i].tolist()} Pa, must be {allowed}"
+    tension = np.trace(target[i]) > 0  # pores press by more than the weight above
+    more = "; of open water above it K0 takes the weight as surcharge" if tension and points.pressure[i] > 0 else ""
+    return f"initial_stress at {points.x[i]}: {target[i].tolist()} Pa, must be {allowed}{more}"

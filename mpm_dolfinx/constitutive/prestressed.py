@@ -17,22 +17,25 @@ from inspect import Parameter, Signature
 import numpy as np
 import ufl
 
+from mpm_dolfinx.constitutive.axes import block, embedded, planar
 from mpm_dolfinx.constitutive.skeleton import Field, Skeleton
-from mpm_dolfinx.constitutive.trial import embedded
 
 AT_REST = " at rest"
 """Ends the names of what points carry of a state as seeded, from which yield is told."""
 
 
-def stressed(m: Skeleton, dim: int) -> Skeleton:
-    """Return a material whose points may have a stress as seeded, by fields of theirs; at first they have none."""
+def stressed(m: Skeleton, stretches: int) -> Skeleton:
+    """Return a material whose points may have a stress as seeded, by fields of theirs; at first they have none.
+
+    stretches: number of axes of F.
+    """
     if "initial_stress" in (names := [f.name for f in fields(m)]):
         own = m.initial_stress if callable(m.initial_stress) else _everywhere(m.initial_stress)
         return type(m)(**{name: getattr(m, name) for name in names} | {"initial_stress": own, "bulk": None})
     if "plastic" in m.state:
         return m
     given = {name: getattr(m, name) for name in names}
-    return prestressed(type(m))(**given, prestretch=_everywhere(np.eye(dim)), across=_everywhere(0.0))
+    return prestressed(type(m))(**given, prestretch=_everywhere(np.eye(stretches)), across=_everywhere(0.0))
 
 
 def _everywhere(value) -> Callable:
@@ -63,8 +66,8 @@ def _seen(function: Callable, name: str) -> Callable:
     def of(**given):
         stretch = given["prestretch"]
         if "F" in given:
-            stretch = stretch if given["F"].ufl_shape == stretch.ufl_shape else embedded(stretch)
-            given["F"] = given["F"] * stretch
+            F, stretch = given["F"], stretch if given["F"].ufl_shape == stretch.ufl_shape else embedded(stretch)
+            given["F"] = block(F * stretch) if F.ufl_shape == (3, 3) and planar(F) else F * stretch
         out = function(**{argument: given[argument] for argument in taken})
         return out / ufl.det(stretch) if name in ("energy", "kirchhoff") else out
 

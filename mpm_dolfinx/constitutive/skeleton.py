@@ -409,9 +409,6 @@ def unsaturated(suction: float, least: float = 1e-4) -> Callable:
     return law
 
 
-LAWS = {"hencky": Hencky, "neo-hookean": NeoHookean, "linear": LinearElastic}
-
-
 @dataclass(frozen=True)
 class Fluid:
     """Pore fluid.

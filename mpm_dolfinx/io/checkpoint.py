@@ -214,7 +214,9 @@ def _points(arrays: dict[str, NDArray], like: MaterialPoints, ids: NDArray[np.in
 def _nodes(grid: Grid) -> NDArray[np.int64]:
     """Return the lexicographic numbers of the nodes of this process."""
     index = np.rint((grid.node_x - grid.lower) / grid.h).astype(np.int64)
-    return np.ravel_multi_index(tuple(index.T), tuple(grid.shape + 1))
+    copy = np.zeros(len(index), dtype=np.int64)
+    copy[grid.cell_nodes] = (grid.cell_number // grid.cells)[:, None]
+    return np.ravel_multi_index(tuple(index.T), tuple(grid.shape + 1)) + copy * grid.nodes
 
 
 def _nodal_of_all(grid: Grid, name: str, nodal: NDArray[np.float64] | None) -> dict[str, NDArray]:
@@ -246,7 +248,7 @@ def _check_nodal(name: str, arrays: dict[str, NDArray], grid: Grid) -> None:
     right = node.dtype == np.int64 and values.dtype == np.float64 and values.shape == (len(node), grid.dim)
     if arrays or not right or not np.isfinite(values).all() or (np.diff(node) <= 0).any():
         raise ValueError(f"{name}: none of nodes of the grid, or not finite")
-    if len(node) and not 0 <= node[0] <= node[-1] < np.prod(grid.shape + 1):
+    if len(node) and not 0 <= node[0] <= node[-1] < grid.copies * grid.nodes:
         raise ValueError(f"{name}: of other nodes than the grid's")
     arrays |= {"node": node, "values": values}
 

@@ -19,6 +19,10 @@ FIELDS = {
         "tool_0_pressure, tool_0_shear": "Pa, pressure and shear traction of tool 0 on the surface of the domain",
         "others": "state of the law (see its documentation), constants that differ from point to point, the user's own",
     },
+    "tools.pvd: what tools fill of the grid's cells": {
+        "tool": "number of the tool",
+        "force": "N, in plane strain N/m, by which it acts on the bodies",
+    },
     "grid.pvd: what the cells hold": {
         "fill": "-, filled share of the cell",
         "x": "m, centroid of what it holds, by components",

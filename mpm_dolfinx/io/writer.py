@@ -51,6 +51,7 @@ class Writer:
       recorded of the probes, the forces of the given displacements and of tools, and the outflow through open sides
       (nan where no step has been taken since they were set by a stage);
     * `fields.txt`, which says what each of these is, and its unit;
+    * with tools `tools.pvd`, what they fill of the grid's cells, with their forces;
     * if asked for `grid.pvd`, what the cells hold (`Simulation.cells`), by components, zero in empty cells.
 
     ParaView and VTK read all of it, meshio the points.
@@ -89,6 +90,7 @@ class Writer:
             self._table = Table(comm, folder / "history.csv", self._t)
             self._points = Series(comm, folder / "points.pvd", self._t)
             self._grid = Series(comm, folder / "grid.pvd", self._t) if grid else None
+            self._tools = Series(comm, folder / "tools.pvd", self._t) if len(simulation.tool_forces) else None
             at_root(comm, lambda: (folder / "fields.txt").write_text(text()))
             if not self._points.entries:
                 self._write_points(simulation)
@@ -108,19 +110,20 @@ class Writer:
         if (len(result.rows) - 1) % self.every and not result.converged:
             return
         self._write_points(simulation)
-        self._points.write_index()
         if self._grid is not None:
             self._write_grid(simulation)
-            self._grid.write_index()
+        self._write_indices()
 
     def _start(self, result: Result) -> None:
         """Drop what the folder holds of later times: from here on the files are this run's."""
         if (began := result.rows[-2][0]) != self._t:
             raise ValueError(f"writer: made at t = {self._t:g} s for a run that goes on from t = {began:g} s")
         self._table.start(_row(Result(rows=result.rows[:1]), *self._acting))
-        self._points.write_index()
-        if self._grid is not None:
-            self._grid.write_index()
+        self._write_indices()
+
+    def _write_indices(self) -> None:
+        for series in filter(None, (self._points, self._grid, self._tools)):
+            series.write_index()
 
     def _write_points(self, simulation: Simulation) -> None:
         comm, file = simulation.grid.comm, self._points.next.with_suffix(".vtu")
@@ -139,6 +142,10 @@ class Writer:
 
         at_root(comm, write)
         self._points.entries.append((simulation.t, [file]))
+        if self._tools is not None:
+            file = self._tools.next.with_suffix(".vtu")
+            at_root(comm, lambda: _write_tools(simulation, file))
+            self._tools.entries.append((simulation.t, [file]))
 
     def _write_grid(self, simulation: Simulation) -> None:
         comm, stem = simulation.grid.comm, self._grid.next
@@ -150,6 +157,16 @@ class Writer:
         if not comm.allreduce(_ends(pieces[comm.rank]), op=MPI.LAND):  # dolfinx does not notice a full disk
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(stem))
         self._grid.entries.append((simulation.t, pieces))
+
+
+def _write_tools(simulation: Simulation, file: Path) -> None:
+    """Write what tools fill of the grid's cells, with their numbers and forces."""
+    grid, forces = simulation.grid, simulation.tool_forces[:, : simulation.grid.dim]
+    tools = simulation.state.stage.conditions["tools"]
+    corners = [tool.drawn(grid, simulation.t) for tool in tools]
+    number = np.repeat(np.arange(len(tools)), [len(one) for one in corners])
+    with replacing(file) as part:
+        _cells(np.concatenate(corners), {"tool": number, "force": forces[number]}).write(part, file_format="vtu")
 
 
 _LOCKS: dict[Path, IO] = {}  # of the folders that this process writes into, for as long as it lives
@@ -210,17 +227,18 @@ def solid(points: MaterialPoints, displacement: NDArray[np.float64], wet: bool) 
     wet
         Whether the points' pore pressure has a meaning.
     """
-    n, d = points.x.shape
-    kind, order = VTK_CELLS[d]
-    corners = points.corners[:, order].reshape(-1, d)
     fields = {"id": points.id, "material": points.material, "displacement": displacement, "J": points.J, "F": points.F}
     if wet:
         fields["pressure"] = points.pressure
-    fields = {
-        label: [column] for name, rows in {**fields, **points.data}.items() for label, column in _columns(name, rows)
-    }
-    cells = np.arange(len(corners)).reshape(n, -1)
-    return meshio.Mesh(_padded(corners), [(kind, cells)], cell_data=fields)
+    return _cells(points.corners, {**fields, **points.data})
+
+
+def _cells(corners: NDArray[np.float64], fields: dict[str, NDArray]) -> meshio.Mesh:
+    """Return cells of corners (n, 2^d, d), m, each with nodes of its own, and their fields (n, ...)."""
+    kind, order = VTK_CELLS[corners.shape[2]]
+    data = {label: [column] for name, rows in fields.items() for label, column in _columns(name, rows)}
+    nodes = corners[:, order].reshape(-1, corners.shape[2])
+    return meshio.Mesh(_padded(nodes), [(kind, np.arange(len(nodes)).reshape(-1, len(order)))], cell_data=data)
 
 
 def _padded(vectors: NDArray) -> NDArray:

@@ -284,7 +284,7 @@ def material_points(
     size = np.concatenate([b.size() for b in bodies])
     material = np.concatenate([np.full(len(b), b.material, dtype=np.int32) for b in bodies])
     x = corners.mean(axis=1)
-    mine = np.flatnonzero(grid.owner(grid.number(grid.index(x))) == grid.comm.rank)
+    mine = np.flatnonzero(grid.owner(grid.number(grid.index(x))) == grid.comm.rank)  # of all copies alike
     n, pressures, refused = len(mine), np.empty(0), ""
     try:
         pressures = pressure_at(pressure, x[mine])

@@ -417,11 +417,13 @@ def check_apart(grid: Grid, bodies: Sequence[Body], present: Sequence[bool]) -> 
     """Refuse bodies that lie in each other as seeded; log a warning for those that do not touch and yet will stick."""
     there = [i for i in range(len(bodies)) if present[i]]
     found = {i: solids(bodies[i]) for i in there} if len(there) > 1 else {}
+    first = np.cumsum([0, *(len(body) for body in bodies[:-1])])  # point of each body
     for i, j in combinations(there, 2):
         depth, gap, x = meeting(found[i], found[j], grid.h)
         if depth:
             raise ValueError(f"bodies {i} and {j}: both are at {x}, {depth:.3g} m deep, must not lie in each other")
-        if 0 < gap < 1 and not any(_lies_in(x, found[k][0]) for k in there if k not in (i, j)):
+        together = grid.copies == 1 or np.ptp(grid.copy(first[[i, j]])) == 0  # else they share no node
+        if together and 0 < gap < 1 and not any(_lies_in(x, found[k][0]) for k in there if k not in (i, j)):
             warn_near(grid, f"bodies {i} and {j}", gap, x)
 
 

@@ -94,6 +94,8 @@ class CutDomains(Keyed):
         self.grid, self.points, self.domains = grid, points, domains
         self._patches: dict[Surface, Patches] = {}
         self.pieces = cut(grid, points.corners) if domains else whole_points(grid, points.x)
+        if grid.copies > 1:
+            self.pieces.cell += grid.copy(points.id)[self.pieces.point]
         self._travel = Exchange(grid.comm, grid.owner(self.pieces.cell))
         self.cells, self.x = grid.local(self._travel.send(self.pieces.cell)), self._travel.send(self.pieces.x)
         """Owned cells, and centroids (m, d), m, of the pieces that this process integrates."""
@@ -188,8 +190,8 @@ class CutDomains(Keyed):
 
     def _filled_cell(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
         """Return the cells (m,) of positions in domains; where no piece of the domain lies, of its largest piece."""
-        pieces, cells = self.pieces, int(np.prod(self.grid.shape))
-        cell = self.grid.number(self.grid.index(x))
+        pieces, cells = self.pieces, len(self.grid.owners)
+        cell = self.grid.number(self.grid.index(x)) + self.grid.copy(self.points.id[at])
         key, keys = at * cells + cell, pieces.point * cells + pieces.cell
         if not len(key):
             return cell

@@ -61,7 +61,7 @@ class Cells:
     num_owned, num_local: number of cells without and with ghosts; cell_nodes (cells, 2^d): their nodes, numbered as
     the Q1 degrees of freedom; node_x (nodes, d), midpoints (cells, d): positions, m; signs (2^d, d): on which side of
     the midpoint a node lies; cell_number (cells,): lexicographic numbers; locals: the way back, -1 where there is none;
-    owners: ranks of all cells of the grid; cell_facets (cells, 2d); facet_cells (facets, 2): -1 where there is none.
+    owners: ranks of all cells, copy by copy; cell_facets (cells, 2d); facet_cells (facets, 2): -1 where there is none.
     """
 
     def __init__(self, grid: Grid, mesh: Any, owners: NDArray[np.int32]):
@@ -76,6 +76,9 @@ class Cells:
         # without a cell: it compiles the same forms
         self.signs = np.concatenate(grid.comm.allgather(np.sign(corners[:1] - self.midpoints[:1, None])))[0]
         self.cell_number = grid.number(np.floor((self.midpoints - grid.lower) / grid.h).astype(np.int64))
+        if grid.copies > 1:
+            brought = np.concatenate(grid.comm.allgather(np.flatnonzero(owners == grid.comm.rank)))
+            self.cell_number = brought[np.asarray(mesh.topology.original_cell_index)]
         self.locals = np.full(len(owners), -1, dtype=np.int32)
         self.locals[self.cell_number] = np.arange(self.num_local)
         topology = mesh.topology
@@ -177,10 +180,14 @@ class Grid:
             load = sum_by(self.number(self.index(x)), np.ones(len(x)), int(np.prod(self.shape)))
             owner = owners(load.reshape(self.shape), self.comm.size)
             own = np.flatnonzero(owner.ravel() == self.comm.rank)
-            mesh = _compat.box_mesh(self.comm, self._corners(own), self._nodes(), *destinations(owner, own))
-            self._made.append(Cells(self, mesh, owner.ravel()))
+            nodes = np.concatenate([self.corners(own) + copy * self.nodes for copy in range(self.copies)])
+            ranks, first = destinations(owner, own)
+            each = np.tile(np.diff(first), self.copies)
+            where = np.tile(ranks, self.copies), np.concatenate([[0], np.cumsum(each)]).astype(np.int32)
+            mesh = _compat.box_mesh(self.comm, nodes, self._nodes(), *where)
+            self._made.append(Cells(self, mesh, np.tile(owner.ravel(), self.copies)))
 
-    def _corners(self, cells: NDArray[np.int64]) -> NDArray[np.int64]:
+    def corners(self, cells: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return the lexicographic numbers of the nodes (n, 2^d) of cells."""
         bits = np.arange(2**self.dim)[:, None] >> np.arange(self.dim) & 1
         index = np.stack(np.unravel_index(cells, self.shape), axis=-1)[:, None] + bits
@@ -188,10 +195,29 @@ class Grid:
 
     def _nodes(self) -> NDArray[np.float64]:
         """Return the positions (n, d), m, of this process's share of the nodes, in lexicographic order."""
-        count = int(np.prod(self.shape + 1))
+        count = self.copies * self.nodes
         start, stop = (count * (self.comm.rank + end) // self.comm.size for end in (0, 1))
-        index = np.stack(np.unravel_index(np.arange(start, stop), self.shape + 1), axis=-1)
+        index = np.stack(np.unravel_index(np.arange(start, stop) % self.nodes, self.shape + 1), axis=-1)
         return self.lower + index * self.h
+
+    @property
+    def copies(self) -> int:
+        """How often the mesh has the box: once, or for each group of bodies, see `GridOfGroups`."""
+        return 1
+
+    @property
+    def cells(self) -> int:
+        """Number of cells of one copy."""
+        return int(np.prod(self.shape))
+
+    @property
+    def nodes(self) -> int:
+        """Number of nodes of one copy."""
+        return int(np.prod(self.shape + 1))
+
+    def copy(self, ids: NDArray[np.int64]) -> NDArray[np.int64] | int:
+        """Return the numbers of the first cells of the copies in which material points (n,), by id, are."""
+        return 0
 
     def cellwise(self, shape: tuple[int, ...] = ()):
         """Return the space of functions of a shape that are constant in the cells (DG0), made once."""
@@ -221,7 +247,7 @@ class Grid:
         return TURN * x[:, 0] if self.axisymmetric else 1.0
 
     def number(self, index: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the lexicographic numbers of cells from their (n, d) indices along the axes."""
+        """Return the lexicographic numbers of cells, in the first copy, from their (n, d) indices along the axes."""
         return np.ravel_multi_index(tuple(index.T), tuple(self.shape))
 
     def index(self, x: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -239,7 +265,7 @@ class Grid:
 
     def beside(self, cells: NDArray[np.integer]) -> NDArray[np.int64]:
         """Return the local cells (n, d, 2) beside local cells, by axis and end, -1 where this process has none."""
-        index = np.stack(np.unravel_index(self.cell_number[cells], tuple(self.shape)), axis=1)
+        index = np.stack(np.unravel_index(self.cell_number[cells] % self.cells, tuple(self.shape)), axis=1)
         out = np.full((len(cells), self.dim, 2), -1, dtype=np.int64)
         for axis in range(self.dim):
             stride = int(np.prod(self.shape[axis + 1 :]))
@@ -292,3 +318,33 @@ class Grid:
         axis, end = side(name, self.dim)
         plane = (self.lower, self.upper)[end][axis]
         return np.abs(self.node_x[:, axis] - plane) < 1e-6 * self.h[axis]
+
+
+class GridOfGroups(Grid):
+    """A grid with a copy of its box for each group of bodies, so that these do not share nodes.
+
+    The mesh is of so many disconnected boxes at one place.  Equal cells of the copies are on one process.
+
+    Parameters
+    ----------
+    grid
+        The grid of the bodies.
+    group : (points,)
+        Group of each material point of the scene, by id, from 0 on.
+    """
+
+    def __init__(self, grid: Grid, group: NDArray[np.int64]):
+        super().__init__(grid.upper, grid.shape, grid.lower, grid.comm)
+        self._group, self._copies = group.astype(np.int16), int(group.max()) + 1
+        if self.dim * self.copies * self.nodes > MOST:
+            what = f"grid: has {self.nodes:.3g} nodes for each of {self.copies} groups"
+            raise ValueError(f"{what}, must be below {MOST // (self.dim * self.copies)}")
+
+    @property
+    def copies(self) -> int:
+        """Number of groups."""
+        return self._copies
+
+    def copy(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the numbers of the first cells of the copies in which material points (n,), by id, are."""
+        return self._group[ids] * np.int64(self.cells)

@@ -22,12 +22,10 @@ def with_axis(grid: Grid, fixed: Mapping[str, str]) -> Mapping[str, str]:
     return {**fixed, "left": "x" + left}
 
 
-def check_axisymmetry(grid: Grid, bodies: Sequence[Body], quadrature: str, initial_stress) -> None:
+def check_axisymmetry(grid: Grid, bodies: Sequence[Body], quadrature: str) -> None:
     """Refuse what axisymmetric scenes cannot have, and warn of holes about the axis that are too narrow."""
     if grid.axisymmetric and quadrature == "point":
         raise ValueError("quadrature 'point': must be domain in axisymmetry")
-    if grid.axisymmetric and initial_stress is not None:
-        raise ValueError("initial_stress: must be None in axisymmetry: let the bodies come to rest in a first stage")
     _warn_narrow_hole(grid, bodies)
 
 

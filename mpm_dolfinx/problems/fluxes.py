@@ -216,16 +216,15 @@ class CellContents:
         """Sum values over the rows of each filled cell."""
         return sum_by(self._slot[cells], values, len(self.filled))
 
-    def set_damping(self, softness: NDArray[np.float64] | float) -> NDArray[np.float64]:
-        """Set the strength tau of the damping for pieces (m,) that are so much softer in shear; return it, 1/Pa.
+    def softest(self, softness: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the softness of the filled cells by that of the pieces (m,): the softest is the one that flows."""
+        softest = np.ones(len(self.filled))
+        np.maximum.at(softest, self._slot[self._cells], softness)
+        return softest
 
-        A cell is as soft as its softest piece: it is the one that flows.
-        """
+    def set_damping(self) -> NDArray[np.float64]:
+        """Set the strength tau of the damping of elastic soil in the filled cells; return it, 1/Pa."""
         tau, values = self._damped.x, self.mean(self._damping)
-        if np.ndim(softness):
-            softest = np.ones(len(values))
-            np.maximum.at(softest, self._slot[self._cells], softness)
-            values *= softest
         tau.array[:] = 0.0
         tau.array[self.filled] = values
         tau.scatter_forward()

@@ -22,6 +22,7 @@ from mpm_dolfinx.points.cut_domains import CutDomains, Patches
 from mpm_dolfinx.points.faces import Surface, face_vectors
 from mpm_dolfinx.points.grid import sum_by
 from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.problems.body_contact import Contacts
 from mpm_dolfinx.problems.closed import closed
 from mpm_dolfinx.problems.conditions import (
     RIGIDITY,
@@ -36,6 +37,7 @@ from mpm_dolfinx.problems.conditions import (
     inward,
     resistance,
 )
+from mpm_dolfinx.problems.contacts import Contact
 from mpm_dolfinx.problems.held_cells import SAME, HeldCells, HeldPoints
 from mpm_dolfinx.problems.side_forms import SideData, SideForms
 from mpm_dolfinx.problems.sides import Sides, check_apart, everywhere, gathered, meeting, on_side
@@ -59,6 +61,8 @@ class MechanicalBoundary:
         The conditions.
     terms
         Those of the user's own on sides.
+    contacts
+        Those of groups of bodies.
 
     Raises
     ------
@@ -77,6 +81,7 @@ class MechanicalBoundary:
         plates: Sequence[RigidPlate],
         tools: Sequence[Tool],
         terms: Sequence[OnSide],
+        contacts: Sequence[Contact] = (),
     ):
         self.grid, self._free, self._materials, d = sides.grid, free, materials, sides.grid.dim
         self.plates = [(plate, sides.of(plate)) for plate in plates]
@@ -106,8 +111,14 @@ class MechanicalBoundary:
         if self.grid.axisymmetric and (tools or terms):
             raise ValueError(f"{'tools' if tools else 'terms on sides'}: must be none in axisymmetry")
         self.tools = Tools(self.grid, materials, tools, sides.all, [(hold, faces) for hold, faces, _ in self.holds])
-        self.symmetric = closed(self.grid, free, self.pressures) and self.tools.symmetric
-        """Whether the tangent of pressures and tools is symmetric."""
+        self.contacts = Contacts(sides, materials, contacts)
+        self.symmetric = closed(self.grid, free, self.pressures) and self.tools.symmetric and self.contacts.symmetric
+        """Whether the tangent of pressures, tools and contacts is symmetric."""
+
+    def forces(self, value: float) -> NDArray[np.float64]:
+        """Return an array of forces and moments of tools, or contacts, see `ToolContact.forces`, all of one value."""
+        count = len(self.tools.tools) + len(self.contacts.contacts)
+        return np.full((count, 3 if self.grid.dim == 2 else 6), value)
 
     def data(self, forms: SideForms, cut: CutDomains, start: float, t: float, points: MaterialPoints) -> SideData:
         """Return what acts at time t (s) of a step that began at `start` on the points where they are now."""
@@ -119,7 +130,8 @@ class MechanicalBoundary:
             holds = self._hold_data(forms, cut, points, t) if self.holds else none
             pairs = zip(forms.own, self._terms, strict=True)
             own = tuple(self._own_data(term.points, faces, cut, points) for term, faces in pairs)
-            return SideData(loads, pressures, plates, *holds, self.tools.placed(cut, points, start, t), own)
+            tools, contact = self.tools.placed(cut, points, start, t), self.contacts.placed(cut, points)
+            return SideData(loads, pressures, plates, *holds, tools, own, contact)
 
     def _load_data(self, forms: SideForms, cut: CutDomains, points: MaterialPoints, t: float) -> PointData:
         """Return the dead loads on the surface."""

@@ -368,19 +368,28 @@ class MomentumProblem:
     @property
     def linear(self) -> bool:
         """Whether the tangent changes with the places of the points only."""
-        return self.forms.linear and self._sides.pressures is None and self._sides.tools is None
+        sides = self._sides
+        return self.forms.linear and sides.pressures is None and sides.tools is None and sides.contact is None
 
     @property
     def smooth(self) -> bool:
         """Whether the tangent of one substep may lead the next."""
-        return self.forms.elastic and self._sides.tools is None
+        return self.forms.elastic and self._sides.tools is None and self._sides.contact is None
 
     def settle_tools(self, sticks: bool) -> bool:
         """Choose what slips on tools at u, and if asked for what sticks again; return whether it is another choice."""
+        if (contact := self._sides.contact) is not None:
+            return contact.settle(*self._at, sticks)
         return self._sides.tools is not None and self._sides.tools.settle(self.forms.nodal, sticks)
+
+    @property
+    def _at(self) -> tuple[Unknowns, NDArray[np.float64]]:
+        return self.system.unknowns, self.forms.u.x.array
 
     def augment_tools(self) -> bool:
         """Shift the pressures of tools that penetrate too deep; return whether the balance is another one since."""
+        if (contact := self._sides.contact) is not None:
+            return contact.augment(*self._at)
         return self._sides.tools is not None and self._sides.tools.augment(self.forms.nodal)
 
     def guesses(self) -> list[NDArray[np.float64]]:
@@ -417,6 +426,8 @@ class MomentumProblem:
         r = system.unknowns.gather(b, system.residual)
         step = system.unknowns.gather(forms.u.x.array, system.step)
         system.penalty.multAdd(step, r, r)
+        if self._sides.contact is not None:
+            self._sides.contact.push(*self._at, r)
         return r, float(np.sqrt(max(squares)))
 
     def assemble_tangent(self, data: QuadratureData | None = None, firmness: float = 0.0) -> PETSc.Mat:
@@ -429,6 +440,8 @@ class MomentumProblem:
         K.assemble()
         pattern = PETSc.Mat.Structure
         K.axpy(1.0, self.system.penalty, pattern.UNKNOWN if first else pattern.SUBSET_NONZERO_PATTERN)
+        if self._sides.contact is not None:
+            K.axpy(1.0, self._sides.contact.tangent(*self._at), pattern.UNKNOWN)
         if firmness > 0:
             K.axpy(firmness, self.system.firm, pattern.SUBSET_NONZERO_PATTERN)
         return K

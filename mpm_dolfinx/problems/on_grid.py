@@ -292,6 +292,8 @@ class Assembled:
             self.round_off += 1e-15 * over_all(grid.comm, stiffest, MPI.MAX) * reach
         if sides.tools is not None:
             self.round_off += over_all(grid.comm, sides.tools.rounding, MPI.MAX)
+        if sides.contact is not None:
+            self.round_off += over_all(grid.comm, sides.contact.rounding, MPI.MAX)
         self._off = None
         if self.storage is not None:
             self.storage.set_alternation()
@@ -380,10 +382,12 @@ def assembled(
                 held.append((holds.cells, holds.x, holds["direction"]))
             if sides.tools is not None:
                 held.append(sides.tools.touching())
-            check_held(grid, on_grid.active, free, held, begins)
+            meeting = sides.contact.touching() if sides.contact is not None else None
+            check_held(grid, on_grid.active, free, held, begins, meeting)
         return System(momentum, storage, scheme, on_grid, dofs, nodes, stiff, momentum.symmetric and symmetric)
 
     # a cell may become active between active nodes, so equal dofs do not mean equal cells
     with Timer("mpm: integration data"):
-        system = systems((stage, on_grid.cells, dofs, on_grid.penalised), make, grid.comm)
+        pairs = None if sides.contact is None else on_grid.key  # couple nodes as they lie
+        system = systems((stage, on_grid.cells, dofs, on_grid.penalised, pairs), make, grid.comm)
         return Assembled(momentum, storage, system, on_grid, stage, sides)

@@ -40,4 +40,4 @@ def bodies_in(cut: CutDomains, bodies: Sequence[Body], cell: int) -> tuple[list[
     grid, ids = cut.grid, cut.points.id[cut.pieces.point[cut.pieces.cell == cell]]
     own = np.searchsorted(np.cumsum([len(body) for body in bodies]), ids, side="right")
     found = sorted({int(i) for rows in grid.comm.allgather(own) for i in rows})
-    return found, grid.lower + (np.array(np.unravel_index(cell, grid.shape)) + 0.5) * grid.h
+    return found, grid.lower + (np.array(np.unravel_index(cell % grid.cells, grid.shape)) + 0.5) * grid.h

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import label
 
+from mpm_dolfinx.parallel.exchange import Exchange
 from mpm_dolfinx.points.grid import Grid
 
 
@@ -20,6 +21,7 @@ def check_held(
     free: NDArray[np.bool_],
     holds: Sequence[tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.float64]]],
     each: bool,
+    meeting: tuple[NDArray[np.int32], NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]] | None = None,
 ) -> None:
     """Refuse a scene of which a part can move as a rigid body.
 
@@ -33,6 +35,9 @@ def check_held(
         Cells (m,), positions (m, d) and directions (m, d) in which sides have given displacements, or touch tools.
     each
         Look at each part that hangs together, not only at all of them.
+    meeting
+        Cells (m,), lexicographic ones of the other part (m,), positions (m, d) and directions (m, d) in which parts
+        touch: what is held holds the other one.
 
     Raises
     ------
@@ -49,21 +54,37 @@ def check_held(
     for cell, place, along in holds:
         number = np.concatenate([number, part[cell]])
         x, direction = np.concatenate([x, place]), np.concatenate([direction, along])
+    against = np.zeros(len(number), dtype=np.int64)
+    if meeting is not None:
+        cell, other, place, along = meeting
+        travel = Exchange(grid.comm, grid.owner(other))
+        both = part[cell], travel.back(part[grid.local(travel.send(other))])
+        number, against = (np.concatenate([a, *b]) for a, b in ((number, both), (against, both[::-1])))
+        x, direction = np.concatenate([x, place, place]), np.concatenate([direction, along, along])
     x = (x - centre[number - 1]) / size[number - 1, None]  # else a small part far from the origin would not turn
     modes = list(direction.T)
     modes += [direction[:, a] * x[:, b] - direction[:, b] * x[:, a] for a in range(grid.dim) for b in range(a)]
     if grid.axisymmetric:  # rings move rigidly along the axis only
         modes = [direction[:, 1]]
     R = np.stack(modes, axis=1)
-    grams = grid.comm.allreduce(np.stack([R[number == k].T @ R[number == k] for k in range(1, count + 1)]))
-    for k, gram in enumerate(grams, start=1):
-        missing = len(modes) - np.linalg.matrix_rank(gram, tol=1e-12 * max(1.0, np.abs(gram).max()))
-        if missing:
+    held, missing = np.append(True, np.zeros(count, dtype=bool)), np.full(count, len(modes))  # the ground holds
+    while True:
+        on = held[against]
+        grams = [R[on & (number == k)].T @ R[on & (number == k)] for k in range(1, count + 1)]
+        grams, before = grid.comm.allreduce(np.stack(grams)), missing
+        ranks = [np.linalg.matrix_rank(gram, tol=1e-12 * max(1.0, np.abs(gram).max())) for gram in grams]
+        missing = len(modes) - np.array(ranks)
+        held[1:] = missing == 0
+        if (missing == before).all():
+            break
+    for k in range(1, count + 1):
+        if missing[k - 1]:
             places = [p for p in grid.comm.allgather(grid.midpoints[active & (part == k)][:1].tolist()) if p]
             where = f"the part at [{' '.join(f'{x:.9g}' for x in places[0][0])}]" if count > 1 else "the body"
             raise ValueError(
-                f"fixed walls: {where} is free to move as a rigid body in {missing} of {len(modes)} ways; "
-                "it must touch walls whose fixed components hold it, have given displacements, or touch tools"
+                f"fixed walls: {where} is free to move as a rigid body in {missing[k - 1]} of {len(modes)} ways; "
+                "it must touch walls whose fixed components hold it, have given displacements, or touch tools, or "
+                "other groups that are held"
             )
 
 
@@ -78,12 +99,14 @@ def _extents(grid: Grid, part: NDArray[np.int64], count: int) -> tuple[NDArray[n
 
 def _parts(grid: Grid, active: NDArray[np.bool_]) -> tuple[NDArray[np.int64], int]:
     """Return the part (cells,), from 1, that each active cell belongs to, by common nodes, and how many there are."""
-    index = grid.index(grid.midpoints[active])
+    index = np.column_stack([grid.cell_number[active] // grid.cells, grid.index(grid.midpoints[active])])
     everywhere = np.concatenate(grid.comm.allgather(index))
     lowest = everywhere.min(axis=0)
     filled = np.zeros(everywhere.max(axis=0) - lowest + 1, dtype=bool)
     filled[tuple((everywhere - lowest).T)] = True
-    labels, count = label(filled, structure=np.ones((3,) * grid.dim))
+    together = np.zeros((3,) * (grid.dim + 1))
+    together[1] = 1  # copies of the grid have no node in common
+    labels, count = label(filled, structure=together)
     out = np.zeros(len(active), dtype=np.int64)
     out[active] = labels[tuple((index - lowest).T)]
     return out, count

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointForm
 from mpm_dolfinx.forms.unknowns import sum_ghosts
 from mpm_dolfinx.points.grid import Grid
+from mpm_dolfinx.problems.body_contact import BodyContact
 from mpm_dolfinx.problems.conditions import OnSide
 from mpm_dolfinx.problems.held_cells import HeldCells
 from mpm_dolfinx.problems.tool_contact import ToolContact
@@ -30,7 +31,7 @@ class SideData:
     loads: with their force; pressures: with their force on the area at the start of the step; plates: with their
     rigidity, normal and present tilt; holds: components of given displacements, with stiffness, direction and gap;
     held: what holds them; row: which of it each component is; tools: contact with them; own: of each term of the
-    user's own.
+    user's own; contact: of groups of bodies.
     """
 
     loads: PointData | None
@@ -41,6 +42,7 @@ class SideData:
     row: NDArray[np.int64]
     tools: ToolContact | None = None
     own: tuple[PointData, ...] = ()
+    contact: BodyContact | None = None
 
 
 def functions_of(terms):

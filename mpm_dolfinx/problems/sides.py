@@ -44,6 +44,10 @@ class Sides:
             where = " in the region" if condition.region is not None else ""
             where += " off the axis" if self.grid.has_axis else ""
             raise ValueError(f"{line(condition)}: no point has this side{where}, must be one of a body")
+        copies = np.unique(self.grid.copy(self._found[key].id))
+        if len(copies) > 1:
+            what = f"{line(condition)}: {len(copies)} groups of bodies have this side"
+            raise ValueError(f"{what}, must be one; limit it to one by a region, and give one for each")
         return self._found[key]
 
     def all(self) -> Surface:

@@ -80,7 +80,8 @@ def stage(
     wet
         Whether there is a fluid.
     conditions
-        fixed, tractions, displacements, drained, inflows, plates, tools, gravity: see `Simulation`; terms: on sides.
+        fixed, tractions, displacements, drained, inflows, plates, tools, contacts, gravity: see `Simulation`; terms: on
+        sides.
     present, later
         Which bodies are there, and which may still come.
 
@@ -101,7 +102,7 @@ def stage(
     conditions = {**conditions, "fixed": with_axis(grid, conditions["fixed"])}
     free, sides = ~_fixed(grid, conditions["fixed"]), Sides(grid, bodies, present)
     acting = (conditions[name] for name in ("tractions", "displacements", "plates", "tools", "terms"))
-    mechanical = MechanicalBoundary(sides, free, materials, *acting)
+    mechanical = MechanicalBoundary(sides, free, materials, *acting, conditions["contacts"])
     hydraulic = HydraulicBoundary(sides, [*conditions["drained"], *conditions["inflows"]])
     given = [(faces, axes) for _, faces, axes in mechanical.holds]
     given += [(faces, range(grid.dim)) for _, faces in mechanical.plates]

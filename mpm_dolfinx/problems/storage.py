@@ -22,7 +22,8 @@ Jumps of the step's increment are damped by max(0, tau d - dt kappa / d) A [p - 
 the step in which the rate at p counts, so that a
 face carries at least tau d A: nothing is added where the flow suffices, nothing is left in a steady
 state, and no fluid is lost.  tau is a quarter of Silvester and Kechkar's patch value (Camargo, White
-and Borja 2021).
+and Borja 2021) for elastic soil.  What soil that flows needs more, up to a hundredfold, damps second differences
+only (`second_differences`): on jumps it would smear pressures that are steep.
 """
 
 from __future__ import annotations
@@ -49,6 +50,7 @@ from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.grid import sum_by
 from mpm_dolfinx.problems.aslant import AslantFlow, Gradients
 from mpm_dolfinx.problems.fluxes import CellContents, Conduction, FluxForms, OpenSides
+from mpm_dolfinx.problems.second_differences import second_differences
 from mpm_dolfinx.validation import line
 
 FILTER = 0.75
@@ -74,6 +76,8 @@ class StorageForms:
         order of (p - p_n) / K_w, so Newton's method converges as fast.
     flows
         Whether anything conducts; without, there are no fluxes.
+    softens
+        Whether soil may be softer than elastic.
     conductivity
         Laws of the conductivity, None where no material has one.
     sources
@@ -90,6 +94,7 @@ class StorageForms:
         weight: ufl.core.expr.Expr | None,
         symmetric: bool,
         flows: bool,
+        softens: bool,
         conductivity: ConductivityAtPieces | None,
         sources: Sequence[Callable],
         t: fem.Constant,
@@ -110,7 +115,7 @@ class StorageForms:
         self._capacity = PointForm(ufl.derivative(change, pressure, one), pieces)
         self.coupling = ElementForces(ufl.diff(strain if symmetric else stored, delta), pieces)
         self.momentum_coupling = self.coupling if symmetric else ElementForces(ufl.diff(strain, delta), pieces)
-        self.symmetric = symmetric
+        self.symmetric, self.softens = symmetric, softens
         self.fluxes = FluxForms(pieces.grid, weight, flows)
         self.sources, self._slopes = [], []
         for source in sources:
@@ -251,7 +256,12 @@ class StorageSystem:
         self._flux, self.damp, self._alternation, self._gravity = (f and f.on(facets) for f in kinds)
         self.set_alternation()
         _add_diagonal(self.L, np.zeros(own.size))  # of a cell without faces
-        self.C, self.P = self.L.duplicate(), self.L.duplicate()
+        pattern = self.L
+        if forms.softens:
+            grid, zeros = forms.grid, np.zeros((forms.grid.num_local, d, 2))
+            pattern = second_differences(own, grid, zeros[: own.size, :, 0], zeros[:, :, 0], zeros)
+            pattern.axpy(1.0, self.L, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
+        self.C, self.P = pattern.duplicate(), pattern.duplicate()
 
     def set_alternation(self) -> None:
         """Assemble the filter L of `StorageProblem.assemble_preconditioner`."""
@@ -312,7 +322,7 @@ class StorageProblem:
     before
         What the cells lose by the rate of the substep before.
     softness : (m,)
-        By how much the pieces are softer than elastic ones.
+        By how much the pieces are softer than elastic ones, where the forms' soil may be.
     passed
         Share of the step that has passed at the end of the substep: of what the volumes have gained.
 
@@ -338,10 +348,13 @@ class StorageProblem:
         outflow = flow(before is None)
         system.unknowns.gather(forms.p_n.x.array, system.p_start)
         reach = 4 * forms.grid.h.max() ** 2  # no two centroids are further apart than 2 h
-        needed = contents.set_damping(softness) * reach > dt * outflow.mobility.min(axis=1)
-        somewhere = over_all(forms.grid.comm, np.array([needed.any(), outflow.faces.seeps.any()], dtype=float)) > 0
-        self.damped, self._seeps = somewhere.tolist()
+        tau, least = contents.set_damping(), dt * outflow.mobility.min(axis=1)
+        softest = contents.softest(softness) if forms.softens else np.ones(1)
+        known = [(tau * reach > least).any(), (softest * tau * reach > least).any() and softest.max() > 1]
+        somewhere = over_all(forms.grid.comm, np.array([*known, outflow.faces.seeps.any()], dtype=float)) > 0
+        self.damped, flows, self._seeps = somewhere.tolist()
         """Whether jumps of the pressure are damped somewhere."""
+        self._softer = self._damping_of_soft_soil(tau, softest, outflow.mobility) if flows else None
         self._flowing = outflow.faces.outflow(self._pressures) >= 0
         self._aslant = self._aslant_now(outflow)
         if self.damped:
@@ -349,6 +362,16 @@ class StorageProblem:
             zero(system.D)
             system.damp.assemble_matrix(system.D)
             system.D.assemble()
+
+    def _damping_of_soft_soil(
+        self, tau: NDArray[np.float64], softest: NDArray[np.float64], mobility: NDArray[np.float64]
+    ) -> PETSc.Mat:
+        """Return what the cells' softness (n,) adds to the damping tau (n,), 1/Pa, beside the flow."""
+        contents, grid = self._contents, self.forms.grid
+        flow = self.dt * mobility / grid.h**2
+        more = np.maximum((softest * tau)[:, None] - flow, 0) - np.maximum(tau[:, None] - flow, 0)
+        strength = grid.cell_volume * more
+        return second_differences(self.system.unknowns, grid, strength, contents.centroid, contents.open)
 
     @property
     def _pressures(self) -> NDArray[np.float64]:
@@ -419,6 +442,8 @@ class StorageProblem:
         r, p = system.unknowns.gather(b, system.residual), system.unknowns.gather(forms.p.x.array, system.p)
         if self.damped:
             system.D.multAdd(p - system.p_start, r, r)
+        if self._softer is not None:
+            self._softer.multAdd(p - system.p_start, r, r)
         rates = self._rates(outflow, p)
         now = rates.taken(self.dt)
         r.array_w[:] += now.cells + before.cells
@@ -460,6 +485,8 @@ class StorageProblem:
         system.C.axpy(self.dt, system.T, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
         if self.damped:
             system.C.axpy(1.0, system.D, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
+        if self._softer is not None:
+            system.C.axpy(1.0, self._softer, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
         owned = system.unknowns.owned
         _add_diagonal(system.C, forms.capacity(data)[owned])
         if self._seeps:

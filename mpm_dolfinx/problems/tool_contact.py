@@ -376,10 +376,6 @@ class Tools:
         """Whether the tangent is symmetric."""
         return not any(tool.grips for tool in self.tools)
 
-    def forces(self, value: float) -> NDArray[np.float64]:
-        """Return an array of forces and moments of the tools, see `ToolContact.forces`, all of one value."""
-        return np.full((len(self.tools), 3 if self.grid.dim == 2 else 6), value)
-
     def _kept(self, n: int) -> dict[str, NDArray[np.float64]]:
         """Return what n points keep of the tools, zero."""
         out = {pressure_name(i): np.zeros(n) for i in range(len(self.tools))}

@@ -15,10 +15,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import ConvexHull, QhullError
 
+from mpm_dolfinx.points.grid import Grid
 from mpm_dolfinx.problems.conditions import given
 from mpm_dolfinx.validation import asked, line, numbers
 
 LEAST = 1e-300  # in place of a distance from a centre, m
+ROUNDED = 1e-9  # cells: what is no deeper in a tool is on its surface
+ONTO = 5  # times that a place is put onto the surface
 DISTANCE = 0.1
 """Relative error of the slope of a user's distance from which on it is none."""
 
@@ -364,3 +367,18 @@ class Tool:
         if angle:
             R = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
         return Pose(R, self._centre(dim), np.broadcast_to(shift, (dim,)))
+
+    def drawn(self, grid: Grid, t: float) -> NDArray[np.float64]:
+        """Return the corners (m, 2^d, d), m, of the grid's cells that the tool fills at time t (s): for pictures.
+
+        Corners beyond its surface are put onto it; so its edges are blunt by a part of a cell.
+        """
+        pose, solid, nodes = self.pose(t, grid.dim), self.solid(grid.h.min()), tuple(grid.shape + 1)
+        y = pose.own(grid.lower + np.stack(np.unravel_index(np.arange(np.prod(nodes)), nodes), axis=1) * grid.h)
+        inside = solid.distance(y) < -ROUNDED * grid.h.min()
+        cells = grid.corners(np.arange(np.prod(grid.shape)))
+        used, at = np.unique(cells[inside[cells].any(axis=1)], return_inverse=True)
+        y = y[used]
+        for _ in range(ONTO):  # where planes meet, onto one after the other
+            y = y - np.maximum(solid.distance(y), 0)[:, None] * solid.normal(y)
+        return pose.put(y)[at.reshape(-1, cells.shape[1])]

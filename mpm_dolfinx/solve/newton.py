@@ -35,7 +35,7 @@ from mpm_dolfinx.problems.storage import Rates, StorageProblem, StorageResidual
 from mpm_dolfinx.result import Report
 from mpm_dolfinx.solve.linear import negative_pivots
 from mpm_dolfinx.solve.schur import LinearSolvers
-from mpm_dolfinx.solve.watchdog import EXPLODES, LARGEST, SHORTEST_DESCENT, Watchdog, firmness, shortened
+from mpm_dolfinx.solve.watchdog import EXPLODES, LARGEST, SHORTEST_DESCENT, Search, Watchdog, firmness, shortened
 
 KEEP = 0.05  # the tangent is kept while a Newton step reduces the residual to less than this
 FORCING, FINEST = 1e-3, 1e-9  # relative accuracy of the linear solve, and the best that is asked for
@@ -185,15 +185,12 @@ class Newton:
         """
         errors, other = self._begin()
         fresh, watched = self._linear or not serves, not self._momentum.forms.elastic
-        again = [(other, True)] if other is not None else []
-        if watched:
-            again.append((other or self._iterate(), False))
-        for start, watches in again:
+        if other is not None:
             try:
                 return self._iterations(errors, as_reset, key, fresh, watched)
             except NotConverged:
-                self._go_to(start)
-                errors, fresh, watched = self._errors(errors.start), True, watches
+                self._go_to(other)
+                errors, fresh = self._errors(errors.start), True
         return self._iterations(errors, as_reset, key, fresh, watched)
 
     def _iterations(
@@ -202,7 +199,8 @@ class Newton:
         """Iterate from the present (u, p), of these errors; fresh: with its own tangent; watched: by a watchdog."""
         dog, count = Watchdog(errors.worst, self._iterate()) if watched else None, 0
         while (errors := self._augmented(errors)).worst > self._scheme.tolerance:
-            self._check(count, "newton")
+            if fresh or not watched:  # what yields and has begun to converge may go on
+                self._check(count, "newton")
             if fresh and self._linear and not self.report.newton:
                 self._solvers.tangent(key, lambda: self._linearise_as_reset(as_reset))
             elif fresh:
@@ -374,9 +372,12 @@ class Newton:
     def _line_search(self, before: Errors, dog: Watchdog | None = None) -> Errors:
         """Go against the direction, backtracking while the residual is not finite or explodes, or as a watchdog says.
 
-        Where soil yields and no residual is as low as that wants, the lowest is taken.
+        Where a watchdog lets the iterations stray, see `_balance_work`.  Where it wants them to descend and no residual
+        is as low, the lowest is taken.
         """
         self.report.newton += 1
+        if dog is not None and not dog.descends:
+            return self._balance_work(before)
         step, moved, tried = 1.0, 0.0, {}
         explodes = min(EXPLODES * before.worst, LARGEST)
         limit, shortest = (explodes, SHORTEST) if dog is None else (dog.limit(before.worst), SHORTEST_DESCENT)
@@ -392,10 +393,29 @@ class Newton:
         self._move(moved - tried[min(tried)])
         return self._errors(before.start)
 
+    def _balance_work(self, before: Errors) -> Errors:
+        """Go against the direction to where the residual falls, or the work that the forces do along it.
+
+        See `watchdog`, to which it is left where no try does so.
+        """
+        force, first = self._momentum.system.residual, self._momentum.system.residual.dot(self._solvers.du)
+        search, moved = Search(), 0.0
+        while search is not None:
+            self._move(moved - search.step)
+            moved, errors = search.step, self._errors(before.start)
+            falls = errors.worst <= before.worst
+            search = None if falls else search.after(_ratio(force.dot(self._solvers.du), first))
+        return errors
+
     def _move(self, scale: float) -> None:
         self._momentum.system.unknowns.add(self._momentum.forms.u, scale, self._solvers.du)
         if self._storage is not None:
             self._storage.system.unknowns.add(self._storage.forms.p, scale, self._solvers.dp)
+
+
+def _ratio(part: float, whole: float) -> float:
+    """Return part / whole, nan where that is not finite."""
+    return part / whole if whole and np.isfinite(part) else np.nan
 
 
 def _relative(norm: float, scale: float, round_off: float = 0.0) -> float:

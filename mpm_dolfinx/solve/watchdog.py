@@ -2,9 +2,12 @@
 """How far Newton's iterations may stray before they are called back.
 
 The residual of a body that bends grows in good steps, for rotations stretch at first order.  Where soil yields it grows
-too, mostly for the better, but iterations may also circle or run away.  Full steps are taken until the least residual
-so far has stood for some of them; then the iterations go back to it and descend from there until they are below it
+too, mostly for the better, but iterations may also circle or run away.  Steps may raise it until the least residual so
+far has stood for some of them; then the iterations go back to it and descend from there until they are below it
 (watchdog technique: Chamberlain, Powell, Lemarechal and Pedersen 1982).
+
+A step that raises the residual is full only if the forces do less work along it at its end than half of that at its
+start; else it goes about as far as where they do none (Matthies and Strang 1979).
 
 Soil that flows has next to no stiffness along its mechanisms, where flow is not associated even less than none: full
 steps go far astray there.  A share of the elastic shear stiffness in the tangent, as the residual is large, holds them
@@ -24,9 +27,11 @@ from numpy.typing import NDArray
 EXPLODES = 1e4
 """Growth of the residual from which on a step is shortened: that of a bending body may grow as much in a good one."""
 PATIENCE = 3
-"""Full steps that may pass without a residual below the least so far."""
+"""Steps that may pass without a residual below the least so far."""
 SHORTEST_DESCENT = 0.1
 """Share of a step below which a descent does not shorten it."""
+WORK, STEEPER, TRIES = 0.5, 2.0, 4
+"""Work along a step, over that at its start, that it may end with, and that tells that it is too long; most tries."""
 LARGEST = sys.float_info.max
 FIRM, FIRMEST = 0.1, 0.1
 """Share of the elastic shear stiffness over the residual that is added to a tangent where soil yields, and its most."""
@@ -36,7 +41,7 @@ FIRM, FIRMEST = 0.1, 0.1
 class Watchdog:
     """Watches the iterations where soil yields.
 
-    least: least residual so far; where: (u, p) there; since: full steps since; descends: whether they were called back.
+    least: least residual so far; where: (u, p) there; since: steps since; descends: whether they were called back.
     """
 
     least: float
@@ -73,3 +78,31 @@ def shortened(growth: float, step: float) -> float:
     if not growth < LARGEST:
         return 0.5
     return min(0.5, max(0.1, step / (growth**2 - 1 + 2 * step)))
+
+
+@dataclass(frozen=True)
+class Search:
+    """Search for a step along which the forces do next to no work at its end.
+
+    step: the one to try; low, high: too short and too long ones, each with the work at its end over that at its start;
+    tries: how many there have been.
+    """
+
+    step: float = 1.0
+    low: tuple[float, float] = (0.0, 1.0)
+    high: tuple[float, float] | None = None
+    tries: int = 1
+
+    def after(self, work: float) -> Search | None:
+        """Return the next step to try after one that ends with such a work, nan if that is not finite; None: none."""
+        if abs(work) <= WORK or self.tries == TRIES:
+            return None
+        low, high = self.low, self.high
+        if WORK < work <= STEEPER:
+            low = self.step, work
+        else:
+            high = self.step, work
+        if high is None:
+            return None
+        share = low[1] / (low[1] - high[1]) if high[1] < 0 else 0.2
+        return Search(low[0] + min(0.9, max(0.1, share)) * (high[0] - low[0]), low, high, self.tries + 1)

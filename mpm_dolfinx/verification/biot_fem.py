@@ -192,13 +192,20 @@ class BiotFEM:
         return fem.Constant(self.grid.mesh, np.asarray(value, dtype=float))
 
     def _field(self, value: Field) -> fem.Constant | fem.Function:
-        """Return a parameter as UFL, one that is a function of place as its quadratic interpolant in the cells."""
+        """Return a parameter as UFL, one that is a function of place as its quadratic interpolant in the cells.
+
+        Its nodes are taken a little inside of their cells, so that it may jump from one to the next.
+        """
         if not callable(value):
             return self._constant(value)
-        d = self.grid.dim
-        shape = np.shape(value(self.grid.midpoints[:1]))[1:]
-        f = fem.Function(_compat.function_space(self.grid.mesh, "DG", 2, shape))
-        f.interpolate(lambda x: np.asarray(value(x[:d].T), dtype=float).T)
+        d, msh = self.grid.dim, self.grid.mesh
+        at, middle, centre = (fem.Function(_compat.function_space(msh, "DG", k, (d,))) for k in (2, 2, 0))
+        for f in (at, centre):
+            f.interpolate(lambda x: x[:d])
+        middle.interpolate(centre)
+        rows = np.asarray(value((middle.x.array + (1 - 1e-9) * (at.x.array - middle.x.array)).reshape(-1, d)), float)
+        f = fem.Function(_compat.function_space(msh, "DG", 2, rows.shape[1:]))
+        f.x.array[:] = rows.ravel()
         return f
 
     def _box(self, name: str, region: Region | None = None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -476,7 +483,8 @@ class BiotFEM:
         if len(out):
             raise ValueError(f"probe at {x[out[0]]}: outside the body, must be in it or on its surface")
         result, began = Result(rows=[self._row(x)]), time.perf_counter()
-        for _ in tqdm(range(steps), disable=not progress or self.grid.comm.rank > 0 or None, unit="step"):
+        shown = {"disable": not progress or self.grid.comm.rank > 0 or None, "unit": "step", "desc": "finite elements"}
+        for _ in tqdm(range(steps), **shown):
             try:
                 newton, residual = self.step(dt)
             except NotConverged as failed:

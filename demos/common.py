@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: MIT
+"""What the demos share besides their physics: options, first and last lines, tables and pictures."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import re
+import sys
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from mpi4py import MPI
+
+import numpy as np
+
+import mpm_dolfinx as mpm
+
+GALLERY = Path(__file__).with_name("README.md")
+
+
+class Parser(argparse.ArgumentParser):
+    """The options of a demo: those that it adds, --json and, of one that writes files, --out."""
+
+    class Formatter(argparse.ArgumentDefaultsHelpFormatter, argparse.RawDescriptionHelpFormatter):
+        """The description as it is written, defaults behind the options."""
+
+    def __init__(self, description: str, file: str, writes: bool = True):
+        super().__init__(description=description, formatter_class=self.Formatter)
+        self.demo = Path(file).stem
+        if writes:
+            self.add_argument("--out", type=Path, default=Path("out") / self.demo, help="folder for pictures, tables")
+        self.add_argument("--json", action="store_true", help="print the results as one line of JSON at the end")
+
+    def parse_args(self, args: Sequence[str] | None = None, namespace=None) -> argparse.Namespace:
+        """Return the options, and in `takes` how long they take (s or min) if the gallery tells."""
+        args = sys.argv[1:] if args is None else list(args)
+        o = super().parse_args(args, namespace)
+        given = re.sub(r"--(json|out[ =]\S+)", "", " ".join(args)).split()
+        row = rf"^\| \[`{self.demo}`\].*?\| (\d+ (?:s|min))(?: <!-- \w+([^;]*);)? "
+        row = re.search(row, GALLERY.read_text(), re.M)
+        o.takes = row[1] if row and (row[2] or "").split() == given else None
+        return o
+
+
+@contextmanager
+def results(o: argparse.Namespace) -> Iterator[dict]:
+    """Yield the results of a run for the demo to fill; print before how long it takes, and them after it (--json).
+
+    A run that gives up (`mpm.GaveUp`) ends with a line; `converged` is False then, and what was found is kept.
+    """
+    out, start = {}, time.perf_counter()
+    if first() and o.takes:
+        print(f"It takes about {o.takes}, and longer the first time, when its forms are compiled.", flush=True)
+    try:
+        yield out
+        out.setdefault("converged", True)
+        if first() and not out["converged"]:
+            print("error: not within the bounds that the demo keeps with its usual options", file=sys.stderr)
+    except mpm.GaveUp as error:
+        out |= {"wall_s": error.result.wall, "converged": False}
+        if first():
+            print(f"error: {error}", file=sys.stderr)
+    if first():
+        written = f"; pictures and tables: {o.out}/" if "out" in o and o.out.exists() else ""
+        print(f"{time.perf_counter() - start:.1f} s in all{written}")
+        if o.json:
+            print(json.dumps(out))
+
+
+def first() -> bool:
+    """Is this the process that prints and draws?"""
+    return MPI.COMM_WORLD.rank == 0
+
+
+def table(rows: Iterable[Iterable[str]]) -> None:
+    """Print rows of text, the head first, in columns as wide as their entries: the first to the left."""
+    rows = [list(row) for row in rows]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for name, *entries in rows:
+        line = [name.ljust(widths[0]), *(x.rjust(w) for x, w in zip(entries, widths[1:], strict=True))]
+        print("  ".join(line).rstrip(), flush=True)
+
+
+def markdown(rows: Iterable[Iterable[str]]) -> str:
+    """Return rows of text, the head first, as a Markdown table."""
+    head, *body = ("| " + " | ".join(row) + " |" for row in rows)
+    return "\n".join([head, "|" + "---|" * (head.count(" | ") + 1), *body])
+
+
+def write_csv(path: Path, head: Iterable[str], rows: Iterable[Iterable]) -> None:
+    """Write a table as CSV."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", newline="") as file:
+        csv.writer(file).writerows([head, *rows])
+
+
+def figure(rows: int, columns: int, size: tuple[float, float]):
+    """Return (figure, axes), size in inches, of matplotlib without a display."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    return plt.subplots(rows, columns, figsize=size, layout="constrained", squeeze=False)
+
+
+def save(fig, path: Path, dpi: int = 130) -> None:
+    """Write a figure as a picture."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    fig.savefig(path, dpi=dpi)
+
+
+def domains(ax, corners: np.ndarray, values: np.ndarray | None = None, **style):
+    """Draw the domains of points by their corners (np, 4, 2), coloured by values (np,); return the collection."""
+    from matplotlib.collections import PolyCollection
+
+    style = {"edgecolors": "face", "linewidth": 0.2} | style
+    drawn = PolyCollection(corners[:, [0, 1, 3, 2]], array=values, **style)
+    return ax.add_collection(drawn)

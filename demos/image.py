@@ -1,0 +1,189 @@
+# SPDX-License-Identifier: MIT
+"""A tissue as a picture shows it: grey values are stiffness, black are holes; compressed by a plate, and drained.
+
+The picture is made here, by smoothed noise; one from a scanner, as an array, does as well.  Each pixel is a cell of
+the grid.  `mpm.shape` keeps what is not black, and the law's constants are functions of place that look the grey value
+up: from black to white tissue becomes ten times as stiff and less permeable.  A rigid plate that lets water through
+presses it between smooth walls by an eighth of its height; its holes are sealed.  On one process.
+
+Checks: `modulus`, stress over strain of the drained tissue under a small load, over that of Taylor-Hood elements of
+which each pixel is one (holes are elements of a millionth of the stiffness), less 1; and `drained`, the settlement of
+the wet tissue in the end over that of dry tissue, less 1.  Both fall with the pixels' size.
+"""
+
+from __future__ import annotations
+
+from argparse import Namespace
+from dataclasses import dataclass, field
+
+import common
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter, label
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.verification.biot_fem import BiotFEM
+
+EDGE, HOLES, CONTRAST, POROSITY = 1e-3, 0.12, 10.0, 0.8  # m; share of holes; of white over black tissue; -
+BULK, SHEAR, CONDUCTIVITY = 2e4, 1.5e4, 1e-9  # Pa, Pa, m/s: those of black tissue
+LOAD, RAMP, SMALL = 1.2e4, 1.0, 1.0  # Pa; s in which it comes; Pa, of the modulus
+WALLS = {"left": "x", "right": "x", "bottom": "y"}
+TOP = ((0.0, 0.999 * EDGE), (EDGE, EDGE))  # region of the upper edge: holes have sides that look up, too
+
+
+def picture(pixels: int, seed: int = 9) -> NDArray[np.float64]:
+    """Return grey values (x, y), 0 to 1; what does not hang together with the largest part is a hole."""
+    noise = np.random.default_rng(seed).standard_normal((pixels, pixels))
+    smooth = gaussian_filter(noise, pixels / 16, mode="reflect")
+    smooth += 3 * smooth.std() * np.exp(-np.arange(pixels)[::-1] / (0.06 * pixels))  # a skin, for the plate
+    grey = smooth.ravel().argsort().argsort().reshape(smooth.shape) / (smooth.size - 1)
+    parts, _ = label(grey >= HOLES)
+    return np.where(parts == np.bincount(parts[parts > 0]).argmax(), grey, 0.0)
+
+
+@dataclass(frozen=True)
+class Tissue:
+    """Tissue of grey values (x, y); those below HOLES are holes."""
+
+    grey: NDArray[np.float64]
+
+    def at(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the grey values at positions (n, 2), m."""
+        return self.grey[tuple(np.floor(x / EDGE * len(self.grey)).astype(int).clip(0, len(self.grey) - 1).T)]
+
+    def inside(self, x: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return whether positions (n, 2), m, are in the tissue."""
+        return (x[:, 1] < EDGE) & (self.at(x) >= HOLES)
+
+    def law(self, holes: float = 1.0) -> mpm.Hencky:
+        """Return the law; `holes` is the stiffness of holes, over black tissue's."""
+
+        def scaled(value: float, power: int) -> mpm.Field:
+            return lambda X: value * np.where(self.at(X) < HOLES, holes**power, CONTRAST ** (power * self.at(X)))
+
+        constants = {"bulk": scaled(BULK, 1), "shear": scaled(SHEAR, 1), "conductivity": scaled(CONDUCTIVITY, -1)}
+        return mpm.Hencky(**constants, porosity=POROSITY)
+
+    def scene(self, load: float, wet: bool) -> tuple[mpm.Simulation, mpm.Probes]:
+        """Return the tissue under a load, Pa, and a probe on its top."""
+        n = len(self.grey)
+        grid = mpm.Grid([EDGE, EDGE * (n + 2) / n], [n, n + 2])
+        body = mpm.shape(grid, self.inside)
+        simulation = mpm.Simulation(
+            grid,
+            [body],
+            [self.law()],
+            fluid=mpm.Fluid() if wet else None,
+            fixed=WALLS,
+            plates=[mpm.RigidPlate("top", lambda t: load * EDGE * min(1, t / RAMP), TOP)],
+            drained=[mpm.Drained("top", region=TOP)] if wet else [],
+        )
+        highest = body.centre[body.centre[:, 1] > EDGE - grid.h[1]]
+        return simulation, mpm.probes([body], [[highest[0, 0], EDGE]])
+
+
+@dataclass
+class Outcome:
+    """What is seen: times, s, settlements over EDGE, and highest pressures, Pa.
+
+    frames: time, corners, pressures and grey values of the points; drained: settlement of dry tissue over EDGE.
+    """
+
+    t: list[float] = field(default_factory=list)
+    settlement: list[float] = field(default_factory=list)
+    pressure: list[float] = field(default_factory=list)
+    frames: list[tuple[float, NDArray, NDArray, NDArray]] = field(default_factory=list)
+    drained: float = 0.0
+    wall: float = 0.0
+    steps: int = 0
+
+
+def modulus(tissue: Tissue) -> tuple[float, float, float]:
+    """Return stress over strain under a small load, Pa, of material points and elements, and at even strain (Voigt)."""
+    simulation, top = tissue.scene(SMALL, wet=False)
+    points = simulation.run(RAMP, RAMP, probes=top, progress=False).displacement[-1][0, 1]
+    n = len(tissue.grey)
+    plate = mpm.RigidPlate("top", SMALL * EDGE)
+    elements = BiotFEM([0, 0], [EDGE, EDGE], [n, n], tissue.law(1e-6), fixed=WALLS, plates=[plate])
+    elements.step(1.0)
+    moved = elements.displacement(np.array([[EDGE / 2, EDGE]]))[0, 1]
+    factor = np.where(tissue.grey < HOLES, 0.0, CONTRAST**tissue.grey).mean()
+    return -SMALL * EDGE / points, -SMALL * EDGE / moved, float(factor * (BULK + 4 / 3 * SHEAR))
+
+
+def run(tissue: Tissue, rtol: float) -> Outcome:
+    """Press the tissue and let it drain, in steps by their error; then as dry."""
+    out, (simulation, top) = Outcome(), tissue.scene(LOAD, wet=True)
+    slow = EDGE**2 * mpm.Fluid().unit_weight / (CONDUCTIVITY * BULK)  # s: of the order of consolidation
+    times = np.append(RAMP * np.linspace(0.25, 1, 4), RAMP + slow * np.logspace(-3, 0.5, 15))
+
+    def observe(s: mpm.Simulation) -> None:
+        p = s.points.pressure
+        out.t.append(s.t)
+        out.settlement.append(-s.result.displacement[-1][0, 1] / EDGE)
+        out.pressure.append(float(p.max()))
+        if s.t in (times[3], times[-1]):
+            out.frames.append((s.t, s.points.corners.copy(), p, tissue.at(s.points.origin.mean(axis=1))))
+
+    result = simulation.run(times[-1], rtol=rtol, t_eval=times, probes=top, observe=observe)
+    dry, top = tissue.scene(LOAD, wet=False)
+    last = dry.run(RAMP, RAMP / 10, probes=top, progress=False)
+    out.drained = float(-last.displacement[-1][0, 1] / EDGE)
+    out.wall, out.steps = result.wall + last.wall, result.steps
+    return out
+
+
+def main(argv: list[str] | None = None) -> dict:
+    """Run the demo; return what --json prints."""
+    parser = common.Parser(__doc__, __file__)
+    parser.add_argument("--pixels", type=int, default=48, help="over the edge of the picture")
+    parser.add_argument("--seed", type=int, default=9, help="of the picture")
+    parser.add_argument("--rtol", type=float, default=1e-2, help="error of the steps")
+    o = parser.parse_args(argv)
+    if not 8 <= o.pixels <= 200:
+        parser.error(f"--pixels {o.pixels}: must be 8 to 200")
+    with common.results(o) as out:
+        tissue = Tissue(picture(o.pixels, o.seed))
+        points, elements, voigt = modulus(tissue)
+        moduli = {"material points": points, "finite elements": elements, "even strain (Voigt)": voigt}
+        common.table([["drained modulus", "kPa"], *([name, f"{value / 1e3:.2f}"] for name, value in moduli.items())])
+        seen = run(tissue, o.rtol)
+        final = seen.settlement[-1]
+        print(f"settlement over height: {seen.settlement[3]:.4f} loaded, {final:.4f} drained, {seen.drained:.4f} dry")
+        draw(o, tissue, seen)
+        print(f"{seen.steps} steps, {seen.wall:.1f} s")
+        out["errors"] = {"modulus": float(points / elements - 1), "drained": float(final / seen.drained - 1)}
+        if (o.pixels, o.seed, o.rtol) == (48, 9, 1e-2):
+            out["converged"] = bool(max(map(abs, out["errors"].values())) < 0.02)
+        out |= {"over_voigt": points / voigt, "settlement": final, "wall_s": seen.wall}
+    return out
+
+
+def draw(o: Namespace, tissue: Tissue, out: Outcome) -> None:
+    """Draw the picture, the pressure when the load has come, the tissue in the end, and both over time."""
+    fig, (axes,) = common.figure(1, 4, (16, 4))
+    mm, (loaded, last) = 1e3 * EDGE, out.frames
+    grey = np.where(tissue.grey < HOLES, np.nan, tissue.grey)
+    axes[0].imshow(grey.T, origin="lower", extent=(0, mm, 0, mm), cmap="cividis", clim=(0, 1))
+    shown = ((1, loaded, 2, 1e-3, "viridis", "pore pressure (kPa)"), (2, last, 3, 1.0, "cividis", "grey value (-)"))
+    for k, frame, values, scale, colours, name in shown:
+        domains = common.domains(axes[k], 1e3 * frame[1], scale * frame[values], cmap=colours)
+        domains.set_clim((0, 1) if k == 2 else None)
+        fig.colorbar(domains, ax=axes[k], label=name, shrink=0.8)
+    for ax, title in zip(
+        axes, ("the picture", f"loaded, t = {loaded[0]:.2g} s", f"drained, t = {last[0]:.0f} s"), strict=False
+    ):
+        ax.set(aspect="equal", xlim=(0, mm), ylim=(0, 1.03 * mm), xlabel="x (mm)", ylabel="y (mm)", title=title)
+    right, twin = axes[3], axes[3].twinx()
+    right.semilogx(out.t, 100 * np.array(out.settlement), color="C0")
+    right.axhline(100 * out.drained, color="C0", ls=":", label="dry tissue")
+    right.set(xlabel="t (s)", ylabel="settlement (% of the height)", title="settlement and pressure")
+    right.yaxis.label.set_color("C0")
+    right.legend(loc="center left")
+    twin.plot(out.t, 1e-3 * np.array(out.pressure), color="C1")
+    twin.set_ylabel("highest pore pressure (kPa)", color="C1")
+    common.save(fig, o.out / "image.png")
+
+
+if __name__ == "__main__":
+    main()

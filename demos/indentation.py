@@ -1,0 +1,168 @@
+# SPDX-License-Identifier: MIT
+"""A rigid cylinder is pressed into a wet gel, held there, and the force on it relaxes as the gel drains.
+
+Plane strain; half of the gel, 5 m wide and high, on a smooth base.  It drains at its side, far from the
+cylinder, which goes down at once.
+
+* At once no water moves and the gel is incompressible.  The pressure under the cylinder is Hertz's,
+
+      p = p_0 sqrt(1 - x^2 / a^2),    a = 2 sqrt(F R / (pi E*)),    p_0 = sqrt(F E* / (pi R)),
+
+  E* = 4 G of the undrained gel.  Of a layer this holds for the force F that it bears.
+* In the end the pressure of the water is gone.  The contact is Hertz's with E* = E / (1 - nu^2) of the drained gel, and
+  the force that of a dry scene, which is run beside it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import poroelastic_beam as beam
+
+import mpm_dolfinx as mpm
+
+RADIUS, SIZE = 20.0, 5.0  # m: of the cylinder, and of the gel
+E, NU = 1e6, 0.2
+GEL = mpm.Hencky(bulk=E / (3 - 6 * NU), shear=E / (2 + 2 * NU), porosity=0.6, conductivity=1e-8)
+DEPTH = 0.03  # m
+UNDRAINED, DRAINED = 4 * GEL.shear, E / (1 - NU**2)  # Pa: E*
+TIME = SIZE**2 * mpm.Fluid().unit_weight / (GEL.conductivity * GEL.oedometric)  # s: of consolidation
+INSTANT = 1e-8  # of it
+TIMES = np.geomspace(1e-4, 10, 21)  # over it: at which the force is recorded
+
+
+@dataclass
+class Contact:
+    """The contact at a time: force (N/m), places (m,), m, and pressures (m,), Pa, of the gel's points at the surface.
+
+    mean, half: largest pressure, Pa, and half-width, m, of the ellipse that fits them.
+    """
+
+    force: float
+    x: np.ndarray
+    p: np.ndarray
+    most: float
+    half: float
+
+    def errors(self, stiff: float) -> tuple[float, float]:
+        """Return the relative errors of half-width and largest pressure for the force, E* in Pa."""
+        half = 2 * np.sqrt(self.force * RADIUS / (np.pi * stiff))
+        return self.half / half - 1, self.most / np.sqrt(self.force * stiff / (np.pi * RADIUS)) - 1
+
+
+def contact(s: mpm.Simulation) -> Contact:
+    """Return the present contact: p^2 is linear in x^2."""
+    p, x = s.points.data["tool_0_pressure"], s.points.x[:, 0]
+    on = p > 0
+    order = np.argsort(x[on])
+    x, p = x[on][order], p[on][order]
+    inner = x < 0.8 * x.max()
+    slope, square = np.polyfit(x[inner] ** 2, p[inner] ** 2, 1)
+    return Contact(-2 * s.tool_forces[0, 1], x, p, np.sqrt(square), np.sqrt(-square / slope))
+
+
+def scene(cells: int, wet: bool) -> mpm.Simulation:
+    """Return half of the gel under the cylinder, with so many cells to a metre."""
+    n, h = round(SIZE * cells), 1 / cells
+    grid = mpm.Grid([SIZE, SIZE + 4 * h], [n, n + 4])
+    top = SIZE + 0.3 * h  # the surface is no line of the grid
+    at_once = INSTANT * TIME
+    ball = mpm.Tool(mpm.Ball((0, top + RADIUS), RADIUS), displacement=lambda t: (0, -DEPTH * min(1, t / at_once)))
+    water = {"fluid": mpm.Fluid(), "drained": [mpm.Drained("right")]} if wet else {}
+    walls = {"left": "x", "right": "x", "bottom": "y"}
+    return mpm.Simulation(grid, [mpm.box(grid, [0, 0], [SIZE, top])], [GEL], fixed=walls, tools=[ball], **water)
+
+
+@dataclass
+class Pressed:
+    """A run: contacts at once and, if wet, in the end; forces (N/m) at once and at `TIMES`; corners, pore pressures and
+    cylinder at once; of the fluid balance the worst, and cut steps.
+    """
+
+    contacts: list[Contact]
+    forces: list[float]
+    frame: tuple[np.ndarray, np.ndarray, np.ndarray]
+    balance: float
+    cuts: int
+
+
+def pressed(cells: int, wet: bool) -> Pressed:
+    """Press the cylinder into the gel and, if it is wet, let it drain."""
+    s = scene(cells, wet)
+    tool = s.state.stage.conditions["tools"][0]
+    result = s.run(INSTANT * TIME, INSTANT * TIME, progress=False)
+    out = Pressed([contact(s)], [], (s.points.corners, s.points.pressure, tool.drawn(s.grid, s.t)), 0.0, result.cuts)
+    out.forces.append(out.contacts[0].force)
+    if wet:
+        out.balance = result.balance
+        result = s.run(TIME * TIMES[-1], rtol=1e-2, t_eval=TIME * TIMES, progress=False)
+        out.forces += [-2 * float(forces[0, 1]) for forces in result.tools[1:]]
+        out.contacts.append(contact(s))
+        out.balance, out.cuts = max(out.balance, result.balance), out.cuts + result.cuts
+    return out
+
+
+def main(argv: list[str] | None = None) -> dict:
+    """Run the demo; return what --json prints."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--cells", type=int, default=12, help="cells to a metre, about half of the contact (12)")
+    parser.add_argument("--out", type=Path, default=Path("out/indentation"), help="folder (out/indentation)")
+    parser.add_argument("--json", action="store_true", help="print the results as one line of JSON at the end")
+    o = parser.parse_args(argv)
+    if not 4 <= o.cells <= 64:
+        parser.error(f"--cells {o.cells}: must be 4 to 64")
+    coarse, wet, dry = pressed(o.cells // 2, True), pressed(o.cells, True), pressed(o.cells, False)
+    at_once, end = wet.contacts[0], dry.contacts[0]
+    force, rough = np.array(wet.forces), np.array(coarse.forces)
+    errors = dict(zip(["half, at once", "pressure, at once"], at_once.errors(UNDRAINED), strict=True))
+    errors |= dict(zip(["half, drained", "pressure, drained"], end.errors(DRAINED), strict=True))
+    errors["force in the end, beside a dry gel"] = force[-1] / end.force - 1
+    errors["force at any time, beside half as many cells"] = np.abs(rough - force).max() / force[0]
+    for name, error in errors.items():
+        print(f"{name}: {error:+.2%}")
+    out = {"errors": errors, "balance": wet.balance, "force": wet.forces, "cuts": wet.cuts}
+    print(f"force at once {force[0]:.0f} N/m, drained {force[-1]:.0f} N/m, fluid balance {out['balance']:.0e}")
+    draw(o, wet, (at_once, end))
+    worst = max(abs(error) for name, error in errors.items() if not name.startswith("half"))  # rough with few cells
+    out["converged"] = bool(worst < 0.03 and out["balance"] < 1e-8)
+    print(f"picture: {o.out}/indentation.png")
+    if o.json:
+        print(json.dumps(out))
+    return out
+
+
+def draw(o: argparse.Namespace, wet: Pressed, contacts: tuple[Contact, Contact]) -> None:
+    """Draw pore pressures at once, pressures under the cylinder beside Hertz's, and the force in time."""
+    from matplotlib.collections import PolyCollection
+
+    fig, ((left, middle, right),) = beam.figure(1, 3, (13, 4))
+    corners, p, tool = wet.frame
+    domains = PolyCollection(corners[:, [0, 1, 3, 2]], array=p / 1e3, cmap="viridis", edgecolors="face", linewidth=0.1)
+    left.add_collection(domains)
+    left.add_collection(PolyCollection(tool[:, [0, 1, 3, 2]], facecolor="0.8", edgecolor="0.8"))
+    fig.colorbar(domains, ax=left, label="pore pressure (kPa)", shrink=0.8)
+    left.set(aspect="equal", xlim=(0, SIZE), ylim=(0, SIZE + 0.25), title="at once", xlabel="x (m)", ylabel="y (m)")
+    named = zip(("at once", "drained"), contacts, (UNDRAINED, DRAINED), strict=True)
+    for k, (name, seen, stiff) in enumerate(named):
+        half = 2 * np.sqrt(seen.force * RADIUS / (np.pi * stiff))
+        most = np.sqrt(seen.force * stiff / (np.pi * RADIUS))
+        x = np.linspace(0, half, 200)
+        middle.plot(x, most * np.sqrt(1 - (x / half) ** 2) / 1e3, color=f"C{k}", lw=1, label=f"Hertz, {name}")
+        middle.plot(seen.x, seen.p / 1e3, "o", color=f"C{k}", mfc="none", ms=4, label=name)
+    middle.set(title="under the cylinder", xlabel="x (m)", ylabel="contact pressure (kPa)")
+    right.semilogx(TIMES, np.array(wet.forces[1:]) / 1e3, "o-", ms=3, label="wet gel")
+    right.axhline(contacts[1].force / 1e3, color="C1", ls="--", label="dry gel")
+    right.set(title="force on the cylinder", xlabel="t c_v / (5 m)² (-)", ylabel="force (kN/m)", ylim=(0, None))
+    for ax in (middle, right):
+        ax.legend(fontsize=9)
+        ax.grid(alpha=0.3)
+    o.out.mkdir(parents=True, exist_ok=True)
+    fig.savefig(o.out / "indentation.png", dpi=100)
+
+
+if __name__ == "__main__":
+    raise SystemExit(0 if main()["converged"] else 1)

@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: MIT
+"""All output times of the points of a run in one file of ParaView's: XDMF, with its numbers in HDF5."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from xml.etree.ElementTree import SubElement
+
+from mpi4py import MPI
+
+import meshio
+import numpy as np
+from meshio.xdmf import TimeSeriesWriter
+
+from mpm_dolfinx.io.units import FIELDS
+from mpm_dolfinx.io.writer import Series
+from mpm_dolfinx.validation import line_of, path
+
+
+def one_file(folder: str | os.PathLike) -> Path:
+    """Write the points that a `Writer` has written to a folder as one time series, `points.xdmf` and `points.h5`.
+
+    ParaView and VTK read it, and meshio's `xdmf.TimeSeriesReader`; dolfinx reads the domains of one output time as a
+    mesh: `XDMFFile.read_mesh(name="2", xpath="/Xdmf/Domain/Grid")`, of the third.  Each output time has its own
+    domains, so bodies may be dug away and filled in between.  `<Information>` in points.xdmf says what the fields are,
+    and their units.  The files of the `Writer` stay: of a run that goes on, what is there by now is written, and all
+    when this is called again at its end.
+
+    Parameters
+    ----------
+    folder
+        That of the `Writer`; the two files come into it when they are whole.
+
+    Returns
+    -------
+    Path
+        That of points.xdmf.
+
+    Raises
+    ------
+    ValueError
+        A folder without points of a `Writer`, or no h5py that can be loaded beside dolfinx.
+    OSError
+        A folder that cannot be written, a disk that is full.
+    """
+    folder = path("one_file: folder", folder)
+    if not (folder / "points.pvd").exists():
+        raise ValueError(f"one_file: folder = {folder}: has no points.pvd, must be that of a Writer")
+    try:
+        import h5py
+    except Exception as error:  # that of PyPI brings an HDF5 of its own, which fails beside dolfinx's in many ways
+        which = "Debian's (apt install python3-h5py) or, with conda's dolfinx, conda-forge's"
+        raise ValueError(f"one_file: h5py: {line_of(error)}; must be {which}") from error
+    entries = Series(MPI.COMM_SELF, folder / "points.pvd", np.inf).entries
+    with TemporaryDirectory(dir=folder) as part:  # beside the old ones, which stay until the new ones are whole
+        writer = TimeSeriesWriter(Path(part) / "points.xdmf")
+        writer.h5_filename = "points.h5"  # meshio's own comes into the present folder
+        with h5py.File(Path(part) / "points.h5", "w") as writer.h5_file:
+            for name, meaning in FIELDS["points.pvd: the domains of the material points"].items():
+                SubElement(writer.domain, "Information", Name=name, Value=meaning)
+            for k, (t, (file,)) in enumerate(entries):
+                _add(writer, k, t, meshio.vtu.read(file))
+            writer.__exit__()
+        for suffix in (".h5", ".xdmf"):
+            os.replace(Path(part) / f"points{suffix}", folder / f"points{suffix}")
+    return folder / "points.xdmf"
+
+
+def _add(writer: TimeSeriesWriter, number: int, t: float, mesh: meshio.Mesh) -> None:
+    """Add a mesh of its own and its fields; meshio's `write_data` knows but one mesh for all times."""
+    grid = SubElement(writer.collection, "Grid", Name=str(number), GridType="Uniform")
+    SubElement(grid, "Time", Value=repr(t))
+    writer.points(grid, mesh.points)
+    writer.cells(mesh.cells, grid)
+    writer.cell_data(mesh.cell_data, grid)

@@ -1,0 +1,32 @@
+# SPDX-License-Identifier: MIT
+"""Press a block aslant, which slips, on another one on however many processes there are; write its state."""
+
+import sys
+
+import numpy as np
+
+import mpm_dolfinx as mpm
+
+grid = mpm.Grid([1.3, 1.2], [13, 12])
+bodies = [mpm.box(grid, [0.13, 0], [1.17, 0.43]), mpm.box(grid, [0.33, 0.44], [0.87, 0.9], per_cell=3)]
+soil = mpm.Hencky(bulk=4e6 / 3, shear=1e6, conductivity=1e-5)
+above = ([0, 0.7], [1.3, 1.2])
+simulation = mpm.Simulation(
+    grid,
+    bodies,
+    [soil],
+    fluid=mpm.Fluid(),
+    fixed={"bottom": "xy"},
+    drained=[mpm.Drained("left", region=([0, 0], [0.2, 1])), mpm.Drained("top", region=above)],
+    displacements=[mpm.Displacement("top", lambda t, X: (0.01 * t, -0.03 * t), region=above)],
+    contacts=[mpm.Contact(1, 0, friction=0.2)],
+)
+result = simulation.run(1.0, 0.5, progress=False)
+points = simulation.points
+data = (points.data["contact_0_shear"], points.data["contact_0_pressure"])
+parts = simulation.grid.comm.gather((points.id, points.x, points.pressure, *data))
+if parts:
+    ids, x, p, s, push = (np.concatenate(a) for a in zip(*parts, strict=True))
+    order = np.argsort(ids)
+    more = {"counts": [len(part[0]) for part in parts], "forces": simulation.tool_forces, "push": push[order]}
+    np.savez(sys.argv[1], x=x[order], p=p[order], shear=s[order], balance=result.balance, **more)

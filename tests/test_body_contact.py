@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: MIT
+"""Contact of groups of bodies: gaps carry nothing, pressed bodies are even, friction, fluid, restart, refusals."""
+
+import numpy as np
+import pytest
+
+import mpm_dolfinx as mpm
+
+E = 1e6  # Pa
+SOIL = mpm.Hencky(bulk=E / 3, shear=E / 2, porosity=0.4, conductivity=1e-6)  # nu = 0
+WALLS = {2: {"bottom": "y", "left": "x", "right": "x"}, 3: {"bottom": "z", "left": "x", "front": "y"}}
+
+
+def two_blocks(
+    offset=0.37, gap=0.01, path=lambda t: -0.1 * min(1, 2.5 * t, 2.5 * (1 - t)), dim=2, wet=False, order=1, **contact
+):
+    """Return two blocks between walls, the upper one on a given path, their face so many cells off the grid."""
+    n = 8 if dim == 2 else 4
+    low, high, y = [0.0] * (dim - 1), [1.0] * (dim - 1), 0.5 + offset / n
+    grid = mpm.Grid([*high, 2.0], [n] * (dim - 1) + [2 * n])
+    lower = mpm.box(grid, [*low, 0], [*high, y], per_cell=2)
+    upper = mpm.box(grid, [*low, y + gap], [*high, y + gap + 0.5], per_cell=3)
+    above = ([*low, y + gap + 0.3], [*high, 2.0])
+    held = mpm.Displacement("top", lambda t, X: [*low, path(t)], region=above)
+    fluid = {}
+    if wet:
+        drained = [mpm.Drained("top", region=above), mpm.Drained("bottom", region=([*low, 0], [*high, 0.2]))]
+        fluid = {"fluid": mpm.Fluid(), "drained": drained}
+    contacts = [mpm.Contact(0, 1, **contact)]
+    bodies = [lower, upper][::order]
+    walls = WALLS[dim]
+    return mpm.Simulation(grid, bodies, [SOIL], fixed=walls, displacements=[held], contacts=contacts, **fluid)
+
+
+@pytest.mark.parametrize(("dim", "offset", "order"), [(2, 0.0, 1), (2, 0.37, -1), (2, 0.98, 1), (3, 0.37, 1)])
+def test_blocks_approach_touch_press_evenly_and_part(dim, offset, order):
+    s = two_blocks(offset, dim=dim, order=order)
+    forces, spread = [], []
+
+    def see(s):
+        stress = s.effective_stress()[:, -1, -1]
+        forces.append((-order * s.tool_forces[0, dim - 1], -s.reactions[0, dim - 1]))
+        spread.append(np.ptp(stress))
+
+    s.run(1.0, 0.2, observe=see)
+    contact, held = np.array(forces).T
+    height, depth = 1 + offset / (8 if dim == 2 else 4), 0.09
+    assert contact[2] == pytest.approx(-E * np.log(1 - depth / height) / (1 - depth / height), rel=1e-3)
+    assert contact == pytest.approx(held, abs=1e-6)
+    assert contact[-1] == 0.0
+    assert max(spread) < 1e-6 * contact[2]
+
+
+def test_a_gap_far_below_a_cell_carries_nothing():
+    s = two_blocks(gap=1e-6, path=lambda t: 0.01 * t)
+    s.run(1.0, 0.5)
+    assert s.tool_forces.tolist() == [[0.0, 0.0, 0.0]]
+    assert np.abs(s.effective_stress()).max() < 1e-6
+    s = two_blocks(gap=1e-6, path=lambda t: -0.5e-6 * t)
+    s.run(1.0, 1.0)
+    assert s.tool_forces.tolist() == [[0.0, 0.0, 0.0]]
+
+
+def pushed(share, mu=0.3):
+    """Return by how much a block on a deformable one, pushed by so much of its weight, slides in 5 steps."""
+    grid = mpm.Grid([3, 2], [24, 16])
+    lower, upper = mpm.box(grid, [0.3, 0], [2.7, 0.55]), mpm.box(grid, [1, 0.55], [1.8, 0.95], per_cell=3)
+    load = mpm.Traction("top", lambda t: (share * 1e3 * min(t, 1), -1e3), region=([0, 0.8], [3, 2]))
+    contact = mpm.Contact(1, 0, friction=mu)
+    s = mpm.Simulation(grid, [lower, upper], [SOIL], fixed={"bottom": "xy"}, tractions=[load], contacts=[contact])
+    s.run(1.0, 0.25)
+    assert s.tool_forces[0, :2] == pytest.approx([-share * 0.8e3, 0.8e3], rel=1e-6)
+    before = s.points.x[:, 0].copy()
+    s.run(2.0, 0.25, after=s.result)
+    return np.abs(s.points.x[:, 0] - before).max()
+
+
+def test_a_block_sticks_below_the_coefficient_of_friction_and_slides_above():
+    assert pushed(0.2985) < 1e-4
+    with pytest.raises(mpm.GaveUp):  # no equilibrium
+        pushed(0.3015)
+
+
+@pytest.mark.parametrize(("wet", "friction"), [(False, 0.3), (True, 0.3)])
+def test_contact_resumes_bit_for_bit_and_keeps_the_fluid(tmp_path, wet, friction):
+    def scene():
+        return two_blocks(path=lambda t: -0.1 * np.sin(np.pi * t / 1e3), wet=wet, friction=friction)
+
+    whole, parts, resumed = scene(), scene(), scene()
+    whole.run(600.0, 100.0)
+    parts.run(300.0, 100.0, checkpoint=mpm.Checkpoint(tmp_path / "half.npz"))
+    resumed.run(600.0, 100.0, after=mpm.resume(resumed, tmp_path / "half.npz"))
+    assert whole.tool_forces.tobytes() == resumed.tool_forces.tobytes()
+    assert all(a.tobytes() == b.tobytes() for a, b in zip(whole.points.arrays, resumed.points.arrays, strict=True))
+    assert np.abs(whole.tool_forces[0, 1]) > 1e4
+    if wet:
+        assert whole.result.balance < 1e-8
+
+
+def test_what_are_no_contacts_is_refused():
+    grid = mpm.Grid([1, 2], [4, 8])
+    boxes = [mpm.box(grid, [0, y], [1, y + 0.5]) for y in (0, 0.5, 1.0)]
+    deep = mpm.box(grid, [0, 0.3], [1, 0.9])
+
+    def scene(bodies, *contacts, **more):
+        return mpm.Simulation(grid, bodies, [SOIL], fixed={"bottom": "xy"}, contacts=contacts, **more)
+
+    with pytest.raises(ValueError, match=r"Contact: friction = -0.1, must be >= 0 and finite"):
+        mpm.Contact(0, 1, friction=-0.1)
+    with pytest.raises(ValueError, match=r"Contact: other = 2, must be indices of the bodies, 0 to 1"):
+        scene(boxes[:2], mpm.Contact(0, 2))
+    with pytest.raises(ValueError, match=r"body 0 is in one = 0 and in other = .*, must be in one of them"):
+        scene(boxes[:2], mpm.Contact(0, [0, 1]))
+    with pytest.raises(ValueError, match=r"body 2 is in no group, must be in one"):
+        scene(boxes, mpm.Contact(0, 1))
+    with pytest.raises(ValueError, match=r"groups \(0,\) and \(2,\) have 0, must have one contact"):
+        scene(boxes, mpm.Contact(0, 1), mpm.Contact(1, 2))
+    with pytest.raises(ValueError, match=r"body 1 is in the groups .*, must be in one; name all"):
+        scene(boxes, mpm.Contact(0, [1, 2]), mpm.Contact(0, 1))
+    with pytest.raises(ValueError, match=r"bodies 0 and 1: both are at .*, 0.2 m deep, must not lie in each other"):
+        scene([boxes[0], deep], mpm.Contact(0, 1))
+    with pytest.raises(ValueError, match=r"2 groups of bodies have this side, must be one; limit it"):
+        scene(boxes[:2], mpm.Contact(0, 1), tractions=[mpm.Traction("left", 0.0)])
+    with pytest.raises(ValueError, match=r"quadrature 'point': must be domain with contacts"):
+        scene(boxes[:2], mpm.Contact(0, 1), quadrature="point")
+    with pytest.raises(ValueError, match=r"tools: must be none with contacts"):
+        scene(boxes[:2], mpm.Contact(0, 1), tools=[mpm.Tool(mpm.Ball([0.5, 3], 0.5))])
+    with pytest.raises(ValueError, match=r"is free to move as a rigid body in 1 of 3 ways"):
+        scene(boxes[:2], mpm.Contact(0, 1), gravity=[0, -10]).step(1.0)  # slides
+    with pytest.raises(ValueError, match=r"is free to move as a rigid body in 3 of 3 ways"):
+        scene(boxes[::2], mpm.Contact(0, 1, friction=0.3), gravity=[0, -10]).step(1.0)
