@@ -22,7 +22,6 @@ from mpm_dolfinx.points.cut_domains import CutDomains, Patches
 from mpm_dolfinx.points.faces import Surface, face_vectors
 from mpm_dolfinx.points.grid import sum_by
 from mpm_dolfinx.points.material_points import MaterialPoints
-from mpm_dolfinx.problems.body_contact import Contacts
 from mpm_dolfinx.problems.closed import closed
 from mpm_dolfinx.problems.conditions import (
     RIGIDITY,
@@ -41,6 +40,7 @@ from mpm_dolfinx.problems.contacts import Contact
 from mpm_dolfinx.problems.held_cells import SAME, HeldCells, HeldPoints
 from mpm_dolfinx.problems.side_forms import SideData, SideForms
 from mpm_dolfinx.problems.sides import Sides, check_apart, everywhere, gathered, meeting, on_side
+from mpm_dolfinx.problems.stage_contacts import Contacts
 from mpm_dolfinx.problems.stage_tools import Tools
 from mpm_dolfinx.problems.tools import Tool
 from mpm_dolfinx.validation import line

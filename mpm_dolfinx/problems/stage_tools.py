@@ -22,9 +22,10 @@ from mpm_dolfinx.points.cut_domains import CutDomains
 from mpm_dolfinx.points.faces import Surface
 from mpm_dolfinx.points.grid import Grid
 from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.problems.cell_contact import pressure_name, shear_name
 from mpm_dolfinx.problems.conditions import Displacement, holding, resistance
 from mpm_dolfinx.problems.sides import everywhere
-from mpm_dolfinx.problems.tool_contact import Rows, ToolContact, pressure_name, shear_name
+from mpm_dolfinx.problems.tool_contact import Rows, ToolContact
 from mpm_dolfinx.problems.tools import Tool
 from mpm_dolfinx.validation import line
 
@@ -73,8 +74,9 @@ class Tools:
 
     def _kept(self, n: int) -> dict[str, NDArray[np.float64]]:
         """Return what n points keep of the tools, zero."""
-        out = {pressure_name(i): np.zeros(n) for i in range(len(self.tools))}
-        return out | {shear_name(i): np.zeros((n, self.grid.dim)) for i, tool in enumerate(self.tools) if tool.grips}
+        out = {pressure_name("tool", i): np.zeros(n) for i in range(len(self.tools))}
+        gripping = [i for i, tool in enumerate(self.tools) if tool.grips]
+        return out | {shear_name("tool", i): np.zeros((n, self.grid.dim)) for i in gripping}
 
     def let_go(self, points: MaterialPoints) -> MaterialPoints:
         """Return points without the tractions of the tools."""
@@ -103,9 +105,9 @@ class Tools:
             before = tool.pose(start, d)
             n = everywhere(grid, lambda tool=tool, pose=pose: tool.solid(grid.h.min()).normal(pose.own(x)) @ pose.R.T)
             at = np.flatnonzero(free & (np.einsum("md,md->m", area, n) < -FACING * size))
-            old = points.data[shear_name(number)][patches.at[at]] if tool.grips else np.zeros((len(at), d))
+            old = points.data[shear_name("tool", number)][patches.at[at]] if tool.grips else np.zeros((len(at), d))
             vectors = [x[at], pose.put(before.own(x[at])), old @ (pose.R @ before.R.T).T]
-            pressure = points.data[pressure_name(number)][patches.at[at]]
+            pressure = points.data[pressure_name("tool", number)][patches.at[at]]
             scalars = [np.full(len(at), number), size[at], *(values[at] for values in own), pressure]
             found.append((at, np.concatenate([np.stack(scalars, axis=1), *vectors], axis=1)))
         at, values = (np.concatenate(column) for column in zip(*found, strict=True))

@@ -1,66 +1,29 @@
 # SPDX-License-Identifier: MIT
 """Contact of the bodies' surface with rigid tools: no penetration, Coulomb friction, adhesion.
 
-The normal pressure at a place with the gap g, and its energy by area, are
-
-    p = <lambda - k g>,     psi = p^2 / (2 k).
-
-k is no stiffer than lets a Q1 field follow curved tools, to which its places ask for more than it has nodes;
-lambda, one value a tool and cell, is at first the pressure of the step before, and augmented (Uzawa) until the cells'
-surfaces penetrate by less than `DEPTH` in the mean.  Friction acts on the mean slip s of the cell against the tool in
-the step, from the traction t_n of the step before, which the points keep,
-
-    t = P (t_n - k_t s),     |t| <= mu p + min(adhesion, 10 p)      by radial return,
-
-P the projection on the tangent plane: what sticks is elastic with a stiffness k_t, and gives back what it took.
-What slips is chosen after each Newton step (active sets): at first all sticks, whatever it would bear; what slips back
-sticks again, as soon as the balance is near, and then for as long.  Decided in each residual anew all would slip to and
-fro, for there is no stiffness in slip.
+Pressures and friction are those of `cell_contact`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
-from mpi4py import MPI
 from petsc4py import PETSc
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.caching import Latest
-from mpm_dolfinx.errors import NotConverged
 from mpm_dolfinx.forms.cell_matrices import insert
 from mpm_dolfinx.forms.point_forms import Places
-from mpm_dolfinx.parallel.exchange import Exchange, first, over_all
+from mpm_dolfinx.parallel.exchange import Exchange, over_all
 from mpm_dolfinx.points.grid import Grid, sum_by
 from mpm_dolfinx.points.material_points import MaterialPoints
-from mpm_dolfinx.problems.conditions import HOLD
+from mpm_dolfinx.problems.cell_contact import LEAST, TOUCH, CellContact
 from mpm_dolfinx.problems.sides import everywhere
 from mpm_dolfinx.problems.tools import DISTANCE, Distance, Pose, Tool
 from mpm_dolfinx.validation import line
-
-STIFF = 100.0
-"""k in units of (what resists) / (cell size)."""
-DEPTH = 5e-4  # cells: mean penetration that is left
-TOUCH = 1e-13  # of the grid: what is nearer touches, but for rounding; light bodies press no deeper than 1e-8 cells
-SLIVER = 0.25  # of a cell's face: of what is smaller less penetration counts
-ROUNDS = 20  # augmentations that are tried
-CLOSE = 1e-6  # of the traction that slips: what is nearer stays what it is
-LEAST = 1e-300
-RAMP = 10.0  # adhesion over the normal pressure, at most
-
-
-def pressure_name(number: int) -> str:
-    """Return the name under which points have the pressure (n,), Pa, of a tool on their faces."""
-    return f"tool_{number}_pressure"
-
-
-def shear_name(number: int) -> str:
-    """Return the name under which points keep the shear traction (n, d), Pa, of a tool."""
-    return f"tool_{number}_shear"
 
 
 class Rows(NamedTuple):
@@ -108,7 +71,7 @@ class Touch(NamedTuple):
     rise: NDArray[np.float64]
 
 
-class ToolContact:
+class ToolContact(CellContact):
     """The contact in a substep.
 
     Parameters
@@ -119,9 +82,8 @@ class ToolContact:
         The tools, and where they are at the end of the substep.
     rows, places
         The points of integration, and where the grid sees them.
-    travel, points, number, area
-        The way of the rows to the owners of their cells; and of each row before it: index of its material point on this
-        process, tool, and area, m^(d-1).
+    back
+        See `CellContact`.
     """
 
     def __init__(
@@ -133,39 +95,10 @@ class ToolContact:
         places: Places,
         back: tuple[Exchange, NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]],
     ):
-        self.grid, self._tools, self._poses, self._rows, self.places, self._back = (
-            grid,
-            tools,
-            poses,
-            rows,
-            places,
-            back,
-        )
-        key, self._at = np.unique(rows.number * grid.num_local + rows.cell, return_inverse=True)
-        self._number, self._cell = np.divmod(key, grid.num_local)
+        super().__init__(grid, "tool", tools, rows, back)
+        self._poses, self.places = poses, places
         self._N = grid.shape_values(rows.cell, places.x)
-        self._whole = sum_by(self._at, rows.area, len(key))
-        h = grid.h.min()
-        self._stiffness, self._hold = STIFF / h * rows.resistance, HOLD / h * self._mean(rows.holding)
-        strength = np.array([(tool.friction, tool.adhesion) for tool in tools], dtype=float)
-        self._strength = strength[self._number]
-        self.grips = any(tool.grips for tool in tools)
-        self._along = np.zeros((len(key), grid.dim))  # direction of the shear of what slips, else zero
-        self._turned = np.zeros(len(key), dtype=bool)  # what has slipped, and stuck again
-        self._lambda, self._rounds = self._mean(rows.pressure), np.zeros(1, dtype=np.int64)
         self._touch: Latest[Touch] = Latest()
-
-    def _total(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the sums (k, ...) of values (m, ...) in the conditions."""
-        size = len(self._whole)
-        columns = values.reshape(len(values), int(np.prod(values.shape[1:], dtype=int))).T
-        out = np.stack([sum_by(self._at, column, size) for column in columns], axis=1)
-        return out.reshape(size, *values.shape[1:])
-
-    def _mean(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the means (k, ...) over the area of values (m, ...) in the conditions."""
-        each = (slice(None), *(None,) * (values.ndim - 1))
-        return self._total(self._rows.area[each] * values) / self._whole[each]
 
     def _shapes(self, x: NDArray[np.float64]) -> tuple[NDArray, NDArray, NDArray]:
         """Return distances (m,), m, from the tools at places x (m, d), with their first and second derivatives."""
@@ -173,9 +106,9 @@ class ToolContact:
         gap, n, second = np.zeros(m), np.zeros((m, d)), np.zeros((m, d, d))
 
         def ask() -> None:
-            for number, (tool, pose) in enumerate(zip(self._tools, self._poses, strict=True)):
+            for number, (tool, pose) in enumerate(zip(self.contacts, self._poses, strict=True)):
                 solid = tool.solid(self.grid.h.min())
-                rows = np.flatnonzero(self._rows.number == number)
+                rows = np.flatnonzero(self.rows.number == number)
                 y = pose.own(x[rows])
                 gap[rows], n[rows] = solid.distance(y), solid.normal(y) @ pose.R.T
                 second[rows] = pose.R @ solid.curvature(y) @ pose.R.T
@@ -188,57 +121,36 @@ class ToolContact:
     def at(self, u: NDArray[np.float64]) -> Touch:
         """Return the contact at nodal displacements u (nodes, d), m."""
         now = u.copy()
-        key = now, self._lambda.copy(), self._along.copy()
+        key = now, self.pressure.copy(), self.along.copy()
         return self._touch(key, lambda: self._at_u(now), self.grid.comm)
 
     def _at_u(self, u: NDArray[np.float64]) -> Touch:
-        rows, at = self._rows, self._at
+        rows, at = self.rows, self.of
         x = rows.now + np.einsum("mk,mkd->md", self._N, u[self.grid.cell_nodes[rows.cell]])
         distance, n, second = self._shapes(x)
-        push, area = np.maximum(0.0, self._lambda[at] - self._stiffness * distance), rows.area
-        touches = (push > 0) | (distance <= TOUCH * self._reach)
-        stiff, pressure = self._stiffness * touches, self._mean(push)
+        push, area = np.maximum(0.0, self.pressure[at] - self.stiffness * distance), rows.area
+        touches = (push > 0) | (distance <= TOUCH * self.reach)
+        stiff, pressure = self.stiffness * touches, self.mean(push)
         slope = stiff[:, None, None] * n[:, :, None] * n[:, None, :] - push[:, None, None] * second
-        on = self._total(touches.astype(float)) > 0
-        normal = self._mean(n)
+        on = self.total(touches.astype(float)) > 0
+        normal = self.mean(n)
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), LEAST)
-        friction = _, _, shear, *_ = self._friction(normal, self._mean(x - rows.carried), pressure, on)
+        friction = _, _, shear, *_ = self.friction(normal, self.mean(x - rows.carried), pressure, on)
         force = area[:, None] * (push[:, None] * n + shear[at])
         return Touch(x, n, force, push, stiff, area[:, None, None] * slope, pressure, on, *friction)
 
-    def _friction(self, n: NDArray, slip: NDArray, pressure: NDArray, on: NDArray) -> tuple:
-        """Return what a `Touch` has from `sticks` on; n (k, d): normals."""
-        P = np.eye(n.shape[1]) - n[:, :, None] * n[:, None, :]
-        hold = np.where(self._strength.any(axis=1), self._hold, 0.0) * on
-        (mu, adhesion), slips = self._strength.T, self._slips
-        trial = np.einsum("kij,kj->ki", P, self._mean(self._rows.shear) * on[:, None] - hold[:, None] * slip)
-        size, ramp = np.maximum(np.linalg.norm(trial, axis=1), LEAST), RAMP * pressure < adhesion
-        most = mu * pressure + np.minimum(adhesion, RAMP * pressure)
-        onward = slips & (np.einsum("kd,kd->k", trial, self._along) > 0)  # what turns back keeps its shear for now
-        along = np.where(onward[:, None], trial / size[:, None], self._along)
-        turns = hold * np.where(slips, onward * most / size, 1.0)
-        grip = turns[:, None, None] * (P - along[:, :, None] * along[:, None, :])
-        rise = (mu + RAMP * ramp)[:, None] * along
-        shear = np.where(slips[:, None], most[:, None] * along, trial)
-        return ~slips & on, trial, shear, most, grip, rise
-
-    @property
-    def _slips(self) -> NDArray[np.bool_]:
-        return self._along.any(axis=1)
-
     def settle(self, u: NDArray[np.float64], sticks: bool) -> bool:
         """Choose what slips at u, and if asked for what sticks again; return whether that is another choice."""
-        if not self.grips:
-            return False
-        touch, before = self.at(u), self._slips
-        size = np.linalg.norm(touch.trial, axis=1)
-        goes_on = (size > (1 - CLOSE) * touch.most) & (np.einsum("kd,kd->k", touch.trial, self._along) > 0)
-        exceeds = (size > (1 + CLOSE) * touch.most) & (sticks | ~self._turned)
-        slips = np.where(before, goes_on if sticks else True, exceeds)
-        self._turned[:] |= before & ~slips
-        new = (slips & (goes_on | ~before))[:, None]
-        self._along[:] = np.where(new, touch.trial / np.maximum(size, LEAST)[:, None], slips[:, None] * self._along)
-        return over_all(self.grid.comm, int((slips != before).sum())) > 0
+        return self.grips and self.choose(self.at(u), sticks)
+
+    def augment(self, u: NDArray[np.float64]) -> bool:
+        """Augment the pressures where means penetrate too deep at u, see `augmented`; return whether they do."""
+        touch = self.at(u)
+        return self.augmented(touch, touch.x, "does a wall hold the body there?") > 0
+
+    def gripped(self, u: NDArray[np.float64], points: MaterialPoints) -> MaterialPoints:
+        """Return the points with the pressures and shear tractions that tools have on them at u."""
+        return self.carried(self.at(u), points)
 
     def assemble_matrix(self, A: PETSc.Mat, u: NDArray[np.float64]) -> None:
         """Add minus the derivative of the shear forces by slip and pressure at u; who calls finalises it.
@@ -247,80 +159,29 @@ class ToolContact:
         """
         if not self.grips:
             return
-        touch, N = self.at(u), self._mean(self._N)
-        pushes = (self._rows.area * touch.stiff)[:, None, None] * self._N[:, :, None] * touch.n[:, None, :]
-        M = np.einsum("ck,cab,cl,c->ckalb", N, touch.grip, N, self._whole)
-        M += np.einsum("ck,ca,clb->ckalb", N, touch.rise, self._total(pushes))
+        touch, N = self.at(u), self.mean(self._N)
+        pushes = (self.rows.area * touch.stiff)[:, None, None] * self._N[:, :, None] * touch.n[:, None, :]
+        M = np.einsum("ck,cab,cl,c->ckalb", N, touch.grip, N, self.area)
+        M += np.einsum("ck,ca,clb->ckalb", N, touch.rise, self.total(pushes))
         count = M.shape[1] * M.shape[2]
-        insert(A, self.grid, self._cell.astype(np.int32), M.reshape(len(M), count, count))
-
-    def augment(self, u: NDArray[np.float64]) -> bool:
-        """Take the present pressures for lambda where means penetrate too deep at u; return whether they do.
-
-        Raises
-        ------
-        NotConverged
-            They still do: something holds the body in the tool.
-        """
-        touch, h = self.at(u), self.grid.h.min()
-        # what is a sliver of a cell has too little area to be pushed out by itself, and goes with its neighbours
-        whole = np.minimum(1.0, self._whole / (SLIVER * self.grid.cell_volume / self.grid.h.max()))
-        off = whole * (touch.pressure - self._lambda) / self._mean(self._stiffness) / h
-        most = over_all(self.grid.comm, float(np.abs(off).max(initial=0.0)), MPI.MAX)
-        if most <= DEPTH:
-            return False
-        self._rounds[0] += 1
-        if self._rounds[0] > ROUNDS:
-            worst = np.flatnonzero(np.abs(off) == most)[:1]
-            x = [f"{line(self._tools[self._number[k]])}: at {touch.x[self._at == k][0]}" for k in worst]
-            message = f"{''.join(x)} penetrates by {most:.2g} cells: does a wall hold the body there?"
-            raise NotConverged(first(self.grid.comm, message if x else ""))
-        self._lambda[:] = touch.pressure
-        return True
-
-    @property
-    def rounding(self) -> float:
-        """What rounding of coordinates makes of the forces, N, of this process."""
-        return 1e-15 * float((self._stiffness * self._rows.area).max(initial=0.0)) * self._reach
-
-    @property
-    def _reach(self) -> float:
-        return float(np.abs(np.concatenate([self.grid.lower, self.grid.upper])).max())
+        insert(A, self.grid, self.cell.astype(np.int32), M.reshape(len(M), count, count))
 
     def touching(self) -> tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.float64]]:
         """Return cells (m,), places (m, d), and directions (m, d) in which tools hold what touches at the start."""
         touch, d = self.at(np.zeros_like(self.grid.node_x)), self.grid.dim
         rows = np.flatnonzero(touch.stiff > 0)
-        rough = rows[self._strength.any(axis=1)[self._at[rows]]]
-        cell, x = (np.concatenate([of[rows], np.repeat(of[rough], d, axis=0)]) for of in (self._rows.cell, touch.x))
+        rough = rows[self.strength.any(axis=1)[self.of[rows]]]
+        cell, x = (np.concatenate([of[rows], np.repeat(of[rough], d, axis=0)]) for of in (self.rows.cell, touch.x))
         return cell, x, np.concatenate([touch.n[rows], np.tile(np.eye(d), (len(rough), 1))])
 
     def forces(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return forces and moments (tools, d + 1) or, in 3D, (tools, 6) of the tools on the bodies, N and N m."""
-        touch, number, d = self.at(u), self._rows.number, self.grid.dim
+        touch, number, d = self.at(u), self.rows.number, self.grid.dim
         middle = np.array([pose.centre + pose.shift for pose in self._poses])
         arm, f = touch.x - middle[number], touch.force
         moment = np.cross(arm, f) if d == 3 else (arm[:, 0] * f[:, 1] - arm[:, 1] * f[:, 0])[:, None]
         columns = np.concatenate([f, moment], axis=1).T
-        return over_all(self.grid.comm, np.stack([sum_by(number, c, len(self._tools)) for c in columns], axis=1))
-
-    def gripped(self, u: NDArray[np.float64], points: MaterialPoints) -> MaterialPoints:
-        """Return the points with the pressures and shear tractions that tools have on them at u.
-
-        What sticks keeps how it differs from the mean of its cell: averaged anew in every step it would creep.
-        """
-        touch, (travel, at, of, area) = self.at(u), self._back
-        off = (self._rows.shear - self._mean(self._rows.shear)[self._at]) * touch.sticks[self._at, None]
-        shear, push = travel.back(touch.shear[self._at] + off), travel.back(touch.push)
-        data, n = dict(points.data), len(points)
-        for number, tool in enumerate(self._tools):
-            rows = np.flatnonzero(of == number)
-            whole = np.maximum(sum_by(at[rows], area[rows], n), 1e-300)
-            means = [sum_by(at[rows], area[rows] * column, n) / whole for column in (push[rows], *shear[rows].T)]
-            data[pressure_name(number)] = means[0]
-            if tool.grips:
-                data[shear_name(number)] = np.stack(means[1:], axis=1)
-        return replace(points, data=data)
+        return over_all(self.grid.comm, np.stack([sum_by(number, c, len(self.contacts)) for c in columns], axis=1))
 
 
 def _check_distance(tool: Tool, x: NDArray, gap: NDArray, n: NDArray, h: float) -> None:

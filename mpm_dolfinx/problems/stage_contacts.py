@@ -1,0 +1,254 @@
+# SPDX-License-Identifier: MIT
+"""The contacts of groups of a stage: which places on their surfaces face one another, and what points keep of it.
+
+The contact itself is in `body_contact`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+from mpi4py import MPI
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from mpm_dolfinx.caching import Latest
+from mpm_dolfinx.constitutive.fields import SceneMaterials
+from mpm_dolfinx.errors import NotConverged
+from mpm_dolfinx.parallel.exchange import Exchange, first, over_all
+from mpm_dolfinx.points.contact import BITS, local, weights
+from mpm_dolfinx.points.cut_domains import DEPTH as UNDER
+from mpm_dolfinx.points.cut_domains import CutDomains
+from mpm_dolfinx.points.cutting import FACES
+from mpm_dolfinx.points.faces import Surface, surface
+from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.problems.body_contact import BodyContact, Rows
+from mpm_dolfinx.problems.cell_contact import LEAST, pressure_name, shear_name
+from mpm_dolfinx.problems.conditions import holding, resistance
+from mpm_dolfinx.problems.contacts import Contact
+from mpm_dolfinx.problems.sides import Sides
+from mpm_dolfinx.problems.stage_tools import BEGINS, FACING
+from mpm_dolfinx.validation import line
+
+REACH = 2.0
+"""Cells: what is farther apart cannot touch within a step; steps in which bodies move farther are refused."""
+DEEP = 0.25
+"""Cells: what is deeper is behind a thin body."""
+CANDIDATES = {2: 8, 3: 24}
+"""Nearest points of the other surface whose faces are tried."""
+BESIDE = 0.6
+"""Cells from points on the other surface: corners that are nearer go with it."""
+EDGE = 1e-6
+"""Of a face: what passes beside it by less meets it."""
+
+
+class Facets(NamedTuple):
+    """Points on the faces of the other group, those of all processes; arrays over n of them.
+
+    x : (n, d), m; face : (n,) row of the `Surface`; cell : (n,) lexicographic; resistance, holding : (n,), Pa;
+    corners, cut : (n, 2^(d-1), d), m, of the face at present and when the grid was reset; outward : (n, d) unit normal.
+    """
+
+    x: NDArray[np.float64]
+    face: NDArray[np.int64]
+    cell: NDArray[np.int64]
+    resistance: NDArray[np.float64]
+    holding: NDArray[np.float64]
+    corners: NDArray[np.float64]
+    cut: NDArray[np.float64]
+    outward: NDArray[np.float64]
+
+
+class Pairs(NamedTuple):
+    """Points of one surface that face the other; arrays over m pairs.
+
+    row : (m,) point among the patches of this process; facet : (m,) one of the `Facets` on the face that it meets;
+    t : (m, 2) where on the face; gap : (m,), m, along the point's normal.
+    """
+
+    row: NDArray[np.int64]
+    facet: NDArray[np.int64]
+    t: NDArray[np.float64]
+    gap: NDArray[np.float64]
+
+
+class Contacts:
+    """The contacts of a stage.
+
+    Parameters
+    ----------
+    sides
+        The sides of the bodies.
+    materials
+        Those of the scene.
+    contacts
+        The contacts.
+    """
+
+    def __init__(self, sides: Sides, materials: SceneMaterials, contacts: Sequence[Contact]):
+        self.grid, self._materials, self.contacts = sides.grid, materials, tuple(contacts)
+        self._faces: list[tuple[Surface, Surface]] = []
+        signs = []
+        for contact in self.contacts:
+            both = contact.groups(len(sides.bodies))
+            there = [[i in group and bool(here) for i, here in enumerate(sides.present)] for group in both]
+            faces = [surface(sides.bodies, None, None, some) for some in there]
+            swap = (faces[1].area0.sum(), faces[1].id[0]) < (faces[0].area0.sum(), faces[0].id[0])
+            self._faces.append((faces[1], faces[0]) if swap else (faces[0], faces[1]))
+            signs.append(-1.0 if swap else 1.0)
+        self._signs = np.array(signs)
+        self._found: Latest[list[tuple[Facets, Pairs]]] = Latest()
+
+    @property
+    def symmetric(self) -> bool:
+        """Whether the tangent is symmetric."""
+        return not any(contact.grips for contact in self.contacts)
+
+    def grip(self, points: MaterialPoints) -> MaterialPoints:
+        """Return points with tractions of the contacts: zero."""
+        n, data = len(points), dict(points.data)
+        for number, contact in enumerate(self.contacts):
+            data[pressure_name("contact", number)] = np.zeros(n)
+            if contact.grips:
+                data[shear_name("contact", number)] = np.zeros((n, self.grid.dim))
+        return replace(points, data=data) if self.contacts else points
+
+    def placed(self, cut: CutDomains, points: MaterialPoints) -> BodyContact | None:
+        """Return the contact in a step, with the points where they are at its start."""
+        if not self.contacts:
+            return None
+        grid, d, rows = self.grid, self.grid.dim, []
+        found = self._found(cut.key, lambda: [self._met(cut, *faces, cut.points) for faces in self._faces], grid.comm)
+        own = [self._materials.table(cut.points, of) for of in (resistance, holding)]
+        for number, ((faces, others), (facets, pairs)) in enumerate(zip(self._faces, found, strict=True)):
+            patches = cut.surface(faces)
+            now = facets if points is cut.points else self._facets(cut, others, points)
+            row, other, at = pairs.row, pairs.facet, patches.at[pairs.row]
+            y, where = (_on(corners[other], pairs.t) for corners in (now.corners, facets.cut))
+            area = patches.area(points)[row]
+            size = np.linalg.norm(area, axis=1)
+            n = -patches.area(cut.points)[row]  # as the pairs were found
+            n /= np.linalg.norm(n, axis=1, keepdims=True)
+            old = np.zeros((len(row), d))
+            if self.contacts[number].grips:
+                old = _turned(points.data[shear_name("contact", number)][at], n)
+            pressure = points.data[pressure_name("contact", number)][at]
+            moduli = [np.minimum(a[at], b[other]) for a, b in zip(own, (now.resistance, now.holding), strict=True)]
+            scalars = np.stack([np.full(len(row), number), size, *moduli, pressure], axis=1)
+            apart = patches.now(points)[row] - y
+            cell = self._under(facets, other, where)
+            rows.append((patches.cell[row], cell, at, np.hstack([scalars, patches.x[row], where, n, apart, old])))
+        cell, other, at, values = (np.concatenate(column) for column in zip(*rows, strict=True))
+        travel = Exchange(grid.comm, grid.owner(cell))
+        cell, other, sent = (travel.send(columns) for columns in (cell, other, values))
+        number, *scalars = sent[:, :5].T
+        x, y, *vectors = np.split(sent[:, 5:], 5, axis=1)
+        placed = Rows(number.astype(np.int64), grid.local(cell), other, x, y, *scalars, *vectors)
+        back = (travel, at, values[:, 0].astype(np.int64), values[:, 1])
+        return BodyContact(grid, self.contacts, self._signs, placed, back)
+
+    def _facets(self, cut: CutDomains, faces: Surface, points: MaterialPoints) -> Facets:
+        """Return points on faces of all processes, with the points where they are."""
+        patches, d = cut.surface(faces), self.grid.dim
+        index = FACES[d][faces.face[patches.here]]
+        now, then = (
+            np.take_along_axis(of.corners[patches.at], index[:, :, None], axis=1) for of in (points, cut.points)
+        )
+        moduli = [self._materials.table(cut.points, of)[patches.at] for of in (resistance, holding)]
+        area, n, k = patches.area(points), len(now), 2 ** (d - 1) * d
+        outward = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), LEAST)
+        whole = np.column_stack([patches.here, patches.cell])
+        rows = np.column_stack([patches.now(points), *moduli, now.reshape(n, k), then.reshape(n, k), outward])
+        whole, rows = (np.concatenate(self.grid.comm.allgather(part)) for part in (whole, rows))
+        x, moduli, now, then, outward = np.split(rows, np.cumsum([d, 2, k, k]), axis=1)
+        shape = (len(rows), 2 ** (d - 1), d)
+        return Facets(x, *whole.T, *moduli.T, now.reshape(shape), then.reshape(shape), outward)
+
+    def _met(self, cut: CutDomains, faces: Surface, others: Surface, points: MaterialPoints) -> tuple[Facets, Pairs]:
+        """Return the points on the faces of the other group, and which of these the points on the faces meet."""
+        patches, facets, d = cut.surface(faces), self._facets(cut, others, points), self.grid.dim
+        x, area = patches.now(points), patches.area(points)
+        n = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), LEAST)
+        count = min(CANDIDATES[d], len(facets.x))
+        reach = REACH * self.grid.h.min() + self.grid.h.max()
+        _, near = cKDTree(facets.x).query(x, range(1, count + 1), distance_upper_bound=reach)
+        row, column = np.nonzero(near < len(facets.x))
+        other = near[row, column]
+        facing = np.einsum("md,md->m", n[row], facets.outward[other]) < -FACING
+        row, other = row[facing], other[facing]
+        t, gap = _along(facets.corners[other], x[row], n[row])
+        met = ((t >= -EDGE) & (t <= 1 + EDGE)).all(axis=1) & (gap <= REACH * self.grid.h.min())
+        met &= gap >= -DEEP * self.grid.h.min()
+        row, other, t, gap = row[met], other[met], t[met], gap[met]
+        order = np.lexsort((np.abs(gap), row))
+        order = order[np.append(True, np.diff(row[order]) > 0)[: len(order)]]
+        return facets, Pairs(row[order], other[order], t[order], gap[order])
+
+    def _under(self, facets: Facets, chosen: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Return the cells (m,) just under places x (m, d) on faces that hold a part of these, else of their facets."""
+        grid, inside = self.grid, x - UNDER * self.grid.h.min() * facets.outward[chosen]
+        number = grid.number(grid.index(inside)) + facets.cell[chosen] // grid.cells * grid.cells
+        keys = np.unique(facets.face * len(grid.owners) + facets.cell)
+        return np.where(np.isin(facets.face[chosen] * len(grid.owners) + number, keys), number, facets.cell[chosen])
+
+    def near(self, cut: CutDomains, points: MaterialPoints, corners: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return which corners (n, 2^d, d) of domains are beside another group: these follow the Q1 field alone.
+
+        points: as they were at the start of the step.
+        """
+        out, reach = np.zeros(corners.shape[:2], dtype=bool), BESIDE * self.grid.h.max()
+        for pair in self._faces:
+            for own, other in (pair, pair[::-1]):
+                x = self._facets(cut, other, points).x
+                mine = np.flatnonzero(self.grid.copy(points.id) == self.grid.copy(own.id[:1]))
+                distance, _ = cKDTree(x).query(corners[mine], distance_upper_bound=reach)
+                out[mine] |= distance < reach
+        return out
+
+    def check_end(self, cut: CutDomains, points: MaterialPoints, before: MaterialPoints) -> None:
+        """Refuse a step in which groups may have passed into each other unseen, or have.
+
+        Raises
+        ------
+        NotConverged
+            Saying where; a shorter step may do.
+        """
+        h, comm = self.grid.h.min(), self.grid.comm
+        moved = np.linalg.norm(points.corners - before.corners, axis=2).max(initial=0.0) if self.contacts else 0.0
+        if self.contacts and 2 * over_all(comm, float(moved), MPI.MAX) > REACH * h:
+            raise NotConverged(f"contacts: bodies move by more than {REACH / 2:g} cells in a step")
+        for contact, (faces, others) in zip(self.contacts, self._faces, strict=True):
+            _, pairs = self._met(cut, faces, others, points)
+            deepest = over_all(comm, float(pairs.gap.min(initial=np.inf)), MPI.MIN)
+            if deepest < -BEGINS * h:
+                row = pairs.row[pairs.gap == deepest][:1]
+                where = first(comm, "".join(f"{x}" for x in cut.surface(faces).now(points)[row]))
+                raise NotConverged(f"{line(contact)}: bodies are {-deepest / h:.3g} cells in each other at {where}")
+
+
+def _turned(shear: NDArray[np.float64], n: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return tractions (m, d) turned by the least angle into the planes with normals n (m, d)."""
+    flat = shear - np.einsum("md,md->m", shear, n)[:, None] * n
+    size = np.maximum(np.linalg.norm(flat, axis=1), LEAST)
+    return flat * (np.linalg.norm(shear, axis=1) / size)[:, None]
+
+
+def _on(corners: NDArray[np.float64], t: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the places (m, d) at coordinates t (m, 2), from 0 to 1, on faces (m, 2^(d-1), d)."""
+    if corners.shape[2] == 2:
+        return corners[:, 0] + t[:, :1] * (corners[:, 1] - corners[:, 0])
+    return np.einsum("mk,mkd->md", weights(t), corners)
+
+
+def _along(corners: NDArray, x: NDArray, n: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return where lines from x (m, d) along n meet faces (m, 2^(d-1), d), in their coordinates (m, 2), and how far."""
+    if corners.shape[2] == 2:  # as in `Faces`, a unit of length wide along a third axis
+        corners = np.dstack([corners[:, BITS[:, 0]], np.broadcast_to(BITS[:, 1], (len(x), 4))])
+        x, n = np.column_stack([x, np.full(len(x), 0.5)]), np.column_stack([n, np.zeros(len(x))])
+    off = np.einsum("mkd,md->mk", corners - x[:, None], n)
+    t = local(corners - off[:, :, None] * n[:, None], x[:, None], n)[0][:, 0]
+    return t, np.einsum("mk,mk->m", weights(t), off)
