@@ -10,15 +10,11 @@ contact takes.  Both are off by what a few cells over the half-width cannot reso
 
 from __future__ import annotations
 
-import argparse
-import json
 import sys
-import time
 from pathlib import Path
 
+import common
 import numpy as np
-import poroelastic_beam as beam
-from matplotlib.collections import PolyCollection
 
 import mpm_dolfinx as mpm
 
@@ -88,45 +84,40 @@ def hertz(cells: int) -> dict[str, float]:
 
 def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return what --json prints."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cells", type=int, default=10, help="cells over the radius of a gel (10)")
-    parser.add_argument("--hertz", type=int, default=18, help="cells a metre of the elastic bodies (18)")
-    parser.add_argument("--out", type=Path, default=Path("out/two_gels"), help="folder for the picture (out/two_gels)")
-    parser.add_argument("--json", action="store_true", help="print the results as one line of JSON at the end")
+    parser = common.Parser(__doc__, __file__)
+    parser.add_argument("--cells", type=int, default=10, help="cells over the radius of a gel")
+    parser.add_argument("--hertz", type=int, default=18, help="cells a metre of the elastic bodies")
     o = parser.parse_args(argv)
     if min(o.cells, o.hertz) < 4:
         parser.error(f"--cells {o.cells} --hertz {o.hertz}: must be >= 4")
-    began, s, shown = time.perf_counter(), scene(o.cells), []
+    with common.results(o) as out:
+        s, shown = scene(o.cells), []
 
-    def see(s: mpm.Simulation) -> None:
-        if min(abs(s.t - t) for t in SHOWN) < 1e-6:
-            shown.append((s.t, s.points.corners.copy(), -s.effective_stress()[:, 1, 1]))
+        def see(s: mpm.Simulation) -> None:
+            if min(abs(s.t - t) for t in SHOWN) < 1e-6:
+                shown.append((s.t, s.points.corners.copy(), -s.effective_stress()[:, 1, 1]))
 
-    see(s)
-    result = s.run(TIMES[-1], 0.05, observe=see)
-    force = np.array(result.tools)[:, 0, :2]
-    t = np.array(result.t)
-    slides = (t > 1.5) & (t <= 2.0)
-    ratio = float(np.abs(force[slides, 0]).sum() / force[slides, 1].sum())
-    out = {"seconds": time.perf_counter() - began, "steps": result.steps, "ratio": ratio}
-    out |= {"largest": float(force[:, 1].max()), "parted": float(np.abs(force[-1]).max()), "hertz": hertz(o.hertz)}
-    print(f"largest force {out['largest']:.4g} N/m; parted {out['parted']:.3g}")
-    print("Hertz, {cells:.1f} cells: pressure {pressure:+.1%}, half-width {half_width:+.1%}".format(**out["hertz"]))
-    draw(o.out, shown, t, force)
-    print(f"picture: {o.out}/two_gels.png")
-    out["converged"] = bool(result.converged and out["parted"] == 0)
-    if o.json:
-        print(json.dumps(out))
+        see(s)
+        result = s.run(TIMES[-1], 0.05, observe=see)
+        force = np.array(result.tools)[:, 0, :2]
+        t = np.array(result.t)
+        slides = (t > 1.5) & (t <= 2.0)
+        ratio = float(np.abs(force[slides, 0]).sum() / force[slides, 1].sum())
+        out |= {"steps": result.steps, "ratio": ratio}
+        out |= {"largest": float(force[:, 1].max()), "parted": float(np.abs(force[-1]).max()), "hertz": hertz(o.hertz)}
+        print(f"largest force {out['largest']:.4g} N/m; parted {out['parted']:.3g}")
+        print("Hertz, {cells:.1f} cells: pressure {pressure:+.1%}, half-width {half_width:+.1%}".format(**out["hertz"]))
+        draw(o.out, shown, t, force)
+        out["converged"] = bool(result.converged and out["parted"] == 0)
     return out
 
 
 def draw(out: Path, shown: list, t: np.ndarray, force: np.ndarray) -> None:
     """Draw the gels with their stresses, and the forces."""
-    fig, axes = beam.figure(3, 2, (11, 9))
+    fig, axes = common.figure(3, 2, (11, 9))
     most = np.quantile(shown[1][2], 0.998) / 1e3
     for ax, (when, corners, p) in zip(axes.ravel(), shown, strict=False):
-        domains = PolyCollection(corners[:, [0, 1, 3, 2]], array=p / 1e3, cmap="viridis", clim=(-most / 4, most))
-        ax.add_collection(domains)
+        domains = common.domains(ax, corners, p / 1e3, cmap="viridis", clim=(-most / 4, most))
         ax.set(aspect="equal", xlim=(0.3, 4.0), ylim=(0, 2.25), title=f"t = {when:g} s", xlabel="x (m)", ylabel="y (m)")
     fig.colorbar(domains, ax=axes[:2].ravel().tolist(), label="vertical pressure (kPa)", shrink=0.7)
     axes[2, 0].plot(t, force[:, 1] / 1e3, label="normal to the path")
@@ -138,8 +129,7 @@ def draw(out: Path, shown: list, t: np.ndarray, force: np.ndarray) -> None:
     for ax in axes[2]:
         ax.grid(alpha=0.3)
     axes[2, 0].legend(fontsize=8)
-    out.mkdir(parents=True, exist_ok=True)
-    fig.savefig(out / "two_gels.png", dpi=90)
+    common.save(fig, out / "two_gels.png", dpi=90)
 
 
 if __name__ == "__main__":

@@ -58,7 +58,7 @@ def test_iterative_solvers_are_freed_with_the_matrices_they_were_made_for(monkey
         s.step(0.1)
         assert solvers.iterative(s.scene.last[1].momentum.unknowns)
         used.append(memory())
-    assert used[-1] - used[3] < 6, f"MB after each step: {used}"
+    assert used[-1] - used[3] < 15, f"MB after each step: {used}, 29 in six steps were none freed"
 
 
 def test_faces_that_end_on_grid_planes_have_no_points_without_area():
