@@ -154,6 +154,16 @@ def clayey(cells: int) -> mpm.Simulation:
     return block(cells, clay, tractions=[mpm.Traction("top", lambda t: (0, -p - LOAD * t))])
 
 
+def apart(cells: int, **options) -> mpm.Simulation:
+    """Return the block with another body beside it, a quarter as wide, that touches nothing."""
+    h = 1 / cells
+    grid = mpm.Grid([1.5, 1 + 2 * h], [round(1.5 * cells), cells + 2])
+    bodies = [mpm.box(grid, [0, 0], [1, 1]), mpm.box(grid, [1.25, 0], [1.5, 1])]
+    load = mpm.Traction("top", lambda t: (0, -LOAD * t), region=((0, 0), (1, 2)))
+    fixed = {"left": "x", "right": "x", "bottom": "y"}
+    return mpm.Simulation(grid, bodies, [soil()], fixed=fixed, tractions=[load], **options)
+
+
 Make = Callable[[int], mpm.Simulation]
 PAIRS: dict[str, tuple[Make, Make]] = {
     "pore fluid that drains at once": (block, lambda n: block(n, soil(conductivity=1e3), **WATER)),
@@ -170,6 +180,10 @@ PAIRS: dict[str, tuple[Make, Make]] = {
     "rough tool that touches nothing": (
         block,
         lambda n: block(n, tools=[mpm.Tool(mpm.HalfSpace((0, 2), (0, -1)), friction=0.3)]),
+    ),
+    "contact of groups that are apart": (
+        apart,
+        lambda n: apart(n, contacts=[mpm.Contact(0, 1, friction=0.3)]),
     ),
     "ghost penalty on all faces": (block, weighted),
     "damping of pressure jumps": (lambda n: conducting(n, mpm.Hencky), lambda n: conducting(n, Watched)),

@@ -45,8 +45,9 @@ def warn_smeared(cut: CutDomains, materials: SceneMaterials, bodies: Sequence[Bo
     cell = over_all(grid.comm, int(grid.cell_number[at].max(initial=-1)), MPI.MAX)
     much = over_all(grid.comm, float(contrast[at].max(initial=0.0)), MPI.MAX)
     those, x = bodies_in(cut, bodies, cell)
-    what = "bodies %s share cells, as at %s: material %d, up to %.3g times as soft as its neighbour, gives about "
-    what += "%.0f %% too little under a load across the layers; lay interfaces along grid lines, or take smaller cells"
+    what = "materials of bodies %s share cells, as at %s: material %d, up to %.3g times as soft as its neighbour, "
+    what += "gives about %.0f %% too little under a load across the layers; lay interfaces along grid lines, or take "
+    what += "smaller cells"
     warn(grid.comm, what, " and ".join(map(str, those)), x, i, much, 100 * share)
     return True
 
