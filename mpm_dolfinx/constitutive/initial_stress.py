@@ -171,20 +171,21 @@ class InitialStresses:
             g = None if gravity is None else np.asarray(gravity).tolist()
             raise ValueError(f"initial_stress: K0 with gravity = {g}, must be down along the last axis at the start")
         # the densities of all points on all processes
-        n, seeded, total = self._start[-1], materials.seeded, np.zeros(self._start[-1])
+        seeded, total = materials.seeded, np.zeros(self._start[-1])
         total[seeded.id] = materials.density(seeded)
         total = over_all(materials.grid.comm, total)
         here = np.repeat(present, [len(body) for body in self._bodies])
         corners = np.concatenate([body.corners() for body, there in zip(self._bodies, present, strict=True) if there])
-        weight, surface = overburden(corners, -gravity[-1] * total[:n][here], points.x)
+        weight, surface = overburden(corners, -gravity[-1] * total[here], points.x)
         return [weight, surface, materials.table(points, lambda m: m.biot) * points.pressure]
 
 
-def stressed(materials: SceneMaterials, points: MaterialPoints, chosen: NDArray[np.bool_], target: NDArray):
+def stressed(
+    materials: SceneMaterials, points: MaterialPoints, chosen: NDArray[np.bool_], target: NDArray[np.float64]
+) -> MaterialPoints:
     """Return points of which the chosen ones (n,) have target stresses (n, 3, 3), Pa; on all processes together.
 
-    Newton's method for symmetric elastic strains: of the prestretch (in plane strain without that across the plane,
-    whose stress the law is given), or of C_p^-1.  Modified Cam Clay has the stress among its constants.
+    Modified Cam Clay has the stress among its constants; other laws have elastic strains with it, see `_Sought`.
 
     Raises
     ------
@@ -194,69 +195,18 @@ def stressed(materials: SceneMaterials, points: MaterialPoints, chosen: NDArray[
     comm, rows, law = materials.grid.comm, np.flatnonzero(chosen), materials.law_of(points)
     part, target = points.map(lambda values: values[rows]), target[rows]
     given = np.isin(law[rows], [k for k, one in enumerate(materials.laws) if issubclass(one, ModifiedCamClay)])
-    plastic = np.isin(law[rows], [k for k, one in enumerate(materials.laws) if "plastic" in one.state])
-    message = _no_constants(part, target, given)
-    if message := first(comm, message):
+    if message := first(comm, _no_constants(part, target, given)):
         raise ValueError(message)
     if given.any():
         normal, kappa = np.diagonal(target, axis1=1, axis2=2), materials.table(part, _kappa)
         part = _with(part, given, initial_stress=normal, bulk=-normal.mean(axis=1) / kappa)
-    which = PLANE if points.x.shape[1] == 2 else SPACE
-    axes = tuple(np.array(which).T)
-    free, stretches = np.repeat(~given[:, None], len(which), axis=1), materials.grid.stretches
-    if stretches == 2:
-        free[:, 2] &= plastic  # across the plane
-
-    def off(strain: NDArray[np.float64]) -> tuple[MaterialPoints, NDArray[np.float64], NDArray[np.float64]]:
-        """Return points with elastic strains (n, k), their stresses, and what is missing of the target (n, k)."""
-        tensor = np.zeros((len(strain), 3, 3))
-        for value, (i, j) in zip(strain.T, which, strict=True):
-            tensor[:, i, j] = tensor[:, j, i] = value
-        logs, turn = np.linalg.eigh(tensor)
-        now = _with(part, plastic & ~given, plastic=(turn * np.exp(2 * logs)[:, None]) @ turn.swapaxes(1, 2))
-        stretch = (turn * np.exp(logs)[:, None]) @ turn.swapaxes(1, 2)
-        now = _with(now, ~plastic & ~given, prestretch=stretch[:, :stretches, :stretches])
-        stress = materials.effective_stress_3d(now)
-        return now, stress, np.where(free, (stress - target)[(slice(None), *axes)], 0.0)
-
-    largest = over_all(comm, float(np.abs(target).max(initial=0.0)), MPI.MAX)
-    bulk, shear = (materials.table(part, lambda m, name=name: getattr(m, name)) for name in ("bulk", "shear"))
-    mean = np.trace(target, axis1=1, axis2=2) / 3
-    elastic = (target - mean[:, None, None] * np.eye(3)) / (2 * shear)[:, None, None]
-    elastic += (mean / (3 * bulk))[:, None, None] * np.eye(3)
-    if stretches == 2:  # laws without a strain across the plane
-        plane, lam = np.trace(target[:, :2, :2], axis1=1, axis2=2), bulk - 2 * shear / 3
-        alone = target / (2 * shear)[:, None, None] - (lam * plane / (4 * shear * (lam + shear)))[
-            :, None, None
-        ] * np.eye(3)
-        elastic = np.where(plastic[:, None, None], elastic, alone)
-    strain = np.where(free, elastic[(slice(None), *axes)], 0.0)
-    try:
-        for _ in range(MOST):
-            now, stress, missing = off(strain)
-            bad = ~(np.abs(missing).max(axis=1, initial=0.0) <= CLOSE * largest)
-            if not over_all(comm, float(np.nan_to_num(np.abs(missing), nan=np.inf).max(initial=0.0)), MPI.MAX) > (
-                EXACT * largest
-            ):
-                break
-            slopes = np.tile(np.eye(len(which)) * (2 * shear)[:, None, None], (1, 1, 1))
-            for k in range(len(which)):
-                moved = strain + DIFFERENCE * np.eye(len(which))[k]
-                change = (off(moved)[2] - missing) / DIFFERENCE
-                slopes[:, :, k] = np.where(free & free[:, [k]], change, slopes[:, :, k])
-            slopes, missing = (np.nan_to_num(values) for values in (slopes, missing))
-            singular = ~(np.abs(np.linalg.det(slopes / shear[:, None, None])) > 1e-12)
-            slopes[singular] = np.eye(len(which)) * (2 * shear[singular])[:, None, None]
-            strain = np.clip(
-                strain - np.linalg.solve(slopes, missing[:, :, None])[:, :, 0].clip(-LARGEST, LARGEST), -1, 1
-            )
-    except NotConverged:
-        bad = np.ones(len(rows), dtype=bool)
+    plastic = np.isin(law[rows], [k for k, one in enumerate(materials.laws) if "plastic" in one.state])
+    now, stress, bad = _Sought(materials, part, target, given, plastic).found()
     message = "".join(_not_borne(materials, part, target, law[rows], i) for i in np.flatnonzero(bad)[:1])
     if message := first(comm, message):
         raise ValueError(message)
     if "across" in points.data:
-        own = np.nan_to_num(target[:, 2, 2] - stress[:, 2, 2]) if stretches == 2 else 0.0
+        own = np.nan_to_num(target[:, 2, 2] - stress[:, 2, 2]) if materials.grid.stretches == 2 else 0.0
         now = _with(now, ~plastic & ~given, across=own)
     if "plastic" in points.data:
         now = _with(now, plastic, **{"plastic" + AT_REST: now.data["plastic"]})
@@ -264,6 +214,101 @@ def stressed(materials: SceneMaterials, points: MaterialPoints, chosen: NDArray[
     for name, values in now.data.items():
         data[name][rows] = values
     return replace(points, data=data)
+
+
+@dataclass(frozen=True, eq=False)
+class _Sought:
+    """Elastic strains that give target stresses, by Newton's method.
+
+    They are symmetric: of the prestretch, in plane strain without that across the plane, whose stress the law is given,
+    or of C_p^-1.  points: n of them; target : (n, 3, 3), Pa; given, plastic : (n,) which have the stress among their
+    constants, and which have C_p^-1.
+    """
+
+    materials: SceneMaterials
+    points: MaterialPoints
+    target: NDArray[np.float64]
+    given: NDArray[np.bool_]
+    plastic: NDArray[np.bool_]
+
+    @property
+    def components(self) -> tuple[tuple[int, int], ...]:
+        """The k components of a symmetric tensor."""
+        return PLANE if self.points.x.shape[1] == 2 else SPACE
+
+    @property
+    def free(self) -> NDArray[np.bool_]:
+        """Which components (n, k) are sought."""
+        out = np.repeat(~self.given[:, None], len(self.components), axis=1)
+        if self.materials.grid.stretches == 2:
+            out[:, 2] &= self.plastic  # across the plane
+        return out
+
+    def of(self, tensor: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the components (n, k) of tensors (n, 3, 3) that are sought, the others zero."""
+        i, j = np.array(self.components).T
+        return np.where(self.free, tensor[:, i, j], 0.0)
+
+    def moduli(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return bulk and shear moduli (n,), Pa."""
+        bulk, shear = (lambda m, name=name: getattr(m, name) for name in ("bulk", "shear"))
+        return self.materials.table(self.points, bulk), self.materials.table(self.points, shear)
+
+    def linear(self) -> NDArray[np.float64]:
+        """Return the strains (n, k) of a linear law."""
+        (bulk, shear), target, identity = self.moduli(), self.target, np.eye(3)
+        mean = np.trace(target, axis1=1, axis2=2) / 3
+        elastic = (target - mean[:, None, None] * identity) / (2 * shear)[:, None, None]
+        elastic += (mean / (3 * bulk))[:, None, None] * identity
+        if self.materials.grid.stretches == 2:  # laws without a strain across the plane
+            plane, lam = np.trace(target[:, :2, :2], axis1=1, axis2=2), bulk - 2 * shear / 3
+            even = (lam * plane / (4 * shear * (lam + shear)))[:, None, None] * identity
+            alone = target / (2 * shear)[:, None, None] - even
+            elastic = np.where(self.plastic[:, None, None], elastic, alone)
+        return self.of(elastic)
+
+    def off(self, strain: NDArray[np.float64]) -> tuple[MaterialPoints, NDArray[np.float64], NDArray[np.float64]]:
+        """Return points with elastic strains (n, k), their stresses, Pa, and what is missing of the target (n, k)."""
+        tensor = np.zeros((len(strain), 3, 3))
+        for value, (i, j) in zip(strain.T, self.components, strict=True):
+            tensor[:, i, j] = tensor[:, j, i] = value
+        logs, turn = np.linalg.eigh(tensor)
+        elastic = (turn * np.exp(2 * logs)[:, None]) @ turn.swapaxes(1, 2)
+        now = _with(self.points, self.plastic & ~self.given, plastic=elastic)
+        d, stretch = self.materials.grid.stretches, (turn * np.exp(logs)[:, None]) @ turn.swapaxes(1, 2)
+        now = _with(now, ~self.plastic & ~self.given, prestretch=stretch[:, :d, :d])
+        stress = self.materials.effective_stress_3d(now)
+        return now, stress, self.of(stress - self.target)
+
+    def step(self, strain: NDArray[np.float64], missing: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the strains (n, k) after a step from those with which so much is missing, by differences."""
+        count, free, (_, shear) = strain.shape[1], self.free, self.moduli()
+        slopes = np.tile(np.eye(count) * (2 * shear)[:, None, None], (1, 1, 1))
+        for k in range(count):
+            change = (self.off(strain + DIFFERENCE * np.eye(count)[k])[2] - missing) / DIFFERENCE
+            slopes[:, :, k] = np.where(free & free[:, [k]], change, slopes[:, :, k])
+        slopes, missing = (np.nan_to_num(values) for values in (slopes, missing))
+        singular = ~(np.abs(np.linalg.det(slopes / shear[:, None, None])) > 1e-12)
+        slopes[singular] = np.eye(count) * (2 * shear[singular])[:, None, None]
+        change = np.linalg.solve(slopes, missing[:, :, None])[:, :, 0].clip(-LARGEST, LARGEST)
+        return np.clip(strain - change, -1, 1)
+
+    def found(self) -> tuple[MaterialPoints, NDArray[np.float64], NDArray[np.bool_]]:
+        """Return points with the strains, their stresses, Pa, and which (n,) do not have the target."""
+        comm, strain = self.materials.grid.comm, self.linear()
+        largest = over_all(comm, float(np.abs(self.target).max(initial=0.0)), MPI.MAX)
+        now, stress, bad = self.points, self.target, np.ones(len(strain), dtype=bool)
+        try:
+            for _ in range(MOST):
+                now, stress, missing = self.off(strain)
+                bad = ~(np.abs(missing).max(axis=1, initial=0.0) <= CLOSE * largest)
+                most = float(np.nan_to_num(np.abs(missing), nan=np.inf).max(initial=0.0))
+                if not over_all(comm, most, MPI.MAX) > EXACT * largest:
+                    break
+                strain = self.step(strain, missing)
+        except NotConverged:
+            bad = np.ones(len(strain), dtype=bool)
+        return now, stress, bad
 
 
 def strained(materials: SceneMaterials, points: MaterialPoints, moved: MaterialPoints) -> MaterialPoints:
