@@ -200,23 +200,25 @@ def main(argv: list[str] | None = None) -> dict:
 
 def draw(out: Path, dry: dict, wet: dict[float, Undrained]) -> None:
     """Draw pressures in drained cavities, and pore pressures around undrained ones as they dissipate."""
+    from matplotlib.cm import viridis
+
     fig, ((left, right),) = common.figure(1, 2, (12, 4.2))
     for k, (name, found) in enumerate(dry.items()):
         known = DRAINED[name].known
         left.plot(list(known), list(known.values()), "o", color=f"C{k}", mfc="white", ms=8)
         left.plot(list(found), [p for p, _ in found.values()], "x--", color=f"C{k}", lw=0.8, label=name)
     left.set(xlabel="a / a0 (-)", ylabel="p / p0 (-)", title="Drained cavities (crosses), published (circles)")
-    for k, (ratio, run) in enumerate(wet.items()):
+    for mark, (ratio, run) in zip(".+x", wet.items(), strict=False):
         for i, (t, r, p) in enumerate(run.profiles):
-            label = f"OCR {ratio:.0f}, T = {t * CV / OUTER**2:.2g}" if i else f"OCR {ratio:.0f}, undrained"
-            shade = 1 - 0.8 * i / len(run.profiles)
-            right.plot(r, p, ".", ms=1.5, color=f"C{k}", alpha=shade, label=label)
+            what = f"T = {t * CV / OUTER**2:.2g}" if i else "undrained"
+            shade = viridis(0.9 * i / (len(run.profiles) - 1))
+            right.plot(r, p, mark, ms=3, color=shade, label=f"OCR {ratio:.0f}, {what}")
     right.set(
         xlabel="r / a0 (-)", ylabel="pore pressure / p0 (-)", title=f"Undrained to a / a0 = {MARKS[-1]}, then drained"
     )
     for ax in (left, right):
         if ax.has_data():
-            ax.legend(fontsize=8, markerscale=4 if ax is right else 1, ncol=2 if ax is right else 1)
+            ax.legend(fontsize=8, markerscale=2 if ax is right else 1, ncol=2 if ax is right else 1)
         ax.grid(alpha=0.3)
     common.save(fig, out / "cavity.png", dpi=90)
 
