@@ -96,9 +96,7 @@ class Motion:
                 x = (state.stay.x if state.stay else cut.pieces.x) + cut.to_pieces(np.einsum("mk,mkd->md", N, at_nodes))
                 start = state.stay.start if state.stay else cut.to_pieces(self._storage.p_n.x.array[pieces.cells])
                 own = on_grid.pressures_up_to_surface(self._reconstruction, state.stage, t)
-                gained = 1 - determinant(deformed()) / points.J if cut.domains else np.zeros(len(points))
-                points = replace(points, pressure=cut.mean(own), data=points.data | {"gained": gained})
-                ids = points.id[cut.pieces.point]
+                points, ids = replace(points, pressure=cut.mean(own)), points.id[cut.pieces.point]
             _check_inside(cut, points, t)
         stay, held = Stay(cut.points, ids, pressure, x, start), state.held if serves else None
         new = replace(state, t=t, points=points, transported=None, stay=stay, held=held)

@@ -76,20 +76,18 @@ def test_what_cycles_leave_falls_with_the_cell_size():
     assert np.log2(left[0] / left[1]) > 1.2, left
 
 
-def left_of(h, dim=2, beyond=0.0, **wet):
-    """Return what three cycles leave of the effective stress of a cantilever, rms over its peak, from x = beyond on."""
+def left_of(h, dim=2, **wet):
+    """Return what three cycles leave of the effective stress of a cantilever, rms over its peak."""
     grid = mpm.Grid([1.2, *[0.4] * (dim - 2), 1.2], np.rint(np.array([1.2, *[0.4] * (dim - 2), 1.2]) / h).astype(int))
     lower = np.array([0.0, *[0.1] * (dim - 2), 0.6 + h / 2])
     body = mpm.box(grid, lower, np.add(lower, [1.0, *[0.2] * (dim - 2), 0.3]))
     load = mpm.Traction("top", lambda t: [0.0] * (dim - 1) + [-2e4 * (1 - abs(2 * (t % 1) - 1))])
     soil = mpm.Hencky(bulk=1e7 / 3, shear=5e6, conductivity=1.0 if "drained" in wet else 0.0)
     s = mpm.Simulation(grid, [body], [soil], fixed={"left": "xyz"[:dim]}, tractions=[load], **wet)
-    there = s.points.x[:, 0] > beyond
     s.run(0.5, 0.1, progress=False)
     peak = cycles.rms(s)
     s.run(3.0, 0.1, progress=False)
-    stress, volume = s.effective_stress(), s.points.volume0
-    return np.sqrt((volume * there * (stress**2).sum(axis=(1, 2))).sum() / volume.sum()) / peak
+    return cycles.rms(s) / peak
 
 
 DRAINS = {"fluid": mpm.Fluid(), "drained": [mpm.Drained("top"), mpm.Drained("bottom")]}
@@ -103,11 +101,9 @@ def test_what_cycles_leave_falls_with_the_cell_size_draining_and_in_3d_as_well(h
 
 
 @pytest.mark.slow
-def test_undrained_what_is_left_falls_with_the_cell_size_but_at_the_clamp():
-    """Its edges are singular: where nothing changes its volume stresses grow as r^-0.4, cells keep h^0.6 of them."""
-    left = [left_of(h, beyond=0.1, fluid=mpm.Fluid()) for h in (0.06, 0.03)]
-    assert np.log2(left[0] / left[1]) > 1.2, left
-    assert left_of(0.03, fluid=mpm.Fluid()) < 0.0165
+def test_undrained_more_of_the_stress_is_left_as_where_it_is_nearly_incompressible():
+    """At the clamp's edges it falls slowly, 1.1 % with half the cell size: the stress there is singular."""
+    assert left_of(0.03, fluid=mpm.Fluid()) < 0.016
 
 
 def test_a_body_that_turns_by_360_degrees_has_its_stresses_back():

@@ -23,9 +23,7 @@ from mpm_dolfinx.points.grid import Grid
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.validation import numbers
 
-RESERVED = frozenset(
-    "F dF softness gained storage storage_at_one density position displacement porosity0 gradient".split()
-)
+RESERVED = frozenset("F dF softness storage storage_at_one density position displacement porosity0 gradient".split())
 """Names of what points of integration carry beside parameters and state."""
 EVOLVED = 1e-3
 """By how much the state of a law differs from that at rest where it counts as another."""
@@ -116,8 +114,6 @@ class SceneMaterials:
         if prestressed and "plastic" in seeded:
             seeded["plastic" + AT_REST] = seeded["plastic"]
         self._softness: dict[int, SoftnessAtPoints] = {}
-        if fluid is not None:
-            seeded["gained"] = np.zeros(len(points))
         if fluid is not None and self.evolves:
             seeded["softness"] = np.ones(len(points))
             for number, law in enumerate(self.laws):

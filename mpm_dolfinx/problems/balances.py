@@ -59,5 +59,5 @@ def balances(scene: Scene, start: Start, acting: Acting, before: Rates | None = 
     weight = None if acting.gravity is None else scene.fluid.density * acting.gravity
     flow = matrices.flow(start.state, weight, start.data, acting.t)
     lost = before and before.taken(substep.before * dt)
-    options = (on_grid.contents, flow, substep.own * dt, lost, on_grid.softness(start.state), substep.end)
+    options = (on_grid.contents, flow, substep.own * dt, lost, on_grid.softness(start.state))
     return Balances(momentum, StorageProblem(scene.storage, matrices.storage, start.data.pieces, *options))

@@ -226,6 +226,7 @@ class BodyContact(CellContact):
 
 def _matrix(rows: scipy.sparse.csr_matrix, columns: int, comm: MPI.Intracomm, own: bool = False) -> PETSc.Mat:
     """Return a matrix of rows of this process, with so many columns of it; own: that have no entries in others."""
+    rows.sort_indices()  # as PETSc wants them
     start = int(comm.exscan(columns) or 0) if own and comm.size > 1 else 0
     csr = [values.astype(PETSc.IntType) for values in (rows.indptr, rows.indices + start)]
     A = PETSc.Mat().createAIJ(((rows.shape[0], None), (columns, None)), csr=(*csr, rows.data), comm=comm)

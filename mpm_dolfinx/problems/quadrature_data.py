@@ -111,7 +111,7 @@ class QuadraturePoints:
         d = grid.dim
         shapes: dict[str, tuple[int, ...]] = {"F": (grid.stretches, grid.stretches), **scene.shapes}
         if fluid:
-            shapes |= {"biot": (), "storage": (), "storage_at_one": (), "gained": ()}
+            shapes |= {"biot": (), "storage": (), "storage_at_one": ()}
         if weighs:
             shapes |= {"density": ()}
         if extended:
@@ -160,8 +160,6 @@ class QuadraturePoints:
             share = self._scene.locking(points) * self._scene.table(points, lambda m: told_share(m, bool(self._fluid)))
             factor = cell_ratios(cut, points, share, self._scene.evolved(points)) / cut.to_cells(points.J)
             weight, fields["F"] = factor * weight, factor[:, None, None] ** (1 / cut.grid.stretches) * fields["F"]
-            if self._fluid:
-                fields["gained"] = 1 - (1 - fields["gained"]) / factor
         pieces = PointData(self.pieces, places.pieces, weight, fields)
         if not places.parts:
             return QuadratureData(pieces, (pieces,), (slice(None),))
@@ -191,7 +189,7 @@ class QuadraturePoints:
         if self._extended:  # what laws take is known for all materials, and zero in `data` for those of other points
             fields |= {name: rows for name, rows in points.data.items() if name not in self._scene.shapes}
         if self._fluid:
-            fields |= {"storage": self._scene.storage(points), "gained": points.data["gained"]}
+            fields["storage"] = self._scene.storage(points)
         if self._weighs:
             fields["density"] = self._scene.density(points)
         return fields

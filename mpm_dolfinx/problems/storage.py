@@ -13,10 +13,6 @@ aslant, `aslant` adds what centroids that are not across from one another leave 
 fluid balance.  The change of the content is that of `fluid_content`, the integral over the step that of a
 substep of `time_integration`.
 
-Corners of domains follow more than u.  What their volumes have gained by that, beyond J_Delta, is counted in the next
-step, at an even rate: J_Delta + s (1 - J / J_n) in place of J_Delta, J_n the volume ratio that the corners tell, J that
-to which the step before has balanced, s the share of the step that has passed.  So a sealed body keeps its volume.
-
 Q1 with DG0 is not inf-sup stable: where next to nothing flows within a step, checkers of p go unseen.
 Jumps of the step's increment are damped by max(0, tau d - dt kappa / d) A [p - p_n], d = d+ + d-, dt the share of
 the step in which the rate at p counts, so that a
@@ -63,8 +59,7 @@ class StorageForms:
     Parameters
     ----------
     pieces
-        Points of integration with the fields biot, storage and storage_at_one (1/Pa), see `change_of_content`, and
-        gained: share of the volumes that the step before has not counted.
+        Points of integration with the fields biot, storage and storage_at_one (1/Pa), see `change_of_content`.
     displacement
         Increment of the displacement since the start of the step.
     pressure
@@ -107,9 +102,7 @@ class StorageForms:
         delta = ufl.variable(pieces.increment(displacement))
         J = ufl.det(delta)
         strain = pieces.biot * (J - 1)
-        self.passed = fem.Constant(pieces.grid.mesh, 1.0)
-        volume = J + self.passed * pieces.gained  # by which the change of the content is counted
-        stored = change_of_content(pieces.biot, pieces.storage_at_one, pieces.storage, volume, pressure - self.p_n)
+        stored = change_of_content(pieces.biot, pieces.storage_at_one, pieces.storage, J, pressure - self.p_n)
         change = stored * q * pieces.dx
         self._change = PointForm(change, pieces)
         self._capacity = PointForm(ufl.derivative(change, pressure, one), pieces)
@@ -323,8 +316,6 @@ class StorageProblem:
         What the cells lose by the rate of the substep before.
     softness : (m,)
         By how much the pieces are softer than elastic ones, where the forms' soil may be.
-    passed
-        Share of the step that has passed at the end of the substep: of what the volumes have gained.
 
     The pressure at the start of the step is that of `forms.p_n`.
     """
@@ -339,12 +330,10 @@ class StorageProblem:
         dt: float,
         before: Rates | None = None,
         softness: NDArray[np.float64] | float = 1.0,
-        passed: float = 1.0,
     ):
         self.forms, self.system, self.data = forms, system, data
         self._contents, self._flow, self.dt = contents, flow, dt
         self._before = before or Rates(np.empty(0), np.zeros(system.unknowns.size), 0.0, 0.0, 0.0)
-        forms.passed.value = passed
         outflow = flow(before is None)
         system.unknowns.gather(forms.p_n.x.array, system.p_start)
         reach = 4 * forms.grid.h.max() ** 2  # no two centroids are further apart than 2 h

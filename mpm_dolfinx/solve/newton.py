@@ -73,9 +73,8 @@ class Errors:
 
     @property
     def exchanged(self) -> float:
-        """Fluid that changes places, m^d; none where it is what rounding leaves."""
-        fluid = self.fluid
-        return fluid.exchanged if fluid is not None and fluid.exchanged > fluid.round_off else 0.0
+        """Fluid that changes places, m^d."""
+        return self.fluid.exchanged if self.fluid is not None else 0.0
 
 
 def solve_substep(
