@@ -376,6 +376,11 @@ class MomentumProblem:
         """Whether the tangent of one substep may lead the next."""
         return self.forms.elastic and self._sides.tools is None and self._sides.contact is None
 
+    @property
+    def touches(self) -> bool:
+        """Whether there are contacts of groups."""
+        return self._sides.contact is not None
+
     def settle_tools(self, sticks: bool) -> bool:
         """Choose what slips on tools at u, and if asked for what sticks again; return whether it is another choice."""
         if (contact := self._sides.contact) is not None:
