@@ -94,6 +94,7 @@ BENCHMARK = {
     "pressure that follows the surface": {"tractions", "pressures"},
     "ghost penalty on all faces": {"ghost penalty"},
     "rough tool that touches nothing": {"tools"},
+    "contact of groups that are apart": {"contacts"},
     "damping of pressure jumps": {"damping of pressure jumps"},
     "damping of what yields": set(),
     "seepage face": set(),
