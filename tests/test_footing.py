@@ -68,7 +68,7 @@ def test_a_fast_push_carries_what_limit_analysis_says_of_an_embedded_base():
     """From 0.37 widths on it was a sixth too much: the wall beside it, over its base by a hair, drained that soil."""
     run = footing.push(footing.SOIL, 9, 0.5, footing.RATES["fast"], box=(4.0, 2.5), steps=126)
     depth = np.array(run.settlement)
-    for low, high, error in ((0.058, 0.3, 0.04), (0.3, 0.5, 0.07)):
+    for low, high, error in ((0.08, 0.3, 0.04), (0.3, 0.5, 0.05)):  # below 0.08 widths not all of the soil flows
         part = (depth > low) & (depth <= high)
         assert np.array(run.load)[part] == pytest.approx(footing.embedded(depth[part]), rel=error)
 
