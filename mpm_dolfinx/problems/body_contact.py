@@ -14,7 +14,7 @@ are those of `cell_contact`.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -25,57 +25,29 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.caching import Latest
 from mpm_dolfinx.forms.unknowns import Unknowns
-from mpm_dolfinx.parallel.exchange import Exchange, over_all
-from mpm_dolfinx.points.grid import Grid, sum_by
+from mpm_dolfinx.parallel.exchange import Exchange
+from mpm_dolfinx.points.grid import Grid
 from mpm_dolfinx.points.material_points import MaterialPoints
-from mpm_dolfinx.problems.cell_contact import LEAST, TOUCH, CellContact
+from mpm_dolfinx.problems.cell_contact import CellContact, Rows, Touch
 from mpm_dolfinx.problems.contacts import Contact
 
 SLOW, STIFFER = 0.6, 10.0
 """Where a round leaves more than this share of the penetration, k is made so many times larger."""
 
 
-class Rows(NamedTuple):
-    """Pairs, at the owners of the points' cells; arrays over m rows.
+@dataclass(frozen=True, eq=False)
+class PairRows(Rows):
+    """Pairs, at the owners of the points' cells; moduli are the lower ones of both sides, shears act on the points.
 
-    number, cell : (m,) contact, local cell; other : (m,) lexicographic cell of the other side; x, y : (m, d), m, where
-    the grid sees both sides; area : (m,), m^(d-1); resistance, holding : (m,), Pa; pressure : (m,) before the step, Pa;
-    n : (m, d) normal out of the other side; apart, shear : (m, d) from the other side to the point, m, and traction on
-    the point, Pa, at the start of the step.
+    other : (m,) lexicographic cell of the other side; x, y : (m, d), m, where the grid sees both sides; n : (m, d)
+    normal out of the other side; apart : (m, d), m, from the other side to the point at the start of the step.
     """
 
-    number: NDArray[np.int64]
-    cell: NDArray[np.int32]
     other: NDArray[np.int64]
     x: NDArray[np.float64]
     y: NDArray[np.float64]
-    area: NDArray[np.float64]
-    resistance: NDArray[np.float64]
-    holding: NDArray[np.float64]
-    pressure: NDArray[np.float64]
     n: NDArray[np.float64]
     apart: NDArray[np.float64]
-    shear: NDArray[np.float64]
-
-
-class Touch(NamedTuple):
-    """The contact at some displacement: of m rows, and of k conditions, one a contact and cell.
-
-    force : (m, d) on the points, N; push : (m,) pressure, Pa; stiff : (m,) minus its derivative by the gap, Pa/m;
-    pressure : (k,) its mean, Pa; and see `cell_contact.Touch`: sticks (k,), trial, shear (k, d), most (k,), grip
-    (k, d, d), rise (k, d).
-    """
-
-    force: NDArray[np.float64]
-    push: NDArray[np.float64]
-    stiff: NDArray[np.float64]
-    pressure: NDArray[np.float64]
-    sticks: NDArray[np.bool_]
-    trial: NDArray[np.float64]
-    shear: NDArray[np.float64]
-    most: NDArray[np.float64]
-    grip: NDArray[np.float64]
-    rise: NDArray[np.float64]
 
 
 class BodyContact(CellContact):
@@ -98,7 +70,7 @@ class BodyContact(CellContact):
         grid: Grid,
         contacts: Sequence[Contact],
         signs: NDArray[np.float64],
-        rows: Rows,
+        rows: PairRows,
         back: tuple[Exchange, NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]],
     ):
         super().__init__(grid, "contact", contacts, rows, back)
@@ -144,17 +116,7 @@ class BodyContact(CellContact):
         return self._touch(key, make, self.grid.comm)
 
     def _at_w(self, w: NDArray[np.float64]) -> Touch:
-        rows, at, area = self.rows, self.of, self.rows.area
-        gap = np.einsum("md,md->m", rows.n, rows.apart + w)
-        push = np.maximum(0.0, self.pressure[at] - self.stiffness * gap)
-        touches = (push > 0) | (gap <= TOUCH * self.reach)
-        pressure, on = self.mean(push), np.zeros(len(self.area), dtype=bool)
-        on[at[touches]] = True
-        normal = self.mean(rows.n)
-        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), LEAST)
-        friction = _, _, shear, *_ = self.friction(normal, self.mean(w), pressure, on)
-        force = area[:, None] * (push[:, None] * rows.n + shear[at])
-        return Touch(force, push, self.stiffness * touches, pressure, *friction)
+        return self.touch(np.einsum("md,md->m", self.rows.n, self.rows.apart + w), self.rows.n, w)
 
     def push(self, unknowns: Unknowns, u: NDArray[np.float64], residual: PETSc.Vec) -> None:
         """Take the forces of the contact at u off a residual, N."""
@@ -206,7 +168,7 @@ class BodyContact(CellContact):
         """Return cells (m,), lexicographic ones of the other side, places and directions (m, d) of what touches."""
         rows, d = self.rows, self.grid.dim
         gap = np.einsum("md,md->m", rows.n, rows.apart)
-        on = np.flatnonzero((rows.pressure > 0) | (gap <= TOUCH * self.reach))
+        on = np.flatnonzero(self.touches(rows.pressure, gap))
         rough = on[self.strength.any(axis=1)[self.of[on]]]
         all_rows = np.concatenate([on, np.repeat(rough, d)])
         along = np.concatenate([rows.n[on], np.tile(np.eye(d), (len(rough), 1))])
@@ -217,11 +179,8 @@ class BodyContact(CellContact):
 
         Moments count about the origin, with the places of the start of the step.
         """
-        rows, d, count = self.rows, self.grid.dim, len(self.contacts)
-        f, arm = self._signs[rows.number, None] * self.at(unknowns, u).force, rows.x
-        moment = np.cross(arm, f) if d == 3 else (arm[:, 0] * f[:, 1] - arm[:, 1] * f[:, 0])[:, None]
-        columns = np.concatenate([f, moment], axis=1).T
-        return over_all(self.grid.comm, np.stack([sum_by(rows.number, c, count) for c in columns], axis=1))
+        rows = self.rows
+        return self.summed(self._signs[rows.number, None] * self.at(unknowns, u).force, rows.x)
 
 
 def _matrix(rows: scipy.sparse.csr_matrix, columns: int, comm: MPI.Intracomm, own: bool = False) -> PETSc.Mat:

@@ -21,7 +21,7 @@ fro, for there is no stiffness in slip.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 from mpi4py import MPI
@@ -57,6 +57,12 @@ def shear_name(kind: str, number: int) -> str:
     return f"{kind}_{number}_shear"
 
 
+def kept(kind: str, contacts: Sequence[Resisting], n: int, dim: int) -> dict[str, NDArray[np.float64]]:
+    """Return what n points keep of the contacts, zero: pressures (n,) and, of what resists slip, tractions (n, d)."""
+    out = {pressure_name(kind, i): np.zeros(n) for i in range(len(contacts))}
+    return out | {shear_name(kind, i): np.zeros((n, dim)) for i, contact in enumerate(contacts) if contact.grips}
+
+
 class Resisting(Protocol):
     """A tool, or the contact of two groups: mu, adhesion, Pa, and whether it resists slip."""
 
@@ -65,8 +71,9 @@ class Resisting(Protocol):
     grips: bool
 
 
-class Rows(Protocol):
-    """What the rows of any contact have; arrays over m of them.
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Points of integration where surfaces may touch; arrays over m rows in owned cells.
 
     number, cell : (m,) contact, local cell; area : (m,), m^(d-1); resistance, holding : (m,), Pa, see `conditions`;
     pressure, shear : (m,) and (m, d), Pa, before the step.
@@ -81,15 +88,19 @@ class Rows(Protocol):
     shear: NDArray[np.float64]
 
 
-class Touch(Protocol):
-    """What the contact at some displacement has for k conditions, and m rows.
+@dataclass(frozen=True, eq=False)
+class Touch:
+    """The contact at some displacement: of m rows, and of k conditions, one a contact and cell.
 
-    push : (m,) pressure, Pa; pressure : (k,) its mean, Pa; sticks : (k,) what touches, and does not slip; trial,
-    shear : (k, d) traction if all stuck, and as it is, Pa; most : (k,) what it may be, Pa; grip : (k, d, d) minus its
-    derivative by the slip, Pa/m; rise : (k, d) that by the pressure.
+    force : (m, d) on the rows, N; push : (m,) pressure, Pa; stiff : (m,) minus its derivative by the gap, Pa/m;
+    pressure : (k,) mean of the pressure, Pa; sticks : (k,) what touches, and does not slip; trial, shear : (k, d)
+    traction if all stuck, and as it is, Pa; most : (k,) what it may be, Pa; grip : (k, d, d) minus its derivative by
+    the slip, Pa/m; rise : (k, d) that by the pressure.
     """
 
+    force: NDArray[np.float64]
     push: NDArray[np.float64]
+    stiff: NDArray[np.float64]
     pressure: NDArray[np.float64]
     sticks: NDArray[np.bool_]
     trial: NDArray[np.float64]
@@ -150,8 +161,23 @@ class CellContact:
         each = (slice(None), *(None,) * (values.ndim - 1))
         return self.total(self.rows.area[each] * values) / self.area[each]
 
-    def friction(self, n: NDArray, slip: NDArray, pressure: NDArray, on: NDArray) -> tuple:
-        """Return what a `Touch` has from `sticks` on; n (k, d): normals."""
+    def touch(self, gap: NDArray[np.float64], n: NDArray[np.float64], slip: NDArray[np.float64]) -> Touch:
+        """Return the contact for gaps (m,), m, normals (m, d) and slips (m, d), m, of the rows."""
+        push = np.maximum(0.0, self.pressure[self.of] - self.stiffness * gap)
+        touches = self.touches(push, gap)
+        pressure, on, normal = self.mean(push), np.zeros(len(self.area), dtype=bool), self.mean(n)
+        on[self.of[touches]] = True
+        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), LEAST)
+        friction = _, _, shear, *_ = self._friction(normal, self.mean(slip), pressure, on)
+        force = self.rows.area[:, None] * (push[:, None] * n + shear[self.of])
+        return Touch(force, push, self.stiffness * touches, pressure, *friction)
+
+    def touches(self, push: NDArray[np.float64], gap: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return which rows (m,) touch, with pressures (m,), Pa, and gaps (m,), m."""
+        return (push > 0) | (gap <= TOUCH * self._reach)
+
+    def _friction(self, n: NDArray, slip: NDArray, pressure: NDArray, on: NDArray) -> tuple:
+        """Return what a `Touch` has from `sticks` on; n, slip : (k, d), normals and means."""
         P = np.eye(n.shape[1]) - n[:, :, None] * n[:, None, :]
         hold = np.where(self.strength.any(axis=1), self._hold, 0.0) * on
         (mu, adhesion), slips = self.strength.T, self._slips
@@ -217,11 +243,20 @@ class CellContact:
     @property
     def rounding(self) -> float:
         """What rounding of coordinates makes of the forces, N, of this process."""
-        return 1e-15 * float((self.stiffness * self.rows.area).max(initial=0.0)) * self.reach
+        return 1e-15 * float((self.stiffness * self.rows.area).max(initial=0.0)) * self._reach
 
     @property
-    def reach(self) -> float:
+    def _reach(self) -> float:
         return float(np.abs(np.concatenate([self.grid.lower, self.grid.upper])).max())
+
+    def summed(self, force: NDArray[np.float64], arm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return forces and moments (contacts, d + 1) or, in 3D, (contacts, 6), N and N m, of all processes.
+
+        force, arm : (m, d), N and m, of the rows.
+        """
+        cross = np.cross(arm, force) if arm.shape[1] == 3 else arm[:, :1] * force[:, 1:] - arm[:, 1:] * force[:, :1]
+        sums = [sum_by(self.rows.number, column, len(self.contacts)) for column in np.hstack([force, cross]).T]
+        return over_all(self.grid.comm, np.stack(sums, axis=1))
 
     def carried(self, touch: Touch, points: MaterialPoints) -> MaterialPoints:
         """Return the points with the pressures and shear tractions that contacts have on them.

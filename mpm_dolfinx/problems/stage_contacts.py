@@ -26,8 +26,8 @@ from mpm_dolfinx.points.cut_domains import CutDomains
 from mpm_dolfinx.points.cutting import FACES
 from mpm_dolfinx.points.faces import Surface, surface
 from mpm_dolfinx.points.material_points import MaterialPoints
-from mpm_dolfinx.problems.body_contact import BodyContact, Rows
-from mpm_dolfinx.problems.cell_contact import LEAST, pressure_name, shear_name
+from mpm_dolfinx.problems.body_contact import BodyContact, PairRows
+from mpm_dolfinx.problems.cell_contact import LEAST, kept, pressure_name, shear_name
 from mpm_dolfinx.problems.conditions import holding, resistance
 from mpm_dolfinx.problems.contacts import Contact
 from mpm_dolfinx.problems.sides import Sides
@@ -110,12 +110,7 @@ class Contacts:
 
     def grip(self, points: MaterialPoints) -> MaterialPoints:
         """Return points with tractions of the contacts: zero."""
-        n, data = len(points), dict(points.data)
-        for number, contact in enumerate(self.contacts):
-            data[pressure_name("contact", number)] = np.zeros(n)
-            if contact.grips:
-                data[shear_name("contact", number)] = np.zeros((n, self.grid.dim))
-        return replace(points, data=data) if self.contacts else points
+        return replace(points, data={**points.data, **kept("contact", self.contacts, len(points), self.grid.dim)})
 
     def placed(self, cut: CutDomains, points: MaterialPoints) -> BodyContact | None:
         """Return the contact in a step, with the points where they are at its start."""
@@ -146,8 +141,8 @@ class Contacts:
         travel = Exchange(grid.comm, grid.owner(cell))
         cell, other, sent = (travel.send(columns) for columns in (cell, other, values))
         number, *scalars = sent[:, :5].T
-        x, y, *vectors = np.split(sent[:, 5:], 5, axis=1)
-        placed = Rows(number.astype(np.int64), grid.local(cell), other, x, y, *scalars, *vectors)
+        x, y, n, apart, shear = np.split(sent[:, 5:], 5, axis=1)
+        placed = PairRows(number.astype(np.int64), grid.local(cell), *scalars, shear, other, x, y, n, apart)
         back = (travel, at, values[:, 0].astype(np.int64), values[:, 1])
         return BodyContact(grid, self.contacts, self._signs, placed, back)
 

@@ -22,10 +22,10 @@ from mpm_dolfinx.points.cut_domains import CutDomains
 from mpm_dolfinx.points.faces import Surface
 from mpm_dolfinx.points.grid import Grid
 from mpm_dolfinx.points.material_points import MaterialPoints
-from mpm_dolfinx.problems.cell_contact import pressure_name, shear_name
+from mpm_dolfinx.problems.cell_contact import kept, pressure_name, shear_name
 from mpm_dolfinx.problems.conditions import Displacement, holding, resistance
 from mpm_dolfinx.problems.sides import everywhere
-from mpm_dolfinx.problems.tool_contact import Rows, ToolContact
+from mpm_dolfinx.problems.tool_contact import ToolContact, ToolRows
 from mpm_dolfinx.problems.tools import Tool
 from mpm_dolfinx.validation import line
 
@@ -74,9 +74,7 @@ class Tools:
 
     def _kept(self, n: int) -> dict[str, NDArray[np.float64]]:
         """Return what n points keep of the tools, zero."""
-        out = {pressure_name("tool", i): np.zeros(n) for i in range(len(self.tools))}
-        gripping = [i for i, tool in enumerate(self.tools) if tool.grips]
-        return out | {shear_name("tool", i): np.zeros((n, self.grid.dim)) for i in gripping}
+        return kept("tool", self.tools, n, self.grid.dim)
 
     def let_go(self, points: MaterialPoints) -> MaterialPoints:
         """Return points without the tractions of the tools."""
@@ -114,7 +112,8 @@ class Tools:
         travel = Exchange(grid.comm, grid.owner(patches.cell[at]))
         cell, place, sent = (travel.send(rows) for rows in (patches.cell[at], patches.x[at], values))
         number, *own = sent[:, :5].T
-        rows = Rows(number.astype(np.int64), grid.local(cell), *own, *np.split(sent[:, 5:], 3, axis=1))
+        now, carried, shear = np.split(sent[:, 5:], 3, axis=1)
+        rows = ToolRows(number.astype(np.int64), grid.local(cell), *own, shear, now, carried)
         back = (travel, patches.at[at], values[:, 0].astype(np.int64), values[:, 1])
         return ToolContact(grid, self.tools, poses, rows, Places(grid, rows.cell, place), back)
 

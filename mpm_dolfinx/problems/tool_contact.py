@@ -7,7 +7,7 @@ Pressures and friction are those of `cell_contact`.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
 
 from petsc4py import PETSc
 
@@ -17,58 +17,38 @@ from numpy.typing import NDArray
 from mpm_dolfinx.caching import Latest
 from mpm_dolfinx.forms.cell_matrices import insert
 from mpm_dolfinx.forms.point_forms import Places
-from mpm_dolfinx.parallel.exchange import Exchange, over_all
-from mpm_dolfinx.points.grid import Grid, sum_by
+from mpm_dolfinx.parallel.exchange import Exchange
+from mpm_dolfinx.points.grid import Grid
 from mpm_dolfinx.points.material_points import MaterialPoints
-from mpm_dolfinx.problems.cell_contact import LEAST, TOUCH, CellContact
+from mpm_dolfinx.problems.cell_contact import CellContact, Rows, Touch
 from mpm_dolfinx.problems.sides import everywhere
 from mpm_dolfinx.problems.tools import DISTANCE, Distance, Pose, Tool
 from mpm_dolfinx.validation import line
 
 
-class Rows(NamedTuple):
-    """Points of integration on faces that look at tools; arrays over m rows in owned cells.
+@dataclass(frozen=True, eq=False)
+class ToolRows(Rows):
+    """Points of integration on faces that look at tools.
 
-    number, cell : (m,) tool, and local cell; area : (m,), m^(d-1); resistance, holding : (m,), Pa, see `conditions`;
-    pressure : (m,) that the tool had, Pa; now, carried, shear : (m, d) position at the start of the step, where the
-    tool takes what touches it there, m; and shear traction that it had, turned with the tool, Pa.
+    now, carried : (m, d), m, position at the start of the step, and where the tool takes what touches it there; shears
+    have turned with the tool.
     """
 
-    number: NDArray[np.int64]
-    cell: NDArray[np.int32]
-    area: NDArray[np.float64]
-    resistance: NDArray[np.float64]
-    holding: NDArray[np.float64]
-    pressure: NDArray[np.float64]
     now: NDArray[np.float64]
     carried: NDArray[np.float64]
-    shear: NDArray[np.float64]
 
 
-class Touch(NamedTuple):
-    """The contact at some displacement: of m rows, and of k conditions, one a tool and cell.
+@dataclass(frozen=True, eq=False)
+class ToolTouch(Touch):
+    """The contact with tools at some displacement.
 
-    x, n, force : (m, d) place, m, gradient of the distance, force on the body, N; push : (m,) pressure, Pa; stiff :
-    (m,) minus its derivative by the gap, Pa/m; slope : (m, d, d) minus that of the force by the displacement of the row
-    alone, N/m; pressure : (k,) mean of the pressure, Pa; on, sticks : (k,) what touches, and does not slip; trial,
-    shear : (k, d) traction if all stuck, and as it is, Pa; most : (k,) what it may be, Pa; grip : (k, d, d) minus its
-    derivative by the slip, Pa/m; rise : (k, d) that by the pressure.
+    x, n : (m, d) place, m, and gradient of the distance; slope : (m, d, d) minus the derivative of the force by the
+    displacement of the row alone, N/m.
     """
 
     x: NDArray[np.float64]
     n: NDArray[np.float64]
-    force: NDArray[np.float64]
-    push: NDArray[np.float64]
-    stiff: NDArray[np.float64]
     slope: NDArray[np.float64]
-    pressure: NDArray[np.float64]
-    on: NDArray[np.bool_]
-    sticks: NDArray[np.bool_]
-    trial: NDArray[np.float64]
-    shear: NDArray[np.float64]
-    most: NDArray[np.float64]
-    grip: NDArray[np.float64]
-    rise: NDArray[np.float64]
 
 
 class ToolContact(CellContact):
@@ -91,14 +71,14 @@ class ToolContact(CellContact):
         grid: Grid,
         tools: Sequence[Tool],
         poses: Sequence[Pose],
-        rows: Rows,
+        rows: ToolRows,
         places: Places,
         back: tuple[Exchange, NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]],
     ):
         super().__init__(grid, "tool", tools, rows, back)
         self._poses, self.places = poses, places
         self._N = grid.shape_values(rows.cell, places.x)
-        self._touch: Latest[Touch] = Latest()
+        self._touch: Latest[ToolTouch] = Latest()
 
     def _shapes(self, x: NDArray[np.float64]) -> tuple[NDArray, NDArray, NDArray]:
         """Return distances (m,), m, from the tools at places x (m, d), with their first and second derivatives."""
@@ -118,26 +98,19 @@ class ToolContact(CellContact):
         everywhere(self.grid, ask)
         return gap, n, second
 
-    def at(self, u: NDArray[np.float64]) -> Touch:
+    def at(self, u: NDArray[np.float64]) -> ToolTouch:
         """Return the contact at nodal displacements u (nodes, d), m."""
         now = u.copy()
         key = now, self.pressure.copy(), self.along.copy()
         return self._touch(key, lambda: self._at_u(now), self.grid.comm)
 
-    def _at_u(self, u: NDArray[np.float64]) -> Touch:
-        rows, at = self.rows, self.of
+    def _at_u(self, u: NDArray[np.float64]) -> ToolTouch:
+        rows = self.rows
         x = rows.now + np.einsum("mk,mkd->md", self._N, u[self.grid.cell_nodes[rows.cell]])
         distance, n, second = self._shapes(x)
-        push, area = np.maximum(0.0, self.pressure[at] - self.stiffness * distance), rows.area
-        touches = (push > 0) | (distance <= TOUCH * self.reach)
-        stiff, pressure = self.stiffness * touches, self.mean(push)
-        slope = stiff[:, None, None] * n[:, :, None] * n[:, None, :] - push[:, None, None] * second
-        on = self.total(touches.astype(float)) > 0
-        normal = self.mean(n)
-        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), LEAST)
-        friction = _, _, shear, *_ = self.friction(normal, self.mean(x - rows.carried), pressure, on)
-        force = area[:, None] * (push[:, None] * n + shear[at])
-        return Touch(x, n, force, push, stiff, area[:, None, None] * slope, pressure, on, *friction)
+        touch = self.touch(distance, n, x - rows.carried)
+        slope = touch.stiff[:, None, None] * n[:, :, None] * n[:, None, :] - touch.push[:, None, None] * second
+        return ToolTouch(**vars(touch), x=x, n=n, slope=rows.area[:, None, None] * slope)
 
     def settle(self, u: NDArray[np.float64], sticks: bool) -> bool:
         """Choose what slips at u, and if asked for what sticks again; return whether that is another choice."""
@@ -176,12 +149,8 @@ class ToolContact(CellContact):
 
     def forces(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return forces and moments (tools, d + 1) or, in 3D, (tools, 6) of the tools on the bodies, N and N m."""
-        touch, number, d = self.at(u), self.rows.number, self.grid.dim
-        middle = np.array([pose.centre + pose.shift for pose in self._poses])
-        arm, f = touch.x - middle[number], touch.force
-        moment = np.cross(arm, f) if d == 3 else (arm[:, 0] * f[:, 1] - arm[:, 1] * f[:, 0])[:, None]
-        columns = np.concatenate([f, moment], axis=1).T
-        return over_all(self.grid.comm, np.stack([sum_by(number, c, len(self.contacts)) for c in columns], axis=1))
+        touch, middle = self.at(u), np.array([pose.centre + pose.shift for pose in self._poses])
+        return self.summed(touch.force, touch.x - middle[self.rows.number])
 
 
 def _check_distance(tool: Tool, x: NDArray, gap: NDArray, n: NDArray, h: float) -> None:
