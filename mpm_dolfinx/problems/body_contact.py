@@ -125,6 +125,19 @@ class BodyContact(CellContact):
         w.array_w[:] = -force.ravel()
         B.multTransposeAdd(w, residual, residual)
 
+    def pattern(self, unknowns: Unknowns) -> PETSc.Mat:
+        """Return zeros wherever a `tangent` may have entries: scipy leaves those out that are zero at present."""
+        m, d = len(self.rows.cell), self.grid.dim
+        together = scipy.sparse.identity(m)
+        if self.grips:
+            of = scipy.sparse.csr_matrix((np.ones(m), (self.of, np.arange(m))), shape=(len(self.area), m))
+            together = of.T @ of
+        all_of = scipy.sparse.kron(together, np.ones((d, d)), format="csr")
+        B, _ = self.operator(unknowns)
+        out = _matrix(all_of, m * d, self.grid.comm, own=True).PtAP(B)
+        out.zeroEntries()
+        return out
+
     def tangent(self, unknowns: Unknowns, u: NDArray[np.float64]) -> PETSc.Mat:
         """Return minus the derivative of the forces at u."""
         touch, rows, d, comm = self.at(unknowns, u), self.rows, self.grid.dim, self.grid.comm

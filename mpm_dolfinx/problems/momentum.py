@@ -376,11 +376,6 @@ class MomentumProblem:
         """Whether the tangent of one substep may lead the next."""
         return self.forms.elastic and self._sides.tools is None and self._sides.contact is None
 
-    @property
-    def touches(self) -> bool:
-        """Whether there are contacts of groups."""
-        return self._sides.contact is not None
-
     def settle_tools(self, sticks: bool) -> bool:
         """Choose what slips on tools at u, and if asked for what sticks again; return whether it is another choice."""
         if (contact := self._sides.contact) is not None:
@@ -438,7 +433,7 @@ class MomentumProblem:
     def assemble_tangent(self, data: QuadratureData | None = None, firmness: float = 0.0) -> PETSc.Mat:
         """Return the tangent at u, of these pieces or of others, with a share of the elastic shear stiffness."""
         K = self.system.K
-        # the first sum gives K the pattern of both
+        # the first sums give K the pattern of all: PETSc does not always see that it changes later
         first = not K.assembled
         zero(K)
         self.forms.assemble_tangent(K, data or self.data, self._sides)
@@ -446,7 +441,9 @@ class MomentumProblem:
         pattern = PETSc.Mat.Structure
         K.axpy(1.0, self.system.penalty, pattern.UNKNOWN if first else pattern.SUBSET_NONZERO_PATTERN)
         if self._sides.contact is not None:
-            K.axpy(1.0, self._sides.contact.tangent(*self._at), pattern.UNKNOWN)
+            if first:
+                K.axpy(1.0, self._sides.contact.pattern(self.system.unknowns), pattern.UNKNOWN)
+            K.axpy(1.0, self._sides.contact.tangent(*self._at), pattern.SUBSET_NONZERO_PATTERN)
         if firmness > 0:
             K.axpy(firmness, self.system.firm, pattern.SUBSET_NONZERO_PATTERN)
         return K

@@ -120,8 +120,6 @@ class LinearSolvers:
                 K.setNearNullSpace(self._modes)
                 allow_no_diagonal(self.solve_u, K)
             if self._block is None or not self._block.factorised:
-                if momentum.touches:  # its entries are others than before, which PETSc does not always see
-                    self.solve_u.reset()
                 self.solve_u.setOperators(K)
                 self.solve_u.setUp()
             if storage is not None:
