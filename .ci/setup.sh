@@ -61,7 +61,7 @@ debian_install() {
     done
     [ ${#missing[@]} -gt 0 ] || return 0
     if [ "$(id -u)" != 0 ]; then
-        command -v sudo >/dev/null || { without_root "${missing[@]}"; exit 1; }
+        { command -v sudo && sudo true; } >/dev/null || { without_root "${missing[@]}"; exit 1; }
         as_root=(sudo)
     fi
     say "Installing Debian's packages that are missing, by apt-get: ${missing[*]}"
