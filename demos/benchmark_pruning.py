@@ -214,6 +214,12 @@ PAIRS: dict[str, tuple[Make, Make]] = {
         lambda n: restless(n, material=soil(conductivity=1e-4), **WATER),
         lambda n: restless(n, material=soil(conductivity=1e-4), axisymmetric=True, **WATER),
     ),
+    "pores that drain": (
+        lambda n: restless(n, material=soil(conductivity=1e-4, conductivity_law=mpm.unsaturated(1e3)), **WATER),
+        lambda n: restless(
+            n, material=soil(conductivity=1e-4, conductivity_law=mpm.unsaturated(1e3, 1e-4, 0.1)), **WATER
+        ),
+    ),
     "16 times the background grid": (lambda n: restless(n, box=1 + 2 / n), lambda n: restless(n, box=4.0)),
 }
 QUICK = ("files of each step",)

@@ -1,21 +1,22 @@
 # SPDX-License-Identifier: MIT
 """A dam: seepage with a free surface, as the reservoir falls.
 
-A dam of 6 m with slopes of 1:2 on an impervious base.  It begins at rest, with the water of its pores level with the
-reservoir, 5 m.  Then its other slope is opened, and the reservoir falls by a metre at a time, with a while for the flow
-to settle in steps that grow: soil that a large step dries hardly conducts, and stays dry.  Water flows below the free
-surface only (`mpm.unsaturated`); the reservoir presses on the slope that it wets, and both slopes are seepage faces
-above it.  The soil is hard, so that times are short: pores count as full above the free surface too, and what drains as
-that falls is not in the model.
+A dam of 6 m with slopes of 1:2 on an impervious base.  The water of its pores is level with the reservoir, 5 m, when
+its other slope is opened; the flow settles to a steady one.  Then the reservoir falls by 2 m in five days, and the
+free surface follows as the soil drains.  Water flows below the free surface only, and pores lose a tenth of the soil's
+volume as it falls (`mpm.unsaturated`); the reservoir presses on the slope that it wets, and both slopes are seepage
+faces above it.
 
 Check: `flow`, what leaves a rectangular dam (10 m and 2 m of water at its sides, 9.6 m wide) over the exact
-k (H1^2 - H2^2) / (2 L) of Dupuit and Charny, whatever its free surface is; and `steady`, what enters the dam over what
-leaves it, at the highest level.
+k (H1^2 - H2^2) / (2 L) of Dupuit and Charny, whatever its free surface is; `steady`, what enters the dam over what
+leaves it before the reservoir falls; and `drained`, what a column loses until the free surface in it has fallen from
+8 m to 4 m above its base, where the head is 2 m, over the exact one.
 """
 
 from __future__ import annotations
 
 from argparse import Namespace
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import common
@@ -25,14 +26,19 @@ import mpm_dolfinx as mpm
 
 HEIGHT, CREST, SLOPE = 6.0, 3.0, 2.0  # m, m, run over rise
 BASE = CREST + 2 * SLOPE * HEIGHT
-LEVELS = (5.0, 4.0, 3.0)  # m: of the reservoir
-WEIGHT, CONDUCTIVITY = 9810.0, 1e-6  # N/m^3, m/s
-STEPS = (1.0, 10.0, 100.0, 1000.0)  # s: at each level
+LEVELS = (5.0, 3.0)  # m: of the reservoir, before and after
+WEIGHT, CONDUCTIVITY, YIELD = 9810.0, 1e-6, 0.1  # N/m^3, m/s, -
+DAY = 86400.0  # s
+SETTLES = (1e-3, 0.01, 0.1, 1.0, 10.0)  # days: steps until the flow is steady
+FALLS, SEEN = 5.0, (5.0, 15.0, 40.0)  # days: of the reservoir's fall; after it began, when the free surface is drawn
 
 
 @dataclass
 class Dam:
-    """What has been seen at each level: flows at both slopes (m^2/s), corners (n, 4, 2), m, and pressures (n,), Pa."""
+    """What has been seen in steady flow and at each of `SEEN`: flows, corners and pressures.
+
+    flows: (2,), m^2/s, out of both slopes; frames: corners (n, 4, 2), m, and pressures (n,), Pa.
+    """
 
     flows: list[np.ndarray] = field(default_factory=list)
     frames: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)
@@ -40,9 +46,20 @@ class Dam:
     wall: float = 0.0
     steps: int = 0
 
+    def run(self, simulation: mpm.Simulation, days: float, steps: int) -> None:
+        """Run for so many days more, in equal steps."""
+        result = simulation.run(simulation.t + days * DAY, days * DAY / steps, progress=False)
+        self.wall, self.steps = self.wall + result.wall, self.steps + result.steps
+        self.balance = max(self.balance, result.balance)
 
-def run(h: float = 0.5, steps: int = 15) -> Dam:
-    """Lower the reservoir of the dam on cells of size h, m, in so many steps of each length at each level."""
+    def see(self, simulation: mpm.Simulation) -> None:
+        """Keep what is to be seen now."""
+        self.flows.append(simulation.outflows.copy())
+        self.frames.append((simulation.points.corners.copy(), simulation.points.pressure))
+
+
+def run(h: float = 0.5, steps: int = 10) -> Dam:
+    """Lower the reservoir of the dam on cells of size h, m, in so many steps of each length, and of the fall."""
     grid = mpm.Grid([BASE + 2, HEIGHT + 1], np.rint(np.array([BASE + 2, HEIGHT + 1]) / h).astype(int))
 
     def trapezoid(X: np.ndarray) -> np.ndarray:
@@ -50,10 +67,10 @@ def run(h: float = 0.5, steps: int = 15) -> Dam:
         return np.stack([1 + BASE / 2 + (X[:, 0] - BASE / 2) * wide, X[:, 1]], axis=1)
 
     body = mpm.mapped(grid, mpm.box(grid, [0, 0], [BASE, HEIGHT]), trapezoid)
-    law = mpm.unsaturated(0.5 * WEIGHT * h)
+    law = mpm.unsaturated(0.5 * WEIGHT * h, specific_yield=YIELD)
     soil = mpm.LinearElastic(bulk=1e9, shear=5e8, porosity=0.3, conductivity=CONDUCTIVITY, conductivity_law=law)
 
-    def conditions(level: float) -> dict:
+    def conditions(level: float | Callable[[float], float]) -> dict:
         load, head = mpm.water("left", level)
         return {"tractions": [load], "drained": [head, mpm.Drained("right", seepage=True)]}
 
@@ -70,14 +87,16 @@ def run(h: float = 0.5, steps: int = 15) -> Dam:
         **conditions(LEVELS[0]),
     )
     out = Dam()
-    for level in LEVELS:
-        simulation.stage(**conditions(level))
-        for dt in STEPS:
-            result = simulation.run(simulation.t + steps * dt, dt, progress=False)
-            out.wall, out.steps = out.wall + result.wall, out.steps + result.steps
-            out.balance = max(out.balance, result.balance)
-        out.flows.append(simulation.outflows.copy())
-        out.frames.append((simulation.points.corners.copy(), simulation.points.pressure))
+    for days in SETTLES:
+        out.run(simulation, steps * days, steps)
+    out.see(simulation)
+    begun = simulation.t
+    simulation.stage(
+        **conditions(lambda t: np.interp(t, [begun, begun + FALLS * DAY], LEVELS)),
+    )
+    for days in np.diff(SEEN, prepend=0.0):
+        out.run(simulation, days, steps)
+        out.see(simulation)
     return out
 
 
@@ -102,46 +121,77 @@ def rectangular(cells: int) -> float:
     return float(simulation.outflows[1] / (k * (upper**2 - lower**2) / (2 * width)))
 
 
+def drained(cells: int, k: float = 1e-5) -> float:
+    """Return what a column of 10 m, so many cells high, loses as its free surface falls, over the exact one.
+
+    With the heads h of the free surface and H at the base, dh/dt = -k (1 - H / h) / (specific yield).
+    """
+    high, low, head, h = 8.0, 4.0, 2.0, 10.0 / cells
+    grid = mpm.Grid([h, 10.0 + h], [1, cells + 1])
+    law = mpm.unsaturated(0.5 * WEIGHT * h, specific_yield=YIELD)
+    soil = mpm.LinearElastic(bulk=1e9, shear=5e8, porosity=0.3, conductivity=k, conductivity_law=law)
+    simulation = mpm.Simulation(
+        grid,
+        [mpm.box(grid, [0, 0], [h, 10])],
+        [soil],
+        fluid=mpm.Fluid(),
+        fixed={"left": "x", "right": "x", "bottom": "y"},
+        drained=[mpm.Drained("bottom", WEIGHT * head)],
+        gravity=(0, -9.81),
+        pressure=mpm.hydrostatic(high),
+        initial_stress=mpm.K0(0.5),
+        method="backward-euler",
+    )
+    time = YIELD / k * (high - low + head * np.log((high - head) / (low - head)))
+    lost, steps = [], 40
+    simulation.run(time, time / steps, progress=False, observe=lambda s: lost.append(s.outflows[0] * time / steps))
+    return float(sum(lost) / (YIELD * h * (high - low)))
+
+
 def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return what --json prints."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--h", type=float, default=0.5, help="cell size, m")
-    parser.add_argument("--steps", type=int, default=15, help="steps of each length at each level")
-    parser.add_argument("--cells", type=int, default=40, help="cells over the height of the rectangular dam")
+    parser.add_argument("--steps", type=int, default=10, help="steps of each length, and of the fall")
+    parser.add_argument(
+        "--cells", type=int, default=40, help="cells over the height of the rectangular dam, and of the column"
+    )
     o = parser.parse_args(argv)
     if not 0.1 <= o.h <= 1 or o.steps < 1 or not 10 <= o.cells <= 200:
         parser.error(f"--h {o.h} --steps {o.steps} --cells {o.cells}: must be 0.1 to 1 m, >= 1, and 10 to 200")
     with common.results(o) as out:
         flow = rectangular(o.cells)
         print(f"rectangular dam, {o.cells} cells high: flow over the exact one {flow:.4f}", flush=True)
+        column = drained(o.cells)
+        print(f"column, {o.cells} cells high: water lost over the exact one {column:.4f}", flush=True)
         dam = run(o.h, o.steps)
         flows = (
-            [f"{level:g}", *(f"{q:.3e}" for q in (-q[0], q[1]))] for level, q in zip(LEVELS, dam.flows, strict=True)
+            [f"{day:g}", *(f"{q:.3e}" for q in (-q[0], q[1]))] for day, q in zip((0, *SEEN), dam.flows, strict=True)
         )
-        common.table([["reservoir at (m)", "flow in (m²/s)", "flow out (m²/s)"], *flows])
+        common.table([["days of drawdown", "flow in (m²/s)", "flow out (m²/s)"], *flows])
         steady = float(-dam.flows[0][0] / dam.flows[0][1])
         draw(o, dam)
         print(f"{dam.steps} steps, {dam.wall:.1f} s, fluid balance {dam.balance:.1e}")
-        out |= {"flow": flow, "balance": dam.balance, "steady": steady, "wall_s": dam.wall}
+        out |= {"flow": flow, "drained": column, "balance": dam.balance, "steady": steady, "wall_s": dam.wall}
     return out
 
 
 def draw(o: Namespace, dam: Dam) -> None:
-    """Draw pressures at the highest level, and the free surfaces of all."""
+    """Draw pressures in steady flow, and all free surfaces."""
     fig, axes = common.figure(2, 1, (9, 6))
     (corners, p), ax = dam.frames[0], axes[0, 0]
     domains = common.domains(ax, corners, p / 1e3, cmap="viridis", clim=(0, WEIGHT * LEVELS[0] / 1e3))
     fig.colorbar(domains, ax=ax, label="pore pressure (kPa)", shrink=0.8)
     axes[1, 0].plot(*np.array([[1, 0], [13, HEIGHT], [16, HEIGHT], [28, 0], [1, 0]]).T, color="grey", lw=0.8)
-    for k, (level, (corners, p), flows) in enumerate(zip(LEVELS, dam.frames, dam.flows, strict=True)):
+    for k, (day, (corners, p)) in enumerate(zip((0.0, *SEEN), dam.frames, strict=True)):
         for ax in axes[:, 0] if k == 0 else axes[1:, 0]:
-            color = "w" if ax is axes[0, 0] else f"C{k}"
+            level, color = np.interp(day, [0, FALLS], LEVELS), "w" if ax is axes[0, 0] else f"C{k}"
             ax.tricontour(*corners.mean(axis=1).T, p, levels=[0.0], colors=color, linewidths=1.5)
-            ax.plot([0, 1 + SLOPE * level], [level, level], color=f"C{k}", label=f"{1e6 * flows[1]:.2f}")
+            ax.plot([0, 1 + SLOPE * level], [level, level], color=f"C{k}", label=f"{day:g}")
             ax.set(aspect="equal", xlim=(0, BASE + 2), ylim=(0, HEIGHT + 0.5), xlabel="x (m)", ylabel="y (m)")
-    axes[0, 0].set_title("seepage through the dam; white: its free surface, p = 0")
-    axes[1, 0].set_title("free surfaces as the reservoir falls")
-    axes[1, 0].legend(title="10⁻⁶ m²/s seep out", fontsize=9, loc="upper right")
+    axes[0, 0].set_title("steady seepage through the dam; white: its free surface, p = 0")
+    axes[1, 0].set_title("free surfaces as the reservoir falls by 2 m in 5 days")
+    axes[1, 0].legend(title="days", fontsize=9, loc="upper right")
     common.save(fig, o.out / "dam.png")
 
 

@@ -7,6 +7,7 @@ import cryer
 import footing
 import numpy as np
 import pytest
+import ufl
 from helpers import rates, refused_in_one_line
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
@@ -357,6 +358,69 @@ def test_water_under_a_load_flows_as_in_finite_elements():
     assert found[2:] == pytest.approx(truth[2:], rel=0.02)
 
 
+@pytest.mark.parametrize("inner", [0.0, 2.0])
+def test_plates_press_a_cylinder_and_a_ring_evenly(inner):
+    h, low = 0.2, inner + 0.06 * (inner > 0)
+    grid, soil = plane((inner + 1.6, 2.0), (8, 10), (inner, 0)), mpm.Hencky(bulk=1e6 / 3, shear=5e5)
+    bottom, top = 0.4 + 0.37 * h, 1.2 + 0.37 * h
+    body = mpm.box(grid, [low, bottom], [inner + 0.83, top])
+    plates = [mpm.HalfSpace((0, bottom), (0, 1)), mpm.HalfSpace((0, top), (0, -1))]
+    tools = [mpm.Tool(plates[0], friction=0.3), mpm.Tool(plates[1], displacement=lambda t: (0, -0.2 * t))]
+    s = mpm.Simulation(grid, [body], [soil], fixed={}, tools=tools)
+    s.run(1, 0.25)
+    exact = 1e6 * np.log(0.75) / 0.75
+    assert s.effective_stress() == pytest.approx(np.tile(np.diag([0, exact, 0]), (len(body), 1, 1)), abs=-5e-3 * exact)
+    force = exact * np.pi * ((inner + 0.83) ** 2 - low**2)
+    assert s.tool_forces == pytest.approx(np.array([[0, -force, 0], [0, force, 0]]), abs=-1e-4 * force)
+
+
+@pytest.mark.parametrize(("cells", "error"), [(8, 0.015), pytest.param(16, 0.004, marks=pytest.mark.slow)])
+def test_a_ball_meets_the_force_of_hertz(cells, error):
+    """On sides that move as Boussinesq says; 5 or 10 cells over the contact, whose radius is 1/126 of the ball's."""
+    L, R, depth, nu, h = 4.0, 80.0, 0.005, 0.3, 1 / cells
+    grid, top = plane((L + h, L + 1), (4 * cells + 1, 5 * cells + 1), (0, -h)), L + 0.3 * h
+    stiff = 1e6 / (1 - nu**2)
+    force = 4 / 3 * stiff * np.sqrt(R) * depth**1.5
+
+    def far(t, X):
+        r, z = X[:, 0], top - X[:, 1]
+        q = np.hypot(r, z)
+        along = np.stack([r * z / q**2 - (1 - 2 * nu) * r / (q + z), -2 * (1 - nu) - z**2 / q**2], axis=1)
+        return (t**1.5 * force * (1 + nu) / (2 * np.pi * 1e6 * q))[:, None] * along
+
+    sides = [mpm.Displacement(side, far) for side in ("bottom", "right")]
+    ball = mpm.Tool(mpm.Ball((0, top + R), R), displacement=lambda t: (0, -depth * t))
+    soil = mpm.LinearElastic(bulk=1e6 / (3 - 6 * nu), shear=1e6 / (2 + 2 * nu))
+    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [L, top])], [soil], fixed={}, displacements=sides, tools=[ball])
+    s.run(1, 1)
+    assert -s.tool_forces[0, 1] == pytest.approx(force, rel=error)
+
+
+def test_springs_around_a_sphere_hold_it_as_lame_says():
+    """Hollow, of radii 1 and 2 m, under a pressure inside; rms of the displacements."""
+    p, spring, errors, (K, G) = 100.0, 5e5, [], (ELASTIC.bulk, ELASTIC.shear)
+    A, B = np.linalg.solve([[3 * K, -4 * G], [3 * K + 2 * spring, -G / 2 + spring / 4]], [-p, 0])
+
+    def springs(points, u):
+        return spring / 2 * ufl.dot(points.displacement + points.value(u), points.normal) ** 2 * points.dx
+
+    def polar(X):
+        return (1 + X[:, :1]) * np.stack([np.cos(X[:, 1]), np.sin(X[:, 1])], axis=1)
+
+    for cells in (4, 8, 16):
+        grid = plane((2 + 2 / cells,) * 2, (2 * cells + 2,) * 2)
+        body = mpm.mapped(grid, mpm.box(grid, [0, 0], [1, np.pi / 2]), polar)
+        load, term = mpm.Pressure("left", lambda t: p * t), mpm.OnSide("right", springs)
+        soil = mpm.LinearElastic(bulk=K, shear=G)
+        s = mpm.Simulation(grid, [body], [soil], fixed={"bottom": "y"}, tractions=[load], terms=[term])
+        s.run(1, 0.5)
+        X, volume = s.points.origin.mean(axis=1), s.points.volume0
+        r = np.linalg.norm(X, axis=1)
+        moved, exact = np.einsum("ni,ni->n", s.points.x - X, X) / r, A * r + B / r**2
+        errors.append(np.sqrt(volume @ (moved - exact) ** 2 / (volume @ exact**2)))
+    assert errors[-1] < 1e-3 and (rates(errors) > 1.8).all()
+
+
 def test_scenes_of_plane_strain_carry_nothing_of_it():
     grid = mpm.Grid([1.0, 1.0], [4, 4])
     s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 0.5])], [ELASTIC], fixed={"bottom": "xy"})
@@ -395,6 +459,9 @@ def scene(**options):
         (lambda: scene(gravity=lambda t: (t, 0)).step(1.0), "gravity", "1"),
         (lambda: scene(tractions=[mpm.Traction("left", (1, 0))]), "Traction", "axis"),
         (lambda: scene(fixed={}).step(1.0), "fixed", "1 of 1"),
+        (lambda: scene(terms=[mpm.OnSide("left", lambda points, v: points.value(v)[0] * points.dx)]), "OnSide", "axis"),
+        (lambda: scene(tools=[mpm.Tool(mpm.Ball((0, 2), 0.5), (0.1, 0))]), "Tool", "[0.1 0. ]"),
+        (lambda: scene(tools=[mpm.Tool(mpm.Ball((0, 2), 0.5), rotation=lambda t: t)]).step(1.0), "Tool", "turns"),
     ],
 )
 def test_what_axisymmetry_does_not_allow_is_refused_in_one_line(make, name, value):

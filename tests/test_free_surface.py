@@ -1,8 +1,12 @@
 # SPDX-License-Identifier: MIT
 """Flow with a free surface: a conductivity that vanishes above it."""
 
+from functools import partial
+
+import dam as demo
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 import mpm_dolfinx as mpm
 
@@ -50,18 +54,51 @@ def test_between_equal_levels_water_is_at_rest():
     assert cell.pressure == pytest.approx(9810 * (UPPER - cell.x[:, 1]), abs=1e-6 * 9810)
 
 
-def test_what_drains_above_a_surface_that_falls_is_not_known():
-    """It falls at once: pores above it count as full. A limit that the pages tell of."""
-    s = dam(10, heads=(UPPER, UPPER))
-    s.run(20, 20, progress=False)
-    s.stage(drained=[mpm.water(side, lambda t: max(LOWER, UPPER - (t - 20) / 10))[1] for side in ("left", "right")])
-    s.run(120, 10, progress=False)
-    cell = s.cells()
-    assert cell.x[cell.pressure > 0, 1].max() < LOWER + 2 * TOP / 10
-    assert s.outflows.sum() * 100 < 0.01 * 0.3 * WIDTH * (UPPER - LOWER), "the last flow, for all of the time"
+@pytest.mark.parametrize("cells, error", [(20, 0.015), pytest.param(40, 0.007, marks=pytest.mark.slow)])
+def test_a_free_surface_falls_as_fast_as_its_pores_drain(cells, error):
+    """In a column with a head at its base: dh/dt = -k (1 - H / h) / (specific yield)."""
+    assert demo.drained(cells) == pytest.approx(1, abs=error)
 
 
-@pytest.mark.parametrize("arguments, said", [((0.0,), "suction = 0.0"), ((1e3, 1.0), "least = 1.0")])
+@pytest.mark.slow
+def test_a_block_drains_to_its_side_as_boussinesq_says():
+    """Dupuit's horizontal flow, its bank falling from 8 m to 6 m in a tenth of the time: mean of the free surface."""
+    h, length, k, drains, end = 1.0, 40.0, 1e-5, 0.1, 3e6
+    level, cells = partial(np.interp, xp=[0, 0.1 * end], fp=[8.0, 6.0]), 400
+
+    def rate(t, y):
+        y = np.concatenate([[level(t)], y])
+        flow = k * (y[1:] + y[:-1]) / 2 * np.diff(y) * cells / length * np.where(np.arange(cells), 1, 2)
+        return np.diff(flow, append=0.0) * cells / length / drains
+
+    exact = solve_ivp(rate, (0, end), np.full(cells, 8.0), t_eval=[0.25 * end, 0.5 * end], method="BDF", rtol=1e-8)
+    grid, law = mpm.Grid([length + 2, 11], [42, 11]), mpm.unsaturated(0.5 * 9810 * h, specific_yield=drains)
+    soil = mpm.LinearElastic(bulk=1e9, shear=5e8, porosity=0.3, conductivity=k, conductivity_law=law)
+    bodies = [mpm.box(grid, [h, 0], [length + h, 10])]
+    acting = {"drained": [mpm.water("left", level)[1]], "gravity": (0, -9.81), "fixed": {"bottom": "xy"}}
+    start = {"pressure": mpm.hydrostatic(8.0), "initial_stress": mpm.K0(0.3)}
+    s = mpm.Simulation(grid, bodies, [soil], fluid=mpm.Fluid(), **acting, **start)
+    for t, heights in zip(exact.t, exact.y.T, strict=True):
+        s.run(t, end / 40, progress=False)
+        cell = s.cells()
+        x = np.clip((1 + cell.pressure / law.suction) / 2, 0, 1)
+        assert (x**2 * (3 - 2 * x) * cell.volume).sum() / length == pytest.approx(heights.mean(), abs=0.03 * 2)
+
+
+def test_pores_that_do_not_drain_cost_nothing():
+    assert "retention" not in dam(10).scene.pieces.pieces.sizes
+
+
+@pytest.mark.parametrize(
+    "arguments, said",
+    [((0.0,), "suction = 0.0"), ((1e3, 1.0), "least = 1.0"), ((1e3, 0.1, 1.0), "specific_yield = 1.0")],
+)
 def test_what_is_no_such_law_is_refused(arguments, said):
     with pytest.raises(ValueError, match=f"unsaturated: {said}"):
         mpm.unsaturated(*arguments)
+
+
+def test_more_cannot_drain_than_there_is():
+    law = mpm.unsaturated(1e3, specific_yield=0.35)
+    with pytest.raises(ValueError, match=r"porosity = 0\.3, must be >= the specific yield 0\.35"):
+        mpm.LinearElastic(1e9, 5e8, porosity=0.3, conductivity_law=law)

@@ -91,6 +91,7 @@ BENCHMARK = {
     "flux form": FLUX | SECOND,
     "second order in time": SECOND,
     "body force": {"body force"},
+    "pores that drain": {"pores that drain"},
     "pressure that follows the surface": {"tractions", "pressures"},
     "ghost penalty on all faces": {"ghost penalty"},
     "rough tool that touches nothing": {"tools"},

@@ -279,4 +279,5 @@ def sampled(law: Callable) -> list[float | None]:
             out.append(float(apply_algebra_lowering(k)(())))
         except Exception:  # a law need not know numbers, nor these
             out.append(None)
-    return out
+    drains = getattr(law, "specific_yield", 0.0)
+    return out + [drains] * (drains > 0)

@@ -23,7 +23,9 @@ from mpm_dolfinx.points.grid import Grid
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.validation import numbers
 
-RESERVED = frozenset("F dF softness storage storage_at_one density position displacement porosity0 gradient".split())
+RESERVED = frozenset(
+    "F dF softness storage storage_at_one density position displacement porosity0 gradient retention".split()
+)
 """Names of what points of integration carry beside parameters and state."""
 EVOLVED = 1e-3
 """By how much the state of a law differs from that at rest where it counts as another."""
@@ -247,6 +249,19 @@ class SceneMaterials:
     def storage(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the storage coefficient at the points (n,), 1/Pa, of a scene with fluid."""
         return self.table(points, lambda m, n: m.storage(self._fluid.bulk, n), self.porosity(points))
+
+    @property
+    def drains(self) -> bool:
+        """Whether pores drain as a free surface falls."""
+        return any(getattr(law, "specific_yield", 0.0) > 0 for law in self.conductivity_laws)
+
+    def retention(self, points: MaterialPoints) -> NDArray[np.float64]:
+        """Return the specific yield at the points, and the suction, Pa, at which it has drained (n, 2)."""
+        names = {"specific_yield": 0.0, "suction": 1.0}
+        return np.stack(
+            [self.table(points, lambda m, k=k, v=v: getattr(m.conductivity_law, k, v)) for k, v in names.items()],
+            axis=1,
+        )
 
     def density(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the density of soil and pore fluid at the points (n,), kg/m^3."""

@@ -164,6 +164,8 @@ class Skeleton:
         for name in ("conductivity", "grain_density"):
             _check(self, name, lambda v: (0 <= v) & (v < inf), ">= 0 and finite")
         _check(self, "porosity", lambda v: (0 < v) & (v < 1), "in (0, 1)")
+        drains = getattr(self.conductivity_law, "specific_yield", 0.0)
+        _check(self, "porosity", lambda v: v >= drains, f">= the specific yield {drains:g}")
         if not callable(self.porosity):
             n = f" = {self.porosity:g}" if np.ndim(self.porosity) == 0 else ""
             _check(self, "biot", lambda v: (self.porosity <= v) & (v <= 1), f"in [porosity{n}, 1]")
@@ -384,13 +386,21 @@ def kozeny_carman(conductivity, porosity, porosity0):
     return conductivity * (porosity / porosity0) ** 3 * ((1 - porosity0) / (1 - porosity)) ** 2
 
 
-def unsaturated(suction: float, least: float = 1e-4) -> Callable:
-    """Return a conductivity law by which water flows below a free surface only: to be given as `conductivity_law`.
+def filled(p, suction):
+    """Return how full the pores that drain are at a pressure p, Pa, from 0 at -`suction` to 1 at `suction`: a cubic."""
+    x = ufl.max_value(0.0, ufl.min_value(1.0, (1 + p / suction) / 2))
+    return x**2 * (3 - 2 * x)
 
-    The conductivity falls from k at p = `suction` to `least` k at p = -`suction`, by a cubic without kinks.  Pores
-    count as full all the same, and hold their water by suction: the law gives steady flow with a free surface (Bathe
-    and Khoshgoftaar 1979), not how much water drains as that falls.  The conductivity is that of the pressure at the
-    start of each substep: steady flow is reached in steps of some (cell size)^2 / (coefficient of consolidation).
+
+@dataclass(frozen=True, eq=False)
+class unsaturated:
+    """A conductivity law by which water flows below a free surface only: to be given as `conductivity_law`.
+
+    The conductivity falls from k at p = `suction` to `least` k at p = -`suction`, by a cubic without kinks (Bathe and
+    Khoshgoftaar 1979).  By the same cubic pores lose their `specific_yield`; the rest is held by suction, and in the
+    weight all pores are full.  The conductivity is that of the pressure at the start of each substep: steady flow is
+    reached in steps of some (cell size)^2 / (coefficient of consolidation), and a surface that falls or rises passes
+    less than a cell in a step.
 
     Parameters
     ----------
@@ -398,15 +408,24 @@ def unsaturated(suction: float, least: float = 1e-4) -> Callable:
         Pa, > 0: half to once the weight of water over a cell's height.
     least
         In (0, 1).
+    specific_yield
+        Volume of water that drains from a volume of soil as the free surface falls through it, in [0, 1), at most the
+        porosity.  With 0 a surface that falls does so at once, and the law is one of steady flow.
     """
-    numbers("unsaturated: suction", suction, test=lambda v: (0 < v) & (v < inf), allowed="> 0 and finite")
-    numbers("unsaturated: least", least, test=lambda v: (0 < v) & (v < 1), allowed="in (0, 1)")
 
-    def law(conductivity, p):
-        x = ufl.max_value(0.0, ufl.min_value(1.0, (1 + p / suction) / 2))
-        return conductivity * (least + (1 - least) * x**2 * (3 - 2 * x))
+    suction: float
+    least: float = 1e-4
+    specific_yield: float = 0.0
 
-    return law
+    def __post_init__(self):
+        numbers("unsaturated: suction", self.suction, test=lambda v: (0 < v) & (v < inf), allowed="> 0 and finite")
+        numbers("unsaturated: least", self.least, test=lambda v: (0 < v) & (v < 1), allowed="in (0, 1)")
+        drains, allowed = self.specific_yield, "in [0, 1)"
+        numbers("unsaturated: specific_yield", drains, test=lambda v: (0 <= v) & (v < 1), allowed=allowed)
+
+    def __call__(self, conductivity, p):
+        """Return the conductivity, m/s, as UFL."""
+        return conductivity * (self.least + (1 - self.least) * filled(p, self.suction))
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A body from a polygon whose edges have names: gmsh fills it with triangles or quadrilaterals."""
+"""A body from a polygon whose edges have names: gmsh fills it with quadrilaterals."""
 
 from __future__ import annotations
 
@@ -14,9 +14,8 @@ from mpm_dolfinx.parallel.exchange import at_root
 from mpm_dolfinx.points.grid import Grid
 from mpm_dolfinx.points.mesh_files import AS_LATTICE
 from mpm_dolfinx.points.meshes import Mesh, MeshBody, seeded
-from mpm_dolfinx.validation import flag, instance, line, numbers, whole
+from mpm_dolfinx.validation import instance, line, numbers, whole
 
-EDGE = 2.7  # cells over points a cell and direction: edge of triangles whose thirds are as large as those of a `box`
 FLAT = 1e-12  # of its size squared: areas below which three corners of a polygon lie on one line
 
 
@@ -29,7 +28,6 @@ def polygon(
     size: float | None = None,
     per_cell: int = 2,
     material: int = 0,
-    quadrilaterals: bool = False,
 ) -> MeshBody:
     """Seed a polygon, such as a slope or a layer, with points; return the body.
 
@@ -47,11 +45,9 @@ def polygon(
     holes : name -> (k, 2), m
         Corners of holes, such as a tunnel, by the names of their sides.
     size
-        Edge of the triangles or quadrilaterals, m; by default there are per_cell points per cell and direction.
+        Edge of the quadrilaterals, m; by default there are per_cell points per cell and direction.
     per_cell, material
         As for `from_mesh`.
-    quadrilaterals
-        Whether triangles are joined to quadrilaterals, whose stresses are nearer to those of boxes.
 
     Raises
     ------
@@ -75,11 +71,10 @@ def polygon(
     for name, inner in (holes or {}).items():
         inner = _outline(f"hole {name!r}", inner)
         loops.append((inner, [name] * len(inner)))
-    flag("polygon: quadrilaterals", quadrilaterals)
-    default = (1.0 if quadrilaterals else EDGE) * grid.h.min() / whole("body: per_cell", per_cell)
+    default = grid.h.min() / whole("body: per_cell", per_cell)
     edge = float(numbers("polygon: size", default if size is None else size, test=lambda v: (v > 0) & np.isfinite(v)))
     _check_simple([corners for corners, _ in loops])
-    mesh = at_root(grid.comm, lambda: _filled(loops, edge, quadrilaterals))
+    mesh = at_root(grid.comm, lambda: _filled(loops, edge))
     return seeded(grid, mesh, None, per_cell, material, "polygon")
 
 
@@ -166,8 +161,8 @@ def _gmsh() -> Iterator:
             signal.signal(signal.SIGINT, hears)
 
 
-def _filled(loops: Sequence[tuple[NDArray[np.float64], Sequence[str]]], size: float, quadrilaterals: bool) -> Mesh:
-    """Return a polygon, and holes after it, filled with triangles of a size, m, or with quadrilaterals."""
+def _filled(loops: Sequence[tuple[NDArray[np.float64], Sequence[str]]], size: float) -> Mesh:
+    """Return a polygon, and holes after it, filled with quadrilaterals of a size, m, and a triangle where none fits."""
     with _gmsh() as gmsh:
         geo, named, curves = gmsh.model.geo, {}, []
         for corners, names in loops:
@@ -178,8 +173,7 @@ def _filled(loops: Sequence[tuple[NDArray[np.float64], Sequence[str]]], size: fl
                 named.setdefault(name, []).append(tag)
         surface = geo.addPlaneSurface(curves)
         geo.synchronize()
-        if quadrilaterals:
-            gmsh.model.mesh.setRecombine(2, surface)
+        gmsh.model.mesh.setRecombine(2, surface)  # of triangles a third is a kite, whose stress is less exact
         gmsh.model.mesh.generate(2)
         tags, x, _ = gmsh.model.mesh.getNodes()
         number = np.zeros(int(max(tags, default=0)) + 1, dtype=np.int64)

@@ -226,7 +226,8 @@ class CellContact:
             They still do after as many rounds as are tried.
         """
         # what is a sliver of a cell has too little area to be pushed out by itself, and goes with its neighbours
-        whole = np.minimum(1.0, self.area / (SLIVER * self.grid.cell_volume / self.grid.h.max()))
+        plane = self.total(self.rows.area / self.grid.around(x))
+        whole = np.minimum(1.0, plane / (SLIVER * self.grid.cell_volume / self.grid.h.max()))
         off = whole * np.abs(touch.pressure - self.pressure) / self.mean(self.stiffness) / self.grid.h.min()
         most = over_all(self.grid.comm, float(off.max(initial=0.0)), MPI.MAX)
         if most <= DEPTH:
@@ -252,8 +253,10 @@ class CellContact:
     def summed(self, force: NDArray[np.float64], arm: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return forces and moments (contacts, d + 1) or, in 3D, (contacts, 6), N and N m, of all processes.
 
-        force, arm : (m, d), N and m, of the rows.
+        force, arm : (m, d), N and m, of the rows.  In axisymmetry moments are zero, and the radial force is the sum of
+        what acts outward.
         """
+        arm = arm * (not self.grid.axisymmetric)
         cross = np.cross(arm, force) if arm.shape[1] == 3 else arm[:, :1] * force[:, 1:] - arm[:, 1:] * force[:, :1]
         sums = [sum_by(self.rows.number, column, len(self.contacts)) for column in np.hstack([force, cross]).T]
         return over_all(self.grid.comm, np.stack(sums, axis=1))

@@ -108,8 +108,6 @@ class MechanicalBoundary:
             if not callable(condition.value):  # what a function gives is checked when it is called
                 more = {Traction: [d], Pressure: [], Displacement: [np.empty((1, d))]}
                 condition.at(0.0, *more[type(condition)])
-        if self.grid.axisymmetric and (tools or terms):
-            raise ValueError(f"{'tools' if tools else 'terms on sides'}: must be none in axisymmetry")
         self.tools = Tools(self.grid, materials, tools, sides.all, [(hold, faces) for hold, faces, _ in self.holds])
         self.contacts = Contacts(sides, materials, contacts)
         self.symmetric = closed(self.grid, free, self.pressures) and self.tools.symmetric and self.contacts.symmetric

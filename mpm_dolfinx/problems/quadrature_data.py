@@ -112,6 +112,7 @@ class QuadraturePoints:
         shapes: dict[str, tuple[int, ...]] = {"F": (grid.stretches, grid.stretches), **scene.shapes}
         if fluid:
             shapes |= {"biot": (), "storage": (), "storage_at_one": ()}
+            shapes |= {"retention": (2,)} if scene.drains else {}
         if weighs:
             shapes |= {"density": ()}
         if extended:
@@ -176,6 +177,8 @@ class QuadraturePoints:
             if self._fluid:
                 fields["biot"] = self._scene.table(points, lambda m: m.biot)
                 fields["storage_at_one"] = self._scene.table(points, lambda m: m.storage(self._fluid.bulk, 1.0))
+                if self._scene.drains:
+                    fields["retention"] = self._scene.retention(points)
             if self.varies:
                 fields["conductivity"] = self._scene.table(points, lambda m: m.conductivity)
                 fields["porosity0"] = self._scene.table(points, lambda m: m.porosity)

@@ -26,7 +26,7 @@ from mpm_dolfinx.problems.cell_contact import kept, pressure_name, shear_name
 from mpm_dolfinx.problems.conditions import Displacement, holding, resistance
 from mpm_dolfinx.problems.sides import everywhere
 from mpm_dolfinx.problems.tool_contact import ToolContact, ToolRows
-from mpm_dolfinx.problems.tools import Tool
+from mpm_dolfinx.problems.tools import Pose, Tool
 from mpm_dolfinx.validation import line
 
 BEGINS = 1e-2  # cells: how deep a tool may be in a body as it begins, and where a displacement is given
@@ -60,6 +60,8 @@ class Tools:
         self.grid, self._materials, self.tools, self._held = grid, materials, tuple(tools), held
         for tool in self.tools:
             tool.check(grid.dim)
+            if not callable(tool.displacement) and not callable(tool.rotation):
+                self._pose(tool, 0.0)
         self.faces = outside() if self.tools else None
         if self.tools:
             sides = 2 * grid.dim
@@ -71,6 +73,14 @@ class Tools:
     def symmetric(self) -> bool:
         """Whether the tangent is symmetric."""
         return not any(tool.grips for tool in self.tools)
+
+    def _pose(self, tool: Tool, t: float) -> Pose:
+        """Return where a tool is at time t (s); in axisymmetry it goes along the axis."""
+        pose = tool.pose(t, self.grid.dim)
+        if self.grid.axisymmetric and (pose.shift[0] or pose.R[0, 1]):
+            what = f"moves by {pose.shift}{' and turns' * bool(pose.R[0, 1])} at t = {t:g} s"
+            raise ValueError(f"{line(tool)}: {what}, must move by (0, z) and not turn in axisymmetry")
+        return pose
 
     def _kept(self, n: int) -> dict[str, NDArray[np.float64]]:
         """Return what n points keep of the tools, zero."""
@@ -98,9 +108,9 @@ class Tools:
         x, area = patches.now(points), patches.area(points)
         size, free = np.linalg.norm(area, axis=1), self._free[patches.here]
         own = [self._materials.table(cut.points, of)[patches.at] for of in (resistance, holding)]
-        poses, found = [tool.pose(t, d) for tool in self.tools], []
+        poses, found = [self._pose(tool, t) for tool in self.tools], []
         for number, (tool, pose) in enumerate(zip(self.tools, poses, strict=True)):
-            before = tool.pose(start, d)
+            before = self._pose(tool, start)
             n = everywhere(grid, lambda tool=tool, pose=pose: tool.solid(grid.h.min()).normal(pose.own(x)) @ pose.R.T)
             at = np.flatnonzero(free & (np.einsum("md,md->m", area, n) < -FACING * size))
             old = points.data[shear_name("tool", number)][patches.at[at]] if tool.grips else np.zeros((len(at), d))

@@ -37,6 +37,7 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.constitutive.evaluate import ConductivityAtPieces
 from mpm_dolfinx.constitutive.fluid_content import change_of_content
+from mpm_dolfinx.constitutive.skeleton import filled
 from mpm_dolfinx.constitutive.user_functions import compiling
 from mpm_dolfinx.constitutive.user_functions import form as form_of
 from mpm_dolfinx.forms.cell_matrices import ElementForces
@@ -59,7 +60,8 @@ class StorageForms:
     Parameters
     ----------
     pieces
-        Points of integration with the fields biot, storage and storage_at_one (1/Pa), see `change_of_content`.
+        Points of integration with the fields biot, storage and storage_at_one (1/Pa), see `change_of_content`, and
+        where pores drain `retention`: specific yield and suction (Pa), see `unsaturated`.
     displacement
         Increment of the displacement since the start of the step.
     pressure
@@ -103,6 +105,11 @@ class StorageForms:
         J = ufl.det(delta)
         strain = pieces.biot * (J - 1)
         stored = change_of_content(pieces.biot, pieces.storage_at_one, pieces.storage, J, pressure - self.p_n)
+        self.drains = "retention" in pieces.sizes
+        """Whether pores drain as a free surface falls."""
+        if self.drains:
+            drains, suction = pieces.retention
+            stored += drains * (filled(pressure, suction) - filled(self.p_n, suction))
         change = stored * q * pieces.dx
         self._change = PointForm(change, pieces)
         self._capacity = PointForm(ufl.derivative(change, pressure, one), pieces)
@@ -120,8 +127,8 @@ class StorageForms:
 
     @property
     def linear(self) -> bool:
-        """Whether the sources do not depend on the pressure."""
-        return not self._slopes
+        """Whether sources and drained pores do not depend on the pressure."""
+        return not self._slopes and not self.drains
 
     def _sum(self, forms: Sequence[PointForm], data: PointData) -> NDArray[np.float64]:
         """Return the sums of forms in the cells, a local array."""

@@ -301,7 +301,7 @@ class Tool:
     shape : HalfSpace, Ball, Convex, Cone, or callable y (m, d) -> (m,), m
         The solid, as it is before its motion; a function gives the signed distance, positive outside of the tool.
     displacement : (d,) or callable t (s) -> (d,), m
-        Of the tool from there; not since a stage.
+        Of the tool from there; not since a stage.  In axisymmetry along the axis, without a rotation.
     rotation : float or callable t (s) -> float, rad
         In 2D: turn about `centre`, anti-clockwise, before the displacement.
     centre : (d,), m
