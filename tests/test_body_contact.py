@@ -32,6 +32,11 @@ def two_blocks(
     return mpm.Simulation(grid, bodies, [SOIL], fixed=walls, displacements=[held], contacts=contacts, **fluid)
 
 
+def pressed_by(depth, height):
+    """Return the stress of a body between walls that is pressed by a depth."""
+    return E * np.log(1 - depth / height) / (1 - depth / height)
+
+
 @pytest.mark.parametrize(("dim", "offset", "order"), [(2, 0.0, 1), (2, 0.37, -1), (2, 0.98, 1), (3, 0.37, 1)])
 def test_blocks_approach_touch_press_evenly_and_part(dim, offset, order):
     s = two_blocks(offset, dim=dim, order=order)
@@ -45,7 +50,7 @@ def test_blocks_approach_touch_press_evenly_and_part(dim, offset, order):
     s.run(1.0, 0.2, observe=see)
     contact, held = np.array(forces).T
     height, depth = 1 + offset / (8 if dim == 2 else 4), 0.09
-    assert contact[2] == pytest.approx(-E * np.log(1 - depth / height) / (1 - depth / height), rel=1e-3)
+    assert contact[2] == pytest.approx(-pressed_by(depth, height), rel=1e-3)
     assert contact == pytest.approx(held, abs=1e-6)
     assert contact[-1] == 0.0
     assert max(spread) < 1e-6 * contact[2]
@@ -97,6 +102,87 @@ def test_contact_resumes_bit_for_bit_and_keeps_the_fluid(tmp_path, wet, friction
         assert whole.result.balance < 1e-8
 
 
+def heap(wet=False):
+    """Return a block on soil of another group, with fills of the block's group to come."""
+    grid, y = mpm.Grid([1, 2], [4, 8]), 0.5 + 0.3 / 4
+    heights = [(0, y), (y, y + 0.4), (y + 0.4, y + 0.7), (y, y + 0.6)]
+    bodies = [mpm.box(grid, [0, low], [1, high], per_cell=2 + i) for i, (low, high) in enumerate(heights)]
+    soil = mpm.Hencky(bulk=E / 3, shear=E / 2, porosity=0.4, conductivity=1e-5, grain_density=2000)
+    walls, contact = {"bottom": "y", "left": "x", "right": "x"}, mpm.Contact([1, 2, 3], 0, friction=0.2)
+    water = {"fluid": mpm.Fluid(), "drained": [mpm.Drained("bottom", region=([0, 0], [1, 0]))]} if wet else {}
+    given = {"contacts": [contact], "gravity": [0, -10.0], "later": [2, 3], **water}
+    return mpm.Simulation(grid, bodies, [soil], fixed=walls, **given)
+
+
+@pytest.mark.parametrize("wet", [False, True])
+def test_the_contact_bears_what_is_on_it_as_bodies_come_and_go(wet):
+    """In a stage loads change too; wet bodies lose a little of their water's weight as they settle."""
+    s, first, again = heap(wet), len(heap().bodies[0]), 1600.0 if wet else 1200.0
+
+    def weight():
+        return again * s.points.volume0[s.points.id >= first].sum()
+
+    s.run(2e3, 1e3)
+    for t, g, stage in ((4e3, 10, {"add": [2]}), (6e3, 20, {"gravity": [0, -20.0]}), (8e3, 20, {"remove": [2]})):
+        s.stage(**stage)
+        s.run(t, 1e3, after=s.result)
+        assert s.tool_forces[0, 1] == pytest.approx(g * weight(), rel=2e-3 if wet else 1e-6)
+    assert weight() == pytest.approx(0.4 * again, rel=1e-9)
+    s.stage(remove=[1])
+    s.run(1e4, 1e3, after=s.result)
+    assert s.tool_forces.tolist() == [[0.0, 0.0, 0.0]]
+    s.stage(add=[3])
+    s.run(1.2e4, 1e3, after=s.result)
+    assert s.tool_forces[0, 1] == pytest.approx(20 * weight(), rel=2e-3 if wet else 1e-6)
+    assert not wet or s.result.balance < 1e-8
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_a_plate_presses_bodies_of_two_groups_evenly(order):
+    """They stand beside each other, with other spacings; each gives back what it took, and the plate parts."""
+    grid, y = mpm.Grid([2, 2], [8, 8]), 0.85
+    bodies = [mpm.box(grid, [0, 0], [1, y]), mpm.box(grid, [1, 0], [2, y], per_cell=3)][::order]
+    plate = mpm.Tool(mpm.HalfSpace([1, y + 0.01], [0, -1]), displacement=lambda t: (0, -0.1 * np.sin(np.pi * t)))
+    walls = {"bottom": "y", "left": "x", "right": "x"}
+    s = mpm.Simulation(grid, bodies, [SOIL], fixed=walls, contacts=[mpm.Contact(0, 1, friction=0.2)], tools=[plate])
+    s.run(0.5, 0.25)
+    most, least = (2 * pressed_by(depth, y) for depth in (0.09, 0.09 - 5e-4 * grid.h[1]))
+    assert most < s.tool_forces[0, 1] < least  # bodies may reach into plates as far
+    assert np.abs(s.tool_forces[1]).max() < 1e-4 * E  # nothing presses them on each other
+    assert np.ptp(s.effective_stress()[:, 1, 1]) < 1e-3 * E * 0.1
+    s.run(1.0, 0.25, after=s.result)
+    assert s.tool_forces.tolist() == [[0.0, 0.0, 0.0]] * 2
+
+
+def test_a_tool_presses_a_face_that_another_group_lay_on(tmp_path):
+    s = two_blocks(gap=0.0, path=lambda t: 0.5 * min(t, 1))
+    write = mpm.Writer(s, tmp_path)
+    s.run(1.0, 0.25, observe=write)
+    top = s.points.corners[s.points.id < len(s.bodies[0]), :, 1].max()
+    plate = mpm.Convex([[-0.5, top], [1.5, top], [1.5, top + 0.2], [-0.5, top + 0.2]])
+    s.stage(tools=[mpm.Tool(plate, displacement=lambda t: (0, -0.1 * (t - 1)))])
+    s.run(2.0, 0.5)
+    assert s.tool_forces[:, 1] == pytest.approx([pressed_by(0.1, top), 0], rel=1e-3)
+
+
+@pytest.mark.parametrize(("wet", "friction"), [(False, 0.0), (True, 0.5)])
+def test_a_block_on_soil_at_rest_stays_there(wet, friction):
+    """Level: exactly; with an edge: as still as the balance at the start is."""
+    density = 1600.0 if wet else 1200.0
+    soil = mpm.Hencky(bulk=E / 3, shear=E / 2, porosity=0.4, conductivity=1e-6, grain_density=2000)
+    for width, still in ((1.0, 1e-12), (0.6, 1e-5)):
+        grid, y = mpm.Grid([1, 2], [8, 16]), 0.55
+        bodies = [mpm.box(grid, [0, 0], [1, y]), mpm.box(grid, [0, y], [width, y + 0.6], per_cell=3)]
+        water = {"fluid": mpm.Fluid(), "pressure": mpm.hydrostatic(y + 0.6, 1e4)} if wet else {}
+        rest = {"gravity": [0, -10], "initial_stress": mpm.K0(1.0), "contacts": [mpm.Contact(1, 0, friction=friction)]}
+        walls = {"bottom": "xy", "left": "x", "right": "x"}
+        s = mpm.Simulation(grid, bodies, [soil], fixed=walls, **rest, **water)
+        before = s.points.x.copy()
+        s.run(20.0, 10.0)
+        assert np.abs(s.points.x - before).max() < still * grid.h.min()
+        assert s.tool_forces[0, 1] == pytest.approx(10 * density * 0.6 * width, rel=1e-3)
+
+
 def test_what_are_no_contacts_is_refused():
     grid = mpm.Grid([1, 2], [4, 8])
     boxes = [mpm.box(grid, [0, y], [1, y + 0.5]) for y in (0, 0.5, 1.0)]
@@ -123,8 +209,8 @@ def test_what_are_no_contacts_is_refused():
         scene(boxes[:2], mpm.Contact(0, 1), tractions=[mpm.Traction("left", 0.0)])
     with pytest.raises(ValueError, match=r"quadrature 'point': must be domain with contacts"):
         scene(boxes[:2], mpm.Contact(0, 1), quadrature="point")
-    with pytest.raises(ValueError, match=r"tools: must be none with contacts"):
-        scene(boxes[:2], mpm.Contact(0, 1), tools=[mpm.Tool(mpm.Ball([0.5, 3], 0.5))])
+    with pytest.raises(ValueError, match=r"terms: must be none with contacts"):
+        scene(boxes[:2], mpm.Contact(0, 1), terms=[lambda at: 0])
     with pytest.raises(ValueError, match=r"is free to move as a rigid body in 1 of 3 ways"):
         scene(boxes[:2], mpm.Contact(0, 1), gravity=[0, -10]).step(1.0)  # slides
     with pytest.raises(ValueError, match=r"is free to move as a rigid body in 3 of 3 ways"):
@@ -133,5 +219,3 @@ def test_what_are_no_contacts_is_refused():
     s = mpm.Simulation(grid, boxes[:2], [sand], fixed={"bottom": "xy"}, contacts=[mpm.Contact(0, 1)], gravity=[0, -10])
     with pytest.raises(ValueError, match=r"factor_of_safety: contacts: must be none"):
         mpm.factor_of_safety(s)
-    with pytest.raises(ValueError, match=r"stage: remove: must be none in a scene with contacts"):
-        s.stage(remove=[1])

@@ -378,9 +378,9 @@ class MomentumProblem:
 
     def settle_tools(self, sticks: bool) -> bool:
         """Choose what slips on tools at u, and if asked for what sticks again; return whether it is another choice."""
-        if (contact := self._sides.contact) is not None:
-            return contact.settle(*self._at, sticks)
-        return self._sides.tools is not None and self._sides.tools.settle(self.forms.nodal, sticks)
+        tools, contact = self._sides.tools, self._sides.contact
+        of_tools = tools is not None and tools.settle(self.forms.nodal, sticks)
+        return (contact is not None and contact.settle(*self._at, sticks)) or of_tools
 
     @property
     def _at(self) -> tuple[Unknowns, NDArray[np.float64]]:
@@ -388,9 +388,9 @@ class MomentumProblem:
 
     def augment_tools(self) -> bool:
         """Shift the pressures of tools that penetrate too deep; return whether the balance is another one since."""
-        if (contact := self._sides.contact) is not None:
-            return contact.augment(*self._at)
-        return self._sides.tools is not None and self._sides.tools.augment(self.forms.nodal)
+        tools, contact = self._sides.tools, self._sides.contact
+        of_tools = tools is not None and tools.augment(self.forms.nodal)
+        return (contact is not None and contact.augment(*self._at)) or of_tools
 
     def guesses(self) -> list[NDArray[np.float64]]:
         """Return displacements (local unknowns,), m, at which Newton's method may begin.

@@ -7,7 +7,6 @@ The contact itself is in `body_contact`.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 from mpi4py import MPI
@@ -20,6 +19,7 @@ from mpm_dolfinx.caching import Latest
 from mpm_dolfinx.constitutive.fields import SceneMaterials
 from mpm_dolfinx.errors import NotConverged
 from mpm_dolfinx.parallel.exchange import Exchange, first, over_all
+from mpm_dolfinx.points.bodies import Body
 from mpm_dolfinx.points.contact import BITS, local, weights
 from mpm_dolfinx.points.cut_domains import DEPTH as UNDER
 from mpm_dolfinx.points.cut_domains import CutDomains
@@ -95,9 +95,9 @@ class Contacts:
         signs = []
         for contact in self.contacts:
             both = contact.groups(len(sides.bodies))
-            there = [[i in group and bool(here) for i, here in enumerate(sides.present)] for group in both]
-            faces = [surface(sides.bodies, None, None, some) for some in there]
-            swap = (faces[1].area0.sum(), faces[1].id[0]) < (faces[0].area0.sum(), faces[0].id[0])
+            faces = [sides.around(group) for group in both]
+            whole = [_extent([sides.bodies[i] for i in group]) for group in both]
+            swap = whole[1] < whole[0]  # the same in all stages, and in any order of the bodies
             self._faces.append((faces[1], faces[0]) if swap else (faces[0], faces[1]))
             signs.append(-1.0 if swap else 1.0)
         self._signs = np.array(signs)
@@ -108,9 +108,9 @@ class Contacts:
         """Whether the tangent is symmetric."""
         return not any(contact.grips for contact in self.contacts)
 
-    def grip(self, points: MaterialPoints) -> MaterialPoints:
-        """Return points with tractions of the contacts: zero."""
-        return replace(points, data={**points.data, **kept("contact", self.contacts, len(points), self.grid.dim)})
+    def kept(self, n: int) -> dict[str, NDArray[np.float64]]:
+        """Return what n points keep of the contacts, zero."""
+        return kept("contact", self.contacts, n, self.grid.dim)
 
     def placed(self, cut: CutDomains, points: MaterialPoints) -> BodyContact | None:
         """Return the contact in a step, with the points where they are at its start."""
@@ -169,6 +169,9 @@ class Contacts:
         x, area = patches.now(points), patches.area(points)
         n = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), LEAST)
         count = min(CANDIDATES[d], len(facets.x))
+        if not count:  # bodies of the other group are not there
+            none = np.zeros(0, dtype=np.int64)
+            return facets, Pairs(none, none, np.zeros((0, 2)), np.zeros(0))
         reach = REACH * self.grid.h.min() + self.grid.h.max()
         _, near = cKDTree(facets.x).query(x, range(1, count + 1), distance_upper_bound=reach)
         row, column = np.nonzero(near < len(facets.x))
@@ -197,7 +200,7 @@ class Contacts:
         """
         out, reach = np.zeros(corners.shape[:2], dtype=bool), BESIDE * self.grid.h.max()
         for pair in self._faces:
-            for own, other in (pair, pair[::-1]):
+            for own, other in (pair, pair[::-1]) if all(map(len, pair)) else ():
                 x = self._facets(cut, other, points).x
                 mine = np.flatnonzero(self.grid.copy(points.id) == self.grid.copy(own.id[:1]))
                 distance, _ = cKDTree(x).query(corners[mine], distance_upper_bound=reach)
@@ -216,13 +219,32 @@ class Contacts:
         moved = np.linalg.norm(points.corners - before.corners, axis=2).max(initial=0.0) if self.contacts else 0.0
         if self.contacts and 2 * over_all(comm, float(moved), MPI.MAX) > REACH * h:
             raise NotConverged(f"contacts: bodies move by more than {REACH / 2:g} cells in a step")
+        if message := self._too_deep(cut, points):
+            raise NotConverged(message)
+
+    def check_start(self, cut: CutDomains, points: MaterialPoints, t: float) -> None:
+        """Refuse groups that are in each other as a stage begins at time t (s)."""
+        if message := self._too_deep(cut, points):
+            raise ValueError(f"{message}, at t = {t:g} s as it begins, must touch or be apart")
+
+    def _too_deep(self, cut: CutDomains, points: MaterialPoints) -> str:
+        """Return where groups are too deep in each other, and how deep; nothing where they are not."""
+        h, comm = self.grid.h.min(), self.grid.comm
         for contact, (faces, others) in zip(self.contacts, self._faces, strict=True):
             _, pairs = self._met(cut, faces, others, points)
             deepest = over_all(comm, float(pairs.gap.min(initial=np.inf)), MPI.MIN)
             if deepest < -BEGINS * h:
                 row = pairs.row[pairs.gap == deepest][:1]
                 where = first(comm, "".join(f"{x}" for x in cut.surface(faces).now(points)[row]))
-                raise NotConverged(f"{line(contact)}: bodies are {-deepest / h:.3g} cells in each other at {where}")
+                return f"{line(contact)}: bodies are {-deepest / h:.3g} cells in each other at {where}"
+        return ""
+
+
+def _extent(bodies: Sequence[Body]) -> tuple:
+    """Return what orders groups of bodies by their surfaces, and equal ones by where they are seeded."""
+    area = surface(bodies, None).area0.sum()
+    corners = np.concatenate([body.corners().reshape(-1, body.dim) for body in bodies])
+    return float(f"{area:.9g}"), *corners.min(axis=0), *corners.max(axis=0)
 
 
 def _turned(shear: NDArray[np.float64], n: NDArray[np.float64]) -> NDArray[np.float64]:
