@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Contact of groups of bodies: gaps carry nothing, pressed bodies are even, friction, fluid, restart, refusals."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -15,7 +17,7 @@ def two_blocks(
     offset=0.37, gap=0.01, path=lambda t: -0.1 * min(1, 2.5 * t, 2.5 * (1 - t)), dim=2, wet=False, order=1, **contact
 ):
     """Return two blocks between walls, the upper one on a given path, their face so many cells off the grid."""
-    n = 8 if dim == 2 else 4
+    n = 8 if dim == 2 else 3
     low, high, y = [0.0] * (dim - 1), [1.0] * (dim - 1), 0.5 + offset / n
     grid = mpm.Grid([*high, 2.0], [n] * (dim - 1) + [2 * n])
     lower = mpm.box(grid, [*low, 0], [*high, y], per_cell=2)
@@ -49,7 +51,7 @@ def test_blocks_approach_touch_press_evenly_and_part(dim, offset, order):
 
     s.run(1.0, 0.2, observe=see)
     contact, held = np.array(forces).T
-    height, depth = 1 + offset / (8 if dim == 2 else 4), 0.09
+    height, depth = 1 + offset / (8 if dim == 2 else 3), 0.09
     assert contact[2] == pytest.approx(-pressed_by(depth, height), rel=1e-3)
     assert contact == pytest.approx(held, abs=1e-6)
     assert contact[-1] == 0.0
@@ -66,24 +68,66 @@ def test_a_gap_far_below_a_cell_carries_nothing():
     assert s.tool_forces.tolist() == [[0.0, 0.0, 0.0]]
 
 
-def pushed(share, mu=0.3):
-    """Return by how much a block on a deformable one, pushed by so much of its weight, slides in 5 steps."""
-    grid = mpm.Grid([3, 2], [24, 16])
+def pushed(share, **contact):
+    """Return by how much a block on another one, pushed by so much of 400 Pa, slides in 5 steps under 1 kPa."""
+    grid = mpm.Grid([3, 2], [12, 8])
     lower, upper = mpm.box(grid, [0.3, 0], [2.7, 0.55]), mpm.box(grid, [1, 0.55], [1.8, 0.95], per_cell=3)
-    load = mpm.Traction("top", lambda t: (share * 1e3 * min(t, 1), -1e3), region=([0, 0.8], [3, 2]))
-    contact = mpm.Contact(1, 0, friction=mu)
-    s = mpm.Simulation(grid, [lower, upper], [SOIL], fixed={"bottom": "xy"}, tractions=[load], contacts=[contact])
+    load = mpm.Traction("top", lambda t: (share * 300 * min(t, 1), -1e3), region=([0, 0.8], [3, 2]))
+    contacts = [mpm.Contact(1, 0, **contact)]
+    s = mpm.Simulation(grid, [lower, upper], [SOIL], fixed={"bottom": "xy"}, tractions=[load], contacts=contacts)
     s.run(1.0, 0.25)
-    assert s.tool_forces[0, :2] == pytest.approx([-share * 0.8e3, 0.8e3], rel=1e-6)
+    assert s.tool_forces[0, :2] == pytest.approx([-share * 0.8 * 300, 0.8e3], rel=1e-6)
     before = s.points.x[:, 0].copy()
     s.run(2.0, 0.25, after=s.result)
     return np.abs(s.points.x[:, 0] - before).max()
 
 
-def test_a_block_sticks_below_the_coefficient_of_friction_and_slides_above():
-    assert pushed(0.2985) < 1e-4
+@pytest.mark.parametrize("contact", [{"friction": 0.3}, {"friction": 0.1, "adhesion": 200.0}])
+def test_a_block_sticks_below_what_friction_and_adhesion_bear_and_slides_above(contact):
+    assert pushed(0.995, **contact) < 1e-4
     with pytest.raises(mpm.GaveUp):  # no equilibrium
-        pushed(0.3015)
+        pushed(1.005, **contact)
+
+
+def stack(order):
+    """Return places and forces of three blocks of three groups on one another, pressed aslant, in some order."""
+    grid, heights = mpm.Grid([1.6, 2], [8, 10], lower=[-0.3, 0]), [0, 0.43, 0.97, 1.5]
+    made = [([0, low], [1, high]) for low, high in pairwise(heights)]
+    bodies = [mpm.box(grid, *made[i], per_cell=2 + i, material=i) for i in order]
+    soils = [mpm.Hencky(bulk=e / 3, shear=e / 2) for e in (E, 100 * E, 3 * E)]
+    low, mid, top = (order.index(i) for i in range(3))
+    contacts = [mpm.Contact(top, mid, friction=0.1), mpm.Contact(mid, low, friction=0.3), mpm.Contact(low, top)]
+    held = mpm.Displacement("top", lambda t, X: (0.02 * t, -0.1 * t), region=([0, 1.4], [1, 2]))
+    s = mpm.Simulation(grid, bodies, soils, fixed={"bottom": "xy"}, displacements=[held], contacts=contacts)
+    s.run(1.0, 0.5)
+    start = np.cumsum([0, *(len(body) for body in bodies)])
+    return np.concatenate([s.points.x[start[i] : start[i + 1]] for i in (low, mid, top)]), s.tool_forces
+
+
+def test_three_groups_do_the_same_in_any_order():
+    (x, forces), (other, exchanged) = stack([0, 1, 2]), stack([2, 0, 1])
+    assert other == pytest.approx(x, abs=1e-12)
+    assert exchanged == pytest.approx(forces, abs=1e-9 * E)
+    assert forces[0, :2] == pytest.approx(
+        forces[1, :2], abs=1e-6 * E
+    )  # what the lowest bears is what the highest presses
+    assert forces[2].tolist() == [0.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize(("stiff", "spacings"), [((100, 1), (1, 5)), ((1, 100), (1, 5)), ((100, 1), (5, 1))])
+def test_a_block_over_the_seam_of_two_others_presses_them_evenly(stiff, spacings):
+    """Three groups meet in one cell; blocks are a hundred times as stiff as others, or five times as fine."""
+    grid, (low, high) = mpm.Grid([1, 2], [8, 16]), (0.55, 1.05)
+    below = [mpm.box(grid, a, b, per_cell=spacings[0]) for a, b in (([0, 0], [0.53, low]), ([0.53, 0], [1, low]))]
+    above = mpm.box(grid, [0, low], [1, high], per_cell=spacings[1], material=1)
+    soils = [mpm.Hencky(bulk=k * E / 3, shear=k * E / 2) for k in stiff]
+    press = mpm.Traction("top", (0, -1e4), region=([0, 1], [1, 2]))
+    contacts = [mpm.Contact(2, 0, friction=0.2), mpm.Contact(1, 2), mpm.Contact(0, 1)]
+    walls = {"bottom": "y", "left": "x", "right": "x"}
+    s = mpm.Simulation(grid, [*below, above], soils, fixed=walls, tractions=[press], contacts=contacts)
+    s.run(1.0, 1.0)
+    assert s.effective_stress()[:, 1, 1] == pytest.approx(np.full(len(s.points), -1e4), rel=1e-3)
+    assert s.tool_forces[:, 1] == pytest.approx([5.3e3, -4.7e3, 0], abs=1)
 
 
 @pytest.mark.parametrize(("wet", "friction"), [(False, 0.3), (True, 0.3)])
