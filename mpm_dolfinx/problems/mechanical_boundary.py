@@ -157,8 +157,8 @@ class MechanicalBoundary:
             forces[: len(self.tools.tools)] = sides.tools.forces(nodal)
             points = sides.tools.gripped(nodal, points)
         if sides.contact is not None:
-            forces[len(self.tools.tools) :] = sides.contact.forces(unknowns, u)
-            points = sides.contact.gripped(unknowns, u, points)
+            forces[len(self.tools.tools) :] = sides.contact.now.forces(unknowns, u)
+            points = sides.contact.now.gripped(unknowns, u, points)
         return forces, points
 
     def data(self, forms: SideForms, cut: CutDomains, start: float, t: float, points: MaterialPoints) -> SideData:
