@@ -263,3 +263,52 @@ def test_what_are_no_contacts_is_refused():
     s = mpm.Simulation(grid, boxes[:2], [sand], fixed={"bottom": "xy"}, contacts=[mpm.Contact(0, 1)], gravity=[0, -10])
     with pytest.raises(ValueError, match=r"factor_of_safety: contacts: must be none"):
         mpm.factor_of_safety(s)
+
+
+def test_a_block_slides_off_the_edge_of_another():
+    """In no step does it come into the other one; smooth, it meets no force along its path until it falls off."""
+    grid = mpm.Grid([2.2, 1.2], [22, 12])
+    bodies = [mpm.box(grid, [0.2, 0], [1.1, 0.53]), mpm.box(grid, [0.4, 0.53], [0.8, 0.93], per_cell=3)]
+    path = mpm.Displacement("top", lambda t, X: (0.1 * max(0, t - 1), -0.01 * min(t, 1)), region=([0, 0.9], [2.2, 1.2]))
+    gel = mpm.Hencky(bulk=1e6, shear=6e5)
+    s = mpm.Simulation(grid, bodies, [gel], fixed={"bottom": "xy"}, displacements=[path], contacts=[mpm.Contact(1, 0)])
+    forces, deepest = [], []
+
+    def see(s):
+        contacts, cut = s.state.stage.mechanical.contacts, s.scene.last[0].cut
+        deepest.append(-min(pairs.gap.min(initial=0.0) for _, pairs in contacts._met_all(cut, s.points)))
+        forces.append(s.tool_forces[0, :2])
+
+    s.run(9.0, 0.5, observe=see)
+    along, normal = np.abs(forces).T
+    assert max(deepest) < 1e-3 * grid.h.min()
+    assert (along[2:6] < 0.01 * normal[2:6]).all() and (normal[2:6] > 0.8 * normal[1]).all()
+    assert forces[-1].tolist() == [0.0, 0.0]
+
+
+@pytest.mark.parametrize("share", [0.995, 1.005])
+def test_a_block_on_a_slope_of_another_body_slips_where_its_tangent_is_the_coefficient_of_friction(share):
+    """The slope is aslant to the grid; gravity turns until the block should not slip yet, or should."""
+    (c, s), mu = (np.cos(0.25), np.sin(0.25)), 0.3
+    turn = np.array([[c, -s], [s, c]])
+    grid = mpm.Grid([3, 2], [18, 12])
+    flat = mpm.box(grid, [0, 0], [1.8, 0.4]), mpm.box(grid, [0.6, 0.4], [1.2, 0.6], per_cell=3)
+    bodies = [mpm.mapped(grid, body, lambda x: x @ turn.T + (0.6, 0.1)) for body in flat]
+    held = mpm.Displacement("bottom", (0, 0), region=([-0.1, -0.1], [1.9, 0.1]))
+    rock = mpm.Hencky(bulk=1e8, shear=6e7, grain_density=2000, porosity=0.4)
+
+    def gravity(t):
+        angle = np.arctan(mu * share * min(t, 1))
+        return turn @ [-10 * np.sin(angle), -10 * np.cos(angle)]
+
+    options = {"fixed": {}, "displacements": [held], "gravity": gravity}
+    scene = mpm.Simulation(grid, bodies, [rock], contacts=[mpm.Contact(1, 0, friction=mu)], **options)
+    if share > 1:
+        with pytest.raises(mpm.GaveUp):
+            scene.run(1.0, 0.25)
+        assert scene.t * share == pytest.approx(1, rel=5e-3)
+    else:
+        scene.run(1.0, 0.25)
+        before = scene.points.x.copy()
+        scene.run(6.0, 0.25, after=scene.result)
+        assert np.abs(scene.points.x - before).max() < 1e-5 * grid.h.min()

@@ -38,6 +38,8 @@ from mpm_dolfinx.validation import line
 
 REACH = 2.0
 """Cells: what is farther apart cannot touch within a step; steps in which bodies move farther are refused."""
+CLEAR = 0.5
+"""Cells: what is farther apart will not touch before pairs are found anew."""
 DEEP = 0.25
 """Cells: what is deeper is behind a thin body."""
 CANDIDATES = {2: 8, 3: 24}
@@ -123,14 +125,14 @@ class Contacts:
             return None
         found = self._found(cut.key, lambda: self._met_all(cut, cut.points), self.grid.comm)
         reach = partial(self._reach, cut.key, partial(self._cells_within_reach, cut, found), self.grid.comm)
-        first = self._contact(cut, points, found, cut.points, points, reach)
+        begun = self._contact(cut, points, found, cut.points, points, reach)
 
         def again(u: NDArray[np.float64]) -> BodyContact:
             moved, _ = cut.followed(u.reshape(-1, self.grid.dim), np.zeros(len(self.grid.node_x), dtype=bool))
             there = replace(points, corners=points.corners + moved)
             return self._contact(cut, points, self._met_all(cut, there), there, there, reach)
 
-        return Following(first, again)
+        return Following(begun, again)
 
     def _contact(
         self,
@@ -150,6 +152,12 @@ class Contacts:
         for number, ((faces, others), (facets, pairs)) in enumerate(zip(self._faces, found, strict=True)):
             patches = cut.surface(faces)
             now = facets if there is seen else self._facets(cut, others, there)
+            cell = self._under(facets, pairs.facet, _on(facets.cut[pairs.facet], pairs.t))
+            if there is not points:
+                near = np.isin(patches.cell[pairs.row] * len(grid.owners) + cell, reach())
+                slides = not near[pairs.gap < CLEAR * grid.h.min()].all()
+                off += f"{line(self.contacts[number])}: bodies slide by more than a cell" * slides
+                pairs, cell = Pairs(*(values[near] for values in pairs)), cell[near]
             row, other, at = pairs.row, pairs.facet, patches.at[pairs.row]
             y, where = (_on(corners[other], pairs.t) for corners in (now.corners, facets.cut))
             area = patches.area(there)[row]
@@ -164,10 +172,7 @@ class Contacts:
             place = number * PLACES + row + grid.comm.rank * len(self.contacts) * PLACES
             scalars = np.stack([np.full(len(row), number), place, size, *moduli, pressure], axis=1)
             apart = patches.now(there)[row] - y
-            cell = self._under(facets, other, where)
             rows.append((patches.cell[row], cell, at, np.hstack([scalars, patches.x[row], where, n, apart, old])))
-            far = ~np.isin(patches.cell[row] * len(grid.owners) + cell, reach()) if there is not points else []
-            off += "".join(f"{line(self.contacts[number])}: bodies slide by more than a cell" for _ in range(any(far)))
         if off := first(grid.comm, off):
             raise NotConverged(off)
         cell, other, at, values = (np.concatenate(column) for column in zip(*rows, strict=True))
