@@ -23,9 +23,9 @@ simulation = mpm.Simulation(
     contacts=[mpm.Contact([1, 2], 0, friction=0.2)],
     later=[2],
 )
-simulation.run(1.0, 0.5, progress=False)
-simulation.stage(add=[2], tools=[mpm.Tool(mpm.Ball([1.03, 0.7], 0.08), displacement=lambda t: (0, -0.03 * (t - 1)))])
-result = simulation.run(2.0, 0.5, progress=False)
+simulation.run(0.5, 0.5, progress=False)
+simulation.stage(add=[2], tools=[mpm.Tool(mpm.Ball([1.03, 0.7], 0.08), displacement=lambda t: (0, -0.08 * (t - 0.5)))])
+result = simulation.run(1.0, 0.5, progress=False)
 points = simulation.points
 data = (points.data["contact_0_shear"], points.data["contact_0_pressure"])
 parts = simulation.grid.comm.gather((points.id, points.x, points.pressure, *data))

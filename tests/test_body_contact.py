@@ -312,3 +312,27 @@ def test_a_block_on_a_slope_of_another_body_slips_where_its_tangent_is_the_coeff
         before = scene.points.x.copy()
         scene.run(6.0, 0.25, after=scene.result)
         assert np.abs(scene.points.x - before).max() < 1e-5 * grid.h.min()
+
+
+@pytest.mark.slow
+def test_a_disc_rolls_between_two_bodies():
+    """Held at first, then only by friction: it goes half as far as what lies on it, and turns as far as that."""
+    n, R, y = 8, 0.5, 1.3
+    grid, c, on = mpm.Grid([4, 2], [4 * n, 2 * n]), np.array([1.5, y - R]), ([1, 0.75], [1.1, 0.85])
+    round_off = lambda x: c + (x - c) * np.sqrt(1 - ((x - c) / R)[:, ::-1] ** 2 / 2)  # noqa: E731
+    disc = mpm.mapped(grid, mpm.box(grid, c - R, c + R), round_off)
+    bodies = [mpm.box(grid, [0.5, 0], [3.5, 0.3]), disc, mpm.box(grid, [0.5, y], [3, 1.6])]
+    gel, contacts = mpm.Hencky(bulk=1e6, shear=6e5), [mpm.Contact(*pair, friction=0.5) for pair in ((1, 0), (2, 1))]
+    press = mpm.Displacement("top", lambda t, X: (0.6 * max(0, t - 1), -0.03 * min(t, 1)), region=([0, 1.5], [4, 2]))
+    hold = mpm.Displacement("left", lambda t, X: (0, -0.015 * t), region=on)
+    contacts.append(mpm.Contact(0, 2))
+    s = mpm.Simulation(grid, bodies, [gel], fixed={"bottom": "xy"}, displacements=[hold, press], contacts=contacts)
+    s.run(1.0, 0.25)
+    s.stage(displacements=[press])
+    mine = (s.points.id >= len(bodies[0])) & (s.points.id < len(bodies[0]) + len(disc))
+    before = s.points.x[mine]
+    s.run(2.0, 0.125)
+    way = s.points.x[mine].mean(axis=0) - before.mean(axis=0)
+    a, b = before - before.mean(axis=0), s.points.x[mine] - s.points.x[mine].mean(axis=0)
+    angle = np.arctan2((a[:, 1] * b[:, 0] - a[:, 0] * b[:, 1]).sum(), (a * b).sum())
+    assert (way[0], angle) == (pytest.approx(0.3, rel=5e-3), pytest.approx(0.6, rel=1e-2))
