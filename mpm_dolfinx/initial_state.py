@@ -87,6 +87,8 @@ def balanced(scene: Scene, state: State) -> State:
             if left <= scene.scheme.tolerance:
                 break
             solve_substep(solvers, problem, None, partial(start.on_grid.as_reset, seeded), count, report)
+            if seeded.stage.mechanical.touches:
+                start, seeded = _pressed(scene, start, seeded, unknowns)
             seen = [*seen[-DEPTH:], (w, forms.u.x.array.copy())]
             w, count = _mixed(unknowns, seen), count + 1
             forms.u.x.array[:] = w
@@ -103,6 +105,14 @@ def balanced(scene: Scene, state: State) -> State:
     tell = warn if changed > REMARKABLE * largest or left > REMARKABLE else log
     tell(comm, what, count, changed, largest, left)
     return replace(start.state, points=points, held=held)
+
+
+def _pressed(scene: Scene, start: Start, state: State, unknowns: Unknowns) -> tuple[Start, State]:
+    """Return start and state with what tools and contacts have on the points at the present displacement."""
+    mechanical, acting, cut = state.stage.mechanical, start.acting[-1], start.on_grid.cut
+    _, points = mechanical.touched(acting.sides, unknowns, scene.momentum.u.x.array, state.points)
+    sides = mechanical.data(scene.momentum.sides, cut, state.t, state.t, points)
+    return start._replace(acting=[acting._replace(sides=sides)]), replace(state, points=points)
 
 
 def _problem(scene: Scene, start: Start, state: State) -> MomentumProblem:

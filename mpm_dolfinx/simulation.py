@@ -53,7 +53,7 @@ class Simulation:
     tractions, displacements, drained, inflows, plates
         Boundary conditions on sides of the bodies; other sides are free and sealed.
     tools, contacts
-        Rigid tools that press on the bodies; or groups of bodies that press on each other, see `Contact`.
+        Rigid tools that press on the bodies; groups of bodies that press on each other, see `Contact`.
     gravity : (d,) or callable t -> (d,), m/s^2
         Acceleration of gravity; in axisymmetry along the axis.
     pressure
@@ -114,8 +114,7 @@ class Simulation:
         scheme = Scheme(coupling, tolerance)
         check_parts(grid, bodies, materials, later)
         check_options(fluid, pressure, terms, sources, quadrature)
-        other = {"tools": tools, "initial_stress": initial_stress, "later": later, "terms": terms, "sources": sources}
-        grid = grouped(grid, bodies, contacts, quadrature, other)
+        grid = grouped(grid, bodies, contacts, quadrature, {"terms": terms, "sources": sources})
         grid.share(np.concatenate([body.centre for body in bodies]))
         warn_thin(grid, bodies, with_axis(grid, fixed), fluid is not None)
         check_axisymmetry(grid, bodies, quadrature)
@@ -185,7 +184,7 @@ class Simulation:
 
     @property
     def tool_forces(self) -> NDArray[np.float64]:
-        """(tools, d + 1), in 3D (tools, 6): force and moment of each `Tool`, or `Contact`, on the bodies."""
+        """(tools + contacts, d + 1), in 3D (..., 6): force and moment of each `Tool`, then `Contact`, on the bodies."""
         return self.state.tool_forces
 
     @property

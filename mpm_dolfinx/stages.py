@@ -19,6 +19,7 @@ from mpm_dolfinx.points.fills import put, touches
 from mpm_dolfinx.points.grid import sum_by
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.points.pressure_transport import at_start
+from mpm_dolfinx.problems.cell_contact import let_go
 from mpm_dolfinx.problems.stage import CONDITIONS, Stage, stage
 from mpm_dolfinx.scene import Scene
 from mpm_dolfinx.state import State
@@ -37,7 +38,7 @@ def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int
         transported = pieces_at_start(scene, points) if callable(scene.initial.pressure) else at_start(points)
     reactions = np.zeros((len(begun.mechanical.holds), scene.grid.dim))
     outflows = np.zeros(len(begun.hydraulic.outlets))
-    points, forces = begun.mechanical.contacts.grip(begun.mechanical.tools.grip(points)), begun.mechanical.forces(0.0)
+    points, forces = begun.mechanical.grip(points), begun.mechanical.forces(0.0)
     return State(0.0, points, transported, None, 0, reactions, outflows, forces, begun, True, None, None, None)
 
 
@@ -57,8 +58,6 @@ def begin_stage(
     chosen("stage: remove", remove, np.flatnonzero(before.present).tolist(), "bodies that are present")
     chosen("stage: add", add, list(before.later), "bodies that are to come later")
     flag("stage: reset_displacement", reset_displacement)
-    if before.conditions["contacts"] and (remove or named.get("tools")):
-        raise ValueError(f"stage: {'remove' if remove else 'tools'}: must be none in a scene with contacts")
     present = [(here and body not in remove) or body in add for body, here in enumerate(before.present)]
     later = [body for body in before.later if body not in add]
     begun = _stage(scene, {**before.conditions, **named}, present, later)
@@ -68,12 +67,13 @@ def begin_stage(
         state = scene.motion.left_grid(state, scene.on_grid(state.stay.points))
     gone, transported = _ids(scene.bodies, remove), state.transported
     there = [body for body, here in enumerate(before.present) if here and body not in remove]
-    bare, gravity = before.mechanical.tools.let_go(state.points), None
+    bare, gravity = before.mechanical.let_go(state.points), None
     if scene.initial.given:
         gravity = begun.gravity_at(state.t)
     bare = _without_extra(scene, bare, add, fields) if add else bare
     points, new = _filled(scene, bare.of(gone, kept=False), there, add, gravity)
-    points = begun.mechanical.tools.grip(points, None if "tools" in named else state.points)
+    kept = let_go(state.points, before.mechanical.tools.kept(0)) if "tools" in named else state.points
+    points = begun.mechanical.grip(points, kept)
     if transported is not None:
         transported = transported.of(gone, kept=False).joined(at_start(new))
     points = _changed(scene, points, fields)

@@ -66,8 +66,8 @@ class State:
         Forces of the given displacements in the last step; nan before the first one of a stage.
     outflows : (drained sides, then inflows), m^3/s (m^2/s in plane strain)
         What leaves the bodies through them at the end of the last step; nan before the first one of a stage.
-    tool_forces : (tools, d + 1) in 2D, (tools, 6) in 3D, N and N m (N/m and N in plane strain)
-        Forces and moments by which tools act on the bodies in the last step; nan before the first one of a stage.
+    tool_forces : (tools + contacts, d + 1), in 3D (..., 6), N and N m (N/m and N in plane strain)
+        Forces and moments of tools, then contacts, on the bodies in the last step; nan before the first one of a stage.
     stage
         The conditions in force.
     begins

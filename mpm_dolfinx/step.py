@@ -24,7 +24,7 @@ def set_up(scene: Scene, state: State, dt: float) -> Start:
     on_grid = scene.on_grid(cut_points)
     place = partial(stage.mechanical.data, scene.momentum.sides, on_grid.cut, state.t)
     if state.begins:
-        stage.mechanical.tools.check_start(on_grid.cut, state.points, state.t)
+        stage.mechanical.check_start(on_grid.cut, state.points, state.t)
     sides, data = [place(t, state.points) for t in times], on_grid.data_of(state)
     as_cut = partial(place, times[-1], cut_points) if state.stay else partial(sides.__getitem__, -1)
     matrices = scene.assembled(on_grid, stage, as_cut, state.begins)
@@ -43,17 +43,13 @@ def step(scene: Scene, state: State, dt: float) -> tuple[State, Report]:
         both, key = balances(scene, start, acting, *rates[-1:]), (on_grid.key, state.stage, acting.substep.own * dt)
         rates.append(solve_substep(solvers, *both, as_reset, key, report))
     note_pressures(report, solvers, both.storage, acting.substep.before * dt, dt, rates)
-    tools, nodal = state.stage.mechanical.tools, scene.momentum.nodal
-    reactions = state.stage.mechanical.reactions(acting.sides, nodal)
+    mechanical, at = state.stage.mechanical, (start.matrices.momentum.unknowns, scene.momentum.u.x.array)
+    reactions = mechanical.reactions(acting.sides, scene.momentum.nodal)
     outflows = both.storage.outflows(len(state.stage.hydraulic.outlets)) if both.storage else state.outflows
     new, report.rederived = scene.motion.advanced(state, on_grid, start.data, state.t + dt)
     velocity = None if scene.momentum.elastic else scene.momentum.u.x.array / dt
     now = {"reactions": reactions, "outflows": outflows, "velocity": velocity}
-    if (contact := acting.sides.tools) is not None:
-        tools.check_end(on_grid.cut, new.points, new.t)
-        now |= {"tool_forces": contact.forces(nodal), "points": contact.gripped(nodal, new.points)}
-    if (contact := acting.sides.contact) is not None:
-        state.stage.mechanical.contacts.check_end(on_grid.cut, new.points, state.points)
-        at = start.matrices.momentum.unknowns, scene.momentum.u.x.array
-        now |= {"tool_forces": contact.forces(*at), "points": contact.gripped(*at, new.points)}
+    mechanical.check_end(on_grid.cut, new.points, state.points, new.t)
+    forces, points = mechanical.touched(acting.sides, *at, new.points)
+    now |= {"tool_forces": forces, "points": points}
     return replace(new, **now, resets=state.resets + (state.stay is None), begins=False), report

@@ -84,13 +84,14 @@ class Writer:
         flag("writer: grid", grid)
         folder, comm, self._t = path("writer: folder", folder), simulation.grid.comm, simulation.t
         self.every, self._simulation = whole("writer: every", every), simulation
+        tools = simulation.state.stage.conditions["tools"]
         self._acting = simulation.reactions, simulation.outflows, simulation.tool_forces  # at the start
         with on_disk("writer: folder", "one that can be written"):
             at_root(comm, lambda: _lock(folder))
             self._table = Table(comm, folder / "history.csv", self._t)
             self._points = Series(comm, folder / "points.pvd", self._t)
             self._grid = Series(comm, folder / "grid.pvd", self._t) if grid else None
-            self._tools = Series(comm, folder / "tools.pvd", self._t) if len(simulation.tool_forces) else None
+            self._tools = Series(comm, folder / "tools.pvd", self._t) if tools else None
             at_root(comm, lambda: (folder / "fields.txt").write_text(text()))
             if not self._points.entries:
                 self._write_points(simulation)

@@ -162,6 +162,14 @@ def surface(
     return Surface(*map(np.concatenate, zip(*found, strict=True)), box)
 
 
+def joined(surfaces: Sequence[Surface]) -> Surface:
+    """Return the faces of several surfaces, of other bodies each, as one."""
+    names = [f.name for f in fields(Surface) if f.name != "region"]
+    rows = {name: np.concatenate([getattr(one, name) for one in surfaces]) for name in names}
+    order = np.argsort(rows["id"], kind="stable")
+    return Surface(**{name: values[order] for name, values in rows.items()}, region=surfaces[0].region)
+
+
 def _face_corners(body: Body, row: NDArray[np.int64], face: NDArray[np.int64]) -> NDArray[np.float64]:
     """Return the reference positions (m, 2^(d-1), d), m, of the corners of faces."""
     return np.take_along_axis(body.reference(row), FACES[body.dim][face][:, :, None], axis=1)

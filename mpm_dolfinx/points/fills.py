@@ -106,7 +106,8 @@ def put(
         if depth:
             what = f"stage: add: body {fill}: body {other} has moved into it, {depth:.3g} m deep at {x}"
             raise ValueError(f"{what}; must be seeded where nothing is by now")
-        if not touching:
+        together = grid.copies == 1 or np.ptp(grid.copy(np.array([_start(bodies, i) for i in (other, fill)]))) == 0
+        if together and not touching:
             warn_near(grid, f"bodies {other} and {fill}", gap, x)
     mine = corners[new.id - _start(bodies, fill)]
     if (mine == new.corners).all():

@@ -2,18 +2,19 @@
 """Contact of groups of bodies: no penetration, Coulomb friction, adhesion.
 
 The points of integration on the surface of one group, the one with the smaller surface, look along their normals for
-the faces of the other.  Places and normals of these pairs are found when the grid is reset, gaps at the start of each
-step.  In a step the gap is linear in the displacements: with w = B u, how both sides of the pairs move apart,
+the faces of the other.  With w = B u, how both sides of the pairs move apart in the step,
 
-    g = g_n + n . w,      p = <lambda - k g>,      forces B^T f,
+    g = g_m + n . (w - w_m),      p = <lambda - k g>,      forces B^T f,
 
-so the forces on both bodies are equal and opposite to rounding, whatever the iterations leave.  Pressure and friction
+so the forces on both bodies are equal and opposite to rounding, whatever the iterations leave.  Pairs, normals n and
+gaps g_m are at first those of the start of the step, with w_m = 0.  What balances with them is balanced anew with those
+of where it has come to, until gaps are those of the faces at the end of the step.  Pressure and friction
 are those of `cell_contact`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from mpi4py import MPI
@@ -25,12 +26,14 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.caching import Latest
 from mpm_dolfinx.forms.unknowns import Unknowns
-from mpm_dolfinx.parallel.exchange import Exchange
+from mpm_dolfinx.parallel.exchange import Exchange, over_all
 from mpm_dolfinx.points.grid import Grid
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.problems.cell_contact import CellContact, Rows, Touch
 from mpm_dolfinx.problems.contacts import Contact
 
+SAME_GAP, FOLLOWS = 5e-4, 8
+"""Cells: by how much gaps may differ from those of faces at the end of a step; how often pairs are found at most."""
 SLOW, STIFFER = 0.6, 10.0
 """Where a round leaves more than this share of the penetration, k is made so many times larger."""
 
@@ -40,7 +43,8 @@ class PairRows(Rows):
     """Pairs, at the owners of the points' cells; moduli are the lower ones of both sides, shears act on the points.
 
     other : (m,) lexicographic cell of the other side; x, y : (m, d), m, where the grid sees both sides; n : (m, d)
-    normal out of the other side; apart : (m, d), m, from the other side to the point at the start of the step.
+    normal out of the other side; apart : (m, d), m, from the other side to the point where the pairs were found;
+    place : (m,) number of the point, the same for all pairs that it has in a step.
     """
 
     other: NDArray[np.int64]
@@ -48,6 +52,7 @@ class PairRows(Rows):
     y: NDArray[np.float64]
     n: NDArray[np.float64]
     apart: NDArray[np.float64]
+    place: NDArray[np.int64]
 
 
 class BodyContact(CellContact):
@@ -63,6 +68,8 @@ class BodyContact(CellContact):
         The pairs.
     back
         See `CellContact`.
+    reach
+        Returns in which pairs of cells the pairs of this process's points may be in the step, see `Contacts`.
     """
 
     def __init__(
@@ -72,9 +79,12 @@ class BodyContact(CellContact):
         signs: NDArray[np.float64],
         rows: PairRows,
         back: tuple[Exchange, NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]],
+        reach: Callable[[], NDArray[np.int64]],
     ):
         super().__init__(grid, "contact", contacts, rows, back)
-        self._signs = signs
+        self._signs, self._reach_of_pairs = signs, reach
+        self._apart = rows.apart.copy()  # at no displacement
+        self._raised = np.ones(1)
         self._off = np.full(1, np.inf)  # cells: what has penetrated in the round before
         self._operator: Latest[tuple[PETSc.Mat, PETSc.Vec]] = Latest()
         self._touch: Latest[Touch] = Latest()
@@ -83,25 +93,30 @@ class BodyContact(CellContact):
         """Return B, which gives how far pairs move apart (m d,), m, from the unknowns, and room for its product."""
 
         def make() -> tuple[PETSc.Mat, PETSc.Vec]:
-            grid, rows, d = self.grid, self.rows, self.grid.dim
-            numbers = unknowns.map.indices.reshape(-1, d)
-            travel = Exchange(grid.comm, grid.owner(rows.other))
-            there = travel.back(numbers[grid.cell_nodes[grid.local(travel.send(rows.other))]])
-            column = np.concatenate([numbers[grid.cell_nodes[rows.cell]], there], axis=1)
+            grid, rows = self.grid, self.rows
             index = np.stack(np.unravel_index(rows.other % grid.cells, tuple(grid.shape)), axis=1)
             off = (rows.y - grid.lower) / grid.h - index - 0.5
             other = np.prod(0.5 + off[:, None] * grid.signs, axis=2)
             value = np.concatenate([grid.shape_values(rows.cell, rows.x), -other], axis=1)
-            value = np.broadcast_to(value[:, None], (len(value), d, value.shape[1]))
-            column, m = column.swapaxes(1, 2), len(rows.cell) * d
-            row = np.broadcast_to(np.arange(m).reshape(-1, d, 1), column.shape)
-            kept = column >= 0
-            shape, own = (m, max(1, unknowns.global_size)), (row[kept], column[kept])
-            csr = scipy.sparse.csr_matrix((value[kept], own), shape=shape)
-            B = _matrix(csr, unknowns.size, grid.comm)
+            B = self._of_nodes(unknowns, rows.cell, rows.other, value)
             return B, B.createVecLeft()
 
         return self._operator(unknowns, make, self.grid.comm)
+
+    def _of_nodes(
+        self, unknowns: Unknowns, cell: NDArray[np.int32], other: NDArray[np.int64], value: NDArray[np.float64]
+    ) -> PETSc.Mat:
+        """Return the matrix with values (m, 2 * 2^d) at the nodes of cells, and of others, component by component."""
+        grid, d = self.grid, self.grid.dim
+        numbers = unknowns.map.indices.reshape(-1, d)
+        travel = Exchange(grid.comm, grid.owner(other))
+        there = travel.back(numbers[grid.cell_nodes[grid.local(travel.send(other))]])
+        column = np.concatenate([numbers[grid.cell_nodes[cell]], there], axis=1).swapaxes(1, 2)
+        value, m = np.broadcast_to(value[:, None], (len(value), d, value.shape[1])), len(cell) * d
+        row = np.broadcast_to(np.arange(m).reshape(-1, d, 1), column.shape)
+        kept = column >= 0
+        shape, own = (m, max(1, unknowns.global_size)), (row[kept], column[kept])
+        return _matrix(scipy.sparse.csr_matrix((value[kept], own), shape=shape), unknowns.size, grid.comm)
 
     def at(self, unknowns: Unknowns, u: NDArray[np.float64]) -> Touch:
         """Return the contact at displacements u, a local array, m."""
@@ -116,7 +131,7 @@ class BodyContact(CellContact):
         return self._touch(key, make, self.grid.comm)
 
     def _at_w(self, w: NDArray[np.float64]) -> Touch:
-        return self.touch(np.einsum("md,md->m", self.rows.n, self.rows.apart + w), self.rows.n, w)
+        return self.touch(np.einsum("md,md->m", self.rows.n, self._apart + w), self.rows.n, w)
 
     def push(self, unknowns: Unknowns, u: NDArray[np.float64], residual: PETSc.Vec) -> None:
         """Take the forces of the contact at u off a residual, N."""
@@ -126,14 +141,19 @@ class BodyContact(CellContact):
         B.multTransposeAdd(w, residual, residual)
 
     def pattern(self, unknowns: Unknowns) -> PETSc.Mat:
-        """Return zeros wherever a `tangent` may have entries: scipy leaves those out that are zero at present."""
-        m, d = len(self.rows.cell), self.grid.dim
+        """Return zeros wherever a `tangent` may have entries in the step, as pairs follow the bodies."""
+        grid, d = self.grid, self.grid.dim
+        cell, other = np.divmod(self._reach_of_pairs(), len(grid.owners))
+        travel = Exchange(grid.comm, grid.owner(cell))
+        cell, other = travel.send(cell), travel.send(other)
+        key, of = np.unique(cell, return_inverse=True)
+        m = len(cell)
         together = scipy.sparse.identity(m)
         if self.grips:
-            of = scipy.sparse.csr_matrix((np.ones(m), (self.of, np.arange(m))), shape=(len(self.area), m))
-            together = of.T @ of
+            all_of = scipy.sparse.csr_matrix((np.ones(m), (of, np.arange(m))), shape=(len(key), m))
+            together = all_of.T @ all_of
         all_of = scipy.sparse.kron(together, np.ones((d, d)), format="csr")
-        B, _ = self.operator(unknowns)
+        B = self._of_nodes(unknowns, grid.local(cell), other, np.ones((m, 2 ** (d + 1))))
         out = _matrix(all_of, m * d, self.grid.comm, own=True).PtAP(B)
         out.zeroEntries()
         return out
@@ -159,6 +179,37 @@ class BodyContact(CellContact):
         D = _matrix(scipy.sparse.csr_matrix(D), m * d, comm, own=True)
         return D.PtAP(B)
 
+    def continues(self, before: BodyContact, unknowns: Unknowns, u: NDArray[np.float64]) -> float:
+        """Take over what another contact of the step has come to at u; return by how much gaps differ, in cells.
+
+        The pairs of this one were found at u.  Those that do not touch in either do not count.
+        """
+        B, w = self.operator(unknowns)
+        B.mult(unknowns.gather_owned(u[unknowns.owned]), w)
+        self._apart[:] = self.rows.apart - w.array_r.reshape(-1, self.grid.dim)
+        size = self.grid.num_local
+        _, here, there = np.intersect1d(
+            self.number * size + self.cell, before.number * size + before.cell, return_indices=True
+        )
+        for mine, its in ((self.pressure, before.pressure), (self.along, before.along), (self._turned, before._turned)):
+            mine[here] = its[there]
+        _, row, at = np.intersect1d(self.rows.place, before.rows.place, return_indices=True)
+        self.stiffness[:] *= before.raised
+        self._raised[:] = before.raised
+        B, w = before.operator(unknowns)
+        B.mult(unknowns.gather_owned(u[unknowns.owned]), w)
+        then = np.einsum("md,md->m", before.rows.n, before._apart + w.array_r.reshape(-1, self.grid.dim))
+        gap, push = np.einsum("md,md->m", self.rows.n, self.rows.apart), before.at(unknowns, u).push
+        off, lost = np.maximum(-gap, 0.0), push > 0
+        off[row], lost[at] = np.where((push[at] > 0) | (gap[row] < 0), np.abs(gap[row] - then[at]), 0.0), False
+        most = float(off.max(initial=0.0)) / self.grid.h.min() if not lost.any() else np.inf
+        return over_all(self.grid.comm, most, MPI.MAX)
+
+    @property
+    def raised(self) -> float:
+        """By how much k has been raised."""
+        return float(self._raised[0])
+
     def settle(self, unknowns: Unknowns, u: NDArray[np.float64], sticks: bool) -> bool:
         """Choose what slips at u, and if asked for what sticks again; return whether that is another choice."""
         return self.grips and self.choose(self.at(unknowns, u), sticks)
@@ -170,6 +221,7 @@ class BodyContact(CellContact):
             return False
         if most > SLOW * self._off[0]:  # fluid, or what hardly changes its volume, resists more than k
             self.stiffness[:] *= STIFFER
+            self._raised[:] *= STIFFER
         self._off[0] = most
         return True
 
@@ -194,6 +246,36 @@ class BodyContact(CellContact):
         """
         rows = self.rows
         return self.summed(self._signs[rows.number, None] * self.at(unknowns, u).force, rows.x)
+
+
+class Following:
+    """The contact of groups in a substep, whose pairs follow the bodies where these slide along curved surfaces.
+
+    Parameters
+    ----------
+    first
+        The contact with pairs as at the start of the step.
+    again
+        Returns the contact with the pairs that points meet at displacements, a local array, m.
+    """
+
+    def __init__(self, first: BodyContact, again: Callable[[NDArray[np.float64]], BodyContact]):
+        self._again, self._found = again, [first]
+
+    @property
+    def now(self) -> BodyContact:
+        """The contact at present."""
+        return self._found[-1]
+
+    def follow(self, unknowns: Unknowns, u: NDArray[np.float64]) -> bool:
+        """Find pairs anew at u, a local array, m; return whether these change the balance."""
+        if len(self._found) > FOLLOWS:
+            return False
+        new = self._again(u)
+        if new.continues(self.now, unknowns, u) <= SAME_GAP:
+            return False
+        self._found.append(new)
+        return True
 
 
 def _matrix(rows: scipy.sparse.csr_matrix, columns: int, comm: MPI.Intracomm, own: bool = False) -> PETSc.Mat:

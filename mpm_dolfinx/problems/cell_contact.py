@@ -20,7 +20,7 @@ fro, for there is no stiffness in slip.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -61,6 +61,22 @@ def kept(kind: str, contacts: Sequence[Resisting], n: int, dim: int) -> dict[str
     """Return what n points keep of the contacts, zero: pressures (n,) and, of what resists slip, tractions (n, d)."""
     out = {pressure_name(kind, i): np.zeros(n) for i in range(len(contacts))}
     return out | {shear_name(kind, i): np.zeros((n, dim)) for i, contact in enumerate(contacts) if contact.grips}
+
+
+def let_go(points: MaterialPoints, names: Iterable[str]) -> MaterialPoints:
+    """Return points without what they keep under these names."""
+    return replace(points, data={name: rows for name, rows in points.data.items() if name not in names})
+
+
+def gripped(
+    points: MaterialPoints, new: Mapping[str, NDArray[np.float64]], before: MaterialPoints | None
+) -> MaterialPoints:
+    """Return points with new data, or with what the same points kept of it `before`."""
+    if before is not None:
+        here, at = before.find(points.id)
+        for name in new.keys() & before.data.keys():
+            new[name][here] = before.data[name][at]
+    return replace(points, data={**points.data, **new}) if new else points
 
 
 class Resisting(Protocol):

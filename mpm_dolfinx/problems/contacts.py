@@ -21,7 +21,7 @@ class Contact:
 
     Bodies of one group stick where they touch; groups do not pass into each other, and what parts is free.  Where they
     touch no fluid passes.  Where there are contacts all bodies are in groups, and every two groups have one contact.
-    The forces on the bodies of `one` are the simulation's `tool_forces`.
+    The forces on the bodies of `one` are in the simulation's `tool_forces`, after those of tools.
 
     Parameters
     ----------

@@ -16,12 +16,14 @@ from scipy.spatial import cKDTree
 from mpm_dolfinx.caching import Latest
 from mpm_dolfinx.constitutive.fields import SceneMaterials
 from mpm_dolfinx.forms.point_forms import FormPoints, Places, PointData
+from mpm_dolfinx.forms.unknowns import Unknowns
 from mpm_dolfinx.parallel.exchange import Exchange, first
 from mpm_dolfinx.parallel.messages import warn
 from mpm_dolfinx.points.cut_domains import CutDomains, Patches
 from mpm_dolfinx.points.faces import Surface, face_vectors
 from mpm_dolfinx.points.grid import sum_by
 from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.problems.cell_contact import gripped, let_go
 from mpm_dolfinx.problems.closed import closed
 from mpm_dolfinx.problems.conditions import (
     RIGIDITY,
@@ -114,9 +116,48 @@ class MechanicalBoundary:
         """Whether the tangent of pressures, tools and contacts is symmetric."""
 
     def forces(self, value: float) -> NDArray[np.float64]:
-        """Return an array of forces and moments of tools, or contacts, see `ToolContact.forces`, all of one value."""
+        """Return an array of forces and moments of tools and contacts, see `ToolContact.forces`, all of one value."""
         count = len(self.tools.tools) + len(self.contacts.contacts)
         return np.full((count, 3 if self.grid.dim == 2 else 6), value)
+
+    @property
+    def touches(self) -> bool:
+        """Whether there are tools or contacts."""
+        return bool(self.tools.tools or self.contacts.contacts)
+
+    def let_go(self, points: MaterialPoints) -> MaterialPoints:
+        """Return points without what tools and contacts have on them."""
+        return let_go(points, {**self.tools.kept(0), **self.contacts.kept(0)})
+
+    def grip(self, points: MaterialPoints, before: MaterialPoints | None = None) -> MaterialPoints:
+        """Return points with what tools and contacts have on them: nothing, or what the same points had `before`."""
+        return gripped(points, {**self.tools.kept(len(points)), **self.contacts.kept(len(points))}, before)
+
+    def check_start(self, cut: CutDomains, points: MaterialPoints, t: float) -> None:
+        """Refuse a stage that begins at time t (s) with tools in bodies, or with groups of bodies in each other."""
+        self.tools.check_start(cut, points, t)
+        self.contacts.check_start(cut, points, t)
+
+    def check_end(self, cut: CutDomains, points: MaterialPoints, before: MaterialPoints, t: float) -> None:
+        """Refuse a step to time t (s) after which tools or groups have passed into bodies."""
+        self.tools.check_end(cut, points, t)
+        self.contacts.check_end(cut, points, before)
+
+    def touched(
+        self, sides: SideData, unknowns: Unknowns, u: NDArray[np.float64], points: MaterialPoints
+    ) -> tuple[NDArray[np.float64], MaterialPoints]:
+        """Return the forces and moments of tools, then of contacts, and the points with what these have on them.
+
+        u: displacements of the step, a local array, m.
+        """
+        forces, nodal = self.forces(0.0), u.reshape(-1, self.grid.dim)
+        if sides.tools is not None:
+            forces[: len(self.tools.tools)] = sides.tools.forces(nodal)
+            points = sides.tools.gripped(nodal, points)
+        if sides.contact is not None:
+            forces[len(self.tools.tools) :] = sides.contact.now.forces(unknowns, u)
+            points = sides.contact.now.gripped(unknowns, u, points)
+        return forces, points
 
     def data(self, forms: SideForms, cut: CutDomains, start: float, t: float, points: MaterialPoints) -> SideData:
         """Return what acts at time t (s) of a step that began at `start` on the points where they are now."""

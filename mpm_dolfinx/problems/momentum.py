@@ -378,9 +378,9 @@ class MomentumProblem:
 
     def settle_tools(self, sticks: bool) -> bool:
         """Choose what slips on tools at u, and if asked for what sticks again; return whether it is another choice."""
-        if (contact := self._sides.contact) is not None:
-            return contact.settle(*self._at, sticks)
-        return self._sides.tools is not None and self._sides.tools.settle(self.forms.nodal, sticks)
+        tools, contact = self._sides.tools, self._sides.contact
+        of_tools = tools is not None and tools.settle(self.forms.nodal, sticks)
+        return (contact is not None and contact.now.settle(*self._at, sticks)) or of_tools
 
     @property
     def _at(self) -> tuple[Unknowns, NDArray[np.float64]]:
@@ -388,9 +388,13 @@ class MomentumProblem:
 
     def augment_tools(self) -> bool:
         """Shift the pressures of tools that penetrate too deep; return whether the balance is another one since."""
-        if (contact := self._sides.contact) is not None:
-            return contact.augment(*self._at)
-        return self._sides.tools is not None and self._sides.tools.augment(self.forms.nodal)
+        tools, contact = self._sides.tools, self._sides.contact
+        of_tools = tools is not None and tools.augment(self.forms.nodal)
+        return (contact is not None and contact.now.augment(*self._at)) or of_tools
+
+    def follow_contacts(self) -> bool:
+        """Find anew which places of groups face one another at u; return whether the balance is another one since."""
+        return self._sides.contact is not None and self._sides.contact.follow(*self._at)
 
     def guesses(self) -> list[NDArray[np.float64]]:
         """Return displacements (local unknowns,), m, at which Newton's method may begin.
@@ -427,7 +431,7 @@ class MomentumProblem:
         step = system.unknowns.gather(forms.u.x.array, system.step)
         system.penalty.multAdd(step, r, r)
         if self._sides.contact is not None:
-            self._sides.contact.push(*self._at, r)
+            self._sides.contact.now.push(*self._at, r)
         return r, float(np.sqrt(max(squares)))
 
     def assemble_tangent(self, data: QuadratureData | None = None, firmness: float = 0.0) -> PETSc.Mat:
@@ -442,8 +446,8 @@ class MomentumProblem:
         K.axpy(1.0, self.system.penalty, pattern.UNKNOWN if first else pattern.SUBSET_NONZERO_PATTERN)
         if self._sides.contact is not None:
             if first:
-                K.axpy(1.0, self._sides.contact.pattern(self.system.unknowns), pattern.UNKNOWN)
-            K.axpy(1.0, self._sides.contact.tangent(*self._at), pattern.SUBSET_NONZERO_PATTERN)
+                K.axpy(1.0, self._sides.contact.now.pattern(self.system.unknowns), pattern.UNKNOWN)
+            K.axpy(1.0, self._sides.contact.now.tangent(*self._at), pattern.SUBSET_NONZERO_PATTERN)
         if firmness > 0:
             K.axpy(firmness, self.system.firm, pattern.SUBSET_NONZERO_PATTERN)
         return K

@@ -293,7 +293,7 @@ class Assembled:
         if sides.tools is not None:
             self.round_off += over_all(grid.comm, sides.tools.rounding, MPI.MAX)
         if sides.contact is not None:
-            self.round_off += over_all(grid.comm, sides.contact.rounding, MPI.MAX)
+            self.round_off += over_all(grid.comm, sides.contact.now.rounding, MPI.MAX)
         self._off = None
         if self.storage is not None:
             self.storage.set_alternation()
@@ -382,7 +382,7 @@ def assembled(
                 held.append((holds.cells, holds.x, holds["direction"]))
             if sides.tools is not None:
                 held.append(sides.tools.touching())
-            meeting = sides.contact.touching() if sides.contact is not None else None
+            meeting = sides.contact.now.touching() if sides.contact is not None else None
             check_held(grid, on_grid.active, free, held, begins, meeting)
         return System(momentum, storage, scheme, on_grid, dofs, nodes, stiff, momentum.symmetric and symmetric)
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointForm
 from mpm_dolfinx.forms.unknowns import sum_ghosts
 from mpm_dolfinx.points.grid import Grid
-from mpm_dolfinx.problems.body_contact import BodyContact
+from mpm_dolfinx.problems.body_contact import Following
 from mpm_dolfinx.problems.conditions import OnSide
 from mpm_dolfinx.problems.held_cells import HeldCells
 from mpm_dolfinx.problems.tool_contact import ToolContact
@@ -42,7 +42,7 @@ class SideData:
     row: NDArray[np.int64]
     tools: ToolContact | None = None
     own: tuple[PointData, ...] = ()
-    contact: BodyContact | None = None
+    contact: Following | None = None
 
 
 def functions_of(terms):

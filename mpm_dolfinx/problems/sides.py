@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from mpm_dolfinx.parallel.exchange import Exchange, first
 from mpm_dolfinx.points.bodies import Body
 from mpm_dolfinx.points.cut_domains import Patches
-from mpm_dolfinx.points.faces import Surface, limits, surface
+from mpm_dolfinx.points.faces import Surface, joined, limits, surface
 from mpm_dolfinx.points.grid import Grid, rounding
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.problems.conditions import Places
@@ -50,9 +50,19 @@ class Sides:
             raise ValueError(f"{what}, must be one; limit it to one by a region, and give one for each")
         return self._found[key]
 
+    def around(self, bodies: Sequence[int]) -> Surface:
+        """Return the faces on all sides of those of some bodies that are there, what lies on other bodies included."""
+        key = ("", np.array(bodies).tobytes())
+        if key not in self._found:
+            there = [bool(here) and i in bodies for i, here in enumerate(self.present)]
+            self._found[key] = surface(self.bodies, None, None, there)
+        return self._found[key]
+
     def all(self) -> Surface:
-        """Return the faces on all sides."""
-        return surface(self.bodies, None, None, self.present)
+        """Return the faces on all sides of all groups of bodies: what groups have on one another may part."""
+        start = np.cumsum([0, *(len(body) for body in self.bodies[:-1])])
+        copy = np.broadcast_to(self.grid.copy(start), len(self.bodies))
+        return joined([self.around(np.flatnonzero(copy == group).tolist()) for group in np.unique(copy)])
 
 
 def everywhere(grid: Grid, ask: Callable[[], NDArray[np.float64]]) -> NDArray[np.float64]:

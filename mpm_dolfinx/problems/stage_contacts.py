@@ -6,8 +6,9 @@ The contact itself is in `body_contact`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 from mpi4py import MPI
@@ -20,13 +21,14 @@ from mpm_dolfinx.caching import Latest
 from mpm_dolfinx.constitutive.fields import SceneMaterials
 from mpm_dolfinx.errors import NotConverged
 from mpm_dolfinx.parallel.exchange import Exchange, first, over_all
+from mpm_dolfinx.points.bodies import Body
 from mpm_dolfinx.points.contact import BITS, local, weights
 from mpm_dolfinx.points.cut_domains import DEPTH as UNDER
 from mpm_dolfinx.points.cut_domains import CutDomains
 from mpm_dolfinx.points.cutting import FACES
 from mpm_dolfinx.points.faces import Surface, surface
 from mpm_dolfinx.points.material_points import MaterialPoints
-from mpm_dolfinx.problems.body_contact import BodyContact, PairRows
+from mpm_dolfinx.problems.body_contact import BodyContact, Following, PairRows
 from mpm_dolfinx.problems.cell_contact import LEAST, kept, pressure_name, shear_name
 from mpm_dolfinx.problems.conditions import holding, resistance
 from mpm_dolfinx.problems.contacts import Contact
@@ -36,12 +38,16 @@ from mpm_dolfinx.validation import line
 
 REACH = 2.0
 """Cells: what is farther apart cannot touch within a step; steps in which bodies move farther are refused."""
+CLEAR = 0.5
+"""Cells: what is farther apart will not touch before pairs are found anew."""
 DEEP = 0.25
 """Cells: what is deeper is behind a thin body."""
 CANDIDATES = {2: 8, 3: 24}
 """Nearest points of the other surface whose faces are tried."""
 BESIDE = 0.6
 """Cells from points on the other surface: corners that are nearer go with it."""
+PLACES = 1 << 32
+"""More than a process has points of integration on a surface."""
 EDGE = 1e-6
 """Of a face: what passes beside it by less meets it."""
 
@@ -95,56 +101,111 @@ class Contacts:
         signs = []
         for contact in self.contacts:
             both = contact.groups(len(sides.bodies))
-            there = [[i in group and bool(here) for i, here in enumerate(sides.present)] for group in both]
-            faces = [surface(sides.bodies, None, None, some) for some in there]
-            swap = (faces[1].area0.sum(), faces[1].id[0]) < (faces[0].area0.sum(), faces[0].id[0])
+            faces = [sides.around(group) for group in both]
+            whole = [_extent([sides.bodies[i] for i in group]) for group in both]
+            swap = whole[1] < whole[0]  # the same in all stages, and in any order of the bodies
             self._faces.append((faces[1], faces[0]) if swap else (faces[0], faces[1]))
             signs.append(-1.0 if swap else 1.0)
         self._signs = np.array(signs)
         self._found: Latest[list[tuple[Facets, Pairs]]] = Latest()
+        self._reach: Latest[NDArray[np.int64]] = Latest()
 
     @property
     def symmetric(self) -> bool:
         """Whether the tangent is symmetric."""
         return not any(contact.grips for contact in self.contacts)
 
-    def grip(self, points: MaterialPoints) -> MaterialPoints:
-        """Return points with tractions of the contacts: zero."""
-        return replace(points, data={**points.data, **kept("contact", self.contacts, len(points), self.grid.dim)})
+    def kept(self, n: int) -> dict[str, NDArray[np.float64]]:
+        """Return what n points keep of the contacts, zero."""
+        return kept("contact", self.contacts, n, self.grid.dim)
 
-    def placed(self, cut: CutDomains, points: MaterialPoints) -> BodyContact | None:
+    def placed(self, cut: CutDomains, points: MaterialPoints) -> Following | None:
         """Return the contact in a step, with the points where they are at its start."""
         if not self.contacts:
             return None
-        grid, d, rows = self.grid, self.grid.dim, []
-        found = self._found(cut.key, lambda: [self._met(cut, *faces, cut.points) for faces in self._faces], grid.comm)
+        found = self._found(cut.key, lambda: self._met_all(cut, cut.points), self.grid.comm)
+        reach = partial(self._reach, cut.key, partial(self._cells_within_reach, cut, found), self.grid.comm)
+        begun = self._contact(cut, points, found, cut.points, points, reach)
+
+        def again(u: NDArray[np.float64]) -> BodyContact:
+            moved, _ = cut.followed(u.reshape(-1, self.grid.dim), np.zeros(len(self.grid.node_x), dtype=bool))
+            there = replace(points, corners=points.corners + moved)
+            return self._contact(cut, points, self._met_all(cut, there), there, there, reach)
+
+        return Following(begun, again)
+
+    def _contact(
+        self,
+        cut: CutDomains,
+        points: MaterialPoints,
+        found: Sequence[tuple[Facets, Pairs]],
+        seen: MaterialPoints,
+        there: MaterialPoints,
+        reach: Callable[[], NDArray[np.int64]],
+    ) -> BodyContact:
+        """Return the contact of pairs that were found with the points as `seen`, with these now `there`.
+
+        points: at the start of the step, with the pressures and shears of then.
+        """
+        grid, d, rows, off = self.grid, self.grid.dim, [], ""
         own = [self._materials.table(cut.points, of) for of in (resistance, holding)]
         for number, ((faces, others), (facets, pairs)) in enumerate(zip(self._faces, found, strict=True)):
             patches = cut.surface(faces)
-            now = facets if points is cut.points else self._facets(cut, others, points)
+            now = facets if there is seen else self._facets(cut, others, there)
+            cell = self._under(facets, pairs.facet, _on(facets.cut[pairs.facet], pairs.t))
+            if there is not points:
+                near = np.isin(patches.cell[pairs.row] * len(grid.owners) + cell, reach())
+                slides = not near[pairs.gap < CLEAR * grid.h.min()].all()
+                off += f"{line(self.contacts[number])}: bodies slide by more than a cell" * slides
+                pairs, cell = Pairs(*(values[near] for values in pairs)), cell[near]
             row, other, at = pairs.row, pairs.facet, patches.at[pairs.row]
             y, where = (_on(corners[other], pairs.t) for corners in (now.corners, facets.cut))
-            area = patches.area(points)[row]
+            area = patches.area(there)[row]
             size = np.linalg.norm(area, axis=1)
-            n = -patches.area(cut.points)[row]  # as the pairs were found
+            n = -patches.area(seen)[row]
             n /= np.linalg.norm(n, axis=1, keepdims=True)
             old = np.zeros((len(row), d))
             if self.contacts[number].grips:
                 old = _turned(points.data[shear_name("contact", number)][at], n)
             pressure = points.data[pressure_name("contact", number)][at]
             moduli = [np.minimum(a[at], b[other]) for a, b in zip(own, (now.resistance, now.holding), strict=True)]
-            scalars = np.stack([np.full(len(row), number), size, *moduli, pressure], axis=1)
-            apart = patches.now(points)[row] - y
-            cell = self._under(facets, other, where)
+            place = number * PLACES + row + grid.comm.rank * len(self.contacts) * PLACES
+            scalars = np.stack([np.full(len(row), number), place, size, *moduli, pressure], axis=1)
+            apart = patches.now(there)[row] - y
             rows.append((patches.cell[row], cell, at, np.hstack([scalars, patches.x[row], where, n, apart, old])))
+        if off := first(grid.comm, off):
+            raise NotConverged(off)
         cell, other, at, values = (np.concatenate(column) for column in zip(*rows, strict=True))
         travel = Exchange(grid.comm, grid.owner(cell))
         cell, other, sent = (travel.send(columns) for columns in (cell, other, values))
-        number, *scalars = sent[:, :5].T
-        x, y, n, apart, shear = np.split(sent[:, 5:], 5, axis=1)
-        placed = PairRows(number.astype(np.int64), grid.local(cell), *scalars, shear, other, x, y, n, apart)
-        back = (travel, at, values[:, 0].astype(np.int64), values[:, 1])
-        return BodyContact(grid, self.contacts, self._signs, placed, back)
+        number, place = sent[:, :2].T.astype(np.int64)
+        x, y, n, apart, shear = np.split(sent[:, 6:], 5, axis=1)
+        placed = PairRows(number, grid.local(cell), *sent[:, 2:6].T, shear, other, x, y, n, apart, place)
+        back = (travel, at, values[:, 0].astype(np.int64), values[:, 2])
+        return BodyContact(grid, self.contacts, self._signs, placed, back, reach)
+
+    def _met_all(self, cut: CutDomains, points: MaterialPoints) -> list[tuple[Facets, Pairs]]:
+        """Return for each contact what `_met` does."""
+        return [self._met(cut, *faces, points) for faces in self._faces]
+
+    def _cells_within_reach(self, cut: CutDomains, found: Sequence[tuple[Facets, Pairs]]) -> NDArray[np.int64]:
+        """Return all pairs of lexicographic cells (m,), first * cells + second, that pairs of a step may be in.
+
+        Those of the pairs found at its start, and all that are next to each other.
+        """
+        grid, keys, count = self.grid, [], len(self.grid.owners)
+        for (faces, _), (facets, pairs) in zip(self._faces, found, strict=True):
+            patches = cut.surface(faces)
+            where = _on(facets.cut[pairs.facet], pairs.t)
+            keys.append(patches.cell[pairs.row] * count + self._under(facets, pairs.facet, where))
+            cells = np.unique(patches.cell), np.unique(facets.cell)
+            index = [np.stack(np.unravel_index(c % grid.cells, tuple(grid.shape)), axis=1) for c in cells]
+            near = cKDTree(index[0]).query_ball_tree(cKDTree(index[1]), 1.5, p=np.inf) if len(cells[0]) else []
+            times = [len(of) for of in near]
+            keys.append(
+                np.repeat(cells[0], times) * count + cells[1][np.concatenate([np.zeros(0, int), *near]).astype(int)]
+            )
+        return np.unique(np.concatenate(keys))
 
     def _facets(self, cut: CutDomains, faces: Surface, points: MaterialPoints) -> Facets:
         """Return points on faces of all processes, with the points where they are."""
@@ -169,6 +230,9 @@ class Contacts:
         x, area = patches.now(points), patches.area(points)
         n = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), LEAST)
         count = min(CANDIDATES[d], len(facets.x))
+        if not count:  # bodies of the other group are not there
+            none = np.zeros(0, dtype=np.int64)
+            return facets, Pairs(none, none, np.zeros((0, 2)), np.zeros(0))
         reach = REACH * self.grid.h.min() + self.grid.h.max()
         _, near = cKDTree(facets.x).query(x, range(1, count + 1), distance_upper_bound=reach)
         row, column = np.nonzero(near < len(facets.x))
@@ -197,7 +261,7 @@ class Contacts:
         """
         out, reach = np.zeros(corners.shape[:2], dtype=bool), BESIDE * self.grid.h.max()
         for pair in self._faces:
-            for own, other in (pair, pair[::-1]):
+            for own, other in (pair, pair[::-1]) if all(map(len, pair)) else ():
                 x = self._facets(cut, other, points).x
                 mine = np.flatnonzero(self.grid.copy(points.id) == self.grid.copy(own.id[:1]))
                 distance, _ = cKDTree(x).query(corners[mine], distance_upper_bound=reach)
@@ -216,13 +280,32 @@ class Contacts:
         moved = np.linalg.norm(points.corners - before.corners, axis=2).max(initial=0.0) if self.contacts else 0.0
         if self.contacts and 2 * over_all(comm, float(moved), MPI.MAX) > REACH * h:
             raise NotConverged(f"contacts: bodies move by more than {REACH / 2:g} cells in a step")
+        if message := self._too_deep(cut, points):
+            raise NotConverged(message)
+
+    def check_start(self, cut: CutDomains, points: MaterialPoints, t: float) -> None:
+        """Refuse groups that are in each other as a stage begins at time t (s)."""
+        if message := self._too_deep(cut, points):
+            raise ValueError(f"{message}, at t = {t:g} s as it begins, must touch or be apart")
+
+    def _too_deep(self, cut: CutDomains, points: MaterialPoints) -> str:
+        """Return where groups are too deep in each other, and how deep; nothing where they are not."""
+        h, comm = self.grid.h.min(), self.grid.comm
         for contact, (faces, others) in zip(self.contacts, self._faces, strict=True):
             _, pairs = self._met(cut, faces, others, points)
             deepest = over_all(comm, float(pairs.gap.min(initial=np.inf)), MPI.MIN)
             if deepest < -BEGINS * h:
                 row = pairs.row[pairs.gap == deepest][:1]
                 where = first(comm, "".join(f"{x}" for x in cut.surface(faces).now(points)[row]))
-                raise NotConverged(f"{line(contact)}: bodies are {-deepest / h:.3g} cells in each other at {where}")
+                return f"{line(contact)}: bodies are {-deepest / h:.3g} cells in each other at {where}"
+        return ""
+
+
+def _extent(bodies: Sequence[Body]) -> tuple:
+    """Return what orders groups of bodies by their surfaces, and equal ones by where they are seeded."""
+    area = surface(bodies, None).area0.sum()
+    corners = np.concatenate([body.corners().reshape(-1, body.dim) for body in bodies])
+    return float(f"{area:.9g}"), *corners.min(axis=0), *corners.max(axis=0)
 
 
 def _turned(shear: NDArray[np.float64], n: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -7,7 +7,6 @@ The contact itself is in `tool_contact`.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 from mpi4py import MPI
 
@@ -82,22 +81,9 @@ class Tools:
             raise ValueError(f"{line(tool)}: {what}, must move by (0, z) and not turn in axisymmetry")
         return pose
 
-    def _kept(self, n: int) -> dict[str, NDArray[np.float64]]:
+    def kept(self, n: int) -> dict[str, NDArray[np.float64]]:
         """Return what n points keep of the tools, zero."""
         return kept("tool", self.tools, n, self.grid.dim)
-
-    def let_go(self, points: MaterialPoints) -> MaterialPoints:
-        """Return points without the tractions of the tools."""
-        return replace(points, data={name: rows for name, rows in points.data.items() if name not in self._kept(0)})
-
-    def grip(self, points: MaterialPoints, before: MaterialPoints | None = None) -> MaterialPoints:
-        """Return points with tractions of the tools: zero, or those of the same points `before`."""
-        new = self._kept(len(points))
-        if before is not None:
-            here, at = before.find(points.id)
-            for name, rows in new.items():
-                rows[here] = before.data[name][at]
-        return replace(points, data={**points.data, **new}) if new else points
 
     def placed(self, cut: CutDomains, points: MaterialPoints, start: float, t: float) -> ToolContact | None:
         """Return the contact at time t (s) of a step that began at `start`, with the points where they are now."""

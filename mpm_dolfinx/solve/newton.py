@@ -42,6 +42,7 @@ FORCING, FINEST = 1e-3, 1e-9  # relative accuracy of the linear solve, and the b
 SHORTEST = 1e-3  # share of a Newton step below which it is not shortened
 INNER = 1e-3  # the momentum is solved to this share of the storage's error: rotations fake volume changes
 MOMENTUM_STEPS = 10
+REBALANCED = 6  # times the most iterations, in all, of what is to balance with other pressures or pairs of contacts
 SETTLED = 1e-2  # residual from which on what slips on tools may stick: before, what touches them still changes
 ERROR = 1 / 20
 """Share of the estimate of first order that the pressures of a run are off by: of consolidations, see tests."""
@@ -197,9 +198,11 @@ class Newton:
     ) -> Errors:
         """Iterate from the present (u, p), of these errors; fresh: with its own tangent; watched: by a watchdog."""
         dog, count = Watchdog(errors.worst, self._iterate()) if watched else None, 0
-        while (errors := self._augmented(errors)).worst > self._scheme.tolerance:
+        while (found := self._augmented(errors)).worst > self._scheme.tolerance:
+            if found is not errors:  # what has balanced is to do so with other pressures or pairs of contacts
+                errors, count = found, 0
             if fresh or not watched:  # what yields and has begun to converge may go on
-                self._check(count, "newton")
+                self._check(max(count, self.report.newton // REBALANCED), "newton")
             if fresh and self._linear and not self.report.newton:
                 self._solvers.tangent(key, lambda: self._linearise_as_reset(as_reset))
             elif fresh:
@@ -214,13 +217,14 @@ class Newton:
             seeps = self._storage is not None and self._storage.settle_seepage()
             if self._momentum.settle_tools(errors.worst <= SETTLED) or seeps:
                 errors, fresh = self._errors(errors.start), True
-        return errors
+        return found
 
     def _augmented(self, errors: Errors) -> Errors:
         """Return the errors, of what balances with the pressures of tools that penetrate too deep shifted."""
         if errors.worst > self._scheme.tolerance:
             return errors
-        if not self._momentum.settle_tools(True) and not self._momentum.augment_tools():
+        momentum = self._momentum
+        if not (momentum.settle_tools(True) or momentum.augment_tools() or momentum.follow_contacts()):
             return errors
         return self._errors(errors.start)
 
