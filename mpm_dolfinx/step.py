@@ -50,7 +50,7 @@ def step(scene: Scene, state: State, dt: float) -> tuple[State, Report]:
     velocity = None if scene.momentum.elastic else scene.momentum.u.x.array / dt
     now = {"reactions": reactions, "outflows": outflows, "velocity": velocity}
     if (contact := acting.sides.tools) is not None:
-        tools.check_end(on_grid.cut, new.points, new.t)
+        tools.check_end(on_grid.cut, new.points, new.t, state.points, state.t)
         now |= {"tool_forces": contact.forces(nodal), "points": contact.gripped(nodal, new.points)}
     if (contact := acting.sides.contact) is not None:
         state.stage.mechanical.contacts.check_end(on_grid.cut, new.points, state.points)

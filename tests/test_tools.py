@@ -290,6 +290,17 @@ def test_a_tool_that_outruns_the_body_cuts_the_step():
     assert s.t == 0 and s.step(0.05).newton > 0
 
 
+def test_a_tool_that_would_be_behind_a_beam_after_a_step_bends_it():
+    """From above to below it in one step: no place was in the tool at its end, and no force acted."""
+    grid = mpm.Grid([1.0, 1.0], [10, 10])
+    beam = mpm.box(grid, [0, 0.6], [0.6, 0.7])
+    shape = mpm.Convex([[0.35, 0.71], [0.8, 0.71], [0.8, 0.81], [0.35, 0.81]])
+    tool = mpm.Tool(shape, displacement=lambda t: (0, -0.23 * t))
+    s = mpm.Simulation(grid, [beam], [SOIL], fixed={"left": "xy"}, tools=[tool])
+    assert s.run(1.0, 1.0, progress=False).cuts
+    assert s.points.x[:, 1].min() < 0.71 - 0.23 and np.linalg.norm(s.tool_forces[0, :2]) > 100
+
+
 def test_a_function_is_a_shape_like_another():
     forces = []
     for shape in (mpm.Ball((0.5, 0.8), 0.2), lambda y: np.hypot(y[:, 0] - 0.5, y[:, 1] - 0.8) - 0.2):
