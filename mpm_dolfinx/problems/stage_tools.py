@@ -119,12 +119,14 @@ class Tools:
         return ToolContact(grid, self.tools, poses, rows, Places(grid, rows.cell, place), back)
 
     def check_start(self, cut: CutDomains, points: MaterialPoints, t: float) -> None:
-        """Refuse tools that are inside of a body at time t (s)."""
+        """Refuse tools that are inside of a body at time t (s); faces that they press on are where a step left them."""
         if not self.tools:
             return
-        x = np.concatenate([cut.surface(self.faces).now(points), points.x])
-        for tool in self.tools:
-            deep, where = self._deepest(tool, x, t)
+        patches = cut.surface(self.faces)
+        x = patches.now(points)
+        for number, tool in enumerate(self.tools):
+            met = points.data[pressure_name("tool", number)] > 0
+            deep, where = self._deepest(tool, np.concatenate([x[~met[patches.at]], points.x]), t)
             if deep > BEGINS:
                 what = f"{line(tool)}: is {deep:.3g} cells inside of a body, at {where}, at t = {t:g} s as it begins"
                 raise ValueError(f"{what}, must be outside of all bodies, or touch them")
