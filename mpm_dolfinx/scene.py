@@ -106,7 +106,7 @@ class Scene:
         """Of time integration."""
         substeps(method, True)  # refuses what is none
         self.motion = Motion(scene, bodies, self.momentum, self.storage)
-        # what is still to be looked for, to be warned of once, of which nothing but the log knows
+        # what is still to be looked for, to be warned of, of which nothing but the log knows
         self._looked_for = [warn_overfilled, *[partial(warn_smeared, materials=scene)] * scene.uneven]
         self._on_grid: Latest[OnGrid] = Latest()
         self._systems: Latest[System] = Latest()
@@ -136,7 +136,8 @@ class Scene:
             self._assembled.clear()  # of coefficients that change now
             with Timer("mpm: cut domains"):
                 cut = CutDomains(grid, points, self.quadrature == "domain")
-                self._looked_for[:] = [warn for warn in self._looked_for if not warn(cut, bodies=self.bodies)]
+                looked = [warn(cut, self.bodies) for warn in self._looked_for]
+                self._looked_for[:] = filter(None, looked)
             with Timer("mpm: integration data"):
                 problems = (self.momentum, self.storage)
                 return OnGrid(self.pieces, self.materials, *problems, cut, self.scheme.of_fluid)

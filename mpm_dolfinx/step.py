@@ -49,7 +49,7 @@ def step(scene: Scene, state: State, dt: float) -> tuple[State, Report]:
     new, report.rederived = scene.motion.advanced(state, on_grid, start.data, state.t + dt)
     velocity = None if scene.momentum.elastic else scene.momentum.u.x.array / dt
     now = {"reactions": reactions, "outflows": outflows, "velocity": velocity}
-    mechanical.check_end(on_grid.cut, new.points, state.points, new.t)
+    mechanical.check_end(on_grid.cut, new.points, new.t, state.points, state.t)
     forces, points = mechanical.touched(acting.sides, *at, new.points)
     now |= {"tool_forces": forces, "points": points}
     return replace(new, **now, resets=state.resets + (state.stay is None), begins=False), report

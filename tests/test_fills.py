@@ -64,6 +64,8 @@ def test_an_embankment_in_lifts_has_its_crest_and_the_ground_beside_it_free_and_
         assert face(s, k, 1)[:, 1] == pytest.approx(6.0 + k), "the new crest is level"
         assert (volumes(s.points.corners) > 0).all()
         result = s.run(s.t + 30 * DAY, 15 * DAY, progress=False)
+        free, between = top.area0.sum(), gap(s, k - 1, k)
+        print(f"lift {k}: free {free:.9f} m, gap {between:.0e} m, fluid balance {result.balance:.0e}")
         assert result.converged and result.balance < 1e-8
         assert k == 1 or gap(s, k - 1, k) < 1e-8
     assert face(s, 0, 1)[:, 1].min() < 5.6, "the ground has settled by half a metre"

@@ -61,7 +61,9 @@ def widened_hole(cells, widened=1e-3, steps=1):
 
 @pytest.mark.parametrize(("cells", "error"), [(6, 1e-2), (12, 2.5e-3), (24, 1e-3)])
 def test_a_widened_hole_pushes_back_as_the_exact_solution_does(cells, error):
-    assert widened_hole(cells) == pytest.approx([1, 1], rel=error)
+    over = widened_hole(cells)
+    print(f"{cells} cells over the wall: reaction / exact {over}")
+    assert over == pytest.approx([1, 1], rel=error)
 
 
 def test_a_widened_hole_of_a_nearly_incompressible_body_pushes_back_as_the_exact_solution_does(monkeypatch):
@@ -88,6 +90,7 @@ def pressed(cells, angle):
 @pytest.mark.parametrize(("cells", "error"), [(10, 2e-3), (20, 1e-3), (40, 5e-4)])
 def test_a_block_pressed_aslant_to_the_grid_resists_as_one_along_it(cells, error):
     along, aslant = pressed(cells, 0.0), pressed(cells, 0.3)
+    print(f"{cells} cells: reaction aslant less along, over along {(aslant - along) / along[1]}")
     assert aslant == pytest.approx(along, abs=error * abs(along[1]))
 
 
@@ -122,6 +125,7 @@ def rough_base(h, steps=1):
 @pytest.mark.parametrize("steps", [1, 10])
 def test_a_wall_pushed_along_a_rough_base_carries_what_the_soil_resists(steps):
     coarse, fine = rough_base(0.1, steps), rough_base(0.05, steps)
+    print(f"{steps} steps, h = 0.1 and 0.05 m: {coarse:.0f} and {fine:.0f} N/m")
     assert 1.5e4 < coarse < 2.9e4
     assert fine == pytest.approx(coarse, rel=0.3)
 
@@ -203,6 +207,7 @@ def footing_load(width):
 def test_a_held_region_may_end_anywhere_in_domains_and_cells():
     """Lines of the points that lie on those of the grid, and that do not."""
     loads = np.array([footing_load(width) for width in (22 / 9, 2.40, 2.46)])
+    print(f"22/9, 2.40, 2.46 wide: load / c down {loads[:, 1]}, sideways {loads[:, 0]}")
     assert loads[:, 1] == pytest.approx(loads[0, 1], rel=0.015)
     assert np.abs(loads[:, 0]).max() < 0.15
 

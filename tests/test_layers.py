@@ -81,7 +81,9 @@ SEAMS = {
 def test_steady_flow_across_seams_is_exact_at_any_offset(seams, offset):
     seams = np.array(SEAMS[seams]) + offset * H
     s = column(seams, fluid=INCOMPRESSIBLE, drained=ends(2))
-    assert steady(s) == pytest.approx(TINY * H / resistance(np.diff(seams).sum()), rel=1e-8, abs=0)
+    over = steady(s) / (TINY * H / resistance(np.diff(seams).sum()))
+    print(f"{offset} cells off the lines: flow / exact - 1 = {over - 1:.0e}")
+    assert over == pytest.approx(1, rel=1e-8)
 
 
 @pytest.mark.parametrize("options", [{"dim": 3}, {"per_cell": 1}, {"per_cell": 3}], ids=str)
@@ -166,7 +168,9 @@ def test_a_seam_holds_the_pressure_below_it_wherever_it_lies_and_is_carried():
     on_lines = below_after_a_day(0, 100)
     assert on_lines == pytest.approx(0.873, abs=0.01), "with cells an eighth as large"
     for offset, load in [(0, 1e4), (0, 3e5), (0.1, 100), (0.25, 3e5), (0.5, 100), (0.9, 1e4)]:
-        assert below_after_a_day(offset, load) == pytest.approx(on_lines, rel=0.02)
+        below = below_after_a_day(offset, load)
+        print(f"{offset} cells off the lines, {load:g} Pa: p / load {below:.4f}, on the lines {on_lines:.4f}")
+        assert below == pytest.approx(on_lines, rel=0.02)
 
 
 @pytest.mark.parametrize("slope", [0.01, 0.1, 0.2])
@@ -223,6 +227,34 @@ def test_a_soft_layer_off_the_grid_lines_is_named_once_with_what_it_loses(ratio,
     assert said == pytest.approx(lost, abs=0.006)
     gives = max(thickness * H * ratio, 0) if ratio > 1 else 1 - thickness * H
     assert error == pytest.approx(said * gives / (1 + thickness * H * (ratio - 1)), rel=0.05)
+
+
+@pytest.mark.parametrize(("dim", "rings", "order"), [(2, False, -1), (3, False, 1), (2, True, -1)])
+def test_a_soft_layer_is_named_in_space_and_in_rings_and_in_any_order(dim, rings, order, caplog):
+    grid = mpm.Grid([*[2 * H] * (dim - 1), 1.2], [*[2] * (dim - 1), 12], axisymmetric=rings)
+    soft, flat = mpm.Hencky(bulk=SAND.bulk / 10, shear=SAND.shear / 10), [0] * (dim - 1)
+    ends = pairwise((0, 3.5 * H, 4.5 * H, 1))
+    bodies = [mpm.box(grid, [*flat, a], [*[2 * H] * (dim - 1), b], material=i % 2) for i, (a, b) in enumerate(ends)]
+    walls = {name: "xyz"[axis] for name, (axis, end) in SIDES[dim].items() if (axis, end) != (dim - 1, 1)}
+    top = list(SIDES[dim])[-1]
+    load = mpm.Traction(top, (*flat, -1.0), ([*flat, 0.99], [9] * dim))
+    s = mpm.Simulation(grid, bodies[::order], [SAND, soft], fixed=walls, tractions=[load])
+    s.step(1.0)
+    (record,) = caplog.records
+    assert "material 1, up to 10 times as soft" in record.getMessage() and "about 74 %" in record.getMessage()
+    exact = (1 + 9 * H) / SAND.oedometric
+    assert (1 - s.points.corners[:, :, -1].max()) / exact == pytest.approx((1 + 9 * H - 0.736 * 10 * H) / 1.9, rel=0.01)
+
+
+def test_a_soft_layer_whose_interfaces_move_on_is_named_again(caplog):
+    """A column that shrinks by 3 % carries them from grid lines to 0.3 cells off: it loses 11 %, then half."""
+    soft = mpm.Hencky(bulk=SAND.bulk / 10, shear=SAND.shear / 10)
+    load = [mpm.Traction("top", lambda t: (0, -2e5 * t), ([0, 1], [H, 1]))]
+    s = column([(0.5, 0.6)], [SAND, soft], tractions=load)
+    s.run(1.0, 0.05, progress=False)
+    said = [float(record.getMessage().split("about ")[1].split(" %")[0]) for record in caplog.records]
+    assert said[0] < 15 and said[-1] > 40
+    assert (np.diff(np.log2(said)) > 0.95).all()
 
 
 @pytest.mark.parametrize(("ratio", "offset"), [(100, 0.0), (100, 1e-3), (2, 0.5), (0.5, 0.5)])

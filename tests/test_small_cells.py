@@ -26,8 +26,9 @@ def tip(cells, offset, nu):
 def test_nearly_incompressible_beams_bend_wherever_they_lie_on_the_grid(nu):
     """With lambda + 2G for a scale the tip came to 0.82 and 0.36 of its way in one step."""
     fine = tip(16, 0.0, nu)
-    for offset in (0.0, 0.1, 0.3, 0.5):
-        assert 0.96 < tip(4, offset, nu) / fine < 1.03
+    over = np.array([tip(4, offset, nu) for offset in (0.0, 0.1, 0.3, 0.5)]) / fine
+    print(f"nu = {nu}, offsets 0, 0.1, 0.3, 0.5: tip of 16 x 4 cells over that of 64 x 16 {over}")
+    assert over.min() > 0.96 and over.max() < 1.03
 
 
 @pytest.mark.parametrize("reach", [1e-4, 1e-2])
@@ -77,6 +78,7 @@ def settled(nu, ratio):
 def test_a_vertical_cut_falls_whatever_its_elastic_constants():
     """It stood at 5, or fell at 4.28 and 4.59; limit analysis has it at 3.78, met at first order in the cells."""
     numbers = [settled(nu, ratio) for nu in (0.3, 0.499) for ratio in (200, 2000)]
+    print(f"gamma H / c at a settlement of H / 50, nu = .3, .3, .499, .499, G / c = 200, 2000, 200, 2000: {numbers}")
     assert max(numbers) < 1.02 * min(numbers)
     assert 3.78 < min(numbers) and max(numbers) < 1.1 * 3.78
 

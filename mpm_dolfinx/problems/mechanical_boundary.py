@@ -138,9 +138,14 @@ class MechanicalBoundary:
         self.tools.check_start(cut, points, t)
         self.contacts.check_start(cut, points, t)
 
-    def check_end(self, cut: CutDomains, points: MaterialPoints, before: MaterialPoints, t: float) -> None:
-        """Refuse a step to time t (s) after which tools or groups have passed into bodies."""
-        self.tools.check_end(cut, points, t)
+    def check_end(
+        self, cut: CutDomains, points: MaterialPoints, t: float, before: MaterialPoints, start: float
+    ) -> None:
+        """Refuse a step to time t (s) after which tools or groups have passed into bodies, or in which they passed them.
+
+        before: the points at the start of the step, at the time `start` (s).
+        """
+        self.tools.check_end(cut, points, t, before, start)
         self.contacts.check_end(cut, points, before)
 
     def touched(

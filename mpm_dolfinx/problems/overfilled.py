@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 from mpi4py import MPI
 
@@ -20,19 +21,19 @@ FULL = 1.2
 """Of a cell: domains that have not folded stay below 1.08 where soil is pushed aside by half a footing's width."""
 
 
-def warn_overfilled(cut: CutDomains, bodies: Sequence[Body]) -> bool:
-    """Log a warning of the fullest cell, with the bodies in it, if it is overfilled; return whether it is."""
+def warn_overfilled(cut: CutDomains, bodies: Sequence[Body]) -> Callable[..., Any] | None:
+    """Log a warning of the fullest cell, with the bodies in it, if it is overfilled; return what looks for the next."""
     grid, points = cut.grid, cut.points
     volume = cut.to_cells(points.volume0 * points.J) * cut.pieces_to_cells(cut.pieces.fraction)
     fill = sum_by(cut.cells, cut.plane(volume)[0], grid.num_owned) / grid.cell_volume
     most = over_all(grid.comm, float(fill.max(initial=0.0)), MPI.MAX)
     if not cut.domains or most <= FULL:
-        return False
+        return warn_overfilled
     number = over_all(grid.comm, int(grid.cell_number[fill.argmax()]) if most in fill else -1, MPI.MAX)
     found, x = bodies_in(cut, bodies, number)
     who = f"bodies {', '.join(map(str, found))}" if len(found) > 1 else f"domains of body {found[0]}"
     warn(grid.comm, "the cell at %s is filled to %.0f %%, more than it holds: %s overlap", x, 100 * most, who)
-    return True
+    return None
 
 
 def bodies_in(cut: CutDomains, bodies: Sequence[Body], cell: int) -> tuple[list[int], NDArray[np.float64]]:

@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
 
 from mpi4py import MPI
 
@@ -20,12 +22,27 @@ from mpm_dolfinx.problems.overfilled import bodies_in
 
 LOST = 0.03
 """Share of what a soft material gives, lost in cells that it shares, from which a scene is warned of."""
+AGAIN = 2.0
+"""Times the share that was named, from which it is named again: interfaces move on to the middle of cells."""
 FINE = 0.1
 """Of what a soft cell gives: what may be lost in a cell; contrasts below 2.1 stay below."""
 
 
-def warn_smeared(cut: CutDomains, materials: SceneMaterials, bodies: Sequence[Body]) -> bool:
-    """Log a warning of the soft material that loses most in cells shared with stiffer ones; return whether one does."""
+def warn_smeared(
+    cut: CutDomains, bodies: Sequence[Body], materials: SceneMaterials, least: float = LOST
+) -> Callable[..., Any]:
+    """Log a warning of the soft material that loses most in cells shared with stiffer ones, if that is much.
+
+    Parameters
+    ----------
+    least
+        Share of what the material gives from which it is named, in [0, 1].
+
+    Returns
+    -------
+    callable
+        What looks for it the next time.
+    """
     grid, points, count = cut.grid, cut.points, len(materials.materials)
     volume = cut.to_cells(points.volume0 * points.J) * cut.pieces_to_cells(cut.pieces.fraction)
     whole = over_all(grid.comm, sum_by(cut.to_cells(points.material), volume, count))
@@ -38,8 +55,8 @@ def warn_smeared(cut: CutDomains, materials: SceneMaterials, bodies: Sequence[Bo
         i = int(share.argmax())
         found.append((share[i], i, np.where(of == i, lost, 0.0), contrast))
     share, i, lost, contrast = max(found, key=lambda row: row[0])
-    if share <= LOST:
-        return False
+    if share <= least:
+        return partial(warn_smeared, materials=materials, least=least)
     most = over_all(grid.comm, float(lost.max(initial=0.0)), MPI.MAX)
     at = np.flatnonzero(lost == most)[:1]
     cell = over_all(grid.comm, int(grid.cell_number[at].max(initial=-1)), MPI.MAX)
@@ -49,7 +66,7 @@ def warn_smeared(cut: CutDomains, materials: SceneMaterials, bodies: Sequence[Bo
     what += "gives about %.0f %% too little under a load across the layers; lay interfaces along grid lines, or take "
     what += "smaller cells"
     warn(grid.comm, what, " and ".join(map(str, those)), x, i, much, 100 * share)
-    return True
+    return partial(warn_smeared, materials=materials, least=AGAIN * share)
 
 
 def _lost(cut: CutDomains, volume: NDArray[np.float64], modulus: NDArray[np.float64]) -> tuple[NDArray, ...]:

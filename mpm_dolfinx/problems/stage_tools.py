@@ -21,7 +21,7 @@ from mpm_dolfinx.points.cut_domains import CutDomains
 from mpm_dolfinx.points.faces import Surface
 from mpm_dolfinx.points.grid import Grid
 from mpm_dolfinx.points.material_points import MaterialPoints
-from mpm_dolfinx.problems.cell_contact import kept, pressure_name, shear_name
+from mpm_dolfinx.problems.cell_contact import LEAST, kept, pressure_name, shear_name
 from mpm_dolfinx.problems.conditions import Displacement, holding, resistance
 from mpm_dolfinx.problems.sides import everywhere
 from mpm_dolfinx.problems.tool_contact import ToolContact, ToolRows
@@ -30,6 +30,7 @@ from mpm_dolfinx.validation import line
 
 BEGINS = 1e-2  # cells: how deep a tool may be in a body as it begins, and where a displacement is given
 NEAR = 0.1  # cells: corners that are nearer go with the tool
+STRIDE = 0.02  # cells: tools that are thinner may pass points within a step unseen
 FACING = 0.5  # cosine between a face's normal and the way to the tool above which it looks at the tool
 
 
@@ -114,18 +115,25 @@ class Tools:
         return ToolContact(grid, self.tools, poses, rows, Places(grid, rows.cell, place), back)
 
     def check_start(self, cut: CutDomains, points: MaterialPoints, t: float) -> None:
-        """Refuse tools that are inside of a body at time t (s)."""
+        """Refuse tools that are inside of a body at time t (s); faces that they press on are where a step left them."""
         if not self.tools:
             return
-        x = np.concatenate([cut.surface(self.faces).now(points), points.x])
-        for tool in self.tools:
-            deep, where = self._deepest(tool, x, t)
+        patches = cut.surface(self.faces)
+        x = patches.now(points)
+        for number, tool in enumerate(self.tools):
+            met = points.data[pressure_name("tool", number)] > 0
+            deep, where = self._deepest(tool, np.concatenate([x[~met[patches.at]], points.x]), t)
             if deep > BEGINS:
                 what = f"{line(tool)}: is {deep:.3g} cells inside of a body, at {where}, at t = {t:g} s as it begins"
                 raise ValueError(f"{what}, must be outside of all bodies, or touch them")
 
-    def check_end(self, cut: CutDomains, points: MaterialPoints, t: float) -> None:
-        """Refuse a step after which tools have points in them, or meet what is given."""
+    def check_end(
+        self, cut: CutDomains, points: MaterialPoints, t: float, before: MaterialPoints, start: float
+    ) -> None:
+        """Refuse a step after which tools have points in them, or meet what is given, or in which they pass points.
+
+        before: the points at the start of the step, at the time `start` (s).
+        """
         for tool in self.tools:
             for hold, faces in self._held:
                 deep, where = self._deepest(tool, cut.surface(faces).now(points), t)
@@ -135,6 +143,8 @@ class Tools:
             deep, where = self._deepest(tool, points.x, t)
             if deep > 0:
                 raise NotConverged(f"{line(tool)}: has passed through the surface, to the point at {where}")
+            if where := self._passed(tool, (before.x, points.x), (start, t)):
+                raise NotConverged(f"{line(tool)}: has passed through a body within a step, at {where}")
 
     def near(self, corners: NDArray[np.float64], t: float) -> NDArray[np.bool_]:
         """Return which corners (n, 2^d, d) of domains touch tools at time t (s): these follow the Q1 field alone.
@@ -148,6 +158,25 @@ class Tools:
             gap = everywhere(self.grid, lambda tool=tool, own=own: tool.solid(h).distance(own))
             out |= (gap < NEAR * h).reshape(out.shape)
         return out
+
+    def _passed(self, tool: Tool, x: tuple[NDArray[np.float64], ...], times: tuple[float, ...]) -> str:
+        """Return one of the places x (n, d) that go straight through a tool between two times (s), or nothing.
+
+        Places go on by their distance to the tool (sphere tracing: Hart 1996).
+        """
+        d, h, comm = self.grid.dim, self.grid.h.min(), self.grid.comm
+        y, end = (tool.pose(t, d).own(at) for at, t in zip(x, times, strict=True))
+        way, gone, on = np.linalg.norm(end - y, axis=1), np.zeros(len(y)), np.arange(len(y))
+        along = (end - y) / np.maximum(way, LEAST)[:, None]
+        while over_all(comm, len(on)):
+            at = y[on] + gone[on, None] * along[on]
+            gap = everywhere(self.grid, lambda at=at: tool.solid(h).distance(at))
+            inside = x[1][on[gap < 0]][:1]
+            if where := first(comm, "".join(np.array2string(place, precision=6) for place in inside)):
+                return where
+            gone[on] += np.maximum(gap, STRIDE * h)
+            on = on[gone[on] < way[on]]
+        return ""
 
     def _deepest(self, tool: Tool, x: NDArray[np.float64], t: float) -> tuple[float, str]:
         """Return how deep places x (m, d) are in a tool at most, in cells, and where."""
