@@ -51,7 +51,8 @@ class Patches:
         self._faces, self.here, self.at, self._xi = faces, here, at, xi
         self.cell, self.x, self._grid = cell, x, grid
         self._share0 = share * faces.area0[here]
-        self.area0 = self._share0 * grid.around(interpolate(faces.domain[here], xi))
+        around = grid.around(interpolate(faces.domain[here], xi)) if grid.axisymmetric else 1.0
+        self.area0 = self._share0 * around
         """Reference areas (n,), m^(d-1)."""
 
     @cached_property
@@ -150,7 +151,8 @@ class CutDomains(Keyed):
         outward = face_vectors(corners, faces.face[here])
         size = np.linalg.norm(outward, axis=1, keepdims=True)
         skew = np.flatnonzero(faces.skew[here][face])  # xi is linear over a triangle, and places are not in xi
-        xi[skew] = on_face(corners[face[skew]], faces.face[here][face[skew]], x[skew], xi[skew])
+        if len(skew):
+            xi[skew] = on_face(corners[face[skew]], faces.face[here][face[skew]], x[skew], xi[skew])
         inward = -DEPTH * self.grid.h.min() * np.divide(outward, size, out=np.zeros_like(outward), where=size > 0)
         cell = self._filled_cell(at[face], middle + inward[face])
         return Patches(self.grid, faces, here[face], at[face], cell, x, xi, share)

@@ -277,7 +277,7 @@ class Grid:
         """Return which points lie outside the grid by more than `tolerance` cells, and what is lost in rounding."""
         y = (x - self.lower) / self.h
         tolerance = tolerance + rounding(np.stack([self.lower, self.upper])) / self.h
-        return ((y < -tolerance) | (y > self.shape + tolerance) | ~np.isfinite(y)).any(axis=1)
+        return ~((y >= -tolerance) & (y <= self.shape + tolerance)).all(axis=1)  # nan is outside as well
 
     def shape_gradients(
         self, cells: NDArray[np.int32], x: NDArray[np.float64], mixed: NDArray[np.float64] | None = None

@@ -146,7 +146,8 @@ def _filtered(d: NDArray[np.float64], crossed: NDArray[np.float64]) -> NDArray[n
         d = d.copy()
         along, cells = np.moveaxis(d, axis, 0), np.moveaxis(crossed, axis, 0)
         share = np.minimum(1.0, FAST * (cells[1 : count - 2] + cells[2 : count - 1]) / 2)
-        third = np.nan_to_num(share / 64 * np.diff(along, 3, axis=0))
+        third = share / 64 * np.diff(along, 3, axis=0)
+        third[np.isnan(third)] = 0.0
         for k, factor in enumerate(THIRD):
             along[k : count - 3 + k] -= factor * third
     return d

@@ -81,9 +81,10 @@ def given(condition, name: str, t: float, side: Places | None, dim: int = 0) -> 
     allowed, shapes = f"a finite number{vectors}", [(), *[(dim,)] * bool(dim)]
     if callable(value):
         wanted = arguments(value)
-        if wanted.count("t") > 1 or (by_place(value) and side is None):
+        named = [k for k in wanted if k in PLACES]
+        if wanted.count("t") > 1 or (named and side is None):
             raise ValueError(f"{what}: must be a function of t" + (", X and x" if side is not None else " alone"))
-        places = [side(k) for k in wanted if k in PLACES]
+        places = [side(k) for k in named]
         if places and not len(places[0]):  # a function need not have an answer for no places
             return np.zeros(0)
         if places:

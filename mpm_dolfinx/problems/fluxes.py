@@ -17,6 +17,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from mpm_dolfinx import _compat
+from mpm_dolfinx.caching import Keyed
 from mpm_dolfinx.forms.point_forms import FacetForm, FacetSum
 from mpm_dolfinx.forms.unknowns import sum_ghosts
 from mpm_dolfinx.points.grid import Grid, sum_by
@@ -58,17 +59,22 @@ class Conduction:
     weight: NDArray[np.float64] | None
 
     def along(self, dim: int) -> NDArray[np.float64]:
-        """Return the mobilities (n, d) along the axes, pulled back."""
-        axes = [np.broadcast_to(normal, (len(self.mobility.mean), dim)) for normal in np.eye(dim)]
-        return np.stack([self.across(slice(None), normal) for normal in axes], axis=1)
+        """Return the mobilities (n, d) along the axes, pulled back: `across` for the unit vectors, all at once."""
+        kappa, share = self.mobility.mean[:, None], self.mobility.share
+        kappa = np.repeat(kappa, dim, axis=1) if share is None else kappa * share
+        if self.motion is None:
+            return kappa
+        F, hoop = self.motion.F, self.motion.hoop
+        along = kappa / determinant(F)[:, None] * (cofactor(F) ** 2).sum(axis=1)
+        return along if hoop is None else along * hoop[:, None]
 
-    def across(self, at: slice | NDArray[np.int64], normal: NDArray[np.float64]) -> NDArray[np.float64]:
+    def across(self, at: NDArray[np.int64], normal: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the mobilities (m,) of some cells along normals (m, d), pulled back: n . J F^-1 kappa F^-T n."""
         kappa, share = self.mobility.mean[at], self.mobility.share
         if share is not None:
             kappa = kappa * (share[at] * normal**2).sum(axis=1)
         if self.motion is None:
-            return kappa.copy()
+            return kappa
         F, hoop = self.motion.F[at], self.motion.hoop
         pulled = np.einsum("mij,mj->mi", cofactor(F), normal)
         across = kappa / determinant(F) * (pulled**2).sum(axis=1)
@@ -167,7 +173,7 @@ class PieceContents:
     damping: NDArray[np.float64]
 
 
-class CellContents:
+class CellContents(Keyed):
     """What the cells hold since the grid was reset; arrays over local cells, ghosts included, zero where empty.
 
     Parameters

@@ -9,6 +9,7 @@ from itertools import combinations
 
 import numpy as np
 
+from mpm_dolfinx.caching import Latest
 from mpm_dolfinx.parallel.exchange import Exchange
 from mpm_dolfinx.points.cut_domains import CutDomains
 from mpm_dolfinx.points.material_points import MaterialPoints
@@ -47,9 +48,16 @@ class HydraulicBoundary:
         """Whether what the sides give depends on time or place."""
         for one, other in combinations(self.outlets, 2):
             check_apart(*one, *other)
+        self._constant: Latest[OpenSides] = Latest()
 
     def data(self, cut: CutDomains, points: MaterialPoints, contents: CellContents, t: float) -> OpenSides:
         """Return the open sides where they were cut, with what they give at time t (s)."""
+        if self.varies:
+            return self._placed(cut, points, contents, t)
+        key = (cut.key, contents.key, points)
+        return self._constant(key, lambda: self._placed(cut, points, contents, t), self._grid.comm)
+
+    def _placed(self, cut: CutDomains, points: MaterialPoints, contents: CellContents, t: float) -> OpenSides:
         grid = self._grid
         none, vectors = np.empty(0), np.empty((0, grid.dim))
         whole, cells = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int32)
