@@ -141,7 +141,7 @@ class MechanicalBoundary:
     def check_end(
         self, cut: CutDomains, points: MaterialPoints, t: float, before: MaterialPoints, start: float
     ) -> None:
-        """Refuse a step to time t (s) after which tools or groups have passed into bodies, or in which they passed them.
+        """Refuse a step to time t (s) in which tools have passed bodies, or after which tools or groups are in bodies.
 
         before: the points at the start of the step, at the time `start` (s).
         """
