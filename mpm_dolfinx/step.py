@@ -46,7 +46,7 @@ def step(scene: Scene, state: State, dt: float) -> tuple[State, Report]:
     tools, nodal = state.stage.mechanical.tools, scene.momentum.nodal
     reactions = state.stage.mechanical.reactions(acting.sides, nodal)
     outflows = both.storage.outflows(len(state.stage.hydraulic.outlets)) if both.storage else state.outflows
-    new, report.rederived = scene.motion.advanced(state, on_grid, start.data, state.t + dt)
+    new, report.rederived = scene.motion.advanced(state, on_grid, start.data, state.t + dt, both.came(rates[-1]))
     velocity = None if scene.momentum.elastic else scene.momentum.u.x.array / dt
     now = {"reactions": reactions, "outflows": outflows, "velocity": velocity}
     if (contact := acting.sides.tools) is not None:

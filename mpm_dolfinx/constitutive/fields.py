@@ -23,7 +23,9 @@ from mpm_dolfinx.points.grid import Grid
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.validation import numbers
 
-RESERVED = frozenset("F dF softness storage storage_at_one density position displacement porosity0 gradient".split())
+RESERVED = frozenset(
+    "F dF softness owed due storage storage_at_one density position displacement porosity0 gradient".split()
+)
 """Names of what points of integration carry beside parameters and state."""
 EVOLVED = 1e-3
 """By how much the state of a law differs from that at rest where it counts as another."""
@@ -114,6 +116,8 @@ class SceneMaterials:
         if prestressed and "plastic" in seeded:
             seeded["plastic" + AT_REST] = seeded["plastic"]
         self._softness: dict[int, SoftnessAtPoints] = {}
+        if fluid is not None:
+            seeded |= {"owed": np.zeros(len(points)), "due": np.zeros(len(points))}
         if fluid is not None and self.evolves:
             seeded["softness"] = np.ones(len(points))
             for number, law in enumerate(self.laws):
@@ -247,6 +251,10 @@ class SceneMaterials:
     def storage(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the storage coefficient at the points (n,), 1/Pa, of a scene with fluid."""
         return self.table(points, lambda m, n: m.storage(self._fluid.bulk, n), self.porosity(points))
+
+    def storage_at_one(self, points: MaterialPoints) -> NDArray[np.float64]:
+        """Return the storage coefficient that the points would have at a porosity of one (n,), 1/Pa."""
+        return self.table(points, lambda m: m.storage(self._fluid.bulk, 1.0))
 
     def density(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the density of soil and pore fluid at the points (n,), kg/m^3."""
