@@ -183,7 +183,7 @@ def main(argv: list[str] | None = None) -> dict:
         default=[0.05, 0.025],
         help="cell sizes of the block, m; last one undrained too",
     )
-    parser.add_argument("--undrained", type=int, default=3, help="load cycles of the undrained beam; 0: none")
+    parser.add_argument("--undrained", type=int, default=20, help="load cycles of the undrained beam; 0: none")
     o = parser.parse_args(argv)
     if not 0 < len(o.h) <= len(COLORS):
         parser.error(f"--h: {len(o.h)} cell sizes, must be 1 to {len(COLORS)}")

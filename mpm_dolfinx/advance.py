@@ -7,18 +7,21 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache, partial
 
+from mpi4py import MPI
+
 import numpy as np
 from dolfinx.common import Timer
 from numpy.typing import NDArray
 
 from mpm_dolfinx.constitutive.fields import SceneMaterials
+from mpm_dolfinx.constitutive.fluid_content import change_at_points
 from mpm_dolfinx.errors import LeftGrid, NotConverged
 from mpm_dolfinx.parallel.exchange import first, over_all
 from mpm_dolfinx.points.bodies import Body
 from mpm_dolfinx.points.cut_domains import CutDomains
 from mpm_dolfinx.points.cutting import parallelepipeds, tangled, volumes
 from mpm_dolfinx.points.domain_gradient import gradient
-from mpm_dolfinx.points.grid import REACH, Grid
+from mpm_dolfinx.points.grid import REACH, Grid, sum_by
 from mpm_dolfinx.points.lattice import filtered, given
 from mpm_dolfinx.points.material_points import MaterialPoints, determinant, with_ratio
 from mpm_dolfinx.points.pressure_transport import PiecePressures, Reconstruction
@@ -28,6 +31,13 @@ from mpm_dolfinx.problems.on_grid import OnGrid
 from mpm_dolfinx.problems.quadrature_data import QuadratureData
 from mpm_dolfinx.problems.storage import StorageForms
 from mpm_dolfinx.state import State, Stay
+
+PAID = 0.2
+"""Share of what points are owed that the next step takes in, over the cells that a corner has moved since the cut.
+
+With 1, after twenty undrained cycles of a beam of 5 cells as little is left; with 0.04 a fifth more.  Where hardly
+anything moves nothing is paid: so the orders in time are those of the method.
+"""
 
 
 class Motion:
@@ -55,7 +65,13 @@ class Motion:
         self._reconstruction = Reconstruction(momentum.grid) if storage is not None else None
 
     def advanced(
-        self, state: State, on_grid: OnGrid, data: QuadratureData, t: float, stays: bool = True
+        self,
+        state: State,
+        on_grid: OnGrid,
+        data: QuadratureData,
+        t: float,
+        came: NDArray[np.float64] | None = None,
+        stays: bool = True,
     ) -> tuple[State, int]:
         """Return the state at time t (s) after a solved step, and how many domains had folded.
 
@@ -65,6 +81,8 @@ class Motion:
             At the start of the step.
         on_grid, data
             The bodies on the grid, and their pieces at the start of the step.
+        came : (cells,), m^d
+            Fluid that came to the local cells in the step; without, what is owed to the points stays as it is.
         stays
             Whether pieces stay in their cells where points hardly move.
 
@@ -97,6 +115,8 @@ class Motion:
                 start = state.stay.start if state.stay else cut.to_pieces(self._storage.p_n.x.array[pieces.cells])
                 own = on_grid.pressures_up_to_surface(self._reconstruction, state.stage, t)
                 points, ids = replace(points, pressure=cut.mean(own)), points.id[cut.pieces.point]
+                if cut.domains and came is not None:
+                    points = replace(points, data=points.data | self._owed(state.points, points, on_grid, came, serves))
             _check_inside(cut, points, t)
         stay, held = Stay(cut.points, ids, pressure, x, start), state.held if serves else None
         new = replace(state, t=t, points=points, transported=None, stay=stay, held=held)
@@ -158,6 +178,31 @@ class Motion:
         if self._materials.evolves:
             F = np.where(evolved[:, None, None], deformed(), F)
         return replace(points, corners=corners, x=corners.mean(axis=1), F=F), serves, folded
+
+    def _owed(
+        self, before: MaterialPoints, points: MaterialPoints, on_grid: OnGrid, came: NDArray[np.float64], serves: bool
+    ) -> dict[str, NDArray[np.float64]]:
+        """Return what is owed to the points after a step (n,), over their volumes at rest, and what of it is due.
+
+        That is by how much their content, by their volumes and the cells' pressures, has grown beyond the fluid that
+        came.  Soil that has yielded, whose volumes are those of the cells, and pores that drain are owed nothing; while
+        the cut serves nothing is due.
+        """
+        cut, materials, forms = on_grid.cut, self._materials, self._storage
+        here = cut.pieces_to_cells(cut.pieces.fraction * (before.volume0 * before.J)[cut.pieces.point])
+        volume = sum_by(cut.cells, here, len(came))[cut.cells]
+        at_pieces = (forms.p.x.array - forms.p_n.x.array)[cut.cells], came[cut.cells] / volume
+        dp, came_here = (cut.mean(cut.to_pieces(values)) for values in at_pieces)
+        alpha, at_one = materials.table(points, lambda m: m.biot), materials.storage_at_one(points)
+        grown = change_at_points(alpha, at_one, materials.storage(before), points.J / before.J, dp) - came_here
+        none = materials.evolved(points)
+        if materials.drains:  # what drains from pores is no part of this content
+            none |= materials.retention(points)[:, 0] > 0
+        owed = np.where(none, 0.0, before.data["owed"] + before.J * grown / alpha)
+        if serves:
+            return {"owed": owed, "due": np.zeros(len(points))}
+        far = float((np.abs(points.corners - cut.points.corners) / cut.grid.h).max(initial=0.0))
+        return {"owed": owed, "due": -np.expm1(-PAID * over_all(cut.grid.comm, far, MPI.MAX)) * owed}
 
     def _sizes(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the edges (n, d), m, of boxes as large as the points' domains at rest, as seeded or put on others."""

@@ -46,7 +46,7 @@ def step(scene: Scene, state: State, dt: float) -> tuple[State, Report]:
     mechanical, at = state.stage.mechanical, (start.matrices.momentum.unknowns, scene.momentum.u.x.array)
     reactions = mechanical.reactions(acting.sides, scene.momentum.nodal)
     outflows = both.storage.outflows(len(state.stage.hydraulic.outlets)) if both.storage else state.outflows
-    new, report.rederived = scene.motion.advanced(state, on_grid, start.data, state.t + dt)
+    new, report.rederived = scene.motion.advanced(state, on_grid, start.data, state.t + dt, both.came(rates[-1]))
     velocity = None if scene.momentum.elastic else scene.momentum.u.x.array / dt
     now = {"reactions": reactions, "outflows": outflows, "velocity": velocity}
     mechanical.check_end(on_grid.cut, new.points, new.t, state.points, state.t)

@@ -77,8 +77,8 @@ def test_fluid_balance_and_residuals_close_in_every_step(beam):
 def test_the_tip_is_the_same_on_all_releases(beam):
     """Recorded with dolfinx 0.5.2."""
     tip = np.array(beam[0].displacement)[:, 0]
-    assert tip[3] == pytest.approx([-0.024851302, -0.230085740], rel=1e-6)
-    assert tip[60] == pytest.approx([-0.063790506, -0.348617252], rel=1e-6)
+    assert tip[3] == pytest.approx([-0.024847250, -0.230072692], rel=1e-6)
+    assert tip[60] == pytest.approx([-0.063789653, -0.348617686], rel=1e-6)
 
 
 @pytest.mark.parametrize("extra", ["", "--bulk 8.3333e6 --shear 3.84615e6"], ids=["nu 0", "nu 0.3"])
@@ -110,4 +110,4 @@ def test_the_undrained_tip_is_that_of_sealed_finite_elements_and_does_not_creep(
     tips = np.array(result.displacement)[3:, 0, 1]
     assert tips[0] == pytest.approx(exact, rel=6e-3)
     assert np.ptp(tips) < 5e-3 * abs(tips[0])
-    assert result.balance <= 1e-8 and result.coupling < 20 * 2 * result.steps
+    assert result.balance <= 1e-8 and result.coupling < 6 * result.newton and result.newton < 9 * result.steps

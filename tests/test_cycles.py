@@ -106,6 +106,13 @@ def test_undrained_more_of_the_stress_is_left_as_where_it_is_nearly_incompressib
     assert left_of(0.03, fluid=mpm.Fluid()) < 0.016
 
 
+def test_what_undrained_cycles_leave_is_bounded():
+    """What is owed to the points is paid back: without, 3.9 and 5.3 % were left after 5 and 10 cycles, and so on."""
+    soil = replace(clay(0.0), conductivity=0.0)
+    left = cycles.cycle(0.06, 54e3, 10, 10, material=soil, fluid=mpm.Fluid())["left"]
+    assert left[-1] < 0.037 and left[-1] < 1.1 * left[4], left
+
+
 def test_a_body_that_turns_by_360_degrees_has_its_stresses_back():
     assert cycles.turn(0.1) < 1e-3
 

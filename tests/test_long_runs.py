@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Many steps of load cycling: the beam comes back, volume and fluid are kept."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers import SOFT
@@ -10,14 +12,14 @@ import mpm_dolfinx as mpm
 STEPS = 40  # in a cycle
 
 
-def cycle(h, cycles, **options):
+def cycle(h, cycles, material=SOFT, observe=(), **options):
     """Return (simulation, result) of the beam whose load comes and goes `cycles` times."""
     grid = mpm.Grid([1.2, 1.2], [round(1.2 / h)] * 2)
     bottom = (round(0.6 / h) + 0.5) * grid.h[1]
     body = mpm.box(grid, [0, bottom], [1, bottom + 0.3])
     load = mpm.Traction("top", lambda t: (0, -27e3 * (1 - np.cos(2 * np.pi * t))), region=((0.05, -1), (1.0, 9)))
-    s = mpm.Simulation(grid, [body], [SOFT], fixed={"left": "xy"}, tractions=[load], **options)
-    return s, s.run(cycles, 1 / STEPS, probes=mpm.probes([body], [[1, bottom + 0.15]]))
+    s = mpm.Simulation(grid, [body], [material], fixed={"left": "xy"}, tractions=[load], **options)
+    return s, s.run(cycles, 1 / STEPS, probes=mpm.probes([body], [[1, bottom + 0.15]]), observe=observe)
 
 
 def returned(result):
@@ -39,16 +41,19 @@ def test_what_is_left_of_a_cycle_falls_with_the_cell_size():
     assert left[1][-1] < 3e-4 and left[1][-1] < 0.4 * left[0][-1]
 
 
-def kept(h):
-    """Return the volume that a sealed beam has lost in a cycle, over its own: of skeleton and compressed fluid."""
-    fluid = mpm.Fluid(bulk=2.2e9)
-    s, result = cycle(h, 1, fluid=fluid)
-    points = s.points
-    assert result.steps == STEPS + result.rejected and result.balance < 1e-8
-    return abs(points.volume0 @ (points.J - 1 + SOFT.porosity / fluid.bulk * points.pressure)) / 0.3
+@pytest.mark.parametrize(("conductivity", "most"), [(0.0, 4e-6), (SOFT.conductivity, 1.2e-5)])
+def test_a_sealed_beam_keeps_the_volume_of_its_domains(conductivity, most):
+    """Corners follow more than the Q1 field, by 7e-5 of the volume in a cycle: what they gain is paid back.
 
+    What is left where nothing conducts does not grow; water that flows takes 3e-6 a cycle along, as p / K_w of it.
+    """
+    water, volumes = mpm.Fluid(bulk=2.2e9), []
 
-def test_what_a_sealed_beam_loses_of_its_volume_in_a_cycle_falls_with_the_cell_size():
-    """No fluid is lost, but the volume of the domains is that of their corners, which follow more than the Q1 field."""
-    coarse, fine = kept(0.05), kept(0.025)
-    assert fine < 3e-5 and np.log2(coarse / fine) > 1.4
+    def observe(s):
+        points = s.points
+        volumes.append(points.volume0 @ (points.J - 1 + SOFT.porosity / water.bulk * points.pressure) / 0.3)
+
+    material = replace(SOFT, conductivity=conductivity)
+    s, result = cycle(0.05, 2, material=material, observe=observe, fluid=water)
+    assert result.steps == 2 * STEPS + result.rejected and result.balance < 1e-8
+    assert abs(volumes[-1]) < most and s.points.data["owed"].any(), volumes[-1]

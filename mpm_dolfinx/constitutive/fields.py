@@ -24,7 +24,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.validation import numbers
 
 RESERVED = frozenset(
-    "F dF softness storage storage_at_one density position displacement porosity0 gradient retention".split()
+    "F dF softness owed due storage storage_at_one density position displacement porosity0 gradient retention".split()
 )
 """Names of what points of integration carry beside parameters and state."""
 EVOLVED = 1e-3
@@ -116,6 +116,8 @@ class SceneMaterials:
         if prestressed and "plastic" in seeded:
             seeded["plastic" + AT_REST] = seeded["plastic"]
         self._softness: dict[int, SoftnessAtPoints] = {}
+        if fluid is not None:
+            seeded |= {"owed": np.zeros(len(points)), "due": np.zeros(len(points))}
         if fluid is not None and self.evolves:
             seeded["softness"] = np.ones(len(points))
             for number, law in enumerate(self.laws):
@@ -249,6 +251,10 @@ class SceneMaterials:
     def storage(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the storage coefficient at the points (n,), 1/Pa, of a scene with fluid."""
         return self.table(points, lambda m, n: m.storage(self._fluid.bulk, n), self.porosity(points))
+
+    def storage_at_one(self, points: MaterialPoints) -> NDArray[np.float64]:
+        """Return the storage coefficient that the points would have at a porosity of one (n,), 1/Pa."""
+        return self.table(points, lambda m: m.storage(self._fluid.bulk, 1.0))
 
     @property
     def drains(self) -> bool:

@@ -12,7 +12,9 @@ is of second order for any path, and nothing where no fluid flows, however long 
 
 from __future__ import annotations
 
+import numpy as np
 import ufl
+from numpy.typing import NDArray
 
 
 def change_of_content(alpha, a, storage, J, dp):
@@ -30,5 +32,16 @@ def change_of_content(alpha, a, storage, J, dp):
     z = a * dp / (2 * alpha)
     small = ufl.lt(abs(z), 1e-3)
     away = ufl.conditional(small, 1.0, z)  # both branches are evaluated, and differentiated
-    sinhc = ufl.conditional(small, 1 + z**2 / 6, ufl.sinh(away) / away)
-    return alpha * (J - 1) * ufl.cosh(z) + (storage + a * (J - 1) / 2) * dp * sinhc
+    return _change(alpha, a, storage, J, dp, ufl.cosh(z), ufl.conditional(small, 1 + z**2 / 6, ufl.sinh(away) / away))
+
+
+def change_at_points(alpha, a, storage, J, dp) -> NDArray[np.float64]:
+    """Return the same of points (n,), of arrays."""
+    z = a * dp / (2 * alpha)
+    small = np.abs(z) < 1e-3
+    away = np.where(small, 1.0, z)
+    return _change(alpha, a, storage, J, dp, np.cosh(z), np.where(small, 1 + z**2 / 6, np.sinh(away) / away))
+
+
+def _change(alpha, a, storage, J, dp, cosh, sinhc):
+    return alpha * (J - 1) * cosh + (storage + a * (J - 1) / 2) * dp * sinhc

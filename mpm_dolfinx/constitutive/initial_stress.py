@@ -314,8 +314,8 @@ class _Sought:
 def strained(materials: SceneMaterials, points: MaterialPoints, moved: MaterialPoints) -> MaterialPoints:
     """Return points with the elastic strains of others, to which these have been deformed from where they are."""
     F, d, law = moved.F, moved.F.shape[1], materials.law_of(points)
-    data = {name: values for name, values in moved.data.items() if name != "softness"}
-    data |= {name: values for name, values in points.data.items() if name == "softness"}
+    own = {name: points.data[name] for name in ("softness", "owed", "due") if name in points.data}
+    data = {**moved.data, **own}
     out = replace(points, data=data)
     if "prestretch" in data:
         out = _with(out, np.ones(len(F), dtype=bool), prestretch=F @ data["prestretch"])

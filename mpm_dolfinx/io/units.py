@@ -14,6 +14,7 @@ FIELDS = {
         "mean_effective_stress": "Pa, p' = -(xx + yy + zz) / 3, positive in compression",
         "deviatoric_stress": "Pa, q = sqrt(3/2 s : s), s the deviator of the stress",
         "porosity": "-, present volume fraction of the pores",
+        "owed, due": "-, volume that the fluid has yet to fill, over that at rest; what of it the next step takes in",
         "softness": "-, elastic over present shear stiffness where a law yields, 1 to 100",
         "tool_0_pressure, tool_0_shear": "Pa, pressure and shear traction of tool 0 on the surface of the domain",
         "others": "state of the law (see its documentation), constants that differ from point to point, the user's own",

@@ -44,6 +44,10 @@ class Balances(NamedTuple):
     momentum: MomentumProblem
     storage: StorageProblem | None
 
+    def came(self, rates: Rates | None) -> NDArray[np.float64] | None:
+        """Return what came to the cells in the step, see `StorageProblem.came`; None without fluid."""
+        return self.storage and self.storage.came(rates)
+
 
 def balances(scene: Scene, start: Start, acting: Acting, before: Rates | None = None) -> Balances:
     """Return the balances at the end of a substep, with u and p as they are; before: rates of the substep before."""
@@ -59,5 +63,6 @@ def balances(scene: Scene, start: Start, acting: Acting, before: Rates | None = 
     weight = None if acting.gravity is None else scene.fluid.density * acting.gravity
     flow = matrices.flow(start.state, weight, start.data, acting.t)
     lost = before and before.taken(substep.before * dt)
-    options = (on_grid.contents, flow, substep.own * dt, lost, on_grid.softness(start.state))
+    carried = on_grid.softness(start.state), substep.end * on_grid.due(start.state)
+    options = (on_grid.contents, flow, substep.own * dt, lost, *carried)
     return Balances(momentum, StorageProblem(scene.storage, matrices.storage, start.data.pieces, *options))

@@ -167,6 +167,12 @@ class OnGrid(Keyed):
         data = state.points.data
         return self.cut.to_cells(data["softness"]) if "softness" in data else 1.0
 
+    def due(self, state: State) -> NDArray[np.float64]:
+        """Return what the filled owned cells take in of what is owed to their points in a step, m^d."""
+        cut, due = self.cut, state.points.volume0 * state.points.data["due"]
+        share = cut.pieces_to_cells(cut.pieces.fraction * due[cut.pieces.point])
+        return self.contents.total(cut.cells, self.data.pieces["biot"][:, 0] * share)
+
     def pressures_up_to_surface(self, reconstruction: Reconstruction, stage: Stage, t: float) -> NDArray[np.float64]:
         """Return the pressures (m,), Pa, at the pieces' centroids; their mean by volume in a cell is the cell's.
 

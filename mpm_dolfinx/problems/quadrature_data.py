@@ -176,7 +176,7 @@ class QuadraturePoints:
             fields = self._scene.parameters(points)
             if self._fluid:
                 fields["biot"] = self._scene.table(points, lambda m: m.biot)
-                fields["storage_at_one"] = self._scene.table(points, lambda m: m.storage(self._fluid.bulk, 1.0))
+                fields["storage_at_one"] = self._scene.storage_at_one(points)
                 if self._scene.drains:
                     fields["retention"] = self._scene.retention(points)
             if self.varies:

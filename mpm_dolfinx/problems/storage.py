@@ -13,6 +13,10 @@ aslant, `aslant` adds what centroids that are not across from one another leave 
 fluid balance.  The change of the content is that of `fluid_content`, the integral over the step that of a
 substep of `time_integration`.
 
+Corners of domains follow more than u, points change cells, and jumps are damped (below), so the volumes of domains part
+from the fluid that has come to them.  The points carry this difference, `owed`, and cells take it in by small shares in
+the next steps: `due`, at an even rate over the step.
+
 Q1 with DG0 is not inf-sup stable: where next to nothing flows within a step, checkers of p go unseen.
 Jumps of the step's increment are damped by max(0, tau d - dt kappa / d) A [p - p_n], d = d+ + d-, dt the share of
 the step in which the rate at p counts, so that a
@@ -323,6 +327,8 @@ class StorageProblem:
         What the cells lose by the rate of the substep before.
     softness : (m,)
         By how much the pieces are softer than elastic ones, where the forms' soil may be.
+    due : (n,), m^d
+        What the active owned cells take in of what their points are owed, until the end of the substep.
 
     The pressure at the start of the step is that of `forms.p_n`.
     """
@@ -337,8 +343,9 @@ class StorageProblem:
         dt: float,
         before: Rates | None = None,
         softness: NDArray[np.float64] | float = 1.0,
+        due: NDArray[np.float64] | float = 0.0,
     ):
-        self.forms, self.system, self.data = forms, system, data
+        self.forms, self.system, self.data, self._due = forms, system, data, due
         self._contents, self._flow, self.dt = contents, flow, dt
         self._before = before or Rates(np.empty(0), np.zeros(system.unknowns.size), 0.0, 0.0, 0.0)
         outflow = flow(before is None)
@@ -433,6 +440,7 @@ class StorageProblem:
         forms, system, before = self.forms, self.system, self._before
         outflow = self._flow(False)
         b = forms.change(self.data)
+        b[system.unknowns.owned] += self._due
         change = b[system.unknowns.owned]
         exchanged, total = float(np.abs(change).sum()), float(change.sum())
         r, p = system.unknowns.gather(b, system.residual), system.unknowns.gather(forms.p.x.array, system.p)
@@ -468,6 +476,15 @@ class StorageProblem:
         """Return the change of the fluid's volume, plus what left, less sources (m^d), at the last residual."""
         lost = residual.rates.taken(self.dt).lost + self._before.lost
         return float(over_all(self.forms.grid.comm, residual.change + lost))
+
+    def came(self, rates: Rates) -> NDArray[np.float64]:
+        """Return the fluid (cells,), m^d, that came to the local cells in the step by fluxes and sources; ghosts none.
+
+        rates: at the end of the substep.
+        """
+        out = np.zeros_like(self.forms.p.x.array)
+        out[self.system.unknowns.owned] = -rates.taken(self.dt).cells - self._before.cells
+        return out
 
     def assemble_tangent(self, data: PointData | None = None) -> None:
         """Assemble C = d/dp and B = d/du of the residual at (u, p), of these pieces or of others."""
