@@ -77,3 +77,10 @@ def test_a_footing_is_pushed_through_soil_that_yields_without_cut_steps():
     """With full Newton steps alone, each from rest: one cut step, 103 Newton steps."""
     run = footing.push(footing.SOIL, 11, 0.1, footing.RATES["intermediate"], box=(4.0, 2.5), steps=4)
     assert run.total("cuts") == 0 and run.total("newton") < 98
+
+
+@pytest.mark.slow
+def test_finer_cells_are_pushed_as_well():
+    """With shortened steps that ended where the residual fell, before the work turned: three cuts, 259 Newton steps."""
+    run = footing.push(footing.SOIL, 21, 0.06, footing.RATES["intermediate"], box=(4.0, 2.5), steps=4)
+    assert run.total("cuts") == 0 and run.total("newton") < 180

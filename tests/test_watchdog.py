@@ -16,11 +16,11 @@ def test_the_residual_may_grow_for_some_full_steps_and_descends_after_them():
     dog = Watchdog(1.0, where)
     for count in range(PATIENCE):
         assert not dog.strays(2.0) and dog.limit(2.0) == np.inf
-        dog = dog.after(2.0 + count, list)
+        dog = dog.after(2.0 + count, 1.0, list)
     assert dog.strays(2.0) and dog.where is where
     down = replace(dog, since=0, descends=True)
     assert down.limit(1.0) == 1.0 and not down.strays(np.inf)
-    assert down.after(0.5, list) == Watchdog(0.5, [])  # full steps again
+    assert down.after(0.5, 1.0, list) == Watchdog(0.5, [])  # full steps again
 
 
 @pytest.mark.parametrize("residual", [1e5, np.inf])
@@ -113,6 +113,26 @@ def test_a_step_that_goes_too_far_is_shortened_to_where_the_forces_do_no_work():
         assert abs(work) <= WORK and step <= 1.1 * end
     assert Search().after(0.5) is None and Search().after(1.5) is None  # full steps
     assert Search().after(np.nan).step == Search().after(100.0).step == 0.2
+
+
+def test_a_shortened_step_goes_on_to_where_the_work_turns_though_the_residual_falls_before():
+    """Else points that it would unload stay on their yield surface, and the next steps are as short."""
+    full = Search()
+    assert full.after(0.9, falls=True) is None and full.after(-1.5, falls=True) is None
+    short = full.after(-85.0, falls=False)
+    assert 0.1 <= short.step < 0.2
+    longer = short.after(0.9, falls=True)
+    assert short.step < longer.step < 1.0
+
+
+def test_tangents_become_firmer_after_steps_that_are_next_to_nothing_and_soft_again_after_full_ones():
+    dog = Watchdog(0.01, [])
+    usual = dog.firmness(0.01)
+    firm = dog.after(0.02, 0.02, list)
+    assert firm.firmness(0.01) == pytest.approx(10 * usual)
+    assert firm.after(0.02, 0.5, list).firm == firm.firm  # neither short nor long
+    soft = firm.after(0.009, 1.0, list)  # a residual below the least, too
+    assert soft.firmness(0.01) == usual == soft.after(0.02, 1.0, list).firmness(0.01)
 
 
 def steps_taken(monkeypatch, **values) -> int:

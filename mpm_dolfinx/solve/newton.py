@@ -35,7 +35,7 @@ from mpm_dolfinx.problems.storage import Rates, StorageProblem, StorageResidual
 from mpm_dolfinx.result import Report
 from mpm_dolfinx.solve.linear import negative_pivots
 from mpm_dolfinx.solve.schur import LinearSolvers
-from mpm_dolfinx.solve.watchdog import EXPLODES, LARGEST, SHORTEST_DESCENT, Search, Watchdog, firmness, shortened
+from mpm_dolfinx.solve.watchdog import EXPLODES, LARGEST, SHORTEST_DESCENT, Search, Watchdog, shortened
 
 KEEP = 0.05  # the tangent is kept while a Newton step reduces the residual to less than this
 FORCING, FINEST = 1e-3, 1e-9  # relative accuracy of the linear solve, and the best that is asked for
@@ -206,11 +206,11 @@ class Newton:
             if fresh and self._linear and not self.report.newton:
                 self._solvers.tangent(key, lambda: self._linearise_as_reset(as_reset))
             elif fresh:
-                self._linearise(firmness(errors.worst) if dog else 0.0)
+                self._linearise(dog.firmness(errors.worst) if dog else 0.0)
             self.report.coupling += self._direction(errors)
-            before, errors = errors, self._line_search(errors, dog)
+            before, (errors, step) = errors, self._line_search(errors, dog)
             count, fresh = count + 1, errors.worst > KEEP * min(1.0, before.worst)  # inf where no fluid has moved yet
-            dog = dog and dog.after(errors.worst, self._iterate)
+            dog = dog and dog.after(errors.worst, step, self._iterate)
             if dog and dog.strays(errors.worst):
                 self._go_to(dog.where)
                 errors, fresh, dog = self._errors(errors.start), True, replace(dog, since=0, descends=True)
@@ -304,7 +304,7 @@ class Newton:
                 return
             with Timer("mpm: linear solve"):
                 self._solvers.solve_momentum()
-            before, errors = errors.u, self._line_search(errors)
+            before, (errors, _) = errors.u, self._line_search(errors)
             settled = self._momentum.settle_tools(errors.u <= SETTLED)
             errors = self._errors(errors.start) if settled else errors
             if settled or errors.u > max(goal, KEEP * before):
@@ -372,8 +372,10 @@ class Newton:
         with Timer("mpm: linear solve"):
             return self._solvers.solve(rtol, errors.forces, errors.exchanged)
 
-    def _line_search(self, before: Errors, dog: Watchdog | None = None) -> Errors:
+    def _line_search(self, before: Errors, dog: Watchdog | None = None) -> tuple[Errors, float]:
         """Go against the direction, backtracking while the residual is not finite or explodes, or as a watchdog says.
+
+        Return the errors there, and the share of the step.
 
         Where a watchdog lets the iterations stray, see `_balance_work`.  Where it wants them to descend and no residual
         is as low, the lowest is taken.
@@ -388,16 +390,17 @@ class Newton:
             self._move(moved - step)
             moved, errors = step, self._errors(before.start)
             if errors.worst <= limit:
-                return errors
+                return errors, step
             tried[errors.worst] = step
             step *= 0.5 if dog is None else shortened(errors.worst / before.worst, step)
         if not min(tried) <= explodes:
             raise NotConverged("no descent along the Newton direction", self.report.history)
-        self._move(moved - tried[min(tried)])
-        return self._errors(before.start)
+        best = tried[min(tried)]
+        self._move(moved - best)
+        return self._errors(before.start), best
 
-    def _balance_work(self, before: Errors) -> Errors:
-        """Go against the direction to where the residual falls, or the work that the forces do along it.
+    def _balance_work(self, before: Errors) -> tuple[Errors, float]:
+        """Go against the direction, fully where the residual falls, else to where the forces do no work along it.
 
         See `watchdog`, to which it is left where no try does so.
         """
@@ -406,9 +409,8 @@ class Newton:
         while search is not None:
             self._move(moved - search.step)
             moved, errors = search.step, self._errors(before.start)
-            falls = errors.worst <= before.worst
-            search = None if falls else search.after(_ratio(force.dot(self._solvers.du), first))
-        return errors
+            search = search.after(_ratio(force.dot(self._solvers.du), first), errors.worst <= before.worst)
+        return errors, moved
 
     def _move(self, scale: float) -> None:
         self._momentum.system.unknowns.add(self._momentum.forms.u, scale, self._solvers.du)
