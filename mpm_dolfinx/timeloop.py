@@ -191,9 +191,8 @@ def _histories(
     last = after.rows[-1][0]
     # a run that was broken off has taken a part of its next interval
     if after.dt != times.interval or not last <= now <= times.next(last):
-        raise ValueError(
-            f"dt = {times.interval!r} from t = {now!r}: the run to go on with has dt = {after.dt!r}, t = {last!r}"
-        )
+        what = f"dt = {times.interval!r} from t = {now!r}: the run to go on with has dt = {after.dt!r}, t = {last!r}"
+        raise ValueError(f"{what}; with other steps, or t_eval, begin new histories: without after")
     shown = after.rows[0].displacement
     if (recorded := 0 if shown is None else len(shown)) != (0 if probes is None else len(probes.id)):
         raise ValueError(f"probes: the run to go on with has {recorded} of them")
