@@ -32,11 +32,12 @@ from mpm_dolfinx.problems.quadrature_data import QuadratureData
 from mpm_dolfinx.problems.storage import StorageForms
 from mpm_dolfinx.state import State, Stay
 
-PAID = 0.2
+PAID = 0.1
 """Share of what points are owed that the next step takes in, over the cells that a corner has moved since the cut.
 
-With 1, after twenty undrained cycles of a beam of 5 cells as little is left; with 0.04 a fifth more.  Where hardly
-anything moves nothing is paid: so the orders in time are those of the method.
+With 0, 0.1, 0.2 and 0.4, twenty undrained cycles of a beam of 5 cells leave 7.7, 3.8, 3.7 and 3.6 % of the stress; from
+0.2 on pressures of a manufactured solution converge with less than order 1.75.  Where hardly anything moves nothing is
+paid, so the orders in time are those of the method.
 """
 
 

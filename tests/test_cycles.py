@@ -110,7 +110,7 @@ def test_what_undrained_cycles_leave_is_bounded():
     """What is owed to the points is paid back: without, 3.9 and 5.3 % were left after 5 and 10 cycles, and so on."""
     soil = replace(clay(0.0), conductivity=0.0)
     left = cycles.cycle(0.06, 54e3, 10, 10, material=soil, fluid=mpm.Fluid())["left"]
-    assert left[-1] < 0.037 and left[-1] < 1.1 * left[4], left
+    assert left[-1] < 0.039 and left[-1] < 1.1 * left[4], left
 
 
 def test_a_body_that_turns_by_360_degrees_has_its_stresses_back():
