@@ -145,6 +145,18 @@ def test_a_law_in_numpy_has_the_stress_the_tangent_and_the_state_that_it_gives(d
         (lambda trial: {"pressure": (trial["volume"], {"volume": np.eye(2)})}, r"derivative of pressure by volume has"),
         (lambda trial: trial["volume"], "what it gives = .* must be a dict"),
         (lambda trial: trial["strain"], "raises KeyError: 'strain'"),
+        (lambda trial: {"pressure": trial["volume"]}, "solution: pressure = .* must be a pair"),
+        (lambda trial: {"pressure": 3.0}, "solution: pressure = 3.0, must be a pair"),
+        (lambda trial: {"pressure": (trial["volume"], trial["volume"])}, "must be a pair"),
+        (lambda trial: {"pressure": (np.zeros(1), {})}, r"solution: pressure has shape \(1,\), must be \(\d+,\)"),
+        (
+            lambda trial: {"pressure": (1j * trial["volume"], {})},
+            "has numbers of type complex128, must be real",
+        ),
+        (
+            lambda trial: {"pressure": (trial["volume"], {"volum": trial["volume"]})},
+            "derivative of pressure by 'volum', must be by some of volume",
+        ),
     ],
 )
 def test_one_line_says_what_is_wrong_with_a_law_in_numpy(solution, message):
@@ -153,6 +165,20 @@ def test_one_line_says_what_is_wrong_with_a_law_in_numpy(solution, message):
     with pytest.raises(ValueError, match=message) as caught:
         s.step(1.0)
     assert "\n" not in str(caught.value)
+
+
+class Torn(Crushable):
+    """Foam that has no pressure beyond a compression."""
+
+    @staticmethod
+    def solution(trial, bulk):
+        volume = trial["volume"]
+        return {"pressure": (np.where(volume > -0.05, bulk * volume, np.nan), {"volume": np.full_like(volume, bulk)})}
+
+
+def test_a_law_in_numpy_without_a_finite_solution_names_the_first_point():
+    with pytest.raises(mpm.NotConverged, match=r"Torn.solution: is not finite at \["):
+        mpm.element_test(Torn(bulk=1e6, shear=2e5), "oedometer", strain=0.1)
 
 
 class Misnamed(Stiffening):

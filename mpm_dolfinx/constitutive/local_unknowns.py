@@ -27,7 +27,7 @@ from mpm_dolfinx.constitutive.user_functions import call
 from mpm_dolfinx.errors import NotConverged
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointExpression
 from mpm_dolfinx.parallel.exchange import first
-from mpm_dolfinx.validation import instance
+from mpm_dolfinx.validation import instance, line
 
 MOST, HALVINGS = 60, 25  # iterations, and halvings of their steps in all
 CLOSE = 1e-9  # a Newton step below this, relative to unknowns of order one, leaves round-off
@@ -168,31 +168,61 @@ class _Equations:
             start += _size(shape)
         given = {name: data[name].reshape(n, *getattr(self._points, name).ufl_shape) for name in self._names}
         given |= {name: float(constant.value) for name, constant in self._by_scene.items()}
-        found, refused = None, ""
+        blocks, refused = [], ""
         try:
             found = call(self._law.solution, **self._with_trial(values), **given)
-            instance(f"{self._law.__name__}.solution: what it gives", found, dict)
-            self._check("solution", {name: np.shape(value)[1:] for name, (value, _) in found.items()})
+            blocks = self._checked(found, n)
         except ValueError as error:
             refused = str(error)
         if message := first(self._grid.comm, refused):  # what one process refuses, all must
             raise ValueError(message)
-        columns, rows = [], []
-        for name, shape in self._unknowns.items():
-            value, slopes = found[name]
-            columns.append(value.reshape(n, _size(shape)))
+        y, slopes = (np.concatenate(parts, axis=1) for parts in zip(*blocks, strict=True))
+        lost = np.flatnonzero(~(np.isfinite(y).all(axis=1) & np.isfinite(slopes).all(axis=(1, 2))))
+        shown = [f"{self._law.__name__}.solution: is not finite at {data.x[i]}" for i in lost[:1]]
+        if message := first(self._grid.comm, "".join(shown)):
+            raise NotConverged(message)
+        return Solved(data.key, y, trial, slopes.reshape(n, self.count * trial.shape[1]))
+
+    def _checked(self, found, n: int) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+        """Return each unknown (n, m) and its slopes (n, m, k) from what a law in numpy gives at n points.
+
+        Raises
+        ------
+        ValueError
+            An unknown is missing, is no pair of values and derivatives, or has another shape or kind of number; a
+            derivative is by what is no trial value.
+        """
+        name = f"{self._law.__name__}.solution"
+        instance(f"{name}: what it gives", found, dict)
+        for unknown, pair in found.items():
+            if not (isinstance(pair, (tuple, list)) and len(pair) == 2 and isinstance(pair[1], dict)):
+                raise ValueError(f"{name}: {unknown} = {line(pair)}, must be a pair: values, and a dict of derivatives")
+        self._check("solution", {unknown: np.shape(value)[1:] for unknown, (value, _) in found.items()})
+        blocks = []
+        for unknown, shape in self._unknowns.items():
+            value, slopes = found[unknown]
+            for of in slopes:
+                if of not in self._trial:
+                    among = ", ".join(self._trial)
+                    raise ValueError(f"{name}: derivative of {unknown} by {line(of)}, must be by some of {among}")
+            m, parts = _size(shape), []
             for of, by in self._trial.items():
-                slope = slopes.get(of)
                 wanted = (n, *shape, *by)
-                if slope is not None and np.shape(slope) != wanted:
-                    what = f"{self._law.__name__}.solution: derivative of {name} by {of}"
-                    raise ValueError(f"{what} has shape {np.shape(slope)}, must be {wanted}")
-                slope = np.zeros(wanted) if slope is None else slope
-                rows.append(slope.reshape(n, _size(shape), _size(by)))
-        count = len(self._trial)
-        slopes = [np.concatenate(rows[i : i + count], axis=2) for i in range(0, len(rows), count)]
-        flat = np.concatenate(slopes, axis=1).reshape(n, self.count * trial.shape[1])
-        return Solved(data.key, np.concatenate(columns, axis=1), trial, flat)
+                slope = _real(f"{name}: derivative of {unknown} by {of}", slopes.get(of, np.zeros(wanted)), wanted)
+                parts.append(slope.reshape(n, m, _size(by)))
+            value = _real(f"{name}: {unknown}", value, (n, *shape))
+            blocks.append((value.reshape(n, m), np.concatenate(parts, axis=2)))
+        return blocks
+
+
+def _real(name: str, value, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """Return real numbers of a shape; others are refused with a ValueError."""
+    value = np.asarray(value)
+    if value.shape != shape:
+        raise ValueError(f"{name} has shape {value.shape}, must be {shape}")
+    if value.dtype.kind not in "fiu":
+        raise ValueError(f"{name} has numbers of type {value.dtype}, must be real")
+    return value.astype(float, copy=False)
 
 
 def _newton(system, y: NDArray[np.float64]) -> NDArray[np.int64]:

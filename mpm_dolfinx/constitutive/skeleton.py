@@ -82,6 +82,7 @@ class Skeleton:
         In place of residual, in numpy: called with arrays (n, ...) of the law's fields, its state and `trial`, gives
         name -> (the unknown (n, ...), {name of a trial value: its derivative by it (n, ..., ...)}).  For returns with
         many cases, and laws that exist elsewhere: their stress, and what `update` sets the state to, are the unknowns.
+        A derivative that is left out is zero.  Where it gives NaN or infinity there is no solution: the step is cut.
     trial
         (F, ...) -> {name: UFL}: all by which the residuals depend on F; without it they name F itself.  What is no UFL
         in it the residuals do not see; `kirchhoff` and `update` may name `trial` too, and see all of it.
