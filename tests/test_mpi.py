@@ -13,12 +13,12 @@ from mpm_dolfinx.parallel.partition import owners
 
 
 def mpirun(processes: int, script: str, *arguments: str) -> None:
-    """Run a script of this folder by mpirun; a failing rank aborts all."""
+    """Run a script of this folder by mpirun; a failing rank aborts all. The limit is one of hanging, not of slowness."""
     here = Path(__file__).parent
     environment = dict(os.environ)  # given whole: mpirun must not see the MPI variables of this process
     environment["PYTHONPATH"] = os.pathsep.join([str(here), str(here.parent), environment.get("PYTHONPATH", "")])
     command = ["mpirun", "--oversubscribe", "-n", str(processes), sys.executable, "-m", "mpi4py", script, *arguments]
-    done = subprocess.run(command, cwd=here, env=environment, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(command, cwd=here, env=environment, capture_output=True, text=True, timeout=900)
     assert done.returncode == 0, done.stderr[-3000:]
 
 
