@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mpm_dolfinx.constitutive.skeleton import STANDARD_GRAVITY
 from mpm_dolfinx.initial_state import pieces_at_start
 from mpm_dolfinx.parallel.messages import warn
 from mpm_dolfinx.points.bodies import Body
@@ -26,11 +27,15 @@ from mpm_dolfinx.state import State
 from mpm_dolfinx.validation import chosen, flag, line, numbers
 
 
+WEIGHS = 5e-3  # share by which the unit weights of water outside and in the pores may differ without a warning
+
+
 def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int]) -> State:
     """Return the state of a scene at rest, in its first stage; its stresses as given, not yet in balance."""
     present = [body not in later for body in range(len(scene.bodies))]
     check_apart(scene.grid, scene.bodies, present)
     begun = _stage(scene, {**conditions, "terms": [term.given for term in scene.momentum.sides.own]}, present, later)
+    _warn_weights(scene, begun, {"pressure": scene.initial.pressure})
     points = scene.materials.seeded.of(_ids(scene.bodies, later), kept=False)
     points = scene.initial.of(scene.materials, points, present, begun.gravity_at(0.0) if scene.initial.given else None)
     transported = None
@@ -61,6 +66,8 @@ def begin_stage(
     present = [(here and body not in remove) or body in add for body, here in enumerate(before.present)]
     later = [body for body in before.later if body not in add]
     begun = _stage(scene, {**before.conditions, **named}, present, later)
+    if named.keys() & {"gravity", "tractions", "drained"}:
+        _warn_weights(scene, begun, {})
     if remove:
         _warn_moved_on(scene, before, begun, [name for name in CONDITIONS if name not in {*named, "tools"}])
     if state.stay:  # pressures are those of the cells
@@ -94,6 +101,22 @@ def begin_stage(
 def _stage(scene: Scene, conditions: Mapping[str, Any], present: Sequence[bool], later: Sequence[int]) -> Stage:
     wet = scene.fluid is not None
     return stage(scene.grid, scene.bodies, scene.materials, wet, conditions, present, later)
+
+
+def _warn_weights(scene: Scene, begun: Stage, given: Mapping[str, Any]) -> None:
+    """Log a warning for each level of water, given ones and those on sides, that is not as heavy as the pore fluid."""
+    if scene.fluid is None:
+        return
+    gravity = begun.conditions["gravity"]
+    g = STANDARD_GRAVITY if callable(gravity) else np.linalg.norm(0.0 if gravity is None else gravity)
+    own = scene.fluid.density * g
+    on_sides = [(f"water at {c.side!r}", c.pressure) for c in begun.conditions["drained"]]
+    on_sides += [(f"water at {c.side!r}", c.value) for c in begun.conditions["tractions"]]
+    weights = {(name, getattr(value, "unit_weight", own)) for name, value in [*given.items(), *on_sides]}
+    for name, weight in sorted(weights):
+        if abs(weight - own) > WEIGHS * max(weight, own):
+            what = "%s: unit_weight = %.6g N/m^3, but that of the pore fluid, its density times gravity, is %.6g"
+            warn(scene.grid.comm, f"{what}: at one level they are not at rest", name, weight, own)
 
 
 def _warn_moved_on(scene: Scene, before: Stage, begun: Stage, kept: Sequence[str]) -> None:

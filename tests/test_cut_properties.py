@@ -102,14 +102,14 @@ def dented(draw):
 def snapped(grid, corners):
     """Return corners in cells, on the grid planes that they are near."""
     y = (corners - grid.lower) / grid.h
-    return np.where(np.abs(y - np.rint(y)) < SNAP, np.rint(y), y)
+    return np.where(np.abs(y - np.rint(y)) < grid.snap, np.rint(y), y)
 
 
 def error(grid, corners):
     """Return how far `snapped` may be off, in cells: by rounding, or where others would snap a corner or not."""
     rounding = 1e-15 * (1 + ((np.abs(corners) + np.abs(grid.lower)) / grid.h).max())
     distance = np.abs((corners - grid.lower) / grid.h - snapped(grid, corners))
-    return rounding + SNAP * (np.abs(distance - SNAP) < rounding).any()
+    return rounding + (grid.snap * (np.abs(distance - grid.snap) < rounding)).max()
 
 
 def pieces(grid, *domains):

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from mpm_dolfinx import Grid, box
-from mpm_dolfinx.points.cutting import SNAP, corner_bits, cut, kuhn_simplices
+from mpm_dolfinx.points.cutting import corner_bits, cut, kuhn_simplices
+from mpm_dolfinx.points.grid import SNAP
 
 GRIDS = {2: Grid([1.0, 1.2], [5, 6]), 3: Grid([1.0, 1.2, 0.8], [4, 4, 4])}
 

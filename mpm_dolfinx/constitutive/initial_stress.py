@@ -77,11 +77,16 @@ def hydrostatic(level: float, unit_weight: float = 1000 * STANDARD_GRAVITY) -> C
     level
         Height, m, along the last axis.
     unit_weight
-        Of the fluid, N/m^3, > 0.
+        Of the fluid, N/m^3, > 0; a warning says where the scene's differs.
     """
     numbers("hydrostatic: level", level)
     numbers("hydrostatic: unit_weight", unit_weight, test=lambda v: (0 < v) & (v < np.inf), allowed="> 0 and finite")
-    return lambda x: unit_weight * (level - x[:, -1])
+
+    def pressure(x: NDArray[np.float64]) -> NDArray[np.float64]:
+        return unit_weight * (level - x[:, -1])
+
+    pressure.unit_weight = unit_weight
+    return pressure
 
 
 def by_body(given, bodies: Sequence[Body], later: Sequence[int]) -> dict[int, InitialStress]:

@@ -27,8 +27,7 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.points.grid import TURN, Grid, sum_by
 
-SNAP = 1e-10  # cells: vertices this close to a grid plane are taken to lie on it
-SLIVER = 1e-12  # of the domain: smaller pieces are dropped; less than a piece that is SNAP thin, whose face is open
+SLIVER = 1e-12  # of the domain: smaller pieces are dropped; less than one `Grid.snap` thin, whose face is open
 CHUNK = 2**15  # corners of domains that are cut at a time, in the processor's cache
 TANGLED = 0.2  # of its volume: a domain whose corners span less is re-derived from F
 
@@ -139,10 +138,10 @@ def cut(grid: Grid, corners: NDArray[np.float64]) -> Pieces:
 def _cut(grid: Grid, corners: NDArray[np.float64]) -> Pieces:
     d, true = grid.dim, np.ascontiguousarray(((corners - grid.lower) / grid.h).transpose(1, 2, 0))
     nearest = np.rint(true)
-    y = np.where(np.abs(true - nearest) < SNAP, nearest, true)
+    y = np.where(np.abs(true - nearest) < grid.snap[:, None], nearest, true)
     volume = np.stack(_simplex_volumes(y))
     flat = np.flatnonzero(~volume.any(axis=0))
-    if len(flat):  # thinner than SNAP, and on a plane: nothing would be left of them
+    if len(flat):  # thinner than that, and on a plane: nothing would be left of them
         y[:, :, flat] = true[:, :, flat]
         volume = np.stack(_simplex_volumes(y))
     # segments or triangles (d, d, m): vertices and coordinates first, which keeps the loops in numpy's fast lanes
@@ -229,9 +228,9 @@ def _sum(
         # what lies on a grid plane belongs to the cell of the body behind it
         index[a] -= (area[a] > 0) & (most[a] == index[a])
         np.clip(index[a], slots.low[a][owner], slots.high[a][owner], out=index[a])
-        flat = most[a] - least[a] < SNAP  # of two domains that touch, rounding may snap one only: hence 2 SNAP
-        lower = np.flatnonzero(flat & (area[a] < 0) & (most[a] - index[a] < 2 * SNAP))
-        upper = np.flatnonzero(flat & (area[a] > 0) & (index[a] + 1 - least[a] < 2 * SNAP))
+        flat = most[a] - least[a] < grid.snap[a]  # of two domains that touch, rounding may snap one only: hence twice
+        lower = np.flatnonzero(flat & (area[a] < 0) & (most[a] - index[a] < 2 * grid.snap[a]))
+        upper = np.flatnonzero(flat & (area[a] > 0) & (index[a] + 1 - least[a] < 2 * grid.snap[a]))
         ends.append((lower, upper))
     slot = slots.of(owner, index)
 
@@ -272,7 +271,7 @@ def _sum(
     # centroids stay off the grid lines, and inside the cell that they belong to
     volume, hoop, mixed = volume[kept], np.empty((len(kept), 0)), np.zeros((len(kept), len(uneven)))
     middle = np.stack([m[kept] / volume for m in moments], axis=1)
-    centroid = np.clip(middle, SNAP, 1 - SNAP)
+    centroid = np.clip(middle, grid.snap, 1 - grid.snap)
     for a, product in enumerate(uneven):
         b, c = (k for k in range(d) if k != a)
         # of a piece thinner than rounding allows for it is not known, and at most this
@@ -301,7 +300,7 @@ def _rings(
     of_volume = np.stack([inner * x + h * squares, inner * z + h * products], axis=1) / radius[:, None]
     product = h * height * (products - (x + z) / 2 + 0.25)
     hoop = np.stack([h * (x - 0.5), height * (z - 0.5), product, radius], axis=1)
-    return radius, np.clip(of_volume, SNAP, 1 - SNAP), hoop
+    return radius, np.clip(of_volume, grid.snap, 1 - grid.snap), hoop
 
 
 def _mean_products(
@@ -359,7 +358,7 @@ def cut_faces(
     d, m = grid.dim, len(corners)
     y = (corners - grid.lower) / grid.h
     nearest = np.rint(y)
-    y = np.where(np.abs(y - nearest) < SNAP, nearest, y)
+    y = np.where(np.abs(y - nearest) < grid.snap, nearest, y)
     both = np.concatenate([y, local], axis=2).transpose(1, 2, 0)
     split = kuhn_simplices(d - 1)
     s = np.concatenate([both[list(simplex)] for simplex in split], axis=2)

@@ -25,6 +25,7 @@ SIDES = {
     3: {"left": (0, 0), "right": (0, 1), "front": (1, 0), "back": (1, 1), "bottom": (2, 0), "top": (2, 1)},
 }
 """Names of the sides of a box: (axis, 0 for the lower or 1 for the upper end)."""
+SNAP = 1e-10  # cells: vertices this close to a grid plane, or as close as rounding tells, are taken to lie on it
 REACH = 1e-4  # cells: a side that is given its way to the wall of the grid gives way by as much
 
 SHARED = frozenset(
@@ -126,6 +127,8 @@ class Grid:
     ----------
     dim, shape, h, lower, upper
         d; cells along each axis (d,); their edges (d,), m; corners (d,), m.
+    snap
+        Distance to a grid plane, along each axis (d,), below which a vertex is taken to lie on it, cells.
     stretches
         Number of axes of deformation gradients: d, in axisymmetry 3, the third one that of the hoops.
     mesh
@@ -162,6 +165,7 @@ class Grid:
                 f"grid: cells = {line(cells)}: has {np.prod(count + 1):.3g} nodes, must be below {MOST // d}"
             )
         self.h = (self.upper - self.lower) / self.shape
+        self.snap = np.maximum(SNAP, [rounding(ends) for ends in zip(self.lower, self.upper, strict=True)] / self.h)
         self.comm = comm
         self._made: list[Cells] = []
         self._spaces: dict[tuple[int, ...], fem.FunctionSpace] = {}

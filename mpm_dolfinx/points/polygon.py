@@ -163,10 +163,12 @@ def _gmsh() -> Iterator:
 
 def _filled(loops: Sequence[tuple[NDArray[np.float64], Sequence[str]]], size: float) -> Mesh:
     """Return a polygon, and holes after it, filled with quadrilaterals of a size, m, and a triangle where none fits."""
+    extent = np.ptp(loops[0][0], axis=0).max()
+    origin = extent * np.round(loops[0][0][0] / extent, -2)  # where coordinates are large gmsh ends the process
     with _gmsh() as gmsh:
         geo, named, curves = gmsh.model.geo, {}, []
         for corners, names in loops:
-            points = [geo.addPoint(*x, 0.0, size) for x in corners]
+            points = [geo.addPoint(*x, 0.0, size) for x in corners - origin]
             lines = [geo.addLine(a, b) for a, b in zip(points, points[1:] + points[:1], strict=True)]
             curves.append(geo.addCurveLoop(lines))
             for tag, name in zip(lines, names, strict=True):
@@ -187,4 +189,4 @@ def _filled(loops: Sequence[tuple[NDArray[np.float64], Sequence[str]]], size: fl
             for name, lines in named.items()
             if name
         }
-    return Mesh(x.reshape(-1, 3)[:, :2].copy(), {kind: rows for kind, rows in cells.items() if len(rows)}, {}, sides)
+    return Mesh(origin + x.reshape(-1, 3)[:, :2], {kind: rows for kind, rows in cells.items() if len(rows)}, {}, sides)

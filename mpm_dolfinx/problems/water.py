@@ -35,7 +35,8 @@ def water(
     region : ((d,), (d,)), m
         Box of reference positions to which the faces are limited.
     unit_weight
-        Of the water, N/m^3, > 0; that of the pores is the fluid's density times the gravity of the scene.
+        Of the water, N/m^3, > 0; that of the pores is the fluid's density times the gravity of the scene: a warning
+        says where they differ.
 
     Raises
     ------
@@ -51,4 +52,5 @@ def water(
         height = numbers(name, asked(name, "a finite number for a time", level, t) if callable(level) else level)
         return unit_weight * np.maximum(height - x[:, -1], 0.0)
 
+    pressure.unit_weight = unit_weight
     return Pressure(side, pressure, region), Drained(side, pressure, region, seepage=True)
