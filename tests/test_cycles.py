@@ -19,9 +19,10 @@ from mpm_dolfinx.points.lattice import filtered, lattices
 MATRICES = st.lists(st.floats(-0.3, 0.3), min_size=9, max_size=9)
 
 
-def test_a_beam_is_free_of_stress_after_twenty_cycles():
-    run = cycles.cycle(0.03, 54e3, 20, 10)
-    assert run["left"][-1] < 5e-3
+def test_a_beam_is_free_of_stress_after_cycles():
+    """0.43 % are left after four and after eight; `demos/run.sh cycles` has twenty."""
+    run = cycles.cycle(0.03, 54e3, 8, 10)
+    assert run["left"][-1] < 4.5e-3 and run["left"][-1] < 1.02 * run["left"][3]
     peaks, rest = run["tips"][5::10], run["tips"][::10]
     assert abs(peaks[-1] / peaks[0] - 1) < 5e-5 and abs(rest[-1] / peaks[0]) < 1e-3
     assert (run["lost"] > 0).all() and run["cuts"] == 0
@@ -98,6 +99,16 @@ DRAINS = {"fluid": mpm.Fluid(), "drained": [mpm.Drained("top"), mpm.Drained("bot
 def test_what_cycles_leave_falls_with_the_cell_size_draining_and_in_3d_as_well(h, scene):
     left = [left_of(size, **scene) for size in (h, h / 2)]
     assert np.log2(left[0] / left[1]) > 1.2, left
+
+
+@pytest.mark.slow
+def test_what_undrained_cycles_leave_falls_slowly_only_where_a_clamp_has_edges():
+    """Stresses there are those of r^(x - 1), x = 0.595: with springs in the clamp's place the order is 1.35."""
+    soil = {"material": replace(clay(0.0), conductivity=0.0), "fluid": mpm.Fluid()}
+    sprung, clamped = ([cycles.cycle(h, 54e3, 5, 10, springs=k, **soil) for h in (0.06, 0.03)] for k in (5e7, 0.0))
+    assert cycles.orders([0.06, 0.03], [run["left"][-1] for run in sprung])[0] > 1.3
+    near = [np.sqrt(run["left"][-1] ** 2 - run["away"][-1] ** 2) for run in clamped]
+    assert 0.5 < cycles.orders([0.06, 0.03], near)[0] < 0.75
 
 
 @pytest.mark.slow
@@ -193,7 +204,7 @@ def test_weak_soil_that_only_turns_stays_free_of_stress_and_takes_no_cut_step(di
     """Its strength is that of a turn by 2 degrees, taken as a linearised displacement."""
     grid = mpm.Grid([1.6] * dim, [8] * dim)
     centre = np.full(dim, 0.81)
-    block = mpm.box(grid, centre - 0.3, centre + 0.3)
+    block = mpm.box(grid, centre - 0.3, centre + 0.3, per_cell=4 - dim)
 
     def turned(t, X):
         c, s, x = np.cos(t), np.sin(t), X - centre

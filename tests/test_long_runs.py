@@ -41,19 +41,28 @@ def test_what_is_left_of_a_cycle_falls_with_the_cell_size():
     assert left[1][-1] < 3e-4 and left[1][-1] < 0.4 * left[0][-1]
 
 
-@pytest.mark.parametrize(("conductivity", "most"), [(0.0, 8e-6), (SOFT.conductivity, 5e-5)])
-def test_a_sealed_beam_keeps_the_volume_of_its_domains(conductivity, most):
+@pytest.mark.parametrize(
+    ("conductivity", "bulk", "cycles", "most"),
+    [
+        (0.0, 2.2e9, 1, 2e-7),
+        (SOFT.conductivity, np.inf, 1, 3e-6),
+        pytest.param(SOFT.conductivity, 2.2e9, 4, 1e-5, marks=pytest.mark.slow),
+    ],
+)
+def test_a_sealed_beam_keeps_the_volume_of_its_domains(conductivity, bulk, cycles, most):
     """Corners follow more than the Q1 field, by 7e-5 of the volume in a cycle: what they gain is paid back.
 
-    What is left where nothing conducts does not grow; water that flows takes 3e-6 a cycle along, as p / K_w of it.
+    What is left, the gain of the last step, does not grow.  Fluxes keep the volume of water, not its mass: water that
+    flows, and that is compressible, takes 2.3e-6 a cycle along, as p / K_w of it.
     """
-    water, volumes = mpm.Fluid(bulk=2.2e9), []
+    volumes = []
 
     def observe(s):
         points = s.points
-        volumes.append(points.volume0 @ (points.J - 1 + SOFT.porosity / water.bulk * points.pressure) / 0.3)
+        volumes.append(points.volume0 @ (points.J - 1 + SOFT.porosity / bulk * points.pressure) / 0.3)
 
     material = replace(SOFT, conductivity=conductivity)
-    s, result = cycle(0.05, 2, material=material, observe=observe, fluid=water)
-    assert result.steps == 2 * STEPS + result.rejected and result.balance < 1e-8
+    s, result = cycle(0.05, cycles, material=material, observe=observe, fluid=mpm.Fluid(bulk=bulk))
+    assert result.steps == cycles * STEPS + result.rejected and result.balance < 1e-8
+    print(f"{cycles} cycles, k = {conductivity:g} m/s, K_w = {bulk:g} Pa: volume {volumes[-1]:.1e}, fluid {result.balance:.1e}")
     assert abs(volumes[-1]) < most and s.points.data["owed"].any(), volumes[-1]

@@ -40,20 +40,15 @@ def followed(
     used = np.flatnonzero(np.bincount(cells, minlength=1))
     slot = np.zeros(used.max(initial=0) + 1, dtype=np.intp)
     slot[used] = np.arange(len(used))
-    nodal, differences = u[grid.cell_nodes[used]], _second_differences(grid, used, u, active)
-    out = np.zeros((2, *x.shape))
+    nodal = np.concatenate([u[grid.cell_nodes[used]], *_second_differences(grid, used, u, active)], axis=2)
+    out = np.empty((2, *x.shape))
     for part in (slice(start, start + CHUNK) for start in range(0, len(x), CHUNK)):
         here = cells[part]
-        at, N, t = slot[here], grid.shape_values(here, x[part]), (x[part] - grid.midpoints[here]) / grid.h + 0.5
-        out[0, part] = _sum(N, nodal, at)
-        for a, D in enumerate(differences):
-            out[1, part] -= _sum((0.5 * t[:, a] * (1 - t[:, a]))[:, None] * N, D, at)
+        N, t = grid.shape_values(here, x[part]), (x[part] - grid.midpoints[here]) / grid.h + 0.5
+        values = np.einsum("mk,mkd->md", N, np.take(nodal, slot[here], axis=0)).reshape(len(t), -1, t.shape[1])
+        out[0, part] = values[:, 0]
+        out[1, part] = np.einsum("ma,mad->md", 0.5 * t * (t - 1), values[:, 1:])
     return out
-
-
-def _sum(N: NDArray[np.float64], values: NDArray[np.float64], at: NDArray[np.intp]) -> NDArray[np.float64]:
-    """Return the sums (m, d) over the nodes of cells of N (m, 2^d) times values (cells, 2^d, d)."""
-    return np.einsum("mk,mkd->md", N, np.take(values, at, axis=0))
 
 
 def _second_differences(

@@ -23,6 +23,7 @@ from mpi4py import MPI
 import numpy as np
 from numpy.typing import NDArray
 
+from mpm_dolfinx.caching import Latest
 from mpm_dolfinx.parallel.exchange import Exchange
 from mpm_dolfinx.points.bodies import Body
 from mpm_dolfinx.points.contact import Faces, covers
@@ -62,6 +63,7 @@ class Lattice:
     ):
         self._body, self._start, self._stop = body, start, start + len(body)
         self._dim, self._count = body.dim, body.lattice
+        self._numbers: Latest[NDArray[np.int64]] = Latest()
         self._parted = PARTED * body.spacing.min()
         self._joined = np.zeros(body.nodes(np.arange(len(body))).max() + 1, dtype=bool)
         self._joined[np.take_along_axis(body.nodes(joined[0]), joined[1], axis=1)] = True
@@ -77,7 +79,11 @@ class Lattice:
 
     def given(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return which components (m, 2^d, d) of the corners of domains conditions give."""
-        return self._given[self._body.nodes(ids - self._start)]
+        return self._given[self._nodes(ids)]
+
+    def _nodes(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the numbers (m, 2^d) of the corners of domains."""
+        return self._numbers(ids, lambda: self._body.nodes(ids - self._start))
 
     def corners_change(
         self, comm: MPI.Intracomm, ids: NDArray[np.int64], d: NDArray[np.float64], crossed: NDArray[np.float64]
@@ -88,7 +94,7 @@ class Lattice:
         """
         if self._count is None:
             return np.zeros_like(d)
-        number = self._body.nodes(ids - self._start)
+        number = self._nodes(ids)
         values = np.concatenate([d, crossed[:, :, None]], axis=2).reshape(-1, self._dim + 1)
         change = _change(comm, tuple(np.add(self._count, 1)), number.ravel(), values, self._parted).reshape(d.shape)
         change[self._joined[number]] = 0.0
