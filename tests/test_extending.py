@@ -363,7 +363,10 @@ CASES = {
         lambda: column(fluid=False, material=replace(SOFT, bulk=lambda X: X[:, 1] - 0.5)),
         "bulk = -0.475, must be > 0",
     ),
-    "update of another shape": (lambda: column(fluid=False, material=WrongUpdate(1, 1)).step(1.0), "'damage' of shape"),
+    "update of another shape": (
+        lambda: column(fluid=False, material=WrongUpdate(1, 1)).step(1.0),
+        r"WrongUpdate.update: gives \{'damage': \(2, 2\)\}, must have",
+    ),
     "unknown argument of a term": (
         lambda: column(fluid=False, terms=[lambda points, w: w]), "argument 'w', must be some of points, u, v, t, dt"),
     "source without fluid": (lambda: column(fluid=False, sources=[lambda q: q]), "need a fluid"),

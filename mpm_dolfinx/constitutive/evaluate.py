@@ -16,13 +16,12 @@ from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
 from mpm_dolfinx.constitutive.axes import block
 from mpm_dolfinx.constitutive.local_unknowns import LocalUnknowns
 from mpm_dolfinx.constitutive.skeleton import BY_SCENE, Skeleton
-from mpm_dolfinx.constitutive.user_functions import call, expression
+from mpm_dolfinx.constitutive.user_functions import call, compiling, expression, named
 from mpm_dolfinx.errors import NotConverged
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointExpression
 from mpm_dolfinx.parallel.exchange import first
 from mpm_dolfinx.points.grid import Grid
 from mpm_dolfinx.points.material_points import MaterialPoints
-from mpm_dolfinx.validation import instance
 
 
 class LawAtPoints:
@@ -64,14 +63,14 @@ class LawAtPoints:
 
     @cached_property
     def _values(self) -> dict:
-        own = self._local.values if self._local is not None else {}
+        own = self._local.known if self._local is not None else {}
         return {**self._given, **own}
 
     def _solve(self, data: PointData, dt: float) -> None:
         """Set the time since the start of the step, s, and solve for local unknowns."""
         self._by_scene["dt"].value = dt
         if self._local is not None:
-            self._local.update(data)
+            self._local.update(data, derive=False)
 
     def data(
         self, points: MaterialPoints, rows: NDArray[np.int64], values: dict[str, NDArray[np.float64]]
@@ -110,14 +109,11 @@ class LawAtPoints:
     @cached_property
     def _update(self) -> tuple[PointExpression, dict[str, tuple[int, ...]]]:
         """All components of the new state in one vector, and the shapes of its parts."""
-        given = call(self.law.update, F=self._F, **self._values)
-        instance(f"{self.law.__name__}.update: the new state", given, dict)
-        new = {name: ufl.as_ufl(f) for name, f in given.items()}
-        for name, f in new.items():
-            if name not in self.law.state or f.ufl_shape != np.shape(self.law.state[name]):
-                raise ValueError(f"{self.law.__name__}.update: {name!r} of shape {f.ufl_shape} is not in its state")
+        what, shapes = f"{self.law.__name__}.update", {name: np.shape(value) for name, value in self.law.state.items()}
+        new = named(what, call(self.law.update, F=self._F, **self._values), shapes, some=True)
         parts = [f[i] if i else f for f in new.values() for i in np.ndindex(f.ufl_shape)]
-        return PointExpression(ufl.as_vector(parts), self.points), {name: f.ufl_shape for name, f in new.items()}
+        with compiling(what, f"real UFL of {shapes}"):
+            return PointExpression(ufl.as_vector(parts), self.points), {name: shapes[name] for name in new}
 
     def new_state(self, data: PointData, dt: float) -> list[tuple[str, NDArray[np.float64]]]:
         """Return the names and values (n, ...) of the state that follows from the F of the end of a step of dt, s."""

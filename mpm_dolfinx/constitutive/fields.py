@@ -27,6 +27,7 @@ RESERVED = frozenset(
     "F dF softness owed due storage storage_at_one density position displacement porosity0 gradient retention".split()
 )
 """Names of what points of integration carry beside parameters and state."""
+WHAT_IS_NAMED = "parameters, state and unknowns"
 EVOLVED = 1e-3
 """By how much the state of a law differs from that at rest where it counts as another."""
 STIFFEST = 100.0
@@ -140,8 +141,11 @@ class SceneMaterials:
         if given != bool(law.unknowns):
             has = f"{'' if law.unknowns else 'no '}unknowns and {given} of residual and solution"
             raise ValueError(f"{law.__name__}: has {has}, must have unknowns and one of these, or neither")
-        if taken := [name for name in (*_names(m), *law.state) if name in BY_SCENE]:
-            raise ValueError(f"{law.__name__}: the name {taken[0]!r} is taken; parameters and state must have another")
+        own, others = (*_names(m), *law.state), {*_names(m), *law.state, *BY_SCENE, "F", "trial"}
+        if taken := [name for name in own if name in BY_SCENE] + [name for name in law.unknowns if name in others]:
+            raise ValueError(f"{law.__name__}: the name {taken[0]!r} is taken; {WHAT_IS_NAMED} must have another")
+        for name, value in law.unknowns.items():
+            _known(f"{law.__name__}: unknown {name!r}", value)
         m.check_cells(mean_size(self.grid))
         for name in law.parameters:
             if not hasattr(m, name):
@@ -156,7 +160,7 @@ class SceneMaterials:
 
     def _set_shape(self, law, name: str, shape: tuple[int, ...]) -> None:
         if name in RESERVED or hasattr(FormPoints(self.grid), name):
-            raise ValueError(f"{law.__name__}: the name {name!r} is taken; parameters and state must have another")
+            raise ValueError(f"{law.__name__}: the name {name!r} is taken; {WHAT_IS_NAMED} must have another")
         other = self.shapes.setdefault(name, shape)
         if other != shape:
             raise ValueError(f"{law.__name__}: {name} has shape {shape}, in another law {other}; must agree")

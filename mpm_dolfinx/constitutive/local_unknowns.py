@@ -7,13 +7,16 @@ once, to round-off.  The forms see
     y = y* + Y (z(F) - z*),     Y = -(df/dy)^-1 df/dz  at the solution (y*, z*),
 
 whose value is y* and whose derivative by F is that of the solution: UFL's derivative of a stress that is a function of
-y and F is the consistent tangent, and no iteration is unrolled.  y*, z* and Y are coefficients at the points.  A law
-may also give y(z) and its derivative in numpy.
+y and F is the consistent tangent, and no iteration is unrolled.  y*, z* and Y are coefficients at the points.  Where a
+stress is evaluated and not differentiated it is that of y*, and there is no Y.  The stress of a law with an energy is
+itself a derivative: there y has a term of second order, whose coefficients follow from f = 0 once more.  A law may also
+give y(z) and its derivative in numpy.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from itertools import combinations_with_replacement, product
 from typing import NamedTuple
 
 import numpy as np
@@ -23,11 +26,11 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.caching import Latest
 from mpm_dolfinx.constitutive.skeleton import BY_SCENE, Skeleton
-from mpm_dolfinx.constitutive.user_functions import call
+from mpm_dolfinx.constitutive.user_functions import call, named
 from mpm_dolfinx.errors import NotConverged
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointExpression
 from mpm_dolfinx.parallel.exchange import first
-from mpm_dolfinx.validation import instance, line
+from mpm_dolfinx.validation import asked, instance, line
 
 MOST, HALVINGS = 60, 25  # iterations, and halvings of their steps in all
 CLOSE = 1e-9  # a Newton step below this, relative to unknowns of order one, leaves round-off
@@ -35,12 +38,19 @@ ROUND_OFF = 1e-15  # of residuals of order one
 
 
 class Solved(NamedTuple):
-    """Solution at some points: key of their data; unknowns (n, m), trial values (n, k) and slopes Y (n, m k)."""
+    """Solution at some points: key of their data; unknowns (n, m), trial values (n, k); what gives the derivatives."""
 
     key: object
     unknowns: NDArray[np.float64]
     trial: NDArray[np.float64]
+    derive: Callable[[], Derived]
+
+
+class Derived(NamedTuple):
+    """Derivatives by the trial values: slopes Y (n, m k), and of an energy's unknowns bends (n, m k k)."""
+
     slopes: NDArray[np.float64]
+    bends: NDArray[np.float64] | None = None
 
 
 class LocalUnknowns:
@@ -56,6 +66,14 @@ class LocalUnknowns:
         Deformation gradient (d, d) that the law sees, as UFL.
     values
         UFL values of the law's parameters and state, and the constants that the scene gives to laws.
+
+    Attributes
+    ----------
+    values
+        The unknowns by name, as UFL that depends on F, and `trial`.
+    known
+        The same for what is not differentiated by F: kernels do not compute trial values there.  Stresses that are
+        derivatives of an energy are.
     """
 
     def __init__(self, law: type[Skeleton], points: FormPoints, F, values: Mapping[str, object]):
@@ -64,12 +82,17 @@ class LocalUnknowns:
         instance(f"{law.__name__}.trial: what it gives", trial, dict)
         given = {"trial": trial}
         trial = {name: value for name, value in trial.items() if isinstance(value, ufl.core.expr.Expr)}
+        if not trial:
+            raise ValueError(f"{law.__name__}.trial: gives {line(given['trial'])}, must have some UFL of F")
         z = _parts(trial.values())
-        self._trial, self._solved = PointExpression(ufl.as_vector(z), points), Latest()
-        self._dt = values["dt"]
-        self._equations = _Equations(law, points, trial, {name: values[name] for name in BY_SCENE})
+        self._trial, self._dt = PointExpression(ufl.as_vector(z), points), values["dt"]
+        self._solved: Latest[Solved] = Latest()
+        self._derived: Latest[tuple[Solved, Derived]] = Latest()
+        self._of_energy = law.kirchhoff is None
+        bends = self._of_energy and law.residual is not None
+        self._equations = _Equations(law, points, trial, {name: values[name] for name in BY_SCENE}, bends)
         m, k = self._equations.count, len(z)
-        shapes = {"unknowns": (m,), "trial": (k,), "slopes": (m, k)}
+        shapes = {"unknowns": (m,), "trial": (k,), "slopes": (m, k)} | ({"bends": (m, k * k)} if bends else {})
         at = {
             what: points.follow(f"local {what}", s, lambda data, w=what: self._now(data, w))
             for what, s in shapes.items()
@@ -77,11 +100,17 @@ class LocalUnknowns:
         # component by component: in 3D products of tensors take ten times as long to compile
         off = [z[j] - at["trial"][j] for j in range(k)]
         y = [at["unknowns"][i] + sum(at["slopes"][i, j] * off[j] for j in range(k)) for i in range(m)]
-        self.values = given | _named({name: np.shape(start) for name, start in law.unknowns.items()}, y)
-        """The unknowns by name, as UFL that depends on F, and `trial`."""
+        if bends:  # in the tangent is the second derivative of the unknowns by F
+            for i, (j, l) in product(range(m), combinations_with_replacement(range(k), 2)):
+                y[i] += at["bends"][i, k * j + l] * off[j] * off[l] / (2 if j == l else 1)
+        shapes = {name: np.shape(start) for name, start in law.unknowns.items()}
+        self.values = given | _named(shapes, y)
+        self.known = self.values if self._of_energy else given | _named(shapes, at["unknowns"])
 
-    def update(self, data: PointData) -> None:
-        """Solve for the unknowns of points at their present F; all processes together.
+    def update(self, data: PointData, derive: bool = True) -> None:
+        """Solve for the unknowns of points at their present F, and derive them; all processes together.
+
+        derive: whether what is evaluated next depends on `values`, not on `known` alone.
 
         Raises
         ------
@@ -90,19 +119,40 @@ class LocalUnknowns:
         """
         trial = self._trial.evaluate(data)
         self._solved((data.key, trial, float(self._dt.value)), lambda: self._equations.solve(data, trial), self._comm)
+        if derive or self._of_energy:
+            self.derive(data)
 
-    def _now(self, data: PointData, what: str) -> NDArray[np.float64]:
+    def derive(self, data: PointData) -> None:
+        """Derive the unknowns of points where they were solved last by F; all processes together."""
+        solved = self._at(data)
+        self._derived(solved.derive, lambda: (solved, solved.derive()), self._comm)
+
+    def _at(self, data: PointData) -> Solved:
         solved = self._solved.value
         if solved is None or solved.key is not data.key:
             raise RuntimeError(f"{self._law.__name__}: local unknowns are asked for before they are solved")
-        return getattr(solved, what)
+        return solved
+
+    def _now(self, data: PointData, what: str) -> NDArray[np.float64]:
+        solved = self._at(data)
+        if what not in Derived._fields:
+            return getattr(solved, what)
+        of, derived = self._derived.value or (None, None)
+        if of is not solved:
+            raise RuntimeError(f"{self._law.__name__}: local unknowns are asked for before they are derived")
+        return getattr(derived, what)
 
 
 class _Equations:
     """The equations f(y, z) = 0 of a law at points that carry what they take."""
 
     def __init__(
-        self, law: type[Skeleton], points: FormPoints, trial: Mapping[str, object], by_scene: Mapping[str, fem.Constant]
+        self,
+        law: type[Skeleton],
+        points: FormPoints,
+        trial: Mapping[str, object],
+        by_scene: Mapping[str, fem.Constant],
+        bends: bool,
     ):
         self._law, self._grid, self._by_scene = law, points.grid, by_scene
         equations = law.residual or law.solution
@@ -119,24 +169,23 @@ class _Equations:
         y, z = (ufl.variable(own.follow(name, (size,), _given)) for name, size in (("unknowns", m), ("trial", k)))
         given = {name: getattr(own, name) for name in self._names} | _named(self._unknowns, y) | self._by_scene
         residual = call(law.residual, **self._with_trial(_named(self._trial, z)), **given)
-        instance(f"{law.__name__}.residual: what it gives", residual, dict)
-        found = {name: ufl.as_ufl(value) for name, value in residual.items()}
-        self._check("residual", {name: value.ufl_shape for name, value in found.items()})
+        found = named(f"{law.__name__}.residual", residual, self._unknowns)
         f = ufl.as_vector(_parts(found[name] for name in self._unknowns))
         by_y, by_z = ufl.diff(f, y), ufl.diff(f, z)
         steps = [by_y[i, j] for i in range(m) for j in range(m)]
         self._newton = PointExpression(ufl.as_vector([*(f[i] for i in range(m)), *steps]), own)
         self._slopes = PointExpression(ufl.as_vector([*steps, *(by_z[i, j] for i in range(m) for j in range(k))]), own)
+        self._bends = None
+        if bends:  # the second derivative of f along y = y* + Y (z - z*)
+            Y = own.follow("slopes", (m, k), _given)
+            along = ufl.as_matrix([[_along(by_y, by_z, Y, m, (i,), j) for j in range(k)] for i in range(m)])
+            by_y, by_z = ufl.diff(along, y), ufl.diff(along, z)
+            each = product(range(m), range(k), range(k))
+            self._bends = PointExpression(ufl.as_vector([_along(by_y, by_z, Y, m, (i, j), l) for i, j, l in each]), own)
 
     def _with_trial(self, values: dict) -> dict:
         """Return trial values as the law's equations name them."""
         return {"trial": values} if self._law.trial is not None else values
-
-    def _check(self, function: str, shapes: dict[str, tuple[int, ...]]) -> None:
-        """Refuse equations that do not give what the unknowns are."""
-        if shapes != self._unknowns:
-            allowed = f"the unknowns' names and shapes {self._unknowns}"
-            raise ValueError(f"{self._law.__name__}.{function}: gives {shapes}, must have {allowed}")
 
     def solve(self, data: PointData, trial: NDArray[np.float64]) -> Solved:
         """Return the solution at points with trial values (n, k); all processes together."""
@@ -153,71 +202,120 @@ class _Equations:
             return f, out[:, m:].reshape(-1, m, m), np.where(norm < np.inf, norm, np.inf)
 
         failed = _newton(system, y)
-        shown = [f"{self._law.__name__}: local equations have no solution at {data.x[i]}" for i in failed[:1]]
+        self._refuse(data, failed, ": local equations have no solution")
+
+        def derive() -> Derived:
+            given = {"unknowns": y, "trial": trial}
+            out, k = self._slopes.evaluate(at, None, given), trial.shape[1]
+            by_y, by_z = out[:, : m * m].reshape(-1, m, m), out[:, m * m :].reshape(n, m, k)
+            slopes = -_solve(by_y, by_z)
+            lost = np.flatnonzero(~np.isfinite(slopes).all(axis=(1, 2)))
+            self._refuse(data, lost, ".residual: does not determine the unknowns")
+            if self._bends is None:
+                return Derived(slopes.reshape(n, m * k))
+            second = self._bends.evaluate(at, None, given | {"slopes": slopes.reshape(n, m * k)})
+            bends = -_solve(by_y, second.reshape(n, m, k * k))
+            return Derived(slopes.reshape(n, m * k), bends.reshape(n, m * k * k))
+
+        return Solved(data.key, y, trial, derive)
+
+    def _refuse(self, data: PointData, lost: NDArray[np.int64], why: str) -> None:
+        """Raise NotConverged, naming the first point that is lost on any process; all of them together."""
+        shown = [f"{self._law.__name__}{why} at {data.x[i]}" for i in lost[:1]]
         if message := first(self._grid.comm, "".join(shown)):
             raise NotConverged(message)
-        out = self._slopes.evaluate(at, None, {"unknowns": y, "trial": trial})
-        by_y, by_z = out[:, : m * m].reshape(-1, m, m), out[:, m * m :].reshape(n, m, trial.shape[1])
-        return Solved(data.key, y, trial, -_solve(by_y, by_z).reshape(n, m * trial.shape[1]))
 
     def _in_numpy(self, data: PointData, trial: NDArray[np.float64]) -> Solved:
         """Return the solution of a law that gives it in numpy."""
-        n, values, start = len(trial), {}, 0
-        for name, shape in self._trial.items():
-            values[name] = trial[:, start : start + _size(shape)].reshape(n, *shape)
+        n, k, values, start = *trial.shape, {}, 0
+        for name, shape in self._trial.items():  # copies: what a law does to its arguments stays with it
+            values[name] = trial[:, start : start + _size(shape)].reshape(n, *shape).copy()
             start += _size(shape)
-        given = {name: data[name].reshape(n, *getattr(self._points, name).ufl_shape) for name in self._names}
+        given = {name: data[name].reshape(n, *getattr(self._points, name).ufl_shape).copy() for name in self._names}
         given |= {name: float(constant.value) for name, constant in self._by_scene.items()}
-        blocks, refused = [], ""
+        found: dict = {}
+
+        def solution() -> list[NDArray[np.float64]]:
+            found.update(self._checked(call(self._law.solution, "numpy", **self._with_trial(values), **given), n))
+            return [found[of][0].reshape(n, _size(shape)) for of, shape in self._unknowns.items()]
+
+        def derive() -> Derived:
+            slopes = self._together(lambda: [self._slopes_of(of, found[of][1], n) for of in self._unknowns])
+            self._refuse(data, np.flatnonzero(~np.isfinite(slopes).all(axis=(1, 2))), ".solution: is not finite")
+            return Derived(slopes.reshape(n, self.count * k))
+
+        y = self._together(solution)
+        self._refuse(data, np.flatnonzero(~np.isfinite(y).all(axis=1)), ".solution: is not finite")
+        return Solved(data.key, y, trial, derive)
+
+    def _together(self, make: Callable[[], list[NDArray[np.float64]]]) -> NDArray[np.float64]:
+        """Return arrays side by side; what one process refuses with a ValueError, all do."""
+        made, refused = [], ""
         try:
-            found = call(self._law.solution, **self._with_trial(values), **given)
-            blocks = self._checked(found, n)
+            made = make()
         except ValueError as error:
             refused = str(error)
-        if message := first(self._grid.comm, refused):  # what one process refuses, all must
+        if message := first(self._grid.comm, refused):
             raise ValueError(message)
-        y, slopes = (np.concatenate(parts, axis=1) for parts in zip(*blocks, strict=True))
-        lost = np.flatnonzero(~(np.isfinite(y).all(axis=1) & np.isfinite(slopes).all(axis=(1, 2))))
-        shown = [f"{self._law.__name__}.solution: is not finite at {data.x[i]}" for i in lost[:1]]
-        if message := first(self._grid.comm, "".join(shown)):
-            raise NotConverged(message)
-        return Solved(data.key, y, trial, slopes.reshape(n, self.count * trial.shape[1]))
+        return np.concatenate(made, axis=1)
 
-    def _checked(self, found, n: int) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-        """Return each unknown (n, m) and its slopes (n, m, k) from what a law in numpy gives at n points.
+    @property
+    def _said(self) -> str:
+        return f"{self._law.__name__}.solution"
+
+    def _checked(self, found, n: int) -> dict:
+        """Return what a law in numpy gives at n points, unknowns and derivatives as arrays of real numbers.
 
         Raises
         ------
         ValueError
-            An unknown is missing, is no pair of values and derivatives, or has another shape or kind of number; a
-            derivative is by what is no trial value.
+            It is no pairs by the names of the unknowns, of these shapes; a derivative is by what is no trial value.
         """
-        name = f"{self._law.__name__}.solution"
-        instance(f"{name}: what it gives", found, dict)
-        for unknown, pair in found.items():
+        instance(f"{self._said}: what it gives", found, dict)
+        for of, pair in found.items():
             if not (isinstance(pair, (tuple, list)) and len(pair) == 2 and isinstance(pair[1], dict)):
-                raise ValueError(f"{name}: {unknown} = {line(pair)}, must be a pair: values, and a dict of derivatives")
-        self._check("solution", {unknown: np.shape(value)[1:] for unknown, (value, _) in found.items()})
-        blocks = []
-        for unknown, shape in self._unknowns.items():
-            value, slopes = found[unknown]
-            for of in slopes:
-                if of not in self._trial:
+                allowed = "must be a pair: values, and a dict of derivatives"
+                raise ValueError(f"{self._said}: {of} = {line(pair)}, {allowed}")
+        if set(found) != set(self._unknowns):
+            names = (", ".join(map(str, of)) or "nothing" for of in (found, self._unknowns))
+            raise ValueError("{}: gives {}, must give {}".format(self._said, *names))
+        out = {}
+        for of, shape in self._unknowns.items():
+            values, slopes = found[of]
+            for by in slopes:
+                if by not in self._trial:
                     among = ", ".join(self._trial)
-                    raise ValueError(f"{name}: derivative of {unknown} by {line(of)}, must be by some of {among}")
-            m, parts = _size(shape), []
-            for of, by in self._trial.items():
-                wanted = (n, *shape, *by)
-                slope = _real(f"{name}: derivative of {unknown} by {of}", slopes.get(of, np.zeros(wanted)), wanted)
-                parts.append(slope.reshape(n, m, _size(by)))
-            value = _real(f"{name}: {unknown}", value, (n, *shape))
-            blocks.append((value.reshape(n, m), np.concatenate(parts, axis=2)))
-        return blocks
+                    raise ValueError(f"{self._said}: derivative of {of} by {line(by)}, must be by some of {among}")
+            known = {by: slope if callable(slope) else self._slope(of, by, slope, n) for by, slope in slopes.items()}
+            out[of] = _real(f"{self._said}: {of}", values, (n, *shape)), known
+        return out
+
+    def _slope(self, of: str, by: str, given, n: int) -> NDArray[np.float64]:
+        """Return the derivative (n, ..., ...) of an unknown by a trial value; given: this, or a function."""
+        what = f"{self._said}: derivative of {of} by {by}"
+        value = asked(what, "a function without arguments that gives it", given) if callable(given) else given
+        return _real(what, value, (n, *self._unknowns[of], *self._trial[by]))
+
+    def _slopes_of(self, of: str, given: Mapping[str, object], n: int) -> NDArray[np.float64]:
+        """Return the slopes (n, m, k) of one unknown; given: its derivatives, by some trial values."""
+        m, parts = _size(self._unknowns[of]), []
+        for by, shape in self._trial.items():
+            slope = self._slope(of, by, given[by], n) if by in given else np.zeros((n, m, _size(shape)))
+            parts.append(slope.reshape(n, m, _size(shape)))
+        return np.concatenate(parts, axis=2)
+
+
+def _along(by_y, by_z, Y, m: int, i: tuple[int, ...], j: int):
+    """Return the derivative of a component i along y = y* + Y (z - z*), by the component j of z, as UFL."""
+    return by_z[(*i, j)] + sum(by_y[(*i, a)] * Y[a, j] for a in range(m))
 
 
 def _real(name: str, value, shape: tuple[int, ...]) -> NDArray[np.float64]:
     """Return real numbers of a shape; others are refused with a ValueError."""
-    value = np.asarray(value)
+    try:
+        value = np.asarray(value)
+    except ValueError as error:  # rows of different lengths
+        raise ValueError(f"{name} = {line(value)}, must be an array of shape {shape}") from error
     if value.shape != shape:
         raise ValueError(f"{name} has shape {value.shape}, must be {shape}")
     if value.dtype.kind not in "fiu":

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from mpm_dolfinx.constitutive.axes import embedded, planar
 from mpm_dolfinx.constitutive.frictional import Frictional
 from mpm_dolfinx.constitutive.skeleton import Field, _check
-from mpm_dolfinx.constitutive.trial import PLANE, Isotropic, coaxial, components, eigen, symmetric
+from mpm_dolfinx.constitutive.trial import PLANE, Coaxial, Isotropic, components, eigen, symmetric
 
 ROUND_OFF = 1e-12  # of stresses over the shear modulus
 FACE, EDGES, ALL = slice(0, 1), slice(1, 3), slice(None)  # of the faces of a return
@@ -106,9 +106,9 @@ class MohrCoulomb(Frictional):
         ordered = np.take_along_axis(e, order, axis=1)
         stresses, slopes, flows = _returned(ordered, bulk, shear, sine, sine_flow, strength, cutoff)
         stresses, slopes = np.take_along_axis(stresses, back, axis=1), slopes[n, back[:, :, None], back[:, None, :]]
-        by_x = slopes / (2 * x[:, None, :])
-        tau, tangent = coaxial(x, axes, stresses, by_x, plane=trial["b"].shape[1] == len(PLANE))
-        return {"stress": (tau, {"b": tangent}), "flows": (flows, {})}
+        tensor = Coaxial(x, axes, stresses, plane=trial["b"].shape[1] == len(PLANE))
+        by_b = {"b": lambda: tensor.tangent(slopes / (2 * x[:, None, :]))}
+        return {"stress": (tensor.values, by_b), "flows": (flows, {})}
 
     @staticmethod
     def kirchhoff(stress):

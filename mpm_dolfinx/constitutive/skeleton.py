@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.constitutive.axes import planar
 from mpm_dolfinx.constitutive.user_functions import expression
-from mpm_dolfinx.validation import asked, functions, line, numbers
+from mpm_dolfinx.validation import asked, functions, instance, line, numbers
 
 Field = float | Sequence[float] | Callable[[NDArray[np.float64]], ArrayLike]
 """A constant (number or vector), or a function of the reference positions X (n, d), m, that gives (n, ...)."""
@@ -82,7 +82,9 @@ class Skeleton:
         In place of residual, in numpy: called with arrays (n, ...) of the law's fields, its state and `trial`, gives
         name -> (the unknown (n, ...), {name of a trial value: its derivative by it (n, ..., ...)}).  For returns with
         many cases, and laws that exist elsewhere: their stress, and what `update` sets the state to, are the unknowns.
-        A derivative that is left out is zero.  Where it gives NaN or infinity there is no solution: the step is cut.
+        A derivative may be a function without arguments that gives it: it is called where there is a tangent to make.
+        One that is left out is zero.  Where it gives NaN or infinity there is no solution: the step is cut.  A law with
+        an `energy` that is not stationary in these unknowns takes many Newton steps, for want of second derivatives.
     trial
         (F, ...) -> {name: UFL}: all by which the residuals depend on F; without it they name F itself.  What is no UFL
         in it the residuals do not see; `kirchhoff` and `update` may name `trial` too, and see all of it.
@@ -142,6 +144,8 @@ class Skeleton:
 
     def __init_subclass__(cls, **options):
         super().__init_subclass__(**options)
+        for name in ("state", "unknowns"):
+            instance(f"{cls.__name__}: {name}", getattr(cls, name), Mapping)
         functions = (cls.energy, cls.kirchhoff, cls.update, cls.trial, cls.residual, cls.solution)
         names = dict.fromkeys(name for f in functions for name in cls.taken_by(f))
         cls.by_scene = tuple(name for name in BY_SCENE if name in names)
@@ -214,8 +218,13 @@ class Skeleton:
     def kirchhoff_in_plane(cls, F, values: Mapping[str, object]):
         """Return the Kirchhoff stress of the shape of F, Pa, as UFL, of a law that gives it."""
         d = F.ufl_shape[0]
-        tau = expression(cls.kirchhoff, [(d, d), (3, 3)], "F", F=F, **values)
+        tau = cls._kirchhoff(F, values, (d, d))
         return ufl.as_matrix([[tau[a, b] for b in range(d)] for a in range(d)])
+
+    @classmethod
+    def _kirchhoff(cls, F, values: Mapping[str, object], shape: tuple[int, int]):
+        """Return the Kirchhoff stress of a shape or (3, 3), Pa, as UFL; it may depend on F by local unknowns alone."""
+        return expression(cls.kirchhoff, [shape, (3, 3)], "" if cls.unknowns else "F", F=F, **values)
 
     @classmethod
     def out_of_plane(cls, F, values: Mapping[str, object]):
@@ -229,8 +238,10 @@ class Skeleton:
             UFL values of the parameters and of the state.
         """
         if cls.kirchhoff is not None:
-            tau = expression(cls.kirchhoff, [(2, 2), (3, 3)], "F", F=F, **values)
+            tau = cls._kirchhoff(F, values, (2, 2))
             return tau[2, 2] / ufl.det(F) if tau.ufl_shape == (3, 3) else None
+        if cls.unknowns:  # by how much these change with a stretch across the plane is not known
+            return None
         whole = ufl.variable(ufl.as_matrix([[F[0, 0], F[0, 1], 0], [F[1, 0], F[1, 1], 0], [0, 0, 1]]))
         try:
             energy = expression(cls.energy, [()], "F", F=whole, **values)

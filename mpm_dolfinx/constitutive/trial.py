@@ -4,7 +4,7 @@
 In UFL isotropic functions of a tensor are Newton's interpolation polynomials at its eigenvalues: exact for smooth
 functions of each eigenvalue, and smooth where eigenvalues are equal, because nodes need not be eigenvalues and are
 kept apart. Principal values that are functions of all three, with kinks, need the eigenvalues themselves: they are
-found in numpy, with the exact derivative, see `coaxial`.
+found in numpy, with the exact derivative, see `Coaxial`.
 """
 
 from __future__ import annotations
@@ -98,44 +98,51 @@ def eigen(b: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float
     return np.stack([mean + radius, mean - radius, b[:, 2]], axis=1), axes
 
 
-def coaxial(
-    x: NDArray[np.float64], axes: NDArray[np.float64], y: NDArray[np.float64], slopes: NDArray[np.float64], plane: bool
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return tensors with the axes of others, and their derivatives by these.
-
-    In the axes dy_ij = (y_i - y_j) / (x_i - x_j) dx_ij beside the diagonal; where x_i = x_j it is
-    (dy_i/dx_i - dy_i/dx_j) dx_ij, for an isotropic function has y_i = y_j there.
+class Coaxial:
+    """Tensors with the axes of others.
 
     Parameters
     ----------
     x, axes : (n, 3), (n, 3, 3)
-        Eigenvalues and axes, see `eigen`.
-    y, slopes : (n, 3), (n, 3, 3)
-        Principal values, and their derivatives by x.
+        Eigenvalues and axes of the others, see `eigen`.
+    y : (n, 3)
+        Principal values.
     plane
         Whether tensors are those of plane strain or axisymmetry.
-
-    Returns
-    -------
-    Components (n, 6) of the tensors, and their derivatives (n, 6, 4 or 6) by the components of the others.
     """
-    inner, pairs = (PLANE, ((0, 1),)) if plane else (SPACE, ((0, 1), (0, 2), (1, 2)))
-    twice = np.array([1.0 if i == j else 2.0 for i, j in inner])
 
-    def dyad(a: int, b: int) -> NDArray[np.float64]:
+    def __init__(self, x: NDArray[np.float64], axes: NDArray[np.float64], y: NDArray[np.float64], plane: bool):
+        self._x, self._axes, self._y = x, axes, y
+        self._inner, self._pairs = (PLANE, ((0, 1),)) if plane else (SPACE, ((0, 1), (0, 2), (1, 2)))
+        self._outer = np.stack([self._dyad(a, a) for a in range(3)], axis=2)
+
+    def _dyad(self, a: int, b: int) -> NDArray[np.float64]:
         """Return the components of the symmetric dyad of two axes."""
-        return np.stack([(axes[:, i, a] * axes[:, j, b] + axes[:, j, a] * axes[:, i, b]) / 2 for i, j in inner], axis=1)
+        u, v = self._axes[:, :, a], self._axes[:, :, b]
+        return np.stack([(u[:, i] * v[:, j] + u[:, j] * v[:, i]) / 2 for i, j in self._inner], axis=1)
 
-    outer = np.stack([dyad(a, a) for a in range(3)], axis=2)
-    found = np.zeros((len(x), len(SPACE), len(inner)))
-    tangent = found[:, : len(inner)]  # in the plane the rest is zero
-    tangent[:] = outer @ slopes @ (outer * twice[:, None]).transpose(0, 2, 1)
-    for a, b in pairs:
-        apart = x[:, a] - x[:, b]
-        equal = np.abs(apart) <= EQUAL * np.abs(x[:, a])
-        turn = np.where(equal, slopes[:, a, a] - slopes[:, a, b], (y[:, a] - y[:, b]) / np.where(equal, 1.0, apart))
-        side = dyad(a, b)
-        tangent += (2 * turn[:, None] * side)[:, :, None] * (side * twice)[:, None, :]
-    values = np.zeros((len(x), len(SPACE)))
-    values[:, : len(inner)] = np.einsum("nva,na->nv", outer, y)
-    return values, found
+    @property
+    def values(self) -> NDArray[np.float64]:
+        """Components (n, 6)."""
+        out = np.zeros((len(self._x), len(SPACE)))  # in the plane the rest is zero
+        out[:, : len(self._inner)] = (self._outer @ self._y[:, :, None])[:, :, 0]
+        return out
+
+    def tangent(self, slopes: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the derivatives (n, 6, 4 or 6) by the components of the others; slopes (n, 3, 3): those of y by x.
+
+        In the axes dy_ij = (y_i - y_j) / (x_i - x_j) dx_ij beside the diagonal; where x_i = x_j it is
+        (dy_i/dx_i - dy_i/dx_j) dx_ij, for an isotropic function has y_i = y_j there.
+        """
+        x, y, inner = self._x, self._y, len(self._inner)
+        twice = np.array([1.0 if i == j else 2.0 for i, j in self._inner])
+        found = np.zeros((len(x), len(SPACE), inner))
+        tangent = found[:, :inner]
+        tangent[:] = self._outer @ slopes @ (self._outer * twice[:, None]).transpose(0, 2, 1)
+        for a, b in self._pairs:
+            apart = x[:, a] - x[:, b]
+            equal = np.abs(apart) <= EQUAL * np.abs(x[:, a])
+            turn = np.where(equal, slopes[:, a, a] - slopes[:, a, b], (y[:, a] - y[:, b]) / np.where(equal, 1.0, apart))
+            side = self._dyad(a, b)
+            tangent += (2 * turn[:, None] * side)[:, :, None] * (side * twice)[:, None, :]
+        return found

@@ -38,20 +38,21 @@ p
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from inspect import signature
 
 import ufl
+from ufl.algorithms import extract_coefficients
 from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
 from ufl.algorithms.check_arities import ArityMismatch
 from ufl.corealg.traversal import unique_pre_traversal
 
-from mpm_dolfinx.validation import asked, line, line_of
+from mpm_dolfinx.validation import asked, instance, line, line_of
 
 
-def call(function: Callable, **available):
-    """Call a function of the user's with those of the available arguments that it names.
+def call(function: Callable, kind: str = "UFL", /, **available):
+    """Call a function of the user's, which gives UFL or another kind, with those arguments that it names.
 
     Raises
     ------
@@ -63,7 +64,7 @@ def call(function: Callable, **available):
         if name not in available:
             raise ValueError(f"{_name(function)}: argument {name!r}, must be some of {', '.join(available)}")
     given = {name: available[name] for name in wanted}
-    return asked(_name(function), f"UFL of {', '.join(wanted) or 'no argument'}", lambda: function(**given))
+    return asked(_name(function), f"{kind} of {', '.join(wanted) or 'no argument'}", lambda: function(**given))
 
 
 def expression(function: Callable, shapes: Sequence[tuple[int, ...]], of: str = "", **available):
@@ -86,6 +87,29 @@ def expression(function: Callable, shapes: Sequence[tuple[int, ...]], of: str = 
         raise ValueError(f"{_name(function)}: gives shape {out.ufl_shape}, must be {allowed}")
     if of and not any(part is available[of] for part in unique_pre_traversal(out)):
         raise ValueError(f"{_name(function)}: gives {line_of(out)}, must be {allowed}")
+    return out
+
+
+def named(what: str, given, shapes: Mapping[str, tuple[int, ...]], some: bool = False) -> dict:
+    """Return what a function of the user's gives by names as UFL of their shapes; some: whether names may be left out.
+
+    Raises
+    ------
+    ValueError
+        In one line: it is no dict of UFL with these names and shapes, or depends on nothing.
+    """
+    instance(f"{what}: what it gives", given, dict)
+    allowed, out = f"{'some of ' if some else ''}the names and shapes {dict(shapes)}", {}
+    for name, value in given.items():
+        try:
+            out[name] = ufl.as_ufl(value)
+        except Exception as error:  # UFL has several kinds
+            raise ValueError(f"{what}: {name} = {line(value)}, must be UFL, of {allowed}") from error
+    found = {name: value.ufl_shape for name, value in out.items()}
+    if not found or found.items() - shapes.items() or not (some or len(found) == len(shapes)):
+        raise ValueError(f"{what}: gives {found}, must have {allowed}")
+    if not any(extract_coefficients(value) for value in out.values()):
+        raise ValueError(f"{what}: gives numbers alone, must be UFL that depends on its arguments")
     return out
 
 

@@ -73,7 +73,15 @@ class MeanDilatation:
         Fbar = (self._theta * ufl.det(points.F) / ufl.det(F)) ** (1 / self._d) * F
         return ufl.variable(block(Fbar)) if self._grid.axisymmetric else Fbar
 
-    def add(self, law: type[Skeleton], points: FormPoints, F, Fbar, values: Mapping[str, object]):
+    def add(
+        self,
+        law: type[Skeleton],
+        points: FormPoints,
+        F,
+        Fbar,
+        values: Mapping[str, object],
+        known: Mapping[str, object],
+    ) -> tuple:
         """Add the pieces of a part that locks.
 
         Parameters
@@ -87,23 +95,28 @@ class MeanDilatation:
         Fbar
             What the law sees of it, see `seen`.
         values
-            UFL values of the law's parameters and state.
+            UFL values of the law's parameters, state and local unknowns.
+        known
+            The same for what is not differentiated, see `LocalUnknowns`.
 
         Returns
         -------
-        The first Piola-Kirchhoff stress that the residual takes, Pa, as UFL of F, theta and pi.
+        The first Piola-Kirchhoff stress that the residual takes, and that whose derivative the tangent takes, Pa, as
+        UFL of F, theta and pi.
         """
         J_n, theta = ufl.det(points.F), self._theta
         ratio = ufl.det(F) / J_n
         self._ratios.append(CellSums([ratio], points))
         self._ratio_slopes.append(CellSums(self._along_shapes(ufl.diff(ratio, F), points), points))
-        P, slope = self._stress(law, F, Fbar, values)
+        P, slope = self._stress(law, F, Fbar, known)
         self._slopes.append(CellSums([slope / J_n], points))
+        of_tangent, slope = self._stress(law, F, Fbar, values)
         derivatives = [*self._along_shapes(ufl.diff(slope / J_n, F), points), ufl.diff(slope / J_n, theta)]
         if not self._symmetric:
-            derivatives += self._along_shapes(ufl.diff(P / J_n, theta), points)
+            derivatives += self._along_shapes(ufl.diff(of_tangent / J_n, theta), points)
         self._derivatives.append(CellSums(derivatives, points))
-        return P + self.pi * ufl.diff(ufl.det(F), F)
+        shared = self.pi * ufl.diff(ufl.det(F), F)
+        return P + shared, of_tangent + shared
 
     def _stress(self, law: type[Skeleton], F, Fbar, values: Mapping[str, object]):
         """Return the derivatives by F and by theta of psi(Fbar); of a law without energy, of its work."""

@@ -133,16 +133,17 @@ class MomentumForms:
         seen = self.dilatation.seen(points, F) if locks else F
         if law.unknowns:
             self._local[number] = local = LocalUnknowns(law, points, seen, values)
-            values |= local.values
-        if locks:
-            P = self.dilatation.add(law, points, F, seen, values)
+            values, known = values | local.values, values | local.known
         else:
-            P = law.first_piola(F, values)
+            known = values
+        if locks:
+            P, of_A = self.dilatation.add(law, points, F, seen, values, known)
+        else:
+            P, of_A = (law.first_piola(F, those) for those in (known, values))
         if pressure is not None:
-            P -= points.biot * pressure * ufl.diff(ufl.det(F), F)
+            P, of_A = (T - points.biot * pressure * ufl.diff(ufl.det(F), F) for T in (P, of_A))
         # differentiated by F and contracted: in 3D a twentieth of the compile time of derivatives by u
-        P /= ufl.det(points.F)
-        A = ufl.diff(P, F)
+        P, A = P / ufl.det(points.F), ufl.diff(of_A / ufl.det(points.F), F)
         i, j, k, l, m, n = ufl.indices(6)
         if self.grid.dim == 2:
             self._residuals.append(PointForm(ufl.inner(P, points.grad(v) * points.F) * points.dx, points))
@@ -220,7 +221,7 @@ class MomentumForms:
         if self.dilatation is not None:
             self.dilatation.set_ratios(data)
         for number, local in self._local.items():
-            local.update(data.parts[number])
+            local.update(data.parts[number], derive=False)
         if self.dilatation is not None:
             self.dilatation.set_stresses(data)
         for residual, part in zip(self._residuals, data.parts, strict=True):
@@ -233,6 +234,8 @@ class MomentumForms:
 
     def assemble_tangent(self, K: PETSc.Mat, data: QuadratureData, sides: SideData) -> None:
         """Add the tangent at u to K, which the caller finalises."""
+        for number, local in self._local.items():
+            local.derive(data.parts[number])
         for tangent, part in zip(self._tangents, data.parts, strict=True):
             tangent.assemble_matrix(K, part)
         for tangent in self._own_tangents:
