@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: MIT
 """A cylindrical cavity is widened in clay and in sand, on a grid that knows nothing of circles.
 
-A quarter of a ring of soil, b = 5 a0, its wall a given displacement that goes a fifth of a cell in a step.
+A quarter of a ring of soil, b = 5 a0, its wall a given displacement that goes a fifth of a cell in a step, undrained a
+tenth: laws with history are integrated to first order, and with eight cells and steps of a fifth the radial solution
+itself has pore pressures that are 1.5 % too low at a = 1.1 a0, where normally consolidated clay is still yielding.
 
 1. Undrained: saturated Modified Cam Clay at two overconsolidation ratios, so fast that no water moves, its outside
    under the pressure that it began with.  Incompressible soil has an exact solution: r^2 - a^2 = R^2 - a0^2.
@@ -27,7 +29,7 @@ import mpm_dolfinx as mpm
 from mpm_dolfinx.verification.cavity import cavity, undrained
 
 P0, OUTER = 1e5, 5.0  # Pa, outer radius over that of the cavity
-PUSH = 0.2  # of a cell, in a step
+PUSH, PUSH_UNDRAINED = 0.2, 0.1  # of a cell, in a step
 CLAY = mpm.ModifiedCamClay(
     M=1.2, lambda_=0.0726, kappa=0.0145, shear=30 * P0, initial_stress=(-P0,) * 3, conductivity=1e-9
 )
@@ -87,10 +89,10 @@ def ring(cells: int, soil: mpm.Skeleton, widest: float, outside: Callable | None
     return mpm.Simulation(grid, [body], [soil], fixed={"left": "x", "bottom": "y"}, displacements=moved, **scene)
 
 
-def widen(s: mpm.Simulation, cells: int, radius: float, seen: Callable | None = None) -> float:
-    """Widen the hole to a radius, m; return the total pressure in it over p_0."""
-    steps = max(1, int(np.ceil((radius - 1 - s.t) * cells / PUSH - 1e-6)))
-    s.run(radius - 1, (radius - 1 - s.t) / steps, observe=[seen] if seen else [], progress=False)
+def widen(s: mpm.Simulation, cells: int, radius: float, push: float) -> float:
+    """Widen the hole to a radius, m, so much of a cell in a step; return the total pressure in it over p_0."""
+    steps = max(1, int(np.ceil((radius - 1 - s.t) * cells / push - 1e-6)))
+    s.run(radius - 1, (radius - 1 - s.t) / steps, progress=False)
     return pressure(s, radius)
 
 
@@ -112,7 +114,7 @@ def drained(name: str, cells: int) -> dict[float, tuple[float, float]]:
     s = ring(cells, case.soil, widest + 1 / cells, lambda t: np.interp(1 + t, radii, out))
     if case.state:
         s.stage(fields=case.state)
-    return {a: (widen(s, cells, a), p[a]) for a in case.known}
+    return {a: (widen(s, cells, a, PUSH), p[a]) for a in case.known}
 
 
 @dataclass
@@ -143,8 +145,8 @@ def push(OCR: float, cells: int) -> Undrained:
     widest = MARKS[-1]
     s, out = ring(cells, soil, widest, **water), Undrained({}, {}, [], 0.0)
     for a in MARKS:
-        found = widen(s, cells, a) - 1
-        drop, stress = undrained(soil, OUTER, np.geomspace(1, a, 41)[1:], 400)
+        found = widen(s, cells, a, PUSH_UNDRAINED) - 1
+        drop, stress = undrained(soil, OUTER, np.geomspace(1, a, 161)[1:], 400)
         out.total[a] = found, drop / P0
         out.water[a] = at_wall(s, a, 1 / cells), 1 + (drop + stress) / P0
 
