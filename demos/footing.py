@@ -19,9 +19,8 @@ The soil that is pushed deep does not dilate: undrained its strength is s_u = xi
 at the surface lies between that of Davis's (1968) reduced friction and c N_c.
 
 Faces are held up to half a cell before the footing's edge, for the last node that they hold carries the half cell
-beyond too.  So the undrained limit is met from below, at second order: -5.9, -2.4, -0.8, -0.2 % with 5, 9, 17, 33
-cells.  Over the width that is held it would be +18, +10, +5, +3 %: from above, as a displacement method must, at
-first order.
+beyond too.  So the undrained limit is met from below, at order 1.5: -6.7, -2.9, -1.1 % with 5, 9, 17 cells.  Over the
+width that is held it would be +17, +9, +5 %: from above, as a displacement method must, at first order.
 
 In associated flow each place of a cell has to dilate with its own shear, but the cell has one mean dilatation: the
 load would go on rising (de Borst and Groen 1995), to +4.4 and +3.4 % with 9 and 17 cells.  So laws see half of what

@@ -23,6 +23,8 @@ from mpm_dolfinx.forms.unknowns import sum_ghosts
 from mpm_dolfinx.points.grid import Grid, sum_by
 from mpm_dolfinx.points.material_points import cofactor, determinant
 
+ALONG = 0.1  # of a unit normal: a side that looks less along an axis tells nothing of the pressure's slope there
+
 
 @dataclass(frozen=True)
 class Mobility:
@@ -147,7 +149,8 @@ class OpenSides:
         at, normal, distance = at[drained], self.normal[drained], distance[drained]
         area, jump = self.shape[drained] * distance, self.pressure[drained] - p[at]
         for axis, end in np.ndindex(out.shape[1:3]):
-            share = area * np.maximum((2 * end - 1) * normal[:, axis], 0.0)
+            looks = (2 * end - 1) * normal[:, axis]
+            share = np.where(looks > ALONG, area * looks, 0.0)
             total = sum_by(at, share, len(p))
             # along the side the pressure does not change, so its gradient is normal to it
             for k, values in enumerate((jump, jump * normal[:, axis] / distance)):
