@@ -141,7 +141,7 @@ class MomentumForms:
         if pressure is not None:
             P -= points.biot * pressure * ufl.diff(ufl.det(F), F)
         # differentiated by F and contracted: in 3D a twentieth of the compile time of derivatives by u
-        P /= ufl.det(points.F)
+        P *= 1 / ufl.det(points.F)  # a factor: divided by it, each derivative would be
         A = ufl.diff(P, F)
         i, j, k, l, m, n = ufl.indices(6)
         if self.grid.dim == 2:
