@@ -7,7 +7,7 @@ Its mesh is made when first it is needed: by then a simulation has shared out th
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import reduce
+from functools import cached_property, reduce
 from typing import Any
 
 from mpi4py import MPI
@@ -300,6 +300,15 @@ class Grid:
                 others = others + mixed[:, a, None] * (self.signs[:, b] * self.signs[:, c] / (self.h[b] * self.h[c]))
             np.multiply(others, self.signs[:, a] / self.h[a], out=dN[:, :, a])
         return dN
+
+    @cached_property
+    def monomials(self) -> NDArray[np.float64]:
+        """Coefficients (2^d, 2^d) of the Q1 shape functions about the midpoint of a cell, one column each.
+
+        Row s is that of the product of the offsets along the axes whose bits are set in s.
+        """
+        bits = np.arange(2**self.dim)[:, None, None] >> np.arange(self.dim) & 1
+        return np.where(bits, self.signs / self.h, 0.5).prod(axis=2)
 
     def shape_values(self, cells: NDArray[np.int32], x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the Q1 shape functions (n, 2^d) of local cells at points."""

@@ -143,7 +143,8 @@ class MomentumForms:
         if pressure is not None:
             P, of_A = (T - points.biot * pressure * ufl.diff(ufl.det(F), F) for T in (P, of_A))
         # differentiated by F and contracted: in 3D a twentieth of the compile time of derivatives by u
-        P, A = P / ufl.det(points.F), ufl.diff(of_A / ufl.det(points.F), F)
+        share = 1 / ufl.det(points.F)  # a factor: divided by it, each derivative would be
+        P, A = P * share, ufl.diff(of_A * share, F)
         i, j, k, l, m, n = ufl.indices(6)
         if self.grid.dim == 2:
             self._residuals.append(PointForm(ufl.inner(P, points.grad(v) * points.F) * points.dx, points))
