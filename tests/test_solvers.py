@@ -77,8 +77,14 @@ def pushed(bulk: float) -> list[mpm.result.Report]:
 
 
 FRICTIONAL = mpm.DruckerPrager(bulk=2e6, shear=1e6, friction=20.0, dilation=0.0, cohesion=1e4, conductivity=1e-7)
+LAYERED = mpm.Hencky(
+    bulk=lambda X: np.where(X[:, 2] < 0.5, 5e10, 5e7),
+    shear=lambda X: np.where(X[:, 2] < 0.5, 1e9, 1e6),
+    conductivity=1e-7,
+)
 BLOCKS = {  # soil, cells, step, m, steps, most iterations
     "nu = 0.499": (mpm.Hencky(bulk=500e6, shear=1e6, conductivity=1e-7), 14, 0.01, 2, 30),
+    "nu = 0.49, layers 1 : 1000": (LAYERED, 14, 0.01, 2, 25),
     "beyond the limit load": (FRICTIONAL, 12, 0.005, 10, 60),
 }
 
@@ -110,6 +116,13 @@ def test_nearly_incompressible_bodies_in_3d_take_few_iterations_a_solve(bulk):
     """nu = 0.49, 0.499; with multigrid alone the latter takes 60 a solve."""
     report = pushed(bulk)[1]
     assert report.coupling < 15 * report.newton
+
+
+def test_factors_serve_as_soon_as_a_multigrid_cycle_is_foreseen_to_take_too_many_iterations(monkeypatch):
+    counts, solve = [], monolithic.BlockSolver.solve
+    monkeypatch.setattr(monolithic.BlockSolver, "solve", lambda *a: counts.append(solve(*a)) or counts[-1])
+    pushed(50e6)
+    assert max(counts) < monolithic.MANY  # 38 without foresight
 
 
 def test_factors_in_place_of_a_multigrid_cycle_solve_the_same_problem(monkeypatch):

@@ -12,16 +12,17 @@ Jacobi's smoothing of K (10 to 15, and 100 at nu = 0.49), conjugate gradients on
 35 to 60 cycles in their inner solves; flexible GMRES with inner solves to 0.1 or 0.01 12 to 24 cycles, MINRES with the
 diagonal blocks 17 to 23, leaving five times the residual.
 
-At nu = 0.499 the cycle is poor: 53 to 146 iterations with 14^3 cells.  A solve that takes `MANY` goes on with factors
-of K in place of the cycle, which serve until they take as many: for the other tangents of the step 4 to 6 iterations,
-and all its linear solves take 8 s, not 18.  MUMPS factorises 3190 unknowns in 0.2 s, 8610 in 1.4 s (PETSc in 3.4 s).
-No solve takes more than 30 then.
+At nu = 0.499 the cycle is poor: 53 to 146 iterations with 14^3 cells.  A solve that takes `MANY`, or is foreseen to,
+goes on with factors of K in place of the cycle, which serve until they take as many: for the other tangents of the step
+4 to 6 iterations, and all its linear solves take 8 s, not 18.  MUMPS factorises 3190 unknowns in 0.2 s, 8610 in 1.4 s
+(PETSc in 3.4 s).  No solve takes more than 23 then, nor more than 21 at nu = 0.49 where contrasts are 1e3.
 To give the storage what of K resists changes of volume, p -> p + k B u, leaves K as at nu = 0.3, but pressures that
 alternate almost free: 500 iterations.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from weakref import finalize
 
 from petsc4py import PETSc
@@ -36,6 +37,8 @@ from mpm_dolfinx.solve.linear import direct_solver, multigrid_solver, solved
 
 MANY, MOST = 29, 500
 """Iterations after which factors take the place of the multigrid cycle on K, and most of all."""
+EARLY = 8
+"""After every so many factors do so at once if the residual falls too slowly in them for `MANY` to be enough."""
 FACTORISED = 20000
 """Unknown displacements up to which K is factorised where the multigrid takes many iterations.
 
@@ -133,6 +136,7 @@ class BlockSolver:
         self._ksp.pc.setType(PETSc.PC.Type.PYTHON)
         self._ksp.pc.setPythonContext(self._operator)
         self._ksp.setOperators(self._A)
+        self._ksp.setMonitor(_foresight())
         self._ksp.setFromOptions()
 
     @property
@@ -182,3 +186,20 @@ class BlockSolver:
         ksp = direct_solver(self._momentum.K, "factors", self._symmetric, package="mumps")
         ksp.setUp()
         return ksp
+
+
+def _foresight() -> Callable[[PETSc.KSP, int, float], None]:
+    """Return a monitor that ends iterations with a multigrid cycle which `MANY` would not be enough for."""
+    before = goal = 0.0
+
+    def monitor(ksp: PETSc.KSP, count: int, norm: float) -> None:
+        nonlocal before, goal
+        rtol, _, _, most = ksp.getTolerances()
+        goal = goal if count else rtol * norm
+        if count % EARLY:
+            return
+        if count and most == MANY and norm * (norm / before) ** ((MANY - count) / EARLY) > goal:
+            ksp.setTolerances(max_it=count)
+        before = norm
+
+    return monitor
