@@ -101,7 +101,7 @@ def balanced(scene: Scene, state: State) -> State:
     left, count, points, held = best
     before, after = (np.nan_to_num(materials.effective_stress_3d(of)) for of in (seeded.points, points))
     largest, changed = (over_all(comm, float(np.abs(v).max(initial=0.0)), MPI.MAX) for v in (before, after - before))
-    what = "initial_stress: in balance after %d iterations, changed by at most %.3g of %.3g Pa; %.2g of the forces held"
+    what = "initial_stress: in balance after %d iterations, changed by at most %.3g of %.3g Pa; %.2g of its forces held"
     tell = warn if changed > REMARKABLE * largest or left > REMARKABLE else log
     tell(comm, what, count, changed, largest, left)
     return replace(start.state, points=points, held=held)
