@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -38,6 +39,7 @@ def start(code=SCENE, **changes):
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,  # Ctrl-C reaches all of a terminal's processes
+        preexec_fn=partial(signal.signal, signal.SIGINT, signal.SIG_DFL),  # which what a shell runs with & ignores
     )
 
 
