@@ -44,6 +44,7 @@ QUICK = {
     "indentation": ("--cells 6", ["indentation.png"]),
     "penetration": ("--cells 4 --rough 0.5 --depth 0.1", ["penetration.png"]),
     "retaining_wall": ("--cells 6 --delta 0 --ways active", ["retaining_wall.png"]),
+    "barrier": ("--cells 10 --steps 40", ["barrier.png"]),
     "slope": ("--cells 4 --steps 4 --rtol 0.1", ["slope.png"]),
     "dam": ("--h 1 --steps 3 --cells 10", ["dam.png"]),
     "two_gels": ("--cells 4 --hertz 4", ["two_gels.png"]),

@@ -33,11 +33,12 @@ from mpm_dolfinx.errors import NotConverged
 from mpm_dolfinx.parallel.exchange import Exchange, first, over_all
 from mpm_dolfinx.points.grid import Grid, sum_by
 from mpm_dolfinx.points.material_points import MaterialPoints
-from mpm_dolfinx.problems.conditions import HOLD
 from mpm_dolfinx.validation import line
 
 STIFF = 100.0
 """k in units of (what resists) / (cell size)."""
+GRIP = 6.0
+"""k_t in units of (what resists) / (cell size): stiffer shears alternate from cell to cell, which displaces no node."""
 DEPTH = 5e-4  # cells: mean penetration that is left
 TOUCH = 1e-13  # of the grid: what is nearer touches, but for rounding; light bodies press no deeper than 1e-8 cells
 SLIVER = 0.25  # of a cell's face: of what is smaller less penetration counts
@@ -91,7 +92,7 @@ class Resisting(Protocol):
 class Rows:
     """Points of integration where surfaces may touch; arrays over m rows in owned cells.
 
-    number, cell : (m,) contact, local cell; area : (m,), m^(d-1); resistance, holding : (m,), Pa, see `conditions`;
+    number, cell : (m,) contact, local cell; area : (m,), m^(d-1); resistance : (m,), Pa, see `conditions`;
     pressure, shear : (m,) and (m, d), Pa, before the step.
     """
 
@@ -99,7 +100,6 @@ class Rows:
     cell: NDArray[np.int32]
     area: NDArray[np.float64]
     resistance: NDArray[np.float64]
-    holding: NDArray[np.float64]
     pressure: NDArray[np.float64]
     shear: NDArray[np.float64]
 
@@ -159,7 +159,7 @@ class CellContact:
         strength = np.array([(contact.friction, contact.adhesion) for contact in contacts], dtype=float)
         self.strength = strength[self.number]
         h = grid.h.min()
-        self.stiffness, self._hold = STIFF / h * rows.resistance, HOLD / h * self.mean(rows.holding)
+        self.stiffness, self._hold = STIFF / h * rows.resistance, GRIP / h * self.mean(rows.resistance)
         self.grips = any(contact.grips for contact in contacts)
         self.along = np.zeros((len(key), grid.dim))  # direction of the shear of what slips, else zero
         self._turned = np.zeros(len(key), dtype=bool)  # what has slipped, and stuck again

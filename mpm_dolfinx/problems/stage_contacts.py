@@ -30,7 +30,7 @@ from mpm_dolfinx.points.faces import Surface, surface
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.problems.body_contact import BodyContact, Following, PairRows
 from mpm_dolfinx.problems.cell_contact import LEAST, kept, pressure_name, shear_name
-from mpm_dolfinx.problems.conditions import holding, resistance
+from mpm_dolfinx.problems.conditions import resistance
 from mpm_dolfinx.problems.contacts import Contact
 from mpm_dolfinx.problems.sides import Sides
 from mpm_dolfinx.problems.stage_tools import BEGINS, FACING
@@ -55,7 +55,7 @@ EDGE = 1e-6
 class Facets(NamedTuple):
     """Points on the faces of the other group, those of all processes; arrays over n of them.
 
-    x : (n, d), m; face : (n,) row of the `Surface`; cell : (n,) lexicographic; resistance, holding : (n,), Pa;
+    x : (n, d), m; face : (n,) row of the `Surface`; cell : (n,) lexicographic; resistance : (n,), Pa;
     corners, cut : (n, 2^(d-1), d), m, of the face at present and when the grid was reset; outward : (n, d) unit normal.
     """
 
@@ -63,7 +63,6 @@ class Facets(NamedTuple):
     face: NDArray[np.int64]
     cell: NDArray[np.int64]
     resistance: NDArray[np.float64]
-    holding: NDArray[np.float64]
     corners: NDArray[np.float64]
     cut: NDArray[np.float64]
     outward: NDArray[np.float64]
@@ -148,7 +147,7 @@ class Contacts:
         points: at the start of the step, with the pressures and shears of then.
         """
         grid, d, rows, off = self.grid, self.grid.dim, [], ""
-        own = [self._materials.table(cut.points, of) for of in (resistance, holding)]
+        own = self._materials.table(cut.points, resistance)
         for number, ((faces, others), (facets, pairs)) in enumerate(zip(self._faces, found, strict=True)):
             patches = cut.surface(faces)
             now = facets if there is seen else self._facets(cut, others, there)
@@ -168,9 +167,9 @@ class Contacts:
             if self.contacts[number].grips:
                 old = _turned(points.data[shear_name("contact", number)][at], n)
             pressure = points.data[pressure_name("contact", number)][at]
-            moduli = [np.minimum(a[at], b[other]) for a, b in zip(own, (now.resistance, now.holding), strict=True)]
+            resists = np.minimum(own[at], now.resistance[other])
             place = number * PLACES + row + grid.comm.rank * len(self.contacts) * PLACES
-            scalars = np.stack([np.full(len(row), number), place, size, *moduli, pressure], axis=1)
+            scalars = np.stack([np.full(len(row), number), place, size, resists, pressure], axis=1)
             apart = patches.now(there)[row] - y
             rows.append((patches.cell[row], cell, at, np.hstack([scalars, patches.x[row], where, n, apart, old])))
         if off := first(grid.comm, off):
@@ -179,8 +178,8 @@ class Contacts:
         travel = Exchange(grid.comm, grid.owner(cell))
         cell, other, sent = (travel.send(columns) for columns in (cell, other, values))
         number, place = sent[:, :2].T.astype(np.int64)
-        x, y, n, apart, shear = np.split(sent[:, 6:], 5, axis=1)
-        placed = PairRows(number, grid.local(cell), *sent[:, 2:6].T, shear, other, x, y, n, apart, place)
+        x, y, n, apart, shear = np.split(sent[:, 5:], 5, axis=1)
+        placed = PairRows(number, grid.local(cell), *sent[:, 2:5].T, shear, other, x, y, n, apart, place)
         back = (travel, at, values[:, 0].astype(np.int64), values[:, 2])
         return BodyContact(grid, self.contacts, self._signs, placed, back, reach)
 
@@ -214,15 +213,15 @@ class Contacts:
         now, then = (
             np.take_along_axis(of.corners[patches.at], index[:, :, None], axis=1) for of in (points, cut.points)
         )
-        moduli = [self._materials.table(cut.points, of)[patches.at] for of in (resistance, holding)]
+        resists = self._materials.table(cut.points, resistance)[patches.at]
         area, n, k = patches.area(points), len(now), 2 ** (d - 1) * d
         outward = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), LEAST)
         whole = np.column_stack([patches.here, patches.cell])
-        rows = np.column_stack([patches.now(points), *moduli, now.reshape(n, k), then.reshape(n, k), outward])
+        rows = np.column_stack([patches.now(points), resists, now.reshape(n, k), then.reshape(n, k), outward])
         whole, rows = (np.concatenate(self.grid.comm.allgather(part)) for part in (whole, rows))
-        x, moduli, now, then, outward = np.split(rows, np.cumsum([d, 2, k, k]), axis=1)
+        x, resists, now, then, outward = np.split(rows, np.cumsum([d, 1, k, k]), axis=1)
         shape = (len(rows), 2 ** (d - 1), d)
-        return Facets(x, *whole.T, *moduli.T, now.reshape(shape), then.reshape(shape), outward)
+        return Facets(x, *whole.T, resists[:, 0], now.reshape(shape), then.reshape(shape), outward)
 
     def _met(self, cut: CutDomains, faces: Surface, others: Surface, points: MaterialPoints) -> tuple[Facets, Pairs]:
         """Return the points on the faces of the other group, and which of these the points on the faces meet."""

@@ -22,7 +22,7 @@ from mpm_dolfinx.points.faces import Surface
 from mpm_dolfinx.points.grid import Grid
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.problems.cell_contact import LEAST, kept, pressure_name, shear_name
-from mpm_dolfinx.problems.conditions import Displacement, holding, resistance
+from mpm_dolfinx.problems.conditions import Displacement, resistance
 from mpm_dolfinx.problems.sides import everywhere
 from mpm_dolfinx.problems.tool_contact import ToolContact, ToolRows
 from mpm_dolfinx.problems.tools import Pose, Tool
@@ -94,7 +94,7 @@ class Tools:
         patches = cut.surface(self.faces)
         x, area = patches.now(points), patches.area(points)
         size, free = np.linalg.norm(area, axis=1), self._free[patches.here]
-        own = [self._materials.table(cut.points, of)[patches.at] for of in (resistance, holding)]
+        resists = self._materials.table(cut.points, resistance)[patches.at]
         poses, found = [self._pose(tool, t) for tool in self.tools], []
         for number, (tool, pose) in enumerate(zip(self.tools, poses, strict=True)):
             before = self._pose(tool, start)
@@ -103,13 +103,13 @@ class Tools:
             old = points.data[shear_name("tool", number)][patches.at[at]] if tool.grips else np.zeros((len(at), d))
             vectors = [x[at], pose.put(before.own(x[at])), old @ (pose.R @ before.R.T).T]
             pressure = points.data[pressure_name("tool", number)][patches.at[at]]
-            scalars = [np.full(len(at), number), size[at], *(values[at] for values in own), pressure]
+            scalars = [np.full(len(at), number), size[at], resists[at], pressure]
             found.append((at, np.concatenate([np.stack(scalars, axis=1), *vectors], axis=1)))
         at, values = (np.concatenate(column) for column in zip(*found, strict=True))
         travel = Exchange(grid.comm, grid.owner(patches.cell[at]))
         cell, place, sent = (travel.send(rows) for rows in (patches.cell[at], patches.x[at], values))
-        number, *own = sent[:, :5].T
-        now, carried, shear = np.split(sent[:, 5:], 3, axis=1)
+        number, *own = sent[:, :4].T
+        now, carried, shear = np.split(sent[:, 4:], 3, axis=1)
         rows = ToolRows(number.astype(np.int64), grid.local(cell), *own, shear, now, carried)
         back = (travel, patches.at[at], values[:, 0].astype(np.int64), values[:, 1])
         return ToolContact(grid, self.tools, poses, rows, Places(grid, rows.cell, place), back)

@@ -1,0 +1,212 @@
+# SPDX-License-Identifier: MIT
+"""A bank of clay loses its strength and slides against a rigid barrier: run-out with and without it, force on it.
+
+Half of a bank of undrained clay, 10 m high and as long, stands with a vertical side on a rough floor.  Within ten
+minutes its strength c falls from 0.3 to 0.07 gamma H; 0.26 would hold it.  Inertia is left out: a viscous stress
+2 eta D, a term in UFL, lets the clay move only so far in so much time, and is gone when it rests.  A wall that takes a
+shear of c / 2 stands in its way.
+
+At rest no plane bears more than c.  So each wedge between the wall and a plane through its foot, of weight W, at the
+angle theta and of length l, bounds the force F normal to the wall, on which the shear V is at most c D / 2, D the depth
+of clay there:
+
+    F >= ((W - V) sin(theta) - c l) / cos(theta),        F <= ((W + V) sin(theta) + c l) / cos(theta).
+
+The largest of the first is Coulomb's active force and the least of the second his passive one, for the surface as it is
+(Culmann 1866).  Planes that end in the axis are left out.  What has slid against the wall and stopped is in between.
+"""
+
+from __future__ import annotations
+
+from argparse import Namespace
+from dataclasses import dataclass, field
+
+import common
+import numpy as np
+import ufl
+
+import mpm_dolfinx as mpm
+
+HEIGHT, LENGTH = 10.0, 26.0  # m: of the bank, also its length; of the floor
+WALL, TOP, THICK = 14.25, 8.0, 1.0  # m: where the barrier stands, its height and thickness
+WEIGHT = 20e3  # N/m³
+SCALE = WEIGHT * HEIGHT  # Pa
+STRONG, WEAK = 0.3 * SCALE, 0.07 * SCALE  # Pa: strength before and after
+ADHESION = 0.5 * WEAK  # Pa: of the barrier
+DURATION = 600.0  # s, in which it is lost
+VISCOSITY = 0.01 * SCALE * DURATION  # Pa s
+SHEAR = 30 * SCALE
+ANGLES = np.radians(np.linspace(20, 85, 261))  # of the planes of wedges
+
+
+def weight(points, v):
+    """Weight of the clay, downwards, N/m³ of the ground as it was."""
+    return WEIGHT / ufl.det(points.F) * points.value(v)[1] * points.dx
+
+
+def viscous(points, u, dt):
+    """Potential of the stress 2 eta D of the rate of strain D = sym grad u / dt."""
+    strain = ufl.sym(points.grad(u))
+    return VISCOSITY / dt * ufl.inner(strain, strain) * points.dx
+
+
+def bank(cells: int, barrier: bool) -> mpm.Simulation:
+    """Return the bank at rest, with so many cells over its height; t is zero."""
+    h = HEIGHT / cells
+    grid = mpm.Grid([LENGTH, HEIGHT + h], [round(LENGTH / h), cells + 1])
+    clay = mpm.DruckerPrager(
+        bulk=50 * SHEAR, shear=SHEAR, friction=0.0, dilation=0.0, cohesion=lambda X: np.full(len(X), STRONG)
+    )
+    corners = [(x, y) for x in (WALL, WALL + THICK) for y in (-THICK, TOP)]
+    tools = [mpm.Tool(mpm.Convex(corners), adhesion=ADHESION, centre=(WALL, 0))] if barrier else []
+    body = mpm.box(grid, [0, 0], [HEIGHT, HEIGHT])
+    walls = {"left": "x", "bottom": "xy"}
+    s = mpm.Simulation(grid, [body], [clay], fixed=walls, terms=[weight, viscous], tools=tools)
+    s.run(1e9, 1e9, progress=False)  # time in which nothing of the viscosity is left
+    s.stage(reset_displacement=True)
+    s.t = 0.0
+    return s
+
+
+@dataclass
+class Frame:
+    """The bank at a time, s.
+
+    corners (n, 4, 2), m; moved (n,), m: how far points have come; force: normal and along, N/m, and moment about the
+    foot, N, of the clay on the barrier; bounds of the normal force, N/m; depth of the clay at the barrier, m.
+    """
+
+    t: float
+    corners: np.ndarray
+    moved: np.ndarray
+    force: np.ndarray
+    bounds: tuple[float, float]
+    depth: float
+
+    @property
+    def run_out(self) -> float:
+        """How far the bank reaches, m."""
+        return float(self.corners[:, :, 0].max())
+
+
+def bounds(s: mpm.Simulation, depth: float) -> tuple[float, float]:
+    """Return the active and the passive force, N/m, of the clay before the barrier, of the strength that it has."""
+    x, c = s.points.x, s.points.data["cohesion"][0]
+    sin, cos, rubs = np.sin(ANGLES), np.cos(ANGLES), ADHESION * depth
+    off = x[:, 1, None] * cos - (WALL - x[:, 0, None]) * sin  # (n, planes), m
+    W = WEIGHT * s.points.volume0 @ (off > 0)
+    near = np.abs(off) < 0.5 * s.grid.h[0]
+    length = np.where(near, (WALL - x[:, 0, None]) * cos + x[:, 1, None] * sin, 0.0).max(axis=0)
+    ends = WALL * np.tan(ANGLES) > s.points.corners[:, :, 1].max()
+    least, most = (((W + way * rubs) * sin + way * c * length) / cos for way in (-1, 1))
+    return max(0.0, float(least[ends].max())), float(most[ends].min())
+
+
+@dataclass
+class Slump:
+    """A run: the bank after each step; how many steps, and cuts."""
+
+    frames: list[Frame] = field(default_factory=list)
+    steps: int = 0
+    cuts: int = 0
+
+
+def slump(cells: int, steps: int, barrier: bool) -> Slump:
+    """Let the bank lose its cohesion in so many steps, and come to rest."""
+    s, out, dt = bank(cells, barrier), Slump(), DURATION / steps
+    start = s.points.x
+
+    def look(s: mpm.Simulation) -> None:
+        corners, moved = s.points.corners, np.linalg.norm(s.points.x - start, axis=1)
+        force, between, at = np.zeros(3), (0.0, 0.0), corners[np.abs(corners[..., 0] - WALL) < s.grid.h[0] / 2]
+        depth = float(at[:, 1].max(initial=0))
+        if barrier and s.t > 0:
+            force, between = s.tool_forces[0] * [-1, -1, 1], bounds(s, depth)
+        out.frames.append(Frame(s.t, corners, moved, force, between, depth))
+
+    def weaken(s: mpm.Simulation) -> None:
+        """Give the next step the strength of its end."""
+        s.stage(fields={"cohesion": STRONG + min(1.0, (s.t + dt) / DURATION) * (WEAK - STRONG)})
+
+    def go(t_end: float, dt: float, *observers) -> None:
+        result = s.run(t_end, dt, observe=observers, progress=False)
+        out.steps, out.cuts = out.steps + result.steps, out.cuts + result.cuts
+
+    look(s)
+    weaken(s)
+    go(DURATION, dt, look, weaken)
+    go(2 * DURATION, dt, look)
+    go(20 * DURATION, 20 * dt, look)
+    return out
+
+
+def main(argv: list[str] | None = None) -> dict:
+    """Run the demo; return what --json prints."""
+    parser = common.Parser(__doc__, __file__)
+    parser.add_argument("--cells", type=int, default=20, help="cells over the height")
+    parser.add_argument("--steps", type=int, default=60, help="steps in which the cohesion is lost")
+    o = parser.parse_args(argv)
+    if not 5 <= o.cells <= 40 or o.cells % 5 or o.steps < 10:
+        parser.error(f"--cells {o.cells} --steps {o.steps}: must be a multiple of 5 from 5 to 40, and >= 10")
+    with common.results(o) as out:
+        free, held = slump(o.cells, o.steps, False), slump(o.cells, o.steps, True)
+        before, end = held.frames[-2:]
+        F, V, M = end.force
+        least, most = end.bounds
+        pushes = [f.force[0] for f in held.frames]
+        out |= {"run_out": free.frames[-1].run_out, "held": end.run_out, "depth": end.depth, "arm": M / F / end.depth}
+        out |= {"force": F, "most": max(pushes), "active": least, "passive": most, "shear": V / (ADHESION * end.depth)}
+        out |= {"over_active": F / least, "over_passive": F / most}
+        out |= {"creep": abs(F / before.force[0] - 1), "cuts": free.cuts + held.cuts, "steps": free.steps + held.steps}
+        report(out)
+        draw(o, free, held)
+        out["converged"] = bool(least < F < most and out["creep"] < 0.01)
+    return out
+
+
+def report(out: dict) -> None:
+    """Print what has come of it."""
+    print(f"run-out: {out['run_out']:.2f} m, with the barrier {out['held']:.3f} m; it stands at {WALL:g} m")
+    print(f"clay at the barrier: {out['depth']:.2f} m; its force acts at {out['arm']:.3f} of that")
+    kN = {name: out[name] / 1e3 for name in ("force", "most", "active", "passive")}
+    print(f"force at rest {kN['force']:.1f} kN/m, at most {kN['most']:.1f}; ", end="")
+    print(f"of wedges: active {kN['active']:.1f}, passive {kN['passive']:.0f} kN/m")
+    liquid = WEIGHT * out["depth"] ** 2 / 2
+    print(f"over that of a liquid as deep: {out['force'] / liquid:.2f}; changes by {out['creep']:.0e} in the last step")
+
+
+def draw(o: Namespace, free: Slump, held: Slump) -> None:
+    """Draw the bank as it meets the barrier and at rest, with and without it, and the force in time."""
+    fig, axes = common.figure(2, 2, (13, 6.6))
+    meets = next(k for k, f in enumerate(held.frames) if f.force[0] > 0)
+    shown = [
+        (axes[0, 0], held.frames[meets], f"it meets the barrier after {held.frames[meets].t / 60:.1f} minutes"),
+        (axes[0, 1], held.frames[-1], "at rest against the barrier"),
+        (axes[1, 0], free.frames[-1], "at rest without a barrier"),
+    ]
+    top = max(f.moved.max() for _, f, _ in shown)
+    for ax, frame, title in shown:
+        drawn = common.domains(ax, frame.corners, frame.moved, cmap="viridis", clim=(0, top), linewidth=0.1)
+        ax.plot([0, HEIGHT, HEIGHT], [HEIGHT, HEIGHT, 0], color="grey", lw=0.8, ls=":", label="before")
+        ax.legend(fontsize=9, loc="upper right")
+        if frame is not free.frames[-1]:
+            ax.fill([WALL, WALL + THICK, WALL + THICK, WALL], [0, 0, TOP, TOP], color="0.3")
+        ax.axhline(0, color="0.3", lw=1)
+        limits = {"xlim": (0, 24), "ylim": (-0.3, 1.05 * HEIGHT)}
+        ax.set(aspect="equal", xlabel="x (m)", ylabel="y (m)", title=title, **limits)
+    fig.colorbar(drawn, ax=axes[0], label="displacement (m)", shrink=0.8)
+    ax, after = axes[1, 1], held.frames[meets:]
+    t, F = np.array([f.t for f in held.frames]) / 60, np.array([f.force[0] for f in held.frames]) / 1e3
+    ax.plot(t, F, label="on the barrier")
+    for k, name in enumerate(("active", "passive")):
+        values = [f.bounds[k] / 1e3 for f in after]
+        ax.plot([f.t / 60 for f in after], values, color="k", ls=("--", ":")[k], lw=1, label=f"{name}, of wedges")
+    ax.set(xlabel="time (minutes)", ylabel="force (kN/m)", title="normal force", xlim=(0, 2 * DURATION / 60))
+    ax.set(ylim=(0, 2.5 * F.max()))
+    ax.legend(fontsize=9)
+    ax.grid(alpha=0.3)
+    common.save(fig, o.out / "barrier.png", dpi=100)
+
+
+if __name__ == "__main__":
+    raise SystemExit(0 if main()["converged"] else 1)
