@@ -66,6 +66,7 @@ DRAINED = {
     "sand-0": Drained(SAND, {1.02: 2.812, 1.1: 4.489, 1.5: 6.531}, state=PRESSED),
     "sand-30": Drained(replace(SAND, dilation=30.0), {1.02: 3.170, 1.1: 6.041, 1.5: 10.710}, state=PRESSED),
 }
+SHOWN = {"well": "Modified Cam Clay", "sand-0": "Mohr–Coulomb, ψ = 0", "sand-30": "Mohr–Coulomb, ψ = 30°"}
 
 
 def ray(X: np.ndarray) -> np.ndarray:
@@ -208,15 +209,18 @@ def draw(out: Path, dry: dict, wet: dict[float, Undrained]) -> None:
     for k, (name, found) in enumerate(dry.items()):
         known = DRAINED[name].known
         left.plot(list(known), list(known.values()), "o", color=f"C{k}", mfc="white", ms=8)
-        left.plot(list(found), [p for p, _ in found.values()], "x--", color=f"C{k}", lw=0.8, label=name)
-    left.set(xlabel="a / a0 (-)", ylabel="p / p0 (-)", title="Drained cavities (crosses), published (circles)")
+        left.plot(list(found), [p for p, _ in found.values()], "x--", color=f"C{k}", lw=0.8, label=SHOWN[name])
+    left.set(xlabel="radius / at start (-)", ylabel="pressure / at start (-)")
+    left.set_title("Drained cavities (crosses), published (circles)")
     for mark, (ratio, run) in zip(".+x", wet.items(), strict=False):
         for i, (t, r, p) in enumerate(run.profiles):
             what = f"T = {t * CV / OUTER**2:.2g}" if i else "undrained"
             shade = viridis(0.9 * i / (len(run.profiles) - 1))
             right.plot(r, p, mark, ms=3, color=shade, label=f"OCR {ratio:.0f}, {what}")
     right.set(
-        xlabel="r / a0 (-)", ylabel="pore pressure / p0 (-)", title=f"Undrained to a / a0 = {MARKS[-1]}, then drained"
+        xlabel="distance from the axis / radius at start (-)",
+        ylabel="pore pressure / stress at start (-)",
+        title=f"Undrained to {MARKS[-1]} times the radius, then drained",
     )
     for ax in (left, right):
         if ax.has_data():
