@@ -17,13 +17,12 @@ Corners of domains follow more than u, points change cells, and jumps are damped
 from the fluid that has come to them.  The points carry this difference, `owed`, and cells take it in by small shares in
 the next steps: `due`, at an even rate over the step.
 
-Q1 with DG0 is not inf-sup stable: where next to nothing flows within a step, checkers of p go unseen.
-Jumps of the step's increment are damped by max(0, tau d - dt kappa / d) A [p - p_n], d = d+ + d-, dt the share of
-the step in which the rate at p counts, so that a
-face carries at least tau d A: nothing is added where the flow suffices, nothing is left in a steady
-state, and no fluid is lost.  tau is a quarter of Silvester and Kechkar's patch value (Camargo, White
-and Borja 2021) for elastic soil.  What soil that flows needs more, up to a hundredfold, damps second differences
-only (`second_differences`): on jumps it would smear pressures that are steep.
+Q1 with DG0 violates the inf-sup condition as the flow within a step goes to zero: alternating pressures go unseen. A
+stabilisation of the jumps of the step's increment is added, max(0, tau d - dt kappa / d) A [p - p_n], d = d+ + d-, dt
+the share of the step in which the rate at p counts.  A face then carries at least tau d A.  Where the flow is larger
+nothing is added.  In a steady state nothing is left, and no fluid is lost.  tau is a quarter of Silvester and
+Kechkar's patch value (Camargo, White and Borja 2021) for elastic soil.  What soil that flows needs more, up to a
+hundredfold, damps second differences only (`second_differences`): on jumps it would smear pressures that are steep.
 """
 
 from __future__ import annotations
