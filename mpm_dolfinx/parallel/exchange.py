@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 from mpi4py import MPI
+from petsc4py import PETSc
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,36 +47,41 @@ class Exchange:
         self.comm = comm
         if comm.size == 1:
             return
-        self._order = np.argsort(destination, kind="stable")
-        self._sent = np.bincount(destination, minlength=comm.size).astype(np.int32)
-        self._received = np.empty_like(self._sent)
-        comm.Alltoall(self._sent, self._received)
+        order = np.argsort(destination, kind="stable")
+        sent = np.bincount(destination, minlength=comm.size).astype(np.int32)
+        received, first_there = np.empty_like(sent), np.empty_like(sent)
+        comm.Alltoall(sent, received)
+        comm.Alltoall((np.cumsum(received) - received).astype(np.int32), first_there)
+        place = np.empty(len(destination), dtype=np.int32)  # of each row among those that its rank receives
+        place[order] = np.arange(len(destination)) + np.repeat(first_there - (np.cumsum(sent) - sent), sent)
+        self._counts = len(destination), int(received.sum())
+        self._away = tuple(np.delete(counts, comm.rank) for counts in (sent, received))
+        self._sf = PETSc.SF().create(comm)  # sends to neighbours only
+        self._sf.setGraph(self._counts[1], None, np.column_stack([destination, place]).astype(PETSc.IntType))
 
     def send(self, rows: NDArray) -> NDArray:
         """Return the rows that this rank received, ordered by sender."""
         if self.comm.size == 1:
             return rows
-        return self._transfer(rows[self._order], self._sent, self._received)
+        return self._transfer(rows, 1, self._sf.reduceBegin, self._sf.reduceEnd)
 
     def back(self, rows: NDArray) -> NDArray:
         """Return answers, one for each received row, to the senders in the order they sent."""
         if self.comm.size == 1:
             return rows
-        answers = self._transfer(rows, self._received, self._sent)
-        out = np.empty_like(answers)
-        out[self._order] = answers
-        return out
+        return self._transfer(rows, 0, self._sf.bcastBegin, self._sf.bcastEnd)
 
-    def _transfer(self, rows: NDArray, counts, received) -> NDArray:
+    def _transfer(self, rows: NDArray, to: int, begin: Callable, end: Callable) -> NDArray:
         rows = np.ascontiguousarray(rows)
-        out = np.empty((int(received.sum()), *rows.shape[1:]), dtype=rows.dtype)
+        out = np.empty((self._counts[to], *rows.shape[1:]), dtype=rows.dtype)
         width = int(np.prod(rows.shape[1:], dtype=int))
         row = MPI._typedict[rows.dtype.char].Create_contiguous(width).Commit()  # entries may be more than an int counts
-        away = np.delete(counts, self.comm.rank)
+        away = self._away[1 - to]
         traffic.transfers += 1
         traffic.messages += int(np.count_nonzero(away))
         traffic.bytes += int(away.sum()) * row.size
-        self.comm.Alltoallv([rows, counts, row], [out, received, row])
+        begin(row, rows, out, MPI.REPLACE)
+        end(row, rows, out, MPI.REPLACE)
         row.Free()
         return out
 
