@@ -105,7 +105,9 @@ def figure(rows: int, columns: int, size: tuple[float, float]):
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    return plt.subplots(rows, columns, figsize=size, layout="constrained", squeeze=False)
+    fig, axes = plt.subplots(rows, columns, figsize=size, layout="constrained", squeeze=False)
+    fig.get_layout_engine().set(w_pad=0.1)  # inches: no label touches the next panel
+    return fig, axes
 
 
 def save(fig, path: Path, dpi: int = 130) -> None:

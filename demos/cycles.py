@@ -262,11 +262,11 @@ def draw(o: Namespace, runs: dict[float, dict], points: dict, fem: tuple[np.ndar
     for (h, run), color in zip(runs.items(), COLORS, strict=False):
         left.plot(np.arange(len(run["left"])) + 1, run["left"], "o-", ms=3, color=color, label=f"domains, h = {h:g} m")
     label = f"standard MPM, h = {o.h[-1]:g} m"
-    left.plot(np.arange(len(points["left"])) + 1, points["left"], "s--", ms=3, color="crimson", label=label)
+    left.plot(np.arange(len(points["left"])) + 1, points["left"], "s--", ms=3, color="C3", label=label)
     left.set(xlabel="cycles", ylabel="stress left at zero load / at the peak", xscale="log", yscale="log")
     left.set_title("What is left of the stress")
     last = runs[o.h[-1]]
-    both = ("domains", last, "-", COLORS[len(runs) - 1]), ("standard MPM", points, "s--", "crimson")
+    both = ("domains", last, "-", COLORS[len(runs) - 1]), ("standard MPM", points, "s--", "C3")
     for name, run, style, color in both:
         end = len(run["left"]) * o.steps
         part = slice(max(0, end - o.steps), end + 1)

@@ -101,7 +101,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 def draw(out: Path, safety: mpm.Safety, before: np.ndarray, corners: np.ndarray, moved: np.ndarray) -> None:
     """Draw the motions of the trials, and the slope before and after its slide."""
-    fig, ((trials, after),) = common.figure(1, 2, (13, 4.2))
+    fig, ((trials, after),) = common.figure(1, 2, (13, 3.6))
     for factor, motion in sorted(safety.motions.items()):
         style = {"color": "C2" if factor <= safety.bounds[0] else "C3", "marker": "o", "ms": 3, "lw": 1}
         trials.semilogy(np.arange(1, len(motion) + 1), motion, **style)
@@ -111,8 +111,9 @@ def draw(out: Path, safety: mpm.Safety, before: np.ndarray, corners: np.ndarray,
     trials.set(
         xlabel="step",
         ylabel="motion in the step (m)",
-        title=f"Factor of safety {safety.factor:.3f}: trials that come to rest (green), or fail (red)",
+        title=f"Factor of safety {safety.factor:.3f}; green: comes to rest, red: fails",
     )
+    trials.margins(x=0.12)
     quads = common.domains(after, corners, moved, cmap="viridis", linewidth=0.1)
     common.domains(after, before, facecolor="none", edgecolors="grey", linewidth=0.1, alpha=0.5)
     fig.colorbar(quads, ax=after, label="displacement (m)", shrink=0.7)

@@ -164,23 +164,24 @@ def main(argv: list[str] | None = None) -> dict:
 
 def draw(o: Namespace, runs: dict[str, list[Run]], limit: float) -> None:
     """Draw the error against the step, and the pressure over the depth of the longest and the shortest steps."""
-    fig, ((left, right),) = common.figure(1, 2, (11.5, 4.8))
+    fig, ((left, *profiles),) = common.figure(1, 3, (14, 4.6))
     dt = T_END / np.array(o.steps)
+    marks = dict(zip(runs, "ox+", strict=True))
     for name, case in runs.items():
-        left.loglog(dt, [run.error for run in case], "o-", ms=4, label=name)
+        left.loglog(dt, [run.error for run in case], f"{marks[name]}-", mfc="none", label=name)
     left.axhline(limit, color="black", lw=1, ls="--", label=f"{o.cells} cells, exact in time")
     left.set(xlabel="step / time of consolidation (-)", ylabel="rms error of p / p0 (-)")
     left.set(title=f"Error at $T_v$ = {T_END:g}")
     left.legend()
     z = np.linspace(0, 1, 201)
-    right.plot(terzaghi_pressure(z, T_END, 1.0, 1.0), z, color="black", lw=1, label="exact")
-    for k, mark in ((0, "s"), (-1, "o")):
-        for colour, (name, case) in enumerate(runs.items()):
-            label = f"{name}, {o.steps[k]} step" + "s" * (o.steps[k] > 1)
-            right.plot(case[k].p, case[k].z, mark, ms=3, mfc="none", color=f"C{colour}", label=label)
-    right.set(xlabel="pore pressure / p0 (-)", ylabel="depth / height (-)", title="Pressure of the cells", ylim=(1, 0))
-    right.legend(loc="lower left")
-    for ax in (left, right):
+    for k, ax in zip((0, -1), profiles, strict=True):
+        ax.plot(terzaghi_pressure(z, T_END, 1.0, 1.0), z, color="black", lw=1, label="exact")
+        for name, case in runs.items():
+            ax.plot(case[k].p, case[k].z, marks[name], ms=5, mfc="none", label=name)
+        title = f"Pressure of the cells, {o.steps[k]} step" + "s" * (o.steps[k] > 1)
+        ax.set(xlabel="pore pressure / p0 (-)", ylabel="depth / height (-)", title=title, ylim=(1, 0))
+        ax.legend(loc="lower left")
+    for ax in (left, *profiles):
         ax.grid(alpha=0.3)
     common.save(fig, o.out / "small_steps.png")
 
@@ -200,7 +201,7 @@ def draw_strip(o: Namespace, strips: dict[str, list[NDArray[np.float64]]]) -> No
     right.set(xlabel="step / time of consolidation (-)", ylabel="roughness (% of the largest p)", ylim=(0, None))
     right.legend()
     right.grid(alpha=0.3)
-    common.save(fig, o.out / "strip.png")
+    common.save(fig, o.out / "small_steps_strip.png")
 
 
 if __name__ == "__main__":
