@@ -6,8 +6,8 @@ coupling of the material points are varied, beside body-fitted finite elements o
 (Q1/DG0, the peer) and Taylor-Hood elements.  Time is that of the time loop, the least of `--repeat`
 runs; compile times are listed apart.  Truths are converged in space and in time.
 
-* beam: the coupled seed beam; largest error of the tip over the output times `beam.TIMES`, most of it in the first, and
-  beside it that from 0.1 s on, against Taylor-Hood elements, 67 x 20 cells, steps of 0.005 s
+* beam: the poroelastic beam; largest error of the tip over the output times `beam.TIMES`, usually in the first, and
+  that from 0.1 s on, against Taylor-Hood elements, 67 x 20 cells, steps of 0.005 s
 * drained: the same without water, load in ten steps; tip, against Taylor-Hood, 67 x 20 cells
 * terzaghi: settlement at T_v = 0.5, exact;  mandel: settlement of the plate at T = 0.1, exact
 * column: height of the soft column under its own weight, exact
@@ -62,7 +62,7 @@ class Row:
     late: float = np.nan
 
 
-# ---- the seed beam -------------------------------------------------------------------------------
+# ---- the beam ------------------------------------------------------------------------------------
 
 
 def beam_runs(drained: bool, quick: bool) -> Iterator[tuple[str, str, Run]]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Where others stop: scenes at the edge of what can be asked, none of them silently wrong.
+"""Stiff and extreme scenes: each converges, recovers or is refused, none is silently wrong.
 
 Every scene is tiny, and one thing about it is extreme.  It ends in one of
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What the domains buy: the drained beam's tip against the number of load steps.
+"""Why domains of points are integrated exactly: the drained beam's tip against the number of load steps.
 
 The beam of `poroelastic_beam.py` without water takes its whole load in n equal steps.  The material
 is elastic, so the answer must not depend on n.  Integrated over the exact pieces of the points'

@@ -15,7 +15,6 @@ from pathlib import Path
 
 import common
 import numpy as np
-import ufl
 
 import mpm_dolfinx as mpm
 
@@ -25,17 +24,6 @@ YOUNG, POISSON = 1e8, 0.3  # Pa, -
 LOG_SPIRAL, PUBLISHED = 1.368, 1.4
 WEAKER = 1.6
 VISCOSITY = 0.1 * WEIGHT * HEIGHT  # Pa s
-
-
-def weight(points, v):
-    """Weight of the soil, downwards, N/m³ of the ground as it was."""
-    return WEIGHT / ufl.det(points.F) * points.value(v)[1] * points.dx
-
-
-def viscous(points, u, dt):
-    """Potential of the stress 2 eta D of the rate of strain D = sym grad u / dt."""
-    strain = ufl.sym(points.grad(u))
-    return VISCOSITY / dt * ufl.inner(strain, strain) * points.dx
 
 
 def slope(cells: int) -> mpm.Simulation:
@@ -58,7 +46,9 @@ def slope(cells: int) -> mpm.Simulation:
         cohesion=lambda X: np.full(len(X), COHESION),
     )
     walls = {"left": "x", "right": "x", "bottom": "xy"}
-    s = mpm.Simulation(grid, [ground, bank], [soil], fixed=walls, terms=[weight, viscous])
+    s = mpm.Simulation(
+        grid, [ground, bank], [soil], fixed=walls, terms=[common.weight(WEIGHT), common.viscous(VISCOSITY)]
+    )
     s.run(1e9, 1e9, progress=False)  # time in which nothing of the viscosity is left
     s.stage(reset_displacement=True)
     s.t = 0.0

@@ -17,9 +17,9 @@ What the motion adds is the strain that points of a cell share in a step, most o
 the column at its drained top; the remap's own error is of second order and smaller.
 
 The overshoot, the largest p / p0 - 1 of all steps, is nothing at rest, however small the step: the scheme has
-no least time step in one dimension.  In more, small steps bring checkers of the pressure, but for the damping of
-jumps (`storage.py`): shown for a strip load on a layer in a rough box, first step, with and without.  On one
-process.
+no least time step in one dimension.  In more, small steps bring checkerboard modes of the pressure, unless its jumps
+are damped (`storage.py`): shown for a strip load on a layer in a rough box, first step, with and without damping.
+On one process.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from dataclasses import dataclass
 import common
 import numpy as np
 import terzaghi
-from coupling_iterations import Undamped
+from coupling_iterations import LAWS, roughness
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
@@ -116,15 +116,6 @@ def strip(cells: int, dt: float, law: type[mpm.Skeleton]) -> NDArray[np.float64]
     p = np.empty(grid.shape.prod())
     p[grid.cell_number] = simulation.scene.storage.p.x.array / load
     return p.reshape(grid.shape)
-
-
-def roughness(p: NDArray[np.float64]) -> float:
-    """Return rms(p - mean of the four neighbours) / max |p| over the inner cells (nx, ny)."""
-    mean = (p[:-2, 1:-1] + p[2:, 1:-1] + p[1:-1, :-2] + p[1:-1, 2:]) / 4
-    return float(np.sqrt(np.mean((p[1:-1, 1:-1] - mean) ** 2)) / np.abs(p).max())
-
-
-LAWS = {"damped": mpm.Hencky, "undamped": Undamped}
 
 
 def main(argv: list[str] | None = None) -> dict:

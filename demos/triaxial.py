@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Triaxial tests of soil laws at a point, beside closed forms: what a law is looked at with before a scene.
+"""Triaxial tests of soil laws at a point, beside closed forms: how to look at a law before it is used.
 
 Modified Cam Clay at three overconsolidation ratios, drained and undrained from the same isotropic stress.  Undrained
 the volume is closed, so that it ends at P_cs = P_0 (R/2)^(1 - kappa/lambda), Q = M P_cs; on the way

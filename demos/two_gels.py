@@ -2,7 +2,8 @@
 """Two gels meet: they are pressed together, slide over each other with friction, and part.
 
 Half-discs of two groups of bodies, each with displacements of its own.  The lower one is held, the upper one follows a
-path.  While they are apart nothing acts between them, however narrow the gap.
+path.  While they are apart nothing acts between them, however narrow the gap.  As the upper one passes over the top of
+the lower one, the contact inclines: the force along the path, over that up, falls below the friction coefficient.
 
 Beside it the contact of a curved and a flat elastic body: pressure and half-width after Hertz, for the force that the
 contact takes.  Both are off by what a few cells over the half-width cannot resolve.
@@ -131,7 +132,7 @@ def draw(out: Path, shown: list, t: np.ndarray, force: np.ndarray) -> None:
         t, np.where((t > TIMES[0]) & (force[:, 1] > 0), rigid, np.nan), "k--", label="rigid gels that slide"
     )
     axes[2, 1].set(xlabel="time (s)", ylabel="force along / force up (-)")
-    axes[2, 1].set_title(f"friction {FRICTION} on a contact that leans more and more", fontsize=10)
+    axes[2, 1].set_title(f"friction {FRICTION} on a contact that inclines more and more", fontsize=10)
     for ax in axes[2]:
         ax.grid(alpha=0.3)
         ax.legend(fontsize=8)
