@@ -23,7 +23,6 @@ from dataclasses import dataclass, field
 
 import common
 import numpy as np
-import ufl
 
 import mpm_dolfinx as mpm
 
@@ -39,17 +38,6 @@ SHEAR = 30 * SCALE
 ANGLES = np.radians(np.linspace(20, 85, 261))  # of the planes of wedges
 
 
-def weight(points, v):
-    """Weight of the clay, downwards, N/m³ of the ground as it was."""
-    return WEIGHT / ufl.det(points.F) * points.value(v)[1] * points.dx
-
-
-def viscous(points, u, dt):
-    """Potential of the stress 2 eta D of the rate of strain D = sym grad u / dt."""
-    strain = ufl.sym(points.grad(u))
-    return VISCOSITY / dt * ufl.inner(strain, strain) * points.dx
-
-
 def bank(cells: int, barrier: bool) -> mpm.Simulation:
     """Return the bank at rest, with so many cells over its height; t is zero."""
     h = HEIGHT / cells
@@ -61,7 +49,9 @@ def bank(cells: int, barrier: bool) -> mpm.Simulation:
     tools = [mpm.Tool(mpm.Convex(corners), adhesion=ADHESION, centre=(WALL, 0))] if barrier else []
     body = mpm.box(grid, [0, 0], [HEIGHT, HEIGHT])
     walls = {"left": "x", "bottom": "xy"}
-    s = mpm.Simulation(grid, [body], [clay], fixed=walls, terms=[weight, viscous], tools=tools)
+    s = mpm.Simulation(
+        grid, [body], [clay], fixed=walls, terms=[common.weight(WEIGHT), common.viscous(VISCOSITY)], tools=tools
+    )
     s.run(1e9, 1e9, progress=False)  # time in which nothing of the viscosity is left
     s.stage(reset_displacement=True)
     s.t = 0.0

@@ -3,7 +3,7 @@
 
 A square block of 1 m between smooth walls is pressed on its top, little enough that the active cells stay.  In each
 pair one feature is left out, or is there and does next to nothing: gravity of zero, a conductivity of 1e-30 m/s, a
-plastic law far from yielding, a penalty that damps what is not there.  `settlement` is the largest relative
+plastic law far from yielding, a stabilisation with nothing to damp.  `settlement` is the largest relative
 difference of the answers; with mean dilatation it is that of the two Poisson ratios.
 
 Steps of both scenes are taken in turn, --repeat times; the least of each counts, since other work on the machine

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""A cylindrical cavity is widened in clay and in sand, on a grid that knows nothing of circles.
+"""A cylindrical cavity is widened in clay and in sand, on a grid of squares.
 
-A quarter of a ring of soil, b = 5 a0, its wall a given displacement that goes a fifth of a cell in a step, undrained a
+A quarter of a ring of soil, b = 5 a0.  The given displacement of its wall is a fifth of a cell in a step, undrained a
 tenth: laws with history are integrated to first order, and with eight cells and steps of a fifth the radial solution
 itself has pore pressures that are 1.5 % too low at a = 1.1 a0, where normally consolidated clay is still yielding.
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What the demos share besides their physics: options, first and last lines, tables and pictures."""
+"""What the demos share: options, first and last lines, tables, pictures, and two terms in UFL."""
 
 from __future__ import annotations
 
@@ -9,13 +9,14 @@ import json
 import re
 import sys
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 from mpi4py import MPI
 
 import numpy as np
+import ufl
 
 import mpm_dolfinx as mpm
 
@@ -105,13 +106,34 @@ def figure(rows: int, columns: int, size: tuple[float, float]):
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    return plt.subplots(rows, columns, figsize=size, layout="constrained", squeeze=False)
+    fig, axes = plt.subplots(rows, columns, figsize=size, layout="constrained", squeeze=False)
+    fig.get_layout_engine().set(w_pad=0.1)  # inches: no label touches the next panel
+    return fig, axes
 
 
 def save(fig, path: Path, dpi: int = 130) -> None:
     """Write a figure as a picture."""
     path.parent.mkdir(parents=True, exist_ok=True)
     fig.savefig(path, dpi=dpi)
+
+
+def weight(unit_weight: float) -> Callable:
+    """Return the term of a weight, N/m³ of the ground as it was, downwards."""
+
+    def weight(points, v):
+        return unit_weight / ufl.det(points.F) * points.value(v)[1] * points.dx
+
+    return weight
+
+
+def viscous(viscosity: float) -> Callable:
+    """Return the term, a potential, of the stress 2 eta D of the rate of strain D = sym grad u / dt; eta in Pa s."""
+
+    def viscous(points, u, dt):
+        strain = ufl.sym(points.grad(u))
+        return viscosity / dt * ufl.inner(strain, strain) * points.dx
+
+    return viscous
 
 
 def domains(ax, corners: np.ndarray, values: np.ndarray | None = None, **style):

@@ -2,12 +2,12 @@
 """A body that comes back: what load cycles and a turn by 360 degrees leave in it.
 
 The drained beam of `poroelastic_beam.py` is loaded and unloaded again and again.  It is elastic: without load it must
-be free of stress.  Domains that followed the kinks of the grid's field would collect a part of them with every grid
-line that they cross; standard MPM collects them at its points.  A block that is stretched between two held sides and
-then turned by 360 degrees must end with the stresses that it began with.  Undrained the beam is clamped at singular
+be free of stress.  The grid's displacements have kinks at grid lines.  Domains that followed them would collect stress
+with every line that they cross, as standard MPM does at its points.  A block that is stretched between two held sides
+and then turned by 360 degrees must end with the stresses that it began with.  Undrained the beam is clamped at singular
 edges: the stress there is that of r^(x - 1), cos(pi x / 2) = x, x = 0.595 (Williams 1952), so its rms within a few
-cells of them falls as h^x, and so does what is left.  It is told with the clamp, but there, there alone, and with
-springs in its place.
+cells of them falls as h^x, and so does the stress that is left.  It is given for the whole beam, far from the clamp,
+near it, and with springs in its place.
 """
 
 from __future__ import annotations
@@ -262,11 +262,11 @@ def draw(o: Namespace, runs: dict[float, dict], points: dict, fem: tuple[np.ndar
     for (h, run), color in zip(runs.items(), COLORS, strict=False):
         left.plot(np.arange(len(run["left"])) + 1, run["left"], "o-", ms=3, color=color, label=f"domains, h = {h:g} m")
     label = f"standard MPM, h = {o.h[-1]:g} m"
-    left.plot(np.arange(len(points["left"])) + 1, points["left"], "s--", ms=3, color="crimson", label=label)
+    left.plot(np.arange(len(points["left"])) + 1, points["left"], "s--", ms=3, color="C3", label=label)
     left.set(xlabel="cycles", ylabel="stress left at zero load / at the peak", xscale="log", yscale="log")
     left.set_title("What is left of the stress")
     last = runs[o.h[-1]]
-    both = ("domains", last, "-", COLORS[len(runs) - 1]), ("standard MPM", points, "s--", "crimson")
+    both = ("domains", last, "-", COLORS[len(runs) - 1]), ("standard MPM", points, "s--", "C3")
     for name, run, style, color in both:
         end = len(run["left"]) * o.steps
         part = slice(max(0, end - o.steps), end + 1)

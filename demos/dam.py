@@ -178,7 +178,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 def draw(o: Namespace, dam: Dam) -> None:
     """Draw pressures in steady flow, and all free surfaces."""
-    fig, axes = common.figure(2, 1, (9, 6))
+    fig, axes = common.figure(2, 1, (9, 4.9))
     (corners, p), ax = dam.frames[0], axes[0, 0]
     domains = common.domains(ax, corners, p / 1e3, cmap="viridis", clim=(0, WEIGHT * LEVELS[0] / 1e3))
     fig.colorbar(domains, ax=ax, label="pore pressure (kPa)", shrink=0.8)

@@ -147,9 +147,9 @@ def main(argv: list[str] | None = None) -> dict:
 
 def draw(o: Namespace, bund: Bund) -> None:
     """Draw the section after the last lift and at the end, and settlements and excess pressure in time."""
-    fig, axes = common.figure(3, 1, (9, 9.5))
+    fig, axes = common.figure(2, 2, (13, 6.4))
     most = max(np.quantile(np.abs(p), 0.995) for _, _, p in bund.frames) / 1e3
-    for ax, (title, corners, excess) in zip(axes[:2, 0], bund.frames, strict=True):
+    for ax, (title, corners, excess) in zip(axes[0], bund.frames, strict=True):
         domains = common.domains(ax, corners, excess / 1e3, cmap="viridis", clim=(0, most))
         ax.plot([CREST + SLOPE * LIFTS, CREST, 0], [CLAY, CLAY + LIFTS, CLAY + LIFTS], color="grey", lw=0.8, ls=":")
         ax.plot([0, WIDTH], [CLAY, CLAY], color="grey", lw=0.8, ls=":")
@@ -161,17 +161,18 @@ def draw(o: Namespace, bund: Bund) -> None:
             xlabel="x (m)",
             ylabel="y (m)",
         )
-        fig.colorbar(domains, ax=ax, label="excess pressure (kPa)", shrink=0.8)
-    ax, days = axes[2, 0], np.array(bund.t) / DAY
+    fig.colorbar(domains, ax=axes[0], label="excess pressure (kPa)", shrink=0.8)
+    (ax, below), days = axes[1], np.array(bund.t) / DAY
     ax.plot(days, bund.axis, color="C0", label="on the axis")
     ax.plot(days, bund.toe, color="C0", ls="--", label="at the toe")
-    ax.set(xlim=(0, None), xlabel="days after the first lift", ylabel="displacement of the ground, up (m)")
-    ax.set_xscale("symlog", linthresh=100)
-    twin = ax.twinx()
-    twin.plot(days, np.array(bund.excess) / 1e3, color="C1")
-    twin.set_ylabel("excess pressure in mid-clay (kPa)", color="C1")
+    ax.set_ylabel("ground's displacement, up (m)")
     ax.legend(loc="lower left")
-    ax.grid(alpha=0.3)
+    below.plot(days, np.array(bund.excess) / 1e3, color="C0")
+    below.set_ylabel("excess pressure in mid-clay (kPa)")
+    for ax in axes[1]:
+        ax.set(xlim=(0, None), xlabel="days after the first lift")
+        ax.set_xscale("symlog", linthresh=100)
+        ax.grid(alpha=0.3)
     common.save(fig, o.out / "embankment.png")
 
 

@@ -6,8 +6,8 @@ coupling of the material points are varied, beside body-fitted finite elements o
 (Q1/DG0, the peer) and Taylor-Hood elements.  Time is that of the time loop, the least of `--repeat`
 runs; compile times are listed apart.  Truths are converged in space and in time.
 
-* beam: the coupled seed beam; largest error of the tip over the output times `beam.TIMES`, most of it in the first, and
-  beside it that from 0.1 s on, against Taylor-Hood elements, 67 x 20 cells, steps of 0.005 s
+* beam: the poroelastic beam; largest error of the tip over the output times `beam.TIMES`, usually in the first, and
+  that from 0.1 s on, against Taylor-Hood elements, 67 x 20 cells, steps of 0.005 s
 * drained: the same without water, load in ten steps; tip, against Taylor-Hood, 67 x 20 cells
 * terzaghi: settlement at T_v = 0.5, exact;  mandel: settlement of the plate at T = 0.1, exact
 * column: height of the soft column under its own weight, exact
@@ -32,7 +32,18 @@ from mpm_dolfinx.verification.biot_fem import BiotFEM
 from mpm_dolfinx.verification.exact import Mandel, terzaghi_consolidation
 
 PEER, TRUTH = "FEM Q1/DG0, same grid", "FEM Taylor-Hood"
-DEFAULT, BY_ERROR = "MPM, defaults", "MPM, steps by error"
+DEFAULT, BY_ERROR, STANDARD = "MPM, defaults", "MPM, steps by error", "standard MPM, at the points"
+STYLES = {  # of the lines: colour and marker of a method, in all cases
+    DEFAULT: ("C0", "o"),
+    PEER: ("C1", "D"),
+    STANDARD: ("C3", "s"),
+    "MPM, fixed-stress": ("C2", "^"),
+    "MPM, backward Euler": ("C4", "v"),
+    BY_ERROR: ("C5", "x"),
+    "MPM, 1x1 points a cell": ("C6", "*"),
+    "MPM, 3x3 points a cell": ("C7", "P"),
+    TRUTH: ("black", "s"),
+}
 Run = Callable[[], tuple[float | tuple[float, float], mpm.Result, float]]
 """A run: error (of the beam also the late one), result, compile seconds."""
 
@@ -51,7 +62,7 @@ class Row:
     late: float = np.nan
 
 
-# ---- the seed beam -------------------------------------------------------------------------------
+# ---- the beam ------------------------------------------------------------------------------------
 
 
 def beam_runs(drained: bool, quick: bool) -> Iterator[tuple[str, str, Run]]:
@@ -86,7 +97,7 @@ def beam_runs(drained: bool, quick: bool) -> Iterator[tuple[str, str, Run]]:
     for h in sizes:
         yield DEFAULT, f"h = {h} m", points(f"--h {h}")
         yield PEER, f"h = {h} m", elements("q1-dg0", (round(beam.LENGTH / h), round(beam.HEIGHT / h)))
-        yield "MPM, at the points", f"h = {h} m", points(f"--h {h} --quadrature point")
+        yield STANDARD, f"h = {h} m", points(f"--h {h} --quadrature point")
         if not drained:
             yield "MPM, fixed-stress", f"h = {h} m", points(f"--h {h} --coupling fixed-stress")
             yield "MPM, backward Euler", f"h = {h} m", points(f"--h {h} --method backward-euler")
@@ -143,7 +154,7 @@ def scene_runs(
         yield PEER, setting, elements(n, m, "q1-dg0")
         yield TRUTH, setting, elements(n, m, "taylor-hood")
     for n in cells:
-        yield "MPM, at the points", f"{n} cells, {time[1]} steps", points(n, time[1], quadrature="point")
+        yield STANDARD, f"{n} cells, {time[1]} steps", points(n, time[1], quadrature="point")
     for rtol in (1e-2, 1e-3) if "fluid" in physics else ():
         yield BY_ERROR, f"{cells[-1]} cells, rtol {rtol:g}", points(cells[-1], 0, rtol)
 
@@ -264,12 +275,11 @@ def draw(out: Path, case: str, rows: list[Row]) -> None:
     """Draw error against time: solid lines from coarse to fine cells, dashed ones from few to many steps."""
     fig, ((ax,),) = common.figure(1, 1, (9.5, 5))
     usual = Counter(r.steps for r in rows).most_common(1)[0][0]
-    for i, method in enumerate(dict.fromkeys(r.method for r in rows)):
+    for method in dict.fromkeys(r.method for r in rows):
         mine = [r for r in rows if r.method == method and np.isfinite(r.error)]
         cells = [r for r in mine if r.steps == usual]
         steps = sorted([*cells[-1:], *(r for r in mine if r.steps != usual)], key=lambda r: r.steps)
-        style = {"color": "black" if method == TRUTH else f"C{i}", "lw": 2 if method == DEFAULT else 1}
-        style["marker"] = "os^Dvx*"[i % 7]
+        style = dict(zip(("color", "marker"), STYLES[method], strict=True), lw=2 if method == DEFAULT else 1)
         for sweep, line in ((cells, "-"), (steps, "--")):
             label = method if (line == "-") == bool(cells) else None
             if len(sweep) > 1 or label:
@@ -279,7 +289,8 @@ def draw(out: Path, case: str, rows: list[Row]) -> None:
     ax.set(xlabel="time of the time loop (s)", ylabel="relative error (-)", title=f"{case}: error against run time")
     ax.grid(alpha=0.3, which="both")
     ax.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    common.save(fig, out / f"{case}.png", dpi=120)
+    name = "error_vs_runtime" if case == "beam" else f"error_vs_runtime_{case}"  # the beam's is on the pages
+    common.save(fig, out / f"{name}.png", dpi=120)
 
 
 def main(argv: list[str] | None = None) -> dict:

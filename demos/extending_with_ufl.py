@@ -166,7 +166,7 @@ def flow(cells: int, law: Callable, exact_law: Callable, title: str) -> Example:
     heights = np.array([0, 0.5 * J[0], 0.5 * J.sum()])
     y, p = pressures(s)
     exact = np.interp(y, heights, [1, 1 - drop[0], 0])
-    return Example(title, "height (m)", "pore pressure / p at the foot (-)", y, p, exact)
+    return Example(title, "height (m)", "p / p at the foot (-)", y, p, exact)
 
 
 def kozeny_carman(cells: int) -> Example:
@@ -258,7 +258,7 @@ def damage(cells: int) -> Example:
     strain = -np.log([1 + top(t, None)[1] for t in np.arange(1, 41) / 40])
     sound = 6e5 * (1 - np.exp(-2 * strain)) + 6e5 * strain
     exact = sound * np.exp(-np.maximum.accumulate(strain) / 0.5)
-    return Example("state: damage", *PATH, strain, stress / 1e3, exact / 1e3)
+    return Example("damage", *PATH, strain, stress / 1e3, exact / 1e3)
 
 
 # ---- plastic flow: a law that gives its stress and returns to a yield surface ----------------------
@@ -376,13 +376,16 @@ def main(argv: list[str] | None = None) -> dict:
 
 def draw(o: Namespace, examples: list[Example]) -> None:
     """Draw every example beside its exact solution."""
-    fig, axes = common.figure(2, 5, (20, 7))
+    fig, axes = common.figure(5, 2, (6.5, 11))
     for ax, e in zip(axes.flat, examples, strict=True):
         ax.plot(e.x, e.exact, color="black", lw=1, label="exact")
         ax.plot(e.x, e.found, "o", ms=3, label="material points")
-        ax.set(xlabel=e.xlabel, ylabel=e.ylabel, title=f"{e.title} (error {e.error:.0e})")
+        ax.set(xlabel=e.xlabel, ylabel=e.ylabel)
+        ax.set_title(f"{e.title}: {e.error:.0e}", fontsize=11)
+        ax.locator_params(nbins=4)
         ax.grid(alpha=0.3)
     axes[0, 0].legend()
+    fig.suptitle("Physics of one's own, and its largest error")
     common.save(fig, o.out / "extending_with_ufl.png")
 
 

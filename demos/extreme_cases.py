@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Where others stop: scenes at the edge of what can be asked, none of them silently wrong.
+"""Stiff and extreme scenes: each converges, recovers or is refused, none is silently wrong.
 
 Every scene is tiny, and one thing about it is extreme.  It ends in one of
 
@@ -35,6 +35,14 @@ import mpm_dolfinx as mpm
 
 LIMIT = 100  # s of processor time, for a case: other work on the machine is no fault of it
 CLOSED = 1e-8  # residuals and fluid balance
+SHOWN = {
+    "fluid-bulk": "water's bulk modulus",
+    "poisson": "Poisson's ratio",
+    "steps": "number of load steps",
+    "combined": "conductivity and step",
+    "filling": "nearly empty cells",
+    "thin": "thin beams",
+}  # in the picture, beside names that need no other
 OUTCOMES = ("converged", "recovered", "refused", "warned", "wrong", "nan", "hung")
 
 
@@ -198,7 +206,7 @@ def draw(out: Path, rows: list[Row]) -> None:
     axes[2].set(xlabel="Newton iterations per step (-)", title="Newton iterations")
     for ax in axes:
         ax.set(xscale="log", yticks=-np.arange(len(names)), ylim=(0.6 - len(names), 0.6))
-        ax.set_yticklabels(names if ax is axes[0] else [])
+        ax.set_yticklabels([SHOWN.get(name, name.replace("-", " ")) for name in names] if ax is axes[0] else [])
         ax.grid(alpha=0.3)
     axes[0].set_xticks(10.0 ** np.arange(-12, 1, 2))
     for name, n in Counter(r.outcome for r in rows).items():

@@ -6,8 +6,8 @@ thick on rough rock, is Drucker and Prager's with cohesion c, weightless, and dr
 v is the rate of the push, V = v B / c_v its ratio to that of consolidation, B the footing's width.
 
 The box ends 8 B from the middle, by a smooth wall that lets no water through.  One that ends at 16 B changes no load
-by 1 %, at any depth and rate; the demo shows it, on fewer cells.  Ended at 4 B it is up to 8 % too large while the soil
-below yields, drained, before the limit is reached.  The layer's thickness is part of the question: in plane strain the
+by 1 %, at any depth and rate; the demo shows it, on fewer cells.  With a wall at 4 B drained loads are up to 8 % too
+large while the soil below yields, before the limit is reached.  The thickness of the layer matters: in plane strain the
 settlement of a thicker layer grows without bound, as its logarithm (5 B: loads down by 11 % at 0.1 B, 3 % at 0.5 B).
 
 Bearing capacity (Prandtl 1921): q = (2 + pi) s_u without friction; with friction and associated flow q = c N_c,
@@ -23,8 +23,9 @@ beyond too.  So the undrained limit is met from below, at order 1.5: -6.7, -2.9,
 width that is held it would be +17, +9, +5 %: from above, as a displacement method must, at first order.
 
 In associated flow each place of a cell has to dilate with its own shear, but the cell has one mean dilatation: the
-load would go on rising (de Borst and Groen 1995), to +4.4 and +3.4 % with 9 and 17 cells.  So laws see half of what
-the gradient differs from its mean in a cell in which all soil flows: -1.0, +0.2, +0.8 % with 5, 9, 17 cells.
+load would go on rising (de Borst and Groen 1995), to +4.4 and +3.4 % with 9 and 17 cells.  So where all
+soil of a cell flows, laws see half of the difference of the gradient from its mean: -1.0, +0.2, +0.8 % with 5, 9, 17
+cells.
 
 A rough circular footing on Tresca's soil carries 6.05 s_u (Cox, Eason and Hopkins 1961), axisymmetric.
 """
@@ -349,7 +350,7 @@ def draw_loads(ax, runs: dict[str, Push]) -> None:
         ax.axhline(value, color="black", lw=0.8, ls="--")
         place = {"xytext": (0, -3), "textcoords": "offset points", "ha": "right", "va": "top", "fontsize": 8}
         ax.annotate(f"{name} limit at the surface: {value:.2f}", (depth[-1], value), **place)
-    ax.set(xlabel="settlement / B (-)", ylabel="load / (B c) (-)", title="Load and settlement")
+    ax.set(xlabel="settlement / B (-)", ylabel="load / (B c) (-)", title="Load and settlement; V = velocity · B / c_v")
     ax.set(xlim=(0, 1.02 * depth[-1]), ylim=(0, None))
     ax.legend(fontsize=8, loc="lower right", ncol=2)
     ax.grid(alpha=0.3)

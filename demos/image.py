@@ -163,7 +163,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 def draw(o: Namespace, tissue: Tissue, out: Outcome) -> None:
     """Draw the picture, the pressure when the load has come, the tissue in the end, and both over time."""
-    fig, (axes,) = common.figure(1, 4, (16, 4))
+    fig, (axes, below) = common.figure(2, 3, (13, 7.6))
     mm, (loaded, last) = 1e3 * EDGE, out.frames
     grey = np.where(tissue.grey < HOLES, np.nan, tissue.grey)
     axes[0].imshow(grey.T, origin="lower", extent=(0, mm, 0, mm), cmap="cividis", clim=(0, 1))
@@ -176,14 +176,15 @@ def draw(o: Namespace, tissue: Tissue, out: Outcome) -> None:
         axes, ("the picture", f"loaded, t = {loaded[0]:.2g} s", f"drained, t = {last[0]:.0f} s"), strict=False
     ):
         ax.set(aspect="equal", xlim=(0, mm), ylim=(0, 1.03 * mm), xlabel="x (mm)", ylabel="y (mm)", title=title)
-    right, twin = axes[3], axes[3].twinx()
-    right.semilogx(out.t, 100 * np.array(out.settlement), color="C0")
-    right.axhline(100 * out.drained, color="C0", ls=":", label="dry tissue")
-    right.set(xlabel="t (s)", ylabel="settlement (% of the height)", title="settlement and pressure")
-    right.yaxis.label.set_color("C0")
-    right.legend(loc="center left")
-    twin.plot(out.t, 1e-3 * np.array(out.pressure), color="C1")
-    twin.set_ylabel("highest pore pressure (kPa)", color="C1")
+    below[0].semilogx(out.t, 100 * np.array(out.settlement), label="wet tissue")
+    below[0].axhline(100 * out.drained, color="black", ls=":", label="dry tissue")
+    below[0].set(xlabel="t (s)", ylabel="settlement (% of the height)")
+    below[0].legend()
+    below[1].semilogx(out.t, 1e-3 * np.array(out.pressure))
+    below[1].set(xlabel="t (s)", ylabel="highest pore pressure (kPa)")
+    below[2].set_axis_off()
+    for ax in below[:2]:
+        ax.grid(alpha=0.3)
     common.save(fig, o.out / "image.png")
 
 

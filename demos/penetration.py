@@ -125,9 +125,7 @@ def draw(o: Namespace, runs: dict[float, Push]) -> None:
     for k, (alpha, run) in enumerate(runs.items()):
         axes[0, 0].plot(run.depth, run.N, color=f"C{k}", label=f"α = {alpha:g}")
         axes[0, 0].axhline(exact(alpha), color=f"C{k}", ls="--", lw=0.8)
-    axes[0, 0].set(
-        xlabel="depth / D (-)", ylabel="F / (s_u D) (-)", title="resistance, from the settled clay on; dashed: exact"
-    )
+    axes[0, 0].set(xlabel="depth / D (-)", ylabel="F / (s_u D) (-)", title="resistance; dashed: exact")
     axes[0, 0].legend(fontsize=9)
     axes[0, 0].grid(alpha=0.3)
     for ax, alpha in zip(axes[0, 1:], ends, strict=True):

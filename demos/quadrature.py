@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What the domains buy: the drained beam's tip against the number of load steps.
+"""Why domains of points are integrated exactly: the drained beam's tip against the number of load steps.
 
 The beam of `poroelastic_beam.py` without water takes its whole load in n equal steps.  The material
 is elastic, so the answer must not depend on n.  Integrated over the exact pieces of the points'
@@ -69,11 +69,11 @@ def draw(o: Namespace, tips: dict[str, list[float]], exact: float) -> None:
     fig, ((ax,),) = common.figure(1, 1, (7, 4.2))
     ax.axhline(exact, color="black", lw=1, label="Taylor-Hood FEM")
     ax.plot(o.steps, tips["domain"], "o-", label="exact pieces of the points' domains")
-    ax.plot(o.steps, tips["point"], "s--", label="at the points, as in standard MPM")
+    ax.plot(o.steps, tips["point"], "s--", color="C3", label="standard MPM, at the points")
     failed = [n for n, u in zip(o.steps, tips["point"], strict=True) if not np.isfinite(u)]
     if failed:
         level = np.nanmin(tips["point"]) if np.isfinite(tips["point"]).any() else 1.2 * exact
-        ax.plot(failed, [level] * len(failed), "x", color="crimson", ms=9, label="at the points: gave up")
+        ax.plot(failed, [level] * len(failed), "x", color="C3", ms=9, label="standard MPM: gave up")
     ax.set(xscale="log", xlabel="number of load steps", ylabel="deflection of the tip (m)")
     ax.set_xticks(o.steps, [str(n) for n in o.steps])
     ax.minorticks_off()

@@ -10,7 +10,7 @@ to K q, normal to the wall.  With c cot(phi) added to both, so that cohesion doe
 the upper sign passive: a zone at the wall, a fan about its crest and Rankine's zone (Prandtl, Sokolovskii).  Without
 friction, delta = 0, this is Rankine's K = (1 ± sin(phi)) / (1 ∓ sin(phi)).  Coulomb's wedge is the worst plane one.
 
-The moment about the toe gives K as well: it is what does work.  A wall that tilts opens no gap at its toe.  One that
+The moment about the toe, which does the work, gives K as well.  A wall that tilts opens no gap at its toe.  One that
 slides does, and bears nothing there: the last of ten cells misses a tenth of the active thrust.  The sand is stiff:
 tilted two and a half times as far, the active thrust rises by 2.5 to 3 %.
 """

@@ -2,10 +2,23 @@
 # bash demos/run.sh [-n PROCESSES] [DEMO] [ARGUMENTS OF THE DEMO]
 #
 # Installs what is missing (on Debian, as root or with sudo) and runs demos/DEMO.py; without a name,
-# the poroelastic beam. ARGUMENTS: see --help of the demo. With -n on so many processes, by mpirun.
+# the poroelastic beam. With -n on so many processes, by mpirun. ARGUMENTS: bash demos/run.sh DEMO --help.
 set -euo pipefail
 . "$(dirname "${BASH_SOURCE[0]}")/../.ci/setup.sh"
 
+# The names of the demos, and the first line of what each says of itself.
+demos() {
+    (cd "$root/demos" && awk 'FNR == 2 { print "    " FILENAME "\t" $0 }' *.py) |
+        sed 's/\.py\t"""/\t/; s/"""$//; /^ *common\t/d' | expand -t 24
+}
+
+case ${1-} in
+    -h | --help)
+        sed -n '2,/^[^#]/s/^# \{0,1\}//p' "${BASH_SOURCE[0]}"
+        printf '\nDemos:\n\n'
+        demos
+        exit ;;
+esac
 processes=
 if [ "${1-}" = -n ]; then
     case ${2-} in
@@ -20,7 +33,7 @@ case ${1-} in
 esac
 if [ ! -f "$root/demos/$demo.py" ] || [ "$demo" = common ]; then
     say "There is no demo $demo. There are:"
-    (cd "$root/demos" && printf '    %s\n' *.py | sed 's/\.py$//; /^ *common$/d') >&2
+    demos >&2
     exit 2
 fi
 

@@ -15,7 +15,6 @@ from pathlib import Path
 
 import common
 import numpy as np
-import ufl
 
 import mpm_dolfinx as mpm
 
@@ -25,17 +24,6 @@ YOUNG, POISSON = 1e8, 0.3  # Pa, -
 LOG_SPIRAL, PUBLISHED = 1.368, 1.4
 WEAKER = 1.6
 VISCOSITY = 0.1 * WEIGHT * HEIGHT  # Pa s
-
-
-def weight(points, v):
-    """Weight of the soil, downwards, N/m³ of the ground as it was."""
-    return WEIGHT / ufl.det(points.F) * points.value(v)[1] * points.dx
-
-
-def viscous(points, u, dt):
-    """Potential of the stress 2 eta D of the rate of strain D = sym grad u / dt."""
-    strain = ufl.sym(points.grad(u))
-    return VISCOSITY / dt * ufl.inner(strain, strain) * points.dx
 
 
 def slope(cells: int) -> mpm.Simulation:
@@ -58,7 +46,9 @@ def slope(cells: int) -> mpm.Simulation:
         cohesion=lambda X: np.full(len(X), COHESION),
     )
     walls = {"left": "x", "right": "x", "bottom": "xy"}
-    s = mpm.Simulation(grid, [ground, bank], [soil], fixed=walls, terms=[weight, viscous])
+    s = mpm.Simulation(
+        grid, [ground, bank], [soil], fixed=walls, terms=[common.weight(WEIGHT), common.viscous(VISCOSITY)]
+    )
     s.run(1e9, 1e9, progress=False)  # time in which nothing of the viscosity is left
     s.stage(reset_displacement=True)
     s.t = 0.0
@@ -101,7 +91,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 def draw(out: Path, safety: mpm.Safety, before: np.ndarray, corners: np.ndarray, moved: np.ndarray) -> None:
     """Draw the motions of the trials, and the slope before and after its slide."""
-    fig, ((trials, after),) = common.figure(1, 2, (13, 4.2))
+    fig, ((trials, after),) = common.figure(1, 2, (13, 3.6))
     for factor, motion in sorted(safety.motions.items()):
         style = {"color": "C2" if factor <= safety.bounds[0] else "C3", "marker": "o", "ms": 3, "lw": 1}
         trials.semilogy(np.arange(1, len(motion) + 1), motion, **style)
@@ -111,8 +101,9 @@ def draw(out: Path, safety: mpm.Safety, before: np.ndarray, corners: np.ndarray,
     trials.set(
         xlabel="step",
         ylabel="motion in the step (m)",
-        title=f"Factor of safety {safety.factor:.3f}: trials that come to rest (green), or fail (red)",
+        title=f"Factor of safety {safety.factor:.3f}; green: comes to rest, red: fails",
     )
+    trials.margins(x=0.12)
     quads = common.domains(after, corners, moved, cmap="viridis", linewidth=0.1)
     common.domains(after, before, facecolor="none", edgecolors="grey", linewidth=0.1, alpha=0.5)
     fig.colorbar(quads, ax=after, label="displacement (m)", shrink=0.7)

@@ -33,7 +33,6 @@ from pathlib import Path
 
 import common
 import numpy as np
-import ufl
 
 import mpm_dolfinx as mpm
 
@@ -48,17 +47,6 @@ DURATION = 600.0  # s, in which it is lost
 VISCOSITY = 0.01 * SCALE * DURATION  # Pa s
 THEORY, RUNAWAY = 3.78, 20
 CV = CONDUCTIVITY / mpm.Fluid().unit_weight * (2 + 4 / 3) * SHEAR  # m²/s
-
-
-def weight(points, v):
-    """Buoyant weight, downwards; the grains of a volume are more in a body that has shrunk."""
-    return WEIGHT / ufl.det(points.F) * points.value(v)[1] * points.dx
-
-
-def viscous(points, u, dt):
-    """Potential of the stress 2 eta D of the rate of strain D = sym grad u / dt."""
-    strain = ufl.sym(points.grad(u))
-    return VISCOSITY / dt * ufl.inner(strain, strain) * points.dx
 
 
 def bank(cells: int, length: float, room: float, friction: float, cohesion: float, conductivity: float, **scene):
@@ -101,7 +89,7 @@ class Failure:
 
 def fail(cells: int, start: float = 3.0, ratio: float = 0.99) -> Failure:
     """Lower the strength of an undrained bank without friction until its crest runs away."""
-    s, crest = bank(cells, 2 * HEIGHT, HEIGHT / 2, 0.0, SCALE / start, 0.0, terms=[weight])
+    s, crest = bank(cells, 2 * HEIGHT, HEIGHT / 2, 0.0, SCALE / start, 0.0, terms=[common.weight(WEIGHT)])
     number, settlement, rate = [start], [0.0], np.zeros(0)
     while len(rate) < 10 or rate[-1] < 2 * RUNAWAY:
         s.stage(fields={"cohesion": ratio * s.points.data["cohesion"]})
@@ -188,7 +176,16 @@ def at_toe(s: mpm.Simulation) -> float:
 def slump(cells: int, steps: int) -> Slump:
     """Let the bank lose its cohesion in so many steps, come to rest, and drain."""
     sides = [mpm.Drained("top"), mpm.Drained("right")]
-    s, _ = bank(cells, HEIGHT, 2 * HEIGHT, FRICTION, STRONG, CONDUCTIVITY, terms=[weight, viscous], drained=sides)
+    s, _ = bank(
+        cells,
+        HEIGHT,
+        2 * HEIGHT,
+        FRICTION,
+        STRONG,
+        CONDUCTIVITY,
+        terms=[common.weight(WEIGHT), common.viscous(VISCOSITY)],
+        drained=sides,
+    )
     out = Slump()
 
     def look(s: mpm.Simulation) -> None:

@@ -17,9 +17,9 @@ What the motion adds is the strain that points of a cell share in a step, most o
 the column at its drained top; the remap's own error is of second order and smaller.
 
 The overshoot, the largest p / p0 - 1 of all steps, is nothing at rest, however small the step: the scheme has
-no least time step in one dimension.  In more, small steps bring checkers of the pressure, but for the damping of
-jumps (`storage.py`): shown for a strip load on a layer in a rough box, first step, with and without.  On one
-process.
+no least time step in one dimension.  In more, small steps bring checkerboard modes of the pressure, unless its jumps
+are damped (`storage.py`): shown for a strip load on a layer in a rough box, first step, with and without damping.
+On one process.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from dataclasses import dataclass
 import common
 import numpy as np
 import terzaghi
-from coupling_iterations import Undamped
+from coupling_iterations import LAWS, roughness
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
@@ -118,15 +118,6 @@ def strip(cells: int, dt: float, law: type[mpm.Skeleton]) -> NDArray[np.float64]
     return p.reshape(grid.shape)
 
 
-def roughness(p: NDArray[np.float64]) -> float:
-    """Return rms(p - mean of the four neighbours) / max |p| over the inner cells (nx, ny)."""
-    mean = (p[:-2, 1:-1] + p[2:, 1:-1] + p[1:-1, :-2] + p[1:-1, 2:]) / 4
-    return float(np.sqrt(np.mean((p[1:-1, 1:-1] - mean) ** 2)) / np.abs(p).max())
-
-
-LAWS = {"damped": mpm.Hencky, "undamped": Undamped}
-
-
 def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return what --json prints."""
     parser = common.Parser(__doc__, __file__)
@@ -164,23 +155,24 @@ def main(argv: list[str] | None = None) -> dict:
 
 def draw(o: Namespace, runs: dict[str, list[Run]], limit: float) -> None:
     """Draw the error against the step, and the pressure over the depth of the longest and the shortest steps."""
-    fig, ((left, right),) = common.figure(1, 2, (11.5, 4.8))
+    fig, ((left, *profiles),) = common.figure(1, 3, (14, 4.6))
     dt = T_END / np.array(o.steps)
+    marks = dict(zip(runs, "ox+", strict=True))
     for name, case in runs.items():
-        left.loglog(dt, [run.error for run in case], "o-", ms=4, label=name)
+        left.loglog(dt, [run.error for run in case], f"{marks[name]}-", mfc="none", label=name)
     left.axhline(limit, color="black", lw=1, ls="--", label=f"{o.cells} cells, exact in time")
     left.set(xlabel="step / time of consolidation (-)", ylabel="rms error of p / p0 (-)")
     left.set(title=f"Error at $T_v$ = {T_END:g}")
     left.legend()
     z = np.linspace(0, 1, 201)
-    right.plot(terzaghi_pressure(z, T_END, 1.0, 1.0), z, color="black", lw=1, label="exact")
-    for k, mark in ((0, "s"), (-1, "o")):
-        for colour, (name, case) in enumerate(runs.items()):
-            label = f"{name}, {o.steps[k]} step" + "s" * (o.steps[k] > 1)
-            right.plot(case[k].p, case[k].z, mark, ms=3, mfc="none", color=f"C{colour}", label=label)
-    right.set(xlabel="pore pressure / p0 (-)", ylabel="depth / height (-)", title="Pressure of the cells", ylim=(1, 0))
-    right.legend(loc="lower left")
-    for ax in (left, right):
+    for k, ax in zip((0, -1), profiles, strict=True):
+        ax.plot(terzaghi_pressure(z, T_END, 1.0, 1.0), z, color="black", lw=1, label="exact")
+        for name, case in runs.items():
+            ax.plot(case[k].p, case[k].z, marks[name], ms=5, mfc="none", label=name)
+        title = f"Pressure of the cells, {o.steps[k]} step" + "s" * (o.steps[k] > 1)
+        ax.set(xlabel="pore pressure / p0 (-)", ylabel="depth / height (-)", title=title, ylim=(1, 0))
+        ax.legend(loc="lower left")
+    for ax in (left, *profiles):
         ax.grid(alpha=0.3)
     common.save(fig, o.out / "small_steps.png")
 
@@ -200,7 +192,7 @@ def draw_strip(o: Namespace, strips: dict[str, list[NDArray[np.float64]]]) -> No
     right.set(xlabel="step / time of consolidation (-)", ylabel="roughness (% of the largest p)", ylim=(0, None))
     right.legend()
     right.grid(alpha=0.3)
-    common.save(fig, o.out / "strip.png")
+    common.save(fig, o.out / "small_steps_strip.png")
 
 
 if __name__ == "__main__":

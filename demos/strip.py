@@ -5,8 +5,8 @@ A layer between smooth walls on a smooth, sealed base carries a dead load q on a
 it is computed, x = 0 is the plane of symmetry.  The soil is elastic (Hencky, nu = 0) with porosity 0.6 and a
 conductivity k0 10^(5 (J - 1)) that falls as pores close; grains and water are incompressible.  T = k0 E t/(gamma_w H²)
 is the reduced time; the load comes until T = 0.01.  After Carter, Small and Booker (1977), in the form of Abaqus'
-benchmark 1.14.3.  With q = E/2 (--load 0.5) the pores under the strip close at T = 0.37, which a law that knows no
-stiffness of the grains cannot bear: the package says so, and the demo shows what it has got by then.
+benchmark 1.14.3.  With q = E/2 (--load 0.5) the pores under the strip close at T = 0.37, which a law without
+stiffness of the grains cannot stand: the package says so, and the demo shows its results up to then.
 
 Checks, for q/E = 0.25, against Taylor-Hood elements extrapolated in h from 20, 40 and 80 cells and in time, which has
 moved those of 40 cells by 0.6 % at T = 0.01 and by 0.2 % at T = 0.1: `settlement`, the largest error of the middle's

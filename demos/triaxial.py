@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Triaxial tests of soil laws at a point, beside closed forms: what a law is looked at with before a scene.
+"""Triaxial tests of soil laws at a point, beside closed forms: how to look at a law before it is used.
 
 Modified Cam Clay at three overconsolidation ratios, drained and undrained from the same isotropic stress.  Undrained
 the volume is closed, so that it ends at P_cs = P_0 (R/2)^(1 - kappa/lambda), Q = M P_cs; on the way
@@ -122,16 +122,18 @@ def draw(out: Path, tests: dict[tuple[str, float], mpm.ElementTest], sands: dict
             water.plot(r.strain, r.pressure / P0, **style)
     p = np.array([0, 3.2])
     path.plot(p, CLAY.M * p, "k:", lw=0.8, label="critical state")
-    path.set(xlabel="p' / p0 (-)", ylabel="q / p0 (-)", title="Clay: stress paths, and their exact ends")
+    path.set(xlabel="p' / p0 (-)", ylabel="q / p0 (-)", title="Clay: stress paths; circles: exact ends")
     curve.set(xlabel="axial strain (-)", ylabel="q / p0 (-)", title="Clay: stress and strain", xlim=(0, 0.6))
     water.set(xlabel="axial strain (-)", ylabel="excess pore pressure / p0 (-)", title="Clay: pore pressure, undrained")
-    for strain, r in sands.items():
-        sand.plot(np.abs(r.strain), r.q / P0, label="compression" if strain > 0 else "extension")
-        sand.plot(np.abs(r.strain), -10 * r.volume_strain, ls="--", label="10 times its volume growth")
-    sand.set(xlabel="axial strain (-)", ylabel="q / p0 (-)", title="Mohr-Coulomb sand, drained")
+    for k, (strain, r) in enumerate(sands.items()):
+        name = "compression" if strain > 0 else "extension"
+        sand.plot(np.abs(r.strain), r.q / P0, color=f"C{k}", label=f"{name}: q / p0")
+        sand.plot(np.abs(r.strain), -10 * r.volume_strain, color=f"C{k}", ls="--", label=f"{name}: 10 x volume growth")
+    sand.set(xlabel="axial strain (-)", ylabel="q / p0, 10 x volume growth (-)", title="Mohr-Coulomb sand, drained")
     for ax in (path, curve, water, sand):
-        ax.legend(fontsize=8)
         ax.grid(alpha=0.3)
+    path.legend(fontsize=8)  # of all three panels
+    sand.legend(fontsize=8, loc=(0.45, 0.45))
     common.save(fig, out / "triaxial.png", dpi=90)
 
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """The method from one cut domain to a consolidating column, to be read from top to bottom.
 
-It needs FEniCSx and nothing of this package.  Each part prints what it has found, and ends in an assertion.
+You need to know FEniCSx, but nothing of this package.  Each part prints what it has found, and ends in an assertion.
 On one process.
 """
 

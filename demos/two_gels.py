@@ -2,7 +2,8 @@
 """Two gels meet: they are pressed together, slide over each other with friction, and part.
 
 Half-discs of two groups of bodies, each with displacements of its own.  The lower one is held, the upper one follows a
-path.  While they are apart nothing acts between them, however narrow the gap.
+path.  While they are apart nothing acts between them, however narrow the gap.  As the upper one passes over the top of
+the lower one, the contact inclines: the force along the path, over that up, falls below the friction coefficient.
 
 Beside it the contact of a curved and a flat elastic body: pressure and half-width after Hertz, for the force that the
 contact takes.  Both are off by what a few cells over the half-width cannot resolve.
@@ -120,15 +121,21 @@ def draw(out: Path, shown: list, t: np.ndarray, force: np.ndarray) -> None:
         domains = common.domains(ax, corners, p / 1e3, cmap="viridis", clim=(-most / 4, most))
         ax.set(aspect="equal", xlim=(0.3, 4.0), ylim=(0, 2.25), title=f"t = {when:g} s", xlabel="x (m)", ylabel="y (m)")
     fig.colorbar(domains, ax=axes[:2].ravel().tolist(), label="vertical pressure (kPa)", shrink=0.7)
-    axes[2, 0].plot(t, force[:, 1] / 1e3, label="normal to the path")
-    axes[2, 0].plot(t, force[:, 0] / 1e3, label="along the path")
+    axes[2, 0].plot(t, force[:, 1] / 1e3, label="up")
+    axes[2, 0].plot(t, force[:, 0] / 1e3, label="along")
     axes[2, 0].set(xlabel="time (s)", ylabel="force on the upper gel (kN/m)")
     with np.errstate(invalid="ignore", divide="ignore"):
-        axes[2, 1].plot(t, np.where(force[:, 1] > 0, -force[:, 0] / force[:, 1], np.nan))
-    axes[2, 1].set(xlabel="time (s)", ylabel="force along over force normal (-)")
+        axes[2, 1].plot(t, np.where(force[:, 1] > 0, -force[:, 0] / force[:, 1], np.nan), label="gels")
+    gap = np.array([(x, 2 * RADIUS + GAP + y) for x, y in map(path, t)])  # between the centres
+    rigid = np.tan(np.arctan(FRICTION) - np.arctan2(*gap.T))
+    axes[2, 1].plot(
+        t, np.where((t > TIMES[0]) & (force[:, 1] > 0), rigid, np.nan), "k--", label="rigid gels that slide"
+    )
+    axes[2, 1].set(xlabel="time (s)", ylabel="force along / force up (-)")
+    axes[2, 1].set_title(f"friction {FRICTION} on a contact that inclines more and more", fontsize=10)
     for ax in axes[2]:
         ax.grid(alpha=0.3)
-    axes[2, 0].legend(fontsize=8)
+        ax.legend(fontsize=8)
     common.save(fig, out / "two_gels.png", dpi=90)
 
 

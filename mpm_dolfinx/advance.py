@@ -32,14 +32,14 @@ from mpm_dolfinx.problems.quadrature_data import QuadratureData
 from mpm_dolfinx.problems.storage import StorageForms
 from mpm_dolfinx.state import State, Stay
 
-PAID, PAID_OF_BODY = 0.1, 10
-"""Shares of what points are owed that the next step takes in, over the cells that a corner has moved since the cut.
+TAKES_IN, TAKES_IN_OF_BODY = 0.1, 10
+"""Rates at which steps take in the difference `owed` of content and fluid, per cell that a corner has moved.
 
-The second is that of the mean over a body, whose volume is so kept, where nothing drains or feeds any; the first that
-of all else.  With 0, 0.1, 0.2 and 0.4 for the first, twenty undrained cycles of a beam of 5 cells leave 7.7, 3.8, 3.7
+The second is that of its mean over a body that nothing drains or feeds, whose volume it keeps; the first that of the
+rest.  With 0, 0.1, 0.2 and 0.4 for the first, twenty undrained cycles of a beam of 5 cells leave 7.7, 3.8, 3.7
 and 3.6 % of the stress; from 0.2 on pressures of a manufactured solution converge with less than order 1.75.  Where
-hardly anything moves nothing is paid, so the orders in time are those of the method.  Steps of bodies that drain must
-not be paid by the second: it made a column under a gravity of time converge with order 1.2 in the step.
+hardly anything moves nothing is taken in, so the orders in time are those of the method.  For bodies that drain the
+second would be wrong: it made a column under a gravity of time converge with order 1.2 in the step.
 """
 
 
@@ -206,7 +206,7 @@ class Motion:
         if serves:
             return {"owed": owed, "due": np.zeros(len(points))}
         far = float((np.abs(points.corners - cut.points.corners) / cut.grid.h).max(initial=0.0))
-        part, whole = -np.expm1(np.multiply([-PAID, -PAID_OF_BODY], over_all(cut.grid.comm, far, MPI.MAX)))
+        part, whole = -np.expm1(np.multiply([-TAKES_IN, -TAKES_IN_OF_BODY], over_all(cut.grid.comm, far, MPI.MAX)))
         sealed = not (state.stage.hydraulic.outlets or forms.sources)
         return {"owed": owed, "due": part * owed + (whole - part) * self._means(points, owed, ~none) * sealed}
 

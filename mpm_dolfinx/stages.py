@@ -26,7 +26,6 @@ from mpm_dolfinx.scene import Scene
 from mpm_dolfinx.state import State
 from mpm_dolfinx.validation import chosen, flag, line, numbers
 
-
 WEIGHS = 5e-3  # share by which the unit weights of water outside and in the pores may differ without a warning
 
 

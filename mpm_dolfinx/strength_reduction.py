@@ -76,8 +76,8 @@ class Safety:
 def factor_of_safety(simulation: Simulation, *, dt: float | None = None, rtol: float = 0.01, steps: int = 20) -> Safety:
     """Return by what the strength of soil may be divided before bodies at rest begin to slide.
 
-    The simulation stays what it is.  On several processes all call it together.  Suction is in the effective stress, and
-    so counts as strength.
+    The simulation stays what it is.  On several processes all call it together.  Suction is in the effective stress,
+    and so counts as strength.
 
     Parameters
     ----------

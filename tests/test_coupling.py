@@ -135,7 +135,9 @@ def test_the_filter_takes_at_most_what_the_fixed_stress_operator_has():
 
 def test_the_undrained_pressure_has_no_checkers():
     rough = {
-        (h, name): demo.roughness(demo.undrained(h, law)[0]) for h in (0.06, 0.03) for name, law in demo.LAWS.items()
+        (h, name): demo.roughness(demo.cells(demo.undrained(h, law)[0]))
+        for h in (0.06, 0.03)
+        for name, law in demo.LAWS.items()
     }
     for h in (0.06, 0.03):
         assert rough[h, "damped"] < 0.5 * rough[h, "undamped"]

@@ -2,6 +2,7 @@
 """A body that comes back is the body that left: cycles, turns, and what moves the domains' corners."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import cycles
 import numpy as np
@@ -154,7 +155,7 @@ def test_a_stretched_block_after_ten_turns_is_that_after_one():
     for end, dt in ((2, 0.2), (3, 1 / 72), (12, 1 / 72)):
         cuts += s.run(float(end), dt, progress=False).cuts
         stress.append(s.effective_stress())
-    one, ten = (np.abs(after - before).max() / 1e7 for before, after in zip(stress, stress[1:], strict=False))
+    one, ten = (np.abs(after - before).max() / 1e7 for before, after in pairwise(stress))
     print(f"one turn {one:.0e} E, nine more {ten:.0e} E, {cuts} cut steps")
     assert one < 5e-5 and ten < 3e-7 and cuts == 0
 

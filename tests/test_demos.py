@@ -22,10 +22,10 @@ QUICK = {
     ),
     "terzaghi": ("--cells 10 --steps 20", ["terzaghi.png"]),
     "self_weight_column": ("--cells 16", ["self_weight_column.png"]),
-    "error_vs_runtime": ("--quick --cases column", ["column.png", "runs.csv", "comparison.md"]),
+    "error_vs_runtime": ("--quick --cases column", ["error_vs_runtime_column.png", "runs.csv", "comparison.md"]),
     "mandel": ("--cells 8 --steps 5", ["mandel.png"]),
     "coupling_iterations": ("--quick --h 0.06", ["iterations.png", "iterations.csv", "iterations.md", "roughness.md"]),
-    "small_steps": ("--cells 10 --steps 1 10 40 --strip-cells 10", ["small_steps.png", "strip.png"]),
+    "small_steps": ("--cells 10 --steps 1 10 40 --strip-cells 10", ["small_steps.png", "small_steps_strip.png"]),
     "cantilever_3d": ("--cells 2 --steps 2 4", ["cantilever_3d.png"]),
     "image": ("--pixels 12", ["image.png"]),
     "strip": ("--cells 8 --steps 4", ["strip.png"]),
@@ -65,6 +65,11 @@ def run(demo, arguments):
 
 def test_every_demo_is_run():
     assert {p.stem for p in (ROOT / "demos").glob("*.py")} == {*QUICK, "tutorial", "tables", "common"}
+
+
+def test_pictures_of_the_pages_are_those_of_one_demo():
+    drawn = [file for _, files in QUICK.values() for file in files if file.endswith(("png", "gif"))]
+    assert len(drawn) == len({*drawn})
 
 
 def test_the_tutorial_s_assertions_hold(tmp_path):

@@ -255,6 +255,13 @@ def test_a_demo_runs_on_two_processes_also_as_root(tmp_path):
     assert (tmp_path / "pressure.png").exists()
 
 
+def test_help_lists_the_demos_with_a_line_each():
+    listed = [line.split(maxsplit=1) for line in script(ROOT / "demos" / "run.sh", "--help")["stdout"].splitlines()]
+    for demo in (ROOT / "demos").glob("*.py"):
+        title = demo.read_text().splitlines()[1].strip('"')
+        assert ([demo.stem, title] in listed) is (demo.stem != "common"), demo
+
+
 @pytest.mark.parametrize("processes", ["0", "two", ""])
 def test_a_number_of_processes_that_is_none_is_refused(processes):
     end = script(ROOT / "demos" / "run.sh", "-n", processes)

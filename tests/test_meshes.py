@@ -400,13 +400,13 @@ def test_a_polygon_has_the_names_of_its_edges_and_lies_on_others():
     size = np.sqrt(volumes(slope.corners()) / GRID.cell_volume)
     assert 0.38 < size.mean() < 0.6, "two points a cell and direction"
 
+
 def test_a_polygon_in_national_coordinates_is_filled():
     """gmsh ended the process."""
     pytest.importorskip("gmsh")
     origin = np.array([512000.0, 5.4e6])
-    body = mpm.polygon(
-        mpm.Grid(origin + [6, 3], [24, 12], lower=origin), origin + [(0, 0), (5, 0), (3, 2), (1, 2)], ["base"] * 4
-    )
+    grid = mpm.Grid(np.add(origin, [6, 3]), [24, 12], lower=origin)
+    body = mpm.polygon(grid, np.add(origin, [(0, 0), (5, 0), (3, 2), (1, 2)]), ["base"] * 4)
     assert np.abs(volumes(body.corners())).sum() == pytest.approx(7.0, rel=1e-8)
 
 

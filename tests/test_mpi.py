@@ -13,7 +13,7 @@ from mpm_dolfinx.parallel.partition import owners
 
 
 def mpirun(processes: int, script: str, *arguments: str) -> None:
-    """Run a script of this folder by mpirun; a failing rank aborts all. The limit is one of hanging, not of slowness."""
+    """Run a script of this folder by mpirun; a failing rank aborts all. The limit is one of hanging."""
     here = Path(__file__).parent
     environment = dict(os.environ)  # given whole: mpirun must not see the MPI variables of this process
     environment["PYTHONPATH"] = os.pathsep.join([str(here), str(here.parent), environment.get("PYTHONPATH", "")])

@@ -88,7 +88,7 @@ def test_a_body_of_one_cell_has_its_pressure():
 
 @pytest.mark.parametrize("tilt", [-1e-6, 0.0, 1e-6])
 def test_a_drained_side_that_leans_a_little_leaves_the_slope_along_it(tilt):
-    """Rounding decided: leaning over a sealed base it counted as a drained one, and water at rest had lost its slope."""
+    """Rounding decided: leaning over a sealed base it counted as drained, and water at rest had lost its slope."""
     grid = mpm.Grid([1.2, 1.0], [6, 5])
     body = mpm.box(grid, [0.2, 0], [1.0, 0.8])
     body = mpm.mapped(grid, body, lambda X: X + tilt * X[:, [1]] * [1, 0])

@@ -73,7 +73,6 @@ def test_water_that_falls_leaves_a_seepage_face():
     assert (p[middle] < full[middle]).all() and (p[middle] > WEIGHT * (0.25 - y[middle])).all()
 
 
-
 def test_water_that_is_not_as_heavy_as_the_pores_is_named(caplog):
     """Sea water in the pores, fresh water on the sides: it sank into the soil, without a word."""
     grid = mpm.Grid([0.5, 2.0], [2, 8])
