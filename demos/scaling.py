@@ -66,8 +66,9 @@ def scene(dim: int, points: float) -> tuple[mpm.Simulation, float]:
         h = np.sqrt(4 * beam.LENGTH * beam.HEIGHT / points)
         return beam.scene(beam.arguments(["--h", str(h), "--ramp", "0.6"]))[0], 0.02
     n = max(2, round((points / 8) ** (1 / 3)))
-    grid = mpm.Grid([1 + 3 / n] * 3, [n + 3] * 3)
-    lower = np.array([1.5, 1.5, 0]) / n
+    margin = 1.5 + n // 8  # cells: the cube leans by a tenth of its width
+    grid = mpm.Grid([1 + 2 * margin / n] * 3, [n + round(2 * margin)] * 3)
+    lower = np.array([margin, margin, 0]) / n
     load = mpm.Traction("top", lambda t: (2e4 * t, 1e4 * t, -5e4 * t))
     simulation = mpm.Simulation(
         grid,

@@ -54,6 +54,29 @@ def test_the_drained_limit_load_of_stiff_soil_tends_to_prandtls():
     assert fine[-1] / fine[30] < 1.003 < coarse[-1] / coarse[30] < 1.006  # what goes on rising is the error of the grid
 
 
+def published(friction, dilation):
+    """Return N_c of soil that dilates by less than it has friction (degrees): Loukidis and Salgado (2009)."""
+    phi, psi = np.radians([friction, dilation])
+    share = 1 - np.tan(phi) * np.tan(0.8 * (phi - psi)) ** 2.5
+    passive = (1 + np.sin(phi)) / (1 - np.sin(phi))
+    return (passive * np.exp(share * np.pi * np.tan(phi)) - 1) / np.tan(phi)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("dilation", "cells", "error"), [(0.0, 9, 0.04), (0.0, 17, 0.015), (20.0, 9, 0.015), (30.0, 9, 0.04)]
+)
+def test_a_footing_on_mohr_coulomb_soil_carries_what_was_published(dilation, cells, error):
+    """The highest load counts: where soil does not dilate, shear bands let it fall afterwards."""
+    elastic = {"bulk": footing.STIFF * footing.SOIL.bulk, "shear": footing.STIFF * footing.SHEAR}
+    soil = mpm.MohrCoulomb(**elastic, friction=30.0, dilation=dilation, cohesion=footing.COHESION)
+    run = footing.push(soil, cells, 0.006, None, box=(4.0, 2.0), steps=40)
+    found, known = max(run.load), published(30.0, dilation)
+    print(f"psi = {dilation:g}, {cells} cells: q/c {found:.2f}, published {known:.2f}, {run.total('cuts')} cut steps")
+    assert found == pytest.approx(known, rel=error)
+    assert run.total("cuts") <= 2
+
+
 @pytest.mark.slow
 def test_a_footing_is_pushed_in_as_deep_as_it_is_wide():
     """With the held faces of folded domains put elsewhere no step was small enough at 0.86 of the way."""
