@@ -8,8 +8,8 @@ set -euo pipefail
 
 # The names of the demos, and the first line of what each says of itself.
 demos() {
-    (cd "$root/demos" && awk 'FNR == 2 { print "    " FILENAME "\t" $0 }' *.py) |
-        sed 's/\.py\t"""/\t/; s/"""$//; /^ *common\t/d' | expand -t 24
+    (cd "$root/demos" && awk 'FNR == 2 && FILENAME != "common.py" {
+        sub(/\.py$/, "", FILENAME); gsub(/"""/, ""); printf "    %-20s%s\n", FILENAME, $0 }' *.py)
 }
 
 case ${1-} in

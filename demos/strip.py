@@ -17,7 +17,6 @@ On one process.
 
 from __future__ import annotations
 
-import sys
 from argparse import Namespace
 from dataclasses import dataclass, field
 
@@ -182,4 +181,4 @@ def draw(o: Namespace, out: Outcome) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(0 if main()["converged"] else 1)
+    raise SystemExit(0 if main()["converged"] else 1)

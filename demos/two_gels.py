@@ -11,7 +11,6 @@ contact takes.  Both are off by what a few cells over the half-width cannot reso
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import common
@@ -140,4 +139,4 @@ def draw(out: Path, shown: list, t: np.ndarray, force: np.ndarray) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(0 if main()["converged"] else 1)
+    raise SystemExit(0 if main()["converged"] else 1)
