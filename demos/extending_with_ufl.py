@@ -8,7 +8,7 @@ return in numpy.  What a function takes is read from the names of its arguments;
 `constitutive/user_functions.py` of the package list them.
 
 Error: the largest difference from the exact solution, over its largest value.  With 20 cells: 8e-4 and 6e-4 for
-energy and fibres, whose layers are stretched in the one step that they take; 2e-3 for both conductivities, 6e-4 for
+energy and fibres, whose layers are stretched in the one step that they take; 3e-3 for both conductivities, 6e-4 for
 the foundation and 5e-4 for the source, which fall with the cell size; 1e-5 for the damage, whose top gives way a
 little; 1e-11 for plastic flow, the equation and the return.
 """

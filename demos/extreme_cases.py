@@ -171,7 +171,9 @@ def summary(rows: list[Row]) -> str:
         if mine := [r for r in rows if r.family == name]:
             count = Counter(r.outcome for r in mine)
             figures = [worst(mine, n) for n in names]
-            lines.append([name, f.cases.__doc__.rstrip("."), f.bound, *(count[n] for n in OUTCOMES), *figures])
+            lines.append(
+                [name, f.cases.__doc__.splitlines()[0].rstrip("."), f.bound, *(count[n] for n in OUTCOMES), *figures]
+            )
     return table(["family", "what, and its reference", "bound", *OUTCOMES, *(f"worst {n}" for n in names)], lines)
 
 

@@ -10,7 +10,7 @@ stiff.  On one process.
 
 Errors: `stress`, the mean over the points, weighted with their volumes, of |sigma - exact(Y)| / (rho0 g l0),
 and the relative error of the column's `height`.  Published for GIMP: 3.7e-3 with 16 cells over the
-initial height, 4.4e-4 with 64; here 2.8e-3 and 3.9e-4.  `--quadrature point` integrates at the points
+initial height, 4.4e-4 with 64; here 9.8e-4 and 1.3e-4.  `--quadrature point` integrates at the points
 instead of over the pieces of their domains: its error stays at some 8 % whatever the cells.
 """
 

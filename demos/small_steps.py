@@ -2,11 +2,11 @@
 """Time steps as small as one likes: what is left is the error of the cells, at rest and on the move.
 
 Terzaghi's column (demo `terzaghi`) is taken to T_v = c_v t / height² = 0.1 in 1, 10, ..., 10 000 equal steps,
-0.1 to 1e-5 of the time of consolidation.  Error: the root mean square over the column of p - exact, over p0, a
-cell's pressure compared at its centroid.  Backward Euler's part falls with the step; what is left must be the
-error of the cells alone, found by an exact solution in time of their ordinary differential equations, and stay
-there however many steps are taken: a pressure that is averaged to points and back in every step would go on
-diffusing.  Three columns:
+0.1 to 1e-5 of the time of consolidation.  Error: the root mean square over the column of p - exact, over p0, a cell's
+pressure compared at its centroid.  The part of the time integration falls with the step; what is left must be the
+error of the cells alone, found by an exact solution in time of their ordinary differential equations, and stay there
+however many steps are taken: a pressure that is averaged to points and back in every step would go on diffusing.
+Three columns:
 
 * resting on the grid;
 * moving: its foot is carried down by half the height meanwhile, through half of all cells;

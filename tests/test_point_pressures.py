@@ -6,7 +6,7 @@ import pytest
 from helpers import SOFT, beam, column
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.points.pressure_transport import Reconstruction
+from mpm_dolfinx.points.pressure_transport import CellPressures, Reconstruction
 
 RANDOM = np.random.default_rng(3)
 
@@ -50,7 +50,7 @@ def test_a_linear_pressure_aslant_is_exact_also_at_sealed_sides(shape, filled):
     slot = np.repeat(np.arange(n), each)
     x = centroid[slot] + 0.3 * grid.h * RANDOM.uniform(-1, 1, (len(slot), grid.dim))
     p = (grid.midpoints + centroid) @ slope
-    found = reconstruction.up_to_surface(np.arange(n), p, centroid, faces, outer(grid), x, slot)
+    found = reconstruction.up_to_surface(CellPressures(np.arange(n), p, centroid, faces, outer(grid)), x, slot)
     assert found == pytest.approx((grid.midpoints[slot] + x) @ slope, abs=1e-13)
 
 
@@ -61,7 +61,7 @@ def test_a_steep_pressure_is_not_carried_on_beyond_the_last_cell():
     p = np.empty(8)
     p[order] = 10.0 ** np.arange(8)
     x = np.tile([0.0, -0.5 * grid.h[1]], (8, 1))
-    found = reconstruction.up_to_surface(np.arange(8), p, centroid, faces, outer(grid), x, np.arange(8))
+    found = reconstruction.up_to_surface(CellPressures(np.arange(8), p, centroid, faces, outer(grid)), x, np.arange(8))
     assert (found > 0).all()
 
 

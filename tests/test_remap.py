@@ -11,7 +11,7 @@ import mpm_dolfinx as mpm
 from mpm_dolfinx import step
 from mpm_dolfinx.points.bodies import material_points
 from mpm_dolfinx.points.cutting import cut
-from mpm_dolfinx.points.pressure_transport import PiecePressures, Reconstruction, transport
+from mpm_dolfinx.points.pressure_transport import CellPressures, PiecePressures, Reconstruction, transport
 
 MOVES = [0.01, 0.3, 2.6]
 
@@ -108,7 +108,7 @@ def reconstruct(p, filled=None):
         faces[~filled(grid.midpoints)] = 0.0
     nowhere, cells = np.zeros((grid.num_local, 2)), np.arange(grid.num_owned)
     sealed = np.full((grid.num_owned, 2, 2, 2), np.nan)
-    slope, bounds = Reconstruction(grid)(cells, p(grid.midpoints), nowhere, faces, sealed, nowhere)
+    slope, bounds = Reconstruction(grid)(CellPressures(cells, p(grid.midpoints), nowhere, faces, sealed), nowhere)
     return grid.midpoints, slope, bounds
 
 

@@ -12,7 +12,7 @@ from strategies import numbers, orders, repeatable, turned
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.points.cutting import Pieces, cut
-from mpm_dolfinx.points.pressure_transport import PiecePressures, Reconstruction, transport
+from mpm_dolfinx.points.pressure_transport import CellPressures, PiecePressures, Reconstruction, transport
 
 # ---- random motions --------------------------------------------------------------------------------
 
@@ -202,7 +202,9 @@ class Cells:
         h, cells = self.grid.h, np.arange(self.grid.num_owned)
         p = self.p if p is None else p
         sealed = np.full((len(cells), len(h), 2, 2), np.nan)
-        slope, bounds = self.reconstruction(cells, p, self.centroid * h, self.faces, sealed, self.origin * h)
+        slope, bounds = self.reconstruction(
+            CellPressures(cells, p, self.centroid * h, self.faces, sealed), self.origin * h
+        )
         return slope * h, bounds
 
     @property

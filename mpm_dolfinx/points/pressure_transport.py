@@ -18,6 +18,7 @@ What is told of the points, and taken along by none, is reconstructed up to seal
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import numpy as np
 from dolfinx import fem
@@ -77,6 +78,21 @@ def at_start(points: MaterialPoints) -> PiecePressures:
     return PiecePressures(points.id, cell, np.ones(n), p, points.x, slope, bounds)
 
 
+class CellPressures(NamedTuple):
+    """What slopes in owned cells are drawn from.
+
+    cells : (n,) owned cells; of all local cells: p : (c,), Pa; centroid : (c, d), m, relative to the midpoints; faces :
+    (c, d, 2) open shares, zero for empty cells; outer : (n, d, 2, 2) by axis and end, difference to the pressure on
+    drained sides ahead, Pa, and slope to them, Pa/m, nan where there is none.
+    """
+
+    cells: NDArray[np.int64]
+    p: NDArray[np.float64]
+    centroid: NDArray[np.float64]
+    faces: NDArray[np.float64]
+    outer: NDArray[np.float64]
+
+
 class Reconstruction:
     """Limited slopes of cellwise values on the owned cells of a grid.
 
@@ -92,28 +108,11 @@ class Reconstruction:
         self._neighbour = grid.beside(np.arange(grid.num_owned))
 
     def __call__(
-        self,
-        cells: NDArray[np.int64],
-        p: NDArray[np.float64],
-        centroid: NDArray[np.float64],
-        faces: NDArray[np.float64],
-        outer: NDArray[np.float64],
-        origin: NDArray[np.float64],
+        self, seen: CellPressures, origin: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return slopes (n, d) and bounds (n, 2) in owned cells (n,).
-
-        Parameters
-        ----------
-        p, centroid, faces
-            Of all local cells: values (c,), centroids (c, d) relative to the midpoints, m, open shares (c, d, 2)
-            of the faces, zero for empty cells.
-        outer : (n, d, 2, 2)
-            By axis and end: difference to the pressure on drained sides ahead, Pa, and slope to them, Pa/m; nan where
-            there is none.
-        origin : (n, d), m
-            Places relative to the midpoints, from which the slopes are drawn.
-        """
-        jump, one_sided, _, drained = self._differences(cells, p, centroid, faces, outer)
+        """Return slopes (n, d) and bounds (n, 2), drawn from places (n, d), m, relative to the cells' midpoints."""
+        cells, p, centroid, *_ = seen
+        jump, one_sided, _, drained = self._differences(seen)
         slope, low, high = van_leer(one_sided), *_spread(jump)
         whole = self.grid.h[:, None] * [-0.5, 0.5]
         filled = (2 * centroid[cells][:, :, None] - whole[:, ::-1]).clip(whole[:, :1], whole[:, 1:])
@@ -123,11 +122,12 @@ class Reconstruction:
             scale = np.minimum(scale, np.divide(room, reach, out=np.ones(len(cells)), where=reach != 0))
         return slope * scale[:, None], p[cells, None] + np.stack([low, high], axis=1)
 
-    def _differences(self, cells, p, centroid, faces, outer) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+    def _differences(self, seen: CellPressures) -> tuple[NDArray, NDArray, NDArray, NDArray]:
         """Return differences and slopes to neighbours and drained sides, and where there is the one or the other.
 
         All (n, d, 2), by axis and end, zero where there is neither.
         """
+        cells, p, centroid, faces, outer = seen
         h, there, here = self.grid.h, self._neighbour[cells], p[cells]
         jump, one_sided = np.zeros(there.shape), np.zeros(there.shape)
         is_open = np.zeros(there.shape, dtype=bool)
@@ -145,14 +145,7 @@ class Reconstruction:
         return jump, one_sided, is_open, drained
 
     def up_to_surface(
-        self,
-        cells: NDArray[np.int64],
-        p: NDArray[np.float64],
-        centroid: NDArray[np.float64],
-        faces: NDArray[np.float64],
-        outer: NDArray[np.float64],
-        x: NDArray[np.float64],
-        slot: NDArray[np.int64],
+        self, seen: CellPressures, x: NDArray[np.float64], slot: NDArray[np.int64]
     ) -> NDArray[np.float64]:
         """Return pressures (m,), Pa, at places in owned cells (n,), also of second order in cells at the surface.
 
@@ -162,14 +155,13 @@ class Reconstruction:
 
         Parameters
         ----------
-        p, centroid, faces, outer
-            As for slopes.
         x : (m, d), m
             Places, relative to the cells' midpoints.
         slot : (m,)
-            Place of each one's cell among `cells`.
+            Place of each one's cell among the owned ones.
         """
-        jump, one_sided, is_open, drained = self._differences(cells, p, centroid, faces, outer)
+        cells, p, centroid, *_ = seen
+        jump, one_sided, is_open, drained = self._differences(seen)
         slope = van_leer(one_sided)
         at, axis = np.nonzero(is_open.any(axis=2) & ~(is_open | drained).all(axis=2))
         end = is_open[at, axis, 1].astype(int)

@@ -17,7 +17,7 @@ from mpm_dolfinx.constitutive.fields import SceneMaterials
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.cut_domains import CutDomains
 from mpm_dolfinx.points.grid import sum_by
-from mpm_dolfinx.points.pressure_transport import Reconstruction, share_within, transport
+from mpm_dolfinx.points.pressure_transport import CellPressures, Reconstruction, share_within, transport
 from mpm_dolfinx.problems.aslant import Gradients, off_facets
 from mpm_dolfinx.problems.fluxes import CellContents, CellMotion, Conduction, Mobility, OpenSides, PieceContents
 from mpm_dolfinx.problems.ghost_penalty import stiffness
@@ -156,7 +156,7 @@ class OnGrid(Keyed):
         weight = np.where(contents.total(cells, store)[at] > 0, store, self.weight)
         total = contents.total(cells, weight)
         origin = np.stack([contents.total(cells, weight * x) / total for x in offset.T], axis=1)
-        slope, bounds = reconstruction(*self._held(p, stage, t), origin)
+        slope, bounds = reconstruction(self._cell_pressures(p, stage, t), origin)
         rise, here = np.einsum("md,md->m", slope[at], offset - origin[at]), p[contents.filled]
         share = share_within(rise, *(bounds.T - here), at)  # drained sides may be aslant in their cells
         slope, pressure = slope * share[:, None], p[cells] + share[at] * rise
@@ -178,15 +178,15 @@ class OnGrid(Keyed):
 
         t, s: time at which drained sides have their pressures.
         """
-        places, held = self._places.pieces, self._held(self._storage.p.x.array, stage, t)
-        return self.cut.to_pieces(reconstruction.up_to_surface(*held, places.offset, places.slots))
+        places, seen = self._places.pieces, self._cell_pressures(self._storage.p.x.array, stage, t)
+        return self.cut.to_pieces(reconstruction.up_to_surface(seen, places.offset, places.slots))
 
-    def _held(self, p: NDArray[np.float64], stage: Stage, t: float) -> tuple:
+    def _cell_pressures(self, p: NDArray[np.float64], stage: Stage, t: float) -> CellPressures:
         """Return what slopes of cells with these pressures are drawn from."""
         contents = self.contents
         sides = stage.hydraulic.data(self.cut, self.cut.points, contents, t)
         outer = sides.ahead(contents.slot(sides.cells), p[contents.filled])
-        return contents.filled, p, contents.centroid, contents.open, outer
+        return CellPressures(contents.filled, p, contents.centroid, contents.open, outer)
 
     def mobility(self, data: QuadratureData, begins: bool) -> Mobility:
         """Return the mobility of the filled owned cells at u; begins: refuse for good what is none."""
