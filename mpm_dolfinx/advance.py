@@ -189,16 +189,19 @@ class Motion:
         """Return what is owed to the points after a step (n,), over their volumes at rest, and what of it is due.
 
         That is by how much their content, by their volumes and the cells' pressures, has grown beyond the fluid that
-        came.  Soil that has yielded, whose volumes are those of the cells, and pores that drain are owed nothing; while
-        the cut serves nothing is due.
+        came: masses, over the density at zero pressure.  Soil that has yielded, whose volumes are those of the cells,
+        and pores that drain are owed nothing; while the cut serves nothing is due.
         """
         before, cut, materials, forms = state.points, on_grid.cut, self._materials, self._storage
         here = cut.pieces_to_cells(cut.pieces.fraction * (before.volume0 * before.J)[cut.pieces.point])
         volume = sum_by(cut.cells, here, len(came))[cut.cells]
-        at_pieces = (forms.p.x.array - forms.p_n.x.array)[cut.cells], came[cut.cells] / volume
-        dp, came_here = (cut.mean(cut.to_pieces(values)) for values in at_pieces)
+        p, p_n = (f.x.array[cut.cells] for f in (forms.p, forms.p_n))
+        density = np.exp((p + p_n) / (2 * forms.bulk))
+        dp, density, came_here = map(cut.to_pieces, (p - p_n, density, density * came[cut.cells] / volume))
         alpha, at_one = materials.table(points, lambda m: m.biot), materials.storage_at_one(points)
-        grown = change_at_points(alpha, at_one, materials.storage(before), points.J / before.J, dp) - came_here
+        rows = (alpha, at_one, materials.storage(before), points.J / before.J)
+        rows = (values[cut.pieces.point] for values in rows)
+        grown = cut.mean(density * change_at_points(*rows, dp) - came_here)
         none = materials.evolved(points)
         if materials.drains:  # what drains from pores is no part of this content
             none |= materials.retention(points)[:, 0] > 0

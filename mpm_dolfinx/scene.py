@@ -99,7 +99,7 @@ class Scene:
                 ConductivityAtPieces(scene.materials, laws, pieces, u, fem.Function(grid.cellwise())) if laws else None
             )
             kind = (symmetric, scene.conducts, scene.evolves)
-            self.storage = StorageForms(pieces, u, p, weight, *kind, law, sources, self.t)
+            self.storage = StorageForms(pieces, u, p, fluid.bulk, weight, *kind, law, sources, self.t)
         self.extensions = terms, sources
         """The user's terms and sources."""
         self.method = method

@@ -178,7 +178,7 @@ class Simulation:
     def outflows(self) -> NDArray[np.float64]:
         """(drained sides, then inflows): what leaves the bodies through each, m^3/s (m^2/s in plane strain).
 
-        At the end of the last step; nan where none has been taken since a stage set them.
+        Volumes at zero pressure, at the end of the last step; nan where none has been taken since a stage set them.
         """
         return self.state.outflows
 

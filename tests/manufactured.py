@@ -69,13 +69,13 @@ def body_force(points, v, t):
 
 
 def source(points, q, t):
-    """Return the rate of the content and the divergence of the flow."""
+    """Return the rate of the mass of the water and the divergence of its flow, over the density at zero pressure."""
     X, t, F, p = _at(points, t)
     J = ufl.det(F)
-    stored = (J - 1 + SOIL.porosity) / WATER.bulk
+    density = ufl.exp(p / WATER.bulk)
     kappa = SOIL.conductivity_law(SOIL.conductivity, J) / WATER.unit_weight
-    flow = -kappa * J * ufl.inv(F) * ufl.inv(F).T * ufl.diff(p, X)
-    rate = ufl.diff(J, t) + stored * ufl.diff(p, t) + _divergence(flow, X)
+    flow = -density * kappa * J * ufl.inv(F) * ufl.inv(F).T * ufl.diff(p, X)
+    rate = ufl.diff(density * (J - 1 + SOIL.porosity), t) + _divergence(flow, X)
     return rate * q / ufl.det(points.F) * points.dx
 
 

@@ -69,8 +69,8 @@ def test_the_fluid_stored_in_all_cells_is_kept_without_new_extremes(way):
 
 
 def stored(on_grid, p):
-    """Return sum w S |p| with the sign of p: the volume of fluid that the pressure stores."""
-    return (on_grid.weight * on_grid.data.pieces["storage"][:, 0]) @ p[on_grid.cut.cells]
+    """Return sum w S K (exp(p / K) - 1): the mass of fluid that the pressure stores, as a volume at zero pressure."""
+    return (on_grid.weight * on_grid.data.pieces["storage"][:, 0]) @ (1e6 * np.expm1(p[on_grid.cut.cells] / 1e6))
 
 
 @pytest.mark.parametrize("move", MOVES)

@@ -8,6 +8,9 @@ S = n / K_w + (alpha - n) / K_s makes S J = a J + b linear in J, with a = S(n = 
 
 a mass, of a fluid of the density rho that fills J + b / a.  Divided by rho halfway between start and end, its change
 is of second order for any path, and nothing where no fluid flows, however long the step.
+
+Fluid that leaves a cell enters its neighbour with its mass.  The flow of mass, of fluid of the density rho_w
+exp(p / K_w), is -rho_w kappa grad pi with pi = K_w (exp(p / K_w) - 1) (Kirchhoff's transformation).
 """
 
 from __future__ import annotations
@@ -41,6 +44,24 @@ def change_at_points(alpha, a, storage, J, dp) -> NDArray[np.float64]:
     small = np.abs(z) < 1e-3
     away = np.where(small, 1.0, z)
     return _change(alpha, a, storage, J, dp, np.cosh(z), np.where(small, 1 + z**2 / 6, np.sinh(away) / away))
+
+
+def mass_potential(p, bulk: float):
+    """Return pi, Pa, whose gradient drives the flow of mass, of pressures p (n,), Pa; bulk: K_w, Pa."""
+    return p if np.isinf(bulk) else bulk * np.expm1(p / bulk)
+
+
+def pressure_of(pi, bulk: float):
+    """Return the pressures (n,), Pa, of mass potentials (n,), Pa."""
+    return pi if np.isinf(bulk) else bulk * np.log1p(pi / bulk)
+
+
+def mass_potential_form(p, compliance):
+    """Return the same as UFL; compliance: 1 / K_w, 1/Pa."""
+    z = compliance * p / 2
+    small = ufl.lt(abs(z), 1e-3)
+    away = ufl.conditional(small, 1.0, z)
+    return p * ufl.exp(z) * ufl.conditional(small, 1 + z**2 / 6, ufl.sinh(away) / away)
 
 
 def _change(alpha, a, storage, J, dp, cosh, sinhc):

@@ -460,7 +460,8 @@ class Fluid:
     bulk
         Bulk modulus K_w, Pa, > 0; infinite for an incompressible fluid.
     density
-        Density rho_w, kg/m^3, > 0.
+        Density rho_w at zero pressure, kg/m^3, > 0, by which its weight counts; that of flowing mass is
+        rho_w exp(p / K_w).
 
     Raises
     ------

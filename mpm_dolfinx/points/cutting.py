@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields
+from functools import cache
 from itertools import combinations, permutations
 
 import numpy as np
@@ -239,15 +240,21 @@ def _sum(
 
     # integrals over the slices of (x, x^2/2, xy, xz) n_x from the cell's lower face, and of the columns beyond
     x = s - index
+
+    @cache
+    def pair(a: int, b: int) -> NDArray[np.float64]:
+        """Return the sums of products of two coordinates over the vertices of the slices."""
+        return (x[:, a] * x[:, b]).sum(axis=0)
+
     sums, products = x.sum(axis=0), area[0] / (d * (d + 1))
     shadow = total(area[0])
     beyond = slots.beyond(shadow, 0)
     volume = total(area[0] * sums[0] / d) + beyond
-    moments = [total(products / 2 * (sums[0] ** 2 + (x[:, 0] ** 2).sum(axis=0))) + beyond / 2]
+    moments = [total(products / 2 * (sums[0] ** 2 + pair(0, 0))) + beyond / 2]
     for a in range(1, d):
-        within = total(products * (sums[0] * sums[a] + (x[:, 0] * x[:, a]).sum(axis=0)))
+        within = total(products * (sums[0] * sums[a] + pair(0, a)))
         moments.append(within + slots.beyond(total(area[0] * sums[a] / d), 0))
-    uneven = _mean_products(x, sums, area[0], total, slots) if d == 3 else []
+    uneven = _mean_products(x, sums, area[0], pair, total, slots) if d == 3 else []
 
     whole = sum_by(slots.point, volume, len(slots.low[0]))[slots.point]
     kept = np.flatnonzero(volume / whole > SLIVER)
@@ -307,6 +314,7 @@ def _mean_products(
     x: NDArray[np.float64],
     sums: NDArray[np.float64],
     area: NDArray[np.float64],
+    pair: Callable[[int, int], NDArray[np.float64]],
     total: Callable[[NDArray[np.float64]], NDArray[np.float64]],
     slots: _Slots,
 ) -> list[NDArray[np.float64]]:
@@ -316,17 +324,17 @@ def _mean_products(
     ----------
     x, sums, area
         Vertices (3, 3, m) of slices, their sums (3, m), and the area of the slices that the first axis sees (m,).
-    total
-        Sums values of slices over slots.
+    pair, total
+        Sums products of two coordinates over the vertices of slices, and values of slices over slots.
     """
 
     def mean(*factors: int) -> NDArray[np.float64]:
         """Return the integrals over the slices of a product of two or three coordinates."""
         if len(factors) == 2:
             (a, b), of = factors, sums
-            return area / 12 * (of[a] * of[b] + (x[:, a] * x[:, b]).sum(axis=0))
+            return area / 12 * (of[a] * of[b] + pair(a, b))
         a, b, c = factors
-        pairs = sum(sums[i] * (x[:, j] * x[:, k]).sum(axis=0) for i, j, k in ((a, b, c), (b, a, c), (c, a, b)))
+        pairs = sums[a] * pair(b, c) + sums[b] * pair(a, c) + sums[c] * pair(a, b)
         return area / 60 * (sums[a] * sums[b] * sums[c] + pairs + 2 * (x[:, a] * x[:, b] * x[:, c]).sum(axis=0))
 
     out = [total(mean(0, 1, 2)) + slots.beyond(total(mean(1, 2)), 0)]

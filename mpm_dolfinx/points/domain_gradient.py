@@ -36,15 +36,30 @@ def gradient(
         now, then = (domain_volumes(y, True) / volumes(y) for y in (corners, reference))
         out[:, 2, 2] = now / then
         return out
-    F, now, then = 0.0, 0.0, 0.0
+    F, then = _of_hexahedra(corners, reference)
+    return F * np.cbrt(volumes(corners) / then / determinant(F))[:, None, None]
+
+
+def _of_hexahedra(
+    corners: NDArray[np.float64], reference: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the mean F (n, 3, 3) over the simplices, and the volumes at rest (n,), m^3, of which it is a derivative.
+
+    Sums over corners of x_k and dV/dX_k, arrays with the points last: a fifth of the time of a sum over simplices.
+    """
+    x, X = (np.ascontiguousarray((y - y[:, :1]).transpose(1, 2, 0)) for y in (corners, reference))
+    slope = np.zeros_like(X)
     for simplex, sign in zip(kuhn_simplices(3), ORIENTATION[3], strict=True):
-        dx, dX = (np.diff(y[:, simplex], axis=1) for y in (corners, reference))  # edges as rows
-        of_edges = cofactor(dX)
-        F = F + sign * np.einsum("nki,nkj->nij", dx, of_edges)
-        then = then + sign * (dX[:, 0] * of_edges[:, 0]).sum(axis=1)
-        now = now + sign * determinant(dx)
-    F = F / then[:, None, None]
-    return F * np.cbrt(now / then / determinant(F))[:, None, None]
+        edges = np.diff(X[simplex], axis=0)
+        for i in range(3):
+            a, b = edges[(i + 1) % 3], edges[(i + 2) % 3]
+            for axis in range(3):
+                j, k = (axis + 1) % 3, (axis + 2) % 3
+                area = sign / 6 * (a[j] * b[k] - a[k] * b[j])
+                slope[simplex[i + 1], axis] += area
+                slope[simplex[i], axis] -= area
+    volume = (X * slope).sum(axis=(0, 1)) / 3
+    return np.moveaxis(np.einsum("kan,kbn->abn", x, slope) / volume, 2, 0).copy(), volume
 
 
 def cell_ratios(

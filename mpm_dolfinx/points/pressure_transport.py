@@ -17,13 +17,14 @@ What is told of the points, and taken along by none, is reconstructed up to seal
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
 
 import numpy as np
 from dolfinx import fem
 from numpy.typing import NDArray
 
+from mpm_dolfinx.constitutive.fluid_content import mass_potential
 from mpm_dolfinx.parallel.exchange import Exchange
 from mpm_dolfinx.points.cutting import Pieces
 from mpm_dolfinx.points.grid import Grid, sum_by
@@ -54,6 +55,12 @@ class PiecePressures:
     def migrated(self, exchange: Exchange) -> PiecePressures:
         """Return the pieces of this process after each went to where its point goes."""
         return PiecePressures(*(exchange.send(getattr(self, f.name)) for f in fields(self)))._ordered()
+
+    def potentials(self, bulk: float) -> PiecePressures:
+        """Return the same of the mass potentials of a fluid of this bulk modulus, Pa: see `transport`."""
+        pi, bounds = mass_potential(self.pressure, bulk), mass_potential(self.bounds, bulk)
+        slope = np.exp(self.pressure / bulk)[:, None] * self.slope
+        return replace(self, pressure=pi, slope=slope, bounds=bounds)
 
     def of(self, ids: NDArray[np.int64], kept: bool = True) -> PiecePressures:
         """Return the pieces of the points of these ids, or of all others."""
@@ -208,7 +215,7 @@ def _spread(jump: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.
 
 
 def transport(old: PiecePressures, points: MaterialPoints, new: Pieces) -> NDArray[np.float64]:
-    """Return the pressures (m,), Pa, that the new pieces bring to their cells."""
+    """Return the pressures (m,), Pa, that the new pieces bring to their cells, or mass potentials, which add up."""
     n = len(points)
     if not n:
         return np.empty(0)

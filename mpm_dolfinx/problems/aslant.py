@@ -169,12 +169,16 @@ class AslantFlow(NamedTuple):
     conductance: NDArray[np.float64]
     weight: NDArray[np.float64] | None
 
-    def __call__(self, p: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def __call__(
+        self, p: NDArray[np.float64], density: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return what leaves the filled cells (n,) to others, and through open sides (m,), m^d/s, at p (c,), Pa.
+
+        density (c,): of the fluid over that at zero pressure.
 
         Seepage faces are left out: they are open or not by the pressure of their cell.
         """
         slope, sides = self.gradients(p, self.sides.pressure, self.weight), self.sides
-        leaves = self.forms.along(slope, self.contents.filled[self.gradients.rows], self.facets)
-        through = self.conductance * self.gradients.through_sides(slope, len(sides.cells))
+        leaves = self.forms.along(slope, self.contents.filled[self.gradients.rows], self.facets, density)
+        through = self.conductance * self.gradients.through_sides(slope, len(sides.cells)) * density[sides.cells]
         return leaves[self.contents.filled], np.where(sides.seeps, 0.0, through)

@@ -234,7 +234,7 @@ class Inflow:
     side
         Side of the bodies, as for `Traction`.
     flux : float or callable (t, X, x) -> float, m/s
-        Volume per present area and time into the body, finite; negative: out of it.
+        Volume at zero pressure per present area and time into the body, finite; negative: out of it.
     region : ((d,), (d,)), m
         Box of reference positions to which the faces are limited.
 

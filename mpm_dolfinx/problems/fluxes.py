@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx import _compat
 from mpm_dolfinx.caching import Keyed
+from mpm_dolfinx.constitutive.fluid_content import mass_potential
 from mpm_dolfinx.forms.point_forms import FacetForm, FacetSum
 from mpm_dolfinx.forms.unknowns import sum_ghosts
 from mpm_dolfinx.points.grid import Grid, sum_by
@@ -118,17 +119,19 @@ class OpenSides:
         """Unit vectors (m, d)."""
         return self.area / np.linalg.norm(self.area, axis=1, keepdims=True)
 
-    def driven(self, at: NDArray[np.int64], flow: Conduction) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the outflow (m,) per unit of the cell's pressure, m^d/(Pa s), and the inflow (m,), m^d/s.
+    def driven(
+        self, at: NDArray[np.int64], flow: Conduction, bulk: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the outflow (m,) per unit of the cell's mass potential, m^d/(Pa s), and the inflow (m,), m^d/s.
 
         The inflow is prescribed, or driven in by the outer pressure and gravity; at (m,): place of the cells among the
-        filled ones.
+        filled ones; bulk: of the fluid, Pa.
         """
         shape = self.shape * flow.nearer(at, self.normal, self.reach)
         conductance, outer = flow.across(at, self.normal) * shape, self.pressure
         if flow.weight is not None:
             outer = outer - flow.deformed(at, self.reach) @ flow.weight
-        return conductance, self.given + conductance * outer
+        return conductance, self.given + conductance * mass_potential(outer, bulk)
 
     def ahead(self, at: NDArray[np.int64], p: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return what lies ahead of the filled cells (n, d, 2, 2): on drained sides, by axis and end of the cell.
@@ -251,6 +254,11 @@ class CellContents(Keyed):
             hoop = 1 + moved[:, 0] / (self.grid.midpoints[self.filled, 0] + self.centroid[self.filled, 0])
         return CellMotion(np.eye(self.grid.dim) + nodal @ self._slopes, moved, hoop)
 
+    def at_rest(self, flow: Conduction) -> NDArray[np.float64]:
+        """Return the pressures (n,) that water at rest would have in the filled cells, less any constant, Pa."""
+        x = self.grid.midpoints[self.filled] + self.centroid[self.filled]
+        return (x if flow.motion is None else x + flow.motion.moved) @ flow.weight
+
     def slot(self, cells: NDArray[np.int32]) -> NDArray[np.int64]:
         """Return the places of cells among the filled ones."""
         return self._slot[cells]
@@ -301,19 +309,26 @@ class FluxForms:
         smaller = ufl.min_value(self.fixed_stress("+"), self.fixed_stress("-"))
         volume = fem.Constant(mesh, grid.cell_volume)  # not a number: each would be compiled anew
         self.alternation = FacetForm(smaller / (4 * d) * across / volume * ufl.jump(dp) * ufl.jump(q) * dS, grid.comm)
-        self.slope, self._sum = fem.Function(grid.cellwise((d,))), fem.Function(Q)
+        self.slope, self.density, self._sum = fem.Function(grid.cellwise((d,))), fem.Function(Q), fem.Function(Q)
         apart = ufl.jump(self.centroid)
         along = apart - ufl.dot(apart, n0) * n0
         self.aslant = None
         if flows and not grid.axisymmetric:
-            self.aslant = FacetForm(-T * ufl.dot(ufl.avg(self.slope), along) * ufl.jump(q) * dS, grid.comm)
+            carried = T * ufl.avg(self.density)
+            self.aslant = FacetForm(-carried * ufl.dot(ufl.avg(self.slope), along) * ufl.jump(q) * dS, grid.comm)
         self.gravity = None
         if weight is not None and flows:
             apart = across * n0 - ufl.jump(self.centroid + self.moved)
             self.gravity = FacetForm(T * ufl.dot(weight, apart) * ufl.jump(q) * dS, grid.comm)
 
-    def along(self, slope: NDArray[np.float64], cells: NDArray[np.int64], facets: FacetSum) -> NDArray[np.float64]:
-        """Return the outflow of the local cells (c,), m^d/s, by gradients (n, d), Pa/m, of some along some faces."""
+    def along(
+        self, slope: NDArray[np.float64], cells: NDArray[np.int64], facets: FacetSum, density: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return the outflow of the local cells (c,), m^d/s, by gradients (n, d), Pa/m, of some along some faces.
+
+        density (c,): of the fluid over that at zero pressure.
+        """
+        self.density.x.array[:] = density
         self.slope.x.array[:] = self._sum.x.array[:] = 0.0
         self.slope.x.array.reshape(-1, self.grid.dim)[cells] = slope
         self.slope.x.scatter_forward()

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 from mpi4py import MPI
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.caching import Keyed, Latest
 from mpm_dolfinx.constitutive.fields import SceneMaterials
+from mpm_dolfinx.constitutive.fluid_content import mass_potential, pressure_of
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.cut_domains import CutDomains
 from mpm_dolfinx.points.grid import sum_by
@@ -113,7 +115,9 @@ class OnGrid(Keyed):
     def pressures(self, state: State) -> NDArray[np.float64]:
         """Return the pressures of the filled owned cells at the start of a step, Pa."""
         if not state.stay:
-            return self._mean_pressures(transport(state.transported, self.cut.points, self.cut.pieces))
+            bulk = self._storage.bulk
+            carried = transport(state.transported.potentials(bulk), self.cut.points, self.cut.pieces)
+            return pressure_of(self._means(carried), bulk)
         p = np.zeros(self.cut.grid.num_local)
         p[self.cut.cells] = self.cut.pieces_to_cells(state.stay.pressure)
         return p[self.contents.filled]
@@ -132,35 +136,38 @@ class OnGrid(Keyed):
         p_n.array[self.cut.cells] = self.cut.pieces_to_cells(at_pieces)
         p_n.scatter_forward()
 
-    def _mean_pressures(self, at_pieces: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the means in the filled owned cells of the pressures (m,), Pa, that pieces bring to them.
+    def _means(self, at_pieces: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the means in the filled owned cells of the potentials (m,), Pa, that pieces bring to them.
 
         By what is stored, or by volume in a cell that stores nothing.
         """
         contents, cells = self.contents, self.cut.cells
-        pressure, store = self.cut.pieces_to_cells(at_pieces), self.weight * self.data.pieces["storage"][:, 0]
-        held, mean = contents.total(cells, store), contents.mean(pressure)
-        return np.divide(contents.total(cells, store * pressure), held, out=mean, where=held > 0)
+        potential, store = self.cut.pieces_to_cells(at_pieces), self.weight * self.data.pieces["storage"][:, 0]
+        held, mean = contents.total(cells, store), contents.mean(potential)
+        return np.divide(contents.total(cells, store * potential), held, out=mean, where=held > 0)
 
     def pressures_at_pieces(
         self, reconstruction: Reconstruction, store: NDArray[np.float64], stage: Stage, t: float
     ) -> list[NDArray[np.float64]]:
         """Return the pressures (m,), their slopes (m, d) and bounds (m, 2) at the pieces, as `set_pressures` has set.
 
-        Their mean in a cell is the cell's pressure: by `store` (m,), m^d/Pa, what the pieces store, or by their volumes
-        in a cell that stores nothing.  t, s: time at which drained sides have their pressures.
+        The mean of their mass potentials in a cell is the cell's: by `store` (m,), m^d/Pa, what the pieces store, or by
+        their volumes in a cell that stores nothing.  t, s: time at which drained sides have their pressures.
         """
-        pieces, contents, p = self.data.pieces, self.contents, self._storage.p_n.x.array
+        pieces, contents, bulk = self.data.pieces, self.contents, self._storage.bulk
+        pi = mass_potential(self._storage.p_n.x.array, bulk)
         cells, offset, at = pieces.cells, pieces.places.offset, contents.slot(pieces.cells)
         store = self.cut.pieces_to_cells(store)
         weight = np.where(contents.total(cells, store)[at] > 0, store, self.weight)
         total = contents.total(cells, weight)
         origin = np.stack([contents.total(cells, weight * x) / total for x in offset.T], axis=1)
-        slope, bounds = reconstruction(self._cell_pressures(p, stage, t), origin)
-        rise, here = np.einsum("md,md->m", slope[at], offset - origin[at]), p[contents.filled]
+        slope, bounds = reconstruction(self._cell_pressures(pi, stage, t, bulk), origin)
+        rise, here = np.einsum("md,md->m", slope[at], offset - origin[at]), pi[contents.filled]
         share = share_within(rise, *(bounds.T - here), at)  # drained sides may be aslant in their cells
-        slope, pressure = slope * share[:, None], p[cells] + share[at] * rise
-        return [self.cut.to_pieces(values) for values in (pressure, slope[at], bounds[at])]
+        pi = pi[cells] + share[at] * rise
+        slope = (slope * share[:, None])[at] / (1 + pi / bulk)[:, None]
+        values = pressure_of(pi, bulk), slope, pressure_of(bounds, bulk)[at]
+        return [self.cut.to_pieces(rows) for rows in values]
 
     def softness(self, state: State) -> NDArray[np.float64] | float:
         """Return by how much the pieces (m,) are softer than elastic ones at the start of the step."""
@@ -181,10 +188,11 @@ class OnGrid(Keyed):
         places, seen = self._places.pieces, self._cell_pressures(self._storage.p.x.array, stage, t)
         return self.cut.to_pieces(reconstruction.up_to_surface(seen, places.offset, places.slots))
 
-    def _cell_pressures(self, p: NDArray[np.float64], stage: Stage, t: float) -> CellPressures:
-        """Return what slopes of cells with these pressures are drawn from."""
+    def _cell_pressures(self, p: NDArray[np.float64], stage: Stage, t: float, bulk: float = np.inf) -> CellPressures:
+        """Return what slopes of cells with these pressures, or mass potentials by `bulk` (Pa), are drawn from."""
         contents = self.contents
         sides = stage.hydraulic.data(self.cut, self.cut.points, contents, t)
+        sides = replace(sides, pressure=mass_potential(sides.pressure, bulk))
         outer = sides.ahead(contents.slot(sides.cells), p[contents.filled])
         return CellPressures(contents.filled, p, contents.centroid, contents.open, outer)
 

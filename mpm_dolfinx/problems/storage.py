@@ -3,15 +3,17 @@
 
 In each active cell, with J_Delta = det(I + grad u) (never div u: a rotation would fake a compression),
 
-    int zeta(J_Delta, p) - zeta_n dV_n  +  int sum_faces Q dt  =  0,      d zeta = alpha dJ + S J dp,
-    Q = T [p+ - p- + rho_w g . (x- - x+)],   T = A / (d+ / kappa+ + d- / kappa-),   kappa = k / (rho_w g),
+    int r [zeta(J_Delta, p) - zeta_n] dV_n  +  int sum_faces Q dt  =  0,      d zeta = alpha dJ + S J dp,
+    Q = T [pi+ - pi- + r rho_w g . (x- - x+)],   T = A / (d+ / kappa+ + d- / kappa-),   kappa = k / (rho_w g),
 
-where A is the exact overlap of the body with the face, x+- are the centroids of what the cells hold
-and d+- their distances from the face; `layers` has kappa and d of cells that hold several conductivities.  Distances
-from the centroids keep the error at 0.2 % for any filling, where half the cell size reaches 12 %.  Where bodies lie
-aslant, `aslant` adds what centroids that are not across from one another leave out.  The sum over the cells is the
-fluid balance.  The change of the content is that of `fluid_content`, the integral over the step that of a
-substep of `time_integration`.
+r = exp(p / K_w) the density of the fluid over rho_w, that at zero pressure, in zeta that at (p_n + p) / 2 and on a face
+the mean, and pi its mass potential (`fluid_content`): what leaves a cell enters its neighbour in mass.  The residual is
+that over r.  Its tangent leaves out what differences of r make, of neighbours and in the step.  A is the exact overlap
+of the body with the face, x+- are the centroids of what the cells hold and d+- their distances from the face; `layers`
+has kappa and d of cells that hold several conductivities.  Distances from the centroids keep the error at 0.2 % for any
+filling, where half the cell size reaches 12 %.  Where bodies lie aslant, `aslant` adds what centroids that are not
+across from one another leave out.  The sum over the cells is the fluid balance.  The change of the content is that of
+`fluid_content`, the integral over the step that of a substep of `time_integration`.
 
 Corners of domains follow more than u, points change cells, and jumps are damped (below), so the volumes of domains part
 from the fluid that has come to them.  The points carry this difference, `owed`, and cells take it in by small shares in
@@ -39,7 +41,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from mpm_dolfinx.constitutive.evaluate import ConductivityAtPieces
-from mpm_dolfinx.constitutive.fluid_content import change_of_content
+from mpm_dolfinx.constitutive.fluid_content import change_of_content, mass_potential
 from mpm_dolfinx.constitutive.skeleton import filled
 from mpm_dolfinx.constitutive.user_functions import compiling
 from mpm_dolfinx.constitutive.user_functions import form as form_of
@@ -69,6 +71,8 @@ class StorageForms:
         Increment of the displacement since the start of the step.
     pressure
         DG0 pore pressure, Pa, positive in compression.
+    bulk
+        Bulk modulus of the fluid, Pa.
     weight : (d,), N/m^3
         Weight of the pore fluid rho_w g as UFL, None without gravity.
     symmetric
@@ -91,6 +95,7 @@ class StorageForms:
         pieces: FormPoints,
         displacement: fem.Function,
         pressure: fem.Function,
+        bulk: float,
         weight: ufl.core.expr.Expr | None,
         symmetric: bool,
         flows: bool,
@@ -99,7 +104,7 @@ class StorageForms:
         sources: Sequence[Callable],
         t: fem.Constant,
     ):
-        self.grid, self.p, Q = pieces.grid, pressure, pressure.function_space
+        self.grid, self.p, self.bulk, Q = pieces.grid, pressure, bulk, pressure.function_space
         self.conductivity = conductivity
         self.p_n, self._work = fem.Function(Q), fem.Function(Q)
         q, one = ufl.TestFunction(Q), fem.Function(Q)
@@ -170,8 +175,8 @@ class OpenFaces:
     """Faces on open sides; arrays over m faces.
 
     number (m,): of the condition; at (m,): place of the cell among the active owned ones; conductance, inflow (m,):
-    outflow per unit of the cell's pressure, m^d/(Pa s), and what is prescribed or driven in, m^d/s; seeps (m,): whether
-    nothing may flow in.
+    outflow per unit of the cell's mass potential, m^d/(Pa s), and what is prescribed or driven in, m^d/s; seeps (m,):
+    whether nothing may flow in.
     """
 
     number: NDArray[np.int64]
@@ -180,14 +185,14 @@ class OpenFaces:
     inflow: NDArray[np.float64]
     seeps: NDArray[np.bool_]
 
-    def outflow(self, p: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return what leaves through each face, were it open both ways, from cells at pressures (n,), Pa; m^d/s."""
-        return self.conductance * p[self.at] - self.inflow
+    def outflow(self, pi: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return what leaves through each face, were it open both ways, from cells at potentials (n,), Pa; m^d/s."""
+        return self.conductance * pi[self.at] - self.inflow
 
-    def seepage(self, p: NDArray[np.float64], flows: NDArray[np.bool_]) -> tuple[NDArray, NDArray]:
+    def seepage(self, pi: NDArray[np.float64], flows: NDArray[np.bool_]) -> tuple[NDArray, NDArray]:
         """Return what seeps out of cells (n,), m^d/s, and its derivative, m^d/(Pa s); flows (m,): where."""
-        parts = (np.where(flows & self.seeps, values, 0.0) for values in (self.outflow(p), self.conductance))
-        return tuple(sum_by(self.at, values, len(p)) for values in parts)
+        parts = (np.where(flows & self.seeps, values, 0.0) for values in (self.outflow(pi), self.conductance))
+        return tuple(sum_by(self.at, values, len(pi)) for values in parts)
 
 
 @dataclass(frozen=True)
@@ -195,8 +200,8 @@ class Outflow:
     """Outflow of the active owned cells: conductance of open sides (m^d/(Pa s)), inflow (m^d/s), and the sum of all.
 
     faces: one by one; of those that seep nothing is in these sums; total: outflow per unit of the cell's own
-    pressure through all its other faces, m^d/(Pa s).  mobility (n, d): along the axes, m^2/(Pa s).
-    aslant: what flows besides.
+    potential through all its other faces, m^d/(Pa s).  mobility (n, d): along the axes, m^2/(Pa s).  at_rest (n,):
+    pressures of water at rest, Pa, if it has weight and is compressible.  aslant: what flows besides.
     """
 
     conductance: NDArray[np.float64]
@@ -204,6 +209,7 @@ class Outflow:
     faces: OpenFaces
     total: NDArray[np.float64]
     mobility: NDArray[np.float64]
+    at_rest: NDArray[np.float64] | None
     aslant: AslantFlow | None
 
 
@@ -277,7 +283,7 @@ class StorageSystem:
     ) -> Outflow:
         """Assemble the fluxes through inner faces and open sides; off: of `AslantFlow`, where there is any."""
         at = contents.slot(sides.cells)
-        faces = OpenFaces(sides.number, at, *sides.driven(at, flow), sides.seeps)
+        faces = OpenFaces(sides.number, at, *sides.driven(at, flow, self._forms.bulk), sides.seeps)
         both = ~faces.seeps
         conductance, inflow = (contents.total(sides.cells[both], v[both]) for v in (faces.conductance, faces.inflow))
         mobility = self._forms.fluxes.set_conduction(contents, flow)
@@ -289,7 +295,8 @@ class StorageSystem:
         self.T.assemble()
         _add_diagonal(self.T, conductance)
         aslant = off and AslantFlow(self._forms.fluxes, *off, contents, sides, faces.conductance, flow.weight)
-        return Outflow(conductance, inflow, faces, self.T.getDiagonal().array.copy(), mobility, aslant)
+        at_rest = contents.at_rest(flow) if self._gravity is not None and np.isfinite(self._forms.bulk) else None
+        return Outflow(conductance, inflow, faces, self.T.getDiagonal().array.copy(), mobility, at_rest, aslant)
 
 
 @dataclass(frozen=True)
@@ -357,7 +364,7 @@ class StorageProblem:
         self.damped, flows, self._seeps = somewhere.tolist()
         """Whether jumps of the pressure are damped somewhere."""
         self._softer = self._damping_of_soft_soil(tau, softest, outflow.mobility) if flows else None
-        self._flowing = outflow.faces.outflow(self._pressures) >= 0
+        self._flowing = outflow.faces.outflow(self._potentials) >= 0
         self._aslant = self._aslant_now(outflow)
         if self.damped:
             forms.fluxes.dt.value = dt
@@ -376,14 +383,20 @@ class StorageProblem:
         return second_differences(self.system.unknowns, grid, strength, contents.centroid, contents.open)
 
     @property
-    def _pressures(self) -> NDArray[np.float64]:
-        """Pressures of the active owned cells, Pa."""
-        return self.forms.p.x.array[self.system.unknowns.owned]
+    def _potentials(self) -> NDArray[np.float64]:
+        """Mass potentials of the active owned cells, Pa."""
+        return mass_potential(self.forms.p.x.array[self.system.unknowns.owned], self.forms.bulk)
+
+    @property
+    def _density(self) -> NDArray[np.float64]:
+        """Density of the fluid halfway between start and end in the active owned cells, over that at zero pressure."""
+        forms, owned = self.forms, self.system.unknowns.owned
+        return np.exp((forms.p.x.array + forms.p_n.x.array)[owned] / (2 * forms.bulk))
 
     def outflows(self, count: int) -> NDArray[np.float64]:
         """Return what leaves through the sides of each of so many conditions (count,) at (u, p), m^d/s."""
         faces = self._flow(False).faces
-        leaves = np.where(self._flowing | ~faces.seeps, faces.outflow(self._pressures), 0.0)
+        leaves = np.where(self._flowing | ~faces.seeps, faces.outflow(self._potentials), 0.0)
         leaves = leaves + self._aslant.faces
         return over_all(self.forms.grid.comm, sum_by(faces.number, leaves, count))
 
@@ -412,7 +425,8 @@ class StorageProblem:
         """Return what flows beside the two-point fluxes at the start of the substep: no tangent sees it."""
         if outflow.aslant is None:
             return Aslant(0.0, 0.0, 0.0)
-        between, faces = outflow.aslant(self.forms.p.x.array)
+        p = self.forms.p.x.array
+        between, faces = outflow.aslant(p, np.exp(p / self.forms.bulk))
         leaving = sum_by(outflow.faces.at, faces, len(between))
         return Aslant(between + leaving, faces, float(leaving.sum()))
 
@@ -425,7 +439,7 @@ class StorageProblem:
         if not self._seeps:
             return False
         faces = self._flow(False).faces
-        flows = faces.outflow(self._pressures) > 0
+        flows = faces.outflow(self._potentials) > 0
         changes = over_all(self.forms.grid.comm, int(np.count_nonzero((flows != self._flowing) & faces.seeps)))
         self._flowing[:] = flows
         return changes > 0
@@ -438,9 +452,8 @@ class StorageProblem:
         """Return the fluid volume out of balance in each cell at (u, p)."""
         forms, system, before = self.forms, self.system, self._before
         outflow = self._flow(False)
-        b = forms.change(self.data)
-        b[system.unknowns.owned] += self._due
-        change = b[system.unknowns.owned]
+        b, owned, density = forms.change(self.data), system.unknowns.owned, self._density
+        b[owned] = change = density * b[owned] + self._due
         exchanged, total = float(np.abs(change).sum()), float(change.sum())
         r, p = system.unknowns.gather(b, system.residual), system.unknowns.gather(forms.p.x.array, system.p)
         if self.damped:
@@ -449,7 +462,7 @@ class StorageProblem:
             self._softer.multAdd(p - system.p_start, r, r)
         rates = self._rates(outflow, p)
         now = rates.taken(self.dt)
-        r.array_w[:] += now.cells + before.cells
+        r.array_w[:] = (r.array_r + now.cells + before.cells) / density
         # what rounding may leave: of the volumes and of the fluxes that cancel
         round_off = 2e-15 * (self._contents.volume + now.turnover + before.turnover)
         sums = over_all(forms.grid.comm, np.array([exchanged + now.gain + before.gain, round_off]))
@@ -458,10 +471,13 @@ class StorageProblem:
     def _rates(self, outflow: Outflow, p: PETSc.Vec) -> Rates:
         """Return the rates at (u, p)."""
         forms, system, gain = self.forms, self.system, np.zeros(1)
-        flux = system.T * p
+        pi = p.copy()
+        pi.array_w[:] = values = mass_potential(p.array_r, forms.bulk)
+        flux = system.T * pi
         flux.axpy(1.0, system.rate)
-        cells, values = flux.array_r.copy(), p.array_r
-        cells += self._aslant.cells
+        cells = flux.array_r + self._aslant.cells
+        if outflow.at_rest is not None:
+            cells -= self._weight_of_denser(outflow, p)
         if forms.sources:
             gain = forms.gain(self.data)[system.unknowns.owned]
             cells -= gain
@@ -469,20 +485,38 @@ class StorageProblem:
         cells += seeping
         lost = (outflow.conductance * values - outflow.inflow + seeping).sum() + self._aslant.lost - gain.sum()
         turnover = (np.abs(outflow.total) + slope) @ np.abs(values)
-        return Rates(values.copy(), cells, float(lost), float(turnover), float(np.abs(gain).sum()))
+        return Rates(p.array_r.copy(), cells, float(lost), float(turnover), float(np.abs(gain).sum()))
+
+    def _weight_of_denser(self, outflow: Outflow, p: PETSc.Vec) -> NDArray[np.float64]:
+        """Return what flows into the cells (n,), m^d/s, as the fluid is denser than at zero pressure: see `_rates`.
+
+        On a face, T times the mean of its two e = exp(p / K_w) - 1 and the jump of the weight's pressures w.
+        """
+        e, w, product = p.copy(), p.copy(), p.copy()
+        e.array_w[:], w.array_w[:] = np.expm1(p.array_r / self.forms.bulk), outflow.at_rest
+        product.array_w[:] = e.array_r * w.array_r
+        of_product, of_e, of_w = (
+            (self.system.T * f).array_r - outflow.conductance * f.array_r for f in (product, e, w)
+        )
+        return (of_product - w.array_r * of_e + e.array_r * of_w) / 2
 
     def balance(self, residual: StorageResidual) -> float:
-        """Return the change of the fluid's volume, plus what left, less sources (m^d), at the last residual."""
+        """Return the change of the fluid's mass, plus what left, less sources, at the last residual.
+
+        Masses are those of a volume, m^d, at zero pressure.
+        """
         lost = residual.rates.taken(self.dt).lost + self._before.lost
         return float(over_all(self.forms.grid.comm, residual.change + lost))
 
     def came(self, rates: Rates) -> NDArray[np.float64]:
         """Return the fluid (cells,), m^d, that came to the local cells in the step by fluxes and sources; ghosts none.
 
+        Its volume is that at the density halfway between start and end, as in `change`.
+
         rates: at the end of the substep.
         """
         out = np.zeros_like(self.forms.p.x.array)
-        out[self.system.unknowns.owned] = -rates.taken(self.dt).cells - self._before.cells
+        out[self.system.unknowns.owned] = (-rates.taken(self.dt).cells - self._before.cells) / self._density
         return out
 
     def assemble_tangent(self, data: PointData | None = None) -> None:
@@ -502,7 +536,7 @@ class StorageProblem:
         owned = system.unknowns.owned
         _add_diagonal(system.C, forms.capacity(data)[owned])
         if self._seeps:
-            slope = self._flow(False).faces.seepage(self._pressures, self._flowing)[1]
+            slope = self._flow(False).faces.seepage(self._potentials, self._flowing)[1]
             _add_diagonal(system.C, self.dt * slope)
         if forms.sources:
             _add_diagonal(system.C, -self.dt * forms.gain_slope(data)[owned])

@@ -5,9 +5,10 @@ With the total displacement u, F = I + grad u, J = det F and the pore pressure p
 on the reference configuration of a box, from state n:
 
     momentum   int d/dF [psi(F) - alpha p J] : grad v dV  =  int t . v dA    (tractions t: dead, or pressures)
-    storage    int [zeta(J, p) - zeta_n] q dV  +  int int kappa J F^-1 F^-T grad p . grad q dV dt  =  0
+    storage    int rho [zeta(J, p) - zeta_n] q dV  +  int int kappa J F^-1 F^-T grad pi . grad q dV dt  =  0
 
-kappa = k/(rho_w g), the content zeta that of `fluid_content`, the integral over the step that of `time_integration`.
+kappa = k/(rho_w g), the content zeta and the mass potential pi those of `fluid_content`, rho = exp((p + p_n)/(2 K_w)),
+the integral over the step that of `time_integration`.
 With pressures constant in the cells the flux is the two-point one, kappa J |F^-T N|^2 (p+ - p-)/h, h the distance of
 the cells' centres; it is not consistent where the body shears.  In axisymmetry F has the hoops' stretch and integrals
 are those of the whole revolution.  Materials, the user's terms and sources, and time
@@ -35,7 +36,7 @@ from tqdm import tqdm
 
 from mpm_dolfinx import _compat
 from mpm_dolfinx.constitutive.axes import block
-from mpm_dolfinx.constitutive.fluid_content import change_of_content
+from mpm_dolfinx.constitutive.fluid_content import change_of_content, mass_potential, mass_potential_form
 from mpm_dolfinx.constitutive.skeleton import Field, Fluid, Skeleton
 from mpm_dolfinx.constitutive.user_functions import call, compiling, term_of
 from mpm_dolfinx.constitutive.user_functions import form as form_of
@@ -333,6 +334,9 @@ class BiotFEM:
         n, n_n = (1 - self._constant(1 - law.porosity) / volume for volume in (J, J_n))
         a, S = self._constant(S_1), self._constant(S_0) + self._constant(S_1 - S_0) * n_n
         content = J_n * change_of_content(self._constant(law.biot), a, S, J / J_n, p - p_n) * q
+        compliance = self._constant(self.scale / self.fluid.bulk)
+        content *= ufl.exp(compliance * (p + p_n) / 2)
+        p = mass_potential_form(p, compliance)
         k = self._field(law.conductivity)
         if law.conductivity_law is not None:
             porosity = {"porosity": n, "porosity0": self._constant(law.porosity)}
@@ -346,7 +350,7 @@ class BiotFEM:
         return content, self._around * kappa * J * ufl.inner(pull * ufl.grad(p), pull * ufl.grad(q)) * dx
 
     def _two_point(self, kappa, J, pull, p, q, outlets: Sequence[Drained]):
-        """Return the two-point flux between cells and to drained sides, half a cell away, as UFL."""
+        """Return the two-point flux between cells and to drained sides, half a cell away, as UFL; p: mass potential."""
         normal, h = ufl.FacetNormal(self.grid.mesh), self._constant(self.grid.h)
         stretch = J * ufl.inner(pull * normal, pull * normal)
         across = sum(abs(normal[a]) * h[a] for a in range(self.grid.dim))
@@ -355,7 +359,8 @@ class BiotFEM:
         around = self._around("+") if self.grid.axisymmetric else 1.0
         flux = around * harmonic * ufl.avg(stretch) / across("+") * ufl.jump(p) * ufl.jump(q) * dS
         for o in outlets:
-            flux += self._on(o, 2 * kappa * stretch / across * (p - self._constant(o.pressure / self.scale)) * q)
+            outer = mass_potential(o.pressure, self.fluid.bulk) / self.scale
+            flux += self._on(o, 2 * kappa * stretch / across * (p - self._constant(outer)) * q)
         return flux
 
     def _solver(self) -> PETSc.SNES:
