@@ -140,7 +140,11 @@ def test_a_body_that_turns_by_360_degrees_has_its_stresses_back():
 
 @pytest.mark.slow
 def test_a_stretched_block_after_ten_turns_is_that_after_one():
-    """A side gives way to what its stress changes in a step: the first turn leaves 3e-5 E, 6e-6 E once it rests."""
+    """A side gives way to what its stress changes in a step: the first turn leaves 3e-5 E, 6e-6 E once it rests.
+
+    Half as much with half the step.  What the start of the turning has left besides fades from turn to turn, by a
+    factor of 18: 1.3e-7, 7e-9, 4e-10 E, with a tolerance of 1e-12 as with 1e-8.
+    """
     grid, centre = mpm.Grid([1.6, 1.6], [8, 8]), np.full(2, 0.81)
     block = mpm.box(grid, centre - 0.3, centre + 0.3)
 
@@ -152,12 +156,12 @@ def test_a_stretched_block_after_ten_turns_is_that_after_one():
     held = [mpm.Displacement(side, moved) for side in ("left", "right", "bottom", "top")]
     s = mpm.Simulation(grid, [block], [clay(0.3)], fixed={}, displacements=held)
     stress, cuts = [], 0
-    for end, dt in ((2, 0.2), (3, 1 / 72), (12, 1 / 72)):
+    for end, dt in ((2, 0.2), (3, 1 / 72), (5, 1 / 72), (12, 1 / 72)):
         cuts += s.run(float(end), dt, progress=False).cuts
         stress.append(s.effective_stress())
-    one, ten = (np.abs(after - before).max() / 1e7 for before, after in pairwise(stress))
-    print(f"one turn {one:.0e} E, nine more {ten:.0e} E, {cuts} cut steps")
-    assert one < 5e-5 and ten < 3e-7 and cuts == 0
+    one, three, ten = (np.abs(after - before).max() / 1e7 for before, after in pairwise(stress))
+    print(f"one turn {one:.0e} E, two more {three:.0e} E, seven more {ten:.0e} E, {cuts} cut steps")
+    assert one < 5e-5 and three < 3e-7 and ten < 1e-8 and cuts == 0
 
 
 @pytest.mark.parametrize("dim", [2, 3])

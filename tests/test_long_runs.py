@@ -63,10 +63,7 @@ def test_a_sealed_beam_keeps_the_volume_of_its_domains(conductivity, bulk, cycle
     material = replace(SOFT, conductivity=conductivity)
     s, result = cycle(0.05, cycles, material=material, observe=observe, fluid=mpm.Fluid(bulk=bulk))
     assert result.steps == cycles * STEPS + result.rejected and result.balance < 1e-8
-    print(
-        f"{cycles} cycles, k = {conductivity:g} m/s, K_w = {bulk:g} Pa:",
-        f"volume {volumes[-1]:.1e}, fluid {result.balance:.1e}",
-    )
+    print(f"{cycles} cycles, k = {conductivity:g} m/s, K_w = {bulk:g} Pa: volume {volumes[-1]:.1e}")
     assert abs(volumes[-1]) < most and s.points.data["owed"].any(), volumes[-1]
 
 
