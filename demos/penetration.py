@@ -11,6 +11,10 @@ keeps the gap behind the bar closed; as that settles the clay, it loads the bar 
 the bar resists less: in one four diameters wide, with 8 and 16 cells over the diameter, 10.9 and 10.8 if it is rough.
 
 Errors are those of the mean of N over the last quarter of the push; `spread` is by how much it varies there.
+
+Wet clay is pushed by a whole diameter, by a smooth bar, at three rates V = v D / c_v, with water of the same pressure
+on top, so that it begins without effective stress.  Clay ahead of the bar parts, and stretches exponentially, by about
+e^4 over a diameter: domains that are as much narrower there at first end as wide as the others.
 """
 
 from __future__ import annotations
@@ -29,7 +33,15 @@ STRENGTH, PRESSURE = 1e3, 2e4  # Pa: s_u of the undrained clay, and the pressure
 SHEAR = 100 * STRENGTH
 ROUGH = (0.0, 0.5, 1.0)
 WALLS = {"left": "x", "right": "x", "bottom": "y"}
-STEP = 1 / 24  # cells that the bar goes in a step
+STEP, WET_STEP = 1 / 24, 1 / 18  # cells that the bar goes in a step
+NOSE = 0.02  # width of the wet clay's narrowest domains over that of the others
+PARTS = 4  # each of those that widen away from the nose is a part of its distance from there
+CLAY = mpm.DruckerPrager(2 * SHEAR, SHEAR, friction=0.0, dilation=0.0, cohesion=STRENGTH, conductivity=1e-9)
+WATER = mpm.Fluid()
+CV = CLAY.conductivity / WATER.unit_weight * CLAY.oedometric  # m²/s
+RATES = {"fast": 1000.0, "intermediate": 1.0, "slow": 1e-2}  # V
+SETTLED = 1e-3  # of the push's time: that in which the pressure comes
+BALANCE = 1e-8  # relative error of the fluid balance that is allowed
 
 
 def exact(alpha: float) -> float:
@@ -39,18 +51,29 @@ def exact(alpha: float) -> float:
     return np.pi + 2 * delta + 4 * np.cos(half) * (np.sqrt(2) + np.sin(half))
 
 
-def clay(cells: int) -> tuple:
+def angles(around: int, nose: float) -> np.ndarray:
+    """Return angles, 0 ahead of the bar, between so many domains, and more where widths fall to `nose` times theirs."""
+    even = np.linspace(0, np.pi, around + 1)
+    if nose == 1:
+        return even
+    ratio = 1 - 1 / PARTS
+    near = even[PARTS] * ratio ** np.arange(round(np.log(nose) / np.log(ratio)) + 1)
+    return np.concatenate([np.linspace(0, near[-1], PARTS + 1)[:-1], near[:0:-1], even[PARTS:]])
+
+
+def clay(cells: int, nose: float = 1) -> tuple:
     """Return a grid with so many cells over the diameter, half of the block around the bar, the region of its top."""
     h = D / cells
     n = round(HALF * cells)
     grid = mpm.Grid([HALF, HALF + 4 * h], [n, 2 * n + 4], lower=[0, -HALF])
     around, outward = 4 * round(np.pi * D / 2 / (FINE * h) / 4), round(np.log(2 * HALF / D) * D / 2 / (FINE * h))
-    size = np.array([outward, around]) * h / 2
+    at = angles(around, nose)
+    size = np.array([outward, len(at) - 1]) * h / 2
 
-    top = ((0, 0.75 * size[1] - HALF - 1e-9), tuple(size))
+    top = ((0, size[1] - around / 4 * h / 2 - HALF - 1e-9), tuple(size))
 
     def ring(X: np.ndarray) -> np.ndarray:  # from the bar to the block's sides, ever larger
-        angle = np.pi * (X[:, 1] + HALF) / size[1]
+        angle = np.interp((X[:, 1] + HALF) / (h / 2), np.arange(len(at)), at)
         e = np.stack([np.sin(angle), -np.cos(angle)], axis=1)
         reach = HALF / np.abs(e).max(axis=1)
         return e * (D / 2 * (2 * reach / D) ** (X[:, 0] / size[0]))[:, None]
@@ -60,16 +83,19 @@ def clay(cells: int) -> tuple:
 
 @dataclass
 class Push:
-    """A push, a step each: depths over D, and resistances over s_u D.
+    """A push, a step each: depths over D, resistances over s_u D, excess pressures of wet clay ahead over s_u.
 
-    frame: corners (n, 4, 2), m, how far points have moved (n,), m, and what the bar fills (m, 4, 2), m, at the end.
+    frame: corners (n, 4, 2), m, how far points have moved (n,), m, or excess pressures of wet clay over s_u (n,), and
+    what the bar fills (m, 4, 2), m, at the end.
     """
 
     depth: list[float] = field(default_factory=list)
     N: list[float] = field(default_factory=list)
+    excess: list[float] = field(default_factory=list)
     frame: tuple = ()
     steps: int = 0
     cuts: int = 0
+    balance: float = 0.0
 
 
 def push(alpha: float, cells: int, depth: float, steps: int) -> Push:
@@ -93,15 +119,47 @@ def push(alpha: float, cells: int, depth: float, steps: int) -> Push:
     return out
 
 
+def push_wet(rate: float, cells: int, depth: float) -> Push:
+    """Push a smooth bar to a depth, over D, into wet clay, at a rate V."""
+    grid, body, top = clay(cells, NOSE)
+    speed = rate * CV / D  # m/s
+    start, end = SETTLED * depth * D / speed, (1 + SETTLED) * depth * D / speed
+    bar = mpm.Tool(mpm.Ball((0, 0), D / 2), lambda t: (0, -speed * max(0, t - start)))
+    load = mpm.Pressure("right", lambda t: PRESSURE * min(1, t / start), region=top)
+    water = {"fluid": WATER, "drained": [mpm.Drained("right", lambda t: PRESSURE * min(1, t / start), region=top)]}
+    simulation = mpm.Simulation(grid, [body], [CLAY], fixed=WALLS, tractions=[load], tools=[bar], **water)
+    simulation.run(start, start, progress=False)
+    out = Push()
+
+    def see(s: mpm.Simulation) -> None:
+        gone = speed * max(0, s.t - start)
+        out.depth.append(gone / D)
+        out.N.append(-2 * float(s.tool_forces[0, 1]) / STRENGTH / D)
+        x = s.points.x + np.array([0, gone])
+        front = (np.linalg.norm(x, axis=1) < D / 2 + grid.h[0] / 2) & (-x[:, 1] > x[:, 0])
+        volume = s.points.volume0[front]
+        out.excess.append(float(volume @ (s.points.pressure[front] - PRESSURE) / volume.sum() / STRENGTH))
+
+    result = simulation.run(end, (end - start) / max(2, round(depth * cells / WET_STEP)), observe=see, progress=False)
+    points = simulation.points
+    out.frame = points.corners, (points.pressure - PRESSURE) / STRENGTH, bar.drawn(grid, simulation.t)
+    out.steps, out.cuts, out.balance = result.steps, result.cuts, result.balance
+    return out
+
+
 def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return what --json prints."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=8, help="cells over the diameter")
     parser.add_argument("--rough", nargs="*", type=float, default=list(ROUGH), help="alpha")
     parser.add_argument("--depth", type=float, default=0.16, help="of the pushes, over the diameter")
+    parser.add_argument("--wet-cells", type=int, default=4, help="cells over the diameter in wet clay")
+    parser.add_argument("--wet-depth", type=float, default=1.0, help="of the pushes into wet clay, over the diameter")
     o = parser.parse_args(argv)
     if not 4 <= o.cells <= 32 or not 0 < o.depth <= 1 or any(not 0 <= alpha <= 1 for alpha in o.rough):
         parser.error(f"--cells {o.cells} --depth {o.depth} --rough {o.rough}: must be 4 to 32, in (0, 1], in [0, 1]")
+    if not 4 <= o.wet_cells <= 32 or not 0 < o.wet_depth <= 1:
+        parser.error(f"--wet-cells {o.wet_cells} --wet-depth {o.wet_depth}: must be 4 to 32, in (0, 1]")
     steps, runs = max(2, round(o.depth * o.cells / STEP)), {}
     with common.results(o) as out:
         out |= {"errors": {}, "cuts": 0, "steps": 0}
@@ -113,28 +171,50 @@ def main(argv: list[str] | None = None) -> dict:
             out["cuts"], out["steps"] = out["cuts"] + run.cuts, out["steps"] + run.steps
             found = f"alpha = {alpha:g}: N = {last.mean():.3f}, exact {exact(alpha):.3f}"
             print(f"{found}; {run.cuts} of {run.steps} steps cut", flush=True)
-        draw(o, runs)
-        out["converged"] = out["cuts"] <= 0.1 * out["steps"]
+        wet = {name: push_wet(rate, o.wet_cells, o.wet_depth) for name, rate in RATES.items()}
+        for name, run in wet.items():
+            out[name] = {"N": run.N[-1], "excess": run.excess[-1], "steps": run.steps, "cuts": run.cuts}
+            found = f"V = {RATES[name]:g}: N = {run.N[-1]:.2f}, excess pressure ahead {run.excess[-1]:.2f} s_u"
+            print(f"{found}; {run.cuts} of {run.steps} steps cut, fluid balance {run.balance:.1e}", flush=True)
+        out["balance"] = max(run.balance for run in wet.values())
+        draw(o, runs, wet)
+        most = max(run.cuts / run.steps for run in wet.values())
+        out["converged"] = max(most, out["cuts"] / max(1, out["steps"])) <= 0.1 and out["balance"] <= BALANCE
     return out
 
 
-def draw(o: Namespace, runs: dict[float, Push]) -> None:
-    """Draw resistances, and how far the clay has moved around the smoothest and the roughest bar."""
-    ends = dict.fromkeys([*list(runs)[:1], *list(runs)[-1:]])
-    fig, axes = common.figure(1, 1 + len(ends), (13, 4))
+def draw(o: Namespace, runs: dict[float, Push], wet: dict[str, Push]) -> None:
+    """Draw resistances, how far the clay has moved around the smoothest and the roughest bar, and pore pressures."""
+    fig, axes = common.figure(2, 4, (17, 8.5))
     for k, (alpha, run) in enumerate(runs.items()):
         axes[0, 0].plot(run.depth, run.N, color=f"C{k}", label=f"α = {alpha:g}")
         axes[0, 0].axhline(exact(alpha), color=f"C{k}", ls="--", lw=0.8)
-    axes[0, 0].set(xlabel="depth / D (-)", ylabel="F / (s_u D) (-)", title="resistance; dashed: exact")
-    axes[0, 0].legend(fontsize=9)
-    axes[0, 0].grid(alpha=0.3)
-    for ax, alpha in zip(axes[0, 1:], ends, strict=True):
-        corners, moved, bar = runs[alpha].frame
-        domains = common.domains(ax, corners, moved / (o.depth * D), cmap="viridis", clim=(0, 1.5))
-        common.domains(ax, bar, facecolor="0.6", edgecolor="0.6")
-        ax.set(aspect="equal", xlim=(0, 2), ylim=(-2, 2), xlabel="x (m)", ylabel="y (m)", title=f"α = {alpha:g}")
-        fig.colorbar(domains, ax=ax, label="displacement / depth (-)", shrink=0.8)
-    common.save(fig, o.out / "penetration.png", dpi=100)
+    axes[0, 0].set(ylabel="F / (s_u D) (-)", title="undrained clay, from settled on; dashed: exact")
+    for ax, alpha in zip(axes[0, 1:3], [*list(runs)[:1], *list(runs)[-1:]], strict=False):
+        title = f"undrained clay, α = {alpha:g}"
+        show(ax, runs[alpha], "displacement / depth (-)", title, (0, 1.5), o.depth * D)
+    for name, run in wet.items():
+        axes[0, 3].plot(run.depth, run.N, label=f"V = {RATES[name]:g}")
+        axes[1, 0].plot(run.depth, run.excess, label=f"V = {RATES[name]:g}")
+    most = max(np.abs(run.frame[1]).max() for run in wet.values())
+    for ax, (name, run) in zip(axes[1, 1:], wet.items(), strict=True):
+        show(ax, run, "excess pore pressure / s_u (-)", f"{name}, V = v D / c_v = {RATES[name]:g}", (-most, most))
+    axes[0, 3].set(ylabel="F / (s_u D) (-)", title="wet clay, smooth bar, at three rates V", ylim=(0, None))
+    axes[1, 0].set(ylabel="excess pore pressure / s_u (-)", title="wet clay, ahead of the bar")
+    for ax in (axes[0, 0], axes[0, 3], axes[1, 0]):
+        ax.set_xlabel("depth / D (-)")
+        ax.legend(fontsize=9)
+        ax.grid(alpha=0.3)
+    common.save(fig, o.out / "penetration.png", dpi=80)
+
+
+def show(ax, run: Push, label: str, title: str, clim: tuple[float, float], over: float = 1.0) -> None:
+    """Draw the end of a push, what its frame shows over `over`."""
+    corners, values, bar = run.frame
+    domains = common.domains(ax, corners, values / over, cmap="viridis" if clim[0] == 0 else "RdBu_r", clim=clim)
+    common.domains(ax, bar, facecolor="0.6", edgecolor="0.6")
+    ax.set(aspect="equal", xlim=(0, 2), ylim=(-2.5, 2), xlabel="x (m)", ylabel="y (m)", title=title)
+    ax.figure.colorbar(domains, ax=ax, label=label, shrink=0.8)
 
 
 if __name__ == "__main__":

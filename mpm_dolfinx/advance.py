@@ -161,12 +161,12 @@ class Motion:
         The points; whether they are still where they were cut; how many domains had folded.
         """
         grid, stage, folded = cut.grid, state.stage, 0
-        free = ~given(grid, stage.lattices, stage.conditions["fixed"], state.points)
-        free &= ~stage.mechanical.tools.near(state.points.corners + moved, t)[:, :, None]
+        own = ~given(grid, stage.lattices, stage.conditions["fixed"], state.points)
+        free = own & ~stage.mechanical.tools.near(state.points.corners + moved, t)[:, :, None]
         if stage.mechanical.contacts.contacts:
             beside = stage.mechanical.contacts.near(cut, state.points, state.points.corners + moved)
             free &= ~beside[:, :, None]
-        corners = state.points.corners + moved + free * bend
+        corners = stage.mechanical.tools.outside(state.points.corners + moved + free * bend, t, own)
         points = replace(state.points, corners=corners)
         serves, evolved = cut.serves(points), self._materials.evolved(points)
         if not serves:
@@ -175,6 +175,7 @@ class Motion:
             folded = over_all(grid.comm, int(bad.sum()))
             if folded:
                 corners = untangled(points, corners, bad, deformed(), grid, stage.mechanical)
+                corners[bad] = stage.mechanical.tools.outside(corners[bad], t, own[bad], np.inf)
         F = gradient(corners, points.reference, grid.axisymmetric)
         if self._momentum.dilatation is not None:
             locks = self._materials.locking(points)

@@ -42,7 +42,7 @@ QUICK = {
     "triaxial": ("--steps 20", ["triaxial.png"]),
     "cavity": ("--cells 4 --cases well --ratios 2", ["cavity.png"]),
     "indentation": ("--cells 6", ["indentation.png"]),
-    "penetration": ("--cells 4 --rough 0.5 --depth 0.1", ["penetration.png"]),
+    "penetration": ("--cells 4 --rough 0.5 --depth 0.1 --wet-depth 0.05", ["penetration.png"]),
     "retaining_wall": ("--cells 6 --delta 0 --ways active", ["retaining_wall.png"]),
     "barrier": ("--cells 10 --steps 40", ["barrier.png"]),
     "slope": ("--cells 4 --steps 4 --rtol 0.1", ["slope.png"]),

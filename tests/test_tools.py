@@ -53,6 +53,18 @@ def test_a_plate_presses_a_cube_evenly_wherever_it_lies(angle, offset, error):
     assert worst < 1e-3
 
 
+def test_corners_of_a_gel_that_rough_plates_squeeze_stay_outside():
+    """Aslant to the grid; its corners were 5e-3 cells inside of them."""
+    R, middle = turned(0.3), np.array([1.0, 1.04])
+    grid = mpm.Grid([2.0, 2.0], [10, 10])
+    body = mpm.mapped(grid, mpm.box(grid, [0, 0], [0.8, 0.8]), lambda x: (x - 0.4) @ R.T + middle)
+    floor, plate = (mpm.HalfSpace(middle + R @ [0, side * 0.4], R @ [0, -side]) for side in (-1, 1))
+    tools = [mpm.Tool(floor, friction=1.0), mpm.Tool(plate, displacement=lambda t: R @ [0, -0.2 * t], friction=1.0)]
+    s, worst = mpm.Simulation(grid, [body], [GEL], fixed={}, tools=tools), []
+    s.run(1.0, 0.125, observe=lambda s: worst.append(deepest(s)))
+    assert max(worst) < 1.001e-3
+
+
 def test_a_disc_presses_as_hertz_says():
     """16 cells over the half-width: this, force and pressure."""
     cells, R, L, nu = 16, 20.0, 4.0, 0.3

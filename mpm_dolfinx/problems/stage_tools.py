@@ -31,6 +31,7 @@ from mpm_dolfinx.validation import line
 BEGINS = 1e-2  # cells: how deep a tool may be in a body as it begins, and where a displacement is given
 NEAR = 0.1  # cells: corners that are nearer go with the tool
 STRIDE = 0.02  # cells: tools that are thinner may pass points within a step unseen
+LEFT = 1e-3  # cells: how deep corners stay in tools; put onto what is less deep they would roughen the stress
 FACING = 0.5  # cosine between a face's normal and the way to the tool above which it looks at the tool
 
 
@@ -140,8 +141,11 @@ class Tools:
                 if deep > BEGINS:
                     what = f"{line(tool)} and {line(hold)}: both act at {where} at t = {t:g} s"
                     raise ValueError(f"{what}, must not; limit the displacement by a region, or move the tool")
+            corners = points.corners[self._gaps(tool, points.corners, t).min(axis=1) < -BEGINS * self.grid.h.min()]
             deep, where = self._deepest(tool, points.x, t)
-            if deep > 0:
+            held, there = self._deepest(tool, corners.mean(axis=1), t)
+            if deep > NEAR or held > 0:  # stretched domains have their middles in round tools, not their corners
+                where = where if deep > NEAR else there
                 raise NotConverged(f"{line(tool)}: has passed through the surface, to the point at {where}")
             if where := self._passed(tool, (before.x, points.x), (start, t)):
                 raise NotConverged(f"{line(tool)}: has passed through a body within a step, at {where}")
@@ -152,12 +156,43 @@ class Tools:
         What else they follow would be pushed back by the tool in the next step, and roughen the pressure.
         """
         out, h = np.zeros(corners.shape[:2], dtype=bool), self.grid.h.min()
-        x = corners.reshape(-1, self.grid.dim)
         for tool in self.tools:
-            own = tool.pose(t, self.grid.dim).own(x)
-            gap = everywhere(self.grid, lambda tool=tool, own=own: tool.solid(h).distance(own))
-            out |= (gap < NEAR * h).reshape(out.shape)
+            out |= self._gaps(tool, corners, t) < NEAR * h
         return out
+
+    def outside(
+        self, corners: NDArray[np.float64], t: float, free: NDArray[np.bool_], most: float = NEAR
+    ) -> NDArray[np.float64]:
+        """Return corners of domains, with those that are a little in tools put as near their surface as `LEFT`.
+
+        Tools hold the mean of what a cell holds; domains that slide along would leave corners behind in them.
+
+        Parameters
+        ----------
+        corners : (n, 2^d, d), m
+            The corners.
+        t
+            Time, s.
+        free : (n, 2^d, d)
+            Which components nothing else gives.
+        most
+            What is deeper stays, cells.
+        """
+        out, h = corners.copy(), self.grid.h.min()
+        for tool in self.tools:
+            gap, pose = self._gaps(tool, out, t), tool.pose(t, self.grid.dim)
+            gap += LEFT * h
+            at = (gap < 0) & (gap > -most * h)
+            own = pose.own(out[at])
+            n = everywhere(self.grid, lambda tool=tool, own=own: tool.solid(h).normal(own))
+            out[at] -= free[at] * (gap[at, None] * n @ pose.R.T)
+        return out
+
+    def _gaps(self, tool: Tool, corners: NDArray[np.float64], t: float) -> NDArray[np.float64]:
+        """Return distances (n, 2^d), m, of corners (n, 2^d, d) from a tool at time t (s)."""
+        own = tool.pose(t, self.grid.dim).own(corners.reshape(-1, self.grid.dim))
+        gap = everywhere(self.grid, lambda: tool.solid(self.grid.h.min()).distance(own))
+        return gap.reshape(corners.shape[:2])
 
     def _passed(self, tool: Tool, x: tuple[NDArray[np.float64], ...], times: tuple[float, ...]) -> str:
         """Return one of the places x (n, d) that go straight through a tool between two times (s), or nothing.
@@ -168,6 +203,12 @@ class Tools:
         y, end = (tool.pose(t, d).own(at) for at, t in zip(x, times, strict=True))
         way, gone, on = np.linalg.norm(end - y, axis=1), np.zeros(len(y)), np.arange(len(y))
         along = (end - y) / np.maximum(way, LEAST)[:, None]
+        inside = everywhere(self.grid, lambda: (tool.solid(h).distance(y) < 0) | (tool.solid(h).distance(end) < 0))
+        a, b = everywhere(self.grid, lambda: (tool.solid(h).normal(y[inside]), tool.solid(h).normal(end[inside])))
+        turned = x[1][inside][np.einsum("nd,nd->n", a, b) < 0][:1]  # a middle in the tool that comes to its other side
+        if where := first(comm, "".join(np.array2string(place, precision=6) for place in turned)):
+            return where
+        on = on[~inside]
         while over_all(comm, len(on)):
             at = y[on] + gone[on, None] * along[on]
             gap = everywhere(self.grid, lambda at=at: tool.solid(h).distance(at))

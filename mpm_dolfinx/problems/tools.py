@@ -179,8 +179,10 @@ class Convex:
         return self._each(y).max(axis=1)
 
     def normal(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the gradients (m, d) of the distance."""
-        return self._planes[self._each(y).argmax(axis=1), :-1]
+        """Return the gradients (m, d) of the distance: where planes are as near, the mean of their normals."""
+        each = self._each(y)
+        near = each >= each.max(axis=1, keepdims=True) - ROUNDED * np.abs(each).max(axis=1, keepdims=True)
+        return near @ self._planes[:, :-1] / near.sum(axis=1, keepdims=True)
 
     def curvature(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the second derivatives (m, d, d) of the distance, 1/m."""

@@ -1,0 +1,24 @@
+# SPDX-License-Identifier: MIT
+"""A bar that is pushed far into wet clay: clay that slides around it stays out of it."""
+
+import numpy as np
+import penetration as demo
+import pytest
+
+
+@pytest.mark.parametrize(
+    ("rate", "depth"),
+    [(1000.0, 0.25), *(pytest.param(rate, 1.0, marks=pytest.mark.slow) for rate in demo.RATES.values())],
+)
+def test_wet_clay_flows_around_a_smooth_bar(rate, depth):
+    """No corner is deeper in the bar than 1e-3 h; steps are not cut, and the fluid balances."""
+    cells = 4
+    run = demo.push_wet(rate, cells, depth)
+    corners, excess, _ = run.frame
+    assert run.depth[-1] == pytest.approx(depth)
+    assert run.cuts <= 0.1 * run.steps
+    assert run.balance <= 1e-8
+    gap = np.linalg.norm(corners + np.array([0, depth * demo.D]), axis=2) - demo.D / 2
+    assert gap.min() >= -1.001e-3 * demo.D / cells
+    assert run.N[-1] == pytest.approx(demo.exact(0), rel=0.25)  # 4 cells are few
+    assert excess.max() > 3 if rate == 1000 else run.excess[-1] < 3
