@@ -10,7 +10,8 @@ a mass, of a fluid of the density rho that fills J + b / a.  Divided by rho half
 is of second order for any path, and nothing where no fluid flows, however long the step.
 
 Fluid that leaves a cell enters its neighbour with its mass.  The flow of mass, of fluid of the density rho_w
-exp(p / K_w), is -rho_w kappa grad pi with pi = K_w (exp(p / K_w) - 1) (Kirchhoff's transformation).
+exp(p / K_w), is -rho_w kappa grad pi with pi = K_w (exp(p / K_w) - 1) (Kirchhoff's transformation).  Between two
+pressures the density is then the logarithmic mean (pi+ - pi-) / (p+ - p-) of both.
 """
 
 from __future__ import annotations
@@ -33,9 +34,7 @@ def change_of_content(alpha, a, storage, J, dp):
         Change of the pore pressure, Pa.
     """
     z = a * dp / (2 * alpha)
-    small = ufl.lt(abs(z), 1e-3)
-    away = ufl.conditional(small, 1.0, z)  # both branches are evaluated, and differentiated
-    return _change(alpha, a, storage, J, dp, ufl.cosh(z), ufl.conditional(small, 1 + z**2 / 6, ufl.sinh(away) / away))
+    return _change(alpha, a, storage, J, dp, ufl.cosh(z), _sinhc(z))
 
 
 def change_at_points(alpha, a, storage, J, dp) -> NDArray[np.float64]:
@@ -58,10 +57,18 @@ def pressure_of(pi, bulk: float):
 
 def mass_potential_form(p, compliance):
     """Return the same as UFL; compliance: 1 / K_w, 1/Pa."""
-    z = compliance * p / 2
+    return p * density_between(p, 0.0, compliance)
+
+
+def density_between(p0, p1, compliance):
+    """Return the logarithmic mean of the densities at two pressures, over that at zero pressure, as UFL."""
+    return ufl.exp(compliance * (p0 + p1) / 2) * _sinhc(compliance * (p0 - p1) / 2)
+
+
+def _sinhc(z):
     small = ufl.lt(abs(z), 1e-3)
-    away = ufl.conditional(small, 1.0, z)
-    return p * ufl.exp(z) * ufl.conditional(small, 1 + z**2 / 6, ufl.sinh(away) / away)
+    away = ufl.conditional(small, 1.0, z)  # both branches are evaluated, and differentiated
+    return ufl.conditional(small, 1 + z**2 / 6, ufl.sinh(away) / away)
 
 
 def _change(alpha, a, storage, J, dp, cosh, sinhc):

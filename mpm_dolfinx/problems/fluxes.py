@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx import _compat
 from mpm_dolfinx.caching import Keyed
-from mpm_dolfinx.constitutive.fluid_content import mass_potential
+from mpm_dolfinx.constitutive.fluid_content import density_between, mass_potential
 from mpm_dolfinx.forms.point_forms import FacetForm, FacetSum
 from mpm_dolfinx.forms.unknowns import sum_ghosts
 from mpm_dolfinx.points.grid import Grid, sum_by
@@ -254,11 +254,6 @@ class CellContents(Keyed):
             hoop = 1 + moved[:, 0] / (self.grid.midpoints[self.filled, 0] + self.centroid[self.filled, 0])
         return CellMotion(np.eye(self.grid.dim) + nodal @ self._slopes, moved, hoop)
 
-    def at_rest(self, flow: Conduction) -> NDArray[np.float64]:
-        """Return the pressures (n,) that water at rest would have in the filled cells, less any constant, Pa."""
-        x = self.grid.midpoints[self.filled] + self.centroid[self.filled]
-        return (x if flow.motion is None else x + flow.motion.moved) @ flow.weight
-
     def slot(self, cells: NDArray[np.int32]) -> NDArray[np.int64]:
         """Return the places of cells among the filled ones."""
         return self._slot[cells]
@@ -275,9 +270,15 @@ class FluxForms:
         Weight of the pore fluid rho_w g as UFL, None without gravity.
     flows
         Whether anything conducts; without, there are no fluxes.
+    pressure
+        DG0 pore pressure, Pa.
+    bulk
+        Bulk modulus of the fluid, Pa.
     """
 
-    def __init__(self, grid: Grid, weight: ufl.core.expr.Expr | None, flows: bool):
+    def __init__(
+        self, grid: Grid, weight: ufl.core.expr.Expr | None, flows: bool, pressure: fem.Function, bulk: float
+    ):
         self.grid, mesh, d, Q = grid, grid.mesh, grid.dim, grid.cellwise()
         q, dp = ufl.TestFunction(Q), ufl.TrialFunction(Q)
         self.damping, self.fixed_stress = (fem.Function(Q) for _ in range(2))
@@ -319,7 +320,9 @@ class FluxForms:
         self.gravity = None
         if weight is not None and flows:
             apart = across * n0 - ufl.jump(self.centroid + self.moved)
-            self.gravity = FacetForm(T * ufl.dot(weight, apart) * ufl.jump(q) * dS, grid.comm)
+            # so water at rest, whose pressure grows by its weight at zero pressure, stays at rest
+            density = density_between(pressure("+"), pressure("-"), fem.Constant(mesh, 1 / bulk))
+            self.gravity = FacetForm(T * density * ufl.dot(weight, apart) * ufl.jump(q) * dS, grid.comm)
 
     def along(
         self, slope: NDArray[np.float64], cells: NDArray[np.int64], facets: FacetSum, density: NDArray[np.float64]
