@@ -32,6 +32,7 @@ A rough circular footing on Tresca's soil carries 6.05 s_u (Cox, Eason and Hopki
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -205,10 +206,17 @@ def main(argv: list[str] | None = None) -> dict:
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=9, help="cells over the footing's width, odd")
     parser.add_argument("--depth", type=float, default=1.0, help="depth of the push over the footing's width")
+    parser.add_argument("--steps", type=int, help="only push at the intermediate rate, in so many equal steps")
+    parser.add_argument("--box", type=float, default=BOX[0], help="with --steps: width of half the soil over B")
     o = parser.parse_args(argv)
     if o.cells < 3 or o.cells % 2 == 0 or not 0 < o.depth <= 1.5:
         parser.error(f"--cells {o.cells} --depth {o.depth:g}: must be odd and >= 3, and in (0, 1.5]")
+    if o.steps is not None and (o.steps < 1 or not 1 <= o.box <= 32):
+        parser.error(f"--steps {o.steps} --box {o.box:g}: must be >= 1, and in [1, 32]")
     with common.results(o) as out:
+        if o.steps is not None:
+            out |= effort(o.cells, o.depth, o.steps, o.box)
+            return out
         stiff = {(how, cells): limit_load(how, cells) for how in LIMITS_OF for cells in (o.cells, 2 * o.cells - 1)}
         out["errors"] = errors(stiff)
         runs = {}
@@ -218,6 +226,23 @@ def main(argv: list[str] | None = None) -> dict:
         draw(o.out, runs, stiff)
         animate(o.out, runs["intermediate"])
     return out
+
+
+def effort(cells: int, depth: float, steps: int, width: float) -> dict:
+    """Push at the intermediate rate in equal steps; print what they took and return it.
+
+    width: of half the soil, over B.
+    """
+    began = time.process_time()
+    run = push(SOIL, cells, depth, RATES["intermediate"], box=(width, BOX[1]), steps=steps)
+    found = {"points": run.results[0].points, "asked": steps, "load": run.load[-1]}
+    found |= {count: run.total(count) for count in ("steps", "cuts", "newton")} | {"cpu": time.process_time() - began}
+    print(
+        f"{cells} cells over the width, {found['points']} points, pushed by {depth:g} B in {steps} steps: q/c "
+        f"{found['load']:.2f}, {found['steps']} steps taken, {found['cuts']} cut, {found['newton']} Newton steps, "
+        f"{found['cpu']:.0f} s of processor time"
+    )
+    return found
 
 
 def errors(stiff: dict[tuple[str, int], Push]) -> dict[str, float]:

@@ -99,7 +99,7 @@ def test_a_fast_push_carries_what_limit_analysis_says_of_an_embedded_base():
 def test_a_footing_is_pushed_through_soil_that_yields_without_cut_steps():
     """With full Newton steps alone, each from rest: one cut step, 103 Newton steps."""
     run = footing.push(footing.SOIL, 11, 0.1, footing.RATES["intermediate"], box=(4.0, 2.5), steps=4)
-    assert run.total("cuts") == 0 and run.total("newton") < 98
+    assert run.total("cuts") == 0 and run.total("newton") < 85
 
 
 @pytest.mark.slow
@@ -107,3 +107,11 @@ def test_finer_cells_are_pushed_as_well():
     """With shortened steps that ended where the residual fell, before the work turned: three cuts, 259 Newton steps."""
     run = footing.push(footing.SOIL, 21, 0.06, footing.RATES["intermediate"], box=(4.0, 2.5), steps=4)
     assert run.total("cuts") == 0 and run.total("newton") < 180
+
+
+def test_what_a_push_takes_is_printed(capsys):
+    out = footing.main("--cells 5 --depth 0.02 --steps 2 --box 2".split())
+    assert out["converged"] and out["points"] == 10 * 12 * 4 and out["steps"] >= 2 and out["newton"] > 2
+    assert "pushed by 0.02 B in 2 steps" in capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        footing.main(["--steps", "0"])

@@ -49,14 +49,23 @@ class Balances(NamedTuple):
         return self.storage and self.storage.came(rates)
 
 
+def going_on(scene: Scene, start: Start, substep: Substep) -> NDArray[np.float64] | None:
+    """Return displacements (unknowns,), m, if bodies that yield moved on as in the substep before, or the last step.
+
+    A local array, None where that is not known.
+    """
+    if substep.before > 0.0 and not scene.momentum.elastic:
+        return substep.end / substep.own * scene.momentum.u.x.array
+    velocity = start.state.velocity if substep.before == 0.0 else None
+    return None if velocity is None else substep.end * start.dt * velocity
+
+
 def balances(scene: Scene, start: Start, acting: Acting, before: Rates | None = None) -> Balances:
     """Return the balances at the end of a substep, with u and p as they are; before: rates of the substep before."""
     substep, on_grid, matrices, dt = acting.substep, start.on_grid, start.matrices, start.dt
     scene.set_time(acting.t, substep.end * dt, acting.gravity)
     scene.momentum.set_rate(substep.own * dt, substep.before / substep.own)
-    velocity = start.state.velocity if substep.before == 0.0 else None  # else the substep before tells more
-    goes_on = None if velocity is None else substep.end * dt * velocity
-    forces = (matrices.round_off, goes_on, start.state.held)
+    forces = (matrices.round_off, going_on(scene, start, substep), start.state.held)
     momentum = MomentumProblem(scene.momentum, matrices.momentum, start.data, acting.sides, *forces)
     if scene.storage is None:
         return Balances(momentum, None)

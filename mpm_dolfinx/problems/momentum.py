@@ -347,7 +347,7 @@ class MomentumProblem:
     round_off
         Norm of the residual that rounding leaves, N.
     goes_on : (unknowns,)
-        Displacements if the bodies moved on as in the last step, a local array, m; None where that is not known.
+        Displacements if the bodies moved on as they did before, a local array, m; None where that is not known.
     held : (unknowns,)
         Forces that hold what is out of balance of an initial stress, a local array, N, if there are any.
     """
@@ -403,7 +403,7 @@ class MomentumProblem:
     def guesses(self) -> list[NDArray[np.float64]]:
         """Return displacements (local unknowns,), m, at which Newton's method may begin.
 
-        Those of a turn, if given displacements turn the bodies as one, and those of the last step gone on with.
+        Those of a turn, if given displacements turn the bodies as one, and those of bodies that move on as before.
         """
         forms, holds = self.forms, self._sides.holds
         turns = holds is not None and not forms.grid.axisymmetric
