@@ -276,9 +276,7 @@ class FluxForms:
         Bulk modulus of the fluid, Pa.
     """
 
-    def __init__(
-        self, grid: Grid, weight: ufl.core.expr.Expr | None, flows: bool, pressure: fem.Function, bulk: float
-    ):
+    def __init__(self, grid: Grid, weight: ufl.core.expr.Expr | None, flows: bool, pressure: fem.Function, bulk: float):
         self.grid, mesh, d, Q = grid, grid.mesh, grid.dim, grid.cellwise()
         q, dp = ufl.TestFunction(Q), ufl.TrialFunction(Q)
         self.damping, self.fixed_stress = (fem.Function(Q) for _ in range(2))

@@ -21,7 +21,7 @@ from mpm_dolfinx.validation import asked, line, numbers
 
 LEAST = 1e-300  # in place of a distance from a centre, m
 ROUNDED = 1e-9  # cells: what is no deeper in a tool is on its surface
-ONTO = 5  # times that a place is put onto the surface
+ONTO = 100  # times at most that a place is put onto the surface
 DISTANCE = 0.1
 """Relative error of the slope of a user's distance from which on it is none."""
 
@@ -381,6 +381,9 @@ class Tool:
         cells = grid.corners(np.arange(np.prod(grid.shape)))
         used, at = np.unique(cells[inside[cells].any(axis=1)], return_inverse=True)
         y = y[used]
-        for _ in range(ONTO):  # where planes meet, onto one after the other
-            y = y - np.maximum(solid.distance(y), 0)[:, None] * solid.normal(y)
+        for _ in range(ONTO):  # where planes meet
+            gap = solid.distance(y)
+            if (gap <= ROUNDED * grid.h.min()).all():
+                break
+            y = y - np.maximum(gap, 0)[:, None] * solid.normal(y)
         return pose.put(y)[at.reshape(-1, cells.shape[1])]
