@@ -140,10 +140,9 @@ def test_a_body_that_turns_by_360_degrees_has_its_stresses_back():
 
 @pytest.mark.slow
 def test_a_stretched_block_after_ten_turns_is_that_after_one():
-    """A side gives way to what its stress changes in a step: the first turn leaves 3e-5 E, 6e-6 E once it rests.
+    """The stress that sides carry turns with them: the first turn leaves 1e-6 E, those after it less and less.
 
-    Half as much with half the step.  What the start of the turning has left besides fades from turn to turn, by a
-    factor of 18: 1.3e-7, 7e-9, 4e-10 E, with a tolerance of 1e-12 as with 1e-8.
+    Were it fixed in space, sides would give way to its turn in each step: 2.6e-5 E.
     """
     grid, centre = mpm.Grid([1.6, 1.6], [8, 8]), np.full(2, 0.81)
     block = mpm.box(grid, centre - 0.3, centre + 0.3)
@@ -161,7 +160,7 @@ def test_a_stretched_block_after_ten_turns_is_that_after_one():
         stress.append(s.effective_stress())
     one, three, ten = (np.abs(after - before).max() / 1e7 for before, after in pairwise(stress))
     print(f"one turn {one:.0e} E, two more {three:.0e} E, seven more {ten:.0e} E, {cuts} cut steps")
-    assert one < 5e-5 and three < 3e-7 and ten < 1e-8 and cuts == 0
+    assert one < 3e-6 and three < 1e-7 and ten < 1e-9 and cuts == 0
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -285,6 +284,6 @@ def test_a_turn_is_found_where_walls_hold_a_part_of_the_body():
         return s
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("mpm_dolfinx.problems.rigid_motion.TURNS", np.inf)
+        patch.setattr("mpm_dolfinx.problems.momentum.rigid_motion", lambda *_: None)
         other = run()
     assert run().points.x == pytest.approx(other.points.x, abs=1e-8)

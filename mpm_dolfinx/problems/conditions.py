@@ -262,8 +262,8 @@ RIGIDITY = 1e4
 HOLD = 3e2
 """Stiffness of what holds the mean of a given displacement in a cell, in units of (modulus by `holding`) / (cell size).
 
-The side gives way by (change of stress in the step) / (modulus) x cell size / HOLD, always measured from its given
-place: nothing adds up.
+The side gives way by (change of stress in the step, but for its turn) / (modulus) x cell size / HOLD, always measured
+from its given place: nothing adds up.
 """
 WEAK = 8.0
 """The same for what is left of it at the points of integration, of (modulus + 10 stress) / (cell size)."""

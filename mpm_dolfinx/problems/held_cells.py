@@ -3,7 +3,8 @@
 
 A Q1 field cannot follow a side at more places than it has nodes for: held firmly at each of them, sides that are curved
 or lie aslant to the grid would lock.  The weak part leaves no wave to itself that the means do not see.  It carries
-the stress that the body has there, so what holds takes the step's change of stress only, and gives way by so much less.
+the stress that the body has there, turned as the side is, so what holds takes the step's change of stress only, and
+gives way by so much less.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ class HeldPoints(NamedTuple):
     firm : (n,) modulus to hold with, norm of the stress when the grid was reset, what resists, and what resists where
     nothing can give way, times area, N; x, gap :
     (n, d) position, and how far it is from where it is to be, m; normal : (n, d) area vector when the grid was reset,
-    m^(d-1); force : (n, d) of the body's present stress, N.
+    m^(d-1); force : (n, d) of the body's present stress, as the side turns it, N.
     """
 
     number: NDArray[np.int64]

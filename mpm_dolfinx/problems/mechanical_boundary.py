@@ -40,6 +40,7 @@ from mpm_dolfinx.problems.conditions import (
 )
 from mpm_dolfinx.problems.contacts import Contact
 from mpm_dolfinx.problems.held_cells import SAME, HeldCells, HeldPoints
+from mpm_dolfinx.problems.rigid_motion import turned
 from mpm_dolfinx.problems.side_forms import SideData, SideForms
 from mpm_dolfinx.problems.sides import Sides, check_apart, everywhere, gathered, meeting, on_side
 from mpm_dolfinx.problems.stage_contacts import Contacts
@@ -261,9 +262,10 @@ class MechanicalBoundary:
         firm = self._materials.confined_modulus(before)
         # of when the grid was reset, as the stiffnesses: they stay as long as the cut serves
         tension = np.linalg.norm(stress if points is cut.points else self._materials.total_stress(before), axis=(1, 2))
-        for number, ((hold, *_), p) in enumerate(zip(self.holds, patches, strict=True)):
-            at, gap = np.searchsorted(chosen, p.at), p.origin(points) + self._given(hold, t, p.X) - p.now(points)
-            force = np.einsum("nij,nj->ni", stress[at, :d, :d], p.area(points))
+        for number, ((hold, *_, axes), p) in enumerate(zip(self.holds, patches, strict=True)):
+            at, now, to = np.searchsorted(chosen, p.at), p.now(points), p.origin(points) + self._given(hold, t, p.X)
+            R = turned(self.grid.comm, p.area0, now, to) if len(axes) == d else np.eye(d)  # as what it carries does
+            force, gap = np.einsum("ij,njk,nk->ni", R, stress[at, :d, :d], p.area(points)), to - now
             own = (p.area0 * v for v in (1, modulus[at], tension[at], resists[at], firm[at]))
             each = np.stack([np.full(len(gap), number), *own], axis=1)
             rows.append((p.cell, p.x, np.concatenate([each, gap, p.area(cut.points), force], axis=1)))

@@ -64,6 +64,26 @@ def rigid_motion(comm: MPI.Intracomm, holds: PointData, x: NDArray[np.float64]) 
     return shift + _apply(turn, x - centre) - (x - centre)
 
 
+def turned(
+    comm: MPI.Intracomm, weight: NDArray[np.float64], x: NDArray[np.float64], to: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the rotation (d, d) nearest to the motion of weighted places x (n, d) to others, m (Kabsch 1976).
+
+    The identity where they are not turned, or where the rotation does not come near.  All processes call it together.
+    """
+    d = x.shape[1]
+    sums = over_all(comm, np.concatenate([[weight.sum()], weight @ x, weight @ to]))
+    if not sums[0] > 0:
+        return np.eye(d)
+    arm, goal = x - sums[1 : 1 + d] / sums[0], to - sums[1 + d :] / sums[0]
+    left, _, right = np.linalg.svd(over_all(comm, goal.T @ (weight[:, None] * arm)))
+    left[:, -1] *= np.linalg.det(left) * np.linalg.det(right)
+    R = left @ right
+    off = np.array([weight @ ((goal - arm @ by.T) ** 2).sum(axis=1) for by in (R, np.eye(d))])
+    less, most = over_all(comm, off)
+    return R if less < MEETS**2 * most and np.linalg.norm(R - np.eye(d)) > TURNS else np.eye(d)
+
+
 def _apply(turn: Rotation, x: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return vectors (n, d) turned, in the plane about its normal."""
     d = x.shape[1]
