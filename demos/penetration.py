@@ -10,20 +10,25 @@ Half of the clay, a block eight diameters wide and high, lies between smooth wal
 keeps the gap behind the bar closed; as that settles the clay, it loads the bar downwards first.  In a narrower block
 the bar resists less: in one four diameters wide, with 8 and 16 cells over the diameter, 10.9 and 10.8 if it is rough.
 
-Errors are those of the mean of N over the last quarter of the push; `spread` is by how much it varies there.
+Clay ahead of the bar parts, and stretches exponentially, by about e^4 over a diameter.  So clay is seeded anew around
+the bar after each quarter of a diameter, under the stresses that are there (remeshing and interpolation: Hu and
+Randolph 1998, Int. J. Numer. Anal. Meth. Geomech. 22): all that this clay remembers.  For a step or two N is lower
+then.  Errors are those of its mean over the last quarters of these ways, `spread` is by how much it varies in them.
 
 Wet clay is pushed by a whole diameter, by a smooth bar, at three rates V = v D / c_v, with water of the same pressure
-on top, so that it begins without effective stress.  Clay ahead of the bar parts, and stretches exponentially, by about
-e^4 over a diameter: domains that are as much narrower there at first end as wide as the others.
+on top, so that it begins without effective stress.  It is seeded once: domains that are narrower ahead of the bar at
+first, by what they will stretch, end as wide as the others.
 """
 
 from __future__ import annotations
 
 from argparse import Namespace
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import common
 import numpy as np
+from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 
 import mpm_dolfinx as mpm
 
@@ -33,6 +38,8 @@ STRENGTH, PRESSURE = 1e3, 2e4  # Pa: s_u of the undrained clay, and the pressure
 SHEAR = 100 * STRENGTH
 ROUGH = (0.0, 0.5, 1.0)
 WALLS = {"left": "x", "right": "x", "bottom": "y"}
+LEG, STEADY = 0.25, 0.75  # diameters after which clay is seeded anew; share of such a way from which on N counts
+BEARS = 0.999  # share of the strength that stresses may take as clay is seeded anew
 STEP, WET_STEP = 1 / 24, 1 / 18  # cells that the bar goes in a step
 NOSE = 0.02  # width of the wet clay's narrowest domains over that of the others
 PARTS = 4  # each of those that widen away from the nose is a part of its distance from there
@@ -61,13 +68,14 @@ def angles(around: int, nose: float) -> np.ndarray:
     return np.concatenate([np.linspace(0, near[-1], PARTS + 1)[:-1], near[:0:-1], even[PARTS:]])
 
 
-def clay(cells: int, nose: float = 1) -> tuple:
-    """Return a grid with so many cells over the diameter, half of the block around the bar, the region of its top."""
+def clay(cells: int, nose: float = 1, y: float = 0.0) -> tuple:
+    """Return a grid with so many cells over the diameter, half of the block around a bar at y, m, its top's region."""
     h = D / cells
     n = round(HALF * cells)
     grid = mpm.Grid([HALF, HALF + 4 * h], [n, 2 * n + 4], lower=[0, -HALF])
     around, outward = 4 * round(np.pi * D / 2 / (FINE * h) / 4), round(np.log(2 * HALF / D) * D / 2 / (FINE * h))
-    at = angles(around, nose)
+    corners = [0, np.arctan2(HALF, HALF + y), np.pi - np.arctan2(HALF, HALF - y), np.pi]
+    at = np.interp(angles(around, nose), np.pi * np.array([0, 1, 3, 4]) / 4, corners)
     size = np.array([outward, len(at) - 1]) * h / 2
 
     top = ((0, size[1] - around / 4 * h / 2 - HALF - 1e-9), tuple(size))
@@ -75,22 +83,23 @@ def clay(cells: int, nose: float = 1) -> tuple:
     def ring(X: np.ndarray) -> np.ndarray:  # from the bar to the block's sides, ever larger
         angle = np.interp((X[:, 1] + HALF) / (h / 2), np.arange(len(at)), at)
         e = np.stack([np.sin(angle), -np.cos(angle)], axis=1)
-        reach = HALF / np.abs(e).max(axis=1)
-        return e * (D / 2 * (2 * reach / D) ** (X[:, 0] / size[0]))[:, None]
+        reach = 1 / np.maximum(e[:, 0] / HALF, np.abs(e[:, 1]) / np.where(e[:, 1] > 0, HALF - y, HALF + y))
+        return e * (D / 2 * (2 * reach / D) ** (X[:, 0] / size[0]))[:, None] + [0, y]
 
     return grid, mpm.mapped(grid, mpm.box(grid, [0, -HALF], size - [0, HALF]), ring), top
 
 
 @dataclass
 class Push:
-    """A push, a step each: depths over D, resistances over s_u D, excess pressures of wet clay ahead over s_u.
+    """A push, a step each: depths over D, resistances over s_u D, whether they count, and excess pressures over s_u.
 
-    frame: corners (n, 4, 2), m, how far points have moved (n,), m, or excess pressures of wet clay over s_u (n,), and
-    what the bar fills (m, 4, 2), m, at the end.
+    frame: corners (n, 4, 2), m, how far points have moved over how far the bar has, since the clay was seeded (n,), or
+    excess pressures of wet clay over s_u (n,), and what the bar fills (m, 4, 2), m, at the end.
     """
 
     depth: list[float] = field(default_factory=list)
     N: list[float] = field(default_factory=list)
+    steady: list[bool] = field(default_factory=list)
     excess: list[float] = field(default_factory=list)
     frame: tuple = ()
     steps: int = 0
@@ -98,25 +107,54 @@ class Push:
     balance: float = 0.0
 
 
-def push(alpha: float, cells: int, depth: float, steps: int) -> Push:
-    """Press the clay, then push a bar of roughness alpha to a depth, over D, in so many steps."""
-    grid, body, top = clay(cells)
+def push(alpha: float, cells: int, depth: float) -> Push:
+    """Press the clay, then push a bar of roughness alpha to a depth, over D, in clay that is seeded anew on the way."""
+    out, stress, legs = Push(), None, max(1, round(depth / LEG))
+    for k in range(legs):
+        stress = leg(out, stress, alpha, cells, depth * (0.5 - k / legs), depth / legs)
+    return out
+
+
+def leg(out: Push, stress: Callable | None, alpha: float, cells: int, y: float, way: float) -> Callable:
+    """Push a bar at y over D by a way, over D, from stresses or after pressing the clay; return the stresses then."""
+    (grid, body, top), begin, gone = clay(cells, y=y * D), 1.0 if stress is None else 0.0, max(out.depth, default=0.0)
     soil = mpm.DruckerPrager(bulk=50 * SHEAR, shear=SHEAR, friction=0.0, dilation=0.0, cohesion=STRENGTH)
-    bar = mpm.Tool(mpm.Ball((0, 0), D / 2), lambda t: (0, -D * max(0, t - 1)), adhesion=alpha * STRENGTH)
-    load = mpm.Pressure("right", lambda t: PRESSURE * min(1, t), region=top)
-    simulation = mpm.Simulation(grid, [body], [soil], fixed=WALLS, tractions=[load], tools=[bar])
-    simulation.run(1.0, 1.0, progress=False)
-    out, start = Push(), simulation.points.x
+    bar = mpm.Tool(mpm.Ball((0, y * D), D / 2), lambda t: (0, -D * max(0, t - begin)), adhesion=alpha * STRENGTH)
+    load = mpm.Pressure("right", lambda t: PRESSURE * (min(1, t) if begin else 1), region=top)
+    acting = {"fixed": WALLS, "tractions": [load], "tools": [bar], "initial_stress": stress}
+    simulation = mpm.Simulation(grid, [body], [soil], **acting)
+    if begin:
+        simulation.run(begin, begin, progress=False)
+    start = simulation.points.x
 
     def see(s: mpm.Simulation) -> None:
-        out.depth.append(s.t - 1)
+        out.depth.append(gone + s.t - begin)
         out.N.append(-2 * float(s.tool_forces[0, 1]) / STRENGTH / D)
+        out.steady.append(s.t - begin > STEADY * way)
 
-    result = simulation.run(1 + depth, depth / steps, observe=see, progress=False)
+    result = simulation.run(begin + way, way / max(2, round(way * cells / STEP)), observe=see, progress=False)
     points, drawn = simulation.points, bar.drawn(grid, simulation.t)
-    out.frame = points.corners, np.linalg.norm(points.x - start, axis=1), drawn
-    out.steps, out.cuts = result.steps, result.cuts
-    return out
+    out.frame = points.corners, np.linalg.norm(points.x - start, axis=1) / (way * D), drawn
+    out.steps, out.cuts = out.steps + result.steps, out.cuts + result.cuts
+    return kept(simulation)
+
+
+def kept(simulation: mpm.Simulation) -> Callable:
+    """Return the effective stress (n, 3, 3), Pa, at places x (n, 2), between the points and as the clay can bear it."""
+    x, stress = simulation.points.x, simulation.point_fields().effective_stress
+    flat = [stress[:, a, b] for a, b in ((0, 0), (1, 1), (2, 2), (0, 1))]
+    between, nearest = (by(x, np.stack(flat, axis=1)) for by in (LinearNDInterpolator, NearestNDInterpolator))
+
+    def bearable(x: np.ndarray) -> np.ndarray:
+        values = between(x)
+        values = np.where(np.isnan(values), nearest(x), values)  # outside of the outermost points
+        out = values[:, :3, None] * np.eye(3)
+        out[:, 0, 1] = out[:, 1, 0] = values[:, 3]
+        mean = np.trace(out, axis1=1, axis2=2)[:, None, None] / 3 * np.eye(3)
+        shear = np.sqrt(((out - mean) ** 2).sum(axis=(1, 2)) / 2)
+        return mean + (out - mean) * np.minimum(1, BEARS * STRENGTH / shear)[:, None, None]
+
+    return bearable
 
 
 def push_wet(rate: float, cells: int, depth: float) -> Push:
@@ -152,25 +190,25 @@ def main(argv: list[str] | None = None) -> dict:
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=8, help="cells over the diameter")
     parser.add_argument("--rough", nargs="*", type=float, default=list(ROUGH), help="alpha")
-    parser.add_argument("--depth", type=float, default=0.16, help="of the pushes, over the diameter")
+    parser.add_argument("--depth", type=float, default=1.0, help="of the pushes, over the diameter")
     parser.add_argument("--wet-cells", type=int, default=4, help="cells over the diameter in wet clay")
     parser.add_argument("--wet-depth", type=float, default=1.0, help="of the pushes into wet clay, over the diameter")
     o = parser.parse_args(argv)
-    if not 4 <= o.cells <= 32 or not 0 < o.depth <= 1 or any(not 0 <= alpha <= 1 for alpha in o.rough):
-        parser.error(f"--cells {o.cells} --depth {o.depth} --rough {o.rough}: must be 4 to 32, in (0, 1], in [0, 1]")
+    if not 4 <= o.cells <= 32 or not 0 < o.depth <= 4 or any(not 0 <= alpha <= 1 for alpha in o.rough):
+        parser.error(f"--cells {o.cells} --depth {o.depth} --rough {o.rough}: must be 4 to 32, in (0, 4], in [0, 1]")
     if not 4 <= o.wet_cells <= 32 or not 0 < o.wet_depth <= 1:
         parser.error(f"--wet-cells {o.wet_cells} --wet-depth {o.wet_depth}: must be 4 to 32, in (0, 1]")
-    steps, runs = max(2, round(o.depth * o.cells / STEP)), {}
+    runs = {}
     with common.results(o) as out:
         out |= {"errors": {}, "cuts": 0, "steps": 0}
         for alpha in o.rough:
-            run = runs[alpha] = push(alpha, o.cells, o.depth, steps)
-            last = np.array(run.N[-max(1, steps // 4) :])
+            run = runs[alpha] = push(alpha, o.cells, o.depth)
+            last = np.array(run.N)[run.steady]
             out["errors"][f"alpha {alpha:g}"] = float(last.mean() / exact(alpha) - 1)
             out[f"spread {alpha:g}"] = float(np.ptp(last) / last.mean())
             out["cuts"], out["steps"] = out["cuts"] + run.cuts, out["steps"] + run.steps
-            found = f"alpha = {alpha:g}: N = {last.mean():.3f}, exact {exact(alpha):.3f}"
-            print(f"{found}; {run.cuts} of {run.steps} steps cut", flush=True)
+            found = f"alpha = {alpha:g}: N = {last.mean():.3f}, {last.min():.3f} to {last.max():.3f}"
+            print(f"{found}, exact {exact(alpha):.3f}; {run.cuts} of {run.steps} steps cut", flush=True)
         wet = {name: push_wet(rate, o.wet_cells, o.wet_depth) for name, rate in RATES.items()}
         for name, run in wet.items():
             out[name] = {"N": run.N[-1], "excess": run.excess[-1], "steps": run.steps, "cuts": run.cuts}
@@ -189,10 +227,11 @@ def draw(o: Namespace, runs: dict[float, Push], wet: dict[str, Push]) -> None:
     for k, (alpha, run) in enumerate(runs.items()):
         axes[0, 0].plot(run.depth, run.N, color=f"C{k}", label=f"α = {alpha:g}")
         axes[0, 0].axhline(exact(alpha), color=f"C{k}", ls="--", lw=0.8)
-    axes[0, 0].set(ylabel="F / (s_u D) (-)", title="undrained clay, from settled on; dashed: exact")
+    title = "undrained clay; dashed: exact"
+    axes[0, 0].set(ylabel="F / (s_u D) (-)", title=title, ylim=(0, None))
     for ax, alpha in zip(axes[0, 1:3], [*list(runs)[:1], *list(runs)[-1:]], strict=False):
         title = f"undrained clay, α = {alpha:g}"
-        show(ax, runs[alpha], "displacement / depth (-)", title, (0, 1.5), o.depth * D)
+        show(ax, runs[alpha], "displacement / that of the bar (-)", title, (0, 1.5))
     for name, run in wet.items():
         axes[0, 3].plot(run.depth, run.N, label=f"V = {RATES[name]:g}")
         axes[1, 0].plot(run.depth, run.excess, label=f"V = {RATES[name]:g}")
@@ -208,10 +247,10 @@ def draw(o: Namespace, runs: dict[float, Push], wet: dict[str, Push]) -> None:
     common.save(fig, o.out / "penetration.png", dpi=80)
 
 
-def show(ax, run: Push, label: str, title: str, clim: tuple[float, float], over: float = 1.0) -> None:
-    """Draw the end of a push, what its frame shows over `over`."""
+def show(ax, run: Push, label: str, title: str, clim: tuple[float, float]) -> None:
+    """Draw the end of a push, and what its frame shows."""
     corners, values, bar = run.frame
-    domains = common.domains(ax, corners, values / over, cmap="viridis" if clim[0] == 0 else "RdBu_r", clim=clim)
+    domains = common.domains(ax, corners, values, cmap="viridis" if clim[0] == 0 else "RdBu_r", clim=clim)
     common.domains(ax, bar, facecolor="0.6", edgecolor="0.6")
     ax.set(aspect="equal", xlim=(0, 2), ylim=(-2.5, 2), xlabel="x (m)", ylabel="y (m)", title=title)
     ax.figure.colorbar(domains, ax=ax, label=label, shrink=0.8)

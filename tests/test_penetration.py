@@ -22,3 +22,16 @@ def test_wet_clay_flows_around_a_smooth_bar(rate, depth):
     assert gap.min() >= -1.001e-3 * demo.D / cells
     assert run.N[-1] == pytest.approx(demo.exact(0), rel=0.25)  # 4 cells are few
     assert excess.max() > 3 if rate == 1000 else run.excess[-1] < 3
+
+
+@pytest.mark.parametrize(
+    ("cells", "depth", "error"), [(4, 0.5, 0.12), pytest.param(8, 1.0, 0.03, marks=pytest.mark.slow)]
+)
+def test_clay_seeded_anew_resists_a_rough_bar_as_before(cells, depth, error):
+    """It has the stresses of the clay before."""
+    run = demo.push(1.0, cells, depth)
+    way = np.ceil(np.array(run.depth) / demo.LEG - 1e-9)
+    ways = np.array([np.array(run.N)[run.steady & (way == k)].mean() for k in np.unique(way)])
+    assert run.depth[-1] == pytest.approx(depth) and run.cuts <= 0.15 * run.steps
+    assert ways[1:] == pytest.approx(ways[0], rel=0.02)
+    assert ways == pytest.approx(demo.exact(1), rel=error)
