@@ -29,6 +29,7 @@ from mpm_dolfinx.problems.mechanical_boundary import MechanicalBoundary
 from mpm_dolfinx.problems.momentum import MomentumForms
 from mpm_dolfinx.problems.on_grid import OnGrid
 from mpm_dolfinx.problems.quadrature_data import QuadratureData
+from mpm_dolfinx.problems.stage_tools import Tools
 from mpm_dolfinx.problems.storage import StorageForms
 from mpm_dolfinx.state import State, Stay
 
@@ -74,6 +75,7 @@ class Motion:
         on_grid: OnGrid,
         data: QuadratureData,
         t: float,
+        tools: Tools,
         came: NDArray[np.float64] | None = None,
         stays: bool = True,
     ) -> tuple[State, int]:
@@ -85,6 +87,8 @@ class Motion:
             At the start of the step.
         on_grid, data
             The bodies on the grid, and their pieces at the start of the step.
+        tools
+            As they go in the step.
         came : (cells,), m^d
             Fluid that came to the local cells in the step; without, what is owed to the points stays as it is.
         stays
@@ -104,7 +108,7 @@ class Motion:
             deformed = cache(partial(self._deformed, cut, data, nodal))
             if cut.domains:
                 moved, bend = cut.followed(nodal, self._momentum.active_nodes(on_grid.cells))
-                points, serves, folded = self._shaped(state, t, cut, moved, bend, deformed)
+                points, serves, folded = self._shaped(state, t, tools, cut, moved, bend, deformed)
             else:
                 x, F = state.points.x + cut.displacement(nodal), deformed()
                 points = replace(state.points, x=x, F=F, corners=parallelepipeds(x, F, self._sizes(state.points)))
@@ -146,6 +150,7 @@ class Motion:
         self,
         state: State,
         t: float,
+        tools: Tools,
         cut: CutDomains,
         moved: NDArray[np.float64],
         bend: NDArray[np.float64],
@@ -162,11 +167,11 @@ class Motion:
         """
         grid, stage, folded = cut.grid, state.stage, 0
         own = ~given(grid, stage.lattices, stage.conditions["fixed"], state.points)
-        free = own & ~stage.mechanical.tools.near(state.points.corners + moved, t)[:, :, None]
+        free = own & ~tools.near(state.points.corners + moved, t)[:, :, None]
         if stage.mechanical.contacts.contacts:
             beside = stage.mechanical.contacts.near(cut, state.points, state.points.corners + moved)
             free &= ~beside[:, :, None]
-        corners = stage.mechanical.tools.outside(state.points.corners + moved + free * bend, t, own)
+        corners = tools.outside(state.points.corners + moved + free * bend, t, own)
         points = replace(state.points, corners=corners)
         serves, evolved = cut.serves(points), self._materials.evolved(points)
         if not serves:
@@ -175,7 +180,7 @@ class Motion:
             folded = over_all(grid.comm, int(bad.sum()))
             if folded:
                 corners = untangled(points, corners, bad, deformed(), grid, stage.mechanical)
-                corners[bad] = stage.mechanical.tools.outside(corners[bad], t, own[bad], np.inf)
+                corners[bad] = tools.outside(corners[bad], t, own[bad], np.inf)
         F = gradient(corners, points.reference, grid.axisymmetric)
         if self._momentum.dilatation is not None:
             locks = self._materials.locking(points)

@@ -95,7 +95,7 @@ def balanced(scene: Scene, state: State) -> State:
             w, count = _mixed(unknowns, seen), count + 1
             forms.u.x.array[:] = w
             forms.internal(start.data)  # mean dilatations are those of w
-            moved, _ = scene.motion.advanced(seeded, start.on_grid, start.data, state.t)
+            moved, _ = scene.motion.advanced(seeded, start.on_grid, start.data, state.t, seeded.stage.mechanical.tools)
             points = strained(materials, seeded.points, moved.points)
     except StepFailed as error:
         scene.forget()
@@ -113,7 +113,7 @@ def _pressed(scene: Scene, start: Start, state: State, unknowns: Unknowns) -> tu
     """Return start and state with what tools and contacts have on the points at the present displacement."""
     mechanical, acting, cut = state.stage.mechanical, start.acting[-1], start.on_grid.cut
     _, points = mechanical.touched(acting.sides, unknowns, scene.momentum.u.x.array, state.points)
-    sides = mechanical.data(scene.momentum.sides, cut, state.t, state.t, points)
+    sides = mechanical.data(scene.momentum.sides, cut, state.t, state.tool_travel, state.t, points)
     return start._replace(acting=[acting._replace(sides=sides)]), replace(state, points=points)
 
 

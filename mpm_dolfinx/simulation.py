@@ -176,16 +176,18 @@ class Simulation:
 
     @property
     def outflows(self) -> NDArray[np.float64]:
-        """(drained sides, then inflows): what leaves the bodies through each, m^3/s (m^2/s in plane strain).
-
-        Volumes at zero pressure, at the end of the last step; nan where none has been taken since a stage set them.
-        """
+        """(drained sides, then inflows), m^3/s (m^2/s in plane strain): what leaves; nan before a first step."""
         return self.state.outflows
 
     @property
     def tool_forces(self) -> NDArray[np.float64]:
         """(tools + contacts, d + 1), in 3D (..., 6): force and moment of each `Tool`, then `Contact`, on the bodies."""
         return self.state.tool_forces
+
+    @property
+    def tool_travel(self) -> NDArray[np.float64]:
+        """(tools,), m: how far a load has pushed each `Tool` beyond its displacement."""
+        return self.state.tool_travel
 
     @property
     def present(self) -> tuple[bool, ...]:

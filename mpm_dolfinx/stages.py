@@ -43,7 +43,8 @@ def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int
     reactions = np.zeros((len(begun.mechanical.holds), scene.grid.dim))
     outflows = np.zeros(len(begun.hydraulic.outlets))
     points, forces = begun.mechanical.grip(points), begun.mechanical.forces(0.0)
-    return State(0.0, points, transported, None, 0, reactions, outflows, forces, begun, True, None, None, None)
+    ways = np.zeros(len(begun.mechanical.tools.tools))
+    return State(0.0, points, transported, None, 0, reactions, outflows, forces, ways, begun, True, None, None, None)
 
 
 def begin_stage(
@@ -90,6 +91,8 @@ def begin_stage(
         new["reactions"] = np.full((len(begun.mechanical.holds), scene.grid.dim), unknown)
     if "tools" in named:
         new["tool_forces"] = begun.mechanical.forces(unknown)
+    if "tools" in named:
+        new["tool_travel"] = np.zeros(len(begun.mechanical.tools.tools))
     if named.keys() & {"drained", "inflows"}:
         new["outflows"] = np.full(len(begun.hydraulic.outlets), unknown)
     if add or remove:

@@ -65,9 +65,12 @@ class State:
     reactions : (displacements, d), N (N/m in plane strain)
         Forces of the given displacements in the last step; nan before the first one of a stage.
     outflows : (drained sides, then inflows), m^3/s (m^2/s in plane strain)
-        What leaves the bodies through them at the end of the last step; nan before the first one of a stage.
+        Volumes at zero pressure that leave the bodies through them at the end of the last step; nan before the first
+        one of a stage.
     tool_forces : (tools + contacts, d + 1), in 3D (..., 6), N and N m (N/m and N in plane strain)
         Forces and moments of tools, then contacts, on the bodies in the last step; nan before the first one of a stage.
+    tool_travel : (tools,), m
+        How far loads have pushed tools beyond their displacement; zero for those without.
     stage
         The conditions in force.
     begins
@@ -90,6 +93,7 @@ class State:
     reactions: NDArray[np.float64]
     outflows: NDArray[np.float64]
     tool_forces: NDArray[np.float64]
+    tool_travel: NDArray[np.float64]
     stage: Stage
     begins: bool
     velocity: NDArray[np.float64] | None

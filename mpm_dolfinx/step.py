@@ -22,9 +22,9 @@ def set_up(scene: Scene, state: State, dt: float) -> Start:
     state = state if state.stay else state.at_owners(scene.grid)
     cut_points = state.stay.points if state.stay else state.points  # points that hardly move stay as they were cut
     on_grid = scene.on_grid(cut_points)
-    place = partial(stage.mechanical.data, scene.momentum.sides, on_grid.cut, state.t)
+    place = partial(stage.mechanical.data, scene.momentum.sides, on_grid.cut, state.t, state.tool_travel)
     if state.begins:
-        stage.mechanical.check_start(on_grid.cut, state.points, state.t)
+        stage.mechanical.check_start(on_grid.cut, state.points, state.t, state.tool_travel)
     sides, data = [place(t, state.points) for t in times], on_grid.data_of(state)
     as_cut = partial(place, times[-1], cut_points) if state.stay else partial(sides.__getitem__, -1)
     matrices = scene.assembled(on_grid, stage, as_cut, state.begins)
@@ -46,10 +46,11 @@ def step(scene: Scene, state: State, dt: float) -> tuple[State, Report]:
     mechanical, at = state.stage.mechanical, (start.matrices.momentum.unknowns, scene.momentum.u.x.array)
     reactions = mechanical.reactions(acting.sides, scene.momentum.nodal)
     outflows = both.storage.outflows(len(state.stage.hydraulic.outlets)) if both.storage else state.outflows
-    new, report.rederived = scene.motion.advanced(state, on_grid, start.data, state.t + dt, both.came(rates[-1]))
+    tools, ways = mechanical.going(acting.sides, state.t, state.t + dt, state.tool_travel)
+    new, report.rederived = scene.motion.advanced(state, on_grid, start.data, state.t + dt, tools, both.came(rates[-1]))
     velocity = None if scene.momentum.elastic else scene.momentum.u.x.array / dt
     now = {"reactions": reactions, "outflows": outflows, "velocity": velocity}
-    mechanical.check_end(on_grid.cut, new.points, new.t, state.points, state.t)
+    mechanical.check_end(on_grid.cut, new.points, new.t, state.points, state.t, tools)
     forces, points = mechanical.touched(acting.sides, *at, new.points)
-    now |= {"tool_forces": forces, "points": points}
+    now |= {"tool_forces": forces, "tool_travel": ways, "points": points}
     return replace(new, **now, resets=state.resets + (state.stay is None), begins=False), report

@@ -13,7 +13,7 @@ soil = mpm.Hencky(bulk=4e6 / 3, shear=1e6, conductivity=1e-5)
 disc = mpm.Ball((0.65, 0.98), 0.25)
 tools = [
     mpm.Tool(disc, displacement=lambda t: (0.008 * t, -0.02 * t), friction=0.3),
-    mpm.Tool(mpm.HalfSpace((1.17, 0), (-1, 0))),
+    mpm.Tool(mpm.HalfSpace((1.17, 0), (-1, 0)), load=lambda t: 2e3 * t, direction=(-1, 0)),
 ]
 simulation = mpm.Simulation(
     grid, [block], [soil], fluid=mpm.Fluid(), fixed={"bottom": "xy"}, drained=[mpm.Drained("left")], tools=tools
@@ -25,5 +25,5 @@ if parts:
     ids, x, p, s = (np.concatenate(a) for a in zip(*parts, strict=True))
     order = np.argsort(ids)
     counts = [len(part[0]) for part in parts]
-    forces = {"forces": simulation.tool_forces}
+    forces = {"forces": simulation.tool_forces, "travel": simulation.tool_travel}
     np.savez(sys.argv[1], x=x[order], p=p[order], shear=s[order], balance=result.balance, counts=counts, **forces)

@@ -29,10 +29,10 @@ from mpm_dolfinx.simulation import Simulation
 from mpm_dolfinx.state import State, Stay
 from mpm_dolfinx.validation import instance, line, numbers, on_disk, path, whole
 
-FORMAT, VERSION = "mpm_dolfinx checkpoint", 7
+FORMAT, VERSION = "mpm_dolfinx checkpoint", 8
 FOREIGN = "no checkpoint of mpm_dolfinx, must be one"
 ZIP = b"PK\3\4"  # how numpy's archives begin
-ACTING = ("reactions", "outflows", "tool_forces")
+ACTING = ("reactions", "outflows", "tool_forces", "tool_travel")
 PIECES = ("id", "pressure", "x", "start")  # of a Stay
 NODAL = ("velocity", "held")  # of a State
 NOTE = {"t": float, "resets": int, "begins": bool, "scene": dict, "result": dict}  # and their kinds
@@ -182,7 +182,7 @@ def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulat
         histories["pressure"] = [*map(tuple, histories["pressure"].tolist())]
         columns = [[*histories[name]] or [None] * len(times) for name in Row._fields]
         result = Result(rows=[Row(*row) for row in zip(*columns, strict=True)], **note["result"])
-        acting = reactions, outflows, forces = [arrays.pop(name) for name in ACTING]
+        acting = reactions, outflows, forces, ways = [arrays.pop(name) for name in ACTING]
         nodal = [_part(arrays, f"{name}/") or None for name in NODAL]
         for name, given in zip(NODAL, nodal, strict=True):
             if given is not None:
@@ -191,6 +191,8 @@ def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulat
             raise ValueError(f"has {', '.join(arrays) or 'other reactions, outflows or times'}")
         if forces.shape != now.tool_forces.shape:
             raise ValueError(f"has forces of {len(forces)} tools")
+        if ways.shape != now.tool_travel.shape or not np.isfinite(ways).all():
+            raise ValueError(f"has ways of {len(ways)} tools, or not finite")
         start = note["t"], points, transported, stay, note["resets"], *acting, None, note["begins"]
         return State(*start, *nodal, result)
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:

@@ -164,7 +164,7 @@ def _write_tools(simulation: Simulation, file: Path) -> None:
     """Write what tools fill of the grid's cells, with their numbers and forces."""
     grid, forces = simulation.grid, simulation.tool_forces[:, : simulation.grid.dim]
     tools = simulation.state.stage.conditions["tools"]
-    corners = [tool.drawn(grid, simulation.t) for tool in tools]
+    corners = [tool.drawn(grid, simulation.t, way) for tool, way in zip(tools, simulation.tool_travel, strict=True)]
     number = np.repeat(np.arange(len(tools)), [len(one) for one in corners])
     with replacing(file) as part:
         _cells(np.concatenate(corners), {"tool": number, "force": forces[number]}).write(part, file_format="vtu")

@@ -44,7 +44,7 @@ from mpm_dolfinx.problems.rigid_motion import turned
 from mpm_dolfinx.problems.side_forms import SideData, SideForms
 from mpm_dolfinx.problems.sides import Sides, check_apart, everywhere, gathered, meeting, on_side
 from mpm_dolfinx.problems.stage_contacts import Contacts
-from mpm_dolfinx.problems.stage_tools import Tools
+from mpm_dolfinx.problems.stage_tools import Tools, Ways
 from mpm_dolfinx.problems.tools import Tool
 from mpm_dolfinx.validation import line
 
@@ -134,20 +134,31 @@ class MechanicalBoundary:
         """Return points with what tools and contacts have on them: nothing, or what the same points had `before`."""
         return gripped(points, {**self.tools.kept(len(points)), **self.contacts.kept(len(points))}, before)
 
-    def check_start(self, cut: CutDomains, points: MaterialPoints, t: float) -> None:
-        """Refuse a stage that begins at time t (s) with tools in bodies, or with groups of bodies in each other."""
-        self.tools.check_start(cut, points, t)
+    def check_start(self, cut: CutDomains, points: MaterialPoints, t: float, ways: NDArray[np.float64]) -> None:
+        """Refuse a stage that begins at time t (s) with tools in bodies, or with groups of bodies in each other.
+
+        ways (tools,): how far loads have pushed them, m.
+        """
+        self.tools.going(Ways(t, t, ways, ways)).check_start(cut, points, t)
         self.contacts.check_start(cut, points, t)
 
     def check_end(
-        self, cut: CutDomains, points: MaterialPoints, t: float, before: MaterialPoints, start: float
+        self, cut: CutDomains, points: MaterialPoints, t: float, before: MaterialPoints, start: float, tools: Tools
     ) -> None:
         """Refuse a step to time t (s) in which tools have passed bodies, or after which tools or groups are in bodies.
 
-        before: the points at the start of the step, at the time `start` (s).
+        before: the points at the start of the step, at the time `start` (s); tools: as they go.
         """
-        self.tools.check_end(cut, points, t, before, start)
+        tools.check_end(cut, points, t, before, start)
         self.contacts.check_end(cut, points, before)
+
+    def going(self, sides: SideData, start: float, t: float, ways: NDArray[np.float64]) -> tuple[Tools, NDArray]:
+        """Return the tools as they go in a step between two times (s), and how far loads have pushed them (tools,), m.
+
+        ways: the same at its start.
+        """
+        after = ways if sides.tools is None else sides.tools.pushed.ways
+        return self.tools.going(Ways(start, t, ways, after)), after
 
     def touched(
         self, sides: SideData, unknowns: Unknowns, u: NDArray[np.float64], points: MaterialPoints
@@ -165,8 +176,19 @@ class MechanicalBoundary:
             points = sides.contact.now.gripped(unknowns, u, points)
         return forces, points
 
-    def data(self, forms: SideForms, cut: CutDomains, start: float, t: float, points: MaterialPoints) -> SideData:
-        """Return what acts at time t (s) of a step that began at `start` on the points where they are now."""
+    def data(
+        self,
+        forms: SideForms,
+        cut: CutDomains,
+        start: float,
+        ways: NDArray[np.float64],
+        t: float,
+        points: MaterialPoints,
+    ) -> SideData:
+        """Return what acts at time t (s) of a step that began at `start` on the points where they are now.
+
+        ways (tools,): how far loads had pushed tools then, m.
+        """
         with Timer("mpm: loads"):
             loads = self._load_data(forms, cut, points, t) if self.loads else None
             pressures = self._pressure_data(forms, cut, points, t) if self.pressures else None
@@ -175,7 +197,8 @@ class MechanicalBoundary:
             holds = self._hold_data(forms, cut, points, t) if self.holds else none
             pairs = zip(forms.own, self._terms, strict=True)
             own = tuple(self._own_data(term.points, faces, cut, points) for term, faces in pairs)
-            tools, contact = self.tools.placed(cut, points, start, t), self.contacts.placed(cut, points)
+            tools = self.tools.going(Ways(start, t, ways, ways)).placed(cut, points, start, t)
+            contact = self.contacts.placed(cut, points)
             return SideData(loads, pressures, plates, *holds, tools, own, contact)
 
     def _load_data(self, forms: SideForms, cut: CutDomains, points: MaterialPoints, t: float) -> PointData:

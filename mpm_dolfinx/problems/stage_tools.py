@@ -7,6 +7,8 @@ The contact itself is in `tool_contact`.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import copy
+from typing import NamedTuple
 
 from mpi4py import MPI
 
@@ -23,6 +25,7 @@ from mpm_dolfinx.points.grid import Grid
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.problems.cell_contact import LEAST, kept, pressure_name, shear_name
 from mpm_dolfinx.problems.conditions import Displacement, resistance
+from mpm_dolfinx.problems.pushed_tools import PushedTools
 from mpm_dolfinx.problems.sides import everywhere
 from mpm_dolfinx.problems.tool_contact import ToolContact, ToolRows
 from mpm_dolfinx.problems.tools import Pose, Tool
@@ -33,6 +36,20 @@ NEAR = 0.1  # cells: corners that are nearer go with the tool
 STRIDE = 0.02  # cells: tools that are thinner may pass points within a step unseen
 LEFT = 1e-3  # cells: how deep corners stay in tools; put onto what is less deep they would roughen the stress
 FACING = 0.5  # cosine between a face's normal and the way to the tool above which it looks at the tool
+
+
+class Ways(NamedTuple):
+    """How far loads have pushed tools (k,), m, at the start and the end of a step, at two times, s."""
+
+    start: float
+    end: float
+    before: NDArray[np.float64]
+    after: NDArray[np.float64]
+
+    def at(self, t: float) -> NDArray[np.float64]:
+        """Return how far they have at a time of the step (s)."""
+        share = (t - self.start) / (self.end - self.start) if self.end > self.start else 1.0
+        return self.before + share * (self.after - self.before)
 
 
 class Tools:
@@ -59,6 +76,9 @@ class Tools:
         held: Sequence[tuple[Displacement, Surface]],
     ):
         self.grid, self._materials, self.tools, self._held = grid, materials, tuple(tools), held
+        self._ways: Ways | None = None
+        if len({id(tool) for tool in self.tools}) < len(self.tools):
+            raise ValueError("tools: one is given twice, must be tools of their own")
         for tool in self.tools:
             tool.check(grid.dim)
             if not callable(tool.displacement) and not callable(tool.rotation):
@@ -75,9 +95,17 @@ class Tools:
         """Whether the tangent is symmetric."""
         return not any(tool.grips for tool in self.tools)
 
+    def going(self, ways: Ways) -> Tools:
+        """Return the tools as loads push them in a step."""
+        if not any(tool.load is not None for tool in self.tools):
+            return self
+        tools = copy(self)
+        tools._ways = ways
+        return tools
+
     def _pose(self, tool: Tool, t: float) -> Pose:
         """Return where a tool is at time t (s); in axisymmetry it goes along the axis."""
-        pose = tool.pose(t, self.grid.dim)
+        pose = tool.pose(t, self.grid.dim, self._ways.at(t)[self.tools.index(tool)] if self._ways else 0.0)
         if self.grid.axisymmetric and (pose.shift[0] or pose.R[0, 1]):
             what = f"moves by {pose.shift}{' and turns' * bool(pose.R[0, 1])} at t = {t:g} s"
             raise ValueError(f"{line(tool)}: {what}, must move by (0, z) and not turn in axisymmetry")
@@ -96,7 +124,9 @@ class Tools:
         x, area = patches.now(points), patches.area(points)
         size, free = np.linalg.norm(area, axis=1), self._free[patches.here]
         resists = self._materials.table(cut.points, resistance)[patches.at]
-        poses, found = [self._pose(tool, t) for tool in self.tools], []
+        poses, found, loads = [self._pose(tool, t) for tool in self.tools], [], [tool.pushes(t) for tool in self.tools]
+        ways = self._ways.before if self._ways else np.zeros(len(loads))
+        pushed = PushedTools([line(tool) for tool in self.tools], ways, np.array(loads), grid.h.min())
         for number, (tool, pose) in enumerate(zip(self.tools, poses, strict=True)):
             before = self._pose(tool, start)
             n = everywhere(grid, lambda tool=tool, pose=pose: tool.solid(grid.h.min()).normal(pose.own(x)) @ pose.R.T)
@@ -113,7 +143,7 @@ class Tools:
         now, carried, shear = np.split(sent[:, 4:], 3, axis=1)
         rows = ToolRows(number.astype(np.int64), grid.local(cell), *own, shear, now, carried)
         back = (travel, patches.at[at], values[:, 0].astype(np.int64), values[:, 1])
-        return ToolContact(grid, self.tools, poses, rows, Places(grid, rows.cell, place), back)
+        return ToolContact(grid, self.tools, poses, pushed, rows, Places(grid, rows.cell, place), back)
 
     def check_start(self, cut: CutDomains, points: MaterialPoints, t: float) -> None:
         """Refuse tools that are inside of a body at time t (s); faces that they press on are where a step left them."""
@@ -180,7 +210,7 @@ class Tools:
         """
         out, h = corners.copy(), self.grid.h.min()
         for tool in self.tools:
-            gap, pose = self._gaps(tool, out, t), tool.pose(t, self.grid.dim)
+            gap, pose = self._gaps(tool, out, t), self._pose(tool, t)
             gap += LEFT * h
             at = (gap < 0) & (gap > -most * h)
             own = pose.own(out[at])
@@ -190,7 +220,7 @@ class Tools:
 
     def _gaps(self, tool: Tool, corners: NDArray[np.float64], t: float) -> NDArray[np.float64]:
         """Return distances (n, 2^d), m, of corners (n, 2^d, d) from a tool at time t (s)."""
-        own = tool.pose(t, self.grid.dim).own(corners.reshape(-1, self.grid.dim))
+        own = self._pose(tool, t).own(corners.reshape(-1, self.grid.dim))
         gap = everywhere(self.grid, lambda: tool.solid(self.grid.h.min()).distance(own))
         return gap.reshape(corners.shape[:2])
 
@@ -199,8 +229,8 @@ class Tools:
 
         Places go on by their distance to the tool (sphere tracing: Hart 1996).
         """
-        d, h, comm = self.grid.dim, self.grid.h.min(), self.grid.comm
-        y, end = (tool.pose(t, d).own(at) for at, t in zip(x, times, strict=True))
+        h, comm = self.grid.h.min(), self.grid.comm
+        y, end = (self._pose(tool, t).own(at) for at, t in zip(x, times, strict=True))
         way, gone, on = np.linalg.norm(end - y, axis=1), np.zeros(len(y)), np.arange(len(y))
         along = (end - y) / np.maximum(way, LEAST)[:, None]
         inside = everywhere(self.grid, lambda: (tool.solid(h).distance(y) < 0) | (tool.solid(h).distance(end) < 0))
@@ -221,7 +251,7 @@ class Tools:
 
     def _deepest(self, tool: Tool, x: NDArray[np.float64], t: float) -> tuple[float, str]:
         """Return how deep places x (m, d) are in a tool at most, in cells, and where."""
-        h, pose = self.grid.h.min(), tool.pose(t, self.grid.dim)
+        h, pose = self.grid.h.min(), self._pose(tool, t)
         gap = everywhere(self.grid, lambda: tool.solid(h).distance(pose.own(x)))
         deepest = over_all(self.grid.comm, float(gap.min(initial=np.inf)), MPI.MIN)
         here = np.array2string(x[gap.argmin()], precision=6) if len(gap) and gap.min() == deepest else ""

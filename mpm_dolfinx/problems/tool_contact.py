@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 from mpm_dolfinx.caching import Latest
 from mpm_dolfinx.forms.cell_matrices import insert
 from mpm_dolfinx.forms.point_forms import Places
-from mpm_dolfinx.parallel.exchange import Exchange
-from mpm_dolfinx.points.grid import Grid
+from mpm_dolfinx.parallel.exchange import Exchange, over_all
+from mpm_dolfinx.points.grid import Grid, sum_by
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.problems.cell_contact import CellContact, Rows, Touch
+from mpm_dolfinx.problems.pushed_tools import PushedTools
 from mpm_dolfinx.problems.sides import everywhere
 from mpm_dolfinx.problems.tools import DISTANCE, Distance, Pose, Tool
 from mpm_dolfinx.validation import line
@@ -59,7 +60,9 @@ class ToolContact(CellContact):
     grid
         Background grid.
     tools, poses
-        The tools, and where they are at the end of the substep.
+        The tools, and where they are at the end of the substep, as far as loads had pushed them at the start.
+    pushed
+        How far loads push them.
     rows, places
         The points of integration, and where the grid sees them.
     back
@@ -71,14 +74,25 @@ class ToolContact(CellContact):
         grid: Grid,
         tools: Sequence[Tool],
         poses: Sequence[Pose],
+        pushed: PushedTools,
         rows: ToolRows,
         places: Places,
         back: tuple[Exchange, NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]],
     ):
         super().__init__(grid, "tool", tools, rows, back)
-        self._poses, self.places = poses, places
+        self._start, self.pushed, self.places = poses, pushed, places
+        self._along = np.array([tool.along(grid.dim) for tool in tools])
         self._N = grid.shape_values(rows.cell, places.x)
         self._touch: Latest[ToolTouch] = Latest()
+
+    @property
+    def _gone(self) -> NDArray[np.float64]:
+        """How far (tools, d), m, loads have pushed them in the step."""
+        return (self.pushed.ways - self.pushed.start)[:, None] * self._along
+
+    @property
+    def _poses(self) -> list[Pose]:
+        return [pose._replace(shift=pose.shift + gone) for pose, gone in zip(self._start, self._gone, strict=True)]
 
     def _shapes(self, x: NDArray[np.float64]) -> tuple[NDArray, NDArray, NDArray]:
         """Return distances (m,), m, from the tools at places x (m, d), with their first and second derivatives."""
@@ -101,14 +115,14 @@ class ToolContact(CellContact):
     def at(self, u: NDArray[np.float64]) -> ToolTouch:
         """Return the contact at nodal displacements u (nodes, d), m."""
         now = u.copy()
-        key = now, self.pressure.copy(), self.along.copy()
+        key = now, self.pressure.copy(), self.along.copy(), self.pushed.ways.copy()
         return self._touch(key, lambda: self._at_u(now), self.grid.comm)
 
     def _at_u(self, u: NDArray[np.float64]) -> ToolTouch:
         rows = self.rows
         x = rows.now + np.einsum("mk,mkd->md", self._N, u[self.grid.cell_nodes[rows.cell]])
         distance, n, second = self._shapes(x)
-        touch = self.touch(distance, n, x - rows.carried)
+        touch = self.touch(distance, n, x - rows.carried - self._gone[rows.number])
         slope = touch.stiff[:, None, None] * n[:, :, None] * n[:, None, :] - touch.push[:, None, None] * second
         return ToolTouch(**vars(touch), x=x, n=n, slope=rows.area[:, None, None] * slope)
 
@@ -117,9 +131,23 @@ class ToolContact(CellContact):
         return self.grips and self.choose(self.at(u), sticks)
 
     def augment(self, u: NDArray[np.float64]) -> bool:
-        """Augment the pressures where means penetrate too deep at u, see `augmented`; return whether they do."""
+        """Augment the pressures where means penetrate too deep at u, see `augmented`; return whether they do.
+
+        Where they do not, tools that a load pushes go on until they meet as much.
+        """
         touch = self.at(u)
-        return self.augmented(touch, touch.x, "does a wall hold the body there?") > 0
+        if self.augmented(touch, touch.x, "does a wall hold the body there?") > 0:
+            return True
+        if np.isnan(self.pushed.loads).all():
+            return False
+        of, along = self.rows.number, self._along[self.rows.number]
+        slope = self.rows.area * touch.stiff * (touch.n * along).sum(axis=1) ** 2
+        met = self.summed(touch.force, 0 * touch.x)[:, : self.grid.dim]
+        goes = self.pushed.go(
+            np.einsum("kd,kd->k", met, self._along), over_all(self.grid.comm, sum_by(of, slope, len(met)))
+        )
+        self._rounds[0] *= not goes  # of augmentations, which begin anew
+        return goes
 
     def gripped(self, u: NDArray[np.float64], points: MaterialPoints) -> MaterialPoints:
         """Return the points with the pressures and shear tractions that tools have on them at u."""

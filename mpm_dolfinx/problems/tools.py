@@ -313,6 +313,11 @@ class Tool:
     adhesion
         Shear stress that the contact takes besides, Pa, >= 0: alpha s_u of undrained soil, with friction 0.  All of it
         where the normal pressure is a tenth of it or more, and as much less as that is less.
+    load : float or callable t (s) -> float, N (N/m in plane strain), >= 0
+        Pushes the tool along `direction`, beyond its displacement, as far as the bodies resist with as much; it begins
+        where it touches them.  How far that is, is in the simulation's `tool_travel`.
+    direction : (d,)
+        In which a load pushes; of any length.
 
     Raises
     ------
@@ -326,6 +331,8 @@ class Tool:
     centre: ArrayLike | None = None
     friction: float = 0.0
     adhesion: float = 0.0
+    load: float | Callable[[float], float] | None = None
+    direction: ArrayLike | None = None
 
     def __post_init__(self):
         if not isinstance(self.shape, (HalfSpace, Ball, Convex, Cone)) and not callable(self.shape):
@@ -333,6 +340,28 @@ class Tool:
         for name in ("friction", "adhesion"):
             value = getattr(self, name)
             numbers(f"Tool: {name}", value, test=lambda v: (v >= 0) & (v < np.inf), allowed=">= 0 and finite")
+        if (self.load is None) != (self.direction is None):
+            raise ValueError(f"{line(self)}: load and direction, must be given both, or none")
+        if self.load is not None and not callable(self.load):
+            self.pushes(0.0)
+
+    def pushes(self, t: float) -> float:
+        """Return the load at time t (s), N; nan where none pushes the tool."""
+        if self.load is None:
+            return np.nan
+        value = float(given(self, "load", t, None))
+        if not 0 <= value < np.inf:
+            raise ValueError(f"{line(self)}: load at t = {t:g} s = {value:g}, must be >= 0 and finite")
+        return value
+
+    def along(self, dim: int) -> NDArray[np.float64]:
+        """Return the unit vector (d,) in which a load pushes, zero without."""
+        if self.direction is None:
+            return np.zeros(dim)
+        along = _direction("Tool: direction", self.direction)
+        if len(along) != dim:
+            raise ValueError(f"Tool: direction = {line(self.direction)}, must have {dim} components as the grid")
+        return along
 
     @property
     def grips(self) -> bool:
@@ -354,28 +383,30 @@ class Tool:
             if not callable(getattr(self, name)):
                 given(self, name, 0.0, None, dim if name == "displacement" else 0)
         self._centre(dim)
+        self.along(dim)
 
     def _centre(self, dim: int) -> NDArray[np.float64]:
         if self.centre is None:
             return np.zeros(dim)
         return numbers("Tool: centre", self.centre, (dim,), allowed=f"{dim} finite coordinates")
 
-    def pose(self, t: float, dim: int) -> Pose:
-        """Return where the tool is at time t (s)."""
+    def pose(self, t: float, dim: int, way: float = 0.0) -> Pose:
+        """Return where the tool is at time t (s), after a load has pushed it by a way, m."""
         shift = given(self, "displacement", t, None, dim)
         if shift.ndim == 0 and shift:
             raise ValueError(f"{line(self)}: displacement at t = {t:g} s = {shift:g}, must be {dim} finite numbers")
         R, angle = np.eye(dim), float(given(self, "rotation", t, None))
         if angle:
             R = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-        return Pose(R, self._centre(dim), np.broadcast_to(shift, (dim,)))
+        return Pose(R, self._centre(dim), np.broadcast_to(shift, (dim,)) + way * self.along(dim))
 
-    def drawn(self, grid: Grid, t: float) -> NDArray[np.float64]:
+    def drawn(self, grid: Grid, t: float, way: float = 0.0) -> NDArray[np.float64]:
         """Return the corners (m, 2^d, d), m, of the grid's cells that the tool fills at time t (s): for pictures.
 
+        way, m: by which a load has pushed it.
         Corners beyond its surface are put onto it; so its edges are blunt by a part of a cell.
         """
-        pose, solid, nodes = self.pose(t, grid.dim), self.solid(grid.h.min()), tuple(grid.shape + 1)
+        pose, solid, nodes = self.pose(t, grid.dim, way), self.solid(grid.h.min()), tuple(grid.shape + 1)
         y = pose.own(grid.lower + np.stack(np.unravel_index(np.arange(np.prod(nodes)), nodes), axis=1) * grid.h)
         inside = solid.distance(y) < -ROUNDED * grid.h.min()
         cells = grid.corners(np.arange(np.prod(grid.shape)))

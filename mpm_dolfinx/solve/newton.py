@@ -207,7 +207,7 @@ class Newton:
         dog, count = Watchdog(errors.worst, self._iterate()) if watched else None, 0
         while (found := self._augmented(errors)).worst > self._scheme.tolerance:
             if found is not errors:  # what has balanced is to do so with other pressures or pairs of contacts
-                errors, count = found, 0
+                errors, count, fresh = found, 0, True
             if fresh or not watched:  # what yields and has begun to converge may go on
                 self._check(max(count, self.report.newton // REBALANCED), "newton")
             if fresh and self._linear and not self.report.newton:
@@ -229,12 +229,12 @@ class Newton:
 
     def _augmented(self, errors: Errors) -> Errors:
         """Return the errors, of what balances with the pressures of tools that penetrate too deep shifted."""
-        if errors.worst > self._scheme.tolerance:
-            return errors
         momentum = self._momentum
-        if not (momentum.settle_tools(True) or momentum.augment_tools() or momentum.follow_contacts()):
-            return errors
-        return self._errors(errors.start)
+        while errors.worst <= self._scheme.tolerance and (
+            momentum.settle_tools(True) or momentum.augment_tools() or momentum.follow_contacts()
+        ):
+            errors = self._errors(errors.start)
+        return errors
 
     def _begin(self) -> tuple[Errors, list[NDArray[np.float64]] | None]:
         """Return the errors where the iterations begin: at a guess that balances better than where (u, p) are.

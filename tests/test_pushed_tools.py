@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: MIT
+"""Tools that a load pushes: they go as far as the bodies resist with as much."""
+
+import numpy as np
+import pytest
+
+import mpm_dolfinx as mpm
+
+SOIL = mpm.Hencky(bulk=1e6, shear=0.6e6, conductivity=1e-6)
+BALL = mpm.Ball((1.0, 1.3), 0.3)
+
+
+def layer(*tools, wet=False, material=SOIL, **options):
+    """Return a layer, 2 m wide and 1 m high, that stands rough."""
+    grid = mpm.Grid([2.0, 1.5], [16, 12])
+    water = {"fluid": mpm.Fluid(), "drained": [mpm.Drained("top")]} if wet else {}
+    options.setdefault("fixed", {"left": "x", "right": "x", "bottom": "xy"})
+    return mpm.Simulation(grid, [mpm.box(grid, [0, 0], [2, 1])], [material], tools=[*tools], **water, **options)
+
+
+def pushed(load, shape=BALL, **options):
+    return mpm.Tool(shape, load=load, direction=(0, -2), **options)
+
+
+def test_a_plate_compresses_a_column_by_its_load():
+    """Hencky: the stress P J, with P = M ln(J) / J, is that of the load."""
+    s = layer(
+        pushed(lambda t: 2e5 * t, mpm.HalfSpace((0, 1.0), (0, -1))), fixed={"left": "x", "right": "x", "bottom": "y"}
+    )
+    s.run(1.0, 0.25)
+    height = 1 - s.tool_travel[0]
+    assert SOIL.oedometric * np.log(height) / height == pytest.approx(-1e5, rel=2e-3)  # contact gives way by 5e-4 h
+    assert s.effective_stress()[:, 1, 1] == pytest.approx(np.full(len(s.points), -1e5), rel=1e-6)
+    assert s.tool_forces[0, :2] == pytest.approx([0, -2e5], rel=1e-6)
+
+
+def test_a_load_pushes_as_far_as_the_force_of_a_path_says():
+    led = layer(mpm.Tool(BALL, displacement=lambda t: (0, -0.05 * t)))
+    led.run(1.0, 1 / 16)
+    force = -led.tool_forces[0, 1]
+    s = layer(pushed(lambda t: force * t))
+    s.run(1.0, 1 / 16)
+    assert s.tool_travel[0] == pytest.approx(0.05, rel=3e-3)
+    assert -s.tool_forces[0, 1] == pytest.approx(force, rel=1e-6)
+
+
+def test_a_tool_comes_back_as_its_load_goes():
+    s, seen = layer(pushed(lambda t: 3e4 * max(0.0, 1 - abs(t - 1)))), []
+    s.run(2.25, 0.25, observe=lambda s: seen.append((s.tool_travel[0], -s.tool_forces[0, 1])))
+    travel, force = np.array(seen).T
+    assert force == pytest.approx(3e4 * np.maximum(0, 1 - np.abs(0.25 * np.arange(1, 10) - 1)), rel=1e-6, abs=1e-9)
+    assert travel.argmax() == 3 and travel[-1] < 0.05 * travel.max()
+
+
+def test_a_constant_load_is_kept_while_the_layer_drains():
+    s, seen = layer(pushed(lambda t: 3e4 * min(1, t / 10)), wet=True), []
+    s.run(1e4, rtol=1e-2, first_step=1.0, observe=lambda s: seen.append((s.t, s.tool_travel[0], -s.tool_forces[0, 1])))
+    t, travel, force = np.array(seen).T
+    assert force == pytest.approx(3e4 * np.minimum(1, t / 10), rel=2e-6)
+    assert (np.diff(travel[t > 10]) > 0).all() and travel[-1] > 1.5 * travel[np.searchsorted(t, 10)]
+
+
+def test_a_plate_under_a_load_slips_at_its_friction():
+    plate = mpm.Convex([(0.6, 1.0), (1.4, 1.0), (1.4, 1.3), (0.6, 1.3)])
+    s = layer(pushed(lambda t: 2e4 * min(t, 1), plate, friction=0.3, displacement=lambda t: (0.02 * max(0, t - 1), 0)))
+    s.run(3.0, 0.25)
+    assert s.tool_forces[0, :2] == pytest.approx([6e3, -2e4], rel=1e-6)
+
+
+def test_two_loads_squeeze_a_body_between_them():
+    left = mpm.Tool(mpm.HalfSpace((0.2, 0), (1, 0)), load=lambda t: 1e4 * t, direction=(1, 0))
+    right = mpm.Tool(mpm.HalfSpace((1.2, 0), (-1, 0)), load=lambda t: 1e4 * t, direction=(-1, 0))
+    grid = mpm.Grid([1.5, 1.0], [15, 10])
+    s = mpm.Simulation(grid, [mpm.box(grid, [0.2, 0], [1.2, 0.5])], [SOIL], fixed={"bottom": "y"}, tools=[left, right])
+    s.run(1.0, 0.5)
+    assert s.tool_forces[:, 0] == pytest.approx([1e4, -1e4], rel=1e-6)
+    stress = s.effective_stress()[:, 0, 0]
+    assert stress == pytest.approx(np.full(len(stress), stress.mean()), rel=1e-3)
+
+
+def test_a_run_that_is_resumed_ends_with_the_same_bits(tmp_path):
+    whole, half, again = (layer(pushed(lambda t: 2e4 * t)) for _ in range(3))
+    whole.run(1.0, 0.25)
+    half.run(0.5, 0.25, checkpoint=mpm.Checkpoint(tmp_path / "half"))
+    again.run(1.0, 0.25, after=mpm.resume(again, tmp_path / "half"))
+    assert np.array_equal(again.points.corners, whole.points.corners)
+    assert np.array_equal(again.tool_travel, whole.tool_travel)
+
+
+def test_a_stage_with_new_tools_lets_go_and_one_without_goes_on():
+    s = layer(pushed(lambda t: 2e4 * min(t, 1)))
+    s.run(1.0, 0.5)
+    travel = s.tool_travel
+    s.stage(tractions=[])
+    s.run(1.5, 0.25)
+    assert s.tool_travel == pytest.approx(travel, rel=1e-2)
+    assert -s.tool_forces[0, 1] == pytest.approx(2e4, rel=1e-6)
+    s.stage(tools=[])
+    assert len(s.tool_travel) == 0
+
+
+def test_a_load_that_meets_nothing_is_refused():
+    with pytest.raises(mpm.GaveUp, match="is pushed by 1000 N and meets nothing within a cell"):
+        layer(pushed(1e3, mpm.Ball((1.0, 1.5), 0.3))).run(1.0, 0.5)
+
+
+@pytest.mark.slow
+def test_a_load_that_soil_cannot_bear_is_refused_and_what_it_bore_is_kept():
+    clay = mpm.DruckerPrager(bulk=5e6, shear=1e5, friction=0.0, dilation=0.0, cohesion=1e3)
+    base = mpm.Convex([(-0.5, 1.0), (0.5, 1.0), (0.5, 1.2), (-0.5, 1.2)])
+    s, seen = layer(pushed(lambda t: 4e3 * t, base), material=clay), []
+    with pytest.raises(mpm.GaveUp):
+        s.run(2.0, 0.25, observe=lambda s: seen.append(-s.tool_forces[0, 1]))
+    assert 2e3 < seen[-1] < 4e3  # (2 + pi) c times half the width is 2.6e3
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"load": 1.0}, "load and direction, must be given both"),
+        ({"load": np.nan, "direction": (0, -1)}, "load at t = 0 s = nan, must be"),
+        ({"load": "1 kN", "direction": (0, -1)}, "load at t = 0 s = '1 kN', must be"),
+        ({"load": lambda t: -1.0, "direction": (0, -1)}, "load at t = .* = -1, must be >= 0"),
+        ({"load": 1.0, "direction": (0, 0)}, "direction = .*, must be a vector"),
+        ({"load": 1.0, "direction": (0, 0, 1)}, "direction = .*, must have 2 components"),
+    ],
+)
+def test_bad_loads_are_refused(given, said):
+    with pytest.raises(ValueError, match=said):
+        layer(mpm.Tool(BALL, **given)).run(1.0, 0.5)
