@@ -117,10 +117,22 @@ class System:
 
 
 def with_water(s: mpm.Simulation, bulk: float) -> mpm.Simulation:
-    """Return the scene in its present state with water of another bulk modulus, Pa."""
+    """Return the scene in its present state with water of another bulk modulus, Pa.
+
+    Its pressures become no larger than a tenth of that: the density would be none that water has.
+    """
     soils, conditions = s.scene.materials.materials, s.state.stage.conditions
     other = mpm.Simulation(s.grid, s.bodies, soils, fluid=mpm.Fluid(bulk=bulk), **conditions)
-    other.state = replace(s.state, stage=other.state.stage)
+    state, stay = replace(s.state, stage=other.state.stage), s.state.stay
+    if stay is not None:
+        share = min(1.0, bulk / 10 / max(np.abs(stay.pressure).max(), np.abs(stay.start).max(), 1e-300))
+        state = replace(state, stay=replace(stay, pressure=share * stay.pressure, start=share * stay.start))
+    else:
+        old = state.transported
+        share = min(1.0, bulk / 10 / max(np.abs(old.bounds).max(), 1e-300))
+        scaled = {name: share * getattr(old, name) for name in ("pressure", "slope", "bounds")}
+        state = replace(state, transported=replace(old, **scaled))
+    other.state = state
     return other
 
 

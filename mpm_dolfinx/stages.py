@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.constitutive.skeleton import STANDARD_GRAVITY
 from mpm_dolfinx.initial_state import pieces_at_start
+from mpm_dolfinx.parallel.exchange import first
 from mpm_dolfinx.parallel.messages import warn
 from mpm_dolfinx.points.bodies import Body
 from mpm_dolfinx.points.contact import check_apart
@@ -24,7 +25,7 @@ from mpm_dolfinx.problems.cell_contact import let_go
 from mpm_dolfinx.problems.stage import CONDITIONS, Stage, stage
 from mpm_dolfinx.scene import Scene
 from mpm_dolfinx.state import State
-from mpm_dolfinx.validation import chosen, flag, line, numbers
+from mpm_dolfinx.validation import chosen, flag, instance, line, numbers
 
 WEIGHS = 5e-3  # share by which the unit weights of water outside and in the pores may differ without a warning
 
@@ -172,6 +173,7 @@ def _ids(bodies: Sequence[Body], chosen: Sequence[int]) -> NDArray[np.int64]:
 
 def _changed(scene: Scene, points: MaterialPoints, fields: Mapping[str, ArrayLike]) -> MaterialPoints:
     """Return points with new values of some of their data."""
+    instance("stage: fields", fields, Mapping)
     data = dict(points.data)
     for name, value in fields.items():
         if name not in data and name in scene.materials.constants:
@@ -185,4 +187,11 @@ def _changed(scene: Scene, points: MaterialPoints, fields: Mapping[str, ArrayLik
             each = "one value for all, or " if name in data else ""
             raise ValueError(f"{what} of shape {new.shape}, must be {each}one for each of {len(points)} points")
         data[name] = new.copy()
-    return replace(points, data=data)
+    points, refused = replace(points, data=data), ""
+    try:
+        scene.materials.check(points)
+    except ValueError as error:
+        refused = f"stage: fields: {error}"
+    if refused := first(scene.grid.comm, refused):
+        raise ValueError(refused)
+    return points

@@ -5,10 +5,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import replace
+from inspect import signature
 from math import inf
 from typing import Any, Protocol
+
+from mpi4py import MPI
 
 import numpy as np
 from dolfinx.common import Timer
@@ -120,6 +123,10 @@ def run(
     if probes is not None:
         probes.check(simulation.scene.bodies, simulation.state.stage.present)
     functions("observe", observers)
+    for observer in observers:
+        with suppress(TypeError):  # of what is built in nothing is known
+            if not list(signature(observer).parameters):
+                raise ValueError(f"observe: {line(observer)}, must be a function of the simulation")
     functions("checkpoint", [checkpoint] if checkpoint is not None else [])
     if after is not None:
         instance("after", after, Result)
@@ -139,7 +146,7 @@ def run(
             simulation.state = replace(simulation.state, result=stopwatch.read(ended))
             ended.rows.append(_row(simulation, probes))
             for observer in observers:
-                observer(simulation)
+                _observe(observer, simulation, comm)
             _note(simulation, stopwatch.read(simulation.state.result))
             if checkpoint is not None:
                 checkpoint(simulation)
@@ -176,6 +183,20 @@ def _note(simulation: Simulated, result: Result) -> Result:
     """Note the histories so far in the state."""
     simulation.state = replace(simulation.state, result=result)
     return result
+
+
+def _observe(observer: Callable, simulation: Simulated, comm: MPI.Intracomm) -> None:
+    """Call an observer; raise on all processes if it raises on one, that none waits for the others."""
+    raised = None
+    try:
+        observer(simulation)
+    except BaseException as error:  # also Ctrl-C
+        raised = error
+    failed = comm.allgather(raised is not None) if comm.size > 1 else [raised is not None]
+    if raised is not None:
+        raise raised
+    if any(failed):
+        raise RuntimeError(f"observe: {line(observer)} has raised an error on process {failed.index(True)}")
 
 
 def _histories(

@@ -35,3 +35,16 @@ for words, simulation in CASES.items():
         message = str(error)
     said = grid.comm.allgather(message)
     assert words in message and len(set(said)) == 1, said
+
+
+def seen(simulation):
+    if grid.comm.rank == grid.comm.size - 1:
+        raise OSError("the disk is full")
+
+
+try:
+    scene().run(1.0, 0.5, observe=seen, progress=False)
+    message = "accepted"
+except (OSError, RuntimeError) as error:
+    message = str(error)
+assert "disk is full" in message or f"on process {grid.comm.size - 1}" in message, message

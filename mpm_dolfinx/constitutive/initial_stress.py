@@ -175,6 +175,9 @@ class InitialStresses:
         if gravity is None or np.any(gravity[:-1]) or not gravity[-1] <= 0:
             g = None if gravity is None else np.asarray(gravity).tolist()
             raise ValueError(f"initial_stress: K0 with gravity = {g}, must be down along the last axis at the start")
+        surcharges = [stress.surcharge for stress in self.given.values() if isinstance(stress, K0)]
+        if not np.any(gravity) and not any(callable(surcharge) or surcharge for surcharge in surcharges):
+            raise ValueError("initial_stress: K0 without gravity at the start, nor a surcharge: must have one of these")
         # the densities of all points on all processes
         seeded, total = materials.seeded, np.zeros(self._start[-1])
         total[seeded.id] = materials.density(seeded)

@@ -42,6 +42,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from inspect import signature
 
+import numpy as np
 import ufl
 from ufl.algorithms import extract_coefficients
 from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
@@ -87,7 +88,15 @@ def expression(function: Callable, shapes: Sequence[tuple[int, ...]], of: str = 
         raise ValueError(f"{_name(function)}: gives shape {out.ufl_shape}, must be {allowed}")
     if of and not any(part is available[of] for part in unique_pre_traversal(out)):
         raise ValueError(f"{_name(function)}: gives {line_of(out)}, must be {allowed}")
+    _check_finite(_name(function), out)
     return out
+
+
+def _check_finite(what: str, out: ufl.core.expr.Expr) -> None:
+    """Refuse numbers in an expression that no compiler takes."""
+    for part in unique_pre_traversal(out):
+        if isinstance(part, ufl.constantvalue.RealValue) and not np.isfinite(float(part)):
+            raise ValueError(f"{what}: contains {float(part)}, must be finite")
 
 
 def named(what: str, given, shapes: Mapping[str, tuple[int, ...]], some: bool = False) -> dict:
@@ -105,6 +114,7 @@ def named(what: str, given, shapes: Mapping[str, tuple[int, ...]], some: bool = 
             out[name] = ufl.as_ufl(value)
         except Exception as error:  # UFL has several kinds
             raise ValueError(f"{what}: {name} = {line(value)}, must be UFL, of {allowed}") from error
+        _check_finite(f"{what}: {name}", out[name])
     found = {name: value.ufl_shape for name, value in out.items()}
     if not found or found.items() - shapes.items() or not (some or len(found) == len(shapes)):
         raise ValueError(f"{what}: gives {found}, must have {allowed}")
@@ -128,6 +138,7 @@ def form(kind: str, function: Callable, **available) -> ufl.Form:
     for integral in out.integrals():
         if (integral.integral_type(), integral.subdomain_id()) != (dx.integral_type(), dx.subdomain_id()):
             raise ValueError(f"{kind}: {_name(function)} gives an integral over the grid, must be {allowed}")
+        _check_finite(f"{kind}: {_name(function)}", integral.integrand())
     return out
 
 

@@ -315,7 +315,10 @@ def _read(file: Path) -> tuple[dict[str, NDArray], dict[str, Any]]:
 
 def describe(simulation: Simulation) -> dict[str, Any]:
     """Return the constants that make the scene, by name, as a checkpoint holds them."""
-    return {**simulation.scene.description, "bodies present": list(simulation.present)}
+    touching = simulation.state.stage.mechanical
+    pairs = [("tools", touching.tools.tools), ("contacts", touching.contacts.contacts)]
+    grips = {f"{name}, each whether it resists slip": [bool(one.grips) for one in of] for name, of in pairs}
+    return {**simulation.scene.description, "bodies present": list(simulation.present), **grips}
 
 
 def _check_scene(file: Path, there: dict[str, Any], here: dict[str, Any]) -> None:

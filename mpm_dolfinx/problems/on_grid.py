@@ -347,7 +347,7 @@ class Assembled:
         def set_fluxes(at_sides: OpenSides, kappa: Mobility, motion: CellMotion | None = None) -> Outflow:
             off = self._off and (
                 self._off,
-                self._gradients((at_sides.cells, at_sides.seeps), lambda: Gradients(contents, at_sides)),
+                self._gradients(tuple(vars(at_sides).values()), lambda: Gradients(contents, at_sides)),
             )
             return self.storage.set_fluxes(contents, at_sides, Conduction(kappa, motion, weight), off)
 

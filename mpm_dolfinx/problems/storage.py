@@ -129,6 +129,8 @@ class StorageForms:
         self.sources, self._slopes = [], []
         for source in sources:
             form = form_of("sources", source, points=pieces, q=q, p=pressure, t=t)
+            if len(form.arguments()) != 1:
+                raise ValueError(f"sources: {line(source)}: does not depend on q, must be linear in it")
             if pressure in form.coefficients():
                 self._slopes.append(PointForm(ufl.derivative(form, pressure, one), pieces))
             with compiling(f"sources: {line(source)}", "linear in q"):
