@@ -114,6 +114,24 @@ def test_a_load_that_soil_cannot_bear_is_refused_and_what_it_bore_is_kept():
     assert 2e3 < seen[-1] < 4e3  # (2 + pi) c times half the width is 2.6e3
 
 
+def test_a_load_pushes_along_the_axis_and_in_space():
+    ring, box = mpm.Grid([0.75, 0.75], [6, 6], axisymmetric=True), mpm.Grid([0.75] * 3, [6] * 3)
+    walls = {"bottom": "xyz", "left": "x", "right": "x", "front": "y", "back": "y"}
+    for grid, size, fixed, centre in (
+        (ring, [0.75, 0.5], {"bottom": "xy", "right": "x"}, (0, 0.75)),
+        (box, [0.75, 0.75, 0.5], walls, (0.375, 0.375, 0.75)),
+    ):
+        down = (0,) * (grid.dim - 1) + (-1,)
+        tool = mpm.Tool(mpm.Ball(centre, 0.25), load=lambda t: 2e3 * t, direction=down)
+        body = mpm.box(grid, [0] * grid.dim, size)
+        s = mpm.Simulation(grid, [body], [SOIL], fixed=fixed, tools=[tool])
+        s.run(1.0, 0.5)
+        assert s.tool_forces[0, grid.dim - 1] == pytest.approx(-2e3, rel=1e-6)
+    with pytest.raises(ValueError, match="direction = .*must be along the axis"):
+        aside = mpm.Tool(mpm.Ball((0, 0.75), 0.25), load=1.0, direction=(1, 0))
+        mpm.Simulation(ring, [mpm.box(ring, [0, 0], [0.75, 0.5])], [SOIL], fixed={"bottom": "xy"}, tools=[aside])
+
+
 @pytest.mark.parametrize(
     ("given", "said"),
     [

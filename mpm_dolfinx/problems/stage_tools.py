@@ -81,6 +81,8 @@ class Tools:
             raise ValueError("tools: one is given twice, must be tools of their own")
         for tool in self.tools:
             tool.check(grid.dim)
+            if grid.axisymmetric and tool.along(grid.dim)[0]:
+                raise ValueError(f"Tool: direction = {line(tool.direction)}, must be along the axis in axisymmetry")
             if not callable(tool.displacement) and not callable(tool.rotation):
                 self._pose(tool, 0.0)
         self.faces = outside() if self.tools else None

@@ -314,10 +314,10 @@ class Tool:
         Shear stress that the contact takes besides, Pa, >= 0: alpha s_u of undrained soil, with friction 0.  All of it
         where the normal pressure is a tenth of it or more, and as much less as that is less.
     load : float or callable t (s) -> float, N (N/m in plane strain), >= 0
-        Pushes the tool along `direction`, beyond its displacement, as far as the bodies resist with as much; it begins
-        where it touches them.  How far that is, is in the simulation's `tool_travel`.
+        Pushes the tool along `direction`, beyond its displacement, as far as the bodies resist with as much, from the
+        first step on; it begins where it touches them.  How far that is, is in the simulation's `tool_travel`.
     direction : (d,)
-        In which a load pushes; of any length.
+        In which a load pushes; of any length; in axisymmetry along the axis.
 
     Raises
     ------
