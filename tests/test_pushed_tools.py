@@ -127,7 +127,7 @@ def test_a_load_pushes_along_the_axis_and_in_space():
         s = mpm.Simulation(grid, [body], [SOIL], fixed=fixed, tools=[tool])
         s.run(1.0, 0.5)
         assert s.tool_forces[0, grid.dim - 1] == pytest.approx(-2e3, rel=1e-6)
-    with pytest.raises(ValueError, match="direction = .*must be along the axis"):
+    with pytest.raises(ValueError, match=r"direction = .*must be along the axis"):
         aside = mpm.Tool(mpm.Ball((0, 0.75), 0.25), load=1.0, direction=(1, 0))
         mpm.Simulation(ring, [mpm.box(ring, [0, 0], [0.75, 0.5])], [SOIL], fixed={"bottom": "xy"}, tools=[aside])
 
