@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.constitutive.skeleton import STANDARD_GRAVITY
 from mpm_dolfinx.initial_state import pieces_at_start
-from mpm_dolfinx.parallel.exchange import first
 from mpm_dolfinx.parallel.messages import warn
 from mpm_dolfinx.points.bodies import Body
 from mpm_dolfinx.points.contact import check_apart
@@ -22,6 +21,7 @@ from mpm_dolfinx.points.grid import sum_by
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.points.pressure_transport import at_start
 from mpm_dolfinx.problems.cell_contact import let_go
+from mpm_dolfinx.problems.sides import everywhere
 from mpm_dolfinx.problems.stage import CONDITIONS, Stage, stage
 from mpm_dolfinx.scene import Scene
 from mpm_dolfinx.state import State
@@ -92,7 +92,6 @@ def begin_stage(
         new["reactions"] = np.full((len(begun.mechanical.holds), scene.grid.dim), unknown)
     if "tools" in named:
         new["tool_forces"] = begun.mechanical.forces(unknown)
-    if "tools" in named:
         new["tool_travel"] = np.zeros(len(begun.mechanical.tools.tools))
     if named.keys() & {"drained", "inflows"}:
         new["outflows"] = np.full(len(begun.hydraulic.outlets), unknown)
@@ -187,11 +186,6 @@ def _changed(scene: Scene, points: MaterialPoints, fields: Mapping[str, ArrayLik
             each = "one value for all, or " if name in data else ""
             raise ValueError(f"{what} of shape {new.shape}, must be {each}one for each of {len(points)} points")
         data[name] = new.copy()
-    points, refused = replace(points, data=data), ""
-    try:
-        scene.materials.check(points)
-    except ValueError as error:
-        refused = f"stage: fields: {error}"
-    if refused := first(scene.grid.comm, refused):
-        raise ValueError(refused)
+    points = replace(points, data=data)
+    everywhere(scene.grid, lambda: scene.materials.check("stage: fields", points))
     return points

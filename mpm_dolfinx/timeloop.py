@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext, suppress
+from contextlib import nullcontext
 from dataclasses import replace
 from inspect import signature
 from math import inf
@@ -21,6 +21,7 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 from mpm_dolfinx import _compat
 from mpm_dolfinx.errors import GaveUp, LeftGrid, StepFailed
 from mpm_dolfinx.io.summary import imbalance, peak_memory
+from mpm_dolfinx.parallel.exchange import first
 from mpm_dolfinx.parallel.messages import log
 from mpm_dolfinx.points.probes import Probes
 from mpm_dolfinx.result import Report, Result, Row
@@ -124,9 +125,8 @@ def run(
         probes.check(simulation.scene.bodies, simulation.state.stage.present)
     functions("observe", observers)
     for observer in observers:
-        with suppress(TypeError):  # of what is built in nothing is known
-            if not list(signature(observer).parameters):
-                raise ValueError(f"observe: {line(observer)}, must be a function of the simulation")
+        if _takes_nothing(observer):
+            raise ValueError(f"observe: {line(observer)}, must be a function of the simulation")
     functions("checkpoint", [checkpoint] if checkpoint is not None else [])
     if after is not None:
         instance("after", after, Result)
@@ -185,6 +185,14 @@ def _note(simulation: Simulated, result: Result) -> Result:
     return result
 
 
+def _takes_nothing(function: Callable) -> bool:
+    """Return whether a function is known to have no argument; of some that are built in nothing is known."""
+    try:
+        return not signature(function).parameters
+    except (TypeError, ValueError):
+        return False
+
+
 def _observe(observer: Callable, simulation: Simulated, comm: MPI.Intracomm) -> None:
     """Call an observer; raise on all processes if it raises on one, that none waits for the others."""
     raised = None
@@ -192,11 +200,11 @@ def _observe(observer: Callable, simulation: Simulated, comm: MPI.Intracomm) -> 
         observer(simulation)
     except BaseException as error:  # also Ctrl-C
         raised = error
-    failed = comm.allgather(raised is not None) if comm.size > 1 else [raised is not None]
+    where = first(comm, "" if raised is None else f"process {comm.rank}")
     if raised is not None:
         raise raised
-    if any(failed):
-        raise RuntimeError(f"observe: {line(observer)} has raised an error on process {failed.index(True)}")
+    if where:
+        raise RuntimeError(f"observe: {line(observer)} has raised an error on {where}")
 
 
 def _histories(

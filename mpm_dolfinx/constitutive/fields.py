@@ -214,11 +214,14 @@ class SceneMaterials:
             out[rows] = values
         return out
 
-    def check(self, points: MaterialPoints) -> None:
+    def check(self, what: str, points: MaterialPoints) -> None:
         """Refuse, with a ValueError, values of the materials' fields at points that these may not have."""
         for i in self._used:
             rows = np.flatnonzero(points.material == i)
-            replace(self.materials[i], **{name: points.data[name][rows] for name in self._fields[i]})
+            try:
+                replace(self.materials[i], **{name: points.data[name][rows] for name in self._fields[i]})
+            except ValueError as error:
+                raise ValueError(f"{what}: {error}") from error
 
     def _at(self, points: MaterialPoints, i: int, rows: NDArray[np.int64]) -> Skeleton:
         """Return a material whose constants are arrays over some of its points."""

@@ -76,7 +76,8 @@ class Tools:
         held: Sequence[tuple[Displacement, Surface]],
     ):
         self.grid, self._materials, self.tools, self._held = grid, materials, tuple(tools), held
-        self._ways: Ways | None = None
+        still = np.zeros(len(self.tools))
+        self._ways = Ways(0.0, 0.0, still, still)
         if len({id(tool) for tool in self.tools}) < len(self.tools):
             raise ValueError("tools: one is given twice, must be tools of their own")
         for tool in self.tools:
@@ -99,15 +100,13 @@ class Tools:
 
     def going(self, ways: Ways) -> Tools:
         """Return the tools as loads push them in a step."""
-        if not any(tool.load is not None for tool in self.tools):
-            return self
         tools = copy(self)
         tools._ways = ways
         return tools
 
     def _pose(self, tool: Tool, t: float) -> Pose:
         """Return where a tool is at time t (s); in axisymmetry it goes along the axis."""
-        pose = tool.pose(t, self.grid.dim, self._ways.at(t)[self.tools.index(tool)] if self._ways else 0.0)
+        pose = tool.pose(t, self.grid.dim, self._ways.at(t)[self.tools.index(tool)])
         if self.grid.axisymmetric and (pose.shift[0] or pose.R[0, 1]):
             what = f"moves by {pose.shift}{' and turns' * bool(pose.R[0, 1])} at t = {t:g} s"
             raise ValueError(f"{line(tool)}: {what}, must move by (0, z) and not turn in axisymmetry")
@@ -127,8 +126,7 @@ class Tools:
         size, free = np.linalg.norm(area, axis=1), self._free[patches.here]
         resists = self._materials.table(cut.points, resistance)[patches.at]
         poses, found, loads = [self._pose(tool, t) for tool in self.tools], [], [tool.pushes(t) for tool in self.tools]
-        ways = self._ways.before if self._ways else np.zeros(len(loads))
-        pushed = PushedTools([line(tool) for tool in self.tools], ways, np.array(loads), grid.h.min())
+        pushed = PushedTools([line(tool) for tool in self.tools], self._ways.before, np.array(loads), grid.h.min())
         for number, (tool, pose) in enumerate(zip(self.tools, poses, strict=True)):
             before = self._pose(tool, start)
             n = everywhere(grid, lambda tool=tool, pose=pose: tool.solid(grid.h.min()).normal(pose.own(x)) @ pose.R.T)

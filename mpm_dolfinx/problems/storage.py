@@ -9,12 +9,12 @@ In each active cell, with J_Delta = det(I + grad u) (never div u: a rotation wou
 r = exp(p / K_w) the density of the fluid over rho_w, that at zero pressure, in zeta that at (p_n + p) / 2 and on a face
 the logarithmic mean, so r [p+ - p-] is the jump of the mass potential (`fluid_content`): what leaves a cell enters its
 neighbour in mass.  The residual is that over r.  Its tangent leaves out what differences of r make, of neighbours and
-in the step.  A is the exact overlap
-of the body with the face, x+- are the centroids of what the cells hold and d+- their distances from the face; `layers`
-has kappa and d of cells that hold several conductivities.  Distances from the centroids keep the error at 0.2 % for any
-filling, where half the cell size reaches 12 %.  Where bodies lie aslant, `aslant` adds what centroids that are not
-across from one another leave out.  The sum over the cells is the fluid balance.  The change of the content is that of
-`fluid_content`, the integral over the step that of a substep of `time_integration`.
+in the step.  A is the exact overlap of the body with the face, x+- are the centroids of what the cells hold and d+-
+their distances from the face; `layers` has kappa and d of cells that hold several conductivities.  Distances from the
+centroids keep the error at 0.2 % for any filling, where half the cell size reaches 12 %.  Where bodies lie aslant,
+`aslant` adds what centroids that are not across from one another leave out.  The sum over the cells is the fluid
+balance.  The change of the content is that of `fluid_content`, the integral over the step that of a substep of
+`time_integration`.
 
 Corners of domains follow more than u, points change cells, and jumps are damped (below), so the volumes of domains part
 from the fluid that has come to them.  The points carry this difference, `owed`, and cells take it in by small shares in
