@@ -36,7 +36,9 @@ from mpm_dolfinx.problems.smeared import warn_smeared
 from mpm_dolfinx.problems.stage import Stage
 from mpm_dolfinx.problems.storage import StorageForms
 from mpm_dolfinx.solve.scheme import Scheme
+from mpm_dolfinx.state import State
 from mpm_dolfinx.time_integration import Substep, substeps
+from mpm_dolfinx.validation import line
 
 
 class Scene:
@@ -127,6 +129,11 @@ class Scene:
         self.t.value, self.dt.value = t, dt
         if gravity is not None:
             self.gravity.value = gravity
+
+    def check(self, state: State) -> None:
+        """Refuse what is no state of this scene: its conditions act on the materials of another one."""
+        if not isinstance(state, State) or state.stage.mechanical.materials is not self.materials:
+            raise ValueError(f"state = {line(state)}, must be a state of this simulation")
 
     def on_grid(self, points: MaterialPoints) -> OnGrid:
         """Return the bodies on the grid, reset for these points."""

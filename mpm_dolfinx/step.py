@@ -16,6 +16,7 @@ from mpm_dolfinx.state import State
 
 def set_up(scene: Scene, state: State, dt: float) -> Start:
     """Return the start of a step of dt (s): the state on the grid, its matrices, and what acts in each substep."""
+    scene.check(state)
     collect_garbage(scene.grid.mesh.comm)
     stage, times = state.stage, [state.t + substep.end * dt for substep in scene.substeps]
     gravity = [stage.gravity_at(t) for t in times]

@@ -35,7 +35,7 @@ from mpm_dolfinx.stages import begin_stage
 from mpm_dolfinx.state import State
 from mpm_dolfinx.step import step
 from mpm_dolfinx.timeloop import run
-from mpm_dolfinx.validation import numbers, whole
+from mpm_dolfinx.validation import line, numbers, whole
 
 if TYPE_CHECKING:
     from mpm_dolfinx.simulation import Simulation
@@ -98,6 +98,8 @@ def factor_of_safety(simulation: Simulation, *, dt: float | None = None, rtol: f
     GaveUp
         A step of a trial that does not converge, however short.
     """
+    if not isinstance(getattr(simulation, "scene", None), Scene):
+        raise ValueError(f"simulation = {line(simulation)}, must be a Simulation")
     weakened = _Weakened(simulation, _step_of(simulation, dt))
     rtol = float(numbers("rtol", rtol, allowed="in [1e-4, 0.5]", test=lambda v: (1e-4 <= v) & (v <= 0.5)))
     steps, motions = whole("steps", steps, 8), {}
@@ -171,7 +173,7 @@ class _Weakened:
             raise ValueError("factor_of_safety: no material has a strength, must have friction and cohesion")
         if simulation.state.stage.conditions["contacts"]:
             raise ValueError("factor_of_safety: contacts: must be none")
-        self._at_rest = at_rest = begin_stage(scene, simulation.state, {}, [], [], False, {})  # free of its grid
+        at_rest = begin_stage(scene, simulation.state, {}, [], [], False, {})  # free of its grid
         viscosity = fem.Constant(scene.grid.mesh, VISCOUS * _mean_stress(scene, at_rest.points) * dt)  # Pa s
 
         def resistance(points, u, dt):
@@ -184,6 +186,8 @@ class _Weakened:
         options = *options, [*terms, resistance], sources, {}  # what initial stresses need the materials have
         self._scene = Scene(scene.grid, scene.bodies, materials, scene.fluid, *options)
         self._strengths = _strengths(scene, at_rest.points)
+        points = replace(at_rest.points, data={**at_rest.points.data, **self._strengths})
+        self._at_rest = begin_stage(self._scene, replace(at_rest, points=points), {}, [], [], False, {})
 
     def motion(self, factor: float, steps: int) -> NDArray[np.float64]:
         """Return the largest motion of a point in each step (n,), m, until it is known what becomes of it."""

@@ -118,6 +118,9 @@ def run(
     GaveUp
         With the histories so far; `points` and `t` are those of the last good step.
     """
+    comm = simulation.scene.grid.comm
+    simulation.scene.check(simulation.state)
+    _check_alike(comm, {"t_end": t_end, "dt": dt, "rtol": rtol, "t_eval": t_eval, "max_step": max_step})
     if probes is not None and not isinstance(probes, Probes):
         raise ValueError(f"probes = {line(probes)}, must be what `probes` gives")
     observers = [observe] if callable(observe) else observe
@@ -130,7 +133,7 @@ def run(
     functions("checkpoint", [checkpoint] if checkpoint is not None else [])
     if after is not None:
         instance("after", after, Result)
-    now, comm = simulation.state.t, simulation.scene.grid.comm
+    now = simulation.state.t
     start = now if after is None else after.rows[0][0]
     times = Times(start, now, t_end, dt, t_eval, rtol, after is not None)
     rule = step_rule(times, rtol, first_step, max_step, simulation.scene, simulation.state.points)
@@ -163,6 +166,16 @@ def run(
             simulation.state = replace(simulation.state, t=target)
             output(target == times.end)
     return _note(simulation, stopwatch.read(_measured(simulation)))
+
+
+def _check_alike(comm: MPI.Intracomm, given: dict[str, Any]) -> None:
+    """Refuse arguments that are not the same on all processes, which would wait for each other."""
+    texts = comm.allgather([line(value) for value in given.values()])
+    for k, name in enumerate(given):
+        for rank, text in enumerate(texts):
+            if text[k] != texts[0][k]:
+                what = f"{name} = {texts[0][k]} on process 0, {text[k]} on process {rank}"
+                raise ValueError(f"{what}, must be the same on all")
 
 
 def _bar(start: float, now: float, end: float, shown: bool) -> tqdm:

@@ -48,3 +48,10 @@ try:
 except (OSError, RuntimeError) as error:
     message = str(error)
 assert "disk is full" in message or f"on process {grid.comm.size - 1}" in message, message
+
+try:
+    scene().run(1.0, 0.1 * (1 + grid.comm.rank), progress=False)
+    message = "accepted"
+except ValueError as error:
+    message = str(error)
+assert message == "dt = 0.1 on process 0, 0.2 on process 1, must be the same on all", message

@@ -259,6 +259,14 @@ CASES = {
     "checkpoint to nothing": (lambda: mpm.Checkpoint(None), "checkpoint: file", "None"),
     "checkpoint to a folder": (lambda folder: mpm.Checkpoint(folder), "checkpoint: file", "is a folder"),
     "checkpoint from nothing": (lambda: mpm.resume(scene(), None), "checkpoint: file", "None"),
+    "a state that is none": (lambda: run_from(None), "state = None", "a state of this simulation"),
+    "a state of another scene": (lambda: run_from(scene().state), "state = State(t=0.0", "a state of this simulation"),
+    "a plate's force that is nan": (
+        lambda: steps(scene(plates=[mpm.RigidPlate("top", lambda t: NAN)])),
+        "RigidPlate(side='top'",
+        "force at t = ",
+    ),
+    "safety of a word": (lambda: mpm.factor_of_safety("scene"), "simulation = 'scene'", "must be a Simulation"),
     "checkpoint into a word": (lambda: mpm.resume("scene", "file"), "simulation", "'scene'"),
     "another archive": (archive(a=np.zeros(3)), "other.npz", "checkpoint of mpm_dolfinx"),
     "a checkpoint without a note": (archive(format=np.array("mpm_dolfinx checkpoint")), "other.npz", "checkpoint of"),
@@ -272,6 +280,12 @@ CASES = {
 
 def run_law(**functions):
     steps(scene(materials=[law(energy=lambda F, bulk, shear, k: ENERGY(F, bulk, shear), **functions)]))
+
+
+def run_from(state):
+    s = scene()
+    s.state = state
+    steps(s)
 
 
 def run_two(probes, **stage):
@@ -297,9 +311,10 @@ def test_a_term_that_becomes_nan_is_no_convergence(options, fluid):
     assert 0.69 < s.t < 0.7 and np.isfinite(s.points.x).all() and caught.value.result.t[-1] == 0.5
 
 
-def test_a_source_that_becomes_nan_is_no_convergence():
-    s = wet(sources=[lambda points, q, t: 1e-6 * ufl.ln(0.7 - t) * q * points.dx])
-    with pytest.raises(mpm.GaveUp, match="nan in the residual of the storage"):
+@pytest.mark.parametrize(("value", "of"), [("nan", ufl.ln), ("inf", lambda left: 1 / ufl.max_value(left, 0.0))])
+def test_a_source_that_is_no_longer_finite_is_no_convergence(value, of):
+    s = wet(sources=[lambda points, q, t: 1e-6 * of(0.7 - t) * q * points.dx])
+    with pytest.raises(mpm.GaveUp, match=f"{value} in the residual of the storage: a source"):
         steps(s)
     assert 0.69 < s.t < 0.7 and np.isfinite(s.points.pressure).all()
 

@@ -333,6 +333,14 @@ class Displacement:
 
 
 @dataclass(frozen=True, eq=False)
+class _OfPlate(Traction):
+    """The even traction of a plate, which refuses what its force gives by the plate's name."""
+
+    def at(self, t: float, dim: int, side: Places | None = None) -> NDArray[np.float64]:
+        return self.value(t)
+
+
+@dataclass(frozen=True, eq=False)
 class RigidPlate:
     """Rigid, smooth plate on a flat side of the bodies: one displacement along the side's axis for all its faces.
 
@@ -372,7 +380,7 @@ class RigidPlate:
             force = asked(name, "a finite number for a time", self.force, t) if callable(self.force) else self.force
             return inward * numbers(name, force) / area
 
-        return Traction(self.side, even, self.region)
+        return _OfPlate(self.side, even, self.region)
 
 
 def facing(faces: Surface) -> tuple[int, int]:

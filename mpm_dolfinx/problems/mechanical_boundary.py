@@ -86,7 +86,7 @@ class MechanicalBoundary:
         terms: Sequence[OnSide],
         contacts: Sequence[Contact] = (),
     ):
-        self.grid, self._free, self._materials, d = sides.grid, free, materials, sides.grid.dim
+        self.grid, self._free, self.materials, d = sides.grid, free, materials, sides.grid.dim
         self.plates = [(plate, sides.of(plate)) for plate in plates]
         self._terms = [sides.of(term) for term in terms]
         self.pressures = [(load, sides.of(load)) for load in tractions if isinstance(load, Pressure)]
@@ -243,7 +243,7 @@ class MechanicalBoundary:
             patches = cut.surface(faces)
             area = patches.area(points)
             length = faces.area0.sum() ** (1 / (d - 1))
-            rigidity = RIGIDITY * self._materials.stiffest * length * np.linalg.norm(area, axis=1, keepdims=True)
+            rigidity = RIGIDITY * self.materials.stiffest * length * np.linalg.norm(area, axis=1, keepdims=True)
             axis = facing(faces)[0]
             normal = np.tile(np.eye(d)[axis], (len(area), 1))
             tilt = normal - area / area[:, [axis]]  # slope of the face: its normal is (-slope, 1)
@@ -280,11 +280,11 @@ class MechanicalBoundary:
         patches = [cut.surface(faces) for _, faces, _ in self.holds]
         chosen = np.unique(np.concatenate([p.at for p in patches]))
         now, before = (of.map(lambda values: values[chosen]) for of in (points, cut.points))
-        stress = self._materials.total_stress(now)
-        modulus, resists = (self._materials.table(before, of) for of in (holding, resistance))
-        firm = self._materials.confined_modulus(before)
+        stress = self.materials.total_stress(now)
+        modulus, resists = (self.materials.table(before, of) for of in (holding, resistance))
+        firm = self.materials.confined_modulus(before)
         # of when the grid was reset, as the stiffnesses: they stay as long as the cut serves
-        tension = np.linalg.norm(stress if points is cut.points else self._materials.total_stress(before), axis=(1, 2))
+        tension = np.linalg.norm(stress if points is cut.points else self.materials.total_stress(before), axis=(1, 2))
         for number, ((hold, *_, axes), p) in enumerate(zip(self.holds, patches, strict=True)):
             at, now, to = np.searchsorted(chosen, p.at), p.now(points), p.origin(points) + self._given(hold, t, p.X)
             R = turned(self.grid.comm, p.area0, now, to) if len(axes) == d else np.eye(d)  # as what it carries does
