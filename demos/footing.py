@@ -135,6 +135,7 @@ def push(
     rest=0.0,
     steps: int | None = None,
     circular: bool = False,
+    method: str = "sdirk2",
 ) -> Push:
     """Push the footing.
 
@@ -154,6 +155,8 @@ def push(
         Equal steps of the push; by default those of `STEP`.
     circular
         A disc of the diameter B, not a strip.
+    method
+        Of time integration.
     """
     h = WIDTH / cells
     columns, rows, air = (round(size * cells) for size in (*box, 0.25 + 0.5 * depth))
@@ -163,7 +166,7 @@ def push(
     end, edge = (depth * WIDTH**2 / (CV * rate) if rate else 1.0), (WIDTH - h) / 2
     under, beside = ((0, -np.inf), (edge, np.inf)), ((edge, -np.inf), (np.inf, np.inf))
     footing = mpm.Displacement("top", lambda t, X: (0, -depth * WIDTH * min(1, t / end)), region=under)
-    water = {"fluid": WATER, "drained": [mpm.Drained("top", region=beside)]} if rate else {}
+    water = {"fluid": WATER, "method": method, "drained": [mpm.Drained("top", region=beside)]} if rate else {}
     fixed = {"left": "x", "right": "x", "bottom": "xy"}
     simulation = mpm.Simulation(grid, [body], [soil], fixed=fixed, displacements=[footing], **water)
     out = Push()
@@ -208,6 +211,8 @@ def main(argv: list[str] | None = None) -> dict:
     parser.add_argument("--depth", type=float, default=1.0, help="depth of the push over the footing's width")
     parser.add_argument("--steps", type=int, help="only push at the intermediate rate, in so many equal steps")
     parser.add_argument("--box", type=float, default=BOX[0], help="with --steps: width of half the soil over B")
+    methods = ("sdirk2", "backward-euler")
+    parser.add_argument("--method", choices=methods, default=methods[0], help="with --steps: of time integration")
     o = parser.parse_args(argv)
     if o.cells < 3 or o.cells % 2 == 0 or not 0 < o.depth <= 1.5:
         parser.error(f"--cells {o.cells} --depth {o.depth:g}: must be odd and >= 3, and in (0, 1.5]")
@@ -215,7 +220,7 @@ def main(argv: list[str] | None = None) -> dict:
         parser.error(f"--steps {o.steps} --box {o.box:g}: must be >= 1, and in [1, 32]")
     with common.results(o) as out:
         if o.steps is not None:
-            out |= effort(o.cells, o.depth, o.steps, o.box)
+            out |= effort(o.cells, o.depth, o.steps, o.box, o.method)
             return out
         stiff = {(how, cells): limit_load(how, cells) for how in LIMITS_OF for cells in (o.cells, 2 * o.cells - 1)}
         out["errors"] = errors(stiff)
@@ -228,13 +233,13 @@ def main(argv: list[str] | None = None) -> dict:
     return out
 
 
-def effort(cells: int, depth: float, steps: int, width: float) -> dict:
+def effort(cells: int, depth: float, steps: int, width: float, method: str) -> dict:
     """Push at the intermediate rate in equal steps; print what they took and return it.
 
     width: of half the soil, over B.
     """
     began = time.process_time()
-    run = push(SOIL, cells, depth, RATES["intermediate"], box=(width, BOX[1]), steps=steps)
+    run = push(SOIL, cells, depth, RATES["intermediate"], box=(width, BOX[1]), steps=steps, method=method)
     found = {"points": run.results[0].points, "asked": steps, "load": run.load[-1]}
     found |= {count: run.total(count) for count in ("steps", "cuts", "newton")} | {"cpu": time.process_time() - began}
     print(

@@ -190,25 +190,12 @@ class Newton:
 
         serves: whether the tangent of the substep before may serve.
         """
-        errors, other = self._begin()
-        fresh, watched = self._linear or not serves, not self._momentum.forms.elastic
-        if other is not None:
-            try:
-                return self._iterations(errors, as_reset, key, fresh, watched)
-            except NotConverged:
-                self._go_to(other)
-                errors, fresh = self._errors(errors.start), True
-        return self._iterations(errors, as_reset, key, fresh, watched)
-
-    def _iterations(
-        self, errors: Errors, as_reset: Callable[[], QuadratureData], key: Hashable, fresh: bool, watched: bool
-    ) -> Errors:
-        """Iterate from the present (u, p), of these errors; fresh: with its own tangent; watched: by a watchdog."""
-        dog, count = Watchdog(errors.worst, self._iterate()) if watched else None, 0
+        errors, watched = self._begin(), not self._momentum.forms.elastic
+        dog, count, fresh = Watchdog(errors.worst, self._iterate()) if watched else None, 0, self._linear or not serves
         while (found := self._augmented(errors)).worst > self._scheme.tolerance:
             if found is not errors:  # what has balanced is to do so with other pressures or pairs of contacts
                 errors, count, fresh = found, 0, True
-            if fresh or not watched:  # what yields and has begun to converge may go on
+            if not watched or (fresh and not dog.converges) or count == 2 * self._scheme.most_newton:
                 self._check(max(count, self.report.newton // REBALANCED), "newton")
             if fresh and self._linear and not self.report.newton:
                 self._solvers.tangent(key, lambda: self._linearise_as_reset(as_reset))
@@ -219,6 +206,8 @@ class Newton:
             count += 1
             fresh = errors.worst > self._keep * min(1.0, before.worst)  # inf where no fluid has moved yet
             dog = dog and dog.after(errors.worst, step, self._iterate)
+            if dog and dog.lost(errors.worst):
+                raise NotConverged("no descent along the Newton directions", self.report.history)
             if dog and dog.strays(errors.worst):
                 self._go_to(dog.where)
                 errors, fresh, dog = self._errors(errors.start), True, replace(dog, since=0, descends=True)
@@ -236,11 +225,8 @@ class Newton:
             errors = self._errors(errors.start)
         return errors
 
-    def _begin(self) -> tuple[Errors, list[NDArray[np.float64]] | None]:
-        """Return the errors where the iterations begin: at a guess that balances better than where (u, p) are.
-
-        Also where else they may begin, if there is another place.
-        """
+    def _begin(self) -> Errors:
+        """Return the errors where the iterations begin: at a guess that balances better than where (u, p) are."""
         errors, start, best = self._errors(), self._iterate(), None
         guesses = [] if self._linear else self._momentum.guesses()
         for guess in guesses:
@@ -251,15 +237,12 @@ class Newton:
                 continue
             if found.u < (best or errors).u:  # of no other p: where no fluid has moved yet the storage tells nothing
                 best, at = found, guess
-        if best is None:
-            if guesses:
-                self._go_to(start)
-                errors = self._errors(errors.start)
-            return errors, None
-        if guess is not at:
-            self._go_to([at, *start[1:]])
-            best = self._errors(errors.start)
-        return best, start
+        if best is not None and guess is at:
+            return best
+        if guesses:
+            self._go_to(start if best is None else [at, *start[1:]])
+            errors = self._errors(errors.start)
+        return errors
 
     def _iterate(self) -> list[NDArray[np.float64]]:
         """Return a copy of the present (u, p), local arrays, m and Pa."""
@@ -344,9 +327,9 @@ class Newton:
                 norm_p = fluid.vector.norm(PETSc.NormType.N1)
                 p = _relative(norm_p, fluid.exchanged, fluid.round_off)
                 noted_p = _relative(norm_p, max(fluid.exchanged, fluid.round_off / tolerance))
-        if not history and np.isnan(norm + norm_p):
-            where = "storage: a source" if norm == norm else "momentum: a law or term"
-            raise NotConverged(f"nan in the residual of the {where} gives it, must be finite")
+        if not history and not np.isfinite(norm + norm_p):
+            where, what = ("storage: a source", norm_p) if np.isfinite(norm) else ("momentum: a law or term", norm)
+            raise NotConverged(f"{what:g} in the residual of the {where} gives it, must be finite")
         history.append((noted_u, noted_p))
         return Errors(u, p, measure, scale_u or scale, fluid)
 

@@ -13,9 +13,9 @@ as short.
 
 Soil that flows has next to no stiffness along its mechanisms, where flow is not associated even less than none: full
 steps go far astray there.  A share of the elastic shear stiffness in the tangent, as the residual is large, holds them
-back (Levenberg 1944, Marquardt 1963): ten times as much after a step that was shortened to next to nothing, until full
-ones are right again.  A footing of 21 cells, pushed by 0.06 widths in 4 steps at an intermediate rate, takes no cut,
-not 3, and 126 tangents, not 384.
+back (Levenberg 1944, Marquardt 1963): ten times as much after a step that was shortened to next to nothing, a tenth
+after a full one to the least residual so far.  If it went with each full step, the next one would be as short as
+before, and the iterations would circle.
 """
 
 from __future__ import annotations
@@ -40,6 +40,13 @@ FIRM, FIRMEST = 0.1, 0.1
 """Share of the elastic shear stiffness over the residual that is added to a tangent where soil yields, and its most."""
 SHORT, LONG, FIRMER, MOST = 0.15, 0.9, 10.0, 1e4
 """Steps below which and from which on tangents become firmer and less firm, by which factor, and the most in all."""
+LOST, GAINED = 4, 0.9
+"""Steps after which iterations are given up that were all short but the first, and by how much they are to gain on it.
+
+A footing's went on for 7 to 14 steps, each of many tries, before the time step was cut.
+"""
+RECENT, FALLS = 8, 0.1
+"""Steps in which the least residual falls to what share lets iterations go on beyond the most that there may be."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +54,8 @@ class Watchdog:
     """Watches the iterations where soil yields.
 
     least: least residual so far; where: (u, p) there; since: steps since; descends: whether they were called back;
-    firm: by how much the tangents are firmer than usual.
+    firm: by how much the tangents are firmer than usual; count, short: steps so far, and short ones since the last that
+    was not; first: residual after the first; leasts: least residuals so far, of recent steps.
     """
 
     least: float
@@ -55,6 +63,10 @@ class Watchdog:
     since: int = 0
     descends: bool = False
     firm: float = 1.0
+    count: int = 0
+    short: int = 0
+    first: float = np.inf
+    leasts: tuple[float, ...] = ()
 
     def limit(self, residual: float) -> float:
         """Return what the next step may make of a residual."""
@@ -62,11 +74,28 @@ class Watchdog:
 
     def after(self, residual: float, step: float, iterate: Callable[[], list[NDArray[np.float64]]]) -> Watchdog:
         """Return what is known after such a share of a Newton step to a residual at (u, p) = iterate()."""
-        firm = self.firm * FIRMER if step < SHORT else self.firm / FIRMER if step >= LONG else self.firm
-        firm = min(MOST, max(1.0, firm))
-        if residual < self.least:
-            return Watchdog(residual, iterate(), firm=firm)
-        return replace(self, since=self.since + 1, firm=firm)
+        falls, short = residual < self.least, step < SHORT
+        firm = self.firm * FIRMER if short else self.firm / FIRMER if falls and step >= LONG else self.firm
+        now = replace(
+            self,
+            firm=min(MOST, max(1.0, firm)),
+            count=self.count + 1,
+            short=self.short + 1 if short else 0,
+            first=self.first if self.count else residual,
+            leasts=(*self.leasts, self.least)[-RECENT:],
+        )
+        if falls:
+            return replace(now, least=residual, where=iterate(), since=0, descends=False)
+        return replace(now, since=self.since + 1)
+
+    def lost(self, residual: float) -> bool:
+        """Return whether the iterations lead nowhere from where their first step has gone."""
+        return self.count == LOST and self.short >= LOST - 1 and residual > GAINED * self.first
+
+    @property
+    def converges(self) -> bool:
+        """Whether the least residual has fallen in recent steps."""
+        return len(self.leasts) == RECENT and self.least < FALLS * self.leasts[0]
 
     def strays(self, residual: float) -> bool:
         """Return whether the iterations are to go back to the least residual, and to descend from there."""
