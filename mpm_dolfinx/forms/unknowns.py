@@ -61,11 +61,15 @@ class Unknowns:
         """Node and component of the entries of the vectors."""
         return np.divmod(self.owned, self.dim)
 
+    @property
+    def positions(self) -> NDArray[np.float64]:
+        """Where the entries of the vectors are (n, d), m."""
+        return self._space.tabulate_dof_coordinates()[self.owned // self.dim, : self._space.mesh.geometry.dim]
+
     def rigid_body_modes(self) -> PETSc.NullSpace:
         """Return translations and rotations, as far as the unknowns allow them: what strain does not see."""
         d = self.dim
-        node, axis = self.nodes
-        x, direction = self._space.tabulate_dof_coordinates()[node, :d], np.eye(d)[axis]
+        x, direction = self.positions, np.eye(d)[self.nodes[1]]
         modes = np.concatenate([direction, np.empty((self.size, d * (d - 1) // 2))], axis=1)
         x = x - self.comm.allreduce(x.sum(axis=0)) / self.global_size
         x /= np.sqrt(self.comm.allreduce(float(np.square(x).sum())) / self.global_size)

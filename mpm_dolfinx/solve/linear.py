@@ -3,9 +3,13 @@
 
 PETSc's own factors of displacements in blocks, a block a node, take a third of the time of those of single
 unknowns: with 44000 unknowns in 2D and minimum degree ordering 110 ms, 60 again with the same pattern (single 430 and
-150; nested dissection twice that; MUMPS 260 and 155, UMFPACK 290 and 265, CHOLMOD 285 and 290).  A solve takes 4 ms
-(MUMPS 15, CHOLMOD 9).  Copying the entries into blocks takes a tenth of the factorisation.  On two processes MUMPS
-takes as long, and 25 ms a solve: each of a few processes has all factors that many solves use.
+150; MUMPS 260 and 155, UMFPACK 290 and 265, CHOLMOD 285 and 290).  A solve takes 4 ms (MUMPS 15, CHOLMOD 9).  Copying
+the entries into blocks takes a tenth of the factorisation.  On two processes MUMPS takes as long, and 25 ms a solve:
+each of a few processes has all factors that many solves use.
+
+Large bodies want nested dissection: with 504000 unknowns in 2D factors take 3.0 s again and 4.6e7 entries by grid
+lines, see `dissection`, by PETSc's nested dissection 5.1 s and 5.0e7, by minimum degree 6 to 12 s and 7.5e7 (MUMPS
+6.2 s and 5.3e7).  With a tenth of the unknowns 80, 110, 120 ms; with fewer all are the same.
 """
 
 from __future__ import annotations
@@ -53,9 +57,10 @@ def direct_solver(
     ksp = _preonly(A, name)
     kind = PETSc.PC.Type.CHOLESKY if symmetric else PETSc.PC.Type.LU
     options = PETSc.Options(ksp.getOptionsPrefix())
+    ordering = "nd" if often else "amd"
     if often and 1 < A.comm.size <= REDUNDANT:
         ksp.pc.setType(PETSc.PC.Type.REDUNDANT)
-        for option, value in {"type": kind, "factor_mat_ordering_type": "amd", "factor_zeropivot": 0.0}.items():
+        for option, value in {"type": kind, "factor_mat_ordering_type": ordering, "factor_zeropivot": 0.0}.items():
             options.setValue(f"redundant_pc_{option}", value)
     else:
         ksp.pc.setType(kind)
@@ -65,7 +70,7 @@ def direct_solver(
         elif package is not None:
             ksp.pc.setFactorSolverType(package)
         else:
-            ksp.pc.setFactorOrdering("amd")
+            ksp.pc.setFactorOrdering(ordering)
             ksp.pc.setFactorPivot(0.0)  # PETSc's 2e-14 refuses slivers of cells: rows of any scale are welcome
     ksp.setOperators(A)
     ksp.setFromOptions()
@@ -125,7 +130,8 @@ class NodalFactors:
         comm = unknowns.comm
         counts = np.concatenate([[0], np.cumsum(comm.allgather(len(np.unique(node))))])
         block = counts[comm.rank] + np.unique(node, return_inverse=True)[1]
-        self._nodes = tuple(np.concatenate(comm.allgather(rows)) for rows in (block, axis))
+        rows = (block, axis, unknowns.positions)
+        self._nodes = tuple(np.concatenate(comm.allgather(values)) for values in rows)
         self._dim, self._symmetric = unknowns.dim, symmetric
         start = int(comm.exscan(unknowns.size) or 0) if comm.size > 1 else 0
         self._mine = slice(start, start + unknowns.size)
@@ -137,7 +143,7 @@ class NodalFactors:
         A, _ = pc.getOperators()
         whole = A if A.comm.size == 1 else A.getRedundantMatrix(A.comm.size, PETSc.COMM_SELF)
         rows, columns, values = whole.getValuesCSR()
-        make = (whole, rows, columns, *self._nodes, self._dim, self._symmetric)
+        make = (rows, columns, *self._nodes, self._dim, self._symmetric)
         self._factors((rows, columns), lambda: BlockFactors(*make)).factorise(values)
         if whole is not A:
             whole.destroy()
@@ -151,27 +157,51 @@ class NodalFactors:
         y.array_w[:] = self._factors.value.solve(whole.array_r)[self._mine]
 
 
+def dissection(x: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return the order (n,) of nodes of a grid at x (n, d), m, by nested dissection.
+
+    A box of nodes is halved by the grid line through its middle, whose nodes come last; so are halves and lines.
+    """
+    at = np.stack([_lines(along) for along in x.T], axis=1)
+    high, every = np.tile(at.max(axis=0, initial=0), (len(at), 1)), np.arange(len(at))
+    low, key = np.zeros_like(high), np.zeros(len(at), dtype=np.int64)
+    while (high > low).any():
+        axis = (high - low).argmax(axis=1)
+        one = every, axis
+        middle, here = (low[one] + high[one]) // 2, at[one]
+        key = 3 * key + np.where(here == middle, 2, here > middle)
+        low[one] = np.where(here < middle, low[one], middle + (here > middle))
+        high[one] = np.where(here > middle, high[one], middle - (here < middle))
+    return np.argsort(key, kind="stable")
+
+
+def _lines(x: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return the numbers (n,) of the grid lines that coordinates (n,) lie on, of those that any does."""
+    values, at = np.unique(x, return_inverse=True)
+    return np.cumsum(np.diff(values, prepend=values[:1]) > 1e-7 * (values[-1:] - values[:1]))[at]
+
+
 class BlockFactors:
     """Factors of matrices of one pattern, with a block a node.
 
     Parameters
     ----------
-    A, rows, columns
-        A matrix, and its pattern.
+    rows, columns
+        The pattern.
     block, axis
         Node and component of each unknown.
+    x : (n, d)
+        Where it is, m.
     dim
         Components of a node.
     symmetric
         Factors are U^T D U; if not, L U.
     """
 
-    def __init__(self, A: PETSc.Mat, rows, columns, block, axis, dim: int, symmetric: bool):
+    def __init__(self, rows, columns, block, axis, x, dim: int, symmetric: bool):
         count = int(block.max(initial=-1)) + 1
-        ordered = block[A.getOrdering("amd")[0].indices]
-        found, first = np.unique(ordered, return_index=True)
         rank = np.empty(count, dtype=np.int64)
-        rank[found[np.argsort(first)]] = np.arange(count)
+        rank[dissection(x[np.unique(block, return_index=True)[1]])] = np.arange(count)
         self._place = rank[block] * dim + axis
         i, j = np.repeat(self._place, np.diff(rows)), self._place[columns]
         kept = np.arange(len(i))
@@ -187,12 +217,14 @@ class BlockFactors:
         self._pattern = blocks.indptr.astype(PETSc.IntType), blocks.indices.astype(PETSc.IntType)
         make = PETSc.Mat().createSBAIJ if symmetric else PETSc.Mat().createBAIJ
         self._matrix = make((n, n), dim, csr=(*self._pattern, np.zeros(blocks.data.shape)), comm=PETSc.COMM_SELF)
-        self._solver = ksp = PETSc.KSP().create(PETSc.COMM_SELF)
-        ksp.setType(PETSc.KSP.Type.PREONLY)
+        self._solver = ksp = _preonly(self._matrix, "nodal_factors")
         ksp.pc.setType(PETSc.PC.Type.CHOLESKY if symmetric else PETSc.PC.Type.LU)
         ksp.pc.setFactorOrdering("natural")
         ksp.pc.setFactorPivot(0.0)  # see `direct_solver`
+        # entries of the factors over those of the matrix: with 5, PETSc's, it makes room twice
+        PETSc.Options(ksp.getOptionsPrefix())["pc_factor_fill"] = 6 + 2.5 * max(0.0, np.log10(max(1, count) / 4000))
         ksp.setOperators(self._matrix)
+        ksp.setFromOptions()
         self._b, self._x = self._matrix.createVecs()
         self._b.set(0.0)
 
