@@ -224,8 +224,9 @@ class SceneMaterials:
                 raise ValueError(f"{what}: {error}") from error
 
     def _at(self, points: MaterialPoints, i: int, rows: NDArray[np.int64]) -> Skeleton:
-        """Return a material whose constants are arrays over some of its points."""
-        return _spread(self.materials[i], {name: points.data[name][rows] for name in self._fields[i]}, len(rows))
+        """Return a material whose constants are arrays over some of its points, unless they are numbers anyway."""
+        values = {name: points.data[name][rows] for name in self._fields[i]}
+        return _spread(self.materials[i], values, len(rows)) if values else self.materials[i]
 
     def parameters(self, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
         """Return all parameters at the points (n, ...), zero where a point's law does not know them."""

@@ -179,6 +179,12 @@ class Places(Keyed):
         self.filled, self.slots = np.unique(cells, return_inverse=True)
         """The cells that hold points; and the place of each point's cell among these."""
 
+    @cached_property
+    def dofs(self) -> NDArray[np.intp]:
+        """Unrolled local dofs (d, 2^d, cells) of Q1 vectors in the filled cells."""
+        d = self.grid.dim
+        return (self.grid.cell_nodes[self.filled] * d + np.arange(d)[:, None, None]).transpose(0, 2, 1).copy()
+
     def part(self, rows: NDArray[np.int64]) -> Places:
         """Return some of the places."""
         mixed, hoop = (None if values is None else values[rows] for values in (self.mixed, self.hoop))
@@ -248,13 +254,12 @@ class PointData(Keyed):
 
     def _gradients_of(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
         places, grid, d = self.places, self.points.grid, self.points.grid.dim
-        nodal, out = u.reshape(-1, d)[grid.cell_nodes[places.filled]], np.empty((len(self.cells), d, d))
+        of_cells, out = grid.monomials @ u.take(places.dofs), np.empty((len(self.cells), d, d))
         # component by component: rows of a few numbers each would take numpy six times as long
-        of_cells = np.ascontiguousarray(np.tensordot(grid.monomials, nodal, axes=(1, 1)).transpose(0, 2, 1))
         for axis in range(d):
             along = 0.0
             for others, product in places.products(axis):
-                along += product * np.take(of_cells[others | 1 << axis], places.slots, axis=1, mode="wrap")
+                along += product * np.take(of_cells[:, others | 1 << axis], places.slots, axis=1, mode="wrap")
             out[:, :, axis] = along.T
         return out.reshape(len(self.cells), d**2)
 

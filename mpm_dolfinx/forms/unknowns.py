@@ -103,8 +103,7 @@ class Unknowns:
 
     def add(self, function: fem.Function, scale: float, v: PETSc.Vec) -> None:
         """Add scale * v to a function, ghosts updated."""
-        with np.errstate(invalid="ignore", over="ignore"):  # a failed solve; the residual tells
-            function.x.array[self.owned] += scale * v.array_r
+        function.x.array[self.owned] += scale * v.array_r
         function.x.scatter_forward()
 
 

@@ -70,6 +70,7 @@ FACES = {d: _faces(d) for d in (2, 3)}
 """Corners (2d, 2^(d-1)) of the faces of a domain."""
 
 
+@cache
 def kuhn_simplices(dim: int) -> NDArray[np.int64]:
     """Return the (d!, d+1) corners of the simplices that a domain is split into."""
     return np.array([[sum(1 << a for a in p[:k]) for k in range(dim + 1)] for p in permutations(range(dim))])

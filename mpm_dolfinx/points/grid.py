@@ -172,11 +172,11 @@ class Grid:
         self._coefficients: dict[tuple[int, ...], fem.Function] = {}
 
     def __getattr__(self, name: str):
-        """Make the mesh when first something of it is asked for."""
+        """Make the mesh when first something of it is asked for; what has been asked for is found at once."""
         if name not in SHARED:  # notebooks ask for `_repr_html_`, `copy` for other names
             raise AttributeError(f"the grid has no {name!r}")
         self.share(np.zeros((0, self.dim)))
-        return getattr(self._made[0], name)
+        return vars(self).setdefault(name, getattr(self._made[0], name))
 
     def share(self, x: NDArray[np.float64]) -> None:
         """Make the mesh, its cells shared out among the processes by the points x (n, d), m; once."""
@@ -236,7 +236,7 @@ class Grid:
         self._coefficients.setdefault(shape, out)
         return out
 
-    @property
+    @cached_property
     def cell_volume(self) -> float:
         """Volume of a cell, in axisymmetry its area in the plane (m^d)."""
         return float(np.prod(self.h))

@@ -9,6 +9,7 @@ centroid of what a cell holds its mobility kappa becomes J F^-1 kappa F^-T.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -61,14 +62,19 @@ class Conduction:
     motion: CellMotion | None
     weight: NDArray[np.float64] | None
 
+    @cached_property
+    def _turned(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Cofactors (n, d, d) and determinants (n,) of the cells' F."""
+        return cofactor(self.motion.F), determinant(self.motion.F)
+
     def along(self, dim: int) -> NDArray[np.float64]:
         """Return the mobilities (n, d) along the axes, pulled back: `across` for the unit vectors, all at once."""
         kappa, share = self.mobility.mean[:, None], self.mobility.share
         kappa = np.repeat(kappa, dim, axis=1) if share is None else kappa * share
         if self.motion is None:
             return kappa
-        F, hoop = self.motion.F, self.motion.hoop
-        along = kappa / determinant(F)[:, None] * (cofactor(F) ** 2).sum(axis=1)
+        (turned, ratio), hoop = self._turned, self.motion.hoop
+        along = kappa / ratio[:, None] * (turned**2).sum(axis=1)
         return along if hoop is None else along * hoop[:, None]
 
     def across(self, at: NDArray[np.int64], normal: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -78,9 +84,9 @@ class Conduction:
             kappa = kappa * (share[at] * normal**2).sum(axis=1)
         if self.motion is None:
             return kappa
-        F, hoop = self.motion.F[at], self.motion.hoop
-        pulled = np.einsum("mij,mj->mi", cofactor(F), normal)
-        across = kappa / determinant(F) * (pulled**2).sum(axis=1)
+        (turned, ratio), hoop = self._turned, self.motion.hoop
+        pulled = np.einsum("mij,mj->mi", turned[at], normal)
+        across = kappa / ratio[at] * (pulled**2).sum(axis=1)
         return across if hoop is None else across * hoop[at]
 
     def nearer(self, at: NDArray[np.int64], normal: NDArray[np.float64], reach: NDArray[np.float64]) -> NDArray | float:
@@ -114,7 +120,7 @@ class OpenSides:
     area: NDArray[np.float64]
     reach: NDArray[np.float64]
 
-    @property
+    @cached_property
     def normal(self) -> NDArray[np.float64]:
         """Unit vectors (m, d)."""
         return self.area / np.linalg.norm(self.area, axis=1, keepdims=True)
@@ -339,11 +345,12 @@ class FluxForms:
     def set_conduction(self, contents: CellContents, flow: Conduction) -> NDArray[np.float64]:
         """Set the coefficients for how the filled owned cells conduct; return their mobilities (n, d) by axis."""
         d, filled, shift = self.grid.dim, contents.filled, flow.mobility.shift
-        mobility, moved = flow.along(d), np.zeros((len(filled), d)) if flow.motion is None else flow.motion.moved
+        mobility = flow.along(d)
         values = {self.mobility: mobility}
         if shift is not None:  # the fluid's weight is that at the centroids nevertheless
             values[self.centroid] = contents.centroid[filled] + shift
         if self.gravity:
+            moved = np.zeros((len(filled), d)) if flow.motion is None else flow.motion.moved
             values[self.moved] = moved if shift is None else moved - shift
         for f, rows in values.items():
             f.x.array[:] = 0.0

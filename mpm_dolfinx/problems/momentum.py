@@ -365,9 +365,10 @@ class MomentumProblem:
         self.forms, self.system, self.data, self.round_off = forms, system, data, round_off
         self._sides, self._goes_on = sides, goes_on
         with Timer("mpm: loads"):
-            self._external, self._pulls = forms.external(data, sides)
+            external, pulls = forms.external(data, sides)
             if held is not None:
-                self._external += held
+                external += held
+            self._external, self._pulls = external[system.touched], pulls[system.touched]
 
     @property
     def linear(self) -> bool:
@@ -415,7 +416,7 @@ class MomentumProblem:
         """Return the out-of-balance nodal forces at u and their scale, the largest of internal, external, terms (N)."""
         forms, system = self.forms, self.system
         b, own = forms.internal(self.data)
-        forces, external = b[system.touched], self._external[system.touched]
+        forces, external = b[system.touched], self._external
         if self._sides.pressures is not None:
             external = external + forms.pressures(self._sides)[system.touched]
         squares = [forces @ forces, external @ external]
@@ -428,7 +429,7 @@ class MomentumProblem:
         squares = over_all(forms.grid.comm, np.array(squares))
         b[system.touched] = forces - external
         if self._sides.holds is not None:  # no measure of forces: at the start of a step it is far above them
-            b[system.touched] -= self._pulls[system.touched]
+            b[system.touched] -= self._pulls
         if self._sides.tools is not None:
             b[system.touched] -= forms.pushed(self._sides.tools)[system.touched]
         r = system.unknowns.gather(b, system.residual)

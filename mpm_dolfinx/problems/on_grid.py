@@ -345,10 +345,8 @@ class Assembled:
             return self._mobility((), lambda: on_grid.mobility(data, True))
 
         def set_fluxes(at_sides: OpenSides, kappa: Mobility, motion: CellMotion | None = None) -> Outflow:
-            off = self._off and (
-                self._off,
-                self._gradients(tuple(vars(at_sides).values()), lambda: Gradients(contents, at_sides)),
-            )
+            where = (at_sides.cells, at_sides.shape, at_sides.seeps, at_sides.area, at_sides.reach)
+            off = self._off and (self._off, self._gradients(where, lambda: Gradients(contents, at_sides)))
             return self.storage.set_fluxes(contents, at_sides, Conduction(kappa, motion, weight), off)
 
         if (storage := self._by_pressure) is not None:

@@ -284,16 +284,16 @@ class StorageSystem:
         """Assemble the fluxes through inner faces and open sides; off: of `AslantFlow`, where there is any."""
         at = contents.slot(sides.cells)
         faces = OpenFaces(sides.number, at, *sides.driven(at, flow, self._forms.bulk), sides.seeps)
-        both = ~faces.seeps
-        conductance, inflow = (contents.total(sides.cells[both], v[both]) for v in (faces.conductance, faces.inflow))
+        both = (np.where(sides.seeps, 0.0, values) for values in (faces.conductance, faces.inflow))
+        conductance, inflow = (sum_by(at, values, len(contents.filled)) for values in both)
         mobility = self._forms.fluxes.set_conduction(contents, flow)
         zero(self.T)
         if self._flux is not None:
             self._flux.assemble_matrix(self.T)
         self.T.assemble()
-        _add_diagonal(self.T, conductance)
+        total = _add_diagonal(self.T, conductance)
         aslant = off and AslantFlow(self._forms.fluxes, *off, contents, sides, faces.conductance, flow.weight)
-        return Outflow(conductance, inflow, faces, self.T.getDiagonal().array.copy(), mobility, aslant)
+        return Outflow(conductance, inflow, faces, total, mobility, aslant)
 
 
 @dataclass(frozen=True)
@@ -476,7 +476,7 @@ class StorageProblem:
         if forms.sources:
             gain = forms.gain(self.data)[system.unknowns.owned]
             cells -= gain
-        seeping, slope = outflow.faces.seepage(values, self._flowing)
+        seeping, slope = outflow.faces.seepage(values, self._flowing) if self._seeps else (0.0, 0.0)
         cells += seeping
         lost = (outflow.conductance * values - outflow.inflow + seeping).sum() + self._aslant.lost - gain.sum()
         turnover = (np.abs(outflow.total) + slope) @ np.abs(values)
@@ -542,7 +542,9 @@ class StorageProblem:
         return system.P
 
 
-def _add_diagonal(A: PETSc.Mat, values: NDArray[np.float64]) -> None:
+def _add_diagonal(A: PETSc.Mat, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Add values to the diagonal of a matrix; return it."""
     d = A.getDiagonal()
     d.array_w[:] += values
     A.setDiagonal(d)
+    return d.array_r.copy()

@@ -280,7 +280,8 @@ class Newton:
                 raise NotConverged(f"the {name} iteration diverges ({why})", report.history) from failed
             with Timer("mpm: linear solve"):
                 dp = self._solvers.solve_storage()
-            self._storage.system.unknowns.add(self._storage.forms.p, -1.0, dp)
+            with _ignored():
+                self._storage.system.unknowns.add(self._storage.forms.p, -1.0, dp)
             report.coupling += 1
             if self._storage.settle_seepage():
                 self._linearise()
@@ -404,9 +405,15 @@ class Newton:
         return errors, moved
 
     def _move(self, scale: float) -> None:
-        self._momentum.system.unknowns.add(self._momentum.forms.u, scale, self._solvers.du)
-        if self._storage is not None:
-            self._storage.system.unknowns.add(self._storage.forms.p, scale, self._solvers.dp)
+        with _ignored():
+            self._momentum.system.unknowns.add(self._momentum.forms.u, scale, self._solvers.du)
+            if self._storage is not None:
+                self._storage.system.unknowns.add(self._storage.forms.p, scale, self._solvers.dp)
+
+
+def _ignored() -> np.errstate:
+    """Return what ignores that a solve has failed: the residual tells."""
+    return np.errstate(invalid="ignore", over="ignore")
 
 
 def _ratio(part: float, whole: float) -> float:
