@@ -107,6 +107,21 @@ def test_a_light_tool_lies_on_a_heavy_layer(load):
     assert -s.tool_forces[0, 1] == pytest.approx(load, rel=1e-6, abs=1e-4)
 
 
+@pytest.mark.parametrize("height", [1.0, 1.03])
+def test_a_load_acts_from_the_first_step_on(height):
+    """Where the initial stress had to be balanced, off the grid lines, the load became a part of it."""
+    heavy, grid = mpm.Hencky(bulk=1e6, shear=0.6e6, grain_density=2700, porosity=0.4), mpm.Grid([1.0, 1.5], [8, 12])
+    plate = pushed(5e3, mpm.HalfSpace((0, height), (0, -1)))
+    walls, ways = {"left": "x", "right": "x", "bottom": "y"}, []
+    for initial in (mpm.K0(0.5), mpm.K0(0.5, surcharge=5e3)):
+        options = {"gravity": (0, -9.81), "initial_stress": initial, "fixed": walls, "tools": [plate]}
+        s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, height])], [heavy], **options)
+        s.run(1.0, 1.0)
+        ways.append(s.tool_travel[0] / height)
+        assert -s.tool_forces[0, 1] == pytest.approx(5e3, rel=1e-6)
+    assert ways == pytest.approx([5e3 / SOIL.oedometric, 0.0], rel=0.03, abs=1e-5)
+
+
 def test_a_load_comes_all_at_once_and_of_any_length_of_its_direction():
     """Bodies that did not go along jumped off a ball that came back from a try too far."""
     ways = []
