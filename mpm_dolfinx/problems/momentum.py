@@ -346,6 +346,8 @@ class MomentumProblem:
         What acts on the sides of the bodies.
     round_off
         Norm of the residual that rounding leaves, N.
+    tolerance
+        Share of the forces to which they are balanced.
     goes_on : (unknowns,)
         Displacements if the bodies moved on as they did before, a local array, m; None where that is not known.
     held : (unknowns,)
@@ -359,11 +361,13 @@ class MomentumProblem:
         data: QuadratureData,
         sides: SideData,
         round_off: float,
+        tolerance: float,
         goes_on: NDArray[np.float64] | None = None,
         held: NDArray[np.float64] | None = None,
     ):
         self.forms, self.system, self.data, self.round_off = forms, system, data, round_off
-        self._sides, self._goes_on = sides, goes_on
+        self._sides, self._goes_on, self._tolerance = sides, goes_on, tolerance
+        self._largest = np.zeros(1)  # forces so far, N
         with Timer("mpm: loads"):
             external, pulls = forms.external(data, sides)
             if held is not None:
@@ -394,7 +398,9 @@ class MomentumProblem:
     def augment_tools(self) -> bool:
         """Shift the pressures of tools that penetrate too deep; return whether the balance is another one since."""
         tools, contact = self._sides.tools, self._sides.contact
-        of_tools = tools is not None and tools.augment(self.forms.nodal)
+        of_tools = tools is not None and tools.augment(
+            self.forms.nodal, self.round_off + self._tolerance * self._largest[0]
+        )
         return (contact is not None and contact.now.augment(*self._at)) or of_tools
 
     def follow_contacts(self) -> bool:
@@ -437,7 +443,9 @@ class MomentumProblem:
         system.penalty.multAdd(step, r, r)
         if self._sides.contact is not None:
             self._sides.contact.now.push(*self._at, r)
-        return r, float(np.sqrt(max(squares)))
+        scale = float(np.sqrt(max(squares)))
+        self._largest[:] = max(scale, self._largest[0])
+        return r, scale
 
     def assemble_tangent(self, data: QuadratureData | None = None, firmness: float = 0.0) -> PETSc.Mat:
         """Return the tangent at u, of these pieces or of others, with a share of the elastic shear stiffness."""

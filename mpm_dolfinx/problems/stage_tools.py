@@ -125,7 +125,8 @@ class Tools:
         x, area = patches.now(points), patches.area(points)
         size, free = np.linalg.norm(area, axis=1), self._free[patches.here]
         resists = self._materials.table(cut.points, resistance)[patches.at]
-        poses, found, loads = [self._pose(tool, t) for tool in self.tools], [], [tool.pushes(t) for tool in self.tools]
+        poses, found = [self._pose(tool, t) for tool in self.tools], []
+        loads = [tool.pushes(t) if t > start else np.nan for tool in self.tools]  # initial stresses are without them
         pushed = PushedTools([line(tool) for tool in self.tools], self._ways.before, np.array(loads), grid.h.min())
         for number, (tool, pose) in enumerate(zip(self.tools, poses, strict=True)):
             before = self._pose(tool, start)

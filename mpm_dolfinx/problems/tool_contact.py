@@ -26,6 +26,8 @@ from mpm_dolfinx.problems.sides import everywhere
 from mpm_dolfinx.problems.tools import DISTANCE, Distance, Pose, Tool
 from mpm_dolfinx.validation import line
 
+ROUNDING = 1e-15  # of coordinates
+
 
 @dataclass(frozen=True, eq=False)
 class ToolRows(Rows):
@@ -130,10 +132,12 @@ class ToolContact(CellContact):
         """Choose what slips at u, and if asked for what sticks again; return whether that is another choice."""
         return self.grips and self.choose(self.at(u), sticks)
 
-    def augment(self, u: NDArray[np.float64]) -> bool:
+    def augment(self, u: NDArray[np.float64], unknown: float) -> bool:
         """Augment the pressures where means penetrate too deep at u, see `augmented`; return whether they do.
 
-        Where they do not, tools that a load pushes go on until they meet as much.
+        Where they do not, tools that a load pushes go on until they meet as much, and u with them.
+
+        unknown: how well the balance tells forces, N.
         """
         touch = self.at(u)
         if self.augmented(touch, touch.x, "does a wall hold the body there?") > 0:
@@ -143,9 +147,9 @@ class ToolContact(CellContact):
         of, along = self.rows.number, self._along[self.rows.number]
         slope = self.rows.area * touch.stiff * (touch.n * along).sum(axis=1) ** 2
         met = self.summed(touch.force, 0 * touch.x)[:, : self.grid.dim]
-        goes = self.pushed.go(
-            np.einsum("kd,kd->k", met, self._along), over_all(self.grid.comm, sum_by(of, slope, len(met)))
-        )
+        slope = over_all(self.grid.comm, sum_by(of, slope, len(met)))
+        unknown = unknown + ROUNDING * self._reach * slope
+        goes = self.pushed.go(u, np.einsum("kd,kd->k", met, self._along), slope, unknown)
         self._rounds[0] *= not goes  # of augmentations, which begin anew
         return goes
 

@@ -53,8 +53,9 @@ def _across(offset: NDArray[np.float64]) -> tuple[NDArray, NDArray, NDArray]:
 def _direction(name: str, value: ArrayLike) -> NDArray[np.float64]:
     """Return a unit vector (d,); ValueError where there is none."""
     v = numbers(name, value, (2,), (3,), allowed="a vector of 2 or 3 finite components, not zero")
-    if not np.linalg.norm(v) > 0:
+    if not v.any():
         raise ValueError(f"{name} = {line(value)}, must be a vector of 2 or 3 finite components, not zero")
+    v = v / np.abs(v).max()  # squares of huge and tiny ones are not finite, or zero
     return v / np.linalg.norm(v)
 
 
@@ -315,7 +316,8 @@ class Tool:
         where the normal pressure is a tenth of it or more, and as much less as that is less.
     load : float or callable t (s) -> float, N (N/m in plane strain), >= 0
         Pushes the tool along `direction`, beyond its displacement, as far as the bodies resist with as much, from the
-        first step on; it begins where it touches them.  How far that is, is in the simulation's `tool_travel`.
+        first step on; it begins where it touches them, or less than a cell before.  How far that is, is in the
+        simulation's `tool_travel`.  In axisymmetry the load all around.
     direction : (d,)
         In which a load pushes; of any length; in axisymmetry along the axis.
 
