@@ -171,6 +171,15 @@ def test_factors_in_place_of_a_multigrid_cycle_solve_the_same_problem(monkeypatc
     assert few.stress == pytest.approx(many.stress, rel=1e-7) and few.change == pytest.approx(many.change, rel=1e-5)
 
 
+def test_factors_in_place_of_a_multigrid_cycle_are_made_once_and_serve_other_tangents(monkeypatch):
+    PETSc.Log.begin()
+    asked, make = [], monolithic.BlockSolver._factorised
+    monkeypatch.setattr(monolithic.BlockSolver, "_factorised", lambda self: asked.append(1) or make(self))
+    before = PETSc.Log.Event("MatCholFctrNum").getPerfInfo()["count"]
+    pushed(500e6)
+    assert PETSc.Log.Event("MatCholFctrNum").getPerfInfo()["count"] - before == len(asked) > 0
+
+
 def test_coarse_unknowns_that_nothing_resists_do_not_break_the_multigrid_of_soil_that_yields_off():
     """Aggregates of fewer unknowns than rigid body modes, as a body has them that lies askew to the grid."""
     A = PETSc.Mat().createAIJ((60, 60), nnz=3, comm=PETSc.COMM_SELF)

@@ -13,9 +13,11 @@ Jacobi's smoothing of K (10 to 15, and 100 at nu = 0.49), conjugate gradients on
 diagonal blocks 17 to 23, leaving five times the residual.
 
 At nu = 0.499 the cycle is poor: 53 to 146 iterations with 14^3 cells.  A solve that takes `MANY`, or is foreseen to,
-goes on with factors of K in place of the cycle, which serve until they take as many: for the other tangents of the step
-4 to 6 iterations, and all its linear solves take 8 s, not 18.  MUMPS factorises 3190 unknowns in 0.2 s, 8610 in 1.4 s
-(PETSc in 3.4 s).  No solve takes more than 23 then, nor more than 21 at nu = 0.49 where contrasts are 1e3.
+goes on with factors of K in place of the cycle, which serve until they take as many: for the other tangents of the
+step about 10 iterations.  A step takes 6.2 s, 8.5 s where each tangent is factorised (then 4 to 6 iterations); four
+steps of soil that yields, 12^3 cells, 33 and 41 s.  MUMPS factorises 3190 unknowns in 0.2 s, 8610 in 1.4 s (PETSc in
+3.4 s).  No solve takes more than 23 then, nor more than 21 at nu = 0.49 where contrasts are 1e3.
+
 Large bodies in 2D that do not yield have factors of the first K and P of a step in place of the cycles; to 1e-5 the
 solves of the step take 8 iterations.  With 504000 unknowns (10^6 points) a step then spends 14 s in linear algebra
 rather than 24 s, with 150000 as much.  Where soil yields factors serve too short: a footing pushed by 0.015 widths on
@@ -202,6 +204,7 @@ class BlockSolver:
         """Return a solver with factors of the present K, which may change."""
         ksp = direct_solver(self._momentum.K, "factors", self._symmetric, package="mumps")
         ksp.setUp()
+        ksp.pc.setReusePreconditioner(True)
         return ksp
 
 
