@@ -8,7 +8,7 @@ import pytest
 from helpers import SOFT
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.solve import monolithic
+from mpm_dolfinx.solve import linear, monolithic
 from mpm_dolfinx.solve.linear import (
     BlockFactors,
     allow_no_diagonal,
@@ -171,6 +171,15 @@ def test_factors_in_place_of_a_multigrid_cycle_solve_the_same_problem(monkeypatc
     assert few.stress == pytest.approx(many.stress, rel=1e-7) and few.change == pytest.approx(many.change, rel=1e-5)
 
 
+def test_factors_in_place_of_a_multigrid_cycle_are_made_once_and_serve_other_tangents(monkeypatch):
+    PETSc.Log.begin()
+    asked, make = [], monolithic.BlockSolver._factorised
+    monkeypatch.setattr(monolithic.BlockSolver, "_factorised", lambda self: asked.append(1) or make(self))
+    before = PETSc.Log.Event("MatCholFctrNum").getPerfInfo()["count"]
+    pushed(500e6)
+    assert PETSc.Log.Event("MatCholFctrNum").getPerfInfo()["count"] - before == len(asked) > 0
+
+
 def test_coarse_unknowns_that_nothing_resists_do_not_break_the_multigrid_of_soil_that_yields_off():
     """Aggregates of fewer unknowns than rigid body modes, as a body has them that lies askew to the grid."""
     A = PETSc.Mat().createAIJ((60, 60), nnz=3, comm=PETSc.COMM_SELF)
@@ -197,3 +206,58 @@ def test_coarse_unknowns_that_nothing_resists_do_not_break_the_multigrid_of_soil
     b.set(1.0)
     ksp.solve(b, x)
     assert solved(ksp, "askew") > 0 and ksp.getConvergedReason() > 0
+
+
+def loaded(conductivity: float = 1e-5) -> mpm.Simulation:
+    """Return a saturated beam, clamped and pressed down more and more."""
+    grid = mpm.Grid(upper=[1.2, 0.4], lower=[0, -0.6], cells=[36, 30])
+    law = mpm.Hencky(bulk=6.7e6, shear=3.1e6, porosity=0.4, conductivity=conductivity)
+    load = mpm.Traction("top", lambda t: (0, -1e5 * t))
+    body, water = mpm.box(grid, [0, 0], [1, 0.3], per_cell=2), {"fluid": mpm.Fluid()}
+    drained = [mpm.Drained("right")]
+    return mpm.Simulation(grid, [body], [law], fixed={"left": "xy"}, tractions=[load], drained=drained, **water)
+
+
+def factorised(monkeypatch) -> list[int]:
+    """Return a list that grows with each factorisation in blocks."""
+    made, factorise = [], BlockFactors.factorise
+    monkeypatch.setattr(BlockFactors, "factorise", lambda *a: made.append(1) or factorise(*a))
+    return made
+
+
+def test_large_elastic_bodies_in_2d_are_factorised_once_a_step_and_end_where_others_do(monkeypatch):
+    made, ends, newton = factorised(monkeypatch), [], []
+    for least in (linear.LAGGED, 1):
+        monkeypatch.setattr(linear, "LAGGED", least)
+        made.clear()
+        s = loaded()
+        reports = [s.step(0.02) for _ in range(4)]
+        ends.append((s.points, len(made)))
+        newton.append(sum(report.newton for report in reports))
+    (each, many), (kept, few) = ends
+    assert few == 4 < many / 2 and newton[1] <= newton[0] + 1
+    assert np.abs(kept.x - each.x).max() < 1e-10
+    assert kept.pressure == pytest.approx(each.pressure, abs=1e-8 * np.abs(each.pressure).max())
+
+
+def test_kept_factors_that_take_many_iterations_are_made_anew(monkeypatch):
+    made, ends = factorised(monkeypatch), []
+    monkeypatch.setattr(linear, "LAGGED", 1)
+    for most in (monolithic.LAGS, 5):
+        monkeypatch.setattr(monolithic, "LAGS", most)
+        made.clear()
+        s = loaded()
+        s.step(0.02)
+        ends.append((s.points.x, len(made)))
+    (kept, one), (anew, several) = ends
+    assert one == 1 < several and np.abs(kept - anew).max() < 1e-10
+
+
+def test_a_step_with_kept_factors_depends_on_no_step_before(monkeypatch):
+    """As it must for a run that is resumed to go on as the first one did."""
+    monkeypatch.setattr(linear, "LAGGED", 1)
+    first, second = loaded(), loaded()
+    first.step(0.02)
+    second.state = first.state
+    first.step(0.02), second.step(0.02)
+    assert np.array_equal(first.points.x, second.points.x)

@@ -251,9 +251,10 @@ class System:
         self._solvers: Latest[LinearSolvers] = Latest()
 
     def solvers(self) -> LinearSolvers:
-        """Return the solvers; those that iterate are made anew in every step, to depend on none before."""
+        """Return the solvers at the start of a step; multigrid ones are made anew, to depend on none before."""
         made = self._solvers.value
-        if made is not None and not made.iterative:
+        if made is not None and not made.multigrid:
+            made.begin()
             return made
         make = (self._scheme, self.momentum, self.storage, *self.kind)
         return self._solvers(object(), lambda: LinearSolvers(*make))

@@ -30,6 +30,11 @@ ITERATIVE = 1500
 Seconds of five load steps of a square beam by factors and by iterations: 0.5 and 0.5 with 1200 unknowns, 2.5 and 1.4
 with 2600, 8.2 and 2.1 with 4900.  In a plate of one cell both cost the same up to 6000.
 """
+LAGGED = 300000
+"""Unknown displacements of a wet 2D problem in which nothing yields from which on factors serve all tangents of a step.
+
+See `monolithic`.
+"""
 TOLERABLE = (-3, -8, -10)  # PETSc's reasons: too many iterations; indefinite preconditioner, matrix
 REDUNDANT = 4
 """Processes up to which each has the factors that are used often."""
@@ -38,6 +43,19 @@ REDUNDANT = 4
 def iterative(unknowns: Unknowns) -> bool:
     """Return whether displacements are better solved for by iterations than by factors."""
     return unknowns.dim == 3 and unknowns.global_size >= ITERATIVE
+
+
+def lagged(unknowns: Unknowns) -> bool:
+    """Return whether factors are better kept for other tangents than made for each, where nothing yields."""
+    return not iterative(unknowns) and unknowns.global_size >= LAGGED
+
+
+def renewed(pc: PETSc.PC, A: PETSc.Mat) -> None:
+    """Make a preconditioner that of the present A, which may change without it."""
+    pc.setReusePreconditioner(False)
+    pc.setOperators(A, A)
+    pc.setUp()
+    pc.setReusePreconditioner(True)
 
 
 def direct_solver(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Both linearised problems at once, where factors of K cost too much: large bodies in 3D.
+"""Both linearised problems at once, where factors of K cost too much: large bodies in 3D, very large ones in 2D.
 
     [ K  -B^T ] [du]   [R_u]
     [ B   C   ] [dp] = [R_p]
@@ -13,9 +13,16 @@ Jacobi's smoothing of K (10 to 15, and 100 at nu = 0.49), conjugate gradients on
 diagonal blocks 17 to 23, leaving five times the residual.
 
 At nu = 0.499 the cycle is poor: 53 to 146 iterations with 14^3 cells.  A solve that takes `MANY`, or is foreseen to,
-goes on with factors of K in place of the cycle, which serve until they take as many: for the other tangents of the step
-4 to 6 iterations, and all its linear solves take 8 s, not 18.  MUMPS factorises 3190 unknowns in 0.2 s, 8610 in 1.4 s
-(PETSc in 3.4 s).  No solve takes more than 23 then, nor more than 21 at nu = 0.49 where contrasts are 1e3.
+goes on with factors of K in place of the cycle, which serve until they take as many: for the other tangents of the
+step about 10 iterations.  A step takes 6.2 s, 8.5 s where each tangent is factorised (then 4 to 6 iterations); four
+steps of soil that yields, 12^3 cells, 33 and 41 s.  MUMPS factorises 3190 unknowns in 0.2 s, 8610 in 1.4 s (PETSc in
+3.4 s).  No solve takes more than 23 then, nor more than 21 at nu = 0.49 where contrasts are 1e3.
+
+Large bodies in 2D that do not yield have factors of the first K and P of a step in place of the cycles; to 1e-5 the
+solves of the step take 8 iterations.  With 504000 unknowns (10^6 points) a step then spends 14 s in linear algebra
+rather than 24 s, with 150000 as much.  Where soil yields factors serve too short: a footing pushed by 0.015 widths on
+21 cells needs 23 of them rather than 39, and four times as long for its solves.
+
 To give the storage what of K resists changes of volume, p -> p + k B u, leaves K as at nu = 0.3, but pressures that
 alternate almost free: 500 iterations.
 """
@@ -23,6 +30,7 @@ alternate almost free: 500 iterations.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from weakref import finalize
 
 from petsc4py import PETSc
@@ -33,10 +41,12 @@ from dolfinx.common import Timer
 from mpm_dolfinx.caching import Latest
 from mpm_dolfinx.problems.momentum import MomentumSystem
 from mpm_dolfinx.problems.storage import StorageSystem
-from mpm_dolfinx.solve.linear import direct_solver, multigrid_solver, solved
+from mpm_dolfinx.solve.linear import direct_solver, multigrid_solver, renewed, solved
 
 MANY, MOST = 29, 500
 """Iterations after which factors take the place of the multigrid cycle on K, and most of all."""
+LAGS = 15
+"""Iterations after which factors of the present K take the place of those of a former one."""
 EARLY = 8
 """After every so many factors do so at once if the residual falls too slowly in them for `MANY` to be enough."""
 FACTORISED = 20000
@@ -54,7 +64,7 @@ class BlockOperator:
     momentum, storage
         The matrices.
     momentum_cycle, storage_cycle
-        One multigrid cycle each on K and P.
+        What stands for K^-1 and P^-1.
     factors : Latest
         Solver with factors of a K, which take the place of its cycle where there are some.
     """
@@ -113,14 +123,24 @@ class BlockSolver:
     momentum, storage
         The matrices.
     cycle
-        One multigrid cycle on K.
+        One multigrid cycle on K, or factors of a K that it was before.
     symmetric
         Whether K is.
+    renew
+        Makes the factors those of the present matrices; None where they are multigrid cycles.
     """
 
-    def __init__(self, momentum: MomentumSystem, storage: StorageSystem, cycle: PETSc.PC, symmetric: bool):
-        self._momentum, self._storage, self._symmetric = momentum, storage, symmetric
-        self._storage_solver = multigrid_solver(storage.P, "storage")
+    def __init__(
+        self,
+        momentum: MomentumSystem,
+        storage: StorageSystem,
+        cycle: PETSc.PC,
+        symmetric: bool,
+        renew: Callable[[], object] | None = None,
+    ):
+        self._momentum, self._storage, self._symmetric, self._renew = momentum, storage, symmetric, renew
+        make = multigrid_solver if renew is None else partial(direct_solver, often=True)
+        self._storage_solver = make(storage.P, "storage")
         self._factors: Latest[PETSc.KSP] = Latest()
         self._operator = BlockOperator(momentum, storage, cycle, self._storage_solver.pc, self._factors)
         finalize(self, vars(self._operator).clear)  # PETSc keeps contexts, and what they refer to
@@ -146,13 +166,12 @@ class BlockSolver:
 
     @property
     def preconditioner(self) -> PETSc.PC:
-        """One cycle on the fixed-stress operator."""
+        """What stands for the inverse of the fixed-stress operator."""
         return self._storage_solver.pc
 
     def set_preconditioner(self, P: PETSc.Mat) -> None:
         """Take the present fixed-stress operator."""
-        self._storage_solver.pc.setOperators(P, P)
-        self._storage_solver.pc.setUp()
+        renewed(self.preconditioner, P)
 
     def solve(self, du: PETSc.Vec, dp: PETSc.Vec, scale: tuple[float, float], rtol: float) -> int:
         """Solve for (du, dp) with the problems' residuals on the right; return the number of iterations.
@@ -166,13 +185,13 @@ class BlockSolver:
         """
         self._operator.scale[:] = scale
         self._operator.join(self._momentum.residual, self._storage.residual, self._b, *(1 / s for s in scale))
-        few = self._momentum.unknowns.global_size <= FACTORISED
-        self._ksp.setTolerances(rtol=rtol, atol=0.0, max_it=MANY if few else MOST)
+        few = self._renew is not None or self._momentum.unknowns.global_size <= FACTORISED
+        self._ksp.setTolerances(rtol=rtol, atol=0.0, max_it=(MANY if self._renew is None else LAGS) if few else MOST)
         self._ksp.solve(self._b, self._x)
         count = solved(self._ksp, "momentum and storage")
         if few and self._ksp.getConvergedReason() < 0:
             with Timer("mpm: factorisation"):
-                self._factors(object(), self._factorised)
+                self._factors(object(), self._factorised) if self._renew is None else self._renew()
             self._ksp.setTolerances(rtol=rtol, atol=0.0, max_it=MOST)
             self._ksp.setInitialGuessNonzero(True)
             self._ksp.solve(self._b, self._x)
@@ -185,6 +204,7 @@ class BlockSolver:
         """Return a solver with factors of the present K, which may change."""
         ksp = direct_solver(self._momentum.K, "factors", self._symmetric, package="mumps")
         ksp.setUp()
+        ksp.pc.setReusePreconditioner(True)
         return ksp
 
 
