@@ -23,6 +23,7 @@ def set_up(scene: Scene, state: State, dt: float) -> Start:
     state = state if state.stay else state.at_owners(scene.grid)
     cut_points = state.stay.points if state.stay else state.points  # points that hardly move stay as they were cut
     on_grid = scene.on_grid(cut_points)
+    on_grid.cut.surfaces(stage.surfaces)  # all at once
     place = partial(stage.mechanical.data, scene.momentum.sides, on_grid.cut, state.t, state.tool_travel)
     if state.begins:
         stage.mechanical.check_start(on_grid.cut, state.points, state.t, state.tool_travel)

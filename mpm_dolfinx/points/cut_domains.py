@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 
 from mpi4py import MPI
@@ -138,24 +138,33 @@ class CutDomains(Keyed):
         The cell is that of a place just under the surface, which holds a piece of the domain: its
         shape functions, continued to the surface, put the load on nodes that have stiffness.
         """
-        if faces not in self._patches:
-            self._patches[faces] = self._cut_surface(faces)
-        return self._patches[faces]
+        return self.surfaces([faces])[0]
 
-    def _cut_surface(self, faces: Surface) -> Patches:
-        here, at = self.points.find(faces.id)
-        corners, xi = self.points.corners[at], faces.xi[here]
+    def surfaces(self, several: Sequence[Surface]) -> list[Patches]:
+        """Return the same of several surfaces: cut all at once they take the time of one."""
+        if new := [faces for faces in dict.fromkeys(several) if faces not in self._patches]:
+            self._patches.update(zip(new, self._cut_surfaces(new), strict=True))
+        return [self._patches[faces] for faces in several]
+
+    def _cut_surfaces(self, several: Sequence[Surface]) -> list[Patches]:
+        columns = ((faces.id, faces.face, faces.xi, faces.skew, np.arange(len(faces))) for faces in several)
+        ids, number, xi, skew, row = map(np.concatenate, zip(*columns, strict=True))
+        here, at = self.points.find(ids)
+        corners, number, xi = self.points.corners[at], number[here], xi[here]
         count = xi.shape[1]
         places = interpolate(np.repeat(corners, count, axis=0), xi.reshape(-1, self.grid.dim)).reshape(xi.shape)
         face, x, xi, share, middle = cut_faces(self.grid, places, xi)
-        outward = face_vectors(corners, faces.face[here])
+        outward = face_vectors(corners, number)
         size = np.linalg.norm(outward, axis=1, keepdims=True)
-        skew = np.flatnonzero(faces.skew[here][face])  # xi is linear over a triangle, and places are not in xi
+        skew = np.flatnonzero(skew[here][face])  # xi is linear over a triangle, and places are not in xi
         if len(skew):
-            xi[skew] = on_face(corners[face[skew]], faces.face[here][face[skew]], x[skew], xi[skew])
+            xi[skew] = on_face(corners[face[skew]], number[face[skew]], x[skew], xi[skew])
         inward = -DEPTH * self.grid.h.min() * np.divide(outward, size, out=np.zeros_like(outward), where=size > 0)
         cell = self._filled_cell(at[face], middle + inward[face])
-        return Patches(self.grid, faces, here[face], at[face], cell, x, xi, share)
+        rows = row[here][face], at[face], cell, x, xi, share
+        surface = np.repeat(np.arange(len(several)), list(map(len, several)))[here][face]
+        own = (np.flatnonzero(surface == k) for k in range(len(several)))
+        return [Patches(self.grid, faces, *(v[o] for v in rows)) for faces, o in zip(several, own, strict=True)]
 
     def displacement(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the Q1 field u (nodes, d) at the points (n, d), which have no domains."""

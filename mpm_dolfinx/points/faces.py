@@ -74,7 +74,7 @@ class Surface:
         """Area (m,) of the whole faces as seeded, m^(d-1)."""
         return np.linalg.norm(self.outward, axis=1)
 
-    @property
+    @cached_property
     def area0(self) -> NDArray[np.float64]:
         """Area (m,) of the parts that count as seeded, m^(d-1)."""
         x = self.places()

@@ -10,12 +10,11 @@ from itertools import combinations
 import numpy as np
 
 from mpm_dolfinx.caching import Latest
-from mpm_dolfinx.parallel.exchange import Exchange
 from mpm_dolfinx.points.cut_domains import CutDomains
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.problems.conditions import Drained, Inflow
 from mpm_dolfinx.problems.fluxes import CellContents, OpenSides
-from mpm_dolfinx.problems.sides import Sides, check_apart, everywhere, on_side
+from mpm_dolfinx.problems.sides import Sides, check_apart, everywhere, gathered, on_side
 
 THICK = np.sqrt(2)
 """Largest section of a cube over its face.
@@ -58,24 +57,19 @@ class HydraulicBoundary:
         return self._constant(key, lambda: self._placed(cut, points, contents, t), self._grid.comm)
 
     def _placed(self, cut: CutDomains, points: MaterialPoints, contents: CellContents, t: float) -> OpenSides:
-        grid = self._grid
-        none, vectors = np.empty(0), np.empty((0, grid.dim))
-        whole, cells = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int32)
-        rows = [(whole, cells, none, none, none, np.empty(0, dtype=bool), vectors, vectors)]
-        for i, (outlet, faces) in enumerate(self.outlets):
-            patches = cut.surface(faces)
-            travel = Exchange(grid.comm, grid.owner(patches.cell))
-            cell = grid.local(travel.send(patches.cell))
-            area, x = travel.send(patches.area(points)), travel.send(patches.x)
-            value = partial(outlet.at, t, on_side(patches, points))
-            value = travel.send(np.resize(everywhere(grid, value), len(patches.x)))
-            size = np.linalg.norm(area, axis=1)
-            number, none, normal = np.full(len(cell), i), np.zeros(len(cell)), area / size[:, None]
-            reach = x - grid.midpoints[cell] - contents.centroid[cell]
-            if isinstance(outlet, Inflow):
-                rows.append((number, cell, none, none, value * size, none > 0, area, reach))
-                continue
-            least = contents.fill[contents.slot(cell)] * grid.h.min() / THICK / (grid.dim + 1)
-            shape = size / np.maximum(np.einsum("md,md->m", reach, normal), least)
-            rows.append((number, cell, shape, value, none, outlet.seepage & (value <= 0), area, reach))
-        return OpenSides(*map(np.concatenate, zip(*rows, strict=True)))
+        grid, rows = self._grid, []
+        patches = cut.surfaces([faces for _, faces in self.outlets])
+        for i, ((outlet, _), p) in enumerate(zip(self.outlets, patches, strict=True)):
+            value, n = everywhere(grid, partial(outlet.at, t, on_side(p, points))), len(p.x)
+            columns = np.full((n, 1), i), np.resize(value, (n, 1)), p.area(points)
+            rows.append((p.cell, p.x, np.concatenate(columns, axis=1)))
+        cell, x, values = gathered(grid, rows, 2 + grid.dim)
+        number, value, area = values[:, 0].astype(np.int64), values[:, 1], values[:, 2:]
+        drains = np.array([isinstance(outlet, Drained) for outlet, _ in self.outlets], dtype=bool)[number]
+        seeps = np.array([getattr(outlet, "seepage", False) for outlet, _ in self.outlets], dtype=bool)[number]
+        size, reach = np.linalg.norm(area, axis=1), x - grid.midpoints[cell] - contents.centroid[cell]
+        least = contents.fill[contents.slot(cell)] * grid.h.min() / THICK / (grid.dim + 1)
+        shape = size / np.maximum(np.einsum("md,md->m", reach, area / size[:, None]), least)
+        shape, pressure = (np.where(drains, values, 0.0) for values in (shape, value))
+        given = np.where(drains, 0.0, value * size)
+        return OpenSides(number, cell, shape, pressure, given, seeps & (value <= 0), area, reach)

@@ -122,6 +122,11 @@ class MechanicalBoundary:
         return np.full((count, 3 if self.grid.dim == 2 else 6), value)
 
     @property
+    def surfaces(self) -> list[Surface]:
+        """The faces of all conditions but tools and contacts."""
+        return [faces for _, faces, *_ in (*self.loads, *self.pressures, *self.plates, *self.holds)] + self._terms
+
+    @property
     def touches(self) -> bool:
         """Whether there are tools or contacts."""
         return bool(self.tools.tools or self.contacts.contacts)
@@ -203,7 +208,7 @@ class MechanicalBoundary:
 
     def _load_data(self, forms: SideForms, cut: CutDomains, points: MaterialPoints, t: float) -> PointData:
         """Return the dead loads on the surface."""
-        patches = [cut.surface(faces) for _, faces in self.loads]
+        patches = cut.surfaces([faces for _, faces in self.loads])
         travel, places = self._loaded(cut.key, lambda: self._loaded_places(patches), self.grid.comm)
         loads = zip(self.loads, patches, strict=True)
         forces = everywhere(self.grid, lambda: np.concatenate([_force(load, t, p, points) for (load, _), p in loads]))
@@ -212,7 +217,7 @@ class MechanicalBoundary:
 
     def _pressure_data(self, forms: SideForms, cut: CutDomains, points: MaterialPoints, t: float) -> PointData:
         """Return the pressures on the surface, with their forces on its area at the start of the step."""
-        patches = [cut.surface(faces) for _, faces in self.pressures]
+        patches = cut.surfaces([faces for _, faces in self.pressures])
         travel, places = self._pressed(cut.key, lambda: self._loaded_places(patches), self.grid.comm)
         pressures = zip(self.pressures, patches, strict=True)
         values = everywhere(self.grid, lambda: [of.at(t, on_side(p, points)) for (of, _), p in pressures])
@@ -277,7 +282,7 @@ class MechanicalBoundary:
     def _held_points(self, cut: CutDomains, points: MaterialPoints, t: float) -> HeldPoints:
         """Return the points of integration on held sides, at the owners of their cells."""
         d, rows = self.grid.dim, []
-        patches = [cut.surface(faces) for _, faces, _ in self.holds]
+        patches = cut.surfaces([faces for _, faces, _ in self.holds])
         chosen = np.unique(np.concatenate([p.at for p in patches]))
         now, before = (of.map(lambda values: values[chosen]) for of in (points, cut.points))
         stress = self.materials.total_stress(now)

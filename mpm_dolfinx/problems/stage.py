@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.constitutive.fields import SceneMaterials
 from mpm_dolfinx.points.bodies import Body
+from mpm_dolfinx.points.faces import Surface
 from mpm_dolfinx.points.grid import Grid
 from mpm_dolfinx.points.lattice import Lattice, lattices
 from mpm_dolfinx.problems.axis import with_axis
@@ -49,6 +50,11 @@ class Stage:
     lattices: Sequence[Lattice]
     mechanical: MechanicalBoundary
     hydraulic: HydraulicBoundary
+
+    @property
+    def surfaces(self) -> list[Surface]:
+        """The faces of all conditions but tools and contacts."""
+        return [*self.mechanical.surfaces, *(faces for _, faces in self.hydraulic.outlets)]
 
     def gravity_at(self, t: float) -> NDArray[np.float64] | None:
         """Return the acceleration of gravity (d,) at time t (s), m/s^2; None without."""
