@@ -16,7 +16,7 @@ No generated code is touched.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from math import factorial
 
 from mpi4py import MPI
@@ -180,7 +180,7 @@ class Places(Keyed):
         """The cells that hold points; and the place of each point's cell among these."""
 
     @cached_property
-    def dofs(self) -> NDArray[np.intp]:
+    def nodal(self) -> NDArray[np.intp]:
         """Unrolled local dofs (d, 2^d, cells) of Q1 vectors in the filled cells."""
         d = self.grid.dim
         return (self.grid.cell_nodes[self.filled] * d + np.arange(d)[:, None, None]).transpose(0, 2, 1).copy()
@@ -254,7 +254,7 @@ class PointData(Keyed):
 
     def _gradients_of(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
         places, grid, d = self.places, self.points.grid, self.points.grid.dim
-        of_cells, out = grid.monomials @ u.take(places.dofs), np.empty((len(self.cells), d, d))
+        of_cells, out = grid.monomials @ u.take(places.nodal), np.empty((len(self.cells), d, d))
         # component by component: rows of a few numbers each would take numpy six times as long
         for axis in range(d):
             along = 0.0
@@ -389,6 +389,7 @@ class FacetForm:
 
     def __init__(self, form: ufl.Form, comm: MPI.Intracomm):
         self._form, self._comm = form, comm
+        self._last: Latest[FacetSum] = Latest()
 
     @property
     def used(self) -> bool:
@@ -397,7 +398,8 @@ class FacetForm:
 
     def on(self, facets: NDArray[np.int32]) -> FacetSum:
         """Return the form over the facets of this process; all processes ask together, for they compile together."""
-        return FacetSum(self, facets, self._comm.allreduce(len(facets)) > 0)
+        make = partial(FacetSum, self, facets)
+        return self._last(facets, lambda: make(self._comm.allreduce(len(facets)) > 0), self._comm)
 
     @cached_property
     def compiled(self) -> _compat.CompiledForm:
