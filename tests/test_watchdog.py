@@ -21,7 +21,8 @@ def test_the_residual_may_grow_for_some_full_steps_and_descends_after_them():
     assert dog.strays(2.0) and dog.where is where
     down = replace(dog, since=0, descends=True)
     assert down.limit(1.0) == 1.0 and not down.strays(np.inf)
-    assert down.after(0.5, 1.0, list) == Watchdog(0.5, [])  # full steps again
+    again = down.after(0.5, 1.0, list)
+    assert again.least == 0.5 and again.where == [] and not again.since and not again.descends  # full steps again
 
 
 @pytest.mark.parametrize("residual", [1e5, np.inf])
@@ -142,8 +143,25 @@ def test_tangents_become_firmer_after_steps_that_are_next_to_nothing_and_soft_ag
     firm = dog.after(0.02, 0.02, list)
     assert firm.firmness(0.01) == pytest.approx(10 * usual)
     assert firm.after(0.02, 0.5, list).firm == firm.firm  # neither short nor long
-    soft = firm.after(0.009, 1.0, list)  # a residual below the least, too
-    assert soft.firmness(0.01) == usual == soft.after(0.02, 1.0, list).firmness(0.01)
+    assert firm.after(0.02, 1.0, list).firm == firm.firm  # not below the least: the next would be short again
+    soft = firm.after(0.009, 1.0, list)
+    assert soft.firmness(0.01) == usual == soft.after(0.008, 1.0, list).firmness(0.01)
+
+
+def test_iterations_are_lost_where_all_steps_after_the_first_are_short_and_gain_nothing():
+    for first, last, lost in [(0.5, 0.01, True), (0.5, 1.0, False), (0.9, 0.01, False)]:
+        dog = Watchdog(1.0, []).after(first, 1.0, list)
+        for step in (0.01, 0.01, last):
+            assert not dog.lost(0.5)
+            dog = dog.after(0.5, step, list)
+        assert dog.lost(0.5) == lost
+
+
+def test_iterations_converge_while_the_least_residual_falls():
+    dog, steady = Watchdog(1.0, []), Watchdog(1.0, [])
+    for k in range(12):
+        dog, steady = dog.after(0.7**k, 1.0, list), steady.after(0.8**k, 1.0, list)
+    assert dog.converges and not steady.converges
 
 
 def steps_taken(monkeypatch, **values) -> int:

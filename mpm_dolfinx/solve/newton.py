@@ -190,8 +190,21 @@ class Newton:
 
         serves: whether the tangent of the substep before may serve.
         """
-        errors, watched = self._begin(), not self._momentum.forms.elastic
-        dog, count, fresh = Watchdog(errors.worst, self._iterate()) if watched else None, 0, self._linear or not serves
+        errors, other = self._begin()
+        fresh, watched = self._linear or not serves, not self._momentum.forms.elastic
+        if other is not None:
+            try:
+                return self._iterations(errors, as_reset, key, fresh, watched)
+            except NotConverged:
+                self._go_to(other)
+                errors, fresh = self._errors(errors.start), True
+        return self._iterations(errors, as_reset, key, fresh, watched)
+
+    def _iterations(
+        self, errors: Errors, as_reset: Callable[[], QuadratureData], key: Hashable, fresh: bool, watched: bool
+    ) -> Errors:
+        """Iterate from the present (u, p), of these errors; fresh: with its own tangent; watched: by a watchdog."""
+        dog, count = Watchdog(errors.worst, self._iterate()) if watched else None, 0
         while (found := self._augmented(errors)).worst > self._scheme.tolerance:
             if found is not errors:  # what has balanced is to do so with other pressures or pairs of contacts
                 errors, count, fresh = found, 0, True
@@ -225,8 +238,11 @@ class Newton:
             errors = self._errors(errors.start)
         return errors
 
-    def _begin(self) -> Errors:
-        """Return the errors where the iterations begin: at a guess that balances better than where (u, p) are."""
+    def _begin(self) -> tuple[Errors, list[NDArray[np.float64]] | None]:
+        """Return the errors where the iterations begin: at a guess that balances better than where (u, p) are.
+
+        Also where else they may begin, if there is another place.
+        """
         errors, start, best = self._errors(), self._iterate(), None
         guesses = [] if self._linear else self._momentum.guesses()
         for guess in guesses:
@@ -237,12 +253,15 @@ class Newton:
                 continue
             if found.u < (best or errors).u:  # of no other p: where no fluid has moved yet the storage tells nothing
                 best, at = found, guess
-        if best is not None and guess is at:
-            return best
-        if guesses:
-            self._go_to(start if best is None else [at, *start[1:]])
-            errors = self._errors(errors.start)
-        return errors
+        if best is None:
+            if guesses:
+                self._go_to(start)
+                errors = self._errors(errors.start)
+            return errors, None
+        if guess is not at:
+            self._go_to([at, *start[1:]])
+            best = self._errors(errors.start)
+        return best, start
 
     def _iterate(self) -> list[NDArray[np.float64]]:
         """Return a copy of the present (u, p), local arrays, m and Pa."""
