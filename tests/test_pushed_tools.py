@@ -133,6 +133,22 @@ def test_a_load_comes_all_at_once_and_of_any_length_of_its_direction():
     assert ways[0] == pytest.approx(ways[1], rel=3e-3)
 
 
+@pytest.mark.parametrize("x", [1.0, 0.5])
+def test_a_rough_ball_begins_to_press_a_layer(x):
+    """The shear of what sticks pushed the surface away from it, in turns with no shear at all."""
+    ball = mpm.Ball((x, 1.15), 0.15)
+    for load in (50.0, 1e3):
+        s = layer(pushed(lambda t, load=load: load * t, ball, friction=0.3))
+        s.run(1.0, 0.25)
+        assert -s.tool_forces[0, 1] == pytest.approx(load, rel=2e-6)
+    for way in (1e-3, 1.2e-3):  # of a path, where it had no balance
+        led = [layer(mpm.Tool(ball, displacement=(0, -way), friction=mu)) for mu in (0.0, 0.3, 1.0)]
+        for s in led:
+            s.step(1.0)
+        forces = [-s.tool_forces[0, 1] for s in led]
+        assert forces == pytest.approx([forces[0]] * 3, rel=0.1)  # cells of which a hundredth touches
+
+
 def test_a_load_drags_a_tool_as_far_as_friction_holds_it():
     """Along the surface, where contact alone has no stiffness; at first no load at all."""
     block = mpm.Convex([(0.6, 1.0), (1.4, 1.0), (1.4, 1.3), (0.6, 1.3)])

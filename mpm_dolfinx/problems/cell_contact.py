@@ -15,7 +15,8 @@ from the traction t_n of the step before, which the points keep,
 P the projection on the tangent plane: what sticks is elastic with a stiffness k_t, and gives back what it took.
 What slips is chosen after each Newton step (active sets): at first all sticks, whatever it would bear; what slips back
 sticks again, as soon as the balance is near, and then for as long.  Decided in each residual anew all would slip to and
-fro, for there is no stiffness in slip.
+fro, for there is no stiffness in slip.  What sticks and leaves slips as well, the second time for good: where the mean
+normal of a cell leans, under round tools that just touch, shear alone would push the surface away, to and fro.
 """
 
 from __future__ import annotations
@@ -163,6 +164,8 @@ class CellContact:
         self.grips = any(contact.grips for contact in contacts)
         self.along = np.zeros((len(key), grid.dim))  # direction of the shear of what slips, else zero
         self._turned = np.zeros(len(key), dtype=bool)  # what has slipped, and stuck again
+        self._left = np.zeros(len(key), dtype=bool)  # and then has left
+        self._stuck = np.zeros((len(key), grid.dim))  # traction, Pa, of what stuck at the last choice
         self.pressure, self._rounds = self.mean(rows.pressure), np.zeros(1, dtype=np.int64)
 
     def total(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -215,13 +218,17 @@ class CellContact:
     def choose(self, touch: Touch, sticks: bool) -> bool:
         """Choose what slips, and if asked for what sticks again; return whether that is another choice."""
         before = self._slips
-        size = np.linalg.norm(touch.trial, axis=1)
-        goes_on = (size > (1 - CLOSE) * touch.most) & (np.einsum("kd,kd->k", touch.trial, self.along) > 0)
+        left = ~before & ~touch.sticks & self._stuck.any(axis=1)
+        self._left[:] |= left & self._turned
+        bears = np.where(left[:, None], self._stuck, touch.trial)
+        size = np.linalg.norm(bears, axis=1)
+        goes_on = (size > (1 - CLOSE) * touch.most) & (np.einsum("kd,kd->k", bears, self.along) > 0)
         exceeds = (size > (1 + CLOSE) * touch.most) & (sticks | ~self._turned)
-        slips = np.where(before, goes_on if sticks else True, exceeds)
+        slips = np.where(before, goes_on | self._left if sticks else True, exceeds | left)
         self._turned[:] |= before & ~slips
+        self._stuck[:] = touch.trial * touch.sticks[:, None]
         new = (slips & (goes_on | ~before))[:, None]
-        self.along[:] = np.where(new, touch.trial / np.maximum(size, LEAST)[:, None], slips[:, None] * self.along)
+        self.along[:] = np.where(new, bears / np.maximum(size, LEAST)[:, None], slips[:, None] * self.along)
         return over_all(self.grid.comm, int((slips != before).sum())) > 0
 
     def augmented(self, touch: Touch, x: NDArray[np.float64], why: str) -> float:
