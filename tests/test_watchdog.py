@@ -9,6 +9,7 @@ import pytest
 import mpm_dolfinx as mpm
 from mpm_dolfinx.problems import balances
 from mpm_dolfinx.solve import watchdog
+from mpm_dolfinx.solve.schur import LinearSolvers
 from mpm_dolfinx.solve.watchdog import PATIENCE, WORK, Search, Watchdog, shortened
 
 
@@ -73,6 +74,23 @@ def test_the_second_substep_begins_as_the_first_went_on_where_soil_flows(monkeyp
     s.state, so_far = before, balances.going_on
     monkeypatch.setattr(balances, "going_on", lambda *at: None if at[2].before > 0 else so_far(*at))
     assert goes_on.newton < s.step(1.0).newton
+
+
+def test_a_direction_that_leads_backwards_is_turned_round(monkeypatch):
+    """As those of tangents with less than no stiffness; turned by the linear solver they change no bit."""
+    s = pushed()
+    s.run(2, 1)
+    before, forwards = s.state, s.step(1.0)
+    there, solve = s.state, LinearSolvers.solve
+
+    def backwards(solvers: LinearSolvers, *how) -> int:
+        count = solve(solvers, *how)
+        solvers.turn_round()
+        return count
+
+    s.state = before
+    monkeypatch.setattr(LinearSolvers, "solve", backwards)
+    assert s.step(1.0).history == forwards.history and np.array_equal(s.points.x, there.points.x)
 
 
 def test_a_run_resumed_where_soil_flows_ends_with_the_same_bits(tmp_path):

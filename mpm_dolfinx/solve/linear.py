@@ -5,7 +5,8 @@ PETSc's own factors of displacements in blocks, a block a node, take a third of 
 unknowns: with 44000 unknowns in 2D and minimum degree ordering 110 ms, 60 again with the same pattern (single 430 and
 150; MUMPS 260 and 155, UMFPACK 290 and 265, CHOLMOD 285 and 290).  A solve takes 4 ms (MUMPS 15, CHOLMOD 9).  Copying
 the entries into blocks takes a tenth of the factorisation.  On two processes MUMPS takes as long, and 25 ms a solve:
-each of a few processes has all factors that many solves use.
+of a few processes one has the factors of displacements that many solves use, and another those of pressures, made at
+the same time.  All of four processes making both, which share the memory's bandwidth, took 1.7 times as long.
 
 Large bodies want nested dissection: with 504000 unknowns in 2D factors take 3.0 s again and 4.6e7 entries by grid
 lines, see `dissection`, by PETSc's nested dissection 5.1 s and 5.0e7, by minimum degree 6 to 12 s and 7.5e7 (MUMPS
@@ -36,8 +37,8 @@ LAGGED = 300000
 See `monolithic`.
 """
 TOLERABLE = (-3, -8, -10)  # PETSc's reasons: too many iterations; indefinite preconditioner, matrix
-REDUNDANT = 4
-"""Processes up to which each has the factors that are used often."""
+FEW = 4
+"""Processes up to which one of them has the factors that are used often."""
 
 
 def iterative(unknowns: Unknowns) -> bool:
@@ -76,10 +77,8 @@ def direct_solver(
     kind = PETSc.PC.Type.CHOLESKY if symmetric else PETSc.PC.Type.LU
     options = PETSc.Options(ksp.getOptionsPrefix())
     ordering = "nd" if often else "amd"
-    if often and 1 < A.comm.size <= REDUNDANT:
-        ksp.pc.setType(PETSc.PC.Type.REDUNDANT)
-        for option, value in {"type": kind, "factor_mat_ordering_type": ordering, "factor_zeropivot": 0.0}.items():
-            options.setValue(f"redundant_pc_{option}", value)
+    if often and 1 < A.comm.size <= FEW:
+        _set_gathered(ksp, A, SingleFactors(name, symmetric), A.comm.size - 1)
     else:
         ksp.pc.setType(kind)
         if A.comm.size > 1:
@@ -123,17 +122,116 @@ def negative_pivots(solver: PETSc.KSP) -> int:
 
 def nodal_solver(A: PETSc.Mat, name: str, unknowns: Unknowns, symmetric: bool) -> PETSc.KSP:
     """Return a direct solver for many systems with the same A, a matrix of displacements: see `NodalFactors`."""
-    if A.comm.size > REDUNDANT:
+    if A.comm.size > FEW:
         return direct_solver(A, name, symmetric)
     ksp = _preonly(A, name)
-    ksp.pc.setType(PETSc.PC.Type.PYTHON)
-    ksp.pc.setPythonContext(NodalFactors(unknowns, symmetric))
+    _set_gathered(ksp, A, NodalFactors(unknowns, symmetric), 0)
     ksp.setOperators(A)
     return ksp
 
 
+def _set_gathered(ksp: PETSc.KSP, A: PETSc.Mat, factors: NodalFactors | SingleFactors, rank: int) -> None:
+    """Let a solver take the factors that a process of this rank has."""
+    ksp.pc.setType(PETSc.PC.Type.PYTHON)
+    ksp.pc.setPythonContext(Gathered(A.createVecRight(), factors, rank))
+
+
+def factorise(*preconditioners: PETSc.PC) -> None:
+    """Factorise matrices that have been set up, at the same time where several processes have the factors."""
+    for pc in preconditioners:
+        if pc.getType() == PETSc.PC.Type.PYTHON:
+            pc.getPythonContext().factorise()
+
+
+class Gathered:
+    """Preconditioner for PETSc: factors of a matrix that one of the processes has.
+
+    Parameters
+    ----------
+    x
+        A vector that the matrix multiplies.
+    factors
+        Of the whole matrix.
+    rank
+        Of the process that has them.
+
+    `setUp` brings a matrix together, and `factorise` makes the factors: processes have each theirs to make once all
+    matrices have been brought together.
+    """
+
+    def __init__(self, x: PETSc.Vec, factors: NodalFactors | SingleFactors, rank: int):
+        self._factors, self._here, self._scatter = factors, x.comm.rank == rank, None
+        self._due: list[tuple[NDArray, ...]] = []
+        if x.comm.size > 1:
+            self._rows = PETSc.IS().createStride(x.size if self._here else 0, step=1, comm=PETSc.COMM_SELF)
+            self._whole = PETSc.Vec().createSeq(self._rows.size, comm=PETSc.COMM_SELF)
+            self._scatter = PETSc.Scatter().create(x, self._rows, self._whole, self._rows)
+
+    def setUp(self, pc: PETSc.PC) -> None:
+        """Bring the present matrix together."""
+        A = pc.getOperators()[1]
+        if self._scatter is None:
+            self._due[:] = [A.getValuesCSR()]
+            return
+        (whole,) = A.createSubMatrices([self._rows], [self._rows])
+        self._due[:] = [whole.getValuesCSR()] if self._here else []
+        whole.destroy()
+
+    def factorise(self) -> None:
+        """Factorise the matrix, if it has changed."""
+        if self._due:
+            self._factors.factorise(*self._due.pop())
+
+    def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """Solve with the factors."""
+        self.factorise()
+        if self._scatter is None:
+            y.array_w[:] = self._factors.solve(x.array_r)
+            return
+        insert = PETSc.InsertMode.INSERT
+        self._scatter.scatter(x, self._whole, insert, PETSc.ScatterMode.FORWARD)
+        if self._here:
+            self._whole.array_w[:] = self._factors.solve(self._whole.array)
+        self._scatter.scatter(self._whole, y, insert, PETSc.ScatterMode.REVERSE)
+
+
+class SingleFactors:
+    """Factors of matrices of one process.
+
+    Parameters
+    ----------
+    name, symmetric
+        See `direct_solver`.
+    """
+
+    def __init__(self, name: str, symmetric: bool):
+        self._name, self._symmetric = f"{name}_gathered", symmetric
+        self._solver: Latest[PETSc.KSP] = Latest()
+
+    def factorise(self, rows: NDArray[np.int32], columns: NDArray[np.int32], values: NDArray[np.float64]) -> None:
+        """Factorise the matrix of these entries."""
+        csr, n = (rows, columns, values), len(rows) - 1
+        ksp = self._solver((rows, columns), lambda: self._of(PETSc.Mat().createAIJ(n, csr=csr, comm=PETSc.COMM_SELF)))
+        A = ksp.getOperators()[0]
+        A.setValuesCSR(*csr)
+        A.assemble()
+        ksp.setOperators(A)
+        ksp.setUp()
+
+    def _of(self, A: PETSc.Mat) -> PETSc.KSP:
+        return direct_solver(A, self._name, self._symmetric, often=True)
+
+    def solve(self, b: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the solution."""
+        ksp = self._solver.value
+        x, right = ksp.getOperators()[0].createVecs()
+        right.array_w[:] = b
+        ksp.solve(right, x)
+        return x.array_r
+
+
 class NodalFactors:
-    """Preconditioner for PETSc: factors of a matrix of displacements in blocks, which every process has.
+    """Factors of matrices of displacements in blocks.
 
     Parameters
     ----------
@@ -151,28 +249,16 @@ class NodalFactors:
         rows = (block, axis, unknowns.positions)
         self._nodes = tuple(np.concatenate(comm.allgather(values)) for values in rows)
         self._dim, self._symmetric = unknowns.dim, symmetric
-        start = int(comm.exscan(unknowns.size) or 0) if comm.size > 1 else 0
-        self._mine = slice(start, start + unknowns.size)
-        self._gather = PETSc.Scatter.toAll(unknowns.vector()) if comm.size > 1 else None
         self._factors: Latest[BlockFactors] = Latest()
 
-    def setUp(self, pc: PETSc.PC) -> None:
-        """Factorise the present matrix."""
-        A, _ = pc.getOperators()
-        whole = A if A.comm.size == 1 else A.getRedundantMatrix(A.comm.size, PETSc.COMM_SELF)
-        rows, columns, values = whole.getValuesCSR()
+    def factorise(self, rows: NDArray[np.int32], columns: NDArray[np.int32], values: NDArray[np.float64]) -> None:
+        """Factorise the matrix of these entries."""
         make = (rows, columns, *self._nodes, self._dim, self._symmetric)
         self._factors((rows, columns), lambda: BlockFactors(*make)).factorise(values)
-        if whole is not A:
-            whole.destroy()
 
-    def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """Solve with the factors."""
-        whole = x
-        if self._gather is not None:
-            scatter, whole = self._gather
-            scatter.scatter(x, whole)
-        y.array_w[:] = self._factors.value.solve(whole.array_r)[self._mine]
+    def solve(self, b: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the solution for all unknowns."""
+        return self._factors.value.solve(b)
 
 
 def dissection(x: NDArray[np.float64]) -> NDArray[np.int64]:

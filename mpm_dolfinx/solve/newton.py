@@ -415,6 +415,7 @@ class Newton:
 
         See `watchdog`, to which it is left where no try does so.
         """
+        self._turn_forwards(before)
         force, first = self._momentum.system.residual, self._momentum.system.residual.dot(self._solvers.du)
         search, moved = Search(), 0.0
         while search is not None:
@@ -422,6 +423,17 @@ class Newton:
             moved, errors = search.step, self._errors(before.start)
             search = search.after(_ratio(force.dot(self._solvers.du), first), errors.worst <= before.worst)
         return errors, moved
+
+    def _turn_forwards(self, errors: Errors) -> None:
+        """Turn a direction round along which the residuals do negative work: see `watchdog`.
+
+        The work of both residuals, in which the coupling's cancels, is what the tangent takes.
+        """
+        work = self._momentum.system.residual.dot(self._solvers.du)
+        if self._storage is not None:
+            work += errors.fluid.vector.dot(self._solvers.dp)
+        if work < 0:
+            self._solvers.turn_round()
 
     def _move(self, scale: float) -> None:
         with _ignored():

@@ -28,6 +28,7 @@ from mpm_dolfinx.problems.storage import FILTER, StorageProblem, StorageSystem
 from mpm_dolfinx.solve.linear import (
     allow_no_diagonal,
     direct_solver,
+    factorise,
     iterative,
     lagged,
     multigrid_solver,
@@ -132,6 +133,7 @@ class LinearSolvers:
         """Factorise the present K and P, for this tangent and those that come."""
         renewed(self.solve_u.pc, self._momentum.K)
         self._block.set_preconditioner(self._storage.P)
+        factorise(self.solve_u.pc, self._preconditioner)
         return True
 
     @property
@@ -167,6 +169,7 @@ class LinearSolvers:
             elif P is not None:
                 self._solve_s.setOperators(self._schur, P)
                 self._solve_s.setUp()
+                factorise(self.solve_u.pc, self._preconditioner)
         return True
 
     def solve(self, rtol: float, scale_u: float, exchanged: float) -> int:
@@ -198,6 +201,11 @@ class LinearSolvers:
         self._rhs.axpy(1.0, residual)
         self.solve_u.solve(self._rhs, self.du)
         return solved(self._solve_s, "storage")
+
+    def turn_round(self) -> None:
+        """Turn the direction round."""
+        for part in (self.du,) if self._storage is None else (self.du, self.dp):
+            part.scale(-1.0)
 
     def condense(self) -> PETSc.Vec:
         """Return the residual of the Schur complement's system, R_p - B K^-1 R_u."""

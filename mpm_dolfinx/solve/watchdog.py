@@ -16,6 +16,10 @@ steps go far astray there.  A share of the elastic shear stiffness in the tangen
 back (Levenberg 1944, Marquardt 1963): ten times as much after a step that was shortened to next to nothing, a tenth
 after a full one to the least residual so far.  If it went with each full step, the next one would be as short as
 before, and the iterations would circle.
+
+Where a few points flow and their tangent has less than no stiffness, Newton's direction leads backwards: it unloads
+them, the next step loads them again, and the iterations circle between the two.  There the residuals do negative work
+along it, and the step goes the other way.
 """
 
 from __future__ import annotations
