@@ -22,7 +22,8 @@ def determinant(F: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def with_ratio(F: NDArray[np.float64], J: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return F (n, d, d), scaled to volume ratios J (n,)."""
-    ratio = J / determinant(F)
+    with np.errstate(divide="ignore", invalid="ignore"):  # of what is turned inside out, which is refused afterwards
+        ratio = J / determinant(F)
     return F * (np.sign(ratio) * np.abs(ratio) ** (1 / F.shape[1]))[:, None, None]
 
 
