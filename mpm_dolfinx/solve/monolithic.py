@@ -49,6 +49,12 @@ LAGS = 15
 """Iterations after which factors of the present K take the place of those of a former one."""
 EARLY = 8
 """After every so many factors do so at once if the residual falls too slowly in them for `MANY` to be enough."""
+RESTART = 200
+"""Iterations after which GMRES starts anew.
+
+Two steps of soil that yields, 24^3 cells on four processes, take 68 s in at most 138 iterations a solve with 60, and
+49 s in 109 with 200.  Vectors are allocated as they are needed.
+"""
 FACTORISED = 20000
 """Unknown displacements up to which K is factorised where the multigrid takes many iterations.
 
@@ -152,7 +158,7 @@ class BlockSolver:
         self._ksp.setType(PETSc.KSP.Type.GMRES)
         self._ksp.setOptionsPrefix("mpm_block_")
         self._ksp.setPCSide(PETSc.PC.Side.RIGHT)
-        self._ksp.setGMRESRestart(60)
+        self._ksp.setGMRESRestart(RESTART)
         self._ksp.pc.setType(PETSc.PC.Type.PYTHON)
         self._ksp.pc.setPythonContext(self._operator)
         self._ksp.setOperators(self._A)
