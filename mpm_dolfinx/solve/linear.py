@@ -206,32 +206,32 @@ class SingleFactors:
 
     def __init__(self, name: str, symmetric: bool):
         self._name, self._symmetric = f"{name}_gathered", symmetric
-        self._solver: Latest[PETSc.KSP] = Latest()
+        self._solver: Latest[tuple[PETSc.KSP, PETSc.Vec, PETSc.Vec]] = Latest()
 
     def factorise(self, rows: NDArray[np.int32], columns: NDArray[np.int32], values: NDArray[np.float64]) -> None:
         """Factorise the matrix of these entries."""
-        csr, n = (rows, columns, values), len(rows) - 1
-        ksp = self._solver((rows, columns), lambda: self._of(PETSc.Mat().createAIJ(n, csr=csr, comm=PETSc.COMM_SELF)))
+        ksp = self._solver((rows, columns), lambda: self._of(rows, columns))[0]
         A = ksp.getOperators()[0]
-        A.setValuesCSR(*csr)
+        A.setValuesCSR(rows, columns, values)
         A.assemble()
         ksp.setOperators(A)
         ksp.setUp()
 
-    def _of(self, A: PETSc.Mat) -> PETSc.KSP:
-        return direct_solver(A, self._name, self._symmetric, often=True)
+    def _of(self, rows: NDArray[np.int32], columns: NDArray[np.int32]) -> tuple[PETSc.KSP, PETSc.Vec, PETSc.Vec]:
+        """Return a solver for matrices of this pattern, a solution and a right-hand side."""
+        A = PETSc.Mat().createAIJ(len(rows) - 1, csr=(rows, columns, np.zeros(len(columns))), comm=PETSc.COMM_SELF)
+        return direct_solver(A, self._name, self._symmetric, often=True), *A.createVecs()
 
     def solve(self, b: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the solution."""
-        ksp = self._solver.value
-        x, right = ksp.getOperators()[0].createVecs()
+        ksp, x, right = self._solver.value
         right.array_w[:] = b
         ksp.solve(right, x)
         return x.array_r
 
 
 class NodalFactors:
-    """Factors of matrices of displacements in blocks.
+    """Factors of matrices of displacements in blocks, which the first process has.
 
     Parameters
     ----------
@@ -247,7 +247,7 @@ class NodalFactors:
         counts = np.concatenate([[0], np.cumsum(comm.allgather(len(np.unique(node))))])
         block = counts[comm.rank] + np.unique(node, return_inverse=True)[1]
         rows = (block, axis, unknowns.positions)
-        self._nodes = tuple(np.concatenate(comm.allgather(values)) for values in rows)
+        self._nodes = tuple(np.concatenate(comm.gather(values) or [values]) for values in rows)  # whole on the first
         self._dim, self._symmetric = unknowns.dim, symmetric
         self._factors: Latest[BlockFactors] = Latest()
 
