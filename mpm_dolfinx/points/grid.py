@@ -279,9 +279,12 @@ class Grid:
 
     def outside(self, x: NDArray[np.float64], tolerance: float = 1e-9) -> NDArray[np.bool_]:
         """Return which points lie outside the grid by more than `tolerance` cells, and what is lost in rounding."""
-        y = (x - self.lower) / self.h
         tolerance = tolerance + rounding(np.stack([self.lower, self.upper])) / self.h
-        return ~((y >= -tolerance) & (y <= self.shape + tolerance)).all(axis=1)  # nan is outside as well
+        inside = np.ones(len(x), dtype=bool)
+        for a in range(self.dim):
+            y = (x[:, a] - self.lower[a]) / self.h[a]
+            inside &= (y >= -tolerance[a]) & (y <= self.shape[a] + tolerance[a])
+        return ~inside  # nan is outside as well
 
     def shape_gradients(
         self, cells: NDArray[np.int32], x: NDArray[np.float64], mixed: NDArray[np.float64] | None = None
