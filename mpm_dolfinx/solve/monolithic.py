@@ -53,7 +53,8 @@ RESTART = 200
 """Iterations after which GMRES starts anew.
 
 Two steps of soil that yields, 24^3 cells on four processes, take 68 s in at most 138 iterations a solve with 60, and
-49 s in 109 with 200.  Vectors are allocated as they are needed.
+49 s in 109 with 200.  With 30, PETSc's, FGMRES on the Schur complement of a footing on 41 cells stagnates where the
+tangent is nearly singular: solves that end after 500 iterations take 50.  Vectors are allocated as they are needed.
 """
 FACTORISED = 20000
 """Unknown displacements up to which K is factorised where the multigrid takes many iterations.

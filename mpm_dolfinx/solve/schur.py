@@ -36,7 +36,7 @@ from mpm_dolfinx.solve.linear import (
     renewed,
     solved,
 )
-from mpm_dolfinx.solve.monolithic import BlockSolver
+from mpm_dolfinx.solve.monolithic import RESTART, BlockSolver
 from mpm_dolfinx.solve.scheme import Scheme
 
 CLOSER = 0.01
@@ -123,6 +123,7 @@ class LinearSolvers:
         krylov = PETSc.KSP.Type.CG if symmetric else PETSc.KSP.Type.FGMRES
         kind = {"schur-cg": krylov, "schur-fgmres": PETSc.KSP.Type.FGMRES}
         self._solve_s.setType(kind.get(scheme.coupling, PETSc.KSP.Type.PREONLY))
+        self._solve_s.setGMRESRestart(RESTART)
         self._preconditioner = self._solve_s.pc
 
     def begin(self) -> None:
