@@ -64,7 +64,7 @@ class Result:
     timers.  points: material points; memory: peak of all processes, libraries included, MB; imbalance: the most that
     one of several processes has over their mean, at the end of the run.
     dt: output interval, s, 0 without one; small: the step to try next, s; converged: the end has been reached; first:
-    see `Report`, of the last step over its length where the grid is reset, Pa/s.
+    see `Report`, of the last step over its length where the grid is reset, Pa/s; waits, kept: see `StepSize.grown`.
     """
 
     rows: list[Row] = field(default_factory=list, repr=False)
@@ -82,6 +82,8 @@ class Result:
     wall: float = 0.0
     dt: float = 0.0
     small: float = 0.0
+    waits: int = 0
+    kept: int = 1
     converged: bool = False
     profile: dict[str, float] = field(default_factory=dict, repr=False)
     points: int = 0
@@ -127,8 +129,8 @@ class Result:
         """Return one quantity of the rows, where it is recorded."""
         return [value for row in self.rows if (value := getattr(row, name)) is not None]
 
-    def after(self, report: Report, small: float, first: float = 0.0) -> Result:
-        """Return the histories after one more step; small: the step to try next, s; first: see `Result`."""
+    def after(self, report: Report, first: float = 0.0) -> Result:
+        """Return the histories after one more step; first: see `Result`."""
         return replace(
             self,
             steps=self.steps + 1,
@@ -137,7 +139,6 @@ class Result:
             rederived=self.rederived + report.rederived,
             balance=max(self.balance, report.balance),
             residual=max(self.residual, *report.history[-1]),
-            small=small,
             first=first,
         )
 

@@ -109,6 +109,28 @@ class StepSize:
             return min(max(taken * factor, result.small), self.longest)  # it may have been short for an output's sake
         return taken * factor
 
+    def cut(self, taken: float, result: Result) -> Result:
+        """Return the histories with half a step, s, to try next: the step has not converged."""
+        whole = taken > 0.99 * result.small
+        waits = 2 * result.waits + 1 if whole and result.kept == 0 else result.waits
+        return replace(result, cuts=result.cuts + 1, small=taken / 2, waits=waits, kept=1)
+
+    def grown(self, taken: float, report: Report, result: Result, failed: bool) -> Result:
+        """Return the histories with the step to try next after one that was taken, s; failed: see `next`.
+
+        Equal steps that were cut grow at once, until one that has just grown fails as well: then they wait for one more
+        step, for three, seven ..., and for half as many after one that has grown has converged.  `waits` is how many,
+        `kept` how many steps there were since the last cut or growth, from one on; 0: the step has just grown.
+        """
+        small, whole = self.next(taken, report, result, failed), taken > 0.99 * result.small
+        if self.by_error:
+            return replace(result, small=small)
+        waits = result.waits // 2 if whole and result.kept == 0 else result.waits
+        if small > 1.01 * result.small and result.kept > waits:  # not by rounding only
+            return replace(result, small=small, waits=waits, kept=0)
+        # a step that was fitted to an output tells nothing of longer ones
+        return replace(result, waits=waits, kept=result.kept + whole)
+
     def _rings(self, taken: float, report: Report, result: Result) -> bool:
         """Return whether a step may have overshot.
 

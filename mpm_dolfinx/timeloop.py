@@ -273,9 +273,11 @@ def _advance(simulation: Simulated, rule: StepSize, target: float) -> None:
         try:
             new, report = simulation.advanced(taken)
         except StepFailed as failed:
-            if taken / 2 < rule.least(wanted, state.t):
-                raise GaveUp(_why(state.t, taken, failed), _cut(simulation, taken), failed.history) from failed
-            _cut(simulation, taken / 2)
+            cut = rule.cut(taken, result)
+            if cut.small < rule.least(wanted, state.t):
+                tried = _note(simulation, replace(cut, small=taken))
+                raise GaveUp(_why(state.t, taken, failed), tried, failed.history) from failed
+            _note(simulation, cut)
             log(comm, "t = %g s: step cut to %.3g s: %s", state.t, taken / 2, failed)
             continue
         known, result = result, measured(result, report)
@@ -286,18 +288,12 @@ def _advance(simulation: Simulated, rule: StepSize, target: float) -> None:
                 raise GaveUp(why, known, report.history)
             _note(simulation, replace(known, rejected=known.rejected + 1, small=small))
             continue
-        grown = rule.next(taken, report, result, failed=taken < 0.99 * wanted)
+        grown = rule.grown(taken, report, result, failed=taken < 0.99 * wanted)
         first = report.first / taken if new.stay is None else 0.0
-        simulation.state = replace(new, result=result.after(report, grown, first))
-        if not rule.by_error and grown > 1.01 * result.small:  # not by rounding only
-            log(comm, "t = %g s: step grows to %.3g s", new.t, grown)
+        simulation.state = replace(new, result=grown.after(report, first))
+        if not rule.by_error and grown.small > result.small:
+            log(comm, "t = %g s: step grows to %.3g s", new.t, grown.small)
         return
-
-
-def _cut(simulation: Simulated, small: float) -> Result:
-    """Note a cut, and the step to try next, s."""
-    result = simulation.state.result
-    return _note(simulation, replace(result, cuts=result.cuts + 1, small=small))
 
 
 def _why(t: float, small: float, failed: StepFailed) -> str:

@@ -294,7 +294,7 @@ def test_steps_checkpoints_and_resumptions_are_logged(tmp_path, caplog, monkeypa
     said = "\n".join(record.getMessage() for record in caplog.records if record.name == "mpm_dolfinx")
     assert said.count("step cut to") == simulation.result.cuts > 0
     assert said.count(f"checkpoint {checkpoint.file} written") == 4
-    assert "step grows to 0.02 s" in said and "t = 0.08 s: resumed from" in said
+    assert "step grows to 0.01 s" in said and "t = 0.08 s: resumed from" in said
 
 
 class Terminal(io.StringIO):

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Time: order of the steps, laws within them, jumps, steps chosen by their error, output times."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -261,6 +262,34 @@ class Stop:
     def __call__(self, simulation):
         if len(simulation.result.rows) - 1 > self.count:
             raise KeyboardInterrupt
+
+
+def driven(fails: Callable[[int, float], bool], intervals: int) -> tuple[Result, list[float]]:
+    """Return the histories of equal steps, of which those fail that `fails` tells by interval and length, and these."""
+    rule, result, taken = StepSize(1.0, 1.0), Result(small=1.0), []
+    for interval in range(intervals):
+        left = 1.0
+        while left > 1e-9:
+            length = rule.fitted(left, result.small)
+            if fails(interval, length):
+                result = rule.cut(length, result)
+            else:
+                taken.append(length)
+                result = rule.grown(length, Report(), result, failed=False)
+                left -= length
+    return result, taken
+
+
+def test_a_step_that_fails_once_is_cut_and_grows_at_once():
+    result, taken = driven(lambda k, length: k == 3 and length == 1.0, 6)
+    assert result.cuts == 1 and taken == [1, 1, 1, 0.5, 0.5, 1, 1] and result.waits == 0
+
+
+def test_steps_whose_growth_fails_again_and_again_wait_longer_and_longer():
+    result, taken = driven(lambda k, length: length > 0.3, 100)
+    assert result.cuts <= 12 and len(taken) == 400
+    _, only_at_first = driven(lambda k, length: k < 20 and length > 0.3, 100)
+    assert only_at_first[-50:] == [1.0] * 50, "and grow back"
 
 
 def test_what_is_as_sudden_in_every_step_is_no_jump_of_the_loads():
