@@ -28,6 +28,7 @@ setup() {
         use_python_as_is
     else
         debian_install "${modules[@]/#/python3-}"
+        advise_blas
         make_venv
     fi
 }
@@ -62,6 +63,8 @@ debian_install() {
             missing+=("$package")
     done
     [ ${#missing[@]} -gt 0 ] || return 0
+    # MUMPS takes two to three times as long with the reference BLAS, which Debian takes where there is no other.
+    ! reference_blas || missing+=(libopenblas0-serial)
     if [ "$(id -u)" != 0 ]; then
         { command -v sudo && sudo true; } >/dev/null || { without_root "${missing[@]}"; exit 1; }
         as_root=(sudo)
@@ -72,6 +75,17 @@ debian_install() {
     "${as_root[@]}" env DEBIAN_FRONTEND=noninteractive \
         apt-get install -q -y --no-install-recommends -o DPkg::Lock::Timeout=600 -o Dpkg::Use-Pty=0 \
         "${missing[@]}" </dev/null >&2
+}
+
+# Is the reference BLAS the only one, or none there yet? In $within, if any.
+reference_blas() {
+    case $("${within[@]}" sh -c 'readlink -f /usr/lib/*/libblas.so.3') in
+        *openblas* | *mkl* | *blis* | *atlas*) return 1 ;;
+    esac
+}
+
+advise_blas() {
+    ! reference_blas || say "Debian's reference BLAS makes MUMPS slow. Faster: apt-get install libopenblas0-serial"
 }
 
 without_root() {

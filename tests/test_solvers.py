@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Factors in blocks solve what they are given."""
 
+import gc
+import weakref
 from dataclasses import replace
 
 from petsc4py import PETSc
@@ -10,7 +12,7 @@ import pytest
 from helpers import SOFT
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.solve import linear, monolithic
+from mpm_dolfinx.solve import linear, monolithic, schur
 from mpm_dolfinx.solve.linear import (
     BlockFactors,
     allow_no_diagonal,
@@ -263,3 +265,46 @@ def test_a_step_with_kept_factors_depends_on_no_step_before(monkeypatch):
     second.state = replace(first.state, stage=second.state.stage)
     first.step(0.02), second.step(0.02)
     assert np.array_equal(first.points.x, second.points.x)
+
+
+def strip_pushed() -> mpm.Simulation:
+    """Return saturated soil, of which a given displacement, 0.01 m a second, pushes half of the top."""
+    grid, half = mpm.Grid([1.0, 1.25], [12, 15]), ((-np.inf, -np.inf), (0.45, np.inf))
+    fixed, drained = (
+        {"left": "x", "right": "x", "bottom": "xy"},
+        mpm.Drained("top", region=((0.5, 0), (np.inf, np.inf))),
+    )
+    push, body = mpm.Displacement("top", lambda t, X: (0, -0.01 * t), region=half), mpm.box(grid, [0, 0], [1, 1])
+    given = {"displacements": [push], "drained": [drained], "fluid": mpm.Fluid()}
+    return mpm.Simulation(grid, [body], [FRICTIONAL], fixed=fixed, **given)
+
+
+def test_large_bodies_that_yield_end_where_small_ones_do_by_mumps(monkeypatch):
+    ends = []
+    for least in (linear.LARGE, 1):
+        monkeypatch.setattr(linear, "LARGE", least)
+        s = strip_pushed()
+        newton = [s.step(1.0).newton for _ in range(2)]
+        ends.append((s.points, newton, s.scene.last[1].solvers().solve_u.pc.getFactorSolverType()))
+    (petsc, few, _), (mumps, many, package) = ends
+    assert package == "mumps" and few == many and np.abs(petsc.data["plastic"] - np.eye(3)).max() > 0.02
+    assert np.abs(mumps.x - petsc.x).max() < 1e-10
+    assert mumps.pressure == pytest.approx(petsc.pressure, abs=1e-7 * np.abs(petsc.pressure).max())
+
+
+@pytest.mark.parametrize("solvers", ["factors", "kept factors", "multigrid"])
+def test_solvers_go_with_their_step_without_the_help_of_pythons_collector(solvers, monkeypatch):
+    """Their factors are most of what a large body takes."""
+    made, make = weakref.WeakSet(), schur.LinearSolvers.__init__
+    monkeypatch.setattr(schur.LinearSolvers, "__init__", lambda self, *a: made.add(self) or make(self, *a))
+    monkeypatch.setattr(linear, "LAGGED", 1 if solvers == "kept factors" else linear.LAGGED)
+    soil = mpm.Hencky(bulk=500e6, shear=1e6, conductivity=1e-7)
+    s = quarter_pushed(soil, 8, 0.01) if solvers == "multigrid" else loaded()
+    gc.collect()
+    gc.disable()
+    try:
+        for _ in range(3):
+            s.step(0.02)
+            assert len(made) == 1
+    finally:
+        gc.enable()

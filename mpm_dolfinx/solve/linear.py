@@ -11,6 +11,9 @@ the same time.  All of four processes making both, which share the memory's band
 Large bodies want nested dissection: with 504000 unknowns in 2D factors take 3.0 s again and 4.6e7 entries by grid
 lines, see `dissection`, by PETSc's nested dissection 5.1 s and 5.0e7, by minimum degree 6 to 12 s and 7.5e7 (MUMPS
 6.2 s and 5.3e7).  With a tenth of the unknowns 80, 110, 120 ms; with fewer all are the same.
+
+Those figures are with the reference BLAS, which only MUMPS, UMFPACK and CHOLMOD use.  With OpenBLAS MUMPS takes a half
+to a third of the time: see `LARGE`.
 """
 
 from __future__ import annotations
@@ -36,6 +39,14 @@ LAGGED = 300000
 
 See `monolithic`.
 """
+LARGE = 100000
+"""Unknown displacements of a wet 2D problem from which on MUMPS makes factors of an unsymmetric K, and those of P.
+
+Seconds of factors of K again and of a solve, with 196000 unknowns: PETSc 2.6 and 0.02, MUMPS 2.2 and 0.10 with the
+reference BLAS, 0.7 and 0.09 with OpenBLAS, 0.5 and 0.08 on four processes; with 51000 unknowns PETSc 0.25 and 0.004,
+MUMPS with OpenBLAS 0.12 and 0.02, 0.09 and 0.02.  Of P, which is symmetric, with 98000: PETSc 0.8 and 0.015, MUMPS 1.1,
+0.3, 0.1 and 0.05.  A Newton step takes five to ten solves.
+"""
 TOLERABLE = (-3, -8, -10)  # PETSc's reasons: too many iterations; indefinite preconditioner, matrix
 FEW = 4
 """Processes up to which one of them has the factors that are used often."""
@@ -49,6 +60,11 @@ def iterative(unknowns: Unknowns) -> bool:
 def lagged(unknowns: Unknowns) -> bool:
     """Return whether factors are better kept for other tangents than made for each, where nothing yields."""
     return not iterative(unknowns) and unknowns.global_size >= LAGGED
+
+
+def by_mumps(unknowns: Unknowns, symmetric: bool) -> bool:
+    """Return whether MUMPS makes the factors of displacements and pressures, on all processes together."""
+    return not symmetric and unknowns.global_size >= LARGE
 
 
 def renewed(pc: PETSc.PC, A: PETSc.Mat) -> None:
@@ -122,8 +138,8 @@ def negative_pivots(solver: PETSc.KSP) -> int:
 
 def nodal_solver(A: PETSc.Mat, name: str, unknowns: Unknowns, symmetric: bool) -> PETSc.KSP:
     """Return a direct solver for many systems with the same A, a matrix of displacements: see `NodalFactors`."""
-    if A.comm.size > FEW:
-        return direct_solver(A, name, symmetric)
+    if A.comm.size > FEW or by_mumps(unknowns, symmetric):
+        return direct_solver(A, name, symmetric, package="mumps")
     ksp = _preonly(A, name)
     _set_gathered(ksp, A, NodalFactors(unknowns, symmetric), 0)
     ksp.setOperators(A)

@@ -30,7 +30,6 @@ alternate almost free: 500 iterations.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from weakref import finalize
 
 from petsc4py import PETSc
@@ -41,7 +40,7 @@ from dolfinx.common import Timer
 from mpm_dolfinx.caching import Latest
 from mpm_dolfinx.problems.momentum import MomentumSystem
 from mpm_dolfinx.problems.storage import StorageSystem
-from mpm_dolfinx.solve.linear import direct_solver, multigrid_solver, renewed, solved
+from mpm_dolfinx.solve.linear import direct_solver, factorise, renewed, solved
 
 MANY, MOST = 29, 500
 """Iterations after which factors take the place of the multigrid cycle on K, and most of all."""
@@ -129,27 +128,28 @@ class BlockSolver:
     ----------
     momentum, storage
         The matrices.
-    cycle
-        One multigrid cycle on K, or factors of a K that it was before.
+    momentum_cycle, storage_cycle
+        One multigrid cycle each on K and on P, or factors of those of a former tangent.
     symmetric
         Whether K is.
-    renew
-        Makes the factors those of the present matrices; None where they are multigrid cycles.
+    lags
+        Whether they are factors, which serve all tangents of a step.
     """
 
     def __init__(
         self,
         momentum: MomentumSystem,
         storage: StorageSystem,
-        cycle: PETSc.PC,
+        momentum_cycle: PETSc.PC,
+        storage_cycle: PETSc.PC,
         symmetric: bool,
-        renew: Callable[[], object] | None = None,
+        lags: bool = False,
     ):
-        self._momentum, self._storage, self._symmetric, self._renew = momentum, storage, symmetric, renew
-        make = multigrid_solver if renew is None else partial(direct_solver, often=True)
-        self._storage_solver = make(storage.P, "storage")
+        self._momentum, self._storage, self._symmetric, self._lags = momentum, storage, symmetric, lags
+        self._cycles = momentum_cycle, storage_cycle
+        self._kept: Latest[bool] = Latest()
         self._factors: Latest[PETSc.KSP] = Latest()
-        self._operator = BlockOperator(momentum, storage, cycle, self._storage_solver.pc, self._factors)
+        self._operator = BlockOperator(momentum, storage, *self._cycles, self._factors)
         finalize(self, vars(self._operator).clear)  # PETSc keeps contexts, and what they refer to
         size = (momentum.unknowns.size + storage.unknowns.size, None)
         self._A = PETSc.Mat().createPython((size, size), self._operator, comm=momentum.unknowns.comm)
@@ -169,16 +169,25 @@ class BlockSolver:
     @property
     def factorised(self) -> bool:
         """Whether factors take the place of the multigrid cycle."""
-        return self._factors.value is not None
+        return self._lags or self._factors.value is not None
 
-    @property
-    def preconditioner(self) -> PETSc.PC:
-        """What stands for the inverse of the fixed-stress operator."""
-        return self._storage_solver.pc
+    def begin(self) -> None:
+        """Begin a step, which depends on no factors of the one before."""
+        self._kept.clear()
 
-    def set_preconditioner(self, P: PETSc.Mat) -> None:
-        """Take the present fixed-stress operator."""
-        renewed(self.preconditioner, P)
+    def linearise(self) -> None:
+        """Take the present matrices; factors that serve all tangents of a step stay."""
+        if self._lags:
+            self._kept((), self._renew)
+        else:
+            renewed(self._cycles[1], self._storage.P)
+
+    def _renew(self) -> bool:
+        """Make the factors those of the present K and P."""
+        for cycle, matrix in zip(self._cycles, (self._momentum.K, self._storage.P), strict=True):
+            renewed(cycle, matrix)
+        factorise(*self._cycles)
+        return True
 
     def solve(self, du: PETSc.Vec, dp: PETSc.Vec, scale: tuple[float, float], rtol: float) -> int:
         """Solve for (du, dp) with the problems' residuals on the right; return the number of iterations.
@@ -192,13 +201,13 @@ class BlockSolver:
         """
         self._operator.scale[:] = scale
         self._operator.join(self._momentum.residual, self._storage.residual, self._b, *(1 / s for s in scale))
-        few = self._renew is not None or self._momentum.unknowns.global_size <= FACTORISED
-        self._ksp.setTolerances(rtol=rtol, atol=0.0, max_it=(MANY if self._renew is None else LAGS) if few else MOST)
+        few = self._lags or self._momentum.unknowns.global_size <= FACTORISED
+        self._ksp.setTolerances(rtol=rtol, atol=0.0, max_it=(LAGS if self._lags else MANY) if few else MOST)
         self._ksp.solve(self._b, self._x)
         count = solved(self._ksp, "momentum and storage")
         if few and self._ksp.getConvergedReason() < 0:
             with Timer("mpm: factorisation"):
-                self._factors(object(), self._factorised) if self._renew is None else self._renew()
+                self._renew() if self._lags else self._factors(object(), self._factorised)
             self._ksp.setTolerances(rtol=rtol, atol=0.0, max_it=MOST)
             self._ksp.setInitialGuessNonzero(True)
             self._ksp.solve(self._b, self._x)

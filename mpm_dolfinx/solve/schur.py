@@ -14,6 +14,7 @@ would still need the parts.
 
 from __future__ import annotations
 
+from functools import partial
 from weakref import finalize
 
 from petsc4py import PETSc
@@ -27,13 +28,13 @@ from mpm_dolfinx.problems.momentum import MomentumProblem, MomentumSystem
 from mpm_dolfinx.problems.storage import FILTER, StorageProblem, StorageSystem
 from mpm_dolfinx.solve.linear import (
     allow_no_diagonal,
+    by_mumps,
     direct_solver,
     factorise,
     iterative,
     lagged,
     multigrid_solver,
     nodal_solver,
-    renewed,
     solved,
 )
 from mpm_dolfinx.solve.monolithic import RESTART, BlockSolver
@@ -92,7 +93,6 @@ class LinearSolvers:
         lags = storage is not None and not scheme.richardson and momentum.firm is None and lagged(momentum.unknowns)
         self.iterative = self.multigrid or lags
         """Whether displacements, with pressures if there are any, are solved for by iterations."""
-        self._kept: Latest[bool] = Latest()
         self.tangent: Latest[bool] = Latest()
         """What the matrices hold the tangent of, where it is kept."""
         self._solve_s = self._schur = self._block = None
@@ -111,31 +111,25 @@ class LinearSolvers:
         self.dp, self._g = storage.unknowns.vector(), storage.unknowns.vector()
         """Direction of the pressures."""
         if self.iterative and not scheme.richardson:
-            renew = self._renew if lags else None
-            self._block = BlockSolver(momentum, storage, self.solve_u.pc, symmetric, renew)
-            self._preconditioner = self._block.preconditioner
+            make = partial(direct_solver, often=True) if lags else multigrid_solver
+            self._solve_s = make(storage.P, "storage")
+            self._block = BlockSolver(momentum, storage, self.solve_u.pc, self._solve_s.pc, symmetric, lags)
             return
         n, context = (storage.unknowns.size, None), SchurComplement(storage, self.solve_u)
         finalize(self, vars(context).clear)  # PETSc keeps contexts of its matrices, and what they refer to
         self._schur = PETSc.Mat().createPython((n, n), context, storage.unknowns.comm)
         self._schur.setUp()
-        self._solve_s = direct_solver(storage.P, "storage", often=True)
+        large = by_mumps(momentum.unknowns, symmetric)
+        self._solve_s = direct_solver(storage.P, "storage", often=not large, package="mumps" if large else None)
         krylov = PETSc.KSP.Type.CG if symmetric else PETSc.KSP.Type.FGMRES
         kind = {"schur-cg": krylov, "schur-fgmres": PETSc.KSP.Type.FGMRES}
         self._solve_s.setType(kind.get(scheme.coupling, PETSc.KSP.Type.PREONLY))
         self._solve_s.setGMRESRestart(RESTART)
-        self._preconditioner = self._solve_s.pc
 
     def begin(self) -> None:
         """Begin a step, which depends on no factors of the one before."""
-        self._kept.clear()
-
-    def _renew(self) -> bool:
-        """Factorise the present K and P, for this tangent and those that come."""
-        renewed(self.solve_u.pc, self._momentum.K)
-        self._block.set_preconditioner(self._storage.P)
-        factorise(self.solve_u.pc, self._preconditioner)
-        return True
+        if self._block is not None:
+            self._block.begin()
 
     @property
     def schur(self) -> tuple[PETSc.Mat, PETSc.KSP]:
@@ -156,9 +150,6 @@ class LinearSolvers:
         with Timer("mpm: factorisation"):
             share = 0.0 if self.scheme.richardson else FILTER
             P = storage and storage.assemble_preconditioner(self.scheme.beta, share)
-            if self._block is not None and not self.multigrid:
-                self._kept((), self._renew)
-                return True
             if self.multigrid:
                 K.setNearNullSpace(self._modes)
                 allow_no_diagonal(self.solve_u, K)
@@ -166,11 +157,11 @@ class LinearSolvers:
                 self.solve_u.setOperators(K)
                 self.solve_u.setUp()
             if self._block is not None:
-                self._block.set_preconditioner(P)
+                self._block.linearise()
             elif P is not None:
                 self._solve_s.setOperators(self._schur, P)
                 self._solve_s.setUp()
-                factorise(self.solve_u.pc, self._preconditioner)
+                factorise(self.solve_u.pc, self._solve_s.pc)
         return True
 
     def solve(self, rtol: float, scale_u: float, exchanged: float) -> int:
@@ -218,7 +209,7 @@ class LinearSolvers:
     def filtered(self, volumes: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the pressures, Pa, that the fixed-stress operator makes of fluid volumes of the owned cells, m^d."""
         self._g.array_w[:] = volumes
-        self._preconditioner.apply(self._g, self.dp)
+        self._solve_s.pc.apply(self._g, self.dp)
         return self.dp.array_r
 
     def solve_momentum(self) -> None:
