@@ -333,8 +333,10 @@ def _newton(system, y: NDArray[np.float64]) -> NDArray[np.int64]:
     halvings = np.zeros(len(y), dtype=int)
     for _ in range(MOST):
         step, begun = _solve(slope, f[:, :, None])[:, :, 0], y[rows]
-        close = (np.abs(step) <= CLOSE * np.maximum(1.0, np.abs(begun))).all(axis=1) | (norm <= ROUND_OFF)
-        lost[rows] = ~np.isfinite(step).all(axis=1)
+        solved, lost[rows] = norm <= ROUND_OFF, ~np.isfinite(step).all(axis=1)
+        step[solved & lost[rows]] = 0.0  # a solution, though it may be one of many
+        lost[rows] &= ~solved
+        close = (np.abs(step) <= CLOSE * np.maximum(1.0, np.abs(begun))).all(axis=1) | solved
         y[rows] = begun - step  # of those that are close this is the solution
         on = ~(close | lost[rows])
         rows, step, begun, norm, length = rows[on], step[on], begun[on], norm[on], np.ones(int(on.sum()))
