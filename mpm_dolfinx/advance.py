@@ -23,7 +23,7 @@ from mpm_dolfinx.points.cutting import parallelepipeds, tangled, volumes
 from mpm_dolfinx.points.domain_gradient import gradient
 from mpm_dolfinx.points.grid import REACH, Grid, sum_by
 from mpm_dolfinx.points.lattice import filtered, given
-from mpm_dolfinx.points.material_points import MaterialPoints, determinant, with_ratio
+from mpm_dolfinx.points.material_points import MaterialPoints, determinant, middle, with_ratio
 from mpm_dolfinx.points.pressure_transport import PiecePressures, Reconstruction
 from mpm_dolfinx.problems.mechanical_boundary import MechanicalBoundary
 from mpm_dolfinx.problems.momentum import MomentumForms
@@ -187,7 +187,7 @@ class Motion:
             F = with_ratio(F, np.where(locks, determinant(deformed()), determinant(F)))
         if self._materials.evolves:
             F = np.where(evolved[:, None, None], deformed(), F)
-        return replace(points, corners=corners, x=corners.mean(axis=1), F=F), serves, folded
+        return replace(points, corners=corners, x=middle(corners), F=F), serves, folded
 
     def _owed(
         self, state: State, points: MaterialPoints, on_grid: OnGrid, came: NDArray[np.float64], serves: bool

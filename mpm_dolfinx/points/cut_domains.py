@@ -17,7 +17,7 @@ from mpm_dolfinx.points.bending import followed
 from mpm_dolfinx.points.cutting import Pieces, cut, cut_faces
 from mpm_dolfinx.points.faces import Surface, face_vectors, interpolate, on_face
 from mpm_dolfinx.points.grid import TURN, Grid, sum_by
-from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.points.material_points import MaterialPoints, middle
 
 STAYS = 3e-4
 """Cells by which corners may have moved since the domains were cut before they are cut anew.
@@ -197,7 +197,7 @@ class CutDomains(Keyed):
         stretch = np.linalg.solve(then.swapaxes(1, 2) @ then, then.swapaxes(1, 2) @ now)  # of the corners' pattern
         off = pieces.x - points.x[pieces.point]
         off0 = np.linalg.solve(stretch.swapaxes(1, 2)[pieces.point], off[:, :, None])[:, :, 0]
-        return off + (points.x - points.origin.mean(axis=1))[pieces.point] - off0
+        return off + (points.x - middle(points.origin))[pieces.point] - off0
 
     def _filled_cell(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
         """Return the cells (m,) of positions in domains; where no piece of the domain lies, of its largest piece."""
