@@ -300,13 +300,14 @@ class StorageSystem:
 class StorageResidual:
     """Fluid volume out of balance in each cell (m^d), and what it is measured by, m^d.
 
-    exchanged: sum of all changes; round_off: what rounding may leave; change: of this process's cells; rates: at
-    (u, p).
+    exchanged: sum of all changes; round_off: what rounding may leave; off: sum of what the masses of the cells are off
+    by, in size; change: of this process's cells; rates: at (u, p).
     """
 
     vector: PETSc.Vec
     exchanged: float
     round_off: float
+    off: float
     change: float
     rates: Rates
 
@@ -459,11 +460,12 @@ class StorageProblem:
             self._softer.multAdd(p - system.p_start, r, r)
         rates = self._rates(outflow, p)
         now = rates.taken(self.dt)
-        r.array_w[:] = (r.array_r + now.cells + before.cells) / density
+        mass = r.array_r + now.cells + before.cells
+        r.array_w[:] = mass / density
         # what rounding may leave: of the volumes and of the fluxes that cancel
         round_off = 2e-15 * (self._contents.volume + now.turnover + before.turnover)
-        sums = over_all(forms.grid.comm, np.array([exchanged + now.gain + before.gain, round_off]))
-        return StorageResidual(r, *sums.tolist(), total, rates)
+        sums = np.array([exchanged + now.gain + before.gain, round_off, np.abs(mass).sum()])
+        return StorageResidual(r, *over_all(forms.grid.comm, sums).tolist(), total, rates)
 
     def _rates(self, outflow: Outflow, p: PETSc.Vec) -> Rates:
         """Return the rates at (u, p)."""

@@ -27,7 +27,6 @@ from dolfinx.common import Timer
 from numpy.typing import NDArray
 
 from mpm_dolfinx.errors import NotConverged
-from mpm_dolfinx.forms.unknowns import sum_of_sizes
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.problems.momentum import MomentumProblem
 from mpm_dolfinx.problems.quadrature_data import QuadratureData
@@ -350,7 +349,7 @@ class Newton:
             noted_u = _relative(norm, max(measure, self._momentum.round_off / tolerance))
             if self._storage is not None:
                 fluid = self._storage.assemble_residual()
-                norm_p = sum_of_sizes(fluid.vector)
+                norm_p = fluid.off
                 p = _relative(norm_p, fluid.exchanged, fluid.round_off)
                 noted_p = _relative(norm_p, max(fluid.exchanged, fluid.round_off / tolerance))
         if not history and not np.isfinite(norm + norm_p):
