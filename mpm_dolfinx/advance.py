@@ -65,8 +65,7 @@ class Motion:
         storage: StorageForms | None,
     ):
         self._materials, self._momentum, self._storage = materials, momentum, storage
-        self._size = np.concatenate([body.size() for body in bodies])
-        self._body = np.repeat(np.arange(len(bodies)), [len(body) for body in bodies])
+        self._bodies, self._starts = bodies, np.cumsum([0, *map(len, bodies)])
         self._reconstruction = Reconstruction(momentum.grid) if storage is not None else None
 
     def advanced(
@@ -107,8 +106,8 @@ class Motion:
             nodal = self._momentum.u.x.array.reshape(-1, d)
             deformed = cache(partial(self._deformed, cut, data, nodal))
             if cut.domains:
-                moved, bend = cut.followed(nodal, self._momentum.active_nodes(on_grid.cells))
-                points, serves, folded = self._shaped(state, t, tools, cut, moved, bend, deformed)
+                followed = cut.followed(nodal, self._momentum.active_nodes(on_grid.cells))
+                points, serves, folded = self._shaped(state, t, tools, cut, *followed, deformed)
             else:
                 x, F = state.points.x + cut.displacement(nodal), deformed()
                 points = replace(state.points, x=x, F=F, corners=parallelepipeds(x, F, self._sizes(state.points)))
@@ -118,8 +117,8 @@ class Motion:
             ids, pressure, x, start = None, None, None, None
             if self._storage is not None:
                 pressure = cut.to_pieces(self._storage.p.x.array[pieces.cells])
-                N, at_nodes = grid.shape_values(pieces.cells, pieces.x), nodal[grid.cell_nodes[pieces.cells]]
-                x = (state.stay.x if state.stay else cut.pieces.x) + cut.to_pieces(np.einsum("mk,mkd->md", N, at_nodes))
+                x = state.stay.x if state.stay else cut.pieces.x
+                x = x + cut.to_pieces(grid.at(pieces.cells, pieces.x, nodal))
                 start = state.stay.start if state.stay else cut.to_pieces(self._storage.p_n.x.array[pieces.cells])
                 own = on_grid.pressures_up_to_surface(self._reconstruction, state.stage, t)
                 points, ids = replace(points, pressure=cut.mean(own)), points.id[cut.pieces.point]
@@ -223,14 +222,20 @@ class Motion:
         self, points: MaterialPoints, values: NDArray[np.float64], counts: NDArray[np.bool_]
     ) -> NDArray[np.float64]:
         """Return the means of values over the volumes at rest of each body's points that count (n,), else zero."""
-        body, volume = self._body[points.id], points.volume0 * counts
-        sums = np.stack([sum_by(body, v, self._body[-1] + 1) for v in (volume * values, volume)])
+        body, volume = self._body(points), points.volume0 * counts
+        sums = np.stack([sum_by(body, v, len(self._bodies)) for v in (volume * values, volume)])
         total, whole = over_all(self._momentum.grid.comm, sums)
         return counts * np.divide(total, whole, out=np.zeros(len(whole)), where=whole > 0)[body]
 
+    def _body(self, points: MaterialPoints) -> NDArray[np.int64]:
+        """Return the number of each point's body (n,)."""
+        return np.searchsorted(self._starts, points.id, side="right") - 1
+
     def _sizes(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the edges (n, d), m, of boxes as large as the points' domains at rest, as seeded or put on others."""
-        size = self._size[points.id]
+        body = self._body(points)
+        rows = [points.id[body == i] - start for i, start in enumerate(self._starts[:-1])]
+        size = np.concatenate([one.size(row) for one, row in zip(self._bodies, rows, strict=True)])
         return size * (points.volume0 / size.prod(axis=1))[:, None] ** (1 / size.shape[1])
 
     def _check_volumes(self, points: MaterialPoints, cut: CutDomains) -> None:

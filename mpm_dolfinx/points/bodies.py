@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.parallel.exchange import first
 from mpm_dolfinx.points.cutting import FACES, corner_bits, domain_volumes, volumes
-from mpm_dolfinx.points.grid import SIDES, Grid
-from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.points.grid import ROWS, SIDES, Grid
+from mpm_dolfinx.points.material_points import MaterialPoints, middle
 from mpm_dolfinx.validation import asked, instance, numbers, whole
 
 
@@ -128,12 +128,12 @@ class Body:
             out = np.maximum(out, off.max(axis=1))
         return out
 
-    def size(self) -> NDArray[np.float64]:
-        """Return the edges (n, d), m, of boxes that are as large as the domains."""
-        boxes = np.broadcast_to(self.spacing, self.lower.shape)
+    def size(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
+        """Return the edges (m, d), m, of boxes that are as large as domains."""
+        boxes = np.broadcast_to(self.spacing, self.lower.shape)[chosen]
         if self.aligned:
             return boxes
-        ratio = volumes(self.corners()) / self.spacing.prod(axis=-1)
+        ratio = volumes(self.corners(chosen)) / boxes.prod(axis=1)
         return boxes * ratio[:, None] ** (1 / self.dim)
 
 
@@ -280,29 +280,43 @@ def material_points(
     grid: Grid, bodies: Sequence[Body], pressure: float | Callable[[NDArray], ArrayLike] = 0.0
 ) -> MaterialPoints:
     """Return this process's material points of the bodies, at rest at a pore pressure: see `pressure_at`."""
-    corners = np.concatenate([b.corners() for b in bodies])
-    size = np.concatenate([b.size() for b in bodies])
-    material = np.concatenate([np.full(len(b), b.material, dtype=np.int32) for b in bodies])
-    x = corners.mean(axis=1)
-    mine = np.flatnonzero(grid.owner(grid.number(grid.index(x))) == grid.comm.rank)  # of all copies alike
+    starts, own = np.cumsum([0, *map(len, bodies)])[:-1], [_own(grid, body) for body in bodies]
+    rows, corners = [rows for rows, _ in own], np.concatenate([corners for _, corners in own])
+    mine = np.concatenate([start + row for start, row in zip(starts, rows, strict=True)])
+    size = np.concatenate([body.size(row) for body, row in zip(bodies, rows, strict=True)])
+    material = np.repeat(np.array([body.material for body in bodies], dtype=np.int32), list(map(len, rows)))
+    x = middle(corners)
     n, pressures, refused = len(mine), np.empty(0), ""
     try:
-        pressures = pressure_at(pressure, x[mine])
+        pressures = pressure_at(pressure, x)
     except ValueError as error:
         refused = str(error)
     if refused := first(grid.comm, refused):
         raise ValueError(refused)
     return MaterialPoints(
         id=mine,
-        corners=corners[mine],
+        corners=corners,
         F=np.tile(np.eye(grid.stretches), (n, 1, 1)),
-        volume0=domain_volumes(corners[mine], True) if grid.axisymmetric else size[mine].prod(axis=1),
-        material=material[mine],
+        volume0=domain_volumes(corners, True) if grid.axisymmetric else size.prod(axis=1),
+        material=material,
         pressure=pressures,
-        x=x[mine],
-        origin=corners[mine],
-        reference=corners[mine],
+        x=x,
+        origin=corners,
+        reference=corners,
     )
+
+
+def _own(grid: Grid, body: Body) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return the domains (m,) whose middles are in cells of this process, and their corners (m, 2^d, d), m."""
+    rows, corners = [np.empty(0, dtype=np.int64)], [np.empty((0, 2**grid.dim, grid.dim))]
+    for start in range(0, len(body), ROWS):
+        part = np.arange(start, min(start + ROWS, len(body)))
+        of_part = body.corners(part)
+        # of all copies of the grid alike
+        here = np.flatnonzero(grid.owner(grid.number(grid.index(middle(of_part)))) == grid.comm.rank)
+        rows.append(part[here])
+        corners.append(of_part[here])
+    return np.concatenate(rows), np.concatenate(corners)
 
 
 def check_bodies(grid: Grid, bodies: Sequence[Body]) -> None:

@@ -169,7 +169,7 @@ class CutDomains(Keyed):
     def displacement(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the Q1 field u (nodes, d) at the points (n, d), which have no domains."""
         travel, cells, x = self._followed
-        return travel.back(np.einsum("mk,mkd->md", self.grid.shape_values(cells, x), u[self.grid.cell_nodes[cells]]))
+        return travel.back(self.grid.at(cells, x, u))
 
     def followed(self, u: NDArray[np.float64], active: NDArray[np.bool_]) -> Iterator[NDArray[np.float64]]:
         """Yield the Q1 field u (nodes, d) at the corners (n, 2^d, d), and what they follow besides, m.

@@ -35,6 +35,8 @@ SHARED = frozenset(
 """What of a grid is made with its mesh, see `Cells`."""
 TURN = 2 * np.pi
 """The angle of the revolution that volumes, forces and outflows of axisymmetric scenes are of."""
+ROWS = 2**14
+"""Rows that are worked on at a time where all at once would take much memory."""
 MOST = 2**31 - 1
 """Unknowns that PETSc's numbers of 32 bits count."""
 
@@ -316,6 +318,14 @@ class Grid:
     def shape_values(self, cells: NDArray[np.int32], x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the Q1 shape functions (n, 2^d) of local cells at points."""
         return reduce(np.multiply, self._hats(cells, x))
+
+    def at(self, cells: NDArray[np.int32], x: NDArray[np.float64], u: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return a Q1 field u (nodes, k) at points (n, d), m, in local cells (n,)."""
+        out = np.empty((len(x), u.shape[1]))
+        for part in (slice(start, start + ROWS) for start in range(0, len(x), ROWS)):
+            N, at_nodes = self.shape_values(cells[part], x[part]), u[self.cell_nodes[cells[part]]]
+            np.einsum("mk,mkd->md", N, at_nodes, out=out[part])
+        return out
 
     def _hats(self, cells: NDArray[np.int32], x: NDArray[np.float64]) -> list[NDArray[np.float64]]:
         """Return the linear factors (n, 2^d) of the shape functions, one an axis."""

@@ -29,7 +29,7 @@ from mpm_dolfinx.points.bodies import Body
 from mpm_dolfinx.points.contact import Faces, covers
 from mpm_dolfinx.points.cutting import FACES
 from mpm_dolfinx.points.faces import Surface
-from mpm_dolfinx.points.grid import SIDES, Grid
+from mpm_dolfinx.points.grid import ROWS, SIDES, Grid
 from mpm_dolfinx.points.material_points import MaterialPoints
 
 FAST = 10
@@ -138,7 +138,9 @@ def _change(
     for at, d in rows:
         field[at] = d
     for at, d in rows:
-        field[at[(np.abs(field[at] - d) > parted).any(axis=1)]] = np.nan
+        for part in (slice(start, start + ROWS) for start in range(0, len(at), ROWS)):
+            here = at[part]
+            field[here[(np.abs(field[here] - d[part]) > parted).any(axis=1)]] = np.nan
     field = field.reshape(-1, *shape[1:], values.shape[1])
     change = np.nan_to_num(_filtered(field[..., :-1], field[..., -1:]) - field[..., :-1])
     return to_home.back(change.reshape(-1, values.shape[1] - 1)[rows[0][0]])
