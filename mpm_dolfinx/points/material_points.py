@@ -106,9 +106,19 @@ class MaterialPoints:
         return determinant(self.F)
 
     def map(self, function: Callable[[NDArray], NDArray]) -> MaterialPoints:
-        """Return points with a function applied to each of their arrays: a choice of rows, a copy, a transfer."""
-        arrays = {f.name: function(getattr(self, f.name)) for f in fields(self) if f.name != "data"}
-        return MaterialPoints(**arrays, data={name: function(values) for name, values in self.data.items()})
+        """Return points with a function applied to each of their arrays: a choice of rows, a copy, a transfer.
+
+        Arrays that are one stay one.
+        """
+        made: dict[int, NDArray] = {}
+
+        def once(values: NDArray) -> NDArray:
+            if id(values) not in made:
+                made[id(values)] = function(values)
+            return made[id(values)]
+
+        arrays = {f.name: once(getattr(self, f.name)) for f in fields(self) if f.name != "data"}
+        return MaterialPoints(**arrays, data={name: once(values) for name, values in self.data.items()})
 
     def joined(self, other: MaterialPoints) -> MaterialPoints:
         """Return these points and others, ordered by id."""
@@ -120,13 +130,21 @@ class MaterialPoints:
     def of(self, ids: NDArray[np.int64], kept: bool = True) -> MaterialPoints:
         """Return the points of these ids, or all others."""
         rows = np.isin(self.id, ids) == kept
-        return self.map(lambda values: values[rows])
+        return self if rows.all() else self.map(lambda values: values[rows])
 
     def migrated(self, exchange: Exchange) -> MaterialPoints:
         """Return the points of this process after every point went to its destination, ordered by id."""
-        received = self.map(exchange.send)
+        arrays = self.arrays
+        one = tuple([values is other for other in arrays].index(True) for values in arrays)
+        alike = len(set(exchange.comm.allgather(one))) == 1  # else processes would wait for transfers of the others
+        received = (self if alike else self._apart()).map(exchange.send)
         order = np.argsort(received.id)
         return received.map(lambda rows: rows[order])
+
+    def _apart(self) -> MaterialPoints:
+        """Return the points with an array of its own for each of their fields."""
+        arrays = {f.name: getattr(self, f.name).copy() for f in fields(self) if f.name != "data"}
+        return MaterialPoints(**arrays, data={name: values.copy() for name, values in self.data.items()})
 
     def find(self, ids: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return (which of `ids` are points of this process, their indices); points are ordered by id."""
