@@ -52,6 +52,8 @@ SLIDES, OVER = 0.6, 3
 """A step that still moves by this share of what it did so many steps before, from the sixth on, is one of a slide."""
 WIDER, WIDEST = 2**0.5, 16.1
 """By how much factors are tried further out until one rests and one slides, and how far from 1 that goes."""
+ROUNDING = 1e-12
+"""Stress, in proportion to the oedometric modulus, that rounding of strains may make."""
 STRENGTHS = ("cohesion", "hardening", "tension", "friction", "dilation")
 ANGLES = ("friction", "dilation")
 
@@ -213,11 +215,12 @@ def _moved(before: MaterialPoints, now: MaterialPoints) -> float:
 
 
 def _mean_stress(scene: Scene, points: MaterialPoints) -> float:
-    """Return the mean size of the effective stress, Pa."""
+    """Return the mean size of the effective stress, Pa; refuse one that rounding of strains has made."""
     size = np.linalg.norm(scene.materials.effective_stress_3d(points), axis=(1, 2))
-    volume = points.volume0 * points.J
-    total, whole_volume = over_all(scene.grid.comm, np.array([size @ volume, volume.sum()]))
-    if not total > 0:
+    moduli, volume = scene.materials.table(points, lambda m: m.oedometric), points.volume0 * points.J
+    sums = np.array([size @ volume, ROUNDING * moduli @ volume, volume.sum()])
+    total, rounding, whole_volume = over_all(scene.grid.comm, sums)
+    if not total > rounding:
         raise ValueError("factor_of_safety: the bodies have no stress, must be at rest under what acts on them")
     return float(total / whole_volume)
 
