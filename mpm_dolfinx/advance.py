@@ -235,7 +235,7 @@ class Motion:
         """Return the edges (n, d), m, of boxes as large as the points' domains at rest, as seeded or put on others."""
         body = self._body(points)
         rows = [points.id[body == i] - start for i, start in enumerate(self._starts[:-1])]
-        size = np.concatenate([one.size(row) for one, row in zip(self._bodies, rows, strict=True)])
+        size = np.concatenate([one.boxes(row) for one, row in zip(self._bodies, rows, strict=True)])
         return size * (points.volume0 / size.prod(axis=1))[:, None] ** (1 / size.shape[1])
 
     def _check_volumes(self, points: MaterialPoints, cut: CutDomains) -> None:

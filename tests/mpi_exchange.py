@@ -1,11 +1,15 @@
 # SPDX-License-Identifier: MIT
-"""Rows of any kind and width travel to other processes and come back, and are counted."""
+"""Rows of any kind and width travel to other processes and come back, and are counted; so do whole points."""
+
+from dataclasses import replace
 
 from mpi4py import MPI
 
 import numpy as np
 
+import mpm_dolfinx as mpm
 from mpm_dolfinx.parallel.exchange import Exchange, traffic
+from mpm_dolfinx.points.bodies import material_points
 
 comm = MPI.COMM_WORLD
 for n in (0, 1, 500):
@@ -27,3 +31,16 @@ for n in (0, 1, 500):
             assert traffic.bytes - before == sum(away) * rows[:1].nbytes
     if comm.size == 1:
         assert there is rows and traffic.bytes == 0
+
+# points arrive alike whichever of their arrays are one and the same, also where that differs between processes
+grid = mpm.Grid([1, 1], [4, 4])
+shared = material_points(grid, [mpm.box(grid, [0, 0], [1, 1])])
+apart = replace(shared, origin=shared.origin.copy(), reference=shared.reference.copy())
+there = Exchange(comm, (shared.id % comm.size).astype(np.int32))
+for points in (shared, apart, apart if comm.rank == 0 else shared):
+    moved = points.migrated(there)
+    assert (moved.id % comm.size == comm.rank).all() and comm.allreduce(len(moved)) == 64
+    assert np.array_equal(moved.corners, moved.origin) and np.array_equal(moved.origin, moved.reference)
+    assert np.allclose(moved.corners.mean(axis=1), moved.x)
+moved = shared.migrated(there)
+assert moved.origin is moved.reference

@@ -194,8 +194,9 @@ def steps_taken(monkeypatch, dt: float, **values) -> int:
 def test_steps_to_where_forces_do_no_work_save_newton_steps_and_long_time_steps_fail_without(monkeypatch):
     assert steps_taken(monkeypatch, 0.5) < 0.8 * steps_taken(monkeypatch, 0.5, TRIES=1)
     assert steps_taken(monkeypatch, 1.0) < 60
-    with pytest.raises(mpm.NotConverged):
-        steps_taken(monkeypatch, 1.0, TRIES=1)
+    for firmness in ({}, {"FIRM": 0.0}):
+        with pytest.raises(mpm.NotConverged):
+            steps_taken(monkeypatch, 1.0, TRIES=1, **firmness)
 
 
 def test_a_firmer_tangent_leads_to_the_same_equilibrium(monkeypatch):

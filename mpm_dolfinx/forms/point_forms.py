@@ -31,10 +31,8 @@ from numpy.typing import NDArray
 from mpm_dolfinx import _compat
 from mpm_dolfinx.caching import Keyed, Latest
 from mpm_dolfinx.constitutive.axes import block
-from mpm_dolfinx.points.grid import Grid
+from mpm_dolfinx.points.grid import Grid, in_chunks
 
-CHUNK = 2**14
-"""Points whose coefficients are packed at a time: no form holds a row for each point of a large body."""
 BATCH = 2**10
 """Points whose element matrices are made at a time, in the processor's cache."""
 
@@ -358,9 +356,9 @@ class PointForm:
         self._rows, self._bound = Rows(self.compiled, points), Latest()
 
     def _parts(self, data: PointData) -> Iterator[tuple]:
-        """Yield the form bound to CHUNK points after the other, with their rows."""
+        """Yield the form bound to one chunk of points after the other, with their rows."""
         cells, live = data.places.slots if self._dense else data.cells, self._rows.live(data)
-        parts = [slice(start, start + CHUNK) for start in range(0, len(cells), CHUNK)]
+        parts = in_chunks(len(cells))
         bound = self._bound(cells, lambda: [self.compiled.bind(cells[part]) for part in parts])
         for part, form in zip(parts, bound, strict=True):
             yield form, self._rows(data, part, live)

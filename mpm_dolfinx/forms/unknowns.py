@@ -18,7 +18,6 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from mpm_dolfinx import _compat
-from mpm_dolfinx.parallel.exchange import over_all
 
 
 class Unknowns:
@@ -106,14 +105,6 @@ class Unknowns:
         """Add scale * v to a function, ghosts updated."""
         function.x.array[self.owned] += scale * v.array_r
         function.x.scatter_forward()
-
-
-def sum_of_sizes(v: PETSc.Vec) -> float:
-    """Return the 1-norm of a vector.
-
-    OpenBLAS's, which PETSc's would be, depends in its last bit on where the vector lies in memory.
-    """
-    return float(over_all(v.comm.tompi4py(), np.abs(v.array_r).sum()))
 
 
 def matrix(rows: Unknowns, columns: Unknowns, row_length: int | NDArray[np.int64]) -> PETSc.Mat:

@@ -18,9 +18,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from mpm_dolfinx.forms.point_forms import CHUNK
 from mpm_dolfinx.points.cutting import corner_bits
-from mpm_dolfinx.points.grid import Grid
+from mpm_dolfinx.points.grid import Grid, in_chunks
 
 
 def followed(
@@ -44,7 +43,7 @@ def followed(
     bends = _second_differences(grid, used, u, active)
     out = np.empty((2, *x.shape))
     # with the corners last: rows of a few numbers each would take numpy six times as long
-    for part in (slice(start, start + CHUNK) for start in range(0, len(x), CHUNK)):
+    for part in in_chunks(len(x)):
         here, y = slot[cells[part]], (x[part] - grid.midpoints[cells[part]]).T.copy()
         out[0, part] = _polynomial(field, y, here).T
         weights = 0.5 * ((y / grid.h[:, None]) ** 2 - 0.25)  # t (t - 1) / 2

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.parallel.exchange import first
 from mpm_dolfinx.points.cutting import FACES, corner_bits, domain_volumes, volumes
-from mpm_dolfinx.points.grid import ROWS, SIDES, Grid
+from mpm_dolfinx.points.grid import SIDES, Grid, in_chunks
 from mpm_dolfinx.points.material_points import MaterialPoints, middle
 from mpm_dolfinx.validation import asked, instance, numbers, whole
 
@@ -128,9 +128,13 @@ class Body:
             out = np.maximum(out, off.max(axis=1))
         return out
 
+    def boxes(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
+        """Return the edges (m, d), m, of the boxes of domains, before the map."""
+        return np.broadcast_to(self.spacing, self.lower.shape)[chosen]
+
     def size(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
         """Return the edges (m, d), m, of boxes that are as large as domains."""
-        boxes = np.broadcast_to(self.spacing, self.lower.shape)[chosen]
+        boxes = self.boxes(chosen)
         if self.aligned:
             return boxes
         ratio = volumes(self.corners(chosen)) / boxes.prod(axis=1)
@@ -309,12 +313,11 @@ def material_points(
 def _own(grid: Grid, body: Body) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return the domains (m,) whose middles are in cells of this process, and their corners (m, 2^d, d), m."""
     rows, corners = [np.empty(0, dtype=np.int64)], [np.empty((0, 2**grid.dim, grid.dim))]
-    for start in range(0, len(body), ROWS):
-        part = np.arange(start, min(start + ROWS, len(body)))
+    for part in in_chunks(len(body)):
         of_part = body.corners(part)
         # of all copies of the grid alike
         here = np.flatnonzero(grid.owner(grid.number(grid.index(middle(of_part)))) == grid.comm.rank)
-        rows.append(part[here])
+        rows.append(part.start + here)
         corners.append(of_part[here])
     return np.concatenate(rows), np.concatenate(corners)
 

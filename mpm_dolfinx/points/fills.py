@@ -19,7 +19,7 @@ from mpm_dolfinx.points.bodies import Body
 from mpm_dolfinx.points.contact import Cover, Faces, covered, covers, local, meeting, warn_near, weights
 from mpm_dolfinx.points.cutting import FACES, TANGLED, domain_volumes, volumes
 from mpm_dolfinx.points.grid import REACH, Grid
-from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.points.material_points import MaterialPoints, middle
 
 MISFIT = 0.01  # cells: fills whose straight edges are further off a bent surface are named in a warning
 UPRIGHT = 0.95  # cosine: what of a mesh looks that straight away from what it lies on stays where it was seeded
@@ -113,7 +113,7 @@ def put(
     if (mine == new.corners).all():
         return new
     volume = domain_volumes(mine, grid.axisymmetric)
-    return replace(new, corners=mine, x=mine.mean(axis=1), volume0=volume, origin=mine, reference=mine)
+    return replace(new, corners=mine, x=middle(mine), volume0=volume, origin=mine, reference=mine)
 
 
 def _start(bodies: Sequence[Body], body: int) -> int:

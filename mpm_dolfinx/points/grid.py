@@ -35,8 +35,8 @@ SHARED = frozenset(
 """What of a grid is made with its mesh, see `Cells`."""
 TURN = 2 * np.pi
 """The angle of the revolution that volumes, forces and outflows of axisymmetric scenes are of."""
-ROWS = 2**14
-"""Rows that are worked on at a time where all at once would take much memory."""
+CHUNK = 2**14
+"""Rows that are worked on at a time: no temporary holds one for each point of a large body."""
 MOST = 2**31 - 1
 """Unknowns that PETSc's numbers of 32 bits count."""
 
@@ -46,6 +46,11 @@ def side(name: str, dim: int) -> tuple[int, int]:
     if not isinstance(name, str) or name not in SIDES[dim]:
         raise ValueError(f"side {name!r}: must be one of {', '.join(SIDES[dim])} in {dim}D")
     return SIDES[dim][name]
+
+
+def in_chunks(count: int) -> list[slice]:
+    """Return so many rows in parts of at most CHUNK, one after the other; none of no rows."""
+    return [slice(start, min(start + CHUNK, count)) for start in range(0, count, CHUNK)]
 
 
 def sum_by(index: NDArray, values: NDArray[np.float64], size: int) -> NDArray[np.float64]:
@@ -322,7 +327,7 @@ class Grid:
     def at(self, cells: NDArray[np.int32], x: NDArray[np.float64], u: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return a Q1 field u (nodes, k) at points (n, d), m, in local cells (n,)."""
         out = np.empty((len(x), u.shape[1]))
-        for part in (slice(start, start + ROWS) for start in range(0, len(x), ROWS)):
+        for part in in_chunks(len(x)):
             N, at_nodes = self.shape_values(cells[part], x[part]), u[self.cell_nodes[cells[part]]]
             np.einsum("mk,mkd->md", N, at_nodes, out=out[part])
         return out

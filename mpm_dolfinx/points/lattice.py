@@ -29,7 +29,7 @@ from mpm_dolfinx.points.bodies import Body
 from mpm_dolfinx.points.contact import Faces, covers
 from mpm_dolfinx.points.cutting import FACES
 from mpm_dolfinx.points.faces import Surface
-from mpm_dolfinx.points.grid import ROWS, SIDES, Grid
+from mpm_dolfinx.points.grid import SIDES, Grid, in_chunks
 from mpm_dolfinx.points.material_points import MaterialPoints
 
 FAST = 10
@@ -138,7 +138,7 @@ def _change(
     for at, d in rows:
         field[at] = d
     for at, d in rows:
-        for part in (slice(start, start + ROWS) for start in range(0, len(at), ROWS)):
+        for part in in_chunks(len(at)):
             here = at[part]
             field[here[(np.abs(field[here] - d[part]) > parted).any(axis=1)]] = np.nan
     field = field.reshape(-1, *shape[1:], values.shape[1])

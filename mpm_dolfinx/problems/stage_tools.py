@@ -22,7 +22,7 @@ from mpm_dolfinx.parallel.exchange import Exchange, first, over_all
 from mpm_dolfinx.points.cut_domains import CutDomains
 from mpm_dolfinx.points.faces import Surface
 from mpm_dolfinx.points.grid import Grid
-from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.points.material_points import MaterialPoints, middle
 from mpm_dolfinx.problems.cell_contact import LEAST, kept, pressure_name, shear_name
 from mpm_dolfinx.problems.conditions import Displacement, resistance
 from mpm_dolfinx.problems.pushed_tools import PushedTools
@@ -174,7 +174,7 @@ class Tools:
                     raise ValueError(f"{what}, must not; limit the displacement by a region, or move the tool")
             corners = points.corners[self._gaps(tool, points.corners, t).min(axis=1) < -BEGINS * self.grid.h.min()]
             deep, where = self._deepest(tool, points.x, t)
-            held, there = self._deepest(tool, corners.mean(axis=1), t)
+            held, there = self._deepest(tool, middle(corners), t)
             if deep > NEAR or held > 0:  # stretched domains have their middles in round tools, not their corners
                 where = where if deep > NEAR else there
                 raise NotConverged(f"{line(tool)}: has passed through the surface, to the point at {where}")

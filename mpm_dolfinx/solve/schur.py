@@ -24,7 +24,7 @@ from dolfinx.common import Timer
 from numpy.typing import NDArray
 
 from mpm_dolfinx.caching import Latest
-from mpm_dolfinx.forms.unknowns import sum_of_sizes
+from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.problems.momentum import MomentumProblem, MomentumSystem
 from mpm_dolfinx.problems.storage import FILTER, StorageProblem, StorageSystem
 from mpm_dolfinx.solve.linear import (
@@ -156,10 +156,6 @@ class LinearSolvers:
             if storage is not None:
                 storage.assemble_tangent(data and data.pieces)
         with Timer("mpm: factorisation"):
-            by_factors = self._schur is not None
-            if storage is not None and not (by_factors and self._operator.value):
-                share = 0.0 if self.scheme.richardson else FILTER
-                storage.assemble_preconditioner(self.scheme.beta, share)
             if self.multigrid:
                 K.setNearNullSpace(self._modes)
                 allow_no_diagonal(self.solve_u, K)
@@ -167,17 +163,19 @@ class LinearSolvers:
                 self.solve_u.setOperators(K)
                 self.solve_u.setUp()
             if self._block is not None:
+                storage.assemble_preconditioner(self.scheme.beta, FILTER)
                 self._block.linearise()
-            elif by_factors:
-                self._operator((), self._set_operator)
+            elif storage is not None:
+                self._operator((), lambda: self._set_operator(storage))
                 factorise(self.solve_u.pc, self._solve_s.pc)
                 if self.scheme.richardson or data is not None:  # what a resumed run may not have any more
                     self._operator.clear()
         return True
 
-    def _set_operator(self) -> bool:
+    def _set_operator(self, storage: StorageProblem) -> bool:
         """Take the present fixed-stress operator, which is then to be factorised."""
-        self._solve_s.setOperators(self._schur, self._storage.P)
+        share = 0.0 if self.scheme.richardson else FILTER
+        self._solve_s.setOperators(self._schur, storage.assemble_preconditioner(self.scheme.beta, share))
         self._solve_s.setUp()
         return True
 
@@ -199,7 +197,8 @@ class LinearSolvers:
             return count if self.iterative else 0
         if self._block is not None:
             r = self._storage.residual  # scales of Euclidean norms that make them the errors
-            size, total = r.norm(), sum_of_sizes(r)
+            # no 1-norm of PETSc's: OpenBLAS's depends in its last bit on where the vector lies in memory
+            size, total = r.norm(), float(over_all(self._storage.unknowns.comm, np.abs(r.array_r).sum()))
             scale_p = (exchanged or 1.0) * (size / total if total > 0 else 1.0)
             share = 1.0 if self.multigrid else CLOSER
             return self._block.solve(self.du, self.dp, (scale_u or 1.0, scale_p), share * rtol)
