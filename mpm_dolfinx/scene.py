@@ -147,7 +147,7 @@ class Scene:
                 self._looked_for[:] = filter(None, looked)
             with Timer("mpm: integration data"):
                 problems = (self.momentum, self.storage)
-                return OnGrid(self.pieces, self.materials, *problems, cut, self.scheme.of_fluid)
+                return OnGrid(self.pieces, *problems, cut, self.scheme.of_fluid)
 
         return self._on_grid(points.arrays, make, grid.comm)
 

@@ -5,9 +5,12 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from mpi4py import MPI
+
 import numpy as np
 from numpy.typing import NDArray
 
+from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.problems.momentum import MomentumProblem
 from mpm_dolfinx.problems.on_grid import Assembled, OnGrid
 from mpm_dolfinx.problems.quadrature_data import QuadratureData
@@ -60,12 +63,21 @@ def going_on(scene: Scene, start: Start, substep: Substep) -> NDArray[np.float64
     return None if velocity is None else substep.end * start.dt * velocity
 
 
+def has_yielded(scene: Scene, state: State) -> bool:
+    """Return whether soil has yielded before, on any process."""
+    if scene.momentum.elastic:
+        return False
+    evolved = bool(scene.materials.evolved(state.points).any())
+    return over_all(scene.grid.comm, evolved, MPI.LOR)
+
+
 def balances(scene: Scene, start: Start, acting: Acting, before: Rates | None = None) -> Balances:
     """Return the balances at the end of a substep, with u and p as they are; before: rates of the substep before."""
     substep, on_grid, matrices, dt = acting.substep, start.on_grid, start.matrices, start.dt
     scene.set_time(acting.t, substep.end * dt, acting.gravity)
     scene.momentum.set_rate(substep.own * dt, substep.before / substep.own)
     forces = matrices.round_off, scene.scheme.tolerance, going_on(scene, start, substep), start.state.held
+    forces = *forces, has_yielded(scene, start.state)
     momentum = MomentumProblem(scene.momentum, matrices.momentum, start.data, acting.sides, *forces)
     if scene.storage is None:
         return Balances(momentum, None)

@@ -65,7 +65,7 @@ class GhostPenalty:
     modulus
         Scale of the penalty by what the cells hold, Pa, see `stiffness`.
     shear
-        Mean shear modulus of what the cells hold, Pa.
+        Mean over what the cells hold of the shear modulus of laws with a history, Pa, 0 of others.
     firmness
         Form of the elastic shear stiffness over whole cells, times their filled share: what makes tangents firmer.
     fill, beside

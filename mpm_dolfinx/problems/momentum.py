@@ -352,6 +352,8 @@ class MomentumProblem:
         Displacements if the bodies moved on as they did before, a local array, m; None where that is not known.
     held : (unknowns,)
         Forces that hold what is out of balance of an initial stress, a local array, N, if there are any.
+    yielded
+        Whether any soil has yielded before.
     """
 
     def __init__(
@@ -364,8 +366,10 @@ class MomentumProblem:
         tolerance: float,
         goes_on: NDArray[np.float64] | None = None,
         held: NDArray[np.float64] | None = None,
+        yielded: bool = False,
     ):
         self.forms, self.system, self.data, self.round_off = forms, system, data, round_off
+        self.yielded = yielded
         self._sides, self._goes_on, self._tolerance = sides, goes_on, tolerance
         self._largest = np.zeros(1)  # forces so far, N
         with Timer("mpm: loads"):

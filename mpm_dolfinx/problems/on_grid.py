@@ -14,7 +14,6 @@ from dolfinx.common import Timer
 from numpy.typing import NDArray
 
 from mpm_dolfinx.caching import Keyed, Latest
-from mpm_dolfinx.constitutive.fields import SceneMaterials
 from mpm_dolfinx.constitutive.fluid_content import mass_potential, pressure_of
 from mpm_dolfinx.forms.unknowns import collect_garbage
 from mpm_dolfinx.parallel.exchange import over_all
@@ -41,8 +40,8 @@ class OnGrid(Keyed):
 
     Parameters
     ----------
-    quadrature, materials
-        Points of integration and materials of the scene.
+    quadrature
+        Points of integration of the scene.
     momentum, storage
         Forms, whose coefficients are set to what the cells hold; storage is None without fluid.
     cut
@@ -54,7 +53,6 @@ class OnGrid(Keyed):
     def __init__(
         self,
         quadrature: QuadraturePoints,
-        materials: SceneMaterials,
         momentum: MomentumForms,
         storage: StorageForms | None,
         cut: CutDomains,
@@ -68,8 +66,8 @@ class OnGrid(Keyed):
         self.weight = weight = pieces["weight"][:, 0] * grid.cell_volume
         """Volumes (m,) of the pieces, m^d."""
         area, x = cut.plane(weight)
-        moduli = [area * quadrature.rows(cut, points, scale) for scale in (stiffness, lambda m: m.shear)]
-        moduli[1] *= cut.to_cells(1.0 * materials.evolved(points))  # soil that has not yielded is firm enough
+        scales = stiffness, lambda m: m.shear if m.state else 0.0  # what never yields is firm enough
+        moduli = [area * quadrature.rows(cut, points, scale) for scale in scales]
         momentum.ghost.set_contents(*(sum_by(cut.cells, rows, grid.num_local) for rows in (area, *moduli)))
         self.active = momentum.ghost.fill.x.array > 0
         """Which local cells hold something, ghosts included."""

@@ -209,7 +209,8 @@ class Newton:
         self, errors: Errors, as_reset: Callable[[], QuadratureData], key: Hashable, fresh: bool, watched: bool
     ) -> Errors:
         """Iterate from the present (u, p), of these errors; fresh: with its own tangent; watched: by a watchdog."""
-        dog, count = Watchdog(errors.worst, self._iterate()) if watched else None, 0
+        eases, count = not self._momentum.yielded, 0
+        dog = Watchdog(errors.worst, self._iterate(), eases=eases) if watched else None
         while (found := self._augmented(errors)).worst > self._scheme.tolerance:
             if found is not errors:  # what has balanced is to do so with other pressures or pairs of contacts
                 errors, count, fresh = found, 0, True
@@ -224,8 +225,6 @@ class Newton:
             count += 1
             fresh = errors.worst > self._keep * min(1.0, before.worst)  # inf where no fluid has moved yet
             dog = dog and dog.after(errors.worst, step, self._iterate)
-            if dog and dog.lost(errors.worst):
-                raise NotConverged("no descent along the Newton directions", self.report.history)
             if dog and dog.strays(errors.worst):
                 self._go_to(dog.where)
                 errors, fresh, dog = self._errors(errors.start), True, replace(dog, since=0, descends=True)
