@@ -7,7 +7,7 @@ from dataclasses import replace
 from functools import partial
 
 from mpm_dolfinx.forms.unknowns import collect_garbage
-from mpm_dolfinx.problems.balances import Acting, Start, balances
+from mpm_dolfinx.problems.balances import Acting, Start, balances, has_yielded
 from mpm_dolfinx.result import Report
 from mpm_dolfinx.scene import Scene
 from mpm_dolfinx.solve.newton import note_pressures, solve_substep
@@ -33,7 +33,7 @@ def set_up(scene: Scene, state: State, dt: float) -> Start:
     scene.momentum.u.x.array[:] = 0.0
     on_grid.start(state)
     acting = [Acting(*one) for one in zip(scene.substeps, times, sides, gravity, strict=True)]
-    return Start(state, on_grid, data, matrices, dt, acting)
+    return Start(state, on_grid, data, matrices, dt, has_yielded(scene, state), acting)
 
 
 def step(scene: Scene, state: State, dt: float) -> tuple[State, Report]:

@@ -31,13 +31,17 @@ class Acting(NamedTuple):
 
 
 class Start(NamedTuple):
-    """The start of a step of dt (s): the state on the grid, with the pieces' data, matrices, and what acts."""
+    """The start of a step of dt (s): the state on the grid, with the pieces' data, matrices, and what acts.
+
+    yielded: whether soil has yielded before, on any process.
+    """
 
     state: State
     on_grid: OnGrid
     data: QuadratureData
     matrices: Assembled
     dt: float
+    yielded: bool
     acting: list[Acting]
 
 
@@ -77,8 +81,7 @@ def balances(scene: Scene, start: Start, acting: Acting, before: Rates | None = 
     scene.set_time(acting.t, substep.end * dt, acting.gravity)
     scene.momentum.set_rate(substep.own * dt, substep.before / substep.own)
     forces = matrices.round_off, scene.scheme.tolerance, going_on(scene, start, substep), start.state.held
-    forces = *forces, has_yielded(scene, start.state)
-    momentum = MomentumProblem(scene.momentum, matrices.momentum, start.data, acting.sides, *forces)
+    momentum = MomentumProblem(scene.momentum, matrices.momentum, start.data, acting.sides, *forces, start.yielded)
     if scene.storage is None:
         return Balances(momentum, None)
     weight = None if acting.gravity is None else scene.fluid.density * acting.gravity

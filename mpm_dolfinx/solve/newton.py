@@ -209,7 +209,7 @@ class Newton:
         self, errors: Errors, as_reset: Callable[[], QuadratureData], key: Hashable, fresh: bool, watched: bool
     ) -> Errors:
         """Iterate from the present (u, p), of these errors; fresh: with its own tangent; watched: by a watchdog."""
-        eases, count = not self._momentum.yielded, 0
+        count, eases = 0, not self._momentum.yielded
         dog = Watchdog(errors.worst, self._iterate(), eases=eases) if watched else None
         while (found := self._augmented(errors)).worst > self._scheme.tolerance:
             if found is not errors:  # what has balanced is to do so with other pressures or pairs of contacts

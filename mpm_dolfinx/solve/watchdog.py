@@ -16,8 +16,8 @@ steps go far astray there.  A share of the elastic shear stiffness in the tangen
 back (Levenberg 1944, Marquardt 1963): ten times as much after a step that was shortened to next to nothing, a tenth
 after a full one to the least residual so far.  If it went with each full step, the next one would be as short as
 before, and the iterations would circle.  Soil that has not yielded gets the share too: where it does so for the first
-time it flows as far.  Only while nothing has yielded before, and each step brings the residual down by far, tangents
-stay as they are: wet elastic soil takes 1.6 times the Newton steps with firmer ones.
+time it flows as far.  Only while nothing has yielded before, and each step brings the residual to less than a
+tenth, tangents stay as they are: wet elastic soil takes 1.6 times the Newton steps with firmer ones.
 
 Where a few points flow and their tangent has less than no stiffness, Newton's direction leads backwards: it unloads
 them, the next step loads them again, and the iterations circle between the two.  There the residuals do negative work
@@ -58,7 +58,7 @@ class Watchdog:
 
     least: least residual so far; where: (u, p) there; since: steps since; descends: whether they were called back;
     firm: by how much the tangents are firmer than usual; leasts: least residuals so far, of recent steps; eases:
-    whether no soil had yielded before and each step so far has brought the residual down by far.
+    whether no soil had yielded before and each step so far has brought the residual to less than a tenth.
     """
 
     least: float
