@@ -7,8 +7,14 @@ import ufl
 from dolfinx import fem
 
 from mpm_dolfinx import Grid, Hencky, NeoHookean, _compat
-from mpm_dolfinx.forms.cell_matrices import ElementForces, ElementMatrices, StackedElementMatrices
-from mpm_dolfinx.forms.point_forms import FormPoints, PointExpression, PointForm
+from mpm_dolfinx.forms.cell_matrices import (
+    ElementForces,
+    ElementMatrices,
+    StackedElementMatrices,
+    along_shapes,
+    insert_rows,
+)
+from mpm_dolfinx.forms.point_forms import CellSums, FormPoints, PointExpression, PointForm
 from mpm_dolfinx.forms.unknowns import Unknowns, matrix
 
 GRIDS = {2: Grid([1.5, 1.0], [4, 3]), 3: Grid([1.0, 1.2, 0.9], [2, 3, 2])}
@@ -140,6 +146,22 @@ def test_element_matrices_equal_the_form_point_by_point(dim, symmetric, stacked)
         data = data.part(p, data.places.part(rows), rows)
 
 
+@pytest.mark.parametrize("dim, stacked", [(2, False), (2, True), (3, True)])
+def test_element_matrices_sum_what_else_is_asked_for(dim, stacked):
+    s = Scene(dim, T=(dim, dim), F=(dim, dim), size=())
+    F = np.eye(dim) + 0.1 * s.rng.normal(size=(len(s.x), dim, dim))
+    data = s.place(T=s.rng.normal(size=F.shape), F=F, size=s.rng.normal(size=len(s.x)))
+    one, p = ufl.Identity(dim), s.points
+    A = ufl.outer(one, one)
+    matrices = (StackedElementMatrices if stacked else ElementMatrices)(A, p, along=[one, p.T], more=[p.size])
+    unknowns = Unknowns(fem.Function(s.V), np.arange(len(fem.Function(s.V).x.array)))
+    K = matrix(unknowns, unknowns, unknowns.size)
+    sums = matrices.assemble_matrix(K, data)
+    pull = p.F if stacked else one
+    expected = [CellSums(along_shapes(T * pull.T, p), p)(data) for T in (one, p.T)] + [CellSums([p.size], p)(data)]
+    assert sums == pytest.approx(np.concatenate(expected, axis=1), rel=1e-12, abs=1e-14)
+
+
 def test_element_forces_equal_the_form_point_by_point(dim):
     s = Scene(dim, T=(dim, dim))
     data = s.place(T=s.rng.normal(size=(len(s.x), dim, dim)))
@@ -150,7 +172,8 @@ def test_element_forces_equal_the_form_point_by_point(dim):
     assert np.abs(b - expected).max() < 1e-12 * np.abs(expected).max()
     rows, columns = (Unknowns(f, np.arange(len(f.x.array))) for f in map(fem.Function, (q.ufl_function_space(), s.V)))
     A = matrix(rows, columns, columns.size)
-    forces.assemble_matrix(A, data)
+    of_cells = CellSums(along_shapes(s.points.T, s.points), s.points)(data)
+    insert_rows(A, s.grid, data.places.filled, of_cells)
     A.assemble()
     assert np.abs(A[:, :].sum(axis=0) - expected).max() < 1e-12 * np.abs(expected).max()
     assert np.abs(A[:, :]).sum(axis=1).nonzero()[0] == pytest.approx(data.places.filled)

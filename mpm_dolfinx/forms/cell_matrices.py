@@ -6,6 +6,7 @@ Inserting the matrix of every point costs more than computing it.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import prod
 
 from petsc4py import PETSc
@@ -73,6 +74,13 @@ def insert(A: PETSc.Mat, grid: Grid, cells: NDArray[np.int32], matrices: NDArray
         A.setValuesLocalRCV(dofs, dofs, matrices, addv=True)
 
 
+def insert_rows(A: PETSc.Mat, grid: Grid, cells: NDArray[np.int32], rows: NDArray[np.float64]) -> None:
+    """Add to `A`, which has a row a cell, values (cells, n) for the Q1 vectors of cells; the caller finalises it."""
+    if len(cells):
+        dofs = element_dofs(grid, cells).astype(PETSc.IntType)
+        A.setValuesLocalRCV(cells[:, None].astype(PETSc.IntType), dofs, rows[:, None], addv=True)
+
+
 def _entries(count: int, symmetric: bool) -> tuple[NDArray, NDArray, NDArray]:
     """Return rows and columns of the entries of a matrix that are needed, and the place of every entry among them."""
     rows, columns = np.triu_indices(count) if symmetric else np.divmod(np.arange(count**2), count)
@@ -103,13 +111,6 @@ class ElementForces:
         dofs = element_dofs(self._grid, data.places.filled)
         b += sum_by(dofs.ravel(), self._sums(data).ravel(), len(b))
 
-    def assemble_matrix(self, A: PETSc.Mat, data: PointData) -> None:
-        """Add to `A`, which has a row a cell, the vectors of the cells; the caller finalises it."""
-        cells = data.places.filled
-        if len(cells):
-            dofs = element_dofs(self._grid, cells).astype(PETSc.IntType)
-            A.setValuesLocalRCV(cells[:, None].astype(PETSc.IntType), dofs, self._sums(data)[:, None], addv=True)
-
 
 class ElementMatrices:
     """The bilinear form grad v : A : grad u of Q1 vectors over points, summed in each cell before insertion.
@@ -126,9 +127,20 @@ class ElementMatrices:
         The points.
     symmetric
         Whether A[i, k, j, l] = A[j, l, i, k]: half of the entries are then left out.
+    along : UFL tensors (d, d)
+        T[i, k] at the points, summed as T : grad v, see `ElementForces`; kernels that share terms with A cost little.
+    more
+        UFL scalars at the points, summed too.
     """
 
-    def __init__(self, tangent: ufl.core.expr.Expr, points: FormPoints, symmetric: bool = True):
+    def __init__(
+        self,
+        tangent: ufl.core.expr.Expr,
+        points: FormPoints,
+        symmetric: bool = True,
+        along: Sequence[ufl.core.expr.Expr] = (),
+        more: Sequence[ufl.core.expr.Expr] = (),
+    ):
         self._grid, dim = points.grid, points.grid.dim
         rows, columns, self._entry = _entries(2**dim * dim, symmetric)
         gradients, entries = shape_gradients(points), []
@@ -139,11 +151,17 @@ class ElementMatrices:
             entries.append(ufl.dot(gradients[v], ufl.dot(block, gradients[u])))
             if points.grid.axisymmetric:
                 entries[-1] += _of_hoops(tangent, gradients, hoops, (int(v), int(i)), (int(u), int(j)))
-        self._sums = CellSums(entries, points)
+        self._count = len(entries)
+        self._sums = CellSums([*entries, *(part for T in along for part in along_shapes(T, points)), *more], points)
 
-    def assemble_matrix(self, A: PETSc.Mat, data: PointData) -> None:
-        """Add the matrix to `A`, by unrolled local dofs; the caller finalises it."""
-        insert(A, self._grid, data.places.filled, self._sums(data)[:, self._entry])
+    def assemble_matrix(self, A: PETSc.Mat, data: PointData) -> NDArray[np.float64]:
+        """Add the matrix to `A`, by unrolled local dofs, and return the other sums (cells, quantities) in filled cells.
+
+        The caller finalises the matrix.
+        """
+        sums = self._sums(data)
+        insert(A, self._grid, data.places.filled, sums[:, self._entry])
+        return sums[:, self._count :]
 
 
 def _of_hoops(tangent, gradients: list, hoops: list, row: tuple[int, int], column: tuple[int, int]):
@@ -181,39 +199,67 @@ class StackedElementMatrices:
         The points, with the field F (d, d).
     symmetric
         Whether A[i, k, j, l] = A[j, l, i, k]: half of the entries are then left out.
+    along : UFL tensors (d, d)
+        T[i, k] at the points, summed as T : (grad v F).
+    more
+        UFL scalars at the points, summed too.
     """
 
-    def __init__(self, tangent: ufl.core.expr.Expr, points: FormPoints, symmetric: bool = True):
-        self._grid, self._d = points.grid, points.grid.dim
+    def __init__(
+        self,
+        tangent: ufl.core.expr.Expr,
+        points: FormPoints,
+        symmetric: bool = True,
+        along: Sequence[ufl.core.expr.Expr] = (),
+        more: Sequence[ufl.core.expr.Expr] = (),
+    ):
+        self._grid, self._d, self._along, self._more = points.grid, points.grid.dim, len(along), len(more)
         d, (rows, columns, place) = self._d, _entries(self._d**2, symmetric)
         self._entry = place.reshape(d, d, d, d).transpose(1, 0, 2, 3).ravel()  # (k, i, j, l)
         pairs = [(*divmod(int(r), d), *divmod(int(c), d)) for r, c in zip(rows, columns, strict=True)]
-        self._tangent = PointExpression(ufl.as_vector([tangent[pair] for pair in pairs]), points)
+        self._count = len(pairs)
+        parts = [T[i, k] for T in along for i in range(d) for k in range(d)]
+        self._values = PointExpression(ufl.as_vector([*(tangent[pair] for pair in pairs), *parts, *more]), points)
         self._sorted: Latest[list] = Latest()
 
-    def assemble_matrix(self, A: PETSc.Mat, data: PointData) -> None:
-        """Add the matrix to `A`, by unrolled local dofs; the caller finalises it."""
-        live = self._tangent.live(data)
-        for cells, points, missing in self._sorted(data.places.key, lambda: batches(data.places)):
-            insert(A, self._grid, cells, self._matrices(data, live, points.ravel(), missing))
+    def assemble_matrix(self, A: PETSc.Mat, data: PointData) -> NDArray[np.float64]:
+        """Add the matrix to `A`, by unrolled local dofs, and return the other sums (cells, quantities) in filled cells.
 
-    def _matrices(self, data: PointData, live, chosen: NDArray[np.int64], missing: NDArray) -> NDArray[np.float64]:
-        """Return the element matrices (cells, n, n) of a batch."""
+        The caller finalises the matrix.
+        """
+        live, filled = self._values.live(data), data.places.filled
+        sums = np.empty((len(filled), self._along * 2**self._d * self._d + self._more))
+        for cells, points, missing in self._sorted(data.places.key, lambda: batches(data.places)):
+            matrices, sums[cells] = self._of_batch(data, live, points.ravel(), missing)
+            insert(A, self._grid, filled[cells], matrices)
+        return sums
+
+    def _of_batch(self, data: PointData, live, chosen: NDArray[np.int64], missing: NDArray) -> tuple[NDArray, NDArray]:
+        """Return the element matrices (cells, n, n) of a batch, and the other sums (cells, quantities)."""
         d, (cells, most) = self._d, missing.shape
         g = data.places.shape_gradients(chosen)
         g = g @ data["F"][chosen].reshape(-1, d, d)
-        nodes = g.shape[1]
-        tangent = self._tangent.evaluate(data, chosen, live)[:, self._entry].reshape(-1, d**3, d)
+        nodes, values = g.shape[1], self._values.evaluate(data, chosen, live)
+        tangent = values[:, self._entry].reshape(-1, d**3, d)
         right = (tangent @ g.transpose(0, 2, 1)).reshape(cells, most * d, d * d * nodes)
-        weight = data["weight"][chosen, 0] * self._grid.cell_volume
-        g *= np.where(missing.ravel(), 0.0, weight)[:, None, None]
+        weight = np.where(missing.ravel(), 0.0, data["weight"][chosen, 0] * self._grid.cell_volume)
+        g *= weight[:, None, None]
         left = g.reshape(cells, most, nodes, d).transpose(0, 2, 1, 3).reshape(cells, nodes, most * d)
         matrices = (left @ right).reshape(cells, nodes, d, d, nodes)
-        return matrices.transpose(0, 1, 2, 4, 3).reshape(cells, nodes * d, nodes * d)
+        matrices = matrices.transpose(0, 1, 2, 4, 3).reshape(cells, nodes * d, nodes * d)
+        if not (self._along or self._more):
+            return matrices, np.empty((cells, 0))
+        last = values.shape[1] - self._more
+        T = values[:, self._count : last].reshape(cells, most, self._along, d, d).transpose(0, 2, 1, 4, 3)
+        along = left[:, None] @ T.reshape(cells, self._along, most * d, d)
+        more = (weight[:, None] * values[:, last:]).reshape(cells, most, self._more).sum(axis=1)
+        return matrices, np.concatenate([along.reshape(cells, self._along * nodes * d), more], axis=1)
 
 
-def batches(places: Places) -> list[tuple[NDArray[np.int32], NDArray[np.int64], NDArray[np.bool_]]]:
-    """Return batches of filled cells that hold about as many points: cells (c,), points (c, most), which are none."""
+def batches(places: Places) -> list[tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]]:
+    """Return batches of filled cells that hold about as many points: places of the cells among these (c,), points
+    (c, most), which are none.
+    """
     cells, filled, out = places.cells, places.filled, []
     order = np.argsort(cells, kind="stable")
     start = np.searchsorted(cells[order], filled)
@@ -226,5 +272,5 @@ def batches(places: Places) -> list[tuple[NDArray[np.int32], NDArray[np.int64], 
         turn = np.arange(count[batch].max())
         missing = turn >= count[batch, None]
         points = order[np.where(missing, start[batch, None], start[batch, None] + turn)]
-        out.append((filled[batch], points, missing))
+        out.append((batch, points, missing))
     return out

@@ -33,8 +33,11 @@ from mpm_dolfinx.caching import Keyed, Latest
 from mpm_dolfinx.constitutive.axes import block
 from mpm_dolfinx.points.grid import Grid, in_chunks
 
-BATCH = 2**10
-"""Points whose element matrices are made at a time, in the processor's cache."""
+BATCH, MANY = 2**10, 2**12
+"""Points whose element matrices are made at a time, in the processor's cache; those that an expression takes at a time.
+
+The latter where there are as many: kernels are called for all that a form is bound to.
+"""
 
 
 class PointMeasure(ufl.Measure):
@@ -447,10 +450,10 @@ class PointExpression:
         dx = ufl.dx(domain=points.grid.mesh, subdomain_id=_compat.SUBDOMAIN, metadata={"quadrature_degree": 0})
         self._compiled = _compat.CompiledForm(ufl.inner(expression, q) * dx)
         self._rows = Rows(self._compiled, points)
-        self._many = min(BATCH, points.grid.num_owned)
-        self._compiled.bind(np.arange(self._many))
-        self._rows.room(self._many)
-        self._values = np.empty((self._many, int(np.prod(self._shape, dtype=int))))
+        sizes = {min(size, points.grid.num_owned) for size in (MANY, BATCH)}
+        self._bound = {size: self._compiled.bind(np.arange(size)) for size in sorted(sizes)}
+        self._rows.room(max(sizes))
+        self._values = np.empty((max(sizes), int(np.prod(self._shape, dtype=int))))
 
     def live(self, data: PointData) -> dict[str, NDArray[np.float64]]:
         """Return the present values of the fields that change while the points stay."""
@@ -462,13 +465,15 @@ class PointExpression:
         """Return the values (m, *shape) at the chosen points, by default all; live: as `live` gives it."""
         live = self.live(data) if live is None else live
         count = len(data.cells if chosen is None else chosen)
-        out = np.empty((count, self._values.shape[1]))
-        for start in range(0, count, max(1, self._many)):
-            stop = min(start + self._many, count)
+        out, start = np.empty((count, self._values.shape[1])), 0
+        while start < count:
+            size = max(size for size in self._bound if size <= max(count - start, min(self._bound)))
+            stop, values = min(start + size, count), self._values[:size]
             self._rows(data, slice(start, stop) if chosen is None else chosen[start:stop], live)
-            self._values[:] = 0.0
-            self._compiled.assemble_vector(self._values.reshape(-1), self._rows.room(self._many))
-            np.divide(self._values[: stop - start], self._volume, out=out[start:stop])
+            values[:] = 0.0
+            self._compiled.assemble_vector(values.reshape(-1), self._rows.room(size)[:size], self._bound[size])
+            np.divide(values[: stop - start], self._volume, out=out[start:stop])
+            start = stop
         return out.reshape(count, *self._shape)
 
 

@@ -34,8 +34,8 @@ from mpm_dolfinx.caching import Latest
 from mpm_dolfinx.constitutive.axes import block
 from mpm_dolfinx.constitutive.skeleton import Skeleton
 from mpm_dolfinx.constitutive.user_functions import expression
-from mpm_dolfinx.forms.cell_matrices import along_shapes, insert
-from mpm_dolfinx.forms.point_forms import CellSums, FormPoints, PointData
+from mpm_dolfinx.forms.cell_matrices import insert
+from mpm_dolfinx.forms.point_forms import CellSums, FormPoints, PointData, PointExpression
 from mpm_dolfinx.points.grid import Grid, sum_by
 from mpm_dolfinx.problems.quadrature_data import QuadratureData
 
@@ -60,18 +60,13 @@ class MeanDilatation:
         self._filled: Latest[Cells] = Latest()
         self._volume: Latest[NDArray[np.float64]] = Latest()
         self._ratios: list[CellSums] = []
-        self._ratio_slopes: list[CellSums] = []
-        self._slopes: list[CellSums] = []
-        self._derivatives: list[CellSums] = []
-
-    def _along_shapes(self, T, points: FormPoints) -> list:
-        """Return T : dF for the displacement of each node, whose dF is grad(v) F_n."""
-        return along_shapes(T * points.F.T, points)
+        self._stresses: list[StressAtPoints] = []
 
     def seen(self, points: FormPoints, F):
-        """Return Fbar (d, d), what laws see of F, as UFL."""
-        Fbar = (self._theta * ufl.det(points.F) / ufl.det(F)) ** (1 / self._d) * F
-        return ufl.variable(block(Fbar)) if self._grid.axisymmetric else Fbar
+        """Return Fbar (d, d), what laws see of F, a UFL variable."""
+        ratio = self._theta * ufl.det(points.F) / ufl.det(F)
+        Fbar = (ufl.sqrt(ratio) if self._d == 2 else ratio ** (1 / self._d)) * F
+        return ufl.variable(block(Fbar) if self._grid.axisymmetric else Fbar)
 
     def add(
         self,
@@ -79,6 +74,7 @@ class MeanDilatation:
         points: FormPoints,
         F,
         Fbar,
+        ratio,
         values: Mapping[str, object],
         known: Mapping[str, object],
     ) -> tuple:
@@ -94,6 +90,8 @@ class MeanDilatation:
             Deformation gradient (d, d), a UFL variable.
         Fbar
             What the law sees of it, see `seen`.
+        ratio
+            det Delta, of F over that at the start of the step.
         values
             UFL values of the law's parameters, state and local unknowns.
         known
@@ -101,24 +99,20 @@ class MeanDilatation:
 
         Returns
         -------
-        The first Piola-Kirchhoff stress that the residual takes, and that whose derivative the tangent takes, Pa, as
-        UFL of F, theta and pi.
+        The first Piola-Kirchhoff stress, Pa, as UFL of F, theta and pi, for the residual; its derivative by F (d, d, d,
+        d), Pa, for the tangent; and what the tangent is to sum over the pieces of each cell, for `assemble_matrix`.
         """
-        J_n, theta = ufl.det(points.F), self._theta
-        ratio = ufl.det(F) / J_n
+        J_n, J = ufl.det(points.F), ufl.det(F)
         self._ratios.append(CellSums([ratio], points))
-        self._ratio_slopes.append(CellSums(self._along_shapes(ufl.diff(ratio, F), points), points))
         P, slope = self._stress(law, F, Fbar, known)
-        self._slopes.append(CellSums([slope / J_n], points))
-        of_tangent, slope = self._stress(law, F, Fbar, values)
-        derivatives = [*self._along_shapes(ufl.diff(slope / J_n, F), points), ufl.diff(slope / J_n, theta)]
-        if not self._symmetric:
-            derivatives += self._along_shapes(ufl.diff(of_tangent / J_n, theta), points)
-        self._derivatives.append(CellSums(derivatives, points))
-        shared = self.pi * ufl.diff(ufl.det(F), F)
-        return P + shared, of_tangent + shared
+        self._stresses.append(StressAtPoints(P, slope / J_n, points))
+        P_F, P_theta, slope_F, slope_theta = self._slopes(law, F, Fbar, values)
+        shared, share = self.pi * ufl.diff(J, F), 1 / J_n
+        along = [share * T for T in (ufl.diff(J, F), slope_F, *([] if self._symmetric else [P_theta]))]
+        sums = {"along": along, "more": [share * slope_theta]}
+        return self._stresses[-1].P + shared, P_F + ufl.diff(shared, F), sums
 
-    def _stress(self, law: type[Skeleton], F, Fbar, values: Mapping[str, object]):
+    def _stress(self, law: type[Skeleton], F, Fbar, values: Mapping[str, object]) -> tuple:
         """Return the derivatives by F and by theta of psi(Fbar); of a law without energy, of its work."""
         if law.kirchhoff is None:
             energy = expression(law.energy, [()], F=Fbar, **values)
@@ -127,28 +121,56 @@ class MeanDilatation:
         mean = ufl.tr(tau) / self._d
         return (tau - mean * ufl.Identity(self._d)) * ufl.inv(F).T, mean / self._theta
 
+    def _slopes(self, law: type[Skeleton], F, Fbar, values: Mapping[str, object]) -> tuple:
+        """Return the derivatives by F and by theta of both that `_stress` gives.
+
+        A law without energy is itself derived by Fbar only, in half of the time: with Fbar = s F
+
+            dtau = s C : dF + (theta dtau/dtheta) (dtheta / theta - F^-T : dF),   C = dtau/dFbar.
+        """
+        P, slope = self._stress(law, F, Fbar, values)
+        if law.kirchhoff is None:
+            return tuple(ufl.diff(of, by) for of in (P, slope) for by in (F, self._theta))
+        d, theta, G = self._d, self._theta, ufl.inv(F).T
+        i, j, k, l, m = ufl.indices(5)
+        tau = law.kirchhoff_in_plane(Fbar, values)
+        C, G_F, dev = ufl.diff(tau, Fbar), ufl.diff(G, F), tau - ufl.tr(tau) / d * ufl.Identity(d)
+        tau_theta = ufl.as_tensor(C[i, j, k, l] * Fbar[k, l], (i, j)) / (d * theta)
+        tau_F = ufl.as_tensor(ufl.inner(Fbar, G) / d * C[i, j, k, l] - theta * tau_theta[i, j] * G[k, l], (i, j, k, l))
+        mean_F, mean_theta = ufl.as_tensor(tau_F[i, i, k, l], (k, l)) / d, ufl.tr(tau_theta) / d
+        P_F = ufl.as_tensor(
+            tau_F[i, m, k, l] * G[m, j] - mean_F[k, l] * G[i, j] + dev[i, m] * G_F[m, j, k, l], (i, j, k, l)
+        )
+        P_theta = (tau_theta - mean_theta * ufl.Identity(d)) * G
+        return P_F, P_theta, mean_F / theta, (mean_theta - slope) / theta
+
     def set_ratios(self, data: QuadratureData) -> None:
         """Set theta at the present displacement."""
-        self.theta.x.array[self._cells(data).filled] = self._mean(self._ratios, data)
+        self._set_mean(self.theta, self._ratios, data)
 
     def set_stresses(self, data: QuadratureData) -> None:
-        """Set pi at the present displacement and theta."""
-        self.pi.x.array[self._cells(data).filled] = self._mean(self._slopes, data)
+        """Set the stresses of the pieces, and pi, at the present displacement and theta."""
+        self._set_mean(self.pi, self._stresses, data)
 
-    def _mean(self, sums: Sequence[CellSums], data: QuadratureData) -> NDArray[np.float64]:
-        """Return the means (cells,) of a quantity over the pieces that lock."""
-        return self._total(sums, data)[:, 0] / self._volume_of(data)[:, 0]
+    def _set_mean(self, f: fem.Function, sums: Sequence[CellSums | StressAtPoints], data: QuadratureData) -> None:
+        """Set f to the means of a quantity over the pieces that lock, of which there are sums (cells, 1)."""
+        total = self._cells(data).total([of(part) for of, part in zip(sums, self._parts(data), strict=True)])
+        f.x.array[self._cells(data).filled] = total[:, 0] / self._volume_of(data)[:, 0]
 
-    def assemble_matrix(self, A: PETSc.Mat, data: QuadratureData) -> None:
-        """Add what theta and pi contribute to the tangent at the last update; the caller finalises it."""
+    def assemble_matrix(self, A: PETSc.Mat, data: QuadratureData, sums: Sequence[NDArray[np.float64]]) -> None:
+        """Add what theta and pi contribute to the tangent at the last update; the caller finalises it.
+
+        sums: of what `add` asks for (cells, quantities), of each part of the pieces.
+        """
         count, volume = 2**self._grid.dim * self._grid.dim, self._volume_of(data)
-        derivatives = self._total(self._derivatives, data)
-        b, c = self._total(self._ratio_slopes, data) / volume, derivatives[:, :count] / volume
-        e = derivatives[:, count, None] / volume
-        d = c if self._symmetric else derivatives[:, count + 1 :] / volume
+        b, c, *other, e = np.split(
+            self._cells(data).total([sums[number] for number in self._numbers]) / volume,
+            range(count, (2 if self._symmetric else 3) * count + 1, count),
+            axis=1,
+        )
+        d = c if self._symmetric else other[0]
         # (d b^T + b c^T + e b b^T) V with the means b, c, d, e of the derivatives of det(Delta), dPsi/dtheta, P
-        e *= 0.5
-        columns, rows = (c + e * b) * volume, (d + e * b) * volume
+        columns, rows = (c + 0.5 * e * b) * volume, (d + 0.5 * e * b) * volume
         matrices = b[:, :, None] * columns[:, None, :] + rows[:, :, None] * b[:, None, :]
         insert(A, self._grid, self._cells(data).filled, matrices)
 
@@ -179,10 +201,36 @@ class MeanDilatation:
 
         return self._volume(key, volumes)
 
-    def _total(self, sums: Sequence[CellSums], data: QuadratureData) -> NDArray[np.float64]:
-        """Return the sums (cells, quantities) over all pieces that lock."""
-        values = [of_part(part) for of_part, part in zip(sums, self._parts(data), strict=True)]
-        return self._cells(data).total(values)
+
+class StressAtPoints:
+    """The stress P of a law and its slope by theta at the points of a part: what residual and pi take, evaluated once.
+
+    Parameters
+    ----------
+    P, slope
+        UFL (d, d) and scalar at the points.
+    points
+        The points.
+    """
+
+    def __init__(self, P, slope, points: FormPoints):
+        shape, self._last = P.ufl_shape, Latest()
+        self._values = PointExpression(ufl.as_vector([*(P[i] for i in np.ndindex(shape)), slope]), points)
+        stress = points.follow("stress of the law", shape, self._stress)
+        self.P = block(stress) if points.grid.axisymmetric else stress
+        """The stress as UFL, of the values that were evaluated last."""
+
+    def __call__(self, data: PointData) -> NDArray[np.float64]:
+        """Evaluate both at the points, and return the sums (cells, 1) of the slope in their cells."""
+        _, values = self._last(object(), lambda: (data.key, self._values.evaluate(data)))
+        return sum_by(data.places.slots, data.volume * values[:, -1], len(data.places.filled))[:, None]
+
+    def _stress(self, data: PointData) -> NDArray[np.float64]:
+        """Return the stresses (n, d^2), Pa."""
+        of, values = self._last.value or (None, None)
+        if of is not data.key:
+            raise RuntimeError("stresses of points are asked for before they are evaluated")
+        return values[:, :-1]
 
 
 class Cells:

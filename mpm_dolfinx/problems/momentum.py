@@ -128,7 +128,7 @@ class MomentumForms:
         given: Mapping[str, fem.Constant],
     ) -> None:
         """Compile residual and tangent of the pieces that follow a law."""
-        F, v = points.deformation(self.u), ufl.TestFunction(self.u.function_space)
+        F = points.deformation(self.u)
         values = {name: getattr(points, name) for name in (*law.parameters, *law.state)} | given
         seen = self.dilatation.seen(points, F) if locks else F
         if law.unknowns:
@@ -136,23 +136,26 @@ class MomentumForms:
             values, known = values | local.values, values | local.known
         else:
             known = values
-        if locks:
-            P, of_A = self.dilatation.add(law, points, F, seen, values, known)
-        else:
-            P, of_A = (law.first_piola(F, those) for those in (known, values))
-        if pressure is not None:
-            P, of_A = (T - points.biot * pressure * ufl.diff(ufl.det(F), F) for T in (P, of_A))
+        sums = {}
         # differentiated by F and contracted: in 3D a twentieth of the compile time of derivatives by u
-        share = 1 / ufl.det(points.F)  # a factor: divided by it, each derivative would be
-        P, A = P * share, ufl.diff(of_A * share, F)
+        if locks:
+            ratio = ufl.det(points.increment(self.u))
+            P, A, sums = self.dilatation.add(law, points, F, seen, ratio, values, known)
+        else:
+            P, A = law.first_piola(F, known), ufl.diff(law.first_piola(F, values), F)
+        if pressure is not None:
+            of_pressure = -points.biot * pressure * ufl.diff(ufl.det(F), F)
+            P, A = P + of_pressure, A + ufl.diff(of_pressure, F)
+        share = 1 / ufl.det(points.F)
+        P, A = share * P, share * A
+        self._residuals.append(ElementForces(P * points.F.T, points))
         i, j, k, l, m, n = ufl.indices(6)
         if self.grid.dim == 2:
-            self._residuals.append(PointForm(ufl.inner(P, points.grad(v) * points.F) * points.dx, points))
             A = ufl.as_tensor(A[i, m, j, n] * points.F[k, m] * points.F[l, n], (i, k, j, l))
-            self._tangents.append(ElementMatrices(A, points, symmetric))
+            sums |= {"along": [T * points.F.T for T in sums.get("along", ())]}
+            self._tangents.append(ElementMatrices(A, points, symmetric, **sums))
         else:
-            self._residuals.append(ElementForces(P * points.F.T, points))
-            self._tangents.append(StackedElementMatrices(A, points, symmetric))
+            self._tangents.append(StackedElementMatrices(A, points, symmetric, **sums))
 
     def _add_term(self, term: Callable, pieces: FormPoints, t: fem.Constant, dt: fem.Constant) -> tuple:
         """Add a term of the user's; return whether it has a potential, depends on u, and on the velocity."""
@@ -237,12 +240,11 @@ class MomentumForms:
         """Add the tangent at u to K, which the caller finalises."""
         for number, local in self._local.items():
             local.derive(data.parts[number])
-        for tangent, part in zip(self._tangents, data.parts, strict=True):
-            tangent.assemble_matrix(K, part)
+        sums = [tangent.assemble_matrix(K, part) for tangent, part in zip(self._tangents, data.parts, strict=True)]
         for tangent in self._own_tangents:
             tangent.assemble_matrix(K, data.pieces)
         if self.dilatation is not None:
-            self.dilatation.assemble_matrix(K, data)
+            self.dilatation.assemble_matrix(K, data, sums)
         if sides.pressures is not None:
             self.sides.pressed_slope.assemble_matrix(K, sides.pressures)
         self.sides.assemble_own(K, sides)

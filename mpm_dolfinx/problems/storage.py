@@ -46,8 +46,8 @@ from mpm_dolfinx.constitutive.fluid_content import change_of_content, mass_poten
 from mpm_dolfinx.constitutive.skeleton import filled
 from mpm_dolfinx.constitutive.user_functions import compiling
 from mpm_dolfinx.constitutive.user_functions import form as form_of
-from mpm_dolfinx.forms.cell_matrices import ElementForces
-from mpm_dolfinx.forms.point_forms import FacetSum, FormPoints, PointData, PointForm
+from mpm_dolfinx.forms.cell_matrices import along_shapes, insert_rows
+from mpm_dolfinx.forms.point_forms import CellSums, FacetSum, FormPoints, PointData, PointForm
 from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts, zero
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.grid import sum_by
@@ -110,20 +110,18 @@ class StorageForms:
         self.p_n, self._work = fem.Function(Q), fem.Function(Q)
         q, one = ufl.TestFunction(Q), fem.Function(Q)
         one.x.array[:] = 1.0
-        delta = ufl.variable(pieces.increment(displacement))
+        p, delta = ufl.variable(pressure), ufl.variable(pieces.increment(displacement))
         J = ufl.det(delta)
-        strain = pieces.biot * (J - 1)
-        stored = change_of_content(pieces.biot, pieces.storage_at_one, pieces.storage, J, pressure - self.p_n)
+        stored = change_of_content(pieces.biot, pieces.storage_at_one, pieces.storage, J, p - self.p_n)
         self.drains = "retention" in pieces.sizes
         """Whether pores drain as a free surface falls."""
         if self.drains:
             drains, suction = pieces.retention
-            stored += drains * (filled(pressure, suction) - filled(self.p_n, suction))
-        change = stored * q * pieces.dx
-        self._change = PointForm(change, pieces)
-        self._capacity = PointForm(ufl.derivative(change, pressure, one), pieces)
-        self.coupling = ElementForces(ufl.diff(strain if symmetric else stored, delta), pieces)
-        self.momentum_coupling = self.coupling if symmetric else ElementForces(ufl.diff(strain, delta), pieces)
+            stored += drains * (filled(p, suction) - filled(self.p_n, suction))
+        self._change = PointForm(stored * q * pieces.dx, pieces)
+        by_u = [pieces.biot * ufl.diff(J, delta), *([] if symmetric else [ufl.diff(stored, delta)])]
+        along = [along_shapes(slope, pieces) for slope in by_u]
+        self._derivatives = CellSums([ufl.diff(stored, p), *(part for slope in along for part in slope)], pieces)
         self.symmetric, self.softens = symmetric, softens
         self.fluxes = FluxForms(pieces.grid, weight, flows, pressure, bulk)
         self.sources, self._slopes = [], []
@@ -153,9 +151,17 @@ class StorageForms:
         """Return the change of the fluid in each cell since the start of the step, m^d, a local array."""
         return self._sum([self._change], data)
 
-    def capacity(self, data: PointData) -> NDArray[np.float64]:
-        """Return its derivative by the cell's pressure, m^d/Pa, a local array."""
-        return self._sum([self._capacity], data)
+    def derivatives(self, data: PointData) -> list[NDArray[np.float64]]:
+        """Return its derivative by the cell's pressure, m^d/Pa, a local array, and those by displacements of its nodes.
+
+        The latter (filled cells, n), m^(d-1), are first those of alpha dJ_Delta, which the momentum takes, then those
+        of the content, where these are others.
+        """
+        sums, count = self._derivatives(data), self.grid.dim * 2**self.grid.dim
+        by_p, *by_u = np.split(sums, range(1, sums.shape[1], count), axis=1)
+        capacity = np.zeros_like(self.p.x.array)
+        capacity[data.places.filled] = by_p[:, 0]
+        return [capacity, *by_u]
 
     def gain(self, data: PointData) -> NDArray[np.float64]:
         """Return the rate of the sources in each cell at p, m^d/s, a local array."""
@@ -411,7 +417,8 @@ class StorageProblem:
     def sealed(self, lost: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return by how much the cells' pressures would have risen, Pa, at fixed stress, by what they lost, m^d."""
         owned = self.system.unknowns.owned
-        return lost / (self.forms.capacity(self.data) + self._contents.fixed_stress)[owned]
+        capacity = self.forms.derivatives(self.data)[0]
+        return lost / (capacity + self._contents.fixed_stress)[owned]
 
     @property
     def ring(self) -> float:
@@ -506,10 +513,10 @@ class StorageProblem:
     def assemble_tangent(self, data: PointData | None = None) -> None:
         """Assemble C = d/dp and B = d/du of the residual at (u, p), of these pieces or of others."""
         forms, system, data = self.forms, self.system, data or self.data
-        pairs = [(system.B, forms.coupling), (system.B_momentum, forms.momentum_coupling)]
-        for A, form in pairs[: 1 if forms.symmetric else 2]:
+        capacity, *by_u = forms.derivatives(data)
+        for A, rows in zip((system.B_momentum, system.B), by_u, strict=False):
             zero(A)
-            form.assemble_matrix(A, data)
+            insert_rows(A, forms.grid, data.places.filled, rows)
             A.assemble()
         system.C.zeroEntries()
         system.C.axpy(self.dt, system.T, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
@@ -518,7 +525,7 @@ class StorageProblem:
         if self._softer is not None:
             system.C.axpy(1.0, self._softer, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
         owned = system.unknowns.owned
-        _add_diagonal(system.C, forms.capacity(data)[owned])
+        _add_diagonal(system.C, capacity[owned])
         if self._seeps:
             slope = self._flow(False).faces.seepage(self._potentials, self._flowing)[1]
             _add_diagonal(system.C, self.dt * slope)
