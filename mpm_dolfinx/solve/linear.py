@@ -322,15 +322,17 @@ class BlockFactors:
         count = int(block.max(initial=-1)) + 1
         rank = np.empty(count, dtype=np.int64)
         rank[dissection(x[np.unique(block, return_index=True)[1]])] = np.arange(count)
-        self._place = rank[block] * dim + axis
-        i, j = np.repeat(self._place, np.diff(rows)), self._place[columns]
-        kept = np.arange(len(i))
+        node, lengths = rank[block].astype(np.int32), np.diff(rows)
+        self._place = node * dim + axis
+        kept = np.arange(len(columns))
         if symmetric:  # the upper triangle
-            kept = np.flatnonzero(i // dim <= j // dim)
+            kept = np.flatnonzero(np.repeat(node, lengths) <= node[columns])
+        place = self._place.astype(np.int32)
+        i, j = np.repeat(place, lengths)[kept], place[columns[kept]]
         # 1 on the diagonal where a component of a node is no unknown
-        missing = np.setdiff1d(np.arange(count * dim), self._place)
-        number = np.concatenate([kept, np.full(len(missing), len(i))]) + 1
-        where, n = (np.concatenate([i[kept], missing]), np.concatenate([j[kept], missing])), count * dim
+        missing = np.setdiff1d(np.arange(count * dim, dtype=np.int32), place)
+        number = np.concatenate([kept, np.full(len(missing), len(columns))]) + 1
+        where, n = (np.concatenate([i, missing]), np.concatenate([j, missing])), count * dim
         blocks = scipy.sparse.coo_matrix((number, where), shape=(n, n)).tocsr().tobsr((dim, dim))
         blocks.sort_indices()
         self._source = blocks.data
