@@ -467,7 +467,7 @@ class PointExpression:
         count = len(data.cells if chosen is None else chosen)
         out, start = np.empty((count, self._values.shape[1])), 0
         while start < count:
-            size = max(size for size in self._bound if size <= max(count - start, min(self._bound)))
+            size = max((size for size in self._bound if size <= count - start), default=min(self._bound))
             stop, values = min(start + size, count), self._values[:size]
             self._rows(data, slice(start, stop) if chosen is None else chosen[start:stop], live)
             values[:] = 0.0

@@ -136,8 +136,8 @@ class MomentumForms:
             values, known = values | local.values, values | local.known
         else:
             known = values
-        sums = {}
-        # differentiated by F and contracted: in 3D a twentieth of the compile time of derivatives by u
+        # derived by F and contracted: in 3D a twentieth of the compile time of derivatives by u
+        sums: dict[str, list] = {}
         if locks:
             ratio = ufl.det(points.increment(self.u))
             P, A, sums = self.dilatation.add(law, points, F, seen, ratio, values, known)
@@ -146,7 +146,7 @@ class MomentumForms:
         if pressure is not None:
             of_pressure = -points.biot * pressure * ufl.diff(ufl.det(F), F)
             P, A = P + of_pressure, A + ufl.diff(of_pressure, F)
-        share = 1 / ufl.det(points.F)
+        share = 1 / ufl.det(points.F)  # divided by it, each component would be
         P, A = share * P, share * A
         self._residuals.append(ElementForces(P * points.F.T, points))
         i, j, k, l, m, n = ufl.indices(6)
