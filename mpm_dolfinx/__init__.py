@@ -34,7 +34,8 @@ from mpm_dolfinx.errors import GaveUp, LeftGrid, NotConverged
 from mpm_dolfinx.io.checkpoint import Checkpoint, resume
 from mpm_dolfinx.io.one_file import one_file
 from mpm_dolfinx.io.writer import Writer
-from mpm_dolfinx.points.bodies import box, mapped, shape
+from mpm_dolfinx.points.bodies import mapped
+from mpm_dolfinx.points.boxes import box, shape
 from mpm_dolfinx.points.grid import Grid
 from mpm_dolfinx.points.mesh_files import from_mesh
 from mpm_dolfinx.points.polygon import polygon

@@ -24,7 +24,7 @@ from mpm_dolfinx.constitutive.user_functions import compiling
 from mpm_dolfinx.points.bodies import Body, material_points
 from mpm_dolfinx.points.cut_domains import CutDomains
 from mpm_dolfinx.points.cutting import volumes
-from mpm_dolfinx.points.grid import Grid
+from mpm_dolfinx.points.grid import Grid, in_chunks
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.problems.conditions import OnSide
 from mpm_dolfinx.problems.momentum import MomentumForms
@@ -183,9 +183,11 @@ class Scene:
             out["groups of the bodies"] = (grid.copy(first) // grid.cells).tolist()
         for i, body in enumerate(self.bodies):
             out[f"points of body {i}"], out[f"material of body {i}"] = len(body), int(body.material)
-            out[f"volume of body {i}"] = float(np.abs(volumes(body.reference())).sum())
-            corners = np.ascontiguousarray(body.corners())
-            out[f"checksum of the positions of body {i}"] = zlib.crc32(corners.tobytes())
+            volume, checksum = 0.0, 0
+            for part in in_chunks(len(body)):
+                volume += float(np.abs(volumes(body.reference(part))).sum())
+                checksum = zlib.crc32(np.ascontiguousarray(body.corners(part)).tobytes(), checksum)
+            out[f"volume of body {i}"], out[f"checksum of the positions of body {i}"] = volume, checksum
         materials = {f"material {i}": m for i, m in enumerate(self.materials.materials)}
         for name, one in {**materials, "fluid": self.fluid}.items():
             out[name] = None if one is None else type(one).__name__

@@ -17,7 +17,7 @@ from mpm_dolfinx.errors import StepFailed
 from mpm_dolfinx.initial_state import balanced
 from mpm_dolfinx.io import summary
 from mpm_dolfinx.point_fields import PointFields, point_fields
-from mpm_dolfinx.points.bodies import Body
+from mpm_dolfinx.points.bodies import Body, points_in_cells
 from mpm_dolfinx.points.grid import Grid
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.problems.axis import check_axisymmetry, with_axis
@@ -115,7 +115,7 @@ class Simulation:
         check_parts(grid, bodies, materials, later)
         check_options(fluid, pressure, terms, sources, quadrature)
         grid = grouped(grid, bodies, contacts, quadrature, {"terms": terms, "sources": sources})
-        grid.share(np.concatenate([body.centre for body in bodies]))
+        grid.share(points_in_cells(grid, bodies))
         warn_thin(grid, bodies, with_axis(grid, fixed), fluid is not None)
         check_axisymmetry(grid, bodies, quadrature)
         began = time.perf_counter()

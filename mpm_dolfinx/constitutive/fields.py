@@ -65,10 +65,11 @@ class SceneMaterials:
         materials = [stressed(m, grid.stretches) for m in materials] if prestressed else materials
         self.grid, self.materials, self._fluid = grid, materials, fluid
         seeded: dict[str, NDArray[np.float64]] = {}
-        X, index = _reference(bodies, len(materials))
-        self._used = np.unique(index).tolist()  # a material that no body is of changes nothing
+        self._used = _used(bodies, len(materials))  # a material that no body is of changes nothing
         used = [materials[i] for i in self._used]
-        evaluated = [m.at(X[index == i]) for i, m in zip(self._used, used, strict=True)]
+        self._fields = [[name for name in _names(m) if callable(getattr(m, name))] for m in materials]
+        places = [_places(bodies, i) if self._fields[i] else np.empty((0, grid.dim)) for i in self._used]
+        evaluated = [m.at(X) for m, X in zip(used, places, strict=True)]
         self.laws = list(dict.fromkeys(map(type, used)))
         self.conductivity_laws = list(dict.fromkeys(m.conductivity_law for m in used if m.conductivity_law))
         """The different conductivity laws of the scene."""
@@ -94,7 +95,6 @@ class SceneMaterials:
         by_place = any(callable(m.conductivity) for m in materials) or any(map(_names_place, self.conductivity_laws))
         self.layered = by_place or len({m.conductivity_law for m in used}) > 1 or bool(np.ptp(conductivity))
         """Whether points may differ in what they conduct."""
-        self._fields = [[name for name in _names(m) if callable(getattr(m, name))] for m in materials]
         self.checksums: dict[str, int | list[float]] = {
             f"conductivity law of material {i}": sampled(m.conductivity_law)
             for i, m in zip(self._used, used, strict=True)
@@ -104,15 +104,15 @@ class SceneMaterials:
         self.shapes: dict[str, tuple[int, ...]] = {}
         """Shape of each parameter and variable of state."""
         for i, m in zip(self._used, evaluated, strict=True):
-            rows = np.flatnonzero(index == i)
             values = {name: getattr(m, name) for name in self._fields[i]}
-            self._add_shapes(_spread(m, values, len(rows)), seeded, len(points))
+            count = sum(len(body) for body in bodies if body.material == i)
+            self._add_shapes(_spread(m, values, count), seeded, len(points))
+            here, rows = _rows(bodies, i, points.id)
             for name, value in values.items():
                 content = np.ascontiguousarray(value).tobytes()
                 self.checksums[f"checksum of {name} of material {i}"] = zlib.crc32(content)
-                everywhere = np.zeros((len(X), *value.shape[1:]))
-                everywhere[rows] = value
-                mine = everywhere[points.id]
+                mine = np.zeros((len(points), *value.shape[1:]))
+                mine[here] = value[rows]
                 seeded[name] = mine + seeded[name] if name in seeded else mine
         if prestressed and "plastic" in seeded:
             seeded["plastic" + AT_REST] = seeded["plastic"]
@@ -404,15 +404,30 @@ def _takes(law: type[Skeleton]) -> list[str]:
     return [*law.parameters, *law.state]
 
 
-def _reference(bodies: Sequence[Body], count: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return the reference positions (n, d) of all points of all processes and the index (n,) of their material."""
+def _used(bodies: Sequence[Body], count: int) -> list[int]:
+    """Return the indices of the materials, of so many, that bodies are of, ascending."""
     for body in bodies:
         if not 0 <= body.material < count:
             raise ValueError(f"body: material = {body.material!r}, must be an index of the {count} materials")
-    return (
-        np.concatenate([b.centre for b in bodies]),
-        np.concatenate([np.full(len(b), b.material) for b in bodies]),
-    )
+    return sorted({int(body.material) for body in bodies})
+
+
+def _places(bodies: Sequence[Body], material: int) -> NDArray[np.float64]:
+    """Return the reference positions (n, d), m, of all points of a material on all processes."""
+    return np.concatenate([body.centre for body in bodies if body.material == material])
+
+
+def _rows(bodies: Sequence[Body], material: int, ids: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return which of some points are of a material (m,), and their rows among all that are, see `_places`."""
+    here, rows, start, before = [], [], 0, 0
+    for body in bodies:
+        if body.material == material:
+            of_body = np.flatnonzero((ids >= start) & (ids < start + len(body)))
+            here.append(of_body)
+            rows.append(ids[of_body] - start + before)
+            before += len(body)
+        start += len(body)
+    return np.concatenate(here), np.concatenate(rows)
 
 
 def _names(m: Skeleton) -> list[str]:

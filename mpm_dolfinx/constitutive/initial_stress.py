@@ -161,7 +161,7 @@ class InitialStresses:
             return value
         weight, surface, pore = above
         on = np.concatenate([points.x[:, :-1], surface[:, None]], axis=1)
-        X = self._bodies[body].centre[points.id - self._start[body]]
+        X = self._bodies[body].centre_of(points.id - self._start[body])
         vertical = -(weight + stress.values("surcharge", on) - pore)
         horizontal = stress.values("ratio", X) * vertical
         normal = np.stack([horizontal] * 3, axis=1)

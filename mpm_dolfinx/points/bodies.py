@@ -14,35 +14,65 @@ from mpm_dolfinx.parallel.exchange import first
 from mpm_dolfinx.points.cutting import FACES, corner_bits, domain_volumes, volumes
 from mpm_dolfinx.points.grid import SIDES, Grid, in_chunks
 from mpm_dolfinx.points.material_points import MaterialPoints, middle
-from mpm_dolfinx.validation import asked, instance, numbers, whole
+from mpm_dolfinx.validation import asked, instance, numbers
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Body:
     """A body as seeded: reference geometry of all its domains, the same on every process.
 
-    lower, spacing : (n, d), (d,), m — box of each domain; sides : (n, d, 2) — whether a face of the
-    domain lies on the surface of the body; map : where the corners of the boxes are put, see `mapped`.
+    material : index in the scene's list; map : where the corners of the domains' boxes are put, see `mapped`; each kind
+    has its `spacing`, the edges of these boxes, (d,) of all alike or (n, d), m.  What is asked of all domains is made
+    anew each time: large bodies are asked in parts.
     """
 
-    lower: NDArray[np.float64]
-    spacing: NDArray[np.float64]
-    sides: NDArray[np.bool_]
     material: int = 0
     map: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None
 
     def __len__(self) -> int:
-        return len(self.lower)
+        raise NotImplementedError
 
     @property
     def dim(self) -> int:
         """Number d of coordinates."""
-        return self.lower.shape[1]
+        raise NotImplementedError
+
+    def lower_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the lower corners (m, d), m, of the boxes of domains."""
+        raise NotImplementedError
+
+    def sides_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return whether faces (m, d, 2) of domains lie on the surface of the body."""
+        raise NotImplementedError
+
+    @property
+    def lower(self) -> NDArray[np.float64]:
+        """Lower corners (n, d), m, of the boxes of all domains."""
+        return self.lower_of(slice(None))
+
+    @property
+    def sides(self) -> NDArray[np.bool_]:
+        """Whether faces (n, d, 2) of all domains lie on the surface of the body."""
+        return self.sides_of(slice(None))
 
     @property
     def centre(self) -> NDArray[np.float64]:
-        """Reference positions (n, d), m, of the centres of the domains."""
-        return self.lower + 0.5 * self.spacing
+        """Reference positions (n, d), m, of the centres of all domains."""
+        return self.centre_of(slice(None))
+
+    def centre_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the reference positions (m, d), m, of the centres of domains."""
+        return self.lower_of(chosen) + 0.5 * self.spacing
+
+    @cached_property
+    def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Corners (d,), m, of the box around the body, before the map."""
+        low, high = np.full((2, self.dim), [[np.inf], [-np.inf]])
+        for part in in_chunks(len(self)):
+            lower = self.lower_of(part)
+            low = np.minimum(low, lower.min(axis=0))
+            high = np.maximum(high, (lower + self.boxes(part)).max(axis=0))
+        return low, high
 
     @property
     def aligned(self) -> bool:
@@ -63,44 +93,30 @@ class Body:
 
         Of unstructured bodies, whose normal has its largest component there, and not below `least`.
         """
-        row = np.flatnonzero(self.sides[:, axis, end])
+        row = self._with_face(axis, end)
         return row, np.full(len(row), 2 * axis + end)
+
+    def _with_face(self, axis: int, end: int) -> NDArray[np.int64]:
+        """Return the domains (m,), ascending, of which the face at an end of an axis lies on the surface."""
+        rows = [part.start + np.flatnonzero(self.sides_of(part)[:, axis, end]) for part in in_chunks(len(self))]
+        return np.concatenate([np.empty(0, np.int64), *rows])
 
     def across(self, axis: int) -> tuple[float, float]:
         """Return how many domains the body has across an axis, and their edge, m; means."""
-        return len(self) / max(1, int(self.sides[:, axis, 0].sum())), float(self.spacing[axis])
+        return len(self) / max(1, len(self._with_face(axis, 0))), float(self.spacing[axis])
 
     def outer(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return the domains (m,) and numbers (m,) of all faces on the surface, by their numbers."""
-        face, row = np.nonzero(self.sides.reshape(len(self), 2 * self.dim).T)
-        return row, face
+        rows = [self._with_face(axis, end) for axis in range(self.dim) for end in (0, 1)]
+        return np.concatenate(rows), np.repeat(np.arange(len(rows)), list(map(len, rows)))
 
     def reference(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
         """Return the reference positions (m, 2^d, d), m, of the corners of domains: those before the map."""
-        lower = self.lower[chosen]
-        return lower[:, None] + corner_bits(self.dim) * self.spacing
+        return self.lower_of(chosen)[:, None] + corner_bits(self.dim) * self.spacing
 
     def corners(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
         """Return the corners (m, 2^d, d), m, of domains, after the map."""
         return self.images(self.reference(chosen))
-
-    @cached_property
-    def lattice(self) -> tuple[int, ...] | None:
-        """Domains along the axes of the lattice that they lie on, some of which may be empty; None without."""
-        return tuple(self.place(np.arange(len(self))).max(axis=0) + 1)
-
-    def place(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the places (m, d) of domains on the lattice."""
-        return np.rint((self.lower[rows] - self._lowest) / self.spacing).astype(np.int64)
-
-    @cached_property
-    def _lowest(self) -> NDArray[np.float64]:
-        return self.lower.min(axis=0)
-
-    def nodes(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the numbers (m, 2^d) of the corners of domains, the same for a corner of several; lexicographic."""
-        corners = self.place(rows)[:, None] + corner_bits(self.dim)
-        return np.ravel_multi_index(tuple(np.moveaxis(corners, 2, 0)), tuple(np.add(self.lattice, 1)))
 
     def images(self, X: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return where the map puts reference positions (..., d), m."""
@@ -130,7 +146,7 @@ class Body:
 
     def boxes(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
         """Return the edges (m, d), m, of the boxes of domains, before the map."""
-        return np.broadcast_to(self.spacing, self.lower.shape)[chosen]
+        return np.broadcast_to(self.spacing, (len(self), self.dim))[chosen]
 
     def size(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
         """Return the edges (m, d), m, of boxes that are as large as domains."""
@@ -139,86 +155,6 @@ class Body:
             return boxes
         ratio = volumes(self.corners(chosen)) / boxes.prod(axis=1)
         return boxes * ratio[:, None] ** (1 / self.dim)
-
-
-def box(grid: Grid, lower: ArrayLike, upper: ArrayLike, per_cell: int = 2, material: int = 0) -> Body:
-    """Seed the box [lower, upper] with a lattice of points that fills it exactly; return the body.
-
-    Parameters
-    ----------
-    grid
-        Background grid.
-    lower, upper : (d,), m
-        Corners of the box, inside the grid; they need not lie on grid lines.
-    per_cell
-        Points per cell and direction (rounded so that they fit the box), >= 1.  With 1, bodies of a few cells'
-        thickness bend too easily (a warning says so), and the error is about ten times that of 2.
-    material
-        Index of the material in the scene's list, >= 0.
-
-    Raises
-    ------
-    ValueError
-        A corner outside the grid, upper not above lower, or per_cell or material that is no such integer.
-    """
-    instance("body: grid", grid, Grid)
-    lower, upper = (
-        numbers(f"body: {name}", x, (grid.dim,), allowed=f"{grid.dim} finite coordinates")
-        for name, x in (("lower", lower), ("upper", upper))
-    )
-    if not (upper > lower).all():
-        raise ValueError(f"body: box {lower.tolist()} to {upper.tolist()}: upper must be > lower")
-    material, per_cell = whole("body: material", material, 0), whole("body: per_cell", per_cell)
-    count = np.maximum(1, np.rint((upper - lower) / (grid.h / per_cell))).astype(int)
-    spacing = (upper - lower) / count
-    index = np.stack(np.meshgrid(*map(np.arange, count), indexing="ij"), axis=-1).reshape(-1, grid.dim)
-    sides = np.stack([index == 0, index == count - 1], axis=-1)
-    return check_inside(grid, Body(lower + index * spacing, spacing, sides, material))
-
-
-def shape(
-    grid: Grid, inside: Callable[[NDArray[np.float64]], NDArray[np.bool_]], per_cell: int = 2, material: int = 0
-) -> Body:
-    """Seed the points of the grid's own lattice whose centres are inside a shape; return the body.
-
-    Its surface is made of steps of a point's size: for smooth sides take `mapped`.
-
-    Parameters
-    ----------
-    grid
-        Background grid.
-    inside
-        Maps positions (n, d), m, to booleans (n,).
-    per_cell
-        Points per cell and direction, >= 1.
-    material
-        Index of the material in the scene's list, >= 0.
-
-    Raises
-    ------
-    ValueError
-        `inside` raises, gives no booleans or holds nowhere; per_cell or material that is no such integer.
-    """
-    instance("body: grid", grid, Grid)
-    material, per_cell = whole("body: material", material, 0), whole("body: per_cell", per_cell)
-    spacing = grid.h / per_cell
-    count = grid.shape * per_cell
-    index = np.stack(np.meshgrid(*map(np.arange, count), indexing="ij"), axis=-1).reshape(-1, grid.dim)
-    allowed = f"one bool a position, ({len(index)},)"
-    filled = np.asarray(asked("body: inside(x)", allowed, inside, grid.lower + (index + 0.5) * spacing))
-    if filled.shape != (len(index),) or filled.dtype != bool:  # a distance is neither inside nor outside
-        raise ValueError(f"body: inside(x) has shape {filled.shape} of {filled.dtype}, must be {allowed}")
-    padded = np.pad(filled.reshape(count), 1)
-    index = index[filled]
-    if not len(index):
-        raise ValueError("body: inside(x) holds at no point of the grid, must hold at one; the body fits in no cell")
-    sides = np.empty((len(index), grid.dim, 2), dtype=bool)
-    for axis in range(grid.dim):
-        for end in (0, 1):
-            neighbour = index + 1
-            neighbour[:, axis] += 2 * end - 1
-            sides[:, axis, end] = ~padded[tuple(neighbour.T)]
-    return check_inside(grid, Body(grid.lower + index * spacing, spacing, sides, material))
 
 
 def mapped(grid: Grid, body: Body, map: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> Body:
@@ -246,27 +182,34 @@ def mapped(grid: Grid, body: Body, map: Callable[[NDArray[np.float64]], NDArray[
     instance("body to bend", body, Body)
     inner = body.map
     bent = replace(body, map=map if inner is None else lambda x: map(np.asarray(inner(x), dtype=float)))
-    corners = bent.corners()
-    out = np.flatnonzero(grid.outside(corners.reshape(-1, grid.dim)))
-    if len(out):
-        x = corners.reshape(-1, grid.dim)[out[0]]
-        raise ValueError(
-            f"body: the map takes a corner to {x}, must not be outside the grid {grid.lower} to {grid.upper}"
-        )
-    smallest = int(np.argmin(volumes(corners)))
-    if not volumes(corners)[smallest] > 0:
-        raise ValueError(f"body: the map turns the domain at {body.centre[smallest]} inside out, must not")
+    for part in in_chunks(len(bent)):
+        corners = bent.corners(part)
+        out = np.flatnonzero(grid.outside(corners.reshape(-1, grid.dim)))
+        if len(out):
+            x = corners.reshape(-1, grid.dim)[out[0]]
+            raise ValueError(
+                f"body: the map takes a corner to {x}, must not be outside the grid {grid.lower} to {grid.upper}"
+            )
+    for part in in_chunks(len(bent)):
+        volume = volumes(bent.corners(part))
+        if not volume.min() > 0:
+            turned = body.centre_of(part)[volume.argmin()]
+            raise ValueError(f"body: the map turns the domain at {turned} inside out, must not")
     return bent
 
 
 def check_inside(grid: Grid, body: Body, name: str = "body") -> Body:
     """Return a body; refuse one that is not wholly in the grid.  What a map has bent has been looked at."""
-    outside = grid.outside(body.lower) | grid.outside(body.lower + body.spacing)
-    out = np.flatnonzero(outside & (body.map is None))
-    if len(out):
+    count, where = 0, None
+    for part in in_chunks(len(body) if body.map is None else 0):
+        lower = body.lower_of(part)
+        out = np.flatnonzero(grid.outside(lower) | grid.outside(lower + body.boxes(part)))
+        where = body.centre_of(part)[out[0]] if len(out) and not count else where
+        count += len(out)
+    if count:
         raise ValueError(
-            f"{name}: {len(out)} points outside the grid, the first at {body.centre[out[0]]}, "
-            f"must be inside {grid.lower} to {grid.upper}"
+            f"{name}: {count} points outside the grid, the first at {where}, must be inside {grid.lower} to "
+            f"{grid.upper}"
         )
     return body
 
@@ -320,6 +263,15 @@ def _own(grid: Grid, body: Body) -> tuple[NDArray[np.int64], NDArray[np.float64]
         rows.append(part.start + here)
         corners.append(of_part[here])
     return np.concatenate(rows), np.concatenate(corners)
+
+
+def points_in_cells(grid: Grid, bodies: Sequence[Body]) -> NDArray[np.float64]:
+    """Return how many points of bodies as seeded, before the maps, are in each cell of the grid (cells,)."""
+    out = np.zeros(int(np.prod(grid.shape)))
+    for body in bodies:
+        for part in in_chunks(len(body)):
+            np.add.at(out, grid.number(grid.index(body.centre_of(part))), 1.0)
+    return out
 
 
 def check_bodies(grid: Grid, bodies: Sequence[Body]) -> None:

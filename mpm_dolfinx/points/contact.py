@@ -369,7 +369,7 @@ def _between_planes(a: NDArray, b: NDArray, normals: Iterable[NDArray]) -> NDArr
 
 def solids(body: Body) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return convex domains (m, 2^d, d), m, that fill a body, a box as one, and their allowances (m,), m."""
-    low, high = body.lower.min(axis=0), (body.lower + body.spacing).max(axis=0)
+    low, high = body.bounds
     size, edge = high - low, body.spacing.min()
     if body.aligned and np.isclose(size.prod(), len(body) * body.spacing.prod(), rtol=1e-9, atol=0):
         return (low + corner_bits(len(size)) * size)[None], allowance(np.full(1, edge))

@@ -182,13 +182,12 @@ class Grid:
         """Make the mesh when first something of it is asked for; what has been asked for is found at once."""
         if name not in SHARED:  # notebooks ask for `_repr_html_`, `copy` for other names
             raise AttributeError(f"the grid has no {name!r}")
-        self.share(np.zeros((0, self.dim)))
+        self.share(np.zeros(int(np.prod(self.shape))))
         return vars(self).setdefault(name, getattr(self._made[0], name))
 
-    def share(self, x: NDArray[np.float64]) -> None:
-        """Make the mesh, its cells shared out among the processes by the points x (n, d), m; once."""
+    def share(self, load: NDArray[np.float64]) -> None:
+        """Make the mesh, its cells shared out among the processes by what each holds (cells,); once."""
         if not self._made:
-            load = sum_by(self.number(self.index(x)), np.ones(len(x)), int(np.prod(self.shape)))
             owner = owners(load.reshape(self.shape), self.comm.size)
             own = np.flatnonzero(owner.ravel() == self.comm.rank)
             nodes = np.concatenate([self.corners(own) + copy * self.nodes for copy in range(self.copies)])

@@ -65,7 +65,7 @@ class Lattice:
         self._dim, self._count = body.dim, body.lattice
         self._numbers: Latest[NDArray[np.int64]] = Latest()
         self._parted = PARTED * body.spacing.min()
-        self._joined = np.zeros(body.nodes(np.arange(len(body))).max() + 1, dtype=bool)
+        self._joined = np.zeros(body.most_nodes, dtype=bool)
         self._joined[np.take_along_axis(body.nodes(joined[0]), joined[1], axis=1)] = True
         self._given = np.zeros((len(self._joined), self._dim), dtype=bool)
         for faces, axes in given:

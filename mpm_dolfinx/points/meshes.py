@@ -62,23 +62,44 @@ class Mesh:
         return chosen
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class MeshBody(Body):
-    """A body seeded from a mesh; lower and spacing (n, d) are those of the boxes around the domains.
+    """A body seeded from a mesh; the boxes of its domains are those around them.
 
-    vertices : (n, 2^d, d), m — corners of the domains before all maps; tagged : name -> (n, d, 2), whether a face of
-    the domain on the surface belongs to a side.
+    vertices : (n, 2^d, d), m — corners of the domains before all maps; surface : (n, d, 2), whether a face of a domain
+    lies on the surface; tagged : name -> (n, d, 2), whether it belongs to a side.
     """
 
-    vertices: NDArray[np.float64] = ()
-    tagged: Mapping[str, NDArray[np.bool_]] = ()
+    vertices: NDArray[np.float64]
+    surface: NDArray[np.bool_]
+    tagged: Mapping[str, NDArray[np.bool_]]
 
     lattice = None
 
+    def __len__(self) -> int:
+        return len(self.vertices)
+
     @property
-    def centre(self) -> NDArray[np.float64]:
-        """Reference positions (n, d), m, of the centres of the domains."""
-        return self.vertices.mean(axis=1)
+    def dim(self) -> int:
+        """Number d of coordinates."""
+        return self.vertices.shape[2]
+
+    @cached_property
+    def spacing(self) -> NDArray[np.float64]:
+        """Edges (n, d), m, of the boxes of domains."""
+        return self.vertices.max(axis=1) - self.vertices.min(axis=1)
+
+    def lower_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the lower corners (m, d), m, of the boxes of domains."""
+        return self.vertices[chosen].min(axis=1)
+
+    def sides_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return whether faces (m, d, 2) of domains lie on the surface of the body."""
+        return self.surface[chosen]
+
+    def centre_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the reference positions (m, d), m, of the centres of domains."""
+        return self.vertices[chosen].mean(axis=1)
 
     @property
     def aligned(self) -> bool:
@@ -117,6 +138,11 @@ class MeshBody(Body):
         """Return the numbers (m, 2^d) of the corners of domains, the same for a corner of several."""
         return self._nodes[rows]
 
+    @property
+    def most_nodes(self) -> int:
+        """Above all numbers of corners."""
+        return int(self._nodes.max()) + 1
+
     @cached_property
     def _nodes(self) -> NDArray[np.int64]:
         x = self.vertices.reshape(-1, self.dim)
@@ -145,10 +171,9 @@ def seeded(grid: Grid, mesh: Mesh, part: str | None, per_cell: int, material: in
     outer = (facet > 0) & (count[facet] == 1)  # 0 is no facet of a cell
     tagged = {side: outer & _among(facets, rows)[facet] for side, rows in mesh.sides.items()}
     vertices, row, kept = _split(grid, domains, per_cell)
-    low, high = vertices.min(axis=1), vertices.max(axis=1)
-    sides, *tagged_rows = (rows[row].reshape(kept.shape) & kept for rows in (outer, *tagged.values()))
+    surface, *tagged_rows = (rows[row].reshape(kept.shape) & kept for rows in (outer, *tagged.values()))
     named = {side: rows for side, rows in zip(tagged, tagged_rows, strict=True) if rows.any()}
-    body = MeshBody(low, high - low, sides, material, None, vertices, named)
+    body = MeshBody(vertices=vertices, surface=surface, tagged=named, material=material)
     _check_conforming(body, name)
     _warn_small(grid, body, per_cell, name)
     return check_inside(grid, body, name)

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 from mpi4py import MPI
@@ -15,7 +15,7 @@ from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.bodies import Body
 from mpm_dolfinx.points.cutting import corner_bits
 from mpm_dolfinx.points.faces import interpolate
-from mpm_dolfinx.points.grid import rounding
+from mpm_dolfinx.points.grid import in_chunks, rounding
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.validation import all_of, flag, line, numbers
 
@@ -70,7 +70,8 @@ class Probes:
 
 def _same(a: Body, b: Body) -> bool:
     """Whether two bodies have the same points."""
-    return a is b or (a.lower.shape == b.lower.shape and np.array_equal(a.lower, b.lower))
+    alike = len(a) == len(b) and a.dim == b.dim
+    return a is b or (alike and all(np.array_equal(a.lower_of(p), b.lower_of(p)) for p in in_chunks(len(a))))
 
 
 def positions(x0: ArrayLike, dim: int) -> NDArray[np.float64]:
@@ -106,21 +107,29 @@ def probes(bodies: Sequence[Body], x0: ArrayLike, *, stress: bool = False) -> Pr
     all_of("probes: bodies", bodies, Body, 1)
     flag("probes: stress", stress)
     x0 = positions(x0, bodies[0].dim)
-    lower = np.concatenate([b.lower for b in bodies])
-    spacing = np.concatenate([np.broadcast_to(b.spacing, b.lower.shape) for b in bodies])
-    start = np.cumsum([0, *map(len, bodies)])
     ids, xi = np.empty(len(x0), dtype=np.int64), np.empty(x0.shape)
     for i, x in enumerate(x0):  # a handful of positions, once a scene
-        slack = 1e-9 + 2 * rounding(x0) / spacing
-        near = np.flatnonzero((np.abs((x - lower) / spacing - 0.5) <= 0.5 + slack).all(axis=1))
-        of = np.searchsorted(start, near, side="right") - 1
-        corners = [bodies[k].reference(near[of == k] - start[k]) for k in np.unique(of)]
-        place = coordinates(np.concatenate([*corners, np.empty((0, 2 ** len(x), len(x)))]), x)
-        on = np.flatnonzero((np.abs(place) <= 1 + 2 * slack[near]).all(axis=1))
-        if not len(on):
+        found = next(_domains_at(bodies, x, rounding(x0)), None)
+        if found is None:
             raise ValueError(f"probe at {x}: outside the bodies, must be in one or on its surface")
-        ids[i], xi[i] = near[on[0]], place[on[0]]
+        ids[i], xi[i] = found
     return Probes(x0, ids, xi, tuple(bodies), stress)
+
+
+def _domains_at(
+    bodies: Sequence[Body], x: NDArray[np.float64], rounded: float
+) -> Iterator[tuple[int, NDArray[np.float64]]]:
+    """Yield the points, in their order, whose domains hold a place x (d,), m, with its coordinates there."""
+    start = 0
+    for body in bodies:
+        for part in in_chunks(len(body)):
+            spacing = body.boxes(part)
+            slack = 1e-9 + 2 * rounded / spacing
+            near = np.flatnonzero((np.abs((x - body.lower_of(part)) / spacing - 0.5) <= 0.5 + slack).all(axis=1))
+            place = coordinates(body.reference(part.start + near), x)
+            for on in np.flatnonzero((np.abs(place) <= 1 + 2 * slack[near]).all(axis=1)):
+                yield start + part.start + int(near[on]), place[on]
+        start += len(body)
 
 
 def coordinates(corners: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -44,14 +44,13 @@ def warn_thin(grid: Grid, bodies: Sequence[Body], fixed: Mapping[str, str], wet:
 def _bends(grid: Grid, bodies: Sequence[Body], i: int, axis: int, fixed: Mapping[str, str], slender: float) -> bool:
     """Whether a body is slender across an axis, and neither a wall nor another body holds it from that side."""
     body = bodies[i]
-    size = (body.lower + body.spacing).max(axis=0) - body.lower.min(axis=0)
+    size = body.bounds[1] - body.bounds[0]
     if size.max() < slender * size[axis]:
         return False
     for name in (name for name, (a, _) in SIDES[grid.dim].items() if a == axis):
         end = SIDES[grid.dim][name][1]
-        at = (body.lower + end * body.spacing)[:, axis]
         wall = (grid.lower, grid.upper)[end][axis]
-        if "xyz"[axis] in fixed.get(name, "") and np.abs(at - wall).min() < 1e-9 * grid.h[axis]:
+        if "xyz"[axis] in fixed.get(name, "") and np.abs(body.bounds[end][axis] - wall) < 1e-9 * grid.h[axis]:
             return False
         own = Faces.of(body, *body.facing(axis, end))
         others = (Faces.around(other) for other in bodies if other is not body)

@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: MIT
+"""Bodies of boxes on a lattice are known by a few numbers, and say of their domains what arrays of them would."""
+
+import tracemalloc
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.points.bodies import points_in_cells
+from mpm_dolfinx.points.cutting import FACES
+from mpm_dolfinx.points.lattice import Lattice
+
+
+def some(dim: int) -> mpm.Grid:
+    return mpm.Grid(lower=[-0.2] * dim, upper=[1.0] * dim, cells=[6, 4, 5][:dim])
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_all_boxes_of_a_lattice_are_what_they_are_one_by_one(dim):
+    body = mpm.box(some(dim), [-0.13] * dim, [0.7, 0.5, 0.9][:dim], per_cell=3)
+    one_by_one = replace(body, filled=np.arange(len(body)))
+    chosen = np.random.default_rng(1).permutation(len(body))[:7]
+    for of in (lambda b: b.lower, lambda b: b.sides, lambda b: b.centre_of(chosen), lambda b: b.nodes(chosen)):
+        assert (of(body) == of(one_by_one)).all()
+    for of in (lambda b: b.bounds, lambda b: b.outer(), lambda b: b.named("top"), lambda b: b.named("left")):
+        assert all((a == b).all() for a, b in zip(of(body), of(one_by_one), strict=True))
+    assert body.lattice == one_by_one.lattice == body.count
+    assert [body.across(a) for a in range(dim)] == [one_by_one.across(a) for a in range(dim)]
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_shape_has_its_surface_where_no_neighbour_is(dim):
+    rng = np.random.default_rng(dim)
+    grid = some(dim)
+    body = mpm.shape(grid, lambda x: rng.random(len(x)) < 0.6)
+    corners = body.corners()
+    faces = np.stack([corners[:, index].mean(axis=1) for index in FACES[dim]], axis=1)
+    _, at, count = np.unique(np.rint(faces / 1e-6).reshape(-1, dim), axis=0, return_inverse=True, return_counts=True)
+    assert (body.sides.reshape(len(body), 2 * dim) == (count == 1)[at.ravel()].reshape(len(body), -1)).all()
+    row, face = body.outer()
+    assert len(row) == (count == 1).sum() and body.sides.reshape(len(body), -1)[row, face].all()
+    number, x = body.nodes(np.arange(len(body))).ravel(), np.rint(corners.reshape(-1, dim) / 1e-6)
+    pairs = np.unique(np.column_stack([number, x]), axis=0)
+    assert len(pairs) == len(np.unique(number)) == len(np.unique(x, axis=0)), "a number a place"
+    assert number.max() < body.most_nodes
+
+
+def test_what_is_known_of_a_large_body_as_seeded_takes_next_to_no_memory():
+    """Bytes a point: 30 were kept, and up to 600 taken to describe it for a checkpoint."""
+    grid = mpm.Grid([1.0, 1.0, 1.0], [40, 40, 40])
+    points_in_cells(grid, [])
+    tracemalloc.start()
+    try:
+        body = mpm.box(grid, [0, 0, 0], [1, 1, 1])
+        kept = tracemalloc.get_traced_memory()[0]
+        points_in_cells(grid, [body])
+        mpm.probes([body], [[0.5, 0.5, 0.5]])
+        Lattice(body, 0, [], (np.array([0]), np.array([[0, 1, 2, 3]])))
+        assert body.bounds[1] == pytest.approx(1.0)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert len(body) == 512000 and kept < 1e4 and peak < 25 * len(body)
