@@ -124,12 +124,14 @@ class MeanDilatation:
     def _slopes(self, law: type[Skeleton], F, Fbar, values: Mapping[str, object]) -> tuple:
         """Return the derivatives by F and by theta of both that `_stress` gives.
 
-        A law without energy is itself derived by Fbar only, in half of the time: with Fbar = s F
+        In the plane a law without energy is itself derived by Fbar only, in half of the time: with Fbar = s F
 
             dtau = s C : dF + (theta dtau/dtheta) (dtheta / theta - F^-T : dF),   C = dtau/dFbar.
+
+        In 3D that would take two minutes to compile.
         """
         P, slope = self._stress(law, F, Fbar, values)
-        if law.kirchhoff is None:
+        if law.kirchhoff is None or self._grid.dim == 3:
             return tuple(ufl.diff(of, by) for of in (P, slope) for by in (F, self._theta))
         d, theta, G = self._d, self._theta, ufl.inv(F).T
         i, j, k, l, m = ufl.indices(5)
