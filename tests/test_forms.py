@@ -8,6 +8,7 @@ from dolfinx import fem
 
 from mpm_dolfinx import Grid, Hencky, NeoHookean, _compat
 from mpm_dolfinx.forms.cell_matrices import (
+    Beside,
     ElementForces,
     ElementMatrices,
     StackedElementMatrices,
@@ -153,7 +154,7 @@ def test_element_matrices_sum_what_else_is_asked_for(dim, stacked):
     data = s.place(T=s.rng.normal(size=F.shape), F=F, size=s.rng.normal(size=len(s.x)))
     one, p = ufl.Identity(dim), s.points
     A = ufl.outer(one, one)
-    matrices = (StackedElementMatrices if stacked else ElementMatrices)(A, p, along=[one, p.T], more=[p.size])
+    matrices = (StackedElementMatrices if stacked else ElementMatrices)(A, p, beside=Beside([one, p.T], [p.size]))
     unknowns = Unknowns(fem.Function(s.V), np.arange(len(fem.Function(s.V).x.array)))
     K = matrix(unknowns, unknowns, unknowns.size)
     sums = matrices.assemble_matrix(K, data)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import prod
+from typing import NamedTuple
 
 from petsc4py import PETSc
 
@@ -112,6 +113,20 @@ class ElementForces:
         b += sum_by(dofs.ravel(), self._sums(data).ravel(), len(b))
 
 
+class Beside(NamedTuple):
+    """What is summed in the cells beside an element matrix A: kernels that share terms with A cost little.
+
+    along: UFL tensors (d, d) T[i, k] at the points, contracted as A is, with grad v or grad v F, for each displacement;
+    scalars: UFL scalars at the points.
+    """
+
+    along: Sequence[ufl.core.expr.Expr] = ()
+    scalars: Sequence[ufl.core.expr.Expr] = ()
+
+
+NOTHING = Beside()
+
+
 class ElementMatrices:
     """The bilinear form grad v : A : grad u of Q1 vectors over points, summed in each cell before insertion.
 
@@ -127,19 +142,12 @@ class ElementMatrices:
         The points.
     symmetric
         Whether A[i, k, j, l] = A[j, l, i, k]: half of the entries are then left out.
-    along : UFL tensors (d, d)
-        T[i, k] at the points, summed as T : grad v, see `ElementForces`; kernels that share terms with A cost little.
-    more
-        UFL scalars at the points, summed too.
+    beside
+        What else is summed.
     """
 
     def __init__(
-        self,
-        tangent: ufl.core.expr.Expr,
-        points: FormPoints,
-        symmetric: bool = True,
-        along: Sequence[ufl.core.expr.Expr] = (),
-        more: Sequence[ufl.core.expr.Expr] = (),
+        self, tangent: ufl.core.expr.Expr, points: FormPoints, symmetric: bool = True, beside: Beside = NOTHING
     ):
         self._grid, dim = points.grid, points.grid.dim
         rows, columns, self._entry = _entries(2**dim * dim, symmetric)
@@ -152,7 +160,8 @@ class ElementMatrices:
             if points.grid.axisymmetric:
                 entries[-1] += _of_hoops(tangent, gradients, hoops, (int(v), int(i)), (int(u), int(j)))
         self._count = len(entries)
-        self._sums = CellSums([*entries, *(part for T in along for part in along_shapes(T, points)), *more], points)
+        along = [part for T in beside.along for part in along_shapes(T, points)]
+        self._sums = CellSums([*entries, *along, *beside.scalars], points)
 
     def assemble_matrix(self, A: PETSc.Mat, data: PointData) -> NDArray[np.float64]:
         """Add the matrix to `A`, by unrolled local dofs, and return the other sums (cells, quantities) in filled cells.
@@ -199,27 +208,22 @@ class StackedElementMatrices:
         The points, with the field F (d, d).
     symmetric
         Whether A[i, k, j, l] = A[j, l, i, k]: half of the entries are then left out.
-    along : UFL tensors (d, d)
-        T[i, k] at the points, summed as T : (grad v F).
-    more
-        UFL scalars at the points, summed too.
+    beside
+        What else is summed.
     """
 
     def __init__(
-        self,
-        tangent: ufl.core.expr.Expr,
-        points: FormPoints,
-        symmetric: bool = True,
-        along: Sequence[ufl.core.expr.Expr] = (),
-        more: Sequence[ufl.core.expr.Expr] = (),
+        self, tangent: ufl.core.expr.Expr, points: FormPoints, symmetric: bool = True, beside: Beside = NOTHING
     ):
-        self._grid, self._d, self._along, self._more = points.grid, points.grid.dim, len(along), len(more)
+        self._grid, self._d = points.grid, points.grid.dim
+        self._along, self._scalars = map(len, beside)
         d, (rows, columns, place) = self._d, _entries(self._d**2, symmetric)
         self._entry = place.reshape(d, d, d, d).transpose(1, 0, 2, 3).ravel()  # (k, i, j, l)
         pairs = [(*divmod(int(r), d), *divmod(int(c), d)) for r, c in zip(rows, columns, strict=True)]
         self._count = len(pairs)
-        parts = [T[i, k] for T in along for i in range(d) for k in range(d)]
-        self._values = PointExpression(ufl.as_vector([*(tangent[pair] for pair in pairs), *parts, *more]), points)
+        parts = [T[i, k] for T in beside.along for i in range(d) for k in range(d)]
+        parts = [*(tangent[pair] for pair in pairs), *parts, *beside.scalars]
+        self._values = PointExpression(ufl.as_vector(parts), points)
         self._sorted: Latest[list] = Latest()
 
     def assemble_matrix(self, A: PETSc.Mat, data: PointData) -> NDArray[np.float64]:
@@ -228,7 +232,7 @@ class StackedElementMatrices:
         The caller finalises the matrix.
         """
         live, filled = self._values.live(data), data.places.filled
-        sums = np.empty((len(filled), self._along * 2**self._d * self._d + self._more))
+        sums = np.empty((len(filled), self._along * 2**self._d * self._d + self._scalars))
         for cells, points, missing in self._sorted(data.places.key, lambda: batches(data.places)):
             matrices, sums[cells] = self._of_batch(data, live, points.ravel(), missing)
             insert(A, self._grid, filled[cells], matrices)
@@ -247,13 +251,13 @@ class StackedElementMatrices:
         left = g.reshape(cells, most, nodes, d).transpose(0, 2, 1, 3).reshape(cells, nodes, most * d)
         matrices = (left @ right).reshape(cells, nodes, d, d, nodes)
         matrices = matrices.transpose(0, 1, 2, 4, 3).reshape(cells, nodes * d, nodes * d)
-        if not (self._along or self._more):
+        if not (self._along or self._scalars):
             return matrices, np.empty((cells, 0))
-        last = values.shape[1] - self._more
+        last = values.shape[1] - self._scalars
         T = values[:, self._count : last].reshape(cells, most, self._along, d, d).transpose(0, 2, 1, 4, 3)
         along = left[:, None] @ T.reshape(cells, self._along, most * d, d)
-        more = (weight[:, None] * values[:, last:]).reshape(cells, most, self._more).sum(axis=1)
-        return matrices, np.concatenate([along.reshape(cells, self._along * nodes * d), more], axis=1)
+        scalars = (weight[:, None] * values[:, last:]).reshape(cells, most, self._scalars).sum(axis=1)
+        return matrices, np.concatenate([along.reshape(cells, self._along * nodes * d), scalars], axis=1)
 
 
 def batches(places: Places) -> list[tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]]:

@@ -182,6 +182,7 @@ def mapped(grid: Grid, body: Body, map: Callable[[NDArray[np.float64]], NDArray[
     instance("body to bend", body, Body)
     inner = body.map
     bent = replace(body, map=map if inner is None else lambda x: map(np.asarray(inner(x), dtype=float)))
+    smallest, where = np.inf, None
     for part in in_chunks(len(bent)):
         corners = bent.corners(part)
         out = np.flatnonzero(grid.outside(corners.reshape(-1, grid.dim)))
@@ -190,11 +191,11 @@ def mapped(grid: Grid, body: Body, map: Callable[[NDArray[np.float64]], NDArray[
             raise ValueError(
                 f"body: the map takes a corner to {x}, must not be outside the grid {grid.lower} to {grid.upper}"
             )
-    for part in in_chunks(len(bent)):
-        volume = volumes(bent.corners(part))
-        if not volume.min() > 0:
-            turned = body.centre_of(part)[volume.argmin()]
-            raise ValueError(f"body: the map turns the domain at {turned} inside out, must not")
+        volume = volumes(corners)
+        if volume.min() < smallest:
+            smallest, where = volume.min(), body.centre_of(part)[volume.argmin()]
+    if not smallest > 0:
+        raise ValueError(f"body: the map turns the domain at {where} inside out, must not")
     return bent
 
 

@@ -34,7 +34,7 @@ from mpm_dolfinx.caching import Latest
 from mpm_dolfinx.constitutive.axes import block
 from mpm_dolfinx.constitutive.skeleton import Skeleton
 from mpm_dolfinx.constitutive.user_functions import expression
-from mpm_dolfinx.forms.cell_matrices import insert
+from mpm_dolfinx.forms.cell_matrices import Beside, insert
 from mpm_dolfinx.forms.point_forms import CellSums, FormPoints, PointData, PointExpression
 from mpm_dolfinx.points.grid import Grid, sum_by
 from mpm_dolfinx.problems.quadrature_data import QuadratureData
@@ -109,8 +109,8 @@ class MeanDilatation:
         P_F, P_theta, slope_F, slope_theta = self._slopes(law, F, Fbar, values)
         shared, share = self.pi * ufl.diff(J, F), 1 / J_n
         along = [share * T for T in (ufl.diff(J, F), slope_F, *([] if self._symmetric else [P_theta]))]
-        sums = {"along": along, "more": [share * slope_theta]}
-        return self._stresses[-1].P + shared, P_F + ufl.diff(shared, F), sums
+        beside = Beside(along, [share * slope_theta])
+        return self._stresses[-1].P + shared, P_F + ufl.diff(shared, F), beside
 
     def _stress(self, law: type[Skeleton], F, Fbar, values: Mapping[str, object]) -> tuple:
         """Return the derivatives by F and by theta of psi(Fbar); of a law without energy, of its work."""

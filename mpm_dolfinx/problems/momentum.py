@@ -28,7 +28,7 @@ from mpm_dolfinx.constitutive.evaluate import by_scene
 from mpm_dolfinx.constitutive.local_unknowns import LocalUnknowns
 from mpm_dolfinx.constitutive.skeleton import Skeleton
 from mpm_dolfinx.constitutive.user_functions import compiling, term_of
-from mpm_dolfinx.forms.cell_matrices import ElementForces, ElementMatrices, StackedElementMatrices
+from mpm_dolfinx.forms.cell_matrices import Beside, ElementForces, ElementMatrices, StackedElementMatrices
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointForm
 from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts, zero
 from mpm_dolfinx.parallel.exchange import over_all
@@ -137,10 +137,10 @@ class MomentumForms:
         else:
             known = values
         # derived by F and contracted: in 3D a twentieth of the compile time of derivatives by u
-        sums: dict[str, list] = {}
+        beside = Beside()
         if locks:
             ratio = ufl.det(points.increment(self.u))
-            P, A, sums = self.dilatation.add(law, points, F, seen, ratio, values, known)
+            P, A, beside = self.dilatation.add(law, points, F, seen, ratio, values, known)
         else:
             P, A = law.first_piola(F, known), ufl.diff(law.first_piola(F, values), F)
         if pressure is not None:
@@ -152,10 +152,10 @@ class MomentumForms:
         i, j, k, l, m, n = ufl.indices(6)
         if self.grid.dim == 2:
             A = ufl.as_tensor(A[i, m, j, n] * points.F[k, m] * points.F[l, n], (i, k, j, l))
-            sums |= {"along": [T * points.F.T for T in sums.get("along", ())]}
-            self._tangents.append(ElementMatrices(A, points, symmetric, **sums))
+            beside = beside._replace(along=[T * points.F.T for T in beside.along])
+            self._tangents.append(ElementMatrices(A, points, symmetric, beside))
         else:
-            self._tangents.append(StackedElementMatrices(A, points, symmetric, **sums))
+            self._tangents.append(StackedElementMatrices(A, points, symmetric, beside))
 
     def _add_term(self, term: Callable, pieces: FormPoints, t: fem.Constant, dt: fem.Constant) -> tuple:
         """Add a term of the user's; return whether it has a potential, depends on u, and on the velocity."""
