@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.points.bodies import Body, check_inside
 from mpm_dolfinx.points.cutting import corner_bits
-from mpm_dolfinx.points.grid import MOST, Grid, in_chunks
+from mpm_dolfinx.points.grid import MOST, Grid, among, in_chunks
 from mpm_dolfinx.validation import asked, instance, numbers, whole
 
 
@@ -61,13 +61,8 @@ class LatticeBody(Body):
             inner = np.flatnonzero(~out[:, axis, end])
             beside = index[inner]
             beside[:, axis] += 2 * end - 1
-            out[inner, axis, end] = ~self._has(np.ravel_multi_index(tuple(beside.T), self.count))
+            out[inner, axis, end] = ~among(np.ravel_multi_index(tuple(beside.T), self.count), self.filled)
         return out
-
-    def _has(self, numbers: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return which boxes of the lattice the body has."""
-        at = np.minimum(np.searchsorted(self.filled, numbers), len(self.filled) - 1)
-        return self.filled[at] == numbers
 
     def _with_face(self, axis: int, end: int) -> NDArray[np.int64]:
         """Return the domains (m,), ascending, of which the face at an end of an axis lies on the surface."""
@@ -96,11 +91,6 @@ class LatticeBody(Body):
         """Domains along the axes of the lattice that they lie on, some of which may be empty."""
         low, high = self._ends
         return tuple(high - low + 1)
-
-    @property
-    def most_nodes(self) -> int:
-        """Above all numbers of corners."""
-        return int(np.prod(np.add(self.lattice, 1)))
 
     def nodes(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return the numbers (m, 2^d) of the corners of domains, the same for a corner of several; lexicographic."""

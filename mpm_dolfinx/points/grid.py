@@ -58,6 +58,13 @@ def sum_by(index: NDArray, values: NDArray[np.float64], size: int) -> NDArray[np
     return np.bincount(index, weights=values, minlength=size).astype(float, copy=False)
 
 
+def among(numbers: NDArray[np.integer], chosen: NDArray[np.integer]) -> NDArray[np.bool_]:
+    """Return which numbers (...) are among chosen ones (m,), ascending: numpy's isin makes room for all numbers."""
+    if not len(chosen):
+        return np.zeros(numbers.shape, dtype=bool)
+    return chosen[np.minimum(np.searchsorted(chosen, numbers), len(chosen) - 1)] == numbers
+
+
 def rounding(x: NDArray[np.float64]) -> float:
     """Return by how much coordinates of this size, m, may differ although they should be equal."""
     return 8 * np.finfo(float).eps * float(np.abs(x).max(initial=0.0))

@@ -29,7 +29,7 @@ from mpm_dolfinx.points.bodies import Body
 from mpm_dolfinx.points.contact import Faces, covers
 from mpm_dolfinx.points.cutting import FACES
 from mpm_dolfinx.points.faces import Surface
-from mpm_dolfinx.points.grid import SIDES, Grid, in_chunks
+from mpm_dolfinx.points.grid import SIDES, Grid, among, in_chunks
 from mpm_dolfinx.points.material_points import MaterialPoints
 
 FAST = 10
@@ -65,13 +65,16 @@ class Lattice:
         self._dim, self._count = body.dim, body.lattice
         self._numbers: Latest[NDArray[np.int64]] = Latest()
         self._parted = PARTED * body.spacing.min()
-        self._joined = np.zeros(body.most_nodes, dtype=bool)
-        self._joined[np.take_along_axis(body.nodes(joined[0]), joined[1], axis=1)] = True
-        self._given = np.zeros((len(self._joined), self._dim), dtype=bool)
+        # the numbers of corners that are held: a flag for each corner would be as large as the body, on every process
+        self._joined = np.unique(np.take_along_axis(body.nodes(joined[0]), joined[1], axis=1))
+        of_axes = [[np.empty(0, dtype=np.int64)] for _ in range(self._dim)]
         for faces, axes in given:
             here = (faces.id >= self._start) & (faces.id < self._stop)
             corners = body.nodes(faces.id[here] - self._start), FACES[self._dim][faces.face[here]]
-            self._given[np.take_along_axis(*corners, axis=1).reshape(-1, 1), list(axes)] = True
+            for axis in axes:
+                of_axes[axis].append(np.take_along_axis(*corners, axis=1).ravel())
+        self._given = [np.unique(np.concatenate(numbers)) for numbers in of_axes]
+        self._held: Latest[tuple[NDArray[np.bool_], NDArray[np.bool_]]] = Latest()
 
     def rows(self, points: MaterialPoints) -> NDArray[np.int64]:
         """Return which points are the body's."""
@@ -79,7 +82,16 @@ class Lattice:
 
     def given(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return which components (m, 2^d, d) of the corners of domains conditions give."""
-        return self._given[self._nodes(ids)]
+        return self._held_of(ids)[0]
+
+    def _held_of(self, ids: NDArray[np.int64]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Return `given` of domains, and which of their corners (m, 2^d) other bodies hold."""
+
+        def held() -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+            number = self._nodes(ids)
+            return np.stack([among(number, of_axis) for of_axis in self._given], axis=2), among(number, self._joined)
+
+        return self._held(ids, held)
 
     def _nodes(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return the numbers (m, 2^d) of the corners of domains."""
@@ -97,7 +109,7 @@ class Lattice:
         number = self._nodes(ids)
         values = np.concatenate([d, crossed[:, :, None]], axis=2).reshape(-1, self._dim + 1)
         change = _change(comm, tuple(np.add(self._count, 1)), number.ravel(), values, self._parted).reshape(d.shape)
-        change[self._joined[number]] = 0.0
+        change[self._held_of(ids)[1]] = 0.0
         return change
 
 

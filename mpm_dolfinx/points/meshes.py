@@ -138,11 +138,6 @@ class MeshBody(Body):
         """Return the numbers (m, 2^d) of the corners of domains, the same for a corner of several."""
         return self._nodes[rows]
 
-    @property
-    def most_nodes(self) -> int:
-        """Above all numbers of corners."""
-        return int(self._nodes.max()) + 1
-
     @cached_property
     def _nodes(self) -> NDArray[np.int64]:
         x = self.vertices.reshape(-1, self.dim)
