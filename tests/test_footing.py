@@ -54,6 +54,19 @@ def test_the_drained_limit_load_of_stiff_soil_tends_to_prandtls():
     assert fine[-1] / fine[30] < 1.003 < coarse[-1] / coarse[30] < 1.006  # what goes on rising is the error of the grid
 
 
+def test_soil_with_a_small_viscosity_resists_in_proportion_to_it():
+    loads = [footing.effort(9, 0.15, 4, 2.0, "backward-euler", viscosity)["load"] for viscosity in (0.0, 0.05, 0.1)]
+    assert 0.01 < loads[1] / loads[0] - 1 < 0.03
+    assert loads[2] - loads[0] == pytest.approx(2 * (loads[1] - loads[0]), rel=0.1)
+
+
+@pytest.mark.slow
+def test_soil_that_does_not_dilate_is_pushed_in_few_newton_steps_if_it_has_a_small_viscosity():
+    """Without one, bands of shear a cell wide jump: on finer grids steps fail however short they are."""
+    none, viscous = (footing.effort(21, 0.3, 8, 4.0, "backward-euler", viscosity) for viscosity in (0.0, 0.05))
+    assert viscous["cuts"] == 0 < none["cuts"] and viscous["newton"] < 0.7 * none["newton"]
+
+
 def published(friction, dilation):
     """Return N_c of soil that dilates by less than it has friction (degrees): Loukidis and Salgado (2009)."""
     phi, psi = np.radians([friction, dilation])
