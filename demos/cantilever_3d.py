@@ -95,7 +95,7 @@ def surface(simulation: mpm.Simulation) -> tuple[np.ndarray, np.ndarray]:
 
 def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return what --json prints."""
-    parser = common.Parser(__doc__, __file__)
+    parser = common.Parser(__doc__, __file__, processes=True)
     add = parser.add_argument
     add("--cells", type=int, default=4, help="cells over the height")
     add("--steps", type=int, nargs="+", default=[10, 20, 40], help="numbers of load steps")

@@ -24,14 +24,17 @@ GALLERY = Path(__file__).with_name("README.md")
 
 
 class Parser(argparse.ArgumentParser):
-    """The options of a demo: those that it adds, --json and, of one that writes files, --out."""
+    """The options of a demo: those that it adds, --json and, of one that writes files, --out.
+
+    processes: whether it runs on several.
+    """
 
     class Formatter(argparse.ArgumentDefaultsHelpFormatter, argparse.RawDescriptionHelpFormatter):
         """The description as it is written, defaults behind the options."""
 
-    def __init__(self, description: str, file: str, writes: bool = True):
+    def __init__(self, description: str, file: str, writes: bool = True, processes: bool = False):
         super().__init__(description=description, formatter_class=self.Formatter)
-        self.demo = Path(file).stem
+        self.demo, self.processes = Path(file).stem, processes
         if writes:
             self.add_argument("--out", type=Path, default=Path("out") / self.demo, help="folder for pictures, tables")
         self.add_argument("--json", action="store_true", help="print the results as one line of JSON at the end")
@@ -40,11 +43,20 @@ class Parser(argparse.ArgumentParser):
         """Return the options, and in `takes` how long they take (s or min) if the gallery tells."""
         args = sys.argv[1:] if args is None else list(args)
         o = super().parse_args(args, namespace)
+        if not self.processes:
+            self.refuse_processes()
         given = re.sub(r"--(json|out[ =]\S+)", "", " ".join(args)).split()
         row = rf"^\| \[`{self.demo}`\].*?\| (\d+ (?:s|min))(?: <!-- \w+([^;]*);)? "
         row = re.search(row, GALLERY.read_text(), re.M)
         o.takes = row[1] if row and (row[2] or "").split() == given else None
         return o
+
+    def refuse_processes(self, what: str = "") -> None:
+        """End a demo that several processes run: what it prints and draws would be that of some of the points."""
+        if MPI.COMM_WORLD.size > 1 and not first():
+            sys.exit(2)
+        if MPI.COMM_WORLD.size > 1:
+            self.error(f"{self.demo}{what}: runs on one process, not {MPI.COMM_WORLD.size}")
 
 
 @contextmanager

@@ -107,7 +107,7 @@ def errors(out: Outcome) -> dict[str, float]:
 
 def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return what --json prints."""
-    parser = common.Parser(__doc__, __file__)
+    parser = common.Parser(__doc__, __file__, processes=True)
     parser.add_argument("--cells", type=int, default=20, help="cells to the radius")
     parser.add_argument("--steps", type=int, default=100, help=f"equal steps to the reduced time {END}")
     parser.add_argument("--axisymmetric", action="store_true", help="a quarter of a disc instead of the octant")

@@ -218,7 +218,7 @@ def limit_load(how: str, cells: int) -> Push:
 
 def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return what --json prints."""
-    parser = common.Parser(__doc__, __file__)
+    parser = common.Parser(__doc__, __file__, processes=True)
     parser.add_argument("--cells", type=int, default=9, help="cells over the footing's width, odd")
     parser.add_argument("--depth", type=float, default=1.0, help="depth of the push over the footing's width")
     parser.add_argument("--steps", type=int, help="only push at the intermediate rate, in so many equal steps")
@@ -234,6 +234,8 @@ def main(argv: list[str] | None = None) -> dict:
         parser.error(f"--steps {o.steps} --box {o.box:g}: must be >= 1, and in [1, 32]")
     if not 0 <= o.viscosity <= 1:
         parser.error(f"--viscosity {o.viscosity:g}: must be in [0, 1]")
+    if o.steps is None:
+        parser.refuse_processes(" without --steps")
     with common.results(o) as out:
         if o.steps is not None:
             out |= effort(o.cells, o.depth, o.steps, o.box, o.method, o.viscosity)

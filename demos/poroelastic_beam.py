@@ -37,7 +37,7 @@ Steps of 0.0025 s change the last digit but one, 100 x 30 cells the fifth.
 
 def arguments(argv: list[str] | None = None) -> Namespace:
     """Parse the command line."""
-    parser = common.Parser(__doc__, __file__)
+    parser = common.Parser(__doc__, __file__, processes=True)
     add = parser.add_argument
     add("--dim", type=int, choices=(2, 3), default=2, help="plane strain, or one cell deep between smooth walls")
     add("--h", type=float, default=0.015, help="cell size, m")

@@ -289,7 +289,7 @@ def write(out: Path, rows: list[dict]) -> dict:
 
 def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return what --json prints."""
-    parser = common.Parser(__doc__, __file__)
+    parser = common.Parser(__doc__, __file__, processes=True)
     add = parser.add_argument
     add("--dims", type=int, nargs="+", choices=(2, 3), default=[2, 3], help="dimensions")
     size = parser.add_mutually_exclusive_group()
