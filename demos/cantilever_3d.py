@@ -75,21 +75,20 @@ def run(cells: int, steps: int, alpha: float, taken: int | None = None) -> tuple
         "seconds_per_step": result.wall / result.steps,
         "memory_MB": memory,
     }
-    if comm.rank == 0 and cells <= 8:
+    if cells <= 8:
         costs["surface"] = surface(simulation)
     return result.displacement[-1][0], result, costs
 
 
 def surface(simulation: mpm.Simulation) -> tuple[np.ndarray, np.ndarray]:
-    """Return the faces (m, 4, 3) of the body's domains on this process, m, and their stretch along the beam."""
-    points, (body,) = simulation.points, simulation.bodies
+    """Return the faces (m, 4, 3) of the body's domains, m, and their stretch along the beam."""
+    (corners, F), (body,) = common.whole(simulation, "corners", "F"), simulation.bodies
     bits, faces, stretch = corner_bits(3), [], []
     for axis in range(3):
         for end in (0, 1):
-            on = body.sides[points.id, axis, end]
-            corners = points.corners[on][:, bits[:, axis] == end]
-            faces.append(corners[:, [0, 1, 3, 2]])
-            stretch.append(np.linalg.norm(points.F[on, :, 0], axis=1))
+            on = body.sides[:, axis, end]
+            faces.append(corners[on][:, bits[:, axis] == end][:, [0, 1, 3, 2]])
+            stretch.append(np.linalg.norm(F[on, :, 0], axis=1))
     return np.concatenate(faces), np.concatenate(stretch)
 
 

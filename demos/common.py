@@ -53,10 +53,11 @@ class Parser(argparse.ArgumentParser):
 
     def refuse_processes(self, what: str = "") -> None:
         """End a demo that several processes run: what it prints and draws would be that of some of the points."""
-        if MPI.COMM_WORLD.size > 1 and not first():
+        if (size := MPI.COMM_WORLD.size) == 1:
+            return
+        if not first():
             sys.exit(2)
-        if MPI.COMM_WORLD.size > 1:
-            self.error(f"{self.demo}{what}: runs on one process, not {MPI.COMM_WORLD.size}")
+        self.error(f"{self.demo}{what}: runs on one process, not {size}")
 
 
 @contextmanager
@@ -87,6 +88,13 @@ def results(o: argparse.Namespace) -> Iterator[dict]:
 def first() -> bool:
     """Is this the process that prints and draws?"""
     return MPI.COMM_WORLD.rank == 0
+
+
+def whole(s: mpm.Simulation, *names: str) -> list[np.ndarray]:
+    """Return what the points of all processes carry under some names, by the points' numbers."""
+    parts = s.grid.comm.allgather([getattr(s.points, name) for name in ("id", *names)])
+    ids, *values = map(np.concatenate, zip(*parts, strict=True))
+    return [each[np.argsort(ids)] for each in values]
 
 
 def table(rows: Iterable[Iterable[str]]) -> None:

@@ -30,7 +30,7 @@ cells.
 A rough circular footing on Tresca's soil carries 6.05 s_u (Cox, Eason and Hopkins 1961), axisymmetric.
 
 Soil whose flow dilates less than its friction has no one answer: bands of shear a cell wide jump from place to place,
-the more of them the finer the cells (Rudnicki and Rice 1975), and on fine grids steps fail however short they are.
+the more of them the finer the cells (Rudnicki and Rice 1975), and on fine grids step after step is cut.
 --viscosity gives it a resistance to the rate of shear, small beside the cohesion: then there is one (Needleman 1988).
 """
 
@@ -180,7 +180,7 @@ def push(
         area = np.pi / 4 * WIDTH**2 if circular else WIDTH / 2  # of half of the strip
         out.load.append(-s.reactions[0, 1] / (area * COHESION))
         if len(out.load) % 5 == 0 or s.result.converged:
-            corners, pressure = whole(s)
+            corners, pressure = common.whole(s, "corners", "pressure")
             top = corners[body.sides[:, 1, 1]][:, 2:].reshape(-1, 2)
             out.frames.append(Frame(s.t / end, out.settlement[-1], corners, pressure, top))
 
@@ -191,14 +191,6 @@ def push(
         later = rest * WIDTH**2 / CV
         out.results.append(simulation.run(end + later, later / 40, observe=observe))
     return out
-
-
-def whole(s: mpm.Simulation) -> tuple[np.ndarray, np.ndarray]:
-    """Return the corners and pressures of the points of all processes, in the order of the body's."""
-    parts = s.grid.comm.allgather((s.points.id, s.points.corners, s.points.pressure))
-    ids, corners, pressure = map(np.concatenate, zip(*parts, strict=True))
-    order = np.argsort(ids)
-    return corners[order], pressure[order]
 
 
 def limit_load(how: str, cells: int) -> Push:
@@ -234,6 +226,8 @@ def main(argv: list[str] | None = None) -> dict:
         parser.error(f"--steps {o.steps} --box {o.box:g}: must be >= 1, and in [1, 32]")
     if not 0 <= o.viscosity <= 1:
         parser.error(f"--viscosity {o.viscosity:g}: must be in [0, 1]")
+    if o.steps is None and (o.box, o.method, o.viscosity) != (BOX[0], methods[0], 0.0):
+        parser.error("--box, --method, --viscosity: must go with --steps")
     if o.steps is None:
         parser.refuse_processes(" without --steps")
     with common.results(o) as out:

@@ -136,13 +136,11 @@ def main(argv: list[str] | None = None) -> dict:
 
     def observe(s: mpm.Simulation) -> None:
         if len(s.result.rows) - 1 in shown and not o.drained:
-            parts = s.grid.comm.gather((s.points.corners, s.points.pressure))
-            if parts:
-                corners, pressure = (np.concatenate(a) for a in zip(*parts, strict=True))
-                if o.dim == 3:  # the front
-                    front = corners[:, 0, 1] < 1e-9
-                    corners, pressure = corners[front][:, [0, 1, 4, 5]][..., [0, 2]], pressure[front]
-                snapshots.append((s.t, corners, pressure))
+            corners, pressure = common.whole(s, "corners", "pressure")
+            if o.dim == 3:  # the front
+                front = corners[:, 0, 1] < 1e-9
+                corners, pressure = corners[front][:, [0, 1, 4, 5]][..., [0, 2]], pressure[front]
+            snapshots.append((s.t, corners, pressure))
 
     observers = [observe]
     if o.paraview:
@@ -243,7 +241,7 @@ def draw_pressure(o: Namespace, snapshots: list) -> None:
         ax.set(aspect="equal", title=f"t = {t:.3g} s", xlabel="x (m)", ylabel="y (m)")
         ax.set(xlim=(-0.03, high[0] + 0.05), ylim=(low[1] - 0.03, high[1] + 0.03))
     bar = fig.colorbar(domains, ax=axes, shrink=0.8, aspect=30, format="%g")
-    bar.set_label(f"pore pressure (kPa), logarithmic beyond ±{limit / 30:.0f}")
+    bar.set_label(f"pore pressure (kPa),\nlogarithmic beyond ±{limit / 30:.0f}")
     bar.set_ticks([sign * x for x in (300, 100, 30, 10) for sign in (-1, 1) if x < limit] + [0])
     for ax in axes.ravel()[len(snapshots) :]:
         ax.set_axis_off()

@@ -60,9 +60,16 @@ def test_soil_with_a_small_viscosity_resists_in_proportion_to_it():
     assert loads[2] - loads[0] == pytest.approx(2 * (loads[1] - loads[0]), rel=0.1)
 
 
+def test_options_that_would_change_nothing_without_steps_are_refused(capsys):
+    for option in ("--viscosity=0.1", "--box=4", "--method=backward-euler"):
+        with pytest.raises(SystemExit):
+            footing.main([option])
+        assert "--box, --method, --viscosity: must go with --steps" in capsys.readouterr().err
+
+
 @pytest.mark.slow
 def test_soil_that_does_not_dilate_is_pushed_in_few_newton_steps_if_it_has_a_small_viscosity():
-    """Without one, bands of shear a cell wide jump: on finer grids steps fail however short they are."""
+    """Without one, bands of shear a cell wide jump: on finer grids step after step is cut."""
     none, viscous = (footing.effort(21, 0.3, 8, 4.0, "backward-euler", viscosity) for viscosity in (0.0, 0.05))
     assert viscous["cuts"] == 0 < none["cuts"] and viscous["newton"] < 0.7 * none["newton"]
 
