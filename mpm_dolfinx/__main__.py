@@ -32,7 +32,7 @@ def info() -> dict[str, str]:
         "dolfinx": dolfinx.__version__,
         **{name: _version(name) for name in PACKAGES},
         "PETSc": f"{'.'.join(map(str, PETSc.Sys.getVersion()))}, {'real' if real else 'complex'} scalars",
-        "solvers": ", ".join(["petsc", "gamg", *filter(PETSc.Sys.hasExternalPackage, SOLVERS)]),
+        "solvers": ", ".join(["petsc", *filter(PETSc.Sys.hasExternalPackage, SOLVERS)]),
         "MPI": MPI.Get_library_version().strip("\0").split(", ")[0],
         "Python": platform.python_version(),
         "platform": platform.platform(),

@@ -76,7 +76,7 @@ def balanced(scene: Scene, state: State) -> State:
         start = set_up(scene, state, 0.0)
         seeded = replace(start.state, stay=_stay(scene, start))
         unknowns, best, count = start.matrices.momentum.unknowns, (np.inf, 0, seeded.points, None), 0
-        solvers, report = LinearSolvers(scene.scheme, start.matrices.momentum, None, *start.matrices.kind), Report()
+        solvers, report = LinearSolvers(scene.scheme, start.matrices.momentum, None, start.matrices.symmetric), Report()
         seen, w, points = [], np.zeros_like(forms.u.x.array), seeded.points
         while count - best[1] < PATIENCE:
             problem = _problem(scene, start, replace(seeded, points=points))

@@ -12,7 +12,6 @@ import growth_3d
 import numpy as np
 import poroelastic_beam as demo
 import pytest
-from helpers import set_up
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.points.bodies import material_points
@@ -86,19 +85,6 @@ def test_iterations_do_not_grow_where_cells_are_nearly_empty(monkeypatch, fluid,
     monkeypatch.setattr(solvers, "ITERATIVE", 0)
     result = block(fill=fill, fluid=fluid).run(1.0, 0.5, progress=False)
     assert result.coupling <= most * result.newton and result.newton <= 20
-
-
-def test_rigid_body_modes_are_what_the_stiffness_does_not_see(monkeypatch):
-    """Of the ghost penalty and the tangent of a block at rest, before it is fixed."""
-    s = block()
-    monkeypatch.setattr("mpm_dolfinx.problems.on_grid.check_held", lambda *_: None)
-    s.state.stage.free[:] = True
-    momentum = set_up(s, 1.0).momentum
-    K, modes = momentum.assemble_tangent(), momentum.system.unknowns.rigid_body_modes()
-    vectors = modes.getVecs()
-    gram = np.array([[v.dot(w) for v in vectors] for w in vectors])
-    assert gram == pytest.approx(np.eye(6), abs=1e-12)
-    assert max((K * v).norm() for v in vectors) < 1e-12 * K.norm()
 
 
 def test_memory_does_not_grow_with_the_steps():

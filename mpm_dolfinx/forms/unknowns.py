@@ -8,8 +8,6 @@ dolfinx assemble straight into them: PETSc ignores negative indices.
 
 from __future__ import annotations
 
-from itertools import combinations
-
 from mpi4py import MPI
 from petsc4py import PETSc
 
@@ -65,21 +63,6 @@ class Unknowns:
     def positions(self) -> NDArray[np.float64]:
         """Where the entries of the vectors are (n, d), m."""
         return self._space.tabulate_dof_coordinates()[self.owned // self.dim, : self._space.mesh.geometry.dim]
-
-    def rigid_body_modes(self) -> PETSc.NullSpace:
-        """Return translations and rotations, as far as the unknowns allow them: what strain does not see."""
-        d = self.dim
-        x, direction = self.positions, np.eye(d)[self.nodes[1]]
-        modes = np.concatenate([direction, np.empty((self.size, d * (d - 1) // 2))], axis=1)
-        x = x - self.comm.allreduce(x.sum(axis=0)) / self.global_size
-        x /= np.sqrt(self.comm.allreduce(float(np.square(x).sum())) / self.global_size)
-        for k, (a, b) in enumerate(combinations(range(d), 2)):
-            modes[:, d + k] = direction[:, a] * x[:, b] - direction[:, b] * x[:, a]
-        size, turn = np.linalg.eigh(self.comm.allreduce(modes.T @ modes))
-        kept = size > 1e-10 * size.max()
-        modes = modes @ (turn[:, kept] / np.sqrt(size[kept]))
-        vectors = [self.gather_owned(mode) for mode in modes.T]
-        return PETSc.NullSpace().create(vectors=vectors, comm=self.comm)
 
     def gather_owned(self, values: NDArray[np.float64]) -> PETSc.Vec:
         """Return a new vector with these entries of this process."""

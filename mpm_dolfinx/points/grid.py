@@ -280,6 +280,19 @@ class Grid:
         """Return this process's index of each cell, -1 where it does not have the cell."""
         return self.locals[number]
 
+    def node_places(self, nodes: NDArray[np.integer]) -> NDArray[np.int64]:
+        """Return the indices along the axes of local nodes (n,), and the copies they belong to (n, d + 1)."""
+        copy = np.zeros(len(self.node_x), dtype=np.int64)
+        if self.copies > 1:
+            copy[self.cell_nodes] = (self.cell_number // self.cells)[:, None]
+        index = np.rint((self.node_x[nodes] - self.lower) / self.h).astype(np.int64)
+        return np.column_stack([index, copy[nodes]])
+
+    def cell_places(self, cells: NDArray[np.integer]) -> NDArray[np.int64]:
+        """Return the same of local cells (n,)."""
+        copy, number = np.divmod(self.cell_number[cells].astype(np.int64), self.cells)
+        return np.column_stack([*np.unravel_index(number, tuple(self.shape)), copy])
+
     def beside(self, cells: NDArray[np.integer]) -> NDArray[np.int64]:
         """Return the local cells (n, d, 2) beside local cells, by axis and end, -1 where this process has none."""
         index = np.stack(np.unravel_index(self.cell_number[cells] % self.cells, tuple(self.shape)), axis=1)

@@ -297,6 +297,8 @@ class MomentumSystem:
     ):
         self._forms, d = forms, forms.grid.dim
         self.unknowns = Unknowns(forms.u, dofs)
+        self.locks = forms.dilatation is not None
+        """Whether laws yield or hardly change their volume."""
         owned = nodes[nodes < forms.u.function_space.dofmap.index_map.size_local]
         self.touched = (owned[:, None] * d + np.arange(d)).ravel()
         """Where forces may act, fixed or not."""
@@ -307,6 +309,14 @@ class MomentumSystem:
         self.firm, self._firmness = None, None  # where nothing yields
         if not forms.elastic:
             self.firm, self._firmness = matrix(self.unknowns, self.unknowns, 3**d * d), forms.ghost.firmness.on(cells)
+
+    def places(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return where on the grid this process's unknowns are, and what walls hold: see `multigrid_solver`."""
+        held = np.setdiff1d(self.touched, self.unknowns.owned)
+        node, axis = np.divmod(np.concatenate([self.unknowns.owned, held]), self.unknowns.dim)
+        places = self._forms.grid.node_places(node)
+        places[:, -1] = places[:, -1] * self.unknowns.dim + axis
+        return places[: self.unknowns.size], places[self.unknowns.size :]
 
     def _penalty_matrix(self, facets: NDArray[np.int32], stiff: bool) -> PETSc.Mat:
         """Return an empty matrix for the penalties: the ghost penalty couples like components, of two cells."""

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.caching import Keyed, Latest
 from mpm_dolfinx.constitutive.fluid_content import mass_potential, pressure_of
-from mpm_dolfinx.forms.unknowns import collect_garbage
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.cut_domains import CutDomains
 from mpm_dolfinx.points.grid import sum_by
@@ -240,8 +239,7 @@ class System:
         stiff: bool,
         symmetric: bool,
     ):
-        self._scheme, self.kind = scheme, (symmetric, momentum.dilatation is not None)
-        """Whether the momentum's tangent is symmetric, and whether skeletons yield or hardly change their volume."""
+        self._scheme, self.symmetric = scheme, symmetric
         own = on_grid.cells[on_grid.cells < momentum.grid.num_owned]
         self.momentum, self.storage = MomentumSystem(momentum, dofs, nodes, own, on_grid.penalised, stiff), None
         if storage is not None:
@@ -250,21 +248,11 @@ class System:
         self._solvers: Latest[LinearSolvers] = Latest()
 
     def solvers(self) -> LinearSolvers:
-        """Return the solvers at the start of a step; multigrid ones are made anew, to depend on none before."""
-        made = self._solvers.value
-        if made is not None and not made.multigrid:
-            made.begin()
-            return made
-        make = (self._scheme, self.momentum, self.storage, *self.kind)
-        return self._solvers(object(), lambda: LinearSolvers(*make))
-
-    def end_step(self) -> None:
-        """Drop the solvers that no other step takes, before its points need the memory to move."""
-        made = self._solvers.value
-        if made is not None and made.multigrid:
-            del made
-            self._solvers.clear()
-            collect_garbage(self.momentum.unknowns.comm)
+        """Return the solvers at the start of a step."""
+        make = (self._scheme, self.momentum, self.storage, self.symmetric)
+        solvers = self._solvers((), lambda: LinearSolvers(*make))
+        solvers.begin()
+        return solvers
 
 
 class Assembled:
@@ -293,8 +281,8 @@ class Assembled:
         stage: Stage,
         sides: SideData,
     ):
-        self.momentum, self.storage, self.kind = system.momentum, system.storage, system.kind
-        self.solvers, self.end_step = system.solvers, system.end_step
+        self.momentum, self.storage, self.symmetric = system.momentum, system.storage, system.symmetric
+        self.solvers = system.solvers
         self._on_grid, self._stage, grid = on_grid, stage, on_grid.cut.grid
         self._u, self._varies = momentum.u, storage is not None and storage.conductivity is not None
         self._by_pressure = storage if self._varies and storage.conductivity.pressure is not None else None

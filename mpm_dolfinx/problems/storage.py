@@ -278,6 +278,11 @@ class StorageSystem:
             pattern.axpy(1.0, self.L, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
         self.C, self.P = pattern.duplicate(), pattern.duplicate()
 
+    def places(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return where on the grid this process's unknowns are, and none that are held: see `multigrid_solver`."""
+        places = self._forms.grid.cell_places(self.unknowns.owned)
+        return places, places[:0]
+
     def set_alternation(self) -> None:
         """Assemble the filter L of `StorageProblem.assemble_preconditioner`."""
         zero(self.L)

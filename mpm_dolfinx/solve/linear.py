@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Linear solvers: factors in 2D and of small bodies in 3D, multigrid of large ones.
+"""Linear solvers by factors, and where they are better than multigrid (`multigrid`).
 
 PETSc's own factors of displacements in blocks, a block a node, take a third of the time of those of single
 unknowns: with 44000 unknowns in 2D and minimum degree ordering 110 ms, 60 again with the same pattern (single 430 and
@@ -29,15 +29,16 @@ from mpm_dolfinx.errors import NotConverged
 from mpm_dolfinx.forms.unknowns import Unknowns
 
 ITERATIVE = 1500
-"""Unknowns of a 3D problem from which on it is solved by iterations: see `multigrid_solver`.
+"""Unknowns of a 3D problem from which on it is solved by multigrid.
 
 Seconds of five load steps of a square beam by factors and by iterations: 0.5 and 0.5 with 1200 unknowns, 2.5 and 1.4
 with 2600, 8.2 and 2.1 with 4900.  In a plate of one cell both cost the same up to 6000.
 """
-LAGGED = 300000
-"""Unknown displacements of a wet 2D problem in which nothing yields from which on factors serve all tangents of a step.
+GRIDS = 30000
+"""Unknown displacements of a wet 2D problem in which nothing yields from which on it is.
 
-See `monolithic`.
+Linear algebra of a step of the beam by factors and by multigrid, s: 0.06 and 0.05 with 10400 unknowns,
+0.19 and 0.14 with 25500, 0.53 and 0.32 with 51000, 2.3 and 1.0 with 151000.
 """
 LARGE = 100000
 """Unknown displacements of a wet 2D problem from which on MUMPS makes factors of an unsymmetric K, and those of P.
@@ -52,14 +53,14 @@ FEW = 4
 """Processes up to which one of them has the factors that are used often."""
 
 
-def iterative(unknowns: Unknowns) -> bool:
-    """Return whether displacements are better solved for by iterations than by factors."""
-    return unknowns.dim == 3 and unknowns.global_size >= ITERATIVE
+def iterative(unknowns: Unknowns, at_once: bool, yields: bool) -> bool:
+    """Return whether displacements are better solved for by multigrid than by factors.
 
-
-def lagged(unknowns: Unknowns) -> bool:
-    """Return whether factors are better kept for other tangents than made for each, where nothing yields."""
-    return not iterative(unknowns) and unknowns.global_size >= LAGGED
+    at_once: with pressures; yields: whether soil may.
+    """
+    if unknowns.dim == 3:
+        return unknowns.global_size >= ITERATIVE
+    return at_once and not yields and unknowns.global_size >= GRIDS
 
 
 def by_mumps(unknowns: Unknowns, symmetric: bool) -> bool:
@@ -362,52 +363,3 @@ class BlockFactors:
         self._b.array_w[self._place] = b
         self._solver.solve(self._b, self._x)
         return self._x.array_r[self._place]
-
-
-def multigrid_solver(A: PETSc.Mat, name: str, smoother: str = "jacobi") -> PETSc.KSP:
-    """Return GMRES with smoothed aggregation multigrid (GAMG), set up anew when A has changed.
-
-    Parameters
-    ----------
-    smoother
-        "jacobi", or "sor" where volumes hardly change or soil yields: a third to a fifth of the iterations for half of
-        the time, but of a dry elastic body 430 instead of 580 for a sixth more.  See `allow_no_diagonal`.
-
-    For elasticity A must have the rigid body modes as near-null space when it is set up.  GMRES because a
-    tangent may be unsymmetric or, where a body buckles, indefinite; on definite ones conjugate gradients
-    take as many iterations: about 20 to 1e-8, with 5000 unknowns as with 60000.  With 60000 the set-up takes 1.0 s,
-    for another tangent of the same unknowns 0.3 s, the solution 0.5 s; BoomerAMG (hypre) takes three to four times
-    as long, and ML cannot keep its set-up.  Unknowns in blocks of three, with rows of the identity for fixed ones, take
-    as many iterations and as long.
-    """
-    prefix = f"mpm_{name}_{smoother}_"
-    options = PETSc.Options(prefix)
-    for option, value in (_MULTIGRID | _SMOOTHERS[smoother]).items():
-        if not options.hasName(option):
-            options.setValue(option, value)
-    ksp = PETSc.KSP().create(A.comm)
-    ksp.setType(PETSc.KSP.Type.GMRES)
-    ksp.setPCSide(PETSc.PC.Side.RIGHT)
-    ksp.setOptionsPrefix(prefix)
-    ksp.pc.setType(PETSc.PC.Type.GAMG)
-    ksp.setOperators(A)
-    ksp.setFromOptions()
-    return ksp
-
-
-_MULTIGRID = {
-    "pc_gamg_reuse_interpolation": "true",  # a new tangent of the same unknowns: a quarter of the time
-    "mg_levels_ksp_type": "chebyshev",
-}
-_SMOOTHERS = {
-    "jacobi": {"mg_levels_pc_type": "jacobi"},
-    "sor": {"mg_levels_pc_type": "sor", "mg_levels_ksp_max_it": "3"},
-}
-
-
-def allow_no_diagonal(ksp: PETSc.KSP, A: PETSc.Mat) -> None:
-    """Let "sor" pass coarse unknowns that nothing resists, of a multigrid solver that is not yet set up for A.
-
-    Aggregates with fewer unknowns than rigid body modes make such: rows and columns of zeros.
-    """
-    PETSc.Options(ksp.getOptionsPrefix())["mg_levels_pc_sor_diagonal_shift"] = 1e-14 * A.norm(PETSc.NormType.INFINITY)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Both linearised problems at once, where factors of K cost too much: large bodies in 3D, very large ones in 2D.
+"""Both linearised problems at once, where factors of K cost too much: large bodies in 3D, larger ones in 2D.
 
     [ K  -B^T ] [du]   [R_u]
     [ B   C   ] [dp] = [R_p]
@@ -18,10 +18,9 @@ step about 10 iterations.  A step takes 6.2 s, 8.5 s where each tangent is facto
 steps of soil that yields, 12^3 cells, 33 and 41 s.  MUMPS factorises 3190 unknowns in 0.2 s, 8610 in 1.4 s (PETSc in
 3.4 s).  No solve takes more than 23 then, nor more than 21 at nu = 0.49 where contrasts are 1e3.
 
-Large bodies in 2D that do not yield have factors of the first K and P of a step in place of the cycles; to 1e-5 the
-solves of the step take 8 iterations.  With 504000 unknowns (10^6 points) a step then spends 14 s in linear algebra
-rather than 24 s, with 150000 as much.  Where soil yields factors serve too short: a footing pushed by 0.015 widths on
-21 cells needs 23 of them rather than 39, and four times as long for its solves.
+Large bodies in 2D that do not yield have cycles of geometric multigrid, see `multigrid`; to 1e-5 a solve takes 8
+iterations, 12 with an algebraic cycle on P.  Where soil yields they take 20 to 500 (a footing on 41 cells): bands that
+slide are a cell wide, and no coarse grid has them.
 
 To give the storage what of K resists changes of volume, p -> p + k B u, leaves K as at nu = 0.3, but pressures that
 alternate almost free: 500 iterations.
@@ -40,12 +39,10 @@ from dolfinx.common import Timer
 from mpm_dolfinx.caching import Latest
 from mpm_dolfinx.problems.momentum import MomentumSystem
 from mpm_dolfinx.problems.storage import StorageSystem
-from mpm_dolfinx.solve.linear import direct_solver, factorise, renewed, solved
+from mpm_dolfinx.solve.linear import direct_solver, factorise, nodal_solver, renewed, solved
 
 MANY, MOST = 29, 500
 """Iterations after which factors take the place of the multigrid cycle on K, and most of all."""
-LAGS = 15
-"""Iterations after which factors of the present K take the place of those of a former one."""
 EARLY = 8
 """After every so many factors do so at once if the residual falls too slowly in them for `MANY` to be enough."""
 RESTART = 200
@@ -55,8 +52,13 @@ Two steps of soil that yields, 24^3 cells on four processes, take 68 s in at mos
 49 s in 109 with 200.  With 30, PETSc's, FGMRES on the Schur complement of a footing on 41 cells stagnates where the
 tangent is nearly singular: solves that end after 500 iterations take 50.  Vectors are allocated as they are needed.
 """
+LEAST = 1e-4
+"""What counts as a little fluid, over what the forces would displace if none was in the pores.
+
+In sealed bodies nearly nothing changes places: with scales that differ by 5e5 rounding left 2e-5 of a residual.
+"""
 FACTORISED = 20000
-"""Unknown displacements up to which K is factorised where the multigrid takes many iterations.
+"""Unknown displacements in 3D up to which K is factorised where the multigrid takes many iterations.
 
 MUMPS takes 8 s and 0.2 GB for as many, where K is not symmetric 15 s and 0.4 GB.
 """
@@ -72,7 +74,7 @@ class BlockOperator:
     momentum_cycle, storage_cycle
         What stands for K^-1 and P^-1.
     factors : Latest
-        Solver with factors of a K, which take the place of its cycle where there are some.
+        Preconditioners with factors of a K, and maybe of a P, which take the place of the cycles where there are some.
     """
 
     def __init__(
@@ -81,10 +83,10 @@ class BlockOperator:
         storage: StorageSystem,
         momentum_cycle: PETSc.PC,
         storage_cycle: PETSc.PC,
-        factors: Latest[PETSc.KSP],
+        factors: Latest[tuple[PETSc.PC, PETSc.PC]],
     ):
         self._momentum, self._storage, self._factors = momentum, storage, factors
-        self._cycle_u, self._cycle_p, self._split = momentum_cycle, storage_cycle, momentum.unknowns.size
+        self._cycles, self._split = (momentum_cycle, storage_cycle), momentum.unknowns.size
         self._u, self._f = momentum.unknowns.vector(), momentum.unknowns.vector()
         self._p, self._g = storage.unknowns.vector(), storage.unknowns.vector()
         self.scale = np.ones(2)
@@ -103,10 +105,19 @@ class BlockOperator:
     def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """Apply the preconditioner."""
         self.part(x, self._f, self._g, *self.scale)
-        self._cycle_p.apply(self._g, self._p)
+        on_u, on_p = self._factors.value or self._cycles
+        on_p.apply(self._g, self._p)
         self._storage.B_momentum.multTransposeAdd(self._p, self._f, self._f)
-        (self._factors.value.pc if self._factors.value else self._cycle_u).apply(self._f, self._u)
+        on_u.apply(self._f, self._u)
         self.join(self._u, self._p, y)
+
+    def displaced(self) -> float:
+        """Return how much fluid the forces of the residual displace, m^d/N."""
+        forces = self._momentum.residual
+        (self._factors.value or self._cycles)[0].apply(forces, self._u)
+        self._storage.B.mult(self._u, self._g)
+        norm = forces.norm()
+        return self._g.norm() / norm if norm > 0 else 0.0
 
     def part(self, x: PETSc.Vec, u: PETSc.Vec, p: PETSc.Vec, scale_u: float = 1.0, scale_p: float = 1.0) -> None:
         """Set (u, p) to the scaled parts of x."""
@@ -129,11 +140,9 @@ class BlockSolver:
     momentum, storage
         The matrices.
     momentum_cycle, storage_cycle
-        One multigrid cycle each on K and on P, or factors of those of a former tangent.
+        One multigrid cycle each on K and on P.
     symmetric
         Whether K is.
-    lags
-        Whether they are factors, which serve all tangents of a step.
     """
 
     def __init__(
@@ -143,13 +152,11 @@ class BlockSolver:
         momentum_cycle: PETSc.PC,
         storage_cycle: PETSc.PC,
         symmetric: bool,
-        lags: bool = False,
     ):
-        self._momentum, self._storage, self._symmetric, self._lags = momentum, storage, symmetric, lags
-        self._cycles = momentum_cycle, storage_cycle
-        self._kept: Latest[bool] = Latest()
-        self._factors: Latest[PETSc.KSP] = Latest()
-        self._operator = BlockOperator(momentum, storage, *self._cycles, self._factors)
+        self._momentum, self._storage, self._symmetric = momentum, storage, symmetric
+        self._storage_cycle = storage_cycle
+        self._factors: Latest[tuple[PETSc.PC, PETSc.PC]] = Latest()
+        self._operator = BlockOperator(momentum, storage, momentum_cycle, storage_cycle, self._factors)
         finalize(self, vars(self._operator).clear)  # PETSc keeps contexts, and what they refer to
         size = (momentum.unknowns.size + storage.unknowns.size, None)
         self._A = PETSc.Mat().createPython((size, size), self._operator, comm=momentum.unknowns.comm)
@@ -169,25 +176,15 @@ class BlockSolver:
     @property
     def factorised(self) -> bool:
         """Whether factors take the place of the multigrid cycle."""
-        return self._lags or self._factors.value is not None
+        return self._factors.value is not None
 
     def begin(self) -> None:
         """Begin a step, which depends on no factors of the one before."""
-        self._kept.clear()
+        self._factors.clear()
 
     def linearise(self) -> None:
-        """Take the present matrices; factors that serve all tangents of a step stay."""
-        if self._lags:
-            self._kept((), self._renew)
-        else:
-            renewed(self._cycles[1], self._storage.P)
-
-    def _renew(self) -> bool:
-        """Make the factors those of the present K and P."""
-        for cycle, matrix in zip(self._cycles, (self._momentum.K, self._storage.P), strict=True):
-            renewed(cycle, matrix)
-        factorise(*self._cycles)
-        return True
+        """Take the present P; factors, which serve all tangents of a step, stay."""
+        renewed(self._storage_cycle, self._storage.P)
 
     def solve(self, du: PETSc.Vec, dp: PETSc.Vec, scale: tuple[float, float], rtol: float) -> int:
         """Solve for (du, dp) with the problems' residuals on the right; return the number of iterations.
@@ -199,15 +196,17 @@ class BlockSolver:
         rtol
             Relative to the norm of both residuals, scaled.
         """
-        self._operator.scale[:] = scale
+        scale_u, scale_p = scale
+        self._operator.scale[:] = scale = scale_u, max(scale_p, LEAST * scale_u * self._operator.displaced())
         self._operator.join(self._momentum.residual, self._storage.residual, self._b, *(1 / s for s in scale))
-        few = self._lags or self._momentum.unknowns.global_size <= FACTORISED
-        self._ksp.setTolerances(rtol=rtol, atol=0.0, max_it=(LAGS if self._lags else MANY) if few else MOST)
+        unknowns = self._momentum.unknowns
+        few = unknowns.dim == 2 or unknowns.global_size <= FACTORISED
+        self._ksp.setTolerances(rtol=rtol, atol=0.0, max_it=MANY if few else MOST)
         self._ksp.solve(self._b, self._x)
         count = solved(self._ksp, "momentum and storage")
         if few and self._ksp.getConvergedReason() < 0:
             with Timer("mpm: factorisation"):
-                self._renew() if self._lags else self._factors(object(), self._factorised)
+                self._factors(object(), self._factorised)
             self._ksp.setTolerances(rtol=rtol, atol=0.0, max_it=MOST)
             self._ksp.setInitialGuessNonzero(True)
             self._ksp.solve(self._b, self._x)
@@ -216,12 +215,20 @@ class BlockSolver:
         self._operator.part(self._x, du, dp)
         return count
 
-    def _factorised(self) -> PETSc.KSP:
-        """Return a solver with factors of the present K, which may change."""
-        ksp = direct_solver(self._momentum.K, "factors", self._symmetric, package="mumps")
-        ksp.setUp()
-        ksp.pc.setReusePreconditioner(True)
-        return ksp
+    def _factorised(self) -> tuple[PETSc.PC, PETSc.PC]:
+        """Return preconditioners with factors of the present K, and in 2D of the present P, which may change."""
+        K, unknowns = self._momentum.K, self._momentum.unknowns
+        if unknowns.dim == 3:
+            solvers = [direct_solver(K, "factors", self._symmetric, package="mumps")]
+        else:
+            solvers = [nodal_solver(K, "factors", unknowns, self._symmetric)]
+            solvers.append(direct_solver(self._storage.P, "storage_factors", often=True))
+        for ksp in solvers:
+            ksp.setUp()
+            ksp.pc.setReusePreconditioner(True)
+        found = [ksp.pc for ksp in solvers]
+        factorise(*found)
+        return found[0], found[1] if found[1:] else self._storage_cycle
 
 
 def _foresight() -> Callable[[PETSc.KSP, int, float], None]:

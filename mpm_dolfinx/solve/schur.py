@@ -14,7 +14,6 @@ would still need the parts.
 
 from __future__ import annotations
 
-from functools import partial
 from weakref import finalize
 
 from petsc4py import PETSc
@@ -28,25 +27,17 @@ from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.problems.momentum import MomentumProblem, MomentumSystem
 from mpm_dolfinx.problems.storage import FILTER, StorageProblem, StorageSystem
 from mpm_dolfinx.solve.linear import (
-    allow_no_diagonal,
     by_mumps,
     direct_solver,
     factorise,
     iterative,
-    lagged,
-    multigrid_solver,
     nodal_solver,
     solved,
 )
 from mpm_dolfinx.solve.monolithic import RESTART, BlockSolver
+from mpm_dolfinx.solve.multigrid import multigrid_solver
 from mpm_dolfinx.solve.scheme import Scheme
 
-CLOSER = 0.01
-"""Share of the accuracy that is asked for of solves with kept factors, whose displacements are not exact.
-
-Two beams take 8, 6, 6, 6 and -, 8, 7, 7 Newton steps, and in them 42, 42, 50, 56 and -, 57, 59, 68 iterations with
-1, 0.1, 0.01, 0.001.
-"""
 WORN = 25
 """Iterations of a solve after which the next tangent has factors of its own fixed-stress operator.
 
@@ -81,8 +72,6 @@ class LinearSolvers:
         Matrices and vectors; storage is None without fluid.
     symmetric
         Whether the momentum's tangent is symmetric.
-    yields
-        Whether the skeleton yields or hardly changes its volume.
     """
 
     def __init__(
@@ -91,22 +80,18 @@ class LinearSolvers:
         momentum: MomentumSystem,
         storage: StorageSystem | None,
         symmetric: bool,
-        yields: bool,
     ):
         self.scheme, self._momentum, self._storage, self.symmetric = scheme, momentum, storage, symmetric
-        self.multigrid = iterative(momentum.unknowns)
+        at_once = storage is not None and not scheme.richardson
+        self.iterative = iterative(momentum.unknowns, at_once, momentum.firm is not None)
         """Whether a multigrid cycle stands for K^-1, not factors."""
-        lags = storage is not None and not scheme.richardson and momentum.firm is None and lagged(momentum.unknowns)
-        self.iterative = self.multigrid or lags
-        """Whether displacements, with pressures if there are any, are solved for by iterations."""
         self.tangent: Latest[bool] = Latest()
         """What the matrices hold the tangent of, where it is kept."""
         self._solve_s = self._schur = self._block = None
         self._operator: Latest[bool] = Latest()  # the fixed-stress operator that has been factorised
-        if self.multigrid:
-            smoother = "sor" if yields or storage is not None else "jacobi"
-            self.solve_u = multigrid_solver(momentum.K, "momentum", smoother)
-            self._modes = momentum.unknowns.rigid_body_modes()
+        if self.iterative:
+            firmly = momentum.locks and momentum.unknowns.dim == 3
+            self.solve_u = multigrid_solver(momentum.K, "momentum", *momentum.places(), nodal=True, firmly=firmly)
         elif storage is None:
             self.solve_u = direct_solver(momentum.K, "momentum", symmetric)
         else:
@@ -117,10 +102,9 @@ class LinearSolvers:
             return
         self.dp, self._g = storage.unknowns.vector(), storage.unknowns.vector()
         """Direction of the pressures."""
-        if self.iterative and not scheme.richardson:
-            make = partial(direct_solver, often=True) if lags else multigrid_solver
-            self._solve_s = make(storage.P, "storage")
-            self._block = BlockSolver(momentum, storage, self.solve_u.pc, self._solve_s.pc, symmetric, lags)
+        if self.iterative and at_once:
+            self._solve_s = multigrid_solver(storage.P, "storage", *storage.places(), nodal=False)
+            self._block = BlockSolver(momentum, storage, self.solve_u.pc, self._solve_s.pc, symmetric)
             return
         n, context = (storage.unknowns.size, None), SchurComplement(storage, self.solve_u)
         finalize(self, vars(context).clear)  # PETSc keeps contexts of its matrices, and what they refer to
@@ -141,7 +125,11 @@ class LinearSolvers:
 
     @property
     def schur(self) -> tuple[PETSc.Mat, PETSc.KSP]:
-        """The Schur complement, and the solver with its preconditioner."""
+        """The Schur complement, and the solver with its preconditioner; ValueError where multigrid takes their place."""
+        if self._schur is None:
+            raise ValueError(
+                "solvers: multigrid solves for both displacements and pressures, without a Schur complement"
+            )
         return self._schur, self._solve_s
 
     def linearise(
@@ -156,9 +144,6 @@ class LinearSolvers:
             if storage is not None:
                 storage.assemble_tangent(data and data.pieces)
         with Timer("mpm: factorisation"):
-            if self.multigrid:
-                K.setNearNullSpace(self._modes)
-                allow_no_diagonal(self.solve_u, K)
             if self._block is None or not self._block.factorised:
                 self.solve_u.setOperators(K)
                 self.solve_u.setUp()
@@ -200,8 +185,7 @@ class LinearSolvers:
             # no 1-norm of PETSc's: OpenBLAS's depends in its last bit on where the vector lies in memory
             size, total = r.norm(), float(over_all(self._storage.unknowns.comm, np.abs(r.array_r).sum()))
             scale_p = (exchanged or 1.0) * (size / total if total > 0 else 1.0)
-            share = 1.0 if self.multigrid else CLOSER
-            return self._block.solve(self.du, self.dp, (scale_u or 1.0, scale_p), share * rtol)
+            return self._block.solve(self.du, self.dp, (scale_u or 1.0, scale_p), rtol)
         g = self.condense()
         self._solve_s.setTolerances(rtol=rtol, atol=0.0, max_it=500)
         self._solve_s.solve(g, self.dp)

@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: MIT
+"""Multigrid on the background grid ends where factors do, in as many iterations on any grid."""
+
+from dataclasses import replace
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.solve import linear, monolithic, multigrid
+from mpm_dolfinx.solve.multigrid import COARSEST, interpolation, interpolations
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch):
+    """Let small bodies be solved by multigrid."""
+    monkeypatch.setattr(linear, "GRIDS", 1)
+    monkeypatch.setattr(multigrid, "COARSEST", 50)
+
+
+def loaded(finer: int = 1, conductivity=1e-5, bulk=6.7e6, shear=3.1e6, cells=(36, 30)) -> mpm.Simulation:
+    """Return a saturated beam, clamped and pressed down more and more."""
+    grid = mpm.Grid(upper=[1.2, 0.4], lower=[0, -0.6], cells=[finer * n for n in cells])
+    law = mpm.Hencky(bulk=bulk, shear=shear, porosity=0.4, conductivity=conductivity)
+    load = mpm.Traction("top", lambda t: (0, -1e5 * t))
+    body, water = mpm.box(grid, [0, 0], [1, 0.3], per_cell=2), {"fluid": mpm.Fluid()}
+    drained = [mpm.Drained("right")]
+    return mpm.Simulation(grid, [body], [law], fixed={"left": "xy"}, tractions=[load], drained=drained, **water)
+
+
+def factorised(monkeypatch) -> list[int]:
+    """Return a list that grows with each factorisation that takes the place of the cycles."""
+    made, factorise = [], monolithic.BlockSolver._factorised
+    monkeypatch.setattr(monolithic.BlockSolver, "_factorised", lambda self: made.append(1) or factorise(self))
+    return made
+
+
+def same_end(one: mpm.Simulation, other: mpm.Simulation) -> None:
+    """Assert that two simulations have come to the same state."""
+    assert np.abs(one.points.x - other.points.x).max() < 1e-10
+    scale = np.abs(one.points.pressure).max()
+    assert other.points.pressure == pytest.approx(one.points.pressure, abs=1e-8 * scale)
+
+
+def test_large_elastic_bodies_in_2d_end_where_those_do_whose_matrices_are_factorised(monkeypatch):
+    made, ends, newton = factorised(monkeypatch), [], []
+    for least in (10**6, 1):
+        monkeypatch.setattr(linear, "GRIDS", least)
+        ends.append(loaded())
+        newton.append(sum(ends[-1].step(0.02).newton for _ in range(4)))
+    same_end(*ends)
+    assert newton[1] <= newton[0] + 1 and not made
+
+
+def test_finer_grids_take_no_more_iterations():
+    for finer in (1, 2, 4):
+        report = loaded(finer).step(0.02)
+        assert report.coupling < 11 * report.newton, finer
+
+
+def layers(X, below: float, above: float):
+    """Return values of a lower layer, a third of the body, and of what is above it."""
+    return np.where(X[:, 1] < 0.1, below, above)
+
+
+STIFF_BELOW = {"bulk": lambda X: layers(X, 6e9, 6e6), "shear": lambda X: layers(X, 3e9, 3e6)}
+HARD = {
+    "nu = 0.495": {"bulk": 310e6},
+    "conductivities 1 : 1e6": {"conductivity": lambda X: layers(X, 1e-9, 1e-3)},
+    "stiffnesses 1 : 1000": STIFF_BELOW,
+    "cells of 1 : 6": {"cells": (12, 60)},
+}
+
+
+@pytest.mark.parametrize("scene", HARD)
+def test_contrasts_and_slender_cells_take_few_iterations_more(scene, monkeypatch):
+    counts, solve, ends = [], monolithic.BlockSolver.solve, []
+    monkeypatch.setattr(monolithic.BlockSolver, "solve", lambda *a: counts.append(solve(*a)) or counts[-1])
+    for least in (10**6, 1):
+        monkeypatch.setattr(linear, "GRIDS", least)
+        ends.append(loaded(2, **HARD[scene]))
+        ends[-1].step(0.02)
+    same_end(*ends)
+    assert 0 < max(counts) < monolithic.MANY
+
+
+def test_factors_take_the_place_of_cycles_that_take_many_iterations_and_serve_the_rest_of_the_step(monkeypatch):
+    made, ends, took = factorised(monkeypatch), [], []
+    for most in (1000, 12):
+        monkeypatch.setattr(monolithic, "MANY", most)
+        made.clear()
+        ends.append(loaded(2, **STIFF_BELOW))
+        took.append((ends[-1].step(0.02), len(made)))
+    same_end(*ends)
+    (cycles, none), (factors, some) = took
+    assert none == 0 < some < factors.newton / 2 and factors.coupling < cycles.coupling
+
+
+def test_a_step_depends_on_no_step_before(monkeypatch):
+    """As it must for a run that is resumed to go on as the first one did."""
+    monkeypatch.setattr(monolithic, "MANY", 4)
+    first, second = loaded(), loaded()
+    first.step(0.02)
+    second.state = replace(first.state, stage=second.state.stage)
+    first.step(0.02), second.step(0.02)
+    assert np.array_equal(first.points.x, second.points.x)
+
+
+cells_of_bodies = st.lists(st.tuples(st.integers(0, 40), st.integers(0, 40)), min_size=1, max_size=400)
+
+
+@given(cells_of_bodies, st.booleans(), st.integers(1, 3))
+def test_linear_functions_are_interpolated_exactly_between_nodes_and_constants_between_cells(cells, nodal, kinds):
+    index = np.unique(cells, axis=0)
+    if nodal:
+        corners = np.array([[0, 0], [1, 0], [0, 1], [1, 1]])
+        index = np.unique((index[:, None] + corners).reshape(-1, 2), axis=0)
+    places = np.column_stack([np.repeat(index, kinds, axis=0), np.tile(np.arange(kinds), len(index))])
+    Q, coarse, _ = interpolation(MPI.COMM_SELF, places, places[:0], nodal)
+    assert len(np.unique(coarse, axis=0)) == len(coarse) == Q.size[1] <= len(places)
+    x, y = Q.createVecs()
+    x.array_w[:] = 1 + coarse @ ([6.0, -10.0, 100.0] if nodal else [0, 0, 100.0])
+    Q.mult(x, y)
+    assert y.array == pytest.approx(1 + places @ ([3.0, -5.0, 100.0] if nodal else [0, 0, 100.0]), abs=1e-10)
+
+
+@given(cells_of_bodies, st.booleans(), st.sampled_from([None, "left", "bottom"]))
+def test_coarse_unknowns_do_not_depend_on_one_another(cells, nodal, wall):
+    """Else coarse matrices were singular."""
+    index = np.unique(cells, axis=0)
+    if nodal:
+        corners = np.array([[0, 0], [1, 0], [0, 1], [1, 1]])
+        index = np.unique((index[:, None] + corners).reshape(-1, 2), axis=0)
+    places = np.column_stack([index, np.zeros(len(index), dtype=np.int64)])
+    fixed = np.zeros(len(index), dtype=bool)
+    if nodal and wall is not None:
+        fixed = index[:, int(wall == "bottom")] == 0
+    places, held = places[~fixed], places[fixed]
+    whole = np.eye(len(places))
+    for _ in range(3):
+        Q, places, held = interpolation(MPI.COMM_SELF, places, held, nodal)
+        whole = whole @ Q.convert("dense").getDenseArray().reshape(Q.size, order="F")
+        singular = np.linalg.svd(whole, compute_uv=False)
+        assert len(singular) == whole.shape[1] and singular.min(initial=1.0) > 1e-6
+
+
+def test_bodies_of_few_cells_that_coarse_grids_do_not_unite_are_left_to_factors():
+    i = np.arange(0, 400, 8)
+    index = np.stack([values.ravel() for values in np.meshgrid(i, i)], axis=1)
+    places = np.column_stack([index + 1, np.zeros(len(index), dtype=np.int64)])
+    steps = interpolations(MPI.COMM_SELF, places, places[:0], nodal=True)
+    assert len(steps) == 1 and len(places) > COARSEST
