@@ -37,13 +37,14 @@ import numpy as np
 from dolfinx.common import Timer
 
 from mpm_dolfinx.caching import Latest
+from mpm_dolfinx.forms.unknowns import Unknowns
 from mpm_dolfinx.problems.momentum import MomentumSystem
 from mpm_dolfinx.problems.storage import StorageSystem
 from mpm_dolfinx.solve.linear import direct_solver, factorise, nodal_solver, renewed, solved
 
 MANY, MOST = 29, 500
 """Iterations after which factors take the place of the multigrid cycle on K, and most of all."""
-EARLY = 8
+EARLY = 6
 """After every so many factors do so at once if the residual falls too slowly in them for `MANY` to be enough."""
 RESTART = 200
 """Iterations after which GMRES starts anew.
@@ -62,6 +63,11 @@ FACTORISED = 20000
 
 MUMPS takes 8 s and 0.2 GB for as many, where K is not symmetric 15 s and 0.4 GB.
 """
+
+
+def factorisable(unknowns: Unknowns) -> bool:
+    """Return whether factors of K may take the place of its cycle."""
+    return unknowns.dim == 2 or unknowns.global_size <= FACTORISED
 
 
 class BlockOperator:
@@ -199,8 +205,7 @@ class BlockSolver:
         scale_u, scale_p = scale
         self._operator.scale[:] = scale = scale_u, max(scale_p, LEAST * scale_u * self._operator.displaced())
         self._operator.join(self._momentum.residual, self._storage.residual, self._b, *(1 / s for s in scale))
-        unknowns = self._momentum.unknowns
-        few = unknowns.dim == 2 or unknowns.global_size <= FACTORISED
+        few = factorisable(self._momentum.unknowns)
         self._ksp.setTolerances(rtol=rtol, atol=0.0, max_it=MANY if few else MOST)
         self._ksp.solve(self._b, self._x)
         count = solved(self._ksp, "momentum and storage")

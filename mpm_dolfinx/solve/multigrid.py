@@ -18,6 +18,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 import numpy as np
+from dolfinx.common import Timer
 from numpy.typing import NDArray
 
 from mpm_dolfinx.parallel.exchange import Exchange, over_all
@@ -31,10 +32,10 @@ OPTIONS = {
     "mg_levels_pc_type": "sor",
 }
 FIRMLY = {"mg_levels_ksp_type": "chebyshev", "mg_levels_ksp_max_it": "3"}
-"""Smoothing in 3D where volumes hardly change.
+"""Smoothing where volumes hardly change and factors may not take the place of cycles.
 
 Two steps of a cube of 14^3 cells with layers of 1 : 1000 at nu = 0.49, without factors, take 126 iterations a solve (by
-GAMG 112); with a single sweep GMRES breaks off.  Where factors come after `MANY` iterations, both take as long.
+GAMG 112); with a single sweep GMRES breaks off.  With factors both take as long.
 """
 MAYBE, NOT, IS = 0, 1, 2  # see `_shared`
 NONE = np.iinfo(np.int64).max
@@ -67,7 +68,8 @@ def multigrid_solver(
     ksp.setType(PETSc.KSP.Type.GMRES)
     ksp.setPCSide(PETSc.PC.Side.RIGHT)
     ksp.setOptionsPrefix(f"mpm_{name}_firmly_" if firmly else f"mpm_{name}_")
-    steps = interpolations(A.comm.tompi4py(), places, held, nodal)
+    with Timer("mpm: factorisation"):
+        steps = interpolations(A.comm.tompi4py(), places, held, nodal)
     ksp.pc.setType(PETSc.PC.Type.MG)
     ksp.pc.setMGLevels(len(steps) + 1)
     for level, Q in zip(range(len(steps), 0, -1), steps, strict=True):

@@ -34,7 +34,7 @@ from mpm_dolfinx.solve.linear import (
     nodal_solver,
     solved,
 )
-from mpm_dolfinx.solve.monolithic import RESTART, BlockSolver
+from mpm_dolfinx.solve.monolithic import RESTART, BlockSolver, factorisable
 from mpm_dolfinx.solve.multigrid import multigrid_solver
 from mpm_dolfinx.solve.scheme import Scheme
 
@@ -90,7 +90,7 @@ class LinearSolvers:
         self._solve_s = self._schur = self._block = None
         self._operator: Latest[bool] = Latest()  # the fixed-stress operator that has been factorised
         if self.iterative:
-            firmly = momentum.locks and momentum.unknowns.dim == 3
+            firmly = momentum.locks and not (at_once and factorisable(momentum.unknowns))
             self.solve_u = multigrid_solver(momentum.K, "momentum", *momentum.places(), nodal=True, firmly=firmly)
         elif storage is None:
             self.solve_u = direct_solver(momentum.K, "momentum", symmetric)
@@ -125,11 +125,9 @@ class LinearSolvers:
 
     @property
     def schur(self) -> tuple[PETSc.Mat, PETSc.KSP]:
-        """The Schur complement, and the solver with its preconditioner; ValueError where multigrid takes their place."""
+        """The Schur complement, and the solver with its preconditioner; ValueError where there is none."""
         if self._schur is None:
-            raise ValueError(
-                "solvers: multigrid solves for both displacements and pressures, without a Schur complement"
-            )
+            raise ValueError("solvers: multigrid solves for displacements and pressures at once, must be factors")
         return self._schur, self._solve_s
 
     def linearise(
