@@ -45,6 +45,8 @@ def step(scene: Scene, state: State, dt: float) -> tuple[State, Report]:
         both, key = balances(scene, start, acting, *rates[-1:]), (on_grid.key, state.stage, acting.substep.own * dt)
         rates.append(solve_substep(solvers, *both, as_reset, key, report))
     note_pressures(report, solvers, both.storage, acting.substep.before * dt, dt, rates)
+    del solvers
+    start.matrices.end_step()
     mechanical, at = state.stage.mechanical, (start.matrices.momentum.unknowns, scene.momentum.u.x.array)
     reactions = mechanical.reactions(acting.sides, scene.momentum.nodal)
     outflows = both.storage.outflows(len(state.stage.hydraulic.outlets)) if both.storage else state.outflows

@@ -92,6 +92,7 @@ def test_factors_take_the_place_of_cycles_that_take_many_iterations_and_serve_th
     made, ends, took = factorised(monkeypatch), [], []
     for most in (1000, 12):
         monkeypatch.setattr(monolithic, "MANY", most)
+        monkeypatch.setattr(monolithic, "EARLY", most // 2)
         made.clear()
         ends.append(loaded(2, **STIFF_BELOW))
         took.append((ends[-1].step(0.02), len(made)))

@@ -191,6 +191,17 @@ def loaded(conductivity: float = 1e-5) -> mpm.Simulation:
     return mpm.Simulation(grid, [body], [law], fixed={"left": "xy"}, tractions=[load], drained=drained, **water)
 
 
+def test_water_flows_through_a_body_whose_nodes_are_all_held():
+    """PETSc's factors in blocks of a matrix without rows ended the process."""
+    grid = mpm.Grid([1.0, 0.1], [10, 1])
+    soil, ends = mpm.Hencky(bulk=2e6, shear=1e6, conductivity=1e-3), (("left", 1e3), ("right", 0.0))
+    conditions = {"fluid": mpm.Fluid(), "drained": [mpm.Drained(side, pressure=p) for side, p in ends]}
+    body, walls = mpm.box(grid, [0, 0], [1, 0.1]), {"bottom": "xy", "top": "xy"}
+    s = mpm.Simulation(grid, [body], [soil], fixed=walls, **conditions)
+    s.run(1.0, 0.5, progress=False)
+    assert s.points.pressure == pytest.approx(1e3 * (1 - s.points.x[:, 0]), abs=1.0)
+
+
 def strip_pushed() -> mpm.Simulation:
     """Return saturated soil, of which a given displacement, 0.01 m a second, pushes half of the top."""
     grid, half = mpm.Grid([1.0, 1.25], [12, 15]), ((-np.inf, -np.inf), (0.45, np.inf))
@@ -229,6 +240,6 @@ def test_solvers_go_with_their_step_without_the_help_of_pythons_collector(solver
     try:
         for _ in range(3):
             s.step(0.02)
-            assert len(made) == 1
+            assert len(made) == (solvers == "factors"), "coarse grids are gone before the points move"
     finally:
         gc.enable()

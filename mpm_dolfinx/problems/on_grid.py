@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.caching import Keyed, Latest
 from mpm_dolfinx.constitutive.fluid_content import mass_potential, pressure_of
+from mpm_dolfinx.forms.unknowns import collect_garbage
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.cut_domains import CutDomains
 from mpm_dolfinx.points.grid import sum_by
@@ -254,6 +255,14 @@ class System:
         solvers.begin()
         return solvers
 
+    def end_step(self) -> None:
+        """Drop coarse grids that hold no tangent for other steps, before the points need the memory to move."""
+        made = self._solvers.value
+        if made is not None and made.iterative and made.tangent.value is None:
+            del made
+            self._solvers.clear()
+            collect_garbage(self.momentum.unknowns.comm)
+
 
 class Assembled:
     """What stays while a cut serves and a stage lasts: penalties and fluxes, in the matrices of a system.
@@ -282,7 +291,7 @@ class Assembled:
         sides: SideData,
     ):
         self.momentum, self.storage, self.symmetric = system.momentum, system.storage, system.symmetric
-        self.solvers = system.solvers
+        self.solvers, self.end_step = system.solvers, system.end_step
         self._on_grid, self._stage, grid = on_grid, stage, on_grid.cut.grid
         self._u, self._varies = momentum.u, storage is not None and storage.conductivity is not None
         self._by_pressure = storage if self._varies and storage.conductivity.pressure is not None else None

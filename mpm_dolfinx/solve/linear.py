@@ -270,12 +270,14 @@ class NodalFactors:
 
     def factorise(self, rows: NDArray[np.int32], columns: NDArray[np.int32], values: NDArray[np.float64]) -> None:
         """Factorise the matrix of these entries."""
+        if len(rows) == 1:  # walls hold all nodes: PETSc has no factors of nothing
+            return
         make = (rows, columns, *self._nodes, self._dim, self._symmetric)
         self._factors((rows, columns), lambda: BlockFactors(*make)).factorise(values)
 
     def solve(self, b: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the solution for all unknowns."""
-        return self._factors.value.solve(b)
+        return self._factors.value.solve(b) if len(b) else b
 
 
 def dissection(x: NDArray[np.float64]) -> NDArray[np.int64]:

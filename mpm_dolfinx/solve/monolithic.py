@@ -7,20 +7,20 @@
 GMRES, preconditioned from the right with the upper triangle in which the fixed-stress operator P = C + beta V
 stands for the Schur complement C + B K^-1 B^T, and one multigrid cycle each for K^-1 and P^-1.
 
-To 1e-3 it takes 7 to 12 iterations, each with one cycle on K, 11 to 26 at nu = 0.49 or where contrasts are 1e3.  With
-Jacobi's smoothing of K (10 to 15, and 100 at nu = 0.49), conjugate gradients on the Schur complement took 3, but with
-35 to 60 cycles in their inner solves; flexible GMRES with inner solves to 0.1 or 0.01 12 to 24 cycles, MINRES with the
-diagonal blocks 17 to 23, leaving five times the residual.
+In 3D it takes 7 to 12 iterations to 1e-3, each with one cycle on K.  With algebraic multigrid and Jacobi's smoothing
+(10 to 15), conjugate gradients on the Schur complement took 3, but with 35 to 60 cycles in their inner solves; flexible
+GMRES with inner solves to 0.1 or 0.01 12 to 24 cycles, MINRES with the diagonal blocks 17 to 23, leaving five times the
+residual.  In 2D it takes 8 to 1e-5, 12 with an algebraic cycle on P.
 
-At nu = 0.499 the cycle is poor: 53 to 146 iterations with 14^3 cells.  A solve that takes `MANY`, or is foreseen to,
-goes on with factors of K in place of the cycle, which serve until they take as many: for the other tangents of the
+At nu = 0.499 the cycle is poor: more than 100 iterations with 14^3 cells.  A solve that takes `MANY`, or is foreseen
+to, goes on with factors of K in place of the cycle, which serve until they take as many: for the other tangents of the
 step about 10 iterations.  A step takes 6.2 s, 8.5 s where each tangent is factorised (then 4 to 6 iterations); four
 steps of soil that yields, 12^3 cells, 33 and 41 s.  MUMPS factorises 3190 unknowns in 0.2 s, 8610 in 1.4 s (PETSc in
-3.4 s).  No solve takes more than 23 then, nor more than 21 at nu = 0.49 where contrasts are 1e3.
+3.4 s).  No solve takes more than 19 then, nor more than 22 at nu = 0.49 where contrasts are 1e3.
 
-Large bodies in 2D that do not yield have cycles of geometric multigrid, see `multigrid`; to 1e-5 a solve takes 8
-iterations, 12 with an algebraic cycle on P.  Where soil yields they take 20 to 500 (a footing on 41 cells): bands that
-slide are a cell wide, and no coarse grid has them.
+In 2D soil that yields would take 20 to 500 (a footing on 41 cells, whatever smooths): bands that slide are a cell wide,
+and no coarse grid has them.  With a viscosity of 0.05 it takes 28, and on 41 cells a tenth less time than factors, but
+on 81 cells 1.7 times as much.
 
 To give the storage what of K resists changes of volume, p -> p + k B u, leaves K as at nu = 0.3, but pressures that
 alternate almost free: 500 iterations.

@@ -11,8 +11,8 @@ with the fixed-stress operator C + beta V (beta = 0.75 alpha^2 / K_dr), filtered
 that alternate from cell to cell (`StorageProblem.assemble_preconditioner`).  These are two separate
 solvers, accelerated.  `schur-fgmres` does the same with the full, slightly unsymmetric Jacobian.
 `fixed-stress` is the Richardson iteration of the fixed-stress split: a storage solve with C + beta V at frozen stress,
-then a momentum solve, in turn.  Large bodies in 3D, of which factors of K cost too much, are solved by
-iterations: `schur-...` then solve both problems at once, see `monolithic`.
+then a momentum solve, in turn.  Large bodies, of which factors of K cost too much, are solved by multigrid:
+`schur-...` then solve both problems at once, see `monolithic`.
 """
 
 from __future__ import annotations

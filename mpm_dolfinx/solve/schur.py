@@ -5,7 +5,7 @@
     [ B   C   ] [dp] = - [R_p]
 
 du is eliminated: S = C + B K^-1 B^T is solved with by conjugate gradients (or FGMRES), preconditioned with the
-fixed-stress operator.  Large bodies in 3D solve both at once, see `monolithic`.
+fixed-stress operator.  Of large bodies both are solved for at once, see `monolithic`.
 
 PETSc's PCFIELDSPLIT with the same two solvers (full Schur factorisation) takes as many iterations, ends with the same
 digits, and takes 0.8 to 1 of the time of a solve.  It wants a copy of -B^T at each tangent, and fixed-stress iterations
