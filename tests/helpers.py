@@ -37,6 +37,16 @@ def beam(*, fluid=True, ramp=0.06, load=54e3, offset=0.5, h=0.03, material=SOFT,
     return simulation, mpm.probes([body], [[1.0, bottom + 0.15]])
 
 
+def pressed(finer: int = 1, conductivity=1e-5, bulk=6.7e6, shear=3.1e6, cells=(36, 30)) -> mpm.Simulation:
+    """Return a saturated beam, clamped and pressed down more and more."""
+    grid = mpm.Grid(upper=[1.2, 0.4], lower=[0, -0.6], cells=[finer * n for n in cells])
+    law = mpm.Hencky(bulk=bulk, shear=shear, porosity=0.4, conductivity=conductivity)
+    load = mpm.Traction("top", lambda t: (0, -1e5 * t))
+    body, water = mpm.box(grid, [0, 0], [1, 0.3], per_cell=2), {"fluid": mpm.Fluid()}
+    drained = [mpm.Drained("right")]
+    return mpm.Simulation(grid, [body], [law], fixed={"left": "xy"}, tractions=[load], drained=drained, **water)
+
+
 def limit(simulation, newton):
     """Let a simulation take so many Newton steps before a step is cut; before its first step."""
     simulation.scene.scheme = replace(simulation.scene.scheme, most_newton=newton)

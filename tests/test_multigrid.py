@@ -7,7 +7,7 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
-from helpers import column
+from helpers import column, pressed
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -21,16 +21,6 @@ def small(monkeypatch):
     """Let small bodies be solved by multigrid."""
     monkeypatch.setattr(linear, "GRIDS", 1)
     monkeypatch.setattr(multigrid, "COARSEST", 50)
-
-
-def loaded(finer: int = 1, conductivity=1e-5, bulk=6.7e6, shear=3.1e6, cells=(36, 30)) -> mpm.Simulation:
-    """Return a saturated beam, clamped and pressed down more and more."""
-    grid = mpm.Grid(upper=[1.2, 0.4], lower=[0, -0.6], cells=[finer * n for n in cells])
-    law = mpm.Hencky(bulk=bulk, shear=shear, porosity=0.4, conductivity=conductivity)
-    load = mpm.Traction("top", lambda t: (0, -1e5 * t))
-    body, water = mpm.box(grid, [0, 0], [1, 0.3], per_cell=2), {"fluid": mpm.Fluid()}
-    drained = [mpm.Drained("right")]
-    return mpm.Simulation(grid, [body], [law], fixed={"left": "xy"}, tractions=[load], drained=drained, **water)
 
 
 def factorised(monkeypatch) -> list[int]:
@@ -51,7 +41,7 @@ def test_large_elastic_bodies_in_2d_end_where_those_do_whose_matrices_are_factor
     made, ends, newton = factorised(monkeypatch), [], []
     for least in (10**6, 1):
         monkeypatch.setattr(linear, "GRIDS", least)
-        ends.append(loaded())
+        ends.append(pressed())
         newton.append(sum(ends[-1].step(0.02).newton for _ in range(4)))
     same_end(*ends)
     assert newton[1] <= newton[0] + 1 and not made
@@ -59,7 +49,7 @@ def test_large_elastic_bodies_in_2d_end_where_those_do_whose_matrices_are_factor
 
 def test_finer_grids_take_no_more_iterations():
     for finer in (1, 2, 4):
-        report = loaded(finer).step(0.02)
+        report = pressed(finer).step(0.02)
         assert report.coupling < 11 * report.newton, finer
 
 
@@ -83,7 +73,7 @@ def test_contrasts_and_slender_cells_take_few_iterations_more(scene, monkeypatch
     monkeypatch.setattr(monolithic.BlockSolver, "solve", lambda *a: counts.append(solve(*a)) or counts[-1])
     for least in (10**6, 1):
         monkeypatch.setattr(linear, "GRIDS", least)
-        ends.append(loaded(2, **HARD[scene]))
+        ends.append(pressed(2, **HARD[scene]))
         ends[-1].step(0.02)
     same_end(*ends)
     assert 0 < max(counts) < monolithic.MANY
@@ -95,17 +85,27 @@ def test_factors_take_the_place_of_cycles_that_take_many_iterations_and_serve_th
         monkeypatch.setattr(monolithic, "MANY", most)
         monkeypatch.setattr(monolithic, "EARLY", most // 2)
         made.clear()
-        ends.append(loaded(2, **STIFF_BELOW))
+        ends.append(pressed(2, **STIFF_BELOW))
         took.append((ends[-1].step(0.02), len(made)))
     same_end(*ends)
     (cycles, none), (factors, some) = took
     assert none == 0 < some < factors.newton / 2 and factors.coupling < cycles.coupling
 
 
+def test_factors_that_take_many_iterations_are_made_anew(monkeypatch):
+    made, ends = factorised(monkeypatch), []
+    for most in (1000, 4):
+        monkeypatch.setattr(monolithic, "MANY", most)
+        ends.append(pressed())
+        ends[-1].step(0.02)
+    same_end(*ends)
+    assert len(made) > 1
+
+
 def test_a_step_depends_on_no_step_before(monkeypatch):
     """As it must for a run that is resumed to go on as the first one did."""
     monkeypatch.setattr(monolithic, "MANY", 4)
-    first, second = loaded(), loaded()
+    first, second = pressed(), pressed()
     first.step(0.02)
     second.state = replace(first.state, stage=second.state.stage)
     first.step(0.02), second.step(0.02)
@@ -120,15 +120,19 @@ def test_sealed_bodies_in_which_hardly_any_fluid_changes_places_converge(bulk, l
     assert result.cuts == 0 and result.residual <= 1e-8 and result.balance <= 1e-8
 
 
+def indices(cells: list[tuple[int, int]], nodal: bool):
+    """Return the indices of cells, or of their nodes."""
+    if nodal:
+        cells = [(i + k, j + l) for i, j in cells for k in (0, 1) for l in (0, 1)]
+    return np.unique(cells, axis=0)
+
+
 cells_of_bodies = st.lists(st.tuples(st.integers(0, 40), st.integers(0, 40)), min_size=1, max_size=400)
 
 
 @given(cells_of_bodies, st.booleans(), st.integers(1, 3))
 def test_linear_functions_are_interpolated_exactly_between_nodes_and_constants_between_cells(cells, nodal, kinds):
-    index = np.unique(cells, axis=0)
-    if nodal:
-        corners = np.array([[0, 0], [1, 0], [0, 1], [1, 1]])
-        index = np.unique((index[:, None] + corners).reshape(-1, 2), axis=0)
+    index = indices(cells, nodal)
     places = np.column_stack([np.repeat(index, kinds, axis=0), np.tile(np.arange(kinds), len(index))])
     Q, coarse, _ = interpolation(MPI.COMM_SELF, places, places[:0], nodal)
     assert len(np.unique(coarse, axis=0)) == len(coarse) == Q.size[1] <= len(places)
@@ -141,10 +145,7 @@ def test_linear_functions_are_interpolated_exactly_between_nodes_and_constants_b
 @given(cells_of_bodies, st.booleans(), st.sampled_from([None, "left", "bottom"]))
 def test_coarse_unknowns_do_not_depend_on_one_another(cells, nodal, wall):
     """Else coarse matrices were singular."""
-    index = np.unique(cells, axis=0)
-    if nodal:
-        corners = np.array([[0, 0], [1, 0], [0, 1], [1, 1]])
-        index = np.unique((index[:, None] + corners).reshape(-1, 2), axis=0)
+    index = indices(cells, nodal)
     places = np.column_stack([index, np.zeros(len(index), dtype=np.int64)])
     fixed = np.zeros(len(index), dtype=bool)
     if nodal and wall is not None:

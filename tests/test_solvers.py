@@ -8,7 +8,7 @@ from petsc4py import PETSc
 
 import numpy as np
 import pytest
-from helpers import SOFT
+from helpers import SOFT, pressed
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.solve import linear, monolithic, schur
@@ -181,16 +181,6 @@ def test_factors_in_place_of_a_multigrid_cycle_are_made_once_and_serve_other_tan
     assert PETSc.Log.Event("MatCholFctrNum").getPerfInfo()["count"] - before == len(asked) > 0
 
 
-def loaded(conductivity: float = 1e-5) -> mpm.Simulation:
-    """Return a saturated beam, clamped and pressed down more and more."""
-    grid = mpm.Grid(upper=[1.2, 0.4], lower=[0, -0.6], cells=[36, 30])
-    law = mpm.Hencky(bulk=6.7e6, shear=3.1e6, porosity=0.4, conductivity=conductivity)
-    load = mpm.Traction("top", lambda t: (0, -1e5 * t))
-    body, water = mpm.box(grid, [0, 0], [1, 0.3], per_cell=2), {"fluid": mpm.Fluid()}
-    drained = [mpm.Drained("right")]
-    return mpm.Simulation(grid, [body], [law], fixed={"left": "xy"}, tractions=[load], drained=drained, **water)
-
-
 def test_water_flows_through_a_body_whose_nodes_are_all_held():
     """PETSc's factors in blocks of a matrix without rows ended the process."""
     grid = mpm.Grid([1.0, 0.1], [10, 1])
@@ -227,14 +217,14 @@ def test_large_bodies_that_yield_end_where_small_ones_do_by_mumps(monkeypatch):
     assert mumps.pressure == pytest.approx(petsc.pressure, abs=1e-7 * np.abs(petsc.pressure).max())
 
 
-@pytest.mark.parametrize("solvers", ["factors", "multigrid on the grid", "multigrid"])
+@pytest.mark.parametrize("solvers", ["factors", "multigrid in 2D", "multigrid in 3D"])
 def test_solvers_go_with_their_step_without_the_help_of_pythons_collector(solvers, monkeypatch):
     """Their factors are most of what a large body takes."""
     made, make = weakref.WeakSet(), schur.LinearSolvers.__init__
     monkeypatch.setattr(schur.LinearSolvers, "__init__", lambda self, *a: made.add(self) or make(self, *a))
-    monkeypatch.setattr(linear, "GRIDS", 1 if solvers == "multigrid on the grid" else linear.GRIDS)
+    monkeypatch.setattr(linear, "GRIDS", 1 if solvers == "multigrid in 2D" else linear.GRIDS)
     soil = mpm.Hencky(bulk=500e6, shear=1e6, conductivity=1e-7)
-    s = quarter_pushed(soil, 8, 0.01) if solvers == "multigrid" else loaded()
+    s = quarter_pushed(soil, 8, 0.01) if solvers == "multigrid in 3D" else pressed()
     gc.collect()
     gc.disable()
     try:

@@ -215,10 +215,8 @@ def _points(arrays: dict[str, NDArray], like: MaterialPoints, ids: NDArray[np.in
 
 def _nodes(grid: Grid) -> NDArray[np.int64]:
     """Return the lexicographic numbers of the nodes of this process."""
-    index = np.rint((grid.node_x - grid.lower) / grid.h).astype(np.int64)
-    copy = np.zeros(len(index), dtype=np.int64)
-    copy[grid.cell_nodes] = (grid.cell_number // grid.cells)[:, None]
-    return np.ravel_multi_index(tuple(index.T), tuple(grid.shape + 1)) + copy * grid.nodes
+    *index, copy = grid.node_places(np.arange(len(grid.node_x))).T
+    return np.ravel_multi_index(tuple(index), tuple(grid.shape + 1)) + copy * grid.nodes
 
 
 def _nodal_of_all(grid: Grid, name: str, nodal: NDArray[np.float64] | None) -> dict[str, NDArray]:

@@ -295,7 +295,7 @@ class Grid:
 
     def beside(self, cells: NDArray[np.integer]) -> NDArray[np.int64]:
         """Return the local cells (n, d, 2) beside local cells, by axis and end, -1 where this process has none."""
-        index = np.stack(np.unravel_index(self.cell_number[cells] % self.cells, tuple(self.shape)), axis=1)
+        index = self.cell_places(cells)
         out = np.full((len(cells), self.dim, 2), -1, dtype=np.int64)
         for axis in range(self.dim):
             stride = int(np.prod(self.shape[axis + 1 :]))

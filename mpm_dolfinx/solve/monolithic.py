@@ -97,6 +97,11 @@ class BlockOperator:
         self._p, self._g = storage.unknowns.vector(), storage.unknowns.vector()
         self.scale = np.ones(2)
 
+    @property
+    def _inverses(self) -> tuple[PETSc.PC, PETSc.PC]:
+        """What stands for K^-1 and P^-1."""
+        return self._factors.value or self._cycles
+
     def mult(self, A: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """Multiply by the operator."""
         s = self._storage
@@ -111,7 +116,7 @@ class BlockOperator:
     def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """Apply the preconditioner."""
         self.part(x, self._f, self._g, *self.scale)
-        on_u, on_p = self._factors.value or self._cycles
+        on_u, on_p = self._inverses
         on_p.apply(self._g, self._p)
         self._storage.B_momentum.multTransposeAdd(self._p, self._f, self._f)
         on_u.apply(self._f, self._u)
@@ -120,7 +125,7 @@ class BlockOperator:
     def displaced(self) -> float:
         """Return how much fluid the forces of the residual displace, m^d/N."""
         forces = self._momentum.residual
-        (self._factors.value or self._cycles)[0].apply(forces, self._u)
+        self._inverses[0].apply(forces, self._u)
         self._storage.B.mult(self._u, self._g)
         norm = forces.norm()
         return self._g.norm() / norm if norm > 0 else 0.0

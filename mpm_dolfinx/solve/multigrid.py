@@ -18,6 +18,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 import numpy as np
+import scipy.sparse
 from dolfinx.common import Timer
 from numpy.typing import NDArray
 
@@ -114,17 +115,18 @@ def interpolation(
     among = np.concatenate([coarse, beside])
     shape = tuple(int(n) for n in over_all(comm, among.max(axis=0, initial=0), MPI.MAX) + 3)  # indices are -1 and more
     keys, at = np.unique(np.ravel_multi_index((among + 1).T, shape), return_inverse=True)
-    said = np.zeros(len(keys), dtype=np.int64)
-    np.maximum.at(said, at, says)
+    said = np.full(len(keys), MAYBE)
+    for word in (NOT, IS):
+        said[at[says == word]] = word
     number, mine = _shared(comm, keys, int(np.prod(shape)), said)
     column = number[at[: len(coarse)]]
-    kept = np.flatnonzero(column != NONE)
-    kept = kept[np.lexsort((column[kept], rows[kept]))]
+    kept = column != NONE
     rows, column, weights = rows[kept], column[kept], weights[kept]
     if not nodal:
         weights = weights / np.bincount(rows, weights, len(places))[rows]
-    starts = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=len(places)))])
-    csr = starts.astype(PETSc.IntType), column.astype(PETSc.IntType), weights
+    Q = scipy.sparse.coo_matrix((weights, (rows, column)), shape=(len(places), column.max(initial=-1) + 1)).tocsr()
+    Q.sort_indices()
+    csr = Q.indptr.astype(PETSc.IntType), Q.indices.astype(PETSc.IntType), Q.data
     sizes = (len(places), None), (np.count_nonzero(mine), None)
     found = np.column_stack(np.unravel_index(keys, shape)) - 1
     return PETSc.Mat().createAIJ(sizes, csr=csr, comm=comm), found[mine], found[(number == NONE) & nodal]

@@ -68,11 +68,13 @@ changes are -gamma z / (1 - gamma z) = sqrt(2) - 1 and 2 - sqrt(2).  What follow
 class Errors:
     """Relative residuals of momentum and storage; forces: what the first is measured by, N; fluid: the other residual.
 
-    start: forces at the start of the step, N.
+    start: forces at the start of the step, N; scales: forces, N, and fluid that changes places, m^d, that counts: no
+    less than what makes round-off the tolerance.
     """
 
     u: float
     p: float
+    scales: tuple[float, float]
     forces: float
     start: float
     fluid: StorageResidual | None
@@ -81,11 +83,6 @@ class Errors:
     def worst(self) -> float:
         """The larger one."""
         return max(self.u, self.p)
-
-    @property
-    def exchanged(self) -> float:
-        """Fluid that changes places, m^d."""
-        return self.fluid.exchanged if self.fluid is not None else 0.0
 
 
 def solve_substep(
@@ -131,8 +128,7 @@ def solve_substep(
     grid, nodes = momentum.forms.grid, momentum.system.unknowns.global_size
     area = grid.cell_volume / grid.h.max() * (storage.ring if grid.axisymmetric else 1.0)
     report.stress = errors.forces / (area * np.sqrt(max(1, nodes)))
-    told = errors.fluid.round_off / solvers.scheme.tolerance
-    report.balance = _relative(abs(storage.balance(errors.fluid)), max(errors.exchanged, told))
+    report.balance = _relative(abs(storage.balance(errors.fluid)), errors.scales[1])
     return errors.fluid.rates
 
 
@@ -343,19 +339,19 @@ class Newton:
             measure = max(scale_u, scale)
             # a tiny load drowns in the round-off of a stiff part: that is no reason not to solve for it once
             round_off = self._momentum.round_off if history else 0.0
-            norm, norm_p, fluid, p, noted_p = r.norm(), 0.0, None, 0.0, 0.0
+            norm, norm_p, fluid, p = r.norm(), 0.0, None, 0.0
             u = _relative(norm, measure, round_off)
-            noted_u = _relative(norm, max(measure, self._momentum.round_off / tolerance))
+            scales = max(measure, self._momentum.round_off / tolerance), 0.0
             if self._storage is not None:
                 fluid = self._storage.assemble_residual()
                 norm_p = fluid.off
                 p = _relative(norm_p, fluid.exchanged, fluid.round_off)
-                noted_p = _relative(norm_p, max(fluid.exchanged, fluid.round_off / tolerance))
+                scales = scales[0], max(fluid.exchanged, fluid.round_off / tolerance)
         if not history and not np.isfinite(norm + norm_p):
             where, what = ("storage: a source", norm_p) if np.isfinite(norm) else ("momentum: a law or term", norm)
             raise NotConverged(f"{what:g} in the residual of the {where} gives it, must be finite")
-        history.append((noted_u, noted_p))
-        return Errors(u, p, measure, scale_u or scale, fluid)
+        history.append((_relative(norm, scales[0]), _relative(norm_p, scales[1])))
+        return Errors(u, p, scales, measure, scale_u or scale, fluid)
 
     def _linearise(self, firmness: float = 0.0) -> None:
         """Set the tangent at the present (u, p), which no other step is to use; firmness: see `LinearSolvers`."""
@@ -386,11 +382,8 @@ class Newton:
         rtol = min(1e-2, max(least, 0.05 * self._scheme.tolerance / min(1.0, errors.worst)))
         if iterative:  # the pull of given displacements, which is all of a first residual, hides the rest
             rtol = max(FINEST, rtol / max(1.0, errors.worst))
-        # where there are hardly any forces, or hardly any fluid changes places, what is left must be round-off
-        round_off = self._momentum.round_off, errors.fluid.round_off if errors.fluid is not None else 0.0
-        forces, exchanged = (r / self._scheme.tolerance for r in round_off)
         with Timer("mpm: linear solve"):
-            return self._solvers.solve(rtol, max(errors.forces, forces), max(errors.exchanged, exchanged))
+            return self._solvers.solve(rtol, *errors.scales)
 
     def _line_search(self, before: Errors, dog: Watchdog | None = None) -> tuple[Errors, float]:
         """Go against the direction, backtracking while the residual is not finite or explodes, or as a watchdog says.
