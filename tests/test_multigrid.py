@@ -4,6 +4,7 @@
 from dataclasses import replace
 
 from mpi4py import MPI
+from petsc4py import PETSc
 
 import numpy as np
 import pytest
@@ -45,6 +46,18 @@ def test_large_elastic_bodies_in_2d_end_where_those_do_whose_matrices_are_factor
         newton.append(sum(ends[-1].step(0.02).newton for _ in range(4)))
     same_end(*ends)
     assert newton[1] <= newton[0] + 1 and not made
+
+
+def test_petscs_options_for_factors_are_not_for_multigrid():
+    """LU in place of PETSc's multigrid, where its coarse grids are set already, ended the process."""
+    options = [f"mpm_{name}_pc_type" for name in ("momentum", "storage")]
+    for option in options:
+        PETSc.Options()[option] = "lu"
+    try:
+        assert pressed().step(0.02).coupling > 0
+    finally:
+        for option in options:
+            PETSc.Options().delValue(option)
 
 
 def test_finer_grids_take_no_more_iterations():

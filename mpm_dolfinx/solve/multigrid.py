@@ -68,7 +68,7 @@ def multigrid_solver(
     ksp = PETSc.KSP().create(A.comm)
     ksp.setType(PETSc.KSP.Type.GMRES)
     ksp.setPCSide(PETSc.PC.Side.RIGHT)
-    ksp.setOptionsPrefix(f"mpm_{name}_firmly_" if firmly else f"mpm_{name}_")
+    ksp.setOptionsPrefix(f"mpm_{name}_{'firmly' if firmly else 'multigrid'}_")  # options for factors are not for it
     with Timer("mpm: factorisation"):
         steps = interpolations(A.comm.tompi4py(), places, held, nodal)
     ksp.pc.setType(PETSc.PC.Type.MG)
