@@ -49,15 +49,15 @@ def test_large_elastic_bodies_in_2d_end_where_those_do_whose_matrices_are_factor
 
 
 def test_petscs_options_for_factors_are_not_for_multigrid():
-    """LU in place of PETSc's multigrid, where its coarse grids are set already, ended the process."""
-    options = [f"mpm_{name}_pc_type" for name in ("momentum", "storage")]
-    for option in options:
-        PETSc.Options()[option] = "lu"
+    """On two processes SuperLU in its place ended the process."""
+    A = PETSc.Mat().createAIJ((4, 4), nnz=1, comm=PETSc.COMM_SELF)
+    places = np.array([[0, 0, 0], [0, 1, 0], [1, 0, 0], [1, 1, 0]])
+    PETSc.Options()["mpm_momentum_pc_type"] = "lu"
     try:
-        assert pressed().step(0.02).coupling > 0
+        solver = multigrid.multigrid_solver(A, "momentum", places, places[:0], nodal=True)
     finally:
-        for option in options:
-            PETSc.Options().delValue(option)
+        PETSc.Options().delValue("mpm_momentum_pc_type")
+    assert solver.pc.getType() == "mg"
 
 
 def test_finer_grids_take_no_more_iterations():
