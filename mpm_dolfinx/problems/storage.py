@@ -61,6 +61,10 @@ FILTER = 0.75
 """Share of beta V that the filtered fixed-stress operator leaves out for checkerboard modes, in [0, 1]."""
 
 
+FluxSlope = Callable[[PETSc.Vec], NDArray[np.float64]]
+"""See `StorageProblem.flux_slope`."""
+
+
 class StorageForms:
     """The compiled forms of the storage of a scene's pore fluid.
 
@@ -297,6 +301,12 @@ class StorageSystem:
         places = self._forms.grid.cell_places(self.unknowns.owned)
         return places, places[:0]
 
+    def lost(self, u: PETSc.Vec, out: PETSc.Vec, *slopes: FluxSlope) -> None:
+        """Set what the residual gains by displacements, m^d: by the content and, with their slope, by the fluxes."""
+        self.B.mult(u, out)
+        for slope in slopes:
+            out.array_w[:] += slope(u)
+
     def set_alternation(self) -> None:
         """Assemble the filter L of `StorageProblem.assemble_preconditioner`."""
         zero(self.L)
@@ -471,6 +481,27 @@ class StorageProblem:
     def set_fluxes(self) -> None:
         """Assemble the fluxes at u."""
         self._flow(False)
+
+    def flux_slope(self, u: fem.Function, unknowns: Unknowns) -> FluxSlope:
+        """Return what gives the change (n,), m^d, of what the cells lose as displacements u change along a vector, m.
+
+        Of what the laws of the conductivity, and the geometry of the fluxes, make of it no matrix is assembled: it is
+        taken from differences (Knoll and Keyes 2004).  `set_fluxes` makes the fluxes those at u again.
+        """
+        p, h = self.system.unknowns.gather(self.forms.p.x.array, self.system.unknowns.vector()), self.forms.grid.h.min()
+        here, density = self._rates(self._flow(False), p).cells, self._density
+
+        def along(v: PETSc.Vec) -> NDArray[np.float64]:
+            largest = v.norm(PETSc.NormType.NORM_INFINITY)
+            if not 0 < largest < np.inf:
+                return np.zeros(len(here))
+            step, now = np.sqrt(np.finfo(float).eps) * h / largest, u.x.array.copy()
+            unknowns.add(u, step, v)
+            there = self._rates(self._flow(False), p).cells
+            u.x.array[:] = now
+            return self.dt * (there - here) / step / density
+
+        return along
 
     def assemble_residual(self) -> StorageResidual:
         """Return the fluid volume out of balance in each cell at (u, p)."""

@@ -40,7 +40,7 @@ from numpy.typing import NDArray
 from mpm_dolfinx.caching import Latest
 from mpm_dolfinx.forms.unknowns import Unknowns
 from mpm_dolfinx.problems.momentum import MomentumSystem
-from mpm_dolfinx.problems.storage import StorageSystem
+from mpm_dolfinx.problems.storage import FluxSlope, StorageSystem
 from mpm_dolfinx.solve.linear import direct_solver, factorise, nodal_solver, renewed, solved
 
 MANY, MOST = 29, 500
@@ -99,6 +99,7 @@ class BlockOperator:
         self._cycles, self._split = (momentum_cycle, storage_cycle), momentum.unknowns.size
         self._u, self._f = momentum.unknowns.vector(), momentum.unknowns.vector()
         self._p, self._g = storage.unknowns.vector(), storage.unknowns.vector()
+        self.slope: list[FluxSlope] = []
         self.scale: list[NDArray[np.float64]] = [np.ones(self._split), np.ones(storage.unknowns.size)]
 
     @property
@@ -110,7 +111,7 @@ class BlockOperator:
         """Multiply by the operator."""
         s = self._storage
         self.part(x, self._u, self._p)
-        s.B.mult(self._u, self._g)
+        s.lost(self._u, self._g, *self.slope)
         s.C.multAdd(self._p, self._g, self._g)
         s.B_momentum.multTranspose(self._p, self._f)
         self._f.scale(-1.0)
@@ -202,7 +203,14 @@ class BlockSolver:
         """Take the present P; factors, which serve all tangents of a step, stay."""
         renewed(self._storage_cycle, self._storage.P)
 
-    def solve(self, du: PETSc.Vec, dp: PETSc.Vec, scales: tuple[NDArray, NDArray], rtol: float) -> int:
+    def solve(
+        self,
+        du: PETSc.Vec,
+        dp: PETSc.Vec,
+        scales: tuple[NDArray, NDArray],
+        rtol: float,
+        slope: FluxSlope | None = None,
+    ) -> int:
         """Solve for (du, dp) with the problems' residuals on the right; return the number of iterations.
 
         Parameters
@@ -211,7 +219,10 @@ class BlockSolver:
             Of the two residuals in each part, N and m^d: what counts as equally large.
         rtol
             Relative to the norm of both residuals, scaled, in each part.
+        slope
+            What the fluxes gain by displacements; without, it is left out.
         """
+        self._operator.slope[:] = [] if slope is None else [slope]
         on_u, on_p = self._momentum.of_parts, self._storage.of_parts
         residuals = self._momentum.residual, self._storage.residual
         scale_u, scale_p = scales

@@ -218,7 +218,7 @@ class Newton:
         self, errors: Errors, as_reset: Callable[[], QuadratureData], key: Hashable, fresh: bool, watched: bool
     ) -> Errors:
         """Iterate from the present (u, p), of these errors; fresh: with its own tangent; watched: by a watchdog."""
-        count, eases, dogs = 0, not self._momentum.yielded, None
+        count, eases, dogs, slow = 0, not self._momentum.yielded, None, False
         if watched:
             where = self._iterate()
             dogs = [Watchdog(error, where, eases=eases) for error in errors.each.tolist()]
@@ -232,11 +232,12 @@ class Newton:
                 self._solvers.tangent(key, lambda: self._linearise_as_reset(as_reset))
             elif fresh:
                 self._linearise(self._firmness(errors, dogs))
-            self.report.coupling += self._direction(errors)
+            self.report.coupling += self._direction(errors, fresh and slow)
             before, (errors, steps) = errors, self._line_search(errors, dogs)
             count += 1
-            slow = errors.each > self._keep * np.minimum(1.0, before.each)  # inf where no fluid has moved yet
-            fresh = bool((slow & (errors.each > self._scheme.tolerance)).any())
+            lags = errors.each > self._keep * np.minimum(1.0, before.each)  # inf where no fluid has moved yet
+            slow = fresh
+            fresh = bool((lags & (errors.each > self._scheme.tolerance)).any())
             dogs, errors, back = self._watched(dogs, before, errors, steps)
             fresh = fresh or back
             seeps = self._storage is not None and self._storage.settle_seepage()
@@ -413,8 +414,12 @@ class Newton:
             f.x.array[:] = values
         return done
 
-    def _direction(self, errors: Errors) -> int:
-        """Solve the linearised problem; return the coupling iterations."""
+    def _direction(self, errors: Errors, slow: bool) -> int:
+        """Solve the linearised problem; return the coupling iterations.
+
+        slow: whether the last step has gained little although its tangent was its own: that leaves out what the fluxes
+        gain by displacements.
+        """
         # no more accuracy than the next residual can use
         iterative = self._solvers.iterative
         in_3d = iterative and self._momentum.forms.grid.dim == 3
@@ -432,7 +437,13 @@ class Newton:
             if errors.fluid is None:
                 return self._solvers.solve(rtol, forces)
             least = errors.fluid.round_off / self._scheme.tolerance
-            return self._solvers.solve(rtol, forces, np.maximum(errors.exchanged, least))
+            measures = forces, np.maximum(errors.exchanged, least)
+            if not slow or self._linear:
+                return self._solvers.solve(rtol, *measures)
+            slope = self._storage.flux_slope(self._momentum.forms.u, self._momentum.system.unknowns)
+            count = self._solvers.solve(rtol, *measures, slope)
+            self._storage.set_fluxes()
+            return count
 
     def _line_search(self, before: Errors, dogs: list[Watchdog] | None = None) -> tuple[Errors, NDArray[np.float64]]:
         """Go against the direction, each part as far as `watchdog` says; return the errors there, and the shares.
@@ -453,10 +464,11 @@ class Newton:
         steps, moved = np.ones(of.count), np.zeros(of.count)
         while True:
             self._move(moved - steps)
-            moved, errors = steps.copy(), self._errors(before.start)
+            moved, (errors, why) = steps.copy(), self._tried(before)
             if free:
                 with _ignored():
                     work = of.sums(residual.array_r * self._solvers.du.array_r)
+                work = np.full(of.count, np.nan) if why is not None else work
             for part, search in list(searches.items()):
                 found, error = float(errors.each[part]), float(before.each[part])
                 if isinstance(search, Search):
@@ -464,13 +476,23 @@ class Newton:
                 else:
                     then = search.after(found)
                     if then is None and not search.ends(found):
-                        raise NotConverged("no descent along the Newton direction", self.report.history)
+                        what = "" if why is None else f": {why.reason}"
+                        raise NotConverged(f"no descent along the Newton direction{what}", self.report.history)
                 if then is None:
                     del searches[part]
                 else:
                     searches[part], steps[part] = then, then.step
             if not searches:
                 return errors, steps
+
+    def _tried(self, before: Errors) -> tuple[Errors, NotConverged | None]:
+        """Return the errors where a step has led, infinite where a law cannot be evaluated; and why it cannot."""
+        try:
+            return self._errors(before.start), None
+        except NotConverged as failed:
+            self.report.history.append((np.inf, np.inf))
+            away = np.where(before.each > self._scheme.tolerance, np.inf, before.each)
+            return replace(before, u=away, p=away), failed
 
     def _turn_forwards(self, errors: Errors) -> None:
         """Turn a direction round along which the residuals do negative work: see `watchdog`.

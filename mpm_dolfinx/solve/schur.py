@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from mpm_dolfinx.caching import Latest
 from mpm_dolfinx.problems.momentum import MomentumProblem, MomentumSystem
 from mpm_dolfinx.problems.parts import OfParts
-from mpm_dolfinx.problems.storage import FILTER, StorageProblem, StorageSystem
+from mpm_dolfinx.problems.storage import FILTER, FluxSlope, StorageProblem, StorageSystem
 from mpm_dolfinx.solve.linear import (
     by_mumps,
     direct_solver,
@@ -52,13 +52,14 @@ class SchurComplement:
     def __init__(self, storage: StorageSystem, solve_momentum: PETSc.KSP):
         self.storage, self.solve = storage, solve_momentum
         self.f, self.v = storage.B.createVecRight(), storage.B.createVecRight()
+        self.slope: list[FluxSlope] = []
 
     def mult(self, A: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """Multiply."""
         s = self.storage
         s.B_momentum.multTranspose(x, self.f)
         self.solve.solve(self.f, self.v)
-        s.B.mult(self.v, y)
+        s.lost(self.v, y, *self.slope)
         s.C.multAdd(x, y, y)
 
 
@@ -107,15 +108,16 @@ class LinearSolvers:
             self._solve_s = multigrid_solver(storage.P, "storage", *storage.places(), nodal=False)
             self._block = BlockSolver(momentum, storage, self.solve_u.pc, self._solve_s.pc, symmetric)
             return
-        n, context = (storage.unknowns.size, None), SchurComplement(storage, self.solve_u)
-        finalize(self, vars(context).clear)  # PETSc keeps contexts of its matrices, and what they refer to
-        self._schur = PETSc.Mat().createPython((n, n), context, storage.unknowns.comm)
+        n, self._context = (storage.unknowns.size, None), SchurComplement(storage, self.solve_u)
+        finalize(self, vars(self._context).clear)  # PETSc keeps contexts of its matrices, and what they refer to
+        self._schur = PETSc.Mat().createPython((n, n), self._context, storage.unknowns.comm)
         self._schur.setUp()
         large = by_mumps(momentum.unknowns, symmetric)
         self._solve_s = direct_solver(storage.P, "storage", often=not large, package="mumps" if large else None)
         krylov = PETSc.KSP.Type.CG if symmetric else PETSc.KSP.Type.FGMRES
         kind = {"schur-cg": krylov, "schur-fgmres": PETSc.KSP.Type.FGMRES}
-        self._solve_s.setType(kind.get(scheme.coupling, PETSc.KSP.Type.PREONLY))
+        self._krylov = kind.get(scheme.coupling, PETSc.KSP.Type.PREONLY)
+        self._solve_s.setType(self._krylov)
         self._solve_s.setGMRESRestart(RESTART)
 
     def begin(self) -> None:
@@ -167,7 +169,13 @@ class LinearSolvers:
         self._solve_s.setUp()
         return True
 
-    def solve(self, rtol: float, forces: NDArray[np.float64], exchanged: NDArray[np.float64] | None = None) -> int:
+    def solve(
+        self,
+        rtol: float,
+        forces: NDArray[np.float64],
+        exchanged: NDArray[np.float64] | None = None,
+        slope: FluxSlope | None = None,
+    ) -> int:
         """Solve for (du, dp) with the present residuals; return the coupling iterations.
 
         Parameters
@@ -176,6 +184,8 @@ class LinearSolvers:
             Relative accuracy of each part.
         forces, exchanged : (parts,)
             What the residuals are measured by: forces, N, and fluid that changes places, m^d.
+        slope
+            What the fluxes gain by displacements; without, the tangent leaves that out.
         """
         residual = self._momentum.residual
         if self._storage is None:
@@ -189,10 +199,16 @@ class LinearSolvers:
             size, total = of.norms(r.array_r), of.sums(np.abs(r.array_r))
             share = np.divide(size, total, out=np.ones(of.count), where=total > 0)
             scales = np.where(forces > 0, forces, 1.0), np.where(exchanged > 0, exchanged, 1.0) * share
-            return self._block.solve(self.du, self.dp, scales, rtol)
+            return self._block.solve(self.du, self.dp, scales, rtol, slope)
+        krylov = self._krylov if slope is None else PETSc.KSP.Type.FGMRES
+        self._context.slope[:] = [] if slope is None else [slope]
+        if self._solve_s.getType() != krylov:
+            self._solve_s.setType(krylov)
+            self._solve_s.setGMRESRestart(RESTART)
         g = self.condense()
         self._solve_s.setTolerances(rtol=rtol, atol=0.0, max_it=500)
-        self._evenly(self._solve_s, g, self.dp, self._storage.of_parts, self._solve_s.pc.apply)
+        measured = self._solve_s.pc.apply if krylov == PETSc.KSP.Type.CG else None  # which takes preconditioned norms
+        self._evenly(self._solve_s, g, self.dp, self._storage.of_parts, measured)
         self._storage.B_momentum.multTranspose(self.dp, self._rhs)
         self._rhs.axpy(1.0, residual)
         self.solve_u.solve(self._rhs, self.du)
@@ -237,7 +253,7 @@ class LinearSolvers:
     def condense(self) -> PETSc.Vec:
         """Return the residual of the Schur complement's system, R_p - B K^-1 R_u."""
         self.solve_u.solve(self._momentum.residual, self.du)
-        self._storage.B.mult(self.du, self._g)
+        self._storage.lost(self.du, self._g, *self._context.slope)
         self._g.aypx(-1.0, self._storage.residual)
         return self._g
 
