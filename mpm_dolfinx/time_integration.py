@@ -40,6 +40,9 @@ METHODS = {
 }
 
 
+EULER = METHODS["backward-euler"]
+
+
 def substeps(method: str, evolves: bool) -> tuple[Substep, ...]:
     """Return the substeps of a method; of a scene in which nothing has a rate, one.
 
