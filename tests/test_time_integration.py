@@ -147,7 +147,7 @@ def test_steps_grow_over_six_decades_of_consolidation():
         )
         return result.steps, np.array(p).reshape(-1, 2, 20, 2).mean(axis=(1, 3))
 
-    (steps, p), (_, true) = run(8e-5), run(1e-5)
+    (steps, p), (_, true) = run(5e-5), run(1e-5)
     assert steps <= 100 and np.abs(p - true).max() < 1e-3 * 100
 
 

@@ -433,7 +433,6 @@ class MomentumProblem:
         self.forms, self.system, self.data = forms, system, data
         self.yielded = yielded
         self._sides, self._goes_on, self._tolerance = sides, goes_on, tolerance
-        self._largest = np.zeros(system.parts.count)  # forces of the parts so far, N
         with Timer("mpm: loads"):
             external, pulls = forms.external(data, sides)
             if held is not None:
@@ -461,16 +460,19 @@ class MomentumProblem:
     def _at(self) -> tuple[Unknowns, NDArray[np.float64]]:
         return self.system.unknowns, self.forms.u.x.array
 
-    def augment_tools(self) -> bool:
-        """Shift the pressures of tools that penetrate too deep; return whether the balance is another one since."""
+    def augment_tools(self, forces: NDArray[np.float64]) -> bool:
+        """Shift the pressures of tools that penetrate too deep; return whether the balance is another one since.
+
+        forces (parts,): what residuals are measured by, N.
+        """
         tools, contact = self._sides.tools, self._sides.contact
-        of_tools = tools is not None and tools.augment(self.forms.nodal, self._unknown_of_tools())
+        of_tools = tools is not None and tools.augment(self.forms.nodal, self._unknown_of_tools(forces))
         return (contact is not None and contact.now.augment(*self._at)) or of_tools
 
-    def _unknown_of_tools(self) -> NDArray[np.float64]:
+    def _unknown_of_tools(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return how well the balance tells the forces of tools (tools,), N: by the parts that they may touch."""
         system, tools = self.system, self._sides.tools
-        of_parts = system.round_off + self._tolerance * self._largest
+        of_parts = system.round_off + self._tolerance * forces
         unknown = np.zeros(len(tools.contacts))
         np.maximum.at(unknown, tools.rows.number, of_parts[system.parts.cells[tools.rows.cell]])
         return over_all(self.forms.grid.comm, unknown, MPI.MAX)
@@ -529,9 +531,7 @@ class MomentumProblem:
         system.penalty.multAdd(step, r, r)
         if self._sides.contact is not None:
             self._sides.contact.now.push(*self._at, r)
-        scales = np.max(norms, axis=0)
-        np.maximum(scales, self._largest, out=self._largest)
-        return r, scales
+        return r, np.max(norms, axis=0)
 
     def out_of_balance(
         self, r: PETSc.Vec, scales: NDArray[np.float64], first: bool
@@ -568,7 +568,7 @@ class MomentumProblem:
             if first:
                 K.axpy(1.0, self._sides.contact.now.pattern(self.system.unknowns), pattern.UNKNOWN)
             K.axpy(1.0, self._sides.contact.now.tangent(*self._at), pattern.SUBSET_NONZERO_PATTERN)
-        shares = np.broadcast_to(firmness, self._largest.shape)
+        shares = np.broadcast_to(firmness, self.system.parts.count)
         if (shares == shares[:1]).all():
             if shares.any():
                 K.axpy(shares[0], self.system.firm, pattern.SUBSET_NONZERO_PATTERN)
