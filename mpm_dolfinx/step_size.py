@@ -251,8 +251,8 @@ def step_rule(times: Times, rtol, first_step, max_step: float, scene: Scene, poi
     longest = float(numbers("max_step", max_step, **positive)) if max_step != inf else inf
     first = times.after(times.start)[0] - times.start
     if len(scene.substeps) > 1:  # without a rate no step has an error
-        # under a load that grows from nothing the error is RELAXES / 2 (dt c_v / h^2)^2 of the change
-        longest_first = SAFETY * np.sqrt(2 * rtol / RELAXES) * diffusion_time(scene, points)
+        # of pressures that grow from nothing it is RELAXES / 2 (dt l)^2; beside a drained side l is 3 c_v / h^2
+        longest_first = SAFETY * np.sqrt(2 * rtol / RELAXES) * diffusion_time(scene, points) / 3
         first = min(first, max(FIRST * first, float(longest_first)))
     if first_step is not None:
         first = float(numbers("first_step", first_step, **positive))
