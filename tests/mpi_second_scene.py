@@ -1,0 +1,30 @@
+# SPDX-License-Identifier: MIT
+"""Two scenes on one grid, whose bodies lie at its two ends: each is as even as it would be alone."""
+
+import sys
+
+import numpy as np
+
+import mpm_dolfinx as mpm
+
+grid = mpm.Grid([4.0, 0.5], [20, 5])
+assert grid.mesh is not None, "a mesh that was looked at before"
+
+
+def faint(points, v):
+    """Return a force of next to nothing."""
+    return 1e-30 * points.value(v)[0] * points.dx
+
+
+ratios, scenes, laws = [], [], [mpm.Hencky(bulk=1e6, shear=6e5)]
+for low in (0.2, 2.6):
+    body = mpm.box(grid, [low, 0], [low + 1, 0.4])
+    s = mpm.Simulation(grid, [body], laws, fixed={"bottom": "xy"}, gravity=(0, -9.81))
+    ratios.append(list(s.run(1.0, 1.0, progress=False).imbalance.values()))
+    scenes.append(s)
+again = mpm.Simulation(scenes[1].grid, scenes[1].bodies, laws, fixed={"bottom": "xy"})
+assert again.grid is scenes[1].grid, "the same points: the same mesh"
+kept = mpm.Simulation(grid, scenes[1].bodies, laws, fixed={"bottom": "xy"}, terms=[faint])
+assert kept.grid is grid, "terms may have been made on the mesh"
+if not grid.comm.rank:
+    np.savez(sys.argv[1], imbalance=ratios)
