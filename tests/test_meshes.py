@@ -20,14 +20,15 @@ from mpm_dolfinx.points.faces import surface
 GRID = mpm.Grid([2, 1.5], [10, 8])
 SPACE = mpm.Grid([2, 2, 2], [4, 4, 4])
 KINDS = {"triangle": (8, 4), "quad": (8, 4), "tetra": (4, 2, 2), "hexahedron": (4, 2, 2)}
+ALL = KINDS | {"wedge": (4, 2, 2), "pyramid": (4, 2, 2)}
 SOIL = mpm.Hencky(bulk=1e6 / 1.2, shear=1e6 / 2.4)
 
 
 def of_kind(kind, upper=(2.0, 1.0, 1.0), **options):
     """Return a grid, and a box of a kind of cells in it."""
-    dim = len(KINDS[kind])
+    dim = len(ALL[kind])
     grid = GRID if dim == 2 else SPACE
-    return grid, mpm.from_mesh(grid, box_mesh(kind, KINDS[kind], (0,) * dim, upper[:dim], **options))
+    return grid, mpm.from_mesh(grid, box_mesh(kind, ALL[kind], (0,) * dim, upper[:dim], **options))
 
 
 def skewed(x):
@@ -35,7 +36,7 @@ def skewed(x):
     return x @ np.array([[0.8, 0.2, 0.0], [-0.3, 1.0, 0.1], [0.2, -0.1, 0.9]])[: x.shape[1], : x.shape[1]] + 0.3
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ALL)
 def test_domains_fill_the_mesh_and_sides_have_its_area_and_names(kind):
     grid, body = of_kind(kind)
     assert volumes(body.corners()).sum() == pytest.approx(2.0, rel=1e-12) and volumes(body.corners()).min() > 0
@@ -71,9 +72,9 @@ def test_slanted_faces_are_limited_by_regions_in_space():
     assert halves == pytest.approx(whole.area0.sum(), rel=1e-10)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", [*KINDS, "wedge"])
 def test_a_linear_field_is_exact_however_the_mesh_lies(kind):
-    dim = len(KINDS[kind])
+    dim = len(ALL[kind])
     grid = mpm.Grid([2.2] * dim, [6] * dim)
     body = mpm.from_mesh(grid, box_mesh(kind, (3,) * dim, (0,) * dim, (1,) * dim, place=skewed))
     H = np.array([[0.05, 0.1, 0.02], [-0.03, -0.08, 0.04], [0.01, 0.06, 0.03]])[:dim, :dim]
@@ -254,7 +255,7 @@ def test_a_file_names_sides_and_parts_by_gmsh_s_groups_or_numbers(tmp_path):
 
 
 def test_probes_are_found_in_any_domain():
-    for kind in KINDS:
+    for kind in ALL:
         grid, body = of_kind(kind, place=skewed, upper=(1, 1, 1))
         x = body.reference().mean(axis=1)[::7]
         found = mpm.probes([body], x)
@@ -316,6 +317,13 @@ def seed(points, cells, part=None, grid=GRID, **options):
     return mpm.from_mesh(grid, meshio.Mesh(np.array(points, dtype=float), cells), part, **options)
 
 
+def two_meshes(kind, x):
+    """Return two boxes of a kind of cells, the second one beginning at a place."""
+    one, two = (box_mesh(kind, (1,) * 3, (low, 0, 0), (low + 1, 1, 1)) for low in (0, x))
+    rows = np.concatenate([one.cells[-1].data, two.cells[-1].data + len(one.points)])
+    return meshio.Mesh(np.concatenate([one.points, two.points]), [(kind, rows)])
+
+
 SQUARE = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)]
 HANGING = [*SQUARE, (2, 0, 0), (2, 1, 0), (1, 0.5, 0), (2, 0.5, 0)]
 BOX = box_mesh("triangle", (2, 2), (0, 0), (1, 1))
@@ -346,7 +354,52 @@ BAD = {
         "mesh: a surface in space",
         "0.5",
     ),
-    "cells of second order": (lambda: seed(SQUARE, [("triangle6", [[0, 1, 2, 3, 0, 1]])]), "mesh: ", "'triangle6'"),
+    "cells of third order": (lambda: seed(SQUARE, [("triangle10", [[0, 1, 2] * 3 + [3]])]), "mesh: ", "'triangle10'"),
+    "a cell twice": (
+        lambda: seed(SQUARE, [("quad", [[0, 1, 2, 3], [1, 2, 3, 0]])]),
+        "mesh: 1 cells (quad) are there more than once",
+        "[0.5 0.5]",
+    ),
+    "a quadrilateral and its triangles": (
+        lambda: seed(SQUARE, [("quad", [[0, 1, 2, 3]]), ("triangle", [[0, 1, 2], [0, 2, 3]])]),
+        "mesh: 4 facets have both of their cells on one side",
+        "[0.5 0. ]",
+    ),
+    "a cell that is folded back": (
+        lambda: seed([*SQUARE, (0.3, 0.6, 0)], [("triangle", [[0, 1, 2], [1, 2, 4]])]),
+        "mesh: 1 facets have both of their cells on one side",
+        "[1.  0.5]",
+    ),
+    "cells in one another": (
+        lambda: seed([*SQUARE, *np.add(SQUARE, (0.9, 0.5, 0))], [("quad", [[0, 1, 2, 3], [4, 5, 6, 7]])]),
+        "mesh: 2 cells lie on one another, the first at [0.95 0.75]",
+        "0.1 m deep",
+    ),
+    "a small cell in a large one": (
+        lambda: seed(
+            [*SQUARE, *np.add(np.multiply(SQUARE, 0.1), (0.4, 0.4, 0))], [("quad", [[0, 1, 2, 3], [4, 5, 6, 7]])]
+        ),
+        "mesh: 2 cells lie on one another",
+        "[0.45 0.45",
+    ),
+    "tetrahedra in one another": (
+        lambda: mpm.from_mesh(SPACE, two_meshes("tetra", 0.99)),
+        "mesh: 12 cells lie on one another",
+        "0.01 m deep",
+    ),
+    "a node that is not there": (lambda: seed(SQUARE, [("quad", [[0, 1, 2, 4]])]), "the node 4", "one of 4"),
+    "a vertex that is nowhere": (
+        lambda: seed([*SQUARE[:3], (np.nan, 1, 0)], [("quad", [[0, 1, 2, 3]])]),
+        "mesh",
+        "nan",
+    ),
+    "no vertices": (lambda: seed(np.empty((0, 3)), []), "mesh: has no vertices", "must have cells"),
+    "no cells": (lambda: seed(SQUARE, []), "mesh: has no triangle and no quad", "2D"),
+    "data that are not there": (
+        lambda: mpm.from_mesh(GRID, BOX, cell_tags="rock"),
+        "mesh: cell_tags = 'rock'",
+        "cells have no data",
+    ),
     "surfaces in 3D": (lambda: mpm.from_mesh(SPACE, BOX), "mesh: has no tetra and no hexahedron", "3D"),
     "tetrahedra in 2D": (
         lambda: mpm.from_mesh(GRID, box_mesh("tetra", (1, 1, 1), (0, 0, 0), (1, 1, 1))),
