@@ -5,15 +5,18 @@ import signal
 
 from mpi4py import MPI
 
+import basix
 import dolfinx.mesh
 import meshio
 import numpy as np
 import pytest
+import ufl
 from helpers import refused_in_one_line
 from meshes import box_mesh
 from scipy.integrate import solve_bvp
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx import _compat
 from mpm_dolfinx.points.cutting import volumes
 from mpm_dolfinx.points.faces import surface
 
@@ -239,6 +242,54 @@ def test_a_dolfinx_mesh_with_tags_is_the_mesh_of_meshio(kind):
     assert surface([whole], "3").area0.sum() == pytest.approx(2) == 2 * surface([half], "top").area0.sum()
 
 
+@pytest.mark.parametrize("kind", ["triangle", "quadrilateral"])
+def test_a_dolfinx_mesh_of_second_order_is_that_of_its_vertices(kind, caplog):
+    x = [(0, 0), (1, 0), (0, 1)] + ([(0.6, 0.6), (0, 0.5), (0.5, 0)] if kind == "triangle" else [(1, 1)])
+    x += [(0.5, 0), (0, 0.5), (1.05, 0.5), (0.5, 1), (0.5, 0.5)] if kind == "quadrilateral" else []
+    cells, x = np.arange(len(x))[None] if MPI.COMM_WORLD.rank == 0 else np.empty((0, len(x)), int), np.array(x)
+    if _compat.OLD:
+        domain = ufl.Mesh(ufl.VectorElement("Lagrange", kind, 2))
+        mesh = dolfinx.mesh.create_mesh(MPI.COMM_WORLD, cells, x, domain)
+    else:
+        domain = ufl.Mesh(basix.ufl.element("Lagrange", kind, 2, shape=(2,)))
+        mesh = dolfinx.mesh.create_mesh(MPI.COMM_WORLD, cells=cells, x=x, e=domain)
+    body = mpm.from_mesh(GRID, mesh)
+    assert volumes(body.corners()).sum() == pytest.approx(0.5 if kind == "triangle" else 1)
+    off = "0.14" if kind == "triangle" else "0.05"
+    assert "1 cells are of second order" in caplog.text and f"up to {off} m off" in caplog.text
+
+
+@pytest.mark.parametrize("kind", ALL)
+def test_cells_may_be_numbered_either_way_round(kind):
+    grid, body = of_kind(kind)
+    mesh = box_mesh(kind, ALL[kind], (0,) * grid.dim, (2.0, 1.0, 1.0)[: grid.dim])
+    mirrored = {"triangle": [0, 2, 1], "quad": [0, 3, 2, 1], "tetra": [0, 2, 1, 3], "pyramid": [0, 3, 2, 1, 4]}
+    mirrored |= {"wedge": [3, 4, 5, 0, 1, 2], "hexahedron": [4, 5, 6, 7, 0, 1, 2, 3]}
+    mesh.cells[-1].data[::2] = mesh.cells[-1].data[::2][:, mirrored[kind]]
+    other = mpm.from_mesh(grid, mesh)
+    assert volumes(other.corners()).sum() == pytest.approx(2) and volumes(other.corners()).min() > 0
+    areas = [{name: surface([b], name).area0.sum() for name in b.names} for b in (body, other)]
+    assert areas[0] == pytest.approx(areas[1])
+
+
+@pytest.mark.parametrize("kind", ["triangle", "quad", "tetra", "hexahedron", "wedge"])
+def test_a_strip_that_is_bent_round_until_its_ends_meet_is_refused_once_they_overlap(kind):
+    """No two cells share a facet there, and all of them lie on both sides of those that they share."""
+    dim = len(ALL[kind])
+    grid = mpm.Grid([4, 4, 1][:dim], [8, 8, 2][:dim])
+
+    def ring(turns):
+        def place(x):
+            angle, r = 2 * np.pi * turns * x[:, 0], 1 + x[:, 1]
+            return np.column_stack([2 + r * np.cos(angle), 2 + r * np.sin(angle), *x[:, 2:].T])
+
+        return mpm.from_mesh(grid, box_mesh(kind, (24, 2, 2)[:dim], (0,) * dim, (1, 0.5, 0.5)[:dim], place=place))
+
+    assert len(ring(0.99)) > 0
+    with pytest.raises(ValueError, match="cells lie on one another"):
+        ring(1.001)
+
+
 def test_a_file_names_sides_and_parts_by_gmsh_s_groups_or_numbers(tmp_path):
     mesh = box_mesh("triangle", (4, 2), (0, 0), (2, 1))
     tags = [np.full(len(block.data), k + 1) for k, block in enumerate(mesh.cells)]
@@ -377,7 +428,8 @@ BAD = {
     ),
     "a small cell in a large one": (
         lambda: seed(
-            [*SQUARE, *np.add(np.multiply(SQUARE, 0.1), (0.4, 0.4, 0))], [("quad", [[0, 1, 2, 3], [4, 5, 6, 7]])]
+            [*SQUARE, *np.add(np.multiply(SQUARE, 0.1), (0.4, 0.4, 0))],
+            [("quad", [[0, 1, 2, 3], [4, 5, 6, 7]])],
         ),
         "mesh: 2 cells lie on one another",
         "[0.45 0.45",

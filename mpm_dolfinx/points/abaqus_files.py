@@ -16,6 +16,8 @@ import meshio
 import numpy as np
 from numpy.typing import NDArray
 
+from mpm_dolfinx.points.mesh_cells import Block
+
 PLANE = re.compile(r"(?:(?:C|DC|DCC|EC)?(?:PE|PS|PEG|AX|GAX|2D)|AC(?:2D|AX)|S|STRI|DS|M3D|SFM3D|R3D)(3|4|6|8|9)(?!\d)")
 SOLID = re.compile(r"(?:(?:C|DC|DCC|EC|AC|Q)3D|SC)(4|5|6|8|10|13|15|20|27)(?![\dV])")
 LINE = re.compile(r"(?:T2D|T3D|R2D|RAX|DC1D|AC1D)(2|3)|(?:B|PIPE|SAX)[23]?([123])")
@@ -244,7 +246,9 @@ def _assembled(placed: list[_Placed]) -> meshio.Mesh:
         x.append(places)
         start += len(places)
     groups = _groups(placed, cells, numbers)
-    return meshio.Mesh(np.concatenate(x), cells, cell_sets=groups)
+    mesh = meshio.Mesh(np.concatenate(x), [], cell_sets=groups)
+    mesh.cells = [Block(*block) for block in cells]
+    return mesh
 
 
 def _once(numbers: list[NDArray[np.int64]], what: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -15,6 +15,8 @@ import meshio
 import numpy as np
 from numpy.typing import NDArray
 
+from mpm_dolfinx.points.mesh_cells import Block
+
 TYPES = {
     **{1: ("line", 2), 2: ("triangle", 3), 3: ("quad", 4), 4: ("tetra", 4), 5: ("hexahedron", 8), 6: ("wedge", 6)},
     **{7: ("pyramid", 5), 8: ("line3", 3), 9: ("triangle6", 6), 10: ("quad9", 9), 11: ("tetra10", 10)},
@@ -73,7 +75,9 @@ def read(file: Path) -> meshio.Mesh:
         str(tag): [np.arange(len(rows) if tag in found else 0) for (_, rows), found in zip(cells, of, strict=True)]
         for tag in tags
     }
-    return meshio.Mesh(x, cells, cell_sets=sets, field_data=_names(data))
+    mesh = meshio.Mesh(x, [], cell_sets=sets, field_data=_names(data))
+    mesh.cells = [Block(*block) for block in cells]
+    return mesh
 
 
 def _section(data: bytes, name: str) -> bytes:

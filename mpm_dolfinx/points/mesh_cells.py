@@ -10,6 +10,7 @@ kinds, but for quadrilaterals: hexahedra keep them whole.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +38,13 @@ LOOPS = {
     "pyramid": [(0, 1, 2, 3), (0, 1, 4), (1, 2, 4), (2, 3, 4), (3, 0, 4)],
 }
 """Vertices of the facets of each kind, around; quadrilaterals and hexahedra with the first axis fastest."""
+
+
+class Block(NamedTuple):
+    """Cells of one kind: meshio's own blocks know not all kinds of second order."""
+
+    type: str
+    data: NDArray[np.int64]
 
 
 def edges(kind: str) -> list[tuple[int, int]]:
