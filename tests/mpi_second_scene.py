@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Two scenes on one grid, whose bodies lie at its two ends: each is as even as it would be alone."""
+"""Scenes on one grid, whose bodies lie at its two ends, or are mapped there: each is as even as it would be alone."""
 
 import sys
 
@@ -22,6 +22,9 @@ for low in (0.2, 2.6):
     s = mpm.Simulation(grid, [body], laws, fixed={"bottom": "xy"}, gravity=(0, -9.81))
     ratios.append(list(s.run(1.0, 1.0, progress=False).imbalance.values()))
     scenes.append(s)
+moved = mpm.mapped(grid, mpm.box(grid, [0.2, 0], [1.2, 0.4]), lambda x: np.add(x, (2, 0)))
+s = mpm.Simulation(grid, [moved], laws, fixed={"bottom": "xy"}, gravity=(0, -9.81))
+ratios.append(list(s.run(1.0, 1.0, progress=False).imbalance.values()))
 again = mpm.Simulation(scenes[1].grid, scenes[1].bodies, laws, fixed={"bottom": "xy"})
 assert again.grid is scenes[1].grid, "the same points: the same mesh"
 kept = mpm.Simulation(grid, scenes[1].bodies, laws, fixed={"bottom": "xy"}, terms=[faint])

@@ -140,6 +140,11 @@ TYPES = {
 }
 
 
+def test_nodes_may_be_there_again_and_have_exponents_of_fortran(tmp_path):
+    again = SETS.replace("7, 3, 3, 9", "7, 3, 3, 9\n*NODE\n2, 1.0D+00, 0.\n3, 2.")
+    assert volume(written(tmp_path, again), "both")[0] == pytest.approx(2)
+
+
 def test_elements_of_soil_have_the_shape_of_their_names():
     for kind, names in TYPES.items():
         assert {_kind(name) for name in names.split()} == {kind}, names
@@ -298,7 +303,7 @@ BAD = {
     "a type of elements": (lambda f: written(f, SETS.replace("CAX4RP", "CINAX4")), "scene.inp: *ELEMENT", "CINAX4"),
     "a node that is not there": (lambda f: written(f, SETS.replace("3, 6, 5", "3, 6, 8")), "scene.inp", "node 8"),
     "too few nodes": (lambda f: written(f, SETS.replace("3, 6, 5", "3, 6")), "TYPE=CAX4RP: 4", "5 of each"),
-    "no number": (lambda f: written(f, SETS.replace("7, 3, 3, 9", "7, q, 3, 9")), "scene.inp", "'q'"),
+    "no number": (lambda f: written(f, SETS.replace("7, 3, 3, 9", "7, q, 3, 9")), "scene.inp", "'Q'"),
     "generated nodes": (lambda f: written(f, SETS + "*NGEN\n1, 2\n"), "scene.inp: *NGEN", "one by one"),
     "cylindrical coordinates": (lambda f: written(f, SETS.replace("NSET=ALL", "SYSTEM=C")), "SYSTEM=C", "Cartesian"),
     "no type": (lambda f: written(f, SETS.replace(" TYPE=CAX4,", "")), "*ELEMENT: has no TYPE", "must"),

@@ -172,7 +172,8 @@ def _define(scope: _Scope, keyword: str, options: dict[str, str], rows: list[str
     if keyword == "NODE" and rows:
         if options.get("SYSTEM", "R").upper() != "R":
             raise ValueError(f"*NODE, SYSTEM={options['SYSTEM']}: must be in Cartesian coordinates")
-        x = np.array([[float(v.strip() or 0) for v in (row + ",0,0,0").split(",")[:4]] for row in rows])
+        rows = [row.upper().replace("D", "E") + ",0,0,0" for row in rows]  # Fortran's exponents
+        x = np.array([[float(v.strip() or 0) for v in row.split(",")[:4]] for row in rows])
         scope.nodes.append((x[:, 0].astype(np.int64), x[:, 1:]))
     elif keyword == "ELEMENT" and rows:
         if not (kind := _kind(options["TYPE"])):
@@ -233,8 +234,8 @@ def _assembled(placed: list[_Placed]) -> meshio.Mesh:
     """Return all that is in place as one mesh."""
     x, cells, numbers, start = [np.empty((0, 3))], [], [], 0
     for k, one in enumerate(placed):
-        known, where = _once([of for of, _ in one.scope.nodes], "node")
         places = one.places(np.concatenate([np.empty((0, 3)), *(p for _, p in one.scope.nodes)]))
+        known, where = _once([of for of, _ in one.scope.nodes], "node", places)
         for kind, number, rows in one.scope.cells:
             at = np.minimum(np.searchsorted(known, rows), max(0, len(known) - 1))
             missing = rows[known[at] != rows] if len(known) else rows
@@ -251,11 +252,19 @@ def _assembled(placed: list[_Placed]) -> meshio.Mesh:
     return mesh
 
 
-def _once(numbers: list[NDArray[np.int64]], what: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return numbers of nodes or elements, ascending, and the order that makes them so; refuse what is there twice."""
+def _once(
+    numbers: list[NDArray[np.int64]], what: str, x: NDArray[np.float64] | None = None
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return numbers of nodes or elements, ascending, and the order that makes them so.
+
+    Refuse those that are there twice, nodes only if they are at two places x (n, 3), m.
+    """
     numbers = np.concatenate([np.empty(0, np.int64), *numbers])
     order = np.argsort(numbers, kind="stable")
-    same = np.flatnonzero(np.diff(numbers[order]) == 0)
+    same = np.diff(numbers[order]) == 0
+    if x is not None:
+        same &= (np.diff(x[order], axis=0) != 0).any(axis=1)
+    same = np.flatnonzero(same)
     if len(same):
         raise ValueError(f"{what} {numbers[order][same[0]]} is there twice in one part, must be there once")
     return numbers[order], order

@@ -56,6 +56,8 @@ def read(file: Path) -> meshio.Mesh:
     data = file.read_bytes()
     _, kind, size = _section(data, "MeshFormat").split()[:3]
     binary = kind == b"1"
+    if binary and b"\n\x01\0\0\0" not in _section(data, "MeshFormat"):
+        raise ValueError("numbers in another order of bytes, must be those of this machine")
     if binary and size != b"8":
         raise ValueError(f"numbers of {size.decode()} bytes, must be of 8")
     groups = dict(_groups(_Numbers(_section(data, "Entities"), binary))) if b"$Entities" in data else {}
