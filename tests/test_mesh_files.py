@@ -297,7 +297,7 @@ def in_two_pieces(folder):
 BAD = {
     "pieces of VTK": (in_two_pieces, "two.vtu: 2 pieces of 8 cells", "4 are read"),
     "a system of Nastran": (
-        lambda f: written(f, BULK.replace("SYSTEM", "5"), "mesh.bdf"), "mesh.bdf: GRID in the coordinate system", "5"),
+        lambda f: written(f, BULK.replace("SYSTEM", "5"), "mesh.bdf"), "mesh: GRID in the coordinate system", "5"),
     "a file of no nodes": (lambda f: written(f, "*HEADING\n"), "mesh: has no vertices", "must have cells"),
     "elements before nodes": (lambda f: written(f, "*ELEMENT, TYPE=CPE3\n1, 1, 2, 3\n"), "node 1", "must be one of"),
     "a type of elements": (lambda f: written(f, SETS.replace("CAX4RP", "CINAX4")), "scene.inp: *ELEMENT", "CINAX4"),

@@ -14,6 +14,7 @@ import ufl
 from helpers import refused_in_one_line
 from meshes import box_mesh
 from scipy.integrate import solve_bvp
+from scipy.spatial import Delaunay
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx import _compat
@@ -288,6 +289,32 @@ def test_a_strip_that_is_bent_round_until_its_ends_meet_is_refused_once_they_ove
     assert len(ring(0.99)) > 0
     with pytest.raises(ValueError, match="cells lie on one another"):
         ring(1.001)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_no_mesh_of_which_two_cells_hold_one_place_is_taken(dim):
+    """Meshes of random points, of which one is moved, or some cells are left out, or two that are put anywhere."""
+    rng, grid, taken = np.random.default_rng(dim), mpm.Grid([1.0] * dim, [2] * dim), {True: 0, False: 0}
+    for trial in range(30):
+        x = rng.random((rng.integers(dim + 3, 20), dim))
+        cells = Delaunay(x).simplices
+        if trial % 3 == 0:
+            x[rng.integers(len(x))] = rng.random(dim)
+        elif trial % 3 == 1:
+            cells = cells[rng.random(len(cells)) < 0.6]
+        else:
+            cells, x = np.concatenate([cells, cells + len(x)]), np.concatenate([x, x + rng.random(dim)]) / 2
+        edges = x[cells[:, 1:]] - x[cells[:, :1]]
+        cells, edges = (rows[np.abs(np.linalg.det(edges)) > 1e-4] for rows in (cells, edges))
+        places = rng.random((2000, dim))
+        at = np.einsum("pcj,cji->pci", places[:, None] - x[cells[:, 0]], np.linalg.inv(edges))
+        twice = ((at.min(axis=2) > 1e-3) & (at.sum(axis=2) < 0.999)).sum(axis=1).max(initial=0) > 1
+        try:
+            seed(x, [("triangle" if dim == 2 else "tetra", cells)], grid=grid, per_cell=1)
+            taken[twice] += 1
+        except ValueError as error:
+            assert "on one" in str(error) or "has no" in str(error)
+    assert taken[False] > 10 and not taken[True]
 
 
 def test_a_file_names_sides_and_parts_by_gmsh_s_groups_or_numbers(tmp_path):

@@ -113,7 +113,8 @@ def _file(file: Path) -> meshio.Mesh:
 
 def _of_meshio(grid: Grid, mesh: meshio.Mesh, names: Mapping[str, int], tags: str | None, name: str) -> Mesh:
     """Return a mesh of meshio's; tags: name of the cells' data that number parts and sides."""
-    dim, x = grid.dim, _positions(grid.dim, mesh.points)
+    mesh_readers.check_systems(mesh)
+    dim, x, sets = grid.dim, _positions(grid.dim, mesh.points), mesh_readers.sets_of(mesh)
     blocks, curved, off = [], 0, 0.0
     for block in mesh.cells:
         kind, rows = _first_order(dim, block)
@@ -130,7 +131,7 @@ def _of_meshio(grid: Grid, mesh: meshio.Mesh, names: Mapping[str, int], tags: st
     parts, sides = {}, {}
     for i, (kind, rows) in enumerate(blocks):
         inner, facet = kind in KINDS[dim], kind in SIDES_OF[dim]
-        numbers = _groups(mesh, i, len(rows), dim if inner else dim - 1, names, tags) if inner or facet else ()
+        numbers = _groups(mesh, sets, i, len(rows), dim if inner else dim - 1, names, tags) if inner or facet else ()
         for group, chosen in dict(numbers).items():
             if inner:
                 start = sum(map(len, cells[kind]))
@@ -224,7 +225,13 @@ def _merged(
 
 
 def _groups(
-    mesh: meshio.Mesh, block: int, count: int, dim: int, names: Mapping[str, int], tags: str | None
+    mesh: meshio.Mesh,
+    sets: Mapping[str, list],
+    block: int,
+    count: int,
+    dim: int,
+    names: Mapping[str, int],
+    tags: str | None,
 ) -> Iterator[tuple[str, NDArray[np.bool_]]]:
     """Yield names of groups, and which cells (count,) of a block of meshio's belong to them."""
     known = {name: int(tag) for name, (tag, d) in _pairs(mesh.field_data) if int(d) == dim} | dict(names)
@@ -242,7 +249,7 @@ def _groups(
             yield from numbered(values.astype(np.int64), known)
         elif tags is not None:
             raise ValueError(f"mesh: cell_tags = {line(tags)}, must be data of integers")
-    for name, rows in mesh.cell_sets.items():
+    for name, rows in sets.items():
         if rows[block] is not None and len(rows[block]) and not name.startswith("gmsh:"):
             for called in [other for other, number in known.items() if name == str(number)] or [name]:
                 yield called, np.isin(np.arange(count), rows[block])

@@ -24,8 +24,6 @@ def read(file: Path) -> meshio.Mesh:
         raise ValueError("gmsh's format 4.0, must be 2.2 or 4.1, such as gmsh -0 -format msh41 writes it")
     mesh = _bulk(file) if file.suffix.lower() in (".bdf", ".nas", ".fem") else meshio.read(file)
     _check_pieces(file, mesh)
-    _check_systems(mesh)
-    _within_blocks(mesh)
     return mesh
 
 
@@ -50,19 +48,20 @@ def _check_pieces(file: Path, mesh: meshio.Mesh) -> None:
         raise ValueError(f"{len(counts)} pieces of {whole} cells, of which {there} are read; must be one piece")
 
 
-def _check_systems(mesh: meshio.Mesh) -> None:
+def check_systems(mesh: meshio.Mesh) -> None:
     """Refuse nodes of Nastran in coordinates of their own, which meshio takes for those of the basic system."""
     systems = np.asarray(mesh.point_data.get("nastran:ref", 0))
     if systems.any():
-        raise ValueError(f"GRID in the coordinate system {systems[systems != 0][0]}, must be in the basic one")
+        raise ValueError(f"mesh: GRID in the coordinate system {systems[systems != 0][0]}, must be in the basic one")
 
 
-def _within_blocks(mesh: meshio.Mesh) -> None:
-    """Number the cells of FLAC3D's groups within their blocks, where they are numbered through all of them."""
-    groups = [rows for name, rows in mesh.cell_sets.items() if re.match("(zone|face):", name)]
+def sets_of(mesh: meshio.Mesh) -> dict[str, list]:
+    """Return the sets of cells, by name, numbered within their blocks: meshio numbers FLAC3D's through all of them."""
+    flac = {name: rows for name, rows in mesh.cell_sets.items() if re.match("(zone|face):", name)}
     count = [len(block.data) for block in mesh.cells]
     start = np.cumsum([0, *count[:-1]])
-    pairs = [(np.asarray(r), k) for rows in groups for k, r in enumerate(rows)]
-    if all((r >= start[k]).all() and (r < start[k] + count[k]).all() for r, k in pairs):
-        for rows in groups:
-            rows[:] = [np.asarray(r) - s for r, s in zip(rows, start, strict=True)]
+    pairs = [(np.asarray(r), k) for rows in flac.values() for k, r in enumerate(rows)]
+    if not all((r >= start[k]).all() and (r < start[k] + count[k]).all() for r, k in pairs):
+        return dict(mesh.cell_sets)
+    within = {name: [np.asarray(r) - s for r, s in zip(rows, start, strict=True)] for name, rows in flac.items()}
+    return {**mesh.cell_sets, **within}
