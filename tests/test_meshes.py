@@ -294,7 +294,7 @@ def test_a_strip_that_is_bent_round_until_its_ends_meet_is_refused_once_they_ove
 @pytest.mark.parametrize("dim", [2, 3])
 def test_no_mesh_of_which_two_cells_hold_one_place_is_taken(dim):
     """Meshes of random points, of which one is moved, or some cells are left out, or two that are put anywhere."""
-    rng, grid, taken = np.random.default_rng(dim), mpm.Grid([1.0] * dim, [2] * dim), {True: 0, False: 0}
+    rng, grid, taken = np.random.default_rng(dim), mpm.Grid([1.0] * dim, [1] * dim), {True: 0, False: 0}
     for trial in range(30):
         x = rng.random((rng.integers(dim + 3, 20), dim))
         cells = Delaunay(x).simplices
@@ -315,6 +315,15 @@ def test_no_mesh_of_which_two_cells_hold_one_place_is_taken(dim):
         except ValueError as error:
             assert "on one" in str(error) or "has no" in str(error)
     assert taken[False] > 10 and not taken[True]
+
+
+def test_warped_hexahedra_gape_by_little_however_they_are_numbered():
+    mesh, rng = box_mesh("hexahedron", (4,) * 3, (0,) * 3, (1,) * 3), np.random.default_rng(0)
+    inner = ((mesh.points > 1e-9) & (mesh.points < 1 - 1e-9)).all(axis=1)
+    mesh.points[inner] += rng.uniform(-0.025, 0.025, (inner.sum(), 3))  # a tenth of an edge
+    mesh.cells[-1].data[::2] = mesh.cells[-1].data[::2][:, [1, 2, 3, 0, 5, 6, 7, 4]]
+    body = mpm.from_mesh(mpm.Grid([1.0] * 3, [4] * 3), mesh, per_cell=1)
+    assert 1e-5 < abs(volumes(body.corners()).sum() - 1) < 3e-4
 
 
 def test_a_file_names_sides_and_parts_by_gmsh_s_groups_or_numbers(tmp_path):
