@@ -48,7 +48,7 @@ PARTS = """*Heading
  4, 0., 1.
 *Element, type=CPE4P
  1, 1, 2, 3, 4
-*Elset, elset=Clay
+*Elset, elset=Clay, internal
  1,
 *End Part
 *Part, name=Wall
@@ -80,6 +80,8 @@ Wall-1.1, S4
 def test_parts_of_an_abaqus_file_are_where_their_instances_put_them(tmp_path):
     file = written(tmp_path, PARTS)
     assert volume(file)[0] == pytest.approx(3)
+    with pytest.raises(ValueError, match="must be one of its parts: 'Soil-1', 'Clay', 'Wall-1'$"):
+        mpm.from_mesh(GRID, file, "_crest_S3")  # of a surface
     for part in ("Soil-1", "Clay"):
         V, low, high, areas = volume(file, part)
         assert V == pytest.approx(1) and areas == pytest.approx({"crest": 1})
@@ -141,7 +143,7 @@ TYPES = {
 
 
 def test_nodes_may_be_there_again_and_have_exponents_of_fortran(tmp_path):
-    again = SETS.replace("7, 3, 3, 9", "7, 3, 3, 9\n*NODE\n2, 1.0D+00, 0.\n3, 2.")
+    again = "> **\n" + SETS.replace("7, 3, 3, 9", "7, 3, 3, 9\n*NODE\n2, 1.0D+00, 0.\n3, 2.")
     assert volume(written(tmp_path, again), "both")[0] == pytest.approx(2)
 
 
@@ -311,6 +313,9 @@ BAD = {
     "a node twice": (lambda f: written(f, SETS.replace("7, 3, 3, 9", "6, 3, 3, 9")), "node 6 is there twice", "once"),
     "an unknown set": (lambda f: written(f, SETS.replace("A, b", "A, c")), "set 'C' of elements", "A, base, B"),
     "an unknown part": (lambda f: written(f, PARTS.replace("part=Wall", "part=Wa")), "*INSTANCE Wall-1", "'Wa'"),
+    "nodes of two parts where they touch": (
+        lambda f: written(f, PARTS.replace(" 3., 1., 0.\n 3., 1., 0., 3., 1., 1., 90.\n", " 1.,\n")),
+        "scene.inp: ", "hanging or doubled nodes, which must be merged, or be of two parts"),
     "half a turn": (lambda f: written(f, PARTS.replace(", 1., 90.", "")), "*INSTANCE Wall-1: 3 and 5", "7 of a turn"),
     "an old format of gmsh": (
         lambda f: written(f, "$MeshFormat\n4.0 0 8\n$EndMeshFormat\n", "a.msh"), "a.msh: gmsh's format 4.0", "2.2"),

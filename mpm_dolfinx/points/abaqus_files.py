@@ -92,11 +92,11 @@ class _Placed:
 
 
 def is_abaqus(file: Path) -> bool:
-    """Return whether a file is an input file: one of keywords with a star, `.inp`."""
+    """Return whether a file is an input file, `.inp` with keywords: AVS' files have that name too."""
     if file.suffix.lower() != ".inp" or not file.is_file():
         return False
     with file.open(errors="replace") as lines:
-        return next((line.startswith("*") for line in lines if line.strip()), False)
+        return any(re.match(r"\s*\*\s*[A-Za-z]", line) for line in lines)
 
 
 def read(file: Path) -> meshio.Mesh:
@@ -273,7 +273,9 @@ def _once(
 def _groups(placed: list[_Placed], cells: list, numbers: list) -> dict[str, list[NDArray[np.int64]]]:
     """Return sets of elements, and surfaces, by name; facets of surfaces are put at the end of the cells."""
     chosen: dict[str, list[tuple[int, NDArray[np.int64]]]] = {}
-    seen = [[key for key, found in one.scope.sets.items() if not found.internal] for one in placed]
+    seen = [
+        [key for key, found in one.scope.sets.items() if not (found.internal and key.startswith("_"))] for one in placed
+    ]
     for k, one in enumerate(placed):
         if one.name:
             chosen.setdefault(one.name, []).extend((k, of) for at, of in numbers if at == k)

@@ -366,7 +366,7 @@ def _check_conforming(body: MeshBody, name: str) -> None:
     if len(cover.face):
         x = own.corners[cover.face[0]].mean(axis=0)[: body.dim]
         what = f"{len(np.unique(cover.face))} faces lie on others without sharing their nodes, the first at {x}"
-        raise ValueError(f"{name}: {what}: hanging or doubled nodes, which must be merged")
+        raise ValueError(f"{name}: {what}: hanging or doubled nodes, which must be merged, or be of two parts")
 
 
 def _warn_small(grid: Grid, body: MeshBody, per_cell: int, name: str) -> None:
