@@ -318,9 +318,11 @@ class MechanicalBoundary:
         grid, data, held = self.grid, sides.holds, sides.held
         if data is None:
             return np.zeros((0, grid.dim))
-        moved = np.einsum("mk,mkd,md->m", held.shape[sides.row], u[grid.cell_nodes[data.cells]], data["direction"])
+        nodes, N, axis = grid.cell_nodes[data.cells], held.shape[sides.row], data["direction"].argmax(axis=1)
+        moved = np.einsum("mk,mkd,md->m", N, u[nodes], data["direction"])
         force = data["stiffness"][:, 0] * (data["gap"][:, 0] - moved)
-        self._warn(held, sides.row, data["direction"].argmax(axis=1), force)
+        self._warn(held, sides.row, axis, force)
+        force = force * (N * self._free[nodes, axis[:, None]]).sum(axis=1)
         number, force = held.number[sides.row], force[:, None] * data["direction"]
         return grid.comm.allreduce(np.stack([sum_by(number, column, len(self.holds)) for column in force.T], axis=1))
 
