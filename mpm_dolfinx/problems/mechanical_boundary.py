@@ -106,6 +106,9 @@ class MechanicalBoundary:
             if common := sorted(set(axes) & set(more)):
                 check_apart(one, faces, other, others)
                 self._meeting.append((one, other, common, meeting(sides.bodies, faces, others)))
+        for k, (hold, _, axes) in enumerate(self.holds):
+            others = [other for other, _, more in self.holds if other is not hold and set(axes) & set(more)]
+            self.holds[k] = (hold, sides.held(hold, others), axes)
         pressures = [pressure for pressure, _ in self.pressures]
         for condition in [*tractions, *pressures, *displacements]:
             if not callable(condition.value):  # what a function gives is checked when it is called
