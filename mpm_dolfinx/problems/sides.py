@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +12,7 @@ from scipy.spatial import cKDTree
 from mpm_dolfinx.parallel.exchange import Exchange, first
 from mpm_dolfinx.points.bodies import Body
 from mpm_dolfinx.points.cut_domains import Patches
-from mpm_dolfinx.points.faces import Surface, joined, limits, surface
+from mpm_dolfinx.points.faces import Region, Surface, joined, limits, surface
 from mpm_dolfinx.points.grid import Grid, rounding
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.problems.conditions import Displacement, Places
@@ -39,18 +38,23 @@ class Sides:
 
     def of(self, condition) -> Surface:
         """Return the faces of a condition's side and region; ValueError where there are none."""
-        key = (str(condition.side), limits(condition.region, self.grid.dim).tobytes())
-        if key not in self._found:
-            found = surface(self.bodies, condition.side, condition.region, self.present)
-            self._found[key] = found.off_axis() if self.grid.has_axis else found
-        if not len(self._found[key]):
+        found = self._of(condition.side, condition.region)
+        if not len(found):
             where = " in the region" if condition.region is not None else ""
             where += " off the axis" if self.grid.has_axis else ""
             raise ValueError(f"{line(condition)}: no point has this side{where}, must be one of a body")
-        copies = np.unique(self.grid.copy(self._found[key].id))
+        copies = np.unique(self.grid.copy(found.id))
         if len(copies) > 1:
             what = f"{line(condition)}: {len(copies)} groups of bodies have this side"
             raise ValueError(f"{what}, must be one; limit it to one by a region, and give one for each")
+        return found
+
+    def _of(self, side: str, region: Region | None) -> Surface:
+        """Return the faces of a side in a region."""
+        key = (str(side), limits(region, self.grid.dim).tobytes())
+        if key not in self._found:
+            found = surface(self.bodies, side, region, self.present)
+            self._found[key] = found.off_axis() if self.grid.has_axis else found
         return self._found[key]
 
     def held(self, condition: Displacement, others: Sequence[Displacement]) -> Surface:
@@ -71,7 +75,8 @@ class Sides:
         box, X = faces.region.copy(), faces.X
         if not np.isfinite(box).any():
             return faces
-        side = self.of(replace(condition, region=None))
+        side = self._of(condition.side, None)
+        own = np.broadcast_to(self.grid.copy(side.id) == self.grid.copy(faces.id[:1]), len(side))  # of its group
         size = X[:, 1].max(axis=0) - X[:, 0].min(axis=0)
         near = 1e-9 * size.max() + rounding(X)
         neighbours = [self.of(other).X for other in others]
@@ -87,19 +92,17 @@ class Sides:
             for end, sign in enumerate((-1, 1)):
                 limit = box[end, axis]
                 beyond = limit + 2 * sign * near
-                goes_on = np.isfinite(limit) and along(side.X, axis, beyond).any()
+                goes_on = np.isfinite(limit) and along(side.X[own], axis, beyond).any()
                 if goes_on and not any(along(boxes, axis, beyond).any() for boxes in neighbours):
-                    box[end, axis] -= sign * self._beyond_nodes(side, axis, limit, sign)
+                    box[end, axis] -= sign * self._beyond_nodes(side, own, axis, limit, sign)
         box[:, box[0] > box[1]] = faces.region[:, box[0] > box[1]]
-        try:
-            return self.of(replace(condition, region=box))
-        except ValueError:  # less than a cell wide
-            return faces
+        shorter = self._of(condition.side, box)
+        return shorter if len(shorter) else faces  # less than a cell wide
 
-    def _beyond_nodes(self, side: Surface, axis: int, x: float, sign: int) -> float:
+    def _beyond_nodes(self, side: Surface, own: NDArray[np.bool_], axis: int, x: float, sign: int) -> float:
         """Return how far, m, a region that ends at x along an axis of reference positions is not held, see `held`."""
         faces = np.flatnonzero(
-            (side.X[:, 0, axis] <= x) & (side.X[:, 1, axis] >= x) & (np.ptp(side.X, axis=1)[:, axis] > 0)
+            own & (side.X[:, 0, axis] <= x) & (side.X[:, 1, axis] >= x) & (np.ptp(side.X, axis=1)[:, axis] > 0)
         )
         X, places = side.corners[faces][:, :, axis], side.places()[faces]
         way, moved = X - X.mean(axis=1, keepdims=True), places - places.mean(axis=1, keepdims=True)
