@@ -80,7 +80,7 @@ Wall-1.1, S4
 def test_parts_of_an_abaqus_file_are_where_their_instances_put_them(tmp_path):
     file = written(tmp_path, PARTS)
     assert volume(file)[0] == pytest.approx(3)
-    with pytest.raises(ValueError, match="must be one of its parts: 'Soil-1', 'Clay', 'Wall-1'$"):
+    with pytest.raises(ValueError, match=r"must be one of its parts: 'Soil-1', 'Clay', 'Wall-1'$"):
         mpm.from_mesh(GRID, file, "_crest_S3")  # of a surface
     for part in ("Soil-1", "Clay"):
         V, low, high, areas = volume(file, part)
