@@ -86,17 +86,17 @@ def run(
         Step and output interval, s, > 0; one step to t_end where it is longer than that.  With `rtol` the output
         interval only; without it and `t_eval` every step is an output.
     rtol
-        Choose the steps by their error: that of the pore pressures in each step, known to a factor of 0.2 to 2, stays
-        below rtol of their largest change since the run began, or of what they would change by in the step if no fluid
-        flowed, which is more where it flows away within the step; at least ten times `tolerance`, and < 1.  Where
-        nothing flows the steps are as long as the output intervals; refused there with terms of the velocity, of which
-        no error is known.
+        Choose the steps by their error: that of the pore pressures stays below about rtol of their largest change
+        since the run began, or of what they would change by in the step if no fluid flowed, which is more where it
+        flows away within the step; at least ten times `tolerance`, and < 1.  Where nothing flows the steps are as long
+        as the output intervals; refused there with terms of the velocity, of which no error is known.  The error is
+        estimated, as a share of that of a first-order step: true ones were 0.7 to 5 times as large, the latter in
+        the step after a load jumps, see `solve.newton.ERROR`.
     t_eval : (m,), s
         Output times, increasing, in (t, t_end]; t_end is one of them in any case.  Steps end at output times.
     first_step, max_step
         With `rtol`: the first step to try, not of a run that goes on, and the longest, s, > 0.  By default the first is
-        about the time in which pressures diffuse through a cell, times 1.5 sqrt(rtol), or a thousandth of the first
-        output.
+        about the time in which pressures diffuse through a cell, times 20 rtol, or a thousandth of the first output.
     probes
         Particles that are recorded.
     observe

@@ -197,19 +197,16 @@ def swinging(speed):
 
 
 @pytest.mark.parametrize("name", DRIVEN)
-def test_the_estimate_of_a_steps_error_is_about_the_error_whatever_drives_the_water(name):
-    """Against eight steps in place of one; a twentieth of the error of a first-order step is off by up to 25."""
+def test_the_estimated_error_is_that_of_a_run_to_a_factor_that_is_told_whatever_drives_the_water(name):
+    """Against steps an eighth as long: 0.7 to 5 times the estimate, see `newton.ERROR`."""
     dt, make = DRIVEN[name]
-    s, ratios = make(), []
-    for k in range(12):
-        before, report = s.state, s.step(dt * TIME)
-        if k in (0, 2, 5, 11):
-            once, after, s.state = s.scene.storage.p.x.array.copy(), s.state, before
-            for _ in range(8):
-                s.step(dt * TIME / 8)
-            ratios.append(np.abs(s.scene.storage.p.x.array - once).max() / report.error)
-            s.state = after
-    assert 0.2 < min(ratios) and max(ratios) < 2, ratios
+    s, fine, errors, estimates = make(), make(), [], []
+    for _ in range(10):
+        estimates.append(s.step(dt * TIME).error)
+        for _ in range(8):
+            fine.step(dt * TIME / 8)
+        errors.append(np.abs(fine.scene.storage.p.x.array - s.scene.storage.p.x.array).max())
+    assert 0.7 < max(errors) / max(estimates) < 5.5, (errors, estimates)
 
 
 def test_output_times_are_hit_whatever_the_steps():
@@ -236,7 +233,7 @@ def test_steps_grow_over_six_decades_of_consolidation():
         )
         return result.steps, np.array(p).reshape(-1, 2, 20, 2).mean(axis=(1, 3))
 
-    (steps, p), (_, true) = run(5e-5), run(1e-5)
+    (steps, p), (_, true) = run(8e-5), run(1e-5)
     assert steps <= 100 and np.abs(p - true).max() < 1e-3 * 100
 
 

@@ -449,13 +449,6 @@ class StorageProblem:
         capacity = self.forms.derivatives(self.data)[0]
         return lost / (capacity + self._contents.fixed_stress)[owned]
 
-    def flows(self, pressure: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return what the owned cells lose by these pressures (n,), Pa, in the time that the rate counts, m^d."""
-        lost = self.dt * (self.system.T * self.system.unknowns.gather_owned(pressure)).array_r
-        if self._seeps:
-            lost = lost + self.dt * self._flow(False).faces.seepage(self._potentials, self._flowing)[1] * pressure
-        return lost
-
     @property
     def ring(self) -> float:
         """Mean length of the rings that the cells' contents are in axisymmetry, m."""
