@@ -124,8 +124,7 @@ def _problem(scene: Scene, start: Start, state: State) -> MomentumProblem:
     scene.momentum.set_rate(NEVER, 0.0)
     scene.momentum.u.x.array[:] = 0.0
     data = start.on_grid.data_of(state)
-    accuracy = matrices.round_off, scene.scheme.tolerance
-    return MomentumProblem(scene.momentum, matrices.momentum, data, acting.sides, *accuracy)
+    return MomentumProblem(scene.momentum, matrices.momentum, data, acting.sides, scene.scheme.tolerance)
 
 
 def _stay(scene: Scene, start: Start) -> Stay:

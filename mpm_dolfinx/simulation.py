@@ -281,11 +281,11 @@ class Simulation:
         self.state, report = self.advanced(dt)
         return report
 
-    def advanced(self, dt: float) -> tuple[State, Report]:
-        """Return the state after a step of dt (s), and what it took; the simulation's own state stays."""
+    def advanced(self, dt: float, *how: tuple) -> tuple[State, Report]:
+        """Return the state after a step of dt (s), and what it took; how: other substeps.  The own state stays."""
         numbers("dt", dt, test=lambda v: (0 < v) & (v < np.inf), allowed="> 0 and finite")
         try:
-            return step(self.scene, self.state, dt)
+            return step(self.scene, self.state, dt, *how)
         except StepFailed:
             raise
         except BaseException as error:  # broken off anywhere

@@ -14,11 +14,11 @@ from mpm_dolfinx.solve.newton import note_pressures, solve_substep
 from mpm_dolfinx.state import State
 
 
-def set_up(scene: Scene, state: State, dt: float) -> Start:
-    """Return the start of a step of dt (s): the state on the grid, its matrices, and what acts in each substep."""
+def set_up(scene: Scene, state: State, dt: float, how: tuple = ()) -> Start:
+    """Return the start of a step of dt (s): the state on the grid, its matrices, and what acts in its substeps."""
     scene.check(state)
     collect_garbage(scene.grid.mesh.comm)
-    stage, times = state.stage, [state.t + substep.end * dt for substep in scene.substeps]
+    stage, times = state.stage, [state.t + substep.end * dt for substep in how or scene.substeps]
     gravity = [stage.gravity_at(t) for t in times]
     state = state if state.stay else state.at_owners(scene.grid)
     cut_points = state.stay.points if state.stay else state.points  # points that hardly move stay as they were cut
@@ -32,13 +32,13 @@ def set_up(scene: Scene, state: State, dt: float) -> Start:
     matrices = scene.assembled(on_grid, stage, as_cut, state.begins)
     scene.momentum.u.x.array[:] = 0.0
     on_grid.start(state)
-    acting = [Acting(*one) for one in zip(scene.substeps, times, sides, gravity, strict=True)]
+    acting = [Acting(*one) for one in zip(how or scene.substeps, times, sides, gravity, strict=True)]
     return Start(state, on_grid, data, matrices, dt, has_yielded(scene, state), acting)
 
 
-def step(scene: Scene, state: State, dt: float) -> tuple[State, Report]:
+def step(scene: Scene, state: State, dt: float, how: tuple = ()) -> tuple[State, Report]:
     """Return the state after a step of dt (s), and what it took; `state` stays what it is, whatever is raised."""
-    start, report, rates = set_up(scene, state, dt), Report(), []
+    start, report, rates = set_up(scene, state, dt, how), Report(), []
     state, on_grid, solvers = start.state, start.on_grid, start.matrices.solvers()
     as_reset = partial(on_grid.as_reset, state)
     for acting in start.acting:

@@ -80,7 +80,7 @@ def balances(scene: Scene, start: Start, acting: Acting, before: Rates | None = 
     substep, on_grid, matrices, dt = acting.substep, start.on_grid, start.matrices, start.dt
     scene.set_time(acting.t, substep.end * dt, acting.gravity)
     scene.momentum.set_rate(substep.own * dt, substep.before / substep.own)
-    forces = matrices.round_off, scene.scheme.tolerance, going_on(scene, start, substep), start.state.held
+    forces = scene.scheme.tolerance, going_on(scene, start, substep), start.state.held
     momentum = MomentumProblem(scene.momentum, matrices.momentum, start.data, acting.sides, *forces, start.yielded)
     if scene.storage is None:
         return Balances(momentum, None)
