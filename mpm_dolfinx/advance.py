@@ -125,8 +125,9 @@ class Motion:
                 if cut.domains and came is not None:
                     points = replace(points, data=points.data | self._owed(state, points, on_grid, came, serves))
             _check_inside(cut, points, t)
-        stay, held = Stay(cut.points, ids, pressure, x, start), state.held if serves else None
-        new = replace(state, t=t, points=points, transported=None, stay=stay, held=held)
+        stay = Stay(cut.points, ids, pressure, x, start)
+        held, rest = (state.held, state.rest) if serves else (None, None)
+        new = replace(state, t=t, points=points, transported=None, stay=stay, held=held, rest=rest)
         return new if serves and stays else self.left_grid(new, on_grid), folded
 
     def _deformed(self, cut: CutDomains, data: QuadratureData, nodal: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -64,7 +64,8 @@ def balanced(scene: Scene, state: State) -> State:
 
     A step's displacement of the grid, w, is balanced with the strains of pieces; points keep the mean of their domains.
     So the steps are a fixed-point iteration, w <- w + u(w), here with Anderson's mixing (Walker and Ni 2011).  At
-    slanted sides means cannot balance all nodes: forces hold the rest, `State.held`.
+    slanted sides means cannot balance all nodes: forces hold the rest, `State.held`.  What holds sides gives way by w, of
+    which it has its force: `State.rest`.
 
     Raises
     ------
@@ -72,49 +73,56 @@ def balanced(scene: Scene, state: State) -> State:
         There is no such balance that the laws can bear.
     """
     forms, materials, comm = scene.momentum, scene.materials, scene.grid.comm
+    mechanical = state.stage.mechanical
     try:
         start = set_up(scene, state, 0.0)
         seeded = replace(start.state, stay=_stay(scene, start))
-        unknowns, best, count = start.matrices.momentum.unknowns, (np.inf, 0, seeded.points, None), 0
+        unknowns, best, count = start.matrices.momentum.unknowns, (np.inf, 0), 0
         solvers, report = LinearSolvers(scene.scheme, start.matrices.momentum, None, start.matrices.symmetric), Report()
         seen, w, points = [], np.zeros_like(forms.u.x.array), seeded.points
         while count - best[1] < PATIENCE:
+            forms.u.x.array[:] = w
+            start = _placed(scene, start, replace(seeded, points=points))
             problem = _problem(scene, start, replace(seeded, points=points))
             residual, scale = problem.assemble_residual()
             left = residual.norm() / max(scale, start.matrices.round_off)
             if left < LESS * best[0]:
                 unknowns.add(forms.u, 1.0, residual)
-                best = left, count, points, forms.u.x.array.copy()
-                forms.u.x.array[:] = 0.0
+                held, forms.u.x.array[:] = forms.u.x.array.copy(), 0.0
+                best = left, count, points, held, w, mechanical.reactions(start.acting[-1].sides, forms.nodal)
             if left <= scene.scheme.tolerance:
                 break
             solve_substep(solvers, problem, None, partial(start.on_grid.as_reset, seeded), count, report)
-            if seeded.stage.mechanical.touches:
-                start, seeded = _pressed(scene, start, seeded, unknowns)
+            if mechanical.touches:
+                _, touched = mechanical.touched(start.acting[-1].sides, unknowns, forms.u.x.array, seeded.points)
+                seeded = replace(seeded, points=touched)
             seen = [*seen[-DEPTH:], (w, forms.u.x.array.copy())]
             w, count = _mixed(unknowns, seen), count + 1
             forms.u.x.array[:] = w
             forms.internal(start.data)  # mean dilatations are those of w
-            moved, _ = scene.motion.advanced(seeded, start.on_grid, start.data, state.t, seeded.stage.mechanical.tools)
+            moved, _ = scene.motion.advanced(seeded, start.on_grid, start.data, state.t, mechanical.tools)
             points = strained(materials, seeded.points, moved.points)
     except StepFailed as error:
         scene.forget()
         raise ValueError(f"initial_stress: must be in balance with what acts at the start: {error}") from error
-    left, count, points, held = best
+    left, count, points, held, rest, reactions = best
     before, after = (np.nan_to_num(materials.effective_stress_3d(of)) for of in (seeded.points, points))
     largest, changed = (over_all(comm, float(np.abs(v).max(initial=0.0)), MPI.MAX) for v in (before, after - before))
     what = "initial_stress: in balance after %d iterations, changed by at most %.3g of %.3g Pa; %.2g of its forces held"
     tell = warn if changed > REMARKABLE * largest or left > REMARKABLE else log
     tell(comm, what, count, changed, largest, left)
-    return replace(start.state, points=points, held=held)
+    rest = rest if mechanical.holds_sides else None
+    return replace(start.state, points=points, held=held, rest=rest, reactions=reactions)
 
 
-def _pressed(scene: Scene, start: Start, state: State, unknowns: Unknowns) -> tuple[Start, State]:
-    """Return start and state with what tools and contacts have on the points at the present displacement."""
-    mechanical, acting, cut = state.stage.mechanical, start.acting[-1], start.on_grid.cut
-    _, points = mechanical.touched(acting.sides, unknowns, scene.momentum.u.x.array, state.points)
-    sides = mechanical.data(scene.momentum.sides, cut, state.t, state.tool_travel, state.t, points)
-    return start._replace(acting=[acting._replace(sides=sides)]), replace(state, points=points)
+def _placed(scene: Scene, start: Start, state: State) -> Start:
+    """Return the start with what acts on the sides of points that are as strained as after u."""
+    mechanical, acting = state.stage.mechanical, start.acting[-1]
+    if not (mechanical.touches or mechanical.holds_sides):
+        return start
+    place = scene.momentum.sides, start.on_grid.cut, state.t, state.tool_travel, state.t, state.points
+    sides = mechanical.data(*place).moved(scene.momentum.u)
+    return start._replace(acting=[acting._replace(sides=sides)])
 
 
 def _problem(scene: Scene, start: Start, state: State) -> MomentumProblem:

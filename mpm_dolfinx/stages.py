@@ -45,7 +45,7 @@ def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int
     outflows = np.zeros(len(begun.hydraulic.outlets))
     points, forces = begun.mechanical.grip(points), begun.mechanical.forces(0.0)
     ways = np.zeros(len(begun.mechanical.tools.tools))
-    return State(0.0, points, transported, None, 0, reactions, outflows, forces, ways, begun, True, None, None, None)
+    return State(0.0, points, transported, None, 0, reactions, outflows, forces, ways, begun, True, *[None] * 4)
 
 
 def begin_stage(

@@ -139,6 +139,11 @@ class MechanicalBoundary:
         """Return points with what tools and contacts have on them: nothing, or what the same points had `before`."""
         return gripped(points, {**self.tools.kept(len(points)), **self.contacts.kept(len(points))}, before)
 
+    @property
+    def holds_sides(self) -> bool:
+        """Whether there are given displacements or plates."""
+        return bool(self.holds or self.plates)
+
     def check_start(self, cut: CutDomains, points: MaterialPoints, t: float, ways: NDArray[np.float64]) -> None:
         """Refuse a stage that begins at time t (s) with tools in bodies, or with groups of bodies in each other.
 
@@ -318,8 +323,7 @@ class MechanicalBoundary:
         grid, data, held = self.grid, sides.holds, sides.held
         if data is None:
             return np.zeros((0, grid.dim))
-        moved = np.einsum("mk,mkd,md->m", held.shape[sides.row], u[grid.cell_nodes[data.cells]], data["direction"])
-        force = data["stiffness"][:, 0] * (data["gap"][:, 0] - moved)
+        force = data["stiffness"][:, 0] * (data["gap"][:, 0] - sides.along(u))
         self._warn(held, sides.row, data["direction"].argmax(axis=1), force)
         number, force = held.number[sides.row], force[:, None] * data["direction"]
         return grid.comm.allreduce(np.stack([sum_by(number, column, len(self.holds)) for column in force.T], axis=1))
