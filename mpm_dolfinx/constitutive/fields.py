@@ -202,16 +202,19 @@ class SceneMaterials:
         return np.stack([conductivity, np.where(by_place, len(known) + points.id, law)], axis=1)
 
     def table(self, points: MaterialPoints, value: Callable[..., float], *columns: NDArray) -> NDArray[np.float64]:
-        """Return value(material, *columns) at the points (n, ...); columns (n,) are values at the points."""
-        if not columns and not any(self._fields[i] for i in self._used):
-            each = [value(m) if i in self._used else 0.0 for i, m in enumerate(self.materials)]
-            return np.array(each)[points.material]
-        out = None
+        """Return value(material, *columns) at the points (n, ...); columns (n,) are values at the points.
+
+        Of a material whose constants are the same everywhere it is one value (...) without columns, else one a point; a
+        single number always stands for all.
+        """
+        each = []
         for i in self._used:
             rows = np.flatnonzero(points.material == i)
-            values = value(self._at(points, i, rows), *(column[rows] for column in columns))
-            out = np.zeros((len(points), *np.shape(values)[1:])) if out is None else out
-            out[rows] = values
+            found = np.asarray(value(self._at(points, i, rows), *(column[rows] for column in columns)))
+            each.append((rows, found, found.shape[bool(columns or self._fields[i]) :]))
+        out = np.zeros((len(points), *np.broadcast_shapes(*(shape for *_, shape in each))))
+        for rows, found, _ in each:
+            out[rows] = found
         return out
 
     def check(self, what: str, points: MaterialPoints) -> None:
