@@ -187,5 +187,4 @@ def _changed(scene: Scene, points: MaterialPoints, fields: Mapping[str, ArrayLik
             raise ValueError(f"{what} of shape {new.shape}, must be {each}one for each of {len(points)} points")
         data[name] = new.copy()
     points = replace(points, data=data)
-    everywhere(scene.grid, lambda: scene.materials.check("stage: fields", points))
-    return points
+    return everywhere(scene.grid, lambda: scene.materials.changed("stage: fields", points, fields))
