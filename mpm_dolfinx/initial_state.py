@@ -100,8 +100,8 @@ def balanced(scene: Scene, state: State) -> State:
             w, count = _mixed(unknowns, seen), count + 1
             forms.u.x.array[:] = w
             forms.internal(start.data)  # mean dilatations are those of w
-            moved, _ = scene.motion.advanced(seeded, start.on_grid, start.data, state.t, mechanical.tools)
-            points = strained(materials, seeded.points, moved.points)
+            moved, *_ = scene.motion.moved(seeded, start.on_grid, start.data, state.t, mechanical.tools)
+            points = strained(materials, seeded.points, moved)
     except StepFailed as error:
         scene.forget()
         raise ValueError(f"initial_stress: must be in balance with what acts at the start: {error}") from error

@@ -95,9 +95,8 @@ def begin_stage(
         new["tool_travel"] = np.zeros(len(begun.mechanical.tools.tools))
     if named.keys() & {"drained", "inflows"}:
         new["outflows"] = np.full(len(begun.hydraulic.outlets), unknown)
-    if add or remove:
-        new["held"] = None
-    return replace(state, points=points, transported=transported, stage=begun, begins=True, **new)
+    new["rest"] = state.rest if begun.mechanical.holds_as(before.mechanical) else None
+    return replace(state, points=points, transported=transported, stage=begun, begins=True, held=None, **new)
 
 
 def _stage(scene: Scene, conditions: Mapping[str, Any], present: Sequence[bool], later: Sequence[int]) -> Stage:

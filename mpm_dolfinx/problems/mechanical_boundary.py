@@ -144,6 +144,14 @@ class MechanicalBoundary:
         """Whether there are given displacements or plates."""
         return bool(self.holds or self.plates)
 
+    def holds_as(self, other: MechanicalBoundary) -> bool:
+        """Return whether the same given displacements and plates hold the same faces."""
+        own, others = ([(hold, faces) for hold, faces, *_ in (*of.holds, *of.plates)] for of in (self, other))
+        return len(own) == len(others) and all(
+            hold is was and np.array_equal(faces.id, then.id) and np.array_equal(faces.xi, then.xi)
+            for (hold, faces), (was, then) in zip(own, others, strict=True)
+        )
+
     def check_start(self, cut: CutDomains, points: MaterialPoints, t: float, ways: NDArray[np.float64]) -> None:
         """Refuse a stage that begins at time t (s) with tools in bodies, or with groups of bodies in each other.
 
