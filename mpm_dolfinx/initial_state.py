@@ -40,7 +40,10 @@ DEPTH = 5  # of the iterations that are mixed
 PATIENCE, LESS = 4, 0.7  # the iteration ends where so many do not bring what is left down to this share
 NEVER = 1e30  # s: time of a step, in which nothing has a rate
 REMARKABLE = 0.05
-"""Share of the largest given stress by which the balance changes stresses, from which on a warning says so."""
+"""Share of the largest given stress by which the balance changes stresses, from which on a warning says so.
+
+Also the share of the forces that may be left out of balance, as the scheme's error.
+"""
 
 
 def pieces_at_start(scene: Scene, points: MaterialPoints) -> PiecePressures:
@@ -106,10 +109,14 @@ def balanced(scene: Scene, state: State) -> State:
         scene.forget()
         raise ValueError(f"initial_stress: must be in balance with what acts at the start: {error}") from error
     left, count, points, held, rest, reactions = best
+    if left > REMARKABLE:
+        scene.forget()
+        what = "initial_stress: must be in balance with what acts at the start, and with what holds the bodies"
+        raise ValueError(f"{what}: {100 * left:.2g} % of the forces are left")
     before, after = (np.nan_to_num(materials.effective_stress_3d(of)) for of in (seeded.points, points))
     largest, changed = (over_all(comm, float(np.abs(v).max(initial=0.0)), MPI.MAX) for v in (before, after - before))
     what = "initial_stress: in balance after %d iterations, changed by at most %.3g of %.3g Pa; %.2g of its forces held"
-    tell = warn if changed > REMARKABLE * largest or left > REMARKABLE else log
+    tell = warn if changed > REMARKABLE * largest else log
     tell(comm, what, count, changed, largest, left)
     rest = rest if mechanical.holds_sides else None
     return replace(start.state, points=points, held=held, rest=rest, reactions=reactions)
@@ -121,7 +128,7 @@ def _placed(scene: Scene, start: Start, state: State) -> Start:
     if not (mechanical.touches or mechanical.holds_sides):
         return start
     place = scene.momentum.sides, start.on_grid.cut, state.t, state.tool_travel, state.t, state.points
-    sides = mechanical.data(*place).moved(scene.momentum.u)
+    sides = mechanical.data(*place, at_rest=True).moved(scene.momentum.u)
     return start._replace(acting=[acting._replace(sides=sides)])
 
 

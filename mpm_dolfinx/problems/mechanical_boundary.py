@@ -202,17 +202,18 @@ class MechanicalBoundary:
         ways: NDArray[np.float64],
         t: float,
         points: MaterialPoints,
+        at_rest: bool = False,
     ) -> SideData:
         """Return what acts at time t (s) of a step that began at `start` on the points where they are now.
 
-        ways (tools,): how far loads had pushed tools then, m.
+        ways (tools,): how far loads had pushed tools then, m; at_rest: hold sides where displacements count from.
         """
         with Timer("mpm: loads"):
             loads = self._load_data(forms, cut, points, t) if self.loads else None
             pressures = self._pressure_data(forms, cut, points, t) if self.pressures else None
             plates = self._plate_data(forms, cut, points) if self.plates else None
             none = (None, np.empty(0, dtype=np.int64), np.empty((0, 2**self.grid.dim)))
-            holds = self._hold_data(forms, cut, points, t) if self.holds else none
+            holds = self._hold_data(forms, cut, points, t, at_rest) if self.holds else none
             pairs = zip(forms.own, self._terms, strict=True)
             own = tuple(self._own_data(term.points, faces, cut, points) for term, faces in pairs)
             tools = self.tools.going(Ways(start, t, ways, ways)).placed(cut, points, start, t)
@@ -271,12 +272,12 @@ class MechanicalBoundary:
         return forms.plates.at(cell, x, np.ones(len(cell)), rigidity=rigidity, normal=normal, tilt=tilt)
 
     def _hold_data(
-        self, forms: SideForms, cut: CutDomains, points: MaterialPoints, t: float
+        self, forms: SideForms, cut: CutDomains, points: MaterialPoints, t: float, at_rest: bool
     ) -> tuple[PointData, HeldCells, NDArray[np.int64]]:
         """Return what holds given displacements, a row a component; by cells and points; and which of these each is."""
         d, comm = self.grid.dim, self.grid.comm
         self._check_meeting(t)
-        held = HeldCells(self.grid, self._held_points(cut, points, t))
+        held = HeldCells(self.grid, self._held_points(cut, points, t, at_rest))
         placed, message = [], ""
         for axis in range(d):
             given = np.array([axis in axes for *_, axes in self.holds])
@@ -292,19 +293,21 @@ class MechanicalBoundary:
         fields |= {"stiffness": stiffness, "gap": gap, "direction": direction}
         return forms.holds.at(held.cell[row], held.x[row], np.ones(len(row)), **fields), held, row
 
-    def _held_points(self, cut: CutDomains, points: MaterialPoints, t: float) -> HeldPoints:
+    def _held_points(self, cut: CutDomains, points: MaterialPoints, t: float, at_rest: bool) -> HeldPoints:
         """Return the points of integration on held sides, at the owners of their cells."""
         d, rows = self.grid.dim, []
         patches = cut.surfaces([faces for _, faces, _ in self.holds])
         chosen = np.unique(np.concatenate([p.at for p in patches]))
-        now, before = (of.map(lambda values: values[chosen]) for of in (points, cut.points))
+        cut_points = points if at_rest else cut.points  # which are where they were cut
+        now, before = (of.map(lambda values: values[chosen]) for of in (points, cut_points))
         stress = self.materials.total_stress(now)
         modulus, resists = (self.materials.table(before, of) for of in (holding, resistance))
         firm = self.materials.confined_modulus(before)
         # of when the grid was reset, as the stiffnesses: they stay as long as the cut serves
-        tension = np.linalg.norm(stress if points is cut.points else self.materials.total_stress(before), axis=(1, 2))
+        tension = np.linalg.norm(stress if points is cut_points else self.materials.total_stress(before), axis=(1, 2))
         for number, ((hold, *_, axes), p) in enumerate(zip(self.holds, patches, strict=True)):
-            at, now, to = np.searchsorted(chosen, p.at), p.now(points), p.origin(points) + self._given(hold, t, p.X)
+            at, now, to = np.searchsorted(chosen, p.at), p.now(points), p.origin(points)
+            to = to if at_rest else to + self._given(hold, t, p.X)
             R = turned(self.grid.comm, p.area0, now, to) if len(axes) == d else np.eye(d)  # as what it carries does
             force, gap = np.einsum("ij,njk,nk->ni", R, stress[at, :d, :d], p.area(points)), to - now
             own = (p.area0 * v for v in (1, modulus[at], tension[at], resists[at], firm[at]))
