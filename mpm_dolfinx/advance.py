@@ -101,9 +101,19 @@ class Motion:
             A point has left the grid.
         """
         with Timer("mpm: move points"):
-            cut, pieces, grid = on_grid.cut, data.pieces, on_grid.cut.grid
-            nodal = self._momentum.u.x.array.reshape(-1, grid.dim)
-            points, serves, folded = self.moved(state, on_grid, data, t, tools)
+            cut, pieces = on_grid.cut, data.pieces
+            grid, d = cut.grid, cut.grid.dim
+            nodal = self._momentum.u.x.array.reshape(-1, d)
+            deformed = cache(partial(self._deformed, cut, data, nodal))
+            if cut.domains:
+                followed = cut.followed(nodal, self._momentum.active_nodes(on_grid.cells))
+                points, serves, folded = self._shaped(state, t, tools, cut, *followed, deformed)
+            else:
+                x, F = state.points.x + cut.displacement(nodal), deformed()
+                points = replace(state.points, x=x, F=F, corners=parallelepipeds(x, F, self._sizes(state.points)))
+                serves, folded = cut.serves(points), 0
+            self._check_volumes(points, cut)
+            points = replace(points, data=self._materials.updated_state(points, state.points, t - state.t))
             ids, pressure, x, start = None, None, None, None
             if self._storage is not None:
                 pressure = cut.to_pieces(self._storage.p.x.array[pieces.cells])
@@ -120,26 +130,12 @@ class Motion:
         new = replace(state, t=t, points=points, transported=None, stay=stay, held=held, rest=rest)
         return new if serves and stays else self.left_grid(new, on_grid), folded
 
-    def moved(
-        self, state: State, on_grid: OnGrid, data: QuadratureData, t: float, tools: Tools
-    ) -> tuple[MaterialPoints, bool, int]:
-        """Return the points at time t (s) after a solved step, but for their pressures, wherever they are.
-
-        See `advanced`; also whether they are still where they were cut, and how many domains had folded.
-        """
-        cut, d = on_grid.cut, on_grid.cut.grid.dim
-        nodal = self._momentum.u.x.array.reshape(-1, d)
-        deformed = cache(partial(self._deformed, cut, data, nodal))
-        if cut.domains:
-            followed = cut.followed(nodal, self._momentum.active_nodes(on_grid.cells))
-            points, serves, folded = self._shaped(state, t, tools, cut, *followed, deformed)
-        else:
-            x, F = state.points.x + cut.displacement(nodal), deformed()
-            points = replace(state.points, x=x, F=F, corners=parallelepipeds(x, F, self._sizes(state.points)))
-            serves, folded = cut.serves(points), 0
-        self._check_volumes(points, cut)
-        data_now = self._materials.updated_state(points, state.points, t - state.t)
-        return replace(points, data=data_now), serves, folded
+    def strained(self, points: MaterialPoints, on_grid: OnGrid, data: QuadratureData) -> MaterialPoints:
+        """Return points with F and state as after a solved step of no time, which stay where they are."""
+        nodal = self._momentum.u.x.array.reshape(-1, on_grid.cut.grid.dim)
+        after = replace(points, F=self._deformed(on_grid.cut, data, nodal))
+        self._check_volumes(after, on_grid.cut)
+        return replace(after, data=self._materials.updated_state(after, points, 0.0))
 
     def _deformed(self, cut: CutDomains, data: QuadratureData, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return F (n, d, d) of the points after a step: the means of Delta F and of its det over their pieces."""

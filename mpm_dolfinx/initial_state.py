@@ -103,8 +103,7 @@ def balanced(scene: Scene, state: State) -> State:
             w, count = _mixed(unknowns, seen), count + 1
             forms.u.x.array[:] = w
             forms.internal(start.data)  # mean dilatations are those of w
-            moved, *_ = scene.motion.moved(seeded, start.on_grid, start.data, state.t, mechanical.tools)
-            points = strained(materials, seeded.points, moved)
+            points = strained(materials, seeded.points, scene.motion.strained(seeded.points, start.on_grid, start.data))
     except StepFailed as error:
         scene.forget()
         raise ValueError(f"initial_stress: must be in balance with what acts at the start: {error}") from error
