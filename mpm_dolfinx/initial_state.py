@@ -36,8 +36,8 @@ from mpm_dolfinx.solve.schur import LinearSolvers
 from mpm_dolfinx.state import State, Stay
 from mpm_dolfinx.step import set_up
 
-DEPTH = 5  # of the iterations that are mixed
-PATIENCE, LESS = 4, 0.7  # the iteration ends where so many do not bring what is left down to this share
+DEPTH = 40  # of the iterations that are mixed
+PATIENCE, LESS = 16, 0.7  # the iteration ends where so many do not bring what is left down to this share
 NEVER = 1e30  # s: time of a step, in which nothing has a rate
 REMARKABLE = 0.05
 """Share of the largest given stress by which the balance changes stresses, from which on a warning says so.
