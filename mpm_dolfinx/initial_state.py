@@ -80,6 +80,9 @@ def balanced(scene: Scene, state: State) -> State:
     try:
         start = set_up(scene, state, 0.0)
         seeded = replace(start.state, stay=_stay(scene, start))
+        if scene.storage is not None:  # those that a step leaves
+            pressure = scene.motion.pressures(start.on_grid, state.stage, state.t)
+            seeded = replace(seeded, points=replace(seeded.points, pressure=pressure))
         unknowns, best, count = start.matrices.momentum.unknowns, (np.inf, 0), 0
         solvers, report = LinearSolvers(scene.scheme, start.matrices.momentum, None, start.matrices.symmetric), Report()
         seen, w, points = [], np.zeros_like(forms.u.x.array), seeded.points
