@@ -228,9 +228,9 @@ def stressed(
 class _Sought:
     """Elastic strains that give target stresses, by Newton's method.
 
-    They are symmetric: of `seeded_stretch`, in plane strain without that across the plane, whose stress the law is given,
-    or of C_p^-1.  points: n of them; target : (n, 3, 3), Pa; given, plastic : (n,) which have the stress among their
-    constants, and which have C_p^-1.
+    They are symmetric: of `seeded_stretch`, in plane strain without that across the plane, whose stress the law is
+    given, or of C_p^-1.  points: n of them; target : (n, 3, 3), Pa; given, plastic : (n,) which have the stress among
+    their constants, and which have C_p^-1.
     """
 
     materials: SceneMaterials

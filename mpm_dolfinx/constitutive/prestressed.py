@@ -44,7 +44,7 @@ def _everywhere(value) -> Callable:
 
 @cache
 def prestressed(law: type[Skeleton]) -> type[Skeleton]:
-    """Return a law with two more fields: `seeded_stretch` F_i (d, d), and `across`, Pa, of the stress across the plane."""
+    """Return a law with two more fields: `seeded_stretch` F_i (d, d), and `across`, Pa, of stress across the plane."""
     names = ("energy", "kirchhoff", "update", "trial")
     given = {name: staticmethod(_seen(f, name)) for name in names if (f := getattr(law, name)) is not None}
 
