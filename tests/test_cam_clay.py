@@ -135,6 +135,18 @@ def test_parameters_may_differ_from_place_to_place():
     assert mean == pytest.approx((1 + s.points.x[:, 1]) * P0, rel=1e-9)
 
 
+def test_the_bulk_modulus_follows_what_is_replaced_and_what_a_stage_changes():
+    wide = replace(CLAY, lambda_=0.1, kappa=0.02)
+    assert wide.bulk == pytest.approx(P0 / 0.02) and replace(wide, initial_stress=(-2 * P0,) * 3).bulk == 2 * wide.bulk
+    by_place = replace(wide, kappa=lambda X: 0.02 + 0.01 * X[:, 1])
+    assert replace(by_place, kappa=0.01).bulk == pytest.approx(P0 / 0.01)
+    s = column(cells=4, fluid=False, material=by_place)
+    s.stage(fields={"kappa": 0.04})
+    assert s.points.data["bulk"] == pytest.approx(P0 / 0.04)
+    with pytest.raises(ValueError, match=r"stage: fields: .* bulk = .*, must be left out"):
+        s.stage(fields={"bulk": 1e9})
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -147,6 +159,7 @@ def test_parameters_may_differ_from_place_to_place():
         ),
         ({"initial_stress": 1e5}, "must be three normal effective stresses"),
         ({"bulk": 1e9}, "must be left out: it is P_0 / kappa"),
+        ({"bulk": lambda X: np.full(len(X), 1e9)}, "must be left out: it is P_0 / kappa"),
         ({"shear": -1.0}, "shear = -1.0, must be > 0"),
     ],
 )
