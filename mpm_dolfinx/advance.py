@@ -29,6 +29,7 @@ from mpm_dolfinx.problems.mechanical_boundary import MechanicalBoundary
 from mpm_dolfinx.problems.momentum import MomentumForms
 from mpm_dolfinx.problems.on_grid import OnGrid
 from mpm_dolfinx.problems.quadrature_data import QuadratureData
+from mpm_dolfinx.problems.stage import Stage
 from mpm_dolfinx.problems.stage_tools import Tools
 from mpm_dolfinx.problems.storage import StorageForms
 from mpm_dolfinx.state import State, Stay
@@ -120,14 +121,26 @@ class Motion:
                 x = state.stay.x if state.stay else cut.pieces.x
                 x = x + cut.to_pieces(grid.at(pieces.cells, pieces.x, nodal))
                 start = state.stay.start if state.stay else cut.to_pieces(self._storage.p_n.x.array[pieces.cells])
-                own = on_grid.pressures_up_to_surface(self._reconstruction, state.stage, t)
-                points, ids = replace(points, pressure=cut.mean(own)), points.id[cut.pieces.point]
+                points = replace(points, pressure=self.pressures(on_grid, state.stage, t))
+                ids = points.id[cut.pieces.point]
                 if cut.domains and came is not None:
                     points = replace(points, data=points.data | self._owed(state, points, on_grid, came, serves))
             _check_inside(cut, points, t)
-        stay, held = Stay(cut.points, ids, pressure, x, start), state.held if serves else None
-        new = replace(state, t=t, points=points, transported=None, stay=stay, held=held)
+        stay = Stay(cut.points, ids, pressure, x, start)
+        held, rest = (state.held, state.rest) if serves else (None, None)
+        new = replace(state, t=t, points=points, transported=None, stay=stay, held=held, rest=rest)
         return new if serves and stays else self.left_grid(new, on_grid), folded
+
+    def pressures(self, on_grid: OnGrid, stage: Stage, t: float) -> NDArray[np.float64]:
+        """Return the pressures (n,), Pa, of the points by those of the cells at time t (s)."""
+        return on_grid.cut.mean(on_grid.pressures_up_to_surface(self._reconstruction, stage, t))
+
+    def strained(self, points: MaterialPoints, on_grid: OnGrid, data: QuadratureData) -> MaterialPoints:
+        """Return points with F and state as after a solved step of no time, which stay where they are."""
+        nodal = self._momentum.u.x.array.reshape(-1, on_grid.cut.grid.dim)
+        after = replace(points, F=self._deformed(on_grid.cut, data, nodal))
+        self._check_volumes(after, on_grid.cut)
+        return replace(after, data=self._materials.updated_state(after, points, 0.0))
 
     def _deformed(self, cut: CutDomains, data: QuadratureData, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return F (n, d, d) of the points after a step: the means of Delta F and of its det over their pieces."""

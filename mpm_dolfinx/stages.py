@@ -45,7 +45,7 @@ def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int
     outflows = np.zeros(len(begun.hydraulic.outlets))
     points, forces = begun.mechanical.grip(points), begun.mechanical.forces(0.0)
     ways = np.zeros(len(begun.mechanical.tools.tools))
-    return State(0.0, points, transported, None, 0, reactions, outflows, forces, ways, begun, True, None, None, None)
+    return State(0.0, points, transported, None, 0, reactions, outflows, forces, ways, begun, True, *[None] * 4)
 
 
 def begin_stage(
@@ -95,9 +95,8 @@ def begin_stage(
         new["tool_travel"] = np.zeros(len(begun.mechanical.tools.tools))
     if named.keys() & {"drained", "inflows"}:
         new["outflows"] = np.full(len(begun.hydraulic.outlets), unknown)
-    if add or remove:
-        new["held"] = None
-    return replace(state, points=points, transported=transported, stage=begun, begins=True, **new)
+    new["rest"] = state.rest if begun.mechanical.holds_as(before.mechanical) else None
+    return replace(state, points=points, transported=transported, stage=begun, begins=True, held=None, **new)
 
 
 def _stage(scene: Scene, conditions: Mapping[str, Any], present: Sequence[bool], later: Sequence[int]) -> Stage:
@@ -187,5 +186,4 @@ def _changed(scene: Scene, points: MaterialPoints, fields: Mapping[str, ArrayLik
             raise ValueError(f"{what} of shape {new.shape}, must be {each}one for each of {len(points)} points")
         data[name] = new.copy()
     points = replace(points, data=data)
-    everywhere(scene.grid, lambda: scene.materials.check("stage: fields", points))
-    return points
+    return everywhere(scene.grid, lambda: scene.materials.changed("stage: fields", points, fields))

@@ -80,7 +80,10 @@ class State:
         yields.  None before the first step, and without such soil.
     held : (unknowns,), N
         Forces on the nodes of this process, ghosts included, that hold what the scheme's error leaves out of balance of
-        an initial stress; None without, and from when the bodies have moved so far that the grid is reset.
+        an initial stress; None without, once a stage begins, and once bodies have moved so far that the grid is reset.
+    rest : (unknowns,), m
+        Displacement of the nodes of this process, ghosts included, for which given displacements and plates have the
+        forces of an initial stress at rest; None once a stage changes these, and once the grid is reset.
     result
         Histories of the last run, None before the first one.
     """
@@ -98,6 +101,7 @@ class State:
     begins: bool
     velocity: NDArray[np.float64] | None
     held: NDArray[np.float64] | None
+    rest: NDArray[np.float64] | None
     result: Result | None
 
     def migrated(self, destination: NDArray[np.int32], comm: MPI.Intracomm) -> State:

@@ -7,7 +7,7 @@ from dataclasses import replace
 from functools import partial
 
 from mpm_dolfinx.forms.unknowns import collect_garbage
-from mpm_dolfinx.problems.balances import Acting, Start, balances, has_yielded
+from mpm_dolfinx.problems.balances import Acting, Start, at_rest, balances, has_yielded
 from mpm_dolfinx.result import Report
 from mpm_dolfinx.scene import Scene
 from mpm_dolfinx.solve.newton import note_pressures, solve_substep
@@ -29,7 +29,7 @@ def set_up(scene: Scene, state: State, dt: float, how: tuple = ()) -> Start:
         stage.mechanical.check_start(on_grid.cut, state.points, state.t, state.tool_travel)
     sides, data = [place(t, state.points) for t in times], on_grid.data_of(state)
     as_cut = partial(place, times[-1], cut_points) if state.stay else partial(sides.__getitem__, -1)
-    matrices = scene.assembled(on_grid, stage, as_cut, state.begins)
+    matrices, sides = scene.assembled(on_grid, stage, as_cut, state.begins), at_rest(scene, state, sides)
     scene.momentum.u.x.array[:] = 0.0
     on_grid.start(state)
     acting = [Acting(*one) for one in zip(how or scene.substeps, times, sides, gravity, strict=True)]

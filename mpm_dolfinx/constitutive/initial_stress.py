@@ -228,9 +228,9 @@ def stressed(
 class _Sought:
     """Elastic strains that give target stresses, by Newton's method.
 
-    They are symmetric: of the prestretch, in plane strain without that across the plane, whose stress the law is given,
-    or of C_p^-1.  points: n of them; target : (n, 3, 3), Pa; given, plastic : (n,) which have the stress among their
-    constants, and which have C_p^-1.
+    They are symmetric: of `seeded_stretch`, in plane strain without that across the plane, whose stress the law is
+    given, or of C_p^-1.  points: n of them; target : (n, 3, 3), Pa; given, plastic : (n,) which have the stress among
+    their constants, and which have C_p^-1.
     """
 
     materials: SceneMaterials
@@ -284,7 +284,7 @@ class _Sought:
         elastic = (turn * np.exp(2 * logs)[:, None]) @ turn.swapaxes(1, 2)
         now = _with(self.points, self.plastic & ~self.given, plastic=elastic)
         d, stretch = self.materials.grid.stretches, (turn * np.exp(logs)[:, None]) @ turn.swapaxes(1, 2)
-        now = _with(now, ~self.plastic & ~self.given, prestretch=stretch[:, :d, :d])
+        now = _with(now, ~self.plastic & ~self.given, seeded_stretch=stretch[:, :d, :d])
         stress = self.materials.effective_stress_3d(now)
         return now, stress, self.of(stress - self.target)
 
@@ -325,8 +325,8 @@ def strained(materials: SceneMaterials, points: MaterialPoints, moved: MaterialP
     own = {name: points.data[name] for name in ("softness", "owed", "due") if name in points.data}
     data = {**moved.data, **own}
     out = replace(points, data=data)
-    if "prestretch" in data:
-        out = _with(out, np.ones(len(F), dtype=bool), prestretch=F @ data["prestretch"])
+    if "seeded_stretch" in data:
+        out = _with(out, np.ones(len(F), dtype=bool), seeded_stretch=F @ data["seeded_stretch"])
     if "plastic" in data:
         stretch = materials.table(points, _prestretch)
         whole = np.tile(np.eye(3), (len(F), 1, 1))

@@ -34,7 +34,7 @@ FOREIGN = "no checkpoint of mpm_dolfinx, must be one"
 ZIP = b"PK\3\4"  # how numpy's archives begin
 ACTING = ("reactions", "outflows", "tool_forces", "tool_travel")
 PIECES = ("id", "pressure", "x", "start")  # of a Stay
-NODAL = ("velocity", "held")  # of a State
+NODAL = ("velocity", "held", "rest")  # of a State
 NOTE = {"t": float, "resets": int, "begins": bool, "scene": dict, "result": dict}  # and their kinds
 
 

@@ -56,6 +56,14 @@ class Balances(NamedTuple):
         return self.storage and self.storage.came(rates)
 
 
+def at_rest(scene: Scene, state: State, sides: list[SideData]) -> list[SideData]:
+    """Return what acts on sides in each substep, what holds them with its forces of an initial stress at rest."""
+    if state.rest is None:
+        return sides
+    scene.momentum.u.x.array[:] = state.rest
+    return [of.moved(scene.momentum.u) for of in sides]
+
+
 def going_on(scene: Scene, start: Start, substep: Substep) -> NDArray[np.float64] | None:
     """Return displacements (unknowns,), m, if bodies that yield moved on as in the substep before, or the last step.
 
