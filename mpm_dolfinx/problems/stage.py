@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.constitutive.fields import SceneMaterials
+from mpm_dolfinx.given_values import check_names, given
 from mpm_dolfinx.points.bodies import Body
 from mpm_dolfinx.points.faces import Surface
 from mpm_dolfinx.points.grid import Grid
@@ -21,7 +22,7 @@ from mpm_dolfinx.problems.hydraulic_boundary import HydraulicBoundary
 from mpm_dolfinx.problems.mechanical_boundary import MechanicalBoundary
 from mpm_dolfinx.problems.sides import Sides
 from mpm_dolfinx.problems.tools import Tool
-from mpm_dolfinx.validation import all_of, asked, line, numbers
+from mpm_dolfinx.validation import all_of, line, numbers
 
 CONDITIONS = {
     "tractions": (Traction, Pressure),
@@ -58,12 +59,10 @@ class Stage:
 
     def gravity_at(self, t: float) -> NDArray[np.float64] | None:
         """Return the acceleration of gravity (d,) at time t (s), m/s^2; None without."""
-        given, name = self.conditions["gravity"], f"gravity at t = {t:g} s"
-        if given is None:
+        gravity, name, d = self.conditions["gravity"], f"gravity at t = {t:g} s", self.free.shape[1]
+        if gravity is None:
             return None
-        d = self.free.shape[1]
-        given = asked(name, f"{d} numbers for a time", given, t) if callable(given) else given
-        return _gravity(given, name, d, self.axisymmetric)
+        return _gravity(given(name, gravity, t, None, d, number=False), name, d, self.axisymmetric)
 
 
 def stage(
@@ -101,18 +100,23 @@ def stage(
     if not wet and (conditions["drained"] or conditions["inflows"]):
         raise ValueError("drained and inflow sides need a fluid")
     gravity = conditions["gravity"]
-    if gravity is not None and not callable(gravity):
-        _gravity(gravity, "gravity", grid.dim, grid.axisymmetric)
+    if callable(gravity):
+        check_names("gravity", gravity, ("t",))
+    elif gravity is not None:
+        gravity = _gravity(gravity, "gravity", grid.dim, grid.axisymmetric).copy()
     if not any(present):
         raise ValueError("bodies: none is there, must be at least one")
-    conditions = {**conditions, "fixed": with_axis(grid, conditions["fixed"])}
-    free, sides = ~_fixed(grid, conditions["fixed"]), Sides(grid, bodies, present)
+    fixed = with_axis(grid, conditions["fixed"])
+    free = ~_fixed(grid, fixed)
+    own = {name: tuple(values) for name, values in conditions.items() if name not in ("fixed", "gravity")}
+    conditions = {**own, "fixed": dict(fixed), "gravity": gravity}  # nobody changes what a stage was given
+    sides = Sides(grid, bodies, present)
     acting = (conditions[name] for name in ("tractions", "displacements", "plates", "tools", "terms"))
     mechanical = MechanicalBoundary(sides, free, materials, *acting, conditions["contacts"])
     hydraulic = HydraulicBoundary(sides, [*conditions["drained"], *conditions["inflows"]])
-    given = [(faces, axes) for _, faces, axes in mechanical.holds]
-    given += [(faces, range(grid.dim)) for _, faces in mechanical.plates]
-    lattice = lattices(bodies, present, given)
+    held = [(faces, axes) for _, faces, axes in mechanical.holds]
+    held += [(faces, range(grid.dim)) for _, faces in mechanical.plates]
+    lattice = lattices(bodies, present, held)
     return Stage(conditions, tuple(present), tuple(later), free, grid.axisymmetric, lattice, mechanical, hydraulic)
 
 

@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.constitutive.skeleton import STANDARD_GRAVITY
+from mpm_dolfinx.given_values import check_names, given
 from mpm_dolfinx.points.faces import Region
 from mpm_dolfinx.problems.conditions import Drained, Pressure
-from mpm_dolfinx.validation import asked, numbers
+from mpm_dolfinx.validation import numbers
 
 
 def water(
@@ -44,12 +45,13 @@ def water(
         Naming what is out of its range; of a function, at the step that asks for it.
     """
     numbers("water: unit_weight", unit_weight, test=lambda v: (0 < v) & (v < np.inf), allowed="> 0 and finite")
-    if not callable(level):
+    if callable(level):
+        check_names(f"water at {side!r}: level", level, ("t",))
+    else:
         numbers("water: level", level)
 
     def pressure(t: float, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        name = f"water at {side!r}: level at t = {t:g} s"
-        height = numbers(name, asked(name, "a finite number for a time", level, t) if callable(level) else level)
+        height = given(f"water at {side!r}: level at t = {t:g} s", level, t)
         return unit_weight * np.maximum(height - x[:, -1], 0.0)
 
     pressure.unit_weight = unit_weight
