@@ -42,10 +42,11 @@ def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int
     if scene.fluid:
         transported = pieces_at_start(scene, points) if callable(scene.initial.pressure) else at_start(points)
     reactions = np.zeros((len(begun.mechanical.holds), scene.grid.dim))
-    outflows = np.zeros(len(begun.hydraulic.outlets))
+    walls, outflows = np.zeros((2 * scene.grid.dim, scene.grid.dim)), np.zeros(len(begun.hydraulic.outlets))
     points, forces = begun.mechanical.grip(points), begun.mechanical.forces(0.0)
     ways = np.zeros(len(begun.mechanical.tools.tools))
-    return State(0.0, points, transported, None, 0, reactions, outflows, forces, ways, begun, True, None, None, None)
+    acting = reactions, walls, outflows, forces, ways
+    return State(0.0, points, transported, None, 0, *acting, begun, True, None, None, None)
 
 
 def begin_stage(
@@ -90,6 +91,8 @@ def begin_stage(
     unknown, new = np.nan if state.resets else 0.0, {}
     if "displacements" in named:
         new["reactions"] = np.full((len(begun.mechanical.holds), scene.grid.dim), unknown)
+    if "fixed" in named:
+        new["walls"] = np.full_like(state.walls, unknown)
     if "tools" in named:
         new["tool_forces"] = begun.mechanical.forces(unknown)
         new["tool_travel"] = np.zeros(len(begun.mechanical.tools.tools))

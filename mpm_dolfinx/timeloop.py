@@ -146,8 +146,7 @@ def run(
     def output(converged: bool) -> None:
         with Timer("mpm: output"):
             ended = replace(simulation.state.result, converged=converged)
-            simulation.state = replace(simulation.state, result=stopwatch.read(ended))
-            ended.rows.append(_row(simulation, probes))
+            _note(simulation, stopwatch.read(ended).more(_row(simulation, probes)))
             for observer in observers:
                 _observe(observer, simulation, comm)
             _note(simulation, stopwatch.read(simulation.state.result))
@@ -227,8 +226,8 @@ def _histories(
     now, latest = simulation.state.t, simulation.state.result
     if after is None:
         first = 0.0 if latest is None else latest.first
-        return Result(dt=times.interval, small=rule.first, first=first, rows=[_row(simulation, probes)])
-    if latest is not None and after.rows is latest.rows:  # of the same run, which may have gone on since
+        return Result(dt=times.interval, small=rule.first, first=first, rows=(_row(simulation, probes),))
+    if latest is not None and after.rows[0] is latest.rows[0]:  # of the same run, which may have gone on since, or not
         after = latest
     last = after.rows[-1][0]
     # a run that was broken off has taken a part of its next interval
@@ -319,6 +318,10 @@ def _row(simulation: Simulated, probes: Probes | None) -> Row:
         out["probe_stress"] = probes.at_points(points, comm, scene.materials.effective_stress_3d)
     if len(simulation.state.tool_forces):
         out["tools"] = simulation.state.tool_forces
+    out |= {name: getattr(simulation.state, name) for name in ("reactions", "walls", "outflows")}
+    for value in out.values():
+        if isinstance(value, np.ndarray):
+            value.flags.writeable = False
     return Row(simulation.state.t, **out)
 
 

@@ -39,6 +39,7 @@ from mpm_dolfinx.problems.quadrature_data import QuadratureData
 from mpm_dolfinx.problems.rigid_motion import rigid_motion
 from mpm_dolfinx.problems.side_forms import OwnTerm, SideData, SideForms
 from mpm_dolfinx.problems.tool_contact import ToolContact
+from mpm_dolfinx.problems.walls import wall_forces
 from mpm_dolfinx.validation import line
 
 
@@ -303,8 +304,12 @@ class MomentumSystem:
         self.touched = (owned[:, None] * d + np.arange(d)).ravel()
         """Where forces may act, fixed or not."""
         self.K = matrix(self.unknowns, self.unknowns, 3**d * d)
-        self.penalty = self._penalty_matrix(facets, stiff)
         self.residual, self.step = self.unknowns.vector(), self.unknowns.vector()
+        every = (nodes[:, None] * d + np.arange(d)).ravel()
+        self.held = Unknowns(forms.u, np.setdiff1d(every, dofs))
+        """What walls hold."""
+        self.held_residual = self.held.vector()
+        self.penalty, self.held_penalty = (self._penalty_matrix(of, facets, stiff) for of in (self.unknowns, self.held))
         self._ghost = forms.ghost.form.on(facets)
         self.firm, self._firmness = None, None  # where nothing yields
         if not forms.elastic:
@@ -318,27 +323,28 @@ class MomentumSystem:
         places[:, -1] = places[:, -1] * self.unknowns.dim + axis
         return places[: self.unknowns.size], places[self.unknowns.size :]
 
-    def _penalty_matrix(self, facets: NDArray[np.int32], stiff: bool) -> PETSc.Mat:
+    def _penalty_matrix(self, rows: Unknowns, facets: NDArray[np.int32], stiff: bool) -> PETSc.Mat:
         """Return an empty matrix for the penalties: the ghost penalty couples like components, of two cells."""
         grid = self._forms.grid
         d = grid.dim
         length = 3**d + 2 * d * 3 ** (d - 1)
         if stiff:
-            return matrix(self.unknowns, self.unknowns, d * length)
+            return matrix(rows, self.unknowns, d * length)
         touched = self._forms.active_nodes(grid.facet_cells[facets])
-        A = matrix(self.unknowns, self.unknowns, np.where(touched[self.unknowns.owned // d], length, 1))
+        A = matrix(rows, self.unknowns, np.where(touched[rows.owned // d], length, 1))
         A.setOption(PETSc.Mat.Option.IGNORE_ZERO_ENTRIES, True)
         return A
 
     def set_penalty(self, sides: SideData) -> None:
         """Assemble what is linear in the step's increment, ghost penalty, plates, given displacements, and firmness."""
-        zero(self.penalty)
-        self._ghost.assemble_matrix(self.penalty)
-        if sides.plates is not None:
-            self._forms.sides.plate.assemble_matrix(self.penalty, sides.plates)
-        if sides.holds is not None:
-            self._forms.sides.hold.assemble_matrix(self.penalty, sides.holds)
-        self.penalty.assemble()
+        for penalty in (self.penalty, self.held_penalty):
+            zero(penalty)
+            self._ghost.assemble_matrix(penalty)
+            if sides.plates is not None:
+                self._forms.sides.plate.assemble_matrix(penalty, sides.plates)
+            if sides.holds is not None:
+                self._forms.sides.hold.assemble_matrix(penalty, sides.holds)
+            penalty.assemble()
         if self.firm is not None:
             zero(self.firm)
             self._firmness.assemble_matrix(self.firm)
@@ -454,6 +460,7 @@ class MomentumProblem:
             b[system.touched] -= self._pulls
         if self._sides.tools is not None:
             b[system.touched] -= forms.pushed(self._sides.tools)[system.touched]
+        system.held.gather(b, system.held_residual)
         r = system.unknowns.gather(b, system.residual)
         step = system.unknowns.gather(forms.u.x.array, system.step)
         system.penalty.multAdd(step, r, r)
@@ -462,6 +469,14 @@ class MomentumProblem:
         scale = float(np.sqrt(max(squares)))
         self._largest[:] = max(scale, self._largest[0])
         return r, scale
+
+    def wall_forces(self, fixed: Mapping[str, str]) -> NDArray[np.float64]:
+        """Return the forces (2 d, d), N, of the walls at u, where the residual was last assembled."""
+        system, forces = self.system, self.system.held_residual.copy()
+        system.held_penalty.multAdd(system.step, forces, forces)
+        if self._sides.contact is not None:
+            self._sides.contact.now.push_on(system.held, *self._at, forces)
+        return wall_forces(self.forms.grid, fixed, system.held.owned, forces.array_r)
 
     def assemble_tangent(self, data: QuadratureData | None = None, firmness: float = 0.0) -> PETSc.Mat:
         """Return the tangent at u, of these pieces or of others, with a share of the elastic shear stiffness."""
