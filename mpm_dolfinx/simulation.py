@@ -26,6 +26,7 @@ from mpm_dolfinx.problems.contacts import Contact, grouped
 from mpm_dolfinx.problems.scene_parts import check_options, check_parts
 from mpm_dolfinx.problems.thin import warn_thin
 from mpm_dolfinx.problems.tools import Tool
+from mpm_dolfinx.problems.unit_weights import under
 from mpm_dolfinx.result import Report, Result
 from mpm_dolfinx.scene import Scene
 from mpm_dolfinx.solve.scheme import Scheme
@@ -121,7 +122,7 @@ class Simulation:
         began = time.perf_counter()
         options = (quadrature, scheme, method, gravity is not None, pressure, terms, sources)
         initial = by_body(initial_stress, bodies, later)
-        self.scene = Scene(grid, bodies, materials, fluid, *options, initial)
+        self.scene = Scene(grid, bodies, materials, under(fluid, gravity), *options, initial)
         conditions = {"fixed": fixed, "tractions": tractions, "displacements": displacements, "drained": drained}
         conditions |= {"inflows": inflows, "plates": plates, "tools": tools, "gravity": gravity, "contacts": contacts}
         self.state = first_state(self.scene, conditions, later)

@@ -19,7 +19,9 @@ def set_up(scene: Scene, state: State, dt: float) -> Start:
     scene.check(state)
     collect_garbage(scene.grid.mesh.comm)
     stage, times = state.stage, [state.t + substep.end * dt for substep in scene.substeps]
-    gravity = [stage.gravity_at(t) for t in times]
+    start, *gravity = (stage.gravity_at(t) for t in [state.t, *times])
+    if dt > 0:
+        scene.look_at([start, *gravity])
     state = state if state.stay else state.at_owners(scene.grid)
     cut_points = state.stay.points if state.stay else state.points  # points that hardly move stay as they were cut
     on_grid = scene.on_grid(cut_points)

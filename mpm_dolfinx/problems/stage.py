@@ -4,13 +4,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.constitutive.fields import SceneMaterials
+from mpm_dolfinx.constitutive.skeleton import Fluid
 from mpm_dolfinx.given_values import check_names, given
 from mpm_dolfinx.points.bodies import Body
 from mpm_dolfinx.points.faces import Surface
@@ -22,6 +23,7 @@ from mpm_dolfinx.problems.hydraulic_boundary import HydraulicBoundary
 from mpm_dolfinx.problems.mechanical_boundary import MechanicalBoundary
 from mpm_dolfinx.problems.sides import Sides
 from mpm_dolfinx.problems.tools import Tool
+from mpm_dolfinx.problems.unit_weights import weighed
 from mpm_dolfinx.validation import all_of, line, numbers
 
 CONDITIONS = {
@@ -69,7 +71,7 @@ def stage(
     grid: Grid,
     bodies: Sequence[Body],
     materials: SceneMaterials,
-    wet: bool,
+    fluid: Fluid | None,
     conditions: Mapping[str, Any],
     present: Sequence[bool],
     later: Sequence[int],
@@ -82,8 +84,8 @@ def stage(
         Background grid, and all bodies of the scene.
     materials
         Those of the scene.
-    wet
-        Whether there is a fluid.
+    fluid
+        Pore fluid, if there is one.
     conditions
         fixed, tractions, displacements, drained, inflows, plates, tools, contacts, gravity: see `Simulation`; terms: on
         sides.
@@ -97,7 +99,7 @@ def stage(
     """
     for name, kind in CONDITIONS.items():
         all_of(name, conditions[name], kind)
-    if not wet and (conditions["drained"] or conditions["inflows"]):
+    if fluid is None and (conditions["drained"] or conditions["inflows"]):
         raise ValueError("drained and inflow sides need a fluid")
     gravity = conditions["gravity"]
     if callable(gravity):
@@ -109,6 +111,8 @@ def stage(
     fixed = with_axis(grid, conditions["fixed"])
     free = ~_fixed(grid, fixed)
     own = {name: tuple(values) for name, values in conditions.items() if name not in ("fixed", "gravity")}
+    own["tractions"] = tuple(replace(load, value=weighed(load.value, fluid)) for load in own["tractions"])
+    own["drained"] = tuple(replace(side, pressure=weighed(side.pressure, fluid)) for side in own["drained"])
     conditions = {**own, "fixed": dict(fixed), "gravity": gravity}  # nobody changes what a stage was given
     sides = Sides(grid, bodies, present)
     acting = (conditions[name] for name in ("tractions", "displacements", "plates", "tools", "terms"))
