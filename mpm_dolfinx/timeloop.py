@@ -22,7 +22,7 @@ from mpm_dolfinx import _compat
 from mpm_dolfinx.errors import GaveUp, LeftGrid, StepFailed
 from mpm_dolfinx.io.summary import imbalance, peak_memory
 from mpm_dolfinx.parallel.exchange import first
-from mpm_dolfinx.parallel.messages import log
+from mpm_dolfinx.parallel.messages import log, warn
 from mpm_dolfinx.points.probes import Probes
 from mpm_dolfinx.result import Report, Result, Row
 from mpm_dolfinx.scene import Scene
@@ -105,7 +105,8 @@ def run(
         Histories to go on with, of a run with the same steps: what `resume` returns, or `result` of a run that was
         interrupted.
     progress
-        Show a progress bar on a terminal.
+        Show a progress bar on a terminal, and warn of the first step that is cut; the others are logged as INFO by the
+        logger `mpm_dolfinx`.
 
     Returns
     -------
@@ -157,7 +158,7 @@ def run(
         for target in targets:
             while not rule.ended(simulation.state.t, target, simulation.state.result):
                 before = simulation.state.t
-                _advance(simulation, rule, target)
+                _advance(simulation, rule, target, progress)
                 there = rule.ended(simulation.state.t, target, simulation.state.result)
                 if times.each and not there:
                     output(False)
@@ -188,7 +189,8 @@ def _show(bar: tqdm, state: State, before: float) -> None:
     result = state.result
     bar.update(state.t - before)
     counts = {"t": f"{state.t:.4g} s", "steps": result.steps, "newton": result.newton, "coupling": result.coupling}
-    bar.set_postfix(counts | ({"refused": result.rejected} if result.rejected else {}))
+    seldom = {"cuts": result.cuts, "refused": result.rejected}
+    bar.set_postfix(counts | {name: count for name, count in seldom.items() if count})
 
 
 def _note(simulation: Simulated, result: Result) -> Result:
@@ -262,8 +264,11 @@ def _timings() -> dict[str, float]:
     return {part: _compat.seconds(f"mpm: {part}") for part in PARTS}
 
 
-def _advance(simulation: Simulated, rule: StepSize, target: float) -> None:
-    """Take one step towards a time, s, cutting it until it converges and is exact enough."""
+def _advance(simulation: Simulated, rule: StepSize, target: float, aloud: bool) -> None:
+    """Take one step towards a time, s, cutting it until it converges and is exact enough.
+
+    aloud: say of the first cut of a run that there are some.
+    """
     comm, wanted = simulation.scene.grid.comm, None
     while True:
         state, result = simulation.state, simulation.state.result
@@ -277,7 +282,8 @@ def _advance(simulation: Simulated, rule: StepSize, target: float) -> None:
                 tried = _note(simulation, replace(cut, small=taken))
                 raise GaveUp(_why(state.t, taken, failed), tried, failed.history) from failed
             _note(simulation, cut)
-            log(comm, "t = %g s: step cut to %.3g s: %s", state.t, taken / 2, failed)
+            tell, more = (warn, "; others: messages of level INFO") if aloud and not result.cuts else (log, "")
+            tell(comm, "t = %g s: step cut to %.3g s: %s%s", state.t, taken / 2, failed, more)
             continue
         known, result = result, measured(result, report)
         if (shrinks := rule.refused(taken, report, result)) < 1:
