@@ -59,7 +59,7 @@ class Scene:
     pressure
         Pore pressure at the start, Pa, or a function of places.
     initial
-        Stresses of bodies as seeded, see `initial_state.by_body`.
+        Stresses of bodies as seeded, see `initial_stress.by_body`.
     """
 
     def __init__(
