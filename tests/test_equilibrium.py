@@ -6,6 +6,7 @@ import pytest
 from helpers import SOFT, beam, column
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx.io.checkpoint import save
 from mpm_dolfinx.points.grid import SIDES
 from mpm_dolfinx.problems.walls import wall_forces
 
@@ -124,7 +125,7 @@ def test_what_several_walls_hold_counts_once():
         assert not walls["bottom"].any() and sum(walls.values()).sum() == len(dofs)
 
 
-def test_forces_and_outflows_are_histories_of_a_run():
+def test_forces_and_outflows_are_histories_of_a_run(tmp_path):
     """Steps of a beam: its load is on the clamp, by the wall in one half of it and by a given side."""
     s, probe = beam(h=0.1, load=5.4e3)
     s.run(0.06, 0.02, probes=probe, progress=False)
@@ -141,6 +142,11 @@ def test_forces_and_outflows_are_histories_of_a_run():
     assert np.array_equal(result.outflows[-1, :1], s.outflows) and np.array_equal(
         walls["left"][-1], s.wall_reactions["left"]
     )
+    save(s, tmp_path / "run.ckpt")
+    again = mpm.resume(s, tmp_path / "run.ckpt")
+    for name in ("reactions", "outflows"):
+        assert np.array_equal(getattr(again, name), getattr(result, name), equal_nan=True)
+    assert all(np.array_equal(again.wall_reactions[wall], force) for wall, force in walls.items())
 
 
 def test_the_axis_of_revolution_pushes_nothing_outward():

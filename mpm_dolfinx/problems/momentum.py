@@ -310,7 +310,10 @@ class MomentumSystem:
         """What walls hold."""
         self.held_residual = self.held.vector()
         self.penalty, self.held_penalty = (self._penalty_matrix(of, facets, stiff) for of in (self.unknowns, self.held))
-        self._ghost = forms.ghost.form.on(facets)
+        at_walls = np.zeros(len(forms.grid.node_x), dtype=bool)
+        at_walls[self.held.map.indices.reshape(-1, d).max(axis=1, initial=-1) >= 0] = True
+        near = at_walls[forms.grid.cell_nodes[forms.grid.facet_cells[facets]]].any(axis=(1, 2))
+        self._ghosts = [forms.ghost.form.on(some) for some in (facets[near], facets)]
         self.firm, self._firmness = None, None  # where nothing yields
         if not forms.elastic:
             self.firm, self._firmness = matrix(self.unknowns, self.unknowns, 3**d * d), forms.ghost.firmness.on(cells)
@@ -337,9 +340,9 @@ class MomentumSystem:
 
     def set_penalty(self, sides: SideData) -> None:
         """Assemble what is linear in the step's increment, ghost penalty, plates, given displacements, and firmness."""
-        for penalty in (self.penalty, self.held_penalty):
+        for penalty, ghost in zip((self.held_penalty, self.penalty), self._ghosts, strict=True):
             zero(penalty)
-            self._ghost.assemble_matrix(penalty)
+            ghost.assemble_matrix(penalty)
             if sides.plates is not None:
                 self._forms.sides.plate.assemble_matrix(penalty, sides.plates)
             if sides.holds is not None:
