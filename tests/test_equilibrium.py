@@ -32,17 +32,17 @@ def off(s, load=0.0, axes=slice(None)):
 
 
 def held_and_pressed(water):
-    """Return a block off the grid lines beside two walls, with a given side and a rough tool, and its load."""
+    """Return a block with nearly empty cells beside two walls, with a given side and a rough tool, and its load."""
     grid = mpm.Grid([2.2, 1.7], [11, 8])
     s = mpm.Simulation(
         grid,
-        [mpm.box(grid, [0, 0], [1.93, 1.13])],
+        [mpm.box(grid, [0, 0], [1.93, 1.1])],
         [SOIL],
         fixed={"left": "xy", "bottom": "y"},
         gravity=(0, -G),
         displacements=[mpm.Displacement("right", lambda t: (0, -1e-3 * t))],
         tractions=[mpm.Traction("top", (3e3, -1e4))],
-        tools=[mpm.Tool(mpm.Ball((1.0, 1.33), 0.2), displacement=lambda t: (0, -2e-3 * t), friction=0.3)],
+        tools=[mpm.Tool(mpm.Ball((1.0, 1.3), 0.2), displacement=lambda t: (0, -2e-3 * t), friction=0.3)],
         **water,
     )
     return s, (3e3 * 1.93, -1e4 * 1.93)
@@ -50,9 +50,18 @@ def held_and_pressed(water):
 
 def under_a_plate(water):
     grid = mpm.Grid([2.2, 1.7], [11, 8])
-    body, plate = mpm.box(grid, [0, 0], [1.93, 1.13]), mpm.RigidPlate("top", 1e4)
+    body, plate = mpm.box(grid, [0, 0], [1.93, 1.1]), mpm.RigidPlate("top", 1e4)
     walls = {"left": "x", "bottom": "xy"}
     return mpm.Simulation(grid, [body], [SOIL], fixed=walls, plates=[plate], gravity=(0, -G), **water), (0, -1e4)
+
+
+def a_thin_layer(water):
+    """Return a layer a little thicker than a cell: the ghost penalty of its top acts on the floor's nodes."""
+    grid, load = mpm.Grid([2.0, 1.0], [10, 5]), (2e3, -1e4)
+    options = {"fixed": {"bottom": "xy"}, "tractions": [mpm.Traction("top", load)], "gravity": (0, -G)}
+    return mpm.Simulation(grid, [mpm.box(grid, [0.1, 0], [1.9, 0.22])], [SOIL], **options, **water), 1.8 * np.array(
+        load
+    )
 
 
 def in_a_corner(water):
@@ -74,16 +83,16 @@ def a_cylinder(water):
 
 
 def two_groups(water):
-    """Return a block that slips on another one, both beside a wall."""
+    """Return a block that slips on a thin one, which the floor holds by the nodes that its pairs act on too."""
     grid = mpm.Grid([1.0, 1.2], [10, 12])
-    bodies = [mpm.box(grid, [0, 0], [0.9, 0.43]), mpm.box(grid, [0, 0.44], [0.7, 0.9])]
-    push = mpm.Displacement("top", lambda t: (0, -0.02 * t), "y", region=((0, 0.8), (1, 1)))
+    bodies = [mpm.box(grid, [0, 0], [0.9, 0.09]), mpm.box(grid, [0, 0.12], [0.7, 0.55])]
+    push = mpm.Displacement("top", lambda t: (0, -0.04 * t), "y", region=((0, 0.5), (1, 1)))
     options = {"fixed": {"left": "x", "bottom": "xy"}, "gravity": (0, -G), "displacements": [push]}
     contact = mpm.Contact(1, 0, friction=0.3)
     return mpm.Simulation(grid, bodies, [SOIL], contacts=[contact], **options, **(water and {"fluid": mpm.Fluid()})), 0
 
 
-SCENES = [held_and_pressed, under_a_plate, in_a_corner, a_cylinder, two_groups]
+SCENES = [held_and_pressed, under_a_plate, a_thin_layer, in_a_corner, a_cylinder, two_groups]
 
 
 @pytest.mark.parametrize("wet", [False, True], ids=["dry", "wet"])
