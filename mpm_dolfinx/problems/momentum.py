@@ -345,7 +345,7 @@ class MomentumSystem:
             ghost.assemble_matrix(penalty)
             if sides.plates is not None:
                 self._forms.sides.plate.assemble_matrix(penalty, sides.plates)
-            if sides.holds is not None:
+            if sides.holds is not None and penalty is self.penalty:
                 self._forms.sides.hold.assemble_matrix(penalty, sides.holds)
             penalty.assemble()
         if self.firm is not None:
@@ -459,11 +459,11 @@ class MomentumProblem:
             forces += own
         squares = over_all(forms.grid.comm, np.array(squares))
         b[system.touched] = forces - external
-        if self._sides.holds is not None:  # no measure of forces: at the start of a step it is far above them
-            b[system.touched] -= self._pulls
         if self._sides.tools is not None:
             b[system.touched] -= forms.pushed(self._sides.tools)[system.touched]
-        system.held.gather(b, system.held_residual)
+        system.held.gather(b, system.held_residual)  # walls bear what sides beside them would push them by
+        if self._sides.holds is not None:  # no measure of forces: at the start of a step it is far above them
+            b[system.touched] -= self._pulls
         r = system.unknowns.gather(b, system.residual)
         step = system.unknowns.gather(forms.u.x.array, system.step)
         system.penalty.multAdd(step, r, r)
