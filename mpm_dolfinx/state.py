@@ -18,6 +18,13 @@ from mpm_dolfinx.problems.stage import Stage
 from mpm_dolfinx.result import Result
 
 
+def _freeze(kept: Stay | State) -> None:
+    """Let nobody write into the arrays of what is kept."""
+    for values in vars(kept).values():
+        if isinstance(values, np.ndarray):
+            values.flags.writeable = False
+
+
 @dataclass(frozen=True, eq=False)
 class Stay:
     """What still holds of the last reset of the grid: points that hardly move since stay in the cells that cut them.
@@ -34,6 +41,9 @@ class Stay:
     pressure: NDArray[np.float64] | None
     x: NDArray[np.float64] | None
     start: NDArray[np.float64] | None
+
+    def __post_init__(self):
+        _freeze(self)
 
     def migrated(self, exchange: Exchange, destination: NDArray[np.int32]) -> Stay:
         """Return what holds for points that go to their destinations, by the exchange of points."""
@@ -64,6 +74,9 @@ class State:
         How often the grid has been reset.
     reactions : (displacements, d), N (N/m in plane strain)
         Forces of the given displacements in the last step; nan before the first one of a stage.
+    walls : (2 d, d), N (N/m in plane strain)
+        Forces of the walls of the grid, in the order of `SIDES`, on the bodies in the last step; nan before the first
+        one of a stage that holds others.
     outflows : (drained sides, then inflows), m^3/s (m^2/s in plane strain)
         Volumes at zero pressure that leave the bodies through them at the end of the last step; nan before the first
         one of a stage.
@@ -94,6 +107,7 @@ class State:
     stay: Stay | None
     resets: int
     reactions: NDArray[np.float64]
+    walls: NDArray[np.float64]
     outflows: NDArray[np.float64]
     tool_forces: NDArray[np.float64]
     tool_travel: NDArray[np.float64]
@@ -103,6 +117,9 @@ class State:
     held: NDArray[np.float64] | None
     rest: NDArray[np.float64] | None
     result: Result | None
+
+    def __post_init__(self):
+        _freeze(self)
 
     def migrated(self, destination: NDArray[np.int32], comm: MPI.Intracomm) -> State:
         """Return the state after every point, with its pieces, went to its destination (n,), a rank."""

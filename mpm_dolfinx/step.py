@@ -19,7 +19,9 @@ def set_up(scene: Scene, state: State, dt: float, how: tuple = ()) -> Start:
     scene.check(state)
     collect_garbage(scene.grid.mesh.comm)
     stage, times = state.stage, [state.t + substep.end * dt for substep in how or scene.substeps]
-    gravity = [stage.gravity_at(t) for t in times]
+    start, *gravity = (stage.gravity_at(t) for t in [state.t, *times])
+    if dt > 0:
+        scene.look_at([start, *gravity])
     state = state if state.stay else state.at_owners(scene.grid)
     cut_points = state.stay.points if state.stay else state.points  # points that hardly move stay as they were cut
     on_grid = scene.on_grid(cut_points)
@@ -48,13 +50,11 @@ def step(scene: Scene, state: State, dt: float, how: tuple = ()) -> tuple[State,
     del solvers
     start.matrices.end_step()
     mechanical, at = state.stage.mechanical, (start.matrices.momentum.unknowns, scene.momentum.u.x.array)
-    reactions = mechanical.reactions(acting.sides, scene.momentum.nodal)
-    outflows = both.storage.outflows(len(state.stage.hydraulic.outlets)) if both.storage else state.outflows
+    now = both.outcome(state, acting)
     tools, ways = mechanical.going(acting.sides, state.t, state.t + dt, state.tool_travel)
     new, report.rederived = scene.motion.advanced(state, on_grid, start.data, state.t + dt, tools, both.came(rates[-1]))
     velocity = None if scene.momentum.elastic else scene.momentum.u.x.array / dt
-    now = {"reactions": reactions, "outflows": outflows, "velocity": velocity}
     mechanical.check_end(on_grid.cut, new.points, new.t, state.points, state.t, tools)
     forces, points = mechanical.touched(acting.sides, *at, new.points)
-    now |= {"tool_forces": forces, "tool_travel": ways, "points": points}
+    now |= {"tool_forces": forces, "tool_travel": ways, "points": points, "velocity": velocity}
     return replace(new, **now, resets=state.resets + (state.stay is None), begins=False), report

@@ -108,7 +108,8 @@ def run(
         Histories to go on with, of a run with the same steps: what `resume` returns, or `result` of a run that was
         interrupted.
     progress
-        Show a progress bar on a terminal.
+        Show a progress bar on a terminal, and warn of the first step that is cut; the others are logged as INFO by the
+        logger `mpm_dolfinx`.
 
     Returns
     -------
@@ -149,8 +150,7 @@ def run(
     def output(converged: bool) -> None:
         with Timer("mpm: output"):
             ended = replace(simulation.state.result, converged=converged)
-            simulation.state = replace(simulation.state, result=stopwatch.read(ended))
-            ended.rows.append(_row(simulation, probes))
+            _note(simulation, stopwatch.read(ended).more(_row(simulation, probes)))
             for observer in observers:
                 _observe(observer, simulation, comm)
             _note(simulation, stopwatch.read(simulation.state.result))
@@ -161,7 +161,7 @@ def run(
         for target in targets:
             while not rule.ended(simulation.state.t, target, simulation.state.result):
                 before = simulation.state.t
-                _advance(simulation, rule, target)
+                _advance(simulation, rule, target, progress)
                 there = rule.ended(simulation.state.t, target, simulation.state.result)
                 if times.each and not there:
                     output(False)
@@ -192,7 +192,8 @@ def _show(bar: tqdm, state: State, before: float) -> None:
     result = state.result
     bar.update(state.t - before)
     counts = {"t": f"{state.t:.4g} s", "steps": result.steps, "newton": result.newton, "coupling": result.coupling}
-    bar.set_postfix(counts | ({"refused": result.rejected} if result.rejected else {}))
+    seldom = {"cuts": result.cuts, "refused": result.rejected}
+    bar.set_postfix(counts | {name: count for name, count in seldom.items() if count})
 
 
 def _note(simulation: Simulated, result: Result) -> Result:
@@ -230,8 +231,8 @@ def _histories(
     now, latest = simulation.state.t, simulation.state.result
     if after is None:
         first = 0.0 if latest is None else latest.first
-        return Result(dt=times.interval, small=rule.first, first=first, rows=[_row(simulation, probes)])
-    if latest is not None and after.rows is latest.rows:  # of the same run, which may have gone on since
+        return Result(dt=times.interval, small=rule.first, first=first, rows=(_row(simulation, probes),))
+    if latest is not None and after.rows[0] is latest.rows[0]:  # of the same run, which may have gone on since, or not
         after = latest
     last = after.rows[-1][0]
     # a run that was broken off has taken a part of its next interval
@@ -266,8 +267,11 @@ def _timings() -> dict[str, float]:
     return {part: _compat.seconds(f"mpm: {part}") for part in PARTS}
 
 
-def _advance(simulation: Simulated, rule: StepSize, target: float) -> None:
-    """Take one step towards a time, s, cutting it until it converges and is exact enough."""
+def _advance(simulation: Simulated, rule: StepSize, target: float, aloud: bool) -> None:
+    """Take one step towards a time, s, cutting it until it converges and is exact enough.
+
+    aloud: say of the first cut of a run that there are some.
+    """
     comm, wanted, whole = simulation.scene.grid.comm, None, None
     while True:
         state, result = simulation.state, simulation.state.result
@@ -279,7 +283,8 @@ def _advance(simulation: Simulated, rule: StepSize, target: float) -> None:
             cut = rule.cut(taken, result)
             if cut.small >= rule.least(wanted, state.t):
                 _note(simulation, cut)
-                log(comm, "t = %g s: step cut to %.3g s: %s", state.t, taken / 2, failed)
+                tell, more = (warn, "; others: messages of level INFO") if aloud and not result.cuts else (log, "")
+                tell(comm, "t = %g s: step cut to %.3g s: %s%s", state.t, taken / 2, failed, more)
                 continue
             if (found := _by_euler(simulation, whole, failed)) is None:
                 tried = _note(simulation, replace(cut, small=taken))
@@ -340,6 +345,10 @@ def _row(simulation: Simulated, probes: Probes | None) -> Row:
         out["probe_stress"] = probes.at_points(points, comm, scene.materials.effective_stress_3d)
     if len(simulation.state.tool_forces):
         out["tools"] = simulation.state.tool_forces
+    out |= {name: getattr(simulation.state, name) for name in ("reactions", "walls", "outflows")}
+    for value in out.values():
+        if isinstance(value, np.ndarray):
+            value.flags.writeable = False
     return Row(simulation.state.t, **out)
 
 

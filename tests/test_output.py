@@ -297,6 +297,15 @@ def test_steps_checkpoints_and_resumptions_are_logged(tmp_path, caplog, monkeypa
     assert "step grows to 0.01 s" in said and "t = 0.08 s: resumed from" in said
 
 
+@pytest.mark.parametrize("progress", [True, False])
+def test_the_first_step_that_is_cut_is_named_without_being_asked_for(progress, caplog):
+    simulation, _ = cut_beam()
+    simulation.run(0.08, 0.02, progress=progress)
+    said = [r.getMessage() for r in caplog.records if r.levelno >= logging.WARNING]
+    assert simulation.result.cuts > 1
+    assert [("step cut to" in message, "level INFO" in message) for message in said] == [(True, True)] * progress
+
+
 class Terminal(io.StringIO):
     def isatty(self):
         return True

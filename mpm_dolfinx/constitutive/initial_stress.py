@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 from mpi4py import MPI
 
@@ -67,7 +68,7 @@ class K0:
 InitialStress = K0 | Callable[[NDArray[np.float64]], ArrayLike]
 
 
-def hydrostatic(level: float, unit_weight: float = 1000 * STANDARD_GRAVITY) -> Callable[[NDArray], NDArray]:
+def hydrostatic(level: float, unit_weight: float | None = None) -> Callable[[NDArray], NDArray]:
     """Return the pore pressure at rest of a phreatic level, as the scene's `pressure`: a function of places x (n, d).
 
     Pores are full above it too, and hold their water by suction: the pressure there is negative.
@@ -77,15 +78,21 @@ def hydrostatic(level: float, unit_weight: float = 1000 * STANDARD_GRAVITY) -> C
     level
         Height, m, along the last axis.
     unit_weight
-        Of the fluid, N/m^3, > 0; a warning says where the scene's differs.
+        Of the fluid, N/m^3, > 0; by default that of the scene's fluid, outside of a scene 9810.  A warning says where
+        it differs from the fluid's.
     """
     numbers("hydrostatic: level", level)
-    numbers("hydrostatic: unit_weight", unit_weight, test=lambda v: (0 < v) & (v < np.inf), allowed="> 0 and finite")
+    if unit_weight is not None:
+        allowed = {"test": lambda v: (0 < v) & (v < np.inf), "allowed": "> 0 and finite"}
+        numbers("hydrostatic: unit_weight", unit_weight, **allowed)
+    weight = 1000 * STANDARD_GRAVITY if unit_weight is None else unit_weight
 
     def pressure(x: NDArray[np.float64]) -> NDArray[np.float64]:
-        return unit_weight * (level - x[:, -1])
+        return weight * (level - x[:, -1])
 
-    pressure.unit_weight = unit_weight
+    pressure.unit_weight = weight
+    if unit_weight is None:
+        pressure.weighed = partial(hydrostatic, level)
     return pressure
 
 

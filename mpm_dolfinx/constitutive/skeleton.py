@@ -462,6 +462,10 @@ class Fluid:
     density
         Density rho_w at zero pressure, kg/m^3, > 0, by which its weight counts; that of flowing mass is
         rho_w exp(p / K_w).
+    gravity
+        Acceleration under which conductivities are what they are, m/s^2, > 0; by default that of the scene where it is
+        given as a vector, which is not zero, else 9.81.  In a scene without gravity, or with one that changes with
+        time, give it where lengths or times have other units than m and s.
 
     Raises
     ------
@@ -471,16 +475,19 @@ class Fluid:
 
     bulk: float = 2.2e9
     density: float = 1000.0
+    gravity: float | None = None
 
     def __post_init__(self):
         _check(self, "bulk", lambda v: 0 < v, "> 0")
+        if self.gravity is not None:
+            _check(self, "gravity", lambda v: (0 < v) & (v < inf), "> 0 and finite")
         _check(self, "density", lambda v: (0 < v) & (v < inf), "> 0 and finite")
         object.__setattr__(self, "density", float(self.density))  # an integer times gravity is no form that compiles
 
     @property
     def unit_weight(self) -> float:
         """Unit weight rho_w g, N/m^3, that turns a hydraulic conductivity into a mobility k/(rho_w g)."""
-        return self.density * STANDARD_GRAVITY
+        return self.density * (self.gravity or STANDARD_GRAVITY)
 
 
 STANDARD_GRAVITY = 9.81  # m/s^2, by which hydraulic conductivities are defined

@@ -53,7 +53,7 @@ class MaterialPoints:
     id : (n,)
         Number of the point in the body.
     corners : (n, 2^d, d), m
-        Tracked corners of the point's domain, in the order of `domains.corner_bits`.
+        Tracked corners of the point's domain, in the order of `cutting.corner_bits`.
     F : (n, d, d)
         Deformation gradient.
     volume0 : (n,), m^d

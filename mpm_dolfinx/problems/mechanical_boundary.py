@@ -17,6 +17,7 @@ from mpm_dolfinx.caching import Latest
 from mpm_dolfinx.constitutive.fields import SceneMaterials
 from mpm_dolfinx.forms.point_forms import FormPoints, Places, PointData
 from mpm_dolfinx.forms.unknowns import Unknowns
+from mpm_dolfinx.given_values import by_place
 from mpm_dolfinx.parallel.exchange import Exchange, first
 from mpm_dolfinx.parallel.messages import warn
 from mpm_dolfinx.points.cut_domains import CutDomains, Patches
@@ -32,7 +33,6 @@ from mpm_dolfinx.problems.conditions import (
     Pressure,
     RigidPlate,
     Traction,
-    by_place,
     facing,
     holding,
     inward,
