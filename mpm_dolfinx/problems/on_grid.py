@@ -88,7 +88,7 @@ class OnGrid(Keyed):
                 x=x,
                 faces=cut.pieces_to_cells(cut.pieces.faces),
                 fixed_stress=quadrature.fixed_stress(cut, points, of_fluid),
-                damping=quadrature.rows(cut, points, lambda m: m.pressure_damping(grid.dim)),
+                damping=quadrature.rows(cut, points, lambda m: m.pressure_damping()),
             )
             self.contents = CellContents(storage.fluxes, brought, self.cells[self.cells < grid.num_owned])
             if quadrature.layered:
