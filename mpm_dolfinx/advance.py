@@ -19,11 +19,11 @@ from mpm_dolfinx.errors import LeftGrid, NotConverged
 from mpm_dolfinx.parallel.exchange import first, over_all
 from mpm_dolfinx.points.bodies import Body
 from mpm_dolfinx.points.cut_domains import CutDomains
-from mpm_dolfinx.points.cutting import parallelepipeds, tangled, volumes
+from mpm_dolfinx.points.cutting import centroids, parallelepipeds, tangled, volumes
 from mpm_dolfinx.points.domain_gradient import gradient
 from mpm_dolfinx.points.grid import REACH, Grid, sum_by
 from mpm_dolfinx.points.lattice import filtered, given
-from mpm_dolfinx.points.material_points import MaterialPoints, determinant, middle, with_ratio
+from mpm_dolfinx.points.material_points import MaterialPoints, determinant, with_ratio
 from mpm_dolfinx.points.pressure_transport import PiecePressures, Reconstruction
 from mpm_dolfinx.problems.mechanical_boundary import MechanicalBoundary
 from mpm_dolfinx.problems.momentum import MomentumForms
@@ -121,7 +121,7 @@ class Motion:
                 x = x + cut.to_pieces(grid.at(pieces.cells, pieces.x, nodal))
                 start = state.stay.start if state.stay else cut.to_pieces(self._storage.p_n.x.array[pieces.cells])
                 own = on_grid.pressures_up_to_surface(self._reconstruction, state.stage, t)
-                points, ids = replace(points, pressure=cut.mean(own)), points.id[cut.pieces.point]
+                points, ids = replace(points, pressure=cut.in_plane(own)), points.id[cut.pieces.point]
                 if cut.domains and came is not None:
                     points = replace(points, data=points.data | self._owed(state, points, on_grid, came, serves))
             _check_inside(cut, points, t)
@@ -186,7 +186,7 @@ class Motion:
             F = with_ratio(F, np.where(locks, determinant(deformed()), determinant(F)))
         if self._materials.evolves:
             F = np.where(evolved[:, None, None], deformed(), F)
-        return replace(points, corners=corners, x=middle(corners), F=F), serves, folded
+        return replace(points, corners=corners, x=centroids(corners), F=F), serves, folded
 
     def _owed(
         self, state: State, points: MaterialPoints, on_grid: OnGrid, came: NDArray[np.float64], serves: bool

@@ -180,12 +180,15 @@ class OnGrid(Keyed):
         return self.contents.total(cut.cells, self.data.pieces["biot"][:, 0] * share)
 
     def pressures_up_to_surface(self, reconstruction: Reconstruction, stage: Stage, t: float) -> NDArray[np.float64]:
-        """Return the pressures (m,), Pa, at the pieces' centroids; their mean by volume in a cell is the cell's.
+        """Return the pressures (m,), Pa, at the pieces' centroids; their mean in a cell is the cell's.
+
+        In axisymmetry centroids and mean are those in the plane.
 
         t, s: time at which drained sides have their pressures.
         """
         places, seen = self._places.pieces, self._cell_pressures(self._storage.p.x.array, stage, t)
-        return self.cut.to_pieces(reconstruction.up_to_surface(seen, places.offset, places.slots))
+        offset = self.cut.plane(self.weight)[1] - self.cut.grid.midpoints[self.cut.cells]
+        return self.cut.to_pieces(reconstruction.up_to_surface(seen, offset, places.slots))
 
     def _cell_pressures(self, p: NDArray[np.float64], stage: Stage, t: float, bulk: float = np.inf) -> CellPressures:
         """Return what slopes of cells with these pressures, or mass potentials by `bulk` (Pa), are drawn from."""
