@@ -207,6 +207,10 @@ class CutDomains(Keyed):
         off0 = np.linalg.solve(stretch.swapaxes(1, 2)[pieces.point], off[:, :, None])[:, :, 0]
         return off + (middle(points.corners) - middle(points.origin))[pieces.point] - off0
 
+    def cells_at(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Return the lexicographic cells (m,) of places x (m, d), m, in or on the domains of points (m,)."""
+        return self._filled_cell(at, x + DEPTH * (self.points.x[at] - x))
+
     def _filled_cell(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
         """Return the cells (m,) of positions in domains; where no piece of the domain lies, of its largest piece."""
         pieces, cells = self.pieces, len(self.grid.owners)

@@ -206,6 +206,14 @@ class OnGrid(Keyed):
             share = graded(self.contents, self._places.pieces.offset, at_pieces, mean)
         return Mobility(mean, share) if self._mixed is None else self._mixed.mobility(at_pieces, mean, share)
 
+    def resting_mobility(self) -> Mobility:
+        """Return the conductivities, m/s, of the filled owned cells as laws of the deformation and pressure have them
+        at rest.
+        """
+        at_pieces = self._quadrature.rows(self.cut, self.cut.points, lambda m: m.conductivity)
+        mean = self.contents.mean(at_pieces)
+        return Mobility(mean) if self._mixed is None else self._mixed.mobility(at_pieces, mean, None)
+
     @property
     def active_cells(self) -> int:
         """Number of active cells of all processes."""
