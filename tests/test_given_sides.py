@@ -156,7 +156,7 @@ def said(caplog):
 
 
 def test_a_side_that_something_else_holds_is_named(caplog):
-    s = on_top((0, 0.95, (0, 0)), (1.0, 2, lambda t, X: (0, -0.02 * t)))  # they share a cell, and do not meet
+    s = on_top((0, 0.97, (0, 0)), (1.0, 2, lambda t, X: (0, -0.02 * t)))  # they share a cell, and do not meet
     s.run(1, 0.5)
     messages = said(caplog)
     assert messages and all("not where it is to be at [" in m and "artefact" in m for m in messages)
@@ -209,7 +209,7 @@ def test_a_held_region_may_end_anywhere_in_domains_and_cells():
     loads = np.array([footing_load(width) for width in (22 / 9, 2.40, 2.46)])
     print(f"22/9, 2.40, 2.46 wide: load / c down {loads[:, 1]}, sideways {loads[:, 0]}")
     assert loads[:, 1] == pytest.approx(loads[0, 1], rel=0.015)
-    assert np.abs(loads[:, 0]).max() < 0.15
+    assert loads[:, 0] == pytest.approx(loads[0, 0], abs=0.05)
 
 
 def test_a_block_turned_in_space_is_pressed_exactly():

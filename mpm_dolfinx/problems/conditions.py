@@ -303,7 +303,8 @@ class Displacement:
     components
         Components that are given, such as "y"; the others are free.  By default all.
     region : ((d,), (d,)), m
-        Box of reference positions to which the condition is limited.
+        Box of reference positions to which the condition is limited.  A cell of which the region, where it ends within
+        a side, covers no more than half is not held: the last node carries half a cell beyond it.
 
     Raises
     ------

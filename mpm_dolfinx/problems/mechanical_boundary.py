@@ -106,6 +106,9 @@ class MechanicalBoundary:
             if common := sorted(set(axes) & set(more)):
                 check_apart(one, faces, other, others)
                 self._meeting.append((one, other, common, meeting(sides.bodies, faces, others)))
+        for k, (hold, _, axes) in enumerate(self.holds):
+            others = [other for other, _, more in self.holds if other is not hold and set(axes) & set(more)]
+            self.holds[k] = (hold, sides.held(hold, others), axes)
         pressures = [pressure for pressure, _ in self.pressures]
         for condition in [*tractions, *pressures, *displacements]:
             if not callable(condition.value):  # what a function gives is checked when it is called
@@ -318,9 +321,11 @@ class MechanicalBoundary:
         grid, data, held = self.grid, sides.holds, sides.held
         if data is None:
             return np.zeros((0, grid.dim))
-        moved = np.einsum("mk,mkd,md->m", held.shape[sides.row], u[grid.cell_nodes[data.cells]], data["direction"])
+        nodes, N, axis = grid.cell_nodes[data.cells], held.shape[sides.row], data["direction"].argmax(axis=1)
+        moved = np.einsum("mk,mkd,md->m", N, u[nodes], data["direction"])
         force = data["stiffness"][:, 0] * (data["gap"][:, 0] - moved)
-        self._warn(held, sides.row, data["direction"].argmax(axis=1), force)
+        self._warn(held, sides.row, axis, force)
+        force = force * (N * self._free[nodes, axis[:, None]]).sum(axis=1)
         number, force = held.number[sides.row], force[:, None] * data["direction"]
         return grid.comm.allreduce(np.stack([sum_by(number, column, len(self.holds)) for column in force.T], axis=1))
 
