@@ -82,45 +82,45 @@ class _Around:
         x, key, cell = np.split(over_all(scene.grid.comm, own), [d, d + 3], axis=1)
         self._lattice = lattice = _Lattice(scene.grid, cell[:, 0].astype(np.int64))
         self._local, rows = self._gathered(on_grid, on_grid.pressures(state), cut.to_cells(alike))
-        ends = np.cumsum([1, 1, d, d, d, 3, 3])
-        filled, p, self._half, self._kappa, self._shift, low, high, share = np.split(rows, ends, axis=2)
+        ends = np.cumsum([1, 1, d, d, d, 3])
+        filled, p, self._half, self._kappa, self._shift, held, share = np.split(rows, ends, axis=2)
         self._filled, self._p, self._open = filled[..., 0] > 0, p[..., 0], share.reshape(*share.shape[:2], d, 2)
         self._centroid = lattice.midpoint + self._half - x[:, None]
-        self._counts, self._reached = self._connected(key, low, high)
+        self._counts, self._reached = self._connected(held == key[:, None])
         self._sides = state.stage.hydraulic.data(cut, points, self._contents, state.t)
 
     def _gathered(self, on_grid: OnGrid, p: NDArray[np.float64], alike: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
         """Return the local numbers (m, cells) of the cells that this process owns, else -1, and what all hold.
 
         p: of the filled owned cells, Pa; alike: of pieces (k, 3), what those have in common that conduct and deform
-        alike.  The columns are one where a cell is filled, p, centroid, mobility, shift, least and largest of `alike`,
-        and open shares.
+        alike.  The columns are one where a cell is filled, p, centroid, mobility, shift, `alike` or nan
+        where pieces differ, and open shares.
         """
         grid, contents, number = self._grid, self._contents, self._lattice.number
         filled, mobility, slot = contents.filled, on_grid.resting_mobility(), contents.slot(on_grid.cut.cells)
-        ends = np.full((2, len(filled), 3), [[[np.inf]], [[-np.inf]]])
-        np.minimum.at(ends[0], slot, alike)
-        np.maximum.at(ends[1], slot, alike)
+        held = np.zeros((len(filled), 3))
+        held[slot] = alike  # of any of the cell's pieces
+        held[np.stack([sum_by(slot, other, len(filled)) > 0 for other in (alike != held[slot]).T], axis=1)] = np.nan
         one = np.ones((len(filled), grid.dim))
         kappa = mobility.mean[:, None] * (one if mobility.share is None else mobility.share)
         shift = 0 * one if mobility.shift is None else mobility.shift
         share = contents.open[filled].reshape(len(filled), -1)
-        rows = np.column_stack([one[:, 0], p, contents.centroid[filled], kappa, shift, *ends, share])
+        rows = np.column_stack([one[:, 0], p, contents.centroid[filled], kappa, shift, held, share])
         local = np.where(number >= 0, grid.local(np.maximum(number, 0)), -1)
         local[(local >= grid.num_owned) | ~on_grid.active[local]] = -1
         out, (probe, place) = np.zeros((*local.shape, rows.shape[1])), np.nonzero(local >= 0)
         out[probe, place] = rows[contents.slot(local[probe, place])]
         return local, over_all(grid.comm, out)
 
-    def _connected(
-        self, key: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64]
-    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    def _connected(self, same: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Return which cells (m, cells) count, and which lie behind open faces of these or of the probe's.
 
         Where none holds the probe's material alone, as in thin layers and where it changes from point to point, those
         of its material's number count, else all.
+
+        same: (m, cells, 3) where cells hold nothing but the probe's conductivity, law of it, and material.
         """
-        same = (low == key[:, None]) & (high == key[:, None]) & self._filled[:, :, None]
+        same = same & self._filled[:, :, None]
         levels = [same.all(axis=2), same[:, :, 2], self._filled]
         alike = levels[-1].copy()
         for level in levels[1::-1]:
