@@ -102,14 +102,15 @@ def test_a_steady_pressure_is_exact_up_to_sides_aslant():
     assert found == pytest.approx(along(0, placed(X)), abs=4e-4 * 1e4)
 
 
-def test_what_lies_beyond_a_gap_tells_nothing():
-    grid = mpm.Grid([0.6, 0.4], [6, 4])
-    bodies = [mpm.box(grid, [0, 0], [0.2, 0.4]), mpm.box(grid, [0.3, 0], [0.6, 0.4])]
+@pytest.mark.parametrize("contacts", [[], [mpm.Contact(0, 1)]], ids=["gap", "contact"])
+def test_what_lies_beyond_a_gap_or_a_contact_tells_nothing(contacts):
+    grid, gap = mpm.Grid([0.6, 0.4], [6, 4]), 0.0 if contacts else 0.1
+    bodies = [mpm.box(grid, [0, 0], [0.2, 0.4]), mpm.box(grid, [0.2 + gap, 0], [0.6, 0.4])]
     soil = mpm.LinearElastic(**STIFF, conductivity=1e-6)
     walls = {"left": "xy", "right": "xy", "bottom": "xy"}
-    ends = {"fluid": mpm.Fluid(), "pressure": lambda x: np.where(x[:, 0] < 0.25, 1e3, 5e3)}
-    s = mpm.Simulation(grid, bodies, [soil], fixed=walls, **ends)
-    probes = mpm.probes(bodies, [[0.2, 0.13], [0.11, 0.4], [0.3, 0.2]])
+    ends = {"fluid": mpm.Fluid(), "pressure": lambda x: np.where(x[:, 0] < 0.2, 1e3, 5e3)}
+    s = mpm.Simulation(grid, bodies, [soil], fixed=walls, contacts=contacts, **ends)
+    probes = mpm.probes(bodies, [[0.2 - 1e-6, 0.13], [0.11, 0.4], [0.2 + gap + 1e-6, 0.2]])
     assert s.run(1.0, 1.0, probes=probes, progress=False).probe_pressure[0] == pytest.approx([1e3, 1e3, 5e3])
 
 
