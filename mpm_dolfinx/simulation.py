@@ -115,7 +115,7 @@ class Simulation:
         check_parts(grid, bodies, materials, later)
         check_options(fluid, pressure, terms, sources, quadrature)
         grid = grouped(grid, bodies, contacts, quadrature, {"terms": terms, "sources": sources})
-        grid.share(points_in_cells(grid, bodies))
+        grid = grid.shared(points_in_cells(grid, bodies), keep=bool(len(terms) + len(sources)))
         warn_thin(grid, bodies, with_axis(grid, fixed), fluid is not None)
         check_axisymmetry(grid, bodies, quadrature)
         began = time.perf_counter()

@@ -267,11 +267,12 @@ def _own(grid: Grid, body: Body) -> tuple[NDArray[np.int64], NDArray[np.float64]
 
 
 def points_in_cells(grid: Grid, bodies: Sequence[Body]) -> NDArray[np.float64]:
-    """Return how many points of bodies as seeded, before the maps, are in each cell of the grid (cells,)."""
+    """Return how many points of bodies as seeded are in each cell of the grid (cells,)."""
     out = np.zeros(int(np.prod(grid.shape)))
     for body in bodies:
         for part in in_chunks(len(body)):
-            np.add.at(out, grid.number(grid.index(body.centre_of(part))), 1.0)
+            x = body.centre_of(part) if body.map is None else centroids(body.corners(part))
+            np.add.at(out, grid.number(grid.index(x)), 1.0)
     return out
 
 

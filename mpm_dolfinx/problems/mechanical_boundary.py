@@ -201,7 +201,7 @@ class MechanicalBoundary:
             loads = self._load_data(forms, cut, points, t) if self.loads else None
             pressures = self._pressure_data(forms, cut, points, t) if self.pressures else None
             plates = self._plate_data(forms, cut, points) if self.plates else None
-            none = (None, np.empty(0, dtype=np.int64), np.empty((0, 2**self.grid.dim)))
+            none = (None, None, np.empty(0, dtype=np.int64), np.empty(0))
             holds = self._hold_data(forms, cut, points, t) if self.holds else none
             pairs = zip(forms.own, self._terms, strict=True)
             own = tuple(self._own_data(term.points, faces, cut, points) for term, faces in pairs)
@@ -262,8 +262,11 @@ class MechanicalBoundary:
 
     def _hold_data(
         self, forms: SideForms, cut: CutDomains, points: MaterialPoints, t: float
-    ) -> tuple[PointData, HeldCells, NDArray[np.int64]]:
-        """Return what holds given displacements, a row a component; by cells and points; and which of these each is."""
+    ) -> tuple[PointData, HeldCells, NDArray[np.int64], NDArray[np.float64]]:
+        """Return what holds given displacements, a row a component; by cells and points; which of these each is.
+
+        Last the share of each row's force that no wall bears.
+        """
         d, comm = self.grid.dim, self.grid.comm
         self._check_meeting(t)
         held = HeldCells(self.grid, self._held_points(cut, points, t))
@@ -277,10 +280,10 @@ class MechanicalBoundary:
                 message = f"{what}, where a fixed wall holds it; must be 0 there, or the wall must leave it free"
         if message := first(comm, message):
             raise ValueError(message)
-        row, stiffness, gap, direction = map(np.concatenate, zip(*placed, strict=True))
+        row, stiffness, gap, beside, direction = map(np.concatenate, zip(*placed, strict=True))
         fields = {name: values[row] for name, values in held.moments.items()}
         fields |= {"stiffness": stiffness, "gap": gap, "direction": direction}
-        return forms.holds.at(held.cell[row], held.x[row], np.ones(len(row)), **fields), held, row
+        return forms.holds.at(held.cell[row], held.x[row], np.ones(len(row)), **fields), held, row, beside
 
     def _held_points(self, cut: CutDomains, points: MaterialPoints, t: float) -> HeldPoints:
         """Return the points of integration on held sides, at the owners of their cells."""
@@ -294,15 +297,16 @@ class MechanicalBoundary:
         # of when the grid was reset, as the stiffnesses: they stay as long as the cut serves
         tension = np.linalg.norm(stress if points is cut.points else self.materials.total_stress(before), axis=(1, 2))
         for number, ((hold, *_, axes), p) in enumerate(zip(self.holds, patches, strict=True)):
-            at, now, to = np.searchsorted(chosen, p.at), p.now(points), p.origin(points) + self._given(hold, t, p.X)
+            at, now, given = np.searchsorted(chosen, p.at), p.now(points), self._given(hold, t, p.X)
+            to = p.origin(points) + given
             R = turned(self.grid.comm, p.area0, now, to) if len(axes) == d else np.eye(d)  # as what it carries does
             force, gap = np.einsum("ij,njk,nk->ni", R, stress[at, :d, :d], p.area(points)), to - now
             own = (p.area0 * v for v in (1, modulus[at], tension[at], resists[at], firm[at]))
             each = np.stack([np.full(len(gap), number), *own], axis=1)
-            rows.append((p.cell, p.x, np.concatenate([each, gap, p.area(cut.points), force], axis=1)))
-        cell, x, values = gathered(self.grid, rows, 6 + 3 * d)
+            rows.append((p.cell, p.x, np.concatenate([each, gap, given, p.area(cut.points), force], axis=1)))
+        cell, x, values = gathered(self.grid, rows, 6 + 4 * d)
         number, *own = values[:, :6].T
-        return HeldPoints(number.astype(np.int64), cell, *own, x, *np.split(values[:, 6:], 3, axis=1))
+        return HeldPoints(number.astype(np.int64), cell, *own, x, *np.split(values[:, 6:], 4, axis=1))
 
     def _check_meeting(self, t: float) -> None:
         """Refuse given displacements that differ where they meet: no body's stress is finite there."""
@@ -321,12 +325,11 @@ class MechanicalBoundary:
         grid, data, held = self.grid, sides.holds, sides.held
         if data is None:
             return np.zeros((0, grid.dim))
-        nodes, N, axis = grid.cell_nodes[data.cells], held.shape[sides.row], data["direction"].argmax(axis=1)
-        moved = np.einsum("mk,mkd,md->m", N, u[nodes], data["direction"])
+        nodes, axis = grid.cell_nodes[data.cells], data["direction"].argmax(axis=1)
+        moved = np.einsum("mk,mkd,md->m", held.shape[sides.row], u[nodes], data["direction"])
         force = data["stiffness"][:, 0] * (data["gap"][:, 0] - moved)
         self._warn(held, sides.row, axis, force)
-        force = force * (N * self._free[nodes, axis[:, None]]).sum(axis=1)
-        number, force = held.number[sides.row], force[:, None] * data["direction"]
+        number, force = held.number[sides.row], (sides.beside * force)[:, None] * data["direction"]
         return grid.comm.allreduce(np.stack([sum_by(number, column, len(self.holds)) for column in force.T], axis=1))
 
     def _warn(

@@ -30,8 +30,8 @@ class SideData:
 
     loads: with their force; pressures: with their force on the area at the start of the step; plates: with their
     rigidity, normal and present tilt; holds: components of given displacements, with stiffness, direction and gap;
-    held: what holds them; row: which of it each component is; tools: contact with them; own: of each term of the
-    user's own; contact: of groups of bodies.
+    held: what holds them; row: which of it each component is; beside: share of its force that no wall bears; tools:
+    contact with them; own: of each term of the user's own; contact: of groups of bodies.
     """
 
     loads: PointData | None
@@ -40,6 +40,7 @@ class SideData:
     holds: PointData | None
     held: HeldCells | None
     row: NDArray[np.int64]
+    beside: NDArray[np.float64]
     tools: ToolContact | None = None
     own: tuple[PointData, ...] = ()
     contact: Following | None = None
