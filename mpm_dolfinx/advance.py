@@ -19,11 +19,11 @@ from mpm_dolfinx.errors import LeftGrid, NotConverged
 from mpm_dolfinx.parallel.exchange import first, over_all
 from mpm_dolfinx.points.bodies import Body
 from mpm_dolfinx.points.cut_domains import CutDomains
-from mpm_dolfinx.points.cutting import parallelepipeds, tangled, volumes
+from mpm_dolfinx.points.cutting import centroids, parallelepipeds, tangled, volumes
 from mpm_dolfinx.points.domain_gradient import gradient
 from mpm_dolfinx.points.grid import REACH, Grid, sum_by
 from mpm_dolfinx.points.lattice import filtered, given
-from mpm_dolfinx.points.material_points import MaterialPoints, determinant, middle, with_ratio
+from mpm_dolfinx.points.material_points import MaterialPoints, determinant, with_ratio
 from mpm_dolfinx.points.pressure_transport import PiecePressures, Reconstruction
 from mpm_dolfinx.problems.mechanical_boundary import MechanicalBoundary
 from mpm_dolfinx.problems.momentum import MomentumForms
@@ -133,7 +133,7 @@ class Motion:
 
     def pressures(self, on_grid: OnGrid, stage: Stage, t: float) -> NDArray[np.float64]:
         """Return the pressures (n,), Pa, of the points by those of the cells at time t (s)."""
-        return on_grid.cut.mean(on_grid.pressures_up_to_surface(self._reconstruction, stage, t))
+        return on_grid.cut.in_plane(on_grid.pressures_up_to_surface(self._reconstruction, stage, t))
 
     def strained(self, points: MaterialPoints, on_grid: OnGrid, data: QuadratureData) -> MaterialPoints:
         """Return points with F and state as after a solved step of no time, which stay where they are."""
@@ -199,7 +199,7 @@ class Motion:
             F = with_ratio(F, np.where(locks, determinant(deformed()), determinant(F)))
         if self._materials.evolves:
             F = np.where(evolved[:, None, None], deformed(), F)
-        return replace(points, corners=corners, x=middle(corners), F=F), serves, folded
+        return replace(points, corners=corners, x=centroids(corners), F=F), serves, folded
 
     def _owed(
         self, state: State, points: MaterialPoints, on_grid: OnGrid, came: NDArray[np.float64], serves: bool

@@ -42,7 +42,7 @@ class Row(NamedTuple):
 
     t, s; displacement (m, d), m, and present position (m, d), m, of the m probes; pressure: least and largest on the
     points, Pa; probe_pressure (m,), Pa, and probe_stress (m, 3, 3), Pa: pore pressure and effective stress, tension
-    positive, of the material points whose domains hold the probes; tools (k, d + 1) or (k, 6), N and N m: forces and
+    positive, at the places of the probes, see `probe_fields`; tools (k, d + 1) or (k, 6), N and N m: forces and
     moments of tools, then of contacts, on the bodies; reactions (displacements, d), walls (2 d, d), N, and outflows
     (drained sides, then inflows), m^3/s: as the simulation's `reactions`, `wall_reactions` and `outflows`.
     """

@@ -24,6 +24,7 @@ from mpm_dolfinx.io.summary import imbalance, peak_memory
 from mpm_dolfinx.parallel.exchange import first
 from mpm_dolfinx.parallel.messages import log, warn
 from mpm_dolfinx.points.probes import Probes
+from mpm_dolfinx.probe_fields import probe_pressures, probe_stresses
 from mpm_dolfinx.result import Report, Result, Row
 from mpm_dolfinx.scene import Scene
 from mpm_dolfinx.state import State
@@ -340,9 +341,9 @@ def _row(simulation: Simulated, probes: Probes | None) -> Row:
     if probes is not None:
         out |= {name: getattr(probes, name)(points, comm) for name in ("displacement", "position")}
     if probes is not None and wet:
-        out["probe_pressure"] = probes.at_points(points, comm, lambda held: held.pressure)
+        out["probe_pressure"] = probe_pressures(scene, simulation.state, probes)
     if probes is not None and probes.stressed:
-        out["probe_stress"] = probes.at_points(points, comm, scene.materials.effective_stress_3d)
+        out["probe_stress"] = probe_stresses(scene, simulation.state, probes)
     if len(simulation.state.tool_forces):
         out["tools"] = simulation.state.tool_forces
     out |= {name: getattr(simulation.state, name) for name in ("reactions", "walls", "outflows")}

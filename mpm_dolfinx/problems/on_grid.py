@@ -89,7 +89,7 @@ class OnGrid(Keyed):
                 x=x,
                 faces=cut.pieces_to_cells(cut.pieces.faces),
                 fixed_stress=quadrature.fixed_stress(cut, points, of_fluid),
-                damping=quadrature.rows(cut, points, lambda m: m.pressure_damping(grid.dim)),
+                damping=quadrature.rows(cut, points, lambda m: m.pressure_damping()),
             )
             self.contents = CellContents(storage.fluxes, brought, self.cells[self.cells < grid.num_owned])
             if quadrature.layered:
@@ -181,12 +181,15 @@ class OnGrid(Keyed):
         return self.contents.total(cut.cells, self.data.pieces["biot"][:, 0] * share)
 
     def pressures_up_to_surface(self, reconstruction: Reconstruction, stage: Stage, t: float) -> NDArray[np.float64]:
-        """Return the pressures (m,), Pa, at the pieces' centroids; their mean by volume in a cell is the cell's.
+        """Return the pressures (m,), Pa, at the pieces' centroids; their mean in a cell is the cell's.
+
+        In axisymmetry centroids and mean are those in the plane.
 
         t, s: time at which drained sides have their pressures.
         """
         places, seen = self._places.pieces, self._cell_pressures(self._storage.p.x.array, stage, t)
-        return self.cut.to_pieces(reconstruction.up_to_surface(seen, places.offset, places.slots))
+        offset = self.cut.plane(self.weight)[1] - self.cut.grid.midpoints[self.cut.cells]
+        return self.cut.to_pieces(reconstruction.up_to_surface(seen, offset, places.slots))
 
     def _cell_pressures(self, p: NDArray[np.float64], stage: Stage, t: float, bulk: float = np.inf) -> CellPressures:
         """Return what slopes of cells with these pressures, or mass potentials by `bulk` (Pa), are drawn from."""
@@ -203,6 +206,14 @@ class OnGrid(Keyed):
         if self._storage.conductivity is not None:
             share = graded(self.contents, self._places.pieces.offset, at_pieces, mean)
         return Mobility(mean, share) if self._mixed is None else self._mixed.mobility(at_pieces, mean, share)
+
+    def resting_mobility(self) -> Mobility:
+        """Return the conductivities, m/s, of the filled owned cells as laws of the deformation and pressure have them
+        at rest.
+        """
+        at_pieces = self._quadrature.rows(self.cut, self.cut.points, lambda m: m.conductivity)
+        mean = self.contents.mean(at_pieces)
+        return Mobility(mean) if self._mixed is None else self._mixed.mobility(at_pieces, mean, None)
 
     @property
     def active_cells(self) -> int:
