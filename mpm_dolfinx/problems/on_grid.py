@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
+from functools import cached_property, partial
 
 from mpi4py import MPI
 
@@ -17,6 +17,7 @@ from mpm_dolfinx.caching import Keyed, Latest
 from mpm_dolfinx.constitutive.fluid_content import mass_potential, pressure_of
 from mpm_dolfinx.forms.unknowns import collect_garbage
 from mpm_dolfinx.parallel.exchange import over_all
+from mpm_dolfinx.points.connected import connected
 from mpm_dolfinx.points.cut_domains import CutDomains
 from mpm_dolfinx.points.grid import sum_by
 from mpm_dolfinx.points.pressure_transport import CellPressures, Reconstruction, share_within, transport
@@ -202,6 +203,17 @@ class OnGrid(Keyed):
         if self._storage.conductivity is not None:
             share = graded(self.contents, self._places.pieces.offset, at_pieces, mean)
         return Mobility(mean, share) if self._mixed is None else self._mixed.mobility(at_pieces, mean, share)
+
+    @cached_property
+    def parts(self) -> tuple[NDArray[np.int64], int]:
+        """Which of the parts that hang together, from 0, each point belongs to (n,), and how many there are.
+
+        A part has unknowns of its own: what happens in another one it does not see.
+        """
+        part, count = connected(self.cut.grid, self.active)
+        out = np.zeros(len(self.cut.points), dtype=np.int64)
+        out[self.cut.pieces.point] = self.cut.to_pieces(part[self.cut.cells] - 1)
+        return out, count
 
     @property
     def active_cells(self) -> int:
