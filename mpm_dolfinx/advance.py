@@ -203,8 +203,8 @@ class Motion:
         """Return what is owed to the points after a step (n,), over their volumes at rest, and what of it is due.
 
         That is by how much their content, by their volumes and the cells' pressures, has grown beyond the fluid that
-        came: masses, over the density at zero pressure.  Soil that has yielded, whose volumes are those of the cells,
-        and pores that drain are owed nothing; while the cut serves nothing is due.
+        came: masses, over the density at zero pressure.  Pores that drain are owed nothing: what drains from them is no
+        part of this content.  While the cut serves nothing is due.
         """
         before, cut, materials, forms = state.points, on_grid.cut, self._materials, self._storage
         here = cut.pieces_to_cells(cut.pieces.fraction * (before.volume0 * before.J)[cut.pieces.point])
@@ -216,9 +216,7 @@ class Motion:
         rows = (alpha, at_one, materials.storage(before), points.J / before.J)
         rows = (values[cut.pieces.point] for values in rows)
         grown = cut.mean(density * change_at_points(*rows, dp) - came_here)
-        none = materials.evolved(points)
-        if materials.drains:  # what drains from pores is no part of this content
-            none |= materials.retention(points)[:, 0] > 0
+        none = materials.retention(points)[:, 0] > 0 if materials.drains else np.zeros(len(points), dtype=bool)
         owed = np.where(none, 0.0, before.data["owed"] + before.J * grown / alpha)
         if serves:
             return {"owed": owed, "due": np.zeros(len(points))}
