@@ -32,6 +32,7 @@ from mpm_dolfinx.problems.on_grid import OnGrid
 from mpm_dolfinx.problems.quadrature_data import QuadratureData
 from mpm_dolfinx.problems.stage_tools import Tools
 from mpm_dolfinx.problems.storage import StorageForms
+from mpm_dolfinx.result import Report
 from mpm_dolfinx.state import State, Stay
 
 TAKES_IN = 0.1
@@ -77,6 +78,7 @@ class Motion:
         t: float,
         tools: Tools,
         came: NDArray[np.float64] | None = None,
+        report: Report | None = None,
         stays: bool = True,
     ) -> tuple[State, int]:
         """Return the state at time t (s) after a solved step, and how many domains had folded.
@@ -91,6 +93,8 @@ class Motion:
             As they go in the step.
         came : (cells,), m^d
             Fluid that came to the local cells in the step; without, what is owed to the points stays as it is.
+        report
+            What the step took, which is told of where a point leaves the grid.
         stays
             Whether pieces stay in their cells where points hardly move.
 
@@ -127,7 +131,7 @@ class Motion:
                     points = replace(
                         points, data=points.data | self._owed(state, points, on_grid, pieces, came, serves)
                     )
-            _check_inside(cut, points, t)
+            _check_inside(cut, points, t, report)
         stay, held = Stay(cut.points, ids, pressure, x, start), state.held if serves else None
         new = replace(state, t=t, points=points, transported=None, stay=stay, held=held)
         return new if serves and stays else self.left_grid(new, on_grid), folded
@@ -281,16 +285,17 @@ class Motion:
         return replace(state, transported=transported, stay=None)
 
 
-def _check_inside(cut: CutDomains, points: MaterialPoints, t: float) -> None:
-    """Refuse points that have left the grid."""
+def _check_inside(cut: CutDomains, points: MaterialPoints, t: float, report: Report | None) -> None:
+    """Refuse points of which a corner has left the grid, and say which."""
     grid, x, message = cut.grid, points.corners if cut.domains else points.x[:, None], ""
-    out = np.flatnonzero(grid.outside(x.reshape(-1, grid.dim), REACH))
-    if len(out):
-        i = out[0] // x.shape[1]
-        message = f"point {points.id[i]} at {points.x[i]} left the grid {grid.lower} to {grid.upper} at t = {t:g} s"
-        message += ", must stay in it: take a larger grid"
+    if grid.outside(x.reshape(-1, grid.dim), REACH).any():
+        beyond = np.maximum(grid.lower - x, x - grid.upper).max(axis=2)
+        i, corner = np.unravel_index(np.argmax(np.where(np.isnan(beyond), np.inf, beyond)), beyond.shape)
+        of = f"point {points.id[i]} at {points.x[i]}" + (f": its corner at {x[i, corner]}" if cut.domains else "")
+        by = f"by {beyond[i, corner]:.3g} m at t = {t:g} s"
+        message = f"{of} left the grid {grid.lower} to {grid.upper} {by}, must stay in it: take a larger grid"
     if message := first(grid.comm, message):
-        raise LeftGrid(message)
+        raise LeftGrid(message, report)
 
 
 def untangled(

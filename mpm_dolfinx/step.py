@@ -40,10 +40,9 @@ def step(scene: Scene, state: State, dt: float) -> tuple[State, Report]:
     """Return the state after a step of dt (s), and what it took; `state` stays what it is, whatever is raised."""
     start, report, rates = set_up(scene, state, dt), Report(), []
     state, on_grid, solvers = start.state, start.on_grid, start.matrices.solvers()
-    as_reset = partial(on_grid.as_reset, state)
     for acting in start.acting:
         both, key = balances(scene, start, acting, *rates[-1:]), (on_grid.key, state.stage, acting.substep.own * dt)
-        rates.append(solve_substep(solvers, *both, as_reset, key, report))
+        rates.append(solve_substep(solvers, *both, partial(on_grid.as_reset, state), key, report))
     note_pressures(report, solvers, both.storage, acting.substep.before * dt, dt, rates)
     del solvers
     start.matrices.end_step()
@@ -51,7 +50,8 @@ def step(scene: Scene, state: State, dt: float) -> tuple[State, Report]:
     reactions = mechanical.reactions(acting.sides, scene.momentum.nodal)
     outflows = both.storage.outflows(len(state.stage.hydraulic.outlets)) if both.storage else state.outflows
     tools, ways = mechanical.going(acting.sides, state.t, state.t + dt, state.tool_travel)
-    new, report.rederived = scene.motion.advanced(state, on_grid, start.data, state.t + dt, tools, both.came(rates[-1]))
+    end = state.t + dt, tools, both.came(rates[-1]), report
+    new, report.rederived = scene.motion.advanced(state, on_grid, start.data, *end)
     velocity = None if scene.momentum.elastic else scene.momentum.u.x.array / dt
     now = {"reactions": reactions, "outflows": outflows, "velocity": velocity}
     mechanical.check_end(on_grid.cut, new.points, new.t, state.points, state.t, tools)

@@ -274,8 +274,9 @@ def _advance(simulation: Simulated, rule: StepSize, target: float) -> None:
             new, report = simulation.advanced(taken)
         except StepFailed as failed:
             cut = rule.cut(taken, result)
-            if cut.small < rule.least(wanted, state.t):
-                tried = _note(simulation, replace(cut, small=taken))
+            left = _has_left(failed, rule, taken, result)
+            if left or cut.small < rule.least(wanted, state.t):
+                tried = result if left else _note(simulation, replace(cut, small=taken))
                 raise GaveUp(_why(state.t, taken, failed), tried, failed.history) from failed
             _note(simulation, cut)
             log(comm, "t = %g s: step cut to %.3g s: %s", state.t, taken / 2, failed)
@@ -294,6 +295,13 @@ def _advance(simulation: Simulated, rule: StepSize, target: float) -> None:
         if not rule.by_error and grown.small > result.small:
             log(comm, "t = %g s: step grows to %.3g s", new.t, grown.small)
         return
+
+
+def _has_left(failed: StepFailed, rule: StepSize, taken: float, result: Result) -> bool:
+    """Return whether points leave the grid in a step that is exact enough: shorter ones would only lead there."""
+    if not isinstance(failed, LeftGrid) or failed.report is None:
+        return False
+    return rule.refused(taken, failed.report, measured(result, failed.report)) == 1
 
 
 def _why(t: float, small: float, failed: StepFailed) -> str:
