@@ -324,9 +324,11 @@ class FluxForms:
         self.gravity = None
         if weight is not None and flows:
             apart = across * n0 - ufl.jump(self.centroid + self.moved)
-            # so water at rest, whose pressure grows by its weight at zero pressure, stays at rest
+            # so water at rest, whose pressure grows by its weight at zero pressure, stays at rest; the two at once for
+            # each face: rounding of what leaves a cell enters its neighbour, and is that of small differences
             density = density_between(pressure("+"), pressure("-"), fem.Constant(mesh, 1 / bulk))
-            self.gravity = FacetForm(T * density * ufl.dot(weight, apart) * ufl.jump(q) * dS, grid.comm)
+            drives = ufl.jump(pressure) + ufl.dot(weight, apart)
+            self.gravity = FacetForm(T * density * drives * ufl.jump(q) * dS, grid.comm)
 
     def along(
         self, slope: NDArray[np.float64], cells: NDArray[np.int64], facets: FacetSum, density: NDArray[np.float64]

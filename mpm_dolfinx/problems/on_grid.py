@@ -17,7 +17,6 @@ from mpm_dolfinx.caching import Keyed, Latest
 from mpm_dolfinx.constitutive.fluid_content import mass_potential, pressure_of
 from mpm_dolfinx.forms.unknowns import collect_garbage
 from mpm_dolfinx.parallel.exchange import over_all
-from mpm_dolfinx.points.connected import connected
 from mpm_dolfinx.points.cut_domains import CutDomains
 from mpm_dolfinx.points.grid import sum_by
 from mpm_dolfinx.points.pressure_transport import CellPressures, Reconstruction, share_within, transport
@@ -26,6 +25,7 @@ from mpm_dolfinx.problems.fluxes import CellContents, CellMotion, Conduction, Mo
 from mpm_dolfinx.problems.ghost_penalty import stiffness
 from mpm_dolfinx.problems.layers import graded, mixed_cells
 from mpm_dolfinx.problems.momentum import MomentumForms, MomentumSystem
+from mpm_dolfinx.problems.parts import parts_of_cells
 from mpm_dolfinx.problems.quadrature_data import QuadratureData, QuadraturePoints
 from mpm_dolfinx.problems.scene_checks import check_held
 from mpm_dolfinx.problems.side_forms import SideData
@@ -210,7 +210,7 @@ class OnGrid(Keyed):
 
         A part has unknowns of its own: what happens in another one it does not see.
         """
-        part, count = connected(self.cut.grid, self.active)
+        part, count = parts_of_cells(self.cut.grid, self.active)
         out = np.zeros(len(self.cut.points), dtype=np.int64)
         out[self.cut.pieces.point] = self.cut.to_pieces(part[self.cut.cells] - 1)
         return out, count

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.parallel.exchange import Exchange
-from mpm_dolfinx.points.connected import connected
 from mpm_dolfinx.points.grid import Grid
+from mpm_dolfinx.problems.parts import parts_of_cells
 
 
 def check_held(
@@ -44,7 +44,7 @@ def check_held(
     ValueError
         Saying where the part is, and in how many ways it can move.
     """
-    part, count = connected(grid, active) if each else (active.astype(np.int64), 1)
+    part, count = parts_of_cells(grid, active) if each else (active.astype(np.int64), 1)
     centre, size = _extents(grid, part, count)
     cells = np.flatnonzero(active)
     nodes, first = np.unique(grid.cell_nodes[cells], return_index=True)

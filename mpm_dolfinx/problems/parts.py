@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Which cells hang together: those of bodies that touch, or are less than a cell apart, share unknowns."""
+"""Parts of the bodies that hang together: no force and no fluid goes from one to another."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from mpm_dolfinx.points.cutting import corner_bits
 from mpm_dolfinx.points.grid import Grid
 
 
-def connected(grid: Grid, active: NDArray[np.bool_]) -> tuple[NDArray[np.int64], int]:
+def parts_of_cells(grid: Grid, active: NDArray[np.bool_]) -> tuple[NDArray[np.int64], int]:
     """Return the part (cells,), from 1, that each active local cell belongs to by common nodes, and how many there are.
 
     Cells that are not active have 0.  Parts are numbered by their first cells, alike on any number of processes.

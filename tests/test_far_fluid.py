@@ -9,7 +9,7 @@ import ufl
 from scipy.ndimage import label
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.points.connected import connected
+from mpm_dolfinx.problems.parts import parts_of_cells
 
 AWAY = (np.array([1.9, 0.0]), np.array([2.4, 2.0]))  # m, around the far body
 
@@ -68,6 +68,6 @@ def test_cells_with_common_nodes_are_one_part():
     for shape, share in (((13, 11), 0.15), ((7, 6, 5), 0.06)):
         grid = mpm.Grid([1.0] * len(shape), shape)
         filled = rng.random(int(np.prod(shape))) < share
-        part, count = connected(grid, filled[grid.cell_number])
+        part, count = parts_of_cells(grid, filled[grid.cell_number])
         expected, number = label(filled.reshape(shape), structure=np.ones((3,) * len(shape)))
         assert count == number > 3 and (part == expected.ravel()[grid.cell_number]).all()
