@@ -7,8 +7,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache, partial
 
-from mpi4py import MPI
-
 import numpy as np
 from dolfinx.common import Timer
 from numpy.typing import NDArray
@@ -112,29 +110,43 @@ class Motion:
             deformed = cache(partial(self._deformed, cut, data, nodal))
             if cut.domains:
                 followed = cut.followed(nodal, self._momentum.active_nodes(on_grid.cells))
-                points, serves, folded = self._shaped(state, t, tools, cut, *followed, deformed)
+                points, keeps, folded = self._shaped(state, t, tools, on_grid, *followed, deformed)
             else:
                 x, F = state.points.x + cut.displacement(nodal), deformed()
                 points = replace(state.points, x=x, F=F, corners=parallelepipeds(x, F, self._sizes(state.points)))
-                serves, folded = cut.serves(points), 0
+                keeps, folded = on_grid.serves(points), 0
             self._check_volumes(points, cut)
             points = replace(points, data=self._materials.updated_state(points, state.points, t - state.t))
             ids, pressure, x, start = None, None, None, None
             if self._storage is not None:
                 pressure = cut.to_pieces(self._storage.p.x.array[pieces.cells])
-                x = state.stay.x if state.stay else cut.pieces.x
+                x = on_grid.of_pieces(state, "x", cut.pieces.x)
                 x = x + cut.to_pieces(grid.at(pieces.cells, pieces.x, nodal))
-                start = state.stay.start if state.stay else cut.to_pieces(self._storage.p_n.x.array[pieces.cells])
+                start = on_grid.of_pieces(state, "start", on_grid.pressures_of_pieces())
                 own = on_grid.pressures_up_to_surface(self._reconstruction, state.stage, t)
                 points, ids = replace(points, pressure=cut.mean(own)), points.id[cut.pieces.point]
                 if cut.domains and came is not None:
-                    points = replace(
-                        points, data=points.data | self._owed(state, points, on_grid, pieces, came, serves)
-                    )
+                    owed = self._owed(state, points, on_grid, pieces, came, keeps)
+                    points = replace(points, data=points.data | owed)
             _check_inside(cut, points, t, report)
-        stay, held = Stay(cut.points, ids, pressure, x, start), state.held if serves else None
-        new = replace(state, t=t, points=points, transported=None, stay=stay, held=held)
-        return new if serves and stays else self.left_grid(new, on_grid), folded
+        stay = Stay(cut.points, ids, pressure, x, start)
+        new = replace(state, t=t, points=points, transported=None, stay=stay)
+        keeps = keeps & stays
+        some, others = over_all(grid.comm, np.array([keeps.any(), not keeps.all()], dtype=float)) > 0
+        if not others:
+            return new, folded
+        new = replace(self.left_grid(new, on_grid), held=None)
+        if some:
+            new = replace(new, stay=replace(stay, keeps=keeps), held=self._held(state, on_grid, keeps))
+        return new, folded
+
+    def _held(self, state: State, on_grid: OnGrid, keeps: NDArray[np.bool_]) -> NDArray[np.float64] | None:
+        """Return the forces that hold nodes of those parts all points (n,) of which stay in their cells."""
+        if state.held is None:
+            return None
+        cut = on_grid.cut
+        kept = np.unique(cut.cells[cut.to_cells(keeps)])
+        return np.where(np.repeat(self._momentum.active_nodes(kept), cut.grid.dim), state.held, 0.0)
 
     def _deformed(self, cut: CutDomains, data: QuadratureData, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return F (n, d, d) of the points after a step: the means of Delta F and of its det over their pieces."""
@@ -157,11 +169,11 @@ class Motion:
         state: State,
         t: float,
         tools: Tools,
-        cut: CutDomains,
+        on_grid: OnGrid,
         moved: NDArray[np.float64],
         bend: NDArray[np.float64],
         deformed: Callable[[], NDArray[np.float64]],
-    ) -> tuple[MaterialPoints, bool, int]:
+    ) -> tuple[MaterialPoints, NDArray[np.bool_], int]:
         """Return the points after their corners have moved (n, 2^d, d) and bent, m, with the F that these tell.
 
         Where Q1 cells would lock the volume ratio is that of the cells, which `deformed` has in its F.
@@ -169,9 +181,10 @@ class Motion:
 
         Returns
         -------
-        The points; whether they are still where they were cut; how many domains had folded.
+        The points; which of them (n,) are still where they were cut; how many domains had folded.
         """
-        grid, stage, folded = cut.grid, state.stage, 0
+        cut, stage, folded = on_grid.cut, state.stage, 0
+        grid = cut.grid
         own = ~given(grid, stage.lattices, stage.conditions["fixed"], state.points)
         free = own & ~tools.near(state.points.corners + moved, t)[:, :, None]
         if stage.mechanical.contacts.contacts:
@@ -179,10 +192,11 @@ class Motion:
             free &= ~beside[:, :, None]
         corners = tools.outside(state.points.corners + moved + free * bend, t, own)
         points = replace(state.points, corners=corners)
-        serves, evolved = cut.serves(points), self._materials.evolved(points)
-        if not serves:
+        keeps, evolved = on_grid.serves(points), self._materials.evolved(points)
+        if over_all(grid.comm, int(not keeps.all())):
+            free &= ~keeps[:, None, None]
             corners = corners + free * filtered(grid, stage.lattices, points, cut.points, ~evolved)
-            bad = tangled(corners, points.volume0 * points.J, grid.axisymmetric)
+            bad = ~keeps & tangled(corners, points.volume0 * points.J, grid.axisymmetric)
             folded = over_all(grid.comm, int(bad.sum()))
             if folded:
                 corners = untangled(points, corners, bad, deformed(), grid, stage.mechanical)
@@ -193,7 +207,7 @@ class Motion:
             F = with_ratio(F, np.where(locks, determinant(deformed()), determinant(F)))
         if self._materials.evolves:
             F = np.where(evolved[:, None, None], deformed(), F)
-        return replace(points, corners=corners, x=middle(corners), F=F), serves, folded
+        return replace(points, corners=corners, x=middle(corners), F=F), keeps, folded
 
     def _owed(
         self,
@@ -202,13 +216,13 @@ class Motion:
         on_grid: OnGrid,
         pieces: PointData,
         came: NDArray[np.float64],
-        serves: bool,
+        keeps: NDArray[np.bool_],
     ) -> dict[str, NDArray[np.float64]]:
         """Return what is owed to the points after a step (n,), over their volumes at rest, and what of it is due.
 
         That is by how much their content, by their volumes and the cells' pressures, has grown beyond the fluid that
         came: masses, over the density at zero pressure.  Pores that drain are owed nothing: what drains from them is no
-        part of this content.  While the cut serves nothing is due.
+        part of this content.  While points stay where they were cut (n,) nothing is due.
         """
         before, cut, materials, forms = state.points, on_grid.cut, self._materials, self._storage
         here = cut.pieces_to_cells(cut.pieces.fraction * (before.volume0 * before.J)[cut.pieces.point])
@@ -222,14 +236,12 @@ class Motion:
         grown = cut.mean(density * change_at_points(*rows, dp) - came_here)
         none = materials.retention(points)[:, 0] > 0 if materials.drains else np.zeros(len(points), dtype=bool)
         owed = np.where(none, 0.0, before.data["owed"] + before.J * grown / alpha)
-        if serves:
+        if not over_all(cut.grid.comm, int(not keeps.all())):
             return {"owed": owed, "due": np.zeros(len(points))}
         part, count = on_grid.parts
-        far = np.zeros(count)
-        np.maximum.at(far, part, np.abs((points.corners - cut.points.corners) / cut.grid.h).max(axis=(1, 2)))
-        share = -np.expm1(-TAKES_IN * over_all(cut.grid.comm, far, MPI.MAX))[part]
+        share = -np.expm1(-TAKES_IN * cut.moved(points, part, count))[part]
         mean = self._means(part, count, points.volume0 * ~none, owed) * self._sealed(state, on_grid, pieces)
-        return {"owed": owed, "due": np.where(none, 0.0, mean[part] + share * (owed - mean[part]))}
+        return {"owed": owed, "due": np.where(none | keeps, 0.0, mean[part] + share * (owed - mean[part]))}
 
     def _means(
         self, part: NDArray[np.int64], count: int, weight: NDArray[np.float64], values: NDArray[np.float64]

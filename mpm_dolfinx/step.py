@@ -20,8 +20,8 @@ def set_up(scene: Scene, state: State, dt: float) -> Start:
     collect_garbage(scene.grid.mesh.comm)
     stage, times = state.stage, [state.t + substep.end * dt for substep in scene.substeps]
     gravity = [stage.gravity_at(t) for t in times]
-    state = state if state.stay else state.at_owners(scene.grid)
-    cut_points = state.stay.points if state.stay else state.points  # points that hardly move stay as they were cut
+    state = state if state.stays else state.at_owners(scene.grid)
+    cut_points = state.as_cut
     on_grid = scene.on_grid(cut_points)
     on_grid.cut.surfaces(stage.surfaces)  # all at once
     place = partial(stage.mechanical.data, scene.momentum.sides, on_grid.cut, state.t, state.tool_travel)
@@ -57,4 +57,4 @@ def step(scene: Scene, state: State, dt: float) -> tuple[State, Report]:
     mechanical.check_end(on_grid.cut, new.points, new.t, state.points, state.t, tools)
     forces, points = mechanical.touched(acting.sides, *at, new.points)
     now |= {"tool_forces": forces, "tool_travel": ways, "points": points}
-    return replace(new, **now, resets=state.resets + (state.stay is None), begins=False), report
+    return replace(new, **now, resets=state.resets + (not state.stays), begins=False), report

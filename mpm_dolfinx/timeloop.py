@@ -290,7 +290,7 @@ def _advance(simulation: Simulated, rule: StepSize, target: float) -> None:
             _note(simulation, replace(known, rejected=known.rejected + 1, small=small))
             continue
         grown = rule.grown(taken, report, result, failed=taken < 0.99 * wanted)
-        first = report.first / taken if new.stay is None else 0.0
+        first = 0.0 if new.stays else report.first / taken
         simulation.state = replace(new, result=grown.after(report, first))
         if not rule.by_error and grown.small > result.small:
             log(comm, "t = %g s: step grows to %.3g s", new.t, grown.small)

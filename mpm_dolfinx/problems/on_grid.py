@@ -19,6 +19,7 @@ from mpm_dolfinx.forms.unknowns import collect_garbage
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.cut_domains import CutDomains
 from mpm_dolfinx.points.grid import sum_by
+from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.points.pressure_transport import CellPressures, Reconstruction, share_within, transport
 from mpm_dolfinx.problems.aslant import Gradients, off_facets
 from mpm_dolfinx.problems.fluxes import CellContents, CellMotion, Conduction, Mobility, OpenSides, PieceContents
@@ -114,21 +115,31 @@ class OnGrid(Keyed):
 
     def pressures(self, state: State) -> NDArray[np.float64]:
         """Return the pressures of the filled owned cells at the start of a step, Pa."""
-        if not state.stay:
+        if not state.stays:
             bulk = self._storage.bulk
             carried = transport(state.transported.potentials(bulk), self.cut.points, self.cut.pieces)
+            if state.stay:
+                carried = mass_potential(self.of_pieces(state, "pressure", pressure_of(carried, bulk)), bulk)
             return pressure_of(self._means(carried), bulk)
         p = np.zeros(self.cut.grid.num_local)
         p[self.cut.cells] = self.cut.pieces_to_cells(state.stay.pressure)
         return p[self.contents.filled]
 
+    def of_pieces(self, state: State, name: str, fresh: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return what pieces have of the state's stay by this name, fresh (m, ...) where there is none."""
+        return state.stay.of_pieces(name, fresh, self.cut.pieces.point) if state.stay else fresh
+
     def as_reset(self, state: State) -> QuadratureData:
         """Return the pieces when the grid was reset, and set the present pressures to those of then."""
         if self._storage is not None:
             if state.stay:
-                self.set_pressures(state.stay.start)
+                self.set_pressures(self.of_pieces(state, "start", self.pressures_of_pieces()))
             self._storage.p.x.array[:] = self._storage.p_n.x.array
         return self.data
+
+    def pressures_of_pieces(self) -> NDArray[np.float64]:
+        """Return the pressures (m,), Pa, at the start of a step of the cells that pieces lie in."""
+        return self.cut.to_pieces(self._storage.p_n.x.array[self.cut.cells])
 
     def set_pressures(self, at_pieces: NDArray[np.float64]) -> None:
         """Set the pressures at the start of a step to those (m,), Pa, that pieces have of their cells."""
@@ -203,6 +214,21 @@ class OnGrid(Keyed):
         if self._storage.conductivity is not None:
             share = graded(self.contents, self._places.pieces.offset, at_pieces, mean)
         return Mobility(mean, share) if self._mixed is None else self._mixed.mobility(at_pieces, mean, share)
+
+    def rests(self, state: State) -> NDArray[np.int64] | None:
+        """Return the filled owned cells all points of which stay as they were cut; None where none does."""
+        if not state.stay:
+            return None
+        moves = self.cut.to_cells(~state.stay.keeps).astype(float)
+        return np.flatnonzero(self.contents.total(self.cut.cells, moves) == 0)
+
+    def serves(self, points: MaterialPoints) -> NDArray[np.bool_]:
+        """Return which points (n,) stay where they were cut: those of parts that hardly move, of all groups at once."""
+        all_of_them = self.cut.serves(points, np.zeros(len(points), dtype=np.int64), 1)[0]
+        if all_of_them or self.cut.grid.copies > 1:
+            return np.full(len(points), all_of_them)
+        part, count = self.parts
+        return self.cut.serves(points, part, count)[part]
 
     @cached_property
     def parts(self) -> tuple[NDArray[np.int64], int]:
@@ -365,13 +391,14 @@ class Assembled:
         if (storage := self._by_pressure) is not None:
             varies = (*varies, storage.p.x.array.copy())
             storage.conductivity.pressure.x.array[:] = storage.p.x.array  # of the start of the substep
-        if state.stay and not self._varies:
+        if state.stays and not self._varies:
             outflow = self._outflow((at, weight, *varies), lambda: set_fluxes(sides(), mobility(True)), grid.comm)
             return lambda begins: outflow
-        placed = sides()
+        placed, rests = sides(), on_grid.rests(state) if not self._varies else None
 
         def at_present(begins: bool) -> Outflow:
-            return set_fluxes(placed, mobility(begins), contents.motion(u.x.array.reshape(-1, grid.dim)))
+            motion = contents.motion(u.x.array.reshape(-1, grid.dim), rests)
+            return set_fluxes(placed, mobility(begins), motion)
 
         # a substep begins where the one before it has ended
         at_u = (data.pieces.key, weight, *varies)
