@@ -26,8 +26,9 @@ from mpm_dolfinx.points.material_points import MaterialPoints, determinant, midd
 from mpm_dolfinx.points.pressure_transport import PiecePressures, Reconstruction
 from mpm_dolfinx.problems.mechanical_boundary import MechanicalBoundary
 from mpm_dolfinx.problems.momentum import MomentumForms
-from mpm_dolfinx.problems.on_grid import OnGrid
+from mpm_dolfinx.problems.on_grid import AtPlaces, OnGrid
 from mpm_dolfinx.problems.quadrature_data import QuadratureData
+from mpm_dolfinx.problems.stage import Stage
 from mpm_dolfinx.problems.stage_tools import Tools
 from mpm_dolfinx.problems.storage import StorageForms
 from mpm_dolfinx.result import Report
@@ -123,7 +124,8 @@ class Motion:
                 x = on_grid.of_pieces(state, "x", cut.pieces.x)
                 x = x + cut.to_pieces(grid.at(pieces.cells, pieces.x, nodal))
                 start = on_grid.of_pieces(state, "start", on_grid.pressures_of_pieces())
-                own = on_grid.pressures_up_to_surface(self._reconstruction, state.stage, t)
+                at_rest = self._at_rest(state.stage, t, nodal)
+                own = on_grid.pressures_up_to_surface(self._reconstruction, state.stage, t, at_rest)
                 points, ids = replace(points, pressure=cut.mean(own)), points.id[cut.pieces.point]
                 if cut.domains and came is not None:
                     owed = self._owed(state, points, on_grid, pieces, came, keeps)
@@ -139,6 +141,17 @@ class Motion:
         if some:
             new = replace(new, stay=replace(stay, keeps=keeps), held=self._held(state, on_grid, keeps))
         return new, folded
+
+    def _at_rest(self, stage: Stage, t: float, nodal: NDArray[np.float64]) -> AtPlaces | None:
+        """Return what gives the pressures, Pa, of fluid at rest at time t (s), but for a constant.
+
+        None where there is no gravity, or no fluid can flow.  nodal (nodes, d), m: displacement since places were cut.
+        """
+        gravity, grid = stage.gravity_at(t), self._momentum.grid
+        if gravity is None or self._storage.fluxes.flux is None:
+            return None
+        weight = self._materials.fluid.density * gravity
+        return lambda cells, x: (x - grid.lower + grid.at(cells, x, nodal)) @ weight
 
     def _held(self, state: State, on_grid: OnGrid, keeps: NDArray[np.bool_]) -> NDArray[np.float64] | None:
         """Return the forces that hold nodes of those parts all points (n,) of which stay in their cells."""

@@ -36,6 +36,9 @@ from mpm_dolfinx.solve.scheme import Scheme
 from mpm_dolfinx.solve.schur import LinearSolvers
 from mpm_dolfinx.state import State
 
+AtPlaces = Callable[[NDArray[np.integer], NDArray[np.float64]], NDArray[np.float64]]
+"""Returns values (m,) at places (m, d), m, in local cells (m,)."""
+
 
 class OnGrid(Keyed):
     """The bodies on the grid since it was reset.
@@ -191,19 +194,40 @@ class OnGrid(Keyed):
         share = cut.pieces_to_cells(cut.pieces.fraction * due[cut.pieces.point])
         return self.contents.total(cut.cells, self.data.pieces["biot"][:, 0] * share)
 
-    def pressures_up_to_surface(self, reconstruction: Reconstruction, stage: Stage, t: float) -> NDArray[np.float64]:
+    def pressures_up_to_surface(
+        self, reconstruction: Reconstruction, stage: Stage, t: float, at_rest: AtPlaces | None = None
+    ) -> NDArray[np.float64]:
         """Return the pressures (m,), Pa, at the pieces' centroids; their mean by volume in a cell is the cell's.
 
-        t, s: time at which drained sides have their pressures.
-        """
-        places, seen = self._places.pieces, self._cell_pressures(self._storage.p.x.array, stage, t)
-        return self.cut.to_pieces(reconstruction.up_to_surface(seen, places.offset, places.slots))
+        What is reconstructed is what they differ by from those at rest: at sealed sides nothing flows.
 
-    def _cell_pressures(self, p: NDArray[np.float64], stage: Stage, t: float, bulk: float = np.inf) -> CellPressures:
-        """Return what slopes of cells with these pressures, or mass potentials by `bulk` (Pa), are drawn from."""
+        t, s: time at which drained sides have their pressures; at_rest: pressures of the fluid at rest, where it flows.
+        """
+        places, seen = self._places.pieces, self._cell_pressures(self._storage.p.x.array, stage, t, at_rest=at_rest)
+        pressures = reconstruction.up_to_surface(seen, places.offset, places.slots)
+        if at_rest is not None:
+            pressures = pressures + at_rest(self.cut.cells, self.cut.grid.midpoints[self.cut.cells] + places.offset)
+        return self.cut.to_pieces(pressures)
+
+    def _cell_pressures(
+        self,
+        p: NDArray[np.float64],
+        stage: Stage,
+        t: float,
+        bulk: float = np.inf,
+        at_rest: AtPlaces | None = None,
+    ) -> CellPressures:
+        """Return what slopes of cells with these pressures, or mass potentials by `bulk` (Pa), are drawn from.
+
+        at_rest: pressures of the fluid at rest, from which these then are the differences.
+        """
         contents = self.contents
         sides = stage.hydraulic.data(self.cut, self.cut.points, contents, t)
         sides = replace(sides, pressure=mass_potential(sides.pressure, bulk))
+        if at_rest is not None:
+            x = self.cut.grid.midpoints + contents.centroid
+            p = p - at_rest(np.arange(len(x)), x)
+            sides = replace(sides, pressure=sides.pressure - at_rest(sides.cells, x[sides.cells] + sides.reach))
         outer = sides.ahead(contents.slot(sides.cells), p[contents.filled])
         return CellPressures(contents.filled, p, contents.centroid, contents.open, outer)
 
