@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from mpm_dolfinx.result import Result
+    from mpm_dolfinx.result import Report, Result
 
 
 class StepFailed(RuntimeError):
@@ -36,7 +36,17 @@ class NotConverged(StepFailed):
 
 
 class LeftGrid(StepFailed):
-    """A material point has left the grid in a step."""
+    """A material point has left the grid in a step whose equations are solved.
+
+    Attributes
+    ----------
+    report
+        What the step took, and the error of its pressures: a shorter one helps only where this one is too inexact.
+    """
+
+    def __init__(self, message: str, report: Report | None = None):
+        super().__init__(message)
+        self.report = report
 
 
 class GaveUp(RuntimeError):

@@ -33,8 +33,8 @@ REACH = 3
 
 def probe_pressures(scene: Scene, state: State, probes: Probes) -> NDArray[np.float64]:
     """Return the pore pressures (m,), Pa, at the places of probes; on all processes together."""
-    state = state if state.stay else state.at_owners(scene.grid)
-    on_grid = scene.on_grid(state.stay.points if state.stay else state.points)  # the next step has use for it
+    state = state if state.stays else state.at_owners(scene.grid)
+    on_grid = scene.on_grid(state.as_cut)  # the next step has use for it
     gravity = state.stage.gravity_at(state.t)
     weight = np.zeros(scene.grid.dim) if gravity is None else scene.fluid.density * gravity
     return _Around(scene, state, on_grid, probes).pressures(weight)

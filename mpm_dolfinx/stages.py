@@ -73,8 +73,9 @@ def begin_stage(
         _warn_weights(scene, begun, {})
     if remove:
         _warn_moved_on(scene, before, begun, [name for name in CONDITIONS if name not in {*named, "tools"}])
-    if state.stay:  # pressures are those of the cells
+    if state.stays:  # pressures are those of the cells
         state = scene.motion.left_grid(state, scene.on_grid(state.stay.points))
+    state = replace(state, stay=None)
     gone, transported = _ids(scene.bodies, remove), state.transported
     there = [body for body, here in enumerate(before.present) if here and body not in remove]
     bare, gravity = before.mechanical.let_go(state.points), None

@@ -34,6 +34,8 @@ class Stay:
     id, pressure, x, start : (m,), (m,) in Pa, (m, d) in m, (m,) in Pa
         Of each piece of their domains, ordered by point and cell: number of its point, pressure of its cell, where
         its centroid has moved to, pressure of its cell when the grid was reset.  None without fluid.
+    keeps : (n,)
+        Points for which it still holds: those of parts of the bodies that hardly move.  None: for all.
     """
 
     points: MaterialPoints
@@ -41,19 +43,35 @@ class Stay:
     pressure: NDArray[np.float64] | None
     x: NDArray[np.float64] | None
     start: NDArray[np.float64] | None
+    keeps: NDArray[np.bool_] | None = None
+
+    def of_pieces(self, name: str, fresh: NDArray[np.float64], point: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return what pieces have: values of this name where these hold, else fresh ones (m, ...).
+
+        point : (m,)
+            Which of the points each piece belongs to; those that are kept have the pieces that they had.
+        """
+        values = getattr(self, name)
+        if self.keeps is None:
+            return values
+        out = fresh.copy()
+        out[self.keeps[point]] = values[self.keeps[np.searchsorted(self.points.id, self.id)]]
+        return out
 
     def __post_init__(self):
         _freeze(self)
 
     def migrated(self, exchange: Exchange, destination: NDArray[np.int32]) -> Stay:
         """Return what holds for points that go to their destinations, by the exchange of points."""
-        points = self.points.migrated(exchange)
+        points, keeps = self.points.migrated(exchange), self.keeps
+        if keeps is not None:
+            keeps = exchange.send(keeps)[np.argsort(exchange.send(self.points.id))]
         if self.id is None:
-            return replace(self, points=points)
+            return replace(self, points=points, keeps=keeps)
         travel = Exchange(exchange.comm, destination[np.searchsorted(self.points.id, self.id)])
         rows = [travel.send(values) for values in (self.id, self.pressure, self.x, self.start)]
         order = np.argsort(rows[0], kind="stable")
-        return Stay(points, *(values[order] for values in rows))
+        return Stay(points, *(values[order] for values in rows), keeps)
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,9 +85,10 @@ class State:
     points
         The material points of this process.
     transported
-        Pressures that the pieces of the points' domains take to the next grid; None without fluid, or with a stay.
+        Pressures that the pieces of the points' domains take to the next grid; None without fluid, or with a stay of
+        all points.
     stay
-        What holds of the last reset of the grid; None where the next step resets it.
+        What holds of the last reset of the grid; None where the next step resets all of it.
     resets
         How often the grid has been reset.
     reactions : (displacements, d), N (N/m in plane strain)
@@ -121,6 +140,18 @@ class State:
     def __post_init__(self):
         _freeze(self)
 
+    @property
+    def stays(self) -> bool:
+        """Whether all points stay in the cells that cut them."""
+        return self.stay is not None and self.stay.keeps is None
+
+    @property
+    def as_cut(self) -> MaterialPoints:
+        """The points where the next step has them cut: those that hardly move stay as they were."""
+        if self.stay is None:
+            return self.points
+        return self.stay.points if self.stay.keeps is None else self.stay.points.where(self.stay.keeps, self.points)
+
     def migrated(self, destination: NDArray[np.int32], comm: MPI.Intracomm) -> State:
         """Return the state after every point, with its pieces, went to its destination (n,), a rank."""
         exchange, pressures, stay = Exchange(comm, destination), self.transported, self.stay
@@ -133,5 +164,5 @@ class State:
         """Return the state with points and pieces at the processes that own the points' cells."""
         if grid.comm.size == 1:
             return self
-        placed = self.stay.points if self.stay else self.points
+        placed = self.as_cut
         return self.migrated(grid.owner(grid.number(grid.index(placed.x)) + grid.copy(placed.id)), grid.comm)

@@ -282,13 +282,14 @@ def _advance(simulation: Simulated, rule: StepSize, target: float, aloud: bool) 
             new, report = simulation.advanced(taken)
         except StepFailed as failed:
             cut = rule.cut(taken, result)
-            if cut.small >= rule.least(wanted, state.t):
+            left = _has_left(failed, rule, taken, result)
+            if not left and cut.small >= rule.least(wanted, state.t):
                 _note(simulation, cut)
                 tell, more = (warn, "; others: messages of level INFO") if aloud and not result.cuts else (log, "")
                 tell(comm, "t = %g s: step cut to %.3g s: %s%s", state.t, taken / 2, failed, more)
                 continue
             if (found := _by_euler(simulation, whole, failed)) is None:
-                tried = _note(simulation, replace(cut, small=taken))
+                tried = result if left else _note(simulation, replace(cut, small=taken))
                 raise GaveUp(_why(state.t, taken, failed), tried, failed.history) from failed
             taken, (new, report) = whole, found
         known, result = result, measured(result, report)
@@ -300,7 +301,7 @@ def _advance(simulation: Simulated, rule: StepSize, target: float, aloud: bool) 
             _note(simulation, replace(known, rejected=known.rejected + 1, small=small))
             continue
         grown = rule.grown(taken, report, result, failed=taken < 0.99 * wanted)
-        first = report.first / taken if new.stay is None else 0.0
+        first = 0.0 if new.stays else report.first / taken
         simulation.state = replace(new, result=grown.after(report, first))
         if not rule.by_error and grown.small > result.small:
             log(comm, "t = %g s: step grows to %.3g s", new.t, grown.small)
@@ -321,6 +322,13 @@ def _by_euler(simulation: Simulated, dt: float, failed: StepFailed) -> tuple[Sta
     what = "t = %g s: a step of %.3g s by backward Euler, of first order: none by %s has converged: %s"
     warn(simulation.scene.grid.comm, what, simulation.state.t, dt, simulation.scene.method, failed)
     return found
+
+
+def _has_left(failed: StepFailed, rule: StepSize, taken: float, result: Result) -> bool:
+    """Return whether points leave the grid in a step that is exact enough: shorter ones would only lead there."""
+    if not isinstance(failed, LeftGrid) or failed.report is None:
+        return False
+    return rule.refused(taken, failed.report, measured(result, failed.report)) == 1
 
 
 def _why(t: float, small: float, failed: StepFailed) -> str:

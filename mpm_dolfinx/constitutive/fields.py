@@ -63,7 +63,7 @@ class SceneMaterials:
         prestressed: bool = False,
     ):
         materials = [stressed(m, grid.stretches) for m in materials] if prestressed else materials
-        self.grid, self.materials, self._fluid = grid, materials, fluid
+        self.grid, self.materials, self.fluid = grid, materials, fluid
         seeded: dict[str, NDArray[np.float64]] = {}
         self._used = _used(bodies, len(materials))  # a material that no body is of changes nothing
         used = [materials[i] for i in self._used]
@@ -280,11 +280,11 @@ class SceneMaterials:
 
     def storage(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the storage coefficient at the points (n,), 1/Pa, of a scene with fluid."""
-        return self.table(points, lambda m, n: m.storage(self._fluid.bulk, n), self.porosity(points))
+        return self.table(points, lambda m, n: m.storage(self.fluid.bulk, n), self.porosity(points))
 
     def storage_at_one(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the storage coefficient that the points would have at a porosity of one (n,), 1/Pa."""
-        return self.table(points, lambda m: m.storage(self._fluid.bulk, 1.0))
+        return self.table(points, lambda m: m.storage(self.fluid.bulk, 1.0))
 
     @property
     def drains(self) -> bool:
@@ -301,7 +301,7 @@ class SceneMaterials:
 
     def density(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the density of soil and pore fluid at the points (n,), kg/m^3."""
-        n, wet = self.porosity(points), self._fluid.density if self._fluid else 0.0
+        n, wet = self.porosity(points), self.fluid.density if self.fluid else 0.0
         return (1 - n) * self.table(points, lambda m: m.grain_density) + n * wet
 
     def confined_modulus(self, points: MaterialPoints) -> NDArray[np.float64]:
@@ -310,7 +310,7 @@ class SceneMaterials:
         At most so many times lambda + 2G as `STIFFEST` says.
         """
         modulus = self.table(points, lambda m: m.oedometric)
-        if self._fluid is None:
+        if self.fluid is None:
             return modulus
         fluid = self.table(points, lambda m: m.biot) ** 2 / np.maximum(self.storage(points), 1e-300)
         return modulus + np.minimum(fluid, STIFFEST * modulus)

@@ -165,6 +165,8 @@ def _arrays(state: State) -> dict[str, NDArray]:
         named["stay"] = {"points": vars(state.stay.points)}
         if state.stay.id is not None:
             named["stay"] |= {name: getattr(state.stay, name) for name in PIECES}
+        if state.stay.keeps is not None:
+            named["stay"]["keeps"] = state.stay.keeps
     return _named("", named)
 
 
@@ -178,10 +180,13 @@ def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulat
         stay, transported, of_stay = None, None, _part(arrays, "stay/")
         if of_stay:
             own = [of_stay.pop(name) for name in PIECES] if wet else [None] * len(PIECES)
-            stay = Stay(_points(_part(of_stay, "points/"), now.points, ids), *own)
+            keeps = of_stay.pop("keeps", None)
+            stay = Stay(_points(_part(of_stay, "points/"), now.points, ids), *own, keeps)
             if wet:
                 _check_pieces(dict(zip(PIECES, own, strict=True)), ids, dim)
-        elif wet:
+            if keeps is not None and (keeps.dtype != bool or keeps.shape != ids.shape):
+                raise ValueError(f"stay/keeps: {keeps.dtype} of shape {keeps.shape}")
+        if wet and (stay is None or stay.keeps is not None):
             transported = PiecePressures(**_part(arrays, "transported/"))
             _check_pieces(vars(transported), ids, dim)
         histories = _part(arrays, "result/")
@@ -280,7 +285,7 @@ def _without_rows(state: State) -> State:
     points, transported, stay = state.points.of(none), state.transported, state.stay
     if stay is not None:
         rows = [None if rows is None else rows[:0] for rows in (getattr(stay, name) for name in PIECES)]
-        stay = Stay(stay.points.of(none), *rows)
+        stay = Stay(stay.points.of(none), *rows, None if stay.keeps is None else stay.keeps[:0])
     return replace(state, points=points, transported=transported and transported.of(none), stay=stay)
 
 

@@ -105,10 +105,18 @@ class CutDomains(Keyed):
         self.hoop = self._travel.send(self.pieces.hoop) if grid.axisymmetric else None
         """Their moments in the plane (m, 4) in axisymmetry, see `Pieces`."""
 
-    def serves(self, points: MaterialPoints) -> bool:
-        """Return whether the points are still where they were cut, but for `STAYS`."""
-        moved = np.abs((points.corners - self.points.corners) / self.grid.h).max(initial=0.0)
-        return over_all(self.grid.comm, moved, MPI.MAX) <= STAYS
+    def moved(self, points: MaterialPoints, part: NDArray[np.int64], count: int) -> NDArray[np.float64]:
+        """Return by how many cells corners of each of so many parts (count,) have moved at most since they were cut.
+
+        part (n,): of each point.
+        """
+        far = np.zeros(count)
+        np.maximum.at(far, part, np.abs((points.corners - self.points.corners) / self.grid.h).max(axis=(1, 2)))
+        return over_all(self.grid.comm, far, MPI.MAX)
+
+    def serves(self, points: MaterialPoints, part: NDArray[np.int64], count: int) -> NDArray[np.bool_]:
+        """Return which parts (count,), see `moved`, are still where they were cut, but for `STAYS`."""
+        return self.moved(points, part, count) <= STAYS
 
     def to_cells(self, values: NDArray) -> NDArray:
         """Send values of the points (n, ...) to the owners of their pieces' cells (m, ...)."""

@@ -126,6 +126,15 @@ class MaterialPoints:
         arrays = {f.name: once(getattr(self, f.name)) for f in fields(self) if f.name != "data"}
         return MaterialPoints(**arrays, data={name: once(values) for name, values in self.data.items()})
 
+    def where(self, rows: NDArray[np.bool_], other: MaterialPoints) -> MaterialPoints:
+        """Return these points in some rows (n,), and in the others another state of the same points."""
+
+        def chosen(a: NDArray, b: NDArray) -> NDArray:
+            return a if a is b else np.where(rows.reshape(-1, *[1] * (a.ndim - 1)), a, b)
+
+        arrays = {f.name: chosen(getattr(self, f.name), getattr(other, f.name)) for f in fields(self)[:-1]}
+        return MaterialPoints(**arrays, data={name: chosen(v, other.data[name]) for name, v in self.data.items()})
+
     def joined(self, other: MaterialPoints) -> MaterialPoints:
         """Return these points and others, ordered by id."""
         order = np.argsort(np.concatenate([self.id, other.id]))
