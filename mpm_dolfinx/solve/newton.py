@@ -215,7 +215,7 @@ class Newton:
             if fresh and self._linear and not self.report.newton:
                 self._solvers.tangent(key, lambda: self._linearise_as_reset(as_reset))
             elif fresh:
-                self._linearise(dog.firmness(errors.worst) if dog else 0.0)
+                self._linearise(dog.firmness(errors.u) if dog else 0.0)
             self.report.coupling += self._direction(errors)
             before, (errors, step) = errors, self._line_search(errors, dog)
             count += 1
