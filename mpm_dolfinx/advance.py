@@ -18,11 +18,11 @@ from mpm_dolfinx.forms.point_forms import PointData
 from mpm_dolfinx.parallel.exchange import first, over_all
 from mpm_dolfinx.points.bodies import Body
 from mpm_dolfinx.points.cut_domains import CutDomains
-from mpm_dolfinx.points.cutting import parallelepipeds, tangled, volumes
+from mpm_dolfinx.points.cutting import centroids, parallelepipeds, tangled, volumes
 from mpm_dolfinx.points.domain_gradient import gradient
 from mpm_dolfinx.points.grid import REACH, Grid, sum_by
 from mpm_dolfinx.points.lattice import filtered, given
-from mpm_dolfinx.points.material_points import MaterialPoints, determinant, middle, with_ratio
+from mpm_dolfinx.points.material_points import MaterialPoints, determinant, with_ratio
 from mpm_dolfinx.points.pressure_transport import PiecePressures, Reconstruction
 from mpm_dolfinx.problems.mechanical_boundary import MechanicalBoundary
 from mpm_dolfinx.problems.momentum import MomentumForms
@@ -124,9 +124,8 @@ class Motion:
                 x = on_grid.of_pieces(state, "x", cut.pieces.x)
                 x = x + cut.to_pieces(grid.at(pieces.cells, pieces.x, nodal))
                 start = on_grid.of_pieces(state, "start", on_grid.pressures_of_pieces())
-                at_rest = self._at_rest(state.stage, t, nodal)
-                own = on_grid.pressures_up_to_surface(self._reconstruction, state.stage, t, at_rest)
-                points, ids = replace(points, pressure=cut.mean(own)), points.id[cut.pieces.point]
+                points = replace(points, pressure=self.pressures(on_grid, state.stage, t, nodal))
+                ids = points.id[cut.pieces.point]
                 if cut.domains and came is not None:
                     owed = self._owed(state, points, on_grid, pieces, came, keeps)
                     points = replace(points, data=points.data | owed)
@@ -137,12 +136,13 @@ class Motion:
         some, others = over_all(grid.comm, np.array([keeps.any(), not keeps.all()], dtype=float)) > 0
         if not others:
             return new, folded
-        new = replace(self.left_grid(new, on_grid), held=None)
+        new = replace(self.left_grid(new, on_grid), held=None, rest=None)
         if some:
-            new = replace(new, stay=replace(stay, keeps=keeps), held=self._held(state, on_grid, keeps))
+            kept = {name: self._kept(getattr(state, name), on_grid, keeps) for name in ("held", "rest")}
+            new = replace(new, stay=replace(stay, keeps=keeps), **kept)
         return new, folded
 
-    def _at_rest(self, stage: Stage, t: float, nodal: NDArray[np.float64]) -> AtPlaces | None:
+    def _at_rest(self, stage: Stage, t: float, nodal: NDArray[np.float64] | None) -> AtPlaces | None:
         """Return what gives the pressures, Pa, of fluid at rest at time t (s), but for a constant.
 
         None where there is no gravity, or no fluid can flow.  nodal (nodes, d), m: displacement since places were cut.
@@ -151,15 +151,34 @@ class Motion:
         if gravity is None or self._storage.fluxes.flux is None:
             return None
         weight = self._materials.fluid.density * gravity
-        return lambda cells, x: (x - grid.lower + grid.at(cells, x, nodal)) @ weight
+        return lambda cells, x: (x - grid.lower + (0.0 if nodal is None else grid.at(cells, x, nodal))) @ weight
 
-    def _held(self, state: State, on_grid: OnGrid, keeps: NDArray[np.bool_]) -> NDArray[np.float64] | None:
-        """Return the forces that hold nodes of those parts all points (n,) of which stay in their cells."""
-        if state.held is None:
+    def _kept(
+        self, values: NDArray[np.float64] | None, on_grid: OnGrid, keeps: NDArray[np.bool_]
+    ) -> NDArray[np.float64] | None:
+        """Return nodal values, a local array, where nodes are of parts all points (n,) of which stay; else zero."""
+        if values is None:
             return None
         cut = on_grid.cut
         kept = np.unique(cut.cells[cut.to_cells(keeps)])
-        return np.where(np.repeat(self._momentum.active_nodes(kept), cut.grid.dim), state.held, 0.0)
+        return np.where(np.repeat(self._momentum.active_nodes(kept), cut.grid.dim), values, 0.0)
+
+    def pressures(
+        self, on_grid: OnGrid, stage: Stage, t: float, nodal: NDArray[np.float64] | None = None
+    ) -> NDArray[np.float64]:
+        """Return the pressures (n,), Pa, of the points by those of the cells at time t (s).
+
+        nodal (nodes, d), m: displacement since the grid was reset, if there was any.
+        """
+        at_rest = self._at_rest(stage, t, nodal)
+        return on_grid.cut.in_plane(on_grid.pressures_up_to_surface(self._reconstruction, stage, t, at_rest))
+
+    def strained(self, points: MaterialPoints, on_grid: OnGrid, data: QuadratureData) -> MaterialPoints:
+        """Return points with F and state as after a solved step of no time, which stay where they are."""
+        nodal = self._momentum.u.x.array.reshape(-1, on_grid.cut.grid.dim)
+        after = replace(points, F=self._deformed(on_grid.cut, data, nodal))
+        self._check_volumes(after, on_grid.cut)
+        return replace(after, data=self._materials.updated_state(after, points, 0.0))
 
     def _deformed(self, cut: CutDomains, data: QuadratureData, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return F (n, d, d) of the points after a step: the means of Delta F and of its det over their pieces."""
@@ -220,7 +239,7 @@ class Motion:
             F = with_ratio(F, np.where(locks, determinant(deformed()), determinant(F)))
         if self._materials.evolves:
             F = np.where(evolved[:, None, None], deformed(), F)
-        return replace(points, corners=corners, x=middle(corners), F=F), keeps, folded
+        return replace(points, corners=corners, x=centroids(corners), F=F), keeps, folded
 
     def _owed(
         self,

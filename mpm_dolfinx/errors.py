@@ -65,3 +65,12 @@ class GaveUp(RuntimeError):
     def __init__(self, message: str, result: Result, history: Sequence[tuple[float, float]] = ()):
         super().__init__(message)
         self.result, self.history = result, history
+
+
+def raise_interrupt(error: BaseException) -> None:
+    """Raise the KeyboardInterrupt that is behind an error: some PETSc make one of their own of it within a solver."""
+    cause = error
+    while cause is not None and not isinstance(cause, KeyboardInterrupt):
+        cause = cause.__cause__ or cause.__context__
+    if cause is not None and cause is not error:
+        raise cause from None

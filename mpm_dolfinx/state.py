@@ -18,6 +18,13 @@ from mpm_dolfinx.problems.stage import Stage
 from mpm_dolfinx.result import Result
 
 
+def _freeze(kept: Stay | State) -> None:
+    """Let nobody write into the arrays of what is kept."""
+    for values in vars(kept).values():
+        if isinstance(values, np.ndarray):
+            values.flags.writeable = False
+
+
 @dataclass(frozen=True, eq=False)
 class Stay:
     """What still holds of the last reset of the grid: points that hardly move since stay in the cells that cut them.
@@ -51,6 +58,9 @@ class Stay:
         out[self.keeps[point]] = values[self.keeps[np.searchsorted(self.points.id, self.id)]]
         return out
 
+    def __post_init__(self):
+        _freeze(self)
+
     def migrated(self, exchange: Exchange, destination: NDArray[np.int32]) -> Stay:
         """Return what holds for points that go to their destinations, by the exchange of points."""
         points, keeps = self.points.migrated(exchange), self.keeps
@@ -83,6 +93,9 @@ class State:
         How often the grid has been reset.
     reactions : (displacements, d), N (N/m in plane strain)
         Forces of the given displacements in the last step; nan before the first one of a stage.
+    walls : (2 d, d), N (N/m in plane strain)
+        Forces of the walls of the grid, in the order of `SIDES`, on the bodies in the last step; nan before the first
+        one of a stage that holds others.
     outflows : (drained sides, then inflows), m^3/s (m^2/s in plane strain)
         Volumes at zero pressure that leave the bodies through them at the end of the last step; nan before the first
         one of a stage.
@@ -99,7 +112,10 @@ class State:
         yields.  None before the first step, and without such soil.
     held : (unknowns,), N
         Forces on the nodes of this process, ghosts included, that hold what the scheme's error leaves out of balance of
-        an initial stress; None without, and from when the bodies have moved so far that the grid is reset.
+        an initial stress; None without, once a stage begins, and once bodies have moved so far that the grid is reset.
+    rest : (unknowns,), m
+        Displacement of the nodes of this process, ghosts included, for which given displacements and plates have the
+        forces of an initial stress at rest; None once a stage changes these, and once the grid is reset.
     result
         Histories of the last run, None before the first one.
     """
@@ -110,6 +126,7 @@ class State:
     stay: Stay | None
     resets: int
     reactions: NDArray[np.float64]
+    walls: NDArray[np.float64]
     outflows: NDArray[np.float64]
     tool_forces: NDArray[np.float64]
     tool_travel: NDArray[np.float64]
@@ -117,7 +134,11 @@ class State:
     begins: bool
     velocity: NDArray[np.float64] | None
     held: NDArray[np.float64] | None
+    rest: NDArray[np.float64] | None
     result: Result | None
+
+    def __post_init__(self):
+        _freeze(self)
 
     @property
     def stays(self) -> bool:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from copy import copy
 from dataclasses import fields, replace
 from inspect import signature
@@ -202,26 +202,42 @@ class SceneMaterials:
         return np.stack([conductivity, np.where(by_place, len(known) + points.id, law)], axis=1)
 
     def table(self, points: MaterialPoints, value: Callable[..., float], *columns: NDArray) -> NDArray[np.float64]:
-        """Return value(material, *columns) at the points (n, ...); columns (n,) are values at the points."""
-        if not columns and not any(self._fields[i] for i in self._used):
-            each = [value(m) if i in self._used else 0.0 for i, m in enumerate(self.materials)]
-            return np.array(each)[points.material]
-        out = None
+        """Return value(material, *columns) at the points (n, ...); columns (n,) are values at the points.
+
+        Of a material whose constants are the same everywhere it is one value (...) without columns, else one a point; a
+        single number always stands for all.
+        """
+        each = []
         for i in self._used:
             rows = np.flatnonzero(points.material == i)
-            values = value(self._at(points, i, rows), *(column[rows] for column in columns))
-            out = np.zeros((len(points), *np.shape(values)[1:])) if out is None else out
-            out[rows] = values
+            found = np.asarray(value(self._at(points, i, rows), *(column[rows] for column in columns)))
+            each.append((rows, found, found.shape[bool(columns or self._fields[i]) :]))
+        out = np.zeros((len(points), *np.broadcast_shapes(*(shape for *_, shape in each))))
+        for rows, found, _ in each:
+            out[rows] = found
         return out
 
-    def check(self, what: str, points: MaterialPoints) -> None:
-        """Refuse, with a ValueError, values of the materials' fields at points that these may not have."""
+    def changed(self, what: str, points: MaterialPoints, named: Collection[str]) -> MaterialPoints:
+        """Return points, some of whose data have been named anew, with what follows from the materials' fields.
+
+        Raises
+        ------
+        ValueError
+            Fields have values that they may not have.
+        """
+        data = dict(points.data)
         for i in self._used:
-            rows = np.flatnonzero(points.material == i)
+            rows, m = np.flatnonzero(points.material == i), self.materials[i]
+            follow = [k for k in self._fields[i] if getattr(getattr(m, k), "follows", False)]
+            own = [name for name in self._fields[i] if name in named or name not in follow]
             try:
-                replace(self.materials[i], **{name: points.data[name][rows] for name in self._fields[i]})
+                made = replace(m, **{name: data[name][rows] for name in own})
             except ValueError as error:
                 raise ValueError(f"{what}: {error}") from error
+            for name in follow:
+                data[name] = data[name].copy()
+                data[name][rows] = getattr(made, name)
+        return replace(points, data=data)
 
     def _at(self, points: MaterialPoints, i: int, rows: NDArray[np.int64]) -> Skeleton:
         """Return a material whose constants are arrays over some of its points, unless they are numbers anyway."""

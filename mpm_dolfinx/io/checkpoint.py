@@ -29,12 +29,13 @@ from mpm_dolfinx.simulation import Simulation
 from mpm_dolfinx.state import State, Stay
 from mpm_dolfinx.validation import instance, line, numbers, on_disk, path, whole
 
-FORMAT, VERSION = "mpm_dolfinx checkpoint", 8
+FORMAT, VERSION = "mpm_dolfinx checkpoint", 9
 FOREIGN = "no checkpoint of mpm_dolfinx, must be one"
 ZIP = b"PK\3\4"  # how numpy's archives begin
-ACTING = ("reactions", "outflows", "tool_forces", "tool_travel")
+ACTING = ("reactions", "walls", "outflows", "tool_forces", "tool_travel")
+ROWS_OF_STAGES = ("reactions", "outflows")  # of a Row: as many as the stage has conditions
 PIECES = ("id", "pressure", "x", "start")  # of a Stay
-NODAL = ("velocity", "held")  # of a State
+NODAL = ("velocity", "held", "rest")  # of a State
 NOTE = {"t": float, "resets": int, "begins": bool, "scene": dict, "result": dict}  # and their kinds
 
 
@@ -151,7 +152,13 @@ def _scalars(result: Result) -> dict[str, Any]:
 def _arrays(state: State) -> dict[str, NDArray]:
     """Return the arrays of a state by names with slashes."""
     named = {"points": vars(state.points), **{name: getattr(state, name) for name in ACTING}}
-    named["result"] = {name: np.array(state.result.column(name)) for name in Row._fields}
+    named["result"] = {}
+    for name in Row._fields:
+        rows = [np.asarray(value) for value in state.result.column(name)]
+        if name in ROWS_OF_STAGES:
+            named["result"][f"{name}_count"] = np.array([*map(len, rows)], dtype=np.int64)
+            rows = rows and np.concatenate(rows)
+        named["result"][name] = np.array(rows)
     if state.transported is not None:
         named["transported"] = vars(state.transported)
     if state.stay is not None:
@@ -185,14 +192,17 @@ def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulat
         histories = _part(arrays, "result/")
         times = histories["t"] = histories["t"].tolist()
         histories["pressure"] = [*map(tuple, histories["pressure"].tolist())]
+        for name in ROWS_OF_STAGES:
+            histories[name] = np.split(histories[name], np.cumsum(histories.pop(f"{name}_count")))[:-1]
         columns = [[*histories[name]] or [None] * len(times) for name in Row._fields]
         result = Result(rows=[Row(*row) for row in zip(*columns, strict=True)], **note["result"])
-        acting = reactions, outflows, forces, ways = [arrays.pop(name) for name in ACTING]
+        acting = reactions, walls, outflows, forces, ways = [arrays.pop(name) for name in ACTING]
         nodal = [_part(arrays, f"{name}/") or None for name in NODAL]
         for name, given in zip(NODAL, nodal, strict=True):
             if given is not None:
                 _check_nodal(name, given, simulation.grid)
-        if arrays or reactions.shape[1:] != (dim,) or outflows.ndim != 1 or not all(np.isfinite([note["t"], *times])):
+        shapes = reactions.shape[1:], walls.shape, outflows.shape[1:]
+        if arrays or shapes != ((dim,), (2 * dim, dim), ()) or not all(np.isfinite([note["t"], *times])):
             raise ValueError(f"has {', '.join(arrays) or 'other reactions, outflows or times'}")
         if forces.shape != now.tool_forces.shape:
             raise ValueError(f"has forces of {len(forces)} tools")

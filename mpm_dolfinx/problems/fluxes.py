@@ -203,13 +203,12 @@ class CellContents(Keyed):
         self.filled, self._slot = filled, np.zeros(grid.num_local, dtype=np.int64)
         self._slot[filled] = np.arange(len(filled))
         self._cells, self.weight = cells, weight = pieces.cells, pieces.weight
-        self._volume = volume = self.total(cells, weight)
+        self.volume = self.total(cells, weight)
+        """Volumes (n,) of what the filled cells hold, m^d."""
         self.area, area = pieces.area, self.total(cells, pieces.area)
         """Of the pieces (m,), m^d; in axisymmetry in the plane, m^2."""
         self.fill = np.minimum(area / grid.cell_volume, 1.0)
         """Filled share of the filled cells."""
-        self.volume = volume.sum()
-        """Volume of all that this process's cells hold, m^d."""
         shapes = (forms.centroid, forms.lower_face, forms.upper_face)
         self._damped, self._damping = forms.damping, pieces.damping
         for f in (forms.fixed_stress, *shapes):
@@ -250,7 +249,7 @@ class CellContents(Keyed):
 
     def mean(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the means over the pieces (m,) of each filled cell."""
-        return self.total(self._cells, self.weight * values) / self._volume
+        return self.total(self._cells, self.weight * values) / self.volume
 
     def motion(self, u: NDArray[np.float64], rests: NDArray[np.int64] | None = None) -> CellMotion:
         """Return what becomes of the filled cells, at their centroids, by nodal u (nodes, d), m; nothing of some."""

@@ -82,8 +82,9 @@ class OnGrid(Keyed):
         self.penalised = momentum.ghost.facets(self.facets)
         """Those of nearly empty cells."""
         rows = quadrature.rows(cut, points, lambda m: m.oedometric) * grid.around(cut.x)
-        self.stiffness = float(rows.max(initial=0.0))
-        """Largest oedometric modulus, Pa; in axisymmetry times the length of its ring, N/m."""
+        self.stiffness = np.zeros(grid.num_local)
+        """Largest oedometric modulus in each local cell, Pa; in axisymmetry times the length of its ring, N/m."""
+        np.maximum.at(self.stiffness, cut.cells, rows)
         self.contents, self._mixed = None, None
         if storage is not None:
             brought = PieceContents(
@@ -93,7 +94,7 @@ class OnGrid(Keyed):
                 x=x,
                 faces=cut.pieces_to_cells(cut.pieces.faces),
                 fixed_stress=quadrature.fixed_stress(cut, points, of_fluid),
-                damping=quadrature.rows(cut, points, lambda m: m.pressure_damping(grid.dim)),
+                damping=quadrature.rows(cut, points, lambda m: m.pressure_damping()),
             )
             self.contents = CellContents(storage.fluxes, brought, self.cells[self.cells < grid.num_owned])
             if quadrature.layered:
@@ -200,13 +201,15 @@ class OnGrid(Keyed):
         """Return the pressures (m,), Pa, at the pieces' centroids; their mean by volume in a cell is the cell's.
 
         What is reconstructed is what they differ by from those at rest: at sealed sides nothing flows.
+        In axisymmetry centroids and mean are those in the plane.
 
         t, s: time at which drained sides have their pressures; at_rest: pressures of the fluid at rest, where it flows.
         """
         places, seen = self._places.pieces, self._cell_pressures(self._storage.p.x.array, stage, t, at_rest=at_rest)
-        pressures = reconstruction.up_to_surface(seen, places.offset, places.slots)
+        x, middle = self.cut.plane(self.weight)[1], self.cut.grid.midpoints[self.cut.cells]
+        pressures = reconstruction.up_to_surface(seen, x - middle, places.slots)
         if at_rest is not None:
-            pressures = pressures + at_rest(self.cut.cells, self.cut.grid.midpoints[self.cut.cells] + places.offset)
+            pressures = pressures + at_rest(self.cut.cells, x)
         return self.cut.to_pieces(pressures)
 
     def _cell_pressures(
@@ -238,6 +241,14 @@ class OnGrid(Keyed):
         if self._storage.conductivity is not None:
             share = graded(self.contents, self._places.pieces.offset, at_pieces, mean)
         return Mobility(mean, share) if self._mixed is None else self._mixed.mobility(at_pieces, mean, share)
+
+    def resting_mobility(self) -> Mobility:
+        """Return the conductivities, m/s, of the filled owned cells as laws of the deformation and pressure have them
+        at rest.
+        """
+        at_pieces = self._quadrature.rows(self.cut, self.cut.points, lambda m: m.conductivity)
+        mean = self.contents.mean(at_pieces)
+        return Mobility(mean) if self._mixed is None else self._mixed.mobility(at_pieces, mean, None)
 
     def rests(self, state: State) -> NDArray[np.int64] | None:
         """Return the filled owned cells all points of which stay as they were cut; None where none does."""
@@ -302,12 +313,12 @@ class System:
         stiff: bool,
         symmetric: bool,
     ):
-        self._scheme, self.symmetric = scheme, symmetric
-        own = on_grid.cells[on_grid.cells < momentum.grid.num_owned]
-        self.momentum, self.storage = MomentumSystem(momentum, dofs, nodes, own, on_grid.penalised, stiff), None
+        self._scheme, self.symmetric, self.storage = scheme, symmetric, None
+        own, parts = on_grid.cells[on_grid.cells < momentum.grid.num_owned], momentum.parts(on_grid.active)
+        self.momentum = MomentumSystem(momentum, dofs, nodes, own, on_grid.penalised, stiff, parts)
         if storage is not None:
             unknowns = self.momentum.unknowns
-            self.storage = StorageSystem(storage, on_grid.cells, on_grid.facets, unknowns)
+            self.storage = StorageSystem(storage, on_grid.cells, on_grid.facets, unknowns, parts)
         self._solvers: Latest[LinearSolvers] = Latest()
 
     def solvers(self) -> LinearSolvers:
@@ -354,23 +365,15 @@ class Assembled:
     ):
         self.momentum, self.storage, self.symmetric = system.momentum, system.storage, system.symmetric
         self.solvers, self.end_step = system.solvers, system.end_step
-        self._on_grid, self._stage, grid = on_grid, stage, on_grid.cut.grid
+        self._on_grid, self._stage = on_grid, stage
         self._u, self._varies = momentum.u, storage is not None and storage.conductivity is not None
         self._by_pressure = storage if self._varies and storage.conductivity.pressure is not None else None
         self._mobility: Latest[Mobility] = Latest()
         self._outflow: Latest[Outflow] = Latest()
         self.momentum.set_penalty(sides)
-        stiffness = over_all(grid.comm, on_grid.stiffness, MPI.MAX) * grid.cell_volume / grid.h.min()
-        self.round_off = 1e-14 * stiffness * np.sqrt(max(1, self.momentum.unknowns.global_size))
+        self.momentum.set_rounding(self._rounding(momentum, sides))
+        self.round_off = float(self.momentum.rounding.norm())
         """Norm of the momentum's residual that rounding leaves, N."""
-        if sides.holds is not None:  # what rounding of coordinates makes of their stiffness
-            reach = np.abs(np.concatenate([grid.lower, grid.upper])).max()
-            stiffest = float(sides.holds["stiffness"].max(initial=0.0))
-            self.round_off += 1e-15 * over_all(grid.comm, stiffest, MPI.MAX) * reach
-        if sides.tools is not None:
-            self.round_off += over_all(grid.comm, sides.tools.rounding, MPI.MAX)
-        if sides.contact is not None:
-            self.round_off += over_all(grid.comm, sides.contact.now.rounding, MPI.MAX)
         self._off = None
         if self.storage is not None:
             self.storage.set_alternation()
@@ -378,6 +381,26 @@ class Assembled:
                 facets = form.on(off_facets(on_grid.contents, on_grid.facets))
                 self._off = facets if facets.some else None
         self._gradients: Latest[Gradients] = Latest()
+
+    def _rounding(self, momentum: MomentumForms, sides: SideData) -> NDArray[np.float64]:
+        """Return what rounding may leave of the residual at the local nodes (nodes,), N.
+
+        It goes with the stiffness of the cells about a node; that of rigid sides and tools with coordinates as well.
+        """
+        grid, on_grid = self._on_grid.cut.grid, self._on_grid
+        of_cells = 1e-14 * on_grid.stiffness * grid.cell_volume / grid.h.min()
+        if sides.holds is not None:
+            reach = np.abs(np.concatenate([grid.lower, grid.upper])).max()
+            held = np.zeros(grid.num_local)
+            np.maximum.at(held, sides.holds.cells, sides.holds["stiffness"][:, 0])
+            of_cells = of_cells + 1e-15 * reach * held
+        if sides.tools is not None:
+            np.maximum.at(of_cells, sides.tools.rows.cell, of_cells[sides.tools.rows.cell] + sides.tools.rounding)
+        own = np.flatnonzero(on_grid.active[: grid.num_owned])
+        at_nodes = momentum.at_nodes(own, of_cells[own]) / 2 ** (grid.dim - 1)  # as many cells beside a flat side
+        if sides.contact is not None:
+            at_nodes += over_all(grid.comm, float(sides.contact.now.rounding.max(initial=0.0)), MPI.MAX)
+        return at_nodes
 
     def flow(
         self, state: State, weight: NDArray[np.float64] | None, data: QuadratureData, t: float
