@@ -79,8 +79,7 @@ def balanced(scene: Scene, state: State) -> State:
     ValueError
         There is no such balance that the laws can bear.
     """
-    forms, materials, comm = scene.momentum, scene.materials, scene.grid.comm
-    mechanical = state.stage.mechanical
+    forms, materials, mechanical = scene.momentum, scene.materials, state.stage.mechanical
     try:
         start = set_up(scene, state, 0.0)
         seeded = replace(start.state, stay=_stay(scene, start))
@@ -115,17 +114,23 @@ def balanced(scene: Scene, state: State) -> State:
         scene.forget()
         raise ValueError(f"initial_stress: must be in balance with what acts at the start: {error}") from error
     left, count, points, held, rest, reactions = best
+    _told(scene, seeded.points, points, count, left)
+    rest = _rest(scene, start, rest) if mechanical.holds_sides else None
+    return replace(start.state, points=points, held=held, rest=rest, reactions=reactions)
+
+
+def _told(scene: Scene, seeded: MaterialPoints, points: MaterialPoints, count: int, left: float) -> None:
+    """Log what the balance has changed; refuse one that leaves too large a share of the forces."""
+    materials, comm = scene.materials, scene.grid.comm
     if left > REMARKABLE:
         scene.forget()
         what = "initial_stress: must be in balance with what acts at the start, and with what holds the bodies"
         raise ValueError(f"{what}: {100 * left:.2g} % of the forces are left")
-    before, after = (np.nan_to_num(materials.effective_stress_3d(of)) for of in (seeded.points, points))
+    before, after = (np.nan_to_num(materials.effective_stress_3d(of)) for of in (seeded, points))
     largest, changed = (over_all(comm, float(np.abs(v).max(initial=0.0)), MPI.MAX) for v in (before, after - before))
     what = "initial_stress: in balance after %d iterations, changed by at most %.3g of %.3g Pa; %.2g of its forces held"
     tell = warn if changed > REMARKABLE * largest else log
     tell(comm, what, count, changed, largest, left)
-    rest = _rest(scene, start, rest) if mechanical.holds_sides else None
-    return replace(start.state, points=points, held=held, rest=rest, reactions=reactions)
 
 
 def _rest(scene: Scene, start: Start, w: NDArray[np.float64]) -> NDArray[np.float64]:
