@@ -3,8 +3,9 @@
 
 A slope of 2:1, 10 m high, on 5 m of the same Mohr-Coulomb soil: phi = 20 degrees, c / (gamma H) = 0.05, no dilation.
 
-1. By what may c and tan(phi) be divided?  `mpm.factor_of_safety` weakens the slope at rest and looks whether its motion
-   dies away.  The best log-spiral mechanism gives 1.368, finite elements 1.4 (Griffiths and Lane 1999).
+1. By what may c and tan(phi) be divided?  `mpm.factor_of_safety` weakens the slope at rest and looks whether what its
+   strength does not bear dies away.  The best log-spiral mechanism gives 1.368, finite elements 1.4 (Griffiths and
+   Lane 1999).
 2. The strength is divided by 1.6 at once, in soil with the viscosity eta: the slope slides until it has found another
    shape, which it is just strong enough for: its factor of safety is then one, to a tenth.
 """
@@ -90,17 +91,17 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(out: Path, safety: mpm.Safety, before: np.ndarray, corners: np.ndarray, moved: np.ndarray) -> None:
-    """Draw the motions of the trials, and the slope before and after its slide."""
+    """Draw the overloads of the trials, and the slope before and after its slide."""
     fig, ((trials, after),) = common.figure(1, 2, (13, 3.6))
-    for factor, motion in sorted(safety.motions.items()):
+    for factor, shares in sorted(safety.overloads.items()):
         style = {"color": "C2" if factor <= safety.bounds[0] else "C3", "marker": "o", "ms": 3, "lw": 1}
-        trials.semilogy(np.arange(1, len(motion) + 1), motion, **style)
+        trials.semilogy(np.arange(1, len(shares) + 1), shares, **style)
         trials.annotate(
-            f"{factor:.3f}", (len(motion), motion[-1]), fontsize=8, xytext=(3, 0), textcoords="offset points"
+            f"{factor:.3f}", (len(shares), shares[-1]), fontsize=8, xytext=(3, 0), textcoords="offset points"
         )
     trials.set(
         xlabel="step",
-        ylabel="motion in the step (m)",
+        ylabel="overload (share of the shear stress)",
         title=f"Factor of safety {safety.factor:.3f}; green: comes to rest, red: fails",
     )
     trials.margins(x=0.12)

@@ -1,12 +1,16 @@
 # SPDX-License-Identifier: MIT
 """The factor of safety: exact for a block, limit analysis and published values for slopes; what is refused."""
 
+import io
+import logging
+import sys
 from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 import slope
+import ufl
 from helpers import SOFT, column
 
 import mpm_dolfinx as mpm
@@ -24,14 +28,15 @@ def strength(factor):
 LOAD = strength(EXACT)
 
 
-def block(materials, load=LOAD, **options):
-    """Return a block on a smooth floor at rest under a load on its top, its right side free."""
+def block(materials, load=LOAD, run=True, **options):
+    """Return a block on a smooth floor at rest under a load on its top, its right side free; run: or as built."""
     grid = mpm.Grid([1.0, 1.0], [4, 4])
     half = (mpm.box(grid, [0, 0], [0.5, 0.25]), mpm.box(grid, [0, 0.25], [0.5, 0.5], material=len(materials) - 1))
     top = mpm.Traction("top", lambda t: (0, -load * min(1, t)), region=((0, 0.3), (0.5, 1)))
     walls = {"left": "x", "bottom": "y"}
     s = mpm.Simulation(grid, half, materials, fixed=walls, tractions=[top], **options)
-    s.run(1, 1)
+    if run:
+        s.run(1, 1)
     return s
 
 
@@ -40,7 +45,12 @@ def at_rest():
     return block([CLAY])
 
 
-@pytest.mark.parametrize("materials", [[CLAY], [CONE, replace(CONE, cohesion=lambda X: C + 0 * X[:, 0])]])
+SOFTENING = mpm.SofteningDruckerPrager(
+    bulk=2e8, shear=1e8, friction=PHI, dilation=PHI, cohesion=C, residual=C, slip=1e-6
+)
+
+
+@pytest.mark.parametrize("materials", [[CLAY], [CONE, replace(CONE, cohesion=lambda X: C + 0 * X[:, 0])], [SOFTENING]])
 def test_a_block_carries_what_its_strength_over_the_factor_does(materials):
     s = block(materials)
     state = s.state
@@ -57,6 +67,49 @@ def test_a_block_that_is_too_weak_has_a_factor_below_one():
     assert mpm.factor_of_safety(s).factor == pytest.approx(0.9, rel=0.01)
 
 
+def test_a_block_that_cannot_stand_has_its_factor_as_built():
+    assert mpm.factor_of_safety(block([CLAY], load=strength(0.6), run=False)).factor == pytest.approx(0.6, rel=0.01)
+
+
+def test_a_steep_bank_that_cannot_stand_has_its_factor_as_built():
+    """45 degrees, phi = 20 degrees, c / (gamma H) = 0.05: the best log-spiral, of associated flow, gives 0.91."""
+    weak = {"friction": PHI, "dilation": 0.0, "cohesion": 0.05 * 1650 * 0.6 * 9.81 * 4}
+    assert mpm.factor_of_safety(bank(10, **weak)).factor == pytest.approx(0.91, rel=0.02)
+
+
+def test_the_factor_of_a_bank_hardly_depends_on_its_stiffness():
+    soil = {"friction": PHI, "dilation": 0.0, "cohesion": 4e3}
+    moduli = [{"bulk": 2 * shear, "shear": shear} for shear in (1e7, 1e10)]
+    soft, stiff = (mpm.factor_of_safety(bank(4, **soil, **one), rtol=0.03).factor for one in moduli)
+    assert soft == pytest.approx(stiff, rel=0.05)
+
+
+def test_pore_pressures_that_are_given_are_a_term():
+    """A uniform pressure u in a block with a free side: the effective stress across is -u."""
+    u = 2e3
+    K = np.tan(np.pi / 4 + np.arctan(np.tan(np.radians(PHI)) / EXACT) / 2) ** 2
+    s = block(
+        [CLAY],
+        load=2 * C / EXACT * np.sqrt(K) - u * (K - 1),
+        run=False,
+        terms=[lambda points, v: -u * ufl.tr(points.grad(v)) * points.dx],
+    )
+    assert mpm.factor_of_safety(s).factor == pytest.approx(EXACT, rel=0.01)
+
+
+def test_a_terminal_shows_each_trial(monkeypatch, caplog):
+    s, terminal = at_rest(), io.StringIO()
+    terminal.isatty = lambda: True
+    monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setattr(logging.getLogger("mpm_dolfinx"), "propagate", True)
+    with caplog.at_level(logging.INFO, "mpm_dolfinx"):
+        mpm.factor_of_safety(s, rtol=0.5, progress=False)
+        assert not terminal.getvalue()
+        mpm.factor_of_safety(s, rtol=0.5)
+    assert "strength over 2: step 2, overload" in terminal.getvalue()
+    assert "strength over 2: slides" in caplog.text
+
+
 @pytest.mark.parametrize(
     ("make", "options", "message"),
     [
@@ -64,6 +117,7 @@ def test_a_block_that_is_too_weak_has_a_factor_below_one():
         (at_rest, {"rtol": 0}, r"rtol = 0, must be in \[1e-4, 0.5\]"),
         (at_rest, {"steps": 3}, "steps = 3, must be an integer >= 8"),
         (at_rest, {"dt": -1}, "dt = -1, must be > 0 and finite"),
+        (at_rest, {"progress": 1}, "progress = 1, must be True or False"),
         (lambda: block([CLAY], load=0.0), {}, "have no stress, must be at rest under what acts on them"),
         (lambda: block([CLAY], load=-10.0), {}, "come to rest with strength / 16, must not at some factor"),
         (
@@ -86,6 +140,45 @@ def test_one_line_says_what_is_wrong(make, options, message):
     with pytest.raises(ValueError, match=message) as caught:
         mpm.factor_of_safety(make(), **options)
     assert "\n" not in str(caught.value)
+
+
+def bank(cells, *, run=4.0, wet=False, **strength):
+    """Return a bank 4 m high on 2 m of ground as built, not run; under water, or as heavy as it is there."""
+    h, middle = 4.0 / cells, 4 + run / 2
+    below, columns = round(2 / h), round((8 + run) / h)
+    grid = mpm.Grid(lower=[0, -below * h], upper=[columns * h, 4 + h], cells=[columns, below + cells + 1])
+
+    def shape(X):
+        return np.stack([X[:, 0] / middle * (4 + run * (1 - X[:, 1] / 4)), X[:, 1]], axis=1)
+
+    bodies = [
+        mpm.box(grid, [0, -below * h], [columns * h, 0]),
+        mpm.mapped(grid, mpm.box(grid, [0, 0], [middle, 4]), shape),
+    ]
+    conditions = {"fixed": {"left": "x", "right": "x", "bottom": "xy"}, "gravity": (0, -9.81)}
+    grains = 2650.0
+    if wet:
+        tractions, drained = zip(*(mpm.water(side, 5.0) for side in ("top", "right")), strict=True)
+        conditions |= {
+            "fluid": mpm.Fluid(),
+            "tractions": tractions,
+            "drained": drained,
+            "pressure": mpm.hydrostatic(5.0),
+        }
+        strength |= {"conductivity": 1e-3}
+    else:
+        grains -= 1000
+    constants = {"bulk": 8e7, "shear": 4e7, "porosity": 0.4, "grain_density": grains} | strength
+    soil = mpm.MohrCoulomb(**constants)
+    return mpm.Simulation(grid, bodies, [soil], **conditions)
+
+
+def test_waiting_long_in_water_is_as_quick_as_without():
+    """Long steps took up to forty times as many: the fluid's residual, which grows with them, made tangents stiff."""
+    soil = {"friction": 20.0, "dilation": 0.0, "cohesion": 4e3}
+    dry, wet = (mpm.factor_of_safety(bank(4, run=8.0, wet=wet, **soil), dt=1e6, rtol=0.03) for wet in (False, True))
+    assert wet.factor == pytest.approx(dry.factor, rel=0.03)
+    assert wet.newton <= 2 * dry.newton
 
 
 @pytest.mark.slow

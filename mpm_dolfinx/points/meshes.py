@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 from mpm_dolfinx.parallel.messages import warn
 from mpm_dolfinx.points.bodies import Body, check_inside
 from mpm_dolfinx.points.contact import TOUCH, Faces, covers, face_vectors
-from mpm_dolfinx.points.cutting import FACES, ORIENTATION, corner_bits, kuhn_simplices, volumes
+from mpm_dolfinx.points.cutting import FACES, ORIENTATION, centroids, corner_bits, kuhn_simplices, volumes
 from mpm_dolfinx.points.grid import Grid, rounding, sum_by
 from mpm_dolfinx.points.mesh_cells import KINDS, PARTS, Polytopes, distinct
 from mpm_dolfinx.validation import whole
@@ -95,7 +95,7 @@ class MeshBody(Body):
 
     def centre_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
         """Return the reference positions (m, d), m, of the centres of domains."""
-        return self.vertices[chosen].mean(axis=1)
+        return centroids(self.vertices[chosen])
 
     @property
     def aligned(self) -> bool:

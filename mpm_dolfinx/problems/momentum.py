@@ -42,6 +42,7 @@ from mpm_dolfinx.problems.quadrature_data import QuadratureData
 from mpm_dolfinx.problems.rigid_motion import rigid_motion
 from mpm_dolfinx.problems.side_forms import OwnTerm, SideData, SideForms
 from mpm_dolfinx.problems.tool_contact import ToolContact
+from mpm_dolfinx.problems.walls import wall_forces
 from mpm_dolfinx.validation import line
 
 
@@ -338,9 +339,16 @@ class MomentumSystem:
         self.rounding = self.unknowns.vector()
         """What rounding may leave of the residual at each unknown, N."""
         self.K = matrix(self.unknowns, self.unknowns, 3**d * d)
-        self.penalty = self._penalty_matrix(facets, stiff)
         self.residual, self.step = self.unknowns.vector(), self.unknowns.vector()
-        self._ghost = forms.ghost.form.on(facets)
+        every = (nodes[:, None] * d + np.arange(d)).ravel()
+        self.held = Unknowns(forms.u, np.setdiff1d(every, dofs))
+        """What walls hold."""
+        self.held_residual = self.held.vector()
+        self.penalty, self.held_penalty = (self._penalty_matrix(of, facets, stiff) for of in (self.unknowns, self.held))
+        at_walls = np.zeros(len(forms.grid.node_x), dtype=bool)
+        at_walls[self.held.map.indices.reshape(-1, d).max(axis=1, initial=-1) >= 0] = True
+        near = at_walls[forms.grid.cell_nodes[forms.grid.facet_cells[facets]]].any(axis=(1, 2))
+        self._ghosts = [forms.ghost.form.on(some) for some in (facets[near], facets)]
         self.firm, self._firmness = None, None  # where nothing yields
         if not forms.elastic:
             self.firm, self._firmness = matrix(self.unknowns, self.unknowns, 3**d * d), forms.ghost.firmness.on(cells)
@@ -371,27 +379,28 @@ class MomentumSystem:
         places[:, -1] = places[:, -1] * self.unknowns.dim + axis
         return places[: self.unknowns.size], places[self.unknowns.size :]
 
-    def _penalty_matrix(self, facets: NDArray[np.int32], stiff: bool) -> PETSc.Mat:
+    def _penalty_matrix(self, rows: Unknowns, facets: NDArray[np.int32], stiff: bool) -> PETSc.Mat:
         """Return an empty matrix for the penalties: the ghost penalty couples like components, of two cells."""
         grid = self._forms.grid
         d = grid.dim
         length = 3**d + 2 * d * 3 ** (d - 1)
         if stiff:
-            return matrix(self.unknowns, self.unknowns, d * length)
+            return matrix(rows, self.unknowns, d * length)
         touched = self._forms.active_nodes(grid.facet_cells[facets])
-        A = matrix(self.unknowns, self.unknowns, np.where(touched[self.unknowns.owned // d], length, 1))
+        A = matrix(rows, self.unknowns, np.where(touched[rows.owned // d], length, 1))
         A.setOption(PETSc.Mat.Option.IGNORE_ZERO_ENTRIES, True)
         return A
 
     def set_penalty(self, sides: SideData) -> None:
         """Assemble what is linear in the step's increment, ghost penalty, plates, given displacements, and firmness."""
-        zero(self.penalty)
-        self._ghost.assemble_matrix(self.penalty)
-        if sides.plates is not None:
-            self._forms.sides.plate.assemble_matrix(self.penalty, sides.plates)
-        if sides.holds is not None:
-            self._forms.sides.hold.assemble_matrix(self.penalty, sides.holds)
-        self.penalty.assemble()
+        for penalty, ghost in zip((self.held_penalty, self.penalty), self._ghosts, strict=True):
+            zero(penalty)
+            ghost.assemble_matrix(penalty)
+            if sides.plates is not None:
+                self._forms.sides.plate.assemble_matrix(penalty, sides.plates)
+            if sides.holds is not None and penalty is self.penalty:
+                self._forms.sides.hold.assemble_matrix(penalty, sides.holds)
+            penalty.assemble()
         if self.firm is not None:
             zero(self.firm)
             self._firmness.assemble_matrix(self.firm)
@@ -522,10 +531,11 @@ class MomentumProblem:
             norms.append(system.force_of_parts(own))
             forces += own
         b[system.touched] = forces - external
-        if self._sides.holds is not None:  # no measure of forces: at the start of a step it is far above them
-            b[system.touched] -= self._pulls
         if self._sides.tools is not None:
             b[system.touched] -= forms.pushed(self._sides.tools)[system.touched]
+        system.held.gather(b, system.held_residual)  # walls bear what sides beside them would push them by
+        if self._sides.holds is not None:  # no measure of forces: at the start of a step it is far above them
+            b[system.touched] -= self._pulls
         r = system.unknowns.gather(b, system.residual)
         step = system.unknowns.gather(forms.u.x.array, system.step)
         system.penalty.multAdd(step, r, r)
@@ -548,6 +558,14 @@ class MomentumProblem:
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
             told = parts.norms(np.where(size > 0, size / np.maximum(scales[parts.of], least), 0.0))
         return counts, relative(told, np.ones(parts.count))
+
+    def wall_forces(self, fixed: Mapping[str, str]) -> NDArray[np.float64]:
+        """Return the forces (2 d, d), N, of the walls at u, where the residual was last assembled."""
+        system, forces = self.system, self.system.held_residual.copy()
+        system.held_penalty.multAdd(system.step, forces, forces)
+        if self._sides.contact is not None:
+            self._sides.contact.now.push_on(system.held, *self._at, forces)
+        return wall_forces(self.forms.grid, fixed, system.held.owned, forces.array_r)
 
     def assemble_tangent(
         self, data: QuadratureData | None = None, firmness: NDArray[np.float64] | float = 0.0

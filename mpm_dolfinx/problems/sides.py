@@ -9,13 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from mpm_dolfinx.given_values import Places
 from mpm_dolfinx.parallel.exchange import Exchange, first
 from mpm_dolfinx.points.bodies import Body
 from mpm_dolfinx.points.cut_domains import Patches
 from mpm_dolfinx.points.faces import Region, Surface, joined, limits, surface
 from mpm_dolfinx.points.grid import Grid, rounding
 from mpm_dolfinx.points.material_points import MaterialPoints
-from mpm_dolfinx.problems.conditions import Displacement, Places
+from mpm_dolfinx.problems.conditions import Displacement
 from mpm_dolfinx.validation import line
 
 HALF = 0.5 * (1 + 1e-6)  # of a cell, but for rounding

@@ -176,8 +176,8 @@ class StorageForms:
         """Return its derivative by the cell's pressure, m^d/(Pa s), a local array."""
         return self._sum(self._slopes, data)
 
-    def weight_of_fluid(self, assembled: FacetSum) -> NDArray[np.float64]:
-        """Return the outflow that the fluid's weight drives from each cell at p, m^d/s, a local array."""
+    def driven(self, assembled: FacetSum) -> NDArray[np.float64]:
+        """Return the outflow that p and the fluid's weight drive from each cell to others, m^d/s, a local array."""
         assembled.assemble_vector(self._sum([], None))
         return sum_ghosts(self._work)
 
@@ -528,9 +528,11 @@ class StorageProblem:
         forms, system, gain = self.forms, self.system, np.zeros(self.system.unknowns.size)
         pi = p.copy()
         pi.array_w[:] = values = mass_potential(p.array_r, forms.bulk)
-        cells = (system.T * pi).array_r - outflow.inflow + self._aslant.cells
-        if system.gravity is not None:
-            cells += forms.weight_of_fluid(system.gravity)[system.unknowns.owned]
+        if system.gravity is None:
+            cells = (system.T * pi).array_r.copy()
+        else:
+            cells = outflow.conductance * values + forms.driven(system.gravity)[system.unknowns.owned]
+        cells += self._aslant.cells - outflow.inflow
         if forms.sources:
             gain = forms.gain(self.data)[system.unknowns.owned]
             cells -= gain

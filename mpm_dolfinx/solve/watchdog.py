@@ -12,8 +12,9 @@ surface, and the next tangent is as stiff as they are.  Shorter steps, with lowe
 as short.
 
 Soil that flows has next to no stiffness along its mechanisms, where flow is not associated even less than none: full
-steps go far astray there.  A share of the elastic shear stiffness in the tangent, as the residual is large, holds them
-back (Levenberg 1944, Marquardt 1963): ten times as much after a step that was shortened to next to nothing, a tenth
+steps go far astray there.  A share of the elastic shear stiffness in the tangent, as the residual of the forces is
+large, holds them back (Levenberg 1944, Marquardt 1963).  The residual of the fluid, which grows with the length of a
+step, says nothing of the soil.  There is ten times as much after a step that was shortened to next to nothing, a tenth
 after a full one to the least residual so far.  If it went with each full step, the next one would be as short as
 before, and the iterations would circle.  Soil that has not yielded gets the share too: where it does so for the first
 time it flows as far.  Only while nothing has yielded before, and each step brings the residual to less than a
@@ -94,7 +95,7 @@ class Watchdog:
         return not self.descends and (runs_away or self.since >= PATIENCE)
 
     def firmness(self, residual: float) -> float:
-        """Return the share of the elastic shear stiffness that is added to the tangent at a relative residual."""
+        """Return the share of the elastic shear stiffness that is added to the tangent at a residual of the forces."""
         return 0.0 if self.eases else min(FIRMEST, self.firm * FIRM * residual)
 
 
