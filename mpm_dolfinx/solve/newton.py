@@ -256,7 +256,7 @@ class Newton:
         """Return the share of the elastic shear stiffness that is added to the tangent of each part; 0 of none."""
         if dogs is None:
             return 0.0
-        shares = [dog.firmness(error) for dog, error in zip(dogs, errors.each.tolist(), strict=True)]
+        shares = [dog.firmness(error) for dog, error in zip(dogs, errors.u.tolist(), strict=True)]
         return np.array(shares) if any(shares) else 0.0
 
     def _watched(
