@@ -65,7 +65,8 @@ class Simulation:
         otherwise have none.  It is brought into balance with what acts at the start, at the pore pressures given,
         so that a first step in which nothing changes moves nothing.
     quadrature
-        "domain": exact pieces of the points' domains; "point": at the points, as in standard MPM, not in axisymmetry.
+        "domain": exact pieces of the points' domains; "point": at the points, as in standard MPM, of boxes, not in
+        axisymmetry.
     coupling, tolerance, method
         See `Scheme`; method of time integration: "sdirk2", of second order, or "backward-euler".
     terms, sources, later
@@ -114,7 +115,7 @@ class Simulation:
     ):
         scheme = Scheme(coupling, tolerance)
         check_parts(grid, bodies, materials, later)
-        check_options(fluid, pressure, terms, sources, quadrature)
+        check_options(bodies, fluid, pressure, terms, sources, quadrature)
         grid = grouped(grid, bodies, contacts, quadrature, {"terms": terms, "sources": sources})
         grid = grid.shared(points_in_cells(grid, bodies), keep=bool(len(terms) + len(sources)))
         warn_thin(grid, bodies, with_axis(grid, fixed), fluid is not None)

@@ -395,3 +395,11 @@ def test_a_result_is_shown_in_a_line():
 def test_what_one_process_refuses_all_refuse():
     """Else the others wait for it for ever."""
     mpirun(2, "mpi_refusals.py")
+
+
+def test_mapped_bodies_are_not_integrated_at_points():
+    """Their domains would be boxes from the first step on, while displacements count from where they are seeded."""
+    grid = mpm.Grid([1.0, 1.0], [4, 4])
+    body = mpm.mapped(grid, mpm.box(grid, [0, 0], [0.5, 0.5]), lambda x: x + 0.1 * x[:, ::-1])
+    with pytest.raises(ValueError, match="quadrature .point.: body 0 is mapped or a mesh, must be a box"):
+        mpm.Simulation(grid, [body], [mpm.Hencky(bulk=1e6, shear=1e6)], fixed={"bottom": "xy"}, quadrature="point")
