@@ -123,13 +123,13 @@ def layered(cells: int, off: float) -> mpm.Simulation:
 class Watched(mpm.Hencky):
     """A skeleton whose pressure jumps are looked after at four times the flow."""
 
-    def pressure_damping(self, dim: int) -> float:
-        return 4 * super().pressure_damping(dim)
+    def pressure_damping(self) -> float:
+        return 4 * super().pressure_damping()
 
 
 def conducting(cells: int, law: type[mpm.Skeleton]) -> mpm.Simulation:
     """Return the draining block with 8 tau h² of flow in a substep; below 4 jumps are looked after, below 1 damped."""
-    kappa = 8 * soil().pressure_damping(2) / cells**2 / (GAMMA * DT)
+    kappa = 8 * soil().pressure_damping() / cells**2 / (GAMMA * DT)
     return block(cells, soil(law, conductivity=kappa * WATER["fluid"].unit_weight), **WATER)
 
 

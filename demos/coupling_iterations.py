@@ -52,7 +52,7 @@ GOAL = 15  # iterations
 class Undamped(mpm.Hencky):
     """Hencky's law without the damping of pressure jumps."""
 
-    def pressure_damping(self, dim: int) -> float:
+    def pressure_damping(self) -> float:
         """Return tau = 0."""
         return 0.0
 

@@ -18,9 +18,9 @@ The soil that is pushed deep does not dilate: undrained its strength is s_u = xi
 (1 + 0.27 sqrt(D/B)) times as much (fit to bounds of limit analysis, Salgado et al. 2004); drained its capacity
 at the surface lies between that of Davis's (1968) reduced friction and c N_c.
 
-Faces are held up to half a cell before the footing's edge, for the last node that they hold carries the half cell
-beyond too.  So the undrained limit is met from below, at order 1.5: -6.7, -2.9, -1.1 % with 5, 9, 17 cells.  Over the
-width that is held it would be +17, +9, +5 %: from above, as a displacement method must, at first order.
+The undrained limit is met from below, at order 1.5: -6.7, -2.9, -1.1 % with 5, 9, 17 cells.  The last node that holds
+the footing carries half a cell beyond it, so an odd number of cells has the true width.  With 4, 8, 16 cells the last
+node lies at the edge, and the load is larger by that half cell on both sides.
 
 In associated flow each place of a cell has to dilate with its own shear, but the cell has one mean dilatation: the
 load would go on rising (de Borst and Groen 1995), to +4.4 and +3.4 % with 9 and 17 cells.  So where all
@@ -167,7 +167,7 @@ def push(
     size, cells_of = {"lower": [0, -rows * h], "upper": [columns * h, air * h]}, [columns, rows + air]
     grid = mpm.Grid(**size, cells=cells_of, axisymmetric=circular)
     body = mpm.box(grid, [0, -rows * h], [columns * h, 0])
-    end, edge = (depth * WIDTH**2 / (CV * rate) if rate else 1.0), (WIDTH - h) / 2
+    end, edge = (depth * WIDTH**2 / (CV * rate) if rate else 1.0), WIDTH / 2
     under, beside = ((0, -np.inf), (edge, np.inf)), ((edge, -np.inf), (np.inf, np.inf))
     footing = mpm.Displacement("top", lambda t, X: (0, -depth * WIDTH * min(1, t / end)), region=under)
     water = {"fluid": WATER, "method": method, "drained": [mpm.Drained("top", region=beside)]} if rate else {}

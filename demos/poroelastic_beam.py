@@ -152,7 +152,7 @@ def main(argv: list[str] | None = None) -> dict:
             result = simulation.run(o.t_end, **output_times(o), probes=probes, observe=observers)
         except mpm.GaveUp as error:  # what was found until then is shown
             failure, result = error, error.result
-        result = replace(result, rows=[r._replace(displacement=r.displacement[:, [0, -1]]) for r in result.rows])
+        result = replace(result, rows=tuple(r._replace(displacement=r.displacement[:, [0, -1]]) for r in result.rows))
         out |= summary(simulation, result)
         fem = reference(o, result, axis - [0, bottom]) if o.reference else None
         if common.first():
@@ -171,7 +171,7 @@ def reference(o: Namespace, result: mpm.Result, axis: np.ndarray) -> mpm.Result:
     fem = BiotFEM([0, 0], [LENGTH, HEIGHT], REFERENCE_CELLS, material(o), **physics(o))
     found = fem.run(o.t_end, o.dt / 4, probes=axis, progress=True)
     at = [int(np.argmin(np.abs(np.array(found.t) - t))) for t in result.t]
-    return replace(found, rows=[found.rows[k] for k in at])
+    return replace(found, rows=tuple(found.rows[k] for k in at))
 
 
 def summary(simulation: mpm.Simulation, result: mpm.Result) -> dict:

@@ -92,7 +92,7 @@ def error_of_cells(cells: int) -> float:
     laplacian[0, 0] = laplacian[-1, -1] = 1
     outflow = laplacian.copy()
     outflow[0, 0] += 2  # drained half a cell above the first centroid
-    store = np.eye(cells) + SOIL.pressure_damping(2) * SOIL.oedometric * laplacian
+    store = np.eye(cells) + SOIL.pressure_damping() * SOIL.oedometric * laplacian
     p = expm(-T_END * cells**2 * np.linalg.solve(store, outflow)) @ np.ones(cells)
     z = (np.arange(cells) + 0.5) / cells
     return float(np.sqrt(np.mean((p - terzaghi_pressure(z, T_END, 1.0, 1.0)) ** 2)))

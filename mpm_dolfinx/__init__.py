@@ -9,8 +9,8 @@ A scene is a `Simulation` of a `Grid`, bodies (`box`, `shape`, `mapped`, `from_m
 `resume` goes on; `stage` changes the scene between two runs, and `factor_of_safety` weakens it until it slides.  Terms
 and sources in UFL: see `mpm_dolfinx.constitutive.user_functions`.
 
-SI units throughout.  Stress is positive in tension, pore pressure in compression; 2D is plane strain, and forces
-are those of a slice of 1 m, or axisymmetric (`Grid`), and forces are those all around.
+SI units throughout, or any that are consistent (`Fluid`).  Stress is positive in tension, pore pressure in compression;
+2D is plane strain, and forces are those of a slice of 1 m, or axisymmetric (`Grid`), and forces are those all around.
 """
 
 from mpm_dolfinx import _environment  # noqa: F401 - first: it says what is missing

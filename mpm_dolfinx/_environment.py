@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import sys
 from importlib.util import find_spec
@@ -40,8 +41,13 @@ def _check() -> None:
             "PETSc: its numbers are complex, mpm_dolfinx needs real ones: on Debian, PETSC_DIR unset or ending in "
             "-real and `apt install python3-dolfinx-real`, elsewhere `conda install -c conda-forge 'petsc=*=real*'`"
         )
+    root = logging.getLogger()
+    level, handlers = root.level, root.handlers[:]
     import dolfinx  # which looks for libraries of PETSc's kind of numbers
 
+    # ffcx of dolfinx 0.5 puts a handler of its own there, after which the user's `logging.basicConfig` did nothing
+    root.setLevel(level)
+    root.handlers[:] = handlers
     if tuple(map(int, dolfinx.__version__.split(".")[:2])) not in SUPPORTED:
         raise ImportError(f"dolfinx {dolfinx.__version__} is not supported; mpm_dolfinx needs 0.5.2, 0.9, 0.10 or 0.11")
 

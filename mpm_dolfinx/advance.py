@@ -7,8 +7,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache, partial
 
-from mpi4py import MPI
-
 import numpy as np
 from dolfinx.common import Timer
 from numpy.typing import NDArray
@@ -16,31 +14,34 @@ from numpy.typing import NDArray
 from mpm_dolfinx.constitutive.fields import SceneMaterials
 from mpm_dolfinx.constitutive.fluid_content import change_at_points
 from mpm_dolfinx.errors import LeftGrid, NotConverged
+from mpm_dolfinx.forms.point_forms import PointData
 from mpm_dolfinx.parallel.exchange import first, over_all
 from mpm_dolfinx.points.bodies import Body
 from mpm_dolfinx.points.cut_domains import CutDomains
-from mpm_dolfinx.points.cutting import parallelepipeds, tangled, volumes
+from mpm_dolfinx.points.cutting import centroids, parallelepipeds, tangled, volumes
 from mpm_dolfinx.points.domain_gradient import gradient
 from mpm_dolfinx.points.grid import REACH, Grid, sum_by
 from mpm_dolfinx.points.lattice import filtered, given
-from mpm_dolfinx.points.material_points import MaterialPoints, determinant, middle, with_ratio
+from mpm_dolfinx.points.material_points import MaterialPoints, determinant, with_ratio
 from mpm_dolfinx.points.pressure_transport import PiecePressures, Reconstruction
 from mpm_dolfinx.problems.mechanical_boundary import MechanicalBoundary
 from mpm_dolfinx.problems.momentum import MomentumForms
-from mpm_dolfinx.problems.on_grid import OnGrid
+from mpm_dolfinx.problems.on_grid import AtPlaces, OnGrid
 from mpm_dolfinx.problems.quadrature_data import QuadratureData
+from mpm_dolfinx.problems.stage import Stage
 from mpm_dolfinx.problems.stage_tools import Tools
 from mpm_dolfinx.problems.storage import StorageForms
+from mpm_dolfinx.result import Report
 from mpm_dolfinx.state import State, Stay
 
-TAKES_IN, TAKES_IN_OF_BODY = 0.1, 10
-"""Rates at which steps take in the difference `owed` of content and fluid, per cell that a corner has moved.
+TAKES_IN = 0.1
+"""Rate at which steps take in the difference `owed` of content and fluid, per cell that a corner of the part has moved.
 
-The second is that of its mean over a body that nothing drains or feeds, whose volume it keeps; the first that of the
-rest.  With 0, 0.1, 0.2 and 0.4 for the first, twenty undrained cycles of a beam of 5 cells leave 7.7, 3.8, 3.7
-and 3.6 % of the stress; from 0.2 on pressures of a manufactured solution converge with less than order 1.75.  Where
-hardly anything moves nothing is taken in, so the orders in time are those of the method.  For bodies that drain the
-second would be wrong: it made a column under a gravity of time converge with order 1.2 in the step.
+Of its mean over a part that nothing drains or feeds all is taken in: such a part keeps its volume.  With 0, 0.1, 0.2
+and 0.4, twenty undrained cycles of a beam of 5 cells leave 7.7, 3.8, 3.7 and 3.6 % of the stress; from 0.2 on
+pressures of a manufactured solution converge with less than order 1.75.  Where hardly anything moves nothing is taken
+in, so the orders in time are those of the method.  To take in the mean of parts that drain would be wrong: it made a
+column under a gravity of time converge with order 1.2 in the step.
 """
 
 
@@ -76,6 +77,7 @@ class Motion:
         t: float,
         tools: Tools,
         came: NDArray[np.float64] | None = None,
+        report: Report | None = None,
         stays: bool = True,
     ) -> tuple[State, int]:
         """Return the state at time t (s) after a solved step, and how many domains had folded.
@@ -90,6 +92,8 @@ class Motion:
             As they go in the step.
         came : (cells,), m^d
             Fluid that came to the local cells in the step; without, what is owed to the points stays as it is.
+        report
+            What the step took, which is told of where a point leaves the grid.
         stays
             Whether pieces stay in their cells where points hardly move.
 
@@ -107,27 +111,74 @@ class Motion:
             deformed = cache(partial(self._deformed, cut, data, nodal))
             if cut.domains:
                 followed = cut.followed(nodal, self._momentum.active_nodes(on_grid.cells))
-                points, serves, folded = self._shaped(state, t, tools, cut, *followed, deformed)
+                points, keeps, folded = self._shaped(state, t, tools, on_grid, *followed, deformed)
             else:
                 x, F = state.points.x + cut.displacement(nodal), deformed()
                 points = replace(state.points, x=x, F=F, corners=parallelepipeds(x, F, self._sizes(state.points)))
-                serves, folded = cut.serves(points), 0
+                keeps, folded = on_grid.serves(points), 0
             self._check_volumes(points, cut)
             points = replace(points, data=self._materials.updated_state(points, state.points, t - state.t))
             ids, pressure, x, start = None, None, None, None
             if self._storage is not None:
                 pressure = cut.to_pieces(self._storage.p.x.array[pieces.cells])
-                x = state.stay.x if state.stay else cut.pieces.x
+                x = on_grid.of_pieces(state, "x", cut.pieces.x)
                 x = x + cut.to_pieces(grid.at(pieces.cells, pieces.x, nodal))
-                start = state.stay.start if state.stay else cut.to_pieces(self._storage.p_n.x.array[pieces.cells])
-                own = on_grid.pressures_up_to_surface(self._reconstruction, state.stage, t)
-                points, ids = replace(points, pressure=cut.mean(own)), points.id[cut.pieces.point]
+                start = on_grid.of_pieces(state, "start", on_grid.pressures_of_pieces())
+                points = replace(points, pressure=self.pressures(on_grid, state.stage, t, nodal))
+                ids = points.id[cut.pieces.point]
                 if cut.domains and came is not None:
-                    points = replace(points, data=points.data | self._owed(state, points, on_grid, came, serves))
-            _check_inside(cut, points, t)
-        stay, held = Stay(cut.points, ids, pressure, x, start), state.held if serves else None
-        new = replace(state, t=t, points=points, transported=None, stay=stay, held=held)
-        return new if serves and stays else self.left_grid(new, on_grid), folded
+                    owed = self._owed(state, points, on_grid, pieces, came, keeps)
+                    points = replace(points, data=points.data | owed)
+            _check_inside(cut, points, t, report)
+        stay = Stay(cut.points, ids, pressure, x, start)
+        new = replace(state, t=t, points=points, transported=None, stay=stay)
+        keeps = keeps & stays
+        some, others = over_all(grid.comm, np.array([keeps.any(), not keeps.all()], dtype=float)) > 0
+        if not others:
+            return new, folded
+        new = replace(self.left_grid(new, on_grid), held=None, rest=None)
+        if some:
+            kept = {name: self._kept(getattr(state, name), on_grid, keeps) for name in ("held", "rest")}
+            new = replace(new, stay=replace(stay, keeps=keeps), **kept)
+        return new, folded
+
+    def _at_rest(self, stage: Stage, t: float, nodal: NDArray[np.float64] | None) -> AtPlaces | None:
+        """Return what gives the pressures, Pa, of fluid at rest at time t (s), but for a constant.
+
+        None where there is no gravity, or no fluid can flow.  nodal (nodes, d), m: displacement since places were cut.
+        """
+        gravity, grid = stage.gravity_at(t), self._momentum.grid
+        if gravity is None or self._storage.fluxes.flux is None:
+            return None
+        weight = self._materials.fluid.density * gravity
+        return lambda cells, x: (x - grid.lower + (0.0 if nodal is None else grid.at(cells, x, nodal))) @ weight
+
+    def _kept(
+        self, values: NDArray[np.float64] | None, on_grid: OnGrid, keeps: NDArray[np.bool_]
+    ) -> NDArray[np.float64] | None:
+        """Return nodal values, a local array, where nodes are of parts all points (n,) of which stay; else zero."""
+        if values is None:
+            return None
+        cut = on_grid.cut
+        kept = np.unique(cut.cells[cut.to_cells(keeps)])
+        return np.where(np.repeat(self._momentum.active_nodes(kept), cut.grid.dim), values, 0.0)
+
+    def pressures(
+        self, on_grid: OnGrid, stage: Stage, t: float, nodal: NDArray[np.float64] | None = None
+    ) -> NDArray[np.float64]:
+        """Return the pressures (n,), Pa, of the points by those of the cells at time t (s).
+
+        nodal (nodes, d), m: displacement since the grid was reset, if there was any.
+        """
+        at_rest = self._at_rest(stage, t, nodal)
+        return on_grid.cut.in_plane(on_grid.pressures_up_to_surface(self._reconstruction, stage, t, at_rest))
+
+    def strained(self, points: MaterialPoints, on_grid: OnGrid, data: QuadratureData) -> MaterialPoints:
+        """Return points with F and state as after a solved step of no time, which stay where they are."""
+        nodal = self._momentum.u.x.array.reshape(-1, on_grid.cut.grid.dim)
+        after = replace(points, F=self._deformed(on_grid.cut, data, nodal))
+        self._check_volumes(after, on_grid.cut)
+        return replace(after, data=self._materials.updated_state(after, points, 0.0))
 
     def _deformed(self, cut: CutDomains, data: QuadratureData, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return F (n, d, d) of the points after a step: the means of Delta F and of its det over their pieces."""
@@ -150,11 +201,11 @@ class Motion:
         state: State,
         t: float,
         tools: Tools,
-        cut: CutDomains,
+        on_grid: OnGrid,
         moved: NDArray[np.float64],
         bend: NDArray[np.float64],
         deformed: Callable[[], NDArray[np.float64]],
-    ) -> tuple[MaterialPoints, bool, int]:
+    ) -> tuple[MaterialPoints, NDArray[np.bool_], int]:
         """Return the points after their corners have moved (n, 2^d, d) and bent, m, with the F that these tell.
 
         Where Q1 cells would lock the volume ratio is that of the cells, which `deformed` has in its F.
@@ -162,9 +213,10 @@ class Motion:
 
         Returns
         -------
-        The points; whether they are still where they were cut; how many domains had folded.
+        The points; which of them (n,) are still where they were cut; how many domains had folded.
         """
-        grid, stage, folded = cut.grid, state.stage, 0
+        cut, stage, folded = on_grid.cut, state.stage, 0
+        grid = cut.grid
         own = ~given(grid, stage.lattices, stage.conditions["fixed"], state.points)
         free = own & ~tools.near(state.points.corners + moved, t)[:, :, None]
         if stage.mechanical.contacts.contacts:
@@ -172,10 +224,11 @@ class Motion:
             free &= ~beside[:, :, None]
         corners = tools.outside(state.points.corners + moved + free * bend, t, own)
         points = replace(state.points, corners=corners)
-        serves, evolved = cut.serves(points), self._materials.evolved(points)
-        if not serves:
+        keeps, evolved = on_grid.serves(points), self._materials.evolved(points)
+        if over_all(grid.comm, int(not keeps.all())):
+            free &= ~keeps[:, None, None]
             corners = corners + free * filtered(grid, stage.lattices, points, cut.points, ~evolved)
-            bad = tangled(corners, points.volume0 * points.J, grid.axisymmetric)
+            bad = ~keeps & tangled(corners, points.volume0 * points.J, grid.axisymmetric)
             folded = over_all(grid.comm, int(bad.sum()))
             if folded:
                 corners = untangled(points, corners, bad, deformed(), grid, stage.mechanical)
@@ -186,16 +239,22 @@ class Motion:
             F = with_ratio(F, np.where(locks, determinant(deformed()), determinant(F)))
         if self._materials.evolves:
             F = np.where(evolved[:, None, None], deformed(), F)
-        return replace(points, corners=corners, x=middle(corners), F=F), serves, folded
+        return replace(points, corners=corners, x=centroids(corners), F=F), keeps, folded
 
     def _owed(
-        self, state: State, points: MaterialPoints, on_grid: OnGrid, came: NDArray[np.float64], serves: bool
+        self,
+        state: State,
+        points: MaterialPoints,
+        on_grid: OnGrid,
+        pieces: PointData,
+        came: NDArray[np.float64],
+        keeps: NDArray[np.bool_],
     ) -> dict[str, NDArray[np.float64]]:
         """Return what is owed to the points after a step (n,), over their volumes at rest, and what of it is due.
 
         That is by how much their content, by their volumes and the cells' pressures, has grown beyond the fluid that
-        came: masses, over the density at zero pressure.  Soil that has yielded, whose volumes are those of the cells,
-        and pores that drain are owed nothing; while the cut serves nothing is due.
+        came: masses, over the density at zero pressure.  Pores that drain are owed nothing: what drains from them is no
+        part of this content.  While points stay where they were cut (n,) nothing is due.
         """
         before, cut, materials, forms = state.points, on_grid.cut, self._materials, self._storage
         here = cut.pieces_to_cells(cut.pieces.fraction * (before.volume0 * before.J)[cut.pieces.point])
@@ -207,25 +266,32 @@ class Motion:
         rows = (alpha, at_one, materials.storage(before), points.J / before.J)
         rows = (values[cut.pieces.point] for values in rows)
         grown = cut.mean(density * change_at_points(*rows, dp) - came_here)
-        none = materials.evolved(points)
-        if materials.drains:  # what drains from pores is no part of this content
-            none |= materials.retention(points)[:, 0] > 0
+        none = materials.retention(points)[:, 0] > 0 if materials.drains else np.zeros(len(points), dtype=bool)
         owed = np.where(none, 0.0, before.data["owed"] + before.J * grown / alpha)
-        if serves:
+        if not over_all(cut.grid.comm, int(not keeps.all())):
             return {"owed": owed, "due": np.zeros(len(points))}
-        far = float((np.abs(points.corners - cut.points.corners) / cut.grid.h).max(initial=0.0))
-        part, whole = -np.expm1(np.multiply([-TAKES_IN, -TAKES_IN_OF_BODY], over_all(cut.grid.comm, far, MPI.MAX)))
-        sealed = not (state.stage.hydraulic.outlets or forms.sources)
-        return {"owed": owed, "due": part * owed + (whole - part) * self._means(points, owed, ~none) * sealed}
+        part, count = on_grid.parts
+        share = -np.expm1(-TAKES_IN * cut.moved(points, part, count))[part]
+        mean = self._means(part, count, points.volume0 * ~none, owed) * self._sealed(state, on_grid, pieces)
+        return {"owed": owed, "due": np.where(none | keeps, 0.0, mean[part] + share * (owed - mean[part]))}
 
     def _means(
-        self, points: MaterialPoints, values: NDArray[np.float64], counts: NDArray[np.bool_]
+        self, part: NDArray[np.int64], count: int, weight: NDArray[np.float64], values: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return the means of values over the volumes at rest of each body's points that count (n,), else zero."""
-        body, volume = self._body(points), points.volume0 * counts
-        sums = np.stack([sum_by(body, v, len(self._bodies)) for v in (volume * values, volume)])
+        """Return the weighted means (count,) of values over each part's points, zero where there are none."""
+        sums = np.stack([sum_by(part, column, count) for column in (weight * values, weight)])
         total, whole = over_all(self._momentum.grid.comm, sums)
-        return counts * np.divide(total, whole, out=np.zeros(len(whole)), where=whole > 0)[body]
+        return np.divide(total, whole, out=np.zeros(count), where=whole > 0)
+
+    def _sealed(self, state: State, on_grid: OnGrid, pieces: PointData) -> NDArray[np.bool_]:
+        """Return which parts (count,) have no open side, and are fed by no source at the end of the step."""
+        cut, (part, count) = on_grid.cut, on_grid.parts
+        patches = cut.surfaces([faces for _, faces in state.stage.hydraulic.outlets])
+        at = np.concatenate([np.zeros(0, dtype=np.int64), *(patch.at for patch in patches)])
+        if self._storage.sources:
+            fed = self._storage.gain(pieces)[cut.cells] != 0
+            at = np.concatenate([at, cut.pieces.point[cut.to_pieces(fed)]])
+        return over_all(cut.grid.comm, np.bincount(part[at], minlength=count)) == 0
 
     def _body(self, points: MaterialPoints) -> NDArray[np.int64]:
         """Return the number of each point's body (n,)."""
@@ -263,16 +329,17 @@ class Motion:
         return replace(state, transported=transported, stay=None)
 
 
-def _check_inside(cut: CutDomains, points: MaterialPoints, t: float) -> None:
-    """Refuse points that have left the grid."""
+def _check_inside(cut: CutDomains, points: MaterialPoints, t: float, report: Report | None) -> None:
+    """Refuse points of which a corner has left the grid, and say which."""
     grid, x, message = cut.grid, points.corners if cut.domains else points.x[:, None], ""
-    out = np.flatnonzero(grid.outside(x.reshape(-1, grid.dim), REACH))
-    if len(out):
-        i = out[0] // x.shape[1]
-        message = f"point {points.id[i]} at {points.x[i]} left the grid {grid.lower} to {grid.upper} at t = {t:g} s"
-        message += ", must stay in it: take a larger grid"
+    if grid.outside(x.reshape(-1, grid.dim), REACH).any():
+        beyond = np.maximum(grid.lower - x, x - grid.upper).max(axis=2)
+        i, corner = np.unravel_index(np.argmax(np.where(np.isnan(beyond), np.inf, beyond)), beyond.shape)
+        of = f"point {points.id[i]} at {points.x[i]}" + (f": its corner at {x[i, corner]}" if cut.domains else "")
+        by = f"by {beyond[i, corner]:.3g} m at t = {t:g} s"
+        message = f"{of} left the grid {grid.lower} to {grid.upper} {by}, must stay in it: take a larger grid"
     if message := first(grid.comm, message):
-        raise LeftGrid(message)
+        raise LeftGrid(message, report)
 
 
 def untangled(

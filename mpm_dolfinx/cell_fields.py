@@ -47,9 +47,9 @@ class CellFields:
 
 def cell_fields(scene: Scene, state: State) -> CellFields:
     """Return what the cells hold in a state; on all processes together."""
-    state = state if state.stay else state.at_owners(scene.grid)
+    state = state if state.stays else state.at_owners(scene.grid)
     points = state.points
-    on_grid = scene.on_grid(state.stay.points if state.stay else points)  # the next step has use for it
+    on_grid = scene.on_grid(state.as_cut)  # the next step has use for it
     cut, places = on_grid.cut, on_grid.data.pieces.places
     weight = cut.pieces_to_cells(cut.pieces.fraction * (points.volume0 * points.J)[cut.pieces.point])
     volume = sum_by(places.slots, weight, len(places.filled))

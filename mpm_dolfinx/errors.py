@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from mpm_dolfinx.result import Result
+    from mpm_dolfinx.result import Report, Result
 
 
 class StepFailed(RuntimeError):
@@ -36,7 +36,17 @@ class NotConverged(StepFailed):
 
 
 class LeftGrid(StepFailed):
-    """A material point has left the grid in a step."""
+    """A material point has left the grid in a step whose equations are solved.
+
+    Attributes
+    ----------
+    report
+        What the step took, and the error of its pressures: a shorter one helps only where this one is too inexact.
+    """
+
+    def __init__(self, message: str, report: Report | None = None):
+        super().__init__(message)
+        self.report = report
 
 
 class GaveUp(RuntimeError):
@@ -55,3 +65,12 @@ class GaveUp(RuntimeError):
     def __init__(self, message: str, result: Result, history: Sequence[tuple[float, float]] = ()):
         super().__init__(message)
         self.result, self.history = result, history
+
+
+def raise_interrupt(error: BaseException) -> None:
+    """Raise the KeyboardInterrupt that is behind an error: some PETSc make one of their own of it within a solver."""
+    cause = error
+    while cause is not None and not isinstance(cause, KeyboardInterrupt):
+        cause = cause.__cause__ or cause.__context__
+    if cause is not None and cause is not error:
+        raise cause from None

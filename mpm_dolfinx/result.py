@@ -9,6 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from mpm_dolfinx.points.grid import SIDES
+
 
 @dataclass
 class Report:
@@ -40,8 +42,9 @@ class Row(NamedTuple):
 
     t, s; displacement (m, d), m, and present position (m, d), m, of the m probes; pressure: least and largest on the
     points, Pa; probe_pressure (m,), Pa, and probe_stress (m, 3, 3), Pa: pore pressure and effective stress, tension
-    positive, of the material points whose domains hold the probes; tools (k, d + 1) or (k, 6), N and N m: forces and
-    moments of tools, then of contacts, on the bodies.
+    positive, at the places of the probes, see `probe_fields`; tools (k, d + 1) or (k, 6), N and N m: forces and
+    moments of tools, then of contacts, on the bodies; reactions (displacements, d), walls (2 d, d), N, and outflows
+    (drained sides, then inflows), m^3/s: as the simulation's `reactions`, `wall_reactions` and `outflows`.
     """
 
     t: float
@@ -51,6 +54,9 @@ class Row(NamedTuple):
     probe_pressure: NDArray[np.float64] | None = None
     probe_stress: NDArray[np.float64] | None = None
     tools: NDArray[np.float64] | None = None
+    reactions: NDArray[np.float64] | None = None
+    walls: NDArray[np.float64] | None = None
+    outflows: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True)
@@ -67,8 +73,8 @@ class Result:
     see `Report`, of the last step over its length where the grid is reset, Pa/s; waits, kept: see `StepSize.grown`.
     """
 
-    rows: list[Row] = field(default_factory=list, repr=False)
-    """One an output time; grows while the run goes on."""
+    rows: tuple[Row, ...] = field(default=(), repr=False)
+    """One an output time."""
     steps: int = 0
     newton: int = 0
     coupling: int = 0
@@ -89,6 +95,9 @@ class Result:
     points: int = 0
     memory: float = 0.0
     imbalance: dict[str, float] = field(default_factory=dict)
+
+    def __post_init__(self):
+        object.__setattr__(self, "rows", tuple(self.rows))  # a kept one does not grow with the run
 
     @property
     def t(self) -> list[float]:
@@ -121,6 +130,25 @@ class Result:
         return self.column("tools")
 
     @property
+    def reactions(self) -> NDArray[np.float64]:
+        """Forces (times, displacements, d) of the given displacements on the bodies at the output times, N.
+
+        Where stages have different numbers of them, the array has room for the most, and nan where there is none.
+        """
+        return _stacked(self.column("reactions"))
+
+    @property
+    def wall_reactions(self) -> dict[str, NDArray[np.float64]]:
+        """Forces (times, d) of each wall of the grid on the bodies at the output times, N; see `Simulation`."""
+        walls = _stacked(self.column("walls"))
+        return {name: walls[:, i] for i, name in enumerate(SIDES[walls.shape[2]])} if len(walls) else {}
+
+    @property
+    def outflows(self) -> NDArray[np.float64]:
+        """What leaves (times, drained sides, then inflows) at the output times, m^3/s; see `reactions` for stages."""
+        return _stacked(self.column("outflows"))
+
+    @property
     def pressure(self) -> list[tuple[float, float]]:
         """Least and largest pore pressure on the points at the output times, Pa."""
         return self.column("pressure")
@@ -128,6 +156,10 @@ class Result:
     def column(self, name: str) -> list:
         """Return one quantity of the rows, where it is recorded."""
         return [value for row in self.rows if (value := getattr(row, name)) is not None]
+
+    def more(self, row: Row) -> Result:
+        """Return the histories with one more output time."""
+        return replace(self, rows=(*self.rows, row))
 
     def after(self, report: Report, first: float = 0.0) -> Result:
         """Return the histories after one more step; first: see `Result`."""
@@ -153,3 +185,10 @@ class Result:
             ratios = ", ".join(f"{name} {ratio:.2f}" for name, ratio in self.imbalance.items())
             lines.append(f"{'most over mean':18} {ratios} (1: perfect balance)")
         return "\n".join(lines)
+
+
+def _stacked(values: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+    """Return arrays (n, ...) one above the other, filled up with nan to the longest n."""
+    most = max(map(len, values), default=0)
+    filled = [np.pad(v, [(0, most - len(v)), *[(0, 0)] * (v.ndim - 1)], constant_values=np.nan) for v in values]
+    return np.stack(filled) if values else np.zeros((0, 0))

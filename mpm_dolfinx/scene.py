@@ -21,6 +21,7 @@ from mpm_dolfinx.constitutive.fields import SceneMaterials
 from mpm_dolfinx.constitutive.initial_stress import InitialStresses
 from mpm_dolfinx.constitutive.skeleton import Fluid, Skeleton
 from mpm_dolfinx.constitutive.user_functions import compiling
+from mpm_dolfinx.parallel.messages import warn
 from mpm_dolfinx.points.bodies import Body, material_points
 from mpm_dolfinx.points.cut_domains import CutDomains
 from mpm_dolfinx.points.cutting import volumes
@@ -35,6 +36,7 @@ from mpm_dolfinx.problems.side_forms import SideData
 from mpm_dolfinx.problems.smeared import warn_smeared
 from mpm_dolfinx.problems.stage import Stage
 from mpm_dolfinx.problems.storage import StorageForms
+from mpm_dolfinx.problems.unit_weights import other_gravity, weighed
 from mpm_dolfinx.solve.scheme import Scheme
 from mpm_dolfinx.state import State
 from mpm_dolfinx.time_integration import Substep, substeps
@@ -57,7 +59,7 @@ class Scene:
     pressure
         Pore pressure at the start, Pa, or a function of places.
     initial
-        Stresses of bodies as seeded, see `initial_state.by_body`.
+        Stresses of bodies as seeded, see `initial_stress.by_body`.
     """
 
     def __init__(
@@ -76,6 +78,7 @@ class Scene:
         initial: Mapping[int, Any],
     ):
         self.grid, self.bodies, self.fluid, self.quadrature = grid, tuple(bodies), fluid, quadrature
+        pressure = weighed(pressure, fluid)
         self.initial = InitialStresses(self.bodies, initial, pressure)
         seeded = material_points(grid, bodies, pressure)
         self.materials = scene = SceneMaterials(grid, materials, bodies, seeded, fluid, bool(initial))
@@ -129,6 +132,21 @@ class Scene:
         self.t.value, self.dt.value = t, dt
         if gravity is not None:
             self.gravity.value = gravity
+
+    @cached_property
+    def _told(self) -> set[str]:
+        """What has been warned of, of which nothing but the log knows."""
+        return set()
+
+    def look_at(self, gravity: Sequence[NDArray[np.float64] | None]) -> None:
+        """Log a warning, once, of a gravity at the start of a step and in it that is not that of the conductivities."""
+        if self.fluid is None or not self.materials.conducts or gravity[0] is None or "gravity" in self._told:
+            return
+        if strength := other_gravity(self.fluid, gravity):
+            self._told.add("gravity")
+            what = "gravity = %.6g m/s^2, but conductivities become mobilities by the fluid's density x 9.81 m/s^2, as "
+            what += "gravity changes with time: must be given as Fluid(gravity=...)"
+            warn(self.grid.comm, what, strength)
 
     def check(self, state: State) -> None:
         """Refuse what is no state of this scene: its conditions act on the materials of another one."""

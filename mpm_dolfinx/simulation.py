@@ -13,12 +13,12 @@ from numpy.typing import ArrayLike, NDArray
 from mpm_dolfinx.cell_fields import CellFields, cell_fields
 from mpm_dolfinx.constitutive.initial_stress import InitialStress, by_body
 from mpm_dolfinx.constitutive.skeleton import Fluid, Skeleton
-from mpm_dolfinx.errors import StepFailed
+from mpm_dolfinx.errors import StepFailed, raise_interrupt
 from mpm_dolfinx.initial_state import balanced
 from mpm_dolfinx.io import summary
 from mpm_dolfinx.point_fields import PointFields, point_fields
 from mpm_dolfinx.points.bodies import Body, points_in_cells
-from mpm_dolfinx.points.grid import Grid
+from mpm_dolfinx.points.grid import SIDES, Grid
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.problems.axis import check_axisymmetry, with_axis
 from mpm_dolfinx.problems.conditions import Displacement, Drained, Inflow, OnSide, Pressure, RigidPlate, Traction
@@ -26,6 +26,7 @@ from mpm_dolfinx.problems.contacts import Contact, grouped
 from mpm_dolfinx.problems.scene_parts import check_options, check_parts
 from mpm_dolfinx.problems.thin import warn_thin
 from mpm_dolfinx.problems.tools import Tool
+from mpm_dolfinx.problems.unit_weights import under
 from mpm_dolfinx.result import Report, Result
 from mpm_dolfinx.scene import Scene
 from mpm_dolfinx.solve.scheme import Scheme
@@ -64,7 +65,8 @@ class Simulation:
         otherwise have none.  It is brought into balance with what acts at the start, at the pore pressures given,
         so that a first step in which nothing changes moves nothing.
     quadrature
-        "domain": exact pieces of the points' domains; "point": at the points, as in standard MPM, not in axisymmetry.
+        "domain": exact pieces of the points' domains; "point": at the points, as in standard MPM, of boxes, not in
+        axisymmetry.
     coupling, tolerance, method
         See `Scheme`; method of time integration: "sdirk2", of second order, or "backward-euler".
     terms, sources, later
@@ -113,15 +115,15 @@ class Simulation:
     ):
         scheme = Scheme(coupling, tolerance)
         check_parts(grid, bodies, materials, later)
-        check_options(fluid, pressure, terms, sources, quadrature)
+        check_options(bodies, fluid, pressure, terms, sources, quadrature)
         grid = grouped(grid, bodies, contacts, quadrature, {"terms": terms, "sources": sources})
-        grid.share(points_in_cells(grid, bodies))
+        grid = grid.shared(points_in_cells(grid, bodies), keep=bool(len(terms) + len(sources)))
         warn_thin(grid, bodies, with_axis(grid, fixed), fluid is not None)
         check_axisymmetry(grid, bodies, quadrature)
         began = time.perf_counter()
         options = (quadrature, scheme, method, gravity is not None, pressure, terms, sources)
         initial = by_body(initial_stress, bodies, later)
-        self.scene = Scene(grid, bodies, materials, fluid, *options, initial)
+        self.scene = Scene(grid, bodies, materials, under(fluid, gravity), *options, initial)
         conditions = {"fixed": fixed, "tractions": tractions, "displacements": displacements, "drained": drained}
         conditions |= {"inflows": inflows, "plates": plates, "tools": tools, "gravity": gravity, "contacts": contacts}
         self.state = first_state(self.scene, conditions, later)
@@ -175,6 +177,14 @@ class Simulation:
         return self.state.reactions
 
     @property
+    def wall_reactions(self) -> dict[str, NDArray[np.float64]]:
+        """Force (d,), N (N/m in plane strain), of each wall of the grid on the bodies; zero where it holds nothing.
+
+        A component of a node that two walls hold counts once: for the wall across it, else half for each.
+        """
+        return dict(zip(SIDES[self.grid.dim], self.state.walls, strict=True))
+
+    @property
     def outflows(self) -> NDArray[np.float64]:
         """(drained sides, then inflows), m^3/s (m^2/s in plane strain): what leaves; nan before a first step."""
         return self.state.outflows
@@ -197,23 +207,16 @@ class Simulation:
     def effective_stress(self) -> NDArray[np.float64]:
         """Return the effective Cauchy stress (n, d, d), Pa, tension positive, at the material points.
 
-        In axisymmetry (n, 3, 3), the axes those of radius, axis and hoops.
-        On several processes all call it together.
+        In axisymmetry (n, 3, 3), of radius, axis and hoops.  On several processes all call it together.
         """
         return self.scene.materials.effective_stress(self.points)
 
     def point_fields(self) -> PointFields:
-        """Return stresses with their part across the plane, p', q and porosity of the points: see `PointFields`.
-
-        On several processes all call it together.
-        """
+        """Return stresses, p', q and porosity of the points, see `PointFields`; all processes call it together."""
         return point_fields(self.scene, self.points)
 
     def cells(self) -> CellFields:
-        """Return centroids, displacements, pressures and stresses of the cells at present: see `CellFields`.
-
-        On several processes all call it together.
-        """
+        """Return centroids and fields of the cells at present, see `CellFields`; all processes call it together."""
         return cell_fields(self.scene, self.state)
 
     # ---- stages ---------------------------------------------------------------------------------
@@ -281,20 +284,16 @@ class Simulation:
         self.state, report = self.advanced(dt)
         return report
 
-    def advanced(self, dt: float) -> tuple[State, Report]:
-        """Return the state after a step of dt (s), and what it took; the simulation's own state stays."""
+    def advanced(self, dt: float, *how: tuple) -> tuple[State, Report]:
+        """Return the state after a step of dt (s), and what it took; how: other substeps.  The own state stays."""
         numbers("dt", dt, test=lambda v: (0 < v) & (v < np.inf), allowed="> 0 and finite")
         try:
-            return step(self.scene, self.state, dt)
+            return step(self.scene, self.state, dt, *how)
         except StepFailed:
             raise
         except BaseException as error:  # broken off anywhere
             self.scene.forget()
-            cause = error
-            while cause is not None and not isinstance(cause, KeyboardInterrupt):
-                cause = cause.__cause__ or cause.__context__
-            if cause is not None and cause is not error:  # within a solver: some PETSc make an error of their own of it
-                raise cause from None
+            raise_interrupt(error)
             raise
 
     run = run

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mpm_dolfinx.constitutive.skeleton import STANDARD_GRAVITY
 from mpm_dolfinx.initial_state import pieces_at_start
 from mpm_dolfinx.parallel.messages import warn
 from mpm_dolfinx.points.bodies import Body
@@ -23,11 +22,10 @@ from mpm_dolfinx.points.pressure_transport import at_start
 from mpm_dolfinx.problems.cell_contact import let_go
 from mpm_dolfinx.problems.sides import everywhere
 from mpm_dolfinx.problems.stage import CONDITIONS, Stage, stage
+from mpm_dolfinx.problems.unit_weights import WEIGHS, warn_units
 from mpm_dolfinx.scene import Scene
 from mpm_dolfinx.state import State
 from mpm_dolfinx.validation import chosen, flag, instance, line, numbers
-
-WEIGHS = 5e-3  # share by which the unit weights of water outside and in the pores may differ without a warning
 
 
 def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int]) -> State:
@@ -36,16 +34,20 @@ def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int
     check_apart(scene.grid, scene.bodies, present)
     begun = _stage(scene, {**conditions, "terms": [term.given for term in scene.momentum.sides.own]}, present, later)
     _warn_weights(scene, begun, {"pressure": scene.initial.pressure})
+    if scene.fluid and scene.materials.conducts:
+        warn_units(scene.grid.comm, scene.fluid, conditions["gravity"])
     points = scene.materials.seeded.of(_ids(scene.bodies, later), kept=False)
     points = scene.initial.of(scene.materials, points, present, begun.gravity_at(0.0) if scene.initial.given else None)
     transported = None
     if scene.fluid:
         transported = pieces_at_start(scene, points) if callable(scene.initial.pressure) else at_start(points)
-    reactions = np.zeros((len(begun.mechanical.holds), scene.grid.dim))
+    d, unknown = scene.grid.dim, np.nan if scene.initial.given else 0.0  # before a first step
+    reactions, walls = (np.full((count, d), unknown) for count in (len(begun.mechanical.holds), 2 * d))
     outflows = np.zeros(len(begun.hydraulic.outlets))
     points, forces = begun.mechanical.grip(points), begun.mechanical.forces(0.0)
     ways = np.zeros(len(begun.mechanical.tools.tools))
-    return State(0.0, points, transported, None, 0, reactions, outflows, forces, ways, begun, True, None, None, None)
+    acting = reactions, walls, outflows, forces, ways
+    return State(0.0, points, transported, None, 0, *acting, begun, True, *[None] * 4)
 
 
 def begin_stage(
@@ -71,8 +73,9 @@ def begin_stage(
         _warn_weights(scene, begun, {})
     if remove:
         _warn_moved_on(scene, before, begun, [name for name in CONDITIONS if name not in {*named, "tools"}])
-    if state.stay:  # pressures are those of the cells
+    if state.stays:  # pressures are those of the cells
         state = scene.motion.left_grid(state, scene.on_grid(state.stay.points))
+    state = replace(state, stay=None)
     gone, transported = _ids(scene.bodies, remove), state.transported
     there = [body for body, here in enumerate(before.present) if here and body not in remove]
     bare, gravity = before.mechanical.let_go(state.points), None
@@ -90,35 +93,41 @@ def begin_stage(
     unknown, new = np.nan if state.resets else 0.0, {}
     if "displacements" in named:
         new["reactions"] = np.full((len(begun.mechanical.holds), scene.grid.dim), unknown)
+    if "fixed" in named:
+        new["walls"] = np.full_like(state.walls, unknown)
     if "tools" in named:
         new["tool_forces"] = begun.mechanical.forces(unknown)
         new["tool_travel"] = np.zeros(len(begun.mechanical.tools.tools))
     if named.keys() & {"drained", "inflows"}:
         new["outflows"] = np.full(len(begun.hydraulic.outlets), unknown)
-    if add or remove:
-        new["held"] = None
-    return replace(state, points=points, transported=transported, stage=begun, begins=True, **new)
+    new["rest"] = state.rest if begun.mechanical.holds_as(before.mechanical) else None
+    return replace(state, points=points, transported=transported, stage=begun, begins=True, held=None, **new)
 
 
 def _stage(scene: Scene, conditions: Mapping[str, Any], present: Sequence[bool], later: Sequence[int]) -> Stage:
-    wet = scene.fluid is not None
-    return stage(scene.grid, scene.bodies, scene.materials, wet, conditions, present, later)
+    return stage(scene.grid, scene.bodies, scene.materials, scene.fluid, conditions, present, later)
 
 
 def _warn_weights(scene: Scene, begun: Stage, given: Mapping[str, Any]) -> None:
-    """Log a warning for each level of water, given ones and those on sides, that is not as heavy as the pore fluid."""
-    if scene.fluid is None:
-        return
-    gravity = begun.conditions["gravity"]
-    g = STANDARD_GRAVITY if callable(gravity) else np.linalg.norm(0.0 if gravity is None else gravity)
-    own = scene.fluid.density * g
+    """Log a warning for each level of water, given ones and those on sides, that is not as heavy as the pore fluid.
+
+    In a dry scene for each that is as heavy as water is under another gravity.
+    """
+    gravity, fluid = begun.conditions["gravity"], scene.fluid
+    g = 0.0 if gravity is None or callable(gravity) else float(np.linalg.norm(gravity))
     on_sides = [(f"water at {c.side!r}", c.pressure) for c in begun.conditions["drained"]]
     on_sides += [(f"water at {c.side!r}", c.value) for c in begun.conditions["tractions"]]
-    weights = {(name, getattr(value, "unit_weight", own)) for name, value in [*given.items(), *on_sides]}
+    levels = [*given.items(), *on_sides]
+    if fluid is None:
+        levels = [(name, value) for name, value in levels if hasattr(value, "weighed") and g]
+        own, of = 1000 * g, "water under the scene's gravity"
+    else:
+        own, of = (fluid.unit_weight if callable(gravity) else fluid.density * g), "the pore fluid"
+    weights = {(name, getattr(value, "unit_weight", own)) for name, value in levels}
     for name, weight in sorted(weights):
         if abs(weight - own) > WEIGHS * max(weight, own):
-            what = "%s: unit_weight = %.6g N/m^3, but that of the pore fluid, its density times gravity, is %.6g"
-            warn(scene.grid.comm, f"{what}: at one level they are not at rest", name, weight, own)
+            what = "%s: unit_weight = %.6g N/m^3, but that of %s, its density times gravity, is %.6g"
+            warn(scene.grid.comm, f"{what}: at one level they are not at rest", name, weight, of, own)
 
 
 def _warn_moved_on(scene: Scene, before: Stage, begun: Stage, kept: Sequence[str]) -> None:
@@ -187,5 +196,4 @@ def _changed(scene: Scene, points: MaterialPoints, fields: Mapping[str, ArrayLik
             raise ValueError(f"{what} of shape {new.shape}, must be {each}one for each of {len(points)} points")
         data[name] = new.copy()
     points = replace(points, data=data)
-    everywhere(scene.grid, lambda: scene.materials.check("stage: fields", points))
-    return points
+    return everywhere(scene.grid, lambda: scene.materials.changed("stage: fields", points, fields))

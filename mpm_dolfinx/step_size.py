@@ -14,7 +14,7 @@ from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.result import Report, Result
 from mpm_dolfinx.scene import Scene
-from mpm_dolfinx.solve.newton import ERROR
+from mpm_dolfinx.time_integration import RELAXES
 from mpm_dolfinx.validation import line, numbers
 
 MIN_CUT, MIN_CUT_BY_ERROR = 2.0**-10, 2.0**-30
@@ -251,8 +251,9 @@ def step_rule(times: Times, rtol, first_step, max_step: float, scene: Scene, poi
     longest = float(numbers("max_step", max_step, **positive)) if max_step != inf else inf
     first = times.after(times.start)[0] - times.start
     if len(scene.substeps) > 1:  # without a rate no step has an error
-        # under a load that grows from nothing the error is ERROR dt c_v / h^2 of the change
-        first = min(first, max(FIRST * first, SAFETY * rtol / ERROR * diffusion_time(scene, points)))
+        # of pressures that grow from nothing it is RELAXES / 2 (dt l)^2; beside a drained side l is 3 c_v / h^2
+        longest_first = SAFETY * np.sqrt(2 * rtol / RELAXES) * diffusion_time(scene, points) / 3
+        first = min(first, max(FIRST * first, float(longest_first)))
     if first_step is not None:
         first = float(numbers("first_step", first_step, **positive))
     return StepSize(min(first, longest), longest, float(rtol))

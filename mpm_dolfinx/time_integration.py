@@ -20,6 +20,12 @@ from dataclasses import dataclass
 import numpy as np
 
 GAMMA = 1 - 1 / np.sqrt(2)
+RELAXES, VARIES = 6 * GAMMA**2 - 4 * GAMMA**3 - 1 / 3, (1 - GAMMA) * GAMMA**2 + GAMMA - 1 / 3
+"""Errors of a step of sdirk2, as shares of that of a step of first order, which is half of dt^2 y''.
+
+Where y' = l y the share is RELAXES dt |l| for small dt |l|: twice the difference of the terms of third order in the
+stability function and in exp(dt l).  Where y' = f(t) it is VARIES, if the slope of f is another one in each step.
+"""
 
 
 @dataclass(frozen=True)
@@ -38,6 +44,9 @@ METHODS = {
     "sdirk2": (Substep(GAMMA, GAMMA, 0.0), Substep(1.0, GAMMA, 1 - GAMMA)),
     "backward-euler": (Substep(1.0, 1.0, 0.0),),
 }
+
+
+EULER = METHODS["backward-euler"]
 
 
 def substeps(method: str, evolves: bool) -> tuple[Substep, ...]:

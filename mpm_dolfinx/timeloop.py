@@ -22,12 +22,14 @@ from mpm_dolfinx import _compat
 from mpm_dolfinx.errors import GaveUp, LeftGrid, StepFailed
 from mpm_dolfinx.io.summary import imbalance, peak_memory
 from mpm_dolfinx.parallel.exchange import first
-from mpm_dolfinx.parallel.messages import log
+from mpm_dolfinx.parallel.messages import log, warn
 from mpm_dolfinx.points.probes import Probes
+from mpm_dolfinx.probe_fields import probe_pressures, probe_stresses
 from mpm_dolfinx.result import Report, Result, Row
 from mpm_dolfinx.scene import Scene
 from mpm_dolfinx.state import State
 from mpm_dolfinx.step_size import StepSize, Times, measured, step_rule
+from mpm_dolfinx.time_integration import EULER, Substep
 from mpm_dolfinx.validation import functions, instance, line
 
 PARTS = (
@@ -54,8 +56,8 @@ class Simulated(Protocol):
     scene: Scene
     state: State
 
-    def advanced(self, dt: float) -> tuple[State, Report]:
-        """Return the state after a step of dt, s, and what it took."""
+    def advanced(self, dt: float, *how: Sequence[Substep]) -> tuple[State, Report]:
+        """Return the state after a step of dt, s, and what it took; how: substeps, if not those of the scene."""
 
 
 def run(
@@ -85,15 +87,17 @@ def run(
         Step and output interval, s, > 0; one step to t_end where it is longer than that.  With `rtol` the output
         interval only; without it and `t_eval` every step is an output.
     rtol
-        Choose the steps by their error: that of the pore pressures stays below about rtol of their largest change
-        since the run began, or of what they would change by in the step if no fluid flowed, which is more where it
-        flows away within the step; at least ten times `tolerance`, and < 1.  Where nothing flows the steps are as long
-        as the output intervals; refused there with terms of the velocity, of which no error is known.
+        Choose the steps by their error: that of the pore pressures in each step, known to a factor of 0.2 to 2, stays
+        below rtol of their largest change since the run began, or of what they would change by in the step if no fluid
+        flowed, which is more where it flows away within the step; at least ten times `tolerance`, and < 1.  Where
+        nothing flows the steps are as long as the output intervals; refused there with terms of the velocity, of which
+        no error is known.
     t_eval : (m,), s
         Output times, increasing, in (t, t_end]; t_end is one of them in any case.  Steps end at output times.
     first_step, max_step
         With `rtol`: the first step to try, not of a run that goes on, and the longest, s, > 0.  By default the first is
-        about the time in which pressures diffuse through a cell, times 20 rtol, or a thousandth of the first output.
+        about the time in which pressures diffuse through a cell, times 1.5 sqrt(rtol), or a thousandth of the first
+        output.
     probes
         Particles that are recorded.
     observe
@@ -105,7 +109,8 @@ def run(
         Histories to go on with, of a run with the same steps: what `resume` returns, or `result` of a run that was
         interrupted.
     progress
-        Show a progress bar on a terminal.
+        Show a progress bar on a terminal, and warn of the first step that is cut; the others are logged as INFO by the
+        logger `mpm_dolfinx`.
 
     Returns
     -------
@@ -146,8 +151,7 @@ def run(
     def output(converged: bool) -> None:
         with Timer("mpm: output"):
             ended = replace(simulation.state.result, converged=converged)
-            simulation.state = replace(simulation.state, result=stopwatch.read(ended))
-            ended.rows.append(_row(simulation, probes))
+            _note(simulation, stopwatch.read(ended).more(_row(simulation, probes)))
             for observer in observers:
                 _observe(observer, simulation, comm)
             _note(simulation, stopwatch.read(simulation.state.result))
@@ -158,7 +162,7 @@ def run(
         for target in targets:
             while not rule.ended(simulation.state.t, target, simulation.state.result):
                 before = simulation.state.t
-                _advance(simulation, rule, target)
+                _advance(simulation, rule, target, progress)
                 there = rule.ended(simulation.state.t, target, simulation.state.result)
                 if times.each and not there:
                     output(False)
@@ -189,7 +193,8 @@ def _show(bar: tqdm, state: State, before: float) -> None:
     result = state.result
     bar.update(state.t - before)
     counts = {"t": f"{state.t:.4g} s", "steps": result.steps, "newton": result.newton, "coupling": result.coupling}
-    bar.set_postfix(counts | ({"refused": result.rejected} if result.rejected else {}))
+    seldom = {"cuts": result.cuts, "refused": result.rejected}
+    bar.set_postfix(counts | {name: count for name, count in seldom.items() if count})
 
 
 def _note(simulation: Simulated, result: Result) -> Result:
@@ -227,8 +232,8 @@ def _histories(
     now, latest = simulation.state.t, simulation.state.result
     if after is None:
         first = 0.0 if latest is None else latest.first
-        return Result(dt=times.interval, small=rule.first, first=first, rows=[_row(simulation, probes)])
-    if latest is not None and after.rows is latest.rows:  # of the same run, which may have gone on since
+        return Result(dt=times.interval, small=rule.first, first=first, rows=(_row(simulation, probes),))
+    if latest is not None and after.rows[0] is latest.rows[0]:  # of the same run, which may have gone on since, or not
         after = latest
     last = after.rows[-1][0]
     # a run that was broken off has taken a part of its next interval
@@ -263,23 +268,30 @@ def _timings() -> dict[str, float]:
     return {part: _compat.seconds(f"mpm: {part}") for part in PARTS}
 
 
-def _advance(simulation: Simulated, rule: StepSize, target: float) -> None:
-    """Take one step towards a time, s, cutting it until it converges and is exact enough."""
-    comm, wanted = simulation.scene.grid.comm, None
+def _advance(simulation: Simulated, rule: StepSize, target: float, aloud: bool) -> None:
+    """Take one step towards a time, s, cutting it until it converges and is exact enough.
+
+    aloud: say of the first cut of a run that there are some.
+    """
+    comm, wanted, whole = simulation.scene.grid.comm, None, None
     while True:
         state, result = simulation.state, simulation.state.result
         taken = rule.fitted(target - state.t, result.small)
-        wanted = wanted or rule.wanted(taken)
+        wanted, whole = wanted or rule.wanted(taken), whole or taken
         try:
             new, report = simulation.advanced(taken)
         except StepFailed as failed:
             cut = rule.cut(taken, result)
-            if cut.small < rule.least(wanted, state.t):
-                tried = _note(simulation, replace(cut, small=taken))
+            left = _has_left(failed, rule, taken, result)
+            if not left and cut.small >= rule.least(wanted, state.t):
+                _note(simulation, cut)
+                tell, more = (warn, "; others: messages of level INFO") if aloud and not result.cuts else (log, "")
+                tell(comm, "t = %g s: step cut to %.3g s: %s%s", state.t, taken / 2, failed, more)
+                continue
+            if (found := _by_euler(simulation, whole, failed)) is None:
+                tried = result if left else _note(simulation, replace(cut, small=taken))
                 raise GaveUp(_why(state.t, taken, failed), tried, failed.history) from failed
-            _note(simulation, cut)
-            log(comm, "t = %g s: step cut to %.3g s: %s", state.t, taken / 2, failed)
-            continue
+            taken, (new, report) = whole, found
         known, result = result, measured(result, report)
         if (shrinks := rule.refused(taken, report, result)) < 1:
             small = wanted = taken * shrinks
@@ -289,11 +301,34 @@ def _advance(simulation: Simulated, rule: StepSize, target: float) -> None:
             _note(simulation, replace(known, rejected=known.rejected + 1, small=small))
             continue
         grown = rule.grown(taken, report, result, failed=taken < 0.99 * wanted)
-        first = report.first / taken if new.stay is None else 0.0
+        first = 0.0 if new.stays else report.first / taken
         simulation.state = replace(new, result=grown.after(report, first))
         if not rule.by_error and grown.small > result.small:
             log(comm, "t = %g s: step grows to %.3g s", new.t, grown.small)
         return
+
+
+def _by_euler(simulation: Simulated, dt: float, failed: StepFailed) -> tuple[State, Report] | None:
+    """Return the state after a step of dt (s) by backward Euler, and what it took; None: that fails too.
+
+    Where loads jump the second substep goes far beyond what is left of them, which soil may not bear.
+    """
+    if isinstance(failed, LeftGrid) or len(simulation.scene.substeps) == 1:
+        return None
+    try:
+        found = simulation.advanced(dt, EULER)
+    except StepFailed:
+        return None
+    what = "t = %g s: a step of %.3g s by backward Euler, of first order: none by %s has converged: %s"
+    warn(simulation.scene.grid.comm, what, simulation.state.t, dt, simulation.scene.method, failed)
+    return found
+
+
+def _has_left(failed: StepFailed, rule: StepSize, taken: float, result: Result) -> bool:
+    """Return whether points leave the grid in a step that is exact enough: shorter ones would only lead there."""
+    if not isinstance(failed, LeftGrid) or failed.report is None:
+        return False
+    return rule.refused(taken, failed.report, measured(result, failed.report)) == 1
 
 
 def _why(t: float, small: float, failed: StepFailed) -> str:
@@ -314,11 +349,15 @@ def _row(simulation: Simulated, probes: Probes | None) -> Row:
     if probes is not None:
         out |= {name: getattr(probes, name)(points, comm) for name in ("displacement", "position")}
     if probes is not None and wet:
-        out["probe_pressure"] = probes.at_points(points, comm, lambda held: held.pressure)
+        out["probe_pressure"] = probe_pressures(scene, simulation.state, probes)
     if probes is not None and probes.stressed:
-        out["probe_stress"] = probes.at_points(points, comm, scene.materials.effective_stress_3d)
+        out["probe_stress"] = probe_stresses(scene, simulation.state, probes)
     if len(simulation.state.tool_forces):
         out["tools"] = simulation.state.tool_forces
+    out |= {name: getattr(simulation.state, name) for name in ("reactions", "walls", "outflows")}
+    for value in out.values():
+        if isinstance(value, np.ndarray):
+            value.flags.writeable = False
     return Row(simulation.state.t, **out)
 
 

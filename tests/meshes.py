@@ -29,7 +29,17 @@ def box_mesh(kind, cells, lower, upper, parts=None, place=None):
         on = nodes[index[:, axis] == end * (cells[axis] - 1)][:, FACES[dim][2 * axis + end]]
         sets[name] = len(blocks)
         blocks.append((facet, np.concatenate([on[:, split] for split in facet_splits])))
-    body = nodes[:, IN_ORDER[2**dim]] if kind in ("quad", "hexahedron") else nodes[:, simplices].reshape(-1, dim + 1)
+    if kind in ("quad", "hexahedron"):
+        body = nodes[:, IN_ORDER[2**dim]]
+    elif kind == "wedge":  # the tops and bottoms are the last two sides
+        body = nodes[:, [[0, 1, 3, 4, 5, 7], [0, 3, 2, 4, 7, 6]]].reshape(-1, 6)
+        blocks[4:] = [("triangle", on[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3)) for _, on in blocks[4:]]
+    elif kind == "pyramid":
+        tips = np.repeat(len(x) + np.arange(len(nodes)), 6)[:, None]
+        body = np.concatenate([nodes[:, FACES[3][:, IN_ORDER[4]]].reshape(-1, 4), tips], axis=1)
+        x = np.concatenate([x, x[nodes].mean(axis=1)])
+    else:
+        body = nodes[:, simplices].reshape(-1, dim + 1)
     if kind == "triangle":  # every other cell is cut the other way
         other = np.repeat(index.sum(axis=1) % 2 == 1, 2)
         body[other] = nodes[:, [[0, 1, 2], [1, 2, 3]]].reshape(-1, 3)[other]

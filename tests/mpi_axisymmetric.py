@@ -27,4 +27,4 @@ if parts:
     state = {"x": x, "p": p, "stress": s, "F": F, "hardened": hardened}
     counts = [len(part[0]) for part in parts]
     state = {k: v[order] for k, v in state.items()} | {"reactions": acts[:2], "outflows": acts[2:]}
-    np.savez(sys.argv[1], **state, balance=result.balance, counts=counts)
+    np.savez(sys.argv[1], **state, balance=result.balance, counts=counts, walls=simulation.state.walls)

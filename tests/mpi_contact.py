@@ -33,4 +33,5 @@ if parts:
     ids, x, p, s, push = (np.concatenate(a) for a in zip(*parts, strict=True))
     order = np.argsort(ids)
     more = {"counts": [len(part[0]) for part in parts], "forces": simulation.tool_forces, "push": push[order]}
+    more["walls"] = simulation.state.walls
     np.savez(sys.argv[1], x=x[order], p=p[order], shear=s[order], balance=result.balance, **more)

@@ -4,11 +4,12 @@
 import sys
 
 import numpy as np
-from test_initial_stress import WATER, moved, slope
+from test_initial_stress import HELD, WATER, moved, slope
 
 import mpm_dolfinx as mpm
 
-simulation = slope(1.1, mpm.MohrCoulomb(bulk=5e6, shear=2.5e6, friction=35, dilation=0, cohesion=5e3, **WATER), h=0.5)
+soil = mpm.MohrCoulomb(bulk=5e6, shear=2.5e6, friction=35, dilation=0, cohesion=5e3, **WATER)
+simulation = slope(1.1, soil, h=0.5, **HELD)
 comm = simulation.grid.comm
 simulation.run(10.0, 10.0, progress=False)
 assert comm.allreduce(moved(simulation)) < 2e-9

@@ -23,7 +23,9 @@ simulation = mpm.Simulation(
     tractions=[mpm.Traction("top", (0, 0, -1e5), top)],
     gravity=(0, 0, -10),
 )
-result = simulation.run(2.0, 1.0, progress=False)
+places = [[x, y, z] for x, y in ((0.0, 0.25), (0.11, 0.13)) for z in (0.0, 0.31, 0.75, 0.8, 0.88, 0.99)]
+probes = mpm.probes(bodies, places, stress=True)
+result = simulation.run(2.0, 1.0, probes=probes, progress=False)
 points = simulation.points
 parts = simulation.grid.comm.gather((points.id, points.x, points.pressure))
 if parts:
@@ -31,4 +33,5 @@ if parts:
     order = np.argsort(ids)
     assert p[x[:, 2] < 0.7].min() > 5e4, "the seam holds nothing back"
     counts = [len(part[0]) for part in parts]
-    np.savez(sys.argv[1], x=x[order], p=p[order], balance=result.balance, counts=counts)
+    probed = {"probe_p": result.probe_pressure[-1], "probe_stress": result.probe_stress[-1]}
+    np.savez(sys.argv[1], x=x[order], p=p[order], balance=result.balance, counts=counts, **probed)

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Flow in bodies that lie aslant on the grid: of second order, through open sides and along sealed ones."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -76,6 +78,33 @@ def test_a_slanted_seepage_face_lets_out_what_flows_to_it(angle):
     cell = s.cells()
     assert s.outflows == pytest.approx([-1e-5 / 9810 * 1e3 * WIDTH, 1e-5 / 9810 * 1e3 * WIDTH], rel=1e-3)
     assert cell.pressure == pytest.approx(1e3 * (1 - along(cell.x)), abs=2.0)
+
+
+@pytest.mark.parametrize("length", [1e-4, 1e3])
+def test_flow_along_slanted_sides_does_not_depend_on_the_unit_of_length(length):
+    """What sealed sides tell counted 1 / h^2 times as much, h in metres: in millimetres 3 % more flowed out."""
+
+    def flow(size):
+        grid = mpm.Grid([1.6 * size] * 2, [12, 12])
+        turn = np.array([[np.cos(0.5), np.sin(0.5)], [-np.sin(0.5), np.cos(0.5)]])
+        strip = mpm.box(grid, [0, 0], [size, 0.5 * size])
+        body = mpm.mapped(grid, strip, lambda X: np.array([0.4, 0.1]) * size + X @ turn)
+        s = mpm.Simulation(
+            grid,
+            [body],
+            [replace(SOIL, conductivity=1e-5 * size**2)],
+            fluid=mpm.Fluid(bulk=WATER),
+            fixed={},
+            displacements=[mpm.Displacement("bottom", (0.0, 0.0))],
+            drained=[mpm.Drained("left", 2e3), mpm.Drained("right", 1e3)],
+        )
+        s.run(1e5, 2e4, progress=False)
+        cell = s.cells()
+        order = np.lexsort(np.rint(cell.x.T / size * 1e6))
+        return cell.pressure[order], s.outflows / size**2
+
+    (p, q), (p0, q0) = flow(length), flow(1.0)
+    assert p == pytest.approx(p0, rel=0, abs=1e-10 * p0.max()) and q == pytest.approx(q0, rel=1e-10)
 
 
 def test_a_body_along_the_grid_has_no_flow_besides():

@@ -184,7 +184,7 @@ def test_a_cylinder_drains_to_its_side_as_the_exact_one_at_second_order(bulk):
 def test_flow_to_a_drain_crosses_a_smeared_zone_at_second_order():
     """A hundred times less permeable than the soil, its edge half a cell off the grid lines."""
     errors, soils = [], [mpm.Hencky(bulk=2e9, shear=1e9, conductivity=k) for k in (1e-7, 1e-5)]
-    for cells in (10, 20):
+    for cells in (20, 40):
         h = 1 / cells
         grid, edge = plane((1.3, 2 * h), (13 * cells // 10, 2)), 0.5 + 0.5 * h
         bodies = [mpm.box(grid, [0.2, 0], [edge, 2 * h]), mpm.box(grid, [edge, 0], [1.2, 2 * h], material=1)]
@@ -193,7 +193,23 @@ def test_flow_to_a_drain_crosses_a_smeared_zone_at_second_order():
         s.run(1e8, 5e7)
         resistance = np.log(edge / 0.2) / 1e-7 + np.log(1.2 / edge) / 1e-5
         errors.append(abs(s.outflows[0] * resistance / (4 * np.pi * h * 1e4 / 9810) - 1))
-    assert errors[1] < 5e-3 and rates(errors)[0] > 1.8
+    assert errors[1] < 1e-3 and rates(errors)[0] > 1.8
+
+
+def test_a_well_half_a_cell_in_radius_takes_what_flows_to_it():
+    """Rings between its face and the first centroid are longer than those at the face: 8 % too little flowed."""
+    grid = mpm.Grid([1.05, 0.2], [10, 2], lower=[0.05, 0], axisymmetric=True)
+    s = mpm.Simulation(
+        grid,
+        [mpm.box(grid, [0.05, 0], [1.05, 0.2])],
+        [mpm.Hencky(bulk=2e9, shear=1e9, conductivity=1e-5)],
+        fluid=mpm.Fluid(),
+        fixed={"bottom": "y", "top": "y"},
+        drained=[mpm.Drained("left"), mpm.Drained("right", 1e4)],
+    )
+    s.run(1e8, 5e7, progress=False)
+    exact = 2 * np.pi * 0.2 * 1e-5 * 1e4 / 9810 / np.log(1.05 / 0.05)
+    assert s.outflows == pytest.approx([exact, -exact], rel=0.03)
 
 
 def test_a_cavity_in_undrained_soil_has_the_exact_pressure():
@@ -419,9 +435,9 @@ def test_springs_around_a_sphere_hold_it_as_lame_says():
         soil = mpm.LinearElastic(bulk=K, shear=G)
         s = mpm.Simulation(grid, [body], [soil], fixed={"bottom": "y"}, tractions=[load], terms=[term])
         s.run(1, 0.5)
-        X, volume = s.points.origin.mean(axis=1), s.points.volume0
+        X, volume = s.points.x - s.points.displacement, s.points.volume0
         r = np.linalg.norm(X, axis=1)
-        moved, exact = np.einsum("ni,ni->n", s.points.x - X, X) / r, A * r + B / r**2
+        moved, exact = np.einsum("ni,ni->n", s.points.displacement, X) / r, A * r + B / r**2
         errors.append(np.sqrt(volume @ (moved - exact) ** 2 / (volume @ exact**2)))
     assert errors[-1] < 1e-3 and (rates(errors) > 1.8).all()
 

@@ -329,12 +329,31 @@ def test_a_stage_that_is_refused_changes_nothing():
 
 def test_a_point_that_leaves_the_grid_is_named_with_its_time():
     s, _ = beam(fluid=False, ramp=1.0, load=400e3)
-    with pytest.raises(mpm.GaveUp, match=r"point \d+ at \[.*\] left the grid .* at t = ") as caught:
+    message = r"point \d+ at \[.*\]: its corner at \[.*\] left the grid .* by .* m at t = "
+    with pytest.raises(mpm.GaveUp, match=message) as caught:
         s.run(2.0, 0.1)
     assert not s.grid.outside(s.points.corners.reshape(-1, 2), 1e-4).any(), "the state is not the last good one"
-    assert 0 < s.t - caught.value.result.t[-1] < 0.1
-    s.stage(tractions=[])
+    assert s.t == caught.value.result.t[-1] and caught.value.result.cuts == 0, "shorter steps only lead there"
+    s.stage(tractions=[top_load(60e3, 0.1)])
     assert s.run(s.t + 0.1, 0.1).converged, "the run cannot go on with other loads"
+
+
+def test_steps_by_error_end_at_the_grid_as_soon_as_they_are_exact_enough():
+    """The first step tried leads far beyond the grid, and is too inexact; ever shorter ones only led to its wall."""
+    grid = mpm.Grid([0.1, 1.1], [1, 11])
+    loads = [mpm.Traction("top", lambda t: (0, 1e5 * t))]
+    s = mpm.Simulation(
+        grid,
+        [mpm.box(grid, [0, 0], [0.1, 1])],
+        [SOFT],
+        fluid=mpm.Fluid(),
+        fixed={"left": "x", "right": "x", "bottom": "y"},
+        tractions=loads,
+        drained=[mpm.Drained("top")],
+    )
+    with pytest.raises(mpm.GaveUp, match=r"its corner at \[.*\] left the grid"):
+        s.run(1e3, rtol=0.01, first_step=100.0, progress=False)
+    assert 0 < s.result.cuts <= 5 and 1.03 < s.points.corners[..., 1].max() < 1.1
 
 
 def test_a_column_that_slides_is_refused():

@@ -18,7 +18,7 @@ CRITICAL = 1 - CLAY.kappa / CLAY.lambda_  # Lambda
 
 @pytest.fixture(scope="module", params=[2, 3], ids=["2D", "3D"])
 def law(request):
-    return LawAtPoints(replace(CLAY, initial_stress=(-0.8 * P0, -1.2 * P0, -P0), bulk=None), request.param)
+    return LawAtPoints(replace(CLAY, initial_stress=(-0.8 * P0, -1.2 * P0, -P0)), request.param)
 
 
 def gradients(dim, scale=0.02, n=60):
@@ -60,7 +60,7 @@ def test_drained_triaxial_compression_ends_where_its_path_meets_the_critical_sta
 
 
 def test_without_overconsolidation_the_initial_stress_is_on_the_yield_surface():
-    clay = replace(CLAY, initial_stress=(-0.5 * P0, -0.5 * P0, -P0), OCR=1.0, bulk=None)
+    clay = replace(CLAY, initial_stress=(-0.5 * P0, -0.5 * P0, -P0), OCR=1.0)
     r = element_test(clay, "oedometer", [1e-4, 0.0, -1e-4], steps=1)
     assert r.stress[0] == pytest.approx(np.diag(clay.initial_stress), abs=1e-9 * P0)
     assert r.state["consolidated"][1] > 1e-5 and r.state["consolidated"][2] == r.state["consolidated"][1]
@@ -129,10 +129,22 @@ def test_a_column_in_a_scene_follows_the_element_test():
 
 def test_parameters_may_differ_from_place_to_place():
     depth = lambda X: -(1 + X[:, [1]]) * P0 * np.array([1.0, 1.0, 1.0])  # noqa: E731
-    clay = replace(CLAY, initial_stress=depth, OCR=lambda X: 1 + X[:, 1], bulk=None)
+    clay = replace(CLAY, initial_stress=depth, OCR=lambda X: 1 + X[:, 1])
     s = column(cells=4, fluid=False, material=clay)
     mean = -np.trace(s.effective_stress(), axis1=1, axis2=2) / 2
     assert mean == pytest.approx((1 + s.points.x[:, 1]) * P0, rel=1e-9)
+
+
+def test_the_bulk_modulus_follows_what_is_replaced_and_what_a_stage_changes():
+    wide = replace(CLAY, lambda_=0.1, kappa=0.02)
+    assert wide.bulk == pytest.approx(P0 / 0.02) and replace(wide, initial_stress=(-2 * P0,) * 3).bulk == 2 * wide.bulk
+    by_place = replace(wide, kappa=lambda X: 0.02 + 0.01 * X[:, 1])
+    assert replace(by_place, kappa=0.01).bulk == pytest.approx(P0 / 0.01)
+    s = column(cells=4, fluid=False, material=by_place)
+    s.stage(fields={"kappa": 0.04})
+    assert s.points.data["bulk"] == pytest.approx(P0 / 0.04)
+    with pytest.raises(ValueError, match=r"stage: fields: .* bulk = .*, must be left out"):
+        s.stage(fields={"bulk": 1e9})
 
 
 @pytest.mark.parametrize(
@@ -147,6 +159,7 @@ def test_parameters_may_differ_from_place_to_place():
         ),
         ({"initial_stress": 1e5}, "must be three normal effective stresses"),
         ({"bulk": 1e9}, "must be left out: it is P_0 / kappa"),
+        ({"bulk": lambda X: np.full(len(X), 1e9)}, "must be left out: it is P_0 / kappa"),
         ({"shear": -1.0}, "shear = -1.0, must be > 0"),
     ],
 )

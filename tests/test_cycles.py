@@ -2,6 +2,7 @@
 """A body that comes back is the body that left: cycles, turns, and what moves the domains' corners."""
 
 from dataclasses import replace
+from functools import cache
 from itertools import pairwise
 
 import cycles
@@ -229,6 +230,32 @@ def test_the_filter_leaves_quadratic_fields_and_what_has_not_moved_and_takes_the
     apart = wave.copy()
     apart[0] += 0.01  # the first domain parts from its neighbours
     assert np.abs(change(apart, far)[0]).max() <= 4 / 64 * 8e-3 and np.isfinite(change(apart, far)).all()
+
+
+@cache
+def left_in(length=1.0, turned=False):
+    """Return the stress (n, 2, 2), Pa, that a load cycle leaves in a beam, and where it ends (n, 2), in lengths.
+
+    turned: with x and y swapped.
+    """
+    way, sides = (slice(None, None, -1), ("bottom", "right")) if turned else (slice(None), ("left", "top"))
+    grid = mpm.Grid([1.2 * length] * 2, [20, 20])
+    body = mpm.box(grid, np.array([0, 0.63])[way] * length, np.array([1, 0.93])[way] * length)
+    load = mpm.Traction(sides[1], lambda t: np.array((0.0, -54e3 * (1 - abs(2 * t - 1))))[way])
+    law = mpm.Hencky(bulk=1e7 / 3, shear=5e6)
+    s = mpm.Simulation(grid, [body], [law], fixed={sides[0]: "xy"}, tractions=[load])
+    s.run(1.0, 0.1, progress=False)
+    order = np.lexsort(np.rint(s.points.reference.mean(axis=1)[:, way].T / length * 1e6))
+    return s.effective_stress()[order][:, way, way], s.points.x[order][:, way] / length
+
+
+@pytest.mark.parametrize("scene", [{"turned": True}, {"length": 1e-9}, {"length": 1e6}], ids=["turned", "nm", "Mm"])
+def test_what_a_cycle_leaves_does_not_depend_on_the_axes_or_the_unit_of_length(scene):
+    """The filter took one axis after the other, and compared cells with metres: 6e-3 and 8e-2 of it."""
+    (stress, x), (stress0, x0) = left_in(**scene), left_in()
+    assert np.abs(stress0).max() > 1e3
+    assert stress == pytest.approx(stress0, rel=0, abs=1e-9 * np.abs(stress0).max())
+    assert x == pytest.approx(x0, rel=0, abs=1e-12)
 
 
 SAND = mpm.DruckerPrager(bulk=8.3e6, shear=3.8e6, cohesion=1e3, friction=0.5, dilation=0.0, conductivity=1e-5)

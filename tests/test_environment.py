@@ -233,6 +233,21 @@ assert (root.handlers, root.level, root.filters, root.manager.disable) == before
     assert (end["returncode"], end["stdout"]) == (0, "failed\n" if fails else "ran\n"), end["stderr"]
 
 
+def test_logging_can_be_set_up_after_the_import(tmp_path):
+    """A handler that the import left on the root logger made nothing of `basicConfig`."""
+    code = """
+import logging
+before = list(logging.getLogger().handlers), logging.getLogger().level
+import mpm_dolfinx as mpm
+assert (logging.getLogger().handlers, logging.getLogger().level) == before
+logging.basicConfig(level=logging.INFO, format="%(name)s: %(message)s")
+from mpm_dolfinx.parallel.messages import MPI, log
+log(MPI.COMM_WORLD, "step cut to %g s", 0.5)
+"""
+    end = ended(start(code, XDG_CACHE_HOME=tmp_path))
+    assert end["returncode"] == 0 and end["stderr"].splitlines()[-1] == "mpm_dolfinx: step cut to 0.5 s", end["stderr"]
+
+
 def test_the_users_own_messages_are_not_kept_back(tmp_path):
     code = f"import logging; logging.basicConfig(level=logging.INFO, force=True)\n{SCENE}\nlogging.info('done')"
     end = ended(start(code, XDG_CACHE_HOME=tmp_path))

@@ -97,3 +97,29 @@ def test_water_flows_and_rests_in_national_coordinates_as_at_the_origin(origin):
         s.run(2.0, 0.5, progress=False)
         pressures.append(s.points.pressure - rest)
     assert pressures[0].max() > 500 and pressures[1] == pytest.approx(pressures[0], abs=1.0)  # 1e-9 m of strain
+
+
+@pytest.mark.parametrize("dt", [1e3, 1e6])
+def test_layers_under_water_rest_in_national_coordinates_for_any_time(dt):
+    """Rounding of the flow between cells moved all of a sealed body, and this the flow: long steps gave up."""
+    o = np.array([3.4e5, 3.4e5])
+    grid = mpm.Grid(np.add(o, [0.4, 0.7]), [4, 7], lower=o)
+    layers = [
+        mpm.box(grid, np.add(o, [0, y]), np.add(o, [0.4, top]), material=i)
+        for i, (y, top) in enumerate([(0, 0.22), (0.22, 0.47)])
+    ]
+    soils = [mpm.Hencky(bulk=k, shear=k / 2, conductivity=1e-3) for k in (2e7, 1e7)]
+    s = mpm.Simulation(
+        grid,
+        layers,
+        soils,
+        fluid=mpm.Fluid(bulk=np.inf),
+        fixed={"left": "x", "right": "x", "bottom": "xy"},
+        gravity=(0, -9.81),
+        pressure=mpm.hydrostatic(o[1] + 0.47),
+        initial_stress=mpm.K0(0.5),
+    )
+    x, reports = s.points.x, [s.step(dt) for _ in range(2)]
+    assert max(report.newton for report in reports) <= 4
+    assert np.abs(s.points.x - x).max() <= 1e-9 * 0.7
+    assert s.points.pressure == pytest.approx(9810 * (o[1] + 0.47 - s.points.x[:, 1]), abs=1e-3 * 9810)

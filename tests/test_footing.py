@@ -47,6 +47,35 @@ def test_the_undrained_limit_load_of_stiff_soil_tends_to_prandtls():
     assert -0.07 < coarse[-1] - 1 < 2 * (fine[-1] - 1) < 0
 
 
+def rough_strip(cells, how):
+    """Return the limit load of a rough strip on very stiff soil without friction, over Prandtl's."""
+    h, end, edge = 1 / cells, 0.0012, 0.5
+    columns, rows = 2 * cells, round(1.2 * cells)
+    grid = mpm.Grid(lower=[0, -rows * h], upper=[columns * h, 3 * h], cells=[columns, rows + 3])
+    stiff = {name: footing.STIFF * getattr(footing.SOIL, name) for name in ("bulk", "shear")}
+    soil = mpm.DruckerPrager(**stiff, friction=0.0, dilation=0.0, cohesion=footing.COHESION)
+    if how == "displacement":
+        held = mpm.Displacement("top", lambda t, X: (0, -end * t), region=((0, -1), (edge, 1)))
+        pushed = {"displacements": [held]}
+    else:
+        block = mpm.Convex([(-edge, 0), (edge, 0), (edge, 1), (-edge, 1)])
+        pushed = {"tools": [mpm.Tool(block, displacement=lambda t: (0, -end * t), adhesion=9 * footing.COHESION)]}
+    walls = {"left": "x", "right": "x", "bottom": "xy"}
+    s = mpm.Simulation(grid, [mpm.box(grid, [0, -rows * h], [columns * h, 0])], [soil], fixed=walls, **pushed)
+    s.run(1.0, 1 / 20, progress=False)
+    force = s.reactions[0, 1] if how == "displacement" else s.tool_forces[0, 1]
+    return -force / (edge * footing.COHESION * soil.xi * (2 + np.pi))
+
+
+@pytest.mark.parametrize(("cells", "error"), [(9, 0.03), pytest.param(17, 0.015, marks=pytest.mark.slow)])
+def test_a_strip_carries_the_same_whether_a_side_is_held_or_a_tool_presses_it(cells, error):
+    """Over the true width, which ends in the middle of a cell."""
+    held, pressed = (rough_strip(cells, how) for how in ("displacement", "tool"))
+    print(f"{cells} cells: load over Prandtl's, held {held:.4f}, by a tool {pressed:.4f}")
+    assert held == pytest.approx(1.0, abs=error)
+    assert pressed == pytest.approx(held, rel=2e-3)
+
+
 @pytest.mark.slow
 def test_the_drained_limit_load_of_stiff_soil_tends_to_prandtls():
     coarse, fine = (footing.limit_load("drained", cells).load for cells in (9, 17))

@@ -102,21 +102,24 @@ def slope(level, soil, h=0.25, axisymmetric=False, **options):
         [bank],
         [soil],
         fluid=mpm.Fluid(),
-        fixed={"left": "x", "bottom": "xy"},
         tractions=loads,
         drained=heads,
         gravity=(0, -9.81),
         pressure=mpm.hydrostatic(level),
         initial_stress=mpm.K0(0.5, surcharge=lambda x: WEIGHT * np.maximum(level - x[:, 1], 0.0)),
-        **options,
+        **{"fixed": {"left": "x", "bottom": "xy"}, **options},
     )
 
 
-@pytest.mark.parametrize("level, axisymmetric", [(0.83, False), (3.0, False), (0.83, True)])
-def test_a_bank_in_still_water_stays_where_it_is(level, axisymmetric):
+HELD = {"fixed": {"left": "x"}, "displacements": [mpm.Displacement("bottom", (0, 0))]}
+"""Holds the base of such a bank in place of the wall."""
+
+
+@pytest.mark.parametrize("level, axisymmetric, h", [(0.83, False, 0.25), (3.0, False, 0.5), (0.83, True, 0.5)])
+def test_a_bank_in_still_water_stays_where_it_is(level, axisymmetric, h):
     """Partly emerged and submerged: neither soil nor water moves."""
     soil = mpm.MohrCoulomb(bulk=5e6, shear=2.5e6, friction=35, dilation=0, cohesion=5e3, **WATER)
-    s = slope(level, soil, axisymmetric=axisymmetric)
+    s = slope(level, soil, h, axisymmetric)
     for dt in (1.0, 1e4):
         s.run(s.t + dt, dt, progress=False)
         assert moved(s) < 1e-9 * 2.2 and np.abs(s.outflows).max() < 1e-9 * 1e-6
@@ -184,7 +187,7 @@ def test_a_fill_has_the_stress_that_it_is_given_and_else_none():
 def test_a_checkpoint_holds_all_of_it(tmp_path):
     soil, states = mpm.Hencky(bulk=5e6, shear=2.5e6, **WATER), []
     for _ in range(2):
-        s = slope(1.1, soil)
+        s = slope(1.1, soil, h=0.5, **HELD)
         if not states:
             s.run(10.0, 10.0, progress=False, checkpoint=mpm.Checkpoint(tmp_path / "a"))
         else:
@@ -194,6 +197,39 @@ def test_a_checkpoint_holds_all_of_it(tmp_path):
         s.run(20.0, 10.0, after=s.result, progress=False)
         assert moved(s) < 2e-9
     assert states[1].held.tolist() == states[0].held.tolist()
+    assert states[1].rest.tolist() == states[0].rest.tolist() and np.abs(states[0].rest).max() > 0
+
+
+PAIRS = {
+    "hencky": lambda: mpm.Hencky(bulk=1e7, shear=6e6),
+    "by place": lambda: mpm.Hencky(bulk=lambda X: 1e7 + 1e6 * X[:, 1], shear=6e6),
+    "sand": lambda: mpm.MohrCoulomb(bulk=1e7, shear=6e6, friction=35, dilation=0, cohesion=1e3),
+    "clay": lambda: mpm.ModifiedCamClay(**CLAY),
+}
+
+
+@pytest.mark.parametrize("below, above", [(a, b) for a in PAIRS for b in PAIRS if {a, b} & {"sand", "clay"} and a != b])
+def test_laws_may_lie_on_one_another_in_any_order(below, above):
+    """Three points each, as many as a tensor has axes, with the stress that they are given."""
+    grid = mpm.Grid([0.5, 4.0], [1, 8])
+    layers = [mpm.box(grid, [0, y], [0.5, y + 1.5], per_cell=1, material=m) for m, y in enumerate((0, 1.5))]
+    walls, load = {"left": "x", "right": "x", "bottom": "y"}, {"tractions": [mpm.Traction("top", -1e3)]}
+    s = mpm.Simulation(
+        grid,
+        layers,
+        [PAIRS[below](), PAIRS[above]()],
+        fixed=walls,
+        gravity=(0, -9.81),
+        initial_stress=mpm.K0(0.6, surcharge=1e3),
+        **load,
+    )
+    exact = -1e3 - 9.81 * 0.6 * 2650 * (3 - s.points.x[:, 1])
+    stress = s.point_fields().effective_stress
+    assert stress[:, 1, 1] == pytest.approx(exact, rel=1e-9)
+    for axis in (0, 2):
+        assert stress[:, axis, axis] == pytest.approx(0.6 * exact, rel=1e-9)
+    s.step(1.0)
+    assert moved(s) < 1e-9
 
 
 def test_forces_that_hold_a_rest_go_where_the_body_moves_or_is_dug_away():

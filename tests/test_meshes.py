@@ -5,29 +5,34 @@ import signal
 
 from mpi4py import MPI
 
+import basix
 import dolfinx.mesh
 import meshio
 import numpy as np
 import pytest
+import ufl
 from helpers import refused_in_one_line
 from meshes import box_mesh
 from scipy.integrate import solve_bvp
+from scipy.spatial import Delaunay
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx import _compat
 from mpm_dolfinx.points.cutting import volumes
 from mpm_dolfinx.points.faces import surface
 
 GRID = mpm.Grid([2, 1.5], [10, 8])
 SPACE = mpm.Grid([2, 2, 2], [4, 4, 4])
 KINDS = {"triangle": (8, 4), "quad": (8, 4), "tetra": (4, 2, 2), "hexahedron": (4, 2, 2)}
+ALL = KINDS | {"wedge": (4, 2, 2), "pyramid": (4, 2, 2)}
 SOIL = mpm.Hencky(bulk=1e6 / 1.2, shear=1e6 / 2.4)
 
 
 def of_kind(kind, upper=(2.0, 1.0, 1.0), **options):
     """Return a grid, and a box of a kind of cells in it."""
-    dim = len(KINDS[kind])
+    dim = len(ALL[kind])
     grid = GRID if dim == 2 else SPACE
-    return grid, mpm.from_mesh(grid, box_mesh(kind, KINDS[kind], (0,) * dim, upper[:dim], **options))
+    return grid, mpm.from_mesh(grid, box_mesh(kind, ALL[kind], (0,) * dim, upper[:dim], **options))
 
 
 def skewed(x):
@@ -35,7 +40,7 @@ def skewed(x):
     return x @ np.array([[0.8, 0.2, 0.0], [-0.3, 1.0, 0.1], [0.2, -0.1, 0.9]])[: x.shape[1], : x.shape[1]] + 0.3
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ALL)
 def test_domains_fill_the_mesh_and_sides_have_its_area_and_names(kind):
     grid, body = of_kind(kind)
     assert volumes(body.corners()).sum() == pytest.approx(2.0, rel=1e-12) and volumes(body.corners()).min() > 0
@@ -71,9 +76,9 @@ def test_slanted_faces_are_limited_by_regions_in_space():
     assert halves == pytest.approx(whole.area0.sum(), rel=1e-10)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", [*KINDS, "wedge"])
 def test_a_linear_field_is_exact_however_the_mesh_lies(kind):
-    dim = len(KINDS[kind])
+    dim = len(ALL[kind])
     grid = mpm.Grid([2.2] * dim, [6] * dim)
     body = mpm.from_mesh(grid, box_mesh(kind, (3,) * dim, (0,) * dim, (1,) * dim, place=skewed))
     H = np.array([[0.05, 0.1, 0.02], [-0.03, -0.08, 0.04], [0.01, 0.06, 0.03]])[:dim, :dim]
@@ -156,13 +161,13 @@ def pressed_hole(body, side, p, steps, cells):
     load = mpm.Pressure(side, lambda t: p * t)
     s = mpm.Simulation(grid, [body], [mpm.Hencky(bulk, shear)], fixed={"left": "x", "bottom": "y"}, tractions=[load])
     s.run(1.0, 1 / steps, progress=False)
-    X = s.points.reference.mean(axis=1) if side == "hole" else body.centre
+    X = s.points.x - s.points.displacement
     u, radial, hoop = cylinder(p, bulk, shear)(np.linalg.norm(X, axis=1).clip(1, 2))
     x, stress, volume = s.points.x, s.effective_stress(), s.points.volume0
     out = x / np.linalg.norm(x, axis=1)[:, None]
     around = np.stack([-out[:, 1], out[:, 0]], axis=1)
     along, across = (np.einsum("ni,nij,nj->n", e, stress, e) for e in (out, around))
-    moved = np.einsum("ni,ni->n", x - s.points.reference.mean(axis=1), out)
+    moved = np.einsum("ni,ni->n", s.points.displacement, out)
     wrong = (along - radial) ** 2 + (across - hoop) ** 2
     exact = radial**2 + hoop**2
     return np.sqrt([volume @ (moved - u) ** 2 / (volume @ u**2), volume @ wrong / (volume @ exact)])
@@ -238,6 +243,89 @@ def test_a_dolfinx_mesh_with_tags_is_the_mesh_of_meshio(kind):
     assert surface([whole], "3").area0.sum() == pytest.approx(2) == 2 * surface([half], "top").area0.sum()
 
 
+@pytest.mark.parametrize("kind", ["triangle", "quadrilateral"])
+def test_a_dolfinx_mesh_of_second_order_is_that_of_its_vertices(kind, caplog):
+    x = [(0, 0), (1, 0), (0, 1)] + ([(0.6, 0.6), (0, 0.5), (0.5, 0)] if kind == "triangle" else [(1, 1)])
+    x += [(0.5, 0), (0, 0.5), (1.05, 0.5), (0.5, 1), (0.5, 0.5)] if kind == "quadrilateral" else []
+    cells, x = np.arange(len(x))[None] if MPI.COMM_WORLD.rank == 0 else np.empty((0, len(x)), int), np.array(x)
+    if _compat.OLD:
+        domain = ufl.Mesh(ufl.VectorElement("Lagrange", kind, 2))
+        mesh = dolfinx.mesh.create_mesh(MPI.COMM_WORLD, cells, x, domain)
+    else:
+        domain = ufl.Mesh(basix.ufl.element("Lagrange", kind, 2, shape=(2,)))
+        mesh = dolfinx.mesh.create_mesh(MPI.COMM_WORLD, cells=cells, x=x, e=domain)
+    body = mpm.from_mesh(GRID, mesh)
+    assert volumes(body.corners()).sum() == pytest.approx(0.5 if kind == "triangle" else 1)
+    off = "0.14" if kind == "triangle" else "0.05"
+    assert "1 cells are of second order" in caplog.text and f"up to {off} m off" in caplog.text
+
+
+@pytest.mark.parametrize("kind", ALL)
+def test_cells_may_be_numbered_either_way_round(kind):
+    grid, body = of_kind(kind)
+    mesh = box_mesh(kind, ALL[kind], (0,) * grid.dim, (2.0, 1.0, 1.0)[: grid.dim])
+    mirrored = {"triangle": [0, 2, 1], "quad": [0, 3, 2, 1], "tetra": [0, 2, 1, 3], "pyramid": [0, 3, 2, 1, 4]}
+    mirrored |= {"wedge": [3, 4, 5, 0, 1, 2], "hexahedron": [4, 5, 6, 7, 0, 1, 2, 3]}
+    mesh.cells[-1].data[::2] = mesh.cells[-1].data[::2][:, mirrored[kind]]
+    other = mpm.from_mesh(grid, mesh)
+    assert volumes(other.corners()).sum() == pytest.approx(2) and volumes(other.corners()).min() > 0
+    areas = [{name: surface([b], name).area0.sum() for name in b.names} for b in (body, other)]
+    assert areas[0] == pytest.approx(areas[1])
+
+
+@pytest.mark.parametrize("kind", ["triangle", "quad", "tetra", "hexahedron", "wedge"])
+def test_a_strip_that_is_bent_round_until_its_ends_meet_is_refused_once_they_overlap(kind):
+    """No two cells share a facet there, and all of them lie on both sides of those that they share."""
+    dim = len(ALL[kind])
+    grid = mpm.Grid([4, 4, 1][:dim], [8, 8, 2][:dim])
+
+    def ring(turns):
+        def place(x):
+            angle, r = 2 * np.pi * turns * x[:, 0], 1 + x[:, 1]
+            return np.column_stack([2 + r * np.cos(angle), 2 + r * np.sin(angle), *x[:, 2:].T])
+
+        return mpm.from_mesh(grid, box_mesh(kind, (24, 2, 2)[:dim], (0,) * dim, (1, 0.5, 0.5)[:dim], place=place))
+
+    assert len(ring(0.99)) > 0
+    with pytest.raises(ValueError, match="cells lie on one another"):
+        ring(1.001)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_no_mesh_of_which_two_cells_hold_one_place_is_taken(dim):
+    """Meshes of random points, of which one is moved, or some cells are left out, or two that are put anywhere."""
+    rng, grid, taken = np.random.default_rng(dim), mpm.Grid([1.0] * dim, [1] * dim), {True: 0, False: 0}
+    for trial in range(30):
+        x = rng.random((rng.integers(dim + 3, 20), dim))
+        cells = Delaunay(x).simplices
+        if trial % 3 == 0:
+            x[rng.integers(len(x))] = rng.random(dim)
+        elif trial % 3 == 1:
+            cells = cells[rng.random(len(cells)) < 0.6]
+        else:
+            cells, x = np.concatenate([cells, cells + len(x)]), np.concatenate([x, x + rng.random(dim)]) / 2
+        edges = x[cells[:, 1:]] - x[cells[:, :1]]
+        cells, edges = (rows[np.abs(np.linalg.det(edges)) > 1e-4] for rows in (cells, edges))
+        places = rng.random((2000, dim))
+        at = np.einsum("pcj,cji->pci", places[:, None] - x[cells[:, 0]], np.linalg.inv(edges))
+        twice = ((at.min(axis=2) > 1e-3) & (at.sum(axis=2) < 0.999)).sum(axis=1).max(initial=0) > 1
+        try:
+            seed(x, [("triangle" if dim == 2 else "tetra", cells)], grid=grid, per_cell=1)
+            taken[twice] += 1
+        except ValueError as error:
+            assert "on one" in str(error) or "has no" in str(error)
+    assert taken[False] > 10 and not taken[True]
+
+
+def test_warped_hexahedra_gape_by_little_however_they_are_numbered():
+    mesh, rng = box_mesh("hexahedron", (4,) * 3, (0,) * 3, (1,) * 3), np.random.default_rng(0)
+    inner = ((mesh.points > 1e-9) & (mesh.points < 1 - 1e-9)).all(axis=1)
+    mesh.points[inner] += rng.uniform(-0.025, 0.025, (inner.sum(), 3))  # a tenth of an edge
+    mesh.cells[-1].data[::2] = mesh.cells[-1].data[::2][:, [1, 2, 3, 0, 5, 6, 7, 4]]
+    body = mpm.from_mesh(mpm.Grid([1.0] * 3, [4] * 3), mesh, per_cell=1)
+    assert 1e-5 < abs(volumes(body.corners()).sum() - 1) < 3e-4
+
+
 def test_a_file_names_sides_and_parts_by_gmsh_s_groups_or_numbers(tmp_path):
     mesh = box_mesh("triangle", (4, 2), (0, 0), (2, 1))
     tags = [np.full(len(block.data), k + 1) for k, block in enumerate(mesh.cells)]
@@ -254,7 +342,7 @@ def test_a_file_names_sides_and_parts_by_gmsh_s_groups_or_numbers(tmp_path):
 
 
 def test_probes_are_found_in_any_domain():
-    for kind in KINDS:
+    for kind in ALL:
         grid, body = of_kind(kind, place=skewed, upper=(1, 1, 1))
         x = body.reference().mean(axis=1)[::7]
         found = mpm.probes([body], x)
@@ -316,6 +404,13 @@ def seed(points, cells, part=None, grid=GRID, **options):
     return mpm.from_mesh(grid, meshio.Mesh(np.array(points, dtype=float), cells), part, **options)
 
 
+def two_meshes(kind, x):
+    """Return two boxes of a kind of cells, the second one beginning at a place."""
+    one, two = (box_mesh(kind, (1,) * 3, (low, 0, 0), (low + 1, 1, 1)) for low in (0, x))
+    rows = np.concatenate([one.cells[-1].data, two.cells[-1].data + len(one.points)])
+    return meshio.Mesh(np.concatenate([one.points, two.points]), [(kind, rows)])
+
+
 SQUARE = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)]
 HANGING = [*SQUARE, (2, 0, 0), (2, 1, 0), (1, 0.5, 0), (2, 0.5, 0)]
 BOX = box_mesh("triangle", (2, 2), (0, 0), (1, 1))
@@ -346,7 +441,53 @@ BAD = {
         "mesh: a surface in space",
         "0.5",
     ),
-    "cells of second order": (lambda: seed(SQUARE, [("triangle6", [[0, 1, 2, 3, 0, 1]])]), "mesh: ", "'triangle6'"),
+    "cells of third order": (lambda: seed(SQUARE, [("triangle10", [[0, 1, 2] * 3 + [3]])]), "mesh: ", "'triangle10'"),
+    "a cell twice": (
+        lambda: seed(SQUARE, [("quad", [[0, 1, 2, 3], [1, 2, 3, 0]])]),
+        "mesh: 1 cells (quad) are there more than once",
+        "[0.5 0.5]",
+    ),
+    "a quadrilateral and its triangles": (
+        lambda: seed(SQUARE, [("quad", [[0, 1, 2, 3]]), ("triangle", [[0, 1, 2], [0, 2, 3]])]),
+        "mesh: 4 facets have both of their cells on one side",
+        "[0.5 0. ]",
+    ),
+    "a cell that is folded back": (
+        lambda: seed([*SQUARE, (0.3, 0.6, 0)], [("triangle", [[0, 1, 2], [1, 2, 4]])]),
+        "mesh: 1 facets have both of their cells on one side",
+        "[1.  0.5]",
+    ),
+    "cells in one another": (
+        lambda: seed([*SQUARE, *np.add(SQUARE, (0.9, 0.5, 0))], [("quad", [[0, 1, 2, 3], [4, 5, 6, 7]])]),
+        "mesh: 2 cells lie on one another, the first at [0.95 0.75]",
+        "0.1 m deep",
+    ),
+    "a small cell in a large one": (
+        lambda: seed(
+            [*SQUARE, *np.add(np.multiply(SQUARE, 0.1), (0.4, 0.4, 0))],
+            [("quad", [[0, 1, 2, 3], [4, 5, 6, 7]])],
+        ),
+        "mesh: 2 cells lie on one another",
+        "[0.45 0.45",
+    ),
+    "tetrahedra in one another": (
+        lambda: mpm.from_mesh(SPACE, two_meshes("tetra", 0.99)),
+        "mesh: 12 cells lie on one another",
+        "0.01 m deep",
+    ),
+    "a node that is not there": (lambda: seed(SQUARE, [("quad", [[0, 1, 2, 4]])]), "the node 4", "one of 4"),
+    "a vertex that is nowhere": (
+        lambda: seed([*SQUARE[:3], (np.nan, 1, 0)], [("quad", [[0, 1, 2, 3]])]),
+        "mesh",
+        "nan",
+    ),
+    "no vertices": (lambda: seed(np.empty((0, 3)), []), "mesh: has no vertices", "must have cells"),
+    "no cells": (lambda: seed(SQUARE, []), "mesh: has no triangle and no quad", "2D"),
+    "data that are not there": (
+        lambda: mpm.from_mesh(GRID, BOX, cell_tags="rock"),
+        "mesh: cell_tags = 'rock'",
+        "cells have no data",
+    ),
     "surfaces in 3D": (lambda: mpm.from_mesh(SPACE, BOX), "mesh: has no tetra and no hexahedron", "3D"),
     "tetrahedra in 2D": (
         lambda: mpm.from_mesh(GRID, box_mesh("tetra", (1, 1, 1), (0, 0, 0), (1, 1, 1))),

@@ -93,3 +93,9 @@ def test_imbalance_memory_and_traffic_are_those_of_the_processes(tmp_path):
     assert two["half_imbalance"][0] == 2, "what is left lies on one process"
     (transfers, other), messages, sent = two["sent"].T
     assert transfers == other > 0 and (messages <= transfers).all() and (sent > 8 * messages).any()
+
+
+def test_a_second_scene_on_a_grid_is_as_even_as_alone(tmp_path):
+    """It kept the processes' cells of the first scene, and of bodies before their maps: all points lay on one."""
+    mpirun(2, "mpi_second_scene.py", str(tmp_path / "out.npz"))
+    assert np.load(tmp_path / "out.npz")["imbalance"].max() < 1.3

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 import ufl
+from helpers import set_up
 from scipy.optimize import brentq
 
 import mpm_dolfinx as mpm
@@ -112,3 +113,33 @@ def test_fluid_flows_between_sides_however_little_their_pressures_differ(differe
     s.step(1e9)
     found = (s.points.pressure - high) / (high * difference)
     assert found == pytest.approx(1 - s.points.x[:, 1], abs=0.01)
+
+
+def test_what_fluxes_gain_by_displacements_is_what_their_residual_does():
+    """With a law of the conductivity, gravity, and cells that turn and stretch; against central differences."""
+    law = lambda conductivity, J: conductivity * J**3 / (1 - ufl.ln(J))  # noqa: E731
+    soil = mpm.Hencky(bulk=1e5, shear=1e5, conductivity=1e-2, conductivity_law=law)
+    grid, rng = mpm.Grid([1.0, 1.0], [4, 4]), np.random.default_rng(3)
+    options = {
+        "fixed": {"bottom": "xy"},
+        "fluid": mpm.Fluid(),
+        "gravity": (0, -9.81),
+        "pressure": lambda x: 1e3 * x[:, 0],
+    }
+    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [0.9, 0.8])], [soil], drained=[mpm.Drained("right")], **options)
+    _, momentum, storage = set_up(s, 10.0)
+    system, unknowns, u = storage.system, momentum.system.unknowns, momentum.forms.u
+    move = lambda v, scale: unknowns.add(u, scale, v)  # noqa: E731
+    bent, v = (unknowns.gather_owned(size * rng.standard_normal(unknowns.size)) for size in (0.01, 1.0))
+    move(bent, 1.0)
+    storage.assemble_tangent()
+    out, content, there = system.unknowns.vector(), system.unknowns.vector(), []
+    slope = storage.flux_slope(u, unknowns)
+    system.lost(v, out, slope)
+    system.lost(v, content)
+    for step in (1e-6, -2e-6):
+        move(v, step)
+        there.append(storage.assemble_residual().vector.array.copy())
+    exact = (there[0] - there[1]) / 2e-6
+    assert out.array == pytest.approx(exact, abs=1e-4 * np.abs(exact).max())
+    assert np.abs(content.array - exact).max() > 0.1 * np.abs(exact).max()

@@ -91,12 +91,13 @@ def test_points_are_read_back_as_they_were(written):
         points, stress = states[k][:2]
         mesh = meshio.read(file)
         data = {name: rows for name, (rows,) in mesh.cell_data.items()}
-        centre = np.column_stack([points.x, np.zeros(len(points))])
-        assert mesh.points[mesh.cells[0].data].mean(axis=1) == pytest.approx(centre, abs=1e-15)
+        out_of_plane = np.zeros(len(points))
+        corners = np.sort(mesh.points[mesh.cells[0].data][:, :, :2], axis=1)
+        assert corners == pytest.approx(np.sort(points.corners, axis=1), abs=1e-15)
         expected = {name: getattr(points, name) for name in ("id", "material", "pressure", "J")}
         expected |= {"F_xx": points.F[:, 0, 0], "F_xy": points.F[:, 0, 1], "F_yx": points.F[:, 1, 0]}
         expected |= {"effective_stress_xy": stress[:, 0, 1], "effective_stress_yy": stress[:, 1, 1]}
-        expected |= {"displacement": centre - np.column_stack([points.origin.mean(axis=1), centre[:, 2]])}
+        expected |= {"displacement": np.column_stack([points.displacement, out_of_plane])}
         expected |= {"grains": 0.1 * points.id, "axis": np.tile([1.0, 2.0, 0.0], (len(points), 1))}
         for name, values in expected.items():
             assert np.array_equal(data[name], values), name
@@ -295,6 +296,15 @@ def test_steps_checkpoints_and_resumptions_are_logged(tmp_path, caplog, monkeypa
     assert said.count("step cut to") == simulation.result.cuts > 0
     assert said.count(f"checkpoint {checkpoint.file} written") == 4
     assert "step grows to 0.01 s" in said and "t = 0.08 s: resumed from" in said
+
+
+@pytest.mark.parametrize("progress", [True, False])
+def test_the_first_step_that_is_cut_is_named_without_being_asked_for(progress, caplog):
+    simulation, _ = cut_beam()
+    simulation.run(0.08, 0.02, progress=progress)
+    said = [r.getMessage() for r in caplog.records if r.levelno >= logging.WARNING]
+    assert simulation.result.cuts > 1
+    assert [("step cut to" in message, "level INFO" in message) for message in said] == [(True, True)] * progress
 
 
 class Terminal(io.StringIO):

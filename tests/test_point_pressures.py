@@ -105,3 +105,23 @@ def test_a_drained_side_that_leans_a_little_leaves_the_slope_along_it(tilt):
     )
     s.run(1.0, 1.0, progress=False)
     assert s.points.pressure == pytest.approx(9810 * (0.8 - s.points.x[:, 1]), abs=10.0)
+
+
+@pytest.mark.parametrize("drained", [[], [mpm.Drained("top")]], ids=["sealed", "drained"])
+@pytest.mark.parametrize("cells", [1, 2])
+def test_points_in_few_cells_have_the_slope_of_water_at_rest(cells, drained):
+    """At sealed sides it is the head that has no slope: two cells between them had 1283 for 2283 Pa."""
+    grid = mpm.Grid([0.5, 0.75], [2, cells + 1] if cells == 2 else [2, 1])
+    soil = mpm.Hencky(bulk=1e8, shear=6e7, conductivity=1e-3)
+    s = mpm.Simulation(
+        grid,
+        [mpm.box(grid, [0, 0], [0.5, 0.5], per_cell=3)],
+        [soil],
+        fluid=mpm.Fluid(),
+        fixed={"left": "x", "right": "x", "bottom": "xy"},
+        gravity=(0, -9.81),
+        drained=drained,
+    )
+    s.run(1e5, 2e4, progress=False)
+    off = s.points.pressure + 9810 * s.points.x[:, 1]
+    assert np.ptp(off) < 0.1 and np.ptp(s.points.pressure) > 2000

@@ -156,7 +156,7 @@ def test_a_load_drags_a_tool_as_far_as_friction_holds_it():
         sunk, drag = lambda t: (0, -0.02 * min(t, 1)), lambda t, most=most: most * max(0.0, t - 1)
         s = layer(mpm.Tool(block, displacement=sunk, load=drag, direction=(1, 0), friction=0.3))
         if slips:
-            with pytest.raises(mpm.GaveUp, match=r"is pushed by 1[34].* N and meets 1.* N, a cell farther too"):
+            with pytest.raises(mpm.GaveUp, match=r"is pushed by 1[23].* N and meets 1.* N, a cell farther too"):
                 s.run(2.0, 0.25)
         else:
             s.run(2.0, 0.25)

@@ -105,17 +105,126 @@ def test_water_flows_from_side_to_side_by_the_heads_of_its_ends():
     assert s.points.pressure == pytest.approx(want, rel=1e-3)
 
 
+KINDS = {
+    "Traction": lambda value: mpm.Traction("top", value).at,
+    "Pressure": lambda value: mpm.Pressure("top", value).at,
+    "Drained": lambda value: mpm.Drained("top", value).at,
+    "Inflow": lambda value: mpm.Inflow("top", value).at,
+    "Displacement": lambda value: mpm.Displacement("top", value).at,
+}
+FORMS = {  # what a function may give, and whether it is then one for each place
+    "number": (lambda x: 3.0, False),
+    "number a place": (lambda x: x[:, 0], False),
+    "vector": (lambda x: np.arange(x.shape[1]) - 5.0, True),
+    "vector a place": (lambda x: 2 * x, True),
+}
+
+
+@pytest.mark.parametrize("d", [2, 3])
+@pytest.mark.parametrize("m", [0, 1, 2, 3, 4])
+@pytest.mark.parametrize("form", FORMS)
+def test_what_a_function_gives_is_read_alike_at_any_number_of_places(form, m, d):
+    """With as many places as components a vector was refused, or read as a number a place, on some processes only."""
+    function, vectors = FORMS[form]
+    X = np.random.default_rng(m).random((m, d))
+    want = np.broadcast_to(function(X) if m else 0.0, (m, d) if vectors else (m,))
+    got = mpm.Traction("top", lambda x: function(x)).at(0.0, d, lambda name: X)
+    assert len(got) == 0 if not m else np.array_equal(np.broadcast_to(got, want.shape), want) and got.ndim <= want.ndim
+    if vectors:
+        assert np.array_equal(mpm.Displacement("top", lambda X: function(X)).at(0.0, X), want)
+    else:
+        for kind in ("Pressure", "Drained", "Inflow"):
+            got = KINDS[kind](lambda t, x: function(x))(0.0, lambda name: X)
+            assert np.array_equal(np.broadcast_to(got, (m,)), want), kind
+
+
+@pytest.mark.parametrize("cells", [1, 2])
+def test_a_vector_for_all_places_acts_as_one_without_places(cells):
+    grid = mpm.Grid([cells / 2, 1.0], [cells, 4])
+    body, walls = mpm.box(grid, [0, 0], [cells / 2, 0.75], per_cell=1), {"left": "x", "right": "x", "bottom": "y"}
+
+    def places(value):
+        s = mpm.Simulation(grid, [body], [SOIL], fixed=walls, tractions=[mpm.Traction("top", value)])
+        s.run(1.0, 1.0, progress=False)
+        return s.points.x
+
+    assert np.array_equal(places(lambda t, x: (0, -1e5)), places((0, -1e5)))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_functions_are_called_by_the_names_of_their_parameters(kind):
+    X, now = np.array([[0.0, 1.0], [1.0, 1.0], [2.0, 1.0]]), np.array([[0.0, 3.0], [1.0, 3.0], [2.0, 3.0]])
+    vector = (lambda v: np.stack([0 * v, v], axis=-1)) if kind == "Displacement" else (lambda v: v)
+    places = lambda name: {"X": X, "x": now}[name]  # noqa: E731
+
+    def at(function):
+        more = {"Traction": [2, places], "Displacement": [X]}.get(kind, [places])
+        values = KINDS[kind](function)(5.0, *more)
+        return values[..., 1] if kind == "Displacement" else values
+
+    for of_time in (lambda t: vector(2.0 * t), lambda time: vector(2.0 * time), lambda s, k=2.0: vector(k * s)):
+        assert at(of_time) == pytest.approx(10.0)
+    for of_places in (lambda X: vector(X[:, 0]), lambda X, t: vector(X[:, 0] + t - 5), lambda *, X: vector(X[:, 0])):
+        assert at(of_places) == pytest.approx([0.0, 1.0, 2.0])
+    if kind != "Displacement":
+        assert at(lambda x, t: x[:, 1] * t) == pytest.approx(15.0)
+        assert at(mpm.hydrostatic(4.0, 10.0)) == pytest.approx(10.0)
+        assert at(mpm.water("top", lambda t: t, unit_weight=10.0)[1].pressure) == pytest.approx(20.0)
+
+    class Interpolated:  # as those of scipy, whose x may well be the time
+        def __call__(self, x):
+            return x
+
+    wrong = [lambda s, x: 1.0, lambda t, depth: 1.0, lambda: 1.0, lambda **k: 1.0, Interpolated()]
+    for function in wrong + [lambda x: 1.0] * (kind == "Displacement"):
+        with pytest.raises(ValueError, match=f"^{kind}.* must be .*") as caught:
+            at(function)
+        assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda f: mpm.RigidPlate("top", f),
+        lambda f: mpm.Tool(mpm.Ball((0, 0), 1.0), displacement=f),
+        lambda f: mpm.Tool(mpm.Ball((0, 0), 1.0), rotation=f),
+        lambda f: mpm.Tool(mpm.Ball((0, 0), 1.0), load=f, direction=(0, 1)),
+        lambda f: mpm.water("top", f),
+        lambda f: block(gravity=f),
+    ],
+    ids=["plate", "displacement", "rotation", "load", "level", "gravity"],
+)
+def test_functions_of_time_alone_are_none_of_places(make):
+    """One of x was called with the time."""
+    with pytest.raises(ValueError, match=r"a function of \(x\), must be of the time alone"):
+        make(lambda x: 1.0)
+
+
+def test_what_a_condition_was_given_is_its_own():
+    """A scene's load and its gravity changed with the arrays and lists that a script went on to use."""
+    value, region, gravity, loads = np.array([0.0, -1e4]), [[0, 0], [2, 2]], np.array([0.0, -9.81]), []
+    loads.append(mpm.Traction("top", value, region))
+    walls = dict(WALLS)
+    s = mpm.Simulation(GRID, [mpm.box(GRID, [0, 0], [1, 1])], [SOIL], fixed=walls, tractions=loads, gravity=gravity)
+    value[:], region[1][0], gravity[:], walls["bottom"] = 1e9, 0.1, 1e9, "x"
+    loads.append(mpm.Traction("top", (0, 1e9)))
+    s.stage(drained=[])
+    s.run(1.0, 0.5, progress=False)
+    same = block(mpm.Traction("top", (0, -1e4)), gravity=(0, -9.81))
+    assert s.points.x == pytest.approx(same.points.x, abs=1e-12)
+
+
 BAD = {
     "of another argument": (
         lambda: block(mpm.Traction("top", lambda t, depth: 1.0)),
         "Traction(side='top'",
-        "t, X and x",
+        "t, X or x",
     ),
     "of too few places": (lambda: block(mpm.Pressure("top", lambda X: X[:3, 0])), "Pressure(side='top'", "places"),
     "of nan": (lambda: block(mpm.Traction("top", lambda x: x[:, 0] * np.nan)), "Traction(side='top'", "nan"),
     "that raise": (lambda: block(mpm.Traction("top", lambda x: 1 / 0)), "Traction(side='top'", "ZeroDivisionError"),
     "vectors of pressure": (lambda: block(mpm.Pressure("top", lambda x: x)), "Pressure(side='top'", "places"),
-    "one vector for places": (lambda: block(mpm.Traction("top", lambda x: (0, 1e3))), "Traction(side='top'", "places"),
+    "three components": (lambda: block(mpm.Traction("top", lambda x: (0, 1, 0))), "Traction(side='top'", "places"),
     "a word": (lambda: mpm.Drained("top", "dry"), "Drained: pressure", "'dry'"),
     "of a head": (
         lambda: column(drained=[mpm.Drained("top", lambda t: "high")]).step(1.0),

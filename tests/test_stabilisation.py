@@ -26,8 +26,8 @@ class Soil(mpm.LinearElastic):
 
     strength = 1.0
 
-    def pressure_damping(self, dim):
-        return self.strength * super().pressure_damping(dim)
+    def pressure_damping(self):
+        return self.strength * super().pressure_damping()
 
 
 def exact(x):

@@ -68,7 +68,7 @@ def same_bits(a: mpm.State, b: mpm.State) -> None:
 def contents(state):
     """Return all arrays of a state by their names."""
     out = {f"points {k}": v for k, v in {**vars(state.points), **state.points.data}.items() if k != "data"}
-    out["reactions"] = state.reactions
+    out |= {"reactions": state.reactions, "walls": state.walls}
     if state.transported is not None:
         out |= {f.name: getattr(state.transported, f.name) for f in fields(state.transported)}
     if state.stay is not None:
@@ -229,6 +229,37 @@ def test_a_run_that_is_interrupted_anywhere_goes_on_to_the_same_end(count):
         same_bits(state, alone)
         assert state.result.t == alone.result.t
         assert np.array_equal(state.result.displacement, alone.result.displacement)
+
+
+def test_a_kept_state_keeps_its_histories():
+    """They grew with the run: going on from the state a second time was refused."""
+    s, _ = scene("clay", True, True)
+    s.run(1.0, 0.5, progress=False)
+    before, rows = s.state, s.result.rows
+    ends = []
+    for _ in range(2):
+        s.state = before
+        result = s.run(2.0, 0.5, after=s.result, progress=False)
+        ends.append((s.state, result))
+        assert before.result.rows is rows and len(rows) == 3
+    same_bits(ends[0][0], ends[1][0])
+    for name in ("t", "reactions", "outflows", "pressure"):
+        assert np.array_equal(*(getattr(result, name) for _, result in ends)), name
+    assert len(ends[0][1].t) == 5 and ends[0][1].steps == ends[1][1].steps
+    s.state = before  # and from histories that another continuation has made, those of the state are taken
+    assert s.run(1.5, 0.5, after=ends[0][1], progress=False).t == [0.0, 0.5, 1.0, 1.5]
+
+
+def test_nobody_writes_into_a_state_or_its_histories():
+    s, _ = scene("sand", True, True)
+    probe = mpm.probes(s.bodies, [[0.1, 0.2]])
+    s.run(1.0, 0.5, probes=probe, progress=False)
+    state, row = s.state, s.result.rows[-1]
+    kept = [state.reactions, state.walls, state.outflows, state.tool_forces, state.tool_travel, state.velocity]
+    for array in [*kept, row.displacement, row.reactions, row.walls, row.outflows, row.probe_pressure]:
+        assert not array.flags.writeable
+    with pytest.raises(TypeError):
+        s.result.rows[0] = row
 
 
 def test_a_step_within_a_stay_depends_on_the_state_alone():

@@ -31,6 +31,7 @@ import ufl
 
 from mpm_dolfinx.constitutive.skeleton import Field, Skeleton, _check, check_given
 from mpm_dolfinx.constitutive.trial import Trial
+from mpm_dolfinx.validation import line
 
 GIVEN = {
     "M": "> 0",
@@ -40,6 +41,12 @@ GIVEN = {
 }
 """Constants that must be given, and what they may be."""
 OFF = 1e9  # a residual that no step is taken to
+
+
+class _Follows(float):
+    """A number that follows from other constants."""
+
+    follows = True
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,12 +110,15 @@ class ModifiedCamClay(Skeleton):
             def bulk(X):
                 at = [f(X) if callable(f) else np.asarray(f) for f in (stress, kappa)]
                 return np.broadcast_to(-np.mean(at[0], axis=-1) / at[1], len(X))
+
+            bulk.follows = True
         else:
             bulk = -np.mean(stress, axis=-1) / kappa
-        if self.bulk is None:
+            bulk = bulk if np.ndim(bulk) else _Follows(bulk)
+        if self.bulk is None or getattr(self.bulk, "follows", False):  # of another one's constants: `replace`
             object.__setattr__(self, "bulk", bulk)
-        elif not callable(self.bulk) and not callable(bulk) and not np.allclose(self.bulk, bulk, rtol=1e-9):
-            raise ValueError(f"{type(self).__name__}: bulk = {self.bulk!r}, must be left out: it is P_0 / kappa")
+        elif callable(self.bulk) or (not callable(bulk) and not np.allclose(self.bulk, bulk, rtol=1e-9)):
+            raise ValueError(f"{type(self).__name__}: bulk = {line(self.bulk)}, must be left out: it is P_0 / kappa")
 
     @property
     def nearly_incompressible(self) -> bool:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from copy import copy
 from dataclasses import fields, replace
 from inspect import signature
@@ -63,7 +63,7 @@ class SceneMaterials:
         prestressed: bool = False,
     ):
         materials = [stressed(m, grid.stretches) for m in materials] if prestressed else materials
-        self.grid, self.materials, self._fluid = grid, materials, fluid
+        self.grid, self.materials, self.fluid = grid, materials, fluid
         seeded: dict[str, NDArray[np.float64]] = {}
         self._used = _used(bodies, len(materials))  # a material that no body is of changes nothing
         used = [materials[i] for i in self._used]
@@ -202,26 +202,42 @@ class SceneMaterials:
         return np.stack([conductivity, np.where(by_place, len(known) + points.id, law)], axis=1)
 
     def table(self, points: MaterialPoints, value: Callable[..., float], *columns: NDArray) -> NDArray[np.float64]:
-        """Return value(material, *columns) at the points (n, ...); columns (n,) are values at the points."""
-        if not columns and not any(self._fields[i] for i in self._used):
-            each = [value(m) if i in self._used else 0.0 for i, m in enumerate(self.materials)]
-            return np.array(each)[points.material]
-        out = None
+        """Return value(material, *columns) at the points (n, ...); columns (n,) are values at the points.
+
+        Of a material whose constants are the same everywhere it is one value (...) without columns, else one a point; a
+        single number always stands for all.
+        """
+        each = []
         for i in self._used:
             rows = np.flatnonzero(points.material == i)
-            values = value(self._at(points, i, rows), *(column[rows] for column in columns))
-            out = np.zeros((len(points), *np.shape(values)[1:])) if out is None else out
-            out[rows] = values
+            found = np.asarray(value(self._at(points, i, rows), *(column[rows] for column in columns)))
+            each.append((rows, found, found.shape[bool(columns or self._fields[i]) :]))
+        out = np.zeros((len(points), *np.broadcast_shapes(*(shape for *_, shape in each))))
+        for rows, found, _ in each:
+            out[rows] = found
         return out
 
-    def check(self, what: str, points: MaterialPoints) -> None:
-        """Refuse, with a ValueError, values of the materials' fields at points that these may not have."""
+    def changed(self, what: str, points: MaterialPoints, named: Collection[str]) -> MaterialPoints:
+        """Return points, some of whose data have been named anew, with what follows from the materials' fields.
+
+        Raises
+        ------
+        ValueError
+            Fields have values that they may not have.
+        """
+        data = dict(points.data)
         for i in self._used:
-            rows = np.flatnonzero(points.material == i)
+            rows, m = np.flatnonzero(points.material == i), self.materials[i]
+            follow = [k for k in self._fields[i] if getattr(getattr(m, k), "follows", False)]
+            own = [name for name in self._fields[i] if name in named or name not in follow]
             try:
-                replace(self.materials[i], **{name: points.data[name][rows] for name in self._fields[i]})
+                made = replace(m, **{name: data[name][rows] for name in own})
             except ValueError as error:
                 raise ValueError(f"{what}: {error}") from error
+            for name in follow:
+                data[name] = data[name].copy()
+                data[name][rows] = getattr(made, name)
+        return replace(points, data=data)
 
     def _at(self, points: MaterialPoints, i: int, rows: NDArray[np.int64]) -> Skeleton:
         """Return a material whose constants are arrays over some of its points, unless they are numbers anyway."""
@@ -264,11 +280,11 @@ class SceneMaterials:
 
     def storage(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the storage coefficient at the points (n,), 1/Pa, of a scene with fluid."""
-        return self.table(points, lambda m, n: m.storage(self._fluid.bulk, n), self.porosity(points))
+        return self.table(points, lambda m, n: m.storage(self.fluid.bulk, n), self.porosity(points))
 
     def storage_at_one(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the storage coefficient that the points would have at a porosity of one (n,), 1/Pa."""
-        return self.table(points, lambda m: m.storage(self._fluid.bulk, 1.0))
+        return self.table(points, lambda m: m.storage(self.fluid.bulk, 1.0))
 
     @property
     def drains(self) -> bool:
@@ -285,7 +301,7 @@ class SceneMaterials:
 
     def density(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the density of soil and pore fluid at the points (n,), kg/m^3."""
-        n, wet = self.porosity(points), self._fluid.density if self._fluid else 0.0
+        n, wet = self.porosity(points), self.fluid.density if self.fluid else 0.0
         return (1 - n) * self.table(points, lambda m: m.grain_density) + n * wet
 
     def confined_modulus(self, points: MaterialPoints) -> NDArray[np.float64]:
@@ -294,7 +310,7 @@ class SceneMaterials:
         At most so many times lambda + 2G as `STIFFEST` says.
         """
         modulus = self.table(points, lambda m: m.oedometric)
-        if self._fluid is None:
+        if self.fluid is None:
             return modulus
         fluid = self.table(points, lambda m: m.biot) ** 2 / np.maximum(self.storage(points), 1e-300)
         return modulus + np.minimum(fluid, STIFFEST * modulus)

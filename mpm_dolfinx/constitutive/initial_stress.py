@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 from mpi4py import MPI
 
@@ -67,7 +68,7 @@ class K0:
 InitialStress = K0 | Callable[[NDArray[np.float64]], ArrayLike]
 
 
-def hydrostatic(level: float, unit_weight: float = 1000 * STANDARD_GRAVITY) -> Callable[[NDArray], NDArray]:
+def hydrostatic(level: float, unit_weight: float | None = None) -> Callable[[NDArray], NDArray]:
     """Return the pore pressure at rest of a phreatic level, as the scene's `pressure`: a function of places x (n, d).
 
     Pores are full above it too, and hold their water by suction: the pressure there is negative.
@@ -77,15 +78,21 @@ def hydrostatic(level: float, unit_weight: float = 1000 * STANDARD_GRAVITY) -> C
     level
         Height, m, along the last axis.
     unit_weight
-        Of the fluid, N/m^3, > 0; a warning says where the scene's differs.
+        Of the fluid, N/m^3, > 0; by default that of the scene's fluid, outside of a scene 9810.  A warning says where
+        it differs from the fluid's.
     """
     numbers("hydrostatic: level", level)
-    numbers("hydrostatic: unit_weight", unit_weight, test=lambda v: (0 < v) & (v < np.inf), allowed="> 0 and finite")
+    if unit_weight is not None:
+        allowed = {"test": lambda v: (0 < v) & (v < np.inf), "allowed": "> 0 and finite"}
+        numbers("hydrostatic: unit_weight", unit_weight, **allowed)
+    weight = 1000 * STANDARD_GRAVITY if unit_weight is None else unit_weight
 
     def pressure(x: NDArray[np.float64]) -> NDArray[np.float64]:
-        return unit_weight * (level - x[:, -1])
+        return weight * (level - x[:, -1])
 
-    pressure.unit_weight = unit_weight
+    pressure.unit_weight = weight
+    if unit_weight is None:
+        pressure.weighed = partial(hydrostatic, level)
     return pressure
 
 
@@ -228,9 +235,9 @@ def stressed(
 class _Sought:
     """Elastic strains that give target stresses, by Newton's method.
 
-    They are symmetric: of the prestretch, in plane strain without that across the plane, whose stress the law is given,
-    or of C_p^-1.  points: n of them; target : (n, 3, 3), Pa; given, plastic : (n,) which have the stress among their
-    constants, and which have C_p^-1.
+    They are symmetric: of `seeded_stretch`, in plane strain without that across the plane, whose stress the law is
+    given, or of C_p^-1.  points: n of them; target : (n, 3, 3), Pa; given, plastic : (n,) which have the stress among
+    their constants, and which have C_p^-1.
     """
 
     materials: SceneMaterials
@@ -284,7 +291,7 @@ class _Sought:
         elastic = (turn * np.exp(2 * logs)[:, None]) @ turn.swapaxes(1, 2)
         now = _with(self.points, self.plastic & ~self.given, plastic=elastic)
         d, stretch = self.materials.grid.stretches, (turn * np.exp(logs)[:, None]) @ turn.swapaxes(1, 2)
-        now = _with(now, ~self.plastic & ~self.given, prestretch=stretch[:, :d, :d])
+        now = _with(now, ~self.plastic & ~self.given, seeded_stretch=stretch[:, :d, :d])
         stress = self.materials.effective_stress_3d(now)
         return now, stress, self.of(stress - self.target)
 
@@ -325,8 +332,8 @@ def strained(materials: SceneMaterials, points: MaterialPoints, moved: MaterialP
     own = {name: points.data[name] for name in ("softness", "owed", "due") if name in points.data}
     data = {**moved.data, **own}
     out = replace(points, data=data)
-    if "prestretch" in data:
-        out = _with(out, np.ones(len(F), dtype=bool), prestretch=F @ data["prestretch"])
+    if "seeded_stretch" in data:
+        out = _with(out, np.ones(len(F), dtype=bool), seeded_stretch=F @ data["seeded_stretch"])
     if "plastic" in data:
         stretch = materials.table(points, _prestretch)
         whole = np.tile(np.eye(3), (len(F), 1, 1))

@@ -35,7 +35,7 @@ def stressed(m: Skeleton, stretches: int) -> Skeleton:
     if "plastic" in m.state:
         return m
     given = {name: getattr(m, name) for name in names}
-    return prestressed(type(m))(**given, prestretch=_everywhere(np.eye(stretches)), across=_everywhere(0.0))
+    return prestressed(type(m))(**given, seeded_stretch=_everywhere(np.eye(stretches)), across=_everywhere(0.0))
 
 
 def _everywhere(value) -> Callable:
@@ -44,7 +44,7 @@ def _everywhere(value) -> Callable:
 
 @cache
 def prestressed(law: type[Skeleton]) -> type[Skeleton]:
-    """Return a law with two more fields: `prestretch` F_i (d, d), and `across`, Pa, of the stress across the plane."""
+    """Return a law with two more fields: `seeded_stretch` F_i (d, d), and `across`, Pa, of stress across the plane."""
     names = ("energy", "kirchhoff", "update", "trial")
     given = {name: staticmethod(_seen(f, name)) for name in names if (f := getattr(law, name)) is not None}
 
@@ -52,7 +52,7 @@ def prestressed(law: type[Skeleton]) -> type[Skeleton]:
         own = law.out_of_plane.__func__(cls, F, values)
         return None if own is None else own + values["across"] / ufl.det(F)
 
-    annotations = {"__annotations__": {"prestretch": Field, "across": Field}, "prestretch": 1.0, "across": 0.0}
+    annotations = {"__annotations__": {"seeded_stretch": Field, "across": Field}, "seeded_stretch": 1.0, "across": 0.0}
     more = {"linear": law.linear, "out_of_plane": classmethod(out_of_plane), "__doc__": law.__doc__}
     cls = dataclass(frozen=True)(type(law.__name__, (law,), {**given, **annotations, **more}))
     cls.parameters = (*cls.parameters, "across")
@@ -64,14 +64,14 @@ def _seen(function: Callable, name: str) -> Callable:
     taken = Skeleton.taken_by(function)
 
     def of(**given):
-        stretch = given["prestretch"]
+        stretch = given["seeded_stretch"]
         if "F" in given:
             F, stretch = given["F"], stretch if given["F"].ufl_shape == stretch.ufl_shape else embedded(stretch)
             given["F"] = block(F * stretch) if F.ufl_shape == (3, 3) and planar(F) else F * stretch
         out = function(**{argument: given[argument] for argument in taken})
         return out / ufl.det(stretch) if name in ("energy", "kirchhoff") else out
 
-    arguments = dict.fromkeys([*taken, "prestretch"])
+    arguments = dict.fromkeys([*taken, "seeded_stretch"])
     of.__signature__ = Signature([Parameter(argument, Parameter.KEYWORD_ONLY) for argument in arguments])
     of.__qualname__ = function.__qualname__
     return of

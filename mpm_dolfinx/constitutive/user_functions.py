@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Physics of the user's own: functions that return UFL, called with those arguments that they name.
 
-Laws and conductivities are the material's: see `materials.Skeleton`.  Terms of the balances are given to
+Laws and conductivities are the material's: see `skeleton.Skeleton`.  Terms of the balances are given to
 `Simulation`; they are integrated over the configuration at the start of the step, by these names:
 
 points

@@ -244,6 +244,11 @@ class PointData(Keyed):
         fields = {name: self._rows[name][rows] for name in points.sizes}
         return PointData(points, places, self.volume[rows], fields)
 
+    def having(self, **fields: NDArray[np.float64]) -> PointData:
+        """Return the same points with other values (n, ...) of some fields."""
+        kept = {name: self._rows[name] for name in self.points.sizes}
+        return PointData(self.points, self.places, self.volume, kept | fields)
+
     def __getitem__(self, name: str) -> NDArray[np.float64]:
         """Return the values (n, size) of a field."""
         return self._rows[name]

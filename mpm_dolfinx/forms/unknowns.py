@@ -84,8 +84,8 @@ class Unknowns:
         out.array_w[:] = values[self.owned]
         return out
 
-    def add(self, function: fem.Function, scale: float, v: PETSc.Vec) -> None:
-        """Add scale * v to a function, ghosts updated."""
+    def add(self, function: fem.Function, scale: NDArray[np.float64] | float, v: PETSc.Vec) -> None:
+        """Add scale * v to a function, ghosts updated; scale: one number, or one for each entry."""
         function.x.array[self.owned] += scale * v.array_r
         function.x.scatter_forward()
 

@@ -29,12 +29,13 @@ from mpm_dolfinx.simulation import Simulation
 from mpm_dolfinx.state import State, Stay
 from mpm_dolfinx.validation import instance, line, numbers, on_disk, path, whole
 
-FORMAT, VERSION = "mpm_dolfinx checkpoint", 8
+FORMAT, VERSION = "mpm_dolfinx checkpoint", 9
 FOREIGN = "no checkpoint of mpm_dolfinx, must be one"
 ZIP = b"PK\3\4"  # how numpy's archives begin
-ACTING = ("reactions", "outflows", "tool_forces", "tool_travel")
+ACTING = ("reactions", "walls", "outflows", "tool_forces", "tool_travel")
+ROWS_OF_STAGES = ("reactions", "outflows")  # of a Row: as many as the stage has conditions
 PIECES = ("id", "pressure", "x", "start")  # of a Stay
-NODAL = ("velocity", "held")  # of a State
+NODAL = ("velocity", "held", "rest")  # of a State
 NOTE = {"t": float, "resets": int, "begins": bool, "scene": dict, "result": dict}  # and their kinds
 
 
@@ -151,13 +152,21 @@ def _scalars(result: Result) -> dict[str, Any]:
 def _arrays(state: State) -> dict[str, NDArray]:
     """Return the arrays of a state by names with slashes."""
     named = {"points": vars(state.points), **{name: getattr(state, name) for name in ACTING}}
-    named["result"] = {name: np.array(state.result.column(name)) for name in Row._fields}
+    named["result"] = {}
+    for name in Row._fields:
+        rows = [np.asarray(value) for value in state.result.column(name)]
+        if name in ROWS_OF_STAGES:
+            named["result"][f"{name}_count"] = np.array([*map(len, rows)], dtype=np.int64)
+            rows = rows and np.concatenate(rows)
+        named["result"][name] = np.array(rows)
     if state.transported is not None:
         named["transported"] = vars(state.transported)
     if state.stay is not None:
         named["stay"] = {"points": vars(state.stay.points)}
         if state.stay.id is not None:
             named["stay"] |= {name: getattr(state.stay, name) for name in PIECES}
+        if state.stay.keeps is not None:
+            named["stay"]["keeps"] = state.stay.keeps
     return _named("", named)
 
 
@@ -171,23 +180,29 @@ def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulat
         stay, transported, of_stay = None, None, _part(arrays, "stay/")
         if of_stay:
             own = [of_stay.pop(name) for name in PIECES] if wet else [None] * len(PIECES)
-            stay = Stay(_points(_part(of_stay, "points/"), now.points, ids), *own)
+            keeps = of_stay.pop("keeps", None)
+            stay = Stay(_points(_part(of_stay, "points/"), now.points, ids), *own, keeps)
             if wet:
                 _check_pieces(dict(zip(PIECES, own, strict=True)), ids, dim)
-        elif wet:
+            if keeps is not None and (keeps.dtype != bool or keeps.shape != ids.shape):
+                raise ValueError(f"stay/keeps: {keeps.dtype} of shape {keeps.shape}")
+        if wet and (stay is None or stay.keeps is not None):
             transported = PiecePressures(**_part(arrays, "transported/"))
             _check_pieces(vars(transported), ids, dim)
         histories = _part(arrays, "result/")
         times = histories["t"] = histories["t"].tolist()
         histories["pressure"] = [*map(tuple, histories["pressure"].tolist())]
+        for name in ROWS_OF_STAGES:
+            histories[name] = np.split(histories[name], np.cumsum(histories.pop(f"{name}_count")))[:-1]
         columns = [[*histories[name]] or [None] * len(times) for name in Row._fields]
         result = Result(rows=[Row(*row) for row in zip(*columns, strict=True)], **note["result"])
-        acting = reactions, outflows, forces, ways = [arrays.pop(name) for name in ACTING]
+        acting = reactions, walls, outflows, forces, ways = [arrays.pop(name) for name in ACTING]
         nodal = [_part(arrays, f"{name}/") or None for name in NODAL]
         for name, given in zip(NODAL, nodal, strict=True):
             if given is not None:
                 _check_nodal(name, given, simulation.grid)
-        if arrays or reactions.shape[1:] != (dim,) or outflows.ndim != 1 or not all(np.isfinite([note["t"], *times])):
+        shapes = reactions.shape[1:], walls.shape, outflows.shape[1:]
+        if arrays or shapes != ((dim,), (2 * dim, dim), ()) or not all(np.isfinite([note["t"], *times])):
             raise ValueError(f"has {', '.join(arrays) or 'other reactions, outflows or times'}")
         if forces.shape != now.tool_forces.shape:
             raise ValueError(f"has forces of {len(forces)} tools")
@@ -270,7 +285,7 @@ def _without_rows(state: State) -> State:
     points, transported, stay = state.points.of(none), state.transported, state.stay
     if stay is not None:
         rows = [None if rows is None else rows[:0] for rows in (getattr(stay, name) for name in PIECES)]
-        stay = Stay(stay.points.of(none), *rows)
+        stay = Stay(stay.points.of(none), *rows, None if stay.keeps is None else stay.keeps[:0])
     return replace(state, points=points, transported=transported and transported.of(none), stay=stay)
 
 

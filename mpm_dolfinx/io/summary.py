@@ -71,7 +71,7 @@ def _storage(s: Scene, state: State) -> list[Part]:
     still, f = "nothing conducts", storage.fluxes
     return [
         Part(names[0], True, "finite volumes, coupled"),
-        _either(names[1], f.flux, "two-point", still),
+        _either(names[1], f.flux, f"two-point, conductivities over {s.fluid.unit_weight:.6g} N/m^3", still),
         _either(names[2], f.gravity, "gravity", "no gravity" if f.flux else still),
         _either(names[3], outlets, f"{len(outlets)} drained or with inflow", "sealed"),
         _either(names[4], f.damp.used, "little flows within a step", "enough flows within a step, so far"),

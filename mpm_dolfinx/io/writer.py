@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.io.units import text
 from mpm_dolfinx.parallel.exchange import at_root, to_root
-from mpm_dolfinx.points.material_points import MaterialPoints, middle
+from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.result import Result
 from mpm_dolfinx.simulation import Simulation
 from mpm_dolfinx.validation import flag, instance, line_of, on_disk, path, whole
@@ -138,7 +138,7 @@ class Writer:
 
         def write() -> None:
             with replacing(file) as part:
-                mesh = solid(points, points.x - middle(points.origin), wet)
+                mesh = solid(points, points.displacement, wet)
                 mesh.write(part, file_format="vtu")
 
         at_root(comm, write)

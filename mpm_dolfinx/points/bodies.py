@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.parallel.exchange import first
-from mpm_dolfinx.points.cutting import FACES, corner_bits, domain_volumes, volumes
+from mpm_dolfinx.points.cutting import FACES, centroids, corner_bits, domain_volumes, volumes
 from mpm_dolfinx.points.grid import SIDES, Grid, in_chunks
-from mpm_dolfinx.points.material_points import MaterialPoints, middle
+from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.validation import asked, instance, numbers
 
 
@@ -233,7 +233,7 @@ def material_points(
     mine = np.concatenate([start + row for start, row in zip(starts, rows, strict=True)])
     size = np.concatenate([body.size(row) for body, row in zip(bodies, rows, strict=True)])
     material = np.repeat(np.array([body.material for body in bodies], dtype=np.int32), list(map(len, rows)))
-    x = middle(corners)
+    x = centroids(corners)
     n, pressures, refused = len(mine), np.empty(0), ""
     try:
         pressures = pressure_at(pressure, x)
@@ -255,23 +255,24 @@ def material_points(
 
 
 def _own(grid: Grid, body: Body) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the domains (m,) whose middles are in cells of this process, and their corners (m, 2^d, d), m."""
+    """Return the domains (m,) whose centroids are in cells of this process, and their corners (m, 2^d, d), m."""
     rows, corners = [np.empty(0, dtype=np.int64)], [np.empty((0, 2**grid.dim, grid.dim))]
     for part in in_chunks(len(body)):
         of_part = body.corners(part)
         # of all copies of the grid alike
-        here = np.flatnonzero(grid.owner(grid.number(grid.index(middle(of_part)))) == grid.comm.rank)
+        here = np.flatnonzero(grid.owner(grid.number(grid.index(centroids(of_part)))) == grid.comm.rank)
         rows.append(part.start + here)
         corners.append(of_part[here])
     return np.concatenate(rows), np.concatenate(corners)
 
 
 def points_in_cells(grid: Grid, bodies: Sequence[Body]) -> NDArray[np.float64]:
-    """Return how many points of bodies as seeded, before the maps, are in each cell of the grid (cells,)."""
+    """Return how many points of bodies as seeded are in each cell of the grid (cells,)."""
     out = np.zeros(int(np.prod(grid.shape)))
     for body in bodies:
         for part in in_chunks(len(body)):
-            np.add.at(out, grid.number(grid.index(body.centre_of(part))), 1.0)
+            x = body.centre_of(part) if body.map is None else centroids(body.corners(part))
+            np.add.at(out, grid.number(grid.index(x)), 1.0)
     return out
 
 

@@ -376,8 +376,10 @@ def solids(body: Body) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     corners = body.corners()
     warp = np.zeros(len(body))
     if len(size) == 3 and not body.aligned:
-        faces = [corners[:, index] for index in FACES[3]]
-        warp = np.max([np.linalg.norm(f[:, 0] - f[:, 1] - f[:, 2] + f[:, 3], axis=1) / 4 for f in faces], axis=0)
+        for face, index in enumerate(FACES[3]):
+            f, n = corners[:, index], face_vectors(corners, face)  # what lies in the plane of a face is no warp
+            off = np.einsum("nd,nd->n", f[:, 0] - f[:, 1] - f[:, 2] + f[:, 3], n)
+            warp = np.maximum(warp, np.abs(off) / np.maximum(np.linalg.norm(n, axis=1), TINY) / 4)
     edge = np.ptp(corners, axis=1).min(axis=1)
     return corners, allowance(edge) + 2 * (body.bend(np.arange(len(body))) + warp)
 

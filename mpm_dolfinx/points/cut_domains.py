@@ -105,10 +105,18 @@ class CutDomains(Keyed):
         self.hoop = self._travel.send(self.pieces.hoop) if grid.axisymmetric else None
         """Their moments in the plane (m, 4) in axisymmetry, see `Pieces`."""
 
-    def serves(self, points: MaterialPoints) -> bool:
-        """Return whether the points are still where they were cut, but for `STAYS`."""
-        moved = np.abs((points.corners - self.points.corners) / self.grid.h).max(initial=0.0)
-        return over_all(self.grid.comm, moved, MPI.MAX) <= STAYS
+    def moved(self, points: MaterialPoints, part: NDArray[np.int64], count: int) -> NDArray[np.float64]:
+        """Return by how many cells corners of each of so many parts (count,) have moved at most since they were cut.
+
+        part (n,): of each point.
+        """
+        far = np.zeros(count)
+        np.maximum.at(far, part, np.abs((points.corners - self.points.corners) / self.grid.h).max(axis=(1, 2)))
+        return over_all(self.grid.comm, far, MPI.MAX)
+
+    def serves(self, points: MaterialPoints, part: NDArray[np.int64], count: int) -> NDArray[np.bool_]:
+        """Return which parts (count,), see `moved`, are still where they were cut, but for `STAYS`."""
+        return self.moved(points, part, count) <= STAYS
 
     def to_cells(self, values: NDArray) -> NDArray:
         """Send values of the points (n, ...) to the owners of their pieces' cells (m, ...)."""
@@ -131,6 +139,14 @@ class CutDomains(Keyed):
     def mean(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the volume means (n,) over the pieces of each point of values (m,) on the pieces."""
         return sum_by(self.pieces.point, self.pieces.fraction * values, len(self.points))
+
+    def in_plane(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the same means of values at the pieces' centroids in the plane, in axisymmetry by area."""
+        if not self.grid.axisymmetric:
+            return self.mean(values)
+        area = self.pieces.fraction / self.pieces.hoop[:, 3]
+        whole, total = (sum_by(self.pieces.point, area * each, len(self.points)) for each in (1.0, values))
+        return total / whole
 
     def surface(self, faces: Surface) -> Patches:
         """Return points of integration on the faces that this process's points have.
@@ -195,9 +211,13 @@ class CutDomains(Keyed):
         pieces = self.pieces
         now, then = (c - c.mean(axis=1, keepdims=True) for c in (points.corners, points.origin))
         stretch = np.linalg.solve(then.swapaxes(1, 2) @ then, then.swapaxes(1, 2) @ now)  # of the corners' pattern
-        off = pieces.x - points.x[pieces.point]
+        off = pieces.x - middle(points.corners)[pieces.point]
         off0 = np.linalg.solve(stretch.swapaxes(1, 2)[pieces.point], off[:, :, None])[:, :, 0]
-        return off + (points.x - middle(points.origin))[pieces.point] - off0
+        return off + (middle(points.corners) - middle(points.origin))[pieces.point] - off0
+
+    def cells_at(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Return the lexicographic cells (m,) of places x (m, d), m, in or on the domains of points (m,)."""
+        return self._filled_cell(at, x + DEPTH * (self.points.x[at] - x))
 
     def _filled_cell(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
         """Return the cells (m,) of positions in domains; where no piece of the domain lies, of its largest piece."""

@@ -90,6 +90,21 @@ def domain_volumes(corners: NDArray[np.float64], axisymmetric: bool) -> NDArray[
     return TURN * sum(area * y[simplex, 0].mean(axis=0) for area, simplex in areas)
 
 
+def centroids(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the centroids (n, d), m, of domains (n, 2^d, d), in axisymmetry in the plane: where their means count.
+
+    As in `cut`, simplices that are turned inside out count as positive.
+    """
+    y = np.ascontiguousarray(corners.transpose(1, 2, 0))
+    whole, middle = 0.0, y.mean(axis=0)
+    moment = np.zeros_like(middle)
+    for volume, simplex in zip(_simplex_volumes(y), kuhn_simplices(y.shape[1]), strict=True):
+        volume = np.abs(volume)
+        whole = whole + volume
+        moment += volume * (y[simplex].mean(axis=0) - middle)
+    return (middle + np.divide(moment, whole, out=np.zeros_like(moment), where=whole > 0)).T.copy()
+
+
 def _simplex_volumes(y: NDArray[np.float64]) -> list[NDArray[np.float64]]:
     """Return the signed volumes (n,) of each simplex of domains (2^d, d, n)."""
     d, out = y.shape[1], []

@@ -17,9 +17,9 @@ from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.parallel.messages import warn
 from mpm_dolfinx.points.bodies import Body
 from mpm_dolfinx.points.contact import Cover, Faces, covered, covers, local, meeting, warn_near, weights
-from mpm_dolfinx.points.cutting import FACES, TANGLED, domain_volumes, volumes
+from mpm_dolfinx.points.cutting import FACES, TANGLED, centroids, domain_volumes, volumes
 from mpm_dolfinx.points.grid import REACH, Grid
-from mpm_dolfinx.points.material_points import MaterialPoints, middle
+from mpm_dolfinx.points.material_points import MaterialPoints
 
 MISFIT = 0.01  # cells: fills whose straight edges are further off a bent surface are named in a warning
 UPRIGHT = 0.95  # cosine: what of a mesh looks that straight away from what it lies on stays where it was seeded
@@ -113,7 +113,7 @@ def put(
     if (mine == new.corners).all():
         return new
     volume = domain_volumes(mine, grid.axisymmetric)
-    return replace(new, corners=mine, x=middle(mine), volume0=volume, origin=mine, reference=mine)
+    return replace(new, corners=mine, x=centroids(mine), volume0=volume, origin=mine, reference=mine)
 
 
 def _start(bodies: Sequence[Body], body: int) -> int:

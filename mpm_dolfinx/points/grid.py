@@ -146,7 +146,8 @@ class Grid:
     stretches
         Number of axes of deformation gradients: d, in axisymmetry 3, the third one that of the hoops.
     mesh
-        The dolfinx mesh; made when first it is needed.
+        The dolfinx mesh; made when first it is needed.  On several processes a second scene whose points lie elsewhere
+        has a grid with a mesh of its own, `Simulation.grid`; not one with terms or sources, which may be made on this.
     """
 
     def __init__(
@@ -195,14 +196,35 @@ class Grid:
     def share(self, load: NDArray[np.float64]) -> None:
         """Make the mesh, its cells shared out among the processes by what each holds (cells,); once."""
         if not self._made:
-            owner = owners(load.reshape(self.shape), self.comm.size)
-            own = np.flatnonzero(owner.ravel() == self.comm.rank)
-            nodes = np.concatenate([self.corners(own) + copy * self.nodes for copy in range(self.copies)])
-            ranks, first = destinations(owner, own)
-            each = np.tile(np.diff(first), self.copies)
-            where = np.tile(ranks, self.copies), np.concatenate([[0], np.cumsum(each)]).astype(np.int32)
-            mesh = _compat.box_mesh(self.comm, nodes, self._nodes(), *where)
-            self._made.append(Cells(self, mesh, np.tile(owner.ravel(), self.copies)))
+            self._make(owners(load.reshape(self.shape), self.comm.size))
+
+    def shared(self, load: NDArray[np.float64], keep: bool) -> Grid:
+        """Return the grid with its cells shared out by what each holds (cells,): this one, or an equal one.
+
+        Parameters
+        ----------
+        load : (cells,)
+            What each cell holds, >= 0.
+        keep
+            Whether a mesh that is there stays, however its cells are shared out: something was made on it.
+        """
+        owner = owners(load.reshape(self.shape), self.comm.size)
+        if not self._made:
+            self._make(owner)
+        elif not keep and (self._made[0].owners[: self.cells] != owner.ravel()).any():  # of an earlier scene
+            other = Grid(self.upper, self.shape, self.lower, self.comm, axisymmetric=self.axisymmetric)
+            other._make(owner)
+            return other
+        return self
+
+    def _make(self, owner: NDArray[np.int32]) -> None:
+        own = np.flatnonzero(owner.ravel() == self.comm.rank)
+        nodes = np.concatenate([self.corners(own) + copy * self.nodes for copy in range(self.copies)])
+        ranks, first = destinations(owner, own)
+        each = np.tile(np.diff(first), self.copies)
+        where = np.tile(ranks, self.copies), np.concatenate([[0], np.cumsum(each)]).astype(np.int32)
+        mesh = _compat.box_mesh(self.comm, nodes, self._nodes(), *where)
+        self._made.append(Cells(self, mesh, np.tile(owner.ravel(), self.copies)))
 
     def corners(self, cells: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return the lexicographic numbers of the nodes (n, 2^d) of cells."""

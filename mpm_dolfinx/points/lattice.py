@@ -4,7 +4,7 @@
 A wave of two domains in the displacement of the corners moves no node of the grid, so that no stress acts against it:
 what crossing grid lines leaves of it would add up from cycle to cycle.  When the grid is reset the corners lose it,
 
-    d <- d - D_a^T s / 64 D_a d     for one axis a after the other,
+    d <- d - D_a^T s / 64 D_a d     for one axis a after the other, the mean over all orders of the axes,
 
 d their displacement since they were at rest, D_a the third difference along axis a where the lattice has four corners
 in a row, s = `FAST` times the cells that they have crossed, at most 1: what hardly moves is left alone.  Quadratic
@@ -38,7 +38,7 @@ THIRD = (-1.0, 3.0, -3.0, 1.0)
 MARGIN = 3
 """Layers of a lattice on both sides that the change of one depends on."""
 PARTED = 1e-6
-"""Of a domain's edge: corners of neighbours that are further apart have parted."""
+"""Of a domain's edge, and of a cell: corners of neighbours that are further apart, or moved otherwise, have parted."""
 
 
 class Lattice:
@@ -64,7 +64,7 @@ class Lattice:
         self._body, self._start, self._stop = body, start, start + len(body)
         self._dim, self._count = body.dim, body.lattice
         self._numbers: Latest[NDArray[np.int64]] = Latest()
-        self._parted = PARTED * body.spacing.min()
+        self._parted = np.append(np.full(self._dim, PARTED * body.spacing.min()), PARTED)
         # the numbers of corners that are held: a flag for each corner would be as large as the body, on every process
         self._joined = np.unique(np.take_along_axis(body.nodes(joined[0]), joined[1], axis=1))
         of_axes = [[np.empty(0, dtype=np.int64)] for _ in range(self._dim)]
@@ -118,7 +118,7 @@ def _change(
     shape: tuple[int, ...],
     number: NDArray[np.int64],
     values: NDArray[np.float64],
-    parted: float,
+    parted: NDArray[np.float64],
 ) -> NDArray[np.float64]:
     """Return what the filter adds (m, k) to values at places of a lattice.
 
@@ -130,8 +130,8 @@ def _change(
         Places along each axis; lexicographic number (m,) of each row's place, which may have several.
     values : (m, k + 1)
         Values, and last how many cells their place has crossed.
-    parted
-        Values of one place that differ by more are nobody's neighbours.
+    parted : (k + 1,)
+        Places of which some of these differ by more are nobody's neighbours.
     """
     across, starts = int(np.prod(shape[1:])), np.arange(comm.size + 1) * shape[0] // comm.size
     layer = number // across
@@ -158,19 +158,32 @@ def _change(
     return to_home.back(change.reshape(-1, values.shape[1] - 1)[rows[0][0]])
 
 
-def _filtered(d: NDArray[np.float64], crossed: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a box (..., k) of values after the filter; nan stands for places that are not there."""
-    for axis, count in enumerate(d.shape[:-1]):
-        if count < len(THIRD):
-            continue
-        d = d.copy()
-        along, cells = np.moveaxis(d, axis, 0), np.moveaxis(crossed, axis, 0)
-        share = np.minimum(1.0, FAST * (cells[1 : count - 2] + cells[2 : count - 1]) / 2)
-        third = share / 64 * np.diff(along, 3, axis=0)
-        third[np.isnan(third)] = 0.0
-        for k, factor in enumerate(THIRD):
-            along[k : count - 3 + k] -= factor * third
-    return d
+def _filtered(
+    d: NDArray[np.float64], crossed: NDArray[np.float64], axes: tuple[int, ...] | None = None
+) -> NDArray[np.float64]:
+    """Return a box (..., k) of values after the filter along axes, by default all; nan stands for no place.
+
+    Filters along two axes do not commute where the share differs, so the mean over their orders is taken: a body that
+    is turned by a right angle is filtered alike.
+    """
+    if axes is None:
+        axes = tuple(axis for axis, count in enumerate(d.shape[:-1]) if count >= len(THIRD))
+    if not axes:
+        return d
+    orders = [_filtered(_along(d, crossed, a), crossed, tuple(b for b in axes if b != a)) for a in axes]
+    return sum(orders[1:], orders[0]) / len(orders)
+
+
+def _along(d: NDArray[np.float64], crossed: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
+    """Return a box (..., k) of values after the filter along one axis."""
+    out, count = d.copy(), d.shape[axis]
+    along, cells = np.moveaxis(out, axis, 0), np.moveaxis(crossed, axis, 0)
+    share = np.minimum(1.0, FAST * (cells[1 : count - 2] + cells[2 : count - 1]) / 2)
+    third = share / 64 * np.diff(along, 3, axis=0)
+    third[np.isnan(third)] = 0.0
+    for k, factor in enumerate(THIRD):
+        along[k : count - 3 + k] -= factor * third
+    return out
 
 
 def lattices(

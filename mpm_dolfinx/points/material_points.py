@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.parallel.exchange import Exchange
+from mpm_dolfinx.points.cutting import centroids
 
 
 def determinant(F: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -53,7 +54,7 @@ class MaterialPoints:
     id : (n,)
         Number of the point in the body.
     corners : (n, 2^d, d), m
-        Tracked corners of the point's domain, in the order of `domains.corner_bits`.
+        Tracked corners of the point's domain, in the order of `cutting.corner_bits`.
     F : (n, d, d)
         Deformation gradient.
     volume0 : (n,), m^d
@@ -64,7 +65,7 @@ class MaterialPoints:
         Pore pressure, positive in compression: the mean over the domain, of second order; what cells and
         domains take along is the state's.
     x : (n, d), m
-        Position.
+        Centroid of the domain, in axisymmetry in the plane: there F and pressure are those of linear fields.
     origin : (n, 2^d, d), m
         Corners from which displacements count: as seeded, or when a stage reset them.
     reference : (n, 2^d, d), m
@@ -105,6 +106,11 @@ class MaterialPoints:
         """Volume ratio det F (n,)."""
         return determinant(self.F)
 
+    @property
+    def displacement(self) -> NDArray[np.float64]:
+        """Displacement (n, d), m, of the centroids, from where displacements count."""
+        return self.x - centroids(self.origin)
+
     def map(self, function: Callable[[NDArray], NDArray]) -> MaterialPoints:
         """Return points with a function applied to each of their arrays: a choice of rows, a copy, a transfer.
 
@@ -119,6 +125,15 @@ class MaterialPoints:
 
         arrays = {f.name: once(getattr(self, f.name)) for f in fields(self) if f.name != "data"}
         return MaterialPoints(**arrays, data={name: once(values) for name, values in self.data.items()})
+
+    def where(self, rows: NDArray[np.bool_], other: MaterialPoints) -> MaterialPoints:
+        """Return these points in some rows (n,), and in the others another state of the same points."""
+
+        def chosen(a: NDArray, b: NDArray) -> NDArray:
+            return a if a is b else np.where(rows.reshape(-1, *[1] * (a.ndim - 1)), a, b)
+
+        arrays = {f.name: chosen(getattr(self, f.name), getattr(other, f.name)) for f in fields(self)[:-1]}
+        return MaterialPoints(**arrays, data={name: chosen(v, other.data[name]) for name, v in self.data.items()})
 
     def joined(self, other: MaterialPoints) -> MaterialPoints:
         """Return these points and others, ordered by id."""

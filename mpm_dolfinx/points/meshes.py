@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Bodies from meshes: each cell is the domain of a material point, or is split into several.
 
-A triangle is split into three quadrilaterals, a tetrahedron into four hexahedra with plane faces, one at each vertex v,
-with the means of v and of some of the others as corners.  Those that are too large for the grid are halved by their own
+How cells are split is said in `mesh_cells`.  Domains that are too large for the grid are halved by their own
 (tri)linear map until they are not.
 """
 
@@ -20,19 +19,16 @@ from scipy.spatial import cKDTree
 
 from mpm_dolfinx.parallel.messages import warn
 from mpm_dolfinx.points.bodies import Body, check_inside
-from mpm_dolfinx.points.contact import Faces, covers, face_vectors
-from mpm_dolfinx.points.cutting import FACES, ORIENTATION, corner_bits, kuhn_simplices, volumes
-from mpm_dolfinx.points.grid import Grid
+from mpm_dolfinx.points.contact import TOUCH, Faces, covers, face_vectors
+from mpm_dolfinx.points.cutting import FACES, ORIENTATION, centroids, corner_bits, kuhn_simplices, volumes
+from mpm_dolfinx.points.grid import Grid, rounding, sum_by
+from mpm_dolfinx.points.mesh_cells import KINDS, PARTS, Polytopes, distinct
 from mpm_dolfinx.validation import whole
 
 LONG = 1.5  # cells over points a cell and direction: domains with longer edges are split
 SMALL = 0.2  # of the cells that domains are wanted in: a warning names smaller ones
 CONVEX = 1e-6  # least volume at a corner of a domain, over that of its box
 SAME = 1e-6  # of the shortest edge: corners nearer than this are one
-KINDS = {2: {"triangle": 3, "quad": 4}, 3: {"tetra": 4, "hexahedron": 8}}
-"""Cells that become domains, and their numbers of vertices."""
-FACETS = {2: {"line": 2}, 3: {"triangle": 3, "quad": 4}}
-"""Cells that are sides."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +95,7 @@ class MeshBody(Body):
 
     def centre_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
         """Return the reference positions (m, d), m, of the centres of domains."""
-        return self.vertices[chosen].mean(axis=1)
+        return centroids(self.vertices[chosen])
 
     @property
     def aligned(self) -> bool:
@@ -149,7 +145,9 @@ class MeshBody(Body):
 def seeded(grid: Grid, mesh: Mesh, part: str | None, per_cell: int, material: int, name: str) -> MeshBody:
     """Return the body of a part of a mesh, or of all of it; see `from_mesh`."""
     per_cell, material = whole("body: per_cell", per_cell), whole("body: material", material, 0)
-    domains, keys, cell = map(np.concatenate, zip(*_domains(mesh, mesh.part(part)), strict=True))
+    cells = mesh.part(part)
+    _check_once(mesh, cells, name)
+    domains, keys, cell = map(np.concatenate, zip(*_domains(mesh, cells), strict=True))
     out = np.flatnonzero(grid.outside(domains.reshape(-1, grid.dim)))
     if len(out):
         x = domains.reshape(-1, grid.dim)[out[0]]
@@ -157,13 +155,17 @@ def seeded(grid: Grid, mesh: Mesh, part: str | None, per_cell: int, material: in
     domains, keys = _turned(domains, keys)
     _check_convex(domains, name)
     facets, facet = _facets(keys)
-    of_cells = np.unique(np.stack([facet.ravel(), np.repeat(cell, 2 * grid.dim)]), axis=1)[0]
-    count = np.bincount(of_cells, minlength=len(facets))
+    sides = np.stack([facet.ravel(), np.repeat(cell, 2 * grid.dim)], axis=1)
+    of, by = sides[distinct(sides)[0]].T
+    count = np.bincount(of, minlength=len(facets))
     if count[1:].max() > 2:
         nodes = facets[1 + count[1:].argmax()]
         x = mesh.x[nodes[nodes >= 0]].mean(axis=0)
         raise ValueError(f"{name}: three cells share the facet at {x}, must be two at most")
     outer = (facet > 0) & (count[facet] == 1)  # 0 is no facet of a cell
+    twice = (of > 0) & (count[of] == 2)
+    _check_sides(mesh, domains, facets, facet, count == 2, name)
+    _check_apart(mesh.x, cells, np.unique(cell[outer.any(axis=1)]), by[twice].reshape(-1, 2), name)
     tagged = {side: outer & _among(facets, rows)[facet] for side, rows in mesh.sides.items()}
     vertices, row, kept = _split(grid, domains, per_cell)
     surface, *tagged_rows = (rows[row].reshape(kept.shape) & kept for rows in (outer, *tagged.values()))
@@ -180,21 +182,118 @@ def _domains(mesh: Mesh, cells: Mapping[str, NDArray[np.int64]]) -> list[tuple[N
     Nodes ascend; those of triangles begin with -1, and those of faces within a cell are all -1.
     """
     d, start, out = mesh.x.shape[1], 0, []
-    for nodes in cells.values():
+    for kind, nodes in cells.items():
         number = start + np.arange(len(nodes))
         start += len(nodes)
-        if nodes.shape[1] == 2**d:
-            out.append((mesh.x[nodes], np.sort(nodes[:, FACES[d]], axis=2), number))
-            continue
-        for v in range(d + 1):
-            others = np.delete(np.arange(d + 1), v)
-            of_corners = [nodes[:, [v, *others[bits == 1]]] for bits in corner_bits(d)]
-            corners = np.stack([mesh.x[of].mean(axis=1) for of in of_corners], axis=1)
+        for part in PARTS[kind]:
+            corners = np.stack([mesh.x[nodes[:, list(of)]].mean(axis=1) for of in part.corners], axis=1)
             keys = np.full((len(nodes), 2 * d, 2 ** (d - 1)), -1)
-            for axis in range(d):
-                keys[:, 2 * axis, 2 ** (d - 1) - d :] = np.sort(np.delete(nodes, others[axis], axis=1), axis=1)
+            for face, of in enumerate(part.faces):
+                if of:
+                    keys[:, face, 2 ** (d - 1) - len(of) :] = np.sort(nodes[:, list(of)], axis=1)
             out.append((corners, keys, number))
     return out
+
+
+def _check_once(mesh: Mesh, cells: Mapping[str, NDArray[np.int64]], name: str) -> None:
+    """Refuse a mesh that has a cell twice: it would weigh, and resist, as two."""
+    for kind, nodes in cells.items():
+        first, same = distinct(np.sort(nodes, axis=1))
+        count = np.bincount(same)
+        if (count > 1).any():
+            x = mesh.x[nodes[first[count > 1][0]]].mean(axis=0)
+            what = f"{np.count_nonzero(count > 1)} cells ({kind}) are there more than once, the first at {x}"
+            raise ValueError(f"{name}: {what}, must be there once")
+
+
+def _check_sides(
+    mesh: Mesh,
+    domains: NDArray[np.float64],
+    facets: NDArray[np.int64],
+    facet: NDArray[np.int64],
+    shared: NDArray[np.bool_],
+    name: str,
+) -> None:
+    """Refuse cells that lie on the same side of a facet (m,) that they share: their outward vectors add up there."""
+    d, size = domains.shape[2], len(facets)
+    outward = np.stack([face_vectors(domains, face) for face in range(2 * d)], axis=1).reshape(-1, d)
+    of = facet.ravel()
+    total = np.linalg.norm([sum_by(of, outward[:, a], size) for a in range(d)], axis=0)
+    same = shared & (total > sum_by(of, np.linalg.norm(outward, axis=1), size) / 2)
+    same[0] = False  # no facet of a cell
+    if same.any():
+        nodes = facets[same.argmax()]
+        x, what = mesh.x[nodes[nodes >= 0]].mean(axis=0), "have both of their cells on one side, the first at"
+        raise ValueError(f"{name}: {same.sum()} facets {what} {x}: cells must not lie on one another")
+
+
+def _check_apart(
+    x: NDArray[np.float64],
+    cells: dict[str, NDArray[np.int64]],
+    outer: NDArray[np.int64],
+    neighbours: NDArray[np.int64],
+    name: str,
+) -> None:
+    """Refuse cells that lie in one another.
+
+    Where all cells lie on the two sides of the facets that they share, how many cells lie at a place changes only at
+    the surface.  So if two lie at a place, there is one with a facet on the surface that lies in another.
+
+    Parameters
+    ----------
+    x : (nodes, d), m
+        Positions of nodes.
+    cells
+        By kind.
+    outer : (m,)
+        Cells with a facet on the surface.
+    neighbours : (n, 2)
+        Cells that share a facet.
+    """
+    corners = [x[nodes] for nodes in cells.values()]
+    boxes = np.concatenate([np.stack([c.min(axis=1), c.max(axis=1)], axis=1) for c in corners])
+    size = boxes[:, 1] - boxes[:, 0]
+    slack = TOUCH / 2 * size.min(axis=1) + rounding(x)
+    pairs = np.stack(_boxes_that_meet(boxes, size, outer, slack), axis=1)
+    both = np.unique(np.sort(pairs, axis=1) @ [len(boxes), 1])
+    both = np.setdiff1d(both, np.sort(neighbours, axis=1) @ [len(boxes), 1], assume_unique=True)
+    pairs = np.stack(np.divmod(both, len(boxes)), axis=1)
+    near_ones, place = np.unique(pairs, return_inverse=True)
+    kinds = np.repeat(np.arange(len(cells)), list(map(len, corners)))[near_ones]
+    row = near_ones - np.cumsum([0, *map(len, corners)])[kinds]
+    solid = Polytopes.of(x, {kind: nodes[row[kinds == k]] for k, (kind, nodes) in enumerate(cells.items())})
+    i, j = place.reshape(pairs.shape).T
+    slack = slack[near_ones] + 2 * solid.warp
+    deep, depth = solid.apart(i, j, slack[i] + slack[j])
+    if len(deep):
+        one, other = boxes[pairs[deep[depth.argmax()]]]
+        meet = (np.maximum(one[0], other[0]) + np.minimum(one[1], other[1])) / 2
+        what = f"{len(np.unique(pairs[deep]))} cells lie on one another, the first at {meet}"
+        raise ValueError(f"{name}: {what}, {depth.max():.3g} m deep; must not lie in each other")
+
+
+def _boxes_that_meet(
+    boxes: NDArray[np.float64], size: NDArray[np.float64], outer: NDArray[np.int64], slack: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the pairs (n,), (n,) of an outer cell and another whose boxes (m, 2, d) lie in each other.
+
+    Boxes are looked for by octaves of their size, so that few large ones do not make many of the small ones near.
+    """
+    octave, middle = np.frexp(size.max(axis=1))[1], (boxes[:, 0] + boxes[:, 1]) / 2
+    of = [[rows[octave[rows] == k] for k in np.unique(octave[rows])] for rows in (outer, np.arange(len(boxes)))]
+    largest = [[size[rows].max(axis=0) for rows in groups] for groups in of]
+    out = [np.empty((2, 0), dtype=np.int64)]
+    for a, most in zip(of[0], largest[0], strict=True):
+        for b, other in zip(of[1], largest[1], strict=True):
+            trees = [cKDTree(middle[rows] * (2 / (most + other))) for rows in (a, b)]
+            pairs = trees[0].sparse_distance_matrix(trees[1], 1.0, p=np.inf, output_type="ndarray")
+            i, j = a[pairs["i"]], b[pairs["j"]]
+            meet = (i != j) & (np.abs(middle[i] - middle[j]) < (size[i] + size[j]) / 2).all(axis=1)
+            i, j = i[meet], j[meet]
+            lap = np.minimum(boxes[i, 1], boxes[j, 1]) - np.maximum(boxes[i, 0], boxes[j, 0])
+            meet = (lap > (slack[i] + slack[j])[:, None]).all(axis=1)
+            out.append(np.stack([i[meet], j[meet]]))
+    return tuple(np.concatenate(out, axis=1))
 
 
 def _turned(domains: NDArray[np.float64], keys: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
@@ -227,16 +326,16 @@ def _check_convex(domains: NDArray[np.float64], name: str) -> None:
 def _facets(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the different facets (m, k), the first one no facet at all, and which one each face (n, 2d) lies on."""
     rows = np.concatenate([np.full((1, keys.shape[2]), -1), keys.reshape(-1, keys.shape[2])])
-    facets, facet = np.unique(rows, axis=0, return_inverse=True)
-    return facets, facet.ravel()[1:].reshape(keys.shape[:2])
+    first, facet = distinct(rows)
+    return rows[first], facet[1:].reshape(keys.shape[:2])
 
 
 def _among(facets: NDArray[np.int64], named: Sequence[NDArray[np.int64]]) -> NDArray[np.bool_]:
     """Return which facets (m,) of a mesh are among those of a side."""
     width = facets.shape[1]
     rows = [np.pad(np.sort(n, axis=1), ((0, 0), (width - n.shape[1], 0)), constant_values=-1) for n in named]
-    both, at = np.unique(np.concatenate([facets, *rows]), axis=0, return_inverse=True)
-    at, among = at.ravel(), np.zeros(len(both), dtype=bool)
+    first, at = distinct(np.concatenate([facets, *rows]))
+    among = np.zeros(len(first), dtype=bool)
     among[at[len(facets) :]] = True
     return among[at[: len(facets)]]
 
@@ -267,7 +366,7 @@ def _check_conforming(body: MeshBody, name: str) -> None:
     if len(cover.face):
         x = own.corners[cover.face[0]].mean(axis=0)[: body.dim]
         what = f"{len(np.unique(cover.face))} faces lie on others without sharing their nodes, the first at {x}"
-        raise ValueError(f"{name}: {what}: hanging or doubled nodes, which must be merged")
+        raise ValueError(f"{name}: {what}: hanging or doubled nodes, which must be merged, or be of two parts")
 
 
 def _warn_small(grid: Grid, body: MeshBody, per_cell: int, name: str) -> None:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.parallel.exchange import at_root
 from mpm_dolfinx.points.grid import Grid
-from mpm_dolfinx.points.mesh_files import AS_LATTICE
+from mpm_dolfinx.points.mesh_cells import AS_LATTICE
 from mpm_dolfinx.points.meshes import Mesh, MeshBody, seeded
 from mpm_dolfinx.validation import instance, line, numbers, whole
 

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from mpi4py import MPI
@@ -53,13 +53,6 @@ class Probes:
         """Return the present positions (m, d), m, on every process."""
         here, at = points.find(self.id)
         return self._shared(comm, here, interpolate(points.corners[at], self.xi[here]))
-
-    def at_points(
-        self, points: MaterialPoints, comm: MPI.Intracomm, value: Callable[[MaterialPoints], NDArray[np.float64]]
-    ) -> NDArray[np.float64]:
-        """Return what a function gives of the points whose domains hold the probes, (m, ...), on every process."""
-        here, at = points.find(self.id)
-        return self._shared(comm, here, value(points.map(lambda rows: rows[at])))
 
     def _shared(self, comm: MPI.Intracomm, here: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return values (m, ...) on every process of those of the probes that are here."""

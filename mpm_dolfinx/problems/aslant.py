@@ -107,7 +107,7 @@ class Gradients:
         distance = np.einsum("md,md->m", reach, self._normal[known])
         to_sides = (weight / np.maximum(distance**2, near))[:, None] * reach
         size = np.linalg.norm(sealed, axis=1, keepdims=True)
-        closed = np.divide(sealed, h * np.sqrt(np.maximum(size, size**2)), out=np.zeros_like(sealed), where=size > 0)
+        closed = np.divide(sealed, np.sqrt(np.maximum(size, size**2)), out=np.zeros_like(sealed), where=size > 0)
         A = np.einsum("nki,nkj->nij", to_cells, self._way) + closed[:, :, None] * closed[:, None, :]
         for i, j in np.ndindex(d, d):
             A[:, i, j] += sum_by(at, to_sides[:, i] * reach[:, j], len(A))

@@ -51,9 +51,26 @@ class Balances(NamedTuple):
     momentum: MomentumProblem
     storage: StorageProblem | None
 
+    def outcome(self, state: State, acting: Acting) -> dict[str, NDArray[np.float64]]:
+        """Return what acts between the bodies and what holds or drains them at the end of a step, see `State`."""
+        stage, storage, forms = state.stage, self.storage, self.momentum.forms
+        return {
+            "reactions": stage.mechanical.reactions(acting.sides, forms.nodal),
+            "walls": self.momentum.wall_forces(stage.conditions["fixed"]),
+            "outflows": storage.outflows(len(stage.hydraulic.outlets)) if storage else state.outflows,
+        }
+
     def came(self, rates: Rates | None) -> NDArray[np.float64] | None:
         """Return what came to the cells in the step, see `StorageProblem.came`; None without fluid."""
         return self.storage and self.storage.came(rates)
+
+
+def at_rest(scene: Scene, state: State, sides: list[SideData]) -> list[SideData]:
+    """Return what acts on sides in each substep, what holds them with its forces of an initial stress at rest."""
+    if state.rest is None:
+        return sides
+    scene.momentum.u.x.array[:] = state.rest
+    return [of.moved(scene.momentum.u) for of in sides]
 
 
 def going_on(scene: Scene, start: Start, substep: Substep) -> NDArray[np.float64] | None:
@@ -80,7 +97,7 @@ def balances(scene: Scene, start: Start, acting: Acting, before: Rates | None = 
     substep, on_grid, matrices, dt = acting.substep, start.on_grid, start.matrices, start.dt
     scene.set_time(acting.t, substep.end * dt, acting.gravity)
     scene.momentum.set_rate(substep.own * dt, substep.before / substep.own)
-    forces = matrices.round_off, scene.scheme.tolerance, going_on(scene, start, substep), start.state.held
+    forces = scene.scheme.tolerance, going_on(scene, start, substep), start.state.held
     momentum = MomentumProblem(scene.momentum, matrices.momentum, start.data, acting.sides, *forces, start.yielded)
     if scene.storage is None:
         return Balances(momentum, None)

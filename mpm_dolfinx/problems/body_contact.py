@@ -91,17 +91,16 @@ class BodyContact(CellContact):
 
     def operator(self, unknowns: Unknowns) -> tuple[PETSc.Mat, PETSc.Vec]:
         """Return B, which gives how far pairs move apart (m d,), m, from the unknowns, and room for its product."""
+        return self._operator(unknowns, lambda: self._apart_by(unknowns), self.grid.comm)
 
-        def make() -> tuple[PETSc.Mat, PETSc.Vec]:
-            grid, rows = self.grid, self.rows
-            index = np.stack(np.unravel_index(rows.other % grid.cells, tuple(grid.shape)), axis=1)
-            off = (rows.y - grid.lower) / grid.h - index - 0.5
-            other = np.prod(0.5 + off[:, None] * grid.signs, axis=2)
-            value = np.concatenate([grid.shape_values(rows.cell, rows.x), -other], axis=1)
-            B = self._of_nodes(unknowns, rows.cell, rows.other, value)
-            return B, B.createVecLeft()
-
-        return self._operator(unknowns, make, self.grid.comm)
+    def _apart_by(self, unknowns: Unknowns) -> tuple[PETSc.Mat, PETSc.Vec]:
+        grid, rows = self.grid, self.rows
+        index = np.stack(np.unravel_index(rows.other % grid.cells, tuple(grid.shape)), axis=1)
+        off = (rows.y - grid.lower) / grid.h - index - 0.5
+        other = np.prod(0.5 + off[:, None] * grid.signs, axis=2)
+        value = np.concatenate([grid.shape_values(rows.cell, rows.x), -other], axis=1)
+        B = self._of_nodes(unknowns, rows.cell, rows.other, value)
+        return B, B.createVecLeft()
 
     def _of_nodes(
         self, unknowns: Unknowns, cell: NDArray[np.int32], other: NDArray[np.int64], value: NDArray[np.float64]
@@ -137,6 +136,13 @@ class BodyContact(CellContact):
         """Take the forces of the contact at u off a residual, N."""
         force = self.at(unknowns, u).force
         B, w = self.operator(unknowns)
+        w.array_w[:] = -force.ravel()
+        B.multTransposeAdd(w, residual, residual)
+
+    def push_on(self, held: Unknowns, unknowns: Unknowns, u: NDArray[np.float64], residual: PETSc.Vec) -> None:
+        """Take its forces at u on other components of nodes, which do not move, off a residual of these, N."""
+        force = self.at(unknowns, u).force
+        B, w = self._apart_by(held)
         w.array_w[:] = -force.ravel()
         B.multTransposeAdd(w, residual, residual)
 

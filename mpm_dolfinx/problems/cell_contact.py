@@ -265,9 +265,9 @@ class CellContact:
         return most
 
     @property
-    def rounding(self) -> float:
-        """What rounding of coordinates makes of the forces, N, of this process."""
-        return 1e-15 * float((self.stiffness * self.rows.area).max(initial=0.0)) * self._reach
+    def rounding(self) -> NDArray[np.float64]:
+        """What rounding of coordinates makes of the forces (m,), N, of the rows."""
+        return 1e-15 * self.stiffness * self.rows.area * self._reach
 
     @property
     def _reach(self) -> float:

@@ -13,10 +13,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from mpm_dolfinx.given_values import by_place
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.faces import Surface
 from mpm_dolfinx.points.grid import SIDES, Grid
-from mpm_dolfinx.problems.conditions import Pressure, by_place
+from mpm_dolfinx.problems.conditions import Pressure
 
 SAME = 1e-6  # cells: corners this close are one
 

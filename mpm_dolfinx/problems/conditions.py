@@ -6,96 +6,52 @@ in the seeded body, before a map; sides of a mesh as it names them (`from_mesh`)
 lies on another body, as seeded, does not count.
 Regions and X are reference positions, before all maps (`mapped`); areas are those as seeded, after them.
 
-Functions are called with those of these arguments that they name; one of a single argument, of another name, has t:
+Values may be functions of the time t, the reference places X and the present places x, by these names: how they are
+called, and what they may give, stands in `given_values`.
 
-t
-    Time, s: the ends of the substeps, see `time_integration`.
-X : (m, d), m
-    Reference positions of m places on the side.
-x : (m, d), m
-    Where these are at the start of the step, as for a water level.
-
-A function of places gives a number, or one for each place (m,), of tractions also vectors (m, d).
-
-What is wrong with a condition is said, with a ValueError, when a scene or a stage is made with it, of functions of time
-at the step that asks for it.  A condition equals only itself: values and regions may be arrays and functions, which
-have no equality of their own.
+What is wrong with a condition is said, with a ValueError, when it is made, or a scene or a stage with it; of what
+functions give at the step that asks for it.  A condition equals only itself: values and regions may be arrays and
+functions, which have no equality of their own.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass
-from inspect import signature
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.constitutive.skeleton import Skeleton
+from mpm_dolfinx.given_values import NAMES, Places, check_names, given
 from mpm_dolfinx.points.faces import Region, Surface
-from mpm_dolfinx.validation import asked, flag, line, numbers
-
-Places = Callable[[str], NDArray[np.float64]]
-"""Gives positions (m, d), m, on a side by their name, "X" or "x"."""
-PLACES = ("X", "x")
+from mpm_dolfinx.validation import flag, line, numbers
 
 
-def arguments(function: Callable) -> list[str]:
-    """Return those of t, X and x with which a function is called; ["t"] where its only argument has another name."""
-    try:
-        wanted = [
-            p.name
-            for p in signature(function).parameters.values()
-            if p.default is p.empty and p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)
-        ]
-    except ValueError:  # numpy's functions have none
-        return ["t"]
-    names = [name for name in wanted if name in ("t", *PLACES)]
-    return names if names and len(names) == len(wanted) else ["t"] * max(1, len(wanted))
+class _Condition:
+    """What a condition is given, in lists and arrays too, is its own: nobody changes it."""
 
+    FUNCTIONS: ClassVar[Mapping[str, Sequence[str]]] = {"value": NAMES}
+    """Values that may be functions, and of what."""
 
-def by_place(value) -> bool:
-    """Return whether a value is a function of places."""
-    return callable(value) and bool(set(PLACES) & set(arguments(value)))
+    def __post_init__(self):
+        for name, value in vars(self).items():
+            if isinstance(value, (list, tuple, np.ndarray)):
+                object.__setattr__(self, name, deepcopy(value))
+        for name, among in self.FUNCTIONS.items():
+            if callable(getattr(self, name)):
+                check_names(f"{line(self)}: {name}", getattr(self, name), among)
 
-
-def given(condition, name: str, t: float, side: Places | None, dim: int = 0) -> NDArray[np.float64]:
-    """Return a value of a condition at time t (s): of shape (), or (m,) of m places; with a dimension (d,), or (m, d).
-
-    Parameters
-    ----------
-    condition, name
-        The condition, and which of its values.
-    side
-        Gives the places; None where there are none.
-    dim
-        Number of components that it may have.
-
-    Raises
-    ------
-    ValueError
-        Naming the condition, what its value is, and what is allowed.
-    """
-    value, what = getattr(condition, name), f"{line(condition)}: {name} at t = {t:g} s"
-    vectors = f" or {dim} of them" if dim else ""
-    allowed, shapes = f"a finite number{vectors}", [(), *[(dim,)] * bool(dim)]
-    if callable(value):
-        wanted = arguments(value)
-        named = [k for k in wanted if k in PLACES]
-        if wanted.count("t") > 1 or (named and side is None):
-            raise ValueError(f"{what}: must be a function of t" + (", X and x" if side is not None else " alone"))
-        places = [side(k) for k in named]
-        if places and not len(places[0]):  # a function need not have an answer for no places
-            return np.zeros(0)
-        if places:
-            allowed = f"a finite number{vectors} for each of {len(places[0])} places, or a number"
-            shapes = [(), (len(places[0]),), *[places[0].shape] * bool(dim)]
-        value = asked(what, allowed, value, *(t if k == "t" else side(k) for k in wanted))
-    return numbers(what, value, *shapes, allowed=allowed)
+    def _given(self, name: str, t: float, *more, **options) -> NDArray[np.float64]:
+        """Return one of its values at time t (s), see `given_values.given`."""
+        what, among = f"{line(self)}: {name} at t = {t:g} s", self.FUNCTIONS[name]
+        return given(what, getattr(self, name), t, *more, among=among, **options)
 
 
 @dataclass(frozen=True, eq=False)
-class Traction:
+class Traction(_Condition):
     """Dead traction on a side of the bodies.
 
     Parameters
@@ -103,7 +59,7 @@ class Traction:
     side
         Side of the bodies: "left", "right", "bottom", "top", in 3D also "front" (lower y) and "back" (upper y); of
         bodies from meshes as these name it.  Where several bodies have one of this name it is all of them.
-    value : (d,) or number, or callable (t, X, x) -> (d,) or number, Pa
+    value : (d,) or number, or callable (t, X, x) -> (d,) or number, or one of these a place, Pa
         Force per reference area; a number acts along the outward normal at the start of the step, negative: presses.
         Several tractions on one face add up.
     region : ((d,), (d,)), m
@@ -122,11 +78,11 @@ class Traction:
 
     def at(self, t: float, dim: int, side: Places | None = None) -> NDArray[np.float64]:
         """Return the traction (d,) or (m, d), or () or (m,) along the normal, at time t (s), Pa, in a dimension."""
-        return given(self, "value", t, side, dim)
+        return self._given("value", t, side, dim)
 
 
 @dataclass(frozen=True, eq=False)
-class Pressure:
+class Pressure(_Condition):
     """Pressure on a side of the bodies, wherever it goes: normal to the present surface, per present area.
 
     Given among the tractions, with which it adds up.  It acts on skeleton and pore fluid together: of water that also
@@ -155,11 +111,11 @@ class Pressure:
 
     def at(self, t: float, side: Places | None = None) -> NDArray[np.float64]:
         """Return the pressure () or (m,) at time t (s), Pa."""
-        return given(self, "value", t, side)
+        return self._given("value", t, side)
 
 
 @dataclass(frozen=True, eq=False)
-class OnSide:
+class OnSide(_Condition):
     """Term of the user's own on a side of the bodies, in UFL: springs, dashpots, loads that depend on what moves.
 
     Given among the `terms` of the scene, for all of its stages.
@@ -183,10 +139,11 @@ class OnSide:
     side: str
     term: Callable
     region: Region | None = None
+    FUNCTIONS: ClassVar[Mapping[str, Sequence[str]]] = {}
 
 
 @dataclass(frozen=True, eq=False)
-class Drained:
+class Drained(_Condition):
     """Side of the bodies, moving with them, at which the pore pressure is given.
 
     What leaves through it is in the simulation's `outflows`.
@@ -214,19 +171,21 @@ class Drained:
     pressure: float | Callable[..., ArrayLike] = 0.0
     region: Region | None = None
     seepage: bool = False
+    FUNCTIONS: ClassVar[Mapping[str, Sequence[str]]] = {"pressure": NAMES}
 
     def __post_init__(self):
+        super().__post_init__()
         flag("Drained: seepage", self.seepage)
         if not callable(self.pressure):
             numbers("Drained: pressure", self.pressure)
 
     def at(self, t: float, side: Places | None = None) -> NDArray[np.float64]:
         """Return the pressure () or (m,) at time t (s), Pa."""
-        return given(self, "pressure", t, side)
+        return self._given("pressure", t, side)
 
 
 @dataclass(frozen=True, eq=False)
-class Inflow:
+class Inflow(_Condition):
     """Side of the bodies through which fluid is pressed in.
 
     Parameters
@@ -247,14 +206,16 @@ class Inflow:
     side: str
     flux: float | Callable[..., ArrayLike]
     region: Region | None = None
+    FUNCTIONS: ClassVar[Mapping[str, Sequence[str]]] = {"flux": NAMES}
 
     def __post_init__(self):
+        super().__post_init__()
         if not callable(self.flux):
             numbers("Inflow: flux", self.flux)
 
     def at(self, t: float, side: Places | None = None) -> NDArray[np.float64]:
         """Return the flux () or (m,) at time t (s), m/s."""
-        return given(self, "flux", t, side)
+        return self._given("flux", t, side)
 
 
 RIGIDITY = 1e4
@@ -287,7 +248,7 @@ def holding(material: Skeleton) -> NDArray[np.float64]:
 
 
 @dataclass(frozen=True, eq=False)
-class Displacement:
+class Displacement(_Condition):
     """Side of the bodies whose displacement is given: a footing, a clamp that moves, a body carried along.
 
     The forces that it takes are `reactions` of the simulation.
@@ -297,13 +258,14 @@ class Displacement:
     side
         Side of the bodies, as for `Traction`.
     value : (d,) or callable (t, X) -> (d,) or (m, d), m
-        Displacement of the side since the start, or since a stage reset it, given the time (s) and the reference
-        positions X (m, d), of which a bent body's map gives the places as seeded.  A number for every component, also
-        for those that are free.
+        Displacement of the side since the start, or since a stage reset it, at the reference positions X (m, d), of
+        which a bent body's map gives the places as seeded.  A number for every component, also for those that are
+        free.
     components
         Components that are given, such as "y"; the others are free.  By default all.
     region : ((d,), (d,)), m
-        Box of reference positions to which the condition is limited.
+        Box of reference positions to which the condition is limited.  A cell of which the region, where it ends within
+        a side, covers no more than half is not held: the last node carries half a cell beyond it.
 
     Raises
     ------
@@ -314,9 +276,10 @@ class Displacement:
     """
 
     side: str
-    value: ArrayLike | Callable[[float, NDArray[np.float64]], ArrayLike]
+    value: ArrayLike | Callable[..., ArrayLike]
     components: str = ""
     region: Region | None = None
+    FUNCTIONS: ClassVar[Mapping[str, Sequence[str]]] = {"value": ("t", "X")}
 
     def axes(self, dim: int) -> list[int]:
         """Return the axes of the given components."""
@@ -326,10 +289,8 @@ class Displacement:
 
     def at(self, t: float, X: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the displacement (m, d), m, at time t (s) of reference positions X (m, d)."""
-        m, d = X.shape
-        name, allowed = f"{line(self)}: value at t = {t:g} s", f"{d} finite numbers, or {d} for each of {m} places"
-        value = asked(name, f"{allowed}, for (t, X)", self.value, t, X) if callable(self.value) else self.value
-        return np.broadcast_to(numbers(name, value, (d,), X.shape, allowed=allowed), X.shape)
+        value = self._given("value", t, lambda name: X, X.shape[1], number=False)
+        return np.broadcast_to(value, X.shape)
 
 
 @dataclass(frozen=True, eq=False)
@@ -341,7 +302,7 @@ class _OfPlate(Traction):
 
 
 @dataclass(frozen=True, eq=False)
-class RigidPlate:
+class RigidPlate(_Condition):
     """Rigid, smooth plate on a flat side of the bodies: one displacement along the side's axis for all its faces.
 
     The slope of the faces is penalised, kappa/2 int |grad_t x_n|^2 dA; an even displacement is free, so
@@ -367,8 +328,10 @@ class RigidPlate:
     side: str
     force: float | Callable[[float], float]
     region: Region | None = None
+    FUNCTIONS: ClassVar[Mapping[str, Sequence[str]]] = {"force": ("t",)}
 
     def __post_init__(self):
+        super().__post_init__()
         if not callable(self.force):
             numbers("RigidPlate: force", self.force)
 
@@ -376,9 +339,7 @@ class RigidPlate:
         """Return the even traction of the plate, along a direction (d,), on its reference area, m^(d-1)."""
 
         def even(t: float) -> NDArray[np.float64]:
-            name = f"{line(self)}: force at t = {t:g} s"
-            force = asked(name, "a finite number for a time", self.force, t) if callable(self.force) else self.force
-            return inward * numbers(name, force) / area
+            return inward * self._given("force", t) / area
 
         return _OfPlate(self.side, even, self.region)
 

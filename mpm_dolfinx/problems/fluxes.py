@@ -203,13 +203,12 @@ class CellContents(Keyed):
         self.filled, self._slot = filled, np.zeros(grid.num_local, dtype=np.int64)
         self._slot[filled] = np.arange(len(filled))
         self._cells, self.weight = cells, weight = pieces.cells, pieces.weight
-        self._volume = volume = self.total(cells, weight)
+        self.volume = self.total(cells, weight)
+        """Volumes (n,) of what the filled cells hold, m^d."""
         self.area, area = pieces.area, self.total(cells, pieces.area)
         """Of the pieces (m,), m^d; in axisymmetry in the plane, m^2."""
         self.fill = np.minimum(area / grid.cell_volume, 1.0)
         """Filled share of the filled cells."""
-        self.volume = volume.sum()
-        """Volume of all that this process's cells hold, m^d."""
         shapes = (forms.centroid, forms.lower_face, forms.upper_face)
         self._damped, self._damping = forms.damping, pieces.damping
         for f in (forms.fixed_stress, *shapes):
@@ -250,15 +249,20 @@ class CellContents(Keyed):
 
     def mean(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the means over the pieces (m,) of each filled cell."""
-        return self.total(self._cells, self.weight * values) / self._volume
+        return self.total(self._cells, self.weight * values) / self.volume
 
-    def motion(self, u: NDArray[np.float64]) -> CellMotion:
-        """Return what becomes of the filled cells, at their centroids, by nodal u (nodes, d), m."""
+    def motion(self, u: NDArray[np.float64], rests: NDArray[np.int64] | None = None) -> CellMotion:
+        """Return what becomes of the filled cells, at their centroids, by nodal u (nodes, d), m; nothing of some."""
         nodal, hoop = u[self.grid.cell_nodes[self.filled]].transpose(0, 2, 1), None
         moved = np.einsum("ndk,nk->nd", nodal, self._values)
         if self.grid.axisymmetric:
             hoop = 1 + moved[:, 0] / (self.grid.midpoints[self.filled, 0] + self.centroid[self.filled, 0])
-        return CellMotion(np.eye(self.grid.dim) + nodal @ self._slopes, moved, hoop)
+        F = np.eye(self.grid.dim) + nodal @ self._slopes
+        if rests is not None:
+            F[rests], moved[rests] = np.eye(self.grid.dim), 0.0
+            if hoop is not None:
+                hoop[rests] = 1.0
+        return CellMotion(F, moved, hoop)
 
     def slot(self, cells: NDArray[np.int32]) -> NDArray[np.int64]:
         """Return the places of cells among the filled ones."""
@@ -324,9 +328,11 @@ class FluxForms:
         self.gravity = None
         if weight is not None and flows:
             apart = across * n0 - ufl.jump(self.centroid + self.moved)
-            # so water at rest, whose pressure grows by its weight at zero pressure, stays at rest
+            # so water at rest, whose pressure grows by its weight at zero pressure, stays at rest; the two at once for
+            # each face: rounding of what leaves a cell enters its neighbour, and is that of small differences
             density = density_between(pressure("+"), pressure("-"), fem.Constant(mesh, 1 / bulk))
-            self.gravity = FacetForm(T * density * ufl.dot(weight, apart) * ufl.jump(q) * dS, grid.comm)
+            drives = ufl.jump(pressure) + ufl.dot(weight, apart)
+            self.gravity = FacetForm(T * density * drives * ufl.jump(q) * dS, grid.comm)
 
     def along(
         self, slope: NDArray[np.float64], cells: NDArray[np.int64], facets: FacetSum, density: NDArray[np.float64]

@@ -15,7 +15,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mpm_dolfinx.points.grid import Grid, sum_by
+from mpm_dolfinx.parallel.exchange import over_all
+from mpm_dolfinx.points.grid import Grid, among, sum_by
 from mpm_dolfinx.problems.conditions import HOLD, WEAK
 
 FLAT = 1e-6  # cells^2: variance of places far below which a side has no extent in a cell
@@ -33,9 +34,9 @@ class HeldPoints(NamedTuple):
 
     number, cell : (n,) condition, and local cell; area : (n,) reference area, m^(d-1); modulus, tension, resistance,
     firm : (n,) modulus to hold with, norm of the stress when the grid was reset, what resists, and what resists where
-    nothing can give way, times area, N; x, gap :
-    (n, d) position, and how far it is from where it is to be, m; normal : (n, d) area vector when the grid was reset,
-    m^(d-1); force : (n, d) of the body's present stress, as the side turns it, N.
+    nothing can give way, times area, N; x, gap, given : (n, d) position, how far it is from where it is to be, and the
+    given displacement, m; normal : (n, d) area vector when the grid was reset, m^(d-1); force : (n, d) of the body's
+    present stress, as the side turns it, N.
     """
 
     number: NDArray[np.int64]
@@ -47,6 +48,7 @@ class HeldPoints(NamedTuple):
     firm: NDArray[np.float64]
     x: NDArray[np.float64]
     gap: NDArray[np.float64]
+    given: NDArray[np.float64]
     normal: NDArray[np.float64]
     force: NDArray[np.float64]
 
@@ -90,7 +92,9 @@ class HeldCells:
 
         x, gap, normal, N = mean(p.x), mean(p.gap), total(p.normal), grid.shape_values(p.cell, p.x)
         off = p.x - x[at]
-        slope = mean(off[:, :, None] * (p.gap - gap[at])[:, None, :]) / (mean(off**2) + FLAT * grid.h**2)[:, :, None]
+        given, spread = mean(p.given), (mean(off**2) + FLAT * grid.h**2)[:, :, None]
+        slopes = (mean(off[:, :, None] * (v - m[at])[:, None, :]) / spread for v, m in ((p.gap, gap), (p.given, given)))
+        slope, rise = slopes
         along = 2 * normal**2 <= (normal**2).sum(axis=1, keepdims=True)
         self.number, self.cell = both(key // grid.num_local, p.number), both(key % grid.num_local, p.cell)
         self.x, self.shape = both(x, p.x), both(mean(N), N)
@@ -108,12 +112,16 @@ class HeldCells:
         self.limit = CARRIED * total(p.resistance + 10 * p.tension) * short
         self._gap, self._force = both(gap, p.gap), both(0 * gap, p.force)
         self._slope, self._along = both(slope, slope[at]), both(along, along[at])
+        self._given, self._rise = both(given, given[at]), both(rise, rise[at])
+        self._x = both(x, x[at])
 
     def rows(self, axis: int, given: NDArray[np.bool_], free: NDArray[np.bool_]) -> tuple:
         """Return which rows give a component, their gaps (k,), m, with what their force makes of them; what is refused.
 
         Where a wall that the side runs into holds nodes of the cell, these are asked for nothing: else its other nodes
-        would make up for them, and others for these, to and fro along the side.
+        would make up for them, and others for these, to and fro along the side.  A side that is to move at the wall,
+        by more than half of its motion beside it, bends over this cell; then its other nodes are held by it only where
+        no other cell holds them.
 
         Parameters
         ----------
@@ -126,22 +134,46 @@ class HeldCells:
 
         Returns
         -------
-        Rows (k,), their stiffnesses (k,) and gaps (k,); of a row that walls hold and that has to move, its index or -1.
+        Rows (k,), their stiffnesses (k,) and gaps (k,), and the share (k,) of their forces that the wall does not bear;
+        of a row that walls hold and that has to move, its index or -1.
         """
         grid, chosen = self.grid, np.flatnonzero(given[self.number])
         nodes, x, gap, N = (v[chosen] for v in (grid.cell_nodes[self.cell], self.x, self._gap[:, axis], self.shape))
         walled = ~free[nodes]
         held = ((N * ~walled).sum(axis=1) < FREE) & (np.abs(gap) > SAME * grid.h.min())
         stuck, asked = np.zeros_like(walled), np.repeat(gap[:, None], N.shape[1], axis=1)
+        given, torn = self._given[chosen, axis], np.zeros(len(chosen), dtype=bool)
         for b in range(grid.dim):
             for sign in (-1, 1):
                 here = grid.signs[:, b] == sign
                 at_wall = (walled[:, here].all(axis=1) & self._along[chosen, b])[:, None] & here
                 asked += at_wall * ((grid.node_x[nodes, b] - x[:, b, None]) * self._slope[chosen, b, axis, None])
                 stuck |= at_wall
+                there = self._rise[chosen, b, axis, None] * (grid.node_x[nodes, b] - self._x[chosen, b, None])
+                torn |= (at_wall & (np.abs(given[:, None] + there) > np.abs(given)[:, None] / 2)).any(axis=1)
+        kept = ~self._held_beside(self.number[chosen], nodes, N, stuck & torn[:, None])
         stiffness = self.stiffness[chosen, axis]
         gap = gap - (N * stuck * asked).sum(axis=1) + self._force[chosen, axis] / stiffness
-        return chosen, stiffness, gap, chosen[held][0] if held.any() else -1
+        beside = 1 - torn * (N * stuck).sum(axis=1)
+        return *(rows[kept] for rows in (chosen, stiffness, gap, beside)), chosen[held][0] if held.any() else -1
+
+    def _held_beside(
+        self, number: NDArray[np.int64], nodes: NDArray[np.int32], N: NDArray[np.float64], stuck: NDArray[np.bool_]
+    ) -> NDArray[np.bool_]:
+        """Return which rows (k,) have nodes of a wall, `stuck` (k, 2^d), and others that all have rows without such.
+
+        number, nodes, N : (k,), (k, 2^d) twice
+            Conditions, nodes, and shape functions.
+        """
+        grid, at_wall, some = self.grid, stuck.any(axis=1), N > FREE
+        if not over_all(grid.comm, int(at_wall.sum())):
+            return at_wall
+        shape = (*(grid.shape + 1), grid.copies)
+        place = np.ravel_multi_index(tuple(grid.node_places(nodes.ravel()).T), shape).reshape(nodes.shape)
+        key = place + number[:, None] * np.prod(shape)
+        asked = np.unique(np.concatenate(grid.comm.allgather(key[(some & ~stuck) & at_wall[:, None]])))
+        found = over_all(grid.comm, np.isin(asked, key[some & ~at_wall[:, None]]).astype(np.int64)) > 0
+        return at_wall & (among(key, asked[found]) | ~some | stuck).all(axis=1)
 
     def beyond(
         self, row: NDArray[np.int64], axis: NDArray[np.int64], force: NDArray[np.float64], told: Collection[int]

@@ -69,7 +69,11 @@ class HydraulicBoundary:
         seeps = np.array([getattr(outlet, "seepage", False) for outlet, _ in self.outlets], dtype=bool)[number]
         size, reach = np.linalg.norm(area, axis=1), x - grid.midpoints[cell] - contents.centroid[cell]
         least = contents.fill[contents.slot(cell)] * grid.h.min() / THICK / (grid.dim + 1)
-        shape = size / np.maximum(np.einsum("md,md->m", reach, area / size[:, None]), least)
+        normal = area / size[:, None]
+        distance = np.einsum("md,md->m", reach, normal)
+        shape = size / np.maximum(distance, least)
+        if grid.axisymmetric:  # half-way to the centroid rings are as much longer or shorter
+            shape = shape * (1 - distance * normal[:, 0] / (2 * x[:, 0]))
         shape, pressure = (np.where(drains, values, 0.0) for values in (shape, value))
         given = np.where(drains, 0.0, value * size)
         return OpenSides(number, cell, shape, pressure, given, seeps & (value <= 0), area, reach)

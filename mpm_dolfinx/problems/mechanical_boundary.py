@@ -17,6 +17,7 @@ from mpm_dolfinx.caching import Latest
 from mpm_dolfinx.constitutive.fields import SceneMaterials
 from mpm_dolfinx.forms.point_forms import FormPoints, Places, PointData
 from mpm_dolfinx.forms.unknowns import Unknowns
+from mpm_dolfinx.given_values import by_place
 from mpm_dolfinx.parallel.exchange import Exchange, first
 from mpm_dolfinx.parallel.messages import warn
 from mpm_dolfinx.points.cut_domains import CutDomains, Patches
@@ -32,7 +33,6 @@ from mpm_dolfinx.problems.conditions import (
     Pressure,
     RigidPlate,
     Traction,
-    by_place,
     facing,
     holding,
     inward,
@@ -106,6 +106,9 @@ class MechanicalBoundary:
             if common := sorted(set(axes) & set(more)):
                 check_apart(one, faces, other, others)
                 self._meeting.append((one, other, common, meeting(sides.bodies, faces, others)))
+        for k, (hold, _, axes) in enumerate(self.holds):
+            others = [other for other, _, more in self.holds if other is not hold and set(axes) & set(more)]
+            self.holds[k] = (hold, sides.held(hold, others), axes)
         pressures = [pressure for pressure, _ in self.pressures]
         for condition in [*tractions, *pressures, *displacements]:
             if not callable(condition.value):  # what a function gives is checked when it is called
@@ -138,6 +141,19 @@ class MechanicalBoundary:
     def grip(self, points: MaterialPoints, before: MaterialPoints | None = None) -> MaterialPoints:
         """Return points with what tools and contacts have on them: nothing, or what the same points had `before`."""
         return gripped(points, {**self.tools.kept(len(points)), **self.contacts.kept(len(points))}, before)
+
+    @property
+    def holds_sides(self) -> bool:
+        """Whether there are given displacements or plates."""
+        return bool(self.holds or self.plates)
+
+    def holds_as(self, other: MechanicalBoundary) -> bool:
+        """Return whether the same given displacements and plates hold the same faces."""
+        own, others = ([(hold, faces) for hold, faces, *_ in (*of.holds, *of.plates)] for of in (self, other))
+        return len(own) == len(others) and all(
+            hold is was and np.array_equal(faces.id, then.id) and np.array_equal(faces.xi, then.xi)
+            for (hold, faces), (was, then) in zip(own, others, strict=True)
+        )
 
     def check_start(self, cut: CutDomains, points: MaterialPoints, t: float, ways: NDArray[np.float64]) -> None:
         """Refuse a stage that begins at time t (s) with tools in bodies, or with groups of bodies in each other.
@@ -189,17 +205,18 @@ class MechanicalBoundary:
         ways: NDArray[np.float64],
         t: float,
         points: MaterialPoints,
+        at_rest: bool = False,
     ) -> SideData:
         """Return what acts at time t (s) of a step that began at `start` on the points where they are now.
 
-        ways (tools,): how far loads had pushed tools then, m.
+        ways (tools,): how far loads had pushed tools then, m; at_rest: hold sides where displacements count from.
         """
         with Timer("mpm: loads"):
             loads = self._load_data(forms, cut, points, t) if self.loads else None
             pressures = self._pressure_data(forms, cut, points, t) if self.pressures else None
             plates = self._plate_data(forms, cut, points) if self.plates else None
-            none = (None, np.empty(0, dtype=np.int64), np.empty((0, 2**self.grid.dim)))
-            holds = self._hold_data(forms, cut, points, t) if self.holds else none
+            none = (None, None, np.empty(0, dtype=np.int64), np.empty(0))
+            holds = self._hold_data(forms, cut, points, t, at_rest) if self.holds else none
             pairs = zip(forms.own, self._terms, strict=True)
             own = tuple(self._own_data(term.points, faces, cut, points) for term, faces in pairs)
             tools = self.tools.going(Ways(start, t, ways, ways)).placed(cut, points, start, t)
@@ -258,12 +275,15 @@ class MechanicalBoundary:
         return forms.plates.at(cell, x, np.ones(len(cell)), rigidity=rigidity, normal=normal, tilt=tilt)
 
     def _hold_data(
-        self, forms: SideForms, cut: CutDomains, points: MaterialPoints, t: float
-    ) -> tuple[PointData, HeldCells, NDArray[np.int64]]:
-        """Return what holds given displacements, a row a component; by cells and points; and which of these each is."""
+        self, forms: SideForms, cut: CutDomains, points: MaterialPoints, t: float, at_rest: bool
+    ) -> tuple[PointData, HeldCells, NDArray[np.int64], NDArray[np.float64]]:
+        """Return what holds given displacements, a row a component; by cells and points; which of these each is.
+
+        Last the share of each row's force that no wall bears.
+        """
         d, comm = self.grid.dim, self.grid.comm
         self._check_meeting(t)
-        held = HeldCells(self.grid, self._held_points(cut, points, t))
+        held = HeldCells(self.grid, self._held_points(cut, points, t, at_rest))
         placed, message = [], ""
         for axis in range(d):
             given = np.array([axis in axes for *_, axes in self.holds])
@@ -274,32 +294,35 @@ class MechanicalBoundary:
                 message = f"{what}, where a fixed wall holds it; must be 0 there, or the wall must leave it free"
         if message := first(comm, message):
             raise ValueError(message)
-        row, stiffness, gap, direction = map(np.concatenate, zip(*placed, strict=True))
+        row, stiffness, gap, beside, direction = map(np.concatenate, zip(*placed, strict=True))
         fields = {name: values[row] for name, values in held.moments.items()}
         fields |= {"stiffness": stiffness, "gap": gap, "direction": direction}
-        return forms.holds.at(held.cell[row], held.x[row], np.ones(len(row)), **fields), held, row
+        return forms.holds.at(held.cell[row], held.x[row], np.ones(len(row)), **fields), held, row, beside
 
-    def _held_points(self, cut: CutDomains, points: MaterialPoints, t: float) -> HeldPoints:
+    def _held_points(self, cut: CutDomains, points: MaterialPoints, t: float, at_rest: bool) -> HeldPoints:
         """Return the points of integration on held sides, at the owners of their cells."""
         d, rows = self.grid.dim, []
         patches = cut.surfaces([faces for _, faces, _ in self.holds])
         chosen = np.unique(np.concatenate([p.at for p in patches]))
-        now, before = (of.map(lambda values: values[chosen]) for of in (points, cut.points))
+        cut_points = points if at_rest else cut.points  # which are where they were cut
+        now, before = (of.map(lambda values: values[chosen]) for of in (points, cut_points))
         stress = self.materials.total_stress(now)
         modulus, resists = (self.materials.table(before, of) for of in (holding, resistance))
         firm = self.materials.confined_modulus(before)
         # of when the grid was reset, as the stiffnesses: they stay as long as the cut serves
-        tension = np.linalg.norm(stress if points is cut.points else self.materials.total_stress(before), axis=(1, 2))
+        tension = np.linalg.norm(stress if points is cut_points else self.materials.total_stress(before), axis=(1, 2))
         for number, ((hold, *_, axes), p) in enumerate(zip(self.holds, patches, strict=True)):
-            at, now, to = np.searchsorted(chosen, p.at), p.now(points), p.origin(points) + self._given(hold, t, p.X)
+            at, now = np.searchsorted(chosen, p.at), p.now(points)
+            given = np.zeros_like(now) if at_rest else self._given(hold, t, p.X)
+            to = p.origin(points) + given
             R = turned(self.grid.comm, p.area0, now, to) if len(axes) == d else np.eye(d)  # as what it carries does
             force, gap = np.einsum("ij,njk,nk->ni", R, stress[at, :d, :d], p.area(points)), to - now
             own = (p.area0 * v for v in (1, modulus[at], tension[at], resists[at], firm[at]))
             each = np.stack([np.full(len(gap), number), *own], axis=1)
-            rows.append((p.cell, p.x, np.concatenate([each, gap, p.area(cut.points), force], axis=1)))
-        cell, x, values = gathered(self.grid, rows, 6 + 3 * d)
+            rows.append((p.cell, p.x, np.concatenate([each, gap, given, p.area(cut.points), force], axis=1)))
+        cell, x, values = gathered(self.grid, rows, 6 + 4 * d)
         number, *own = values[:, :6].T
-        return HeldPoints(number.astype(np.int64), cell, *own, x, *np.split(values[:, 6:], 3, axis=1))
+        return HeldPoints(number.astype(np.int64), cell, *own, x, *np.split(values[:, 6:], 4, axis=1))
 
     def _check_meeting(self, t: float) -> None:
         """Refuse given displacements that differ where they meet: no body's stress is finite there."""
@@ -318,10 +341,9 @@ class MechanicalBoundary:
         grid, data, held = self.grid, sides.holds, sides.held
         if data is None:
             return np.zeros((0, grid.dim))
-        moved = np.einsum("mk,mkd,md->m", held.shape[sides.row], u[grid.cell_nodes[data.cells]], data["direction"])
-        force = data["stiffness"][:, 0] * (data["gap"][:, 0] - moved)
+        force = data["stiffness"][:, 0] * (data["gap"][:, 0] - sides.along(u))
         self._warn(held, sides.row, data["direction"].argmax(axis=1), force)
-        number, force = held.number[sides.row], force[:, None] * data["direction"]
+        number, force = held.number[sides.row], (sides.beside * force)[:, None] * data["direction"]
         return grid.comm.allreduce(np.stack([sum_by(number, column, len(self.holds)) for column in force.T], axis=1))
 
     def _warn(

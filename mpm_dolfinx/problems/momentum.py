@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 
+from mpi4py import MPI
 from petsc4py import PETSc
 
 import numpy as np
@@ -32,13 +33,16 @@ from mpm_dolfinx.forms.cell_matrices import Beside, ElementForces, ElementMatric
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointForm
 from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts, zero
 from mpm_dolfinx.parallel.exchange import over_all
+from mpm_dolfinx.points.grid import sum_by
 from mpm_dolfinx.problems.conditions import OnSide
 from mpm_dolfinx.problems.ghost_penalty import GhostPenalty
 from mpm_dolfinx.problems.mean_dilatation import MeanDilatation
+from mpm_dolfinx.problems.parts import OfParts, Parts, parts_of_cells, relative
 from mpm_dolfinx.problems.quadrature_data import QuadratureData
 from mpm_dolfinx.problems.rigid_motion import rigid_motion
 from mpm_dolfinx.problems.side_forms import OwnTerm, SideData, SideForms
 from mpm_dolfinx.problems.tool_contact import ToolContact
+from mpm_dolfinx.problems.walls import wall_forces
 from mpm_dolfinx.validation import line
 
 
@@ -254,6 +258,28 @@ class MomentumForms:
             self.sides.pushed_slope.assemble_matrix(K, of_rows)
             sides.tools.assemble_matrix(K, self.nodal)
 
+    def at_nodes(self, cells: NDArray[np.int32], values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the sums (nodes,) at the local nodes of what owned cells, of all processes, have (cells,)."""
+        shared, nodes = self._work[0], self.grid.cell_nodes[cells]
+        sums = sum_by(nodes.ravel(), np.repeat(values, nodes.shape[1]), len(self.grid.node_x))
+        shared.x.array[:] = np.repeat(sums, self.grid.dim)
+        sum_ghosts(shared)
+        shared.x.scatter_forward()
+        return shared.x.array[:: self.grid.dim].copy()
+
+    def parts(self, active: NDArray[np.bool_]) -> Parts:
+        """Return the parts of the bodies in active cells (cells,).
+
+        Groups press on one another through their contacts: they are one part.
+        """
+        of, count = parts_of_cells(self.grid, active)
+        if self.grid.copies > 1:
+            of, count = active.astype(np.int64), 1
+        own = np.flatnonzero(active[: self.grid.num_owned])
+        total, cells = (self.at_nodes(own, values) for values in (of[own].astype(float), np.ones(len(own))))
+        nodes = np.divide(total, cells, out=np.zeros(len(cells)), where=cells > 0)
+        return Parts(count, of - 1, np.rint(nodes).astype(np.int64) - 1)
+
     def active_nodes(self, cells: NDArray[np.int32]) -> NDArray[np.bool_]:
         """Return which nodes belong to some active cells of any process."""
         nodes = np.zeros(len(self.grid.node_x), dtype=bool)
@@ -284,6 +310,8 @@ class MomentumSystem:
         Faces of this process that carry the ghost penalty.
     stiff
         Whether sides have plates or given displacements.
+    parts
+        Parts of the bodies.
     """
 
     def __init__(
@@ -294,6 +322,7 @@ class MomentumSystem:
         cells: NDArray[np.int32],
         facets: NDArray[np.int32],
         stiff: bool,
+        parts: Parts,
     ):
         self._forms, d = forms, forms.grid.dim
         self.unknowns = Unknowns(forms.u, dofs)
@@ -302,13 +331,45 @@ class MomentumSystem:
         owned = nodes[nodes < forms.u.function_space.dofmap.index_map.size_local]
         self.touched = (owned[:, None] * d + np.arange(d)).ravel()
         """Where forces may act, fixed or not."""
+        self.parts, comm = parts, forms.grid.comm
+        self.of_parts, self._touched = (
+            OfParts(comm, parts.nodes[at // d], parts.count) for at in (self.unknowns.owned, self.touched)
+        )
+        """Parts of the unknowns."""
+        self.rounding = self.unknowns.vector()
+        """What rounding may leave of the residual at each unknown, N."""
         self.K = matrix(self.unknowns, self.unknowns, 3**d * d)
-        self.penalty = self._penalty_matrix(facets, stiff)
         self.residual, self.step = self.unknowns.vector(), self.unknowns.vector()
-        self._ghost = forms.ghost.form.on(facets)
+        every = (nodes[:, None] * d + np.arange(d)).ravel()
+        self.held = Unknowns(forms.u, np.setdiff1d(every, dofs))
+        """What walls hold."""
+        self.held_residual = self.held.vector()
+        self.penalty, self.held_penalty = (self._penalty_matrix(of, facets, stiff) for of in (self.unknowns, self.held))
+        at_walls = np.zeros(len(forms.grid.node_x), dtype=bool)
+        at_walls[self.held.map.indices.reshape(-1, d).max(axis=1, initial=-1) >= 0] = True
+        near = at_walls[forms.grid.cell_nodes[forms.grid.facet_cells[facets]]].any(axis=(1, 2))
+        self._ghosts = [forms.ghost.form.on(some) for some in (facets[near], facets)]
         self.firm, self._firmness = None, None  # where nothing yields
         if not forms.elastic:
             self.firm, self._firmness = matrix(self.unknowns, self.unknowns, 3**d * d), forms.ghost.firmness.on(cells)
+
+    @property
+    def local_parts(self) -> NDArray[np.int64]:
+        """Parts (n,) of the degrees of freedom of this process, ghosts included, -1 where nothing is."""
+        return np.repeat(self.parts.nodes, self.unknowns.dim)
+
+    @property
+    def round_off(self) -> NDArray[np.float64]:
+        """What rounding may leave of the residual of each part (parts,), N."""
+        return self.of_parts.norms(self.rounding.array_r)
+
+    def force_of_parts(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the norms (parts,), N, of forces where these may act, see `touched`."""
+        return self._touched.norms(forces)
+
+    def set_rounding(self, nodes: NDArray[np.float64]) -> None:
+        """Set what rounding may leave of the residual at the local nodes, N."""
+        self.rounding.array_w[:] = nodes[self.unknowns.owned // self.unknowns.dim]
 
     def places(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return where on the grid this process's unknowns are, and what walls hold: see `multigrid_solver`."""
@@ -318,27 +379,28 @@ class MomentumSystem:
         places[:, -1] = places[:, -1] * self.unknowns.dim + axis
         return places[: self.unknowns.size], places[self.unknowns.size :]
 
-    def _penalty_matrix(self, facets: NDArray[np.int32], stiff: bool) -> PETSc.Mat:
+    def _penalty_matrix(self, rows: Unknowns, facets: NDArray[np.int32], stiff: bool) -> PETSc.Mat:
         """Return an empty matrix for the penalties: the ghost penalty couples like components, of two cells."""
         grid = self._forms.grid
         d = grid.dim
         length = 3**d + 2 * d * 3 ** (d - 1)
         if stiff:
-            return matrix(self.unknowns, self.unknowns, d * length)
+            return matrix(rows, self.unknowns, d * length)
         touched = self._forms.active_nodes(grid.facet_cells[facets])
-        A = matrix(self.unknowns, self.unknowns, np.where(touched[self.unknowns.owned // d], length, 1))
+        A = matrix(rows, self.unknowns, np.where(touched[rows.owned // d], length, 1))
         A.setOption(PETSc.Mat.Option.IGNORE_ZERO_ENTRIES, True)
         return A
 
     def set_penalty(self, sides: SideData) -> None:
         """Assemble what is linear in the step's increment, ghost penalty, plates, given displacements, and firmness."""
-        zero(self.penalty)
-        self._ghost.assemble_matrix(self.penalty)
-        if sides.plates is not None:
-            self._forms.sides.plate.assemble_matrix(self.penalty, sides.plates)
-        if sides.holds is not None:
-            self._forms.sides.hold.assemble_matrix(self.penalty, sides.holds)
-        self.penalty.assemble()
+        for penalty, ghost in zip((self.held_penalty, self.penalty), self._ghosts, strict=True):
+            zero(penalty)
+            ghost.assemble_matrix(penalty)
+            if sides.plates is not None:
+                self._forms.sides.plate.assemble_matrix(penalty, sides.plates)
+            if sides.holds is not None and penalty is self.penalty:
+                self._forms.sides.hold.assemble_matrix(penalty, sides.holds)
+            penalty.assemble()
         if self.firm is not None:
             zero(self.firm)
             self._firmness.assemble_matrix(self.firm)
@@ -356,8 +418,6 @@ class MomentumProblem:
         The pieces.
     sides
         What acts on the sides of the bodies.
-    round_off
-        Norm of the residual that rounding leaves, N.
     tolerance
         Share of the forces to which they are balanced.
     goes_on : (unknowns,)
@@ -374,16 +434,14 @@ class MomentumProblem:
         system: MomentumSystem,
         data: QuadratureData,
         sides: SideData,
-        round_off: float,
         tolerance: float,
         goes_on: NDArray[np.float64] | None = None,
         held: NDArray[np.float64] | None = None,
         yielded: bool = False,
     ):
-        self.forms, self.system, self.data, self.round_off = forms, system, data, round_off
+        self.forms, self.system, self.data = forms, system, data
         self.yielded = yielded
         self._sides, self._goes_on, self._tolerance = sides, goes_on, tolerance
-        self._largest = np.zeros(1)  # forces so far, N
         with Timer("mpm: loads"):
             external, pulls = forms.external(data, sides)
             if held is not None:
@@ -411,13 +469,22 @@ class MomentumProblem:
     def _at(self) -> tuple[Unknowns, NDArray[np.float64]]:
         return self.system.unknowns, self.forms.u.x.array
 
-    def augment_tools(self) -> bool:
-        """Shift the pressures of tools that penetrate too deep; return whether the balance is another one since."""
+    def augment_tools(self, forces: NDArray[np.float64]) -> bool:
+        """Shift the pressures of tools that penetrate too deep; return whether the balance is another one since.
+
+        forces (parts,): what residuals are measured by, N.
+        """
         tools, contact = self._sides.tools, self._sides.contact
-        of_tools = tools is not None and tools.augment(
-            self.forms.nodal, self.round_off + self._tolerance * self._largest[0]
-        )
+        of_tools = tools is not None and tools.augment(self.forms.nodal, self._unknown_of_tools(forces))
         return (contact is not None and contact.now.augment(*self._at)) or of_tools
+
+    def _unknown_of_tools(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return how well the balance tells the forces of tools (tools,), N: by the parts that they may touch."""
+        system, tools = self.system, self._sides.tools
+        of_parts = system.round_off + self._tolerance * forces
+        unknown = np.zeros(len(tools.contacts))
+        np.maximum.at(unknown, tools.rows.number, of_parts[system.parts.cells[tools.rows.cell]])
+        return over_all(self.forms.grid.comm, unknown, MPI.MAX)
 
     def follow_contacts(self) -> bool:
         """Find anew which places of groups face one another at u; return whether the balance is another one since."""
@@ -428,43 +495,85 @@ class MomentumProblem:
 
         Those of a turn, if given displacements turn the bodies as one, and those of bodies that move on as before.
         """
-        forms, holds = self.forms, self._sides.holds
-        turns = holds is not None and not forms.grid.axisymmetric
-        motion = rigid_motion(forms.grid.comm, holds, forms.grid.node_x) if turns else None
-        found = [values.ravel() for values in (motion, self._goes_on) if values is not None]
+        found = [values for values in (self._turned(), self._goes_on) if values is not None]
         return [np.where(self.system.unknowns.map.indices >= 0, values, 0.0) for values in found]
+
+    def _turned(self) -> NDArray[np.float64] | None:
+        """Return u with the rigid motions of the parts that given displacements turn; None where they turn none."""
+        forms, holds, parts = self.forms, self._sides.holds, self.system.parts
+        if holds is None or forms.grid.axisymmetric:
+            return None
+        of, moved = parts.cells[holds.cells], None
+        for part in np.flatnonzero(over_all(forms.grid.comm, sum_by(of, np.ones(len(of)), parts.count))):
+            motion = rigid_motion(forms.grid.comm, holds, forms.grid.node_x, of == part)
+            if motion is not None:
+                moved = forms.nodal.copy() if moved is None else moved
+                moved[parts.nodes == part] = motion[parts.nodes == part]
+        return None if moved is None else moved.ravel()
 
     def assemble_residual(self) -> tuple[PETSc.Vec, float]:
         """Return the out-of-balance nodal forces at u and their scale, the largest of internal, external, terms (N)."""
+        r, scales = self.residual_of_parts()
+        return r, float(np.linalg.norm(scales))
+
+    def residual_of_parts(self) -> tuple[PETSc.Vec, NDArray[np.float64]]:
+        """Return the out-of-balance nodal forces at u and the scales (parts,), N, of each part: see above."""
         forms, system = self.forms, self.system
         b, own = forms.internal(self.data)
         forces, external = b[system.touched], self._external
         if self._sides.pressures is not None:
             external = external + forms.pressures(self._sides)[system.touched]
-        squares = [forces @ forces, external @ external]
+        norms = [system.force_of_parts(forces), system.force_of_parts(external)]
         if forms.terms or forms.sides.own:
             own = own[system.touched]
             if forms.sides.own:
                 own = own + forms.sides.own_forces(self._sides)[system.touched]
-            squares.append(own @ own)
+            norms.append(system.force_of_parts(own))
             forces += own
-        squares = over_all(forms.grid.comm, np.array(squares))
         b[system.touched] = forces - external
-        if self._sides.holds is not None:  # no measure of forces: at the start of a step it is far above them
-            b[system.touched] -= self._pulls
         if self._sides.tools is not None:
             b[system.touched] -= forms.pushed(self._sides.tools)[system.touched]
+        system.held.gather(b, system.held_residual)  # walls bear what sides beside them would push them by
+        if self._sides.holds is not None:  # no measure of forces: at the start of a step it is far above them
+            b[system.touched] -= self._pulls
         r = system.unknowns.gather(b, system.residual)
         step = system.unknowns.gather(forms.u.x.array, system.step)
         system.penalty.multAdd(step, r, r)
         if self._sides.contact is not None:
             self._sides.contact.now.push(*self._at, r)
-        scale = float(np.sqrt(max(squares)))
-        self._largest[:] = max(scale, self._largest[0])
-        return r, scale
+        return r, np.max(norms, axis=0)
 
-    def assemble_tangent(self, data: QuadratureData | None = None, firmness: float = 0.0) -> PETSc.Mat:
-        """Return the tangent at u, of these pieces or of others, with a share of the elastic shear stiffness."""
+    def out_of_balance(
+        self, r: PETSc.Vec, scales: NDArray[np.float64], first: bool
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return residuals r (N) of the parts, relative to scales (parts,), N: what counts of them, and as they are.
+
+        What rounding may leave at a node does not count, but at first: a tiny load drowns in it, which is no reason not
+        to solve for it once.  The other ones are relative to no less than what makes this the tolerance.
+        """
+        system, parts = self.system, self.system.of_parts
+        size, rounding = np.abs(r.array_r), system.rounding.array_r
+        counts = relative(parts.norms(size if first else np.maximum(size - rounding, 0.0)), scales)
+        least = rounding * np.sqrt(parts.sizes)[parts.of] / self._tolerance
+        with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+            told = parts.norms(np.where(size > 0, size / np.maximum(scales[parts.of], least), 0.0))
+        return counts, relative(told, np.ones(parts.count))
+
+    def wall_forces(self, fixed: Mapping[str, str]) -> NDArray[np.float64]:
+        """Return the forces (2 d, d), N, of the walls at u, where the residual was last assembled."""
+        system, forces = self.system, self.system.held_residual.copy()
+        system.held_penalty.multAdd(system.step, forces, forces)
+        if self._sides.contact is not None:
+            self._sides.contact.now.push_on(system.held, *self._at, forces)
+        return wall_forces(self.forms.grid, fixed, system.held.owned, forces.array_r)
+
+    def assemble_tangent(
+        self, data: QuadratureData | None = None, firmness: NDArray[np.float64] | float = 0.0
+    ) -> PETSc.Mat:
+        """Return the tangent at u, of these pieces or of others, with a share of the elastic shear stiffness.
+
+        firmness: the share, one number or one for each part.
+        """
         K = self.system.K
         # the first sums give K the pattern of all: PETSc does not always see that it changes later
         first = not K.assembled
@@ -477,6 +586,12 @@ class MomentumProblem:
             if first:
                 K.axpy(1.0, self._sides.contact.now.pattern(self.system.unknowns), pattern.UNKNOWN)
             K.axpy(1.0, self._sides.contact.now.tangent(*self._at), pattern.SUBSET_NONZERO_PATTERN)
-        if firmness > 0:
-            K.axpy(firmness, self.system.firm, pattern.SUBSET_NONZERO_PATTERN)
+        shares = np.broadcast_to(firmness, self.system.parts.count)
+        if (shares == shares[:1]).all():
+            if shares.any():
+                K.axpy(shares[0], self.system.firm, pattern.SUBSET_NONZERO_PATTERN)
+            return K
+        firm = self.system.firm.copy()
+        firm.diagonalScale(self.system.unknowns.gather_owned(shares[self.system.of_parts.of]))
+        K.axpy(1.0, firm, pattern.SUBSET_NONZERO_PATTERN)
         return K

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
+from functools import cached_property, partial
 
 from mpi4py import MPI
 
@@ -19,12 +19,14 @@ from mpm_dolfinx.forms.unknowns import collect_garbage
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.cut_domains import CutDomains
 from mpm_dolfinx.points.grid import sum_by
+from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.points.pressure_transport import CellPressures, Reconstruction, share_within, transport
 from mpm_dolfinx.problems.aslant import Gradients, off_facets
 from mpm_dolfinx.problems.fluxes import CellContents, CellMotion, Conduction, Mobility, OpenSides, PieceContents
 from mpm_dolfinx.problems.ghost_penalty import stiffness
 from mpm_dolfinx.problems.layers import graded, mixed_cells
 from mpm_dolfinx.problems.momentum import MomentumForms, MomentumSystem
+from mpm_dolfinx.problems.parts import parts_of_cells
 from mpm_dolfinx.problems.quadrature_data import QuadratureData, QuadraturePoints
 from mpm_dolfinx.problems.scene_checks import check_held
 from mpm_dolfinx.problems.side_forms import SideData
@@ -33,6 +35,9 @@ from mpm_dolfinx.problems.storage import Outflow, StorageForms, StorageSystem
 from mpm_dolfinx.solve.scheme import Scheme
 from mpm_dolfinx.solve.schur import LinearSolvers
 from mpm_dolfinx.state import State
+
+AtPlaces = Callable[[NDArray[np.integer], NDArray[np.float64]], NDArray[np.float64]]
+"""Returns values (m,) at places (m, d), m, in local cells (m,)."""
 
 
 class OnGrid(Keyed):
@@ -77,8 +82,9 @@ class OnGrid(Keyed):
         self.penalised = momentum.ghost.facets(self.facets)
         """Those of nearly empty cells."""
         rows = quadrature.rows(cut, points, lambda m: m.oedometric) * grid.around(cut.x)
-        self.stiffness = float(rows.max(initial=0.0))
-        """Largest oedometric modulus, Pa; in axisymmetry times the length of its ring, N/m."""
+        self.stiffness = np.zeros(grid.num_local)
+        """Largest oedometric modulus in each local cell, Pa; in axisymmetry times the length of its ring, N/m."""
+        np.maximum.at(self.stiffness, cut.cells, rows)
         self.contents, self._mixed = None, None
         if storage is not None:
             brought = PieceContents(
@@ -88,7 +94,7 @@ class OnGrid(Keyed):
                 x=x,
                 faces=cut.pieces_to_cells(cut.pieces.faces),
                 fixed_stress=quadrature.fixed_stress(cut, points, of_fluid),
-                damping=quadrature.rows(cut, points, lambda m: m.pressure_damping(grid.dim)),
+                damping=quadrature.rows(cut, points, lambda m: m.pressure_damping()),
             )
             self.contents = CellContents(storage.fluxes, brought, self.cells[self.cells < grid.num_owned])
             if quadrature.layered:
@@ -113,21 +119,31 @@ class OnGrid(Keyed):
 
     def pressures(self, state: State) -> NDArray[np.float64]:
         """Return the pressures of the filled owned cells at the start of a step, Pa."""
-        if not state.stay:
+        if not state.stays:
             bulk = self._storage.bulk
             carried = transport(state.transported.potentials(bulk), self.cut.points, self.cut.pieces)
+            if state.stay:
+                carried = mass_potential(self.of_pieces(state, "pressure", pressure_of(carried, bulk)), bulk)
             return pressure_of(self._means(carried), bulk)
         p = np.zeros(self.cut.grid.num_local)
         p[self.cut.cells] = self.cut.pieces_to_cells(state.stay.pressure)
         return p[self.contents.filled]
 
+    def of_pieces(self, state: State, name: str, fresh: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return what pieces have of the state's stay by this name, fresh (m, ...) where there is none."""
+        return state.stay.of_pieces(name, fresh, self.cut.pieces.point) if state.stay else fresh
+
     def as_reset(self, state: State) -> QuadratureData:
         """Return the pieces when the grid was reset, and set the present pressures to those of then."""
         if self._storage is not None:
             if state.stay:
-                self.set_pressures(state.stay.start)
+                self.set_pressures(self.of_pieces(state, "start", self.pressures_of_pieces()))
             self._storage.p.x.array[:] = self._storage.p_n.x.array
         return self.data
+
+    def pressures_of_pieces(self) -> NDArray[np.float64]:
+        """Return the pressures (m,), Pa, at the start of a step of the cells that pieces lie in."""
+        return self.cut.to_pieces(self._storage.p_n.x.array[self.cut.cells])
 
     def set_pressures(self, at_pieces: NDArray[np.float64]) -> None:
         """Set the pressures at the start of a step to those (m,), Pa, that pieces have of their cells."""
@@ -179,19 +195,42 @@ class OnGrid(Keyed):
         share = cut.pieces_to_cells(cut.pieces.fraction * due[cut.pieces.point])
         return self.contents.total(cut.cells, self.data.pieces["biot"][:, 0] * share)
 
-    def pressures_up_to_surface(self, reconstruction: Reconstruction, stage: Stage, t: float) -> NDArray[np.float64]:
+    def pressures_up_to_surface(
+        self, reconstruction: Reconstruction, stage: Stage, t: float, at_rest: AtPlaces | None = None
+    ) -> NDArray[np.float64]:
         """Return the pressures (m,), Pa, at the pieces' centroids; their mean by volume in a cell is the cell's.
 
-        t, s: time at which drained sides have their pressures.
-        """
-        places, seen = self._places.pieces, self._cell_pressures(self._storage.p.x.array, stage, t)
-        return self.cut.to_pieces(reconstruction.up_to_surface(seen, places.offset, places.slots))
+        What is reconstructed is what they differ by from those at rest: at sealed sides nothing flows.
+        In axisymmetry centroids and mean are those in the plane.
 
-    def _cell_pressures(self, p: NDArray[np.float64], stage: Stage, t: float, bulk: float = np.inf) -> CellPressures:
-        """Return what slopes of cells with these pressures, or mass potentials by `bulk` (Pa), are drawn from."""
+        t, s: time at which drained sides have their pressures; at_rest: pressures of the fluid at rest, where it flows.
+        """
+        places, seen = self._places.pieces, self._cell_pressures(self._storage.p.x.array, stage, t, at_rest=at_rest)
+        x, middle = self.cut.plane(self.weight)[1], self.cut.grid.midpoints[self.cut.cells]
+        pressures = reconstruction.up_to_surface(seen, x - middle, places.slots)
+        if at_rest is not None:
+            pressures = pressures + at_rest(self.cut.cells, x)
+        return self.cut.to_pieces(pressures)
+
+    def _cell_pressures(
+        self,
+        p: NDArray[np.float64],
+        stage: Stage,
+        t: float,
+        bulk: float = np.inf,
+        at_rest: AtPlaces | None = None,
+    ) -> CellPressures:
+        """Return what slopes of cells with these pressures, or mass potentials by `bulk` (Pa), are drawn from.
+
+        at_rest: pressures of the fluid at rest, from which these then are the differences.
+        """
         contents = self.contents
         sides = stage.hydraulic.data(self.cut, self.cut.points, contents, t)
         sides = replace(sides, pressure=mass_potential(sides.pressure, bulk))
+        if at_rest is not None:
+            x = self.cut.grid.midpoints + contents.centroid
+            p = p - at_rest(np.arange(len(x)), x)
+            sides = replace(sides, pressure=sides.pressure - at_rest(sides.cells, x[sides.cells] + sides.reach))
         outer = sides.ahead(contents.slot(sides.cells), p[contents.filled])
         return CellPressures(contents.filled, p, contents.centroid, contents.open, outer)
 
@@ -202,6 +241,40 @@ class OnGrid(Keyed):
         if self._storage.conductivity is not None:
             share = graded(self.contents, self._places.pieces.offset, at_pieces, mean)
         return Mobility(mean, share) if self._mixed is None else self._mixed.mobility(at_pieces, mean, share)
+
+    def resting_mobility(self) -> Mobility:
+        """Return the conductivities, m/s, of the filled owned cells as laws of the deformation and pressure have them
+        at rest.
+        """
+        at_pieces = self._quadrature.rows(self.cut, self.cut.points, lambda m: m.conductivity)
+        mean = self.contents.mean(at_pieces)
+        return Mobility(mean) if self._mixed is None else self._mixed.mobility(at_pieces, mean, None)
+
+    def rests(self, state: State) -> NDArray[np.int64] | None:
+        """Return the filled owned cells all points of which stay as they were cut; None where none does."""
+        if not state.stay:
+            return None
+        moves = self.cut.to_cells(~state.stay.keeps).astype(float)
+        return np.flatnonzero(self.contents.total(self.cut.cells, moves) == 0)
+
+    def serves(self, points: MaterialPoints) -> NDArray[np.bool_]:
+        """Return which points (n,) stay where they were cut: those of parts that hardly move, of all groups at once."""
+        all_of_them = self.cut.serves(points, np.zeros(len(points), dtype=np.int64), 1)[0]
+        if all_of_them or self.cut.grid.copies > 1:
+            return np.full(len(points), all_of_them)
+        part, count = self.parts
+        return self.cut.serves(points, part, count)[part]
+
+    @cached_property
+    def parts(self) -> tuple[NDArray[np.int64], int]:
+        """Which of the parts that hang together, from 0, each point belongs to (n,), and how many there are.
+
+        A part has unknowns of its own: what happens in another one it does not see.
+        """
+        part, count = parts_of_cells(self.cut.grid, self.active)
+        out = np.zeros(len(self.cut.points), dtype=np.int64)
+        out[self.cut.pieces.point] = self.cut.to_pieces(part[self.cut.cells] - 1)
+        return out, count
 
     @property
     def active_cells(self) -> int:
@@ -240,12 +313,12 @@ class System:
         stiff: bool,
         symmetric: bool,
     ):
-        self._scheme, self.symmetric = scheme, symmetric
-        own = on_grid.cells[on_grid.cells < momentum.grid.num_owned]
-        self.momentum, self.storage = MomentumSystem(momentum, dofs, nodes, own, on_grid.penalised, stiff), None
+        self._scheme, self.symmetric, self.storage = scheme, symmetric, None
+        own, parts = on_grid.cells[on_grid.cells < momentum.grid.num_owned], momentum.parts(on_grid.active)
+        self.momentum = MomentumSystem(momentum, dofs, nodes, own, on_grid.penalised, stiff, parts)
         if storage is not None:
             unknowns = self.momentum.unknowns
-            self.storage = StorageSystem(storage, on_grid.cells, on_grid.facets, unknowns)
+            self.storage = StorageSystem(storage, on_grid.cells, on_grid.facets, unknowns, parts)
         self._solvers: Latest[LinearSolvers] = Latest()
 
     def solvers(self) -> LinearSolvers:
@@ -292,23 +365,15 @@ class Assembled:
     ):
         self.momentum, self.storage, self.symmetric = system.momentum, system.storage, system.symmetric
         self.solvers, self.end_step = system.solvers, system.end_step
-        self._on_grid, self._stage, grid = on_grid, stage, on_grid.cut.grid
+        self._on_grid, self._stage = on_grid, stage
         self._u, self._varies = momentum.u, storage is not None and storage.conductivity is not None
         self._by_pressure = storage if self._varies and storage.conductivity.pressure is not None else None
         self._mobility: Latest[Mobility] = Latest()
         self._outflow: Latest[Outflow] = Latest()
         self.momentum.set_penalty(sides)
-        stiffness = over_all(grid.comm, on_grid.stiffness, MPI.MAX) * grid.cell_volume / grid.h.min()
-        self.round_off = 1e-14 * stiffness * np.sqrt(max(1, self.momentum.unknowns.global_size))
+        self.momentum.set_rounding(self._rounding(momentum, sides))
+        self.round_off = float(self.momentum.rounding.norm())
         """Norm of the momentum's residual that rounding leaves, N."""
-        if sides.holds is not None:  # what rounding of coordinates makes of their stiffness
-            reach = np.abs(np.concatenate([grid.lower, grid.upper])).max()
-            stiffest = float(sides.holds["stiffness"].max(initial=0.0))
-            self.round_off += 1e-15 * over_all(grid.comm, stiffest, MPI.MAX) * reach
-        if sides.tools is not None:
-            self.round_off += over_all(grid.comm, sides.tools.rounding, MPI.MAX)
-        if sides.contact is not None:
-            self.round_off += over_all(grid.comm, sides.contact.now.rounding, MPI.MAX)
         self._off = None
         if self.storage is not None:
             self.storage.set_alternation()
@@ -316,6 +381,26 @@ class Assembled:
                 facets = form.on(off_facets(on_grid.contents, on_grid.facets))
                 self._off = facets if facets.some else None
         self._gradients: Latest[Gradients] = Latest()
+
+    def _rounding(self, momentum: MomentumForms, sides: SideData) -> NDArray[np.float64]:
+        """Return what rounding may leave of the residual at the local nodes (nodes,), N.
+
+        It goes with the stiffness of the cells about a node; that of rigid sides and tools with coordinates as well.
+        """
+        grid, on_grid = self._on_grid.cut.grid, self._on_grid
+        of_cells = 1e-14 * on_grid.stiffness * grid.cell_volume / grid.h.min()
+        if sides.holds is not None:
+            reach = np.abs(np.concatenate([grid.lower, grid.upper])).max()
+            held = np.zeros(grid.num_local)
+            np.maximum.at(held, sides.holds.cells, sides.holds["stiffness"][:, 0])
+            of_cells = of_cells + 1e-15 * reach * held
+        if sides.tools is not None:
+            np.maximum.at(of_cells, sides.tools.rows.cell, of_cells[sides.tools.rows.cell] + sides.tools.rounding)
+        own = np.flatnonzero(on_grid.active[: grid.num_owned])
+        at_nodes = momentum.at_nodes(own, of_cells[own]) / 2 ** (grid.dim - 1)  # as many cells beside a flat side
+        if sides.contact is not None:
+            at_nodes += over_all(grid.comm, float(sides.contact.now.rounding.max(initial=0.0)), MPI.MAX)
+        return at_nodes
 
     def flow(
         self, state: State, weight: NDArray[np.float64] | None, data: QuadratureData, t: float
@@ -353,13 +438,14 @@ class Assembled:
         if (storage := self._by_pressure) is not None:
             varies = (*varies, storage.p.x.array.copy())
             storage.conductivity.pressure.x.array[:] = storage.p.x.array  # of the start of the substep
-        if state.stay and not self._varies:
+        if state.stays and not self._varies:
             outflow = self._outflow((at, weight, *varies), lambda: set_fluxes(sides(), mobility(True)), grid.comm)
             return lambda begins: outflow
-        placed = sides()
+        placed, rests = sides(), on_grid.rests(state) if not self._varies else None
 
         def at_present(begins: bool) -> Outflow:
-            return set_fluxes(placed, mobility(begins), contents.motion(u.x.array.reshape(-1, grid.dim)))
+            motion = contents.motion(u.x.array.reshape(-1, grid.dim), rests)
+            return set_fluxes(placed, mobility(begins), motion)
 
         # a substep begins where the one before it has ended
         at_u = (data.pieces.key, weight, *varies)

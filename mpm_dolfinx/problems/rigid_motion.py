@@ -23,7 +23,9 @@ MEETS = 0.1
 ITERATIONS = 9
 
 
-def rigid_motion(comm: MPI.Intracomm, holds: PointData, x: NDArray[np.float64]) -> NDArray[np.float64] | None:
+def rigid_motion(
+    comm: MPI.Intracomm, holds: PointData, x: NDArray[np.float64], counts: NDArray[np.bool_]
+) -> NDArray[np.float64] | None:
     """Return the displacements (n, d), m, of places in the rigid motion nearest to given displacements.
 
     Parameters
@@ -34,12 +36,15 @@ def rigid_motion(comm: MPI.Intracomm, holds: PointData, x: NDArray[np.float64]) 
         Rows of given displacements: a direction, the gap along it, m, and the stiffness that it counts with.
     x : (n, d), m
         The places.
+    counts : (m,)
+        Which rows count.
 
     Returns
     -------
     None where nothing is turned, or where a shift meets the given displacements nearly as well.
     """
-    d, e, gap, weight = x.shape[1], holds["direction"], holds["gap"][:, 0], holds["stiffness"]
+    d, e, gap = x.shape[1], holds["direction"], holds["gap"][:, 0]
+    weight = holds["stiffness"] * counts[:, None]
     moments = over_all(comm, np.concatenate([[weight.sum()], (weight * holds.x).sum(axis=0)]))
     if not moments[0] > 0:
         return None

@@ -9,10 +9,10 @@ from mpi4py import MPI
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import label
 
 from mpm_dolfinx.parallel.exchange import Exchange
 from mpm_dolfinx.points.grid import Grid
+from mpm_dolfinx.problems.parts import parts_of_cells
 
 
 def check_held(
@@ -44,7 +44,7 @@ def check_held(
     ValueError
         Saying where the part is, and in how many ways it can move.
     """
-    part, count = _parts(grid, active) if each else (active.astype(np.int64), 1)
+    part, count = parts_of_cells(grid, active) if each else (active.astype(np.int64), 1)
     centre, size = _extents(grid, part, count)
     cells = np.flatnonzero(active)
     nodes, first = np.unique(grid.cell_nodes[cells], return_index=True)
@@ -95,18 +95,3 @@ def _extents(grid: Grid, part: NDArray[np.int64], count: int) -> tuple[NDArray[n
         np.minimum.at(ends, part[part > 0] - 1, sign * grid.midpoints[part > 0])
         grid.comm.Allreduce(MPI.IN_PLACE, ends, op=MPI.MIN)
     return (low - high) / 2, (-high - low + grid.h).max(axis=1)
-
-
-def _parts(grid: Grid, active: NDArray[np.bool_]) -> tuple[NDArray[np.int64], int]:
-    """Return the part (cells,), from 1, that each active cell belongs to, by common nodes, and how many there are."""
-    index = np.column_stack([grid.cell_number[active] // grid.cells, grid.index(grid.midpoints[active])])
-    everywhere = np.concatenate(grid.comm.allgather(index))
-    lowest = everywhere.min(axis=0)
-    filled = np.zeros(everywhere.max(axis=0) - lowest + 1, dtype=bool)
-    filled[tuple((everywhere - lowest).T)] = True
-    together = np.zeros((3,) * (grid.dim + 1))
-    together[1] = 1  # copies of the grid have no node in common
-    labels, count = label(filled, structure=together)
-    out = np.zeros(len(active), dtype=np.int64)
-    out[active] = labels[tuple((index - lowest).T)]
-    return out, count

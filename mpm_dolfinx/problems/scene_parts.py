@@ -22,15 +22,19 @@ def check_parts(grid: Grid, bodies: Sequence[Body], materials: Sequence[Skeleton
 
 
 def check_options(
+    bodies: Sequence[Body],
     fluid: Fluid | None,
     pressure: float | Callable,
     terms: Sequence[Callable],
     sources: Sequence[Callable],
     quadrature: str,
 ) -> None:
-    """Refuse terms and sources that are no functions, pressures and sources without fluid, and other quadratures."""
+    """Refuse terms and sources that are no functions, pressures and sources without fluid, and wrong quadratures."""
     if quadrature not in ("domain", "point"):
         raise ValueError(f"quadrature {quadrature!r}: must be domain or point")
+    turned = [i for i, body in enumerate(bodies) if not body.aligned]
+    if quadrature == "point" and turned:
+        raise ValueError(f"quadrature 'point': body {turned[0]} is mapped or a mesh, must be a box along the grid")
     functions("terms", functions_of(terms))
     functions("sources", sources)
     if fluid is not None:

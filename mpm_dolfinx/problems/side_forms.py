@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -30,8 +30,8 @@ class SideData:
 
     loads: with their force; pressures: with their force on the area at the start of the step; plates: with their
     rigidity, normal and present tilt; holds: components of given displacements, with stiffness, direction and gap;
-    held: what holds them; row: which of it each component is; tools: contact with them; own: of each term of the
-    user's own; contact: of groups of bodies.
+    held: what holds them; row: which of it each component is; beside: share of its force that no wall bears; tools:
+    contact with them; own: of each term of the user's own; contact: of groups of bodies.
     """
 
     loads: PointData | None
@@ -40,9 +40,29 @@ class SideData:
     holds: PointData | None
     held: HeldCells | None
     row: NDArray[np.int64]
+    beside: NDArray[np.float64]
     tools: ToolContact | None = None
     own: tuple[PointData, ...] = ()
     contact: Following | None = None
+
+    def moved(self, u: fem.Function) -> SideData:
+        """Return the same with the forces that what holds sides has after a displacement u, m, of the nodes.
+
+        Given displacements are then off their place, and plates tilted, by so much more.
+        """
+        holds, plates = self.holds, self.plates
+        if holds is not None:
+            holds = holds.having(gap=holds["gap"][:, 0] - self.along(u.x.array.reshape(-1, holds.points.grid.dim)))
+        if plates is not None:
+            n, d = plates["normal"], plates.points.grid.dim
+            slope = np.einsum("ni,nij->nj", n, plates.gradients(u).reshape(-1, d, d))
+            plates = plates.having(tilt=plates["tilt"] + slope - (slope * n).sum(axis=1, keepdims=True) * n)
+        return replace(self, holds=holds, plates=plates)
+
+    def along(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the displacement (m,), m, of each component that is given, at nodal values u (nodes, d), m."""
+        at_nodes = u[self.holds.points.grid.cell_nodes[self.holds.cells]]
+        return np.einsum("mk,mkd,md->m", self.held.shape[self.row], at_nodes, self.holds["direction"])
 
 
 def functions_of(terms):

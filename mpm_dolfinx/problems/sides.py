@@ -9,14 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from mpm_dolfinx.given_values import Places
 from mpm_dolfinx.parallel.exchange import Exchange, first
 from mpm_dolfinx.points.bodies import Body
 from mpm_dolfinx.points.cut_domains import Patches
-from mpm_dolfinx.points.faces import Surface, joined, limits, surface
+from mpm_dolfinx.points.faces import Region, Surface, joined, limits, surface
 from mpm_dolfinx.points.grid import Grid, rounding
 from mpm_dolfinx.points.material_points import MaterialPoints
-from mpm_dolfinx.problems.conditions import Places
+from mpm_dolfinx.problems.conditions import Displacement
 from mpm_dolfinx.validation import line
+
+HALF = 0.5 * (1 + 1e-6)  # of a cell, but for rounding
 
 
 class Sides:
@@ -36,19 +39,81 @@ class Sides:
 
     def of(self, condition) -> Surface:
         """Return the faces of a condition's side and region; ValueError where there are none."""
-        key = (str(condition.side), limits(condition.region, self.grid.dim).tobytes())
-        if key not in self._found:
-            found = surface(self.bodies, condition.side, condition.region, self.present)
-            self._found[key] = found.off_axis() if self.grid.has_axis else found
-        if not len(self._found[key]):
+        found = self._of(condition.side, condition.region)
+        if not len(found):
             where = " in the region" if condition.region is not None else ""
             where += " off the axis" if self.grid.has_axis else ""
             raise ValueError(f"{line(condition)}: no point has this side{where}, must be one of a body")
-        copies = np.unique(self.grid.copy(self._found[key].id))
+        copies = np.unique(self.grid.copy(found.id))
         if len(copies) > 1:
             what = f"{line(condition)}: {len(copies)} groups of bodies have this side"
             raise ValueError(f"{what}, must be one; limit it to one by a region, and give one for each")
+        return found
+
+    def _of(self, side: str, region: Region | None) -> Surface:
+        """Return the faces of a side in a region."""
+        key = (str(side), limits(region, self.grid.dim).tobytes())
+        if key not in self._found:
+            found = surface(self.bodies, side, region, self.present)
+            self._found[key] = found.off_axis() if self.grid.has_axis else found
         return self._found[key]
+
+    def held(self, condition: Displacement, others: Sequence[Displacement]) -> Surface:
+        """Return the faces at which a given displacement is imposed: not those of a cell that its region half leaves.
+
+        The last node that is held carries half a cell beyond it.  So a region that reaches no farther than half of its
+        last cell is held up to this cell; aslant to the grid, up to half a cell before its end.  A region ends where
+        its side goes on and nothing else gives the same components.
+
+        Parameters
+        ----------
+        condition
+            The given displacement.
+        others
+            The other ones that give some of its components.
+        """
+        faces, d = self.of(condition), self.grid.dim
+        box, X = faces.region.copy(), faces.X
+        if not np.isfinite(box).any():
+            return faces
+        side = self._of(condition.side, None)
+        own = np.broadcast_to(self.grid.copy(side.id) == self.grid.copy(faces.id[:1]), len(side))  # of its group
+        size = X[:, 1].max(axis=0) - X[:, 0].min(axis=0)
+        near = 1e-9 * size.max() + rounding(X)
+        neighbours = [self.of(other).X for other in others]
+
+        def along(boxes: NDArray[np.float64], axis: int, x: float) -> NDArray[np.bool_]:
+            """Return which boxes (m, 2, d) lie beside the faces, and reach beyond x along an axis on both sides."""
+            across = np.arange(d) != axis
+            low, high = X[:, 0].min(axis=0) - near, X[:, 1].max(axis=0) + near
+            beside = ((boxes[:, 0] < high) & (boxes[:, 1] > low))[:, across].all(axis=1)
+            return beside & (boxes[:, 0, axis] <= x) & (boxes[:, 1, axis] >= x)
+
+        for axis in range(d):
+            for end, sign in enumerate((-1, 1)):
+                limit = box[end, axis]
+                beyond = limit + 2 * sign * near
+                goes_on = np.isfinite(limit) and along(side.X[own], axis, beyond).any()
+                if goes_on and not any(along(boxes, axis, beyond).any() for boxes in neighbours):
+                    box[end, axis] -= sign * self._beyond_nodes(side, own, axis, limit, sign)
+        box[:, box[0] > box[1]] = faces.region[:, box[0] > box[1]]
+        shorter = self._of(condition.side, box)
+        return shorter if len(shorter) else faces  # less than a cell wide
+
+    def _beyond_nodes(self, side: Surface, own: NDArray[np.bool_], axis: int, x: float, sign: int) -> float:
+        """Return how far, m, a region that ends at x along an axis of reference positions is not held, see `held`."""
+        faces = np.flatnonzero(
+            own & (side.X[:, 0, axis] <= x) & (side.X[:, 1, axis] >= x) & (np.ptp(side.X, axis=1)[:, axis] > 0)
+        )
+        X, places = side.corners[faces][:, :, axis], side.places()[faces]
+        way, moved = X - X.mean(axis=1, keepdims=True), places - places.mean(axis=1, keepdims=True)
+        slope = np.einsum("mk,mkd->d", way, moved) / np.square(way).sum() / self.grid.h  # of a map, cells over metres
+        a = np.abs(slope).argmax()
+        if np.abs(np.delete(slope, a)).max() > 1e-9 * abs(slope[a]):
+            return 0.5 / float(np.linalg.norm(slope))
+        end = (places.mean(axis=1)[0, a] - self.grid.lower[a]) / self.grid.h[a] + (x - X.mean(axis=1)[0]) * slope[a]
+        share = (sign * np.sign(slope[a]) * end) % 1.0
+        return share / abs(float(slope[a])) if share <= HALF else 0.0
 
     def around(self, bodies: Sequence[int]) -> Surface:
         """Return the faces on all sides of those of some bodies that are there, what lies on other bodies included."""

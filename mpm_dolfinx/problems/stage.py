@@ -4,13 +4,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.constitutive.fields import SceneMaterials
+from mpm_dolfinx.constitutive.skeleton import Fluid
+from mpm_dolfinx.given_values import check_names, given
 from mpm_dolfinx.points.bodies import Body
 from mpm_dolfinx.points.faces import Surface
 from mpm_dolfinx.points.grid import Grid
@@ -21,7 +23,8 @@ from mpm_dolfinx.problems.hydraulic_boundary import HydraulicBoundary
 from mpm_dolfinx.problems.mechanical_boundary import MechanicalBoundary
 from mpm_dolfinx.problems.sides import Sides
 from mpm_dolfinx.problems.tools import Tool
-from mpm_dolfinx.validation import all_of, asked, line, numbers
+from mpm_dolfinx.problems.unit_weights import weighed
+from mpm_dolfinx.validation import all_of, line, numbers
 
 CONDITIONS = {
     "tractions": (Traction, Pressure),
@@ -58,19 +61,17 @@ class Stage:
 
     def gravity_at(self, t: float) -> NDArray[np.float64] | None:
         """Return the acceleration of gravity (d,) at time t (s), m/s^2; None without."""
-        given, name = self.conditions["gravity"], f"gravity at t = {t:g} s"
-        if given is None:
+        gravity, name, d = self.conditions["gravity"], f"gravity at t = {t:g} s", self.free.shape[1]
+        if gravity is None:
             return None
-        d = self.free.shape[1]
-        given = asked(name, f"{d} numbers for a time", given, t) if callable(given) else given
-        return _gravity(given, name, d, self.axisymmetric)
+        return _gravity(given(name, gravity, t, None, d, number=False), name, d, self.axisymmetric)
 
 
 def stage(
     grid: Grid,
     bodies: Sequence[Body],
     materials: SceneMaterials,
-    wet: bool,
+    fluid: Fluid | None,
     conditions: Mapping[str, Any],
     present: Sequence[bool],
     later: Sequence[int],
@@ -83,8 +84,8 @@ def stage(
         Background grid, and all bodies of the scene.
     materials
         Those of the scene.
-    wet
-        Whether there is a fluid.
+    fluid
+        Pore fluid, if there is one.
     conditions
         fixed, tractions, displacements, drained, inflows, plates, tools, contacts, gravity: see `Simulation`; terms: on
         sides.
@@ -98,21 +99,28 @@ def stage(
     """
     for name, kind in CONDITIONS.items():
         all_of(name, conditions[name], kind)
-    if not wet and (conditions["drained"] or conditions["inflows"]):
+    if fluid is None and (conditions["drained"] or conditions["inflows"]):
         raise ValueError("drained and inflow sides need a fluid")
     gravity = conditions["gravity"]
-    if gravity is not None and not callable(gravity):
-        _gravity(gravity, "gravity", grid.dim, grid.axisymmetric)
+    if callable(gravity):
+        check_names("gravity", gravity, ("t",))
+    elif gravity is not None:
+        gravity = _gravity(gravity, "gravity", grid.dim, grid.axisymmetric).copy()
     if not any(present):
         raise ValueError("bodies: none is there, must be at least one")
-    conditions = {**conditions, "fixed": with_axis(grid, conditions["fixed"])}
-    free, sides = ~_fixed(grid, conditions["fixed"]), Sides(grid, bodies, present)
+    fixed = with_axis(grid, conditions["fixed"])
+    free = ~_fixed(grid, fixed)
+    own = {name: tuple(values) for name, values in conditions.items() if name not in ("fixed", "gravity")}
+    own["tractions"] = tuple(replace(load, value=weighed(load.value, fluid)) for load in own["tractions"])
+    own["drained"] = tuple(replace(side, pressure=weighed(side.pressure, fluid)) for side in own["drained"])
+    conditions = {**own, "fixed": dict(fixed), "gravity": gravity}  # nobody changes what a stage was given
+    sides = Sides(grid, bodies, present)
     acting = (conditions[name] for name in ("tractions", "displacements", "plates", "tools", "terms"))
     mechanical = MechanicalBoundary(sides, free, materials, *acting, conditions["contacts"])
     hydraulic = HydraulicBoundary(sides, [*conditions["drained"], *conditions["inflows"]])
-    given = [(faces, axes) for _, faces, axes in mechanical.holds]
-    given += [(faces, range(grid.dim)) for _, faces in mechanical.plates]
-    lattice = lattices(bodies, present, given)
+    held = [(faces, axes) for _, faces, axes in mechanical.holds]
+    held += [(faces, range(grid.dim)) for _, faces in mechanical.plates]
+    lattice = lattices(bodies, present, held)
     return Stage(conditions, tuple(present), tuple(later), free, grid.axisymmetric, lattice, mechanical, hydraulic)
 
 

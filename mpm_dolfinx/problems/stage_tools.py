@@ -14,6 +14,7 @@ from mpi4py import MPI
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from mpm_dolfinx.constitutive.fields import SceneMaterials
 from mpm_dolfinx.errors import NotConverged
@@ -36,6 +37,11 @@ NEAR = 0.1  # cells: corners that are nearer go with the tool
 STRIDE = 0.02  # cells: tools that are thinner may pass points within a step unseen
 LEFT = 1e-3  # cells: how deep corners stay in tools; put onto what is less deep they would roughen the stress
 FACING = 0.5  # cosine between a face's normal and the way to the tool above which it looks at the tool
+
+
+def _box(x: NDArray[np.float64]) -> list[tuple[NDArray[np.float64], MPI.Op]]:
+    """Return the corners (d,) of the box around places (m, d), and how those of processes are put together."""
+    return [(x.min(axis=0, initial=np.inf), MPI.MIN), (x.max(axis=0, initial=-np.inf), MPI.MAX)]
 
 
 class Ways(NamedTuple):
@@ -131,7 +137,8 @@ class Tools:
         for number, (tool, pose) in enumerate(zip(self.tools, poses, strict=True)):
             before = self._pose(tool, start)
             n = everywhere(grid, lambda tool=tool, pose=pose: tool.solid(grid.h.min()).normal(pose.own(x)) @ pose.R.T)
-            at = np.flatnonzero(free & (np.einsum("md,md->m", area, n) < -FACING * size))
+            faces = free & (np.einsum("md,md->m", area, n) < -FACING * size)
+            at = np.flatnonzero(faces)[~self._edge(tool, pose, x, area / size[:, None], faces)]
             old = points.data[shear_name("tool", number)][patches.at[at]] if tool.grips else np.zeros((len(at), d))
             vectors = [x[at], pose.put(before.own(x[at])), old @ (pose.R @ before.R.T).T]
             pressure = points.data[pressure_name("tool", number)][patches.at[at]]
@@ -145,6 +152,40 @@ class Tools:
         rows = ToolRows(number.astype(np.int64), grid.local(cell), *own, shear, now, carried)
         back = (travel, patches.at[at], values[:, 0].astype(np.int64), values[:, 1])
         return ToolContact(grid, self.tools, poses, pushed, rows, Places(grid, rows.cell, place), back)
+
+    def _edge(
+        self, tool: Tool, pose: Pose, x: NDArray[np.float64], unit: NDArray[np.float64], faces: NDArray[np.bool_]
+    ) -> NDArray[np.bool_]:
+        """Return which of the places that face a tool lie less than half a cell before its edge, if the body goes on.
+
+        The last node that a tool presses carries half a cell beyond it: up to there its edge presses nothing.
+
+        Parameters
+        ----------
+        x, unit : (m, d), m, -
+            Places on the surface of the bodies, and outward normals.
+        faces : (m,)
+            Which of them face the tool.
+        """
+        grid, h = self.grid, self.grid.h
+        y, n = x[faces], unit[faces]
+        edge = np.zeros(len(y), dtype=bool)
+        for axis, e in enumerate(np.eye(grid.dim)):
+            for half in (-0.5 * h, 0.5 * h):
+                beside = pose.own(y + half * (e - n[:, [axis]] * n))
+                to = everywhere(grid, lambda beside=beside: tool.solid(h.min()).normal(beside) @ pose.R.T)
+                edge |= np.einsum("md,md->m", n, to) >= -FACING
+        if not over_all(grid.comm, int(edge.sum())):
+            return edge
+        low, high = (over_all(grid.comm, end, op) for end, op in _box(y[edge] / h))
+        off = ~faces & (np.abs(np.clip(x / h, low, high) - x / h) <= 1).all(axis=1)
+        beyond = np.concatenate(grid.comm.allgather(np.hstack([x[off] / h, unit[off]])))
+        pairs = cKDTree(y[edge] / h).sparse_distance_matrix(cKDTree(beyond[:, : grid.dim]), 1.0, output_type="ndarray")
+        on = np.einsum("md,md->m", n[edge][pairs["i"]], beyond[pairs["j"], grid.dim :]) > np.sqrt(0.5)
+        goes_on = np.zeros(int(edge.sum()), dtype=bool)
+        goes_on[pairs["i"][on]] = True
+        edge[edge] = goes_on
+        return edge
 
     def check_start(self, cut: CutDomains, points: MaterialPoints, t: float) -> None:
         """Refuse tools that are inside of a body at time t (s); faces that they press on are where a step left them."""

@@ -53,11 +53,16 @@ from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.grid import sum_by
 from mpm_dolfinx.problems.aslant import AslantFlow, Gradients
 from mpm_dolfinx.problems.fluxes import CellContents, Conduction, FluxForms, OpenSides
+from mpm_dolfinx.problems.parts import OfParts, Parts
 from mpm_dolfinx.problems.second_differences import second_differences
 from mpm_dolfinx.validation import line
 
 FILTER = 0.75
 """Share of beta V that the filtered fixed-stress operator leaves out for checkerboard modes, in [0, 1]."""
+
+
+FluxSlope = Callable[[PETSc.Vec], NDArray[np.float64]]
+"""See `StorageProblem.flux_slope`."""
 
 
 class StorageForms:
@@ -171,8 +176,8 @@ class StorageForms:
         """Return its derivative by the cell's pressure, m^d/(Pa s), a local array."""
         return self._sum(self._slopes, data)
 
-    def weight_of_fluid(self, assembled: FacetSum) -> NDArray[np.float64]:
-        """Return the outflow that the fluid's weight drives from each cell at p, m^d/s, a local array."""
+    def driven(self, assembled: FacetSum) -> NDArray[np.float64]:
+        """Return the outflow that p and the fluid's weight drive from each cell to others, m^d/s, a local array."""
         assembled.assemble_vector(self._sum([], None))
         return sum_ghosts(self._work)
 
@@ -220,31 +225,31 @@ class Outflow:
 
 
 class Aslant(NamedTuple):
-    """What flows beside the two-point fluxes, m^d/s: out of active owned cells, through open faces, and their sum."""
+    """What flows beside the two-point fluxes, m^d/s: out of active owned cells, through open faces, and theirs."""
 
     cells: NDArray[np.float64] | float
     faces: NDArray[np.float64] | float
-    lost: float
+    lost: NDArray[np.float64] | float
 
 
 @dataclass(frozen=True)
 class Rates:
     """Rates at which the owned cells lose fluid, m^d/s, or with `taken` what they lose in a time, m^d.
 
-    pressure: of the cells, Pa; cells: outflow less sources of each; lost: what leaves the bodies from all cells of this
-    process, less sources; turnover: sum of what goes in and out; gain: sum of what sources bring or take.
+    pressure: of the cells, Pa; cells: outflow less sources of each; lost: what of that leaves the bodies, less sources;
+    turnover: what goes in and out; gain: what sources bring or take, in size.
     """
 
     pressure: NDArray[np.float64]
     cells: NDArray[np.float64]
-    lost: float
-    turnover: float
-    gain: float
+    lost: NDArray[np.float64]
+    turnover: NDArray[np.float64]
+    gain: NDArray[np.float64]
 
     def taken(self, seconds: float) -> Rates:
         """Return what the cells lose in a time."""
-        sums = (seconds * value for value in (self.lost, self.turnover, self.gain))
-        return Rates(self.pressure, seconds * self.cells, *sums)
+        taken = (seconds * values for values in (self.cells, self.lost, self.turnover, self.gain))
+        return Rates(self.pressure, *taken)
 
 
 class StorageSystem:
@@ -258,11 +263,24 @@ class StorageSystem:
         Active local cells, ghosts included, and the faces between two of them.
     momentum
         Unknowns of the displacement.
+    parts
+        Parts of the bodies.
     """
 
-    def __init__(self, forms: StorageForms, cells: NDArray[np.int32], facets: NDArray[np.int32], momentum: Unknowns):
+    def __init__(
+        self,
+        forms: StorageForms,
+        cells: NDArray[np.int32],
+        facets: NDArray[np.int32],
+        momentum: Unknowns,
+        parts: Parts,
+    ):
         self._forms, d, fluxes = forms, forms.grid.dim, forms.fluxes
         self.unknowns = own = Unknowns(forms.p, cells.astype(np.int64))
+        self.local_parts = parts.cells
+        """Parts (cells,) of the local cells, -1 where they hold nothing."""
+        self.of_parts = OfParts(forms.grid.comm, parts.cells[own.owned], parts.count)
+        """Parts of the unknowns."""
         self.T, self.D, self.L = (matrix(own, own, 2 * d + 1) for _ in range(3))
         self.B = matrix(own, momentum, 2**d * d)
         self.B_momentum = self.B if forms.symmetric else matrix(own, momentum, 2**d * d)
@@ -282,6 +300,12 @@ class StorageSystem:
         """Return where on the grid this process's unknowns are, and none that are held: see `multigrid_solver`."""
         places = self._forms.grid.cell_places(self.unknowns.owned)
         return places, places[:0]
+
+    def lost(self, u: PETSc.Vec, out: PETSc.Vec, *slopes: FluxSlope) -> None:
+        """Set what the residual gains by displacements, m^d: by the content and, with their slope, by the fluxes."""
+        self.B.mult(u, out)
+        for slope in slopes:
+            out.array_w[:] += slope(u)
 
     def set_alternation(self) -> None:
         """Assemble the filter L of `StorageProblem.assemble_preconditioner`."""
@@ -309,17 +333,17 @@ class StorageSystem:
 
 @dataclass(frozen=True)
 class StorageResidual:
-    """Fluid volume out of balance in each cell (m^d), and what it is measured by, m^d.
+    """Fluid volume out of balance in each cell (m^d), and what it is measured by in each part (parts,), m^d.
 
     exchanged: sum of all changes; round_off: what rounding may leave; off: sum of what the masses of the cells are off
-    by, in size; change: of this process's cells; rates: at (u, p).
+    by, in size; gain: change, plus what left, less sources; rates: at (u, p).
     """
 
     vector: PETSc.Vec
-    exchanged: float
-    round_off: float
-    off: float
-    change: float
+    exchanged: NDArray[np.float64]
+    round_off: NDArray[np.float64]
+    off: NDArray[np.float64]
+    gain: NDArray[np.float64]
     rates: Rates
 
 
@@ -362,7 +386,7 @@ class StorageProblem:
     ):
         self.forms, self.system, self.data, self._due = forms, system, data, due
         self._contents, self._flow, self.dt = contents, flow, dt
-        self._before = before or Rates(np.empty(0), np.zeros(system.unknowns.size), 0.0, 0.0, 0.0)
+        self._before = before or Rates(np.empty(0), *np.zeros((4, system.unknowns.size)))
         outflow = flow(before is None)
         system.unknowns.gather(forms.p_n.x.array, system.p_start)
         reach = 4 * forms.grid.h.max() ** 2  # no two centroids are further apart than 2 h
@@ -425,10 +449,17 @@ class StorageProblem:
         capacity = self.forms.derivatives(self.data)[0]
         return lost / (capacity + self._contents.fixed_stress)[owned]
 
+    def flows(self, pressure: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return what the owned cells lose by these pressures (n,), Pa, in the time that the rate counts, m^d."""
+        lost = self.dt * (self.system.T * self.system.unknowns.gather_owned(pressure)).array_r
+        if self._seeps:
+            lost = lost + self.dt * self._flow(False).faces.seepage(self._potentials, self._flowing)[1] * pressure
+        return lost
+
     @property
     def ring(self) -> float:
         """Mean length of the rings that the cells' contents are in axisymmetry, m."""
-        whole, area = over_all(self.forms.grid.comm, np.array([self._contents.volume, self._contents.area.sum()]))
+        whole, area = over_all(self.forms.grid.comm, np.array([self._contents.volume.sum(), self._contents.area.sum()]))
         return float(whole / area)
 
     def _aslant_now(self, outflow: Outflow) -> Aslant:
@@ -438,7 +469,7 @@ class StorageProblem:
         p = self.forms.p.x.array
         between, faces = outflow.aslant(p, np.exp(p / self.forms.bulk))
         leaving = sum_by(outflow.faces.at, faces, len(between))
-        return Aslant(between + leaving, faces, float(leaving.sum()))
+        return Aslant(between + leaving, faces, leaving)
 
     def settle_seepage(self) -> bool:
         """Open and close seepage faces as the flow at (u, p) asks for; return whether that has changed anything.
@@ -458,13 +489,33 @@ class StorageProblem:
         """Assemble the fluxes at u."""
         self._flow(False)
 
+    def flux_slope(self, u: fem.Function, unknowns: Unknowns) -> FluxSlope:
+        """Return what gives the change (n,), m^d, of what the cells lose as displacements u change along a vector, m.
+
+        Of what the laws of the conductivity, and the geometry of the fluxes, make of it no matrix is assembled: it is
+        taken from differences (Knoll and Keyes 2004).  `set_fluxes` makes the fluxes those at u again.
+        """
+        p, h = self.system.unknowns.gather(self.forms.p.x.array, self.system.unknowns.vector()), self.forms.grid.h.min()
+        here, density = self._rates(self._flow(False), p).cells, self._density
+
+        def along(v: PETSc.Vec) -> NDArray[np.float64]:
+            largest = v.norm(PETSc.NormType.NORM_INFINITY)
+            if not 0 < largest < np.inf:
+                return np.zeros(len(here))
+            step, now = np.sqrt(np.finfo(float).eps) * h / largest, u.x.array.copy()
+            unknowns.add(u, step, v)
+            there = self._rates(self._flow(False), p).cells
+            u.x.array[:] = now
+            return self.dt * (there - here) / step / density
+
+        return along
+
     def assemble_residual(self) -> StorageResidual:
         """Return the fluid volume out of balance in each cell at (u, p)."""
         forms, system, before = self.forms, self.system, self._before
         outflow = self._flow(False)
         b, owned, density = forms.change(self.data), system.unknowns.owned, self._density
         b[owned] = change = density * b[owned] + self._due
-        exchanged, total = float(np.abs(change).sum()), float(change.sum())
         r, p = system.unknowns.gather(b, system.residual), system.unknowns.gather(forms.p.x.array, system.p)
         if self.damped:
             system.D.multAdd(p - system.p_start, r, r)
@@ -476,33 +527,27 @@ class StorageProblem:
         r.array_w[:] = mass / density
         # what rounding may leave: of the volumes and of the fluxes that cancel
         round_off = 2e-15 * (self._contents.volume + now.turnover + before.turnover)
-        sums = np.array([exchanged + now.gain + before.gain, round_off, np.abs(mass).sum()])
-        return StorageResidual(r, *over_all(forms.grid.comm, sums).tolist(), total, rates)
+        rows = np.abs(change) + now.gain + before.gain, round_off, np.abs(mass), change + now.lost + before.lost
+        return StorageResidual(r, *(system.of_parts.sums(row) for row in rows), rates)
 
     def _rates(self, outflow: Outflow, p: PETSc.Vec) -> Rates:
         """Return the rates at (u, p)."""
-        forms, system, gain = self.forms, self.system, np.zeros(1)
+        forms, system, gain = self.forms, self.system, np.zeros(self.system.unknowns.size)
         pi = p.copy()
         pi.array_w[:] = values = mass_potential(p.array_r, forms.bulk)
-        cells = (system.T * pi).array_r - outflow.inflow + self._aslant.cells
-        if system.gravity is not None:
-            cells += forms.weight_of_fluid(system.gravity)[system.unknowns.owned]
+        if system.gravity is None:
+            cells = (system.T * pi).array_r.copy()
+        else:
+            cells = outflow.conductance * values + forms.driven(system.gravity)[system.unknowns.owned]
+        cells += self._aslant.cells - outflow.inflow
         if forms.sources:
             gain = forms.gain(self.data)[system.unknowns.owned]
             cells -= gain
         seeping, slope = outflow.faces.seepage(values, self._flowing) if self._seeps else (0.0, 0.0)
         cells += seeping
-        lost = (outflow.conductance * values - outflow.inflow + seeping).sum() + self._aslant.lost - gain.sum()
-        turnover = (np.abs(outflow.total) + slope) @ np.abs(values)
-        return Rates(p.array_r.copy(), cells, float(lost), float(turnover), float(np.abs(gain).sum()))
-
-    def balance(self, residual: StorageResidual) -> float:
-        """Return the change of the fluid's mass, plus what left, less sources, at the last residual.
-
-        Masses are those of a volume, m^d, at zero pressure.
-        """
-        lost = residual.rates.taken(self.dt).lost + self._before.lost
-        return float(over_all(self.forms.grid.comm, residual.change + lost))
+        lost = outflow.conductance * values - outflow.inflow + seeping + self._aslant.lost - gain
+        turnover = (np.abs(outflow.total) + slope) * np.abs(values)
+        return Rates(p.array_r.copy(), cells, lost, turnover, np.abs(gain))
 
     def came(self, rates: Rates) -> NDArray[np.float64]:
         """Return the fluid (cells,), m^d, that came to the local cells in the step by fluxes and sources; ghosts none.

@@ -132,12 +132,12 @@ class ToolContact(CellContact):
         """Choose what slips at u, and if asked for what sticks again; return whether that is another choice."""
         return self.grips and self.choose(self.at(u), sticks)
 
-    def augment(self, u: NDArray[np.float64], unknown: float) -> bool:
+    def augment(self, u: NDArray[np.float64], unknown: NDArray[np.float64]) -> bool:
         """Augment the pressures where means penetrate too deep at u, see `augmented`; return whether they do.
 
         Where they do not, tools that a load pushes go on until they meet as much, and u with them.
 
-        unknown: how well the balance tells forces, N.
+        unknown (tools,): how well the balance tells forces, N.
         """
         touch = self.at(u)
         if self.augmented(touch, touch.x, "does a wall hold the body there?") > 0:

@@ -7,6 +7,7 @@ A shape is a signed distance, m, positive outside of the tool, in the place that
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple, Protocol
@@ -15,8 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import ConvexHull, QhullError
 
+from mpm_dolfinx.given_values import check_names, given
 from mpm_dolfinx.points.grid import Grid
-from mpm_dolfinx.problems.conditions import given
 from mpm_dolfinx.validation import asked, line, numbers
 
 LEAST = 1e-300  # in place of a distance from a centre, m
@@ -344,6 +345,12 @@ class Tool:
             numbers(f"Tool: {name}", value, test=lambda v: (v >= 0) & (v < np.inf), allowed=">= 0 and finite")
         if (self.load is None) != (self.direction is None):
             raise ValueError(f"{line(self)}: load and direction, must be given both, or none")
+        for name in ("displacement", "rotation", "load"):
+            value = getattr(self, name)
+            if callable(value):
+                check_names(f"{line(self)}: {name}", value, ("t",))
+            elif isinstance(value, (list, np.ndarray)):
+                object.__setattr__(self, name, deepcopy(value))  # nobody changes it
         if self.load is not None and not callable(self.load):
             self.pushes(0.0)
 
@@ -351,10 +358,14 @@ class Tool:
         """Return the load at time t (s), N; nan where none pushes the tool."""
         if self.load is None:
             return np.nan
-        value = float(given(self, "load", t, None))
+        value = float(self._given("load", t))
         if not 0 <= value < np.inf:
             raise ValueError(f"{line(self)}: load at t = {t:g} s = {value:g}, must be >= 0 and finite")
         return value
+
+    def _given(self, name: str, t: float, dim: int = 0) -> NDArray[np.float64]:
+        """Return one of its values at time t (s): a number, or with a dimension also (d,)."""
+        return given(f"{line(self)}: {name} at t = {t:g} s", getattr(self, name), t, None, dim)
 
     def along(self, dim: int) -> NDArray[np.float64]:
         """Return the unit vector (d,) in which a load pushes, zero without."""
@@ -383,7 +394,7 @@ class Tool:
             raise ValueError(f"{line(self)}: rotation, must be 0 in 3D")
         for name in ("displacement", "rotation"):  # what a function gives is checked when it is called
             if not callable(getattr(self, name)):
-                given(self, name, 0.0, None, dim if name == "displacement" else 0)
+                self._given(name, 0.0, dim if name == "displacement" else 0)
         self._centre(dim)
         self.along(dim)
 
@@ -394,10 +405,10 @@ class Tool:
 
     def pose(self, t: float, dim: int, way: float = 0.0) -> Pose:
         """Return where the tool is at time t (s), after a load has pushed it by a way, m."""
-        shift = given(self, "displacement", t, None, dim)
+        shift = self._given("displacement", t, dim)
         if shift.ndim == 0 and shift:
             raise ValueError(f"{line(self)}: displacement at t = {t:g} s = {shift:g}, must be {dim} finite numbers")
-        R, angle = np.eye(dim), float(given(self, "rotation", t, None))
+        R, angle = np.eye(dim), float(self._given("rotation", t))
         if angle:
             R = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
         return Pose(R, self._centre(dim), np.broadcast_to(shift, (dim,)) + way * self.along(dim))

@@ -35,11 +35,12 @@ from petsc4py import PETSc
 
 import numpy as np
 from dolfinx.common import Timer
+from numpy.typing import NDArray
 
 from mpm_dolfinx.caching import Latest
 from mpm_dolfinx.forms.unknowns import Unknowns
 from mpm_dolfinx.problems.momentum import MomentumSystem
-from mpm_dolfinx.problems.storage import StorageSystem
+from mpm_dolfinx.problems.storage import FluxSlope, StorageSystem
 from mpm_dolfinx.solve.linear import direct_solver, factorise, nodal_solver, renewed, solved
 
 MANY, MOST = 29, 500
@@ -63,6 +64,9 @@ FACTORISED = 20000
 
 MUMPS takes 8 s and 0.2 GB for as many, where K is not symmetric 15 s and 0.4 GB.
 """
+
+
+Scale = NDArray[np.float64] | float
 
 
 def factorisable(unknowns: Unknowns) -> bool:
@@ -95,7 +99,8 @@ class BlockOperator:
         self._cycles, self._split = (momentum_cycle, storage_cycle), momentum.unknowns.size
         self._u, self._f = momentum.unknowns.vector(), momentum.unknowns.vector()
         self._p, self._g = storage.unknowns.vector(), storage.unknowns.vector()
-        self.scale = np.ones(2)
+        self.slope: list[FluxSlope] = []
+        self.scale: list[NDArray[np.float64]] = [np.ones(self._split), np.ones(storage.unknowns.size)]
 
     @property
     def _inverses(self) -> tuple[PETSc.PC, PETSc.PC]:
@@ -106,12 +111,12 @@ class BlockOperator:
         """Multiply by the operator."""
         s = self._storage
         self.part(x, self._u, self._p)
-        s.B.mult(self._u, self._g)
+        s.lost(self._u, self._g, *self.slope)
         s.C.multAdd(self._p, self._g, self._g)
         s.B_momentum.multTranspose(self._p, self._f)
         self._f.scale(-1.0)
         self._momentum.K.multAdd(self._u, self._f, self._f)
-        self.join(self._f, self._g, y, *(1 / self.scale))
+        self.join(self._f, self._g, y, *(1 / scale for scale in self.scale))
 
     def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """Apply the preconditioner."""
@@ -122,21 +127,22 @@ class BlockOperator:
         on_u.apply(self._f, self._u)
         self.join(self._u, self._p, y)
 
-    def displaced(self) -> float:
-        """Return how much fluid the forces of the residual displace, m^d/N."""
+    def displaced(self) -> NDArray[np.float64]:
+        """Return how much fluid the forces of the residual displace in each part (parts,), m^d/N."""
         forces = self._momentum.residual
         self._inverses[0].apply(forces, self._u)
         self._storage.B.mult(self._u, self._g)
-        norm = forces.norm()
-        return self._g.norm() / norm if norm > 0 else 0.0
+        norms = self._momentum.of_parts.norms(forces.array_r)
+        displaced = self._storage.of_parts.norms(self._g.array_r)
+        return np.divide(displaced, norms, out=np.zeros(len(norms)), where=norms > 0)
 
-    def part(self, x: PETSc.Vec, u: PETSc.Vec, p: PETSc.Vec, scale_u: float = 1.0, scale_p: float = 1.0) -> None:
+    def part(self, x: PETSc.Vec, u: PETSc.Vec, p: PETSc.Vec, scale_u: Scale = 1.0, scale_p: Scale = 1.0) -> None:
         """Set (u, p) to the scaled parts of x."""
         values = x.array_r
         np.multiply(values[: self._split], scale_u, out=u.array_w)
         np.multiply(values[self._split :], scale_p, out=p.array_w)
 
-    def join(self, u: PETSc.Vec, p: PETSc.Vec, x: PETSc.Vec, scale_u: float = 1.0, scale_p: float = 1.0) -> None:
+    def join(self, u: PETSc.Vec, p: PETSc.Vec, x: PETSc.Vec, scale_u: Scale = 1.0, scale_p: Scale = 1.0) -> None:
         """Set the parts of x to (u, p), scaled."""
         values = x.array_w
         np.multiply(u.array_r, scale_u, out=values[: self._split])
@@ -197,19 +203,36 @@ class BlockSolver:
         """Take the present P; factors, which serve all tangents of a step, stay."""
         renewed(self._storage_cycle, self._storage.P)
 
-    def solve(self, du: PETSc.Vec, dp: PETSc.Vec, scale: tuple[float, float], rtol: float) -> int:
+    def solve(
+        self,
+        du: PETSc.Vec,
+        dp: PETSc.Vec,
+        scales: tuple[NDArray, NDArray],
+        rtol: float,
+        slope: FluxSlope | None = None,
+    ) -> int:
         """Solve for (du, dp) with the problems' residuals on the right; return the number of iterations.
 
         Parameters
         ----------
-        scale
-            Of the two residuals, N and m^d: what counts as equally large.
+        scales : (parts,), (parts,)
+            Of the two residuals in each part, N and m^d: what counts as equally large.
         rtol
-            Relative to the norm of both residuals, scaled.
+            Relative to the norm of both residuals, scaled, in each part.
+        slope
+            What the fluxes gain by displacements; without, it is left out.
         """
-        scale_u, scale_p = scale
-        self._operator.scale[:] = scale = scale_u, max(scale_p, LEAST * scale_u * self._operator.displaced())
-        self._operator.join(self._momentum.residual, self._storage.residual, self._b, *(1 / s for s in scale))
+        self._operator.slope[:] = [] if slope is None else [slope]
+        on_u, on_p = self._momentum.of_parts, self._storage.of_parts
+        residuals = self._momentum.residual, self._storage.residual
+        scale_u, scale_p = scales
+        scale_p = np.maximum(scale_p, LEAST * scale_u * self._operator.displaced())
+        if on_u.count > 1:  # nothing couples the parts: each counts as much
+            sizes = [of.norms(r.array_r) for of, r in zip((on_u, on_p), residuals, strict=True)]
+            size = np.hypot(sizes[0] / scale_u, sizes[1] / scale_p)
+            scale_u, scale_p = (scale * np.where(size > 0, size, 1.0) for scale in (scale_u, scale_p))
+        self._operator.scale[:] = scale = scale_u[on_u.of], scale_p[on_p.of]
+        self._operator.join(*residuals, self._b, *(1 / s for s in scale))
         few = factorisable(self._momentum.unknowns)
         self._ksp.setTolerances(rtol=rtol, atol=0.0, max_it=MANY if few else MOST)
         self._ksp.solve(self._b, self._x)

@@ -14,6 +14,7 @@ would still need the parts.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from weakref import finalize
 
 from petsc4py import PETSc
@@ -23,9 +24,9 @@ from dolfinx.common import Timer
 from numpy.typing import NDArray
 
 from mpm_dolfinx.caching import Latest
-from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.problems.momentum import MomentumProblem, MomentumSystem
-from mpm_dolfinx.problems.storage import FILTER, StorageProblem, StorageSystem
+from mpm_dolfinx.problems.parts import OfParts
+from mpm_dolfinx.problems.storage import FILTER, FluxSlope, StorageProblem, StorageSystem
 from mpm_dolfinx.solve.linear import (
     by_mumps,
     direct_solver,
@@ -51,13 +52,14 @@ class SchurComplement:
     def __init__(self, storage: StorageSystem, solve_momentum: PETSc.KSP):
         self.storage, self.solve = storage, solve_momentum
         self.f, self.v = storage.B.createVecRight(), storage.B.createVecRight()
+        self.slope: list[FluxSlope] = []
 
     def mult(self, A: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """Multiply."""
         s = self.storage
         s.B_momentum.multTranspose(x, self.f)
         self.solve.solve(self.f, self.v)
-        s.B.mult(self.v, y)
+        s.lost(self.v, y, *self.slope)
         s.C.multAdd(x, y, y)
 
 
@@ -106,15 +108,16 @@ class LinearSolvers:
             self._solve_s = multigrid_solver(storage.P, "storage", *storage.places(), nodal=False)
             self._block = BlockSolver(momentum, storage, self.solve_u.pc, self._solve_s.pc, symmetric)
             return
-        n, context = (storage.unknowns.size, None), SchurComplement(storage, self.solve_u)
-        finalize(self, vars(context).clear)  # PETSc keeps contexts of its matrices, and what they refer to
-        self._schur = PETSc.Mat().createPython((n, n), context, storage.unknowns.comm)
+        n, self._context = (storage.unknowns.size, None), SchurComplement(storage, self.solve_u)
+        finalize(self, vars(self._context).clear)  # PETSc keeps contexts of its matrices, and what they refer to
+        self._schur = PETSc.Mat().createPython((n, n), self._context, storage.unknowns.comm)
         self._schur.setUp()
         large = by_mumps(momentum.unknowns, symmetric)
         self._solve_s = direct_solver(storage.P, "storage", often=not large, package="mumps" if large else None)
         krylov = PETSc.KSP.Type.CG if symmetric else PETSc.KSP.Type.FGMRES
         kind = {"schur-cg": krylov, "schur-fgmres": PETSc.KSP.Type.FGMRES}
-        self._solve_s.setType(kind.get(scheme.coupling, PETSc.KSP.Type.PREONLY))
+        self._krylov = kind.get(scheme.coupling, PETSc.KSP.Type.PREONLY)
+        self._solve_s.setType(self._krylov)
         self._solve_s.setGMRESRestart(RESTART)
 
     def begin(self) -> None:
@@ -131,11 +134,15 @@ class LinearSolvers:
         return self._schur, self._solve_s
 
     def linearise(
-        self, momentum: MomentumProblem, storage: StorageProblem | None, data=None, firmness: float = 0.0
+        self,
+        momentum: MomentumProblem,
+        storage: StorageProblem | None,
+        data=None,
+        firmness: NDArray[np.float64] | float = 0.0,
     ) -> bool:
         """Set the tangents at (u, p), of the problems' pieces or of others, and factorise them.
 
-        firmness: share of the elastic shear stiffness that is added.
+        firmness: share of the elastic shear stiffness that is added, one number or one for each part.
         """
         with Timer("mpm: tangent"):
             K = momentum.assemble_tangent(data, firmness)
@@ -162,31 +169,46 @@ class LinearSolvers:
         self._solve_s.setUp()
         return True
 
-    def solve(self, rtol: float, scale_u: float, exchanged: float) -> int:
+    def solve(
+        self,
+        rtol: float,
+        forces: NDArray[np.float64],
+        exchanged: NDArray[np.float64] | None = None,
+        slope: FluxSlope | None = None,
+    ) -> int:
         """Solve for (du, dp) with the present residuals; return the coupling iterations.
 
         Parameters
         ----------
         rtol
-            Relative accuracy.
-        scale_u, exchanged
+            Relative accuracy of each part.
+        forces, exchanged : (parts,)
             What the residuals are measured by: forces, N, and fluid that changes places, m^d.
+        slope
+            What the fluxes gain by displacements; without, the tangent leaves that out.
         """
         residual = self._momentum.residual
         if self._storage is None:
             self.solve_u.setTolerances(rtol=rtol, atol=0.0, max_it=500)
-            self.solve_u.solve(residual, self.du)
+            self.solve_momentum()
             count = solved(self.solve_u, "momentum")
             return count if self.iterative else 0
         if self._block is not None:
             r = self._storage.residual  # scales of Euclidean norms that make them the errors
-            # no 1-norm of PETSc's: OpenBLAS's depends in its last bit on where the vector lies in memory
-            size, total = r.norm(), float(over_all(self._storage.unknowns.comm, np.abs(r.array_r).sum()))
-            scale_p = (exchanged or 1.0) * (size / total if total > 0 else 1.0)
-            return self._block.solve(self.du, self.dp, (scale_u or 1.0, scale_p), rtol)
+            of = self._storage.of_parts
+            size, total = of.norms(r.array_r), of.sums(np.abs(r.array_r))
+            share = np.divide(size, total, out=np.ones(of.count), where=total > 0)
+            scales = np.where(forces > 0, forces, 1.0), np.where(exchanged > 0, exchanged, 1.0) * share
+            return self._block.solve(self.du, self.dp, scales, rtol, slope)
+        krylov = self._krylov if slope is None else PETSc.KSP.Type.FGMRES
+        self._context.slope[:] = [] if slope is None else [slope]
+        if self._solve_s.getType() != krylov:
+            self._solve_s.setType(krylov)
+            self._solve_s.setGMRESRestart(RESTART)
         g = self.condense()
         self._solve_s.setTolerances(rtol=rtol, atol=0.0, max_it=500)
-        self._solve_s.solve(g, self.dp)
+        measured = self._solve_s.pc.apply if krylov == PETSc.KSP.Type.CG else None  # which takes preconditioned norms
+        self._evenly(self._solve_s, g, self.dp, self._storage.of_parts, measured)
         self._storage.B_momentum.multTranspose(self.dp, self._rhs)
         self._rhs.axpy(1.0, residual)
         self.solve_u.solve(self._rhs, self.du)
@@ -195,15 +217,43 @@ class LinearSolvers:
             self._operator.clear()
         return count
 
-    def turn_round(self) -> None:
-        """Turn the direction round."""
-        for part in (self.du,) if self._storage is None else (self.du, self.dp):
-            part.scale(-1.0)
+    @staticmethod
+    def _evenly(
+        ksp: PETSc.KSP,
+        b: PETSc.Vec,
+        x: PETSc.Vec,
+        of: OfParts,
+        measured: Callable[[PETSc.Vec, PETSc.Vec], None] | None = None,
+    ) -> None:
+        """Solve for x iteratively, so that all parts are as accurate: nothing couples them, so each may have a scale.
+
+        measured: makes of the right-hand side b what the solver takes the norm of; None: b itself.
+        """
+        if of.count <= 1:
+            ksp.solve(b, x)
+            return
+        if measured is not None:
+            measured(b, x)
+        size = of.norms((b if measured is None else x).array_r)
+        scale = np.where((size > 0) & (size < np.inf), size, 1.0)[of.of]
+        b.array_w[:] /= scale
+        ksp.solve(b, x)
+        b.array_w[:] *= scale
+        x.array_w[:] *= scale
+
+    def turn_round(self, parts: NDArray[np.bool_] | None = None) -> None:
+        """Turn the direction round, of all parts or of some (parts,)."""
+        directions = [(self.du, self._momentum)] + ([(self.dp, self._storage)] if self._storage is not None else [])
+        for direction, system in directions:
+            if parts is None or parts.all():
+                direction.scale(-1.0)
+            else:
+                direction.array_w[:] *= np.where(parts, -1.0, 1.0)[system.of_parts.of]
 
     def condense(self) -> PETSc.Vec:
         """Return the residual of the Schur complement's system, R_p - B K^-1 R_u."""
         self.solve_u.solve(self._momentum.residual, self.du)
-        self._storage.B.mult(self.du, self._g)
+        self._storage.lost(self.du, self._g, *self._context.slope)
         self._g.aypx(-1.0, self._storage.residual)
         return self._g
 
@@ -215,8 +265,12 @@ class LinearSolvers:
 
     def solve_momentum(self) -> None:
         """Solve for du alone, pressures kept."""
-        self.dp.set(0.0)
-        self.solve_u.solve(self._momentum.residual, self.du)
+        if self._storage is not None:
+            self.dp.set(0.0)
+        if self.iterative:
+            self._evenly(self.solve_u, self._momentum.residual, self.du, self._momentum.of_parts)
+        else:
+            self.solve_u.solve(self._momentum.residual, self.du)
 
     def solve_storage(self) -> PETSc.Vec:
         """Return dp, solved for at fixed stress."""

@@ -38,8 +38,8 @@ EXPLODES = 1e4
 """Growth of the residual from which on a step is shortened: that of a bending body may grow as much in a good one."""
 PATIENCE = 6
 """Steps that may pass without a residual below the least so far."""
-SHORTEST_DESCENT = 0.1
-"""Share of a step below which a descent does not shorten it."""
+SHORTEST, SHORTEST_DESCENT = 1e-3, 0.1
+"""Share of a step below which it is not shortened, and below which a descent does not shorten it."""
 WORK, STEEPER, TRIES = 0.5, 2.0, 6
 """Work along a step, over that at its start, that it may end with, and that tells that it is too long; most tries."""
 LARGEST = sys.float_info.max
@@ -141,3 +141,44 @@ class Search:
             return None
         share = np.sqrt(low[1] / (low[1] - high[1])) if high[1] < 0 else 0.2  # beyond the turn it grows ever faster
         return Search(low[0] + min(0.8, max(0.1, share)) * (high[0] - low[0]), low, high, self.tries + 1)
+
+
+@dataclass(frozen=True)
+class Descent:
+    """Backtracking along a step until the residual is no larger than a limit.
+
+    before: residual at its start; limit, most: what it may be at its end, and at least has to be below; shortest: share
+    of the step below which it is not shortened; by_half: how it is shortened, else see `shortened`; step: share to try;
+    best: least residual so far, and its share; settles: whether the best one is taken now.
+    """
+
+    before: float
+    limit: float
+    most: float
+    shortest: float
+    by_half: bool
+    step: float = 1.0
+    best: tuple[float, float] = (np.inf, 1.0)
+    settles: bool = False
+
+    @classmethod
+    def of(cls, before: float, dog: Watchdog | None) -> Descent:
+        """Return the search from a residual, by a watchdog that wants it to descend, or without one."""
+        most = min(EXPLODES * before, LARGEST)
+        if dog is None:
+            return cls(before, most, most, SHORTEST, by_half=True)
+        return cls(before, dog.limit(before), most, SHORTEST_DESCENT, by_half=False)
+
+    def ends(self, residual: float) -> bool:
+        """Return whether the search may end with a residual."""
+        return residual <= self.limit or self.settles
+
+    def after(self, residual: float) -> Descent | None:
+        """Return the search with the next step to try; None: it has ended, or there is no descent."""
+        if self.ends(residual):
+            return None
+        best = min(self.best, (residual, self.step))
+        step = self.step * (0.5 if self.by_half else shortened(residual / self.before, self.step))
+        if step >= self.shortest:
+            return replace(self, step=step, best=best)
+        return replace(self, step=best[1], settles=True, best=best) if best[0] <= self.most else None

@@ -487,7 +487,7 @@ class BiotFEM:
         out = np.flatnonzero(self.grid.outside(x))
         if len(out):
             raise ValueError(f"probe at {x[out[0]]}: outside the body, must be in it or on its surface")
-        result, began = Result(rows=[self._row(x)]), time.perf_counter()
+        result, began = Result(rows=(self._row(x),)), time.perf_counter()
         shown = {"disable": not progress or self.grid.comm.rank > 0 or None, "unit": "step", "desc": "finite elements"}
         for _ in tqdm(range(steps), **shown):
             try:
@@ -495,8 +495,7 @@ class BiotFEM:
             except NotConverged as failed:
                 message = f"gave up at t = {self.t:g} s with dt = {dt:.3g} s: {failed}"
                 raise GaveUp(message, result, failed.history) from failed
-            result = result.after(Report(newton=newton, history=[(residual, 0.0)]), dt)
-            result.rows.append(self._row(x))
+            result = result.after(Report(newton=newton, history=[(residual, 0.0)]), dt).more(self._row(x))
         return replace(result, wall=time.perf_counter() - began, converged=True)
 
     def displacement(self, x: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: MIT
+"""Values at places, by polynomials that are fitted to what is known around them: moving least squares.
+
+    sum_i w(o_i) (P(o_i) - v_i)^2 + small terms of P's coefficients -> min,      o_i the offsets from the place,
+
+whose constant is the value there (Lancaster and Salkauskas 1981).  Polynomials up to the degree are exact.  The weights
+fall smoothly to nothing, so values change steadily as data come and go.  Where the data do not tell a coefficient it
+is none: the small terms see to it, the higher degrees first.
+"""
+
+from __future__ import annotations
+
+from itertools import combinations_with_replacement
+
+from mpi4py import MPI
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpm_dolfinx.parallel.exchange import over_all
+from mpm_dolfinx.points.grid import sum_by
+
+RADIUS = 3.0
+"""Offsets, over the spacing of the data, from which on these have no weight.
+
+At an end of the data those at 0.5, 1.5 and 2.5 have: as many as a parabola needs.
+"""
+UNTOLD = (0.0, 1e-10, 1e-6)
+"""Weights of the coefficients of each degree, over those of the data: of what these do not tell.
+
+A hundredth and a hundred times as much change pressures of a consolidating column by 1e-5 of the load.
+"""
+
+
+def near(offset: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the weights (r,) of data at offsets (r, d) over their spacing."""
+    return np.clip(1 - (offset / RADIUS) ** 2, 0, None).prod(axis=1) ** 4
+
+
+class LocalFit:
+    """Polynomials about some places, fitted to values that all processes add.
+
+    Parameters
+    ----------
+    count
+        Number of places.
+    dim
+        Number d of coordinates.
+    degree
+        Of the polynomials, 1 or 2.
+    width
+        Number of values at each place.
+    """
+
+    def __init__(self, count: int, dim: int, degree: int, width: int = 1):
+        powers = [rows for k in range(degree + 1) for rows in combinations_with_replacement(range(dim), k)]
+        self._powers, size = powers, len(powers)
+        self._sums = np.zeros((count, size * (size + width)))
+
+    def add(self, at: NDArray[np.int64], offset: NDArray, values: NDArray, weight: NDArray) -> None:
+        """Add values (r, width), with weights, for places `at` (r,), at offsets (r, d) over the spacing of the data."""
+        basis = np.stack([offset[:, list(p)].prod(axis=1) for p in self._powers], axis=1)
+        rows = np.concatenate([basis, values], axis=1)
+        outer = (weight[:, None] * basis)[:, :, None] * rows[:, None, :]
+        for k, column in enumerate(outer.reshape(len(at), self._sums.shape[1]).T):
+            self._sums[:, k] += sum_by(at, column, len(self._sums))
+
+    def values(self, comm: MPI.Intracomm) -> NDArray[np.float64]:
+        """Return the values (count, width) at the places, on every process; zero where nothing was added."""
+        size = len(self._powers)
+        sums = over_all(comm, self._sums).reshape(len(self._sums), size, -1)
+        A, b, degree = sums[:, :, :size].copy(), sums[:, :, size:], np.array([len(p) for p in self._powers])
+        some = A[:, 0, 0] > 0
+        whole = np.where(some, A[:, 0, 0], 1.0)
+        A[:, np.arange(size), np.arange(size)] += whole[:, None] * np.array(UNTOLD)[degree] + (~some)[:, None]
+        return np.linalg.solve(A, b)[:, 0]

@@ -1,0 +1,209 @@
+# SPDX-License-Identifier: MIT
+"""Kinds of cells of meshes: their facets, and how they are split into domains.
+
+A triangle is split into three quadrilaterals, a tetrahedron into four hexahedra with plane faces, one at each vertex v,
+with the means of v and of some of the others as corners.  A wedge is three such quadrilaterals, drawn along its third
+direction; a pyramid is two tetrahedra.  So a facet is split alike by the cells on both of its sides, whatever their
+kinds, but for quadrilaterals: hexahedra keep them whole.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpm_dolfinx.points.cutting import FACES, corner_bits
+
+KINDS = {2: {"triangle": 3, "quad": 4}, 3: {"tetra": 4, "hexahedron": 8, "wedge": 6, "pyramid": 5}}
+"""Cells that become domains, and their numbers of vertices."""
+SIDES_OF = {2: {"line": 2}, 3: {"triangle": 3, "quad": 4}}
+"""Cells that are sides."""
+AS_LATTICE = {"quad": [0, 1, 3, 2], "hexahedron": [0, 1, 3, 2, 4, 5, 7, 6]}
+"""Vertices of meshio's cells with the first axis fastest."""
+SECOND_ORDER = {
+    **{"line3": "line", "triangle6": "triangle", "triangle7": "triangle", "quad8": "quad", "quad9": "quad"},
+    **{"tetra10": "tetra", "hexahedron20": "hexahedron", "hexahedron24": "hexahedron", "hexahedron27": "hexahedron"},
+    **{"wedge12": "wedge", "wedge15": "wedge", "wedge18": "wedge", "pyramid13": "pyramid", "pyramid14": "pyramid"},
+}
+"""Kinds of second order, whose vertices come first, and those that have these vertices alone."""
+LOOPS = {
+    "triangle": [(0, 1), (1, 2), (2, 0)],
+    "quad": [(0, 1), (1, 3), (3, 2), (2, 0)],
+    "tetra": [(0, 1, 2), (0, 1, 3), (0, 2, 3), (1, 2, 3)],
+    "hexahedron": [(a, b, d, c) for a, b, c, d in FACES[3].tolist()],
+    "wedge": [(0, 1, 2), (3, 4, 5), (0, 1, 4, 3), (1, 2, 5, 4), (2, 0, 3, 5)],
+    "pyramid": [(0, 1, 2, 3), (0, 1, 4), (1, 2, 4), (2, 3, 4), (3, 0, 4)],
+}
+"""Vertices of the facets of each kind, around; quadrilaterals and hexahedra with the first axis fastest."""
+
+
+class Block(NamedTuple):
+    """Cells of one kind: meshio's own blocks know not all kinds of second order."""
+
+    type: str
+    data: NDArray[np.int64]
+
+
+def edges(kind: str) -> list[tuple[int, int]]:
+    """Return the vertices of the edges of a kind, each once, numbered as those of `LOOPS`."""
+    around = [pair for loop in LOOPS[kind] for pair in zip(loop, (*loop[1:], loop[0]), strict=True)]
+    return sorted({tuple(sorted(pair)) for pair in around})
+
+
+def distinct(rows: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return where each of the different rows (n, k) is first, the rows ascending, and which of them each row (n,) is.
+
+    numpy's unique compares rows as one object each, five times slower.
+    """
+    order = np.lexsort(rows.T[::-1])
+    new = np.append(True, (np.diff(rows[order], axis=0) != 0).any(axis=1))[: len(rows)]
+    which = np.empty(len(rows), dtype=np.int64)
+    which[order] = np.cumsum(new) - 1
+    return order[new], which
+
+
+@dataclass(frozen=True)
+class Part:
+    """A domain that is a part of a cell.
+
+    corners : (2^d,) of the vertices whose mean each corner is; faces : (2d,) of the vertices of the facet that each
+    face lies on, none of a face in the cell.
+    """
+
+    corners: tuple[tuple[int, ...], ...]
+    faces: tuple[tuple[int, ...], ...]
+
+
+def _of_simplices(kind: str, *simplices: tuple[int, ...]) -> list[Part]:
+    """Return the parts of a cell that is made of simplices."""
+    d, out = len(simplices[0]) - 1, []
+    bits = corner_bits(d)
+    for simplex in simplices:
+        for v in simplex:
+            others = [w for w in simplex if w != v]
+            faces = [()] * (2 * d)
+            for axis in range(d):
+                of = {*simplex} - {others[axis]}
+                faces[2 * axis] = next((loop for loop in LOOPS[kind] if of <= {*loop}), ())
+            corners = [(v, *(w for w, bit in zip(others, row, strict=True) if bit)) for row in bits]
+            out.append(Part(tuple(corners), tuple(faces)))
+    return out
+
+
+def _wedge() -> list[Part]:
+    """Return the parts of a wedge: those of its triangle, from its lower to its upper end."""
+    out, quads = [], LOOPS["wedge"][2:]
+    for part in _of_simplices("triangle", (0, 1, 2)):
+        corners = [tuple(v + end for v in of) for end in (0, 3) for of in part.corners]
+        sides = [next((loop for loop in quads if of and {*of} <= {*loop}), ()) for of in part.faces]
+        out.append(Part(tuple(corners), (*sides, *LOOPS["wedge"][:2])))
+    return out
+
+
+def _whole(dim: int) -> list[Part]:
+    """Return the one part of a quadrilateral or hexahedron."""
+    return [Part(tuple((k,) for k in range(2**dim)), tuple(map(tuple, FACES[dim].tolist())))]
+
+
+PARTS = {
+    "triangle": _of_simplices("triangle", (0, 1, 2)),
+    "quad": _whole(2),
+    "tetra": _of_simplices("tetra", (0, 1, 2, 3)),
+    "hexahedron": _whole(3),
+    "wedge": _wedge(),
+    "pyramid": _of_simplices("pyramid", (0, 1, 2, 4), (0, 2, 3, 4)),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Polytopes:
+    """Cells as convex polytopes, of all kinds; arrays over n cells.
+
+    x : (n, k, d), m, vertices, the last one as often as is needed; normals : (n, f, d) of facets, edges : (n, e, d), m,
+    zeros where there are fewer; warp : (n,), m, how far vertices of facets lie off planes.
+    """
+
+    x: NDArray[np.float64]
+    normals: NDArray[np.float64]
+    edges: NDArray[np.float64]
+    warp: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, x: NDArray[np.float64], cells: dict[str, NDArray[np.int64]]) -> Polytopes:
+        """Return cells (n, k) by kind, of vertices x (nodes, d), m, one kind after the other."""
+        d = x.shape[1]
+        most = [max(len(of) for of in parts) for parts in zip(*(_shape(kind) for kind in cells), strict=True)]
+        rows = [_polytopes(d, kind, x[nodes], *most) for kind, nodes in cells.items()]
+        return cls(*map(np.concatenate, zip(*rows, strict=True)))
+
+    def apart(
+        self, i: NDArray[np.int64], j: NDArray[np.int64], slack: NDArray[np.float64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Return which pairs (m,) of cells i, j no plane parts, and how deep these lie in each other, m.
+
+        Planes along a facet of one, or in 3D along an edge of each, are enough for convex cells.  Pairs that lie in
+        each other by less than `slack` (m,), m, are parted.
+        """
+        left, depth = np.arange(len(i)), np.full(len(i), np.inf)
+        for normals in self._planes():
+            if not len(left):
+                break
+            n = normals(i[left], j[left])
+            length = np.linalg.norm(n, axis=1)
+            known = length > 0
+            n = n / np.where(known, length, 1.0)[:, None]
+            a, b = (np.einsum("nkd,nd->nk", self.x[c[left]], n) for c in (i, j))
+            lap = np.minimum(a.max(axis=1) - b.min(axis=1), b.max(axis=1) - a.min(axis=1))
+            depth[left] = np.minimum(depth[left], np.where(known, lap, np.inf))
+            left = left[depth[left] > slack[left]]
+        return left, depth[left]
+
+    def _planes(self):
+        """Yield functions that give the normals (m, d) of a plane of each of some pairs of cells."""
+        for f in range(self.normals.shape[1]):
+            yield lambda i, j, f=f: self.normals[i, f]
+            yield lambda i, j, f=f: self.normals[j, f]
+        if self.x.shape[2] == 3:
+            for e in range(self.edges.shape[1]):
+                for g in range(self.edges.shape[1]):
+                    yield lambda i, j, e=e, g=g: _crossed(self.edges[i, e], self.edges[j, g])
+
+
+def _crossed(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the cross products (n, 3) of edges, nothing of those that are parallel but for rounding."""
+    out = np.cross(a, b)
+    size = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
+    return np.where((np.linalg.norm(out, axis=1) > PARALLEL * size)[:, None], out, 0.0)
+
+
+PARALLEL = 1e-9  # sine of the angle between edges of which no common normal is known for rounding
+
+
+def _shape(kind: str) -> tuple[range, list, list]:
+    """Return the vertices, facets and edges of a kind."""
+    return range(1 + max(map(max, LOOPS[kind]))), LOOPS[kind], edges(kind)
+
+
+def _polytopes(dim: int, kind: str, x: NDArray[np.float64], vertices: int, facets: int, edges: int) -> tuple:
+    """Return what `Polytopes` have of cells of one kind with corners x (n, k, d), with room for so many."""
+    _, loops, ends = _shape(kind)
+    corners = np.concatenate([x, np.repeat(x[:, -1:], vertices - x.shape[1], axis=1)], axis=1)
+    normals, warp = np.zeros((len(x), facets, dim)), np.zeros(len(x))
+    for f, loop in enumerate(loops):
+        c = x[:, list(loop)]
+        if dim == 2:
+            t = c[:, 1] - c[:, 0]
+            normals[:, f] = np.stack([t[:, 1], -t[:, 0]], axis=1)
+            continue
+        n = np.cross(c[:, 2] - c[:, 0], c[:, -1] - c[:, 1])
+        normals[:, f] = n / np.maximum(np.linalg.norm(n, axis=1), np.finfo(float).tiny)[:, None]
+        if len(loop) == 4:
+            off = np.einsum("nd,nd->n", c[:, 0] - c[:, 1] + c[:, 2] - c[:, 3], normals[:, f])
+            warp = np.maximum(warp, np.abs(off) / 4)
+    along = np.zeros((len(x), edges, dim))
+    for e, (a, b) in enumerate(ends):
+        along[:, e] = x[:, b] - x[:, a]
+    return corners, normals, along, warp

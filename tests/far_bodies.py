@@ -1,0 +1,31 @@
+# SPDX-License-Identifier: MIT
+"""A soft beam, alone or beside a body that it does not touch, which rests, moves, is loaded or drains."""
+
+import numpy as np
+
+import mpm_dolfinx as mpm
+
+E = 1e3  # Pa, of the beam
+THERE = ((2.0, -np.inf), (np.inf, np.inf))
+
+
+def beside(kind: str | None, stiffer: float = 1.0, wet: bool = False, law=None, **options) -> mpm.Simulation:
+    """Return the scene; stiffer: what the other body's modulus is in terms of the beam's; law: of the beam."""
+    grid = mpm.Grid([3.6, 1.2], [30, 10])
+    soft, hard = (mpm.Hencky(bulk=f * E / 1.8, shear=f * E / 2.6, conductivity=1e-4) for f in (1, stiffer))
+    bodies, materials = [mpm.box(grid, [0, 0.42], [1, 0.75])], [law or soft]
+    at_beam = ((0.05, -np.inf), (1.01, np.inf))
+    loads = [mpm.Traction("top", lambda t: (0, -t), region=at_beam)]
+    drained = [mpm.Drained("right", region=((-np.inf, -np.inf), (1.01, np.inf)))]
+    if kind:
+        bodies.append(mpm.box(grid, [2.52, 0.3], [3.0, 0.78], material=1))
+        materials.append(hard)
+        way = (lambda t, X: (0.1 * t, 0.05 * t)) if kind == "moves" else (0, 0)
+        options["displacements"] = [mpm.Displacement("bottom", way, region=THERE)]
+    if kind in ("loaded", "drains"):
+        loads.append(mpm.Traction("top", lambda t: (0, -0.05 * stiffer * E * t), region=THERE))
+    if kind == "drains":
+        drained.append(mpm.Drained("top", region=THERE))
+    if wet:
+        options |= {"fluid": mpm.Fluid(), "drained": drained}
+    return mpm.Simulation(grid, bodies, materials, fixed={"left": "xy"}, tractions=loads, **options)

@@ -1,0 +1,168 @@
+# SPDX-License-Identifier: MIT
+"""Forces of walls, conditions and tools on the bodies: in balance with loads and weight, and what they are."""
+
+import numpy as np
+import pytest
+from helpers import SOFT, beam, column
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.io.checkpoint import save
+from mpm_dolfinx.points.grid import SIDES
+from mpm_dolfinx.problems.walls import wall_forces
+
+SOIL = mpm.Hencky(bulk=2e8, shear=1e8, porosity=0.4, conductivity=1e-5, grain_density=2650)
+G = 9.81
+
+
+def weight(s):
+    """Return the weight (d,), N, of grains and pore water, counted from the points."""
+    p, n = s.points, SOIL.porosity
+    mass = ((1 - n) * SOIL.grain_density * p.volume0).sum()
+    if s.scene.fluid is not None:
+        mass += 1000 * ((p.J - (1 - n)) * p.volume0).sum()
+    return np.array([*[0.0] * (s.grid.dim - 1), -mass * G])
+
+
+def off(s, load=0.0, axes=slice(None)):
+    """Return what is left of the sum of all forces on the bodies, over the largest of them."""
+    d, tools = s.grid.dim, len(s.state.stage.conditions["tools"])
+    forces = [*s.wall_reactions.values(), *s.reactions, *s.tool_forces[:tools, :d], weight(s)]
+    forces = np.array([*forces, np.broadcast_to(load, d)])
+    return np.abs(forces.sum(axis=0)[axes]).max() / np.abs(forces).max()
+
+
+def held_and_pressed(water):
+    """Return a block with nearly empty cells beside two walls, with a given side and a rough tool, and its load."""
+    grid = mpm.Grid([2.2, 1.7], [11, 8])
+    s = mpm.Simulation(
+        grid,
+        [mpm.box(grid, [0, 0], [1.93, 1.1])],
+        [SOIL],
+        fixed={"left": "xy", "bottom": "y"},
+        gravity=(0, -G),
+        displacements=[mpm.Displacement("right", lambda t: (0, -1e-3 * t))],
+        tractions=[mpm.Traction("top", (3e3, -1e4))],
+        tools=[mpm.Tool(mpm.Ball((1.0, 1.3), 0.2), displacement=lambda t: (0, -2e-3 * t), friction=0.3)],
+        **water,
+    )
+    return s, (3e3 * 1.93, -1e4 * 1.93)
+
+
+def under_a_plate(water):
+    grid = mpm.Grid([2.2, 1.7], [11, 8])
+    body, plate = mpm.box(grid, [0, 0], [1.93, 1.1]), mpm.RigidPlate("top", 1e4)
+    walls = {"left": "x", "bottom": "xy"}
+    return mpm.Simulation(grid, [body], [SOIL], fixed=walls, plates=[plate], gravity=(0, -G), **water), (0, -1e4)
+
+
+def a_thin_layer(water):
+    """Return a layer a little thicker than a cell: the ghost penalty of its top acts on the floor's nodes."""
+    grid, load = mpm.Grid([2.0, 1.0], [10, 5]), (2e3, -1e4)
+    options = {"fixed": {"bottom": "xy"}, "tractions": [mpm.Traction("top", load)], "gravity": (0, -G)}
+    return mpm.Simulation(grid, [mpm.box(grid, [0.1, 0], [1.9, 0.22])], [SOIL], **options, **water), 1.8 * np.array(
+        load
+    )
+
+
+def in_a_corner(water):
+    grid = mpm.Grid([1.1, 1.1, 1.4], [5, 5, 6])
+    load, walls = (3e3, 10.0, -1e4), {"left": "xyz", "back": "y", "front": "yz", "bottom": "xz"}
+    options = {"fixed": walls, "tractions": [mpm.Traction("top", load)], "gravity": (0, 0, -G)}
+    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0, 0], [0.93, 1.1, 1.03])], [SOIL], **options, **water)
+    return s, np.array(load) * 0.93 * 1.1
+
+
+def a_cylinder(water):
+    grid = mpm.Grid([1.1, 1.4], [5, 6], axisymmetric=True)
+    load = mpm.Traction("top", (0, -1e4))
+    options = {"fixed": {"bottom": "xy"}, "tractions": [load], "gravity": (0, -G)}
+    return mpm.Simulation(grid, [mpm.box(grid, [0, 0], [0.93, 1.03])], [SOIL], **options, **water), (
+        0.0,
+        -1e4 * np.pi * 0.93**2,
+    )
+
+
+def two_groups(water):
+    """Return a block that slips on a thin one, which the floor holds by the nodes that its pairs act on too."""
+    grid = mpm.Grid([1.0, 1.2], [10, 12])
+    bodies = [mpm.box(grid, [0, 0], [0.9, 0.09]), mpm.box(grid, [0, 0.12], [0.7, 0.55])]
+    push = mpm.Displacement("top", lambda t: (0, -0.04 * t), "y", region=((0, 0.5), (1, 1)))
+    options = {"fixed": {"left": "x", "bottom": "xy"}, "gravity": (0, -G), "displacements": [push]}
+    contact = mpm.Contact(1, 0, friction=0.3)
+    return mpm.Simulation(grid, bodies, [SOIL], contacts=[contact], **options, **(water and {"fluid": mpm.Fluid()})), 0
+
+
+SCENES = [held_and_pressed, under_a_plate, a_thin_layer, in_a_corner, a_cylinder, two_groups]
+
+
+@pytest.mark.parametrize("wet", [False, True], ids=["dry", "wet"])
+@pytest.mark.parametrize("scene", SCENES)
+def test_all_forces_on_the_bodies_are_in_balance(scene, wet):
+    s, load = scene({"fluid": mpm.Fluid(), "drained": [mpm.Drained("right")]} if wet else {})
+    s.run(1.0, 0.5, progress=False)
+    assert off(s, load, slice(1, 2) if s.grid.axisymmetric else slice(None)) < 1e-7
+    assert not any(
+        np.any(force) for wall, force in s.wall_reactions.items() if wall not in s.state.stage.conditions["fixed"]
+    )
+
+
+def test_walls_of_a_column_bear_what_is_on_them():
+    """Under an even load each wall's force is known: that of a column's oedometric stress."""
+    s = column(cells=5, width=2, fluid=False, tractions=[mpm.Traction("top", (0, -1e4))])
+    s.run(1.0, 1.0, progress=False)
+    (left, bottom), stress = (s.wall_reactions[wall] for wall in ("left", "bottom")), s.effective_stress()
+    height = s.points.corners[..., 1].max()
+    assert bottom == pytest.approx([0.0, 1e4 * 0.4], rel=1e-7)
+    assert left == pytest.approx([-stress[0, 0, 0] * height, 0.0], rel=1e-6)
+    assert s.wall_reactions["right"] == pytest.approx(-left, rel=1e-6)
+    assert not s.wall_reactions["top"].any()
+
+
+def test_what_several_walls_hold_counts_once():
+    """For the wall across it; else each has an equal part, in whatever order they are given."""
+    grid = mpm.Grid([1.0] * 3, [2] * 3)
+    on_walls = np.flatnonzero((np.abs(grid.node_x[:, :2] - 0.5) > 0.4).any(axis=1))
+    dofs = (3 * on_walls[:, None] + np.arange(3)).ravel()
+    for order in (("left", "right", "front", "back"), ("back", "front", "right", "left")):
+        walls = dict(
+            zip(SIDES[3], wall_forces(grid, dict.fromkeys(order, "xyz"), dofs, np.ones(len(dofs))), strict=True)
+        )
+        for wall in ("left", "right"):  # 9 nodes, 6 of them on edges
+            assert walls[wall].tolist() == [9, 3, 3 + 6 / 2]
+        for wall in ("front", "back"):
+            assert walls[wall].tolist() == [3, 9, 3 + 6 / 2]
+        assert not walls["bottom"].any() and sum(walls.values()).sum() == len(dofs)
+
+
+def test_forces_and_outflows_are_histories_of_a_run(tmp_path):
+    """Steps of a beam: its load is on the clamp, by the wall in one half of it and by a given side."""
+    s, probe = beam(h=0.1, load=5.4e3)
+    s.run(0.06, 0.02, probes=probe, progress=False)
+    s.stage(fixed={"right": "x"}, displacements=[mpm.Displacement("left", (0, 0))], drained=[mpm.Drained("left")])
+    result = s.run(0.1, 0.02, probes=probe, after=s.result, progress=False)
+    t, walls = result.t, result.wall_reactions
+    assert walls.keys() == {"left", "right", "bottom", "top"} and walls["left"].shape == (len(t), 2) == (6, 2)
+    load = 5.4e3 * 0.95 * np.minimum(1, np.array(t) / 0.06)
+    assert walls["left"][:4, 1] == pytest.approx(load[:4], rel=1e-5)
+    assert not walls["left"][4:].any() and not walls["top"].any()
+    assert result.reactions.shape == (6, 1, 2) and np.isnan(result.reactions[:4]).all()
+    assert result.reactions[4:, 0, 1] == pytest.approx(load[4:], rel=1e-5)
+    assert result.outflows.shape == (6, 2) and np.isnan(result.outflows[4:, 1]).all()
+    assert np.array_equal(result.outflows[-1, :1], s.outflows) and np.array_equal(
+        walls["left"][-1], s.wall_reactions["left"]
+    )
+    save(s, tmp_path / "run.ckpt")
+    again = mpm.resume(s, tmp_path / "run.ckpt")
+    for name in ("reactions", "outflows"):
+        assert np.array_equal(getattr(again, name), getattr(result, name), equal_nan=True)
+    assert all(np.array_equal(again.wall_reactions[wall], force) for wall, force in walls.items())
+
+
+def test_the_axis_of_revolution_pushes_nothing_outward():
+    grid = mpm.Grid([1.0, 1.0], [4, 4], axisymmetric=True)
+    body = mpm.box(grid, [0, 0], [1, 1])
+    options = {"fixed": {"left": "y", "right": "x", "bottom": "y"}, "tractions": [mpm.Traction("top", (0, -1e4))]}
+    s = mpm.Simulation(grid, [body], [SOFT], **options)
+    s.run(1.0, 1.0, progress=False)
+    assert s.wall_reactions["left"][0] == 0.0
+    assert s.wall_reactions["left"][1] + s.wall_reactions["bottom"][1] == pytest.approx(1e4 * np.pi, rel=1e-8)

@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: MIT
+"""What does not touch a body is nothing to it: neither how stiff it is, nor what it does."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from far_bodies import E, beside
+from scipy.optimize import brentq
+from test_mpi import mpirun
+
+import mpm_dolfinx as mpm
+
+CLAY = mpm.DruckerPrager(bulk=E / 1.8, shear=E / 2.6, friction=20.0, dilation=0.0, cohesion=30.0, conductivity=1e-4)
+
+
+@cache
+def after(kind, stiffer=1.0, wet=False, law=None, steps=2):
+    """Return displacements, stresses and pressures of the beam after some steps, and the residuals that these told."""
+    s = beside(kind, stiffer, wet, law)
+    n, start = len(s.bodies[0]), s.points.x
+    told = [s.step(1.0).history[-1] for _ in range(steps)]
+    points = s.points
+    found = [(points.x - start)[:n], s.effective_stress()[:n], *[points.pressure[:n]] * wet]
+    return found, np.max(told, axis=0)
+
+
+def off(one, other):
+    """Return the largest difference in proportion to the largest value."""
+    return max(np.abs(a - b).max() / np.abs(b).max() for a, b in zip(one, other, strict=True))
+
+
+@pytest.mark.parametrize("stiffer", [1e2, 1e6, 1e10, 1e13])
+def test_a_body_at_rest_however_stiff_changes_nothing_and_hides_no_residual(stiffer):
+    (found, told), (alone, as_is) = after("rests", stiffer), after(None)
+    assert off(found, alone) < 1e-11 and told == pytest.approx(as_is, rel=1e-3)
+
+
+@pytest.mark.parametrize("kind", ["moves", "loaded"])
+@pytest.mark.parametrize("stiffer", [1.0, 1e10])
+def test_what_a_far_body_does_changes_nothing(kind, stiffer):
+    assert off(after(kind, stiffer)[0], after(None)[0]) < 1e-11
+
+
+@pytest.mark.parametrize(("kind", "stiffer"), [("rests", 1e10), ("moves", 1e8), ("drains", 1.0), ("drains", 1e6)])
+def test_a_wet_body_takes_the_same_step_whatever_others_do(kind, stiffer):
+    assert off(after(kind, stiffer, wet=True, steps=1)[0], after(None, wet=True, steps=1)[0]) < 1e-9
+
+
+@pytest.mark.parametrize("kind", ["moves", "loaded"])
+def test_soil_that_yields_takes_the_same_step_whatever_others_do(kind):
+    """With searches and watchdogs of its own; it has yielded, and the far body has not."""
+    (found, told), (alone, as_is) = (after(one, 1e4, law=CLAY) for one in (kind, None))
+    q = alone[1][:, 0, 0] - alone[1][:, 1, 1]
+    assert np.abs(q).max() > 30.0 and off(found, alone) < 1e-9 and told[0] <= 1e-8 and as_is[0] <= 1e-8
+
+
+@pytest.mark.parametrize("stiffer", [1e6, 1e10, 1e14])
+def test_a_soft_part_is_solved_for_however_stiff_what_it_sits_on_is(stiffer):
+    """Rounding is that of each node, and what is told of the residual is that of the soft part too."""
+    grid, load = mpm.Grid([0.1, 1.0], [1, 10]), 0.03
+    soft, hard = (mpm.Hencky(bulk=f * 1e5, shear=f * 1e5) for f in (1, stiffer))
+    bodies = [mpm.box(grid, [0, 0], [0.1, 0.5]), mpm.box(grid, [0, 0.5], [0.1, 0.9], material=1)]
+    pull = mpm.Traction("top", (0, load * soft.oedometric), region=((-np.inf, 0.8), (np.inf, np.inf)))
+    walls = {"left": "x", "right": "x", "bottom": "y"}
+    s = mpm.Simulation(grid, bodies, [hard, soft], fixed=walls, tractions=[pull])
+    history = s.step(1.0).history
+    strain = s.points.F[s.points.material == 1, 1, 1] - 1
+    assert strain == pytest.approx(np.full(len(strain), brentq(lambda a: np.log(a) / a - load, 1, 2) - 1), rel=1e-7)
+    assert history[0][0] == pytest.approx(1.0) and history[-1][0] < 1e-8
+
+
+def test_parts_are_the_same_on_several_processes(tmp_path):
+    """A wet beam beside a stiff body that moves and drains, on one process and on three."""
+    for processes in (1, 3):
+        mpirun(processes, "mpi_parts.py", str(tmp_path / f"{processes}.npz"))
+    one, three = (dict(np.load(tmp_path / f"{processes}.npz")) for processes in (1, 3))
+    for name, values in one.items():
+        assert three[name] == pytest.approx(values, abs=1e-8 * np.abs(values).max()), name

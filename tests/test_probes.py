@@ -1,0 +1,171 @@
+# SPDX-License-Identifier: MIT
+"""Pressures and stresses of probes are those of their places: exact where linear, of second order elsewhere."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_places import irregular
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.probe_fields import probe_stresses
+
+RANDOM = np.random.default_rng(7)
+STIFF = {"bulk": 1e12, "shear": 1e12}
+WEIGHT = 9810.0
+SIDES = {2: {"left": "x", "right": "x"}, 3: {"left": "x", "right": "x", "front": "y", "back": "y"}}
+UP = {2: "y", 3: "z"}
+
+
+def terzaghi(z, T):
+    """Return the pressure over the load at heights z above a sealed base, over the drainage path."""
+    M = np.pi / 2 * (2 * np.arange(200) + 1)
+    return (2 / M * np.sin(M * (1 - z[:, None])) * np.exp(-(M**2) * T)).sum(axis=1)
+
+
+@pytest.mark.parametrize("cells, allowed", [(10, 0.005), (20, 0.0012)])
+def test_a_column_consolidates_at_any_place_as_terzaghi_says(cells, allowed):
+    h, times, modulus, k = 1 / cells, [0.06, 0.1, 0.2, 0.5, 1.0], 1e8, 1e-6
+    grid = mpm.Grid([h, 1 + h], [1, cells + 1])
+    body = mpm.box(grid, [0, 0], [h, 1])
+    soil = mpm.LinearElastic(bulk=modulus / 3, shear=modulus / 2, conductivity=k)
+    walls, load = SIDES[2] | {"bottom": "y"}, [mpm.Traction("top", (0, -1e3))]
+    water = {"fluid": mpm.Fluid(bulk=np.inf), "drained": [mpm.Drained("top")]}
+    s = mpm.Simulation(grid, [body], [soil], fixed=walls, tractions=load, **water)
+    z, unit = np.linspace(0, 1, 37), WEIGHT / (k * modulus)
+    probes = mpm.probes([body], np.column_stack([np.full(37, 0.2 * h), z]))
+    found = s.run(unit, rtol=1e-4, t_eval=unit * np.array(times), probes=probes, progress=False).probe_pressure[1:]
+    errors = [np.abs(p / 1e3 - terzaghi(z, T)).max() for T, p in zip(times, found, strict=True)]
+    print("errors over the load:", *(f"{e:.5f}" for e in errors))
+    assert max(errors) < allowed
+
+
+@pytest.mark.parametrize(
+    "dim, axisymmetric, off, lower, upper",
+    [(2, False, 0.0, 1e-6, 1e-4), (2, False, 0.3, 1e-4, 1e-6), (2, True, 0.3, 1e-6, 1e-4), (3, False, 0.3, 1e-6, 1e-4)],
+    ids=["plane", "off", "ring", "space"],
+)
+def test_steady_flow_through_layers_is_exact_up_to_their_interface_and_drained_sides(
+    dim, axisymmetric, off, lower, upper
+):
+    """The interface is within a cell; water flows up, or down, against its weight."""
+    n, h, meets = (8, 0.125, 0.55) if dim == 2 else (5, 0.2, 0.5)
+    grid = mpm.Grid([2 * h] * (dim - 1) + [1 + h], [2] * (dim - 1) + [n + 1], axisymmetric=axisymmetric)
+    z, side = off * h, [2 * h] * (dim - 1)
+    ends = ((z, z + meets), (z + meets, z + 1))
+    bodies = [mpm.box(grid, [0] * (dim - 1) + [a], [*side, b], material=i) for i, (a, b) in enumerate(ends)]
+    s = mpm.Simulation(
+        grid,
+        bodies,
+        [mpm.LinearElastic(**STIFF, conductivity=k) for k in (lower, upper)],
+        fixed=SIDES[dim],
+        fluid=mpm.Fluid(bulk=np.inf),
+        displacements=[mpm.Displacement("bottom", [0] * dim, UP[dim])],
+        gravity=[0] * (dim - 1) + [-9.81],
+        drained=[mpm.Drained("top"), mpm.Drained("bottom", 2e4)],
+    )
+    y = np.concatenate([np.linspace(0, meets - 1e-9, 9), np.linspace(meets + 1e-9, 1, 9)])
+    places = np.column_stack([*[RANDOM.uniform(0, 2 * h, len(y))] * (dim - 1), z + y])
+    found = s.run(1e4, 1e4, probes=mpm.probes(bodies, places), progress=False).probe_pressure[-1]
+    resists = np.minimum(y, meets) / lower + np.maximum(y - meets, 0) / upper
+    head = 2e4 + (WEIGHT - 2e4) * resists / (meets / lower + (1 - meets) / upper)
+    assert found == pytest.approx(head - WEIGHT * y, abs=1e-6 * 2e4)
+
+
+@pytest.mark.parametrize("thick", [1, 2, 5], ids=lambda n: f"{n} cells")
+def test_water_at_rest_is_exact_just_below_a_drained_surface_and_at_a_sealed_base(thick):
+    grid = mpm.Grid([3.0, thick + 1.0], [3, thick + 1])
+    body, head = mpm.box(grid, [0, 0], [3, thick]), mpm.hydrostatic(thick + 1.0)
+    soil = mpm.LinearElastic(**STIFF, conductivity=1e-4)
+    water = {"fluid": mpm.Fluid(), "gravity": (0, -9.81), "pressure": head, "drained": [mpm.Drained("top", WEIGHT)]}
+    s = mpm.Simulation(grid, [body], [soil], fixed=SIDES[2] | {"bottom": "y"}, **water)
+    places = np.array([[1.3, thick - 0.01], [0, thick], [3, 0], [1.5, 0.1]])
+    result = s.run(1e6, 1e6, probes=mpm.probes([body], places), progress=False)
+    for p in result.probe_pressure:
+        assert p == pytest.approx(WEIGHT * (thick + 1 - places[:, 1]), rel=1e-6)
+
+
+def test_a_steady_pressure_is_exact_up_to_sides_aslant():
+    """Its cells' pressures are known to 1e-4 of it."""
+    turn = np.array([[np.cos(0.5), np.sin(0.5)], [-np.sin(0.5), np.cos(0.5)]])
+    grid = mpm.Grid([1.6, 1.8], [16, 18])
+    box = mpm.box(grid, [0.5, 0.1], [0.9, 1.1])
+    placed = lambda X: (X - [0.5, 0.1]) @ turn + [0.55, 0.1]  # noqa: E731
+    body, along = mpm.mapped(grid, box, placed), lambda t, x: 1e4 * (x - [0.55, 0.1]) @ turn[1]
+    sides = [mpm.Drained(side, along) for side in ("top", "bottom")]
+    held = [mpm.Displacement("bottom", (0, 0))]
+    soil, water = mpm.LinearElastic(**STIFF, conductivity=1e-5), mpm.Fluid(bulk=np.inf)
+    s = mpm.Simulation(grid, [body], [soil], fixed={}, fluid=water, displacements=held, drained=sides)
+    X = [0.5, 0.1] + RANDOM.uniform(size=(30, 2)) * [0.4, 1.0]
+    X = np.concatenate([X, [[0.5, 0.1], [0.9, 1.1], [0.5, 0.7], [0.9, 0.4]]])
+    found = s.run(1e5, 1e5, probes=mpm.probes([body], X), progress=False).probe_pressure[-1]
+    assert found == pytest.approx(along(0, placed(X)), abs=4e-4 * 1e4)
+
+
+@pytest.mark.parametrize("contacts", [[], [mpm.Contact(0, 1)]], ids=["gap", "contact"])
+def test_what_lies_beyond_a_gap_or_a_contact_tells_nothing(contacts):
+    grid, gap = mpm.Grid([0.6, 0.4], [6, 4]), 0.0 if contacts else 0.1
+    bodies = [mpm.box(grid, [0, 0], [0.2, 0.4]), mpm.box(grid, [0.2 + gap, 0], [0.6, 0.4])]
+    soil = mpm.LinearElastic(**STIFF, conductivity=1e-6)
+    walls = {"left": "xy", "right": "xy", "bottom": "xy"}
+    ends = {"fluid": mpm.Fluid(), "pressure": lambda x: np.where(x[:, 0] < 0.2, 1e3, 5e3)}
+    s = mpm.Simulation(grid, bodies, [soil], fixed=walls, contacts=contacts, **ends)
+    probes = mpm.probes(bodies, [[0.2 - 1e-6, 0.13], [0.11, 0.4], [0.2 + gap + 1e-6, 0.2]])
+    assert s.run(1.0, 1.0, probes=probes, progress=False).probe_pressure[0] == pytest.approx([1e3, 1e3, 5e3])
+
+
+@pytest.mark.parametrize("place", [0.0, 0.5, 0.9, 1.0])
+def test_no_pressure_passes_those_around_it_where_one_jumps(place):
+    """All of the load is carried by water, but on the drained side."""
+    grid = mpm.Grid([0.2, 1.0], [2, 10])
+    body, soil = mpm.box(grid, [0, 0], [0.2, 1]), mpm.LinearElastic(bulk=1e6, shear=1e6, conductivity=1e-6)
+    walls, load = SIDES[2] | {"bottom": "y"}, [mpm.Traction("top", (0, -1e3))]
+    water = {"fluid": mpm.Fluid(bulk=np.inf), "drained": [mpm.Drained("top")]}
+    s = mpm.Simulation(grid, [body], [soil], fixed=walls, tractions=load, **water)
+    probes = mpm.probes([body], [[0.07, place + d] for d in (-0.03, 0.0, 0.03) if 0 <= place + d <= 1])
+    p = s.run(0.1, 0.1, probes=probes, progress=False).probe_pressure[-1]
+    most = s.cells().pressure.max()
+    assert p.min() >= 0 and p.max() <= most * (1 + 1e-9) and (place == 1 or p.max() > 0.5 * most)
+
+
+def stressed(grid, bodies, materials, field):
+    """Return a simulation whose points have deformation gradients of a field (n, d, d) of their places."""
+    walls = {"bottom": "xyz"[: grid.dim]}
+    s = mpm.Simulation(grid, bodies, materials, fixed=walls)
+    s.state = replace(s.state, points=replace(s.points, F=field(s.points)))
+    return s
+
+
+@pytest.mark.parametrize("dim, axisymmetric", [(2, False), (2, True), (3, False)], ids=["plane", "ring", "space"])
+def test_a_linear_stress_is_exact_at_any_place_of_irregular_domains(dim, axisymmetric):
+    """Up to sides, edges and corners, and beside other materials and bodies."""
+    grid = mpm.Grid([2.0] * dim, [5 if dim == 2 else 4] * dim, axisymmetric=axisymmetric)
+    boxes = [mpm.box(grid, [a] + [0.0] * (dim - 1), [b] + [1.0] * (dim - 1), material=m) for a, b, m in PARTS]
+    bodies = [mpm.mapped(grid, boxes[0], irregular), *boxes[1:]]
+    soil, stretches = [mpm.LinearElastic(bulk=k, shear=k) for k in (1e6, 5e6)], grid.stretches
+    slope = RANDOM.uniform(-1e-9, 1e-9, (3, dim, stretches, stretches))
+
+    def field(points):
+        of = np.searchsorted(np.cumsum([len(b) for b in bodies]), points.id, side="right")
+        return np.eye(stretches) + np.einsum("nd,ndij->nij", points.x, slope[of])
+
+    s = stressed(grid, bodies, soil, field)
+    for i, body in enumerate(bodies):
+        low, high = body.bounds
+        X = low + RANDOM.uniform(size=(12, dim)) * (high - low)
+        X[:2], X[2:4, 0] = [low, high], [low[0], high[0]]
+        X = X + 1e-6 * (0.5 * (low + high) - X)
+        probes = mpm.probes(bodies, X, stress=True)
+        x = probes.position(s.points, grid.comm)
+        e = np.zeros((len(x), 3, 3))
+        e[:, :stretches, :stretches] = np.einsum("nd,dij->nij", x, slope[i])
+        e = (e + e.swapaxes(1, 2)) / 2
+        if axisymmetric:
+            e[:, 2, :2] = e[:, :2, 2] = 0.0
+        k = soil[body.material].bulk
+        exact = (k - 2 * k / 3) * np.trace(e, axis1=1, axis2=2)[:, None, None] * np.eye(3) + 2 * k * e
+        found = probe_stresses(s.scene, s.state, probes)
+        assert found == pytest.approx(exact, abs=2e-6 * np.abs(exact).max())
+
+
+PARTS = [(0.0, 1.0, 0), (1.0, 1.6, 1), (1.6, 2.0, 0)]
