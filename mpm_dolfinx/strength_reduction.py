@@ -135,7 +135,7 @@ def factor_of_safety(
         while unsafe > safe * (1 + rtol):
             trial = float(np.sqrt(safe * unsafe))
             safe, unsafe = (trial, unsafe) if rests(trial) else (safe, trial)
-    return Safety((safe + unsafe) / 2, (safe, unsafe), overloads, weakened.newton)
+    return Safety((safe + unsafe) / 2, (safe, unsafe), overloads, sum(weakened.newton))
 
 
 class _Bar:
@@ -202,16 +202,16 @@ def _ends(overloads: Sequence[float], steps: int, least: float) -> bool:
 
 @dataclass
 class _Trial:
-    """What the time loop drives; newton: Newton steps so far."""
+    """What the time loop drives; newton: is given the Newton steps of each step."""
 
     scene: Scene
     state: State
-    newton: int = 0
+    newton: list[int]
 
     def advanced(self, dt: float) -> tuple[State, Report]:
         """Return the state after a step of dt, s, and what it took."""
         state, report = step(self.scene, self.state, dt)
-        self.newton += report.newton
+        self.newton.append(report.newton)
         return state, report
 
 
@@ -240,7 +240,7 @@ class _Weakened:
         terms, sources = scene.extensions
         options = *options, [*terms, resistance], sources, {}  # what initial stresses need the materials have
         self._scene = Scene(scene.grid, scene.bodies, materials, scene.fluid, *options)
-        self._strengths, self.newton = _strengths(scene, begun.points), 0
+        self._strengths, self.newton = _strengths(scene, begun.points), []
         points = replace(begun.points, data={**begun.points.data, **self._strengths})
         begun = begin_stage(self._scene, replace(begun, points=points), {}, [], [], False, {})
         self._start = self._unyielding(begun)
@@ -268,17 +268,14 @@ class _Weakened:
         """Return a trial from a state on, with other strengths of its points."""
         data = {name: strength(name, value) for name, value in self._strengths.items()}
         points = replace(start.points, data={**start.points.data, **data})
-        return _Trial(self._scene, replace(start, points=points, velocity=None, result=None))
+        return _Trial(self._scene, replace(start, points=points, velocity=None, result=None), self.newton)
 
     def _go_on(self, trial: _Trial, what: str) -> None:
         """Take a step; what: names the strength."""
-        before = trial.newton
         try:
             run(trial, trial.state.t + self._dt, self._dt, progress=False)
         except GaveUp as error:
             raise GaveUp(f"factor_of_safety: {what}: {error}", error.result, error.history) from error
-        finally:
-            self.newton += trial.newton - before
 
     def _overload(self, before: MaterialPoints, now: MaterialPoints) -> float:
         """Return the work of the viscous stress in a step over that of the shear stress, both in size.

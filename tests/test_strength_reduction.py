@@ -92,7 +92,7 @@ def test_pore_pressures_that_are_given_are_a_term():
         [CLAY],
         load=2 * C / EXACT * np.sqrt(K) - u * (K - 1),
         run=False,
-        terms=[lambda points, v: -u * ufl.tr(points.grad(v)) * points.dx],
+        terms=[lambda points, v: -(u + 0 * points.position[1]) * ufl.tr(points.grad(v)) * points.dx],
     )
     assert mpm.factor_of_safety(s).factor == pytest.approx(EXACT, rel=0.01)
 
@@ -142,14 +142,14 @@ def test_one_line_says_what_is_wrong(make, options, message):
     assert "\n" not in str(caught.value)
 
 
-def bank(cells, *, run=4.0, wet=False, **strength):
+def bank(cells, *, run=4.0, crest=4.0, wet=False, **strength):
     """Return a bank 4 m high on 2 m of ground as built, not run; under water, or as heavy as it is there."""
-    h, middle = 4.0 / cells, 4 + run / 2
-    below, columns = round(2 / h), round((8 + run) / h)
+    h, middle = 4.0 / cells, crest + run / 2
+    below, columns = round(2 / h), round((crest + run + 4) / h)
     grid = mpm.Grid(lower=[0, -below * h], upper=[columns * h, 4 + h], cells=[columns, below + cells + 1])
 
     def shape(X):
-        return np.stack([X[:, 0] / middle * (4 + run * (1 - X[:, 1] / 4)), X[:, 1]], axis=1)
+        return np.stack([X[:, 0] / middle * (crest + run * (1 - X[:, 1] / 4)), X[:, 1]], axis=1)
 
     bodies = [
         mpm.box(grid, [0, -below * h], [columns * h, 0]),
@@ -179,6 +179,16 @@ def test_waiting_long_in_water_is_as_quick_as_without():
     dry, wet = (mpm.factor_of_safety(bank(4, run=8.0, wet=wet, **soil), dt=1e6, rtol=0.03) for wet in (False, True))
     assert wet.factor == pytest.approx(dry.factor, rel=0.03)
     assert wet.newton <= 2 * dry.newton
+
+
+@pytest.mark.slow
+def test_factors_are_of_first_order_in_the_cells():
+    """A vertical cut in clay: gamma H / c = 3.776 by limit analysis."""
+    clay = {"friction": 0.0, "dilation": 0.0, "cohesion": 1650 * 0.6 * 9.81 * 4 / 3.776}
+    coarse, fine = (mpm.factor_of_safety(bank(cells, run=0.0, crest=6.0, **clay)).factor for cells in (8, 16))
+    print(f"cut: {coarse - 1:+.1%}, {fine - 1:+.1%}, extrapolated {2 * fine - coarse - 1:+.1%}")
+    assert 0 < fine - 1 < 0.7 * (coarse - 1) < 0.08
+    assert 2 * fine - coarse == pytest.approx(1, abs=0.02)
 
 
 @pytest.mark.slow
