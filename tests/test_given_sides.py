@@ -225,6 +225,20 @@ def test_a_held_region_may_end_anywhere_in_domains_and_cells():
     assert np.abs(loads[:, 0]).max() < 0.15
 
 
+def test_a_region_half_a_cell_wide_at_the_end_of_a_side_is_held_alike_in_any_unit_of_length():
+    """By rounding a sliver of the next domain was held too, which changed the reaction by 3 %."""
+    forces = []
+    for unit in (1.0, 1e-4, 1e3):
+        grid = mpm.Grid([unit, 0.6 * unit], [10, 6])
+        region = ((0.95 * unit, 0.45 * unit), (unit, 0.55 * unit))
+        end = mpm.Displacement("top", (6e-3 * unit, -2e-2 * unit), region=region)
+        body = mpm.box(grid, [0, 0], [unit, 0.5 * unit])
+        s = mpm.Simulation(grid, [body], [SOIL], fixed=WALLS, displacements=[end])
+        s.run(1.0, 0.5, progress=False)
+        forces.append(s.reactions[0] / unit)
+    assert np.array(forces) == pytest.approx(np.tile(forces[0], (3, 1)), rel=1e-9)
+
+
 def test_a_block_turned_in_space_is_pressed_exactly():
     """Aslant to all axes, nu = 0: by 2 % in two steps, and one at rest in which the sides come where they are to be."""
     grid = mpm.Grid([1, 1, 1], [5] * 3)

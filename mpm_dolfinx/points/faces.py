@@ -182,9 +182,10 @@ def _in_region(
     x = _face_corners(body, row, face)
     low, high = x.min(axis=1), x.max(axis=1)
     size = high - low
-    flat, slack = size <= rounding(x), 1e-9 * size.max(axis=1, keepdims=True) + rounding(x)
+    slack = 1e-9 * size.max(axis=1, keepdims=True) + rounding(x)  # slivers are none: their domains would count as held
     within = (low >= region[0] - slack) & (high <= region[1] + slack)
-    on = np.where(flat, within, np.minimum(high, region[1]) > np.maximum(low, region[0])).all(axis=1)
+    common = np.minimum(high, region[1]) - np.maximum(low, region[0])
+    on = np.where(size <= slack, within, common > slack).all(axis=1)
     return row[on], face[on]
 
 
