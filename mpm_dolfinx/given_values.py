@@ -32,7 +32,16 @@ Places = Callable[[str], NDArray[np.float64]]
 """Gives positions (m, d), m, by their name, "X" or "x"."""
 PLACES = ("X", "x")
 NAMES = ("t", *PLACES)
-PLAIN = (FunctionType, MethodType, partial)  # whose parameters have the names that their author has given them
+PLAIN = (FunctionType, MethodType)
+LIBRARIES = ("numpy", "scipy")  # x is what their functions are of, whatever that is
+
+
+def _plain(function: Callable) -> bool:
+    """Return whether the parameters of a function have the names that the author of a scene has given them."""
+    while isinstance(function, partial):
+        function = function.func
+    library = str(getattr(function, "__module__", None)).partition(".")[0] in LIBRARIES
+    return isinstance(function, PLAIN) and not library
 
 
 def _parameters(function: Callable) -> list[Parameter] | None:
@@ -55,7 +64,7 @@ def takes(function: Callable) -> tuple[str, ...] | None:
         return ("t",)
     if not names or not set(names) <= set(NAMES):
         return None
-    return None if names == ("x",) and not isinstance(function, PLAIN) else names
+    return None if names == ("x",) and not _plain(function) else names
 
 
 def by_place(value) -> bool:
@@ -76,7 +85,7 @@ def check_names(what: str, function: Callable, among: Sequence[str] = NAMES) -> 
         return names
     given = ", ".join(p.name for p in _parameters(function) or ())
     if given == "x" and "x" in among:  # an interpolation in time, say
-        raise ValueError(f"{what}: an object that is called with x, must be lambda t: ..., or lambda x: ...")
+        raise ValueError(f"{what}: an object or a library's function of x, must be lambda t: ..., or lambda x: ...")
     allowed = "must be of the time alone"
     if len(among) > 1:
         allowed = f"must be of {', '.join(among[:-1])} or {among[-1]} by these names, or of the time alone"

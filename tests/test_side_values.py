@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
 """What acts on sides as functions of time and place: loads, heads and inflows."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from helpers import column, rates, refused_in_one_line
@@ -175,7 +177,8 @@ def test_functions_are_called_by_the_names_of_their_parameters(kind):
         def __call__(self, x):
             return x
 
-    wrong = [lambda s, x: 1.0, lambda t, depth: 1.0, lambda: 1.0, lambda **k: 1.0, Interpolated()]
+    table = partial(np.interp, xp=[0.0, 1.0], fp=[0.0, 1.0])  # of x, which is no place
+    wrong = [lambda s, x: 1.0, lambda t, depth: 1.0, lambda: 1.0, lambda **k: 1.0, Interpolated(), table]
     for function in wrong + [lambda x: 1.0] * (kind == "Displacement"):
         with pytest.raises(ValueError, match=f"^{kind}.* must be .*") as caught:
             at(function)
