@@ -146,8 +146,8 @@ def _placed(scene: Scene, start: Start, state: State) -> Start:
     mechanical, acting = state.stage.mechanical, start.acting[-1]
     if not (mechanical.touches or mechanical.holds_sides):
         return start
-    place = scene.momentum.sides, start.on_grid.cut, state.t, state.tool_travel, state.t, state.points
-    sides = mechanical.data(*place, at_rest=True).moved(scene.momentum.u)
+    place = scene.momentum.sides, start.on_grid.cut, (state.t, 0.0), state.tool_travel, state.t, state.points
+    sides = mechanical.data(*place).moved(scene.momentum.u)
     return start._replace(acting=[acting._replace(sides=sides)])
 
 

@@ -169,13 +169,17 @@ class Scene:
 
         return self._on_grid(points.arrays, make, grid.comm)
 
-    def assembled(self, on_grid: OnGrid, stage: Stage, sides: Callable[[], SideData], begins: bool) -> Assembled:
+    def assembled(
+        self, on_grid: OnGrid, stage: Stage, now: SideData, sides: Callable[[], SideData], begins: bool
+    ) -> Assembled:
         """Return the matrices for a stage of the bodies on the grid.
 
         Parameters
         ----------
+        now
+            What acts on the sides.
         sides
-            Returns what acts on the sides, placed where the points were cut.
+            Returns this, placed where the points were cut.
         begins
             Whether all parts of the bodies must be held.
         """
@@ -184,7 +188,7 @@ class Scene:
             problems = (self.momentum, self.storage, self.scheme, self._systems)
             return assembled(*problems, on_grid, stage, sides(), begins)
 
-        return self._assembled((on_grid.key, stage), make, self.grid.comm)
+        return self._assembled((on_grid.key, stage, now.asked), make, self.grid.comm)
 
     def all_ids(self, present: Sequence[bool]) -> NDArray[np.int64]:
         """Return the numbers of all points of the bodies that are there."""

@@ -26,12 +26,12 @@ def set_up(scene: Scene, state: State, dt: float, how: tuple = ()) -> Start:
     cut_points = state.as_cut
     on_grid = scene.on_grid(cut_points)
     on_grid.cut.surfaces(stage.surfaces)  # all at once
-    place = partial(stage.mechanical.data, scene.momentum.sides, on_grid.cut, state.t, state.tool_travel)
+    place = partial(stage.mechanical.data, scene.momentum.sides, on_grid.cut, (state.t, dt), state.tool_travel)
     if state.begins:
         stage.mechanical.check_start(on_grid.cut, state.points, state.t, state.tool_travel)
     sides, data = [place(t, state.points) for t in times], on_grid.data_of(state)
     as_cut = partial(place, times[-1], cut_points) if state.stay else partial(sides.__getitem__, -1)
-    matrices, sides = scene.assembled(on_grid, stage, as_cut, state.begins), at_rest(scene, state, sides)
+    matrices, sides = scene.assembled(on_grid, stage, sides[-1], as_cut, state.begins), at_rest(scene, state, sides)
     scene.momentum.u.x.array[:] = 0.0
     on_grid.start(state)
     acting = [Acting(*one) for one in zip(how or scene.substeps, times, sides, gravity, strict=True)]
@@ -43,7 +43,7 @@ def step(scene: Scene, state: State, dt: float, how: tuple = ()) -> tuple[State,
     start, report, rates = set_up(scene, state, dt, how), Report(), []
     state, on_grid, solvers = start.state, start.on_grid, start.matrices.solvers()
     for acting in start.acting:
-        both, key = balances(scene, start, acting, *rates[-1:]), (on_grid.key, state.stage, acting.substep.own * dt)
+        both, key = balances(scene, start, acting, *rates[-1:]), (start.matrices.key, acting.substep.own * dt)
         rates.append(solve_substep(solvers, *both, partial(on_grid.as_reset, state), key, report))
     note_pressures(report, solvers, both.storage, acting.substep.before * dt, dt, rates)
     del solvers

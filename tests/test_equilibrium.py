@@ -92,7 +92,22 @@ def two_groups(water):
     return mpm.Simulation(grid, bodies, [SOIL], contacts=[contact], **options, **(water and {"fluid": mpm.Fluid()})), 0
 
 
+def held_beside_walls(water, move=lambda t: (0.0, 0.0), **options):
+    """Return a block whose side is held where the floor, which is rough, holds its last nodes too."""
+    grid = mpm.Grid([2.0, 1.4], [8, 7])
+    side = mpm.Displacement("left", move, "x")
+    options = {"fixed": {"right": "x", "bottom": "xy"}, "gravity": (0, -G), "displacements": [side], **options}
+    return mpm.Simulation(grid, [mpm.box(grid, [0, 0], [2.0, 1.0])], [SOIL], **options, **water), 0
+
+
+def held_on_the_floor(water):
+    return held_beside_walls(
+        water, fixed={"left": "x", "right": "x", "bottom": "xy"}, displacements=[mpm.Displacement("bottom", (0, 0))]
+    )
+
+
 SCENES = [held_and_pressed, under_a_plate, a_thin_layer, in_a_corner, a_cylinder, two_groups]
+SCENES += [held_beside_walls, held_on_the_floor]
 
 
 @pytest.mark.parametrize("wet", [False, True], ids=["dry", "wet"])
@@ -104,6 +119,30 @@ def test_all_forces_on_the_bodies_are_in_balance(scene, wet):
     assert not any(
         np.any(force) for wall, force in s.wall_reactions.items() if wall not in s.state.stage.conditions["fixed"]
     )
+
+
+@pytest.mark.parametrize("rest", [mpm.K0(0.5), None], ids=["initial stress", "without"])
+def test_a_side_that_begins_to_move_along_a_wall_carries_what_it_does_that_moves_from_the_start(rest):
+    """It was held by other cells than before, in matrices of before: reactions were forty times too large."""
+    begins, moves = (
+        held_beside_walls({}, lambda t, start=start: (1e-3 * max(0.0, t - start), 0.0), initial_stress=rest)[0]
+        for start in (1.0, 0.0)
+    )
+    before = np.zeros(2)
+    for s, end in ((begins, 1.0), (begins, 1.5), (moves, 0.5)):
+        s.run(end, 0.5, progress=False)
+        assert off(s) < 1e-7
+        before = s.reactions[0] if s.t == 1.0 else before
+    assert begins.reactions[0] == pytest.approx(moves.reactions[0], rel=1e-2)
+    assert moves.reactions[0, 0] > 10 * before[0]
+
+
+def test_forces_on_a_held_side_and_on_the_floor_at_its_foot_are_those_of_the_stress_at_rest():
+    """The floor bore the part of the side's last node once more."""
+    s, _ = held_beside_walls({}, initial_stress=mpm.K0(0.5))
+    s.run(1.0, 1.0, progress=False)
+    assert s.reactions[0, 0] == pytest.approx(-weight(s)[1] / 2 * 0.5 / 2, rel=1e-6)
+    assert np.abs(s.wall_reactions["bottom"][0]) < 1e-6 * s.reactions[0, 0]
 
 
 def test_walls_of_a_column_bear_what_is_on_them():

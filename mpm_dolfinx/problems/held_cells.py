@@ -34,9 +34,9 @@ class HeldPoints(NamedTuple):
 
     number, cell : (n,) condition, and local cell; area : (n,) reference area, m^(d-1); modulus, tension, resistance,
     firm : (n,) modulus to hold with, norm of the stress when the grid was reset, what resists, and what resists where
-    nothing can give way, times area, N; x, gap, given : (n, d) position, how far it is from where it is to be, and the
-    given displacement, m; normal : (n, d) area vector when the grid was reset, m^(d-1); force : (n, d) of the body's
-    present stress, as the side turns it, N.
+    nothing can give way, times area, N; x, gap : (n, d) position, and how far it is from where it is to be, m; given :
+    (n, 2 d) given displacements at the start and the end of the step, m; normal : (n, d) area vector when the grid was
+    reset, m^(d-1); force : (n, d) of the body's present stress, as the side turns it, N.
     """
 
     number: NDArray[np.int64]
@@ -121,7 +121,7 @@ class HeldCells:
         Where a wall that the side runs into holds nodes of the cell, these are asked for nothing: else its other nodes
         would make up for them, and others for these, to and fro along the side.  A side that is to move at the wall,
         by more than half of its motion beside it, bends over this cell; then its other nodes are held by it only where
-        no other cell holds them.
+        no other cell holds them.  It does all through a step if it is off its place at the start or the end of it.
 
         Parameters
         ----------
@@ -134,28 +134,29 @@ class HeldCells:
 
         Returns
         -------
-        Rows (k,), their stiffnesses (k,) and gaps (k,), and the share (k,) of their forces that the wall does not bear;
-        of a row that walls hold and that has to move, its index or -1.
+        Rows (k,), their stiffnesses (k,) and gaps (k,), and the shares (k, 2^d) of their forces that they have on each
+        node, but for what the wall bears; of a row that walls hold and that has to move, its index or -1.
         """
         grid, chosen = self.grid, np.flatnonzero(given[self.number])
         nodes, x, gap, N = (v[chosen] for v in (grid.cell_nodes[self.cell], self.x, self._gap[:, axis], self.shape))
         walled = ~free[nodes]
         held = ((N * ~walled).sum(axis=1) < FREE) & (np.abs(gap) > SAME * grid.h.min())
         stuck, asked = np.zeros_like(walled), np.repeat(gap[:, None], N.shape[1], axis=1)
-        given, torn = self._given[chosen, axis], np.zeros(len(chosen), dtype=bool)
+        moved, rise = (v[chosen][..., axis :: grid.dim, None] for v in (self._given, self._rise))  # at both ends
+        torn = np.zeros(len(chosen), dtype=bool)
         for b in range(grid.dim):
             for sign in (-1, 1):
                 here = grid.signs[:, b] == sign
                 at_wall = (walled[:, here].all(axis=1) & self._along[chosen, b])[:, None] & here
                 asked += at_wall * ((grid.node_x[nodes, b] - x[:, b, None]) * self._slope[chosen, b, axis, None])
                 stuck |= at_wall
-                there = self._rise[chosen, b, axis, None] * (grid.node_x[nodes, b] - self._x[chosen, b, None])
-                torn |= (at_wall & (np.abs(given[:, None] + there) > np.abs(given)[:, None] / 2)).any(axis=1)
+                there = moved + rise[:, b] * (grid.node_x[nodes, b] - self._x[chosen, b, None])[:, None]
+                torn |= (at_wall[:, None] & (np.abs(there) > np.abs(moved) / 2)).any(axis=(1, 2))
         kept = ~self._held_beside(self.number[chosen], nodes, N, stuck & torn[:, None])
         stiffness = self.stiffness[chosen, axis]
         gap = gap - (N * stuck * asked).sum(axis=1) + self._force[chosen, axis] / stiffness
-        beside = 1 - torn * (N * stuck).sum(axis=1)
-        return *(rows[kept] for rows in (chosen, stiffness, gap, beside)), chosen[held][0] if held.any() else -1
+        own = N * ~(stuck & torn[:, None])
+        return *(rows[kept] for rows in (chosen, stiffness, gap, own)), chosen[held][0] if held.any() else -1
 
     def _held_beside(
         self, number: NDArray[np.int64], nodes: NDArray[np.int32], N: NDArray[np.float64], stuck: NDArray[np.bool_]

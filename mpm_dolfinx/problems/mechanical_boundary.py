@@ -201,22 +201,24 @@ class MechanicalBoundary:
         self,
         forms: SideForms,
         cut: CutDomains,
-        start: float,
+        step: tuple[float, float],
         ways: NDArray[np.float64],
         t: float,
         points: MaterialPoints,
-        at_rest: bool = False,
     ) -> SideData:
-        """Return what acts at time t (s) of a step that began at `start` on the points where they are now.
+        """Return what acts at time t (s) of a step on the points where they are now.
 
-        ways (tools,): how far loads had pushed tools then, m; at_rest: hold sides where displacements count from.
+        step: its start and length, s; without a length sides are held where displacements count from.  ways (tools,):
+        how far loads had pushed tools at its start, m.
         """
+        start, dt = step
+        ends = (start, start + dt) if dt > 0 else ()
         with Timer("mpm: loads"):
             loads = self._load_data(forms, cut, points, t) if self.loads else None
             pressures = self._pressure_data(forms, cut, points, t) if self.pressures else None
             plates = self._plate_data(forms, cut, points) if self.plates else None
-            none = (None, None, np.empty(0, dtype=np.int64), np.empty(0))
-            holds = self._hold_data(forms, cut, points, t, at_rest) if self.holds else none
+            none = (None, None, np.empty(0, dtype=np.int64), np.empty((0, 2**self.grid.dim)))
+            holds = self._hold_data(forms, cut, points, t, ends) if self.holds else none
             pairs = zip(forms.own, self._terms, strict=True)
             own = tuple(self._own_data(term.points, faces, cut, points) for term, faces in pairs)
             tools = self.tools.going(Ways(start, t, ways, ways)).placed(cut, points, start, t)
@@ -275,15 +277,15 @@ class MechanicalBoundary:
         return forms.plates.at(cell, x, np.ones(len(cell)), rigidity=rigidity, normal=normal, tilt=tilt)
 
     def _hold_data(
-        self, forms: SideForms, cut: CutDomains, points: MaterialPoints, t: float, at_rest: bool
+        self, forms: SideForms, cut: CutDomains, points: MaterialPoints, t: float, ends: Sequence[float]
     ) -> tuple[PointData, HeldCells, NDArray[np.int64], NDArray[np.float64]]:
         """Return what holds given displacements, a row a component; by cells and points; which of these each is.
 
-        Last the share of each row's force that no wall bears.
+        Last the shares of each row's force on the nodes that no wall bears.
         """
         d, comm = self.grid.dim, self.grid.comm
         self._check_meeting(t)
-        held = HeldCells(self.grid, self._held_points(cut, points, t, at_rest))
+        held = HeldCells(self.grid, self._held_points(cut, points, t, ends))
         placed, message = [], ""
         for axis in range(d):
             given = np.array([axis in axes for *_, axes in self.holds])
@@ -294,17 +296,20 @@ class MechanicalBoundary:
                 message = f"{what}, where a fixed wall holds it; must be 0 there, or the wall must leave it free"
         if message := first(comm, message):
             raise ValueError(message)
-        row, stiffness, gap, beside, direction = map(np.concatenate, zip(*placed, strict=True))
+        row, stiffness, gap, own, direction = map(np.concatenate, zip(*placed, strict=True))
         fields = {name: values[row] for name, values in held.moments.items()}
         fields |= {"stiffness": stiffness, "gap": gap, "direction": direction}
-        return forms.holds.at(held.cell[row], held.x[row], np.ones(len(row)), **fields), held, row, beside
+        return forms.holds.at(held.cell[row], held.x[row], np.ones(len(row)), **fields), held, row, own
 
-    def _held_points(self, cut: CutDomains, points: MaterialPoints, t: float, at_rest: bool) -> HeldPoints:
-        """Return the points of integration on held sides, at the owners of their cells."""
+    def _held_points(self, cut: CutDomains, points: MaterialPoints, t: float, ends: Sequence[float]) -> HeldPoints:
+        """Return the points of integration on held sides, at the owners of their cells.
+
+        ends: start and end of the step, s; none for sides at rest.
+        """
         d, rows = self.grid.dim, []
         patches = cut.surfaces([faces for _, faces, _ in self.holds])
         chosen = np.unique(np.concatenate([p.at for p in patches]))
-        cut_points = points if at_rest else cut.points  # which are where they were cut
+        cut_points = cut.points if ends else points  # which are where they were cut
         now, before = (of.map(lambda values: values[chosen]) for of in (points, cut_points))
         stress = self.materials.total_stress(now)
         modulus, resists = (self.materials.table(before, of) for of in (holding, resistance))
@@ -313,16 +318,16 @@ class MechanicalBoundary:
         tension = np.linalg.norm(stress if points is cut_points else self.materials.total_stress(before), axis=(1, 2))
         for number, ((hold, *_, axes), p) in enumerate(zip(self.holds, patches, strict=True)):
             at, now = np.searchsorted(chosen, p.at), p.now(points)
-            given = np.zeros_like(now) if at_rest else self._given(hold, t, p.X)
-            to = p.origin(points) + given
+            given = [self._given(hold, time, p.X) for time in (t, *ends)] if ends else 3 * [np.zeros_like(now)]
+            to, given = p.origin(points) + given[0], np.concatenate(given[1:], axis=1)
             R = turned(self.grid.comm, p.area0, now, to) if len(axes) == d else np.eye(d)  # as what it carries does
             force, gap = np.einsum("ij,njk,nk->ni", R, stress[at, :d, :d], p.area(points)), to - now
             own = (p.area0 * v for v in (1, modulus[at], tension[at], resists[at], firm[at]))
             each = np.stack([np.full(len(gap), number), *own], axis=1)
             rows.append((p.cell, p.x, np.concatenate([each, gap, given, p.area(cut.points), force], axis=1)))
-        cell, x, values = gathered(self.grid, rows, 6 + 4 * d)
+        cell, x, values = gathered(self.grid, rows, 6 + 5 * d)
         number, *own = values[:, :6].T
-        return HeldPoints(number.astype(np.int64), cell, *own, x, *np.split(values[:, 6:], 4, axis=1))
+        return HeldPoints(number.astype(np.int64), cell, *own, x, *np.split(values[:, 6:], [d, 3 * d, 4 * d], axis=1))
 
     def _check_meeting(self, t: float) -> None:
         """Refuse given displacements that differ where they meet: no body's stress is finite there."""
@@ -341,9 +346,9 @@ class MechanicalBoundary:
         grid, data, held = self.grid, sides.holds, sides.held
         if data is None:
             return np.zeros((0, grid.dim))
-        force = data["stiffness"][:, 0] * (data["gap"][:, 0] - sides.along(u))
+        force = sides.pull(u)
         self._warn(held, sides.row, data["direction"].argmax(axis=1), force)
-        number, force = held.number[sides.row], (sides.beside * force)[:, None] * data["direction"]
+        number, force = held.number[sides.row], (sides.share.sum(axis=1) * force)[:, None] * data["direction"]
         return grid.comm.allreduce(np.stack([sum_by(number, column, len(self.holds)) for column in force.T], axis=1))
 
     def _warn(

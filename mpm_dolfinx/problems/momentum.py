@@ -565,7 +565,11 @@ class MomentumProblem:
         system.held_penalty.multAdd(system.step, forces, forces)
         if self._sides.contact is not None:
             self._sides.contact.now.push_on(system.held, *self._at, forces)
-        return wall_forces(self.forms.grid, fixed, system.held.owned, forces.array_r)
+        dofs, forces = system.held.owned, forces.array_r
+        if self._sides.holds is not None:  # what given sides count of their own
+            pulled, own = self._sides.pulled(self.forms.nodal)
+            dofs, forces = np.concatenate([dofs, pulled]), np.concatenate([forces, -own])
+        return wall_forces(self.forms.grid, fixed, dofs, forces)
 
     def assemble_tangent(
         self, data: QuadratureData | None = None, firmness: NDArray[np.float64] | float = 0.0

@@ -337,7 +337,7 @@ class System:
             collect_garbage(self.momentum.unknowns.comm)
 
 
-class Assembled:
+class Assembled(Keyed):
     """What stays while a cut serves and a stage lasts: penalties and fluxes, in the matrices of a system.
 
     Parameters

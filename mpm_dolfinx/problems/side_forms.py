@@ -30,8 +30,8 @@ class SideData:
 
     loads: with their force; pressures: with their force on the area at the start of the step; plates: with their
     rigidity, normal and present tilt; holds: components of given displacements, with stiffness, direction and gap;
-    held: what holds them; row: which of it each component is; beside: share of its force that no wall bears; tools:
-    contact with them; own: of each term of the user's own; contact: of groups of bodies.
+    held: what holds them; row: which of it each component is; share (m, 2^d): of its force on each node, but for what
+    walls bear; tools: contact with them; own: of each term of the user's own; contact: of groups of bodies.
     """
 
     loads: PointData | None
@@ -40,7 +40,7 @@ class SideData:
     holds: PointData | None
     held: HeldCells | None
     row: NDArray[np.int64]
-    beside: NDArray[np.float64]
+    share: NDArray[np.float64]
     tools: ToolContact | None = None
     own: tuple[PointData, ...] = ()
     contact: Following | None = None
@@ -59,10 +59,27 @@ class SideData:
             plates = plates.having(tilt=plates["tilt"] + slope - (slope * n).sum(axis=1, keepdims=True) * n)
         return replace(self, holds=holds, plates=plates)
 
+    @property
+    def asked(self) -> NDArray[np.int64] | None:
+        """Which components of which rows (m,) hold sides; None where nothing does."""
+        if self.holds is None:
+            return None
+        return self.holds.points.grid.dim * self.row + self.holds["direction"].argmax(axis=1)
+
     def along(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the displacement (m,), m, of each component that is given, at nodal values u (nodes, d), m."""
         at_nodes = u[self.holds.points.grid.cell_nodes[self.holds.cells]]
         return np.einsum("mk,mkd,md->m", self.held.shape[self.row], at_nodes, self.holds["direction"])
+
+    def pull(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the force (m,), N, along each component that is given, at nodal values u (nodes, d), m."""
+        return self.holds["stiffness"][:, 0] * (self.holds["gap"][:, 0] - self.along(u))
+
+    def pulled(self, u: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Return unrolled local degrees of freedom (n,), and forces (n,), N, on them that reactions count."""
+        d, data = self.holds.points.grid.dim, self.holds
+        dofs = d * data.points.grid.cell_nodes[data.cells] + data["direction"].argmax(axis=1)[:, None]
+        return dofs.ravel(), (self.share * self.pull(u)[:, None]).ravel()
 
 
 def functions_of(terms):

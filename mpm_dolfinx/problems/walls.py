@@ -24,7 +24,7 @@ def wall_forces(
     fixed
         Walls with the components that they hold.
     dofs : (n,)
-        Unrolled local degrees of freedom of this process that walls hold.
+        Unrolled local degrees of freedom, each once or more often; of those that no wall holds forces do not count.
     forces : (n,), N
         Forces on them.
     """
