@@ -261,7 +261,8 @@ def probe_stresses(scene: Scene, state: State, probes: Probes) -> NDArray[np.flo
 def _near(x: NDArray[np.float64], places: NDArray[np.float64], reach: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
     """Return the pairs of some places (m, d) and of points at x (n, d) within a reach (m,) along each axis, all m."""
     low, high = ((places + way * reach[:, None]).T for way in (-1, 1))
-    some = np.flatnonzero(((x >= low.min(axis=1)) & (x <= high.max(axis=1))).all(axis=1))
+    bounds = low.min(axis=1, initial=np.inf), high.max(axis=1, initial=-np.inf)
+    some = np.flatnonzero(((x >= bounds[0]) & (x <= bounds[1])).all(axis=1))
     if not len(some):
         return np.empty(0, np.int64), np.empty(0, np.int64)
     found = cKDTree(x[some]).query_ball_point(places, reach, p=np.inf)

@@ -169,3 +169,11 @@ def test_a_linear_stress_is_exact_at_any_place_of_irregular_domains(dim, axisymm
 
 
 PARTS = [(0.0, 1.0, 0), (1.0, 1.6, 1), (1.6, 2.0, 0)]
+
+
+def test_no_probes_have_no_pressures():
+    grid, law = mpm.Grid([1, 1], [2, 2]), mpm.Hencky(bulk=1e6, shear=6e5, conductivity=1e-5)
+    body = mpm.box(grid, [0, 0], [1, 1])
+    s = mpm.Simulation(grid, [body], [law], fluid=mpm.Fluid(), fixed={"left": "xy"})
+    result = s.run(1.0, 1.0, probes=mpm.probes([body], np.zeros((0, 2)), stress=True), progress=False)
+    assert result.probe_pressure[-1].shape == (0,) and result.probe_stress[-1].shape == (0, 3, 3)

@@ -55,7 +55,7 @@ class LocalFit:
     def __init__(self, count: int, dim: int, degree: int, width: int = 1):
         powers = [rows for k in range(degree + 1) for rows in combinations_with_replacement(range(dim), k)]
         self._powers, size = powers, len(powers)
-        self._sums = np.zeros((count, size * (size + width)))
+        self._sums, self._shape = np.zeros((count, size * (size + width))), (count, size, size + width)
 
     def add(self, at: NDArray[np.int64], offset: NDArray, values: NDArray, weight: NDArray) -> None:
         """Add values (r, width), with weights, for places `at` (r,), at offsets (r, d) over the spacing of the data."""
@@ -68,7 +68,7 @@ class LocalFit:
     def values(self, comm: MPI.Intracomm) -> NDArray[np.float64]:
         """Return the values (count, width) at the places, on every process; zero where nothing was added."""
         size = len(self._powers)
-        sums = over_all(comm, self._sums).reshape(len(self._sums), size, -1)
+        sums = over_all(comm, self._sums).reshape(self._shape)
         A, b, degree = sums[:, :, :size].copy(), sums[:, :, size:], np.array([len(p) for p in self._powers])
         some = A[:, 0, 0] > 0
         whole = np.where(some, A[:, 0, 0], 1.0)
