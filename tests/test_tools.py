@@ -443,3 +443,20 @@ def test_a_disc_that_turns_drives_the_body_by_friction():
     along, down, moment = s.tool_forces[0]
     assert along > 0
     assert moment == pytest.approx(-0.2 * 0.3 * down, rel=1e-2)
+
+
+@pytest.mark.parametrize("ends", [(0.3, 0.38), (0.33, 0.41), (0.3, 0.4)])
+def test_a_tool_less_than_a_cell_wide_presses(ends):
+    """Its edges left nothing of it: it went into the body without a force."""
+    grid, (a, b) = mpm.Grid([1.0, 0.7], [10, 7]), ends
+    stamp = mpm.Convex([(a, 0.5), (b, 0.5), (b, 0.6), (a, 0.6)])
+    one_cell = mpm.Displacement("top", lambda t: (0, -0.02 * t), "y", region=((0.3, 0.4), (0.4, 0.6)))
+    forces = []
+    for how in ({"tools": [mpm.Tool(stamp, displacement=lambda t: (0, -0.02 * t))]}, {"displacements": [one_cell]}):
+        body = mpm.box(grid, [0, 0], [1.0, 0.5])
+        s = mpm.Simulation(
+            grid, [body], [mpm.Hencky(bulk=1e6, shear=6e5)], fixed={"left": "x", "right": "x", "bottom": "xy"}, **how
+        )
+        s.run(1.0, 0.5, progress=False)
+        forces.append([*s.tool_forces[:, 1], *s.reactions[:, 1]][0])
+    assert forces[0] == pytest.approx(forces[1], rel=0.1)

@@ -158,7 +158,8 @@ class Tools:
     ) -> NDArray[np.bool_]:
         """Return which of the places that face a tool lie less than half a cell before its edge, if the body goes on.
 
-        The last node that a tool presses carries half a cell beyond it: up to there its edge presses nothing.
+        The last node that a tool presses carries half a cell beyond it: up to there its edge presses nothing.  A tool
+        of which nothing would be left, less than a cell wide, presses all over.
 
         Parameters
         ----------
@@ -185,7 +186,7 @@ class Tools:
         goes_on = np.zeros(int(edge.sum()), dtype=bool)
         goes_on[pairs["i"][on]] = True
         edge[edge] = goes_on
-        return edge
+        return edge if over_all(grid.comm, int((~edge).sum())) else np.zeros_like(edge)
 
     def check_start(self, cut: CutDomains, points: MaterialPoints, t: float) -> None:
         """Refuse tools that are inside of a body at time t (s); faces that they press on are where a step left them."""
