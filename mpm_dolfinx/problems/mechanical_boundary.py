@@ -341,7 +341,7 @@ class MechanicalBoundary:
         grid, data, held = self.grid, sides.holds, sides.held
         if data is None:
             return np.zeros((0, grid.dim))
-        force = data["stiffness"][:, 0] * (data["gap"][:, 0] - sides.along(u))
+        force = sides.pulls(u)
         self._warn(held, sides.row, data["direction"].argmax(axis=1), force)
         number, force = held.number[sides.row], (sides.beside * force)[:, None] * data["direction"]
         return grid.comm.allreduce(np.stack([sum_by(number, column, len(self.holds)) for column in force.T], axis=1))

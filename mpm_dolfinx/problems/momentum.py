@@ -563,6 +563,10 @@ class MomentumProblem:
         """Return the forces (2 d, d), N, of the walls at u, where the residual was last assembled."""
         system, forces = self.system, self.system.held_residual.copy()
         system.held_penalty.multAdd(system.step, forces, forces)
+        if self._sides.holds is not None:
+            pulls = self.forms.sides.forces
+            pulls.x.array[:] = self._sides.pulls_beside_walls(self.forms.nodal)
+            forces.axpy(-1.0, system.held.gather(sum_ghosts(pulls), system.held.vector()))
         if self._sides.contact is not None:
             self._sides.contact.now.push_on(system.held, *self._at, forces)
         return wall_forces(self.forms.grid, fixed, system.held.owned, forces.array_r)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointForm
 from mpm_dolfinx.forms.unknowns import sum_ghosts
-from mpm_dolfinx.points.grid import Grid
+from mpm_dolfinx.points.grid import Grid, sum_by
 from mpm_dolfinx.problems.body_contact import Following
 from mpm_dolfinx.problems.conditions import OnSide
 from mpm_dolfinx.problems.held_cells import HeldCells
@@ -63,6 +63,20 @@ class SideData:
         """Return the displacement (m,), m, of each component that is given, at nodal values u (nodes, d), m."""
         at_nodes = u[self.holds.points.grid.cell_nodes[self.holds.cells]]
         return np.einsum("mk,mkd,md->m", self.held.shape[self.row], at_nodes, self.holds["direction"])
+
+    def pulls(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the force (m,), N, of each component that is given, at nodal values u (nodes, d), m."""
+        return self.holds["stiffness"][:, 0] * (self.holds["gap"][:, 0] - self.along(u))
+
+    def pulls_beside_walls(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the nodal forces, a local array, N, of components that hold all of their nodes: no wall bears a part.
+
+        On several processes each has those of its own rows.
+        """
+        grid, axis = self.holds.points.grid, self.holds["direction"].argmax(axis=1)
+        force = np.where(self.beside == 1, self.pulls(u), 0.0)
+        dofs = grid.cell_nodes[self.holds.cells] * grid.dim + axis[:, None]
+        return sum_by(dofs.ravel(), (force[:, None] * self.held.shape[self.row]).ravel(), u.size)
 
 
 def functions_of(terms):
