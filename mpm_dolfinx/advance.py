@@ -110,7 +110,7 @@ class Motion:
             nodal = self._momentum.u.x.array.reshape(-1, d)
             deformed = cache(partial(self._deformed, cut, data, nodal))
             if cut.domains:
-                followed = cut.followed(nodal, self._momentum.active_nodes(on_grid.cells))
+                followed = cut.followed(nodal, on_grid.active)
                 points, keeps, folded = self._shaped(state, t, tools, on_grid, *followed, deformed)
             else:
                 x, F = state.points.x + cut.displacement(nodal), deformed()

@@ -219,9 +219,9 @@ class Scene:
         return {**out, **self.materials.checksums, "data of the points": sorted(self.materials.seeded.data)}
 
     @property
-    def last(self) -> tuple[OnGrid | None, Assembled | None]:
-        """The bodies on the grid and the matrices of the last step, to be looked at."""
-        return self._on_grid.value, self._assembled.value
+    def last(self) -> tuple[OnGrid | None, Assembled | System | None]:
+        """The bodies as they were last cut, and the matrices of the last step, to be looked at."""
+        return self._on_grid.value, self._assembled.value or self._systems.value
 
     def forget(self) -> None:
         """Drop all that was made for a step: it may have been broken off anywhere."""

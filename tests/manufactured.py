@@ -111,7 +111,9 @@ def errors(s):
     """
     fem = isinstance(s, BiotFEM)
     X = s.grid.midpoints[: s.grid.num_owned] if fem else s.bodies[0].centre
-    found, pressure = (s.displacement(X), s.pressure(X)) if fem else (s.points.x - X, s.points.pressure)
+    found, pressure = (
+        (s.displacement(X), s.pressure(X)) if fem else (s.points.corners.mean(axis=1) - X, s.points.pressure)
+    )
     u, p = solution(X.T, s.t)
     u = np.stack(u, axis=1)
     return np.array([rms(found - u) / np.abs(u).max(), rms(pressure - p) / np.abs(p).max()])

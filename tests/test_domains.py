@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from mpm_dolfinx import Grid, box
-from mpm_dolfinx.points.cutting import corner_bits, cut, kuhn_simplices
+from mpm_dolfinx.points import cutting
+from mpm_dolfinx.points.cutting import corner_bits, cut
 from mpm_dolfinx.points.grid import SNAP
 
 GRIDS = {2: Grid([1.0, 1.2], [5, 6]), 3: Grid([1.0, 1.2, 0.8], [4, 4, 4])}
@@ -24,9 +25,9 @@ def domains(grid, distort):
 
 
 def simplices(corners):
-    """The simplices (n, d!, d+1, d) of domains and their volumes, all positive."""
-    s = corners[:, kuhn_simplices(corners.shape[2])]
-    return s, np.abs(np.linalg.det(s[:, :, 1:] - s[:, :, :1])) / s.shape[1]
+    """The simplices (n, k, d+1, d) of domains and their volumes, all positive."""
+    s = np.moveaxis(cutting.vertices(np.moveaxis(corners, 0, 2)), 2, 0)[:, cutting.simplices(corners.shape[2])]
+    return s, np.abs(np.linalg.det(s[:, :, 1:] - s[:, :, :1])) / (2, 6)[s.shape[3] - 2]
 
 
 def test_pieces_of_undistorted_domains_are_the_boxes_that_they_share_with_the_cells(grid):

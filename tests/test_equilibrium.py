@@ -16,6 +16,8 @@ G = 9.81
 
 def weight(s):
     """Return the weight (d,), N, of grains and pore water, counted from the points."""
+    if s.scene.gravity is None:
+        return np.zeros(s.grid.dim)
     p, n = s.points, SOIL.porosity
     mass = ((1 - n) * SOIL.grain_density * p.volume0).sum()
     if s.scene.fluid is not None:
@@ -64,6 +66,23 @@ def a_thin_layer(water):
     )
 
 
+def held_in_the_cells_of_a_wall(water):
+    """Return a block whose held top ends in the cells beside a wall, which it does not touch."""
+    grid, walls = mpm.Grid([2.2, 1.7], [11, 8]), {"left": "x", "bottom": "xy"}
+    held = mpm.Displacement("top", lambda t: (5e-4 * t, -1e-3 * t))
+    body = mpm.box(grid, [0.07, 0], [1.3, 1.1])
+    return mpm.Simulation(grid, [body], [SOIL], fixed=walls, displacements=[held], **water), (0, 0)
+
+
+def pushed_along_a_wall(water):
+    """Return a block, and a plate one cell high, of which a given displacement pushes a side along a rough floor."""
+    grid, walls = mpm.Grid([2.2, 1.7], [11, 8]), {"bottom": "xy"}
+    bodies = [mpm.box(grid, [0.27, 0], [0.9, 1.1]), mpm.box(grid, [1.3, 0], [1.9, 0.2])]
+    near = [((0, 0), (1, 2)), ((1, 0), (2, 2))]
+    sides = [mpm.Displacement("left", lambda t: (1e-2 * t, 0), "x", region=region) for region in near]
+    return mpm.Simulation(grid, bodies, [SOIL], fixed=walls, displacements=sides, gravity=(0, -G), **water), (0, 0)
+
+
 def in_a_corner(water):
     grid = mpm.Grid([1.1, 1.1, 1.4], [5, 5, 6])
     load, walls = (3e3, 10.0, -1e4), {"left": "xyz", "back": "y", "front": "yz", "bottom": "xz"}
@@ -106,8 +125,8 @@ def held_on_the_floor(water):
     )
 
 
-SCENES = [held_and_pressed, under_a_plate, a_thin_layer, in_a_corner, a_cylinder, two_groups]
-SCENES += [held_beside_walls, held_on_the_floor]
+SCENES = [held_and_pressed, under_a_plate, a_thin_layer, held_in_the_cells_of_a_wall, pushed_along_a_wall, in_a_corner]
+SCENES += [a_cylinder, two_groups, held_beside_walls, held_on_the_floor]
 
 
 @pytest.mark.parametrize("wet", [False, True], ids=["dry", "wet"])

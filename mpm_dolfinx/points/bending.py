@@ -23,7 +23,7 @@ from mpm_dolfinx.points.grid import Grid, in_chunks
 
 
 def followed(
-    grid: Grid, cells: NDArray[np.int32], x: NDArray[np.float64], u: NDArray[np.float64], active: NDArray[np.bool_]
+    grid: Grid, cells: NDArray[np.int32], x: NDArray[np.float64], u: NDArray[np.float64], filled: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
     """Return the Q1 field at corners, and what they follow besides (2, m, d), m.
 
@@ -33,14 +33,14 @@ def followed(
         Owned cells that the corners lie in, and their positions.
     u : (nodes, d), m
         Nodal displacements.
-    active : (nodes,)
-        Which nodes belong to cells that hold something.
+    filled : (cells,)
+        Which local cells hold something: beyond an empty one may be nodes of another body.
     """
     used = np.flatnonzero(np.bincount(cells, minlength=1))
     slot = np.zeros(used.max(initial=0) + 1, dtype=np.intp)
     slot[used] = np.arange(len(used))
     field = grid.monomials @ _at(u, grid.cell_nodes[used])
-    bends = _second_differences(grid, used, u, active)
+    bends = _second_differences(grid, used, u, filled)
     out = np.empty((2, *x.shape))
     # with the corners last: rows of a few numbers each would take numpy six times as long
     for part in in_chunks(len(x)):
@@ -76,7 +76,7 @@ def _polynomial(
 
 
 def _second_differences(
-    grid: Grid, cells: NDArray[np.int32], u: NDArray[np.float64], active: NDArray[np.bool_]
+    grid: Grid, cells: NDArray[np.int32], u: NDArray[np.float64], filled: NDArray[np.bool_]
 ) -> list[NDArray[np.float64]]:
     """Return the second differences along the edges of owned cells, m, as polynomials of the places across, per axis.
 
@@ -92,7 +92,7 @@ def _second_differences(
         for k, (end, value) in enumerate(((low, first), (high, last))):
             local = beside[:, a, k]
             beyond = grid.cell_nodes[local][:, end]
-            known.append((local >= 0) & active[beyond].T)
+            known.append(np.broadcast_to((local >= 0) & filled[local], (2 ** (d - 1), len(local))))
             ends.append(_at(u, beyond) - value - (2 * k - 1) * along)
         first, last = (np.where(known[k], ends[k], ends[1 - k]) for k in (0, 1))
         smaller = np.where(np.abs(first) < np.abs(last), first, last)

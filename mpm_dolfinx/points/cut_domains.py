@@ -187,13 +187,13 @@ class CutDomains(Keyed):
         travel, cells, x = self._followed
         return travel.back(self.grid.at(cells, x, u))
 
-    def followed(self, u: NDArray[np.float64], active: NDArray[np.bool_]) -> Iterator[NDArray[np.float64]]:
+    def followed(self, u: NDArray[np.float64], filled: NDArray[np.bool_]) -> Iterator[NDArray[np.float64]]:
         """Yield the Q1 field u (nodes, d) at the corners (n, 2^d, d), and what they follow besides, m.
 
-        active: nodes of filled cells.
+        filled (cells,): which local cells hold something.
         """
         travel, cells, x = self._followed
-        return (travel.back(v).reshape(self.points.corners.shape) for v in followed(self.grid, cells, x, u, active))
+        return (travel.back(v).reshape(self.points.corners.shape) for v in followed(self.grid, cells, x, u, filled))
 
     @cached_property
     def _followed(self) -> tuple[Exchange, NDArray[np.int32], NDArray[np.float64]]:

@@ -6,8 +6,8 @@ and centroids, in 3D also their moments of products: gradients of Q1 functions a
 so one row of integration data a piece integrates them exactly, and the answer does not depend on how points lie on the
 grid.
 
-The surface of a domain (4 edges, or the 12 outer triangles of its 6 Kuhn tetrahedra, which match those of
-the neighbours) is sliced by the grid planes of one axis after the other.  Gauss's theorem turns the slices into
+The surface of a domain (4 edges, or in 3D 4 triangles a face about its middle, which match those of the neighbours and
+prefer no diagonal) is sliced by the grid planes of one axis after the other.  Gauss's theorem turns the slices into
 volumes and first moments of what lies between them and the lower face of their cell and, below it, of whole
 columns of cells: nothing inside a domain is ever cut, and the faces of the pieces come for free.
 
@@ -68,26 +68,82 @@ def _faces(dim: int) -> NDArray[np.int64]:
 
 FACES = {d: _faces(d) for d in (2, 3)}
 """Corners (2d, 2^(d-1)) of the faces of a domain."""
+FACE_SIGNS = (-1, 1, 1, -1, -1, 1)
+"""Which way (6,) faces look whose corners are taken in turn, of quadrilaterals the first four: outward or inward."""
+ABOUT_MIDDLE = ((0, 1, 4), (1, 3, 4), (3, 2, 4), (2, 0, 4))
+"""Triangles that a face in 3D is split into: corners, and its middle, so that no diagonal is preferred."""
 
 
 @cache
 def kuhn_simplices(dim: int) -> NDArray[np.int64]:
-    """Return the (d!, d+1) corners of the simplices that a domain is split into."""
+    """Return the (d!, d+1) corners of Kuhn's simplices of a domain or face."""
     return np.array([[sum(1 << a for a in p[:k]) for k in range(dim + 1)] for p in permutations(range(dim))])
 
 
+@cache
+def simplices(dim: int) -> NDArray[np.int64]:
+    """Return the `vertices` (4 or 24, d+1) of the simplices of a domain: facets of its surface, and its middle.
+
+    They are alike under all turns and mirrors of the domain; the facets look outward.
+    """
+    rings = FACES[dim][:, [0, 1, 3, 2][: 2 ** (dim - 1)]]
+    facets = []
+    for face, (ring, sign) in enumerate(zip(rings, FACE_SIGNS, strict=False)):
+        ring = ring[::sign]
+        if dim == 2:
+            facets.append(ring)
+        else:
+            facets += [(a, b, 8 + face) for a, b in zip(ring, np.roll(ring, -1), strict=True)]
+    return np.pad(facets, ((0, 0), (0, 1)), constant_values=(4, 14)[dim - 2])
+
+
+def vertices(y: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the corners of domains (2^d, d, n), in 3D the middles of their faces, and last their middles."""
+    faces = [y[index].sum(axis=0) / 4 for index in FACES[3]] if y.shape[1] == 3 else []
+    return np.concatenate([y, *(v[None] for v in faces), y.sum(axis=0)[None] / len(y)])
+
+
+def simplex_volumes(v: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the signed volumes (k, n) of the simplices of domains with these vertices (v, d, n)."""
+    d, (*rest, middle) = v.shape[1], simplices(v.shape[1]).T
+    facets = np.stack([v[vertex] for vertex in rest], axis=-1)  # (k, d, n, d)
+    s = np.moveaxis(facets, (3, 1, 0, 2), (0, 1, 2, 3)).reshape(d, d, -1)
+    height = s[0] - np.moveaxis(v[middle], 1, 0).reshape(d, -1)
+    volume = (_area_vectors(s) * height).sum(axis=0) / d
+    return volume.reshape(len(middle), -1)
+
+
 def volumes(corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the volumes (n,), m^d, of domains (n, 2^d, d), negative if they are turned inside out."""
-    return sum(_simplex_volumes(np.ascontiguousarray(corners.transpose(1, 2, 0))))
+    """Return the volumes (n,), m^d, of domains (n, 2^d, d), negative if they are turned inside out.
+
+    In 3D by faces: a third of the product of the middle of each and its area vector.
+    """
+    y = np.ascontiguousarray((corners - corners[:, :1]).transpose(1, 2, 0))
+    if len(y) == 4:
+        (ax, ay), (bx, by) = y[3] - y[0], y[2] - y[1]
+        return (ax * by - ay * bx) / 2
+    total = 0.0
+    for (p, q, r, s), sign in zip(y[FACES[3]], FACE_SIGNS, strict=True):
+        total = total + sign * _triple(p + q + r + s, s - p, r - q)
+    return total / 24
+
+
+def _triple(a: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the triple products (n,) of vectors (3, n)."""
+    return (a * cross(b, c)).sum(axis=0)
+
+
+def cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the cross products (3, n) of vectors (3, n)."""
+    return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
 def domain_volumes(corners: NDArray[np.float64], axisymmetric: bool) -> NDArray[np.float64]:
     """Return the volumes (n,), m^d, of domains (n, 2^d, d), in axisymmetry of the rings that they stand for, m^3."""
     if not axisymmetric:
         return volumes(corners)
-    y = np.ascontiguousarray(corners.transpose(1, 2, 0))
-    areas = zip(_simplex_volumes(y), kuhn_simplices(2), strict=True)
-    return TURN * sum(area * y[simplex, 0].mean(axis=0) for area, simplex in areas)
+    v = vertices(np.ascontiguousarray(corners.transpose(1, 2, 0)))
+    return TURN * (simplex_volumes(v) * v[simplices(2), 0].mean(axis=1)).sum(axis=0)
 
 
 def centroids(corners: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -95,23 +151,12 @@ def centroids(corners: NDArray[np.float64]) -> NDArray[np.float64]:
 
     As in `cut`, simplices that are turned inside out count as positive.
     """
-    y = np.ascontiguousarray(corners.transpose(1, 2, 0))
-    whole, middle = 0.0, y.mean(axis=0)
-    moment = np.zeros_like(middle)
-    for volume, simplex in zip(_simplex_volumes(y), kuhn_simplices(y.shape[1]), strict=True):
-        volume = np.abs(volume)
-        whole = whole + volume
-        moment += volume * (y[simplex].mean(axis=0) - middle)
+    v = vertices(np.ascontiguousarray(corners.transpose(1, 2, 0)))
+    volume, middle = np.abs(simplex_volumes(v)), v[-1]
+    whole, moment = volume.sum(axis=0), np.zeros_like(middle)
+    for share, simplex in zip(volume, simplices(v.shape[1]), strict=True):
+        moment += share * (v[simplex].mean(axis=0) - middle)
     return (middle + np.divide(moment, whole, out=np.zeros_like(moment), where=whole > 0)).T.copy()
-
-
-def _simplex_volumes(y: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Return the signed volumes (n,) of each simplex of domains (2^d, d, n)."""
-    d, out = y.shape[1], []
-    for simplex, sign in zip(kuhn_simplices(d), ORIENTATION[d], strict=True):
-        height = y[simplex[-1]] - y[simplex[0]]
-        out.append((_area_vectors(y[simplex[:-1]]) * height).sum(axis=0) * (sign * (-1) ** (d + 1) / d))
-    return out
 
 
 def tangled(corners: NDArray[np.float64], volume: NDArray[np.float64], axisymmetric: bool = False) -> NDArray[np.bool_]:
@@ -126,9 +171,6 @@ def parallelepipeds(
     """Return the corners (n, 2^d, d), m, of boxes of size `spacing` (n, d) about x (n, d), deformed by F (n, d, d)."""
     offset = (corner_bits(x.shape[1]) - 0.5) * spacing[:, None, :]
     return x[:, None] + np.einsum("nab,nkb->nka", F, offset)
-
-
-ORIENTATION = {d: np.sign(np.linalg.det(np.diff(corner_bits(d)[kuhn_simplices(d)], axis=1))) for d in (2, 3)}
 
 
 def cut(grid: Grid, corners: NDArray[np.float64]) -> Pieces:
@@ -156,18 +198,20 @@ def _cut(grid: Grid, corners: NDArray[np.float64]) -> Pieces:
     d, true = grid.dim, np.ascontiguousarray(((corners - grid.lower) / grid.h).transpose(1, 2, 0))
     nearest = np.rint(true)
     y = np.where(np.abs(true - nearest) < grid.snap[:, None], nearest, true)
-    volume = np.stack(_simplex_volumes(y))
+    v = vertices(y)
+    volume = simplex_volumes(v)
     flat = np.flatnonzero(~volume.any(axis=0))
     if len(flat):  # thinner than that, and on a plane: nothing would be left of them
         y[:, :, flat] = true[:, :, flat]
-        volume = np.stack(_simplex_volumes(y))
+        v = vertices(y)
+        volume = simplex_volumes(v)
     # segments or triangles (d, d, m): vertices and coordinates first, which keeps the loops in numpy's fast lanes
-    s = np.concatenate([y[facet] for facet in _FACETS[d][:, [0, -1]].reshape(-1, d)], axis=2)
-    outward, owner = _area_vectors(s), np.tile(np.arange(len(corners)), 2 * len(_FACETS[d]))
+    s = np.concatenate([v[facet] for facet in _FACETS[d][:, -1]], axis=2)
+    outward, owner = _area_vectors(s), np.tile(np.arange(len(corners)), len(_FACETS[d]))
     # a simplex that is turned inside out, in a domain about to fold, counts as positive: minus twice its volume
     simplex, folded = np.nonzero(volume < 0)
     if len(folded):
-        turned = y[_FACETS[d][simplex], :, folded[:, None, None]].transpose(2, 3, 0, 1).reshape(d, d, -1)
+        turned = v[_FACETS[d][simplex], :, folded[:, None, None]].transpose(2, 3, 0, 1).reshape(d, d, -1)
         s = np.concatenate([s, turned, turned], axis=2)
         outward = np.concatenate([outward, *[-_area_vectors(turned)] * 2], axis=1)
         owner = np.concatenate([owner, *[np.repeat(folded, d + 1)] * 2])
@@ -189,16 +233,16 @@ def _area_vectors(s: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _facets(dim: int) -> NDArray[np.int64]:
-    """Return the (d!, d+1, d) corners of the facets of a domain's simplices, turned outward.
+    """Return the vertices (k, d+1, d) of the facets of a domain's simplices, turned outward.
 
-    The k-th facet lacks the k-th corner; the first and the last are part of the domain's surface.
+    The k-th facet lacks the k-th vertex; the last ones, which lack the middle, are the domain's surface.
     """
-    out = np.stack([np.delete(kuhn_simplices(dim), k, axis=1) for k in range(dim + 1)], axis=1)
-    bits = corner_bits(dim).astype(float)
-    for simplex, facets in zip(kuhn_simplices(dim), out, strict=True):
+    out = np.stack([np.delete(simplices(dim), k, axis=1) for k in range(dim + 1)], axis=1)
+    box = vertices(corner_bits(dim).astype(float)[:, :, None])[:, :, 0]
+    for simplex, facets in zip(simplices(dim), out, strict=True):
         for facet in facets:
-            away = bits[facet].mean(axis=0) - bits[simplex].mean(axis=0)
-            if _area_vectors(bits[facet][:, :, None])[:, 0] @ away < 0:
+            away = box[facet].mean(axis=0) - box[simplex].mean(axis=0)
+            if _area_vectors(box[facet][:, :, None])[:, 0] @ away < 0:
                 facet[:2] = facet[1::-1].copy()
     return out
 
@@ -370,7 +414,7 @@ def cut_faces(
     Parameters
     ----------
     corners : (m, 2^(d-1), d), m
-        Corners of the faces.
+        Corners of the faces, of a triangle the last one twice.
     local : (m, 2^(d-1), e)
         Coordinates of the corners to be interpolated.
 
@@ -384,7 +428,10 @@ def cut_faces(
     nearest = np.rint(y)
     y = np.where(np.abs(y - nearest) < grid.snap, nearest, y)
     both = np.concatenate([y, local], axis=2).transpose(1, 2, 0)
-    split = kuhn_simplices(d - 1)
+    split = [(0, 1)]
+    if d == 3:
+        three = (both[2] == both[3]).all(axis=0)  # triangles, about a corner
+        both, split = np.concatenate([both, np.where(three, both[2], both.sum(axis=0) / 4)[None]]), ABOUT_MIDDLE
     s = np.concatenate([both[list(simplex)] for simplex in split], axis=2)
     owner = np.arange(s.shape[2])
     whole = s

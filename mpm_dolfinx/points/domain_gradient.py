@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.points.cut_domains import CutDomains
-from mpm_dolfinx.points.cutting import ORIENTATION, domain_volumes, kuhn_simplices, volumes
+from mpm_dolfinx.points.cutting import FACE_SIGNS, FACES, cross, domain_volumes, volumes
 from mpm_dolfinx.points.grid import sum_by
 from mpm_dolfinx.points.material_points import MaterialPoints, cofactor, determinant
 
@@ -45,19 +45,16 @@ def _of_hexahedra(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the mean F (n, 3, 3) over the simplices, and the volumes at rest (n,), m^3, of which it is a derivative.
 
-    Sums over corners of x_k and dV/dX_k, arrays with the points last: a fifth of the time of a sum over simplices.
+    Sums over corners of x_k and dV/dX_k, of the volumes by faces, with the points last.
     """
     x, X = (np.ascontiguousarray((y - y[:, :1]).transpose(1, 2, 0)) for y in (corners, reference))
     slope = np.zeros_like(X)
-    for simplex, sign in zip(kuhn_simplices(3), ORIENTATION[3], strict=True):
-        edges = np.diff(X[simplex], axis=0)
-        for i in range(3):
-            a, b = edges[(i + 1) % 3], edges[(i + 2) % 3]
-            for axis in range(3):
-                j, k = (axis + 1) % 3, (axis + 2) % 3
-                area = sign / 6 * (a[j] * b[k] - a[k] * b[j])
-                slope[simplex[i + 1], axis] += area
-                slope[simplex[i], axis] -= area
+    for face, sign in zip(FACES[3], FACE_SIGNS, strict=True):
+        p, q, r, s = X[face]
+        total, a, b = p + q + r + s, s - p, r - q
+        area, by_a, by_b = (sign / 24 * cross(*pair) for pair in ((a, b), (b, total), (total, a)))
+        for corner, own in zip(face, (-by_a, -by_b, by_b, by_a), strict=True):
+            slope[corner] += area + own
     volume = (X * slope).sum(axis=(0, 1)) / 3
     return np.moveaxis(np.einsum("kan,kbn->abn", x, slope) / volume, 2, 0).copy(), volume
 

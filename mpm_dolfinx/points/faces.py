@@ -26,7 +26,7 @@ from mpm_dolfinx.points.contact import (
     weights,
     within,
 )
-from mpm_dolfinx.points.cutting import FACES, corner_bits, kuhn_simplices
+from mpm_dolfinx.points.cutting import ABOUT_MIDDLE, FACES, corner_bits
 from mpm_dolfinx.points.grid import rounding
 from mpm_dolfinx.validation import numbers
 
@@ -203,16 +203,16 @@ def _limited(
     """
     dim, three = body.dim, (t[:, 2] == t[:, 3]).all(axis=1)
     X = _face_corners(body, row[part], face[part])
-    if dim == 3 and body.lattice is None:
-        some = ((X.min(axis=1) < region[0]) | (X.max(axis=1) > region[1])).any(axis=1)  # of a face that is not whole
-        triangles, at = _clipped(X[some], t[some], region)
-        quads, at = t[~some], np.concatenate([np.flatnonzero(~some), np.flatnonzero(some)[at]])
-    else:
-        low, high = _interval(X, region)
-        triangles, at = within(t[three, :3].transpose(1, 2, 0), np.flatnonzero(three), low[three], high[three])
-        triangles = triangles.transpose(2, 0, 1)
-        quads = np.clip(t[~three], low[~three, None], high[~three, None])
-        at = np.concatenate([np.flatnonzero(~three), at])
+    bent, clipped, of = np.zeros(len(X), dtype=bool), np.empty((0, 3, 2)), np.empty(0, np.int64)
+    if dim == 3 and body.lattice is None:  # faces that are not whole, and no rectangles along the axes
+        bent = ((X.min(axis=1) < region[0]) | (X.max(axis=1) > region[1])).any(axis=1) & ~_along_axes(X)
+        clipped, of = _clipped(X[bent], t[bent], region)
+    quad, three = np.flatnonzero(~bent & ~three), np.flatnonzero(~bent & three)
+    low, high = _interval(X, region)
+    triangles, at = within(t[three, :3].transpose(1, 2, 0), three, low[three], high[three])
+    triangles = np.concatenate([triangles.transpose(2, 0, 1), clipped])
+    quads = np.clip(t[quad], low[quad, None], high[quad, None])
+    at = np.concatenate([quad, at, np.flatnonzero(bent)[of]])
     t = np.concatenate([quads, triangles[:, [0, 1, 2, 2]]])
     kept = np.flatnonzero((np.ptp(t, axis=1) > 0).all(axis=1))
     kept = kept[np.lexsort((at[kept], row[part[at[kept]]]))]
@@ -222,6 +222,12 @@ def _limited(
     np.put_along_axis(xi, np.broadcast_to(TANGENTIAL[dim][axis], t.shape), 2 * t - 1, axis=2)
     np.put_along_axis(xi, np.broadcast_to(axis[:, None], xi[:, :, :1].shape), 2.0 * end[:, None] - 1, axis=2)
     return part, xi
+
+
+def _along_axes(X: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which faces (n,), of corners (n, 4, 3), m, are rectangles with edges along the axes."""
+    edges = X[:, [1, 2, 3, 3]] - X[:, [0, 0, 2, 1]]
+    return ((np.abs(edges) > rounding(X)).sum(axis=2) == 1).all(axis=1)
 
 
 def _interval(X: NDArray[np.float64], region: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -244,8 +250,11 @@ def _clipped(
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Return what lies in a region of parts t (n, 4, 2) of faces X (n, 4, 3): triangles, and the parts they are of."""
     places = np.einsum("npk,nkd->npd", weights(t.reshape(-1, 2)).reshape(*t.shape[:2], 4), X)
-    s = np.concatenate([places[:, list(simplex)].transpose(1, 2, 0) for simplex in kuhn_simplices(2)], axis=2)
-    at = np.tile(np.arange(len(X)), 2)
+    three = (t[:, 2] == t[:, 3]).all(axis=1)[:, None]  # triangles, about a corner
+    middle = np.where(three, places[:, 2], places.mean(axis=1))
+    places = np.concatenate([places, middle[:, None]], axis=1)
+    s = np.concatenate([places[:, list(triangle)].transpose(1, 2, 0) for triangle in ABOUT_MIDDLE], axis=2)
+    at = np.tile(np.arange(len(X)), len(ABOUT_MIDDLE))
     for axis in range(3):
         _, _, s, at = split(s, at, axis, region[0, axis])
         s, at, _, _ = split(s, at, axis, region[1, axis])

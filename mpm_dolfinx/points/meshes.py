@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 from mpm_dolfinx.parallel.messages import warn
 from mpm_dolfinx.points.bodies import Body, check_inside
 from mpm_dolfinx.points.contact import TOUCH, Faces, covers, face_vectors
-from mpm_dolfinx.points.cutting import FACES, ORIENTATION, centroids, corner_bits, kuhn_simplices, volumes
+from mpm_dolfinx.points.cutting import FACES, centroids, corner_bits, simplex_volumes, vertices, volumes
 from mpm_dolfinx.points.grid import Grid, rounding, sum_by
 from mpm_dolfinx.points.mesh_cells import KINDS, PARTS, Polytopes, distinct
 from mpm_dolfinx.validation import whole
@@ -314,8 +314,8 @@ def _check_convex(domains: NDArray[np.float64], name: str) -> None:
     ends = np.arange(2**d)[:, None] ^ (1 << np.arange(d))
     edges = (domains[:, ends] - domains[:, :, None]) * (1 - 2 * bits)[:, :, None]
     least = np.linalg.det(edges).min(axis=1)
-    for simplex, sign in zip(kuhn_simplices(d), ORIENTATION[d], strict=True):
-        least = np.minimum(least, sign * np.linalg.det(np.diff(domains[:, simplex], axis=1)))
+    of_simplices = simplex_volumes(vertices(np.ascontiguousarray(domains.transpose(1, 2, 0))))
+    least = np.minimum(least, of_simplices.min(axis=0, initial=np.inf))
     bad = np.flatnonzero(~(least > CONVEX * size))
     if len(bad):
         x = domains[bad[0]].mean(axis=0)

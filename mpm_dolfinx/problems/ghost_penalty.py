@@ -83,14 +83,12 @@ class GhostPenalty:
         def kink(w):
             return ufl.dot(ufl.grad(w)("+") - ufl.grad(w)("-"), n)
 
-        scale = self._scale()
-        if grid.axisymmetric:
-            scale *= TURN * ufl.SpatialCoordinate(grid.mesh)("+")[0]
-        form = GHOST / 3 * scale * across * ufl.inner(kink(du), kink(v)) * dS
+        around = TURN * ufl.SpatialCoordinate(grid.mesh)[0] if grid.axisymmetric else ufl.as_ufl(1.0)
+        form = GHOST / 3 * self._scale() * around("+") * across * ufl.inner(kink(du), kink(v)) * dS
         self.form = FacetForm(form, grid.comm)
         dx = ufl.Measure("dx", domain=grid.mesh, subdomain_id=_compat.SUBDOMAIN, metadata={"quadrature_degree": 2})
         strains = [ufl.sym(ufl.grad(w)) for w in (du, v)]
-        self.firmness = FacetForm(2 * self.fill * self.shear * ufl.inner(*strains) * dx, grid.comm)
+        self.firmness = FacetForm(2 * self.fill * self.shear * around * ufl.inner(*strains) * dx, grid.comm)
 
     def _scale(self):
         """Return the strength of a face times its modulus, the harmonic mean of both cells', Pa, as UFL."""

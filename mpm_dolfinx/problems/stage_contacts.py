@@ -127,7 +127,7 @@ class Contacts:
         begun = self._contact(cut, points, found, cut.points, points, reach)
 
         def again(u: NDArray[np.float64]) -> BodyContact:
-            moved, _ = cut.followed(u.reshape(-1, self.grid.dim), np.zeros(len(self.grid.node_x), dtype=bool))
+            moved, _ = cut.followed(u.reshape(-1, self.grid.dim), np.zeros(self.grid.num_local, dtype=bool))
             there = replace(points, corners=points.corners + moved)
             return self._contact(cut, points, self._met_all(cut, there), there, there, reach)
 

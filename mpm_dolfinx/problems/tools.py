@@ -243,7 +243,7 @@ class Cone:
         _, r, _, second = self._polar(y)
         if y.shape[1] == 2:
             return _flat(y)
-        near_axis = r[:, None, None] <= 1e-6 * np.abs(y).max(initial=1.0)
+        near_axis = r[:, None, None] <= 1e-6 * np.abs(y - self.tip).max(initial=0.0)
         along = self._axis[:, None] * self._axis / np.where(near_axis, np.inf, r[:, None, None])
         return np.where(near_axis, 0.0, second - along) * np.cos(np.radians(self.angle))
 

@@ -1,0 +1,210 @@
+# SPDX-License-Identifier: MIT
+"""Forces and fluid of a scene, counted from its points and conditions, not by the scheme.
+
+Forces by the work of rigid translations: dead loads by the areas of sides as drawn, weights by the masses of points,
+reactions of conditions, tools and walls.  Fluid by what the pores of the points hold.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpm_dolfinx.points.grid import SIDES
+from scenes.comparing import NOTHING, softest
+from scenes.description import WATER, Block, Condition, Draw, Scene, drawn
+from scenes.running import Built
+
+COUNTED = ("traction", "plate", "displacement", "drained", "seepage", "inflow")
+
+
+def balanced(seed: int, **given) -> Scene:
+    """Return a scene whose loads can be counted from its description: no pressures, springs, compressible grains."""
+    scene = drawn(seed, **given)
+    laws = [
+        (law, constants | {"biot": 1.0} if "biot" in constants else constants) for law, constants in scene.materials
+    ]
+    conditions = tuple(c for c in scene.conditions if c.kind in COUNTED)
+    stage = scene.stage if scene.stage and scene.stage.kind in ("load", "free", "reset") else None
+    scene = scene.with_(conditions=conditions, materials=tuple(laws), stiffness=0.0, stage=stage, rtol=None)
+    if scene.fluid is not None:  # what leaves in a step is then what the last outflow says
+        scene = scene.with_(method="backward-euler")
+    return scene
+
+
+def held_by_conditions(seed: int, **given) -> Scene:
+    """Return such a scene that no wall touches: its base is held by a given displacement, and nothing else."""
+    scene, draw = balanced(seed, **given), Draw([seed, 3])
+    bodies = []
+    for block in scene.bodies:
+        low, high = np.array(block.lower), np.array(block.upper)
+        for axis in range(scene.axisymmetric, scene.dim - 1):
+            low[axis] = max(low[axis], 0.7 * scene.h[axis])
+            high[axis] = min(high[axis], scene.size[axis] - 0.8 * scene.h[axis])
+        if scene.axisymmetric:
+            high[0] = min(high[0], scene.size[0] - 0.8 * scene.h[0])
+        raised = draw.between(0.3, 0.7) if block is scene.bodies[0] else 0.0
+        low[-1] += raised * (high[-1] - low[-1])
+        bodies.append(Block(**vars(block) | {"lower": tuple(low), "upper": tuple(high)}))
+    base = Condition("displacement", "bottom", (0.0,) * scene.dim, 0.0, "")
+    conditions = [c for c in scene.conditions if c.side != "bottom"]  # whose region is the floor's
+    scene = scene.with_(bodies=tuple(bodies), walls={}, conditions=(*conditions, base), initial=None, level=None)
+    return scene.with_(stage=scene.stage if scene.stage and scene.stage.kind == "load" else None)
+
+
+def area(scene: Scene, condition: Condition) -> float:
+    """Return the area of what a condition acts on, as seeded, on the sides of boxes that are free."""
+    axis, end = SIDES[scene.dim][condition.side]
+    total = 0.0
+    for number, block in enumerate(scene.bodies):
+        if axis == scene.dim - 1 and number != end * (len(scene.bodies) - 1):
+            continue  # another one lies on it
+        low, high = np.array(block.lower, dtype=float), np.array(block.upper, dtype=float)
+        low[axis] = high[axis] = (low, high)[end][axis]
+        if condition.region is not None:
+            low, high = np.maximum(low, condition.region[0]), np.minimum(high, condition.region[1])
+        total += _size(scene, block, low, high, axis)
+    return total
+
+
+def _size(scene: Scene, block: Block, low: NDArray, high: NDArray, axis: int) -> float:
+    """Return the area of a rectangle across an axis after the map that makes blocks narrower above."""
+    if (high < low).any():
+        return 0.0
+    left, top = block.lower[0], scene.bodies[-1].upper[-1]
+
+    def image(x):
+        y = np.array(x, dtype=float)
+        y[0] -= block.slant * (y[0] - left) * y[-1] / top
+        return y
+
+    a, b = image(low), image(high)
+    if scene.dim == 2:
+        length = float(np.linalg.norm(b - a))
+        return length * (np.pi * (a[0] + b[0]) if scene.axisymmetric else 1.0)
+    if axis == 0:  # it leans
+        return float(np.linalg.norm((b - a)[[0, 2]]) * (b - a)[1])
+    others = [k for k in range(3) if k != axis]
+    size = np.abs(b - a)[others].prod()
+    if axis == 1:  # a trapezium
+        upper, lower = (image([x, low[1], z])[0] for x, z in ((high[0], high[2]), (high[0], low[2])))
+        size = ((upper - a[0]) + (lower - a[0])) / 2 * (high[2] - low[2])
+    return float(size)
+
+
+@dataclass
+class Ledger:
+    """What is counted after each step of a scene, see `counted`.
+
+    off : largest resultant of all forces, over the largest of them; leaked: fluid that appears or is lost, over what
+    changes places; said: what the worst one is made of.
+    """
+
+    off: float = 0.0
+    leaked: float = 0.0
+    said: str = ""
+    _start: tuple | None = field(default=None, repr=False)
+    _moved: float = 0.0
+    _out: float = 0.0
+    _before: NDArray[np.float64] | None = field(default=None, repr=False)
+
+    def __call__(self, built: Built) -> None:
+        simulation = built.simulation
+        if self._start is None:
+            self._start = (_fluid(built), _pores(built), simulation.t) if built.scene.fluid is not None else (0, 0, 0)
+            self._before = _owed(built)
+            return
+        self._count_forces(built)
+        if built.scene.fluid is not None:
+            self._count_fluid(built)
+        self._before = _owed(built)
+
+    def _count_forces(self, built: Built) -> None:
+        scene, s = built.scene, built.simulation
+        d, ramp = scene.dim, lambda c: min(1.0, s.t / c.ramp) if c.ramp else 1.0
+        parts, load = {}, built.loads["factor"]
+        for i, c in enumerate(scene.conditions):
+            if c.kind == "traction":
+                parts[f"traction {i}"] = load * ramp(c) * area(scene, c) * np.array(c.value)
+            if c.kind == "plate":
+                down = np.zeros(d)
+                down[-1] = -1.0
+                parts[f"plate {i}"] = load * ramp(c) * c.value[0] * down
+        down = np.zeros(d)
+        down[-1] = -scene.gravity
+        parts["weight"] = _mass(built, self._before) * down
+        parts["reactions"] = s.reactions.sum(axis=0)
+        parts["tools"] = s.tool_forces[: len(scene.tools), :d].sum(axis=0)
+        parts["walls"] = sum(s.wall_reactions.values())
+        total = np.abs(sum(parts.values())[int(scene.axisymmetric) :]).max()
+        # what nothing but itself presses on has a stress of its own
+        stress = max(np.abs(s.effective_stress()).max(), NOTHING * softest(scene)) * min(scene.h) ** (d - 1)
+        most = max(stress, *(np.abs(v).max() for v in parts.values()))
+        if total > self.off * most:
+            self.off = total / most
+            self.said = f"t = {s.t:.3g}: " + ", ".join(
+                f"{k} {np.array2string(v, precision=9)}" for k, v in parts.items()
+            )
+
+    def _count_fluid(self, built: Built) -> None:
+        scene, s = built.scene, built.simulation
+        fluid, pores, t = self._start
+        dt, outflows = s.t - t, np.nan_to_num(s.outflows)
+        volume = pores.sum() + (s.points.volume0 * (1 - _of_points(built, "porosity"))).sum()  # when the step began
+        self._out += dt * (float(outflows.sum()) - scene.rate * volume)
+        now = _pores(built)
+        self._moved += float(np.abs(now - pores).sum()) + dt * (float(np.abs(outflows).sum()) + scene.rate * volume)
+        self._start = (fluid, now, s.t)
+        off = abs(_fluid(built) - fluid + self._out)
+        if self._moved:
+            self.leaked = max(self.leaked, off / self._moved)
+
+
+def _of_points(built: Built, name: str) -> NDArray[np.float64]:
+    """Return a constant of the material of each point."""
+    s = built.simulation
+    return np.array([getattr(law, name) for law in built.laws], dtype=float)[s.points.material]
+
+
+def _pores(built: Built) -> NDArray[np.float64]:
+    """Return the volume of the pores of each point (n,)."""
+    points = built.simulation.points
+    return points.volume0 * (points.J - (1 - _of_points(built, "porosity")))
+
+
+def _fluid(built: Built) -> float:
+    """Return the mass of all fluid over its density at no pressure, with what is owed to the points, m^d.
+
+    Pressures are those of the pieces that points take from cell to cell, or have in the cells where they stay.
+    """
+    s, bulk = built.simulation, built.scene.fluid
+    points, density = s.points, 1.0
+    if np.isfinite(bulk):
+        pieces, stay = s.state.transported, s.state.stay
+        ids, pressure = (pieces.id, pieces.pressure) if pieces is not None else (stay.id, stay.pressure)
+        fraction = pieces.fraction if pieces is not None else s.scene.on_grid(stay.points).cut.pieces.fraction
+        at = np.searchsorted(points.id, ids)
+        density = np.bincount(at, fraction * np.exp(pressure / bulk), minlength=len(points))
+    return float((_pores(built) * density - points.volume0 * points.data.get("owed", 0.0)).sum())
+
+
+def _mass(built: Built, taken: NDArray[np.float64]) -> float:
+    """Return the mass of skeleton and fluid, kg; that of the fluid at no pressure, in pores as the balances see them.
+
+    taken: what points owed and was due when the step began (2, n).  The volumes of their domains differ by what of it
+    has changed.
+    """
+    points = built.simulation.points
+    grains = points.volume0 * (1 - _of_points(built, "porosity")) * _of_points(built, "grain_density")
+    if built.scene.fluid is None:
+        return float(grains.sum())
+    seen = _pores(built) - points.volume0 * (points.data["owed"] - taken[0] + taken[1])
+    return float(grains.sum() + WATER * seen.sum())
+
+
+def _owed(built: Built) -> NDArray[np.float64]:
+    """Return what is owed to the points, and due (2, n), over their volumes at rest."""
+    data = built.simulation.points.data
+    return np.stack([data["owed"], data["due"]]) if "owed" in data else np.zeros((2, 1))

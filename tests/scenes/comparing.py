@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: MIT
+"""By how much two runs of a scene differ, and what a scene makes of a disturbance."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from mpm_dolfinx.problems.cell_contact import STIFF
+from mpm_dolfinx.problems.conditions import HOLD
+from scenes.description import Scene
+from scenes.frames import Frame
+from scenes.running import Shown
+
+SAME = 1e-5  # of a cell: places of points at rest that are one
+LEAST = 1e-4  # cells: what moves less does not move
+NOTHING = 1e-8  # of the shear modulus: stresses below which there are none
+
+
+def differences(scene: Scene, one: Sequence[Shown], other: Sequence[Shown]) -> dict[str, float]:
+    """Return the largest difference of each field over the largest value that it has in the scene."""
+    out: dict[str, float] = {}
+    scales = _scales(scene, one)
+    for a, b in zip(one, other, strict=True):
+        if a.place.shape != b.place.shape:
+            return {"points": np.inf}
+        distance, at = cKDTree(b.place).query(a.place)
+        if distance.max() > SAME * min(scene.h) or len(np.unique(at)) < len(at):
+            return {"points": np.inf}
+        for name, values in a.fields.items():
+            others = b.fields[name][at] if len(values) == len(at) and name in OF_POINTS else b.fields[name]
+            if values.shape != others.shape:
+                return {name: np.inf}
+            off = np.abs(np.nan_to_num(values, nan=-1.0) - np.nan_to_num(others, nan=-1.0)).max(initial=0.0)
+            out[name] = max(out.get(name, 0.0), off / scales[name])
+    return out
+
+
+OF_POINTS = ("displacement", "stress", "volume", "pressure")
+
+
+def softest(scene: Scene) -> float:
+    """Return the least shear modulus, Pa."""
+    return min(law["shear"] for _, law in scene.materials)
+
+
+def _seeps(scene: Scene) -> float:
+    """Return what flows by an area under gravity alone, m/s."""
+    return max(law.get("conductivity", 0.0) for _, law in scene.materials) if scene.gravity else 0.0
+
+
+def _scales(scene: Scene, run: Sequence[Shown]) -> dict[str, float]:
+    """Return the largest value of each field; of those that are nothing a small part of what there is."""
+
+    def most(name: str) -> float:
+        return max(float(np.nanmax(np.abs(s.fields[name]), initial=0.0)) for s in run if name in s.fields)
+
+    h, d = min(scene.h), scene.dim if not scene.axisymmetric else 3
+    found = {name: most(name) for name in run[0].fields}
+    stress = max(found["stress"], found.get("pressure", 0.0), NOTHING * softest(scene))
+    moved = max(found["displacement"], LEAST * h)
+    found |= {"displacement": moved, "stress": stress, "pressure": stress}
+    found["volume"] = max(found["volume"], LEAST)
+    for name in ("reactions", "tools"):
+        found[name] = max(found[name], 1e-3 * stress * h ** (d - 1))
+    found["outflows"] = max(found["outflows"], 1e-3 * (moved / scene.end + _seeps(scene)) * h ** (d - 1))
+    found["travel"] = max(found["travel"], LEAST * h)
+    return found
+
+
+def resolved(scene: Scene, frame: Frame, run: Sequence[Shown]) -> dict[str, float]:
+    """Return what the rounding of coordinates in a frame is in each field, over the largest value of the field.
+
+    A place is known to the last digit of a coordinate, a strain to that over a cell, a stress to the stiffest modulus
+    times that; what holds sides and tools is so many times stiffer still.
+    """
+    scales, h, d = _scales(scene, run), min(scene.h), scene.dim if not scene.axisymmetric else 3
+    most = np.abs(frame.place([np.zeros(scene.dim), scene.size], scene)).max() / frame.length
+    place = np.finfo(float).eps * most
+    stress = place / h * max(law.get("bulk", 1e7) + 4 / 3 * law["shear"] for _, law in scene.materials)
+    out = {name: place / scales["displacement"] for name in scales}
+    out |= {"volume": place / h / scales["volume"]}
+    out["outflows"] += place / h * _seeps(scene) * h ** (d - 1) / scales["outflows"]
+    out |= {name: stress / scales[name] for name in ("stress", "pressure")}
+    forces = {"reactions": HOLD, "tools": STIFF}
+    return out | {name: k * stress * h ** (d - 1) / scales[name] for name, k in forces.items()}
