@@ -95,16 +95,18 @@ class Sides:
                 beyond = limit + 2 * sign * near
                 goes_on = np.isfinite(limit) and along(side.X[own], axis, beyond).any()
                 if goes_on and not any(along(boxes, axis, beyond).any() for boxes in neighbours):
-                    box[end, axis] -= sign * self._beyond_nodes(side, own, axis, limit, sign)
+                    at_end = own & along(side.X, axis, limit) & (np.ptp(side.X, axis=1)[:, axis] > 0)
+                    box[end, axis] -= sign * self._beyond_nodes(side, at_end, axis, limit, sign)
         box[:, box[0] > box[1]] = faces.region[:, box[0] > box[1]]
         shorter = self._of(condition.side, box)
         return shorter if len(shorter) else faces  # less than a cell wide
 
-    def _beyond_nodes(self, side: Surface, own: NDArray[np.bool_], axis: int, x: float, sign: int) -> float:
-        """Return how far, m, a region that ends at x along an axis of reference positions is not held, see `held`."""
-        faces = np.flatnonzero(
-            own & (side.X[:, 0, axis] <= x) & (side.X[:, 1, axis] >= x) & (np.ptp(side.X, axis=1)[:, axis] > 0)
-        )
+    def _beyond_nodes(self, side: Surface, at_end: NDArray[np.bool_], axis: int, x: float, sign: int) -> float:
+        """Return how far, m, a region that ends at x along an axis of reference positions is not held, see `held`.
+
+        at_end (m,): which faces of the side reach over x.
+        """
+        faces = np.flatnonzero(at_end)
         X, places = side.corners[faces][:, :, axis], side.places()[faces]
         way, moved = X - X.mean(axis=1, keepdims=True), places - places.mean(axis=1, keepdims=True)
         slope = np.einsum("mk,mkd->d", way, moved) / np.square(way).sum() / self.grid.h  # of a map, cells over metres
