@@ -138,7 +138,7 @@ class Tools:
             before = self._pose(tool, start)
             n = everywhere(grid, lambda tool=tool, pose=pose: tool.solid(grid.h.min()).normal(pose.own(x)) @ pose.R.T)
             faces = free & (np.einsum("md,md->m", area, n) < -FACING * size)
-            at = np.flatnonzero(faces)[~self._edge(tool, pose, x, area / size[:, None], faces)]
+            at = np.flatnonzero(faces)[~self._edge(tool, pose, x, area / np.maximum(size, LEAST)[:, None], faces)]
             old = points.data[shear_name("tool", number)][patches.at[at]] if tool.grips else np.zeros((len(at), d))
             vectors = [x[at], pose.put(before.own(x[at])), old @ (pose.R @ before.R.T).T]
             pressure = points.data[pressure_name("tool", number)][patches.at[at]]
