@@ -168,7 +168,7 @@ def push(
     grid = mpm.Grid(**size, cells=cells_of, axisymmetric=circular)
     body = mpm.box(grid, [0, -rows * h], [columns * h, 0])
     end, edge = (depth * WIDTH**2 / (CV * rate) if rate else 1.0), WIDTH / 2
-    under, beside = ((0, -np.inf), (edge, np.inf)), ((edge, -np.inf), (np.inf, np.inf))
+    under, beside = ((0, -np.inf), (edge, np.inf)), ((edge - h / 2, -np.inf), (np.inf, np.inf))  # from its last node on
     footing = mpm.Displacement("top", lambda t, X: (0, -depth * WIDTH * min(1, t / end)), region=under)
     water = {"fluid": WATER, "method": method, "drained": [mpm.Drained("top", region=beside)]} if rate else {}
     fixed = {"left": "x", "right": "x", "bottom": "xy"}
