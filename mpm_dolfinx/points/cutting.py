@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from mpm_dolfinx.points.grid import TURN, Grid, sum_by
 
 SLIVER = 1e-12  # of the domain: smaller pieces are dropped; less than one `Grid.snap` thin, whose face is open
-CHUNK = 2**15  # corners of domains that are cut at a time, in the processor's cache
+CHUNK = 2**15  # simplices of domains that are cut at a time, in the processor's cache
 TANGLED = 0.2  # of its volume: a domain whose corners span less is re-derived from F
 
 
@@ -151,6 +151,10 @@ def centroids(corners: NDArray[np.float64]) -> NDArray[np.float64]:
 
     As in `cut`, simplices that are turned inside out count as positive.
     """
+    return np.concatenate([_centroids(corners[part]) for part in _chunks(len(corners), corners.shape[2])])
+
+
+def _centroids(corners: NDArray[np.float64]) -> NDArray[np.float64]:
     v = vertices(np.ascontiguousarray(corners.transpose(1, 2, 0)))
     volume, middle = np.abs(simplex_volumes(v)), v[-1]
     whole, moment = volume.sum(axis=0), np.zeros_like(middle)
@@ -173,6 +177,12 @@ def parallelepipeds(
     return x[:, None] + np.einsum("nab,nkb->nka", F, offset)
 
 
+def _chunks(count: int, dim: int) -> list[slice]:
+    """Return so many domains in parts, one after the other, of which all simplices fit the processor's cache."""
+    size = CHUNK // len(simplices(dim))
+    return [slice(start, start + size) for start in range(0, max(1, count), size)]
+
+
 def cut(grid: Grid, corners: NDArray[np.float64]) -> Pieces:
     """Cut the domains by the grid.
 
@@ -185,11 +195,10 @@ def cut(grid: Grid, corners: NDArray[np.float64]) -> Pieces:
     -------
     The pieces, slivers below 1e-12 of their domain left out; fractions sum to one for every domain.
     """
-    size = CHUNK // 2**grid.dim
-    starts = range(0, max(1, len(corners)), size)
-    parts = [_cut(grid, corners[start : start + size]) for start in starts]
-    for start, part in zip(starts, parts, strict=True):
-        part.point += start
+    chunks = _chunks(len(corners), grid.dim)
+    parts = [_cut(grid, corners[chunk]) for chunk in chunks]
+    for chunk, part in zip(chunks, parts, strict=True):
+        part.point += chunk.start
     columns = zip(*([getattr(part, f.name) for f in fields(Pieces)] for part in parts), strict=True)
     return Pieces(*map(np.concatenate, columns))
 
