@@ -104,10 +104,12 @@ class _Around:
         one = np.ones((len(filled), grid.dim))
         kappa = mobility.mean[:, None] * (one if mobility.share is None else mobility.share)
         shift = 0 * one if mobility.shift is None else mobility.shift
-        share = contents.open[filled].reshape(len(filled), -1)
+        share = contents.open[filled].reshape(len(filled), 2 * grid.dim)
         rows = np.column_stack([one[:, 0], p, contents.centroid[filled], kappa, shift, held, share])
         local = np.where(number >= 0, grid.local(np.maximum(number, 0)), -1)
-        local[(local >= grid.num_owned) | ~on_grid.active[local]] = -1
+        local[local >= grid.num_owned] = -1
+        own = local >= 0  # a process may have no cell
+        local[own] = np.where(on_grid.active[local[own]], local[own], -1)
         out, (probe, place) = np.zeros((*local.shape, rows.shape[1])), np.nonzero(local >= 0)
         out[probe, place] = rows[contents.slot(local[probe, place])]
         return local, over_all(grid.comm, out)
