@@ -27,10 +27,10 @@ import poroelastic_beam as beam
 from numpy.typing import NDArray
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx import step
-from mpm_dolfinx.problems.balances import balances
-from mpm_dolfinx.problems.storage import FILTER, StorageProblem
+from mpm_dolfinx.flow.storage import FILTER, StorageProblem
 from mpm_dolfinx.solve.schur import LinearSolvers
+from mpm_dolfinx.stepping import step
+from mpm_dolfinx.stepping.balances import balances
 
 K_DT = np.array([-23, -16, -12, -10, -9, -8, -7, -6, -5, -4, -3, -2, 0, 3, 7, 11])  # log10 of k dt in m
 BULK = (1e4, 1e6, 2.2e9, np.inf)  # of the water, Pa

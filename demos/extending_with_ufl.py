@@ -4,8 +4,8 @@
 A column of 1 m between smooth walls stands on a floor (plane strain).  Each time something is added: a stored
 energy, fibres whose direction is stored on the points, a conductivity that depends on the deformation (twice), an
 elastic foundation, a source of fluid, a law with a state of its own, plastic flow, an equation that a stress solves, a
-return in numpy.  What a function takes is read from the names of its arguments; `constitutive/skeleton.py` and
-`constitutive/user_functions.py` of the package list them.
+return in numpy.  What a function takes is read from the names of its arguments; `materials/skeleton.py` and
+`materials/user_functions.py` of the package list them.
 
 Error: the largest difference from the exact solution, over its largest value.  With 20 cells: 8e-4 and 6e-4 for
 energy and fibres, whose layers are stretched in the one step that they take; 3e-3 for both conductivities, 6e-4 for

@@ -46,7 +46,7 @@ from scipy.optimize import nnls
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.parallel.exchange import traffic
-from mpm_dolfinx.timeloop import PARTS
+from mpm_dolfinx.simulation.timeloop import PARTS
 
 SIZES = {
     "quick": {2: (500, 2000), 3: (200, 1000)},

@@ -17,7 +17,7 @@ import ufl
 from dolfinx import fem
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx import _compat
+from mpm_dolfinx.base import _compat
 from mpm_dolfinx.forms.point_forms import FormPoints, PointForm
 from mpm_dolfinx.forms.unknowns import Unknowns, matrix
 from mpm_dolfinx.points.cutting import cut, volumes

@@ -7,19 +7,31 @@ A scene is a `Simulation` of a `Grid`, bodies (`box`, `shape`, `mapped`, `from_m
 `Drained`, `Inflow`, `water`), and rigid tools (`Tool` of a `HalfSpace`, `Ball`, `Convex`, `Cone`).  Its `run` gives a
 `Result` with what `probes` record, and feeds a `Writer`, whose files `one_file` joins, and a `Checkpoint`, from which
 `resume` goes on; `stage` changes the scene between two runs, and `factor_of_safety` weakens it until it slides.  Terms
-and sources in UFL: see `mpm_dolfinx.constitutive.user_functions`.
+and sources in UFL: see `mpm_dolfinx.materials.user_functions`.
 
 SI units throughout, or any that are consistent (`Fluid`).  Stress is positive in tension, pore pressure in compression;
 2D is plane strain, and forces are those of a slice of 1 m, or axisymmetric (`Grid`), and forces are those all around.
 """
 
-from mpm_dolfinx import _environment  # noqa: F401 - first: it says what is missing
-from mpm_dolfinx.constitutive.cam_clay import ModifiedCamClay
-from mpm_dolfinx.constitutive.drucker_prager import DruckerPrager
-from mpm_dolfinx.constitutive.element_test import ElementTest, element_test
-from mpm_dolfinx.constitutive.initial_stress import K0, hydrostatic
-from mpm_dolfinx.constitutive.mohr_coulomb import MohrCoulomb
-from mpm_dolfinx.constitutive.skeleton import (
+from mpm_dolfinx.base import _environment  # noqa: F401 - first: it says what is missing
+from mpm_dolfinx.base.errors import LeftGrid, NotConverged
+from mpm_dolfinx.bodies.bodies import mapped
+from mpm_dolfinx.bodies.boxes import box, shape
+from mpm_dolfinx.bodies.mesh_files import from_mesh
+from mpm_dolfinx.bodies.polygon import polygon
+from mpm_dolfinx.conditions.conditions import Displacement, Drained, Inflow, OnSide, Pressure, RigidPlate, Traction
+from mpm_dolfinx.conditions.water import water
+from mpm_dolfinx.contact.groups import Contact
+from mpm_dolfinx.contact.tools import Ball, Cone, Convex, HalfSpace, Tool
+from mpm_dolfinx.grid.grid import Grid
+from mpm_dolfinx.io.checkpoint import Checkpoint, resume
+from mpm_dolfinx.io.one_file import one_file
+from mpm_dolfinx.io.writer import Writer
+from mpm_dolfinx.materials.cam_clay import ModifiedCamClay
+from mpm_dolfinx.materials.drucker_prager import DruckerPrager
+from mpm_dolfinx.materials.initial_stress import K0, hydrostatic
+from mpm_dolfinx.materials.mohr_coulomb import MohrCoulomb
+from mpm_dolfinx.materials.skeleton import (
     Field,
     Fluid,
     Hencky,
@@ -29,26 +41,14 @@ from mpm_dolfinx.constitutive.skeleton import (
     kozeny_carman,
     unsaturated,
 )
-from mpm_dolfinx.constitutive.softening import SofteningDruckerPrager
-from mpm_dolfinx.errors import GaveUp, LeftGrid, NotConverged
-from mpm_dolfinx.io.checkpoint import Checkpoint, resume
-from mpm_dolfinx.io.one_file import one_file
-from mpm_dolfinx.io.writer import Writer
-from mpm_dolfinx.points.bodies import mapped
-from mpm_dolfinx.points.boxes import box, shape
-from mpm_dolfinx.points.grid import Grid
-from mpm_dolfinx.points.mesh_files import from_mesh
-from mpm_dolfinx.points.polygon import polygon
-from mpm_dolfinx.points.probes import probes
-from mpm_dolfinx.problems.conditions import Displacement, Drained, Inflow, OnSide, Pressure, RigidPlate, Traction
-from mpm_dolfinx.problems.contacts import Contact
-from mpm_dolfinx.problems.tools import Ball, Cone, Convex, HalfSpace, Tool
-from mpm_dolfinx.problems.water import water
-from mpm_dolfinx.result import Result
-from mpm_dolfinx.simulation import Simulation
+from mpm_dolfinx.materials.softening import SofteningDruckerPrager
+from mpm_dolfinx.probing.probes import probes
+from mpm_dolfinx.simulation.simulation import Simulation
+from mpm_dolfinx.simulation.strength_reduction import Safety, factor_of_safety
 from mpm_dolfinx.solve.scheme import COUPLINGS
-from mpm_dolfinx.state import State
-from mpm_dolfinx.strength_reduction import Safety, factor_of_safety
+from mpm_dolfinx.stepping.result import GaveUp, Result
+from mpm_dolfinx.stepping.state import State
+from mpm_dolfinx.verification.element_test import ElementTest, element_test
 
 __version__ = "0.1.0"
 __all__ = [

@@ -7,9 +7,9 @@ import numpy as np
 import ufl
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.constitutive.evaluate import by_scene
-from mpm_dolfinx.constitutive.local_unknowns import LocalUnknowns
 from mpm_dolfinx.forms.point_forms import FormPoints, PointExpression
+from mpm_dolfinx.materials.evaluate import by_scene
+from mpm_dolfinx.materials.local_unknowns import LocalUnknowns
 
 
 class LawAtPoints:

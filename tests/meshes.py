@@ -6,8 +6,8 @@ from itertools import permutations
 import meshio
 import numpy as np
 
+from mpm_dolfinx.grid.grid import SIDES
 from mpm_dolfinx.points.cutting import FACES, corner_bits
-from mpm_dolfinx.points.grid import SIDES
 
 IN_ORDER = {4: [0, 1, 3, 2], 8: [0, 1, 3, 2, 4, 5, 7, 6]}
 

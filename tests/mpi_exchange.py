@@ -8,8 +8,8 @@ from mpi4py import MPI
 import numpy as np
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx.bodies.bodies import material_points
 from mpm_dolfinx.parallel.exchange import Exchange, traffic
-from mpm_dolfinx.points.bodies import material_points
 
 comm = MPI.COMM_WORLD
 for n in (0, 1, 500):

@@ -14,9 +14,9 @@ import poroelastic_beam as demo
 import pytest
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.points.bodies import material_points
+from mpm_dolfinx.bodies.bodies import material_points
+from mpm_dolfinx.bodies.faces import face_vectors, surface
 from mpm_dolfinx.points.cutting import volumes
-from mpm_dolfinx.points.faces import face_vectors, surface
 from mpm_dolfinx.solve import linear as solvers
 
 SOIL = mpm.Hencky(bulk=1e7 / 3, shear=5e6, conductivity=1e-6)

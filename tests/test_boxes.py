@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.points.bodies import points_in_cells
+from mpm_dolfinx.bodies.bodies import points_in_cells
+from mpm_dolfinx.domains.lattice import Lattice
 from mpm_dolfinx.points.cutting import FACES
-from mpm_dolfinx.points.lattice import Lattice
 
 
 def some(dim: int) -> mpm.Grid:

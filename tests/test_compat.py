@@ -9,7 +9,8 @@ import pytest
 import ufl
 from dolfinx import fem
 
-from mpm_dolfinx import Grid, _compat
+from mpm_dolfinx import Grid
+from mpm_dolfinx.base import _compat
 from mpm_dolfinx.forms.point_forms import FormPoints, PointForm
 
 GRID = Grid([2.0, 1.0], [4, 3])

@@ -9,8 +9,8 @@ import pytest
 from helpers import SOFT, beam, limit, set_up
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.problems.storage import FILTER
-from mpm_dolfinx.result import Report
+from mpm_dolfinx.base.report import Report
+from mpm_dolfinx.flow.storage import FILTER
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +53,7 @@ def test_a_step_that_has_been_cut_grows_again_once_it_is_easy(newton, steps, mon
         taken.append(dt)
         return replace(state, t=state.t + dt), Report(newton=newton, history=[(0.0, 0.0)], easy=3 * newton <= 25)
 
-    monkeypatch.setattr("mpm_dolfinx.simulation.step", step)
+    monkeypatch.setattr("mpm_dolfinx.simulation.simulation.step", step)
     result = s.run(3.0, 1.0, progress=False)
     assert result.cuts == 1 and taken == steps
 

@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from meshes import box_mesh
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.points.bending import followed
+from mpm_dolfinx.domains.bending import followed
+from mpm_dolfinx.domains.domain_gradient import gradient
+from mpm_dolfinx.domains.lattice import filtered, lattices
 from mpm_dolfinx.points.cutting import corner_bits, volumes
-from mpm_dolfinx.points.domain_gradient import gradient
-from mpm_dolfinx.points.lattice import filtered, lattices
 
 MATRICES = st.lists(st.floats(-0.3, 0.3), min_size=9, max_size=9)
 
@@ -311,6 +311,6 @@ def test_a_turn_is_found_where_walls_hold_a_part_of_the_body():
         return s
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("mpm_dolfinx.problems.momentum.rigid_motion", lambda *_: None)
+        patch.setattr("mpm_dolfinx.mechanics.momentum.rigid_motion", lambda *_: None)
         other = run()
     assert run().points.x == pytest.approx(other.points.x, abs=1e-8)

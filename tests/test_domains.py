@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from mpm_dolfinx import Grid, box
+from mpm_dolfinx.grid.grid import SNAP
 from mpm_dolfinx.points import cutting
 from mpm_dolfinx.points.cutting import corner_bits, cut
-from mpm_dolfinx.points.grid import SNAP
 
 GRIDS = {2: Grid([1.0, 1.2], [5, 6]), 3: Grid([1.0, 1.2, 0.8], [4, 4, 4])}
 

@@ -9,7 +9,7 @@ import ufl
 from scipy.ndimage import label
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.problems.parts import parts_of_cells
+from mpm_dolfinx.points.parts import parts_of_cells
 
 AWAY = (np.array([1.9, 0.0]), np.array([2.4, 2.0]))  # m, around the far body
 

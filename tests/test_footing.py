@@ -9,9 +9,9 @@ import pytest
 from helpers import SOFT
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.advance import untangled
+from mpm_dolfinx.domains.domain_gradient import gradient
 from mpm_dolfinx.points.cutting import corner_bits, tangled, volumes
-from mpm_dolfinx.points.domain_gradient import gradient
+from mpm_dolfinx.stepping.advance import untangled
 
 
 @pytest.mark.parametrize("dim", [2, 3])

@@ -6,7 +6,8 @@ import pytest
 import ufl
 from dolfinx import fem
 
-from mpm_dolfinx import Grid, Hencky, NeoHookean, _compat
+from mpm_dolfinx import Grid, Hencky, NeoHookean
+from mpm_dolfinx.base import _compat
 from mpm_dolfinx.forms.cell_matrices import (
     Beside,
     ElementForces,

@@ -4,7 +4,8 @@
 import numpy as np
 import pytest
 
-from mpm_dolfinx import Grid, _compat
+from mpm_dolfinx import Grid
+from mpm_dolfinx.base import _compat
 
 GRIDS = [Grid([1.5, 1.0], [6, 5], lower=[0.5, -1.0]), Grid([1.0, 2.0, 1.5], [3, 4, 2])]
 

@@ -8,7 +8,7 @@ import pytest
 import ufl
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.points.grid import SIDES
+from mpm_dolfinx.grid.grid import SIDES
 
 H, TINY = 0.1, 1e-3  # m, Pa: so little that nothing moves
 SAND = mpm.Hencky(bulk=1e7 / 3, shear=5e6, porosity=0.4, conductivity=1e-4)

@@ -11,11 +11,11 @@ from helpers import refused_in_one_line
 from meshes import box_mesh
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.points.abaqus_files import _kind
-from mpm_dolfinx.points.contact import face_vectors
+from mpm_dolfinx.bodies.abaqus_files import _kind
+from mpm_dolfinx.bodies.faces import surface
+from mpm_dolfinx.bodies.mesh_cells import AS_LATTICE, edges
+from mpm_dolfinx.bodies.touching import face_vectors
 from mpm_dolfinx.points.cutting import volumes
-from mpm_dolfinx.points.faces import surface
-from mpm_dolfinx.points.mesh_cells import AS_LATTICE, edges
 
 GRID = mpm.Grid([4, 4], [8, 8])
 SPACE = mpm.Grid([3, 3, 3], [3, 3, 3])

@@ -17,9 +17,9 @@ from scipy.integrate import solve_bvp
 from scipy.spatial import Delaunay
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx import _compat
+from mpm_dolfinx.base import _compat
+from mpm_dolfinx.bodies.faces import surface
 from mpm_dolfinx.points.cutting import volumes
-from mpm_dolfinx.points.faces import surface
 
 GRID = mpm.Grid([2, 1.5], [10, 8])
 SPACE = mpm.Grid([2, 2, 2], [4, 4, 4])

@@ -11,7 +11,7 @@ from laws import LawAtPoints, turned
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx import element_test
-from mpm_dolfinx.constitutive.mohr_coulomb import _returned
+from mpm_dolfinx.materials.mohr_coulomb import _returned
 
 SAND = mpm.MohrCoulomb(bulk=2e7, shear=1e7, friction=30.0, dilation=10.0, cohesion=2e5)
 BRITTLE = replace(SAND, tension=1e5)

@@ -6,7 +6,7 @@ import pytest
 from helpers import SOFT, beam, column, set_up
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.problems.ghost_penalty import GHOST
+from mpm_dolfinx.mechanics.ghost_penalty import GHOST
 
 
 @pytest.mark.parametrize("offset", [0.0, 0.3, 0.77])
@@ -93,7 +93,7 @@ def test_a_large_load_is_held_for_hundreds_of_steps_without_drift():
 def test_the_ghost_penalty_hardly_changes_the_tip(monkeypatch):
     tips = []
     for strength in (GHOST / 10, GHOST):
-        monkeypatch.setattr("mpm_dolfinx.problems.ghost_penalty.GHOST", strength)
+        monkeypatch.setattr("mpm_dolfinx.mechanics.ghost_penalty.GHOST", strength)
         s, probe = beam(fluid=False, ramp=1.0)
         tips.append(s.run(1.0, 0.1, probes=probe).displacement[-1][0, 1])
     assert tips[0] != tips[1] and np.ptp(tips) < 2e-4 * abs(tips[0])

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import slump
 
-from mpm_dolfinx.parallel.partition import owners
+from mpm_dolfinx.grid.partition import owners
 
 
 def mpirun(processes: int, script: str, *arguments: str) -> None:

@@ -90,7 +90,7 @@ def test_names_in_backticks_are_there():
 
 
 def test_a_stale_name_is_found():
-    file = ROOT / "scene.py"
+    file = ROOT / "stepping" / "scene.py"
     for name in (
         "initial_state.by_body",
         "materials.Skeleton",

@@ -24,8 +24,8 @@ from test_restart import block, cut_beam
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.__main__ import main
+from mpm_dolfinx.base.report import Report
 from mpm_dolfinx.points.cutting import volumes
-from mpm_dolfinx.result import Report
 
 
 def with_h5py():

@@ -6,7 +6,7 @@ import pytest
 from helpers import SOFT, beam, column
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.points.pressure_transport import CellPressures, Reconstruction
+from mpm_dolfinx.domains.pressure_transport import CellPressures, Reconstruction
 
 RANDOM = np.random.default_rng(3)
 

@@ -8,7 +8,7 @@ import pytest
 from test_places import irregular
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.probe_fields import probe_stresses
+from mpm_dolfinx.probing.probe_fields import probe_stresses
 
 RANDOM = np.random.default_rng(7)
 STIFF = {"bulk": 1e12, "shear": 1e12}

@@ -13,7 +13,7 @@ from test_bad_input import BODY, GRID, NAN, WATER, law, run, sand, scene, sides,
 from test_mpi import mpirun
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.points.bodies import check_different
+from mpm_dolfinx.bodies.bodies import check_different
 
 UPPER = mpm.box(GRID, [0, 0.5], [0.5, 0.6])  # on BODY
 LOAD = {"tractions": [mpm.Traction("top", -1e3)]}

@@ -7,7 +7,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from mpm_dolfinx.points.faces import limits
+from mpm_dolfinx.bodies.faces import limits
 
 SAME = {
     "tuples": ((0, -1), (2, 0.5)),

@@ -8,10 +8,10 @@ import pytest
 from helpers import beam
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx import step
-from mpm_dolfinx.points.bodies import material_points
+from mpm_dolfinx.bodies.bodies import material_points
+from mpm_dolfinx.domains.pressure_transport import CellPressures, PiecePressures, Reconstruction, transport
 from mpm_dolfinx.points.cutting import cut
-from mpm_dolfinx.points.pressure_transport import CellPressures, PiecePressures, Reconstruction, transport
+from mpm_dolfinx.stepping import step
 
 MOVES = [0.01, 0.3, 2.6]
 

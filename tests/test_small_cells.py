@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.problems.ghost_penalty import GHOST
+from mpm_dolfinx.mechanics.ghost_penalty import GHOST
 
 
 def tip(cells, offset, nu):
@@ -84,7 +84,7 @@ def test_a_vertical_cut_falls_whatever_its_elastic_constants():
 
 
 def limit_load(monkeypatch, nu, strength=1.0, cells=9, steps=40):
-    monkeypatch.setattr("mpm_dolfinx.problems.ghost_penalty.GHOST", strength * GHOST)
+    monkeypatch.setattr("mpm_dolfinx.mechanics.ghost_penalty.GHOST", strength * GHOST)
     shear = 1e4 * footing.COHESION
     soil = mpm.DruckerPrager(
         bulk=2 * shear * (1 + nu) / 3 / (1 - 2 * nu), shear=shear, friction=0, dilation=0, cohesion=footing.COHESION

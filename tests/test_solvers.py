@@ -11,6 +11,7 @@ import pytest
 from helpers import SOFT, pressed
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx.base.report import Report
 from mpm_dolfinx.solve import linear, monolithic, schur
 from mpm_dolfinx.solve.linear import (
     BlockFactors,
@@ -108,7 +109,7 @@ def quarter_pushed(soil: mpm.Skeleton, n: int, step: float) -> mpm.Simulation:
     return mpm.Simulation(grid, [body], [soil], fixed=walls, displacements=[push], drained=[drained], fluid=mpm.Fluid())
 
 
-def pushed(bulk: float) -> list[mpm.result.Report]:
+def pushed(bulk: float) -> list[Report]:
     """Return what two steps of such a cube take."""
     s = quarter_pushed(mpm.Hencky(bulk=bulk, shear=1e6, conductivity=1e-7), 8, 0.01)
     return [s.step(1.0), s.step(1.0)]

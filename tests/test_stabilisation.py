@@ -12,10 +12,10 @@ from dolfinx import fem
 from slump import alternating
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.constitutive.evaluate import MOST
+from mpm_dolfinx.flow.second_differences import second_differences
 from mpm_dolfinx.forms.unknowns import Unknowns
-from mpm_dolfinx.problems.ghost_penalty import GHOST
-from mpm_dolfinx.problems.second_differences import second_differences
+from mpm_dolfinx.materials.evaluate import MOST
+from mpm_dolfinx.mechanics.ghost_penalty import GHOST
 
 SHEAR, LOAD, K = 1e6, 1e2, np.pi  # Pa, Pa, 1/m
 CELLS = (8, 16, 32)
@@ -71,7 +71,7 @@ def layer(cells, damping=1.0, ghost=1.0, filled=0.5):
     walls = {"left": "x", "right": "x", "bottom": "y"}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Soil, "strength", damping)
-        patch.setattr("mpm_dolfinx.problems.ghost_penalty.GHOST", ghost * GHOST)
+        patch.setattr("mpm_dolfinx.mechanics.ghost_penalty.GHOST", ghost * GHOST)
         s = mpm.Simulation(grid, [body], [soil], fluid=mpm.Fluid(bulk=np.inf), fixed=walls, tractions=tractions)
         s.run(1.0, 1.0, progress=False)
     cells_pressure = s.scene.storage.p.x.array[s.grid.local(s.grid.number(s.grid.index(body.centre)))]
@@ -120,7 +120,7 @@ def test_what_the_ghost_penalty_changes_vanishes_faster_than_the_error(strength,
 
 def pushed(monkeypatch, most, law=mpm.DruckerPrager, **strength):
     """Return load and pressures (columns, rows), Pa, under a footing pushed into an undrained layer of flat cells."""
-    monkeypatch.setattr("mpm_dolfinx.constitutive.evaluate.MOST", most)
+    monkeypatch.setattr("mpm_dolfinx.materials.evaluate.MOST", most)
     grid = mpm.Grid(lower=[0, -1], upper=[1.6, 0.2], cells=[24, 6])
     soil = law(bulk=13 / 6 * 1e8, shear=1e8, **strength)
     under, beside = ((0, -1), (7 / 15, 1)), ((7 / 15, -1), (2, 1))

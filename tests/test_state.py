@@ -15,7 +15,7 @@ from interrupting import interrupted
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.io.checkpoint import save
-from mpm_dolfinx.result import Row
+from mpm_dolfinx.stepping.result import Row
 
 SAND = mpm.DruckerPrager(
     bulk=2e7,

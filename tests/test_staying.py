@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx import scene
-from mpm_dolfinx.io.summary import parts
-from mpm_dolfinx.points import cut_domains
+from mpm_dolfinx.domains import cut_domains
+from mpm_dolfinx.stepping import scene
+from mpm_dolfinx.stepping.summary import parts
 
 SOIL = mpm.Hencky(bulk=2e7, shear=1e7, porosity=0.4, conductivity=1e-5)
 WATER = mpm.Fluid(bulk=1e8)
@@ -107,7 +107,7 @@ def test_a_stage_after_a_step_that_failed_begins_with_the_last_good_pressures(lo
         s.run(4, 0.8, progress=False)
         if fails:
             with monkeypatch.context() as patch:
-                patch.setattr("mpm_dolfinx.step.solve_substep", partial(fail, s))
+                patch.setattr("mpm_dolfinx.stepping.step.solve_substep", partial(fail, s))
                 with pytest.raises(mpm.GaveUp):
                     s.run(8, 0.8, progress=False)
         s.stage(tractions=[mpm.Traction("top", (0, -load))])

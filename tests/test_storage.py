@@ -9,7 +9,7 @@ import ufl
 from helpers import SOFT, beam, column, set_up
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.constitutive.skeleton import STANDARD_GRAVITY
+from mpm_dolfinx.materials.skeleton import STANDARD_GRAVITY
 from mpm_dolfinx.points.cutting import corner_bits
 
 

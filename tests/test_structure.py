@@ -25,15 +25,37 @@ def module(path):
     return ".".join(["mpm_dolfinx", *path.relative_to(ROOT).with_suffix("").parts]).removesuffix(".__init__")
 
 
-def test_imports_make_no_circle():
+def arrows():
+    """Return the modules that each module imports."""
     names = {module(path) for path in TREES}
-    arrows = {name: set() for name in names}
+    out = {name: set() for name in names}
     for path, tree in TREES.items():
         for node in ast.walk(tree):
             if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("mpm_dolfinx"):
                 inner = {f"{node.module}.{alias.name}" for alias in node.names} & names
-                arrows[module(path)] |= inner or {node.module}
-    assert tuple(TopologicalSorter(arrows).static_order())
+                out[module(path)] |= inner or {node.module}
+    return out
+
+
+def folder(name):
+    return name.split(".")[1]
+
+
+def test_imports_make_no_circle():
+    assert tuple(TopologicalSorter(arrows()).static_order())
+
+
+def test_folders_import_downwards_only():
+    inner = {name: found for name, found in arrows().items() if (ROOT / name.split(".", 1)[-1].split(".")[0]).is_dir()}
+    between = {folder(name): set() for name in inner}
+    for name, found in inner.items():
+        between[folder(name)] |= {folder(other) for other in found} - {folder(name)}
+    assert len(between) > 15 and tuple(TopologicalSorter(between).static_order())
+
+
+def test_no_folder_has_more_than_fourteen_files():
+    folders = {path.parent for path in TREES}
+    assert {path.name: n for path in folders if (n := len(list(path.glob("*.py")))) > 14} == {}
 
 
 def test_nothing_but_the_state_is_set_outside_of_init():
@@ -50,5 +72,5 @@ def test_no_class_has_more_than_twenty_attributes():
 
 
 def test_the_step_is_a_page():
-    assert len((ROOT / "step.py").read_text().splitlines()) <= 60
-    assert len((ROOT / "simulation.py").read_text().splitlines()) <= 300
+    assert len((ROOT / "stepping" / "step.py").read_text().splitlines()) <= 60
+    assert len((ROOT / "simulation" / "simulation.py").read_text().splitlines()) <= 300

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from strategies import numbers, repeatable
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.points.faces import face_vectors, surface
+from mpm_dolfinx.bodies.faces import face_vectors, surface
 
 SOIL = mpm.Hencky(bulk=1e6, shear=6e5)
 

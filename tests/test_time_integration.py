@@ -10,10 +10,11 @@ import ufl
 from helpers import SOFT, beam, column, rates
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx import simulation
-from mpm_dolfinx.result import Report, Result
-from mpm_dolfinx.step_size import StepSize
-from mpm_dolfinx.time_integration import METHODS
+from mpm_dolfinx.base.report import Report
+from mpm_dolfinx.simulation import simulation
+from mpm_dolfinx.simulation.step_size import StepSize
+from mpm_dolfinx.stepping.result import Result
+from mpm_dolfinx.stepping.time_integration import METHODS
 from mpm_dolfinx.verification.exact import terzaghi_consolidation
 
 DRAINED = {"drained": [mpm.Drained("top")]}
@@ -120,7 +121,7 @@ def test_a_run_takes_a_step_by_backward_euler_before_it_gives_up(monkeypatch, ca
     result = s.run(3.0, 1.0, progress=False)
     assert result.t == [0, 1, 2, 3] and result.cuts > 5 and [dt for dt, count in tried if count == 1] == [1.0]
     assert "a step of 1 s by backward Euler" in caplog.text
-    monkeypatch.setattr("mpm_dolfinx.timeloop.EULER", METHODS["sdirk2"])
+    monkeypatch.setattr("mpm_dolfinx.simulation.timeloop.EULER", METHODS["sdirk2"])
     with pytest.raises(mpm.GaveUp, match=r"gave up at t = 0 s .*no such step"):
         again = loaded(100.0, cells=2, **DRAINED)
         again.run(3.0, 1.0, progress=False)

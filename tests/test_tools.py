@@ -8,8 +8,8 @@ import pytest
 from helpers import set_up
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.problems.momentum import MomentumProblem
-from mpm_dolfinx.problems.stage_tools import BEGINS
+from mpm_dolfinx.contact.tool_placing import BEGINS
+from mpm_dolfinx.mechanics.momentum import MomentumProblem
 
 E = 1e6  # Pa
 SOIL = mpm.Hencky(bulk=E / 3, shear=E / 2)  # nu = 0

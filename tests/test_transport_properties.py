@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from strategies import numbers, orders, repeatable, turned
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx.domains.pressure_transport import CellPressures, PiecePressures, Reconstruction, transport
 from mpm_dolfinx.points.cutting import Pieces, cut
-from mpm_dolfinx.points.pressure_transport import CellPressures, PiecePressures, Reconstruction, transport
 
 # ---- random motions --------------------------------------------------------------------------------
 

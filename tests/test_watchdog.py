@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.problems import balances
 from mpm_dolfinx.solve import watchdog
 from mpm_dolfinx.solve.schur import LinearSolvers
 from mpm_dolfinx.solve.watchdog import PATIENCE, WORK, Search, Watchdog, shortened
+from mpm_dolfinx.stepping import balances
 
 
 def test_the_residual_may_grow_for_some_full_steps_and_descends_after_them():

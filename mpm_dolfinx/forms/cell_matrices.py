@@ -17,9 +17,9 @@ import ufl
 from dolfinx import fem
 from numpy.typing import NDArray
 
-from mpm_dolfinx.caching import Latest
+from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.forms.point_forms import BATCH, CellSums, FormPoints, Places, PointData, PointExpression
-from mpm_dolfinx.points.grid import Grid, sum_by
+from mpm_dolfinx.grid.grid import Grid, sum_by
 
 
 def shape_gradients(points: FormPoints) -> list:

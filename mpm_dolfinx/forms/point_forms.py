@@ -28,10 +28,10 @@ from dolfinx import fem
 from dolfinx.mesh import Mesh
 from numpy.typing import NDArray
 
-from mpm_dolfinx import _compat
-from mpm_dolfinx.caching import Keyed, Latest
-from mpm_dolfinx.constitutive.axes import block
-from mpm_dolfinx.points.grid import Grid, in_chunks
+from mpm_dolfinx.base import _compat
+from mpm_dolfinx.base.caching import Keyed, Latest
+from mpm_dolfinx.forms.axes import block
+from mpm_dolfinx.grid.grid import Grid, in_chunks
 
 BATCH, MANY = 2**10, 2**12
 """Points whose element matrices are made at a time, in the processor's cache; those that an expression takes at a time.

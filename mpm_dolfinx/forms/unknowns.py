@@ -15,7 +15,7 @@ import numpy as np
 from dolfinx import fem
 from numpy.typing import NDArray
 
-from mpm_dolfinx import _compat
+from mpm_dolfinx.base import _compat
 
 
 class Unknowns:

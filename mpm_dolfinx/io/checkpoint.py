@@ -18,16 +18,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mpm_dolfinx.base.validation import instance, line, numbers, on_disk, path, whole
+from mpm_dolfinx.domains.pressure_transport import PiecePressures
+from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.io.writer import WRITABLE, replacing
 from mpm_dolfinx.parallel.exchange import at_root
 from mpm_dolfinx.parallel.messages import log
-from mpm_dolfinx.points.grid import Grid
 from mpm_dolfinx.points.material_points import MaterialPoints
-from mpm_dolfinx.points.pressure_transport import PiecePressures
-from mpm_dolfinx.result import Result, Row
-from mpm_dolfinx.simulation import Simulation
-from mpm_dolfinx.state import State, Stay
-from mpm_dolfinx.validation import instance, line, numbers, on_disk, path, whole
+from mpm_dolfinx.simulation.simulation import Simulation
+from mpm_dolfinx.stepping.result import Result, Row
+from mpm_dolfinx.stepping.state import State, Stay
 
 FORMAT, VERSION = "mpm_dolfinx checkpoint", 9
 FOREIGN = "no checkpoint of mpm_dolfinx, must be one"

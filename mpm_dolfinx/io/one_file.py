@@ -14,9 +14,9 @@ import meshio
 import numpy as np
 from meshio.xdmf import TimeSeriesWriter
 
+from mpm_dolfinx.base.validation import line_of, path
 from mpm_dolfinx.io.units import FIELDS
 from mpm_dolfinx.io.writer import Series
-from mpm_dolfinx.validation import line_of, path
 
 
 def one_file(folder: str | os.PathLike) -> Path:

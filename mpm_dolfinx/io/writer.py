@@ -25,12 +25,12 @@ import numpy as np
 from dolfinx import fem, io
 from numpy.typing import NDArray
 
+from mpm_dolfinx.base.validation import flag, instance, line_of, on_disk, path, whole
 from mpm_dolfinx.io.units import text
 from mpm_dolfinx.parallel.exchange import at_root, to_root
 from mpm_dolfinx.points.material_points import MaterialPoints
-from mpm_dolfinx.result import Result
-from mpm_dolfinx.simulation import Simulation
-from mpm_dolfinx.validation import flag, instance, line_of, on_disk, path, whole
+from mpm_dolfinx.simulation.simulation import Simulation
+from mpm_dolfinx.stepping.result import Result
 
 SYMMETRIC = {"xx": (0, 0), "yy": (1, 1), "zz": (2, 2), "xy": (0, 1), "xz": (0, 2), "yz": (1, 2)}
 """Components of a symmetric tensor, the first four those of plane strain."""

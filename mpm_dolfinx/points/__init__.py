@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""Grid, bodies, material points: how domains are cut by the cells, and how points and pressures move on."""
+"""Material points, the cutting of their domains, and the parts that hang together."""

@@ -26,7 +26,7 @@ from itertools import combinations, permutations
 import numpy as np
 from numpy.typing import NDArray
 
-from mpm_dolfinx.points.grid import TURN, Grid, sum_by
+from mpm_dolfinx.grid.grid import TURN, Grid, sum_by
 
 SLIVER = 1e-12  # of the domain: smaller pieces are dropped; less than one `Grid.snap` thin, whose face is open
 CHUNK = 2**15  # simplices of domains that are cut at a time, in the processor's cache

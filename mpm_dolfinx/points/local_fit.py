@@ -17,8 +17,8 @@ from mpi4py import MPI
 import numpy as np
 from numpy.typing import NDArray
 
+from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.parallel.exchange import over_all
-from mpm_dolfinx.points.grid import sum_by
 
 RADIUS = 3.0
 """Offsets, over the spacing of the data, from which on these have no weight.

@@ -24,8 +24,8 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
-from mpm_dolfinx.caching import Latest
-from mpm_dolfinx.errors import NotConverged
+from mpm_dolfinx.base.caching import Latest
+from mpm_dolfinx.base.errors import NotConverged
 from mpm_dolfinx.forms.unknowns import Unknowns
 
 ITERATIVE = 1500

@@ -37,10 +37,10 @@ import numpy as np
 from dolfinx.common import Timer
 from numpy.typing import NDArray
 
-from mpm_dolfinx.caching import Latest
+from mpm_dolfinx.base.caching import Latest
+from mpm_dolfinx.flow.storage import FluxSlope, StorageSystem
 from mpm_dolfinx.forms.unknowns import Unknowns
-from mpm_dolfinx.problems.momentum import MomentumSystem
-from mpm_dolfinx.problems.storage import FluxSlope, StorageSystem
+from mpm_dolfinx.mechanics.momentum import MomentumSystem
 from mpm_dolfinx.solve.linear import direct_solver, factorise, nodal_solver, renewed, solved
 
 MANY, MOST = 29, 500

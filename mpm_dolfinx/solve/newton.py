@@ -31,13 +31,13 @@ import numpy as np
 from dolfinx.common import Timer
 from numpy.typing import NDArray
 
-from mpm_dolfinx.errors import NotConverged
+from mpm_dolfinx.base.errors import NotConverged
+from mpm_dolfinx.base.report import Report
+from mpm_dolfinx.flow.storage import Rates, StorageProblem, StorageResidual
+from mpm_dolfinx.mechanics.momentum import MomentumProblem
+from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
 from mpm_dolfinx.parallel.exchange import over_all
-from mpm_dolfinx.problems.momentum import MomentumProblem
-from mpm_dolfinx.problems.parts import relative
-from mpm_dolfinx.problems.quadrature_data import QuadratureData
-from mpm_dolfinx.problems.storage import Rates, StorageProblem, StorageResidual
-from mpm_dolfinx.result import Report
+from mpm_dolfinx.points.parts import relative
 from mpm_dolfinx.solve.linear import negative_pivots
 from mpm_dolfinx.solve.schur import LinearSolvers
 from mpm_dolfinx.solve.watchdog import Descent, Search, Watchdog

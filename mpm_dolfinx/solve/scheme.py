@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from mpm_dolfinx.validation import numbers
+from mpm_dolfinx.base.validation import numbers
 
 COUPLINGS = {
     "schur-cg": 0.75,

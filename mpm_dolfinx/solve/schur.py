@@ -23,10 +23,10 @@ import numpy as np
 from dolfinx.common import Timer
 from numpy.typing import NDArray
 
-from mpm_dolfinx.caching import Latest
-from mpm_dolfinx.problems.momentum import MomentumProblem, MomentumSystem
-from mpm_dolfinx.problems.parts import OfParts
-from mpm_dolfinx.problems.storage import FILTER, FluxSlope, StorageProblem, StorageSystem
+from mpm_dolfinx.base.caching import Latest
+from mpm_dolfinx.flow.storage import FILTER, FluxSlope, StorageProblem, StorageSystem
+from mpm_dolfinx.mechanics.momentum import MomentumProblem, MomentumSystem
+from mpm_dolfinx.points.parts import OfParts
 from mpm_dolfinx.solve.linear import (
     by_mumps,
     direct_solver,

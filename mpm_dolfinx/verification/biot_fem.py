@@ -34,22 +34,23 @@ from dolfinx import fem, mesh
 from numpy.typing import ArrayLike, NDArray
 from tqdm import tqdm
 
-from mpm_dolfinx import _compat
-from mpm_dolfinx.constitutive.axes import block
-from mpm_dolfinx.constitutive.fluid_content import change_of_content, mass_potential, mass_potential_form
-from mpm_dolfinx.constitutive.skeleton import Field, Fluid, Skeleton
-from mpm_dolfinx.constitutive.user_functions import call, compiling, term_of
-from mpm_dolfinx.constitutive.user_functions import form as form_of
-from mpm_dolfinx.errors import GaveUp, NotConverged
+from mpm_dolfinx.base import _compat
+from mpm_dolfinx.base.errors import NotConverged
+from mpm_dolfinx.base.fluid_content import change_of_content, mass_potential, mass_potential_form
+from mpm_dolfinx.base.report import Report
+from mpm_dolfinx.base.validation import all_of, functions, line, numbers
+from mpm_dolfinx.bodies.faces import Region, limits
+from mpm_dolfinx.conditions.axis import with_axis
+from mpm_dolfinx.conditions.conditions import RIGIDITY, Drained, Pressure, RigidPlate, Traction
+from mpm_dolfinx.forms.axes import block
 from mpm_dolfinx.forms.point_forms import PointMeasure
-from mpm_dolfinx.points.faces import Region, limits
-from mpm_dolfinx.points.grid import TURN, Grid, side
-from mpm_dolfinx.points.probes import positions
-from mpm_dolfinx.problems.axis import with_axis
-from mpm_dolfinx.problems.conditions import RIGIDITY, Drained, Pressure, RigidPlate, Traction
-from mpm_dolfinx.result import Report, Result, Row
-from mpm_dolfinx.time_integration import Substep, substeps
-from mpm_dolfinx.validation import all_of, functions, line, numbers
+from mpm_dolfinx.grid.grid import TURN, Grid, side
+from mpm_dolfinx.materials.skeleton import Field, Fluid, Skeleton
+from mpm_dolfinx.materials.user_functions import call, compiling, term_of
+from mpm_dolfinx.materials.user_functions import form as form_of
+from mpm_dolfinx.probing.probes import positions
+from mpm_dolfinx.stepping.result import GaveUp, Result, Row
+from mpm_dolfinx.stepping.time_integration import Substep, substeps
 
 ELEMENTS = {"taylor-hood": (2, ("Lagrange", 1, ())), "q1-dg0": (1, ("DG", 0, ()))}  # degree of u; space of p
 CUT_DEGREE = 20  # of quadrature on a side of which a region is loaded: the region's edge may cut facets

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import solve_banded
 
-from mpm_dolfinx.constitutive.evaluate import LawAtPoints
-from mpm_dolfinx.constitutive.skeleton import Skeleton
-from mpm_dolfinx.points.grid import Grid
+from mpm_dolfinx.grid.grid import Grid
+from mpm_dolfinx.materials.evaluate import LawAtPoints
+from mpm_dolfinx.materials.skeleton import Skeleton
 
 State = dict[str, NDArray[np.float64]]
 NUDGE, NEAR, MOST = 1e-7, 1e-10, 60  # of stretches; relative residual; iterations

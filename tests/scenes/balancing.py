@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from mpm_dolfinx.points.grid import SIDES
+from mpm_dolfinx.grid.grid import SIDES
 from scenes.comparing import NOTHING, softest
 from scenes.description import WATER, Block, Condition, Draw, Scene, drawn
 from scenes.running import Built

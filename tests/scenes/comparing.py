@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial import cKDTree
 
-from mpm_dolfinx.problems.cell_contact import STIFF
-from mpm_dolfinx.problems.conditions import HOLD
+from mpm_dolfinx.conditions.conditions import HOLD
+from mpm_dolfinx.contact.cell_contact import STIFF
 from scenes.description import Scene
 from scenes.frames import Frame
 from scenes.running import Shown

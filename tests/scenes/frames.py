@@ -10,7 +10,7 @@ from itertools import permutations
 import numpy as np
 from numpy.typing import NDArray
 
-from mpm_dolfinx.points.grid import SIDES
+from mpm_dolfinx.grid.grid import SIDES
 from scenes.description import AXES, Draw, Scene
 
 FAR_BODIES = ("resting", "moving", "stiff", "draining")

@@ -8,8 +8,8 @@ from itertools import permutations
 import meshio
 import numpy as np
 
+from mpm_dolfinx.grid.grid import SIDES
 from mpm_dolfinx.points.cutting import FACES, corner_bits
-from mpm_dolfinx.points.grid import SIDES
 from scenes.description import Block, Scene
 from scenes.frames import Frame
 

@@ -1,0 +1,254 @@
+# SPDX-License-Identifier: MIT
+"""Every spelling that differs between the supported dolfinx releases (0.5.2, 0.9 and 0.11).
+
+The rest of the package never asks for a version.  A branch goes when the oldest release that needs
+it goes; the branches marked OLD are those of 0.5.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+
+from mpi4py import MPI
+from petsc4py import PETSc
+
+import numpy as np
+import ufl
+from dolfinx import common, cpp, fem, la, mesh
+from numpy.typing import NDArray
+
+from mpm_dolfinx.base._compiler import compiler
+
+OLD = not hasattr(fem, "functionspace")
+SUBDOMAIN = 1  # the one subdomain id of our measures
+
+if OLD:
+    from dolfinx import jit
+    from dolfinx.fem.assemble import pack_coefficients as _pack_coefficients
+else:
+    import basix.ufl
+    from dolfinx import graph
+
+
+def box_mesh(
+    comm: MPI.Intracomm,
+    cells: NDArray[np.int64],
+    x: NDArray[np.float64],
+    ranks: NDArray[np.int32],
+    offsets: NDArray[np.int32],
+) -> mesh.Mesh:
+    """Return a mesh of quadrilaterals or hexahedra, shared out as told.
+
+    Parameters
+    ----------
+    cells : (n, 2^d)
+        Nodes of the cells that this process brings in, first axis fastest.
+    x : (m, d), m
+        Positions of the nodes that this process brings in; those of all processes follow each other.
+    ranks, offsets
+        Processes that have cell i: `ranks[offsets[i] : offsets[i + 1]]`, its owner first.
+    """
+    kind = {4: "quadrilateral", 8: "hexahedron"}[cells.shape[1]]
+    where = (ranks, offsets)
+    if OLD:
+        domain = ufl.Mesh(ufl.VectorElement("Lagrange", kind, 1))
+        ghosts = mesh.GhostMode.shared_facet
+        lists = cpp.graph.AdjacencyList_int32(*where)
+        return mesh.create_mesh(comm, cells, x, domain, ghosts, lambda *_: lists)
+    domain = ufl.Mesh(basix.ufl.element("Lagrange", kind, 1, shape=(x.shape[1],)))
+    lists = graph.adjacencylist(*where)
+    lists = getattr(lists, "_cpp_object", lists)  # 0.11 wraps it, and does not unwrap what a partitioner returns
+    return mesh.create_mesh(comm, cells=cells, x=x, e=domain, partitioner=lambda *_: lists)
+
+
+def function_space(msh: mesh.Mesh, family: str, degree: int, shape: tuple[int, ...] = ()):
+    """Return the space of `shape`-valued functions of a family ("DG", "Lagrange") and degree."""
+    if not OLD:
+        return fem.functionspace(msh, (family, degree, shape) if shape else (family, degree))
+    with compiler(msh.comm):
+        return fem.FunctionSpace(msh, _old_element(msh, family, degree, shape))
+
+
+def _old_element(msh, family: str, degree: int, shape: tuple[int, ...]):
+    cell = msh.ufl_cell()
+    if family == "DG" and cell.cellname() in ("quadrilateral", "hexahedron"):
+        family = "DQ"  # as ufl calls it there, after a line on the console
+    if len(shape) == 2:
+        return ufl.TensorElement(family, cell, degree, shape=shape)
+    if len(shape) == 1:
+        return ufl.VectorElement(family, cell, degree, dim=shape[0])
+    return ufl.FiniteElement(family, cell, degree)
+
+
+def mixed_space(msh: mesh.Mesh, parts: Sequence[tuple[str, int, tuple[int, ...]]]):
+    """Return the mixed space of several (family, degree, shape)."""
+    if OLD:
+        with compiler(msh.comm):
+            return fem.FunctionSpace(msh, ufl.MixedElement(*[_old_element(msh, *p) for p in parts]))
+    elements = [basix.ufl.element(f, msh.basix_cell(), k, shape=s) for f, k, s in parts]
+    return fem.functionspace(msh, basix.ufl.mixed_element(elements))
+
+
+def cell_dofs(V) -> NDArray[np.int32]:
+    """Return the blocked degrees of freedom of the cells, ghosts included, (cells, n)."""
+    dofs = V.dofmap.list
+    return dofs.array.reshape(-1, V.dofmap.dof_layout.num_dofs) if OLD else np.asarray(dofs)
+
+
+def petsc_vec(u: fem.Function) -> PETSc.Vec:
+    """Return the PETSc vector that shares the function's memory."""
+    return u.vector if OLD else u.x.petsc_vec
+
+
+def num_cells(msh: mesh.Mesh) -> tuple[int, int]:
+    """Return the numbers of owned cells and of all cells on this process."""
+    index_map = msh.topology.index_map(msh.topology.dim)
+    return index_map.size_local, index_map.size_local + index_map.num_ghosts
+
+
+def cell_kind(msh: mesh.Mesh) -> str:
+    """Return the name of the mesh's kind of cell, such as "tetrahedron"."""
+    return msh.topology.cell_name()
+
+
+def geometry_dofs(msh: mesh.Mesh) -> NDArray[np.int32]:
+    """Return the nodes of the cells, ghosts included, (cells, n)."""
+    dofs = msh.geometry.dofmap
+    return dofs.array.reshape(len(dofs), -1) if OLD else np.asarray(dofs)
+
+
+def scatter_reverse_add(u: fem.Function) -> None:
+    """Add the values at ghosts to those of their owners."""
+    u.x.scatter_reverse(la.ScatterMode.add if OLD else la.InsertMode.add)
+
+
+def seconds(task: str) -> float:
+    """Return the wall seconds that dolfinx's timers have counted for a task so far."""
+    try:
+        total = common.timing(task)[1]
+    except RuntimeError:  # not met yet
+        return 0.0
+    return total.total_seconds() if hasattr(total, "total_seconds") else total
+
+
+class CompiledForm:
+    """A UFL form over cells or interior facets, compiled once and bound to entity lists at will.
+
+    The list may name a cell any number of times: the kernel is called once an entry.  Only owned
+    cells may be named (0.5 skips ghosts without a word).  0.5 takes the list as mesh tags with
+    repeated indices, later releases as an entity list.
+
+    Parameters
+    ----------
+    form
+        Form with one integral type, all integrals with the subdomain id `SUBDOMAIN`.
+    """
+
+    def __init__(self, form: ufl.Form):
+        (self.integral_type,) = {i.integral_type() for i in form.integrals()}
+        self.mesh = _mesh_of(form)
+        self._spaces = [a.ufl_function_space() for a in form.arguments()]
+        coefficients, self._constants = form.coefficients(), form.constants()
+        if OLD:
+            with compiler(self.mesh.comm):
+                self._ufcx, self._module, _ = jit.ffcx_jit(self.mesh.comm, form)
+            position = self._ufcx.original_coefficient_position
+            count = self._ufcx.num_coefficients
+        else:
+            with compiler(self.mesh.comm):
+                self._compiled = fem.compile_form(self.mesh.comm, form)
+            position = self._compiled.ufcx_form.original_coefficient_positions
+            count = self._compiled.ufcx_form.num_coefficients
+            self._all = coefficients
+        self.coefficients = [coefficients[position[i]] for i in range(count)]
+        self._last: list = []
+
+    @property
+    def form(self):
+        """The form as it was bound last."""
+        return self._last[0]
+
+    def bind(self, entities: NDArray[np.int32]):
+        """Set the cells (repeats allowed) or the interior facets over which the form is integrated; return it so bound.
+
+        What is returned stays bound to them, and can be given to `assemble_vector` and `assemble_matrix`.
+        """
+        entities = np.ascontiguousarray(entities, dtype=np.int32)
+        cells = self.integral_type == "cell"
+        kind = fem.IntegralType.cell if cells else fem.IntegralType.interior_facet
+        dim = self.mesh.topology.dim - (0 if cells else 1)
+        if OLD:
+            values = np.full(len(entities), SUBDOMAIN, dtype=np.int32)
+            tags = cpp.mesh.MeshTags_int32(self.mesh, dim, entities, values)
+            ffi = self._module.ffi
+            form = cpp.fem.Form_float64(
+                int(ffi.cast("uintptr_t", ffi.addressof(self._ufcx))),
+                [V._cpp_object for V in self._spaces],
+                [c._cpp_object for c in self.coefficients],
+                [c._cpp_object for c in self._constants],
+                {kind: tags},
+                self.mesh,
+            )
+            self._last[:] = [form]
+        else:
+            if not cells:
+                entities = _facet_cells(self.mesh, entities, dim)
+            bound = fem.create_form(
+                self._compiled,
+                self._spaces,
+                self.mesh,
+                {kind: [(SUBDOMAIN, entities)]},
+                {c: c for c in self._all},
+                {c: c for c in self._constants},
+            )
+            self._last[:] = bound._cpp_object, bound
+        return self.form
+
+    def packed(self, form=None) -> dict:
+        """Return dolfinx's own packed coefficients, one row an entity."""
+        form = form or self.form
+        return _pack_coefficients(form) if OLD else cpp.fem.pack_coefficients(form)
+
+    def assemble_vector(self, b: NDArray[np.float64], rows: NDArray[np.float64] | None = None, form=None) -> None:
+        """Add the vector to `b` (ghosts not accumulated), with own coefficient rows if given."""
+        form = form or self.form
+        cpp.fem.assemble_vector(b, form, cpp.fem.pack_constants(form), self._coefficients(rows, form))
+
+    def assemble_matrix(self, A: PETSc.Mat, rows: NDArray[np.float64] | None = None, form=None) -> None:
+        """Add the matrix to `A` (not finalised), dofs unrolled, with own coefficient rows if given."""
+        form = form or self.form
+        constants = cpp.fem.pack_constants(form)
+        cpp.fem.petsc.assemble_matrix(A, form, constants, self._coefficients(rows, form), [], unrolled=True)
+
+    def _coefficients(self, rows, form) -> dict:
+        if rows is None:
+            return self.packed(form)
+        # 0.11 counts the integrals where earlier releases name the subdomain
+        return {(fem.IntegralType.cell, key): rows for key in self._keys}
+
+    @cached_property
+    def _keys(self) -> list[int]:
+        return [key for _, key in self.packed()] or [SUBDOMAIN]
+
+
+def _mesh_of(form: ufl.Form):
+    if OLD:
+        return form.ufl_domain().ufl_cargo()
+    spaces = [a.ufl_function_space() for a in form.arguments()]
+    return spaces[0].mesh
+
+
+def _facet_cells(msh, facets, dim: int) -> NDArray[np.int32]:
+    """Return the flat list (cell0, local facet0, cell1, local facet1, ...) of interior facets."""
+    adjacency = msh.topology.connectivity(dim, dim + 1)
+    cells = adjacency.array[adjacency.offsets[facets][:, None] + np.arange(2)]
+    cell_facets = msh.topology.connectivity(dim + 1, dim).array.reshape(-1, 2 * (dim + 1))  # of boxes
+    local = np.argmax(cell_facets[cells] == facets[:, None, None], axis=2)
+    return np.stack([cells, local], axis=2).reshape(-1).astype(np.int32)
+
+
+def compiled(form: ufl.Form):
+    """Return `fem.form`."""
+    with compiler(_mesh_of(form).comm):
+        return fem.form(form)

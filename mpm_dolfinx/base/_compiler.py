@@ -1,0 +1,218 @@
+# SPDX-License-Identifier: MIT
+"""The compiler behind dolfinx's forms and function spaces: quiet, with whole libraries, and errors in one line.
+
+FFCx marks in its cache that a library is being made, and waits ten seconds for one that is marked.  What a run that
+was broken off leaves there ends every later run.  Here a library is made in a folder of its own and moved into the
+cache when it is whole: nothing is ever half made there.  What others have left unfinished or broken is made anew.
+"""
+
+from __future__ import annotations
+
+import atexit
+import logging
+import os
+import shutil
+import struct
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from importlib.machinery import EXTENSION_SUFFIXES
+from pathlib import Path
+from uuid import uuid4
+
+from mpi4py import MPI
+
+import cffi
+import ffcx
+from dolfinx import jit
+from ffcx.codegeneration import jit as libraries
+
+from mpm_dolfinx.base.validation import line_of
+from mpm_dolfinx.parallel.exchange import at_root, first
+
+WORKSHOP = ".mpm_dolfinx-"
+"""How the names of the folders begin in which libraries are made."""
+ABANDONED = 600.0
+"""Seconds after which a library that another program has begun will not be finished."""
+DAY = 86400.0
+logger = logging.getLogger("mpm_dolfinx")
+_settings = jit.get_options if hasattr(jit, "get_options") else jit.get_parameters  # OLD
+_ffcx_settings = ffcx.get_options if hasattr(ffcx, "get_options") else ffcx.get_parameters  # OLD
+_instead: dict[Path, Path] = {}
+"""Folders of this run only, by those that cannot be written."""
+_to_say: dict[Path, str] = {}
+"""Warnings by folders of this run, until something is compiled there."""
+
+
+@contextmanager
+def compiler(comm: MPI.Intracomm) -> Iterator[None]:
+    """Let dolfinx find or compile what it needs within, on all processes of `comm`.
+
+    Raises
+    ------
+    OSError
+        In one line, on all of them: settings that cannot be read, no folder that can be written, a C compiler that
+        fails.
+    """
+    folder, said, raised = at_root(comm, _folder), [""], None
+    makers = {name: _whole(getattr(libraries, name), folder, said) for name in MAKERS}
+    try:
+        with _quiet(), _replaced(**makers):
+            yield
+    except Exception as error:
+        raised = error
+    message = first(comm, said[-1])  # on several processes dolfinx tells the others only that one has failed
+    if message:
+        raise OSError(message) from raised
+    if raised is not None:
+        raise raised
+
+
+MAKERS = [name for name in ("compile_forms", "compile_elements") if hasattr(libraries, name)]
+
+
+def _folder() -> Path:
+    """Return the folder for libraries: dolfinx's cache, or where it cannot be written one for this run only."""
+    try:
+        _ffcx_settings()
+        cache = _settings()["cache_dir"]
+    except (OSError, ValueError) as error:  # what is no JSON is a ValueError
+        file, why = getattr(error, "filename", None), getattr(error, "strerror", None)
+        what = f"{file}: {why}" if file else f"dolfinx_jit_*.json or ffcx_*.json: {line_of(error)}"
+        allowed = "must be absent, or JSON that can be read: set HOME or XDG_CONFIG_HOME to another folder"
+        raise OSError(f"{what}: settings of dolfinx, {allowed}") from error
+    try:
+        cache.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=WORKSHOP, dir=cache):
+            return cache
+    except OSError as error:
+        if cache not in _instead:
+            _instead[cache] = _of_this_run(cache, error)
+        return _instead[cache]
+
+
+def _of_this_run(cache: Path, why: OSError) -> Path:
+    """Return a new folder for libraries, which is removed at the end of the run."""
+    allowed = "must be a folder that can be written: set XDG_CACHE_HOME to another"
+    what = f"{cache}: {why.strerror}: dolfinx keeps there what it compiles"
+    try:
+        folder = Path(tempfile.mkdtemp(prefix="mpm_dolfinx-"))
+    except OSError as error:
+        raise OSError(f"{what}, and {line_of(error)}, {allowed}") from error
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    _to_say[folder] = f"{what}, {allowed}; until then every run compiles anew, in {folder}"
+    return folder
+
+
+def _whole(make: Callable, folder: Path, said: list[str]) -> Callable:
+    """Return FFCx's maker of a library as one that finds or makes it whole.
+
+    Parameters
+    ----------
+    folder
+        Where new libraries go.
+    said
+        Receives what is wrong where it is not the code that is to be compiled.
+    """
+
+    def find_or_make(*objects, cache_dir, **settings):
+        workshop, find = folder / f"{WORKSHOP}{uuid4().hex}", libraries.get_cached_module
+
+        def look(name: str, names, workshop, timeout):
+            for place in dict.fromkeys((Path(cache_dir), folder)):
+                with suppress(OSError, ImportError, AttributeError):  # not readable, or not what its name says
+                    if _is_whole(place, name):
+                        return find(name, names, place, timeout)
+            return find(name, names, workshop, timeout)  # makes the workshop, in which there is nothing
+
+        try:
+            with _replaced(get_cached_module=look):
+                out = make(*objects, cache_dir=workshop, **settings)
+            if workshop.exists():
+                if folder in _to_say:
+                    logger.warning(_to_say.pop(folder))
+                with suppress(OSError):  # it has been loaded: who looks for it next makes it again
+                    _publish(workshop, folder)
+            return out
+        except cffi.VerificationError as error:
+            allowed = "must be able to make Python extensions: on Debian, apt install gcc libc6-dev python3-dev"
+            said.append(f"C compiler: {line_of(error)}, {allowed}")
+            raise
+        except OSError as error:
+            allowed = "must be a folder that can be written, with room, or set XDG_CACHE_HOME to another"
+            said.append(f"{folder}: {line_of(error)}, {allowed}")
+            raise
+        finally:
+            shutil.rmtree(workshop, ignore_errors=True)
+
+    return find_or_make
+
+
+def _library(place: Path, name: str) -> Path | None:
+    """Return the file of a library that Python would load."""
+    return next(filter(Path.exists, (place / (name + suffix) for suffix in EXTENSION_SUFFIXES)), None)
+
+
+def _is_whole(place: Path, name: str) -> bool:
+    """Return whether a library is there and marked as ready, with its source by which FFCx finds it, up to its end.
+
+    The loader does not notice a library that is cut short: the run dies of a bus error when it uses what is missing.
+    """
+    library = _library(place, name)
+    if library is None or not all((place / f"{name}{end}").exists() for end in (".c", ".c.cached")):
+        return False
+    with open(library, "rb") as f:
+        head = f.read(64)
+    if len(head) < 64 or head[:5] != b"\x7fELF\x02":  # not of Linux: the loader may know by itself
+        return len(head) == 64
+    (table,), (size, count) = struct.unpack_from("=Q", head, 0x28), struct.unpack_from("=2H", head, 0x3A)
+    return library.stat().st_size >= table + size * count  # the table of sections is the last that a linker writes
+
+
+def _publish(workshop: Path, folder: Path) -> None:
+    """Move a library into the cache, if it is not there and no other program is about to put it there."""
+    (source,) = workshop.glob("*.c")
+    mark, name = folder / source.name, source.stem
+    ready = mark.with_suffix(".c.cached")
+    try:
+        open(mark, "x").close()  # so do other programs claim a name
+    except FileExistsError:
+        if not ready.exists() and time.time() - mark.stat().st_mtime < ABANDONED:
+            return
+    for file in (_library(workshop, name), source, workshop / ready.name):
+        os.replace(file, folder / file.name)
+    for left in folder.glob(f"{WORKSHOP}*"):  # of runs that were killed
+        if time.time() - left.stat().st_mtime > DAY:
+            shutil.rmtree(left, ignore_errors=True)
+
+
+@contextmanager
+def _replaced(**functions: Callable) -> Iterator[None]:
+    """Put functions in the place of FFCx's of their names."""
+    before = {name: getattr(libraries, name) for name in functions}
+    for name, function in functions.items():
+        setattr(libraries, name, function)
+    try:
+        yield
+    finally:
+        for name, function in before.items():
+            setattr(libraries, name, function)
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep back what setuptools logs of every call of the compiler; leave logging as it was, whatever happens."""
+    root = logging.getLogger()
+    level, handlers = root.level, root.handlers[:]
+    root.addFilter(_is_wanted)
+    try:
+        yield
+    finally:
+        root.removeFilter(_is_wanted)
+        root.setLevel(level)
+        root.handlers[:] = handlers
+
+
+def _is_wanted(record: logging.LogRecord) -> bool:
+    return record.levelno > logging.INFO or "distutils" not in record.pathname

@@ -1,0 +1,293 @@
+# SPDX-License-Identifier: MIT
+"""Bodies: how they are seeded with material points."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mpm_dolfinx.base.validation import asked, instance, numbers
+from mpm_dolfinx.grid.grid import SIDES, Grid, in_chunks
+from mpm_dolfinx.parallel.exchange import first
+from mpm_dolfinx.points.cutting import FACES, centroids, corner_bits, domain_volumes, volumes
+from mpm_dolfinx.points.material_points import MaterialPoints
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Body:
+    """A body as seeded: reference geometry of all its domains, the same on every process.
+
+    material : index in the scene's list; map : where the corners of the domains' boxes are put, see `mapped`; each kind
+    has its `spacing`, the edges of these boxes, (d,) of all alike or (n, d), m.  What is asked of all domains is made
+    anew each time: large bodies are asked in parts.
+    """
+
+    material: int = 0
+    map: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None
+
+    def __len__(self) -> int:
+        raise NotImplementedError
+
+    @property
+    def dim(self) -> int:
+        """Number d of coordinates."""
+        raise NotImplementedError
+
+    def lower_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the lower corners (m, d), m, of the boxes of domains."""
+        raise NotImplementedError
+
+    def sides_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return whether faces (m, d, 2) of domains lie on the surface of the body."""
+        raise NotImplementedError
+
+    @property
+    def lower(self) -> NDArray[np.float64]:
+        """Lower corners (n, d), m, of the boxes of all domains."""
+        return self.lower_of(slice(None))
+
+    @property
+    def sides(self) -> NDArray[np.bool_]:
+        """Whether faces (n, d, 2) of all domains lie on the surface of the body."""
+        return self.sides_of(slice(None))
+
+    @property
+    def centre(self) -> NDArray[np.float64]:
+        """Reference positions (n, d), m, of the centres of all domains."""
+        return self.centre_of(slice(None))
+
+    def centre_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the reference positions (m, d), m, of the centres of domains."""
+        return self.lower_of(chosen) + 0.5 * self.spacing
+
+    @cached_property
+    def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Corners (d,), m, of the box around the body, before the map."""
+        low, high = np.full((2, self.dim), [[np.inf], [-np.inf]])
+        for part in in_chunks(len(self)):
+            lower = self.lower_of(part)
+            low = np.minimum(low, lower.min(axis=0))
+            high = np.maximum(high, (lower + self.boxes(part)).max(axis=0))
+        return low, high
+
+    @property
+    def aligned(self) -> bool:
+        """Whether the domains are boxes along the axes."""
+        return self.map is None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the sides."""
+        return tuple(SIDES[self.dim])
+
+    def named(self, name: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the domains (m,) that have a face on a side, ascending, and the numbers (m,) of these faces."""
+        return self.facing(*SIDES[self.dim][name]) if name in self.names else (np.empty(0, np.int64),) * 2
+
+    def facing(self, axis: int, end: int, least: float = 0.0) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the domains (m,) with a face on the surface that looks towards an end of an axis, and its numbers.
+
+        Of unstructured bodies, whose normal has its largest component there, and not below `least`.
+        """
+        row = self._with_face(axis, end)
+        return row, np.full(len(row), 2 * axis + end)
+
+    def _with_face(self, axis: int, end: int) -> NDArray[np.int64]:
+        """Return the domains (m,), ascending, of which the face at an end of an axis lies on the surface."""
+        rows = [part.start + np.flatnonzero(self.sides_of(part)[:, axis, end]) for part in in_chunks(len(self))]
+        return np.concatenate([np.empty(0, np.int64), *rows])
+
+    def across(self, axis: int) -> tuple[float, float]:
+        """Return how many domains the body has across an axis, and their edge, m; means."""
+        return len(self) / max(1, len(self._with_face(axis, 0))), float(self.spacing[axis])
+
+    def outer(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the domains (m,) and numbers (m,) of all faces on the surface, by their numbers."""
+        rows = [self._with_face(axis, end) for axis in range(self.dim) for end in (0, 1)]
+        return np.concatenate(rows), np.repeat(np.arange(len(rows)), list(map(len, rows)))
+
+    def reference(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
+        """Return the reference positions (m, 2^d, d), m, of the corners of domains: those before the map."""
+        return self.lower_of(chosen)[:, None] + corner_bits(self.dim) * self.spacing
+
+    def corners(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
+        """Return the corners (m, 2^d, d), m, of domains, after the map."""
+        return self.images(self.reference(chosen))
+
+    def images(self, X: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return where the map puts reference positions (..., d), m."""
+        if self.map is None or not X.size:  # a map need not have an answer for no positions
+            return X
+        x = X.reshape(-1, X.shape[-1])
+        images = numbers("body: the map", asked("body: the map", "a function of positions", self.map, x), None)
+        if images.shape != x.shape:
+            raise ValueError(f"body: the map gives shape {images.shape}, must be one position each, {x.shape}")
+        return images.reshape(X.shape)
+
+    def bend(self, chosen: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return how far the middles of the domains' edges lie from the images of their middles (m,), m.
+
+        By so much the straight edges of two domains may differ that follow the same curve.
+        """
+        out = np.zeros(len(chosen))
+        if self.map is None:
+            return out
+        corners, X = self.corners(chosen), self.reference(chosen)
+        for axis in range(self.dim):
+            first, other = FACES[self.dim][2 * axis], FACES[self.dim][2 * axis + 1]
+            middle = self.images((X[:, first] + X[:, other]) / 2)
+            off = np.linalg.norm((corners[:, first] + corners[:, other]) / 2 - middle, axis=2)
+            out = np.maximum(out, off.max(axis=1))
+        return out
+
+    def boxes(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
+        """Return the edges (m, d), m, of the boxes of domains, before the map."""
+        return np.broadcast_to(self.spacing, (len(self), self.dim))[chosen]
+
+    def size(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
+        """Return the edges (m, d), m, of boxes that are as large as domains."""
+        boxes = self.boxes(chosen)
+        if self.aligned:
+            return boxes
+        ratio = volumes(self.corners(chosen)) / boxes.prod(axis=1)
+        return boxes * ratio[:, None] ** (1 / self.dim)
+
+
+def mapped(grid: Grid, body: Body, map: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> Body:
+    """Bend a body: its boxes become the quadrilaterals or hexahedra between the images of their corners.
+
+    Reference positions are those before all maps: regions, probes, X of fields of materials and of displacements.
+    All else is judged after them: what touches, lies in one another, is flat, is loaded.  Sides keep their names.
+    Returns the bent body.
+
+    Parameters
+    ----------
+    grid
+        Background grid.
+    body
+        Of `box`, `shape`, `from_mesh` or `polygon`, or of `mapped`: then its own map comes first.
+    map
+        Maps positions (n, d), m, to positions (n, d), m, inside the grid; smooth, and not turning boxes inside out.
+
+    Raises
+    ------
+    ValueError
+        The map raises, gives another shape or nan, leads out of the grid or turns a box inside out.
+    """
+    instance("body: grid", grid, Grid)
+    instance("body to bend", body, Body)
+    inner = body.map
+    bent = replace(body, map=map if inner is None else lambda x: map(np.asarray(inner(x), dtype=float)))
+    smallest, where = np.inf, None
+    for part in in_chunks(len(bent)):
+        corners = bent.corners(part)
+        out = np.flatnonzero(grid.outside(corners.reshape(-1, grid.dim)))
+        if len(out):
+            x = corners.reshape(-1, grid.dim)[out[0]]
+            raise ValueError(
+                f"body: the map takes a corner to {x}, must not be outside the grid {grid.lower} to {grid.upper}"
+            )
+        volume = volumes(corners)
+        if volume.min() < smallest:
+            smallest, where = volume.min(), body.centre_of(part)[volume.argmin()]
+    if not smallest > 0:
+        raise ValueError(f"body: the map turns the domain at {where} inside out, must not")
+    return bent
+
+
+def check_inside(grid: Grid, body: Body, name: str = "body") -> Body:
+    """Return a body; refuse one that is not wholly in the grid.  What a map has bent has been looked at."""
+    count, where = 0, None
+    for part in in_chunks(len(body) if body.map is None else 0):
+        lower = body.lower_of(part)
+        out = np.flatnonzero(grid.outside(lower) | grid.outside(lower + body.boxes(part)))
+        where = body.centre_of(part)[out[0]] if len(out) and not count else where
+        count += len(out)
+    if count:
+        raise ValueError(
+            f"{name}: {count} points outside the grid, the first at {where}, must be inside {grid.lower} to "
+            f"{grid.upper}"
+        )
+    return body
+
+
+def pressure_at(pressure: float | Callable[[NDArray], ArrayLike], x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the pore pressure as seeded (n,), Pa, a number or a function of places, at places x (n, d), m."""
+    if callable(pressure) and len(x):
+        allowed = f"a finite number, or one for each of {len(x)} places"
+        given = asked("pressure(x)", allowed, pressure, x)
+        return np.broadcast_to(numbers("pressure(x)", given, (), (len(x),), allowed=allowed), len(x)).copy()
+    return np.full(len(x), 0.0 if callable(pressure) else float(numbers("pressure", pressure)))
+
+
+def material_points(
+    grid: Grid, bodies: Sequence[Body], pressure: float | Callable[[NDArray], ArrayLike] = 0.0
+) -> MaterialPoints:
+    """Return this process's material points of the bodies, at rest at a pore pressure: see `pressure_at`."""
+    starts, own = np.cumsum([0, *map(len, bodies)])[:-1], [_own(grid, body) for body in bodies]
+    rows, corners = [rows for rows, _ in own], np.concatenate([corners for _, corners in own])
+    mine = np.concatenate([start + row for start, row in zip(starts, rows, strict=True)])
+    size = np.concatenate([body.size(row) for body, row in zip(bodies, rows, strict=True)])
+    material = np.repeat(np.array([body.material for body in bodies], dtype=np.int32), list(map(len, rows)))
+    x = centroids(corners)
+    n, pressures, refused = len(mine), np.empty(0), ""
+    try:
+        pressures = pressure_at(pressure, x)
+    except ValueError as error:
+        refused = str(error)
+    if refused := first(grid.comm, refused):
+        raise ValueError(refused)
+    return MaterialPoints(
+        id=mine,
+        corners=corners,
+        F=np.tile(np.eye(grid.stretches), (n, 1, 1)),
+        volume0=domain_volumes(corners, True) if grid.axisymmetric else size.prod(axis=1),
+        material=material,
+        pressure=pressures,
+        x=x,
+        origin=corners,
+        reference=corners,
+    )
+
+
+def _own(grid: Grid, body: Body) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return the domains (m,) whose centroids are in cells of this process, and their corners (m, 2^d, d), m."""
+    rows, corners = [np.empty(0, dtype=np.int64)], [np.empty((0, 2**grid.dim, grid.dim))]
+    for part in in_chunks(len(body)):
+        of_part = body.corners(part)
+        # of all copies of the grid alike
+        here = np.flatnonzero(grid.owner(grid.number(grid.index(centroids(of_part)))) == grid.comm.rank)
+        rows.append(part.start + here)
+        corners.append(of_part[here])
+    return np.concatenate(rows), np.concatenate(corners)
+
+
+def points_in_cells(grid: Grid, bodies: Sequence[Body]) -> NDArray[np.float64]:
+    """Return how many points of bodies as seeded are in each cell of the grid (cells,)."""
+    out = np.zeros(int(np.prod(grid.shape)))
+    for body in bodies:
+        for part in in_chunks(len(body)):
+            x = body.centre_of(part) if body.map is None else centroids(body.corners(part))
+            np.add.at(out, grid.number(grid.index(x)), 1.0)
+    return out
+
+
+def check_bodies(grid: Grid, bodies: Sequence[Body]) -> None:
+    """Refuse bodies of another dimension or outside of the grid, and a list that names one twice."""
+    check_different(bodies)
+    for i, body in enumerate(bodies):
+        if body.dim != grid.dim:
+            raise ValueError(f"body {i}: has {body.dim} coordinates, must have the grid's {grid.dim}")
+        check_inside(grid, body, f"body {i}")
+
+
+def check_different(bodies: Sequence[Body]) -> None:
+    """Refuse a list that names a body twice: conditions would count its faces twice and act on one of the two."""
+    for j, body in enumerate(bodies):
+        for i in range(j):
+            if bodies[i] is body:
+                raise ValueError(f"bodies {i} and {j}: are one and the same, must be two; seed the second one anew")

@@ -1,0 +1,170 @@
+# SPDX-License-Identifier: MIT
+"""Bodies whose domains are boxes of a lattice: known by a few numbers, whatever their size."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mpm_dolfinx.base.validation import asked, instance, numbers, whole
+from mpm_dolfinx.bodies.bodies import Body, check_inside
+from mpm_dolfinx.grid.grid import MOST, Grid, among, in_chunks
+from mpm_dolfinx.points.cutting import corner_bits
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LatticeBody(Body):
+    """A body whose domains are boxes of a lattice, all of them or some.
+
+    origin, spacing, count : (d,) — where the lattice begins, m, edges of its boxes, m, their number along each axis;
+    filled : (n,) — lexicographic numbers of those that the body has, ascending; None: all.
+    """
+
+    origin: NDArray[np.float64]
+    spacing: NDArray[np.float64]
+    count: tuple[int, ...]
+    filled: NDArray[np.integer] | None = None
+
+    def __len__(self) -> int:
+        return int(np.prod(self.count)) if self.filled is None else len(self.filled)
+
+    @property
+    def dim(self) -> int:
+        """Number d of coordinates."""
+        return len(self.count)
+
+    def _index(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the indices (m, d) of domains in the lattice."""
+        if self.filled is not None:
+            numbers = self.filled[chosen]
+        elif isinstance(chosen, slice):
+            numbers = np.arange(*chosen.indices(len(self)))
+        else:
+            numbers = np.arange(len(self))[chosen] if chosen.dtype == bool else chosen
+        return np.stack(np.unravel_index(numbers, self.count), axis=-1)
+
+    def lower_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the lower corners (m, d), m, of the boxes of domains."""
+        return self.origin + self._index(chosen) * self.spacing
+
+    def sides_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return whether faces (m, d, 2) of domains lie on the surface of the body."""
+        index = self._index(chosen)
+        out = np.stack([index == 0, index == np.array(self.count) - 1], axis=-1)
+        if self.filled is None:
+            return out
+        for axis, end in np.ndindex(self.dim, 2):
+            inner = np.flatnonzero(~out[:, axis, end])
+            beside = index[inner]
+            beside[:, axis] += 2 * end - 1
+            out[inner, axis, end] = ~among(np.ravel_multi_index(tuple(beside.T), self.count), self.filled)
+        return out
+
+    def _with_face(self, axis: int, end: int) -> NDArray[np.int64]:
+        """Return the domains (m,), ascending, of which the face at an end of an axis lies on the surface."""
+        if self.filled is not None:
+            return super()._with_face(axis, end)
+        along = [np.arange(n) for n in self.count]
+        along[axis] = np.array([end * (self.count[axis] - 1)])
+        return np.ravel_multi_index(np.ix_(*along), self.count).ravel()
+
+    @cached_property
+    def _ends(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Least and largest indices (d,) of the domains."""
+        if self.filled is None:
+            return np.zeros(self.dim, np.int64), np.array(self.count) - 1
+        parts = [self._index(part) for part in in_chunks(len(self))]
+        return np.min([p.min(axis=0) for p in parts], axis=0), np.max([p.max(axis=0) for p in parts], axis=0)
+
+    @property
+    def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Corners (d,), m, of the box around the body, before the map."""
+        low, high = (self.origin + index * self.spacing for index in self._ends)
+        return low, high + self.spacing
+
+    @property
+    def lattice(self) -> tuple[int, ...]:
+        """Domains along the axes of the lattice that they lie on, some of which may be empty."""
+        low, high = self._ends
+        return tuple(high - low + 1)
+
+    def nodes(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the numbers (m, 2^d) of the corners of domains, the same for a corner of several; lexicographic."""
+        corners = (self._index(rows) - self._ends[0])[:, None] + corner_bits(self.dim)
+        return np.ravel_multi_index(tuple(np.moveaxis(corners, 2, 0)), tuple(np.add(self.lattice, 1)))
+
+
+def box(grid: Grid, lower: ArrayLike, upper: ArrayLike, per_cell: int = 2, material: int = 0) -> Body:
+    """Seed the box [lower, upper] with a lattice of points that fills it exactly; return the body.
+
+    Parameters
+    ----------
+    grid
+        Background grid.
+    lower, upper : (d,), m
+        Corners of the box, inside the grid; they need not lie on grid lines.
+    per_cell
+        Points per cell and direction (rounded so that they fit the box), >= 1.  With 1, bodies of a few cells'
+        thickness bend too easily (a warning says so), and the error is about ten times that of 2.
+    material
+        Index of the material in the scene's list, >= 0.
+
+    Raises
+    ------
+    ValueError
+        A corner outside the grid, upper not above lower, or per_cell or material that is no such integer.
+    """
+    instance("body: grid", grid, Grid)
+    lower, upper = (
+        numbers(f"body: {name}", x, (grid.dim,), allowed=f"{grid.dim} finite coordinates")
+        for name, x in (("lower", lower), ("upper", upper))
+    )
+    if not (upper > lower).all():
+        raise ValueError(f"body: box {lower.tolist()} to {upper.tolist()}: upper must be > lower")
+    material, per_cell = whole("body: material", material, 0), whole("body: per_cell", per_cell)
+    count = np.maximum(1, np.rint((upper - lower) / (grid.h / per_cell))).astype(int)
+    lattice = {"origin": lower, "spacing": (upper - lower) / count, "count": tuple(count.tolist())}
+    return check_inside(grid, LatticeBody(**lattice, material=material))
+
+
+def shape(
+    grid: Grid, inside: Callable[[NDArray[np.float64]], NDArray[np.bool_]], per_cell: int = 2, material: int = 0
+) -> Body:
+    """Seed the points of the grid's own lattice whose centres are inside a shape; return the body.
+
+    Its surface is made of steps of a point's size: for smooth sides take `mapped`.
+
+    Parameters
+    ----------
+    grid
+        Background grid.
+    inside
+        Maps positions (n, d), m, to booleans (n,).
+    per_cell
+        Points per cell and direction, >= 1.
+    material
+        Index of the material in the scene's list, >= 0.
+
+    Raises
+    ------
+    ValueError
+        `inside` raises, gives no booleans or holds nowhere; per_cell or material that is no such integer.
+    """
+    instance("body: grid", grid, Grid)
+    material, per_cell = whole("body: material", material, 0), whole("body: per_cell", per_cell)
+    spacing = grid.h / per_cell
+    count = grid.shape * per_cell
+    index = np.stack(np.meshgrid(*map(np.arange, count), indexing="ij"), axis=-1).reshape(-1, grid.dim)
+    allowed = f"one bool a position, ({len(index)},)"
+    filled = np.asarray(asked("body: inside(x)", allowed, inside, grid.lower + (index + 0.5) * spacing))
+    if filled.shape != (len(index),) or filled.dtype != bool:  # a distance is neither inside nor outside
+        raise ValueError(f"body: inside(x) has shape {filled.shape} of {filled.dtype}, must be {allowed}")
+    if not filled.any():
+        raise ValueError("body: inside(x) holds at no point of the grid, must hold at one; the body fits in no cell")
+    numbers_of = np.flatnonzero(filled).astype(np.int32 if len(filled) <= MOST else np.int64)
+    lattice = {"origin": grid.lower, "spacing": spacing, "count": tuple(count.tolist()), "filled": numbers_of}
+    return check_inside(grid, LatticeBody(**lattice, material=material))

@@ -1,0 +1,301 @@
+# SPDX-License-Identifier: MIT
+"""The surface of the bodies."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mpm_dolfinx.base.validation import numbers
+from mpm_dolfinx.bodies.bodies import Body
+from mpm_dolfinx.bodies.touching import (
+    BITS,
+    SAME,
+    TINY,
+    Cover,
+    Faces,
+    covers,
+    face_vectors,
+    local,
+    split,
+    uncovered,
+    uncovered_triangles,
+    weights,
+    within,
+)
+from mpm_dolfinx.grid.grid import rounding
+from mpm_dolfinx.points.cutting import ABOUT_MIDDLE, FACES, corner_bits
+
+TANGENTIAL = {d: np.array([[a for a in range(d) if a != axis] for axis in range(d)]) for d in (2, 3)}
+"""Axes (d, d-1) along the faces of a domain that are across each axis."""
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Faces of domains on one side of the bodies, the same on every process; arrays over m faces.
+
+    A face of which several parts count has a row for each.
+
+    id : (m,) number of the point, ascending; face : (m,) number of the face in its domain, see `cutting.FACES`;
+    xi : (m, 2^(d-1), d) corners of the part of the face that counts, in the domain's coordinates from -1 to 1, of a
+    triangle the last one twice; domain, before : (m, 2^d, d) corners of the domain as seeded, after all maps and before
+    them (reference positions), m; region : (2, d) box of reference positions to which the faces are limited, m.
+    """
+
+    id: NDArray[np.int64]
+    face: NDArray[np.int64]
+    xi: NDArray[np.float64]
+    domain: NDArray[np.float64]
+    before: NDArray[np.float64]
+    region: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.id)
+
+    def off_axis(self) -> Surface:
+        """Return the faces but for those that lie on the axis of revolution, where they have no area."""
+        off = self.places()[:, :, 0].max(axis=1, initial=0.0) > 1e-9 * self.whole0
+        if off.all():
+            return self
+        rows = {f.name: getattr(self, f.name)[off] for f in fields(self) if f.name != "region"}
+        return Surface(**rows, region=self.region)
+
+    @cached_property
+    def outward(self) -> NDArray[np.float64]:
+        """Outward area vectors (m, d) of the whole faces as seeded, m^(d-1)."""
+        return face_vectors(self.domain, self.face)
+
+    @cached_property
+    def whole0(self) -> NDArray[np.float64]:
+        """Area (m,) of the whole faces as seeded, m^(d-1)."""
+        return np.linalg.norm(self.outward, axis=1)
+
+    @cached_property
+    def area0(self) -> NDArray[np.float64]:
+        """Area (m,) of the parts that count as seeded, m^(d-1)."""
+        x = self.places()
+        if x.shape[2] == 2:
+            return np.linalg.norm(x[:, 1] - x[:, 0], axis=1)
+        return np.linalg.norm(np.cross(x[:, 3] - x[:, 0], x[:, 2] - x[:, 1]), axis=1) / 2
+
+    @cached_property
+    def skew(self) -> NDArray[np.bool_]:
+        """Which faces (m,) are no parallelograms as seeded."""
+        x = np.take_along_axis(self.domain, FACES[self.xi.shape[2]][self.face][:, :, None], axis=1)
+        off = np.linalg.norm(x[:, -1] - x[:, 1] - x[:, -2] + x[:, 0], axis=1) if x.shape[2] == 3 else np.zeros(len(x))
+        return off > SAME * np.ptp(x, axis=1).max(axis=1)
+
+    def places(self) -> NDArray[np.float64]:
+        """Return where the corners of the parts (m, 2^(d-1), d) are as seeded, m."""
+        domain = np.repeat(self.domain, self.xi.shape[1], axis=0)
+        return interpolate(domain, self.xi.reshape(-1, self.xi.shape[2])).reshape(self.xi.shape)
+
+    def reference(self, at: NDArray[np.int64], xi: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the reference positions (n, d), m, of places xi (n, d) on faces."""
+        return np.clip(interpolate(self.before[at], xi), *self.region)
+
+    @cached_property
+    def corners(self) -> NDArray[np.float64]:
+        """Reference positions (m, 2^(d-1), d) of the corners of the parts, m."""
+        at = np.repeat(np.arange(len(self)), self.xi.shape[1])
+        return self.reference(at, self.xi.reshape(len(at), self.xi.shape[2])).reshape(self.xi.shape)
+
+    @property
+    def X(self) -> NDArray[np.float64]:
+        """Boxes (m, 2, d) around the parts in reference positions, m."""
+        return np.stack([self.corners.min(axis=1), self.corners.max(axis=1)], axis=1)
+
+
+Region = tuple[ArrayLike, ArrayLike]
+
+
+def limits(region: Region | None, dim: int) -> NDArray[np.float64]:
+    """Return the corners (2, d) of a region, m; without one, of all space.
+
+    Equal regions have equal bytes (`tobytes`), however they are given: by these they are compared.
+    """
+    if region is None:
+        return np.repeat([[-np.inf], [np.inf]], dim, axis=1)
+    allowed = f"two corners of {dim} coordinates each, the lower first"
+    corners = numbers("region", region, (2, dim), allowed=allowed, test=lambda x: x[0] <= x[1])
+    return np.ascontiguousarray(corners) + 0.0  # no -0
+
+
+def surface(
+    bodies: Sequence[Body], name: str | None, region: Region | None = None, present: Sequence[bool] | None = None
+) -> Surface:
+    """Return the faces on a named side of the bodies that are present, but for what of them lies on another body.
+
+    Bodies lie on one another as they are seeded, after their maps, and from then on: bodies that touch stick.
+
+    Parameters
+    ----------
+    name
+        Side: of lattices "left", "right", "bottom", "top", in 3D also "front", "back"; of meshes as these name it.
+        None: all sides.
+    region : ((d,), (d,)), m
+        Box of reference positions that limits the faces; faces partly in it count with that part.
+    present
+        Which bodies are there, by default all.
+    """
+    there = [present is None or bool(present[i]) for i in range(len(bodies))]
+    dim, known = bodies[0].dim, dict.fromkeys(name for body in bodies for name in body.names)
+    if name is not None and (not isinstance(name, str) or name not in known):
+        raise ValueError(f"side {name!r}: must be one of {', '.join(known) or 'none: no body has a side with a name'}")
+    box = limits(region, dim)
+    around = [Faces.around(body) if here and sum(there) > 1 else None for body, here in zip(bodies, there, strict=True)]
+    none = np.empty(0, np.int64)
+    start, found = 0, [(none, none, *(np.empty((0, n, dim)) for n in (2 ** (dim - 1), 2**dim, 2**dim)))]
+    for i, body in enumerate(bodies):
+        on = body.outer() if name is None else body.named(name)
+        row, face = _in_region(body, *on, box) if there[i] else (none, none)
+        others = [faces for j, faces in enumerate(around) if faces is not None and j != i]
+        part, t = _free(Faces.of(body, row, face), others)
+        part, xi = _limited(body, row, face, part, t, box)
+        row, face = row[part], face[part]
+        found.append((start + row, face, xi, body.corners(row), body.reference(row)))
+        start += len(body)
+    return Surface(*map(np.concatenate, zip(*found, strict=True)), box)
+
+
+def joined(surfaces: Sequence[Surface]) -> Surface:
+    """Return the faces of several surfaces, of other bodies each, as one."""
+    names = [f.name for f in fields(Surface) if f.name != "region"]
+    rows = {name: np.concatenate([getattr(one, name) for one in surfaces]) for name in names}
+    order = np.argsort(rows["id"], kind="stable")
+    return Surface(**{name: values[order] for name, values in rows.items()}, region=surfaces[0].region)
+
+
+def _face_corners(body: Body, row: NDArray[np.int64], face: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the reference positions (m, 2^(d-1), d), m, of the corners of faces."""
+    return np.take_along_axis(body.reference(row), FACES[body.dim][face][:, :, None], axis=1)
+
+
+def _in_region(
+    body: Body, row: NDArray[np.int64], face: NDArray[np.int64], region: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return those of a body's faces that may have a part in a box (2, d) of all space."""
+    x = _face_corners(body, row, face)
+    low, high = x.min(axis=1), x.max(axis=1)
+    size = high - low
+    slack = 1e-9 * size.max(axis=1, keepdims=True) + rounding(x)  # slivers are none: their domains would count as held
+    within = (low >= region[0] - slack) & (high <= region[1] + slack)
+    common = np.minimum(high, region[1]) - np.maximum(low, region[0])
+    on = np.where(size <= slack, within, common > slack).all(axis=1)
+    return row[on], face[on]
+
+
+def _limited(
+    body: Body,
+    row: NDArray[np.int64],
+    face: NDArray[np.int64],
+    part: NDArray[np.int64],
+    t: NDArray[np.float64],
+    region: NDArray[np.float64],
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return what of parts t (n, 4, 2) of faces part (n,) lies in a region: their faces (m,), and xi as of a `Surface`.
+
+    row, face (k,): domains, and numbers in them, of all faces.
+    """
+    dim, three = body.dim, (t[:, 2] == t[:, 3]).all(axis=1)
+    X = _face_corners(body, row[part], face[part])
+    bent, clipped, of = np.zeros(len(X), dtype=bool), np.empty((0, 3, 2)), np.empty(0, np.int64)
+    if dim == 3 and body.lattice is None:  # faces that are not whole, and no rectangles along the axes
+        bent = ((X.min(axis=1) < region[0]) | (X.max(axis=1) > region[1])).any(axis=1) & ~_along_axes(X)
+        clipped, of = _clipped(X[bent], t[bent], region)
+    quad, three = np.flatnonzero(~bent & ~three), np.flatnonzero(~bent & three)
+    low, high = _interval(X, region)
+    triangles, at = within(t[three, :3].transpose(1, 2, 0), three, low[three], high[three])
+    triangles = np.concatenate([triangles.transpose(2, 0, 1), clipped])
+    quads = np.clip(t[quad], low[quad, None], high[quad, None])
+    at = np.concatenate([quad, at, np.flatnonzero(bent)[of]])
+    t = np.concatenate([quads, triangles[:, [0, 1, 2, 2]]])
+    kept = np.flatnonzero((np.ptp(t, axis=1) > 0).all(axis=1))
+    kept = kept[np.lexsort((at[kept], row[part[at[kept]]]))]
+    part, t = part[at[kept]], t[kept][:, : 2 ** (dim - 1), : dim - 1]
+    axis, end = (k[:, None] for k in np.divmod(face[part], 2))
+    xi = np.empty((*t.shape[:2], dim))
+    np.put_along_axis(xi, np.broadcast_to(TANGENTIAL[dim][axis], t.shape), 2 * t - 1, axis=2)
+    np.put_along_axis(xi, np.broadcast_to(axis[:, None], xi[:, :, :1].shape), 2.0 * end[:, None] - 1, axis=2)
+    return part, xi
+
+
+def _along_axes(X: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which faces (n,), of corners (n, 4, 3), m, are rectangles with edges along the axes."""
+    edges = X[:, [1, 2, 3, 3]] - X[:, [0, 0, 2, 1]]
+    return ((np.abs(edges) > rounding(X)).sum(axis=2) == 1).all(axis=1)
+
+
+def _interval(X: NDArray[np.float64], region: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return from where to where (n, 2), in the coordinates of faces, these lie in a region.
+
+    X (n, 2^(d-1), d), m: reference positions of the corners of edges, or of rectangles along the axes.
+    """
+    low, high = np.zeros((len(X), 2)), np.ones((len(X), 2))
+    for k in range(X.shape[2] - 1):
+        way = X[:, 1 << k] - X[:, 0]
+        with np.errstate(divide="ignore", invalid="ignore"):  # along an axis that does not limit them
+            ends = np.where(np.abs(way) > rounding(X), (region[:, None] - X[:, 0]) / way, [[[-np.inf]], [[np.inf]]])
+        low[:, k] = np.maximum(0.0, ends.min(axis=0).max(axis=1))
+        high[:, k] = np.minimum(1.0, ends.max(axis=0).min(axis=1))
+    return low, np.maximum(low, high)
+
+
+def _clipped(
+    X: NDArray[np.float64], t: NDArray[np.float64], region: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return what lies in a region of parts t (n, 4, 2) of faces X (n, 4, 3): triangles, and the parts they are of."""
+    places = np.einsum("npk,nkd->npd", weights(t.reshape(-1, 2)).reshape(*t.shape[:2], 4), X)
+    three = (t[:, 2] == t[:, 3]).all(axis=1)[:, None]  # triangles, about a corner
+    middle = np.where(three, places[:, 2], places.mean(axis=1))
+    places = np.concatenate([places, middle[:, None]], axis=1)
+    s = np.concatenate([places[:, list(triangle)].transpose(1, 2, 0) for triangle in ABOUT_MIDDLE], axis=2)
+    at = np.tile(np.arange(len(X)), len(ABOUT_MIDDLE))
+    for axis in range(3):
+        _, _, s, at = split(s, at, axis, region[0, axis])
+        s, at, _, _ = split(s, at, axis, region[1, axis])
+    diagonals = np.cross(X[:, 3] - X[:, 0], X[:, 2] - X[:, 1])
+    normal = diagonals / np.maximum(np.linalg.norm(diagonals, axis=1, keepdims=True), TINY)
+    return np.clip(local(X[at], s.transpose(2, 0, 1), normal[at])[0], 0.0, 1.0), at
+
+
+def _free(own: Faces, others: Sequence[Faces]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return the free parts of faces: the face (n,) of each, and its corners (n, 4, 2), from 0 to 1 over the face.
+
+    They are rectangles where boxes lie along the face's edges, else triangles, whose last corner comes twice.
+    """
+    on = [covers(own, other) for other in others]
+    if not on:
+        return np.arange(len(own.row)), np.tile(BITS, (len(own.row), 1, 1)).astype(float)
+    cover = Cover(*(np.concatenate([getattr(c, f.name) for c in on]) for f in fields(Cover)))
+    turned = np.isin(cover.face, cover.face[cover.corner[:, 0] < 0])
+    row, low, high = uncovered(len(own.row), *(x[~turned] for x in (cover.face, cover.low, cover.high, cover.slack)))
+    whole = ~np.isin(row, cover.face[turned])
+    quads = np.where(BITS, high[whole, None], low[whole, None])
+    if not turned.any():
+        return row, quads
+    split, triangles = uncovered_triangles(own, cover, np.unique(cover.face[turned]))
+    return np.concatenate([row[whole], split]), np.concatenate([quads, triangles[:, [0, 1, 2, 2]]])
+
+
+def interpolate(corners: NDArray[np.float64], xi: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the positions (m, d) in domains (m, 2^d, d) at local coordinates (m, d) from -1 to 1."""
+    signs = 2 * corner_bits(xi.shape[1]) - 1
+    N = (0.5 * (1 + signs * xi[:, None, :])).prod(axis=2)
+    return np.einsum("mk,mkd->md", N, corners)
+
+
+def on_face(
+    corners: NDArray[np.float64], face: NDArray[np.int64], x: NDArray[np.float64], xi: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return coordinates xi (n, 3) in domains (n, 8, 3) with those along faces (n,) put to places x (n, 3) on these."""
+    quads = np.take_along_axis(corners, FACES[3][face][:, :, None], axis=1)
+    normal = face_vectors(corners, face)
+    t, _ = local(quads, x[:, None], normal)
+    out = xi.copy()
+    np.put_along_axis(out, TANGENTIAL[3][face // 2], 2 * t[:, 0] - 1, axis=1)
+    return out

@@ -1,0 +1,228 @@
+# SPDX-License-Identifier: MIT
+"""Bodies that come later are put onto the present surface of those that they were seeded to touch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from mpi4py import MPI
+from petsc4py import PETSc
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array, csr_array, diags
+
+from mpm_dolfinx.bodies.bodies import Body
+from mpm_dolfinx.bodies.touching import Cover, Faces, covered, covers, local, meeting, warn_near, weights
+from mpm_dolfinx.grid.grid import REACH, Grid
+from mpm_dolfinx.parallel.exchange import over_all
+from mpm_dolfinx.parallel.messages import warn
+from mpm_dolfinx.points.cutting import FACES, TANGLED, centroids, domain_volumes, volumes
+from mpm_dolfinx.points.material_points import MaterialPoints
+
+MISFIT = 0.01  # cells: fills whose straight edges are further off a bent surface are named in a warning
+UPRIGHT = 0.95  # cosine: what of a mesh looks that straight away from what it lies on stays where it was seeded
+INSIDE = 0.05  # of a domain's shortest edge: what lies deeper in a fill is in its way
+
+
+@dataclass
+class Contact:
+    """Where a side of a fill lies on a body, as seeded; n pairs of faces.
+
+    side : (axis, end) of the fill; own, other: faces of both; cover: which lie on which; moved : (n, 4, d), m, how far
+    the corners of the body's faces have moved since they were seeded.
+    """
+
+    side: tuple[int, int]
+    own: Faces
+    other: Faces
+    cover: Cover
+    moved: NDArray[np.float64]
+
+    def area(self) -> float:
+        """Return how large it is, m^(d-1)."""
+        return float(covered(len(self.own.row), self.cover) @ np.linalg.norm(self.own.outward, axis=1))
+
+    def corners(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return domains (n, 1) of the fill, and which of their corners (n, 4) the paired faces have."""
+        face = self.cover.face
+        return self.own.row[face][:, None], self.own.index[face]
+
+    def given(self) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+        """Return which corners (n, 4) of the fill's faces lie on the paired one, and its way there (n, 4, d), m."""
+        face, by = self.cover.face, self.cover.by
+        s, _ = local(self.other.corners[by], self.own.corners[face], self.other.outward[by])
+        on = np.abs(s - 0.5).max(axis=2) <= 0.5 + np.maximum(self.cover.slack, 1e-9)[:, None]
+        return on, weights(np.clip(s, 0, 1).reshape(-1, 2)).reshape(*s.shape[:2], 4) @ self.moved
+
+    def misfit(self, u: NDArray[np.float64]) -> float:
+        """Return how far corners of the body come to lie off the fill, m, if its domains' corners move by u."""
+        on = (np.abs(self.cover.t - 0.5) <= 0.5).all(axis=2)
+        share = weights(np.clip(self.cover.t, 0, 1).reshape(-1, 2)).reshape(*on.shape, 4)
+        off = share @ u[self.corners()] - self.moved
+        return float(np.linalg.norm(off, axis=2)[on].max(initial=0.0))
+
+
+def touches(bodies: Sequence[Body], there: Sequence[int], fill: int) -> bool:
+    """Whether a fill as seeded touches one of the bodies that are there."""
+    own = Faces.around(bodies[fill])
+    return any(len(covers(own, Faces.around(bodies[other])).face) for other in there)
+
+
+def put(
+    grid: Grid, bodies: Sequence[Body], there: Sequence[int], fill: int, points: MaterialPoints, new: MaterialPoints
+) -> MaterialPoints:
+    """Return the points of a fill put onto the bodies that are there.
+
+    Its sides that touch bodies as seeded follow these, the side opposite to the largest contact stays where it was
+    seeded, and what lies between follows evenly: at rest, its domains have the places and volumes that are left to it.
+
+    Parameters
+    ----------
+    bodies, there, fill
+        All bodies, which of them are there, and which one comes.
+    points, new
+        This process's points of those that are there, and of the fill as seeded.
+
+    Raises
+    ------
+    ValueError
+        What is there has moved into the fill; the message says where and how far.
+    """
+    body, corners, misfit = bodies[fill], bodies[fill].corners(), 0.0
+    found = {other: _contacts(grid, bodies, other, body, points) for other in there}
+    contacts = [contact for one in found.values() for contact in one]
+    if any(contact.moved.any() for contact in contacts):
+        u = _follow(grid, body, corners, contacts)
+        misfit = max(contact.misfit(u) for contact in contacts)
+        _check_shape(grid, fill, body, corners, u)
+        corners = corners + u
+    if misfit > MISFIT * grid.h.min():
+        what = "stage: add: body %d: its straight edges are up to %.2g m off the surface that it is put on"
+        warn(grid.comm, what + "; seed it with the spacing of what it lies on", fill, misfit)
+    for other, touching in found.items():
+        depth, gap, x = _room(grid, bodies, other, corners, points, misfit)
+        if depth:
+            what = f"stage: add: body {fill}: body {other} has moved into it, {depth:.3g} m deep at {x}"
+            raise ValueError(f"{what}; must be seeded where nothing is by now")
+        together = grid.copies == 1 or np.ptp(grid.copy(np.array([_start(bodies, i) for i in (other, fill)]))) == 0
+        if together and not touching:
+            warn_near(grid, f"bodies {other} and {fill}", gap, x)
+    mine = corners[new.id - _start(bodies, fill)]
+    if (mine == new.corners).all():
+        return new
+    volume = domain_volumes(mine, grid.axisymmetric)
+    return replace(new, corners=mine, x=centroids(mine), volume0=volume, origin=mine, reference=mine)
+
+
+def _start(bodies: Sequence[Body], body: int) -> int:
+    """Return the number of the first point of a body."""
+    return sum(len(b) for b in bodies[:body])
+
+
+def _contacts(grid: Grid, bodies: Sequence[Body], other: int, fill: Body, points: MaterialPoints) -> list[Contact]:
+    """Return where a fill lies on a body."""
+    around, out = Faces.around(bodies[other]), []
+    for axis in range(grid.dim):
+        for end in (0, 1):
+            own = Faces.of(fill, *fill.facing(axis, end))
+            cover = covers(own, around)
+            if len(cover.face):
+                rows, pair = np.unique(around.row[cover.by], return_inverse=True)
+                now = np.zeros((len(rows), 2**grid.dim, grid.dim))
+                here, at = points.find(_start(bodies, other) + rows)
+                now[here] = points.corners[at]
+                moved = over_all(grid.comm, now) - bodies[other].corners(rows)
+                moved = moved[pair[:, None], around.index[cover.by]]
+                out.append(Contact((axis, end), own, around, cover, moved))
+    return out
+
+
+def _follow(grid: Grid, body: Body, corners: NDArray[np.float64], contacts: Sequence[Contact]) -> NDArray[np.float64]:
+    """Return the displacement (n, 2^d, d), m, of the corners of a fill that follows what it lies on."""
+    number = body.nodes(np.arange(len(body)))
+    nodes, node = np.unique(number, return_inverse=True)
+    node = node.reshape(number.shape)
+    u, hits, x = np.zeros((len(nodes), grid.dim)), np.zeros(len(nodes)), np.empty((len(nodes), grid.dim))
+    x[node] = corners
+    for contact in contacts:
+        on, moved = contact.given()
+        at = node[contact.corners()]
+        np.add.at(u, at[on], moved[on])
+        np.add.at(hits, at[on], 1.0)
+    u[hits > 0] /= hits[hits > 0, None]
+    sides: dict[tuple[int, int], float] = {}
+    for contact in contacts:
+        sides[contact.side] = sides.get(contact.side, 0.0) + contact.area()
+    axis, end = max(sides, key=sides.get)
+    opposite = Faces.of(body, *body.facing(axis, 1 - end, UPRIGHT))
+    fixed = np.minimum(np.abs(x - grid.lower), np.abs(x - grid.upper)) < 1e-9 * grid.h  # along a wall it only slides
+    fixed[hits > 0] = True
+    fixed[node[opposite.row[:, None], opposite.index]] = True
+    K = _springs(body, node, len(nodes))
+    return np.stack([_between(K, *column) for column in zip(fixed.T, u.T, strict=True)], axis=1)[node]
+
+
+def _springs(body: Body, node: NDArray[np.int64], count: int) -> csr_array:
+    """Return the matrix (count, count) of springs along the edges of a body's domains."""
+    X, ends = body.reference(), [(FACES[body.dim][2 * axis], FACES[body.dim][2 * axis + 1]) for axis in range(body.dim)]
+    a, b = (np.concatenate([node[:, pair[k]].ravel() for pair in ends]) for k in (0, 1))
+    length = np.concatenate([((X[:, f] - X[:, g]) ** 2).sum(axis=2).ravel() for f, g in ends])
+    stiffness = length.min() / length
+    W = coo_array((np.tile(stiffness, 2), (np.concatenate([a, b]), np.concatenate([b, a]))), shape=(count, count))
+    return (diags(W.sum(axis=1)) - W).tocsr()
+
+
+def _between(K: csr_array, fixed: NDArray[np.bool_], u: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return displacements (n,) along an axis, those that are fixed and the others in balance with them."""
+    out, free = u.copy(), np.flatnonzero(~fixed)
+    if len(free):
+        held = np.flatnonzero(fixed)
+        rows = K[free]
+        A = rows[:, free].tocsr()
+        csr = (A.indptr.astype(PETSc.IntType), A.indices.astype(PETSc.IntType), A.data)
+        matrix = PETSc.Mat().createAIJ(A.shape, csr=csr, comm=MPI.COMM_SELF)  # all processes have all seeded bodies
+        solver = PETSc.KSP().create(MPI.COMM_SELF)
+        solver.setErrorIfNotConverged(True)
+        solver.setOperators(matrix)
+        solver.setType("cg")
+        solver.getPC().setType("icc")
+        solver.setTolerances(rtol=1e-12)
+        x, b = matrix.createVecs()
+        b.array[:] = -(rows[:, held] @ u[held])
+        solver.solve(b, x)
+        out[free] = x.array
+        for made in (solver, matrix, x, b):
+            made.destroy()
+    return out
+
+
+def _check_shape(grid: Grid, fill: int, body: Body, corners: NDArray, u: NDArray) -> None:
+    """Refuse a fill of which next to nothing is left, or that leaves the grid."""
+    now = corners + u
+    ratio = volumes(now) / volumes(corners)
+    k = int(np.argmin(ratio))
+    far = np.linalg.norm(u, axis=2).max()
+    name = f"stage: add: body {fill}: what it was seeded to touch has moved by up to {far:.3g} m"
+    if ratio[k] < TANGLED:
+        raise ValueError(
+            f"{name}; to its domain at {corners[k].mean(axis=0)} it leaves {ratio[k]:.2g} of the volume, must leave "
+            f"{TANGLED}"
+        )
+    out = np.flatnonzero(grid.outside(now.reshape(-1, grid.dim), REACH))
+    if len(out):
+        x = now.reshape(-1, grid.dim)[out[0]]
+        raise ValueError(f"{name}; following it, it has a corner at {x}, must be inside {grid.lower} to {grid.upper}")
+
+
+def _room(
+    grid: Grid, bodies: Sequence[Body], other: int, corners: NDArray, points: MaterialPoints, misfit: float
+) -> tuple[float, float, NDArray[np.float64]]:
+    """Return how deep a body lies in a fill's domains now, m, else how many cells it is apart, and where."""
+    start = _start(bodies, other)
+    rows = np.flatnonzero((points.id >= start) & (points.id < start + len(bodies[other])))
+    both = [(c, INSIDE / 2 * np.ptp(c, axis=1).min(axis=1) + misfit) for c in (points.corners[rows], corners)]
+    found = grid.comm.allgather(meeting(*both, grid.h))
+    deepest, nearest = max(found, key=lambda m: m[0]), min(found, key=lambda m: m[1])
+    return deepest if deepest[0] else nearest

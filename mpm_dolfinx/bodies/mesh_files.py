@@ -1,0 +1,357 @@
+# SPDX-License-Identifier: MIT
+"""Meshes of others as bodies: files and objects of meshio, meshes of dolfinx with their tags."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import redirect_stderr, redirect_stdout
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+from mpi4py import MPI
+
+import meshio
+import numpy as np
+from dolfinx import mesh as dolfinx_mesh
+from numpy.typing import NDArray
+
+from mpm_dolfinx.base import _compat
+from mpm_dolfinx.base.validation import instance, line, line_of, path
+from mpm_dolfinx.bodies import mesh_readers
+from mpm_dolfinx.bodies.mesh_cells import AS_LATTICE, KINDS, SECOND_ORDER, SIDES_OF, distinct, edges
+from mpm_dolfinx.bodies.meshes import Mesh, MeshBody, seeded
+from mpm_dolfinx.grid.grid import Grid
+from mpm_dolfinx.parallel.exchange import at_root
+from mpm_dolfinx.parallel.messages import warn
+from mpm_dolfinx.points.cutting import FACES
+
+TAGS = ("gmsh:physical", "medit:ref", "cell_tags", "MaterialIDs", "attribute", "material", "nastran:ref", "su2:tag")
+TAGS += ("avsucd:material", "ugrid:ref", "netgen:index", "tetgen:ref", "cell_markers", "CellEntityIds")
+"""Data of meshio's cells that number parts and sides."""
+OF_DOLFINX = {2: {"triangle": 6, "quad": 9}, 3: {"tetra": 10, "hexahedron": 27}}
+"""Cells of dolfinx that become domains, and their numbers of nodes where they are of second order."""
+FLAT = 1e-9  # of the size of a mesh in the plane: how far its vertices may lie off it
+
+
+def from_mesh(
+    grid: Grid,
+    mesh: str | os.PathLike | meshio.Mesh | dolfinx_mesh.Mesh,
+    part: str | None = None,
+    *,
+    cell_tags: Any = None,
+    facet_tags: Any = None,
+    names: Mapping[str, int] | None = None,
+    per_cell: int = 2,
+    material: int = 0,
+) -> MeshBody:
+    """Seed a body from a mesh: its cells are the points' domains; return the body.
+
+    Sides have the names of the mesh's facets: gmsh's physical groups of lines in 2D, of surfaces in 3D, surfaces of
+    Abaqus, or facet tags.
+    A body of each part of a mesh shares its inner faces with those of the others: no surface is between them while both
+    are there.  Reference positions are those of the mesh.  Its points lie on no lattice, along which waves that no node
+    sees would be filtered.
+
+    Parameters
+    ----------
+    grid
+        Background grid.
+    mesh
+        A file that meshio reads, an input file of Abaqus, a meshio mesh, or a dolfinx mesh: of triangles and
+        quadrilaterals in 2D, of tetrahedra, hexahedra, wedges and pyramids in 3D.  Of cells of second order the corners
+        are taken (a warning says how far nodes lie off straight edges).  In 2D cells lie in a plane of equal z.
+    part
+        Name of a group of cells, such as a physical group, a part, instance or set of Abaqus, or a number in data such
+        as "MaterialIDs"; by default all cells.
+    cell_tags, facet_tags
+        Of a dolfinx mesh; cell_tags also the name of a file's data of cells that number parts and sides.
+    names
+        Numbers of tags by the names that they get; others without a name are called by their digits, such as "3".
+    per_cell
+        Points per cell of the grid and direction that are wanted, >= 1: domains with an edge of more than 1.5 cells /
+        per_cell are split.
+    material
+        Index of the material in the scene's list, >= 0.
+
+    Raises
+    ------
+    ValueError
+        A file that is not there or cannot be read, another kind of mesh, unknown parts, cells that are flat, inside out
+        or not convex, that are there twice or lie on one another, vertices outside the grid, hanging or doubled nodes.
+    """
+    instance("body: grid", grid, Grid)
+    name, names = "mesh", _numbers(names)
+    if isinstance(mesh, (str, os.PathLike)):
+        name, file = f"mesh {os.fspath(mesh)}", path("mesh", mesh)
+        mesh = at_root(grid.comm, lambda: _file(file))
+    if isinstance(mesh, meshio.Mesh):
+        if not (cell_tags is None or isinstance(cell_tags, str)) or facet_tags is not None:
+            raise ValueError(
+                "mesh: cell_tags and facet_tags must be of a dolfinx mesh; or cell_tags a name of cells' data"
+            )
+        found = _of_meshio(grid, mesh, names, cell_tags, name)
+    else:
+        instance("mesh", mesh, dolfinx_mesh.Mesh)
+        found = _of_dolfinx(grid, mesh, cell_tags, facet_tags, names)
+    return seeded(grid, found, part, per_cell, material, name)
+
+
+def _file(file: Path) -> meshio.Mesh:
+    """Return the mesh of a file; what meshio prints of it is kept for the message."""
+    said = StringIO()
+    try:
+        with redirect_stdout(said), redirect_stderr(said):
+            return mesh_readers.read(file)
+    except (Exception, SystemExit) as error:  # meshio ends the program where it cannot read a file
+        why = line_of(error) if isinstance(error, Exception) else " ".join(said.getvalue().split())
+        why = why or type(error).__name__
+        allowed = "" if " must " in why else "; must be a file that meshio reads"
+        raise ValueError(f"mesh {file}: {why}{allowed}") from None
+
+
+def _of_meshio(grid: Grid, mesh: meshio.Mesh, names: Mapping[str, int], tags: str | None, name: str) -> Mesh:
+    """Return a mesh of meshio's; tags: name of the cells' data that number parts and sides."""
+    mesh_readers.check_systems(mesh)
+    dim, x, sets = grid.dim, _positions(grid.dim, mesh.points), mesh_readers.sets_of(mesh)
+    blocks, curved, off = [], 0, 0.0
+    for block in mesh.cells:
+        kind, rows = _first_order(dim, block)
+        _check_nodes(rows, len(x))
+        if kind != block.type and kind in KINDS[dim]:
+            curved, off = curved + len(rows), max(off, _beside(x, rows, kind))
+        blocks.append((kind, rows[:, : _vertices(dim, kind)]))
+    if curved:
+        _warn_curved(grid, name, curved, off)
+    if tags is not None and tags not in mesh.cell_data:
+        known = ", ".join(mesh.cell_data) or "none, for its cells have no data"
+        raise ValueError(f"mesh: cell_tags = {line(tags)}, must be one of the mesh's data of cells: {known}")
+    cells = {kind: [np.empty((0, count), np.int64)] for kind, count in KINDS[dim].items()}
+    parts, sides = {}, {}
+    for i, (kind, rows) in enumerate(blocks):
+        inner, facet = kind in KINDS[dim], kind in SIDES_OF[dim]
+        numbers = _groups(mesh, sets, i, len(rows), dim if inner else dim - 1, names, tags) if inner or facet else ()
+        for group, chosen in dict(numbers).items():
+            if inner:
+                start = sum(map(len, cells[kind]))
+                parts.setdefault(group, {k: [] for k in cells})[kind].append(start + np.flatnonzero(chosen))
+            else:
+                sides.setdefault(group, []).append(rows[chosen])
+        if inner:
+            cells[kind].append(rows[:, AS_LATTICE.get(kind, slice(None))])
+    parts = {
+        group: {kind: np.concatenate([np.empty(0, np.int64), *rows]) for kind, rows in found.items()}
+        for group, found in parts.items()
+    }
+    cells, parts = _merged({kind: np.concatenate(rows) for kind, rows in cells.items()}, parts)
+    return Mesh(_plane(dim, x, cells), cells, parts, sides)
+
+
+def _positions(dim: int, points: Any) -> NDArray[np.float64]:
+    """Return the vertices (n, 2 or 3), m, of a mesh."""
+    x = np.asarray(points, dtype=float)
+    if not len(x):
+        raise ValueError("mesh: has no vertices, must have cells to fill a body")
+    if x.ndim != 2 or not dim <= x.shape[1] <= 3:
+        raise ValueError(f"mesh: its vertices have shape {x.shape}, must have the grid's {dim} coordinates")
+    return x
+
+
+def _first_order(dim: int, block: Any) -> tuple[str, NDArray[np.int64]]:
+    """Return the kind of a block of meshio's cells, of second order that of their corners, and their nodes."""
+    kind = SECOND_ORDER.get(block.type, block.type)
+    if kind not in [*KINDS[dim], *SIDES_OF[dim], "vertex", "line"]:
+        raise ValueError(f"mesh: has cells {block.type!r}, must be of {' and '.join(KINDS[dim])} for a grid in {dim}D")
+    rows = np.asarray(block.data, dtype=np.int64)
+    return kind, rows if rows.ndim == 2 else rows.reshape(len(rows), 0)
+
+
+def _vertices(dim: int, kind: str) -> int:
+    """Return how many vertices a cell of a kind has."""
+    return {"vertex": 1, "line": 2, **SIDES_OF[dim], **KINDS[dim]}[kind]
+
+
+def _check_nodes(rows: NDArray[np.int64], count: int) -> None:
+    """Refuse cells of nodes that are not there."""
+    if rows.size and not (rows.min() >= 0 and rows.max() < count):
+        worst = rows.min() if rows.min() < 0 else rows.max()
+        raise ValueError(f"mesh: a cell has the node {worst}, must be one of {count}, from 0 on")
+
+
+def _beside(x: NDArray[np.float64], rows: NDArray[np.int64], kind: str) -> float:
+    """Return how far nodes on the edges of cells of second order lie, at most, from the middles of these, m.
+
+    These nodes follow the vertices; their order is that of a format.
+    """
+    first, second = np.array(edges(kind)).T
+    corners = x[rows[:, AS_LATTICE.get(kind, range(1 + second.max()))]]
+    middles = (corners[:, first] + corners[:, second]) / 2
+    on = x[rows[:, corners.shape[1] : corners.shape[1] + len(first)]]
+    nearest = [np.linalg.norm(middles - on[:, k, None], axis=2).min(axis=1) for k in range(on.shape[1])]
+    return float(np.max(nearest, initial=0.0))
+
+
+def _warn_curved(grid: Grid, name: str, count: int, off: float) -> None:
+    """Log a warning of cells of second order, whose corners alone are taken."""
+    what = (
+        "%s: %d cells are of second order: their corners are taken, and edges are straight; nodes between corners lie "
+    )
+    warn(grid.comm, what + "up to %.2g m off the middles", name, count, off)
+
+
+def _merged(
+    cells: dict[str, NDArray[np.int64]], parts: dict[str, dict[str, NDArray[np.int64]]]
+) -> tuple[dict[str, NDArray[np.int64]], dict[str, dict[str, NDArray[np.int64]]]]:
+    """Return cells, and their indices by parts, in which those of several parts are there once.
+
+    gmsh's format 2.2 has a cell once for each of its physical groups.
+    """
+    cells = dict(cells)
+    for kind, rows in cells.items():
+        first, same = distinct(np.sort(rows, axis=1))
+        if len(first) == len(rows):
+            continue
+        several = np.flatnonzero(np.bincount(same)[same] > 1)
+        member = np.stack([np.isin(several, found[kind]) for found in parts.values()] or [np.zeros(len(several), bool)])
+        if len(np.unique(np.stack([same[several], *member]), axis=1).T) < len(several):
+            continue  # twice in the same parts: refused, if it is to be filled
+        order = np.argsort(first)  # as they come
+        number = np.empty_like(order)
+        number[order] = np.arange(len(order))
+        cells[kind] = rows[np.sort(first)]
+        parts = {name: {**found, kind: np.unique(number[same[found[kind]]])} for name, found in parts.items()}
+    return cells, parts
+
+
+def _groups(
+    mesh: meshio.Mesh,
+    sets: Mapping[str, list],
+    block: int,
+    count: int,
+    dim: int,
+    names: Mapping[str, int],
+    tags: str | None,
+) -> Iterator[tuple[str, NDArray[np.bool_]]]:
+    """Yield names of groups, and which cells (count,) of a block of meshio's belong to them."""
+    known = {name: int(tag) for name, (tag, d) in _pairs(mesh.field_data) if int(d) == dim} | dict(names)
+    families = getattr(mesh, "cell_tags", None) or {}  # of MED: names of the groups of each number
+    for key in (tags,) if tags is not None else TAGS:
+        if key not in mesh.cell_data:
+            continue
+        values = np.asarray(mesh.cell_data[key][block]).reshape(count, -1)[:, 0]
+        if families and key == "cell_tags":
+            for name in sorted({name for of in families.values() for name in of}):
+                chosen = np.isin(values, [number for number, of in families.items() if name in of])
+                if chosen.any():
+                    yield name, chosen
+        elif (values == np.rint(values)).all():
+            yield from numbered(values.astype(np.int64), known)
+        elif tags is not None:
+            raise ValueError(f"mesh: cell_tags = {line(tags)}, must be data of integers")
+    for name, rows in sets.items():
+        if rows[block] is not None and len(rows[block]) and not name.startswith("gmsh:"):
+            for called in [other for other, number in known.items() if name == str(number)] or [name]:
+                yield called, np.isin(np.arange(count), rows[block])
+
+
+def _pairs(field_data: Mapping[str, Any]) -> Iterator[tuple[str, NDArray]]:
+    """Yield the names of gmsh's physical groups with their numbers and dimensions; a name may be that of several."""
+    for name, value in field_data.items():
+        if np.shape(value)[-1:] == (2,):
+            for pair in np.reshape(value, (-1, 2)):
+                yield name, pair
+
+
+def _numbers(names: Mapping[str, int] | None) -> Mapping[str, int]:
+    """Return the numbers of tags by names that a user gives, if any."""
+    whole = (int, np.integer)
+    if names is not None and not (
+        isinstance(names, Mapping) and all(isinstance(k, str) and isinstance(v, whole) for k, v in names.items())
+    ):
+        raise ValueError(f"mesh: names = {line(names)}, must be numbers of tags by names, such as {{'top': 3}}")
+    return names or {}
+
+
+def numbered(tags: NDArray[np.int64], names: Mapping[str, int]) -> Iterator[tuple[str, NDArray[np.bool_]]]:
+    """Yield names, and which of some tags (n,) they stand for; tags without a name are called by their digits."""
+    for name, number in names.items():
+        if (tags == number).any():
+            yield name, tags == number
+    for number in np.setdiff1d(tags, list(names.values())).tolist():
+        if number:  # 0 is no group
+            yield str(number), tags == number
+
+
+def _plane(dim: int, x: NDArray[np.float64], cells: Mapping[str, NDArray[np.int64]]) -> NDArray[np.float64]:
+    """Return the first coordinates (nodes, dim) of vertices (nodes, 2 or 3); refuse cells that leave the plane."""
+    used = np.unique(np.concatenate([np.empty(0, np.int64), *(rows.ravel() for rows in cells.values())]))
+    if not np.isfinite(x[used]).all():
+        bad = used[~np.isfinite(x[used]).all(axis=1)][0]
+        raise ValueError(f"mesh: vertex {bad} is at {x[bad]}, must be at finite coordinates")
+    if len(used) and x.shape[1] > dim and np.ptp(x[used, 2]) > FLAT * np.ptp(x[used, :2], axis=0).max():
+        low, high = x[used, 2].min(), x[used, 2].max()
+        raise ValueError(f"mesh: a surface in space, z from {low:.3g} to {high:.3g}, must be flat in 2D, in x and y")
+    return x[:, :dim]
+
+
+def _of_dolfinx(grid: Grid, mesh, cell_tags, facet_tags, names: Mapping[str, int]) -> Mesh:
+    """Return a dolfinx mesh, whole on every process; cells are ordered by their places, however they are shared out."""
+    dim, topology, kind = grid.dim, mesh.topology, _compat.cell_kind(mesh)
+    kind = {"quadrilateral": "quad", "tetrahedron": "tetra"}.get(kind, kind)
+    if topology.dim != dim or kind not in OF_DOLFINX[dim]:
+        raise ValueError(f"mesh: has cells {kind!r}, must be of {' or '.join(OF_DOLFINX[dim])} for a grid in {dim}D")
+    for name, tags, of in (("cell_tags", cell_tags, dim), ("facet_tags", facet_tags, dim - 1)):
+        if tags is not None and getattr(tags, "dim", None) != of:
+            raise ValueError(f"mesh: {name} = {line(tags)}, must be tags of entities of dimension {of}")
+    owned, _ = _compat.num_cells(mesh)
+    dofs = _compat.geometry_dofs(mesh)[:owned]
+    vertices, orders = KINDS[dim][kind], OF_DOLFINX[dim][kind]
+    if dofs.shape[1] not in (vertices, orders):
+        what = f"must have {vertices} or {orders}: of first or second order"
+        raise ValueError(f"mesh: its cells have {dofs.shape[1]} nodes, {what}")
+    if dofs.shape[1] != vertices:
+        off = _beside(mesh.geometry.x, _as_meshio(dofs, kind), kind)
+        count, off = mesh.comm.allreduce(owned), mesh.comm.allreduce(off, op=MPI.MAX)
+        _warn_curved(grid, "mesh", count, off)
+        dofs = dofs[:, :vertices]
+    topology.create_connectivity(dim, dim - 1)
+    facets = topology.connectivity(dim, dim - 1).array.reshape(-1, len(_facets(dim, kind)))[:owned]
+    nodes = mesh.geometry.index_map().local_to_global(np.arange(len(mesh.geometry.x), dtype=np.int32))
+    rows = mesh.comm.allgather(
+        (nodes, mesh.geometry.x, nodes[dofs], _tag_of(cell_tags, np.arange(owned)), _tag_of(facet_tags, facets))
+    )
+    number, x, cells, tag, side = map(np.concatenate, zip(*rows, strict=True))
+    vertices = np.empty((number.max(initial=-1) + 1, 3))
+    vertices[number] = x
+    vertices = _plane(dim, vertices, {kind: cells})
+    order = np.lexsort(vertices[cells].mean(axis=1).T)
+    cells, tag, side = cells[order], tag[order], side[order]
+    parts = {name: {kind: np.flatnonzero(rows)} for name, rows in numbered(tag, names)}
+    sides = {
+        name: [cells[on[:, k]][:, corners] for k, corners in enumerate(_facets(dim, kind))]
+        for name, on in numbered(side, names)
+    }
+    return Mesh(vertices, {kind: cells}, parts, sides)
+
+
+def _as_meshio(nodes: NDArray[np.int32], kind: str) -> NDArray[np.int32]:
+    """Return nodes (n, k) of dolfinx's cells with the vertices as meshio orders them."""
+    order = AS_LATTICE.get(kind, [])
+    return np.concatenate([nodes[:, order], nodes[:, len(order) :]], axis=1)
+
+
+def _tag_of(tags, entities: NDArray[np.int32]) -> NDArray[np.int64]:
+    """Return the tags of entities of this process, 0 of those without one."""
+    found = np.zeros(entities.shape, dtype=np.int64)
+    if tags is not None and len(tags.indices):
+        at = np.minimum(np.searchsorted(tags.indices, entities), len(tags.indices) - 1)
+        found = np.where(tags.indices[at] == entities, tags.values[at], 0)
+    return found
+
+
+def _facets(dim: int, kind: str) -> list[NDArray[np.int64]]:
+    """Return the vertices of each facet of a cell, as dolfinx orders them."""
+    if KINDS[dim][kind] == dim + 1:
+        return [np.delete(np.arange(dim + 1), k) for k in range(dim + 1)]
+    return sorted(FACES[dim].tolist())

@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: MIT
+"""What meshio's readers lose or misplace in a file without a word: put right, or refused."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import meshio
+import numpy as np
+
+from mpm_dolfinx.bodies import abaqus_files, gmsh_files
+
+
+def read(file: Path) -> meshio.Mesh:
+    """Return the mesh of a file, put right where meshio would misread it; refuse what cannot be."""
+    if abaqus_files.is_abaqus(file):
+        return abaqus_files.read(file)
+    version = gmsh_files.version(file) if file.suffix.lower() == ".msh" else ""
+    if version in ("4", "4.1"):
+        return gmsh_files.read(file)
+    if version == "4.0":
+        raise ValueError("gmsh's format 4.0, must be 2.2 or 4.1, such as gmsh -0 -format msh41 writes it")
+    mesh = _bulk(file) if file.suffix.lower() in (".bdf", ".nas", ".fem") else meshio.read(file)
+    _check_pieces(file, mesh)
+    return mesh
+
+
+def _bulk(file: Path) -> meshio.Mesh:
+    """Return the mesh of a file of Nastran, also of one with bulk data alone, as gmsh writes it."""
+    text = file.read_text(errors="replace")
+    if re.search(r"^BEGIN\s+BULK", text, re.MULTILINE | re.IGNORECASE):
+        return meshio.read(file, "nastran")
+    with TemporaryDirectory() as folder:
+        whole = Path(folder) / "bulk.bdf"
+        whole.write_text("BEGIN BULK\n" + text + ("" if re.search("^ENDDATA", text, re.MULTILINE) else "\nENDDATA\n"))
+        return meshio.read(whole, "nastran")
+
+
+def _check_pieces(file: Path, mesh: meshio.Mesh) -> None:
+    """Refuse a file of VTK's in pieces, all but the last of which meshio drops."""
+    if file.suffix.lower() != ".vtu":
+        return
+    counts = re.findall(rb"<Piece\b[^>]*NumberOfCells\s*=\s*[\"'](\d+)", file.read_bytes())
+    there, whole = sum(len(block.data) for block in mesh.cells), sum(map(int, counts))
+    if len(counts) > 1 and there != whole:
+        raise ValueError(f"{len(counts)} pieces of {whole} cells, of which {there} are read; must be one piece")
+
+
+def check_systems(mesh: meshio.Mesh) -> None:
+    """Refuse nodes of Nastran in coordinates of their own, which meshio takes for those of the basic system."""
+    systems = np.asarray(mesh.point_data.get("nastran:ref", 0))
+    if systems.any():
+        raise ValueError(f"mesh: GRID in the coordinate system {systems[systems != 0][0]}, must be in the basic one")
+
+
+def sets_of(mesh: meshio.Mesh) -> dict[str, list]:
+    """Return the sets of cells, by name, numbered within their blocks: meshio numbers FLAC3D's through all of them."""
+    flac = {name: rows for name, rows in mesh.cell_sets.items() if re.match("(zone|face):", name)}
+    count = [len(block.data) for block in mesh.cells]
+    start = np.cumsum([0, *count[:-1]])
+    pairs = [(np.asarray(r), k) for rows in flac.values() for k, r in enumerate(rows)]
+    if not all((r >= start[k]).all() and (r < start[k] + count[k]).all() for r, k in pairs):
+        return dict(mesh.cell_sets)
+    within = {name: [np.asarray(r) - s for r, s in zip(rows, start, strict=True)] for name, rows in flac.items()}
+    return {**mesh.cell_sets, **within}

@@ -1,0 +1,379 @@
+# SPDX-License-Identifier: MIT
+"""Bodies from meshes: each cell is the domain of a material point, or is split into several.
+
+How cells are split is said in `mesh_cells`.  Domains that are too large for the grid are halved by their own
+(tri)linear map until they are not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from mpm_dolfinx.base.validation import whole
+from mpm_dolfinx.bodies.bodies import Body, check_inside
+from mpm_dolfinx.bodies.mesh_cells import KINDS, PARTS, Polytopes, distinct
+from mpm_dolfinx.bodies.touching import TOUCH, Faces, covers, face_vectors
+from mpm_dolfinx.grid.grid import Grid, rounding, sum_by
+from mpm_dolfinx.parallel.messages import warn
+from mpm_dolfinx.points.cutting import FACES, centroids, corner_bits, simplex_volumes, vertices, volumes
+
+LONG = 1.5  # cells over points a cell and direction: domains with longer edges are split
+SMALL = 0.2  # of the cells that domains are wanted in: a warning names smaller ones
+CONVEX = 1e-6  # least volume at a corner of a domain, over that of its box
+SAME = 1e-6  # of the shortest edge: corners nearer than this are one
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """A mesh as it was read, the same on every process.
+
+    x : (nodes, d), m; cells : kind -> (n, k) nodes, quadrilaterals and hexahedra with the first axis fastest;
+    parts : name -> kind -> indices of its cells; sides : name -> facets as arrays (m, k) of nodes.
+    """
+
+    x: NDArray[np.float64]
+    cells: Mapping[str, NDArray[np.int64]]
+    parts: Mapping[str, Mapping[str, NDArray[np.int64]]]
+    sides: Mapping[str, Sequence[NDArray[np.int64]]]
+
+    def part(self, name: str | None) -> dict[str, NDArray[np.int64]]:
+        """Return the cells of a part, or all of them, by kind."""
+        if name is not None and (not isinstance(name, str) or name not in self.parts):
+            known = ", ".join(map(repr, self.parts)) or "none, for the mesh has no parts with a name"
+            raise ValueError(f"mesh: part {name!r}, must be one of its parts: {known}")
+        chosen = {kind: cells if name is None else cells[self.parts[name][kind]] for kind, cells in self.cells.items()}
+        chosen = {kind: cells for kind, cells in chosen.items() if len(cells)}
+        if not chosen:
+            dim = self.x.shape[1]
+            what = f"has no {' and no '.join(KINDS[dim])}" + (f" in part {name!r}" if name is not None else "")
+            raise ValueError(f"mesh: {what}, must have cells to fill a body in {dim}D")
+        return chosen
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MeshBody(Body):
+    """A body seeded from a mesh; the boxes of its domains are those around them.
+
+    vertices : (n, 2^d, d), m — corners of the domains before all maps; surface : (n, d, 2), whether a face of a domain
+    lies on the surface; tagged : name -> (n, d, 2), whether it belongs to a side.
+    """
+
+    vertices: NDArray[np.float64]
+    surface: NDArray[np.bool_]
+    tagged: Mapping[str, NDArray[np.bool_]]
+
+    lattice = None
+
+    def __len__(self) -> int:
+        return len(self.vertices)
+
+    @property
+    def dim(self) -> int:
+        """Number d of coordinates."""
+        return self.vertices.shape[2]
+
+    @cached_property
+    def spacing(self) -> NDArray[np.float64]:
+        """Edges (n, d), m, of the boxes of domains."""
+        return self.vertices.max(axis=1) - self.vertices.min(axis=1)
+
+    def lower_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the lower corners (m, d), m, of the boxes of domains."""
+        return self.vertices[chosen].min(axis=1)
+
+    def sides_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return whether faces (m, d, 2) of domains lie on the surface of the body."""
+        return self.surface[chosen]
+
+    def centre_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the reference positions (m, d), m, of the centres of domains."""
+        return centroids(self.vertices[chosen])
+
+    @property
+    def aligned(self) -> bool:
+        """Whether the domains are boxes along the axes: not in general."""
+        return False
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the sides."""
+        return tuple(self.tagged)
+
+    def named(self, name: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the domains (m,) that have a face on a side, ascending, and the numbers (m,) of these faces."""
+        if name not in self.tagged:
+            return (np.empty(0, np.int64),) * 2
+        return np.nonzero(self.tagged[name].reshape(len(self), 2 * self.dim))
+
+    def facing(self, axis: int, end: int, least: float = 0.0) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the domains (m,) with a face on the surface whose normal is nearest to an end of an axis."""
+        row, face = self.outer()
+        outward = face_vectors(self.corners(row), face)
+        along = np.abs(outward).argmax(axis=1) == axis
+        along &= (2 * end - 1) * outward[:, axis] > least * np.linalg.norm(outward, axis=1)
+        return row[along], face[along]
+
+    def across(self, axis: int) -> tuple[float, float]:
+        """Return how many domains the body has across an axis, and their edge, m; means."""
+        edge = float(self.spacing[:, axis].mean())
+        return float(np.ptp(self.vertices[:, :, axis])) / edge, edge
+
+    def reference(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
+        """Return the reference positions (m, 2^d, d), m, of the corners of domains: those before the map."""
+        return self.vertices[chosen]
+
+    def nodes(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the numbers (m, 2^d) of the corners of domains, the same for a corner of several."""
+        return self._nodes[rows]
+
+    @cached_property
+    def _nodes(self) -> NDArray[np.int64]:
+        x = self.vertices.reshape(-1, self.dim)
+        pairs = cKDTree(x).query_pairs(SAME * self.spacing.min(), output_type="ndarray")
+        graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(x), len(x)))
+        return connected_components(graph, directed=False)[1].astype(np.int64).reshape(self.vertices.shape[:2])
+
+
+def seeded(grid: Grid, mesh: Mesh, part: str | None, per_cell: int, material: int, name: str) -> MeshBody:
+    """Return the body of a part of a mesh, or of all of it; see `from_mesh`."""
+    per_cell, material = whole("body: per_cell", per_cell), whole("body: material", material, 0)
+    cells = mesh.part(part)
+    _check_once(mesh, cells, name)
+    domains, keys, cell = map(np.concatenate, zip(*_domains(mesh, cells), strict=True))
+    out = np.flatnonzero(grid.outside(domains.reshape(-1, grid.dim)))
+    if len(out):
+        x = domains.reshape(-1, grid.dim)[out[0]]
+        raise ValueError(f"{name}: has a vertex at {x}, must be inside the grid {grid.lower} to {grid.upper}")
+    domains, keys = _turned(domains, keys)
+    _check_convex(domains, name)
+    facets, facet = _facets(keys)
+    sides = np.stack([facet.ravel(), np.repeat(cell, 2 * grid.dim)], axis=1)
+    of, by = sides[distinct(sides)[0]].T
+    count = np.bincount(of, minlength=len(facets))
+    if count[1:].max() > 2:
+        nodes = facets[1 + count[1:].argmax()]
+        x = mesh.x[nodes[nodes >= 0]].mean(axis=0)
+        raise ValueError(f"{name}: three cells share the facet at {x}, must be two at most")
+    outer = (facet > 0) & (count[facet] == 1)  # 0 is no facet of a cell
+    twice = (of > 0) & (count[of] == 2)
+    _check_sides(mesh, domains, facets, facet, count == 2, name)
+    _check_apart(mesh.x, cells, np.unique(cell[outer.any(axis=1)]), by[twice].reshape(-1, 2), name)
+    tagged = {side: outer & _among(facets, rows)[facet] for side, rows in mesh.sides.items()}
+    vertices, row, kept = _split(grid, domains, per_cell)
+    surface, *tagged_rows = (rows[row].reshape(kept.shape) & kept for rows in (outer, *tagged.values()))
+    named = {side: rows for side, rows in zip(tagged, tagged_rows, strict=True) if rows.any()}
+    body = MeshBody(vertices=vertices, surface=surface, tagged=named, material=material)
+    _check_conforming(body, name)
+    _warn_small(grid, body, per_cell, name)
+    return check_inside(grid, body, name)
+
+
+def _domains(mesh: Mesh, cells: Mapping[str, NDArray[np.int64]]) -> list[tuple[NDArray, NDArray, NDArray]]:
+    """Return domains (n, 2^d, d), the nodes (n, 2d, 2^(d-1)) of the facets that their faces lie on, and their cells.
+
+    Nodes ascend; those of triangles begin with -1, and those of faces within a cell are all -1.
+    """
+    d, start, out = mesh.x.shape[1], 0, []
+    for kind, nodes in cells.items():
+        number = start + np.arange(len(nodes))
+        start += len(nodes)
+        for part in PARTS[kind]:
+            corners = np.stack([mesh.x[nodes[:, list(of)]].mean(axis=1) for of in part.corners], axis=1)
+            keys = np.full((len(nodes), 2 * d, 2 ** (d - 1)), -1)
+            for face, of in enumerate(part.faces):
+                if of:
+                    keys[:, face, 2 ** (d - 1) - len(of) :] = np.sort(nodes[:, list(of)], axis=1)
+            out.append((corners, keys, number))
+    return out
+
+
+def _check_once(mesh: Mesh, cells: Mapping[str, NDArray[np.int64]], name: str) -> None:
+    """Refuse a mesh that has a cell twice: it would weigh, and resist, as two."""
+    for kind, nodes in cells.items():
+        first, same = distinct(np.sort(nodes, axis=1))
+        count = np.bincount(same)
+        if (count > 1).any():
+            x = mesh.x[nodes[first[count > 1][0]]].mean(axis=0)
+            what = f"{np.count_nonzero(count > 1)} cells ({kind}) are there more than once, the first at {x}"
+            raise ValueError(f"{name}: {what}, must be there once")
+
+
+def _check_sides(
+    mesh: Mesh,
+    domains: NDArray[np.float64],
+    facets: NDArray[np.int64],
+    facet: NDArray[np.int64],
+    shared: NDArray[np.bool_],
+    name: str,
+) -> None:
+    """Refuse cells that lie on the same side of a facet (m,) that they share: their outward vectors add up there."""
+    d, size = domains.shape[2], len(facets)
+    outward = np.stack([face_vectors(domains, face) for face in range(2 * d)], axis=1).reshape(-1, d)
+    of = facet.ravel()
+    total = np.linalg.norm([sum_by(of, outward[:, a], size) for a in range(d)], axis=0)
+    same = shared & (total > sum_by(of, np.linalg.norm(outward, axis=1), size) / 2)
+    same[0] = False  # no facet of a cell
+    if same.any():
+        nodes = facets[same.argmax()]
+        x, what = mesh.x[nodes[nodes >= 0]].mean(axis=0), "have both of their cells on one side, the first at"
+        raise ValueError(f"{name}: {same.sum()} facets {what} {x}: cells must not lie on one another")
+
+
+def _check_apart(
+    x: NDArray[np.float64],
+    cells: dict[str, NDArray[np.int64]],
+    outer: NDArray[np.int64],
+    neighbours: NDArray[np.int64],
+    name: str,
+) -> None:
+    """Refuse cells that lie in one another.
+
+    Where all cells lie on the two sides of the facets that they share, how many cells lie at a place changes only at
+    the surface.  So if two lie at a place, there is one with a facet on the surface that lies in another.
+
+    Parameters
+    ----------
+    x : (nodes, d), m
+        Positions of nodes.
+    cells
+        By kind.
+    outer : (m,)
+        Cells with a facet on the surface.
+    neighbours : (n, 2)
+        Cells that share a facet.
+    """
+    corners = [x[nodes] for nodes in cells.values()]
+    boxes = np.concatenate([np.stack([c.min(axis=1), c.max(axis=1)], axis=1) for c in corners])
+    size = boxes[:, 1] - boxes[:, 0]
+    slack = TOUCH / 2 * size.min(axis=1) + rounding(x)
+    pairs = np.stack(_boxes_that_meet(boxes, size, outer, slack), axis=1)
+    both = np.unique(np.sort(pairs, axis=1) @ [len(boxes), 1])
+    both = np.setdiff1d(both, np.sort(neighbours, axis=1) @ [len(boxes), 1], assume_unique=True)
+    pairs = np.stack(np.divmod(both, len(boxes)), axis=1)
+    near_ones, place = np.unique(pairs, return_inverse=True)
+    kinds = np.repeat(np.arange(len(cells)), list(map(len, corners)))[near_ones]
+    row = near_ones - np.cumsum([0, *map(len, corners)])[kinds]
+    solid = Polytopes.of(x, {kind: nodes[row[kinds == k]] for k, (kind, nodes) in enumerate(cells.items())})
+    i, j = place.reshape(pairs.shape).T
+    slack = slack[near_ones] + 2 * solid.warp
+    deep, depth = solid.apart(i, j, slack[i] + slack[j])
+    if len(deep):
+        one, other = boxes[pairs[deep[depth.argmax()]]]
+        meet = (np.maximum(one[0], other[0]) + np.minimum(one[1], other[1])) / 2
+        what = f"{len(np.unique(pairs[deep]))} cells lie on one another, the first at {meet}"
+        raise ValueError(f"{name}: {what}, {depth.max():.3g} m deep; must not lie in each other")
+
+
+def _boxes_that_meet(
+    boxes: NDArray[np.float64], size: NDArray[np.float64], outer: NDArray[np.int64], slack: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the pairs (n,), (n,) of an outer cell and another whose boxes (m, 2, d) lie in each other.
+
+    Boxes are looked for by octaves of their size, so that few large ones do not make many of the small ones near.
+    """
+    octave, middle = np.frexp(size.max(axis=1))[1], (boxes[:, 0] + boxes[:, 1]) / 2
+    of = [[rows[octave[rows] == k] for k in np.unique(octave[rows])] for rows in (outer, np.arange(len(boxes)))]
+    largest = [[size[rows].max(axis=0) for rows in groups] for groups in of]
+    out = [np.empty((2, 0), dtype=np.int64)]
+    for a, most in zip(of[0], largest[0], strict=True):
+        for b, other in zip(of[1], largest[1], strict=True):
+            trees = [cKDTree(middle[rows] * (2 / (most + other))) for rows in (a, b)]
+            pairs = trees[0].sparse_distance_matrix(trees[1], 1.0, p=np.inf, output_type="ndarray")
+            i, j = a[pairs["i"]], b[pairs["j"]]
+            meet = (i != j) & (np.abs(middle[i] - middle[j]) < (size[i] + size[j]) / 2).all(axis=1)
+            i, j = i[meet], j[meet]
+            lap = np.minimum(boxes[i, 1], boxes[j, 1]) - np.maximum(boxes[i, 0], boxes[j, 0])
+            meet = (lap > (slack[i] + slack[j])[:, None]).all(axis=1)
+            out.append(np.stack([i[meet], j[meet]]))
+    return tuple(np.concatenate(out, axis=1))
+
+
+def _turned(domains: NDArray[np.float64], keys: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return domains, and the keys of their faces, with the first two axes changed of those that are left-handed."""
+    d, left = domains.shape[2], volumes(domains) < 0
+    bits, face = corner_bits(d), np.arange(2 * d)
+    swapped = (bits[:, [1, 0, *range(2, d)]] << np.arange(d)).sum(axis=1)
+    face[:4] = [2, 3, 0, 1]
+    domains, keys = domains.copy(), keys.copy()
+    domains[left], keys[left] = domains[left][:, swapped], keys[left][:, face]
+    return domains, keys
+
+
+def _check_convex(domains: NDArray[np.float64], name: str) -> None:
+    """Refuse cells that are flat, inside out or not convex: a corner, or a simplex that is cut, has no volume."""
+    d, bits = domains.shape[2], corner_bits(domains.shape[2])
+    size = np.ptp(domains, axis=1).prod(axis=1)
+    ends = np.arange(2**d)[:, None] ^ (1 << np.arange(d))
+    edges = (domains[:, ends] - domains[:, :, None]) * (1 - 2 * bits)[:, :, None]
+    least = np.linalg.det(edges).min(axis=1)
+    of_simplices = simplex_volumes(vertices(np.ascontiguousarray(domains.transpose(1, 2, 0))))
+    least = np.minimum(least, of_simplices.min(axis=0, initial=np.inf))
+    bad = np.flatnonzero(~(least > CONVEX * size))
+    if len(bad):
+        x = domains[bad[0]].mean(axis=0)
+        what = f"{len(bad)} cells are flat, turned inside out or not convex, the first at {x}"
+        raise ValueError(f"{name}: {what}; must be convex, of corners that are not flat")
+
+
+def _facets(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the different facets (m, k), the first one no facet at all, and which one each face (n, 2d) lies on."""
+    rows = np.concatenate([np.full((1, keys.shape[2]), -1), keys.reshape(-1, keys.shape[2])])
+    first, facet = distinct(rows)
+    return rows[first], facet[1:].reshape(keys.shape[:2])
+
+
+def _among(facets: NDArray[np.int64], named: Sequence[NDArray[np.int64]]) -> NDArray[np.bool_]:
+    """Return which facets (m,) of a mesh are among those of a side."""
+    width = facets.shape[1]
+    rows = [np.pad(np.sort(n, axis=1), ((0, 0), (width - n.shape[1], 0)), constant_values=-1) for n in named]
+    first, at = distinct(np.concatenate([facets, *rows]))
+    among = np.zeros(len(first), dtype=bool)
+    among[at[len(facets) :]] = True
+    return among[at[: len(facets)]]
+
+
+def _split(
+    grid: Grid, domains: NDArray[np.float64], per_cell: int
+) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.bool_]]:
+    """Return domains (m, 2^d, d) small enough for the grid, of which each is a part, and its faces (m, d, 2)."""
+    d, bits, out = grid.dim, corner_bits(grid.dim), []
+    edges = [domains[:, FACES[d][2 * a + 1]] - domains[:, FACES[d][2 * a]] for a in range(d)]
+    longest = np.max([np.linalg.norm(e / grid.h, axis=2).max(axis=1) for e in edges], axis=0)
+    count = 2 ** np.ceil(np.log2(np.maximum(1.0, longest * per_cell / LONG) - 1e-9)).astype(np.int64)
+    for n in np.unique(count):
+        row = np.flatnonzero(count == n)
+        index = np.stack(np.unravel_index(np.arange(n**d), (n,) * d), axis=1)
+        t = (index[:, None] + bits)[:, :, None] / n
+        N = np.where(bits, t, 1 - t).prod(axis=3)  # (parts, corners, corners of the whole)
+        parts = np.einsum("pkl,mld->mpkd", N, domains[row]).reshape(-1, 2**d, d)
+        on = np.stack([index == 0, index == n - 1], axis=2)
+        out.append((parts, np.repeat(row, n**d), np.tile(on, (len(row), 1, 1))))
+    return tuple(map(np.concatenate, zip(*out, strict=True)))
+
+
+def _check_conforming(body: MeshBody, name: str) -> None:
+    """Refuse a mesh with faces on its surface that lie on one another: they would be loaded, and drain, in the body."""
+    own = Faces.around(body)
+    cover = covers(own, own)
+    if len(cover.face):
+        x = own.corners[cover.face[0]].mean(axis=0)[: body.dim]
+        what = f"{len(np.unique(cover.face))} faces lie on others without sharing their nodes, the first at {x}"
+        raise ValueError(f"{name}: {what}: hanging or doubled nodes, which must be merged, or be of two parts")
+
+
+def _warn_small(grid: Grid, body: MeshBody, per_cell: int, name: str) -> None:
+    """Log a warning of domains that are far smaller than the grid asks for."""
+    size = (volumes(body.vertices) / grid.cell_volume) ** (1 / grid.dim) * per_cell
+    small = np.flatnonzero(size < SMALL)
+    if len(small):
+        what = "%s: %d of %d domains are smaller than %.3g of what the grid can tell apart, the first at %s: "
+        what += "they cost as much as large ones; a coarser mesh would do"
+        warn(grid.comm, what, name, len(small), len(body), SMALL, body.centre[small[0]])

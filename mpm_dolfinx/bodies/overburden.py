@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: MIT
+"""The weight that lies above places in bodies, straight up through their domains."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from mpm_dolfinx.bodies.touching import face_vectors
+from mpm_dolfinx.points.cutting import FACES
+
+ASIDE = 1e-7
+"""By how much of a domain's width lines are off their places: else one on a joint may cross two domains."""
+FLAT = 1e-12  # slope of a face below which it is along the lines
+
+
+def overburden(
+    corners: NDArray[np.float64], unit_weight: NDArray[np.float64], x: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the vertical stress (m,), Pa, by the weight above places, and the height (m,), m, of the surface there.
+
+    Parameters
+    ----------
+    corners : (n, 2^d, d), m
+        All domains of the bodies, convex; the last axis is the vertical one.
+    unit_weight : (n,), N/m^3
+        Of the domains.
+    x : (m, d), m
+        Places in the domains.
+    """
+    low, high = corners.min(axis=1), corners.max(axis=1)
+    half = (high - low)[:, :-1].max(initial=0.0) / 2
+    aside = ASIDE * (high - low)[:, :-1].min(initial=np.inf) * np.sqrt([2.0, 3.0])[: x.shape[1] - 1]
+    across, line = np.unique(x[:, :-1] + aside, axis=0, return_inverse=True)
+    line, middle = line.reshape(len(x)), (low + high)[:, :-1] / 2
+    pairs = cKDTree(across).sparse_distance_matrix(cKDTree(middle), half * (1 + 1e-9), p=np.inf, output_type="ndarray")
+    ray, domain = pairs["i"], pairs["j"]
+    inside = ((across[ray] >= low[domain, :-1]) & (across[ray] <= high[domain, :-1])).all(axis=1)
+    ray, domain = ray[inside], domain[inside]
+    bottom, top = _chord(corners[domain], across[ray], low[domain, -1], high[domain, -1])
+    met = top > bottom
+    ray, weight, bottom, top = ray[met], unit_weight[domain[met]], bottom[met], top[met]
+    surface = np.full(len(across), -np.inf)
+    np.maximum.at(surface, ray, top)
+    # places above one another share what their line crosses: sums of it, sorted by line and height
+    order = np.lexsort((bottom, ray))
+    ray, weight, bottom, top = ray[order], weight[order], bottom[order], top[order]
+    total = np.concatenate([[0.0], np.cumsum(weight * (top - bottom))])
+    ends = np.searchsorted(ray, np.arange(len(across)), side="right")
+    scale = 1 + np.ptp(corners[..., -1])
+    after = np.searchsorted(ray * scale + (bottom - corners[..., -1].min()), line * scale + x[:, -1] - low[:, -1].min())
+    own = np.maximum(after - 1, 0)
+    part = np.where(ray[own] == line, weight[own] * np.maximum(top[own] - x[:, -1], 0.0), 0.0)
+    return total[ends[line]] - total[after] + part, np.maximum(surface[line], x[:, -1])
+
+
+def _chord(corners: NDArray, across: NDArray, low: NDArray, high: NDArray) -> tuple[NDArray, NDArray]:
+    """Return between which heights (m,), m, vertical lines through (m, d-1) are in domains (m, 2^d, d)."""
+    d = corners.shape[2]
+    for face in range(2 * d):
+        n, on = face_vectors(corners, face), corners[:, FACES[d][face]].mean(axis=1)
+        ahead = ((across - on[:, :-1]) * n[:, :-1]).sum(axis=1)  # n . (x - on) <= 0 inside
+        slope = n[:, -1]
+        steep = np.abs(slope) > FLAT * np.linalg.norm(n, axis=1)
+        at = on[:, -1] - np.divide(ahead, slope, out=np.zeros(len(n)), where=steep)
+        high = np.where(steep & (slope > 0), np.minimum(high, at), high)
+        low = np.where(steep & (slope < 0), np.maximum(low, at), low)
+        high = np.where(~steep & (ahead > 0), -np.inf, high)
+    return low, high

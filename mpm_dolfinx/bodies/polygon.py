@@ -1,0 +1,192 @@
+# SPDX-License-Identifier: MIT
+"""A body from a polygon whose edges have names: gmsh fills it with quadrilaterals."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mpm_dolfinx.base.validation import instance, line, numbers, whole
+from mpm_dolfinx.bodies.mesh_cells import AS_LATTICE
+from mpm_dolfinx.bodies.meshes import Mesh, MeshBody, seeded
+from mpm_dolfinx.grid.grid import Grid
+from mpm_dolfinx.parallel.exchange import at_root
+
+FLAT = 1e-12  # of its size squared: areas below which three corners of a polygon lie on one line
+
+
+def polygon(
+    grid: Grid,
+    corners: ArrayLike,
+    sides: Sequence[str] | str,
+    *,
+    holes: Mapping[str, ArrayLike] | None = None,
+    size: float | None = None,
+    per_cell: int = 2,
+    material: int = 0,
+) -> MeshBody:
+    """Seed a polygon, such as a slope or a layer, with points; return the body.
+
+    Layers and parts are a polygon each: bodies that touch stick, and no surface is between them, whatever the sizes.
+    Needs gmsh.
+
+    Parameters
+    ----------
+    grid
+        Background grid, in 2D.
+    corners : (m, 2), m
+        Corners one after the other, either way around.
+    sides
+        Name of the edge from each corner to the next, "" for none, or one name for all; edges may share a name.
+    holes : name -> (k, 2), m
+        Corners of holes, such as a tunnel, by the names of their sides.
+    size
+        Edge of the quadrilaterals, m; by default there are per_cell points per cell and direction.
+    per_cell, material
+        As for `from_mesh`.
+
+    Raises
+    ------
+    ImportError
+        There is no gmsh.
+    ValueError
+        A polygon or hole that crosses itself or others, or lies outside of the grid; names that do not fit.
+    """
+    instance("body: grid", grid, Grid)
+    if grid.dim != 2:
+        raise ValueError(f"polygon: grid of {grid.dim} dimensions, must have 2; in 3D take a mesh (`from_mesh`)")
+    outline = _outline("corners", corners)
+    sides = [sides] * len(outline) if isinstance(sides, str) else sides
+    if not isinstance(sides, Sequence) or len(sides) != len(outline) or not all(isinstance(s, str) for s in sides):
+        raise ValueError(
+            f"polygon: sides = {line(sides)}, must be a name for each of {len(outline)} edges, or one for all"
+        )
+    if not isinstance(holes or {}, Mapping) or not all(isinstance(name, str) for name in holes or {}):
+        raise ValueError(f"polygon: holes = {line(holes)}, must be corners by the names of their sides")
+    loops = [(outline, sides)]
+    for name, inner in (holes or {}).items():
+        inner = _outline(f"hole {name!r}", inner)
+        loops.append((inner, [name] * len(inner)))
+    default = grid.h.min() / whole("body: per_cell", per_cell)
+    edge = float(numbers("polygon: size", default if size is None else size, test=lambda v: (v > 0) & np.isfinite(v)))
+    _check_simple([corners for corners, _ in loops])
+    mesh = at_root(grid.comm, lambda: _filled(loops, edge))
+    return seeded(grid, mesh, None, per_cell, material, "polygon")
+
+
+def _outline(name: str, corners: ArrayLike) -> NDArray[np.float64]:
+    """Return corners (m, 2), m, of which no two neighbours are one."""
+    allowed = "at least 3 corners of 2 finite coordinates each, no two neighbours the same"
+    x = numbers(f"polygon: {name}", corners, None, allowed=allowed)
+    if x.ndim != 2 or x.shape[1] != 2 or len(x) < 3 or not np.any(np.roll(x, -1, axis=0) != x, axis=1).all():
+        raise ValueError(f"polygon: {name} = {line(corners)} of shape {x.shape}, must be {allowed}")
+    return x
+
+
+def _check_simple(outlines: Sequence[NDArray[np.float64]]) -> None:
+    """Refuse outlines that touch or cross themselves or others, and holes that are not in the first one's inside."""
+    a, stop = np.concatenate(outlines), np.cumsum([len(x) for x in outlines])
+    after = np.concatenate([np.roll(rows, -1) for rows in np.split(np.arange(len(a)), stop[:-1])])
+    b = a[after]
+    i, j = np.triu_indices(len(a), 1)
+    beside = (after[i] == j) | (after[j] == i)
+    # two edges have a place in common if the ends of neither lie on one side of the other
+    slack = FLAT * np.ptp(outlines[0], axis=0).max() ** 2
+    sides = [_turn(a[i], b[i], a[j]), _turn(a[i], b[i], b[j]), _turn(a[j], b[j], a[i]), _turn(a[j], b[j], b[i])]
+    apart = np.any([(np.minimum(*two) > slack) | (np.maximum(*two) < -slack) for two in (sides[:2], sides[2:])], axis=0)
+    low, high = np.minimum(a, b), np.maximum(a, b)
+    apart |= ((low[i] > high[j]) | (low[j] > high[i])).any(axis=1)  # on one line
+    back = beside & (np.abs(np.where(after[i] == j, sides[1], sides[0])) <= slack)
+    back &= np.einsum("nd,nd->n", b[i] - a[i], b[j] - a[j]) < 0
+    wrong = np.flatnonzero((~apart & ~beside) | back)
+    if len(wrong):
+        one, other = ([a[k[wrong[0]]].tolist(), b[k[wrong[0]]].tolist()] for k in (i, j))
+        raise ValueError(f"polygon: the edges {one} and {other} touch or cross, must not")
+    for k, hole in enumerate(outlines[1:], start=1):
+        within = [_inside(hole[0], outline) for m, outline in enumerate(outlines) if m != k]
+        if not within[0] or any(within[1:]):
+            raise ValueError(f"polygon: the hole at {hole[0]} must be inside of the polygon, and of no other hole")
+
+
+def _turn(a: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return on which side of the lines from a to b places c (n, 2) lie, and how far, times the way."""
+    return _cross(b - a, c - a)
+
+
+def _cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the products (n,), across the plane, of vectors (n, 2)."""
+    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+
+
+def _inside(x: NDArray[np.float64], outline: NDArray[np.float64]) -> bool:
+    """Return whether a place (2,) is inside of a polygon: a ray from it crosses an odd number of edges."""
+    a, b = outline - x, np.roll(outline, -1, axis=0) - x
+    crosses = (a[:, 1] > 0) != (b[:, 1] > 0)
+    return bool((crosses & ((_cross(a, b) > 0) == (b[:, 1] > a[:, 1]))).sum() % 2)
+
+
+@contextmanager
+def _gmsh() -> Iterator:
+    """Give gmsh with a model of its own; what the user has in gmsh, and who hears Ctrl-C, stay what they are."""
+    hears = signal.getsignal(signal.SIGINT)
+    try:
+        import gmsh
+    except ImportError as error:
+        what = "polygon: needs gmsh: on Debian `apt install python3-gmsh`, elsewhere `conda install python-gmsh`"
+        raise ImportError(what, name="gmsh") from error
+    tells = hasattr(gmsh, "isInitialized")  # before 4.9 it cannot be asked: it is begun again, and never ended
+    begun, talks = tells and gmsh.isInitialized(), 0.0
+    if begun or not tells:
+        with suppress(Exception):  # before 4.9 it raises once somebody has ended it
+            talks = gmsh.option.getNumber("General.Terminal")
+            gmsh.option.setNumber("General.Terminal", 0)  # of being begun again
+    if not begun:
+        gmsh.initialize()
+    before = gmsh.model.getCurrent()
+    try:
+        gmsh.option.setNumber("General.Terminal", 0)
+        gmsh.model.add("mpm_dolfinx polygon")
+        yield gmsh
+    finally:
+        gmsh.model.remove()
+        gmsh.model.setCurrent(before)
+        gmsh.option.setNumber("General.Terminal", talks)
+        if tells and not begun:
+            gmsh.finalize()
+        if hears is not None:
+            signal.signal(signal.SIGINT, hears)
+
+
+def _filled(loops: Sequence[tuple[NDArray[np.float64], Sequence[str]]], size: float) -> Mesh:
+    """Return a polygon, and holes after it, filled with quadrilaterals of a size, m, and a triangle where none fits."""
+    extent = np.ptp(loops[0][0], axis=0).max()
+    origin = extent * np.round(loops[0][0][0] / extent, -2)  # where coordinates are large gmsh ends the process
+    with _gmsh() as gmsh:
+        geo, named, curves = gmsh.model.geo, {}, []
+        for corners, names in loops:
+            points = [geo.addPoint(*x, 0.0, size) for x in corners - origin]
+            lines = [geo.addLine(a, b) for a, b in zip(points, points[1:] + points[:1], strict=True)]
+            curves.append(geo.addCurveLoop(lines))
+            for tag, name in zip(lines, names, strict=True):
+                named.setdefault(name, []).append(tag)
+        surface = geo.addPlaneSurface(curves)
+        geo.synchronize()
+        gmsh.model.mesh.setRecombine(2, surface)  # of triangles a third is a kite, whose stress is less exact
+        gmsh.model.mesh.generate(2)
+        tags, x, _ = gmsh.model.mesh.getNodes()
+        number = np.zeros(int(max(tags, default=0)) + 1, dtype=np.int64)
+        number[tags] = np.arange(len(tags))
+        triangles, squares = (
+            number[gmsh.model.mesh.getElementsByType(kind)[1]].reshape(-1, kind + 1) for kind in (2, 3)
+        )
+        cells = {"triangle": triangles, "quad": squares[:, AS_LATTICE["quad"]]}
+        sides = {
+            name: [number[gmsh.model.mesh.getElementsByType(1, tag)[1]].reshape(-1, 2) for tag in lines]
+            for name, lines in named.items()
+            if name
+        }
+    return Mesh(origin + x.reshape(-1, 3)[:, :2], {kind: rows for kind, rows in cells.items() if len(rows)}, {}, sides)

@@ -1,0 +1,443 @@
+# SPDX-License-Identifier: MIT
+"""Where bodies touch: which parts of a face other faces cover, and how far domains are apart.
+
+Faces are quadrilaterals in space; in plane strain they are a unit of length wide along a third axis.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from mpm_dolfinx.bodies.bodies import Body
+from mpm_dolfinx.grid.grid import Grid, rounding, sum_by
+from mpm_dolfinx.parallel.messages import warn
+from mpm_dolfinx.points.cutting import FACES, corner_bits, cut_at, kuhn_simplices
+
+TOUCH = 1e-6  # of the shortest edge: faces nearer than this touch
+SAME = 1e-11  # of an edge: ends nearer than this are one
+TINY = 1e-300  # in place of the length of an edge that a map has shrunk to nothing
+BITS = corner_bits(2)
+
+
+@dataclass
+class Faces:
+    """Faces of a body, after its map; arrays over m faces.
+
+    row : (m,) domain of each; index : (m, 4) corners of the domain; corners : (m, 4, 3), m; outward : (m, 3), m^2, area
+    vector; bend : (m,), m, see `Body.bend`.
+    """
+
+    row: NDArray[np.int64]
+    index: NDArray[np.int64]
+    corners: NDArray[np.float64]
+    outward: NDArray[np.float64]
+    bend: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, body: Body, row: NDArray[np.int64], face: NDArray[np.int64]) -> Faces:
+        """Return faces of a body: those of some domains (m,), by their numbers (m,) in these."""
+        domains, dim = body.corners(row), body.dim
+        outward = np.pad(face_vectors(domains, face), ((0, 0), (0, 3 - dim)))
+        index = face_index(dim)[face]
+        corners = np.take_along_axis(domains, index[:, :, None], axis=1)
+        if dim == 2:
+            corners = np.concatenate([corners, np.broadcast_to(BITS[:, 1:], (len(row), 4, 1))], axis=2)
+        return cls(row, index, corners, outward, body.bend(row))
+
+    @classmethod
+    def around(cls, body: Body) -> Faces:
+        """Return the faces on all sides of a body."""
+        return cls.of(body, *body.outer())
+
+    def edge(self) -> NDArray[np.float64]:
+        """Return the shorter of the two edges (m, 2), m, along each of a face's axes."""
+        c = self.corners
+        along = [np.linalg.norm([c[:, 1] - c[:, 0], c[:, 3] - c[:, 2]], axis=2)]
+        along += [np.linalg.norm([c[:, 2] - c[:, 0], c[:, 3] - c[:, 1]], axis=2)]
+        return np.stack([a.min(axis=0) for a in along], axis=1)
+
+
+@dataclass
+class Cover:
+    """Pairs of faces of which one lies on the other; arrays over n pairs.
+
+    face : (n,) the covered one; by : (n,) the covering one; low, high : (n, 2) its box in the coordinates of the
+    former, which go from 0 to 1; corner : (n, 4) corner of this box that each of its corners is, -1 where it is
+    turned against the box; t : (n, 4, 2) its corners; slack : (n,) error of the coordinates; plane : (n, 4, 2) its
+    corners in the coordinates of a parallelogram, along two edges of the former: in these what is straight is straight.
+    """
+
+    face: NDArray[np.int64]
+    by: NDArray[np.int64]
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+    corner: NDArray[np.int64]
+    t: NDArray[np.float64]
+    slack: NDArray[np.float64]
+    plane: NDArray[np.float64]
+
+    def at(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return what each corner of the covering faces counts (n, 4) at coordinates t (n, 2) of the covered ones."""
+        return np.take_along_axis(weights((t - self.low) / (self.high - self.low)), self.corner, axis=1)
+
+
+def face_vectors(corners: NDArray[np.float64], face: NDArray[np.int64] | int) -> NDArray[np.float64]:
+    """Return the outward area vectors (m, d), m^(d-1), of the faces of domains (m, 2^d, d) with numbers (m,) or one."""
+    dim = corners.shape[2]
+    index = np.broadcast_to(FACES[dim][face], (len(corners), 2 ** (dim - 1)))
+    x = np.take_along_axis(corners, index[:, :, None], axis=1)
+    if dim == 2:
+        t = x[:, 1] - x[:, 0]
+        n = np.stack([t[:, 1], -t[:, 0]], axis=1)
+    else:
+        n = 0.5 * np.cross(x[:, 3] - x[:, 0], x[:, 2] - x[:, 1])
+    return n * np.broadcast_to(_OUTWARD[dim][face], len(n))[:, None]
+
+
+_OUTWARD = {2: np.array([-1, 1, 1, -1]), 3: np.array([-1, 1, 1, -1, -1, 1])}
+"""Signs of the cross products of the faces' edges."""
+
+
+def face_index(dim: int) -> NDArray[np.int64]:
+    """Return which corners of a domain (2d, 4) its faces have; in plane strain each twice, at both ends of axis 3."""
+    return FACES[dim] if dim == 3 else FACES[dim][:, BITS[:, 0]]
+
+
+def weights(t: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return what each corner of a face counts (n, 4) at its coordinates t (n, 2), from 0 to 1."""
+    return np.where(BITS, t[:, None], 1 - t[:, None]).prod(axis=2)
+
+
+def near(a: NDArray[np.float64], b: NDArray[np.float64], reach: float = 0.0) -> tuple[NDArray, NDArray]:
+    """Return the pairs (n,), (n,) of polytopes a (k, c, d) and b (l, c, d) whose boxes are within `reach`."""
+    if not (len(a) and len(b)):
+        return (np.empty(0, dtype=np.int64),) * 2
+    low, high = np.maximum(a.min(axis=(0, 1)), b.min(axis=(0, 1))), np.minimum(a.max(axis=(0, 1)), b.max(axis=(0, 1)))
+    size = [np.ptp(c, axis=1) for c in (a, b)]
+    edge = np.maximum(size[0].max(axis=0), size[1].max(axis=0))
+    slack = reach + 0.01 * edge.max()
+    i, j = (
+        np.flatnonzero(((c.max(axis=1) >= low - slack) & (c.min(axis=1) <= high + slack)).all(axis=1)) for c in (a, b)
+    )
+    if not (len(i) and len(j)):
+        return i[:0], j[:0]
+    scale = (size[0][i].max(axis=0) + size[1][j].max(axis=0)) / 2 + slack
+    trees = [cKDTree((c.min(axis=1) + c.max(axis=1)) / (2 * scale)) for c in (a[i], b[j])]
+    pairs = trees[0].sparse_distance_matrix(trees[1], 1.0, p=np.inf, output_type="ndarray")
+    return i[pairs["i"]], j[pairs["j"]]
+
+
+def covers(own: Faces, other: Faces) -> Cover:
+    """Return where faces of another body lie on faces of one, each seen from the other side."""
+    i, j = near(own.corners, other.corners)
+    n, m = (f.outward / np.maximum(np.linalg.norm(f.outward, axis=1, keepdims=True), TINY) for f in (own, other))
+    back = np.einsum("nd,nd->n", n[i], m[j]) < -0.5
+    i, j = i[back], j[back]
+    t, off = local(own.corners[i], other.corners[j], n[i])
+    low, high = t.min(axis=1), t.max(axis=1)
+    edge, bend = own.edge()[i], own.bend[i] + other.bend[j]
+    lost = 4 * rounding(own.corners)
+    slack = np.minimum(SAME + (lost + bend) / np.maximum(edge.min(axis=1), TINY), (high - low).min(axis=1) / 4)
+    upper = t > ((low + high) / 2)[:, None]
+    corner = upper @ [1, 2]
+    straight = np.abs(t - np.where(upper, high[:, None], low[:, None])).max(axis=(1, 2)) <= np.maximum(slack, 1e-9)
+    straight &= (np.sort(corner, axis=1) == np.arange(4)).all(axis=1)
+    flat = _parallelograms(own.corners[i])
+    plane, whole = (local(flat, corners, n[i])[0] for corners in (other.corners[j], own.corners[i]))
+    out = Cover(i, j, low, high, np.where(straight[:, None], corner, -1), t, slack, plane)
+    box = [np.where(straight[:, None], one, two) for one, two in ((low, plane.min(axis=1)), (high, plane.max(axis=1)))]
+    within = [np.where(straight[:, None], k, x) for k, x in enumerate((whole.min(axis=1), whole.max(axis=1)))]
+    ends = [np.clip(x, *within) for x in box]
+    on = ((ends[1] - ends[0]) > slack[:, None]).all(axis=1)
+    at = (ends[0] + ends[1]) / 2
+    off_edges = np.einsum("nk,nkd->nd", weights(at), flat)  # the same place but for faces that are no parallelograms
+    at = np.where(straight[:, None], at, local(own.corners[i], off_edges[:, None], n[i])[0][:, 0])
+    middle = np.einsum("nk,nkd->nd", weights(at), own.corners[i])
+    _, beside = local(other.corners[j], middle[:, None], m[j])
+    gap = np.where(straight, 0.0, np.abs(beside[:, 0]))  # of those that are turned, between their middles
+    with np.errstate(divide="ignore", invalid="ignore"):  # of boxes without a width, which are not on
+        for bits in BITS:
+            at = out.at(np.where(bits, ends[1], ends[0]))
+            gap = np.where(straight, np.maximum(gap, np.abs((at * off).sum(axis=1))), gap)
+    on &= gap <= TOUCH * np.minimum(edge.min(axis=1), other.edge()[j].min(axis=1)) + lost + 2 * bend
+    return Cover(*(getattr(out, name)[on] for name in Cover.__dataclass_fields__))
+
+
+def _parallelograms(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return faces (n, 4, 3) with their last corner put where two edges of the others tell."""
+    return np.stack([*(corners[:, k] for k in range(3)), corners[:, 1] + corners[:, 2] - corners[:, 0]], axis=1)
+
+
+def local(corners: NDArray, x: NDArray, normal: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the coordinates (n, c, 2) of places x (n, c, 3) in faces (n, 4, 3), and how far they are before them."""
+    t = np.full((*x.shape[:2], 2), 0.5)
+    c0, c1, c2, c3 = (corners[:, k, None] for k in range(4))
+    for _ in range(8):  # Gauss and Newton's method; of parallelograms the first is exact
+        a, b = t[..., :1], t[..., 1:]
+        e = (c1 - c0) * (1 - b) + (c3 - c2) * b, (c2 - c0) * (1 - a) + (c3 - c1) * a
+        r = x - (c0 * (1 - a) * (1 - b) + c1 * a * (1 - b) + c2 * (1 - a) * b + c3 * a * b)
+        aa, ab, bb = (np.einsum("ncd,ncd->nc", *p) for p in ((e[0], e[0]), (e[0], e[1]), (e[1], e[1])))
+        ra, rb = (np.einsum("ncd,ncd->nc", r, v) for v in e)
+        step = np.stack([bb * ra - ab * rb, aa * rb - ab * ra], axis=2) / np.maximum(aa * bb - ab**2, TINY)[..., None]
+        t = np.clip(t + step, -1e3, 1e3)
+        if np.abs(step).max(initial=0.0) < 1e-12:
+            break
+    return t, np.einsum("ncd,nd->nc", r, normal)
+
+
+def covered(count: int, cover: Cover) -> NDArray[np.float64]:
+    """Return the share of each of so many faces (m,), in its coordinates, that lies under others."""
+    s, owner = within(*_triangles(cover.t, cover.face), np.zeros(2), np.ones(2))
+    return sum_by(owner, _areas(s), count)
+
+
+def uncovered_triangles(
+    own: Faces, cover: Cover, faces: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return what is free of faces (m,) as triangles: the face (n,) of each, and its corners (n, 3, 2), from 0 to 1."""
+    corners = own.corners[faces]
+    normal = own.outward[faces] / np.linalg.norm(own.outward[faces], axis=1, keepdims=True)
+    whole, _ = local(_parallelograms(corners), corners, normal)
+    of = np.flatnonzero(np.isin(cover.face, faces))
+    of = of[np.argsort(cover.face[of], kind="stable")]
+    first = np.searchsorted(cover.face[of], faces)
+    count = np.searchsorted(cover.face[of], faces, "right") - first
+    s, owner = _triangles(whole, np.arange(len(faces)))
+    for k in range(count.max()):  # take the k-th of the faces that lie on each away
+        has = count[owner] > k
+        free, whose = [s[:, :, ~has]], [owner[~has]]
+        s, owner = s[:, :, has], owner[has]
+        quad = cover.plane[of[np.minimum(first + k, len(of) - 1)]][:, [0, 1, 3, 2]]  # around
+        turn = np.sign(_cross(quad[:, 2] - quad[:, 0], quad[:, 3] - quad[:, 1]))
+        for a in range(4):
+            p, q = quad[owner, a].T, quad[owner, (a + 1) % 4].T
+            inside = turn[owner] * _cross((q - p).T, (s - p).transpose(0, 2, 1))
+            s3 = np.concatenate([s, inside[:, None]], axis=1)
+            out, out_owner, s3, owner = split(s3, owner, 2, 0.0)
+            free.append(out[:, :2])
+            whose.append(out_owner)
+            s = s3[:, :2]
+        s, owner = np.concatenate(free, axis=2), np.concatenate(whose)
+        some = _areas(s) > SAME
+        s, owner = s[:, :, some], owner[some]
+    slack = np.zeros(len(faces))
+    np.maximum.at(slack, np.searchsorted(faces, cover.face[of]), cover.slack[of])
+    edge = np.linalg.norm(s - s[[1, 2, 0]], axis=1).max(axis=0)
+    some = 2 * _areas(s) > 2 * slack[owner] * edge  # chords of a curve that differ leave slivers, which would drain it
+    s, owner = s[:, :, some].transpose(2, 0, 1), owner[some]
+    kites = np.abs(whole[owner] - BITS).max(axis=(1, 2), initial=0.0) > SAME
+    x = np.einsum(
+        "nck,nkd->ncd", weights(s[kites].reshape(-1, 2)).reshape(-1, 3, 4), _parallelograms(corners)[owner[kites]]
+    )
+    s[kites] = np.clip(local(corners[owner[kites]], x, normal[owner[kites]])[0], 0.0, 1.0)
+    return faces[owner], s
+
+
+def within(s: NDArray, owner: NDArray, low: NDArray, high: NDArray) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return what of triangles (3, 2, n) lies in boxes (2,) or (n, 2), and their owners."""
+    low, high = (np.broadcast_to(x, (s.shape[2], 2)) for x in (low, high))
+    index = np.arange(s.shape[2])
+    for axis in (0, 1):
+        _, _, s, index = split(s, index, axis, low[index, axis])
+        s, index, _, _ = split(s, index, axis, high[index, axis])
+    return s, owner[index]
+
+
+def _triangles(quads: NDArray, owner: NDArray) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return two triangles each (3, 2, 2n) of quadrilaterals (n, 4, 2), and their owners."""
+    both = [quads[:, list(simplex)].transpose(1, 2, 0) for simplex in kuhn_simplices(2)]
+    return np.concatenate(both, axis=2).astype(float), np.tile(owner, 2)
+
+
+def _cross(a: NDArray, b: NDArray) -> NDArray[np.float64]:
+    """Return the cross products (...) of vectors (..., 2)."""
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+
+
+def _areas(s: NDArray) -> NDArray[np.float64]:
+    """Return the areas (n,) of triangles (3, 2, n)."""
+    return 0.5 * np.abs(_cross(*(s[1:] - s[0]).swapaxes(1, 2)))
+
+
+def split(s: NDArray, owner: NDArray, axis: int, plane) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+    """Return what of triangles (3, e, n) lies below a plane of an axis, and above it, each with its owners."""
+    plane = np.broadcast_to(plane, len(owner))
+    low, high = s[:, axis].min(axis=0) < plane, s[:, axis].max(axis=0) > plane
+    both = np.flatnonzero(low & high)
+    below, below_owner, above, above_owner = cut_at(s[:, :, both], owner[both], axis, plane[both])
+    parts = (below, below_owner, low & ~high), (above, above_owner, high & ~low)  # what lies in the plane has no area
+    out = [(np.concatenate([c, s[:, :, k]], axis=2), np.concatenate([o, owner[k]])) for c, o, k in parts]
+    return *out[0], *out[1]
+
+
+def uncovered(
+    count: int, face: NDArray[np.int64], low: NDArray[np.float64], high: NDArray[np.float64], slack: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return the free rectangles of faces: the face (m,) of each, and its lower and upper corners (m, 2).
+
+    Parameters
+    ----------
+    count
+        Number of faces.
+    face, low, high : (n,), (n, 2), (n, 2)
+        Boxes that cover faces, in coordinates that go from 0 to 1 over a face.
+    slack : (n,)
+        By how much ends of boxes that are one may differ.
+    """
+    touched, row = np.unique(face, return_inverse=True)
+    whole = np.setdiff1d(np.arange(count), touched)
+    k, most = len(touched), np.full(len(touched), SAME)
+    np.maximum.at(most, row, slack)
+    ends, lines, start, size = [], [], [], []  # along both axes: planes through the ends of boxes, of all faces in turn
+    for a in range(2):
+        value = np.clip(np.concatenate([np.zeros(k), np.ones(k), low[:, a], high[:, a]]), 0, 1)
+        owner = np.concatenate([np.arange(k), np.arange(k), row, row])
+        order = np.lexsort((value, owner))
+        v, o = value[order], owner[order]
+        new = np.append(True, (np.diff(v) > most[o[1:]]) | (np.diff(o) > 0))[: len(v)]
+        at = np.empty(len(v), dtype=np.int64)
+        at[order] = np.cumsum(new) - 1
+        planes = v[new]
+        planes[at[k : 2 * k]] = 1.0
+        start.append(at[:k])
+        size.append(at[k : 2 * k] - at[:k] + 1)
+        lines.append(planes)
+        ends.append(at[2 * k :].reshape(2, -1) - at[:k][row])
+    block = size[0] * size[1]
+    offset = np.cumsum(block) - block
+    cover = np.zeros(int(block.sum()), dtype=np.int64)
+    for e0 in (0, 1):
+        for e1 in (0, 1):
+            np.add.at(cover, offset[row] + ends[0][e0] * size[1][row] + ends[1][e1], 1 if e0 == e1 else -1)
+    owner = np.repeat(np.arange(k), block)
+    i, j = np.divmod(np.arange(len(cover)) - offset[owner], size[1][owner])
+    cover = np.cumsum(cover)  # along the second axis: a row of a face sums to nothing
+    across = np.lexsort((i, j, owner))
+    cover[across] = np.cumsum(cover[across])
+    free = (cover == 0) & (i < size[0][owner] - 1) & (j < size[1][owner] - 1)
+    begin = np.flatnonzero(free & np.append(True, ~free[:-1])[: len(free)])  # runs along the second axis
+    stop = np.flatnonzero(free & np.append(~free[1:], True)[: len(free)])
+    order = np.lexsort((i[begin], j[stop], j[begin], owner[begin]))
+    begin, stop = begin[order], stop[order]
+    same = [owner[begin], j[begin], j[stop], i[begin] - np.arange(len(begin))]  # runs of runs along the first
+    first = np.append(True, np.any([np.diff(s) != 0 for s in same], axis=0))[: len(begin)]
+    last = np.append(first[1:], True)[: len(begin)]
+    begin, stop, o = begin[first], stop[last], owner[begin[first]]
+    corners = [
+        np.stack([lines[0][start[0][o] + a], lines[1][start[1][o] + b]], axis=1)
+        for a, b in ((i[begin], j[begin]), (i[stop] + 1, j[stop] + 1))
+    ]
+    wholes = np.zeros((len(whole), 2)), np.ones((len(whole), 2))
+    out = np.concatenate([whole, touched[o]])
+    order = np.argsort(out, kind="stable")
+    return out[order], *(np.concatenate(pair)[order] for pair in zip(wholes, corners, strict=True))
+
+
+def separation(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return how far convex domains a, b (n, 2^d, d), m, are apart (n,), m; negative: how deep they lie in each other.
+
+    Domains do not overlap if a plane lies between them: along a face of one, or in 3D along an edge of each.
+    """
+    d = a.shape[2]
+    out = _between_planes(a, b, (face_vectors(c, face) for c in (a, b) for face in range(2 * d)))
+    if d == 3:
+        k = np.flatnonzero(out < 0)
+        bits = corner_bits(3)
+        edges = [(i, i + (1 << axis)) for axis in range(3) for i in np.flatnonzero(bits[:, axis] == 0)]
+        e, f = ([c[k, j] - c[k, i] for i, j in edges] for c in (a, b))
+        out[k] = np.maximum(out[k], _between_planes(a[k], b[k], (np.cross(x, y) for x in e for y in f)))
+    return out
+
+
+def _between_planes(a: NDArray, b: NDArray, normals: Iterable[NDArray]) -> NDArray[np.float64]:
+    """Return how far planes of these normals (n, d) can be apart between domains (n,), m."""
+    out, size = np.full(len(a), -np.inf), np.ptp(a, axis=1).max(axis=1)
+    for n in normals:
+        length = np.linalg.norm(n, axis=1)
+        n = n / np.where(length > 0, length, 1.0)[:, None]
+        pa, pb = (np.einsum("nkd,nd->nk", c, n) for c in (a, b))
+        gap = np.maximum(pb.min(axis=1) - pa.max(axis=1), pa.min(axis=1) - pb.max(axis=1))
+        out = np.maximum(out, np.where(length > 1e-9 * size ** (a.shape[2] - 1), gap, -np.inf))
+    return out
+
+
+def solids(body: Body) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return convex domains (m, 2^d, d), m, that fill a body, a box as one, and their allowances (m,), m."""
+    low, high = body.bounds
+    size, edge = high - low, body.spacing.min()
+    if body.aligned and np.isclose(size.prod(), len(body) * body.spacing.prod(), rtol=1e-9, atol=0):
+        return (low + corner_bits(len(size)) * size)[None], allowance(np.full(1, edge))
+    corners = body.corners()
+    warp = np.zeros(len(body))
+    if len(size) == 3 and not body.aligned:
+        for face, index in enumerate(FACES[3]):
+            f, n = corners[:, index], face_vectors(corners, face)  # what lies in the plane of a face is no warp
+            off = np.einsum("nd,nd->n", f[:, 0] - f[:, 1] - f[:, 2] + f[:, 3], n)
+            warp = np.maximum(warp, np.abs(off) / np.maximum(np.linalg.norm(n, axis=1), TINY) / 4)
+    edge = np.ptp(corners, axis=1).min(axis=1)
+    return corners, allowance(edge) + 2 * (body.bend(np.arange(len(body))) + warp)
+
+
+def allowance(edge: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return by how much domains that touch, with edges (m,), m, may seem to lie in or off each other."""
+    return TOUCH / 2 * edge
+
+
+def meeting(
+    a: tuple[NDArray[np.float64], NDArray[np.float64]],
+    b: tuple[NDArray[np.float64], NDArray[np.float64]],
+    h: NDArray[np.float64],
+) -> tuple[float, float, NDArray[np.float64]]:
+    """Return how deep domains lie in others, m, how many cells of size h (d,) they are apart, and where (d,).
+
+    a, b: domains and their allowances, see `solids`.  Those that touch are 0 m deep, 0 cells apart; far ones inf cells.
+    """
+    i, j = near(a[0], b[0])
+    apart, slack = separation(a[0][i], b[0][j]), a[1][i] + b[1][j] + rounding(a[0])
+    if (apart <= slack).any():
+        k = int(np.argmin(apart + slack))
+        depth, gap = max(0.0, -apart[k]) if apart[k] < -slack[k] else 0.0, 0.0
+    else:
+        i, j = near(a[0] / h, b[0] / h, 1.0)
+        apart = separation(a[0][i] / h, b[0][j] / h)
+        if not len(i):
+            return 0.0, np.inf, np.zeros(len(h))
+        k = int(np.argmin(apart))
+        depth, gap = 0.0, float(apart[k])
+    one, other = a[0][i[k]], b[0][j[k]]
+    x = (np.maximum(one.min(axis=0), other.min(axis=0)) + np.minimum(one.max(axis=0), other.max(axis=0))) / 2
+    return depth, gap, x
+
+
+def check_apart(grid: Grid, bodies: Sequence[Body], present: Sequence[bool]) -> None:
+    """Refuse bodies that lie in each other as seeded; log a warning for those that do not touch and yet will stick."""
+    there = [i for i in range(len(bodies)) if present[i]]
+    found = {i: solids(bodies[i]) for i in there} if len(there) > 1 else {}
+    first = np.cumsum([0, *(len(body) for body in bodies[:-1])])  # point of each body
+    for i, j in combinations(there, 2):
+        depth, gap, x = meeting(found[i], found[j], grid.h)
+        if depth:
+            raise ValueError(f"bodies {i} and {j}: both are at {x}, {depth:.3g} m deep, must not lie in each other")
+        together = grid.copies == 1 or np.ptp(grid.copy(first[[i, j]])) == 0  # else they share no node
+        if together and 0 < gap < 1 and not any(_lies_in(x, found[k][0]) for k in there if k not in (i, j)):
+            warn_near(grid, f"bodies {i} and {j}", gap, x)
+
+
+def _lies_in(x: NDArray[np.float64], domains: NDArray[np.float64]) -> bool:
+    """Return whether a position (d,), m, lies in one of the domains (n, 2^d, d), m."""
+    point = np.broadcast_to(x, (1, *domains.shape[1:]))
+    which, _ = near(domains, point)
+    return bool((separation(domains[which], np.repeat(point, len(which), axis=0)) <= 0).any())
+
+
+def warn_near(grid: Grid, names: str, gap: float, x: NDArray[np.float64]) -> None:
+    """Log a warning for bodies that do not touch but are less than a cell apart: they share nodes, and so stick."""
+    if 0 < gap < 1:
+        where = "%s: %.2g cells apart at %s, and yet they stick, as they share nodes of the grid"
+        warn(grid.comm, where + "; seed them in contact, or take cells smaller than the gap", names, gap, x)

@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: MIT
+"""The axis of revolution of axisymmetric scenes: it is held, and a hole about it has to be a cell wide."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from mpm_dolfinx.bodies.bodies import Body
+from mpm_dolfinx.grid.grid import Grid
+from mpm_dolfinx.parallel.messages import warn
+
+ON = 1e-6  # cells: how near to the axis what touches it lies
+
+
+def with_axis(grid: Grid, fixed: Mapping[str, str]) -> Mapping[str, str]:
+    """Return walls with their components, also that of the axis of revolution, which stays where it is."""
+    left = fixed.get("left", "") if isinstance(fixed, Mapping) else None
+    if not grid.has_axis or not isinstance(left, str) or "x" in left:
+        return fixed
+    return {**fixed, "left": "x" + left}
+
+
+def check_axisymmetry(grid: Grid, bodies: Sequence[Body], quadrature: str) -> None:
+    """Refuse what axisymmetric scenes cannot have, and warn of holes about the axis that are too narrow."""
+    if grid.axisymmetric and quadrature == "point":
+        raise ValueError("quadrature 'point': must be domain in axisymmetry")
+    _warn_narrow_hole(grid, bodies)
+
+
+def _warn_narrow_hole(grid: Grid, bodies: Sequence[Body]) -> None:
+    """Log a warning of a hole about the axis that ends within the cells beside it, whose nodes on the axis are held."""
+    if not grid.has_axis:
+        return
+    x = np.concatenate([body.corners() for body in bodies])
+    inner = x[:, :, 0].min(axis=1)
+    near = np.flatnonzero(inner < grid.h[0] * (1 - ON))
+    row = grid.index(x[near].mean(axis=1))[:, 1]
+    touches = np.zeros(grid.shape[1] + 2, dtype=bool)
+    for k in range(3):  # a surface aslant begins off the axis in the next row
+        touches[row[inner[near] <= ON * grid.h[0]] + k] = True
+    hole = near[~touches[row + 1]]
+    if len(hole):
+        k = hole[inner[hole].argmin()]
+        what = "a hole about the axis of radius %.3g m, at %s, is narrower than a cell of %.3g m: its side moves as a "
+        what += "solid core does; take smaller cells, or a grid that begins at a radius > 0"
+        warn(grid.comm, what, inner[k], x[k].mean(axis=0), grid.h[0])

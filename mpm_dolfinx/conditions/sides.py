@@ -1,0 +1,194 @@
+# SPDX-License-Identifier: MIT
+"""The sides of the bodies that conditions name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from mpm_dolfinx.base.given_values import Places
+from mpm_dolfinx.base.validation import line
+from mpm_dolfinx.bodies.bodies import Body
+from mpm_dolfinx.bodies.faces import Region, Surface, joined, limits, surface
+from mpm_dolfinx.conditions.conditions import Displacement
+from mpm_dolfinx.domains.cut_domains import Patches
+from mpm_dolfinx.grid.grid import Grid, rounding
+from mpm_dolfinx.parallel.exchange import Exchange, first
+from mpm_dolfinx.points.material_points import MaterialPoints
+
+HALF = 0.5 * (1 + 1e-6)  # of a cell, but for rounding
+
+
+class Sides:
+    """Finds the faces of conditions, the same object for conditions on the same faces.
+
+    Parameters
+    ----------
+    grid, bodies
+        Background grid and all bodies of the scene.
+    present
+        Which bodies are there.
+    """
+
+    def __init__(self, grid: Grid, bodies: Sequence[Body], present: Sequence[bool]):
+        self.grid, self.bodies, self.present = grid, bodies, present
+        self._found: dict[tuple[str, bytes], Surface] = {}
+
+    def of(self, condition) -> Surface:
+        """Return the faces of a condition's side and region; ValueError where there are none."""
+        found = self._of(condition.side, condition.region)
+        if not len(found):
+            where = " in the region" if condition.region is not None else ""
+            where += " off the axis" if self.grid.has_axis else ""
+            raise ValueError(f"{line(condition)}: no point has this side{where}, must be one of a body")
+        copies = np.unique(self.grid.copy(found.id))
+        if len(copies) > 1:
+            what = f"{line(condition)}: {len(copies)} groups of bodies have this side"
+            raise ValueError(f"{what}, must be one; limit it to one by a region, and give one for each")
+        return found
+
+    def _of(self, side: str, region: Region | None) -> Surface:
+        """Return the faces of a side in a region."""
+        key = (str(side), limits(region, self.grid.dim).tobytes())
+        if key not in self._found:
+            found = surface(self.bodies, side, region, self.present)
+            self._found[key] = found.off_axis() if self.grid.has_axis else found
+        return self._found[key]
+
+    def held(self, condition: Displacement, others: Sequence[Displacement]) -> Surface:
+        """Return the faces at which a given displacement is imposed: not those of a cell that its region half leaves.
+
+        The last node that is held carries half a cell beyond it.  So a region that reaches no farther than half of its
+        last cell is held up to this cell; aslant to the grid, up to half a cell before its end.  A region ends where
+        its side goes on and nothing else gives the same components.
+
+        Parameters
+        ----------
+        condition
+            The given displacement.
+        others
+            The other ones that give some of its components.
+        """
+        faces, d = self.of(condition), self.grid.dim
+        box, X = faces.region.copy(), faces.X
+        if not np.isfinite(box).any():
+            return faces
+        side = self._of(condition.side, None)
+        own = np.broadcast_to(self.grid.copy(side.id) == self.grid.copy(faces.id[:1]), len(side))  # of its group
+        size = X[:, 1].max(axis=0) - X[:, 0].min(axis=0)
+        near = 1e-9 * size.max() + rounding(X)
+        neighbours = [self.of(other).X for other in others]
+
+        def along(boxes: NDArray[np.float64], axis: int, x: float) -> NDArray[np.bool_]:
+            """Return which boxes (m, 2, d) lie beside the faces, and reach beyond x along an axis on both sides."""
+            across = np.arange(d) != axis
+            low, high = X[:, 0].min(axis=0) - near, X[:, 1].max(axis=0) + near
+            beside = ((boxes[:, 0] < high) & (boxes[:, 1] > low))[:, across].all(axis=1)
+            return beside & (boxes[:, 0, axis] <= x) & (boxes[:, 1, axis] >= x)
+
+        for axis in range(d):
+            for end, sign in enumerate((-1, 1)):
+                limit = box[end, axis]
+                beyond = limit + 2 * sign * near
+                goes_on = np.isfinite(limit) and along(side.X[own], axis, beyond).any()
+                if goes_on and not any(along(boxes, axis, beyond).any() for boxes in neighbours):
+                    at_end = own & along(side.X, axis, limit) & (np.ptp(side.X, axis=1)[:, axis] > 0)
+                    box[end, axis] -= sign * self._beyond_nodes(side, at_end, axis, limit, sign)
+        box[:, box[0] > box[1]] = faces.region[:, box[0] > box[1]]
+        shorter = self._of(condition.side, box)
+        return shorter if len(shorter) else faces  # less than a cell wide
+
+    def _beyond_nodes(self, side: Surface, at_end: NDArray[np.bool_], axis: int, x: float, sign: int) -> float:
+        """Return how far, m, a region that ends at x along an axis of reference positions is not held, see `held`.
+
+        at_end (m,): which faces of the side reach over x.
+        """
+        faces = np.flatnonzero(at_end)
+        X, places = side.corners[faces][:, :, axis], side.places()[faces]
+        way, moved = X - X.mean(axis=1, keepdims=True), places - places.mean(axis=1, keepdims=True)
+        slope = np.einsum("mk,mkd->d", way, moved) / np.square(way).sum() / self.grid.h  # of a map, cells over metres
+        a = np.abs(slope).argmax()
+        if np.abs(np.delete(slope, a)).max() > 1e-9 * abs(slope[a]):
+            return 0.5 / float(np.linalg.norm(slope))
+        end = (places.mean(axis=1)[0, a] - self.grid.lower[a]) / self.grid.h[a] + (x - X.mean(axis=1)[0]) * slope[a]
+        share = (sign * np.sign(slope[a]) * end) % 1.0
+        return share / abs(float(slope[a])) if share <= HALF else 0.0
+
+    def around(self, bodies: Sequence[int]) -> Surface:
+        """Return the faces on all sides of those of some bodies that are there, what lies on other bodies included."""
+        key = ("", np.array(bodies).tobytes())
+        if key not in self._found:
+            there = [bool(here) and i in bodies for i, here in enumerate(self.present)]
+            self._found[key] = surface(self.bodies, None, None, there)
+        return self._found[key]
+
+    def all(self) -> Surface:
+        """Return the faces on all sides of all groups of bodies: what groups have on one another may part."""
+        start = np.cumsum([0, *(len(body) for body in self.bodies[:-1])])
+        copy = np.broadcast_to(self.grid.copy(start), len(self.bodies))
+        return joined([self.around(np.flatnonzero(copy == group).tolist()) for group in np.unique(copy)])
+
+
+def everywhere(grid: Grid, ask: Callable[[], NDArray[np.float64]]) -> NDArray[np.float64]:
+    """Return what functions of the user's give on this process; raise on all what is raised on one."""
+    message, value = "", None
+    try:
+        value = ask()
+    except ValueError as error:
+        message = str(error)
+    if message := first(grid.comm, message):
+        raise ValueError(message)
+    return value
+
+
+def on_side(patches: Patches, points: MaterialPoints) -> Places:
+    """Return what gives the places at which functions of the user's are asked on a side."""
+    return lambda name: patches.X if name == "X" else patches.now(points)
+
+
+def gathered(grid: Grid, rows: Sequence[tuple], width: int) -> tuple[NDArray, NDArray, NDArray]:
+    """Send (cells, positions, values) to the owners of the cells; return (owned cells, positions, values)."""
+    empty = (np.empty(0, dtype=np.int64), np.empty((0, grid.dim)), np.empty((0, width)))
+    parts = [np.concatenate(column) for column in zip(empty, *rows, strict=True)]
+    travel = Exchange(grid.comm, grid.owner(parts[0]))
+    cell, x, values = map(travel.send, parts)
+    return grid.local(cell), x, values
+
+
+def check_apart(one, faces: Surface, other, others: Surface) -> None:
+    """Refuse two conditions, of a kind that excludes the other, on the same part of a face."""
+    first, stop = (np.searchsorted(others.id, faces.id, end) for end in ("left", "right"))
+    a = np.repeat(np.arange(len(faces)), stop - first)  # all pairs of parts of one domain's faces
+    b = np.arange(len(a)) - np.repeat(np.cumsum(stop - first) - stop, stop - first)
+    same = faces.face[a] == others.face[b]
+    a, b = a[same], b[same]
+    low, high = np.maximum(faces.X[a, 0], others.X[b, 0]), np.minimum(faces.X[a, 1], others.X[b, 1])
+    size = faces.X[a, 1] - faces.X[a, 0]
+    common = (high - low > 1e-9 * size) | (size <= 1e-9 * size.max(axis=1, keepdims=True))  # they lie across this axis
+    both = np.flatnonzero(common.all(axis=1))
+    if len(both):
+        x = (low[both[0]] + high[both[0]]) / 2
+        raise ValueError(f"{line(one)} and {line(other)}: both act at {x}, must not; limit them by regions")
+
+
+def meeting(bodies: Sequence[Body], one: Surface, other: Surface) -> NDArray[np.float64]:
+    """Return the reference positions (k, d), m, of corners that faces of two conditions have in common.
+
+    Bodies that a map has put elsewhere have corners in common with themselves only.
+    """
+
+    def corners(faces: Surface) -> NDArray[np.float64]:
+        body = np.searchsorted(np.cumsum([len(b) for b in bodies]), faces.id, side="right")
+        moved = np.array([i if b.map is not None else -1 for i, b in enumerate(bodies)])[body]
+        X = faces.corners
+        return np.concatenate([X, np.broadcast_to(moved[:, None, None], (*X.shape[:2], 1))], axis=2).reshape(
+            -1, dim + 1
+        )
+
+    dim = bodies[0].dim
+    x, near = corners(other), 1e-9 * min(b.spacing.min() for b in bodies) + rounding(one.X)
+    distance, _ = cKDTree(corners(one)).query(x, distance_upper_bound=near)
+    return x[distance <= near, :dim]

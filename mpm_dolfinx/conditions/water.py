@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: MIT
+"""Free water against a side of the bodies: its pressure and its head on what it wets, a seepage face above."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpm_dolfinx.base.given_values import check_names, given
+from mpm_dolfinx.base.validation import numbers
+from mpm_dolfinx.bodies.faces import Region
+from mpm_dolfinx.conditions.conditions import Drained, Pressure
+from mpm_dolfinx.materials.skeleton import STANDARD_GRAVITY
+
+
+def water(
+    side: str,
+    level: float | Callable[[float], float],
+    *,
+    region: Region | None = None,
+    unit_weight: float | None = None,
+) -> tuple[Pressure, Drained]:
+    """Return the two conditions by which still water acts on a side: one of the `tractions`, one of the `drained`.
+
+    Below its level it presses on the side and is open to the pores, with the hydrostatic pressure; above, the side is
+    a seepage face.  Both follow the side as it moves, from step to step.
+
+    Parameters
+    ----------
+    side
+        Side of the bodies, as for `Traction`.
+    level : float or callable t (s) -> float, m
+        Height of the free surface, along the last axis; finite.
+    region : ((d,), (d,)), m
+        Box of reference positions to which the faces are limited.
+    unit_weight
+        Of the water, N/m^3, > 0; by default that of the scene's fluid.  That of the pores is the fluid's density times
+        the gravity of the scene: a warning says where they differ.
+
+    Raises
+    ------
+    ValueError
+        Naming what is out of its range; of a function, at the step that asks for it.
+    """
+    if unit_weight is not None:
+        numbers("water: unit_weight", unit_weight, test=lambda v: (0 < v) & (v < np.inf), allowed="> 0 and finite")
+    if callable(level):
+        check_names(f"water at {side!r}: level", level, ("t",))
+    else:
+        numbers("water: level", level)
+
+    pressure = _pressure(side, level, 1000 * STANDARD_GRAVITY if unit_weight is None else unit_weight)
+    if unit_weight is None:
+        pressure.weighed = partial(_pressure, side, level)
+    return Pressure(side, pressure, region), Drained(side, pressure, region, seepage=True)
+
+
+def _pressure(side: str, level: float | Callable[[float], float], unit_weight: float) -> Callable[..., NDArray]:
+    """Return the pressure of water as a function of time and places."""
+
+    def pressure(t: float, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        height = given(f"water at {side!r}: level at t = {t:g} s", level, t)
+        return unit_weight * np.maximum(height - x[:, -1], 0.0)
+
+    pressure.unit_weight = unit_weight
+    return pressure

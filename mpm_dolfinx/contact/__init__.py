@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""Rigid tools and contact between groups of bodies."""

@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: MIT
+"""Which bodies touch which others without sticking: groups of bodies, each with a copy of the grid."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from mpm_dolfinx.base.validation import all_of, line, numbers
+from mpm_dolfinx.bodies.bodies import Body
+from mpm_dolfinx.grid.grid import Grid, GridOfGroups
+
+
+@dataclass(frozen=True, eq=False)
+class Contact:
+    """Two groups of bodies that touch, slide and part.
+
+    Bodies of one group stick where they touch; groups do not pass into each other, and what parts is free.  Where they
+    touch no fluid passes.  Where there are contacts all bodies are in groups, and every two groups have one contact.
+    The forces on the bodies of `one` are in the simulation's `tool_forces`, after those of tools.
+
+    Parameters
+    ----------
+    one, other : int or several
+        Indices of the bodies of each group.
+    friction
+        Coulomb's coefficient mu, >= 0.
+    adhesion
+        Shear stress that the contact takes besides, Pa, >= 0, as of a `Tool`.
+
+    Raises
+    ------
+    ValueError
+        What is none that is allowed; from the scene: groups that share bodies, or that have no contact.
+    """
+
+    one: int | Sequence[int]
+    other: int | Sequence[int]
+    friction: float = 0.0
+    adhesion: float = 0.0
+
+    def __post_init__(self):
+        for name in ("friction", "adhesion"):
+            value = getattr(self, name)
+            numbers(f"Contact: {name}", value, test=lambda v: (v >= 0) & (v < np.inf), allowed=">= 0 and finite")
+
+    @property
+    def grips(self) -> bool:
+        """Whether the contact resists slip."""
+        return self.friction > 0 or self.adhesion > 0
+
+    def groups(self, count: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        """Return the two groups, of a scene of so many bodies."""
+        allowed = f"indices of the bodies, 0 to {count - 1}"
+        found = []
+        for name in ("one", "other"):
+            value = numbers(
+                f"Contact: {name}",
+                getattr(self, name),
+                None,
+                allowed=allowed,
+                test=lambda i: (i >= 0) & (i < count) & (i % 1 == 0),
+            )
+            if not value.size:
+                raise ValueError(f"Contact: {name} = {line(getattr(self, name))}, must be {allowed}")
+            found.append(tuple(sorted({int(i) for i in value.ravel()})))
+        if common := set(found[0]) & set(found[1]):
+            what = f"Contact: body {min(common)} is in one = {line(self.one)} and in other = {line(self.other)}"
+            raise ValueError(f"{what}, must be in one of them: a body does not touch itself")
+        return found[0], found[1]
+
+
+def groups_of(contacts: Sequence[Contact], count: int) -> list[tuple[int, ...]]:
+    """Return the groups of a scene of so many bodies, by their first bodies; ValueError where they are none."""
+    pairs = [contact.groups(count) for contact in contacts]
+    groups = sorted({group for pair in pairs for group in pair})
+    for one, other in combinations(groups, 2):
+        if common := set(one) & set(other):
+            what = f"contacts: body {min(common)} is in the groups {line(one)} and {line(other)}"
+            raise ValueError(f"{what}, must be in one; name all bodies of a group in each of its contacts")
+        met = sum({*pair} == {one, other} for pair in pairs)
+        if met != 1:
+            raise ValueError(f"contacts: groups {line(one)} and {line(other)} have {met}, must have one contact")
+    if missing := set(range(count)) - {body for group in groups for body in group}:
+        raise ValueError(f"contacts: body {min(missing)} is in no group, must be in one")
+    return groups
+
+
+def grouped(
+    grid: Grid, bodies: Sequence[Body], contacts: Sequence[Contact], quadrature: str, other: dict[str, Any]
+) -> Grid:
+    """Return the grid of a scene: with contacts, one with a copy for each group.
+
+    Parameters
+    ----------
+    quadrature
+        See `Simulation`.
+    other
+        What scenes with contacts cannot have, by name.
+
+    Raises
+    ------
+    ValueError
+        Contacts that are none, or do not go together with what else the scene has.
+    """
+    all_of("contacts", contacts, Contact)
+    if not contacts:
+        return grid
+    if grid.axisymmetric:
+        raise ValueError("contacts: must be none in axisymmetry")
+    if quadrature == "point":
+        raise ValueError("quadrature 'point': must be domain with contacts")
+    for name, value in other.items():
+        if value is not None and not (isinstance(value, Sequence) and not len(value)):
+            raise ValueError(f"{name}: must be none with contacts")
+    group = np.zeros(len(bodies), dtype=np.int64)
+    for number, members in enumerate(groups_of(contacts, len(bodies))):
+        group[list(members)] = number
+    return GridOfGroups(grid, np.repeat(group, [len(body) for body in bodies]))

@@ -1,0 +1,331 @@
+# SPDX-License-Identifier: MIT
+"""The contacts of groups of a stage: which places on their surfaces face one another, and what points keep of it.
+
+The contact itself is in `body_contact`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
+
+from mpi4py import MPI
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from mpm_dolfinx.base.caching import Latest
+from mpm_dolfinx.base.errors import NotConverged
+from mpm_dolfinx.base.validation import line
+from mpm_dolfinx.bodies.bodies import Body
+from mpm_dolfinx.bodies.faces import Surface, surface
+from mpm_dolfinx.bodies.touching import BITS, local, weights
+from mpm_dolfinx.conditions.conditions import resistance
+from mpm_dolfinx.conditions.sides import Sides
+from mpm_dolfinx.contact.body_contact import BodyContact, Following, PairRows
+from mpm_dolfinx.contact.cell_contact import LEAST, kept, pressure_name, shear_name
+from mpm_dolfinx.contact.groups import Contact
+from mpm_dolfinx.contact.tool_placing import BEGINS, FACING
+from mpm_dolfinx.domains.cut_domains import DEPTH as UNDER
+from mpm_dolfinx.domains.cut_domains import CutDomains
+from mpm_dolfinx.materials.fields import SceneMaterials
+from mpm_dolfinx.parallel.exchange import Exchange, first, over_all
+from mpm_dolfinx.points.cutting import FACES
+from mpm_dolfinx.points.material_points import MaterialPoints
+
+REACH = 2.0
+"""Cells: what is farther apart cannot touch within a step; steps in which bodies move farther are refused."""
+CLEAR = 0.5
+"""Cells: what is farther apart will not touch before pairs are found anew."""
+DEEP = 0.25
+"""Cells: what is deeper is behind a thin body."""
+CANDIDATES = {2: 8, 3: 24}
+"""Nearest points of the other surface whose faces are tried."""
+BESIDE = 0.6
+"""Cells from points on the other surface: corners that are nearer go with it."""
+PLACES = 1 << 32
+"""More than a process has points of integration on a surface."""
+EDGE = 1e-6
+"""Of a face: what passes beside it by less meets it."""
+
+
+class Facets(NamedTuple):
+    """Points on the faces of the other group, those of all processes; arrays over n of them.
+
+    x : (n, d), m; face : (n,) row of the `Surface`; cell : (n,) lexicographic; resistance : (n,), Pa;
+    corners, cut : (n, 2^(d-1), d), m, of the face at present and when the grid was reset; outward : (n, d) unit normal.
+    """
+
+    x: NDArray[np.float64]
+    face: NDArray[np.int64]
+    cell: NDArray[np.int64]
+    resistance: NDArray[np.float64]
+    corners: NDArray[np.float64]
+    cut: NDArray[np.float64]
+    outward: NDArray[np.float64]
+
+
+class Pairs(NamedTuple):
+    """Points of one surface that face the other; arrays over m pairs.
+
+    row : (m,) point among the patches of this process; facet : (m,) one of the `Facets` on the face that it meets;
+    t : (m, 2) where on the face; gap : (m,), m, along the point's normal.
+    """
+
+    row: NDArray[np.int64]
+    facet: NDArray[np.int64]
+    t: NDArray[np.float64]
+    gap: NDArray[np.float64]
+
+
+class Contacts:
+    """The contacts of a stage.
+
+    Parameters
+    ----------
+    sides
+        The sides of the bodies.
+    materials
+        Those of the scene.
+    contacts
+        The contacts.
+    """
+
+    def __init__(self, sides: Sides, materials: SceneMaterials, contacts: Sequence[Contact]):
+        self.grid, self._materials, self.contacts = sides.grid, materials, tuple(contacts)
+        self._faces: list[tuple[Surface, Surface]] = []
+        signs = []
+        for contact in self.contacts:
+            both = contact.groups(len(sides.bodies))
+            faces = [sides.around(group) for group in both]
+            whole = [_extent([sides.bodies[i] for i in group]) for group in both]
+            swap = whole[1] < whole[0]  # the same in all stages, and in any order of the bodies
+            self._faces.append((faces[1], faces[0]) if swap else (faces[0], faces[1]))
+            signs.append(-1.0 if swap else 1.0)
+        self._signs = np.array(signs)
+        self._found: Latest[list[tuple[Facets, Pairs]]] = Latest()
+        self._reach: Latest[NDArray[np.int64]] = Latest()
+
+    @property
+    def symmetric(self) -> bool:
+        """Whether the tangent is symmetric."""
+        return not any(contact.grips for contact in self.contacts)
+
+    def kept(self, n: int) -> dict[str, NDArray[np.float64]]:
+        """Return what n points keep of the contacts, zero."""
+        return kept("contact", self.contacts, n, self.grid.dim)
+
+    def placed(self, cut: CutDomains, points: MaterialPoints) -> Following | None:
+        """Return the contact in a step, with the points where they are at its start."""
+        if not self.contacts:
+            return None
+        found = self._found(cut.key, lambda: self._met_all(cut, cut.points), self.grid.comm)
+        reach = partial(self._reach, cut.key, partial(self._cells_within_reach, cut, found), self.grid.comm)
+        begun = self._contact(cut, points, found, cut.points, points, reach)
+
+        def again(u: NDArray[np.float64]) -> BodyContact:
+            moved, _ = cut.followed(u.reshape(-1, self.grid.dim), np.zeros(self.grid.num_local, dtype=bool))
+            there = replace(points, corners=points.corners + moved)
+            return self._contact(cut, points, self._met_all(cut, there), there, there, reach)
+
+        return Following(begun, again)
+
+    def _contact(
+        self,
+        cut: CutDomains,
+        points: MaterialPoints,
+        found: Sequence[tuple[Facets, Pairs]],
+        seen: MaterialPoints,
+        there: MaterialPoints,
+        reach: Callable[[], NDArray[np.int64]],
+    ) -> BodyContact:
+        """Return the contact of pairs that were found with the points as `seen`, with these now `there`.
+
+        points: at the start of the step, with the pressures and shears of then.
+        """
+        grid, d, rows, off = self.grid, self.grid.dim, [], ""
+        own = self._materials.table(cut.points, resistance)
+        for number, ((faces, others), (facets, pairs)) in enumerate(zip(self._faces, found, strict=True)):
+            patches = cut.surface(faces)
+            now = facets if there is seen else self._facets(cut, others, there)
+            cell = self._under(facets, pairs.facet, _on(facets.cut[pairs.facet], pairs.t))
+            if there is not points:
+                near = np.isin(patches.cell[pairs.row] * len(grid.owners) + cell, reach())
+                slides = not near[pairs.gap < CLEAR * grid.h.min()].all()
+                off += f"{line(self.contacts[number])}: bodies slide by more than a cell" * slides
+                pairs, cell = Pairs(*(values[near] for values in pairs)), cell[near]
+            row, other, at = pairs.row, pairs.facet, patches.at[pairs.row]
+            y, where = (_on(corners[other], pairs.t) for corners in (now.corners, facets.cut))
+            area = patches.area(there)[row]
+            size = np.linalg.norm(area, axis=1)
+            n = -patches.area(seen)[row]
+            n /= np.linalg.norm(n, axis=1, keepdims=True)
+            old = np.zeros((len(row), d))
+            if self.contacts[number].grips:
+                old = _turned(points.data[shear_name("contact", number)][at], n)
+            pressure = points.data[pressure_name("contact", number)][at]
+            resists = np.minimum(own[at], now.resistance[other])
+            place = number * PLACES + row + grid.comm.rank * len(self.contacts) * PLACES
+            scalars = np.stack([np.full(len(row), number), place, size, resists, pressure], axis=1)
+            apart = patches.now(there)[row] - y
+            rows.append((patches.cell[row], cell, at, np.hstack([scalars, patches.x[row], where, n, apart, old])))
+        if off := first(grid.comm, off):
+            raise NotConverged(off)
+        cell, other, at, values = (np.concatenate(column) for column in zip(*rows, strict=True))
+        travel = Exchange(grid.comm, grid.owner(cell))
+        cell, other, sent = (travel.send(columns) for columns in (cell, other, values))
+        number, place = sent[:, :2].T.astype(np.int64)
+        x, y, n, apart, shear = np.split(sent[:, 5:], 5, axis=1)
+        placed = PairRows(number, grid.local(cell), *sent[:, 2:5].T, shear, other, x, y, n, apart, place)
+        back = (travel, at, values[:, 0].astype(np.int64), values[:, 2])
+        return BodyContact(grid, self.contacts, self._signs, placed, back, reach)
+
+    def _met_all(self, cut: CutDomains, points: MaterialPoints) -> list[tuple[Facets, Pairs]]:
+        """Return for each contact what `_met` does."""
+        return [self._met(cut, *faces, points) for faces in self._faces]
+
+    def _cells_within_reach(self, cut: CutDomains, found: Sequence[tuple[Facets, Pairs]]) -> NDArray[np.int64]:
+        """Return all pairs of lexicographic cells (m,), first * cells + second, that pairs of a step may be in.
+
+        Those of the pairs found at its start, and all that are next to each other.
+        """
+        grid, keys, count = self.grid, [], len(self.grid.owners)
+        for (faces, _), (facets, pairs) in zip(self._faces, found, strict=True):
+            patches = cut.surface(faces)
+            where = _on(facets.cut[pairs.facet], pairs.t)
+            keys.append(patches.cell[pairs.row] * count + self._under(facets, pairs.facet, where))
+            cells = np.unique(patches.cell), np.unique(facets.cell)
+            index = [np.stack(np.unravel_index(c % grid.cells, tuple(grid.shape)), axis=1) for c in cells]
+            near = cKDTree(index[0]).query_ball_tree(cKDTree(index[1]), 1.5, p=np.inf) if len(cells[0]) else []
+            times = [len(of) for of in near]
+            keys.append(
+                np.repeat(cells[0], times) * count + cells[1][np.concatenate([np.zeros(0, int), *near]).astype(int)]
+            )
+        return np.unique(np.concatenate(keys))
+
+    def _facets(self, cut: CutDomains, faces: Surface, points: MaterialPoints) -> Facets:
+        """Return points on faces of all processes, with the points where they are."""
+        patches, d = cut.surface(faces), self.grid.dim
+        index = FACES[d][faces.face[patches.here]]
+        now, then = (
+            np.take_along_axis(of.corners[patches.at], index[:, :, None], axis=1) for of in (points, cut.points)
+        )
+        resists = self._materials.table(cut.points, resistance)[patches.at]
+        area, n, k = patches.area(points), len(now), 2 ** (d - 1) * d
+        outward = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), LEAST)
+        whole = np.column_stack([patches.here, patches.cell])
+        rows = np.column_stack([patches.now(points), resists, now.reshape(n, k), then.reshape(n, k), outward])
+        whole, rows = (np.concatenate(self.grid.comm.allgather(part)) for part in (whole, rows))
+        x, resists, now, then, outward = np.split(rows, np.cumsum([d, 1, k, k]), axis=1)
+        shape = (len(rows), 2 ** (d - 1), d)
+        return Facets(x, *whole.T, resists[:, 0], now.reshape(shape), then.reshape(shape), outward)
+
+    def _met(self, cut: CutDomains, faces: Surface, others: Surface, points: MaterialPoints) -> tuple[Facets, Pairs]:
+        """Return the points on the faces of the other group, and which of these the points on the faces meet."""
+        patches, facets, d = cut.surface(faces), self._facets(cut, others, points), self.grid.dim
+        x, area = patches.now(points), patches.area(points)
+        n = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), LEAST)
+        count = min(CANDIDATES[d], len(facets.x))
+        if not count:  # bodies of the other group are not there
+            none = np.zeros(0, dtype=np.int64)
+            return facets, Pairs(none, none, np.zeros((0, 2)), np.zeros(0))
+        reach = REACH * self.grid.h.min() + self.grid.h.max()
+        _, near = cKDTree(facets.x).query(x, range(1, count + 1), distance_upper_bound=reach)
+        row, column = np.nonzero(near < len(facets.x))
+        other = near[row, column]
+        facing = np.einsum("md,md->m", n[row], facets.outward[other]) < -FACING
+        row, other = row[facing], other[facing]
+        t, gap = _along(facets.corners[other], x[row], n[row])
+        met = ((t >= -EDGE) & (t <= 1 + EDGE)).all(axis=1) & (gap <= REACH * self.grid.h.min())
+        met &= gap >= -DEEP * self.grid.h.min()
+        row, other, t, gap = row[met], other[met], t[met], gap[met]
+        order = np.lexsort((np.abs(gap), row))
+        order = order[np.append(True, np.diff(row[order]) > 0)[: len(order)]]
+        return facets, Pairs(row[order], other[order], t[order], gap[order])
+
+    def _under(self, facets: Facets, chosen: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Return the cells (m,) just under places x (m, d) on faces that hold a part of these, else of their facets."""
+        grid, inside = self.grid, x - UNDER * self.grid.h.min() * facets.outward[chosen]
+        number = grid.number(grid.index(inside)) + facets.cell[chosen] // grid.cells * grid.cells
+        keys = np.unique(facets.face * len(grid.owners) + facets.cell)
+        return np.where(np.isin(facets.face[chosen] * len(grid.owners) + number, keys), number, facets.cell[chosen])
+
+    def near(self, cut: CutDomains, points: MaterialPoints, corners: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return which corners (n, 2^d, d) of domains are beside another group: these follow the Q1 field alone.
+
+        points: as they were at the start of the step.
+        """
+        out, reach = np.zeros(corners.shape[:2], dtype=bool), BESIDE * self.grid.h.max()
+        for pair in self._faces:
+            for own, other in (pair, pair[::-1]) if all(map(len, pair)) else ():
+                x = self._facets(cut, other, points).x
+                mine = np.flatnonzero(self.grid.copy(points.id) == self.grid.copy(own.id[:1]))
+                distance, _ = cKDTree(x).query(corners[mine], distance_upper_bound=reach)
+                out[mine] |= distance < reach
+        return out
+
+    def check_end(self, cut: CutDomains, points: MaterialPoints, before: MaterialPoints) -> None:
+        """Refuse a step in which groups may have passed into each other unseen, or have.
+
+        Raises
+        ------
+        NotConverged
+            Saying where; a shorter step may do.
+        """
+        h, comm = self.grid.h.min(), self.grid.comm
+        moved = np.linalg.norm(points.corners - before.corners, axis=2).max(initial=0.0) if self.contacts else 0.0
+        if self.contacts and 2 * over_all(comm, float(moved), MPI.MAX) > REACH * h:
+            raise NotConverged(f"contacts: bodies move by more than {REACH / 2:g} cells in a step")
+        if message := self._too_deep(cut, points):
+            raise NotConverged(message)
+
+    def check_start(self, cut: CutDomains, points: MaterialPoints, t: float) -> None:
+        """Refuse groups that are in each other as a stage begins at time t (s)."""
+        if message := self._too_deep(cut, points):
+            raise ValueError(f"{message}, at t = {t:g} s as it begins, must touch or be apart")
+
+    def _too_deep(self, cut: CutDomains, points: MaterialPoints) -> str:
+        """Return where groups are too deep in each other, and how deep; nothing where they are not."""
+        h, comm = self.grid.h.min(), self.grid.comm
+        for contact, (faces, others) in zip(self.contacts, self._faces, strict=True):
+            _, pairs = self._met(cut, faces, others, points)
+            deepest = over_all(comm, float(pairs.gap.min(initial=np.inf)), MPI.MIN)
+            if deepest < -BEGINS * h:
+                row = pairs.row[pairs.gap == deepest][:1]
+                where = first(comm, "".join(f"{x}" for x in cut.surface(faces).now(points)[row]))
+                return f"{line(contact)}: bodies are {-deepest / h:.3g} cells in each other at {where}"
+        return ""
+
+
+def _extent(bodies: Sequence[Body]) -> tuple:
+    """Return what orders groups of bodies by their surfaces, and equal ones by where they are seeded."""
+    area = surface(bodies, None).area0.sum()
+    corners = np.concatenate([body.corners().reshape(-1, body.dim) for body in bodies])
+    return float(f"{area:.9g}"), *corners.min(axis=0), *corners.max(axis=0)
+
+
+def _turned(shear: NDArray[np.float64], n: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return tractions (m, d) turned by the least angle into the planes with normals n (m, d)."""
+    flat = shear - np.einsum("md,md->m", shear, n)[:, None] * n
+    size = np.maximum(np.linalg.norm(flat, axis=1), LEAST)
+    return flat * (np.linalg.norm(shear, axis=1) / size)[:, None]
+
+
+def _on(corners: NDArray[np.float64], t: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the places (m, d) at coordinates t (m, 2), from 0 to 1, on faces (m, 2^(d-1), d)."""
+    if corners.shape[2] == 2:
+        return corners[:, 0] + t[:, :1] * (corners[:, 1] - corners[:, 0])
+    return np.einsum("mk,mkd->md", weights(t), corners)
+
+
+def _along(corners: NDArray, x: NDArray, n: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return where lines from x (m, d) along n meet faces (m, 2^(d-1), d), in their coordinates (m, 2), and how far."""
+    if corners.shape[2] == 2:  # as in `Faces`, a unit of length wide along a third axis
+        corners = np.dstack([corners[:, BITS[:, 0]], np.broadcast_to(BITS[:, 1], (len(x), 4))])
+        x, n = np.column_stack([x, np.full(len(x), 0.5)]), np.column_stack([n, np.zeros(len(x))])
+    off = np.einsum("mkd,md->mk", corners - x[:, None], n)
+    t = local(corners - off[:, :, None] * n[:, None], x[:, None], n)[0][:, 0]
+    return t, np.einsum("mk,mk->m", weights(t), off)

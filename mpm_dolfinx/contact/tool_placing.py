@@ -1,0 +1,301 @@
+# SPDX-License-Identifier: MIT
+"""The rigid tools of a stage: where they touch the bodies in a step, and what points keep of them.
+
+The contact itself is in `tool_contact`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from copy import copy
+from typing import NamedTuple
+
+from mpi4py import MPI
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from mpm_dolfinx.base.errors import NotConverged
+from mpm_dolfinx.base.validation import line
+from mpm_dolfinx.bodies.faces import Surface
+from mpm_dolfinx.conditions.conditions import Displacement, resistance
+from mpm_dolfinx.conditions.sides import everywhere
+from mpm_dolfinx.contact.cell_contact import LEAST, kept, pressure_name, shear_name
+from mpm_dolfinx.contact.pushed_tools import PushedTools
+from mpm_dolfinx.contact.tool_contact import ToolContact, ToolRows
+from mpm_dolfinx.contact.tools import Pose, Tool
+from mpm_dolfinx.domains.cut_domains import CutDomains
+from mpm_dolfinx.forms.point_forms import Places
+from mpm_dolfinx.grid.grid import Grid
+from mpm_dolfinx.materials.fields import SceneMaterials
+from mpm_dolfinx.parallel.exchange import Exchange, first, over_all
+from mpm_dolfinx.points.material_points import MaterialPoints, middle
+
+BEGINS = 1e-2  # cells: how deep a tool may be in a body as it begins, and where a displacement is given
+NEAR = 0.1  # cells: corners that are nearer go with the tool
+STRIDE = 0.02  # cells: tools that are thinner may pass points within a step unseen
+LEFT = 1e-3  # cells: how deep corners stay in tools; put onto what is less deep they would roughen the stress
+FACING = 0.5  # cosine between a face's normal and the way to the tool above which it looks at the tool
+
+
+def _box(x: NDArray[np.float64]) -> list[tuple[NDArray[np.float64], MPI.Op]]:
+    """Return the corners (d,) of the box around places (m, d), and how those of processes are put together."""
+    return [(x.min(axis=0, initial=np.inf), MPI.MIN), (x.max(axis=0, initial=-np.inf), MPI.MAX)]
+
+
+class Ways(NamedTuple):
+    """How far loads have pushed tools (k,), m, at the start and the end of a step, at two times, s."""
+
+    start: float
+    end: float
+    before: NDArray[np.float64]
+    after: NDArray[np.float64]
+
+    def at(self, t: float) -> NDArray[np.float64]:
+        """Return how far they have at a time of the step (s)."""
+        share = (t - self.start) / (self.end - self.start) if self.end > self.start else 1.0
+        return self.before + share * (self.after - self.before)
+
+
+class Tools:
+    """The tools of a stage.
+
+    Parameters
+    ----------
+    grid, materials
+        Background grid, and the materials of the scene.
+    tools
+        The tools.
+    outside
+        The surface of the bodies; called where there are tools.
+    held
+        Given displacements with their faces, on which tools do not act.
+    """
+
+    def __init__(
+        self,
+        grid: Grid,
+        materials: SceneMaterials,
+        tools: Sequence[Tool],
+        outside: Callable[[], Surface],
+        held: Sequence[tuple[Displacement, Surface]],
+    ):
+        self.grid, self._materials, self.tools, self._held = grid, materials, tuple(tools), held
+        still = np.zeros(len(self.tools))
+        self._ways = Ways(0.0, 0.0, still, still)
+        if len({id(tool) for tool in self.tools}) < len(self.tools):
+            raise ValueError("tools: one is given twice, must be tools of their own")
+        for tool in self.tools:
+            tool.check(grid.dim)
+            if grid.axisymmetric and tool.along(grid.dim)[0]:
+                raise ValueError(f"Tool: direction = {line(tool.direction)}, must be along the axis in axisymmetry")
+            if not callable(tool.displacement) and not callable(tool.rotation):
+                self._pose(tool, 0.0)
+        self.faces = outside() if self.tools else None
+        if self.tools:
+            sides = 2 * grid.dim
+            taken = [faces.id * sides + faces.face for _, faces in held]
+            own = self.faces.id * sides + self.faces.face
+            self._free = ~np.isin(own, np.concatenate([np.zeros(0, np.int64), *taken]))
+
+    @property
+    def symmetric(self) -> bool:
+        """Whether the tangent is symmetric."""
+        return not any(tool.grips for tool in self.tools)
+
+    def going(self, ways: Ways) -> Tools:
+        """Return the tools as loads push them in a step."""
+        tools = copy(self)
+        tools._ways = ways
+        return tools
+
+    def _pose(self, tool: Tool, t: float) -> Pose:
+        """Return where a tool is at time t (s); in axisymmetry it goes along the axis."""
+        pose = tool.pose(t, self.grid.dim, self._ways.at(t)[self.tools.index(tool)])
+        if self.grid.axisymmetric and (pose.shift[0] or pose.R[0, 1]):
+            what = f"moves by {pose.shift}{' and turns' * bool(pose.R[0, 1])} at t = {t:g} s"
+            raise ValueError(f"{line(tool)}: {what}, must move by (0, z) and not turn in axisymmetry")
+        return pose
+
+    def kept(self, n: int) -> dict[str, NDArray[np.float64]]:
+        """Return what n points keep of the tools, zero."""
+        return kept("tool", self.tools, n, self.grid.dim)
+
+    def placed(self, cut: CutDomains, points: MaterialPoints, start: float, t: float) -> ToolContact | None:
+        """Return the contact at time t (s) of a step that began at `start`, with the points where they are now."""
+        if not self.tools:
+            return None
+        grid, d = self.grid, self.grid.dim
+        patches = cut.surface(self.faces)
+        x, area = patches.now(points), patches.area(points)
+        size, free = np.linalg.norm(area, axis=1), self._free[patches.here]
+        resists = self._materials.table(cut.points, resistance)[patches.at]
+        poses, found = [self._pose(tool, t) for tool in self.tools], []
+        loads = [tool.pushes(t) if t > start else np.nan for tool in self.tools]  # initial stresses are without them
+        pushed = PushedTools([line(tool) for tool in self.tools], self._ways.before, np.array(loads), grid.h.min())
+        for number, (tool, pose) in enumerate(zip(self.tools, poses, strict=True)):
+            before = self._pose(tool, start)
+            n = everywhere(grid, lambda tool=tool, pose=pose: tool.solid(grid.h.min()).normal(pose.own(x)) @ pose.R.T)
+            faces = free & (np.einsum("md,md->m", area, n) < -FACING * size)
+            at = np.flatnonzero(faces)[~self._edge(tool, pose, x, area / np.maximum(size, LEAST)[:, None], faces)]
+            old = points.data[shear_name("tool", number)][patches.at[at]] if tool.grips else np.zeros((len(at), d))
+            vectors = [x[at], pose.put(before.own(x[at])), old @ (pose.R @ before.R.T).T]
+            pressure = points.data[pressure_name("tool", number)][patches.at[at]]
+            scalars = [np.full(len(at), number), size[at], resists[at], pressure]
+            found.append((at, np.concatenate([np.stack(scalars, axis=1), *vectors], axis=1)))
+        at, values = (np.concatenate(column) for column in zip(*found, strict=True))
+        travel = Exchange(grid.comm, grid.owner(patches.cell[at]))
+        cell, place, sent = (travel.send(rows) for rows in (patches.cell[at], patches.x[at], values))
+        number, *own = sent[:, :4].T
+        now, carried, shear = np.split(sent[:, 4:], 3, axis=1)
+        rows = ToolRows(number.astype(np.int64), grid.local(cell), *own, shear, now, carried)
+        back = (travel, patches.at[at], values[:, 0].astype(np.int64), values[:, 1])
+        return ToolContact(grid, self.tools, poses, pushed, rows, Places(grid, rows.cell, place), back)
+
+    def _edge(
+        self, tool: Tool, pose: Pose, x: NDArray[np.float64], unit: NDArray[np.float64], faces: NDArray[np.bool_]
+    ) -> NDArray[np.bool_]:
+        """Return which of the places that face a tool lie less than half a cell before its edge, if the body goes on.
+
+        The last node that a tool presses carries half a cell beyond it: up to there its edge presses nothing.  A tool
+        of which nothing would be left, less than a cell wide, presses all over.
+
+        Parameters
+        ----------
+        x, unit : (m, d), m, -
+            Places on the surface of the bodies, and outward normals.
+        faces : (m,)
+            Which of them face the tool.
+        """
+        grid, h = self.grid, self.grid.h
+        y, n = x[faces], unit[faces]
+        edge = np.zeros(len(y), dtype=bool)
+        for axis, e in enumerate(np.eye(grid.dim)):
+            for half in (-0.5 * h, 0.5 * h):
+                beside = pose.own(y + half * (e - n[:, [axis]] * n))
+                to = everywhere(grid, lambda beside=beside: tool.solid(h.min()).normal(beside) @ pose.R.T)
+                edge |= np.einsum("md,md->m", n, to) >= -FACING
+        if not over_all(grid.comm, int(edge.sum())):
+            return edge
+        low, high = (over_all(grid.comm, end, op) for end, op in _box(y[edge] / h))
+        off = ~faces & (np.abs(np.clip(x / h, low, high) - x / h) <= 1).all(axis=1)
+        beyond = np.concatenate(grid.comm.allgather(np.hstack([x[off] / h, unit[off]])))
+        pairs = cKDTree(y[edge] / h).sparse_distance_matrix(cKDTree(beyond[:, : grid.dim]), 1.0, output_type="ndarray")
+        on = np.einsum("md,md->m", n[edge][pairs["i"]], beyond[pairs["j"], grid.dim :]) > np.sqrt(0.5)
+        goes_on = np.zeros(int(edge.sum()), dtype=bool)
+        goes_on[pairs["i"][on]] = True
+        edge[edge] = goes_on
+        return edge if over_all(grid.comm, int((~edge).sum())) else np.zeros_like(edge)
+
+    def check_start(self, cut: CutDomains, points: MaterialPoints, t: float) -> None:
+        """Refuse tools that are inside of a body at time t (s); faces that they press on are where a step left them."""
+        if not self.tools:
+            return
+        patches = cut.surface(self.faces)
+        x = patches.now(points)
+        for number, tool in enumerate(self.tools):
+            met = points.data[pressure_name("tool", number)] > 0
+            deep, where = self._deepest(tool, np.concatenate([x[~met[patches.at]], points.x]), t)
+            if deep > BEGINS:
+                what = f"{line(tool)}: is {deep:.3g} cells inside of a body, at {where}, at t = {t:g} s as it begins"
+                raise ValueError(f"{what}, must be outside of all bodies, or touch them")
+
+    def check_end(
+        self, cut: CutDomains, points: MaterialPoints, t: float, before: MaterialPoints, start: float
+    ) -> None:
+        """Refuse a step after which tools have points in them, or meet what is given, or in which they pass points.
+
+        before: the points at the start of the step, at the time `start` (s).
+        """
+        for tool in self.tools:
+            for hold, faces in self._held:
+                deep, where = self._deepest(tool, cut.surface(faces).now(points), t)
+                if deep > BEGINS:
+                    what = f"{line(tool)} and {line(hold)}: both act at {where} at t = {t:g} s"
+                    raise ValueError(f"{what}, must not; limit the displacement by a region, or move the tool")
+            corners = points.corners[self._gaps(tool, points.corners, t).min(axis=1) < -BEGINS * self.grid.h.min()]
+            deep, where = self._deepest(tool, points.x, t)
+            held, there = self._deepest(tool, middle(corners), t)
+            if deep > NEAR or held > 0:  # stretched domains have their middles in round tools, not their corners
+                where = where if deep > NEAR else there
+                raise NotConverged(f"{line(tool)}: has passed through the surface, to the point at {where}")
+            if where := self._passed(tool, (before.x, points.x), (start, t)):
+                raise NotConverged(f"{line(tool)}: has passed through a body within a step, at {where}")
+
+    def near(self, corners: NDArray[np.float64], t: float) -> NDArray[np.bool_]:
+        """Return which corners (n, 2^d, d) of domains touch tools at time t (s): these follow the Q1 field alone.
+
+        What else they follow would be pushed back by the tool in the next step, and roughen the pressure.
+        """
+        out, h = np.zeros(corners.shape[:2], dtype=bool), self.grid.h.min()
+        for tool in self.tools:
+            out |= self._gaps(tool, corners, t) < NEAR * h
+        return out
+
+    def outside(
+        self, corners: NDArray[np.float64], t: float, free: NDArray[np.bool_], most: float = NEAR
+    ) -> NDArray[np.float64]:
+        """Return corners of domains, with those that are a little in tools put as near their surface as `LEFT`.
+
+        Tools hold the mean of what a cell holds; domains that slide along would leave corners behind in them.
+
+        Parameters
+        ----------
+        corners : (n, 2^d, d), m
+            The corners.
+        t
+            Time, s.
+        free : (n, 2^d, d)
+            Which components nothing else gives.
+        most
+            What is deeper stays, cells.
+        """
+        out, h = corners.copy(), self.grid.h.min()
+        for tool in self.tools:
+            gap, pose = self._gaps(tool, out, t), self._pose(tool, t)
+            gap += LEFT * h
+            at = (gap < 0) & (gap > -most * h)
+            own = pose.own(out[at])
+            n = everywhere(self.grid, lambda tool=tool, own=own: tool.solid(h).normal(own))
+            out[at] -= free[at] * (gap[at, None] * n @ pose.R.T)
+        return out
+
+    def _gaps(self, tool: Tool, corners: NDArray[np.float64], t: float) -> NDArray[np.float64]:
+        """Return distances (n, 2^d), m, of corners (n, 2^d, d) from a tool at time t (s)."""
+        own = self._pose(tool, t).own(corners.reshape(-1, self.grid.dim))
+        gap = everywhere(self.grid, lambda: tool.solid(self.grid.h.min()).distance(own))
+        return gap.reshape(corners.shape[:2])
+
+    def _passed(self, tool: Tool, x: tuple[NDArray[np.float64], ...], times: tuple[float, ...]) -> str:
+        """Return one of the places x (n, d) that go straight through a tool between two times (s), or nothing.
+
+        Places go on by their distance to the tool (sphere tracing: Hart 1996).
+        """
+        h, comm = self.grid.h.min(), self.grid.comm
+        y, end = (self._pose(tool, t).own(at) for at, t in zip(x, times, strict=True))
+        way, gone, on = np.linalg.norm(end - y, axis=1), np.zeros(len(y)), np.arange(len(y))
+        along = (end - y) / np.maximum(way, LEAST)[:, None]
+        inside = everywhere(self.grid, lambda: (tool.solid(h).distance(y) < 0) | (tool.solid(h).distance(end) < 0))
+        a, b = everywhere(self.grid, lambda: (tool.solid(h).normal(y[inside]), tool.solid(h).normal(end[inside])))
+        turned = x[1][inside][np.einsum("nd,nd->n", a, b) < 0][:1]  # a middle in the tool that comes to its other side
+        if where := first(comm, "".join(np.array2string(place, precision=6) for place in turned)):
+            return where
+        on = on[~inside]
+        while over_all(comm, len(on)):
+            at = y[on] + gone[on, None] * along[on]
+            gap = everywhere(self.grid, lambda at=at: tool.solid(h).distance(at))
+            inside = x[1][on[gap < 0]][:1]
+            if where := first(comm, "".join(np.array2string(place, precision=6) for place in inside)):
+                return where
+            gone[on] += np.maximum(gap, STRIDE * h)
+            on = on[gone[on] < way[on]]
+        return ""
+
+    def _deepest(self, tool: Tool, x: NDArray[np.float64], t: float) -> tuple[float, str]:
+        """Return how deep places x (m, d) are in a tool at most, in cells, and where."""
+        h, pose = self.grid.h.min(), self._pose(tool, t)
+        gap = everywhere(self.grid, lambda: tool.solid(h).distance(pose.own(x)))
+        deepest = over_all(self.grid.comm, float(gap.min(initial=np.inf)), MPI.MIN)
+        here = np.array2string(x[gap.argmin()], precision=6) if len(gap) and gap.min() == deepest else ""
+        return -deepest / h, first(self.grid.comm, here)

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""Warnings and refusals about a scene."""

@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: MIT
+"""Whether what lies on the grid is held: parts that can move as rigid bodies make the tangent singular."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from mpi4py import MPI
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpm_dolfinx.grid.grid import Grid
+from mpm_dolfinx.parallel.exchange import Exchange
+from mpm_dolfinx.points.parts import parts_of_cells
+
+
+def check_held(
+    grid: Grid,
+    active: NDArray[np.bool_],
+    free: NDArray[np.bool_],
+    holds: Sequence[tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.float64]]],
+    each: bool,
+    meeting: tuple[NDArray[np.int32], NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]] | None = None,
+) -> None:
+    """Refuse a scene of which a part can move as a rigid body.
+
+    Parameters
+    ----------
+    active : (cells,)
+        Cells of this process that hold a piece.
+    free : (nodes, d)
+        Components that no wall holds.
+    holds
+        Cells (m,), positions (m, d) and directions (m, d) in which sides have given displacements, or touch tools.
+    each
+        Look at each part that hangs together, not only at all of them.
+    meeting
+        Cells (m,), lexicographic ones of the other part (m,), positions (m, d) and directions (m, d) in which parts
+        touch: what is held holds the other one.
+
+    Raises
+    ------
+    ValueError
+        Saying where the part is, and in how many ways it can move.
+    """
+    part, count = parts_of_cells(grid, active) if each else (active.astype(np.int64), 1)
+    centre, size = _extents(grid, part, count)
+    cells = np.flatnonzero(active)
+    nodes, first = np.unique(grid.cell_nodes[cells], return_index=True)
+    row, axis = np.nonzero(~free[nodes])
+    x, direction = grid.node_x[nodes[row]], np.eye(grid.dim)[axis]
+    number = part[cells[first[row] // 2**grid.dim]]  # of any cell at the node: they hang together
+    for cell, place, along in holds:
+        number = np.concatenate([number, part[cell]])
+        x, direction = np.concatenate([x, place]), np.concatenate([direction, along])
+    against = np.zeros(len(number), dtype=np.int64)
+    if meeting is not None:
+        cell, other, place, along = meeting
+        travel = Exchange(grid.comm, grid.owner(other))
+        both = part[cell], travel.back(part[grid.local(travel.send(other))])
+        number, against = (np.concatenate([a, *b]) for a, b in ((number, both), (against, both[::-1])))
+        x, direction = np.concatenate([x, place, place]), np.concatenate([direction, along, along])
+    x = (x - centre[number - 1]) / size[number - 1, None]  # else a small part far from the origin would not turn
+    modes = list(direction.T)
+    modes += [direction[:, a] * x[:, b] - direction[:, b] * x[:, a] for a in range(grid.dim) for b in range(a)]
+    if grid.axisymmetric:  # rings move rigidly along the axis only
+        modes = [direction[:, 1]]
+    R = np.stack(modes, axis=1)
+    held, missing = np.append(True, np.zeros(count, dtype=bool)), np.full(count, len(modes))  # the ground holds
+    while True:
+        on = held[against]
+        grams = [R[on & (number == k)].T @ R[on & (number == k)] for k in range(1, count + 1)]
+        grams, before = grid.comm.allreduce(np.stack(grams)), missing
+        ranks = [np.linalg.matrix_rank(gram, tol=1e-12 * max(1.0, np.abs(gram).max())) for gram in grams]
+        missing = len(modes) - np.array(ranks)
+        held[1:] = missing == 0
+        if meeting is None or (missing == before).all():
+            break
+    for k in range(1, count + 1):
+        if missing[k - 1]:
+            places = [p for p in grid.comm.allgather(grid.midpoints[active & (part == k)][:1].tolist()) if p]
+            where = f"the part at [{' '.join(f'{x:.9g}' for x in places[0][0])}]" if count > 1 else "the body"
+            raise ValueError(
+                f"fixed walls: {where} is free to move as a rigid body in {missing[k - 1]} of {len(modes)} ways; "
+                "it must touch walls whose fixed components hold it, have given displacements, or touch tools, or "
+                "other groups that are held"
+            )
+
+
+def _extents(grid: Grid, part: NDArray[np.int64], count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the centres (count, d), m, and the largest edges (count,), m, of the boxes around the parts."""
+    low, high = np.full((2, count, grid.dim), np.inf)  # the higher ends with a minus
+    for sign, ends in ((1, low), (-1, high)):
+        np.minimum.at(ends, part[part > 0] - 1, sign * grid.midpoints[part > 0])
+        grid.comm.Allreduce(MPI.IN_PLACE, ends, op=MPI.MIN)
+    return (low - high) / 2, (-high - low + grid.h).max(axis=1)

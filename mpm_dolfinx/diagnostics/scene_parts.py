@@ -1,0 +1,45 @@
+# SPDX-License-Identifier: MIT
+"""Whether the parts of which a scene is made go together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from mpm_dolfinx.base.validation import all_of, chosen, functions, instance, line, numbers
+from mpm_dolfinx.bodies.bodies import Body, check_bodies
+from mpm_dolfinx.grid.grid import Grid
+from mpm_dolfinx.materials.skeleton import Fluid, Skeleton
+from mpm_dolfinx.mechanics.side_forms import functions_of
+
+
+def check_parts(grid: Grid, bodies: Sequence[Body], materials: Sequence[Skeleton], later: Sequence[int]) -> None:
+    """Refuse what is no grid, bodies or materials, bodies outside of the grid, and `later` ones that are none."""
+    instance("grid", grid, Grid)
+    all_of("bodies", bodies, Body, 1)
+    all_of("materials", materials, Skeleton, 1)
+    check_bodies(grid, bodies)
+    chosen("later", later, range(len(bodies)), "indices of the bodies")
+
+
+def check_options(
+    bodies: Sequence[Body],
+    fluid: Fluid | None,
+    pressure: float | Callable,
+    terms: Sequence[Callable],
+    sources: Sequence[Callable],
+    quadrature: str,
+) -> None:
+    """Refuse terms and sources that are no functions, pressures and sources without fluid, and wrong quadratures."""
+    if quadrature not in ("domain", "point"):
+        raise ValueError(f"quadrature {quadrature!r}: must be domain or point")
+    turned = [i for i, body in enumerate(bodies) if not body.aligned]
+    if quadrature == "point" and turned:
+        raise ValueError(f"quadrature 'point': body {turned[0]} is mapped or a mesh, must be a box along the grid")
+    functions("terms", functions_of(terms))
+    functions("sources", sources)
+    if fluid is not None:
+        instance("fluid", fluid, Fluid)
+    elif callable(pressure) or numbers("pressure", pressure):
+        raise ValueError(f"pressure = {line(pressure)}: needs a fluid")
+    elif sources:
+        raise ValueError("sources need a fluid")

@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: MIT
+"""The displacement that corners of domains follow: the Q1 field of the grid, without its kinks.
+
+In bending the true strain varies linearly over a cell, that of a Q1 field does not: it jumps at the grid lines.
+Domains that followed it would take along a sawtooth, and on the way back, with other grid lines across the body, leave
+it as stress.  So corners follow the field with its second differences along each axis,
+
+    u(x) = sum_i N_i(x) [u_i - 1/2 sum_a t_a (1 - t_a) D_a],
+
+t_a in [0, 1] the place in the cell: exact for quadratic fields, Q1 at the nodes, and continuous.  D_a is the second
+difference along the edge of the cell that node i ends: the smaller one of those at its two ends, zero where their signs
+differ, and that of one end where the other has none.  So a kink that is no error of the grid, as between materials,
+stays one.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpm_dolfinx.grid.grid import Grid, in_chunks
+from mpm_dolfinx.points.cutting import corner_bits
+
+
+def followed(
+    grid: Grid, cells: NDArray[np.int32], x: NDArray[np.float64], u: NDArray[np.float64], filled: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    """Return the Q1 field at corners, and what they follow besides (2, m, d), m.
+
+    Parameters
+    ----------
+    cells, x : (m,), (m, d), m
+        Owned cells that the corners lie in, and their positions.
+    u : (nodes, d), m
+        Nodal displacements.
+    filled : (cells,)
+        Which local cells hold something: beyond an empty one may be nodes of another body.
+    """
+    used = np.flatnonzero(np.bincount(cells, minlength=1))
+    slot = np.zeros(used.max(initial=0) + 1, dtype=np.intp)
+    slot[used] = np.arange(len(used))
+    field = grid.monomials @ _at(u, grid.cell_nodes[used])
+    bends = _second_differences(grid, used, u, filled)
+    out = np.empty((2, *x.shape))
+    # with the corners last: rows of a few numbers each would take numpy six times as long
+    for part in in_chunks(len(x)):
+        here, y = slot[cells[part]], (x[part] - grid.midpoints[cells[part]]).T.copy()
+        out[0, part] = _polynomial(field, y, here).T
+        weights = 0.5 * ((y / grid.h[:, None]) ** 2 - 0.25)  # t (t - 1) / 2
+        out[1, part] = sum(weights[a] * _polynomial(bends[a], y, here, a) for a in range(grid.dim)).T
+    return out
+
+
+def _at(u: NDArray[np.float64], nodes: NDArray[np.int32]) -> NDArray[np.float64]:
+    """Return a vector's nodal values (nodes, d) at nodes (n, k), as (d, k, n)."""
+    return u.take(u.shape[1] * nodes.T[None] + np.arange(u.shape[1])[:, None, None])
+
+
+def _polynomial(
+    coefficients: NDArray[np.float64], y: NDArray[np.float64], slot: NDArray[np.intp], without: int | None = None
+) -> NDArray[np.float64]:
+    """Return a vector (d, m) that is multilinear in cells, at offsets y (d, m), m, from their midpoints.
+
+    coefficients (d, k, cells): of the monomials as `Grid.monomials` has them; those that do not depend on the axis
+    `without`.
+    """
+    rows = [row for row in range(2 ** len(y)) if without is None or not row >> without & 1]
+    total = np.zeros(y.shape)
+    for k, row in enumerate(rows):
+        term = coefficients[:, k].take(slot, axis=1)
+        for a in range(len(y)):
+            if row >> a & 1:
+                term *= y[a]
+        total += term
+    return total
+
+
+def _second_differences(
+    grid: Grid, cells: NDArray[np.int32], u: NDArray[np.float64], filled: NDArray[np.bool_]
+) -> list[NDArray[np.float64]]:
+    """Return the second differences along the edges of owned cells, m, as polynomials of the places across, per axis.
+
+    That is coefficients (d, 2^(d-1), cells), as `_polynomial` takes them.
+    """
+    d, bits, out = grid.dim, corner_bits(grid.dim), []
+    order = np.lexsort(grid.signs.T)  # of the nodes, as `bits` has them
+    nodes, beside = grid.cell_nodes[cells], grid.beside(cells)
+    for a in range(d):
+        low, high = (order[bits[:, a] == end] for end in (0, 1))
+        first, last = _at(u, nodes[:, low]), _at(u, nodes[:, high])
+        along, ends, known = last - first, [], []
+        for k, (end, value) in enumerate(((low, first), (high, last))):
+            local = beside[:, a, k]
+            beyond = grid.cell_nodes[local][:, end]
+            known.append(np.broadcast_to((local >= 0) & filled[local], (2 ** (d - 1), len(local))))
+            ends.append(_at(u, beyond) - value - (2 * k - 1) * along)
+        first, last = (np.where(known[k], ends[k], ends[1 - k]) for k in (0, 1))
+        smaller = np.where(np.abs(first) < np.abs(last), first, last)
+        bend = np.where((first * last > 0) & (known[0] | known[1]), smaller, 0.0)
+        across = grid.monomials[np.arange(2**d) >> a & 1 == 0]  # one and the same at both ends
+        out.append((across[:, low] + across[:, high]) @ bend)
+    return out

@@ -1,0 +1,246 @@
+# SPDX-License-Identifier: MIT
+"""Where the points lie on the grid of a step: their pieces, who owns the cells, values there and back."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from functools import cached_property
+
+from mpi4py import MPI
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpm_dolfinx.base.caching import Keyed
+from mpm_dolfinx.bodies.faces import Surface, face_vectors, interpolate, on_face
+from mpm_dolfinx.domains.bending import followed
+from mpm_dolfinx.grid.grid import TURN, Grid, sum_by
+from mpm_dolfinx.parallel.exchange import Exchange, over_all
+from mpm_dolfinx.points.cutting import Pieces, cut, cut_faces
+from mpm_dolfinx.points.material_points import MaterialPoints, middle
+
+STAYS = 3e-4
+"""Cells by which corners may have moved since the domains were cut before they are cut anew.
+
+A column of ten cells that consolidates then differs by 7e-5 of the load in its pressures and by 3e-5 of the
+settlement from one that is cut in every step; both are proportional to this number.
+"""
+DEPTH = 1e-6  # cells: how far under the surface the cell is looked up; of corners, share of the way to the middle
+
+
+class Patches:
+    """Points of integration on faces of the domains; arrays over n points.
+
+    Parameters
+    ----------
+    grid
+        Background grid.
+    faces
+        The faces; and of each point:
+    here, at : (n,)
+        its face among these, and the material point;
+    cell : (n,)
+        lexicographic cell;
+    x, xi : (n, d), m, -
+        position when the domains were cut, and in the domain;
+    share : (n,)
+        of the face.
+    """
+
+    def __init__(self, grid: Grid, faces: Surface, here, at, cell, x, xi, share):
+        self._faces, self.here, self.at, self._xi = faces, here, at, xi
+        self.cell, self.x, self._grid = cell, x, grid
+        self._share0 = share * faces.area0[here]
+        around = grid.around(interpolate(faces.domain[here], xi)) if grid.axisymmetric else 1.0
+        self.area0 = self._share0 * around
+        """Reference areas (n,), m^(d-1)."""
+
+    @cached_property
+    def X(self) -> NDArray[np.float64]:
+        """Reference positions (n, d), m."""
+        return self._faces.reference(self.here, self._xi)
+
+    def origin(self, points: MaterialPoints) -> NDArray[np.float64]:
+        """Return the positions (n, d), m, from which displacements count."""
+        return interpolate(points.origin[self.at], self._xi)
+
+    def now(self, points: MaterialPoints) -> NDArray[np.float64]:
+        """Return where the points of integration have moved to (n, d), m."""
+        return interpolate(points.corners[self.at], self._xi)
+
+    def area(self, points: MaterialPoints) -> NDArray[np.float64]:
+        """Return the outward area vectors (n, d), m^(d-1)."""
+        share = self._share0 / self._faces.whole0[self.here]
+        if self._grid.axisymmetric:
+            share = share * self._grid.around(self.now(points))
+        return face_vectors(points.corners[self.at], self._faces.face[self.here]) * share[:, None]
+
+
+class CutDomains(Keyed):
+    """The points' domains cut by the cells, and the way of their data to the owners of the cells.
+
+    It serves until the points have moved: where they were when they were cut is what the grid sees.
+
+    Parameters
+    ----------
+    grid
+        Background grid.
+    points
+        The material points of this process, in the grid.
+    domains
+        Exact pieces of the points' domains; else one piece a point, as in standard MPM.
+    """
+
+    def __init__(self, grid: Grid, points: MaterialPoints, domains: bool):
+        self.grid, self.points, self.domains = grid, points, domains
+        self._patches: dict[Surface, Patches] = {}
+        self.pieces = cut(grid, points.corners) if domains else whole_points(grid, points.x)
+        if grid.copies > 1:
+            self.pieces.cell += grid.copy(points.id)[self.pieces.point]
+        self._travel = Exchange(grid.comm, grid.owner(self.pieces.cell))
+        self.cells, self.x = grid.local(self._travel.send(self.pieces.cell)), self._travel.send(self.pieces.x)
+        """Owned cells, and centroids (m, d), m, of the pieces that this process integrates."""
+        self.mixed = self._travel.send(self.pieces.mixed) if grid.dim == 3 and domains else None
+        """Their mean products of offsets in 3D, see `Pieces`."""
+        self.hoop = self._travel.send(self.pieces.hoop) if grid.axisymmetric else None
+        """Their moments in the plane (m, 4) in axisymmetry, see `Pieces`."""
+
+    def moved(self, points: MaterialPoints, part: NDArray[np.int64], count: int) -> NDArray[np.float64]:
+        """Return by how many cells corners of each of so many parts (count,) have moved at most since they were cut.
+
+        part (n,): of each point.
+        """
+        far = np.zeros(count)
+        np.maximum.at(far, part, np.abs((points.corners - self.points.corners) / self.grid.h).max(axis=(1, 2)))
+        return over_all(self.grid.comm, far, MPI.MAX)
+
+    def serves(self, points: MaterialPoints, part: NDArray[np.int64], count: int) -> NDArray[np.bool_]:
+        """Return which parts (count,), see `moved`, are still where they were cut, but for `STAYS`."""
+        return self.moved(points, part, count) <= STAYS
+
+    def to_cells(self, values: NDArray) -> NDArray:
+        """Send values of the points (n, ...) to the owners of their pieces' cells (m, ...)."""
+        return self._travel.send(values[self.pieces.point])
+
+    def pieces_to_cells(self, values: NDArray) -> NDArray:
+        """Send values of the pieces to the owners of their cells."""
+        return self._travel.send(values)
+
+    def to_pieces(self, values: NDArray) -> NDArray:
+        """Bring values at the integrated pieces back to the pieces of this process's points."""
+        return self._travel.back(values)
+
+    def plane(self, volume: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return volumes (m,) and centroids (m, d), m, of pieces of given volumes, m^d; in axisymmetry in the plane."""
+        if not self.grid.axisymmetric:
+            return volume, self.x
+        return volume / (TURN * self.hoop[:, 3]), self.grid.midpoints[self.cells] + self.hoop[:, :2]
+
+    def mean(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the volume means (n,) over the pieces of each point of values (m,) on the pieces."""
+        return sum_by(self.pieces.point, self.pieces.fraction * values, len(self.points))
+
+    def in_plane(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the same means of values at the pieces' centroids in the plane, in axisymmetry by area."""
+        if not self.grid.axisymmetric:
+            return self.mean(values)
+        area = self.pieces.fraction / self.pieces.hoop[:, 3]
+        whole, total = (sum_by(self.pieces.point, area * each, len(self.points)) for each in (1.0, values))
+        return total / whole
+
+    def surface(self, faces: Surface) -> Patches:
+        """Return points of integration on the faces that this process's points have.
+
+        The cell is that of a place just under the surface, which holds a piece of the domain: its
+        shape functions, continued to the surface, put the load on nodes that have stiffness.
+        """
+        return self.surfaces([faces])[0]
+
+    def surfaces(self, several: Sequence[Surface]) -> list[Patches]:
+        """Return the same of several surfaces: cut all at once they take the time of one."""
+        if new := [faces for faces in dict.fromkeys(several) if faces not in self._patches]:
+            self._patches.update(zip(new, self._cut_surfaces(new), strict=True))
+        return [self._patches[faces] for faces in several]
+
+    def _cut_surfaces(self, several: Sequence[Surface]) -> list[Patches]:
+        columns = ((faces.id, faces.face, faces.xi, faces.skew, np.arange(len(faces))) for faces in several)
+        ids, number, xi, skew, row = map(np.concatenate, zip(*columns, strict=True))
+        here, at = self.points.find(ids)
+        corners, number, xi = self.points.corners[at], number[here], xi[here]
+        count = xi.shape[1]
+        places = interpolate(np.repeat(corners, count, axis=0), xi.reshape(-1, self.grid.dim)).reshape(xi.shape)
+        face, x, xi, share, middle = cut_faces(self.grid, places, xi)
+        outward = face_vectors(corners, number)
+        size = np.linalg.norm(outward, axis=1, keepdims=True)
+        skew = np.flatnonzero(skew[here][face])  # xi is linear over a triangle, and places are not in xi
+        if len(skew):
+            xi[skew] = on_face(corners[face[skew]], number[face[skew]], x[skew], xi[skew])
+        inward = -DEPTH * self.grid.h.min() * np.divide(outward, size, out=np.zeros_like(outward), where=size > 0)
+        cell = self._filled_cell(at[face], middle + inward[face])
+        rows = row[here][face], at[face], cell, x, xi, share
+        surface = np.repeat(np.arange(len(several)), list(map(len, several)))[here][face]
+        own = (np.flatnonzero(surface == k) for k in range(len(several)))
+        return [Patches(self.grid, faces, *(v[o] for v in rows)) for faces, o in zip(several, own, strict=True)]
+
+    def displacement(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the Q1 field u (nodes, d) at the points (n, d), which have no domains."""
+        travel, cells, x = self._followed
+        return travel.back(self.grid.at(cells, x, u))
+
+    def followed(self, u: NDArray[np.float64], filled: NDArray[np.bool_]) -> Iterator[NDArray[np.float64]]:
+        """Yield the Q1 field u (nodes, d) at the corners (n, 2^d, d), and what they follow besides, m.
+
+        filled (cells,): which local cells hold something.
+        """
+        travel, cells, x = self._followed
+        return (travel.back(v).reshape(self.points.corners.shape) for v in followed(self.grid, cells, x, u, filled))
+
+    @cached_property
+    def _followed(self) -> tuple[Exchange, NDArray[np.int32], NDArray[np.float64]]:
+        """The way to the owners of the cells of corners or points, these cells, and the positions."""
+        grid, n, d = self.grid, len(self.points), self.grid.dim
+        at = np.repeat(np.arange(n), 2**d if self.domains else 1)
+        x = self.points.corners.reshape(-1, d) if self.domains else self.points.x
+        # of a corner on a grid line, rounding must not choose a cell in which the domain does not lie
+        cell = self._filled_cell(at, x + DEPTH * (self.points.x[at] - x))
+        travel = Exchange(grid.comm, grid.owner(cell))
+        return travel, grid.local(travel.send(cell)), travel.send(x)
+
+    def total_displacement(self, points: MaterialPoints) -> NDArray[np.float64]:
+        """Return the displacements (m, d), m, of the pieces' centroids, as those of their domains' corners."""
+        pieces = self.pieces
+        now, then = (c - c.mean(axis=1, keepdims=True) for c in (points.corners, points.origin))
+        stretch = np.linalg.solve(then.swapaxes(1, 2) @ then, then.swapaxes(1, 2) @ now)  # of the corners' pattern
+        off = pieces.x - middle(points.corners)[pieces.point]
+        off0 = np.linalg.solve(stretch.swapaxes(1, 2)[pieces.point], off[:, :, None])[:, :, 0]
+        return off + (middle(points.corners) - middle(points.origin))[pieces.point] - off0
+
+    def cells_at(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Return the lexicographic cells (m,) of places x (m, d), m, in or on the domains of points (m,)."""
+        return self._filled_cell(at, x + DEPTH * (self.points.x[at] - x))
+
+    def _filled_cell(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Return the cells (m,) of positions in domains; where no piece of the domain lies, of its largest piece."""
+        pieces, cells = self.pieces, len(self.grid.owners)
+        cell = self.grid.number(self.grid.index(x)) + self.grid.copy(self.points.id[at])
+        key, keys = at * cells + cell, pieces.point * cells + pieces.cell
+        if not len(key):
+            return cell
+        found = np.minimum(np.searchsorted(keys, key), len(keys) - 1)
+        empty = keys[found] != key
+        if empty.any():
+            cell[empty] = pieces.cell[self._largest()[at[empty]]]
+        return cell
+
+    def _largest(self) -> NDArray[np.int64]:
+        """Return the largest piece of each point (n,)."""
+        order = np.lexsort((self.pieces.fraction, self.pieces.point))
+        return order[np.cumsum(np.bincount(self.pieces.point, minlength=len(self.points))) - 1]
+
+
+def whole_points(grid: Grid, x: NDArray[np.float64]) -> Pieces:
+    """Return one piece a point, at the point; a cell that holds points has open faces."""
+    n, number = len(x), grid.number(grid.index(x))
+    _, cell, count = np.unique(number, return_inverse=True, return_counts=True)
+    share = (grid.cell_volume / grid.h) / count[cell][:, None]
+    return Pieces(np.arange(n), number, np.ones(n), x.copy(), np.stack([share, share], axis=2), np.zeros((n, 0)))

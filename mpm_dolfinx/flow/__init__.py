@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""Balance of fluid: storage, and fluxes between cells."""

@@ -1,0 +1,365 @@
+# SPDX-License-Identifier: MIT
+"""Two-point fluxes of the pore fluid between cells, through what the bodies cover of the faces, and their damping.
+
+The coefficients of the forms are what cells hold, set anew whenever the grid is reset.  In a step in which a body moves
+the fluxes are those through the deformed cells, pulled back to the start of the step: with F = I + grad u at the
+centroid of what a cell holds its mobility kappa becomes J F^-1 kappa F^-T.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from numpy.typing import NDArray
+
+from mpm_dolfinx.base import _compat
+from mpm_dolfinx.base.caching import Keyed
+from mpm_dolfinx.base.fluid_content import density_between, mass_potential
+from mpm_dolfinx.forms.point_forms import FacetForm, FacetSum
+from mpm_dolfinx.forms.unknowns import sum_ghosts
+from mpm_dolfinx.grid.grid import Grid, sum_by
+from mpm_dolfinx.points.material_points import cofactor, determinant
+
+ALONG = 0.1  # of a unit normal: a side that looks less along an axis tells nothing of the pressure's slope there
+
+
+@dataclass(frozen=True)
+class Mobility:
+    """Mobility of the filled owned cells.
+
+    mean (n,): of the pieces, m^2/(Pa s); share (n, d): of it along each axis; shift (n, d): way, m, from the centroid
+    to the place from which the resistance to the faces counts.  The last two are None where no cell holds several
+    conductivities.
+    """
+
+    mean: NDArray[np.float64]
+    share: NDArray[np.float64] | None = None
+    shift: NDArray[np.float64] | None = None
+
+
+class CellMotion(NamedTuple):
+    """What becomes of n cells in a step: F (n, d, d), displacement (n, d), m; hoops' stretch (n,) in axisymmetry."""
+
+    F: NDArray[np.float64]
+    moved: NDArray[np.float64]
+    hoop: NDArray[np.float64] | None
+
+
+@dataclass(frozen=True)
+class Conduction:
+    """How the filled owned cells conduct, and what has become of them in the step.
+
+    motion: since the start of the step, at the centroids; None where the body hardly moves.  weight (d,): of the fluid,
+    N/m^3, if there is gravity.
+    """
+
+    mobility: Mobility
+    motion: CellMotion | None
+    weight: NDArray[np.float64] | None
+
+    @cached_property
+    def _turned(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Cofactors (n, d, d) and determinants (n,) of the cells' F."""
+        return cofactor(self.motion.F), determinant(self.motion.F)
+
+    def along(self, dim: int) -> NDArray[np.float64]:
+        """Return the mobilities (n, d) along the axes, pulled back: `across` for the unit vectors, all at once."""
+        kappa, share = self.mobility.mean[:, None], self.mobility.share
+        kappa = np.repeat(kappa, dim, axis=1) if share is None else kappa * share
+        if self.motion is None:
+            return kappa
+        (turned, ratio), hoop = self._turned, self.motion.hoop
+        along = kappa / ratio[:, None] * (turned**2).sum(axis=1)
+        return along if hoop is None else along * hoop[:, None]
+
+    def across(self, at: NDArray[np.int64], normal: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the mobilities (m,) of some cells along normals (m, d), pulled back: n . J F^-1 kappa F^-T n."""
+        kappa, share = self.mobility.mean[at], self.mobility.share
+        if share is not None:
+            kappa = kappa * (share[at] * normal**2).sum(axis=1)
+        if self.motion is None:
+            return kappa
+        (turned, ratio), hoop = self._turned, self.motion.hoop
+        pulled = np.einsum("mij,mj->mi", turned[at], normal)
+        across = kappa / ratio[at] * (pulled**2).sum(axis=1)
+        return across if hoop is None else across * hoop[at]
+
+    def nearer(self, at: NDArray[np.int64], normal: NDArray[np.float64], reach: NDArray[np.float64]) -> NDArray | float:
+        """Return ways (m, d) to faces over those from which the resistance counts, along normals (m, d)."""
+        if self.mobility.shift is None:
+            return 1.0
+        way = (reach * normal).sum(axis=1)
+        rest = way - (self.mobility.shift[at] * normal).sum(axis=1)
+        return np.divide(way, rest, out=np.ones(len(way)), where=rest > 0)
+
+    def deformed(self, at: NDArray[np.int64], way: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return ways (m, d) in some of the cells, m, as they are now."""
+        return way if self.motion is None else np.einsum("mij,mj->mi", self.motion.F[at], way)
+
+
+@dataclass(frozen=True)
+class OpenSides:
+    """Open sides of the bodies; arrays over m faces.
+
+    number (m,): of the condition; cells (m,): owned cell behind each; shape: area over distance from the cell's
+    centroid, m^(d-2), zero where the inflow is prescribed; pressure: beyond it, Pa; given: prescribed inflow, m^d/s;
+    seeps: whether nothing may flow in; area (m, d): outward, m^(d-1); reach (m, d): way from the cell's centroid, m.
+    """
+
+    number: NDArray[np.int64]
+    cells: NDArray[np.int32]
+    shape: NDArray[np.float64]
+    pressure: NDArray[np.float64]
+    given: NDArray[np.float64]
+    seeps: NDArray[np.bool_]
+    area: NDArray[np.float64]
+    reach: NDArray[np.float64]
+
+    @cached_property
+    def normal(self) -> NDArray[np.float64]:
+        """Unit vectors (m, d)."""
+        return self.area / np.linalg.norm(self.area, axis=1, keepdims=True)
+
+    def driven(
+        self, at: NDArray[np.int64], flow: Conduction, bulk: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the outflow (m,) per unit of the cell's mass potential, m^d/(Pa s), and the inflow (m,), m^d/s.
+
+        The inflow is prescribed, or driven in by the outer pressure and gravity; at (m,): place of the cells among the
+        filled ones; bulk: of the fluid, Pa.
+        """
+        shape = self.shape * flow.nearer(at, self.normal, self.reach)
+        conductance, outer = flow.across(at, self.normal) * shape, self.pressure
+        if flow.weight is not None:
+            outer = outer - flow.deformed(at, self.reach) @ flow.weight
+        return conductance, self.given + conductance * mass_potential(outer, bulk)
+
+    def ahead(self, at: NDArray[np.int64], p: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return what lies ahead of the filled cells (n, d, 2, 2): on drained sides, by axis and end of the cell.
+
+        Difference (Pa) of the pressure there to that of the cell, and slope (Pa/m) towards it; nan where there is none.
+
+        Parameters
+        ----------
+        at : (m,)
+            Place of the faces' cells among the filled ones.
+        p : (n,), Pa
+            Pressures of the filled cells.
+        """
+        out = np.full((len(p), self.normal.shape[1], 2, 2), np.nan)
+        distance = np.einsum("md,md->m", self.reach, self.normal)
+        # sides of an inflow have no conductance, seepage faces that let nothing out no pressure
+        drained = np.flatnonzero((self.shape > 0) & (distance > 0) & ~(self.seeps & (p[at] <= self.pressure)))
+        at, normal, distance = at[drained], self.normal[drained], distance[drained]
+        area, jump = self.shape[drained] * distance, self.pressure[drained] - p[at]
+        for axis, end in np.ndindex(out.shape[1:3]):
+            looks = (2 * end - 1) * normal[:, axis]
+            share = np.where(looks > ALONG, area * looks, 0.0)
+            total = sum_by(at, share, len(p))
+            # along the side the pressure does not change, so its gradient is normal to it
+            for k, values in enumerate((jump, jump * normal[:, axis] / distance)):
+                np.divide(sum_by(at, share * values, len(p)), total, out=out[:, axis, end, k], where=total > 0)
+        return out
+
+
+@dataclass(frozen=True)
+class PieceContents:
+    """What pieces bring to their owned cells; arrays over m pieces.
+
+    cells (m,); weight: volumes, m^d; area, x (m, d): volumes and centroids, m, in axisymmetry in the plane; faces
+    (m, d, 2): areas on the lower and upper faces of the cell, m^(d-1); fixed_stress: the coefficient beta, 1/Pa;
+    damping: the strength tau of the damping of pressure jumps, 1/Pa.
+    """
+
+    cells: NDArray[np.int32]
+    weight: NDArray[np.float64]
+    area: NDArray[np.float64]
+    x: NDArray[np.float64]
+    faces: NDArray[np.float64]
+    fixed_stress: NDArray[np.float64]
+    damping: NDArray[np.float64]
+
+
+class CellContents(Keyed):
+    """What the cells hold since the grid was reset; arrays over local cells, ghosts included, zero where empty.
+
+    Parameters
+    ----------
+    forms
+        The forms, whose coefficients are set.
+    pieces
+        What the pieces bring.
+    filled
+        Owned active cells.
+    """
+
+    def __init__(self, forms: FluxForms, pieces: PieceContents, filled: NDArray[np.int64]):
+        self.grid = grid = forms.grid
+        self.filled, self._slot = filled, np.zeros(grid.num_local, dtype=np.int64)
+        self._slot[filled] = np.arange(len(filled))
+        self._cells, self.weight = cells, weight = pieces.cells, pieces.weight
+        self.volume = self.total(cells, weight)
+        """Volumes (n,) of what the filled cells hold, m^d."""
+        self.area, area = pieces.area, self.total(cells, pieces.area)
+        """Of the pieces (m,), m^d; in axisymmetry in the plane, m^2."""
+        self.fill = np.minimum(area / grid.cell_volume, 1.0)
+        """Filled share of the filled cells."""
+        shapes = (forms.centroid, forms.lower_face, forms.upper_face)
+        self._damped, self._damping = forms.damping, pieces.damping
+        for f in (forms.fixed_stress, *shapes):
+            f.x.array[:] = 0.0
+        forms.fixed_stress.x.array[filled] = self.total(cells, weight * pieces.fixed_stress)
+        centroid, lower, upper = (f.x.array.reshape(-1, grid.dim) for f in shapes)
+        for a in range(grid.dim):
+            mean = self.total(cells, pieces.area * pieces.x[:, a]) / area
+            centroid[filled, a] = mean - grid.midpoints[filled, a]
+            for target, end in ((lower, 0), (upper, 1)):
+                target[filled, a] = self.total(cells, pieces.faces[:, a, end]) * grid.h[a] / grid.cell_volume
+        for f in (forms.fixed_stress, *shapes):
+            f.x.scatter_forward()
+        self.fixed_stress = forms.fixed_stress.x.array.copy()
+        """Fixed-stress coefficient times volume."""
+        self._slopes = grid.shape_gradients(filled, grid.midpoints[filled] + centroid[filled])
+        self._values = grid.shape_values(filled, grid.midpoints[filled] + centroid[filled])
+        self.centroid, self.open = centroid.copy(), np.stack([lower, upper], axis=2)
+        """Centroids (c, d) of what the cells hold from their midpoints, m; open shares of their faces (c, d, 2)."""
+
+    def total(self, cells: NDArray[np.int32], values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Sum values over the rows of each filled cell."""
+        return sum_by(self._slot[cells], values, len(self.filled))
+
+    def softest(self, softness: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the softness of the filled cells by that of the pieces (m,): the softest is the one that flows."""
+        softest = np.ones(len(self.filled))
+        np.maximum.at(softest, self._slot[self._cells], softness)
+        return softest
+
+    def set_damping(self) -> NDArray[np.float64]:
+        """Set the strength tau of the damping of elastic soil in the filled cells; return it, 1/Pa."""
+        tau, values = self._damped.x, self.mean(self._damping)
+        tau.array[:] = 0.0
+        tau.array[self.filled] = values
+        tau.scatter_forward()
+        return values
+
+    def mean(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the means over the pieces (m,) of each filled cell."""
+        return self.total(self._cells, self.weight * values) / self.volume
+
+    def motion(self, u: NDArray[np.float64], rests: NDArray[np.int64] | None = None) -> CellMotion:
+        """Return what becomes of the filled cells, at their centroids, by nodal u (nodes, d), m; nothing of some."""
+        nodal, hoop = u[self.grid.cell_nodes[self.filled]].transpose(0, 2, 1), None
+        moved = np.einsum("ndk,nk->nd", nodal, self._values)
+        if self.grid.axisymmetric:
+            hoop = 1 + moved[:, 0] / (self.grid.midpoints[self.filled, 0] + self.centroid[self.filled, 0])
+        F = np.eye(self.grid.dim) + nodal @ self._slopes
+        if rests is not None:
+            F[rests], moved[rests] = np.eye(self.grid.dim), 0.0
+            if hoop is not None:
+                hoop[rests] = 1.0
+        return CellMotion(F, moved, hoop)
+
+    def slot(self, cells: NDArray[np.int32]) -> NDArray[np.int64]:
+        """Return the places of cells among the filled ones."""
+        return self._slot[cells]
+
+
+class FluxForms:
+    """The forms over the faces between active cells, and their coefficients.
+
+    Parameters
+    ----------
+    grid
+        Background grid.
+    weight : (d,), N/m^3
+        Weight of the pore fluid rho_w g as UFL, None without gravity.
+    flows
+        Whether anything conducts; without, there are no fluxes.
+    pressure
+        DG0 pore pressure, Pa.
+    bulk
+        Bulk modulus of the fluid, Pa.
+    """
+
+    def __init__(self, grid: Grid, weight: ufl.core.expr.Expr | None, flows: bool, pressure: fem.Function, bulk: float):
+        self.grid, mesh, d, Q = grid, grid.mesh, grid.dim, grid.cellwise()
+        q, dp = ufl.TestFunction(Q), ufl.TrialFunction(Q)
+        self.damping, self.fixed_stress = (fem.Function(Q) for _ in range(2))
+        vectors = (fem.Function(grid.cellwise((d,))) for _ in range(5))
+        self.mobility, self.moved, self.centroid, self.lower_face, self.upper_face = vectors
+        n, h = ufl.FacetNormal(mesh), fem.Constant(mesh, grid.h)
+        n0 = n("+")
+        across = sum(abs(n0[a]) * h[a] for a in range(d))
+
+        def opening(side, sign):
+            """Share of the face that the body covers, times `Grid.around`, on the side that sign * n0 looks to."""
+            lower, upper = self.lower_face(side), self.upper_face(side)
+            return sum(
+                ufl.conditional(ufl.gt(sign * n0[a], 0.5), upper[a], 0.0)
+                + ufl.conditional(ufl.lt(sign * n0[a], -0.5), lower[a], 0.0)
+                for a in range(d)
+            )
+
+        share = ufl.min_value(opening("+", 1), opening("-", -1))
+        d0 = across / 2 - ufl.dot(self.centroid("+"), n0)
+        d1 = across / 2 + ufl.dot(self.centroid("-"), n0)
+        k0, k1 = (sum(abs(n0[a]) * self.mobility(side)[a] for a in range(d)) for side in "+-")
+        T = share * k0 * k1 / (d0 * k1 + d1 * k0 + 1e-300)
+        dS = ufl.Measure("dS", domain=mesh, subdomain_id=_compat.SUBDOMAIN, metadata={"quadrature_degree": 0})
+        self.flux = FacetForm(T * ufl.jump(dp) * ufl.jump(q) * dS, grid.comm) if flows else None
+        self.dt = fem.Constant(mesh, 0.0)
+        damped = ufl.max_value(ufl.avg(self.damping) * share * (d0 + d1) - self.dt * T, 0.0)
+        self.damp = FacetForm(damped * ufl.jump(dp) * ufl.jump(q) * dS, grid.comm)
+        smaller = ufl.min_value(self.fixed_stress("+"), self.fixed_stress("-"))
+        volume = fem.Constant(mesh, grid.cell_volume)  # not a number: each would be compiled anew
+        self.alternation = FacetForm(smaller / (4 * d) * across / volume * ufl.jump(dp) * ufl.jump(q) * dS, grid.comm)
+        self.slope, self.density, self._sum = fem.Function(grid.cellwise((d,))), fem.Function(Q), fem.Function(Q)
+        apart = ufl.jump(self.centroid)
+        along = apart - ufl.dot(apart, n0) * n0
+        self.aslant = None
+        if flows and not grid.axisymmetric:
+            carried = T * ufl.avg(self.density)
+            self.aslant = FacetForm(-carried * ufl.dot(ufl.avg(self.slope), along) * ufl.jump(q) * dS, grid.comm)
+        self.gravity = None
+        if weight is not None and flows:
+            apart = across * n0 - ufl.jump(self.centroid + self.moved)
+            # so water at rest, whose pressure grows by its weight at zero pressure, stays at rest; the two at once for
+            # each face: rounding of what leaves a cell enters its neighbour, and is that of small differences
+            density = density_between(pressure("+"), pressure("-"), fem.Constant(mesh, 1 / bulk))
+            drives = ufl.jump(pressure) + ufl.dot(weight, apart)
+            self.gravity = FacetForm(T * density * drives * ufl.jump(q) * dS, grid.comm)
+
+    def along(
+        self, slope: NDArray[np.float64], cells: NDArray[np.int64], facets: FacetSum, density: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return the outflow of the local cells (c,), m^d/s, by gradients (n, d), Pa/m, of some along some faces.
+
+        density (c,): of the fluid over that at zero pressure.
+        """
+        self.density.x.array[:] = density
+        self.slope.x.array[:] = self._sum.x.array[:] = 0.0
+        self.slope.x.array.reshape(-1, self.grid.dim)[cells] = slope
+        self.slope.x.scatter_forward()
+        facets.assemble_vector(self._sum.x.array)
+        return sum_ghosts(self._sum)
+
+    def set_conduction(self, contents: CellContents, flow: Conduction) -> NDArray[np.float64]:
+        """Set the coefficients for how the filled owned cells conduct; return their mobilities (n, d) by axis."""
+        d, filled, shift = self.grid.dim, contents.filled, flow.mobility.shift
+        mobility = flow.along(d)
+        values = {self.mobility: mobility}
+        if shift is not None:  # the fluid's weight is that at the centroids nevertheless
+            values[self.centroid] = contents.centroid[filled] + shift
+        if self.gravity:
+            moved = np.zeros((len(filled), d)) if flow.motion is None else flow.motion.moved
+            values[self.moved] = moved if shift is None else moved - shift
+        for f, rows in values.items():
+            f.x.array[:] = 0.0
+            f.x.array.reshape(-1, d)[filled] = rows
+            f.x.scatter_forward()
+        return mobility

@@ -1,0 +1,210 @@
+# SPDX-License-Identifier: MIT
+"""How cells conduct that hold several conductivities: along lines through them, axis by axis.
+
+What lies one after the other on a line resists in series; lines side by side conduct in parallel.  So a cell's mobility
+along an axis is the mean over lines of their harmonic means (Cardwell and Parsons 1945): exact for layers along the
+grid, across and along them, however many a cell has.  Aslant, a seam stays a barrier as it crosses all lines of some
+cell between its sides, and a drain conducts as some lines stay in it: both need to be a cell thick.
+
+Resistance counts from where the pressure is the mean of a line in steady flow: int (1 - s) dR to its lower end and
+int s dR to the upper one, s in [0, 1] along the line.  Their sum over faces is exact.  Where layers lie aslant by more
+than `ASLANT` the place moves to the more conductive end, or a drain would be cut wherever it passes from one row of
+cells to the next.  A piece counts as a box, the part of its domain's bounding box in the cell.
+
+Of a material whose conductivity depends on its deformation a cell holds many, but no layers: see `graded`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpm_dolfinx.domains.cut_domains import CutDomains
+from mpm_dolfinx.flow.fluxes import CellContents, Mobility
+from mpm_dolfinx.grid.grid import sum_by
+from mpm_dolfinx.parallel.exchange import over_all
+
+BLUR = 1e-6
+"""Cells within which a line at the edge of a piece counts half for it."""
+ASLANT = 0.01
+"""Slope of layers on the grid from which a cell's pressure is rather that of its most conductive part."""
+PAIRS = 2**16
+"""Pairs of pieces in a cell that are looked at, at a time."""
+INSIDE = 1e-12  # of half a cell: how near to a face the place of a cell's pressure may come
+
+
+@dataclass(frozen=True)
+class Lines:
+    """Lines along an axis through the centroids of pieces; arrays over pairs of a line and a piece that it crosses.
+
+    line, piece: numbers among the pieces of mixed cells; length: within the piece, cells; before: share of it that
+    counts for the way from the lower end to the place of mean pressure; total: length of all lines, cells.
+    """
+
+    line: NDArray[np.int64]
+    piece: NDArray[np.int64]
+    length: NDArray[np.float64]
+    before: NDArray[np.float64]
+    total: NDArray[np.float64]
+
+
+class MixedCells:
+    """The owned cells that hold several conductivities, and lines through them.
+
+    Parameters
+    ----------
+    rows
+        Pieces (m,) in mixed cells, those of a cell one after the other.
+    cells
+        Their cells (m,).
+    low, high
+        Their boxes (m, d) in the cell, whose edge is 1.
+    x
+        Their centroids (m, d) in the cell.
+    volume
+        Their volumes (m,), m^d.
+    contents
+        What the cells hold.
+    h : (d,), m
+        Edges of a cell.
+    """
+
+    def __init__(self, rows, cells, low, high, x, volume, contents: CellContents, h: NDArray[np.float64]):
+        self._rows, self._x, self._volume, self._h = rows, x, volume, h
+        own, first, self._at, count = np.unique(cells, return_index=True, return_inverse=True, return_counts=True)
+        self._filled, middle = contents.slot(own), contents.centroid[own] / h
+        self._room = np.minimum(INSIDE - 0.5 - middle, 0.0), np.maximum(0.5 - INSIDE - middle, 0.0)
+        count, first = count[self._at], first[self._at]
+        ends = 1 + np.flatnonzero(np.diff(np.cumsum(count) // PAIRS, append=-1))
+        met = [self._crossed(slice(a, b), first, count, low, high) for a, b in pairwise([0, *ends])]
+        size, share = np.maximum(high - low, BLUR), volume / h.prod()
+        self._lines = []
+        for axis, found in enumerate(zip(*met, strict=True)):
+            line, piece, meets = (np.concatenate(rows) for rows in zip(*found, strict=True))
+            length = (share / np.delete(size, axis, axis=1).prod(axis=1))[piece] * meets
+            total, place = (sum_by(line, length * y, len(cells)) for y in (1.0, x[piece, axis]))
+            before = 0.5 + ((place / total)[line] - x[piece, axis]) / total[line]
+            self._lines.append(Lines(line, piece, length, before, total))
+
+    def _crossed(self, rows: slice, first, count, low, high) -> list[tuple[NDArray, NDArray, NDArray]]:
+        """Return, for each axis, lines of some pieces, the pieces that they cross, and the share in which they do.
+
+        first, count (m,): of the pieces in each piece's cell.
+        """
+        own = np.arange(rows.start, rows.stop)
+        line = np.repeat(own, count[rows])
+        begin = np.cumsum(count[rows]) - count[rows]
+        piece = np.repeat(first[rows] - begin, count[rows]) + np.arange(len(line))
+        inside = np.minimum(self._x[line] - low[piece], high[piece] - self._x[line]) / BLUR + 0.5
+        out = []
+        for axis in range(self._x.shape[1]):
+            meets = np.delete(inside, axis, axis=1).clip(0, 1).prod(axis=1)
+            kept = np.flatnonzero(meets)
+            out.append((line[kept], piece[kept], meets[kept]))
+        return out
+
+    def mobility(
+        self, kappa: NDArray[np.float64], mean: NDArray[np.float64], share: NDArray[np.float64] | None
+    ) -> Mobility:
+        """Return the mobility of all filled cells, of their means (n,) and of those of all pieces, m^2/(Pa s).
+
+        share (n, d): along the axes in the other cells, which is changed here.
+        """
+        along, off = self._along(kappa[self._rows])
+        shift = np.zeros((len(mean), along.shape[1]))
+        share = np.ones_like(shift) if share is None else share
+        share[self._filled] = np.divide(along, mean[self._filled, None], out=np.zeros_like(along), where=along > 0)
+        shift[self._filled] = off.clip(*self._room) * self._h
+        return Mobility(mean, share, shift)
+
+    def _along(self, kappa: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return mobilities along the axes and shifts, cells, of mixed cells (n, d), of those of their pieces."""
+        n, d = len(self._filled), self._x.shape[1]
+        mobility, shift, sharper = np.zeros((n, d)), np.zeros((n, d)), self._sharper(kappa)
+        with np.errstate(divide="ignore"):
+            resistivity = 1 / kappa
+        for axis, lines in enumerate(self._lines):
+            resists = lines.length * resistivity[lines.piece]
+            resistance = sum_by(lines.line, resists, len(kappa))
+            conducts = self._volume * lines.total / resistance
+            resists = np.where((resistance < np.inf)[lines.line], resists, 0.0)
+            below = sum_by(lines.line, resists * lines.before, len(kappa))
+            below = np.divide(below, resistance, out=np.full(len(kappa), 0.5), where=resistance < np.inf)
+            off = lines.total * (sharper[self._at] * (below - 0.5)).clip(-0.5, 0.5)
+            total = sum_by(self._at, conducts, n)
+            mobility[:, axis] = total / sum_by(self._at, self._volume, n)
+            np.divide(sum_by(self._at, conducts * off, n), total, out=shift[:, axis], where=total > 0)
+        return mobility, shift
+
+    def _sharper(self, kappa: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return how much further (n,) than of mean pressure the place of a cell's pressure is from the middle."""
+        n = len(self._filled)
+
+        def total(values: NDArray[np.float64]) -> NDArray[np.float64]:
+            return sum_by(self._at, self._volume * values, n)
+
+        volume = total(np.ones(len(kappa)))
+        both = kappa + (total(kappa) / volume)[self._at]
+        conducts = np.divide(kappa, both, out=np.zeros_like(kappa), where=both > 0)
+        conducts -= (total(conducts) / volume)[self._at]
+        moment = np.stack([total(conducts * x) for x in self._x.T], axis=1) ** 2
+        whole = moment.sum(axis=1) ** 2
+        aslant = np.divide(whole - (moment**2).sum(axis=1), 2 * whole, out=np.zeros(n), where=whole > 0)
+        return 1 + aslant / ASLANT**2
+
+
+def graded(
+    contents: CellContents, offset: NDArray[np.float64], kappa: NDArray[np.float64], mean: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the share (n, d) of the mean along each axis, where the mobility changes steadily through a cell.
+
+    Along its gradient the pieces resist in series, across it they conduct in parallel.  Aslant, the difference of the
+    two means counts along each axis by the variance that the linear change there explains, as for lines.
+
+    Parameters
+    ----------
+    offset, kappa
+        Of the pieces: places (m, d) from the cells' midpoints, m, and mobilities (m,), m^2/(Pa s).
+    mean
+        Mean mobility of the filled cells (n,).
+    """
+    with np.errstate(divide="ignore"):
+        series = 1 / contents.mean(1 / kappa)
+    parts = []  # of the variance, by the linear change along each axis
+    for x, least in zip(offset.T, (BLUR * contents.grid.h) ** 2, strict=True):
+        middle, moment = contents.mean(x), contents.mean(x * kappa)
+        spread = contents.mean(x**2) - middle**2
+        parts.append(np.divide((moment - middle * mean) ** 2, spread, out=np.zeros(len(mean)), where=spread > least))
+    parts = np.stack(parts, axis=1)
+    whole = parts.sum(axis=1, keepdims=True)
+    along = np.divide(parts, whole, out=np.full(parts.shape, 1 / parts.shape[1]), where=whole > 0)
+    less = np.divide(mean - series, mean, out=np.zeros(len(mean)), where=mean > 0)
+    return 1 - less[:, None] * along
+
+
+def mixed_cells(cut: CutDomains, alike: NDArray[np.float64], contents: CellContents) -> MixedCells | None:
+    """Return the owned cells that hold pieces that do not conduct alike, None if no process has any.
+
+    alike: (m, k) what those pieces have in common that do.
+    """
+    grid, cells, volume = cut.grid, cut.cells, contents.area
+    some = np.zeros((grid.num_local, alike.shape[1]))
+    some[cells] = alike  # of any of the cell's pieces
+    mixed = sum_by(cells, (alike != some[cells]).any(axis=1), grid.num_local) > 0
+    corners = cut.points.corners
+    low, high = (cut.to_cells(rows) for rows in (corners.min(axis=1), corners.max(axis=1)))
+    if over_all(grid.comm, bool(mixed.any())) == 0:
+        return None
+    rows = np.flatnonzero(mixed[cells])
+    rows = rows[np.argsort(cells[rows], kind="stable")]
+    cells, volume = cells[rows], volume[rows]
+    x = (cut.x[rows] - grid.midpoints[cells]) / grid.h + 0.5
+    if cut.domains:
+        low, high = (((y[rows] - grid.midpoints[cells]) / grid.h + 0.5).clip(0, 1) for y in (low, high))
+    else:
+        half = 0.5 * (volume / grid.cell_volume)[:, None] ** (1 / grid.dim)
+        low, high = x - half, x + half
+    return MixedCells(rows, cells, low, high, x, volume, contents, grid.h)

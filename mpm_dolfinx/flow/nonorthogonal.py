@@ -1,0 +1,184 @@
+# SPDX-License-Identifier: MIT
+"""Fluxes between cells whose centroids do not lie across from one another, and through open sides aslant.
+
+The two-point flux takes the difference of two pressures for that across the face.  Where bodies lie aslant in their
+cells the centroids of what two of these hold differ along the face too, by t: up to half a cell, which is an error of
+the flux that does not fall with h.  With the gradients g of the pressure less the weight of the fluid in the cells
+
+    Q = T [p+ - p- + rho_w g . (x- - x+) - (g+ + g-)/2 . t],
+
+and through an open side p - p_out + g . t, t the way along it from the foot of the centroid.  Gradients are those of
+least squares over the neighbours, the pressures of drained sides, and no flow across sealed ones, whose area is what
+the open faces of the cell leave to close it; linear pressures are exact.  They are limited: no cell's pressure as it
+counts at a face passes those of its neighbours.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpm_dolfinx.flow.fluxes import CellContents, FluxForms, OpenSides
+from mpm_dolfinx.forms.point_forms import FacetSum
+from mpm_dolfinx.grid.grid import sum_by
+
+ALONG = 1e-4
+"""Share of a cell below which centroids lie across from one another."""
+NEAREST = 0.1
+"""Share of a cell: what is nearer counts as if it were as far in the least squares."""
+SLACK = 1e-6
+"""Share of the differences of pressure between neighbours by which limited pressures may pass them."""
+SIDES = 2.0
+"""Weight of all that is known beyond a cell's open sides in its least squares, by their areas, over a neighbour's."""
+FLAT = 1e-6
+"""Share of the best known direction's weight below which a gradient along another one is unknown, and taken as none."""
+
+
+def off_facets(contents: CellContents, facets: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Return those facets between two active cells whose centroids do not lie across from one another."""
+    grid = contents.grid
+    first, other = grid.facet_cells[facets].T
+    apart = contents.centroid[other] - contents.centroid[first]
+    across = np.abs(grid.midpoints[other] - grid.midpoints[first]) > 0.5 * grid.h
+    return facets[(np.where(across, 0.0, np.abs(apart) / grid.h) > ALONG).any(axis=1)]
+
+
+class Gradients:
+    """Gradients of the head in cells whose centroids do not lie across from their neighbours' or from open sides.
+
+    They are those of a cut: what is open and where, not what acts there.
+
+    Parameters
+    ----------
+    contents, sides
+        What the cells hold, and open sides.
+    """
+
+    def __init__(self, contents: CellContents, sides: OpenSides):
+        grid, d, h = contents.grid, contents.grid.dim, contents.grid.h
+        centroid, share, towards = contents.centroid, contents.open, np.repeat(np.arange(d), 2)
+        at, normal = contents.slot(sides.cells), sides.normal
+        foot = sides.reach - np.einsum("md,md->m", sides.reach, normal)[:, None] * normal
+        beside = grid.beside(contents.filled)
+        there = np.maximum(beside, 0)
+        inside = (beside >= 0) & (share[contents.filled] > 0)
+        for axis, end in np.ndindex(d, 2):
+            inside[:, axis, end] &= share[there[:, axis, end], axis, 1 - end] > 0
+        there, inside = there.reshape(-1, 2 * d), inside.reshape(-1, 2 * d)
+        way = centroid[there] - centroid[contents.filled][:, None]
+        along = np.where(inside[:, :, None], way / 2, 0.0)
+        along[:, np.arange(2 * d), towards] = 0.0
+        off = np.abs(along / h).max(axis=(1, 2)) > ALONG / 2
+        off[at[(np.abs(foot / h) > ALONG).any(axis=1)]] = True
+        self.rows = rows = np.flatnonzero(off)
+        """Places of these cells among the filled ones."""
+        way[:, np.arange(2 * d), towards] += np.tile([-1, 1], d) * h[towards]
+        self._here, self._there, self._inside = contents.filled[rows], there[rows], inside[rows]
+        self._along, self._way = along[rows], way[rows]
+        place = np.full(len(off), -1)
+        place[rows] = np.arange(len(rows))
+        self._faces = np.flatnonzero(off[at])
+        self._at, self._reach, self._foot = place[at[self._faces]], sides.reach[self._faces], foot[self._faces]
+        self._normal = normal[self._faces]
+        self._known = np.flatnonzero(((sides.shape > 0) & ~sides.seeps)[self._faces])
+        size = np.linalg.norm(sides.area, axis=1)[self._faces[self._known]]
+        at_sides = self._at[self._known]
+        weight = SIDES * size / sum_by(at_sides, size, len(rows))[at_sides]
+        self._of_cells, self._of_sides = self._units(self._sealed(contents, sides)[rows], weight, h.min())
+
+    def _sealed(self, contents: CellContents, sides: OpenSides) -> NDArray[np.float64]:
+        """Return the area vectors (n, d) of sealed sides in the filled cells, over that of a cell's face."""
+        grid, share = contents.grid, contents.open[contents.filled]
+        out = -(share[:, :, 1] - share[:, :, 0])
+        for axis in range(grid.dim):
+            area = sum_by(contents.slot(sides.cells), sides.area[:, axis], len(out))
+            out[:, axis] -= area * grid.h[axis] / grid.cell_volume
+        return np.where(np.linalg.norm(out, axis=1, keepdims=True) > ALONG, out, 0.0)
+
+    def _units(
+        self, sealed: NDArray[np.float64], weight: NDArray[np.float64], h: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the gradients by a unit of difference to each neighbour (n, 2 d, d), and to each side (m, d), 1/m."""
+        known, d = self._known, self._way.shape[2]
+        at, reach, near = self._at[known], self._reach[known], (NEAREST * h) ** 2
+        to_cells = self._inside[:, :, None] * self._way / np.maximum((self._way**2).sum(axis=2), near)[:, :, None]
+        distance = np.einsum("md,md->m", reach, self._normal[known])
+        to_sides = (weight / np.maximum(distance**2, near))[:, None] * reach
+        size = np.linalg.norm(sealed, axis=1, keepdims=True)
+        closed = np.divide(sealed, np.sqrt(np.maximum(size, size**2)), out=np.zeros_like(sealed), where=size > 0)
+        A = np.einsum("nki,nkj->nij", to_cells, self._way) + closed[:, :, None] * closed[:, None, :]
+        for i, j in np.ndindex(d, d):
+            A[:, i, j] += sum_by(at, to_sides[:, i] * reach[:, j], len(A))
+        inverse = np.linalg.pinv(A, rcond=FLAT, hermitian=True)
+        return np.einsum("nij,nkj->nki", inverse, to_cells), np.einsum("mij,mj->mi", inverse[at], to_sides)
+
+    def __call__(
+        self, p: NDArray[np.float64], outer: NDArray[np.float64], weight: NDArray[np.float64] | None
+    ) -> NDArray[np.float64]:
+        """Return the gradients (rows, d), Pa/m, of the pressure less the weight of the fluid.
+
+        Parameters
+        ----------
+        p : (c,), Pa
+            Pressures of all local cells.
+        outer : (m,), Pa
+            Beyond the open sides.
+        weight : (d,), N/m^3
+            Of the fluid, None without gravity.
+        """
+        here, at = p[self._here], self._at[self._known]
+        to_cells = p[self._there] - here[:, None]
+        to_sides = outer[self._faces[self._known]] - here[at]
+        if weight is not None:
+            to_cells, to_sides = to_cells - self._way @ weight, to_sides - self._reach[self._known] @ weight
+        to_cells = np.where(self._inside, to_cells, 0.0)
+        out = np.einsum("nk,nki->ni", to_cells, self._of_cells)
+        for axis in range(out.shape[1]):
+            out[:, axis] += sum_by(at, to_sides * self._of_sides[:, axis], len(out))
+        low, high = to_cells.min(axis=1, initial=0.0), to_cells.max(axis=1, initial=0.0)
+        np.minimum.at(low, at, to_sides)
+        np.maximum.at(high, at, to_sides)
+        rise = np.einsum("nd,nkd->nk", out, self._along)
+        share, slack = np.ones(len(out)), SLACK * (high - low)  # else rounding would decide where nothing rises
+        for room, most in ((-low, -rise.min(axis=1)), (high, rise.max(axis=1))):
+            room = room + slack
+            share = np.minimum(share, np.divide(room, most, out=np.ones(len(out)), where=most > room))
+        return out * share[:, None]
+
+    def through_sides(self, slope: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+        """Return what so many open faces (count,) see more than the pressure of their cell, Pa."""
+        out = np.zeros(count)
+        out[self._faces] = np.einsum("md,md->m", self._foot, slope[self._at])
+        return out
+
+
+class AslantFlow(NamedTuple):
+    """What flows beside the two-point fluxes.
+
+    forms, facets: over the faces of `off_facets`; gradients: of the cut; contents, sides: what the cells hold, open
+    sides; conductance (m,), m^d/(Pa s): of these; weight (d,), N/m^3: of the fluid, None without gravity.
+    """
+
+    forms: FluxForms
+    facets: FacetSum
+    gradients: Gradients
+    contents: CellContents
+    sides: OpenSides
+    conductance: NDArray[np.float64]
+    weight: NDArray[np.float64] | None
+
+    def __call__(
+        self, p: NDArray[np.float64], density: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return what leaves the filled cells (n,) to others, and through open sides (m,), m^d/s, at p (c,), Pa.
+
+        density (c,): of the fluid over that at zero pressure.
+
+        Seepage faces are left out: they are open or not by the pressure of their cell.
+        """
+        slope, sides = self.gradients(p, self.sides.pressure, self.weight), self.sides
+        leaves = self.forms.along(slope, self.contents.filled[self.gradients.rows], self.facets, density)
+        through = self.conductance * self.gradients.through_sides(slope, len(sides.cells)) * density[sides.cells]
+        return leaves[self.contents.filled], np.where(sides.seeps, 0.0, through)

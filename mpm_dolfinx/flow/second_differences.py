@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: MIT
+"""Damping of the second differences of pressures along the axes: alternating ones, and no even gradient.
+
+    (H p, q) = sum over cells and axes of w D p D q,   D p = h ((p_+ - p) / d_+ - (p - p_-) / d_-),
+
+where d_+- are the distances between the centroids of what the cells hold.  A cell has a term along an axis where both
+its faces are open.  Pressures that alternate from cell to cell meet 16 w, as they meet 4 times the coefficient of a
+damping of jumps; a gradient that is even meets nothing, so that steep pressures are not smeared, up to sides of the
+body.  The sum of H p over the cells is zero: no fluid is lost.
+"""
+
+from __future__ import annotations
+
+from petsc4py import PETSc
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpm_dolfinx.forms.unknowns import Unknowns
+from mpm_dolfinx.grid.grid import Grid
+
+
+def second_differences(
+    unknowns: Unknowns,
+    grid: Grid,
+    strength: NDArray[np.float64],
+    centroid: NDArray[np.float64],
+    opening: NDArray[np.float64],
+) -> PETSc.Mat:
+    """Return the matrix H; its pattern depends on the active cells alone.
+
+    Parameters
+    ----------
+    unknowns
+        The pressures of the active cells.
+    grid
+        Background grid.
+    strength : (n, d), m^d/Pa
+        Of a damping of jumps through wholly open faces, of the owned active cells along each axis, >= 0.
+    centroid : (c, d), m
+        Of what the local cells hold, from their midpoints.
+    opening : (c, d, 2)
+        Open shares of the lower and upper faces of the local cells, in axisymmetry times `Grid.around`.
+    """
+    own, number, h = unknowns.owned, unknowns.map.indices, grid.h
+    beside = grid.beside(own)
+    active = (beside >= 0) & (number[beside] >= 0)
+    row, axis = np.nonzero(active.all(axis=2))
+    low, high = beside[row, axis].T
+    here = own[row]
+    share = np.minimum(
+        np.minimum(opening[here, axis, 0], opening[low, axis, 1]),
+        np.minimum(opening[here, axis, 1], opening[high, axis, 0]),
+    )
+    apart = [h[axis] + centroid[b, axis] - centroid[a, axis] for a, b in ((low, here), (here, high))]
+    steep = [h[axis] / np.maximum(d, h[axis] / 2) for d in apart]
+    values = np.sqrt(share * strength[row, axis] / 4)[:, None] * np.stack([steep[0], -sum(steep), steep[1]], axis=1)
+    columns = number[np.stack([low, here, high], axis=1)].astype(PETSc.IntType)
+    starts = np.arange(0, 3 * len(row) + 1, 3, dtype=PETSc.IntType)
+    size = ((len(row), None), (unknowns.size, None))
+    D = PETSc.Mat().createAIJ(size, csr=(starts, columns.ravel(), values.ravel()), comm=unknowns.comm)
+    return D.transposeMatMult(D)

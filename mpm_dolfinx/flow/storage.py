@@ -1,0 +1,602 @@
+# SPDX-License-Identifier: MIT
+"""Storage of the pore fluid: DG0 on the grid, which is the finite volume method.
+
+In each active cell, with J_Delta = det(I + grad u) (never div u: a rotation would fake a compression),
+
+    int r [zeta(J_Delta, p) - zeta_n] dV_n  +  int sum_faces Q dt  =  0,      d zeta = alpha dJ + S J dp,
+    Q = T r [p+ - p- + rho_w g . (x- - x+)],   T = A / (d+ / kappa+ + d- / kappa-),   kappa = k / (rho_w g),
+
+r = exp(p / K_w) the density of the fluid over rho_w, that at zero pressure, in zeta that at (p_n + p) / 2 and on a face
+the logarithmic mean, so r [p+ - p-] is the jump of the mass potential (`fluid_content`): what leaves a cell enters its
+neighbour in mass.  The residual is that over r.  Its tangent leaves out what differences of r make, of neighbours and
+in the step.  A is the exact overlap of the body with the face, x+- are the centroids of what the cells hold and d+-
+their distances from the face; `layers` has kappa and d of cells that hold several conductivities.  Distances from the
+centroids keep the error at 0.2 % for any filling, where half the cell size reaches 12 %.  Where bodies lie aslant,
+`aslant` adds what centroids that are not across from one another leave out.  The sum over the cells is the fluid
+balance.  The change of the content is that of `fluid_content`, the integral over the step that of a substep of
+`time_integration`.
+
+Corners of domains follow more than u, points change cells, and jumps are damped (below), so the volumes of domains part
+from the fluid that has come to them.  The points carry this difference, `owed`, and cells take it in by small shares in
+the next steps: `due`, at an even rate over the step.
+
+Q1 with DG0 violates the inf-sup condition as the flow within a step goes to zero: alternating pressures go unseen. A
+stabilisation of the jumps of the step's increment is added, max(0, tau d - dt kappa / d) A [p - p_n], d = d+ + d-, dt
+the share of the step in which the rate at p counts.  A face then carries at least tau d A.  Where the flow is larger
+nothing is added.  In a steady state nothing is left, and no fluid is lost.  tau is a quarter of Silvester and
+Kechkar's patch value (Camargo, White and Borja 2021) for elastic soil.  What soil that flows needs more, up to a
+hundredfold, damps second differences only (`second_differences`): on jumps it would smear pressures that are steep.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from petsc4py import PETSc
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from numpy.typing import NDArray
+
+from mpm_dolfinx.base.fluid_content import change_of_content, mass_potential
+from mpm_dolfinx.base.validation import line
+from mpm_dolfinx.flow.fluxes import CellContents, Conduction, FluxForms, OpenSides
+from mpm_dolfinx.flow.nonorthogonal import AslantFlow, Gradients
+from mpm_dolfinx.flow.second_differences import second_differences
+from mpm_dolfinx.forms.cell_matrices import along_shapes, insert_rows
+from mpm_dolfinx.forms.point_forms import CellSums, FacetSum, FormPoints, PointData, PointForm
+from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts, zero
+from mpm_dolfinx.grid.grid import sum_by
+from mpm_dolfinx.materials.evaluate import ConductivityAtPieces
+from mpm_dolfinx.materials.skeleton import filled
+from mpm_dolfinx.materials.user_functions import compiling
+from mpm_dolfinx.materials.user_functions import form as form_of
+from mpm_dolfinx.parallel.exchange import over_all
+from mpm_dolfinx.points.parts import OfParts, Parts
+
+FILTER = 0.75
+"""Share of beta V that the filtered fixed-stress operator leaves out for checkerboard modes, in [0, 1]."""
+
+
+FluxSlope = Callable[[PETSc.Vec], NDArray[np.float64]]
+"""See `StorageProblem.flux_slope`."""
+
+
+class StorageForms:
+    """The compiled forms of the storage of a scene's pore fluid.
+
+    Parameters
+    ----------
+    pieces
+        Points of integration with the fields biot, storage and storage_at_one (1/Pa), see `change_of_content`, and
+        where pores drain `retention`: specific yield and suction (Pa), see `unsaturated`.
+    displacement
+        Increment of the displacement since the start of the step.
+    pressure
+        DG0 pore pressure, Pa, positive in compression.
+    bulk
+        Bulk modulus of the fluid, Pa.
+    weight : (d,), N/m^3
+        Weight of the pore fluid rho_w g as UFL, None without gravity.
+    symmetric
+        Take alpha dJ_Delta for the derivative of the content by J_Delta, for a symmetric Jacobian: the rest is of the
+        order of (p - p_n) / K_w, so Newton's method converges as fast.
+    flows
+        Whether anything conducts; without, there are no fluxes.
+    softens
+        Whether soil may be softer than elastic.
+    conductivity
+        Laws of the conductivity, None where no material has one.
+    sources
+        The user's, see `user_functions`.
+    t : s
+        Time at the end of the substep, a UFL constant.
+    """
+
+    def __init__(
+        self,
+        pieces: FormPoints,
+        displacement: fem.Function,
+        pressure: fem.Function,
+        bulk: float,
+        weight: ufl.core.expr.Expr | None,
+        symmetric: bool,
+        flows: bool,
+        softens: bool,
+        conductivity: ConductivityAtPieces | None,
+        sources: Sequence[Callable],
+        t: fem.Constant,
+    ):
+        self.grid, self.p, self.bulk, Q = pieces.grid, pressure, bulk, pressure.function_space
+        self.conductivity = conductivity
+        self.p_n, self._work = fem.Function(Q), fem.Function(Q)
+        q, one = ufl.TestFunction(Q), fem.Function(Q)
+        one.x.array[:] = 1.0
+        p, delta = ufl.variable(pressure), ufl.variable(pieces.increment(displacement))
+        J = ufl.det(delta)
+        stored = change_of_content(pieces.biot, pieces.storage_at_one, pieces.storage, J, p - self.p_n)
+        self.drains = "retention" in pieces.sizes
+        """Whether pores drain as a free surface falls."""
+        if self.drains:
+            drains, suction = pieces.retention
+            stored += drains * (filled(p, suction) - filled(self.p_n, suction))
+        self._change = PointForm(stored * q * pieces.dx, pieces)
+        by_u = [pieces.biot * ufl.diff(J, delta), *([] if symmetric else [ufl.diff(stored, delta)])]
+        along = [along_shapes(slope, pieces) for slope in by_u]
+        self._derivatives = CellSums([ufl.diff(stored, p), *(part for slope in along for part in slope)], pieces)
+        self.symmetric, self.softens = symmetric, softens
+        self.fluxes = FluxForms(pieces.grid, weight, flows, pressure, bulk)
+        self.sources, self._slopes = [], []
+        for source in sources:
+            form = form_of("sources", source, points=pieces, q=q, p=pressure, t=t)
+            if len(form.arguments()) != 1:
+                raise ValueError(f"sources: {line(source)}: does not depend on q, must be linear in it")
+            if pressure in form.coefficients():
+                self._slopes.append(PointForm(ufl.derivative(form, pressure, one), pieces))
+            with compiling(f"sources: {line(source)}", "linear in q"):
+                self.sources.append(PointForm(form, pieces))
+
+    @property
+    def linear(self) -> bool:
+        """Whether sources and drained pores do not depend on the pressure."""
+        return not self._slopes and not self.drains
+
+    def _sum(self, forms: Sequence[PointForm], data: PointData) -> NDArray[np.float64]:
+        """Return the sums of forms in the cells, a local array."""
+        b = self._work.x.array
+        b[:] = 0.0
+        for form in forms:
+            form.assemble_vector(b, data)
+        return b
+
+    def change(self, data: PointData) -> NDArray[np.float64]:
+        """Return the change of the fluid in each cell since the start of the step, m^d, a local array."""
+        return self._sum([self._change], data)
+
+    def derivatives(self, data: PointData) -> list[NDArray[np.float64]]:
+        """Return its derivative by the cell's pressure, m^d/Pa, a local array, and those by displacements of its nodes.
+
+        The latter (filled cells, n), m^(d-1), are first those of alpha dJ_Delta, which the momentum takes, then those
+        of the content, where these are others.
+        """
+        sums, count = self._derivatives(data), self.grid.dim * 2**self.grid.dim
+        by_p, *by_u = np.split(sums, range(1, sums.shape[1], count), axis=1)
+        capacity = np.zeros_like(self.p.x.array)
+        capacity[data.places.filled] = by_p[:, 0]
+        return [capacity, *by_u]
+
+    def gain(self, data: PointData) -> NDArray[np.float64]:
+        """Return the rate of the sources in each cell at p, m^d/s, a local array."""
+        return self._sum(self.sources, data)
+
+    def gain_slope(self, data: PointData) -> NDArray[np.float64]:
+        """Return its derivative by the cell's pressure, m^d/(Pa s), a local array."""
+        return self._sum(self._slopes, data)
+
+    def driven(self, assembled: FacetSum) -> NDArray[np.float64]:
+        """Return the outflow that p and the fluid's weight drive from each cell to others, m^d/s, a local array."""
+        assembled.assemble_vector(self._sum([], None))
+        return sum_ghosts(self._work)
+
+
+@dataclass(frozen=True)
+class OpenFaces:
+    """Faces on open sides; arrays over m faces.
+
+    number (m,): of the condition; at (m,): place of the cell among the active owned ones; conductance, inflow (m,):
+    outflow per unit of the cell's mass potential, m^d/(Pa s), and what is prescribed or driven in, m^d/s; seeps (m,):
+    whether nothing may flow in.
+    """
+
+    number: NDArray[np.int64]
+    at: NDArray[np.int64]
+    conductance: NDArray[np.float64]
+    inflow: NDArray[np.float64]
+    seeps: NDArray[np.bool_]
+
+    def outflow(self, pi: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return what leaves through each face, were it open both ways, from cells at potentials (n,), Pa; m^d/s."""
+        return self.conductance * pi[self.at] - self.inflow
+
+    def seepage(self, pi: NDArray[np.float64], flows: NDArray[np.bool_]) -> tuple[NDArray, NDArray]:
+        """Return what seeps out of cells (n,), m^d/s, and its derivative, m^d/(Pa s); flows (m,): where."""
+        parts = (np.where(flows & self.seeps, values, 0.0) for values in (self.outflow(pi), self.conductance))
+        return tuple(sum_by(self.at, values, len(pi)) for values in parts)
+
+
+@dataclass(frozen=True)
+class Outflow:
+    """Outflow of the active owned cells: conductance of open sides (m^d/(Pa s)), inflow (m^d/s), and the sum of all.
+
+    faces: one by one; of those that seep nothing is in these sums; total: outflow per unit of the cell's own
+    potential through all its other faces, m^d/(Pa s).  mobility (n, d): along the axes, m^2/(Pa s).  aslant: what flows
+    besides.
+    """
+
+    conductance: NDArray[np.float64]
+    inflow: NDArray[np.float64]
+    faces: OpenFaces
+    total: NDArray[np.float64]
+    mobility: NDArray[np.float64]
+    aslant: AslantFlow | None
+
+
+class Aslant(NamedTuple):
+    """What flows beside the two-point fluxes, m^d/s: out of active owned cells, through open faces, and theirs."""
+
+    cells: NDArray[np.float64] | float
+    faces: NDArray[np.float64] | float
+    lost: NDArray[np.float64] | float
+
+
+@dataclass(frozen=True)
+class Rates:
+    """Rates at which the owned cells lose fluid, m^d/s, or with `taken` what they lose in a time, m^d.
+
+    pressure: of the cells, Pa; cells: outflow less sources of each; lost: what of that leaves the bodies, less sources;
+    turnover: what goes in and out; gain: what sources bring or take, in size.
+    """
+
+    pressure: NDArray[np.float64]
+    cells: NDArray[np.float64]
+    lost: NDArray[np.float64]
+    turnover: NDArray[np.float64]
+    gain: NDArray[np.float64]
+
+    def taken(self, seconds: float) -> Rates:
+        """Return what the cells lose in a time."""
+        taken = (seconds * values for values in (self.cells, self.lost, self.turnover, self.gain))
+        return Rates(self.pressure, *taken)
+
+
+class StorageSystem:
+    """Vectors and matrices of the pressures of one active set, complete when made.
+
+    Parameters
+    ----------
+    forms
+        The forms; the contents of the cells are set.
+    cells, facets
+        Active local cells, ghosts included, and the faces between two of them.
+    momentum
+        Unknowns of the displacement.
+    parts
+        Parts of the bodies.
+    """
+
+    def __init__(
+        self,
+        forms: StorageForms,
+        cells: NDArray[np.int32],
+        facets: NDArray[np.int32],
+        momentum: Unknowns,
+        parts: Parts,
+    ):
+        self._forms, d, fluxes = forms, forms.grid.dim, forms.fluxes
+        self.unknowns = own = Unknowns(forms.p, cells.astype(np.int64))
+        self.local_parts = parts.cells
+        """Parts (cells,) of the local cells, -1 where they hold nothing."""
+        self.of_parts = OfParts(forms.grid.comm, parts.cells[own.owned], parts.count)
+        """Parts of the unknowns."""
+        self.T, self.D, self.L = (matrix(own, own, 2 * d + 1) for _ in range(3))
+        self.B = matrix(own, momentum, 2**d * d)
+        self.B_momentum = self.B if forms.symmetric else matrix(own, momentum, 2**d * d)
+        self.residual, self.p, self.p_start = (own.vector() for _ in range(3))
+        kinds = (fluxes.flux, fluxes.damp, fluxes.alternation, fluxes.gravity)
+        self._flux, self.damp, self._alternation, self.gravity = (f and f.on(facets) for f in kinds)
+        self.set_alternation()
+        _add_diagonal(self.L, np.zeros(own.size))  # of a cell without faces
+        pattern = self.L
+        if forms.softens:
+            grid, zeros = forms.grid, np.zeros((forms.grid.num_local, d, 2))
+            pattern = second_differences(own, grid, zeros[: own.size, :, 0], zeros[:, :, 0], zeros)
+            pattern.axpy(1.0, self.L, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
+        self.C, self.P = pattern.duplicate(), pattern.duplicate()
+
+    def places(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return where on the grid this process's unknowns are, and none that are held: see `multigrid_solver`."""
+        places = self._forms.grid.cell_places(self.unknowns.owned)
+        return places, places[:0]
+
+    def lost(self, u: PETSc.Vec, out: PETSc.Vec, *slopes: FluxSlope) -> None:
+        """Set what the residual gains by displacements, m^d: by the content and, with their slope, by the fluxes."""
+        self.B.mult(u, out)
+        for slope in slopes:
+            out.array_w[:] += slope(u)
+
+    def set_alternation(self) -> None:
+        """Assemble the filter L of `StorageProblem.assemble_preconditioner`."""
+        zero(self.L)
+        self._alternation.assemble_matrix(self.L)
+        self.L.assemble()
+
+    def set_fluxes(
+        self, contents: CellContents, sides: OpenSides, flow: Conduction, off: tuple[FacetSum, Gradients] | None
+    ) -> Outflow:
+        """Assemble the fluxes through inner faces and open sides; off: of `AslantFlow`, where there is any."""
+        at = contents.slot(sides.cells)
+        faces = OpenFaces(sides.number, at, *sides.driven(at, flow, self._forms.bulk), sides.seeps)
+        both = (np.where(sides.seeps, 0.0, values) for values in (faces.conductance, faces.inflow))
+        conductance, inflow = (sum_by(at, values, len(contents.filled)) for values in both)
+        mobility = self._forms.fluxes.set_conduction(contents, flow)
+        zero(self.T)
+        if self._flux is not None:
+            self._flux.assemble_matrix(self.T)
+        self.T.assemble()
+        total = _add_diagonal(self.T, conductance)
+        aslant = off and AslantFlow(self._forms.fluxes, *off, contents, sides, faces.conductance, flow.weight)
+        return Outflow(conductance, inflow, faces, total, mobility, aslant)
+
+
+@dataclass(frozen=True)
+class StorageResidual:
+    """Fluid volume out of balance in each cell (m^d), and what it is measured by in each part (parts,), m^d.
+
+    exchanged: sum of all changes; round_off: what rounding may leave; off: sum of what the masses of the cells are off
+    by, in size; gain: change, plus what left, less sources; rates: at (u, p).
+    """
+
+    vector: PETSc.Vec
+    exchanged: NDArray[np.float64]
+    round_off: NDArray[np.float64]
+    off: NDArray[np.float64]
+    gain: NDArray[np.float64]
+    rates: Rates
+
+
+class StorageProblem:
+    """The storage of the pore fluid in one substep.
+
+    Parameters
+    ----------
+    forms, system
+        Compiled forms; vectors and matrices, with the fluxes in them.
+    data
+        The pieces.
+    contents
+        What the cells hold.
+    flow
+        Assembles what leaves them at (u, p); called with whether this is the start of the substep.
+    dt
+        Share of the step in which the rate at (u, p) counts, s.
+    before
+        What the cells lose by the rate of the substep before.
+    softness : (m,)
+        By how much the pieces are softer than elastic ones, where the forms' soil may be.
+    due : (n,), m^d
+        What the active owned cells take in of what their points are owed, until the end of the substep.
+
+    The pressure at the start of the step is that of `forms.p_n`.
+    """
+
+    def __init__(
+        self,
+        forms: StorageForms,
+        system: StorageSystem,
+        data: PointData,
+        contents: CellContents,
+        flow: Callable[[bool], Outflow],
+        dt: float,
+        before: Rates | None = None,
+        softness: NDArray[np.float64] | float = 1.0,
+        due: NDArray[np.float64] | float = 0.0,
+    ):
+        self.forms, self.system, self.data, self._due = forms, system, data, due
+        self._contents, self._flow, self.dt = contents, flow, dt
+        self._before = before or Rates(np.empty(0), *np.zeros((4, system.unknowns.size)))
+        outflow = flow(before is None)
+        system.unknowns.gather(forms.p_n.x.array, system.p_start)
+        reach = 4 * forms.grid.h.max() ** 2  # no two centroids are further apart than 2 h
+        tau, least = contents.set_damping(), dt * outflow.mobility.min(axis=1)
+        softest = contents.softest(softness) if forms.softens else np.ones(1)
+        known = [(tau * reach > least).any(), (softest * tau * reach > least).any() and softest.max() > 1]
+        somewhere = over_all(forms.grid.comm, np.array([*known, outflow.faces.seeps.any()], dtype=float)) > 0
+        self.damped, flows, self._seeps = somewhere.tolist()
+        """Whether jumps of the pressure are damped somewhere."""
+        self._softer = self._damping_of_soft_soil(tau, softest, outflow.mobility) if flows else None
+        self._flowing = outflow.faces.outflow(self._potentials) >= 0
+        self._aslant = self._aslant_now(outflow)
+        if self.damped:
+            forms.fluxes.dt.value = dt
+            zero(system.D)
+            system.damp.assemble_matrix(system.D)
+            system.D.assemble()
+
+    def _damping_of_soft_soil(
+        self, tau: NDArray[np.float64], softest: NDArray[np.float64], mobility: NDArray[np.float64]
+    ) -> PETSc.Mat:
+        """Return what the cells' softness (n,) adds to the damping tau (n,), 1/Pa, beside the flow."""
+        contents, grid = self._contents, self.forms.grid
+        flow = self.dt * mobility / grid.h**2
+        more = np.maximum((softest * tau)[:, None] - flow, 0) - np.maximum(tau[:, None] - flow, 0)
+        strength = grid.cell_volume * more
+        return second_differences(self.system.unknowns, grid, strength, contents.centroid, contents.open)
+
+    @property
+    def _potentials(self) -> NDArray[np.float64]:
+        """Mass potentials of the active owned cells, Pa."""
+        return mass_potential(self.forms.p.x.array[self.system.unknowns.owned], self.forms.bulk)
+
+    @property
+    def _density(self) -> NDArray[np.float64]:
+        """Density of the fluid halfway between start and end in the active owned cells, over that at zero pressure."""
+        forms, owned = self.forms, self.system.unknowns.owned
+        return np.exp((forms.p.x.array + forms.p_n.x.array)[owned] / (2 * forms.bulk))
+
+    def outflows(self, count: int) -> NDArray[np.float64]:
+        """Return what leaves through the sides of each of so many conditions (count,) at (u, p), m^d/s."""
+        faces = self._flow(False).faces
+        leaves = np.where(self._flowing | ~faces.seeps, faces.outflow(self._potentials), 0.0)
+        leaves = leaves + self._aslant.faces
+        return over_all(self.forms.grid.comm, sum_by(faces.number, leaves, count))
+
+    @property
+    def linear(self) -> bool:
+        """Whether the tangent does not depend on the pressure."""
+        return self.forms.linear and not self._seeps
+
+    @property
+    def fill(self) -> NDArray[np.float64]:
+        """Filled share of the cells, which is what their pressures count for."""
+        return self._contents.fill
+
+    def sealed(self, lost: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return by how much the cells' pressures would have risen, Pa, at fixed stress, by what they lost, m^d."""
+        owned = self.system.unknowns.owned
+        capacity = self.forms.derivatives(self.data)[0]
+        return lost / (capacity + self._contents.fixed_stress)[owned]
+
+    @property
+    def ring(self) -> float:
+        """Mean length of the rings that the cells' contents are in axisymmetry, m."""
+        whole, area = over_all(self.forms.grid.comm, np.array([self._contents.volume.sum(), self._contents.area.sum()]))
+        return float(whole / area)
+
+    def _aslant_now(self, outflow: Outflow) -> Aslant:
+        """Return what flows beside the two-point fluxes at the start of the substep: no tangent sees it."""
+        if outflow.aslant is None:
+            return Aslant(0.0, 0.0, 0.0)
+        p = self.forms.p.x.array
+        between, faces = outflow.aslant(p, np.exp(p / self.forms.bulk))
+        leaving = sum_by(outflow.faces.at, faces, len(between))
+        return Aslant(between + leaving, faces, leaving)
+
+    def settle_seepage(self) -> bool:
+        """Open and close seepage faces as the flow at (u, p) asks for; return whether that has changed anything.
+
+        Newton's method solves for (u, p) with the faces as they are, and then settles them: a primal-dual active set
+        (Hintermueller, Ito and Kunisch 2002).
+        """
+        if not self._seeps:
+            return False
+        faces = self._flow(False).faces
+        flows = faces.outflow(self._potentials) > 0
+        changes = over_all(self.forms.grid.comm, int(np.count_nonzero((flows != self._flowing) & faces.seeps)))
+        self._flowing[:] = flows
+        return changes > 0
+
+    def set_fluxes(self) -> None:
+        """Assemble the fluxes at u."""
+        self._flow(False)
+
+    def flux_slope(self, u: fem.Function, unknowns: Unknowns) -> FluxSlope:
+        """Return what gives the change (n,), m^d, of what the cells lose as displacements u change along a vector, m.
+
+        Of what the laws of the conductivity, and the geometry of the fluxes, make of it no matrix is assembled: it is
+        taken from differences (Knoll and Keyes 2004).  `set_fluxes` makes the fluxes those at u again.
+        """
+        p, h = self.system.unknowns.gather(self.forms.p.x.array, self.system.unknowns.vector()), self.forms.grid.h.min()
+        here, density = self._rates(self._flow(False), p).cells, self._density
+
+        def along(v: PETSc.Vec) -> NDArray[np.float64]:
+            largest = v.norm(PETSc.NormType.NORM_INFINITY)
+            if not 0 < largest < np.inf:
+                return np.zeros(len(here))
+            step, now = np.sqrt(np.finfo(float).eps) * h / largest, u.x.array.copy()
+            unknowns.add(u, step, v)
+            there = self._rates(self._flow(False), p).cells
+            u.x.array[:] = now
+            return self.dt * (there - here) / step / density
+
+        return along
+
+    def assemble_residual(self) -> StorageResidual:
+        """Return the fluid volume out of balance in each cell at (u, p)."""
+        forms, system, before = self.forms, self.system, self._before
+        outflow = self._flow(False)
+        b, owned, density = forms.change(self.data), system.unknowns.owned, self._density
+        b[owned] = change = density * b[owned] + self._due
+        r, p = system.unknowns.gather(b, system.residual), system.unknowns.gather(forms.p.x.array, system.p)
+        if self.damped:
+            system.D.multAdd(p - system.p_start, r, r)
+        if self._softer is not None:
+            self._softer.multAdd(p - system.p_start, r, r)
+        rates = self._rates(outflow, p)
+        now = rates.taken(self.dt)
+        mass = r.array_r + now.cells + before.cells
+        r.array_w[:] = mass / density
+        # what rounding may leave: of the volumes and of the fluxes that cancel
+        round_off = 2e-15 * (self._contents.volume + now.turnover + before.turnover)
+        rows = np.abs(change) + now.gain + before.gain, round_off, np.abs(mass), change + now.lost + before.lost
+        return StorageResidual(r, *(system.of_parts.sums(row) for row in rows), rates)
+
+    def _rates(self, outflow: Outflow, p: PETSc.Vec) -> Rates:
+        """Return the rates at (u, p)."""
+        forms, system, gain = self.forms, self.system, np.zeros(self.system.unknowns.size)
+        pi = p.copy()
+        pi.array_w[:] = values = mass_potential(p.array_r, forms.bulk)
+        if system.gravity is None:
+            cells = (system.T * pi).array_r.copy()
+        else:
+            cells = outflow.conductance * values + forms.driven(system.gravity)[system.unknowns.owned]
+        cells += self._aslant.cells - outflow.inflow
+        if forms.sources:
+            gain = forms.gain(self.data)[system.unknowns.owned]
+            cells -= gain
+        seeping, slope = outflow.faces.seepage(values, self._flowing) if self._seeps else (0.0, 0.0)
+        cells += seeping
+        lost = outflow.conductance * values - outflow.inflow + seeping + self._aslant.lost - gain
+        turnover = (np.abs(outflow.total) + slope) * np.abs(values)
+        return Rates(p.array_r.copy(), cells, lost, turnover, np.abs(gain))
+
+    def came(self, rates: Rates) -> NDArray[np.float64]:
+        """Return the fluid (cells,), m^d, that came to the local cells in the step by fluxes and sources; ghosts none.
+
+        Its volume is that at the density halfway between start and end, as in `change`.
+
+        rates: at the end of the substep.
+        """
+        out = np.zeros_like(self.forms.p.x.array)
+        out[self.system.unknowns.owned] = (-rates.taken(self.dt).cells - self._before.cells) / self._density
+        return out
+
+    def assemble_tangent(self, data: PointData | None = None) -> None:
+        """Assemble C = d/dp and B = d/du of the residual at (u, p), of these pieces or of others."""
+        forms, system, data = self.forms, self.system, data or self.data
+        capacity, *by_u = forms.derivatives(data)
+        for A, rows in zip((system.B_momentum, system.B), by_u, strict=False):
+            zero(A)
+            insert_rows(A, forms.grid, data.places.filled, rows)
+            A.assemble()
+        system.C.zeroEntries()
+        system.C.axpy(self.dt, system.T, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
+        if self.damped:
+            system.C.axpy(1.0, system.D, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
+        if self._softer is not None:
+            system.C.axpy(1.0, self._softer, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
+        owned = system.unknowns.owned
+        _add_diagonal(system.C, capacity[owned])
+        if self._seeps:
+            slope = self._flow(False).faces.seepage(self._potentials, self._flowing)[1]
+            _add_diagonal(system.C, self.dt * slope)
+        if forms.sources:
+            _add_diagonal(system.C, -self.dt * forms.gain_slope(data)[owned])
+
+    def assemble_preconditioner(self, factor: float, share: float) -> PETSc.Mat:
+        """Return the fixed-stress operator C + factor (beta V - share L) for the present C.
+
+        Parameters
+        ----------
+        factor
+            Multiple of beta, >= 0.
+        share
+            Of the filter L, in [0, 1]: 0 is the fixed-stress operator.  B K^-1 B^T falls from beta V for a smooth
+            pressure to a half (at nu = 0) where it alternates along one axis and to nothing for a checkerboard.
+            So does beta V - L, with L = sum over the faces of min(beta V+, beta V-) / (4 d) [p][q] <= beta V.
+        """
+        system = self.system
+        system.C.copy(system.P, structure=PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+        system.P.axpy(-factor * share, system.L, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
+        _add_diagonal(system.P, factor * self._contents.fixed_stress[system.unknowns.owned])
+        return system.P
+
+
+def _add_diagonal(A: PETSc.Mat, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Add values to the diagonal of a matrix; return it."""
+    d = A.getDiagonal()
+    d.array_w[:] += values
+    A.setDiagonal(d)
+    return d.array_r.copy()

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""The background grid and its partition."""

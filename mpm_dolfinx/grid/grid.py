@@ -1,0 +1,422 @@
+# SPDX-License-Identifier: MIT
+"""The background grid: a box of equal quadrilaterals or hexahedra, in which points are found by arithmetic.
+
+Its mesh is made when first it is needed: by then a simulation has shared out the cells by the points in them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property, reduce
+from typing import Any
+
+from mpi4py import MPI
+
+import numpy as np
+from dolfinx import fem
+from numpy.typing import ArrayLike, NDArray
+
+from mpm_dolfinx.base import _compat
+from mpm_dolfinx.base.validation import flag, instance, line, numbers
+from mpm_dolfinx.grid.partition import destinations, owners
+
+SIDES = {
+    2: {"left": (0, 0), "right": (0, 1), "bottom": (1, 0), "top": (1, 1)},
+    3: {"left": (0, 0), "right": (0, 1), "front": (1, 0), "back": (1, 1), "bottom": (2, 0), "top": (2, 1)},
+}
+"""Names of the sides of a box: (axis, 0 for the lower or 1 for the upper end)."""
+SNAP = 1e-10  # cells: vertices this close to a grid plane, or as close as rounding tells, are taken to lie on it
+REACH = 1e-4  # cells: a side that is given its way to the wall of the grid gives way by as much
+
+SHARED = frozenset(
+    "mesh num_owned num_local cell_nodes node_x midpoints signs cell_number cell_facets facet_cells facets_owned "
+    "owners locals".split()
+)
+"""What of a grid is made with its mesh, see `Cells`."""
+TURN = 2 * np.pi
+"""The angle of the revolution that volumes, forces and outflows of axisymmetric scenes are of."""
+CHUNK = 2**14
+"""Rows that are worked on at a time: no temporary holds one for each point of a large body."""
+MOST = 2**31 - 1
+"""Unknowns that PETSc's numbers of 32 bits count."""
+
+
+def side(name: str, dim: int) -> tuple[int, int]:
+    """Return (axis, end) of a named side of a box."""
+    if not isinstance(name, str) or name not in SIDES[dim]:
+        raise ValueError(f"side {name!r}: must be one of {', '.join(SIDES[dim])} in {dim}D")
+    return SIDES[dim][name]
+
+
+def in_chunks(count: int) -> list[slice]:
+    """Return so many rows in parts of at most CHUNK, one after the other; none of no rows."""
+    return [slice(start, min(start + CHUNK, count)) for start in range(0, count, CHUNK)]
+
+
+def sum_by(index: NDArray, values: NDArray[np.float64], size: int) -> NDArray[np.float64]:
+    """Return the sums (size,) of values by index (numpy's bincount, which gives integers for no values)."""
+    return np.bincount(index, weights=values, minlength=size).astype(float, copy=False)
+
+
+def among(numbers: NDArray[np.integer], chosen: NDArray[np.integer]) -> NDArray[np.bool_]:
+    """Return which numbers (...) are among chosen ones (m,), ascending: numpy's isin makes room for all numbers."""
+    if not len(chosen):
+        return np.zeros(numbers.shape, dtype=bool)
+    return chosen[np.minimum(np.searchsorted(chosen, numbers), len(chosen) - 1)] == numbers
+
+
+def rounding(x: NDArray[np.float64]) -> float:
+    """Return by how much coordinates of this size, m, may differ although they should be equal."""
+    return 8 * np.finfo(float).eps * float(np.abs(x).max(initial=0.0))
+
+
+class Cells:
+    """The cells of a grid that this process has, ghosts included, as the mesh numbers them; complete when made.
+
+    num_owned, num_local: number of cells without and with ghosts; cell_nodes (cells, 2^d): their nodes, numbered as
+    the Q1 degrees of freedom; node_x (nodes, d), midpoints (cells, d): positions, m; signs (2^d, d): on which side of
+    the midpoint a node lies; cell_number (cells,): lexicographic numbers; locals: the way back, -1 where there is none;
+    owners: ranks of all cells, copy by copy; cell_facets (cells, 2d); facet_cells (facets, 2): -1 where there is none.
+    """
+
+    def __init__(self, grid: Grid, mesh: Any, owners: NDArray[np.int32]):
+        self.mesh, self.owners, d = mesh, owners, grid.dim
+        nodes = _compat.function_space(mesh, "Lagrange", 1)
+        self.num_owned, self.num_local = _compat.num_cells(mesh)
+        self.cell_nodes = _compat.cell_dofs(nodes)
+        self.node_x = nodes.tabulate_dof_coordinates()[:, :d]
+        corners = self.node_x[self.cell_nodes]
+        self.midpoints = corners.mean(axis=1)
+        # all cells list their vertices in the same order (tested), so one set of signs serves all, also a process
+        # without a cell: it compiles the same forms
+        self.signs = np.concatenate(grid.comm.allgather(np.sign(corners[:1] - self.midpoints[:1, None])))[0]
+        self.cell_number = grid.number(np.floor((self.midpoints - grid.lower) / grid.h).astype(np.int64))
+        if grid.copies > 1:
+            brought = np.concatenate(grid.comm.allgather(np.flatnonzero(owners == grid.comm.rank)))
+            self.cell_number = brought[np.asarray(mesh.topology.original_cell_index)]
+        self.locals = np.full(len(owners), -1, dtype=np.int32)
+        self.locals[self.cell_number] = np.arange(self.num_local)
+        topology = mesh.topology
+        topology.create_connectivity(d, d - 1)
+        topology.create_connectivity(d - 1, d)
+        if d == 3 and grid.comm.size > 1:  # all together: else who first integrates over a facet waits for who has none
+            topology.create_entity_permutations()
+        self.cell_facets = topology.connectivity(d, d - 1).array.reshape(-1, 2 * d)
+        adjacency = topology.connectivity(d - 1, d)
+        first = adjacency.offsets[:-1]
+        two = np.diff(adjacency.offsets) == 2
+        self.facet_cells = np.stack([adjacency.array[first], np.full(len(first), -1, dtype=np.int32)], axis=1)
+        self.facet_cells[two, 1] = adjacency.array[first[two] + 1]
+        self.facets_owned = topology.index_map(d - 1).size_local
+
+
+class Grid:
+    """Background grid of equal cells over the box [lower, upper].
+
+    Bodies must stay in it; what is empty of it costs next to nothing.  Its sides are the walls that `fixed` names:
+    "left", "right" (x), "bottom", "top" (y in 2D, z in 3D), in 3D also "front", "back" (y).
+
+    Parameters
+    ----------
+    upper : (d,), m
+        Upper corner; d = 2 (plane strain) or 3.
+    cells : (d,)
+        Number of cells along each axis, at least 1.
+    lower : (d,), m
+        Lower corner, by default the origin.
+    comm
+        Processes that share the grid.
+    axisymmetric
+        The first axis is the radius r >= 0 and the second the axis of revolution: bodies are what the plane sweeps as
+        it turns once, without torsion.  Volumes, forces and outflows are those of the whole revolution, m^3, N, m^3/s.
+        Where the grid begins at r = 0 its side "left" is the axis, which stays where it is.
+
+    Raises
+    ------
+    ValueError
+        Corners that are not finite or not in order, numbers of cells that are no integers >= 1, more cells than
+        PETSc's numbers count, or an axisymmetric grid in 3D or beyond its axis.
+
+    Attributes
+    ----------
+    dim, shape, h, lower, upper
+        d; cells along each axis (d,); their edges (d,), m; corners (d,), m.
+    snap
+        Distance to a grid plane, along each axis (d,), below which a vertex is taken to lie on it, cells.
+    stretches
+        Number of axes of deformation gradients: d, in axisymmetry 3, the third one that of the hoops.
+    mesh
+        The dolfinx mesh; made when first it is needed.  On several processes a second scene whose points lie elsewhere
+        has a grid with a mesh of its own, `Simulation.grid`; not one with terms or sources, which may be made on this.
+    """
+
+    def __init__(
+        self,
+        upper: ArrayLike,
+        cells: Sequence[int],
+        lower: ArrayLike | None = None,
+        comm: MPI.Intracomm = MPI.COMM_WORLD,
+        *,
+        axisymmetric: bool = False,
+    ):
+        self.upper = numbers("grid: upper", upper, (2,), (3,), allowed="2 or 3 finite coordinates")
+        self.dim = d = self.upper.size
+        lower = np.zeros(d) if lower is None else lower
+        self.lower = numbers("grid: lower", lower, (d,), allowed=f"{d} finite coordinates")
+        if not (self.upper > self.lower).all():
+            raise ValueError(f"grid: upper = {line(upper)}, must be > lower = {line(lower)}")
+        flag("grid: axisymmetric", axisymmetric)
+        if axisymmetric and (d != 2 or self.lower[0] < 0):
+            what = f"lower = {line(lower)}, must begin at a radius >= 0" if d == 2 else f"{d} coordinates, must have 2"
+            raise ValueError(f"grid: axisymmetric = True: {what}")
+        self.axisymmetric, self.stretches = axisymmetric, 3 if axisymmetric else d
+        count = numbers(
+            "grid: cells", cells, (d,), allowed=f"{d} integers >= 1", test=lambda n: (n >= 1) & (n % 1 == 0)
+        )
+        instance("grid: comm", comm, MPI.Comm)
+        self.shape = count.astype(np.int64)
+        if d * np.prod(count + 1) > MOST:
+            raise ValueError(
+                f"grid: cells = {line(cells)}: has {np.prod(count + 1):.3g} nodes, must be below {MOST // d}"
+            )
+        self.h = (self.upper - self.lower) / self.shape
+        self.snap = np.maximum(SNAP, [rounding(ends) for ends in zip(self.lower, self.upper, strict=True)] / self.h)
+        self.comm = comm
+        self._made: list[Cells] = []
+        self._spaces: dict[tuple[int, ...], fem.FunctionSpace] = {}
+        self._coefficients: dict[tuple[int, ...], fem.Function] = {}
+
+    def __getattr__(self, name: str):
+        """Make the mesh when first something of it is asked for; what has been asked for is found at once."""
+        if name not in SHARED:  # notebooks ask for `_repr_html_`, `copy` for other names
+            raise AttributeError(f"the grid has no {name!r}")
+        self.share(np.zeros(int(np.prod(self.shape))))
+        return vars(self).setdefault(name, getattr(self._made[0], name))
+
+    def share(self, load: NDArray[np.float64]) -> None:
+        """Make the mesh, its cells shared out among the processes by what each holds (cells,); once."""
+        if not self._made:
+            self._make(owners(load.reshape(self.shape), self.comm.size))
+
+    def shared(self, load: NDArray[np.float64], keep: bool) -> Grid:
+        """Return the grid with its cells shared out by what each holds (cells,): this one, or an equal one.
+
+        Parameters
+        ----------
+        load : (cells,)
+            What each cell holds, >= 0.
+        keep
+            Whether a mesh that is there stays, however its cells are shared out: something was made on it.
+        """
+        owner = owners(load.reshape(self.shape), self.comm.size)
+        if not self._made:
+            self._make(owner)
+        elif not keep and (self._made[0].owners[: self.cells] != owner.ravel()).any():  # of an earlier scene
+            other = Grid(self.upper, self.shape, self.lower, self.comm, axisymmetric=self.axisymmetric)
+            other._make(owner)
+            return other
+        return self
+
+    def _make(self, owner: NDArray[np.int32]) -> None:
+        own = np.flatnonzero(owner.ravel() == self.comm.rank)
+        nodes = np.concatenate([self.corners(own) + copy * self.nodes for copy in range(self.copies)])
+        ranks, first = destinations(owner, own)
+        each = np.tile(np.diff(first), self.copies)
+        where = np.tile(ranks, self.copies), np.concatenate([[0], np.cumsum(each)]).astype(np.int32)
+        mesh = _compat.box_mesh(self.comm, nodes, self._nodes(), *where)
+        self._made.append(Cells(self, mesh, np.tile(owner.ravel(), self.copies)))
+
+    def corners(self, cells: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the lexicographic numbers of the nodes (n, 2^d) of cells."""
+        bits = np.arange(2**self.dim)[:, None] >> np.arange(self.dim) & 1
+        index = np.stack(np.unravel_index(cells, self.shape), axis=-1)[:, None] + bits
+        return np.ravel_multi_index(tuple(np.moveaxis(index, 2, 0)), tuple(self.shape + 1))
+
+    def _nodes(self) -> NDArray[np.float64]:
+        """Return the positions (n, d), m, of this process's share of the nodes, in lexicographic order."""
+        count = self.copies * self.nodes
+        start, stop = (count * (self.comm.rank + end) // self.comm.size for end in (0, 1))
+        index = np.stack(np.unravel_index(np.arange(start, stop) % self.nodes, self.shape + 1), axis=-1)
+        return self.lower + index * self.h
+
+    @property
+    def copies(self) -> int:
+        """How often the mesh has the box: once, or for each group of bodies, see `GridOfGroups`."""
+        return 1
+
+    @property
+    def cells(self) -> int:
+        """Number of cells of one copy."""
+        return int(np.prod(self.shape))
+
+    @property
+    def nodes(self) -> int:
+        """Number of nodes of one copy."""
+        return int(np.prod(self.shape + 1))
+
+    def copy(self, ids: NDArray[np.int64]) -> NDArray[np.int64] | int:
+        """Return the numbers of the first cells of the copies in which material points (n,), by id, are."""
+        return 0
+
+    def cellwise(self, shape: tuple[int, ...] = ()):
+        """Return the space of functions of a shape that are constant in the cells (DG0), made once."""
+        if shape not in self._spaces:
+            self._spaces[shape] = _compat.function_space(self.mesh, "DG", 0, shape)
+        return self._spaces[shape]
+
+    def coefficient(self, shape: tuple[int, ...] = ()) -> fem.Function:
+        """Return a new cellwise function that stands in forms for rows of values; all of a shape share its memory."""
+        first = self._coefficients.get(shape)
+        out = fem.Function(self.cellwise(shape), None if first is None else first.x)
+        self._coefficients.setdefault(shape, out)
+        return out
+
+    @cached_property
+    def cell_volume(self) -> float:
+        """Volume of a cell, in axisymmetry its area in the plane (m^d)."""
+        return float(np.prod(self.h))
+
+    @property
+    def has_axis(self) -> bool:
+        """Whether its side "left" is the axis of revolution."""
+        return self.axisymmetric and bool(self.lower[0] <= 1e-9 * self.h[0])
+
+    def around(self, x: NDArray[np.float64]) -> NDArray[np.float64] | float:
+        """Return by what measures in the plane at places (n, d), m, count: 2 pi r (n,), m, in axisymmetry, else 1."""
+        return TURN * x[:, 0] if self.axisymmetric else 1.0
+
+    def number(self, index: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the lexicographic numbers of cells, in the first copy, from their (n, d) indices along the axes."""
+        return np.ravel_multi_index(tuple(index.T), tuple(self.shape))
+
+    def index(self, x: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Return the (n, d) indices of the cells that hold points, clamped into the grid."""
+        i = np.floor((x - self.lower) / self.h).astype(np.int64)
+        return np.clip(i, 0, self.shape - 1, out=i)
+
+    def owner(self, number: NDArray[np.int64]) -> NDArray[np.int32]:
+        """Return the rank that owns each cell, given by its lexicographic number."""
+        return self.owners[number]
+
+    def local(self, number: NDArray[np.int64]) -> NDArray[np.int32]:
+        """Return this process's index of each cell, -1 where it does not have the cell."""
+        return self.locals[number]
+
+    def node_places(self, nodes: NDArray[np.integer]) -> NDArray[np.int64]:
+        """Return the indices along the axes of local nodes (n,), and the copies they belong to (n, d + 1)."""
+        copy = np.zeros(len(self.node_x), dtype=np.int64)
+        if self.copies > 1:
+            copy[self.cell_nodes] = (self.cell_number // self.cells)[:, None]
+        index = np.rint((self.node_x[nodes] - self.lower) / self.h).astype(np.int64)
+        return np.column_stack([index, copy[nodes]])
+
+    def cell_places(self, cells: NDArray[np.integer]) -> NDArray[np.int64]:
+        """Return the same of local cells (n,)."""
+        copy, number = np.divmod(self.cell_number[cells].astype(np.int64), self.cells)
+        return np.column_stack([*np.unravel_index(number, tuple(self.shape)), copy])
+
+    def beside(self, cells: NDArray[np.integer]) -> NDArray[np.int64]:
+        """Return the local cells (n, d, 2) beside local cells, by axis and end, -1 where this process has none."""
+        index = self.cell_places(cells)
+        out = np.full((len(cells), self.dim, 2), -1, dtype=np.int64)
+        for axis in range(self.dim):
+            stride = int(np.prod(self.shape[axis + 1 :]))
+            for end, inside in enumerate((index[:, axis] > 0, index[:, axis] < self.shape[axis] - 1)):
+                out[inside, axis, end] = self.locals[self.cell_number[cells[inside]] + (2 * end - 1) * stride]
+        return out
+
+    def outside(self, x: NDArray[np.float64], tolerance: float = 1e-9) -> NDArray[np.bool_]:
+        """Return which points lie outside the grid by more than `tolerance` cells, and what is lost in rounding."""
+        tolerance = tolerance + rounding(np.stack([self.lower, self.upper])) / self.h
+        inside = np.ones(len(x), dtype=bool)
+        for a in range(self.dim):
+            y = (x[:, a] - self.lower[a]) / self.h[a]
+            inside &= (y >= -tolerance[a]) & (y <= self.shape[a] + tolerance[a])
+        return ~inside  # nan is outside as well
+
+    def shape_gradients(
+        self, cells: NDArray[np.int32], x: NDArray[np.float64], mixed: NDArray[np.float64] | None = None
+    ) -> NDArray[np.float64]:
+        """Return the gradients (n, 2^d, d), 1/m, of the Q1 shape functions of local cells at points.
+
+        mixed (n, 3), m^2: in 3D the means over pieces about these points, by their mean products of offsets.
+        """
+        hats = self._hats(cells, x)
+        dN = np.empty((*hats[0].shape, self.dim))
+        for a in range(self.dim):
+            b, *more = [k for k in range(self.dim) if k != a]
+            others = reduce(np.multiply, [hats[k] for k in (b, *more)])
+            if mixed is not None and more:
+                c = more[0]
+                others = others + mixed[:, a, None] * (self.signs[:, b] * self.signs[:, c] / (self.h[b] * self.h[c]))
+            np.multiply(others, self.signs[:, a] / self.h[a], out=dN[:, :, a])
+        return dN
+
+    @cached_property
+    def monomials(self) -> NDArray[np.float64]:
+        """Coefficients (2^d, 2^d) of the Q1 shape functions about the midpoint of a cell, one column each.
+
+        Row s is that of the product of the offsets along the axes whose bits are set in s.
+        """
+        bits = np.arange(2**self.dim)[:, None, None] >> np.arange(self.dim) & 1
+        return np.where(bits, self.signs / self.h, 0.5).prod(axis=2)
+
+    def shape_values(self, cells: NDArray[np.int32], x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the Q1 shape functions (n, 2^d) of local cells at points."""
+        return reduce(np.multiply, self._hats(cells, x))
+
+    def at(self, cells: NDArray[np.int32], x: NDArray[np.float64], u: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return a Q1 field u (nodes, k) at points (n, d), m, in local cells (n,)."""
+        out = np.empty((len(x), u.shape[1]))
+        for part in in_chunks(len(x)):
+            N, at_nodes = self.shape_values(cells[part], x[part]), u[self.cell_nodes[cells[part]]]
+            np.einsum("mk,mkd->md", N, at_nodes, out=out[part])
+        return out
+
+    def _hats(self, cells: NDArray[np.int32], x: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+        """Return the linear factors (n, 2^d) of the shape functions, one an axis."""
+        y = (x - self.midpoints[cells]) / self.h
+        return [0.5 + y[:, a, None] * self.signs[:, a] for a in range(self.dim)]
+
+    def interior_facets(self, active: NDArray[np.bool_], cells: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Return the facets of this process between two active cells (`cells` = where `active` holds)."""
+        facets = np.unique(self.cell_facets[cells])
+        facets = facets[facets < self.facets_owned]
+        both = self.facet_cells[facets]
+        return facets[(both[:, 1] >= 0) & active[both[:, 0]] & active[both[:, 1]]]
+
+    def wall_nodes(self, name: str) -> NDArray[np.bool_]:
+        """Return which nodes lie on a side of the box."""
+        axis, end = side(name, self.dim)
+        plane = (self.lower, self.upper)[end][axis]
+        return np.abs(self.node_x[:, axis] - plane) < 1e-6 * self.h[axis]
+
+
+class GridOfGroups(Grid):
+    """A grid with a copy of its box for each group of bodies, so that these do not share nodes.
+
+    The mesh is of so many disconnected boxes at one place.  Equal cells of the copies are on one process.
+
+    Parameters
+    ----------
+    grid
+        The grid of the bodies.
+    group : (points,)
+        Group of each material point of the scene, by id, from 0 on.
+    """
+
+    def __init__(self, grid: Grid, group: NDArray[np.int64]):
+        super().__init__(grid.upper, grid.shape, grid.lower, grid.comm)
+        self._group, self._copies = group.astype(np.int16), int(group.max()) + 1
+        if self.dim * self.copies * self.nodes > MOST:
+            what = f"grid: has {self.nodes:.3g} nodes for each of {self.copies} groups"
+            raise ValueError(f"{what}, must be below {MOST // (self.dim * self.copies)}")
+
+    @property
+    def copies(self) -> int:
+        """Number of groups."""
+        return self._copies
+
+    def copy(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the numbers of the first cells of the copies in which material points (n,), by id, are."""
+        return self._group[ids] * np.int64(self.cells)

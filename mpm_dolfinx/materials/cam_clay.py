@@ -1,0 +1,210 @@
+# SPDX-License-Identifier: MIT
+"""Modified Cam Clay at finite strain (Borja and Tamagnini 1998), with one local unknown.
+
+Multiplicative, in principal logarithmic strains, as Drucker and Prager's law: with the elastic volume strain e_v and
+deviator e (tension positive), pressure P = -tr(tau)/3 and Q = sqrt(3/2) |dev tau| in Kirchhoff stress,
+
+    P = P_0 exp(-e_v / kappa),   dev tau = 2G e,
+    f = Q^2 / M^2 + P (P - P_c) <= 0,   dP_c / P_c = -de_v^p / (lambda - kappa),
+
+flow associated.  P and P_c follow the bilogarithmic law: ln v is linear in ln P.  A step is implicit, from the trial
+stresses P_t and Q_t, w = (Q_t / (M P_t))^2, with the plastic compaction kappa a and 6G dgamma / M^2 = exp(h) - 1:
+
+    P = P_t exp(-a),   Q = Q_t exp(-h),   P_c = P_c,n exp(rho a),   rho = kappa / (lambda - kappa),
+    (6G kappa / M^2) a = (exp(h) - 1) (2P - P_c).
+
+The unknown is d = 2 (h - a), by which the end is steeper than the trial: Q / (M P) = sqrt(w) exp(-d/2).  It gives
+a = (ln(P_t / P_c,n) + ln(1 + w exp(-d))) / (1 + rho) from the yield surface, and all is smooth and monotone, at the
+critical state, where a says nothing, and at isotropic stresses too.
+
+Where M^2 P_c > 6G (lambda - kappa) soil on the dry side softens faster than it unloads: its stress jumps, or the
+step has no solution and is cut.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import ufl
+
+from mpm_dolfinx.base.validation import line
+from mpm_dolfinx.materials.skeleton import Field, Skeleton, _check, check_given
+from mpm_dolfinx.materials.trial import Trial
+
+GIVEN = {
+    "M": "> 0",
+    "lambda_": "> kappa",
+    "kappa": "> 0",
+    "initial_stress": "three normal effective stresses whose mean is compressive, < 0 Pa",
+}
+"""Constants that must be given, and what they may be."""
+OFF = 1e9  # a residual that no step is taken to
+
+
+class _Follows(float):
+    """A number that follows from other constants."""
+
+    follows = True
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModifiedCamClay(Skeleton):
+    """Modified Cam Clay with a constant shear modulus, in Kirchhoff stress.
+
+    Parameters
+    ----------
+    M
+        Slope of the critical state line Q = M P, -, > 0.
+    lambda_, kappa
+        Slopes lambda* and kappa* of ln v over ln P, first loading and unloading, -, 0 < kappa < lambda_, in Kirchhoff
+        stress.  An index C of v over the logarithm of the Cauchy stress, at the specific volume v, is C / (v - C) here.
+    initial_stress : (3,), Pa
+        Normal effective stresses at F = I, the last one out of plane in 2D, in axisymmetry along the hoops; tension
+        positive, their mean < 0.  The loads have to balance them.
+    OCR
+        Overconsolidation ratio, -, >= 1: how much larger the yield surface is at the start than that through the
+        initial stress.
+    shear
+        Shear modulus G, Pa, > 0.
+    bulk
+        Not to be given: P_0 / kappa, at the start.
+
+    The other parameters are those of `Skeleton`, all by name.  The state is `plastic`, C_p^-1 (3, 3), and
+    `consolidated`, ln of P_c over that at the start, in `points.data`.  Borja and Tamagnini (1998).
+
+    Raises
+    ------
+    ValueError
+        Naming the constant that is out of its range, or is not given.
+    """
+
+    bulk: Field = None
+    M: Field = None
+    lambda_: Field = None
+    kappa: Field = None
+    initial_stress: Field = None
+    OCR: Field = 1.0
+
+    state: ClassVar = {"plastic": np.eye(3), "consolidated": 0.0}
+    unknowns: ClassVar = {"steeper": 0.0}
+
+    def __post_init__(self):
+        check_given(self, GIVEN)
+        for name in ("M", "kappa"):
+            _check(self, name, lambda v: (0 < np.asarray(v)) & np.isfinite(v), "> 0 and finite")
+        if not callable(self.kappa):
+            allowed = f"finite and > kappa = {np.max(self.kappa):g}"
+            _check(self, "lambda_", lambda v: (np.asarray(v) > self.kappa) & np.isfinite(v), allowed)
+        _check(self, "OCR", lambda v: (1 <= np.asarray(v)) & np.isfinite(v), ">= 1 and finite")
+        _check(self, "initial_stress", _compressive, GIVEN["initial_stress"])
+        self._set_bulk()
+        super().__post_init__()
+
+    def _set_bulk(self) -> None:
+        """Set the bulk modulus of the start, from which the scheme takes its scales."""
+        stress, kappa = self.initial_stress, self.kappa
+        if callable(stress) or callable(kappa):
+
+            def bulk(X):
+                at = [f(X) if callable(f) else np.asarray(f) for f in (stress, kappa)]
+                return np.broadcast_to(-np.mean(at[0], axis=-1) / at[1], len(X))
+
+            bulk.follows = True
+        else:
+            bulk = -np.mean(stress, axis=-1) / kappa
+            bulk = bulk if np.ndim(bulk) else _Follows(bulk)
+        if self.bulk is None or getattr(self.bulk, "follows", False):  # of another one's constants: `replace`
+            object.__setattr__(self, "bulk", bulk)
+        elif callable(self.bulk) or (not callable(bulk) and not np.allclose(self.bulk, bulk, rtol=1e-9)):
+            raise ValueError(f"{type(self).__name__}: bulk = {line(self.bulk)}, must be left out: it is P_0 / kappa")
+
+    @property
+    def nearly_incompressible(self) -> bool:
+        return True  # at the critical state it is
+
+    @property
+    def pressure(self):
+        """Pressure P_0 at F = I, Pa."""
+        return -np.mean(self.initial_stress, axis=-1)
+
+    @property
+    def _deviator(self):
+        return np.asarray(self.initial_stress) + np.asarray(self.pressure)[..., None]
+
+    @property
+    def prestretch(self):
+        """Principal elastic stretches at F = I but for the volume's (3,)."""
+        return np.exp(self._deviator / (2 * np.asarray(self.shear)[..., None]))
+
+    @property
+    def yield_pressure(self):
+        """Size P_c of the yield surface at the start, Pa."""
+        Q2 = 1.5 * (self._deviator**2).sum(axis=-1)
+        return self.OCR * (self.pressure + Q2 / (self.M**2 * self.pressure))
+
+    @staticmethod
+    def trial(F, prestretch, plastic):
+        """Return volume strain and square of the distortion, e_s^2 = 2/3 e : e, of the trial strain."""
+        strain = Trial(F, plastic, prestretch)
+        e = strain.deviatoric
+        return {"volume": strain.volumetric, "distortion": 2 / 3 * ufl.inner(e, e), "strain": strain}
+
+    @staticmethod
+    def residual(trial, shear, M, lambda_, kappa, pressure, yield_pressure, consolidated, steeper):
+        """Return the equation of d: the flow rule, on the yield surface."""
+        to = _Return(trial, shear, M, lambda_, kappa, pressure, yield_pressure, consolidated, steeper)
+        c, P = 6 * shear * kappa / M**2, to.trial_pressure * ufl.exp(-to.compaction)
+        rule = (c * to.compaction - (ufl.exp(to.flow) - 1) * (1 - to.steepness) * P) / (c + P)
+        rule = ufl.conditional(
+            ufl.lt(to.flow, -1e-9), OFF, rule
+        )  # soil that softens fast has another root, back in time
+        return {"steeper": ufl.conditional(to.yields, rule, steeper)}
+
+    @staticmethod
+    def kirchhoff(trial, shear, M, lambda_, kappa, pressure, yield_pressure, consolidated, steeper):
+        """Return the Kirchhoff stress (3, 3), Pa, as UFL."""
+        to = _Return(trial, shear, M, lambda_, kappa, pressure, yield_pressure, consolidated, steeper)
+        a, h = (ufl.conditional(to.yields, value, 0.0) for value in (to.compaction, to.flow))
+        deviator = 2 * shear * ufl.exp(-h) * trial["strain"].deviatoric
+        return deviator - to.trial_pressure * ufl.exp(-a) * ufl.Identity(3)
+
+    @staticmethod
+    def update(trial, shear, M, lambda_, kappa, pressure, yield_pressure, plastic, consolidated, steeper):
+        """Return the state at the end of the step, name -> UFL."""
+        to = _Return(trial, shear, M, lambda_, kappa, pressure, yield_pressure, consolidated, steeper)
+        strain, a, ratio = trial["strain"], to.compaction, ufl.exp(-to.flow)
+        volume = strain.volumetric + kappa * a
+        b = strain.isotropic(lambda e: ufl.exp(2 * volume / 3 + ratio * (ufl.ln(e) - 2 * strain.volumetric / 3)))
+        back = ufl.inv(strain.F)
+        return {
+            "plastic": ufl.conditional(to.yields, back * b * back.T, plastic),
+            "consolidated": consolidated + ufl.conditional(to.yields, to.rho * a, 0.0),
+        }
+
+
+class _Return:
+    """The return to the yield surface that an unknown d stands for.
+
+    compaction, flow: a and h; steepness: w exp(-d), the square of Q / (M P) at the end; trial_pressure: P_t, Pa; rho:
+    change of ln P_c over a; yields: whether the trial stress is outside.
+    """
+
+    def __init__(self, trial, shear, M, lambda_, kappa, pressure, yield_pressure, consolidated, steeper):
+        self.rho = kappa / (lambda_ - kappa)
+        self.trial_pressure = P = pressure * ufl.exp(-trial["volume"] / kappa)
+        w = (3 * shear / (M * P)) ** 2 * trial["distortion"]
+        over = -trial["volume"] / kappa + ufl.ln(pressure / yield_pressure) - consolidated  # ln(P_t / P_c)
+        self.yields = ufl.gt(over + ufl.ln(1 + w), 0)
+        self.steepness = w * ufl.exp(-steeper)
+        self.compaction = (over + ufl.ln(1 + self.steepness)) / (1 + self.rho)
+        self.flow = self.compaction + steeper / 2
+
+
+def _compressive(stress) -> np.ndarray:
+    """Return whether normal stresses (..., 3) are finite and their mean is compressive."""
+    stress = np.asarray(stress, dtype=float)
+    if stress.shape[-1:] != (3,):
+        return np.array(False)
+    return np.isfinite(stress).all(axis=-1) & (stress.mean(axis=-1) < 0)

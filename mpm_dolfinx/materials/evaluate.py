@@ -1,0 +1,279 @@
+# SPDX-License-Identifier: MIT
+"""Laws evaluated at points: stresses and new state at the material points, conductivities at the pieces."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import cached_property
+from inspect import signature
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from numpy.typing import NDArray
+from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
+
+from mpm_dolfinx.base.errors import NotConverged
+from mpm_dolfinx.forms.axes import block
+from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointExpression
+from mpm_dolfinx.grid.grid import Grid
+from mpm_dolfinx.materials.local_unknowns import LocalUnknowns
+from mpm_dolfinx.materials.skeleton import BY_SCENE, Skeleton
+from mpm_dolfinx.materials.user_functions import call, compiling, expression, named
+from mpm_dolfinx.parallel.exchange import first
+from mpm_dolfinx.points.material_points import MaterialPoints
+
+
+class LawAtPoints:
+    """A law evaluated at the material points that follow it.
+
+    Parameters
+    ----------
+    grid
+        Background grid.
+    law
+        Class of the law.
+    shapes
+        Shape of each of its parameters and of its variables of state.
+    cell_size
+        That laws are given, m; by default that of the grid.
+    """
+
+    def __init__(
+        self, grid: Grid, law: type[Skeleton], shapes: dict[str, tuple[int, ...]], cell_size: float | None = None
+    ):
+        self.grid, self.law, self._shapes, self._by_scene = grid, law, shapes, by_scene(grid, cell_size)
+
+    @cached_property
+    def points(self) -> FormPoints:
+        """The points, with F and what the law takes."""
+        return FormPoints(self.grid, F=(self.grid.stretches, self.grid.stretches), **self._shapes)
+
+    @cached_property
+    def _F(self):
+        return ufl.variable(self.points.F)
+
+    @cached_property
+    def _local(self) -> LocalUnknowns | None:
+        return LocalUnknowns(self.law, self.points, self._F, self._given) if self.law.unknowns else None
+
+    @property
+    def _given(self) -> dict:
+        return {**{name: getattr(self.points, name) for name in self._shapes}, **self._by_scene}
+
+    @cached_property
+    def _values(self) -> dict:
+        own = self._local.known if self._local is not None else {}
+        return {**self._given, **own}
+
+    def _solve(self, data: PointData, dt: float) -> None:
+        """Set the time since the start of the step, s, and solve for local unknowns."""
+        self._by_scene["dt"].value = dt
+        if self._local is not None:
+            self._local.update(data, derive=False)
+
+    def data(
+        self, points: MaterialPoints, rows: NDArray[np.int64], values: dict[str, NDArray[np.float64]]
+    ) -> PointData:
+        """Return some of the material points, with values (n, ...) of F and of what the law takes."""
+        x = points.x[rows]
+        cells = self.grid.local(self.grid.number(self.grid.index(x)))
+        taken = {name: values[name][rows] for name in ("F", *self._shapes)}
+        return self.points.at(cells, x, points.volume0[rows], **taken)
+
+    @cached_property
+    def _stress(self) -> PointExpression:
+        F = self._F
+        return PointExpression(self.law.first_piola(F, self._values) * F.T / ufl.det(F), self.points)
+
+    def stress(self, data: PointData, dt: float = 0.0) -> NDArray[np.float64]:
+        """Return the effective Cauchy stress of the shape of F (n, d, d), Pa, so long after the state, s."""
+        stress = self._stress
+        self._solve(data, dt)
+        return stress.evaluate(data)
+
+    @cached_property
+    def _out_of_plane(self) -> PointExpression | None:
+        across = self.law.out_of_plane(self._F, self._values)
+        return None if across is None else PointExpression(across, self.points)
+
+    def stress_3d(self, data: PointData) -> NDArray[np.float64]:
+        """Return the effective Cauchy stress (n, 3, 3), Pa; nan across the plane where the law does not know it."""
+        if self.grid.stretches == 3:
+            return self.stress(data)
+        out = np.zeros((len(data.cells), 3, 3))
+        out[:, :2, :2], across = self.stress(data), self._out_of_plane
+        out[:, 2, 2] = np.nan if across is None else across.evaluate(data)
+        return out
+
+    @cached_property
+    def _update(self) -> tuple[PointExpression, dict[str, tuple[int, ...]]]:
+        """All components of the new state in one vector, and the shapes of its parts."""
+        what, shapes = f"{self.law.__name__}.update", {name: np.shape(value) for name, value in self.law.state.items()}
+        new = named(what, call(self.law.update, F=self._F, **self._values), shapes, some=True)
+        parts = [f[i] if i else f for f in new.values() for i in np.ndindex(f.ufl_shape)]
+        with compiling(what, f"real UFL of {shapes}"):
+            return PointExpression(ufl.as_vector(parts), self.points), {name: shapes[name] for name in new}
+
+    def new_state(self, data: PointData, dt: float) -> list[tuple[str, NDArray[np.float64]]]:
+        """Return the names and values (n, ...) of the state that follows from the F of the end of a step of dt, s."""
+        if self.law.update is None:
+            return []
+        expression, shapes = self._update
+        self._solve(data, dt)
+        values, out, start = expression.evaluate(data), [], 0
+        for name, shape in shapes.items():
+            stop = start + int(np.prod(shape, dtype=int))
+            out.append((name, values[:, start:stop].reshape(-1, *shape)))
+            start = stop
+        return out
+
+
+def by_scene(grid: Grid, cell_size: float | None = None) -> dict[str, fem.Constant]:
+    """Return what the scene gives to laws, see `BY_SCENE`, as UFL constants; the time is to be set."""
+    size = mean_size(grid) if cell_size is None else cell_size
+    return dict(zip(BY_SCENE, (fem.Constant(grid.mesh, 0.0), fem.Constant(grid.mesh, float(size))), strict=True))
+
+
+def mean_size(grid: Grid) -> float:
+    """Return the mean length of a cell, m: that of a square or cube of its size."""
+    return float(np.prod(grid.h) ** (1 / grid.dim))
+
+
+MOST = 100.0
+"""The most by which a skeleton counts as softer than elastic: perfectly plastic flow has no stiffness at all."""
+LEAST = 1e-12  # strain of a step below which it counts as elastic
+
+
+class SoftnessAtPoints:
+    """By how much material points that yield are softer in shear than elastic, along the strain of the last step.
+
+    What alternates from cell to cell in the volume changes grows with the strain; the pressures that balance it are
+    this over the strength tau of their damping, 1/Pa, that of the elastic moduli.  Where soil flows the strain grows
+    and the stress does not: tau must be that of the tangent, else pressures alternate by as much as the soil is strong.
+    With the strain of a step e = dev sym dF F^-1 and the Kirchhoff stress at F - (1 - s) dF, the tangent's shear
+    modulus is G_t = (d tau / ds) : e / (2 e : e) at s = 1.  It is that of the step before: one of the present iterate
+    would keep Newton's method from converging, or make the answer depend on its way.
+
+    Parameters
+    ----------
+    grid, law, shapes
+        See `LawAtPoints`.
+    """
+
+    def __init__(self, grid: Grid, law: type[Skeleton], shapes: dict[str, tuple[int, ...]]):
+        self._law, self._grid, self._shapes, d = law, grid, shapes, grid.stretches
+        self._points = points = FormPoints(grid, F=(d, d), dF=(d, d), **shapes)
+        s = ufl.variable(fem.Constant(grid.mesh, 1.0))
+        F = points.F - (1 - s) * points.dF
+        F = ufl.variable(block(F) if grid.axisymmetric else F)
+        self._by_scene = by_scene(grid)
+        values = {**{name: getattr(points, name) for name in shapes}, **self._by_scene}
+        self._local = LocalUnknowns(law, points, F, values) if law.unknowns else None
+        if self._local is not None:
+            values |= self._local.values
+        tau = law.first_piola(F, values) * F.T
+        e = ufl.sym(points.dF * ufl.inv(points.F))
+        e -= ufl.tr(e) / d * ufl.Identity(d)
+        size = ufl.sqrt(ufl.inner(e, e) + LEAST**2)
+        self._along = PointExpression(ufl.as_vector([size, ufl.inner(ufl.diff(tau, s), e) / size]), points)
+
+    def __call__(
+        self, at: PointData, dF: NDArray[np.float64], shear: NDArray[np.float64], dt: float
+    ) -> NDArray[np.float64]:
+        """Return the softness (n,) of points with F and what the law takes, in [1, MOST].
+
+        dF (n, d, d): change of F in the step; shear (n,): elastic shear modulus, Pa; dt: length of the step, s.
+        """
+        self._by_scene["dt"].value = dt
+        fields = {name: at[name] for name in ("F", *self._shapes)}
+        data = PointData(self._points, at.places, at.volume, {"dF": dF, **fields})
+        if self._local is not None:
+            self._local.update(data)
+        strain, change = self._along.evaluate(data).T
+        elastic = 2 * shear * strain
+        soft = elastic / np.maximum(change, elastic / MOST)
+        return np.where(strain > 10 * LEAST, np.maximum(soft, 1.0), 1.0)
+
+
+class ConductivityAtPieces:
+    """Conductivities that depend on deformation and place, evaluated at the pieces.
+
+    Parameters
+    ----------
+    materials
+        The scene's materials.
+    laws
+        Their different conductivity laws.
+    pieces
+        Points with the fields F, position, conductivity and porosity0, where a material has a conductivity law.
+    displacement
+        Increment of the displacement since the start of the step.
+    pressure
+        DG0 pressure of the cells, Pa, at the start of the substep.
+    """
+
+    def __init__(
+        self,
+        materials: Sequence[Skeleton],
+        laws: Sequence[Callable],
+        pieces: FormPoints,
+        displacement: fem.Function,
+        pressure: fem.Function,
+    ):
+        self._points, self._materials, self._u = pieces, materials, displacement
+        self.pressure = pressure if any("p" in signature(law).parameters for law in laws) else None
+        """What laws are given for p, None where none names it."""
+        self._p = pressure
+        self._laws = {law: PointExpression(self._in_ufl(law), pieces) for law in laws}
+
+    def _in_ufl(self, law: Callable):
+        points, F = self._points, self._points.increment(self._u) * self._points.F
+        J = ufl.det(F)
+        return expression(
+            law,
+            [()],
+            conductivity=points.conductivity,
+            F=F,
+            J=J,
+            porosity=1 - (1 - points.porosity0) / J,
+            porosity0=points.porosity0,
+            x=points.position + points.value(self._u),
+            p=self._p,
+        )
+
+    def evaluate(self, data: PointData, material: NDArray[np.int32], begins: bool) -> NDArray[np.float64]:
+        """Return the conductivities (m,), m/s, at u of pieces of the given materials (m,).
+
+        Raises
+        ------
+        ValueError, NotConverged
+            A law gives what is no conductivity: the first when a step begins, the other at an iterate.
+        """
+        out = data["conductivity"][:, 0].copy()
+        for law, k in self._laws.items():
+            rows = np.flatnonzero([m.conductivity_law is law for m in self._materials])
+            chosen = np.isin(material, rows)
+            out[chosen] = k.evaluate(data)[chosen]
+            bad = np.flatnonzero(chosen & ~((out >= 0) & (out < np.inf)))[:1]
+            shown = [f"k = {out[i]:g} at {data.x[i]}" for i in bad]
+            if where := first(self._points.grid.comm, "".join(shown)):
+                kind = ValueError if begins else NotConverged
+                raise kind(f"conductivity law: {where}, must be >= 0 and finite")
+        return out
+
+
+def sampled(law: Callable) -> list[float | None]:
+    """Return the conductivities that a law gives in three states, which tell it from another law."""
+    out = []
+    for J in (0.8, 1.0, 1.25):
+        F = ufl.as_matrix([[J, 0.1 * J], [0.0, 1.0]])
+        state = {"J": J, "porosity": 1 - 0.6 / J, "porosity0": 0.4, "conductivity": 1e-5, "p": 1e4 * (J - 1)}
+        given = {name: ufl.as_ufl(value) for name, value in state.items()}
+        try:
+            k = expression(law, [()], F=F, x=ufl.as_vector([0.3, 0.7]), **given)
+            out.append(float(apply_algebra_lowering(k)(())))
+        except Exception:  # a law need not know numbers, nor these
+            out.append(None)
+    drains = getattr(law, "specific_yield", 0.0)
+    return out + [drains] * (drains > 0)

@@ -1,0 +1,464 @@
+# SPDX-License-Identifier: MIT
+"""The materials of a scene at its points: parameters that differ from place to place, state, several laws."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable, Collection, Sequence
+from copy import copy
+from dataclasses import fields, replace
+from inspect import signature
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpm_dolfinx.base.errors import NotConverged
+from mpm_dolfinx.base.validation import numbers
+from mpm_dolfinx.bodies.bodies import Body
+from mpm_dolfinx.forms.point_forms import FormPoints, PointData
+from mpm_dolfinx.grid.grid import Grid
+from mpm_dolfinx.materials.evaluate import LawAtPoints, SoftnessAtPoints, mean_size, sampled
+from mpm_dolfinx.materials.prestressed import AT_REST, stressed
+from mpm_dolfinx.materials.skeleton import BY_SCENE, Fluid, Skeleton
+from mpm_dolfinx.parallel.exchange import first
+from mpm_dolfinx.points.material_points import MaterialPoints
+
+RESERVED = frozenset(
+    "F dF softness owed due storage storage_at_one density position displacement porosity0 gradient retention".split()
+)
+"""Names of what points of integration carry beside parameters and state."""
+WHAT_IS_NAMED = "parameters, state and unknowns"
+EVOLVED = 1e-3
+"""By how much the state of a law differs from that at rest where it counts as another."""
+STIFFEST = 100.0
+"""How much stiffer than the skeleton pore fluid that cannot flow is taken to be, at most: rounding grows with it."""
+
+
+class SceneMaterials:
+    """The materials of a scene; what differs from point to point is put into `points.data`, and found there.
+
+    Parameters
+    ----------
+    grid
+        Background grid.
+    materials
+        Material of each index that the bodies name.
+    bodies
+        All bodies; their reference positions are where fields are evaluated.
+    points
+        The points of this process, as seeded.
+    fluid
+        Pore fluid, if there is one.
+    prestressed
+        Whether points may have a stress as seeded.
+    """
+
+    def __init__(
+        self,
+        grid: Grid,
+        materials: Sequence[Skeleton],
+        bodies: Sequence[Body],
+        points: MaterialPoints,
+        fluid: Fluid | None,
+        prestressed: bool = False,
+    ):
+        materials = [stressed(m, grid.stretches) for m in materials] if prestressed else materials
+        self.grid, self.materials, self.fluid = grid, materials, fluid
+        seeded: dict[str, NDArray[np.float64]] = {}
+        self._used = _used(bodies, len(materials))  # a material that no body is of changes nothing
+        used = [materials[i] for i in self._used]
+        self._fields = [[name for name in _names(m) if callable(getattr(m, name))] for m in materials]
+        places = [_places(bodies, i) if self._fields[i] else np.empty((0, grid.dim)) for i in self._used]
+        evaluated = [m.at(X) for m, X in zip(used, places, strict=True)]
+        self.laws = list(dict.fromkeys(map(type, used)))
+        self.conductivity_laws = list(dict.fromkeys(m.conductivity_law for m in used if m.conductivity_law))
+        """The different conductivity laws of the scene."""
+        self._law = np.array([self.laws.index(type(m)) if type(m) in self.laws else 0 for m in materials])
+        locks = [bool(np.any(m.nearly_incompressible)) for m in evaluated]
+        self._parts = list(dict.fromkeys(zip(map(type, used), locks, strict=True)))
+        own = dict(zip(self._used, zip(map(type, used), locks, strict=True), strict=True))
+        self._part = np.array([self._parts.index(own[i]) if i in own else 0 for i in range(len(materials))])
+        self.symmetric = all(m.symmetric for m in used)
+        """Whether the tangents of all materials are symmetric."""
+        self.stiffest = max(float(np.max(m.oedometric, initial=0.0)) for m in evaluated)
+        """Largest oedometric modulus, Pa."""
+        self.uneven = any(
+            max(float(np.max(y)) for y in moduli) > 2 * min(float(np.min(y)) for y in moduli)
+            for moduli in ([m.oedometric for m in evaluated], [m.shear for m in evaluated])
+        )
+        """Whether points differ in stiffness by more than a factor of two."""
+        self.conducts = any(m.conductivity_law or np.any(np.asarray(m.conductivity) > 0) for m in evaluated) or any(
+            callable(m.conductivity) for m in used
+        )
+        """Whether fluid flows anywhere, or may in a later stage."""
+        conductivity = np.concatenate([np.ravel(m.conductivity) for m in evaluated])
+        by_place = any(callable(m.conductivity) for m in materials) or any(map(_names_place, self.conductivity_laws))
+        self.layered = by_place or len({m.conductivity_law for m in used}) > 1 or bool(np.ptp(conductivity))
+        """Whether points may differ in what they conduct."""
+        self.checksums: dict[str, int | list[float]] = {
+            f"conductivity law of material {i}": sampled(m.conductivity_law)
+            for i, m in zip(self._used, used, strict=True)
+            if m.conductivity_law
+        }
+        """What tells fields and conductivity laws from others."""
+        self.shapes: dict[str, tuple[int, ...]] = {}
+        """Shape of each parameter and variable of state."""
+        for i, m in zip(self._used, evaluated, strict=True):
+            values = {name: getattr(m, name) for name in self._fields[i]}
+            count = sum(len(body) for body in bodies if body.material == i)
+            self._add_shapes(_spread(m, values, count), seeded, len(points))
+            here, rows = _rows(bodies, i, points.id)
+            for name, value in values.items():
+                content = np.ascontiguousarray(value).tobytes()
+                self.checksums[f"checksum of {name} of material {i}"] = zlib.crc32(content)
+                mine = np.zeros((len(points), *value.shape[1:]))
+                mine[here] = value[rows]
+                seeded[name] = mine + seeded[name] if name in seeded else mine
+        if prestressed and "plastic" in seeded:
+            seeded["plastic" + AT_REST] = seeded["plastic"]
+        self._softness: dict[int, SoftnessAtPoints] = {}
+        if fluid is not None:
+            seeded |= {"owed": np.zeros(len(points)), "due": np.zeros(len(points))}
+        if fluid is not None and self.evolves:
+            seeded["softness"] = np.ones(len(points))
+            for number, law in enumerate(self.laws):
+                if law.state:
+                    shapes = {name: self.shapes[name] for name in _takes(law)}
+                    self._softness[number] = SoftnessAtPoints(grid, law, shapes)
+        self.seeded = replace(points, data=seeded)
+        """The points with what they carry at the start: parameters that differ from place to place, state."""
+        self._at_points = [
+            LawAtPoints(grid, law, {name: self.shapes[name] for name in _takes(law)}) for law in self.laws
+        ]
+
+    def _add_shapes(self, m: Skeleton, seeded: dict[str, NDArray[np.float64]], count: int) -> None:
+        """Note the shapes of what a material's law takes, and seed the state of so many points."""
+        law = type(m)
+        if (law.energy is None) == (law.kirchhoff is None):
+            which = "neither" if law.energy is None else "both"
+            raise ValueError(f"{law.__name__}: has {which}, must define energy or kirchhoff")
+        given = (law.residual is not None) + (law.solution is not None)
+        if given != bool(law.unknowns):
+            has = f"{'' if law.unknowns else 'no '}unknowns and {given} of residual and solution"
+            raise ValueError(f"{law.__name__}: has {has}, must have unknowns and one of these, or neither")
+        own, others = (*_names(m), *law.state), {*_names(m), *law.state, *BY_SCENE, "F", "trial"}
+        if taken := [name for name in own if name in BY_SCENE] + [name for name in law.unknowns if name in others]:
+            raise ValueError(f"{law.__name__}: the name {taken[0]!r} is taken; {WHAT_IS_NAMED} must have another")
+        for name, value in law.unknowns.items():
+            _known(f"{law.__name__}: unknown {name!r}", value)
+        m.check_cells(mean_size(self.grid))
+        for name in law.parameters:
+            if not hasattr(m, name):
+                known = ", ".join([*_names(m), *law.state])
+                raise ValueError(f"{law.__name__}: its law takes {name!r}, must be F or some of {known}")
+            value = _known(f"{law.__name__}: {name}", getattr(m, name))
+            self._set_shape(law, name, value.shape[1:])
+        for name, value in law.state.items():
+            value = _known(f"{law.__name__}: state {name!r}", value)
+            self._set_shape(law, name, value.shape)
+            seeded[name] = np.tile(value, (count, *[1] * value.ndim))
+
+    def _set_shape(self, law, name: str, shape: tuple[int, ...]) -> None:
+        if name in RESERVED or hasattr(FormPoints(self.grid), name):
+            raise ValueError(f"{law.__name__}: the name {name!r} is taken; {WHAT_IS_NAMED} must have another")
+        other = self.shapes.setdefault(name, shape)
+        if other != shape:
+            raise ValueError(f"{law.__name__}: {name} has shape {shape}, in another law {other}; must agree")
+
+    def parts(self, pieces: FormPoints, common: Sequence[str]) -> list[tuple[type[Skeleton], FormPoints, bool]]:
+        """Return each law with points for the pieces that follow it, and whether Q1 cells would lock with these.
+
+        Materials of one law of which some lock and others do not are two parts; a single part's points are all
+        `pieces`, those of several have the fields `common` of the pieces and what their law takes.
+        """
+        if len(self._parts) == 1:
+            return [(law, pieces, locks) for law, locks in self._parts]
+        names = [dict.fromkeys([*common, *_takes(law)]) for law, _ in self._parts]
+        shapes = [{name: getattr(pieces, name).ufl_shape for name in taken} for taken in names]
+        points = [FormPoints(pieces.grid, **s) for s in shapes]
+        return [(law, own, locks) for (law, locks), own in zip(self._parts, points, strict=True)]
+
+    def part_of(self, points: MaterialPoints) -> NDArray[np.int64]:
+        """Return the number of each point's part (n,), see `parts`."""
+        return self._part[points.material]
+
+    def law_of(self, points: MaterialPoints) -> NDArray[np.int64]:
+        """Return the number of each point's law (n,)."""
+        return self._law[points.material]
+
+    def locking(self, points: MaterialPoints) -> NDArray[np.bool_]:
+        """Return at which points (n,) Q1 cells would lock."""
+        return np.array([locks for _, locks in self._parts])[self.part_of(points)]
+
+    def conducting(self, points: MaterialPoints) -> NDArray[np.float64]:
+        """Return what points (n, 2) that conduct alike have in common: conductivity, m/s, and number of their law.
+
+        By a law of the place none does.
+        """
+        laws, known = [m.conductivity_law for m in self.materials], self.conductivity_laws
+        law = np.array([known.index(law) if law in known else -1 for law in laws])[points.material]
+        by_place = np.array([law is not None and _names_place(law) for law in laws])[points.material]
+        conductivity = self.table(points, lambda m: m.conductivity)
+        return np.stack([conductivity, np.where(by_place, len(known) + points.id, law)], axis=1)
+
+    def table(self, points: MaterialPoints, value: Callable[..., float], *columns: NDArray) -> NDArray[np.float64]:
+        """Return value(material, *columns) at the points (n, ...); columns (n,) are values at the points.
+
+        Of a material whose constants are the same everywhere it is one value (...) without columns, else one a point; a
+        single number always stands for all.
+        """
+        each = []
+        for i in self._used:
+            rows = np.flatnonzero(points.material == i)
+            found = np.asarray(value(self._at(points, i, rows), *(column[rows] for column in columns)))
+            each.append((rows, found, found.shape[bool(columns or self._fields[i]) :]))
+        out = np.zeros((len(points), *np.broadcast_shapes(*(shape for *_, shape in each))))
+        for rows, found, _ in each:
+            out[rows] = found
+        return out
+
+    def changed(self, what: str, points: MaterialPoints, named: Collection[str]) -> MaterialPoints:
+        """Return points, some of whose data have been named anew, with what follows from the materials' fields.
+
+        Raises
+        ------
+        ValueError
+            Fields have values that they may not have.
+        """
+        data = dict(points.data)
+        for i in self._used:
+            rows, m = np.flatnonzero(points.material == i), self.materials[i]
+            follow = [k for k in self._fields[i] if getattr(getattr(m, k), "follows", False)]
+            own = [name for name in self._fields[i] if name in named or name not in follow]
+            try:
+                made = replace(m, **{name: data[name][rows] for name in own})
+            except ValueError as error:
+                raise ValueError(f"{what}: {error}") from error
+            for name in follow:
+                data[name] = data[name].copy()
+                data[name][rows] = getattr(made, name)
+        return replace(points, data=data)
+
+    def _at(self, points: MaterialPoints, i: int, rows: NDArray[np.int64]) -> Skeleton:
+        """Return a material whose constants are arrays over some of its points, unless they are numbers anyway."""
+        values = {name: points.data[name][rows] for name in self._fields[i]}
+        return _spread(self.materials[i], values, len(rows)) if values else self.materials[i]
+
+    def parameters(self, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
+        """Return all parameters at the points (n, ...), zero where a point's law does not know them."""
+        out = {name: np.zeros((len(points), *s)) for name, s in self.shapes.items() if name not in self.state_names}
+        for i in self._used:
+            rows = np.flatnonzero(points.material == i)
+            at = self._at(points, i, rows)
+            for name in self.materials[i].parameters:
+                out[name][rows] = getattr(at, name)
+        return out
+
+    @property
+    def constants(self) -> dict[str, Skeleton]:
+        """Names of the constants of materials, each with a material that has it."""
+        return {name: self.materials[i] for i in self._used for name in _names(self.materials[i])}
+
+    @property
+    def field_names(self) -> list[str]:
+        """Names of the constants of materials that differ from place to place."""
+        return list(dict.fromkeys(name for i in self._used for name in self._fields[i]))
+
+    @property
+    def evolves(self) -> bool:
+        """Whether a law has a state."""
+        return any(law.state for law in self.laws)
+
+    @property
+    def state_names(self) -> list[str]:
+        """Names of what evolves with a law."""
+        return list(dict.fromkeys(name for law in self.laws for name in law.state))
+
+    def porosity(self, points: MaterialPoints) -> NDArray[np.float64]:
+        """Return the porosity n = 1 - (1 - n_0) / J at the points (n,)."""
+        return 1 - (1 - self.table(points, lambda m: m.porosity)) / points.J
+
+    def storage(self, points: MaterialPoints) -> NDArray[np.float64]:
+        """Return the storage coefficient at the points (n,), 1/Pa, of a scene with fluid."""
+        return self.table(points, lambda m, n: m.storage(self.fluid.bulk, n), self.porosity(points))
+
+    def storage_at_one(self, points: MaterialPoints) -> NDArray[np.float64]:
+        """Return the storage coefficient that the points would have at a porosity of one (n,), 1/Pa."""
+        return self.table(points, lambda m: m.storage(self.fluid.bulk, 1.0))
+
+    @property
+    def drains(self) -> bool:
+        """Whether pores drain as a free surface falls."""
+        return any(getattr(law, "specific_yield", 0.0) > 0 for law in self.conductivity_laws)
+
+    def retention(self, points: MaterialPoints) -> NDArray[np.float64]:
+        """Return the specific yield at the points, and the suction, Pa, at which it has drained (n, 2)."""
+        names = {"specific_yield": 0.0, "suction": 1.0}
+        return np.stack(
+            [self.table(points, lambda m, k=k, v=v: getattr(m.conductivity_law, k, v)) for k, v in names.items()],
+            axis=1,
+        )
+
+    def density(self, points: MaterialPoints) -> NDArray[np.float64]:
+        """Return the density of soil and pore fluid at the points (n,), kg/m^3."""
+        n, wet = self.porosity(points), self.fluid.density if self.fluid else 0.0
+        return (1 - n) * self.table(points, lambda m: m.grain_density) + n * wet
+
+    def confined_modulus(self, points: MaterialPoints) -> NDArray[np.float64]:
+        """Return what resists where neither skeleton nor pore fluid can give way (n,), Pa: lambda + 2G + alpha^2 / S.
+
+        At most so many times lambda + 2G as `STIFFEST` says.
+        """
+        modulus = self.table(points, lambda m: m.oedometric)
+        if self.fluid is None:
+            return modulus
+        fluid = self.table(points, lambda m: m.biot) ** 2 / np.maximum(self.storage(points), 1e-300)
+        return modulus + np.minimum(fluid, STIFFEST * modulus)
+
+    def state(self, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
+        """Return the state at the points (n, ...)."""
+        return {name: points.data[name] for name in self.state_names}
+
+    def evolved(self, points: MaterialPoints) -> NDArray[np.bool_]:
+        """Return at which points (n,) the state of a law is no longer that at rest."""
+        out, law_of = np.zeros(len(points), dtype=bool), self.law_of(points)
+        for number, law in enumerate(self.laws):
+            rows = np.flatnonzero(law_of == number)
+            for name, at_rest in law.state.items():
+                rest = points.data[name + AT_REST][rows] if name + AT_REST in points.data else at_rest
+                off = np.abs(points.data[name][rows] - np.asarray(rest))
+                out[rows] |= off.max(axis=tuple(range(1, off.ndim)), initial=0.0) > EVOLVED
+        return out
+
+    @property
+    def dilates(self) -> bool:
+        """Whether the plastic flow of any soil may change its volume; the same on all processes."""
+        used = [self.materials[i] for i in self._used]
+        return any(m.dilates and (callable(m.dilation) or np.any(m.dilation)) for m in used)
+
+    def dilating(self, points: MaterialPoints) -> NDArray[np.bool_]:
+        """Return at which points (n,) soil has yielded whose plastic flow changes the volume."""
+        return self.evolved(points) & (self.table(points, lambda m: m.dilation if m.dilates else 0.0) > 0)
+
+    def effective_stress(self, points: MaterialPoints) -> NDArray[np.float64]:
+        """Return the effective Cauchy stress (n, d, d), Pa, at the points; on all processes together.
+
+        In axisymmetry (n, 3, 3).
+        """
+        out = np.zeros_like(points.F)
+        for law, rows, data in self._placed(points):
+            out[rows] = law.stress(data)
+        return out
+
+    def effective_stress_3d(self, points: MaterialPoints) -> NDArray[np.float64]:
+        """Return the effective Cauchy stress (n, 3, 3), Pa, also across the plane; on all processes together."""
+        out = np.zeros((len(points), 3, 3))
+        for law, rows, data in self._placed(points):
+            out[rows] = law.stress_3d(data)
+        return out
+
+    def total_stress(self, points: MaterialPoints) -> NDArray[np.float64]:
+        """Return the Cauchy stress of skeleton and fluid, Pa, as `effective_stress`; on all processes together."""
+        pressure = self.table(points, lambda m: m.biot) * points.pressure
+        return self.effective_stress(points) - pressure[:, None, None] * np.eye(self.grid.stretches)
+
+    def updated_state(
+        self, points: MaterialPoints, before: MaterialPoints, dt: float
+    ) -> dict[str, NDArray[np.float64]]:
+        """Return what the points, with the F of the end of a step of dt, s, carry from then on; before: at its start.
+
+        Raises
+        ------
+        NotConverged
+            The new state is not finite.
+        """
+        if all(law.update is None for law in self.laws) and not self._softness:
+            return points.data
+        placed = self._placed(points)
+        new = [(law.law, rows, name, v) for law, rows, at in placed for name, v in law.new_state(at, dt)]
+        bad = [(law, name, rows[~_finite(values)]) for law, rows, name, values in new]
+        shown = [f"{law.__name__}.update: {name!r} is not finite at {points.x[i[0]]}" for law, name, i in bad if len(i)]
+        if message := first(self.grid.comm, "".join(shown[:1])):
+            raise NotConverged(message)
+        out = {name: values.copy() if name in self.state_names else values for name, values in points.data.items()}
+        for _, rows, name, values in new:
+            out[name][rows] = values
+        if self._softness:
+            out["softness"], dF = np.ones(len(points)), points.F - before.F
+            shear = self.table(points, lambda m: m.shear)
+            for number, softness in self._softness.items():
+                _, rows, at = placed[number]
+                out["softness"][rows] = softness(at, dF[rows], shear[rows], dt)
+        return out
+
+    def _placed(self, points: MaterialPoints) -> list[tuple[LawAtPoints, NDArray[np.int64], PointData]]:
+        """Return every law with the indices and the data of the points that follow it."""
+        number, values = self.law_of(points), {"F": points.F, **self.parameters(points), **self.state(points)}
+        rows = [np.flatnonzero(number == k) for k in range(len(self.laws))]
+        return [(law, own, law.data(points, own, values)) for law, own in zip(self._at_points, rows, strict=True)]
+
+
+def _known(name: str, value) -> NDArray[np.float64]:
+    """Return what a law takes as an array; it may be infinite, but not nan."""
+    out = numbers(name, value, None, allowed="numbers", test=np.isreal)
+    if np.isnan(out).any():
+        raise ValueError(f"{name} = nan, must be numbers")
+    return out
+
+
+def _names_place(law: Callable) -> bool:
+    return "x" in signature(law).parameters
+
+
+def _finite(values: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which rows (n,) of values (n, ...) are finite."""
+    return np.isfinite(values).all(axis=tuple(range(1, np.ndim(values))))
+
+
+def _takes(law: type[Skeleton]) -> list[str]:
+    """Return the names of the parameters and of the state that a law takes."""
+    return [*law.parameters, *law.state]
+
+
+def _used(bodies: Sequence[Body], count: int) -> list[int]:
+    """Return the indices of the materials, of so many, that bodies are of, ascending."""
+    for body in bodies:
+        if not 0 <= body.material < count:
+            raise ValueError(f"body: material = {body.material!r}, must be an index of the {count} materials")
+    return sorted({int(body.material) for body in bodies})
+
+
+def _places(bodies: Sequence[Body], material: int) -> NDArray[np.float64]:
+    """Return the reference positions (n, d), m, of all points of a material on all processes."""
+    return np.concatenate([body.centre for body in bodies if body.material == material])
+
+
+def _rows(bodies: Sequence[Body], material: int, ids: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return which of some points are of a material (m,), and their rows among all that are, see `_places`."""
+    here, rows, start, before = [], [], 0, 0
+    for body in bodies:
+        if body.material == material:
+            of_body = np.flatnonzero((ids >= start) & (ids < start + len(body)))
+            here.append(of_body)
+            rows.append(ids[of_body] - start + before)
+            before += len(body)
+        start += len(body)
+    return np.concatenate(here), np.concatenate(rows)
+
+
+def _names(m: Skeleton) -> list[str]:
+    """Return the names of a material's fields."""
+    return [f.name for f in fields(m) if f.name != "conductivity_law"]
+
+
+def _spread(m: Skeleton, values: dict[str, NDArray[np.float64]], n: int) -> Skeleton:
+    """Return a copy of a material with values (n, ...) of some fields, its other numbers repeated n times."""
+    out = copy(m)
+    for name in _names(m):
+        value = getattr(m, name)
+        if name in values:
+            value = values[name]
+        elif not (callable(value) or isinstance(value, str) or value is None):
+            value = np.broadcast_to(np.asarray(value, dtype=float), (n, *np.shape(value)))
+        vars(out)[name] = value  # the values have been checked
+    return out

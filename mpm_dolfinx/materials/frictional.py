@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: MIT
+"""What the laws of frictional soil have in common: angles of friction and dilation, cohesion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from mpm_dolfinx.materials.skeleton import Field, Skeleton, _check, check_given
+
+GIVEN = {
+    "friction": "in [0, 90) degrees",
+    "dilation": "in [0, friction] degrees; 0 for flow without a change of volume, friction for associated flow",
+    "cohesion": ">= 0 Pa",
+}
+"""Constants that must be given, and what they may be."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Frictional(Skeleton):
+    """Elastic, perfectly plastic or hardening soil with friction; laws derive from it.
+
+    Parameters
+    ----------
+    friction, dilation
+        Angles phi and psi, degrees, in [0, 90) and [0, friction].
+    cohesion
+        Cohesion, Pa, >= 0.
+
+    Raises
+    ------
+    ValueError
+        Naming the constant that is out of its range, or is not given.
+    """
+
+    dilates: ClassVar = True
+
+    friction: Field = None  # given always: without it a message says what it may be
+    dilation: Field = None
+    cohesion: Field = None
+
+    def __post_init__(self):
+        super().__post_init__()
+        check_given(self, GIVEN)
+        _check(self, "friction", lambda v: (0 <= v) & (v < 90), "in [0, 90) degrees")
+        _check(self, "cohesion", lambda v: 0 <= v, ">= 0")
+        if not callable(self.friction):
+            _check(self, "dilation", lambda v: (0 <= v) & (v <= self.friction), "in [0, friction] degrees")
+
+    @property
+    def symmetric(self) -> bool:
+        return self.dilation == self.friction
+
+    @property
+    def nearly_incompressible(self) -> bool:
+        return True  # plastic flow is

@@ -1,0 +1,379 @@
+# SPDX-License-Identifier: MIT
+"""Effective stresses of soil as seeded, given or by the weight above, and the elastic strains that go with them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+from mpi4py import MPI
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mpm_dolfinx.base.errors import NotConverged
+from mpm_dolfinx.base.validation import asked, line, numbers
+from mpm_dolfinx.bodies.bodies import Body
+from mpm_dolfinx.bodies.overburden import overburden
+from mpm_dolfinx.materials.cam_clay import ModifiedCamClay
+from mpm_dolfinx.materials.fields import SceneMaterials
+from mpm_dolfinx.materials.prestressed import AT_REST
+from mpm_dolfinx.materials.skeleton import STANDARD_GRAVITY, Field
+from mpm_dolfinx.materials.trial import PLANE, SPACE
+from mpm_dolfinx.parallel.exchange import first, over_all
+from mpm_dolfinx.points.material_points import MaterialPoints
+
+EXACT, CLOSE = 1e-13, 1e-8  # of the largest given stress: to which laws are solved, and have to be
+MOST = 30  # iterations
+DIFFERENCE = 1e-7  # of strains, for derivatives
+LARGEST = 0.2  # change of a strain in an iteration
+
+
+@dataclass(frozen=True, eq=False)
+class K0:
+    """Initial effective stress of soil at rest under its own weight.
+
+    The vertical one is the weight above, soil and fluid, and the surcharge, less biot times the pore pressure; the
+    horizontal ones, in axisymmetry along radius and hoops, are K0 times that.  Exact where ground and layers are
+    level; elsewhere a start for the balance.
+
+    Parameters
+    ----------
+    ratio
+        K0, >= 0: a number, or a function of the reference positions X (n, d), m.
+    surcharge : number or callable x (n, d) -> (n,), Pa
+        What acts on the surface, >= 0, at places x on it, as for still water above it.
+    """
+
+    ratio: Field
+    surcharge: float | Callable[[NDArray[np.float64]], ArrayLike] = 0.0
+
+    def __post_init__(self):
+        for name in ("ratio", "surcharge"):
+            if not callable(getattr(self, name)):
+                self._checked(name, getattr(self, name))
+
+    def _checked(self, name: str, value, *shapes) -> NDArray[np.float64]:
+        test = {"test": lambda v: (0 <= v) & (v < np.inf), "allowed": ">= 0 and finite, one value or one a place"}
+        return numbers(f"K0: {name}", value, (), *shapes, **test)
+
+    def values(self, name: str, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return ratio or surcharge at places (n, d), m: one or (n,)."""
+        value = getattr(self, name)
+        given = asked(f"K0: {name}", "one value a place", value, x) if callable(value) else value
+        return self._checked(name, given, (len(x),))
+
+
+InitialStress = K0 | Callable[[NDArray[np.float64]], ArrayLike]
+
+
+def hydrostatic(level: float, unit_weight: float | None = None) -> Callable[[NDArray], NDArray]:
+    """Return the pore pressure at rest of a phreatic level, as the scene's `pressure`: a function of places x (n, d).
+
+    Pores are full above it too, and hold their water by suction: the pressure there is negative.
+
+    Parameters
+    ----------
+    level
+        Height, m, along the last axis.
+    unit_weight
+        Of the fluid, N/m^3, > 0; by default that of the scene's fluid, outside of a scene 9810.  A warning says where
+        it differs from the fluid's.
+    """
+    numbers("hydrostatic: level", level)
+    if unit_weight is not None:
+        allowed = {"test": lambda v: (0 < v) & (v < np.inf), "allowed": "> 0 and finite"}
+        numbers("hydrostatic: unit_weight", unit_weight, **allowed)
+    weight = 1000 * STANDARD_GRAVITY if unit_weight is None else unit_weight
+
+    def pressure(x: NDArray[np.float64]) -> NDArray[np.float64]:
+        return weight * (level - x[:, -1])
+
+    pressure.unit_weight = weight
+    if unit_weight is None:
+        pressure.weighed = partial(hydrostatic, level)
+    return pressure
+
+
+def by_body(given, bodies: Sequence[Body], later: Sequence[int]) -> dict[int, InitialStress]:
+    """Return the initial stress of each body that has one; one for all is that of the bodies that are there."""
+    allowed = "a K0, a function of x, or one of these for each of some bodies, {index: ...}"
+    if given is None:
+        return {}
+    if not isinstance(given, Mapping):
+        given = {i: given for i in range(len(bodies)) if i not in later}
+    for body, value in given.items():
+        if body not in range(len(bodies)) or not (isinstance(value, K0) or callable(value)):
+            raise ValueError(f"initial_stress: {line({body: value})}, must be {allowed}")
+    return {int(body): value for body, value in given.items()}
+
+
+class InitialStresses:
+    """The stresses that bodies of a scene have as seeded.
+
+    Parameters
+    ----------
+    bodies
+        All bodies.
+    given
+        See `by_body`.
+    pressure
+        Pore pressure as seeded, Pa, a number or a function of places.
+    """
+
+    def __init__(self, bodies: Sequence[Body], given: Mapping[int, InitialStress], pressure: float | Callable):
+        self._bodies, self.given, self.pressure = bodies, given, pressure
+        self._start = np.cumsum([0, *(len(body) for body in bodies)])
+
+    def of(self, materials: SceneMaterials, points: MaterialPoints, present: Sequence[bool], gravity) -> MaterialPoints:
+        """Return points whose elastic strain is that of the stress given; on all processes together.
+
+        Parameters
+        ----------
+        present
+            Which bodies lie on one another, as seeded.
+        gravity : (d,), m/s^2
+            None without.
+        """
+        if not self.given:
+            return points
+        target, rows, refused = np.zeros((len(points), 3, 3)), np.zeros(len(points), dtype=bool), ""
+        above = self._above(materials, points, present, gravity)
+        try:
+            for body, stress in self.given.items():
+                own = (points.id >= self._start[body]) & (points.id < self._start[body + 1])
+                if own.any():
+                    target[own] = self._at(stress, body, points.map(lambda v, own=own: v[own]), [a[own] for a in above])
+                rows |= own
+        except ValueError as error:
+            refused = str(error)
+        if refused := first(materials.grid.comm, refused):
+            raise ValueError(refused)
+        return stressed(materials, points, rows, target)
+
+    def _at(self, stress: InitialStress, body: int, points: MaterialPoints, above: list[NDArray]) -> NDArray:
+        """Return the effective stress (n, 3, 3), Pa, of some points of a body."""
+        n, d = points.x.shape
+        if not isinstance(stress, K0):
+            name = f"initial_stress of body {body}: {line(stress)}"
+            allowed = f"three normal stresses or a symmetric tensor (3, 3), finite, for each of {n} places"
+            value = numbers(name, asked(name, allowed, stress, points.x), (n, 3), (n, 3, 3), allowed=allowed)
+            value = value if value.ndim == 3 else value[:, :, None] * np.eye(3)
+            wrong = np.abs(value - value.swapaxes(1, 2)).max(axis=(1, 2)) > 1e-9 * np.abs(value).max(initial=0)
+            if d == 2:
+                wrong |= (value[:, :2, 2] != 0).any(axis=1)
+            if wrong.any():
+                raise ValueError(f"{name} = {value[wrong][0].tolist()}, must be {allowed}, without shear out of plane")
+            return value
+        weight, surface, pore = above
+        on = np.concatenate([points.x[:, :-1], surface[:, None]], axis=1)
+        X = self._bodies[body].centre_of(points.id - self._start[body])
+        vertical = -(weight + stress.values("surcharge", on) - pore)
+        horizontal = stress.values("ratio", X) * vertical
+        normal = np.stack([horizontal] * 3, axis=1)
+        normal[:, d - 1] = vertical
+        return normal[:, :, None] * np.eye(3)
+
+    def _above(self, materials: SceneMaterials, points: MaterialPoints, present, gravity) -> list[NDArray]:
+        """Return weight above, Pa, height of the surface, m, and biot times pressure, Pa, of points, where asked."""
+        if not any(isinstance(stress, K0) for stress in self.given.values()):
+            return [points.pressure] * 3
+        if gravity is None or np.any(gravity[:-1]) or not gravity[-1] <= 0:
+            g = None if gravity is None else np.asarray(gravity).tolist()
+            raise ValueError(f"initial_stress: K0 with gravity = {g}, must be down along the last axis at the start")
+        surcharges = [stress.surcharge for stress in self.given.values() if isinstance(stress, K0)]
+        if not np.any(gravity) and not any(callable(surcharge) or surcharge for surcharge in surcharges):
+            raise ValueError("initial_stress: K0 without gravity at the start, nor a surcharge: must have one of these")
+        # the densities of all points on all processes
+        seeded, total = materials.seeded, np.zeros(self._start[-1])
+        total[seeded.id] = materials.density(seeded)
+        total = over_all(materials.grid.comm, total)
+        here = np.repeat(present, [len(body) for body in self._bodies])
+        corners = np.concatenate([body.corners() for body, there in zip(self._bodies, present, strict=True) if there])
+        weight, surface = overburden(corners, -gravity[-1] * total[here], points.x)
+        return [weight, surface, materials.table(points, lambda m: m.biot) * points.pressure]
+
+
+def stressed(
+    materials: SceneMaterials, points: MaterialPoints, chosen: NDArray[np.bool_], target: NDArray[np.float64]
+) -> MaterialPoints:
+    """Return points of which the chosen ones (n,) have target stresses (n, 3, 3), Pa; on all processes together.
+
+    Modified Cam Clay has the stress among its constants; other laws have elastic strains with it, see `_Sought`.
+
+    Raises
+    ------
+    ValueError
+        Naming the first place where a law cannot bear its stress.
+    """
+    comm, rows, law = materials.grid.comm, np.flatnonzero(chosen), materials.law_of(points)
+    part, target = points.map(lambda values: values[rows]), target[rows]
+    given = np.isin(law[rows], [k for k, one in enumerate(materials.laws) if issubclass(one, ModifiedCamClay)])
+    if message := first(comm, _no_constants(part, target, given)):
+        raise ValueError(message)
+    if given.any():
+        normal, kappa = np.diagonal(target, axis1=1, axis2=2), materials.table(part, _kappa)
+        part = _with(part, given, initial_stress=normal, bulk=-normal.mean(axis=1) / kappa)
+    plastic = np.isin(law[rows], [k for k, one in enumerate(materials.laws) if "plastic" in one.state])
+    now, stress, bad = _Sought(materials, part, target, given, plastic).found()
+    message = "".join(_not_borne(materials, part, target, law[rows], i) for i in np.flatnonzero(bad)[:1])
+    if message := first(comm, message):
+        raise ValueError(message)
+    if "across" in points.data:
+        own = np.nan_to_num(target[:, 2, 2] - stress[:, 2, 2]) if materials.grid.stretches == 2 else 0.0
+        now = _with(now, ~plastic & ~given, across=own)
+    if "plastic" in points.data:
+        now = _with(now, plastic, **{"plastic" + AT_REST: now.data["plastic"]})
+    data = {name: values.copy() for name, values in points.data.items()}
+    for name, values in now.data.items():
+        data[name][rows] = values
+    return replace(points, data=data)
+
+
+@dataclass(frozen=True, eq=False)
+class _Sought:
+    """Elastic strains that give target stresses, by Newton's method.
+
+    They are symmetric: of `seeded_stretch`, in plane strain without that across the plane, whose stress the law is
+    given, or of C_p^-1.  points: n of them; target : (n, 3, 3), Pa; given, plastic : (n,) which have the stress among
+    their constants, and which have C_p^-1.
+    """
+
+    materials: SceneMaterials
+    points: MaterialPoints
+    target: NDArray[np.float64]
+    given: NDArray[np.bool_]
+    plastic: NDArray[np.bool_]
+
+    @property
+    def components(self) -> tuple[tuple[int, int], ...]:
+        """The k components of a symmetric tensor."""
+        return PLANE if self.points.x.shape[1] == 2 else SPACE
+
+    @property
+    def free(self) -> NDArray[np.bool_]:
+        """Which components (n, k) are sought."""
+        out = np.repeat(~self.given[:, None], len(self.components), axis=1)
+        if self.materials.grid.stretches == 2:
+            out[:, 2] &= self.plastic  # across the plane
+        return out
+
+    def of(self, tensor: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the components (n, k) of tensors (n, 3, 3) that are sought, the others zero."""
+        i, j = np.array(self.components).T
+        return np.where(self.free, tensor[:, i, j], 0.0)
+
+    def moduli(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return bulk and shear moduli (n,), Pa."""
+        bulk, shear = (lambda m, name=name: getattr(m, name) for name in ("bulk", "shear"))
+        return self.materials.table(self.points, bulk), self.materials.table(self.points, shear)
+
+    def linear(self) -> NDArray[np.float64]:
+        """Return the strains (n, k) of a linear law."""
+        (bulk, shear), target, identity = self.moduli(), self.target, np.eye(3)
+        mean = np.trace(target, axis1=1, axis2=2) / 3
+        elastic = (target - mean[:, None, None] * identity) / (2 * shear)[:, None, None]
+        elastic += (mean / (3 * bulk))[:, None, None] * identity
+        if self.materials.grid.stretches == 2:  # laws without a strain across the plane
+            plane, lam = np.trace(target[:, :2, :2], axis1=1, axis2=2), bulk - 2 * shear / 3
+            even = (lam * plane / (4 * shear * (lam + shear)))[:, None, None] * identity
+            alone = target / (2 * shear)[:, None, None] - even
+            elastic = np.where(self.plastic[:, None, None], elastic, alone)
+        return self.of(elastic)
+
+    def off(self, strain: NDArray[np.float64]) -> tuple[MaterialPoints, NDArray[np.float64], NDArray[np.float64]]:
+        """Return points with elastic strains (n, k), their stresses, Pa, and what is missing of the target (n, k)."""
+        tensor = np.zeros((len(strain), 3, 3))
+        for value, (i, j) in zip(strain.T, self.components, strict=True):
+            tensor[:, i, j] = tensor[:, j, i] = value
+        logs, turn = np.linalg.eigh(tensor)
+        elastic = (turn * np.exp(2 * logs)[:, None]) @ turn.swapaxes(1, 2)
+        now = _with(self.points, self.plastic & ~self.given, plastic=elastic)
+        d, stretch = self.materials.grid.stretches, (turn * np.exp(logs)[:, None]) @ turn.swapaxes(1, 2)
+        now = _with(now, ~self.plastic & ~self.given, seeded_stretch=stretch[:, :d, :d])
+        stress = self.materials.effective_stress_3d(now)
+        return now, stress, self.of(stress - self.target)
+
+    def step(self, strain: NDArray[np.float64], missing: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the strains (n, k) after a step from those with which so much is missing, by differences."""
+        count, free, (_, shear) = strain.shape[1], self.free, self.moduli()
+        slopes = np.tile(np.eye(count) * (2 * shear)[:, None, None], (1, 1, 1))
+        for k in range(count):
+            change = (self.off(strain + DIFFERENCE * np.eye(count)[k])[2] - missing) / DIFFERENCE
+            slopes[:, :, k] = np.where(free & free[:, [k]], change, slopes[:, :, k])
+        slopes, missing = (np.nan_to_num(values) for values in (slopes, missing))
+        singular = ~(np.abs(np.linalg.det(slopes / shear[:, None, None])) > 1e-12)
+        slopes[singular] = np.eye(count) * (2 * shear[singular])[:, None, None]
+        change = np.linalg.solve(slopes, missing[:, :, None])[:, :, 0].clip(-LARGEST, LARGEST)
+        return np.clip(strain - change, -1, 1)
+
+    def found(self) -> tuple[MaterialPoints, NDArray[np.float64], NDArray[np.bool_]]:
+        """Return points with the strains, their stresses, Pa, and which (n,) do not have the target."""
+        comm, strain = self.materials.grid.comm, self.linear()
+        largest = over_all(comm, float(np.abs(self.target).max(initial=0.0)), MPI.MAX)
+        now, stress, bad = self.points, self.target, np.ones(len(strain), dtype=bool)
+        try:
+            for _ in range(MOST):
+                now, stress, missing = self.off(strain)
+                bad = ~(np.abs(missing).max(axis=1, initial=0.0) <= CLOSE * largest)
+                most = float(np.nan_to_num(np.abs(missing), nan=np.inf).max(initial=0.0))
+                if not over_all(comm, most, MPI.MAX) > EXACT * largest:
+                    break
+                strain = self.step(strain, missing)
+        except NotConverged:
+            bad = np.ones(len(strain), dtype=bool)
+        return now, stress, bad
+
+
+def strained(materials: SceneMaterials, points: MaterialPoints, moved: MaterialPoints) -> MaterialPoints:
+    """Return points with the elastic strains of others, to which these have been deformed from where they are."""
+    F, d, law = moved.F, moved.F.shape[1], materials.law_of(points)
+    own = {name: points.data[name] for name in ("softness", "owed", "due") if name in points.data}
+    data = {**moved.data, **own}
+    out = replace(points, data=data)
+    if "seeded_stretch" in data:
+        out = _with(out, np.ones(len(F), dtype=bool), seeded_stretch=F @ data["seeded_stretch"])
+    if "plastic" in data:
+        stretch = materials.table(points, _prestretch)
+        whole = np.tile(np.eye(3), (len(F), 1, 1))
+        whole[:, :d, :d] = F
+        whole = whole * (stretch[:, None, :] / stretch[:, :, None])  # D^-1 F D
+        own = np.isin(law, [k for k, one in enumerate(materials.laws) if "plastic" in one.state])
+        elastic = whole @ data["plastic"] @ whole.swapaxes(1, 2)
+        out = _with(out, own, plastic=elastic, **{"plastic" + AT_REST: elastic})
+    return out
+
+
+def _with(points: MaterialPoints, chosen: NDArray[np.bool_], **values: NDArray) -> MaterialPoints:
+    """Return points of which the chosen ones (n,) carry other values (n, ...), if they carry any of this name."""
+    data = dict(points.data)
+    for name, new in values.items():
+        if name in data and chosen.any():
+            data[name] = data[name].copy()
+            data[name][chosen] = np.broadcast_to(new, data[name].shape)[chosen]
+    return replace(points, data=data)
+
+
+def _kappa(m) -> NDArray[np.float64]:
+    return m.kappa if isinstance(m, ModifiedCamClay) else np.ones(np.shape(m.bulk))
+
+
+def _prestretch(m) -> NDArray[np.float64]:
+    return m.prestretch if isinstance(m, ModifiedCamClay) else np.ones((*np.shape(m.bulk), 3))
+
+
+def _no_constants(points: MaterialPoints, target: NDArray[np.float64], given: NDArray[np.bool_]) -> str:
+    """Return what is wrong with stresses (n, 3, 3) as constants of Modified Cam Clay."""
+    shear = np.abs(target - np.diagonal(target, axis1=1, axis2=2)[:, :, None] * np.eye(3)).max(axis=(1, 2), initial=0.0)
+    bad = given & ((shear > 0) | ~(np.trace(target, axis1=1, axis2=2) < 0))
+    what = "must be without shear, of compressive mean, for ModifiedCamClay"
+    return "".join(f"initial_stress at {points.x[i]}: {target[i].tolist()} Pa, {what}" for i in np.flatnonzero(bad)[:1])
+
+
+def _not_borne(materials: SceneMaterials, points: MaterialPoints, target: NDArray, law: NDArray, i: int) -> str:
+    name = materials.laws[law[i]].__name__
+    allowed = f"what {name} can bear: inside its yield surface"
+    tension = np.trace(target[i]) > 0  # pores press by more than the weight above
+    more = "; of open water above it K0 takes the weight as surcharge" if tension and points.pressure[i] > 0 else ""
+    return f"initial_stress at {points.x[i]}: {target[i].tolist()} Pa, must be {allowed}{more}"

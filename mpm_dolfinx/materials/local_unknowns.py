@@ -1,0 +1,397 @@
+# SPDX-License-Identifier: MIT
+"""Local unknowns: what a law's stress depends on beside F, and what equations at each point determine.
+
+A law names unknowns y, trial values z(F) and residuals f(y, z); f = 0 is solved by Newton's method at all points at
+once, to round-off.  The forms see
+
+    y = y* + Y (z(F) - z*),     Y = -(df/dy)^-1 df/dz  at the solution (y*, z*),
+
+whose value is y* and whose derivative by F is that of the solution: UFL's derivative of a stress that is a function of
+y and F is the consistent tangent, and no iteration is unrolled.  y*, z* and Y are coefficients at the points.  Where a
+stress is evaluated and not differentiated it is that of y*, and there is no Y.  The stress of a law with an energy is
+itself a derivative: there y has a term of second order, whose coefficients follow from f = 0 once more.  A law may also
+give y(z) and its derivative in numpy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from itertools import combinations_with_replacement, product
+from typing import NamedTuple
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from numpy.typing import NDArray
+
+from mpm_dolfinx.base.caching import Latest
+from mpm_dolfinx.base.errors import NotConverged
+from mpm_dolfinx.base.validation import asked, instance, line
+from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointExpression
+from mpm_dolfinx.materials.skeleton import BY_SCENE, Skeleton
+from mpm_dolfinx.materials.user_functions import call, named
+from mpm_dolfinx.parallel.exchange import first
+
+MOST, HALVINGS = 60, 25  # iterations, and halvings of their steps in all
+CLOSE = 1e-9  # a Newton step below this, relative to unknowns of order one, leaves round-off
+ROUND_OFF = 1e-15  # of residuals of order one
+
+
+class Solved(NamedTuple):
+    """Solution at some points: key of their data; unknowns (n, m), trial values (n, k); what gives the derivatives."""
+
+    key: object
+    unknowns: NDArray[np.float64]
+    trial: NDArray[np.float64]
+    derive: Callable[[], Derived]
+
+
+class Derived(NamedTuple):
+    """Derivatives by the trial values: slopes Y (n, m k), and of an energy's unknowns bends (n, m k k)."""
+
+    slopes: NDArray[np.float64]
+    bends: NDArray[np.float64] | None = None
+
+
+class LocalUnknowns:
+    """The local unknowns of a law at some points, as coefficients of forms.
+
+    Parameters
+    ----------
+    law
+        Class of the law.
+    points
+        The points, which carry what the law takes.
+    F
+        Deformation gradient (d, d) that the law sees, as UFL.
+    values
+        UFL values of the law's parameters and state, and the constants that the scene gives to laws.
+
+    Attributes
+    ----------
+    values
+        The unknowns by name, as UFL that depends on F, and `trial`.
+    known
+        The same for what is not differentiated by F: kernels do not compute trial values there.  Stresses that are
+        derivatives of an energy are.
+    """
+
+    def __init__(self, law: type[Skeleton], points: FormPoints, F, values: Mapping[str, object]):
+        self._law, self._comm = law, points.grid.comm
+        trial = call(law.trial, F=F, **values) if law.trial is not None else {"F": F}
+        instance(f"{law.__name__}.trial: what it gives", trial, dict)
+        given = {"trial": trial}
+        trial = {name: value for name, value in trial.items() if isinstance(value, ufl.core.expr.Expr)}
+        if not trial:
+            raise ValueError(f"{law.__name__}.trial: gives {line(given['trial'])}, must have some UFL of F")
+        z = _parts(trial.values())
+        self._trial, self._dt = PointExpression(ufl.as_vector(z), points), values["dt"]
+        self._solved: Latest[Solved] = Latest()
+        self._derived: Latest[tuple[Solved, Derived]] = Latest()
+        self._of_energy = law.kirchhoff is None
+        bends = self._of_energy and law.residual is not None
+        self._equations = _Equations(law, points, trial, {name: values[name] for name in BY_SCENE}, bends)
+        m, k = self._equations.count, len(z)
+        shapes = {"unknowns": (m,), "trial": (k,), "slopes": (m, k)} | ({"bends": (m, k * k)} if bends else {})
+        at = {
+            what: points.follow(f"local {what}", s, lambda data, w=what: self._now(data, w))
+            for what, s in shapes.items()
+        }
+        # component by component: in 3D products of tensors take ten times as long to compile
+        off = [z[j] - at["trial"][j] for j in range(k)]
+        y = [at["unknowns"][i] + sum(at["slopes"][i, j] * off[j] for j in range(k)) for i in range(m)]
+        if bends:  # in the tangent is the second derivative of the unknowns by F
+            for i, (j, l) in product(range(m), combinations_with_replacement(range(k), 2)):
+                y[i] += at["bends"][i, k * j + l] * off[j] * off[l] / (2 if j == l else 1)
+        shapes = {name: np.shape(start) for name, start in law.unknowns.items()}
+        self.values = given | _named(shapes, y)
+        self.known = self.values if self._of_energy else given | _named(shapes, at["unknowns"])
+
+    def update(self, data: PointData, derive: bool = True) -> None:
+        """Solve for the unknowns of points at their present F, and derive them; all processes together.
+
+        derive: whether what is evaluated next depends on `values`, not on `known` alone.
+
+        Raises
+        ------
+        NotConverged
+            Naming the first point where the equations could not be solved.
+        """
+        trial = self._trial.evaluate(data)
+        self._solved((data.key, trial, float(self._dt.value)), lambda: self._equations.solve(data, trial), self._comm)
+        if derive or self._of_energy:
+            self.derive(data)
+
+    def derive(self, data: PointData) -> None:
+        """Derive the unknowns of points where they were solved last by F; all processes together."""
+        solved = self._at(data)
+        self._derived(solved.derive, lambda: (solved, solved.derive()), self._comm)
+
+    def _at(self, data: PointData) -> Solved:
+        solved = self._solved.value
+        if solved is None or solved.key is not data.key:
+            raise RuntimeError(f"{self._law.__name__}: local unknowns are asked for before they are solved")
+        return solved
+
+    def _now(self, data: PointData, what: str) -> NDArray[np.float64]:
+        solved = self._at(data)
+        if what not in Derived._fields:
+            return getattr(solved, what)
+        of, derived = self._derived.value or (None, None)
+        if of is not solved:
+            raise RuntimeError(f"{self._law.__name__}: local unknowns are asked for before they are derived")
+        return getattr(derived, what)
+
+
+class _Equations:
+    """The equations f(y, z) = 0 of a law at points that carry what they take."""
+
+    def __init__(
+        self,
+        law: type[Skeleton],
+        points: FormPoints,
+        trial: Mapping[str, object],
+        by_scene: Mapping[str, fem.Constant],
+        bends: bool,
+    ):
+        self._law, self._grid, self._by_scene = law, points.grid, by_scene
+        equations = law.residual or law.solution
+        self._names = [name for name in (*law.parameters, *law.state) if name in law.taken_by(equations)]
+        self._points = own = FormPoints(points.grid, **{name: getattr(points, name).ufl_shape for name in self._names})
+        starts = {name: np.asarray(start, dtype=float) for name, start in law.unknowns.items()}
+        self._start = np.concatenate([start.ravel() for start in starts.values()])
+        self.count = m = len(self._start)
+        self._unknowns = {name: start.shape for name, start in starts.items()}
+        self._trial = {name: value.ufl_shape for name, value in trial.items()}
+        if law.residual is None:
+            return
+        k = sum(_size(s) for s in self._trial.values())
+        y, z = (ufl.variable(own.follow(name, (size,), _given)) for name, size in (("unknowns", m), ("trial", k)))
+        given = {name: getattr(own, name) for name in self._names} | _named(self._unknowns, y) | self._by_scene
+        residual = call(law.residual, **self._with_trial(_named(self._trial, z)), **given)
+        found = named(f"{law.__name__}.residual", residual, self._unknowns)
+        f = ufl.as_vector(_parts(found[name] for name in self._unknowns))
+        by_y, by_z = ufl.diff(f, y), ufl.diff(f, z)
+        steps = [by_y[i, j] for i in range(m) for j in range(m)]
+        self._newton = PointExpression(ufl.as_vector([*(f[i] for i in range(m)), *steps]), own)
+        self._slopes = PointExpression(ufl.as_vector([*steps, *(by_z[i, j] for i in range(m) for j in range(k))]), own)
+        self._bends = None
+        if bends:  # the second derivative of f along y = y* + Y (z - z*)
+            Y = own.follow("slopes", (m, k), _given)
+            along = ufl.as_matrix([[_along(by_y, by_z, Y, m, (i,), j) for j in range(k)] for i in range(m)])
+            by_y, by_z = ufl.diff(along, y), ufl.diff(along, z)
+            each = product(range(m), range(k), range(k))
+            self._bends = PointExpression(ufl.as_vector([_along(by_y, by_z, Y, m, (i, j), l) for i, j, l in each]), own)
+
+    def _with_trial(self, values: dict) -> dict:
+        """Return trial values as the law's equations name them."""
+        return {"trial": values} if self._law.trial is not None else values
+
+    def solve(self, data: PointData, trial: NDArray[np.float64]) -> Solved:
+        """Return the solution at points with trial values (n, k); all processes together."""
+        if self._law.residual is None:
+            return self._in_numpy(data, trial)
+        m, n = self.count, len(trial)
+        at = PointData(self._points, data.places, data.volume, {name: data[name] for name in self._names})
+        y = np.tile(self._start, (n, 1))
+
+        def system(rows: NDArray[np.int64], values: NDArray[np.float64]):
+            y[rows] = values
+            out = self._newton.evaluate(at, None if len(rows) == n else rows, {"unknowns": y, "trial": trial})
+            f, norm = out[:, :m], np.abs(out[:, :m]).max(axis=1)
+            return f, out[:, m:].reshape(-1, m, m), np.where(norm < np.inf, norm, np.inf)
+
+        failed = _newton(system, y)
+        self._refuse(data, failed, ": local equations have no solution")
+
+        def derive() -> Derived:
+            given = {"unknowns": y, "trial": trial}
+            out, k = self._slopes.evaluate(at, None, given), trial.shape[1]
+            by_y, by_z = out[:, : m * m].reshape(-1, m, m), out[:, m * m :].reshape(n, m, k)
+            slopes = -_solve(by_y, by_z)
+            lost = np.flatnonzero(~np.isfinite(slopes).all(axis=(1, 2)))
+            self._refuse(data, lost, ".residual: does not determine the unknowns")
+            if self._bends is None:
+                return Derived(slopes.reshape(n, m * k))
+            second = self._bends.evaluate(at, None, given | {"slopes": slopes.reshape(n, m * k)})
+            bends = -_solve(by_y, second.reshape(n, m, k * k))
+            return Derived(slopes.reshape(n, m * k), bends.reshape(n, m * k * k))
+
+        return Solved(data.key, y, trial, derive)
+
+    def _refuse(self, data: PointData, lost: NDArray[np.int64], why: str) -> None:
+        """Raise NotConverged, naming the first point that is lost on any process; all of them together."""
+        shown = [f"{self._law.__name__}{why} at {data.x[i]}" for i in lost[:1]]
+        if message := first(self._grid.comm, "".join(shown)):
+            raise NotConverged(message)
+
+    def _in_numpy(self, data: PointData, trial: NDArray[np.float64]) -> Solved:
+        """Return the solution of a law that gives it in numpy."""
+        n, k, values, start = *trial.shape, {}, 0
+        for name, shape in self._trial.items():  # copies: what a law does to its arguments stays with it
+            values[name] = trial[:, start : start + _size(shape)].reshape(n, *shape).copy()
+            start += _size(shape)
+        given = {name: data[name].reshape(n, *getattr(self._points, name).ufl_shape).copy() for name in self._names}
+        given |= {name: float(constant.value) for name, constant in self._by_scene.items()}
+        found: dict = {}
+
+        def solution() -> list[NDArray[np.float64]]:
+            found.update(self._checked(call(self._law.solution, "numpy", **self._with_trial(values), **given), n))
+            return [found[of][0].reshape(n, _size(shape)) for of, shape in self._unknowns.items()]
+
+        def derive() -> Derived:
+            slopes = self._together(lambda: [self._slopes_of(of, found[of][1], n) for of in self._unknowns])
+            self._refuse(data, np.flatnonzero(~np.isfinite(slopes).all(axis=(1, 2))), ".solution: is not finite")
+            return Derived(slopes.reshape(n, self.count * k))
+
+        y = self._together(solution)
+        self._refuse(data, np.flatnonzero(~np.isfinite(y).all(axis=1)), ".solution: is not finite")
+        return Solved(data.key, y, trial, derive)
+
+    def _together(self, make: Callable[[], list[NDArray[np.float64]]]) -> NDArray[np.float64]:
+        """Return arrays side by side; what one process refuses with a ValueError, all do."""
+        made, refused = [], ""
+        try:
+            made = make()
+        except ValueError as error:
+            refused = str(error)
+        if message := first(self._grid.comm, refused):
+            raise ValueError(message)
+        return np.concatenate(made, axis=1)
+
+    @property
+    def _said(self) -> str:
+        return f"{self._law.__name__}.solution"
+
+    def _checked(self, found, n: int) -> dict:
+        """Return what a law in numpy gives at n points, unknowns and derivatives as arrays of real numbers.
+
+        Raises
+        ------
+        ValueError
+            It is no pairs by the names of the unknowns, of these shapes; a derivative is by what is no trial value.
+        """
+        instance(f"{self._said}: what it gives", found, dict)
+        for of, pair in found.items():
+            if not (isinstance(pair, (tuple, list)) and len(pair) == 2 and isinstance(pair[1], dict)):
+                allowed = "must be a pair: values, and a dict of derivatives"
+                raise ValueError(f"{self._said}: {of} = {line(pair)}, {allowed}")
+        if set(found) != set(self._unknowns):
+            names = (", ".join(map(str, of)) or "nothing" for of in (found, self._unknowns))
+            raise ValueError("{}: gives {}, must give {}".format(self._said, *names))
+        out = {}
+        for of, shape in self._unknowns.items():
+            values, slopes = found[of]
+            for by in slopes:
+                if by not in self._trial:
+                    among = ", ".join(self._trial)
+                    raise ValueError(f"{self._said}: derivative of {of} by {line(by)}, must be by some of {among}")
+            known = {by: slope if callable(slope) else self._slope(of, by, slope, n) for by, slope in slopes.items()}
+            out[of] = _real(f"{self._said}: {of}", values, (n, *shape)), known
+        return out
+
+    def _slope(self, of: str, by: str, given, n: int) -> NDArray[np.float64]:
+        """Return the derivative (n, ..., ...) of an unknown by a trial value; given: this, or a function."""
+        what = f"{self._said}: derivative of {of} by {by}"
+        value = asked(what, "a function without arguments that gives it", given) if callable(given) else given
+        return _real(what, value, (n, *self._unknowns[of], *self._trial[by]))
+
+    def _slopes_of(self, of: str, given: Mapping[str, object], n: int) -> NDArray[np.float64]:
+        """Return the slopes (n, m, k) of one unknown; given: its derivatives, by some trial values."""
+        m, parts = _size(self._unknowns[of]), []
+        for by, shape in self._trial.items():
+            slope = self._slope(of, by, given[by], n) if by in given else np.zeros((n, m, _size(shape)))
+            parts.append(slope.reshape(n, m, _size(shape)))
+        return np.concatenate(parts, axis=2)
+
+
+def _along(by_y, by_z, Y, m: int, i: tuple[int, ...], j: int):
+    """Return the derivative of a component i along y = y* + Y (z - z*), by the component j of z, as UFL."""
+    return by_z[(*i, j)] + sum(by_y[(*i, a)] * Y[a, j] for a in range(m))
+
+
+def _real(name: str, value, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """Return real numbers of a shape; others are refused with a ValueError."""
+    try:
+        value = np.asarray(value)
+    except ValueError as error:  # rows of different lengths
+        raise ValueError(f"{name} = {line(value)}, must be an array of shape {shape}") from error
+    if value.shape != shape:
+        raise ValueError(f"{name} has shape {value.shape}, must be {shape}")
+    if value.dtype.kind not in "fiu":
+        raise ValueError(f"{name} has numbers of type {value.dtype}, must be real")
+    return value.astype(float, copy=False)
+
+
+def _newton(system, y: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Solve f(y) = 0 at all points, in place: Newton's method with a line search; return the points where it fails.
+
+    system: called with rows (r,) and values (r, m), sets these and returns f (r, m), df/dy (r, m, m) and norms (r,).
+    """
+    rows, lost = np.arange(len(y)), np.zeros(len(y), dtype=bool)
+    f, slope, norm = system(rows, y)
+    halvings = np.zeros(len(y), dtype=int)
+    for _ in range(MOST):
+        step, begun = _solve(slope, f[:, :, None])[:, :, 0], y[rows]
+        solved, lost[rows] = norm <= ROUND_OFF, ~np.isfinite(step).all(axis=1)
+        step[solved & lost[rows]] = 0.0  # a solution, though it may be one of many
+        lost[rows] &= ~solved
+        close = (np.abs(step) <= CLOSE * np.maximum(1.0, np.abs(begun))).all(axis=1) | solved
+        y[rows] = begun - step  # of those that are close this is the solution
+        on = ~(close | lost[rows])
+        rows, step, begun, norm, length = rows[on], step[on], begun[on], norm[on], np.ones(int(on.sum()))
+        if not len(rows):
+            break
+        f, slope, new = system(rows, begun - step)
+        while len(worse := np.flatnonzero(~(new < norm) & (halvings[rows] < HALVINGS))):
+            length[worse] /= 2
+            halvings[rows[worse]] += 1
+            f[worse], slope[worse], new[worse] = system(rows[worse], begun[worse] - length[worse, None] * step[worse])
+        lost[rows] = ~(new < norm)
+        on = ~lost[rows]
+        rows, f, slope, norm = rows[on], f[on], slope[on], new[on]
+    lost[rows] = True  # after so many iterations
+    return np.flatnonzero(lost)
+
+
+def _solve(A: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return A^-1 b (n, m, k) of matrices (n, m, m); not finite where there is none."""
+    with np.errstate(all="ignore"):
+        if A.shape[1] == 1:
+            return b / A
+        if A.shape[1] == 2:  # a tenth of LAPACK's time
+            (a11, a12), (a21, a22) = A.transpose(1, 2, 0)[..., None]
+            det = a11 * a22 - a12 * a21
+            return np.stack([a22 * b[:, 0] - a12 * b[:, 1], a11 * b[:, 1] - a21 * b[:, 0]], axis=1) / det[:, None]
+        try:
+            return np.linalg.solve(A, b)
+        except np.linalg.LinAlgError:
+            singular = ~(np.abs(np.linalg.det(A)) > 0)
+            return np.linalg.solve(np.where(singular[:, None, None], np.nan, A), b)
+
+
+def _parts(values) -> list:
+    """Return all components of UFL values."""
+    return [value[i] if i else value for value in values for i in np.ndindex(value.ufl_shape)]
+
+
+def _size(shape: tuple[int, ...]) -> int:
+    return int(np.prod(shape, dtype=int))
+
+
+def _named(shapes: Mapping[str, tuple[int, ...]], vector) -> dict:
+    """Return tensors of given shapes that a UFL vector holds one after the other."""
+    out, start = {}, 0
+    for name, shape in shapes.items():
+        index = np.arange(start, start + _size(shape)).reshape(shape)
+        out[name] = ufl.as_tensor(_nested(vector, index)) if shape else vector[start]
+        start += index.size
+    return out
+
+
+def _nested(vector, index: NDArray[np.int64]):
+    return [_nested(vector, row) for row in index] if index.ndim else vector[int(index)]
+
+
+def _given(data: PointData) -> NDArray[np.float64]:
+    raise RuntimeError("trial values and unknowns are given with each evaluation")

@@ -1,0 +1,249 @@
+# SPDX-License-Identifier: MIT
+"""Mohr and Coulomb's elastoplasticity at finite strain, with edges, apex and a tension cut-off.
+
+Multiplicative, in principal logarithmic strains, as Drucker and Prager's law, with Hencky's elasticity.  With principal
+Kirchhoff stresses t_1 >= t_2 >= t_3, tension positive,
+
+    f_ij = (1 + sin phi) t_i - (1 - sin phi) t_j - 2 c cos phi <= 0  for all i, j,    t_i <= T,
+
+flow along (1 + sin psi) e_i - (1 - sin psi) e_j and along e_i.  The return keeps the order of the principal values, so
+that it ends on one of eleven faces, edges and vertices (de Souza Neto, Peric and Owen 2008, 8.2, without the
+cut-off).  On each the stress is a linear function of the trial stress.  The end is the one that offends least against:
+the stress is admissible, the order is kept, and all plastic multipliers are >= 0; for one of them that is nothing but
+round-off. All of this is numpy, with exact derivatives also where principal values are equal, as they are on the
+edges.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import ufl
+from numpy.typing import NDArray
+
+from mpm_dolfinx.forms.axes import embedded, planar
+from mpm_dolfinx.materials.frictional import Frictional
+from mpm_dolfinx.materials.skeleton import Field, _check
+from mpm_dolfinx.materials.trial import PLANE, Coaxial, Isotropic, components, eigen, symmetric
+
+ROUND_OFF = 1e-12  # of stresses over the shear modulus
+FACE, EDGES, ALL = slice(0, 1), slice(1, 3), slice(None)  # of the faces of a return
+NEVER = 1e6  # tensile strength over the bulk modulus where none is given
+
+
+@dataclass(frozen=True, kw_only=True)
+class MohrCoulomb(Frictional):
+    """Hencky elasticity with Mohr and Coulomb's yield surface in Kirchhoff stress, perfectly plastic.
+
+    Parameters
+    ----------
+    friction
+        Friction angle phi, degrees, in [0, 90); 0 is Tresca's law, of the undrained strength `cohesion`.
+    dilation
+        Dilation angle psi, degrees, in [0, friction]; equal to the friction angle the flow is associated, and the
+        tangent symmetric.  At the apex soil that is torn apart dilates in any case.
+    cohesion
+        Cohesion c, Pa, >= 0.  Without any, points without pressure have no stiffness.
+    tension
+        Tensile strength T, Pa, >= 0: no principal stress is above it.  By default that of the apex, c cot phi.
+
+    The other parameters are those of `Skeleton`, all by name.  The state is `plastic`, C_p^-1 (3, 3), in `points.data`.
+
+    Raises
+    ------
+    ValueError
+        Naming the constant that is out of its range, or is not given: friction, dilation and cohesion have no
+        values that are safe to assume.
+    """
+
+    tension: Field = np.inf
+
+    state: ClassVar = {"plastic": np.eye(3)}
+    unknowns: ClassVar = {"stress": np.zeros(6), "flows": 0.0}
+
+    def __post_init__(self):
+        super().__post_init__()
+        _check(self, "tension", lambda v: 0 <= v, ">= 0")
+
+    @property
+    def sine(self):
+        """Sine of the friction angle."""
+        return np.sin(np.radians(self.friction))
+
+    @property
+    def sine_flow(self):
+        """Sine of the dilation angle."""
+        return np.sin(np.radians(self.dilation))
+
+    @property
+    def strength(self):
+        """2 c cos phi, Pa."""
+        return 2 * self.cohesion * np.cos(np.radians(self.friction))
+
+    @property
+    def cutoff(self):
+        """Tensile strength, finite, Pa."""
+        return np.minimum(self.tension, NEVER * self.bulk)
+
+    @staticmethod
+    def trial(F, plastic):
+        """Return the components of the trial elastic strain b."""
+        F3 = embedded(F)
+        b, plane = F3 * plastic * F3.T, planar(F)
+        return {"b": components(b, plane), "F": (F3, plane)}
+
+    @staticmethod
+    def solution(trial, bulk, shear, sine, sine_flow, strength, cutoff):
+        """Return the components of the stress at the end, Pa, with their derivatives, and whether there was flow."""
+        x, axes = eigen(trial["b"])
+        with np.errstate(invalid="ignore", divide="ignore"):  # of an iterate gone astray, which is refused
+            e = np.log(x) / 2
+        order = np.argsort(-e, axis=1, kind="stable")
+        back, n = np.argsort(order, axis=1), np.arange(len(order))[:, None, None]
+        ordered = np.take_along_axis(e, order, axis=1)
+        stresses, slopes, flows = _returned(ordered, bulk, shear, sine, sine_flow, strength, cutoff)
+        stresses, slopes = np.take_along_axis(stresses, back, axis=1), slopes[n, back[:, :, None], back[:, None, :]]
+        tensor = Coaxial(x, axes, stresses, plane=trial["b"].shape[1] == len(PLANE))
+        by_b = {"b": lambda: tensor.tangent(slopes / (2 * x[:, None, :]))}
+        return {"stress": (tensor.values, by_b), "flows": (flows, {})}
+
+    @staticmethod
+    def kirchhoff(stress):
+        """Return the Kirchhoff stress (3, 3), Pa, as UFL."""
+        return symmetric(stress)
+
+    @staticmethod
+    def update(trial, bulk, shear, plastic, stress, flows):
+        """Return the state at the end of the step, name -> UFL."""
+        (F, plane), tau, I = trial["F"], symmetric(stress), ufl.Identity(3)
+        mean = ufl.tr(tau) / 3
+        twice_strain = (tau - mean * I) / shear + 2 * mean / (3 * bulk) * I
+        b, back = Isotropic(twice_strain, plane)(ufl.exp), ufl.inv(F)
+        return {"plastic": ufl.conditional(ufl.gt(flows, 0.5), back * b * back.T, plastic)}
+
+
+def _returned(e: NDArray, bulk: NDArray, shear: NDArray, sine: NDArray, sine_flow: NDArray, *limits: NDArray) -> tuple:
+    """Return the stresses of ordered principal trial strains, Pa.
+
+    Parameters
+    ----------
+    e : (n, 3)
+        Strains, the largest first; the parameters (n,) follow.
+
+    Returns
+    -------
+    Stresses (n, 3), their derivatives by the strains (n, 3, 3), and 1 where there was flow (n,).
+    """
+    elastic = (bulk - 2 * shear / 3)[:, None, None] * np.ones((3, 3)) + 2 * shear[:, None, None] * np.eye(3)
+    t, slopes = np.einsum("nij,nj->ni", elastic, e), elastic
+    flows = _Surface(sine, *limits).outside(t) > 0
+    if flows.any():
+        parameters = elastic, bulk, shear, sine, sine_flow, *limits
+
+        trial, rows = t.copy(), np.flatnonzero(flows)
+        for few in (FACE, EDGES, ALL):  # most end on the first, most others on the next
+            at = _Return(trial[rows], *(v[rows] for v in parameters))
+            ends, of_trial, offence = at.end(few)
+            there = offence <= ROUND_OFF * shear[rows] if few is not ALL else slice(None)
+            t[rows[there]], slopes[rows[there]] = ends[there], of_trial[there] @ elastic[rows[there]]
+            rows = np.delete(rows, there)
+            if not len(rows):
+                break
+    return t, slopes, flows.astype(float)
+
+
+class _Surface:
+    """The yield surface for ordered stresses: 1 + sin phi, 1 - sin phi, 2 c cos phi and T (n,)."""
+
+    def __init__(self, sine: NDArray, strength: NDArray, cutoff: NDArray):
+        self.p, self.q, self.k, self.T = 1 + sine, 1 - sine, strength, cutoff
+
+    def outside(self, t: NDArray) -> NDArray:
+        """Return by how much stresses (n, 3) are outside (n,), Pa."""
+        return np.maximum(self.p * t[:, 0] - self.q * t[:, 2] - self.k, t[:, 0] - self.T)
+
+
+class _Return:
+    """The return of ordered trial stresses t (n, 3), Pa, that are outside."""
+
+    def __init__(self, t, elastic, bulk, shear, sine, sine_flow, strength, cutoff):
+        self._trial, self._elastic, self._K, self._G = t, elastic, bulk, shear
+        self._surface = s = _Surface(sine, strength, cutoff)
+        self._p, self._q = 1 + sine_flow, 1 - sine_flow
+        zero, one = np.zeros_like(sine), np.ones_like(sine)
+        # faces: normal (n, 3), limit (n,), direction of flow (n, 3)
+        main = _rows(s.p, zero, -s.q), s.k, _rows(self._p, zero, -self._q)
+        right = _rows(s.p, -s.q, zero), s.k, _rows(self._p, -self._q, zero)
+        left = _rows(zero, s.p, -s.q), s.k, _rows(zero, self._p, -self._q)
+        first, second = ((axis, s.T, axis) for axis in (_rows(one, zero, zero), _rows(zero, one, zero)))
+        self._faces = ([main], [main, left], [main, right], [first], [first, second], [main, first])
+        apex, lowest = s.k / (2 * sine + 1e-30), (s.p * s.T - s.k) / s.q
+        self._vertices = (
+            (_rows(apex, apex, apex), self._in_apex),
+            (_rows(s.T, s.T, s.T), lambda x: x.T),
+            (_rows(s.T, lowest, lowest), self._in_triaxial),
+            (_rows(s.T, s.T, lowest), self._in_extension),
+        )
+
+    def end(self, few: slice) -> tuple[NDArray, NDArray, NDArray]:
+        """Return the stresses that offend least of some ends (n, 3), Pa, their derivatives (n, 3, 3), their offence."""
+        with np.errstate(all="ignore"):  # vertices that are nowhere
+            ends = [self._on(faces) for faces in self._faces[few]]
+            if few is ALL:
+                ends += [self._at(*vertex) for vertex in self._vertices]
+        if len(ends) == 1:
+            return ends[0]
+        offence = np.array([np.nan_to_num(offends, nan=np.inf) for _, _, offends in ends])
+        best, n = offence.argmin(axis=0), np.arange(len(self._trial))
+        stresses, slopes = (np.array([end[i] for end in ends])[best, n] for i in (0, 1))
+        return stresses, slopes, offence[best, n]
+
+    def _offence(self, t: NDArray, multipliers: Sequence[NDArray]) -> NDArray:
+        """Return by how much stresses, and multipliers that must be >= 0, offend (n,), Pa."""
+        multipliers = [-2 * self._G * m for m in multipliers]
+        return np.max([self._surface.outside(t), t[:, 1] - t[:, 0], t[:, 2] - t[:, 1], *multipliers], axis=0)
+
+    def _on(self, faces: Sequence) -> tuple[NDArray, NDArray, NDArray]:
+        """Return stresses on a face or on the edge of two, their derivatives, and their offence."""
+        normals, limits, flows = (np.stack(part, axis=1) for part in zip(*faces, strict=True))
+        drops = np.einsum("nij,nfj->nif", self._elastic, flows)
+        gram = normals @ drops
+        inverse = 1 / gram if len(faces) == 1 else _inverse(gram)
+        slopes = np.eye(3) - drops @ inverse @ normals
+        over = np.einsum("nfi,ni->nf", normals, self._trial) - limits
+        multipliers = np.einsum("nfg,ng->nf", inverse, over)
+        t = self._trial - np.einsum("nif,nf->ni", drops, multipliers)
+        return t, slopes, self._offence(t, multipliers.T)
+
+    def _at(self, t: NDArray, conditions: Callable) -> tuple[NDArray, NDArray, NDArray]:
+        """Return the stresses of a vertex, no derivatives, and the offence; conditions: what must be >= 0 in flow."""
+        drop = self._trial - t
+        mean = drop.mean(axis=1)
+        plastic = drop / (2 * self._G)[:, None] + (mean / (3 * self._K) - mean / (2 * self._G))[:, None]
+        return t, np.zeros((len(t), 3, 3)), self._offence(t, conditions(plastic))
+
+    def _in_apex(self, x: NDArray) -> list[NDArray]:
+        """Return what is >= 0 where an ordered strain is in the cone of the flows of all six faces."""
+        total, turn = x.sum(axis=1), self._p - self._q
+        return [total, self._q * total + turn * x[:, 2], self._q * total + turn * (x[:, 1] + x[:, 2])]
+
+    def _in_triaxial(self, x: NDArray) -> list[NDArray]:
+        """The same of two faces that meet where t_2 = t_3, and of the cut-off of t_1."""
+        return [-x[:, 1], -x[:, 2], x[:, 0] + self._p / self._q * (x[:, 1] + x[:, 2])]
+
+    def _in_extension(self, x: NDArray) -> list[NDArray]:
+        """The same of two faces that meet where t_1 = t_2, and of the cut-off of both."""
+        return [x[:, 0], x[:, 1], -x[:, 2], x[:, 0] + x[:, 1] + self._p / self._q * x[:, 2]]
+
+
+def _inverse(A: NDArray) -> NDArray:
+    """Return the inverses of matrices (n, 2, 2), in a tenth of LAPACK's time."""
+    adjugate = A[:, ::-1, ::-1].transpose(0, 2, 1) * [[1, -1], [-1, 1]]
+    return adjugate / (A[:, 0, 0] * A[:, 1, 1] - A[:, 0, 1] * A[:, 1, 0])[:, None, None]
+
+
+def _rows(*columns: NDArray) -> NDArray:
+    return np.stack(columns, axis=1)

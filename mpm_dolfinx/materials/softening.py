@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: MIT
+"""Drucker and Prager's soil that loses its cohesion as it slips, and resists with a viscosity.
+
+What softens localises in bands one cell wide, whatever the cells: softening by strain would take the less work the
+finer the grid.  So the cohesion falls with the slip along such a band, gamma h, of the plastic shear strain gamma and
+the cell's size h (crack band: Bazant and Oh 1983; Pietruszczak and Mroz 1981),
+
+    c = c_0 - (c_0 - c_r) min(1, gamma h / s),
+
+and the work to part the soil along a band is that of (c_0 - c_r) s / 2 on any grid.  The viscosity is Perzyna's,
+f = eta dgamma/dt, without an exponent: implicit in the step, and none as the rate goes to nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import ufl
+
+from mpm_dolfinx.materials.drucker_prager import DruckerPrager, metric, returned, stress
+from mpm_dolfinx.materials.skeleton import Field, _check, check_given
+from mpm_dolfinx.materials.trial import Trial
+
+GIVEN = {"residual": "in [0, cohesion] Pa", "slip": "> 0 m"}
+"""Constants that must be given, and what they may be."""
+NEVER = 1e-300  # s: added to no time, in which nothing flows
+
+
+@dataclass(frozen=True, kw_only=True)
+class SofteningDruckerPrager(DruckerPrager):
+    """Drucker-Prager soil whose cohesion falls as it slips, at a rate.
+
+    Parameters
+    ----------
+    residual
+        Cohesion c_r that is left, Pa, in [0, cohesion]; with the cohesion itself nothing softens.
+    slip
+        Slip s along a band of shear, m, > 0, over which the cohesion falls to that.  Where cells are so large that soil
+        softens faster than it unloads it is refused.
+    viscosity
+        eta, Pa s, >= 0: sqrt(J_2) + eta_phi p - xi c = eta dgamma/dt.
+
+    The other parameters are those of `DruckerPrager`, without hardening.  The state is `plastic` and `hardened`, xi
+    times the plastic shear strain.  At the apex of the cone soil that is torn apart has the residual cohesion.
+
+    Raises
+    ------
+    ValueError
+        Naming the constant that is out of its range, or is not given.
+    """
+
+    residual: Field = None
+    slip: Field = None
+    viscosity: Field = 0.0
+
+    state: ClassVar = {"plastic": np.eye(3), "hardened": 0.0}
+
+    def __post_init__(self):
+        super().__post_init__()
+        check_given(self, GIVEN)
+        _check(self, "hardening", lambda v: v == 0, "0: this law softens")
+        _check(self, "slip", lambda v: (0 < v) & (v < np.inf), "> 0 and finite")
+        _check(self, "viscosity", lambda v: (0 <= v) & (v < np.inf), ">= 0 and finite")
+        if not callable(self.cohesion):
+            _check(self, "residual", lambda v: (0 <= v) & (v <= self.cohesion), "in [0, cohesion]")
+
+    def check_cells(self, cell_size: float) -> None:
+        stiff = self.shear + self.bulk * self.eta * self.eta_flow
+        least = np.max(np.asarray(self.xi * (self.cohesion - self.residual) * cell_size / stiff))
+        if least >= np.min(self.slip):
+            what = f"{type(self).__name__}: slip = {np.min(self.slip):g}, must be > {least:.3g} m in cells of"
+            raise ValueError(f"{what} {cell_size:g} m: the soil would soften faster than it unloads")
+
+    @staticmethod
+    def kirchhoff(
+        F, bulk, shear, eta, xi, eta_flow, cohesion, residual, slip, viscosity, plastic, hardened, dt, cell_size
+    ):
+        """Return the Kirchhoff stress (3, 3), Pa, as UFL."""
+        trial = Trial(F, plastic)
+        strength = cohesion, residual, slip / cell_size, viscosity / (dt + NEVER)
+        return stress(trial, _softened(trial, bulk, shear, eta, xi, eta_flow, hardened, *strength), shear)
+
+    @staticmethod
+    def update(
+        F, bulk, shear, eta, xi, eta_flow, cohesion, residual, slip, viscosity, plastic, hardened, dt, cell_size
+    ):
+        """Return the state at the end of the step, name -> UFL."""
+        trial = Trial(F, plastic)
+        strength = cohesion, residual, slip / cell_size, viscosity / (dt + NEVER)
+        to = _softened(trial, bulk, shear, eta, xi, eta_flow, hardened, *strength)
+        return {"plastic": metric(trial, to, bulk, plastic), "hardened": hardened + to["hardened"]}
+
+
+def _softened(trial: Trial, bulk, shear, eta, xi, eta_flow, hardened, cohesion, residual, strain, drag) -> dict:
+    """Return the stress as `drucker_prager.returned` does; strain: that at which the cohesion is the residual one."""
+    end = xi * strain  # in terms of `hardened`
+    moduli = trial, bulk, shear, eta, xi, eta_flow
+    falling = returned(*moduli, cohesion, (residual - cohesion) / end, hardened, drag)
+    left = returned(*moduli, residual, 0.0, hardened, drag)
+    # what ends at the apex is torn: in that branch softening has no meaning
+    grown = hardened + falling["hardened"]
+    falls = ufl.le(ufl.conditional(ufl.gt(falling["apex"], 0.5), 2 * end, grown), end)
+    out = {name: ufl.conditional(falls, falling[name], left[name]) for name in ("p", "ratio", "hardened")}
+    yields = (ufl.conditional(to["yields"], 1.0, 0.0) for to in (falling, left))
+    return out | {"yields": ufl.gt(ufl.conditional(falls, *yields), 0.5)}

@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: MIT
+"""The trial elastic strain of multiplicative plasticity, and isotropic functions: in UFL, and in numpy.
+
+In UFL isotropic functions of a tensor are Newton's interpolation polynomials at its eigenvalues: exact for smooth
+functions of each eigenvalue, and smooth where eigenvalues are equal, because nodes need not be eigenvalues and are
+kept apart. Principal values that are functions of all three, with kinks, need the eigenvalues themselves: they are
+found in numpy, with the exact derivative, see `Coaxial`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import ufl
+from numpy.typing import NDArray
+
+from mpm_dolfinx.forms.axes import embedded, planar
+from mpm_dolfinx.materials.skeleton import _eigenvalues
+
+EQUAL = 1e-8  # relative distance below which two eigenvalues count as equal
+PLANE, SPACE = ((0, 0), (1, 1), (2, 2), (0, 1)), ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+"""Components of a symmetric tensor in plane strain or axisymmetry, and in 3D."""
+
+
+class Isotropic:
+    """Isotropic functions of a symmetric UFL tensor b (3, 3); plane: whether its third axis is principal."""
+
+    def __init__(self, b, plane: bool):
+        self._b, self._plane = b, plane
+        block = ufl.as_matrix([[b[i, j] for j in (0, 1)] for i in (0, 1)]) if plane else b
+        self._nodes = _eigenvalues(block, 1e-6)
+
+    def __call__(self, f: Callable):
+        """Return f(b) (3, 3) for a function of the eigenvalues."""
+        b, I, x, y = self._b, ufl.Identity(3), self._nodes, [f(node) for node in self._nodes]
+        slope = (y[0] - y[1]) / (x[0] - x[1])
+        linear = y[0] * I + slope * (b - x[0] * I)
+        if self._plane:
+            rows = [[linear[i, j] if i < 2 and j < 2 else 0 for j in range(3)] for i in range(3)]
+            rows[2][2] = f(b[2, 2])
+            return ufl.as_matrix(rows)
+        bend = (slope - (y[1] - y[2]) / (x[1] - x[2])) / (x[0] - x[2])
+        return linear + bend * (b - x[0] * I) * (b - x[1] * I)
+
+
+class Trial:
+    """The trial elastic strain of a deformation gradient, in UFL.
+
+    Parameters
+    ----------
+    F
+        Deformation gradient (d, d).
+    plastic
+        C_p^-1 (3, 3).
+    prestretch
+        Principal elastic stretches (3,) at F = I, if there are any.
+    """
+
+    def __init__(self, F, plastic, prestretch=None):
+        self.F = embedded(F)
+        if prestretch is not None:
+            self.F = self.F * ufl.diag(prestretch)
+        self.isotropic = Isotropic(self.F * plastic * self.F.T, planar(F))
+        strain = self.isotropic(lambda e: ufl.ln(e) / 2)
+        self.volumetric = ufl.tr(strain)
+        self.deviatoric = strain - self.volumetric / 3 * ufl.Identity(3)
+
+
+def components(b, plane: bool):
+    """Return the components of a symmetric UFL tensor (3, 3) as a vector: all, or `PLANE`."""
+    return ufl.as_vector([b[i] for i in (PLANE if plane else SPACE)])
+
+
+def symmetric(values):
+    """Return the symmetric UFL tensor (3, 3) of all its six components."""
+    place = {}
+    for k, (i, j) in enumerate(SPACE):
+        place[i, j] = place[j, i] = values[k]
+    return ufl.as_matrix([[place[i, j] for j in range(3)] for i in range(3)])
+
+
+def eigen(b: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return eigenvalues (n, 3) and axes (n, 3, 3), a column each, of tensors with components b (n, 4 or 6)."""
+    n = len(b)
+    if b.shape[1] == len(SPACE):
+        full = np.empty((n, 3, 3))
+        for k, (i, j) in enumerate(SPACE):
+            full[:, i, j] = full[:, j, i] = b[:, k]
+        lost = ~np.isfinite(b).all(axis=1)  # of an iterate gone astray
+        full[lost] = np.eye(3)
+        x, axes = np.linalg.eigh(full)
+        return np.where(lost[:, None], np.nan, x), axes
+    mean, half = (b[:, 0] + b[:, 1]) / 2, (b[:, 0] - b[:, 1]) / 2
+    radius, angle = np.hypot(half, b[:, 3]), np.arctan2(b[:, 3], half) / 2
+    axes, (c, s) = np.zeros((n, 3, 3)), (np.cos(angle), np.sin(angle))
+    axes[:, 0, 0], axes[:, 1, 0], axes[:, 0, 1], axes[:, 1, 1], axes[:, 2, 2] = c, s, -s, c, 1.0
+    return np.stack([mean + radius, mean - radius, b[:, 2]], axis=1), axes
+
+
+class Coaxial:
+    """Tensors with the axes of others.
+
+    Parameters
+    ----------
+    x, axes : (n, 3), (n, 3, 3)
+        Eigenvalues and axes of the others, see `eigen`.
+    y : (n, 3)
+        Principal values.
+    plane
+        Whether tensors are those of plane strain or axisymmetry.
+    """
+
+    def __init__(self, x: NDArray[np.float64], axes: NDArray[np.float64], y: NDArray[np.float64], plane: bool):
+        self._x, self._axes, self._y = x, axes, y
+        self._inner, self._pairs = (PLANE, ((0, 1),)) if plane else (SPACE, ((0, 1), (0, 2), (1, 2)))
+        self._outer = np.stack([self._dyad(a, a) for a in range(3)], axis=2)
+
+    def _dyad(self, a: int, b: int) -> NDArray[np.float64]:
+        """Return the components of the symmetric dyad of two axes."""
+        u, v = self._axes[:, :, a], self._axes[:, :, b]
+        return np.stack([(u[:, i] * v[:, j] + u[:, j] * v[:, i]) / 2 for i, j in self._inner], axis=1)
+
+    @property
+    def values(self) -> NDArray[np.float64]:
+        """Components (n, 6)."""
+        out = np.zeros((len(self._x), len(SPACE)))  # in the plane the rest is zero
+        out[:, : len(self._inner)] = (self._outer @ self._y[:, :, None])[:, :, 0]
+        return out
+
+    def tangent(self, slopes: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the derivatives (n, 6, 4 or 6) by the components of the others; slopes (n, 3, 3): those of y by x.
+
+        In the axes dy_ij = (y_i - y_j) / (x_i - x_j) dx_ij beside the diagonal; where x_i = x_j it is
+        (dy_i/dx_i - dy_i/dx_j) dx_ij, for an isotropic function has y_i = y_j there.
+        """
+        x, y, inner = self._x, self._y, len(self._inner)
+        twice = np.array([1.0 if i == j else 2.0 for i, j in self._inner])
+        found = np.zeros((len(x), len(SPACE), inner))
+        tangent = found[:, :inner]
+        tangent[:] = self._outer @ slopes @ (self._outer * twice[:, None]).transpose(0, 2, 1)
+        for a, b in self._pairs:
+            apart = x[:, a] - x[:, b]
+            equal = np.abs(apart) <= EQUAL * np.abs(x[:, a])
+            turn = np.where(equal, slopes[:, a, a] - slopes[:, a, b], (y[:, a] - y[:, b]) / np.where(equal, 1.0, apart))
+            side = self._dyad(a, b)
+            tangent += (2 * turn[:, None] * side)[:, :, None] * (side * twice)[:, None, :]
+        return found

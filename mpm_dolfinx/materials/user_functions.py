@@ -1,0 +1,182 @@
+# SPDX-License-Identifier: MIT
+"""Physics of the user's own: functions that return UFL, called with those arguments that they name.
+
+Laws and conductivities are the material's: see `skeleton.Skeleton`.  Terms of the balances are given to
+`Simulation`; they are integrated over the configuration at the start of the step, by these names:
+
+points
+    The points of integration.  `points.dx`: their measure; `points.value(f)`, `points.grad(f)`: f and its
+    gradient, f one of u and v, in axisymmetry (3, 3), with f_r / r; `points.F`: deformation gradient at the start of
+    the step, of the same shape;
+    `points.position`, `points.displacement`: place, and displacement since the start (or since it was reset),
+    both at the start of the step; and what the material points carry in `points.data`: fields of the materials
+    that are functions of place, and the laws' state.
+t
+    Time at which the balances are taken, s, a UFL constant: at the end of the step, and of its first substep.
+
+A function in `terms` adds to the balance of momentum, int P : grad v dV - loads + term = 0:
+
+u
+    Increment of the displacement in the step, m; Q1.
+v
+    Test function.  The term is a linear form in v, such as -inner(b, points.value(v)) * points.dx for a
+    body force b; or a stored energy without v, whose derivative is added.
+velocity
+    Rate of the displacement, m/s, of the order of the time integration: for what resists motion.
+dt
+    Time since the start of the step, s, a UFL constant: u / dt is the mean rate since then.
+
+A term that is linear in v and depends on u is taken to have an unsymmetric tangent.
+
+A function in `sources` gives the volume of fluid, as at zero pressure, that is brought in a time, m^d/s:
+
+q
+    Test function, constant in the cells: the source is s * q * points.dx with s in 1/s.
+p
+    Pore pressure, Pa, constant in the cells.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from inspect import signature
+
+import numpy as np
+import ufl
+from ufl.algorithms import extract_coefficients
+from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
+from ufl.algorithms.check_arities import ArityMismatch
+from ufl.corealg.traversal import unique_pre_traversal
+
+from mpm_dolfinx.base.validation import asked, instance, line, line_of
+
+
+def call(function: Callable, kind: str = "UFL", /, **available):
+    """Call a function of the user's, which gives UFL or another kind, with those arguments that it names.
+
+    Raises
+    ------
+    ValueError
+        Naming the function, the argument that there is not, and those that there are; or what it raises.
+    """
+    wanted = list(signature(function).parameters)
+    for name in wanted:
+        if name not in available:
+            raise ValueError(f"{_name(function)}: argument {name!r}, must be some of {', '.join(available)}")
+    given = {name: available[name] for name in wanted}
+    return asked(_name(function), f"{kind} of {', '.join(wanted) or 'no argument'}", lambda: function(**given))
+
+
+def expression(function: Callable, shapes: Sequence[tuple[int, ...]], of: str = "", **available):
+    """Return the UFL expression that a function of the user's gives, of one of some shapes.
+
+    Raises
+    ------
+    ValueError
+        As `call`; what it gives is no UFL, has another shape, or does not depend on the argument `of`.
+    """
+    value = call(function, **available)
+    allowed = f"UFL of shape {' or '.join(map(str, shapes))}{f' that depends on {of}' if of else ''}"
+    try:
+        out = ufl.as_ufl(value)
+        apply_algebra_lowering(out)  # where UFL finds most of what cannot be
+    except Exception as error:  # UFL has several kinds
+        why = f" ({line_of(error)})" if isinstance(value, ufl.core.expr.Expr) else ""
+        raise ValueError(f"{_name(function)}: gives {line(value)}{why}, must be {allowed}") from error
+    if out.ufl_shape not in shapes:
+        raise ValueError(f"{_name(function)}: gives shape {out.ufl_shape}, must be {allowed}")
+    if of and not any(part is available[of] for part in unique_pre_traversal(out)):
+        raise ValueError(f"{_name(function)}: gives {line_of(out)}, must be {allowed}")
+    _check_finite(_name(function), out)
+    return out
+
+
+def _check_finite(what: str, out: ufl.core.expr.Expr) -> None:
+    """Refuse numbers in an expression that no compiler takes."""
+    for part in unique_pre_traversal(out):
+        if isinstance(part, ufl.constantvalue.RealValue) and not np.isfinite(float(part)):
+            raise ValueError(f"{what}: contains {float(part)}, must be finite")
+
+
+def named(what: str, given, shapes: Mapping[str, tuple[int, ...]], some: bool = False) -> dict:
+    """Return what a function of the user's gives by names as UFL of their shapes; some: whether names may be left out.
+
+    Raises
+    ------
+    ValueError
+        In one line: it is no dict of UFL with these names and shapes, or depends on nothing.
+    """
+    instance(f"{what}: what it gives", given, dict)
+    allowed, out = f"{'some of ' if some else ''}the names and shapes {dict(shapes)}", {}
+    for name, value in given.items():
+        try:
+            out[name] = ufl.as_ufl(value)
+        except Exception as error:  # UFL has several kinds
+            raise ValueError(f"{what}: {name} = {line(value)}, must be UFL, of {allowed}") from error
+        _check_finite(f"{what}: {name}", out[name])
+    found = {name: value.ufl_shape for name, value in out.items()}
+    if not found or found.items() - shapes.items() or not (some or len(found) == len(shapes)):
+        raise ValueError(f"{what}: gives {found}, must have {allowed}")
+    if not any(extract_coefficients(value) for value in out.values()):
+        raise ValueError(f"{what}: gives numbers alone, must be UFL that depends on its arguments")
+    return out
+
+
+def form(kind: str, function: Callable, **available) -> ufl.Form:
+    """Return the form that a function of the user's gives, integrated over the points.
+
+    Raises
+    ------
+    ValueError
+        As `call`; or what it gives is no form, or has integrals that are not over the points.
+    """
+    out, dx = call(function, **available), available["points"].dx
+    allowed = "a form with points.dx"
+    if not isinstance(out, ufl.Form):
+        raise ValueError(f"{kind}: {_name(function)} gives {line(out)}, must be {allowed}")
+    for integral in out.integrals():
+        if (integral.integral_type(), integral.subdomain_id()) != (dx.integral_type(), dx.subdomain_id()):
+            raise ValueError(f"{kind}: {_name(function)} gives an integral over the grid, must be {allowed}")
+        _check_finite(f"{kind}: {_name(function)}", integral.integrand())
+    return out
+
+
+def term_of(term: Callable, unknown: ufl.Coefficient, test: ufl.Argument, **available) -> tuple[ufl.Form, bool]:
+    """Return a term of the user's as a linear form in the test function, and whether it is the slope of an energy.
+
+    Raises
+    ------
+    ValueError
+        As `form`; or it depends on neither the unknown nor v.
+    """
+    out = form("terms", term, **available)
+    if out.arguments():
+        return out, False
+    if unknown not in out.coefficients():
+        raise ValueError(f"terms: {line(out)}: depends on neither u nor v, must be a form in one of them")
+    return ufl.derivative(out, unknown, test), True
+
+
+@contextmanager
+def compiling(what: str, allowed: str) -> Iterator[None]:
+    """Name the object and the remedy where UFL or its compiler refuses an expression, with a ValueError."""
+    try:
+        yield
+    except (Exception, ArityMismatch) as error:  # UFL and FFCx have many kinds, one is no Exception
+        if isinstance(error, (ValueError, OSError)) and _is_ours(error):  # an OSError: the compiler is at fault
+            raise
+        why = f"{type(error).__name__}: {line_of(error)}"
+        raise ValueError(f"{what}: does not compile ({why}), must be {allowed}") from error
+
+
+def _is_ours(error: Exception) -> bool:
+    """Whether an error was raised by this package, which has named the object."""
+    frames = error.__traceback__
+    while frames.tb_next is not None:
+        frames = frames.tb_next
+    return frames.tb_frame.f_globals["__name__"].startswith("mpm_dolfinx")
+
+
+def _name(function: Callable) -> str:
+    return getattr(function, "__qualname__", repr(function))

@@ -1,0 +1,252 @@
+# SPDX-License-Identifier: MIT
+"""Mean dilatation: one volume change per cell, the cure for volumetric locking of nearly incompressible skeletons.
+
+Four constraints of volume a cell leave a Q1 quadrilateral no freedom to bend: with nu = 0.499 it is up to half
+too stiff.  Here the law sees the deformation gradient with the volume ratio of the step averaged over the cell,
+
+    Fbar = (theta J_n / det F)^(1/d) F,     theta = sum w det(Delta) / sum w   over the cell's pieces that lock,
+
+d = 2 in plane strain, 3 in axisymmetry.  Which do is a matter of their material (`Skeleton.nearly_incompressible`).  In
+a cell that these share with others the others see their own F: one constraint a cell is left, and neither kind of
+material knows of the other but by the displacements that they share.  The energy sum w psi(Fbar) / J_n has the
+derivative
+
+    sum w [dPsi/dF : dF + pi d(det Delta)],   pi = (sum w dPsi/dtheta) / (sum w),
+
+so for given (theta, pi) the residual is that of one more term in the energy, and the tangent is symmetric:
+what theta and pi contribute has rank two in each cell (Simo, Taylor and Pister 1985; F-bar of the material point
+method by increments: Coombs et al. 2018).  A law that gives its stress has P(Fbar) : dFbar in place of dPsi.  The
+points keep Fbar; the J_n with which the next step begins is that of the cell's domains (`cell_ratios`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from petsc4py import PETSc
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from numpy.typing import NDArray
+
+from mpm_dolfinx.base.caching import Latest
+from mpm_dolfinx.forms.axes import block
+from mpm_dolfinx.forms.cell_matrices import Beside, insert
+from mpm_dolfinx.forms.point_forms import CellSums, FormPoints, PointData, PointExpression
+from mpm_dolfinx.grid.grid import Grid, sum_by
+from mpm_dolfinx.materials.skeleton import Skeleton
+from mpm_dolfinx.materials.user_functions import expression
+from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
+
+
+class MeanDilatation:
+    """The cells' volume ratio theta of the step and the mean stress pi that goes with it.
+
+    Parameters
+    ----------
+    grid
+        Background grid.
+    numbers
+        Which parts of the pieces lock, see `QuadratureData`, in the order in which they are added.
+    symmetric
+        Whether the tangents of all laws are symmetric.
+    """
+
+    def __init__(self, grid: Grid, numbers: Sequence[int], symmetric: bool = True):
+        self._grid, self._d, self._symmetric, self._numbers = grid, grid.stretches, symmetric, numbers
+        self.theta, self.pi = fem.Function(grid.cellwise()), fem.Function(grid.cellwise())
+        self._theta = ufl.variable(self.theta)
+        self._filled: Latest[Cells] = Latest()
+        self._volume: Latest[NDArray[np.float64]] = Latest()
+        self._ratios: list[CellSums] = []
+        self._stresses: list[StressAtPoints] = []
+
+    def seen(self, points: FormPoints, F):
+        """Return Fbar (d, d), what laws see of F, a UFL variable."""
+        ratio = self._theta * ufl.det(points.F) / ufl.det(F)
+        Fbar = (ufl.sqrt(ratio) if self._d == 2 else ratio ** (1 / self._d)) * F
+        return ufl.variable(block(Fbar) if self._grid.axisymmetric else Fbar)
+
+    def add(
+        self,
+        law: type[Skeleton],
+        points: FormPoints,
+        F,
+        Fbar,
+        ratio,
+        values: Mapping[str, object],
+        known: Mapping[str, object],
+    ) -> tuple:
+        """Add the pieces of a part that locks.
+
+        Parameters
+        ----------
+        law
+            Class of its law.
+        points
+            Its pieces, with the field F (d, d), the deformation gradient at the start of the step.
+        F
+            Deformation gradient (d, d), a UFL variable.
+        Fbar
+            What the law sees of it, see `seen`.
+        ratio
+            det Delta, of F over that at the start of the step.
+        values
+            UFL values of the law's parameters, state and local unknowns.
+        known
+            The same for what is not differentiated, see `LocalUnknowns`.
+
+        Returns
+        -------
+        The first Piola-Kirchhoff stress, Pa, as UFL of F, theta and pi, for the residual; its derivative by F (d, d, d,
+        d), Pa, for the tangent; and what the tangent is to sum over the pieces of each cell, for `assemble_matrix`.
+        """
+        J_n, J = ufl.det(points.F), ufl.det(F)
+        self._ratios.append(CellSums([ratio], points))
+        P, slope = self._stress(law, F, Fbar, known)
+        self._stresses.append(StressAtPoints(P, slope / J_n, points))
+        P_F, P_theta, slope_F, slope_theta = self._slopes(law, F, Fbar, values)
+        shared, share = self.pi * ufl.diff(J, F), 1 / J_n
+        along = [share * T for T in (ufl.diff(J, F), slope_F, *([] if self._symmetric else [P_theta]))]
+        beside = Beside(along, [share * slope_theta])
+        return self._stresses[-1].P + shared, P_F + ufl.diff(shared, F), beside
+
+    def _stress(self, law: type[Skeleton], F, Fbar, values: Mapping[str, object]) -> tuple:
+        """Return the derivatives by F and by theta of psi(Fbar); of a law without energy, of its work."""
+        if law.kirchhoff is None:
+            energy = expression(law.energy, [()], F=Fbar, **values)
+            return ufl.diff(energy, F), ufl.diff(energy, self._theta)
+        tau = law.kirchhoff_in_plane(Fbar, values)  # dFbar Fbar^-1 = dev(dF F^-1) + dtheta / (d theta) I
+        mean = ufl.tr(tau) / self._d
+        return (tau - mean * ufl.Identity(self._d)) * ufl.inv(F).T, mean / self._theta
+
+    def _slopes(self, law: type[Skeleton], F, Fbar, values: Mapping[str, object]) -> tuple:
+        """Return the derivatives by F and by theta of both that `_stress` gives.
+
+        In the plane a law without energy is itself derived by Fbar only, in half of the time: with Fbar = s F
+
+            dtau = s C : dF + (theta dtau/dtheta) (dtheta / theta - F^-T : dF),   C = dtau/dFbar.
+
+        In 3D that would take two minutes to compile.
+        """
+        P, slope = self._stress(law, F, Fbar, values)
+        if law.kirchhoff is None or self._grid.dim == 3:
+            return tuple(ufl.diff(of, by) for of in (P, slope) for by in (F, self._theta))
+        d, theta, G = self._d, self._theta, ufl.inv(F).T
+        i, j, k, l, m = ufl.indices(5)
+        tau = law.kirchhoff_in_plane(Fbar, values)
+        C, G_F, dev = ufl.diff(tau, Fbar), ufl.diff(G, F), tau - ufl.tr(tau) / d * ufl.Identity(d)
+        tau_theta = ufl.as_tensor(C[i, j, k, l] * Fbar[k, l], (i, j)) / (d * theta)
+        tau_F = ufl.as_tensor(ufl.inner(Fbar, G) / d * C[i, j, k, l] - theta * tau_theta[i, j] * G[k, l], (i, j, k, l))
+        mean_F, mean_theta = ufl.as_tensor(tau_F[i, i, k, l], (k, l)) / d, ufl.tr(tau_theta) / d
+        P_F = ufl.as_tensor(
+            tau_F[i, m, k, l] * G[m, j] - mean_F[k, l] * G[i, j] + dev[i, m] * G_F[m, j, k, l], (i, j, k, l)
+        )
+        P_theta = (tau_theta - mean_theta * ufl.Identity(d)) * G
+        return P_F, P_theta, mean_F / theta, (mean_theta - slope) / theta
+
+    def set_ratios(self, data: QuadratureData) -> None:
+        """Set theta at the present displacement."""
+        self._set_mean(self.theta, self._ratios, data)
+
+    def set_stresses(self, data: QuadratureData) -> None:
+        """Set the stresses of the pieces, and pi, at the present displacement and theta."""
+        self._set_mean(self.pi, self._stresses, data)
+
+    def _set_mean(self, f: fem.Function, sums: Sequence[CellSums | StressAtPoints], data: QuadratureData) -> None:
+        """Set f to the means of a quantity over the pieces that lock, of which there are sums (cells, 1)."""
+        total = self._cells(data).total([of(part) for of, part in zip(sums, self._parts(data), strict=True)])
+        f.x.array[self._cells(data).filled] = total[:, 0] / self._volume_of(data)[:, 0]
+
+    def assemble_matrix(self, A: PETSc.Mat, data: QuadratureData, sums: Sequence[NDArray[np.float64]]) -> None:
+        """Add what theta and pi contribute to the tangent at the last update; the caller finalises it.
+
+        sums: of what `add` asks for (cells, quantities), of each part of the pieces.
+        """
+        count, volume = 2**self._grid.dim * self._grid.dim, self._volume_of(data)
+        b, c, *other, e = np.split(
+            self._cells(data).total([sums[number] for number in self._numbers]) / volume,
+            range(count, (2 if self._symmetric else 3) * count + 1, count),
+            axis=1,
+        )
+        d = c if self._symmetric else other[0]
+        # (d b^T + b c^T + e b b^T) V with the means b, c, d, e of the derivatives of det(Delta), dPsi/dtheta, P
+        columns, rows = (c + 0.5 * e * b) * volume, (d + 0.5 * e * b) * volume
+        matrices = b[:, :, None] * columns[:, None, :] + rows[:, :, None] * b[:, None, :]
+        insert(A, self._grid, self._cells(data).filled, matrices)
+
+    def averaged(self, delta: NDArray[np.float64], data: QuadratureData) -> NDArray[np.float64]:
+        """Return the gradients Delta (m, d, d) of the pieces, those that lock with the volume ratio of their cell."""
+        delta = delta.copy()
+        for number in self._numbers:
+            rows = data.rows[number]
+            theta, own = self.theta.x.array[data.parts[number].cells], delta[rows]
+            delta[rows] = own * ((theta / np.linalg.det(own)) ** (1 / self._d))[:, None, None]
+        return delta
+
+    def _parts(self, data: QuadratureData) -> list[PointData]:
+        return [data.parts[number] for number in self._numbers]
+
+    def _cells(self, data: QuadratureData) -> Cells:
+        """Return the cells that hold pieces that lock."""
+        places = [part.places for part in self._parts(data)]
+        return self._filled(tuple(p.key for p in places), lambda: Cells([p.filled for p in places]))
+
+    def _volume_of(self, data: QuadratureData) -> NDArray[np.float64]:
+        """Return the volumes (cells, 1) of the pieces that lock."""
+        key = tuple(part.key for part in self._parts(data))
+
+        def volumes() -> NDArray[np.float64]:
+            sums = [sum_by(p.places.slots, p.volume, len(p.places.filled))[:, None] for p in self._parts(data)]
+            return self._cells(data).total(sums)
+
+        return self._volume(key, volumes)
+
+
+class StressAtPoints:
+    """The stress P of a law and its slope by theta at the points of a part: what residual and pi take, evaluated once.
+
+    Parameters
+    ----------
+    P, slope
+        UFL (d, d) and scalar at the points.
+    points
+        The points.
+    """
+
+    def __init__(self, P, slope, points: FormPoints):
+        shape, self._last = P.ufl_shape, Latest()
+        self._values = PointExpression(ufl.as_vector([*(P[i] for i in np.ndindex(shape)), slope]), points)
+        stress = points.follow("stress of the law", shape, self._stress)
+        self.P = block(stress) if points.grid.axisymmetric else stress
+        """The stress as UFL, of the values that were evaluated last."""
+
+    def __call__(self, data: PointData) -> NDArray[np.float64]:
+        """Evaluate both at the points, and return the sums (cells, 1) of the slope in their cells."""
+        _, values = self._last(object(), lambda: (data.key, self._values.evaluate(data)))
+        return sum_by(data.places.slots, data.volume * values[:, -1], len(data.places.filled))[:, None]
+
+    def _stress(self, data: PointData) -> NDArray[np.float64]:
+        """Return the stresses (n, d^2), Pa."""
+        of, values = self._last.value or (None, None)
+        if of is not data.key:
+            raise RuntimeError("stresses of points are asked for before they are evaluated")
+        return values[:, :-1]
+
+
+class Cells:
+    """The cells of several parts; filled: all, where: the place of each part's among these."""
+
+    def __init__(self, of_parts: Sequence[NDArray[np.int32]]):
+        self.filled = np.unique(np.concatenate(of_parts))
+        self.where = [np.searchsorted(self.filled, cells) for cells in of_parts]
+
+    def total(self, values: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+        """Return the sums over all parts of what the cells of each hold."""
+        if len(values) == 1:
+            return values[0]
+        out = np.zeros((len(self.filled), values[0].shape[1]))
+        for where, of_part in zip(self.where, values, strict=True):
+            out[where] += of_part
+        return out

@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: MIT
+"""Parts of the bodies that hang together: no force and no fluid goes from one to another."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+from mpi4py import MPI
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from mpm_dolfinx.grid.grid import Grid, sum_by
+from mpm_dolfinx.parallel.exchange import over_all
+from mpm_dolfinx.points.cutting import corner_bits
+
+
+@dataclass(frozen=True, eq=False)
+class Parts:
+    """Parts of the bodies on the grid.
+
+    count: how many there are; cells, nodes : (cells,), (nodes,) part of each active local cell and node, from 0, else
+    -1.
+    """
+
+    count: int
+    cells: NDArray[np.int64]
+    nodes: NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class OfParts:
+    """Entries of a vector of this process, each of a part.
+
+    Parameters
+    ----------
+    comm
+        The processes.
+    of : (n,)
+        Part of each entry.
+    count
+        Number of parts.
+    """
+
+    comm: MPI.Comm
+    of: NDArray[np.int64]
+    count: int
+
+    def sums(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the sums (count,) of entries (n,) over each part, of all processes."""
+        return over_all(self.comm, sum_by(self.of, values, self.count))
+
+    def norms(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the Euclidean norms (count,) of entries (n,) of each part."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            return np.sqrt(self.sums(values**2))
+
+    @cached_property
+    def sizes(self) -> NDArray[np.float64]:
+        """Numbers (count,) of entries of each part."""
+        return self.sums(np.ones(len(self.of)))
+
+
+def relative(
+    norms: NDArray[np.float64], scales: NDArray[np.float64], round_off: NDArray[np.float64] | float = 0.0
+) -> NDArray[np.float64]:
+    """Return norms / scales; 0 where the norm is round-off, never nan, which no comparison would notice."""
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        ratio = np.where((scales > 0) & (norms < np.inf), norms / scales, np.inf)
+    return np.where(norms <= round_off, 0.0, ratio)
+
+
+def parts_of_cells(grid: Grid, active: NDArray[np.bool_]) -> tuple[NDArray[np.int64], int]:
+    """Return the part (cells,), from 1, that each active local cell belongs to by common nodes, and how many there are.
+
+    Cells that are not active have 0.  Parts are numbered by their first cells, alike on any number of processes.
+    """
+    cells, out = np.flatnonzero(active), np.zeros(len(active), dtype=np.int64)
+    nodes, at = np.unique(grid.cell_nodes[cells], return_inverse=True)
+    own, count = _joined(np.repeat(np.arange(len(cells)), 2**grid.dim), at.ravel(), (len(cells), len(nodes)))
+    if grid.comm.size > 1:
+        of_node = np.zeros(len(nodes), dtype=np.int64)
+        of_node[at.ravel()] = np.repeat(own, 2**grid.dim)
+        own, count = _over_processes(grid, own, count, nodes, of_node)
+    first = np.full(count, np.iinfo(np.int64).max)
+    np.minimum.at(first, own, grid.cell_number[cells].astype(np.int64))
+    place = np.empty(count, dtype=np.int64)
+    place[np.argsort(over_all(grid.comm, first, MPI.MIN))] = np.arange(count)
+    out[cells] = place[own] + 1
+    return out, count
+
+
+def _joined(rows: NDArray[np.int64], columns: NDArray[np.int64], shape: Sequence[int]) -> tuple[NDArray[np.int64], int]:
+    """Return the part of each row, from 0, that common columns make, and how many there are; no row is empty."""
+    n = sum(shape)
+    pairs = coo_array((np.ones(len(rows), dtype=np.int8), (rows, shape[0] + columns)), shape=(n, n))
+    count, part = connected_components(pairs, directed=False)
+    return part[: shape[0]].astype(np.int64), count
+
+
+def _over_processes(
+    grid: Grid, own: NDArray[np.int64], count: int, nodes: NDArray[np.integer], of_node: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], int]:
+    """Return the parts of cells over all processes, and how many there are.
+
+    own, count: part of each cell on this process, and how many there are; nodes, of_node (n,): local numbers of their
+    nodes, and the part that each belongs to.
+    """
+    counts = grid.comm.allgather(count)
+    start = sum(counts[: grid.comm.rank])
+    index, copy = np.split(grid.node_places(nodes), [grid.dim], axis=1)
+    shared = np.zeros(len(nodes), dtype=bool)
+    for bits in corner_bits(grid.dim):
+        cell = grid.number(np.clip(index - bits, 0, grid.shape - 1)) + copy[:, 0] * grid.cells
+        shared |= grid.owner(cell) != grid.comm.rank
+    number = np.ravel_multi_index(tuple(index[shared].T), tuple(grid.shape + 1)) + copy[shared, 0] * grid.nodes
+    pairs = np.concatenate(grid.comm.allgather(np.stack([start + of_node[shared], number], axis=1)))
+    # each part also has a column of its own
+    columns, at = np.unique(pairs[:, 1], return_inverse=True)
+    rows = np.concatenate([pairs[:, 0], np.arange(sum(counts))])
+    at = np.concatenate([at.ravel(), len(columns) + np.arange(sum(counts))])
+    part, total = _joined(rows, at, (sum(counts), len(columns) + sum(counts)))
+    return part[start + own], total

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""Fields at points, cells and probes."""

@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: MIT
+"""What the cells of the grid hold at present: centroids, displacements, pressures, stresses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpm_dolfinx.grid.grid import sum_by
+from mpm_dolfinx.stepping.scene import Scene
+from mpm_dolfinx.stepping.state import State
+
+
+@dataclass(frozen=True)
+class CellFields:
+    """Fields of this process's cells that hold something; arrays over n cells.
+
+    They are of the grid on which the next step begins, so all are of the present, and of the same second order as the
+    solution: at `x`, not at the cell's middle.  Means are by volume, over what the cell holds.
+
+    Attributes
+    ----------
+    cell : (n,)
+        Local number of the cell in the grid's mesh.
+    x : (n, d), m
+        Centroid of what it holds.
+    volume : (n,), m^d
+        Of what it holds.
+    displacement : (n, d), m
+        Mean since the start, or since a stage reset it.
+    effective_stress, stress : (n, d, d), in axisymmetry (n, 3, 3), Pa
+        Mean Cauchy stress of the skeleton, and of skeleton and fluid together; tension is positive.
+    pressure : (n,), Pa
+        Pore pressure, positive in compression; None without fluid.
+    """
+
+    cell: NDArray[np.int64]
+    x: NDArray[np.float64]
+    volume: NDArray[np.float64]
+    displacement: NDArray[np.float64]
+    effective_stress: NDArray[np.float64]
+    stress: NDArray[np.float64]
+    pressure: NDArray[np.float64] | None
+
+
+def cell_fields(scene: Scene, state: State) -> CellFields:
+    """Return what the cells hold in a state; on all processes together."""
+    state = state if state.stays else state.at_owners(scene.grid)
+    points = state.points
+    on_grid = scene.on_grid(state.as_cut)  # the next step has use for it
+    cut, places = on_grid.cut, on_grid.data.pieces.places
+    weight = cut.pieces_to_cells(cut.pieces.fraction * (points.volume0 * points.J)[cut.pieces.point])
+    volume = sum_by(places.slots, weight, len(places.filled))
+
+    def mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the means in the cells of values (m, ...) at the pieces."""
+        columns = values.reshape(len(values), -1).T
+        sums = [sum_by(places.slots, weight * column, len(volume)) / volume for column in columns]
+        return np.stack(sums, axis=1).reshape(len(volume), *values.shape[1:])
+
+    effective = mean(cut.to_cells(scene.materials.effective_stress(points)))
+    moved = mean(cut.pieces_to_cells(cut.total_displacement(points)))
+    pressure, stress = None, effective
+    if scene.fluid is not None:
+        pressure = on_grid.pressures(state)
+        biot = mean(cut.to_cells(scene.materials.table(points, lambda m: m.biot)))
+        stress = effective - (biot * pressure)[:, None, None] * np.eye(scene.grid.stretches)
+    return CellFields(places.filled, mean(cut.x), volume, moved, effective, stress, pressure)

@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: MIT
+"""Places in the bodies whose displacement, pressure and stress are wanted."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+from mpi4py import MPI
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mpm_dolfinx.base.validation import all_of, flag, line, numbers
+from mpm_dolfinx.bodies.bodies import Body
+from mpm_dolfinx.bodies.faces import interpolate
+from mpm_dolfinx.grid.grid import in_chunks, rounding
+from mpm_dolfinx.parallel.exchange import over_all
+from mpm_dolfinx.points.cutting import corner_bits
+from mpm_dolfinx.points.material_points import MaterialPoints
+
+
+@dataclass(frozen=True, eq=False)
+class Probes:
+    """Tracked positions: material particles whose displacement is wanted; m of them.
+
+    x0 : (m, d) reference positions; id : (m,) the domain that holds each; xi : (m, d) place in it;
+    bodies: those of the scene that they are for; stressed: whether their stress is wanted too.
+    """
+
+    x0: NDArray[np.float64]
+    id: NDArray[np.int64]
+    xi: NDArray[np.float64]
+    bodies: tuple[Body, ...] = ()
+    stressed: bool = False
+
+    def check(self, bodies: Sequence[Body], present: Sequence[bool]) -> None:
+        """Refuse, with a ValueError, a scene of other bodies, or one from which a probed body has gone."""
+        if len(bodies) != len(self.bodies) or not all(map(_same, bodies, self.bodies)):
+            what = f"made for {len(self.bodies)} bodies, the scene has {len(bodies)}"
+            raise ValueError(f"probes: {what}; must be made with all bodies of the scene, in its order")
+        body = np.searchsorted(np.cumsum([len(b) for b in bodies]), self.id, side="right")
+        gone = np.flatnonzero(~np.asarray(present)[body])
+        if len(gone):
+            raise ValueError(f"probe at {self.x0[gone[0]]}: in body {body[gone[0]]}, must be in one that is there now")
+
+    def displacement(self, points: MaterialPoints, comm: MPI.Intracomm) -> NDArray[np.float64]:
+        """Return the displacements (m, d), m, on every process."""
+        here, at = points.find(self.id)
+        return self._shared(comm, here, interpolate(points.corners[at] - points.origin[at], self.xi[here]))
+
+    def position(self, points: MaterialPoints, comm: MPI.Intracomm) -> NDArray[np.float64]:
+        """Return the present positions (m, d), m, on every process."""
+        here, at = points.find(self.id)
+        return self._shared(comm, here, interpolate(points.corners[at], self.xi[here]))
+
+    def _shared(self, comm: MPI.Intracomm, here: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return values (m, ...) on every process of those of the probes that are here."""
+        out = np.zeros((len(self.id), *values.shape[1:]))
+        out[here] = values
+        return over_all(comm, out)
+
+
+def _same(a: Body, b: Body) -> bool:
+    """Whether two bodies have the same points."""
+    alike = len(a) == len(b) and a.dim == b.dim
+    return a is b or (alike and all(np.array_equal(a.lower_of(p), b.lower_of(p)) for p in in_chunks(len(a))))
+
+
+def positions(x0: ArrayLike, dim: int) -> NDArray[np.float64]:
+    """Return places where something is probed, as an array (m, d), m."""
+    allowed = f"positions of {dim} finite coordinates"
+    x = np.atleast_2d(numbers("probes: x0", x0, None, allowed=allowed))
+    if x.shape[1:] != (dim,):
+        raise ValueError(f"probes: x0 = {line(x0)}, must be {allowed}")
+    return x
+
+
+def probes(bodies: Sequence[Body], x0: ArrayLike, *, stress: bool = False) -> Probes:
+    """Return probes: material particles that a run records, the `probes` of `Simulation.run`.
+
+    Recorded are displacement and position, with a fluid the pore pressure and, if asked for, the effective stress; see
+    `Row`.
+
+    Parameters
+    ----------
+    bodies
+        All bodies of the scene, in its order.
+    x0 : (m, d), m
+        Reference positions, before a map, inside or on the surface of the bodies.  Where bodies touch, a position
+        belongs to the first of them: keep off by a little to have the other.
+    stress
+        Record the effective stress too.
+
+    Raises
+    ------
+    ValueError
+        A position outside the bodies; from the run: other bodies than the scene's, or one that is not there now.
+    """
+    all_of("probes: bodies", bodies, Body, 1)
+    flag("probes: stress", stress)
+    x0 = positions(x0, bodies[0].dim)
+    ids, xi = np.empty(len(x0), dtype=np.int64), np.empty(x0.shape)
+    for i, x in enumerate(x0):  # a handful of positions, once a scene
+        found = next(_domains_at(bodies, x, rounding(x0)), None)
+        if found is None:
+            raise ValueError(f"probe at {x}: outside the bodies, must be in one or on its surface")
+        ids[i], xi[i] = found
+    return Probes(x0, ids, xi, tuple(bodies), stress)
+
+
+def _domains_at(
+    bodies: Sequence[Body], x: NDArray[np.float64], rounded: float
+) -> Iterator[tuple[int, NDArray[np.float64]]]:
+    """Yield the points, in their order, whose domains hold a place x (d,), m, with its coordinates there."""
+    start = 0
+    for body in bodies:
+        for part in in_chunks(len(body)):
+            spacing = body.boxes(part)
+            slack = 1e-9 + 2 * rounded / spacing
+            near = np.flatnonzero((np.abs((x - body.lower_of(part)) / spacing - 0.5) <= 0.5 + slack).all(axis=1))
+            place = coordinates(body.reference(part.start + near), x)
+            for on in np.flatnonzero((np.abs(place) <= 1 + 2 * slack[near]).all(axis=1)):
+                yield start + part.start + int(near[on]), place[on]
+        start += len(body)
+
+
+def coordinates(corners: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the coordinates (n, d), from -1 to 1, of a place x (d,), m, in each of some domains (n, 2^d, d), m."""
+    signs, xi = 2 * corner_bits(len(x)) - 1, np.zeros((len(corners), len(x)))
+    for _ in range(20):  # Newton's method; of parallelepipeds the first step is exact
+        hats = 0.5 * (1 + signs * xi[:, None, :])
+        dN = np.stack([0.5 * signs[:, a] * np.delete(hats, a, axis=2).prod(axis=2) for a in range(len(x))], axis=2)
+        slope, off = np.einsum("nkd,nka->nda", corners, dN), x - interpolate(corners, xi)
+        step = (np.linalg.pinv(slope) @ off[:, :, None])[:, :, 0]  # outside a domain there may be no place
+        xi = np.clip(xi + step, -2.0, 2.0)
+        if np.abs(step).max(initial=0.0) < 1e-14:
+            break
+    return xi

@@ -1,2 +1,0 @@
-# SPDX-License-Identifier: MIT
-"""The two balances, momentum and storage, with their boundaries and stabilisation."""

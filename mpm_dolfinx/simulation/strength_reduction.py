@@ -1,0 +1,356 @@
+# SPDX-License-Identifier: MIT
+"""The factor of safety: by what the strength of soil may be divided before bodies at rest begin to slide.
+
+Cohesion, tensile strength and the tangents of the angles of friction and dilation are divided by a factor F (Griffiths
+and Lane 1999; dilation too, so that associated flow stays associated).  Soil that is too weak has no equilibrium, but a
+solver that finds none says nothing about the soil.  So each trial goes on in time against a viscous stress, and what is
+judged is the overload: the share of the shear stress, where soil moves, that this viscous stress bears.  A body that
+comes to rest hands its load over to the strength of its soil, and the overload dies away.  In a slide it stays: there
+it is what the strength lacks, whatever the viscosity and the size of the cells.
+
+All trials begin from stresses that soil of unlimited strength bears.  Bodies at rest have them: nothing moves when
+yielding ends.  Bodies that have not been run, because they cannot stand, find them in an elastic step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass, fields, replace
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from numpy.typing import NDArray
+from tqdm import tqdm
+from tqdm.contrib.logging import logging_redirect_tqdm
+
+from mpm_dolfinx.base.report import Report
+from mpm_dolfinx.base.validation import flag, line, numbers, whole
+from mpm_dolfinx.materials.frictional import Frictional
+from mpm_dolfinx.materials.skeleton import Skeleton
+from mpm_dolfinx.parallel.exchange import over_all
+from mpm_dolfinx.parallel.messages import log
+from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.simulation.timeloop import run
+from mpm_dolfinx.stepping.result import GaveUp
+from mpm_dolfinx.stepping.scene import Scene
+from mpm_dolfinx.stepping.stages import begin_stage
+from mpm_dolfinx.stepping.state import State
+from mpm_dolfinx.stepping.step import step
+
+if TYPE_CHECKING:
+    from mpm_dolfinx.simulation.simulation import Simulation
+
+WIDER, WIDEST = 2**0.5, 16.1
+"""By how much factors are tried further out until one rests and one slides, and how far from 1 that goes."""
+LACKS = 0.25
+"""Overload up to which a trial rests, over `rtol`.
+
+At once it is 0.9 of what the strength of a uniform block lacks, and 0.6 of that of a slope; in a slide at the end of a
+trial half as much.  With an eighth and a half the slope's factor differs by 1.1 and 0.5 %.
+"""
+STRAINS = 4.0
+"""Strains in a trial of a slide that is just told from rest, in elastic strains at yield; in overloads at most.
+
+Stresses of soil that begins to flow find their new places within a few strains at yield.  In soft soil they would
+change the shape of the body: there the viscosity is larger.  Half and twice as much change the factor of a slope by
+0.5 %, twice the steps by less than 0.1 %.
+"""
+STRENGTHS = ("cohesion", "residual", "hardening", "tension", "friction", "dilation")
+ANGLES = ("friction", "dilation")
+
+
+@dataclass(frozen=True)
+class Safety:
+    """A factor of safety, and how it was found.
+
+    factor
+        Mean of the two bounds.
+    bounds
+        Largest factor at which the bodies came to rest, and smallest at which they did not.
+    overloads
+        Factor -> share of the shear stress that the soil's strength does not bear, in each step of the trial (n,).
+    newton
+        Newton steps of all trials.
+    """
+
+    factor: float
+    bounds: tuple[float, float]
+    overloads: Mapping[float, NDArray[np.float64]]
+    newton: int
+
+
+def factor_of_safety(
+    simulation: Simulation, *, dt: float | None = None, rtol: float = 0.01, steps: int = 10, progress: bool = True
+) -> Safety:
+    """Return by what the strength of soil may be divided before bodies at rest begin to slide.
+
+    The simulation stays what it is.  One that cannot stand need not be run: trials begin where its soil, as if it could
+    not yield, is after a step of dt.  On several processes all call it together.  Suction is in the effective stress,
+    and so counts as strength.  Friction of tools is not divided.
+
+    Parameters
+    ----------
+    simulation
+        Under the loads that act; where they are functions of time, they should no longer change.
+    dt
+        Length of a step, s, > 0: long beside what viscosities of laws and terms need.  It must be given where fluid
+        flows: short for undrained, long for drained failure.
+    rtol
+        Relative distance of the bounds at the end, in [1e-4, 0.5].
+    steps
+        At most so many in a trial, >= 8; who has not come to rest by then slides.
+    progress
+        Show a progress bar on a terminal.
+
+    Raises
+    ------
+    ValueError
+        Naming the argument; soil whose strength is none that can be divided; bodies without stress, that do not slide
+        with a sixteenth of their strength, or that do not come to rest with sixteen times as much.
+    GaveUp
+        A step of a trial that does not converge, however short.
+    """
+    if not isinstance(getattr(simulation, "scene", None), Scene):
+        raise ValueError(f"simulation = {line(simulation)}, must be a Simulation")
+    dt, steps = _step_of(simulation, dt), whole("steps", steps, 8)
+    rtol = float(numbers("rtol", rtol, allowed="in [1e-4, 0.5]", test=lambda v: (1e-4 <= v) & (v <= 0.5)))
+    flag("progress", progress)
+    comm, overloads, least = simulation.grid.comm, {}, LACKS * rtol
+    with _Bar(progress and comm.rank == 0) as bar:
+        weakened = _Weakened(simulation, dt, steps, least)
+
+        def rests(factor: float) -> bool:
+            overloads[factor] = weakened.overloads(factor, lambda *now: bar.show(factor, *now))
+            count, last = len(overloads[factor]), overloads[factor][-1]
+            judged = "rests" if last <= least else "slides"
+            log(comm, "strength over %.4g: %s, overload %.2g in step %d", factor, judged, last, count)
+            bar.tried(factor, judged)
+            return judged == "rests"
+
+        safe, unsafe = _bracket(rests)
+        while unsafe > safe * (1 + rtol):
+            trial = float(np.sqrt(safe * unsafe))
+            safe, unsafe = (trial, unsafe) if rests(trial) else (safe, trial)
+    return Safety((safe + unsafe) / 2, (safe, unsafe), overloads, sum(weakened.newton))
+
+
+class _Bar:
+    """A line on a terminal that tells what has been tried and where the present trial is."""
+
+    def __init__(self, shown: bool):
+        self._bar = tqdm(bar_format="{desc}, {n_fmt} steps, {elapsed}{postfix}", disable=None if shown else True)
+        self._bar.set_description("factor of safety")
+        self._logs = nullcontext() if self._bar.disable else logging_redirect_tqdm()  # messages above the line
+        self._known = {"rests": "", "slides": ""}
+
+    def __enter__(self) -> _Bar:
+        self._logs.__enter__()
+        return self
+
+    def __exit__(self, *raised) -> None:
+        self._logs.__exit__(*raised)
+        self._bar.close()
+
+    def show(self, factor: float, count: int, overload: float) -> None:
+        """Show a step of a trial."""
+        self._bar.update()
+        known = "".join(f", {what} at {at}" for what, at in self._known.items() if at)
+        self._bar.set_postfix_str(f"strength over {factor:.4g}: step {count}, overload {overload:.1e}{known}")
+
+    def tried(self, factor: float, judged: str) -> None:
+        """Note what has become of a trial."""
+        self._known[judged] = f"{factor:.4g}"
+
+
+def _bracket(rests: Callable[[float], bool]) -> tuple[float, float]:
+    """Return a factor with which bodies rest and a larger one with which they slide, one after the other from 1 on."""
+    known, wider = 1.0, WIDER if (begins := rests(1.0)) else 1 / WIDER
+    while 1 / WIDEST <= (trial := known * wider) <= WIDEST:
+        if rests(trial) != begins:
+            return min(known, trial), max(known, trial)
+        known = trial
+    found = "come to rest" if begins else "slide"
+    more = "" if begins else "; what acts on them must not change in time"
+    raise ValueError(f"factor_of_safety: the bodies {found} with strength / {known:.3g}, must not at some factor{more}")
+
+
+def _step_of(simulation: Simulation, dt: float | None) -> float:
+    """Return the length of a step, s."""
+    if dt is None and simulation.scene.flows:
+        raise ValueError("dt is not given, must be where fluid flows: short for undrained, long for drained failure, s")
+    return _positive("dt", 1.0 if dt is None else dt)
+
+
+def _positive(name: str, value: float) -> float:
+    return float(numbers(name, value, allowed="> 0 and finite", test=lambda v: (0 < v) & (v < np.inf)))
+
+
+def _ends(overloads: Sequence[float], steps: int, least: float) -> bool:
+    """Return whether it is known what becomes of a trial, of the overload of each step so far.
+
+    It falls ever more slowly.  So a body slides if it would not come to rest in the steps that are left at the rate of
+    the last one.
+    """
+    *before, last = overloads
+    rate = min(1.0, last / before[-1]) if before else 0.0
+    return last <= least or last * rate ** (steps - len(overloads)) > least
+
+
+@dataclass
+class _Trial:
+    """What the time loop drives; newton: is given the Newton steps of each step."""
+
+    scene: Scene
+    state: State
+    newton: list[int]
+
+    def advanced(self, dt: float) -> tuple[State, Report]:
+        """Return the state after a step of dt, s, and what it took."""
+        state, report = step(self.scene, self.state, dt)
+        self.newton.append(report.newton)
+        return state, report
+
+
+class _Weakened:
+    """The scene of a simulation with strengths on its points, and a viscous stress; see `factor_of_safety`."""
+
+    def __init__(self, simulation: Simulation, dt: float, steps: int, least: float):
+        scene, self._dt, self._steps, self._least = simulation.scene, dt, steps, least
+        for m in scene.materials.materials:
+            if m.state and not isinstance(m, Frictional):
+                what = f"factor_of_safety: strength of {type(m).__name__} is none that can be divided"
+                raise ValueError(f"{what}, must be a law with friction and cohesion")
+        if not any(isinstance(m, Frictional) for m in scene.materials.materials):
+            raise ValueError("factor_of_safety: no material has a strength, must have friction and cohesion")
+        if simulation.state.stage.conditions["contacts"]:
+            raise ValueError("factor_of_safety: contacts: must be none")
+        begun = begin_stage(scene, simulation.state, {}, [], [], False, {})  # free of its grid
+        self._viscosity = viscosity = fem.Constant(scene.grid.mesh, 0.0)  # Pa s
+
+        def resistance(points, u, dt):
+            strain = ufl.sym(points.grad(u))
+            return viscosity / dt * ufl.inner(strain, strain) * points.dx
+
+        materials = [_as_fields(m) for m in scene.materials.materials]
+        options = scene.quadrature, scene.scheme, "backward-euler", scene.gravity is not None, 0.0
+        terms, sources = scene.extensions
+        options = *options, [*terms, resistance], sources, {}  # what initial stresses need the materials have
+        self._scene = Scene(scene.grid, scene.bodies, materials, scene.fluid, *options)
+        self._strengths, self.newton = _strengths(scene, begun.points), []
+        points = replace(begun.points, data={**begun.points.data, **self._strengths})
+        begun = begin_stage(self._scene, replace(begun, points=points), {}, [], [], False, {})
+        self._start = self._unyielding(begun)
+        stress, modulus = _mean_stress(self._scene, self._start.points), _shear_modulus(self._scene, self._start.points)
+        self._viscosity.value = steps / STRAINS * max(least * modulus, stress) * dt
+
+    def overloads(self, factor: float, tell: Callable[[int, float], None]) -> NDArray[np.float64]:
+        """Return the overload of each step (n,), until it is known what becomes of it; tell: called with each."""
+        trial, out = self._trial(self._start, lambda name, value: _over(name, value, factor)), []
+        while len(out) < self._steps and not (out and _ends(out, self._steps, self._least)):
+            before = trial.state.points
+            self._go_on(trial, f"strength / {factor:g}")
+            out.append(self._overload(before, trial.state.points))
+            tell(len(out), out[-1])
+        return np.array(out)
+
+    def _unyielding(self, begun: State) -> State:
+        """Return the state after a step of soil that does not yield below strains of one."""
+        moduli = self._scene.materials.table(begun.points, lambda m: m.oedometric)
+        trial = self._trial(begun, lambda name, value: value if name in ANGLES else np.maximum(value, moduli))
+        self._go_on(trial, "soil that cannot yield")
+        return replace(trial.state, t=begun.t)
+
+    def _trial(self, start: State, strength: Callable[[str, NDArray[np.float64]], NDArray[np.float64]]) -> _Trial:
+        """Return a trial from a state on, with other strengths of its points."""
+        data = {name: strength(name, value) for name, value in self._strengths.items()}
+        points = replace(start.points, data={**start.points.data, **data})
+        return _Trial(self._scene, replace(start, points=points, velocity=None, result=None), self.newton)
+
+    def _go_on(self, trial: _Trial, what: str) -> None:
+        """Take a step; what: names the strength."""
+        try:
+            run(trial, trial.state.t + self._dt, self._dt, progress=False)
+        except GaveUp as error:
+            raise GaveUp(f"factor_of_safety: {what}: {error}", error.result, error.history) from error
+
+    def _overload(self, before: MaterialPoints, now: MaterialPoints) -> float:
+        """Return the work of the viscous stress in a step over that of the shear stress, both in size.
+
+        Points that have gone to another process are left out.
+        """
+        _, old, new = np.intersect1d(before.id, now.id, assume_unique=True, return_indices=True)
+        d = before.F.shape[1]
+        increment = now.F[new] @ np.linalg.inv(before.F[old]) - np.eye(d)
+        strain = np.pad((increment + increment.transpose(0, 2, 1)) / 2, ((0, 0), (0, 3 - d), (0, 3 - d)))
+        stress = self._scene.materials.effective_stress_3d(now)[new]
+        volume, size = (now.volume0 * now.J)[new], partial(np.linalg.norm, axis=(1, 2))
+        viscous = 2 * float(self._viscosity.value) / self._dt * size(strain) ** 2
+        work = np.array([volume @ viscous, volume @ (size(_deviator(stress)) * size(_deviator(strain)))])
+        borne, whole_work = over_all(self._scene.grid.comm, work)
+        return float(borne / whole_work) if borne > 0 else 0.0
+
+
+def _deviator(tensors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the deviators of tensors (n, 3, 3)."""
+    return tensors - np.trace(tensors, axis1=1, axis2=2)[:, None, None] / 3 * np.eye(3)
+
+
+def _mean_stress(scene: Scene, points: MaterialPoints) -> float:
+    """Return the mean size of the effective stress, Pa; refuse one that rounding of coordinates has made."""
+    grid = scene.grid
+    size = np.linalg.norm(scene.materials.effective_stress_3d(points), axis=(1, 2))
+    moduli, volume = scene.materials.table(points, lambda m: m.oedometric), points.volume0 * points.J
+    far = np.abs([grid.lower, grid.upper]).max() / grid.h.min()
+    sums = np.array([size @ volume, np.finfo(float).eps * far * moduli @ volume, volume.sum()])
+    total, rounding, whole_volume = over_all(grid.comm, sums)
+    if not total > rounding:
+        raise ValueError("factor_of_safety: the bodies have no stress, must be at rest under what acts on them")
+    return float(total / whole_volume)
+
+
+def _shear_modulus(scene: Scene, points: MaterialPoints) -> float:
+    """Return the harmonic mean of the shear moduli of soil with a strength, Pa: the soft soil is what flows."""
+    softness = scene.materials.table(points, lambda m: 1 / m.shear if isinstance(m, Frictional) else 0 * m.shear)
+    volume = points.volume0 * points.J
+    total, whole_volume = over_all(scene.grid.comm, np.array([softness @ volume, (softness > 0) @ volume]))
+    return float(whole_volume / total)
+
+
+def _of(m: Skeleton) -> list[str]:
+    """Return the names of a material's constants that are divided."""
+    if not isinstance(m, Frictional):
+        return []
+    own = {f.name for f in fields(m)} & set(STRENGTHS)
+    return [name for name in STRENGTHS if name in own and (callable(v := getattr(m, name)) or np.isfinite(v))]
+
+
+def _as_fields(m: Skeleton) -> Skeleton:
+    """Return a material whose strengths are carried by its points."""
+    carried = {name: partial(_constant, value=getattr(m, name)) for name in _of(m) if not callable(getattr(m, name))}
+    if isinstance(m, Frictional) and m.symmetric:
+        carried |= {"dilation": carried.get("friction", m.friction)}
+    return replace(m, **carried)
+
+
+def _constant(X: NDArray[np.float64], value: float) -> NDArray[np.float64]:
+    return np.full(len(X), value)
+
+
+def _strengths(scene: Scene, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
+    """Return the strengths of the points, name -> (n,), zero where a material has none of the name."""
+    out = {}
+    for i, m in enumerate(scene.materials.materials):
+        rows = np.flatnonzero(points.material == i)
+        for name in _of(m):
+            own = getattr(m, name)
+            out.setdefault(name, np.zeros(len(points)))[rows] = points.data[name][rows] if callable(own) else own
+    return out
+
+
+def _over(name: str, value: NDArray[np.float64], factor: float) -> NDArray[np.float64]:
+    """Return a strength over a factor."""
+    return np.degrees(np.arctan(np.tan(np.radians(value)) / factor)) if name in ANGLES else value / factor

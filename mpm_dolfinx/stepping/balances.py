@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: MIT
+"""The start of a step, and the two balances at the end of each of its substeps."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from mpi4py import MPI
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpm_dolfinx.flow.storage import Rates, StorageProblem
+from mpm_dolfinx.mechanics.momentum import MomentumProblem
+from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
+from mpm_dolfinx.mechanics.side_forms import SideData
+from mpm_dolfinx.parallel.exchange import over_all
+from mpm_dolfinx.stepping.on_grid import Assembled, OnGrid
+from mpm_dolfinx.stepping.scene import Scene
+from mpm_dolfinx.stepping.state import State
+from mpm_dolfinx.stepping.time_integration import Substep
+
+
+class Acting(NamedTuple):
+    """What acts in a substep: its shares of the step, time, s, sides, and gravity (d,), m/s^2, if there is any."""
+
+    substep: Substep
+    t: float
+    sides: SideData
+    gravity: NDArray[np.float64] | None
+
+
+class Start(NamedTuple):
+    """The start of a step of dt (s): the state on the grid, with the pieces' data, matrices, and what acts.
+
+    yielded: whether soil has yielded before, on any process.
+    """
+
+    state: State
+    on_grid: OnGrid
+    data: QuadratureData
+    matrices: Assembled
+    dt: float
+    yielded: bool
+    acting: list[Acting]
+
+
+class Balances(NamedTuple):
+    """The two balances at the end of a substep; storage is None without fluid."""
+
+    momentum: MomentumProblem
+    storage: StorageProblem | None
+
+    def outcome(self, state: State, acting: Acting) -> dict[str, NDArray[np.float64]]:
+        """Return what acts between the bodies and what holds or drains them at the end of a step, see `State`."""
+        stage, storage, forms = state.stage, self.storage, self.momentum.forms
+        return {
+            "reactions": stage.mechanical.reactions(acting.sides, forms.nodal),
+            "walls": self.momentum.wall_forces(stage.conditions["fixed"]),
+            "outflows": storage.outflows(len(stage.hydraulic.outlets)) if storage else state.outflows,
+        }
+
+    def came(self, rates: Rates | None) -> NDArray[np.float64] | None:
+        """Return what came to the cells in the step, see `StorageProblem.came`; None without fluid."""
+        return self.storage and self.storage.came(rates)
+
+
+def at_rest(scene: Scene, state: State, sides: list[SideData]) -> list[SideData]:
+    """Return what acts on sides in each substep, what holds them with its forces of an initial stress at rest."""
+    if state.rest is None:
+        return sides
+    scene.momentum.u.x.array[:] = state.rest
+    return [of.moved(scene.momentum.u) for of in sides]
+
+
+def going_on(scene: Scene, start: Start, substep: Substep) -> NDArray[np.float64] | None:
+    """Return displacements (unknowns,), m, if bodies that yield moved on as in the substep before, or the last step.
+
+    A local array, None where that is not known.
+    """
+    if substep.before > 0.0 and not scene.momentum.elastic:
+        return substep.end / substep.own * scene.momentum.u.x.array
+    velocity = start.state.velocity if substep.before == 0.0 else None
+    return None if velocity is None else substep.end * start.dt * velocity
+
+
+def has_yielded(scene: Scene, state: State) -> bool:
+    """Return whether soil has yielded before, on any process."""
+    if scene.momentum.elastic:
+        return False
+    evolved = bool(scene.materials.evolved(state.points).any())
+    return over_all(scene.grid.comm, evolved, MPI.LOR)
+
+
+def balances(scene: Scene, start: Start, acting: Acting, before: Rates | None = None) -> Balances:
+    """Return the balances at the end of a substep, with u and p as they are; before: rates of the substep before."""
+    substep, on_grid, matrices, dt = acting.substep, start.on_grid, start.matrices, start.dt
+    scene.set_time(acting.t, substep.end * dt, acting.gravity)
+    scene.momentum.set_rate(substep.own * dt, substep.before / substep.own)
+    forces = scene.scheme.tolerance, going_on(scene, start, substep), start.state.held
+    momentum = MomentumProblem(scene.momentum, matrices.momentum, start.data, acting.sides, *forces, start.yielded)
+    if scene.storage is None:
+        return Balances(momentum, None)
+    weight = None if acting.gravity is None else scene.fluid.density * acting.gravity
+    flow = matrices.flow(start.state, weight, start.data, acting.t)
+    lost = before and before.taken(substep.before * dt)
+    carried = on_grid.softness(start.state), substep.end * on_grid.due(start.state)
+    options = (on_grid.contents, flow, substep.own * dt, lost, *carried)
+    return Balances(momentum, StorageProblem(scene.storage, matrices.storage, start.data.pieces, *options))

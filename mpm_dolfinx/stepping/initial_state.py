@@ -1,0 +1,185 @@
+# SPDX-License-Identifier: MIT
+"""The state in which a scene begins: stresses and pore pressures as seeded, in balance with what acts on the bodies.
+
+What is out of balance, as stresses are given, or by the scheme's own error, steps of the momentum at fixed pressures
+take up: their deformation goes into the elastic strain of the points, which stay where they are, until nothing is left
+that a step would move.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from itertools import pairwise
+
+from mpi4py import MPI
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpm_dolfinx.base.errors import StepFailed
+from mpm_dolfinx.base.fluid_content import mass_potential, pressure_of
+from mpm_dolfinx.base.report import Report
+from mpm_dolfinx.bodies.bodies import pressure_at
+from mpm_dolfinx.domains.pressure_transport import PiecePressures
+from mpm_dolfinx.forms.unknowns import Unknowns
+from mpm_dolfinx.materials.initial_stress import strained
+from mpm_dolfinx.mechanics.momentum import MomentumProblem
+from mpm_dolfinx.parallel.exchange import over_all
+from mpm_dolfinx.parallel.messages import log, warn
+from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.solve.newton import solve_substep
+from mpm_dolfinx.solve.schur import LinearSolvers
+from mpm_dolfinx.stepping.balances import Start
+from mpm_dolfinx.stepping.scene import Scene
+from mpm_dolfinx.stepping.state import State, Stay
+from mpm_dolfinx.stepping.step import set_up
+
+DEPTH, PATIENCE, LESS = 40, 16, 0.7
+"""Iterations that are mixed; the iteration ends where so many do not bring what is left down to this share.
+
+A wet bank, its law elastic or frictional, blocks on a rough base, a half held one: forces left 4e-5 to 3e-9 with 40 and
+16 and with 80 and 24, in as many iterations; with 40 and 8 up to 6e-3.
+"""
+NEVER = 1e30  # s: time of a step, in which nothing has a rate
+REMARKABLE = 0.05
+"""Share of the largest given stress by which the balance changes stresses, from which on a warning says so.
+
+Also the share of the forces that may be left out of balance, as the scheme's error.
+"""
+
+
+def pieces_at_start(scene: Scene, points: MaterialPoints) -> PiecePressures:
+    """Return what pieces of domains carry of a field of pressure, by which cells have that of their centroids."""
+    on_grid, grid, pressure = scene.on_grid(points), scene.grid, scene.initial.pressure
+    cut, contents, bulk = on_grid.cut, on_grid.contents, scene.fluid.bulk
+    pi = mass_potential(cut.pieces_to_cells(pressure_at(pressure, cut.pieces.x)), bulk)  # which adds up in a cell
+    store = on_grid.weight * on_grid.data.pieces["storage"][:, 0]
+    held = contents.total(cut.cells, store)
+    weight = np.where(held[contents.slot(cut.cells)] > 0, store, on_grid.weight)
+    mean = contents.total(cut.cells, weight * pi) / contents.total(cut.cells, weight)
+    wanted = pressure_at(pressure, grid.midpoints[contents.filled] + contents.centroid[contents.filled])
+    pi = pi + (mass_potential(wanted, bulk) - mean)[contents.slot(cut.cells)]
+    p = cut.to_pieces(pressure_of(pi, bulk))
+    pieces, bounds = cut.pieces, np.stack([p, p], axis=1)
+    return PiecePressures(points.id[pieces.point], pieces.cell, pieces.fraction, p, pieces.x, 0 * pieces.x, bounds)
+
+
+def balanced(scene: Scene, state: State) -> State:
+    """Return a state whose stresses are in balance with what acts at its time, at its pore pressures.
+
+    A step's displacement of the grid, w, is balanced with the strains of pieces; points keep the mean of their domains.
+    So the steps are a fixed-point iteration, w <- w + u(w), here with Anderson's mixing (Walker and Ni 2011).  Where
+    means cannot balance all nodes forces hold the rest: `State.held`.  What holds sides has the force of giving way by
+    w, `State.rest`: it holds them where they are seeded, whatever a condition gives at the start.
+
+    Raises
+    ------
+    ValueError
+        There is no such balance that the laws can bear.
+    """
+    forms, materials, mechanical = scene.momentum, scene.materials, state.stage.mechanical
+    try:
+        start = set_up(scene, state, 0.0)
+        seeded = replace(start.state, stay=_stay(scene, start))
+        if scene.storage is not None:  # those that a step leaves
+            pressure = scene.motion.pressures(start.on_grid, state.stage, state.t)
+            seeded = replace(seeded, points=replace(seeded.points, pressure=pressure))
+        unknowns, best, count = start.matrices.momentum.unknowns, (np.inf, 0), 0
+        solvers, report = LinearSolvers(scene.scheme, start.matrices.momentum, None, start.matrices.symmetric), Report()
+        seen, w, points = [], np.zeros_like(forms.u.x.array), seeded.points
+        while count - best[1] < PATIENCE:
+            forms.u.x.array[:] = w
+            start = _placed(scene, start, replace(seeded, points=points))
+            problem = _problem(scene, start, replace(seeded, points=points))
+            residual, scale = problem.assemble_residual()
+            left = residual.norm() / max(scale, start.matrices.round_off)
+            if left < LESS * best[0]:
+                unknowns.add(forms.u, 1.0, residual)
+                held, forms.u.x.array[:] = forms.u.x.array.copy(), 0.0
+                best = left, count, points, held, w, mechanical.reactions(start.acting[-1].sides, forms.nodal)
+            if left <= scene.scheme.tolerance:
+                break
+            solve_substep(solvers, problem, None, partial(start.on_grid.as_reset, seeded), count, report)
+            if mechanical.touches:
+                _, touched = mechanical.touched(start.acting[-1].sides, unknowns, forms.u.x.array, seeded.points)
+                seeded = replace(seeded, points=touched)
+            seen = [*seen[-DEPTH:], (w, forms.u.x.array.copy())]
+            w, count = _mixed(unknowns, seen), count + 1
+            forms.u.x.array[:] = w
+            forms.internal(start.data)  # mean dilatations are those of w
+            points = strained(materials, seeded.points, scene.motion.strained(seeded.points, start.on_grid, start.data))
+    except StepFailed as error:
+        scene.forget()
+        raise ValueError(f"initial_stress: must be in balance with what acts at the start: {error}") from error
+    left, count, points, held, rest, reactions = best
+    _told(scene, seeded, points, count, left)
+    rest = _rest(scene, start, rest) if mechanical.holds_sides else None
+    return replace(start.state, points=points, held=held, rest=rest, reactions=reactions)
+
+
+def _told(scene: Scene, seeded: State, points: MaterialPoints, count: int, left: float) -> None:
+    """Log what the balance has changed; refuse one that leaves too large a share of the forces.
+
+    What tools and groups in contact bear is found in the first step: there a warning tells the share.
+    """
+    materials, comm = scene.materials, scene.grid.comm
+    if left > REMARKABLE and not seeded.stage.mechanical.touches:
+        scene.forget()
+        what = "initial_stress: must be in balance with what acts at the start, and with what holds the bodies"
+        raise ValueError(f"{what}: {100 * left:.2g} % of the forces are left")
+    before, after = (np.nan_to_num(materials.effective_stress_3d(of)) for of in (seeded.points, points))
+    largest, changed = (over_all(comm, float(np.abs(v).max(initial=0.0)), MPI.MAX) for v in (before, after - before))
+    what = "initial_stress: in balance after %d iterations, changed by at most %.3g of %.3g Pa; %.2g of its forces held"
+    tell = warn if changed > REMARKABLE * largest or left > REMARKABLE else log
+    tell(comm, what, count, changed, largest, left)
+
+
+def _rest(scene: Scene, start: Start, w: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return a displacement of the nodes, m, zero but in the cells of sides that are held; a local array."""
+    sides, forms = start.acting[-1].sides, scene.momentum
+    cells = [of.cells for of in (sides.holds, sides.plates) if of is not None]
+    nodes = forms.active_nodes(np.unique(np.concatenate(cells)))
+    return np.where(np.repeat(nodes, scene.grid.dim), w, 0.0)
+
+
+def _placed(scene: Scene, start: Start, state: State) -> Start:
+    """Return the start with what acts on the sides of points that are as strained as after u."""
+    mechanical, acting = state.stage.mechanical, start.acting[-1]
+    if not (mechanical.touches or mechanical.holds_sides):
+        return start
+    place = scene.momentum.sides, start.on_grid.cut, (state.t, 0.0), state.tool_travel, state.t, state.points
+    sides = mechanical.data(*place).moved(scene.momentum.u)
+    return start._replace(acting=[acting._replace(sides=sides)])
+
+
+def _problem(scene: Scene, start: Start, state: State) -> MomentumProblem:
+    """Return the balance of momentum of points where they are, at no displacement and without any rate."""
+    acting, matrices = start.acting[-1], start.matrices
+    scene.set_time(state.t, NEVER, acting.gravity)
+    scene.momentum.set_rate(NEVER, 0.0)
+    scene.momentum.u.x.array[:] = 0.0
+    data = start.on_grid.data_of(state)
+    return MomentumProblem(scene.momentum, matrices.momentum, data, acting.sides, scene.scheme.tolerance)
+
+
+def _stay(scene: Scene, start: Start) -> Stay:
+    """Return what holds of a reset since which nothing has moved."""
+    cut, p = start.on_grid.cut, None
+    if scene.storage is None:
+        return Stay(cut.points, None, None, None, None)
+    p = cut.to_pieces(scene.storage.p_n.x.array[start.data.pieces.cells])
+    return Stay(cut.points, cut.points.id[cut.pieces.point], p, cut.pieces.x, p)
+
+
+def _mixed(unknowns: Unknowns, seen: Sequence[tuple[NDArray, NDArray]]) -> NDArray[np.float64]:
+    """Return the next displacement of a fixed-point iteration, from those seen and their steps; local arrays, m."""
+    (w, u), owned = seen[-1], unknowns.owned
+    if len(seen) == 1:
+        return w + u
+    dw, du = (np.stack([b - a for a, b in pairwise(values)]) for values in zip(*seen, strict=True))
+    rows = du[:, owned]
+    sums = over_all(unknowns.comm, np.column_stack([rows @ rows.T, rows @ u[owned]]))
+    share = np.linalg.lstsq(sums[:, :-1], sums[:, -1], rcond=1e-14)[0]
+    return w + u - share @ (dw + du)

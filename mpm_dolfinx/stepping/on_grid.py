@@ -1,0 +1,492 @@
+# SPDX-License-Identifier: MIT
+"""What a reset of the grid makes: bodies cut by the cells, the active set, matrices that stay while a cut serves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cached_property, partial
+
+from mpi4py import MPI
+
+import numpy as np
+from dolfinx.common import Timer
+from numpy.typing import NDArray
+
+from mpm_dolfinx.base.caching import Keyed, Latest
+from mpm_dolfinx.base.fluid_content import mass_potential, pressure_of
+from mpm_dolfinx.diagnostics.scene_checks import check_held
+from mpm_dolfinx.domains.cut_domains import CutDomains
+from mpm_dolfinx.domains.pressure_transport import CellPressures, Reconstruction, share_within, transport
+from mpm_dolfinx.flow.fluxes import CellContents, CellMotion, Conduction, Mobility, OpenSides, PieceContents
+from mpm_dolfinx.flow.layers import graded, mixed_cells
+from mpm_dolfinx.flow.nonorthogonal import Gradients, off_facets
+from mpm_dolfinx.flow.storage import Outflow, StorageForms, StorageSystem
+from mpm_dolfinx.forms.unknowns import collect_garbage
+from mpm_dolfinx.grid.grid import sum_by
+from mpm_dolfinx.mechanics.ghost_penalty import stiffness
+from mpm_dolfinx.mechanics.momentum import MomentumForms, MomentumSystem
+from mpm_dolfinx.mechanics.quadrature_data import QuadratureData, QuadraturePoints
+from mpm_dolfinx.mechanics.side_forms import SideData
+from mpm_dolfinx.parallel.exchange import over_all
+from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.points.parts import parts_of_cells
+from mpm_dolfinx.solve.scheme import Scheme
+from mpm_dolfinx.solve.schur import LinearSolvers
+from mpm_dolfinx.stepping.stage import Stage
+from mpm_dolfinx.stepping.state import State
+
+AtPlaces = Callable[[NDArray[np.integer], NDArray[np.float64]], NDArray[np.float64]]
+"""Returns values (m,) at places (m, d), m, in local cells (m,)."""
+
+
+class OnGrid(Keyed):
+    """The bodies on the grid since it was reset.
+
+    Parameters
+    ----------
+    quadrature
+        Points of integration of the scene.
+    momentum, storage
+        Forms, whose coefficients are set to what the cells hold; storage is None without fluid.
+    cut
+        The domains of the points, cut.
+    of_fluid
+        Whether beta is 1/K_w, see `Scheme`.
+    """
+
+    def __init__(
+        self,
+        quadrature: QuadraturePoints,
+        momentum: MomentumForms,
+        storage: StorageForms | None,
+        cut: CutDomains,
+        of_fluid: bool,
+    ):
+        grid, points, self.cut, self._quadrature, self._storage = cut.grid, cut.points, cut, quadrature, storage
+        self._places = quadrature.places(cut)
+        self.data = quadrature.data(cut, self._places, points)
+        """The pieces when the grid was reset."""
+        pieces = self.data.pieces
+        self.weight = weight = pieces["weight"][:, 0] * grid.cell_volume
+        """Volumes (m,) of the pieces, m^d."""
+        area, x = cut.plane(weight)
+        scales = stiffness, lambda m: m.shear if m.state else 0.0  # what never yields is firm enough
+        moduli = [area * quadrature.rows(cut, points, scale) for scale in scales]
+        momentum.ghost.set_contents(*(sum_by(cut.cells, rows, grid.num_local) for rows in (area, *moduli)))
+        self.active = momentum.ghost.fill.x.array > 0
+        """Which local cells hold something, ghosts included."""
+        self.cells = np.flatnonzero(self.active)
+        self.facets = grid.interior_facets(self.active, self.cells)
+        """Faces of this process between two active cells."""
+        self.penalised = momentum.ghost.facets(self.facets)
+        """Those of nearly empty cells."""
+        rows = quadrature.rows(cut, points, lambda m: m.oedometric) * grid.around(cut.x)
+        self.stiffness = np.zeros(grid.num_local)
+        """Largest oedometric modulus in each local cell, Pa; in axisymmetry times the length of its ring, N/m."""
+        np.maximum.at(self.stiffness, cut.cells, rows)
+        self.contents, self._mixed = None, None
+        if storage is not None:
+            brought = PieceContents(
+                cells=cut.cells,
+                weight=weight,
+                area=area,
+                x=x,
+                faces=cut.pieces_to_cells(cut.pieces.faces),
+                fixed_stress=quadrature.fixed_stress(cut, points, of_fluid),
+                damping=quadrature.rows(cut, points, lambda m: m.pressure_damping()),
+            )
+            self.contents = CellContents(storage.fluxes, brought, self.cells[self.cells < grid.num_owned])
+            if quadrature.layered:
+                self._mixed = mixed_cells(cut, quadrature.conducting(cut), self.contents)
+
+    def data_of(self, state: State) -> QuadratureData:
+        """Return the pieces with what the points, which have hardly moved since, carry now."""
+        if not state.stay:
+            return self.data
+        with Timer("mpm: integration data"):
+            return self._quadrature.data(self.cut, self._places, state.points)
+
+    def start(self, state: State) -> None:
+        """Set the pressures at the start of a step."""
+        if self._storage is None:
+            return
+        with Timer("mpm: remap"):
+            p_n = self._storage.p_n.x
+            p_n.array[self.contents.filled] = self.pressures(state)
+            p_n.scatter_forward()
+        self._storage.p.x.array[:] = p_n.array
+
+    def pressures(self, state: State) -> NDArray[np.float64]:
+        """Return the pressures of the filled owned cells at the start of a step, Pa."""
+        if not state.stays:
+            bulk = self._storage.bulk
+            carried = transport(state.transported.potentials(bulk), self.cut.points, self.cut.pieces)
+            if state.stay:
+                carried = mass_potential(self.of_pieces(state, "pressure", pressure_of(carried, bulk)), bulk)
+            return pressure_of(self._means(carried), bulk)
+        p = np.zeros(self.cut.grid.num_local)
+        p[self.cut.cells] = self.cut.pieces_to_cells(state.stay.pressure)
+        return p[self.contents.filled]
+
+    def of_pieces(self, state: State, name: str, fresh: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return what pieces have of the state's stay by this name, fresh (m, ...) where there is none."""
+        return state.stay.of_pieces(name, fresh, self.cut.pieces.point) if state.stay else fresh
+
+    def as_reset(self, state: State) -> QuadratureData:
+        """Return the pieces when the grid was reset, and set the present pressures to those of then."""
+        if self._storage is not None:
+            if state.stay:
+                self.set_pressures(self.of_pieces(state, "start", self.pressures_of_pieces()))
+            self._storage.p.x.array[:] = self._storage.p_n.x.array
+        return self.data
+
+    def pressures_of_pieces(self) -> NDArray[np.float64]:
+        """Return the pressures (m,), Pa, at the start of a step of the cells that pieces lie in."""
+        return self.cut.to_pieces(self._storage.p_n.x.array[self.cut.cells])
+
+    def set_pressures(self, at_pieces: NDArray[np.float64]) -> None:
+        """Set the pressures at the start of a step to those (m,), Pa, that pieces have of their cells."""
+        p_n = self._storage.p_n.x
+        p_n.array[self.cut.cells] = self.cut.pieces_to_cells(at_pieces)
+        p_n.scatter_forward()
+
+    def _means(self, at_pieces: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the means in the filled owned cells of the potentials (m,), Pa, that pieces bring to them.
+
+        By what is stored, or by volume in a cell that stores nothing.
+        """
+        contents, cells = self.contents, self.cut.cells
+        potential, store = self.cut.pieces_to_cells(at_pieces), self.weight * self.data.pieces["storage"][:, 0]
+        held, mean = contents.total(cells, store), contents.mean(potential)
+        return np.divide(contents.total(cells, store * potential), held, out=mean, where=held > 0)
+
+    def pressures_at_pieces(
+        self, reconstruction: Reconstruction, store: NDArray[np.float64], stage: Stage, t: float
+    ) -> list[NDArray[np.float64]]:
+        """Return the pressures (m,), their slopes (m, d) and bounds (m, 2) at the pieces, as `set_pressures` has set.
+
+        The mean of their mass potentials in a cell is the cell's: by `store` (m,), m^d/Pa, what the pieces store, or by
+        their volumes in a cell that stores nothing.  t, s: time at which drained sides have their pressures.
+        """
+        pieces, contents, bulk = self.data.pieces, self.contents, self._storage.bulk
+        pi = mass_potential(self._storage.p_n.x.array, bulk)
+        cells, offset, at = pieces.cells, pieces.places.offset, contents.slot(pieces.cells)
+        store = self.cut.pieces_to_cells(store)
+        weight = np.where(contents.total(cells, store)[at] > 0, store, self.weight)
+        total = contents.total(cells, weight)
+        origin = np.stack([contents.total(cells, weight * x) / total for x in offset.T], axis=1)
+        slope, bounds = reconstruction(self._cell_pressures(pi, stage, t, bulk), origin)
+        rise, here = np.einsum("md,md->m", slope[at], offset - origin[at]), pi[contents.filled]
+        share = share_within(rise, *(bounds.T - here), at)  # drained sides may be aslant in their cells
+        pi = pi[cells] + share[at] * rise
+        slope = (slope * share[:, None])[at] / (1 + pi / bulk)[:, None]
+        values = pressure_of(pi, bulk), slope, pressure_of(bounds, bulk)[at]
+        return [self.cut.to_pieces(rows) for rows in values]
+
+    def softness(self, state: State) -> NDArray[np.float64] | float:
+        """Return by how much the pieces (m,) are softer than elastic ones at the start of the step."""
+        data = state.points.data
+        return self.cut.to_cells(data["softness"]) if "softness" in data else 1.0
+
+    def due(self, state: State) -> NDArray[np.float64]:
+        """Return what the filled owned cells take in of what is owed to their points in a step, m^d."""
+        cut, due = self.cut, state.points.volume0 * state.points.data["due"]
+        share = cut.pieces_to_cells(cut.pieces.fraction * due[cut.pieces.point])
+        return self.contents.total(cut.cells, self.data.pieces["biot"][:, 0] * share)
+
+    def pressures_up_to_surface(
+        self, reconstruction: Reconstruction, stage: Stage, t: float, at_rest: AtPlaces | None = None
+    ) -> NDArray[np.float64]:
+        """Return the pressures (m,), Pa, at the pieces' centroids; their mean by volume in a cell is the cell's.
+
+        What is reconstructed is what they differ by from those at rest: at sealed sides nothing flows.
+        In axisymmetry centroids and mean are those in the plane.
+
+        t, s: time at which drained sides have their pressures; at_rest: pressures of the fluid at rest, where it flows.
+        """
+        places, seen = self._places.pieces, self._cell_pressures(self._storage.p.x.array, stage, t, at_rest=at_rest)
+        x, middle = self.cut.plane(self.weight)[1], self.cut.grid.midpoints[self.cut.cells]
+        pressures = reconstruction.up_to_surface(seen, x - middle, places.slots)
+        if at_rest is not None:
+            pressures = pressures + at_rest(self.cut.cells, x)
+        return self.cut.to_pieces(pressures)
+
+    def _cell_pressures(
+        self,
+        p: NDArray[np.float64],
+        stage: Stage,
+        t: float,
+        bulk: float = np.inf,
+        at_rest: AtPlaces | None = None,
+    ) -> CellPressures:
+        """Return what slopes of cells with these pressures, or mass potentials by `bulk` (Pa), are drawn from.
+
+        at_rest: pressures of the fluid at rest, from which these then are the differences.
+        """
+        contents = self.contents
+        sides = stage.hydraulic.data(self.cut, self.cut.points, contents, t)
+        sides = replace(sides, pressure=mass_potential(sides.pressure, bulk))
+        if at_rest is not None:
+            x = self.cut.grid.midpoints + contents.centroid
+            p = p - at_rest(np.arange(len(x)), x)
+            sides = replace(sides, pressure=sides.pressure - at_rest(sides.cells, x[sides.cells] + sides.reach))
+        outer = sides.ahead(contents.slot(sides.cells), p[contents.filled])
+        return CellPressures(contents.filled, p, contents.centroid, contents.open, outer)
+
+    def mobility(self, data: QuadratureData, begins: bool) -> Mobility:
+        """Return the mobility of the filled owned cells at u; begins: refuse for good what is none."""
+        at_pieces = self._quadrature.mobility(self.cut, self._storage.conductivity, data.pieces, begins)
+        mean, share = self.contents.mean(at_pieces), None
+        if self._storage.conductivity is not None:
+            share = graded(self.contents, self._places.pieces.offset, at_pieces, mean)
+        return Mobility(mean, share) if self._mixed is None else self._mixed.mobility(at_pieces, mean, share)
+
+    def resting_mobility(self) -> Mobility:
+        """Return the conductivities, m/s, of the filled owned cells as laws of the deformation and pressure have them
+        at rest.
+        """
+        at_pieces = self._quadrature.rows(self.cut, self.cut.points, lambda m: m.conductivity)
+        mean = self.contents.mean(at_pieces)
+        return Mobility(mean) if self._mixed is None else self._mixed.mobility(at_pieces, mean, None)
+
+    def rests(self, state: State) -> NDArray[np.int64] | None:
+        """Return the filled owned cells all points of which stay as they were cut; None where none does."""
+        if not state.stay:
+            return None
+        moves = self.cut.to_cells(~state.stay.keeps).astype(float)
+        return np.flatnonzero(self.contents.total(self.cut.cells, moves) == 0)
+
+    def serves(self, points: MaterialPoints) -> NDArray[np.bool_]:
+        """Return which points (n,) stay where they were cut: those of parts that hardly move, of all groups at once."""
+        all_of_them = self.cut.serves(points, np.zeros(len(points), dtype=np.int64), 1)[0]
+        if all_of_them or self.cut.grid.copies > 1:
+            return np.full(len(points), all_of_them)
+        part, count = self.parts
+        return self.cut.serves(points, part, count)[part]
+
+    @cached_property
+    def parts(self) -> tuple[NDArray[np.int64], int]:
+        """Which of the parts that hang together, from 0, each point belongs to (n,), and how many there are.
+
+        A part has unknowns of its own: what happens in another one it does not see.
+        """
+        part, count = parts_of_cells(self.cut.grid, self.active)
+        out = np.zeros(len(self.cut.points), dtype=np.int64)
+        out[self.cut.pieces.point] = self.cut.to_pieces(part[self.cut.cells] - 1)
+        return out, count
+
+    @property
+    def active_cells(self) -> int:
+        """Number of active cells of all processes."""
+        grid = self.cut.grid
+        return int(grid.comm.allreduce(int(self.active[: grid.num_owned].sum())))
+
+
+class System:
+    """Vectors, matrices and solvers of one active set, complete when made.
+
+    Parameters
+    ----------
+    momentum, storage
+        Compiled forms; storage is None without fluid.
+    scheme
+        How they are coupled.
+    on_grid
+        The bodies on the grid.
+    dofs, nodes
+        Unrolled local unknowns of the displacement, and active nodes.
+    stiff
+        Whether sides have plates or given displacements.
+    symmetric
+        Whether the momentum's tangent is.
+    """
+
+    def __init__(
+        self,
+        momentum: MomentumForms,
+        storage: StorageForms | None,
+        scheme: Scheme,
+        on_grid: OnGrid,
+        dofs: NDArray[np.int64],
+        nodes: NDArray[np.int64],
+        stiff: bool,
+        symmetric: bool,
+    ):
+        self._scheme, self.symmetric, self.storage = scheme, symmetric, None
+        own, parts = on_grid.cells[on_grid.cells < momentum.grid.num_owned], momentum.parts(on_grid.active)
+        self.momentum = MomentumSystem(momentum, dofs, nodes, own, on_grid.penalised, stiff, parts)
+        if storage is not None:
+            unknowns = self.momentum.unknowns
+            self.storage = StorageSystem(storage, on_grid.cells, on_grid.facets, unknowns, parts)
+        self._solvers: Latest[LinearSolvers] = Latest()
+
+    def solvers(self) -> LinearSolvers:
+        """Return the solvers at the start of a step."""
+        make = (self._scheme, self.momentum, self.storage, self.symmetric)
+        solvers = self._solvers((), lambda: LinearSolvers(*make))
+        solvers.begin()
+        return solvers
+
+    def end_step(self) -> None:
+        """Drop coarse grids that hold no tangent for other steps, before the points need the memory to move."""
+        made = self._solvers.value
+        if made is not None and made.iterative and made.tangent.value is None:
+            del made
+            self._solvers.clear()
+            collect_garbage(self.momentum.unknowns.comm)
+
+
+class Assembled(Keyed):
+    """What stays while a cut serves and a stage lasts: penalties and fluxes, in the matrices of a system.
+
+    Parameters
+    ----------
+    momentum, storage
+        Compiled forms.
+    system
+        The matrices.
+    on_grid
+        The bodies on the grid.
+    stage
+        The conditions.
+    sides
+        What acts on the sides, placed where the points were cut.
+    """
+
+    def __init__(
+        self,
+        momentum: MomentumForms,
+        storage: StorageForms | None,
+        system: System,
+        on_grid: OnGrid,
+        stage: Stage,
+        sides: SideData,
+    ):
+        self.momentum, self.storage, self.symmetric = system.momentum, system.storage, system.symmetric
+        self.solvers, self.end_step = system.solvers, system.end_step
+        self._on_grid, self._stage = on_grid, stage
+        self._u, self._varies = momentum.u, storage is not None and storage.conductivity is not None
+        self._by_pressure = storage if self._varies and storage.conductivity.pressure is not None else None
+        self._mobility: Latest[Mobility] = Latest()
+        self._outflow: Latest[Outflow] = Latest()
+        self.momentum.set_penalty(sides)
+        self.momentum.set_rounding(self._rounding(momentum, sides))
+        self.round_off = float(self.momentum.rounding.norm())
+        """Norm of the momentum's residual that rounding leaves, N."""
+        self._off = None
+        if self.storage is not None:
+            self.storage.set_alternation()
+            if (form := storage.fluxes.aslant) is not None:
+                facets = form.on(off_facets(on_grid.contents, on_grid.facets))
+                self._off = facets if facets.some else None
+        self._gradients: Latest[Gradients] = Latest()
+
+    def _rounding(self, momentum: MomentumForms, sides: SideData) -> NDArray[np.float64]:
+        """Return what rounding may leave of the residual at the local nodes (nodes,), N.
+
+        It goes with the stiffness of the cells about a node; that of rigid sides and tools with coordinates as well.
+        """
+        grid, on_grid = self._on_grid.cut.grid, self._on_grid
+        of_cells = 1e-14 * on_grid.stiffness * grid.cell_volume / grid.h.min()
+        if sides.holds is not None:
+            reach = np.abs(np.concatenate([grid.lower, grid.upper])).max()
+            held = np.zeros(grid.num_local)
+            np.maximum.at(held, sides.holds.cells, sides.holds["stiffness"][:, 0])
+            of_cells = of_cells + 1e-15 * reach * held
+        if sides.tools is not None:
+            np.maximum.at(of_cells, sides.tools.rows.cell, of_cells[sides.tools.rows.cell] + sides.tools.rounding)
+        own = np.flatnonzero(on_grid.active[: grid.num_owned])
+        at_nodes = momentum.at_nodes(own, of_cells[own]) / 2 ** (grid.dim - 1)  # as many cells beside a flat side
+        if sides.contact is not None:
+            at_nodes += over_all(grid.comm, float(sides.contact.now.rounding.max(initial=0.0)), MPI.MAX)
+        return at_nodes
+
+    def flow(
+        self, state: State, weight: NDArray[np.float64] | None, data: QuadratureData, t: float
+    ) -> Callable[[bool], Outflow]:
+        """Return what assembles the fluxes at u, called with whether a step begins.
+
+        Where points stay in their cells, and nothing but u would change the fluxes, they are those of the start.
+
+        Parameters
+        ----------
+        state
+            At the start of the step.
+        weight : (d,), N/m^3
+            Of the fluid, if there is gravity.
+        data
+            The pieces.
+        t
+            Time at which open sides have their pressures and fluxes, s.
+        """
+        on_grid, contents, grid, u = self._on_grid, self._on_grid.contents, self._on_grid.cut.grid, self._u
+        hydraulic, varies = self._stage.hydraulic, (t,) if self._stage.hydraulic.varies else ()
+        at = state.points if weight is not None or varies else on_grid.cut.points  # gravity may change with time
+        sides = partial(hydraulic.data, on_grid.cut, at, contents, t)
+
+        def mobility(begins: bool) -> Mobility:
+            if self._varies:
+                return on_grid.mobility(data, begins)
+            return self._mobility((), lambda: on_grid.mobility(data, True))
+
+        def set_fluxes(at_sides: OpenSides, kappa: Mobility, motion: CellMotion | None = None) -> Outflow:
+            where = (at_sides.cells, at_sides.shape, at_sides.seeps, at_sides.area, at_sides.reach)
+            off = self._off and (self._off, self._gradients(where, lambda: Gradients(contents, at_sides)))
+            return self.storage.set_fluxes(contents, at_sides, Conduction(kappa, motion, weight), off)
+
+        if (storage := self._by_pressure) is not None:
+            varies = (*varies, storage.p.x.array.copy())
+            storage.conductivity.pressure.x.array[:] = storage.p.x.array  # of the start of the substep
+        if state.stays and not self._varies:
+            outflow = self._outflow((at, weight, *varies), lambda: set_fluxes(sides(), mobility(True)), grid.comm)
+            return lambda begins: outflow
+        placed, rests = sides(), on_grid.rests(state) if not self._varies else None
+
+        def at_present(begins: bool) -> Outflow:
+            motion = contents.motion(u.x.array.reshape(-1, grid.dim), rests)
+            return set_fluxes(placed, mobility(begins), motion)
+
+        # a substep begins where the one before it has ended
+        at_u = (data.pieces.key, weight, *varies)
+        return lambda begins: self._outflow((*at_u, u.x.array.copy()), lambda: at_present(begins), grid.comm)
+
+
+def assembled(
+    momentum: MomentumForms,
+    storage: StorageForms | None,
+    scheme: Scheme,
+    systems: Latest[System],
+    on_grid: OnGrid,
+    stage: Stage,
+    sides: SideData,
+    begins: bool,
+) -> Assembled:
+    """Return the matrices of a cut and a stage; begins: refuse all parts of the bodies that are not held.
+
+    Raises
+    ------
+    ValueError
+        A body, or at the start of a stage a part of one, is free to move as a rigid body.
+    """
+    grid, free = on_grid.cut.grid, stage.free
+    nodes = np.flatnonzero(momentum.active_nodes(on_grid.cells))
+    dofs = (nodes[:, None] * grid.dim + np.arange(grid.dim))[free[nodes]]
+    stiff, symmetric = sides.plates is not None or sides.holds is not None, stage.mechanical.symmetric
+
+    def make() -> System:
+        if not momentum.holding:
+            holds, held = sides.holds, []
+            if holds is not None:
+                held.append((holds.cells, holds.x, holds["direction"]))
+            if sides.tools is not None:
+                held.append(sides.tools.touching())
+            meeting = sides.contact.now.touching() if sides.contact is not None else None
+            check_held(grid, on_grid.active, free, held, begins, meeting)
+        return System(momentum, storage, scheme, on_grid, dofs, nodes, stiff, momentum.symmetric and symmetric)
+
+    # a cell may become active between active nodes, so equal dofs do not mean equal cells
+    with Timer("mpm: integration data"):
+        pairs = None if sides.contact is None else on_grid.key  # couple nodes as they lie
+        system = systems((stage, on_grid.cells, dofs, on_grid.penalised, pairs), make, grid.comm)
+        return Assembled(momentum, storage, system, on_grid, stage, sides)

@@ -1,0 +1,229 @@
+# SPDX-License-Identifier: MIT
+"""A scene as it is compiled: grid, bodies, materials and forms; all that lasts from its first step to its last."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields, replace
+from functools import cached_property, partial
+from typing import Any
+
+import numpy as np
+from dolfinx import fem
+from dolfinx.common import Timer
+from numpy.typing import NDArray
+
+from mpm_dolfinx.base.caching import Latest
+from mpm_dolfinx.base.validation import line
+from mpm_dolfinx.bodies.bodies import Body, material_points
+from mpm_dolfinx.conditions.conditions import OnSide
+from mpm_dolfinx.conditions.unit_weights import other_gravity, weighed
+from mpm_dolfinx.diagnostics.overfilled import warn_overfilled
+from mpm_dolfinx.diagnostics.smeared import warn_smeared
+from mpm_dolfinx.domains.cut_domains import CutDomains
+from mpm_dolfinx.flow.storage import StorageForms
+from mpm_dolfinx.grid.grid import Grid, in_chunks
+from mpm_dolfinx.materials.evaluate import ConductivityAtPieces
+from mpm_dolfinx.materials.fields import SceneMaterials
+from mpm_dolfinx.materials.initial_stress import InitialStresses
+from mpm_dolfinx.materials.skeleton import Fluid, Skeleton
+from mpm_dolfinx.materials.user_functions import compiling
+from mpm_dolfinx.mechanics.momentum import MomentumForms
+from mpm_dolfinx.mechanics.quadrature_data import QuadraturePoints
+from mpm_dolfinx.mechanics.side_forms import SideData
+from mpm_dolfinx.parallel.messages import warn
+from mpm_dolfinx.points.cutting import volumes
+from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.solve.scheme import Scheme
+from mpm_dolfinx.stepping.advance import Motion
+from mpm_dolfinx.stepping.on_grid import Assembled, OnGrid, System, assembled
+from mpm_dolfinx.stepping.stage import Stage
+from mpm_dolfinx.stepping.state import State
+from mpm_dolfinx.stepping.time_integration import Substep, substeps
+
+
+class Scene:
+    """A scene.  Nothing of it tells one step from another: what a step depends on is in its `State`.
+
+    Parameters
+    ----------
+    grid, bodies, materials, fluid, quadrature, terms, sources
+        See `Simulation`.
+    scheme
+        How the two problems are coupled.
+    method
+        Of time integration, see `time_integration`.
+    weighs
+        Whether there is gravity.
+    pressure
+        Pore pressure at the start, Pa, or a function of places.
+    initial
+        Stresses of bodies as seeded, see `initial_stress.by_body`.
+    """
+
+    def __init__(
+        self,
+        grid: Grid,
+        bodies: Sequence[Body],
+        materials: Sequence[Skeleton],
+        fluid: Fluid | None,
+        quadrature: str,
+        scheme: Scheme,
+        method: str,
+        weighs: bool,
+        pressure: float | Callable,
+        terms: Sequence[Callable],
+        sources: Sequence[Callable],
+        initial: Mapping[int, Any],
+    ):
+        self.grid, self.bodies, self.fluid, self.quadrature = grid, tuple(bodies), fluid, quadrature
+        pressure = weighed(pressure, fluid)
+        self.initial = InitialStresses(self.bodies, initial, pressure)
+        seeded = material_points(grid, bodies, pressure)
+        self.materials = scene = SceneMaterials(grid, materials, bodies, seeded, fluid, bool(initial))
+        self.gravity = fem.Constant(grid.mesh, np.zeros(grid.dim)) if weighs else None
+        self.t, self.dt = fem.Constant(grid.mesh, 0.0), fem.Constant(grid.mesh, 1.0)
+        """Time at the end of the substep, and since the start of the step, s, for forms."""
+        inside = [term for term in terms if not isinstance(term, OnSide)]
+        self.pieces = QuadraturePoints(grid, scene, fluid, weighs, bool(len(inside) + len(sources)))
+        laws, p = self.pieces.laws, fem.Function(grid.cellwise()) if fluid else None
+        with compiling(f"materials: {', '.join(law.__name__ for law in scene.laws)}", "laws in UFL of these shapes"):
+            wet = fluid.density if fluid else None
+            options = (self.gravity, wet, scene.symmetric)
+            options = (*options, quadrature == "point", terms, self.t, self.dt)
+            self.momentum = MomentumForms(self.pieces.pieces, laws, p, *options)
+        if not self.momentum.symmetric and scheme.coupling == "schur-cg":
+            scheme = replace(scheme, coupling="schur-fgmres")
+        self.scheme, self.storage = scheme, None
+        if fluid:
+            weight = fluid.density * self.gravity if weighs else None
+            symmetric = scheme.coupling != "schur-fgmres"
+            pieces, u, laws = self.pieces.pieces, self.momentum.u, scene.conductivity_laws
+            law = (
+                ConductivityAtPieces(scene.materials, laws, pieces, u, fem.Function(grid.cellwise())) if laws else None
+            )
+            kind = (symmetric, scene.conducts, scene.evolves)
+            self.storage = StorageForms(pieces, u, p, fluid.bulk, weight, *kind, law, sources, self.t)
+        self.extensions = terms, sources
+        """The user's terms and sources."""
+        self.method = method
+        """Of time integration."""
+        substeps(method, True)  # refuses what is none
+        self.motion = Motion(scene, bodies, self.momentum, self.storage)
+        # what is still to be looked for, to be warned of, of which nothing but the log knows
+        self._looked_for = [warn_overfilled, *[partial(warn_smeared, materials=scene)] * scene.uneven]
+        self._on_grid: Latest[OnGrid] = Latest()
+        self._systems: Latest[System] = Latest()
+        self._assembled: Latest[Assembled] = Latest()
+
+    @property
+    def flows(self) -> bool:
+        """Whether fluid moves, or is brought by sources."""
+        return self.storage is not None and (self.materials.conducts or bool(self.storage.sources))
+
+    @property
+    def substeps(self) -> tuple[Substep, ...]:
+        """Substeps of a step."""
+        return substeps(self.method, self.flows or self.momentum.rates)
+
+    def set_time(self, t: float, dt: float, gravity: NDArray[np.float64] | None) -> None:
+        """Set what forms see of a substep: time, and time since the start of the step, s; gravity (d,), m/s^2."""
+        self.t.value, self.dt.value = t, dt
+        if gravity is not None:
+            self.gravity.value = gravity
+
+    @cached_property
+    def _told(self) -> set[str]:
+        """What has been warned of, of which nothing but the log knows."""
+        return set()
+
+    def look_at(self, gravity: Sequence[NDArray[np.float64] | None]) -> None:
+        """Log a warning, once, of a gravity at the start of a step and in it that is not that of the conductivities."""
+        if self.fluid is None or not self.materials.conducts or gravity[0] is None or "gravity" in self._told:
+            return
+        if strength := other_gravity(self.fluid, gravity):
+            self._told.add("gravity")
+            what = "gravity = %.6g m/s^2, but conductivities become mobilities by the fluid's density x 9.81 m/s^2, as "
+            what += "gravity changes with time: must be given as Fluid(gravity=...)"
+            warn(self.grid.comm, what, strength)
+
+    def check(self, state: State) -> None:
+        """Refuse what is no state of this scene: its conditions act on the materials of another one."""
+        if not isinstance(state, State) or state.stage.mechanical.materials is not self.materials:
+            raise ValueError(f"state = {line(state)}, must be a state of this simulation")
+
+    def on_grid(self, points: MaterialPoints) -> OnGrid:
+        """Return the bodies on the grid, reset for these points."""
+        grid = self.grid
+
+        def make() -> OnGrid:
+            self._assembled.clear()  # of coefficients that change now
+            with Timer("mpm: cut domains"):
+                cut = CutDomains(grid, points, self.quadrature == "domain")
+                looked = [warn(cut, self.bodies) for warn in self._looked_for]
+                self._looked_for[:] = filter(None, looked)
+            with Timer("mpm: integration data"):
+                problems = (self.momentum, self.storage)
+                return OnGrid(self.pieces, *problems, cut, self.scheme.of_fluid)
+
+        return self._on_grid(points.arrays, make, grid.comm)
+
+    def assembled(
+        self, on_grid: OnGrid, stage: Stage, now: SideData, sides: Callable[[], SideData], begins: bool
+    ) -> Assembled:
+        """Return the matrices for a stage of the bodies on the grid.
+
+        Parameters
+        ----------
+        now
+            What acts on the sides.
+        sides
+            Returns this, placed where the points were cut.
+        begins
+            Whether all parts of the bodies must be held.
+        """
+
+        def make() -> Assembled:
+            problems = (self.momentum, self.storage, self.scheme, self._systems)
+            return assembled(*problems, on_grid, stage, sides(), begins)
+
+        return self._assembled((on_grid.key, stage, now.asked), make, self.grid.comm)
+
+    def all_ids(self, present: Sequence[bool]) -> NDArray[np.int64]:
+        """Return the numbers of all points of the bodies that are there."""
+        return np.flatnonzero(np.repeat(present, [len(body) for body in self.bodies]))
+
+    @cached_property
+    def description(self) -> dict[str, Any]:
+        """The constants that make the scene, by name: what a checkpoint of it is known by."""
+        grid = self.grid
+        out = {"grid cells": grid.shape.tolist(), "grid lower": grid.lower.tolist(), "grid upper": grid.upper.tolist()}
+        out |= {"quadrature": self.quadrature, **({"axisymmetric": True} if grid.axisymmetric else {})}
+        if grid.copies > 1:
+            first = np.cumsum([0, *(len(body) for body in self.bodies[:-1])])
+            out["groups of the bodies"] = (grid.copy(first) // grid.cells).tolist()
+        for i, body in enumerate(self.bodies):
+            out[f"points of body {i}"], out[f"material of body {i}"] = len(body), int(body.material)
+            volume, checksum = 0.0, 0
+            for part in in_chunks(len(body)):
+                volume += float(np.abs(volumes(body.reference(part))).sum())
+                checksum = zlib.crc32(np.ascontiguousarray(body.corners(part)).tobytes(), checksum)
+            out[f"volume of body {i}"], out[f"checksum of the positions of body {i}"] = volume, checksum
+        materials = {f"material {i}": m for i, m in enumerate(self.materials.materials)}
+        for name, one in {**materials, "fluid": self.fluid}.items():
+            out[name] = None if one is None else type(one).__name__
+            constants = {f.name: getattr(one, f.name) for f in fields(one)} if one is not None else {}
+            constants = {key: value for key, value in constants.items() if value is not None and not callable(value)}
+            out |= {f"{key} of {name}": np.asarray(value).tolist() for key, value in constants.items()}
+        return {**out, **self.materials.checksums, "data of the points": sorted(self.materials.seeded.data)}
+
+    @property
+    def last(self) -> tuple[OnGrid | None, Assembled | System | None]:
+        """The bodies as they were last cut, and the matrices of the last step, to be looked at."""
+        return self._on_grid.value, self._assembled.value or self._systems.value
+
+    def forget(self) -> None:
+        """Drop all that was made for a step: it may have been broken off anywhere."""
+        for made in (self._assembled, self._systems, self._on_grid):
+            made.clear()

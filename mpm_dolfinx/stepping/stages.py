@@ -1,0 +1,199 @@
+# SPDX-License-Identifier: MIT
+"""From one stage to the next: bodies come and go, conditions change, fields of the points are set anew."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mpm_dolfinx.base.validation import chosen, flag, instance, line, numbers
+from mpm_dolfinx.bodies.bodies import Body
+from mpm_dolfinx.bodies.faces import surface
+from mpm_dolfinx.bodies.fills import put, touches
+from mpm_dolfinx.bodies.touching import check_apart
+from mpm_dolfinx.conditions.sides import everywhere
+from mpm_dolfinx.conditions.unit_weights import WEIGHS, warn_units
+from mpm_dolfinx.contact.cell_contact import let_go
+from mpm_dolfinx.domains.pressure_transport import at_start
+from mpm_dolfinx.grid.grid import sum_by
+from mpm_dolfinx.parallel.messages import warn
+from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.stepping.initial_state import pieces_at_start
+from mpm_dolfinx.stepping.scene import Scene
+from mpm_dolfinx.stepping.stage import CONDITIONS, Stage, stage
+from mpm_dolfinx.stepping.state import State
+
+
+def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int]) -> State:
+    """Return the state of a scene at rest, in its first stage; its stresses as given, not yet in balance."""
+    present = [body not in later for body in range(len(scene.bodies))]
+    check_apart(scene.grid, scene.bodies, present)
+    begun = _stage(scene, {**conditions, "terms": [term.given for term in scene.momentum.sides.own]}, present, later)
+    _warn_weights(scene, begun, {"pressure": scene.initial.pressure})
+    if scene.fluid and scene.materials.conducts:
+        warn_units(scene.grid.comm, scene.fluid, conditions["gravity"])
+    points = scene.materials.seeded.of(_ids(scene.bodies, later), kept=False)
+    points = scene.initial.of(scene.materials, points, present, begun.gravity_at(0.0) if scene.initial.given else None)
+    transported = None
+    if scene.fluid:
+        transported = pieces_at_start(scene, points) if callable(scene.initial.pressure) else at_start(points)
+    d, unknown = scene.grid.dim, np.nan if scene.initial.given else 0.0  # before a first step
+    reactions, walls = (np.full((count, d), unknown) for count in (len(begun.mechanical.holds), 2 * d))
+    outflows = np.zeros(len(begun.hydraulic.outlets))
+    points, forces = begun.mechanical.grip(points), begun.mechanical.forces(0.0)
+    ways = np.zeros(len(begun.mechanical.tools.tools))
+    acting = reactions, walls, outflows, forces, ways
+    return State(0.0, points, transported, None, 0, *acting, begun, True, *[None] * 4)
+
+
+def begin_stage(
+    scene: Scene,
+    state: State,
+    named: Mapping[str, Any],
+    add: Sequence[int],
+    remove: Sequence[int],
+    reset_displacement: bool,
+    fields: Mapping[str, ArrayLike],
+) -> State:
+    """Return the state in which a stage begins: see `Simulation.stage`; named: the conditions that are new."""
+    before = state.stage
+    if "gravity" in named and scene.gravity is None:
+        raise ValueError("gravity: the scene was made without, must be made with (0, 0) first")
+    chosen("stage: remove", remove, np.flatnonzero(before.present).tolist(), "bodies that are present")
+    chosen("stage: add", add, list(before.later), "bodies that are to come later")
+    flag("stage: reset_displacement", reset_displacement)
+    present = [(here and body not in remove) or body in add for body, here in enumerate(before.present)]
+    later = [body for body in before.later if body not in add]
+    begun = _stage(scene, {**before.conditions, **named}, present, later)
+    if named.keys() & {"gravity", "tractions", "drained"}:
+        _warn_weights(scene, begun, {})
+    if remove:
+        _warn_moved_on(scene, before, begun, [name for name in CONDITIONS if name not in {*named, "tools"}])
+    if state.stays:  # pressures are those of the cells
+        state = scene.motion.left_grid(state, scene.on_grid(state.stay.points))
+    state = replace(state, stay=None)
+    gone, transported = _ids(scene.bodies, remove), state.transported
+    there = [body for body, here in enumerate(before.present) if here and body not in remove]
+    bare, gravity = before.mechanical.let_go(state.points), None
+    if scene.initial.given:
+        gravity = begun.gravity_at(state.t)
+    bare = _without_extra(scene, bare, add, fields) if add else bare
+    points, new = _filled(scene, bare.of(gone, kept=False), there, add, gravity)
+    kept = let_go(state.points, before.mechanical.tools.kept(0)) if "tools" in named else state.points
+    points = begun.mechanical.grip(points, kept)
+    if transported is not None:
+        transported = transported.of(gone, kept=False).joined(at_start(new))
+    points = _changed(scene, points, fields)
+    if reset_displacement:
+        points = replace(points, origin=points.corners)
+    unknown, new = np.nan if state.resets else 0.0, {}
+    if "displacements" in named:
+        new["reactions"] = np.full((len(begun.mechanical.holds), scene.grid.dim), unknown)
+    if "fixed" in named:
+        new["walls"] = np.full_like(state.walls, unknown)
+    if "tools" in named:
+        new["tool_forces"] = begun.mechanical.forces(unknown)
+        new["tool_travel"] = np.zeros(len(begun.mechanical.tools.tools))
+    if named.keys() & {"drained", "inflows"}:
+        new["outflows"] = np.full(len(begun.hydraulic.outlets), unknown)
+    new["rest"] = state.rest if begun.mechanical.holds_as(before.mechanical) else None
+    return replace(state, points=points, transported=transported, stage=begun, begins=True, held=None, **new)
+
+
+def _stage(scene: Scene, conditions: Mapping[str, Any], present: Sequence[bool], later: Sequence[int]) -> Stage:
+    return stage(scene.grid, scene.bodies, scene.materials, scene.fluid, conditions, present, later)
+
+
+def _warn_weights(scene: Scene, begun: Stage, given: Mapping[str, Any]) -> None:
+    """Log a warning for each level of water, given ones and those on sides, that is not as heavy as the pore fluid.
+
+    In a dry scene for each that is as heavy as water is under another gravity.
+    """
+    gravity, fluid = begun.conditions["gravity"], scene.fluid
+    g = 0.0 if gravity is None or callable(gravity) else float(np.linalg.norm(gravity))
+    on_sides = [(f"water at {c.side!r}", c.pressure) for c in begun.conditions["drained"]]
+    on_sides += [(f"water at {c.side!r}", c.value) for c in begun.conditions["tractions"]]
+    levels = [*given.items(), *on_sides]
+    if fluid is None:
+        levels = [(name, value) for name, value in levels if hasattr(value, "weighed") and g]
+        own, of = 1000 * g, "water under the scene's gravity"
+    else:
+        own, of = (fluid.unit_weight if callable(gravity) else fluid.density * g), "the pore fluid"
+    weights = {(name, getattr(value, "unit_weight", own)) for name, value in levels}
+    for name, weight in sorted(weights):
+        if abs(weight - own) > WEIGHS * max(weight, own):
+            what = "%s: unit_weight = %.6g N/m^3, but that of %s, its density times gravity, is %.6g"
+            warn(scene.grid.comm, f"{what}: at one level they are not at rest", name, weight, of, own)
+
+
+def _warn_moved_on(scene: Scene, before: Stage, begun: Stage, kept: Sequence[str]) -> None:
+    """Log a warning for each condition that was not given anew and acts on what an excavation has laid bare."""
+    stop = np.cumsum([len(body) for body in scene.bodies])
+    for condition in (condition for name in kept for condition in begun.conditions[name]):
+        was, now = (surface(scene.bodies, condition.side, condition.region, s.present) for s in (before, begun))
+        bare = sum_by(now.id, now.area0, stop[-1]) - sum_by(was.id, was.area0, stop[-1])
+        here = np.repeat(before.present, [len(body) for body in scene.bodies])
+        new = np.flatnonzero(here[now.id] & (bare[now.id] > 1e-9 * now.whole0))
+        if len(new):
+            area = bare[np.unique(now.id[new])].sum()
+            what = "stage: remove: %s was not given anew and now also acts on %.3g m^%d that were laid bare, from %s on"
+            warn(scene.grid.comm, what, line(condition), area, scene.grid.dim - 1, now.X[new[0]].mean(axis=0))
+
+
+def _filled(
+    scene: Scene, points: MaterialPoints, there: Sequence[int], add: Sequence[int], gravity: NDArray | None
+) -> tuple[MaterialPoints, MaterialPoints]:
+    """Return the points with those of bodies that come, and these alone; what lies on another comes after it."""
+    there, waiting, new = list(there), list(add), scene.materials.seeded.of(_ids(scene.bodies, []))
+    while waiting:
+        fill = next((body for body in waiting if touches(scene.bodies, there, body)), waiting[0])
+        placed = scene.materials.seeded.of(_ids(scene.bodies, [fill]))
+        placed = put(scene.grid, scene.bodies, there, fill, points, placed)
+        placed = scene.initial.of(
+            scene.materials, placed, [i in (*there, *add) for i in range(len(scene.bodies))], gravity
+        )
+        points, new = points.joined(placed), new.joined(placed)
+        there.append(fill)
+        waiting.remove(fill)
+    return points, new
+
+
+def _without_extra(
+    scene: Scene, points: MaterialPoints, add: Sequence[int], fields: Mapping[str, ArrayLike]
+) -> MaterialPoints:
+    """Return points without the data that only a stage gave them, which bodies that come have not."""
+    extra = points.data.keys() - scene.materials.seeded.data.keys()
+    for name in sorted(extra - fields.keys()):
+        what = f"stage: add: body {add[0]}: its points have no {name!r}"
+        raise ValueError(f"{what}, must be given anew for all in fields=")
+    return replace(points, data={name: rows for name, rows in points.data.items() if name not in extra})
+
+
+def _ids(bodies: Sequence[Body], chosen: Sequence[int]) -> NDArray[np.int64]:
+    """Return the numbers of the points of some bodies."""
+    stop = np.cumsum([len(body) for body in bodies])
+    return np.concatenate([np.empty(0, np.int64), *(np.arange(stop[i] - len(bodies[i]), stop[i]) for i in chosen)])
+
+
+def _changed(scene: Scene, points: MaterialPoints, fields: Mapping[str, ArrayLike]) -> MaterialPoints:
+    """Return points with new values of some of their data."""
+    instance("stage: fields", fields, Mapping)
+    data = dict(points.data)
+    for name, value in fields.items():
+        if name not in data and name in scene.materials.constants:
+            law, value = type(scene.materials.constants[name]).__name__, getattr(scene.materials.constants[name], name)
+            allowed = f"given to it as a function of place, lambda X: np.full(len(X), {value}), to be changed"
+            raise ValueError(f"stage: fields: {name!r}: a constant of {law}, must be {allowed}")
+        new, what = numbers(f"stage: fields: {name}", value, None, allowed="finite numbers"), f"stage: fields: {name!r}"
+        if name in data and new.shape == data[name].shape[1:]:
+            new = np.broadcast_to(new, data[name].shape)
+        if new.shape != (data[name].shape if name in data else (len(points), *new.shape[1:])):
+            each = "one value for all, or " if name in data else ""
+            raise ValueError(f"{what} of shape {new.shape}, must be {each}one for each of {len(points)} points")
+        data[name] = new.copy()
+    points = replace(points, data=data)
+    return everywhere(scene.grid, lambda: scene.materials.changed("stage: fields", points, fields))

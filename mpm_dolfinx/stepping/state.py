@@ -1,0 +1,168 @@
+# SPDX-License-Identifier: MIT
+"""The state of a scene: all that it remembers between two steps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from mpi4py import MPI
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpm_dolfinx.domains.pressure_transport import PiecePressures
+from mpm_dolfinx.grid.grid import Grid
+from mpm_dolfinx.parallel.exchange import Exchange
+from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.stepping.result import Result
+from mpm_dolfinx.stepping.stage import Stage
+
+
+def _freeze(kept: Stay | State) -> None:
+    """Let nobody write into the arrays of what is kept."""
+    for values in vars(kept).values():
+        if isinstance(values, np.ndarray):
+            values.flags.writeable = False
+
+
+@dataclass(frozen=True, eq=False)
+class Stay:
+    """What still holds of the last reset of the grid: points that hardly move since stay in the cells that cut them.
+
+    points
+        The material points when the grid was reset.
+    id, pressure, x, start : (m,), (m,) in Pa, (m, d) in m, (m,) in Pa
+        Of each piece of their domains, ordered by point and cell: number of its point, pressure of its cell, where
+        its centroid has moved to, pressure of its cell when the grid was reset.  None without fluid.
+    keeps : (n,)
+        Points for which it still holds: those of parts of the bodies that hardly move.  None: for all.
+    """
+
+    points: MaterialPoints
+    id: NDArray[np.int64] | None
+    pressure: NDArray[np.float64] | None
+    x: NDArray[np.float64] | None
+    start: NDArray[np.float64] | None
+    keeps: NDArray[np.bool_] | None = None
+
+    def of_pieces(self, name: str, fresh: NDArray[np.float64], point: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return what pieces have: values of this name where these hold, else fresh ones (m, ...).
+
+        point : (m,)
+            Which of the points each piece belongs to; those that are kept have the pieces that they had.
+        """
+        values = getattr(self, name)
+        if self.keeps is None:
+            return values
+        out = fresh.copy()
+        out[self.keeps[point]] = values[self.keeps[np.searchsorted(self.points.id, self.id)]]
+        return out
+
+    def __post_init__(self):
+        _freeze(self)
+
+    def migrated(self, exchange: Exchange, destination: NDArray[np.int32]) -> Stay:
+        """Return what holds for points that go to their destinations, by the exchange of points."""
+        points, keeps = self.points.migrated(exchange), self.keeps
+        if keeps is not None:
+            keeps = exchange.send(keeps)[np.argsort(exchange.send(self.points.id))]
+        if self.id is None:
+            return replace(self, points=points, keeps=keeps)
+        travel = Exchange(exchange.comm, destination[np.searchsorted(self.points.id, self.id)])
+        rows = [travel.send(values) for values in (self.id, self.pressure, self.x, self.start)]
+        order = np.argsort(rows[0], kind="stable")
+        return Stay(points, *(values[order] for values in rows), keeps)
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """All that a scene remembers between two steps.  A step makes a new one; nobody changes one.
+
+    A checkpoint holds all of it but the stage, which the script gives.
+
+    t
+        Time, s.
+    points
+        The material points of this process.
+    transported
+        Pressures that the pieces of the points' domains take to the next grid; None without fluid, or with a stay of
+        all points.
+    stay
+        What holds of the last reset of the grid; None where the next step resets all of it.
+    resets
+        How often the grid has been reset.
+    reactions : (displacements, d), N (N/m in plane strain)
+        Forces of the given displacements in the last step; nan before the first one of a stage.
+    walls : (2 d, d), N (N/m in plane strain)
+        Forces of the walls of the grid, in the order of `SIDES`, on the bodies in the last step; nan before the first
+        one of a stage that holds others.
+    outflows : (drained sides, then inflows), m^3/s (m^2/s in plane strain)
+        Volumes at zero pressure that leave the bodies through them at the end of the last step; nan before the first
+        one of a stage.
+    tool_forces : (tools + contacts, d + 1), in 3D (..., 6), N and N m (N/m and N in plane strain)
+        Forces and moments of tools, then contacts, on the bodies in the last step; nan before the first one of a stage.
+    tool_travel : (tools,), m
+        How far loads have pushed tools beyond their displacement; zero for those without.
+    stage
+        The conditions in force.
+    begins
+        Whether no step of the stage has been taken.
+    velocity : (unknowns,), m/s
+        Of the nodes of this process in the last step, ghosts included: where Newton's method may begin in soil that
+        yields.  None before the first step, and without such soil.
+    held : (unknowns,), N
+        Forces on the nodes of this process, ghosts included, that hold what the scheme's error leaves out of balance of
+        an initial stress; None without, once a stage begins, and once bodies have moved so far that the grid is reset.
+    rest : (unknowns,), m
+        Displacement of the nodes of this process, ghosts included, for which given displacements and plates have the
+        forces of an initial stress at rest; None once a stage changes these, and once the grid is reset.
+    result
+        Histories of the last run, None before the first one.
+    """
+
+    t: float
+    points: MaterialPoints
+    transported: PiecePressures | None
+    stay: Stay | None
+    resets: int
+    reactions: NDArray[np.float64]
+    walls: NDArray[np.float64]
+    outflows: NDArray[np.float64]
+    tool_forces: NDArray[np.float64]
+    tool_travel: NDArray[np.float64]
+    stage: Stage
+    begins: bool
+    velocity: NDArray[np.float64] | None
+    held: NDArray[np.float64] | None
+    rest: NDArray[np.float64] | None
+    result: Result | None
+
+    def __post_init__(self):
+        _freeze(self)
+
+    @property
+    def stays(self) -> bool:
+        """Whether all points stay in the cells that cut them."""
+        return self.stay is not None and self.stay.keeps is None
+
+    @property
+    def as_cut(self) -> MaterialPoints:
+        """The points where the next step has them cut: those that hardly move stay as they were."""
+        if self.stay is None:
+            return self.points
+        return self.stay.points if self.stay.keeps is None else self.stay.points.where(self.stay.keeps, self.points)
+
+    def migrated(self, destination: NDArray[np.int32], comm: MPI.Intracomm) -> State:
+        """Return the state after every point, with its pieces, went to its destination (n,), a rank."""
+        exchange, pressures, stay = Exchange(comm, destination), self.transported, self.stay
+        if pressures is not None:
+            pressures = pressures.migrated(Exchange(comm, destination[np.searchsorted(self.points.id, pressures.id)]))
+        stay = stay and stay.migrated(exchange, destination)
+        return replace(self, points=self.points.migrated(exchange), transported=pressures, stay=stay)
+
+    def at_owners(self, grid: Grid) -> State:
+        """Return the state with points and pieces at the processes that own the points' cells."""
+        if grid.comm.size == 1:
+            return self
+        placed = self.as_cut
+        return self.migrated(grid.owner(grid.number(grid.index(placed.x)) + grid.copy(placed.id)), grid.comm)

@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: MIT
+"""What a scene is compiled to: its terms and solvers, and why it does without the others; how it is shared out."""
+
+from __future__ import annotations
+
+import resource
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from mpi4py import MPI
+
+import numpy as np
+
+from mpm_dolfinx.materials.skeleton import LOCKING
+from mpm_dolfinx.parallel.exchange import over_all
+from mpm_dolfinx.stepping.scene import Scene
+from mpm_dolfinx.stepping.state import State
+
+
+@dataclass(frozen=True)
+class Part:
+    """A term or solver: its name, whether the scene has it, what it is or why it is left out."""
+
+    name: str
+    used: bool
+    why: str
+
+
+def parts(scene: Scene, state: State) -> list[Part]:
+    """Return the terms and solvers of a scene, as they are so far: some are compiled when first they are needed."""
+    return [*_momentum(scene, state), *_storage(scene, state), *_solvers(scene, state)]
+
+
+def _either(name: str, used, what: str, otherwise: str) -> Part:
+    return Part(name, bool(used), what if used else otherwise)
+
+
+def _momentum(s: Scene, state: State) -> list[Part]:
+    m, side = s.momentum, state.stage.mechanical
+    laws, evolves = ", ".join(law.__name__ for law in s.materials.laws), ", ".join(s.materials.state_names)
+    return [
+        _either("reset of the grid", state.resets > 1, f"{state.resets} so far", "nothing has moved so far"),
+        _either("axisymmetry", s.grid.axisymmetric, "rings about r = 0", "plane strain" if s.grid.dim == 2 else "3D"),
+        Part("stress", True, f"{laws}; integrated over {'exact domains' if s.quadrature == 'domain' else 'points'}"),
+        _either(
+            "mean dilatation",
+            m.dilatation,
+            f"of what has nu > {LOCKING}, or plastic flow",
+            f"nu <= {LOCKING}, no plastic flow",
+        ),
+        _either("state of the law", evolves, evolves, "the stress depends on F only"),
+        _either("initial stress", s.initial.given, f"of {len(s.initial.given)} bodies", "none given"),
+        _either("body force", s.gravity is not None, "gravity", "no gravity"),
+        _either("tractions", side.loads, f"on {len(side.loads)} sides", "no tractions"),
+        _either("pressures", side.pressures, f"on {len(side.pressures)} sides", "no pressures"),
+        _either("given displacements", side.holds, f"on {len(side.holds)} sides", "no given displacements"),
+        _either("rigid plates", side.plates, f"on {len(side.plates)} sides", "no plates"),
+        _either("tools", side.tools.tools, f"{len(side.tools.tools)}", "no tools"),
+        _either("contacts", side.contacts.contacts, f"of {s.grid.copies} groups", "bodies that touch stick"),
+        _either("ghost penalty", m.ghost.form.used, "faces of nearly empty cells", "no nearly empty cell so far"),
+        _either("terms of the user's", m.terms or m.sides.own, f"{len(m.terms) + len(m.sides.own)}", "none given"),
+    ]
+
+
+def _storage(s: Scene, state: State) -> list[Part]:
+    storage, outlets = s.storage, state.stage.hydraulic.outlets
+    names = ("pore pressure", "fluxes between cells", "weight of the fluid", "open sides", "damping of pressure jumps")
+    if storage is None:
+        return [Part(name, False, "no fluid") for name in (*names, "pores that drain", "sources")]
+    still, f = "nothing conducts", storage.fluxes
+    return [
+        Part(names[0], True, "finite volumes, coupled"),
+        _either(names[1], f.flux, f"two-point, conductivities over {s.fluid.unit_weight:.6g} N/m^3", still),
+        _either(names[2], f.gravity, "gravity", "no gravity" if f.flux else still),
+        _either(names[3], outlets, f"{len(outlets)} drained or with inflow", "sealed"),
+        _either(names[4], f.damp.used, "little flows within a step", "enough flows within a step, so far"),
+        _either("pores that drain", storage.drains, "as a free surface falls", "pores stay full"),
+        _either("sources", storage.sources, f"{len(storage.sources)}", "none given"),
+    ]
+
+
+def _solvers(s: Scene, state: State) -> list[Part]:
+    side = state.stage.mechanical
+    kind = "symmetric" if s.momentum.symmetric and side.symmetric else "unsymmetric: LU and FGMRES"
+    return [
+        _either("coupling", s.storage, f"{s.scheme.coupling}, {kind}", "no fluid: Newton on the momentum"),
+        _either(
+            "one factorisation for many steps",
+            s.momentum.linear and not (side.pressures or side.tools.tools or side.contacts.contacts),
+            "linear law: until active cells or time step change",
+            "the tangent depends on the strain",
+        ),
+        _either("second substep", len(s.substeps) > 1, "second order in time", _one_substep(s)),
+    ]
+
+
+def _one_substep(s: Scene) -> str:
+    return "first order in time" if s.method == "backward-euler" else "nothing has a rate"
+
+
+def table(scene: Scene, state: State) -> str:
+    """Return the parts of a scene as a table."""
+    rows = parts(scene, state)
+    width = max(len(part.name) for part in rows)
+    return "\n".join(f"{part.name:{width}}  {'yes' if part.used else 'no ':3}  {part.why}" for part in rows)
+
+
+def imbalance(scene: Scene, state: State) -> dict[str, float]:
+    """Return the most that one process has over the mean of all: points, pieces, active cells; after the first step.
+
+    1 is perfect; the time of a step goes with the pieces.  Called on all processes together.
+    """
+    comm, (on_grid, _) = scene.grid.comm, scene.last
+    pieces = on_grid.data.pieces if on_grid else None
+    mine = [len(state.points), len(pieces.cells), len(pieces.places.filled)] if pieces else [len(state.points), 0, 0]
+    mine = np.array(mine, dtype=float)
+    total, most = over_all(comm, mine), over_all(comm, mine, MPI.MAX)
+    ratio = np.divide(most * comm.size, total, out=np.ones_like(mine), where=total > 0)
+    return dict(zip(("points", "pieces", "active cells"), ratio.tolist(), strict=True))
+
+
+def peak_memory() -> float:
+    """Return the most memory that this process has had, MB."""
+    status = Path("/proc/self/status")
+    if status.exists():  # Linux counts the parent's into getrusage
+        (line,) = (line for line in status.read_text().splitlines() if line.startswith("VmHWM:"))
+        return int(line.split()[1]) / 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 1024)

@@ -1,0 +1,258 @@
+# SPDX-License-Identifier: MIT
+"""Laboratory tests of a law at a single point: what a soil law is looked at with before it goes into a scene."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import ClassVar
+
+from mpi4py import MPI
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mpm_dolfinx.base.errors import NotConverged
+from mpm_dolfinx.base.validation import instance, numbers, whole
+from mpm_dolfinx.grid.grid import Grid
+from mpm_dolfinx.materials.evaluate import LawAtPoints
+from mpm_dolfinx.materials.skeleton import Skeleton
+
+KINDS = ("isotropic", "oedometer", "triaxial drained", "triaxial undrained", "shear drained", "shear undrained")
+AXIAL, LATERAL, SHEAR = (2, 2), ((0, 0), (1, 1)), (0, 1)
+LONG = 1e30  # s: in which nothing is left of a viscosity
+ITERATIONS, CUTS, NEAR, NUDGE = 30, 12, 1e-11, 1e-6  # of Newton's method; relative accuracy; difference of stretches
+
+
+@dataclass(frozen=True)
+class ElementTest:
+    """What an element test measures, an entry a step, the first one at its start.
+
+    F, stress : (n, 3, 3), -, Pa
+        Deformation gradient, and effective Cauchy stress, tension positive.
+    strain : (n,)
+        What is driven: logarithmic axial strain, compression positive; shear F_xy in shear.
+    pressure : (n,), Pa
+        Excess pore pressure: zero where drained.
+    state
+        Name -> values (n, ...) of the law's state.
+    """
+
+    KINDS: ClassVar = KINDS
+
+    F: NDArray[np.float64]
+    stress: NDArray[np.float64]
+    strain: NDArray[np.float64]
+    pressure: NDArray[np.float64]
+    state: dict[str, NDArray[np.float64]]
+
+    @property
+    def p(self) -> NDArray[np.float64]:
+        """Mean effective stress p' (n,), Pa, compression positive."""
+        return -np.trace(self.stress, axis1=1, axis2=2) / 3
+
+    @property
+    def q(self) -> NDArray[np.float64]:
+        """Deviatoric stress q = sqrt(3/2) |dev stress| (n,), Pa."""
+        s = self.stress + self.p[:, None, None] * np.eye(3)
+        return np.sqrt(1.5 * (s * s).sum(axis=(1, 2)))
+
+    @property
+    def volume_strain(self) -> NDArray[np.float64]:
+        """Logarithmic volume strain -ln J (n,), compression positive."""
+        return -np.log(np.linalg.det(self.F))
+
+    def draw(self, file: str | Path, title: str = "") -> None:
+        """Draw stress path, stress and strain, and volume or pore pressure, into a picture."""
+        from matplotlib.figure import Figure
+
+        fig = Figure(figsize=(12, 3.6), layout="constrained")
+        path, curve, third = fig.subplots(1, 3)
+        path.plot(self.p / 1e3, self.q / 1e3)
+        path.set(xlabel="p' (kPa)", ylabel="q (kPa)", title=title)
+        curve.plot(self.strain, self.q / 1e3)
+        curve.set(xlabel="strain (-)", ylabel="q (kPa)")
+        wet = np.any(self.pressure != 0)
+        third.plot(self.strain, self.pressure / 1e3 if wet else self.volume_strain)
+        third.set(xlabel="strain (-)", ylabel="excess pore pressure (kPa)" if wet else "volume strain (-)")
+        for ax in (path, curve, third):
+            ax.grid(alpha=0.3)
+        fig.savefig(file, dpi=120)
+
+
+def element_test(
+    material: Skeleton,
+    test: str,
+    strain: float | Sequence[float],
+    *,
+    steps: int = 100,
+    confinement: float = 0.0,
+    rate: float | None = None,
+    cell_size: float | None = None,
+) -> ElementTest:
+    """Drive a law through a laboratory test.
+
+    Parameters
+    ----------
+    material
+        The soil; its constants are numbers, not functions of place.
+    test
+        One of `ElementTest.KINDS`: "isotropic", "oedometer" (no lateral strain), "triaxial drained" (constant lateral
+        stress), "triaxial undrained" (constant volume and lateral total stress), "shear drained" (simple, at constant
+        normal stress, F_xx = F_zz = 1), "shear undrained" (simple, at constant volume).
+    strain
+        Where it goes, or the turning points on the way: logarithmic axial strain, compression positive, in an
+        isotropic test of each axis; in shear F_xy.
+    steps
+        Equal steps to each turning point.
+    confinement
+        Isotropic effective stress, Pa, >= 0, to which the soil is brought before, drained and slowly; 0: what its law
+        begins with.
+    rate
+        Strain in a second, 1/s, > 0, of laws that depend on the time step.
+    cell_size
+        Size of the cells, m, > 0, of laws that depend on it.
+
+    Raises
+    ------
+    ValueError
+        Naming what is not allowed.
+    NotConverged
+        The law gives no such stress, however short the step.
+    """
+    instance("material", material, Skeleton)
+    if test not in KINDS:
+        raise ValueError(f"test = {test!r}, must be one of {', '.join(KINDS)}")
+    ends = numbers("strain", strain, None, allowed="a finite number, or several").ravel()
+    confinement = float(numbers("confinement", confinement, allowed=">= 0 Pa and finite", test=_not_negative))
+    for name, value in (("rate", rate), ("cell_size", cell_size)):
+        if value is not None:
+            numbers(name, value, allowed="> 0 and finite", test=lambda v: (0 < v) & (v < np.inf))
+        elif {"rate": "dt", "cell_size": "cell_size"}[name] in material.by_scene:
+            raise ValueError(f"{name} is not given, must be > 0: {type(material).__name__} depends on it")
+    if cell_size is not None:
+        material.check_cells(cell_size)
+    steps, point = whole("steps", steps), _Point(material, rate, cell_size)
+    start = point.compressed(confinement) if confinement else point.at_rest()
+    path = np.concatenate([np.linspace(a, b, steps + 1)[1:] for a, b in zip([0.0, *ends], ends, strict=False)])
+    out = [start]
+    for goal in path:
+        out.append(point.moved(out[-1], test, start, goal))
+    states = {name: np.array([s.state[name] for s in out]) for name in material.state}
+    F, stress = (np.array([getattr(s, name) for s in out]) for name in ("F", "stress"))
+    # undrained, the total stress on the cell's wall, and in shear the total normal stress, stays
+    pressure = (stress - stress[0])[:, 1, 1] * test.endswith("undrained")
+    return ElementTest(F, stress, np.array([0.0, *path]), pressure, states)
+
+
+def _not_negative(v) -> NDArray[np.bool_]:
+    return (0 <= v) & (v < np.inf)
+
+
+@dataclass(frozen=True)
+class _At:
+    """A state of the soil: F (3, 3) and effective Cauchy stress (3, 3), Pa, value of the strain, the law's state."""
+
+    F: NDArray[np.float64]
+    stress: NDArray[np.float64]
+    strain: float
+    state: dict[str, NDArray[np.float64]]
+
+
+class _Point:
+    """A law at a single point."""
+
+    def __init__(self, material: Skeleton, rate: float | None, cell_size: float | None):
+        self._rate, law = rate or 1.0, type(material)
+        for field in fields(material):
+            if callable(getattr(material, field.name)) and field.name != "conductivity_law":
+                raise ValueError(f"{law.__name__}: {field.name} is a function, must be a number in an element test")
+        self._parameters = {name: np.asarray(getattr(material, name), dtype=float) for name in law.parameters}
+        self._rest = {name: np.asarray(value, dtype=float) for name, value in law.state.items()}
+        shapes = {name: value.shape for name, value in (self._parameters | self._rest).items()}
+        self._law = LawAtPoints(Grid([1.0] * 3, [2] * 3, comm=MPI.COMM_SELF), law, shapes, cell_size)
+        self._bulk = float(material.bulk)
+
+    def _data(self, F: NDArray[np.float64], state: dict[str, NDArray[np.float64]]):
+        """Return the point with several deformation gradients (m, 3, 3), and one state."""
+        m, grid = len(F), self._law.grid
+        taken = {name: np.tile(v, (m, *[1] * v.ndim)) for name, v in (self._parameters | state).items()}
+        cells = np.arange(m, dtype=np.int32) % 8
+        return self._law.points.at(cells, grid.midpoints[cells], np.ones(m), F=F, **taken)
+
+    def _stress(
+        self, F: NDArray[np.float64], state: dict[str, NDArray[np.float64]], dt: float = 0.0
+    ) -> NDArray[np.float64]:
+        return self._law.stress(self._data(F, state), dt)
+
+    def _updated(self, F: NDArray[np.float64], strain: float, before: _At, dt: float) -> _At:
+        new = {name: values[0] for name, values in self._law.new_state(self._data(F[None], before.state), dt)}
+        return _At(F, self._stress(F[None], before.state, dt)[0], strain, before.state | new)
+
+    def at_rest(self) -> _At:
+        """Return the soil as its law begins."""
+        return _At(np.eye(3), self._stress(np.eye(3)[None], self._rest)[0], 0.0, self._rest)
+
+    def compressed(self, confinement: float) -> _At:
+        """Return the soil under an isotropic effective stress, Pa, to which its law is brought in steps."""
+        at = self.at_rest()
+        first = -np.trace(at.stress) / 3
+        for share in np.linspace(0, 1, 21)[1:]:
+            goal = -(first + share * (confinement - first)) * np.ones(3)
+            at = self._balanced(at, at.F, [(0, 0), (1, 1), (2, 2)], goal, 0.0, LONG)
+        return at
+
+    def moved(self, at: _At, test: str, start: _At, strain: float) -> _At:
+        """Return the soil after a strain is reached, from a state at another; steps that fail are halved."""
+        parts, done = [strain], 0
+        while parts:
+            try:
+                at = self._step(at, test, start, parts[-1])
+                parts.pop()
+            except NotConverged:
+                done += 1
+                if done > CUTS:
+                    raise
+                parts.append((at.strain + parts[-1]) / 2)
+        return at
+
+    def _step(self, at: _At, test: str, start: _At, strain: float) -> _At:
+        kind, _, drainage = test.partition(" ")
+        F, dt = at.F.copy(), abs(strain - at.strain) / self._rate
+        if kind == "shear":
+            F[SHEAR] = start.F[1, 1] * strain
+            free = [(1, 1)] if drainage == "drained" else []
+            return self._balanced(at, F, free, start.stress[[1], [1]], strain, dt)
+        stretch = np.exp(-strain)
+        F[AXIAL] = start.F[AXIAL] * stretch
+        if kind == "isotropic":
+            F = start.F * stretch
+        elif drainage == "undrained":
+            for axis in LATERAL:
+                F[axis] = start.F[axis] / np.sqrt(stretch)
+        free = list(LATERAL) if drainage == "drained" else []
+        return self._balanced(at, F, free, start.stress[[0, 1], [0, 1]], strain, dt)
+
+    def _balanced(
+        self, at: _At, F: NDArray[np.float64], free: Sequence, goal: ArrayLike, strain: float, dt: float
+    ) -> _At:
+        """Return the soil after dt, s, where the free components of F give Cauchy stresses their goal, Pa."""
+        if not free:
+            return self._updated(F, strain, at, dt)
+        F, rows, columns = F.copy(), *np.array(free).T
+        nudges = np.zeros((1 + 2 * len(free), 3, 3))
+        for k, (i, j) in enumerate(free):
+            nudges[1 + 2 * k, i, j], nudges[2 + 2 * k, i, j] = NUDGE, -NUDGE
+        near = NEAR * np.abs(goal).max() + 1e-14 * self._bulk  # the second is round-off
+        for _ in range(ITERATIONS):
+            found = self._stress(F + nudges, at.state, dt)[:, rows, columns]
+            error = found[0] - goal
+            if not np.isfinite(found).all():
+                break
+            if np.abs(error).max() <= near:
+                return self._updated(F, strain, at, dt)
+            slope = (found[1::2] - found[2::2]).T / (2 * NUDGE)
+            step = np.linalg.lstsq(slope, error, rcond=1e-14)[0]
+            F[rows, columns] -= step * min(1.0, 0.2 / np.abs(step).max(initial=1e-300))
+        raise NotConverged(f"element test: no stretch gives the lateral stress at a strain of {strain:g}")
