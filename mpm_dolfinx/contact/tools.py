@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple, Protocol
 
@@ -321,6 +321,9 @@ class Tool:
         simulation's `tool_travel`.  In axisymmetry the load all around.
     direction : (d,)
         In which a load pushes; of any length; in axisymmetry along the axis.
+    name
+        By which its results are found, and what it has on points, as NAME_pressure; without, "tool".
+        A tool of a later stage that is given the same name keeps that.
 
     Raises
     ------
@@ -336,6 +339,7 @@ class Tool:
     adhesion: float = 0.0
     load: float | Callable[[float], float] | None = None
     direction: ArrayLike | None = None
+    name: str | None = field(default=None, kw_only=True, repr=False)
 
     def __post_init__(self):
         if not isinstance(self.shape, (HalfSpace, Ball, Convex, Cone)) and not callable(self.shape):

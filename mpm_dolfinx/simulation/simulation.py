@@ -16,12 +16,13 @@ from mpm_dolfinx.base.validation import numbers
 from mpm_dolfinx.bodies.bodies import Body, points_in_cells
 from mpm_dolfinx.conditions.axis import check_axisymmetry, with_axis
 from mpm_dolfinx.conditions.conditions import Displacement, Drained, Inflow, OnSide, Pressure, RigidPlate, Traction
+from mpm_dolfinx.conditions.names import ByName
 from mpm_dolfinx.conditions.unit_weights import under
 from mpm_dolfinx.contact.groups import Contact, grouped
 from mpm_dolfinx.contact.tools import Tool
 from mpm_dolfinx.diagnostics.scene_parts import check_options, check_parts
 from mpm_dolfinx.diagnostics.thin import warn_thin
-from mpm_dolfinx.grid.grid import SIDES, Grid
+from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.materials.initial_stress import InitialStress, by_body
 from mpm_dolfinx.materials.skeleton import Fluid, Skeleton
 from mpm_dolfinx.points.material_points import MaterialPoints
@@ -169,36 +170,40 @@ class Simulation:
         return self.state.result
 
     @property
-    def reactions(self) -> NDArray[np.float64]:
-        """(displacements, d): force by which each given displacement acts on the bodies, N (N/m in plane strain).
+    def reactions(self) -> ByName[NDArray[np.float64]]:
+        """Force (d,) by which each given displacement acts on the bodies, by its name, N (N/m in plane strain).
 
         In axisymmetry all around, the radial one the sum of what acts outward.  Of the last step; nan where none has
         been taken since a stage set them.
         """
-        return self.state.reactions
+        return self.outcome("reactions")
 
     @property
-    def wall_reactions(self) -> dict[str, NDArray[np.float64]]:
+    def wall_reactions(self) -> ByName[NDArray[np.float64]]:
         """Force (d,), N (N/m in plane strain), of each wall of the grid on the bodies; zero where it holds nothing.
 
         A component of a node that two walls hold counts once: for the wall across it, else half for each.
         """
-        return dict(zip(SIDES[self.grid.dim], self.state.walls, strict=True))
+        return self.outcome("wall_reactions")
 
     @property
-    def outflows(self) -> NDArray[np.float64]:
-        """(drained sides, then inflows), m^3/s (m^2/s in plane strain): what leaves; nan before a first step."""
-        return self.state.outflows
+    def outflows(self) -> ByName[NDArray[np.float64]]:
+        """What leaves through each drained side and inflow, by its name, m^3/s (m^2/s in plane strain)."""
+        return self.outcome("outflows")
 
     @property
-    def tool_forces(self) -> NDArray[np.float64]:
-        """(tools + contacts, d + 1), in 3D (..., 6): force and moment of each `Tool`, then `Contact`, on the bodies."""
-        return self.state.tool_forces
+    def tool_forces(self) -> ByName[NDArray[np.float64]]:
+        """Force and moment (d + 1,), in 3D (6,), of each `Tool` and `Contact` on the bodies, by its name."""
+        return self.outcome("tool_forces")
 
     @property
-    def tool_travel(self) -> NDArray[np.float64]:
-        """(tools,), m: how far a load has pushed each `Tool` beyond its displacement."""
-        return self.state.tool_travel
+    def tool_travel(self) -> ByName[NDArray[np.float64]]:
+        """How far a load has pushed each `Tool` beyond its displacement, by its name, m."""
+        return self.outcome("tool_travel")
+
+    def outcome(self, quantity: str) -> ByName[NDArray[np.float64]]:
+        """Return what conditions do to the bodies at the end of the last step, by name: of the above, or own ones."""
+        return ByName(self.state.outcome.get(quantity, {}))
 
     @property
     def present(self) -> tuple[bool, ...]:

@@ -15,9 +15,10 @@ from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.faces import surface
 from mpm_dolfinx.bodies.fills import put, touches
 from mpm_dolfinx.bodies.touching import check_apart
+from mpm_dolfinx.conditions.conditions import Drained, Pressure, Traction
 from mpm_dolfinx.conditions.sides import everywhere
 from mpm_dolfinx.conditions.unit_weights import WEIGHS, warn_units
-from mpm_dolfinx.contact.cell_contact import let_go
+from mpm_dolfinx.contact.cell_contact import gripped, let_go
 from mpm_dolfinx.domains.pressure_transport import at_start
 from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.parallel.messages import warn
@@ -32,7 +33,7 @@ def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int
     """Return the state of a scene at rest, in its first stage; its stresses as given, not yet in balance."""
     present = [body not in later for body in range(len(scene.bodies))]
     check_apart(scene.grid, scene.bodies, present)
-    begun = _stage(scene, {**conditions, "terms": [term.given for term in scene.momentum.sides.own]}, present, later)
+    begun = _stage(scene, conditions, present, later)
     _warn_weights(scene, begun, {"pressure": scene.initial.pressure})
     if scene.fluid and scene.materials.conducts:
         warn_units(scene.grid.comm, scene.fluid, conditions["gravity"])
@@ -41,13 +42,8 @@ def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int
     transported = None
     if scene.fluid:
         transported = pieces_at_start(scene, points) if callable(scene.initial.pressure) else at_start(points)
-    d, unknown = scene.grid.dim, np.nan if scene.initial.given else 0.0  # before a first step
-    reactions, walls = (np.full((count, d), unknown) for count in (len(begun.mechanical.holds), 2 * d))
-    outflows = np.zeros(len(begun.hydraulic.outlets))
-    points, forces = begun.mechanical.grip(points), begun.mechanical.forces(0.0)
-    ways = np.zeros(len(begun.mechanical.tools.tools))
-    acting = reactions, walls, outflows, forces, ways
-    return State(0.0, points, transported, None, 0, *acting, begun, True, *[None] * 4)
+    outcome = begun.unknown(np.nan if scene.initial.given else 0.0)
+    return State(0.0, _gripped(scene, begun, points), transported, None, 0, outcome, begun, True, *[None] * 4)
 
 
 def begin_stage(
@@ -72,40 +68,50 @@ def begin_stage(
     if named.keys() & {"gravity", "tractions", "drained"}:
         _warn_weights(scene, begun, {})
     if remove:
-        _warn_moved_on(scene, before, begun, [name for name in CONDITIONS if name not in {*named, "tools"}])
+        _warn_moved_on(scene, before, begun, [name for name in CONDITIONS if name not in {*named, "tools", "contacts"}])
     if state.stays:  # pressures are those of the cells
         state = scene.motion.left_grid(state, scene.on_grid(state.stay.points))
     state = replace(state, stay=None)
     gone, transported = _ids(scene.bodies, remove), state.transported
     there = [body for body, here in enumerate(before.present) if here and body not in remove]
-    bare, gravity = before.mechanical.let_go(state.points), None
+    bare, gravity = let_go(state.points, before.data_names(before.named)), None
     if scene.initial.given:
         gravity = begun.gravity_at(state.t)
     bare = _without_extra(scene, bare, add, fields) if add else bare
     points, new = _filled(scene, bare.of(gone, kept=False), there, add, gravity)
-    kept = let_go(state.points, before.mechanical.tools.kept(0)) if "tools" in named else state.points
-    points = begun.mechanical.grip(points, kept)
+    others = before.data_names(before.named.keys() - begun.same(before))
+    points = _gripped(scene, begun, points, let_go(state.points, others))
     if transported is not None:
         transported = transported.of(gone, kept=False).joined(at_start(new))
     points = _changed(scene, points, fields)
     if reset_displacement:
         points = replace(points, origin=points.corners)
-    unknown, new = np.nan if state.resets else 0.0, {}
-    if "displacements" in named:
-        new["reactions"] = np.full((len(begun.mechanical.holds), scene.grid.dim), unknown)
-    if "fixed" in named:
-        new["walls"] = np.full_like(state.walls, unknown)
-    if "tools" in named:
-        new["tool_forces"] = begun.mechanical.forces(unknown)
-        new["tool_travel"] = np.zeros(len(begun.mechanical.tools.tools))
-    if named.keys() & {"drained", "inflows"}:
-        new["outflows"] = np.full(len(begun.hydraulic.outlets), unknown)
-    new["rest"] = state.rest if begun.mechanical.holds_as(before.mechanical) else None
-    return replace(state, points=points, transported=transported, stage=begun, begins=True, held=None, **new)
+    outcome = begun.begun(before, state.outcome, np.nan if state.resets else 0.0)
+    rest = state.rest if _holds_as(begun, before) else None
+    new = {"stage": begun, "begins": True, "outcome": outcome, "held": None, "rest": rest}
+    return replace(state, points=points, transported=transported, **new)
+
+
+def _gripped(
+    scene: Scene, begun: Stage, points: MaterialPoints, before: MaterialPoints | None = None
+) -> MaterialPoints:
+    """Return points with what they keep of conditions: nothing, or what the same points had `before`."""
+    kept = begun.kept(len(points))
+    if taken := sorted(kept.keys() & scene.materials.seeded.data.keys()):
+        raise ValueError(f"{taken[0]!r}: points have data of this name, must be another name of a condition")
+    return gripped(points, kept, before)
+
+
+def _holds_as(begun: Stage, before: Stage) -> bool:
+    """Return whether the same conditions hold the same faces."""
+    return len(begun.held) == len(before.held) and all(
+        hold is was and np.array_equal(faces.id, then.id) and np.array_equal(faces.xi, then.xi)
+        for (hold, faces, _), (was, then, _) in zip(begun.held, before.held, strict=True)
+    )
 
 
 def _stage(scene: Scene, conditions: Mapping[str, Any], present: Sequence[bool], later: Sequence[int]) -> Stage:
-    return stage(scene.grid, scene.bodies, scene.materials, scene.fluid, conditions, present, later)
+    return stage(scene.grid, scene.bodies, scene.materials, scene.fluid, scene.momentum, conditions, present, later)
 
 
 def _warn_weights(scene: Scene, begun: Stage, given: Mapping[str, Any]) -> None:
@@ -115,8 +121,8 @@ def _warn_weights(scene: Scene, begun: Stage, given: Mapping[str, Any]) -> None:
     """
     gravity, fluid = begun.conditions["gravity"], scene.fluid
     g = 0.0 if gravity is None or callable(gravity) else float(np.linalg.norm(gravity))
-    on_sides = [(f"water at {c.side!r}", c.pressure) for c in begun.conditions["drained"]]
-    on_sides += [(f"water at {c.side!r}", c.value) for c in begun.conditions["tractions"]]
+    on_sides = [(f"water at {c.side!r}", c.pressure) for c in begun.of(Drained).values()]
+    on_sides += [(f"water at {c.side!r}", c.value) for c in begun.of(Traction, Pressure).values()]
     levels = [*given.items(), *on_sides]
     if fluid is None:
         levels = [(name, value) for name, value in levels if hasattr(value, "weighed") and g]
@@ -133,7 +139,7 @@ def _warn_weights(scene: Scene, begun: Stage, given: Mapping[str, Any]) -> None:
 def _warn_moved_on(scene: Scene, before: Stage, begun: Stage, kept: Sequence[str]) -> None:
     """Log a warning for each condition that was not given anew and acts on what an excavation has laid bare."""
     stop = np.cumsum([len(body) for body in scene.bodies])
-    for condition in (condition for name in kept for condition in begun.conditions[name]):
+    for condition in (one for name in kept for one in begun.conditions[name] if hasattr(one, "side")):
         was, now = (surface(scene.bodies, condition.side, condition.region, s.present) for s in (before, begun))
         bare = sum_by(now.id, now.area0, stop[-1]) - sum_by(was.id, was.area0, stop[-1])
         here = np.repeat(before.present, [len(body) for body in scene.bodies])
