@@ -147,12 +147,12 @@ def test_the_undrained_pressure_has_no_checkers():
 
 def slender(thrust, side_load):
     """Return a cantilever of 1 m x 0.1 m, pressed by a multiple of its buckling load, and its tip."""
-    grid = mpm.Grid([1.2, 1.6], [48, 64])
+    grid = mpm.Grid([0, 0], [1.2, 1.6], [48, 64])
     body = mpm.box(grid, [0, 1.2], [1, 1.3])
     critical = np.pi**2 * 1e7 * 0.1**2 / 12 / 4  # Pa
     press = mpm.Traction("right", lambda t: (-thrust * critical * t, 0))
     push = mpm.Traction("top", lambda t: (0, -side_load * t))
-    s = mpm.Simulation(grid, [body], [SOFT], fixed={"left": "xy"}, tractions=[press, push])
+    s = mpm.Simulation(grid, [body], [SOFT], walls={"left": "xy"}, tractions=[press, push])
     return s, mpm.probes([body], [[1, 1.25]])
 
 

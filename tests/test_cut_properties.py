@@ -61,7 +61,7 @@ def in_a_grid(draw, y):
     shape = np.ceil(y.max(axis=0) - SNAP / 2).astype(int).clip(1) + draw(st.integers(0, 2))
     h = orders(draw, -3, 3, d)
     lower = h * orders(draw, -2, 4, d) * numbers(draw, -1, 1, d)
-    grid = Grid(lower + h * shape, shape, lower)
+    grid = Grid(lower, lower + h * shape, shape)
     return grid, grid.lower + y * grid.h
 
 
@@ -226,7 +226,7 @@ def test_the_pieces_of_a_quadrilateral_together_have_its_centroid(scene):
 @repeatable(50)
 @given(st.lists(quadrilaterals(), min_size=2, max_size=4))
 def test_a_domain_is_cut_among_others_as_by_itself(scenes):
-    grid = Grid([14.0, 14.0], [14, 14])
+    grid = Grid([0, 0], [14.0, 14.0], [14, 14])
     domains = [(corners - own.lower) / own.h for own, corners in scenes]
     alone, among, slack = pieces(grid, domains[-1]), pieces(grid, *domains), error(grid, domains[-1])
     area, perimeter, _ = conditioned(exact(domains[-1]), slack)
@@ -358,7 +358,7 @@ def test_the_open_faces_of_a_hexahedron_are_the_sections_of_its_tetrahedra(scene
 @pytest.mark.parametrize("gap", [0, 1e-12, 9e-11, 4e-10, 1e-9, 1e-7, 1e-3])
 def test_a_face_is_open_where_the_body_is_no_further_from_it_than_the_snap(d, gap):
     """From above and from below, on either side of the middle plane."""
-    grid, open_ = Grid([2.0] * d, [2] * d), float(gap < SNAP)
+    grid, open_ = Grid([0] * d, [2.0] * d, [2] * d), float(gap < SNAP)
     for axis in range(d):
         above, below = BITS[d] * 0.5 + 0.2, BITS[d] * 0.5 + 0.2
         above[:, axis], below[:, axis] = 1 + gap + 0.5 * BITS[d][:, axis], 1 - gap - 0.5 * BITS[d][:, axis][::-1]
@@ -432,7 +432,7 @@ def test_points_on_a_face_integrate_what_is_quadratic_in_each_cell(d):
 def test_pieces_in_3d_have_the_moments_of_products_of_what_they_are():
     """Those of a turned box, and those of its eight parts summed in each cell."""
     rng = np.random.default_rng(0)
-    grid, F = Grid([3.0, 2.0, 4.0], [3, 4, 5]), np.eye(3) + 0.3 * rng.normal(size=(3, 3))
+    grid, F = Grid([0, 0, 0], [3.0, 2.0, 4.0], [3, 4, 5]), np.eye(3) + 0.3 * rng.normal(size=(3, 3))
     x, whole = np.array([[1.4, 1.1, 1.9]]), np.full((1, 3), 0.7)
     parts = x + 0.25 * 0.7 * (2 * BITS[3] - 1) @ F.T
     found = []

@@ -19,7 +19,7 @@ from mpm_dolfinx.forms.cell_matrices import (
 from mpm_dolfinx.forms.point_forms import CellSums, FormPoints, PointExpression, PointForm
 from mpm_dolfinx.forms.unknowns import Unknowns, matrix
 
-GRIDS = {2: Grid([1.5, 1.0], [4, 3]), 3: Grid([1.0, 1.2, 0.9], [2, 3, 2])}
+GRIDS = {2: Grid([0, 0], [1.5, 1.0], [4, 3]), 3: Grid([0, 0, 0], [1.0, 1.2, 0.9], [2, 3, 2])}
 
 
 class Scene:

@@ -7,7 +7,7 @@ import pytest
 from mpm_dolfinx import Grid
 from mpm_dolfinx.base import _compat
 
-GRIDS = [Grid([1.5, 1.0], [6, 5], lower=[0.5, -1.0]), Grid([1.0, 2.0, 1.5], [3, 4, 2])]
+GRIDS = [Grid([0.5, -1.0], [1.5, 1.0], [6, 5]), Grid([0, 0, 0], [1.0, 2.0, 1.5], [3, 4, 2])]
 
 
 @pytest.fixture(params=GRIDS, ids=["2D", "3D"])
@@ -69,11 +69,11 @@ def test_dolfinx_numbers_vector_dofs_as_scalar_ones(grid):
 
 def test_only_what_is_made_with_the_mesh_makes_it():
     """Notebooks, debuggers and `copy` ask any object for names of their own."""
-    grid, shared = Grid([1.0, 1.0], [2, 2]), Grid([1.0, 1.0], [2, 2])
+    grid, shared = Grid([0, 0], [1.0, 1.0], [2, 2]), Grid([0, 0], [1.0, 1.0], [2, 2])
     for name in ("_repr_html_", "_ipython_display_", "shape_", "__array__"):
         assert not hasattr(grid, name)
     assert not grid._made
     made = vars(shared._made[0]).keys() if shared.mesh is not None else set()
     assert {"mesh", "cell_nodes"} <= made
     for name in made:
-        assert hasattr(Grid([1.0, 1.0], [2, 2]), name), f"{name} is made with the mesh, but is not there before"
+        assert hasattr(Grid([0, 0], [1.0, 1.0], [2, 2]), name), f"{name} is made with the mesh, but is not there before"

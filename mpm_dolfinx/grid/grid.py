@@ -39,6 +39,7 @@ CHUNK = 2**14
 """Rows that are worked on at a time: no temporary holds one for each point of a large body."""
 MOST = 2**31 - 1
 """Unknowns that PETSc's numbers of 32 bits count."""
+ORDER = "the order is Grid(lower, upper, cells)"
 
 
 def side(name: str, dim: int) -> tuple[int, int]:
@@ -113,17 +114,15 @@ class Cells:
 class Grid:
     """Background grid of equal cells over the box [lower, upper].
 
-    Bodies must stay in it; what is empty of it costs next to nothing.  Its sides are the walls that `fixed` names:
+    Bodies must stay in it; what is empty of it costs next to nothing.  Its sides are the walls of a scene:
     "left", "right" (x), "bottom", "top" (y in 2D, z in 3D), in 3D also "front", "back" (y).
 
     Parameters
     ----------
-    upper : (d,), m
-        Upper corner; d = 2 (plane strain) or 3.
+    lower, upper : (d,), m
+        Lower and upper corner; d = 2 (plane strain) or 3.
     cells : (d,)
         Number of cells along each axis, at least 1.
-    lower : (d,), m
-        Lower corner, by default the origin.
     comm
         Processes that share the grid.
     axisymmetric
@@ -152,26 +151,25 @@ class Grid:
 
     def __init__(
         self,
+        lower: ArrayLike,
         upper: ArrayLike,
         cells: Sequence[int],
-        lower: ArrayLike | None = None,
         comm: MPI.Intracomm = MPI.COMM_WORLD,
         *,
         axisymmetric: bool = False,
     ):
-        self.upper = numbers("grid: upper", upper, (2,), (3,), allowed="2 or 3 finite coordinates")
-        self.dim = d = self.upper.size
-        lower = np.zeros(d) if lower is None else lower
-        self.lower = numbers("grid: lower", lower, (d,), allowed=f"{d} finite coordinates")
+        self.lower = numbers("grid: lower", lower, (2,), (3,), allowed="2 or 3 finite coordinates")
+        self.dim = d = self.lower.size
+        self.upper = numbers("grid: upper", upper, (d,), allowed=f"{d} finite coordinates, as lower")
         if not (self.upper > self.lower).all():
-            raise ValueError(f"grid: upper = {line(upper)}, must be > lower = {line(lower)}")
+            raise ValueError(f"grid: upper = {line(upper)}, must be > lower = {line(lower)}; {ORDER}")
         flag("grid: axisymmetric", axisymmetric)
         if axisymmetric and (d != 2 or self.lower[0] < 0):
             what = f"lower = {line(lower)}, must begin at a radius >= 0" if d == 2 else f"{d} coordinates, must have 2"
             raise ValueError(f"grid: axisymmetric = True: {what}")
         self.axisymmetric, self.stretches = axisymmetric, 3 if axisymmetric else d
         count = numbers(
-            "grid: cells", cells, (d,), allowed=f"{d} integers >= 1", test=lambda n: (n >= 1) & (n % 1 == 0)
+            "grid: cells", cells, (d,), allowed=f"{d} integers >= 1; {ORDER}", test=lambda n: (n >= 1) & (n % 1 == 0)
         )
         instance("grid: comm", comm, MPI.Comm)
         self.shape = count.astype(np.int64)
@@ -212,7 +210,7 @@ class Grid:
         if not self._made:
             self._make(owner)
         elif not keep and (self._made[0].owners[: self.cells] != owner.ravel()).any():  # of an earlier scene
-            other = Grid(self.upper, self.shape, self.lower, self.comm, axisymmetric=self.axisymmetric)
+            other = Grid(self.lower, self.upper, self.shape, self.comm, axisymmetric=self.axisymmetric)
             other._make(owner)
             return other
         return self

@@ -293,7 +293,7 @@ class MechanicalBoundary:
             placed.append((*rows, np.tile(np.eye(d)[axis], (len(rows[0]), 1))))
             if wrong >= 0:
                 what = f"{line(self.holds[held.number[wrong]][0])}: moves {'xyz'[axis]} at {held.x[wrong]}"
-                message = f"{what}, where a fixed wall holds it; must be 0 there, or the wall must leave it free"
+                message = f"{what}, where a wall holds it; must be 0 there, or the wall must leave it free"
         if message := first(comm, message):
             raise ValueError(message)
         row, stiffness, gap, own, direction = map(np.concatenate, zip(*placed, strict=True))

@@ -217,7 +217,7 @@ class Motion:
         """
         cut, stage, folded = on_grid.cut, state.stage, 0
         grid = cut.grid
-        own = ~given(grid, stage.lattices, stage.conditions["fixed"], state.points)
+        own = ~given(grid, stage.lattices, stage.conditions["walls"], state.points)
         free = own & ~tools.near(state.points.corners + moved, t)[:, :, None]
         if stage.mechanical.contacts.contacts:
             beside = stage.mechanical.contacts.near(cut, state.points, state.points.corners + moved)

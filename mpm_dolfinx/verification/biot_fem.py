@@ -102,7 +102,7 @@ class BiotFEM:
         Number of cells along each axis, at least 1.
     material, fluid
         Skeleton without state, and pore fluid, whose pressure is zero at the start.
-    fixed
+    walls
         Sides with the components that are zero there, such as {"left": "xy"}.
     tractions, drained, plates
         Conditions on sides, nodal pressures on whole facets of a region; other sides are free and sealed.
@@ -127,7 +127,7 @@ class BiotFEM:
         cells: Sequence[int],
         material: Skeleton,
         *,
-        fixed: Mapping[str, str],
+        walls: Mapping[str, str],
         fluid: Fluid | None = None,
         tractions: Sequence[Traction | Pressure] = (),
         drained: Sequence[Drained] = (),
@@ -160,7 +160,7 @@ class BiotFEM:
                 f"{type(material).__name__}: the reference has no state and no local unknowns; only moduli, "
                 "conductivity and parameters of the law may be functions of place, the rest must be numbers"
             )
-        self.grid = Grid(upper, cells, lower, comm, axisymmetric=axisymmetric)
+        self.grid = Grid(lower, upper, cells, comm, axisymmetric=axisymmetric)
         self.material, self.fluid = material, fluid
         radius = ufl.SpatialCoordinate(self.grid.mesh)[0]
         self._around = TURN * radius if axisymmetric else 1.0  # what measures in the plane count by
@@ -169,7 +169,7 @@ class BiotFEM:
         self.scale = float(np.max(material.at(self.grid.midpoints).oedometric))
         """Unit of the pressure among the unknowns, Pa; both equations are divided by it."""
         self._space = Space(self.grid, fluid is not None, *ELEMENTS[element])
-        self._bcs = self._conditions(with_axis(self.grid, fixed), drained if element == "taylor-hood" else ())
+        self._bcs = self._conditions(with_axis(self.grid, walls), drained if element == "taylor-hood" else ())
         start = time.perf_counter()
         self._plates = [(plate, self._area(plate)) for plate in plates]
         for load in tractions:
@@ -227,12 +227,12 @@ class BiotFEM:
         facets = mesh.locate_entities_boundary(msh, d - 1, lambda x: ((x[:d] >= low) & (x[:d] <= high)).all(axis=0))
         return fem.dirichletbc(PETSc.ScalarType(value), fem.locate_dofs_topological(space, d - 1, facets), space)
 
-    def _conditions(self, fixed: Mapping[str, str], drained: Sequence[Drained]) -> list:
+    def _conditions(self, walls: Mapping[str, str], drained: Sequence[Drained]) -> list:
         """Return the conditions of zero displacement and of nodal pressure."""
         axes, bcs, space = "xyz"[: self.grid.dim], [], self._space.u.function_space
-        for name, held in fixed.items():
+        for name, held in walls.items():
             if not isinstance(held, str) or not held or not set(held) <= set(axes):
-                raise ValueError(f"fixed side {name!r}: components {held!r}, must be some of {axes!r}")
+                raise ValueError(f"walls: {name!r}: components {held!r}, must be some of {axes!r}")
             bcs += [self._prescribe(space.sub(axes.index(a)), 0.0, name) for a in held]
         return bcs + [self._prescribe(self._space.W.sub(1), o.pressure / self.scale, o.side, o.region) for o in drained]
 
