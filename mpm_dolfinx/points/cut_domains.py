@@ -51,6 +51,8 @@ class Patches:
         self._faces, self.here, self.at, self._xi = faces, here, at, xi
         self.cell, self.x, self._grid = cell, x, grid
         self._share0 = share * faces.area0[here]
+        self.base = grid.base
+        """From which places count, see `Grid`."""
         around = grid.around(interpolate(faces.domain[here], xi)) if grid.axisymmetric else 1.0
         self.area0 = self._share0 * around
         """Reference areas (n,), m^(d-1)."""

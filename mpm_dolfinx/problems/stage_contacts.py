@@ -295,7 +295,7 @@ class Contacts:
             deepest = over_all(comm, float(pairs.gap.min(initial=np.inf)), MPI.MIN)
             if deepest < -BEGINS * h:
                 row = pairs.row[pairs.gap == deepest][:1]
-                where = first(comm, "".join(f"{x}" for x in cut.surface(faces).now(points)[row]))
+                where = first(comm, "".join(f"{x}" for x in cut.surface(faces).now(points)[row] + cut.grid.base))
                 return f"{line(contact)}: bodies are {-deepest / h:.3g} cells in each other at {where}"
         return ""
 

@@ -109,7 +109,7 @@ class ToolContact(CellContact):
                 gap[rows], n[rows] = solid.distance(y), solid.normal(y) @ pose.R.T
                 second[rows] = pose.R @ solid.curvature(y) @ pose.R.T
                 if isinstance(solid, Distance):
-                    _check_distance(tool, x[rows], gap[rows], n[rows], self.grid.h.min())
+                    _check_distance(tool, x[rows] + self.grid.base, gap[rows], n[rows], self.grid.h.min())
 
         everywhere(self.grid, ask)
         return gap, n, second
@@ -148,7 +148,7 @@ class ToolContact(CellContact):
         slope = self.rows.area * touch.stiff * (touch.n * along).sum(axis=1) ** 2
         met = self.summed(touch.force, 0 * touch.x)[:, : self.grid.dim]
         slope = over_all(self.grid.comm, sum_by(of, slope, len(met)))
-        unknown = unknown + ROUNDING * self._reach * slope
+        unknown = unknown + ROUNDING * self.grid.reach * slope
         goes = self.pushed.go(u, np.einsum("kd,kd->k", met, self._along), slope, unknown)
         self._rounds[0] *= not goes  # of augmentations, which begin anew
         return goes
