@@ -193,7 +193,7 @@ class CellContact:
 
     def touches(self, push: NDArray[np.float64], gap: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return which rows (m,) touch, with pressures (m,), Pa, and gaps (m,), m."""
-        return (push > 0) | (gap <= TOUCH * self.grid.reach)
+        return (push > 0) | (gap <= TOUCH * np.abs([self.grid.lower, self.grid.upper]).max())
 
     def _friction(self, n: NDArray, slip: NDArray, pressure: NDArray, on: NDArray) -> tuple:
         """Return what a `Touch` has from `sticks` on; n, slip : (k, d), normals and means."""
