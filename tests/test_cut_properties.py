@@ -131,7 +131,7 @@ def pieces(grid, *domains):
     p = Pieces(*(getattr(p, f.name)[p.point == len(domains) - 1] for f in fields(Pieces)))
     assert (p.fraction > 0).all() and (p.fraction <= 1).all() and abs(p.fraction.sum() - 1) < 1e-13
     index = np.stack(np.unravel_index(p.cell, grid.shape), axis=1)
-    assert (grid.index(p.x) == index).all(), "a centroid lies in another cell"
+    assert (grid.index_from_base(p.x) == index).all(), "a centroid lies in another cell"
     x, faces = (p.x - grid.low) / grid.h - index, p.faces * (grid.h / grid.cell_volume)[:, None]
     return {tuple(i): row for i, *row in zip(index.tolist(), p.fraction, x, faces, strict=True)}
 

@@ -77,7 +77,7 @@ class LawAtPoints:
     ) -> PointData:
         """Return some of the material points, with values (n, ...) of F and of what the law takes."""
         x = points.x[rows]
-        cells = self.grid.local(self.grid.number(self.grid.index(x)))
+        cells = self.grid.local(self.grid.number(self.grid.index_from_base(x)))
         taken = {name: values[name][rows] for name in ("F", *self._shapes)}
         return self.points.at(cells, x, points.volume0[rows], **taken)
 

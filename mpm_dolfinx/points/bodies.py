@@ -260,7 +260,7 @@ def _own(grid: Grid, body: Body) -> tuple[NDArray[np.int64], NDArray[np.float64]
     for part in in_chunks(len(body)):
         of_part = body.corners(part) - grid.base
         # of all copies of the grid alike
-        here = np.flatnonzero(grid.owner(grid.number(grid.index(centroids(of_part)))) == grid.comm.rank)
+        here = np.flatnonzero(grid.owner(grid.number(grid.index_from_base(centroids(of_part)))) == grid.comm.rank)
         rows.append(part.start + here)
         corners.append(of_part[here])
     return np.concatenate(rows), np.concatenate(corners)
@@ -272,7 +272,7 @@ def points_in_cells(grid: Grid, bodies: Sequence[Body]) -> NDArray[np.float64]:
     for body in bodies:
         for part in in_chunks(len(body)):
             x = body.centre_of(part) if body.map is None else centroids(body.corners(part))
-            np.add.at(out, grid.number(grid.index(x - grid.base)), 1.0)
+            np.add.at(out, grid.number(grid.index(x)), 1.0)
     return out
 
 

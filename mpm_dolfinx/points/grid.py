@@ -300,7 +300,11 @@ class Grid:
         return np.ravel_multi_index(tuple(index.T), tuple(self.shape))
 
     def index(self, x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the (n, d) indices of the cells that hold points, clamped into the grid."""
+        """Return the (n, d) indices of the cells that hold true places (n, d), m, clamped into the grid."""
+        return self.index_from_base(x - self.base)
+
+    def index_from_base(self, x: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Return the same of places that count from the base."""
         i = np.floor((x - self.low) / self.h).astype(np.int64)
         return np.clip(i, 0, self.shape - 1, out=i)
 
@@ -336,7 +340,7 @@ class Grid:
         return out
 
     def outside(self, x: NDArray[np.float64], tolerance: float = 1e-9) -> NDArray[np.bool_]:
-        """Return which points lie outside the grid by more than `tolerance` cells, and what is lost in rounding."""
+        """Return which places, from the base, lie outside the grid by more than `tolerance` cells, and what is lost in rounding."""
         tolerance = tolerance + rounding(np.stack([self.lower, self.upper])) / self.h
         inside = np.ones(len(x), dtype=bool)
         for a in range(self.dim):

@@ -36,7 +36,7 @@ def _warn_narrow_hole(grid: Grid, bodies: Sequence[Body]) -> None:
     x = np.concatenate([body.corners() for body in bodies])
     inner = x[:, :, 0].min(axis=1)
     near = np.flatnonzero(inner < grid.h[0] * (1 - ON))
-    row = grid.index(x[near].mean(axis=1) - grid.base)[:, 1]
+    row = grid.index(x[near].mean(axis=1))[:, 1]
     touches = np.zeros(grid.shape[1] + 2, dtype=bool)
     for k in range(3):  # a surface aslant begins off the axis in the next row
         touches[row[inner[near] <= ON * grid.h[0]] + k] = True

@@ -267,7 +267,12 @@ class CellContact:
     @property
     def rounding(self) -> NDArray[np.float64]:
         """What rounding of coordinates makes of the forces (m,), N, of the rows."""
-        return 1e-15 * self.stiffness * self.rows.area * self.grid.reach
+        return 1e-15 * self.stiffness * self.rows.area * self._reach
+
+    @property
+    def _reach(self) -> NDArray[np.float64] | float:
+        """Largest coordinate of what gaps are measured from, m; of the rows (m,), or of all."""
+        return self.grid.reach
 
     def summed(self, force: NDArray[np.float64], arm: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return forces and moments (contacts, d + 1) or, in 3D, (contacts, 6), N and N m, of all processes.

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from copy import copy, deepcopy
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import ClassVar, NamedTuple, Protocol
 
 import numpy as np
@@ -266,13 +266,22 @@ class Cone:
 
 @dataclass(frozen=True, eq=False)
 class Distance:
-    """A shape whose signed distance a function of the user's gives; its derivatives are differences over `step`, m."""
+    """A shape whose signed distance a function of the user's gives; its derivatives are differences over `step`, m.
+
+    base : (d,), m — from which places count; of true places the function is asked.  Steps are powers of two, by which
+    no true place is rounded to another one.
+    """
 
     function: Callable[[NDArray[np.float64]], ArrayLike]
     step: float
+    base: NDArray[np.float64] | float = 0.0
 
     def distance(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the signed distances (m,), m."""
+        return self._at(y + self.base)
+
+    def _at(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the signed distances (m,), m, at true places."""
         if not len(y):  # a function need not have an answer for no places
             return np.zeros(0)
         allowed = f"a finite number for each of {len(y)} places (m, {y.shape[1]})"
@@ -281,23 +290,24 @@ class Distance:
 
     def normal(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the gradients (m, d) of the distance."""
-        steps = self.step * np.eye(y.shape[1])
-        slopes = [(self.distance(y + e) - self.distance(y - e)) / (2 * self.step) for e in steps]
+        return self._slopes(y + self.base, _power_of_two(self.step))
+
+    def _slopes(self, y: NDArray[np.float64], step: float) -> NDArray[np.float64]:
+        """Return differences (m, d) of the distance over a step, m, at true places."""
+        slopes = [(self._at(y + e) - self._at(y - e)) / (2 * step) for e in step * np.eye(y.shape[1])]
         return np.stack(slopes, axis=1)
 
     def curvature(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the second derivatives (m, d, d) of the distance, 1/m."""
-        wide = Distance(self.function, 30 * self.step)  # of second differences less is lost in rounding
-        steps = wide.step * np.eye(y.shape[1])
-        slopes = [(wide.normal(y + e) - wide.normal(y - e)) / (2 * wide.step) for e in steps]
+        y, wide = y + self.base, _power_of_two(30 * self.step)  # of second differences less is lost in rounding
+        steps = wide * np.eye(y.shape[1])
+        slopes = [(self._slopes(y + e, wide) - self._slopes(y - e, wide)) / (2 * wide) for e in steps]
         return np.stack(slopes, axis=2)
 
 
-def _from_base(
-    function: Callable[[NDArray[np.float64]], ArrayLike], base: NDArray[np.float64], y: NDArray[np.float64]
-) -> ArrayLike:
-    """Return what a function of true places gives at places y (m, d), m, that count from a base (d,)."""
-    return function(y + base)
+def _power_of_two(x: float) -> float:
+    """Return the power of two next to a number."""
+    return float(2.0 ** np.rint(np.log2(x)))
 
 
 class Pose(NamedTuple):
@@ -361,7 +371,7 @@ class Tool:
     load: float | Callable[[float], float] | None = None
     direction: ArrayLike | None = None
     _base: ClassVar[NDArray[np.float64] | float] = 0.0
-    _own: ClassVar[Shape | Callable | None] = None
+    _moved: ClassVar[Shape | None] = None
 
     def __post_init__(self):
         if not isinstance(self.shape, (HalfSpace, Ball, Convex, Cone)) and not callable(self.shape):
@@ -406,8 +416,7 @@ class Tool:
         """Return the tool as places see it that count from the grid's base."""
         out, base = copy(self), grid.base
         if base.any():
-            own = partial(_from_base, self.shape, base) if callable(self.shape) else self.shape.moved(-base)
-            vars(out).update(_base=base, _own=own)
+            vars(out).update(_base=base, _moved=None if callable(self.shape) else self.shape.moved(-base))
         return out
 
     @property
@@ -417,8 +426,7 @@ class Tool:
 
     def solid(self, h: float) -> Shape:
         """Return the shape; h, m: size of a cell."""
-        shape = self._own or self.shape
-        return Distance(shape, 1e-6 * h) if callable(shape) else shape
+        return Distance(self.shape, 1e-6 * h, self._base) if callable(self.shape) else self._moved or self.shape
 
     def check(self, dim: int) -> None:
         """Refuse a tool of another dimension, or whose motion at the start is none."""

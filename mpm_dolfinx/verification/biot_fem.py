@@ -515,7 +515,7 @@ class BiotFEM:
     def _at(self, f: fem.Function, x: NDArray[np.float64], size: int) -> NDArray[np.float64]:
         """Return a function's values (m, size) at reference positions x (m, d) in the body, on every process."""
         grid, out, x = self.grid, np.zeros((len(x), size)), x - self.grid.base
-        cells = grid.local(grid.number(grid.index(x)))
+        cells = grid.local(grid.number(grid.index_from_base(x)))
         here = np.flatnonzero((cells >= 0) & (cells < grid.num_owned))
         if len(here):
             out[here] = f.eval(np.pad(x[here], ((0, 0), (0, 3 - grid.dim))), cells[here]).reshape(-1, size)
