@@ -45,7 +45,7 @@ def cofactor(F: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack([np.cross(F[:, (i + 1) % 3], F[:, (i + 2) % 3]) for i in range(3)], axis=1)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class MaterialPoints:
     """Material points of this process; arrays over its n points, that nobody changes.
 
@@ -105,6 +105,15 @@ class MaterialPoints:
             return corners if values is self.corners else values + base
 
         return replace(self, corners=corners, x=x, origin=of(self.origin), reference=of(self.reference))
+
+    def __repr__(self) -> str:
+        """Return one line: how many points, their volume at rest, and the ranges of J and pressure."""
+        own = [f"{len(self)} points in {self.F.shape[1]}D"]
+        if len(self):
+            own.append(f"{self.volume0.sum():.4g} m^{self.F.shape[1]} at rest")
+            ranges = {"J": (self.J, ""), "pressure": (self.pressure, " Pa")}
+            own += [f"{name} {v.min():.4g} to {v.max():.4g}{unit}" for name, (v, unit) in ranges.items()]
+        return f"MaterialPoints({', '.join([*own, *self.data])})"
 
     @property
     def arrays(self) -> tuple[NDArray, ...]:
