@@ -15,7 +15,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 from weakref import WeakValueDictionary, finalize
 from xml.etree import ElementTree
 
@@ -27,9 +27,9 @@ from dolfinx import fem, io
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.validation import flag, instance, line_of, on_disk, path, whole
+from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.io.units import text
 from mpm_dolfinx.parallel.exchange import at_root, to_root
-from mpm_dolfinx.points.grid import Grid
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.simulation.simulation import Simulation
 from mpm_dolfinx.stepping.result import Result
@@ -196,7 +196,7 @@ def _write_tools(simulation: Simulation, file: Path) -> None:
 class Lock:
     """A folder that this process alone writes into, for as long as any of its writers holds the lock."""
 
-    _held: WeakValueDictionary[Path, Lock] = WeakValueDictionary()
+    _held: ClassVar[WeakValueDictionary[Path, Lock]] = WeakValueDictionary()
 
     def __init__(self, folder: Path):
         file = open(folder / ".lock", "w")
