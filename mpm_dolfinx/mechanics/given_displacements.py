@@ -100,8 +100,9 @@ class GivenDisplacements(Acting):
             *rows, wrong = held.rows(axis, given, self._free[:, axis])
             placed.append((*rows, np.tile(np.eye(d)[axis], (len(rows[0]), 1))))
             if wrong >= 0:
-                what = f"{line(self._holds[held.number[wrong]][0])}: moves {'xyz'[axis]} at {held.x[wrong]}"
-                message = f"{what}, where a fixed wall holds it; must be 0 there, or the wall must leave it free"
+                hold, x = self._holds[held.number[wrong]][0], held.x[wrong] + self._grid.base
+                what = f"{line(hold)}: moves {'xyz'[axis]} at {x}"
+                message = f"{what}, where a wall holds it; must be 0 there, or the wall must leave it free"
         if message := first(comm, message):
             raise ValueError(message)
         row, stiffness, gap, own, direction = map(np.concatenate, zip(*placed, strict=True))
@@ -172,7 +173,7 @@ class GivenDisplacements(Acting):
             self._warned.add(number)
             why = "its reaction is an artefact; does something else hold it, or is the step too large?"
             what = "%s: not where it is to be at %s: %s"
-            warn(self._grid.comm, what, line(self._holds[number][0]), x, why)
+            warn(self._grid.comm, what, line(self._holds[number][0]), x + self._grid.base, why)
 
     def under_held(
         self, ids: NDArray[np.int64], tracked: NDArray[np.float64], volume: NDArray[np.float64], corners: NDArray
@@ -284,9 +285,9 @@ class HoldLoads(Loads):
     def rounding(self, of_cells: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return what rounding leaves: that of rigid sides with coordinates as well."""
         grid = self.data.points.grid
-        reach, held = np.abs(np.concatenate([grid.lower, grid.upper])).max(), np.zeros(grid.num_local)
+        held = np.zeros(grid.num_local)
         np.maximum.at(held, self.data.cells, self.data["stiffness"][:, 0])
-        return of_cells + 1e-15 * reach * held
+        return of_cells + 1e-15 * grid.reach * held
 
     def outcome(self, at: At) -> dict[str, dict[str, NDArray[np.float64]]]:
         """Return the reactions."""

@@ -255,7 +255,7 @@ class MomentumSystem:
         """Whether laws yield or hardly change their volume."""
         owned = nodes[nodes < forms.u.function_space.dofmap.index_map.size_local]
         self.touched = (owned[:, None] * d + np.arange(d)).ravel()
-        """Where forces may act, fixed or not."""
+        """Where forces may act, held by walls or not."""
         self.parts, comm = parts, forms.grid.comm
         self.of_parts, self._touched = (
             OfParts(comm, parts.nodes[at // d], parts.count) for at in (self.unknowns.owned, self.touched)
@@ -456,7 +456,7 @@ class MomentumProblem:
             told = parts.norms(np.where(size > 0, size / np.maximum(scales[parts.of], least), 0.0))
         return counts, relative(told, np.ones(parts.count))
 
-    def wall_forces(self, fixed: Mapping[str, str]) -> dict[str, NDArray[np.float64]]:
+    def wall_forces(self, walls: Mapping[str, str]) -> dict[str, NDArray[np.float64]]:
         """Return the forces (d,), N, of the walls by their names at u, where the residual was last assembled."""
         system, forces = self.system, self.system.held_residual.copy()
         system.held_penalty.multAdd(system.step, forces, forces)
@@ -466,7 +466,7 @@ class MomentumProblem:
         for one in self.loads:
             at_walls, counted = one.counted(self.at)
             dofs, values = [*dofs, at_walls], [*values, -counted]
-        return wall_forces(self.forms.grid, fixed, np.concatenate(dofs), np.concatenate(values))
+        return wall_forces(self.forms.grid, walls, np.concatenate(dofs), np.concatenate(values))
 
     def outcome(self) -> dict[str, dict[str, NDArray[np.float64]]]:
         """Return what conditions do to the bodies at u, by quantity and name."""

@@ -74,7 +74,7 @@ class OwnTerms:
         if self.rates:
             self._past.x.array[:] = past * self._u.x.array
 
-    def on(self, setting: Setting) -> Acting:
+    def acting(self, setting: Setting) -> Acting:
         """Return the terms in a stage."""
         return OwnTermsOfStage(self.terms, setting)
 

@@ -34,7 +34,7 @@ class Weight(Acting):
             grown = fem.Constant(pieces.grid.mesh, fluid_density) * (ufl.det(pieces.increment(u)) - 1)
             self._taken_up = PointForm(-grown * pull * pieces.dx, pieces)
 
-    def on(self, setting: Setting) -> Acting:
+    def acting(self, setting: Setting) -> Acting:
         """Return the weight in a stage."""
         return self
 

@@ -55,7 +55,7 @@ class Balances(NamedTuple):
     def outcome(self, state: State) -> Outcome:
         """Return what conditions do to the bodies at the end of a step, see `State`."""
         stage, out = state.stage, self.momentum.outcome()
-        out["wall_reactions"] = self.momentum.wall_forces(stage.conditions["fixed"])
+        out["wall_reactions"] = self.momentum.wall_forces(stage.conditions["walls"])
         out["outflows"] = self.storage.outflows(stage.hydraulic.names) if self.storage else {}
         return out
 

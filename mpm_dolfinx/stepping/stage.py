@@ -46,14 +46,14 @@ CONDITIONS = {
 }
 """Lists in which conditions are given, and what may stand in them beside conditions of the user's own."""
 KINDS: tuple[type[Acting], ...] = (Tractions, Pressures, Plates, GivenDisplacements, ToolsOfStage, ContactsOfStage)
-"""What acts for conditions that do not say it themselves, by their method `on`."""
+"""What acts for conditions that do not say it themselves, by their method `acting`."""
 
 
 @dataclass(frozen=True, eq=False)
 class Stage:
     """The conditions in force.
 
-    conditions: as they were given, by lists, the axis among the fixed walls; present: which bodies are there; later:
+    conditions: as they were given, by lists, the axis among the walls; present: which bodies are there; later:
     those that may still come; free: (nodes, d), components that no wall holds; axisymmetric: as the grid; lattices: of
     the bodies that are there; materials: of the scene; named: all conditions on the bodies, by their names; acting:
     what they do to the momentum; hydraulic: to the storage of the fluid.
@@ -124,7 +124,7 @@ class Stage:
     def begun(self, before: Stage, outcome: Outcome, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
         """Return the outcome as the stage begins after another: of this value for what is new in it."""
         same = {name for name, one in self.named.items() if before.named.get(name) is one}
-        if self.conditions["fixed"] == before.conditions["fixed"]:
+        if self.conditions["walls"] == before.conditions["walls"]:
             same |= SIDES[self.free.shape[1]].keys()
         return {
             quantity: {name: outcome[quantity][name] if name in same else new for name, new in values.items()}
@@ -162,7 +162,7 @@ def stage(
     momentum
         Forms, and what acts in all stages.
     conditions
-        fixed, gravity, and the lists of `CONDITIONS`: see `Simulation`.
+        walls, gravity, and the lists of `CONDITIONS`: see `Simulation`.
     present, later
         Which bodies are there, and which may still come.
 
@@ -172,7 +172,7 @@ def stage(
         Naming the condition, its value and what is allowed.
     """
     for name, kind in CONDITIONS.items():
-        all_of(name, [one for one in conditions[name] if not hasattr(one, "on")], kind)
+        all_of(name, [one for one in conditions[name] if not hasattr(one, "acting")], kind)
     if fluid is None and (conditions["drained"] or conditions["inflows"]):
         raise ValueError("drained and inflow sides need a fluid")
     gravity = conditions["gravity"]
@@ -182,17 +182,17 @@ def stage(
         gravity = _gravity(gravity, "gravity", grid.dim, grid.axisymmetric).copy()
     if not any(present):
         raise ValueError("bodies: none is there, must be at least one")
-    fixed = with_axis(grid, conditions["fixed"])
-    free = ~_fixed(grid, fixed)
-    own = {name: tuple(values) for name, values in conditions.items() if name not in ("fixed", "gravity")}
+    walls = with_axis(grid, conditions["walls"])
+    free = ~_held(grid, walls)
+    own = {name: tuple(values) for name, values in conditions.items() if name not in ("walls", "gravity")}
     for name, value in (("tractions", "value"), ("drained", "pressure")):
         own[name] = tuple(_weighed(one, value, fluid) for one in own[name])
-    conditions = {**own, "fixed": dict(fixed), "gravity": gravity}  # nobody changes what a stage was given
+    conditions = {**own, "walls": dict(walls), "gravity": gravity}  # nobody changes what a stage was given
     sides = Sides(grid, bodies, present)
     by_name = named([one for name in CONDITIONS for one in conditions[name]])
     setting = Setting(sides, free, materials, momentum.conditions, by_name)
     found = [(kind, setting.of(*kind.conditions)) for kind in KINDS]
-    acting = [one.on(setting) for one in (*momentum.acting, *by_name.values()) if hasattr(one, "on")]
+    acting = [one.acting(setting) for one in (*momentum.acting, *by_name.values()) if hasattr(one, "acting")]
     acting += [kind(setting, mine) for kind, mine in found if mine]
     hydraulic = HydraulicBoundary(sides, setting.of(Drained, Inflow))
     lattice = lattices(bodies, present, [(faces, axes) for one in acting for _, faces, axes in one.held])
@@ -214,15 +214,15 @@ def _gravity(value: ArrayLike, name: str, dim: int, axisymmetric: bool) -> NDArr
     return out
 
 
-def _fixed(grid: Grid, fixed: Mapping[str, str]) -> NDArray[np.bool_]:
+def _held(grid: Grid, walls: Mapping[str, str]) -> NDArray[np.bool_]:
     """Return which components (nodes, d) are held by walls."""
     d = grid.dim
     out = np.zeros((len(grid.node_x), d), dtype=bool)
-    if not isinstance(fixed, Mapping):
-        raise ValueError(f"fixed = {line(fixed)}, must be walls with their components, such as {{'left': 'xy'}}")
-    for wall, axes in fixed.items():
+    if not isinstance(walls, Mapping):
+        raise ValueError(f"walls = {line(walls)}, must be walls with their components, such as {{'left': 'xy'}}")
+    for wall, axes in walls.items():
         if not isinstance(axes, str) or not axes or any(a not in "xyz"[:d] for a in axes):
-            raise ValueError(f"fixed wall {wall!r}: components {axes!r}, must be some of {'xyz'[:d]!r}")
+            raise ValueError(f"walls: {wall!r}: components {axes!r}, must be some of {'xyz'[:d]!r}")
         for a in axes:
             out[grid.wall_nodes(wall), "xyz".index(a)] = True
     return out
