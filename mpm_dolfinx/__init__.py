@@ -19,6 +19,7 @@ from mpm_dolfinx.bodies.bodies import mapped
 from mpm_dolfinx.bodies.boxes import box, shape
 from mpm_dolfinx.bodies.mesh_files import from_mesh
 from mpm_dolfinx.bodies.polygon import polygon
+from mpm_dolfinx.conditions.acting import Acting, Loads
 from mpm_dolfinx.conditions.conditions import Displacement, Drained, Inflow, OnSide, Pressure, RigidPlate, Traction
 from mpm_dolfinx.conditions.water import water
 from mpm_dolfinx.contact.groups import Contact
@@ -54,6 +55,7 @@ __version__ = "0.1.0"
 __all__ = [
     "COUPLINGS",
     "K0",
+    "Acting",
     "Ball",
     "Checkpoint",
     "Cone",
@@ -72,6 +74,7 @@ __all__ = [
     "Inflow",
     "LeftGrid",
     "LinearElastic",
+    "Loads",
     "ModifiedCamClay",
     "MohrCoulomb",
     "NeoHookean",

@@ -68,7 +68,7 @@ def same_bits(a: mpm.State, b: mpm.State) -> None:
 def contents(state):
     """Return all arrays of a state by their names."""
     out = {f"points {k}": v for k, v in {**vars(state.points), **state.points.data}.items() if k != "data"}
-    out |= {"reactions": state.reactions, "walls": state.walls}
+    out |= {f"{what} {name}": value for what, of in state.outcome.items() for name, value in of.items()}
     if state.transported is not None:
         out |= {f.name: getattr(state.transported, f.name) for f in fields(state.transported)}
     if state.stay is not None:
@@ -158,7 +158,7 @@ class Driven(RuleBasedStateMachine):
     @rule()
     def look(self):
         """Reading changes nothing."""
-        str(self.s), self.s.effective_stress(), self.s.reactions, self.s.points.pressure
+        str(self.s), self.s.effective_stress(), self.s.reactions.array, self.s.points.pressure
         with pytest.raises(ValueError, match="read-only"):
             self.s.points.pressure[:] = 5e4
 
@@ -255,8 +255,8 @@ def test_nobody_writes_into_a_state_or_its_histories():
     probe = mpm.probes(s.bodies, [[0.1, 0.2]])
     s.run(1.0, 0.5, probes=probe, progress=False)
     state, row = s.state, s.result.rows[-1]
-    kept = [state.reactions, state.walls, state.outflows, state.tool_forces, state.tool_travel, state.velocity]
-    for array in [*kept, row.displacement, row.reactions, row.walls, row.outflows, row.probe_pressure]:
+    kept = [value for outcome in (state.outcome, row.outcome) for of in outcome.values() for value in of.values()]
+    for array in [*kept, state.velocity, row.displacement, row.probe_pressure]:
         assert not array.flags.writeable
     with pytest.raises(TypeError):
         s.result.rows[0] = row

@@ -31,6 +31,8 @@ T = TypeVar("T")
 
 Outcome = Mapping[str, Mapping[str, NDArray[np.float64]]]
 """What conditions do to the bodies, by quantity, such as "reactions", and by name of the condition."""
+QUANTITIES = ("reactions", "wall_reactions", "outflows", "tool_forces", "tool_travel")
+"""Those of the conditions of the package."""
 
 
 class FormsOf:

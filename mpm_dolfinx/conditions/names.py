@@ -7,6 +7,9 @@ import re
 from collections.abc import Sequence
 from typing import Any, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 from mpm_dolfinx.base.validation import line
 
 T = TypeVar("T")
@@ -14,6 +17,11 @@ T = TypeVar("T")
 
 class ByName(dict[str, T]):
     """What belongs to conditions by their names; in the order in which they were given."""
+
+    @property
+    def array(self) -> NDArray[np.float64]:
+        """All of it (conditions, ...), one above the other; what belongs to none is of shape (0,)."""
+        return np.stack(list(self.values())) if self else np.zeros(0)
 
     def __missing__(self, name: Any) -> T:
         """Refuse what is no name of them, such as a position."""

@@ -142,7 +142,7 @@ class Writer:
         """Drop what the folder holds of later times: from here on the files are this run's."""
         if (began := result.rows[-2][0]) != self._t:
             raise ValueError(f"writer: made at t = {self._t:g} s for a run that goes on from t = {began:g} s")
-        self._table.start(_row(Result(rows=result.rows[:1])))
+        self._table.start(_row(Result(rows=result.rows[-2:-1])))
         self._write_indices()
 
     def _write_indices(self) -> None:
@@ -456,7 +456,7 @@ class Table:
     def _check(self, row: dict[str, float]) -> None:
         here, there = ([name for name in names if not name.startswith(self._own)] for names in (row, self.columns))
         if here != there:
-            both = f"{', '.join(self.columns)}, the run's {', '.join(row)}"
+            both = f"{', '.join(there)}, the run's {', '.join(here)}"
             raise ValueError(f"{self.file}: its columns are {both}; must be the same, or in another folder")
 
     def _append(self, file: Path, rows: Sequence[dict], mode: str) -> None:

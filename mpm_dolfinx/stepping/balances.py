@@ -11,7 +11,7 @@ from mpi4py import MPI
 import numpy as np
 from numpy.typing import NDArray
 
-from mpm_dolfinx.conditions.acting import Loads, Outcome
+from mpm_dolfinx.conditions.acting import QUANTITIES, Loads, Outcome
 from mpm_dolfinx.flow.storage import Rates, StorageProblem
 from mpm_dolfinx.mechanics.momentum import MomentumProblem
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
@@ -54,7 +54,7 @@ class Balances(NamedTuple):
 
     def outcome(self, state: State) -> Outcome:
         """Return what conditions do to the bodies at the end of a step, see `State`."""
-        stage, out = state.stage, self.momentum.outcome()
+        stage, out = state.stage, {quantity: {} for quantity in QUANTITIES} | self.momentum.outcome()
         out["wall_reactions"] = self.momentum.wall_forces(stage.conditions["walls"])
         out["outflows"] = self.storage.outflows(stage.hydraulic.names) if self.storage else {}
         return out

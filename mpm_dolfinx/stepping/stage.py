@@ -15,7 +15,7 @@ from mpm_dolfinx.base.given_values import check_names, given
 from mpm_dolfinx.base.validation import all_of, line, numbers
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.faces import Surface
-from mpm_dolfinx.conditions.acting import Acting, Loads, Outcome, Place, Setting
+from mpm_dolfinx.conditions.acting import QUANTITIES, Acting, Loads, Outcome, Place, Setting
 from mpm_dolfinx.conditions.axis import with_axis
 from mpm_dolfinx.conditions.conditions import Displacement, Drained, Inflow, Pressure, RigidPlate, Traction
 from mpm_dolfinx.conditions.names import named
@@ -113,7 +113,7 @@ class Stage:
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
         """Return an outcome of this value, where no step has been taken."""
         d = self.free.shape[1]
-        out = {name: {} for name in ("reactions", "wall_reactions", "outflows", "tool_forces", "tool_travel")}
+        out = {quantity: {} for quantity in QUANTITIES}
         out["wall_reactions"] = {wall: np.full(d, value) for wall in SIDES[d]}
         out["outflows"] = self.hydraulic.unknown(value)
         for one in self.acting:

@@ -140,7 +140,8 @@ def _warn_moved_on(scene: Scene, before: Stage, begun: Stage, kept: Sequence[str
     """Log a warning for each condition that was not given anew and acts on what an excavation has laid bare."""
     stop = np.cumsum([len(body) for body in scene.bodies])
     for condition in (one for name in kept for one in begun.conditions[name] if hasattr(one, "side")):
-        was, now = (surface(scene.bodies, condition.side, condition.region, s.present) for s in (before, begun))
+        where = condition.side, getattr(condition, "region", None)
+        was, now = (surface(scene.bodies, *where, s.present) for s in (before, begun))
         bare = sum_by(now.id, now.area0, stop[-1]) - sum_by(was.id, was.area0, stop[-1])
         here = np.repeat(before.present, [len(body) for body in scene.bodies])
         new = np.flatnonzero(here[now.id] & (bare[now.id] > 1e-9 * now.whole0))
