@@ -75,9 +75,10 @@ class Cells:
     """The cells of a grid that this process has, ghosts included, as the mesh numbers them; complete when made.
 
     num_owned, num_local: number of cells without and with ghosts; cell_nodes (cells, 2^d): their nodes, numbered as
-    the Q1 degrees of freedom; node_x (nodes, d), midpoints (cells, d): places from the grid's base, m; signs (2^d, d):
-    on which side of the midpoint a node lies; cell_number (cells,): lexicographic numbers; locals: the way back, -1 where there is none;
-    owners: ranks of all cells, copy by copy; cell_facets (cells, 2d); facet_cells (facets, 2): -1 where there is none.
+    the Q1 degrees of freedom; node_x (nodes, d), midpoints (cells, d): places from the grid's base, m; signs
+    (2^d, d): on which side of the midpoint a node lies; cell_number (cells,): lexicographic numbers; locals: the way
+    back, -1 where there is none; owners: ranks of all cells, copy by copy; cell_facets (cells, 2d); facet_cells
+    (facets, 2): -1 where there is none.
     """
 
     def __init__(self, grid: Grid, mesh: Any, owners: NDArray[np.int32]):
@@ -419,7 +420,7 @@ class GridOfGroups(Grid):
     """
 
     def __init__(self, grid: Grid, group: NDArray[np.int64]):
-        super().__init__(grid.upper, grid.shape, grid.lower, grid.comm)
+        super().__init__(grid.lower, grid.upper, grid.shape, grid.comm)
         self._group, self._copies = group.astype(np.int16), int(group.max()) + 1
         if self.dim * self.copies * self.nodes > MOST:
             what = f"grid: has {self.nodes:.3g} nodes for each of {self.copies} groups"
