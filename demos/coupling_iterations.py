@@ -98,8 +98,7 @@ def column(h: float) -> mpm.Simulation:
         [soil],
         fluid=mpm.Fluid(),
         walls={"left": "x", "right": "x", "bottom": "xy"},
-        tractions=[footing],
-        drained=[mpm.Drained("top")],
+        conditions=[footing, mpm.Drained("top")],
     )
 
 

@@ -27,5 +27,5 @@ def beside(kind: str | None, stiffer: float = 1.0, wet: bool = False, law=None, 
     if kind == "drains":
         drained.append(mpm.Drained("top", region=THERE))
     if wet:
-        options |= {"fluid": mpm.Fluid(), "drained": drained}
-    return mpm.Simulation(grid, bodies, materials, walls={"left": "xy"}, tractions=loads, **options)
+        options |= {"fluid": mpm.Fluid(), "conditions": drained}
+    return mpm.Simulation(grid, bodies, materials, walls={"left": "xy"}, conditions=loads, **options)

@@ -32,7 +32,7 @@ def beam(*, fluid=True, ramp=0.06, load=54e3, offset=0.5, h=0.03, material=SOFT,
         options.setdefault("drained", [mpm.Drained("left"), mpm.Drained("right")])
         options["fluid"] = mpm.Fluid() if fluid is True else fluid
     simulation = mpm.Simulation(
-        grid, [body], [material], walls={"left": "xy"}, tractions=[top_load(load, ramp)], **options
+        grid, [body], [material], walls={"left": "xy"}, conditions=[top_load(load, ramp), *options.pop("conditions", [])], **options
     )
     return simulation, mpm.probes([body], [[1.0, bottom + 0.15]])
 
@@ -44,7 +44,7 @@ def pressed(finer: int = 1, conductivity=1e-5, bulk=6.7e6, shear=3.1e6, cells=(3
     load = mpm.Traction("top", lambda t: (0, -1e5 * t))
     body, water = mpm.box(grid, [0, 0], [1, 0.3], per_cell=2), {"fluid": mpm.Fluid()}
     drained = [mpm.Drained("right")]
-    return mpm.Simulation(grid, [body], [law], walls={"left": "xy"}, tractions=[load], drained=drained, **water)
+    return mpm.Simulation(grid, [body], [law], walls={"left": "xy"}, conditions=[load, *drained], **water)
 
 
 def limit(simulation, newton):

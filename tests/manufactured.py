@@ -82,8 +82,7 @@ def source(points, q, t):
 PHYSICS = {
     "fluid": WATER,
     "walls": WALLS,
-    "tractions": [mpm.Traction("top", traction)],
-    "drained": [mpm.Drained("top")],
+    "conditions": [mpm.Traction("top", traction), mpm.Drained("top")],
     "terms": [body_force],
     "sources": [source],
 }

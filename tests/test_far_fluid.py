@@ -19,18 +19,17 @@ def source(points, q):
 
 
 FAR = {
-    "resting": {"displacements": [mpm.Displacement("bottom", (0, 0), region=AWAY)]},
+    "resting": {"conditions": [mpm.Displacement("bottom", (0, 0), region=AWAY)]},
     "moving": {
-        "displacements": [
+        "conditions": [*(
             mpm.Displacement(side, lambda t, X: np.array([0.3 * np.sin(2 * np.pi * t), 0.0]), region=AWAY)
             for side in ("bottom", "top")
-        ]
+        )]
     },
     "draining": {
-        "displacements": [mpm.Displacement("bottom", (0, 0), region=AWAY)],
-        "drained": [mpm.Drained("right", lambda t: 1e3 * t, region=AWAY)],
+        "conditions": [mpm.Displacement("bottom", (0, 0), region=AWAY), mpm.Drained("right", lambda t: 1e3 * t, region=AWAY)],
     },
-    "fed": {"displacements": [mpm.Displacement("bottom", (0, 0), region=AWAY)], "sources": [source]},
+    "fed": {"conditions": [mpm.Displacement("bottom", (0, 0), region=AWAY)], "sources": [source]},
 }
 
 
@@ -44,7 +43,7 @@ def scene(far=None, load=54e3, wet=True):
         bodies.append(mpm.box(grid, [2.0, 0.6], [2.3, 0.9], material=1))
         soils.append(mpm.Hencky(bulk=3e7, shear=2e7, conductivity=1e-4))
     pressed = mpm.Traction("top", lambda t: (0, -load * (1 - abs(2 * t - 1))), region=((0, -1), (1.0 + h, 9)))
-    conditions = {"walls": {"left": "xy"}, "tractions": [pressed], **FAR.get(far, {})}
+    conditions = {"walls": {"left": "xy"}, "conditions": [pressed], **FAR.get(far, {})}
     return mpm.Simulation(grid, bodies, soils, fluid=mpm.Fluid() if wet else None, **conditions), len(bodies[0])
 
 
@@ -92,7 +91,7 @@ def test_a_checkpoint_knows_which_parts_stay(tmp_path):
     mpm.resume(resumed, tmp_path / "run")
     for each in (s, resumed):
         each.step(0.1)
-        each.stage(tractions=[])
+        each.stage(conditions=[])
         each.step(0.1)
     assert all(
         (values == values0).all() for values, values0 in zip(of_beam(resumed, count), of_beam(s, count), strict=True)

@@ -29,14 +29,14 @@ def footing(dim=2, axisymmetric=False, dilation=0.0, bulk=np.inf, steps=5, **opt
     if axisymmetric:
         walls = {"right": "x", "bottom": "xy"}
     fluid = mpm.Fluid(bulk=bulk)
-    return mpm.Simulation(grid, [block], [soil], fluid=fluid, walls=walls, displacements=[push], **options)
+    return mpm.Simulation(grid, [block], [soil], fluid=fluid, walls=walls, conditions=[push, *options.pop("conditions", [])], **options)
 
 
 def source(points, q, t):
     return 1e-6 * t * q * points.dx
 
 
-OPEN = {"drained": [mpm.Drained("top", region=([0.8, 1.6], [5.0, 1.9]))], "inflows": [mpm.Inflow("right", 1e-6)]}
+OPEN = {"conditions": [mpm.Drained("top", region=([0.8, 1.6], [5.0, 1.9])), mpm.Inflow("right", 1e-6)]}
 
 
 @pytest.mark.parametrize(

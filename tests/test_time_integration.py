@@ -17,11 +17,11 @@ from mpm_dolfinx.stepping.result import Result
 from mpm_dolfinx.stepping.time_integration import METHODS
 from mpm_dolfinx.verification.exact import terzaghi_consolidation
 
-DRAINED = {"drained": [mpm.Drained("top")]}
+DRAINED = {"conditions": [mpm.Drained("top")]}
 
 
 def loaded(load, **options):
-    return column(tractions=[mpm.Traction("top", (0, -load))], **options)
+    return column(conditions=[mpm.Traction("top", (0, -load)), *options.pop("conditions", [])], **options)
 
 
 def ramp(load, end):
@@ -43,7 +43,7 @@ def test_what_changes_within_a_step_is_of_second_order(name):
     """A column of one metre that settles by a tenth, through cells of a fifth."""
 
     def end(steps):
-        s = column(cells=5, tractions=ramp(1e6, 40), **DRAINED, **SCENES[name])
+        s = column(cells=5, conditions=[*ramp(1e6, 40)], **DRAINED, **SCENES[name])
         top = mpm.probes(s.bodies, [[0.1, 1.0]])
         return s.run(40.0, 40 / steps, probes=top, progress=False).displacement[-1][0, 1]
 
@@ -56,7 +56,7 @@ def test_what_changes_within_a_step_is_of_second_order(name):
 @pytest.mark.parametrize("steps", [1, 7, 100])
 def test_a_sealed_bodys_fluid_keeps_its_mass_whatever_the_steps(steps):
     """rho V of the pores stays: (n0 + J - 1) exp(p / K_w) = n0, for water as soft as the skeleton at large strain."""
-    s = column(cells=4, tractions=ramp(3e6, 1.0), fluid=SOFT_WATER)
+    s = column(cells=4, conditions=[*ramp(3e6, 1.0)], fluid=SOFT_WATER)
     s.run(1.0, 1 / steps, progress=False)
     J, p = s.points.J, s.points.pressure
     assert J.max() < 0.9
@@ -73,7 +73,7 @@ def hencky_column(width, headroom=0, load=1.0, porosity=0.7, **options):
     grid = mpm.Grid([0, 0], [width * h, 1.0 + headroom * h], [width, 50 + headroom])
     body, push = mpm.box(grid, [0, 0], [width * h, 1.0]), [mpm.Traction("top", (0, -load * soil.oedometric))]
     walls, water = {"left": "x", "right": "x", "bottom": "y"}, mpm.Fluid(bulk=np.inf)
-    s = mpm.Simulation(grid, [body], [soil], fluid=water, walls=walls, tractions=push, **DRAINED, **options)
+    s = mpm.Simulation(grid, [body], [soil], fluid=water, walls=walls, conditions=push, **DRAINED, **options)
     return s, mpm.probes([body], [[h / 2, 1.0]]), 1e-4 * soil.oedometric / 9810
 
 
@@ -136,14 +136,14 @@ def test_a_body_that_is_loaded_sealed_and_then_drained_does_not_ring(dt):
     s = loaded(100.0, cells=20)
     s.run(1.0, 1.0, progress=False)
     p0 = s.points.pressure.max()
-    s.stage(drained=[mpm.Drained("top")])
+    s.stage(conditions=[mpm.Drained("top")])
     extremes = np.array(s.run(1 + 3 * dt, dt, progress=False).pressure)
     assert extremes.min() > -1e-3 * p0 and extremes.max() < p0 * (1 + 1e-3)
 
 
 def test_backward_euler_is_an_option_and_of_first_order():
     def end(steps, method):
-        s = column(cells=5, tractions=ramp(1e4, 40), method=method, **DRAINED)
+        s = column(cells=5, conditions=[*ramp(1e4, 40)], method=method, **DRAINED)
         s.run(40.0, 40 / steps, progress=False)
         return s.points.pressure
 
@@ -178,14 +178,14 @@ def test_a_term_of_the_velocity_makes_a_dry_body_creep_exactly():
 TIME = 1.0 / (SOFT.conductivity / 9810 * SOFT.oedometric)  # s: T_v = 1
 DRIVEN = {
     "a load that stays": (0.05, lambda: loaded(100.0, **DRAINED)),
-    "a load that rises": (0.05, lambda: column(tractions=ramp(100.0, 2 * TIME), **DRAINED)),
-    "a load that swings": (0.02, lambda: column(tractions=[swinging(6)], **DRAINED)),
-    "one that swings slowly": (0.2, lambda: column(tractions=[swinging(0.5)], **DRAINED)),
+    "a load that rises": (0.05, lambda: column(conditions=[*ramp(100.0, 2 * TIME)], **DRAINED)),
+    "a load that swings": (0.02, lambda: column(conditions=[swinging(6)], **DRAINED)),
+    "one that swings slowly": (0.2, lambda: column(conditions=[swinging(0.5)], **DRAINED)),
     "a source": (
         0.02,
-        lambda: column(sources=[lambda points, q, t: 1e-9 * ufl.sin(8 * t / TIME) * q * points.dx], **DRAINED),
+        lambda: column(terms=[mpm.Source(lambda points, q, t: 1e-9 * ufl.sin(8 * t / TIME) * q * points.dx)], **DRAINED),
     ),
-    "a drained side": (0.02, lambda: column(drained=[mpm.Drained("top", lambda t: 100.0 * np.sin(8 * t / TIME))])),
+    "a drained side": (0.02, lambda: column(conditions=[mpm.Drained("top", lambda t: 100.0 * np.sin(8 * t / TIME))])),
 }
 
 
@@ -243,7 +243,7 @@ def test_a_jump_of_the_load_within_the_run_is_found():
     jump = [mpm.Traction("top", lambda t: (0, -100.0 if t < 7.3 else -200.0))]
 
     def run(times, **options):
-        s = column(cells=10, tractions=jump, **DRAINED)
+        s = column(cells=10, conditions=jump, **DRAINED)
         s.run(7.3 - 1e-9, 0.05, progress=False) if not options else None
         return s, s.run(20.0, *times, **options, progress=False)
 

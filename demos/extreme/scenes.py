@@ -102,7 +102,7 @@ class Beam:
         if self.weight:
             out["gravity"] = along(0, -self.weight)
         if self.fluid:
-            out |= {"fluid": self.fluid, "drained": [mpm.Drained(side) for side in self.drained]}
+            out |= {"fluid": self.fluid, "conditions": [*(mpm.Drained(side) for side in self.drained)]}
         return out
 
     def __call__(self) -> Scene:
@@ -115,7 +115,7 @@ class Beam:
         middle = low + np.array([0, height / 2])
         clamp: dict = {"walls": {"left": "xy"}}
         if self.angle:
-            clamp = {"walls": {}, "displacements": [mpm.Displacement("left", (0, 0))]}
+            clamp = {"walls": {}, "conditions": [mpm.Displacement("left", (0, 0))]}
         s = mpm.Simulation(grid, [body], [self.material], **clamp, **self.physics())
         place(s, turned(s.points.corners - middle, self.angle) + middle)
         probes = mpm.probes([body], [middle + np.array([length, 0])])
@@ -148,7 +148,7 @@ def column(error: Error | None, *layers, h=0.05, end=1.0, steps=1, per_cell=2, l
         ]
         walls = {"left": "x", "right": "x", "bottom": "y"}
         loads = [mpm.Traction("top", (0, -load), region=([-inf, tops[-1]], [inf, inf]))]
-        s = mpm.Simulation(grid, bodies, [m for m, _ in layers], walls=walls, tractions=loads, **physics)
+        s = mpm.Simulation(grid, bodies, [m for m, _ in layers], walls=walls, conditions=loads, **physics)
         return Scene(s, end, steps, error, mpm.probes(bodies, [[h / 2, tops[-1]]]))
 
     return make
@@ -167,8 +167,8 @@ def square(angle: float, error: Error | None, cells: int = 12, end=1.0, steps=4,
         body = mpm.box(grid, [0, 0], [0.6, 0.6])
         inward = {"left": (1, 0), "right": (-1, 0), "bottom": (0, 1), "top": (0, -1)}
         loads = [mpm.Traction(side, turned(1e5 * np.array(n), angle)) for side, n in inward.items()]
-        water = {"fluid": fluid, "drained": [mpm.Drained(side) for side in drained]} if fluid else {}
-        s = mpm.Simulation(grid, [body], [SOIL], walls={"left": "x", "bottom": "y"}, tractions=loads, **water)
+        water = {"fluid": fluid, "conditions": [*(mpm.Drained(side) for side in drained)]} if fluid else {}
+        s = mpm.Simulation(grid, [body], [SOIL], walls={"left": "x", "bottom": "y"}, conditions=loads, **water)
         corners = turned(s.points.corners, angle)
         place(s, corners - corners.min(axis=(0, 1)))
         return Scene(s, end, steps, error)

@@ -349,10 +349,10 @@ def _stage(built: Built) -> None:
     if kind == "load":
         built.loads["factor"] *= 1.3
     if kind == "reset":
-        built.simulation.stage(reset_displacement=True, displacements=[])
+        built.simulation.stage(reset_displacement=True, conditions=[])
         built.numbers["displacements"] = []
     if kind == "free":
-        built.simulation.stage(displacements=[])
+        built.simulation.stage(conditions=[])
         built.numbers["displacements"] = []
 
 
