@@ -58,7 +58,7 @@ def block(
     h = 1 / cells
     count = [round(box * cells), round(box * cells) + 2]
     grid = mpm.Grid([0, 0], [box, box + 2 * h], count, axisymmetric=axisymmetric)
-    options.setdefault("tractions", [mpm.Traction("top", lambda t: (0, -LOAD * t))])
+    options.setdefault("conditions", [mpm.Traction("top", lambda t: (0, -LOAD * t))])
     walls = {"left": "x", "right": "x", "bottom": "y"}
     body = meshed(grid, cells) if from_mesh else mpm.box(grid, [0, 0], [1, 1])
     return mpm.Simulation(grid, [body], [material or soil()], walls=walls, **options)
@@ -117,7 +117,7 @@ def layered(cells: int, off: float) -> mpm.Simulation:
     soils = [soil(conductivity=k) for k in (1e-4, 1e-6)]
     load = mpm.Traction("top", lambda t: (0, -LOAD * t))
     walls = {"left": "x", "right": "x", "bottom": "y"}
-    return mpm.Simulation(grid, bodies, soils, walls=walls, conditions=[load], **WATER)
+    return mpm.Simulation(grid, bodies, soils, walls=walls, **WATER | {"conditions": [load, *WATER["conditions"]]})
 
 
 class Watched(mpm.Hencky):
@@ -161,7 +161,9 @@ def apart(cells: int, **options) -> mpm.Simulation:
     bodies = [mpm.box(grid, [0, 0], [1, 1]), mpm.box(grid, [1.25, 0], [1.5, 1])]
     load = mpm.Traction("top", lambda t: (0, -LOAD * t), region=((0, 0), (1, 2)))
     walls = {"left": "x", "right": "x", "bottom": "y"}
-    return mpm.Simulation(grid, bodies, [soil()], walls=walls, conditions=[load, *options.pop("conditions", [])], **options)
+    return mpm.Simulation(
+        grid, bodies, [soil()], walls=walls, conditions=[load, *options.pop("conditions", [])], **options
+    )
 
 
 Make = Callable[[int], mpm.Simulation]

@@ -37,7 +37,9 @@ def column(cells: int, material: mpm.Skeleton, load: float = LOAD, **scene) -> m
     body = mpm.box(grid, [0, 0], [1 / cells, 1])
     top = mpm.Traction("top", lambda t: (0, -load * min(1, t)))
     walls = {"left": "x", "right": "x", "bottom": "y"}
-    return mpm.Simulation(grid, [body], [material], walls=walls, conditions=[top, *scene.pop("conditions", [])], **scene)
+    return mpm.Simulation(
+        grid, [body], [material], walls=walls, conditions=[top, *scene.pop("conditions", [])], **scene
+    )
 
 
 @dataclass

@@ -172,7 +172,9 @@ def push(
     footing = mpm.Displacement("top", lambda t, X: (0, -depth * WIDTH * min(1, t / end)), region=under)
     water = {"fluid": WATER, "method": method, "conditions": [mpm.Drained("top", region=beside)]} if rate else {}
     walls = {"left": "x", "right": "x", "bottom": "xy"}
-    simulation = mpm.Simulation(grid, [body], [soil], walls=walls, conditions=[footing], **water)
+    simulation = mpm.Simulation(
+        grid, [body], [soil], walls=walls, conditions=[footing, *water.pop("conditions", [])], **water
+    )
     out = Push()
 
     def observe(s: mpm.Simulation) -> None:

@@ -75,7 +75,10 @@ class Tissue:
             [self.law()],
             fluid=mpm.Fluid() if wet else None,
             walls=WALLS,
-            conditions=[mpm.RigidPlate("top", lambda t: load * EDGE * min(1, t / RAMP), TOP), *([mpm.Drained("top", region=TOP)] if wet else [])],
+            conditions=[
+                mpm.RigidPlate("top", lambda t: load * EDGE * min(1, t / RAMP), TOP),
+                *([mpm.Drained("top", region=TOP)] if wet else []),
+            ],
         )
         highest = body.centre[body.centre[:, 1] > EDGE - grid.h[1]]
         return simulation, mpm.probes([body], [[highest[0, 0], EDGE]])

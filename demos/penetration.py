@@ -165,7 +165,9 @@ def push_wet(rate: float, cells: int, depth: float) -> Push:
     bar = mpm.Tool(mpm.Ball((0, 0), D / 2), lambda t: (0, -speed * max(0, t - start)))
     load = mpm.Pressure("right", lambda t: PRESSURE * min(1, t / start), region=top)
     water = {"fluid": WATER, "conditions": [mpm.Drained("right", lambda t: PRESSURE * min(1, t / start), region=top)]}
-    simulation = mpm.Simulation(grid, [body], [CLAY], walls=WALLS, conditions=[load, bar], **water)
+    simulation = mpm.Simulation(
+        grid, [body], [CLAY], walls=WALLS, conditions=[load, bar, *water.pop("conditions", [])], **water
+    )
     simulation.run(start, start, progress=False)
     out = Push()
 

@@ -83,8 +83,7 @@ PHYSICS = {
     "fluid": WATER,
     "walls": WALLS,
     "conditions": [mpm.Traction("top", traction), mpm.Drained("top")],
-    "terms": [body_force],
-    "sources": [source],
+    "terms": [body_force, mpm.Source(source)],
 }
 
 

@@ -40,7 +40,11 @@ simulation = mpm.Simulation(
     [sand, gel, clay, weak],
     fluid=mpm.Fluid(),
     walls={"left": "x", "bottom": "y"},
-    conditions=[mpm.Drained("right"), mpm.Traction("top", lambda t: (0, -1e5 - 3e4 * t), region=((0, 1), (1, 2))), mpm.Traction("right", (-1e5, 0))],
+    conditions=[
+        mpm.Drained("right"),
+        mpm.Traction("top", lambda t: (0, -1e5 - 3e4 * t), region=((0, 1), (1, 2))),
+        mpm.Traction("right", (-1e5, 0)),
+    ],
     terms=[push, mpm.Source(lambda points, q, t: 1e-3 * t * points.displacement[0] * q * points.dx)],
 )
 result = simulation.run(1.0, 0.1, progress=False)

@@ -16,7 +16,7 @@ options = {"fluid": mpm.Fluid(), "walls": walls, "gravity": (0, -9.81), "conditi
 simulation = mpm.Simulation(grid, bodies, [soil], later=[2], **options)
 simulation.run(1.0, 0.5, progress=False)
 push = mpm.Displacement("top", lambda t, X: (0, -0.02 * (t - 1)), region=((0.0, 0.0), (0.31, 0.5)))
-simulation.stage(add=[2], remove=[1], conditions=[push], reset_displacement=True)
+simulation.stage(add=[2], remove=[1], conditions=[*simulation.conditions, push], reset_displacement=True)
 result = simulation.run(2.0, 0.25, probes=mpm.probes(bodies, [[0.3, 0.4], [0.9, 0.9]]), progress=False)
 points = simulation.points
 parts = grid.comm.gather((points.id, points.x, points.pressure, simulation.effective_stress()))

@@ -30,7 +30,9 @@ def block(*, fill=0.4, n=4, fluid=False, aslant=1e4, **options):
     if fluid:
         options |= {"fluid": mpm.Fluid(), "conditions": [mpm.Drained("top")]}
     load = mpm.Traction("top", lambda t: (2 * t * aslant, t * aslant, -5 * t * aslant))
-    return mpm.Simulation(grid, [body], [SOIL], walls={"bottom": "xyz"}, conditions=[load, *options.pop("conditions", [])], **options)
+    return mpm.Simulation(
+        grid, [body], [SOIL], walls={"bottom": "xyz"}, conditions=[load, *options.pop("conditions", [])], **options
+    )
 
 
 def test_a_beam_between_smooth_walls_is_in_plane_strain():

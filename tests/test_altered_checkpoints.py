@@ -12,7 +12,12 @@ import mpm_dolfinx as mpm
 
 def scene(wet, load):
     options = {"conditions": [mpm.Drained("top")]} if wet else {}
-    return column(cells=4, fluid=wet, conditions=[mpm.Traction("top", lambda t: (0, -load * t))], **options)
+    return column(
+        cells=4,
+        fluid=wet,
+        conditions=[mpm.Traction("top", lambda t: (0, -load * t)), *options.pop("conditions", [])],
+        **options,
+    )
 
 
 def noted(change):

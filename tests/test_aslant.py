@@ -32,7 +32,10 @@ def turned(cells, angle, drained, off=0.0, dim=2, seepage=False, **options):
         [SOIL],
         fluid=mpm.Fluid(bulk=WATER),
         walls={},
-        conditions=[mpm.Displacement(sides[0], (0.0,) * dim), *(mpm.Drained(sides[end], p, seepage=seepage and end == 1) for end, p in drained)],
+        conditions=[
+            mpm.Displacement(sides[0], (0.0,) * dim),
+            *(mpm.Drained(sides[end], p, seepage=seepage and end == 1) for end, p in drained),
+        ],
         **options,
     )
     return simulation, lambda x: ((x - foot) @ turn)[:, 1]

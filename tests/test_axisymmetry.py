@@ -32,7 +32,9 @@ def pressed(radial, axial, inner=0.0, upper=(1.03, 1.01), material=ELASTIC, **op
     body = mpm.box(grid, [inner, 0], upper)
     sides = ["right"] + ["left"] * (inner > 0)
     loads = [mpm.Pressure(side, radial) for side in sides] + [mpm.Pressure("top", axial)]
-    return mpm.Simulation(grid, [body], [material], walls={"bottom": "y"}, conditions=[*loads, *options.pop("conditions", [])], **options)
+    return mpm.Simulation(
+        grid, [body], [material], walls={"bottom": "y"}, conditions=[*loads, *options.pop("conditions", [])], **options
+    )
 
 
 @pytest.mark.parametrize("inner", [0.0, 0.33])
@@ -254,7 +256,7 @@ def test_laws_with_a_state_see_the_hoops(material, confinement):
     """A triaxial test of a cylinder is that of a point, but for what its top gives way within the push."""
     s = pressed(1e5, 1e5, 0.0, (0.038, 0.1), material, grid=plane((0.05, 0.12), (3, 4)))
     s.step(1.0)
-    height, side = s.points.corners[:, :, 1].max(), s.state.stage.conditions["tractions"][:1]
+    height, side = s.points.corners[:, :, 1].max(), s.conditions[:1]
     confined = s.points.F[0, 1, 1]
     push = mpm.Displacement("top", lambda t, X: (0, height * np.exp(-0.02 * (t - 1)) - 0.1), "y")
     s.stage(conditions=[*side, push])
@@ -274,7 +276,7 @@ def test_a_body_carried_along_its_axis_over_ten_cells_is_at_rest(bulk):
     grid, soil = plane((1.0, 3.0), (8, 24)), mpm.Hencky(bulk=bulk, shear=1e6, conductivity=1e-4)
     body, carried = mpm.box(grid, [0, 0.1], [0.7, 0.9]), mpm.Displacement("bottom", lambda t, X: (0, 1.25 * t), "y")
     water = {"fluid": mpm.Fluid(), "conditions": [mpm.Drained("top")]}
-    s = mpm.Simulation(grid, [body], [soil], walls={}, conditions=[carried], **water)
+    s = mpm.Simulation(grid, [body], [soil], walls={}, conditions=[carried, *water.pop("conditions", [])], **water)
     s.run(1, 0.25)
     assert s.points.corners[:, :, 1].max() == pytest.approx(0.9 + 1.25)
     assert np.abs(s.effective_stress()).max() < 1e-8 * soil.shear
@@ -298,7 +300,14 @@ def slice_or_ring(inner):
         walls={"bottom": "xy"},
         fluid=mpm.Fluid(bulk=1e8),
         gravity=(0, -9.81),
-        conditions=[mpm.Pressure("left", 2e3), mpm.Traction("right", lambda t: (1e3 * t, 0)), mpm.RigidPlate("top", lambda t: 3e4 * t * around), mpm.Drained("top", region=half), mpm.Drained("right", 2e3), mpm.Inflow("left", 1e-6)],
+        conditions=[
+            mpm.Pressure("left", 2e3),
+            mpm.Traction("right", lambda t: (1e3 * t, 0)),
+            mpm.RigidPlate("top", lambda t: 3e4 * t * around),
+            mpm.Drained("top", region=half),
+            mpm.Drained("right", 2e3),
+            mpm.Inflow("left", 1e-6),
+        ],
     )
     s.run(0.2, 0.1)
     return s
@@ -364,8 +373,11 @@ def test_the_hoops_carry_what_the_radii_do_at_the_axis_at_second_order():
 
 def test_water_under_a_load_flows_as_in_finite_elements():
     soil, load = replace(ELASTIC, conductivity=1e-6), mpm.Traction("top", (0, -1e5), region=((0, -9), (0.5, 9)))
-    common = {"fluid": mpm.Fluid(), "walls": {"left": "x", "right": "x", "bottom": "y"}, "conditions": [load]}
-    common["drained"] = [mpm.Drained("top")]
+    common = {
+        "fluid": mpm.Fluid(),
+        "walls": {"left": "x", "right": "x", "bottom": "y"},
+        "conditions": [load, mpm.Drained("top")],
+    }
     probes = [[0, 0.5], [1, 1.0]]
     fem = BiotFEM([0, 0], [1, 1], [12, 12], soil, axisymmetric=True, **common)
     truth = np.array(fem.run(20, 4, probes=probes).displacement)[:, :, 1]

@@ -31,7 +31,9 @@ def two_blocks(
     contacts = [mpm.Contact(0, 1, **contact)]
     bodies = [lower, upper][::order]
     walls = WALLS[dim]
-    return mpm.Simulation(grid, bodies, [SOIL], walls=walls, conditions=[held, *contacts], **fluid)
+    return mpm.Simulation(
+        grid, bodies, [SOIL], walls=walls, conditions=[held, *contacts, *fluid.pop("conditions", [])], **fluid
+    )
 
 
 def pressed_by(depth, height):
@@ -153,9 +155,9 @@ def heap(wet=False):
     bodies = [mpm.box(grid, [0, low], [1, high], per_cell=2 + i) for i, (low, high) in enumerate(heights)]
     soil = mpm.Hencky(bulk=E / 3, shear=E / 2, porosity=0.4, conductivity=1e-5, grain_density=2000)
     walls, contact = {"bottom": "y", "left": "x", "right": "x"}, mpm.Contact([1, 2, 3], 0, friction=0.2)
-    water = {"fluid": mpm.Fluid(), "conditions": [mpm.Drained("bottom", region=([0, 0], [1, 0]))]} if wet else {}
-    given = {"conditions": [contact], "gravity": [0, -10.0], "later": [2, 3], **water}
-    return mpm.Simulation(grid, bodies, [soil], walls=walls, **given)
+    conditions = [contact, *[mpm.Drained("bottom", region=([0, 0], [1, 0]))] * wet]
+    given = {"gravity": [0, -10.0], "later": [2, 3], "fluid": mpm.Fluid() if wet else None}
+    return mpm.Simulation(grid, bodies, [soil], walls=walls, conditions=conditions, **given)
 
 
 @pytest.mark.parametrize("wet", [False, True])
@@ -204,7 +206,7 @@ def test_a_tool_presses_a_face_that_another_group_lay_on(tmp_path):
     s.run(1.0, 0.25, observe=write)
     top = s.points.corners[s.points.id < len(s.bodies[0]), :, 1].max()
     plate = mpm.Convex([[-0.5, top], [1.5, top], [1.5, top + 0.2], [-0.5, top + 0.2]])
-    s.stage(conditions=[mpm.Tool(plate, displacement=lambda t: (0, -0.1 * (t - 1)))])
+    s.stage(conditions=[*s.conditions, mpm.Tool(plate, displacement=lambda t: (0, -0.1 * (t - 1)))])
     s.run(2.0, 0.5)
     assert s.tool_forces[:, 1] == pytest.approx([pressed_by(0.1, top), 0], rel=1e-3)
 
@@ -218,7 +220,11 @@ def test_a_block_on_soil_at_rest_stays_there(wet, friction):
         grid, y = mpm.Grid([0, 0], [1, 2], [8, 16]), 0.55
         bodies = [mpm.box(grid, [0, 0], [1, y]), mpm.box(grid, [0, y], [width, y + 0.6], per_cell=3)]
         water = {"fluid": mpm.Fluid(), "pressure": mpm.hydrostatic(y + 0.6, 1e4)} if wet else {}
-        rest = {"gravity": [0, -10], "initial_stress": mpm.K0(1.0), "conditions": [mpm.Contact(1, 0, friction=friction)]}
+        rest = {
+            "gravity": [0, -10],
+            "initial_stress": mpm.K0(1.0),
+            "conditions": [mpm.Contact(1, 0, friction=friction)],
+        }
         walls = {"bottom": "xy", "left": "x", "right": "x"}
         s = mpm.Simulation(grid, bodies, [soil], walls=walls, **rest, **water)
         before = s.points.x.copy()
@@ -233,7 +239,9 @@ def test_what_are_no_contacts_is_refused():
     deep = mpm.box(grid, [0, 0.3], [1, 0.9])
 
     def scene(bodies, *contacts, **more):
-        return mpm.Simulation(grid, bodies, [SOIL], walls={"bottom": "xy"}, conditions=[*contacts, *more.pop("conditions", [])], **more)
+        return mpm.Simulation(
+            grid, bodies, [SOIL], walls={"bottom": "xy"}, conditions=[*contacts, *more.pop("conditions", [])], **more
+        )
 
     with pytest.raises(ValueError, match=r"Contact: friction = -0.1, must be >= 0 and finite"):
         mpm.Contact(0, 1, friction=-0.1)
@@ -260,7 +268,9 @@ def test_what_are_no_contacts_is_refused():
     with pytest.raises(ValueError, match=r"is free to move as a rigid body in 3 of 3 ways"):
         scene(boxes[::2], mpm.Contact(0, 1, friction=0.3), gravity=[0, -10]).step(1.0)
     sand = mpm.MohrCoulomb(bulk=2e7, shear=1e7, friction=30.0, dilation=10.0, cohesion=5e3)
-    s = mpm.Simulation(grid, boxes[:2], [sand], walls={"bottom": "xy"}, conditions=[mpm.Contact(0, 1)], gravity=[0, -10])
+    s = mpm.Simulation(
+        grid, boxes[:2], [sand], walls={"bottom": "xy"}, conditions=[mpm.Contact(0, 1)], gravity=[0, -10]
+    )
     with pytest.raises(ValueError, match=r"factor_of_safety: contacts: must be none"):
         mpm.factor_of_safety(s)
 
@@ -302,7 +312,9 @@ def test_a_block_on_a_slope_of_another_body_slips_where_its_tangent_is_the_coeff
         return turn @ [-10 * np.sin(angle), -10 * np.cos(angle)]
 
     options = {"walls": {}, "conditions": [held], "gravity": gravity}
-    scene = mpm.Simulation(grid, bodies, [rock], conditions=[mpm.Contact(1, 0, friction=mu)], **options)
+    scene = mpm.Simulation(
+        grid, bodies, [rock], conditions=[mpm.Contact(1, 0, friction=mu), *options.pop("conditions", [])], **options
+    )
     if share > 1:
         with pytest.raises(mpm.GaveUp):
             scene.run(1.0, 0.25)

@@ -95,8 +95,15 @@ def left_of(h, dim=2, **wet):
     lower = np.array([0.0, *[0.1] * (dim - 2), 0.6 + h / 2])
     body = mpm.box(grid, lower, np.add(lower, [1.0, *[0.2] * (dim - 2), 0.3]))
     load = mpm.Traction("top", lambda t: [0.0] * (dim - 1) + [-2e4 * (1 - abs(2 * (t % 1) - 1))])
-    soil = mpm.Hencky(bulk=1e7 / 3, shear=5e6, conductivity=1.0 if "drained" in wet else 0.0)
-    s = mpm.Simulation(grid, [body], [soil], walls={"left": "xyz"[:dim]}, conditions=[load, *wet.pop("conditions", [])], **wet)
+    soil = mpm.Hencky(bulk=1e7 / 3, shear=5e6, conductivity=1.0 if "conditions" in wet else 0.0)
+    s = mpm.Simulation(
+        grid,
+        [body],
+        [soil],
+        walls={"left": "xyz"[:dim]},
+        conditions=[load, *wet.get("conditions", [])],
+        fluid=wet.get("fluid"),
+    )
     s.run(0.5, 0.1, progress=False)
     peak = cycles.rms(s)
     s.run(3.0, 0.1, progress=False)

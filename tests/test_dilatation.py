@@ -119,7 +119,9 @@ def sagging(*materials, far=False, later=False, **options):
     load = mpm.Traction("top", lambda t: (0, -54e3 * t), region=((0.05, 0.9), (1.0, 1.0)))
     walls = {"left": "xy", "bottom": "xy"}
     options |= {"later": [1] if later else [], "tolerance": 1e-11}
-    s = mpm.Simulation(grid, bodies, materials, walls=walls, conditions=[load], **options)
+    s = mpm.Simulation(
+        grid, bodies, materials, walls=walls, conditions=[load, *options.pop("conditions", [])], **options
+    )
     probe = mpm.probes(bodies, [[1.0, 0.78]])
     if later:
         s.run(0.5, 0.25, probes=probe)

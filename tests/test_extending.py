@@ -67,7 +67,9 @@ def two_halves(lower, upper, **options):
     grid = mpm.Grid([0, 0], [0.1, 1.4], [1, 14])
     bodies = [mpm.box(grid, [0, 0], [0.1, 0.5]), mpm.box(grid, [0, 0.5], [0.1, 1], material=1)]
     walls = {"left": "x", "right": "x", "bottom": "y"}
-    return mpm.Simulation(grid, bodies, [lower, upper], walls=walls, conditions=[load(1.0), *options.pop("conditions", [])], **options)
+    return mpm.Simulation(
+        grid, bodies, [lower, upper], walls=walls, conditions=[load(1.0), *options.pop("conditions", [])], **options
+    )
 
 
 def test_a_function_of_place_equals_two_materials():
@@ -147,9 +149,7 @@ def test_each_body_has_the_stress_of_its_own_law():
 
 
 def test_state_changes_once_a_step_and_only_if_it_converged():
-    s = column(
-        fluid=False, material=Damaged(1e6, 6e5), conditions=[mpm.Displacement("top", lambda t, X: (0, -t), "y")]
-    )
+    s = column(fluid=False, material=Damaged(1e6, 6e5), conditions=[mpm.Displacement("top", lambda t, X: (0, -t), "y")])
     s.run(0.2, 0.05)
     assert s.points.data["damage"] == pytest.approx(-np.log(0.8), abs=1e-4)
     before = {name: values.copy() for name, values in s.points.data.items()}
@@ -292,7 +292,12 @@ def test_a_viscous_stress_takes_the_length_of_each_step():
 
 def test_a_source_raises_the_steady_pressure_and_the_balance_closes():
     rate, soil = 1e-7, replace(SOFT, conductivity=1e-6)
-    s = column(cells=20, material=soil, conditions=[mpm.Drained("top")], terms=[mpm.Source(lambda points, q: rate * q * points.dx)])
+    s = column(
+        cells=20,
+        material=soil,
+        conditions=[mpm.Drained("top")],
+        terms=[mpm.Source(lambda points, q: rate * q * points.dx)],
+    )
     result = s.run(5000, 250)
     exact = rate * 9810 / 1e-6 / 2 * (1 - s.points.x[:, 1] ** 2)
     lattice = (2, 20, 2)

@@ -29,7 +29,9 @@ def footing(dim=2, axisymmetric=False, dilation=0.0, bulk=np.inf, steps=5, **opt
     if axisymmetric:
         walls = {"right": "x", "bottom": "xy"}
     fluid = mpm.Fluid(bulk=bulk)
-    return mpm.Simulation(grid, [block], [soil], fluid=fluid, walls=walls, conditions=[push, *options.pop("conditions", [])], **options)
+    return mpm.Simulation(
+        grid, [block], [soil], fluid=fluid, walls=walls, conditions=[push, *options.pop("conditions", [])], **options
+    )
 
 
 def source(points, q, t):
@@ -47,7 +49,7 @@ OPEN = {"conditions": [mpm.Drained("top", region=([0.8, 1.6], [5.0, 1.9])), mpm.
         {"axisymmetric": True},
         {"dim": 3},
         {"method": "backward-euler", **OPEN},
-        {"method": "backward-euler", "sources": [source], "bulk": 2.2e9, **OPEN},
+        {"method": "backward-euler", "terms": [mpm.Source(source)], "bulk": 2.2e9, **OPEN},
     ],
     ids=["sealed", "compressible", "axisymmetric", "3D", "open", "fed"],
 )
@@ -61,7 +63,7 @@ def test_yielding_soil_keeps_its_fluid(scene):
     for _ in range(steps):
         s.step(1 / steps)
         came -= s.outflows.sum() / steps
-        if "sources" in scene:
+        if "terms" in scene:
             came += 1e-6 * s.t / steps * (s.points.volume0 * s.points.J).sum()
     now, exchanged = fluid_of(s)
     off = abs(now - start - came) / exchanged

@@ -89,7 +89,7 @@ def test_steady_flow_across_seams_is_exact_at_any_offset(seams, offset):
 @pytest.mark.parametrize("options", [{"dim": 3}, {"per_cell": 1}, {"per_cell": 3}], ids=str)
 def test_steady_flow_is_exact_in_3d_and_with_any_number_of_points(options):
     dim = options.get("dim", 2)
-    s = column([(0.525, 0.625)], fluid=INCOMPRESSIBLE, conditions=[*ends(dim)], **options)
+    s = column([(0.525, 0.625)], fluid=INCOMPRESSIBLE, conditions=ends(dim), **options)
     assert steady(s) == pytest.approx(TINY * H ** (dim - 1) / resistance(0.1), rel=1e-8, abs=0)
 
 
@@ -145,7 +145,10 @@ def test_flow_across_a_seam_is_exact_wherever_the_load_moves_it():
             [(0.5, 0.6)],
             [sand, clay],
             fluid=INCOMPRESSIBLE,
-            conditions=[*ends(2, 1.0), mpm.Traction("top", lambda t, load=load: (0, -load * min(1, t / 1e9)), ([0, 1], [H, 1]))],
+            conditions=[
+                *ends(2, 1.0),
+                mpm.Traction("top", lambda t, load=load: (0, -load * min(1, t / 1e9)), ([0, 1], [H, 1])),
+            ],
         )
         s.run(1e10, 2.5e8, progress=False)
         thickness = s.points.volume0 * s.points.J / H

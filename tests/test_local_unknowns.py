@@ -107,7 +107,12 @@ def test_an_energy_of_local_unknowns_has_its_tangent(dim):
 
 def settled(material, **options):
     """Return the displacement of the top of a column under a load that grows; it has a fluid or none."""
-    s = column(cells=4, material=material, conditions=[mpm.Traction("top", lambda t: (0, -2e5 * t)), *options.pop("conditions", [])], **options)
+    s = column(
+        cells=4,
+        material=material,
+        conditions=[mpm.Traction("top", lambda t: (0, -2e5 * t)), *options.pop("conditions", [])],
+        **options,
+    )
     result = s.run(1.0, 0.25, probes=mpm.probes(s.bodies, [[0.125, 1.0]]))
     return s, result, result.displacement[-1][0, 1]
 

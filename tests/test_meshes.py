@@ -390,7 +390,11 @@ def test_a_resumed_mesh_ends_as_one_that_was_never_interrupted(tmp_path):
     def scene():
         body = mpm.from_mesh(GRID, box_mesh("triangle", (6, 4), (0, 0), (1, 1)))
         return mpm.Simulation(
-            GRID, [body], [SOIL], walls={"bottom": "xy"}, conditions=[mpm.Traction("top", lambda t: (2e4 * t, -2e4 * t))]
+            GRID,
+            [body],
+            [SOIL],
+            walls={"bottom": "xy"},
+            conditions=[mpm.Traction("top", lambda t: (2e4 * t, -2e4 * t))],
         )
 
     whole, part = scene(), scene()

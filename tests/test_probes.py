@@ -31,7 +31,7 @@ def test_a_column_consolidates_at_any_place_as_terzaghi_says(cells, allowed):
     soil = mpm.LinearElastic(bulk=modulus / 3, shear=modulus / 2, conductivity=k)
     walls, load = SIDES[2] | {"bottom": "y"}, [mpm.Traction("top", (0, -1e3))]
     water = {"fluid": mpm.Fluid(bulk=np.inf), "conditions": [mpm.Drained("top")]}
-    s = mpm.Simulation(grid, [body], [soil], walls=walls, conditions=load, **water)
+    s = mpm.Simulation(grid, [body], [soil], walls=walls, conditions=[*load, *water.pop("conditions", [])], **water)
     z, unit = np.linspace(0, 1, 37), WEIGHT / (k * modulus)
     probes = mpm.probes([body], np.column_stack([np.full(37, 0.2 * h), z]))
     found = s.run(unit, rtol=1e-4, t_eval=unit * np.array(times), probes=probes, progress=False).probe_pressure[1:]
@@ -120,7 +120,7 @@ def test_no_pressure_passes_those_around_it_where_one_jumps(place):
     body, soil = mpm.box(grid, [0, 0], [0.2, 1]), mpm.LinearElastic(bulk=1e6, shear=1e6, conductivity=1e-6)
     walls, load = SIDES[2] | {"bottom": "y"}, [mpm.Traction("top", (0, -1e3))]
     water = {"fluid": mpm.Fluid(bulk=np.inf), "conditions": [mpm.Drained("top")]}
-    s = mpm.Simulation(grid, [body], [soil], walls=walls, conditions=load, **water)
+    s = mpm.Simulation(grid, [body], [soil], walls=walls, conditions=[*load, *water.pop("conditions", [])], **water)
     probes = mpm.probes([body], [[0.07, place + d] for d in (-0.03, 0.0, 0.03) if 0 <= place + d <= 1])
     p = s.run(0.1, 0.1, probes=probes, progress=False).probe_pressure[-1]
     most = s.cells().pressure.max()

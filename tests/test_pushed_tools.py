@@ -15,7 +15,14 @@ def layer(*tools, wet=False, material=SOIL, **options):
     grid = mpm.Grid([0, 0], [2.0, 1.5], [16, 12])
     water = {"fluid": mpm.Fluid(), "conditions": [mpm.Drained("top")]} if wet else {}
     options.setdefault("walls", {"left": "x", "right": "x", "bottom": "xy"})
-    return mpm.Simulation(grid, [mpm.box(grid, [0, 0], [2, 1])], [material], conditions=[*tools, *options.pop("conditions", [])], **water, **options)
+    return mpm.Simulation(
+        grid,
+        [mpm.box(grid, [0, 0], [2, 1])],
+        [material],
+        conditions=[*tools, *options.pop("conditions", []), *water.pop("conditions", [])],
+        **water,
+        **options,
+    )
 
 
 def pushed(load, shape=BALL, **options):
@@ -71,7 +78,9 @@ def test_two_loads_squeeze_a_body_between_them():
     left = mpm.Tool(mpm.HalfSpace((0.2, 0), (1, 0)), load=lambda t: 1e4 * t, direction=(1, 0))
     right = mpm.Tool(mpm.HalfSpace((1.2, 0), (-1, 0)), load=lambda t: 1e4 * t, direction=(-1, 0))
     grid = mpm.Grid([0, 0], [1.5, 1.0], [15, 10])
-    s = mpm.Simulation(grid, [mpm.box(grid, [0.2, 0], [1.2, 0.5])], [SOIL], walls={"bottom": "y"}, conditions=[left, right])
+    s = mpm.Simulation(
+        grid, [mpm.box(grid, [0.2, 0], [1.2, 0.5])], [SOIL], walls={"bottom": "y"}, conditions=[left, right]
+    )
     s.run(1.0, 0.5)
     assert s.tool_forces[:, 0] == pytest.approx([1e4, -1e4], rel=1e-6)
     stress = s.effective_stress()[:, 0, 0]
@@ -180,7 +189,7 @@ def test_a_stage_with_new_tools_lets_go_and_one_without_goes_on():
     s = layer(pushed(lambda t: 2e4 * min(t, 1)))
     s.run(1.0, 0.5)
     travel = s.tool_travel
-    s.stage(conditions=[])
+    s.stage(conditions=s.conditions)
     s.run(1.5, 0.25)
     assert s.tool_travel == pytest.approx(travel, rel=1e-2)
     assert -s.tool_forces[0, 1] == pytest.approx(2e4, rel=1e-6)

@@ -20,7 +20,13 @@ def scene(material=None, wet=False, **options):
     soil = material or mpm.Hencky(bulk=1e6, shear=6e5, conductivity=1e-5)
     water = {"fluid": mpm.Fluid(), "conditions": [mpm.Drained("top")]} if wet else {}
     return mpm.Simulation(
-        GRID, [BODY], [soil], walls=WALLS, conditions=[mpm.Traction("top", (0, -1e4)), *options.pop("conditions", [])], **water, **options
+        GRID,
+        [BODY],
+        [soil],
+        walls=WALLS,
+        conditions=[mpm.Traction("top", (0, -1e4)), *options.pop("conditions", []), *water.pop("conditions", [])],
+        **water,
+        **options,
     )
 
 

@@ -22,7 +22,14 @@ def column(base, dim=2, top=0.0, h=0.25, seepage=True, **options):
     drained = [mpm.Drained("bottom", base), mpm.Drained("top", top, seepage=seepage)]
     gravity = [*[0.0] * (dim - 1), -9.81]
     return mpm.Simulation(
-        grid, [body], [SOIL], walls=walls, fluid=mpm.Fluid(), conditions=[*drained, *options.pop("conditions", [])], gravity=gravity, **options
+        grid,
+        [body],
+        [SOIL],
+        walls=walls,
+        fluid=mpm.Fluid(),
+        conditions=[*drained, *options.pop("conditions", [])],
+        gravity=gravity,
+        **options,
     )
 
 

@@ -18,7 +18,9 @@ WEIGHT = 9810.0  # of water, N/m^3
 def block(*tractions, walls=WALLS, **options):
     """Return a block that has taken a step under tractions."""
     body = mpm.box(GRID, [0, 0], [1, 1])
-    s = mpm.Simulation(GRID, [body], [SOIL], walls=walls, conditions=[*tractions, *options.pop("conditions", [])], **options)
+    s = mpm.Simulation(
+        GRID, [body], [SOIL], walls=walls, conditions=[*tractions, *options.pop("conditions", [])], **options
+    )
     s.run(1.0, 0.5, progress=False)
     return s
 
@@ -78,8 +80,8 @@ def test_heads_and_inflows_of_time_are_of_second_order(name):
         if name == "drained":
             sides = {"conditions": [mpm.Drained("top", lambda t: 1e4 * np.sin(2 * t))]}
         else:
-            sides = {"conditions": [mpm.Inflow("top", lambda t, X: 1e-6 * np.sin(2 * t) * np.ones(len(X)))]}
-            sides["drained"] = [mpm.Drained("bottom")]
+            into = mpm.Inflow("top", lambda t, X: 1e-6 * np.sin(2 * t) * np.ones(len(X)))
+            sides = {"conditions": [into, mpm.Drained("bottom")]}
         s = column(cells=10, material=stiff, **sides)
         s.run(4.0, 4.0 / steps, progress=False)
         return s.points.pressure[s.points.x[:, 1] < 0.5]  # at the side itself the order rises to 2 later
@@ -210,7 +212,7 @@ def test_what_a_condition_was_given_is_its_own():
     s = mpm.Simulation(GRID, [mpm.box(GRID, [0, 0], [1, 1])], [SOIL], walls=walls, conditions=loads, gravity=gravity)
     value[:], region[1][0], gravity[:], walls["bottom"] = 1e9, 0.1, 1e9, "x"
     loads.append(mpm.Traction("top", (0, 1e9)))
-    s.stage(conditions=[])
+    s.stage(conditions=s.conditions)
     s.run(1.0, 0.5, progress=False)
     same = block(mpm.Traction("top", (0, -1e4)), gravity=(0, -9.81))
     assert s.points.x == pytest.approx(same.points.x, abs=1e-12)

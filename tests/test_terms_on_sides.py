@@ -30,7 +30,9 @@ def column(terms, dim=2, off=0.03, load=LOAD, **options):
     every = {"left": "x", "right": "x", "front": "y", "back": "y"}
     walls = {name: axes for name, axes in every.items() if dim == 3 or name in ("left", "right")}
     loads = [mpm.Traction("top", lambda t: [0] * (dim - 1) + [-load * min(t, 1)])]
-    s = mpm.Simulation(grid, [body], [SOIL], walls=walls, conditions=[*loads, *options.pop("conditions", [])], terms=terms, **options)
+    s = mpm.Simulation(
+        grid, [body], [SOIL], walls=walls, conditions=[*loads, *options.pop("conditions", [])], terms=terms, **options
+    )
     return s, mpm.probes([body], [[0.25] * (dim - 1) + [y + off] for y in (0.2, 1.2)])
 
 

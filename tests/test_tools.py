@@ -25,7 +25,7 @@ def deepest(simulation):
     """Return how deep corners are in the tools, in cells."""
     t, d = simulation.t, simulation.grid.dim
     x = simulation.points.corners.reshape(-1, d)
-    tools = simulation.state.stage.conditions["tools"]
+    tools = [one for one in simulation.conditions if isinstance(one, mpm.Tool)]
     return max(-tool.shape.distance(tool.pose(t, d).own(x)).min() for tool in tools) / simulation.grid.h.min()
 
 
@@ -155,7 +155,9 @@ def on_a_floor(way, cells, length, delta, floor, steps):
     ]
     options = {"conditions": [mpm.Pressure("top", lambda t: load * min(1, t)), *tools], "walls": {}}
     far = [mpm.Displacement("right", (0, 0), "x")]
-    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [length, 1])], [soil], conditions=far, **options)
+    s = mpm.Simulation(
+        grid, [mpm.box(grid, [0, 0], [length, 1])], [soil], conditions=[*far, *options.pop("conditions", [])], **options
+    )
     s.run(1.0, 1 / steps)
     return (np.array(s.run(2.0, 1 / steps).tools)[1:, 0, 0] + rest) / (load + rest)
 
@@ -263,7 +265,9 @@ def simple(**options):
     plate = options.pop("shape", mpm.HalfSpace((0, 0.6), (0, -1)))
     tool = mpm.Tool(plate, **options.pop("tool", {"displacement": lambda t: (0, -0.1 * t)}))
     options.setdefault("walls", {"bottom": "xy"})
-    return mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 0.6])], [GEL], conditions=[tool, *options.pop("conditions", [])], **options)
+    return mpm.Simulation(
+        grid, [mpm.box(grid, [0, 0], [1, 0.6])], [GEL], conditions=[tool, *options.pop("conditions", [])], **options
+    )
 
 
 def shallow(y):
@@ -350,7 +354,7 @@ def test_a_refused_step_leaves_the_contact():
             return 0.0
 
         s = simple(tool={"displacement": lambda t: (0.02 * t, -0.03 * t), "friction": 0.3})
-        s.stage(conditions=[mpm.Pressure("right", load)])
+        s.stage(conditions=[*s.conditions, mpm.Pressure("right", load)])
         s.step(0.5)
         if refuses:
             with pytest.raises(ValueError, match="not now"):
@@ -369,7 +373,9 @@ def test_a_stage_goes_on_with_a_tool_wherever_the_step_before_left_it():
     forces = []
     for stages in (1, 2):
         disc = mpm.Tool(mpm.Ball((0.63, 0.78), 0.18), displacement=lambda t: (0, -0.15 * t))
-        s = mpm.Simulation(grid, [mpm.box(grid, [0.1, 0], [1.1, 0.6])], [GEL], walls={"bottom": "xy"}, conditions=[disc])
+        s = mpm.Simulation(
+            grid, [mpm.box(grid, [0.1, 0], [1.1, 0.6])], [GEL], walls={"bottom": "xy"}, conditions=[disc]
+        )
         s.run(1.0, 0.1, progress=False)
         if stages == 2:
             faces = s.scene.on_grid(s.points).cut.surface(s.state.stage.mechanical.tools.faces)

@@ -136,7 +136,7 @@ def test_a_unit_weight_that_is_given_stays():
         )
         assert s.points.pressure == pytest.approx(weight * (2.0 - s.points.x[:, 1]))
         conditions = s.state.stage.conditions
-        for value in (conditions["tractions"][0].value, conditions["drained"][0].pressure):
+        for value in (conditions["tractions"][0].value, conditions["outlets"][0].pressure):
             assert value(0.0, np.array([[0.0, 1.0]])) == pytest.approx(weight)
 
 
@@ -153,9 +153,9 @@ def test_finite_elements_take_the_same_unit_weight():
     for unit in (Units(), units):
         water = unit.fluid(gravity=9.81 * unit.gravity)
         load = mpm.Traction("top", (0, -LOAD * unit.stress))
-        options = {"walls": {"left": "x", "right": "x", "bottom": "y"}, "conditions": [mpm.Drained("top")]}
+        options = {"walls": {"left": "x", "right": "x", "bottom": "y"}, "conditions": [load, mpm.Drained("top")]}
         size = np.array([0.2, 1.0]) * unit.length
-        fem = BiotFEM([0, 0], size, [1, 8], unit.soil(), fluid=water, conditions=[load], **options)
+        fem = BiotFEM([0, 0], size, [1, 8], unit.soil(), fluid=water, **options)
         fem.run(10 * unit.time, 10 * unit.time, probes=[size / 2])
         pressures.append(fem.pressure(np.array([[0.0, 0.0]]))[0] / unit.stress)
     assert pressures[1] == pytest.approx(pressures[0], rel=1e-6)

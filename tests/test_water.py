@@ -91,7 +91,7 @@ def test_water_that_is_not_as_heavy_as_the_pores_is_named(caplog):
         said = [r.message for r in caplog.records if "unit_weight" in r.message]
         assert len(said) == named, said
     assert not caplog.records
-    s.stage(conditions=[mpm.water("top", 1.2, unit_weight=9810.0)[1]])
+    s.stage(conditions=[load, mpm.water("top", 1.2, unit_weight=9810.0)[1]])
     (message,) = (r.message for r in caplog.records)
     assert message.startswith("water at 'top': unit_weight = 9810 N/m^3") and "is 10055.2" in message
 
