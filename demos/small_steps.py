@@ -76,7 +76,7 @@ def column(cells: int, steps: int, way: float = 0.0, softness: float = 0.0, stra
     scene, (on_grid, _) = simulation.scene, simulation.scene.last
     here = on_grid.contents.filled
     # the cells hold what they held at the start of the last step
-    y = grid.midpoints[here, 1] + on_grid.contents.centroid[here, 1] + way * HEIGHT * (1 - 1 / steps)
+    y = (grid.base + grid.midpoints[here] + on_grid.contents.centroid[here])[:, 1] + way * HEIGHT * (1 - 1 / steps)
     z, p = np.clip(1 - y / HEIGHT, 0, 1), scene.storage.p.x.array[here] / p0
     volume = scene.momentum.ghost.fill.x.array[here]
     error = np.sqrt(volume @ (p - terzaghi_pressure(z, T_END, 1.0, 1.0)) ** 2 / volume.sum())

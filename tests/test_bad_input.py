@@ -344,7 +344,7 @@ def test_a_point_that_leaves_the_grid_is_named_with_its_time():
     message = r"point \d+ at \[.*\]: its corner at \[.*\] left the grid .* by .* m at t = "
     with pytest.raises(mpm.GaveUp, match=message) as caught:
         s.run(2.0, 0.1)
-    assert not s.grid.outside(s.points.corners.reshape(-1, 2), 1e-4).any(), "the state is not the last good one"
+    assert not s.grid.outside(s.state.points.corners.reshape(-1, 2), 1e-4).any(), "the state is not the last good one"
     assert s.t == caught.value.result.t[-1] and caught.value.result.cuts == 0, "shorter steps only lead there"
     s.stage(conditions=[top_load(60e3, 0.1)])
     assert s.run(s.t + 0.1, 0.1).converged, "the run cannot go on with other loads"

@@ -122,7 +122,7 @@ def test_the_filter_takes_at_most_what_the_fixed_stress_operator_has():
     L, V = storage.L, contents.fixed_stress[contents.filled]
     assert V.min() < 0.02 * V.max(), "no cell is hardly filled"
     x, y = L.createVecs()
-    index = s.grid.index(s.grid.midpoints[storage.unknowns.owned])
+    index = s.grid.index_from_base(s.grid.midpoints[storage.unknowns.owned])
     for values in (np.random.default_rng(0).normal(size=x.size), (-1.0) ** index.sum(axis=1), np.ones(x.size)):
         x.array_w[:] = values
         L.mult(x, y)

@@ -16,20 +16,20 @@ def grid(request):
 
 
 def test_a_point_is_found_in_the_cell_that_holds_it(grid):
-    x = np.random.default_rng(1).uniform(grid.lower, grid.upper, (200, grid.dim))
-    cells = grid.local(grid.number(grid.index(x)))
+    x = np.random.default_rng(1).uniform(grid.low, grid.high, (200, grid.dim))
+    cells = grid.local(grid.number(grid.index_from_base(x)))
     assert (np.abs(x - grid.midpoints[cells]) <= grid.h / 2 * (1 + 1e-12)).all()
 
 
 def test_points_on_the_upper_wall_belong_to_the_last_cell(grid):
     assert (grid.index(grid.upper[None]) == grid.shape - 1).all()
-    assert not grid.outside(np.stack([grid.lower, grid.upper])).any()
-    assert grid.outside(grid.upper[None] + 1e-6).all()
+    assert not grid.outside(np.stack([grid.low, grid.high])).any()
+    assert grid.outside(grid.high[None] + 1e-6).all()
 
 
 def test_shape_functions_interpolate_multilinear_fields_with_their_gradients(grid):
-    x = np.random.default_rng(2).uniform(grid.lower, grid.upper, (50, grid.dim))
-    cells = grid.local(grid.number(grid.index(x)))
+    x = np.random.default_rng(2).uniform(grid.low, grid.high, (50, grid.dim))
+    cells = grid.local(grid.number(grid.index_from_base(x)))
     N, dN = grid.shape_values(cells, x), grid.shape_gradients(cells, x)
 
     def f(y):

@@ -351,13 +351,39 @@ def test_nonsense_gets_the_usage(arguments, capsys):
 
 def test_two_runs_do_not_write_into_one_folder(tmp_path):
     simulation, _ = beam(h=0.06)
-    mpm.Writer(simulation, tmp_path / "out")
     script = "import sys; from helpers import beam; import mpm_dolfinx as mpm; mpm.Writer(beam(h=0.06)[0], sys.argv[1])"
     here = {"cwd": Path(__file__).parent, "capture_output": True, "text": True}
-    other = subprocess.run([sys.executable, "-c", script, str(tmp_path / "out")], **here)
-    assert other.returncode == 1 and "another run writes into it, must be one of its own" in other.stderr
-    mpm.Writer(simulation, tmp_path / "out")
-    assert subprocess.run([sys.executable, "-c", script, str(tmp_path / "new")], **here).returncode == 0
+    lock = "import fcntl, sys; fcntl.lockf(open(sys.argv[1], 'w'), fcntl.LOCK_EX | fcntl.LOCK_NB)"
+
+    def held():
+        return subprocess.run([sys.executable, "-c", lock, str(tmp_path / ".lock")], **here).returncode != 0
+
+    with mpm.Writer(simulation, tmp_path) as writer:
+        again = mpm.Writer(simulation, tmp_path)
+        other = subprocess.run([sys.executable, "-c", script, str(tmp_path)], **here)
+        assert other.returncode == 1 and "another run writes into it, must be one of its own" in other.stderr
+    assert writer.closed and held(), "one that is open holds the folder"
+    del again
+    assert not held()
+
+
+def test_a_closed_writer_writes_no_more_and_another_goes_on(tmp_path):
+    simulation, _ = beam(h=0.06)
+    with mpm.Writer(simulation, tmp_path) as first:
+        simulation.run(0.02, 0.02, observe=first)
+    first.close()
+    with pytest.raises(ValueError, match=f"{tmp_path} is closed, must be open"):
+        simulation.run(0.04, 0.02, observe=first, after=simulation.result)
+    with mpm.Writer(simulation, tmp_path) as second:
+        simulation.run(0.06, 0.02, observe=second, after=simulation.result)
+    assert list(index(tmp_path / "points.pvd")) == [0.0, 0.02, 0.06]
+
+
+def test_points_are_shown_in_one_line_of_numbers():
+    simulation, _ = beam(h=0.06)
+    shown = repr(simulation.points)
+    assert "\n" not in shown and len(shown) < 160
+    assert re.match(rf"MaterialPoints\({len(simulation.points)} points in 2D, 0.3 m\^2 at rest, J 1 to 1, ", shown)
 
 
 def test_tools_are_written_where_they_are(tmp_path):

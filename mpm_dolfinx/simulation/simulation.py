@@ -147,7 +147,7 @@ class Simulation:
     @property
     def points(self) -> MaterialPoints:
         """The material points of this process; their arrays can be read, not written."""
-        return self.state.points
+        return self.state.points.placed(self.grid.base)
 
     @property
     def t(self) -> float:
@@ -213,11 +213,11 @@ class Simulation:
 
         In axisymmetry (n, 3, 3), of radius, axis and hoops.  On several processes all call it together.
         """
-        return self.scene.materials.effective_stress(self.points)
+        return self.scene.materials.effective_stress(self.state.points)
 
     def point_fields(self) -> PointFields:
         """Return stresses, p', q and porosity of the points, see `PointFields`; all processes call it together."""
-        return point_fields(self.scene, self.points)
+        return point_fields(self.scene, self.state.points)
 
     def cells(self) -> CellFields:
         """Return centroids and fields of the cells at present, see `CellFields`; all processes call it together."""
