@@ -18,8 +18,11 @@ simulation = mpm.Simulation(
     [soil],
     fluid=mpm.Fluid(),
     walls={"bottom": "xyz"},
-    drained=[mpm.Drained("top")],
-    tractions=[mpm.Traction("top", lambda t: (2e4 * t, 1e4 * t, -5e4 * t)), mpm.Pressure("right", lambda t: 2e4 * t)],
+    conditions=[
+        mpm.Drained("top"),
+        mpm.Traction("top", lambda t: (2e4 * t, 1e4 * t, -5e4 * t)),
+        mpm.Pressure("right", lambda t: 2e4 * t),
+    ],
     tolerance=1e-11,
 )
 result = simulation.run(1.0, 0.25, progress=False)

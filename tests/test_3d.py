@@ -28,9 +28,11 @@ def block(*, fill=0.4, n=4, fluid=False, aslant=1e4, **options):
     grid = mpm.Grid([0] * 3, [1 + 3 * h] * 3, [n + 3] * 3)
     body = mpm.box(grid, [h, h, 0], [1 + h + fill * h, 1 + h + fill * h, 1 + fill * h])
     if fluid:
-        options |= {"fluid": mpm.Fluid(), "drained": [mpm.Drained("top")]}
+        options |= {"fluid": mpm.Fluid(), "conditions": [mpm.Drained("top")]}
     load = mpm.Traction("top", lambda t: (2 * t * aslant, t * aslant, -5 * t * aslant))
-    return mpm.Simulation(grid, [body], [SOIL], walls={"bottom": "xyz"}, tractions=[load], **options)
+    return mpm.Simulation(
+        grid, [body], [SOIL], walls={"bottom": "xyz"}, conditions=[load, *options.pop("conditions", [])], **options
+    )
 
 
 def test_a_beam_between_smooth_walls_is_in_plane_strain():
@@ -153,7 +155,7 @@ def test_a_normal_traction_on_a_closed_surface_has_no_resultant_and_squeezes_eve
     rubber = mpm.NeoHookean(bulk=1e6, shear=5e5)
     presses = [mpm.Traction(side, lambda t: -1e3 * t) for side in ("right", "back", "top")]
     walls = {"left": "x", "front": "y", "bottom": "z"}
-    s = mpm.Simulation(grid, [body], [rubber], walls=walls, tractions=presses)
+    s = mpm.Simulation(grid, [body], [rubber], walls=walls, conditions=presses)
     s.run(1.0, 1.0, progress=False)
     assert s.points.J == pytest.approx(np.full(len(s.points), 1 - 1e-3), abs=2e-4)
     assert np.mean(s.points.J * s.points.volume0) / s.points.volume0.mean() == pytest.approx(1 - 1e-3, abs=5e-6)

@@ -129,7 +129,7 @@ def test_a_step_depends_on_no_step_before(monkeypatch):
 def test_sealed_bodies_in_which_hardly_any_fluid_changes_places_converge(bulk, load):
     """With scales that differ as much as forces and this fluid, rounding left more than steps may leave."""
     press = mpm.Traction("top", lambda t: (0, -load * t**2))
-    result = column(cells=4, tractions=[press], fluid=mpm.Fluid(bulk=bulk)).run(1.0, 0.01, progress=False)
+    result = column(cells=4, conditions=[press], fluid=mpm.Fluid(bulk=bulk)).run(1.0, 0.01, progress=False)
     assert result.cuts == 0 and result.residual <= 1e-8 and result.balance <= 1e-8
 
 

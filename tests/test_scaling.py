@@ -50,9 +50,11 @@ def test_iterative_solvers_are_freed_with_the_matrices_they_were_made_for(monkey
     grid = mpm.Grid([0, 0, 0], [4, 1.5, 2], [16, 6, 8])
     body = mpm.box(grid, [0, 0.25, 0.625], [3.75, 1.25, 1.625])
     law = mpm.LinearElastic(bulk=1e7, shear=1e7, conductivity=1e-4)
-    water = {"fluid": mpm.Fluid(), "drained": [mpm.Drained("right")]}
+    water = {"fluid": mpm.Fluid(), "conditions": [mpm.Drained("right")]}
     load = mpm.Traction("top", lambda t: (0, 0, -1e3 * t))
-    s = mpm.Simulation(grid, [body], [law], walls={"left": "xyz"}, tractions=[load], **water)
+    s = mpm.Simulation(
+        grid, [body], [law], walls={"left": "xyz"}, conditions=[load, *water.pop("conditions", [])], **water
+    )
     used = []
     for _ in range(10):
         s.step(0.1)

@@ -28,7 +28,7 @@ def momentum(dim: int):
     every = {"left": "x", "bottom": "xyz"[dim - 1], "front": "y"}
     walls = {wall: axis for wall, axis in every.items() if dim == 3 or wall != "front"}
     body, load = mpm.box(grid, [0] * dim, [0.6] * dim), [0.0] * (dim - 1) + [-1e4]
-    s = mpm.Simulation(grid, [body], [SOFT], walls=walls, tractions=[mpm.Traction("top", load)])
+    s = mpm.Simulation(grid, [body], [SOFT], walls=walls, conditions=[mpm.Traction("top", load)])
     s.step(1.0)
     return s.scene.last[1].momentum
 
@@ -106,7 +106,7 @@ def quarter_pushed(soil: mpm.Skeleton, n: int, step: float) -> mpm.Simulation:
     quarter, beside = ((-np.inf,) * 3, (0.45, 0.45, np.inf)), ((0.5, 0, 0), (np.inf,) * 3)
     push = mpm.Displacement("top", lambda t, X: (0, 0, -step * t), region=quarter)
     drained, body = mpm.Drained("top", region=beside), mpm.box(grid, [0, 0, 0], [1, 1, 1])
-    return mpm.Simulation(grid, [body], [soil], walls=walls, displacements=[push], drained=[drained], fluid=mpm.Fluid())
+    return mpm.Simulation(grid, [body], [soil], walls=walls, conditions=[push, drained], fluid=mpm.Fluid())
 
 
 def pushed(bulk: float) -> list[Report]:
@@ -186,7 +186,7 @@ def test_water_flows_through_a_body_whose_nodes_are_all_held():
     """PETSc's factors in blocks of a matrix without rows ended the process."""
     grid = mpm.Grid([0, 0], [1.0, 0.1], [10, 1])
     soil, ends = mpm.Hencky(bulk=2e6, shear=1e6, conductivity=1e-3), (("left", 1e3), ("right", 0.0))
-    conditions = {"fluid": mpm.Fluid(), "drained": [mpm.Drained(side, pressure=p) for side, p in ends]}
+    conditions = {"fluid": mpm.Fluid(), "conditions": [*(mpm.Drained(side, pressure=p) for side, p in ends)]}
     body, walls = mpm.box(grid, [0, 0], [1, 0.1]), {"bottom": "xy", "top": "xy"}
     s = mpm.Simulation(grid, [body], [soil], walls=walls, **conditions)
     s.run(1.0, 0.5, progress=False)
@@ -201,7 +201,7 @@ def strip_pushed() -> mpm.Simulation:
         mpm.Drained("top", region=((0.5, 0), (np.inf, np.inf))),
     )
     push, body = mpm.Displacement("top", lambda t, X: (0, -0.01 * t), region=half), mpm.box(grid, [0, 0], [1, 1])
-    given = {"displacements": [push], "drained": [drained], "fluid": mpm.Fluid()}
+    given = {"conditions": [push, drained], "fluid": mpm.Fluid()}
     return mpm.Simulation(grid, [body], [FRICTIONAL], walls=walls, **given)
 
 

@@ -41,7 +41,7 @@ from mpm_dolfinx.base.report import Report
 from mpm_dolfinx.base.validation import all_of, functions, line, numbers
 from mpm_dolfinx.bodies.faces import Region, limits
 from mpm_dolfinx.conditions.axis import with_axis
-from mpm_dolfinx.conditions.conditions import RIGIDITY, Drained, Pressure, RigidPlate, Traction
+from mpm_dolfinx.conditions.conditions import RIGIDITY, Drained, Pressure, RigidPlate, Source, Traction, sorted_terms
 from mpm_dolfinx.forms.axes import block
 from mpm_dolfinx.forms.point_forms import PointMeasure
 from mpm_dolfinx.grid.grid import TURN, Grid, side
@@ -104,12 +104,14 @@ class BiotFEM:
         Skeleton without state, and pore fluid, whose pressure is zero at the start.
     walls
         Sides with the components that are zero there, such as {"left": "xy"}.
-    tractions, drained, plates
-        Conditions on sides, nodal pressures on whole facets of a region; other sides are free and sealed.
+    conditions
+        `Traction`, `Pressure`, `RigidPlate` and `Drained` on sides, nodal pressures on whole facets of a region; other
+        sides are free and sealed.
     gravity : callable t -> (d,), m/s^2
         Acceleration of gravity, without fluid only.
-    terms, sources
-        The user's, as those of `Simulation`: see `user_functions`.  q is a test function of the pressure's elements.
+    terms
+        The user's, as those of `Simulation`, none on sides: see `user_functions`, `Source`.
+        q is a test function of the pressure's elements.
     element
         "taylor-hood": Q2 displacement, Q1 pressure; "q1-dg0": Q1, constant in the cells with two-point fluxes.
     method
@@ -128,13 +130,10 @@ class BiotFEM:
         material: Skeleton,
         *,
         walls: Mapping[str, str],
+        conditions: Sequence[Traction | Pressure | RigidPlate | Drained] = (),
         fluid: Fluid | None = None,
-        tractions: Sequence[Traction | Pressure] = (),
-        drained: Sequence[Drained] = (),
-        plates: Sequence[RigidPlate] = (),
         gravity: Callable[[float], ArrayLike] | None = None,
-        terms: Sequence[Callable] = (),
-        sources: Sequence[Callable] = (),
+        terms: Sequence[Callable | Source] = (),
         element: str = "taylor-hood",
         comm: MPI.Intracomm = MPI.COMM_WORLD,
         tolerance: float = 1e-8,
@@ -146,6 +145,11 @@ class BiotFEM:
         numbers("tolerance", tolerance, test=lambda v: (0 < v) & (v < 1), allowed="in (0, 1)")
         if element not in ELEMENTS:
             raise ValueError(f"element {element!r}: must be one of {', '.join(ELEMENTS)}")
+        all_of("conditions", conditions, (Traction, Pressure, RigidPlate, Drained))
+        tractions = [one for one in conditions if isinstance(one, (Traction, Pressure))]
+        plates = [one for one in conditions if isinstance(one, RigidPlate)]
+        drained = [one for one in conditions if isinstance(one, Drained)]
+        terms, sources = sorted_terms(terms)
         functions("terms", terms)
         functions("sources", sources)
         if fluid is None and (drained or sources):
