@@ -31,7 +31,7 @@ from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.parallel.messages import log, warn
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.solve.newton import solve_substep
-from mpm_dolfinx.solve.schur import LinearSolvers
+from mpm_dolfinx.solve.schur import Kept, LinearSolvers, planned
 from mpm_dolfinx.stepping.balances import Start
 from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.state import State, Stay
@@ -89,7 +89,8 @@ def balanced(scene: Scene, state: State) -> State:
             pressure = scene.motion.pressures(start.on_grid, state.stage, state.t)
             seeded = replace(seeded, points=replace(seeded.points, pressure=pressure))
         unknowns, best, count = start.matrices.momentum.unknowns, (np.inf, 0), 0
-        solvers, report = LinearSolvers(scene.scheme, start.matrices.momentum, None, start.matrices.symmetric), Report()
+        scheme, momentum, report = scene.scheme, start.matrices.momentum, Report()
+        solvers = LinearSolvers(planned(scheme, momentum, None, start.matrices.symmetric), scheme, momentum, None)
         seen, w, points = [], np.zeros_like(forms.u.x.array), seeded.points
         while count - best[1] < PATIENCE:
             forms.u.x.array[:] = w
@@ -103,7 +104,7 @@ def balanced(scene: Scene, state: State) -> State:
                 best = left, count, points, held, w, mechanical.reactions(start.acting[-1].sides, forms.nodal)
             if left <= scene.scheme.tolerance:
                 break
-            solve_substep(solvers, problem, None, partial(start.on_grid.as_reset, seeded), count, report)
+            solve_substep(solvers, problem, None, partial(start.on_grid.as_reset, seeded), count, report, Kept())
             if mechanical.touches:
                 _, touched = mechanical.touched(start.acting[-1].sides, unknowns, forms.u.x.array, seeded.points)
                 seeded = replace(seeded, points=touched)
