@@ -50,7 +50,7 @@ def bank(cells: int, barrier: bool) -> mpm.Simulation:
     body = mpm.box(grid, [0, 0], [HEIGHT, HEIGHT])
     walls = {"left": "x", "bottom": "xy"}
     s = mpm.Simulation(
-        grid, [body], [clay], walls=walls, terms=[common.weight(WEIGHT), common.viscous(VISCOSITY)], tools=tools
+        grid, [body], [clay], walls=walls, terms=[common.weight(WEIGHT), common.viscous(VISCOSITY)], conditions=tools
     )
     s.run(1e9, 1e9, progress=False)  # time in which nothing of the viscosity is left
     s.stage(reset_displacement=True)

@@ -41,7 +41,7 @@ def traction(alpha: float) -> tuple[float, float]:
     return 0.0, -alpha * STIFFNESS / LENGTH**2 / HEIGHT
 
 
-PHYSICS = {"walls": {"left": "xy"}, "tractions": [mpm.Traction("right", traction)]}
+PHYSICS = {"walls": {"left": "xy"}, "conditions": [mpm.Traction("right", traction)]}
 
 
 @dataclass

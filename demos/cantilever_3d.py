@@ -55,7 +55,7 @@ def scene(cells: int, alpha: float) -> tuple[mpm.Simulation, mpm.surface.Probes]
     body = mpm.box(grid, lower, lower + size)
     traction = ALONG * alpha * STIFFNESS / LENGTH**2 / SIDE**2
     pull = mpm.Traction("right", lambda t: traction * t)
-    simulation = mpm.Simulation(grid, [body], [RUBBER], walls={"left": "xyz"}, tractions=[pull])
+    simulation = mpm.Simulation(grid, [body], [RUBBER], walls={"left": "xyz"}, conditions=[pull])
     return simulation, mpm.probes([body], [lower + size * [1, 0.5, 0.5]])
 
 

@@ -98,8 +98,7 @@ def column(h: float) -> mpm.Simulation:
         [soil],
         fluid=mpm.Fluid(),
         walls={"left": "x", "right": "x", "bottom": "xy"},
-        tractions=[footing],
-        drained=[mpm.Drained("top")],
+        conditions=[footing, mpm.Drained("top")],
     )
 
 
@@ -121,8 +120,8 @@ def with_water(s: mpm.Simulation, bulk: float) -> mpm.Simulation:
 
     Its pressures become no larger than a tenth of that: the density would be none that water has.
     """
-    soils, conditions = s.scene.materials.materials, s.state.stage.conditions
-    other = mpm.Simulation(s.grid, s.bodies, soils, fluid=mpm.Fluid(bulk=bulk), **conditions)
+    soils, walls = s.scene.materials.materials, s.state.stage.conditions["walls"]
+    other = mpm.Simulation(s.grid, s.bodies, soils, fluid=mpm.Fluid(bulk=bulk), walls=walls, conditions=s.conditions)
     state, stay = replace(s.state, stage=other.state.stage), s.state.stay
     if stay is not None:
         share = min(1.0, bulk / 10 / max(np.abs(stay.pressure).max(), np.abs(stay.start).max(), 1e-300))

@@ -40,7 +40,7 @@ def conditions(o: Namespace) -> dict:
     """Return the beam's conditions, with a load that rises and falls once a second."""
     region = ((beam.CLAMP, -np.inf), (beam.LENGTH, np.inf))
     load = mpm.Traction("top", lambda t: (0.0, -o.load * (1 - abs(2 * (t % 1) - 1))), region=region)
-    return {"walls": {"left": "xy"}, "tractions": [load]}
+    return {"walls": {"left": "xy"}, "conditions": [load]}
 
 
 def rms(simulation: mpm.Simulation, away: float = 0.0) -> float:
@@ -158,7 +158,7 @@ def turn(h: float, nu: float = 0.3, steps: int = 90, fluid: mpm.Fluid | None = N
 
     held = [mpm.Displacement(side, given(sign)) for side, sign in (("left", -1), ("right", 1))]
     law = mpm.Hencky(bulk=1e6 / (3 * (1 - 2 * nu)), shear=1e6 / (2 * (1 + nu)))
-    simulation = mpm.Simulation(grid, [block], [law], fluid=fluid, walls={}, displacements=held)
+    simulation = mpm.Simulation(grid, [block], [law], fluid=fluid, walls={}, conditions=held)
     middle = (np.abs(simulation.points.x - centre) < BLOCK / 4).all(axis=1)
 
     def stress() -> np.ndarray:

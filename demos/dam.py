@@ -72,7 +72,7 @@ def run(h: float = 0.5, steps: int = 10) -> Dam:
 
     def conditions(level: float | Callable[[float], float]) -> dict:
         load, head = mpm.water("left", level)
-        return {"tractions": [load], "drained": [head, mpm.Drained("right", seepage=True)]}
+        return {"conditions": [load, head, mpm.Drained("right", seepage=True)]}
 
     simulation = mpm.Simulation(
         grid,
@@ -113,7 +113,7 @@ def rectangular(cells: int) -> float:
         [soil],
         fluid=mpm.Fluid(),
         walls={"bottom": "xy"},
-        drained=[mpm.water("left", upper)[1], mpm.water("right", lower)[1]],
+        conditions=[mpm.water("left", upper)[1], mpm.water("right", lower)[1]],
         gravity=(0, -9.81),
         pressure=mpm.hydrostatic(upper),
     )
@@ -136,7 +136,7 @@ def drained(cells: int, k: float = 1e-5) -> float:
         [soil],
         fluid=mpm.Fluid(),
         walls={"left": "x", "right": "x", "bottom": "y"},
-        drained=[mpm.Drained("bottom", WEIGHT * head)],
+        conditions=[mpm.Drained("bottom", WEIGHT * head)],
         gravity=(0, -9.81),
         pressure=mpm.hydrostatic(high),
         initial_stress=mpm.K0(0.5),

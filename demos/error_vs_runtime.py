@@ -168,8 +168,7 @@ def terzaghi_runs(quick: bool) -> Iterator[tuple[str, str, Run]]:
     physics = {
         "fluid": terzaghi.WATER,
         "walls": {"left": "x", "right": "x", "bottom": "y"},
-        "tractions": [mpm.Traction("top", (0, -load))],
-        "drained": [mpm.Drained("top")],
+        "conditions": [mpm.Traction("top", (0, -load)), mpm.Drained("top")],
     }
     end = 0.5 / terzaghi.CV
     exact = -1e-5 * float(terzaghi_consolidation(end, 1.0, terzaghi.CV))
@@ -185,8 +184,7 @@ def mandel_runs(quick: bool) -> Iterator[tuple[str, str, Run]]:
     physics = {
         "fluid": water,
         "walls": {"left": "x", "bottom": "y"},
-        "plates": [mpm.RigidPlate("top", 20.0)],
-        "drained": [mpm.Drained("right")],
+        "conditions": [mpm.RigidPlate("top", 20.0), mpm.Drained("right")],
     }
     end = 0.1 / slab.cv
     exact = float(slab.displacement(0.0, 1.0, end)[1])

@@ -71,9 +71,16 @@ def scene(cells: int, wet: bool) -> mpm.Simulation:
     at_once = INSTANT * TIME
     shape = mpm.Ball((0, top + RADIUS), RADIUS)
     ball = mpm.Tool(shape, displacement=lambda t: (0, -DEPTH * min(1, t / at_once)), name="ball")
-    water = {"fluid": mpm.Fluid(), "drained": [mpm.Drained("right")]} if wet else {}
+    water = {"fluid": mpm.Fluid(), "conditions": [mpm.Drained("right")]} if wet else {}
     walls = {"left": "x", "right": "x", "bottom": "y"}
-    return mpm.Simulation(grid, [mpm.box(grid, [0, 0], [SIZE, top])], [GEL], walls=walls, tools=[ball], **water)
+    return mpm.Simulation(
+        grid,
+        [mpm.box(grid, [0, 0], [SIZE, top])],
+        [GEL],
+        walls=walls,
+        conditions=[ball, *water.pop("conditions", [])],
+        **water,
+    )
 
 
 @dataclass
@@ -92,7 +99,7 @@ class Pressed:
 def pressed(cells: int, wet: bool) -> Pressed:
     """Press the cylinder into the gel and, if it is wet, let it drain."""
     s = scene(cells, wet)
-    tool = s.state.stage.named["ball"]
+    tool = s.conditions[0]
     result = s.run(INSTANT * TIME, INSTANT * TIME, progress=False)
     out = Pressed([contact(s)], [], (s.points.corners, s.points.pressure, tool.drawn(s.grid, s.t)), 0.0, result.cuts)
     out.forces.append(out.contacts[0].force)

@@ -68,8 +68,7 @@ def run(cells: int = 40, steps: int = 30, method: str = "sdirk2") -> tuple[dict[
         [SOIL],
         fluid=WATER,
         walls={"left": "x", "bottom": "y"},
-        plates=[mpm.RigidPlate("top", FORCE)],
-        drained=[mpm.Drained("right")],
+        conditions=[mpm.RigidPlate("top", FORCE), mpm.Drained("right")],
         method=method,
     )
     top = mpm.probes([quarter], [[x, HEIGHT] for x in np.linspace(0, WIDTH, 11)])

@@ -83,10 +83,10 @@ def physics(o: Namespace, dim: int = 2) -> dict:
     )
     walls = {"left": "xy"} if dim == 2 else {"left": "xyz", "front": "y", "back": "y"}
     if o.drained:
-        return {"walls": walls, "tractions": [load]}
+        return {"walls": walls, "conditions": [load]}
     fluid = mpm.Fluid(bulk=o.fluid_bulk)
     ends = [mpm.Drained("left"), mpm.Drained("right")]
-    return {"walls": walls, "tractions": [load], "fluid": fluid, "drained": ends}
+    return {"walls": walls, "conditions": [load, *ends], "fluid": fluid}
 
 
 def material(o: Namespace) -> mpm.Hencky:

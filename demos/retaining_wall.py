@@ -81,7 +81,7 @@ def tilted(name: str, delta: float, cells: int) -> Tilted:
     floor = mpm.Tool(mpm.HalfSpace((0, 0), (0, 1)), friction=np.tan(np.radians(PHI)), adhesion=COHESION)
     load = mpm.Pressure("top", lambda t: LOAD * min(1, t))
     sand = mpm.box(grid, [0, 0], [length, 1])
-    s = mpm.Simulation(grid, [sand], [SOIL], walls={"right": "x"}, tractions=[load], tools=[wall, floor])
+    s = mpm.Simulation(grid, [sand], [SOIL], walls={"right": "x"}, conditions=[load, wall, floor])
     s.run(1.0, 1 / STEPS[name], progress=False)
     result = s.run(2.0, 1 / STEPS[name], progress=False)
     forces = result.tool_forces["wall"]

@@ -76,8 +76,7 @@ def scene(dim: int, points: float) -> tuple[mpm.Simulation, float]:
         [mpm.Hencky(bulk=4e6 / 3, shear=1e6, conductivity=1e-5)],
         fluid=mpm.Fluid(),
         walls={"bottom": "xyz"},
-        drained=[mpm.Drained("top")],
-        tractions=[load],
+        conditions=[mpm.Drained("top"), load],
     )
     return simulation, 0.25
 

@@ -184,7 +184,7 @@ def slump(cells: int, steps: int) -> Slump:
         STRONG,
         CONDUCTIVITY,
         terms=[common.weight(WEIGHT), common.viscous(VISCOSITY)],
-        drained=sides,
+        conditions=sides,
     )
     out = Slump()
 

@@ -69,9 +69,7 @@ def column(cells: int, steps: int, way: float = 0.0, softness: float = 0.0, stra
         [SOIL],
         fluid=water,
         walls={"left": "x", "right": "x", **({} if way else {"bottom": "y"})},
-        tractions=[mpm.Traction("top", (0, -load))],
-        displacements=[foot] if way else [],
-        drained=[mpm.Drained("top")],
+        conditions=[mpm.Traction("top", (0, -load)), *([foot] if way else []), mpm.Drained("top")],
     )
     highest = []
     simulation.run(t_end, t_end / steps, observe=lambda s: highest.append(s.points.pressure.max() / p0))
@@ -109,8 +107,7 @@ def strip(cells: int, dt: float, law: type[mpm.Skeleton]) -> NDArray[np.float64]
         [soil],
         fluid=terzaghi.WATER,
         walls={"left": "xy", "right": "xy", "bottom": "xy"},
-        tractions=[mpm.Traction("top", (0, -load), region=((0, 0), (HEIGHT / 2, 2 * HEIGHT)))],
-        drained=[mpm.Drained("top")],
+        conditions=[mpm.Traction("top", (0, -load), region=((0, 0), (HEIGHT / 2, 2 * HEIGHT))), mpm.Drained("top")],
     )
     simulation.step(dt * HEIGHT**2 / terzaghi.CV)
     p = np.empty(grid.shape.prod())

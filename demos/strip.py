@@ -58,7 +58,7 @@ WALLS = {"left": "x", "right": "x", "bottom": "y"}
 def conditions(load: float) -> dict:
     """Return what acts, load over E."""
     strip = mpm.Traction("top", lambda t: (0, -load * E * min(1, t / (RAMP * UNIT))), ((0, 0), (STRIP, 2 * HEIGHT)))
-    return {"fluid": WATER, "walls": WALLS, "tractions": [strip], "drained": [mpm.Drained("top")]}
+    return {"fluid": WATER, "walls": WALLS, "conditions": [strip, mpm.Drained("top")]}
 
 
 def times(a_decade: int) -> NDArray[np.float64]:

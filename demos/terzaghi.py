@@ -62,8 +62,7 @@ def run(
         [SOIL],
         fluid=WATER,
         walls={"left": "x", "right": "x", "bottom": "y"},
-        tractions=[mpm.Traction("top", (0, -load))],
-        drained=[mpm.Drained("top")],
+        conditions=[mpm.Traction("top", (0, -load)), mpm.Drained("top")],
         method=method,
     )
     out = Outcome(mpm.Result())

@@ -148,8 +148,7 @@ simulation = mpm.Simulation(
     [soil],
     fluid=water,
     walls=walls,
-    tractions=[mpm.Traction("top", (0, -load))],
-    drained=[mpm.Drained("top")],
+    conditions=[mpm.Traction("top", (0, -load)), mpm.Drained("top")],
 )
 simulation.run(t_end=0.1 / consolidation, rtol=1e-3)
 held = simulation.cells()

@@ -53,8 +53,7 @@ def scene(cells: int) -> mpm.Simulation:
         bodies,
         [GEL],
         walls={"bottom": "xy"},
-        displacements=[mpm.Displacement("top", lambda t, X: path(t), region=above)],
-        contacts=[mpm.Contact(1, 0, friction=FRICTION)],
+        conditions=[mpm.Displacement("top", lambda t, X: path(t), region=above), mpm.Contact(1, 0, friction=FRICTION)],
     )
 
 
@@ -71,7 +70,7 @@ def hertz(cells: int) -> dict[str, float]:
     held = mpm.Displacement("top", lambda t, X: (0, -0.041 * t), components="y", region=([0, top + L / 2], [L, 10]))
     soil = mpm.Hencky(bulk=E / (3 - 6 * nu), shear=E / (2 + 2 * nu))
     walls = {"left": "x", "right": "x", "bottom": "xy"}
-    s = mpm.Simulation(grid, bodies, [soil], walls=walls, displacements=[held], contacts=[mpm.Contact(0, 1)])
+    s = mpm.Simulation(grid, bodies, [soil], walls=walls, conditions=[held, mpm.Contact(0, 1)])
     s.run(1.0, 1.0, progress=False)
     force = 2 * abs(s.tool_forces["contact"][1])
     half, most = 2 * np.sqrt(force * R / (np.pi * stiff)), np.sqrt(force * stiff / (np.pi * R))

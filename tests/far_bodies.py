@@ -21,11 +21,12 @@ def beside(kind: str | None, stiffer: float = 1.0, wet: bool = False, law=None, 
         bodies.append(mpm.box(grid, [2.52, 0.3], [3.0, 0.78], material=1))
         materials.append(hard)
         way = (lambda t, X: (0.1 * t, 0.05 * t)) if kind == "moves" else (0, 0)
-        options["displacements"] = [mpm.Displacement("bottom", way, region=THERE)]
+        loads += [mpm.Displacement("bottom", way, region=THERE)]
     if kind in ("loaded", "drains"):
         loads.append(mpm.Traction("top", lambda t: (0, -0.05 * stiffer * E * t), region=THERE))
     if kind == "drains":
         drained.append(mpm.Drained("top", region=THERE))
     if wet:
-        options |= {"fluid": mpm.Fluid(), "drained": drained}
-    return mpm.Simulation(grid, bodies, materials, walls={"left": "xy"}, tractions=loads, **options)
+        options["fluid"] = mpm.Fluid()
+        loads += drained
+    return mpm.Simulation(grid, bodies, materials, walls={"left": "xy"}, conditions=loads, **options)

@@ -82,10 +82,8 @@ def source(points, q, t):
 PHYSICS = {
     "fluid": WATER,
     "walls": WALLS,
-    "tractions": [mpm.Traction("top", traction)],
-    "drained": [mpm.Drained("top")],
-    "terms": [body_force],
-    "sources": [source],
+    "conditions": [mpm.Traction("top", traction), mpm.Drained("top")],
+    "terms": [body_force, mpm.Source(source)],
 }
 
 

@@ -13,7 +13,7 @@ sand = mpm.DruckerPrager(bulk=4e6, shear=2e6, friction=30, dilation=5, cohesion=
 gel = mpm.NeoHookean(bulk=2e6, shear=1e6, conductivity=1e-5)
 push = mpm.Displacement("top", lambda t, X: (0, -0.1 * t), region=((0, 0), (0.45, 2)))
 drained = [mpm.Drained("right"), mpm.Drained("top", region=((0.45, 0), (2, 2)))]
-acting = {"displacements": [push], "drained": drained, "tractions": [mpm.Pressure("right", 2e4)]}
+acting = {"conditions": [push, *drained, mpm.Pressure("right", 2e4)]}
 simulation = mpm.Simulation(grid, bodies, [sand, gel], fluid=mpm.Fluid(), walls={"bottom": "xy"}, **acting)
 result = simulation.run(1.0, 0.2, progress=False)
 stress, points = simulation.effective_stress(), simulation.points

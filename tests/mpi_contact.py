@@ -18,13 +18,22 @@ simulation = mpm.Simulation(
     [soil],
     fluid=mpm.Fluid(),
     walls={"bottom": "xy"},
-    drained=[mpm.Drained("left", region=([0, 0], [0.2, 1])), mpm.Drained("top", region=above)],
-    displacements=[mpm.Displacement("top", lambda t, X: (0.01 * t, -0.03 * t), region=above)],
-    contacts=[mpm.Contact([1, 2], 0, friction=0.2)],
+    conditions=[
+        mpm.Drained("left", region=([0, 0], [0.2, 1])),
+        mpm.Drained("top", region=above),
+        mpm.Displacement("top", lambda t, X: (0.01 * t, -0.03 * t), region=above),
+        mpm.Contact([1, 2], 0, friction=0.2),
+    ],
     later=[2],
 )
 simulation.run(0.5, 0.5, progress=False)
-simulation.stage(add=[2], tools=[mpm.Tool(mpm.Ball([1.03, 0.7], 0.08), displacement=lambda t: (0, -0.08 * (t - 0.5)))])
+simulation.stage(
+    add=[2],
+    conditions=[
+        *simulation.conditions,
+        mpm.Tool(mpm.Ball([1.03, 0.7], 0.08), displacement=lambda t: (0, -0.08 * (t - 0.5))),
+    ],
+)
 result = simulation.run(1.0, 0.5, progress=False)
 points = simulation.points
 data = (points.data["contact_shear"], points.data["contact_pressure"])

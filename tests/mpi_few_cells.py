@@ -22,8 +22,7 @@ for shape in SHAPES:
         [soil],
         fluid=mpm.Fluid(),
         walls=walls,
-        tractions=[mpm.Traction("top", -1e4)],
-        drained=[mpm.Drained("top")],
+        conditions=[mpm.Traction("top", -1e4), mpm.Drained("top")],
         gravity=(0,) * (dim - 1) + (-9.81,),
     )
     result = s.run(2.0, 1.0, progress=False, probes=mpm.probes([body], [top]))

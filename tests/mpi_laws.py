@@ -40,13 +40,12 @@ simulation = mpm.Simulation(
     [sand, gel, clay, weak],
     fluid=mpm.Fluid(),
     walls={"left": "x", "bottom": "y"},
-    drained=[mpm.Drained("right")],
-    tractions=[
+    conditions=[
+        mpm.Drained("right"),
         mpm.Traction("top", lambda t: (0, -1e5 - 3e4 * t), region=((0, 1), (1, 2))),
         mpm.Traction("right", (-1e5, 0)),
     ],
-    terms=[push],
-    sources=[lambda points, q, t: 1e-3 * t * points.displacement[0] * q * points.dx],
+    terms=[push, mpm.Source(lambda points, q, t: 1e-3 * t * points.displacement[0] * q * points.dx)],
 )
 result = simulation.run(1.0, 0.1, progress=False)
 stress, points = simulation.effective_stress(), simulation.points

@@ -19,8 +19,7 @@ simulation = mpm.Simulation(
     [sand, clay],
     fluid=mpm.Fluid(),
     walls={"left": "x", "right": "x", "front": "y", "back": "y", "bottom": "z"},
-    drained=[mpm.Drained("top", 0.0, top)],
-    tractions=[mpm.Traction("top", (0, 0, -1e5), top)],
+    conditions=[mpm.Drained("top", 0.0, top), mpm.Traction("top", (0, 0, -1e5), top)],
     gravity=(0, 0, -10),
 )
 places = [[x, y, z] for x, y in ((0.0, 0.25), (0.11, 0.13)) for z in (0.0, 0.31, 0.75, 0.8, 0.88, 0.99)]

@@ -20,8 +20,7 @@ simulation = mpm.Simulation(
     [soil],
     fluid=mpm.Fluid(),
     walls={"left": "x", "right": "x", "bottom": "y"},
-    tractions=[mpm.Traction("top", lambda t: -1e5 * t)],
-    drained=[mpm.Drained("right")],
+    conditions=[mpm.Traction("top", lambda t: -1e5 * t), mpm.Drained("right")],
 )
 result = simulation.run(1.0, 0.25, probes=mpm.probes(bodies, [[0.3, 0.4], [0.3, 0.8]]), progress=False)
 points = simulation.points

@@ -23,9 +23,9 @@ def torn(t, X):
 
 
 CASES = {
-    "left the grid": scene(displacements=[mpm.Displacement("right", pulled)]),
+    "left the grid": scene(conditions=[mpm.Displacement("right", pulled)]),
     "conductivity law: k": scene(lambda x: 0.4 - x[0], fluid=mpm.Fluid()),
-    "Displacement(side='top'": scene(displacements=[mpm.Displacement("top", torn)]),
+    "Displacement(side='top'": scene(conditions=[mpm.Displacement("top", torn)]),
 }
 for words, simulation in CASES.items():
     try:

@@ -16,11 +16,13 @@ simulation = mpm.Simulation(
     [soil],
     fluid=mpm.Fluid(),
     walls={"left": "x", "bottom": "y"},
-    drained=[mpm.Drained("right", pressure=50.0)],
-    inflows=[mpm.Inflow("left", 1e-9)],
-    plates=[mpm.RigidPlate("top", lambda t: 2e4 * t)],
+    conditions=[
+        mpm.Drained("right", pressure=50.0),
+        mpm.Inflow("left", 1e-9),
+        mpm.RigidPlate("top", lambda t: 2e4 * t),
+        mpm.Pressure("right", 50.0),
+    ],
     gravity=lambda t: (0, -9.81 * t),
-    tractions=[mpm.Pressure("right", 50.0)],
 )
 result = simulation.run(1.0, 0.25, progress=False)
 stress, points = simulation.effective_stress(), simulation.points

@@ -16,7 +16,7 @@ tools = [
     mpm.Tool(mpm.HalfSpace((1.17, 0), (-1, 0)), load=lambda t: 2e3 * t, direction=(-1, 0)),
 ]
 simulation = mpm.Simulation(
-    grid, [block], [soil], fluid=mpm.Fluid(), walls={"bottom": "xy"}, drained=[mpm.Drained("left")], tools=tools
+    grid, [block], [soil], fluid=mpm.Fluid(), walls={"bottom": "xy"}, conditions=[mpm.Drained("left"), *tools]
 )
 result = simulation.run(1.0, 0.5, progress=False)
 points = simulation.points

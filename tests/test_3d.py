@@ -12,12 +12,12 @@ import growth_3d
 import numpy as np
 import poroelastic_beam as demo
 import pytest
+from helpers import thresholds
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.bodies.bodies import material_points
 from mpm_dolfinx.bodies.faces import face_vectors, surface
 from mpm_dolfinx.points.cutting import volumes
-from mpm_dolfinx.solve import linear as solvers
 
 SOIL = mpm.Hencky(bulk=1e7 / 3, shear=5e6, conductivity=1e-6)
 
@@ -28,9 +28,11 @@ def block(*, fill=0.4, n=4, fluid=False, aslant=1e4, **options):
     grid = mpm.Grid([0] * 3, [1 + 3 * h] * 3, [n + 3] * 3)
     body = mpm.box(grid, [h, h, 0], [1 + h + fill * h, 1 + h + fill * h, 1 + fill * h])
     if fluid:
-        options |= {"fluid": mpm.Fluid(), "drained": [mpm.Drained("top")]}
+        options |= {"fluid": mpm.Fluid(), "conditions": [mpm.Drained("top")]}
     load = mpm.Traction("top", lambda t: (2 * t * aslant, t * aslant, -5 * t * aslant))
-    return mpm.Simulation(grid, [body], [SOIL], walls={"bottom": "xyz"}, tractions=[load], **options)
+    return mpm.Simulation(
+        grid, [body], [SOIL], walls={"bottom": "xyz"}, conditions=[load, *options.pop("conditions", [])], **options
+    )
 
 
 def test_a_beam_between_smooth_walls_is_in_plane_strain():
@@ -60,7 +62,7 @@ def test_a_larger_background_box_changes_nothing():
 def test_iterations_and_factors_give_the_same_answer(monkeypatch, fluid, coupling):
     states = []
     for least in (10**9, 0):
-        monkeypatch.setattr(solvers, "ITERATIVE", least)
+        thresholds(monkeypatch, multigrid_3d=least)
         s = block(n=3, fluid=fluid, coupling=coupling)
         result = s.run(1.0, 0.5, progress=False)
         assert result.cuts == 0 and result.residual <= 1e-8 and result.balance <= 1e-8
@@ -72,7 +74,7 @@ def test_iterations_and_factors_give_the_same_answer(monkeypatch, fluid, couplin
 
 
 def test_a_tangent_that_is_not_symmetric_is_solved_by_iterations(monkeypatch):
-    monkeypatch.setattr(solvers, "ITERATIVE", 0)
+    thresholds(monkeypatch, multigrid_3d=0)
     s = block(fluid=True, coupling="schur-fgmres")
     result = s.run(1.0, 0.5, progress=False)
     assert result.converged and result.cuts == 0 and result.newton <= 20
@@ -82,7 +84,7 @@ def test_a_tangent_that_is_not_symmetric_is_solved_by_iterations(monkeypatch):
 @pytest.mark.parametrize("fill", [0.5, 1e-2, 1e-4, 1e-6])
 def test_iterations_do_not_grow_where_cells_are_nearly_empty(monkeypatch, fluid, most, fill):
     """The ghost penalty keeps the condition number; without it the linear solver needs more than twice as many."""
-    monkeypatch.setattr(solvers, "ITERATIVE", 0)
+    thresholds(monkeypatch, multigrid_3d=0)
     result = block(fill=fill, fluid=fluid).run(1.0, 0.5, progress=False)
     assert result.coupling <= most * result.newton and result.newton <= 20
 
@@ -153,7 +155,7 @@ def test_a_normal_traction_on_a_closed_surface_has_no_resultant_and_squeezes_eve
     rubber = mpm.NeoHookean(bulk=1e6, shear=5e5)
     presses = [mpm.Traction(side, lambda t: -1e3 * t) for side in ("right", "back", "top")]
     walls = {"left": "x", "front": "y", "bottom": "z"}
-    s = mpm.Simulation(grid, [body], [rubber], walls=walls, tractions=presses)
+    s = mpm.Simulation(grid, [body], [rubber], walls=walls, conditions=presses)
     s.run(1.0, 1.0, progress=False)
     assert s.points.J == pytest.approx(np.full(len(s.points), 1 - 1e-3), abs=2e-4)
     assert np.mean(s.points.J * s.points.volume0) / s.points.volume0.mean() == pytest.approx(1 - 1e-3, abs=5e-6)

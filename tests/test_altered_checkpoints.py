@@ -11,8 +11,13 @@ import mpm_dolfinx as mpm
 
 
 def scene(wet, load):
-    options = {"drained": [mpm.Drained("top")]} if wet else {}
-    return column(cells=4, fluid=wet, tractions=[mpm.Traction("top", lambda t: (0, -load * t))], **options)
+    options = {"conditions": [mpm.Drained("top")]} if wet else {}
+    return column(
+        cells=4,
+        fluid=wet,
+        conditions=[mpm.Traction("top", lambda t: (0, -load * t)), *options.pop("conditions", [])],
+        **options,
+    )
 
 
 def noted(change):

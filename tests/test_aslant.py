@@ -32,8 +32,10 @@ def turned(cells, angle, drained, off=0.0, dim=2, seepage=False, **options):
         [SOIL],
         fluid=mpm.Fluid(bulk=WATER),
         walls={},
-        displacements=[mpm.Displacement(sides[0], (0.0,) * dim)],
-        drained=[mpm.Drained(sides[end], p, seepage=seepage and end == 1) for end, p in drained],
+        conditions=[
+            mpm.Displacement(sides[0], (0.0,) * dim),
+            *(mpm.Drained(sides[end], p, seepage=seepage and end == 1) for end, p in drained),
+        ],
         **options,
     )
     return simulation, lambda x: ((x - foot) @ turn)[:, 1]
@@ -95,8 +97,7 @@ def test_flow_along_slanted_sides_does_not_depend_on_the_unit_of_length(length):
             [replace(SOIL, conductivity=1e-5 * size**2)],
             fluid=mpm.Fluid(bulk=WATER),
             walls={},
-            displacements=[mpm.Displacement("bottom", (0.0, 0.0))],
-            drained=[mpm.Drained("left", 2e3), mpm.Drained("right", 1e3)],
+            conditions=[mpm.Displacement("bottom", (0.0, 0.0)), mpm.Drained("left", 2e3), mpm.Drained("right", 1e3)],
         )
         s.run(1e5, 2e4, progress=False)
         cell = s.cells()

@@ -13,6 +13,7 @@ GRID_3D = mpm.Grid([0, 0, 0], [1.0, 1.0, 1.0], [2, 2, 2])
 BODY = mpm.box(GRID, [0, 0.2], [0.5, 0.5])
 NAN = float("nan")
 WATER = mpm.Fluid()
+OPEN = mpm.Drained("top")
 
 
 def scene(bodies=(BODY,), materials=(SOFT,), grid=GRID, **options):
@@ -21,9 +22,8 @@ def scene(bodies=(BODY,), materials=(SOFT,), grid=GRID, **options):
 
 def sides(kind, *values, **options):
     """Return a scene with a condition."""
-    name = {"Displacement": "displacements", "Drained": "drained", "Inflow": "inflows", "RigidPlate": "plates"}
     wet = {"fluid": WATER} if kind in ("Drained", "Inflow") else {}
-    return scene(**{name.get(kind, "tractions"): [getattr(mpm, kind)(*values, **options)]}, **wet)
+    return scene(conditions=[getattr(mpm, kind)(*values, **options)], **wet)
 
 
 def soil(**constants):
@@ -178,12 +178,16 @@ CASES = {
     "walls in a list": (lambda: scene(walls=["left"]), "walls", "['left']"),
     "nothing holds the body": (lambda: scene(walls={"right": "xy"}).run(1, 1), "walls", "3 of 3 ways"),
     "the body may turn": (lambda: scene(walls={"left": "x"}).run(1, 1), "walls", "1 of 3 ways"),
-    "drained without fluid": (lambda: scene(drained=[mpm.Drained("left")]), "drained", "fluid"),
-    "source without fluid": (lambda: scene(sources=[lambda q: q]), "sources", "fluid"),
-    "source of what there is not": (lambda: scene(fluid=WATER, sources=[lambda q, tide: q]), "argument", "'tide'"),
+    "drained without fluid": (lambda: scene(conditions=[mpm.Drained("left")]), "drained", "fluid"),
+    "source without fluid": (lambda: scene(terms=[mpm.Source(lambda q: q)]), "sources", "fluid"),
+    "source of what there is not": (
+        lambda: scene(fluid=WATER, terms=[mpm.Source(lambda q, tide: q)]),
+        "argument",
+        "'tide'",
+    ),
     "term of a number": (lambda: scene(terms=[1.0]), "terms", "1.0"),
     "term that gives nothing": (lambda: scene(terms=[lambda v: None]), "terms", "None"),
-    "source that gives a number": (lambda: scene(fluid=WATER, sources=[lambda q: 1.0]), "sources", "1.0"),
+    "source that gives a number": (lambda: scene(fluid=WATER, terms=[mpm.Source(lambda q: 1.0)]), "sources", "1.0"),
     "body to come that there is not": (
         lambda: scene(later=[5]),
         "later: body 5",
@@ -233,8 +237,10 @@ CASES = {
         "Traction(side='top'",
         "nan",
     ),
-    "condition of another kind": (lambda: scene(tractions=[mpm.RigidPlate("top", 1.0)]), "tractions", "RigidPlate"),
-    "condition alone": (lambda: scene(tractions=mpm.Traction("top", (0, 1))), "tractions", "Traction"),
+    "condition that is none": (lambda: scene(conditions=["top"]), "conditions", "'top'"),
+    "condition alone": (lambda: scene(conditions=mpm.Traction("top", (0, 1))), "conditions", "Traction"),
+    "condition given twice": (lambda: scene(conditions=[OPEN, OPEN], fluid=WATER), "conditions", "given twice"),
+    "term among conditions": (lambda: scene(conditions=[mpm.OnSide("top", abs)]), "conditions", "terms="),
     "drained to nan": (lambda: sides("Drained", "top", NAN), "Drained: pressure", "= nan"),
     "inflow of nan": (lambda: sides("Inflow", "top", NAN), "Inflow: flux", "= nan"),
     "inflow of a word": (lambda: sides("Inflow", "top", "much"), "Inflow: flux", "much"),
@@ -291,16 +297,16 @@ CASES = {
     "elements with a state": (lambda: fem(material=sand()), "DruckerPrager", "no state"),
     "elements fixed at an unknown side": (lambda: fem(walls={"west": "x"}), "side 'west'", "left, right, bottom, top"),
     "elements fixed by an unknown component": (lambda: fem(walls={"left": "q"}), "walls: 'left'", "'q'"),
-    "elements drained without fluid": (lambda: fem(drained=[mpm.Drained("top")]), "drained", "fluid"),
+    "elements drained without fluid": (lambda: fem(conditions=[mpm.Drained("top")]), "drained", "fluid"),
     "elements with fluid and gravity": (lambda: fem(fluid=WATER, gravity=lambda t: (0, 1)), "gravity", "fluid"),
     "elements loaded nowhere": (
-        lambda: fem(tractions=[mpm.Traction("top", (0, 1), region=((2, 0), (3, 1)))]),
+        lambda: fem(conditions=[mpm.Traction("top", (0, 1), region=((2, 0), (3, 1)))]),
         "side 'top'",
         "(2, 0)",
     ),
-    "elements pulled by nan": (lambda: fem(tractions=[mpm.Traction("top", (0, NAN))]), "Traction(side='top'", "nan"),
+    "elements pulled by nan": (lambda: fem(conditions=[mpm.Traction("top", (0, NAN))]), "Traction(side='top'", "nan"),
     "elements pressed by a number": (
-        lambda: fem(tractions=[mpm.Traction("top", -1e5)]),
+        lambda: fem(conditions=[mpm.Traction("top", -1e5)]),
         "Traction(side='top'",
         "-100000.0",
     ),
@@ -320,15 +326,15 @@ def test_a_run_that_ends_in_bad_input_keeps_what_it_has():
     with pytest.raises(ValueError, match=r"value at t = 0\.5 s"):
         s.run(1.0, 0.125)
     assert s.result.t == pytest.approx([0, 0.125, 0.25, 0.375]) and s.t == 0.375
-    s.stage(tractions=[])
+    s.stage(conditions=[])
     assert s.run(1.0, 0.125).converged
 
 
 def test_a_stage_that_is_refused_changes_nothing():
-    s = scene([BODY, mpm.box(GRID, [0, 0.5], [0.5, 0.6])], tractions=[mpm.Traction("top", (0, -1e4))])
+    s = scene([BODY, mpm.box(GRID, [0, 0.5], [0.5, 0.6])], conditions=[mpm.Traction("top", (0, -1e4))])
     before = s.state
     with pytest.raises(ValueError, match="side 'lid'"):
-        s.stage(remove=[1], tractions=[mpm.Traction("lid", (0, 1))])
+        s.stage(remove=[1], conditions=[mpm.Traction("lid", (0, 1))])
     assert s.state is before
     assert s.run(1.0, 1.0, progress=False).converged
 
@@ -340,7 +346,7 @@ def test_a_point_that_leaves_the_grid_is_named_with_its_time():
         s.run(2.0, 0.1)
     assert not s.grid.outside(s.state.points.corners.reshape(-1, 2), 1e-4).any(), "the state is not the last good one"
     assert s.t == caught.value.result.t[-1] and caught.value.result.cuts == 0, "shorter steps only lead there"
-    s.stage(tractions=[top_load(60e3, 0.1)])
+    s.stage(conditions=[top_load(60e3, 0.1)])
     assert s.run(s.t + 0.1, 0.1).converged, "the run cannot go on with other loads"
 
 
@@ -354,8 +360,7 @@ def test_steps_by_error_end_at_the_grid_as_soon_as_they_are_exact_enough():
         [SOFT],
         fluid=mpm.Fluid(),
         walls={"left": "x", "right": "x", "bottom": "y"},
-        tractions=loads,
-        drained=[mpm.Drained("top")],
+        conditions=[*loads, mpm.Drained("top")],
     )
     with pytest.raises(mpm.GaveUp, match=r"its corner at \[.*\] left the grid"):
         s.run(1e3, rtol=0.01, first_step=100.0, progress=False)
@@ -364,7 +369,7 @@ def test_steps_by_error_end_at_the_grid_as_soon_as_they_are_exact_enough():
 
 def test_a_column_that_slides_is_refused():
     with pytest.raises(ValueError, match="free to move as a rigid body in 1 of 3 ways"):
-        column(fluid=False, walls={"left": "x", "right": "x"}, tractions=[top_load()]).run(1.0, 1.0)
+        column(fluid=False, walls={"left": "x", "right": "x"}, conditions=[top_load()]).run(1.0, 1.0)
 
 
 @pytest.mark.parametrize("fluid, message", [(False, "the body is turned inside out"), (True, "the pores have closed")])
@@ -372,7 +377,7 @@ def test_a_load_that_leaves_no_volume_is_refused(fluid, message):
     """The linear law has an answer for any load: half of the volume is more than the pores, twice more than all."""
     law = mpm.LinearElastic(SOFT.bulk, SOFT.shear, porosity=0.4, conductivity=1.0)
     load = [mpm.Traction("top", (0, -(0.5 if fluid else 2.0) * law.oedometric))]
-    s = column(fluid=fluid, material=law, tractions=load, **({"drained": [mpm.Drained("top")]} if fluid else {}))
+    s = column(fluid=fluid, material=law, conditions=[*load, *([mpm.Drained("top")] if fluid else [])])
     with pytest.raises(mpm.GaveUp, match=f"{message}, J <= .*: point"):
         s.run(1e6, 1e6)
     assert s.t == 0 and (s.points.J == 1).all()

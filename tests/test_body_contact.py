@@ -27,11 +27,13 @@ def two_blocks(
     fluid = {}
     if wet:
         drained = [mpm.Drained("top", region=above), mpm.Drained("bottom", region=([*low, 0], [*high, 0.2]))]
-        fluid = {"fluid": mpm.Fluid(), "drained": drained}
+        fluid = {"fluid": mpm.Fluid(), "conditions": drained}
     contacts = [mpm.Contact(0, 1, **contact)]
     bodies = [lower, upper][::order]
     walls = WALLS[dim]
-    return mpm.Simulation(grid, bodies, [SOIL], walls=walls, displacements=[held], contacts=contacts, **fluid)
+    return mpm.Simulation(
+        grid, bodies, [SOIL], walls=walls, conditions=[held, *contacts, *fluid.pop("conditions", [])], **fluid
+    )
 
 
 def pressed_by(depth, height):
@@ -74,7 +76,7 @@ def pushed(share, **contact):
     lower, upper = mpm.box(grid, [0.3, 0], [2.7, 0.55]), mpm.box(grid, [1, 0.55], [1.8, 0.95], per_cell=3)
     load = mpm.Traction("top", lambda t: (share * 300 * min(t, 1), -1e3), region=([0, 0.8], [3, 2]))
     contacts = [mpm.Contact(1, 0, **contact)]
-    s = mpm.Simulation(grid, [lower, upper], [SOIL], walls={"bottom": "xy"}, tractions=[load], contacts=contacts)
+    s = mpm.Simulation(grid, [lower, upper], [SOIL], walls={"bottom": "xy"}, conditions=[load, *contacts])
     s.run(1.0, 0.25)
     assert s.tool_forces.array[0, :2] == pytest.approx([-share * 0.8 * 300, 0.8e3], rel=1e-6)
     before = s.points.x[:, 0].copy()
@@ -98,7 +100,7 @@ def stack(order):
     low, mid, top = (order.index(i) for i in range(3))
     contacts = [mpm.Contact(top, mid, friction=0.1), mpm.Contact(mid, low, friction=0.3), mpm.Contact(low, top)]
     held = mpm.Displacement("top", lambda t, X: (0.02 * t, -0.1 * t), region=([0, 1.4], [1, 2]))
-    s = mpm.Simulation(grid, bodies, soils, walls={"bottom": "xy"}, displacements=[held], contacts=contacts)
+    s = mpm.Simulation(grid, bodies, soils, walls={"bottom": "xy"}, conditions=[held, *contacts])
     s.run(1.0, 0.5)
     start = np.cumsum([0, *(len(body) for body in bodies)])
     return np.concatenate([s.points.x[start[i] : start[i + 1]] for i in (low, mid, top)]), s.tool_forces.array
@@ -124,7 +126,7 @@ def test_a_block_over_the_seam_of_two_others_presses_them_evenly(stiff, spacings
     press = mpm.Traction("top", (0, -1e4), region=([0, 1], [1, 2]))
     contacts = [mpm.Contact(2, 0, friction=0.2), mpm.Contact(1, 2), mpm.Contact(0, 1)]
     walls = {"bottom": "y", "left": "x", "right": "x"}
-    s = mpm.Simulation(grid, [*below, above], soils, walls=walls, tractions=[press], contacts=contacts)
+    s = mpm.Simulation(grid, [*below, above], soils, walls=walls, conditions=[press, *contacts])
     s.run(1.0, 1.0)
     assert s.effective_stress()[:, 1, 1] == pytest.approx(np.full(len(s.points), -1e4), rel=1e-3)
     assert s.tool_forces.array[:, 1] == pytest.approx([5.3e3, -4.7e3, 0], abs=1)
@@ -153,9 +155,9 @@ def heap(wet=False):
     bodies = [mpm.box(grid, [0, low], [1, high], per_cell=2 + i) for i, (low, high) in enumerate(heights)]
     soil = mpm.Hencky(bulk=E / 3, shear=E / 2, porosity=0.4, conductivity=1e-5, grain_density=2000)
     walls, contact = {"bottom": "y", "left": "x", "right": "x"}, mpm.Contact([1, 2, 3], 0, friction=0.2)
-    water = {"fluid": mpm.Fluid(), "drained": [mpm.Drained("bottom", region=([0, 0], [1, 0]))]} if wet else {}
-    given = {"contacts": [contact], "gravity": [0, -10.0], "later": [2, 3], **water}
-    return mpm.Simulation(grid, bodies, [soil], walls=walls, **given)
+    conditions = [contact, *[mpm.Drained("bottom", region=([0, 0], [1, 0]))] * wet]
+    given = {"gravity": [0, -10.0], "later": [2, 3], "fluid": mpm.Fluid() if wet else None}
+    return mpm.Simulation(grid, bodies, [soil], walls=walls, conditions=conditions, **given)
 
 
 @pytest.mark.parametrize("wet", [False, True])
@@ -188,7 +190,7 @@ def test_a_plate_presses_bodies_of_two_groups_evenly(order):
     bodies = [mpm.box(grid, [0, 0], [1, y]), mpm.box(grid, [1, 0], [2, y], per_cell=3)][::order]
     plate = mpm.Tool(mpm.HalfSpace([1, y + 0.01], [0, -1]), displacement=lambda t: (0, -0.1 * np.sin(np.pi * t)))
     walls = {"bottom": "y", "left": "x", "right": "x"}
-    s = mpm.Simulation(grid, bodies, [SOIL], walls=walls, contacts=[mpm.Contact(0, 1, friction=0.2)], tools=[plate])
+    s = mpm.Simulation(grid, bodies, [SOIL], walls=walls, conditions=[mpm.Contact(0, 1, friction=0.2), plate])
     s.run(0.5, 0.25)
     most, least = (2 * pressed_by(depth, y) for depth in (0.09, 0.09 - 5e-4 * grid.h[1]))
     assert most < s.tool_forces.array[0, 1] < least  # bodies may reach into plates as far
@@ -204,7 +206,7 @@ def test_a_tool_presses_a_face_that_another_group_lay_on(tmp_path):
     s.run(1.0, 0.25, observe=write)
     top = s.points.corners[s.points.id < len(s.bodies[0]), :, 1].max()
     plate = mpm.Convex([[-0.5, top], [1.5, top], [1.5, top + 0.2], [-0.5, top + 0.2]])
-    s.stage(tools=[mpm.Tool(plate, displacement=lambda t: (0, -0.1 * (t - 1)))])
+    s.stage(conditions=[*s.conditions, mpm.Tool(plate, displacement=lambda t: (0, -0.1 * (t - 1)))])
     s.run(2.0, 0.5)
     assert s.tool_forces.array[:, 1] == pytest.approx([pressed_by(0.1, top), 0], rel=1e-3)
 
@@ -218,7 +220,11 @@ def test_a_block_on_soil_at_rest_stays_there(wet, friction):
         grid, y = mpm.Grid([0, 0], [1, 2], [8, 16]), 0.55
         bodies = [mpm.box(grid, [0, 0], [1, y]), mpm.box(grid, [0, y], [width, y + 0.6], per_cell=3)]
         water = {"fluid": mpm.Fluid(), "pressure": mpm.hydrostatic(y + 0.6, 1e4)} if wet else {}
-        rest = {"gravity": [0, -10], "initial_stress": mpm.K0(1.0), "contacts": [mpm.Contact(1, 0, friction=friction)]}
+        rest = {
+            "gravity": [0, -10],
+            "initial_stress": mpm.K0(1.0),
+            "conditions": [mpm.Contact(1, 0, friction=friction)],
+        }
         walls = {"bottom": "xy", "left": "x", "right": "x"}
         s = mpm.Simulation(grid, bodies, [soil], walls=walls, **rest, **water)
         before = s.points.x.copy()
@@ -233,7 +239,9 @@ def test_what_are_no_contacts_is_refused():
     deep = mpm.box(grid, [0, 0.3], [1, 0.9])
 
     def scene(bodies, *contacts, **more):
-        return mpm.Simulation(grid, bodies, [SOIL], walls={"bottom": "xy"}, contacts=contacts, **more)
+        return mpm.Simulation(
+            grid, bodies, [SOIL], walls={"bottom": "xy"}, conditions=[*contacts, *more.pop("conditions", [])], **more
+        )
 
     with pytest.raises(ValueError, match=r"Contact: friction = -0.1, must be >= 0 and finite"):
         mpm.Contact(0, 1, friction=-0.1)
@@ -250,7 +258,7 @@ def test_what_are_no_contacts_is_refused():
     with pytest.raises(ValueError, match=r"bodies 0 and 1: both are at .*, 0.2 m deep, must not lie in each other"):
         scene([boxes[0], deep], mpm.Contact(0, 1))
     with pytest.raises(ValueError, match=r"2 groups of bodies have this side, must be one; limit it"):
-        scene(boxes[:2], mpm.Contact(0, 1), tractions=[mpm.Traction("left", 0.0)])
+        scene(boxes[:2], mpm.Contact(0, 1), conditions=[mpm.Traction("left", 0.0)])
     with pytest.raises(ValueError, match=r"quadrature 'point': must be domain with contacts"):
         scene(boxes[:2], mpm.Contact(0, 1), quadrature="point")
     with pytest.raises(ValueError, match=r"terms: must be none with contacts"):
@@ -260,7 +268,9 @@ def test_what_are_no_contacts_is_refused():
     with pytest.raises(ValueError, match=r"is free to move as a rigid body in 3 of 3 ways"):
         scene(boxes[::2], mpm.Contact(0, 1, friction=0.3), gravity=[0, -10]).step(1.0)
     sand = mpm.MohrCoulomb(bulk=2e7, shear=1e7, friction=30.0, dilation=10.0, cohesion=5e3)
-    s = mpm.Simulation(grid, boxes[:2], [sand], walls={"bottom": "xy"}, contacts=[mpm.Contact(0, 1)], gravity=[0, -10])
+    s = mpm.Simulation(
+        grid, boxes[:2], [sand], walls={"bottom": "xy"}, conditions=[mpm.Contact(0, 1)], gravity=[0, -10]
+    )
     with pytest.raises(ValueError, match=r"factor_of_safety: contacts: must be none"):
         mpm.factor_of_safety(s)
 
@@ -271,7 +281,7 @@ def test_a_block_slides_off_the_edge_of_another():
     bodies = [mpm.box(grid, [0.2, 0], [1.1, 0.53]), mpm.box(grid, [0.4, 0.53], [0.8, 0.93], per_cell=3)]
     path = mpm.Displacement("top", lambda t, X: (0.1 * max(0, t - 1), -0.01 * min(t, 1)), region=([0, 0.9], [2.2, 1.2]))
     gel = mpm.Hencky(bulk=1e6, shear=6e5)
-    s = mpm.Simulation(grid, bodies, [gel], walls={"bottom": "xy"}, displacements=[path], contacts=[mpm.Contact(1, 0)])
+    s = mpm.Simulation(grid, bodies, [gel], walls={"bottom": "xy"}, conditions=[path, mpm.Contact(1, 0)])
     forces, deepest = [], []
 
     def see(s):
@@ -301,8 +311,10 @@ def test_a_block_on_a_slope_of_another_body_slips_where_its_tangent_is_the_coeff
         angle = np.arctan(mu * share * min(t, 1))
         return turn @ [-10 * np.sin(angle), -10 * np.cos(angle)]
 
-    options = {"walls": {}, "displacements": [held], "gravity": gravity}
-    scene = mpm.Simulation(grid, bodies, [rock], contacts=[mpm.Contact(1, 0, friction=mu)], **options)
+    options = {"walls": {}, "conditions": [held], "gravity": gravity}
+    scene = mpm.Simulation(
+        grid, bodies, [rock], conditions=[mpm.Contact(1, 0, friction=mu), *options.pop("conditions", [])], **options
+    )
     if share > 1:
         with pytest.raises(mpm.GaveUp):
             scene.run(1.0, 0.25)
@@ -326,9 +338,9 @@ def test_a_disc_rolls_between_two_bodies():
     press = mpm.Displacement("top", lambda t, X: (0.6 * max(0, t - 1), -0.03 * min(t, 1)), region=([0, 1.5], [4, 2]))
     hold = mpm.Displacement("left", lambda t, X: (0, -0.015 * t), region=on)
     contacts.append(mpm.Contact(0, 2))
-    s = mpm.Simulation(grid, bodies, [gel], walls={"bottom": "xy"}, displacements=[hold, press], contacts=contacts)
+    s = mpm.Simulation(grid, bodies, [gel], walls={"bottom": "xy"}, conditions=[hold, press, *contacts])
     s.run(1.0, 0.25)
-    s.stage(displacements=[press])
+    s.stage(conditions=[press])
     mine = (s.points.id >= len(bodies[0])) & (s.points.id < len(bodies[0]) + len(disc))
     before = s.points.x[mine]
     s.run(2.0, 0.125)

@@ -55,7 +55,7 @@ def pressures(cells, bulk, marks, outer):
     body = mpm.box(grid, [0, 0], [outer - 1] * 2)
     body = mpm.mapped(grid, body, lambda X: (1 + X[:, :1]) * ray(X))
     wall = mpm.Displacement("left", lambda t, X: t * ray(X))
-    s = mpm.Simulation(grid, [body], [soil(bulk)], walls={"left": "x", "bottom": "y"}, displacements=[wall])
+    s = mpm.Simulation(grid, [body], [soil(bulk)], walls={"left": "x", "bottom": "y"}, conditions=[wall])
     found = []
     for mark in marks:
         steps = round((mark - 1 - s.t) / (0.2 * h) + 0.499)

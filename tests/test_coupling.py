@@ -152,7 +152,7 @@ def slender(thrust, side_load):
     critical = np.pi**2 * 1e7 * 0.1**2 / 12 / 4  # Pa
     press = mpm.Traction("right", lambda t: (-thrust * critical * t, 0))
     push = mpm.Traction("top", lambda t: (0, -side_load * t))
-    s = mpm.Simulation(grid, [body], [SOFT], walls={"left": "xy"}, tractions=[press, push])
+    s = mpm.Simulation(grid, [body], [SOFT], walls={"left": "xy"}, conditions=[press, push])
     return s, mpm.probes([body], [[1, 1.25]])
 
 

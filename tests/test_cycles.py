@@ -95,15 +95,22 @@ def left_of(h, dim=2, **wet):
     lower = np.array([0.0, *[0.1] * (dim - 2), 0.6 + h / 2])
     body = mpm.box(grid, lower, np.add(lower, [1.0, *[0.2] * (dim - 2), 0.3]))
     load = mpm.Traction("top", lambda t: [0.0] * (dim - 1) + [-2e4 * (1 - abs(2 * (t % 1) - 1))])
-    soil = mpm.Hencky(bulk=1e7 / 3, shear=5e6, conductivity=1.0 if "drained" in wet else 0.0)
-    s = mpm.Simulation(grid, [body], [soil], walls={"left": "xyz"[:dim]}, tractions=[load], **wet)
+    soil = mpm.Hencky(bulk=1e7 / 3, shear=5e6, conductivity=1.0 if "conditions" in wet else 0.0)
+    s = mpm.Simulation(
+        grid,
+        [body],
+        [soil],
+        walls={"left": "xyz"[:dim]},
+        conditions=[load, *wet.get("conditions", [])],
+        fluid=wet.get("fluid"),
+    )
     s.run(0.5, 0.1, progress=False)
     peak = cycles.rms(s)
     s.run(3.0, 0.1, progress=False)
     return cycles.rms(s) / peak
 
 
-DRAINS = {"fluid": mpm.Fluid(), "drained": [mpm.Drained("top"), mpm.Drained("bottom")]}
+DRAINS = {"fluid": mpm.Fluid(), "conditions": [mpm.Drained("top"), mpm.Drained("bottom")]}
 
 
 @pytest.mark.slow
@@ -156,7 +163,7 @@ def test_a_stretched_block_after_ten_turns_is_that_after_one():
         return stretched @ [[np.cos(a), np.sin(a)], [-np.sin(a), np.cos(a)]] + centre - X
 
     held = [mpm.Displacement(side, moved) for side in ("left", "right", "bottom", "top")]
-    s = mpm.Simulation(grid, [block], [clay(0.3)], walls={}, displacements=held)
+    s = mpm.Simulation(grid, [block], [clay(0.3)], walls={}, conditions=held)
     stress, cuts = [], 0
     for end, dt in ((2, 0.2), (3, 1 / 72), (5, 1 / 72), (12, 1 / 72)):
         cuts += s.run(float(end), dt, progress=False).cuts
@@ -210,7 +217,7 @@ def test_the_filter_leaves_quadratic_fields_and_what_has_not_moved_and_takes_the
     grid = mpm.Grid([0] * dim, [2.0] * dim, [4] * dim)
     body = mpm.box(grid, [0.1] * dim, [1.7] * dim)
     points = mpm.Simulation(
-        grid, [body], [mpm.Hencky(bulk=1e6, shear=1e6)], walls={}, displacements=[mpm.Displacement("top", [0] * dim)]
+        grid, [body], [mpm.Hencky(bulk=1e6, shear=1e6)], walls={}, conditions=[mpm.Displacement("top", [0] * dim)]
     ).points
     found = lattices([body], [True], [])
     X = points.reference
@@ -245,7 +252,7 @@ def left_in(length=1.0, turned=False):
     body = mpm.box(grid, np.array([0, 0.63])[way] * length, np.array([1, 0.93])[way] * length)
     load = mpm.Traction(sides[1], lambda t: np.array((0.0, -54e3 * (1 - abs(2 * t - 1))))[way])
     law = mpm.Hencky(bulk=1e7 / 3, shear=5e6)
-    s = mpm.Simulation(grid, [body], [law], walls={sides[0]: "xy"}, tractions=[load])
+    s = mpm.Simulation(grid, [body], [law], walls={sides[0]: "xy"}, conditions=[load])
     s.run(1.0, 0.1, progress=False)
     order = np.lexsort(np.rint(s.points.reference.mean(axis=1)[:, way].T / length * 1e6))
     return s.effective_stress()[order][:, way, way], s.points.x[order][:, way] / length
@@ -277,7 +284,7 @@ def test_weak_soil_that_only_turns_stays_free_of_stress_and_takes_no_cut_step(di
         return out
 
     held = mpm.Displacement("bottom", turned)
-    s = mpm.Simulation(grid, [block], [SAND], fluid=fluid, walls={}, displacements=[held])
+    s = mpm.Simulation(grid, [block], [SAND], fluid=fluid, walls={}, conditions=[held])
     result = s.run(0.4, 0.1, progress=False)
     assert result.cuts == 0 and result.newton <= 3 * result.steps
     assert np.abs(s.effective_stress()).max() < 1e-3 * 1e3
@@ -292,7 +299,7 @@ def test_weak_soil_turns_by_360_degrees_without_a_cut_step():
         c, s = np.cos(2 * np.pi * t), np.sin(2 * np.pi * t)
         return (X - centre) @ np.array([[c, s], [-s, c]]) + centre - X
 
-    s = mpm.Simulation(grid, [block], [SAND], walls={}, displacements=[mpm.Displacement("bottom", turned)])
+    s = mpm.Simulation(grid, [block], [SAND], walls={}, conditions=[mpm.Displacement("bottom", turned)])
     result = s.run(1.0, 1 / 72, progress=False)
     assert result.cuts == 0 and np.abs(s.effective_stress()).max() < 1e-3 * 1e3
 
@@ -308,7 +315,7 @@ def test_a_turn_is_found_where_walls_hold_a_part_of_the_body():
 
     def run():
         held = [mpm.Displacement("right", value)]
-        s = mpm.Simulation(grid, [block], [mpm.Hencky(bulk=1e6, shear=1e6)], walls={"left": "xy"}, displacements=held)
+        s = mpm.Simulation(grid, [block], [mpm.Hencky(bulk=1e6, shear=1e6)], walls={"left": "xy"}, conditions=held)
         s.run(1.0, 0.5, progress=False)
         return s
 

@@ -31,7 +31,7 @@ def test_nearly_incompressible_beams_do_not_lock(nu):
     load = mpm.Traction("top", lambda t: (0, -54e3 * min(1, t)), region=((0.05, -np.inf), (1.0, np.inf)))
 
     def reference(n):
-        fem = BiotFEM([0, 0], [1, 0.3], (n, 3 * n // 10), skeleton(nu), walls={"left": "xy"}, tractions=[load])
+        fem = BiotFEM([0, 0], [1, 0.3], (n, 3 * n // 10), skeleton(nu), walls={"left": "xy"}, conditions=[load])
         return fem.run(1.0, 0.1, probes=[[1.0, 0.15]]).displacement[-1][0, 1]
 
     assert tip == pytest.approx(2 * reference(60) - reference(30), rel=1e-2)
@@ -52,7 +52,7 @@ def two_layers(*materials, dim=2):
     layers = [([0, 0.1, 0.1], [0.5, 0.35, 0.4]), ([0, 0.35, 0.1], [0.5, 0.6, 0.4])]
     bodies = [mpm.box(grid, a[:dim], b[:dim], material=k) for k, (a, b) in enumerate(layers)]
     load = mpm.Traction("top", (0, -1e5, 0)[:dim])
-    return mpm.Simulation(grid, bodies, materials, walls={"left": "xyz"[:dim]}, tractions=[load])
+    return mpm.Simulation(grid, bodies, materials, walls={"left": "xyz"[:dim]}, conditions=[load])
 
 
 @pytest.mark.parametrize(
@@ -86,7 +86,7 @@ def test_the_tangent_is_the_derivative_of_the_residual(make):
 
 
 def test_uniform_strain_is_exact():
-    s = column(material=skeleton(0.49), fluid=False, displacements=[mpm.Displacement("top", (0, -0.1), "y")])
+    s = column(material=skeleton(0.49), fluid=False, conditions=[mpm.Displacement("top", (0, -0.1), "y")])
     s.run(1.0, 0.5)
     stress = s.effective_stress()[:, 1, 1]
     exact = skeleton(0.49).oedometric * np.log(0.9) / 0.9
@@ -102,7 +102,7 @@ def test_a_turned_body_has_no_stress():
         return (X - centre) @ np.array([[c, s], [-s, c]]) + centre - X
 
     sides = [mpm.Displacement(side, turned) for side in ("left", "right", "bottom", "top")]
-    s = mpm.Simulation(grid, [body], [skeleton(0.49)], walls={}, displacements=sides)
+    s = mpm.Simulation(grid, [body], [skeleton(0.49)], walls={}, conditions=sides)
     s.run(1.0, 0.05)
     assert np.abs(s.effective_stress()).max() < 1e-8 * YOUNG
 
@@ -119,7 +119,9 @@ def sagging(*materials, far=False, later=False, **options):
     load = mpm.Traction("top", lambda t: (0, -54e3 * t), region=((0.05, 0.9), (1.0, 1.0)))
     walls = {"left": "xy", "bottom": "xy"}
     options |= {"later": [1] if later else [], "tolerance": 1e-11}
-    s = mpm.Simulation(grid, bodies, materials, walls=walls, tractions=[load], **options)
+    s = mpm.Simulation(
+        grid, bodies, materials, walls=walls, conditions=[load, *options.pop("conditions", [])], **options
+    )
     probe = mpm.probes(bodies, [[1.0, 0.78]])
     if later:
         s.run(0.5, 0.25, probes=probe)
@@ -165,7 +167,7 @@ def test_a_coupled_nearly_incompressible_beam_follows_finite_elements():
     result = s.run(0.1, 0.02, probes=probe)
     load = mpm.Traction("top", lambda t: (0, -54e3 * min(1, t / 0.06)), region=((0.05, -np.inf), (1.0, np.inf)))
     ends = [mpm.Drained("left"), mpm.Drained("right")]
-    scene = {"walls": {"left": "xy"}, "tractions": [load], "drained": ends, "fluid": mpm.Fluid()}
+    scene = {"walls": {"left": "xy"}, "conditions": [load, *ends], "fluid": mpm.Fluid()}
     fem = BiotFEM([0, 0], [1, 0.3], (40, 12), skeleton(0.45), **scene)
     exact = fem.run(0.1, 0.02, probes=[[1.0, 0.15]]).displacement[-1][0, 1]
     assert result.displacement[-1][0, 1] == pytest.approx(exact, rel=1e-2)

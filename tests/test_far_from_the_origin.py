@@ -26,7 +26,7 @@ def block(origin, size, walls, **options):
     body = mpm.box(grid, lower, lower + size * np.array([1, 0.53]))
     part = (lower + size * np.array([0.2, 0.53]), lower + size * np.array([0.61, 0.53]))
     load = mpm.Traction("top", -1e4, region=part)
-    s = mpm.Simulation(grid, [body], [SOIL], walls=walls, tractions=[load], **options)
+    s = mpm.Simulation(grid, [body], [SOIL], walls=walls, conditions=[load, *options.pop("conditions", [])], **options)
     return s, mpm.probes([body], lower + np.array([[0, 0.53], [0.5, 0.53], [1, 0.2]]) * size)
 
 
@@ -69,7 +69,7 @@ def test_what_ends_at_a_side_reaches_it_anywhere(origin):
         grid = mpm.Grid(lower, upper, [7, 11])
         body = mpm.box(grid, lower, upper)
         load = mpm.Traction("top", -1e3, region=([lower[0], upper[1]], upper))
-        s = mpm.Simulation(grid, [body], [SOIL], walls={"left": "x", "right": "x", "bottom": "y"}, tractions=[load])
+        s = mpm.Simulation(grid, [body], [SOIL], walls={"left": "x", "right": "x", "bottom": "y"}, conditions=[load])
         result = s.run(1.0, 1.0, probes=mpm.probes([body], [lower, upper]), progress=False)
         assert result.displacement[-1] == pytest.approx(
             np.array([[0, 0], [0, -1e3 * size / SOIL.oedometric]]), rel=1e-3
@@ -95,7 +95,7 @@ def test_water_flows_and_rests_in_national_coordinates_as_at_the_origin(origin):
         s.run(1.0, 1.0, progress=False)
         rest = s.points.pressure
         assert rest == pytest.approx(9810 * (o + 1.9 - s.points.x[:, 1]), abs=0.01)
-        s.stage(drained=[mpm.Drained("top", 1e4)])
+        s.stage(conditions=[mpm.Drained("top", 1e4)])
         s.run(2.0, 0.5, progress=False)
         pressures.append(s.points.pressure - rest)
     assert pressures[0].max() > 500 and pressures[1] == pytest.approx(pressures[0], abs=1.0)  # 1e-9 m of strain

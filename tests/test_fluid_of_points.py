@@ -29,14 +29,16 @@ def footing(dim=2, axisymmetric=False, dilation=0.0, bulk=np.inf, steps=5, **opt
     if axisymmetric:
         walls = {"right": "x", "bottom": "xy"}
     fluid = mpm.Fluid(bulk=bulk)
-    return mpm.Simulation(grid, [block], [soil], fluid=fluid, walls=walls, displacements=[push], **options)
+    return mpm.Simulation(
+        grid, [block], [soil], fluid=fluid, walls=walls, conditions=[push, *options.pop("conditions", [])], **options
+    )
 
 
 def source(points, q, t):
     return 1e-6 * t * q * points.dx
 
 
-OPEN = {"drained": [mpm.Drained("top", region=([0.8, 1.6], [5.0, 1.9]))], "inflows": [mpm.Inflow("right", 1e-6)]}
+OPEN = {"conditions": [mpm.Drained("top", region=([0.8, 1.6], [5.0, 1.9])), mpm.Inflow("right", 1e-6)]}
 
 
 @pytest.mark.parametrize(
@@ -47,7 +49,7 @@ OPEN = {"drained": [mpm.Drained("top", region=([0.8, 1.6], [5.0, 1.9]))], "inflo
         {"axisymmetric": True},
         {"dim": 3},
         {"method": "backward-euler", **OPEN},
-        {"method": "backward-euler", "sources": [source], "bulk": 2.2e9, **OPEN},
+        {"method": "backward-euler", "terms": [mpm.Source(source)], "bulk": 2.2e9, **OPEN},
     ],
     ids=["sealed", "compressible", "axisymmetric", "3D", "open", "fed"],
 )
@@ -61,7 +63,7 @@ def test_yielding_soil_keeps_its_fluid(scene):
     for _ in range(steps):
         s.step(1 / steps)
         came -= s.outflows.array.sum() / steps
-        if "sources" in scene:
+        if "terms" in scene:
             came += 1e-6 * s.t / steps * (s.points.volume0 * s.points.J).sum()
     now, exchanged = fluid_of(s)
     off = abs(now - start - came) / exchanged

@@ -25,7 +25,7 @@ def dam(cells, heads=(UPPER, LOWER), **options):
         [soil],
         fluid=mpm.Fluid(),
         walls={"bottom": "xy"},
-        drained=[mpm.water(side, level)[1] for side, level in zip(("left", "right"), heads, strict=True)],
+        conditions=[*(mpm.water(side, level)[1] for side, level in zip(("left", "right"), heads, strict=True))],
         gravity=(0, -9.81),
         pressure=mpm.hydrostatic(UPPER),
         **options,
@@ -75,7 +75,7 @@ def test_a_block_drains_to_its_side_as_boussinesq_says():
     grid, law = mpm.Grid([0, 0], [length + 2, 11], [42, 11]), mpm.unsaturated(0.5 * 9810 * h, specific_yield=drains)
     soil = mpm.LinearElastic(bulk=1e9, shear=5e8, porosity=0.3, conductivity=k, conductivity_law=law)
     bodies = [mpm.box(grid, [h, 0], [length + h, 10])]
-    acting = {"drained": [mpm.water("left", level)[1]], "gravity": (0, -9.81), "walls": {"bottom": "xy"}}
+    acting = {"conditions": [mpm.water("left", level)[1]], "gravity": (0, -9.81), "walls": {"bottom": "xy"}}
     start = {"pressure": mpm.hydrostatic(8.0), "initial_stress": mpm.K0(0.3)}
     s = mpm.Simulation(grid, bodies, [soil], fluid=mpm.Fluid(), **acting, **start)
     for t, heights in zip(exact.t, exact.y.T, strict=True):

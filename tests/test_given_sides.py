@@ -53,7 +53,7 @@ def widened_hole(cells, widened=1e-3, steps=1):
 
     body = mpm.mapped(grid, mpm.box(grid, [0, 0], [1, 2]), polar)
     s = mpm.Simulation(
-        grid, [body], [NEO], walls={"left": "x", "bottom": "y"}, displacements=[mpm.Displacement("left", out)]
+        grid, [body], [NEO], walls={"left": "x", "bottom": "y"}, conditions=[mpm.Displacement("left", out)]
     )
     s.run(1.0, 1 / steps)
     return s.reactions.array[0] / -radial_stress(widened)
@@ -82,7 +82,7 @@ def pressed(cells, angle):
     R = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     body = mpm.mapped(grid, mpm.box(grid, [0, 0], [0.5, 1]), lambda x: x @ R.T + [0.7, 0.2])
     sides = [mpm.Displacement("bottom", (0, 0)), mpm.Displacement("top", R @ [0, -0.01])]
-    s = mpm.Simulation(grid, [body], [SOIL], walls={}, displacements=sides)
+    s = mpm.Simulation(grid, [body], [SOIL], walls={}, conditions=sides)
     s.run(1.0, 1.0)
     return s.reactions.array[1] @ R
 
@@ -103,7 +103,7 @@ def test_a_slanted_block_under_uniform_stress_is_exact():
         return np.stack([0.5 * t * (X[:, 1] - 0.13), 0 * t * X[:, 0]], axis=1)
 
     held = [mpm.Displacement(side, value) for side in ("left", "right", "bottom", "top")]
-    s = mpm.Simulation(grid, [body], [NEO], walls={}, displacements=held)
+    s = mpm.Simulation(grid, [body], [NEO], walls={}, conditions=held)
     s.run(1.0, 0.1)
     F = np.array([[1, 0.5], [0, 1]])
     stress = NEO.shear * (F @ F.T - np.eye(2))
@@ -116,7 +116,7 @@ def pushed_along_a_rough_base(way, steps, start=0.5, h=0.1):
     """Return the reaction over the way, N/m^2, of a side pushed by so many cells, at the end and held for ten steps."""
     grid = mpm.Grid([0, 0], [2.5, 1.2], [round(2.5 / h), round(1.2 / h)])
     wall = mpm.Displacement("left", lambda t, X: (way * h * min(t, 1.0), 0), "x")
-    s = mpm.Simulation(grid, [mpm.box(grid, [start, 0], [2, 1])], [SOIL], walls={"bottom": "xy"}, displacements=[wall])
+    s = mpm.Simulation(grid, [mpm.box(grid, [start, 0], [2, 1])], [SOIL], walls={"bottom": "xy"}, conditions=[wall])
     found = []
     for end, dt in ((1.0, 1 / steps), (11.0, 1.0)):
         s.run(end, dt, progress=False)
@@ -137,7 +137,7 @@ def test_a_side_one_cell_high_on_a_rough_base_is_held_too():
     grid = mpm.Grid([0, 0], [2.5, 0.3], [25, 3])
     wall = mpm.Displacement("left", lambda t, X: (0.02 * t, 0), "x")
     body = mpm.box(grid, [0.5, 0], [2, 0.1])
-    s = mpm.Simulation(grid, [body], [SOIL], walls={"bottom": "xy"}, displacements=[wall])
+    s = mpm.Simulation(grid, [body], [SOIL], walls={"bottom": "xy"}, conditions=[wall])
     s.run(1.0, 0.25, progress=False)
     moved = (s.points.corners - s.points.origin)[body.sides[:, 0, 0]][:, 2, 0]
     assert moved.max() == pytest.approx(0.02, rel=0.06)
@@ -147,7 +147,7 @@ def on_top(*regions, h=0.1, walls=WALLS, side="top"):
     """Return soil, 2 m by 1 m, with given displacements (region, value) of its top."""
     grid = mpm.Grid([0, 0], [2, 1 + h], [round(2 / h), round(1 / h) + 1])
     held = [mpm.Displacement(side, value, region=((low, -9), (high, 9))) for low, high, value in regions]
-    return mpm.Simulation(grid, [mpm.box(grid, [0, 0], [2, 1])], [SOIL], walls=walls, displacements=held)
+    return mpm.Simulation(grid, [mpm.box(grid, [0, 0], [2, 1])], [SOIL], walls=walls, conditions=held)
 
 
 def test_displacements_that_differ_where_they_meet_are_refused():
@@ -187,7 +187,7 @@ def test_a_side_that_comes_to_lie_on_a_grid_line_is_not_named(caplog):
     grid = mpm.Grid(lower=[0, -10 * h], upper=[18 * h, 3 * h], cells=[18, 13])
     body = mpm.box(grid, [0, -10 * h], [18 * h, h / 4])
     strip = mpm.Displacement("top", lambda t, X: (0, -9 / 28 * h * t), region=((0, -9), (edge, 9)))
-    s = mpm.Simulation(grid, [body], [footing.SOIL], walls=WALLS, displacements=[strip], fluid=mpm.Fluid())
+    s = mpm.Simulation(grid, [body], [footing.SOIL], walls=WALLS, conditions=[strip], fluid=mpm.Fluid())
     s.run(1.0, 1 / 9, observe=lambda s: loads.append(-s.reactions.array[0, 1]), progress=False)
     assert not said(caplog) and loads[-1] == pytest.approx(2 * loads[-2] - loads[-3], rel=0.01)
 
@@ -214,7 +214,7 @@ def footing_load(width):
     soil = mpm.DruckerPrager(friction=0.0, dilation=0.0, cohesion=footing.COHESION, **stiff)
     strip = mpm.Displacement("top", lambda t, X: (0, -end * t), region=((0, -np.inf), (4 / 9, np.inf)))
     body = mpm.box(grid, [0, -rows * h], [width, 0])
-    s = mpm.Simulation(grid, [body], [soil], walls=WALLS, displacements=[strip])
+    s = mpm.Simulation(grid, [body], [soil], walls=WALLS, conditions=[strip])
     assert s.run(1.0, 1 / 40).cuts == 0
     return s.reactions.array[0] / footing.COHESION
 
@@ -235,7 +235,7 @@ def test_a_region_half_a_cell_wide_at_the_end_of_a_side_is_held_alike_in_any_uni
         region = ((0.95 * unit, 0.45 * unit), (unit, 0.55 * unit))
         end = mpm.Displacement("top", (6e-3 * unit, -2e-2 * unit), region=region)
         body = mpm.box(grid, [0, 0], [unit, 0.5 * unit])
-        s = mpm.Simulation(grid, [body], [SOIL], walls=WALLS, displacements=[end])
+        s = mpm.Simulation(grid, [body], [SOIL], walls=WALLS, conditions=[end])
         s.run(1.0, 0.5, progress=False)
         forces.append(s.reactions.array[0] / unit)
     assert np.array(forces) == pytest.approx(np.tile(forces[0], (3, 1)), rel=1e-9)
@@ -251,7 +251,7 @@ def test_a_block_turned_in_space_is_pressed_exactly():
         mpm.Displacement("bottom", (0, 0, 0)),
         mpm.Displacement("top", lambda t, X: np.tile(R @ [0, 0, -0.008 * min(t, 1)], (len(X), 1))),
     ]
-    s = mpm.Simulation(grid, [body], [SOFT], walls={}, displacements=sides)
+    s = mpm.Simulation(grid, [body], [SOFT], walls={}, conditions=sides)
     s.run(1.5, 0.5)
     stretch = 1 - 0.02
     force = R @ [0, 0, 1e7 * np.log(stretch) / stretch * 0.16]
@@ -266,6 +266,6 @@ def test_a_flat_side_moves_as_it_is_given_whatever_resists(bulk, fluid):
     body, law = mpm.box(grid, [0, 0], [1.5, 1.0]), mpm.Hencky(bulk=bulk, shear=1e6)
     press = mpm.Displacement("top", lambda t, X: (0, -1e-3 * t), components="y")
     walls = {"left": "x", "right": "x", "bottom": "y"}
-    s = mpm.Simulation(grid, [body], [law], walls=walls, fluid=fluid, displacements=[press])
+    s = mpm.Simulation(grid, [body], [law], walls=walls, fluid=fluid, conditions=[press])
     moved = s.run(1.0, 1.0, probes=mpm.probes([body], [[0.2, 1.0]]), progress=False).displacement[-1][0, 1]
     assert -moved == pytest.approx(1e-3, rel=1e-2 if fluid else 1e-3)

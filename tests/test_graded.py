@@ -62,8 +62,15 @@ def test_a_column_that_shrinks_to_half_with_a_conductivity_law_settles_in_its_ti
     h, soil = 1 / 50, mpm.Hencky(1e6 / 3, 5e5, porosity=0.7, conductivity=1e-4, conductivity_law=linear_diffusion)
     grid = mpm.Grid([0, 0], [h, 1.0], [1, 50])
     body, load = mpm.box(grid, [0, 0], [h, 1.0], per_cell), [mpm.Traction("top", (0, -soil.oedometric))]
-    options = {"walls": {"left": "x", "right": "x", "bottom": "y"}, "drained": [mpm.Drained("top")]}
-    s = mpm.Simulation(grid, [body], [soil], fluid=mpm.Fluid(bulk=np.inf), tractions=load, **options)
+    options = {"walls": {"left": "x", "right": "x", "bottom": "y"}, "conditions": [mpm.Drained("top")]}
+    s = mpm.Simulation(
+        grid,
+        [body],
+        [soil],
+        fluid=mpm.Fluid(bulk=np.inf),
+        conditions=[*load, *options.pop("conditions", [])],
+        **options,
+    )
     cv, final, times = 1e-4 * soil.oedometric / 9810, 1 - 0.5671432904097838, (0.05, 0.1, 0.5)[: len(ceilings)]
     end, top = times[-1] / cv, mpm.probes([body], [[h / 2, 1.0]])  # ln J / J = -1 at the very end
     result = s.run(end, end / steps, probes=top, progress=False)

@@ -102,8 +102,7 @@ def slope(level, soil, h=0.25, axisymmetric=False, **options):
         [bank],
         [soil],
         fluid=mpm.Fluid(),
-        tractions=loads,
-        drained=heads,
+        conditions=[*loads, *heads],
         gravity=(0, -9.81),
         pressure=mpm.hydrostatic(level),
         initial_stress=mpm.K0(0.5, surcharge=lambda x: WEIGHT * np.maximum(level - x[:, 1], 0.0)),
@@ -111,7 +110,7 @@ def slope(level, soil, h=0.25, axisymmetric=False, **options):
     )
 
 
-HELD = {"walls": {"left": "x"}, "displacements": [mpm.Displacement("bottom", (0, 0))]}
+HELD = {"walls": {"left": "x"}, "conditions": [mpm.Displacement("bottom", (0, 0))]}
 """Holds the base of such a bank in place of the wall."""
 
 
@@ -154,7 +153,7 @@ def test_soil_is_loaded_on_as_if_its_stress_had_come_by_loading(law, axisymmetri
         [column],
         [material],
         walls={"left": "x", "right": "x", "bottom": "y"},
-        tractions=[mpm.Traction("top", lambda t: (0, first if t == 0 else second))],
+        conditions=[mpm.Traction("top", lambda t: (0, first if t == 0 else second))],
         initial_stress=lambda x: np.tile([lateral, first, lateral], (len(x), 1)),
     )
     probe = mpm.probes([column], [[0.25, 1.0]])
@@ -213,7 +212,7 @@ def test_laws_may_lie_on_one_another_in_any_order(below, above):
     """Three points each, as many as a tensor has axes, with the stress that they are given."""
     grid = mpm.Grid([0, 0], [0.5, 4.0], [1, 8])
     layers = [mpm.box(grid, [0, y], [0.5, y + 1.5], per_cell=1, material=m) for m, y in enumerate((0, 1.5))]
-    walls, load = {"left": "x", "right": "x", "bottom": "y"}, {"tractions": [mpm.Traction("top", -1e3)]}
+    walls, load = {"left": "x", "right": "x", "bottom": "y"}, {"conditions": [mpm.Traction("top", -1e3)]}
     s = mpm.Simulation(
         grid,
         layers,
@@ -234,7 +233,7 @@ def test_laws_may_lie_on_one_another_in_any_order(below, above):
 
 def test_forces_that_hold_a_rest_go_where_the_body_moves_or_is_dug_away():
     s = slope(3.0, mpm.Hencky(bulk=5e6, shear=2.5e6, **WATER))
-    s.stage(tractions=[], drained=[])
+    s.stage(conditions=[])
     s.run(1e6, 1e6, progress=False)
     assert moved(s) > 1e-3 and s.state.held is None
 
@@ -274,7 +273,7 @@ def test_a_stage_changes_what_was_given_as_a_function_of_place_only():
         [soil],
         fluid=mpm.Fluid(),
         walls={"bottom": "y", "left": "x", "right": "x"},
-        drained=[mpm.Drained("top", 1e3)],
+        conditions=[mpm.Drained("top", 1e3)],
     )
     s.run(10.0, 10.0, progress=False)
     assert np.abs(s.points.pressure).max() < 1e-9

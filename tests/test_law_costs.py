@@ -25,7 +25,7 @@ def footing(soil, surcharge=0.0):
     beside = mpm.Traction("top", (0, -surcharge), region=((EDGE, -np.inf), (np.inf, np.inf)))
     walls = {"left": "x", "right": "x", "bottom": "xy"}
     body = mpm.box(grid, [0, -20], [40, 0])
-    s = mpm.Simulation(grid, [body], [soil], walls=walls, displacements=[pushed], tractions=[beside])
+    s = mpm.Simulation(grid, [body], [soil], walls=walls, conditions=[pushed, beside])
     s.run(0.2, 0.2)
     return s
 

@@ -18,7 +18,9 @@ def cycle(h, cycles, material=SOFT, observe=(), **options):
     bottom = (round(0.6 / h) + 0.5) * grid.h[1]
     body = mpm.box(grid, [0, bottom], [1, bottom + 0.3])
     load = mpm.Traction("top", lambda t: (0, -27e3 * (1 - np.cos(2 * np.pi * t))), region=((0.05, -1), (1.0, 9)))
-    s = mpm.Simulation(grid, [body], [material], walls={"left": "xy"}, tractions=[load], **options)
+    s = mpm.Simulation(
+        grid, [body], [material], walls={"left": "xy"}, conditions=[load, *options.pop("conditions", [])], **options
+    )
     return s, s.run(cycles, 1 / STEPS, probes=mpm.probes([body], [[1, bottom + 0.15]]), observe=observe)
 
 

@@ -83,7 +83,7 @@ def test_a_linear_field_is_exact_however_the_mesh_lies(kind):
     body = mpm.from_mesh(grid, box_mesh(kind, (3,) * dim, (0,) * dim, (1,) * dim, place=skewed))
     H = np.array([[0.05, 0.1, 0.02], [-0.03, -0.08, 0.04], [0.01, 0.06, 0.03]])[:dim, :dim]
     sides = [mpm.Displacement(name, lambda t, X: t * X @ H.T) for name in body.names]
-    s = mpm.Simulation(grid, [body], [SOIL], walls={}, displacements=sides)
+    s = mpm.Simulation(grid, [body], [SOIL], walls={}, conditions=sides)
     s.run(1.0, 0.5, progress=False)
     assert s.points.F == pytest.approx(np.tile(np.eye(dim) + H, (len(s.points), 1, 1)), abs=2e-3)
 
@@ -93,7 +93,7 @@ def tip(body, grid, load, x):
     walls = {"left": "xyz"[: grid.dim]} | ({"front": "y", "back": "y"} if grid.dim == 3 else {})
     down = (0,) * (grid.dim - 1) + (-load,)
     traction = mpm.Traction("top", lambda t: np.multiply(t, down))
-    s = mpm.Simulation(grid, [body], [SOIL], walls=walls, tractions=[traction])
+    s = mpm.Simulation(grid, [body], [SOIL], walls=walls, conditions=[traction])
     return s.run(1.0, 0.25, probes=mpm.probes([body], [x]), progress=False).displacement[-1][0, -1]
 
 
@@ -164,7 +164,7 @@ def pressed_hole(body, side, p, steps, cells):
     grid = mpm.Grid([0] * 2, [2.6] * 2, [round(2.6 * cells)] * 2)
     body = body(grid)
     load = mpm.Pressure(side, lambda t: p * t)
-    s = mpm.Simulation(grid, [body], [mpm.Hencky(bulk, shear)], walls={"left": "x", "bottom": "y"}, tractions=[load])
+    s = mpm.Simulation(grid, [body], [mpm.Hencky(bulk, shear)], walls={"left": "x", "bottom": "y"}, conditions=[load])
     s.run(1.0, 1 / steps, progress=False)
     X = s.points.x - s.points.displacement
     u, radial, hoop = cylinder(p, bulk, shear)(np.linalg.norm(X, axis=1).clip(1, 2))
@@ -210,7 +210,7 @@ def test_a_polygon_is_filled_up_to_sides_with_their_names():
 def test_a_slope_under_an_even_pressure_has_an_even_stress():
     body = outlined([(0, 0), (1.8, 0), (0.6, 1), (0, 1)], ["base", "slope", "crest", "axis"])
     loads = [mpm.Pressure(side, lambda t: 5e5 * t) for side in ("slope", "crest")]
-    s = mpm.Simulation(GRID, [body], [SOIL], walls={"left": "x", "bottom": "y"}, tractions=loads)
+    s = mpm.Simulation(GRID, [body], [SOIL], walls={"left": "x", "bottom": "y"}, conditions=loads)
     s.run(1.0, 0.2, progress=False)
     assert s.effective_stress() == pytest.approx(np.tile(-5e5 * np.eye(2), (len(body), 1, 1)), abs=1.0)
 
@@ -222,8 +222,8 @@ def test_parts_of_a_mesh_share_their_inner_faces(kind):
     assert len(one) == len(two) and surface([one, two], "top").area0.sum() == pytest.approx(2.0, rel=1e-12)
     assert set(one.names) == {"left", "bottom", "top"} and set(two.names) == {"right", "bottom", "top"}
     walls, load = {"left": "x", "bottom": "y"}, mpm.Traction("right", (-1e5, 0))
-    both = mpm.Simulation(GRID, [one, two], [SOIL], walls=walls, tractions=[load])
-    whole = mpm.Simulation(GRID, [mpm.from_mesh(GRID, mesh)], [SOIL], walls=walls, tractions=[load])
+    both = mpm.Simulation(GRID, [one, two], [SOIL], walls=walls, conditions=[load])
+    whole = mpm.Simulation(GRID, [mpm.from_mesh(GRID, mesh)], [SOIL], walls=walls, conditions=[load])
     for s in (both, whole):
         s.run(1.0, 1.0, progress=False)
     assert both.points.F.mean(axis=0) == pytest.approx(whole.points.F.mean(axis=0), rel=1e-9)
@@ -371,12 +371,12 @@ def test_a_fill_of_a_mesh_lies_on_the_settled_ground():
     fill = mpm.from_mesh(grid, box_mesh("triangle", (9, 4), (0, 0), (0.8, 1), place=trapezoid))
     walls = {"left": "x", "right": "x", "bottom": "y"}
     load = mpm.Traction("top", (0, -1e5), region=((0, 0), (0.8, 0.5)))
-    s = mpm.Simulation(grid, [ground, fill], [SOIL], walls=walls, tractions=[load], later=[1])
+    s = mpm.Simulation(grid, [ground, fill], [SOIL], walls=walls, conditions=[load], later=[1])
     s.run(1.0, 0.25, progress=False)
     top = surface([ground], "top")
     settled = s.points.corners[top.id][:, :, 1].max(axis=1).min()
     assert settled < 0.47
-    s.stage(add=[1], tractions=[])
+    s.stage(add=[1], conditions=[])
     new = s.points.of(np.arange(len(ground)), kept=False)
     area = volumes(s.points.corners).sum()
     assert new.corners[:, :, 1].max() == pytest.approx(0.8, abs=1e-9), "its top stays where it was seeded"
@@ -390,7 +390,11 @@ def test_a_resumed_mesh_ends_as_one_that_was_never_interrupted(tmp_path):
     def scene():
         body = mpm.from_mesh(GRID, box_mesh("triangle", (6, 4), (0, 0), (1, 1)))
         return mpm.Simulation(
-            GRID, [body], [SOIL], walls={"bottom": "xy"}, tractions=[mpm.Traction("top", lambda t: (2e4 * t, -2e4 * t))]
+            GRID,
+            [body],
+            [SOIL],
+            walls={"bottom": "xy"},
+            conditions=[mpm.Traction("top", lambda t: (2e4 * t, -2e4 * t))],
         )
 
     whole, part = scene(), scene()
@@ -502,7 +506,7 @@ BAD = {
     "an unknown part": (lambda: mpm.from_mesh(GRID, BOX, "clay"), "mesh: part 'clay'", "no parts with a name"),
     "an unknown side": (
         lambda: mpm.Simulation(
-            GRID, [mpm.from_mesh(GRID, BOX)], [SOIL], walls={"left": "xy"}, tractions=[mpm.Traction("crest", 1.0)]
+            GRID, [mpm.from_mesh(GRID, BOX)], [SOIL], walls={"left": "xy"}, conditions=[mpm.Traction("crest", 1.0)]
         ),
         "side 'crest'",
         "left, right, bottom, top",

@@ -76,15 +76,15 @@ def block(**options):
     load = mpm.Traction("top", lambda t: (0, -2e4 * t), name="load")
     walls = {"left": "x", "right": "x"}
     body = mpm.box(grid, [0, 0], [1, 0.77])
-    tractions = [load, *options.pop("springs", [])]
-    return mpm.Simulation(grid, [body], [SOFT], walls=walls, tractions=tractions, **options)
+    conditions = [load, *options.pop("conditions", [])]
+    return mpm.Simulation(grid, [body], [SOFT], walls=walls, conditions=conditions, **options)
 
 
 def test_a_condition_of_the_users_own_acts_as_a_term_on_the_same_side():
     def term(points, u, v):
         return STIFFNESS * ufl.inner(points.value(u) + points.displacement, points.value(v)) * points.dx
 
-    own, other = block(springs=[Springs("bottom")]), block(terms=[mpm.OnSide("bottom", term)])
+    own, other = block(conditions=[Springs("bottom")]), block(terms=[mpm.OnSide("bottom", term)])
     for s in (own, other):
         s.run(1.0, 0.25, progress=False)
     assert own.points.x == pytest.approx(other.points.x, abs=1e-12)
@@ -99,7 +99,7 @@ def test_a_block_without_its_springs_is_free_to_move(tmp_path):
 
 
 def test_results_are_found_by_names_and_not_by_positions():
-    s = block(springs=[Springs("bottom")], displacements=[mpm.Displacement("left", (0, 0), "y", name="clamp")])
+    s = block(conditions=[Springs("bottom"), mpm.Displacement("left", (0, 0), "y", name="clamp")])
     s.step(0.5)
     assert s.reactions["clamp"][1] > 0
     with pytest.raises(KeyError, match=r"0: must be the name of a condition: 'clamp'"):
@@ -112,13 +112,13 @@ def test_results_are_found_by_names_and_not_by_positions():
 )
 def test_a_name_that_is_none_or_of_two_conditions_is_refused(names, value, tmp_path):
     held = [mpm.Displacement(side, (0, 0), "y", name=name) for side, name in zip(("left", "right"), names, strict=True)]
-    refused_in_one_line(lambda: block(displacements=held), "name", value, tmp_path, 400)
+    refused_in_one_line(lambda: block(conditions=held), "name", value, tmp_path, 400)
 
 
 def test_conditions_without_names_have_those_of_kind_and_side():
     held = [mpm.Displacement("left", (0, 0), "y", region=([0, low], [1, low + 0.3])) for low in (0, 0.4)]
     drained = [mpm.Drained("top"), mpm.Drained("bottom", name="drain")]
-    s = block(displacements=held, fluid=mpm.Fluid(), drained=drained)
+    s = block(conditions=[*held, *drained], fluid=mpm.Fluid())
     assert list(s.reactions) == ["displacement_left", "displacement_left_2"]
     assert list(s.outflows) == ["drained_top", "drain"]
 
@@ -128,9 +128,9 @@ def test_a_tool_of_a_later_stage_keeps_what_one_of_the_same_given_name_has_on_po
         return mpm.Tool(mpm.HalfSpace((0, 0.77), (0, -1)), displacement=lambda t: (0, -0.02 * min(t, 1)), **options)
 
     for name, kept in (("plate", True), (None, False)):
-        s = block(springs=[Springs("bottom")], tools=[plate(name=name)])
+        s = block(conditions=[Springs("bottom"), plate(name=name)])
         s.run(1.0, 0.5, progress=False)
         data = "plate_pressure" if kept else "tool_pressure"
         before = s.points.data[data].copy()
-        s.stage(tools=[plate(name=name, friction=0.1)])
+        s.stage(conditions=[*s.conditions[:2], plate(name=name, friction=0.1)])
         assert before.max() > 1e3 and np.array_equal(s.points.data[data], before) == kept

@@ -22,7 +22,9 @@ def column(law, fluid=None, dim=2, top=-0.1, **options):
     walls = {name: axes for name, axes in every.items() if dim == 3 or name not in ("front", "back")}
     body = mpm.box(grid, [0.0] * dim, [1.5] * (dim - 1) + [1.0])
     move = mpm.Displacement("top", lambda t, X: [0.0] * (dim - 1) + [top * t], components="xyz"[dim - 1])
-    return mpm.Simulation(grid, [body], [law], walls=walls, fluid=fluid, displacements=[move], **options), body
+    return mpm.Simulation(
+        grid, [body], [law], walls=walls, fluid=fluid, conditions=[move, *options.pop("conditions", [])], **options
+    ), body
 
 
 @pytest.mark.parametrize("law", [mpm.Hencky, mpm.NeoHookean, mpm.LinearElastic])

@@ -30,8 +30,8 @@ def test_a_column_consolidates_at_any_place_as_terzaghi_says(cells, allowed):
     body = mpm.box(grid, [0, 0], [h, 1])
     soil = mpm.LinearElastic(bulk=modulus / 3, shear=modulus / 2, conductivity=k)
     walls, load = SIDES[2] | {"bottom": "y"}, [mpm.Traction("top", (0, -1e3))]
-    water = {"fluid": mpm.Fluid(bulk=np.inf), "drained": [mpm.Drained("top")]}
-    s = mpm.Simulation(grid, [body], [soil], walls=walls, tractions=load, **water)
+    water = {"fluid": mpm.Fluid(bulk=np.inf), "conditions": [mpm.Drained("top")]}
+    s = mpm.Simulation(grid, [body], [soil], walls=walls, conditions=[*load, *water.pop("conditions", [])], **water)
     z, unit = np.linspace(0, 1, 37), WEIGHT / (k * modulus)
     probes = mpm.probes([body], np.column_stack([np.full(37, 0.2 * h), z]))
     found = s.run(unit, rtol=1e-4, t_eval=unit * np.array(times), probes=probes, progress=False).probe_pressure[1:]
@@ -60,9 +60,8 @@ def test_steady_flow_through_layers_is_exact_up_to_their_interface_and_drained_s
         [mpm.LinearElastic(**STIFF, conductivity=k) for k in (lower, upper)],
         walls=SIDES[dim],
         fluid=mpm.Fluid(bulk=np.inf),
-        displacements=[mpm.Displacement("bottom", [0] * dim, UP[dim])],
+        conditions=[mpm.Displacement("bottom", [0] * dim, UP[dim]), mpm.Drained("top"), mpm.Drained("bottom", 2e4)],
         gravity=[0] * (dim - 1) + [-9.81],
-        drained=[mpm.Drained("top"), mpm.Drained("bottom", 2e4)],
     )
     y = np.concatenate([np.linspace(0, meets - 1e-9, 9), np.linspace(meets + 1e-9, 1, 9)])
     places = np.column_stack([*[RANDOM.uniform(0, 2 * h, len(y))] * (dim - 1), z + y])
@@ -77,7 +76,7 @@ def test_water_at_rest_is_exact_just_below_a_drained_surface_and_at_a_sealed_bas
     grid = mpm.Grid([0, 0], [3.0, thick + 1.0], [3, thick + 1])
     body, head = mpm.box(grid, [0, 0], [3, thick]), mpm.hydrostatic(thick + 1.0)
     soil = mpm.LinearElastic(**STIFF, conductivity=1e-4)
-    water = {"fluid": mpm.Fluid(), "gravity": (0, -9.81), "pressure": head, "drained": [mpm.Drained("top", WEIGHT)]}
+    water = {"fluid": mpm.Fluid(), "gravity": (0, -9.81), "pressure": head, "conditions": [mpm.Drained("top", WEIGHT)]}
     s = mpm.Simulation(grid, [body], [soil], walls=SIDES[2] | {"bottom": "y"}, **water)
     places = np.array([[1.3, thick - 0.01], [0, thick], [3, 0], [1.5, 0.1]])
     result = s.run(1e6, 1e6, probes=mpm.probes([body], places), progress=False)
@@ -95,7 +94,7 @@ def test_a_steady_pressure_is_exact_up_to_sides_aslant():
     sides = [mpm.Drained(side, along) for side in ("top", "bottom")]
     held = [mpm.Displacement("bottom", (0, 0))]
     soil, water = mpm.LinearElastic(**STIFF, conductivity=1e-5), mpm.Fluid(bulk=np.inf)
-    s = mpm.Simulation(grid, [body], [soil], walls={}, fluid=water, displacements=held, drained=sides)
+    s = mpm.Simulation(grid, [body], [soil], walls={}, fluid=water, conditions=[*held, *sides])
     X = [0.5, 0.1] + RANDOM.uniform(size=(30, 2)) * [0.4, 1.0]
     X = np.concatenate([X, [[0.5, 0.1], [0.9, 1.1], [0.5, 0.7], [0.9, 0.4]]])
     found = s.run(1e5, 1e5, probes=mpm.probes([body], X), progress=False).probe_pressure[-1]
@@ -109,7 +108,7 @@ def test_what_lies_beyond_a_gap_or_a_contact_tells_nothing(contacts):
     soil = mpm.LinearElastic(**STIFF, conductivity=1e-6)
     walls = {"left": "xy", "right": "xy", "bottom": "xy"}
     ends = {"fluid": mpm.Fluid(), "pressure": lambda x: np.where(x[:, 0] < 0.2, 1e3, 5e3)}
-    s = mpm.Simulation(grid, bodies, [soil], walls=walls, contacts=contacts, **ends)
+    s = mpm.Simulation(grid, bodies, [soil], walls=walls, conditions=contacts, **ends)
     probes = mpm.probes(bodies, [[0.2 - 1e-6, 0.13], [0.11, 0.4], [0.2 + gap + 1e-6, 0.2]])
     assert s.run(1.0, 1.0, probes=probes, progress=False).probe_pressure[0] == pytest.approx([1e3, 1e3, 5e3])
 
@@ -120,8 +119,8 @@ def test_no_pressure_passes_those_around_it_where_one_jumps(place):
     grid = mpm.Grid([0, 0], [0.2, 1.0], [2, 10])
     body, soil = mpm.box(grid, [0, 0], [0.2, 1]), mpm.LinearElastic(bulk=1e6, shear=1e6, conductivity=1e-6)
     walls, load = SIDES[2] | {"bottom": "y"}, [mpm.Traction("top", (0, -1e3))]
-    water = {"fluid": mpm.Fluid(bulk=np.inf), "drained": [mpm.Drained("top")]}
-    s = mpm.Simulation(grid, [body], [soil], walls=walls, tractions=load, **water)
+    water = {"fluid": mpm.Fluid(bulk=np.inf), "conditions": [mpm.Drained("top")]}
+    s = mpm.Simulation(grid, [body], [soil], walls=walls, conditions=[*load, *water.pop("conditions", [])], **water)
     probes = mpm.probes([body], [[0.07, place + d] for d in (-0.03, 0.0, 0.03) if 0 <= place + d <= 1])
     p = s.run(0.1, 0.1, probes=probes, progress=False).probe_pressure[-1]
     most = s.cells().pressure.max()

@@ -13,9 +13,16 @@ BALL = mpm.Ball((1.0, 1.3), 0.3)
 def layer(*tools, wet=False, material=SOIL, **options):
     """Return a layer, 2 m wide and 1 m high, that stands rough."""
     grid = mpm.Grid([0, 0], [2.0, 1.5], [16, 12])
-    water = {"fluid": mpm.Fluid(), "drained": [mpm.Drained("top")]} if wet else {}
+    water = {"fluid": mpm.Fluid(), "conditions": [mpm.Drained("top")]} if wet else {}
     options.setdefault("walls", {"left": "x", "right": "x", "bottom": "xy"})
-    return mpm.Simulation(grid, [mpm.box(grid, [0, 0], [2, 1])], [material], tools=[*tools], **water, **options)
+    return mpm.Simulation(
+        grid,
+        [mpm.box(grid, [0, 0], [2, 1])],
+        [material],
+        conditions=[*tools, *options.pop("conditions", []), *water.pop("conditions", [])],
+        **water,
+        **options,
+    )
 
 
 def pushed(load, shape=BALL, **options):
@@ -76,7 +83,9 @@ def test_two_loads_squeeze_a_body_between_them():
     left = mpm.Tool(mpm.HalfSpace((0.2, 0), (1, 0)), load=lambda t: 1e4 * t, direction=(1, 0))
     right = mpm.Tool(mpm.HalfSpace((1.2, 0), (-1, 0)), load=lambda t: 1e4 * t, direction=(-1, 0))
     grid = mpm.Grid([0, 0], [1.5, 1.0], [15, 10])
-    s = mpm.Simulation(grid, [mpm.box(grid, [0.2, 0], [1.2, 0.5])], [SOIL], walls={"bottom": "y"}, tools=[left, right])
+    s = mpm.Simulation(
+        grid, [mpm.box(grid, [0.2, 0], [1.2, 0.5])], [SOIL], walls={"bottom": "y"}, conditions=[left, right]
+    )
     s.run(1.0, 0.5)
     assert s.tool_forces.array[:, 0] == pytest.approx([1e4, -1e4], rel=1e-6)
     stress = s.effective_stress()[:, 0, 0]
@@ -105,7 +114,7 @@ def test_a_light_tool_lies_on_a_heavy_layer(load):
     rolls = {"left": "x", "right": "x", "bottom": "y"}
     options = {"walls": rolls, "gravity": (0, -9.81), "material": heavy}
     s = layer(pushed(load, mpm.HalfSpace((0, 1.0), (0, -1))), **options)
-    other = layer(tractions=[mpm.Traction("top", (0, -load / 2))], **options)
+    other = layer(conditions=[mpm.Traction("top", (0, -load / 2))], **options)
     s.run(0.5, 0.25)
     other.run(0.5, 0.25)
     assert s.tool_travel.array[0] == pytest.approx(1 - other.points.corners[..., 1].max(), rel=1e-5)
@@ -122,7 +131,7 @@ def test_a_load_acts_from_the_first_step_on(height):
     plate = pushed(5e3, mpm.HalfSpace((0, height), (0, -1)))
     walls, ways = {"left": "x", "right": "x", "bottom": "y"}, []
     for initial in (mpm.K0(0.5), mpm.K0(0.5, surcharge=5e3)):
-        options = {"gravity": (0, -9.81), "initial_stress": initial, "walls": walls, "tools": [plate]}
+        options = {"gravity": (0, -9.81), "initial_stress": initial, "walls": walls, "conditions": [plate]}
         s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, height])], [heavy], **options)
         s.run(1.0, 1.0)
         ways.append(s.tool_travel.array[0] / height)
@@ -185,11 +194,11 @@ def test_a_stage_with_new_tools_lets_go_and_one_without_goes_on():
     s = layer(pushed(lambda t: 2e4 * min(t, 1)))
     s.run(1.0, 0.5)
     travel = s.tool_travel.array
-    s.stage(tractions=[])
+    s.stage(conditions=s.conditions)
     s.run(1.5, 0.25)
     assert s.tool_travel.array == pytest.approx(travel, rel=1e-2)
     assert -s.tool_forces.array[0, 1] == pytest.approx(2e4, rel=1e-6)
-    s.stage(tools=[])
+    s.stage(conditions=[])
     assert not s.tool_travel
 
 
@@ -218,12 +227,12 @@ def test_a_load_pushes_along_the_axis_and_in_space():
         down = (0,) * (grid.dim - 1) + (-1,)
         tool = mpm.Tool(mpm.Ball(centre, 0.25), load=lambda t: 2e3 * t, direction=down)
         body = mpm.box(grid, [0] * grid.dim, size)
-        s = mpm.Simulation(grid, [body], [SOIL], walls=walls, tools=[tool])
+        s = mpm.Simulation(grid, [body], [SOIL], walls=walls, conditions=[tool])
         s.run(1.0, 0.5)
         assert s.tool_forces.array[0, grid.dim - 1] == pytest.approx(-2e3, rel=1e-6)
     with pytest.raises(ValueError, match=r"direction = .*must be along the axis"):
         aside = mpm.Tool(mpm.Ball((0, 0.75), 0.25), load=1.0, direction=(1, 0))
-        mpm.Simulation(ring, [mpm.box(ring, [0, 0], [0.75, 0.5])], [SOIL], walls={"bottom": "xy"}, tools=[aside])
+        mpm.Simulation(ring, [mpm.box(ring, [0, 0], [0.75, 0.5])], [SOIL], walls={"bottom": "xy"}, conditions=[aside])
 
 
 @pytest.mark.parametrize(

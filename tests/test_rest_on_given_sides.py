@@ -48,7 +48,9 @@ def soil(law="hencky", E=2e7, dim=2, wet=False, bend=None, between=True, given=N
         options |= {"fluid": mpm.Fluid(), "pressure": mpm.hydrostatic(1.3)}
     options = {"initial_stress": mpm.K0(0.6), "gravity": [*[0.0] * (dim - 1), -9.81], **options}
     given = [hold("bottom", up, dim=dim)] if given is None else given
-    return mpm.Simulation(grid, bodies, materials, walls=walls, displacements=given, **options)
+    return mpm.Simulation(
+        grid, bodies, materials, walls=walls, conditions=[*given, *options.pop("conditions", [])], **options
+    )
 
 
 def weight(s):
@@ -98,7 +100,7 @@ def test_a_footing_on_soil_at_rest_bears_nothing(wet, axisymmetric):
 @pytest.mark.parametrize("bend", [None, 0.2])
 def test_a_plate_bends_nothing_at_rest(bend):
     """Under layers that dip the stress below a rigid plate is not even."""
-    rests(soil(bend=bend, plates=[mpm.RigidPlate("top", 1e4)], initial_stress=mpm.K0(0.6, surcharge=5e3)), 1e4)
+    rests(soil(bend=bend, conditions=[mpm.RigidPlate("top", 1e4)], initial_stress=mpm.K0(0.6, surcharge=5e3)), 1e4)
 
 
 def test_curved_sides_that_are_held_are_at_rest():
@@ -114,7 +116,7 @@ def test_curved_sides_that_are_held_are_at_rest():
         [body],
         [LAWS["hencky"](2e7)],
         walls={"left": "x", "right": "x"},
-        displacements=[hold("bottom")],
+        conditions=[hold("bottom")],
         fluid=mpm.Fluid(),
         pressure=mpm.hydrostatic(1.3),
         gravity=(0, -9.81),
@@ -131,21 +133,21 @@ def test_half_a_base_bears_all_and_what_then_loses_its_support_sinks_or_is_refus
     rests(soil(between=False, lower=0.13, given=[hold("bottom", region=half)]))
     s = soil(between=False, lower=0.13, given=[hold("bottom")])
     rests(s)
-    s.stage(displacements=[hold("bottom", region=half)])
+    s.stage(conditions=[hold("bottom", region=half)])
     assert s.state.held is None and s.state.rest is None
     s.step(1.0)
     assert s.points.corners[:, :, 1].min() < s.points.origin[:, :, 1].min() - 1e-4
     assert s.reactions.array[0, 1] == pytest.approx(weight(s), rel=1e-6)
-    s.stage(displacements=[])
+    s.stage(conditions=[])
     with pytest.raises(ValueError, match="free to move as a rigid body"):
         s.step(1.0)
 
 
 def test_a_stage_that_leaves_what_holds_moves_nothing():
     s = soil(bend=0.2, given=[hold("bottom")])
-    s.stage(tractions=[])
+    s.stage(conditions=s.conditions)
     rests(s)
-    s.stage(displacements=[hold("bottom", "y")])
+    s.stage(conditions=[hold("bottom", "y")])
     assert s.state.rest is None
 
 

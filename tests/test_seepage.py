@@ -22,7 +22,14 @@ def column(base, dim=2, top=0.0, h=0.25, seepage=True, **options):
     drained = [mpm.Drained("bottom", base), mpm.Drained("top", top, seepage=seepage)]
     gravity = [*[0.0] * (dim - 1), -9.81]
     return mpm.Simulation(
-        grid, [body], [SOIL], walls=walls, fluid=mpm.Fluid(), drained=drained, gravity=gravity, **options
+        grid,
+        [body],
+        [SOIL],
+        walls=walls,
+        fluid=mpm.Fluid(),
+        conditions=[*drained, *options.pop("conditions", [])],
+        gravity=gravity,
+        **options,
     )
 
 
@@ -72,8 +79,7 @@ def test_a_seepage_face_opens_when_the_soil_is_pressed_and_closes_when_it_swells
         [soil],
         walls={"left": "x", "right": "x", "bottom": "y"},
         fluid=mpm.Fluid(),
-        drained=[mpm.Drained("top", seepage=True)],
-        tractions=[load],
+        conditions=[mpm.Drained("top", seepage=True), load],
     )
     probe = mpm.probes([body], [[0.25, 1.0]])
     result = s.run(2e4, 1e3, probes=probe, progress=False)
@@ -88,7 +94,7 @@ def test_outflows_of_a_stage_are_not_known_before_its_first_step_and_prescribed_
     simulation = column(2 * WEIGHT)
     assert simulation.outflows.array.tolist() == [0.0, 0.0]
     simulation.run(1e3, 1e3, progress=False)
-    simulation.stage(drained=[mpm.Drained("bottom", 2 * WEIGHT)], inflows=[mpm.Inflow("top", 1e-6)])
+    simulation.stage(conditions=[mpm.Drained("bottom", 2 * WEIGHT), mpm.Inflow("top", 1e-6)])
     assert np.isnan(simulation.outflows.array).tolist() == [True, True]
     writer = mpm.Writer(simulation, tmp_path)
     simulation.run(2e3, 1e3, observe=writer, progress=False)
@@ -113,6 +119,6 @@ def test_other_couplings_find_the_same_seepage(coupling):
 
 
 def test_the_reference_refuses_seepage_faces():
-    options = {"walls": {"bottom": "xy"}, "fluid": mpm.Fluid(), "drained": [mpm.Drained("top", seepage=True)]}
+    options = {"walls": {"bottom": "xy"}, "fluid": mpm.Fluid(), "conditions": [mpm.Drained("top", seepage=True)]}
     with pytest.raises(ValueError, match="drained: seepage = True, must be False"):
         BiotFEM([0, 0], [1, 1], [2, 2], SOIL, **options)

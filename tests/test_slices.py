@@ -21,7 +21,7 @@ def bent(across, soil, **options):
     body = mpm.box(grid, place(0, 0.03), place(0.5, 0.27, 0.1 * across))
     walls = {"left": "xy"} if flat else {"left": "xz", "front": "y", "back": "y"}
     load = mpm.Traction("top", place(0, -3e3), region=(place(0.2, 0, -1), place(1, 1, 1)))
-    s = mpm.Simulation(grid, [body], [soil], walls=walls, tractions=[load], **options)
+    s = mpm.Simulation(grid, [body], [soil], walls=walls, conditions=[load], **options)
     s.run(1.0, 1.0, progress=False)
     return s
 

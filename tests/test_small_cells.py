@@ -17,7 +17,7 @@ def tip(cells, offset, nu):
     body = mpm.box(grid, [0, bottom], [4, bottom + 1])
     soil = mpm.Hencky(bulk=1e6 / 3 / (1 - 2 * nu), shear=1e6 / 2 / (1 + nu))
     load = mpm.Traction("right", (0, -1.0))
-    s = mpm.Simulation(grid, [body], [soil], walls={"left": "xy"}, tractions=[load])
+    s = mpm.Simulation(grid, [body], [soil], walls={"left": "xy"}, conditions=[load])
     probe = mpm.probes([body], [[4, bottom + 0.5]])
     return s.run(1.0, 1.0, probes=probe, progress=False).displacement[-1][0, 1]
 
@@ -45,8 +45,7 @@ def test_an_open_side_that_reaches_into_the_next_cell_does_not_drain_what_else_i
             [soil],
             fluid=mpm.Fluid(),
             walls={"left": "x", "right": "x", "bottom": "y"},
-            tractions=[mpm.Traction("top", (0, -10.0))],
-            drained=drained,
+            conditions=[mpm.Traction("top", (0, -10.0)), *drained],
         )
         s.run(1.0, 1.0, progress=False)
         cells = s.cells()

@@ -72,7 +72,7 @@ def layer(cells, damping=1.0, ghost=1.0, filled=0.5):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Soil, "strength", damping)
         patch.setattr("mpm_dolfinx.mechanics.ghost_penalty.GHOST", ghost * GHOST)
-        s = mpm.Simulation(grid, [body], [soil], fluid=mpm.Fluid(bulk=np.inf), walls=walls, tractions=tractions)
+        s = mpm.Simulation(grid, [body], [soil], fluid=mpm.Fluid(bulk=np.inf), walls=walls, conditions=tractions)
         s.run(1.0, 1.0, progress=False)
     cells_pressure = s.scene.storage.p.x.array[s.grid.local(s.grid.number(s.grid.index(body.centre)))]
     return s.points.corners.mean(axis=1) - body.centre, s.points.pressure, *exact(body.centre), cells_pressure
@@ -126,7 +126,7 @@ def pushed(monkeypatch, most, law=mpm.DruckerPrager, **strength):
     under, beside = ((0, -1), (7 / 15, 1)), ((7 / 15, -1), (2, 1))
     foot = mpm.Displacement("top", lambda t, X: (0, -6e-4 * t), region=under)
     walls, open_side = {"left": "x", "right": "x", "bottom": "xy"}, mpm.Drained("top", region=beside)
-    scene = {"walls": walls, "fluid": mpm.Fluid(), "drained": [open_side], "displacements": [foot]}
+    scene = {"walls": walls, "fluid": mpm.Fluid(), "conditions": [open_side, foot]}
     s = mpm.Simulation(grid, [mpm.box(grid, [0, -1], [1.6, 0])], [soil], **scene)
     s.run(1.0, 0.05)
     cells = s.cells()

@@ -46,11 +46,11 @@ def scene(law, wet, held):
             raise Refusal
         return 0.0, -asked["load"]
 
-    options = {"tractions": [mpm.Traction("top", load)]}
+    options = {"conditions": [mpm.Traction("top", load)]}
     if held:
-        options = {"displacements": [mpm.Displacement("top", lambda t, X: (0, 1e-7 * load(t)[1]), "y")]}
+        options = {"conditions": [mpm.Displacement("top", lambda t, X: (0, 1e-7 * load(t)[1]), "y")]}
     if wet:
-        options |= {"fluid": mpm.Fluid(bulk=1e8), "drained": [mpm.Drained("top")]}
+        options = {"fluid": mpm.Fluid(bulk=1e8), "conditions": [*options["conditions"], mpm.Drained("top")]}
     walls = {"left": "x", "right": "x", "bottom": "y"}
     s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [0.3, 0.63])], [LAWS[law]], walls=walls, **options)
     return s, asked
@@ -270,8 +270,16 @@ def test_a_step_within_a_stay_depends_on_the_state_alone():
         bodies = [mpm.box(grid, [0, 0], [2, 0.5]), mpm.box(grid, [0, 0.5], [0.9, 0.9])]
         soil = mpm.Hencky(bulk=2e6, shear=6e5, conductivity=1e-6)
         walls, load = {"left": "x", "right": "x", "bottom": "xy"}, mpm.Traction("top", (0, -2e3))
-        water = {"fluid": mpm.Fluid(), "drained": [mpm.Drained("top")], "pressure": mpm.hydrostatic(0.5)}
-        return mpm.Simulation(grid, bodies, [soil], walls=walls, gravity=(0, -9.81), tractions=[load], **water)
+        water = {"fluid": mpm.Fluid(), "conditions": [mpm.Drained("top")], "pressure": mpm.hydrostatic(0.5)}
+        return mpm.Simulation(
+            grid,
+            bodies,
+            [soil],
+            walls=walls,
+            gravity=(0, -9.81),
+            conditions=[load, *water.pop("conditions", [])],
+            **water,
+        )
 
     one, other, states = build(), build(), []
     for _ in range(8):

@@ -21,7 +21,7 @@ def pulled(cells, size, steps, per_cell):
     tool = mpm.Tool(disc, lambda t: (0.016 * max(0, t - 1), -0.05 * min(1, t)), friction=mu)
     gel = mpm.Hencky(bulk=E / (3 - 6 * 0.49), shear=E / (2 + 2 * 0.49))
     walls = {"left": "x", "right": "x", "bottom": "xy"}
-    s = mpm.Simulation(grid, [mpm.box(grid, [-size, 0], [size, top], per_cell)], [gel], walls=walls, tools=[tool])
+    s = mpm.Simulation(grid, [mpm.box(grid, [-size, 0], [size, top], per_cell)], [gel], walls=walls, conditions=[tool])
     s.run(1.0, 1.0)
     for k in range(1, steps + 1):
         s.run(1 + k / 4, 0.25)

@@ -34,7 +34,7 @@ def block(materials, load=LOAD, run=True, **options):
     half = (mpm.box(grid, [0, 0], [0.5, 0.25]), mpm.box(grid, [0, 0.25], [0.5, 0.5], material=len(materials) - 1))
     top = mpm.Traction("top", lambda t: (0, -load * min(1, t)), region=((0, 0.3), (0.5, 1)))
     walls = {"left": "x", "bottom": "y"}
-    s = mpm.Simulation(grid, half, materials, walls=walls, tractions=[top], **options)
+    s = mpm.Simulation(grid, half, materials, walls=walls, conditions=[top, *options.pop("conditions", [])], **options)
     if run:
         s.run(1, 1)
     return s
@@ -161,8 +161,7 @@ def bank(cells, *, run=4.0, crest=4.0, wet=False, **strength):
         tractions, drained = zip(*(mpm.water(side, 5.0) for side in ("top", "right")), strict=True)
         conditions |= {
             "fluid": mpm.Fluid(),
-            "tractions": tractions,
-            "drained": drained,
+            "conditions": [*tractions, *drained],
             "pressure": mpm.hydrostatic(5.0),
         }
         strength |= {"conductivity": 1e-3}

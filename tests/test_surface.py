@@ -128,7 +128,7 @@ def test_a_load_on_what_is_free_beside_a_turned_body_carries_its_whole_force():
     turned = mpm.mapped(grid, above, lambda x: (x - [1, 0.75, 0]) @ [[c, s, 0], [-s, c, 0], [0, 0, 1]] + [2.1, 1.9, 0])
     ground = ((0, 0, 0), (4, 4, 0))
     hold, load = mpm.Displacement("bottom", (0, 0, 0), region=ground), mpm.Traction("top", (0, 0, -1e3))
-    s = mpm.Simulation(grid, [below, turned], [SOIL], walls={}, displacements=[hold], tractions=[load])
+    s = mpm.Simulation(grid, [below, turned], [SOIL], walls={}, conditions=[hold, load])
     s.run(1.0, 1.0, progress=False)
     assert s.reactions.array[0, 2] == pytest.approx(16e3, rel=1e-6)
 
@@ -191,9 +191,9 @@ def test_a_plate_lies_on_the_body_as_it_is_bent():
     grid = mpm.Grid([0, 0], [4.0, 4.0], [8, 8])
     body, plate = mpm.box(grid, [0, 0], [2, 1]), [mpm.RigidPlate("top", 1e3)]
     with pytest.raises(ValueError, match=r"RigidPlate\(.* slope, must be one flat side normal to an axis"):
-        scene(grid, [mpm.mapped(grid, body, lambda x: x + np.outer(x[:, 0] * x[:, 1], [0, 0.3]))], plates=plate)
+        scene(grid, [mpm.mapped(grid, body, lambda x: x + np.outer(x[:, 0] * x[:, 1], [0, 0.3]))], conditions=plate)
     sheared = mpm.mapped(grid, body, lambda x: x + np.outer(x[:, 1], [0.5, 0]))
-    assert scene(grid, [sheared], plates=plate).run(1.0, 1.0, progress=False).converged
+    assert scene(grid, [sheared], conditions=plate).run(1.0, 1.0, progress=False).converged
 
 
 def test_bodies_that_do_not_touch_and_yet_will_stick_are_named_with_their_distance(caplog):

@@ -19,7 +19,7 @@ def sheared(sides, gamma=5.0, steps=100):
         return np.stack([gamma * t * (X[:, 1] - 0.13), 0 * t * X[:, 0]], axis=1)
 
     held = [mpm.Displacement(side, value) for side in sides]
-    s = mpm.Simulation(grid, [body], [SOFT], walls={}, displacements=held)
+    s = mpm.Simulation(grid, [body], [SOFT], walls={}, conditions=held)
     return s, s.run(1.0, 1 / steps)
 
 
@@ -52,7 +52,7 @@ def test_a_column_tears_at_a_weak_layer(softness):
     column.append(mpm.box(grid, [0.1, 0.6], [0.53, 1.0]))
     weak = mpm.NeoHookean(bulk=softness * SOFT.bulk, shear=softness * SOFT.shear)
     top = mpm.Displacement("top", lambda t, X: (0, 1.9 * t))
-    s = mpm.Simulation(grid, column, [SOFT, weak], walls={"bottom": "xy"}, displacements=[top])
+    s = mpm.Simulation(grid, column, [SOFT, weak], walls={"bottom": "xy"}, conditions=[top])
     s.run(1.0, 0.01)
     volume, layer = s.points.volume0 * s.points.J, s.points.material == 1
     assert volume[~layer].sum() == pytest.approx(0.43 * 0.9, rel=2e-2 if softness > 1e-4 else 2e-4)

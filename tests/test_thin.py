@@ -24,7 +24,7 @@ def bent(cells, per_cell):
     inertia = HEIGHT**3 / 12
     load = 0.05 * YOUNG * inertia / LENGTH**2
     end = mpm.Traction("right", (0, -load / HEIGHT))
-    s = mpm.Simulation(grid, [body], [RUBBER], walls={"left": "xy"}, tractions=[end])
+    s = mpm.Simulation(grid, [body], [RUBBER], walls={"left": "xy"}, conditions=[end])
     result = s.run(1.0, 1.0, probes=mpm.probes([body], [[LENGTH, bottom + HEIGHT / 2]]), progress=False)
     rod = load * LENGTH**3 / (3 * YOUNG * inertia) + load * LENGTH / (5 / 6 * RUBBER.shear * HEIGHT)
     return -result.displacement[-1][0, 1] / rod

@@ -25,7 +25,7 @@ def deepest(simulation):
     """Return how deep corners are in the tools, in cells."""
     t, d = simulation.t, simulation.grid.dim
     x = simulation.points.corners.reshape(-1, d)
-    tools = simulation.state.stage.of(mpm.Tool).values()
+    tools = [one for one in simulation.conditions if isinstance(one, mpm.Tool)]
     return max(-tool.shape.distance(tool.pose(t, d).own(x)).min() for tool in tools) / simulation.grid.h.min()
 
 
@@ -37,7 +37,7 @@ def pressed(angle, offset, cells=4):
     body = mpm.mapped(grid, mpm.box(grid, [0, 0], [0.8, 0.8]), lambda x: (x - 0.4) @ R.T + middle)
     plates = [mpm.HalfSpace(middle + R @ [0, side * 0.4], R @ [0, -side]) for side in (-1, 1)]
     tools = [mpm.Tool(plates[0], friction=0.3), mpm.Tool(plates[1], displacement=lambda t: R @ [0, -0.2 * t])]
-    s = mpm.Simulation(grid, [body], [SOIL], walls={}, tools=tools)
+    s = mpm.Simulation(grid, [body], [SOIL], walls={}, conditions=tools)
     worst = []
     s.run(1.0, 0.25, observe=lambda s: worst.append(deepest(s)))
     return s, R, max(worst)
@@ -62,7 +62,7 @@ def test_corners_of_a_gel_that_rough_plates_squeeze_stay_outside():
     body = mpm.mapped(grid, mpm.box(grid, [0, 0], [0.8, 0.8]), lambda x: (x - 0.4) @ R.T + middle)
     floor, plate = (mpm.HalfSpace(middle + R @ [0, side * 0.4], R @ [0, -side]) for side in (-1, 1))
     tools = [mpm.Tool(floor, friction=1.0), mpm.Tool(plate, displacement=lambda t: R @ [0, -0.2 * t], friction=1.0)]
-    s, worst = mpm.Simulation(grid, [body], [GEL], walls={}, tools=tools), []
+    s, worst = mpm.Simulation(grid, [body], [GEL], walls={}, conditions=tools), []
     s.run(1.0, 0.125, observe=lambda s: worst.append(deepest(s)))
     assert max(worst) < 1.001e-3
 
@@ -76,7 +76,7 @@ def test_a_disc_presses_as_hertz_says():
     soil = mpm.Hencky(bulk=E / (3 - 6 * nu), shear=E / (2 + 2 * nu))
     disc = mpm.Tool(mpm.Ball((0, top + R), R), displacement=lambda t: (0, -0.05 * t))
     walls = {"left": "x", "right": "x", "bottom": "xy"}
-    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [L, top])], [soil], walls=walls, tools=[disc])
+    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [L, top])], [soil], walls=walls, conditions=[disc])
     s.run(1.0, 1.0)
     force = -2 * s.tool_forces.array[0, 1]
     half, most = 2 * np.sqrt(force * R / (np.pi * stiff)), np.sqrt(force * stiff / (np.pi * R))
@@ -99,7 +99,7 @@ def on_a_plane(angle, reach, steps=8, mu=0.5):
         return 9.81 * R @ [np.sin(turn), -np.cos(turn)]
 
     plane = mpm.Tool(mpm.HalfSpace((1, 0.7), R @ [0, 1]), friction=mu)
-    s = mpm.Simulation(grid, [body], [GEL], walls={}, gravity=gravity, tools=[plane])
+    s = mpm.Simulation(grid, [body], [GEL], walls={}, gravity=gravity, conditions=[plane])
     return s, mpm.probes([body], [[0.0, 0.0], [1.0, 0.0]])
 
 
@@ -135,7 +135,7 @@ def test_a_smooth_retaining_wall_has_the_pressure_of_rankine(way, length):
     walls = {"bottom": "y", "right": "x"}
     weight = {"gravity": lambda t: (0, -9.81 * min(1, t))}
     body = mpm.box(grid, [0, 0], [length, 1])
-    s = mpm.Simulation(grid, [body], [soil], walls=walls, tools=[wall], **weight)
+    s = mpm.Simulation(grid, [body], [soil], walls=walls, conditions=[wall], **weight)
     s.run(2.0, 0.25)
     K = 3.0 ** np.sign(way)
     exact = K * 0.5 * 2000 * 9.81 + np.sign(way) * 2 * 20 * np.sqrt(K)
@@ -155,9 +155,11 @@ def on_a_floor(way, cells, length, delta, floor, steps):
         mpm.Tool(mpm.HalfSpace((0, 0), (1, 0)), lambda t: (way * max(0, t - 1), 0), friction=mu, adhesion=rest * mu),
         mpm.Tool(mpm.HalfSpace((0, 0), (0, 1)), **floor),
     ]
-    options = {"tractions": [mpm.Pressure("top", lambda t: load * min(1, t))], "walls": {}, "tools": tools}
+    options = {"conditions": [mpm.Pressure("top", lambda t: load * min(1, t)), *tools], "walls": {}}
     far = [mpm.Displacement("right", (0, 0), "x")]
-    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [length, 1])], [soil], displacements=far, **options)
+    s = mpm.Simulation(
+        grid, [mpm.box(grid, [0, 0], [length, 1])], [soil], conditions=[*far, *options.pop("conditions", [])], **options
+    )
     s.run(1.0, 1 / steps)
     return (s.run(2.0, 1 / steps).tool_forces["tool"][1:, 0] + rest) / (load + rest)
 
@@ -185,7 +187,7 @@ def work(friction, path, end, steps):
     grid = mpm.Grid([0, 0], [1.5, 0.75], [12, 6])
     body = mpm.box(grid, [0.25, 0], [1.25, 0.53])
     plate = mpm.Tool(mpm.HalfSpace((0, 0.53), (0, -1)), displacement=path, friction=friction)
-    s = mpm.Simulation(grid, [body], [GEL], walls={"bottom": "xy"}, tools=[plate])
+    s = mpm.Simulation(grid, [body], [GEL], walls={"bottom": "xy"}, conditions=[plate])
     result = s.run(end, 1 / steps)
     force, x = result.tool_forces["tool"][:, :2], np.array([path(t) for t in result.t])
     parts = ((force[1:] + force[:-1]) / 2 * np.diff(x, axis=0)).sum(axis=1)
@@ -223,7 +225,7 @@ def test_adhesion_bounds_the_shear():
     grid = mpm.Grid([0, 0], [1.5, 0.75], [12, 6])
     body = mpm.box(grid, [0.25, 0], [1.25, 0.5])
     plate = mpm.Tool(mpm.HalfSpace((0, 0.5), (0, -1)), lambda t: (0.1 * max(0, t - 1), -0.01 * min(t, 1)), adhesion=2e3)
-    s = mpm.Simulation(grid, [body], [GEL], walls={"bottom": "xy"}, tools=[plate])
+    s = mpm.Simulation(grid, [body], [GEL], walls={"bottom": "xy"}, conditions=[plate])
     s.run(2.0, 0.25)
     assert s.tool_forces.array[0, 0] == pytest.approx(2e3, rel=0.02)
 
@@ -235,7 +237,7 @@ def test_the_tangent_of_the_contact_is_its_derivative(friction):
     disc = mpm.Ball((0.5, 0.71), 0.2)
     motion = {"displacement": lambda t: (0.02 * t, -0.01 * t), "rotation": lambda t: 0.2 * t, "centre": (0.5, 0.7)}
     tool = mpm.Tool(disc, **motion, friction=friction)
-    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 0.51])], [GEL], walls={"bottom": "xy"}, tools=[tool])
+    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 0.51])], [GEL], walls={"bottom": "xy"}, conditions=[tool])
     s.step(0.5)
     momentum: MomentumProblem = set_up(s, 0.5).momentum
     rng, forms, unknowns = np.random.default_rng(1), momentum.forms, momentum.system.unknowns
@@ -265,7 +267,9 @@ def simple(**options):
     plate = options.pop("shape", mpm.HalfSpace((0, 0.6), (0, -1)))
     tool = mpm.Tool(plate, **options.pop("tool", {"displacement": lambda t: (0, -0.1 * t)}))
     options.setdefault("walls", {"bottom": "xy"})
-    return mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 0.6])], [GEL], tools=[tool], **options)
+    return mpm.Simulation(
+        grid, [mpm.box(grid, [0, 0], [1, 0.6])], [GEL], conditions=[tool, *options.pop("conditions", [])], **options
+    )
 
 
 def shallow(y):
@@ -288,7 +292,7 @@ def shallow(y):
         (lambda: simple(shape=shallow).run(1, 1), "slope 0.5 at .*must be a signed distance"),
         (lambda: simple(walls={}).run(1, 1), "free to move"),
         (
-            lambda: simple(displacements=[mpm.Displacement("top", (0, 0))]).run(1, 1),
+            lambda: simple(conditions=[mpm.Displacement("top", (0, 0))]).run(1, 1),
             "HalfSpace.* and Displacement.*both act at",
         ),
     ],
@@ -312,7 +316,7 @@ def test_a_tool_that_would_be_behind_a_beam_after_a_step_bends_it():
     beam = mpm.box(grid, [0, 0.6], [0.6, 0.7])
     shape = mpm.Convex([[0.35, 0.71], [0.8, 0.71], [0.8, 0.81], [0.35, 0.81]])
     tool = mpm.Tool(shape, displacement=lambda t: (0, -0.23 * t))
-    s = mpm.Simulation(grid, [beam], [SOIL], walls={"left": "xy"}, tools=[tool])
+    s = mpm.Simulation(grid, [beam], [SOIL], walls={"left": "xy"}, conditions=[tool])
     assert s.run(1.0, 1.0, progress=False).cuts
     assert s.points.x[:, 1].min() < 0.71 - 0.23 and np.linalg.norm(s.tool_forces.array[0, :2]) > 100
 
@@ -352,7 +356,7 @@ def test_a_refused_step_leaves_the_contact():
             return 0.0
 
         s = simple(tool={"displacement": lambda t: (0.02 * t, -0.03 * t), "friction": 0.3})
-        s.stage(tractions=[mpm.Pressure("right", load)])
+        s.stage(conditions=[*s.conditions, mpm.Pressure("right", load)])
         s.step(0.5)
         if refuses:
             with pytest.raises(ValueError, match="not now"):
@@ -371,7 +375,9 @@ def test_a_stage_goes_on_with_a_tool_wherever_the_step_before_left_it():
     forces = []
     for stages in (1, 2):
         disc = mpm.Tool(mpm.Ball((0.63, 0.78), 0.18), displacement=lambda t: (0, -0.15 * t))
-        s = mpm.Simulation(grid, [mpm.box(grid, [0.1, 0], [1.1, 0.6])], [GEL], walls={"bottom": "xy"}, tools=[disc])
+        s = mpm.Simulation(
+            grid, [mpm.box(grid, [0.1, 0], [1.1, 0.6])], [GEL], walls={"bottom": "xy"}, conditions=[disc]
+        )
         s.run(1.0, 0.1, progress=False)
         if stages == 2:
             faces = s.scene.on_grid(s.points).cut.surface(s.state.stage.acting[0].found.faces)
@@ -387,11 +393,11 @@ def test_a_stage_takes_tools_away_and_brings_others():
     s = simple(tool={"displacement": lambda t: (0, -0.05 * t), "friction": 0.3})
     s.run(1.0, 0.5)
     before = -s.tool_forces.array[0, 1]
-    s.stage(tools=[])
+    s.stage(conditions=[])
     assert not s.tool_forces and not any(name.startswith("tool") for name in s.points.data)
     s.run(2.0, 1.0)
     assert np.abs(s.effective_stress()).max() < 0.05 * before
-    s.stage(tools=[mpm.Tool(mpm.Ball((0.5, 0.81), 0.2), displacement=lambda t: (0, -0.05 * (t - 2)))])
+    s.stage(conditions=[mpm.Tool(mpm.Ball((0.5, 0.81), 0.2), displacement=lambda t: (0, -0.05 * (t - 2)))])
     assert np.isnan(s.tool_forces.array).all()
     s.run(3.0, 0.5)
     assert s.tool_forces.array[0, 1] < 0
@@ -403,7 +409,7 @@ def test_a_plate_presses_a_cube_evenly_in_space():
     body = mpm.box(grid, [0.17, 0.2, 0], [0.97, 1, 0.8])
     floor = mpm.Tool(mpm.HalfSpace((0, 0, 0), (0, 0, 1)), friction=0.2)
     plate = mpm.Tool(mpm.HalfSpace((0, 0, 0.8), (0, 0, -1)), displacement=lambda t: (0.1 * t, 0, -0.2 * t))
-    s = mpm.Simulation(grid, [body], [SOIL], walls={}, tools=[floor, plate])
+    s = mpm.Simulation(grid, [body], [SOIL], walls={}, conditions=[floor, plate])
     s.run(1.0, 0.5)
     exact = E * np.log(0.75) / 0.75
     assert s.effective_stress()[:, 2, 2] == pytest.approx(np.full(len(s.points), exact), rel=1e-3)
@@ -454,7 +460,7 @@ def test_a_tool_less_than_a_cell_wide_presses(ends):
     stamp = mpm.Convex([(a, 0.5), (b, 0.5), (b, 0.6), (a, 0.6)])
     one_cell = mpm.Displacement("top", lambda t: (0, -0.02 * t), "y", region=((0.3, 0.4), (0.4, 0.6)))
     forces = []
-    for how in ({"tools": [mpm.Tool(stamp, displacement=lambda t: (0, -0.02 * t))]}, {"displacements": [one_cell]}):
+    for how in ({"conditions": [mpm.Tool(stamp, displacement=lambda t: (0, -0.02 * t))]}, {"conditions": [one_cell]}):
         body = mpm.box(grid, [0, 0], [1.0, 0.5])
         s = mpm.Simulation(
             grid, [body], [mpm.Hencky(bulk=1e6, shear=6e5)], walls={"left": "x", "right": "x", "bottom": "xy"}, **how

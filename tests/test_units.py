@@ -53,7 +53,7 @@ def column(units, *, water=None, **options):
     body = mpm.box(grid, [0, 0], np.array([0.2, 1.0]) * units.length)
     walls = {"left": "x", "right": "x", "bottom": "y"}
     load = mpm.Traction("top", lambda t: (0, -LOAD * units.stress * min(1.0, t / units.time / 10)))
-    options = {"tractions": [load], "drained": [mpm.Drained("top")], **options}
+    options = {"conditions": [load, mpm.Drained("top")], **options}
     s = mpm.Simulation(grid, [body], [units.soil()], walls=walls, fluid=water or units.fluid(), **options)
     result = s.run(30 * units.time, 10 * units.time, progress=False)
     return np.array(result.pressure)[:, 1] / units.stress
@@ -114,7 +114,7 @@ def test_water_on_sides_and_levels_weigh_what_the_pore_fluid_does(name, caplog):
     for units in (Units(), OTHERS[name]):
         push, head = mpm.water("top", 1.5 * units.length)
         level = mpm.hydrostatic(1.5 * units.length)
-        water = {"tractions": [push], "drained": [head], "pressure": level, "gravity": (0, -9.81 * units.gravity)}
+        water = {"conditions": [push, head], "pressure": level, "gravity": (0, -9.81 * units.gravity)}
         found.append(column(units, **water))
     assert found[1] == pytest.approx(found[0], rel=1e-6)
     assert not any("unit_weight" in r.getMessage() for r in caplog.records)
@@ -131,13 +131,12 @@ def test_a_unit_weight_that_is_given_stays():
             fluid=sea,
             walls={"bottom": "xy"},
             gravity=(0, -9.81),
-            tractions=[push],
-            drained=[head],
+            conditions=[push, head],
             pressure=mpm.hydrostatic(2.0, **given),
         )
         assert s.points.pressure == pytest.approx(weight * (2.0 - s.points.x[:, 1]))
         conditions = s.state.stage.conditions
-        for value in (conditions["tractions"][0].value, conditions["drained"][0].pressure):
+        for value in (conditions["tractions"][0].value, conditions["outlets"][0].pressure):
             assert value(0.0, np.array([[0.0, 1.0]])) == pytest.approx(weight)
 
 
@@ -145,7 +144,7 @@ def test_a_unit_weight_that_is_given_stays():
 def test_water_on_a_dry_body_is_named_where_gravity_is_of_other_units(g, said, caplog):
     grid, (push, _) = mpm.Grid([0, 0], [1.0, 1.0], [2, 2]), mpm.water("top", 2.0)
     body, options = mpm.box(grid, [0, 0], [1, 0.5]), {"walls": {"bottom": "xy"}, "gravity": (0, -g)}
-    mpm.Simulation(grid, [body], [mpm.Hencky(bulk=1e6, shear=1e6)], tractions=[push], **options)
+    mpm.Simulation(grid, [body], [mpm.Hencky(bulk=1e6, shear=1e6)], conditions=[push], **options)
     assert sum("unit_weight = 9810" in r.getMessage() for r in caplog.records) == said
 
 
@@ -154,9 +153,9 @@ def test_finite_elements_take_the_same_unit_weight():
     for unit in (Units(), units):
         water = unit.fluid(gravity=9.81 * unit.gravity)
         load = mpm.Traction("top", (0, -LOAD * unit.stress))
-        options = {"walls": {"left": "x", "right": "x", "bottom": "y"}, "drained": [mpm.Drained("top")]}
+        options = {"walls": {"left": "x", "right": "x", "bottom": "y"}, "conditions": [load, mpm.Drained("top")]}
         size = np.array([0.2, 1.0]) * unit.length
-        fem = BiotFEM([0, 0], size, [1, 8], unit.soil(), fluid=water, tractions=[load], **options)
+        fem = BiotFEM([0, 0], size, [1, 8], unit.soil(), fluid=water, **options)
         fem.run(10 * unit.time, 10 * unit.time, probes=[size / 2])
         pressures.append(fem.pressure(np.array([[0.0, 0.0]]))[0] / unit.stress)
     assert pressures[1] == pytest.approx(pressures[0], rel=1e-6)

@@ -50,7 +50,7 @@ def pushed(dim: int = 2) -> mpm.Simulation:
     walls = {"left": "x", "right": "x", "bottom": "xyz"[:dim]} | ({"front": "y", "back": "y"} if dim == 3 else {})
     body = mpm.box(grid, [0] * dim, [1] * dim)
     drained = mpm.Drained("top", region=([0.5, *[-np.inf] * (dim - 1)], [np.inf] * dim))
-    bodies = {"displacements": [footing], "drained": [drained], "fluid": mpm.Fluid()}
+    bodies = {"conditions": [footing, drained], "fluid": mpm.Fluid()}
     return mpm.Simulation(grid, [body], [soil], walls=walls, **bodies)
 
 
@@ -107,7 +107,7 @@ def test_a_run_resumed_where_soil_flows_ends_with_the_same_bits(tmp_path):
 def test_bodies_that_do_not_yield_remember_no_velocities():
     grid = mpm.Grid([0, 0], [1.0, 1.0], [4, 4])
     body, load = mpm.box(grid, [0, 0], [0.5, 0.5]), mpm.Traction("top", (0, -1e3))
-    s = mpm.Simulation(grid, [body], [mpm.Hencky(bulk=1e6, shear=1e6)], walls={"bottom": "xy"}, tractions=[load])
+    s = mpm.Simulation(grid, [body], [mpm.Hencky(bulk=1e6, shear=1e6)], walls={"bottom": "xy"}, conditions=[load])
     s.step(1.0)
     assert s.state.velocity is None
 

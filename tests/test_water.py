@@ -21,8 +21,7 @@ def bank(level, h=0.25):
         [mpm.Hencky(grain_density=1000.0, **MUD)],
         fluid=mpm.Fluid(),
         walls={"bottom": "xy"},
-        tractions=loads,
-        drained=heads,
+        conditions=[*loads, *heads],
         gravity=lambda t: (0, -9.81 * min(1.0, t / 10)),
     )
 
@@ -49,8 +48,7 @@ def test_heavier_soil_under_water_carries_its_weight_less_the_waters():
         [mpm.Hencky(grain_density=2650.0, **{**MUD, "bulk": 2e8, "shear": 1e8})],
         fluid=mpm.Fluid(),
         walls={"bottom": "y", "left": "x", "right": "x"},
-        tractions=[load],
-        drained=[head],
+        conditions=[load, head],
         gravity=(0, -9.81),
     )
     s.run(2e5, 2e4, progress=False)
@@ -86,15 +84,14 @@ def test_water_that_is_not_as_heavy_as_the_pores_is_named(caplog):
             [mpm.Hencky(**MUD)],
             fluid=mpm.Fluid(density=density),
             walls={"bottom": "y", "left": "x", "right": "x"},
-            tractions=[load],
-            drained=[head],
+            conditions=[load, head],
             gravity=(0, -g),
             pressure=mpm.hydrostatic(1.5, unit_weight),
         )
         said = [r.message for r in caplog.records if "unit_weight" in r.message]
         assert len(said) == named, said
     assert not caplog.records
-    s.stage(drained=[mpm.water("top", 1.2, unit_weight=9810.0)[1]])
+    s.stage(conditions=[load, mpm.water("top", 1.2, unit_weight=9810.0)[1]])
     (message,) = (r.message for r in caplog.records)
     assert message.startswith("water at 'top': unit_weight = 9810 N/m^3") and "is 10055.2" in message
 
@@ -110,7 +107,7 @@ def test_water_that_is_not_as_heavy_as_the_pores_is_named(caplog):
 def test_water_that_is_none_is_refused(arguments, said):
     with pytest.raises(ValueError, match=said):
         load, head = mpm.water(**{"side": "top", **arguments})
-        bank_with = {"tractions": [load], "drained": [head]}
+        bank_with = {"conditions": [load, head]}
         grid = mpm.Grid([0, 0], [1.0, 1.0], [2, 2])
         body, soil = mpm.box(grid, [0, 0], [1, 0.5]), mpm.Hencky(**MUD)
         mpm.Simulation(grid, [body], [soil], fluid=mpm.Fluid(), walls={"bottom": "xy"}, **bank_with)

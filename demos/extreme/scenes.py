@@ -98,11 +98,11 @@ class Beam:
             return lambda t: turned(np.array([x, y]), self.angle) * min(1.0, t / (self.ramp * self.end))
 
         loads = [mpm.Traction("top", along(0, -self.load)), mpm.Traction("right", along(-self.thrust, 0))]
-        out: dict = {"tractions": loads}
+        out: dict = {"conditions": loads}
         if self.weight:
             out["gravity"] = along(0, -self.weight)
         if self.fluid:
-            out |= {"fluid": self.fluid, "drained": [mpm.Drained(side) for side in self.drained]}
+            out |= {"fluid": self.fluid, "conditions": [*loads, *(mpm.Drained(side) for side in self.drained)]}
         return out
 
     def __call__(self) -> Scene:
@@ -113,10 +113,11 @@ class Beam:
         low = np.array([0.0, self.offset * hy])
         body = mpm.box(grid, low, low + self.size, per_cell=self.per_cell)
         middle = low + np.array([0, height / 2])
-        clamp: dict = {"walls": {"left": "xy"}}
+        physics = self.physics()
+        acting, walls = physics.pop("conditions"), {"left": "xy"}
         if self.angle:
-            clamp = {"walls": {}, "displacements": [mpm.Displacement("left", (0, 0))]}
-        s = mpm.Simulation(grid, [body], [self.material], **clamp, **self.physics())
+            acting, walls = [*acting, mpm.Displacement("left", (0, 0))], {}
+        s = mpm.Simulation(grid, [body], [self.material], walls=walls, conditions=acting, **physics)
         place(s, turned(s.points.corners - middle, self.angle) + middle)
         probes = mpm.probes([body], [middle + np.array([length, 0])])
         return Scene(s, self.end, self.steps, lambda s, r: off(turned(tip(r), -self.angle), self.elements()), probes)
@@ -148,7 +149,13 @@ def column(error: Error | None, *layers, h=0.05, end=1.0, steps=1, per_cell=2, l
         ]
         walls = {"left": "x", "right": "x", "bottom": "y"}
         loads = [mpm.Traction("top", (0, -load), region=([-inf, tops[-1]], [inf, inf]))]
-        s = mpm.Simulation(grid, bodies, [m for m, _ in layers], walls=walls, tractions=loads, **physics)
+        s = mpm.Simulation(
+            grid,
+            bodies,
+            [m for m, _ in layers],
+            walls=walls,
+            **physics | {"conditions": [*loads, *physics.get("conditions", [])]},
+        )
         return Scene(s, end, steps, error, mpm.probes(bodies, [[h / 2, tops[-1]]]))
 
     return make
@@ -167,8 +174,15 @@ def square(angle: float, error: Error | None, cells: int = 12, end=1.0, steps=4,
         body = mpm.box(grid, [0, 0], [0.6, 0.6])
         inward = {"left": (1, 0), "right": (-1, 0), "bottom": (0, 1), "top": (0, -1)}
         loads = [mpm.Traction(side, turned(1e5 * np.array(n), angle)) for side, n in inward.items()]
-        water = {"fluid": fluid, "drained": [mpm.Drained(side) for side in drained]} if fluid else {}
-        s = mpm.Simulation(grid, [body], [SOIL], walls={"left": "x", "bottom": "y"}, tractions=loads, **water)
+        water = {"fluid": fluid, "conditions": [*(mpm.Drained(side) for side in drained)]} if fluid else {}
+        s = mpm.Simulation(
+            grid,
+            [body],
+            [SOIL],
+            walls={"left": "x", "bottom": "y"},
+            conditions=[*loads, *water.pop("conditions", [])],
+            **water,
+        )
         corners = turned(s.points.corners, angle)
         place(s, corners - corners.min(axis=(0, 1)))
         return Scene(s, end, steps, error)

@@ -32,7 +32,7 @@ from mpm_dolfinx.simulation.simulation import Simulation
 from mpm_dolfinx.stepping.result import Result, Row
 from mpm_dolfinx.stepping.state import State, Stay
 
-FORMAT, VERSION = "mpm_dolfinx checkpoint", 10
+FORMAT, VERSION = "mpm_dolfinx checkpoint", 10  # Source: the format of the files
 FOREIGN = "no checkpoint of mpm_dolfinx, must be one"
 ZIP = b"PK\3\4"  # how numpy's archives begin
 PIECES = ("id", "pressure", "x", "start")  # of a Stay

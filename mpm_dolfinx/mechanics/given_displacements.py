@@ -13,6 +13,7 @@ import ufl
 from dolfinx import fem
 from numpy.typing import NDArray
 
+from mpm_dolfinx.base.tolerances import EPSILON, NEAR
 from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.bodies.faces import Surface, face_vectors
 from mpm_dolfinx.conditions.acting import Acting, At, Loads, Place, Setting
@@ -21,7 +22,7 @@ from mpm_dolfinx.conditions.sides import check_apart, everywhere, gathered, meet
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointForm
 from mpm_dolfinx.grid.grid import Grid, sum_by
-from mpm_dolfinx.mechanics.held_cells import SAME, HeldCells, HeldPoints
+from mpm_dolfinx.mechanics.held_cells import HeldCells, HeldPoints
 from mpm_dolfinx.mechanics.rigid_motion import rigid_motion, turned
 from mpm_dolfinx.parallel.exchange import first, over_all
 from mpm_dolfinx.parallel.messages import warn
@@ -145,7 +146,7 @@ class GivenDisplacements(Acting):
         """Refuse given displacements that differ where they meet: no body's stress is finite there."""
         for one, other, axes, X in self._meeting:
             jump = np.abs(self._given(one, t, X) - self._given(other, t, X))[:, axes].max(axis=1)
-            if jump.max(initial=0.0) > SAME * self._grid.h.min():
+            if jump.max(initial=0.0) > NEAR * self._grid.h.min():
                 what = f"{line(one)} and {line(other)}: differ by {jump.max():.3g} m at t = {t:g} s where they meet"
                 raise ValueError(f"{what}, at {X[jump.argmax()]}; must agree there, or leave two cells between them")
 
@@ -287,7 +288,7 @@ class HoldLoads(Loads):
         grid = self.data.points.grid
         held = np.zeros(grid.num_local)
         np.maximum.at(held, self.data.cells, self.data["stiffness"][:, 0])
-        return of_cells + 1e-15 * grid.reach * held
+        return of_cells + 4 * EPSILON * grid.reach * held
 
     def outcome(self, at: At) -> dict[str, dict[str, NDArray[np.float64]]]:
         """Return the reactions."""

@@ -15,6 +15,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from mpm_dolfinx.base.tolerances import NEAR
 from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.bodies.faces import Surface
 from mpm_dolfinx.conditions.acting import Acting, Loads, Place, Setting
@@ -127,11 +128,11 @@ def _check_flat(plate: RigidPlate, faces: Surface) -> None:
     low, high, height = corners.min(axis=1)[:, tangential], corners.max(axis=1)[:, tangential], corners[..., axis]
     X, extent = (low + high) / 2, high - low
     size = extent.max(axis=0)
-    apart = np.flatnonzero(np.abs(height - height[0, 0]).max(axis=1) > 1e-6 * size.min())
+    apart = np.flatnonzero(np.abs(height - height[0, 0]).max(axis=1) > NEAR * size.min())
     if not len(apart):
-        pairs = cKDTree(X / size).query_pairs(1 + 1e-6, p=np.inf, output_type="ndarray")
+        pairs = cKDTree(X / size).query_pairs(1 + NEAR, p=np.inf, output_type="ndarray")
         i, j = pairs.T
-        pairs = pairs[(np.abs(X[i] - X[j]) <= (extent[i] + extent[j]) / 2 + 1e-6 * size).all(axis=1)]
+        pairs = pairs[(np.abs(X[i] - X[j]) <= (extent[i] + extent[j]) / 2 + NEAR * size).all(axis=1)]
         graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(X), len(X)))
         _, part = connected_components(graph, directed=False)
         apart = np.flatnonzero(part != part[0])

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from dolfinx.common import Timer
@@ -17,7 +17,16 @@ from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.faces import Surface
 from mpm_dolfinx.conditions.acting import QUANTITIES, Acting, Loads, Outcome, Place, Setting
 from mpm_dolfinx.conditions.axis import with_axis
-from mpm_dolfinx.conditions.conditions import Displacement, Drained, Inflow, Pressure, RigidPlate, Traction
+from mpm_dolfinx.conditions.conditions import (
+    Displacement,
+    Drained,
+    Inflow,
+    OnSide,
+    Pressure,
+    RigidPlate,
+    Source,
+    Traction,
+)
 from mpm_dolfinx.conditions.names import named
 from mpm_dolfinx.conditions.sides import Sides
 from mpm_dolfinx.conditions.unit_weights import weighed
@@ -35,30 +44,38 @@ from mpm_dolfinx.mechanics.plates import Plates
 from mpm_dolfinx.mechanics.pressures import Pressures
 from mpm_dolfinx.mechanics.tractions import Tractions
 
-CONDITIONS = {
-    "tractions": (Traction, Pressure),
-    "displacements": Displacement,
-    "drained": Drained,
-    "inflows": Inflow,
-    "plates": RigidPlate,
-    "tools": Tool,
-    "contacts": Contact,
-}
-"""Lists in which conditions are given, and what may stand in them beside conditions of the user's own."""
+Condition = Traction | Pressure | Displacement | RigidPlate | Drained | Inflow | Tool | Contact
+"""What acts on the bodies."""
 KINDS: tuple[type[Acting], ...] = (Tractions, Pressures, Plates, GivenDisplacements, ToolsOfStage, ContactsOfStage)
-"""What acts for conditions that do not say it themselves, by their method `acting`."""
+"""What acts on the momentum for conditions that do not say it themselves, by their method `acting`."""
+
+
+def checked(conditions: Sequence[Condition]) -> Sequence[Condition]:
+    """Return conditions; ValueError where one is none."""
+    if isinstance(conditions, Sequence) and any(isinstance(one, (OnSide, Source)) for one in conditions):
+        raise ValueError("conditions: OnSide and Source are terms, must be given as terms=")
+    if isinstance(conditions, Sequence) and not isinstance(conditions, (str, bytes)):
+        all_of("conditions", [one for one in conditions if not hasattr(one, "acting")], get_args(Condition))
+    else:
+        all_of("conditions", conditions, get_args(Condition))
+    if len({id(one) for one in conditions}) < len(conditions):
+        twice = next(one for i, one in enumerate(conditions) if any(one is other for other in conditions[:i]))
+        raise ValueError(f"conditions: {line(twice)} is given twice, must be given once")
+    return conditions
 
 
 @dataclass(frozen=True, eq=False)
 class Stage:
     """The conditions in force.
 
-    conditions: as they were given, by lists, the axis among the walls; present: which bodies are there; later:
-    those that may still come; free: (nodes, d), components that no wall holds; axisymmetric: as the grid; lattices: of
-    the bodies that are there; materials: of the scene; named: all conditions on the bodies, by their names; acting:
-    what they do to the momentum; hydraulic: to the storage of the fluid.
+    given: the conditions by their names, as they were given; named: the same, with water as heavy as the pore fluid;
+    conditions: walls, the axis among them, and gravity; present: which bodies are there; later: those that may still
+    come; free: (nodes, d), components that no wall holds; axisymmetric: as the grid; lattices: of the bodies that are
+    there; materials: of the scene; acting: what the conditions do to the momentum; hydraulic: to the storage of fluid.
     """
 
+    given: Mapping[str, Condition]
+    named: Mapping[str, Condition]
     conditions: Mapping[str, Any]
     present: tuple[bool, ...]
     later: tuple[int, ...]
@@ -66,7 +83,6 @@ class Stage:
     axisymmetric: bool
     lattices: Sequence[Lattice]
     materials: SceneMaterials
-    named: Mapping[str, Any]
     acting: tuple[Acting, ...]
     hydraulic: HydraulicBoundary
 
@@ -107,8 +123,8 @@ class Stage:
 
     def same(self, before: Stage) -> set[str]:
         """Return the names of conditions that there were in the stage before, or that had the name given to them."""
-        shared = ((name, one) for name, one in self.named.items() if name in before.named)
-        return {name for name, one in shared if one is before.named[name] or getattr(one, "name", None) == name}
+        shared = ((name, one) for name, one in self.given.items() if name in before.given)
+        return {name for name, one in shared if one is before.given[name] or getattr(one, "name", None) == name}
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
         """Return an outcome of this value, where no step has been taken."""
@@ -123,7 +139,7 @@ class Stage:
 
     def begun(self, before: Stage, outcome: Outcome, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
         """Return the outcome as the stage begins after another: of this value for what is new in it."""
-        same = {name for name, one in self.named.items() if before.named.get(name) is one}
+        same = {name for name, one in self.given.items() if before.given.get(name) is one}
         if self.conditions["walls"] == before.conditions["walls"]:
             same |= SIDES[self.free.shape[1]].keys()
         return {
@@ -162,7 +178,7 @@ def stage(
     momentum
         Forms, and what acts in all stages.
     conditions
-        walls, gravity, and the lists of `CONDITIONS`: see `Simulation`.
+        walls, conditions, gravity: see `Simulation`.
     present, later
         Which bodies are there, and which may still come.
 
@@ -171,9 +187,9 @@ def stage(
     ValueError
         Naming the condition, its value and what is allowed.
     """
-    for name, kind in CONDITIONS.items():
-        all_of(name, [one for one in conditions[name] if not hasattr(one, "acting")], kind)
-    if fluid is None and (conditions["drained"] or conditions["inflows"]):
+    given_by_name = named(checked(conditions["conditions"]))
+    by_name = {name: _weighed(one, fluid) for name, one in given_by_name.items()}
+    if fluid is None and any(isinstance(one, (Drained, Inflow)) for one in by_name.values()):
         raise ValueError("drained and inflow sides need a fluid")
     gravity = conditions["gravity"]
     if callable(gravity):
@@ -184,27 +200,31 @@ def stage(
         raise ValueError("bodies: none is there, must be at least one")
     walls = with_axis(grid, conditions["walls"])
     free = ~_held(grid, walls)
-    own = {name: tuple(values) for name, values in conditions.items() if name not in ("walls", "gravity")}
-    for name, value in (("tractions", "value"), ("drained", "pressure")):
-        own[name] = tuple(_weighed(one, value, fluid) for one in own[name])
-    conditions = {**own, "walls": dict(walls), "gravity": gravity}  # nobody changes what a stage was given
     sides = Sides(grid, bodies, present)
-    by_name = named([one for name in CONDITIONS for one in conditions[name]])
     setting = Setting(sides, free, materials, momentum.conditions, by_name)
     found = [(kind, setting.of(*kind.conditions)) for kind in KINDS]
     acting = [one.acting(setting) for one in (*momentum.acting, *by_name.values()) if hasattr(one, "acting")]
     acting += [kind(setting, mine) for kind, mine in found if mine]
-    hydraulic = HydraulicBoundary(sides, setting.of(Drained, Inflow))
     lattice = lattices(bodies, present, [(faces, axes) for one in acting for _, faces, axes in one.held])
-    what = (conditions, tuple(present), tuple(later), free, grid.axisymmetric, lattice, materials)
-    return Stage(*what, by_name, tuple(acting), hydraulic)
+    return Stage(
+        given=given_by_name,
+        named=by_name,
+        conditions={"walls": dict(walls), "gravity": gravity},  # nobody changes what a stage was given
+        present=tuple(present),
+        later=tuple(later),
+        free=free,
+        axisymmetric=grid.axisymmetric,
+        lattices=lattice,
+        materials=materials,
+        acting=tuple(acting),
+        hydraulic=HydraulicBoundary(sides, setting.of(Drained, Inflow)),
+    )
 
 
-def _weighed(condition: Any, name: str, fluid: Fluid | None) -> Any:
+def _weighed(condition: Condition, fluid: Fluid | None) -> Condition:
     """Return a condition whose pressure of water has a unit weight, see `weighed`."""
-    given = getattr(condition, name, None)
-    value = weighed(given, fluid)
-    return condition if value is given else replace(condition, **{name: value})
+    name = {Drained: "pressure", Pressure: "value", Traction: "value"}.get(type(condition))
+    return condition if name is None else replace(condition, **{name: weighed(getattr(condition, name), fluid)})
 
 
 def _gravity(value: ArrayLike, name: str, dim: int, axisymmetric: bool) -> NDArray[np.float64]:

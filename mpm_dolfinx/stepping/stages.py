@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mpm_dolfinx.base.tolerances import SAME
 from mpm_dolfinx.base.validation import chosen, flag, instance, line, numbers
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.faces import surface
@@ -19,14 +20,17 @@ from mpm_dolfinx.conditions.conditions import Drained, Pressure, Traction
 from mpm_dolfinx.conditions.sides import everywhere
 from mpm_dolfinx.conditions.unit_weights import WEIGHS, warn_units
 from mpm_dolfinx.contact.cell_contact import gripped, let_go
+from mpm_dolfinx.contact.groups import Contact
 from mpm_dolfinx.domains.pressure_transport import at_start
 from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.parallel.messages import warn
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.stepping.initial_state import pieces_at_start
 from mpm_dolfinx.stepping.scene import Scene
-from mpm_dolfinx.stepping.stage import CONDITIONS, Stage, stage
+from mpm_dolfinx.stepping.stage import Condition, Stage, checked, stage
 from mpm_dolfinx.stepping.state import State
+
+LEVELS = (Traction, Pressure, Drained)  # which may be water
 
 
 def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int]) -> State:
@@ -42,8 +46,13 @@ def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int
     transported = None
     if scene.fluid:
         transported = pieces_at_start(scene, points) if callable(scene.initial.pressure) else at_start(points)
-    outcome = begun.unknown(np.nan if scene.initial.given else 0.0)
-    return State(0.0, _gripped(scene, begun, points), transported, None, 0, outcome, begun, True, *[None] * 4)
+    return State(
+        t=0.0,
+        points=_gripped(scene, begun, points),
+        transported=transported,
+        outcome=begun.unknown(np.nan if scene.initial.given else 0.0),
+        stage=begun,
+    )
 
 
 def begin_stage(
@@ -64,11 +73,13 @@ def begin_stage(
     flag("stage: reset_displacement", reset_displacement)
     present = [(here and body not in remove) or body in add for body, here in enumerate(before.present)]
     later = [body for body in before.later if body not in add]
-    begun = _stage(scene, {**before.conditions, **named}, present, later)
-    if named.keys() & {"gravity", "tractions", "drained"}:
+    conditions = _with_contacts(before, named.get("conditions", tuple(before.given.values())))
+    begun = _stage(scene, {**before.conditions, **named, "conditions": conditions}, present, later)
+    was, now = ([one for one in of.given.values() if isinstance(one, LEVELS)] for of in (before, begun))
+    if "gravity" in named or was != now:
         _warn_weights(scene, begun, {})
     if remove:
-        _warn_moved_on(scene, before, begun, [name for name in CONDITIONS if name not in {*named, "tools", "contacts"}])
+        _warn_moved_on(scene, before, begun)
     if state.stays:  # pressures are those of the cells
         state = scene.motion.left_grid(state, scene.on_grid(state.stay.points))
     state = replace(state, stay=None)
@@ -110,6 +121,14 @@ def _holds_as(begun: Stage, before: Stage) -> bool:
     )
 
 
+def _with_contacts(before: Stage, conditions: Sequence[Condition]) -> list[Condition]:
+    """Return conditions with the scene's contacts, which no stage changes."""
+    there, given = [*before.of(Contact).values()], [one for one in checked(conditions) if isinstance(one, Contact)]
+    if given and given != there:
+        raise ValueError(f"stage: conditions: {line(given[0])}, contacts must be those of the scene, or left out")
+    return [*conditions, *(() if given else there)]
+
+
 def _stage(scene: Scene, conditions: Mapping[str, Any], present: Sequence[bool], later: Sequence[int]) -> Stage:
     return stage(scene.grid, scene.bodies, scene.materials, scene.fluid, scene.momentum, conditions, present, later)
 
@@ -136,18 +155,20 @@ def _warn_weights(scene: Scene, begun: Stage, given: Mapping[str, Any]) -> None:
             warn(scene.grid.comm, f"{what}: at one level they are not at rest", name, weight, of, own)
 
 
-def _warn_moved_on(scene: Scene, before: Stage, begun: Stage, kept: Sequence[str]) -> None:
-    """Log a warning for each condition that was not given anew and acts on what an excavation has laid bare."""
+def _warn_moved_on(scene: Scene, before: Stage, begun: Stage) -> None:
+    """Log a warning for each condition that stays as it was and acts on what an excavation has laid bare."""
     stop = np.cumsum([len(body) for body in scene.bodies])
-    for condition in (one for name in kept for one in begun.conditions[name] if hasattr(one, "side")):
+    for name, condition in begun.given.items():
+        if not hasattr(condition, "side") or before.given.get(name) is not condition:
+            continue
         where = condition.side, getattr(condition, "region", None)
         was, now = (surface(scene.bodies, *where, s.present) for s in (before, begun))
         bare = sum_by(now.id, now.area0, stop[-1]) - sum_by(was.id, was.area0, stop[-1])
         here = np.repeat(before.present, [len(body) for body in scene.bodies])
-        new = np.flatnonzero(here[now.id] & (bare[now.id] > 1e-9 * now.whole0))
+        new = np.flatnonzero(here[now.id] & (bare[now.id] > SAME * now.whole0))
         if len(new):
             area = bare[np.unique(now.id[new])].sum()
-            what = "stage: remove: %s was not given anew and now also acts on %.3g m^%d that were laid bare, from %s on"
+            what = "stage: remove: %s stays as it was and now also acts on %.3g m^%d that were laid bare, from %s on"
             warn(scene.grid.comm, what, line(condition), area, scene.grid.dim - 1, now.X[new[0]].mean(axis=0))
 
 

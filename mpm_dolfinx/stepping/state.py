@@ -79,7 +79,7 @@ class Stay:
         return Stay(points, *(values[order] for values in rows), keeps)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class State:
     """All that a scene remembers between two steps.  A step makes a new one; nobody changes one.
 
@@ -122,15 +122,15 @@ class State:
     t: float
     points: MaterialPoints
     transported: PiecePressures | None
-    stay: Stay | None
-    resets: int
+    stay: Stay | None = None
+    resets: int = 0
     outcome: Outcome
     stage: Stage
-    begins: bool
-    velocity: NDArray[np.float64] | None
-    held: NDArray[np.float64] | None
-    rest: NDArray[np.float64] | None
-    result: Result | None
+    begins: bool = True
+    velocity: NDArray[np.float64] | None = None
+    held: NDArray[np.float64] | None = None
+    rest: NDArray[np.float64] | None = None
+    result: Result | None = None
 
     def __post_init__(self):
         _freeze(vars(self))

@@ -38,10 +38,11 @@ from mpm_dolfinx.base import _compat
 from mpm_dolfinx.base.errors import NotConverged
 from mpm_dolfinx.base.fluid_content import change_of_content, mass_potential, mass_potential_form
 from mpm_dolfinx.base.report import Report
+from mpm_dolfinx.base.tolerances import NEAR, ROUND_OFF, SAME, TINY
 from mpm_dolfinx.base.validation import all_of, functions, line, numbers
 from mpm_dolfinx.bodies.faces import Region, limits
 from mpm_dolfinx.conditions.axis import with_axis
-from mpm_dolfinx.conditions.conditions import RIGIDITY, Drained, Pressure, RigidPlate, Traction
+from mpm_dolfinx.conditions.conditions import RIGIDITY, Drained, Pressure, RigidPlate, Source, Traction, sorted_terms
 from mpm_dolfinx.forms.axes import block
 from mpm_dolfinx.forms.point_forms import PointMeasure
 from mpm_dolfinx.grid.grid import TURN, Grid, side
@@ -104,12 +105,14 @@ class BiotFEM:
         Skeleton without state, and pore fluid, whose pressure is zero at the start.
     walls
         Sides with the components that are zero there, such as {"left": "xy"}.
-    tractions, drained, plates
-        Conditions on sides, nodal pressures on whole facets of a region; other sides are free and sealed.
+    conditions
+        `Traction`, `Pressure`, `RigidPlate` and `Drained` on sides, nodal pressures on whole facets of a region; other
+        sides are free and sealed.
     gravity : callable t -> (d,), m/s^2
         Acceleration of gravity, without fluid only.
-    terms, sources
-        The user's, as those of `Simulation`: see `user_functions`.  q is a test function of the pressure's elements.
+    terms
+        The user's, as those of `Simulation`, none on sides: see `user_functions`, `Source`.
+        q is a test function of the pressure's elements.
     element
         "taylor-hood": Q2 displacement, Q1 pressure; "q1-dg0": Q1, constant in the cells with two-point fluxes.
     method
@@ -128,13 +131,10 @@ class BiotFEM:
         material: Skeleton,
         *,
         walls: Mapping[str, str],
+        conditions: Sequence[Traction | Pressure | RigidPlate | Drained] = (),
         fluid: Fluid | None = None,
-        tractions: Sequence[Traction | Pressure] = (),
-        drained: Sequence[Drained] = (),
-        plates: Sequence[RigidPlate] = (),
         gravity: Callable[[float], ArrayLike] | None = None,
-        terms: Sequence[Callable] = (),
-        sources: Sequence[Callable] = (),
+        terms: Sequence[Callable | Source] = (),
         element: str = "taylor-hood",
         comm: MPI.Intracomm = MPI.COMM_WORLD,
         tolerance: float = 1e-8,
@@ -146,6 +146,11 @@ class BiotFEM:
         numbers("tolerance", tolerance, test=lambda v: (0 < v) & (v < 1), allowed="in (0, 1)")
         if element not in ELEMENTS:
             raise ValueError(f"element {element!r}: must be one of {', '.join(ELEMENTS)}")
+        all_of("conditions", conditions, (Traction, Pressure, RigidPlate, Drained))
+        tractions = [one for one in conditions if isinstance(one, (Traction, Pressure))]
+        plates = [one for one in conditions if isinstance(one, RigidPlate)]
+        drained = [one for one in conditions if isinstance(one, Drained)]
+        terms, sources = sorted_terms(terms)
         functions("terms", terms)
         functions("sources", sources)
         if fluid is None and (drained or sources):
@@ -210,7 +215,7 @@ class BiotFEM:
         for f in (at, centre):
             f.interpolate(lambda x: x[:d])
         middle.interpolate(centre)
-        x = (middle.x.array + (1 - 1e-9) * (at.x.array - middle.x.array)).reshape(-1, d)
+        x = (middle.x.array + (1 - SAME) * (at.x.array - middle.x.array)).reshape(-1, d)
         rows = np.asarray(value(x + self.grid.base), float)
         f = fem.Function(_compat.function_space(msh, "DG", 2, rows.shape[1:]))
         f.x.array[:] = rows.ravel()
@@ -220,7 +225,7 @@ class BiotFEM:
         """Return the corners of a flat box around a side, or around the part of it in a region."""
         grid, (axis, end) = self.grid, side(name, self.grid.dim)
         low, high = limits(region, grid.dim) - grid.base
-        plane, near = (grid.low, grid.high)[end][axis], 1e-6 * grid.h
+        plane, near = (grid.low, grid.high)[end][axis], NEAR * grid.h
         low, high = np.maximum(low, grid.low) - near, np.minimum(high, grid.high) + near
         if not (low[axis] <= plane <= high[axis] and (low < high).all()):
             raise ValueError(f"side {name!r}: the region {line(region)} must have a part of it")
@@ -362,7 +367,7 @@ class BiotFEM:
         stretch = J * ufl.inner(pull * normal, pull * normal)
         across = sum(abs(normal[a]) * h[a] for a in range(self.grid.dim))
         dS = ufl.dS(domain=self.grid.mesh, metadata={"quadrature_degree": 2})
-        harmonic = 2 * kappa("+") * kappa("-") / (kappa("+") + kappa("-") + 1e-300)
+        harmonic = 2 * kappa("+") * kappa("-") / (kappa("+") + kappa("-") + TINY)
         around = self._around("+") if self.grid.axisymmetric else 1.0
         flux = around * harmonic * ufl.avg(stretch) / across("+") * ufl.jump(p) * ufl.jump(q) * dS
         for o in outlets:
@@ -446,7 +451,7 @@ class BiotFEM:
             space.f.x.array[:] += space.b.x.array
         x = _compat.petsc_vec(self._space.w).copy()
         petsc.set_bc(x, self._bcs)
-        round_off = 1e-14 * self.grid.cell_volume / self.grid.h.min() * np.sqrt(x.getSize())
+        round_off = ROUND_OFF * self.grid.cell_volume / self.grid.h.min() * np.sqrt(x.getSize())
         snes.setTolerances(self.tolerance, max(self.tolerance * load, round_off), 0.0)
         snes.solve(None, x)
         norms, _ = snes.getConvergenceHistory()
@@ -488,7 +493,7 @@ class BiotFEM:
             Show a progress bar on a terminal.
         """
         steps = round((t_end - self.t) / dt) if dt > 0 else 0
-        if steps < 1 or abs(steps * dt - (t_end - self.t)) > 1e-6 * dt:
+        if steps < 1 or abs(steps * dt - (t_end - self.t)) > NEAR * dt:
             raise ValueError(f"dt = {dt!r}, t_end = {t_end!r}: dt must divide the {t_end - self.t:g} s left")
         x = positions(probes, self.grid.dim)
         out = np.flatnonzero(self.grid.outside(x - self.grid.base))
