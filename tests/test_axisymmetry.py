@@ -491,7 +491,11 @@ def scene(**options):
         (lambda: scene(walls={}).step(1.0), "walls", "1 of 1"),
         (lambda: scene(terms=[mpm.OnSide("left", lambda points, v: points.value(v)[0] * points.dx)]), "OnSide", "axis"),
         (lambda: scene(conditions=[mpm.Tool(mpm.Ball((0, 2), 0.5), (0.1, 0))]), "Tool", "[0.1 0. ]"),
-        (lambda: scene(conditions=[mpm.Tool(mpm.Ball((0, 2), 0.5), rotation=lambda t: t)]).step(1.0), "Tool", "turns"),
+        (
+            lambda: scene(conditions=[mpm.Tool(mpm.Ball((0, 2), 0.5), rotation_rad=lambda t: t)]).step(1.0),
+            "Tool",
+            "turns",
+        ),
     ],
 )
 def test_what_axisymmetry_does_not_allow_is_refused_in_one_line(make, name, value):

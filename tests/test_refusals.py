@@ -24,8 +24,9 @@ def two(**options):
 
 
 def wet(law=None, **options):
-    drained = {"fluid": WATER, "conditions": [mpm.Drained("top")]}
-    return scene(materials=[soil(conductivity=1e-4, conductivity_law=law)], **{**drained, **LOAD, **options})
+    conditions = [mpm.Drained("top"), *options.pop("conditions", LOAD["conditions"])]
+    soils = [soil(conductivity=1e-4, conductivity_law=law)]
+    return scene(materials=soils, fluid=WATER, conditions=conditions, **options)
 
 
 def bad(*values):

@@ -208,8 +208,9 @@ def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulat
             raise ValueError(f"has forces of {len(forces)} tools")
         if ways.shape != now.tool_travel.shape or not np.isfinite(ways).all():
             raise ValueError(f"has ways of {len(ways)} tools, or not finite")
-        start = note["t"], points, transported, stay, note["resets"], *acting, None, note["begins"]
-        return State(*start, *nodal, result)
+        told = dict(zip((*ACTING, *NODAL), (*acting, *nodal), strict=True)) | {"stage": None, "result": result}
+        reset = {"stay": stay, "resets": note["resets"], "begins": note["begins"]}
+        return State(t=note["t"], points=points, transported=transported, **reset, **told)
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         raise ValueError(f"{damaged} ({line(error)}), must be a whole checkpoint") from error
 
