@@ -484,7 +484,7 @@ def scene(**options):
         (lambda: mpm.Grid([0, 0, 0], [1, 1, 1], [2, 2, 2], axisymmetric=True), "axisymmetric", "3"),
         (lambda: mpm.Grid([-0.5, 0], [1, 1], [2, 2], axisymmetric=True), "axisymmetric", "-0.5"),
         (lambda: mpm.Grid([0, 0], [1, 1], [2, 2], axisymmetric=1), "axisymmetric", "1"),
-        (lambda: scene(quadrature="point"), "quadrature", "point"),
+        (lambda: scene(numerics=mpm.Numerics(quadrature="point")), "quadrature", "point"),
         (lambda: scene(gravity=(1, -9.81)), "gravity", "1"),
         (lambda: scene(gravity=lambda t: (t, 0)).step(1.0), "gravity", "1"),
         (lambda: scene(conditions=[mpm.Traction("left", (1, 0))]), "Traction", "axis"),
