@@ -2,13 +2,14 @@
 """Run a saturated block in 3D, solved by iterations, on however many processes there are; write its state."""
 
 import sys
+from dataclasses import replace
 
 import numpy as np
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.solve import linear as solvers
+from mpm_dolfinx.solve import plan
 
-solvers.ITERATIVE = 0
+plan.THRESHOLDS = replace(plan.THRESHOLDS, multigrid_3d=0)
 grid = mpm.Grid([0] * 3, [1.2] * 3, [6] * 3)
 block = mpm.box(grid, [0.2, 0.2, 0], [0.9, 0.93, 0.77])
 soil = mpm.Hencky(bulk=4e6 / 3, shear=1e6, conductivity=1e-7)

@@ -20,13 +20,12 @@ import mpi_restart
 import numpy as np
 import pytest
 import restart_run
-from helpers import beam, column, limit
+from helpers import beam, column, limit, thresholds
 from test_mpi import mpirun
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.io import checkpoint as restart
 from mpm_dolfinx.io.writer import Series
-from mpm_dolfinx.solve import linear as solvers
 
 
 def cut_beam():
@@ -109,7 +108,7 @@ def test_resumed_after_any_step_the_end_is_the_same_to_the_last_bit(scene, tmp_p
 
 @pytest.mark.parametrize("fluid", [None, mpm.Fluid()], ids=["dry", "wet"])
 def test_resumed_runs_end_with_the_same_bits_by_multigrid_too(fluid, tmp_path, monkeypatch):
-    monkeypatch.setattr(solvers, "ITERATIVE", 50)
+    thresholds(monkeypatch, multigrid_3d=50)
     test_resumed_after_any_step_the_end_is_the_same_to_the_last_bit(lambda: block(fluid), tmp_path)
 
 

@@ -14,7 +14,7 @@ LINEAR = mpm.LinearElastic(bulk=1e7 / 3, shear=5e6, conductivity=1e-4)
 SEALED = mpm.Hencky(bulk=1e7 / 3, shear=5e6)
 STIFF = mpm.NeoHookean(bulk=1e9, shear=5e6)
 
-ALWAYS = {"stress"}
+ALWAYS = {"stress", "linear solvers"}
 FLUID = {"pore pressure", "coupling"}
 SCENES = {
     "drained beam": (lambda: beam(fluid=False, load=1e3, offset=0.1)[0], {"tractions", "ghost penalty"}),

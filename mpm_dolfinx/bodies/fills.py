@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array, diags
 
+from mpm_dolfinx.base.tolerances import SAME
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.touching import Cover, Faces, covered, covers, local, meeting, warn_near, weights
 from mpm_dolfinx.grid.grid import REACH, Grid
@@ -53,7 +54,7 @@ class Contact:
         """Return which corners (n, 4) of the fill's faces lie on the paired one, and its way there (n, 4, d), m."""
         face, by = self.cover.face, self.cover.by
         s, _ = local(self.other.corners[by], self.own.corners[face], self.other.outward[by])
-        on = np.abs(s - 0.5).max(axis=2) <= 0.5 + np.maximum(self.cover.slack, 1e-9)[:, None]
+        on = np.abs(s - 0.5).max(axis=2) <= 0.5 + np.maximum(self.cover.slack, SAME)[:, None]
         return on, weights(np.clip(s, 0, 1).reshape(-1, 2)).reshape(*s.shape[:2], 4) @ self.moved
 
     def misfit(self, u: NDArray[np.float64]) -> float:
@@ -157,7 +158,7 @@ def _follow(grid: Grid, body: Body, corners: NDArray[np.float64], contacts: Sequ
         sides[contact.side] = sides.get(contact.side, 0.0) + contact.area()
     axis, end = max(sides, key=sides.get)
     opposite = Faces.of(body, *body.facing(axis, 1 - end, UPRIGHT))
-    fixed = np.minimum(np.abs(x - grid.low), np.abs(x - grid.high)) < 1e-9 * grid.h  # along a wall it only slides
+    fixed = np.minimum(np.abs(x - grid.low), np.abs(x - grid.high)) < SAME * grid.h  # along a wall it only slides
     fixed[hits > 0] = True
     fixed[node[opposite.row[:, None], opposite.index]] = True
     K = _springs(body, node, len(nodes))

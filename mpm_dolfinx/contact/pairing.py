@@ -19,6 +19,7 @@ from scipy.spatial import cKDTree
 
 from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.base.errors import NotConverged
+from mpm_dolfinx.base.tolerances import NEAR as UNDER
 from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.faces import Surface, surface
@@ -29,7 +30,6 @@ from mpm_dolfinx.contact.body_contact import BodyContact, Following, PairRows
 from mpm_dolfinx.contact.cell_contact import LEAST, kept, pressure_name, shear_name
 from mpm_dolfinx.contact.groups import Contact
 from mpm_dolfinx.contact.tool_placing import BEGINS, FACING
-from mpm_dolfinx.domains.cut_domains import DEPTH as UNDER
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.parallel.exchange import Exchange, first, over_all

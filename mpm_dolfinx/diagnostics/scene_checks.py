@@ -10,6 +10,7 @@ from mpi4py import MPI
 import numpy as np
 from numpy.typing import NDArray
 
+from mpm_dolfinx.base.tolerances import NEAR
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.parallel.exchange import Exchange
 from mpm_dolfinx.points.parts import parts_of_cells
@@ -72,7 +73,7 @@ def check_held(
         on = held[against]
         grams = [R[on & (number == k)].T @ R[on & (number == k)] for k in range(1, count + 1)]
         grams, before = grid.comm.allreduce(np.stack(grams)), missing
-        ranks = [np.linalg.matrix_rank(gram, tol=1e-12 * max(1.0, np.abs(gram).max())) for gram in grams]
+        ranks = [np.linalg.matrix_rank(gram, tol=NEAR**2 * max(1.0, np.abs(gram).max())) for gram in grams]
         missing = len(modes) - np.array(ranks)
         held[1:] = missing == 0
         if meeting is None or (missing == before).all():

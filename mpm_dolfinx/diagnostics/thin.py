@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from mpm_dolfinx.base.tolerances import SAME
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.touching import Faces, covered, covers
 from mpm_dolfinx.grid.grid import SIDES, Grid
@@ -50,7 +51,7 @@ def _bends(grid: Grid, bodies: Sequence[Body], i: int, axis: int, walls: Mapping
     for name in (name for name, (a, _) in SIDES[grid.dim].items() if a == axis):
         end = SIDES[grid.dim][name][1]
         wall = (grid.lower, grid.upper)[end][axis]
-        if "xyz"[axis] in walls.get(name, "") and np.abs(body.bounds[end][axis] - wall) < 1e-9 * grid.h[axis]:
+        if "xyz"[axis] in walls.get(name, "") and np.abs(body.bounds[end][axis] - wall) < SAME * grid.h[axis]:
             return False
         own = Faces.of(body, *body.facing(axis, end))
         others = (Faces.around(other) for other in bodies if other is not body)

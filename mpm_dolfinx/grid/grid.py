@@ -17,6 +17,7 @@ from dolfinx import fem
 from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.base import _compat
+from mpm_dolfinx.base.tolerances import EPSILON, NEAR, SAME
 from mpm_dolfinx.base.validation import flag, instance, line, numbers
 from mpm_dolfinx.grid.partition import destinations, owners
 
@@ -34,7 +35,7 @@ SHARED = frozenset(
 )
 """What of a grid is made with its mesh, see `Cells`."""
 TURN = 2 * np.pi
-"""The angle of the revolution that volumes, forces and outflows of axisymmetric scenes are of."""
+"""The angle of the revolution that volumes, forces and outflows of axisymmetric scenes are of.  Source: definition."""
 CHUNK = 2**14
 """Rows that are worked on at a time: no temporary holds one for each point of a large body."""
 MOST = 2**31 - 1
@@ -68,16 +69,17 @@ def among(numbers: NDArray[np.integer], chosen: NDArray[np.integer]) -> NDArray[
 
 def rounding(x: NDArray[np.float64]) -> float:
     """Return by how much coordinates of this size, m, may differ although they should be equal."""
-    return 8 * np.finfo(float).eps * float(np.abs(x).max(initial=0.0))
+    return 8 * EPSILON * float(np.abs(x).max(initial=0.0))
 
 
 class Cells:
     """The cells of a grid that this process has, ghosts included, as the mesh numbers them; complete when made.
 
     num_owned, num_local: number of cells without and with ghosts; cell_nodes (cells, 2^d): their nodes, numbered as
-    the Q1 degrees of freedom; node_x (nodes, d), midpoints (cells, d): places from the grid's base, m; signs (2^d, d):
-    on which side of the midpoint a node lies; cell_number (cells,): lexicographic numbers; locals: the way back, -1 where there is none;
-    owners: ranks of all cells, copy by copy; cell_facets (cells, 2d); facet_cells (facets, 2): -1 where there is none.
+    the Q1 degrees of freedom; node_x (nodes, d), midpoints (cells, d): places from the grid's base, m; signs
+    (2^d, d): on which side of the midpoint a node lies; cell_number (cells,): lexicographic numbers; locals: the way
+    back, -1 where there is none; owners: ranks of all cells, copy by copy; cell_facets (cells, 2d); facet_cells
+    (facets, 2): -1 where there is none.
     """
 
     def __init__(self, grid: Grid, mesh: Any, owners: NDArray[np.int32]):
@@ -288,7 +290,7 @@ class Grid:
     @property
     def has_axis(self) -> bool:
         """Whether its side "left" is the axis of revolution."""
-        return self.axisymmetric and bool(self.lower[0] <= 1e-9 * self.h[0])
+        return self.axisymmetric and bool(self.lower[0] <= SAME * self.h[0])
 
     def around(self, x: NDArray[np.float64]) -> NDArray[np.float64] | float:
         """Return by what measures in the plane at places (n, d), m, count: 2 pi r (n,), m, in axisymmetry, else 1."""
@@ -338,7 +340,7 @@ class Grid:
                 out[inside, axis, end] = self.locals[self.cell_number[cells[inside]] + (2 * end - 1) * stride]
         return out
 
-    def outside(self, x: NDArray[np.float64], tolerance: float = 1e-9) -> NDArray[np.bool_]:
+    def outside(self, x: NDArray[np.float64], tolerance: float = SAME) -> NDArray[np.bool_]:
         """Return which places, from the base, lie outside the grid by more than `tolerance` cells, and by rounding."""
         tolerance = tolerance + rounding(np.stack([self.lower, self.upper])) / self.h
         inside = np.ones(len(x), dtype=bool)
@@ -402,7 +404,7 @@ class Grid:
         """Return which nodes lie on a side of the box."""
         axis, end = side(name, self.dim)
         plane = (self.low, self.high)[end][axis]
-        return np.abs(self.node_x[:, axis] - plane) < 1e-6 * self.h[axis]
+        return np.abs(self.node_x[:, axis] - plane) < NEAR * self.h[axis]
 
 
 class GridOfGroups(Grid):

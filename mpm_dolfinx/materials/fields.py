@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.errors import NotConverged
+from mpm_dolfinx.base.tolerances import TINY
 from mpm_dolfinx.base.validation import numbers
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData
@@ -312,7 +313,7 @@ class SceneMaterials:
         modulus = self.table(points, lambda m: m.oedometric)
         if self.fluid is None:
             return modulus
-        fluid = self.table(points, lambda m: m.biot) ** 2 / np.maximum(self.storage(points), 1e-300)
+        fluid = self.table(points, lambda m: m.biot) ** 2 / np.maximum(self.storage(points), TINY)
         return modulus + np.minimum(fluid, STIFFEST * modulus)
 
     def state(self, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.base.errors import NotConverged
+from mpm_dolfinx.base.tolerances import SAME
 from mpm_dolfinx.base.validation import asked, line, numbers
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.overburden import overburden
@@ -26,7 +27,6 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 
 EXACT, CLOSE = 1e-13, 1e-8  # of the largest given stress: to which laws are solved, and have to be
 MOST = 30  # iterations
-DIFFERENCE = 1e-7  # of strains, for derivatives
 LARGEST = 0.2  # change of a strain in an iteration
 
 
@@ -161,7 +161,7 @@ class InitialStresses:
             allowed = f"three normal stresses or a symmetric tensor (3, 3), finite, for each of {n} places"
             value = numbers(name, asked(name, allowed, stress, points.x), (n, 3), (n, 3, 3), allowed=allowed)
             value = value if value.ndim == 3 else value[:, :, None] * np.eye(3)
-            wrong = np.abs(value - value.swapaxes(1, 2)).max(axis=(1, 2)) > 1e-9 * np.abs(value).max(initial=0)
+            wrong = np.abs(value - value.swapaxes(1, 2)).max(axis=(1, 2)) > SAME * np.abs(value).max(initial=0)
             if d == 2:
                 wrong |= (value[:, :2, 2] != 0).any(axis=1)
             if wrong.any():
@@ -302,7 +302,7 @@ class _Sought:
         count, free, (_, shear) = strain.shape[1], self.free, self.moduli()
         slopes = np.tile(np.eye(count) * (2 * shear)[:, None, None], (1, 1, 1))
         for k in range(count):
-            change = (self.off(strain + DIFFERENCE * np.eye(count)[k])[2] - missing) / DIFFERENCE
+            change = (self.off(strain + SAME * np.eye(count)[k])[2] - missing) / SAME
             slopes[:, :, k] = np.where(free & free[:, [k]], change, slopes[:, :, k])
         slopes, missing = (np.nan_to_num(values) for values in (slopes, missing))
         singular = ~(np.abs(np.linalg.det(slopes / shear[:, None, None])) > 1e-12)

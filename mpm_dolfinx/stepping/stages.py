@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mpm_dolfinx.base.tolerances import SAME
 from mpm_dolfinx.base.validation import chosen, flag, instance, line, numbers
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.faces import surface
@@ -160,7 +161,7 @@ def _warn_moved_on(scene: Scene, before: Stage, begun: Stage) -> None:
         was, now = (surface(scene.bodies, condition.side, condition.region, s.present) for s in (before, begun))
         bare = sum_by(now.id, now.area0, stop[-1]) - sum_by(was.id, was.area0, stop[-1])
         here = np.repeat(before.present, [len(body) for body in scene.bodies])
-        new = np.flatnonzero(here[now.id] & (bare[now.id] > 1e-9 * now.whole0))
+        new = np.flatnonzero(here[now.id] & (bare[now.id] > SAME * now.whole0))
         if len(new):
             area = bare[np.unique(now.id[new])].sum()
             what = "stage: remove: %s stays as it was and now also acts on %.3g m^%d that were laid bare, from %s on"

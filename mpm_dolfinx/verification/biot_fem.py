@@ -38,6 +38,7 @@ from mpm_dolfinx.base import _compat
 from mpm_dolfinx.base.errors import NotConverged
 from mpm_dolfinx.base.fluid_content import change_of_content, mass_potential, mass_potential_form
 from mpm_dolfinx.base.report import Report
+from mpm_dolfinx.base.tolerances import NEAR, ROUND_OFF, SAME, TINY
 from mpm_dolfinx.base.validation import all_of, functions, instance, line, numbers
 from mpm_dolfinx.bodies.faces import Region, limits
 from mpm_dolfinx.conditions.axis import with_axis
@@ -212,7 +213,7 @@ class BiotFEM:
         for f in (at, centre):
             f.interpolate(lambda x: x[:d])
         middle.interpolate(centre)
-        x = (middle.x.array + (1 - 1e-9) * (at.x.array - middle.x.array)).reshape(-1, d)
+        x = (middle.x.array + (1 - SAME) * (at.x.array - middle.x.array)).reshape(-1, d)
         rows = np.asarray(value(x + self.grid.base), float)
         f = fem.Function(_compat.function_space(msh, "DG", 2, rows.shape[1:]))
         f.x.array[:] = rows.ravel()
@@ -222,7 +223,7 @@ class BiotFEM:
         """Return the corners of a flat box around a side, or around the part of it in a region."""
         grid, (axis, end) = self.grid, side(name, self.grid.dim)
         low, high = limits(region, grid.dim) - grid.base
-        plane, near = (grid.low, grid.high)[end][axis], 1e-6 * grid.h
+        plane, near = (grid.low, grid.high)[end][axis], NEAR * grid.h
         low, high = np.maximum(low, grid.low) - near, np.minimum(high, grid.high) + near
         if not (low[axis] <= plane <= high[axis] and (low < high).all()):
             raise ValueError(f"side {name!r}: the region {line(region)} must have a part of it")
@@ -364,7 +365,7 @@ class BiotFEM:
         stretch = J * ufl.inner(pull * normal, pull * normal)
         across = sum(abs(normal[a]) * h[a] for a in range(self.grid.dim))
         dS = ufl.dS(domain=self.grid.mesh, metadata={"quadrature_degree": 2})
-        harmonic = 2 * kappa("+") * kappa("-") / (kappa("+") + kappa("-") + 1e-300)
+        harmonic = 2 * kappa("+") * kappa("-") / (kappa("+") + kappa("-") + TINY)
         around = self._around("+") if self.grid.axisymmetric else 1.0
         flux = around * harmonic * ufl.avg(stretch) / across("+") * ufl.jump(p) * ufl.jump(q) * dS
         for o in outlets:
@@ -448,7 +449,7 @@ class BiotFEM:
             space.f.x.array[:] += space.b.x.array
         x = _compat.petsc_vec(self._space.w).copy()
         petsc.set_bc(x, self._bcs)
-        round_off = 1e-14 * self.grid.cell_volume / self.grid.h.min() * np.sqrt(x.getSize())
+        round_off = ROUND_OFF * self.grid.cell_volume / self.grid.h.min() * np.sqrt(x.getSize())
         snes.setTolerances(self.tolerance, max(self.tolerance * load, round_off), 0.0)
         snes.solve(None, x)
         norms, _ = snes.getConvergenceHistory()
@@ -490,7 +491,7 @@ class BiotFEM:
             Show a progress bar on a terminal.
         """
         steps = round((t_end - self.t) / dt) if dt > 0 else 0
-        if steps < 1 or abs(steps * dt - (t_end - self.t)) > 1e-6 * dt:
+        if steps < 1 or abs(steps * dt - (t_end - self.t)) > NEAR * dt:
             raise ValueError(f"dt = {dt!r}, t_end = {t_end!r}: dt must divide the {t_end - self.t:g} s left")
         x = positions(probes, self.grid.dim)
         out = np.flatnonzero(self.grid.outside(x - self.grid.base))
