@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from mpm_dolfinx.points.contact import face_vectors
 from mpm_dolfinx.points.cutting import FACES
 
-ASIDE = 1e-7
+ASIDE = 1e-9
 """By how much of a domain's width lines are off their places: else one on a joint may cross two domains."""
 FLAT = 1e-12  # slope of a face below which it is along the lines
 

@@ -83,7 +83,8 @@ def resolved(scene: Scene, frame: Frame, run: Sequence[Shown]) -> dict[str, floa
     stress = place / h * max(law.get("bulk", 1e7) + 4 / 3 * law["shear"] for _, law in scene.materials)
     out = {name: place / scales["displacement"] for name in scales}
     out |= {"displacement": given / scales["displacement"], "volume": place / h / scales["volume"]}
-    out["outflows"] += place / h * _seeps(scene) * h ** (d - 1) / scales["outflows"]
+    flows = _seeps(scene) + h / (scene.end / scene.steps)  # what a step's rounding of a volume presses out, too
+    out["outflows"] += place / h * flows * h ** (d - 1) / scales["outflows"]
     out |= {name: stress / scales[name] for name in ("stress", "pressure")}
     forces = {"reactions": HOLD, "tools": STIFF}
     out |= {name: k * stress * h ** (d - 1) / scales[name] for name, k in forces.items()}
