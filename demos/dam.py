@@ -83,7 +83,7 @@ def run(h: float = 0.5, steps: int = 10) -> Dam:
         gravity=(0, -9.81),
         pressure=mpm.hydrostatic(LEVELS[0]),
         initial_stress=mpm.K0(0.5, surcharge=lambda x: WEIGHT * np.maximum(LEVELS[0] - x[:, 1], 0)),
-        method="backward-euler",
+        numerics=mpm.Numerics(method="backward-euler"),
         **conditions(LEVELS[0]),
     )
     out = Dam()
@@ -140,7 +140,7 @@ def drained(cells: int, k: float = 1e-5) -> float:
         gravity=(0, -9.81),
         pressure=mpm.hydrostatic(high),
         initial_stress=mpm.K0(0.5),
-        method="backward-euler",
+        numerics=mpm.Numerics(method="backward-euler"),
     )
     time = YIELD / k * (high - low + head * np.log((high - head) / (low - head)))
     lost, steps = [], 40

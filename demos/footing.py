@@ -170,11 +170,12 @@ def push(
     end, edge = (depth * WIDTH**2 / (CV * rate) if rate else 1.0), WIDTH / 2
     under, beside = ((0, -np.inf), (edge, np.inf)), ((edge - h / 2, -np.inf), (np.inf, np.inf))  # from its last node on
     footing = mpm.Displacement("top", lambda t, X: (0, -depth * WIDTH * min(1, t / end)), region=under, name="footing")
-    water = {"fluid": WATER, "method": method, "conditions": [mpm.Drained("top", region=beside)]} if rate else {}
+    sides, water = [footing], {}
+    if rate:
+        sides.append(mpm.Drained("top", region=beside))
+        water = {"fluid": WATER, "numerics": mpm.Numerics(method=method)}
     walls = {"left": "x", "right": "x", "bottom": "xy"}
-    simulation = mpm.Simulation(
-        grid, [body], [soil], walls=walls, conditions=[footing, *water.pop("conditions", [])], **water
-    )
+    simulation = mpm.Simulation(grid, [body], [soil], walls=walls, conditions=sides, **water)
     out = Push()
 
     def observe(s: mpm.Simulation) -> None:

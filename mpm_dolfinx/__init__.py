@@ -56,6 +56,7 @@ from mpm_dolfinx.probing.probes import probes
 from mpm_dolfinx.simulation.simulation import Simulation
 from mpm_dolfinx.simulation.strength_reduction import Safety, factor_of_safety
 from mpm_dolfinx.solve.scheme import COUPLINGS
+from mpm_dolfinx.stepping.numerics import Numerics
 from mpm_dolfinx.stepping.result import GaveUp, Result
 from mpm_dolfinx.stepping.state import State
 from mpm_dolfinx.verification.element_test import ElementTest, element_test
@@ -88,6 +89,7 @@ __all__ = [
     "MohrCoulomb",
     "NeoHookean",
     "NotConverged",
+    "Numerics",
     "OnSide",
     "Pressure",
     "Result",

@@ -24,7 +24,7 @@ simulation = mpm.Simulation(
         mpm.Traction("top", lambda t: (2e4 * t, 1e4 * t, -5e4 * t)),
         mpm.Pressure("right", lambda t: 2e4 * t),
     ],
-    tolerance=1e-11,
+    numerics=mpm.Numerics(tolerance=1e-11),
 )
 result = simulation.run(1.0, 0.25, progress=False)
 points = simulation.points

@@ -484,14 +484,18 @@ def scene(**options):
         (lambda: mpm.Grid([0, 0, 0], [1, 1, 1], [2, 2, 2], axisymmetric=True), "axisymmetric", "3"),
         (lambda: mpm.Grid([-0.5, 0], [1, 1], [2, 2], axisymmetric=True), "axisymmetric", "-0.5"),
         (lambda: mpm.Grid([0, 0], [1, 1], [2, 2], axisymmetric=1), "axisymmetric", "1"),
-        (lambda: scene(quadrature="point"), "quadrature", "point"),
+        (lambda: scene(numerics=mpm.Numerics(quadrature="point")), "quadrature", "point"),
         (lambda: scene(gravity=(1, -9.81)), "gravity", "1"),
         (lambda: scene(gravity=lambda t: (t, 0)).step(1.0), "gravity", "1"),
         (lambda: scene(conditions=[mpm.Traction("left", (1, 0))]), "Traction", "axis"),
         (lambda: scene(walls={}).step(1.0), "walls", "1 of 1"),
         (lambda: scene(terms=[mpm.OnSide("left", lambda points, v: points.value(v)[0] * points.dx)]), "OnSide", "axis"),
         (lambda: scene(conditions=[mpm.Tool(mpm.Ball((0, 2), 0.5), (0.1, 0))]), "Tool", "[0.1 0. ]"),
-        (lambda: scene(conditions=[mpm.Tool(mpm.Ball((0, 2), 0.5), rotation=lambda t: t)]).step(1.0), "Tool", "turns"),
+        (
+            lambda: scene(conditions=[mpm.Tool(mpm.Ball((0, 2), 0.5), rotation_rad=lambda t: t)]).step(1.0),
+            "Tool",
+            "turns",
+        ),
     ],
 )
 def test_what_axisymmetry_does_not_allow_is_refused_in_one_line(make, name, value):

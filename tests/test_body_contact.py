@@ -260,7 +260,7 @@ def test_what_are_no_contacts_is_refused():
     with pytest.raises(ValueError, match=r"2 groups of bodies have this side, must be one; limit it"):
         scene(boxes[:2], mpm.Contact(0, 1), conditions=[mpm.Traction("left", 0.0)])
     with pytest.raises(ValueError, match=r"quadrature 'point': must be domain with contacts"):
-        scene(boxes[:2], mpm.Contact(0, 1), quadrature="point")
+        scene(boxes[:2], mpm.Contact(0, 1), numerics=mpm.Numerics(quadrature="point"))
     with pytest.raises(ValueError, match=r"terms: must be none with contacts"):
         scene(boxes[:2], mpm.Contact(0, 1), terms=[lambda at: 0])
     with pytest.raises(ValueError, match=r"is free to move as a rigid body in 1 of 3 ways"):

@@ -3,7 +3,7 @@
 
 import numpy as np
 import pytest
-from helpers import SOFT, beam, column, without
+from helpers import SOFT, beam, column, joined, without
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.grid.grid import SIDES
@@ -65,7 +65,7 @@ def under_a_plate(water):
         [SOIL],
         walls=walls,
         gravity=(0, -G),
-        **water | {"conditions": [plate, *water.get("conditions", [])]},
+        **joined({"conditions": [plate]}, water),
     ), (0, -1e4)
 
 
@@ -73,9 +73,9 @@ def a_thin_layer(water):
     """Return a layer a little thicker than a cell: the ghost penalty of its top acts on the floor's nodes."""
     grid, load = mpm.Grid([0, 0], [2.0, 1.0], [10, 5]), (2e3, -1e4)
     options = {"walls": {"bottom": "xy"}, "conditions": [mpm.Traction("top", load)], "gravity": (0, -G)}
-    return mpm.Simulation(grid, [mpm.box(grid, [0.1, 0], [1.9, 0.22])], [SOIL], **options, **water), 1.8 * np.array(
-        load
-    )
+    return mpm.Simulation(
+        grid, [mpm.box(grid, [0.1, 0], [1.9, 0.22])], [SOIL], **joined(options, water)
+    ), 1.8 * np.array(load)
 
 
 def held_in_the_cells_of_a_wall(water):
@@ -83,9 +83,7 @@ def held_in_the_cells_of_a_wall(water):
     grid, walls = mpm.Grid([0, 0], [2.2, 1.7], [11, 8]), {"left": "x", "bottom": "xy"}
     held = mpm.Displacement("top", lambda t: (5e-4 * t, -1e-3 * t))
     body = mpm.box(grid, [0.07, 0], [1.3, 1.1])
-    return mpm.Simulation(
-        grid, [body], [SOIL], walls=walls, **water | {"conditions": [held, *water.get("conditions", [])]}
-    ), (
+    return mpm.Simulation(grid, [body], [SOIL], walls=walls, **joined({"conditions": [held]}, water)), (
         0,
         0,
     )
@@ -103,7 +101,7 @@ def pushed_along_a_wall(water):
         [SOIL],
         walls=walls,
         gravity=(0, -G),
-        **water | {"conditions": [*sides, *water.get("conditions", [])]},
+        **joined({"conditions": [*sides]}, water),
     ), (0, 0)
 
 
@@ -111,7 +109,7 @@ def in_a_corner(water):
     grid = mpm.Grid([0, 0, 0], [1.1, 1.1, 1.4], [5, 5, 6])
     load, walls = (3e3, 10.0, -1e4), {"left": "xyz", "back": "y", "front": "yz", "bottom": "xz"}
     options = {"walls": walls, "conditions": [mpm.Traction("top", load)], "gravity": (0, 0, -G)}
-    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0, 0], [0.93, 1.1, 1.03])], [SOIL], **options, **water)
+    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0, 0], [0.93, 1.1, 1.03])], [SOIL], **joined(options, water))
     return s, np.array(load) * 0.93 * 1.1
 
 
@@ -119,7 +117,7 @@ def a_cylinder(water):
     grid = mpm.Grid([0, 0], [1.1, 1.4], [5, 6], axisymmetric=True)
     load = mpm.Traction("top", (0, -1e4))
     options = {"walls": {"bottom": "xy"}, "conditions": [load], "gravity": (0, -G)}
-    return mpm.Simulation(grid, [mpm.box(grid, [0, 0], [0.93, 1.03])], [SOIL], **options, **water), (
+    return mpm.Simulation(grid, [mpm.box(grid, [0, 0], [0.93, 1.03])], [SOIL], **joined(options, water)), (
         0.0,
         -1e4 * np.pi * 0.93**2,
     )
@@ -147,7 +145,7 @@ def held_beside_walls(water, move=lambda t: (0.0, 0.0), **options):
     grid = mpm.Grid([0, 0], [2.0, 1.4], [8, 7])
     side = mpm.Displacement("left", move, "x")
     options = {"walls": {"right": "x", "bottom": "xy"}, "gravity": (0, -G), "conditions": [side], **options}
-    return mpm.Simulation(grid, [mpm.box(grid, [0, 0], [2.0, 1.0])], [SOIL], **options, **water), 0
+    return mpm.Simulation(grid, [mpm.box(grid, [0, 0], [2.0, 1.0])], [SOIL], **joined(options, water)), 0
 
 
 def held_on_the_floor(water):

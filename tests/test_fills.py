@@ -79,7 +79,7 @@ def settled(dim=2, per_cell=2, quadrature="domain", until=1.0, **options):
     fill = mpm.box(grid, [1] * (dim - 1) + [2], [3] * (dim - 1) + [3], per_cell=per_cell)
     half = mpm.Traction("top", [0] * (dim - 1) + [-8e4], region=([0] * dim, [2, *[4] * (dim - 1)]))
     walls = {name: "xyz"[:dim] for name in ("left", "right", "bottom", *["front", "back"][: 2 * dim - 4])}
-    options = {"conditions": [half], "quadrature": quadrature} | options
+    options = {"conditions": [half], "numerics": mpm.Numerics(quadrature=quadrature)} | options
     s = mpm.Simulation(grid, [ground, fill], [SOFT], walls=walls, later=[1], gravity=[0.0] * dim, **options)
     if until:
         s.run(until, 0.5, progress=False)

@@ -48,8 +48,8 @@ OPEN = {"conditions": [mpm.Drained("top", region=([0.8, 1.6], [5.0, 1.9])), mpm.
         {"dilation": 5.0, "bulk": 2.2e9},
         {"axisymmetric": True},
         {"dim": 3},
-        {"method": "backward-euler", **OPEN},
-        {"method": "backward-euler", "terms": [mpm.Source(source)], "bulk": 2.2e9, **OPEN},
+        {"numerics": mpm.Numerics(method="backward-euler"), **OPEN},
+        {"numerics": mpm.Numerics(method="backward-euler"), "terms": [mpm.Source(source)], "bulk": 2.2e9, **OPEN},
     ],
     ids=["sealed", "compressible", "axisymmetric", "3D", "open", "fed"],
 )

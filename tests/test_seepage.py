@@ -112,7 +112,7 @@ def test_what_is_no_flag_is_refused():
 def test_other_couplings_find_the_same_seepage(coupling):
     found = []
     for chosen in ("schur-cg", coupling):
-        simulation = column(4 * WEIGHT, coupling=chosen)
+        simulation = column(4 * WEIGHT, numerics=mpm.Numerics(coupling=chosen))
         simulation.run(4e3, 1e3, progress=False)  # on the way there
         found.append(simulation.points.pressure)
     assert found[1] == pytest.approx(found[0], abs=1e-5 * WEIGHT)

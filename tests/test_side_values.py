@@ -191,7 +191,7 @@ def test_functions_are_called_by_the_names_of_their_parameters(kind):
     [
         lambda f: mpm.RigidPlate("top", f),
         lambda f: mpm.Tool(mpm.Ball((0, 0), 1.0), displacement=f),
-        lambda f: mpm.Tool(mpm.Ball((0, 0), 1.0), rotation=f),
+        lambda f: mpm.Tool(mpm.Ball((0, 0), 1.0), rotation_rad=f),
         lambda f: mpm.Tool(mpm.Ball((0, 0), 1.0), load=f, direction=(0, 1)),
         lambda f: mpm.water("top", f),
         lambda f: block(gravity=f),

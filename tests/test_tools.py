@@ -235,7 +235,7 @@ def test_the_tangent_of_the_contact_is_its_derivative(friction):
     """In a step in which a disc turns and slips."""
     grid = mpm.Grid([-0.25, 0], [1.25, 1], [12, 8])
     disc = mpm.Ball((0.5, 0.71), 0.2)
-    motion = {"displacement": lambda t: (0.02 * t, -0.01 * t), "rotation": lambda t: 0.2 * t, "centre": (0.5, 0.7)}
+    motion = {"displacement": lambda t: (0.02 * t, -0.01 * t), "rotation_rad": lambda t: 0.2 * t, "centre": (0.5, 0.7)}
     tool = mpm.Tool(disc, **motion, friction=friction)
     s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 0.51])], [GEL], walls={"bottom": "xy"}, conditions=[tool])
     s.step(0.5)
@@ -284,7 +284,7 @@ def shallow(y):
         (lambda: mpm.Tool(mpm.Ball((0, 0), 1), friction=-0.1), "friction = -0.1, must be >= 0"),
         (lambda: mpm.HalfSpace((0, 0), (0, 0)), "outward = .*, must be a vector"),
         (lambda: mpm.Convex([(0, 0), (1, 1), (2, 2)]), "corners = .*must be at least"),
-        (lambda: mpm.Cone((0, 0), (0, 1), 90), "angle = 90, must be in"),
+        (lambda: mpm.Cone((0, 0), (0, 1), 90), "angle_deg = 90, must be in"),
         (lambda: simple(shape=mpm.Ball((0, 0, 0), 1)), "in 3D, must be in 2D"),
         (lambda: simple(tool={"displacement": 1.0}).run(1, 1), "displacement .* must be 2 finite numbers"),
         (lambda: simple(tool={"displacement": lambda t: (0, np.nan)}).run(1, 1), "displacement at t = 0 s.*must be"),
@@ -445,7 +445,7 @@ def test_a_state_with_tools_may_be_put_back():
 
 def test_a_disc_that_turns_drives_the_body_by_friction():
     """Anti-clockwise on its top: to the right; its moment is mu times what it presses with, times its radius."""
-    turn = {"rotation": lambda t: 0.3 * max(0, t - 1), "centre": (0.5, 0.8), "friction": 0.3}
+    turn = {"rotation_rad": lambda t: 0.3 * max(0, t - 1), "centre": (0.5, 0.8), "friction": 0.3}
     s = simple(shape=mpm.Ball((0.5, 0.8), 0.2), tool={"displacement": lambda t: (0, -0.01 * min(t, 1)), **turn})
     s.run(2.0, 0.25)
     along, down, moment = s.tool_forces.array[0]

@@ -91,7 +91,7 @@ class Tools:
             tool.check(grid.dim)
             if grid.axisymmetric and tool.along(grid.dim)[0]:
                 raise ValueError(f"Tool: direction = {line(tool.direction)}, must be along the axis in axisymmetry")
-            if not callable(tool.displacement) and not callable(tool.rotation):
+            if not callable(tool.displacement) and not callable(tool.rotation_rad):
                 self._pose(tool, 0.0)
         self.tools = tuple(tool.on(grid) for tool in self.tools)
         self.faces, sides = outside, 2 * grid.dim

@@ -30,8 +30,6 @@ def check_options(
     quadrature: str,
 ) -> None:
     """Refuse terms and sources that are no functions, pressures and sources without fluid, and wrong quadratures."""
-    if quadrature not in ("domain", "point"):
-        raise ValueError(f"quadrature {quadrature!r}: must be domain or point")
     turned = [i for i, body in enumerate(bodies) if not body.aligned]
     if quadrature == "point" and turned:
         raise ValueError(f"quadrature 'point': body {turned[0]} is mapped or a mesh, must be a box along the grid")

@@ -203,8 +203,9 @@ def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulat
         if arrays or not all(np.isfinite([note["t"], *times])):
             raise ValueError(f"has {', '.join(arrays) or 'other times'}")
         outcome = _like(outcome, now.outcome)
-        start = note["t"], points, transported, stay, note["resets"], outcome, None, note["begins"]
-        return State(*start, *nodal, result)
+        reset = {"stay": stay, "resets": note["resets"], "begins": note["begins"]}
+        told = dict(zip(NODAL, nodal, strict=True)) | {"outcome": outcome, "stage": None, "result": result}
+        return State(t=note["t"], points=points, transported=transported, **reset, **told)
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         raise ValueError(f"{damaged} ({line(error)}), must be a whole checkpoint") from error
 

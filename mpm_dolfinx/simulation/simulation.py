@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.base.errors import StepFailed, raise_interrupt
 from mpm_dolfinx.base.report import Report
-from mpm_dolfinx.base.validation import numbers
+from mpm_dolfinx.base.validation import instance, numbers
 from mpm_dolfinx.bodies.bodies import Body, points_in_cells
 from mpm_dolfinx.conditions.axis import check_axisymmetry, with_axis
 from mpm_dolfinx.conditions.conditions import OnSide, Source, sorted_terms
@@ -28,9 +28,9 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.probing.cell_fields import CellFields, cell_fields
 from mpm_dolfinx.probing.point_fields import PointFields, point_fields
 from mpm_dolfinx.simulation.timeloop import run
-from mpm_dolfinx.solve.scheme import Scheme
 from mpm_dolfinx.stepping import summary
 from mpm_dolfinx.stepping.initial_state import balanced
+from mpm_dolfinx.stepping.numerics import DEFAULT, Numerics
 from mpm_dolfinx.stepping.result import Result
 from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.stage import Condition, checked
@@ -65,16 +65,13 @@ class Simulation:
         (n, 3) or tensors (n, 3, 3), Pa, or one of these for each of some bodies, {index: ...}; of fills too, which
         otherwise have none.  It is brought into balance with what acts at the start, at the pore pressures given,
         so that a first step in which nothing changes moves nothing.
-    quadrature
-        "domain": exact pieces of the points' domains; "point": at the points, as in standard MPM, of boxes, not in
-        axisymmetry.
-    coupling, tolerance, method
-        See `Scheme`; method of time integration: "sdirk2", of second order, or "backward-euler".
     terms
         Terms of the user's own in UFL: functions for the balance of momentum, see `user_functions`, such functions on
         a side, `OnSide`, and those for the storage of fluid, `Source`.
     later
         Indices of bodies that a later stage adds, each once.
+    numerics
+        Quadrature, coupling, tolerance and method of time integration, see `Numerics`.
 
     Attributes
     ----------
@@ -102,14 +99,12 @@ class Simulation:
         gravity: ArrayLike | Callable[[float], ArrayLike] | None = None,
         pressure: float | Callable[[NDArray], ArrayLike] = 0.0,
         initial_stress: InitialStress | Mapping[int, InitialStress] | None = None,
-        quadrature: str = "domain",
-        coupling: str = "schur-cg",
-        tolerance: float = 1e-8,
-        method: str = "sdirk2",
         terms: Sequence[Callable | OnSide | Source] = (),
         later: Sequence[int] = (),
+        numerics: Numerics = DEFAULT,
     ):
-        scheme = Scheme(coupling, tolerance)
+        instance("numerics", numerics, Numerics)
+        quadrature = numerics.quadrature
         check_parts(grid, bodies, materials, later)
         contacts = [one for one in checked(conditions) if isinstance(one, Contact)]
         terms, sources = sorted_terms(terms)
@@ -119,9 +114,18 @@ class Simulation:
         warn_thin(grid, bodies, with_axis(grid, walls), fluid is not None)
         check_axisymmetry(grid, bodies, quadrature)
         began = time.perf_counter()
-        options = (quadrature, scheme, method, gravity is not None, pressure, terms, sources)
         initial = by_body(initial_stress, bodies, later)
-        self.scene = Scene(grid, bodies, materials, under(fluid, gravity), *options, initial)
+        self.scene = Scene(
+            grid,
+            bodies,
+            materials,
+            under(fluid, gravity),
+            numerics=numerics,
+            weighs=gravity is not None,
+            pressure=pressure,
+            extensions=(terms, sources),
+            initial=initial,
+        )
         given = {"walls": walls, "conditions": conditions, "gravity": gravity}
         self.state = first_state(self.scene, given, later)
         if initial:

@@ -237,10 +237,18 @@ class _Weakened:
             return viscosity / dt * ufl.inner(strain, strain) * points.dx
 
         materials = [_as_fields(m) for m in scene.materials.materials]
-        options = scene.quadrature, scene.scheme, "backward-euler", scene.gravity is not None, 0.0
         terms, sources = scene.extensions
-        options = *options, [*terms, resistance], sources, {}  # what initial stresses need the materials have
-        self._scene = Scene(scene.grid, scene.bodies, materials, scene.fluid, *options)
+        self._scene = Scene(
+            scene.grid,
+            scene.bodies,
+            materials,
+            scene.fluid,
+            numerics=replace(scene.numerics, method="backward-euler"),
+            weighs=scene.gravity is not None,
+            pressure=0.0,
+            extensions=([*terms, resistance], sources),
+            initial={},  # what initial stresses need the materials have
+        )
         self._strengths, self.newton = _strengths(scene, begun.points), []
         points = replace(begun.points, data={**begun.points.data, **self._strengths})
         begun = begin_stage(self._scene, replace(begun, points=points), {}, [], [], False, {})

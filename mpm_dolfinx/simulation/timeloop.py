@@ -319,7 +319,7 @@ def _by_euler(simulation: Simulated, dt: float, failed: StepFailed) -> tuple[Sta
     except StepFailed:
         return None
     what = "t = %g s: a step of %.3g s by backward Euler, of first order: none by %s has converged: %s"
-    warn(simulation.scene.grid.comm, what, simulation.state.t, dt, simulation.scene.method, failed)
+    warn(simulation.scene.grid.comm, what, simulation.state.t, dt, simulation.scene.numerics.method, failed)
     return found
 
 

@@ -46,7 +46,11 @@ def _momentum(s: Scene, state: State) -> list[Part]:
     return [
         _either("reset of the grid", state.resets > 1, f"{state.resets} so far", "nothing has moved so far"),
         _either("axisymmetry", s.grid.axisymmetric, "rings about r = 0", "plane strain" if s.grid.dim == 2 else "3D"),
-        Part("stress", True, f"{laws}; integrated over {'exact domains' if s.quadrature == 'domain' else 'points'}"),
+        Part(
+            "stress",
+            True,
+            f"{laws}; integrated over {'exact domains' if s.numerics.quadrature == 'domain' else 'points'}",
+        ),
         _either(
             "mean dilatation",
             m.dilatation,
@@ -100,7 +104,7 @@ def _solvers(s: Scene, state: State) -> list[Part]:
 
 
 def _one_substep(s: Scene) -> str:
-    return "first order in time" if s.method == "backward-euler" else "nothing has a rate"
+    return "first order in time" if s.numerics.method == "backward-euler" else "nothing has a rate"
 
 
 def table(scene: Scene, state: State) -> str:

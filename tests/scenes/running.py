@@ -274,7 +274,7 @@ class _Builder:
 
     def options(self, later: list[int]) -> dict:
         scene, frame = self.scene, self.frame
-        out = {"method": scene.method, "tolerance": scene.tolerance}
+        out = {"numerics": mpm.Numerics(method=scene.method, tolerance=scene.tolerance)}
         down = np.zeros(scene.dim)
         down[-1] = -scene.gravity * frame.length / frame.time**2
         if scene.gravity:
