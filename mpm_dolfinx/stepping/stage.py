@@ -113,6 +113,11 @@ class Stage:
         with Timer("mpm: loads"):
             return [one.placed(place) for one in self.acting]
 
+    def check_start(self, place: Place) -> None:
+        """Refuse a stage that begins in a place where it cannot."""
+        for one in self.acting:
+            one.check_start(place)
+
     def kept(self, n: int) -> dict[str, NDArray[np.float64]]:
         """Return what n points keep of the conditions, as these begin."""
         return {data: rows for one in self.acting for of in one.kept(n).values() for data, rows in of.items()}
