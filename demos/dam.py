@@ -54,7 +54,7 @@ class Dam:
 
     def see(self, simulation: mpm.Simulation) -> None:
         """Keep what is to be seen now."""
-        self.flows.append(simulation.outflows.copy())
+        self.flows.append(simulation.outflows.array)
         self.frames.append((simulation.points.corners.copy(), simulation.points.pressure))
 
 
@@ -118,7 +118,7 @@ def rectangular(cells: int) -> float:
         pressure=mpm.hydrostatic(upper),
     )
     simulation.run(600.0, 20.0, progress=False)
-    return float(simulation.outflows[1] / (k * (upper**2 - lower**2) / (2 * width)))
+    return float(simulation.outflows["drained_right"] / (k * (upper**2 - lower**2) / (2 * width)))
 
 
 def drained(cells: int, k: float = 1e-5) -> float:
@@ -144,8 +144,8 @@ def drained(cells: int, k: float = 1e-5) -> float:
     )
     time = YIELD / k * (high - low + head * np.log((high - head) / (low - head)))
     lost, steps = [], 40
-    simulation.run(time, time / steps, progress=False, observe=lambda s: lost.append(s.outflows[0] * time / steps))
-    return float(sum(lost) / (YIELD * h * (high - low)))
+    simulation.run(time, time / steps, progress=False, observe=lambda s: lost.append(s.outflows["drained_bottom"]))
+    return float(sum(lost) * time / steps / (YIELD * h * (high - low)))
 
 
 def main(argv: list[str] | None = None) -> dict:

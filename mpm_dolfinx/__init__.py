@@ -21,6 +21,7 @@ from mpm_dolfinx.bodies.boxes import box, shape
 from mpm_dolfinx.bodies.mesh_files import from_mesh
 from mpm_dolfinx.bodies.meshes import MeshBody
 from mpm_dolfinx.bodies.polygon import polygon
+from mpm_dolfinx.conditions.acting import Acting, Loads
 from mpm_dolfinx.conditions.conditions import (
     Displacement,
     Drained,
@@ -69,6 +70,7 @@ __version__ = "0.1.0"
 __all__ = [
     "COUPLINGS",
     "K0",
+    "Acting",
     "Ball",
     "Body",
     "CellFields",
@@ -89,6 +91,7 @@ __all__ = [
     "Inflow",
     "LeftGrid",
     "LinearElastic",
+    "Loads",
     "MaterialPoints",
     "MeshBody",
     "ModifiedCamClay",

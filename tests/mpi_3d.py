@@ -34,5 +34,12 @@ if parts:
     ids, x, p = (np.concatenate(a) for a in zip(*parts, strict=True))
     order = np.argsort(ids)
     counts = [len(part[0]) for part in parts]
-    np.savez(sys.argv[1], x=x[order], p=p[order], balance=result.balance, counts=counts, walls=simulation.state.walls)
+    np.savez(
+        sys.argv[1],
+        x=x[order],
+        p=p[order],
+        balance=result.balance,
+        counts=counts,
+        walls=simulation.wall_reactions.array,
+    )
     print(result.newton, result.coupling, result.cuts)

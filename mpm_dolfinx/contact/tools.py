@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from copy import copy, deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import ClassVar, NamedTuple, Protocol
 
@@ -355,6 +355,9 @@ class Tool:
         simulation's `tool_travel`.  In axisymmetry the load all around.
     direction : (d,)
         In which a load pushes; of any length; in axisymmetry along the axis.
+    name
+        By which its results are found, and what it has on points, as NAME_pressure; without, "tool".
+        A tool of a later stage that is given the same name keeps that.
 
     Raises
     ------
@@ -370,6 +373,7 @@ class Tool:
     adhesion: float = 0.0
     load: float | Callable[[float], float] | None = None
     direction: ArrayLike | None = None
+    name: str | None = field(default=None, kw_only=True, repr=False)
     _base: ClassVar[NDArray[np.float64] | float] = 0.0
     _moved: ClassVar[Shape | None] = None
 

@@ -16,11 +16,12 @@ from mpm_dolfinx.base.validation import instance, numbers
 from mpm_dolfinx.bodies.bodies import Body, points_in_cells
 from mpm_dolfinx.conditions.axis import check_axisymmetry, with_axis
 from mpm_dolfinx.conditions.conditions import OnSide, Source, sorted_terms
+from mpm_dolfinx.conditions.names import ByName
 from mpm_dolfinx.conditions.unit_weights import under
-from mpm_dolfinx.contact.groups import grouped
+from mpm_dolfinx.contact.groups import Contact, grouped
 from mpm_dolfinx.diagnostics.scene_parts import check_options, check_parts
 from mpm_dolfinx.diagnostics.thin import warn_thin
-from mpm_dolfinx.grid.grid import SIDES, Grid
+from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.materials.initial_stress import InitialStress, by_body
 from mpm_dolfinx.materials.skeleton import Fluid, Skeleton
 from mpm_dolfinx.points.material_points import MaterialPoints
@@ -32,7 +33,7 @@ from mpm_dolfinx.stepping.initial_state import balanced
 from mpm_dolfinx.stepping.numerics import DEFAULT, Numerics
 from mpm_dolfinx.stepping.result import Result
 from mpm_dolfinx.stepping.scene import Scene
-from mpm_dolfinx.stepping.stage import Condition, by_kind
+from mpm_dolfinx.stepping.stage import Condition, checked
 from mpm_dolfinx.stepping.stages import begin_stage, first_state
 from mpm_dolfinx.stepping.state import State
 from mpm_dolfinx.stepping.step import step
@@ -105,7 +106,7 @@ class Simulation:
         instance("numerics", numerics, Numerics)
         quadrature = numerics.quadrature
         check_parts(grid, bodies, materials, later)
-        contacts = by_kind(conditions)["contacts"]
+        contacts = [one for one in checked(conditions) if isinstance(one, Contact)]
         terms, sources = sorted_terms(terms)
         check_options(bodies, fluid, pressure, terms, sources, quadrature)
         grid = grouped(grid, bodies, contacts, quadrature, {"terms": terms, "sources": sources})
@@ -170,42 +171,43 @@ class Simulation:
     @property
     def conditions(self) -> tuple[Condition, ...]:
         """The conditions in force, as they were given."""
-        return self.state.stage.given
+        return tuple(self.state.stage.given.values())
 
     @property
-    def reactions(self) -> NDArray[np.float64]:
-        """(displacements, d): force by which each given displacement acts on the bodies, N (N/m in plane strain).
+    def reactions(self) -> ByName[NDArray[np.float64]]:
+        """Force (d,) by which each given displacement acts on the bodies, by its name, N (N/m in plane strain).
 
         In axisymmetry all around, the radial one the sum of what acts outward.  Of the last step; nan where none has
         been taken since a stage set them.
         """
-        return self.state.reactions
+        return self.outcome("reactions")
 
     @property
-    def wall_reactions(self) -> dict[str, NDArray[np.float64]]:
+    def wall_reactions(self) -> ByName[NDArray[np.float64]]:
         """Force (d,), N (N/m in plane strain), of each wall of the grid on the bodies; zero where it holds nothing.
 
         A component of a node that two walls hold counts once: for the wall across it, else half for each.
         """
-        return dict(zip(SIDES[self.grid.dim], self.state.walls, strict=True))
+        return self.outcome("wall_reactions")
 
     @property
-    def outflows(self) -> NDArray[np.float64]:
-        """(drained sides and inflows, in their order), m^3/s (m^2/s in plane strain): what leaves.
-
-        Nan before a first step.
-        """
-        return self.state.outflows
+    def outflows(self) -> ByName[NDArray[np.float64]]:
+        """What leaves through each drained side and inflow, by its name, m^3/s (m^2/s in plane strain)."""
+        return self.outcome("outflows")
 
     @property
-    def tool_forces(self) -> NDArray[np.float64]:
-        """(tools + contacts, d + 1), in 3D (..., 6): force and moment of each `Tool`, then `Contact`, on the bodies."""
-        return self.state.tool_forces
+    def tool_forces(self) -> ByName[NDArray[np.float64]]:
+        """Force and moment (d + 1,), in 3D (6,), of each `Tool` and `Contact` on the bodies, by its name."""
+        return self.outcome("tool_forces")
 
     @property
-    def tool_travel(self) -> NDArray[np.float64]:
-        """(tools,), m: how far a load has pushed each `Tool` beyond its displacement."""
-        return self.state.tool_travel
+    def tool_travel(self) -> ByName[NDArray[np.float64]]:
+        """How far a load has pushed each `Tool` beyond its displacement, by its name, m."""
+        return self.outcome("tool_travel")
+
+    def outcome(self, quantity: str) -> ByName[NDArray[np.float64]]:
+        """Return what conditions do to the bodies at the end of the last step, by name: of the above, or own ones."""
+        return ByName(self.state.outcome.get(quantity, {}))
 
     @property
     def present(self) -> tuple[bool, ...]:

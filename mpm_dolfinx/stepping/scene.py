@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.bodies.bodies import Body, material_points
+from mpm_dolfinx.conditions.acting import Loads
 from mpm_dolfinx.conditions.conditions import OnSide
 from mpm_dolfinx.conditions.unit_weights import other_gravity, weighed
 from mpm_dolfinx.diagnostics.overfilled import warn_overfilled
@@ -31,7 +32,6 @@ from mpm_dolfinx.materials.skeleton import Fluid, Skeleton
 from mpm_dolfinx.materials.user_functions import compiling
 from mpm_dolfinx.mechanics.momentum import MomentumForms
 from mpm_dolfinx.mechanics.quadrature_data import QuadraturePoints
-from mpm_dolfinx.mechanics.side_forms import SideData
 from mpm_dolfinx.parallel.messages import warn
 from mpm_dolfinx.points.cutting import volumes
 from mpm_dolfinx.points.material_points import MaterialPoints
@@ -119,7 +119,7 @@ class Scene:
     @property
     def substeps(self) -> tuple[Substep, ...]:
         """Substeps of a step."""
-        return substeps(self.numerics.method, self.flows or self.momentum.rates)
+        return substeps(self.numerics.method, self.flows or self.momentum.own.rates)
 
     def set_time(self, t: float, dt: float, gravity: NDArray[np.float64] | None) -> None:
         """Set what forms see of a substep: time, and time since the start of the step, s; gravity (d,), m/s^2."""
@@ -144,7 +144,7 @@ class Scene:
 
     def check(self, state: State) -> None:
         """Refuse what is no state of this scene: its conditions act on the materials of another one."""
-        if not isinstance(state, State) or state.stage.mechanical.materials is not self.materials:
+        if not isinstance(state, State) or state.stage.materials is not self.materials:
             raise ValueError(f"state = {line(state)}, must be a state of this simulation")
 
     def on_grid(self, points: MaterialPoints) -> OnGrid:
@@ -164,15 +164,20 @@ class Scene:
         return self._on_grid(points.arrays, make, grid.comm)
 
     def assembled(
-        self, on_grid: OnGrid, stage: Stage, now: SideData, sides: Callable[[], SideData], begins: bool
+        self,
+        on_grid: OnGrid,
+        stage: Stage,
+        now: Sequence[Loads],
+        as_cut: Callable[[], Sequence[Loads]],
+        begins: bool,
     ) -> Assembled:
         """Return the matrices for a stage of the bodies on the grid.
 
         Parameters
         ----------
         now
-            What acts on the sides.
-        sides
+            What acts on the bodies.
+        as_cut
             Returns this, placed where the points were cut.
         begins
             Whether all parts of the bodies must be held.
@@ -180,9 +185,9 @@ class Scene:
 
         def make() -> Assembled:
             problems = (self.momentum, self.storage, self.scheme, self._systems)
-            return assembled(*problems, on_grid, stage, sides(), begins)
+            return assembled(*problems, on_grid, stage, as_cut(), begins)
 
-        return self._assembled((on_grid.key, stage, now.asked), make, self.grid.comm)
+        return self._assembled((on_grid.key, stage, *(one.key for one in now)), make, self.grid.comm)
 
     def all_ids(self, present: Sequence[bool]) -> NDArray[np.int64]:
         """Return the numbers of all points of the bodies that are there."""

@@ -135,8 +135,8 @@ class Ledger:
         down = np.zeros(d)
         down[-1] = -scene.gravity
         parts["weight"] = _mass(built, self._before) * down
-        parts["reactions"] = s.reactions.sum(axis=0)
-        parts["tools"] = s.tool_forces[: len(scene.tools), :d].sum(axis=0)
+        parts["reactions"] = s.reactions.array.sum(axis=0)
+        parts["tools"] = s.tool_forces.array[: len(scene.tools), :d].sum(axis=0)
         parts["walls"] = sum(s.wall_reactions.values())
         total = np.abs(sum(parts.values())[int(scene.axisymmetric) :]).max()
         # what nothing but itself presses on has a stress of its own
@@ -151,7 +151,7 @@ class Ledger:
     def _count_fluid(self, built: Built) -> None:
         scene, s = built.scene, built.simulation
         fluid, pores, t = self._start
-        dt, outflows = s.t - t, np.nan_to_num(s.outflows)
+        dt, outflows = s.t - t, np.nan_to_num(s.outflows.array)
         volume = pores.sum() + (s.points.volume0 * (1 - _of_points(built, "porosity"))).sum()  # when the step began
         self._out += dt * (float(outflows.sum()) - scene.rate * volume)
         now = _pores(built)
