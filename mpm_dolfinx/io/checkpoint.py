@@ -202,10 +202,18 @@ def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulat
                 _check_nodal(name, given, simulation.grid)
         if arrays or not all(np.isfinite([note["t"], *times])):
             raise ValueError(f"has {', '.join(arrays) or 'other times'}")
-        outcome = _like(outcome, now.outcome)
-        reset = {"stay": stay, "resets": note["resets"], "begins": note["begins"]}
-        told = dict(zip(NODAL, nodal, strict=True)) | {"outcome": outcome, "stage": None, "result": result}
-        return State(t=note["t"], points=points, transported=transported, **reset, **told)
+        return State(
+            t=note["t"],
+            points=points,
+            transported=transported,
+            stay=stay,
+            resets=note["resets"],
+            outcome=_like(outcome, now.outcome),
+            stage=None,
+            begins=note["begins"],
+            result=result,
+            **dict(zip(NODAL, nodal, strict=True)),
+        )
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         raise ValueError(f"{damaged} ({line(error)}), must be a whole checkpoint") from error
 
