@@ -26,17 +26,18 @@ from mpm_dolfinx.parallel.exchange import at_root
 from mpm_dolfinx.parallel.messages import log
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.simulation.simulation import Simulation
-from mpm_dolfinx.stepping.result import Result, Row
+from mpm_dolfinx.stepping.histories import Row, Rows
+from mpm_dolfinx.stepping.result import Result
 from mpm_dolfinx.stepping.state import State, Stay
+from mpm_dolfinx.stepping.step_control import StepControl
 
-FORMAT, VERSION = "mpm_dolfinx checkpoint", 9
+FORMAT, VERSION = "mpm_dolfinx checkpoint", 10
 FOREIGN = "no checkpoint of mpm_dolfinx, must be one"
 ZIP = b"PK\3\4"  # how numpy's archives begin
 ACTING = ("reactions", "walls", "outflows", "tool_forces", "tool_travel")
-ROWS_OF_STAGES = ("reactions", "outflows")  # of a Row: as many as the stage has conditions
 PIECES = ("id", "pressure", "x", "start")  # of a Stay
 NODAL = ("velocity", "held", "rest")  # of a State
-NOTE = {"t": float, "resets": int, "begins": bool, "scene": dict, "result": dict}  # and their kinds
+NOTE = {"t": float, "resets": int, "begins": bool, "scene": dict, "result": dict, "control": dict}  # and their kinds
 
 
 @dataclass
@@ -90,7 +91,7 @@ def save(simulation: Simulation, file: Path) -> None:
     for name in NODAL:
         nodal |= _nodal_of_all(simulation.grid, name, getattr(state, name))
     note = {"version": VERSION, "t": state.t, "resets": state.resets, "begins": state.begins}
-    note |= {"scene": describe(simulation), "result": _scalars(state.result)}
+    note |= {"scene": describe(simulation), "result": _scalars(state.result), "control": vars(state.control)}
 
     def write() -> int:
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -152,13 +153,7 @@ def _scalars(result: Result) -> dict[str, Any]:
 def _arrays(state: State) -> dict[str, NDArray]:
     """Return the arrays of a state by names with slashes."""
     named = {"points": vars(state.points), **{name: getattr(state, name) for name in ACTING}}
-    named["result"] = {}
-    for name in Row._fields:
-        rows = [np.asarray(value) for value in state.result.column(name)]
-        if name in ROWS_OF_STAGES:
-            named["result"][f"{name}_count"] = np.array([*map(len, rows)], dtype=np.int64)
-            rows = rows and np.concatenate(rows)
-        named["result"][name] = np.array(rows)
+    named["result"] = {name: state.result.rows.column(name) for name in Row._fields}
     if state.transported is not None:
         named["transported"] = vars(state.transported)
     if state.stay is not None:
@@ -189,27 +184,22 @@ def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulat
         if wet and (stay is None or stay.keeps is not None):
             transported = PiecePressures(**_part(arrays, "transported/"))
             _check_pieces(vars(transported), ids, dim)
-        histories = _part(arrays, "result/")
-        times = histories["t"] = histories["t"].tolist()
-        histories["pressure"] = [*map(tuple, histories["pressure"].tolist())]
-        for name in ROWS_OF_STAGES:
-            histories[name] = np.split(histories[name], np.cumsum(histories.pop(f"{name}_count")))[:-1]
-        columns = [[*histories[name]] or [None] * len(times) for name in Row._fields]
-        result = Result(rows=[Row(*row) for row in zip(*columns, strict=True)], **note["result"])
+        result = Result(Rows.of_columns(_part(arrays, "result/")), **note["result"])
+        control = StepControl(**note["control"])
         acting = reactions, walls, outflows, forces, ways = [arrays.pop(name) for name in ACTING]
         nodal = [_part(arrays, f"{name}/") or None for name in NODAL]
         for name, given in zip(NODAL, nodal, strict=True):
             if given is not None:
                 _check_nodal(name, given, simulation.grid)
         shapes = reactions.shape[1:], walls.shape, outflows.shape[1:]
-        if arrays or shapes != ((dim,), (2 * dim, dim), ()) or not all(np.isfinite([note["t"], *times])):
+        if arrays or shapes != ((dim,), (2 * dim, dim), ()) or not all(np.isfinite([note["t"], *result.t])):
             raise ValueError(f"has {', '.join(arrays) or 'other reactions, outflows or times'}")
         if forces.shape != now.tool_forces.shape:
             raise ValueError(f"has forces of {len(forces)} tools")
         if ways.shape != now.tool_travel.shape or not np.isfinite(ways).all():
             raise ValueError(f"has ways of {len(ways)} tools, or not finite")
         start = note["t"], points, transported, stay, note["resets"], *acting, None, note["begins"]
-        return State(*start, *nodal, result)
+        return State(*start, *nodal, result, control)
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         raise ValueError(f"{damaged} ({line(error)}), must be a whole checkpoint") from error
 

@@ -15,7 +15,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 from weakref import WeakValueDictionary, finalize
 from xml.etree import ElementTree
 
@@ -140,7 +140,7 @@ class Writer:
         """Drop what the folder holds of later times: from here on the files are this run's."""
         if (began := result.rows[-2][0]) != self._t:
             raise ValueError(f"writer: made at t = {self._t:g} s for a run that goes on from t = {began:g} s")
-        self._table.start(_row(Result(rows=result.rows[:1]), *self._acting))
+        self._table.start(_row(Result(result.rows[:1]), *self._acting))
         self._write_indices()
 
     def _write_indices(self) -> None:
@@ -194,7 +194,7 @@ def _write_tools(simulation: Simulation, file: Path) -> None:
 class Lock:
     """A folder that this process alone writes into, for as long as any of its writers holds the lock."""
 
-    _held: WeakValueDictionary[Path, Lock] = WeakValueDictionary()
+    _held: ClassVar[WeakValueDictionary[Path, Lock]] = WeakValueDictionary()
 
     def __init__(self, folder: Path):
         file = open(folder / ".lock", "w")
@@ -222,14 +222,13 @@ def _row(
     """Return what the histories hold of the last output time, and what acts at the conditions then."""
     row = result.rows[-1]
     out = {"t": row.t, **{name: getattr(result, name) for name in COUNTS}}
-    if row.pressure is not None:
-        out["p_min"], out["p_max"] = row.pressure
-    for i, u in enumerate(() if row.displacement is None else row.displacement):
+    out |= dict(zip(("p_min", "p_max"), row.pressure.tolist(), strict=False))
+    for i, u in enumerate(row.displacement):
         out |= {f"{axis}_{i}": value for axis, value in zip("xyz", row.position[i].tolist(), strict=False)}
         out |= {f"u{axis}_{i}": value for axis, value in zip("xyz", u.tolist(), strict=False)}
-        if row.probe_pressure is not None:
+        if len(row.probe_pressure):
             out[f"p_{i}"] = float(row.probe_pressure[i])
-        if row.probe_stress is not None:
+        if len(row.probe_stress):
             out |= {f"s{name}_{i}": value for name, value in _components(row.probe_stress[i], len(u)).items()}
     for i, force in enumerate(reactions):
         out |= {f"reaction_{axis}_{i}": value for axis, value in zip("xyz", force.tolist(), strict=False)}

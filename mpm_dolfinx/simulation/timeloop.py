@@ -27,9 +27,11 @@ from mpm_dolfinx.parallel.messages import log, warn
 from mpm_dolfinx.probing.probe_fields import probe_pressures, probe_stresses
 from mpm_dolfinx.probing.probes import Probes
 from mpm_dolfinx.simulation.step_size import StepSize, Times, measured, step_rule
-from mpm_dolfinx.stepping.result import GaveUp, Result, Row
+from mpm_dolfinx.stepping.histories import Row, Rows
+from mpm_dolfinx.stepping.result import GaveUp, Result
 from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.state import State
+from mpm_dolfinx.stepping.step_control import StepControl
 from mpm_dolfinx.stepping.summary import imbalance, peak_memory
 from mpm_dolfinx.stepping.time_integration import EULER, Substep
 
@@ -140,14 +142,14 @@ def run(
     if after is not None:
         instance("after", after, Result)
     now = simulation.state.t
-    start = now if after is None else after.rows[0][0]
+    start = now if after is None else after.rows[0].t
     times = Times(start, now, t_end, dt, t_eval, rtol, after is not None)
     rule = step_rule(times, rtol, first_step, max_step, simulation.scene, simulation.state.points)
-    result = _histories(simulation, times, rule, probes, after)
-    stopwatch = _Stopwatch(result)
-    targets = times.after(result.rows[-1][0])
-    _note(simulation, replace(result, converged=not targets))
-    bar = _bar(start, result.rows[-1][0], times.end, progress and comm.rank == 0)
+    result, control = _histories(simulation, times, rule, probes, after)
+    stopwatch, last = _Stopwatch(result), result.rows[-1].t
+    targets = times.after(last)
+    _note(simulation, replace(result, converged=not targets), control)
+    bar = _bar(start, last, times.end, progress and comm.rank == 0)
 
     def output(converged: bool) -> None:
         with Timer("mpm: output"):
@@ -161,10 +163,10 @@ def run(
 
     with bar, nullcontext() if bar.disable else logging_redirect_tqdm():  # messages above the bar, not into it
         for target in targets:
-            while not rule.ended(simulation.state.t, target, simulation.state.result):
+            while not rule.ended(simulation.state.t, target, simulation.state.control):
                 before = simulation.state.t
                 _advance(simulation, rule, target, progress)
-                there = rule.ended(simulation.state.t, target, simulation.state.result)
+                there = rule.ended(simulation.state.t, target, simulation.state.control)
                 if times.each and not there:
                     output(False)
                 _show(bar, simulation.state, before)
@@ -198,9 +200,9 @@ def _show(bar: tqdm, state: State, before: float) -> None:
     bar.set_postfix(counts | {name: count for name, count in seldom.items() if count})
 
 
-def _note(simulation: Simulated, result: Result) -> Result:
-    """Note the histories so far in the state."""
-    simulation.state = replace(simulation.state, result=result)
+def _note(simulation: Simulated, result: Result, control: StepControl | None = None) -> Result:
+    """Note the histories so far in the state, and the memory of the step sizes if it has changed."""
+    simulation.state = replace(simulation.state, result=result, control=control or simulation.state.control)
     return result
 
 
@@ -228,28 +230,28 @@ def _observe(observer: Callable, simulation: Simulated, comm: MPI.Intracomm) -> 
 
 def _histories(
     simulation: Simulated, times: Times, rule: StepSize, probes: Probes | None, after: Result | None
-) -> Result:
-    """Return new histories that begin with the present state, or those to go on with."""
-    now, latest = simulation.state.t, simulation.state.result
+) -> tuple[Result, StepControl]:
+    """Return new histories that begin with the present state, or those to go on with, and the memory of the steps."""
+    state, latest, control = simulation.state, simulation.state.result, simulation.state.control
     if after is None:
-        first = 0.0 if latest is None else latest.first
-        return Result(dt=times.interval, small=rule.first, first=first, rows=(_row(simulation, probes),))
-    if latest is not None and after.rows[0] is latest.rows[0]:  # of the same run, which may have gone on since, or not
-        after = latest
-    last = after.rows[-1][0]
+        begun = StepControl(times.interval, rule.first, first=0.0 if control is None else control.first)
+        return Result(Rows([_row(simulation, probes)])), begun
+    if latest is None or control is None or after.rows.run is not latest.rows.run:
+        raise ValueError("after: histories of another run, must be those of the last one, or what `resume` returns")
+    after = latest  # which may have gone on since, or not
+    now, start, last = state.t, after.rows[0], after.rows[-1].t
     # a run that was broken off has taken a part of its next interval
-    if after.dt != times.interval or not last <= now <= times.next(last):
-        what = f"dt = {times.interval!r} from t = {now!r}: the run to go on with has dt = {after.dt!r}, t = {last!r}"
-        raise ValueError(f"{what}; with other steps, or t_eval, begin new histories: without after")
-    shown = after.rows[0].displacement
-    if (recorded := 0 if shown is None else len(shown)) != (0 if probes is None else len(probes.id)):
+    if control.interval != times.interval or not last <= now <= times.next(last):
+        what = f"dt = {times.interval!r} from t = {now!r}: the run to go on with has dt = {control.interval!r}"
+        raise ValueError(f"{what}, t = {last!r}; with other steps, or t_eval, begin new histories: without after")
+    count = 0 if probes is None else len(probes.id)
+    if (recorded := len(start.displacement)) != count:
         raise ValueError(f"probes: the run to go on with has {recorded} of them")
-    tools = 0 if after.rows[0].tools is None else len(after.rows[0].tools)
-    if tools != len(simulation.state.tool_forces):
+    if (tools := len(start.tools)) != len(state.tool_forces):
         raise ValueError(f"tools: the run to go on with has {tools} of them")
-    if probes is not None and probes.stressed != (after.rows[0].probe_stress is not None):
+    if count and probes.stressed != (len(start.probe_stress) > 0):
         raise ValueError(f"probes: stress = {probes.stressed}, must be what the run to go on with has")
-    return after
+    return after, control
 
 
 class _Stopwatch:
@@ -276,35 +278,35 @@ def _advance(simulation: Simulated, rule: StepSize, target: float, aloud: bool) 
     """
     comm, wanted, whole = simulation.scene.grid.comm, None, None
     while True:
-        state, result = simulation.state, simulation.state.result
-        taken = rule.fitted(target - state.t, result.small)
+        state, result, control = simulation.state, simulation.state.result, simulation.state.control
+        taken = rule.fitted(target - state.t, control.small)
         wanted, whole = wanted or rule.wanted(taken), whole or taken
         try:
             new, report = simulation.advanced(taken)
         except StepFailed as failed:
-            cut = rule.cut(taken, result)
-            left = _has_left(failed, rule, taken, result)
+            cut, counted = rule.cut(taken, control), replace(result, cuts=result.cuts + 1)
+            left = _has_left(failed, rule, taken, state)
             if not left and cut.small >= rule.least(wanted, state.t):
-                _note(simulation, cut)
+                _note(simulation, counted, cut)
                 tell, more = (warn, "; others: messages of level INFO") if aloud and not result.cuts else (log, "")
                 tell(comm, "t = %g s: step cut to %.3g s: %s%s", state.t, taken / 2, failed, more)
                 continue
             if (found := _by_euler(simulation, whole, failed)) is None:
-                tried = result if left else _note(simulation, replace(cut, small=taken))
+                tried = result if left else _note(simulation, counted, replace(cut, small=taken))
                 raise GaveUp(_why(state.t, taken, failed), tried, failed.history) from failed
             taken, (new, report) = whole, found
-        known, result = result, measured(result, report)
-        if (shrinks := rule.refused(taken, report, result)) < 1:
+        now = measured(control, report, result)
+        if (shrinks := rule.refused(taken, report, now)) < 1:
             small = wanted = taken * shrinks
             if state.t + small == state.t:
                 why = f"gave up at t = {state.t:g} s: no step is short enough for rtol = {rule.rtol:g}"
-                raise GaveUp(why, known, report.history)
-            _note(simulation, replace(known, rejected=known.rejected + 1, small=small))
+                raise GaveUp(why, result, report.history)
+            _note(simulation, replace(result, rejected=result.rejected + 1), replace(control, small=small))
             continue
-        grown = rule.grown(taken, report, result, failed=taken < 0.99 * wanted)
-        first = 0.0 if new.stays else report.first / taken
-        simulation.state = replace(new, result=grown.after(report, first))
-        if not rule.by_error and grown.small > result.small:
+        grown = rule.grown(taken, report, now, failed=taken < 0.99 * wanted)
+        grown = replace(grown, first=0.0 if new.stays else report.first / taken)
+        simulation.state = replace(new, result=result.after(report), control=grown)
+        if not rule.by_error and grown.small > control.small:
             log(comm, "t = %g s: step grows to %.3g s", new.t, grown.small)
         return
 
@@ -325,11 +327,11 @@ def _by_euler(simulation: Simulated, dt: float, failed: StepFailed) -> tuple[Sta
     return found
 
 
-def _has_left(failed: StepFailed, rule: StepSize, taken: float, result: Result) -> bool:
+def _has_left(failed: StepFailed, rule: StepSize, taken: float, state: State) -> bool:
     """Return whether points leave the grid in a step that is exact enough: shorter ones would only lead there."""
     if not isinstance(failed, LeftGrid) or failed.report is None:
         return False
-    return rule.refused(taken, failed.report, measured(result, failed.report)) == 1
+    return rule.refused(taken, failed.report, measured(state.control, failed.report, state.result)) == 1
 
 
 def _why(t: float, small: float, failed: StepFailed) -> str:
@@ -342,24 +344,20 @@ def _why(t: float, small: float, failed: StepFailed) -> str:
 
 def _row(simulation: Simulated, probes: Probes | None) -> Row:
     """Return what the histories hold of the present state."""
-    scene, points = simulation.scene, simulation.state.points
-    comm, out, wet = scene.grid.comm, {}, scene.fluid is not None
+    scene, state = simulation.scene, simulation.state
+    comm, d, points, wet = scene.grid.comm, scene.grid.dim, state.points, scene.fluid is not None
+    out = {"displacement": np.zeros((0, d)), "position": np.zeros((0, d)), "tools": state.tool_forces}
     if wet:
         ends = comm.allgather((points.pressure.min(initial=np.inf), points.pressure.max(initial=-np.inf)))
-        out["pressure"] = (min(e[0] for e in ends), max(e[1] for e in ends))
+        out["pressure"] = np.array([min(e[0] for e in ends), max(e[1] for e in ends)])
     if probes is not None:
         out |= {name: getattr(probes, name)(points, comm) for name in ("displacement", "position")}
     if probes is not None and wet:
-        out["probe_pressure"] = probe_pressures(scene, simulation.state, probes)
+        out["probe_pressure"] = probe_pressures(scene, state, probes)
     if probes is not None and probes.stressed:
-        out["probe_stress"] = probe_stresses(scene, simulation.state, probes)
-    if len(simulation.state.tool_forces):
-        out["tools"] = simulation.state.tool_forces
-    out |= {name: getattr(simulation.state, name) for name in ("reactions", "walls", "outflows")}
-    for value in out.values():
-        if isinstance(value, np.ndarray):
-            value.flags.writeable = False
-    return Row(simulation.state.t, **out)
+        out["probe_stress"] = probe_stresses(scene, state, probes)
+    out |= {name: getattr(state, name) for name in ("reactions", "walls", "outflows")}
+    return Row(state.t, **out)
 
 
 def _measured(simulation: Simulated) -> Result:

@@ -5,68 +5,52 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.report import Report
 from mpm_dolfinx.grid.grid import SIDES
-
-
-class Row(NamedTuple):
-    """What the histories hold of an output time; None where nothing is asked for, or there is no fluid.
-
-    t, s; displacement (m, d), m, and present position (m, d), m, of the m probes; pressure: least and largest on the
-    points, Pa; probe_pressure (m,), Pa, and probe_stress (m, 3, 3), Pa: pore pressure and effective stress, tension
-    positive, at the places of the probes, see `probe_fields`; tools (k, d + 1) or (k, 6), N and N m: forces and
-    moments of tools, then of contacts, on the bodies; reactions (displacements, d), walls (2 d, d), N, and outflows
-    (drained sides, then inflows), m^3/s: as the simulation's `reactions`, `wall_reactions` and `outflows`.
-    """
-
-    t: float
-    displacement: NDArray[np.float64] | None = None
-    pressure: tuple[float, float] | None = None
-    position: NDArray[np.float64] | None = None
-    probe_pressure: NDArray[np.float64] | None = None
-    probe_stress: NDArray[np.float64] | None = None
-    tools: NDArray[np.float64] | None = None
-    reactions: NDArray[np.float64] | None = None
-    walls: NDArray[np.float64] | None = None
-    outflows: NDArray[np.float64] | None = None
+from mpm_dolfinx.stepping.histories import Row, Rows
 
 
 @dataclass(frozen=True)
 class Result:
-    """Histories of a run, and where its time loop is; one row an output time, the start included.
+    """Histories of a run; one row an output time, the start included.
 
-    rows: what is recorded at the output times, see `Row`; each column is a property too.  Of
-    the steps so far: steps, newton, coupling (iterations), balance and residual (worst, relative), cuts (for want of
-    convergence), rejected (for their error), change (largest of the pressures since the run began, Pa), rederived
-    (domains that had folded), wall (s), and profile: seconds of each part of the run on this process, from dolfinx's
-    timers.  points: material points; memory: peak of all processes, libraries included, MB; imbalance: the most that
-    one of several processes has over their mean, at the end of the run.
-    dt: output interval, s, 0 without one; small: the step to try next, s; converged: the end has been reached; first:
-    see `Report`, of the last step over its length where the grid is reset, Pa/s; waits, kept: see `StepSize.grown`.
+    Histories are arrays (n, ...) of n output times, which cannot be written into.  Where nothing was asked for they
+    have no entries along one of their axes: (n, 0, d) without probes.
+
+    Parameters
+    ----------
+    rows
+        What is recorded at the output times, see `Row`.
+    steps, newton, coupling, cuts, rejected
+        Numbers so far: steps, iterations, steps cut for want of convergence, and refused for their error.
+    rederived
+        Domains that had folded, and were derived from F.
+    balance, residual
+        Worst relative errors so far of the fluid's balance, and of the two problems.
+    wall, profile
+        Seconds, of the whole run and of each part of it on this process, from dolfinx's timers.
+    converged
+        Whether the end has been reached.
+    points, memory, imbalance
+        At the end of the run: material points, the peak of all processes, libraries included, MB, and the most that
+        one of several processes has over their mean.
     """
 
-    rows: tuple[Row, ...] = field(default=(), repr=False)
+    rows: Rows = field(default_factory=Rows, repr=False)
     """One an output time."""
     steps: int = 0
     newton: int = 0
     coupling: int = 0
     cuts: int = 0
     rejected: int = 0
-    change: float = 0.0
-    first: float = 0.0
     rederived: int = 0
     balance: float = 0.0
     residual: float = 0.0
     wall: float = 0.0
-    dt: float = 0.0
-    small: float = 0.0
-    waits: int = 0
-    kept: int = 1
     converged: bool = False
     profile: dict[str, float] = field(default_factory=dict, repr=False)
     points: int = 0
@@ -74,72 +58,69 @@ class Result:
     imbalance: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self):
-        object.__setattr__(self, "rows", tuple(self.rows))  # a kept one does not grow with the run
+        if not isinstance(self.rows, Rows):
+            object.__setattr__(self, "rows", Rows(self.rows))
 
     @property
-    def t(self) -> list[float]:
-        """Output times, s."""
-        return self.column("t")
+    def t(self) -> NDArray[np.float64]:
+        """Output times (n,), s."""
+        return self.rows.column("t")
 
     @property
-    def displacement(self) -> list[NDArray[np.float64]]:
-        """Displacements (m, d) of the probes at the output times, m."""
-        return self.column("displacement")
+    def displacement(self) -> NDArray[np.float64]:
+        """Displacements (n, m, d) of the probes, m."""
+        return self.rows.column("displacement")
 
     @property
-    def position(self) -> list[NDArray[np.float64]]:
-        """Positions (m, d) of the probes at the output times, m."""
-        return self.column("position")
+    def position(self) -> NDArray[np.float64]:
+        """Positions (n, m, d) of the probes, m."""
+        return self.rows.column("position")
 
     @property
-    def probe_pressure(self) -> list[NDArray[np.float64]]:
-        """Pore pressures (m,) at the probes at the output times, Pa."""
-        return self.column("probe_pressure")
+    def pressure(self) -> NDArray[np.float64]:
+        """Least and largest pore pressure (n, 2) on the points, Pa; (n, 0) without fluid."""
+        return self.rows.column("pressure")
 
     @property
-    def probe_stress(self) -> list[NDArray[np.float64]]:
-        """Effective stresses (m, 3, 3) at the probes at the output times, Pa, tension positive."""
-        return self.column("probe_stress")
+    def probe_pressure(self) -> NDArray[np.float64]:
+        """Pore pressures (n, m) at the probes, Pa; (n, 0) without fluid."""
+        return self.rows.column("probe_pressure")
 
     @property
-    def tools(self) -> list[NDArray[np.float64]]:
-        """Forces and moments (k, d + 1), in 3D (k, 6), of tools on the bodies at the output times, N and N m."""
-        return self.column("tools")
+    def probe_stress(self) -> NDArray[np.float64]:
+        """Effective stresses (n, m, 3, 3) at the probes, Pa, tension positive; (n, 0, 3, 3) where not asked for."""
+        return self.rows.column("probe_stress")
+
+    @property
+    def tools(self) -> NDArray[np.float64]:
+        """Forces and moments (n, k, d + 1), in 3D (n, k, 6), of tools on the bodies, N and N m."""
+        return self.rows.column("tools")
 
     @property
     def reactions(self) -> NDArray[np.float64]:
-        """Forces (times, displacements, d) of the given displacements on the bodies at the output times, N.
+        """Forces (n, displacements, d) of the given displacements on the bodies, N.
 
         Where stages have different numbers of them, the array has room for the most, and nan where there is none.
         """
-        return _stacked(self.column("reactions"))
+        return self.rows.column("reactions")
 
     @property
     def wall_reactions(self) -> dict[str, NDArray[np.float64]]:
-        """Forces (times, d) of each wall of the grid on the bodies at the output times, N; see `Simulation`."""
-        walls = _stacked(self.column("walls"))
-        return {name: walls[:, i] for i, name in enumerate(SIDES[walls.shape[2]])} if len(walls) else {}
+        """Forces (n, d) of each wall of the grid on the bodies, N; see `Simulation`."""
+        walls = self.rows.column("walls")
+        return {name: walls[:, i] for i, name in enumerate(SIDES.get(walls.shape[2], ()))}
 
     @property
     def outflows(self) -> NDArray[np.float64]:
-        """What leaves (times, drained sides, then inflows) at the output times, m^3/s; see `reactions` for stages."""
-        return _stacked(self.column("outflows"))
-
-    @property
-    def pressure(self) -> list[tuple[float, float]]:
-        """Least and largest pore pressure on the points at the output times, Pa."""
-        return self.column("pressure")
-
-    def column(self, name: str) -> list:
-        """Return one quantity of the rows, where it is recorded."""
-        return [value for row in self.rows if (value := getattr(row, name)) is not None]
+        """What leaves (n, drained sides, then inflows), m^3/s; see `reactions` for stages."""
+        return self.rows.column("outflows")
 
     def more(self, row: Row) -> Result:
         """Return the histories with one more output time."""
-        return replace(self, rows=(*self.rows, row))
+        return replace(self, rows=self.rows.more(row))
 
-    def after(self, report: Report, first: float = 0.0) -> Result:
-        """Return the histories after one more step; first: see `Result`."""
+    def after(self, report: Report) -> Result:
+        """Return the histories after one more step."""
         return replace(
             self,
             steps=self.steps + 1,
@@ -148,7 +129,6 @@ class Result:
             rederived=self.rederived + report.rederived,
             balance=max(self.balance, report.balance),
             residual=max(self.residual, *report.history[-1]),
-            first=first,
         )
 
     def shares(self) -> str:
@@ -180,10 +160,3 @@ class GaveUp(RuntimeError):
     def __init__(self, message: str, result: Result, history: Sequence[tuple[float, float]] = ()):
         super().__init__(message)
         self.result, self.history = result, history
-
-
-def _stacked(values: list[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """Return arrays (n, ...) one above the other, filled up with nan to the longest n."""
-    most = max(map(len, values), default=0)
-    filled = [np.pad(v, [(0, most - len(v)), *[(0, 0)] * (v.ndim - 1)], constant_values=np.nan) for v in values]
-    return np.stack(filled) if values else np.zeros((0, 0))
