@@ -42,6 +42,7 @@ from mpm_dolfinx.materials.skeleton import (
     unsaturated,
 )
 from mpm_dolfinx.materials.softening import SofteningDruckerPrager
+from mpm_dolfinx.parallel.messages import ConditionWarning, ResolutionWarning, ResultWarning, set_log_level
 from mpm_dolfinx.probing.probes import probes
 from mpm_dolfinx.simulation.simulation import Simulation
 from mpm_dolfinx.simulation.strength_reduction import Safety, factor_of_safety
@@ -56,6 +57,7 @@ __all__ = [
     "K0",
     "Ball",
     "Checkpoint",
+    "ConditionWarning",
     "Cone",
     "Contact",
     "Convex",
@@ -78,7 +80,9 @@ __all__ = [
     "NotConverged",
     "OnSide",
     "Pressure",
+    "ResolutionWarning",
     "Result",
+    "ResultWarning",
     "RigidPlate",
     "Safety",
     "Simulation",
@@ -99,6 +103,7 @@ __all__ = [
     "polygon",
     "probes",
     "resume",
+    "set_log_level",
     "shape",
     "unsaturated",
     "water",

@@ -9,7 +9,7 @@ import numpy as np
 
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.grid.grid import Grid
-from mpm_dolfinx.parallel.messages import warn
+from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 
 ON = 1e-6  # cells: how near to the axis what touches it lies
 
@@ -30,7 +30,7 @@ def check_axisymmetry(grid: Grid, bodies: Sequence[Body], quadrature: str) -> No
 
 
 def _warn_narrow_hole(grid: Grid, bodies: Sequence[Body]) -> None:
-    """Log a warning of a hole about the axis that ends within the cells beside it, whose nodes on the axis are held."""
+    """Warn of a hole about the axis that ends within the cells beside it, whose nodes on the axis are held."""
     if not grid.has_axis:
         return
     x = np.concatenate([body.corners() for body in bodies])
@@ -45,4 +45,4 @@ def _warn_narrow_hole(grid: Grid, bodies: Sequence[Body]) -> None:
         k = hole[inner[hole].argmin()]
         what = "a hole about the axis of radius %.3g m, at %s, is narrower than a cell of %.3g m: its side moves as a "
         what += "solid core does; take smaller cells, or a grid that begins at a radius > 0"
-        warn(grid.comm, what, inner[k], x[k].mean(axis=0), grid.h[0])
+        warn(grid.comm, ResolutionWarning, what, inner[k], x[k].mean(axis=0), grid.h[0])

@@ -45,7 +45,7 @@ from mpm_dolfinx.mechanics.held_cells import SAME, HeldCells, HeldPoints
 from mpm_dolfinx.mechanics.rigid_motion import turned
 from mpm_dolfinx.mechanics.side_forms import SideData, SideForms
 from mpm_dolfinx.parallel.exchange import Exchange, first
-from mpm_dolfinx.parallel.messages import warn
+from mpm_dolfinx.parallel.messages import ConditionWarning, warn
 from mpm_dolfinx.points.material_points import MaterialPoints
 
 
@@ -354,12 +354,12 @@ class MechanicalBoundary:
     def _warn(
         self, held: HeldCells, row: NDArray[np.int64], axis: NDArray[np.int64], force: NDArray[np.float64]
     ) -> None:
-        """Log a warning, once a condition, of forces that no change of the body's stress balances."""
+        """Warn, once a condition, of forces that no change of the body's stress balances."""
         for number, x in held.beyond(row, axis, force, self._warned):
-            self._warned.add(number)
             why = "its reaction is an artefact; does something else hold it, or is the step too large?"
             what = "%s: not where it is to be at %s: %s"
-            warn(self.grid.comm, what, line(self.holds[number][0]), x, why)
+            warn(self.grid.comm, ConditionWarning, what, line(self.holds[number][0]), x, why)
+            self._warned.add(number)
 
     def under_held(
         self, ids: NDArray[np.int64], tracked: NDArray[np.float64], volume: NDArray[np.float64], corners: NDArray

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from inspect import signature
+from logging import INFO, WARNING
 from math import inf
 from typing import Any, Protocol
 
@@ -23,7 +24,7 @@ from mpm_dolfinx.base.errors import LeftGrid, StepFailed
 from mpm_dolfinx.base.report import Report
 from mpm_dolfinx.base.validation import functions, instance, line
 from mpm_dolfinx.parallel.exchange import first
-from mpm_dolfinx.parallel.messages import log, warn
+from mpm_dolfinx.parallel.messages import ResolutionWarning, log, logger, warn
 from mpm_dolfinx.probing.probe_fields import probe_pressures, probe_stresses
 from mpm_dolfinx.probing.probes import Probes
 from mpm_dolfinx.simulation.step_size import StepSize, Times, measured, step_rule
@@ -161,7 +162,8 @@ def run(
             if checkpoint is not None:
                 checkpoint(simulation)
 
-    with bar, nullcontext() if bar.disable else logging_redirect_tqdm():  # messages above the bar, not into it
+    # messages above the bar, not into it
+    with bar, nullcontext() if bar.disable else logging_redirect_tqdm([logger] if logger.handlers else None):
         for target in targets:
             while not rule.ended(simulation.state.t, target, simulation.state.control):
                 before = simulation.state.t
@@ -288,8 +290,9 @@ def _advance(simulation: Simulated, rule: StepSize, target: float, aloud: bool) 
             left = _has_left(failed, rule, taken, state)
             if not left and cut.small >= rule.least(wanted, state.t):
                 _note(simulation, counted, cut)
-                tell, more = (warn, "; others: messages of level INFO") if aloud and not result.cuts else (log, "")
-                tell(comm, "t = %g s: step cut to %.3g s: %s%s", state.t, taken / 2, failed, more)
+                loud = aloud and not result.cuts
+                level, more = (WARNING, "; others: messages of level INFO") if loud else (INFO, "")
+                log(comm, "t = %g s: step cut to %.3g s: %s%s", state.t, taken / 2, failed, more, level=level)
                 continue
             if (found := _by_euler(simulation, whole, failed)) is None:
                 tried = result if left else _note(simulation, counted, replace(cut, small=taken))
@@ -323,7 +326,7 @@ def _by_euler(simulation: Simulated, dt: float, failed: StepFailed) -> tuple[Sta
     except StepFailed:
         return None
     what = "t = %g s: a step of %.3g s by backward Euler, of first order: none by %s has converged: %s"
-    warn(simulation.scene.grid.comm, what, simulation.state.t, dt, simulation.scene.method, failed)
+    warn(simulation.scene.grid.comm, ResolutionWarning, what, simulation.state.t, dt, simulation.scene.method, failed)
     return found
 
 

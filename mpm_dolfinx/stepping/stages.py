@@ -20,7 +20,7 @@ from mpm_dolfinx.conditions.unit_weights import WEIGHS, warn_units
 from mpm_dolfinx.contact.cell_contact import let_go
 from mpm_dolfinx.domains.pressure_transport import at_start
 from mpm_dolfinx.grid.grid import sum_by
-from mpm_dolfinx.parallel.messages import warn
+from mpm_dolfinx.parallel.messages import ConditionWarning, warn
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.stepping.initial_state import pieces_at_start
 from mpm_dolfinx.stepping.scene import Scene
@@ -109,7 +109,7 @@ def _stage(scene: Scene, conditions: Mapping[str, Any], present: Sequence[bool],
 
 
 def _warn_weights(scene: Scene, begun: Stage, given: Mapping[str, Any]) -> None:
-    """Log a warning for each level of water, given ones and those on sides, that is not as heavy as the pore fluid.
+    """Warn for each level of water, given ones and those on sides, that is not as heavy as the pore fluid.
 
     In a dry scene for each that is as heavy as water is under another gravity.
     """
@@ -127,11 +127,11 @@ def _warn_weights(scene: Scene, begun: Stage, given: Mapping[str, Any]) -> None:
     for name, weight in sorted(weights):
         if abs(weight - own) > WEIGHS * max(weight, own):
             what = "%s: unit_weight = %.6g N/m^3, but that of %s, its density times gravity, is %.6g"
-            warn(scene.grid.comm, f"{what}: at one level they are not at rest", name, weight, of, own)
+            warn(scene.grid.comm, ConditionWarning, f"{what}: at one level they are not at rest", name, weight, of, own)
 
 
 def _warn_moved_on(scene: Scene, before: Stage, begun: Stage, kept: Sequence[str]) -> None:
-    """Log a warning for each condition that was not given anew and acts on what an excavation has laid bare."""
+    """Warn for each condition that was not given anew and acts on what an excavation has laid bare."""
     stop = np.cumsum([len(body) for body in scene.bodies])
     for condition in (condition for name in kept for condition in begun.conditions[name]):
         was, now = (surface(scene.bodies, condition.side, condition.region, s.present) for s in (before, begun))
@@ -141,7 +141,15 @@ def _warn_moved_on(scene: Scene, before: Stage, begun: Stage, kept: Sequence[str
         if len(new):
             area = bare[np.unique(now.id[new])].sum()
             what = "stage: remove: %s was not given anew and now also acts on %.3g m^%d that were laid bare, from %s on"
-            warn(scene.grid.comm, what, line(condition), area, scene.grid.dim - 1, now.X[new[0]].mean(axis=0))
+            warn(
+                scene.grid.comm,
+                ConditionWarning,
+                what,
+                line(condition),
+                area,
+                scene.grid.dim - 1,
+                now.X[new[0]].mean(axis=0),
+            )
 
 
 def _filled(
