@@ -9,7 +9,7 @@ import pytest
 from helpers import column
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.stepping.histories import Row, Rows
+from mpm_dolfinx.base.histories import Row, Rows
 
 
 def rows(n, m=3):

@@ -129,7 +129,7 @@ def test_a_step_depends_on_no_step_before(monkeypatch):
 def test_sealed_bodies_in_which_hardly_any_fluid_changes_places_converge(bulk, load):
     """With scales that differ as much as forces and this fluid, rounding left more than steps may leave."""
     press = mpm.Traction("top", lambda t: (0, -load * t**2))
-    result = column(cells=4, tractions=[press], fluid=mpm.Fluid(bulk=bulk)).run(1.0, 0.01, progress=False)
+    result = column(cells=4, conditions=[press], fluid=mpm.Fluid(bulk=bulk)).run(1.0, 0.01, progress=False)
     assert result.cuts == 0 and result.residual <= 1e-8 and result.balance <= 1e-8
 
 
@@ -160,10 +160,10 @@ def test_coarse_unknowns_do_not_depend_on_one_another(cells, nodal, wall):
     """Else coarse matrices were singular."""
     index = indices(cells, nodal)
     places = np.column_stack([index, np.zeros(len(index), dtype=np.int64)])
-    fixed = np.zeros(len(index), dtype=bool)
+    walls = np.zeros(len(index), dtype=bool)
     if nodal and wall is not None:
-        fixed = index[:, int(wall == "bottom")] == 0
-    places, held = places[~fixed], places[fixed]
+        walls = index[:, int(wall == "bottom")] == 0
+    places, held = places[~walls], places[walls]
     whole = np.eye(len(places))
     for _ in range(3):
         Q, places, held = interpolation(MPI.COMM_SELF, places, held, nodal)

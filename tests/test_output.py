@@ -151,10 +151,10 @@ def test_fields_of_the_grid_are_read_back_as_they_were(written):
 def test_all_times_are_in_one_file(tmp_path, capsys):
     """Also where a body has been dug away between two of them, and without the h5py that it needs."""
     with_h5py()
-    grid = mpm.Grid([1.4, 1.2], [7, 8], [0, -0.4])
+    grid = mpm.Grid([0, -0.4], [1.4, 1.2], [7, 8])
     bodies = [mpm.box(grid, [0, y], [1, y + 0.4]) for y in (0, 0.4)]
     loads = [mpm.Traction("right", (0, -1e4))]
-    scene = mpm.Simulation(grid, bodies, [mpm.Hencky(1e6, 1e6)], fixed={"left": "xy"}, tractions=loads)
+    scene = mpm.Simulation(grid, bodies, [mpm.Hencky(1e6, 1e6)], walls={"left": "xy"}, conditions=loads)
     scene.run(1, 1, observe=mpm.Writer(scene, tmp_path))
     scene.stage(remove=[1])
     after = scene.run(2, 1, observe=mpm.Writer(scene, tmp_path))
@@ -239,7 +239,7 @@ def test_forces_of_displacements_that_a_stage_sets_are_not_known_before_its_firs
     simulation.run(0.5, 0.25, observe=mpm.Writer(simulation, tmp_path / "kept"))
     assert np.array_equal(reactions(tmp_path / "kept" / "history.csv")[0], before)
     sides = [mpm.Displacement(side, (0, 0)) for side in ("left", "right")]
-    simulation.stage(displacements=sides, reset_displacement=True)
+    simulation.stage(conditions=sides, reset_displacement=True)
     simulation.run(0.75, 0.25, observe=mpm.Writer(simulation, tmp_path / "set"))
     found = reactions(tmp_path / "set" / "history.csv")
     assert np.isnan(found[0]).all() and np.isfinite(found[1]).all()
@@ -388,11 +388,11 @@ def test_points_are_shown_in_one_line_of_numbers():
 
 def test_tools_are_written_where_they_are(tmp_path):
     """A disc that goes down, and a plate beside the grid, of which nothing is to be seen."""
-    grid = mpm.Grid([1.0, 1.0], [8, 8])
+    grid = mpm.Grid([0, 0], [1.0, 1.0], [8, 8])
     disc = mpm.Tool(mpm.Ball((0.5, 0.75), 0.25), displacement=lambda t: (0, -0.06 * t))
     walls = {"left": "x", "right": "x", "bottom": "xy"}
     soil, beside = mpm.Hencky(bulk=1e6, shear=6e5), mpm.Tool(mpm.HalfSpace((0, 1.5), (0, -1)))
-    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 0.5])], [soil], fixed=walls, tools=[disc, beside])
+    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 0.5])], [soil], walls=walls, conditions=[disc, beside])
     s.run(1.0, 1.0, observe=mpm.Writer(s, tmp_path))
     files = index(tmp_path / "tools.pvd")
     assert list(files) == [0.0, 1.0]
@@ -405,7 +405,7 @@ def test_tools_are_written_where_they_are(tmp_path):
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_tools_are_drawn_up_to_their_surface(dim):
-    grid, up = mpm.Grid([1.0] * dim, [8] * dim), np.eye(dim)[-1]
+    grid, up = mpm.Grid([0] * dim, [1.0] * dim, [8] * dim), np.eye(dim)[-1]
     edges = np.array(np.meshgrid(*[[0.0, 0.4]] * dim)).reshape(dim, -1).T
     drawn = mpm.Tool(mpm.Convex(edges), displacement=0.33 * up).drawn(grid, 0.0)
     assert drawn.min(axis=(0, 1)) == pytest.approx(0.33 * up, abs=1e-9)

@@ -36,7 +36,7 @@ def cut_beam():
 
 def pressed_column():
     plates, outlets = [mpm.RigidPlate("top", lambda t: 3e4 * t)], [mpm.Drained("top")]
-    simulation = column(width=3, offset=0.3, plates=plates, drained=outlets, gravity=lambda t: (0, -50 * t))
+    simulation = column(width=3, offset=0.3, conditions=[*plates, *outlets], gravity=lambda t: (0, -50 * t))
     return simulation, None
 
 
@@ -50,17 +50,17 @@ def plastic_column():
     }
     sand = mpm.DruckerPrager(bulk=2e7, shear=1e7, hardening=5e6, **options)
     push = mpm.Displacement("top", lambda t, X: (0, -1.5 * t), "y")
-    simulation = column(width=3, cells=6, material=sand, displacements=[push], drained=[mpm.Drained("top")])
+    simulation = column(width=3, cells=6, material=sand, conditions=[push, mpm.Drained("top")])
     return simulation, None
 
 
 def block(fluid=None):
-    grid = mpm.Grid([0.6, 0.4, 0.5], [3, 2, 3])
+    grid = mpm.Grid([0, 0, 0], [0.6, 0.4, 0.5], [3, 2, 3])
     body = mpm.box(grid, [0.1, 0, 0], [0.5, 0.4, 0.35])
     load = mpm.Traction("top", lambda t: (2e6 * t, 0, -4e6 * t))
-    fixed = {"bottom": "xyz", "front": "y", "back": "y"}
+    walls = {"bottom": "xyz", "front": "y", "back": "y"}
     rubber = mpm.NeoHookean(1e7, 5e6, conductivity=1e-4)
-    simulation = mpm.Simulation(grid, [body], [rubber], fixed=fixed, tractions=[load], fluid=fluid)
+    simulation = mpm.Simulation(grid, [body], [rubber], walls=walls, conditions=[load], fluid=fluid)
     return simulation, mpm.probes([body], [[0.5, 0.4, 0.35]])
 
 

@@ -20,8 +20,8 @@ WALLS = {"left": "x", "right": "x", "bottom": "xy"}
 
 def overlapping():
     """Return a scene of two bodies that have come to lie in each other, which its first step finds."""
-    grid = mpm.Grid([1, 1], [10, 10])
-    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 0.3]), mpm.box(grid, [0, 0.5], [1, 0.8])], [SOFT], fixed=WALLS)
+    grid = mpm.Grid([0, 0], [1, 1], [10, 10])
+    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 0.3]), mpm.box(grid, [0, 0.5], [1, 0.8])], [SOFT], walls=WALLS)
     down = np.where(s.points.id < len(s.bodies[0]), 0.0, 0.3)[:, None] * [0, 1]
     moved = replace(s.points, corners=s.points.corners - down[:, None], x=s.points.x - down)
     s.state = replace(s.state, points=moved)
@@ -29,14 +29,14 @@ def overlapping():
 
 
 def thin():
-    grid = mpm.Grid([1.0, 1.0], [10, 10])
-    return mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 0.1], per_cell=1)], [SOFT], fixed={"left": "xy"})
+    grid = mpm.Grid([0, 0], [1.0, 1.0], [10, 10])
+    return mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 0.1], per_cell=1)], [SOFT], walls={"left": "xy"})
 
 
 def sea_water():
-    grid, (load, head) = mpm.Grid([0.5, 2.0], [2, 8]), mpm.water("top", 1.5, unit_weight=9810.0)
-    water = {"tractions": [load], "drained": [head], "gravity": (0, -9.81), "fluid": mpm.Fluid(density=1025.0)}
-    return mpm.Simulation(grid, [mpm.box(grid, [0, 0], [0.5, 1.0])], [SOFT], fixed=WALLS, **water)
+    grid, (load, head) = mpm.Grid([0, 0], [0.5, 2.0], [2, 8]), mpm.water("top", 1.5, unit_weight=9810.0)
+    water = {"conditions": [load, head], "gravity": (0, -9.81), "fluid": mpm.Fluid(density=1025.0)}
+    return mpm.Simulation(grid, [mpm.box(grid, [0, 0], [0.5, 1.0])], [SOFT], walls=WALLS, **water)
 
 
 CASES = {

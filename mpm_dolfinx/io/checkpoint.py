@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mpm_dolfinx.base.histories import Row, Rows
 from mpm_dolfinx.base.validation import instance, line, numbers, on_disk, path, whole
 from mpm_dolfinx.domains.pressure_transport import PiecePressures
 from mpm_dolfinx.grid.grid import Grid
@@ -26,12 +27,11 @@ from mpm_dolfinx.parallel.exchange import at_root
 from mpm_dolfinx.parallel.messages import log
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.simulation.simulation import Simulation
-from mpm_dolfinx.stepping.histories import Row, Rows
 from mpm_dolfinx.stepping.result import Result
 from mpm_dolfinx.stepping.state import State, Stay
 from mpm_dolfinx.stepping.step_control import StepControl
 
-FORMAT, VERSION = "mpm_dolfinx checkpoint", 10
+FORMAT, VERSION = "mpm_dolfinx checkpoint", 10  # Source: the format of the files
 FOREIGN = "no checkpoint of mpm_dolfinx, must be one"
 ZIP = b"PK\3\4"  # how numpy's archives begin
 ACTING = ("reactions", "walls", "outflows", "tool_forces", "tool_travel")
@@ -198,8 +198,10 @@ def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulat
             raise ValueError(f"has forces of {len(forces)} tools")
         if ways.shape != now.tool_travel.shape or not np.isfinite(ways).all():
             raise ValueError(f"has ways of {len(ways)} tools, or not finite")
-        start = note["t"], points, transported, stay, note["resets"], *acting, None, note["begins"]
-        return State(*start, *nodal, result, control)
+        kept = {name: note[name] for name in ("t", "resets", "begins")}
+        kept |= dict(zip(NODAL, nodal, strict=True)) | dict(zip(ACTING, acting, strict=True))
+        kept |= {"points": points, "transported": transported, "stay": stay, "stage": None}
+        return State(**kept, result=result, control=control)
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         raise ValueError(f"{damaged} ({line(error)}), must be a whole checkpoint") from error
 

@@ -27,6 +27,7 @@ from dolfinx import fem, io
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.validation import flag, instance, line_of, on_disk, path, whole
+from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.io.units import text
 from mpm_dolfinx.parallel.exchange import at_root, to_root
 from mpm_dolfinx.points.material_points import MaterialPoints
@@ -171,7 +172,8 @@ class Writer:
 
     def _write_grid(self, simulation: Simulation) -> None:
         comm, stem = simulation.grid.comm, self._grid.next
-        _write_fields(comm, stem.with_suffix(".pvd"), _grid_fields(simulation), simulation.t)
+        with _true_places(simulation.grid):
+            _write_fields(comm, stem.with_suffix(".pvd"), _grid_fields(simulation), simulation.t)
         if comm.rank == 0:  # our index names the pieces themselves: 0.5's own names each of them once a function
             stem.with_suffix(".pvd").unlink(missing_ok=True)
             stem.with_name(f"{stem.name}000000.pvtu").unlink(missing_ok=True)
@@ -306,6 +308,18 @@ def _grid_fields(simulation: Simulation) -> list[fem.Function]:
         out[-1].x.array[cells.cell] = rows
         out[-1].x.scatter_forward()
     return out
+
+
+@contextmanager
+def _true_places(grid: Grid) -> Iterator[None]:
+    """Give the mesh of a grid the true places of its nodes, for as long as it is written."""
+    x = grid.mesh.geometry.x
+    own = x.copy()
+    x[:, : grid.dim] += grid.base
+    try:
+        yield
+    finally:
+        x[:] = own
 
 
 def _write_fields(comm: MPI.Intracomm, file: Path, fields: list[fem.Function], t: float) -> None:

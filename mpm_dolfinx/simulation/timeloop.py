@@ -21,14 +21,15 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 
 from mpm_dolfinx.base import _compat
 from mpm_dolfinx.base.errors import LeftGrid, StepFailed
+from mpm_dolfinx.base.histories import Row, Rows
 from mpm_dolfinx.base.report import Report
+from mpm_dolfinx.base.tolerances import SAME
 from mpm_dolfinx.base.validation import functions, instance, line
 from mpm_dolfinx.parallel.exchange import first
 from mpm_dolfinx.parallel.messages import ResolutionWarning, log, logger, warn
 from mpm_dolfinx.probing.probe_fields import probe_pressures, probe_stresses
 from mpm_dolfinx.probing.probes import Probes
 from mpm_dolfinx.simulation.step_size import StepSize, Times, measured, step_rule
-from mpm_dolfinx.stepping.histories import Row, Rows
 from mpm_dolfinx.stepping.result import GaveUp, Result
 from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.state import State
@@ -306,7 +307,7 @@ def _advance(simulation: Simulated, rule: StepSize, target: float, aloud: bool) 
                 raise GaveUp(why, result, report.history)
             _note(simulation, replace(result, rejected=result.rejected + 1), replace(control, small=small))
             continue
-        grown = rule.grown(taken, report, now, failed=taken < 0.99 * wanted)
+        grown = rule.grown(taken, report, now, failed=taken < (1 - SAME) * wanted)
         grown = replace(grown, first=0.0 if new.stays else report.first / taken)
         simulation.state = replace(new, result=result.after(report), control=grown)
         if not rule.by_error and grown.small > control.small:
@@ -354,7 +355,8 @@ def _row(simulation: Simulated, probes: Probes | None) -> Row:
         ends = comm.allgather((points.pressure.min(initial=np.inf), points.pressure.max(initial=-np.inf)))
         out["pressure"] = np.array([min(e[0] for e in ends), max(e[1] for e in ends)])
     if probes is not None:
-        out |= {name: getattr(probes, name)(points, comm) for name in ("displacement", "position")}
+        out["displacement"] = probes.displacement(points, comm)
+        out["position"] = probes.position(points, comm) + scene.grid.base
     if probes is not None and wet:
         out["probe_pressure"] = probe_pressures(scene, state, probes)
     if probes is not None and probes.stressed:

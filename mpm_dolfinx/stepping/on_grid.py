@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.base.caching import Keyed, Latest
 from mpm_dolfinx.base.fluid_content import mass_potential, pressure_of
+from mpm_dolfinx.base.tolerances import EPSILON, ROUND_OFF
 from mpm_dolfinx.diagnostics.scene_checks import check_held
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.domains.pressure_transport import CellPressures, Reconstruction, share_within, transport
@@ -388,12 +389,11 @@ class Assembled(Keyed):
         It goes with the stiffness of the cells about a node; that of rigid sides and tools with coordinates as well.
         """
         grid, on_grid = self._on_grid.cut.grid, self._on_grid
-        of_cells = 1e-14 * on_grid.stiffness * grid.cell_volume / grid.h.min()
+        of_cells = ROUND_OFF * on_grid.stiffness * grid.cell_volume / grid.h.min()
         if sides.holds is not None:
-            reach = np.abs(np.concatenate([grid.lower, grid.upper])).max()
             held = np.zeros(grid.num_local)
             np.maximum.at(held, sides.holds.cells, sides.holds["stiffness"][:, 0])
-            of_cells = of_cells + 1e-15 * reach * held
+            of_cells = of_cells + 4 * EPSILON * grid.reach * held
         if sides.tools is not None:
             np.maximum.at(of_cells, sides.tools.rows.cell, of_cells[sides.tools.rows.cell] + sides.tools.rounding)
         own = np.flatnonzero(on_grid.active[: grid.num_owned])

@@ -9,9 +9,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from mpm_dolfinx.base.histories import Row, Rows
 from mpm_dolfinx.base.report import Report
 from mpm_dolfinx.grid.grid import SIDES
-from mpm_dolfinx.stepping.histories import Row, Rows
 
 
 @dataclass(frozen=True)
