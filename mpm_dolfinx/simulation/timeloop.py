@@ -29,6 +29,7 @@ from mpm_dolfinx.parallel.exchange import first
 from mpm_dolfinx.parallel.messages import ResolutionWarning, log, logger, warn
 from mpm_dolfinx.probing.probe_fields import probe_pressures, probe_stresses
 from mpm_dolfinx.probing.probes import Probes
+from mpm_dolfinx.simulation.events import Event, Events, Step
 from mpm_dolfinx.simulation.step_size import StepSize, Times, measured, step_rule
 from mpm_dolfinx.stepping.result import GaveUp, Result
 from mpm_dolfinx.stepping.scene import Scene
@@ -74,6 +75,7 @@ def run(
     t_eval: Sequence[float] | None = None,
     first_step: float | None = None,
     max_step: float = inf,
+    until: Event | Sequence[Event] | None = None,
     probes: Probes | None = None,
     observe: Observer | Sequence[Observer] = (),
     checkpoint: Observer | None = None,
@@ -103,6 +105,13 @@ def run(
     first_step, max_step
         With `rtol`: the first step to try, not of a run that goes on, and the longest, s, > 0.  By default the first is
         about the time in which pressures diffuse through a cell, times 20 rtol, or a thousandth of the first output.
+    until
+        Functions of the simulation, or one, that end the run before t_end: where the sign of a number changes within a
+        step, or a truth turns true, such as `lambda s: -s.points.displacement[:, 1].min() - 0.1`.  What is so at the
+        start is no event.  Steps of other lengths find where: the last state is the first one found in which the event
+        has occurred, a thousandth of that step after it at most.  It is an output; `Result.event` says which and when.
+        On several processes all give the same.  Histories that an event has ended are at their end, as at t_end, where
+        a run goes on with them; without `until` it goes on.
     probes
         Particles that are recorded.
     observe
@@ -149,8 +158,9 @@ def run(
     rule = step_rule(times, rtol, first_step, max_step, simulation.scene, simulation.state.points)
     result, control = _histories(simulation, times, rule, probes, after)
     stopwatch, last = _Stopwatch(result), result.rows[-1].t
-    targets = times.after(last)
-    _note(simulation, replace(result, converged=not targets), control)
+    events = Events(simulation, until)
+    targets = [] if until is not None and result.event is not None else times.after(last)
+    _note(simulation, replace(result, converged=not targets, event=None if targets else result.event), control)
     bar = _bar(start, last, times.end, progress and comm.rank == 0)
 
     def output(converged: bool) -> None:
@@ -168,7 +178,9 @@ def run(
         for target in targets:
             while not rule.ended(simulation.state.t, target, simulation.state.control):
                 before = simulation.state.t
-                _advance(simulation, rule, target, progress)
+                if _take_step(simulation, rule, target, progress, events):
+                    output(True)
+                    return _note(simulation, stopwatch.read(_measured(simulation)))
                 there = rule.ended(simulation.state.t, target, simulation.state.control)
                 if times.each and not there:
                     output(False)
@@ -274,15 +286,38 @@ def _timings() -> dict[str, float]:
     return {part: _compat.seconds(f"mpm: {part}") for part in PARTS}
 
 
-def _advance(simulation: Simulated, rule: StepSize, target: float, aloud: bool) -> None:
-    """Take one step towards a time, s, cutting it until it converges and is exact enough.
+def _take_step(simulation: Simulated, rule: StepSize, target: float, aloud: bool, events: Events) -> bool:
+    """Take one step towards a time, s; return whether an event has ended the run in it."""
+    step, new = _advance(simulation, rule, target, aloud)
+    found = events.within(step, new)
+    if found is None:
+        simulation.state = new
+        return False
+    event = found.number, found.new.t
+    new = _accepted(rule, step.start, found.dt, found.new, found.report)
+    simulation.state = replace(new, result=replace(new.result, event=event))
+    return True
+
+
+def _accepted(
+    rule: StepSize, start: State, taken: float, new: State, report: Report, wanted: float | None = None
+) -> State:
+    """Return the state after a step of a length, s, with the histories; wanted: what it should have been, s."""
+    grown = measured(start.control, report, start.result)
+    grown = rule.grown(taken, report, grown, failed=taken < (1 - SAME) * (wanted or taken))
+    grown = replace(grown, first=0.0 if new.stays else report.first / taken)
+    return replace(new, result=start.result.after(report), control=grown)
+
+
+def _advance(simulation: Simulated, rule: StepSize, target: float, aloud: bool) -> tuple[Step, State]:
+    """Return a step towards a time, s, and its end, cut until it converges and is exact enough.
 
     aloud: say of the first cut of a run that there are some.
     """
     comm, wanted, whole = simulation.scene.grid.comm, None, None
     while True:
         state, result, control = simulation.state, simulation.state.result, simulation.state.control
-        taken = rule.fitted(target - state.t, control.small)
+        taken, how = rule.fitted(target - state.t, control.small), ()
         wanted, whole = wanted or rule.wanted(taken), whole or taken
         try:
             new, report = simulation.advanced(taken)
@@ -298,7 +333,7 @@ def _advance(simulation: Simulated, rule: StepSize, target: float, aloud: bool) 
             if (found := _by_euler(simulation, whole, failed)) is None:
                 tried = result if left else _note(simulation, counted, replace(cut, small=taken))
                 raise GaveUp(_why(state.t, taken, failed), tried, failed.history) from failed
-            taken, (new, report) = whole, found
+            taken, how, (new, report) = whole, (EULER,), found
         now = measured(control, report, result)
         if (shrinks := rule.refused(taken, report, now)) < 1:
             small = wanted = taken * shrinks
@@ -307,12 +342,10 @@ def _advance(simulation: Simulated, rule: StepSize, target: float, aloud: bool) 
                 raise GaveUp(why, result, report.history)
             _note(simulation, replace(result, rejected=result.rejected + 1), replace(control, small=small))
             continue
-        grown = rule.grown(taken, report, now, failed=taken < (1 - SAME) * wanted)
-        grown = replace(grown, first=0.0 if new.stays else report.first / taken)
-        simulation.state = replace(new, result=result.after(report), control=grown)
-        if not rule.by_error and grown.small > control.small:
-            log(comm, "t = %g s: step grows to %.3g s", new.t, grown.small)
-        return
+        new = _accepted(rule, state, taken, new, report, wanted)
+        if not rule.by_error and new.control.small > control.small:
+            log(comm, "t = %g s: step grows to %.3g s", new.t, new.control.small)
+        return Step(state, taken, how), new
 
 
 def _by_euler(simulation: Simulated, dt: float, failed: StepFailed) -> tuple[State, Report] | None:

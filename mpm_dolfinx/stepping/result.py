@@ -35,6 +35,8 @@ class Result:
         Seconds, of the whole run and of each part of it on this process, from dolfinx's timers.
     converged
         Whether the end has been reached.
+    event
+        Which function of `until` has ended the run, from 0 on, and when, s; None where none has.
     points, memory, imbalance
         At the end of the run: material points, the peak of all processes, libraries included, MB, and the most that
         one of several processes has over their mean.
@@ -52,6 +54,7 @@ class Result:
     residual: float = 0.0
     wall: float = 0.0
     converged: bool = False
+    event: tuple[int, float] | None = None
     profile: dict[str, float] = field(default_factory=dict, repr=False)
     points: int = 0
     memory: float = 0.0
@@ -60,6 +63,8 @@ class Result:
     def __post_init__(self):
         if not isinstance(self.rows, Rows):
             object.__setattr__(self, "rows", Rows(self.rows))
+        if self.event is not None:
+            object.__setattr__(self, "event", tuple(self.event))
 
     @property
     def t(self) -> NDArray[np.float64]:
