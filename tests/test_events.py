@@ -71,7 +71,7 @@ def test_what_a_function_raises_leaves_the_state_at_the_start_of_the_step():
 
     def fails(s):
         count.append(s.t)
-        if len(count) == 5:  # while the event is located
+        if len(count) == 4:  # while the event is located
             raise OSError("no more")
         return s.t - 0.8
 
