@@ -11,6 +11,7 @@ import pytest
 import mpm_dolfinx as mpm
 from mpm_dolfinx.flow.storage import StorageProblem
 from mpm_dolfinx.mechanics.momentum import MomentumProblem
+from mpm_dolfinx.solve import plan
 from mpm_dolfinx.stepping import step
 from mpm_dolfinx.stepping.balances import Start, balances
 from mpm_dolfinx.stepping.time_integration import METHODS
@@ -52,9 +53,31 @@ def pressed(finer: int = 1, conductivity=1e-5, bulk=6.7e6, shear=3.1e6, cells=(3
     return mpm.Simulation(grid, [body], [law], walls={"left": "xy"}, conditions=[load, *drained], **water)
 
 
+def joined(*given):
+    """Return arguments of scenes as one, with the conditions of all."""
+    conditions = [one for options in given for one in options.get("conditions", [])]
+    return {name: value for options in given for name, value in options.items()} | {"conditions": conditions}
+
+
 def without(simulation, *kinds):
     """Return the conditions in force, but for those of some kinds."""
     return [one for one in simulation.conditions if not isinstance(one, kinds)]
+
+
+def thresholds(monkeypatch, **values):
+    """Let the choice of solvers follow other thresholds."""
+    monkeypatch.setattr(plan, "THRESHOLDS", replace(plan.THRESHOLDS, **values))
+
+
+def noting(counts, solve):
+    """Return `BlockSolver.solve` that notes its iterations."""
+
+    def noted(*how):
+        found = solve(*how)
+        counts.append(found[0])
+        return found
+
+    return noted
 
 
 def limit(simulation, newton):

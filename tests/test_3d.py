@@ -12,12 +12,12 @@ import growth_3d
 import numpy as np
 import poroelastic_beam as demo
 import pytest
+from helpers import thresholds
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.bodies.bodies import material_points
 from mpm_dolfinx.bodies.faces import face_vectors, surface
 from mpm_dolfinx.points.cutting import volumes
-from mpm_dolfinx.solve import linear as solvers
 
 SOIL = mpm.Hencky(bulk=1e7 / 3, shear=5e6, conductivity=1e-6)
 
@@ -62,8 +62,8 @@ def test_a_larger_background_box_changes_nothing():
 def test_iterations_and_factors_give_the_same_answer(monkeypatch, fluid, coupling):
     states = []
     for least in (10**9, 0):
-        monkeypatch.setattr(solvers, "ITERATIVE", least)
-        s = block(n=3, fluid=fluid, coupling=coupling)
+        thresholds(monkeypatch, multigrid_3d=least)
+        s = block(n=3, fluid=fluid, numerics=mpm.Numerics(coupling=coupling))
         result = s.run(1.0, 0.5, progress=False)
         assert result.cuts == 0 and result.residual <= 1e-8 and result.balance <= 1e-8
         states.append(s.points)
@@ -74,8 +74,8 @@ def test_iterations_and_factors_give_the_same_answer(monkeypatch, fluid, couplin
 
 
 def test_a_tangent_that_is_not_symmetric_is_solved_by_iterations(monkeypatch):
-    monkeypatch.setattr(solvers, "ITERATIVE", 0)
-    s = block(fluid=True, coupling="schur-fgmres")
+    thresholds(monkeypatch, multigrid_3d=0)
+    s = block(fluid=True, numerics=mpm.Numerics(coupling="schur-fgmres"))
     result = s.run(1.0, 0.5, progress=False)
     assert result.converged and result.cuts == 0 and result.newton <= 20
 
@@ -84,7 +84,7 @@ def test_a_tangent_that_is_not_symmetric_is_solved_by_iterations(monkeypatch):
 @pytest.mark.parametrize("fill", [0.5, 1e-2, 1e-4, 1e-6])
 def test_iterations_do_not_grow_where_cells_are_nearly_empty(monkeypatch, fluid, most, fill):
     """The ghost penalty keeps the condition number; without it the linear solver needs more than twice as many."""
-    monkeypatch.setattr(solvers, "ITERATIVE", 0)
+    thresholds(monkeypatch, multigrid_3d=0)
     result = block(fill=fill, fluid=fluid).run(1.0, 0.5, progress=False)
     assert result.coupling <= most * result.newton and result.newton <= 20
 

@@ -20,13 +20,12 @@ import mpi_restart
 import numpy as np
 import pytest
 import restart_run
-from helpers import beam, column, limit
+from helpers import beam, column, limit, thresholds
 from test_mpi import mpirun
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.io import checkpoint as restart
 from mpm_dolfinx.io.writer import Series
-from mpm_dolfinx.solve import linear as solvers
 
 
 def cut_beam():
@@ -66,7 +65,7 @@ def block(fluid=None):
 
 SCENES = {
     "beam": lambda: beam(h=0.06),
-    "at the points": lambda: beam(h=0.06, quadrature="point", load=5e3),
+    "at the points": lambda: beam(h=0.06, numerics=mpm.Numerics(quadrature="point"), load=5e3),
     "linear": lambda: beam(h=0.06, load=1e3, material=mpm.LinearElastic(1e7 / 3, 5e6, conductivity=1e-4)),
     "cut steps": cut_beam,
     "plate and gravity": pressed_column,
@@ -109,7 +108,7 @@ def test_resumed_after_any_step_the_end_is_the_same_to_the_last_bit(scene, tmp_p
 
 @pytest.mark.parametrize("fluid", [None, mpm.Fluid()], ids=["dry", "wet"])
 def test_resumed_runs_end_with_the_same_bits_by_multigrid_too(fluid, tmp_path, monkeypatch):
-    monkeypatch.setattr(solvers, "ITERATIVE", 50)
+    thresholds(monkeypatch, multigrid_3d=50)
     test_resumed_after_any_step_the_end_is_the_same_to_the_last_bit(lambda: block(fluid), tmp_path)
 
 
@@ -260,7 +259,7 @@ OTHER_SCENES = {
     "place": ({"offset": 0.6}, "checksum of the positions of body 0"),
     "fluid": ({"fluid": mpm.Fluid(bulk=1e9)}, "bulk of fluid: 2200000000.0 there, 1000000000.0 here"),
     "dry": ({"fluid": False}, "fluid: Fluid there, None here"),
-    "quadrature": ({"quadrature": "point"}, "quadrature: domain there, point here"),
+    "quadrature": ({"numerics": mpm.Numerics(quadrature="point")}, "quadrature: domain there, point here"),
 }
 
 

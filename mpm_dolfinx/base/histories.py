@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from collections.abc import Iterable, Mapping, Sequence
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,9 +23,7 @@ class Row(NamedTuple):
 
     t, s; displacement (m, d), m, and present position (m, d), m, of the m probes; pressure (2,): least and largest on
     the points, Pa; probe_pressure (m,), Pa, and probe_stress (m, 3, 3), Pa: pore pressure and effective stress, tension
-    positive, at the places of the probes, see `probe_fields`; tools (k, d + 1) or (k, 6), N and N m: forces and
-    moments of tools, then of contacts, on the bodies; reactions (displacements, d), walls (2 d, d), N, and outflows
-    (drained sides, then inflows), m^3/s: as the simulation's `reactions`, `wall_reactions` and `outflows`.
+    positive, at the places of the probes, see `probe_fields`; outcome: what conditions do to the bodies, see `State`.
     """
 
     t: float
@@ -33,17 +32,22 @@ class Row(NamedTuple):
     position: NDArray[np.float64] = _none(0, 0)
     probe_pressure: NDArray[np.float64] = _none(0)
     probe_stress: NDArray[np.float64] = _none(0, 3, 3)
-    tools: NDArray[np.float64] = _none(0, 0)
-    reactions: NDArray[np.float64] = _none(0, 0)
-    walls: NDArray[np.float64] = _none(0, 0)
-    outflows: NDArray[np.float64] = _none(0)
+    outcome: Mapping[str, Mapping[str, NDArray[np.float64]]] = MappingProxyType({})
+
+
+COLUMNS = tuple(name for name in Row._fields if name != "outcome")
+"""Names of the quantities that are arrays."""
 
 
 class _Columns:
-    """Arrays (room, ...) by name, of which the first `used` rows are written."""
+    """Arrays (room, ...) by name, and the outcomes, of which the first `used` rows are written."""
 
-    def __init__(self, arrays: dict[str, NDArray[np.float64]], used: int):
-        self.arrays, self.used = arrays, used
+    def __init__(self, arrays: dict[str, NDArray[np.float64]], outcomes: list[Any]):
+        self.arrays, self.outcomes = arrays, outcomes
+
+    @property
+    def used(self) -> int:
+        return len(self.outcomes)
 
     def reshaped(self, count: int, room: int, shapes: dict[str, tuple[int, ...]]) -> _Columns:
         """Return the first rows in arrays with room for more, of these shapes a row; nan where they have none."""
@@ -53,7 +57,7 @@ class _Columns:
             if count:
                 rows = self.arrays[name][:count]
                 out[name][tuple(map(slice, rows.shape))] = rows
-        return _Columns(out, count)
+        return _Columns(out, self.outcomes[:count])
 
 
 class Rows(Sequence[Row]):
@@ -69,20 +73,24 @@ class Rows(Sequence[Row]):
     """
 
     def __init__(self, rows: Iterable[Row] = ()):
-        self._columns, self._count, self.run = _Columns({}, 0), 0, object()
+        self._columns, self._count, self.run = _Columns({}, []), 0, object()
         for row in rows:
             grown = self.more(row)
             self._columns, self._count = grown._columns, grown._count
 
     @classmethod
-    def of_columns(cls, columns: dict[str, NDArray[np.float64]]) -> Rows:
-        """Return rows from all columns (n, ...) by name; ValueError where they are others, or differ in length."""
-        if columns.keys() != set(Row._fields):
-            raise ValueError(f"columns {', '.join(columns)}, must be {', '.join(Row._fields)}")
-        (count,) = {len(values) for values in columns.values()}
+    def of_columns(cls, columns: dict[str, NDArray[np.float64]], outcomes: Sequence[Any]) -> Rows:
+        """Return rows from all columns (n, ...) by name, and the outcomes (n).
+
+        ValueError where the columns are others, or differ in length.
+        """
+        if columns.keys() != set(COLUMNS):
+            raise ValueError(f"columns {', '.join(columns)}, must be {', '.join(COLUMNS)}")
+        if {len(values) for values in columns.values()} != {len(outcomes)}:
+            raise ValueError("columns differ in length")
         out = cls()
-        out._columns = _Columns({name: np.array(columns[name], dtype=np.float64) for name in Row._fields}, count)
-        out._count = count
+        arrays = {name: np.array(columns[name], dtype=np.float64) for name in COLUMNS}
+        out._columns, out._count = _Columns(arrays, list(outcomes)), len(outcomes)
         return out
 
     def __len__(self) -> int:
@@ -91,11 +99,16 @@ class Rows(Sequence[Row]):
     def __getitem__(self, k: int | slice) -> Row | Rows:
         if isinstance(k, slice):
             return Rows(self[i] for i in range(*k.indices(len(self))))
-        t, *others = (self.column(name)[k] for name in Row._fields)
-        return Row(float(t), *others)
+        t, *others = (self.column(name)[k] for name in COLUMNS)
+        return Row(float(t), *others, self.outcomes[k])
 
     def __reduce__(self):  # without the room for more
-        return Rows.of_columns, ({name: self.column(name) for name in Row._fields},)
+        return Rows.of_columns, ({name: self.column(name) for name in COLUMNS}, self.outcomes)
+
+    @property
+    def outcomes(self) -> list[Mapping[str, Mapping[str, NDArray[np.float64]]]]:
+        """What conditions did to the bodies, a copy of the list."""
+        return self._columns.outcomes[: self._count]
 
     def column(self, name: str) -> NDArray[np.float64]:
         """Return one quantity (n, ...), which cannot be written into; it is not copied."""
@@ -108,7 +121,7 @@ class Rows(Sequence[Row]):
     def more(self, row: Row) -> Rows:
         """Return these rows and another one."""
         columns, n = self._columns, self._count
-        values = {name: np.asarray(value, dtype=np.float64) for name, value in row._asdict().items()}
+        values = {name: np.asarray(value, dtype=np.float64) for name, value in zip(COLUMNS, row, strict=False)}
         old = {name: rows.shape[1:] if n else values[name].shape for name, rows in columns.arrays.items()}
         shapes = {name: tuple(np.maximum(v.shape, old.get(name, v.shape))) for name, v in values.items()}
         if columns.used != n or shapes != old:  # others have gone on in them, or there is more to be held in a row
@@ -117,7 +130,7 @@ class Rows(Sequence[Row]):
             columns.arrays = columns.reshaped(n, 2 * n, shapes).arrays
         for name, value in values.items():
             columns.arrays[name][(n, *map(slice, value.shape))] = value
-        columns.used = n + 1
+        columns.outcomes.append(row.outcome)
         out = Rows()
         out._columns, out._count, out.run = columns, n + 1, self.run
         return out

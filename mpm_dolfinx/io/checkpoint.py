@@ -18,8 +18,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mpm_dolfinx.base.histories import Row, Rows
+from mpm_dolfinx.base.histories import COLUMNS, Rows
 from mpm_dolfinx.base.validation import instance, line, numbers, on_disk, path, whole
+from mpm_dolfinx.conditions.acting import Outcome
+from mpm_dolfinx.contact.groups import Contact
+from mpm_dolfinx.contact.tools import Tool
 from mpm_dolfinx.domains.pressure_transport import PiecePressures
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.io.writer import WRITABLE, replacing
@@ -34,7 +37,6 @@ from mpm_dolfinx.stepping.step_control import StepControl
 FORMAT, VERSION = "mpm_dolfinx checkpoint", 10  # Source: the format of the files
 FOREIGN = "no checkpoint of mpm_dolfinx, must be one"
 ZIP = b"PK\3\4"  # how numpy's archives begin
-ACTING = ("reactions", "walls", "outflows", "tool_forces", "tool_travel")
 PIECES = ("id", "pressure", "x", "start")  # of a Stay
 NODAL = ("velocity", "held", "rest")  # of a State
 NOTE = {"t": float, "resets": int, "begins": bool, "scene": dict, "result": dict, "control": dict}  # and their kinds
@@ -152,8 +154,13 @@ def _scalars(result: Result) -> dict[str, Any]:
 
 def _arrays(state: State) -> dict[str, NDArray]:
     """Return the arrays of a state by names with slashes."""
-    named = {"points": vars(state.points), **{name: getattr(state, name) for name in ACTING}}
-    named["result"] = {name: state.result.rows.column(name) for name in Row._fields}
+    named = {"points": vars(state.points), "outcome": state.outcome}
+    named["result"] = {name: state.result.rows.column(name) for name in COLUMNS}
+    for i, outcome in enumerate(state.result.rows.outcomes):
+        for name, value in _named("", outcome).items():
+            named["result"].setdefault(f"outcome/{name}", {"row": [], "value": []})
+            for rows, one in zip(named["result"][f"outcome/{name}"].values(), (i, value), strict=True):
+                rows.append(one)
     if state.transported is not None:
         named["transported"] = vars(state.transported)
     if state.stay is not None:
@@ -184,26 +191,61 @@ def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulat
         if wet and (stay is None or stay.keeps is not None):
             transported = PiecePressures(**_part(arrays, "transported/"))
             _check_pieces(vars(transported), ids, dim)
-        result = Result(Rows.of_columns(_part(arrays, "result/")), **note["result"])
-        control = StepControl(**note["control"])
-        acting = reactions, walls, outflows, forces, ways = [arrays.pop(name) for name in ACTING]
+        histories = _part(arrays, "result/")
+        times = histories["t"]
+        outcomes = _outcomes(_part(histories, "outcome/"), len(times))
+        result, control = Result(Rows.of_columns(histories, outcomes), **note["result"]), StepControl(**note["control"])
+        outcome = _nested(_part(arrays, "outcome/"))
         nodal = [_part(arrays, f"{name}/") or None for name in NODAL]
         for name, given in zip(NODAL, nodal, strict=True):
             if given is not None:
                 _check_nodal(name, given, simulation.grid)
-        shapes = reactions.shape[1:], walls.shape, outflows.shape[1:]
-        if arrays or shapes != ((dim,), (2 * dim, dim), ()) or not all(np.isfinite([note["t"], *result.t])):
-            raise ValueError(f"has {', '.join(arrays) or 'other reactions, outflows or times'}")
-        if forces.shape != now.tool_forces.shape:
-            raise ValueError(f"has forces of {len(forces)} tools")
-        if ways.shape != now.tool_travel.shape or not np.isfinite(ways).all():
-            raise ValueError(f"has ways of {len(ways)} tools, or not finite")
-        kept = {name: note[name] for name in ("t", "resets", "begins")}
-        kept |= dict(zip(NODAL, nodal, strict=True)) | dict(zip(ACTING, acting, strict=True))
-        kept |= {"points": points, "transported": transported, "stay": stay, "stage": None}
-        return State(**kept, result=result, control=control)
+        if arrays or not all(np.isfinite([note["t"], *times])):
+            raise ValueError(f"has {', '.join(arrays) or 'other times'}")
+        outcome = _like(outcome, now.outcome)
+        reset = {"stay": stay, "resets": note["resets"], "begins": note["begins"]}
+        told = dict(zip(NODAL, nodal, strict=True)) | {"outcome": outcome, "stage": None, "result": result}
+        told["control"] = control
+        return State(t=note["t"], points=points, transported=transported, **reset, **told)
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         raise ValueError(f"{damaged} ({line(error)}), must be a whole checkpoint") from error
+
+
+def _outcomes(arrays: dict[str, NDArray], count: int) -> list[dict[str, dict[str, NDArray]]]:
+    """Return what conditions had done at each of so many output times."""
+    out: list[dict[str, dict[str, NDArray]]] = [{} for _ in range(count)]
+    for quantity, names in _nested(arrays).items():
+        for name, found in names.items():
+            for i, value in zip(found["row"], found["value"], strict=True):
+                out[i].setdefault(quantity, {})[name] = value
+    return out
+
+
+def _like(outcome: dict[str, dict[str, NDArray]], now: Outcome) -> dict[str, dict[str, NDArray]]:
+    """Return an outcome of the conditions that there are now; of those that there were not, as it is.
+
+    ValueError where it has other shapes, or how far tools have been pushed is not finite.
+    """
+    found = {q: {name: outcome.get(q, {}).get(name, value) for name, value in of.items()} for q, of in now.items()}
+    for quantity, of in found.items():
+        for name, value in of.items():
+            if value.shape != now[quantity][name].shape or value.dtype != np.float64:
+                raise ValueError(f"outcome/{quantity}/{name}: {value.dtype} of shape {value.shape}")
+            if quantity == "tool_travel" and not np.isfinite(value):
+                raise ValueError(f"outcome/{quantity}/{name} is not finite")
+    return found
+
+
+def _nested(arrays: dict[str, NDArray]) -> dict[str, Any]:
+    """Return arrays by names with slashes in dictionaries of dictionaries."""
+    out: dict[str, Any] = {}
+    for name, value in arrays.items():
+        *folders, last = name.split("/")
+        at = out
+        for folder in folders:
+            at = at.setdefault(folder, {})
+        at[last] = value
+    return out
 
 
 def _points(arrays: dict[str, NDArray], like: MaterialPoints, ids: NDArray[np.int64]) -> MaterialPoints:
@@ -320,10 +362,9 @@ def _read(file: Path) -> tuple[dict[str, NDArray], dict[str, Any]]:
 
 def describe(simulation: Simulation) -> dict[str, Any]:
     """Return the constants that make the scene, by name, as a checkpoint holds them."""
-    touching = simulation.state.stage.mechanical
-    pairs = [("tools", touching.tools.tools), ("contacts", touching.contacts.contacts)]
-    grips = {f"{name}, each whether it resists slip": [bool(one.grips) for one in of] for name, of in pairs}
-    return {**simulation.scene.description, "bodies present": list(simulation.present), **grips}
+    grips = {name: bool(one.grips) for name, one in simulation.state.stage.of(Tool, Contact).items()}
+    more = {"bodies present": list(simulation.present), "tools and contacts, whether each resists slip": grips}
+    return {**simulation.scene.description, **more}
 
 
 def _check_scene(file: Path, there: dict[str, Any], here: dict[str, Any]) -> None:

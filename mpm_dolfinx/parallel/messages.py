@@ -26,7 +26,7 @@ class ResolutionWarning(ResultWarning):
 
 
 class ConditionWarning(ResultWarning):
-    """Conditions, units or initial stresses contradict each other, or what the bodies are."""
+    """Conditions, units, initial stresses or options contradict each other, or do nothing."""
 
 
 def set_log_level(level: int | str) -> None:

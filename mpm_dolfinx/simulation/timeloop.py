@@ -262,8 +262,6 @@ def _histories(
     count = 0 if probes is None else len(probes.id)
     if (recorded := len(start.displacement)) != count:
         raise ValueError(f"probes: the run to go on with has {recorded} of them")
-    if (tools := len(start.tools)) != len(state.tool_forces):
-        raise ValueError(f"tools: the run to go on with has {tools} of them")
     if count and probes.stressed != (len(start.probe_stress) > 0):
         raise ValueError(f"probes: stress = {probes.stressed}, must be what the run to go on with has")
     return after, control
@@ -360,7 +358,15 @@ def _by_euler(simulation: Simulated, dt: float, failed: StepFailed) -> tuple[Sta
     except StepFailed:
         return None
     what = "t = %g s: a step of %.3g s by backward Euler, of first order: none by %s has converged: %s"
-    warn(simulation.scene.grid.comm, ResolutionWarning, what, simulation.state.t, dt, simulation.scene.method, failed)
+    warn(
+        simulation.scene.grid.comm,
+        ResolutionWarning,
+        what,
+        simulation.state.t,
+        dt,
+        simulation.scene.numerics.method,
+        failed,
+    )
     return found
 
 
@@ -383,7 +389,7 @@ def _row(simulation: Simulated, probes: Probes | None) -> Row:
     """Return what the histories hold of the present state."""
     scene, state = simulation.scene, simulation.state
     comm, d, points, wet = scene.grid.comm, scene.grid.dim, state.points, scene.fluid is not None
-    out = {"displacement": np.zeros((0, d)), "position": np.zeros((0, d)), "tools": state.tool_forces}
+    out = {"displacement": np.zeros((0, d)), "position": np.zeros((0, d))}
     if wet:
         ends = comm.allgather((points.pressure.min(initial=np.inf), points.pressure.max(initial=-np.inf)))
         out["pressure"] = np.array([min(e[0] for e in ends), max(e[1] for e in ends)])
@@ -394,8 +400,7 @@ def _row(simulation: Simulated, probes: Probes | None) -> Row:
         out["probe_pressure"] = probe_pressures(scene, state, probes)
     if probes is not None and probes.stressed:
         out["probe_stress"] = probe_stresses(scene, state, probes)
-    out |= {name: getattr(state, name) for name in ("reactions", "walls", "outflows")}
-    return Row(state.t, **out)
+    return Row(state.t, **out, outcome=state.outcome)
 
 
 def _measured(simulation: Simulated) -> Result:

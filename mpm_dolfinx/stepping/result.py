@@ -5,13 +5,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.histories import Row, Rows
 from mpm_dolfinx.base.report import Report
-from mpm_dolfinx.grid.grid import SIDES
+from mpm_dolfinx.conditions.names import ByName
 
 
 @dataclass(frozen=True)
@@ -96,29 +97,39 @@ class Result:
         """Effective stresses (n, m, 3, 3) at the probes, Pa, tension positive; (n, 0, 3, 3) where not asked for."""
         return self.rows.column("probe_stress")
 
-    @property
-    def tools(self) -> NDArray[np.float64]:
-        """Forces and moments (n, k, d + 1), in 3D (n, k, 6), of tools on the bodies, N and N m."""
-        return self.rows.column("tools")
+    @cached_property
+    def reactions(self) -> ByName[NDArray[np.float64]]:
+        """Forces (times, d), N, of each given displacement on the bodies at the output times, by its name."""
+        return self.outcome("reactions")
 
-    @property
-    def reactions(self) -> NDArray[np.float64]:
-        """Forces (n, displacements, d) of the given displacements on the bodies, N.
+    @cached_property
+    def wall_reactions(self) -> ByName[NDArray[np.float64]]:
+        """Forces (times, d), N, of each wall of the grid on the bodies at the output times; see `Simulation`."""
+        return self.outcome("wall_reactions")
 
-        Where stages have different numbers of them, the array has room for the most, and nan where there is none.
+    @cached_property
+    def outflows(self) -> ByName[NDArray[np.float64]]:
+        """What leaves (times,), m^3/s, through each open side at the output times, by its name."""
+        return self.outcome("outflows")
+
+    @cached_property
+    def tool_forces(self) -> ByName[NDArray[np.float64]]:
+        """Forces and moments (times, d + 1), in 3D (times, 6), N and N m, of each tool and contact, by its name."""
+        return self.outcome("tool_forces")
+
+    @cached_property
+    def tool_travel(self) -> ByName[NDArray[np.float64]]:
+        """How far a load has pushed (times,), m, each tool beyond its displacement at the output times, by its name."""
+        return self.outcome("tool_travel")
+
+    def outcome(self, quantity: str) -> ByName[NDArray[np.float64]]:
+        """Return what conditions have done (n, ...) at the output times, by name, such as "reactions".
+
+        nan where a condition was not there.
         """
-        return self.rows.column("reactions")
-
-    @property
-    def wall_reactions(self) -> dict[str, NDArray[np.float64]]:
-        """Forces (n, d) of each wall of the grid on the bodies, N; see `Simulation`."""
-        walls = self.rows.column("walls")
-        return {name: walls[:, i] for i, name in enumerate(SIDES.get(walls.shape[2], ()))}
-
-    @property
-    def outflows(self) -> NDArray[np.float64]:
-        """What leaves (n, drained sides, then inflows), m^3/s; see `reactions` for stages."""
-        return self.rows.column("outflows")
+        rows = [outcome.get(quantity, {}) for outcome in self.rows.outcomes]
+        like = {name: np.full_like(value, np.nan) for row in rows for name, value in row.items()}
+        return ByName({name: np.array([row.get(name, none) for row in rows]) for name, none in like.items()})
 
     def more(self, row: Row) -> Result:
         """Return the histories with one more output time."""
