@@ -54,6 +54,7 @@ from mpm_dolfinx.materials.skeleton import (
     unsaturated,
 )
 from mpm_dolfinx.materials.softening import SofteningDruckerPrager
+from mpm_dolfinx.parallel.messages import ConditionWarning, ResolutionWarning, ResultWarning, set_log_level
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.probing.cell_fields import CellFields
 from mpm_dolfinx.probing.point_fields import PointFields
@@ -75,6 +76,7 @@ __all__ = [
     "Body",
     "CellFields",
     "Checkpoint",
+    "ConditionWarning",
     "Cone",
     "Contact",
     "Convex",
@@ -105,7 +107,9 @@ __all__ = [
     "Pressure",
     "Probes",
     "Report",
+    "ResolutionWarning",
     "Result",
+    "ResultWarning",
     "RigidPlate",
     "Safety",
     "Scheme",
@@ -129,6 +133,7 @@ __all__ = [
     "polygon",
     "probes",
     "resume",
+    "set_log_level",
     "shape",
     "unsaturated",
     "water",

@@ -28,7 +28,7 @@ from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.flow.storage import FILTER, FluxSlope, StorageProblem, StorageSystem
 from mpm_dolfinx.mechanics.momentum import MomentumProblem, MomentumSystem
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
-from mpm_dolfinx.parallel.messages import warn
+from mpm_dolfinx.parallel.messages import ConditionWarning, warn
 from mpm_dolfinx.points.parts import OfParts
 from mpm_dolfinx.solve.linear import MOST, direct_solver, displacement_solver, factorise, solved
 from mpm_dolfinx.solve.monolithic import BlockSolver, Inverses
@@ -211,7 +211,7 @@ class LinearSolvers:
         comm = self.du.comm.tompi4py()
         names = sorted(set.intersection(*map(set, comm.allgather(self._unread))))
         if names:
-            warn(comm, "petsc_options: no solver reads %s (%s)", ", ".join(names), self.plan)
+            warn(comm, ConditionWarning, "petsc_options: no solver reads %s (%s)", ", ".join(names), self.plan)
         self._unread.clear()
 
     def solve(
