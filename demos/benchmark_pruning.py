@@ -57,11 +57,11 @@ def block(
     """Return the block, that many cells wide; the grid reaches to `box`, m, and two cells above it."""
     h = 1 / cells
     count = [round(box * cells), round(box * cells) + 2]
-    grid = mpm.Grid([box, box + 2 * h], count, axisymmetric=axisymmetric)
+    grid = mpm.Grid([0, 0], [box, box + 2 * h], count, axisymmetric=axisymmetric)
     options.setdefault("tractions", [mpm.Traction("top", lambda t: (0, -LOAD * t))])
-    fixed = {"left": "x", "right": "x", "bottom": "y"}
+    walls = {"left": "x", "right": "x", "bottom": "y"}
     body = meshed(grid, cells) if from_mesh else mpm.box(grid, [0, 0], [1, 1])
-    return mpm.Simulation(grid, [body], [material or soil()], fixed=fixed, **options)
+    return mpm.Simulation(grid, [body], [material or soil()], walls=walls, **options)
 
 
 def meshed(grid: mpm.Grid, cells: int):
@@ -112,12 +112,12 @@ def layered(cells: int, off: float) -> mpm.Simulation:
     """Return the draining block with four layers, of two conductivities in turn, so many cells off the grid lines."""
     h, heights = 1 / cells, np.arange(5) / 4
     heights[1:-1] += off * h
-    grid = mpm.Grid([1, 1 + 2 * h], [cells, cells + 2])
+    grid = mpm.Grid([0, 0], [1, 1 + 2 * h], [cells, cells + 2])
     bodies = [mpm.box(grid, [0, a], [1, b], material=k % 2) for k, (a, b) in enumerate(pairwise(heights))]
     soils = [soil(conductivity=k) for k in (1e-4, 1e-6)]
     load = mpm.Traction("top", lambda t: (0, -LOAD * t))
-    fixed = {"left": "x", "right": "x", "bottom": "y"}
-    return mpm.Simulation(grid, bodies, soils, fixed=fixed, tractions=[load], **WATER)
+    walls = {"left": "x", "right": "x", "bottom": "y"}
+    return mpm.Simulation(grid, bodies, soils, walls=walls, tractions=[load], **WATER)
 
 
 class Watched(mpm.Hencky):
@@ -157,11 +157,11 @@ def clayey(cells: int) -> mpm.Simulation:
 def apart(cells: int, **options) -> mpm.Simulation:
     """Return the block with another body beside it, a quarter as wide, that touches nothing."""
     h = 1 / cells
-    grid = mpm.Grid([1.5, 1 + 2 * h], [round(1.5 * cells), cells + 2])
+    grid = mpm.Grid([0, 0], [1.5, 1 + 2 * h], [round(1.5 * cells), cells + 2])
     bodies = [mpm.box(grid, [0, 0], [1, 1]), mpm.box(grid, [1.25, 0], [1.5, 1])]
     load = mpm.Traction("top", lambda t: (0, -LOAD * t), region=((0, 0), (1, 2)))
-    fixed = {"left": "x", "right": "x", "bottom": "y"}
-    return mpm.Simulation(grid, bodies, [soil()], fixed=fixed, tractions=[load], **options)
+    walls = {"left": "x", "right": "x", "bottom": "y"}
+    return mpm.Simulation(grid, bodies, [soil()], walls=walls, tractions=[load], **options)
 
 
 Make = Callable[[int], mpm.Simulation]

@@ -82,12 +82,12 @@ def ring(cells: int, soil: mpm.Skeleton, widest: float, outside: Callable | None
     """
     h = 1 / cells
     size = int(np.ceil(np.sqrt(OUTER**2 + widest**2 - 1) / h)) + 2
-    grid = mpm.Grid([size * h] * 2, [size] * 2)
+    grid = mpm.Grid([0] * 2, [size * h] * 2, [size] * 2)
     body = mpm.mapped(grid, mpm.box(grid, [0, 0], [OUTER - 1] * 2), lambda X: (1 + X[:, :1]) * ray(X))
     moved = [mpm.Displacement("left", lambda t, X: min(t, widest - 1) * ray(X))]
     if outside is not None:
         moved.append(mpm.Displacement("right", lambda t, X: outside(t) * ray(X)))
-    return mpm.Simulation(grid, [body], [soil], fixed={"left": "x", "bottom": "y"}, displacements=moved, **scene)
+    return mpm.Simulation(grid, [body], [soil], walls={"left": "x", "bottom": "y"}, displacements=moved, **scene)
 
 
 def widen(s: mpm.Simulation, cells: int, radius: float, push: float) -> float:

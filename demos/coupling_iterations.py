@@ -89,7 +89,7 @@ def bent(h: float) -> mpm.Simulation:
 def column(h: float) -> mpm.Simulation:
     """Return a drained column of 0.5 m x 1 m between smooth walls with a load on half of its top."""
     cells = np.rint(np.array([0.5, 1.2]) / h).astype(int)
-    grid = mpm.Grid([0.5, 1.2], cells)
+    grid = mpm.Grid([0, 0], [0.5, 1.2], cells)
     soil = beam.material(beam.arguments([]))
     footing = mpm.Traction("top", lambda t: (0, -1e6 * t), region=((0, 0), (0.25, 2)))
     return mpm.Simulation(
@@ -97,7 +97,7 @@ def column(h: float) -> mpm.Simulation:
         [mpm.box(grid, [0, 0], [0.5, 1.0])],
         [soil],
         fluid=mpm.Fluid(),
-        fixed={"left": "x", "right": "x", "bottom": "xy"},
+        walls={"left": "x", "right": "x", "bottom": "xy"},
         tractions=[footing],
         drained=[mpm.Drained("top")],
     )

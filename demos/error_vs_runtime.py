@@ -130,7 +130,9 @@ def scene_runs(
     def points(n: int, m: int, rtol: float | None = None, **options) -> Run:
         def run():
             h = size[1] / n
-            grid = mpm.Grid([size[0] + (2 * h if width < 0 else 0), size[1]], [n + 2 if width < 0 else width, n])
+            grid = mpm.Grid(
+                [0, 0], [size[0] + (2 * h if width < 0 else 0), size[1]], [n + 2 if width < 0 else width, n]
+            )
             body = mpm.box(grid, [0, 0], size)
             probe = mpm.probes([body], [[0, size[1]]])
             simulation = mpm.Simulation(grid, [body], [material], **physics, **options)
@@ -165,7 +167,7 @@ def terzaghi_runs(quick: bool) -> Iterator[tuple[str, str, Run]]:
     load = 1e-5 * terzaghi.SOIL.oedometric
     physics = {
         "fluid": terzaghi.WATER,
-        "fixed": {"left": "x", "right": "x", "bottom": "y"},
+        "walls": {"left": "x", "right": "x", "bottom": "y"},
         "tractions": [mpm.Traction("top", (0, -load))],
         "drained": [mpm.Drained("top")],
     }
@@ -182,7 +184,7 @@ def mandel_runs(quick: bool) -> Iterator[tuple[str, str, Run]]:
     slab = Mandel(1.0, 1.0, soil.bulk, soil.shear, soil.conductivity / water.unit_weight, force=20.0)
     physics = {
         "fluid": water,
-        "fixed": {"left": "x", "bottom": "y"},
+        "walls": {"left": "x", "bottom": "y"},
         "plates": [mpm.RigidPlate("top", 20.0)],
         "drained": [mpm.Drained("right")],
     }
@@ -196,7 +198,7 @@ def column_runs(quick: bool) -> Iterator[tuple[str, str, Run]]:
     """Yield the runs of the soft column under its own weight."""
     soft = column.EXACT
     physics = {
-        "fixed": {"left": "x", "right": "x", "bottom": "y"},
+        "walls": {"left": "x", "right": "x", "bottom": "y"},
         "gravity": lambda t: (0, -soft.gravity * t),
     }
     cells, steps = ((8, 16), ()) if quick else ((8, 16, 32, 64), (160,))

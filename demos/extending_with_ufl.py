@@ -33,11 +33,11 @@ WATER = mpm.Fluid()
 
 def column(cells: int, material: mpm.Skeleton, load: float = LOAD, **scene) -> mpm.Simulation:
     """Return the column under a load on its top that grows from t = 0 to 1 s."""
-    grid = mpm.Grid([1 / cells, 1.0 + 2 / cells], [1, cells + 2])
+    grid = mpm.Grid([0, 0], [1 / cells, 1.0 + 2 / cells], [1, cells + 2])
     body = mpm.box(grid, [0, 0], [1 / cells, 1])
     top = mpm.Traction("top", lambda t: (0, -load * min(1, t)))
     walls = {"left": "x", "right": "x", "bottom": "y"}
-    return mpm.Simulation(grid, [body], [material], fixed=walls, tractions=[top], **scene)
+    return mpm.Simulation(grid, [body], [material], walls=walls, tractions=[top], **scene)
 
 
 @dataclass

@@ -171,8 +171,8 @@ def push(
     under, beside = ((0, -np.inf), (edge, np.inf)), ((edge - h / 2, -np.inf), (np.inf, np.inf))  # from its last node on
     footing = mpm.Displacement("top", lambda t, X: (0, -depth * WIDTH * min(1, t / end)), region=under)
     water = {"fluid": WATER, "method": method, "drained": [mpm.Drained("top", region=beside)]} if rate else {}
-    fixed = {"left": "x", "right": "x", "bottom": "xy"}
-    simulation = mpm.Simulation(grid, [body], [soil], fixed=fixed, displacements=[footing], **water)
+    walls = {"left": "x", "right": "x", "bottom": "xy"}
+    simulation = mpm.Simulation(grid, [body], [soil], walls=walls, displacements=[footing], **water)
     out = Push()
 
     def observe(s: mpm.Simulation) -> None:

@@ -67,14 +67,14 @@ class Tissue:
     def scene(self, load: float, wet: bool) -> tuple[mpm.Simulation, mpm.Probes]:
         """Return the tissue under a load, Pa, and a probe on its top."""
         n = len(self.grey)
-        grid = mpm.Grid([EDGE, EDGE * (n + 2) / n], [n, n + 2])
+        grid = mpm.Grid([0, 0], [EDGE, EDGE * (n + 2) / n], [n, n + 2])
         body = mpm.shape(grid, self.inside)
         simulation = mpm.Simulation(
             grid,
             [body],
             [self.law()],
             fluid=mpm.Fluid() if wet else None,
-            fixed=WALLS,
+            walls=WALLS,
             plates=[mpm.RigidPlate("top", lambda t: load * EDGE * min(1, t / RAMP), TOP)],
             drained=[mpm.Drained("top", region=TOP)] if wet else [],
         )
@@ -104,7 +104,7 @@ def modulus(tissue: Tissue) -> tuple[float, float, float]:
     points = simulation.run(RAMP, RAMP, probes=top, progress=False).displacement[-1][0, 1]
     n = len(tissue.grey)
     plate = mpm.RigidPlate("top", SMALL * EDGE)
-    elements = BiotFEM([0, 0], [EDGE, EDGE], [n, n], tissue.law(1e-6), fixed=WALLS, plates=[plate])
+    elements = BiotFEM([0, 0], [EDGE, EDGE], [n, n], tissue.law(1e-6), walls=WALLS, plates=[plate])
     elements.step(1.0)
     moved = elements.displacement(np.array([[EDGE / 2, EDGE]]))[0, 1]
     factor = np.where(tissue.grey < HOLES, 0.0, CONTRAST**tissue.grey).mean()

@@ -48,6 +48,7 @@ from mpm_dolfinx.simulation.strength_reduction import Safety, factor_of_safety
 from mpm_dolfinx.solve.scheme import COUPLINGS
 from mpm_dolfinx.stepping.result import GaveUp, Result
 from mpm_dolfinx.stepping.state import State
+from mpm_dolfinx.stepping.tangent import Tangent
 from mpm_dolfinx.verification.element_test import ElementTest, element_test
 
 __version__ = "0.1.0"
@@ -85,6 +86,7 @@ __all__ = [
     "Skeleton",
     "SofteningDruckerPrager",
     "State",
+    "Tangent",
     "Tool",
     "Traction",
     "Writer",

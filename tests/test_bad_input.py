@@ -8,15 +8,15 @@ from helpers import SOFT, beam, column, refused_in_one_line, top_load
 import mpm_dolfinx as mpm
 from mpm_dolfinx.verification.biot_fem import BiotFEM
 
-GRID = mpm.Grid([1.0, 1.0], [10, 10])
-GRID_3D = mpm.Grid([1.0, 1.0, 1.0], [2, 2, 2])
+GRID = mpm.Grid([0, 0], [1.0, 1.0], [10, 10])
+GRID_3D = mpm.Grid([0, 0, 0], [1.0, 1.0, 1.0], [2, 2, 2])
 BODY = mpm.box(GRID, [0, 0.2], [0.5, 0.5])
 NAN = float("nan")
 WATER = mpm.Fluid()
 
 
 def scene(bodies=(BODY,), materials=(SOFT,), grid=GRID, **options):
-    return mpm.Simulation(grid, bodies, materials, **{"fixed": {"left": "xy"}, **options})
+    return mpm.Simulation(grid, bodies, materials, **{"walls": {"left": "xy"}, **options})
 
 
 def sides(kind, *values, **options):
@@ -40,7 +40,7 @@ def law(**functions):
 
 
 def fem(lower=(0, 0), upper=(1, 1), cells=(2, 2), material=SOFT, **options):
-    return BiotFEM(lower, upper, cells, material, **{"fixed": {"left": "xy"}, **options})
+    return BiotFEM(lower, upper, cells, material, **{"walls": {"left": "xy"}, **options})
 
 
 def run(t_end=1.0, dt=1.0, **options):
@@ -65,15 +65,21 @@ PULL = {"energy": lambda F, bulk: bulk * F[0, 0]}
 
 CASES = {
     # ---- grid and bodies: what is called, what the line names, the value in it
-    "grid of no cells": (lambda: mpm.Grid([1, 1], [0, 3]), "grid: cells", "[0, 3]"),
-    "grid of half cells": (lambda: mpm.Grid([1, 1], [2.5, 3]), "grid: cells", "[2.5, 3]"),
-    "grid of too many numbers of cells": (lambda: mpm.Grid([1, 1], [2, 3, 4]), "grid: cells", "[2, 3, 4]"),
-    "grid of one dimension": (lambda: mpm.Grid([1], [3]), "grid: upper", "[1]"),
-    "grid turned over": (lambda: mpm.Grid([1, -1], [3, 3]), "grid: upper", "[1, -1]"),
-    "grid without end": (lambda: mpm.Grid([1, np.inf], [3, 3]), "grid: upper", "inf"),
-    "grid up to nan": (lambda: mpm.Grid([1, NAN], [3, 3]), "grid: upper", "nan"),
-    "grid up to a word": (lambda: mpm.Grid("high", [3, 3]), "grid: upper", "'high'"),
-    "grid from another dimension": (lambda: mpm.Grid([1, 1], [3, 3], lower=[0]), "grid: lower", "[0]"),
+    "grid of no cells": (lambda: mpm.Grid([0, 0], [1, 1], [0, 3]), "grid: cells", "[0, 3]"),
+    "grid of half cells": (lambda: mpm.Grid([0, 0], [1, 1], [2.5, 3]), "grid: cells", "[2.5, 3]"),
+    "grid of too many numbers of cells": (lambda: mpm.Grid([0, 0], [1, 1], [2, 3, 4]), "grid: cells", "[2, 3, 4]"),
+    "grid of one dimension": (lambda: mpm.Grid([0], [1], [3]), "grid: lower", "[0]"),
+    "grid from its upper corner": (lambda: mpm.Grid([1, 1], [0, 0], [3, 3]), "Grid(lower, upper, cells)", "[0, 0]"),
+    "grid with cells before its upper corner": (
+        lambda: mpm.Grid([0, 0], [10, 10], [0.5, 1.2]),
+        "Grid(lower, upper, cells)",
+        "[0.5, 1.2]",
+    ),
+    "grid turned over": (lambda: mpm.Grid([0, 0], [1, -1], [3, 3]), "grid: upper", "[1, -1]"),
+    "grid without end": (lambda: mpm.Grid([0, 0], [1, np.inf], [3, 3]), "grid: upper", "inf"),
+    "grid up to nan": (lambda: mpm.Grid([0, 0], [1, NAN], [3, 3]), "grid: upper", "nan"),
+    "grid up to a word": (lambda: mpm.Grid([0, 0], "high", [3, 3]), "grid: upper", "'high'"),
+    "grid from another dimension": (lambda: mpm.Grid([0, 0, 0], [1, 1], [3, 3]), "grid: upper", "[1, 1]"),
     "body outside the grid": (
         lambda: mpm.box(GRID, [0.5, 0.5], [1.5, 0.8]),
         "points outside the grid",
@@ -165,13 +171,13 @@ CASES = {
         "gravity at t = 0.5 s",
         "(0, 0, 1)",
     ),
-    "unknown wall": (lambda: scene(fixed={"west": "x"}), "side 'west'", "left, right, bottom, top"),
-    "unknown component": (lambda: scene(fixed={"left": "z"}), "fixed wall 'left'", "'z'"),
-    "wall of no component": (lambda: scene(fixed={"left": ""}), "fixed wall 'left'", "''"),
-    "component by number": (lambda: scene(fixed={"left": 0}), "fixed wall 'left'", "0"),
-    "walls in a list": (lambda: scene(fixed=["left"]), "fixed", "['left']"),
-    "nothing holds the body": (lambda: scene(fixed={"right": "xy"}).run(1, 1), "fixed walls", "3 of 3 ways"),
-    "the body may turn": (lambda: scene(fixed={"left": "x"}).run(1, 1), "fixed walls", "1 of 3 ways"),
+    "unknown wall": (lambda: scene(walls={"west": "x"}), "side 'west'", "left, right, bottom, top"),
+    "unknown component": (lambda: scene(walls={"left": "z"}), "walls: 'left'", "'z'"),
+    "wall of no component": (lambda: scene(walls={"left": ""}), "walls: 'left'", "''"),
+    "component by number": (lambda: scene(walls={"left": 0}), "walls: 'left'", "0"),
+    "walls in a list": (lambda: scene(walls=["left"]), "walls", "['left']"),
+    "nothing holds the body": (lambda: scene(walls={"right": "xy"}).run(1, 1), "walls", "3 of 3 ways"),
+    "the body may turn": (lambda: scene(walls={"left": "x"}).run(1, 1), "walls", "1 of 3 ways"),
     "drained without fluid": (lambda: scene(drained=[mpm.Drained("left")]), "drained", "fluid"),
     "source without fluid": (lambda: scene(sources=[lambda q: q]), "sources", "fluid"),
     "source of what there is not": (lambda: scene(fluid=WATER, sources=[lambda q, tide: q]), "argument", "'tide'"),
@@ -283,8 +289,8 @@ CASES = {
     "elements without tolerance": (lambda: fem(tolerance=0), "tolerance", "= 0"),
     "elements of a word": (lambda: fem(material="sand"), "material", "'sand'"),
     "elements with a state": (lambda: fem(material=sand()), "DruckerPrager", "no state"),
-    "elements fixed at an unknown side": (lambda: fem(fixed={"west": "x"}), "side 'west'", "left, right, bottom, top"),
-    "elements fixed by an unknown component": (lambda: fem(fixed={"left": "q"}), "fixed side 'left'", "'q'"),
+    "elements fixed at an unknown side": (lambda: fem(walls={"west": "x"}), "side 'west'", "left, right, bottom, top"),
+    "elements fixed by an unknown component": (lambda: fem(walls={"left": "q"}), "walls: 'left'", "'q'"),
     "elements drained without fluid": (lambda: fem(drained=[mpm.Drained("top")]), "drained", "fluid"),
     "elements with fluid and gravity": (lambda: fem(fluid=WATER, gravity=lambda t: (0, 1)), "gravity", "fluid"),
     "elements loaded nowhere": (
@@ -332,7 +338,7 @@ def test_a_point_that_leaves_the_grid_is_named_with_its_time():
     message = r"point \d+ at \[.*\]: its corner at \[.*\] left the grid .* by .* m at t = "
     with pytest.raises(mpm.GaveUp, match=message) as caught:
         s.run(2.0, 0.1)
-    assert not s.grid.outside(s.points.corners.reshape(-1, 2), 1e-4).any(), "the state is not the last good one"
+    assert not s.grid.outside(s.state.points.corners.reshape(-1, 2), 1e-4).any(), "the state is not the last good one"
     assert s.t == caught.value.result.t[-1] and caught.value.result.cuts == 0, "shorter steps only lead there"
     s.stage(tractions=[top_load(60e3, 0.1)])
     assert s.run(s.t + 0.1, 0.1).converged, "the run cannot go on with other loads"
@@ -340,14 +346,14 @@ def test_a_point_that_leaves_the_grid_is_named_with_its_time():
 
 def test_steps_by_error_end_at_the_grid_as_soon_as_they_are_exact_enough():
     """The first step tried leads far beyond the grid, and is too inexact; ever shorter ones only led to its wall."""
-    grid = mpm.Grid([0.1, 1.1], [1, 11])
+    grid = mpm.Grid([0, 0], [0.1, 1.1], [1, 11])
     loads = [mpm.Traction("top", lambda t: (0, 1e5 * t))]
     s = mpm.Simulation(
         grid,
         [mpm.box(grid, [0, 0], [0.1, 1])],
         [SOFT],
         fluid=mpm.Fluid(),
-        fixed={"left": "x", "right": "x", "bottom": "y"},
+        walls={"left": "x", "right": "x", "bottom": "y"},
         tractions=loads,
         drained=[mpm.Drained("top")],
     )
@@ -358,7 +364,7 @@ def test_steps_by_error_end_at_the_grid_as_soon_as_they_are_exact_enough():
 
 def test_a_column_that_slides_is_refused():
     with pytest.raises(ValueError, match="free to move as a rigid body in 1 of 3 ways"):
-        column(fluid=False, fixed={"left": "x", "right": "x"}, tractions=[top_load()]).run(1.0, 1.0)
+        column(fluid=False, walls={"left": "x", "right": "x"}, tractions=[top_load()]).run(1.0, 1.0)
 
 
 @pytest.mark.parametrize("fluid, message", [(False, "the body is turned inside out"), (True, "the pores have closed")])

@@ -64,10 +64,10 @@ def test_an_energy_of_ones_own_gives_what_the_built_in_law_gives():
 
 def two_halves(lower, upper, **options):
     """Return a column of two materials, one on the other."""
-    grid = mpm.Grid([0.1, 1.4], [1, 14])
+    grid = mpm.Grid([0, 0], [0.1, 1.4], [1, 14])
     bodies = [mpm.box(grid, [0, 0], [0.1, 0.5]), mpm.box(grid, [0, 0.5], [0.1, 1], material=1)]
     walls = {"left": "x", "right": "x", "bottom": "y"}
-    return mpm.Simulation(grid, bodies, [lower, upper], fixed=walls, tractions=[load(1.0)], **options)
+    return mpm.Simulation(grid, bodies, [lower, upper], walls=walls, tractions=[load(1.0)], **options)
 
 
 def test_a_function_of_place_equals_two_materials():
@@ -94,7 +94,7 @@ def test_a_beam_whose_moduli_vary_follows_finite_elements():
     s, probe = beam(material=soft_end, fluid=False, ramp=1.0)
     tip = s.run(1.0, 0.25, probes=probe).displacement[-1]
     load = mpm.Traction("top", lambda t: (0, -54e3 * min(1, t)), region=((0.05, -np.inf), (1.0, np.inf)))
-    fem = BiotFEM([0, 0], [1, 0.3], (40, 12), soft_end, fixed={"left": "xy"}, tractions=[load])
+    fem = BiotFEM([0, 0], [1, 0.3], (40, 12), soft_end, walls={"left": "xy"}, tractions=[load])
     exact = fem.run(1.0, 0.25, probes=[[1.0, 0.15]]).displacement[-1]
     assert tip == pytest.approx(exact, rel=4e-3)
 
@@ -107,8 +107,8 @@ def test_oblique_fibres_on_the_points_follow_finite_elements():
         return np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
     tissue = Fibrous(bulk=1e6, shear=6e5, fibre=4e6, direction=slanted)
-    scene = {"fixed": {"bottom": "xy"}, "tractions": [mpm.Traction("top", lambda t: (0, -2e5 * t))]}
-    grid = mpm.Grid([2.0, 1.2], [40, 24], lower=[-0.5, 0])
+    scene = {"walls": {"bottom": "xy"}, "tractions": [mpm.Traction("top", lambda t: (0, -2e5 * t))]}
+    grid = mpm.Grid([-0.5, 0], [2.0, 1.2], [40, 24])
     s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 1])], [tissue], **scene)
     place = [[0.5, 1.0]]
     u = s.run(1.0, 0.25, probes=mpm.probes(s.bodies, place)).displacement[-1]
@@ -132,12 +132,12 @@ def test_several_laws_in_one_scene_share_it_as_one_law_would():
 
 def test_each_body_has_the_stress_of_its_own_law():
     """Hencky, neo-Hookean and Drucker-Prager in one column; under a dead load the stress is the load everywhere."""
-    grid = mpm.Grid([0.1, 1.8], [1, 18])
+    grid = mpm.Grid([0, 0], [0.1, 1.8], [1, 18])
     sand = mpm.DruckerPrager(2e7, 1e7, friction=30.0, dilation=0.0, cohesion=1e4)
     materials = [mpm.Hencky(1e7, 6e6), mpm.NeoHookean(4e6, 3e6), sand]
     bodies = [mpm.box(grid, [0, 0.5 * k], [0.1, 0.5 * (k + 1)], material=k) for k in range(3)]
     walls = {"left": "x", "right": "x", "bottom": "y"}
-    s = mpm.Simulation(grid, bodies, materials, fixed=walls, tractions=[load(1.5)])
+    s = mpm.Simulation(grid, bodies, materials, walls=walls, tractions=[load(1.5)])
     s.run(1.0, 1.0)  # in one step the layers are cells
     assert s.effective_stress()[:, 1, 1] == pytest.approx(-1e6 * np.ones(len(s.points)), rel=1e-6)
     stretch = s.points.F[:, 1, 1].reshape(3, -1)
@@ -170,7 +170,7 @@ def test_consolidation_with_a_conductivity_law_follows_finite_elements(law):
     scene = {"tractions": [mpm.Traction("top", lambda t: (0, -4e5 * min(1, t / 10)))], "drained": [mpm.Drained("top")]}
     s = column(cells=20, material=soil, **scene)
     settlement = np.array(s.run(50, 2.5, probes=mpm.probes(s.bodies, [[0.025, 1.0]])).displacement)[1:, 0, 1]
-    scene |= {"fixed": {"left": "x", "right": "x", "bottom": "y"}, "fluid": mpm.Fluid()}
+    scene |= {"walls": {"left": "x", "right": "x", "bottom": "y"}, "fluid": mpm.Fluid()}
     exact, constant = (
         np.array(BiotFEM([0, 0], [0.05, 1], (1, 40), m, **scene).run(50, 2.5, probes=[[0.025, 1]]).displacement)[
             1:, 0, 1
@@ -237,11 +237,11 @@ def test_an_elastic_foundation_converges_to_its_exact_solution_at_second_order()
 
 def test_an_energy_and_its_forces_give_the_same_and_may_hold_a_body_alone():
     """The energy's tangent is factorised as a symmetric one, that of the forces is not."""
-    grid, positions = mpm.Grid([1.0, 1.4], [10, 14]), []
+    grid, positions = mpm.Grid([0, 0], [1.0, 1.4], [10, 14]), []
     body = mpm.box(grid, [0.3, 0.33], [0.7, 1.0])
     pull = mpm.Traction("top", (1e3, -1e3))
     for term in (foundation, foundation_in_v):
-        s = mpm.Simulation(grid, [body], [SOFT], fixed={}, terms=[term], tractions=[pull])
+        s = mpm.Simulation(grid, [body], [SOFT], walls={}, terms=[term], tractions=[pull])
         s.run(1.0, 0.5)
         positions.append(s.points.corners.mean(axis=1))
         assert s.scene.momentum.symmetric == (term is foundation)
@@ -375,7 +375,7 @@ CASES = {
     "negative conductivity": (
         lambda: column(material=replace(SOFT, conductivity_law=lambda J: 1 - 2 * J)).step(1.0), "k = -1 at .* >= 0"),
     "state in the reference": (
-        lambda: BiotFEM([0, 0], [1, 1], (2, 2), Damaged(1, 1), fixed={}), "the reference has no state"),
+        lambda: BiotFEM([0, 0], [1, 1], (2, 2), Damaged(1, 1), walls={}), "the reference has no state"),
 }  # fmt: skip
 
 
@@ -387,7 +387,7 @@ def test_one_line_says_what_is_wrong(make, message):
 
 
 def test_a_term_of_nothing_changes_nothing_where_one_of_two_materials_is_a_field():
-    grid = mpm.Grid([0.5, 1.2], [5, 12])
+    grid = mpm.Grid([0, 0], [0.5, 1.2], [5, 12])
     bodies = [mpm.box(grid, [0, 0], [0.5, 0.5]), mpm.box(grid, [0, 0.5], [0.5, 1], material=1)]
     materials = [mpm.Hencky(bulk=2e6, shear=1e6), mpm.Hencky(bulk=lambda X: 1e6 * (2 - X[:, 1]), shear=1e6)]
 
@@ -400,7 +400,7 @@ def test_a_term_of_nothing_changes_nothing_where_one_of_two_materials_is_a_field
             grid,
             bodies,
             materials,
-            fixed={"left": "x", "right": "x", "bottom": "y"},
+            walls={"left": "x", "right": "x", "bottom": "y"},
             tractions=[mpm.Traction("top", lambda t: -1e5 * t)],
             terms=terms,
         )

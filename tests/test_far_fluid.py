@@ -37,14 +37,14 @@ FAR = {
 def scene(far=None, load=54e3, wet=True):
     """Return a beam on whose top a load comes and goes in 1 s, beside a body far away, and the number of its points."""
     h = 0.1
-    grid = mpm.Grid([2.6, 1.2], [26, 12])
+    grid = mpm.Grid([0, 0], [2.6, 1.2], [26, 12])
     bodies = [mpm.box(grid, [0, 0.65], [1, 0.95])]
     soils = [mpm.Hencky(bulk=1e7 / 3, shear=5e6, conductivity=1e-4)]
     if far:
         bodies.append(mpm.box(grid, [2.0, 0.6], [2.3, 0.9], material=1))
         soils.append(mpm.Hencky(bulk=3e7, shear=2e7, conductivity=1e-4))
     pressed = mpm.Traction("top", lambda t: (0, -load * (1 - abs(2 * t - 1))), region=((0, -1), (1.0 + h, 9)))
-    conditions = {"fixed": {"left": "xy"}, "tractions": [pressed], **FAR.get(far, {})}
+    conditions = {"walls": {"left": "xy"}, "tractions": [pressed], **FAR.get(far, {})}
     return mpm.Simulation(grid, bodies, soils, fluid=mpm.Fluid() if wet else None, **conditions), len(bodies[0])
 
 
@@ -102,7 +102,7 @@ def test_a_checkpoint_knows_which_parts_stay(tmp_path):
 def test_cells_with_common_nodes_are_one_part():
     rng = np.random.default_rng(1)
     for shape, share in (((13, 11), 0.15), ((7, 6, 5), 0.06)):
-        grid = mpm.Grid([1.0] * len(shape), shape)
+        grid = mpm.Grid([0] * len(shape), [1.0] * len(shape), shape)
         filled = rng.random(int(np.prod(shape))) < share
         part, count = parts_of_cells(grid, filled[grid.cell_number])
         expected, number = label(filled.reshape(shape), structure=np.ones((3,) * len(shape)))

@@ -35,7 +35,7 @@ def embankment(slope, lifts=6):
     crest, length = 24.0, 60.0
     base = crest + 2 * lifts * slope
     n = round(base)
-    grid = mpm.Grid([length, 16.0], [60, 16])
+    grid = mpm.Grid([0, 0], [length, 16.0], [60, 16])
 
     def lift(k):
         def taper(x):
@@ -48,7 +48,7 @@ def embankment(slope, lifts=6):
     bodies = [mpm.box(grid, [0, 0], [length, 6]), *map(lift, range(lifts))]
     walls = {"left": "x", "right": "x", "bottom": "xy"}
     options = {"gravity": (0, -9.81), "fluid": mpm.Fluid(), "drained": [mpm.Drained("top")]}
-    return mpm.Simulation(grid, bodies, [SOFT], fixed=walls, later=range(1, lifts + 1), **options), length - base
+    return mpm.Simulation(grid, bodies, [SOFT], walls=walls, later=range(1, lifts + 1), **options), length - base
 
 
 @pytest.mark.parametrize("slope", [1.0, 1.25, 2.0])
@@ -73,13 +73,13 @@ def test_an_embankment_in_lifts_has_its_crest_and_the_ground_beside_it_free_and_
 
 def settled(dim=2, per_cell=2, quadrature="domain", until=1.0, **options):
     """Return ground that settles more on its left than on its right, and a fill as high as 1 m to come."""
-    grid = mpm.Grid([4.0] * dim, [8] * dim)
+    grid = mpm.Grid([0] * dim, [4.0] * dim, [8] * dim)
     ground = mpm.box(grid, [0] * dim, [*[4] * (dim - 1), 2])
     fill = mpm.box(grid, [1] * (dim - 1) + [2], [3] * (dim - 1) + [3], per_cell=per_cell)
     half = mpm.Traction("top", [0] * (dim - 1) + [-8e4], region=([0] * dim, [2, *[4] * (dim - 1)]))
     walls = {name: "xyz"[:dim] for name in ("left", "right", "bottom", *["front", "back"][: 2 * dim - 4])}
     options = {"tractions": [half], "quadrature": quadrature} | options
-    s = mpm.Simulation(grid, [ground, fill], [SOFT], fixed=walls, later=[1], gravity=[0.0] * dim, **options)
+    s = mpm.Simulation(grid, [ground, fill], [SOFT], walls=walls, later=[1], gravity=[0.0] * dim, **options)
     if until:
         s.run(until, 0.5, progress=False)
     return s
@@ -111,11 +111,11 @@ def test_a_fill_on_ground_that_has_not_moved_is_as_it_was_seeded():
 
 
 def test_a_fill_between_walls_of_a_pit_follows_all_of_them():
-    grid = mpm.Grid([4.0, 4.0], [8, 8])
+    grid = mpm.Grid([0, 0], [4.0, 4.0], [8, 8])
     parts = [([0, 0], [4, 1]), ([0, 1], [1, 2]), ([3, 1], [4, 2]), ([1, 1], [3, 2])]
     bodies = [mpm.box(grid, *part) for part in parts]
     walls = {"left": "x", "right": "x", "bottom": "xy"}
-    s = mpm.Simulation(grid, bodies, [SOFT], fixed=walls, later=[3], gravity=(0, -3 * 9.81))
+    s = mpm.Simulation(grid, bodies, [SOFT], walls=walls, later=[3], gravity=(0, -3 * 9.81))
     s.run(1.0, 0.5, progress=False)
     s.stage(add=[3])
     pit = np.concatenate([s.points.corners[s.points.id < len(s.points) - len(bodies[3])].reshape(-1, 2)])
@@ -129,10 +129,10 @@ def test_a_fill_between_walls_of_a_pit_follows_all_of_them():
 
 def test_what_has_risen_into_a_fill_makes_it_thinner_or_is_refused_with_how_far():
     def risen(height, bottom=1.0):
-        grid = mpm.Grid([2.0, 3.0], [4, 6])
+        grid = mpm.Grid([0, 0], [2.0, 3.0], [4, 6])
         bodies = [mpm.box(grid, [0, 0], [2, 1]), mpm.box(grid, [0, bottom], [2, bottom + 0.5])]
         lift = [mpm.Displacement("top", lambda t, X: (0, height * t))]
-        s = mpm.Simulation(grid, bodies, [SOFT], fixed={"bottom": "y", "left": "x"}, displacements=lift, later=[1])
+        s = mpm.Simulation(grid, bodies, [SOFT], walls={"bottom": "y", "left": "x"}, displacements=lift, later=[1])
         s.run(1.0, 0.25, progress=False)
         return s
 
@@ -181,9 +181,9 @@ def test_a_run_resumed_after_a_fill_came_has_the_same_bits(quadrature, tmp_path)
 
 
 def test_what_a_stage_gave_the_points_must_be_given_anew_when_a_body_comes():
-    grid = mpm.Grid([1, 1], [4, 4])
+    grid = mpm.Grid([0, 0], [1, 1], [4, 4])
     bodies = [mpm.box(grid, [0, 0], [1, 0.5]), mpm.box(grid, [0, 0.5], [1, 1])]
-    s = mpm.Simulation(grid, bodies, [SOFT], fixed={"bottom": "xy"}, later=[1])
+    s = mpm.Simulation(grid, bodies, [SOFT], walls={"bottom": "xy"}, later=[1])
     s.stage(fields={"damage": np.arange(len(s.points))})
     with pytest.raises(ValueError, match=r"stage: add: body 1: its points have no 'damage', must be given anew"):
         s.stage(add=[1])

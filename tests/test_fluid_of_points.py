@@ -21,7 +21,7 @@ def fluid_of(s):
 def footing(dim=2, axisymmetric=False, dilation=0.0, bulk=np.inf, steps=5, **options):
     """Return a wet, frictional block into which a strip or a disc is pushed, and the soil's law."""
     upper, top = ([4.0, 2.0], 1.75) if dim == 2 else ([1.5, 1.5, 1.2], 0.9)
-    grid = mpm.Grid(upper, [16, 8] if dim == 2 else [5, 5, 4], axisymmetric=axisymmetric)
+    grid = mpm.Grid([0] * dim, upper, [16, 8] if dim == 2 else [5, 5, 4], axisymmetric=axisymmetric)
     block = mpm.box(grid, [0.0] * dim, [*upper[:-1], top])
     soil = mpm.DruckerPrager(bulk=1e7, shear=6e6, porosity=POROSITY, conductivity=1e-6, dilation=dilation, **FRICTIONAL)
     push = mpm.Displacement("top", lambda t, X: (0.0,) * (dim - 1) + (-0.03 * t,), region=RIM[dim])
@@ -29,7 +29,7 @@ def footing(dim=2, axisymmetric=False, dilation=0.0, bulk=np.inf, steps=5, **opt
     if axisymmetric:
         walls = {"right": "x", "bottom": "xy"}
     fluid = mpm.Fluid(bulk=bulk)
-    return mpm.Simulation(grid, [block], [soil], fluid=fluid, fixed=walls, displacements=[push], **options)
+    return mpm.Simulation(grid, [block], [soil], fluid=fluid, walls=walls, displacements=[push], **options)
 
 
 def source(points, q, t):

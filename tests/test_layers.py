@@ -30,7 +30,7 @@ def side(which, at, pressure, dim=2, axis=None):
 
 def column(seams, materials=(SAND, CLAY), dim=2, width=H, per_cell=2, place=None, **options):
     """Return a column of sand, 1 m high, with seams of clay from and to some heights (m)."""
-    grid = mpm.Grid([*[width] * (dim - 1), 1.2], [*[round(width / H)] * (dim - 1), 12])
+    grid = mpm.Grid([0] * dim, [*[width] * (dim - 1), 1.2], [*[round(width / H)] * (dim - 1), 12])
     heights = np.array([0.0, *np.ravel(seams), 1.0])
     bodies = [
         mpm.box(grid, [*[0] * (dim - 1), a], [*[width] * (dim - 1), b], per_cell=per_cell, material=i % 2)
@@ -39,7 +39,7 @@ def column(seams, materials=(SAND, CLAY), dim=2, width=H, per_cell=2, place=None
     ]
     bodies = bodies if place is None else [mpm.mapped(grid, body, place) for body in bodies]
     walls = {name: "xyz"[axis] for name, (axis, end) in SIDES[dim].items() if (axis, end) != (dim - 1, 1)}
-    return mpm.Simulation(grid, bodies, list(materials), fixed=walls, **options)
+    return mpm.Simulation(grid, bodies, list(materials), walls=walls, **options)
 
 
 def ends(dim, pressure=TINY):
@@ -231,14 +231,14 @@ def test_a_soft_layer_off_the_grid_lines_is_named_once_with_what_it_loses(ratio,
 
 @pytest.mark.parametrize(("dim", "rings", "order"), [(2, False, -1), (3, False, 1), (2, True, -1)])
 def test_a_soft_layer_is_named_in_space_and_in_rings_and_in_any_order(dim, rings, order, caplog):
-    grid = mpm.Grid([*[2 * H] * (dim - 1), 1.2], [*[2] * (dim - 1), 12], axisymmetric=rings)
+    grid = mpm.Grid([0] * dim, [*[2 * H] * (dim - 1), 1.2], [*[2] * (dim - 1), 12], axisymmetric=rings)
     soft, flat = mpm.Hencky(bulk=SAND.bulk / 10, shear=SAND.shear / 10), [0] * (dim - 1)
     ends = pairwise((0, 3.5 * H, 4.5 * H, 1))
     bodies = [mpm.box(grid, [*flat, a], [*[2 * H] * (dim - 1), b], material=i % 2) for i, (a, b) in enumerate(ends)]
     walls = {name: "xyz"[axis] for name, (axis, end) in SIDES[dim].items() if (axis, end) != (dim - 1, 1)}
     top = list(SIDES[dim])[-1]
     load = mpm.Traction(top, (*flat, -1.0), ([*flat, 0.99], [9] * dim))
-    s = mpm.Simulation(grid, bodies[::order], [SAND, soft], fixed=walls, tractions=[load])
+    s = mpm.Simulation(grid, bodies[::order], [SAND, soft], walls=walls, tractions=[load])
     s.step(1.0)
     (record,) = caplog.records
     assert "material 1, up to 10 times as soft" in record.getMessage() and "about 74 %" in record.getMessage()

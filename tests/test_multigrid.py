@@ -159,10 +159,10 @@ def test_coarse_unknowns_do_not_depend_on_one_another(cells, nodal, wall):
     """Else coarse matrices were singular."""
     index = indices(cells, nodal)
     places = np.column_stack([index, np.zeros(len(index), dtype=np.int64)])
-    fixed = np.zeros(len(index), dtype=bool)
+    walls = np.zeros(len(index), dtype=bool)
     if nodal and wall is not None:
-        fixed = index[:, int(wall == "bottom")] == 0
-    places, held = places[~fixed], places[fixed]
+        walls = index[:, int(wall == "bottom")] == 0
+    places, held = places[~walls], places[walls]
     whole = np.eye(len(places))
     for _ in range(3):
         Q, places, held = interpolation(MPI.COMM_SELF, places, held, nodal)

@@ -20,7 +20,7 @@ class AtPoints:
 
     def __init__(self, dim):
         self.dim, cells = dim, {2: [8, 8], 3: [4, 4, 4]}[dim]
-        self.grid = mpm.Grid([1.0] * dim, cells)
+        self.grid = mpm.Grid([0] * dim, [1.0] * dim, cells)
         names = {name: () for name in SAND.parameters} | {"plastic": (3, 3), "hardened": ()}
         self.points = FormPoints(self.grid, F=(dim, dim), **names)
         self.values = {name: getattr(self.points, name) for name in names}
@@ -286,10 +286,10 @@ def test_drained_triaxial_compression_follows_the_exact_path():
 
         return at
 
-    grid = mpm.Grid([2.0] * 3, [2] * 3)
+    grid = mpm.Grid([0] * 3, [2.0] * 3, [2] * 3)
     body = mpm.box(grid, [0] * 3, [1] * 3)
     loads = [mpm.Traction(side, load(axis)) for axis, side in enumerate(("right", "back", "top"))]
-    s = mpm.Simulation(grid, [body], [m], fixed={"left": "x", "front": "y", "bottom": "z"}, tractions=loads)
+    s = mpm.Simulation(grid, [body], [m], walls={"left": "x", "front": "y", "bottom": "z"}, tractions=loads)
     kappas = []
 
     def compare(s):
@@ -308,11 +308,11 @@ def test_drained_triaxial_compression_follows_the_exact_path():
 def test_a_strip_footing_sinks_at_prandtls_load(friction, factor):
     """Bearing capacity over the cohesion, associated flow; from above, and a plateau: nothing locks."""
     clay = mpm.DruckerPrager(bulk=2e7, shear=1e7, friction=friction, dilation=friction, cohesion=1e4)
-    grid = mpm.Grid([5.0, 3.5], [40, 28])
+    grid = mpm.Grid([0, 0], [5.0, 3.5], [40, 28])
     soil = mpm.box(grid, [0, 0], [5, 3])
     footing = mpm.Displacement("top", lambda t, X: (0, -0.04 * t), region=((0, 0), (1, 9)))  # rough, half of it
     walls = {"left": "x", "right": "x", "bottom": "xy"}
-    s = mpm.Simulation(grid, [soil], [clay], fixed=walls, displacements=[footing])
+    s = mpm.Simulation(grid, [soil], [clay], walls=walls, displacements=[footing])
     loads = []
     s.run(1.0, 0.1, observe=lambda s: loads.append(-s.reactions[0, 1] / clay.cohesion))
     assert factor < loads[-1] < 1.12 * factor

@@ -170,12 +170,12 @@ CASES = {
     "source on the grid's sides": (lambda: wet(sources=[lambda q: q * ufl.ds]), "sources", "over the grid"),
     "source of q squared": (lambda: wet(sources=[lambda points, q: q * q * points.dx]), "sources", "linear in q"),
     # ---- grid, bodies, stages
-    "grid for nobody": (lambda: mpm.Grid([1, 1], [2, 2], comm="world"), "grid: comm", "'world'"),
-    "grid of too many cells": (lambda: mpm.Grid([1, 1], [10**6, 10**6]), "grid: cells", "1e+12"),
-    "scene without a grid": (lambda: mpm.Simulation("grid", [BODY], [soil()], fixed={}), "grid", "'grid'"),
+    "grid for nobody": (lambda: mpm.Grid([0, 0], [1, 1], [2, 2], comm="world"), "grid: comm", "'world'"),
+    "grid of too many cells": (lambda: mpm.Grid([0, 0], [1, 1], [10**6, 10**6]), "grid: cells", "1e+12"),
+    "scene without a grid": (lambda: mpm.Simulation("grid", [BODY], [soil()], walls={}), "grid", "'grid'"),
     "box without a grid": (lambda: mpm.box(None, [0, 0], [1, 1]), "body: grid", "None"),
     "body of a larger grid": (
-        lambda: scene([mpm.box(mpm.Grid([2, 2], [20, 20]), [0, 0], [2, 1])]),
+        lambda: scene([mpm.box(mpm.Grid([0, 0], [2, 2], [20, 20]), [0, 0], [2, 1])]),
         "body 0",
         "outside the grid",
     ),
@@ -219,7 +219,7 @@ CASES = {
     ),
     "a body that nothing holds beside one that is held": (
         lambda: steps(scene(APART)),
-        "fixed walls: the part at [0.65 0.05]",
+        "walls: the part at [0.65 0.05]",
         "3 of 3 ways",
     ),
     # ---- running
@@ -337,7 +337,7 @@ def small_disk():
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # of zipfile, which fails twice
 @pytest.mark.parametrize("what", ["points", "grid", "checkpoint"])
 def test_a_full_disk_loses_nothing(what, tmp_path, small_disk):
-    grid = mpm.Grid([1.0, 1.0], [60, 60]) if what == "grid" else GRID  # the grid's file is the larger one
+    grid = mpm.Grid([0, 0], [1.0, 1.0], [60, 60]) if what == "grid" else GRID  # the grid's file is the larger one
     s = scene([mpm.box(grid, [0, 0.2], [0.1, 0.4])], grid=grid, **LOAD)
     checkpoint = mpm.Checkpoint(tmp_path / "run.ckpt")
     observer = checkpoint if what == "checkpoint" else mpm.Writer(s, tmp_path, grid=what == "grid")
@@ -399,7 +399,7 @@ def test_what_one_process_refuses_all_refuse():
 
 def test_mapped_bodies_are_not_integrated_at_points():
     """Their domains would be boxes from the first step on, while displacements count from where they are seeded."""
-    grid = mpm.Grid([1.0, 1.0], [4, 4])
+    grid = mpm.Grid([0, 0], [1.0, 1.0], [4, 4])
     body = mpm.mapped(grid, mpm.box(grid, [0, 0], [0.5, 0.5]), lambda x: x + 0.1 * x[:, ::-1])
     with pytest.raises(ValueError, match=r"body 0 is mapped or a mesh, must be a box along the grid"):
-        mpm.Simulation(grid, [body], [mpm.Hencky(bulk=1e6, shear=1e6)], fixed={"bottom": "xy"}, quadrature="point")
+        mpm.Simulation(grid, [body], [mpm.Hencky(bulk=1e6, shear=1e6)], walls={"bottom": "xy"}, quadrature="point")

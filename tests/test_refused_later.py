@@ -7,7 +7,7 @@ import ufl
 
 import mpm_dolfinx as mpm
 
-GRID = mpm.Grid([1.0, 1.0], [6, 6])
+GRID = mpm.Grid([0, 0], [1.0, 1.0], [6, 6])
 BODY = mpm.box(GRID, [0, 0], [1, 0.5])
 WALLS = {"left": "x", "right": "x", "bottom": "xy"}
 
@@ -20,7 +20,7 @@ def scene(material=None, wet=False, **options):
     soil = material or mpm.Hencky(bulk=1e6, shear=6e5, conductivity=1e-5)
     water = {"fluid": mpm.Fluid(), "drained": [mpm.Drained("top")]} if wet else {}
     return mpm.Simulation(
-        GRID, [BODY], [soil], fixed=WALLS, tractions=[mpm.Traction("top", (0, -1e4))], **water, **options
+        GRID, [BODY], [soil], walls=WALLS, tractions=[mpm.Traction("top", (0, -1e4))], **water, **options
     )
 
 

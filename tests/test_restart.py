@@ -54,12 +54,12 @@ def plastic_column():
 
 
 def block(fluid=None):
-    grid = mpm.Grid([0.6, 0.4, 0.5], [3, 2, 3])
+    grid = mpm.Grid([0, 0, 0], [0.6, 0.4, 0.5], [3, 2, 3])
     body = mpm.box(grid, [0.1, 0, 0], [0.5, 0.4, 0.35])
     load = mpm.Traction("top", lambda t: (2e6 * t, 0, -4e6 * t))
-    fixed = {"bottom": "xyz", "front": "y", "back": "y"}
+    walls = {"bottom": "xyz", "front": "y", "back": "y"}
     rubber = mpm.NeoHookean(1e7, 5e6, conductivity=1e-4)
-    simulation = mpm.Simulation(grid, [body], [rubber], fixed=fixed, tractions=[load], fluid=fluid)
+    simulation = mpm.Simulation(grid, [body], [rubber], walls=walls, tractions=[load], fluid=fluid)
     return simulation, mpm.probes([body], [[0.5, 0.4, 0.35]])
 
 

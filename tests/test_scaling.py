@@ -46,12 +46,12 @@ def test_a_run_tells_its_memory_and_its_parts():
 
 def test_iterative_solvers_are_freed_with_the_matrices_they_were_made_for(monkeypatch):
     thresholds(monkeypatch, multigrid_3d=1)
-    grid = mpm.Grid([4, 1.5, 2], [16, 6, 8])
+    grid = mpm.Grid([0, 0, 0], [4, 1.5, 2], [16, 6, 8])
     body = mpm.box(grid, [0, 0.25, 0.625], [3.75, 1.25, 1.625])
     law = mpm.LinearElastic(bulk=1e7, shear=1e7, conductivity=1e-4)
     water = {"fluid": mpm.Fluid(), "drained": [mpm.Drained("right")]}
     load = mpm.Traction("top", lambda t: (0, 0, -1e3 * t))
-    s = mpm.Simulation(grid, [body], [law], fixed={"left": "xyz"}, tractions=[load], **water)
+    s = mpm.Simulation(grid, [body], [law], walls={"left": "xyz"}, tractions=[load], **water)
     used = []
     for _ in range(10):
         s.step(0.1)
@@ -61,7 +61,7 @@ def test_iterative_solvers_are_freed_with_the_matrices_they_were_made_for(monkey
 
 
 def test_faces_that_end_on_grid_planes_have_no_points_without_area():
-    grid = mpm.Grid([2, 2, 2], [2, 2, 2])
+    grid = mpm.Grid([0, 0, 0], [2, 2, 2], [2, 2, 2])
     face = np.array([[[2, 0.25, 0.5], [2, 0.75, 1.0], [2, 0.25, 1.0], [2, 0.75, 1.5]]])
     _, _, _, share, _ = cut_faces(grid, face, face)
     assert share.min() > 0 and share.sum() == pytest.approx(1, abs=1e-14)

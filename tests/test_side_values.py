@@ -9,7 +9,7 @@ from helpers import column, rates, refused_in_one_line
 
 import mpm_dolfinx as mpm
 
-GRID = mpm.Grid([1.2, 1.2], [12, 12])
+GRID = mpm.Grid([0, 0], [1.2, 1.2], [12, 12])
 SOIL = mpm.Hencky(bulk=1e6, shear=6e5)
 WALLS = {"left": "x", "bottom": "y"}
 WEIGHT = 9810.0  # of water, N/m^3
@@ -18,7 +18,7 @@ WEIGHT = 9810.0  # of water, N/m^3
 def block(*tractions, walls=WALLS, **options):
     """Return a block that has taken a step under tractions."""
     body = mpm.box(GRID, [0, 0], [1, 1])
-    s = mpm.Simulation(GRID, [body], [SOIL], fixed=walls, tractions=tractions, **options)
+    s = mpm.Simulation(GRID, [body], [SOIL], walls=walls, tractions=tractions, **options)
     s.run(1.0, 0.5, progress=False)
     return s
 
@@ -60,7 +60,7 @@ def test_a_side_under_a_level_that_rises_is_at_rest():
         [body],
         [mpm.Hencky(bulk=1e7, shear=6e6, conductivity=1.0, grain_density=1000)],
         fluid=mpm.Fluid(density=1000, bulk=2.2e9),
-        fixed={"left": "x", "right": "x", "bottom": "y"},
+        walls={"left": "x", "right": "x", "bottom": "y"},
         gravity=(0, -9.81),
         tractions=[mpm.Pressure("top", depth)],
         drained=[mpm.Drained("top", depth)],
@@ -99,7 +99,7 @@ def test_water_flows_from_side_to_side_by_the_heads_of_its_ends():
         [body],
         [mpm.Hencky(bulk=1e9, shear=6e8, conductivity=k)],
         fluid=mpm.Fluid(),
-        fixed={"left": "x", "bottom": "xy"},
+        walls={"left": "x", "bottom": "xy"},
         drained=[mpm.Drained("left", heads), mpm.Drained("right", heads)],
     )
     s.run(100.0, 50.0, progress=False)
@@ -142,11 +142,11 @@ def test_what_a_function_gives_is_read_alike_at_any_number_of_places(form, m, d)
 
 @pytest.mark.parametrize("cells", [1, 2])
 def test_a_vector_for_all_places_acts_as_one_without_places(cells):
-    grid = mpm.Grid([cells / 2, 1.0], [cells, 4])
+    grid = mpm.Grid([0, 0], [cells / 2, 1.0], [cells, 4])
     body, walls = mpm.box(grid, [0, 0], [cells / 2, 0.75], per_cell=1), {"left": "x", "right": "x", "bottom": "y"}
 
     def places(value):
-        s = mpm.Simulation(grid, [body], [SOIL], fixed=walls, tractions=[mpm.Traction("top", value)])
+        s = mpm.Simulation(grid, [body], [SOIL], walls=walls, tractions=[mpm.Traction("top", value)])
         s.run(1.0, 1.0, progress=False)
         return s.points.x
 
@@ -208,7 +208,7 @@ def test_what_a_condition_was_given_is_its_own():
     value, region, gravity, loads = np.array([0.0, -1e4]), [[0, 0], [2, 2]], np.array([0.0, -9.81]), []
     loads.append(mpm.Traction("top", value, region))
     walls = dict(WALLS)
-    s = mpm.Simulation(GRID, [mpm.box(GRID, [0, 0], [1, 1])], [SOIL], fixed=walls, tractions=loads, gravity=gravity)
+    s = mpm.Simulation(GRID, [mpm.box(GRID, [0, 0], [1, 1])], [SOIL], walls=walls, tractions=loads, gravity=gravity)
     value[:], region[1][0], gravity[:], walls["bottom"] = 1e9, 0.1, 1e9, "x"
     loads.append(mpm.Traction("top", (0, 1e9)))
     s.stage(drained=[])

@@ -62,7 +62,7 @@ def test_what_the_step_changes_falls_with_the_cells():
     """Jumps of the step's increment are damped, less where the step's flow is larger: a part of the cells' error."""
     changes = []
     for cells in (5, 10, 15):  # over the load's width
-        grid = mpm.Grid([1.4, 1], [28 * cells // 5, 4 * cells], lower=[-0.2, 0])
+        grid = mpm.Grid([-0.2, 0], [1.4, 1], [28 * cells // 5, 4 * cells])
         soil, water = mpm.Hencky(bulk=1e6, shear=6e5, conductivity=1e-4), mpm.Fluid(bulk=2e7)
 
         def pressed(t, X):
@@ -75,7 +75,7 @@ def test_what_the_step_changes_falls_with_the_cells():
                 [body],
                 [soil],
                 fluid=water,
-                fixed={"bottom": "xy"},
+                walls={"bottom": "xy"},
                 tractions=[mpm.Traction("top", pressed)],
                 drained=[mpm.Drained("left"), mpm.Drained("right")],
             )

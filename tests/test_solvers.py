@@ -25,11 +25,11 @@ from mpm_dolfinx.solve.plan import NODAL, THRESHOLDS
 
 def momentum(dim: int):
     """Return the momentum's matrices of a cube on rollers: some nodes have one unknown, some two or three."""
-    grid = mpm.Grid([1.0] * dim, [4] * dim)
-    walls = {"left": "x", "bottom": "xyz"[dim - 1], "front": "y"}
-    fixed = {wall: axis for wall, axis in walls.items() if dim == 3 or wall != "front"}
+    grid = mpm.Grid([0] * dim, [1.0] * dim, [4] * dim)
+    every = {"left": "x", "bottom": "xyz"[dim - 1], "front": "y"}
+    walls = {wall: axis for wall, axis in every.items() if dim == 3 or wall != "front"}
     body, load = mpm.box(grid, [0] * dim, [0.6] * dim), [0.0] * (dim - 1) + [-1e4]
-    s = mpm.Simulation(grid, [body], [SOFT], fixed=fixed, tractions=[mpm.Traction("top", load)])
+    s = mpm.Simulation(grid, [body], [SOFT], walls=walls, tractions=[mpm.Traction("top", load)])
     s.step(1.0)
     return s.scene.last[1].momentum
 
@@ -103,12 +103,12 @@ def test_a_linear_solver_that_breaks_off_fails_the_step():
 def quarter_pushed(soil: mpm.Skeleton, n: int, step: float) -> mpm.Simulation:
     """Return a saturated cube, of which a given displacement, `step` (m) a second, pushes a quarter of the top."""
     air = n // 4
-    grid = mpm.Grid([1.0, 1.0, 1 + air / n], [n, n, n + air])
+    grid = mpm.Grid([0, 0, 0], [1.0, 1.0, 1 + air / n], [n, n, n + air])
     walls = dict.fromkeys(("left", "right"), "x") | dict.fromkeys(("front", "back"), "y") | {"bottom": "xyz"}
     quarter, beside = ((-np.inf,) * 3, (0.45, 0.45, np.inf)), ((0.5, 0, 0), (np.inf,) * 3)
     push = mpm.Displacement("top", lambda t, X: (0, 0, -step * t), region=quarter)
     drained, body = mpm.Drained("top", region=beside), mpm.box(grid, [0, 0, 0], [1, 1, 1])
-    return mpm.Simulation(grid, [body], [soil], fixed=walls, displacements=[push], drained=[drained], fluid=mpm.Fluid())
+    return mpm.Simulation(grid, [body], [soil], walls=walls, displacements=[push], drained=[drained], fluid=mpm.Fluid())
 
 
 def pushed(bulk: float) -> list[Report]:
@@ -186,25 +186,25 @@ def test_factors_in_place_of_a_multigrid_cycle_are_made_once_and_serve_other_tan
 
 def test_water_flows_through_a_body_whose_nodes_are_all_held():
     """PETSc's factors in blocks of a matrix without rows ended the process."""
-    grid = mpm.Grid([1.0, 0.1], [10, 1])
+    grid = mpm.Grid([0, 0], [1.0, 0.1], [10, 1])
     soil, ends = mpm.Hencky(bulk=2e6, shear=1e6, conductivity=1e-3), (("left", 1e3), ("right", 0.0))
     conditions = {"fluid": mpm.Fluid(), "drained": [mpm.Drained(side, pressure=p) for side, p in ends]}
     body, walls = mpm.box(grid, [0, 0], [1, 0.1]), {"bottom": "xy", "top": "xy"}
-    s = mpm.Simulation(grid, [body], [soil], fixed=walls, **conditions)
+    s = mpm.Simulation(grid, [body], [soil], walls=walls, **conditions)
     s.run(1.0, 0.5, progress=False)
     assert s.points.pressure == pytest.approx(1e3 * (1 - s.points.x[:, 0]), abs=1.0)
 
 
 def strip_pushed() -> mpm.Simulation:
     """Return saturated soil, of which a given displacement, 0.01 m a second, pushes half of the top."""
-    grid, half = mpm.Grid([1.0, 1.25], [12, 15]), ((-np.inf, -np.inf), (0.45, np.inf))
-    fixed, drained = (
+    grid, half = mpm.Grid([0, 0], [1.0, 1.25], [12, 15]), ((-np.inf, -np.inf), (0.45, np.inf))
+    walls, drained = (
         {"left": "x", "right": "x", "bottom": "xy"},
         mpm.Drained("top", region=((0.5, 0), (np.inf, np.inf))),
     )
     push, body = mpm.Displacement("top", lambda t, X: (0, -0.01 * t), region=half), mpm.box(grid, [0, 0], [1, 1])
     given = {"displacements": [push], "drained": [drained], "fluid": mpm.Fluid()}
-    return mpm.Simulation(grid, [body], [FRICTIONAL], fixed=fixed, **given)
+    return mpm.Simulation(grid, [body], [FRICTIONAL], walls=walls, **given)
 
 
 def test_large_bodies_that_yield_end_where_small_ones_do_by_mumps(monkeypatch):

@@ -15,10 +15,10 @@ WALLS = {"left": "x", "right": "x", "bottom": "y"}
 
 def blocks(heights=(0.5, 0.5), **options):
     """Return a simulation of blocks on one another, 1 m wide, and a probe in the middle of the lowest block's top."""
-    grid = mpm.Grid([1.0, 1.4], [10, 14])
+    grid = mpm.Grid([0, 0], [1.0, 1.4], [10, 14])
     bottoms = np.concatenate([[0], np.cumsum(heights)])
     bodies = [mpm.box(grid, [0, a], [1, b]) for a, b in pairwise(bottoms)]
-    options = {"gravity": GRAVITY, "fixed": WALLS} | options
+    options = {"gravity": GRAVITY, "walls": WALLS} | options
     return mpm.Simulation(grid, bodies, [DENSE], **options), mpm.probes(bodies, [[0.5, heights[0]]])
 
 
@@ -72,16 +72,16 @@ def test_the_top_of_what_is_left_is_a_side():
 
 @pytest.mark.parametrize("remove, area", [([1], 0.8), ([1, 2], 1.0)])
 def test_a_condition_that_moves_on_to_what_an_excavation_lays_bare_is_named(caplog, remove, area):
-    grid = mpm.Grid([1.0, 1.4], [10, 14])
+    grid = mpm.Grid([0, 0], [1.0, 1.4], [10, 14])
     bodies = [mpm.box(grid, *part) for part in (([0, 0], [1, 0.5]), ([0, 0.5], [0.8, 1]), ([0.8, 0.5], [1, 1]))]
     load = [mpm.Traction("top", (0, -1e3), region=((0, 0), (0.9, 2))), mpm.Traction("top", (0, -1e3))]
-    s = mpm.Simulation(grid, bodies, [DENSE], fixed=WALLS, tractions=load[1:])
+    s = mpm.Simulation(grid, bodies, [DENSE], walls=WALLS, tractions=load[1:])
     with caplog.at_level("WARNING", "mpm_dolfinx"):
         s.stage(remove=remove)
     (record,) = caplog.records
     assert "Traction(side='top'" in record.getMessage() and f"on {area:.3g} m^1 that were" in record.getMessage()
     caplog.clear()
-    other = mpm.Simulation(grid, bodies, [DENSE], fixed=WALLS, tractions=load[1:])
+    other = mpm.Simulation(grid, bodies, [DENSE], walls=WALLS, tractions=load[1:])
     other.stage(remove=remove, tractions=load)
     assert not caplog.records, "they were given anew"
 
@@ -110,14 +110,14 @@ def test_a_wet_fill_keeps_the_fluids_balance():
 
 
 def test_walls_plates_and_given_displacements_come_and_go():
-    s, probe = blocks(gravity=None, fixed=WALLS)
+    s, probe = blocks(gravity=None, walls=WALLS)
     s.stage(plates=[mpm.RigidPlate("top", 1e3)])
     down = s.run(1.0, 1.0, probes=probe).displacement[-1]
     assert down[0, 1] == pytest.approx(-0.5 * 1e3 / DENSE.oedometric, rel=1e-2)
     s.stage(plates=[], displacements=[mpm.Displacement("top", (0, 0), "y")])
     back = s.run(2.0, 1.0, probes=probe).displacement[-1]
     assert abs(back[0, 1]) < 1e-6 and s.reactions.shape == (1, 2)
-    s.stage(displacements=[], fixed={"bottom": "xy"})
+    s.stage(displacements=[], walls={"bottom": "xy"})
     assert s.run(3.0, 1.0).converged
 
 
@@ -143,11 +143,11 @@ def test_a_body_that_is_to_come_must_exist():
 
 def bent(**options):
     """Return a simulation of two bodies that a map has bent, one on the other, pressed from above."""
-    grid = mpm.Grid([1.0, 1.4], [10, 14])
+    grid = mpm.Grid([0, 0], [1.0, 1.4], [10, 14])
     boxes = [mpm.box(grid, [0, a], [0.5, a + 0.5]) for a in (0.0, 0.5)]
     bodies = [mpm.mapped(grid, body, lambda x: x + [0.1, 0] * np.sin(x[:, [1]])) for body in boxes]
     load = [mpm.Traction("top", -1e3)]
-    return mpm.Simulation(grid, bodies, [DENSE], fixed={"bottom": "xy"}, tractions=load, **options)
+    return mpm.Simulation(grid, bodies, [DENSE], walls={"bottom": "xy"}, tractions=load, **options)
 
 
 def test_a_mapped_body_comes_later_and_goes():

@@ -17,12 +17,12 @@ WATER = mpm.Fluid(bulk=1e8)
 
 def column(load: float, **options) -> mpm.Simulation:
     """Return a column of 1 m, off the grid lines, that consolidates under a load, Pa."""
-    grid = mpm.Grid([0.5, 1.2], [5, 12])
+    grid = mpm.Grid([0, 0], [0.5, 1.2], [5, 12])
     body = mpm.box(grid, [0, 0], [0.5, 0.97])
-    fixed = {"left": "x", "right": "x", "bottom": "y"}
+    walls = {"left": "x", "right": "x", "bottom": "y"}
     conditions = {"tractions": [mpm.Traction("top", (0, -load))]} | options
     drained = [mpm.Drained("top")]
-    return mpm.Simulation(grid, [body], [SOIL], fluid=WATER, fixed=fixed, drained=drained, **conditions)
+    return mpm.Simulation(grid, [body], [SOIL], fluid=WATER, walls=walls, drained=drained, **conditions)
 
 
 @pytest.fixture

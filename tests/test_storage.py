@@ -127,15 +127,15 @@ def test_a_jump_between_two_cells_is_damped_by_a_quarter_of_the_published_stabil
     """
     lam, shear, biot, brought = 2e6, 5e6, 0.8, 1e-6  # the last: share of a cell's volume
     soil = mpm.Hencky(bulk=lam + 2 * shear / 3, shear=shear, porosity=0.4, biot=biot)
-    grid = mpm.Grid([1.0, *[0.5] * (dim - 1)], [2, *[1] * (dim - 1)])
-    fixed = {side: "xyz"[:dim] for side in ("left", "right", "bottom")} | {"top": "xyz"[: dim - 1]}
-    fixed |= {"front": "xy", "back": "xy"} if dim == 3 else {}
+    grid = mpm.Grid([0] * dim, [1.0, *[0.5] * (dim - 1)], [2, *[1] * (dim - 1)])
+    walls = {side: "xyz"[:dim] for side in ("left", "right", "bottom")} | {"top": "xyz"[: dim - 1]}
+    walls |= {"front": "xy", "back": "xy"} if dim == 3 else {}
     body, water = mpm.box(grid, [0] * dim, grid.upper), mpm.Fluid(bulk=1e7)
 
     def filling(points, q):
         return brought * ufl.conditional(ufl.lt(points.position[0], 0.5), 1.0, 0.0) * q * points.dx
 
-    s = mpm.Simulation(grid, [body], [soil], fixed=fixed, fluid=water, sources=[filling])
+    s = mpm.Simulation(grid, [body], [soil], walls=walls, fluid=water, sources=[filling])
     s.step(1.0)
     left, p = s.points.x[:, 0] < 0.5, s.points.pressure
     patch = 3 * biot**2 / (8 * (lam + 3 * shear))
@@ -144,12 +144,12 @@ def test_a_jump_between_two_cells_is_damped_by_a_quarter_of_the_published_stabil
 
 
 def test_a_cell_that_becomes_active_between_active_nodes_gets_an_unknown():
-    grid = mpm.Grid([3.0, 3.0], [3, 3])
+    grid = mpm.Grid([0, 0], [3.0, 3.0], [3, 3])
 
     def ring(x):
         return (np.abs(x - 1.5) > 0.5).any(axis=1)
 
-    s = mpm.Simulation(grid, [mpm.shape(grid, ring)], [SOFT], fluid=mpm.Fluid(), fixed={"left": "xy", "bottom": "xy"})
+    s = mpm.Simulation(grid, [mpm.shape(grid, ring)], [SOFT], fluid=mpm.Fluid(), walls={"left": "xy", "bottom": "xy"})
     assert set_up(s, 1.0).matrices.storage.unknowns.size == 8
     # one domain of the cell below comes to fill the hole, another one the place that it left
     moved, other = np.flatnonzero((np.abs(s.points.x - [1.5, 0.5]) < 0.5).all(axis=1))[:2]

@@ -70,10 +70,10 @@ def hencky_column(width, headroom=0, load=1.0, porosity=0.7, **options):
     """
     h, law = 1 / 50, {"conductivity": 1e-4, "conductivity_law": linear_diffusion}
     soil = mpm.Hencky(1e6 / 3, 5e5, porosity=porosity, **law)
-    grid = mpm.Grid([width * h, 1.0 + headroom * h], [width, 50 + headroom])
+    grid = mpm.Grid([0, 0], [width * h, 1.0 + headroom * h], [width, 50 + headroom])
     body, push = mpm.box(grid, [0, 0], [width * h, 1.0]), [mpm.Traction("top", (0, -load * soil.oedometric))]
     walls, water = {"left": "x", "right": "x", "bottom": "y"}, mpm.Fluid(bulk=np.inf)
-    s = mpm.Simulation(grid, [body], [soil], fluid=water, fixed=walls, tractions=push, **DRAINED, **options)
+    s = mpm.Simulation(grid, [body], [soil], fluid=water, walls=walls, tractions=push, **DRAINED, **options)
     return s, mpm.probes([body], [[h / 2, 1.0]]), 1e-4 * soil.oedometric / 9810
 
 

@@ -12,7 +12,7 @@ MUD = {"bulk": 2e6, "shear": 1e6, "porosity": 0.4, "conductivity": 1e-5}
 
 def bank(level, h=0.25):
     """Return a block of 1 m in water up to a level, under gravity."""
-    grid = mpm.Grid([3.0, 2.0], [round(3 / h), round(2 / h)])
+    grid = mpm.Grid([0, 0], [3.0, 2.0], [round(3 / h), round(2 / h)])
     body = mpm.box(grid, [1, 0], [2, 1])
     loads, heads = zip(*(mpm.water(side, level) for side in ("left", "right", "top")), strict=True)
     return mpm.Simulation(
@@ -20,7 +20,7 @@ def bank(level, h=0.25):
         [body],
         [mpm.Hencky(grain_density=1000.0, **MUD)],
         fluid=mpm.Fluid(),
-        fixed={"bottom": "xy"},
+        walls={"bottom": "xy"},
         tractions=loads,
         drained=heads,
         gravity=lambda t: (0, -9.81 * min(1.0, t / 10)),
@@ -40,7 +40,7 @@ def test_soil_as_heavy_as_water_hardly_moves_in_still_water(h):
 
 
 def test_heavier_soil_under_water_carries_its_weight_less_the_waters():
-    grid = mpm.Grid([0.5, 2.0], [2, 16])
+    grid = mpm.Grid([0, 0], [0.5, 2.0], [2, 16])
     body = mpm.box(grid, [0, 0], [0.5, 1.0])
     load, head = mpm.water("top", 1.5)
     s = mpm.Simulation(
@@ -48,7 +48,7 @@ def test_heavier_soil_under_water_carries_its_weight_less_the_waters():
         [body],
         [mpm.Hencky(grain_density=2650.0, **{**MUD, "bulk": 2e8, "shear": 1e8})],
         fluid=mpm.Fluid(),
-        fixed={"bottom": "y", "left": "x", "right": "x"},
+        walls={"bottom": "y", "left": "x", "right": "x"},
         tractions=[load],
         drained=[head],
         gravity=(0, -9.81),
@@ -75,7 +75,7 @@ def test_water_that_falls_leaves_a_seepage_face():
 
 def test_water_that_is_not_as_heavy_as_the_pores_is_named(caplog):
     """Sea water in the pores, fresh water on the sides: it sank into the soil, without a word."""
-    grid = mpm.Grid([0.5, 2.0], [2, 8])
+    grid = mpm.Grid([0, 0], [0.5, 2.0], [2, 8])
     cases = [(1000.0, 9810.0, 9.8, 0), (1025.0, 9810.0, 9.81, 2), (1025.0, 10055.0, 9.81, 0)]
     for density, unit_weight, g, named in cases:
         load, head = mpm.water("top", 1.5, unit_weight=unit_weight)
@@ -85,7 +85,7 @@ def test_water_that_is_not_as_heavy_as_the_pores_is_named(caplog):
             [mpm.box(grid, [0, 0], [0.5, 1.0])],
             [mpm.Hencky(**MUD)],
             fluid=mpm.Fluid(density=density),
-            fixed={"bottom": "y", "left": "x", "right": "x"},
+            walls={"bottom": "y", "left": "x", "right": "x"},
             tractions=[load],
             drained=[head],
             gravity=(0, -g),
@@ -111,9 +111,9 @@ def test_water_that_is_none_is_refused(arguments, said):
     with pytest.raises(ValueError, match=said):
         load, head = mpm.water(**{"side": "top", **arguments})
         bank_with = {"tractions": [load], "drained": [head]}
-        grid = mpm.Grid([1.0, 1.0], [2, 2])
+        grid = mpm.Grid([0, 0], [1.0, 1.0], [2, 2])
         body, soil = mpm.box(grid, [0, 0], [1, 0.5]), mpm.Hencky(**MUD)
-        mpm.Simulation(grid, [body], [soil], fluid=mpm.Fluid(), fixed={"bottom": "xy"}, **bank_with)
+        mpm.Simulation(grid, [body], [soil], fluid=mpm.Fluid(), walls={"bottom": "xy"}, **bank_with)
 
 
 def test_a_level_that_a_function_does_not_give_is_refused_by_its_step():

@@ -210,7 +210,7 @@ def given(
         out[rows] = lattice.given(points.id[rows])
     for name, axes in walls.items():
         axis, end = SIDES[grid.dim][name]
-        at_wall = np.abs(points.corners[:, :, axis] - (grid.lower, grid.upper)[end][axis]) < 1e-6 * grid.h[axis]
+        at_wall = np.abs(points.corners[:, :, axis] - (grid.low, grid.high)[end][axis]) < 1e-6 * grid.h[axis]
         for letter in axes:
             out[:, :, "xyz".index(letter)] |= at_wall
     return out

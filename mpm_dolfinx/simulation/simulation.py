@@ -36,6 +36,7 @@ from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.stages import begin_stage, first_state
 from mpm_dolfinx.stepping.state import State
 from mpm_dolfinx.stepping.step import step
+from mpm_dolfinx.stepping.tangent import tangent
 
 
 class Simulation:
@@ -47,7 +48,7 @@ class Simulation:
         Background grid, and seeded bodies.
     materials
         Material of each index that the bodies name.
-    fixed
+    walls
         Walls of the grid ("left", "right", "bottom", "top", in 3D also "front", "back") with the components that
         are zero there, such as {"left": "xy", "bottom": "y"}.
     fluid
@@ -94,7 +95,7 @@ class Simulation:
         bodies: Sequence[Body],
         materials: Sequence[Skeleton],
         *,
-        fixed: Mapping[str, str],
+        walls: Mapping[str, str],
         fluid: Fluid | None = None,
         tractions: Sequence[Traction | Pressure] = (),
         displacements: Sequence[Displacement] = (),
@@ -119,13 +120,13 @@ class Simulation:
         check_options(bodies, fluid, pressure, terms, sources, quadrature)
         grid = grouped(grid, bodies, contacts, quadrature, {"terms": terms, "sources": sources})
         grid = grid.shared(points_in_cells(grid, bodies), keep=bool(len(terms) + len(sources)))
-        warn_thin(grid, bodies, with_axis(grid, fixed), fluid is not None)
+        warn_thin(grid, bodies, with_axis(grid, walls), fluid is not None)
         check_axisymmetry(grid, bodies, quadrature)
         began = time.perf_counter()
         options = (quadrature, scheme, method, gravity is not None, pressure, terms, sources)
         initial = by_body(initial_stress, bodies, later)
         self.scene = Scene(grid, bodies, materials, under(fluid, gravity), *options, initial)
-        conditions = {"fixed": fixed, "tractions": tractions, "displacements": displacements, "drained": drained}
+        conditions = {"walls": walls, "tractions": tractions, "displacements": displacements, "drained": drained}
         conditions |= {"inflows": inflows, "plates": plates, "tools": tools, "gravity": gravity, "contacts": contacts}
         self.state = first_state(self.scene, conditions, later)
         if initial:
@@ -152,7 +153,7 @@ class Simulation:
     @property
     def points(self) -> MaterialPoints:
         """The material points of this process; their arrays can be read, not written."""
-        return self.state.points
+        return self.state.points.placed(self.grid.base)
 
     @property
     def t(self) -> float:
@@ -210,22 +211,22 @@ class Simulation:
 
         In axisymmetry (n, 3, 3), of radius, axis and hoops.  On several processes all call it together.
         """
-        return self.scene.materials.effective_stress(self.points)
+        return self.scene.materials.effective_stress(self.state.points)
 
     def point_fields(self) -> PointFields:
         """Return stresses, p', q and porosity of the points, see `PointFields`; all processes call it together."""
-        return point_fields(self.scene, self.points)
+        return point_fields(self.scene, self.state.points)
 
     def cells(self) -> CellFields:
         """Return centroids and fields of the cells at present, see `CellFields`; all processes call it together."""
         return cell_fields(self.scene, self.state)
 
-    # ---- stages ---------------------------------------------------------------------------------
+    # ---- stages and steps -----------------------------------------------------------------------
 
     def stage(
         self,
         *,
-        fixed: Mapping[str, str] | None = None,
+        walls: Mapping[str, str] | None = None,
         tractions: Sequence[Traction | Pressure] | None = None,
         displacements: Sequence[Displacement] | None = None,
         drained: Sequence[Drained] | None = None,
@@ -245,7 +246,7 @@ class Simulation:
 
         Parameters
         ----------
-        fixed, tractions, displacements, drained, inflows, plates, tools, gravity
+        walls, tractions, displacements, drained, inflows, plates, tools, gravity
             As for the scene; `gravity` only if the scene had it.
         add
             Indices of bodies that were to come `later`: a fill, at rest and without stress, put onto the
@@ -265,12 +266,10 @@ class Simulation:
         ValueError
             The scene is then what it was.
         """
-        conditions = {"fixed": fixed, "tractions": tractions, "displacements": displacements, "drained": drained}
+        conditions = {"walls": walls, "tractions": tractions, "displacements": displacements, "drained": drained}
         conditions |= {"inflows": inflows, "plates": plates, "tools": tools, "gravity": gravity}
         named = {name: value for name, value in conditions.items() if value is not None}
         self.state = begin_stage(self.scene, self.state, named, add, remove, reset_displacement, fields or {})
-
-    # ---- steps ----------------------------------------------------------------------------------
 
     def step(self, dt: float) -> Report:
         """Advance by dt (s), > 0; return what the step took.
@@ -297,4 +296,4 @@ class Simulation:
             raise_interrupt(error)
             raise
 
-    run = run
+    run, tangent = run, tangent

@@ -54,12 +54,14 @@ def pieces_at_start(scene: Scene, points: MaterialPoints) -> PiecePressures:
     """Return what pieces of domains carry of a field of pressure, by which cells have that of their centroids."""
     on_grid, grid, pressure = scene.on_grid(points), scene.grid, scene.initial.pressure
     cut, contents, bulk = on_grid.cut, on_grid.contents, scene.fluid.bulk
-    pi = mass_potential(cut.pieces_to_cells(pressure_at(pressure, cut.pieces.x)), bulk)  # which adds up in a cell
+    pi = mass_potential(
+        cut.pieces_to_cells(pressure_at(pressure, cut.pieces.x + grid.base)), bulk
+    )  # which adds up in a cell
     store = on_grid.weight * on_grid.data.pieces["storage"][:, 0]
     held = contents.total(cut.cells, store)
     weight = np.where(held[contents.slot(cut.cells)] > 0, store, on_grid.weight)
     mean = contents.total(cut.cells, weight * pi) / contents.total(cut.cells, weight)
-    wanted = pressure_at(pressure, grid.midpoints[contents.filled] + contents.centroid[contents.filled])
+    wanted = pressure_at(pressure, grid.base + grid.midpoints[contents.filled] + contents.centroid[contents.filled])
     pi = pi + (mass_potential(wanted, bulk) - mean)[contents.slot(cut.cells)]
     p = cut.to_pieces(pressure_of(pi, bulk))
     pieces, bounds = cut.pieces, np.stack([p, p], axis=1)

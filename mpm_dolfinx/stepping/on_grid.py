@@ -389,10 +389,9 @@ class Assembled(Keyed):
         grid, on_grid = self._on_grid.cut.grid, self._on_grid
         of_cells = 1e-14 * on_grid.stiffness * grid.cell_volume / grid.h.min()
         if sides.holds is not None:
-            reach = np.abs(np.concatenate([grid.lower, grid.upper])).max()
             held = np.zeros(grid.num_local)
             np.maximum.at(held, sides.holds.cells, sides.holds["stiffness"][:, 0])
-            of_cells = of_cells + 1e-15 * reach * held
+            of_cells = of_cells + 1e-15 * grid.reach * held
         if sides.tools is not None:
             np.maximum.at(of_cells, sides.tools.rows.cell, of_cells[sides.tools.rows.cell] + sides.tools.rounding)
         own = np.flatnonzero(on_grid.active[: grid.num_owned])

@@ -40,7 +40,7 @@ CONDITIONS = {
 class Stage:
     """The conditions in force.
 
-    conditions: as they were given, by name, the axis among the fixed walls; present: which bodies are there; later:
+    conditions: as they were given, by name, the axis among the walls; present: which bodies are there; later:
     those that may still come; free: (nodes, d), components that no wall holds; axisymmetric: as the grid; lattices: of
     the bodies that are there; mechanical, hydraulic: what acts on the sides of the bodies.
     """
@@ -87,7 +87,7 @@ def stage(
     fluid
         Pore fluid, if there is one.
     conditions
-        fixed, tractions, displacements, drained, inflows, plates, tools, contacts, gravity: see `Simulation`; terms: on
+        walls, tractions, displacements, drained, inflows, plates, tools, contacts, gravity: see `Simulation`; terms: on
         sides.
     present, later
         Which bodies are there, and which may still come.
@@ -108,12 +108,12 @@ def stage(
         gravity = _gravity(gravity, "gravity", grid.dim, grid.axisymmetric).copy()
     if not any(present):
         raise ValueError("bodies: none is there, must be at least one")
-    fixed = with_axis(grid, conditions["fixed"])
-    free = ~_fixed(grid, fixed)
-    own = {name: tuple(values) for name, values in conditions.items() if name not in ("fixed", "gravity")}
+    walls = with_axis(grid, conditions["walls"])
+    free = ~_held(grid, walls)
+    own = {name: tuple(values) for name, values in conditions.items() if name not in ("walls", "gravity")}
     own["tractions"] = tuple(replace(load, value=weighed(load.value, fluid)) for load in own["tractions"])
     own["drained"] = tuple(replace(side, pressure=weighed(side.pressure, fluid)) for side in own["drained"])
-    conditions = {**own, "fixed": dict(fixed), "gravity": gravity}  # nobody changes what a stage was given
+    conditions = {**own, "walls": dict(walls), "gravity": gravity}  # nobody changes what a stage was given
     sides = Sides(grid, bodies, present)
     acting = (conditions[name] for name in ("tractions", "displacements", "plates", "tools", "terms"))
     mechanical = MechanicalBoundary(sides, free, materials, *acting, conditions["contacts"])
@@ -131,15 +131,15 @@ def _gravity(value: ArrayLike, name: str, dim: int, axisymmetric: bool) -> NDArr
     return out
 
 
-def _fixed(grid: Grid, fixed: Mapping[str, str]) -> NDArray[np.bool_]:
+def _held(grid: Grid, walls: Mapping[str, str]) -> NDArray[np.bool_]:
     """Return which components (nodes, d) are held by walls."""
     d = grid.dim
     out = np.zeros((len(grid.node_x), d), dtype=bool)
-    if not isinstance(fixed, Mapping):
-        raise ValueError(f"fixed = {line(fixed)}, must be walls with their components, such as {{'left': 'xy'}}")
-    for wall, axes in fixed.items():
+    if not isinstance(walls, Mapping):
+        raise ValueError(f"walls = {line(walls)}, must be walls with their components, such as {{'left': 'xy'}}")
+    for wall, axes in walls.items():
         if not isinstance(axes, str) or not axes or any(a not in "xyz"[:d] for a in axes):
-            raise ValueError(f"fixed wall {wall!r}: components {axes!r}, must be some of {'xyz'[:d]!r}")
+            raise ValueError(f"walls: {wall!r}: components {axes!r}, must be some of {'xyz'[:d]!r}")
         for a in axes:
             out[grid.wall_nodes(wall), "xyz".index(a)] = True
     return out

@@ -93,7 +93,7 @@ def begin_stage(
     unknown, new = np.nan if state.resets else 0.0, {}
     if "displacements" in named:
         new["reactions"] = np.full((len(begun.mechanical.holds), scene.grid.dim), unknown)
-    if "fixed" in named:
+    if "walls" in named:
         new["walls"] = np.full_like(state.walls, unknown)
     if "tools" in named:
         new["tool_forces"] = begun.mechanical.forces(unknown)

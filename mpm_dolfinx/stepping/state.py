@@ -165,4 +165,4 @@ class State:
         if grid.comm.size == 1:
             return self
         placed = self.as_cut
-        return self.migrated(grid.owner(grid.number(grid.index(placed.x)) + grid.copy(placed.id)), grid.comm)
+        return self.migrated(grid.owner(grid.number(grid.index_from_base(placed.x)) + grid.copy(placed.id)), grid.comm)

@@ -59,7 +59,7 @@ class _Builder:
         size = scene.size + more * scene.h
         lower, upper = frame.box(np.zeros(scene.dim), size, scene)
         cells = np.abs(frame.vector(np.add(scene.cells, more))).astype(int).tolist()
-        self.grid = mpm.Grid(upper, cells, lower=lower, axisymmetric=scene.axisymmetric)
+        self.grid = mpm.Grid(lower, upper, cells, axisymmetric=scene.axisymmetric)
         bodies = self.permuted(list(range(len(scene.bodies) + far)))
         laws = self.permuted(list(range(len(scene.materials) + far)))
         self.order = [bodies.index(i) for i in range(len(bodies))]
@@ -78,7 +78,7 @@ class _Builder:
             walls[frame.side("top")] = "xyz"[: scene.dim]
         walls = dict(self.permuted(list(walls.items())))
         options = self.options(later)
-        simulation = mpm.Simulation(self.grid, found, materials, fixed=walls, later=later, **conditions, **options)
+        simulation = mpm.Simulation(self.grid, found, materials, walls=walls, later=later, **conditions, **options)
         return Built(scene, frame, simulation, self.order, self.loads, numbers, materials)
 
     def permuted(self, values: list) -> list:
