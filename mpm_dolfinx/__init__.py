@@ -65,6 +65,7 @@ from mpm_dolfinx.solve.scheme import COUPLINGS, Scheme
 from mpm_dolfinx.stepping.numerics import Numerics
 from mpm_dolfinx.stepping.result import GaveUp, Result
 from mpm_dolfinx.stepping.state import State
+from mpm_dolfinx.stepping.tangent import Tangent
 from mpm_dolfinx.verification.element_test import ElementTest, element_test
 
 __version__ = "0.1.0"
@@ -119,6 +120,7 @@ __all__ = [
     "SofteningDruckerPrager",
     "Source",
     "State",
+    "Tangent",
     "Tool",
     "Traction",
     "Writer",
