@@ -237,7 +237,7 @@ def test_the_tangent_of_the_contact_is_its_derivative(friction):
     s.step(0.5)
     momentum: MomentumProblem = set_up(s, 0.5).momentum
     rng, forms, unknowns = np.random.default_rng(1), momentum.forms, momentum.system.unknowns
-    contact = momentum._sides.tools
+    (contact,) = momentum._sides.contacts
 
     def residual(values):
         forms.u.x.array[unknowns.owned] = values
@@ -245,7 +245,7 @@ def test_the_tangent_of_the_contact_is_its_derivative(friction):
         return momentum.assemble_residual()[0].array.copy()
 
     at = 1e-4 * rng.normal(size=unknowns.size)
-    residual(at), contact.settle(forms.nodal, True)
+    residual(at), contact.settle(unknowns, forms.u.x.array, True)
     way = rng.normal(size=unknowns.size)
     residual(at)
     x, y = unknowns.vector(), unknowns.vector()

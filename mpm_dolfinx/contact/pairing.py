@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """The contacts of groups of a stage: which places on their surfaces face one another, and what points keep of it.
 
-The contact itself is in `body_contact`.
+The contact itself is in `problem`.
 """
 
 from __future__ import annotations
@@ -25,9 +25,11 @@ from mpm_dolfinx.bodies.faces import Surface, surface
 from mpm_dolfinx.bodies.touching import BITS, local, weights
 from mpm_dolfinx.conditions.conditions import resistance
 from mpm_dolfinx.conditions.sides import Sides
-from mpm_dolfinx.contact.body_contact import BodyContact, Following, PairRows
-from mpm_dolfinx.contact.cell_contact import LEAST, kept, pressure_name, shear_name
 from mpm_dolfinx.contact.groups import Contact
+from mpm_dolfinx.contact.history import Origin, kept, pressure_name, shear_name
+from mpm_dolfinx.contact.law import LEAST, ContactLaw
+from mpm_dolfinx.contact.pairs import FacePairs
+from mpm_dolfinx.contact.problem import ContactProblem
 from mpm_dolfinx.contact.tool_placing import BEGINS, FACING
 from mpm_dolfinx.domains.cut_domains import DEPTH as UNDER
 from mpm_dolfinx.domains.cut_domains import CutDomains
@@ -118,22 +120,22 @@ class Contacts:
         """Return what n points keep of the contacts, zero."""
         return kept("contact", self.contacts, n, self.grid.dim)
 
-    def placed(self, cut: CutDomains, points: MaterialPoints) -> Following | None:
+    def placed(self, cut: CutDomains, points: MaterialPoints) -> ContactProblem | None:
         """Return the contact in a step, with the points where they are at its start."""
         if not self.contacts:
             return None
         found = self._found(cut.key, lambda: self._met_all(cut, cut.points), self.grid.comm)
         reach = partial(self._reach, cut.key, partial(self._cells_within_reach, cut, found), self.grid.comm)
-        begun = self._contact(cut, points, found, cut.points, points, reach)
+        begun = self._law(cut, points, found, cut.points, points, reach)
 
-        def again(u: NDArray[np.float64]) -> BodyContact:
+        def again(u: NDArray[np.float64]) -> tuple[ContactLaw, Origin]:
             moved, _ = cut.followed(u.reshape(-1, self.grid.dim), np.zeros(self.grid.num_local, dtype=bool))
             there = replace(points, corners=points.corners + moved)
-            return self._contact(cut, points, self._met_all(cut, there), there, there, reach)
+            return self._law(cut, points, self._met_all(cut, there), there, there, reach)
 
-        return Following(begun, again)
+        return ContactProblem("contact", *begun, again=again, reach=reach)
 
-    def _contact(
+    def _law(
         self,
         cut: CutDomains,
         points: MaterialPoints,
@@ -141,8 +143,8 @@ class Contacts:
         seen: MaterialPoints,
         there: MaterialPoints,
         reach: Callable[[], NDArray[np.int64]],
-    ) -> BodyContact:
-        """Return the contact of pairs that were found with the points as `seen`, with these now `there`.
+    ) -> tuple[ContactLaw, Origin]:
+        """Return the conditions of pairs that were found with the points as `seen`, with these now `there`.
 
         points: at the start of the step, with the pressures and shears of then.
         """
@@ -179,9 +181,9 @@ class Contacts:
         cell, other, sent = (travel.send(columns) for columns in (cell, other, values))
         number, place = sent[:, :2].T.astype(np.int64)
         x, y, n, apart, shear = np.split(sent[:, 5:], 5, axis=1)
-        placed = PairRows(number, grid.local(cell), *sent[:, 2:5].T, shear, other, x, y, n, apart, place)
-        back = (travel, at, values[:, 0].astype(np.int64), values[:, 2])
-        return BodyContact(grid, self.contacts, self._signs, placed, back, reach)
+        own = number, grid.local(cell), *sent[:, 2:5].T, shear, x, self._signs
+        pairs = FacePairs(grid, *own, other, y, n, apart, place)
+        return ContactLaw(self.contacts, pairs), Origin(travel, at, values[:, 0].astype(np.int64), values[:, 2])
 
     def _met_all(self, cut: CutDomains, points: MaterialPoints) -> list[tuple[Facets, Pairs]]:
         """Return for each contact what `_met` does."""

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """The rigid tools of a stage: where they touch the bodies in a step, and what points keep of them.
 
-The contact itself is in `tool_contact`.
+The contact itself is in `problem`.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.bodies.faces import Surface
 from mpm_dolfinx.conditions.conditions import Displacement, resistance
 from mpm_dolfinx.conditions.sides import everywhere
-from mpm_dolfinx.contact.cell_contact import LEAST, kept, pressure_name, shear_name
-from mpm_dolfinx.contact.pushed_tools import PushedTools
-from mpm_dolfinx.contact.tool_contact import ToolContact, ToolRows
-from mpm_dolfinx.contact.tools import Pose, Tool
+from mpm_dolfinx.contact.history import Origin, kept, pressure_name, shear_name
+from mpm_dolfinx.contact.law import LEAST, ContactLaw
+from mpm_dolfinx.contact.pairs import ToolPairs
+from mpm_dolfinx.contact.problem import ContactProblem, Loads
+from mpm_dolfinx.contact.tool import Pose, Tool
 from mpm_dolfinx.domains.cut_domains import CutDomains
-from mpm_dolfinx.forms.point_forms import Places
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.parallel.exchange import Exchange, first, over_all
@@ -122,7 +122,7 @@ class Tools:
         """Return what n points keep of the tools, zero."""
         return kept("tool", self.tools, n, self.grid.dim)
 
-    def placed(self, cut: CutDomains, points: MaterialPoints, start: float, t: float) -> ToolContact | None:
+    def placed(self, cut: CutDomains, points: MaterialPoints, start: float, t: float) -> ContactProblem | None:
         """Return the contact at time t (s) of a step that began at `start`, with the points where they are now."""
         if not self.tools:
             return None
@@ -133,7 +133,6 @@ class Tools:
         resists = self._materials.table(cut.points, resistance)[patches.at]
         poses, found = [self._pose(tool, t) for tool in self.tools], []
         loads = [tool.pushes(t) if t > start else np.nan for tool in self.tools]  # initial stresses are without them
-        pushed = PushedTools([line(tool) for tool in self.tools], self._ways.before, np.array(loads), grid.h.min())
         for number, (tool, pose) in enumerate(zip(self.tools, poses, strict=True)):
             before = self._pose(tool, start)
             n = everywhere(grid, lambda tool=tool, pose=pose: tool.solid(grid.h.min()).normal(pose.own(x)) @ pose.R.T)
@@ -149,9 +148,12 @@ class Tools:
         cell, place, sent = (travel.send(rows) for rows in (patches.cell[at], patches.x[at], values))
         number, *own = sent[:, :4].T
         now, carried, shear = np.split(sent[:, 4:], 3, axis=1)
-        rows = ToolRows(number.astype(np.int64), grid.local(cell), *own, shear, now, carried)
-        back = (travel, patches.at[at], values[:, 0].astype(np.int64), values[:, 1])
-        return ToolContact(grid, self.tools, poses, pushed, rows, Places(grid, rows.cell, place), back)
+        acts = np.ones(len(self.tools)), self.tools, poses
+        pairs = ToolPairs(grid, number.astype(np.int64), grid.local(cell), *own, shear, place, *acts, now, carried)
+        origin = Origin(travel, patches.at[at], values[:, 0].astype(np.int64), values[:, 1])
+        along = np.array([tool.along(d) for tool in self.tools])
+        pushes = Loads([line(tool) for tool in self.tools], self._ways.before, along, np.array(loads))
+        return ContactProblem("tool", ContactLaw(self.tools, pairs), origin, pushes)
 
     def _edge(
         self, tool: Tool, pose: Pose, x: NDArray[np.float64], unit: NDArray[np.float64], faces: NDArray[np.bool_]

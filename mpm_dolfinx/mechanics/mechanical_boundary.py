@@ -30,11 +30,11 @@ from mpm_dolfinx.conditions.conditions import (
     resistance,
 )
 from mpm_dolfinx.conditions.sides import Sides, check_apart, everywhere, gathered, meeting, on_side
-from mpm_dolfinx.contact.cell_contact import gripped, let_go
 from mpm_dolfinx.contact.groups import Contact
+from mpm_dolfinx.contact.history import gripped, let_go
 from mpm_dolfinx.contact.pairing import Contacts
+from mpm_dolfinx.contact.tool import Tool
 from mpm_dolfinx.contact.tool_placing import Tools, Ways
-from mpm_dolfinx.contact.tools import Tool
 from mpm_dolfinx.domains.cut_domains import CutDomains, Patches
 from mpm_dolfinx.forms.point_forms import FormPoints, Places, PointData
 from mpm_dolfinx.forms.unknowns import Unknowns
@@ -120,7 +120,7 @@ class MechanicalBoundary:
         """Whether the tangent of pressures, tools and contacts is symmetric."""
 
     def forces(self, value: float) -> NDArray[np.float64]:
-        """Return an array of forces and moments of tools and contacts, see `ToolContact.forces`, all of one value."""
+        """Return an array of forces and moments of tools and contacts, see `ContactProblem`, all of one value."""
         count = len(self.tools.tools) + len(self.contacts.contacts)
         return np.full((count, 3 if self.grid.dim == 2 else 6), value)
 
@@ -173,12 +173,22 @@ class MechanicalBoundary:
         tools.check_end(cut, points, t, before, start)
         self.contacts.check_end(cut, points, before)
 
-    def going(self, sides: SideData, start: float, t: float, ways: NDArray[np.float64]) -> tuple[Tools, NDArray]:
+    def going(
+        self,
+        sides: SideData,
+        unknowns: Unknowns,
+        u: NDArray[np.float64],
+        times: tuple[float, float],
+        ways: NDArray[np.float64],
+    ) -> tuple[Tools, NDArray]:
         """Return the tools as they go in a step between two times (s), and how far loads have pushed them (tools,), m.
 
-        ways: the same at its start.
+        u: displacements of the step, a local array, m; ways: the same at its start.
         """
-        after = ways if sides.tools is None else sides.tools.pushed.ways
+        after, (start, t) = ways, times
+        for contact in sides.contacts:
+            if contact.pushed:
+                after = ways + contact.at(unknowns, u).travel
         return self.tools.going(Ways(start, t, ways, after)), after
 
     def touched(
@@ -188,14 +198,11 @@ class MechanicalBoundary:
 
         u: displacements of the step, a local array, m.
         """
-        forces, nodal = self.forces(0.0), u.reshape(-1, self.grid.dim)
-        if sides.tools is not None:
-            forces[: len(self.tools.tools)] = sides.tools.forces(nodal)
-            points = sides.tools.gripped(nodal, points)
-        if sides.contact is not None:
-            forces[len(self.tools.tools) :] = sides.contact.now.forces(unknowns, u)
-            points = sides.contact.now.gripped(unknowns, u, points)
-        return forces, points
+        forces = [self.forces(0.0)[:0]]
+        for contact in sides.contacts:
+            forces.append(contact.forces(unknowns, u))
+            points = contact.gripped(unknowns, u, points)
+        return np.concatenate(forces), points
 
     def data(
         self,
@@ -222,8 +229,8 @@ class MechanicalBoundary:
             pairs = zip(forms.own, self._terms, strict=True)
             own = tuple(self._own_data(term.points, faces, cut, points) for term, faces in pairs)
             tools = self.tools.going(Ways(start, t, ways, ways)).placed(cut, points, start, t)
-            contact = self.contacts.placed(cut, points)
-            return SideData(loads, pressures, plates, *holds, tools, own, contact)
+            contacts = tuple(found for found in (tools, self.contacts.placed(cut, points)) if found is not None)
+            return SideData(loads, pressures, plates, *holds, own, contacts)
 
     def _load_data(self, forms: SideForms, cut: CutDomains, points: MaterialPoints, t: float) -> PointData:
         """Return the dead loads on the surface."""

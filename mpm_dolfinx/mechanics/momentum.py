@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 
-from mpi4py import MPI
 from petsc4py import PETSc
 
 import numpy as np
@@ -27,9 +26,8 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base import _compat
 from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.conditions.conditions import OnSide
-from mpm_dolfinx.contact.tool_contact import ToolContact
 from mpm_dolfinx.forms.cell_matrices import Beside, ElementForces, ElementMatrices, StackedElementMatrices
-from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointForm
+from mpm_dolfinx.forms.point_forms import FormPoints, PointForm
 from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts, zero
 from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.materials.evaluate import by_scene
@@ -207,16 +205,6 @@ class MomentumForms:
         self.sides.pressed.assemble_vector(forces.x.array, sides.pressures)
         return sum_ghosts(forces)
 
-    def pushed(self, contact: ToolContact) -> NDArray[np.float64]:
-        """Return the nodal forces of tools at u, a local array."""
-        sides, places = self.sides, contact.places
-        sides.forces.x.array[:] = 0.0
-        force = contact.at(self.nodal).force
-        sides.traction.assemble_vector(
-            sides.forces.x.array, PointData(sides.loads, places, np.ones(len(force)), {"force": force})
-        )
-        return sum_ghosts(sides.forces)
-
     @property
     def nodal(self) -> NDArray[np.float64]:
         """u by nodes (nodes, d), m."""
@@ -252,11 +240,6 @@ class MomentumForms:
         if sides.pressures is not None:
             self.sides.pressed_slope.assemble_matrix(K, sides.pressures)
         self.sides.assemble_own(K, sides)
-        if sides.tools is not None:
-            places, slope = sides.tools.places, sides.tools.at(self.nodal).slope
-            of_rows = PointData(self.sides.slopes, places, np.ones(len(slope)), {"slope": slope})
-            self.sides.pushed_slope.assemble_matrix(K, of_rows)
-            sides.tools.assemble_matrix(K, self.nodal)
 
     def at_nodes(self, cells: NDArray[np.int32], values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the sums (nodes,) at the local nodes of what owned cells, of all processes, have (cells,)."""
@@ -452,43 +435,28 @@ class MomentumProblem:
     def linear(self) -> bool:
         """Whether the tangent changes with the places of the points only."""
         sides = self._sides
-        return self.forms.linear and sides.pressures is None and sides.tools is None and sides.contact is None
+        return self.forms.linear and sides.pressures is None and not sides.contacts
 
     @property
     def smooth(self) -> bool:
         """Whether the tangent of one substep may lead the next."""
-        return self.forms.elastic and self._sides.tools is None and self._sides.contact is None
+        return self.forms.elastic and not self._sides.contacts
 
-    def settle_tools(self, sticks: bool) -> bool:
-        """Choose what slips on tools at u, and if asked for what sticks again; return whether it is another choice."""
-        tools, contact = self._sides.tools, self._sides.contact
-        of_tools = tools is not None and tools.settle(self.forms.nodal, sticks)
-        return (contact is not None and contact.now.settle(*self._at, sticks)) or of_tools
+    def settle_contacts(self, sticks: bool) -> bool:
+        """Choose what slips at u, and if asked for what sticks again; return whether it is another choice."""
+        return any([contact.settle(*self._at, sticks) for contact in self._sides.contacts])
+
+    def augment_contacts(self) -> bool:
+        """Augment the pressures of what penetrates too deep; return whether the balance is another one since."""
+        return any([contact.augment(*self._at) for contact in self._sides.contacts])
+
+    def follow_contacts(self) -> bool:
+        """Find anew which places of groups face one another at u; return whether the balance is another one since."""
+        return any([contact.follow(*self._at) for contact in self._sides.contacts])
 
     @property
     def _at(self) -> tuple[Unknowns, NDArray[np.float64]]:
         return self.system.unknowns, self.forms.u.x.array
-
-    def augment_tools(self, forces: NDArray[np.float64]) -> bool:
-        """Shift the pressures of tools that penetrate too deep; return whether the balance is another one since.
-
-        forces (parts,): what residuals are measured by, N.
-        """
-        tools, contact = self._sides.tools, self._sides.contact
-        of_tools = tools is not None and tools.augment(self.forms.nodal, self._unknown_of_tools(forces))
-        return (contact is not None and contact.now.augment(*self._at)) or of_tools
-
-    def _unknown_of_tools(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return how well the balance tells the forces of tools (tools,), N: by the parts that they may touch."""
-        system, tools = self.system, self._sides.tools
-        of_parts = system.round_off + self._tolerance * forces
-        unknown = np.zeros(len(tools.contacts))
-        np.maximum.at(unknown, tools.rows.number, of_parts[system.parts.cells[tools.rows.cell]])
-        return over_all(self.forms.grid.comm, unknown, MPI.MAX)
-
-    def follow_contacts(self) -> bool:
-        """Find anew which places of groups face one another at u; return whether the balance is another one since."""
-        return self._sides.contact is not None and self._sides.contact.follow(*self._at)
 
     def guesses(self) -> list[NDArray[np.float64]]:
         """Return displacements (local unknowns,), m, at which Newton's method may begin.
@@ -531,16 +499,14 @@ class MomentumProblem:
             norms.append(system.force_of_parts(own))
             forces += own
         b[system.touched] = forces - external
-        if self._sides.tools is not None:
-            b[system.touched] -= forms.pushed(self._sides.tools)[system.touched]
         system.held.gather(b, system.held_residual)  # walls bear what sides beside them would push them by
         if self._sides.holds is not None:  # no measure of forces: at the start of a step it is far above them
             b[system.touched] -= self._pulls
         r = system.unknowns.gather(b, system.residual)
         step = system.unknowns.gather(forms.u.x.array, system.step)
         system.penalty.multAdd(step, r, r)
-        if self._sides.contact is not None:
-            self._sides.contact.now.push(*self._at, r)
+        for contact in self._sides.contacts:
+            contact.push(*self._at, r)
         return r, np.max(norms, axis=0)
 
     def out_of_balance(
@@ -563,8 +529,8 @@ class MomentumProblem:
         """Return the forces (2 d, d), N, of the walls at u, where the residual was last assembled."""
         system, forces = self.system, self.system.held_residual.copy()
         system.held_penalty.multAdd(system.step, forces, forces)
-        if self._sides.contact is not None:
-            self._sides.contact.now.push_on(system.held, *self._at, forces)
+        for contact in self._sides.contacts:
+            contact.push(*self._at, forces, system.held)
         dofs, forces = system.held.owned, forces.array_r
         if self._sides.holds is not None:  # what given sides count of their own
             pulled, own = self._sides.pulled(self.forms.nodal)
@@ -586,10 +552,10 @@ class MomentumProblem:
         K.assemble()
         pattern = PETSc.Mat.Structure
         K.axpy(1.0, self.system.penalty, pattern.UNKNOWN if first else pattern.SUBSET_NONZERO_PATTERN)
-        if self._sides.contact is not None:
-            if first:
-                K.axpy(1.0, self._sides.contact.now.pattern(self.system.unknowns), pattern.UNKNOWN)
-            K.axpy(1.0, self._sides.contact.now.tangent(*self._at), pattern.SUBSET_NONZERO_PATTERN)
+        for contact in self._sides.contacts:
+            if first and (zeros := contact.pattern(self.system.unknowns)) is not None:
+                K.axpy(1.0, zeros, pattern.UNKNOWN)
+            K.axpy(1.0, contact.tangent(*self._at), pattern.SUBSET_NONZERO_PATTERN)
         shares = np.broadcast_to(firmness, self.system.parts.count)
         if (shares == shares[:1]).all():
             if shares.any():

@@ -16,8 +16,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from mpm_dolfinx.conditions.conditions import OnSide
-from mpm_dolfinx.contact.body_contact import Following
-from mpm_dolfinx.contact.tool_contact import ToolContact
+from mpm_dolfinx.contact.problem import ContactProblem
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointForm
 from mpm_dolfinx.forms.unknowns import sum_ghosts
 from mpm_dolfinx.grid.grid import Grid
@@ -31,7 +30,7 @@ class SideData:
     loads: with their force; pressures: with their force on the area at the start of the step; plates: with their
     rigidity, normal and present tilt; holds: components of given displacements, with stiffness, direction and gap;
     held: what holds them; row: which of it each component is; share (m, 2^d): of its force on each node, but for what
-    walls bear; tools: contact with them; own: of each term of the user's own; contact: of groups of bodies.
+    walls bear; own: of each term of the user's own; contacts: with tools, and of groups of bodies.
     """
 
     loads: PointData | None
@@ -41,9 +40,8 @@ class SideData:
     held: HeldCells | None
     row: NDArray[np.int64]
     share: NDArray[np.float64]
-    tools: ToolContact | None = None
     own: tuple[PointData, ...] = ()
-    contact: Following | None = None
+    contacts: tuple[ContactProblem, ...] = ()
 
     def moved(self, u: fem.Function) -> SideData:
         """Return the same with the forces that what holds sides has after a displacement u, m, of the nodes.
@@ -197,17 +195,6 @@ class SideForms:
     def _bend(self, slope) -> ufl.Form:
         """Return the work of plates that bend or turn by a slope: kappa slope . grad_t(v_n)."""
         return self.plates.rigidity * ufl.inner(slope, self._slope(self._v)) * self.plates.dx
-
-    @cached_property
-    def slopes(self) -> FormPoints:
-        """Points with a force that changes with their displacement."""
-        return FormPoints(self._grid, slope=(self._grid.dim, self._grid.dim))
-
-    @cached_property
-    def pushed_slope(self) -> PointForm:
-        """Minus the derivative of such forces."""
-        p = self.slopes
-        return PointForm(ufl.inner(p.slope * p.value(self._du), p.value(self._v)) * p.dx, p)
 
     @cached_property
     def holds(self) -> FormPoints:

@@ -18,7 +18,7 @@ from mpm_dolfinx.conditions.axis import check_axisymmetry, with_axis
 from mpm_dolfinx.conditions.conditions import Displacement, Drained, Inflow, OnSide, Pressure, RigidPlate, Traction
 from mpm_dolfinx.conditions.unit_weights import under
 from mpm_dolfinx.contact.groups import Contact, grouped
-from mpm_dolfinx.contact.tools import Tool
+from mpm_dolfinx.contact.tool import Tool
 from mpm_dolfinx.diagnostics.scene_parts import check_options, check_parts
 from mpm_dolfinx.diagnostics.thin import warn_thin
 from mpm_dolfinx.grid.grid import SIDES, Grid

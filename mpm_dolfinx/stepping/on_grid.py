@@ -394,12 +394,13 @@ class Assembled(Keyed):
             held = np.zeros(grid.num_local)
             np.maximum.at(held, sides.holds.cells, sides.holds["stiffness"][:, 0])
             of_cells = of_cells + 1e-15 * reach * held
-        if sides.tools is not None:
-            np.maximum.at(of_cells, sides.tools.rows.cell, of_cells[sides.tools.rows.cell] + sides.tools.rounding)
+        for contact in sides.contacts:
+            np.maximum.at(of_cells, contact.pairs.cell, of_cells[contact.pairs.cell] + contact.rounding)
         own = np.flatnonzero(on_grid.active[: grid.num_owned])
         at_nodes = momentum.at_nodes(own, of_cells[own]) / 2 ** (grid.dim - 1)  # as many cells beside a flat side
-        if sides.contact is not None:
-            at_nodes += over_all(grid.comm, float(sides.contact.now.rounding.max(initial=0.0)), MPI.MAX)
+        for contact in sides.contacts:
+            if contact.kind == "contact":  # other sides, in other cells
+                at_nodes += over_all(grid.comm, float(contact.rounding.max(initial=0.0)), MPI.MAX)
         return at_nodes
 
     def flow(
@@ -478,15 +479,14 @@ def assembled(
         if not momentum.holding:
             holds, held = sides.holds, []
             if holds is not None:
-                held.append((holds.cells, holds.x, holds["direction"]))
-            if sides.tools is not None:
-                held.append(sides.tools.touching())
-            meeting = sides.contact.now.touching() if sides.contact is not None else None
-            check_held(grid, on_grid.active, free, held, begins, meeting)
+                held.append((holds.cells, None, holds.x, holds["direction"]))
+            held += [contact.touching() for contact in sides.contacts]
+            check_held(grid, on_grid.active, free, held, begins)
         return System(momentum, storage, scheme, on_grid, dofs, nodes, stiff, momentum.symmetric and symmetric)
 
     # a cell may become active between active nodes, so equal dofs do not mean equal cells
     with Timer("mpm: integration data"):
-        pairs = None if sides.contact is None else on_grid.key  # couple nodes as they lie
+        couples = any(contact.couples for contact in sides.contacts)
+        pairs = on_grid.key if couples else None  # couple nodes as they lie
         system = systems((stage, on_grid.cells, dofs, on_grid.penalised, pairs), make, grid.comm)
         return Assembled(momentum, storage, system, on_grid, stage, sides)

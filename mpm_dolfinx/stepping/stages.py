@@ -17,7 +17,7 @@ from mpm_dolfinx.bodies.fills import put, touches
 from mpm_dolfinx.bodies.touching import check_apart
 from mpm_dolfinx.conditions.sides import everywhere
 from mpm_dolfinx.conditions.unit_weights import WEIGHS, warn_units
-from mpm_dolfinx.contact.cell_contact import let_go
+from mpm_dolfinx.contact.history import let_go
 from mpm_dolfinx.domains.pressure_transport import at_start
 from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.parallel.messages import warn

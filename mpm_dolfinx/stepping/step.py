@@ -50,7 +50,7 @@ def step(scene: Scene, state: State, dt: float, how: tuple = ()) -> tuple[State,
     start.matrices.end_step()
     mechanical, at = state.stage.mechanical, (start.matrices.momentum.unknowns, scene.momentum.u.x.array)
     now = both.outcome(state, acting)
-    tools, ways = mechanical.going(acting.sides, state.t, state.t + dt, state.tool_travel)
+    tools, ways = mechanical.going(acting.sides, *at, (state.t, state.t + dt), state.tool_travel)
     end = state.t + dt, tools, both.came(rates[-1]), report
     new, report.rederived = scene.motion.advanced(state, on_grid, start.data, *end)
     velocity = None if scene.momentum.elastic else scene.momentum.u.x.array / dt
