@@ -35,7 +35,7 @@ WORKSHOP = ".mpm_dolfinx-"
 """How the names of the folders begin in which libraries are made."""
 ABANDONED = 600.0
 """Seconds after which a library that another program has begun will not be finished."""
-DAY = 86400.0
+DAY = 86400.0  # Source: definition
 logger = logging.getLogger("mpm_dolfinx")
 _settings = jit.get_options if hasattr(jit, "get_options") else jit.get_parameters  # OLD
 _ffcx_settings = ffcx.get_options if hasattr(ffcx, "get_options") else ffcx.get_parameters  # OLD

@@ -20,6 +20,11 @@ import numpy as np
 import ufl
 from numpy.typing import NDArray
 
+from mpm_dolfinx.base.tolerances import EPSILON
+
+SERIES = (120 * EPSILON) ** 0.25
+"""Arguments below which sinh(z) / z is 1 + z^2 / 6.  Source: exact, the next term is z^4 / 120."""
+
 
 def change_of_content(alpha, a, storage, J, dp):
     """Return the change of the content in a step as UFL, per volume at its start.
@@ -40,7 +45,7 @@ def change_of_content(alpha, a, storage, J, dp):
 def change_at_points(alpha, a, storage, J, dp) -> NDArray[np.float64]:
     """Return the same of points (n,), of arrays."""
     z = a * dp / (2 * alpha)
-    small = np.abs(z) < 1e-3
+    small = np.abs(z) < SERIES
     away = np.where(small, 1.0, z)
     return _change(alpha, a, storage, J, dp, np.cosh(z), np.where(small, 1 + z**2 / 6, np.sinh(away) / away))
 
@@ -66,7 +71,7 @@ def density_between(p0, p1, compliance):
 
 
 def _sinhc(z):
-    small = ufl.lt(abs(z), 1e-3)
+    small = ufl.lt(abs(z), SERIES)
     away = ufl.conditional(small, 1.0, z)  # both branches are evaluated, and differentiated
     return ufl.conditional(small, 1 + z**2 / 6, ufl.sinh(away) / away)
 

@@ -10,12 +10,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mpm_dolfinx.base.tolerances import SAME, TINY
 from mpm_dolfinx.base.validation import numbers
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.touching import (
     BITS,
-    SAME,
-    TINY,
     Cover,
     Faces,
     covers,
@@ -58,7 +57,7 @@ class Surface:
 
     def off_axis(self) -> Surface:
         """Return the faces but for those that lie on the axis of revolution, where they have no area."""
-        off = self.places()[:, :, 0].max(axis=1, initial=0.0) > 1e-9 * self.whole0
+        off = self.places()[:, :, 0].max(axis=1, initial=0.0) > SAME * self.whole0
         if off.all():
             return self
         rows = {f.name: getattr(self, f.name)[off] for f in fields(self) if f.name != "region"}
@@ -182,7 +181,7 @@ def _in_region(
     x = _face_corners(body, row, face)
     low, high = x.min(axis=1), x.max(axis=1)
     size = high - low
-    slack = 1e-9 * size.max(axis=1, keepdims=True) + rounding(x)  # slivers are none: their domains would count as held
+    slack = SAME * size.max(axis=1, keepdims=True) + rounding(x)  # slivers are none: their domains would count as held
     within = (low >= region[0] - slack) & (high <= region[1] + slack)
     common = np.minimum(high, region[1]) - np.maximum(low, region[0])
     on = np.where(size <= slack, within, common > slack).all(axis=1)

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from mpm_dolfinx.base.tolerances import SAME
 from mpm_dolfinx.points.cutting import FACES, corner_bits
 
 KINDS = {2: {"triangle": 3, "quad": 4}, 3: {"tetra": 4, "hexahedron": 8, "wedge": 6, "pyramid": 5}}
@@ -176,10 +177,7 @@ def _crossed(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float
     """Return the cross products (n, 3) of edges, nothing of those that are parallel but for rounding."""
     out = np.cross(a, b)
     size = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
-    return np.where((np.linalg.norm(out, axis=1) > PARALLEL * size)[:, None], out, 0.0)
-
-
-PARALLEL = 1e-9  # sine of the angle between edges of which no common normal is known for rounding
+    return np.where((np.linalg.norm(out, axis=1) > SAME * size)[:, None], out, 0.0)
 
 
 def _shape(kind: str) -> tuple[range, list, list]:

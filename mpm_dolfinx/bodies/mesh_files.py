@@ -18,6 +18,7 @@ from dolfinx import mesh as dolfinx_mesh
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base import _compat
+from mpm_dolfinx.base.tolerances import NEAR
 from mpm_dolfinx.base.validation import instance, line, line_of, path
 from mpm_dolfinx.bodies import mesh_readers
 from mpm_dolfinx.bodies.mesh_cells import AS_LATTICE, KINDS, SECOND_ORDER, SIDES_OF, distinct, edges
@@ -32,7 +33,6 @@ TAGS += ("avsucd:material", "ugrid:ref", "netgen:index", "tetgen:ref", "cell_mar
 """Data of meshio's cells that number parts and sides."""
 OF_DOLFINX = {2: {"triangle": 6, "quad": 9}, 3: {"tetra": 10, "hexahedron": 27}}
 """Cells of dolfinx that become domains, and their numbers of nodes where they are of second order."""
-FLAT = 1e-9  # of the size of a mesh in the plane: how far its vertices may lie off it
 
 
 def from_mesh(
@@ -289,7 +289,7 @@ def _plane(dim: int, x: NDArray[np.float64], cells: Mapping[str, NDArray[np.int6
     if not np.isfinite(x[used]).all():
         bad = used[~np.isfinite(x[used]).all(axis=1)][0]
         raise ValueError(f"mesh: vertex {bad} is at {x[bad]}, must be at finite coordinates")
-    if len(used) and x.shape[1] > dim and np.ptp(x[used, 2]) > FLAT * np.ptp(x[used, :2], axis=0).max():
+    if len(used) and x.shape[1] > dim and np.ptp(x[used, 2]) > NEAR * np.ptp(x[used, :2], axis=0).max():
         low, high = x[used, 2].min(), x[used, 2].max()
         raise ValueError(f"mesh: a surface in space, z from {low:.3g} to {high:.3g}, must be flat in 2D, in x and y")
     return x[:, :dim]

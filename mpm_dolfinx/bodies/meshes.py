@@ -17,18 +17,17 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from mpm_dolfinx.base.tolerances import NEAR, SAME
 from mpm_dolfinx.base.validation import whole
 from mpm_dolfinx.bodies.bodies import Body, check_inside
 from mpm_dolfinx.bodies.mesh_cells import KINDS, PARTS, Polytopes, distinct
-from mpm_dolfinx.bodies.touching import TOUCH, Faces, covers, face_vectors
+from mpm_dolfinx.bodies.touching import Faces, covers, face_vectors
 from mpm_dolfinx.grid.grid import Grid, rounding, sum_by
 from mpm_dolfinx.parallel.messages import warn
 from mpm_dolfinx.points.cutting import FACES, centroids, corner_bits, simplex_volumes, vertices, volumes
 
 LONG = 1.5  # cells over points a cell and direction: domains with longer edges are split
 SMALL = 0.2  # of the cells that domains are wanted in: a warning names smaller ones
-CONVEX = 1e-6  # least volume at a corner of a domain, over that of its box
-SAME = 1e-6  # of the shortest edge: corners nearer than this are one
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +136,7 @@ class MeshBody(Body):
     @cached_property
     def _nodes(self) -> NDArray[np.int64]:
         x = self.vertices.reshape(-1, self.dim)
-        pairs = cKDTree(x).query_pairs(SAME * self.spacing.min(), output_type="ndarray")
+        pairs = cKDTree(x).query_pairs(NEAR * self.spacing.min(), output_type="ndarray")
         graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(x), len(x)))
         return connected_components(graph, directed=False)[1].astype(np.int64).reshape(self.vertices.shape[:2])
 
@@ -148,7 +147,7 @@ def seeded(grid: Grid, mesh: Mesh, part: str | None, per_cell: int, material: in
     cells = mesh.part(part)
     _check_once(mesh, cells, name)
     domains, keys, cell = map(np.concatenate, zip(*_domains(mesh, cells), strict=True))
-    out = np.flatnonzero(grid.outside(domains.reshape(-1, grid.dim)))
+    out = np.flatnonzero(grid.outside(domains.reshape(-1, grid.dim) - grid.base))
     if len(out):
         x = domains.reshape(-1, grid.dim)[out[0]]
         raise ValueError(f"{name}: has a vertex at {x}, must be inside the grid {grid.lower} to {grid.upper}")
@@ -253,7 +252,7 @@ def _check_apart(
     corners = [x[nodes] for nodes in cells.values()]
     boxes = np.concatenate([np.stack([c.min(axis=1), c.max(axis=1)], axis=1) for c in corners])
     size = boxes[:, 1] - boxes[:, 0]
-    slack = TOUCH / 2 * size.min(axis=1) + rounding(x)
+    slack = NEAR / 2 * size.min(axis=1) + rounding(x)
     pairs = np.stack(_boxes_that_meet(boxes, size, outer, slack), axis=1)
     both = np.unique(np.sort(pairs, axis=1) @ [len(boxes), 1])
     both = np.setdiff1d(both, np.sort(neighbours, axis=1) @ [len(boxes), 1], assume_unique=True)
@@ -316,7 +315,7 @@ def _check_convex(domains: NDArray[np.float64], name: str) -> None:
     least = np.linalg.det(edges).min(axis=1)
     of_simplices = simplex_volumes(vertices(np.ascontiguousarray(domains.transpose(1, 2, 0))))
     least = np.minimum(least, of_simplices.min(axis=0, initial=np.inf))
-    bad = np.flatnonzero(~(least > CONVEX * size))
+    bad = np.flatnonzero(~(least > NEAR * size))
     if len(bad):
         x = domains[bad[0]].mean(axis=0)
         what = f"{len(bad)} cells are flat, turned inside out or not convex, the first at {x}"
@@ -347,7 +346,7 @@ def _split(
     d, bits, out = grid.dim, corner_bits(grid.dim), []
     edges = [domains[:, FACES[d][2 * a + 1]] - domains[:, FACES[d][2 * a]] for a in range(d)]
     longest = np.max([np.linalg.norm(e / grid.h, axis=2).max(axis=1) for e in edges], axis=0)
-    count = 2 ** np.ceil(np.log2(np.maximum(1.0, longest * per_cell / LONG) - 1e-9)).astype(np.int64)
+    count = 2 ** np.ceil(np.log2(np.maximum(1.0, longest * per_cell / LONG) - SAME)).astype(np.int64)
     for n in np.unique(count):
         row = np.flatnonzero(count == n)
         index = np.stack(np.unravel_index(np.arange(n**d), (n,) * d), axis=1)

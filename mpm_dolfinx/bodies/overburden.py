@@ -7,12 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from mpm_dolfinx.base.tolerances import SAME
 from mpm_dolfinx.bodies.touching import face_vectors
 from mpm_dolfinx.points.cutting import FACES
-
-ASIDE = 1e-7
-"""By how much of a domain's width lines are off their places: else one on a joint may cross two domains."""
-FLAT = 1e-12  # slope of a face below which it is along the lines
 
 
 def overburden(
@@ -31,10 +28,10 @@ def overburden(
     """
     low, high = corners.min(axis=1), corners.max(axis=1)
     half = (high - low)[:, :-1].max(initial=0.0) / 2
-    aside = ASIDE * (high - low)[:, :-1].min(initial=np.inf) * np.sqrt([2.0, 3.0])[: x.shape[1] - 1]
+    aside = SAME * (high - low)[:, :-1].min(initial=np.inf) * np.sqrt([2.0, 3.0])[: x.shape[1] - 1]
     across, line = np.unique(x[:, :-1] + aside, axis=0, return_inverse=True)
     line, middle = line.reshape(len(x)), (low + high)[:, :-1] / 2
-    pairs = cKDTree(across).sparse_distance_matrix(cKDTree(middle), half * (1 + 1e-9), p=np.inf, output_type="ndarray")
+    pairs = cKDTree(across).sparse_distance_matrix(cKDTree(middle), half * (1 + SAME), p=np.inf, output_type="ndarray")
     ray, domain = pairs["i"], pairs["j"]
     inside = ((across[ray] >= low[domain, :-1]) & (across[ray] <= high[domain, :-1])).all(axis=1)
     ray, domain = ray[inside], domain[inside]
@@ -62,7 +59,7 @@ def _chord(corners: NDArray, across: NDArray, low: NDArray, high: NDArray) -> tu
         n, on = face_vectors(corners, face), corners[:, FACES[d][face]].mean(axis=1)
         ahead = ((across - on[:, :-1]) * n[:, :-1]).sum(axis=1)  # n . (x - on) <= 0 inside
         slope = n[:, -1]
-        steep = np.abs(slope) > FLAT * np.linalg.norm(n, axis=1)
+        steep = np.abs(slope) > SAME * np.linalg.norm(n, axis=1)
         at = on[:, -1] - np.divide(ahead, slope, out=np.zeros(len(n)), where=steep)
         high = np.where(steep & (slope > 0), np.minimum(high, at), high)
         low = np.where(steep & (slope < 0), np.maximum(low, at), low)

@@ -10,13 +10,12 @@ from contextlib import contextmanager, suppress
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mpm_dolfinx.base.tolerances import ROUND_OFF
 from mpm_dolfinx.base.validation import instance, line, numbers, whole
 from mpm_dolfinx.bodies.mesh_cells import AS_LATTICE
 from mpm_dolfinx.bodies.meshes import Mesh, MeshBody, seeded
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.parallel.exchange import at_root
-
-FLAT = 1e-12  # of its size squared: areas below which three corners of a polygon lie on one line
 
 
 def polygon(
@@ -95,7 +94,7 @@ def _check_simple(outlines: Sequence[NDArray[np.float64]]) -> None:
     i, j = np.triu_indices(len(a), 1)
     beside = (after[i] == j) | (after[j] == i)
     # two edges have a place in common if the ends of neither lie on one side of the other
-    slack = FLAT * np.ptp(outlines[0], axis=0).max() ** 2
+    slack = ROUND_OFF * np.ptp(outlines[0], axis=0).max() ** 2
     sides = [_turn(a[i], b[i], a[j]), _turn(a[i], b[i], b[j]), _turn(a[j], b[j], a[i]), _turn(a[j], b[j], b[i])]
     apart = np.any([(np.minimum(*two) > slack) | (np.maximum(*two) < -slack) for two in (sides[:2], sides[2:])], axis=0)
     low, high = np.minimum(a, b), np.maximum(a, b)

@@ -14,14 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from mpm_dolfinx.base.tolerances import NEAR, ROUND_OFF, SAME, TINY
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.grid.grid import Grid, rounding, sum_by
 from mpm_dolfinx.parallel.messages import warn
 from mpm_dolfinx.points.cutting import FACES, corner_bits, cut_at, kuhn_simplices
 
-TOUCH = 1e-6  # of the shortest edge: faces nearer than this touch
-SAME = 1e-11  # of an edge: ends nearer than this are one
-TINY = 1e-300  # in place of the length of an edge that a map has shrunk to nothing
 BITS = corner_bits(2)
 
 
@@ -146,7 +144,7 @@ def covers(own: Faces, other: Faces) -> Cover:
     slack = np.minimum(SAME + (lost + bend) / np.maximum(edge.min(axis=1), TINY), (high - low).min(axis=1) / 4)
     upper = t > ((low + high) / 2)[:, None]
     corner = upper @ [1, 2]
-    straight = np.abs(t - np.where(upper, high[:, None], low[:, None])).max(axis=(1, 2)) <= np.maximum(slack, 1e-9)
+    straight = np.abs(t - np.where(upper, high[:, None], low[:, None])).max(axis=(1, 2)) <= np.maximum(slack, SAME)
     straight &= (np.sort(corner, axis=1) == np.arange(4)).all(axis=1)
     flat = _parallelograms(own.corners[i])
     plane, whole = (local(flat, corners, n[i])[0] for corners in (other.corners[j], own.corners[i]))
@@ -165,7 +163,7 @@ def covers(own: Faces, other: Faces) -> Cover:
         for bits in BITS:
             at = out.at(np.where(bits, ends[1], ends[0]))
             gap = np.where(straight, np.maximum(gap, np.abs((at * off).sum(axis=1))), gap)
-    on &= gap <= TOUCH * np.minimum(edge.min(axis=1), other.edge()[j].min(axis=1)) + lost + 2 * bend
+    on &= gap <= NEAR * np.minimum(edge.min(axis=1), other.edge()[j].min(axis=1)) + lost + 2 * bend
     return Cover(*(getattr(out, name)[on] for name in Cover.__dataclass_fields__))
 
 
@@ -186,7 +184,7 @@ def local(corners: NDArray, x: NDArray, normal: NDArray) -> tuple[NDArray[np.flo
         ra, rb = (np.einsum("ncd,ncd->nc", r, v) for v in e)
         step = np.stack([bb * ra - ab * rb, aa * rb - ab * ra], axis=2) / np.maximum(aa * bb - ab**2, TINY)[..., None]
         t = np.clip(t + step, -1e3, 1e3)
-        if np.abs(step).max(initial=0.0) < 1e-12:
+        if np.abs(step).max(initial=0.0) < ROUND_OFF:
             break
     return t, np.einsum("ncd,nd->nc", r, normal)
 
@@ -363,7 +361,7 @@ def _between_planes(a: NDArray, b: NDArray, normals: Iterable[NDArray]) -> NDArr
         n = n / np.where(length > 0, length, 1.0)[:, None]
         pa, pb = (np.einsum("nkd,nd->nk", c, n) for c in (a, b))
         gap = np.maximum(pb.min(axis=1) - pa.max(axis=1), pa.min(axis=1) - pb.max(axis=1))
-        out = np.maximum(out, np.where(length > 1e-9 * size ** (a.shape[2] - 1), gap, -np.inf))
+        out = np.maximum(out, np.where(length > SAME * size ** (a.shape[2] - 1), gap, -np.inf))
     return out
 
 
@@ -371,7 +369,7 @@ def solids(body: Body) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return convex domains (m, 2^d, d), m, that fill a body, a box as one, and their allowances (m,), m."""
     low, high = body.bounds
     size, edge = high - low, body.spacing.min()
-    if body.aligned and np.isclose(size.prod(), len(body) * body.spacing.prod(), rtol=1e-9, atol=0):
+    if body.aligned and np.isclose(size.prod(), len(body) * body.spacing.prod(), rtol=SAME, atol=0):
         return (low + corner_bits(len(size)) * size)[None], allowance(np.full(1, edge))
     corners = body.corners()
     warp = np.zeros(len(body))
@@ -386,7 +384,7 @@ def solids(body: Body) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 def allowance(edge: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return by how much domains that touch, with edges (m,), m, may seem to lie in or off each other."""
-    return TOUCH / 2 * edge
+    return NEAR / 2 * edge
 
 
 def meeting(

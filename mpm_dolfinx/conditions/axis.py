@@ -7,19 +7,18 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from mpm_dolfinx.base.tolerances import NEAR
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.parallel.messages import warn
 
-ON = 1e-6  # cells: how near to the axis what touches it lies
 
-
-def with_axis(grid: Grid, fixed: Mapping[str, str]) -> Mapping[str, str]:
+def with_axis(grid: Grid, walls: Mapping[str, str]) -> Mapping[str, str]:
     """Return walls with their components, also that of the axis of revolution, which stays where it is."""
-    left = fixed.get("left", "") if isinstance(fixed, Mapping) else None
+    left = walls.get("left", "") if isinstance(walls, Mapping) else None
     if not grid.has_axis or not isinstance(left, str) or "x" in left:
-        return fixed
-    return {**fixed, "left": "x" + left}
+        return walls
+    return {**walls, "left": "x" + left}
 
 
 def check_axisymmetry(grid: Grid, bodies: Sequence[Body], quadrature: str) -> None:
@@ -35,11 +34,11 @@ def _warn_narrow_hole(grid: Grid, bodies: Sequence[Body]) -> None:
         return
     x = np.concatenate([body.corners() for body in bodies])
     inner = x[:, :, 0].min(axis=1)
-    near = np.flatnonzero(inner < grid.h[0] * (1 - ON))
+    near = np.flatnonzero(inner < grid.h[0] * (1 - NEAR))
     row = grid.index(x[near].mean(axis=1))[:, 1]
     touches = np.zeros(grid.shape[1] + 2, dtype=bool)
     for k in range(3):  # a surface aslant begins off the axis in the next row
-        touches[row[inner[near] <= ON * grid.h[0]] + k] = True
+        touches[row[inner[near] <= NEAR * grid.h[0]] + k] = True
     hole = near[~touches[row + 1]]
     if len(hole):
         k = hole[inner[hole].argmin()]

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mpm_dolfinx.base.given_values import Places
+from mpm_dolfinx.base.tolerances import NEAR, SAME
 from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.faces import Region, Surface, joined, limits, surface
@@ -18,8 +19,6 @@ from mpm_dolfinx.domains.cut_domains import Patches
 from mpm_dolfinx.grid.grid import Grid, rounding
 from mpm_dolfinx.parallel.exchange import Exchange, first
 from mpm_dolfinx.points.material_points import MaterialPoints
-
-HALF = 0.5 * (1 + 1e-6)  # of a cell, but for rounding
 
 
 class Sides:
@@ -79,7 +78,7 @@ class Sides:
         side = self._of(condition.side, None)
         own = np.broadcast_to(self.grid.copy(side.id) == self.grid.copy(faces.id[:1]), len(side))  # of its group
         size = X[:, 1].max(axis=0) - X[:, 0].min(axis=0)
-        near = 1e-9 * size.max() + rounding(X)
+        near = SAME * size.max() + rounding(X)
         neighbours = [self.of(other).X for other in others]
 
         def along(boxes: NDArray[np.float64], axis: int, x: float) -> NDArray[np.bool_]:
@@ -111,11 +110,11 @@ class Sides:
         way, moved = X - X.mean(axis=1, keepdims=True), places - places.mean(axis=1, keepdims=True)
         slope = np.einsum("mk,mkd->d", way, moved) / np.square(way).sum() / self.grid.h  # of a map, cells over metres
         a = np.abs(slope).argmax()
-        if np.abs(np.delete(slope, a)).max() > 1e-9 * abs(slope[a]):
+        if np.abs(np.delete(slope, a)).max() > SAME * abs(slope[a]):
             return 0.5 / float(np.linalg.norm(slope))
         end = (places.mean(axis=1)[0, a] - self.grid.lower[a]) / self.grid.h[a] + (x - X.mean(axis=1)[0]) * slope[a]
         share = (sign * np.sign(slope[a]) * end) % 1.0
-        return share / abs(float(slope[a])) if share <= HALF else 0.0
+        return share / abs(float(slope[a])) if share <= (1 + NEAR) / 2 else 0.0
 
     def around(self, bodies: Sequence[int]) -> Surface:
         """Return the faces on all sides of those of some bodies that are there, what lies on other bodies included."""
@@ -146,7 +145,7 @@ def everywhere(grid: Grid, ask: Callable[[], NDArray[np.float64]]) -> NDArray[np
 
 def on_side(patches: Patches, points: MaterialPoints) -> Places:
     """Return what gives the places at which functions of the user's are asked on a side."""
-    return lambda name: patches.X if name == "X" else patches.now(points)
+    return lambda name: patches.X if name == "X" else patches.now(points) + patches.base
 
 
 def gathered(grid: Grid, rows: Sequence[tuple], width: int) -> tuple[NDArray, NDArray, NDArray]:
@@ -167,7 +166,7 @@ def check_apart(one, faces: Surface, other, others: Surface) -> None:
     a, b = a[same], b[same]
     low, high = np.maximum(faces.X[a, 0], others.X[b, 0]), np.minimum(faces.X[a, 1], others.X[b, 1])
     size = faces.X[a, 1] - faces.X[a, 0]
-    common = (high - low > 1e-9 * size) | (size <= 1e-9 * size.max(axis=1, keepdims=True))  # they lie across this axis
+    common = (high - low > SAME * size) | (size <= SAME * size.max(axis=1, keepdims=True))  # they lie across this axis
     both = np.flatnonzero(common.all(axis=1))
     if len(both):
         x = (low[both[0]] + high[both[0]]) / 2
@@ -189,6 +188,6 @@ def meeting(bodies: Sequence[Body], one: Surface, other: Surface) -> NDArray[np.
         )
 
     dim = bodies[0].dim
-    x, near = corners(other), 1e-9 * min(b.spacing.min() for b in bodies) + rounding(one.X)
+    x, near = corners(other), SAME * min(b.spacing.min() for b in bodies) + rounding(one.X)
     distance, _ = cKDTree(corners(one)).query(x, distance_upper_bound=near)
     return x[distance <= near, :dim]

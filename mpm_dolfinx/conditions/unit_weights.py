@@ -17,7 +17,7 @@ from mpm_dolfinx.parallel.messages import warn
 
 WEIGHS = 5e-3  # share by which unit weights of water, and gravities, may differ without a warning
 DENSITIES = (500.0, 2000.0)  # kg/m^3: of oils and brines
-SOFTEST = 1e5  # Pa: bulk modulus of a gas at the pressure of the atmosphere
+SOFTEST = 1e5  # Pa: bulk modulus of a gas at the pressure of the atmosphere.  Source: exact, by Boyle's law
 
 Gravity = ArrayLike | Callable[[float], ArrayLike] | None
 

@@ -31,6 +31,7 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.errors import NotConverged
+from mpm_dolfinx.base.tolerances import EPSILON, NEAR, TINY
 from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.contact.history import Rough
 from mpm_dolfinx.contact.pairs import Geometry, Pairs
@@ -47,8 +48,6 @@ SLIVER = 0.25  # of a cell's face: of what is smaller less penetration counts
 ROUNDS = 20  # augmentations that are tried
 SLOW, STIFFER = 0.6, 10.0
 """Where a round leaves more than this share of the penetration, k is made so many times larger."""
-CLOSE = 1e-6  # of the traction that slips: what is nearer stays what it is
-LEAST = 1e-300
 RAMP = 10.0  # adhesion over the normal pressure, at most
 
 
@@ -149,10 +148,10 @@ class ContactLaw:
         """Return the contact of the pairs where they are."""
         stiffness = self.stiffness(state)
         push = np.maximum(0.0, state.pressure[self.of] - stiffness * at.gap)
-        touches = (push > 0) | (at.gap <= TOUCH * self._reach)
+        touches = (push > 0) | (at.gap <= TOUCH * np.abs([self.grid.lower, self.grid.upper]).max())
         pressure, on, normal = self.mean(push), np.zeros(len(self.area), dtype=bool), self.mean(at.n)
         on[self.of[touches]] = True
-        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), LEAST)
+        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), TINY)
         friction = _, _, shear, *_ = self._friction(state, normal, self.mean(at.slip), pressure, on)
         force = self.pairs.area[:, None] * (push[:, None] * at.n + shear[self.of])
         return Touch(force, push, stiffness * touches, pressure, *friction)
@@ -163,7 +162,7 @@ class ContactLaw:
         hold = np.where(self.strength.any(axis=1), self._hold, 0.0) * on
         (mu, adhesion), slips = self.strength.T, state.slips
         trial = np.einsum("kij,kj->ki", P, self.mean(self.pairs.shear) * on[:, None] - hold[:, None] * slip)
-        size, ramp = np.maximum(np.linalg.norm(trial, axis=1), LEAST), RAMP * pressure < adhesion
+        size, ramp = np.maximum(np.linalg.norm(trial, axis=1), TINY), RAMP * pressure < adhesion
         most = mu * pressure + np.minimum(adhesion, RAMP * pressure)
         onward = slips & (np.einsum("kd,kd->k", trial, state.slip) > 0)  # what turns back keeps its shear for now
         along = np.where(onward[:, None], trial / size[:, None], state.slip)
@@ -217,11 +216,11 @@ class ContactLaw:
         parts = state.parts | (left & state.resticks)
         bears = np.where(left[:, None], state.stuck, touch.trial)
         size = np.linalg.norm(bears, axis=1)
-        goes_on = (size > (1 - CLOSE) * touch.most) & (np.einsum("kd,kd->k", bears, state.slip) > 0)
-        exceeds = (size > (1 + CLOSE) * touch.most) & (sticks | ~state.resticks)
+        goes_on = (size > (1 - NEAR) * touch.most) & (np.einsum("kd,kd->k", bears, state.slip) > 0)
+        exceeds = (size > (1 + NEAR) * touch.most) & (sticks | ~state.resticks)
         slips = np.where(before, goes_on | parts if sticks else True, exceeds | left)
         new = (slips & (goes_on | ~before))[:, None]
-        slip = np.where(new, bears / np.maximum(size, LEAST)[:, None], slips[:, None] * state.slip)
+        slip = np.where(new, bears / np.maximum(size, TINY)[:, None], slips[:, None] * state.slip)
         stuck = touch.trial * touch.sticks[:, None]
         changed = over_all(self.grid.comm, int((slips != before).sum())) > 0
         resticks = state.resticks | (before & ~slips)
@@ -242,7 +241,7 @@ class ContactLaw:
         if state.rounds == ROUNDS:
             number = self.key // self.grid.num_local
             worst = np.flatnonzero(off == most)[:1]
-            where = [f"{line(self.contacts[number[k]])}: at {x[self.of == k][0]}" for k in worst]
+            where = [f"{line(self.contacts[number[k]])}: at {x[self.of == k][0] + self.grid.base}" for k in worst]
             message = f"{''.join(where)} penetrates by {most:.2g} cells: does a wall hold the body there?"
             raise NotConverged(first(self.grid.comm, message if where else ""))
         # fluid, or what hardly changes its volume, resists more than k
@@ -254,13 +253,9 @@ class ContactLaw:
         return self.rounding_of_gap * self.stiffness(state) * self.pairs.area
 
     @property
-    def rounding_of_gap(self) -> float:
-        """What rounding of coordinates makes of gaps, m."""
-        return 1e-15 * self._reach
-
-    @property
-    def _reach(self) -> float:
-        return float(np.abs(np.concatenate([self.grid.lower, self.grid.upper])).max())
+    def rounding_of_gap(self) -> NDArray[np.float64] | float:
+        """What rounding of coordinates makes of gaps, m; of the pairs (m,), or of all."""
+        return 4 * EPSILON * self.pairs.reach
 
     def by_contact(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the sums (contacts, ...) of values (m, ...) over each contact, of all processes."""

@@ -19,6 +19,7 @@ from scipy.spatial import cKDTree
 
 from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.base.errors import NotConverged
+from mpm_dolfinx.base.tolerances import NEAR, TINY
 from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.faces import Surface, surface
@@ -27,11 +28,10 @@ from mpm_dolfinx.conditions.conditions import resistance
 from mpm_dolfinx.conditions.sides import Sides
 from mpm_dolfinx.contact.groups import Contact
 from mpm_dolfinx.contact.history import Origin, kept, pressure_name, shear_name
-from mpm_dolfinx.contact.law import LEAST, ContactLaw
+from mpm_dolfinx.contact.law import ContactLaw
 from mpm_dolfinx.contact.pairs import FacePairs
 from mpm_dolfinx.contact.problem import ContactProblem
 from mpm_dolfinx.contact.tool_placing import BEGINS, FACING
-from mpm_dolfinx.domains.cut_domains import DEPTH as UNDER
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.parallel.exchange import Exchange, first, over_all
@@ -50,8 +50,6 @@ BESIDE = 0.6
 """Cells from points on the other surface: corners that are nearer go with it."""
 PLACES = 1 << 32
 """More than a process has points of integration on a surface."""
-EDGE = 1e-6
-"""Of a face: what passes beside it by less meets it."""
 
 
 class Facets(NamedTuple):
@@ -217,7 +215,7 @@ class Contacts:
         )
         resists = self._materials.table(cut.points, resistance)[patches.at]
         area, n, k = patches.area(points), len(now), 2 ** (d - 1) * d
-        outward = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), LEAST)
+        outward = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), TINY)
         whole = np.column_stack([patches.here, patches.cell])
         rows = np.column_stack([patches.now(points), resists, now.reshape(n, k), then.reshape(n, k), outward])
         whole, rows = (np.concatenate(self.grid.comm.allgather(part)) for part in (whole, rows))
@@ -229,7 +227,7 @@ class Contacts:
         """Return the points on the faces of the other group, and which of these the points on the faces meet."""
         patches, facets, d = cut.surface(faces), self._facets(cut, others, points), self.grid.dim
         x, area = patches.now(points), patches.area(points)
-        n = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), LEAST)
+        n = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), TINY)
         count = min(CANDIDATES[d], len(facets.x))
         if not count:  # bodies of the other group are not there
             none = np.zeros(0, dtype=np.int64)
@@ -241,7 +239,7 @@ class Contacts:
         facing = np.einsum("md,md->m", n[row], facets.outward[other]) < -FACING
         row, other = row[facing], other[facing]
         t, gap = _along(facets.corners[other], x[row], n[row])
-        met = ((t >= -EDGE) & (t <= 1 + EDGE)).all(axis=1) & (gap <= REACH * self.grid.h.min())
+        met = ((t >= -NEAR) & (t <= 1 + NEAR)).all(axis=1) & (gap <= REACH * self.grid.h.min())
         met &= gap >= -DEEP * self.grid.h.min()
         row, other, t, gap = row[met], other[met], t[met], gap[met]
         order = np.lexsort((np.abs(gap), row))
@@ -250,8 +248,8 @@ class Contacts:
 
     def _under(self, facets: Facets, chosen: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
         """Return the cells (m,) just under places x (m, d) on faces that hold a part of these, else of their facets."""
-        grid, inside = self.grid, x - UNDER * self.grid.h.min() * facets.outward[chosen]
-        number = grid.number(grid.index(inside)) + facets.cell[chosen] // grid.cells * grid.cells
+        grid, inside = self.grid, x - NEAR * self.grid.h.min() * facets.outward[chosen]
+        number = grid.number(grid.index_from_base(inside)) + facets.cell[chosen] // grid.cells * grid.cells
         keys = np.unique(facets.face * len(grid.owners) + facets.cell)
         return np.where(np.isin(facets.face[chosen] * len(grid.owners) + number, keys), number, facets.cell[chosen])
 
@@ -297,7 +295,7 @@ class Contacts:
             deepest = over_all(comm, float(pairs.gap.min(initial=np.inf)), MPI.MIN)
             if deepest < -BEGINS * h:
                 row = pairs.row[pairs.gap == deepest][:1]
-                where = first(comm, "".join(f"{x}" for x in cut.surface(faces).now(points)[row]))
+                where = first(comm, "".join(f"{x}" for x in cut.surface(faces).now(points)[row] + cut.grid.base))
                 return f"{line(contact)}: bodies are {-deepest / h:.3g} cells in each other at {where}"
         return ""
 
@@ -312,7 +310,7 @@ def _extent(bodies: Sequence[Body]) -> tuple:
 def _turned(shear: NDArray[np.float64], n: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return tractions (m, d) turned by the least angle into the planes with normals n (m, d)."""
     flat = shear - np.einsum("md,md->m", shear, n)[:, None] * n
-    size = np.maximum(np.linalg.norm(flat, axis=1), LEAST)
+    size = np.maximum(np.linalg.norm(flat, axis=1), TINY)
     return flat * (np.linalg.norm(shear, axis=1) / size)[:, None]
 
 

@@ -65,6 +65,11 @@ class Pairs:
         """Return the pairs at w (m, d), m, where loads have pushed tools (contacts,), m, in the step."""
         raise NotImplementedError
 
+    @property
+    def reach(self) -> NDArray[np.float64] | float:
+        """Largest coordinate of what gaps are measured from, m; of the pairs (m,), or of all."""
+        return self.grid.reach
+
     def other_side(self) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
         """Return the lexicographic cells (m,), and shape functions (m, 2^d), of other sides that deform."""
         return None
@@ -105,10 +110,16 @@ class ToolPairs(Pairs):
                 gap[rows], n[rows] = solid.distance(y), solid.normal(y) @ pose.R.T
                 second[rows] = pose.R @ solid.curvature(y) @ pose.R.T
                 if isinstance(solid, Distance):
-                    _check_distance(tool, x[rows], gap[rows], n[rows], h)
+                    _check_distance(tool, x[rows] + self.grid.base, gap[rows], n[rows], h)
 
         everywhere(self.grid, ask)
         return Geometry(gap, n, second, x - self.carried - gone[self.number], x - middle)
+
+    @property
+    def reach(self) -> NDArray[np.float64]:
+        """See `Pairs`: of functions of the user's, which are asked at true places, it is that of these."""
+        true = np.array([callable(tool.shape) for tool in self.tools])[self.number]
+        return np.where(true, np.abs([self.grid.lower, self.grid.upper]).max(), self.grid.reach)
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,13 +139,14 @@ class FacePairs(Pairs):
 
     def at(self, w: NDArray[np.float64], travel: NDArray[np.float64]) -> Geometry:
         """See `Pairs`; moments count with the places of the start of the step."""
-        return Geometry(np.einsum("md,md->m", self.n, self.apart + w), self.n, None, w, self.x)
+        gap = np.einsum("md,md->m", self.n, self.apart + w)
+        return Geometry(gap, self.n, None, w, self.x + self.grid.base)
 
     def other_side(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """See `Pairs`."""
         grid = self.grid
         index = np.stack(np.unravel_index(self.other % grid.cells, tuple(grid.shape)), axis=1)
-        off = (self.y - grid.lower) / grid.h - index - 0.5
+        off = (self.y - grid.low) / grid.h - index - 0.5
         return self.other, np.prod(0.5 + off[:, None] * grid.signs, axis=2)
 
 

@@ -6,7 +6,7 @@ equal and opposite to rounding, whatever the iterations leave.  Where both sides
 first those of the start of the step.  What balances with them is balanced anew with those of where it has come to,
 until gaps are those of the faces at the end of the step.
 
-The way a of a tool that a load pushes is one more unknown, in the direction e: with the forces f(w - a e) on the points,
+The way a of a tool that a load pushes is one more unknown, in the direction e: with the forces f(w - a e) on points,
 D minus their derivative by w, and s = e . D e, Newton's method solves e . f = load together with the balance of the
 bodies, by
 
@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.base.errors import NotConverged
+from mpm_dolfinx.base.tolerances import EPSILON, SAME
 from mpm_dolfinx.contact.history import Origin
 from mpm_dolfinx.contact.law import DEPTH, ROUNDS, ContactLaw, ContactState, Touch
 from mpm_dolfinx.contact.pairs import Geometry, Pairs, at_nodes, petsc_matrix
@@ -38,8 +39,6 @@ from mpm_dolfinx.parallel.exchange import Exchange, over_all
 from mpm_dolfinx.points.material_points import MaterialPoints
 
 FOLLOWS = 8  # how often pairs are found at most in a step
-BALANCED = 1e-8  # of a load: what a tool meets more or less
-ROUNDING = 1e-8  # square root of that of numbers: stiffness of what tools that loads push hold against one another
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,7 +218,7 @@ class ContactProblem:
         for k in np.flatnonzero((slope > 0) & ~np.isnan(self.loads.load)):
             e = self.loads.direction[k] * (self.pairs.number == k)[:, None]
             sides = (self._nodal(unknowns, law.slope(touch, at, e, adjoint)) for adjoint in (False, True))
-            K.axpy((ROUNDING - 1) / slope[k], _outer(*sides), PETSc.Mat.Structure.UNKNOWN)
+            K.axpy((SAME - 1) / slope[k], _outer(*sides), PETSc.Mat.Structure.UNKNOWN)
         return K
 
     def _nodal(self, unknowns: Unknowns, values: NDArray[np.float64]) -> PETSc.Vec:
@@ -252,7 +251,8 @@ class ContactProblem:
         law, e = self.now.law, self.loads.direction[self.pairs.number]
         slope = law.slope(found.touch, found.at, e)
         met, slope = law.by_contact(np.stack([(e * found.touch.force).sum(axis=1), (e * slope).sum(axis=1)], axis=1)).T
-        return met, slope, np.maximum(1e-12 * np.nan_to_num(self.loads.load), law.rounding_of_gap * slope)
+        off = law.rounding(self.now.state) * (found.touch.stiff > 0)
+        return met, slope, law.by_contact(off[:, None])[:, 0]
 
     def _seek(self, found: Found) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """Return how far tools go (tools,), m, until a place alone would bear the load, and which tools touch.
@@ -283,7 +283,7 @@ class ContactProblem:
         for _ in range(ROUNDS):
             found = self._found_at(still, way)
             before, way = way, np.clip(way + np.minimum(self._shift(found), self._seek(found)[0]), -h, h)
-            if np.abs(way - before).max() <= self.now.law.rounding_of_gap:
+            if np.abs(way - before).max() <= EPSILON * self.grid.reach:
                 break
         return way
 
@@ -311,7 +311,7 @@ class ContactProblem:
         met, slope, unknown = self._met(found)
         load, h = self.loads.load, self.grid.h.min()
         off = np.nan_to_num(met - load)
-        wrong = np.abs(off) > np.maximum(BALANCED * np.nan_to_num(load), unknown)
+        wrong = np.abs(off) > np.maximum(SAME * np.nan_to_num(load), unknown)
         if not wrong.any():
             return False
         _, touches = self._seek(found)

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol
 
@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import ConvexHull, QhullError
 
+from mpm_dolfinx.base.tolerances import TINY
 from mpm_dolfinx.base.validation import asked, line, numbers
 
-LEAST = 1e-300  # in place of a distance from a centre, m
 ROUNDED = 1e-9  # cells: what is no deeper in a tool is on its surface
 DISTANCE = 0.1
 """Relative error of the slope of a user's distance from which on it is none."""
@@ -39,7 +39,7 @@ def _flat(y: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _across(offset: NDArray[np.float64]) -> tuple[NDArray, NDArray, NDArray]:
     """Return lengths (m,) of vectors (m, d), their directions, and the second derivatives of the lengths, 1/m."""
-    r = np.maximum(np.linalg.norm(offset, axis=1), LEAST)
+    r = np.maximum(np.linalg.norm(offset, axis=1), TINY)
     e = offset / r[:, None]
     return r, e, (np.eye(offset.shape[1]) - e[:, :, None] * e[:, None, :]) / r[:, None, None]
 
@@ -92,6 +92,10 @@ class HalfSpace:
         """Return the second derivatives (m, d, d) of the distance, 1/m."""
         return _flat(y)
 
+    def moved(self, by: NDArray[np.float64]) -> HalfSpace:
+        """Return the shape moved by a vector (d,), m."""
+        return replace(self, point=np.asarray(self.point) + by)
+
 
 @dataclass(frozen=True, eq=False)
 class Ball:
@@ -128,6 +132,10 @@ class Ball:
     def curvature(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the second derivatives (m, d, d) of the distance, 1/m."""
         return _across(y - self.centre)[2]
+
+    def moved(self, by: NDArray[np.float64]) -> Ball:
+        """Return the shape moved by a vector (d,), m."""
+        return replace(self, centre=np.asarray(self.centre) + by)
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,6 +190,10 @@ class Convex:
     def curvature(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the second derivatives (m, d, d) of the distance, 1/m."""
         return _flat(y)
+
+    def moved(self, by: NDArray[np.float64]) -> Convex:
+        """Return the shape moved by a vector (d,), m."""
+        return replace(self, corners=np.asarray(self.corners) + by)
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,16 +252,29 @@ class Cone:
         along = self._axis[:, None] * self._axis / np.where(near_axis, np.inf, r[:, None, None])
         return np.where(near_axis, 0.0, second - along) * np.cos(np.radians(self.angle))
 
+    def moved(self, by: NDArray[np.float64]) -> Cone:
+        """Return the shape moved by a vector (d,), m."""
+        return replace(self, tip=np.asarray(self.tip) + by)
+
 
 @dataclass(frozen=True, eq=False)
 class Distance:
-    """A shape whose signed distance a function of the user's gives; its derivatives are differences over `step`, m."""
+    """A shape whose signed distance a function of the user's gives; its derivatives are differences over `step`, m.
+
+    base : (d,), m — from which places count; of true places the function is asked.  Steps are powers of two, by which
+    no true place is rounded to another one.
+    """
 
     function: Callable[[NDArray[np.float64]], ArrayLike]
     step: float
+    base: NDArray[np.float64] | float = 0.0
 
     def distance(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the signed distances (m,), m."""
+        return self._at(y + self.base)
+
+    def _at(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the signed distances (m,), m, at true places."""
         if not len(y):  # a function need not have an answer for no places
             return np.zeros(0)
         allowed = f"a finite number for each of {len(y)} places (m, {y.shape[1]})"
@@ -258,13 +283,21 @@ class Distance:
 
     def normal(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the gradients (m, d) of the distance."""
-        steps = self.step * np.eye(y.shape[1])
-        slopes = [(self.distance(y + e) - self.distance(y - e)) / (2 * self.step) for e in steps]
+        return self._slopes(y + self.base, _power_of_two(self.step))
+
+    def _slopes(self, y: NDArray[np.float64], step: float) -> NDArray[np.float64]:
+        """Return differences (m, d) of the distance over a step, m, at true places."""
+        slopes = [(self._at(y + e) - self._at(y - e)) / (2 * step) for e in step * np.eye(y.shape[1])]
         return np.stack(slopes, axis=1)
 
     def curvature(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the second derivatives (m, d, d) of the distance, 1/m."""
-        wide = Distance(self.function, 30 * self.step)  # of second differences less is lost in rounding
-        steps = wide.step * np.eye(y.shape[1])
-        slopes = [(wide.normal(y + e) - wide.normal(y - e)) / (2 * wide.step) for e in steps]
+        y, wide = y + self.base, _power_of_two(30 * self.step)  # of second differences less is lost in rounding
+        steps = wide * np.eye(y.shape[1])
+        slopes = [(self._slopes(y + e, wide) - self._slopes(y - e, wide)) / (2 * wide) for e in steps]
         return np.stack(slopes, axis=2)
+
+
+def _power_of_two(x: float) -> float:
+    """Return the power of two next to a number."""
+    return float(2.0 ** np.rint(np.log2(x)))

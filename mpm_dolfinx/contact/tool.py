@@ -4,9 +4,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from copy import deepcopy
+from copy import copy, deepcopy
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -28,11 +28,12 @@ class Pose(NamedTuple):
 
     def own(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return places x (m, d) in the frame of the tool."""
-        return (x - self.centre - self.shift) @ self.R + self.centre
+        y = x - self.shift
+        return y + (y - self.centre) @ (self.R - np.eye(len(self.R)))  # what does not turn loses no digits
 
     def put(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return where places y (m, d) of the tool are."""
-        return (y - self.centre) @ self.R.T + self.centre + self.shift
+        return y + self.shift + (y - self.centre) @ (self.R - np.eye(len(self.R))).T
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +79,8 @@ class Tool:
     adhesion: float = 0.0
     load: float | Callable[[float], float] | None = None
     direction: ArrayLike | None = None
+    _base: ClassVar[NDArray[np.float64] | float] = 0.0
+    _moved: ClassVar[Shape | None] = None
 
     def __post_init__(self):
         if not isinstance(self.shape, (HalfSpace, Ball, Convex, Cone)) and not callable(self.shape):
@@ -118,6 +121,13 @@ class Tool:
             raise ValueError(f"Tool: direction = {line(self.direction)}, must have {dim} components as the grid")
         return along
 
+    def on(self, grid: Grid) -> Tool:
+        """Return the tool as places see it that count from the grid's base."""
+        out, base = copy(self), grid.base
+        if base.any():
+            vars(out).update(_base=base, _moved=None if callable(self.shape) else self.shape.moved(-base))
+        return out
+
     @property
     def grips(self) -> bool:
         """Whether the tool resists slip."""
@@ -125,7 +135,7 @@ class Tool:
 
     def solid(self, h: float) -> Shape:
         """Return the shape; h, m: size of a cell."""
-        return Distance(self.shape, 1e-6 * h) if callable(self.shape) else self.shape
+        return Distance(self.shape, 1e-6 * h, self._base) if callable(self.shape) else self._moved or self.shape
 
     def check(self, dim: int) -> None:
         """Refuse a tool of another dimension, or whose motion at the start is none."""
@@ -142,8 +152,8 @@ class Tool:
 
     def _centre(self, dim: int) -> NDArray[np.float64]:
         if self.centre is None:
-            return np.zeros(dim)
-        return numbers("Tool: centre", self.centre, (dim,), allowed=f"{dim} finite coordinates")
+            return np.zeros(dim) - self._base
+        return numbers("Tool: centre", self.centre, (dim,), allowed=f"{dim} finite coordinates") - self._base
 
     def pose(self, t: float, dim: int, way: float = 0.0) -> Pose:
         """Return where the tool is at time t (s), after a load has pushed it by a way, m."""

@@ -17,12 +17,13 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mpm_dolfinx.base.errors import NotConverged
+from mpm_dolfinx.base.tolerances import TINY
 from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.bodies.faces import Surface
 from mpm_dolfinx.conditions.conditions import Displacement, resistance
 from mpm_dolfinx.conditions.sides import everywhere
 from mpm_dolfinx.contact.history import Origin, kept, pressure_name, shear_name
-from mpm_dolfinx.contact.law import LEAST, ContactLaw
+from mpm_dolfinx.contact.law import ContactLaw
 from mpm_dolfinx.contact.pairs import ToolPairs
 from mpm_dolfinx.contact.problem import ContactProblem, Loads
 from mpm_dolfinx.contact.tool import Pose, Tool
@@ -92,6 +93,7 @@ class Tools:
                 raise ValueError(f"Tool: direction = {line(tool.direction)}, must be along the axis in axisymmetry")
             if not callable(tool.displacement) and not callable(tool.rotation):
                 self._pose(tool, 0.0)
+        self.tools = tuple(tool.on(grid) for tool in self.tools)
         self.faces = outside() if self.tools else None
         if self.tools:
             sides = 2 * grid.dim
@@ -136,8 +138,8 @@ class Tools:
         for number, (tool, pose) in enumerate(zip(self.tools, poses, strict=True)):
             before = self._pose(tool, start)
             n = everywhere(grid, lambda tool=tool, pose=pose: tool.solid(grid.h.min()).normal(pose.own(x)) @ pose.R.T)
-            faces = free & (np.einsum("md,md->m", area, n) < -FACING * size)
-            at = np.flatnonzero(faces)[~self._edge(tool, pose, x, area / np.maximum(size, LEAST)[:, None], faces)]
+            faces = free & (np.einsum("md,md->m", area, n) < -FACING * size * np.linalg.norm(n, axis=1))
+            at = np.flatnonzero(faces)[~self._edge(tool, pose, x, area / np.maximum(size, TINY)[:, None], faces)]
             old = points.data[shear_name("tool", number)][patches.at[at]] if tool.grips else np.zeros((len(at), d))
             vectors = [x[at], pose.put(before.own(x[at])), old @ (pose.R @ before.R.T).T]
             pressure = points.data[pressure_name("tool", number)][patches.at[at]]
@@ -277,18 +279,18 @@ class Tools:
         h, comm = self.grid.h.min(), self.grid.comm
         y, end = (self._pose(tool, t).own(at) for at, t in zip(x, times, strict=True))
         way, gone, on = np.linalg.norm(end - y, axis=1), np.zeros(len(y)), np.arange(len(y))
-        along = (end - y) / np.maximum(way, LEAST)[:, None]
+        along = (end - y) / np.maximum(way, TINY)[:, None]
         inside = everywhere(self.grid, lambda: (tool.solid(h).distance(y) < 0) | (tool.solid(h).distance(end) < 0))
         a, b = everywhere(self.grid, lambda: (tool.solid(h).normal(y[inside]), tool.solid(h).normal(end[inside])))
         turned = x[1][inside][np.einsum("nd,nd->n", a, b) < 0][:1]  # a middle in the tool that comes to its other side
-        if where := first(comm, "".join(np.array2string(place, precision=6) for place in turned)):
+        if where := first(comm, "".join(np.array2string(place, precision=6) for place in turned + self.grid.base)):
             return where
         on = on[~inside]
         while over_all(comm, len(on)):
             at = y[on] + gone[on, None] * along[on]
             gap = everywhere(self.grid, lambda at=at: tool.solid(h).distance(at))
             inside = x[1][on[gap < 0]][:1]
-            if where := first(comm, "".join(np.array2string(place, precision=6) for place in inside)):
+            if where := first(comm, "".join(np.array2string(place, precision=6) for place in inside + self.grid.base)):
                 return where
             gone[on] += np.maximum(gap, STRIDE * h)
             on = on[gone[on] < way[on]]
@@ -299,5 +301,7 @@ class Tools:
         h, pose = self.grid.h.min(), self._pose(tool, t)
         gap = everywhere(self.grid, lambda: tool.solid(h).distance(pose.own(x)))
         deepest = over_all(self.grid.comm, float(gap.min(initial=np.inf)), MPI.MIN)
-        here = np.array2string(x[gap.argmin()], precision=6) if len(gap) and gap.min() == deepest else ""
+        here = (
+            np.array2string(x[gap.argmin()] + self.grid.base, precision=6) if len(gap) and gap.min() == deepest else ""
+        )
         return -deepest / h, first(self.grid.comm, here)

@@ -10,6 +10,7 @@ from mpi4py import MPI
 import numpy as np
 from numpy.typing import NDArray
 
+from mpm_dolfinx.base.tolerances import NEAR
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.parallel.exchange import Exchange
 from mpm_dolfinx.points.parts import parts_of_cells
@@ -69,7 +70,7 @@ def check_held(
         on = held[against]
         grams = [R[on & (number == k)].T @ R[on & (number == k)] for k in range(1, count + 1)]
         grams, before = grid.comm.allreduce(np.stack(grams)), missing
-        ranks = [np.linalg.matrix_rank(gram, tol=1e-12 * max(1.0, np.abs(gram).max())) for gram in grams]
+        ranks = [np.linalg.matrix_rank(gram, tol=NEAR**2 * max(1.0, np.abs(gram).max())) for gram in grams]
         missing = len(modes) - np.array(ranks)
         held[1:] = missing == 0
         if (missing == before).all():
@@ -77,10 +78,12 @@ def check_held(
     for k in range(1, count + 1):
         if missing[k - 1]:
             places = [p for p in grid.comm.allgather(grid.midpoints[active & (part == k)][:1].tolist()) if p]
-            where = f"the part at [{' '.join(f'{x:.9g}' for x in places[0][0])}]" if count > 1 else "the body"
+            where = (
+                f"the part at [{' '.join(f'{x:.9g}' for x in places[0][0] + grid.base)}]" if count > 1 else "the body"
+            )
             raise ValueError(
-                f"fixed walls: {where} is free to move as a rigid body in {missing[k - 1]} of {len(modes)} ways; "
-                "it must touch walls whose fixed components hold it, have given displacements, or touch tools, or "
+                f"walls: {where} is free to move as a rigid body in {missing[k - 1]} of {len(modes)} ways; "
+                "it must touch walls whose components hold it, have given displacements, or touch tools, or "
                 "other groups that are held"
             )
 

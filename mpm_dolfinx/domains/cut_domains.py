@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.caching import Keyed
+from mpm_dolfinx.base.tolerances import NEAR
 from mpm_dolfinx.bodies.faces import Surface, face_vectors, interpolate, on_face
 from mpm_dolfinx.domains.bending import followed
 from mpm_dolfinx.grid.grid import TURN, Grid, sum_by
@@ -25,7 +26,6 @@ STAYS = 3e-4
 A column of ten cells that consolidates then differs by 7e-5 of the load in its pressures and by 3e-5 of the
 settlement from one that is cut in every step; both are proportional to this number.
 """
-DEPTH = 1e-6  # cells: how far under the surface the cell is looked up; of corners, share of the way to the middle
 
 
 class Patches:
@@ -51,6 +51,8 @@ class Patches:
         self._faces, self.here, self.at, self._xi = faces, here, at, xi
         self.cell, self.x, self._grid = cell, x, grid
         self._share0 = share * faces.area0[here]
+        self.base = grid.base
+        """From which places count, see `Grid`."""
         around = grid.around(interpolate(faces.domain[here], xi)) if grid.axisymmetric else 1.0
         self.area0 = self._share0 * around
         """Reference areas (n,), m^(d-1)."""
@@ -175,7 +177,7 @@ class CutDomains(Keyed):
         skew = np.flatnonzero(skew[here][face])  # xi is linear over a triangle, and places are not in xi
         if len(skew):
             xi[skew] = on_face(corners[face[skew]], number[face[skew]], x[skew], xi[skew])
-        inward = -DEPTH * self.grid.h.min() * np.divide(outward, size, out=np.zeros_like(outward), where=size > 0)
+        inward = -NEAR * self.grid.h.min() * np.divide(outward, size, out=np.zeros_like(outward), where=size > 0)
         cell = self._filled_cell(at[face], middle + inward[face])
         rows = row[here][face], at[face], cell, x, xi, share
         surface = np.repeat(np.arange(len(several)), list(map(len, several)))[here][face]
@@ -202,7 +204,7 @@ class CutDomains(Keyed):
         at = np.repeat(np.arange(n), 2**d if self.domains else 1)
         x = self.points.corners.reshape(-1, d) if self.domains else self.points.x
         # of a corner on a grid line, rounding must not choose a cell in which the domain does not lie
-        cell = self._filled_cell(at, x + DEPTH * (self.points.x[at] - x))
+        cell = self._filled_cell(at, x + NEAR * (self.points.x[at] - x))
         travel = Exchange(grid.comm, grid.owner(cell))
         return travel, grid.local(travel.send(cell)), travel.send(x)
 
@@ -217,12 +219,12 @@ class CutDomains(Keyed):
 
     def cells_at(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
         """Return the lexicographic cells (m,) of places x (m, d), m, in or on the domains of points (m,)."""
-        return self._filled_cell(at, x + DEPTH * (self.points.x[at] - x))
+        return self._filled_cell(at, x + NEAR * (self.points.x[at] - x))
 
     def _filled_cell(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
         """Return the cells (m,) of positions in domains; where no piece of the domain lies, of its largest piece."""
         pieces, cells = self.pieces, len(self.grid.owners)
-        cell = self.grid.number(self.grid.index(x)) + self.grid.copy(self.points.id[at])
+        cell = self.grid.number(self.grid.index_from_base(x)) + self.grid.copy(self.points.id[at])
         key, keys = at * cells + cell, pieces.point * cells + pieces.cell
         if not len(key):
             return cell
@@ -240,7 +242,7 @@ class CutDomains(Keyed):
 
 def whole_points(grid: Grid, x: NDArray[np.float64]) -> Pieces:
     """Return one piece a point, at the point; a cell that holds points has open faces."""
-    n, number = len(x), grid.number(grid.index(x))
+    n, number = len(x), grid.number(grid.index_from_base(x))
     _, cell, count = np.unique(number, return_inverse=True, return_counts=True)
     share = (grid.cell_volume / grid.h) / count[cell][:, None]
     return Pieces(np.arange(n), number, np.ones(n), x.copy(), np.stack([share, share], axis=2), np.zeros((n, 0)))

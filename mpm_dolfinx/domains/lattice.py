@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.caching import Latest
+from mpm_dolfinx.base.tolerances import NEAR
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.faces import Surface
 from mpm_dolfinx.bodies.touching import Faces, covers
@@ -37,8 +38,6 @@ FAST = 10
 THIRD = (-1.0, 3.0, -3.0, 1.0)
 MARGIN = 3
 """Layers of a lattice on both sides that the change of one depends on."""
-PARTED = 1e-6
-"""Of a domain's edge, and of a cell: corners of neighbours that are further apart, or moved otherwise, have parted."""
 
 
 class Lattice:
@@ -64,7 +63,7 @@ class Lattice:
         self._body, self._start, self._stop = body, start, start + len(body)
         self._dim, self._count = body.dim, body.lattice
         self._numbers: Latest[NDArray[np.int64]] = Latest()
-        self._parted = np.append(np.full(self._dim, PARTED * body.spacing.min()), PARTED)
+        self._parted = np.append(np.full(self._dim, NEAR * body.spacing.min()), NEAR)
         # the numbers of corners that are held: a flag for each corner would be as large as the body, on every process
         self._joined = np.unique(np.take_along_axis(body.nodes(joined[0]), joined[1], axis=1))
         of_axes = [[np.empty(0, dtype=np.int64)] for _ in range(self._dim)]
@@ -210,7 +209,7 @@ def given(
         out[rows] = lattice.given(points.id[rows])
     for name, axes in walls.items():
         axis, end = SIDES[grid.dim][name]
-        at_wall = np.abs(points.corners[:, :, axis] - (grid.lower, grid.upper)[end][axis]) < 1e-6 * grid.h[axis]
+        at_wall = np.abs(points.corners[:, :, axis] - (grid.low, grid.high)[end][axis]) < NEAR * grid.h[axis]
         for letter in axes:
             out[:, :, "xyz".index(letter)] |= at_wall
     return out

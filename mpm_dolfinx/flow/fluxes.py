@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base import _compat
 from mpm_dolfinx.base.caching import Keyed
 from mpm_dolfinx.base.fluid_content import density_between, mass_potential
+from mpm_dolfinx.base.tolerances import TINY
 from mpm_dolfinx.forms.point_forms import FacetForm, FacetSum
 from mpm_dolfinx.forms.unknowns import sum_ghosts
 from mpm_dolfinx.grid.grid import Grid, sum_by
@@ -309,7 +310,7 @@ class FluxForms:
         d0 = across / 2 - ufl.dot(self.centroid("+"), n0)
         d1 = across / 2 + ufl.dot(self.centroid("-"), n0)
         k0, k1 = (sum(abs(n0[a]) * self.mobility(side)[a] for a in range(d)) for side in "+-")
-        T = share * k0 * k1 / (d0 * k1 + d1 * k0 + 1e-300)
+        T = share * k0 * k1 / (d0 * k1 + d1 * k0 + TINY)
         dS = ufl.Measure("dS", domain=mesh, subdomain_id=_compat.SUBDOMAIN, metadata={"quadrature_degree": 0})
         self.flux = FacetForm(T * ufl.jump(dp) * ufl.jump(q) * dS, grid.comm) if flows else None
         self.dt = fem.Constant(mesh, 0.0)

@@ -17,7 +17,7 @@ from mpm_dolfinx.flow.fluxes import CellContents, OpenSides
 from mpm_dolfinx.points.material_points import MaterialPoints
 
 THICK = np.sqrt(2)
-"""Largest section of a cube over its face.
+"""Largest section of a cube over its face.  Source: exact bound (Ball 1986).
 
 A convex body behind a plane has its centroid at least its volume / ((d + 1) THICK h^(d-1)) behind it.  A face that is
 closer to the centroid of what its cell holds, or behind it, bounds a part of that only, and must not drain it at once.

@@ -22,18 +22,16 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from mpm_dolfinx.base.tolerances import NEAR, ROUND_OFF
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.flow.fluxes import CellContents, Mobility
 from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.parallel.exchange import over_all
 
-BLUR = 1e-6
-"""Cells within which a line at the edge of a piece counts half for it."""
 ASLANT = 0.01
 """Slope of layers on the grid from which a cell's pressure is rather that of its most conductive part."""
 PAIRS = 2**16
 """Pairs of pieces in a cell that are looked at, at a time."""
-INSIDE = 1e-12  # of half a cell: how near to a face the place of a cell's pressure may come
 
 
 @dataclass(frozen=True)
@@ -76,11 +74,11 @@ class MixedCells:
         self._rows, self._x, self._volume, self._h = rows, x, volume, h
         own, first, self._at, count = np.unique(cells, return_index=True, return_inverse=True, return_counts=True)
         self._filled, middle = contents.slot(own), contents.centroid[own] / h
-        self._room = np.minimum(INSIDE - 0.5 - middle, 0.0), np.maximum(0.5 - INSIDE - middle, 0.0)
+        self._room = np.minimum(ROUND_OFF - 0.5 - middle, 0.0), np.maximum(0.5 - ROUND_OFF - middle, 0.0)
         count, first = count[self._at], first[self._at]
         ends = 1 + np.flatnonzero(np.diff(np.cumsum(count) // PAIRS, append=-1))
         met = [self._crossed(slice(a, b), first, count, low, high) for a, b in pairwise([0, *ends])]
-        size, share = np.maximum(high - low, BLUR), volume / h.prod()
+        size, share = np.maximum(high - low, NEAR), volume / h.prod()
         self._lines = []
         for axis, found in enumerate(zip(*met, strict=True)):
             line, piece, meets = (np.concatenate(rows) for rows in zip(*found, strict=True))
@@ -98,7 +96,7 @@ class MixedCells:
         line = np.repeat(own, count[rows])
         begin = np.cumsum(count[rows]) - count[rows]
         piece = np.repeat(first[rows] - begin, count[rows]) + np.arange(len(line))
-        inside = np.minimum(self._x[line] - low[piece], high[piece] - self._x[line]) / BLUR + 0.5
+        inside = np.minimum(self._x[line] - low[piece], high[piece] - self._x[line]) / NEAR + 0.5
         out = []
         for axis in range(self._x.shape[1]):
             meets = np.delete(inside, axis, axis=1).clip(0, 1).prod(axis=1)
@@ -174,7 +172,7 @@ def graded(
     with np.errstate(divide="ignore"):
         series = 1 / contents.mean(1 / kappa)
     parts = []  # of the variance, by the linear change along each axis
-    for x, least in zip(offset.T, (BLUR * contents.grid.h) ** 2, strict=True):
+    for x, least in zip(offset.T, (NEAR * contents.grid.h) ** 2, strict=True):
         middle, moment = contents.mean(x), contents.mean(x * kappa)
         spread = contents.mean(x**2) - middle**2
         parts.append(np.divide((moment - middle * mean) ** 2, spread, out=np.zeros(len(mean)), where=spread > least))

@@ -20,6 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from mpm_dolfinx.base.tolerances import NEAR
 from mpm_dolfinx.flow.fluxes import CellContents, FluxForms, OpenSides
 from mpm_dolfinx.forms.point_forms import FacetSum
 from mpm_dolfinx.grid.grid import sum_by
@@ -28,12 +29,8 @@ ALONG = 1e-4
 """Share of a cell below which centroids lie across from one another."""
 NEAREST = 0.1
 """Share of a cell: what is nearer counts as if it were as far in the least squares."""
-SLACK = 1e-6
-"""Share of the differences of pressure between neighbours by which limited pressures may pass them."""
 SIDES = 2.0
 """Weight of all that is known beyond a cell's open sides in its least squares, by their areas, over a neighbour's."""
-FLAT = 1e-6
-"""Share of the best known direction's weight below which a gradient along another one is unknown, and taken as none."""
 
 
 def off_facets(contents: CellContents, facets: NDArray[np.int32]) -> NDArray[np.int32]:
@@ -111,7 +108,7 @@ class Gradients:
         A = np.einsum("nki,nkj->nij", to_cells, self._way) + closed[:, :, None] * closed[:, None, :]
         for i, j in np.ndindex(d, d):
             A[:, i, j] += sum_by(at, to_sides[:, i] * reach[:, j], len(A))
-        inverse = np.linalg.pinv(A, rcond=FLAT, hermitian=True)
+        inverse = np.linalg.pinv(A, rcond=NEAR, hermitian=True)
         return np.einsum("nij,nkj->nki", inverse, to_cells), np.einsum("mij,mj->mi", inverse[at], to_sides)
 
     def __call__(
@@ -141,7 +138,7 @@ class Gradients:
         np.minimum.at(low, at, to_sides)
         np.maximum.at(high, at, to_sides)
         rise = np.einsum("nd,nkd->nk", out, self._along)
-        share, slack = np.ones(len(out)), SLACK * (high - low)  # else rounding would decide where nothing rises
+        share, slack = np.ones(len(out)), NEAR * (high - low)  # else rounding would decide where nothing rises
         for room, most in ((-low, -rise.min(axis=1)), (high, rise.max(axis=1))):
             room = room + slack
             share = np.minimum(share, np.divide(room, most, out=np.ones(len(out)), where=most > room))

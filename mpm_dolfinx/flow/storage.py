@@ -42,6 +42,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.fluid_content import change_of_content, mass_potential
+from mpm_dolfinx.base.tolerances import EPSILON
 from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.flow.fluxes import CellContents, Conduction, FluxForms, OpenSides
 from mpm_dolfinx.flow.nonorthogonal import AslantFlow, Gradients
@@ -519,7 +520,7 @@ class StorageProblem:
         mass = r.array_r + now.cells + before.cells
         r.array_w[:] = mass / density
         # what rounding may leave: of the volumes and of the fluxes that cancel
-        round_off = 2e-15 * (self._contents.volume + now.turnover + before.turnover)
+        round_off = 8 * EPSILON * (self._contents.volume + now.turnover + before.turnover)
         rows = np.abs(change) + now.gain + before.gain, round_off, np.abs(mass), change + now.lost + before.lost
         return StorageResidual(r, *(system.of_parts.sums(row) for row in rows), rates)
 

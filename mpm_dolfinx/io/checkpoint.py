@@ -29,7 +29,7 @@ from mpm_dolfinx.simulation.simulation import Simulation
 from mpm_dolfinx.stepping.result import Result, Row
 from mpm_dolfinx.stepping.state import State, Stay
 
-FORMAT, VERSION = "mpm_dolfinx checkpoint", 9
+FORMAT, VERSION = "mpm_dolfinx checkpoint", 9  # Source: the format of the files
 FOREIGN = "no checkpoint of mpm_dolfinx, must be one"
 ZIP = b"PK\3\4"  # how numpy's archives begin
 ACTING = ("reactions", "walls", "outflows", "tool_forces", "tool_travel")

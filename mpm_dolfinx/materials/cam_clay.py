@@ -29,6 +29,7 @@ from typing import ClassVar
 import numpy as np
 import ufl
 
+from mpm_dolfinx.base.tolerances import SAME
 from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.materials.skeleton import Field, Skeleton, _check, check_given
 from mpm_dolfinx.materials.trial import Trial
@@ -40,7 +41,6 @@ GIVEN = {
     "initial_stress": "three normal effective stresses whose mean is compressive, < 0 Pa",
 }
 """Constants that must be given, and what they may be."""
-OFF = 1e9  # a residual that no step is taken to
 
 
 class _Follows(float):
@@ -117,7 +117,7 @@ class ModifiedCamClay(Skeleton):
             bulk = bulk if np.ndim(bulk) else _Follows(bulk)
         if self.bulk is None or getattr(self.bulk, "follows", False):  # of another one's constants: `replace`
             object.__setattr__(self, "bulk", bulk)
-        elif callable(self.bulk) or (not callable(bulk) and not np.allclose(self.bulk, bulk, rtol=1e-9)):
+        elif callable(self.bulk) or (not callable(bulk) and not np.allclose(self.bulk, bulk, rtol=SAME)):
             raise ValueError(f"{type(self).__name__}: bulk = {line(self.bulk)}, must be left out: it is P_0 / kappa")
 
     @property
@@ -158,7 +158,7 @@ class ModifiedCamClay(Skeleton):
         c, P = 6 * shear * kappa / M**2, to.trial_pressure * ufl.exp(-to.compaction)
         rule = (c * to.compaction - (ufl.exp(to.flow) - 1) * (1 - to.steepness) * P) / (c + P)
         rule = ufl.conditional(
-            ufl.lt(to.flow, -1e-9), OFF, rule
+            ufl.lt(to.flow, -SAME), 1 / SAME, rule
         )  # soil that softens fast has another root, back in time
         return {"steeper": ufl.conditional(to.yields, rule, steeper)}
 

@@ -19,6 +19,7 @@ from typing import ClassVar
 import numpy as np
 import ufl
 
+from mpm_dolfinx.base.tolerances import EPSILON
 from mpm_dolfinx.materials.frictional import Frictional
 from mpm_dolfinx.materials.skeleton import Field, _check
 from mpm_dolfinx.materials.trial import Trial
@@ -29,7 +30,7 @@ MATCHES = {
     "extension": lambda t, s, c: (6 * s / np.sqrt(3) / (3 + s), 6 * c / np.sqrt(3) / (3 + s)),
 }
 """How the cone meets Mohr and Coulomb's pyramid: (eta, xi) from tangent, sine and cosine of the friction angle."""
-TINY = 1e-20  # under the root of the deviatoric strain's square: keeps its derivative finite
+LEAST = 1e-20  # under the root of the deviatoric strain's square: keeps its derivative finite
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -131,13 +132,13 @@ def returned(trial: Trial, bulk, shear, eta, xi, eta_flow, cohesion, hardening, 
     apex: 1 where it returns to the apex, else 0; hardened: growth of the hardening variable.
     """
     p = bulk * trial.volumetric
-    q = shear * ufl.sqrt(2 * ufl.inner(trial.deviatoric, trial.deviatoric) + TINY)  # sqrt(J_2)
+    q = shear * ufl.sqrt(2 * ufl.inner(trial.deviatoric, trial.deviatoric) + LEAST)  # sqrt(J_2)
     strength = xi * (cohesion + hardening * hardened)
     f = q + eta * p - strength
     cone = f / (shear + bulk * eta * eta_flow + xi**2 * hardening + drag)
     to_cone = ufl.le(shear * cone, q)
-    slope = xi / (eta + 1e-12)  # no friction has no apex, but every branch must be finite
-    apex = (p - strength / (eta + 1e-12)) / (bulk + slope**2 * hardening)
+    slope = xi / (eta + EPSILON)  # no friction has no apex, but every branch must be finite
+    apex = (p - strength / (eta + EPSILON)) / (bulk + slope**2 * hardening)
     yields = ufl.gt(f, 0)
 
     def choose(elastic, on_cone, at_apex):

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.errors import NotConverged
+from mpm_dolfinx.base.tolerances import TINY
 from mpm_dolfinx.base.validation import numbers
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData
@@ -312,7 +313,7 @@ class SceneMaterials:
         modulus = self.table(points, lambda m: m.oedometric)
         if self.fluid is None:
             return modulus
-        fluid = self.table(points, lambda m: m.biot) ** 2 / np.maximum(self.storage(points), 1e-300)
+        fluid = self.table(points, lambda m: m.biot) ** 2 / np.maximum(self.storage(points), TINY)
         return modulus + np.minimum(fluid, STIFFEST * modulus)
 
     def state(self, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
@@ -377,7 +378,11 @@ class SceneMaterials:
         placed = self._placed(points)
         new = [(law.law, rows, name, v) for law, rows, at in placed for name, v in law.new_state(at, dt)]
         bad = [(law, name, rows[~_finite(values)]) for law, rows, name, values in new]
-        shown = [f"{law.__name__}.update: {name!r} is not finite at {points.x[i[0]]}" for law, name, i in bad if len(i)]
+        shown = [
+            f"{law.__name__}.update: {name!r} is not finite at {points.x[i[0]] + self.grid.base}"
+            for law, name, i in bad
+            if len(i)
+        ]
         if message := first(self.grid.comm, "".join(shown[:1])):
             raise NotConverged(message)
         out = {name: values.copy() if name in self.state_names else values for name, values in points.data.items()}

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.base.errors import NotConverged
+from mpm_dolfinx.base.tolerances import SAME
 from mpm_dolfinx.base.validation import asked, line, numbers
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.overburden import overburden
@@ -26,7 +27,6 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 
 EXACT, CLOSE = 1e-13, 1e-8  # of the largest given stress: to which laws are solved, and have to be
 MOST = 30  # iterations
-DIFFERENCE = 1e-7  # of strains, for derivatives
 LARGEST = 0.2  # change of a strain in an iteration
 
 
@@ -139,12 +139,13 @@ class InitialStresses:
         if not self.given:
             return points
         target, rows, refused = np.zeros((len(points), 3, 3)), np.zeros(len(points), dtype=bool), ""
+        placed = points.placed(materials.grid.base)
         above = self._above(materials, points, present, gravity)
         try:
             for body, stress in self.given.items():
                 own = (points.id >= self._start[body]) & (points.id < self._start[body + 1])
                 if own.any():
-                    target[own] = self._at(stress, body, points.map(lambda v, own=own: v[own]), [a[own] for a in above])
+                    target[own] = self._at(stress, body, placed.map(lambda v, own=own: v[own]), [a[own] for a in above])
                 rows |= own
         except ValueError as error:
             refused = str(error)
@@ -160,7 +161,7 @@ class InitialStresses:
             allowed = f"three normal stresses or a symmetric tensor (3, 3), finite, for each of {n} places"
             value = numbers(name, asked(name, allowed, stress, points.x), (n, 3), (n, 3, 3), allowed=allowed)
             value = value if value.ndim == 3 else value[:, :, None] * np.eye(3)
-            wrong = np.abs(value - value.swapaxes(1, 2)).max(axis=(1, 2)) > 1e-9 * np.abs(value).max(initial=0)
+            wrong = np.abs(value - value.swapaxes(1, 2)).max(axis=(1, 2)) > SAME * np.abs(value).max(initial=0)
             if d == 2:
                 wrong |= (value[:, :2, 2] != 0).any(axis=1)
             if wrong.any():
@@ -191,8 +192,9 @@ class InitialStresses:
         total = over_all(materials.grid.comm, total)
         here = np.repeat(present, [len(body) for body in self._bodies])
         corners = np.concatenate([body.corners() for body, there in zip(self._bodies, present, strict=True) if there])
-        weight, surface = overburden(corners, -gravity[-1] * total[here], points.x)
-        return [weight, surface, materials.table(points, lambda m: m.biot) * points.pressure]
+        base = materials.grid.base
+        weight, surface = overburden(corners - base, -gravity[-1] * total[here], points.x)
+        return [weight, surface + base[-1], materials.table(points, lambda m: m.biot) * points.pressure]
 
 
 def stressed(
@@ -210,7 +212,7 @@ def stressed(
     comm, rows, law = materials.grid.comm, np.flatnonzero(chosen), materials.law_of(points)
     part, target = points.map(lambda values: values[rows]), target[rows]
     given = np.isin(law[rows], [k for k, one in enumerate(materials.laws) if issubclass(one, ModifiedCamClay)])
-    if message := first(comm, _no_constants(part, target, given)):
+    if message := first(comm, _no_constants(part.placed(materials.grid.base), target, given)):
         raise ValueError(message)
     if given.any():
         normal, kappa = np.diagonal(target, axis1=1, axis2=2), materials.table(part, _kappa)
@@ -300,7 +302,7 @@ class _Sought:
         count, free, (_, shear) = strain.shape[1], self.free, self.moduli()
         slopes = np.tile(np.eye(count) * (2 * shear)[:, None, None], (1, 1, 1))
         for k in range(count):
-            change = (self.off(strain + DIFFERENCE * np.eye(count)[k])[2] - missing) / DIFFERENCE
+            change = (self.off(strain + SAME * np.eye(count)[k])[2] - missing) / SAME
             slopes[:, :, k] = np.where(free & free[:, [k]], change, slopes[:, :, k])
         slopes, missing = (np.nan_to_num(values) for values in (slopes, missing))
         singular = ~(np.abs(np.linalg.det(slopes / shear[:, None, None])) > 1e-12)
@@ -376,4 +378,4 @@ def _not_borne(materials: SceneMaterials, points: MaterialPoints, target: NDArra
     allowed = f"what {name} can bear: inside its yield surface"
     tension = np.trace(target[i]) > 0  # pores press by more than the weight above
     more = "; of open water above it K0 takes the weight as surcharge" if tension and points.pressure[i] > 0 else ""
-    return f"initial_stress at {points.x[i]}: {target[i].tolist()} Pa, must be {allowed}{more}"
+    return f"initial_stress at {points.x[i] + materials.grid.base}: {target[i].tolist()} Pa, must be {allowed}{more}"

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.base.errors import NotConverged
+from mpm_dolfinx.base.tolerances import EPSILON, SAME
 from mpm_dolfinx.base.validation import asked, instance, line
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointExpression
 from mpm_dolfinx.materials.skeleton import BY_SCENE, Skeleton
@@ -33,8 +34,6 @@ from mpm_dolfinx.materials.user_functions import call, named
 from mpm_dolfinx.parallel.exchange import first
 
 MOST, HALVINGS = 60, 25  # iterations, and halvings of their steps in all
-CLOSE = 1e-9  # a Newton step below this, relative to unknowns of order one, leaves round-off
-ROUND_OFF = 1e-15  # of residuals of order one
 
 
 class Solved(NamedTuple):
@@ -221,7 +220,7 @@ class _Equations:
 
     def _refuse(self, data: PointData, lost: NDArray[np.int64], why: str) -> None:
         """Raise NotConverged, naming the first point that is lost on any process; all of them together."""
-        shown = [f"{self._law.__name__}{why} at {data.x[i]}" for i in lost[:1]]
+        shown = [f"{self._law.__name__}{why} at {data.x[i] + data.points.grid.base}" for i in lost[:1]]
         if message := first(self._grid.comm, "".join(shown)):
             raise NotConverged(message)
 
@@ -333,10 +332,10 @@ def _newton(system, y: NDArray[np.float64]) -> NDArray[np.int64]:
     halvings = np.zeros(len(y), dtype=int)
     for _ in range(MOST):
         step, begun = _solve(slope, f[:, :, None])[:, :, 0], y[rows]
-        solved, lost[rows] = norm <= ROUND_OFF, ~np.isfinite(step).all(axis=1)
+        solved, lost[rows] = norm <= 4 * EPSILON, ~np.isfinite(step).all(axis=1)
         step[solved & lost[rows]] = 0.0  # a solution, though it may be one of many
         lost[rows] &= ~solved
-        close = (np.abs(step) <= CLOSE * np.maximum(1.0, np.abs(begun))).all(axis=1) | solved
+        close = (np.abs(step) <= SAME * np.maximum(1.0, np.abs(begun))).all(axis=1) | solved
         y[rows] = begun - step  # of those that are close this is the solution
         on = ~(close | lost[rows])
         rows, step, begun, norm, length = rows[on], step[on], begun[on], norm[on], np.ones(int(on.sum()))

@@ -24,12 +24,13 @@ import numpy as np
 import ufl
 from numpy.typing import NDArray
 
+from mpm_dolfinx.base.tolerances import EPSILON
 from mpm_dolfinx.forms.axes import embedded, planar
 from mpm_dolfinx.materials.frictional import Frictional
 from mpm_dolfinx.materials.skeleton import Field, _check
 from mpm_dolfinx.materials.trial import PLANE, Coaxial, Isotropic, components, eigen, symmetric
 
-ROUND_OFF = 1e-12  # of stresses over the shear modulus
+CLOSE = 1e-12  # of stresses over the shear modulus
 FACE, EDGES, ALL = slice(0, 1), slice(1, 3), slice(None)  # of the faces of a return
 NEVER = 1e6  # tensile strength over the bulk modulus where none is given
 
@@ -147,7 +148,7 @@ def _returned(e: NDArray, bulk: NDArray, shear: NDArray, sine: NDArray, sine_flo
         for few in (FACE, EDGES, ALL):  # most end on the first, most others on the next
             at = _Return(trial[rows], *(v[rows] for v in parameters))
             ends, of_trial, offence = at.end(few)
-            there = offence <= ROUND_OFF * shear[rows] if few is not ALL else slice(None)
+            there = offence <= CLOSE * shear[rows] if few is not ALL else slice(None)
             t[rows[there]], slopes[rows[there]] = ends[there], of_trial[there] @ elastic[rows[there]]
             rows = np.delete(rows, there)
             if not len(rows):
@@ -180,7 +181,7 @@ class _Return:
         left = _rows(zero, s.p, -s.q), s.k, _rows(zero, self._p, -self._q)
         first, second = ((axis, s.T, axis) for axis in (_rows(one, zero, zero), _rows(zero, one, zero)))
         self._faces = ([main], [main, left], [main, right], [first], [first, second], [main, first])
-        apex, lowest = s.k / (2 * sine + 1e-30), (s.p * s.T - s.k) / s.q
+        apex, lowest = s.k / (2 * sine + EPSILON), (s.p * s.T - s.k) / s.q
         self._vertices = (
             (_rows(apex, apex, apex), self._in_apex),
             (_rows(s.T, s.T, s.T), lambda x: x.T),

@@ -490,4 +490,4 @@ class Fluid:
         return self.density * (self.gravity or STANDARD_GRAVITY)
 
 
-STANDARD_GRAVITY = 9.81  # m/s^2, by which hydraulic conductivities are defined
+STANDARD_GRAVITY = 9.81  # m/s^2, by which conductivities are defined.  Source: standard gravity of 1901, three digits

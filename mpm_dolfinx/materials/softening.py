@@ -19,13 +19,13 @@ from typing import ClassVar
 import numpy as np
 import ufl
 
+from mpm_dolfinx.base.tolerances import TINY
 from mpm_dolfinx.materials.drucker_prager import DruckerPrager, metric, returned, stress
 from mpm_dolfinx.materials.skeleton import Field, _check, check_given
 from mpm_dolfinx.materials.trial import Trial
 
 GIVEN = {"residual": "in [0, cohesion] Pa", "slip": "> 0 m"}
 """Constants that must be given, and what they may be."""
-NEVER = 1e-300  # s: added to no time, in which nothing flows
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,7 +79,7 @@ class SofteningDruckerPrager(DruckerPrager):
     ):
         """Return the Kirchhoff stress (3, 3), Pa, as UFL."""
         trial = Trial(F, plastic)
-        strength = cohesion, residual, slip / cell_size, viscosity / (dt + NEVER)
+        strength = cohesion, residual, slip / cell_size, viscosity / (dt + TINY)
         return stress(trial, _softened(trial, bulk, shear, eta, xi, eta_flow, hardened, *strength), shear)
 
     @staticmethod
@@ -88,7 +88,7 @@ class SofteningDruckerPrager(DruckerPrager):
     ):
         """Return the state at the end of the step, name -> UFL."""
         trial = Trial(F, plastic)
-        strength = cohesion, residual, slip / cell_size, viscosity / (dt + NEVER)
+        strength = cohesion, residual, slip / cell_size, viscosity / (dt + TINY)
         to = _softened(trial, bulk, shear, eta, xi, eta_flow, hardened, *strength)
         return {"plastic": metric(trial, to, bulk, plastic), "hardened": hardened + to["hardened"]}
 

@@ -15,10 +15,10 @@ import numpy as np
 import ufl
 from numpy.typing import NDArray
 
+from mpm_dolfinx.base.tolerances import NEAR, SAME
 from mpm_dolfinx.forms.axes import embedded, planar
 from mpm_dolfinx.materials.skeleton import _eigenvalues
 
-EQUAL = 1e-8  # relative distance below which two eigenvalues count as equal
 PLANE, SPACE = ((0, 0), (1, 1), (2, 2), (0, 1)), ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 """Components of a symmetric tensor in plane strain or axisymmetry, and in 3D."""
 
@@ -29,7 +29,7 @@ class Isotropic:
     def __init__(self, b, plane: bool):
         self._b, self._plane = b, plane
         block = ufl.as_matrix([[b[i, j] for j in (0, 1)] for i in (0, 1)]) if plane else b
-        self._nodes = _eigenvalues(block, 1e-6)
+        self._nodes = _eigenvalues(block, NEAR)
 
     def __call__(self, f: Callable):
         """Return f(b) (3, 3) for a function of the eigenvalues."""
@@ -141,7 +141,7 @@ class Coaxial:
         tangent[:] = self._outer @ slopes @ (self._outer * twice[:, None]).transpose(0, 2, 1)
         for a, b in self._pairs:
             apart = x[:, a] - x[:, b]
-            equal = np.abs(apart) <= EQUAL * np.abs(x[:, a])
+            equal = np.abs(apart) <= SAME * np.abs(x[:, a])
             turn = np.where(equal, slopes[:, a, a] - slopes[:, a, b], (y[:, a] - y[:, b]) / np.where(equal, 1.0, apart))
             side = self._dyad(a, b)
             tangent += (2 * turn[:, None] * side)[:, :, None] * (side * twice)[:, None, :]

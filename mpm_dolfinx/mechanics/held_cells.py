@@ -15,13 +15,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from mpm_dolfinx.base.tolerances import NEAR
 from mpm_dolfinx.conditions.conditions import HOLD, WEAK
 from mpm_dolfinx.grid.grid import Grid, among, sum_by
 from mpm_dolfinx.parallel.exchange import over_all
 
-FLAT = 1e-6  # cells^2: variance of places far below which a side has no extent in a cell
-FREE = 1e-6  # below this share of the nodes that may move in what moves a side, a wall holds it
-SAME = 1e-6  # cells: displacements that differ by less are the same
 ALIGNED = 1e-2
 """Slope of a side in a cell to an axis below which its cells can follow it, whatever they keep their volume."""
 EVERYWHERE = 1e2
@@ -92,7 +90,7 @@ class HeldCells:
 
         x, gap, normal, N = mean(p.x), mean(p.gap), total(p.normal), grid.shape_values(p.cell, p.x)
         off = p.x - x[at]
-        given, spread = mean(p.given), (mean(off**2) + FLAT * grid.h**2)[:, :, None]
+        given, spread = mean(p.given), (mean(off**2) + NEAR * grid.h**2)[:, :, None]
         slopes = (mean(off[:, :, None] * (v - m[at])[:, None, :]) / spread for v, m in ((p.gap, gap), (p.given, given)))
         slope, rise = slopes
         along = 2 * normal**2 <= (normal**2).sum(axis=1, keepdims=True)
@@ -140,7 +138,7 @@ class HeldCells:
         grid, chosen = self.grid, np.flatnonzero(given[self.number])
         nodes, x, gap, N = (v[chosen] for v in (grid.cell_nodes[self.cell], self.x, self._gap[:, axis], self.shape))
         walled = ~free[nodes]
-        held = ((N * ~walled).sum(axis=1) < FREE) & (np.abs(gap) > SAME * grid.h.min())
+        held = ((N * ~walled).sum(axis=1) < NEAR) & (np.abs(gap) > NEAR * grid.h.min())
         stuck, asked = np.zeros_like(walled), np.repeat(gap[:, None], N.shape[1], axis=1)
         moved, rise = (v[chosen][..., axis :: grid.dim, None] for v in (self._given, self._rise))  # at both ends
         torn = np.zeros(len(chosen), dtype=bool)
@@ -166,7 +164,7 @@ class HeldCells:
         number, nodes, N : (k,), (k, 2^d) twice
             Conditions, nodes, and shape functions.
         """
-        grid, at_wall, some = self.grid, stuck.any(axis=1), N > FREE
+        grid, at_wall, some = self.grid, stuck.any(axis=1), N > NEAR
         if not over_all(grid.comm, int(at_wall.sum())):
             return at_wall
         shape = (*(grid.shape + 1), grid.copies)
@@ -200,7 +198,7 @@ class HeldCells:
         if not suspected:
             return []
         mine = np.isin(self.number[row], suspected)
-        node = np.rint((grid.node_x[grid.cell_nodes[self.cell[row[mine]]]] - grid.lower) / grid.h)
+        node = np.rint((grid.node_x[grid.cell_nodes[self.cell[row[mine]]]] - grid.low) / grid.h)
         columns = (self.number[row[mine]], axis[mine], force[mine], limit[mine], node, self.shape[row[mine]])
         rows = (*columns, self.x[row[mine]])
         number, axis, force, limit, node, N, x = map(np.concatenate, zip(*comm.allgather(rows), strict=True))

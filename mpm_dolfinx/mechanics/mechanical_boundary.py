@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 
 from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.base.given_values import by_place
+from mpm_dolfinx.base.tolerances import NEAR
 from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.bodies.faces import Surface, face_vectors
 from mpm_dolfinx.conditions.conditions import (
@@ -41,7 +42,7 @@ from mpm_dolfinx.forms.unknowns import Unknowns
 from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.mechanics.closed import closed
-from mpm_dolfinx.mechanics.held_cells import SAME, HeldCells, HeldPoints
+from mpm_dolfinx.mechanics.held_cells import HeldCells, HeldPoints
 from mpm_dolfinx.mechanics.rigid_motion import turned
 from mpm_dolfinx.mechanics.side_forms import SideData, SideForms
 from mpm_dolfinx.parallel.exchange import Exchange, first
@@ -299,8 +300,9 @@ class MechanicalBoundary:
             *rows, wrong = held.rows(axis, given, self._free[:, axis])
             placed.append((*rows, np.tile(np.eye(d)[axis], (len(rows[0]), 1))))
             if wrong >= 0:
-                what = f"{line(self.holds[held.number[wrong]][0])}: moves {'xyz'[axis]} at {held.x[wrong]}"
-                message = f"{what}, where a fixed wall holds it; must be 0 there, or the wall must leave it free"
+                hold, x = self.holds[held.number[wrong]][0], held.x[wrong] + self.grid.base
+                what = f"{line(hold)}: moves {'xyz'[axis]} at {x}"
+                message = f"{what}, where a wall holds it; must be 0 there, or the wall must leave it free"
         if message := first(comm, message):
             raise ValueError(message)
         row, stiffness, gap, own, direction = map(np.concatenate, zip(*placed, strict=True))
@@ -340,7 +342,7 @@ class MechanicalBoundary:
         """Refuse given displacements that differ where they meet: no body's stress is finite there."""
         for one, other, axes, X in self._meeting:
             jump = np.abs(self._given(one, t, X) - self._given(other, t, X))[:, axes].max(axis=1)
-            if jump.max(initial=0.0) > SAME * self.grid.h.min():
+            if jump.max(initial=0.0) > NEAR * self.grid.h.min():
                 what = f"{line(one)} and {line(other)}: differ by {jump.max():.3g} m at t = {t:g} s where they meet"
                 raise ValueError(f"{what}, at {X[jump.argmax()]}; must agree there, or leave two cells between them")
 
@@ -366,7 +368,7 @@ class MechanicalBoundary:
             self._warned.add(number)
             why = "its reaction is an artefact; does something else hold it, or is the step too large?"
             what = "%s: not where it is to be at %s: %s"
-            warn(self.grid.comm, what, line(self.holds[number][0]), x, why)
+            warn(self.grid.comm, what, line(self.holds[number][0]), x + self.grid.base, why)
 
     def under_held(
         self, ids: NDArray[np.int64], tracked: NDArray[np.float64], volume: NDArray[np.float64], corners: NDArray
@@ -405,11 +407,11 @@ def _check_flat(plate: RigidPlate, faces: Surface) -> None:
     low, high, height = corners.min(axis=1)[:, tangential], corners.max(axis=1)[:, tangential], corners[..., axis]
     X, extent = (low + high) / 2, high - low
     size = extent.max(axis=0)
-    apart = np.flatnonzero(np.abs(height - height[0, 0]).max(axis=1) > 1e-6 * size.min())
+    apart = np.flatnonzero(np.abs(height - height[0, 0]).max(axis=1) > NEAR * size.min())
     if not len(apart):
-        pairs = cKDTree(X / size).query_pairs(1 + 1e-6, p=np.inf, output_type="ndarray")
+        pairs = cKDTree(X / size).query_pairs(1 + NEAR, p=np.inf, output_type="ndarray")
         i, j = pairs.T
-        pairs = pairs[(np.abs(X[i] - X[j]) <= (extent[i] + extent[j]) / 2 + 1e-6 * size).all(axis=1)]
+        pairs = pairs[(np.abs(X[i] - X[j]) <= (extent[i] + extent[j]) / 2 + NEAR * size).all(axis=1)]
         graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(X), len(X)))
         _, part = connected_components(graph, directed=False)
         apart = np.flatnonzero(part != part[0])

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from mpm_dolfinx.base.tolerances import SAME, TINY
 from mpm_dolfinx.forms.point_forms import PointData
 from mpm_dolfinx.parallel.exchange import over_all
 
@@ -56,13 +57,13 @@ def rigid_motion(
         turned = _apply(turn, arm)
         off = gap - np.einsum("nd,nd->n", e, shift + turned - arm)
         left.append(over_all(comm, float(weight[:, 0] @ off**2)))
-        slope = np.concatenate([e, _spin(turned, e) / max(size, 1e-300)], axis=1)
+        slope = np.concatenate([e, _spin(turned, e) / max(size, TINY)], axis=1)
         normal = over_all(comm, np.concatenate([slope.T @ (weight * slope), [slope.T @ (weight[:, 0] * off)]]))
         part = slice(None) if iteration else slice(d)  # first without a turn
         step = np.zeros(len(normal) - 1)
-        step[part] = np.linalg.lstsq(normal[:-1][part, part] / moments[0], normal[-1][part] / moments[0], rcond=1e-9)[0]
+        step[part] = np.linalg.lstsq(normal[:-1][part, part] / moments[0], normal[-1][part] / moments[0], rcond=SAME)[0]
         shift = shift + step[:d]
-        angles = step[d:] / max(size, 1e-300)
+        angles = step[d:] / max(size, TINY)
         turn = Rotation.from_rotvec(angles if d == 3 else [0.0, 0.0, angles[0]]) * turn
     if turn.magnitude() < TURNS or not left[-1] < MEETS**2 * left[1]:
         return None

@@ -23,7 +23,7 @@ from mpm_dolfinx.parallel.exchange import over_all
 RADIUS = 3.0
 """Offsets, over the spacing of the data, from which on these have no weight.
 
-At an end of the data those at 0.5, 1.5 and 2.5 have: as many as a parabola needs.
+Source: exact, at an end of the data those at 0.5, 1.5 and 2.5 have weight: as many as a parabola needs.
 """
 UNTOLD = (0.0, 1e-10, 1e-6)
 """Weights of the coefficients of each degree, over those of the data: of what these do not tell.

@@ -11,6 +11,7 @@ from mpi4py import MPI
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mpm_dolfinx.base.tolerances import ROUND_OFF, SAME
 from mpm_dolfinx.base.validation import all_of, flag, line, numbers
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.faces import interpolate
@@ -117,7 +118,7 @@ def _domains_at(
     for body in bodies:
         for part in in_chunks(len(body)):
             spacing = body.boxes(part)
-            slack = 1e-9 + 2 * rounded / spacing
+            slack = SAME + 2 * rounded / spacing
             near = np.flatnonzero((np.abs((x - body.lower_of(part)) / spacing - 0.5) <= 0.5 + slack).all(axis=1))
             place = coordinates(body.reference(part.start + near), x)
             for on in np.flatnonzero((np.abs(place) <= 1 + 2 * slack[near]).all(axis=1)):
@@ -134,6 +135,6 @@ def coordinates(corners: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray
         slope, off = np.einsum("nkd,nka->nda", corners, dN), x - interpolate(corners, xi)
         step = (np.linalg.pinv(slope) @ off[:, :, None])[:, :, 0]  # outside a domain there may be no place
         xi = np.clip(xi + step, -2.0, 2.0)
-        if np.abs(step).max(initial=0.0) < 1e-14:
+        if np.abs(step).max(initial=0.0) < ROUND_OFF:
             break
     return xi

@@ -11,6 +11,7 @@ from mpi4py import MPI
 import numpy as np
 
 from mpm_dolfinx.base.report import Report
+from mpm_dolfinx.base.tolerances import EPSILON, NEAR, ROUND_OFF, SAME
 from mpm_dolfinx.base.validation import line, numbers
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.material_points import MaterialPoints
@@ -34,10 +35,8 @@ The stability function is never below -0.21: what goes unseen overshoots by a th
 """
 AGAIN = 2.0
 """Sudden changes, in proportion to those in the step before and its length, that need not be those of jumps."""
-SMALLEST = 1e-6
-"""Pressures that count, in proportion to the stress: where water flows freely the rest is rounding."""
-MOST = 1e9
-"""Output intervals of a run: with more, a step is lost in the rounding of the time."""
+MOST = SAME / EPSILON
+"""Output intervals of a run.  Source: exact bound, with more a step's slack SAME is below epsilon times the time."""
 RESOLVED = 10
 """Errors that can be told from what the solver leaves, in proportion to its tolerance."""
 FIRST = 1e-3
@@ -68,7 +67,7 @@ class StepSize:
 
     def ended(self, t: float, target: float, result: Result) -> bool:
         """Return whether a time, s, is the target but for rounding."""
-        slack = 1e-14 * abs(target) if self.by_error else 1e-9 * min(result.small, self.longest)
+        slack = ROUND_OFF * abs(target) if self.by_error else SAME * min(result.small, self.longest)
         return target - t <= slack
 
     def least(self, wanted: float, t: float) -> float:
@@ -83,9 +82,9 @@ class StepSize:
         """Return the length of the next step, s: `small`, fitted to the time that is left to the next output."""
         if self.by_error:  # no scrap of a step before an output
             small = min(small, self.longest)  # of a run that went on with other steps it may be longer
-            return left if left <= min(1.05 * small, (1 + 1e-9) * self.longest) else min(small, left / 2)
+            return left if left <= min(1.05 * small, (1 + SAME) * self.longest) else min(small, left / 2)
         # steps that fit but for rounding are all of the same length
-        return left if not left > (1 - 1e-9) * small else small
+        return left if not left > (1 - SAME) * small else small
 
     def refused(self, taken: float, report: Report, result: Result) -> float:
         """Return by how much its error has to shrink a step that has been solved; 1 where it is accepted.
@@ -112,7 +111,7 @@ class StepSize:
 
     def cut(self, taken: float, result: Result) -> Result:
         """Return the histories with half a step, s, to try next: the step has not converged."""
-        whole = taken > 0.99 * result.small
+        whole = taken > (1 - SAME) * result.small
         waits = 2 * result.waits + 1 if whole and result.kept == 0 else result.waits
         return replace(result, cuts=result.cuts + 1, small=taken / 2, waits=waits, kept=1)
 
@@ -123,11 +122,11 @@ class StepSize:
         step, for three, seven ..., and for half as many after one that has grown has converged.  `waits` is how many,
         `kept` how many steps there were since the last cut or growth, from one on; 0: the step has just grown.
         """
-        small, whole = self.next(taken, report, result, failed), taken > 0.99 * result.small
+        small, whole = self.next(taken, report, result, failed), taken > (1 - SAME) * result.small
         if self.by_error:
             return replace(result, small=small)
         waits = result.waits // 2 if whole and result.kept == 0 else result.waits
-        if small > 1.01 * result.small and result.kept > waits:  # not by rounding only
+        if small > (1 + SAME) * result.small and result.kept > waits:  # not by rounding only
             return replace(result, small=small, waits=waits, kept=0)
         # a step that was fitted to an output tells nothing of longer ones
         return replace(result, waits=waits, kept=result.kept + whole)
@@ -156,7 +155,7 @@ class StepSize:
 
 def measured(result: Result, report: Report) -> Result:
     """Return the histories with the largest change of the pressures so far, that of a step that was solved included."""
-    change = max(result.change, report.change, SMALLEST * report.stress)
+    change = max(result.change, report.change, NEAR * report.stress)
     if result.rows and (start := result.rows[0].pressure) is not None and report.extremes is not None:
         change = max(change, *(abs(now - then) for now, then in zip(report.extremes, start, strict=True)))
     return replace(result, change=change)
@@ -213,12 +212,12 @@ class Times:
         # a last interval that is a fraction of dt counts as one
         start, dt = self.start, self.interval
         done = round((t - start) / dt)
-        count = max(done + (self.end - t > 1e-9 * dt), round((self.end - start) / dt))
+        count = max(done + (self.end - t > SAME * dt), round((self.end - start) / dt))
         return [start + k * dt for k in range(done + 1, count)] + [self.end] * (count > done)
 
     def next(self, t: float) -> float:
         """Return until when a run that has been broken off after an output time may have got, s."""
-        return max([*self.after(t)[:1], t]) + 1e-9 * self.interval
+        return max([*self.after(t)[:1], t]) + SAME * self.interval
 
 
 def diffusion_time(scene: Scene, points: MaterialPoints) -> float:

@@ -21,6 +21,7 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 from mpm_dolfinx.base import _compat
 from mpm_dolfinx.base.errors import LeftGrid, StepFailed
 from mpm_dolfinx.base.report import Report
+from mpm_dolfinx.base.tolerances import SAME
 from mpm_dolfinx.base.validation import functions, instance, line
 from mpm_dolfinx.parallel.exchange import first
 from mpm_dolfinx.parallel.messages import log, warn
@@ -301,7 +302,7 @@ def _advance(simulation: Simulated, rule: StepSize, target: float, aloud: bool) 
                 raise GaveUp(why, known, report.history)
             _note(simulation, replace(known, rejected=known.rejected + 1, small=small))
             continue
-        grown = rule.grown(taken, report, result, failed=taken < 0.99 * wanted)
+        grown = rule.grown(taken, report, result, failed=taken < (1 - SAME) * wanted)
         first = 0.0 if new.stays else report.first / taken
         simulation.state = replace(new, result=grown.after(report, first))
         if not rule.by_error and grown.small > result.small:
@@ -348,7 +349,8 @@ def _row(simulation: Simulated, probes: Probes | None) -> Row:
         ends = comm.allgather((points.pressure.min(initial=np.inf), points.pressure.max(initial=-np.inf)))
         out["pressure"] = (min(e[0] for e in ends), max(e[1] for e in ends))
     if probes is not None:
-        out |= {name: getattr(probes, name)(points, comm) for name in ("displacement", "position")}
+        out["displacement"] = probes.displacement(points, comm)
+        out["position"] = probes.position(points, comm) + scene.grid.base
     if probes is not None and wet:
         out["probe_pressure"] = probe_pressures(scene, simulation.state, probes)
     if probes is not None and probes.stressed:

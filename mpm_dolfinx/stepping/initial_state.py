@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base.errors import StepFailed
 from mpm_dolfinx.base.fluid_content import mass_potential, pressure_of
 from mpm_dolfinx.base.report import Report
+from mpm_dolfinx.base.tolerances import FOREVER, ROUND_OFF
 from mpm_dolfinx.bodies.bodies import pressure_at
 from mpm_dolfinx.domains.pressure_transport import PiecePressures
 from mpm_dolfinx.forms.unknowns import Unknowns
@@ -30,7 +31,7 @@ from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.parallel.messages import log, warn
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.solve.newton import solve_substep
-from mpm_dolfinx.solve.schur import LinearSolvers
+from mpm_dolfinx.solve.schur import Kept, LinearSolvers, planned
 from mpm_dolfinx.stepping.balances import Start
 from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.state import State, Stay
@@ -42,7 +43,6 @@ DEPTH, PATIENCE, LESS = 40, 16, 0.7
 A wet bank, its law elastic or frictional, blocks on a rough base, a half held one: forces left 4e-5 to 3e-9 with 40 and
 16 and with 80 and 24, in as many iterations; with 40 and 8 up to 6e-3.
 """
-NEVER = 1e30  # s: time of a step, in which nothing has a rate
 REMARKABLE = 0.05
 """Share of the largest given stress by which the balance changes stresses, from which on a warning says so.
 
@@ -54,12 +54,14 @@ def pieces_at_start(scene: Scene, points: MaterialPoints) -> PiecePressures:
     """Return what pieces of domains carry of a field of pressure, by which cells have that of their centroids."""
     on_grid, grid, pressure = scene.on_grid(points), scene.grid, scene.initial.pressure
     cut, contents, bulk = on_grid.cut, on_grid.contents, scene.fluid.bulk
-    pi = mass_potential(cut.pieces_to_cells(pressure_at(pressure, cut.pieces.x)), bulk)  # which adds up in a cell
+    pi = mass_potential(
+        cut.pieces_to_cells(pressure_at(pressure, cut.pieces.x + grid.base)), bulk
+    )  # which adds up in a cell
     store = on_grid.weight * on_grid.data.pieces["storage"][:, 0]
     held = contents.total(cut.cells, store)
     weight = np.where(held[contents.slot(cut.cells)] > 0, store, on_grid.weight)
     mean = contents.total(cut.cells, weight * pi) / contents.total(cut.cells, weight)
-    wanted = pressure_at(pressure, grid.midpoints[contents.filled] + contents.centroid[contents.filled])
+    wanted = pressure_at(pressure, grid.base + grid.midpoints[contents.filled] + contents.centroid[contents.filled])
     pi = pi + (mass_potential(wanted, bulk) - mean)[contents.slot(cut.cells)]
     p = cut.to_pieces(pressure_of(pi, bulk))
     pieces, bounds = cut.pieces, np.stack([p, p], axis=1)
@@ -87,7 +89,8 @@ def balanced(scene: Scene, state: State) -> State:
             pressure = scene.motion.pressures(start.on_grid, state.stage, state.t)
             seeded = replace(seeded, points=replace(seeded.points, pressure=pressure))
         unknowns, best, count = start.matrices.momentum.unknowns, (np.inf, 0), 0
-        solvers, report = LinearSolvers(scene.scheme, start.matrices.momentum, None, start.matrices.symmetric), Report()
+        scheme, momentum, report = scene.scheme, start.matrices.momentum, Report()
+        solvers = LinearSolvers(planned(scheme, momentum, None, start.matrices.symmetric), scheme, momentum, None)
         seen, w, points = [], np.zeros_like(forms.u.x.array), seeded.points
         while count - best[1] < PATIENCE:
             forms.u.x.array[:] = w
@@ -101,7 +104,7 @@ def balanced(scene: Scene, state: State) -> State:
                 best = left, count, points, held, w, mechanical.reactions(start.acting[-1].sides, forms.nodal)
             if left <= scene.scheme.tolerance:
                 break
-            solve_substep(solvers, problem, None, partial(start.on_grid.as_reset, seeded), count, report)
+            solve_substep(solvers, problem, None, partial(start.on_grid.as_reset, seeded), count, report, Kept())
             if mechanical.touches:
                 _, touched = mechanical.touched(start.acting[-1].sides, unknowns, forms.u.x.array, seeded.points)
                 seeded = replace(seeded, points=touched)
@@ -157,8 +160,8 @@ def _placed(scene: Scene, start: Start, state: State) -> Start:
 def _problem(scene: Scene, start: Start, state: State) -> MomentumProblem:
     """Return the balance of momentum of points where they are, at no displacement and without any rate."""
     acting, matrices = start.acting[-1], start.matrices
-    scene.set_time(state.t, NEVER, acting.gravity)
-    scene.momentum.set_rate(NEVER, 0.0)
+    scene.set_time(state.t, FOREVER, acting.gravity)
+    scene.momentum.set_rate(FOREVER, 0.0)
     scene.momentum.u.x.array[:] = 0.0
     data = start.on_grid.data_of(state)
     return MomentumProblem(scene.momentum, matrices.momentum, data, acting.sides, scene.scheme.tolerance)
@@ -181,5 +184,5 @@ def _mixed(unknowns: Unknowns, seen: Sequence[tuple[NDArray, NDArray]]) -> NDArr
     dw, du = (np.stack([b - a for a, b in pairwise(values)]) for values in zip(*seen, strict=True))
     rows = du[:, owned]
     sums = over_all(unknowns.comm, np.column_stack([rows @ rows.T, rows @ u[owned]]))
-    share = np.linalg.lstsq(sums[:, :-1], sums[:, -1], rcond=1e-14)[0]
+    share = np.linalg.lstsq(sums[:, :-1], sums[:, -1], rcond=ROUND_OFF)[0]
     return w + u - share @ (dw + du)

@@ -15,12 +15,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import solve_banded
 
+from mpm_dolfinx.base.tolerances import SAME
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.materials.evaluate import LawAtPoints
 from mpm_dolfinx.materials.skeleton import Skeleton
 
 State = dict[str, NDArray[np.float64]]
-NUDGE, NEAR, MOST = 1e-7, 1e-10, 60  # of stretches; relative residual; iterations
+CLOSE, MOST = 1e-10, 60  # relative residual; iterations
 
 
 class _Rings:
@@ -30,7 +31,7 @@ class _Rings:
         law = type(material)
         values = {name: np.asarray(getattr(material, name), dtype=float) for name in law.parameters}
         start = {name: np.asarray(v, dtype=float) for name, v in (dict(law.state) | dict(state or {})).items()}
-        grid = Grid([1.0] * 3, [2] * 3, comm=MPI.COMM_SELF)
+        grid = Grid([0] * 3, [1.0] * 3, [2] * 3, comm=MPI.COMM_SELF)
         self._law = LawAtPoints(grid, law, {name: v.shape for name, v in (values | start).items()})
         self._values, self.start = _tiled(values, count), _tiled(start, count)
 
@@ -48,10 +49,10 @@ class _Rings:
 
     def nominal(self, stretches: NDArray[np.float64], state: State) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the nominal stresses (n, 2), Pa, and their derivatives by the stretches (n, 2, 2)."""
-        nudges = NUDGE * np.array([[0, 0], [1, 0], [0, 1]])
+        nudges = SAME * np.array([[0, 0], [1, 0], [0, 1]])
         near = (stretches + nudges[:, None, :]).reshape(-1, 2)
         P = (self.kirchhoff(near, state, len(nudges)) / near).reshape(len(nudges), -1, 2)
-        return P[0], (P[1:] - P[0]).transpose(1, 2, 0) / NUDGE
+        return P[0], (P[1:] - P[0]).transpose(1, 2, 0) / SAME
 
     def updated(self, stretches: NDArray[np.float64], state: State) -> State:
         """Return the state at the end of a step."""
@@ -89,7 +90,7 @@ class Cavity:
             force[-1] += self.far * r[-1]  # the pressure follows the surface
             scale = np.abs(forces).max() + self.far * r[-1]
             force[0] = 0.0
-            if np.abs(force).max() < NEAR * scale:
+            if np.abs(force).max() < CLOSE * scale:
                 state = self.rings.updated(_stretches(self.R, r), self.state)
                 return replace(self, r=r, state=state, pressure=inside / r[0])
             K = np.einsum("ase,est,bte->eab", B, D, B) * weight[:, None, None]

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.base.errors import NotConverged
+from mpm_dolfinx.base.tolerances import CENTRAL, FOREVER, ROUND_OFF, TINY
 from mpm_dolfinx.base.validation import instance, numbers, whole
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.materials.evaluate import LawAtPoints
@@ -21,8 +22,7 @@ from mpm_dolfinx.materials.skeleton import Skeleton
 
 KINDS = ("isotropic", "oedometer", "triaxial drained", "triaxial undrained", "shear drained", "shear undrained")
 AXIAL, LATERAL, SHEAR = (2, 2), ((0, 0), (1, 1)), (0, 1)
-LONG = 1e30  # s: in which nothing is left of a viscosity
-ITERATIONS, CUTS, NEAR, NUDGE = 30, 12, 1e-11, 1e-6  # of Newton's method; relative accuracy; difference of stretches
+ITERATIONS, CUTS, CLOSE = 30, 12, 1e-11  # of Newton's method; relative accuracy
 
 
 @dataclass(frozen=True)
@@ -171,7 +171,7 @@ class _Point:
         self._parameters = {name: np.asarray(getattr(material, name), dtype=float) for name in law.parameters}
         self._rest = {name: np.asarray(value, dtype=float) for name, value in law.state.items()}
         shapes = {name: value.shape for name, value in (self._parameters | self._rest).items()}
-        self._law = LawAtPoints(Grid([1.0] * 3, [2] * 3, comm=MPI.COMM_SELF), law, shapes, cell_size)
+        self._law = LawAtPoints(Grid([0] * 3, [1.0] * 3, [2] * 3, comm=MPI.COMM_SELF), law, shapes, cell_size)
         self._bulk = float(material.bulk)
 
     def _data(self, F: NDArray[np.float64], state: dict[str, NDArray[np.float64]]):
@@ -200,7 +200,7 @@ class _Point:
         first = -np.trace(at.stress) / 3
         for share in np.linspace(0, 1, 21)[1:]:
             goal = -(first + share * (confinement - first)) * np.ones(3)
-            at = self._balanced(at, at.F, [(0, 0), (1, 1), (2, 2)], goal, 0.0, LONG)
+            at = self._balanced(at, at.F, [(0, 0), (1, 1), (2, 2)], goal, 0.0, FOREVER)
         return at
 
     def moved(self, at: _At, test: str, start: _At, strain: float) -> _At:
@@ -243,8 +243,8 @@ class _Point:
         F, rows, columns = F.copy(), *np.array(free).T
         nudges = np.zeros((1 + 2 * len(free), 3, 3))
         for k, (i, j) in enumerate(free):
-            nudges[1 + 2 * k, i, j], nudges[2 + 2 * k, i, j] = NUDGE, -NUDGE
-        near = NEAR * np.abs(goal).max() + 1e-14 * self._bulk  # the second is round-off
+            nudges[1 + 2 * k, i, j], nudges[2 + 2 * k, i, j] = CENTRAL, -CENTRAL
+        near = CLOSE * np.abs(goal).max() + ROUND_OFF * self._bulk  # the second is round-off
         for _ in range(ITERATIONS):
             found = self._stress(F + nudges, at.state, dt)[:, rows, columns]
             error = found[0] - goal
@@ -252,7 +252,7 @@ class _Point:
                 break
             if np.abs(error).max() <= near:
                 return self._updated(F, strain, at, dt)
-            slope = (found[1::2] - found[2::2]).T / (2 * NUDGE)
-            step = np.linalg.lstsq(slope, error, rcond=1e-14)[0]
-            F[rows, columns] -= step * min(1.0, 0.2 / np.abs(step).max(initial=1e-300))
+            slope = (found[1::2] - found[2::2]).T / (2 * CENTRAL)
+            step = np.linalg.lstsq(slope, error, rcond=ROUND_OFF)[0]
+            F[rows, columns] -= step * min(1.0, 0.2 / np.abs(step).max(initial=TINY))
         raise NotConverged(f"element test: no stretch gives the lateral stress at a strain of {strain:g}")

@@ -18,6 +18,8 @@ from scipy.integrate import solve_bvp
 from scipy.optimize import brentq
 from scipy.special import ellipe, ellipeinc, ellipkinc, ellipkm1, erf, erfc, erfcx, lambertw
 
+from mpm_dolfinx.base.tolerances import EPSILON, ROUND_OFF, TINY
+
 SWITCH = 0.02  # reduced time below which the closed form for short times is taken
 TERMS = 20  # exponentials above it: the last is below exp(-70)
 Array = NDArray[np.float64]
@@ -228,7 +230,7 @@ def _cryer_long(mu: float, T: Array) -> Array:
     def zero(x):  # (1 - x²/mu) tan(x) = x
         return x * np.cos(x) - (1 - x**2 / mu) * np.sin(x)
 
-    r = np.array([brentq(zero, max(n * np.pi, 0.1), (n + 1) * np.pi, xtol=1e-14) for n in range(TERMS)])
+    r = np.array([brentq(zero, max(n * np.pi, 0.1), (n + 1) * np.pi, xtol=ROUND_OFF) for n in range(TERMS)])
     return _series(2 * (np.sin(r) - r) / ((2 - mu) * np.sin(r) + r * np.cos(r)), r, T)
 
 
@@ -299,7 +301,7 @@ def elastica_tip(load_parameter: float) -> tuple[float, float]:
         m1, theta = angles(q)
         return ellipkm1(m1) - ellipkinc(theta, 1 - m1) - root
 
-    m1, theta = angles(q := brentq(excess, 0, 650, xtol=1e-300, rtol=1e-15))
+    m1, theta = angles(q := brentq(excess, 0, 650, xtol=TINY, rtol=4 * EPSILON))
     v = 1 - 2 / root * (ellipe(1 - m1) - ellipeinc(theta, 1 - m1))
     return float(1 - np.sqrt(-2 * np.expm1(-q)) / root), float(v)
 

@@ -1,0 +1,298 @@
+# SPDX-License-Identifier: MIT
+"""Measures of the package's house, counted over its syntax trees: `python -m tests.house` prints them.
+
+A number is *structure* where it can be no other: all that is written below as `structure`.  It is *sourced* where a
+comment beside it, or the string below it, names one of two things:
+
+    Source: an equation, a paper (with its year), a definition, a format, or an exact bound, see `SOURCE`;
+    Plateau (scene): halved a, doubled b, cells c.
+
+The latter are relative changes of the scene's answer: with half and twice the number, and with half the cells.  The
+first two have to be below the third, and `python -m tests.plateaus` measures them again.  All else is *ad hoc*.
+"""
+
+import ast
+import re
+import sys
+from functools import cache, cached_property
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1] / "mpm_dolfinx"
+SOURCE = re.compile(
+    r"\bSource: .*?(\b(1[89]|20)\d\d\b|\beq\. |\bequation\b|\bdefinition\b|\bformat\b|\bexact\b|\bepsilon\b|\bIEEE\b)",
+    re.DOTALL,
+)
+PLATEAU = re.compile(r"\bPlateau \((\w+)\): halved ([\d.e+-]+), doubled ([\d.e+-]+), cells ([\d.e+-]*[\d])")
+UNITS = {10, 60, 90, 100, 180, 360, 1000, 1e6, 1024, 86400}
+"""Per cent, degrees, and the like; as factors 10 and 60 are none, see `inline`."""
+CONDITIONS = ("Traction", "Pressure", "Displacement", "RigidPlate", "Drained", "Inflow", "OnSide", "Tool", "Contact")
+
+
+class Module:
+    """One file: its name, its lines and its tree."""
+
+    def __init__(self, path: Path):
+        self.path, self.text = path, path.read_text()
+        self.tree, self.lines = ast.parse(self.text), self.text.splitlines()
+        self.where = str(path.relative_to(ROOT))
+        self.name = ".".join([ROOT.name, *path.relative_to(ROOT).with_suffix("").parts]).removesuffix(".__init__")
+
+    @cached_property
+    def nodes(self) -> list[ast.AST]:
+        return list(ast.walk(self.tree))
+
+    @cached_property
+    def used(self) -> set[str]:
+        """Names that stand in the code, but those that are only imported."""
+        return {n.id for n in self.nodes if isinstance(n, ast.Name)} | {
+            n.name for n in self.nodes if isinstance(n, ast.ClassDef)
+        }
+
+    def beside(self, node: ast.stmt) -> str:
+        """Return what is said of a statement: comments on its lines and above it, and the string below it."""
+        first, last = node.lineno - 1, node.end_lineno
+        said = [line.partition("#")[2] for line in self.lines[first:last]]
+        while first > 0 and self.lines[first - 1].lstrip().startswith("#"):
+            first -= 1
+            said.insert(0, self.lines[first].lstrip(" #"))
+        body = self.tree.body
+        after = body[body.index(node) + 1 :][:1] if node in body else []
+        if after and isinstance(after[0], ast.Expr) and isinstance(after[0].value, ast.Constant):
+            said.append(str(after[0].value.value))
+        return " ".join(" ".join(said).split())
+
+
+@cache
+def modules() -> tuple[Module, ...]:
+    return tuple(Module(path) for path in sorted(ROOT.rglob("*.py")))
+
+
+def literals(node: ast.AST):
+    """Yield the numbers written in an expression, no truth values among them."""
+    return (m for m in ast.walk(node) if isinstance(m, ast.Constant) and type(m.value) in (int, float))
+
+
+def power_of_two(node: ast.AST) -> bool:
+    """Return whether an expression is 2**k or 1 << k, maybe less one: sizes of chunks and of numbers' formats."""
+    if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Sub):
+        return power_of_two(node.left)
+    return isinstance(node, ast.BinOp) and isinstance(node.op, ast.Pow | ast.LShift) and integers(node)
+
+
+def integers(node: ast.AST) -> bool:
+    return all(type(m.value) is int and not (isinstance(m.value, bool)) for m in literals(node))
+
+
+def table(node: ast.AST) -> bool:
+    """Return whether an expression is a table of indices or of names: a nest of integers, of more than one level."""
+    inner = [m for m in ast.walk(node) if m is not node and isinstance(m, ast.Tuple | ast.List | ast.Dict | ast.Set)]
+    rows = isinstance(node, ast.Tuple | ast.List) and len(node.elts) > 1
+    names = any(isinstance(m, ast.Constant) and isinstance(m.value, str) for m in ast.walk(node))
+    return integers(node) and (bool(inner) or rows or names)
+
+
+def pairs(node: ast.Assign):
+    """Yield (name, value) of an assignment to names, also of several at once."""
+    for target in node.targets:
+        if isinstance(target, ast.Tuple) and isinstance(node.value, ast.Tuple):
+            yield from ((a.id, b) for a, b in zip(target.elts, node.value.elts, strict=True) if isinstance(a, ast.Name))
+        elif isinstance(target, ast.Name):
+            yield target.id, node.value
+
+
+def structure(value: ast.AST) -> bool:
+    """Return whether the numbers of a value at module level are structure."""
+    written = [m.value for m in literals(value)]
+    harmless = all(v in (0, 1) for v in written)  # `not x[0]`, slices
+    code = any(isinstance(m, ast.Lambda | ast.comprehension | ast.JoinedStr | ast.Subscript) for m in ast.walk(value))
+    return not written or harmless or code or power_of_two(value) or table(value)
+
+
+def named():
+    """Yield (where, name, what is said) of all numbers in capitals that are no structure."""
+    for module in modules():
+        for node in module.tree.body:
+            if isinstance(node, ast.AnnAssign) and node.value is not None:
+                found = [(node.target.id, node.value)] if isinstance(node.target, ast.Name) else []
+            else:
+                found = list(pairs(node)) if isinstance(node, ast.Assign) else []
+            for name, value in found:
+                if name.lstrip("_").isupper() and not structure(value):
+                    yield f"{module.where}:{node.lineno}", name, module.beside(node)
+
+
+def plateau(said: str):
+    """Return (scene, halved, doubled, cells) of what is said of a number, None where it names no plateau."""
+    found = PLATEAU.search(said)
+    return found and (found[1], *map(float, found.groups()[1:]))
+
+
+def sourced(said: str) -> bool:
+    """Return whether what is said of a number names its source, or a plateau on which it moves less than the cells."""
+    flat = plateau(said)
+    return bool(SOURCE.search(said)) or bool(flat and max(flat[1:3]) < flat[3])
+
+
+def ad_hoc() -> list[str]:
+    return [f"{where} {name}" for where, name, said in named() if not sourced(said)]
+
+
+def inline() -> list[str]:
+    """Return the numbers in functions that are rules: no small fractions, no units, no defaults that callers choose."""
+    out = []
+    for module in modules():
+        within = [n for n in module.nodes if isinstance(n, ast.FunctionDef | ast.Lambda)]
+        chosen = {m for f in within for d in [*f.args.defaults, *f.args.kw_defaults] if d for m in literals(d)}
+        checks = {m for n in module.nodes if isinstance(n, ast.Compare) and len(n.ops) > 1 for m in literals(n)}
+        texts = {m for n in module.nodes if isinstance(n, ast.JoinedStr) for m in literals(n)}
+        for number in {m for f in within for m in literals(f)} - chosen - checks - texts:
+            v, line = abs(number.value), module.lines[number.lineno - 1]
+            whole = type(number.value) is int
+            rule = v not in UNITS and (v > 100 if whole else (v * 8 % 1 != 0 or v > 8))
+            if rule and not SOURCE.search(line):
+                out.append(f"{module.where}:{number.lineno} {number.value}")
+    return sorted(set(out))
+
+
+def imports() -> dict[str, set[str]]:
+    """Return the modules of the package that each module imports."""
+    names = {module.name for module in modules()}
+    out: dict[str, set[str]] = {name: set() for name in names}
+    for module in modules():
+        for node in module.nodes:
+            if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith(ROOT.name):
+                inner = {f"{node.module}.{alias.name}" for alias in node.names} & names
+                out[module.name] |= inner or {node.module}
+    return out
+
+
+def folders() -> dict[str, set[str]]:
+    """Return the folders that each folder imports from."""
+    out: dict[str, set[str]] = {}
+    rooms = {path.name for path in ROOT.iterdir() if path.is_dir()}
+    for name, found in imports().items():
+        own = [*name.split("."), ""][1]
+        if own in rooms:
+            out.setdefault(own, set()).update({other.split(".")[1] for other in found} & rooms - {own})
+    return out
+
+
+def cycles(graph: dict[str, set[str]]) -> list[str]:
+    """Return the nodes of a circle, none where there is no circle."""
+    try:
+        tuple(TopologicalSorter(graph).static_order())
+    except CycleError as error:
+        return error.args[1]
+    return []
+
+
+def parameters() -> list[tuple[int, str]]:
+    """Return (number of parameters, function), the most first, of all functions and of fields of data classes."""
+    out = []
+    for module in modules():
+        for node in module.nodes:
+            if isinstance(node, ast.FunctionDef):
+                a = node.args
+                count = sum(arg.arg != "self" for arg in [*a.posonlyargs, *a.args, *a.kwonlyargs])
+                out.append((count, f"{module.where}:{node.lineno} {node.name}"))
+    return sorted(out, reverse=True)
+
+
+def packed() -> list[str]:
+    """Return the assignments of three and more values to as many names in one statement."""
+    found = []
+    for module in modules():
+        for node in module.nodes:
+            if isinstance(node, ast.Assign) and isinstance(node.value, ast.Tuple):
+                if any(isinstance(t, ast.Tuple) and len(t.elts) > 2 for t in node.targets):
+                    found.append(f"{module.where}:{node.lineno}")
+    return found
+
+
+def _slot(index: ast.AST) -> bool:
+    """Return whether a subscript is [0], [()] or [:], by which a container stands for an attribute."""
+    whole = isinstance(index, ast.Slice) and index.lower is index.upper is index.step is None
+    empty = isinstance(index, ast.Tuple) and not index.elts
+    return whole or empty or (isinstance(index, ast.Constant) and index.value == 0)
+
+
+def hidden() -> list[str]:
+    """Return where a method changes what its object holds without setting an attribute, or a function a global.
+
+    self.x[0] += 1, self.x[:] = y, self.x[()] = y; self._x.append, clear, update, pop and add outside of __init__;
+    `global`; attributes of functions; names of a module's own lists and dictionaries whose entries are set.
+    """
+    out = []
+    for module in modules():
+        functions = {n.name for n in module.nodes if isinstance(n, ast.FunctionDef)}
+        for method in (n for n in module.nodes if isinstance(n, ast.FunctionDef) and n.name != "__init__"):
+            for node in ast.walk(method):
+                if _changes(node, functions):
+                    out.append(f"{module.where}:{node.lineno} {ast.unparse(node).splitlines()[0]}")
+    return sorted(set(out))
+
+
+def _of_self(node: ast.AST) -> bool:
+    return isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "self"
+
+
+def _changes(node: ast.AST, functions: set[str]) -> bool:
+    if isinstance(node, ast.Global):
+        return True
+    for target in getattr(node, "targets", [getattr(node, "target", None)]):
+        if isinstance(target, ast.Subscript) and _of_self(target.value) and _slot(target.slice):
+            return isinstance(node, ast.Assign | ast.AugAssign)
+        if isinstance(target, ast.Attribute) and isinstance(target.value, ast.Name) and target.value.id in functions:
+            return isinstance(node, ast.Assign | ast.AugAssign)
+    if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and _of_self(node.func.value):
+        private = node.func.value.attr.startswith("_")
+        return private and node.func.attr in ("append", "clear", "extend", "pop", "setdefault", "insert")
+    return False
+
+
+def rooms(name: str) -> list[str]:
+    """Return the modules in which the name of a class stands, but those that only export it."""
+    return [m.where for m in modules() if m.path.name != "__init__.py" and name in m.used]
+
+
+def lines() -> int:
+    return sum(len(module.lines) for module in modules())
+
+
+def measures() -> dict[str, float]:
+    """Return all measures by their names."""
+    size: dict[Path, int] = {}
+    for module in modules():
+        size[module.path.parent] = size.get(module.path.parent, 0) + 1
+    arrows = imports()
+    return {
+        "ad hoc named numbers": len(ad_hoc()),
+        "rules among numbers in functions": len(inline()),
+        "lines of the package": lines(),
+        "imports a file, mean": round(sum(map(len, arrows.values())) / len(arrows), 2),
+        "files in a circle of imports": len(cycles(arrows)),
+        "folders in a circle of imports": len(cycles(folders())),
+        "files of the largest folder": max(size.values()),
+        "parameters of the longest list": parameters()[0][0],
+        "assignments of three and more values": len(packed()),
+        "changes of hidden state": len(hidden()),
+        "files that name a condition's class, most": max(len(rooms(name)) for name in CONDITIONS),
+    }
+
+
+def main(arguments: list[str]) -> None:
+    """Print the measures, and with --list what they count."""
+    for name, value in measures().items():
+        print(f"{value:9g}  {name}")
+    if "--list" in arguments:
+        every = {"ad hoc": ad_hoc(), "inline": inline(), "hidden": hidden(), "packed": packed()}
+        every["sourced"] = [f"{where} {name}: {said}" for where, name, said in named() if sourced(said)]
+        every["parameters"] = [f"{n} {what}" for n, what in parameters()[:10]]
+        every["conditions"] = [f"{name}: {', '.join(rooms(name))}" for name in CONDITIONS]
+        for title, found in every.items():
+            print(f"\n{title} ({len(found)})", *found, sep="\n    ")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

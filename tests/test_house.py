@@ -1,0 +1,47 @@
+# SPDX-License-Identifier: MIT
+"""Measures of the package's house only fall: each has a ceiling, that is lowered with what it counts."""
+
+import house
+import pytest
+
+CEILINGS = {
+    "ad hoc named numbers": 222,
+    "rules among numbers in functions": 102,
+    "imports a file, mean": 5.06,
+    "files in a circle of imports": 0,
+    "folders in a circle of imports": 0,
+    "files of the largest folder": 14,
+    "parameters of the longest list": 22,
+    "assignments of three and more values": 209,
+    "changes of hidden state": 55,
+    "files that name a condition's class, most": 7,
+    "lines of the package": 26348,
+}
+
+
+@pytest.fixture(scope="module")
+def measures():
+    return house.measures()
+
+
+@pytest.mark.parametrize("name", CEILINGS)
+def test_measure_is_not_above_its_ceiling(measures, name):
+    assert measures[name] <= CEILINGS[name]
+
+
+def test_every_measure_has_a_ceiling(measures):
+    assert set(measures) == set(CEILINGS)
+
+
+@pytest.mark.parametrize(
+    ("said", "holds"),
+    [
+        ("Half of a cell.", False),
+        ("Source: it works well", False),
+        ("Source: Higham (2002), eq. 3.4.", True),
+        ("Plateau (bank): halved 1e-5, doubled 2e-5, cells 3e-3.", True),
+        ("Plateau (bank): halved 1e-5, doubled 4e-3, cells 3e-3.", False),
+    ],
+)
+def test_number_has_a_source_or_moves_less_than_the_cells(said, holds):
+    assert house.sourced(said) is holds
