@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -23,20 +23,22 @@ class Rough(Protocol):
     grips: bool
 
 
-def pressure_name(kind: str, number: int) -> str:
-    """Return the name under which points have the pressure (n,), Pa, of a "tool" or "contact" on their faces."""
-    return f"{kind}_{number}_pressure"
+def pressure_name(name: str) -> str:
+    """Return the name under which points have the pressure (n,), Pa, of a tool or contact on their faces."""
+    return f"{name}_pressure"
 
 
-def shear_name(kind: str, number: int) -> str:
-    """Return the name under which points keep the shear traction (n, d), Pa, of a "tool" or "contact"."""
-    return f"{kind}_{number}_shear"
+def shear_name(name: str) -> str:
+    """Return the name under which points keep the shear traction (n, d), Pa, of a tool or contact."""
+    return f"{name}_shear"
 
 
-def kept(kind: str, contacts: Sequence[Rough], n: int, dim: int) -> dict[str, NDArray[np.float64]]:
-    """Return what n points keep of the contacts, zero: pressures (n,) and, of what resists slip, tractions (n, d)."""
-    out = {pressure_name(kind, i): np.zeros(n) for i in range(len(contacts))}
-    return out | {shear_name(kind, i): np.zeros((n, dim)) for i, contact in enumerate(contacts) if contact.grips}
+def kept(contacts: Mapping[str, Rough], n: int, dim: int) -> dict[str, dict[str, NDArray[np.float64]]]:
+    """Return what n points keep of each contact, zero: pressures (n,) and, of what resists slip, tractions (n, d)."""
+    return {
+        name: {pressure_name(name): np.zeros(n), **({shear_name(name): np.zeros((n, dim))} if contact.grips else {})}
+        for name, contact in contacts.items()
+    }
 
 
 def let_go(points: MaterialPoints, names: Iterable[str]) -> MaterialPoints:
@@ -68,17 +70,17 @@ class Origin:
     area: NDArray[np.float64]
 
     def means(
-        self, kind: str, contacts: Sequence[Rough], points: MaterialPoints, push: NDArray, shear: NDArray
+        self, contacts: Mapping[str, Rough], points: MaterialPoints, push: NDArray, shear: NDArray
     ) -> MaterialPoints:
         """Return the points with the means of the pressures (m,) and shear tractions (m, d), Pa, of their pairs."""
         push, shear, data, n = self.travel.back(push), self.travel.back(shear), dict(points.data), len(points)
-        for number, contact in enumerate(contacts):
+        for number, (name, contact) in enumerate(contacts.items()):
             rows = np.flatnonzero(self.number == number)
             at, area = self.point[rows], self.area[rows]
             whole = sum_by(at, area, n)
             whole[whole == 0] = 1.0
             means = [sum_by(at, area * column, n) / whole for column in (push[rows], *shear[rows].T)]
-            data[pressure_name(kind, number)] = means[0]
+            data[pressure_name(name)] = means[0]
             if contact.grips:
-                data[shear_name(kind, number)] = np.stack(means[1:], axis=1)
+                data[shear_name(name)] = np.stack(means[1:], axis=1)
         return replace(points, data=data)

@@ -104,14 +104,14 @@ class ContactLaw:
 
     Parameters
     ----------
-    contacts
+    names, contacts
         The contacts.
     pairs
         What may touch.
     """
 
-    def __init__(self, contacts: Sequence[Rough], pairs: Pairs):
-        self.grid, self.contacts, self.pairs = pairs.grid, contacts, pairs
+    def __init__(self, names: Sequence[str], contacts: Sequence[Rough], pairs: Pairs):
+        self.grid, self.names, self.contacts, self.pairs = pairs.grid, names, contacts, pairs
         key, self.of = np.unique(pairs.number * self.grid.num_local + pairs.cell, return_inverse=True)
         self.key = key
         """Contact and cell (k,) of the conditions, in one number."""

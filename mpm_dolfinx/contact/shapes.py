@@ -206,17 +206,17 @@ class Cone:
         Its tip.
     axis : (d,)
         Direction from the tip into the tool; of any length.
-    angle
+    angle_deg
         Between axis and flank, degrees, in (0, 90): 30 of a CPT's cone.
     """
 
     tip: ArrayLike
     axis: ArrayLike
-    angle: float
+    angle_deg: float
 
     def __post_init__(self):
         numbers("Cone: tip", self.tip, self._axis.shape, allowed=f"{len(self._axis)} finite coordinates")
-        numbers("Cone: angle", self.angle, test=lambda a: (a > 0) & (a < 90), allowed="in (0, 90) degrees")
+        numbers("Cone: angle_deg", self.angle_deg, test=lambda a: (a > 0) & (a < 90), allowed="in (0, 90) degrees")
 
     @cached_property
     def _axis(self) -> NDArray[np.float64]:
@@ -235,12 +235,12 @@ class Cone:
     def distance(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the signed distances (m,), m, from the flank."""
         z, r, _, _ = self._polar(y)
-        beta = np.radians(self.angle)
+        beta = np.radians(self.angle_deg)
         return r * np.cos(beta) - z * np.sin(beta)
 
     def normal(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the gradients (m, d) of the distance."""
-        beta = np.radians(self.angle)
+        beta = np.radians(self.angle_deg)
         return self._polar(y)[2] * np.cos(beta) - self._axis * np.sin(beta)
 
     def curvature(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -250,7 +250,7 @@ class Cone:
             return _flat(y)
         near_axis = r[:, None, None] <= 1e-6 * np.abs(y - self.tip).max(initial=0.0)
         along = self._axis[:, None] * self._axis / np.where(near_axis, np.inf, r[:, None, None])
-        return np.where(near_axis, 0.0, second - along) * np.cos(np.radians(self.angle))
+        return np.where(near_axis, 0.0, second - along) * np.cos(np.radians(self.angle_deg))
 
     def moved(self, by: NDArray[np.float64]) -> Cone:
         """Return the shape moved by a vector (d,), m."""

@@ -32,8 +32,8 @@ def check_held(
     free : (nodes, d)
         Components that no wall holds.
     holds
-        Cells (m,), lexicographic ones of the other part (m,) or None, positions (m, d) and directions (m, d) in which
-        sides have given displacements, touch tools, or touch the other part: what is held holds the other one.
+        Cells (m,), lexicographic ones of other parts (m,) or None, positions (m, d) and directions (m, d) in which
+        sides have given displacements, touch tools, or other parts: what is held holds the other one.
     each
         Look at each part that hangs together, not only at all of them.
 
@@ -51,14 +51,13 @@ def check_held(
     number = part[cells[first[row] // 2**grid.dim]]  # of any cell at the node: they hang together
     against = np.zeros(len(number), dtype=np.int64)
     for cell, other, place, along in holds:
-        if other is None:
-            number, against = np.concatenate([number, part[cell]]), np.concatenate([against, np.zeros(len(cell), int)])
-            x, direction = np.concatenate([x, place]), np.concatenate([direction, along])
-            continue
-        travel = Exchange(grid.comm, grid.owner(other))
-        both = part[cell], travel.back(part[grid.local(travel.send(other))])
-        number, against = (np.concatenate([a, *b]) for a, b in ((number, both), (against, both[::-1])))
-        x, direction = np.concatenate([x, place, place]), np.concatenate([direction, along, along])
+        both, twice = [part[cell]], 1
+        if other is not None:
+            travel, twice = Exchange(grid.comm, grid.owner(other)), 2
+            both.append(travel.back(part[grid.local(travel.send(other))]))
+        number = np.concatenate([number, *both])
+        against = np.concatenate([against, *(both[::-1] if twice == 2 else [np.zeros(len(cell), dtype=np.int64)])])
+        x, direction = np.concatenate([x, *[place] * twice]), np.concatenate([direction, *[along] * twice])
     x = (x - centre[number - 1]) / size[number - 1, None]  # else a small part far from the origin would not turn
     modes = list(direction.T)
     modes += [direction[:, a] * x[:, b] - direction[:, b] * x[:, a] for a in range(grid.dim) for b in range(a)]
