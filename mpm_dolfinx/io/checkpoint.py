@@ -22,7 +22,7 @@ from mpm_dolfinx.base.histories import COLUMNS, Rows
 from mpm_dolfinx.base.validation import instance, line, numbers, on_disk, path, whole
 from mpm_dolfinx.conditions.acting import Outcome
 from mpm_dolfinx.contact.groups import Contact
-from mpm_dolfinx.contact.tools import Tool
+from mpm_dolfinx.contact.tool import Tool
 from mpm_dolfinx.domains.pressure_transport import PiecePressures
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.io.writer import WRITABLE, replacing
