@@ -32,7 +32,7 @@ from mpm_dolfinx.conditions.sides import Sides
 from mpm_dolfinx.conditions.unit_weights import with_weight
 from mpm_dolfinx.contact.acting import ContactsOfStage, ToolsOfStage
 from mpm_dolfinx.contact.groups import Contact
-from mpm_dolfinx.contact.tools import Tool
+from mpm_dolfinx.contact.tool import Tool
 from mpm_dolfinx.domains.lattice import Lattice, lattices
 from mpm_dolfinx.flow.hydraulic_boundary import HydraulicBoundary
 from mpm_dolfinx.grid.grid import SIDES, Grid
