@@ -27,8 +27,9 @@ def weight(s):
 
 def off(s, load=0.0, axes=slice(None)):
     """Return what is left of the sum of all forces on the bodies, over the largest of them."""
-    d, tools = s.grid.dim, sum(isinstance(one, mpm.Tool) for one in s.conditions)
-    forces = [*s.wall_reactions.values(), *s.reactions.values(), *s.tool_forces.array[:tools, ..., :d], weight(s)]
+    d, tools = s.grid.dim, s.state.stage.of(mpm.Tool)
+    pressed = [s.tool_forces[name][:d] for name in tools]
+    forces = [*s.wall_reactions.values(), *s.reactions.values(), *pressed, weight(s)]
     forces = np.array([*forces, np.broadcast_to(load, d)])
     return np.abs(forces.sum(axis=0)[axes]).max() / np.abs(forces).max()
 

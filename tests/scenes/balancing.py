@@ -144,8 +144,8 @@ class Ledger:
         down = np.zeros(d)
         down[-1] = -scene.gravity
         parts["weight"] = _mass(built, self._before) * down
-        parts["reactions"] = s.reactions.array.sum(axis=0)
-        parts["tools"] = s.tool_forces.array[: len(scene.tools), :d].sum(axis=0)
+        parts["reactions"] = s.reactions.array.reshape(-1, d).sum(axis=0)
+        parts["tools"] = s.tool_forces.array.reshape(-1, 3 * d - 3)[: len(scene.tools), :d].sum(axis=0)
         parts["walls"] = sum(s.wall_reactions.values())
         parts["held at rest"] = self._held  # of which the log has told
         total = np.abs(sum(parts.values())[int(scene.axisymmetric) :]).max()

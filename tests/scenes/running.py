@@ -331,13 +331,15 @@ def shown(built: Built) -> Shown:
     }
     if scene.fluid is not None:
         fields["pressure"] = points.pressure[own] / frame.stress
-    fields["reactions"] = frame.vector_back(s.reactions.array[built.own("displacements")] / frame.force(scene))
+    fields["reactions"] = frame.vector_back(
+        s.reactions.array.reshape(-1, d)[built.own("displacements")] / frame.force(scene)
+    )
     drained = len(built.numbers["drained"])
     rows = [*built.own("drained"), *(drained + i for i in built.own("inflows"))]
     fields["outflows"] = s.outflows.array[rows] / frame.flow(scene)
     tools = len(built.numbers["tools"])
     rows = [*built.own("tools"), *(tools + i for i in built.own("contacts"))]
-    fields["tools"] = frame.vector_back(s.tool_forces.array[rows, :d] / frame.force(scene))
+    fields["tools"] = frame.vector_back(s.tool_forces.array.reshape(-1, 3 * d - 3)[rows, :d] / frame.force(scene))
     fields["travel"] = s.tool_travel.array[built.own("tools")] / frame.length
     return Shown(frame.place_back(places, scene), fields, s.result.steps)
 
