@@ -62,8 +62,8 @@ from mpm_dolfinx.probing.point_fields import PointFields
 from mpm_dolfinx.probing.probes import Probes, probes
 from mpm_dolfinx.simulation.simulation import Simulation
 from mpm_dolfinx.simulation.strength_reduction import Safety, factor_of_safety
+from mpm_dolfinx.solve.numerics import Numerics
 from mpm_dolfinx.solve.scheme import COUPLINGS, Scheme
-from mpm_dolfinx.stepping.numerics import Numerics
 from mpm_dolfinx.stepping.result import GaveUp, Result
 from mpm_dolfinx.stepping.state import State
 from mpm_dolfinx.stepping.tangent import Tangent

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Tools, and contacts of groups of bodies, as conditions that act on the momentum: see `conditions.acting`."""
+"""Tools, and contacts of groups of bodies, as conditions that act on the momentum: see `acting.Acting`."""
 
 from __future__ import annotations
 

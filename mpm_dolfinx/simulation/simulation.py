@@ -28,9 +28,9 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.probing.cell_fields import CellFields, cell_fields
 from mpm_dolfinx.probing.point_fields import PointFields, point_fields
 from mpm_dolfinx.simulation.timeloop import run
+from mpm_dolfinx.solve.numerics import DEFAULT, Numerics
 from mpm_dolfinx.stepping import summary
 from mpm_dolfinx.stepping.initial_state import balanced
-from mpm_dolfinx.stepping.numerics import DEFAULT, Numerics
 from mpm_dolfinx.stepping.result import Result
 from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.stage import Condition, checked

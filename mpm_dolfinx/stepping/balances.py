@@ -11,6 +11,7 @@ from mpi4py import MPI
 import numpy as np
 from numpy.typing import NDArray
 
+from mpm_dolfinx.base.time_integration import Substep
 from mpm_dolfinx.conditions.acting import QUANTITIES, At, Loads, Outcome
 from mpm_dolfinx.flow.storage import Rates, StorageProblem
 from mpm_dolfinx.mechanics.momentum import MomentumProblem
@@ -20,7 +21,6 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.stepping.on_grid import Assembled, OnGrid
 from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.state import State
-from mpm_dolfinx.stepping.time_integration import Substep
 
 
 class Acting(NamedTuple):
