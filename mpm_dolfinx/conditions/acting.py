@@ -255,8 +255,12 @@ class Acting:
 
     conditions: ClassVar[tuple[type, ...]] = ()
     """Classes of conditions of this kind."""
+    title: ClassVar[str] = "conditions of the user's own"
+    """What they are called where a scene lists what it has."""
     symmetric: bool = True
     """Whether the tangent is symmetric."""
+    linear: bool = True
+    """Whether the tangent is the same at all displacements."""
     surfaces: Sequence[Surface] = ()
     """Faces on which they act; found together, these are cut once."""
     held: Sequence[tuple[Any, Surface, Sequence[int]]] = ()

@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import Any, TypeVar
 
 from mpi4py import MPI
 
@@ -19,6 +20,7 @@ WEIGHS = 5e-3  # share by which unit weights of water, and gravities, may differ
 DENSITIES = (500.0, 2000.0)  # kg/m^3: of oils and brines
 SOFTEST = 1e5  # Pa: bulk modulus of a gas at the pressure of the atmosphere.  Source: exact, by Boyle's law
 
+T = TypeVar("T")
 Gravity = ArrayLike | Callable[[float], ArrayLike] | None
 
 
@@ -34,6 +36,22 @@ def weighed(value, fluid: Fluid | None):
     """Return a pressure of water that has, where its unit weight was not given, that of the pore fluid."""
     make = getattr(value, "weighed", None)
     return value if make is None or fluid is None else make(fluid.unit_weight)
+
+
+def waters(conditions: Mapping[str, Any]) -> list[tuple[str, Any]]:
+    """Return the pressures of water that conditions have, with the sides on which they act."""
+    each = ((one, value) for one in conditions.values() for value in getattr(one, "__dict__", {}).values())
+    return [(f"water at {one.side!r}", value) for one, value in each if hasattr(value, "unit_weight")]
+
+
+def with_weight(condition: T, fluid: Fluid | None) -> T:
+    """Return a condition whose pressures of water have a unit weight, see `weighed`."""
+    new = {
+        name: weighed(value, fluid)
+        for name, value in getattr(condition, "__dict__", {}).items()
+        if hasattr(value, "weighed")
+    }
+    return replace(condition, **new) if new else condition
 
 
 def warn_units(comm: MPI.Intracomm, fluid: Fluid, gravity: Gravity) -> None:

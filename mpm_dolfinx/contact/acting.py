@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Tools, and contacts of groups of bodies, as conditions that act on the momentum: see `acting.Acting`."""
+"""Tools, and contacts of groups of bodies, as conditions that act on the momentum: see `Acting`."""
 
 from __future__ import annotations
 
@@ -29,6 +29,8 @@ class Touching(Acting):
         Where the conditions are put, their names, and what finds where they touch.
     """
 
+    linear = False
+
     def __init__(self, setting: Setting, names: Sequence[str], found: Tools | Contacts):
         self._grid, self.names, self.found = setting.grid, tuple(names), found
         self.symmetric = found.symmetric
@@ -55,7 +57,7 @@ class ToolsOfStage(Touching):
         Where they are put, and the tools by name.
     """
 
-    conditions = (Tool,)
+    conditions, title = (Tool,), "tools"
 
     def __init__(self, setting: Setting, tools: Mapping[str, Tool]):
         held = [(hold, faces) for hold, faces, _ in held_faces(setting)]
@@ -91,7 +93,7 @@ class ContactsOfStage(Touching):
         Where they are put, and the contacts by name.
     """
 
-    conditions = (Contact,)
+    conditions, title = (Contact,), "contacts"
 
     def __init__(self, setting: Setting, contacts: Mapping[str, Contact]):
         found = Contacts(setting.sides, setting.materials, contacts)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from mpm_dolfinx.base.validation import all_of, line, numbers
+from mpm_dolfinx.base.validation import line, numbers
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.grid.grid import Grid, GridOfGroups
 
@@ -93,14 +93,19 @@ def groups_of(contacts: Sequence[Contact], count: int) -> list[tuple[int, ...]]:
     return groups
 
 
+def contacts_of(conditions: Sequence[Any]) -> list[Contact]:
+    """Return the contacts among conditions."""
+    return [one for one in conditions if isinstance(one, Contact)]
+
+
 def grouped(
-    grid: Grid, bodies: Sequence[Body], contacts: Sequence[Contact], quadrature: str, other: dict[str, Any]
+    grid: Grid, bodies: Sequence[Body], conditions: Sequence[Any], quadrature: str, other: dict[str, Any]
 ) -> Grid:
     """Return the grid of a scene: with contacts, one with a copy for each group.
 
     Parameters
     ----------
-    quadrature
+    conditions, quadrature
         See `Simulation`.
     other
         What scenes with contacts cannot have, by name.
@@ -110,7 +115,7 @@ def grouped(
     ValueError
         Contacts that are none, or do not go together with what else the scene has.
     """
-    all_of("contacts", contacts, Contact)
+    contacts = contacts_of(conditions)
     if not contacts:
         return grid
     if grid.axisymmetric:

@@ -21,8 +21,6 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base.histories import COLUMNS, Rows
 from mpm_dolfinx.base.validation import instance, line, numbers, on_disk, path, whole
 from mpm_dolfinx.conditions.acting import Outcome
-from mpm_dolfinx.contact.groups import Contact
-from mpm_dolfinx.contact.tool import Tool
 from mpm_dolfinx.domains.pressure_transport import PiecePressures
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.io.writer import WRITABLE, replacing
@@ -370,8 +368,8 @@ def _read(file: Path) -> tuple[dict[str, NDArray], dict[str, Any]]:
 
 def describe(simulation: Simulation) -> dict[str, Any]:
     """Return the constants that make the scene, by name, as a checkpoint holds them."""
-    grips = {name: bool(one.grips) for name, one in simulation.state.stage.of(Tool, Contact).items()}
-    more = {"bodies present": list(simulation.present), "tools and contacts, whether each resists slip": grips}
+    kept = sorted(simulation.state.stage.kept(0))
+    more = {"bodies present": list(simulation.present), "data that points keep of conditions": kept}
     return {**simulation.scene.description, **more}
 
 

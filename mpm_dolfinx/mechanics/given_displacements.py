@@ -66,7 +66,7 @@ class GivenDisplacements(Acting):
         Two give the same component on the same part of a face.
     """
 
-    conditions = (Displacement,)
+    conditions, title = (Displacement,), "given displacements"
 
     def __init__(self, setting: Setting, displacements: Mapping[str, Displacement]):
         self._grid, self._forms, self._materials = setting.grid, setting.forms, setting.materials

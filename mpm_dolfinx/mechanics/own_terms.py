@@ -82,8 +82,10 @@ class OwnTerms:
 class OwnTermsOfStage(Acting):
     """The terms in a stage: those on sides have faces."""
 
+    title = "terms of the user's"
+
     def __init__(self, terms: Sequence[OwnTerm], setting: Setting):
-        self._grid = setting.grid
+        self._grid, self.linear = setting.grid, all(term.slope is None for term in terms)
         self._terms = [
             (term, setting.sides.of(term.given) if isinstance(term.given, OnSide) else None) for term in terms
         ]

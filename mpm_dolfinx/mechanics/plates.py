@@ -56,7 +56,7 @@ class Plates(Acting):
         The faces of a plate are not one flat side.
     """
 
-    conditions = (RigidPlate,)
+    conditions, title = (RigidPlate,), "rigid plates"
 
     def __init__(self, setting: Setting, plates: Mapping[str, RigidPlate]):
         self._grid, self._forms, self._materials = setting.grid, setting.forms, setting.materials

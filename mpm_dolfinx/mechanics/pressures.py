@@ -54,7 +54,7 @@ class Pressures(Acting):
         Where they are put, and the pressures by name.
     """
 
-    conditions = (Pressure,)
+    conditions, title, linear = (Pressure,), "pressures", False
 
     def __init__(self, setting: Setting, pressures: Mapping[str, Pressure]):
         self._grid, self._forms = setting.grid, setting.forms

@@ -40,7 +40,7 @@ class Tractions(Acting):
         Where they are put, and the tractions by name.
     """
 
-    conditions = (Traction,)
+    conditions, title = (Traction,), "tractions"
 
     def __init__(self, setting: Setting, tractions: Mapping[str, Traction]):
         self._grid, self._forms = setting.grid, setting.forms

@@ -18,7 +18,7 @@ from mpm_dolfinx.conditions.axis import check_axisymmetry, with_axis
 from mpm_dolfinx.conditions.conditions import OnSide, Source, sorted_terms
 from mpm_dolfinx.conditions.names import ByName
 from mpm_dolfinx.conditions.unit_weights import under
-from mpm_dolfinx.contact.groups import Contact, grouped
+from mpm_dolfinx.contact.groups import grouped
 from mpm_dolfinx.diagnostics.scene_parts import check_options, check_parts
 from mpm_dolfinx.diagnostics.thin import warn_thin
 from mpm_dolfinx.grid.grid import Grid
@@ -107,10 +107,9 @@ class Simulation:
         instance("numerics", numerics, Numerics)
         quadrature = numerics.quadrature
         check_parts(grid, bodies, materials, later)
-        contacts = [one for one in checked(conditions) if isinstance(one, Contact)]
         terms, sources = sorted_terms(terms)
         check_options(bodies, fluid, pressure, terms, sources, quadrature)
-        grid = grouped(grid, bodies, contacts, quadrature, {"terms": terms, "sources": sources})
+        grid = grouped(grid, bodies, checked(conditions), quadrature, {"terms": terms, "sources": sources})
         grid = grid.shared(points_in_cells(grid, bodies), keep=bool(len(terms) + len(sources)))
         warn_thin(grid, bodies, with_axis(grid, walls), fluid is not None)
         check_axisymmetry(grid, bodies, quadrature)

@@ -29,7 +29,6 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 
 from mpm_dolfinx.base.report import Report
 from mpm_dolfinx.base.validation import flag, line, numbers, whole
-from mpm_dolfinx.contact.groups import Contact
 from mpm_dolfinx.materials.frictional import Frictional
 from mpm_dolfinx.materials.skeleton import Skeleton
 from mpm_dolfinx.parallel.exchange import over_all
@@ -227,7 +226,7 @@ class _Weakened:
                 raise ValueError(f"{what}, must be a law with friction and cohesion")
         if not any(isinstance(m, Frictional) for m in scene.materials.materials):
             raise ValueError("factor_of_safety: no material has a strength, must have friction and cohesion")
-        if simulation.state.stage.of(Contact):
+        if scene.grid.copies > 1:
             raise ValueError("factor_of_safety: contacts: must be none")
         begun = begin_stage(scene, simulation.state, {}, [], [], False, {})  # free of its grid
         self._viscosity = viscosity = fem.Constant(scene.grid.mesh, 0.0)  # Pa s

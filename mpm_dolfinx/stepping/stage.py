@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, get_args
 
 import numpy as np
@@ -29,7 +29,7 @@ from mpm_dolfinx.conditions.conditions import (
 )
 from mpm_dolfinx.conditions.names import named
 from mpm_dolfinx.conditions.sides import Sides
-from mpm_dolfinx.conditions.unit_weights import weighed
+from mpm_dolfinx.conditions.unit_weights import with_weight
 from mpm_dolfinx.contact.acting import ContactsOfStage, ToolsOfStage
 from mpm_dolfinx.contact.groups import Contact
 from mpm_dolfinx.contact.tool import Tool
@@ -193,7 +193,7 @@ def stage(
         Naming the condition, its value and what is allowed.
     """
     given_by_name = named(checked(conditions["conditions"]))
-    by_name = {name: _weighed(one, fluid) for name, one in given_by_name.items()}
+    by_name = {name: with_weight(one, fluid) for name, one in given_by_name.items()}
     if fluid is None and any(isinstance(one, (Drained, Inflow)) for one in by_name.values()):
         raise ValueError("drained and inflow sides need a fluid")
     gravity = conditions["gravity"]
@@ -224,12 +224,6 @@ def stage(
         acting=tuple(acting),
         hydraulic=HydraulicBoundary(sides, setting.of(Drained, Inflow)),
     )
-
-
-def _weighed(condition: Condition, fluid: Fluid | None) -> Condition:
-    """Return a condition whose pressure of water has a unit weight, see `weighed`."""
-    name = {Drained: "pressure", Pressure: "value", Traction: "value"}.get(type(condition))
-    return condition if name is None else replace(condition, **{name: weighed(getattr(condition, name), fluid)})
 
 
 def _gravity(value: ArrayLike, name: str, dim: int, axisymmetric: bool) -> NDArray[np.float64]:

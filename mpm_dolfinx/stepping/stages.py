@@ -16,10 +16,9 @@ from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.faces import surface
 from mpm_dolfinx.bodies.fills import put, touches
 from mpm_dolfinx.bodies.touching import check_apart
-from mpm_dolfinx.conditions.conditions import Drained, Pressure, Traction
 from mpm_dolfinx.conditions.sides import everywhere
-from mpm_dolfinx.conditions.unit_weights import WEIGHS, warn_units
-from mpm_dolfinx.contact.groups import Contact
+from mpm_dolfinx.conditions.unit_weights import WEIGHS, warn_units, waters
+from mpm_dolfinx.contact.groups import contacts_of
 from mpm_dolfinx.contact.history import gripped, let_go
 from mpm_dolfinx.domains.pressure_transport import at_start
 from mpm_dolfinx.grid.grid import sum_by
@@ -29,8 +28,6 @@ from mpm_dolfinx.stepping.initial_state import pieces_at_start
 from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.stage import Condition, Stage, checked, stage
 from mpm_dolfinx.stepping.state import State
-
-LEVELS = (Traction, Pressure, Drained)  # which may be water
 
 
 def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int]) -> State:
@@ -75,8 +72,7 @@ def begin_stage(
     later = [body for body in before.later if body not in add]
     conditions = _with_contacts(before, named.get("conditions", tuple(before.given.values())))
     begun = _stage(scene, {**before.conditions, **named, "conditions": conditions}, present, later)
-    was, now = ([one for one in of.given.values() if isinstance(one, LEVELS)] for of in (before, begun))
-    if "gravity" in named or was != now:
+    if "gravity" in named or waters(begun.given) != waters(before.given):
         _warn_weights(scene, begun, {})
     if remove:
         _warn_moved_on(scene, before, begun)
@@ -123,7 +119,7 @@ def _holds_as(begun: Stage, before: Stage) -> bool:
 
 def _with_contacts(before: Stage, conditions: Sequence[Condition]) -> list[Condition]:
     """Return conditions with the scene's contacts, which no stage changes."""
-    there, given = [*before.of(Contact).values()], [one for one in checked(conditions) if isinstance(one, Contact)]
+    there, given = contacts_of(before.given.values()), contacts_of(checked(conditions))
     if given and given != there:
         raise ValueError(f"stage: conditions: {line(given[0])}, contacts must be those of the scene, or left out")
     return [*conditions, *(() if given else there)]
@@ -140,9 +136,7 @@ def _warn_weights(scene: Scene, begun: Stage, given: Mapping[str, Any]) -> None:
     """
     gravity, fluid = begun.conditions["gravity"], scene.fluid
     g = 0.0 if gravity is None or callable(gravity) else float(np.linalg.norm(gravity))
-    on_sides = [(f"water at {c.side!r}", c.pressure) for c in begun.of(Drained).values()]
-    on_sides += [(f"water at {c.side!r}", c.value) for c in begun.of(Traction, Pressure).values()]
-    levels = [*given.items(), *on_sides]
+    levels = [*given.items(), *waters(begun.named)]
     if fluid is None:
         levels = [(name, value) for name, value in levels if hasattr(value, "weighed") and g]
         own, of = 1000 * g, "water under the scene's gravity"

@@ -12,12 +12,10 @@ from mpi4py import MPI
 
 import numpy as np
 
-from mpm_dolfinx.conditions.conditions import Displacement, Pressure, RigidPlate, Traction
-from mpm_dolfinx.contact.groups import Contact
-from mpm_dolfinx.contact.tool import Tool
 from mpm_dolfinx.materials.skeleton import LOCKING
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.stepping.scene import Scene
+from mpm_dolfinx.stepping.stage import KINDS
 from mpm_dolfinx.stepping.state import State
 
 
@@ -40,8 +38,7 @@ def _either(name: str, used, what: str, otherwise: str) -> Part:
 
 
 def _momentum(s: Scene, state: State) -> list[Part]:
-    m, kinds = s.momentum, (Traction, Pressure, Displacement, RigidPlate, Tool, Contact)
-    of = {kind: state.stage.of(kind) for kind in kinds}
+    m, number = s.momentum, {kind.title: len(state.stage.of(*kind.conditions)) for kind in KINDS}
     laws, evolves = ", ".join(law.__name__ for law in s.materials.laws), ", ".join(s.materials.state_names)
     return [
         _either("reset of the grid", state.resets > 1, f"{state.resets} so far", "nothing has moved so far"),
@@ -60,12 +57,7 @@ def _momentum(s: Scene, state: State) -> list[Part]:
         _either("state of the law", evolves, evolves, "the stress depends on F only"),
         _either("initial stress", s.initial.given, f"of {len(s.initial.given)} bodies", "none given"),
         _either("body force", s.gravity is not None, "gravity", "no gravity"),
-        _either("tractions", of[Traction], f"on {len(of[Traction])} sides", "no tractions"),
-        _either("pressures", of[Pressure], f"on {len(of[Pressure])} sides", "no pressures"),
-        _either("given displacements", of[Displacement], f"on {len(of[Displacement])} sides", "no given displacements"),
-        _either("rigid plates", of[RigidPlate], f"on {len(of[RigidPlate])} sides", "no plates"),
-        _either("tools", of[Tool], f"{len(of[Tool])}", "no tools"),
-        _either("contacts", of[Contact], f"of {s.grid.copies} groups", "bodies that touch stick"),
+        *(_either(kind.title, number[kind.title], f"{number[kind.title]}", "none given") for kind in KINDS),
         _either("ghost penalty", m.ghost.form.used, "faces of nearly empty cells", "no nearly empty cell so far"),
         _either("terms of the user's", m.own.terms, f"{len(m.own.terms)}", "none given"),
     ]
@@ -94,7 +86,7 @@ def _solvers(s: Scene, state: State) -> list[Part]:
         _either("coupling", s.storage, f"{s.scheme.coupling}, {kind}", "no fluid: Newton on the momentum"),
         _either(
             "one factorisation for many steps",
-            s.momentum.linear and not (state.stage.of(Pressure, Tool, Contact) or s.momentum.own.holding),
+            s.momentum.linear and all(one.linear for one in state.stage.acting),
             "linear law: until active cells or time step change",
             "the tangent depends on the strain",
         ),
