@@ -34,7 +34,8 @@ from mpm_dolfinx.conditions.conditions import (
 )
 from mpm_dolfinx.conditions.water import water
 from mpm_dolfinx.contact.groups import Contact
-from mpm_dolfinx.contact.tools import Ball, Cone, Convex, HalfSpace, Pose, Shape, Tool
+from mpm_dolfinx.contact.shapes import Ball, Cone, Convex, HalfSpace, Shape
+from mpm_dolfinx.contact.tool import Pose, Tool
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.io.checkpoint import Checkpoint, resume
 from mpm_dolfinx.io.one_file import one_file
@@ -54,6 +55,7 @@ from mpm_dolfinx.materials.skeleton import (
     unsaturated,
 )
 from mpm_dolfinx.materials.softening import SofteningDruckerPrager
+from mpm_dolfinx.parallel.messages import ConditionWarning, ResolutionWarning, ResultWarning, set_log_level
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.probing.cell_fields import CellFields
 from mpm_dolfinx.probing.point_fields import PointFields
@@ -64,6 +66,7 @@ from mpm_dolfinx.solve.scheme import COUPLINGS, Scheme
 from mpm_dolfinx.stepping.numerics import Numerics
 from mpm_dolfinx.stepping.result import GaveUp, Result
 from mpm_dolfinx.stepping.state import State
+from mpm_dolfinx.stepping.tangent import Tangent
 from mpm_dolfinx.verification.element_test import ElementTest, element_test
 
 __version__ = "0.1.0"
@@ -75,6 +78,7 @@ __all__ = [
     "Body",
     "CellFields",
     "Checkpoint",
+    "ConditionWarning",
     "Cone",
     "Contact",
     "Convex",
@@ -105,7 +109,9 @@ __all__ = [
     "Pressure",
     "Probes",
     "Report",
+    "ResolutionWarning",
     "Result",
+    "ResultWarning",
     "RigidPlate",
     "Safety",
     "Scheme",
@@ -115,6 +121,7 @@ __all__ = [
     "SofteningDruckerPrager",
     "Source",
     "State",
+    "Tangent",
     "Tool",
     "Traction",
     "Writer",
@@ -129,6 +136,7 @@ __all__ = [
     "polygon",
     "probes",
     "resume",
+    "set_log_level",
     "shape",
     "unsaturated",
     "water",
