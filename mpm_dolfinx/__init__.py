@@ -62,11 +62,11 @@ from mpm_dolfinx.probing.point_fields import PointFields
 from mpm_dolfinx.probing.probes import Probes, probes
 from mpm_dolfinx.simulation.simulation import Simulation
 from mpm_dolfinx.simulation.strength_reduction import Safety, factor_of_safety
+from mpm_dolfinx.simulation.tangent import Tangent
 from mpm_dolfinx.solve.numerics import Numerics
 from mpm_dolfinx.solve.scheme import COUPLINGS, Scheme
 from mpm_dolfinx.stepping.result import GaveUp, Result
 from mpm_dolfinx.stepping.state import State
-from mpm_dolfinx.stepping.tangent import Tangent
 from mpm_dolfinx.verification.element_test import ElementTest, element_test
 
 __version__ = "0.1.0"

@@ -32,11 +32,11 @@ from mpm_dolfinx.probing.probe_fields import probe_pressures, probe_stresses
 from mpm_dolfinx.probing.probes import Probes
 from mpm_dolfinx.simulation.events import Event, Events, Step
 from mpm_dolfinx.simulation.step_size import StepSize, Times, measured, step_rule
+from mpm_dolfinx.simulation.summary import imbalance, peak_memory
 from mpm_dolfinx.stepping.result import GaveUp, Result
 from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.state import State
 from mpm_dolfinx.stepping.step_control import StepControl
-from mpm_dolfinx.stepping.summary import imbalance, peak_memory
 
 PARTS = (
     "cut domains",
