@@ -34,8 +34,8 @@ from mpm_dolfinx.conditions.conditions import (
 )
 from mpm_dolfinx.conditions.water import water
 from mpm_dolfinx.contact.groups import Contact
-from mpm_dolfinx.contact.shapes import Ball, Cone, Convex, HalfSpace, Pose, Shape
-from mpm_dolfinx.contact.tool import Tool
+from mpm_dolfinx.contact.shapes import Ball, Cone, Convex, HalfSpace, Shape
+from mpm_dolfinx.contact.tool import Pose, Tool
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.io.checkpoint import Checkpoint, resume
 from mpm_dolfinx.io.one_file import one_file
