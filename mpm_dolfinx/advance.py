@@ -335,7 +335,9 @@ def _check_inside(cut: CutDomains, points: MaterialPoints, t: float, report: Rep
     if grid.outside(x.reshape(-1, grid.dim), REACH).any():
         beyond = np.maximum(grid.low - x, x - grid.high).max(axis=2)
         i, corner = np.unravel_index(np.argmax(np.where(np.isnan(beyond), np.inf, beyond)), beyond.shape)
-        of = f"point {points.id[i]} at {points.x[i] + grid.base}" + (f": its corner at {x[i, corner] + grid.base}" if cut.domains else "")
+        of = f"point {points.id[i]} at {points.x[i] + grid.base}" + (
+            f": its corner at {x[i, corner] + grid.base}" if cut.domains else ""
+        )
         by = f"by {beyond[i, corner]:.3g} m at t = {t:g} s"
         message = f"{of} left the grid {grid.lower} to {grid.upper} {by}, must stay in it: take a larger grid"
     if message := first(grid.comm, message):

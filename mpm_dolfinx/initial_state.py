@@ -54,7 +54,9 @@ def pieces_at_start(scene: Scene, points: MaterialPoints) -> PiecePressures:
     """Return what pieces of domains carry of a field of pressure, by which cells have that of their centroids."""
     on_grid, grid, pressure = scene.on_grid(points), scene.grid, scene.initial.pressure
     cut, contents, bulk = on_grid.cut, on_grid.contents, scene.fluid.bulk
-    pi = mass_potential(cut.pieces_to_cells(pressure_at(pressure, cut.pieces.x + grid.base)), bulk)  # which adds up in a cell
+    pi = mass_potential(
+        cut.pieces_to_cells(pressure_at(pressure, cut.pieces.x + grid.base)), bulk
+    )  # which adds up in a cell
     store = on_grid.weight * on_grid.data.pieces["storage"][:, 0]
     held = contents.total(cut.cells, store)
     weight = np.where(held[contents.slot(cut.cells)] > 0, store, on_grid.weight)

@@ -29,7 +29,7 @@ from mpm_dolfinx.simulation import Simulation
 from mpm_dolfinx.state import State, Stay
 from mpm_dolfinx.validation import instance, line, numbers, on_disk, path, whole
 
-FORMAT, VERSION = "mpm_dolfinx checkpoint", 9
+FORMAT, VERSION = "mpm_dolfinx checkpoint", 10
 FOREIGN = "no checkpoint of mpm_dolfinx, must be one"
 ZIP = b"PK\3\4"  # how numpy's archives begin
 ACTING = ("reactions", "walls", "outflows", "tool_forces", "tool_travel")
