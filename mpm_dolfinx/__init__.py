@@ -36,6 +36,7 @@ from mpm_dolfinx.contact.tools import Ball, Cone, Convex, HalfSpace, Tool
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.io.checkpoint import Checkpoint, resume
 from mpm_dolfinx.io.one_file import one_file
+from mpm_dolfinx.io.plots import plot
 from mpm_dolfinx.io.writer import Writer
 from mpm_dolfinx.materials.cam_clay import ModifiedCamClay
 from mpm_dolfinx.materials.drucker_prager import DruckerPrager
@@ -115,6 +116,7 @@ __all__ = [
     "kozeny_carman",
     "mapped",
     "one_file",
+    "plot",
     "polygon",
     "probes",
     "resume",
