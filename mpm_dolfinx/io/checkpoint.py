@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.histories import COLUMNS, Rows
+from mpm_dolfinx.base.step_control import StepControl
 from mpm_dolfinx.base.validation import instance, line, numbers, on_disk, path, whole
 from mpm_dolfinx.conditions.acting import Outcome
 from mpm_dolfinx.contact.groups import Contact
@@ -32,7 +33,6 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.simulation.simulation import Simulation
 from mpm_dolfinx.stepping.result import Result
 from mpm_dolfinx.stepping.state import State, Stay
-from mpm_dolfinx.stepping.step_control import StepControl
 
 FORMAT, VERSION = "mpm_dolfinx checkpoint", 10  # Source: the format of the files
 FOREIGN = "no checkpoint of mpm_dolfinx, must be one"

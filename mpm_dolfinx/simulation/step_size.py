@@ -11,6 +11,7 @@ from mpi4py import MPI
 import numpy as np
 
 from mpm_dolfinx.base.report import Report
+from mpm_dolfinx.base.step_control import StepControl
 from mpm_dolfinx.base.tolerances import EPSILON, NEAR, ROUND_OFF, SAME
 from mpm_dolfinx.base.validation import line, numbers
 from mpm_dolfinx.parallel.exchange import over_all
@@ -18,7 +19,6 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.solve.newton import ERROR
 from mpm_dolfinx.stepping.result import Result
 from mpm_dolfinx.stepping.scene import Scene
-from mpm_dolfinx.stepping.step_control import StepControl
 
 MIN_CUT, MIN_CUT_BY_ERROR = 2.0**-10, 2.0**-30
 """Share of what a step should be long below which it is not cut.
