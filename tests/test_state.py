@@ -15,8 +15,8 @@ from interrupting import interrupted
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.base.histories import Row
-from mpm_dolfinx.base.step_control import StepControl
 from mpm_dolfinx.io.checkpoint import save
+from mpm_dolfinx.stepping.step_control import StepControl
 
 SAND = mpm.DruckerPrager(
     bulk=2e7,

@@ -19,11 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.histories import COLUMNS, Rows
-from mpm_dolfinx.base.step_control import StepControl
 from mpm_dolfinx.base.validation import instance, line, numbers, on_disk, path, whole
 from mpm_dolfinx.conditions.acting import Outcome
 from mpm_dolfinx.contact.groups import Contact
-from mpm_dolfinx.contact.tools import Tool
+from mpm_dolfinx.contact.tool import Tool
 from mpm_dolfinx.domains.pressure_transport import PiecePressures
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.io.writer import WRITABLE, replacing
@@ -33,6 +32,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.simulation.simulation import Simulation
 from mpm_dolfinx.stepping.result import Result
 from mpm_dolfinx.stepping.state import State, Stay
+from mpm_dolfinx.stepping.step_control import StepControl
 
 FORMAT, VERSION = "mpm_dolfinx checkpoint", 10  # Source: the format of the files
 FOREIGN = "no checkpoint of mpm_dolfinx, must be one"
@@ -202,11 +202,19 @@ def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulat
                 _check_nodal(name, given, simulation.grid)
         if arrays or not all(np.isfinite([note["t"], *times])):
             raise ValueError(f"has {', '.join(arrays) or 'other times'}")
-        outcome = _like(outcome, now.outcome)
-        reset = {"stay": stay, "resets": note["resets"], "begins": note["begins"]}
-        told = dict(zip(NODAL, nodal, strict=True)) | {"outcome": outcome, "stage": None, "result": result}
-        told["control"] = control
-        return State(t=note["t"], points=points, transported=transported, **reset, **told)
+        return State(
+            t=note["t"],
+            points=points,
+            transported=transported,
+            stay=stay,
+            resets=note["resets"],
+            outcome=_like(outcome, now.outcome),
+            stage=None,
+            begins=note["begins"],
+            result=result,
+            control=control,
+            **dict(zip(NODAL, nodal, strict=True)),
+        )
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         raise ValueError(f"{damaged} ({line(error)}), must be a whole checkpoint") from error
 

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.base.tables import columns, components
 from mpm_dolfinx.base.validation import flag, instance, line_of, on_disk, path, whole
-from mpm_dolfinx.contact.tools import Tool
+from mpm_dolfinx.contact.tool import Tool
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.io.units import text
 from mpm_dolfinx.parallel.exchange import at_root, to_root

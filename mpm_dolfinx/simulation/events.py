@@ -13,12 +13,12 @@ from scipy.optimize import brentq
 
 from mpm_dolfinx.base.errors import StepFailed
 from mpm_dolfinx.base.report import Report
+from mpm_dolfinx.base.time_integration import Substep
 from mpm_dolfinx.base.validation import functions, line
 from mpm_dolfinx.parallel.exchange import first
 from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.state import State
-from mpm_dolfinx.stepping.time_integration import Substep
 
 LOCATED = 1e-3
 """Share of a step to which the time of an event is found.  Source: the documented accuracy of `until`."""

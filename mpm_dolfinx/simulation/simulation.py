@@ -28,15 +28,16 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.probing.cell_fields import CellFields, cell_fields
 from mpm_dolfinx.probing.point_fields import PointFields, point_fields
 from mpm_dolfinx.simulation.timeloop import run
+from mpm_dolfinx.solve.numerics import DEFAULT, Numerics
 from mpm_dolfinx.stepping import summary
 from mpm_dolfinx.stepping.initial_state import balanced
-from mpm_dolfinx.stepping.numerics import DEFAULT, Numerics
 from mpm_dolfinx.stepping.result import Result
 from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.stage import Condition, checked
 from mpm_dolfinx.stepping.stages import begin_stage, first_state
 from mpm_dolfinx.stepping.state import State
 from mpm_dolfinx.stepping.step import step
+from mpm_dolfinx.stepping.tangent import tangent
 
 
 class Simulation:
@@ -229,7 +230,7 @@ class Simulation:
         """Return centroids and fields of the cells at present, see `CellFields`; all processes call it together."""
         return cell_fields(self.scene, self.state)
 
-    # ---- stages ---------------------------------------------------------------------------------
+    # ---- stages and steps -----------------------------------------------------------------------
 
     def stage(
         self,
@@ -276,8 +277,6 @@ class Simulation:
         named = {name: value for name, value in given.items() if value is not None}
         self.state = begin_stage(self.scene, self.state, named, add, remove, reset_displacement, fields or {})
 
-    # ---- steps ----------------------------------------------------------------------------------
-
     def step(self, dt: float) -> Report:
         """Advance by dt (s), > 0; return what the step took.
 
@@ -303,4 +302,4 @@ class Simulation:
             raise_interrupt(error)
             raise
 
-    run = run
+    run, tangent = run, tangent

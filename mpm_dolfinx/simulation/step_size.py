@@ -11,7 +11,6 @@ from mpi4py import MPI
 import numpy as np
 
 from mpm_dolfinx.base.report import Report
-from mpm_dolfinx.base.step_control import StepControl
 from mpm_dolfinx.base.tolerances import EPSILON, NEAR, ROUND_OFF, SAME
 from mpm_dolfinx.base.validation import line, numbers
 from mpm_dolfinx.parallel.exchange import over_all
@@ -19,6 +18,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.solve.newton import ERROR
 from mpm_dolfinx.stepping.result import Result
 from mpm_dolfinx.stepping.scene import Scene
+from mpm_dolfinx.stepping.step_control import StepControl
 
 MIN_CUT, MIN_CUT_BY_ERROR = 2.0**-10, 2.0**-30
 """Share of what a step should be long below which it is not cut.
@@ -247,7 +247,7 @@ def step_rule(times: Times, rtol, first_step, max_step: float, scene: Scene, poi
     if scene.numerics.method == "backward-euler":
         raise ValueError(f"rtol = {line(rtol)}: backward-euler knows no error of a step, must be sdirk2")
     timed = any("dt" in law.by_scene for law in scene.materials.laws)
-    if (scene.momentum.rates or timed) and not scene.flows:
+    if (scene.momentum.own.rates or timed) and not scene.flows:
         raise ValueError(f"rtol = {line(rtol)}: where nothing flows no error of a velocity is known, must be dt")
     longest = float(numbers("max_step", max_step, **positive)) if max_step != inf else inf
     first = times.after(times.start)[0] - times.start

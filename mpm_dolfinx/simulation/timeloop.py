@@ -23,7 +23,7 @@ from mpm_dolfinx.base import _compat
 from mpm_dolfinx.base.errors import LeftGrid, StepFailed
 from mpm_dolfinx.base.histories import Row, Rows
 from mpm_dolfinx.base.report import Report
-from mpm_dolfinx.base.step_control import StepControl
+from mpm_dolfinx.base.time_integration import EULER, Substep
 from mpm_dolfinx.base.tolerances import SAME
 from mpm_dolfinx.base.validation import functions, instance, line
 from mpm_dolfinx.parallel.exchange import first
@@ -35,8 +35,8 @@ from mpm_dolfinx.simulation.step_size import StepSize, Times, measured, step_rul
 from mpm_dolfinx.stepping.result import GaveUp, Result
 from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.state import State
+from mpm_dolfinx.stepping.step_control import StepControl
 from mpm_dolfinx.stepping.summary import imbalance, peak_memory
-from mpm_dolfinx.stepping.time_integration import EULER, Substep
 
 PARTS = (
     "cut domains",

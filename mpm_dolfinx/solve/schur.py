@@ -140,6 +140,8 @@ class LinearSolvers:
             gathered = how.gathered and not mumps
             self._solve_s = direct_solver(storage.P, "storage", gathered=gathered, package="mumps" if mumps else None)
             self._set_krylov(how.krylov)
+            self._solve_s.setFromOptions()
+            self._krylov = self._solve_s.getType()
 
     def _momentum_solver(self) -> PETSc.KSP:
         """Return what solves for displacements."""
@@ -250,7 +252,7 @@ class LinearSolvers:
             with using(self.scheme.petsc_options):
                 count, kept.factors = self._block.solve(self.du, self.dp, scales, rtol, slopes, kept.factors)
             return count
-        self._set_krylov(self.plan.krylov if slope is None else PETSc.KSP.Type.FGMRES)
+        self._set_krylov(self._krylov if slope is None else PETSc.KSP.Type.FGMRES)
         if slope is not None:
             self._schur.setPythonContext(replace(self._context, slopes=slopes))
         g = self.condense(*slopes)

@@ -15,6 +15,7 @@ from dolfinx.common import Timer
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.caching import Latest
+from mpm_dolfinx.base.time_integration import Substep, substeps
 from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.bodies.bodies import Body, material_points
 from mpm_dolfinx.conditions.acting import Loads
@@ -35,12 +36,11 @@ from mpm_dolfinx.mechanics.quadrature_data import QuadraturePoints
 from mpm_dolfinx.parallel.messages import ConditionWarning, warn
 from mpm_dolfinx.points.cutting import volumes
 from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.solve.numerics import Numerics
 from mpm_dolfinx.stepping.advance import Motion
-from mpm_dolfinx.stepping.numerics import Numerics
 from mpm_dolfinx.stepping.on_grid import Assembled, OnGrid, System, assembled
 from mpm_dolfinx.stepping.stage import Stage
 from mpm_dolfinx.stepping.state import State
-from mpm_dolfinx.stepping.time_integration import Substep, substeps
 
 
 class Scene:

@@ -19,8 +19,8 @@ from mpm_dolfinx.bodies.touching import check_apart
 from mpm_dolfinx.conditions.conditions import Drained, Pressure, Traction
 from mpm_dolfinx.conditions.sides import everywhere
 from mpm_dolfinx.conditions.unit_weights import WEIGHS, warn_units
-from mpm_dolfinx.contact.cell_contact import gripped, let_go
 from mpm_dolfinx.contact.groups import Contact
+from mpm_dolfinx.contact.history import gripped, let_go
 from mpm_dolfinx.domains.pressure_transport import at_start
 from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.parallel.messages import ConditionWarning, warn

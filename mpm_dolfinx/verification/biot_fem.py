@@ -39,6 +39,7 @@ from mpm_dolfinx.base.errors import NotConverged
 from mpm_dolfinx.base.fluid_content import change_of_content, mass_potential, mass_potential_form
 from mpm_dolfinx.base.histories import Row, Rows
 from mpm_dolfinx.base.report import Report
+from mpm_dolfinx.base.time_integration import Substep, substeps
 from mpm_dolfinx.base.tolerances import NEAR, ROUND_OFF, SAME, TINY
 from mpm_dolfinx.base.validation import all_of, functions, instance, line, numbers
 from mpm_dolfinx.bodies.faces import Region, limits
@@ -51,9 +52,8 @@ from mpm_dolfinx.materials.skeleton import Field, Fluid, Skeleton
 from mpm_dolfinx.materials.user_functions import call, compiling, term_of
 from mpm_dolfinx.materials.user_functions import form as form_of
 from mpm_dolfinx.probing.probes import positions
-from mpm_dolfinx.stepping.numerics import DEFAULT, Numerics
+from mpm_dolfinx.solve.numerics import DEFAULT, Numerics
 from mpm_dolfinx.stepping.result import GaveUp, Result
-from mpm_dolfinx.stepping.time_integration import Substep, substeps
 
 ELEMENTS = {"taylor-hood": (2, ("Lagrange", 1, ())), "q1-dg0": (1, ("DG", 0, ()))}  # degree of u; space of p
 CUT_DEGREE = 20  # of quadrature on a side of which a region is loaded: the region's edge may cut facets
