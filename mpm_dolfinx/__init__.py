@@ -39,6 +39,7 @@ from mpm_dolfinx.contact.tool import Pose, Tool
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.io.checkpoint import Checkpoint, resume
 from mpm_dolfinx.io.one_file import one_file
+from mpm_dolfinx.io.plots import plot
 from mpm_dolfinx.io.writer import Writer
 from mpm_dolfinx.materials.cam_clay import ModifiedCamClay
 from mpm_dolfinx.materials.drucker_prager import DruckerPrager
@@ -133,6 +134,7 @@ __all__ = [
     "kozeny_carman",
     "mapped",
     "one_file",
+    "plot",
     "polygon",
     "probes",
     "resume",

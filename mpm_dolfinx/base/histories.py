@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,7 +31,7 @@ class Row(NamedTuple):
     position: NDArray[np.float64] = _none(0, 0)
     probe_pressure: NDArray[np.float64] = _none(0)
     probe_stress: NDArray[np.float64] = _none(0, 3, 3)
-    outcome: Mapping[str, Mapping[str, NDArray[np.float64]]] = MappingProxyType({})
+    outcome: Mapping[str, Mapping[str, NDArray[np.float64]]] = {}
 
 
 COLUMNS = tuple(name for name in Row._fields if name != "outcome")

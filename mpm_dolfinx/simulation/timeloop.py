@@ -358,15 +358,8 @@ def _by_euler(simulation: Simulated, dt: float, failed: StepFailed) -> tuple[Sta
     except StepFailed:
         return None
     what = "t = %g s: a step of %.3g s by backward Euler, of first order: none by %s has converged: %s"
-    warn(
-        simulation.scene.grid.comm,
-        ResolutionWarning,
-        what,
-        simulation.state.t,
-        dt,
-        simulation.scene.numerics.method,
-        failed,
-    )
+    values = simulation.state.t, dt, simulation.scene.numerics.method, failed
+    warn(simulation.scene.grid.comm, ResolutionWarning, what, *values)
     return found
 
 
