@@ -244,7 +244,7 @@ def _changes(node: ast.AST, functions: set[str]) -> bool:
         if isinstance(target, ast.Subscript) and _of_self(target.value) and _slot(target.slice):
             return isinstance(node, ast.Assign | ast.AugAssign)
         if isinstance(target, ast.Attribute) and isinstance(target.value, ast.Name) and target.value.id in functions:
-            return isinstance(node, ast.Assign | ast.AugAssign)
+            return not target.attr.startswith("__") and isinstance(node, ast.Assign | ast.AugAssign)
     if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and _of_self(node.func.value):
         private = node.func.value.attr.startswith("_")
         return private and node.func.attr in ("append", "clear", "extend", "pop", "setdefault", "insert")

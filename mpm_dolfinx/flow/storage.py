@@ -476,7 +476,7 @@ class StorageProblem:
         faces = self._flow(False).faces
         flows = faces.outflow(self._potentials) > 0
         changes = over_all(self.forms.grid.comm, int(np.count_nonzero((flows != self._flowing) & faces.seeps)))
-        self._flowing[:] = flows
+        self._flowing = flows
         return changes > 0
 
     def set_fluxes(self) -> None:

@@ -63,7 +63,7 @@ class Checkpoint:
     file: str | os.PathLike
     every: int = 1
     seconds: float = 0.0
-    _written: list[float] = field(default_factory=lambda: [time.monotonic()], init=False, repr=False)
+    _written: float = field(default_factory=time.monotonic, init=False, repr=False)
 
     def __post_init__(self):
         if path("checkpoint: file", self.file).is_dir():
@@ -76,10 +76,10 @@ class Checkpoint:
         result, comm = simulation.result, simulation.grid.comm
         due = (len(result.rows) - 1) % self.every == 0
         if due and self.seconds > 0:
-            due = comm.bcast(time.monotonic() - self._written[0] >= self.seconds)
+            due = comm.bcast(time.monotonic() - self._written >= self.seconds)
         if due or result.converged:
             save(simulation, Path(self.file))
-            self._written[0] = time.monotonic()
+            self._written = time.monotonic()
 
 
 def save(simulation: Simulation, file: Path) -> None:

@@ -379,7 +379,7 @@ class Table:
     def start(self, first: dict[str, float]) -> None:
         """Write the rows that were kept, or else a first row."""
         rows = [row for _, row in self._rows] or [first]
-        self.columns[:] = rows[0]
+        self.columns = list(rows[0])
         self._check(first)
 
         def write() -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 from mpi4py import MPI
 
@@ -85,15 +84,29 @@ def hydrostatic(level: float, unit_weight: float | None = None) -> Callable[[NDA
     if unit_weight is not None:
         allowed = {"test": lambda v: (0 < v) & (v < np.inf), "allowed": "> 0 and finite"}
         numbers("hydrostatic: unit_weight", unit_weight, **allowed)
-    weight = 1000 * STANDARD_GRAVITY if unit_weight is None else unit_weight
+    return Hydrostatic(level, unit_weight)
 
-    def pressure(x: NDArray[np.float64]) -> NDArray[np.float64]:
-        return weight * (level - x[:, -1])
 
-    pressure.unit_weight = weight
-    if unit_weight is None:
-        pressure.weighed = partial(hydrostatic, level)
-    return pressure
+@dataclass(frozen=True)
+class OfWater:
+    """A pressure of water: its unit weight, N/m^3, where none is given that of the scene's fluid, else 9810."""
+
+    @property
+    def unit_weight(self) -> float:
+        """Unit weight, N/m^3."""
+        return 1000 * STANDARD_GRAVITY if self.given is None else self.given
+
+
+@dataclass(frozen=True)
+class Hydrostatic(OfWater):
+    """The pressure of water at rest below a level, as a function of places."""
+
+    level: float
+    given: float | None = None
+
+    def __call__(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the pressures (m,), Pa, at places x (m, d)."""
+        return self.unit_weight * (self.level - x[:, -1])
 
 
 def by_body(given, bodies: Sequence[Body], later: Sequence[int]) -> dict[int, InitialStress]:

@@ -21,6 +21,7 @@ from mpm_dolfinx.conditions.unit_weights import WEIGHS, warn_units
 from mpm_dolfinx.contact.cell_contact import let_go
 from mpm_dolfinx.domains.pressure_transport import at_start
 from mpm_dolfinx.grid.grid import sum_by
+from mpm_dolfinx.materials.initial_stress import OfWater
 from mpm_dolfinx.parallel.messages import warn
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.stepping.initial_state import pieces_at_start
@@ -120,11 +121,11 @@ def _warn_weights(scene: Scene, begun: Stage, given: Mapping[str, Any]) -> None:
     on_sides += [(f"water at {c.side!r}", c.value) for c in begun.conditions["tractions"]]
     levels = [*given.items(), *on_sides]
     if fluid is None:
-        levels = [(name, value) for name, value in levels if hasattr(value, "weighed") and g]
+        levels = [(name, value) for name, value in levels if isinstance(value, OfWater) and value.given is None and g]
         own, of = 1000 * g, "water under the scene's gravity"
     else:
         own, of = (fluid.unit_weight if callable(gravity) else fluid.density * g), "the pore fluid"
-    weights = {(name, getattr(value, "unit_weight", own)) for name, value in levels}
+    weights = {(name, value.unit_weight if isinstance(value, OfWater) else own) for name, value in levels}
     for name, weight in sorted(weights):
         if abs(weight - own) > WEIGHS * max(weight, own):
             what = "%s: unit_weight = %.6g N/m^3, but that of %s, its density times gravity, is %.6g"
