@@ -41,7 +41,7 @@ ANGLES = np.radians(np.linspace(20, 85, 261))  # of the planes of wedges
 def bank(cells: int, barrier: bool) -> mpm.Simulation:
     """Return the bank at rest, with so many cells over its height; t is zero."""
     h = HEIGHT / cells
-    grid = mpm.Grid([LENGTH, HEIGHT + h], [round(LENGTH / h), cells + 1])
+    grid = mpm.Grid([0, 0], [LENGTH, HEIGHT + h], [round(LENGTH / h), cells + 1])
     clay = mpm.DruckerPrager(
         bulk=50 * SHEAR, shear=SHEAR, friction=0.0, dilation=0.0, cohesion=lambda X: np.full(len(X), STRONG)
     )
@@ -50,7 +50,7 @@ def bank(cells: int, barrier: bool) -> mpm.Simulation:
     body = mpm.box(grid, [0, 0], [HEIGHT, HEIGHT])
     walls = {"left": "x", "bottom": "xy"}
     s = mpm.Simulation(
-        grid, [body], [clay], fixed=walls, terms=[common.weight(WEIGHT), common.viscous(VISCOSITY)], tools=tools
+        grid, [body], [clay], walls=walls, terms=[common.weight(WEIGHT), common.viscous(VISCOSITY)], conditions=tools
     )
     s.run(1e9, 1e9, progress=False)  # time in which nothing of the viscosity is left
     s.stage(reset_displacement=True)

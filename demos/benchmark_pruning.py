@@ -37,7 +37,7 @@ from mpm_dolfinx.stepping.summary import peak_memory
 from mpm_dolfinx.stepping.time_integration import GAMMA
 
 SHEAR, LOAD, DT, STEPS = 5e6, 20.0, 1.0, 4  # Pa, Pa a step, s, steps at a time
-WATER = {"fluid": mpm.Fluid(), "drained": [mpm.Drained("top")]}
+WATER = {"fluid": mpm.Fluid(), "conditions": [mpm.Drained("top")]}
 SEALED = {"fluid": mpm.Fluid()}
 
 
@@ -57,11 +57,11 @@ def block(
     """Return the block, that many cells wide; the grid reaches to `box`, m, and two cells above it."""
     h = 1 / cells
     count = [round(box * cells), round(box * cells) + 2]
-    grid = mpm.Grid([box, box + 2 * h], count, axisymmetric=axisymmetric)
-    options.setdefault("tractions", [mpm.Traction("top", lambda t: (0, -LOAD * t))])
-    fixed = {"left": "x", "right": "x", "bottom": "y"}
+    grid = mpm.Grid([0, 0], [box, box + 2 * h], count, axisymmetric=axisymmetric)
+    options.setdefault("conditions", [mpm.Traction("top", lambda t: (0, -LOAD * t))])
+    walls = {"left": "x", "right": "x", "bottom": "y"}
     body = meshed(grid, cells) if from_mesh else mpm.box(grid, [0, 0], [1, 1])
-    return mpm.Simulation(grid, [body], [material or soil()], fixed=fixed, **options)
+    return mpm.Simulation(grid, [body], [material or soil()], walls=walls, **options)
 
 
 def meshed(grid: mpm.Grid, cells: int):
@@ -112,12 +112,12 @@ def layered(cells: int, off: float) -> mpm.Simulation:
     """Return the draining block with four layers, of two conductivities in turn, so many cells off the grid lines."""
     h, heights = 1 / cells, np.arange(5) / 4
     heights[1:-1] += off * h
-    grid = mpm.Grid([1, 1 + 2 * h], [cells, cells + 2])
+    grid = mpm.Grid([0, 0], [1, 1 + 2 * h], [cells, cells + 2])
     bodies = [mpm.box(grid, [0, a], [1, b], material=k % 2) for k, (a, b) in enumerate(pairwise(heights))]
     soils = [soil(conductivity=k) for k in (1e-4, 1e-6)]
     load = mpm.Traction("top", lambda t: (0, -LOAD * t))
-    fixed = {"left": "x", "right": "x", "bottom": "y"}
-    return mpm.Simulation(grid, bodies, soils, fixed=fixed, tractions=[load], **WATER)
+    walls = {"left": "x", "right": "x", "bottom": "y"}
+    return mpm.Simulation(grid, bodies, soils, walls=walls, **WATER | {"conditions": [load, *WATER["conditions"]]})
 
 
 class Watched(mpm.Hencky):
@@ -151,39 +151,41 @@ def clayey(cells: int) -> mpm.Simulation:
     p = 1e5  # Pa
     moduli = {"shear": SHEAR, "kappa": p / soil().bulk, "lambda_": 5 * p / soil().bulk}
     clay = mpm.ModifiedCamClay(M=1.2, OCR=4.0, initial_stress=(-p, -p, -p), **moduli)
-    return block(cells, clay, tractions=[mpm.Traction("top", lambda t: (0, -p - LOAD * t))])
+    return block(cells, clay, conditions=[mpm.Traction("top", lambda t: (0, -p - LOAD * t))])
 
 
 def apart(cells: int, **options) -> mpm.Simulation:
     """Return the block with another body beside it, a quarter as wide, that touches nothing."""
     h = 1 / cells
-    grid = mpm.Grid([1.5, 1 + 2 * h], [round(1.5 * cells), cells + 2])
+    grid = mpm.Grid([0, 0], [1.5, 1 + 2 * h], [round(1.5 * cells), cells + 2])
     bodies = [mpm.box(grid, [0, 0], [1, 1]), mpm.box(grid, [1.25, 0], [1.5, 1])]
     load = mpm.Traction("top", lambda t: (0, -LOAD * t), region=((0, 0), (1, 2)))
-    fixed = {"left": "x", "right": "x", "bottom": "y"}
-    return mpm.Simulation(grid, bodies, [soil()], fixed=fixed, tractions=[load], **options)
+    walls = {"left": "x", "right": "x", "bottom": "y"}
+    return mpm.Simulation(
+        grid, bodies, [soil()], walls=walls, conditions=[load, *options.pop("conditions", [])], **options
+    )
 
 
 Make = Callable[[int], mpm.Simulation]
 PAIRS: dict[str, tuple[Make, Make]] = {
     "pore fluid that drains at once": (block, lambda n: block(n, soil(conductivity=1e3), **WATER)),
     "flux form": (lambda n: block(n, **SEALED), lambda n: block(n, soil(conductivity=1e-30), **SEALED)),
-    "seepage face": (draining, lambda n: draining(n, drained=[mpm.Drained("top", seepage=True)])),
+    "seepage face": (draining, lambda n: draining(n, conditions=[mpm.Drained("top", seepage=True)])),
     "layers off the grid lines": (partial(layered, off=0.0), partial(layered, off=0.5)),
     "second order in time": (lambda n: draining(n, method="backward-euler"), draining),
     "body force": (block, lambda n: block(n, gravity=(0, 0))),
     "initial stress": (block, lambda n: block(n, initial_stress=lambda x: np.zeros((len(x), 3)))),
     "pressure that follows the surface": (
         block,
-        lambda n: block(n, tractions=[mpm.Pressure("top", lambda t: LOAD * t)]),
+        lambda n: block(n, conditions=[mpm.Pressure("top", lambda t: LOAD * t)]),
     ),
     "rough tool that touches nothing": (
         block,
-        lambda n: block(n, tools=[mpm.Tool(mpm.HalfSpace((0, 2), (0, -1)), friction=0.3)]),
+        lambda n: block(n, conditions=[mpm.Tool(mpm.HalfSpace((0, 2), (0, -1)), friction=0.3)]),
     ),
     "contact of groups that are apart": (
         apart,
-        lambda n: apart(n, contacts=[mpm.Contact(0, 1, friction=0.3)]),
+        lambda n: apart(n, conditions=[mpm.Contact(0, 1, friction=0.3)]),
     ),
     "ghost penalty on all faces": (block, weighted),
     "damping of pressure jumps": (lambda n: conducting(n, mpm.Hencky), lambda n: conducting(n, Watched)),

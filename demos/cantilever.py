@@ -41,7 +41,7 @@ def traction(alpha: float) -> tuple[float, float]:
     return 0.0, -alpha * STIFFNESS / LENGTH**2 / HEIGHT
 
 
-PHYSICS = {"fixed": {"left": "xy"}, "tractions": [mpm.Traction("right", traction)]}
+PHYSICS = {"walls": {"left": "xy"}, "conditions": [mpm.Traction("right", traction)]}
 
 
 @dataclass
@@ -58,7 +58,7 @@ def run(cells: int = 8, steps: int = 40, last: int = 10) -> tuple[dict[str, floa
     Returns the errors that the module's docstring defines, and the axes.
     """
     h = HEIGHT / cells
-    grid = mpm.Grid(BOX, np.rint(BOX / h).astype(int))
+    grid = mpm.Grid([0, 0], BOX, np.rint(BOX / h).astype(int))
     bottom = BOX[1] - 2 * HEIGHT + h / 2
     body = mpm.box(grid, [0, bottom], [LENGTH, bottom + HEIGHT], per_cell=2)
     simulation = mpm.Simulation(grid, [body], [RUBBER], **PHYSICS)

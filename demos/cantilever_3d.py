@@ -47,7 +47,7 @@ def scene(cells: int, alpha: float) -> tuple[mpm.Simulation, mpm.surface.Probes]
     span = np.array([LENGTH * 1.05, SIDE, SIDE]) + reach + 3 * h
     span[1:] += h
     count = np.ceil(span / h).astype(int)
-    grid = mpm.Grid(count * h, count)
+    grid = mpm.Grid([0, 0, 0], count * h, count)
     lower = OFFSET * h
     lower[1:] += h
     lower[2] += np.ceil(reach[2] / h) * h
@@ -55,7 +55,7 @@ def scene(cells: int, alpha: float) -> tuple[mpm.Simulation, mpm.surface.Probes]
     body = mpm.box(grid, lower, lower + size)
     traction = ALONG * alpha * STIFFNESS / LENGTH**2 / SIDE**2
     pull = mpm.Traction("right", lambda t: traction * t)
-    simulation = mpm.Simulation(grid, [body], [RUBBER], fixed={"left": "xyz"}, tractions=[pull])
+    simulation = mpm.Simulation(grid, [body], [RUBBER], walls={"left": "xyz"}, conditions=[pull])
     return simulation, mpm.probes([body], [lower + size * [1, 0.5, 0.5]])
 
 

@@ -82,12 +82,19 @@ def ring(cells: int, soil: mpm.Skeleton, widest: float, outside: Callable | None
     """
     h = 1 / cells
     size = int(np.ceil(np.sqrt(OUTER**2 + widest**2 - 1) / h)) + 2
-    grid = mpm.Grid([size * h] * 2, [size] * 2)
+    grid = mpm.Grid([0] * 2, [size * h] * 2, [size] * 2)
     body = mpm.mapped(grid, mpm.box(grid, [0, 0], [OUTER - 1] * 2), lambda X: (1 + X[:, :1]) * ray(X))
     moved = [mpm.Displacement("left", lambda t, X: min(t, widest - 1) * ray(X))]
     if outside is not None:
         moved.append(mpm.Displacement("right", lambda t, X: outside(t) * ray(X)))
-    return mpm.Simulation(grid, [body], [soil], fixed={"left": "x", "bottom": "y"}, displacements=moved, **scene)
+    return mpm.Simulation(
+        grid,
+        [body],
+        [soil],
+        walls={"left": "x", "bottom": "y"},
+        conditions=[*moved, *scene.pop("conditions", [])],
+        **scene,
+    )
 
 
 def widen(s: mpm.Simulation, cells: int, radius: float, push: float) -> float:
@@ -142,7 +149,7 @@ def at_wall(s: mpm.Simulation, radius: float, h: float) -> float:
 def push(OCR: float, cells: int) -> Undrained:
     """Widen the hole in clay to the last of `MARKS`, fast, then let the clay drain."""
     soil = replace(CLAY, OCR=OCR, bulk=None)
-    water = {"fluid": mpm.Fluid(), "tractions": [mpm.Pressure("right", P0)], "drained": [mpm.Drained("right")]}
+    water = {"fluid": mpm.Fluid(), "conditions": [mpm.Pressure("right", P0), mpm.Drained("right")]}
     widest = MARKS[-1]
     s, out = ring(cells, soil, widest, **water), Undrained({}, {}, [], 0.0)
     for a in MARKS:
@@ -159,7 +166,8 @@ def push(OCR: float, cells: int) -> Undrained:
     look(s)
     result = s.result
     s.t = 0.0
-    s.stage(displacements=[mpm.Displacement("left", lambda t, X: (widest - 1) * ray(X))])
+    held = mpm.Displacement("left", lambda t, X: (widest - 1) * ray(X))
+    s.stage(conditions=[*(one for one in s.conditions if not isinstance(one, mpm.Displacement)), held])
     times = OUTER**2 / CV * np.array([0.003, 0.03, 0.1, 0.3, 3.0])
     before = out.balance = result.balance
     after = s.run(times[-1], rtol=2e-2, t_eval=times, observe=look, progress=False)

@@ -89,7 +89,7 @@ def bent(h: float) -> mpm.Simulation:
 def column(h: float) -> mpm.Simulation:
     """Return a drained column of 0.5 m x 1 m between smooth walls with a load on half of its top."""
     cells = np.rint(np.array([0.5, 1.2]) / h).astype(int)
-    grid = mpm.Grid([0.5, 1.2], cells)
+    grid = mpm.Grid([0, 0], [0.5, 1.2], cells)
     soil = beam.material(beam.arguments([]))
     footing = mpm.Traction("top", lambda t: (0, -1e6 * t), region=((0, 0), (0.25, 2)))
     return mpm.Simulation(
@@ -97,9 +97,8 @@ def column(h: float) -> mpm.Simulation:
         [mpm.box(grid, [0, 0], [0.5, 1.0])],
         [soil],
         fluid=mpm.Fluid(),
-        fixed={"left": "x", "right": "x", "bottom": "xy"},
-        tractions=[footing],
-        drained=[mpm.Drained("top")],
+        walls={"left": "x", "right": "x", "bottom": "xy"},
+        conditions=[footing, mpm.Drained("top")],
     )
 
 
@@ -121,8 +120,8 @@ def with_water(s: mpm.Simulation, bulk: float) -> mpm.Simulation:
 
     Its pressures become no larger than a tenth of that: the density would be none that water has.
     """
-    soils, conditions = s.scene.materials.materials, s.state.stage.conditions
-    other = mpm.Simulation(s.grid, s.bodies, soils, fluid=mpm.Fluid(bulk=bulk), **conditions)
+    soils, walls = s.scene.materials.materials, s.state.stage.conditions["walls"]
+    other = mpm.Simulation(s.grid, s.bodies, soils, fluid=mpm.Fluid(bulk=bulk), walls=walls, conditions=s.conditions)
     state, stay = replace(s.state, stage=other.state.stage), s.state.stay
     if stay is not None:
         share = min(1.0, bulk / 10 / max(np.abs(stay.pressure).max(), np.abs(stay.start).max(), 1e-300))

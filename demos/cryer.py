@@ -50,16 +50,16 @@ def scene(cells: int, axisymmetric: bool = False) -> mpm.Simulation:
     """Return the octant, or the quarter disc, with that many cells to the radius."""
     h = RADIUS / cells
     if axisymmetric:
-        grid, sides = mpm.Grid([RADIUS + h] * 2, [cells + 1] * 2, axisymmetric=True), ("right", "top")
+        grid, sides = mpm.Grid([0] * 2, [RADIUS + h] * 2, [cells + 1] * 2, axisymmetric=True), ("right", "top")
         quarter = mpm.mapped(grid, mpm.box(grid, [0, 0], [SQUARE] * 2), disc)
         pressed, drained = [mpm.Traction(s, -LOAD) for s in sides], [mpm.Drained(s) for s in sides]
-        acting = {"fixed": {"bottom": "y"}, "tractions": pressed, "drained": drained}
+        acting = {"walls": {"bottom": "y"}, "conditions": [*pressed, *drained]}
         return mpm.Simulation(grid, [quarter], [SAND], fluid=WATER, **acting)
-    grid = mpm.Grid([RADIUS + h] * 3, [cells + 1] * 3)
+    grid = mpm.Grid([0] * 3, [RADIUS + h] * 3, [cells + 1] * 3)
     octant = mpm.mapped(grid, mpm.box(grid, [0] * 3, [CUBE] * 3), ball)
     walls = {"left": "x", "front": "y", "bottom": "z"}
     pressed, drained = [mpm.Traction(s, -LOAD) for s in OUTER], [mpm.Drained(s) for s in OUTER]
-    return mpm.Simulation(grid, [octant], [SAND], fluid=WATER, fixed=walls, tractions=pressed, drained=drained)
+    return mpm.Simulation(grid, [octant], [SAND], fluid=WATER, walls=walls, conditions=[*pressed, *drained])
 
 
 @dataclass

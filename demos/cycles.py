@@ -40,7 +40,7 @@ def conditions(o: Namespace) -> dict:
     """Return the beam's conditions, with a load that rises and falls once a second."""
     region = ((beam.CLAMP, -np.inf), (beam.LENGTH, np.inf))
     load = mpm.Traction("top", lambda t: (0.0, -o.load * (1 - abs(2 * (t % 1) - 1))), region=region)
-    return {"fixed": {"left": "xy"}, "tractions": [load]}
+    return {"walls": {"left": "xy"}, "conditions": [load]}
 
 
 def rms(simulation: mpm.Simulation, away: float = 0.0) -> float:
@@ -91,7 +91,7 @@ def cycle(
     """
     o = options(h, load, quadrature)
     cells = np.rint(beam.BOX / h).astype(int)
-    grid = mpm.Grid(beam.BOX, cells)
+    grid = mpm.Grid([0, 0], beam.BOX, cells)
     bottom = (round(0.5 * beam.BOX[1] / h) + o.offset) * grid.h[1]
     body = seed(grid, [0, bottom], [beam.LENGTH, bottom + beam.HEIGHT], o.points_per_cell)
     given = {"quadrature": quadrature, "fluid": fluid, **conditions(o)}
@@ -101,7 +101,7 @@ def cycle(
             y = (points.position[1] - points.displacement[1] - bottom) / beam.HEIGHT
             return springs * 2 * y * (1 - y) * (points.displacement[1] + points.value(u)[1]) ** 2 * points.dx
 
-        given |= {"fixed": {"left": "x"}, "terms": [mpm.OnSide("left", held_up)]}
+        given |= {"walls": {"left": "x"}, "terms": [mpm.OnSide("left", held_up)]}
     simulation = mpm.Simulation(grid, [body], [material or beam.material(o)], **given)
     loaded = np.linspace(beam.CLAMP, beam.LENGTH, 201)[:-1] + (beam.LENGTH - beam.CLAMP) / 400
     places = [[beam.LENGTH, bottom + beam.HEIGHT / 2], *([x, bottom + beam.HEIGHT] for x in loaded)]
@@ -143,7 +143,7 @@ def turn(h: float, nu: float = 0.3, steps: int = 90, fluid: mpm.Fluid | None = N
     With a fluid the block is undrained.
     """
     cells = round(1.8 * BLOCK / h)
-    grid = mpm.Grid([cells * h] * 2, [cells] * 2)
+    grid = mpm.Grid([0] * 2, [cells * h] * 2, [cells] * 2)
     lower = 0.4 * BLOCK + 0.37 * h
     block = mpm.box(grid, [lower] * 2, [lower + BLOCK] * 2)
     centre = lower + BLOCK / 2
@@ -158,7 +158,7 @@ def turn(h: float, nu: float = 0.3, steps: int = 90, fluid: mpm.Fluid | None = N
 
     held = [mpm.Displacement(side, given(sign)) for side, sign in (("left", -1), ("right", 1))]
     law = mpm.Hencky(bulk=1e6 / (3 * (1 - 2 * nu)), shear=1e6 / (2 * (1 + nu)))
-    simulation = mpm.Simulation(grid, [block], [law], fluid=fluid, fixed={}, displacements=held)
+    simulation = mpm.Simulation(grid, [block], [law], fluid=fluid, walls={}, conditions=held)
     middle = (np.abs(simulation.points.x - centre) < BLOCK / 4).all(axis=1)
 
     def stress() -> np.ndarray:

@@ -60,7 +60,7 @@ class Dam:
 
 def run(h: float = 0.5, steps: int = 10) -> Dam:
     """Lower the reservoir of the dam on cells of size h, m, in so many steps of each length, and of the fall."""
-    grid = mpm.Grid([BASE + 2, HEIGHT + 1], np.rint(np.array([BASE + 2, HEIGHT + 1]) / h).astype(int))
+    grid = mpm.Grid([0, 0], [BASE + 2, HEIGHT + 1], np.rint(np.array([BASE + 2, HEIGHT + 1]) / h).astype(int))
 
     def trapezoid(X: np.ndarray) -> np.ndarray:
         wide = 1 - 2 * SLOPE * X[:, 1] / BASE
@@ -72,14 +72,14 @@ def run(h: float = 0.5, steps: int = 10) -> Dam:
 
     def conditions(level: float | Callable[[float], float]) -> dict:
         load, head = mpm.water("left", level)
-        return {"tractions": [load], "drained": [head, mpm.Drained("right", seepage=True)]}
+        return {"conditions": [load, head, mpm.Drained("right", seepage=True)]}
 
     simulation = mpm.Simulation(
         grid,
         [body],
         [soil],
         fluid=mpm.Fluid(),
-        fixed={"bottom": "xy"},
+        walls={"bottom": "xy"},
         gravity=(0, -9.81),
         pressure=mpm.hydrostatic(LEVELS[0]),
         initial_stress=mpm.K0(0.5, surcharge=lambda x: WEIGHT * np.maximum(LEVELS[0] - x[:, 1], 0)),
@@ -104,7 +104,7 @@ def rectangular(cells: int) -> float:
     """Return the flow through a rectangular dam, so many cells high, over the exact one."""
     upper, lower, width, top, k = 10.0, 2.0, 9.6, 12.0, 1e-5
     h = top / cells
-    grid = mpm.Grid([width + 2 * h, top + 2 * h], [round(width / h) + 2, cells + 2])
+    grid = mpm.Grid([0, 0], [width + 2 * h, top + 2 * h], [round(width / h) + 2, cells + 2])
     law = mpm.unsaturated(0.5 * WEIGHT * h)
     soil = mpm.LinearElastic(bulk=1e9, shear=5e8, porosity=0.3, conductivity=k, conductivity_law=law)
     simulation = mpm.Simulation(
@@ -112,8 +112,8 @@ def rectangular(cells: int) -> float:
         [mpm.box(grid, [h, 0], [width + h, top])],
         [soil],
         fluid=mpm.Fluid(),
-        fixed={"bottom": "xy"},
-        drained=[mpm.water("left", upper)[1], mpm.water("right", lower)[1]],
+        walls={"bottom": "xy"},
+        conditions=[mpm.water("left", upper)[1], mpm.water("right", lower)[1]],
         gravity=(0, -9.81),
         pressure=mpm.hydrostatic(upper),
     )
@@ -127,7 +127,7 @@ def drained(cells: int, k: float = 1e-5) -> float:
     With the heads h of the free surface and H at the base, dh/dt = -k (1 - H / h) / (specific yield).
     """
     high, low, head, h = 8.0, 4.0, 2.0, 10.0 / cells
-    grid = mpm.Grid([h, 10.0 + h], [1, cells + 1])
+    grid = mpm.Grid([0, 0], [h, 10.0 + h], [1, cells + 1])
     law = mpm.unsaturated(0.5 * WEIGHT * h, specific_yield=YIELD)
     soil = mpm.LinearElastic(bulk=1e9, shear=5e8, porosity=0.3, conductivity=k, conductivity_law=law)
     simulation = mpm.Simulation(
@@ -135,8 +135,8 @@ def drained(cells: int, k: float = 1e-5) -> float:
         [mpm.box(grid, [0, 0], [h, 10])],
         [soil],
         fluid=mpm.Fluid(),
-        fixed={"left": "x", "right": "x", "bottom": "y"},
-        drained=[mpm.Drained("bottom", WEIGHT * head)],
+        walls={"left": "x", "right": "x", "bottom": "y"},
+        conditions=[mpm.Drained("bottom", WEIGHT * head)],
         gravity=(0, -9.81),
         pressure=mpm.hydrostatic(high),
         initial_stress=mpm.K0(0.5),

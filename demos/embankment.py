@@ -83,16 +83,16 @@ class Bund:
 
 def run(h: float = 0.5, steps: int = 6) -> Bund:
     """Build the bund on cells of size h, m, with so many steps between two lifts, 6 times as many after."""
-    grid = mpm.Grid([WIDTH, CLAY + LIFTS + 1], np.rint(np.array([WIDTH, CLAY + LIFTS + 1]) / h).astype(int))
+    grid = mpm.Grid([0, 0], [WIDTH, CLAY + LIFTS + 1], np.rint(np.array([WIDTH, CLAY + LIFTS + 1]) / h).astype(int))
     bodies = [mpm.box(grid, [0, 0], [WIDTH, CLAY]), *[lift(grid, k) for k in range(LIFTS)]]
     simulation = mpm.Simulation(
         grid,
         bodies,
         [SOFT, SAND],
-        fixed={"left": "x", "right": "x", "bottom": "xy"},
+        walls={"left": "x", "right": "x", "bottom": "xy"},
         fluid=mpm.Fluid(),
         terms=[weight],
-        drained=[mpm.Drained("top")],
+        conditions=[mpm.Drained("top")],
         later=range(1, LIFTS + 1),
     )
     out = Bund()
@@ -106,7 +106,7 @@ def run(h: float = 0.5, steps: int = 6) -> Bund:
             values.append(float(value))
 
     for k in range(LIFTS):
-        simulation.stage(add=[k + 1], drained=[mpm.Drained(side) for side in ("top", "slope", "crest")])
+        simulation.stage(add=[k + 1], conditions=[mpm.Drained(side) for side in ("top", "slope", "crest")])
         last, now = k == LIFTS - 1, simulation.t
         times = [(now + 5 * DAY, 1), (now + PAUSE, steps), (now + END, 5 * steps)] if last else [(now + PAUSE, steps)]
         for part, (end, count) in enumerate(times):

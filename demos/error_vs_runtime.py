@@ -130,7 +130,9 @@ def scene_runs(
     def points(n: int, m: int, rtol: float | None = None, **options) -> Run:
         def run():
             h = size[1] / n
-            grid = mpm.Grid([size[0] + (2 * h if width < 0 else 0), size[1]], [n + 2 if width < 0 else width, n])
+            grid = mpm.Grid(
+                [0, 0], [size[0] + (2 * h if width < 0 else 0), size[1]], [n + 2 if width < 0 else width, n]
+            )
             body = mpm.box(grid, [0, 0], size)
             probe = mpm.probes([body], [[0, size[1]]])
             simulation = mpm.Simulation(grid, [body], [material], **physics, **options)
@@ -165,9 +167,8 @@ def terzaghi_runs(quick: bool) -> Iterator[tuple[str, str, Run]]:
     load = 1e-5 * terzaghi.SOIL.oedometric
     physics = {
         "fluid": terzaghi.WATER,
-        "fixed": {"left": "x", "right": "x", "bottom": "y"},
-        "tractions": [mpm.Traction("top", (0, -load))],
-        "drained": [mpm.Drained("top")],
+        "walls": {"left": "x", "right": "x", "bottom": "y"},
+        "conditions": [mpm.Traction("top", (0, -load)), mpm.Drained("top")],
     }
     end = 0.5 / terzaghi.CV
     exact = -1e-5 * float(terzaghi_consolidation(end, 1.0, terzaghi.CV))
@@ -182,9 +183,8 @@ def mandel_runs(quick: bool) -> Iterator[tuple[str, str, Run]]:
     slab = Mandel(1.0, 1.0, soil.bulk, soil.shear, soil.conductivity / water.unit_weight, force=20.0)
     physics = {
         "fluid": water,
-        "fixed": {"left": "x", "bottom": "y"},
-        "plates": [mpm.RigidPlate("top", 20.0)],
-        "drained": [mpm.Drained("right")],
+        "walls": {"left": "x", "bottom": "y"},
+        "conditions": [mpm.RigidPlate("top", 20.0), mpm.Drained("right")],
     }
     end = 0.1 / slab.cv
     exact = float(slab.displacement(0.0, 1.0, end)[1])
@@ -196,7 +196,7 @@ def column_runs(quick: bool) -> Iterator[tuple[str, str, Run]]:
     """Yield the runs of the soft column under its own weight."""
     soft = column.EXACT
     physics = {
-        "fixed": {"left": "x", "right": "x", "bottom": "y"},
+        "walls": {"left": "x", "right": "x", "bottom": "y"},
         "gravity": lambda t: (0, -soft.gravity * t),
     }
     cells, steps = ((8, 16), ()) if quick else ((8, 16, 32, 64), (160,))

@@ -33,11 +33,13 @@ WATER = mpm.Fluid()
 
 def column(cells: int, material: mpm.Skeleton, load: float = LOAD, **scene) -> mpm.Simulation:
     """Return the column under a load on its top that grows from t = 0 to 1 s."""
-    grid = mpm.Grid([1 / cells, 1.0 + 2 / cells], [1, cells + 2])
+    grid = mpm.Grid([0, 0], [1 / cells, 1.0 + 2 / cells], [1, cells + 2])
     body = mpm.box(grid, [0, 0], [1 / cells, 1])
     top = mpm.Traction("top", lambda t: (0, -load * min(1, t)))
     walls = {"left": "x", "right": "x", "bottom": "y"}
-    return mpm.Simulation(grid, [body], [material], fixed=walls, tractions=[top], **scene)
+    return mpm.Simulation(
+        grid, [body], [material], walls=walls, conditions=[top, *scene.pop("conditions", [])], **scene
+    )
 
 
 @dataclass
@@ -157,7 +159,7 @@ def flow(cells: int, law: Callable, exact_law: Callable, title: str) -> Example:
 
     soil = mpm.Hencky(bulk=modulus, shear=modulus, conductivity=1e-4, conductivity_law=law)
     drained = [mpm.Drained("top"), mpm.Drained("bottom", pressure=1.0)]
-    s = column(cells, soil, fluid=WATER, drained=drained)
+    s = column(cells, soil, fluid=WATER, conditions=drained)
     s.run(2000, 100)
     J = np.array([stretch(lambda a, M=M: M * 7 / 3 * np.log(a) / a) for M in (1e6, 4e6)])
     n = 1 - 0.6 / J
@@ -210,7 +212,7 @@ def source(points, q):
 
 def well(cells: int) -> Example:
     soil = mpm.Hencky(bulk=1e9, shear=1e9, conductivity=1e-6)
-    s = column(cells, soil, fluid=WATER, drained=[mpm.Drained("top")], sources=[source])
+    s = column(cells, soil, fluid=WATER, conditions=[mpm.Drained("top")], terms=[mpm.Source(source)])
     s.run(100, 10)
     y, p = pressures(s)
     exact = RATE * WATER.unit_weight / soil.conductivity / 2 * (1 - y**2)
@@ -253,7 +255,7 @@ def damage(cells: int) -> Example:
         return 0, 0.3 * np.interp(t, [0, 0.4, 0.7, 1], [0, -0.6, -0.1, -1])
 
     soft = Damaged(bulk=1e6, shear=6e5)
-    s = column(cells, soft, load=0.0, displacements=[mpm.Displacement("top", top, "y")])
+    s = column(cells, soft, load=0.0, conditions=[mpm.Displacement("top", top, "y")])
     _, stress = path(s, 40)
     strain = -np.log([1 + top(t, None)[1] for t in np.arange(1, 41) / 40])
     sound = 6e5 * (1 - np.exp(-2 * strain)) + 6e5 * strain
@@ -346,7 +348,7 @@ def numpy_law(cells: int) -> Example:
 
     top = [mpm.Traction("top", lambda t: (0, -load(t)))]
     s = column(cells, foam, load=0.0)
-    s.stage(tractions=top)
+    s.stage(conditions=top)
     strain, stress = path(s, 20)
     crushed, exact = 0.0, []
     for e in strain:

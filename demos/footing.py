@@ -170,9 +170,11 @@ def push(
     end, edge = (depth * WIDTH**2 / (CV * rate) if rate else 1.0), WIDTH / 2
     under, beside = ((0, -np.inf), (edge, np.inf)), ((edge - h / 2, -np.inf), (np.inf, np.inf))  # from its last node on
     footing = mpm.Displacement("top", lambda t, X: (0, -depth * WIDTH * min(1, t / end)), region=under)
-    water = {"fluid": WATER, "method": method, "drained": [mpm.Drained("top", region=beside)]} if rate else {}
-    fixed = {"left": "x", "right": "x", "bottom": "xy"}
-    simulation = mpm.Simulation(grid, [body], [soil], fixed=fixed, displacements=[footing], **water)
+    water = {"fluid": WATER, "method": method, "conditions": [mpm.Drained("top", region=beside)]} if rate else {}
+    walls = {"left": "x", "right": "x", "bottom": "xy"}
+    simulation = mpm.Simulation(
+        grid, [body], [soil], walls=walls, conditions=[footing, *water.pop("conditions", [])], **water
+    )
     out = Push()
 
     def observe(s: mpm.Simulation) -> None:

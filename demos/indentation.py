@@ -66,13 +66,20 @@ def contact(s: mpm.Simulation) -> Contact:
 def scene(cells: int, wet: bool) -> mpm.Simulation:
     """Return half of the gel under the cylinder, with so many cells to a metre."""
     n, h = round(SIZE * cells), 1 / cells
-    grid = mpm.Grid([SIZE, SIZE + 4 * h], [n, n + 4])
+    grid = mpm.Grid([0, 0], [SIZE, SIZE + 4 * h], [n, n + 4])
     top = SIZE + 0.3 * h  # the surface is no line of the grid
     at_once = INSTANT * TIME
     ball = mpm.Tool(mpm.Ball((0, top + RADIUS), RADIUS), displacement=lambda t: (0, -DEPTH * min(1, t / at_once)))
-    water = {"fluid": mpm.Fluid(), "drained": [mpm.Drained("right")]} if wet else {}
+    water = {"fluid": mpm.Fluid(), "conditions": [mpm.Drained("right")]} if wet else {}
     walls = {"left": "x", "right": "x", "bottom": "y"}
-    return mpm.Simulation(grid, [mpm.box(grid, [0, 0], [SIZE, top])], [GEL], fixed=walls, tools=[ball], **water)
+    return mpm.Simulation(
+        grid,
+        [mpm.box(grid, [0, 0], [SIZE, top])],
+        [GEL],
+        walls=walls,
+        conditions=[ball, *water.pop("conditions", [])],
+        **water,
+    )
 
 
 @dataclass
@@ -91,7 +98,7 @@ class Pressed:
 def pressed(cells: int, wet: bool) -> Pressed:
     """Press the cylinder into the gel and, if it is wet, let it drain."""
     s = scene(cells, wet)
-    tool = s.state.stage.conditions["tools"][0]
+    tool = s.conditions[0]
     result = s.run(INSTANT * TIME, INSTANT * TIME, progress=False)
     out = Pressed([contact(s)], [], (s.points.corners, s.points.pressure, tool.drawn(s.grid, s.t)), 0.0, result.cuts)
     out.forces.append(out.contacts[0].force)

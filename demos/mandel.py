@@ -60,16 +60,15 @@ def run(cells: int = 40, steps: int = 30, method: str = "sdirk2") -> tuple[dict[
     Returns the errors that the module's docstring defines, and the histories.
     """
     rows = max(1, cells // 4)  # the solution is linear in y
-    grid = mpm.Grid([WIDTH + WIDTH / cells, HEIGHT], [cells + 1, rows])  # the slab bulges into the last column
+    grid = mpm.Grid([0, 0], [WIDTH + WIDTH / cells, HEIGHT], [cells + 1, rows])  # the slab bulges into the last column
     quarter = mpm.box(grid, [0, 0], [WIDTH, HEIGHT], per_cell=2)
     simulation = mpm.Simulation(
         grid,
         [quarter],
         [SOIL],
         fluid=WATER,
-        fixed={"left": "x", "bottom": "y"},
-        plates=[mpm.RigidPlate("top", FORCE)],
-        drained=[mpm.Drained("right")],
+        walls={"left": "x", "bottom": "y"},
+        conditions=[mpm.RigidPlate("top", FORCE), mpm.Drained("right")],
         method=method,
     )
     top = mpm.probes([quarter], [[x, HEIGHT] for x in np.linspace(0, WIDTH, 11)])

@@ -72,7 +72,7 @@ def clay(cells: int, nose: float = 1, y: float = 0.0) -> tuple:
     """Return a grid with so many cells over the diameter, half of the block around a bar at y, m, its top's region."""
     h = D / cells
     n = round(HALF * cells)
-    grid = mpm.Grid([HALF, HALF + 4 * h], [n, 2 * n + 4], lower=[0, -HALF])
+    grid = mpm.Grid([0, -HALF], [HALF, HALF + 4 * h], [n, 2 * n + 4])
     around, outward = 4 * round(np.pi * D / 2 / (FINE * h) / 4), round(np.log(2 * HALF / D) * D / 2 / (FINE * h))
     corners = [0, np.arctan2(HALF, HALF + y), np.pi - np.arctan2(HALF, HALF - y), np.pi]
     at = np.interp(angles(around, nose), np.pi * np.array([0, 1, 3, 4]) / 4, corners)
@@ -121,7 +121,7 @@ def leg(out: Push, stress: Callable | None, alpha: float, cells: int, y: float, 
     soil = mpm.DruckerPrager(bulk=50 * SHEAR, shear=SHEAR, friction=0.0, dilation=0.0, cohesion=STRENGTH)
     bar = mpm.Tool(mpm.Ball((0, y * D), D / 2), lambda t: (0, -D * max(0, t - begin)), adhesion=alpha * STRENGTH)
     load = mpm.Pressure("right", lambda t: PRESSURE * (min(1, t) if begin else 1), region=top)
-    acting = {"fixed": WALLS, "tractions": [load], "tools": [bar], "initial_stress": stress}
+    acting = {"walls": WALLS, "conditions": [load, bar], "initial_stress": stress}
     simulation = mpm.Simulation(grid, [body], [soil], **acting)
     if begin:
         simulation.run(begin, begin, progress=False)
@@ -164,8 +164,10 @@ def push_wet(rate: float, cells: int, depth: float) -> Push:
     start, end = SETTLED * depth * D / speed, (1 + SETTLED) * depth * D / speed
     bar = mpm.Tool(mpm.Ball((0, 0), D / 2), lambda t: (0, -speed * max(0, t - start)))
     load = mpm.Pressure("right", lambda t: PRESSURE * min(1, t / start), region=top)
-    water = {"fluid": WATER, "drained": [mpm.Drained("right", lambda t: PRESSURE * min(1, t / start), region=top)]}
-    simulation = mpm.Simulation(grid, [body], [CLAY], fixed=WALLS, tractions=[load], tools=[bar], **water)
+    water = {"fluid": WATER, "conditions": [mpm.Drained("right", lambda t: PRESSURE * min(1, t / start), region=top)]}
+    simulation = mpm.Simulation(
+        grid, [body], [CLAY], walls=WALLS, conditions=[load, bar, *water.pop("conditions", [])], **water
+    )
     simulation.run(start, start, progress=False)
     out = Push()
 

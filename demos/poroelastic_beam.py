@@ -81,12 +81,12 @@ def physics(o: Namespace, dim: int = 2) -> dict:
         lambda t: [0.0] * (dim - 1) + [-o.load * min(1.0, t / o.ramp)],
         region=((CLAMP, *np.negative(inner)), (LENGTH, *inner)),
     )
-    fixed = {"left": "xy"} if dim == 2 else {"left": "xyz", "front": "y", "back": "y"}
+    walls = {"left": "xy"} if dim == 2 else {"left": "xyz", "front": "y", "back": "y"}
     if o.drained:
-        return {"fixed": fixed, "tractions": [load]}
+        return {"walls": walls, "conditions": [load]}
     fluid = mpm.Fluid(bulk=o.fluid_bulk)
     ends = [mpm.Drained("left"), mpm.Drained("right")]
-    return {"fixed": fixed, "tractions": [load], "fluid": fluid, "drained": ends}
+    return {"walls": walls, "conditions": [load, *ends], "fluid": fluid}
 
 
 def material(o: Namespace) -> mpm.Hencky:
@@ -108,7 +108,7 @@ def scene(o: Namespace) -> tuple[mpm.Simulation, float]:
             np.insert(x, 1, y) for x, y in ((lower, 0), (upper, DEPTH), (start, 0), (end, DEPTH))
         )
         cells = np.insert(cells, 1, 1)
-    grid = mpm.Grid(upper, cells, lower)
+    grid = mpm.Grid(lower, upper, cells)
     beam = mpm.box(grid, start, end, per_cell=o.points_per_cell)
     conditions = physics(o, o.dim)
     options = {"quadrature": o.quadrature, "coupling": o.coupling, "method": o.method}

@@ -67,7 +67,7 @@ def scene(dim: int, points: float) -> tuple[mpm.Simulation, float]:
         return beam.scene(beam.arguments(["--h", str(h), "--ramp", "0.6"]))[0], 0.02
     n = max(2, round((points / 8) ** (1 / 3)))
     margin = 1.5 + n // 8  # cells: the cube leans by a tenth of its width
-    grid = mpm.Grid([1 + 2 * margin / n] * 3, [n + round(2 * margin)] * 3)
+    grid = mpm.Grid([0] * 3, [1 + 2 * margin / n] * 3, [n + round(2 * margin)] * 3)
     lower = np.array([margin, margin, 0]) / n
     load = mpm.Traction("top", lambda t: (2e4 * t, 1e4 * t, -5e4 * t))
     simulation = mpm.Simulation(
@@ -75,9 +75,8 @@ def scene(dim: int, points: float) -> tuple[mpm.Simulation, float]:
         [mpm.box(grid, lower, lower + 1)],
         [mpm.Hencky(bulk=4e6 / 3, shear=1e6, conductivity=1e-5)],
         fluid=mpm.Fluid(),
-        fixed={"bottom": "xyz"},
-        drained=[mpm.Drained("top")],
-        tractions=[load],
+        walls={"bottom": "xyz"},
+        conditions=[mpm.Drained("top"), load],
     )
     return simulation, 0.25
 

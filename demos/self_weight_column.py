@@ -45,13 +45,13 @@ class Outcome:
 def run(cells: int = 64, steps: int = 40, quadrature: str = "domain") -> Outcome:
     """Load the column, that many cells high, in equal steps."""
     h = EXACT.l0 / cells
-    grid = mpm.Grid([h, EXACT.l0], [1, cells])
+    grid = mpm.Grid([0, 0], [h, EXACT.l0], [1, cells])
     column = mpm.box(grid, [0, 0], [h, EXACT.l0], per_cell=2)
     simulation = mpm.Simulation(
         grid,
         [column],
         [FOAM],
-        fixed={"left": "x", "right": "x", "bottom": "y"},
+        walls={"left": "x", "right": "x", "bottom": "y"},
         gravity=lambda t: (0, -EXACT.gravity * t),
         quadrature=quadrature,
     )

@@ -48,7 +48,7 @@ def slope(cells: int) -> mpm.Simulation:
     )
     walls = {"left": "x", "right": "x", "bottom": "xy"}
     s = mpm.Simulation(
-        grid, [ground, bank], [soil], fixed=walls, terms=[common.weight(WEIGHT), common.viscous(VISCOSITY)]
+        grid, [ground, bank], [soil], walls=walls, terms=[common.weight(WEIGHT), common.viscous(VISCOSITY)]
     )
     s.run(1e9, 1e9, progress=False)  # time in which nothing of the viscosity is left
     s.stage(reset_displacement=True)

@@ -52,7 +52,7 @@ CV = CONDUCTIVITY / mpm.Fluid().unit_weight * (2 + 4 / 3) * SHEAR  # m²/s
 def bank(cells: int, length: float, room: float, friction: float, cohesion: float, conductivity: float, **scene):
     """Return the consolidated bank with so many cells over its height, `room` m before it, and a probe on its crest."""
     h = HEIGHT / cells
-    grid = mpm.Grid([length + room, HEIGHT + h], [round((length + room) / h), cells + 1])
+    grid = mpm.Grid([0, 0], [length + room, HEIGHT + h], [round((length + room) / h), cells + 1])
     body = mpm.box(grid, [0, 0], [length, HEIGHT])
     soil = mpm.DruckerPrager(
         bulk=2 * SHEAR,
@@ -64,7 +64,7 @@ def bank(cells: int, length: float, room: float, friction: float, cohesion: floa
         conductivity=conductivity,
     )
     walls = {"left": "x", "bottom": "xy"}
-    simulation = mpm.Simulation(grid, [body], [soil], fluid=mpm.Fluid(), fixed=walls, **scene)
+    simulation = mpm.Simulation(grid, [body], [soil], fluid=mpm.Fluid(), walls=walls, **scene)
     simulation.run(1e12, 1e12, progress=False)  # time enough for the water to leave, where it can
     simulation.stage(reset_displacement=True)
     simulation.t = 0.0
@@ -184,7 +184,7 @@ def slump(cells: int, steps: int) -> Slump:
         STRONG,
         CONDUCTIVITY,
         terms=[common.weight(WEIGHT), common.viscous(VISCOSITY)],
-        drained=sides,
+        conditions=sides,
     )
     out = Slump()
 

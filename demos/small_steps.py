@@ -61,24 +61,22 @@ def column(cells: int, steps: int, way: float = 0.0, softness: float = 0.0, stra
     water = mpm.Fluid(bulk=SOIL.porosity * modulus / softness if softness else np.inf)
     t_end = T_END * HEIGHT**2 * (1 + softness) / (SOIL.conductivity / water.unit_weight * modulus)
     below = int(np.ceil(way * cells))
-    grid = mpm.Grid([h, HEIGHT], [1, cells + below], lower=[0, -below * h])
+    grid = mpm.Grid([0, -below * h], [h, HEIGHT], [1, cells + below])
     foot = mpm.Displacement("bottom", lambda t, X: (0, -way * HEIGHT * t / t_end), "y")
     simulation = mpm.Simulation(
         grid,
         [mpm.box(grid, [0, 0], [h, HEIGHT])],
         [SOIL],
         fluid=water,
-        fixed={"left": "x", "right": "x", **({} if way else {"bottom": "y"})},
-        tractions=[mpm.Traction("top", (0, -load))],
-        displacements=[foot] if way else [],
-        drained=[mpm.Drained("top")],
+        walls={"left": "x", "right": "x", **({} if way else {"bottom": "y"})},
+        conditions=[mpm.Traction("top", (0, -load)), *([foot] if way else []), mpm.Drained("top")],
     )
     highest = []
     simulation.run(t_end, t_end / steps, observe=lambda s: highest.append(s.points.pressure.max() / p0))
     scene, (on_grid, _) = simulation.scene, simulation.scene.last
     here = on_grid.contents.filled
     # the cells hold what they held at the start of the last step
-    y = grid.midpoints[here, 1] + on_grid.contents.centroid[here, 1] + way * HEIGHT * (1 - 1 / steps)
+    y = (grid.base + grid.midpoints[here] + on_grid.contents.centroid[here])[:, 1] + way * HEIGHT * (1 - 1 / steps)
     z, p = np.clip(1 - y / HEIGHT, 0, 1), scene.storage.p.x.array[here] / p0
     volume = scene.momentum.ghost.fill.x.array[here]
     error = np.sqrt(volume @ (p - terzaghi_pressure(z, T_END, 1.0, 1.0)) ** 2 / volume.sum())
@@ -100,7 +98,7 @@ def error_of_cells(cells: int) -> float:
 
 def strip(cells: int, dt: float, law: type[mpm.Skeleton]) -> NDArray[np.float64]:
     """Return p / load (nx, ny) after the first step, dt over the time of consolidation, under a strip load."""
-    grid = mpm.Grid([2 * HEIGHT, HEIGHT], [2 * cells, cells])
+    grid = mpm.Grid([0, 0], [2 * HEIGHT, HEIGHT], [2 * cells, cells])
     soil = law(bulk=SOIL.bulk, shear=SOIL.shear, porosity=SOIL.porosity, conductivity=SOIL.conductivity)
     load = 1e-5 * SOIL.oedometric
     simulation = mpm.Simulation(
@@ -108,9 +106,8 @@ def strip(cells: int, dt: float, law: type[mpm.Skeleton]) -> NDArray[np.float64]
         [mpm.box(grid, [0, 0], [2 * HEIGHT, HEIGHT])],
         [soil],
         fluid=terzaghi.WATER,
-        fixed={"left": "xy", "right": "xy", "bottom": "xy"},
-        tractions=[mpm.Traction("top", (0, -load), region=((0, 0), (HEIGHT / 2, 2 * HEIGHT)))],
-        drained=[mpm.Drained("top")],
+        walls={"left": "xy", "right": "xy", "bottom": "xy"},
+        conditions=[mpm.Traction("top", (0, -load), region=((0, 0), (HEIGHT / 2, 2 * HEIGHT))), mpm.Drained("top")],
     )
     simulation.step(dt * HEIGHT**2 / terzaghi.CV)
     p = np.empty(grid.shape.prod())

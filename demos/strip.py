@@ -58,7 +58,7 @@ WALLS = {"left": "x", "right": "x", "bottom": "y"}
 def conditions(load: float) -> dict:
     """Return what acts, load over E."""
     strip = mpm.Traction("top", lambda t: (0, -load * E * min(1, t / (RAMP * UNIT))), ((0, 0), (STRIP, 2 * HEIGHT)))
-    return {"fluid": WATER, "fixed": WALLS, "tractions": [strip], "drained": [mpm.Drained("top")]}
+    return {"fluid": WATER, "walls": WALLS, "conditions": [strip, mpm.Drained("top")]}
 
 
 def times(a_decade: int) -> NDArray[np.float64]:
@@ -86,7 +86,7 @@ class Outcome:
 def run(cells: int = 40, load: float = 0.25, a_decade: int = 30) -> Outcome:
     """Consolidate a layer of that many cells in its height under a load over E."""
     h = HEIGHT / cells
-    grid = mpm.Grid([HEIGHT, HEIGHT + 4 * h], [cells, cells + 4])
+    grid = mpm.Grid([0, 0], [HEIGHT, HEIGHT + 4 * h], [cells, cells + 4])
     body = mpm.box(grid, [0, 0], [HEIGHT, HEIGHT])
     simulation, top = mpm.Simulation(grid, [body], [SOIL], **conditions(load)), mpm.probes([body], PLACES)
     out, shown = Outcome(), [0.1, 10**0.5]

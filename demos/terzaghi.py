@@ -54,16 +54,15 @@ def run(
     In equal steps, or with `rtol` in steps chosen by their error.
     """
     h, load = HEIGHT / cells, strain * SOIL.oedometric
-    grid = mpm.Grid([h, HEIGHT], [1, cells])
+    grid = mpm.Grid([0, 0], [h, HEIGHT], [1, cells])
     column = mpm.box(grid, [0, 0], [h, HEIGHT], per_cell=2)
     simulation = mpm.Simulation(
         grid,
         [column],
         [SOIL],
         fluid=WATER,
-        fixed={"left": "x", "right": "x", "bottom": "y"},
-        tractions=[mpm.Traction("top", (0, -load))],
-        drained=[mpm.Drained("top")],
+        walls={"left": "x", "right": "x", "bottom": "y"},
+        conditions=[mpm.Traction("top", (0, -load)), mpm.Drained("top")],
         method=method,
     )
     out = Outcome(mpm.Result())

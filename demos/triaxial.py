@@ -56,10 +56,10 @@ def sand_errors(tests: dict[float, mpm.ElementTest]) -> dict[str, float]:
 def block(soil: mpm.Skeleton, cells: int) -> mpm.Simulation:
     """Return a block under p_0 on its free side, which is squeezed by a thousandth of its height in a second."""
     h = 1 / cells
-    grid = mpm.Grid([1 + 2 * h] * 2, [cells + 2] * 2)
+    grid = mpm.Grid([0] * 2, [1 + 2 * h] * 2, [cells + 2] * 2)
     squeeze = mpm.Displacement("top", lambda t, X: (0, -1e-3 * t), components="y")
-    loads = {"fixed": {"left": "x", "bottom": "y"}, "tractions": [mpm.Pressure("right", P0)]}
-    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 1])], [soil], displacements=[squeeze], **loads)
+    walls, load = {"left": "x", "bottom": "y"}, mpm.Pressure("right", P0)
+    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 1])], [soil], walls=walls, conditions=[squeeze, load])
     if not isinstance(soil, mpm.ModifiedCamClay):  # sand begins with its pressure as elastic strain
         s.stage(fields={"plastic": np.exp(-2 * P0 / (3 * soil.bulk)) * np.eye(3)})
     return s

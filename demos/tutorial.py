@@ -32,7 +32,7 @@ out = parser.parse_args().out
 # The grid is a box of equal cells, a dolfinx mesh.  A material point stands for a quadrilateral, its domain, whose
 # corners are tracked.  Corner k is at the lower or upper end of each axis: (0, 0), (1, 0), (0, 1), (1, 1).
 
-grid = mpm.Grid(upper=[0.4, 1.2], cells=[4, 12])
+grid = mpm.Grid(lower=[0, 0], upper=[0.4, 1.2], cells=[4, 12])
 domain = np.array([[[0.07, 0.22], [0.25, 0.26], [0.04, 0.36], [0.25, 0.46]]])
 pieces = cut(grid, domain)
 print(f"1. a domain of {volumes(domain)[0]:.5f} m^2 has {len(pieces.cell)} pieces; their shares add up to one")
@@ -129,7 +129,7 @@ assert apart < 1e-3
 soil = mpm.NeoHookean(bulk=BULK, shear=SHEAR, porosity=0.5, grain_density=WEIGHT / 9.81 / 0.5)  # dry
 column = mpm.box(grid, [0, 0], [0.4, 0.95], per_cell=2)
 walls = {"left": "x", "right": "x", "bottom": "y"}
-simulation = mpm.Simulation(grid, [column], [soil], fixed=walls, gravity=(0, -9.81))
+simulation = mpm.Simulation(grid, [column], [soil], walls=walls, gravity=(0, -9.81))
 result = simulation.run(t_end=1, dt=1, probes=mpm.probes([column], [[0.2, 0.95]]))
 print(f"5. the package: {-result.displacement[-1][0, 1]:.5f} m")
 assert abs(-result.displacement[-1][0, 1] / settlement - 1) < 5e-3
@@ -140,16 +140,15 @@ height, load = 1.0, 100.0
 soil = mpm.LinearElastic(bulk=1e7 / 3, shear=5e6, conductivity=1e-4)
 water = mpm.Fluid(bulk=np.inf)
 consolidation = soil.conductivity / water.unit_weight * soil.oedometric / height**2  # T_v of a second
-grid = mpm.Grid([0.05, height], [1, 20])
+grid = mpm.Grid([0, 0], [0.05, height], [1, 20])
 column = mpm.box(grid, [0, 0], [0.05, height])
 simulation = mpm.Simulation(
     grid,
     [column],
     [soil],
     fluid=water,
-    fixed=walls,
-    tractions=[mpm.Traction("top", (0, -load))],
-    drained=[mpm.Drained("top")],
+    walls=walls,
+    conditions=[mpm.Traction("top", (0, -load)), mpm.Drained("top")],
 )
 simulation.run(t_end=0.1 / consolidation, rtol=1e-3)
 held = simulation.cells()
@@ -162,7 +161,7 @@ assert error < 5e-3
 import matplotlib.pyplot as plt  # noqa: E402
 from matplotlib.patches import Polygon  # noqa: E402
 
-pieces = cut(mpm.Grid(upper=[0.4, 1.2], cells=[4, 12]), domain)
+pieces = cut(mpm.Grid(lower=[0, 0], upper=[0.4, 1.2], cells=[4, 12]), domain)
 figure, ax = plt.subplots(figsize=(6, 4.2), layout="constrained")
 ax.add_patch(Polygon(domain[0][[0, 1, 3, 2]], facecolor="#cfe3f2", edgecolor="black"))
 for x, share in zip(pieces.x, pieces.fraction, strict=True):

@@ -44,7 +44,7 @@ def path(t: float) -> tuple[float, float]:
 
 def scene(cells: int) -> mpm.Simulation:
     """Return the two gels, with so many cells over a radius."""
-    grid = mpm.Grid([4.5, 2.25], [round(4.5 * cells), round(2.25 * cells)])
+    grid = mpm.Grid([0, 0], [4.5, 2.25], [round(4.5 * cells), round(2.25 * cells)])
     low, high = (1.5, 0.0), (1.5, 2 * RADIUS + GAP)
     bodies = [half_disc(grid, low, 1.0), half_disc(grid, high, -1.0)]
     above = ([0, high[1]], [4.5, 2.25])
@@ -52,9 +52,8 @@ def scene(cells: int) -> mpm.Simulation:
         grid,
         bodies,
         [GEL],
-        fixed={"bottom": "xy"},
-        displacements=[mpm.Displacement("top", lambda t, X: path(t), region=above)],
-        contacts=[mpm.Contact(1, 0, friction=FRICTION)],
+        walls={"bottom": "xy"},
+        conditions=[mpm.Displacement("top", lambda t, X: path(t), region=above), mpm.Contact(1, 0, friction=FRICTION)],
     )
 
 
@@ -62,7 +61,7 @@ def hertz(cells: int) -> dict[str, float]:
     """Return cells over the half-width, and the errors of the largest pressure and the half-width, relative."""
     E, nu, R, L = 1e6, 0.3, 20.0, 4.0
     stiff, top, n = E / (1 - nu**2) / 2, L + 0.3 / cells, [round(L * cells), round((2 * L + 2) * cells)]
-    grid = mpm.Grid([L, 2 * L + 2], n)
+    grid = mpm.Grid([0, 0], [L, 2 * L + 2], n)
 
     def bend(x: np.ndarray) -> np.ndarray:
         return x + np.column_stack([0 * x[:, 0], (1 - (x[:, 1] - top) / L) * x[:, 0] ** 2 / (2 * R)])
@@ -71,7 +70,7 @@ def hertz(cells: int) -> dict[str, float]:
     held = mpm.Displacement("top", lambda t, X: (0, -0.041 * t), components="y", region=([0, top + L / 2], [L, 10]))
     soil = mpm.Hencky(bulk=E / (3 - 6 * nu), shear=E / (2 + 2 * nu))
     walls = {"left": "x", "right": "x", "bottom": "xy"}
-    s = mpm.Simulation(grid, bodies, [soil], fixed=walls, displacements=[held], contacts=[mpm.Contact(0, 1)])
+    s = mpm.Simulation(grid, bodies, [soil], walls=walls, conditions=[held, mpm.Contact(0, 1)])
     s.run(1.0, 1.0, progress=False)
     force = 2 * abs(s.tool_forces[0, 1])
     half, most = 2 * np.sqrt(force * R / (np.pi * stiff)), np.sqrt(force * stiff / (np.pi * R))

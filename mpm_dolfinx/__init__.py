@@ -19,7 +19,16 @@ from mpm_dolfinx.bodies.bodies import mapped
 from mpm_dolfinx.bodies.boxes import box, shape
 from mpm_dolfinx.bodies.mesh_files import from_mesh
 from mpm_dolfinx.bodies.polygon import polygon
-from mpm_dolfinx.conditions.conditions import Displacement, Drained, Inflow, OnSide, Pressure, RigidPlate, Traction
+from mpm_dolfinx.conditions.conditions import (
+    Displacement,
+    Drained,
+    Inflow,
+    OnSide,
+    Pressure,
+    RigidPlate,
+    Source,
+    Traction,
+)
 from mpm_dolfinx.conditions.water import water
 from mpm_dolfinx.contact.groups import Contact
 from mpm_dolfinx.contact.tools import Ball, Cone, Convex, HalfSpace, Tool
@@ -84,6 +93,7 @@ __all__ = [
     "Simulation",
     "Skeleton",
     "SofteningDruckerPrager",
+    "Source",
     "State",
     "Tool",
     "Traction",

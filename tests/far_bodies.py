@@ -11,7 +11,7 @@ THERE = ((2.0, -np.inf), (np.inf, np.inf))
 
 def beside(kind: str | None, stiffer: float = 1.0, wet: bool = False, law=None, **options) -> mpm.Simulation:
     """Return the scene; stiffer: what the other body's modulus is in terms of the beam's; law: of the beam."""
-    grid = mpm.Grid([3.6, 1.2], [30, 10])
+    grid = mpm.Grid([0, 0], [3.6, 1.2], [30, 10])
     soft, hard = (mpm.Hencky(bulk=f * E / 1.8, shear=f * E / 2.6, conductivity=1e-4) for f in (1, stiffer))
     bodies, materials = [mpm.box(grid, [0, 0.42], [1, 0.75])], [law or soft]
     at_beam = ((0.05, -np.inf), (1.01, np.inf))
@@ -21,11 +21,12 @@ def beside(kind: str | None, stiffer: float = 1.0, wet: bool = False, law=None, 
         bodies.append(mpm.box(grid, [2.52, 0.3], [3.0, 0.78], material=1))
         materials.append(hard)
         way = (lambda t, X: (0.1 * t, 0.05 * t)) if kind == "moves" else (0, 0)
-        options["displacements"] = [mpm.Displacement("bottom", way, region=THERE)]
+        loads += [mpm.Displacement("bottom", way, region=THERE)]
     if kind in ("loaded", "drains"):
         loads.append(mpm.Traction("top", lambda t: (0, -0.05 * stiffer * E * t), region=THERE))
     if kind == "drains":
         drained.append(mpm.Drained("top", region=THERE))
     if wet:
-        options |= {"fluid": mpm.Fluid(), "drained": drained}
-    return mpm.Simulation(grid, bodies, materials, fixed={"left": "xy"}, tractions=loads, **options)
+        options["fluid"] = mpm.Fluid()
+        loads += drained
+    return mpm.Simulation(grid, bodies, materials, walls={"left": "xy"}, conditions=loads, **options)

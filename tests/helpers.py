@@ -11,6 +11,7 @@ import pytest
 import mpm_dolfinx as mpm
 from mpm_dolfinx.flow.storage import StorageProblem
 from mpm_dolfinx.mechanics.momentum import MomentumProblem
+from mpm_dolfinx.solve import plan
 from mpm_dolfinx.stepping import step
 from mpm_dolfinx.stepping.balances import Start, balances
 from mpm_dolfinx.stepping.time_integration import METHODS
@@ -25,26 +26,52 @@ def rates(errors):
 
 def beam(*, fluid=True, ramp=0.06, load=54e3, offset=0.5, h=0.03, material=SOFT, box=1.2, **options):
     """Return (simulation, probe at the tip) of the poroelastic beam on a coarse grid."""
-    grid = mpm.Grid([1.2, box], [round(1.2 / h), round(box / h)])
+    grid = mpm.Grid([0, 0], [1.2, box], [round(1.2 / h), round(box / h)])
     bottom = (round(box / 2 / h) + offset) * grid.h[1]
-    body = mpm.box(grid, [0, bottom], [1, bottom + 0.3])
+    body, ends = mpm.box(grid, [0, bottom], [1, bottom + 0.3]), []
     if fluid:
-        options.setdefault("drained", [mpm.Drained("left"), mpm.Drained("right")])
+        ends = [mpm.Drained("left"), mpm.Drained("right")]
         options["fluid"] = mpm.Fluid() if fluid is True else fluid
     simulation = mpm.Simulation(
-        grid, [body], [material], fixed={"left": "xy"}, tractions=[top_load(load, ramp)], **options
+        grid,
+        [body],
+        [material],
+        walls={"left": "xy"},
+        conditions=[top_load(load, ramp), *options.pop("conditions", ends)],
+        **options,
     )
     return simulation, mpm.probes([body], [[1.0, bottom + 0.15]])
 
 
 def pressed(finer: int = 1, conductivity=1e-5, bulk=6.7e6, shear=3.1e6, cells=(36, 30)) -> mpm.Simulation:
     """Return a saturated beam, clamped and pressed down more and more."""
-    grid = mpm.Grid(upper=[1.2, 0.4], lower=[0, -0.6], cells=[finer * n for n in cells])
+    grid = mpm.Grid(lower=[0, -0.6], upper=[1.2, 0.4], cells=[finer * n for n in cells])
     law = mpm.Hencky(bulk=bulk, shear=shear, porosity=0.4, conductivity=conductivity)
     load = mpm.Traction("top", lambda t: (0, -1e5 * t))
     body, water = mpm.box(grid, [0, 0], [1, 0.3], per_cell=2), {"fluid": mpm.Fluid()}
     drained = [mpm.Drained("right")]
-    return mpm.Simulation(grid, [body], [law], fixed={"left": "xy"}, tractions=[load], drained=drained, **water)
+    return mpm.Simulation(grid, [body], [law], walls={"left": "xy"}, conditions=[load, *drained], **water)
+
+
+def without(simulation, *kinds):
+    """Return the conditions in force, but for those of some kinds."""
+    return [one for one in simulation.conditions if not isinstance(one, kinds)]
+
+
+def thresholds(monkeypatch, **values):
+    """Let the choice of solvers follow other thresholds."""
+    monkeypatch.setattr(plan, "THRESHOLDS", replace(plan.THRESHOLDS, **values))
+
+
+def noting(counts, solve):
+    """Return `BlockSolver.solve` that notes its iterations."""
+
+    def noted(*how):
+        found = solve(*how)
+        counts.append(found[0])
+        return found
+
+    return noted
 
 
 def limit(simulation, newton):
@@ -81,11 +108,11 @@ def top_load(load=54e3, ramp=0.06):
 def column(*, cells=10, offset=0.0, width=1, fluid=True, height=1.0, bottom=0.0, **options):
     """Return a laterally held column on the floor, its top `offset` cells above a grid line."""
     h = height / cells
-    grid = mpm.Grid([width * h, (cells + 4) * h], [width, cells + 4])
+    grid = mpm.Grid([0, 0], [width * h, (cells + 4) * h], [width, cells + 4])
     body = mpm.box(grid, [0, bottom], [width * h, height + offset * h])
     if fluid:
         options["fluid"] = mpm.Fluid() if fluid is True else fluid
-    options.setdefault("fixed", {"left": "x", "right": "x", "bottom": "y"})
+    options.setdefault("walls", {"left": "x", "right": "x", "bottom": "y"})
     material = options.pop("material", SOFT)
     return mpm.Simulation(grid, [body], [material], **options)
 

@@ -17,7 +17,7 @@ class LawAtPoints:
 
     def __init__(self, material, dim):
         self.material, self.law, self.dim = material, type(material), dim
-        self.grid = mpm.Grid([1.0] * dim, {2: [8, 8], 3: [4, 4, 4]}[dim])
+        self.grid = mpm.Grid([0] * dim, [1.0] * dim, {2: [8, 8], 3: [4, 4, 4]}[dim])
         taken = {name: np.shape(getattr(material, name)) for name in self.law.parameters}
         taken |= {name: np.shape(value) for name, value in self.law.state.items()}
         self.points = FormPoints(self.grid, F=(dim, dim), **taken)

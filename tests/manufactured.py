@@ -81,17 +81,15 @@ def source(points, q, t):
 
 PHYSICS = {
     "fluid": WATER,
-    "fixed": WALLS,
-    "tractions": [mpm.Traction("top", traction)],
-    "drained": [mpm.Drained("top")],
-    "terms": [body_force],
-    "sources": [source],
+    "walls": WALLS,
+    "conditions": [mpm.Traction("top", traction), mpm.Drained("top")],
+    "terms": [body_force, mpm.Source(source)],
 }
 
 
 def scene(cells):
     """Return the block on a grid of that many cells a metre."""
-    grid = mpm.Grid([1.0, 1 + 2 / cells], [cells, cells + 2])
+    grid = mpm.Grid([0, 0], [1.0, 1 + 2 / cells], [cells, cells + 2])
     return mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 1])], [SOIL], **PHYSICS)
 
 

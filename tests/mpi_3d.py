@@ -2,14 +2,15 @@
 """Run a saturated block in 3D, solved by iterations, on however many processes there are; write its state."""
 
 import sys
+from dataclasses import replace
 
 import numpy as np
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.solve import linear as solvers
+from mpm_dolfinx.solve import plan
 
-solvers.ITERATIVE = 0
-grid = mpm.Grid([1.2] * 3, [6] * 3)
+plan.THRESHOLDS = replace(plan.THRESHOLDS, multigrid_3d=0)
+grid = mpm.Grid([0] * 3, [1.2] * 3, [6] * 3)
 block = mpm.box(grid, [0.2, 0.2, 0], [0.9, 0.93, 0.77])
 soil = mpm.Hencky(bulk=4e6 / 3, shear=1e6, conductivity=1e-7)
 simulation = mpm.Simulation(
@@ -17,9 +18,12 @@ simulation = mpm.Simulation(
     [block],
     [soil],
     fluid=mpm.Fluid(),
-    fixed={"bottom": "xyz"},
-    drained=[mpm.Drained("top")],
-    tractions=[mpm.Traction("top", lambda t: (2e4 * t, 1e4 * t, -5e4 * t)), mpm.Pressure("right", lambda t: 2e4 * t)],
+    walls={"bottom": "xyz"},
+    conditions=[
+        mpm.Drained("top"),
+        mpm.Traction("top", lambda t: (2e4 * t, 1e4 * t, -5e4 * t)),
+        mpm.Pressure("right", lambda t: 2e4 * t),
+    ],
     tolerance=1e-11,
 )
 result = simulation.run(1.0, 0.25, progress=False)

@@ -7,7 +7,7 @@ import numpy as np
 
 import mpm_dolfinx as mpm
 
-grid = mpm.Grid([1.3, 1.2], [13, 12])
+grid = mpm.Grid([0, 0], [1.3, 1.2], [13, 12])
 bodies = [mpm.box(grid, [0.13, 0], [1.17, 0.43]), mpm.box(grid, [0.33, 0.44], [0.87, 0.9], per_cell=3)]
 bodies.append(mpm.box(grid, [0.95, 0.43], [1.11, 0.6]))
 soil = mpm.Hencky(bulk=4e6 / 3, shear=1e6, conductivity=1e-5)
@@ -17,14 +17,23 @@ simulation = mpm.Simulation(
     bodies,
     [soil],
     fluid=mpm.Fluid(),
-    fixed={"bottom": "xy"},
-    drained=[mpm.Drained("left", region=([0, 0], [0.2, 1])), mpm.Drained("top", region=above)],
-    displacements=[mpm.Displacement("top", lambda t, X: (0.01 * t, -0.03 * t), region=above)],
-    contacts=[mpm.Contact([1, 2], 0, friction=0.2)],
+    walls={"bottom": "xy"},
+    conditions=[
+        mpm.Drained("left", region=([0, 0], [0.2, 1])),
+        mpm.Drained("top", region=above),
+        mpm.Displacement("top", lambda t, X: (0.01 * t, -0.03 * t), region=above),
+        mpm.Contact([1, 2], 0, friction=0.2),
+    ],
     later=[2],
 )
 simulation.run(0.5, 0.5, progress=False)
-simulation.stage(add=[2], tools=[mpm.Tool(mpm.Ball([1.03, 0.7], 0.08), displacement=lambda t: (0, -0.08 * (t - 0.5)))])
+simulation.stage(
+    add=[2],
+    conditions=[
+        *simulation.conditions,
+        mpm.Tool(mpm.Ball([1.03, 0.7], 0.08), displacement=lambda t: (0, -0.08 * (t - 0.5))),
+    ],
+)
 result = simulation.run(1.0, 0.5, progress=False)
 points = simulation.points
 data = (points.data["contact_0_shear"], points.data["contact_0_pressure"])

@@ -13,11 +13,11 @@ CLAY = mpm.Hencky(bulk=1.7e8, shear=3.4e6)  # nu = 0.49
 
 def cycled(dim):
     """Return a simulation after a load cycle and a half."""
-    grid = mpm.Grid([1.3, *[0.4] * (dim - 2), 1.0], [13, *[4] * (dim - 2), 10])
+    grid = mpm.Grid([0] * dim, [1.3, *[0.4] * (dim - 2), 1.0], [13, *[4] * (dim - 2), 10])
     lower, upper = [0.0, *[0.13] * (dim - 2), 0.43], [1.0, *[0.33] * (dim - 2), 0.63]
     bodies = [mpm.box(grid, lower, [0.55, *upper[1:]]), mpm.box(grid, [0.55, *lower[1:]], upper, material=3 - dim)]
     load = mpm.Traction("top", lambda t: [0.0] * (dim - 1) + [-8e3 * (1 - abs(2 * (t % 1) - 1))])
-    s = mpm.Simulation(grid, bodies, [SOFT, CLAY], fixed={"left": "xyz"[:dim]}, tractions=[load])
+    s = mpm.Simulation(grid, bodies, [SOFT, CLAY], walls={"left": "xyz"[:dim]}, conditions=[load])
     s.run(1.5, 0.125, progress=False)
     return s
 

@@ -33,7 +33,7 @@ for n in (0, 1, 500):
         assert there is rows and traffic.bytes == 0
 
 # points arrive alike whichever of their arrays are one and the same, also where that differs between processes
-grid = mpm.Grid([1, 1], [4, 4])
+grid = mpm.Grid([0, 0], [1, 1], [4, 4])
 shared = material_points(grid, [mpm.box(grid, [0, 0], [1, 1])])
 apart = replace(shared, origin=shared.origin.copy(), reference=shared.reference.copy())
 there = Exchange(comm, (shared.id % comm.size).astype(np.int32))

@@ -12,7 +12,7 @@ soil = mpm.Hencky(bulk=1e8, shear=6e7, conductivity=1e-4)
 tops = {}
 for shape in SHAPES:
     dim = len(shape)
-    grid = mpm.Grid(np.array(shape, dtype=float), shape)
+    grid = mpm.Grid([0] * dim, np.array(shape, dtype=float), shape)
     top = np.array([*shape[:-1], shape[-1] - 0.4])
     body = mpm.box(grid, [0] * dim, top)
     walls = {"left": "x", "right": "x", "bottom": "xyz"[:dim]} | ({"front": "y", "back": "y"} if dim == 3 else {})
@@ -21,9 +21,8 @@ for shape in SHAPES:
         [body],
         [soil],
         fluid=mpm.Fluid(),
-        fixed=walls,
-        tractions=[mpm.Traction("top", -1e4)],
-        drained=[mpm.Drained("top")],
+        walls=walls,
+        conditions=[mpm.Traction("top", -1e4), mpm.Drained("top")],
         gravity=(0,) * (dim - 1) + (-9.81,),
     )
     result = s.run(2.0, 1.0, progress=False, probes=mpm.probes([body], [top]))

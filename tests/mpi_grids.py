@@ -2,17 +2,18 @@
 """As `mpi_beam.py`, on a finer grid, by multigrid on the background grid."""
 
 import sys
+from dataclasses import replace
 
 import numpy as np
 from helpers import beam
 
-from mpm_dolfinx.solve import linear, multigrid
+from mpm_dolfinx.solve import plan
 
-linear.GRIDS, multigrid.COARSEST = 1, 50
+plan.THRESHOLDS = replace(plan.THRESHOLDS, multigrid_2d=1, coarsest=50)
 simulation, _ = beam(h=0.01)
 result = simulation.run(0.04, 0.02, progress=False)
 solvers = simulation.scene.last[1].solvers()
-assert solvers.iterative
+assert solvers.plan.iterative
 parts = simulation.grid.comm.gather((simulation.points.id, simulation.points.x, simulation.points.pressure))
 if parts:
     ids, x, p = (np.concatenate(a) for a in zip(*parts, strict=True))

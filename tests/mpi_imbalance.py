@@ -8,11 +8,11 @@ import numpy as np
 import mpm_dolfinx as mpm
 from mpm_dolfinx.parallel.exchange import traffic
 
-grid = mpm.Grid([2.0, 0.6], [20, 6])
+grid = mpm.Grid([0, 0], [2.0, 0.6], [20, 6])
 bodies = [mpm.box(grid, [0, 0], [1, 0.5]), mpm.box(grid, [1, 0], [2, 0.5])]
 walls = {"left": "x", "right": "x", "bottom": "xy"}
 simulation = mpm.Simulation(
-    grid, bodies, [mpm.Hencky(bulk=1e6, shear=6e5)], fixed=walls, gravity=lambda t: (0, -9.81 * t)
+    grid, bodies, [mpm.Hencky(bulk=1e6, shear=6e5)], walls=walls, gravity=lambda t: (0, -9.81 * t)
 )
 
 

@@ -15,7 +15,7 @@ simulation.run(10.0, 10.0, progress=False)
 assert comm.allreduce(moved(simulation)) < 2e-9
 before = simulation.effective_stress()
 parts = comm.gather((simulation.points.id, before))
-simulation.stage(tractions=[*simulation.state.stage.conditions["tractions"], mpm.Traction("top", (0, -2e3))])
+simulation.stage(conditions=[*simulation.conditions, mpm.Traction("top", (0, -2e3))])
 result = simulation.run(1e3, 1e3, progress=False)
 points = simulation.points
 after = comm.gather((points.id, points.x, points.pressure, simulation.effective_stress()))

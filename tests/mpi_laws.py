@@ -15,7 +15,7 @@ def push(points, u, v, t):
     return -ufl.inner(F * ufl.as_vector([2e4 * t, 0]), points.value(v)) / ufl.det(points.F) * points.dx
 
 
-grid = mpm.Grid([1.6, 1.3], [16, 13])
+grid = mpm.Grid([0, 0], [1.6, 1.3], [16, 13])
 bodies = [
     mpm.box(grid, [0, 0], [0.5, 0.5]),
     mpm.box(grid, [0.5, 0], [1, 0.5], material=3),
@@ -39,14 +39,13 @@ simulation = mpm.Simulation(
     bodies,
     [sand, gel, clay, weak],
     fluid=mpm.Fluid(),
-    fixed={"left": "x", "bottom": "y"},
-    drained=[mpm.Drained("right")],
-    tractions=[
+    walls={"left": "x", "bottom": "y"},
+    conditions=[
+        mpm.Drained("right"),
         mpm.Traction("top", lambda t: (0, -1e5 - 3e4 * t), region=((0, 1), (1, 2))),
         mpm.Traction("right", (-1e5, 0)),
     ],
-    terms=[push],
-    sources=[lambda points, q, t: 1e-3 * t * points.displacement[0] * q * points.dx],
+    terms=[push, mpm.Source(lambda points, q, t: 1e-3 * t * points.displacement[0] * q * points.dx)],
 )
 result = simulation.run(1.0, 0.1, progress=False)
 stress, points = simulation.effective_stress(), simulation.points

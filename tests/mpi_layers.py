@@ -7,7 +7,7 @@ import numpy as np
 
 import mpm_dolfinx as mpm
 
-grid = mpm.Grid([0.25, 0.25, 1.25], [2, 2, 10])
+grid = mpm.Grid([0, 0, 0], [0.25, 0.25, 1.25], [2, 2, 10])
 seams = [(0, 0.76, 0), (0.76, 0.87, 1), (0.87, 1, 0)]
 bodies = [mpm.box(grid, [0, 0, low], [0.25, 0.25, high], material=m) for low, high, m in seams]
 sand = mpm.Hencky(bulk=1e6, shear=6e5, conductivity=1e-4, conductivity_law=mpm.kozeny_carman)
@@ -18,9 +18,8 @@ simulation = mpm.Simulation(
     bodies,
     [sand, clay],
     fluid=mpm.Fluid(),
-    fixed={"left": "x", "right": "x", "front": "y", "back": "y", "bottom": "z"},
-    drained=[mpm.Drained("top", 0.0, top)],
-    tractions=[mpm.Traction("top", (0, 0, -1e5), top)],
+    walls={"left": "x", "right": "x", "front": "y", "back": "y", "bottom": "z"},
+    conditions=[mpm.Drained("top", 0.0, top), mpm.Traction("top", (0, 0, -1e5), top)],
     gravity=(0, 0, -10),
 )
 places = [[x, y, z] for x, y in ((0.0, 0.25), (0.11, 0.13)) for z in (0.0, 0.31, 0.75, 0.8, 0.88, 0.99)]

@@ -8,7 +8,7 @@ from meshes import box_mesh
 
 import mpm_dolfinx as mpm
 
-grid = mpm.Grid([1.2, 1.2], [12, 12])
+grid = mpm.Grid([0, 0], [1.2, 1.2], [12, 12])
 slope = box_mesh(
     "triangle", (6, 4), (0, 0), (1, 1), place=lambda x: np.stack([x[:, 0] * (1 - 0.4 * x[:, 1]), x[:, 1] / 2 + 0.4], 1)
 )
@@ -19,9 +19,8 @@ simulation = mpm.Simulation(
     bodies,
     [soil],
     fluid=mpm.Fluid(),
-    fixed={"left": "x", "right": "x", "bottom": "y"},
-    tractions=[mpm.Traction("top", lambda t: -1e5 * t)],
-    drained=[mpm.Drained("right")],
+    walls={"left": "x", "right": "x", "bottom": "y"},
+    conditions=[mpm.Traction("top", lambda t: -1e5 * t), mpm.Drained("right")],
 )
 result = simulation.run(1.0, 0.25, probes=mpm.probes(bodies, [[0.3, 0.4], [0.3, 0.8]]), progress=False)
 points = simulation.points

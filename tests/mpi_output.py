@@ -8,10 +8,10 @@ import mpm_dolfinx as mpm
 
 def sheared(folder):
     """Return a block whose foot is held while its top is sheared and pressed, and its writer."""
-    grid = mpm.Grid([1.4, 1.0], [14, 10])
+    grid = mpm.Grid([0, 0], [1.4, 1.0], [14, 10])
     body = mpm.box(grid, [0.2, 0.15], [0.9, 0.75])
     sides = [mpm.Displacement("bottom", (0, 0)), mpm.Displacement("top", lambda t, X: (0.2 * t, -0.05 * t))]
-    simulation = mpm.Simulation(grid, [body], [mpm.Hencky(bulk=2e6, shear=1e6)], fixed={}, displacements=sides)
+    simulation = mpm.Simulation(grid, [body], [mpm.Hencky(bulk=2e6, shear=1e6)], walls={}, conditions=sides)
     return simulation, mpm.Writer(simulation, folder, every=100)
 
 

@@ -5,13 +5,13 @@ import numpy as np
 
 import mpm_dolfinx as mpm
 
-grid = mpm.Grid([1.0, 1.0], [10, 10])
+grid = mpm.Grid([0, 0], [1.0, 1.0], [10, 10])
 body = mpm.box(grid, [0, 0.2], [0.5, 0.5])
 
 
 def scene(conductivity_law=None, **options):
     soil = mpm.Hencky(bulk=1e6, shear=6e5, conductivity=1e-4, conductivity_law=conductivity_law)
-    return mpm.Simulation(grid, [body], [soil], fixed={"left": "xy"}, **options)
+    return mpm.Simulation(grid, [body], [soil], walls={"left": "xy"}, **options)
 
 
 def pulled(t, X):
@@ -23,9 +23,9 @@ def torn(t, X):
 
 
 CASES = {
-    "left the grid": scene(displacements=[mpm.Displacement("right", pulled)]),
+    "left the grid": scene(conditions=[mpm.Displacement("right", pulled)]),
     "conductivity law: k": scene(lambda x: 0.4 - x[0], fluid=mpm.Fluid()),
-    "Displacement(side='top'": scene(displacements=[mpm.Displacement("top", torn)]),
+    "Displacement(side='top'": scene(conditions=[mpm.Displacement("top", torn)]),
 }
 for words, simulation in CASES.items():
     try:

@@ -7,7 +7,7 @@ import numpy as np
 
 import mpm_dolfinx as mpm
 
-grid = mpm.Grid([4.0, 0.5], [20, 5])
+grid = mpm.Grid([0, 0], [4.0, 0.5], [20, 5])
 assert grid.mesh is not None, "a mesh that was looked at before"
 
 
@@ -25,15 +25,15 @@ def uneven(simulation):
 ratios, scenes, laws = [], [], [mpm.Hencky(bulk=1e6, shear=6e5)]
 for low in (0.2, 2.6):
     body = mpm.box(grid, [low, 0], [low + 1, 0.4])
-    s = mpm.Simulation(grid, [body], laws, fixed={"bottom": "xy"})
+    s = mpm.Simulation(grid, [body], laws, walls={"bottom": "xy"})
     ratios.append(uneven(s))
     scenes.append(s)
 moved = mpm.mapped(grid, mpm.box(grid, [0.2, 0], [1.2, 0.4]), lambda x: np.add(x, (2, 0)))
-s = mpm.Simulation(grid, [moved], laws, fixed={"bottom": "xy"})
+s = mpm.Simulation(grid, [moved], laws, walls={"bottom": "xy"})
 ratios.append(uneven(s))
-again = mpm.Simulation(scenes[1].grid, scenes[1].bodies, laws, fixed={"bottom": "xy"})
+again = mpm.Simulation(scenes[1].grid, scenes[1].bodies, laws, walls={"bottom": "xy"})
 assert again.grid is scenes[1].grid, "the same points: the same mesh"
-kept = mpm.Simulation(grid, scenes[1].bodies, laws, fixed={"bottom": "xy"}, terms=[faint])
+kept = mpm.Simulation(grid, scenes[1].bodies, laws, walls={"bottom": "xy"}, terms=[faint])
 assert kept.grid is grid, "terms may have been made on the mesh"
 if not grid.comm.rank:
     np.savez(sys.argv[1], imbalance=ratios)

@@ -7,7 +7,7 @@ import numpy as np
 
 import mpm_dolfinx as mpm
 
-grid = mpm.Grid([1.2, 1.3], [12, 13])
+grid = mpm.Grid([0, 0], [1.2, 1.3], [12, 13])
 slab = mpm.box(grid, [0, 0], [1, 1.03])
 soil = mpm.Hencky(bulk=4e6 / 3, shear=1e6, conductivity=1e-9, biot=0.9, grain_bulk=1e9)
 simulation = mpm.Simulation(
@@ -15,12 +15,14 @@ simulation = mpm.Simulation(
     [slab],
     [soil],
     fluid=mpm.Fluid(),
-    fixed={"left": "x", "bottom": "y"},
-    drained=[mpm.Drained("right", pressure=50.0)],
-    inflows=[mpm.Inflow("left", 1e-9)],
-    plates=[mpm.RigidPlate("top", lambda t: 2e4 * t)],
+    walls={"left": "x", "bottom": "y"},
+    conditions=[
+        mpm.Drained("right", pressure=50.0),
+        mpm.Inflow("left", 1e-9),
+        mpm.RigidPlate("top", lambda t: 2e4 * t),
+        mpm.Pressure("right", 50.0),
+    ],
     gravity=lambda t: (0, -9.81 * t),
-    tractions=[mpm.Pressure("right", 50.0)],
 )
 result = simulation.run(1.0, 0.25, progress=False)
 stress, points = simulation.effective_stress(), simulation.points

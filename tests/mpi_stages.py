@@ -7,16 +7,16 @@ import numpy as np
 
 import mpm_dolfinx as mpm
 
-grid = mpm.Grid([1.2, 1.4], [12, 14])
+grid = mpm.Grid([0, 0], [1.2, 1.4], [12, 14])
 boxes = [([0, 0], [1.2, 0.5]), ([0, 0.5], [0.6, 0.8]), ([0.6, 0.5], [1.2, 0.93])]
 bodies = [mpm.box(grid, low, high) for low, high in boxes]
 soil = mpm.Hencky(bulk=1e6, shear=6e5, conductivity=1e-5)
 walls = {"left": "x", "right": "x", "bottom": "y"}
-options = {"fluid": mpm.Fluid(), "fixed": walls, "gravity": (0, -9.81), "drained": [mpm.Drained("top")]}
+options = {"fluid": mpm.Fluid(), "walls": walls, "gravity": (0, -9.81), "conditions": [mpm.Drained("top")]}
 simulation = mpm.Simulation(grid, bodies, [soil], later=[2], **options)
 simulation.run(1.0, 0.5, progress=False)
 push = mpm.Displacement("top", lambda t, X: (0, -0.02 * (t - 1)), region=((0.0, 0.0), (0.31, 0.5)))
-simulation.stage(add=[2], remove=[1], displacements=[push], reset_displacement=True)
+simulation.stage(add=[2], remove=[1], conditions=[*simulation.conditions, push], reset_displacement=True)
 result = simulation.run(2.0, 0.25, probes=mpm.probes(bodies, [[0.3, 0.4], [0.9, 0.9]]), progress=False)
 points = simulation.points
 parts = grid.comm.gather((points.id, points.x, points.pressure, simulation.effective_stress()))

@@ -7,7 +7,7 @@ import numpy as np
 
 import mpm_dolfinx as mpm
 
-grid = mpm.Grid([1.3, 1.0], [13, 10])
+grid = mpm.Grid([0, 0], [1.3, 1.0], [13, 10])
 block = mpm.box(grid, [0.13, 0], [1.17, 0.73])
 soil = mpm.Hencky(bulk=4e6 / 3, shear=1e6, conductivity=1e-5)
 disc = mpm.Ball((0.65, 0.98), 0.25)
@@ -16,7 +16,7 @@ tools = [
     mpm.Tool(mpm.HalfSpace((1.17, 0), (-1, 0)), load=lambda t: 2e3 * t, direction=(-1, 0)),
 ]
 simulation = mpm.Simulation(
-    grid, [block], [soil], fluid=mpm.Fluid(), fixed={"bottom": "xy"}, drained=[mpm.Drained("left")], tools=tools
+    grid, [block], [soil], fluid=mpm.Fluid(), walls={"bottom": "xy"}, conditions=[mpm.Drained("left"), *tools]
 )
 result = simulation.run(1.0, 0.5, progress=False)
 points = simulation.points

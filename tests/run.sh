@@ -11,6 +11,6 @@ cd "$root"
 if [ "${1-}" = --release ]; then
     exec bash tests/release.sh "${@:2}"
 fi
-setup pytest pytest-xdist hypothesis gmsh h5py
+setup pytest pytest-xdist hypothesis gmsh h5py pandas xarray
 [ $# -gt 0 ] || set -- -n "$(env -u OMP_NUM_THREADS nproc)" --dist loadfile
 exec "$python" -m pytest "$@" # of tests/, says pyproject.toml

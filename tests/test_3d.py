@@ -12,12 +12,12 @@ import growth_3d
 import numpy as np
 import poroelastic_beam as demo
 import pytest
+from helpers import thresholds
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.bodies.bodies import material_points
 from mpm_dolfinx.bodies.faces import face_vectors, surface
 from mpm_dolfinx.points.cutting import volumes
-from mpm_dolfinx.solve import linear as solvers
 
 SOIL = mpm.Hencky(bulk=1e7 / 3, shear=5e6, conductivity=1e-6)
 
@@ -25,12 +25,14 @@ SOIL = mpm.Hencky(bulk=1e7 / 3, shear=5e6, conductivity=1e-6)
 def block(*, fill=0.4, n=4, fluid=False, aslant=1e4, **options):
     """A block on rough ground, n cells high, pressed and pushed aslant; cells of its sides are filled so far."""
     h = 1 / n
-    grid = mpm.Grid([1 + 3 * h] * 3, [n + 3] * 3)
+    grid = mpm.Grid([0] * 3, [1 + 3 * h] * 3, [n + 3] * 3)
     body = mpm.box(grid, [h, h, 0], [1 + h + fill * h, 1 + h + fill * h, 1 + fill * h])
     if fluid:
-        options |= {"fluid": mpm.Fluid(), "drained": [mpm.Drained("top")]}
+        options |= {"fluid": mpm.Fluid(), "conditions": [mpm.Drained("top")]}
     load = mpm.Traction("top", lambda t: (2 * t * aslant, t * aslant, -5 * t * aslant))
-    return mpm.Simulation(grid, [body], [SOIL], fixed={"bottom": "xyz"}, tractions=[load], **options)
+    return mpm.Simulation(
+        grid, [body], [SOIL], walls={"bottom": "xyz"}, conditions=[load, *options.pop("conditions", [])], **options
+    )
 
 
 def test_a_beam_between_smooth_walls_is_in_plane_strain():
@@ -55,12 +57,12 @@ def test_a_larger_background_box_changes_nothing():
 
 
 @pytest.mark.parametrize(
-    "fluid, coupling", [(False, "schur-cg"), (True, "schur-cg"), (True, "fixed-stress")], ids=["dry", "schur", "fixed"]
+    "fluid, coupling", [(False, "schur-cg"), (True, "schur-cg"), (True, "fixed-stress")], ids=["dry", "schur", "walls"]
 )
 def test_iterations_and_factors_give_the_same_answer(monkeypatch, fluid, coupling):
     states = []
     for least in (10**9, 0):
-        monkeypatch.setattr(solvers, "ITERATIVE", least)
+        thresholds(monkeypatch, multigrid_3d=least)
         s = block(n=3, fluid=fluid, coupling=coupling)
         result = s.run(1.0, 0.5, progress=False)
         assert result.cuts == 0 and result.residual <= 1e-8 and result.balance <= 1e-8
@@ -72,7 +74,7 @@ def test_iterations_and_factors_give_the_same_answer(monkeypatch, fluid, couplin
 
 
 def test_a_tangent_that_is_not_symmetric_is_solved_by_iterations(monkeypatch):
-    monkeypatch.setattr(solvers, "ITERATIVE", 0)
+    thresholds(monkeypatch, multigrid_3d=0)
     s = block(fluid=True, coupling="schur-fgmres")
     result = s.run(1.0, 0.5, progress=False)
     assert result.converged and result.cuts == 0 and result.newton <= 20
@@ -82,7 +84,7 @@ def test_a_tangent_that_is_not_symmetric_is_solved_by_iterations(monkeypatch):
 @pytest.mark.parametrize("fill", [0.5, 1e-2, 1e-4, 1e-6])
 def test_iterations_do_not_grow_where_cells_are_nearly_empty(monkeypatch, fluid, most, fill):
     """The ghost penalty keeps the condition number; without it the linear solver needs more than twice as many."""
-    monkeypatch.setattr(solvers, "ITERATIVE", 0)
+    thresholds(monkeypatch, multigrid_3d=0)
     result = block(fill=fill, fluid=fluid).run(1.0, 0.5, progress=False)
     assert result.coupling <= most * result.newton and result.newton <= 20
 
@@ -103,7 +105,7 @@ def ball(x):
 
 
 def octant(n):
-    grid = mpm.Grid([1.1] * 3, [n] * 3)
+    grid = mpm.Grid([0] * 3, [1.1] * 3, [n] * 3)
     return grid, mpm.mapped(grid, mpm.box(grid, [0] * 3, [1] * 3, per_cell=1), ball)
 
 
@@ -122,7 +124,7 @@ def test_a_bent_body_has_the_volume_and_the_surface_of_its_image():
 
 
 def test_a_body_bent_to_itself_is_the_same_body():
-    grid = mpm.Grid([1.0, 1.0, 1.0], [4, 4, 4])
+    grid = mpm.Grid([0, 0, 0], [1.0, 1.0, 1.0], [4, 4, 4])
     body = mpm.box(grid, [0.1] * 3, [0.8, 0.7, 0.6])
     plain, bent = (material_points(grid, [b]) for b in (body, mpm.mapped(grid, body, lambda x: x)))
     assert (plain.corners == bent.corners).all() and plain.volume0 == pytest.approx(bent.volume0, rel=1e-12)
@@ -137,7 +139,7 @@ def test_a_body_bent_to_itself_is_the_same_body():
     [(lambda x: 2 * x, "outside the grid"), (lambda x: x * [1, 1, -1] + [0, 0, 1], "inside out")],
 )
 def test_a_map_that_does_not_make_a_body_is_refused(map, message):
-    grid = mpm.Grid([1.0] * 3, [4] * 3)
+    grid = mpm.Grid([0] * 3, [1.0] * 3, [4] * 3)
     with pytest.raises(ValueError, match=message):
         mpm.mapped(grid, mpm.box(grid, [0.1] * 3, [0.9] * 3), map)
 
@@ -148,12 +150,12 @@ def test_domains_of_a_bent_body_are_rederived_with_their_own_size():
 
 
 def test_a_normal_traction_on_a_closed_surface_has_no_resultant_and_squeezes_evenly():
-    grid = mpm.Grid([1.2] * 3, [5] * 3)
+    grid = mpm.Grid([0] * 3, [1.2] * 3, [5] * 3)
     body = mpm.mapped(grid, mpm.box(grid, [0] * 3, [1] * 3, per_cell=2), ball)
     rubber = mpm.NeoHookean(bulk=1e6, shear=5e5)
     presses = [mpm.Traction(side, lambda t: -1e3 * t) for side in ("right", "back", "top")]
     walls = {"left": "x", "front": "y", "bottom": "z"}
-    s = mpm.Simulation(grid, [body], [rubber], fixed=walls, tractions=presses)
+    s = mpm.Simulation(grid, [body], [rubber], walls=walls, conditions=presses)
     s.run(1.0, 1.0, progress=False)
     assert s.points.J == pytest.approx(np.full(len(s.points), 1 - 1e-3), abs=2e-4)
     assert np.mean(s.points.J * s.points.volume0) / s.points.volume0.mean() == pytest.approx(1 - 1e-3, abs=5e-6)

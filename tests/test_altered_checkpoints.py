@@ -11,8 +11,13 @@ import mpm_dolfinx as mpm
 
 
 def scene(wet, load):
-    options = {"drained": [mpm.Drained("top")]} if wet else {}
-    return column(cells=4, fluid=wet, tractions=[mpm.Traction("top", lambda t: (0, -load * t))], **options)
+    options = {"conditions": [mpm.Drained("top")]} if wet else {}
+    return column(
+        cells=4,
+        fluid=wet,
+        conditions=[mpm.Traction("top", lambda t: (0, -load * t)), *options.pop("conditions", [])],
+        **options,
+    )
 
 
 def noted(change):
@@ -108,12 +113,12 @@ def test_a_scene_with_other_fields_or_laws_is_refused(name, tmp_path):
 
 
 def test_a_map_is_part_of_the_scene(tmp_path):
-    grid, made = mpm.Grid([2.0, 2.0], [4, 4]), []
+    grid, made = mpm.Grid([0, 0], [2.0, 2.0], [4, 4]), []
     for bend in (0.1, 0.2):
         body = mpm.mapped(
             grid, mpm.box(grid, [0, 0], [1, 1]), lambda x, bend=bend: x * [1, 1] + bend * x[:, ::-1] * [1, 0]
         )
-        made.append(mpm.Simulation(grid, [body], [mpm.Hencky(1e7, 5e6)], fixed={"bottom": "xy"}))
+        made.append(mpm.Simulation(grid, [body], [mpm.Hencky(1e7, 5e6)], walls={"bottom": "xy"}))
     made[0].run(1.0, 1.0, progress=False, checkpoint=mpm.Checkpoint(tmp_path / "x"))
     with pytest.raises(ValueError, match="checksum of the positions of body 0"):
         mpm.resume(made[1], tmp_path / "x")

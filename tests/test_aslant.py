@@ -19,7 +19,7 @@ def turned(cells, angle, drained, off=0.0, dim=2, seepage=False, **options):
     seepage: whether the top is a seepage face.
     """
     h = HEIGHT / cells
-    grid = mpm.Grid([*[1.6, 1.6][:2], *[2 * h] * (dim - 2)], [*[round(1.6 / h)] * 2, *[2] * (dim - 2)])
+    grid = mpm.Grid([0] * dim, [*[1.6, 1.6][:2], *[2 * h] * (dim - 2)], [*[round(1.6 / h)] * 2, *[2] * (dim - 2)])
     turn = np.eye(dim)
     turn[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
     foot = np.array([0.7, 0.15, 0.0][:dim]) + off * h * (np.arange(dim) < 2)
@@ -31,9 +31,11 @@ def turned(cells, angle, drained, off=0.0, dim=2, seepage=False, **options):
         [body],
         [SOIL],
         fluid=mpm.Fluid(bulk=WATER),
-        fixed={},
-        displacements=[mpm.Displacement(sides[0], (0.0,) * dim)],
-        drained=[mpm.Drained(sides[end], p, seepage=seepage and end == 1) for end, p in drained],
+        walls={},
+        conditions=[
+            mpm.Displacement(sides[0], (0.0,) * dim),
+            *(mpm.Drained(sides[end], p, seepage=seepage and end == 1) for end, p in drained),
+        ],
         **options,
     )
     return simulation, lambda x: ((x - foot) @ turn)[:, 1]
@@ -85,7 +87,7 @@ def test_flow_along_slanted_sides_does_not_depend_on_the_unit_of_length(length):
     """What sealed sides tell counted 1 / h^2 times as much, h in metres: in millimetres 3 % more flowed out."""
 
     def flow(size):
-        grid = mpm.Grid([1.6 * size] * 2, [12, 12])
+        grid = mpm.Grid([0] * 2, [1.6 * size] * 2, [12, 12])
         turn = np.array([[np.cos(0.5), np.sin(0.5)], [-np.sin(0.5), np.cos(0.5)]])
         strip = mpm.box(grid, [0, 0], [size, 0.5 * size])
         body = mpm.mapped(grid, strip, lambda X: np.array([0.4, 0.1]) * size + X @ turn)
@@ -94,9 +96,8 @@ def test_flow_along_slanted_sides_does_not_depend_on_the_unit_of_length(length):
             [body],
             [replace(SOIL, conductivity=1e-5 * size**2)],
             fluid=mpm.Fluid(bulk=WATER),
-            fixed={},
-            displacements=[mpm.Displacement("bottom", (0.0, 0.0))],
-            drained=[mpm.Drained("left", 2e3), mpm.Drained("right", 1e3)],
+            walls={},
+            conditions=[mpm.Displacement("bottom", (0.0, 0.0)), mpm.Drained("left", 2e3), mpm.Drained("right", 1e3)],
         )
         s.run(1e5, 2e4, progress=False)
         cell = s.cells()

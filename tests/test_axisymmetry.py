@@ -23,7 +23,7 @@ LAME = ELASTIC.bulk - 2 * ELASTIC.shear / 3
 
 
 def plane(upper=(1.5, 1.5), cells=(7, 9), lower=None):
-    return mpm.Grid(upper, cells, lower, axisymmetric=True)
+    return mpm.Grid(lower, upper, cells, axisymmetric=True)
 
 
 def pressed(radial, axial, inner=0.0, upper=(1.03, 1.01), material=ELASTIC, **options):
@@ -32,7 +32,9 @@ def pressed(radial, axial, inner=0.0, upper=(1.03, 1.01), material=ELASTIC, **op
     body = mpm.box(grid, [inner, 0], upper)
     sides = ["right"] + ["left"] * (inner > 0)
     loads = [mpm.Pressure(side, radial) for side in sides] + [mpm.Pressure("top", axial)]
-    return mpm.Simulation(grid, [body], [material], fixed={"bottom": "y"}, tractions=loads, **options)
+    return mpm.Simulation(
+        grid, [body], [material], walls={"bottom": "y"}, conditions=[*loads, *options.pop("conditions", [])], **options
+    )
 
 
 @pytest.mark.parametrize("inner", [0.0, 0.33])
@@ -70,7 +72,7 @@ def test_a_pressure_on_curved_sides_is_even_but_for_the_faces_rule():
     body = mpm.mapped(grid, mpm.box(grid, [0.0, 0.1], [1.0, 1.2]), bend)
     loads = [mpm.Pressure(side, 5e5) for side in ("right", "top", "bottom")]
     spring = [lambda points, u: 10.0 * points.value(u)[1] ** 2 * points.dx]
-    s = mpm.Simulation(grid, [body], [ELASTIC], fixed={}, tractions=loads, terms=spring)
+    s = mpm.Simulation(grid, [body], [ELASTIC], walls={}, conditions=loads, terms=spring)
     s.step(1.0)
     assert s.points.J.max() < 0.82
     assert np.abs(s.effective_stress() + 5e5 * np.eye(3)).max() < 3e-4 * 5e5
@@ -146,13 +148,13 @@ def test_a_thick_cylinder_is_widened_as_the_exact_one_at_second_order():
         h = 0.5 / cells
         grid = plane((1.5, 2 * h), (3 * cells, 2))
         body = mpm.box(grid, [0.5, 0], [1, 2 * h])
-        s = mpm.Simulation(grid, [body], [ELASTIC], fixed=walls, tractions=[mpm.Pressure("left", load)])
+        s = mpm.Simulation(grid, [body], [ELASTIC], walls=walls, conditions=[mpm.Pressure("left", load)])
         places = [[x, h] for x, _ in probes]
         found = s.run(1, 0.25, probes=mpm.probes([body], places)).displacement[-1][:, 0]
         errors.append(np.abs(found / exact - 1).max())
     assert errors[1] < 3e-4 and rates(errors)[0] / 2 > 1.8
     loads = [mpm.Pressure("left", load)]
-    fem = BiotFEM([0.5, 0], [1, 0.1], [8, 1], ELASTIC, fixed=walls, tractions=loads, axisymmetric=True)
+    fem = BiotFEM([0.5, 0], [1, 0.1], [8, 1], ELASTIC, walls=walls, conditions=loads, axisymmetric=True)
     assert fem.run(1, 0.5, probes=probes).displacement[-1][:, 0] == pytest.approx(exact, rel=1e-6)
 
 
@@ -171,7 +173,7 @@ def test_a_cylinder_drains_to_its_side_as_the_exact_one_at_second_order(bulk):
         grid, outer = plane((1 + 2 * h, 2 * h), (cells + 2, 2)), 1 + 0.4 * h
         body, walls = mpm.box(grid, [0, 0], [outer, 2 * h]), {"bottom": "y", "top": "y"}
         s = mpm.Simulation(
-            grid, [body], [soil], fluid=water, fixed=walls, drained=[mpm.Drained("right")], pressure=100.0
+            grid, [body], [soil], fluid=water, walls=walls, conditions=[mpm.Drained("right")], pressure=100.0
         )
         s.run(t := T * outer**2 * 0.4 / (mobility * water.bulk), t / 10)
         decay, r = np.exp(-(a**2) * T), s.points.x[:, :1] / outer
@@ -189,7 +191,7 @@ def test_flow_to_a_drain_crosses_a_smeared_zone_at_second_order():
         grid, edge = plane((1.3, 2 * h), (13 * cells // 10, 2)), 0.5 + 0.5 * h
         bodies = [mpm.box(grid, [0.2, 0], [edge, 2 * h]), mpm.box(grid, [edge, 0], [1.2, 2 * h], material=1)]
         sides, walls = [mpm.Drained("left"), mpm.Drained("right", 1e4)], {"bottom": "y", "top": "y"}
-        s = mpm.Simulation(grid, bodies, soils, fluid=mpm.Fluid(), fixed=walls, drained=sides)
+        s = mpm.Simulation(grid, bodies, soils, fluid=mpm.Fluid(), walls=walls, conditions=sides)
         s.run(1e8, 5e7)
         resistance = np.log(edge / 0.2) / 1e-7 + np.log(1.2 / edge) / 1e-5
         errors.append(abs(s.outflows[0] * resistance / (4 * np.pi * h * 1e4 / 9810) - 1))
@@ -198,14 +200,14 @@ def test_flow_to_a_drain_crosses_a_smeared_zone_at_second_order():
 
 def test_a_well_half_a_cell_in_radius_takes_what_flows_to_it():
     """Rings between its face and the first centroid are longer than those at the face: 8 % too little flowed."""
-    grid = mpm.Grid([1.05, 0.2], [10, 2], lower=[0.05, 0], axisymmetric=True)
+    grid = mpm.Grid([0.05, 0], [1.05, 0.2], [10, 2], axisymmetric=True)
     s = mpm.Simulation(
         grid,
         [mpm.box(grid, [0.05, 0], [1.05, 0.2])],
         [mpm.Hencky(bulk=2e9, shear=1e9, conductivity=1e-5)],
         fluid=mpm.Fluid(),
-        fixed={"bottom": "y", "top": "y"},
-        drained=[mpm.Drained("left"), mpm.Drained("right", 1e4)],
+        walls={"bottom": "y", "top": "y"},
+        conditions=[mpm.Drained("left"), mpm.Drained("right", 1e4)],
     )
     s.run(1e8, 5e7, progress=False)
     exact = 2 * np.pi * 0.2 * 1e-5 * 1e4 / 9810 / np.log(1.05 / 0.05)
@@ -218,7 +220,7 @@ def test_a_cavity_in_undrained_soil_has_the_exact_pressure():
     soil = mpm.DruckerPrager(bulk=5e4 * strength, shear=50 * strength, friction=0, dilation=0, cohesion=strength)
     grid = plane((11.0, 2 * h), (44, 2))
     body, push = mpm.box(grid, [1, 0], [10, 2 * h]), mpm.Displacement("left", lambda t, X: (t, 0), "x")
-    s = mpm.Simulation(grid, [body], [soil], fixed={"bottom": "y", "top": "y"}, displacements=[push])
+    s = mpm.Simulation(grid, [body], [soil], walls={"bottom": "y", "top": "y"}, conditions=[push])
     s.run(widened, 0.05)
     pressure = s.reactions[0, 0] / (2 * np.pi * (1 + widened) * 2 * h)
     assert pressure == pytest.approx(3.7100 * strength, rel=2e-3)
@@ -254,10 +256,10 @@ def test_laws_with_a_state_see_the_hoops(material, confinement):
     """A triaxial test of a cylinder is that of a point, but for what its top gives way within the push."""
     s = pressed(1e5, 1e5, 0.0, (0.038, 0.1), material, grid=plane((0.05, 0.12), (3, 4)))
     s.step(1.0)
-    height, side = s.points.corners[:, :, 1].max(), s.state.stage.conditions["tractions"][:1]
+    height, side = s.points.corners[:, :, 1].max(), s.conditions[:1]
     confined = s.points.F[0, 1, 1]
     push = mpm.Displacement("top", lambda t, X: (0, height * np.exp(-0.02 * (t - 1)) - 0.1), "y")
-    s.stage(tractions=side, displacements=[push])
+    s.stage(conditions=[*side, push])
     s.run(2.0, 0.25)
     strain = -np.log(s.points.F[0, 1, 1] / confined)
     assert strain == pytest.approx(0.02, rel=1e-4)
@@ -273,8 +275,8 @@ def test_laws_with_a_state_see_the_hoops(material, confinement):
 def test_a_body_carried_along_its_axis_over_ten_cells_is_at_rest(bulk):
     grid, soil = plane((1.0, 3.0), (8, 24)), mpm.Hencky(bulk=bulk, shear=1e6, conductivity=1e-4)
     body, carried = mpm.box(grid, [0, 0.1], [0.7, 0.9]), mpm.Displacement("bottom", lambda t, X: (0, 1.25 * t), "y")
-    water = {"fluid": mpm.Fluid(), "drained": [mpm.Drained("top")]}
-    s = mpm.Simulation(grid, [body], [soil], fixed={}, displacements=[carried], **water)
+    water = {"fluid": mpm.Fluid(), "conditions": [mpm.Drained("top")]}
+    s = mpm.Simulation(grid, [body], [soil], walls={}, conditions=[carried, *water.pop("conditions", [])], **water)
     s.run(1, 0.25)
     assert s.points.corners[:, :, 1].max() == pytest.approx(0.9 + 1.25)
     assert np.abs(s.effective_stress()).max() < 1e-8 * soil.shear
@@ -286,7 +288,7 @@ RADIUS = 1e6  # m; of a ring that is a slice
 def slice_or_ring(inner):
     """Return soil that moves, drains and is loaded, in plane strain or, far from the axis, as a ring."""
     low, high = inner, inner + 1.3
-    grid = mpm.Grid([high, 1.5], [13, 15], [low, 0], axisymmetric=inner > 0)
+    grid = mpm.Grid([low, 0], [high, 1.5], [13, 15], axisymmetric=inner > 0)
     body = mpm.box(grid, [low + 0.24, 0], [low + 1.07, 1.03])
     soil = mpm.NeoHookean(bulk=4e6, shear=2e6, conductivity=1e-4, conductivity_law=mpm.kozeny_carman)
     half = ((low, 0), (low + 0.7, 9))
@@ -295,13 +297,17 @@ def slice_or_ring(inner):
         grid,
         [body],
         [soil],
-        fixed={"bottom": "xy"},
+        walls={"bottom": "xy"},
         fluid=mpm.Fluid(bulk=1e8),
         gravity=(0, -9.81),
-        tractions=[mpm.Pressure("left", 2e3), mpm.Traction("right", lambda t: (1e3 * t, 0))],
-        plates=[mpm.RigidPlate("top", lambda t: 3e4 * t * around)],
-        drained=[mpm.Drained("top", region=half), mpm.Drained("right", 2e3)],
-        inflows=[mpm.Inflow("left", 1e-6)],
+        conditions=[
+            mpm.Pressure("left", 2e3),
+            mpm.Traction("right", lambda t: (1e3 * t, 0)),
+            mpm.RigidPlate("top", lambda t: 3e4 * t * around),
+            mpm.Drained("top", region=half),
+            mpm.Drained("right", 2e3),
+            mpm.Inflow("left", 1e-6),
+        ],
     )
     s.run(0.2, 0.1)
     return s
@@ -324,8 +330,8 @@ def footed(folder, steps):
     body, sand = mpm.box(grid, [0, 0], [0.7, 1.2]), mpm.DruckerPrager(bulk=2e7, shear=1e7, conductivity=1e-6, **WEAK)
     load = mpm.Traction("top", lambda t: (0, -1e5 * t), region=((0, 0), (0.35, 9)))
     sides = [mpm.Drained("top"), mpm.Drained("right")]
-    options = {"fluid": mpm.Fluid(), "gravity": (0, -9.81), "tractions": [load], "drained": sides}
-    s = mpm.Simulation(grid, [body], [sand], fixed={"bottom": "xy"}, **options)
+    options = {"fluid": mpm.Fluid(), "gravity": (0, -9.81), "conditions": [load, *sides]}
+    s = mpm.Simulation(grid, [body], [sand], walls={"bottom": "xy"}, **options)
     file = folder / "run.ckpt"
     after = mpm.resume(s, file) if file.exists() else None
     s.run(0.1 * steps, 0.1, after=after, checkpoint=mpm.Checkpoint(file) if steps == 2 else None)
@@ -343,10 +349,10 @@ def test_a_run_goes_on_from_a_checkpoint_with_the_same_bits_and_keeps_its_water(
     for name in ("F", "corners", "pressure"):
         assert np.array_equal(getattr(whole.points, name), getattr(resumed.points, name))
     with pytest.raises(ValueError, match="axisymmetric: True there, None here"):
-        grid = mpm.Grid([1.0, 1.5], [6, 9])
+        grid = mpm.Grid([0, 0], [1.0, 1.5], [6, 9])
         body = mpm.box(grid, [0, 0], [0.7, 1.2])
         sand = mpm.DruckerPrager(bulk=2e7, shear=1e7, conductivity=1e-6, **WEAK)
-        flat = mpm.Simulation(grid, [body], [sand], fluid=mpm.Fluid(), fixed={"bottom": "xy"}, gravity=(0, -9.81))
+        flat = mpm.Simulation(grid, [body], [sand], fluid=mpm.Fluid(), walls={"bottom": "xy"}, gravity=(0, -9.81))
         mpm.resume(flat, tmp_path / "run.ckpt")
 
 
@@ -357,7 +363,7 @@ def test_the_hoops_carry_what_the_radii_do_at_the_axis_at_second_order():
         grid = plane((1 + h, 1 + 2 * h), (cells + 1, cells + 2))
         body = mpm.box(grid, [0, 0], [1, 1 + 0.3 * h])
         load = mpm.Traction("top", lambda t, X: np.stack([0 * X[:, 0], -3e5 * np.exp(-4 * X[:, 0] ** 2)], axis=1))
-        s = mpm.Simulation(grid, [body], [ELASTIC], fixed={"bottom": "xy", "right": "x"}, tractions=[load])
+        s = mpm.Simulation(grid, [body], [ELASTIC], walls={"bottom": "xy", "right": "x"}, conditions=[load])
         s.run(1, 0.5)
         stress = s.point_fields().stress
         off = np.abs(stress[:, 0, 0] - stress[:, 2, 2])[s.points.x[:, 0] < 0.3 * h]
@@ -367,8 +373,11 @@ def test_the_hoops_carry_what_the_radii_do_at_the_axis_at_second_order():
 
 def test_water_under_a_load_flows_as_in_finite_elements():
     soil, load = replace(ELASTIC, conductivity=1e-6), mpm.Traction("top", (0, -1e5), region=((0, -9), (0.5, 9)))
-    common = {"fluid": mpm.Fluid(), "fixed": {"left": "x", "right": "x", "bottom": "y"}, "tractions": [load]}
-    common["drained"] = [mpm.Drained("top")]
+    common = {
+        "fluid": mpm.Fluid(),
+        "walls": {"left": "x", "right": "x", "bottom": "y"},
+        "conditions": [load, mpm.Drained("top")],
+    }
     probes = [[0, 0.5], [1, 1.0]]
     fem = BiotFEM([0, 0], [1, 1], [12, 12], soil, axisymmetric=True, **common)
     truth = np.array(fem.run(20, 4, probes=probes).displacement)[:, :, 1]
@@ -387,7 +396,7 @@ def test_plates_press_a_cylinder_and_a_ring_evenly(inner):
     body = mpm.box(grid, [low, bottom], [inner + 0.83, top])
     plates = [mpm.HalfSpace((0, bottom), (0, 1)), mpm.HalfSpace((0, top), (0, -1))]
     tools = [mpm.Tool(plates[0], friction=0.3), mpm.Tool(plates[1], displacement=lambda t: (0, -0.2 * t))]
-    s = mpm.Simulation(grid, [body], [soil], fixed={}, tools=tools)
+    s = mpm.Simulation(grid, [body], [soil], walls={}, conditions=tools)
     s.run(1, 0.25)
     exact = 1e6 * np.log(0.75) / 0.75
     assert s.effective_stress() == pytest.approx(np.tile(np.diag([0, exact, 0]), (len(body), 1, 1)), abs=-5e-3 * exact)
@@ -412,7 +421,7 @@ def test_a_ball_meets_the_force_of_hertz(cells, error):
     sides = [mpm.Displacement(side, far) for side in ("bottom", "right")]
     ball = mpm.Tool(mpm.Ball((0, top + R), R), displacement=lambda t: (0, -depth * t))
     soil = mpm.LinearElastic(bulk=1e6 / (3 - 6 * nu), shear=1e6 / (2 + 2 * nu))
-    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [L, top])], [soil], fixed={}, displacements=sides, tools=[ball])
+    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [L, top])], [soil], walls={}, conditions=[*sides, ball])
     s.run(1, 1)
     assert -s.tool_forces[0, 1] == pytest.approx(force, rel=error)
 
@@ -433,7 +442,7 @@ def test_springs_around_a_sphere_hold_it_as_lame_says():
         body = mpm.mapped(grid, mpm.box(grid, [0, 0], [1, np.pi / 2]), polar)
         load, term = mpm.Pressure("left", lambda t: p * t), mpm.OnSide("right", springs)
         soil = mpm.LinearElastic(bulk=K, shear=G)
-        s = mpm.Simulation(grid, [body], [soil], fixed={"bottom": "y"}, tractions=[load], terms=[term])
+        s = mpm.Simulation(grid, [body], [soil], walls={"bottom": "y"}, conditions=[load], terms=[term])
         s.run(1, 0.5)
         X, volume = s.points.x - s.points.displacement, s.points.volume0
         r = np.linalg.norm(X, axis=1)
@@ -443,8 +452,8 @@ def test_springs_around_a_sphere_hold_it_as_lame_says():
 
 
 def test_scenes_of_plane_strain_carry_nothing_of_it():
-    grid = mpm.Grid([1.0, 1.0], [4, 4])
-    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 0.5])], [ELASTIC], fixed={"bottom": "xy"})
+    grid = mpm.Grid([0, 0], [1.0, 1.0], [4, 4])
+    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 0.5])], [ELASTIC], walls={"bottom": "xy"})
     s.step(1.0)
     pieces = s.scene.last[0].data.pieces
     assert "hoop" not in s.scene.pieces.pieces.functions and pieces.places.hoop is None
@@ -454,7 +463,7 @@ def test_scenes_of_plane_strain_carry_nothing_of_it():
 def hole(radius, caplog):
     grid = plane((1.0, 1.0), (10, 10))
     body = mpm.box(grid, [radius, 0], [0.5, 0.5])
-    mpm.Simulation(grid, [body], [ELASTIC], fixed={"bottom": "y"})
+    mpm.Simulation(grid, [body], [ELASTIC], walls={"bottom": "y"})
     return "narrower than a cell" in caplog.text
 
 
@@ -466,23 +475,23 @@ def test_a_hole_narrower_than_a_cell_is_warned_of(caplog):
 def scene(**options):
     grid = options.pop("grid", None) or plane()
     body = mpm.box(grid, [0, 0], [1, 1])
-    return mpm.Simulation(grid, [body], [ELASTIC], **{"fixed": {"bottom": "y"}, **options})
+    return mpm.Simulation(grid, [body], [ELASTIC], **{"walls": {"bottom": "y"}, **options})
 
 
 @pytest.mark.parametrize(
     "make, name, value",
     [
-        (lambda: mpm.Grid([1, 1, 1], [2, 2, 2], axisymmetric=True), "axisymmetric", "3"),
-        (lambda: mpm.Grid([1, 1], [2, 2], [-0.5, 0], axisymmetric=True), "axisymmetric", "-0.5"),
-        (lambda: mpm.Grid([1, 1], [2, 2], axisymmetric=1), "axisymmetric", "1"),
+        (lambda: mpm.Grid([0, 0, 0], [1, 1, 1], [2, 2, 2], axisymmetric=True), "axisymmetric", "3"),
+        (lambda: mpm.Grid([-0.5, 0], [1, 1], [2, 2], axisymmetric=True), "axisymmetric", "-0.5"),
+        (lambda: mpm.Grid([0, 0], [1, 1], [2, 2], axisymmetric=1), "axisymmetric", "1"),
         (lambda: scene(quadrature="point"), "quadrature", "point"),
         (lambda: scene(gravity=(1, -9.81)), "gravity", "1"),
         (lambda: scene(gravity=lambda t: (t, 0)).step(1.0), "gravity", "1"),
-        (lambda: scene(tractions=[mpm.Traction("left", (1, 0))]), "Traction", "axis"),
-        (lambda: scene(fixed={}).step(1.0), "fixed", "1 of 1"),
+        (lambda: scene(conditions=[mpm.Traction("left", (1, 0))]), "Traction", "axis"),
+        (lambda: scene(walls={}).step(1.0), "walls", "1 of 1"),
         (lambda: scene(terms=[mpm.OnSide("left", lambda points, v: points.value(v)[0] * points.dx)]), "OnSide", "axis"),
-        (lambda: scene(tools=[mpm.Tool(mpm.Ball((0, 2), 0.5), (0.1, 0))]), "Tool", "[0.1 0. ]"),
-        (lambda: scene(tools=[mpm.Tool(mpm.Ball((0, 2), 0.5), rotation=lambda t: t)]).step(1.0), "Tool", "turns"),
+        (lambda: scene(conditions=[mpm.Tool(mpm.Ball((0, 2), 0.5), (0.1, 0))]), "Tool", "[0.1 0. ]"),
+        (lambda: scene(conditions=[mpm.Tool(mpm.Ball((0, 2), 0.5), rotation=lambda t: t)]).step(1.0), "Tool", "turns"),
     ],
 )
 def test_what_axisymmetry_does_not_allow_is_refused_in_one_line(make, name, value):

@@ -8,22 +8,22 @@ from helpers import SOFT, beam, column, refused_in_one_line, top_load
 import mpm_dolfinx as mpm
 from mpm_dolfinx.verification.biot_fem import BiotFEM
 
-GRID = mpm.Grid([1.0, 1.0], [10, 10])
-GRID_3D = mpm.Grid([1.0, 1.0, 1.0], [2, 2, 2])
+GRID = mpm.Grid([0, 0], [1.0, 1.0], [10, 10])
+GRID_3D = mpm.Grid([0, 0, 0], [1.0, 1.0, 1.0], [2, 2, 2])
 BODY = mpm.box(GRID, [0, 0.2], [0.5, 0.5])
 NAN = float("nan")
 WATER = mpm.Fluid()
+OPEN = mpm.Drained("top")
 
 
 def scene(bodies=(BODY,), materials=(SOFT,), grid=GRID, **options):
-    return mpm.Simulation(grid, bodies, materials, **{"fixed": {"left": "xy"}, **options})
+    return mpm.Simulation(grid, bodies, materials, **{"walls": {"left": "xy"}, **options})
 
 
 def sides(kind, *values, **options):
     """Return a scene with a condition."""
-    name = {"Displacement": "displacements", "Drained": "drained", "Inflow": "inflows", "RigidPlate": "plates"}
     wet = {"fluid": WATER} if kind in ("Drained", "Inflow") else {}
-    return scene(**{name.get(kind, "tractions"): [getattr(mpm, kind)(*values, **options)]}, **wet)
+    return scene(conditions=[getattr(mpm, kind)(*values, **options)], **wet)
 
 
 def soil(**constants):
@@ -40,7 +40,7 @@ def law(**functions):
 
 
 def fem(lower=(0, 0), upper=(1, 1), cells=(2, 2), material=SOFT, **options):
-    return BiotFEM(lower, upper, cells, material, **{"fixed": {"left": "xy"}, **options})
+    return BiotFEM(lower, upper, cells, material, **{"walls": {"left": "xy"}, **options})
 
 
 def run(t_end=1.0, dt=1.0, **options):
@@ -65,15 +65,21 @@ PULL = {"energy": lambda F, bulk: bulk * F[0, 0]}
 
 CASES = {
     # ---- grid and bodies: what is called, what the line names, the value in it
-    "grid of no cells": (lambda: mpm.Grid([1, 1], [0, 3]), "grid: cells", "[0, 3]"),
-    "grid of half cells": (lambda: mpm.Grid([1, 1], [2.5, 3]), "grid: cells", "[2.5, 3]"),
-    "grid of too many numbers of cells": (lambda: mpm.Grid([1, 1], [2, 3, 4]), "grid: cells", "[2, 3, 4]"),
-    "grid of one dimension": (lambda: mpm.Grid([1], [3]), "grid: upper", "[1]"),
-    "grid turned over": (lambda: mpm.Grid([1, -1], [3, 3]), "grid: upper", "[1, -1]"),
-    "grid without end": (lambda: mpm.Grid([1, np.inf], [3, 3]), "grid: upper", "inf"),
-    "grid up to nan": (lambda: mpm.Grid([1, NAN], [3, 3]), "grid: upper", "nan"),
-    "grid up to a word": (lambda: mpm.Grid("high", [3, 3]), "grid: upper", "'high'"),
-    "grid from another dimension": (lambda: mpm.Grid([1, 1], [3, 3], lower=[0]), "grid: lower", "[0]"),
+    "grid of no cells": (lambda: mpm.Grid([0, 0], [1, 1], [0, 3]), "grid: cells", "[0, 3]"),
+    "grid of half cells": (lambda: mpm.Grid([0, 0], [1, 1], [2.5, 3]), "grid: cells", "[2.5, 3]"),
+    "grid of too many numbers of cells": (lambda: mpm.Grid([0, 0], [1, 1], [2, 3, 4]), "grid: cells", "[2, 3, 4]"),
+    "grid of one dimension": (lambda: mpm.Grid([0], [1], [3]), "grid: lower", "[0]"),
+    "grid from its upper corner": (lambda: mpm.Grid([1, 1], [0, 0], [3, 3]), "Grid(lower, upper, cells)", "[0, 0]"),
+    "grid with cells before its upper corner": (
+        lambda: mpm.Grid([0, 0], [10, 10], [0.5, 1.2]),
+        "Grid(lower, upper, cells)",
+        "[0.5, 1.2]",
+    ),
+    "grid turned over": (lambda: mpm.Grid([0, 0], [1, -1], [3, 3]), "grid: upper", "[1, -1]"),
+    "grid without end": (lambda: mpm.Grid([0, 0], [1, np.inf], [3, 3]), "grid: upper", "inf"),
+    "grid up to nan": (lambda: mpm.Grid([0, 0], [1, NAN], [3, 3]), "grid: upper", "nan"),
+    "grid up to a word": (lambda: mpm.Grid([0, 0], "high", [3, 3]), "grid: upper", "'high'"),
+    "grid from another dimension": (lambda: mpm.Grid([0, 0, 0], [1, 1], [3, 3]), "grid: upper", "[1, 1]"),
     "body outside the grid": (
         lambda: mpm.box(GRID, [0.5, 0.5], [1.5, 0.8]),
         "points outside the grid",
@@ -165,19 +171,23 @@ CASES = {
         "gravity at t = 0.5 s",
         "(0, 0, 1)",
     ),
-    "unknown wall": (lambda: scene(fixed={"west": "x"}), "side 'west'", "left, right, bottom, top"),
-    "unknown component": (lambda: scene(fixed={"left": "z"}), "fixed wall 'left'", "'z'"),
-    "wall of no component": (lambda: scene(fixed={"left": ""}), "fixed wall 'left'", "''"),
-    "component by number": (lambda: scene(fixed={"left": 0}), "fixed wall 'left'", "0"),
-    "walls in a list": (lambda: scene(fixed=["left"]), "fixed", "['left']"),
-    "nothing holds the body": (lambda: scene(fixed={"right": "xy"}).run(1, 1), "fixed walls", "3 of 3 ways"),
-    "the body may turn": (lambda: scene(fixed={"left": "x"}).run(1, 1), "fixed walls", "1 of 3 ways"),
-    "drained without fluid": (lambda: scene(drained=[mpm.Drained("left")]), "drained", "fluid"),
-    "source without fluid": (lambda: scene(sources=[lambda q: q]), "sources", "fluid"),
-    "source of what there is not": (lambda: scene(fluid=WATER, sources=[lambda q, tide: q]), "argument", "'tide'"),
+    "unknown wall": (lambda: scene(walls={"west": "x"}), "side 'west'", "left, right, bottom, top"),
+    "unknown component": (lambda: scene(walls={"left": "z"}), "walls: 'left'", "'z'"),
+    "wall of no component": (lambda: scene(walls={"left": ""}), "walls: 'left'", "''"),
+    "component by number": (lambda: scene(walls={"left": 0}), "walls: 'left'", "0"),
+    "walls in a list": (lambda: scene(walls=["left"]), "walls", "['left']"),
+    "nothing holds the body": (lambda: scene(walls={"right": "xy"}).run(1, 1), "walls", "3 of 3 ways"),
+    "the body may turn": (lambda: scene(walls={"left": "x"}).run(1, 1), "walls", "1 of 3 ways"),
+    "drained without fluid": (lambda: scene(conditions=[mpm.Drained("left")]), "drained", "fluid"),
+    "source without fluid": (lambda: scene(terms=[mpm.Source(lambda q: q)]), "sources", "fluid"),
+    "source of what there is not": (
+        lambda: scene(fluid=WATER, terms=[mpm.Source(lambda q, tide: q)]),
+        "argument",
+        "'tide'",
+    ),
     "term of a number": (lambda: scene(terms=[1.0]), "terms", "1.0"),
     "term that gives nothing": (lambda: scene(terms=[lambda v: None]), "terms", "None"),
-    "source that gives a number": (lambda: scene(fluid=WATER, sources=[lambda q: 1.0]), "sources", "1.0"),
+    "source that gives a number": (lambda: scene(fluid=WATER, terms=[mpm.Source(lambda q: 1.0)]), "sources", "1.0"),
     "body to come that there is not": (
         lambda: scene(later=[5]),
         "later: body 5",
@@ -227,8 +237,10 @@ CASES = {
         "Traction(side='top'",
         "nan",
     ),
-    "condition of another kind": (lambda: scene(tractions=[mpm.RigidPlate("top", 1.0)]), "tractions", "RigidPlate"),
-    "condition alone": (lambda: scene(tractions=mpm.Traction("top", (0, 1))), "tractions", "Traction"),
+    "condition that is none": (lambda: scene(conditions=["top"]), "conditions", "'top'"),
+    "condition alone": (lambda: scene(conditions=mpm.Traction("top", (0, 1))), "conditions", "Traction"),
+    "condition given twice": (lambda: scene(conditions=[OPEN, OPEN], fluid=WATER), "conditions", "given twice"),
+    "term among conditions": (lambda: scene(conditions=[mpm.OnSide("top", abs)]), "conditions", "terms="),
     "drained to nan": (lambda: sides("Drained", "top", NAN), "Drained: pressure", "= nan"),
     "inflow of nan": (lambda: sides("Inflow", "top", NAN), "Inflow: flux", "= nan"),
     "inflow of a word": (lambda: sides("Inflow", "top", "much"), "Inflow: flux", "much"),
@@ -283,18 +295,18 @@ CASES = {
     "elements without tolerance": (lambda: fem(tolerance=0), "tolerance", "= 0"),
     "elements of a word": (lambda: fem(material="sand"), "material", "'sand'"),
     "elements with a state": (lambda: fem(material=sand()), "DruckerPrager", "no state"),
-    "elements fixed at an unknown side": (lambda: fem(fixed={"west": "x"}), "side 'west'", "left, right, bottom, top"),
-    "elements fixed by an unknown component": (lambda: fem(fixed={"left": "q"}), "fixed side 'left'", "'q'"),
-    "elements drained without fluid": (lambda: fem(drained=[mpm.Drained("top")]), "drained", "fluid"),
+    "elements fixed at an unknown side": (lambda: fem(walls={"west": "x"}), "side 'west'", "left, right, bottom, top"),
+    "elements fixed by an unknown component": (lambda: fem(walls={"left": "q"}), "walls: 'left'", "'q'"),
+    "elements drained without fluid": (lambda: fem(conditions=[mpm.Drained("top")]), "drained", "fluid"),
     "elements with fluid and gravity": (lambda: fem(fluid=WATER, gravity=lambda t: (0, 1)), "gravity", "fluid"),
     "elements loaded nowhere": (
-        lambda: fem(tractions=[mpm.Traction("top", (0, 1), region=((2, 0), (3, 1)))]),
+        lambda: fem(conditions=[mpm.Traction("top", (0, 1), region=((2, 0), (3, 1)))]),
         "side 'top'",
         "(2, 0)",
     ),
-    "elements pulled by nan": (lambda: fem(tractions=[mpm.Traction("top", (0, NAN))]), "Traction(side='top'", "nan"),
+    "elements pulled by nan": (lambda: fem(conditions=[mpm.Traction("top", (0, NAN))]), "Traction(side='top'", "nan"),
     "elements pressed by a number": (
-        lambda: fem(tractions=[mpm.Traction("top", -1e5)]),
+        lambda: fem(conditions=[mpm.Traction("top", -1e5)]),
         "Traction(side='top'",
         "-100000.0",
     ),
@@ -314,15 +326,15 @@ def test_a_run_that_ends_in_bad_input_keeps_what_it_has():
     with pytest.raises(ValueError, match=r"value at t = 0\.5 s"):
         s.run(1.0, 0.125)
     assert s.result.t == pytest.approx([0, 0.125, 0.25, 0.375]) and s.t == 0.375
-    s.stage(tractions=[])
+    s.stage(conditions=[])
     assert s.run(1.0, 0.125).converged
 
 
 def test_a_stage_that_is_refused_changes_nothing():
-    s = scene([BODY, mpm.box(GRID, [0, 0.5], [0.5, 0.6])], tractions=[mpm.Traction("top", (0, -1e4))])
+    s = scene([BODY, mpm.box(GRID, [0, 0.5], [0.5, 0.6])], conditions=[mpm.Traction("top", (0, -1e4))])
     before = s.state
     with pytest.raises(ValueError, match="side 'lid'"):
-        s.stage(remove=[1], tractions=[mpm.Traction("lid", (0, 1))])
+        s.stage(remove=[1], conditions=[mpm.Traction("lid", (0, 1))])
     assert s.state is before
     assert s.run(1.0, 1.0, progress=False).converged
 
@@ -332,24 +344,23 @@ def test_a_point_that_leaves_the_grid_is_named_with_its_time():
     message = r"point \d+ at \[.*\]: its corner at \[.*\] left the grid .* by .* m at t = "
     with pytest.raises(mpm.GaveUp, match=message) as caught:
         s.run(2.0, 0.1)
-    assert not s.grid.outside(s.points.corners.reshape(-1, 2), 1e-4).any(), "the state is not the last good one"
+    assert not s.grid.outside(s.state.points.corners.reshape(-1, 2), 1e-4).any(), "the state is not the last good one"
     assert s.t == caught.value.result.t[-1] and caught.value.result.cuts == 0, "shorter steps only lead there"
-    s.stage(tractions=[top_load(60e3, 0.1)])
+    s.stage(conditions=[top_load(60e3, 0.1)])
     assert s.run(s.t + 0.1, 0.1).converged, "the run cannot go on with other loads"
 
 
 def test_steps_by_error_end_at_the_grid_as_soon_as_they_are_exact_enough():
     """The first step tried leads far beyond the grid, and is too inexact; ever shorter ones only led to its wall."""
-    grid = mpm.Grid([0.1, 1.1], [1, 11])
+    grid = mpm.Grid([0, 0], [0.1, 1.1], [1, 11])
     loads = [mpm.Traction("top", lambda t: (0, 1e5 * t))]
     s = mpm.Simulation(
         grid,
         [mpm.box(grid, [0, 0], [0.1, 1])],
         [SOFT],
         fluid=mpm.Fluid(),
-        fixed={"left": "x", "right": "x", "bottom": "y"},
-        tractions=loads,
-        drained=[mpm.Drained("top")],
+        walls={"left": "x", "right": "x", "bottom": "y"},
+        conditions=[*loads, mpm.Drained("top")],
     )
     with pytest.raises(mpm.GaveUp, match=r"its corner at \[.*\] left the grid"):
         s.run(1e3, rtol=0.01, first_step=100.0, progress=False)
@@ -358,7 +369,7 @@ def test_steps_by_error_end_at_the_grid_as_soon_as_they_are_exact_enough():
 
 def test_a_column_that_slides_is_refused():
     with pytest.raises(ValueError, match="free to move as a rigid body in 1 of 3 ways"):
-        column(fluid=False, fixed={"left": "x", "right": "x"}, tractions=[top_load()]).run(1.0, 1.0)
+        column(fluid=False, walls={"left": "x", "right": "x"}, conditions=[top_load()]).run(1.0, 1.0)
 
 
 @pytest.mark.parametrize("fluid, message", [(False, "the body is turned inside out"), (True, "the pores have closed")])
@@ -366,7 +377,7 @@ def test_a_load_that_leaves_no_volume_is_refused(fluid, message):
     """The linear law has an answer for any load: half of the volume is more than the pores, twice more than all."""
     law = mpm.LinearElastic(SOFT.bulk, SOFT.shear, porosity=0.4, conductivity=1.0)
     load = [mpm.Traction("top", (0, -(0.5 if fluid else 2.0) * law.oedometric))]
-    s = column(fluid=fluid, material=law, tractions=load, **({"drained": [mpm.Drained("top")]} if fluid else {}))
+    s = column(fluid=fluid, material=law, conditions=[*load, *([mpm.Drained("top")] if fluid else [])])
     with pytest.raises(mpm.GaveUp, match=f"{message}, J <= .*: point"):
         s.run(1e6, 1e6)
     assert s.t == 0 and (s.points.J == 1).all()

@@ -19,7 +19,7 @@ def two_blocks(
     """Return two blocks between walls, the upper one on a given path, their face so many cells off the grid."""
     n = 8 if dim == 2 else 3
     low, high, y = [0.0] * (dim - 1), [1.0] * (dim - 1), 0.5 + offset / n
-    grid = mpm.Grid([*high, 2.0], [n] * (dim - 1) + [2 * n])
+    grid = mpm.Grid([0] * dim, [*high, 2.0], [n] * (dim - 1) + [2 * n])
     lower = mpm.box(grid, [*low, 0], [*high, y], per_cell=2)
     upper = mpm.box(grid, [*low, y + gap], [*high, y + gap + 0.5], per_cell=3)
     above = ([*low, y + gap + 0.3], [*high, 2.0])
@@ -27,11 +27,13 @@ def two_blocks(
     fluid = {}
     if wet:
         drained = [mpm.Drained("top", region=above), mpm.Drained("bottom", region=([*low, 0], [*high, 0.2]))]
-        fluid = {"fluid": mpm.Fluid(), "drained": drained}
+        fluid = {"fluid": mpm.Fluid(), "conditions": drained}
     contacts = [mpm.Contact(0, 1, **contact)]
     bodies = [lower, upper][::order]
     walls = WALLS[dim]
-    return mpm.Simulation(grid, bodies, [SOIL], fixed=walls, displacements=[held], contacts=contacts, **fluid)
+    return mpm.Simulation(
+        grid, bodies, [SOIL], walls=walls, conditions=[held, *contacts, *fluid.pop("conditions", [])], **fluid
+    )
 
 
 def pressed_by(depth, height):
@@ -70,11 +72,11 @@ def test_a_gap_far_below_a_cell_carries_nothing():
 
 def pushed(share, **contact):
     """Return by how much a block on another one, pushed by so much of 400 Pa, slides in 5 steps under 1 kPa."""
-    grid = mpm.Grid([3, 2], [12, 8])
+    grid = mpm.Grid([0, 0], [3, 2], [12, 8])
     lower, upper = mpm.box(grid, [0.3, 0], [2.7, 0.55]), mpm.box(grid, [1, 0.55], [1.8, 0.95], per_cell=3)
     load = mpm.Traction("top", lambda t: (share * 300 * min(t, 1), -1e3), region=([0, 0.8], [3, 2]))
     contacts = [mpm.Contact(1, 0, **contact)]
-    s = mpm.Simulation(grid, [lower, upper], [SOIL], fixed={"bottom": "xy"}, tractions=[load], contacts=contacts)
+    s = mpm.Simulation(grid, [lower, upper], [SOIL], walls={"bottom": "xy"}, conditions=[load, *contacts])
     s.run(1.0, 0.25)
     assert s.tool_forces[0, :2] == pytest.approx([-share * 0.8 * 300, 0.8e3], rel=1e-6)
     before = s.points.x[:, 0].copy()
@@ -91,14 +93,14 @@ def test_a_block_sticks_below_what_friction_and_adhesion_bear_and_slides_above(c
 
 def stack(order):
     """Return places and forces of three blocks of three groups on one another, pressed aslant, in some order."""
-    grid, heights = mpm.Grid([1.6, 2], [8, 10], lower=[-0.3, 0]), [0, 0.43, 0.97, 1.5]
+    grid, heights = mpm.Grid([-0.3, 0], [1.6, 2], [8, 10]), [0, 0.43, 0.97, 1.5]
     made = [([0, low], [1, high]) for low, high in pairwise(heights)]
     bodies = [mpm.box(grid, *made[i], per_cell=2 + i, material=i) for i in order]
     soils = [mpm.Hencky(bulk=e / 3, shear=e / 2) for e in (E, 100 * E, 3 * E)]
     low, mid, top = (order.index(i) for i in range(3))
     contacts = [mpm.Contact(top, mid, friction=0.1), mpm.Contact(mid, low, friction=0.3), mpm.Contact(low, top)]
     held = mpm.Displacement("top", lambda t, X: (0.02 * t, -0.1 * t), region=([0, 1.4], [1, 2]))
-    s = mpm.Simulation(grid, bodies, soils, fixed={"bottom": "xy"}, displacements=[held], contacts=contacts)
+    s = mpm.Simulation(grid, bodies, soils, walls={"bottom": "xy"}, conditions=[held, *contacts])
     s.run(1.0, 0.5)
     start = np.cumsum([0, *(len(body) for body in bodies)])
     return np.concatenate([s.points.x[start[i] : start[i + 1]] for i in (low, mid, top)]), s.tool_forces
@@ -117,14 +119,14 @@ def test_three_groups_do_the_same_in_any_order():
 @pytest.mark.parametrize(("stiff", "spacings"), [((100, 1), (1, 5)), ((1, 100), (1, 5)), ((100, 1), (5, 1))])
 def test_a_block_over_the_seam_of_two_others_presses_them_evenly(stiff, spacings):
     """Three groups meet in one cell; blocks are a hundred times as stiff as others, or five times as fine."""
-    grid, (low, high) = mpm.Grid([1, 2], [8, 16]), (0.55, 1.05)
+    grid, (low, high) = mpm.Grid([0, 0], [1, 2], [8, 16]), (0.55, 1.05)
     below = [mpm.box(grid, a, b, per_cell=spacings[0]) for a, b in (([0, 0], [0.53, low]), ([0.53, 0], [1, low]))]
     above = mpm.box(grid, [0, low], [1, high], per_cell=spacings[1], material=1)
     soils = [mpm.Hencky(bulk=k * E / 3, shear=k * E / 2) for k in stiff]
     press = mpm.Traction("top", (0, -1e4), region=([0, 1], [1, 2]))
     contacts = [mpm.Contact(2, 0, friction=0.2), mpm.Contact(1, 2), mpm.Contact(0, 1)]
     walls = {"bottom": "y", "left": "x", "right": "x"}
-    s = mpm.Simulation(grid, [*below, above], soils, fixed=walls, tractions=[press], contacts=contacts)
+    s = mpm.Simulation(grid, [*below, above], soils, walls=walls, conditions=[press, *contacts])
     s.run(1.0, 1.0)
     assert s.effective_stress()[:, 1, 1] == pytest.approx(np.full(len(s.points), -1e4), rel=1e-3)
     assert s.tool_forces[:, 1] == pytest.approx([5.3e3, -4.7e3, 0], abs=1)
@@ -148,14 +150,14 @@ def test_contact_resumes_bit_for_bit_and_keeps_the_fluid(tmp_path, wet, friction
 
 def heap(wet=False):
     """Return a block on soil of another group, with fills of the block's group to come."""
-    grid, y = mpm.Grid([1, 2], [4, 8]), 0.5 + 0.3 / 4
+    grid, y = mpm.Grid([0, 0], [1, 2], [4, 8]), 0.5 + 0.3 / 4
     heights = [(0, y), (y, y + 0.4), (y + 0.4, y + 0.7), (y, y + 0.6)]
     bodies = [mpm.box(grid, [0, low], [1, high], per_cell=2 + i) for i, (low, high) in enumerate(heights)]
     soil = mpm.Hencky(bulk=E / 3, shear=E / 2, porosity=0.4, conductivity=1e-5, grain_density=2000)
     walls, contact = {"bottom": "y", "left": "x", "right": "x"}, mpm.Contact([1, 2, 3], 0, friction=0.2)
-    water = {"fluid": mpm.Fluid(), "drained": [mpm.Drained("bottom", region=([0, 0], [1, 0]))]} if wet else {}
-    given = {"contacts": [contact], "gravity": [0, -10.0], "later": [2, 3], **water}
-    return mpm.Simulation(grid, bodies, [soil], fixed=walls, **given)
+    conditions = [contact, *[mpm.Drained("bottom", region=([0, 0], [1, 0]))] * wet]
+    given = {"gravity": [0, -10.0], "later": [2, 3], "fluid": mpm.Fluid() if wet else None}
+    return mpm.Simulation(grid, bodies, [soil], walls=walls, conditions=conditions, **given)
 
 
 @pytest.mark.parametrize("wet", [False, True])
@@ -184,11 +186,11 @@ def test_the_contact_bears_what_is_on_it_as_bodies_come_and_go(wet):
 @pytest.mark.parametrize("order", [1, -1])
 def test_a_plate_presses_bodies_of_two_groups_evenly(order):
     """They stand beside each other, with other spacings; each gives back what it took, and the plate parts."""
-    grid, y = mpm.Grid([2, 2], [8, 8]), 0.85
+    grid, y = mpm.Grid([0, 0], [2, 2], [8, 8]), 0.85
     bodies = [mpm.box(grid, [0, 0], [1, y]), mpm.box(grid, [1, 0], [2, y], per_cell=3)][::order]
     plate = mpm.Tool(mpm.HalfSpace([1, y + 0.01], [0, -1]), displacement=lambda t: (0, -0.1 * np.sin(np.pi * t)))
     walls = {"bottom": "y", "left": "x", "right": "x"}
-    s = mpm.Simulation(grid, bodies, [SOIL], fixed=walls, contacts=[mpm.Contact(0, 1, friction=0.2)], tools=[plate])
+    s = mpm.Simulation(grid, bodies, [SOIL], walls=walls, conditions=[mpm.Contact(0, 1, friction=0.2), plate])
     s.run(0.5, 0.25)
     most, least = (2 * pressed_by(depth, y) for depth in (0.09, 0.09 - 5e-4 * grid.h[1]))
     assert most < s.tool_forces[0, 1] < least  # bodies may reach into plates as far
@@ -204,7 +206,7 @@ def test_a_tool_presses_a_face_that_another_group_lay_on(tmp_path):
     s.run(1.0, 0.25, observe=write)
     top = s.points.corners[s.points.id < len(s.bodies[0]), :, 1].max()
     plate = mpm.Convex([[-0.5, top], [1.5, top], [1.5, top + 0.2], [-0.5, top + 0.2]])
-    s.stage(tools=[mpm.Tool(plate, displacement=lambda t: (0, -0.1 * (t - 1)))])
+    s.stage(conditions=[*s.conditions, mpm.Tool(plate, displacement=lambda t: (0, -0.1 * (t - 1)))])
     s.run(2.0, 0.5)
     assert s.tool_forces[:, 1] == pytest.approx([pressed_by(0.1, top), 0], rel=1e-3)
 
@@ -215,12 +217,16 @@ def test_a_block_on_soil_at_rest_stays_there(wet, friction):
     density = 1600.0 if wet else 1200.0
     soil = mpm.Hencky(bulk=E / 3, shear=E / 2, porosity=0.4, conductivity=1e-6, grain_density=2000)
     for width, still in ((1.0, 1e-12), (0.6, 1e-5)):
-        grid, y = mpm.Grid([1, 2], [8, 16]), 0.55
+        grid, y = mpm.Grid([0, 0], [1, 2], [8, 16]), 0.55
         bodies = [mpm.box(grid, [0, 0], [1, y]), mpm.box(grid, [0, y], [width, y + 0.6], per_cell=3)]
         water = {"fluid": mpm.Fluid(), "pressure": mpm.hydrostatic(y + 0.6, 1e4)} if wet else {}
-        rest = {"gravity": [0, -10], "initial_stress": mpm.K0(1.0), "contacts": [mpm.Contact(1, 0, friction=friction)]}
+        rest = {
+            "gravity": [0, -10],
+            "initial_stress": mpm.K0(1.0),
+            "conditions": [mpm.Contact(1, 0, friction=friction)],
+        }
         walls = {"bottom": "xy", "left": "x", "right": "x"}
-        s = mpm.Simulation(grid, bodies, [soil], fixed=walls, **rest, **water)
+        s = mpm.Simulation(grid, bodies, [soil], walls=walls, **rest, **water)
         before = s.points.x.copy()
         s.run(20.0, 10.0)
         assert np.abs(s.points.x - before).max() < still * grid.h.min()
@@ -228,12 +234,14 @@ def test_a_block_on_soil_at_rest_stays_there(wet, friction):
 
 
 def test_what_are_no_contacts_is_refused():
-    grid = mpm.Grid([1, 2], [4, 8])
+    grid = mpm.Grid([0, 0], [1, 2], [4, 8])
     boxes = [mpm.box(grid, [0, y], [1, y + 0.5]) for y in (0, 0.5, 1.0)]
     deep = mpm.box(grid, [0, 0.3], [1, 0.9])
 
     def scene(bodies, *contacts, **more):
-        return mpm.Simulation(grid, bodies, [SOIL], fixed={"bottom": "xy"}, contacts=contacts, **more)
+        return mpm.Simulation(
+            grid, bodies, [SOIL], walls={"bottom": "xy"}, conditions=[*contacts, *more.pop("conditions", [])], **more
+        )
 
     with pytest.raises(ValueError, match=r"Contact: friction = -0.1, must be >= 0 and finite"):
         mpm.Contact(0, 1, friction=-0.1)
@@ -250,7 +258,7 @@ def test_what_are_no_contacts_is_refused():
     with pytest.raises(ValueError, match=r"bodies 0 and 1: both are at .*, 0.2 m deep, must not lie in each other"):
         scene([boxes[0], deep], mpm.Contact(0, 1))
     with pytest.raises(ValueError, match=r"2 groups of bodies have this side, must be one; limit it"):
-        scene(boxes[:2], mpm.Contact(0, 1), tractions=[mpm.Traction("left", 0.0)])
+        scene(boxes[:2], mpm.Contact(0, 1), conditions=[mpm.Traction("left", 0.0)])
     with pytest.raises(ValueError, match=r"quadrature 'point': must be domain with contacts"):
         scene(boxes[:2], mpm.Contact(0, 1), quadrature="point")
     with pytest.raises(ValueError, match=r"terms: must be none with contacts"):
@@ -260,18 +268,20 @@ def test_what_are_no_contacts_is_refused():
     with pytest.raises(ValueError, match=r"is free to move as a rigid body in 3 of 3 ways"):
         scene(boxes[::2], mpm.Contact(0, 1, friction=0.3), gravity=[0, -10]).step(1.0)
     sand = mpm.MohrCoulomb(bulk=2e7, shear=1e7, friction=30.0, dilation=10.0, cohesion=5e3)
-    s = mpm.Simulation(grid, boxes[:2], [sand], fixed={"bottom": "xy"}, contacts=[mpm.Contact(0, 1)], gravity=[0, -10])
+    s = mpm.Simulation(
+        grid, boxes[:2], [sand], walls={"bottom": "xy"}, conditions=[mpm.Contact(0, 1)], gravity=[0, -10]
+    )
     with pytest.raises(ValueError, match=r"factor_of_safety: contacts: must be none"):
         mpm.factor_of_safety(s)
 
 
 def test_a_block_slides_off_the_edge_of_another():
     """In no step does it come into the other one; smooth, it meets no force along its path until it falls off."""
-    grid = mpm.Grid([2.2, 1.2], [22, 12])
+    grid = mpm.Grid([0, 0], [2.2, 1.2], [22, 12])
     bodies = [mpm.box(grid, [0.2, 0], [1.1, 0.53]), mpm.box(grid, [0.4, 0.53], [0.8, 0.93], per_cell=3)]
     path = mpm.Displacement("top", lambda t, X: (0.1 * max(0, t - 1), -0.01 * min(t, 1)), region=([0, 0.9], [2.2, 1.2]))
     gel = mpm.Hencky(bulk=1e6, shear=6e5)
-    s = mpm.Simulation(grid, bodies, [gel], fixed={"bottom": "xy"}, displacements=[path], contacts=[mpm.Contact(1, 0)])
+    s = mpm.Simulation(grid, bodies, [gel], walls={"bottom": "xy"}, conditions=[path, mpm.Contact(1, 0)])
     forces, deepest = [], []
 
     def see(s):
@@ -291,7 +301,7 @@ def test_a_block_on_a_slope_of_another_body_slips_where_its_tangent_is_the_coeff
     """The slope is aslant to the grid; gravity turns until the block should not slip yet, or should."""
     (c, s), mu = (np.cos(0.25), np.sin(0.25)), 0.3
     turn = np.array([[c, -s], [s, c]])
-    grid = mpm.Grid([3, 2], [18, 12])
+    grid = mpm.Grid([0, 0], [3, 2], [18, 12])
     flat = mpm.box(grid, [0, 0], [1.8, 0.4]), mpm.box(grid, [0.6, 0.4], [1.2, 0.6], per_cell=3)
     bodies = [mpm.mapped(grid, body, lambda x: x @ turn.T + (0.6, 0.1)) for body in flat]
     held = mpm.Displacement("bottom", (0, 0), region=([-0.1, -0.1], [1.9, 0.1]))
@@ -301,8 +311,10 @@ def test_a_block_on_a_slope_of_another_body_slips_where_its_tangent_is_the_coeff
         angle = np.arctan(mu * share * min(t, 1))
         return turn @ [-10 * np.sin(angle), -10 * np.cos(angle)]
 
-    options = {"fixed": {}, "displacements": [held], "gravity": gravity}
-    scene = mpm.Simulation(grid, bodies, [rock], contacts=[mpm.Contact(1, 0, friction=mu)], **options)
+    options = {"walls": {}, "conditions": [held], "gravity": gravity}
+    scene = mpm.Simulation(
+        grid, bodies, [rock], conditions=[mpm.Contact(1, 0, friction=mu), *options.pop("conditions", [])], **options
+    )
     if share > 1:
         with pytest.raises(mpm.GaveUp):
             scene.run(1.0, 0.25)
@@ -318,7 +330,7 @@ def test_a_block_on_a_slope_of_another_body_slips_where_its_tangent_is_the_coeff
 def test_a_disc_rolls_between_two_bodies():
     """Held at first, then only by friction: it goes half as far as what lies on it, and turns as far as that."""
     n, R, y = 8, 0.5, 1.3
-    grid, c, on = mpm.Grid([4, 2], [4 * n, 2 * n]), np.array([1.5, y - R]), ([1, 0.75], [1.1, 0.85])
+    grid, c, on = mpm.Grid([0, 0], [4, 2], [4 * n, 2 * n]), np.array([1.5, y - R]), ([1, 0.75], [1.1, 0.85])
     round_off = lambda x: c + (x - c) * np.sqrt(1 - ((x - c) / R)[:, ::-1] ** 2 / 2)  # noqa: E731
     disc = mpm.mapped(grid, mpm.box(grid, c - R, c + R), round_off)
     bodies = [mpm.box(grid, [0.5, 0], [3.5, 0.3]), disc, mpm.box(grid, [0.5, y], [3, 1.6])]
@@ -326,9 +338,9 @@ def test_a_disc_rolls_between_two_bodies():
     press = mpm.Displacement("top", lambda t, X: (0.6 * max(0, t - 1), -0.03 * min(t, 1)), region=([0, 1.5], [4, 2]))
     hold = mpm.Displacement("left", lambda t, X: (0, -0.015 * t), region=on)
     contacts.append(mpm.Contact(0, 2))
-    s = mpm.Simulation(grid, bodies, [gel], fixed={"bottom": "xy"}, displacements=[hold, press], contacts=contacts)
+    s = mpm.Simulation(grid, bodies, [gel], walls={"bottom": "xy"}, conditions=[hold, press, *contacts])
     s.run(1.0, 0.25)
-    s.stage(displacements=[press])
+    s.stage(conditions=[press])
     mine = (s.points.id >= len(bodies[0])) & (s.points.id < len(bodies[0]) + len(disc))
     before = s.points.x[mine]
     s.run(2.0, 0.125)

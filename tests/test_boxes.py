@@ -48,7 +48,7 @@ def test_a_shape_has_its_surface_where_no_neighbour_is(dim):
 
 def test_what_is_known_of_a_large_body_as_seeded_takes_next_to_no_memory():
     """Bytes a point: 34 were kept, and up to 600 taken to describe it for a checkpoint."""
-    grid = mpm.Grid([1.0, 1.0, 1.0], [40, 40, 40])
+    grid = mpm.Grid([0, 0, 0], [1.0, 1.0, 1.0], [40, 40, 40])
     points_in_cells(grid, [])
     tracemalloc.start()
     try:

@@ -118,7 +118,7 @@ def test_a_column_in_a_scene_follows_the_element_test():
     clay = replace(CLAY, OCR=1.2)
     lab = element_test(clay, "oedometer", 0.02, steps=10)
     load = lambda t: (0, np.interp(t, lab.strain / 0.02, lab.stress[:, 2, 2]))  # noqa: E731
-    s = column(cells=4, fluid=False, material=clay, tractions=[mpm.Traction("top", load)])
+    s = column(cells=4, fluid=False, material=clay, conditions=[mpm.Traction("top", load)])
     assert s.effective_stress() == pytest.approx(-P0 * np.tile(np.eye(2), (len(s.points), 1, 1)), rel=1e-9, abs=1e-4)
     result = s.run(1.0, 0.1)
     assert result.cuts == 0

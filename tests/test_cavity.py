@@ -44,7 +44,7 @@ def pressures(cells, bulk, marks, outer):
     """
     h = 1 / cells
     size = int(np.ceil(np.sqrt(outer**2 + marks[-1] ** 2 - 1) / h)) + 2
-    grid = mpm.Grid([size * h] * 2, [size] * 2)
+    grid = mpm.Grid([0] * 2, [size * h] * 2, [size] * 2)
 
     def angle(X):
         return X[:, 1:] * np.pi / (2 * (outer - 1))
@@ -55,7 +55,7 @@ def pressures(cells, bulk, marks, outer):
     body = mpm.box(grid, [0, 0], [outer - 1] * 2)
     body = mpm.mapped(grid, body, lambda X: (1 + X[:, :1]) * ray(X))
     wall = mpm.Displacement("left", lambda t, X: t * ray(X))
-    s = mpm.Simulation(grid, [body], [soil(bulk)], fixed={"left": "x", "bottom": "y"}, displacements=[wall])
+    s = mpm.Simulation(grid, [body], [soil(bulk)], walls={"left": "x", "bottom": "y"}, conditions=[wall])
     found = []
     for mark in marks:
         steps = round((mark - 1 - s.t) / (0.2 * h) + 0.499)

@@ -24,7 +24,7 @@ def test_fields_of_the_cells_are_of_second_order():
 @pytest.mark.parametrize("load", [1e-6, 0.1], ids=["points that stay in their cells", "points that leave them"])
 def test_an_undrained_column_has_its_stresses_and_volume(load):
     q = load * SOFT.oedometric
-    s = column(offset=0.3, fluid=mpm.Fluid(bulk=5e6), tractions=[mpm.Traction("top", (0, -q))])
+    s = column(offset=0.3, fluid=mpm.Fluid(bulk=5e6), conditions=[mpm.Traction("top", (0, -q))])
     s.step(1.0)
     cells = s.cells()
     assert (s.state.stay is not None) == (load < 1e-5)

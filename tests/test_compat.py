@@ -13,7 +13,7 @@ from mpm_dolfinx import Grid
 from mpm_dolfinx.base import _compat
 from mpm_dolfinx.forms.point_forms import FormPoints, PointForm
 
-GRID = Grid([2.0, 1.0], [4, 3])
+GRID = Grid([0, 0], [2.0, 1.0], [4, 3])
 
 
 def assembled(points, data, integrand, space):

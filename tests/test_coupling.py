@@ -122,7 +122,7 @@ def test_the_filter_takes_at_most_what_the_fixed_stress_operator_has():
     L, V = storage.L, contents.fixed_stress[contents.filled]
     assert V.min() < 0.02 * V.max(), "no cell is hardly filled"
     x, y = L.createVecs()
-    index = s.grid.index(s.grid.midpoints[storage.unknowns.owned])
+    index = s.grid.index_from_base(s.grid.midpoints[storage.unknowns.owned])
     for values in (np.random.default_rng(0).normal(size=x.size), (-1.0) ** index.sum(axis=1), np.ones(x.size)):
         x.array_w[:] = values
         L.mult(x, y)
@@ -147,12 +147,12 @@ def test_the_undrained_pressure_has_no_checkers():
 
 def slender(thrust, side_load):
     """Return a cantilever of 1 m x 0.1 m, pressed by a multiple of its buckling load, and its tip."""
-    grid = mpm.Grid([1.2, 1.6], [48, 64])
+    grid = mpm.Grid([0, 0], [1.2, 1.6], [48, 64])
     body = mpm.box(grid, [0, 1.2], [1, 1.3])
     critical = np.pi**2 * 1e7 * 0.1**2 / 12 / 4  # Pa
     press = mpm.Traction("right", lambda t: (-thrust * critical * t, 0))
     push = mpm.Traction("top", lambda t: (0, -side_load * t))
-    s = mpm.Simulation(grid, [body], [SOFT], fixed={"left": "xy"}, tractions=[press, push])
+    s = mpm.Simulation(grid, [body], [SOFT], walls={"left": "xy"}, conditions=[press, push])
     return s, mpm.probes([body], [[1, 1.25]])
 
 

@@ -61,8 +61,8 @@ def in_a_grid(draw, y):
     shape = np.ceil(y.max(axis=0) - SNAP / 2).astype(int).clip(1) + draw(st.integers(0, 2))
     h = orders(draw, -3, 3, d)
     lower = h * orders(draw, -2, 4, d) * numbers(draw, -1, 1, d)
-    grid = Grid(lower + h * shape, shape, lower)
-    return grid, grid.lower + y * grid.h
+    grid = Grid(lower, lower + h * shape, shape)
+    return grid, grid.low + y * grid.h
 
 
 @st.composite
@@ -113,14 +113,14 @@ def dented(draw):
 
 def snapped(grid, corners):
     """Return corners in cells, on the grid planes that they are near."""
-    y = (corners - grid.lower) / grid.h
+    y = (corners - grid.low) / grid.h
     return np.where(np.abs(y - np.rint(y)) < grid.snap, np.rint(y), y)
 
 
 def error(grid, corners):
     """Return how far `snapped` may be off, in cells: by rounding, or where others would snap a corner or not."""
-    rounding = 1e-15 * (1 + ((np.abs(corners) + np.abs(grid.lower)) / grid.h).max())
-    distance = np.abs((corners - grid.lower) / grid.h - snapped(grid, corners))
+    rounding = 1e-15 * (1 + ((np.abs(corners) + np.abs(grid.low)) / grid.h).max())
+    distance = np.abs((corners - grid.low) / grid.h - snapped(grid, corners))
     return rounding + (grid.snap * (np.abs(distance - grid.snap) < rounding)).max()
 
 
@@ -131,8 +131,8 @@ def pieces(grid, *domains):
     p = Pieces(*(getattr(p, f.name)[p.point == len(domains) - 1] for f in fields(Pieces)))
     assert (p.fraction > 0).all() and (p.fraction <= 1).all() and abs(p.fraction.sum() - 1) < 1e-13
     index = np.stack(np.unravel_index(p.cell, grid.shape), axis=1)
-    assert (grid.index(p.x) == index).all(), "a centroid lies in another cell"
-    x, faces = (p.x - grid.lower) / grid.h - index, p.faces * (grid.h / grid.cell_volume)[:, None]
+    assert (grid.index_from_base(p.x) == index).all(), "a centroid lies in another cell"
+    x, faces = (p.x - grid.low) / grid.h - index, p.faces * (grid.h / grid.cell_volume)[:, None]
     return {tuple(i): row for i, *row in zip(index.tolist(), p.fraction, x, faces, strict=True)}
 
 
@@ -216,17 +216,17 @@ def test_a_quadrilateral_has_the_pieces_of_the_exact_clipping(scene):
 @given(quadrilaterals())
 def test_the_pieces_of_a_quadrilateral_together_have_its_centroid(scene):
     grid, corners = scene
-    y, p = (corners - grid.lower) / grid.h, cut(grid, corners[None])
+    y, p = (corners - grid.low) / grid.h, cut(grid, corners[None])
     slack = error(grid, corners) + np.abs(y - snapped(grid, corners)).max()
     area, perimeter, centroid = conditioned(exact(y), slack)
-    off = (p.fraction @ p.x - grid.lower) / grid.h - centroid
+    off = (p.fraction @ p.x - grid.low) / grid.h - centroid
     assert np.abs(off).max() < LOST + 4 * slack * perimeter / area * max(1, perimeter)
 
 
 @repeatable(50)
 @given(st.lists(quadrilaterals(), min_size=2, max_size=4))
 def test_a_domain_is_cut_among_others_as_by_itself(scenes):
-    grid = Grid([14.0, 14.0], [14, 14])
+    grid = Grid([0, 0], [14.0, 14.0], [14, 14])
     domains = [(corners - own.lower) / own.h for own, corners in scenes]
     alone, among, slack = pieces(grid, domains[-1]), pieces(grid, *domains), error(grid, domains[-1])
     area, perimeter, _ = conditioned(exact(domains[-1]), slack)
@@ -358,7 +358,7 @@ def test_the_open_faces_of_a_hexahedron_are_the_sections_of_its_tetrahedra(scene
 @pytest.mark.parametrize("gap", [0, 1e-12, 9e-11, 4e-10, 1e-9, 1e-7, 1e-3])
 def test_a_face_is_open_where_the_body_is_no_further_from_it_than_the_snap(d, gap):
     """From above and from below, on either side of the middle plane."""
-    grid, open_ = Grid([2.0] * d, [2] * d), float(gap < SNAP)
+    grid, open_ = Grid([0] * d, [2.0] * d, [2] * d), float(gap < SNAP)
     for axis in range(d):
         above, below = BITS[d] * 0.5 + 0.2, BITS[d] * 0.5 + 0.2
         above[:, axis], below[:, axis] = 1 + gap + 0.5 * BITS[d][:, axis], 1 - gap - 0.5 * BITS[d][:, axis][::-1]
@@ -413,7 +413,7 @@ def test_points_on_a_face_integrate_what_is_quadratic_in_each_cell(d):
         grid, corners, local = scene
         face, x, xi, share, middle = cut_faces(grid, corners[None], local[None])
         assert (face == 0).all() and (share > 0).all() and abs(share.sum() - 1) < LOST
-        at, middle = (x - grid.lower) / grid.h, (middle - grid.lower) / grid.h
+        at, middle = (x - grid.low) / grid.h, (middle - grid.low) / grid.h
         z = np.hstack([np.ones((len(x), 1)), at, xi])
         slack = 10 * (error(grid, corners) + LOST) * (1 + np.abs(z).max() ** 2)
         both = np.hstack([snapped(grid, corners), local])
@@ -432,7 +432,7 @@ def test_points_on_a_face_integrate_what_is_quadratic_in_each_cell(d):
 def test_pieces_in_3d_have_the_moments_of_products_of_what_they_are():
     """Those of a turned box, and those of its eight parts summed in each cell."""
     rng = np.random.default_rng(0)
-    grid, F = Grid([3.0, 2.0, 4.0], [3, 4, 5]), np.eye(3) + 0.3 * rng.normal(size=(3, 3))
+    grid, F = Grid([0, 0, 0], [3.0, 2.0, 4.0], [3, 4, 5]), np.eye(3) + 0.3 * rng.normal(size=(3, 3))
     x, whole = np.array([[1.4, 1.1, 1.9]]), np.full((1, 3), 0.7)
     parts = x + 0.25 * 0.7 * (2 * BITS[3] - 1) @ F.T
     found = []

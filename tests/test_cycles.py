@@ -89,19 +89,28 @@ def test_what_cycles_leave_falls_with_the_cell_size():
 
 def left_of(h, dim=2, **wet):
     """Return what three cycles leave of the effective stress of a cantilever, rms over its peak."""
-    grid = mpm.Grid([1.2, *[0.4] * (dim - 2), 1.2], np.rint(np.array([1.2, *[0.4] * (dim - 2), 1.2]) / h).astype(int))
+    grid = mpm.Grid(
+        [0] * dim, [1.2, *[0.4] * (dim - 2), 1.2], np.rint(np.array([1.2, *[0.4] * (dim - 2), 1.2]) / h).astype(int)
+    )
     lower = np.array([0.0, *[0.1] * (dim - 2), 0.6 + h / 2])
     body = mpm.box(grid, lower, np.add(lower, [1.0, *[0.2] * (dim - 2), 0.3]))
     load = mpm.Traction("top", lambda t: [0.0] * (dim - 1) + [-2e4 * (1 - abs(2 * (t % 1) - 1))])
-    soil = mpm.Hencky(bulk=1e7 / 3, shear=5e6, conductivity=1.0 if "drained" in wet else 0.0)
-    s = mpm.Simulation(grid, [body], [soil], fixed={"left": "xyz"[:dim]}, tractions=[load], **wet)
+    soil = mpm.Hencky(bulk=1e7 / 3, shear=5e6, conductivity=1.0 if "conditions" in wet else 0.0)
+    s = mpm.Simulation(
+        grid,
+        [body],
+        [soil],
+        walls={"left": "xyz"[:dim]},
+        conditions=[load, *wet.get("conditions", [])],
+        fluid=wet.get("fluid"),
+    )
     s.run(0.5, 0.1, progress=False)
     peak = cycles.rms(s)
     s.run(3.0, 0.1, progress=False)
     return cycles.rms(s) / peak
 
 
-DRAINS = {"fluid": mpm.Fluid(), "drained": [mpm.Drained("top"), mpm.Drained("bottom")]}
+DRAINS = {"fluid": mpm.Fluid(), "conditions": [mpm.Drained("top"), mpm.Drained("bottom")]}
 
 
 @pytest.mark.slow
@@ -145,7 +154,7 @@ def test_a_stretched_block_after_ten_turns_is_that_after_one():
 
     Were it fixed in space, sides would give way to its turn in each step: 2.6e-5 E.
     """
-    grid, centre = mpm.Grid([1.6, 1.6], [8, 8]), np.full(2, 0.81)
+    grid, centre = mpm.Grid([0, 0], [1.6, 1.6], [8, 8]), np.full(2, 0.81)
     block = mpm.box(grid, centre - 0.3, centre + 0.3)
 
     def moved(t, X):
@@ -154,7 +163,7 @@ def test_a_stretched_block_after_ten_turns_is_that_after_one():
         return stretched @ [[np.cos(a), np.sin(a)], [-np.sin(a), np.cos(a)]] + centre - X
 
     held = [mpm.Displacement(side, moved) for side in ("left", "right", "bottom", "top")]
-    s = mpm.Simulation(grid, [block], [clay(0.3)], fixed={}, displacements=held)
+    s = mpm.Simulation(grid, [block], [clay(0.3)], walls={}, conditions=held)
     stress, cuts = [], 0
     for end, dt in ((2, 0.2), (3, 1 / 72), (5, 1 / 72), (12, 1 / 72)):
         cuts += s.run(float(end), dt, progress=False).cuts
@@ -183,7 +192,7 @@ def test_corners_tell_a_homogeneous_deformation_and_in_all_others_the_volume(dim
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_corners_follow_quadratic_fields_exactly_and_kinks_at_grid_lines(dim):
-    grid = mpm.Grid([1.0] * dim, [5] * dim)
+    grid = mpm.Grid([0] * dim, [1.0] * dim, [5] * dim)
     rng = np.random.default_rng(1)
     x = rng.uniform(0, 1, (200, dim))
     Q = rng.normal(size=(dim, dim, dim))
@@ -205,10 +214,10 @@ def test_corners_follow_quadratic_fields_exactly_and_kinks_at_grid_lines(dim):
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_the_filter_leaves_quadratic_fields_and_what_has_not_moved_and_takes_the_wave_of_two_domains(dim):
-    grid = mpm.Grid([2.0] * dim, [4] * dim)
+    grid = mpm.Grid([0] * dim, [2.0] * dim, [4] * dim)
     body = mpm.box(grid, [0.1] * dim, [1.7] * dim)
     points = mpm.Simulation(
-        grid, [body], [mpm.Hencky(bulk=1e6, shear=1e6)], fixed={}, displacements=[mpm.Displacement("top", [0] * dim)]
+        grid, [body], [mpm.Hencky(bulk=1e6, shear=1e6)], walls={}, conditions=[mpm.Displacement("top", [0] * dim)]
     ).points
     found = lattices([body], [True], [])
     X = points.reference
@@ -239,11 +248,11 @@ def left_in(length=1.0, turned=False):
     turned: with x and y swapped.
     """
     way, sides = (slice(None, None, -1), ("bottom", "right")) if turned else (slice(None), ("left", "top"))
-    grid = mpm.Grid([1.2 * length] * 2, [20, 20])
+    grid = mpm.Grid([0] * 2, [1.2 * length] * 2, [20, 20])
     body = mpm.box(grid, np.array([0, 0.63])[way] * length, np.array([1, 0.93])[way] * length)
     load = mpm.Traction(sides[1], lambda t: np.array((0.0, -54e3 * (1 - abs(2 * t - 1))))[way])
     law = mpm.Hencky(bulk=1e7 / 3, shear=5e6)
-    s = mpm.Simulation(grid, [body], [law], fixed={sides[0]: "xy"}, tractions=[load])
+    s = mpm.Simulation(grid, [body], [law], walls={sides[0]: "xy"}, conditions=[load])
     s.run(1.0, 0.1, progress=False)
     order = np.lexsort(np.rint(s.points.reference.mean(axis=1)[:, way].T / length * 1e6))
     return s.effective_stress()[order][:, way, way], s.points.x[order][:, way] / length
@@ -264,7 +273,7 @@ SAND = mpm.DruckerPrager(bulk=8.3e6, shear=3.8e6, cohesion=1e3, friction=0.5, di
 @pytest.mark.parametrize(("dim", "fluid"), [(2, None), (2, mpm.Fluid()), (3, None)])
 def test_weak_soil_that_only_turns_stays_free_of_stress_and_takes_no_cut_step(dim, fluid):
     """Its strength is that of a turn by 2 degrees, taken as a linearised displacement."""
-    grid = mpm.Grid([1.6] * dim, [8] * dim)
+    grid = mpm.Grid([0] * dim, [1.6] * dim, [8] * dim)
     centre = np.full(dim, 0.81)
     block = mpm.box(grid, centre - 0.3, centre + 0.3, per_cell=4 - dim)
 
@@ -275,7 +284,7 @@ def test_weak_soil_that_only_turns_stays_free_of_stress_and_takes_no_cut_step(di
         return out
 
     held = mpm.Displacement("bottom", turned)
-    s = mpm.Simulation(grid, [block], [SAND], fluid=fluid, fixed={}, displacements=[held])
+    s = mpm.Simulation(grid, [block], [SAND], fluid=fluid, walls={}, conditions=[held])
     result = s.run(0.4, 0.1, progress=False)
     assert result.cuts == 0 and result.newton <= 3 * result.steps
     assert np.abs(s.effective_stress()).max() < 1e-3 * 1e3
@@ -283,21 +292,21 @@ def test_weak_soil_that_only_turns_stays_free_of_stress_and_takes_no_cut_step(di
 
 @pytest.mark.slow
 def test_weak_soil_turns_by_360_degrees_without_a_cut_step():
-    grid, centre = mpm.Grid([1.6, 1.6], [8, 8]), np.full(2, 0.81)
+    grid, centre = mpm.Grid([0, 0], [1.6, 1.6], [8, 8]), np.full(2, 0.81)
     block = mpm.box(grid, centre - 0.3, centre + 0.3)
 
     def turned(t, X):
         c, s = np.cos(2 * np.pi * t), np.sin(2 * np.pi * t)
         return (X - centre) @ np.array([[c, s], [-s, c]]) + centre - X
 
-    s = mpm.Simulation(grid, [block], [SAND], fixed={}, displacements=[mpm.Displacement("bottom", turned)])
+    s = mpm.Simulation(grid, [block], [SAND], walls={}, conditions=[mpm.Displacement("bottom", turned)])
     result = s.run(1.0, 1 / 72, progress=False)
     assert result.cuts == 0 and np.abs(s.effective_stress()).max() < 1e-3 * 1e3
 
 
 def test_a_turn_is_found_where_walls_hold_a_part_of_the_body():
     """A block hinged at a wall is no rigid body: Newton begins where it would have begun."""
-    grid = mpm.Grid([1.0, 1.0], [10, 10])
+    grid = mpm.Grid([0, 0], [1.0, 1.0], [10, 10])
     block = mpm.box(grid, [0.0, 0.3], [0.8, 0.7])
 
     def value(t, X):
@@ -306,7 +315,7 @@ def test_a_turn_is_found_where_walls_hold_a_part_of_the_body():
 
     def run():
         held = [mpm.Displacement("right", value)]
-        s = mpm.Simulation(grid, [block], [mpm.Hencky(bulk=1e6, shear=1e6)], fixed={"left": "xy"}, displacements=held)
+        s = mpm.Simulation(grid, [block], [mpm.Hencky(bulk=1e6, shear=1e6)], walls={"left": "xy"}, conditions=held)
         s.run(1.0, 0.5, progress=False)
         return s
 

@@ -31,7 +31,7 @@ def test_nearly_incompressible_beams_do_not_lock(nu):
     load = mpm.Traction("top", lambda t: (0, -54e3 * min(1, t)), region=((0.05, -np.inf), (1.0, np.inf)))
 
     def reference(n):
-        fem = BiotFEM([0, 0], [1, 0.3], (n, 3 * n // 10), skeleton(nu), fixed={"left": "xy"}, tractions=[load])
+        fem = BiotFEM([0, 0], [1, 0.3], (n, 3 * n // 10), skeleton(nu), walls={"left": "xy"}, conditions=[load])
         return fem.run(1.0, 0.1, probes=[[1.0, 0.15]]).displacement[-1][0, 1]
 
     assert tip == pytest.approx(2 * reference(60) - reference(30), rel=1e-2)
@@ -40,7 +40,7 @@ def test_nearly_incompressible_beams_do_not_lock(nu):
 def test_water_in_a_nearly_incompressible_beam_has_its_pressure():
     """Pressed out anew in each step by what corners tell it had up to thirty times that; steps by error never grew."""
     wet = Beam(extreme_soil(nu=0.499), WATER)
-    fem = BiotFEM([0, 0], wet.size, (20, 8), wet.material, fixed={"left": "xy"}, **wet.physics())
+    fem = BiotFEM([0, 0], wet.size, (20, 8), wet.material, walls={"left": "xy"}, **wet.physics())
     reference = fem.run(0.2, 0.02, probes=[[1.0, 0.2]])
     result = wet().simulation.run(0.2, 0.02)
     assert result.rows[-1].pressure == pytest.approx(reference.rows[-1].pressure, rel=0.1)
@@ -48,11 +48,11 @@ def test_water_in_a_nearly_incompressible_beam_has_its_pressure():
 
 def two_layers(*materials, dim=2):
     """Return a clamped block of two layers that share a row of cells, with a dead load on its top."""
-    grid = mpm.Grid([0.7, 0.7, 0.5][:dim], [7, 7, 5][:dim])
+    grid = mpm.Grid([0] * dim, [0.7, 0.7, 0.5][:dim], [7, 7, 5][:dim])
     layers = [([0, 0.1, 0.1], [0.5, 0.35, 0.4]), ([0, 0.35, 0.1], [0.5, 0.6, 0.4])]
     bodies = [mpm.box(grid, a[:dim], b[:dim], material=k) for k, (a, b) in enumerate(layers)]
     load = mpm.Traction("top", (0, -1e5, 0)[:dim])
-    return mpm.Simulation(grid, bodies, materials, fixed={"left": "xyz"[:dim]}, tractions=[load])
+    return mpm.Simulation(grid, bodies, materials, walls={"left": "xyz"[:dim]}, conditions=[load])
 
 
 @pytest.mark.parametrize(
@@ -86,7 +86,7 @@ def test_the_tangent_is_the_derivative_of_the_residual(make):
 
 
 def test_uniform_strain_is_exact():
-    s = column(material=skeleton(0.49), fluid=False, displacements=[mpm.Displacement("top", (0, -0.1), "y")])
+    s = column(material=skeleton(0.49), fluid=False, conditions=[mpm.Displacement("top", (0, -0.1), "y")])
     s.run(1.0, 0.5)
     stress = s.effective_stress()[:, 1, 1]
     exact = skeleton(0.49).oedometric * np.log(0.9) / 0.9
@@ -94,7 +94,7 @@ def test_uniform_strain_is_exact():
 
 
 def test_a_turned_body_has_no_stress():
-    grid, centre = mpm.Grid([1.0, 1.0], [10, 10]), np.array([0.5, 0.5])
+    grid, centre = mpm.Grid([0, 0], [1.0, 1.0], [10, 10]), np.array([0.5, 0.5])
     body = mpm.box(grid, [0.3, 0.33], [0.7, 0.72])
 
     def turned(t, X):
@@ -102,7 +102,7 @@ def test_a_turned_body_has_no_stress():
         return (X - centre) @ np.array([[c, s], [-s, c]]) + centre - X
 
     sides = [mpm.Displacement(side, turned) for side in ("left", "right", "bottom", "top")]
-    s = mpm.Simulation(grid, [body], [skeleton(0.49)], fixed={}, displacements=sides)
+    s = mpm.Simulation(grid, [body], [skeleton(0.49)], walls={}, conditions=sides)
     s.run(1.0, 0.05)
     assert np.abs(s.effective_stress()).max() < 1e-8 * YOUNG
 
@@ -114,12 +114,14 @@ def test_compressible_scenes_do_without():
 
 def sagging(*materials, far=False, later=False, **options):
     """Return the tip of an elastic beam, with a block elsewhere that is of the second material, or comes later."""
-    grid = mpm.Grid([1.8, 1.2], [30, 20])
+    grid = mpm.Grid([0, 0], [1.8, 1.2], [30, 20])
     bodies = [mpm.box(grid, [0, 0.63], [1, 0.93])] + [mpm.box(grid, [1.4, 0], [1.7, 0.3], material=1)] * far
     load = mpm.Traction("top", lambda t: (0, -54e3 * t), region=((0.05, 0.9), (1.0, 1.0)))
     walls = {"left": "xy", "bottom": "xy"}
     options |= {"later": [1] if later else [], "tolerance": 1e-11}
-    s = mpm.Simulation(grid, bodies, materials, fixed=walls, tractions=[load], **options)
+    s = mpm.Simulation(
+        grid, bodies, materials, walls=walls, conditions=[load, *options.pop("conditions", [])], **options
+    )
     probe = mpm.probes(bodies, [[1.0, 0.78]])
     if later:
         s.run(0.5, 0.25, probes=probe)
@@ -142,12 +144,12 @@ def test_a_skin_that_does_not_lock_shares_the_cells_of_a_beam_that_does():
 
     With one mean for all that a cell holds the tip would go down by 1.9 % less.
     """
-    grid, clay = mpm.Grid([1.2, 1.2], [20, 20]), skeleton(0.499)
+    grid, clay = mpm.Grid([0, 0], [1.2, 1.2], [20, 20]), skeleton(0.499)
     skin = replace(SOFT, bulk=1e-4 * SOFT.bulk, shear=1e-4 * SOFT.shear, grain_density=0.0)
     bodies = [mpm.box(grid, [0, 0.63], [1, 0.93]), mpm.box(grid, [0, 0.93], [1, 0.96], material=1)]
     tips = []
     for count in (1, 2):
-        scene = {"fixed": {"left": "xy"}, "gravity": lambda t: (0, -60 * t)}
+        scene = {"walls": {"left": "xy"}, "gravity": lambda t: (0, -60 * t)}
         s = mpm.Simulation(grid, bodies[:count], [clay, skin][:count], **scene)
         tips.append(s.run(1.0, 0.25, probes=mpm.probes(bodies[:count], [[1.0, 0.78]])).displacement[-1][0, 1])
     assert tips[1] == pytest.approx(tips[0], rel=1e-4)
@@ -165,7 +167,7 @@ def test_a_coupled_nearly_incompressible_beam_follows_finite_elements():
     result = s.run(0.1, 0.02, probes=probe)
     load = mpm.Traction("top", lambda t: (0, -54e3 * min(1, t / 0.06)), region=((0.05, -np.inf), (1.0, np.inf)))
     ends = [mpm.Drained("left"), mpm.Drained("right")]
-    scene = {"fixed": {"left": "xy"}, "tractions": [load], "drained": ends, "fluid": mpm.Fluid()}
+    scene = {"walls": {"left": "xy"}, "conditions": [load, *ends], "fluid": mpm.Fluid()}
     fem = BiotFEM([0, 0], [1, 0.3], (40, 12), skeleton(0.45), **scene)
     exact = fem.run(0.1, 0.02, probes=[[1.0, 0.15]]).displacement[-1][0, 1]
     assert result.displacement[-1][0, 1] == pytest.approx(exact, rel=1e-2)

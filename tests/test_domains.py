@@ -9,7 +9,7 @@ from mpm_dolfinx.grid.grid import SNAP
 from mpm_dolfinx.points import cutting
 from mpm_dolfinx.points.cutting import corner_bits, cut
 
-GRIDS = {2: Grid([1.0, 1.2], [5, 6]), 3: Grid([1.0, 1.2, 0.8], [4, 4, 4])}
+GRIDS = {2: Grid([0, 0], [1.0, 1.2], [5, 6]), 3: Grid([0, 0, 0], [1.0, 1.2, 0.8], [4, 4, 4])}
 
 
 @pytest.fixture(params=[2, 3], ids=["2D", "3D"])

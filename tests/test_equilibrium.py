@@ -3,7 +3,7 @@
 
 import numpy as np
 import pytest
-from helpers import SOFT, beam, column
+from helpers import SOFT, beam, column, without
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.grid.grid import SIDES
@@ -27,7 +27,7 @@ def weight(s):
 
 def off(s, load=0.0, axes=slice(None)):
     """Return what is left of the sum of all forces on the bodies, over the largest of them."""
-    d, tools = s.grid.dim, len(s.state.stage.conditions["tools"])
+    d, tools = s.grid.dim, sum(isinstance(one, mpm.Tool) for one in s.conditions)
     forces = [*s.wall_reactions.values(), *s.reactions, *s.tool_forces[:tools, :d], weight(s)]
     forces = np.array([*forces, np.broadcast_to(load, d)])
     return np.abs(forces.sum(axis=0)[axes]).max() / np.abs(forces).max()
@@ -35,32 +35,44 @@ def off(s, load=0.0, axes=slice(None)):
 
 def held_and_pressed(water):
     """Return a block with nearly empty cells beside two walls, with a given side and a rough tool, and its load."""
-    grid = mpm.Grid([2.2, 1.7], [11, 8])
+    grid = mpm.Grid([0, 0], [2.2, 1.7], [11, 8])
     s = mpm.Simulation(
         grid,
         [mpm.box(grid, [0, 0], [1.93, 1.1])],
         [SOIL],
-        fixed={"left": "xy", "bottom": "y"},
+        walls={"left": "xy", "bottom": "y"},
         gravity=(0, -G),
-        displacements=[mpm.Displacement("right", lambda t: (0, -1e-3 * t))],
-        tractions=[mpm.Traction("top", (3e3, -1e4))],
-        tools=[mpm.Tool(mpm.Ball((1.0, 1.3), 0.2), displacement=lambda t: (0, -2e-3 * t), friction=0.3)],
-        **water,
+        **water
+        | {
+            "conditions": [
+                mpm.Displacement("right", lambda t: (0, -1e-3 * t)),
+                mpm.Traction("top", (3e3, -1e4)),
+                mpm.Tool(mpm.Ball((1.0, 1.3), 0.2), displacement=lambda t: (0, -2e-3 * t), friction=0.3),
+                *water.get("conditions", []),
+            ]
+        },
     )
     return s, (3e3 * 1.93, -1e4 * 1.93)
 
 
 def under_a_plate(water):
-    grid = mpm.Grid([2.2, 1.7], [11, 8])
+    grid = mpm.Grid([0, 0], [2.2, 1.7], [11, 8])
     body, plate = mpm.box(grid, [0, 0], [1.93, 1.1]), mpm.RigidPlate("top", 1e4)
     walls = {"left": "x", "bottom": "xy"}
-    return mpm.Simulation(grid, [body], [SOIL], fixed=walls, plates=[plate], gravity=(0, -G), **water), (0, -1e4)
+    return mpm.Simulation(
+        grid,
+        [body],
+        [SOIL],
+        walls=walls,
+        gravity=(0, -G),
+        **water | {"conditions": [plate, *water.get("conditions", [])]},
+    ), (0, -1e4)
 
 
 def a_thin_layer(water):
     """Return a layer a little thicker than a cell: the ghost penalty of its top acts on the floor's nodes."""
-    grid, load = mpm.Grid([2.0, 1.0], [10, 5]), (2e3, -1e4)
-    options = {"fixed": {"bottom": "xy"}, "tractions": [mpm.Traction("top", load)], "gravity": (0, -G)}
+    grid, load = mpm.Grid([0, 0], [2.0, 1.0], [10, 5]), (2e3, -1e4)
+    options = {"walls": {"bottom": "xy"}, "conditions": [mpm.Traction("top", load)], "gravity": (0, -G)}
     return mpm.Simulation(grid, [mpm.box(grid, [0.1, 0], [1.9, 0.22])], [SOIL], **options, **water), 1.8 * np.array(
         load
     )
@@ -68,33 +80,45 @@ def a_thin_layer(water):
 
 def held_in_the_cells_of_a_wall(water):
     """Return a block whose held top ends in the cells beside a wall, which it does not touch."""
-    grid, walls = mpm.Grid([2.2, 1.7], [11, 8]), {"left": "x", "bottom": "xy"}
+    grid, walls = mpm.Grid([0, 0], [2.2, 1.7], [11, 8]), {"left": "x", "bottom": "xy"}
     held = mpm.Displacement("top", lambda t: (5e-4 * t, -1e-3 * t))
     body = mpm.box(grid, [0.07, 0], [1.3, 1.1])
-    return mpm.Simulation(grid, [body], [SOIL], fixed=walls, displacements=[held], **water), (0, 0)
+    return mpm.Simulation(
+        grid, [body], [SOIL], walls=walls, **water | {"conditions": [held, *water.get("conditions", [])]}
+    ), (
+        0,
+        0,
+    )
 
 
 def pushed_along_a_wall(water):
     """Return a block, and a plate one cell high, of which a given displacement pushes a side along a rough floor."""
-    grid, walls = mpm.Grid([2.2, 1.7], [11, 8]), {"bottom": "xy"}
+    grid, walls = mpm.Grid([0, 0], [2.2, 1.7], [11, 8]), {"bottom": "xy"}
     bodies = [mpm.box(grid, [0.27, 0], [0.9, 1.1]), mpm.box(grid, [1.3, 0], [1.9, 0.2])]
     near = [((0, 0), (1, 2)), ((1, 0), (2, 2))]
     sides = [mpm.Displacement("left", lambda t: (1e-2 * t, 0), "x", region=region) for region in near]
-    return mpm.Simulation(grid, bodies, [SOIL], fixed=walls, displacements=sides, gravity=(0, -G), **water), (0, 0)
+    return mpm.Simulation(
+        grid,
+        bodies,
+        [SOIL],
+        walls=walls,
+        gravity=(0, -G),
+        **water | {"conditions": [*sides, *water.get("conditions", [])]},
+    ), (0, 0)
 
 
 def in_a_corner(water):
-    grid = mpm.Grid([1.1, 1.1, 1.4], [5, 5, 6])
+    grid = mpm.Grid([0, 0, 0], [1.1, 1.1, 1.4], [5, 5, 6])
     load, walls = (3e3, 10.0, -1e4), {"left": "xyz", "back": "y", "front": "yz", "bottom": "xz"}
-    options = {"fixed": walls, "tractions": [mpm.Traction("top", load)], "gravity": (0, 0, -G)}
+    options = {"walls": walls, "conditions": [mpm.Traction("top", load)], "gravity": (0, 0, -G)}
     s = mpm.Simulation(grid, [mpm.box(grid, [0, 0, 0], [0.93, 1.1, 1.03])], [SOIL], **options, **water)
     return s, np.array(load) * 0.93 * 1.1
 
 
 def a_cylinder(water):
-    grid = mpm.Grid([1.1, 1.4], [5, 6], axisymmetric=True)
+    grid = mpm.Grid([0, 0], [1.1, 1.4], [5, 6], axisymmetric=True)
     load = mpm.Traction("top", (0, -1e4))
-    options = {"fixed": {"bottom": "xy"}, "tractions": [load], "gravity": (0, -G)}
+    options = {"walls": {"bottom": "xy"}, "conditions": [load], "gravity": (0, -G)}
     return mpm.Simulation(grid, [mpm.box(grid, [0, 0], [0.93, 1.03])], [SOIL], **options, **water), (
         0.0,
         -1e4 * np.pi * 0.93**2,
@@ -103,25 +127,32 @@ def a_cylinder(water):
 
 def two_groups(water):
     """Return a block that slips on a thin one, which the floor holds by the nodes that its pairs act on too."""
-    grid = mpm.Grid([1.0, 1.2], [10, 12])
+    grid = mpm.Grid([0, 0], [1.0, 1.2], [10, 12])
     bodies = [mpm.box(grid, [0, 0], [0.9, 0.09]), mpm.box(grid, [0, 0.12], [0.7, 0.55])]
     push = mpm.Displacement("top", lambda t: (0, -0.04 * t), "y", region=((0, 0.5), (1, 1)))
-    options = {"fixed": {"left": "x", "bottom": "xy"}, "gravity": (0, -G), "displacements": [push]}
+    options = {"walls": {"left": "x", "bottom": "xy"}, "gravity": (0, -G), "conditions": [push]}
     contact = mpm.Contact(1, 0, friction=0.3)
-    return mpm.Simulation(grid, bodies, [SOIL], contacts=[contact], **options, **(water and {"fluid": mpm.Fluid()})), 0
+    return mpm.Simulation(
+        grid,
+        bodies,
+        [SOIL],
+        conditions=[contact, *options.pop("conditions", [])],
+        **options,
+        **(water and {"fluid": mpm.Fluid()}),
+    ), 0
 
 
 def held_beside_walls(water, move=lambda t: (0.0, 0.0), **options):
     """Return a block whose side is held where the floor, which is rough, holds its last nodes too."""
-    grid = mpm.Grid([2.0, 1.4], [8, 7])
+    grid = mpm.Grid([0, 0], [2.0, 1.4], [8, 7])
     side = mpm.Displacement("left", move, "x")
-    options = {"fixed": {"right": "x", "bottom": "xy"}, "gravity": (0, -G), "displacements": [side], **options}
+    options = {"walls": {"right": "x", "bottom": "xy"}, "gravity": (0, -G), "conditions": [side], **options}
     return mpm.Simulation(grid, [mpm.box(grid, [0, 0], [2.0, 1.0])], [SOIL], **options, **water), 0
 
 
 def held_on_the_floor(water):
     return held_beside_walls(
-        water, fixed={"left": "x", "right": "x", "bottom": "xy"}, displacements=[mpm.Displacement("bottom", (0, 0))]
+        water, walls={"left": "x", "right": "x", "bottom": "xy"}, conditions=[mpm.Displacement("bottom", (0, 0))]
     )
 
 
@@ -132,11 +163,11 @@ SCENES += [a_cylinder, two_groups, held_beside_walls, held_on_the_floor]
 @pytest.mark.parametrize("wet", [False, True], ids=["dry", "wet"])
 @pytest.mark.parametrize("scene", SCENES)
 def test_all_forces_on_the_bodies_are_in_balance(scene, wet):
-    s, load = scene({"fluid": mpm.Fluid(), "drained": [mpm.Drained("right")]} if wet else {})
+    s, load = scene({"fluid": mpm.Fluid(), "conditions": [mpm.Drained("right")]} if wet else {})
     s.run(1.0, 0.5, progress=False)
     assert off(s, load, slice(1, 2) if s.grid.axisymmetric else slice(None)) < 1e-7
     assert not any(
-        np.any(force) for wall, force in s.wall_reactions.items() if wall not in s.state.stage.conditions["fixed"]
+        np.any(force) for wall, force in s.wall_reactions.items() if wall not in s.state.stage.conditions["walls"]
     )
 
 
@@ -166,7 +197,7 @@ def test_forces_on_a_held_side_and_on_the_floor_at_its_foot_are_those_of_the_str
 
 def test_walls_of_a_column_bear_what_is_on_them():
     """Under an even load each wall's force is known: that of a column's oedometric stress."""
-    s = column(cells=5, width=2, fluid=False, tractions=[mpm.Traction("top", (0, -1e4))])
+    s = column(cells=5, width=2, fluid=False, conditions=[mpm.Traction("top", (0, -1e4))])
     s.run(1.0, 1.0, progress=False)
     (left, bottom), stress = (s.wall_reactions[wall] for wall in ("left", "bottom")), s.effective_stress()
     height = s.points.corners[..., 1].max()
@@ -178,7 +209,7 @@ def test_walls_of_a_column_bear_what_is_on_them():
 
 def test_what_several_walls_hold_counts_once():
     """For the wall across it; else each has an equal part, in whatever order they are given."""
-    grid = mpm.Grid([1.0] * 3, [2] * 3)
+    grid = mpm.Grid([0] * 3, [1.0] * 3, [2] * 3)
     on_walls = np.flatnonzero((np.abs(grid.node_x[:, :2] - 0.5) > 0.4).any(axis=1))
     dofs = (3 * on_walls[:, None] + np.arange(3)).ravel()
     for order in (("left", "right", "front", "back"), ("back", "front", "right", "left")):
@@ -196,7 +227,10 @@ def test_forces_and_outflows_are_histories_of_a_run(tmp_path):
     """Steps of a beam: its load is on the clamp, by the wall in one half of it and by a given side."""
     s, probe = beam(h=0.1, load=5.4e3)
     s.run(0.06, 0.02, probes=probe, progress=False)
-    s.stage(fixed={"right": "x"}, displacements=[mpm.Displacement("left", (0, 0))], drained=[mpm.Drained("left")])
+    s.stage(
+        walls={"right": "x"},
+        conditions=[*without(s, mpm.Drained), mpm.Displacement("left", (0, 0)), mpm.Drained("left")],
+    )
     result = s.run(0.1, 0.02, probes=probe, after=s.result, progress=False)
     t, walls = result.t, result.wall_reactions
     assert walls.keys() == {"left", "right", "bottom", "top"} and walls["left"].shape == (len(t), 2) == (6, 2)
@@ -217,9 +251,9 @@ def test_forces_and_outflows_are_histories_of_a_run(tmp_path):
 
 
 def test_the_axis_of_revolution_pushes_nothing_outward():
-    grid = mpm.Grid([1.0, 1.0], [4, 4], axisymmetric=True)
+    grid = mpm.Grid([0, 0], [1.0, 1.0], [4, 4], axisymmetric=True)
     body = mpm.box(grid, [0, 0], [1, 1])
-    options = {"fixed": {"left": "y", "right": "x", "bottom": "y"}, "tractions": [mpm.Traction("top", (0, -1e4))]}
+    options = {"walls": {"left": "y", "right": "x", "bottom": "y"}, "conditions": [mpm.Traction("top", (0, -1e4))]}
     s = mpm.Simulation(grid, [body], [SOFT], **options)
     s.run(1.0, 1.0, progress=False)
     assert s.wall_reactions["left"][0] == 0.0

@@ -64,15 +64,17 @@ def test_an_energy_of_ones_own_gives_what_the_built_in_law_gives():
 
 def two_halves(lower, upper, **options):
     """Return a column of two materials, one on the other."""
-    grid = mpm.Grid([0.1, 1.4], [1, 14])
+    grid = mpm.Grid([0, 0], [0.1, 1.4], [1, 14])
     bodies = [mpm.box(grid, [0, 0], [0.1, 0.5]), mpm.box(grid, [0, 0.5], [0.1, 1], material=1)]
     walls = {"left": "x", "right": "x", "bottom": "y"}
-    return mpm.Simulation(grid, bodies, [lower, upper], fixed=walls, tractions=[load(1.0)], **options)
+    return mpm.Simulation(
+        grid, bodies, [lower, upper], walls=walls, conditions=[load(1.0), *options.pop("conditions", [])], **options
+    )
 
 
 def test_a_function_of_place_equals_two_materials():
     """All that may be a function of place is one here, with a step where the other scene has two materials."""
-    water = {"fluid": mpm.Fluid(), "drained": [mpm.Drained("top")], "gravity": [0, -9.81]}
+    water = {"fluid": mpm.Fluid(), "conditions": [mpm.Drained("top")], "gravity": [0, -9.81]}
     names = ("bulk", "shear", "porosity", "conductivity", "biot", "grain_bulk", "grain_density")
     below = (1e7, 6e6, 0.3, 1e-4, 0.9, 1e9, 2600.0)
     above = (4e6, 3e6, 0.5, 3e-5, 0.8, 5e8, 2000.0)
@@ -94,7 +96,7 @@ def test_a_beam_whose_moduli_vary_follows_finite_elements():
     s, probe = beam(material=soft_end, fluid=False, ramp=1.0)
     tip = s.run(1.0, 0.25, probes=probe).displacement[-1]
     load = mpm.Traction("top", lambda t: (0, -54e3 * min(1, t)), region=((0.05, -np.inf), (1.0, np.inf)))
-    fem = BiotFEM([0, 0], [1, 0.3], (40, 12), soft_end, fixed={"left": "xy"}, tractions=[load])
+    fem = BiotFEM([0, 0], [1, 0.3], (40, 12), soft_end, walls={"left": "xy"}, conditions=[load])
     exact = fem.run(1.0, 0.25, probes=[[1.0, 0.15]]).displacement[-1]
     assert tip == pytest.approx(exact, rel=4e-3)
 
@@ -107,8 +109,8 @@ def test_oblique_fibres_on_the_points_follow_finite_elements():
         return np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
     tissue = Fibrous(bulk=1e6, shear=6e5, fibre=4e6, direction=slanted)
-    scene = {"fixed": {"bottom": "xy"}, "tractions": [mpm.Traction("top", lambda t: (0, -2e5 * t))]}
-    grid = mpm.Grid([2.0, 1.2], [40, 24], lower=[-0.5, 0])
+    scene = {"walls": {"bottom": "xy"}, "conditions": [mpm.Traction("top", lambda t: (0, -2e5 * t))]}
+    grid = mpm.Grid([-0.5, 0], [2.0, 1.2], [40, 24])
     s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 1])], [tissue], **scene)
     place = [[0.5, 1.0]]
     u = s.run(1.0, 0.25, probes=mpm.probes(s.bodies, place)).displacement[-1]
@@ -121,7 +123,7 @@ def test_several_laws_in_one_scene_share_it_as_one_law_would():
     """Two names for one law are two integrals; the sum is that of the one law, also with mean dilatation."""
     for stiff in (SOFT, replace(SOFT, bulk=5e7)):
         own = Own(bulk=stiff.bulk, shear=stiff.shear, conductivity=stiff.conductivity)
-        water = {"fluid": mpm.Fluid(), "drained": [mpm.Drained("top")]}
+        water = {"fluid": mpm.Fluid(), "conditions": [mpm.Drained("top")]}
         one, two = two_halves(stiff, stiff, **water), two_halves(stiff, own, **water)
         for s in (one, two):
             s.run(1.0, 0.25)
@@ -132,12 +134,12 @@ def test_several_laws_in_one_scene_share_it_as_one_law_would():
 
 def test_each_body_has_the_stress_of_its_own_law():
     """Hencky, neo-Hookean and Drucker-Prager in one column; under a dead load the stress is the load everywhere."""
-    grid = mpm.Grid([0.1, 1.8], [1, 18])
+    grid = mpm.Grid([0, 0], [0.1, 1.8], [1, 18])
     sand = mpm.DruckerPrager(2e7, 1e7, friction=30.0, dilation=0.0, cohesion=1e4)
     materials = [mpm.Hencky(1e7, 6e6), mpm.NeoHookean(4e6, 3e6), sand]
     bodies = [mpm.box(grid, [0, 0.5 * k], [0.1, 0.5 * (k + 1)], material=k) for k in range(3)]
     walls = {"left": "x", "right": "x", "bottom": "y"}
-    s = mpm.Simulation(grid, bodies, materials, fixed=walls, tractions=[load(1.5)])
+    s = mpm.Simulation(grid, bodies, materials, walls=walls, conditions=[load(1.5)])
     s.run(1.0, 1.0)  # in one step the layers are cells
     assert s.effective_stress()[:, 1, 1] == pytest.approx(-1e6 * np.ones(len(s.points)), rel=1e-6)
     stretch = s.points.F[:, 1, 1].reshape(3, -1)
@@ -147,9 +149,7 @@ def test_each_body_has_the_stress_of_its_own_law():
 
 
 def test_state_changes_once_a_step_and_only_if_it_converged():
-    s = column(
-        fluid=False, material=Damaged(1e6, 6e5), displacements=[mpm.Displacement("top", lambda t, X: (0, -t), "y")]
-    )
+    s = column(fluid=False, material=Damaged(1e6, 6e5), conditions=[mpm.Displacement("top", lambda t, X: (0, -t), "y")])
     s.run(0.2, 0.05)
     assert s.points.data["damage"] == pytest.approx(-np.log(0.8), abs=1e-4)
     before = {name: values.copy() for name, values in s.points.data.items()}
@@ -167,10 +167,10 @@ def test_state_changes_once_a_step_and_only_if_it_converged():
 @pytest.mark.parametrize("law", [mpm.kozeny_carman, lambda conductivity, J: conductivity * ufl.exp(5 * (J - 1))])
 def test_consolidation_with_a_conductivity_law_follows_finite_elements(law):
     soil = mpm.Hencky(bulk=1e6, shear=6e5, porosity=0.5, conductivity=1e-4, conductivity_law=law)
-    scene = {"tractions": [mpm.Traction("top", lambda t: (0, -4e5 * min(1, t / 10)))], "drained": [mpm.Drained("top")]}
+    scene = {"conditions": [mpm.Traction("top", lambda t: (0, -4e5 * min(1, t / 10))), mpm.Drained("top")]}
     s = column(cells=20, material=soil, **scene)
     settlement = np.array(s.run(50, 2.5, probes=mpm.probes(s.bodies, [[0.025, 1.0]])).displacement)[1:, 0, 1]
-    scene |= {"fixed": {"left": "x", "right": "x", "bottom": "y"}, "fluid": mpm.Fluid()}
+    scene |= {"walls": {"left": "x", "right": "x", "bottom": "y"}, "fluid": mpm.Fluid()}
     exact, constant = (
         np.array(BiotFEM([0, 0], [0.05, 1], (1, 40), m, **scene).run(50, 2.5, probes=[[0.025, 1]]).displacement)[
             1:, 0, 1
@@ -187,7 +187,7 @@ def test_a_conductivity_that_depends_on_place_is_evaluated_at_the_pieces():
     soil = mpm.Hencky(
         1e9, 1e9, conductivity=1e-6, conductivity_law=lambda conductivity, x: conductivity * ufl.exp(x[1])
     )
-    s = column(cells=20, material=soil, drained=[mpm.Drained("top"), mpm.Drained("bottom", pressure=1e3)])
+    s = column(cells=20, material=soil, conditions=[mpm.Drained("top"), mpm.Drained("bottom", pressure=1e3)])
     s.run(1000, 100)
     y = s.points.x[:, 1]
     exact = 1e3 * (np.exp(-y) - np.exp(-1)) / (1 - np.exp(-1))
@@ -226,7 +226,7 @@ def test_an_elastic_foundation_converges_to_its_exact_solution_at_second_order()
     kappa = np.sqrt(4e6 / soil.oedometric)
     for cells in (8, 16, 32):
         s = column(
-            cells=cells, fluid=False, material=soil, terms=[foundation], tractions=[mpm.Traction("top", (0, -10))]
+            cells=cells, fluid=False, material=soil, terms=[foundation], conditions=[mpm.Traction("top", (0, -10))]
         )
         Y = s.points.x[:, 1].copy()
         s.run(1.0, 0.25)
@@ -237,11 +237,11 @@ def test_an_elastic_foundation_converges_to_its_exact_solution_at_second_order()
 
 def test_an_energy_and_its_forces_give_the_same_and_may_hold_a_body_alone():
     """The energy's tangent is factorised as a symmetric one, that of the forces is not."""
-    grid, positions = mpm.Grid([1.0, 1.4], [10, 14]), []
+    grid, positions = mpm.Grid([0, 0], [1.0, 1.4], [10, 14]), []
     body = mpm.box(grid, [0.3, 0.33], [0.7, 1.0])
     pull = mpm.Traction("top", (1e3, -1e3))
     for term in (foundation, foundation_in_v):
-        s = mpm.Simulation(grid, [body], [SOFT], fixed={}, terms=[term], tractions=[pull])
+        s = mpm.Simulation(grid, [body], [SOFT], walls={}, terms=[term], conditions=[pull])
         s.run(1.0, 0.5)
         positions.append(s.points.corners.mean(axis=1))
         assert s.scene.momentum.symmetric == (term is foundation)
@@ -282,7 +282,7 @@ def viscous(points, u, dt):
 
 def test_a_viscous_stress_takes_the_length_of_each_step():
     soil, load = mpm.LinearElastic(bulk=SOFT.bulk, shear=SOFT.shear), 100.0
-    s = column(fluid=False, material=soil, terms=[viscous], tractions=[mpm.Traction("top", (0, -load))])
+    s = column(fluid=False, material=soil, terms=[viscous], conditions=[mpm.Traction("top", (0, -load))])
     strain = 0.0
     for dt in (0.5, 0.5, 0.1, 2.0):
         s.step(dt)
@@ -292,7 +292,12 @@ def test_a_viscous_stress_takes_the_length_of_each_step():
 
 def test_a_source_raises_the_steady_pressure_and_the_balance_closes():
     rate, soil = 1e-7, replace(SOFT, conductivity=1e-6)
-    s = column(cells=20, material=soil, drained=[mpm.Drained("top")], sources=[lambda points, q: rate * q * points.dx])
+    s = column(
+        cells=20,
+        material=soil,
+        conditions=[mpm.Drained("top")],
+        terms=[mpm.Source(lambda points, q: rate * q * points.dx)],
+    )
     result = s.run(5000, 250)
     exact = rate * 9810 / 1e-6 / 2 * (1 - s.points.x[:, 1] ** 2)
     lattice = (2, 20, 2)
@@ -308,8 +313,8 @@ def test_a_source_may_depend_on_the_pressure_and_on_time():
     s = column(
         cells=20,
         material=soil,
-        drained=[mpm.Drained("top", pressure=1e3)],
-        sources=[lambda points, q, p: -leak * p * q * points.dx],
+        conditions=[mpm.Drained("top", pressure=1e3)],
+        terms=[mpm.Source(lambda points, q, p: -leak * p * q * points.dx)],
     )
     result = s.run(2e4, 1e3)
     a = np.sqrt(leak * 9810 / 1e-6)
@@ -317,7 +322,7 @@ def test_a_source_may_depend_on_the_pressure_and_on_time():
     mean = lambda values: values.reshape(lattice).mean(axis=(0, 2))  # noqa: E731
     assert mean(s.points.pressure) == pytest.approx(mean(1e3 * np.cosh(a * s.points.x[:, 1]) / np.cosh(a)), rel=2e-3)
     assert result.newton < 3 * result.steps and result.balance < 1e-8
-    closed = column(sources=[lambda points, q, t: 1e-9 * t * q * points.dx], material=soil)
+    closed = column(terms=[mpm.Source(lambda points, q, t: 1e-9 * t * q * points.dx)], material=soil)
     closed.run(4.0, 1.0)
     # 1e-9 4^2 / 2 of water into what gives way by M
     assert closed.points.J - 1 == pytest.approx(8e-9 / (1 + 0.4 * SOFT.oedometric / 2.2e9), rel=1e-3)
@@ -369,13 +374,13 @@ CASES = {
     ),
     "unknown argument of a term": (
         lambda: column(fluid=False, terms=[lambda points, w: w]), "argument 'w', must be some of points, u, v, t, dt"),
-    "source without fluid": (lambda: column(fluid=False, sources=[lambda q: q]), "need a fluid"),
+    "source without fluid": (lambda: column(fluid=False, terms=[mpm.Source(lambda q: q)]), "need a fluid"),
     "unknown argument of a conductivity": (
         lambda: column(material=replace(SOFT, conductivity_law=lambda stress: stress)), "argument 'stress', must be"),
     "negative conductivity": (
         lambda: column(material=replace(SOFT, conductivity_law=lambda J: 1 - 2 * J)).step(1.0), "k = -1 at .* >= 0"),
     "state in the reference": (
-        lambda: BiotFEM([0, 0], [1, 1], (2, 2), Damaged(1, 1), fixed={}), "the reference has no state"),
+        lambda: BiotFEM([0, 0], [1, 1], (2, 2), Damaged(1, 1), walls={}), "the reference has no state"),
 }  # fmt: skip
 
 
@@ -387,7 +392,7 @@ def test_one_line_says_what_is_wrong(make, message):
 
 
 def test_a_term_of_nothing_changes_nothing_where_one_of_two_materials_is_a_field():
-    grid = mpm.Grid([0.5, 1.2], [5, 12])
+    grid = mpm.Grid([0, 0], [0.5, 1.2], [5, 12])
     bodies = [mpm.box(grid, [0, 0], [0.5, 0.5]), mpm.box(grid, [0, 0.5], [0.5, 1], material=1)]
     materials = [mpm.Hencky(bulk=2e6, shear=1e6), mpm.Hencky(bulk=lambda X: 1e6 * (2 - X[:, 1]), shear=1e6)]
 
@@ -400,8 +405,8 @@ def test_a_term_of_nothing_changes_nothing_where_one_of_two_materials_is_a_field
             grid,
             bodies,
             materials,
-            fixed={"left": "x", "right": "x", "bottom": "y"},
-            tractions=[mpm.Traction("top", lambda t: -1e5 * t)],
+            walls={"left": "x", "right": "x", "bottom": "y"},
+            conditions=[mpm.Traction("top", lambda t: -1e5 * t)],
             terms=terms,
         )
         s.run(1.0, 0.25, progress=False)

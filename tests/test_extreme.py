@@ -66,7 +66,7 @@ def test_steady_flow_through_layers_of_any_conductivity_is_exact(ratio):
     def error(s, r):
         return series(CUTS["on a grid line"], ratio, s, r)
 
-    row = judged(column(error, *layers, h=1 / 80, end=1e15, fluid=INCOMPRESSIBLE, drained=ends), 1e-7)
+    row = judged(column(error, *layers, h=1 / 80, end=1e15, fluid=INCOMPRESSIBLE, conditions=ends), 1e-7)
     assert row.outcome == "converged", row
 
 
@@ -97,7 +97,7 @@ def test_a_slender_beam_buckles_in_one_step():
 NO_EQUILIBRIUM = {
     "pulled beyond Hencky's peak": lambda: column(None, (SOIL, 1.0), load=-0.4 * M, room=40),
     "turned inside out": lambda: column(None, (soil(law=mpm.LinearElastic), 1.0), load=2 * M, room=40),
-    "pores closed": lambda: column(None, (SOIL, 1.0), end=1e9, fluid=WATER, drained=[mpm.Drained("top", -M)]),
+    "pores closed": lambda: column(None, (SOIL, 1.0), end=1e9, fluid=WATER, conditions=[mpm.Drained("top", -M)]),
     "far too large a load": lambda: Beam(load=2e7, steps=1, ramp=1.0),
 }
 

@@ -58,12 +58,12 @@ def test_soil_that_yields_takes_the_same_step_whatever_others_do(kind):
 @pytest.mark.parametrize("stiffer", [1e6, 1e10, 1e14])
 def test_a_soft_part_is_solved_for_however_stiff_what_it_sits_on_is(stiffer):
     """Rounding is that of each node, and what is told of the residual is that of the soft part too."""
-    grid, load = mpm.Grid([0.1, 1.0], [1, 10]), 0.03
+    grid, load = mpm.Grid([0, 0], [0.1, 1.0], [1, 10]), 0.03
     soft, hard = (mpm.Hencky(bulk=f * 1e5, shear=f * 1e5) for f in (1, stiffer))
     bodies = [mpm.box(grid, [0, 0], [0.1, 0.5]), mpm.box(grid, [0, 0.5], [0.1, 0.9], material=1)]
     pull = mpm.Traction("top", (0, load * soft.oedometric), region=((-np.inf, 0.8), (np.inf, np.inf)))
     walls = {"left": "x", "right": "x", "bottom": "y"}
-    s = mpm.Simulation(grid, bodies, [hard, soft], fixed=walls, tractions=[pull])
+    s = mpm.Simulation(grid, bodies, [hard, soft], walls=walls, conditions=[pull])
     history = s.step(1.0).history
     strain = s.points.F[s.points.material == 1, 1, 1] - 1
     assert strain == pytest.approx(np.full(len(strain), brentq(lambda a: np.log(a) / a - load, 1, 2) - 1), rel=1e-7)

@@ -6,6 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 import ufl
+from helpers import without
 from scipy.ndimage import label
 
 import mpm_dolfinx as mpm
@@ -19,33 +20,36 @@ def source(points, q):
 
 
 FAR = {
-    "resting": {"displacements": [mpm.Displacement("bottom", (0, 0), region=AWAY)]},
+    "resting": {"conditions": [mpm.Displacement("bottom", (0, 0), region=AWAY)]},
     "moving": {
-        "displacements": [
+        "conditions": [
             mpm.Displacement(side, lambda t, X: np.array([0.3 * np.sin(2 * np.pi * t), 0.0]), region=AWAY)
             for side in ("bottom", "top")
         ]
     },
     "draining": {
-        "displacements": [mpm.Displacement("bottom", (0, 0), region=AWAY)],
-        "drained": [mpm.Drained("right", lambda t: 1e3 * t, region=AWAY)],
+        "conditions": [
+            mpm.Displacement("bottom", (0, 0), region=AWAY),
+            mpm.Drained("right", lambda t: 1e3 * t, region=AWAY),
+        ],
     },
-    "fed": {"displacements": [mpm.Displacement("bottom", (0, 0), region=AWAY)], "sources": [source]},
+    "fed": {"conditions": [mpm.Displacement("bottom", (0, 0), region=AWAY)], "terms": [mpm.Source(source)]},
 }
 
 
 def scene(far=None, load=54e3, wet=True):
     """Return a beam on whose top a load comes and goes in 1 s, beside a body far away, and the number of its points."""
     h = 0.1
-    grid = mpm.Grid([2.6, 1.2], [26, 12])
+    grid = mpm.Grid([0, 0], [2.6, 1.2], [26, 12])
     bodies = [mpm.box(grid, [0, 0.65], [1, 0.95])]
     soils = [mpm.Hencky(bulk=1e7 / 3, shear=5e6, conductivity=1e-4)]
     if far:
         bodies.append(mpm.box(grid, [2.0, 0.6], [2.3, 0.9], material=1))
         soils.append(mpm.Hencky(bulk=3e7, shear=2e7, conductivity=1e-4))
     pressed = mpm.Traction("top", lambda t: (0, -load * (1 - abs(2 * t - 1))), region=((0, -1), (1.0 + h, 9)))
-    conditions = {"fixed": {"left": "xy"}, "tractions": [pressed], **FAR.get(far, {})}
-    return mpm.Simulation(grid, bodies, soils, fluid=mpm.Fluid() if wet else None, **conditions), len(bodies[0])
+    given = {"walls": {"left": "xy"}, "fluid": mpm.Fluid() if wet else None, **FAR.get(far, {})}
+    given["conditions"] = [pressed, *given.get("conditions", [])]
+    return mpm.Simulation(grid, bodies, soils, **given), len(bodies[0])
 
 
 def of_beam(s, count):
@@ -92,7 +96,7 @@ def test_a_checkpoint_knows_which_parts_stay(tmp_path):
     mpm.resume(resumed, tmp_path / "run")
     for each in (s, resumed):
         each.step(0.1)
-        each.stage(tractions=[])
+        each.stage(conditions=without(each, mpm.Traction))
         each.step(0.1)
     assert all(
         (values == values0).all() for values, values0 in zip(of_beam(resumed, count), of_beam(s, count), strict=True)
@@ -102,7 +106,7 @@ def test_a_checkpoint_knows_which_parts_stay(tmp_path):
 def test_cells_with_common_nodes_are_one_part():
     rng = np.random.default_rng(1)
     for shape, share in (((13, 11), 0.15), ((7, 6, 5), 0.06)):
-        grid = mpm.Grid([1.0] * len(shape), shape)
+        grid = mpm.Grid([0] * len(shape), [1.0] * len(shape), shape)
         filled = rng.random(int(np.prod(shape))) < share
         part, count = parts_of_cells(grid, filled[grid.cell_number])
         expected, number = label(filled.reshape(shape), structure=np.ones((3,) * len(shape)))

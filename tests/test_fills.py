@@ -5,6 +5,7 @@ import logging
 
 import numpy as np
 import pytest
+from helpers import without
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.points.cutting import corner_bits, volumes
@@ -35,7 +36,7 @@ def embankment(slope, lifts=6):
     crest, length = 24.0, 60.0
     base = crest + 2 * lifts * slope
     n = round(base)
-    grid = mpm.Grid([length, 16.0], [60, 16])
+    grid = mpm.Grid([0, 0], [length, 16.0], [60, 16])
 
     def lift(k):
         def taper(x):
@@ -47,8 +48,8 @@ def embankment(slope, lifts=6):
 
     bodies = [mpm.box(grid, [0, 0], [length, 6]), *map(lift, range(lifts))]
     walls = {"left": "x", "right": "x", "bottom": "xy"}
-    options = {"gravity": (0, -9.81), "fluid": mpm.Fluid(), "drained": [mpm.Drained("top")]}
-    return mpm.Simulation(grid, bodies, [SOFT], fixed=walls, later=range(1, lifts + 1), **options), length - base
+    options = {"gravity": (0, -9.81), "fluid": mpm.Fluid(), "conditions": [mpm.Drained("top")]}
+    return mpm.Simulation(grid, bodies, [SOFT], walls=walls, later=range(1, lifts + 1), **options), length - base
 
 
 @pytest.mark.parametrize("slope", [1.0, 1.25, 2.0])
@@ -56,7 +57,7 @@ def test_an_embankment_in_lifts_has_its_crest_and_the_ground_beside_it_free_and_
     s, beside = embankment(slope)
     s.run(30 * DAY, 30 * DAY, progress=False)
     for k in range(1, 7):
-        s.stage(add=[k], tractions=[mpm.Traction("top", (0, -1.0))])
+        s.stage(add=[k], conditions=[*without(s, mpm.Traction), mpm.Traction("top", (0, -1.0))])
         _, top = s.state.stage.mechanical.loads[0]
         assert top.area0.sum() == pytest.approx(beside + 24 + 2 * slope * (6 - k), rel=1e-12)
         assert k == 1 or gap(s, k - 1, k) < 1e-11, "lifts have as many domains side by side"
@@ -73,13 +74,13 @@ def test_an_embankment_in_lifts_has_its_crest_and_the_ground_beside_it_free_and_
 
 def settled(dim=2, per_cell=2, quadrature="domain", until=1.0, **options):
     """Return ground that settles more on its left than on its right, and a fill as high as 1 m to come."""
-    grid = mpm.Grid([4.0] * dim, [8] * dim)
+    grid = mpm.Grid([0] * dim, [4.0] * dim, [8] * dim)
     ground = mpm.box(grid, [0] * dim, [*[4] * (dim - 1), 2])
     fill = mpm.box(grid, [1] * (dim - 1) + [2], [3] * (dim - 1) + [3], per_cell=per_cell)
     half = mpm.Traction("top", [0] * (dim - 1) + [-8e4], region=([0] * dim, [2, *[4] * (dim - 1)]))
     walls = {name: "xyz"[:dim] for name in ("left", "right", "bottom", *["front", "back"][: 2 * dim - 4])}
-    options = {"tractions": [half], "quadrature": quadrature} | options
-    s = mpm.Simulation(grid, [ground, fill], [SOFT], fixed=walls, later=[1], gravity=[0.0] * dim, **options)
+    options = {"conditions": [half], "quadrature": quadrature} | options
+    s = mpm.Simulation(grid, [ground, fill], [SOFT], walls=walls, later=[1], gravity=[0.0] * dim, **options)
     if until:
         s.run(until, 0.5, progress=False)
     return s
@@ -88,7 +89,7 @@ def settled(dim=2, per_cell=2, quadrature="domain", until=1.0, **options):
 @pytest.mark.parametrize(("dim", "per_cell"), [(2, 2), (2, 4), (2, 1), (3, 2)])
 def test_a_fill_follows_the_surface_and_its_domains_are_at_rest_as_they_are(dim, per_cell):
     s = settled(dim, per_cell)
-    s.stage(add=[1], tractions=[], gravity=[0.0] * (dim - 1) + [-9.81])
+    s.stage(add=[1], conditions=[], gravity=[0.0] * (dim - 1) + [-9.81])
     new = s.points.of(np.arange(len(s.bodies[0])), kept=False)
     below, above = face(s, 0, 1), face(s, 1, 0)
     near = np.linalg.norm(above[:, None] - below, axis=2).min(axis=1)
@@ -104,18 +105,18 @@ def test_a_fill_follows_the_surface_and_its_domains_are_at_rest_as_they_are(dim,
 
 
 def test_a_fill_on_ground_that_has_not_moved_is_as_it_was_seeded():
-    s = settled(tractions=[])
+    s = settled(conditions=[])
     seeded = s.scene.materials.seeded.corners
     s.stage(add=[1])
     assert np.abs(s.points.corners[-64:] - seeded[-64:]).max() < 1e-14 and len(s.points) == len(seeded)
 
 
 def test_a_fill_between_walls_of_a_pit_follows_all_of_them():
-    grid = mpm.Grid([4.0, 4.0], [8, 8])
+    grid = mpm.Grid([0, 0], [4.0, 4.0], [8, 8])
     parts = [([0, 0], [4, 1]), ([0, 1], [1, 2]), ([3, 1], [4, 2]), ([1, 1], [3, 2])]
     bodies = [mpm.box(grid, *part) for part in parts]
     walls = {"left": "x", "right": "x", "bottom": "xy"}
-    s = mpm.Simulation(grid, bodies, [SOFT], fixed=walls, later=[3], gravity=(0, -3 * 9.81))
+    s = mpm.Simulation(grid, bodies, [SOFT], walls=walls, later=[3], gravity=(0, -3 * 9.81))
     s.run(1.0, 0.5, progress=False)
     s.stage(add=[3])
     pit = np.concatenate([s.points.corners[s.points.id < len(s.points) - len(bodies[3])].reshape(-1, 2)])
@@ -129,15 +130,15 @@ def test_a_fill_between_walls_of_a_pit_follows_all_of_them():
 
 def test_what_has_risen_into_a_fill_makes_it_thinner_or_is_refused_with_how_far():
     def risen(height, bottom=1.0):
-        grid = mpm.Grid([2.0, 3.0], [4, 6])
+        grid = mpm.Grid([0, 0], [2.0, 3.0], [4, 6])
         bodies = [mpm.box(grid, [0, 0], [2, 1]), mpm.box(grid, [0, bottom], [2, bottom + 0.5])]
         lift = [mpm.Displacement("top", lambda t, X: (0, height * t))]
-        s = mpm.Simulation(grid, bodies, [SOFT], fixed={"bottom": "y", "left": "x"}, displacements=lift, later=[1])
+        s = mpm.Simulation(grid, bodies, [SOFT], walls={"bottom": "y", "left": "x"}, conditions=lift, later=[1])
         s.run(1.0, 0.25, progress=False)
         return s
 
     s = risen(0.3)
-    s.stage(add=[1], displacements=[])
+    s.stage(add=[1], conditions=[])
     assert s.points.volume0[-16:].sum() == pytest.approx(2 * 0.2, rel=3e-4)  # the lift gives way by 1 / 300 of a strain
     with pytest.raises(
         ValueError, match=r"body 1: what it was seeded to touch has moved by up to 0.45 m; to its domain"
@@ -154,7 +155,7 @@ def test_a_refused_fill_changes_nothing():
     s.run(2.0, 1.0, progress=False)
     state = s.state
     with pytest.raises(ValueError, match="no point has this side in the region"):
-        s.stage(add=[1], tractions=[mpm.Traction("top", -1.0, ((9, 9), (10, 10)))])
+        s.stage(add=[1], conditions=[mpm.Traction("top", -1.0, ((9, 9), (10, 10)))])
     assert s.state is state
     s.stage(add=[1])
     assert s.present == (True, True)
@@ -163,7 +164,7 @@ def test_a_refused_fill_changes_nothing():
 def test_edges_that_cannot_follow_a_bend_are_named_with_the_distance(caplog):
     with caplog.at_level(logging.WARNING, "mpm_dolfinx"):
         strip = mpm.Traction("top", (0, -4e5), region=((1.7, 0), (2.3, 2)))
-        settled(per_cell=1, tractions=[strip]).stage(add=[1], tractions=[])
+        settled(per_cell=1, conditions=[strip]).stage(add=[1], conditions=[])
     assert "body 1: its straight edges are up to 0.026 m" in caplog.records[-1].getMessage()
 
 
@@ -171,7 +172,7 @@ def test_edges_that_cannot_follow_a_bend_are_named_with_the_distance(caplog):
 def test_a_run_resumed_after_a_fill_came_has_the_same_bits(quadrature, tmp_path):
     one, other = (settled(quadrature=quadrature, until=until) for until in (1.0, 0.0))
     for s in (one, other):
-        s.stage(add=[1], tractions=[])
+        s.stage(add=[1], conditions=[])
     one.run(2.0, 0.5, progress=False, checkpoint=mpm.Checkpoint(tmp_path / "a.ckpt"))
     one.run(3.0, 0.5, progress=False)
     mpm.resume(other, tmp_path / "a.ckpt")
@@ -181,9 +182,9 @@ def test_a_run_resumed_after_a_fill_came_has_the_same_bits(quadrature, tmp_path)
 
 
 def test_what_a_stage_gave_the_points_must_be_given_anew_when_a_body_comes():
-    grid = mpm.Grid([1, 1], [4, 4])
+    grid = mpm.Grid([0, 0], [1, 1], [4, 4])
     bodies = [mpm.box(grid, [0, 0], [1, 0.5]), mpm.box(grid, [0, 0.5], [1, 1])]
-    s = mpm.Simulation(grid, bodies, [SOFT], fixed={"bottom": "xy"}, later=[1])
+    s = mpm.Simulation(grid, bodies, [SOFT], walls={"bottom": "xy"}, later=[1])
     s.stage(fields={"damage": np.arange(len(s.points))})
     with pytest.raises(ValueError, match=r"stage: add: body 1: its points have no 'damage', must be given anew"):
         s.stage(add=[1])

@@ -21,7 +21,7 @@ def fluid_of(s):
 def footing(dim=2, axisymmetric=False, dilation=0.0, bulk=np.inf, steps=5, **options):
     """Return a wet, frictional block into which a strip or a disc is pushed, and the soil's law."""
     upper, top = ([4.0, 2.0], 1.75) if dim == 2 else ([1.5, 1.5, 1.2], 0.9)
-    grid = mpm.Grid(upper, [16, 8] if dim == 2 else [5, 5, 4], axisymmetric=axisymmetric)
+    grid = mpm.Grid([0] * dim, upper, [16, 8] if dim == 2 else [5, 5, 4], axisymmetric=axisymmetric)
     block = mpm.box(grid, [0.0] * dim, [*upper[:-1], top])
     soil = mpm.DruckerPrager(bulk=1e7, shear=6e6, porosity=POROSITY, conductivity=1e-6, dilation=dilation, **FRICTIONAL)
     push = mpm.Displacement("top", lambda t, X: (0.0,) * (dim - 1) + (-0.03 * t,), region=RIM[dim])
@@ -29,14 +29,16 @@ def footing(dim=2, axisymmetric=False, dilation=0.0, bulk=np.inf, steps=5, **opt
     if axisymmetric:
         walls = {"right": "x", "bottom": "xy"}
     fluid = mpm.Fluid(bulk=bulk)
-    return mpm.Simulation(grid, [block], [soil], fluid=fluid, fixed=walls, displacements=[push], **options)
+    return mpm.Simulation(
+        grid, [block], [soil], fluid=fluid, walls=walls, conditions=[push, *options.pop("conditions", [])], **options
+    )
 
 
 def source(points, q, t):
     return 1e-6 * t * q * points.dx
 
 
-OPEN = {"drained": [mpm.Drained("top", region=([0.8, 1.6], [5.0, 1.9]))], "inflows": [mpm.Inflow("right", 1e-6)]}
+OPEN = {"conditions": [mpm.Drained("top", region=([0.8, 1.6], [5.0, 1.9])), mpm.Inflow("right", 1e-6)]}
 
 
 @pytest.mark.parametrize(
@@ -47,7 +49,7 @@ OPEN = {"drained": [mpm.Drained("top", region=([0.8, 1.6], [5.0, 1.9]))], "inflo
         {"axisymmetric": True},
         {"dim": 3},
         {"method": "backward-euler", **OPEN},
-        {"method": "backward-euler", "sources": [source], "bulk": 2.2e9, **OPEN},
+        {"method": "backward-euler", "terms": [mpm.Source(source)], "bulk": 2.2e9, **OPEN},
     ],
     ids=["sealed", "compressible", "axisymmetric", "3D", "open", "fed"],
 )
@@ -61,7 +63,7 @@ def test_yielding_soil_keeps_its_fluid(scene):
     for _ in range(steps):
         s.step(1 / steps)
         came -= s.outflows.sum() / steps
-        if "sources" in scene:
+        if "terms" in scene:
             came += 1e-6 * s.t / steps * (s.points.volume0 * s.points.J).sum()
     now, exchanged = fluid_of(s)
     off = abs(now - start - came) / exchanged

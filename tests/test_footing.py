@@ -17,10 +17,10 @@ from mpm_dolfinx.stepping.advance import untangled
 @pytest.mark.parametrize("dim", [2, 3])
 def test_a_held_domain_that_folds_keeps_its_face_and_its_volume(dim):
     """A face put elsewhere is pulled back, all at once: no step is small enough for that."""
-    grid = mpm.Grid([1.0] * dim, [4] * dim)
+    grid = mpm.Grid([0] * dim, [1.0] * dim, [4] * dim)
     body = mpm.box(grid, [0] * dim, [1] * (dim - 1) + [0.5])
     held = mpm.Displacement("top", np.zeros(dim))
-    s = mpm.Simulation(grid, [body], [SOFT], fixed={"bottom": "xyz"[:dim]}, displacements=[held])
+    s = mpm.Simulation(grid, [body], [SOFT], walls={"bottom": "xyz"[:dim]}, conditions=[held])
     points, up = s.points.map(np.copy), corner_bits(dim)[:, dim - 1] == 1
     at_top = np.flatnonzero((points.corners[:, up, -1] == 0.5).all(axis=1))
     inside = np.flatnonzero(points.corners[:, :, -1].max(axis=1) < 0.4)
@@ -56,12 +56,12 @@ def rough_strip(cells, how):
     soil = mpm.DruckerPrager(**stiff, friction=0.0, dilation=0.0, cohesion=footing.COHESION)
     if how == "displacement":
         held = mpm.Displacement("top", lambda t, X: (0, -end * t), region=((0, -1), (edge, 1)))
-        pushed = {"displacements": [held]}
+        pushed = {"conditions": [held]}
     else:
         block = mpm.Convex([(-edge, 0), (edge, 0), (edge, 1), (-edge, 1)])
-        pushed = {"tools": [mpm.Tool(block, displacement=lambda t: (0, -end * t), adhesion=9 * footing.COHESION)]}
+        pushed = {"conditions": [mpm.Tool(block, displacement=lambda t: (0, -end * t), adhesion=9 * footing.COHESION)]}
     walls = {"left": "x", "right": "x", "bottom": "xy"}
-    s = mpm.Simulation(grid, [mpm.box(grid, [0, -rows * h], [columns * h, 0])], [soil], fixed=walls, **pushed)
+    s = mpm.Simulation(grid, [mpm.box(grid, [0, -rows * h], [columns * h, 0])], [soil], walls=walls, **pushed)
     s.run(1.0, 1 / 20, progress=False)
     force = s.reactions[0, 1] if how == "displacement" else s.tool_forces[0, 1]
     return -force / (edge * footing.COHESION * soil.xi * (2 + np.pi))

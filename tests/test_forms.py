@@ -19,7 +19,7 @@ from mpm_dolfinx.forms.cell_matrices import (
 from mpm_dolfinx.forms.point_forms import CellSums, FormPoints, PointExpression, PointForm
 from mpm_dolfinx.forms.unknowns import Unknowns, matrix
 
-GRIDS = {2: Grid([1.5, 1.0], [4, 3]), 3: Grid([1.0, 1.2, 0.9], [2, 3, 2])}
+GRIDS = {2: Grid([0, 0], [1.5, 1.0], [4, 3]), 3: Grid([0, 0, 0], [1.0, 1.2, 0.9], [2, 3, 2])}
 
 
 class Scene:
@@ -29,8 +29,8 @@ class Scene:
         rng = np.random.default_rng(dim)
         self.grid = grid = GRIDS[dim]
         self.points = FormPoints(grid, **fields)
-        x = rng.uniform(grid.lower, grid.lower + 0.7 * (grid.upper - grid.lower), (n, dim))
-        self.cells = grid.local(grid.number(grid.index(x)))
+        x = rng.uniform(grid.low, grid.low + 0.7 * (grid.upper - grid.lower), (n, dim))
+        self.cells = grid.local(grid.number(grid.index_from_base(x)))
         self.weight = rng.uniform(0.5, 2, n)
         self.x, self.rng = x, rng
         self.N, self.dN = grid.shape_values(self.cells, x), grid.shape_gradients(self.cells, x)

@@ -16,7 +16,7 @@ UPPER, LOWER, WIDTH, TOP, K = 10.0, 2.0, 9.6, 12.0, 1e-5  # m, m, m, m, m/s
 def dam(cells, heads=(UPPER, LOWER), **options):
     """Return a rectangular dam of hard soil on an impervious base, so many cells high, with water at its two sides."""
     h = TOP / cells
-    grid = mpm.Grid([WIDTH + 2 * h, TOP + 2 * h], [round(WIDTH / h) + 2, cells + 2])
+    grid = mpm.Grid([0, 0], [WIDTH + 2 * h, TOP + 2 * h], [round(WIDTH / h) + 2, cells + 2])
     law = mpm.unsaturated(0.5 * 9810 * h)
     soil = mpm.LinearElastic(bulk=1e9, shear=5e8, porosity=0.3, conductivity=K, conductivity_law=law)
     return mpm.Simulation(
@@ -24,8 +24,8 @@ def dam(cells, heads=(UPPER, LOWER), **options):
         [mpm.box(grid, [h, 0], [WIDTH + h, TOP])],
         [soil],
         fluid=mpm.Fluid(),
-        fixed={"bottom": "xy"},
-        drained=[mpm.water(side, level)[1] for side, level in zip(("left", "right"), heads, strict=True)],
+        walls={"bottom": "xy"},
+        conditions=[*(mpm.water(side, level)[1] for side, level in zip(("left", "right"), heads, strict=True))],
         gravity=(0, -9.81),
         pressure=mpm.hydrostatic(UPPER),
         **options,
@@ -72,10 +72,10 @@ def test_a_block_drains_to_its_side_as_boussinesq_says():
         return np.diff(flow, append=0.0) * cells / length / drains
 
     exact = solve_ivp(rate, (0, end), np.full(cells, 8.0), t_eval=[0.25 * end, 0.5 * end], method="BDF", rtol=1e-8)
-    grid, law = mpm.Grid([length + 2, 11], [42, 11]), mpm.unsaturated(0.5 * 9810 * h, specific_yield=drains)
+    grid, law = mpm.Grid([0, 0], [length + 2, 11], [42, 11]), mpm.unsaturated(0.5 * 9810 * h, specific_yield=drains)
     soil = mpm.LinearElastic(bulk=1e9, shear=5e8, porosity=0.3, conductivity=k, conductivity_law=law)
     bodies = [mpm.box(grid, [h, 0], [length + h, 10])]
-    acting = {"drained": [mpm.water("left", level)[1]], "gravity": (0, -9.81), "fixed": {"bottom": "xy"}}
+    acting = {"conditions": [mpm.water("left", level)[1]], "gravity": (0, -9.81), "walls": {"bottom": "xy"}}
     start = {"pressure": mpm.hydrostatic(8.0), "initial_stress": mpm.K0(0.3)}
     s = mpm.Simulation(grid, bodies, [soil], fluid=mpm.Fluid(), **acting, **start)
     for t, heights in zip(exact.t, exact.y.T, strict=True):

@@ -40,7 +40,7 @@ def radial_stress(widened):
 
 def widened_hole(cells, widened=1e-3, steps=1):
     """Return the reaction over the exact one of a quarter of a thick-walled cylinder, so many cells over its wall."""
-    grid = mpm.Grid([2 + 2 / cells] * 2, [2 * cells + 2] * 2)
+    grid = mpm.Grid([0] * 2, [2 + 2 / cells] * 2, [2 * cells + 2] * 2)
 
     def angle(X):
         return X[:, 1] * np.pi / 4
@@ -53,7 +53,7 @@ def widened_hole(cells, widened=1e-3, steps=1):
 
     body = mpm.mapped(grid, mpm.box(grid, [0, 0], [1, 2]), polar)
     s = mpm.Simulation(
-        grid, [body], [NEO], fixed={"left": "x", "bottom": "y"}, displacements=[mpm.Displacement("left", out)]
+        grid, [body], [NEO], walls={"left": "x", "bottom": "y"}, conditions=[mpm.Displacement("left", out)]
     )
     s.run(1.0, 1 / steps)
     return s.reactions[0] / -radial_stress(widened)
@@ -78,11 +78,11 @@ def test_a_hole_widened_by_a_tenth_in_steps_pushes_back_as_the_exact_solution_do
 
 def pressed(cells, angle):
     """Return the reaction of a rough block, 1 m high, nu = 0.3, pressed by 1 % along its own axis."""
-    grid = mpm.Grid([1.6, 1.6], [round(1.6 * cells)] * 2)
+    grid = mpm.Grid([0, 0], [1.6, 1.6], [round(1.6 * cells)] * 2)
     R = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     body = mpm.mapped(grid, mpm.box(grid, [0, 0], [0.5, 1]), lambda x: x @ R.T + [0.7, 0.2])
     sides = [mpm.Displacement("bottom", (0, 0)), mpm.Displacement("top", R @ [0, -0.01])]
-    s = mpm.Simulation(grid, [body], [SOIL], fixed={}, displacements=sides)
+    s = mpm.Simulation(grid, [body], [SOIL], walls={}, conditions=sides)
     s.run(1.0, 1.0)
     return s.reactions[1] @ R
 
@@ -96,14 +96,14 @@ def test_a_block_pressed_aslant_to_the_grid_resists_as_one_along_it(cells, error
 
 def test_a_slanted_block_under_uniform_stress_is_exact():
     """Sheared by 50 % in steps, all sides given: nothing of the grid is seen."""
-    grid = mpm.Grid([2.0, 1.0], [20, 10])
+    grid = mpm.Grid([0, 0], [2.0, 1.0], [20, 10])
     body = mpm.box(grid, [0.2, 0.13], [0.7, 0.63])
 
     def value(t, X):
         return np.stack([0.5 * t * (X[:, 1] - 0.13), 0 * t * X[:, 0]], axis=1)
 
     held = [mpm.Displacement(side, value) for side in ("left", "right", "bottom", "top")]
-    s = mpm.Simulation(grid, [body], [NEO], fixed={}, displacements=held)
+    s = mpm.Simulation(grid, [body], [NEO], walls={}, conditions=held)
     s.run(1.0, 0.1)
     F = np.array([[1, 0.5], [0, 1]])
     stress = NEO.shear * (F @ F.T - np.eye(2))
@@ -114,9 +114,9 @@ def test_a_slanted_block_under_uniform_stress_is_exact():
 
 def pushed_along_a_rough_base(way, steps, start=0.5, h=0.1):
     """Return the reaction over the way, N/m^2, of a side pushed by so many cells, at the end and held for ten steps."""
-    grid = mpm.Grid([2.5, 1.2], [round(2.5 / h), round(1.2 / h)])
+    grid = mpm.Grid([0, 0], [2.5, 1.2], [round(2.5 / h), round(1.2 / h)])
     wall = mpm.Displacement("left", lambda t, X: (way * h * min(t, 1.0), 0), "x")
-    s = mpm.Simulation(grid, [mpm.box(grid, [start, 0], [2, 1])], [SOIL], fixed={"bottom": "xy"}, displacements=[wall])
+    s = mpm.Simulation(grid, [mpm.box(grid, [start, 0], [2, 1])], [SOIL], walls={"bottom": "xy"}, conditions=[wall])
     found = []
     for end, dt in ((1.0, 1 / steps), (11.0, 1.0)):
         s.run(end, dt, progress=False)
@@ -134,20 +134,20 @@ def test_a_side_pushed_along_a_rough_base_carries_the_same_in_any_steps_on_any_l
 
 
 def test_a_side_one_cell_high_on_a_rough_base_is_held_too():
-    grid = mpm.Grid([2.5, 0.3], [25, 3])
+    grid = mpm.Grid([0, 0], [2.5, 0.3], [25, 3])
     wall = mpm.Displacement("left", lambda t, X: (0.02 * t, 0), "x")
     body = mpm.box(grid, [0.5, 0], [2, 0.1])
-    s = mpm.Simulation(grid, [body], [SOIL], fixed={"bottom": "xy"}, displacements=[wall])
+    s = mpm.Simulation(grid, [body], [SOIL], walls={"bottom": "xy"}, conditions=[wall])
     s.run(1.0, 0.25, progress=False)
     moved = (s.points.corners - s.points.origin)[body.sides[:, 0, 0]][:, 2, 0]
     assert moved.max() == pytest.approx(0.02, rel=0.06)
 
 
-def on_top(*regions, h=0.1, fixed=WALLS, side="top"):
+def on_top(*regions, h=0.1, walls=WALLS, side="top"):
     """Return soil, 2 m by 1 m, with given displacements (region, value) of its top."""
-    grid = mpm.Grid([2, 1 + h], [round(2 / h), round(1 / h) + 1])
+    grid = mpm.Grid([0, 0], [2, 1 + h], [round(2 / h), round(1 / h) + 1])
     held = [mpm.Displacement(side, value, region=((low, -9), (high, 9))) for low, high, value in regions]
-    return mpm.Simulation(grid, [mpm.box(grid, [0, 0], [2, 1])], [SOIL], fixed=fixed, displacements=held)
+    return mpm.Simulation(grid, [mpm.box(grid, [0, 0], [2, 1])], [SOIL], walls=walls, conditions=held)
 
 
 def test_displacements_that_differ_where_they_meet_are_refused():
@@ -159,7 +159,7 @@ def test_displacements_that_differ_where_they_meet_are_refused():
 
 
 def test_a_motion_that_a_wall_forbids_is_refused():
-    with pytest.raises(ValueError, match=r"Displacement\(side='bottom'.*moves y at .*, where a fixed wall holds it"):
+    with pytest.raises(ValueError, match=r"Displacement\(side='bottom'.*moves y at .*, where a wall holds it"):
         on_top((0, 2, (0, 0.01)), side="bottom").run(1, 1)
     assert on_top((0, 2, (0, 0)), side="bottom").run(1, 1).converged
 
@@ -185,15 +185,15 @@ def test_a_side_that_comes_to_lie_on_a_grid_line_is_not_named(caplog):
     grid = mpm.Grid(lower=[0, -10 * h], upper=[18 * h, 3 * h], cells=[18, 13])
     body = mpm.box(grid, [0, -10 * h], [18 * h, h / 4])
     strip = mpm.Displacement("top", lambda t, X: (0, -9 / 28 * h * t), region=((0, -9), (edge, 9)))
-    s = mpm.Simulation(grid, [body], [footing.SOIL], fixed=WALLS, displacements=[strip], fluid=mpm.Fluid())
+    s = mpm.Simulation(grid, [body], [footing.SOIL], walls=WALLS, conditions=[strip], fluid=mpm.Fluid())
     s.run(1.0, 1 / 9, observe=lambda s: loads.append(-s.reactions[0, 1]), progress=False)
     assert not said(caplog) and loads[-1] == pytest.approx(2 * loads[-2] - loads[-3], rel=0.01)
 
 
 def test_bodies_that_overlap_are_named(caplog):
-    grid = mpm.Grid([1, 1], [10, 10])
+    grid = mpm.Grid([0, 0], [1, 1], [10, 10])
     bodies = [mpm.box(grid, [0, 0], [1, 0.3]), mpm.box(grid, [0, 0.5], [1, 0.8])]
-    s = mpm.Simulation(grid, bodies, [SOFT], fixed=WALLS)
+    s = mpm.Simulation(grid, bodies, [SOFT], walls=WALLS)
     points = s.points
     down = np.where(points.id < len(bodies[0]), 0.0, 0.3)[:, None] * [0, 1]
     moved = replace(points, corners=points.corners - down[:, None], x=points.x - down)
@@ -212,7 +212,7 @@ def footing_load(width):
     soil = mpm.DruckerPrager(friction=0.0, dilation=0.0, cohesion=footing.COHESION, **stiff)
     strip = mpm.Displacement("top", lambda t, X: (0, -end * t), region=((0, -np.inf), (4 / 9, np.inf)))
     body = mpm.box(grid, [0, -rows * h], [width, 0])
-    s = mpm.Simulation(grid, [body], [soil], fixed=WALLS, displacements=[strip])
+    s = mpm.Simulation(grid, [body], [soil], walls=WALLS, conditions=[strip])
     assert s.run(1.0, 1 / 40).cuts == 0
     return s.reactions[0] / footing.COHESION
 
@@ -229,11 +229,11 @@ def test_a_region_half_a_cell_wide_at_the_end_of_a_side_is_held_alike_in_any_uni
     """By rounding a sliver of the next domain was held too, which changed the reaction by 3 %."""
     forces = []
     for unit in (1.0, 1e-4, 1e3):
-        grid = mpm.Grid([unit, 0.6 * unit], [10, 6])
+        grid = mpm.Grid([0, 0], [unit, 0.6 * unit], [10, 6])
         region = ((0.95 * unit, 0.45 * unit), (unit, 0.55 * unit))
         end = mpm.Displacement("top", (6e-3 * unit, -2e-2 * unit), region=region)
         body = mpm.box(grid, [0, 0], [unit, 0.5 * unit])
-        s = mpm.Simulation(grid, [body], [SOIL], fixed=WALLS, displacements=[end])
+        s = mpm.Simulation(grid, [body], [SOIL], walls=WALLS, conditions=[end])
         s.run(1.0, 0.5, progress=False)
         forces.append(s.reactions[0] / unit)
     assert np.array(forces) == pytest.approx(np.tile(forces[0], (3, 1)), rel=1e-9)
@@ -241,7 +241,7 @@ def test_a_region_half_a_cell_wide_at_the_end_of_a_side_is_held_alike_in_any_uni
 
 def test_a_block_turned_in_space_is_pressed_exactly():
     """Aslant to all axes, nu = 0: by 2 % in two steps, and one at rest in which the sides come where they are to be."""
-    grid = mpm.Grid([1, 1, 1], [5] * 3)
+    grid = mpm.Grid([0, 0, 0], [1, 1, 1], [5] * 3)
     R, _ = np.linalg.qr([[3.0, 1, 0.5], [-1, 3, 0.7], [0.2, -0.9, 3]])
     R *= np.sign(np.diag(R))
     body = mpm.mapped(grid, mpm.box(grid, [0.3] * 3, [0.7, 0.7, 0.7]), lambda x: (x - 0.5) @ R.T + 0.5)
@@ -249,7 +249,7 @@ def test_a_block_turned_in_space_is_pressed_exactly():
         mpm.Displacement("bottom", (0, 0, 0)),
         mpm.Displacement("top", lambda t, X: np.tile(R @ [0, 0, -0.008 * min(t, 1)], (len(X), 1))),
     ]
-    s = mpm.Simulation(grid, [body], [SOFT], fixed={}, displacements=sides)
+    s = mpm.Simulation(grid, [body], [SOFT], walls={}, conditions=sides)
     s.run(1.5, 0.5)
     stretch = 1 - 0.02
     force = R @ [0, 0, 1e7 * np.log(stretch) / stretch * 0.16]
@@ -260,10 +260,10 @@ def test_a_block_turned_in_space_is_pressed_exactly():
 @pytest.mark.parametrize(("bulk", "fluid"), [(5e8, None), (5e9, None), (2e6, mpm.Fluid())], ids=["499", "4999", "wet"])
 def test_a_flat_side_moves_as_it_is_given_whatever_resists(bulk, fluid):
     """Soil that cannot give way, pressed in one step: held by 4G the side came .83, .33, .27 of its way."""
-    grid = mpm.Grid([1.5, 1.5], [6, 12])
+    grid = mpm.Grid([0, 0], [1.5, 1.5], [6, 12])
     body, law = mpm.box(grid, [0, 0], [1.5, 1.0]), mpm.Hencky(bulk=bulk, shear=1e6)
     press = mpm.Displacement("top", lambda t, X: (0, -1e-3 * t), components="y")
     walls = {"left": "x", "right": "x", "bottom": "y"}
-    s = mpm.Simulation(grid, [body], [law], fixed=walls, fluid=fluid, displacements=[press])
+    s = mpm.Simulation(grid, [body], [law], walls=walls, fluid=fluid, conditions=[press])
     moved = s.run(1.0, 1.0, probes=mpm.probes([body], [[0.2, 1.0]]), progress=False).displacement[-1][0, 1]
     assert -moved == pytest.approx(1e-3, rel=1e-2 if fluid else 1e-3)

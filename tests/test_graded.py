@@ -21,9 +21,9 @@ def mobilities(slope, dim=2, top=0.33):
     soil = mpm.Hencky(
         SOFT.bulk, SOFT.shear, conductivity=1e-4, conductivity_law=lambda conductivity, J: conductivity * J
     )
-    grid = mpm.Grid([0.4] * dim, [2, 5, 4][:dim])  # cells that are no cubes
+    grid = mpm.Grid([0] * dim, [0.4] * dim, [2, 5, 4][:dim])  # cells that are no cubes
     body = mpm.box(grid, [0.0] * dim, [0.4] * (dim - 1) + [top], per_cell=3)
-    s = mpm.Simulation(grid, [body], [soil], fluid=mpm.Fluid(), fixed={"bottom": "xyz"[:dim], "left": "x"})
+    s = mpm.Simulation(grid, [body], [soil], fluid=mpm.Fluid(), walls={"bottom": "xyz"[:dim], "left": "x"})
     J = np.exp(s.points.x @ slope)
     on_grid = s.scene.on_grid(replace(s.points, F=J[:, None, None] ** (1 / dim) * np.eye(dim)))
     mobility, kappa = on_grid.mobility(on_grid.data, True), on_grid.cut.to_cells(J)
@@ -60,10 +60,17 @@ def test_a_column_that_shrinks_to_half_with_a_conductivity_law_settles_in_its_ti
     At T = 0.05, 0.1 and 0.5, in equal steps to the last of them that has a ceiling.
     """
     h, soil = 1 / 50, mpm.Hencky(1e6 / 3, 5e5, porosity=0.7, conductivity=1e-4, conductivity_law=linear_diffusion)
-    grid = mpm.Grid([h, 1.0], [1, 50])
+    grid = mpm.Grid([0, 0], [h, 1.0], [1, 50])
     body, load = mpm.box(grid, [0, 0], [h, 1.0], per_cell), [mpm.Traction("top", (0, -soil.oedometric))]
-    options = {"fixed": {"left": "x", "right": "x", "bottom": "y"}, "drained": [mpm.Drained("top")]}
-    s = mpm.Simulation(grid, [body], [soil], fluid=mpm.Fluid(bulk=np.inf), tractions=load, **options)
+    options = {"walls": {"left": "x", "right": "x", "bottom": "y"}, "conditions": [mpm.Drained("top")]}
+    s = mpm.Simulation(
+        grid,
+        [body],
+        [soil],
+        fluid=mpm.Fluid(bulk=np.inf),
+        conditions=[*load, *options.pop("conditions", [])],
+        **options,
+    )
     cv, final, times = 1e-4 * soil.oedometric / 9810, 1 - 0.5671432904097838, (0.05, 0.1, 0.5)[: len(ceilings)]
     end, top = times[-1] / cv, mpm.probes([body], [[h / 2, 1.0]])  # ln J / J = -1 at the very end
     result = s.run(end, end / steps, probes=top, progress=False)

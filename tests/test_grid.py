@@ -7,7 +7,7 @@ import pytest
 from mpm_dolfinx import Grid
 from mpm_dolfinx.base import _compat
 
-GRIDS = [Grid([1.5, 1.0], [6, 5], lower=[0.5, -1.0]), Grid([1.0, 2.0, 1.5], [3, 4, 2])]
+GRIDS = [Grid([0.5, -1.0], [1.5, 1.0], [6, 5]), Grid([0, 0, 0], [1.0, 2.0, 1.5], [3, 4, 2])]
 
 
 @pytest.fixture(params=GRIDS, ids=["2D", "3D"])
@@ -16,20 +16,20 @@ def grid(request):
 
 
 def test_a_point_is_found_in_the_cell_that_holds_it(grid):
-    x = np.random.default_rng(1).uniform(grid.lower, grid.upper, (200, grid.dim))
-    cells = grid.local(grid.number(grid.index(x)))
+    x = np.random.default_rng(1).uniform(grid.low, grid.high, (200, grid.dim))
+    cells = grid.local(grid.number(grid.index_from_base(x)))
     assert (np.abs(x - grid.midpoints[cells]) <= grid.h / 2 * (1 + 1e-12)).all()
 
 
 def test_points_on_the_upper_wall_belong_to_the_last_cell(grid):
     assert (grid.index(grid.upper[None]) == grid.shape - 1).all()
-    assert not grid.outside(np.stack([grid.lower, grid.upper])).any()
-    assert grid.outside(grid.upper[None] + 1e-6).all()
+    assert not grid.outside(np.stack([grid.low, grid.high])).any()
+    assert grid.outside(grid.high[None] + 1e-6).all()
 
 
 def test_shape_functions_interpolate_multilinear_fields_with_their_gradients(grid):
-    x = np.random.default_rng(2).uniform(grid.lower, grid.upper, (50, grid.dim))
-    cells = grid.local(grid.number(grid.index(x)))
+    x = np.random.default_rng(2).uniform(grid.low, grid.high, (50, grid.dim))
+    cells = grid.local(grid.number(grid.index_from_base(x)))
     N, dN = grid.shape_values(cells, x), grid.shape_gradients(cells, x)
 
     def f(y):
@@ -69,11 +69,11 @@ def test_dolfinx_numbers_vector_dofs_as_scalar_ones(grid):
 
 def test_only_what_is_made_with_the_mesh_makes_it():
     """Notebooks, debuggers and `copy` ask any object for names of their own."""
-    grid, shared = Grid([1.0, 1.0], [2, 2]), Grid([1.0, 1.0], [2, 2])
+    grid, shared = Grid([0, 0], [1.0, 1.0], [2, 2]), Grid([0, 0], [1.0, 1.0], [2, 2])
     for name in ("_repr_html_", "_ipython_display_", "shape_", "__array__"):
         assert not hasattr(grid, name)
     assert not grid._made
     made = vars(shared._made[0]).keys() if shared.mesh is not None else set()
     assert {"mesh", "cell_nodes"} <= made
     for name in made:
-        assert hasattr(Grid([1.0, 1.0], [2, 2]), name), f"{name} is made with the mesh, but is not there before"
+        assert hasattr(Grid([0, 0], [1.0, 1.0], [2, 2]), name), f"{name} is made with the mesh, but is not there before"

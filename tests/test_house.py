@@ -5,17 +5,17 @@ import house
 import pytest
 
 CEILINGS = {
-    "ad hoc named numbers": 222,
-    "rules among numbers in functions": 102,
-    "imports a file, mean": 5.06,
+    "ad hoc named numbers": 167,
+    "rules among numbers in functions": 39,
+    "imports a file, mean": 5.35,
     "files in a circle of imports": 0,
     "folders in a circle of imports": 0,
     "files of the largest folder": 14,
-    "parameters of the longest list": 22,
-    "assignments of three and more values": 209,
-    "changes of hidden state": 55,
+    "parameters of the longest list": 15,
+    "assignments of three and more values": 211,
+    "changes of hidden state": 29,
     "files that name a condition's class, most": 7,
-    "lines of the package": 26348,
+    "lines of the package": 26900,
 }
 
 

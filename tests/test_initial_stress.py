@@ -22,20 +22,20 @@ LAWS = {
 def ground(law="hencky", dim=2, off=0.13, level=2.0, axisymmetric=False, **options):
     """Return two layers, 3 m, whose interface and surface are off the grid lines, with a phreatic level in them."""
     width = [2.0] if dim == 2 else [1.0, 1.0]
-    grid = mpm.Grid([*width, 4.0], [*(round(2 * w) for w in width), 8], axisymmetric=axisymmetric)
+    grid = mpm.Grid([0] * dim, [*width, 4.0], [*(round(2 * w) for w in width), 8], axisymmetric=axisymmetric)
     bodies = [
         mpm.box(grid, [*[0.0] * (dim - 1), low], [*width, high], material=m)
         for m, (low, high) in enumerate([(0.0, 1 + off), (1 + off, 3 + off)])
     ]
-    walls = {"left": "x", "right": "x", "front": "y", "back": "y", "bottom": "xyz"[dim - 1]}
-    fixed = {name: axes for name, axes in walls.items() if dim == 3 or name not in ("front", "back")}
+    every = {"left": "x", "right": "x", "front": "y", "back": "y", "bottom": "xyz"[dim - 1]}
+    walls = {name: axes for name, axes in every.items() if dim == 3 or name not in ("front", "back")}
     materials = [LAWS[law](1e7, **WATER), LAWS[law](6e6, **{**WATER, "porosity": 0.3})]
     return mpm.Simulation(
         grid,
         bodies,
         materials,
         fluid=mpm.Fluid(),
-        fixed=fixed,
+        walls=walls,
         **{
             "gravity": [*[0.0] * (dim - 1), -9.81],
             "pressure": mpm.hydrostatic(level),
@@ -92,7 +92,7 @@ def test_along_the_grid_stresses_at_rest_are_the_exact_ones():
 
 def slope(level, soil, h=0.25, axisymmetric=False, **options):
     """Return a bank with a slanted side, wet up to a level, or a mound."""
-    grid = mpm.Grid([5.5, 3.0], [round(5.5 / h), round(3 / h)], axisymmetric=axisymmetric)
+    grid = mpm.Grid([0, 0], [5.5, 3.0], [round(5.5 / h), round(3 / h)], axisymmetric=axisymmetric)
     bank = mpm.mapped(
         grid, mpm.box(grid, [0, 0], [5.1, 2.2]), lambda X: np.stack([X[:, 0] * (1 - X[:, 1] / 4.4), X[:, 1]], axis=1)
     )
@@ -102,16 +102,15 @@ def slope(level, soil, h=0.25, axisymmetric=False, **options):
         [bank],
         [soil],
         fluid=mpm.Fluid(),
-        tractions=loads,
-        drained=heads,
+        conditions=[*loads, *heads],
         gravity=(0, -9.81),
         pressure=mpm.hydrostatic(level),
         initial_stress=mpm.K0(0.5, surcharge=lambda x: WEIGHT * np.maximum(level - x[:, 1], 0.0)),
-        **{"fixed": {"left": "x", "bottom": "xy"}, **options},
+        **{"walls": {"left": "x", "bottom": "xy"}, **options},
     )
 
 
-HELD = {"fixed": {"left": "x"}, "displacements": [mpm.Displacement("bottom", (0, 0))]}
+HELD = {"walls": {"left": "x"}, "conditions": [mpm.Displacement("bottom", (0, 0))]}
 """Holds the base of such a bank in place of the wall."""
 
 
@@ -142,7 +141,7 @@ def oedometric(stress, law):
 @pytest.mark.parametrize("law, axisymmetric", [("hencky", False), ("linear", False), ("hencky", True)])
 def test_soil_is_loaded_on_as_if_its_stress_had_come_by_loading(law, axisymmetric):
     """A stress of a tenth of the modulus as seeded, and then half as much again: the exact stretch between the two."""
-    grid = mpm.Grid([0.5, 1.2], [2, 12], axisymmetric=axisymmetric)
+    grid = mpm.Grid([0, 0], [0.5, 1.2], [2, 12], axisymmetric=axisymmetric)
     column, first, second = mpm.box(grid, [0, 0], [0.5, 1.0]), -3e5, -4.5e5
     material = {"hencky": mpm.Hencky, "linear": mpm.LinearElastic}[law](bulk=2e6, shear=1e6, porosity=0.4)
     stretch = oedometric(first, law)
@@ -153,8 +152,8 @@ def test_soil_is_loaded_on_as_if_its_stress_had_come_by_loading(law, axisymmetri
         grid,
         [column],
         [material],
-        fixed={"left": "x", "right": "x", "bottom": "y"},
-        tractions=[mpm.Traction("top", lambda t: (0, first if t == 0 else second))],
+        walls={"left": "x", "right": "x", "bottom": "y"},
+        conditions=[mpm.Traction("top", lambda t: (0, first if t == 0 else second))],
         initial_stress=lambda x: np.tile([lateral, first, lateral], (len(x), 1)),
     )
     probe = mpm.probes([column], [[0.25, 1.0]])
@@ -211,14 +210,14 @@ PAIRS = {
 @pytest.mark.parametrize("below, above", [(a, b) for a in PAIRS for b in PAIRS if {a, b} & {"sand", "clay"} and a != b])
 def test_laws_may_lie_on_one_another_in_any_order(below, above):
     """Three points each, as many as a tensor has axes, with the stress that they are given."""
-    grid = mpm.Grid([0.5, 4.0], [1, 8])
+    grid = mpm.Grid([0, 0], [0.5, 4.0], [1, 8])
     layers = [mpm.box(grid, [0, y], [0.5, y + 1.5], per_cell=1, material=m) for m, y in enumerate((0, 1.5))]
-    walls, load = {"left": "x", "right": "x", "bottom": "y"}, {"tractions": [mpm.Traction("top", -1e3)]}
+    walls, load = {"left": "x", "right": "x", "bottom": "y"}, {"conditions": [mpm.Traction("top", -1e3)]}
     s = mpm.Simulation(
         grid,
         layers,
         [PAIRS[below](), PAIRS[above]()],
-        fixed=walls,
+        walls=walls,
         gravity=(0, -9.81),
         initial_stress=mpm.K0(0.6, surcharge=1e3),
         **load,
@@ -234,7 +233,7 @@ def test_laws_may_lie_on_one_another_in_any_order(below, above):
 
 def test_forces_that_hold_a_rest_go_where_the_body_moves_or_is_dug_away():
     s = slope(3.0, mpm.Hencky(bulk=5e6, shear=2.5e6, **WATER))
-    s.stage(tractions=[], drained=[])
+    s.stage(conditions=[])
     s.run(1e6, 1e6, progress=False)
     assert moved(s) > 1e-3 and s.state.held is None
 
@@ -265,7 +264,7 @@ def test_what_is_no_ratio_is_refused(value):
 
 
 def test_a_stage_changes_what_was_given_as_a_function_of_place_only():
-    grid = mpm.Grid([0.5, 1.25], [2, 5])
+    grid = mpm.Grid([0, 0], [0.5, 1.25], [2, 5])
     body = mpm.box(grid, [0, 0], [0.5, 1])
     soil = mpm.Hencky(bulk=1e6, shear=5e5, conductivity=lambda X: np.zeros(len(X)))
     s = mpm.Simulation(
@@ -273,8 +272,8 @@ def test_a_stage_changes_what_was_given_as_a_function_of_place_only():
         [body],
         [soil],
         fluid=mpm.Fluid(),
-        fixed={"bottom": "y", "left": "x", "right": "x"},
-        drained=[mpm.Drained("top", 1e3)],
+        walls={"bottom": "y", "left": "x", "right": "x"},
+        conditions=[mpm.Drained("top", 1e3)],
     )
     s.run(10.0, 10.0, progress=False)
     assert np.abs(s.points.pressure).max() < 1e-9

@@ -23,9 +23,9 @@ def footing(soil, surcharge=0.0):
     grid = mpm.Grid(lower=[0, -20], upper=[40, 4], cells=[40, 24])
     pushed = mpm.Displacement("top", lambda t, X: (0, -0.5 * t), region=((0, -np.inf), (EDGE, np.inf)))
     beside = mpm.Traction("top", (0, -surcharge), region=((EDGE, -np.inf), (np.inf, np.inf)))
-    fixed = {"left": "x", "right": "x", "bottom": "xy"}
+    walls = {"left": "x", "right": "x", "bottom": "xy"}
     body = mpm.box(grid, [0, -20], [40, 0])
-    s = mpm.Simulation(grid, [body], [soil], fixed=fixed, displacements=[pushed], tractions=[beside])
+    s = mpm.Simulation(grid, [body], [soil], walls=walls, conditions=[pushed, beside])
     s.run(0.2, 0.2)
     return s
 
@@ -48,11 +48,11 @@ def test_a_step_costs_at_most_half_as_much_again_as_with_drucker_and_prager():
 SPACE = f"""
 import mpm_dolfinx as mpm
 clay = mpm.ModifiedCamClay(**{CLAY!r}, conductivity=1e-8)
-grid = mpm.Grid([1.0, 1.0, 1.0], [2, 2, 3])
+grid = mpm.Grid([0, 0, 0], [1.0, 1.0, 1.0], [2, 2, 3])
 walls = {{"left": "x", "right": "x", "front": "y", "back": "y", "bottom": "z"}}
 load = mpm.Traction("top", lambda t: (0, 0, -2e4 * (1 + t)))
 body = mpm.box(grid, [0, 0, 0], [1, 1, 0.6])
-mpm.Simulation(grid, [body], [clay], fluid=mpm.Fluid(), fixed=walls, tractions=[load]).run(1.0, 0.5)
+mpm.Simulation(grid, [body], [clay], fluid=mpm.Fluid(), walls=walls, tractions=[load]).run(1.0, 0.5)
 """
 
 

@@ -30,7 +30,7 @@ def side(which, at, pressure, dim=2, axis=None):
 
 def column(seams, materials=(SAND, CLAY), dim=2, width=H, per_cell=2, place=None, **options):
     """Return a column of sand, 1 m high, with seams of clay from and to some heights (m)."""
-    grid = mpm.Grid([*[width] * (dim - 1), 1.2], [*[round(width / H)] * (dim - 1), 12])
+    grid = mpm.Grid([0] * dim, [*[width] * (dim - 1), 1.2], [*[round(width / H)] * (dim - 1), 12])
     heights = np.array([0.0, *np.ravel(seams), 1.0])
     bodies = [
         mpm.box(grid, [*[0] * (dim - 1), a], [*[width] * (dim - 1), b], per_cell=per_cell, material=i % 2)
@@ -39,7 +39,7 @@ def column(seams, materials=(SAND, CLAY), dim=2, width=H, per_cell=2, place=None
     ]
     bodies = bodies if place is None else [mpm.mapped(grid, body, place) for body in bodies]
     walls = {name: "xyz"[axis] for name, (axis, end) in SIDES[dim].items() if (axis, end) != (dim - 1, 1)}
-    return mpm.Simulation(grid, bodies, list(materials), fixed=walls, **options)
+    return mpm.Simulation(grid, bodies, list(materials), walls=walls, **options)
 
 
 def ends(dim, pressure=TINY):
@@ -80,7 +80,7 @@ SEAMS = {
 @pytest.mark.parametrize("offset", [0.0, 0.1, 0.25, 0.5, 0.9])
 def test_steady_flow_across_seams_is_exact_at_any_offset(seams, offset):
     seams = np.array(SEAMS[seams]) + offset * H
-    s = column(seams, fluid=INCOMPRESSIBLE, drained=ends(2))
+    s = column(seams, fluid=INCOMPRESSIBLE, conditions=[*ends(2)])
     over = steady(s) / (TINY * H / resistance(np.diff(seams).sum()))
     print(f"{offset} cells off the lines: flow / exact - 1 = {over - 1:.0e}")
     assert over == pytest.approx(1, rel=1e-8)
@@ -89,7 +89,7 @@ def test_steady_flow_across_seams_is_exact_at_any_offset(seams, offset):
 @pytest.mark.parametrize("options", [{"dim": 3}, {"per_cell": 1}, {"per_cell": 3}], ids=str)
 def test_steady_flow_is_exact_in_3d_and_with_any_number_of_points(options):
     dim = options.get("dim", 2)
-    s = column([(0.525, 0.625)], fluid=INCOMPRESSIBLE, drained=ends(dim), **options)
+    s = column([(0.525, 0.625)], fluid=INCOMPRESSIBLE, conditions=ends(dim), **options)
     assert steady(s) == pytest.approx(TINY * H ** (dim - 1) / resistance(0.1), rel=1e-8, abs=0)
 
 
@@ -98,7 +98,7 @@ def test_steady_flow_is_exact_in_3d_and_with_any_number_of_points(options):
 def test_steady_flow_along_seams_is_exact_at_any_offset(seams, offset):
     seams, width = np.array(SEAMS[seams]) + offset * H, 0.4
     drained = [side("left", 0.0, TINY, axis=0), side("right", width, 0.0, axis=0)]
-    s = column(seams, fluid=INCOMPRESSIBLE, drained=drained, width=width)
+    s = column(seams, fluid=INCOMPRESSIBLE, conditions=drained, width=width)
     share = 1 - np.diff(seams).sum()
     exact = (share * SAND.conductivity + (1 - share) * CLAY.conductivity) / 9810 * TINY / width
     assert steady(s) == pytest.approx(exact, rel=1e-8, abs=0)
@@ -106,7 +106,7 @@ def test_steady_flow_along_seams_is_exact_at_any_offset(seams, offset):
 
 @pytest.mark.parametrize("offset", [0.0, 0.3])
 def test_a_seam_at_an_open_end_resists_as_exact(offset):
-    s = column([(0.9 + offset * H, 1.0)], fluid=INCOMPRESSIBLE, drained=ends(2))
+    s = column([(0.9 + offset * H, 1.0)], fluid=INCOMPRESSIBLE, conditions=[*ends(2)])
     assert steady(s) == pytest.approx(TINY * H / resistance(0.1 - offset * H), rel=1e-8, abs=0)
 
 
@@ -122,12 +122,12 @@ def test_a_conductivity_that_jumps_with_the_place_or_on_the_points_is_layered_to
         mpm.Hencky(bulk=1e7, shear=5e6, conductivity=1e-4, conductivity_law=by_place),
         mpm.Hencky(bulk=1e7, shear=5e6, conductivity=by_points),
     ):
-        s = column(seams, [soil, soil], fluid=INCOMPRESSIBLE, drained=ends(2))
+        s = column(seams, [soil, soil], fluid=INCOMPRESSIBLE, conditions=[*ends(2)])
         assert steady(s) == pytest.approx(TINY * H / resistance(0.1), rel=1e-8, abs=0)
 
 
 def test_water_at_rest_does_not_flow_through_seams():
-    s = column([(0.525, 0.625)], fluid=mpm.Fluid(), drained=[side("top", 1, 0.0)], gravity=(0, -10.0))
+    s = column([(0.525, 0.625)], fluid=mpm.Fluid(), conditions=[side("top", 1, 0.0)], gravity=(0, -10.0))
     s.run(1e15, 1e15, progress=False)
     on_grid, _ = s.scene.last
     y = (s.grid.midpoints + on_grid.contents.centroid)[on_grid.cells, 1]
@@ -145,8 +145,10 @@ def test_flow_across_a_seam_is_exact_wherever_the_load_moves_it():
             [(0.5, 0.6)],
             [sand, clay],
             fluid=INCOMPRESSIBLE,
-            drained=ends(2, 1.0),
-            tractions=[mpm.Traction("top", lambda t, load=load: (0, -load * min(1, t / 1e9)), ([0, 1], [H, 1]))],
+            conditions=[
+                *ends(2, 1.0),
+                mpm.Traction("top", lambda t, load=load: (0, -load * min(1, t / 1e9)), ([0, 1], [H, 1])),
+            ],
         )
         s.run(1e10, 2.5e8, progress=False)
         thickness = s.points.volume0 * s.points.J / H
@@ -159,7 +161,7 @@ def below_after_a_day(offset, load):
     """Return the pressure below a seam of a cell after a day, over the load on the drained top."""
     top = [0, 1], [H, 1]
     load_on_top = [mpm.Traction("top", (0, -load), top)]
-    s = column(np.array([(0.5, 0.6)]) + offset * H, fluid=mpm.Fluid(), drained=ends(2)[1:], tractions=load_on_top)
+    s = column(np.array([(0.5, 0.6)]) + offset * H, fluid=mpm.Fluid(), conditions=[*ends(2)[1:], *load_on_top])
     s.run(86400, 3600, progress=False)
     return s.points.pressure[s.points.x[:, 1] < 0.25].mean() / load
 
@@ -183,16 +185,16 @@ def test_aslant_a_seam_is_a_barrier_and_a_drain_conducts(slope):
         return np.stack([x[:, 0], x[:, 1] + share * slope * (x[:, 0] - 0.5)], axis=1)
 
     scene = {"seams": [(low, high)], "width": width, "place": place, "fluid": INCOMPRESSIBLE}
-    across = steady(column(drained=ends(2), **scene))
+    across = steady(column(conditions=[*ends(2)], **scene))
     assert across == pytest.approx(TINY * width / (9810 * 0.1 / steep / CLAY.conductivity), rel=0.2, abs=0)
     drained = [side("left", 0.0, TINY, axis=0), side("right", width, 0.0, axis=0)]
-    along = steady(column(materials=[CLAY, SAND], drained=drained, **scene))
+    along = steady(column(materials=[CLAY, SAND], conditions=drained, **scene))
     assert along == pytest.approx(0.1 / steep * SAND.conductivity / 9810 * TINY / width, rel=0.2, abs=0)
 
 
 def test_cells_that_conduct_alike_are_treated_as_ever():
     other = mpm.Hencky(bulk=2e7, shear=5e6, conductivity=SAND.conductivity)
-    s = column([(0.525, 0.625)], [SAND, other], fluid=mpm.Fluid(), drained=ends(2))
+    s = column([(0.525, 0.625)], [SAND, other], fluid=mpm.Fluid(), conditions=[*ends(2)])
     s.step(1.0)
     on_grid, _ = s.scene.last
     mobility = on_grid.mobility(on_grid.data, True)
@@ -204,7 +206,7 @@ def settled(ratio, offset, thickness=1):
     """Return the settlement of a column with a layer so many times softer, some cells thick, over the exact one."""
     soft = mpm.Hencky(bulk=SAND.bulk / ratio, shear=SAND.shear / ratio)
     load = [mpm.Traction("top", (0, -1.0), ([0, 1], [H, 1]))]
-    s = column([((3 + offset) * H, (3 + offset + thickness) * H)], [SAND, soft], tractions=load)
+    s = column([((3 + offset) * H, (3 + offset + thickness) * H)], [SAND, soft], conditions=load)
     for _ in range(2):
         s.step(1.0)
     exact = (1 + thickness * H * (ratio - 1)) / SAND.oedometric
@@ -231,14 +233,14 @@ def test_a_soft_layer_off_the_grid_lines_is_named_once_with_what_it_loses(ratio,
 
 @pytest.mark.parametrize(("dim", "rings", "order"), [(2, False, -1), (3, False, 1), (2, True, -1)])
 def test_a_soft_layer_is_named_in_space_and_in_rings_and_in_any_order(dim, rings, order, caplog):
-    grid = mpm.Grid([*[2 * H] * (dim - 1), 1.2], [*[2] * (dim - 1), 12], axisymmetric=rings)
+    grid = mpm.Grid([0] * dim, [*[2 * H] * (dim - 1), 1.2], [*[2] * (dim - 1), 12], axisymmetric=rings)
     soft, flat = mpm.Hencky(bulk=SAND.bulk / 10, shear=SAND.shear / 10), [0] * (dim - 1)
     ends = pairwise((0, 3.5 * H, 4.5 * H, 1))
     bodies = [mpm.box(grid, [*flat, a], [*[2 * H] * (dim - 1), b], material=i % 2) for i, (a, b) in enumerate(ends)]
     walls = {name: "xyz"[axis] for name, (axis, end) in SIDES[dim].items() if (axis, end) != (dim - 1, 1)}
     top = list(SIDES[dim])[-1]
     load = mpm.Traction(top, (*flat, -1.0), ([*flat, 0.99], [9] * dim))
-    s = mpm.Simulation(grid, bodies[::order], [SAND, soft], fixed=walls, tractions=[load])
+    s = mpm.Simulation(grid, bodies[::order], [SAND, soft], walls=walls, conditions=[load])
     s.step(1.0)
     (record,) = caplog.records
     assert "material 1, up to 10 times as soft" in record.getMessage() and "about 74 %" in record.getMessage()
@@ -250,7 +252,7 @@ def test_a_soft_layer_whose_interfaces_move_on_is_named_again(caplog):
     """A column that shrinks by 3 % carries them from grid lines to 0.3 cells off: it loses 11 %, then half."""
     soft = mpm.Hencky(bulk=SAND.bulk / 10, shear=SAND.shear / 10)
     load = [mpm.Traction("top", lambda t: (0, -2e5 * t), ([0, 1], [H, 1]))]
-    s = column([(0.5, 0.6)], [SAND, soft], tractions=load)
+    s = column([(0.5, 0.6)], [SAND, soft], conditions=load)
     s.run(1.0, 0.05, progress=False)
     said = [float(record.getMessage().split("about ")[1].split(" %")[0]) for record in caplog.records]
     assert said[0] < 15 and said[-1] > 40

@@ -107,7 +107,12 @@ def test_an_energy_of_local_unknowns_has_its_tangent(dim):
 
 def settled(material, **options):
     """Return the displacement of the top of a column under a load that grows; it has a fluid or none."""
-    s = column(cells=4, material=material, tractions=[mpm.Traction("top", lambda t: (0, -2e5 * t))], **options)
+    s = column(
+        cells=4,
+        material=material,
+        conditions=[mpm.Traction("top", lambda t: (0, -2e5 * t)), *options.pop("conditions", [])],
+        **options,
+    )
     result = s.run(1.0, 0.25, probes=mpm.probes(s.bodies, [[0.125, 1.0]]))
     return s, result, result.displacement[-1][0, 1]
 
@@ -131,7 +136,7 @@ def test_an_energy_of_local_unknowns_keeps_the_order_of_newtons_method():
 
 def test_a_column_with_water_ends_where_the_dry_one_does():
     dry = settled(SOIL, fluid=False)[2]
-    wet = settled(replace(SOIL, conductivity=1e3), fluid=True, drained=[mpm.Drained("top")])[2]
+    wet = settled(replace(SOIL, conductivity=1e3), fluid=True, conditions=[mpm.Drained("top")])[2]
     assert wet == pytest.approx(dry, rel=1e-4)
 
 
@@ -150,7 +155,7 @@ class Brittle(Stiffening):
 def test_a_step_without_a_local_solution_is_cut_and_names_the_first_point():
     """ln J = -0.05 is reached at about half of the load; only the upper half of the column is weak."""
     weak = Brittle(bulk=2e6, shear=1e6, least=lambda X: np.where(X[:, 1] > 0.5, -0.05, -9.0))
-    s = column(cells=4, fluid=False, material=weak, tractions=[mpm.Traction("top", lambda t: (0, -2e5 * t))])
+    s = column(cells=4, fluid=False, material=weak, conditions=[mpm.Traction("top", lambda t: (0, -2e5 * t))])
     with pytest.raises(mpm.GaveUp, match=r"Brittle: local equations have no solution at \[0\.\d+ +0\.(4[5-9]|[5-9])"):
         s.run(1.0, 0.25)
     assert s.result.cuts > 2 and np.log(s.points.J).min() == pytest.approx(-0.05, rel=0.05)
@@ -282,7 +287,7 @@ def test_one_line_says_what_is_wrong():
         column(fluid=False, material=Misnamed(bulk=1e6, shear=1e6))
     assert "\n" not in str(caught.value)
     with pytest.raises(ValueError, match="the reference has no state"):
-        BiotFEM([0, 0], [1, 1], (2, 2), SOIL, fixed={})
+        BiotFEM([0, 0], [1, 1], (2, 2), SOIL, walls={})
     half = type("Half", (Stiffening,), {"residual": None})
     with pytest.raises(
         ValueError, match="Half: has unknowns and 0 of residual and solution, must have unknowns and one"

@@ -14,11 +14,13 @@ STEPS = 40  # in a cycle
 
 def cycle(h, cycles, material=SOFT, observe=(), **options):
     """Return (simulation, result) of the beam whose load comes and goes `cycles` times."""
-    grid = mpm.Grid([1.2, 1.2], [round(1.2 / h)] * 2)
+    grid = mpm.Grid([0, 0], [1.2, 1.2], [round(1.2 / h)] * 2)
     bottom = (round(0.6 / h) + 0.5) * grid.h[1]
     body = mpm.box(grid, [0, bottom], [1, bottom + 0.3])
     load = mpm.Traction("top", lambda t: (0, -27e3 * (1 - np.cos(2 * np.pi * t))), region=((0.05, -1), (1.0, 9)))
-    s = mpm.Simulation(grid, [body], [material], fixed={"left": "xy"}, tractions=[load], **options)
+    s = mpm.Simulation(
+        grid, [body], [material], walls={"left": "xy"}, conditions=[load, *options.pop("conditions", [])], **options
+    )
     return s, s.run(cycles, 1 / STEPS, probes=mpm.probes([body], [[1, bottom + 0.15]]), observe=observe)
 
 

@@ -17,8 +17,8 @@ from mpm_dolfinx.bodies.mesh_cells import AS_LATTICE, edges
 from mpm_dolfinx.bodies.touching import face_vectors
 from mpm_dolfinx.points.cutting import volumes
 
-GRID = mpm.Grid([4, 4], [8, 8])
-SPACE = mpm.Grid([3, 3, 3], [3, 3, 3])
+GRID = mpm.Grid([0, 0], [4, 4], [8, 8])
+SPACE = mpm.Grid([0, 0, 0], [3, 3, 3], [3, 3, 3])
 
 
 def volume(file, part=None, grid=GRID, **options):
@@ -346,4 +346,4 @@ def test_bodies_of_tetrahedra_in_one_another_are_refused_however_little():
     """Faces that are plane kites counted as warped: a tenth of an edge was let pass."""
     one, two = (mpm.from_mesh(SPACE, box_mesh("tetra", (2,) * 3, (x, 0, 0), (x + 1, 1, 1))) for x in (0, 0.99))
     with pytest.raises(ValueError, match=r"bodies 0 and 1: both are at .* 0.01 m deep, must not lie in each other"):
-        mpm.Simulation(SPACE, [one, two], [mpm.Hencky(bulk=1e6, shear=5e5)], fixed={})
+        mpm.Simulation(SPACE, [one, two], [mpm.Hencky(bulk=1e6, shear=5e5)], walls={})

@@ -21,8 +21,8 @@ from mpm_dolfinx.base import _compat
 from mpm_dolfinx.bodies.faces import surface
 from mpm_dolfinx.points.cutting import volumes
 
-GRID = mpm.Grid([2, 1.5], [10, 8])
-SPACE = mpm.Grid([2, 2, 2], [4, 4, 4])
+GRID = mpm.Grid([0, 0], [2, 1.5], [10, 8])
+SPACE = mpm.Grid([0, 0, 0], [2, 2, 2], [4, 4, 4])
 KINDS = {"triangle": (8, 4), "quad": (8, 4), "tetra": (4, 2, 2), "hexahedron": (4, 2, 2)}
 ALL = KINDS | {"wedge": (4, 2, 2), "pyramid": (4, 2, 2)}
 SOIL = mpm.Hencky(bulk=1e6 / 1.2, shear=1e6 / 2.4)
@@ -79,11 +79,11 @@ def test_slanted_faces_are_limited_by_regions_in_space():
 @pytest.mark.parametrize("kind", [*KINDS, "wedge"])
 def test_a_linear_field_is_exact_however_the_mesh_lies(kind):
     dim = len(ALL[kind])
-    grid = mpm.Grid([2.2] * dim, [6] * dim)
+    grid = mpm.Grid([0] * dim, [2.2] * dim, [6] * dim)
     body = mpm.from_mesh(grid, box_mesh(kind, (3,) * dim, (0,) * dim, (1,) * dim, place=skewed))
     H = np.array([[0.05, 0.1, 0.02], [-0.03, -0.08, 0.04], [0.01, 0.06, 0.03]])[:dim, :dim]
     sides = [mpm.Displacement(name, lambda t, X: t * X @ H.T) for name in body.names]
-    s = mpm.Simulation(grid, [body], [SOIL], fixed={}, displacements=sides)
+    s = mpm.Simulation(grid, [body], [SOIL], walls={}, conditions=sides)
     s.run(1.0, 0.5, progress=False)
     assert s.points.F == pytest.approx(np.tile(np.eye(dim) + H, (len(s.points), 1, 1)), abs=2e-3)
 
@@ -93,12 +93,12 @@ def tip(body, grid, load, x):
     walls = {"left": "xyz"[: grid.dim]} | ({"front": "y", "back": "y"} if grid.dim == 3 else {})
     down = (0,) * (grid.dim - 1) + (-load,)
     traction = mpm.Traction("top", lambda t: np.multiply(t, down))
-    s = mpm.Simulation(grid, [body], [SOIL], fixed=walls, tractions=[traction])
+    s = mpm.Simulation(grid, [body], [SOIL], walls=walls, conditions=[traction])
     return s.run(1.0, 0.25, probes=mpm.probes([body], [x]), progress=False).displacement[-1][0, -1]
 
 
 def test_a_beam_of_a_mesh_bends_as_one_of_boxes():
-    grid, low, high, x = mpm.Grid([2.2, 1.5], [22, 15]), (0, 0.75), (2, 1.25), [2.0, 1.0]
+    grid, low, high, x = mpm.Grid([0, 0], [2.2, 1.5], [22, 15]), (0, 0.75), (2, 1.25), [2.0, 1.0]
     boxes = {n: tip(mpm.box(grid, low, high, per_cell=n), grid, 4e3, x) for n in (2, 3, 4)}
     limit = boxes[2] + (boxes[4] - boxes[2]) * 4 / 3  # what is left falls as one over the points squared
     assert boxes[3] == pytest.approx(limit + (boxes[2] - limit) * 4 / 9, rel=3e-4)
@@ -112,7 +112,12 @@ def test_a_beam_of_a_mesh_bends_as_one_of_boxes():
 
 @pytest.mark.slow
 def test_a_beam_of_a_mesh_in_3d_bends_as_one_of_boxes():
-    grid, low, high, x = mpm.Grid([1.8, 0.4, 1.2], [18, 4, 12]), (0, 0, 0.6), (1.5, 0.4, 1.0), [1.5, 0.2, 0.8]
+    grid, low, high, x = (
+        mpm.Grid([0, 0, 0], [1.8, 0.4, 1.2], [18, 4, 12]),
+        (0, 0, 0.6),
+        (1.5, 0.4, 1.0),
+        [1.5, 0.2, 0.8],
+    )
     boxes = {n: tip(mpm.box(grid, low, high, per_cell=n), grid, 3e3, x) for n in (2, 4)}
     hexahedra = mpm.from_mesh(grid, box_mesh("hexahedron", (30, 8, 8), low, high))
     tetrahedra = mpm.from_mesh(grid, box_mesh("tetra", (11, 3, 3), low, high))
@@ -156,10 +161,10 @@ def cylinder(p, bulk, shear):
 def pressed_hole(body, side, p, steps, cells):
     """Return the errors (rms) of displacements and stresses of a quarter of a cylinder of radii 1 and 2 m."""
     bulk, shear = 2e6, 1e6
-    grid = mpm.Grid([2.6] * 2, [round(2.6 * cells)] * 2)
+    grid = mpm.Grid([0] * 2, [2.6] * 2, [round(2.6 * cells)] * 2)
     body = body(grid)
     load = mpm.Pressure(side, lambda t: p * t)
-    s = mpm.Simulation(grid, [body], [mpm.Hencky(bulk, shear)], fixed={"left": "x", "bottom": "y"}, tractions=[load])
+    s = mpm.Simulation(grid, [body], [mpm.Hencky(bulk, shear)], walls={"left": "x", "bottom": "y"}, conditions=[load])
     s.run(1.0, 1 / steps, progress=False)
     X = s.points.x - s.points.displacement
     u, radial, hoop = cylinder(p, bulk, shear)(np.linalg.norm(X, axis=1).clip(1, 2))
@@ -205,7 +210,7 @@ def test_a_polygon_is_filled_up_to_sides_with_their_names():
 def test_a_slope_under_an_even_pressure_has_an_even_stress():
     body = outlined([(0, 0), (1.8, 0), (0.6, 1), (0, 1)], ["base", "slope", "crest", "axis"])
     loads = [mpm.Pressure(side, lambda t: 5e5 * t) for side in ("slope", "crest")]
-    s = mpm.Simulation(GRID, [body], [SOIL], fixed={"left": "x", "bottom": "y"}, tractions=loads)
+    s = mpm.Simulation(GRID, [body], [SOIL], walls={"left": "x", "bottom": "y"}, conditions=loads)
     s.run(1.0, 0.2, progress=False)
     assert s.effective_stress() == pytest.approx(np.tile(-5e5 * np.eye(2), (len(body), 1, 1)), abs=1.0)
 
@@ -217,8 +222,8 @@ def test_parts_of_a_mesh_share_their_inner_faces(kind):
     assert len(one) == len(two) and surface([one, two], "top").area0.sum() == pytest.approx(2.0, rel=1e-12)
     assert set(one.names) == {"left", "bottom", "top"} and set(two.names) == {"right", "bottom", "top"}
     walls, load = {"left": "x", "bottom": "y"}, mpm.Traction("right", (-1e5, 0))
-    both = mpm.Simulation(GRID, [one, two], [SOIL], fixed=walls, tractions=[load])
-    whole = mpm.Simulation(GRID, [mpm.from_mesh(GRID, mesh)], [SOIL], fixed=walls, tractions=[load])
+    both = mpm.Simulation(GRID, [one, two], [SOIL], walls=walls, conditions=[load])
+    whole = mpm.Simulation(GRID, [mpm.from_mesh(GRID, mesh)], [SOIL], walls=walls, conditions=[load])
     for s in (both, whole):
         s.run(1.0, 1.0, progress=False)
     assert both.points.F.mean(axis=0) == pytest.approx(whole.points.F.mean(axis=0), rel=1e-9)
@@ -277,7 +282,7 @@ def test_cells_may_be_numbered_either_way_round(kind):
 def test_a_strip_that_is_bent_round_until_its_ends_meet_is_refused_once_they_overlap(kind):
     """No two cells share a facet there, and all of them lie on both sides of those that they share."""
     dim = len(ALL[kind])
-    grid = mpm.Grid([4, 4, 1][:dim], [8, 8, 2][:dim])
+    grid = mpm.Grid([0] * dim, [4, 4, 1][:dim], [8, 8, 2][:dim])
 
     def ring(turns):
         def place(x):
@@ -294,7 +299,7 @@ def test_a_strip_that_is_bent_round_until_its_ends_meet_is_refused_once_they_ove
 @pytest.mark.parametrize("dim", [2, 3])
 def test_no_mesh_of_which_two_cells_hold_one_place_is_taken(dim):
     """Meshes of random points, of which one is moved, or some cells are left out, or two that are put anywhere."""
-    rng, grid, taken = np.random.default_rng(dim), mpm.Grid([1.0] * dim, [1] * dim), {True: 0, False: 0}
+    rng, grid, taken = np.random.default_rng(dim), mpm.Grid([0] * dim, [1.0] * dim, [1] * dim), {True: 0, False: 0}
     for trial in range(30):
         x = rng.random((rng.integers(dim + 3, 20), dim))
         cells = Delaunay(x).simplices
@@ -322,7 +327,7 @@ def test_warped_hexahedra_fill_their_mesh_however_they_are_numbered():
     inner = ((mesh.points > 1e-9) & (mesh.points < 1 - 1e-9)).all(axis=1)
     mesh.points[inner] += rng.uniform(-0.025, 0.025, (inner.sum(), 3))  # a tenth of an edge
     mesh.cells[-1].data[::2] = mesh.cells[-1].data[::2][:, [1, 2, 3, 0, 5, 6, 7, 4]]
-    body = mpm.from_mesh(mpm.Grid([1.0] * 3, [4] * 3), mesh, per_cell=1)
+    body = mpm.from_mesh(mpm.Grid([0] * 3, [1.0] * 3, [4] * 3), mesh, per_cell=1)
     assert volumes(body.corners()).sum() == pytest.approx(1.0, rel=1e-13)
 
 
@@ -360,18 +365,18 @@ def test_a_bent_mesh_keeps_its_sides_and_reference_positions():
 
 
 def test_a_fill_of_a_mesh_lies_on_the_settled_ground():
-    grid = mpm.Grid([1.2, 1.2], [12, 12])
+    grid = mpm.Grid([0, 0], [1.2, 1.2], [12, 12])
     ground = mpm.from_mesh(grid, box_mesh("triangle", (12, 5), (0, 0), (1.2, 0.5)))
     trapezoid = lambda x: np.stack([x[:, 0] * (1 - 0.5 * x[:, 1]), 0.5 + 0.3 * x[:, 1]], axis=1)  # noqa: E731
     fill = mpm.from_mesh(grid, box_mesh("triangle", (9, 4), (0, 0), (0.8, 1), place=trapezoid))
     walls = {"left": "x", "right": "x", "bottom": "y"}
     load = mpm.Traction("top", (0, -1e5), region=((0, 0), (0.8, 0.5)))
-    s = mpm.Simulation(grid, [ground, fill], [SOIL], fixed=walls, tractions=[load], later=[1])
+    s = mpm.Simulation(grid, [ground, fill], [SOIL], walls=walls, conditions=[load], later=[1])
     s.run(1.0, 0.25, progress=False)
     top = surface([ground], "top")
     settled = s.points.corners[top.id][:, :, 1].max(axis=1).min()
     assert settled < 0.47
-    s.stage(add=[1], tractions=[])
+    s.stage(add=[1], conditions=[])
     new = s.points.of(np.arange(len(ground)), kept=False)
     area = volumes(s.points.corners).sum()
     assert new.corners[:, :, 1].max() == pytest.approx(0.8, abs=1e-9), "its top stays where it was seeded"
@@ -385,7 +390,11 @@ def test_a_resumed_mesh_ends_as_one_that_was_never_interrupted(tmp_path):
     def scene():
         body = mpm.from_mesh(GRID, box_mesh("triangle", (6, 4), (0, 0), (1, 1)))
         return mpm.Simulation(
-            GRID, [body], [SOIL], fixed={"bottom": "xy"}, tractions=[mpm.Traction("top", lambda t: (2e4 * t, -2e4 * t))]
+            GRID,
+            [body],
+            [SOIL],
+            walls={"bottom": "xy"},
+            conditions=[mpm.Traction("top", lambda t: (2e4 * t, -2e4 * t))],
         )
 
     whole, part = scene(), scene()
@@ -497,7 +506,7 @@ BAD = {
     "an unknown part": (lambda: mpm.from_mesh(GRID, BOX, "clay"), "mesh: part 'clay'", "no parts with a name"),
     "an unknown side": (
         lambda: mpm.Simulation(
-            GRID, [mpm.from_mesh(GRID, BOX)], [SOIL], fixed={"left": "xy"}, tractions=[mpm.Traction("crest", 1.0)]
+            GRID, [mpm.from_mesh(GRID, BOX)], [SOIL], walls={"left": "xy"}, conditions=[mpm.Traction("crest", 1.0)]
         ),
         "side 'crest'",
         "left, right, bottom, top",
@@ -546,7 +555,7 @@ def test_a_polygon_in_national_coordinates_is_filled():
     """gmsh ended the process."""
     pytest.importorskip("gmsh")
     origin = np.array([512000.0, 5.4e6])
-    grid = mpm.Grid(np.add(origin, [6, 3]), [24, 12], lower=origin)
+    grid = mpm.Grid(origin, np.add(origin, [6, 3]), [24, 12])
     body = mpm.polygon(grid, np.add(origin, [(0, 0), (5, 0), (3, 2), (1, 2)]), ["base"] * 4)
     assert np.abs(volumes(body.corners())).sum() == pytest.approx(7.0, rel=1e-8)
 

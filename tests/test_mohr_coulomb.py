@@ -160,7 +160,7 @@ def test_a_column_in_a_scene_follows_the_element_test(dilation):
     soil = replace(SAND, cohesion=2e4, dilation=dilation)
     lab = element_test(soil, "oedometer", 0.05, steps=10)
     load = lambda t: (0, np.interp(t, lab.strain / 0.05, lab.stress[:, 2, 2]))  # noqa: E731
-    s = column(cells=4, fluid=False, material=soil, tractions=[mpm.Traction("top", load)])
+    s = column(cells=4, fluid=False, material=soil, conditions=[mpm.Traction("top", load)])
     result = s.run(1.0, 0.1)
     assert result.cuts == 0 and s.scene.momentum.symmetric == (dilation == 30.0)
     assert np.log(s.points.F[:, 1, 1]) == pytest.approx(-0.05, rel=1e-6)

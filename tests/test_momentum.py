@@ -13,7 +13,7 @@ from mpm_dolfinx.mechanics.ghost_penalty import GHOST
 @pytest.mark.parametrize("law", [mpm.Hencky, mpm.NeoHookean])
 def test_uniform_compression_is_exact_however_the_body_lies_on_the_grid(offset, law):
     material = law(bulk=2e5, shear=1e5)
-    s = column(fluid=False, offset=offset, material=material, tractions=[mpm.Traction("top", lambda t: (0, -5e4 * t))])
+    s = column(fluid=False, offset=offset, material=material, conditions=[mpm.Traction("top", lambda t: (0, -5e4 * t))])
     s.run(1.0, 0.25)
     stretch = s.points.F[:, 1, 1]
     assert np.ptp(stretch) < 1e-6, "stretch is not uniform"
@@ -50,19 +50,19 @@ def test_the_load_is_the_traction_times_the_area_also_where_a_domain_is_partly_l
 @pytest.mark.parametrize("strain", [1e-3, 1e-9])
 def test_a_tiny_load_is_carried_however_stiff_a_part_of_the_body_is(strain):
     """Round-off in the stiff part is larger than the load."""
-    grid = mpm.Grid([0.1, 1.0], [1, 10])
+    grid = mpm.Grid([0, 0], [0.1, 1.0], [1, 10])
     bodies = [mpm.box(grid, [0, 0], [0.1, 0.5]), mpm.box(grid, [0, 0.5], [0.1, 1.0], material=1)]
     soft, hard = mpm.Hencky(bulk=1e5, shear=1e5), mpm.Hencky(bulk=1e13, shear=1e13)
-    fixed = {"left": "x", "right": "x", "bottom": "y"}
+    walls = {"left": "x", "right": "x", "bottom": "y"}
     load = mpm.Traction("top", (0, -strain * soft.oedometric), region=((-np.inf, 0.9), (np.inf, np.inf)))
-    s = mpm.Simulation(grid, bodies, [soft, hard], fixed=fixed, tractions=[load])
+    s = mpm.Simulation(grid, bodies, [soft, hard], walls=walls, conditions=[load])
     result = s.run(1.0, 1.0, probes=mpm.probes(bodies, [[0.05, 1.0]]))
     assert result.displacement[-1][0, 1] == pytest.approx(-0.5 * strain, rel=2e-3)
 
 
 @pytest.mark.parametrize("dt", [1.0, 1e3, 1e12, np.inf])
 def test_a_step_longer_than_the_run_is_one_step(dt):
-    s = column(fluid=False, tractions=[mpm.Traction("top", (0, -1e4))])
+    s = column(fluid=False, conditions=[mpm.Traction("top", (0, -1e4))])
     result = s.run(1.0, dt)
     assert result.steps == 1 and s.points.F[:, 1, 1] == pytest.approx(1 - 1e4 / SOFT.oedometric, abs=1e-5)
 
@@ -102,19 +102,19 @@ def test_the_ghost_penalty_hardly_changes_the_tip(monkeypatch):
 def test_three_dimensions_equal_plane_strain():
     h, tips = 0.1, []
     for dim in (2, 3):
-        grid = mpm.Grid([1.2, *[h] * (dim - 2), 1.0], [12, *[1] * (dim - 2), 10])
+        grid = mpm.Grid([0] * dim, [1.2, *[h] * (dim - 2), 1.0], [12, *[1] * (dim - 2), 10])
         body = mpm.box(grid, [0, *[0] * (dim - 2), 0.45], [1, *[h] * (dim - 2), 0.75])
-        fixed = {"left": "xy"} if dim == 2 else {"left": "xyz", "front": "y", "back": "y"}
+        walls = {"left": "xy"} if dim == 2 else {"left": "xyz", "front": "y", "back": "y"}
         load = mpm.Traction("top", lambda t, dim=dim: (*[0] * (dim - 1), -30e3 * t))
         material = mpm.NeoHookean(bulk=1e7 / 3, shear=5e6)
-        s = mpm.Simulation(grid, [body], [material], fixed=fixed, tractions=[load])
+        s = mpm.Simulation(grid, [body], [material], walls=walls, conditions=[load])
         probe = mpm.probes([body], [[1, *[h / 2] * (dim - 2), 0.6]])
         tips.append(s.run(1.0, 0.5, probes=probe).displacement[-1][0, [0, -1]])
     assert tips[1] == pytest.approx(tips[0], rel=1e-6)
 
 
 def test_the_stress_of_the_points_is_that_of_the_law():
-    s = column(fluid=False, material=SOFT, tractions=[mpm.Traction("top", lambda t: (0, -2e6 * t))])
+    s = column(fluid=False, material=SOFT, conditions=[mpm.Traction("top", lambda t: (0, -2e6 * t))])
     s.run(1.0, 0.25)
     J = s.points.J
     stress = s.effective_stress()
@@ -126,12 +126,12 @@ def test_the_stress_of_the_points_is_that_of_the_law():
 
 @pytest.mark.parametrize("offset", [0.0, 0.4])
 def test_a_rigid_plate_settles_evenly_on_uneven_ground_and_carries_its_force(offset):
-    grid = mpm.Grid([1.0, 1.4], [10, 14])
+    grid = mpm.Grid([0, 0], [1.0, 1.4], [10, 14])
     soft, hard = mpm.Hencky(bulk=1e6, shear=6e5), mpm.Hencky(bulk=4e6, shear=2.4e6)
     top = 1 + offset / 10
     bodies = [mpm.box(grid, [0, 0], [0.5, top]), mpm.box(grid, [0.5, 0], [1, top], material=1)]
-    fixed = {"left": "x", "right": "x", "bottom": "y"}
-    s = mpm.Simulation(grid, bodies, [soft, hard], fixed=fixed, plates=[mpm.RigidPlate("top", 1e3)])
+    walls = {"left": "x", "right": "x", "bottom": "y"}
+    s = mpm.Simulation(grid, bodies, [soft, hard], walls=walls, conditions=[mpm.RigidPlate("top", 1e3)])
     probes = mpm.probes(bodies, [[0.0, top], [0.3, top], [1.0, top]])
     u = s.run(1.0, 0.5, probes=probes).displacement[-1]
     assert np.ptp(u[:, 1]) < 1e-3 * abs(u[0, 1])

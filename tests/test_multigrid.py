@@ -8,20 +8,20 @@ from petsc4py import PETSc
 
 import numpy as np
 import pytest
-from helpers import column, pressed
+from helpers import column, noting, pressed, thresholds
 from hypothesis import given
 from hypothesis import strategies as st
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.solve import linear, monolithic, multigrid
-from mpm_dolfinx.solve.multigrid import COARSEST, interpolation, interpolations
+from mpm_dolfinx.solve import monolithic, multigrid
+from mpm_dolfinx.solve.multigrid import interpolation, interpolations
+from mpm_dolfinx.solve.plan import THRESHOLDS
 
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
     """Let small bodies be solved by multigrid."""
-    monkeypatch.setattr(linear, "GRIDS", 1)
-    monkeypatch.setattr(multigrid, "COARSEST", 50)
+    thresholds(monkeypatch, multigrid_2d=1, coarsest=50)
 
 
 def factorised(monkeypatch) -> list[int]:
@@ -41,7 +41,7 @@ def same_end(one: mpm.Simulation, other: mpm.Simulation) -> None:
 def test_large_elastic_bodies_in_2d_end_where_those_do_whose_matrices_are_factorised(monkeypatch):
     made, ends, newton = factorised(monkeypatch), [], []
     for least in (10**6, 1):
-        monkeypatch.setattr(linear, "GRIDS", least)
+        thresholds(monkeypatch, multigrid_2d=least)
         ends.append(pressed())
         newton.append(sum(ends[-1].step(0.02).newton for _ in range(4)))
     same_end(*ends)
@@ -54,7 +54,7 @@ def test_petscs_options_for_factors_are_not_for_multigrid():
     places = np.array([[0, 0, 0], [0, 1, 0], [1, 0, 0], [1, 1, 0]])
     PETSc.Options()["mpm_momentum_pc_type"] = "lu"
     try:
-        solver = multigrid.multigrid_solver(A, "momentum", places, places[:0], nodal=True)
+        solver = multigrid.multigrid_solver(A, "momentum", places, places[:0], nodal=True, coarsest=1)
     finally:
         PETSc.Options().delValue("mpm_momentum_pc_type")
     assert solver.pc.getType() == "mg"
@@ -83,20 +83,19 @@ HARD = {
 @pytest.mark.parametrize("scene", HARD)
 def test_contrasts_and_slender_cells_take_few_iterations_more(scene, monkeypatch):
     counts, solve, ends = [], monolithic.BlockSolver.solve, []
-    monkeypatch.setattr(monolithic.BlockSolver, "solve", lambda *a: counts.append(solve(*a)) or counts[-1])
+    monkeypatch.setattr(monolithic.BlockSolver, "solve", noting(counts, solve))
     for least in (10**6, 1):
-        monkeypatch.setattr(linear, "GRIDS", least)
+        thresholds(monkeypatch, multigrid_2d=least)
         ends.append(pressed(2, **HARD[scene]))
         ends[-1].step(0.02)
     same_end(*ends)
-    assert 0 < max(counts) < monolithic.MANY
+    assert 0 < max(counts) < THRESHOLDS.many
 
 
 def test_factors_take_the_place_of_cycles_that_take_many_iterations_and_serve_the_rest_of_the_step(monkeypatch):
     made, ends, took = factorised(monkeypatch), [], []
     for most in (1000, 12):
-        monkeypatch.setattr(monolithic, "MANY", most)
-        monkeypatch.setattr(monolithic, "EARLY", most // 2)
+        thresholds(monkeypatch, many=most)
         made.clear()
         ends.append(pressed(2, **STIFF_BELOW))
         took.append((ends[-1].step(0.02), len(made)))
@@ -108,7 +107,7 @@ def test_factors_take_the_place_of_cycles_that_take_many_iterations_and_serve_th
 def test_factors_that_take_many_iterations_are_made_anew(monkeypatch):
     made, ends = factorised(monkeypatch), []
     for most in (1000, 4):
-        monkeypatch.setattr(monolithic, "MANY", most)
+        thresholds(monkeypatch, many=most)
         ends.append(pressed())
         ends[-1].step(0.02)
     same_end(*ends)
@@ -117,7 +116,7 @@ def test_factors_that_take_many_iterations_are_made_anew(monkeypatch):
 
 def test_a_step_depends_on_no_step_before(monkeypatch):
     """As it must for a run that is resumed to go on as the first one did."""
-    monkeypatch.setattr(monolithic, "MANY", 4)
+    thresholds(monkeypatch, many=4)
     first, second = pressed(), pressed()
     first.step(0.02)
     second.state = replace(first.state, stage=second.state.stage)
@@ -129,7 +128,7 @@ def test_a_step_depends_on_no_step_before(monkeypatch):
 def test_sealed_bodies_in_which_hardly_any_fluid_changes_places_converge(bulk, load):
     """With scales that differ as much as forces and this fluid, rounding left more than steps may leave."""
     press = mpm.Traction("top", lambda t: (0, -load * t**2))
-    result = column(cells=4, tractions=[press], fluid=mpm.Fluid(bulk=bulk)).run(1.0, 0.01, progress=False)
+    result = column(cells=4, conditions=[press], fluid=mpm.Fluid(bulk=bulk)).run(1.0, 0.01, progress=False)
     assert result.cuts == 0 and result.residual <= 1e-8 and result.balance <= 1e-8
 
 
@@ -160,10 +159,10 @@ def test_coarse_unknowns_do_not_depend_on_one_another(cells, nodal, wall):
     """Else coarse matrices were singular."""
     index = indices(cells, nodal)
     places = np.column_stack([index, np.zeros(len(index), dtype=np.int64)])
-    fixed = np.zeros(len(index), dtype=bool)
+    walls = np.zeros(len(index), dtype=bool)
     if nodal and wall is not None:
-        fixed = index[:, int(wall == "bottom")] == 0
-    places, held = places[~fixed], places[fixed]
+        walls = index[:, int(wall == "bottom")] == 0
+    places, held = places[~walls], places[walls]
     whole = np.eye(len(places))
     for _ in range(3):
         Q, places, held = interpolation(MPI.COMM_SELF, places, held, nodal)
@@ -176,5 +175,5 @@ def test_bodies_of_few_cells_that_coarse_grids_do_not_unite_are_left_to_factors(
     i = np.arange(0, 400, 8)
     index = np.stack([values.ravel() for values in np.meshgrid(i, i)], axis=1)
     places = np.column_stack([index + 1, np.zeros(len(index), dtype=np.int64)])
-    steps = interpolations(MPI.COMM_SELF, places, places[:0], nodal=True)
-    assert len(steps) == 1 and len(places) > COARSEST
+    steps = interpolations(MPI.COMM_SELF, places, places[:0], nodal=True, coarsest=THRESHOLDS.coarsest)
+    assert len(steps) == 1 and len(places) > THRESHOLDS.coarsest

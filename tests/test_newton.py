@@ -36,11 +36,11 @@ def test_a_newton_step_is_shortened_where_the_residual_grows_more_than_ten_thous
     The first step overshoots to e = 1, where the residual is 3e3 or 1e6 times what it was.  From there Newton's method
     comes back in about as many iterations as the exponent, and some.
     """
-    grid, across = mpm.Grid([1.2, 1.5], [12, 15]), 1e5
+    grid, across = mpm.Grid([0, 0], [1.2, 1.5], [12, 15]), 1e5
     pulls = [mpm.Traction("right", (across, 0)), mpm.Traction("top", lambda t: (0, float(t > 1)))]
     law = Stiffening(bulk=1e3 * across, shear=1e3 * across, exponent=exponent)
     walls = {"left": "x", "bottom": "y"}
-    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 1])], [law], fixed=walls, tractions=pulls, tolerance=1e-12)
+    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 1])], [law], walls=walls, conditions=pulls, tolerance=1e-12)
     s.step(1.0)
     report = s.step(1.0)
     residuals = np.array([momentum for momentum, _ in report.history])
@@ -59,11 +59,11 @@ def stretch(load):
 @pytest.mark.parametrize(("stiffer", "load", "error"), [(1e7, 0.01, 1e-4), (1e8, 0.03, 1e-5)])
 def test_what_round_off_in_a_stiff_part_does_not_hide_is_solved_for(stiffer, load, error):
     """What Newton's first step leaves of the soft part's residual is 100 times the round-off of the stiff part."""
-    grid = mpm.Grid([0.1, 1.0], [1, 10])
+    grid = mpm.Grid([0, 0], [0.1, 1.0], [1, 10])
     bodies = [mpm.box(grid, [0, 0], [0.1, 0.5]), mpm.box(grid, [0, 0.5], [0.1, 0.9], material=1)]
     hard = mpm.Hencky(bulk=stiffer * SOIL.bulk, shear=stiffer * SOIL.shear)
     pull = mpm.Traction("top", (0, load * SOIL.oedometric), region=((-np.inf, 0.8), (np.inf, np.inf)))
-    s = mpm.Simulation(grid, bodies, [hard, SOIL], fixed=SIDES | {"bottom": "y"}, tractions=[pull])
+    s = mpm.Simulation(grid, bodies, [hard, SOIL], walls=SIDES | {"bottom": "y"}, conditions=[pull])
     s.step(1.0)
     a = s.points.F[s.points.material == 1, 1, 1]
     assert a - 1 == pytest.approx(np.full(len(a), stretch(load) - 1), rel=error)
@@ -71,9 +71,9 @@ def test_what_round_off_in_a_stiff_part_does_not_hide_is_solved_for(stiffer, loa
 
 @pytest.mark.parametrize("load", [1e-9, 1e-3])
 def test_residuals_and_balance_are_told_as_they_are_also_where_they_are_round_off(load):
-    grid = mpm.Grid([0.1, 1.0], [1, 10])
+    grid = mpm.Grid([0, 0], [0.1, 1.0], [1, 10])
     pull = [mpm.Traction("top", (0, load * SOIL.oedometric))]
-    options = {"fixed": SIDES | {"bottom": "y"}, "tractions": pull, "drained": [mpm.Drained("top")]}
+    options = {"walls": SIDES | {"bottom": "y"}, "conditions": [*pull, mpm.Drained("top")]}
     s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [0.1, 0.85])], [SOIL], **options, fluid=mpm.Fluid())
     report = s.step(1.0)
     assert all(0 < residual <= 1e-8 for residual in report.history[-1]) and 0 < report.balance <= 1e-8
@@ -81,10 +81,10 @@ def test_residuals_and_balance_are_told_as_they_are_also_where_they_are_round_of
 
 def test_what_the_rounding_of_places_far_from_the_origin_does_not_hide_is_solved_for():
     """A bar that a given displacement holds, a thousand cells from the origin."""
-    grid = mpm.Grid([100.1, 1.2], [1, 12], lower=[100.0, 0.0])
+    grid = mpm.Grid([100.0, 0.0], [100.1, 1.2], [1, 12])
     foot, pull = mpm.Displacement("bottom", (0, 0), "y"), mpm.Traction("top", (0, 0.2 * SOIL.oedometric))
     bar = mpm.box(grid, [100.0, 0.1], [100.1, 0.9])
-    s = mpm.Simulation(grid, [bar], [SOIL], fixed=SIDES, displacements=[foot], tractions=[pull])
+    s = mpm.Simulation(grid, [bar], [SOIL], walls=SIDES, conditions=[foot, pull])
     s.step(1.0)
     assert s.points.F[:, 1, 1] - 1 == pytest.approx(np.full(len(s.points), stretch(0.2) - 1), rel=1e-6)
 
@@ -92,10 +92,10 @@ def test_what_the_rounding_of_places_far_from_the_origin_does_not_hide_is_solved
 @pytest.mark.parametrize("share", [1e-12, 2e-13])
 def test_fluid_that_comes_in_is_stored_however_little_it_is(share):
     """Of the body's volume; its rounding leaves 2e-15."""
-    grid, water = mpm.Grid([0.1, 1.0], [1, 10]), mpm.Fluid(bulk=1e7)
-    body, fixed = mpm.box(grid, [0, 0], [0.1, 0.8]), SIDES | {"bottom": "y"}
+    grid, water = mpm.Grid([0, 0], [0.1, 1.0], [1, 10]), mpm.Fluid(bulk=1e7)
+    body, walls = mpm.box(grid, [0, 0], [0.1, 0.8]), SIDES | {"bottom": "y"}
     filling = [lambda points, q: share * q * points.dx]
-    s = mpm.Simulation(grid, [body], [SOIL], fixed=fixed, fluid=water, sources=filling)
+    s = mpm.Simulation(grid, [body], [SOIL], walls=walls, fluid=water, terms=[*(mpm.Source(f) for f in filling)])
     s.step(1.0)
     exact = share / (1 / SOIL.oedometric + SOIL.porosity / water.bulk)
     assert s.points.pressure == pytest.approx(np.full(len(s.points), exact), rel=1e-3)
@@ -104,12 +104,12 @@ def test_fluid_that_comes_in_is_stored_however_little_it_is(share):
 @pytest.mark.parametrize("difference", [1e-11, 2e-12])
 def test_fluid_flows_between_sides_however_little_their_pressures_differ(difference):
     """Of the pressure; to the cells' fluxes, which cancel, rounding may add 2e-15 of each."""
-    grid, high = mpm.Grid([0.1, 1.0], [1, 10]), 1e5
+    grid, high = mpm.Grid([0, 0], [0.1, 1.0], [1, 10]), 1e5
     soil = mpm.Hencky(bulk=1e7, shear=1e7, conductivity=1e-4)
     sides = [mpm.Drained("top", high), mpm.Drained("bottom", high * (1 + difference))]
-    fixed = SIDES | {"bottom": "y", "top": "y"}
+    walls = SIDES | {"bottom": "y", "top": "y"}
     body = mpm.box(grid, [0, 0], [0.1, 1.0])
-    s = mpm.Simulation(grid, [body], [soil], fixed=fixed, fluid=mpm.Fluid(), pressure=high, drained=sides)
+    s = mpm.Simulation(grid, [body], [soil], walls=walls, fluid=mpm.Fluid(), pressure=high, conditions=sides)
     s.step(1e9)
     found = (s.points.pressure - high) / (high * difference)
     assert found == pytest.approx(1 - s.points.x[:, 1], abs=0.01)
@@ -119,14 +119,14 @@ def test_what_fluxes_gain_by_displacements_is_what_their_residual_does():
     """With a law of the conductivity, gravity, and cells that turn and stretch; against central differences."""
     law = lambda conductivity, J: conductivity * J**3 / (1 - ufl.ln(J))  # noqa: E731
     soil = mpm.Hencky(bulk=1e5, shear=1e5, conductivity=1e-2, conductivity_law=law)
-    grid, rng = mpm.Grid([1.0, 1.0], [4, 4]), np.random.default_rng(3)
+    grid, rng = mpm.Grid([0, 0], [1.0, 1.0], [4, 4]), np.random.default_rng(3)
     options = {
-        "fixed": {"bottom": "xy"},
+        "walls": {"bottom": "xy"},
         "fluid": mpm.Fluid(),
         "gravity": (0, -9.81),
         "pressure": lambda x: 1e3 * x[:, 0],
     }
-    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [0.9, 0.8])], [soil], drained=[mpm.Drained("right")], **options)
+    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [0.9, 0.8])], [soil], conditions=[mpm.Drained("right")], **options)
     _, momentum, storage = set_up(s, 10.0)
     system, unknowns, u = storage.system, momentum.system.unknowns, momentum.forms.u
     move = lambda v, scale: unknowns.add(u, scale, v)  # noqa: E731

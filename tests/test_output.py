@@ -151,10 +151,10 @@ def test_fields_of_the_grid_are_read_back_as_they_were(written):
 def test_all_times_are_in_one_file(tmp_path, capsys):
     """Also where a body has been dug away between two of them, and without the h5py that it needs."""
     with_h5py()
-    grid = mpm.Grid([1.4, 1.2], [7, 8], [0, -0.4])
+    grid = mpm.Grid([0, -0.4], [1.4, 1.2], [7, 8])
     bodies = [mpm.box(grid, [0, y], [1, y + 0.4]) for y in (0, 0.4)]
     loads = [mpm.Traction("right", (0, -1e4))]
-    scene = mpm.Simulation(grid, bodies, [mpm.Hencky(1e6, 1e6)], fixed={"left": "xy"}, tractions=loads)
+    scene = mpm.Simulation(grid, bodies, [mpm.Hencky(1e6, 1e6)], walls={"left": "xy"}, conditions=loads)
     scene.run(1, 1, observe=mpm.Writer(scene, tmp_path))
     scene.stage(remove=[1])
     after = scene.run(2, 1, observe=mpm.Writer(scene, tmp_path))
@@ -239,7 +239,7 @@ def test_forces_of_displacements_that_a_stage_sets_are_not_known_before_its_firs
     simulation.run(0.5, 0.25, observe=mpm.Writer(simulation, tmp_path / "kept"))
     assert np.array_equal(reactions(tmp_path / "kept" / "history.csv")[0], before)
     sides = [mpm.Displacement(side, (0, 0)) for side in ("left", "right")]
-    simulation.stage(displacements=sides, reset_displacement=True)
+    simulation.stage(conditions=sides, reset_displacement=True)
     simulation.run(0.75, 0.25, observe=mpm.Writer(simulation, tmp_path / "set"))
     found = reactions(tmp_path / "set" / "history.csv")
     assert np.isnan(found[0]).all() and np.isfinite(found[1]).all()
@@ -351,22 +351,48 @@ def test_nonsense_gets_the_usage(arguments, capsys):
 
 def test_two_runs_do_not_write_into_one_folder(tmp_path):
     simulation, _ = beam(h=0.06)
-    mpm.Writer(simulation, tmp_path / "out")
     script = "import sys; from helpers import beam; import mpm_dolfinx as mpm; mpm.Writer(beam(h=0.06)[0], sys.argv[1])"
     here = {"cwd": Path(__file__).parent, "capture_output": True, "text": True}
-    other = subprocess.run([sys.executable, "-c", script, str(tmp_path / "out")], **here)
-    assert other.returncode == 1 and "another run writes into it, must be one of its own" in other.stderr
-    mpm.Writer(simulation, tmp_path / "out")
-    assert subprocess.run([sys.executable, "-c", script, str(tmp_path / "new")], **here).returncode == 0
+    lock = "import fcntl, sys; fcntl.lockf(open(sys.argv[1], 'w'), fcntl.LOCK_EX | fcntl.LOCK_NB)"
+
+    def held():
+        return subprocess.run([sys.executable, "-c", lock, str(tmp_path / ".lock")], **here).returncode != 0
+
+    with mpm.Writer(simulation, tmp_path) as writer:
+        again = mpm.Writer(simulation, tmp_path)
+        other = subprocess.run([sys.executable, "-c", script, str(tmp_path)], **here)
+        assert other.returncode == 1 and "another run writes into it, must be one of its own" in other.stderr
+    assert writer.closed and held(), "one that is open holds the folder"
+    del again
+    assert not held()
+
+
+def test_a_closed_writer_writes_no_more_and_another_goes_on(tmp_path):
+    simulation, _ = beam(h=0.06)
+    with mpm.Writer(simulation, tmp_path) as first:
+        simulation.run(0.02, 0.02, observe=first)
+    first.close()
+    with pytest.raises(ValueError, match=f"{tmp_path} is closed, must be open"):
+        simulation.run(0.04, 0.02, observe=first, after=simulation.result)
+    with mpm.Writer(simulation, tmp_path) as second:
+        simulation.run(0.06, 0.02, observe=second, after=simulation.result)
+    assert list(index(tmp_path / "points.pvd")) == [0.0, 0.02, 0.06]
+
+
+def test_points_are_shown_in_one_line_of_numbers():
+    simulation, _ = beam(h=0.06)
+    shown = repr(simulation.points)
+    assert "\n" not in shown and len(shown) < 160
+    assert re.match(rf"MaterialPoints\({len(simulation.points)} points in 2D, 0.3 m\^2 at rest, J 1 to 1, ", shown)
 
 
 def test_tools_are_written_where_they_are(tmp_path):
     """A disc that goes down, and a plate beside the grid, of which nothing is to be seen."""
-    grid = mpm.Grid([1.0, 1.0], [8, 8])
+    grid = mpm.Grid([0, 0], [1.0, 1.0], [8, 8])
     disc = mpm.Tool(mpm.Ball((0.5, 0.75), 0.25), displacement=lambda t: (0, -0.06 * t))
     walls = {"left": "x", "right": "x", "bottom": "xy"}
     soil, beside = mpm.Hencky(bulk=1e6, shear=6e5), mpm.Tool(mpm.HalfSpace((0, 1.5), (0, -1)))
-    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 0.5])], [soil], fixed=walls, tools=[disc, beside])
+    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 0.5])], [soil], walls=walls, conditions=[disc, beside])
     s.run(1.0, 1.0, observe=mpm.Writer(s, tmp_path))
     files = index(tmp_path / "tools.pvd")
     assert list(files) == [0.0, 1.0]
@@ -379,7 +405,7 @@ def test_tools_are_written_where_they_are(tmp_path):
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_tools_are_drawn_up_to_their_surface(dim):
-    grid, up = mpm.Grid([1.0] * dim, [8] * dim), np.eye(dim)[-1]
+    grid, up = mpm.Grid([0] * dim, [1.0] * dim, [8] * dim), np.eye(dim)[-1]
     edges = np.array(np.meshgrid(*[[0.0, 0.4]] * dim)).reshape(dim, -1).T
     drawn = mpm.Tool(mpm.Convex(edges), displacement=0.33 * up).drawn(grid, 0.0)
     assert drawn.min(axis=(0, 1)) == pytest.approx(0.33 * up, abs=1e-9)

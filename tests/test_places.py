@@ -18,12 +18,12 @@ def irregular(X):
 
 def at_rest(dim, **options):
     """Return a cube of irregular domains in water at rest, two or four cells a side and a part of one."""
-    grid = mpm.Grid([1.2] * dim, [5 if dim == 2 else 3] * dim, **options)
+    grid = mpm.Grid([0] * dim, [1.2] * dim, [5 if dim == 2 else 3] * dim, **options)
     body = mpm.mapped(grid, mpm.box(grid, [0.0] * dim, [1.0] * dim), irregular)
     walls = {"left": "x", "bottom": "xyz"[:dim]} | ({"front": "y"} if dim == 3 else {})
     water = {"fluid": mpm.Fluid(), "pressure": mpm.hydrostatic(1.0), "gravity": [*[0] * (dim - 1), -9.81]}
     soil = mpm.Hencky(bulk=1e9, shear=5e8, conductivity=1e-5)
-    return mpm.Simulation(grid, [body], [soil], fixed=walls, initial_stress=mpm.K0(0.5), **water)
+    return mpm.Simulation(grid, [body], [soil], walls=walls, initial_stress=mpm.K0(0.5), **water)
 
 
 @pytest.mark.parametrize("dim, axisymmetric", [(2, False), (2, True), (3, False)], ids=["2D", "ring", "3D"])
@@ -38,7 +38,7 @@ def test_water_at_rest_in_irregular_domains_keeps_its_pressures(dim, axisymmetri
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_a_point_is_at_the_centroid_of_its_pieces(dim):
-    grid = mpm.Grid([1.2] * dim, [5] * dim)
+    grid = mpm.Grid([0] * dim, [1.2] * dim, [5] * dim)
     corners = mpm.mapped(grid, mpm.box(grid, [0.0] * dim, [1.0] * dim), irregular).corners()
     pieces, x = cut(grid, corners), centroids(corners)
     for axis in range(dim):

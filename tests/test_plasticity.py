@@ -20,7 +20,7 @@ class AtPoints:
 
     def __init__(self, dim):
         self.dim, cells = dim, {2: [8, 8], 3: [4, 4, 4]}[dim]
-        self.grid = mpm.Grid([1.0] * dim, cells)
+        self.grid = mpm.Grid([0] * dim, [1.0] * dim, cells)
         names = {name: () for name in SAND.parameters} | {"plastic": (3, 3), "hardened": ()}
         self.points = FormPoints(self.grid, F=(dim, dim), **names)
         self.values = {name: getattr(self.points, name) for name in names}
@@ -193,7 +193,7 @@ def test_a_column_in_an_oedometer_follows_the_exact_path(dilation, hardening):
     m = replace(SAND, cohesion=2e4, dilation=dilation, hardening=hardening)
     strain = lambda t: np.array(-0.05 * t)  # noqa: E731
     load = lambda t: (0, oedometric(m, strain(t))[0] / np.exp(strain(t)))  # noqa: E731
-    s = column(cells=4, fluid=False, material=m, tractions=[mpm.Traction("top", load)])
+    s = column(cells=4, fluid=False, material=m, conditions=[mpm.Traction("top", load)])
     yielded = []
 
     def compare(s):
@@ -239,7 +239,7 @@ def test_the_assembled_tangent_is_the_derivative_of_the_residual(dilation):
 def test_without_flow_the_law_is_hencky():
     positions = []
     for m in (replace(SAND, cohesion=1e12), mpm.Hencky(bulk=2e7, shear=1e7)):
-        s = column(fluid=False, material=m, tractions=[mpm.Traction("top", lambda t: (0, -1e6 * t))])
+        s = column(fluid=False, material=m, conditions=[mpm.Traction("top", lambda t: (0, -1e6 * t))])
         s.run(1.0, 0.5)
         positions.append(s.points.x)
     assert np.abs(positions[0] - positions[1]).max() < 1e-8
@@ -250,9 +250,9 @@ def test_a_drained_column_ends_where_the_dry_one_does(dilation):
     """The coupled problem with an unsymmetric tangent: consolidation of a column that yields."""
     m = replace(SAND, cohesion=2e4, dilation=dilation, conductivity=1e-2)
     load = mpm.Traction("top", lambda t: (0, -8e5 * min(1, t)))
-    dry = column(cells=4, fluid=False, material=m, tractions=[load])
+    dry = column(cells=4, fluid=False, material=m, conditions=[load])
     dry.run(1.0, 0.1)
-    wet = column(cells=4, fluid=True, material=m, tractions=[load], drained=[mpm.Drained("top")])
+    wet = column(cells=4, fluid=True, material=m, conditions=[load, mpm.Drained("top")])
     result = wet.run(3.0, 0.1)
     assert wet.scene.scheme.coupling == ("schur-cg" if dilation == 30.0 else "schur-fgmres")
     assert result.balance < 1e-8 and wet.points.data["hardened"].min() > 1e-3
@@ -286,10 +286,10 @@ def test_drained_triaxial_compression_follows_the_exact_path():
 
         return at
 
-    grid = mpm.Grid([2.0] * 3, [2] * 3)
+    grid = mpm.Grid([0] * 3, [2.0] * 3, [2] * 3)
     body = mpm.box(grid, [0] * 3, [1] * 3)
     loads = [mpm.Traction(side, load(axis)) for axis, side in enumerate(("right", "back", "top"))]
-    s = mpm.Simulation(grid, [body], [m], fixed={"left": "x", "front": "y", "bottom": "z"}, tractions=loads)
+    s = mpm.Simulation(grid, [body], [m], walls={"left": "x", "front": "y", "bottom": "z"}, conditions=loads)
     kappas = []
 
     def compare(s):
@@ -308,11 +308,11 @@ def test_drained_triaxial_compression_follows_the_exact_path():
 def test_a_strip_footing_sinks_at_prandtls_load(friction, factor):
     """Bearing capacity over the cohesion, associated flow; from above, and a plateau: nothing locks."""
     clay = mpm.DruckerPrager(bulk=2e7, shear=1e7, friction=friction, dilation=friction, cohesion=1e4)
-    grid = mpm.Grid([5.0, 3.5], [40, 28])
+    grid = mpm.Grid([0, 0], [5.0, 3.5], [40, 28])
     soil = mpm.box(grid, [0, 0], [5, 3])
     footing = mpm.Displacement("top", lambda t, X: (0, -0.04 * t), region=((0, 0), (1, 9)))  # rough, half of it
     walls = {"left": "x", "right": "x", "bottom": "xy"}
-    s = mpm.Simulation(grid, [soil], [clay], fixed=walls, displacements=[footing])
+    s = mpm.Simulation(grid, [soil], [clay], walls=walls, conditions=[footing])
     loads = []
     s.run(1.0, 0.1, observe=lambda s: loads.append(-s.reactions[0, 1] / clay.cohesion))
     assert factor < loads[-1] < 1.12 * factor

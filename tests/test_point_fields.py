@@ -17,12 +17,14 @@ BULK, SHEAR = 2e6, 1e6
 
 def column(law, fluid=None, dim=2, top=-0.1, **options):
     """Return a unit block on rollers whose top is pressed down by a tenth in one step: uniform, lambda_y = 0.9."""
-    grid = mpm.Grid([1.5] * dim, [3] * dim)
-    walls = {"left": "x", "right": "x", "bottom": "xyz"[dim - 1], "front": "y", "back": "y"}
-    fixed = {name: axes for name, axes in walls.items() if dim == 3 or name not in ("front", "back")}
+    grid = mpm.Grid([0] * dim, [1.5] * dim, [3] * dim)
+    every = {"left": "x", "right": "x", "bottom": "xyz"[dim - 1], "front": "y", "back": "y"}
+    walls = {name: axes for name, axes in every.items() if dim == 3 or name not in ("front", "back")}
     body = mpm.box(grid, [0.0] * dim, [1.5] * (dim - 1) + [1.0])
     move = mpm.Displacement("top", lambda t, X: [0.0] * (dim - 1) + [top * t], components="xyz"[dim - 1])
-    return mpm.Simulation(grid, [body], [law], fixed=fixed, fluid=fluid, displacements=[move], **options), body
+    return mpm.Simulation(
+        grid, [body], [law], walls=walls, fluid=fluid, conditions=[move, *options.pop("conditions", [])], **options
+    ), body
 
 
 @pytest.mark.parametrize("law", [mpm.Hencky, mpm.NeoHookean, mpm.LinearElastic])

@@ -14,14 +14,14 @@ RANDOM = np.random.default_rng(3)
 @pytest.mark.parametrize("offset", [0.0, 0.1, 0.9])
 def test_a_steady_pressure_between_two_drained_sides_is_linear(offset):
     """The top cell is full, or nearly empty, or nearly full."""
-    s = column(offset=offset, drained=[mpm.Drained("top"), mpm.Drained("bottom", pressure=1.0)])
+    s = column(offset=offset, conditions=[mpm.Drained("top"), mpm.Drained("bottom", pressure=1.0)])
     s.step(1e9)
     assert s.points.pressure == pytest.approx(1 - s.points.x[:, 1] / (1 + offset / 10), abs=1e-6)
 
 
 @pytest.mark.parametrize("offset", [0.0, 0.1, 0.9])
 def test_a_hydrostatic_pressure_is_linear_down_to_the_sealed_floor(offset):
-    s = column(offset=offset, gravity=[0, -10.0], drained=[mpm.Drained("top", pressure=50.0)])
+    s = column(offset=offset, gravity=[0, -10.0], conditions=[mpm.Drained("top", pressure=50.0)])
     s.step(1e9)
     top = s.points.corners[..., 1].max()
     assert s.points.pressure == pytest.approx(50 + 1e4 * (top - s.points.x[:, 1]), abs=2e-2)
@@ -29,7 +29,7 @@ def test_a_hydrostatic_pressure_is_linear_down_to_the_sealed_floor(offset):
 
 def cells(shape, filled):
     """Return a grid, its reconstruction, and centroids of cells that are filled so far in their last layer."""
-    grid = mpm.Grid(0.1 * np.array(shape), shape)
+    grid = mpm.Grid([0] * len(shape), 0.1 * np.array(shape), shape)
     centroid, faces = np.zeros((grid.num_local, grid.dim)), np.ones((grid.num_local, grid.dim, 2))
     last = grid.midpoints[:, -1] > grid.upper[-1] - grid.h[-1]
     centroid[last, -1] = -0.5 * (1 - filled) * grid.h[-1]
@@ -66,7 +66,7 @@ def test_a_steep_pressure_is_not_carried_on_beyond_the_last_cell():
 
 
 def test_points_of_a_cell_keep_its_mean_pressure_and_pass_no_neighbour_nor_drained_side():
-    s, _ = beam(offset=0.3, drained=[mpm.Drained("left", pressure=3e5), mpm.Drained("right")])
+    s, _ = beam(offset=0.3, conditions=[mpm.Drained("left", pressure=3e5), mpm.Drained("right")])
     on_grid, scene = s.scene.on_grid(s.points), s.scene
     contents, pieces = on_grid.contents, on_grid.data.pieces
     scene.storage.p.x.array[:] = p = RANDOM.normal(size=s.grid.num_local) * 1e5
@@ -78,10 +78,10 @@ def test_points_of_a_cell_keep_its_mean_pressure_and_pass_no_neighbour_nor_drain
 
 
 def test_a_body_of_one_cell_has_its_pressure():
-    grid = mpm.Grid([1.0, 1.0], [2, 2])
+    grid = mpm.Grid([0, 0], [1.0, 1.0], [2, 2])
     body = mpm.box(grid, [0, 0], [0.5, 0.5])
     load, walls = [mpm.Traction("top", (0, -1e2))], {"left": "x", "bottom": "y"}
-    s = mpm.Simulation(grid, [body], [SOFT], fluid=mpm.Fluid(), fixed=walls, tractions=load)
+    s = mpm.Simulation(grid, [body], [SOFT], fluid=mpm.Fluid(), walls=walls, conditions=load)
     s.step(1.0)
     assert np.ptp(s.points.pressure) == 0 and s.points.pressure[0] > 10
 
@@ -89,7 +89,7 @@ def test_a_body_of_one_cell_has_its_pressure():
 @pytest.mark.parametrize("tilt", [-1e-6, 0.0, 1e-6])
 def test_a_drained_side_that_leans_a_little_leaves_the_slope_along_it(tilt):
     """Rounding decided: leaning over a sealed base it counted as drained, and water at rest had lost its slope."""
-    grid = mpm.Grid([1.2, 1.0], [6, 5])
+    grid = mpm.Grid([0, 0], [1.2, 1.0], [6, 5])
     body = mpm.box(grid, [0.2, 0], [1.0, 0.8])
     body = mpm.mapped(grid, body, lambda X: X + tilt * X[:, [1]] * [1, 0])
     s = mpm.Simulation(
@@ -97,10 +97,10 @@ def test_a_drained_side_that_leans_a_little_leaves_the_slope_along_it(tilt):
         [body],
         [mpm.Hencky(bulk=2e9, shear=1e9, conductivity=1e-6)],
         fluid=mpm.Fluid(),
-        fixed={"bottom": "xy"},
+        walls={"bottom": "xy"},
         gravity=(0, -9.81),
         pressure=mpm.hydrostatic(0.8),
-        drained=[mpm.Drained(side, lambda x: 9810 * (0.8 - x[:, 1])) for side in ("left", "right")],
+        conditions=[*(mpm.Drained(side, lambda x: 9810 * (0.8 - x[:, 1])) for side in ("left", "right"))],
         initial_stress=mpm.K0(0.5),
     )
     s.run(1.0, 1.0, progress=False)
@@ -111,16 +111,16 @@ def test_a_drained_side_that_leans_a_little_leaves_the_slope_along_it(tilt):
 @pytest.mark.parametrize("cells", [1, 2])
 def test_points_in_few_cells_have_the_slope_of_water_at_rest(cells, drained):
     """At sealed sides it is the head that has no slope: two cells between them had 1283 for 2283 Pa."""
-    grid = mpm.Grid([0.5, 0.75], [2, cells + 1] if cells == 2 else [2, 1])
+    grid = mpm.Grid([0, 0], [0.5, 0.75], [2, cells + 1] if cells == 2 else [2, 1])
     soil = mpm.Hencky(bulk=1e8, shear=6e7, conductivity=1e-3)
     s = mpm.Simulation(
         grid,
         [mpm.box(grid, [0, 0], [0.5, 0.5], per_cell=3)],
         [soil],
         fluid=mpm.Fluid(),
-        fixed={"left": "x", "right": "x", "bottom": "xy"},
+        walls={"left": "x", "right": "x", "bottom": "xy"},
         gravity=(0, -9.81),
-        drained=drained,
+        conditions=drained,
     )
     s.run(1e5, 2e4, progress=False)
     off = s.points.pressure + 9810 * s.points.x[:, 1]

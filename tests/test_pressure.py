@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 import ufl
-from helpers import SOFT, column, set_up
+from helpers import SOFT, column, set_up, without
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.stepping.step import step
@@ -26,7 +26,7 @@ def hardly_held(points, u):
 @pytest.mark.parametrize("turn, offset", [(0.0, 0.0), (0.3, 0.0), (1.0, 0.0511), (2.5, 0.03)])
 def test_a_floating_block_has_uniform_stress_at_any_turn_and_offset(turn, offset):
     """Under 3 MPa its edges are a fifth shorter: the area is that of now."""
-    grid = mpm.Grid([1.2, 1.2], [12, 12])
+    grid = mpm.Grid([0, 0], [1.2, 1.2], [12, 12])
     c, s = np.cos(turn), np.sin(turn)
     block = mpm.mapped(
         grid,
@@ -34,7 +34,9 @@ def test_a_floating_block_has_uniform_stress_at_any_turn_and_offset(turn, offset
         lambda X: (X - 0.55) @ np.array([[c, s], [-s, c]]) + 0.55 + offset,
     )
     value = lambda t: 3e6 * t  # noqa: E731 - one function for all sides: they close
-    simulation = mpm.Simulation(grid, [block], [SOFT], fixed={}, terms=[hardly_held], tractions=around(value, *ALL[2]))
+    simulation = mpm.Simulation(
+        grid, [block], [SOFT], walls={}, terms=[hardly_held], conditions=[*around(value, *ALL[2])]
+    )
     simulation.run(1.0, 0.25)
     assert np.abs(simulation.effective_stress() + 3e6 * np.eye(2)).max() < 1e-9 * 3e6
     assert simulation.points.J.max() < 0.67 and simulation.state.stage.mechanical.symmetric
@@ -42,10 +44,10 @@ def test_a_floating_block_has_uniform_stress_at_any_turn_and_offset(turn, offset
 
 @pytest.mark.parametrize("top", [0.6, 0.7, 0.6371])
 def test_a_block_between_walls_has_uniform_stress_in_3d(top):
-    grid = mpm.Grid([1.2] * 3, [6] * 3)
+    grid = mpm.Grid([0] * 3, [1.2] * 3, [6] * 3)
     walls = {"left": "x", "front": "y", "bottom": "z"}
     load = around(3e6, "right", "back", "top")
-    s = mpm.Simulation(grid, [mpm.box(grid, [0] * 3, [top] * 3)], [SOFT], fixed=walls, tractions=load)
+    s = mpm.Simulation(grid, [mpm.box(grid, [0] * 3, [top] * 3)], [SOFT], walls=walls, conditions=load)
     s.run(1.0, 1.0)
     assert np.abs(s.effective_stress() + 3e6 * np.eye(3)).max() < 1e-7 * 3e6
     assert s.state.stage.mechanical.symmetric
@@ -53,7 +55,7 @@ def test_a_block_between_walls_has_uniform_stress_in_3d(top):
 
 def test_a_block_turned_in_space_has_uniform_stress_under_pressure():
     """Gradients of Q1 functions are bilinear in 3D: at the centroids of the pieces alone it was 1 % off."""
-    grid, (c, s) = mpm.Grid([1.2] * 3, [6] * 3), (0.8, 0.6)
+    grid, (c, s) = mpm.Grid([0] * 3, [1.2] * 3, [6] * 3), (0.8, 0.6)
     turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ np.array([[1, 0, 0], [0, s, -c], [0, c, s]])
     block = mpm.mapped(grid, mpm.box(grid, [0.3] * 3, [0.8] * 3), lambda X: (X - 0.55) @ turn.T + 0.56)
 
@@ -61,14 +63,14 @@ def test_a_block_turned_in_space_has_uniform_stress_under_pressure():
         return 1e5 * hardly_held(points, u)
 
     load = around(3e4, *ALL[3])
-    simulation = mpm.Simulation(grid, [block], [SOFT], fixed={}, terms=[held], tractions=load)
+    simulation = mpm.Simulation(grid, [block], [SOFT], walls={}, terms=[held], conditions=load)
     simulation.run(1.0, 1.0)
     assert np.abs(simulation.effective_stress() + 3e4 * np.eye(3)).max() < 2e-6 * 3e4
 
 
 def test_a_sealed_saturated_body_shares_the_pressure_between_water_and_skeleton():
     load = around(1e5, "top")
-    s = column(material=mpm.Hencky(bulk=1e7 / 3, shear=5e6), fluid=mpm.Fluid(bulk=1e7), tractions=load)
+    s = column(material=mpm.Hencky(bulk=1e7 / 3, shear=5e6), fluid=mpm.Fluid(bulk=1e7), conditions=load)
     s.run(1.0, 1.0)
     total = s.effective_stress()[:, 1, 1] - s.points.pressure
     assert total == pytest.approx(np.full(len(total), -1e5), rel=1e-6)
@@ -77,9 +79,9 @@ def test_a_sealed_saturated_body_shares_the_pressure_between_water_and_skeleton(
 
 def clamped_column(load):
     """Return the sideways displacement of the top of a leaning column that buckles under a dead load of 20 kPa."""
-    grid = mpm.Grid([1.0, 1.2], [20, 24])
+    grid = mpm.Grid([0, 0], [1.0, 1.2], [20, 24])
     body = mpm.mapped(grid, mpm.box(grid, [0.45, 0], [0.55, 1.0]), lambda X: X + 0.01 * X[:, 1:] * [1, 0])
-    s = mpm.Simulation(grid, [body], [SOFT], fixed={"bottom": "xy"}, tractions=load)
+    s = mpm.Simulation(grid, [body], [SOFT], walls={"bottom": "xy"}, conditions=load)
     return s.run(1.0, 0.125, probes=mpm.probes([body], [[0.5, 1.0]])).displacement[-1][0, 0]
 
 
@@ -96,10 +98,12 @@ BEAM = {"region": ((0.05, -np.inf), (1.0, np.inf))}
 
 def pressed_beam(cells, load, wet):
     """Return the simulation of a beam with a load on its top, and a probe at its tip."""
-    grid = mpm.Grid([1.2, 1.2], [cells, cells])
+    grid = mpm.Grid([0, 0], [1.2, 1.2], [cells, cells])
     bottom = 0.6 + grid.h[1] / 2
     body = mpm.box(grid, [0, bottom], [1, bottom + 0.3])
-    s = mpm.Simulation(grid, [body], [SOFT], fixed={"left": "xy"}, tractions=load, **wet)
+    s = mpm.Simulation(
+        grid, [body], [SOFT], walls={"left": "xy"}, **wet | {"conditions": [*load, *wet.get("conditions", [])]}
+    )
     return s, mpm.probes([body], [[1.0, bottom + 0.15]])
 
 
@@ -107,10 +111,18 @@ def pressed_beam(cells, load, wet):
 def test_a_beam_under_a_pressure_that_follows_it_agrees_with_finite_elements(wet):
     """Its tip goes down by a third of its length; the surface ends in the open, the tangent is unsymmetric."""
     load, steps = around(lambda t: 54e3 * min(1, t / 0.1), "top", **BEAM), (0.2, 0.02)
-    scene = {"fluid": mpm.Fluid(), "drained": [mpm.Drained("left"), mpm.Drained("right")]} if wet else {}
+    scene = {"fluid": mpm.Fluid(), "conditions": [mpm.Drained("left"), mpm.Drained("right")]} if wet else {}
     s, probe = pressed_beam(60, load, scene)
     tip = s.run(*steps, probes=probe).displacement[-1][0]
-    fem = BiotFEM([0, 0], [1, 0.3], (40, 12), SOFT, fixed={"left": "xy"}, tractions=load, **scene)
+    fem = BiotFEM(
+        [0, 0],
+        [1, 0.3],
+        (40, 12),
+        SOFT,
+        walls={"left": "xy"},
+        conditions=[*load, *scene.pop("conditions", [])],
+        **scene,
+    )
     exact = fem.run(*steps, probes=[[1.0, 0.15]]).displacement[-1][0]
     assert not s.state.stage.mechanical.symmetric and exact[1] < -0.2
     assert np.abs(tip - exact).max() < 2e-3 * np.abs(exact).max()
@@ -119,9 +131,9 @@ def test_a_beam_under_a_pressure_that_follows_it_agrees_with_finite_elements(wet
 def clamped_block(dim, tractions):
     """Return a block clamped at a wall, bent by a first step."""
     lower, upper = [0.0, 0.1, 0.1], [0.47, 0.6, 0.43]
-    grid = mpm.Grid([0.7, 0.7, 0.5][:dim], [7, 7, 5][:dim])
+    grid = mpm.Grid([0] * dim, [0.7, 0.7, 0.5][:dim], [7, 7, 5][:dim])
     body = mpm.box(grid, lower[:dim], upper[:dim])
-    s = mpm.Simulation(grid, [body], [SOFT], fixed={"left": "xyz"[:dim]}, tractions=tractions)
+    s = mpm.Simulation(grid, [body], [SOFT], walls={"left": "xyz"[:dim]}, conditions=tractions)
     s.run(0.5, 0.5)
     return s
 
@@ -160,22 +172,22 @@ def test_newton_converges_quadratically(monkeypatch):
 
 
 def test_a_stage_may_change_a_dead_load_into_a_pressure():
-    s = column(fluid=False, tractions=[mpm.Traction("top", (0, -1e6))])
+    s = column(fluid=False, conditions=[mpm.Traction("top", (0, -1e6))])
     s.run(1.0, 1.0)
-    s.stage(tractions=around(1e6, "top"))
+    s.stage(conditions=[*without(s, mpm.Pressure), *around(1e6, "top")])
     s.run(2.0, 1.0)
-    other = column(fluid=False, tractions=around(1e6, "top"))
+    other = column(fluid=False, conditions=[*around(1e6, "top")])
     other.run(1.0, 1.0)
     assert np.abs(s.points.x - other.points.x).max() < 1e-9  # the area of its top does not change
 
 
 def test_surfaces_are_closed_where_one_pressure_meets_itself_or_walls_that_hold_it():
-    def symmetric(loads, fixed=None, dim=2):
-        grid = mpm.Grid([1.0] * dim, [5] * dim)
+    def symmetric(loads, walls=None, dim=2):
+        grid = mpm.Grid([0] * dim, [1.0] * dim, [5] * dim)
         bodies = [mpm.box(grid, [0] * dim, [0.4, 0.6, 0.6][:dim]), mpm.box(grid, [0.4, *[0] * (dim - 1)], [0.8] * dim)]
-        fixed = fixed or {"left": "x", "bottom": "y" if dim == 2 else "z", "front": "y"}
-        walls = {name: fixed[name] for name in fixed if dim == 3 or name != "front"}
-        return mpm.Simulation(grid, bodies, [SOFT], fixed=walls, tractions=loads).state.stage.mechanical.symmetric
+        walls = walls or {"left": "x", "bottom": "y" if dim == 2 else "z", "front": "y"}
+        walls = {name: walls[name] for name in walls if dim == 3 or name != "front"}
+        return mpm.Simulation(grid, bodies, [SOFT], walls=walls, conditions=loads).state.stage.mechanical.symmetric
 
     assert symmetric(around(1e5, "right", "top")) is False, "the step between the bodies is a gap on the left"
     assert symmetric(around(1e5, "left", "right", "top"))

@@ -12,10 +12,17 @@ BALL = mpm.Ball((1.0, 1.3), 0.3)
 
 def layer(*tools, wet=False, material=SOIL, **options):
     """Return a layer, 2 m wide and 1 m high, that stands rough."""
-    grid = mpm.Grid([2.0, 1.5], [16, 12])
-    water = {"fluid": mpm.Fluid(), "drained": [mpm.Drained("top")]} if wet else {}
-    options.setdefault("fixed", {"left": "x", "right": "x", "bottom": "xy"})
-    return mpm.Simulation(grid, [mpm.box(grid, [0, 0], [2, 1])], [material], tools=[*tools], **water, **options)
+    grid = mpm.Grid([0, 0], [2.0, 1.5], [16, 12])
+    water = {"fluid": mpm.Fluid(), "conditions": [mpm.Drained("top")]} if wet else {}
+    options.setdefault("walls", {"left": "x", "right": "x", "bottom": "xy"})
+    return mpm.Simulation(
+        grid,
+        [mpm.box(grid, [0, 0], [2, 1])],
+        [material],
+        conditions=[*tools, *options.pop("conditions", []), *water.pop("conditions", [])],
+        **water,
+        **options,
+    )
 
 
 def pushed(load, shape=BALL, **options):
@@ -25,7 +32,7 @@ def pushed(load, shape=BALL, **options):
 def test_a_plate_compresses_a_column_by_its_load():
     """Hencky: the stress P J, with P = M ln(J) / J, is that of the load."""
     s = layer(
-        pushed(lambda t: 2e5 * t, mpm.HalfSpace((0, 1.0), (0, -1))), fixed={"left": "x", "right": "x", "bottom": "y"}
+        pushed(lambda t: 2e5 * t, mpm.HalfSpace((0, 1.0), (0, -1))), walls={"left": "x", "right": "x", "bottom": "y"}
     )
     s.run(1.0, 0.25)
     height = 1 - s.tool_travel[0]
@@ -70,8 +77,10 @@ def test_a_plate_under_a_load_slips_at_its_friction():
 def test_two_loads_squeeze_a_body_between_them():
     left = mpm.Tool(mpm.HalfSpace((0.2, 0), (1, 0)), load=lambda t: 1e4 * t, direction=(1, 0))
     right = mpm.Tool(mpm.HalfSpace((1.2, 0), (-1, 0)), load=lambda t: 1e4 * t, direction=(-1, 0))
-    grid = mpm.Grid([1.5, 1.0], [15, 10])
-    s = mpm.Simulation(grid, [mpm.box(grid, [0.2, 0], [1.2, 0.5])], [SOIL], fixed={"bottom": "y"}, tools=[left, right])
+    grid = mpm.Grid([0, 0], [1.5, 1.0], [15, 10])
+    s = mpm.Simulation(
+        grid, [mpm.box(grid, [0.2, 0], [1.2, 0.5])], [SOIL], walls={"bottom": "y"}, conditions=[left, right]
+    )
     s.run(1.0, 0.5)
     assert s.tool_forces[:, 0] == pytest.approx([1e4, -1e4], rel=1e-6)
     stress = s.effective_stress()[:, 0, 0]
@@ -98,9 +107,9 @@ def test_a_light_tool_lies_on_a_heavy_layer(load):
     """Solvers tell forces to a share of the layer's weight; the plate goes down with it, however light."""
     heavy = mpm.Hencky(bulk=1e6, shear=0.6e6, grain_density=2700, porosity=0.4)
     rolls = {"left": "x", "right": "x", "bottom": "y"}
-    options = {"fixed": rolls, "gravity": (0, -9.81), "material": heavy}
+    options = {"walls": rolls, "gravity": (0, -9.81), "material": heavy}
     s = layer(pushed(load, mpm.HalfSpace((0, 1.0), (0, -1))), **options)
-    other = layer(tractions=[mpm.Traction("top", (0, -load / 2))], **options)
+    other = layer(conditions=[mpm.Traction("top", (0, -load / 2))], **options)
     s.run(0.5, 0.25)
     other.run(0.5, 0.25)
     assert s.tool_travel[0] == pytest.approx(1 - other.points.corners[..., 1].max(), rel=1e-5)
@@ -110,11 +119,14 @@ def test_a_light_tool_lies_on_a_heavy_layer(load):
 @pytest.mark.parametrize("height", [1.0, 1.03])
 def test_a_load_acts_from_the_first_step_on(height):
     """Where the initial stress had to be balanced, off the grid lines, the load became a part of it."""
-    heavy, grid = mpm.Hencky(bulk=1e6, shear=0.6e6, grain_density=2700, porosity=0.4), mpm.Grid([1.0, 1.5], [8, 12])
+    heavy, grid = (
+        mpm.Hencky(bulk=1e6, shear=0.6e6, grain_density=2700, porosity=0.4),
+        mpm.Grid([0, 0], [1.0, 1.5], [8, 12]),
+    )
     plate = pushed(5e3, mpm.HalfSpace((0, height), (0, -1)))
     walls, ways = {"left": "x", "right": "x", "bottom": "y"}, []
     for initial in (mpm.K0(0.5), mpm.K0(0.5, surcharge=5e3)):
-        options = {"gravity": (0, -9.81), "initial_stress": initial, "fixed": walls, "tools": [plate]}
+        options = {"gravity": (0, -9.81), "initial_stress": initial, "walls": walls, "conditions": [plate]}
         s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, height])], [heavy], **options)
         s.run(1.0, 1.0)
         ways.append(s.tool_travel[0] / height)
@@ -177,11 +189,11 @@ def test_a_stage_with_new_tools_lets_go_and_one_without_goes_on():
     s = layer(pushed(lambda t: 2e4 * min(t, 1)))
     s.run(1.0, 0.5)
     travel = s.tool_travel
-    s.stage(tractions=[])
+    s.stage(conditions=s.conditions)
     s.run(1.5, 0.25)
     assert s.tool_travel == pytest.approx(travel, rel=1e-2)
     assert -s.tool_forces[0, 1] == pytest.approx(2e4, rel=1e-6)
-    s.stage(tools=[])
+    s.stage(conditions=[])
     assert len(s.tool_travel) == 0
 
 
@@ -201,21 +213,21 @@ def test_a_load_that_soil_cannot_bear_is_refused_and_what_it_bore_is_kept():
 
 
 def test_a_load_pushes_along_the_axis_and_in_space():
-    ring, box = mpm.Grid([0.75, 0.75], [6, 6], axisymmetric=True), mpm.Grid([0.75] * 3, [6] * 3)
-    walls = {"bottom": "xyz", "left": "x", "right": "x", "front": "y", "back": "y"}
-    for grid, size, fixed, centre in (
+    ring, box = mpm.Grid([0, 0], [0.75, 0.75], [6, 6], axisymmetric=True), mpm.Grid([0] * 3, [0.75] * 3, [6] * 3)
+    rolls = {"bottom": "xyz", "left": "x", "right": "x", "front": "y", "back": "y"}
+    for grid, size, walls, centre in (
         (ring, [0.75, 0.5], {"bottom": "xy", "right": "x"}, (0, 0.75)),
-        (box, [0.75, 0.75, 0.5], walls, (0.375, 0.375, 0.75)),
+        (box, [0.75, 0.75, 0.5], rolls, (0.375, 0.375, 0.75)),
     ):
         down = (0,) * (grid.dim - 1) + (-1,)
         tool = mpm.Tool(mpm.Ball(centre, 0.25), load=lambda t: 2e3 * t, direction=down)
         body = mpm.box(grid, [0] * grid.dim, size)
-        s = mpm.Simulation(grid, [body], [SOIL], fixed=fixed, tools=[tool])
+        s = mpm.Simulation(grid, [body], [SOIL], walls=walls, conditions=[tool])
         s.run(1.0, 0.5)
         assert s.tool_forces[0, grid.dim - 1] == pytest.approx(-2e3, rel=1e-6)
     with pytest.raises(ValueError, match=r"direction = .*must be along the axis"):
         aside = mpm.Tool(mpm.Ball((0, 0.75), 0.25), load=1.0, direction=(1, 0))
-        mpm.Simulation(ring, [mpm.box(ring, [0, 0], [0.75, 0.5])], [SOIL], fixed={"bottom": "xy"}, tools=[aside])
+        mpm.Simulation(ring, [mpm.box(ring, [0, 0], [0.75, 0.5])], [SOIL], walls={"bottom": "xy"}, conditions=[aside])
 
 
 @pytest.mark.parametrize(

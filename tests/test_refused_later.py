@@ -7,7 +7,7 @@ import ufl
 
 import mpm_dolfinx as mpm
 
-GRID = mpm.Grid([1.0, 1.0], [6, 6])
+GRID = mpm.Grid([0, 0], [1.0, 1.0], [6, 6])
 BODY = mpm.box(GRID, [0, 0], [1, 0.5])
 WALLS = {"left": "x", "right": "x", "bottom": "xy"}
 
@@ -18,9 +18,15 @@ def of_place(value):
 
 def scene(material=None, wet=False, **options):
     soil = material or mpm.Hencky(bulk=1e6, shear=6e5, conductivity=1e-5)
-    water = {"fluid": mpm.Fluid(), "drained": [mpm.Drained("top")]} if wet else {}
+    water = {"fluid": mpm.Fluid(), "conditions": [mpm.Drained("top")]} if wet else {}
     return mpm.Simulation(
-        GRID, [BODY], [soil], fixed=WALLS, tractions=[mpm.Traction("top", (0, -1e4))], **water, **options
+        GRID,
+        [BODY],
+        [soil],
+        walls=WALLS,
+        conditions=[mpm.Traction("top", (0, -1e4)), *options.pop("conditions", []), *water.pop("conditions", [])],
+        **water,
+        **options,
     )
 
 
@@ -60,7 +66,7 @@ def stiffened(F, bulk, shear):
     "make",
     [
         lambda: scene(terms=[lambda points, u: float("nan") * ufl.inner(points.value(u), points.value(u)) * points.dx]),
-        lambda: scene(wet=True, sources=[lambda points, q: float("inf") * q * points.dx]),
+        lambda: scene(wet=True, terms=[mpm.Source(lambda points, q: float("inf") * q * points.dx)]),
         lambda: scene(type("Law", (mpm.Skeleton,), {"energy": staticmethod(stiffened)})(1e6, 1e6)),
     ],
     ids=["term", "source", "law"],
@@ -72,16 +78,16 @@ def test_numbers_in_forms_are_finite(make):
 
 def test_a_source_depends_on_its_test_function():
     with pytest.raises(ValueError, match=r"sources: .* does not depend on q, must be linear in it"):
-        scene(wet=True, sources=[lambda points, q: 1e-6 * points.dx])
+        scene(wet=True, terms=[mpm.Source(lambda points, q: 1e-6 * points.dx)])
 
 
 @pytest.mark.parametrize("other", [0, 1, 2])
 def test_a_checkpoint_with_other_tools_is_one_of_another_scene(other, tmp_path):
     plate = mpm.HalfSpace((0, 0.5), (0, -1))
     tools = [[], [mpm.Tool(plate)], [mpm.Tool(plate, friction=0.3)]]
-    scene(tools=tools[other - 1]).run(0.5, 0.25, checkpoint=mpm.Checkpoint(tmp_path / "c"))
+    scene(conditions=[*tools[other - 1]]).run(0.5, 0.25, checkpoint=mpm.Checkpoint(tmp_path / "c"))
     with pytest.raises(ValueError, match="checkpoint of another scene: tools"):
-        mpm.resume(scene(tools=tools[other]), tmp_path / "c")
+        mpm.resume(scene(conditions=[*tools[other]]), tmp_path / "c")
 
 
 def test_an_observer_takes_the_simulation():

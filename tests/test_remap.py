@@ -37,7 +37,7 @@ def moved(s, state, pressure, way):
 
 def moving_body(move, pressure, slope, bounds):
     """Return what pieces of a rigid body carry, how they lie after a move (in cells), and the move (m)."""
-    grid = mpm.Grid([2.0, 2.0], [20, 20])
+    grid = mpm.Grid([0, 0], [2.0, 2.0], [20, 20])
     points = material_points(grid, [mpm.box(grid, [0.33, 0.41], [1.2, 1.0])])
     old, way = cut(grid, points.corners), move * grid.h * [0.8, 1.0]
     p, s = pressure(old.x), slope(old.x)
@@ -103,7 +103,7 @@ def test_a_linear_pressure_moves_with_the_body(move):
 
 def reconstruct(p, filled=None):
     """Return (midpoints, slopes, bounds) of cells with values p(x), all full, or those where `filled(x)`."""
-    grid = mpm.Grid([1.0, 0.5], [10, 5])
+    grid = mpm.Grid([0, 0], [1.0, 0.5], [10, 5])
     faces = np.ones((grid.num_local, 2, 2))
     if filled is not None:
         faces[~filled(grid.midpoints)] = 0.0

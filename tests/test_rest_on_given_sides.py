@@ -23,14 +23,14 @@ def hold(side, components="", region=None, value=None, dim=2):
     return mpm.Displacement(side, np.zeros(dim) if value is None else value, components, region)
 
 
-def soil(law="hencky", E=2e7, dim=2, wet=False, bend=None, walls=True, given=None, lower=0.0, **options):
+def soil(law="hencky", E=2e7, dim=2, wet=False, bend=None, between=True, given=None, lower=0.0, **options):
     """Return soil on a base that is held, 2 m wide, or 1 m in 3D; bend: height of layers over x where they dip."""
     up, width = "xyz"[dim - 1], 2.0 if dim == 2 else 1.0
-    more = 0.0 if walls else 0.5  # m: what has no walls may go aside
+    more = 0.0 if between else 0.5  # m: what has no walls may go aside
     grid = mpm.Grid(
+        [*[-more] * (dim - 1), -1.0],
         [*[width + more] * (dim - 1), 3.0],
         [*[round(2 * width + 4 * more)] * (dim - 1), 8],
-        lower=[*[-more] * (dim - 1), -1.0],
         axisymmetric=options.pop("axisymmetric", False),
     )
     bodies = [mpm.box(grid, [*[0.0] * (dim - 1), lower], [*[width] * (dim - 1), HEIGHT])]
@@ -43,12 +43,14 @@ def soil(law="hencky", E=2e7, dim=2, wet=False, bend=None, walls=True, given=Non
             return np.stack([X[:, 0], X[:, 1] + share * bend * (X[:, 0] - 1)], axis=1)
 
         bodies, materials = [mpm.mapped(grid, body, dip) for body in bodies], [*materials, LAWS[law](E / 2)]
-    fixed = {"left": "x", "right": "x", **({"front": "y", "back": "y"} if dim == 3 else {})} if walls else {}
+    walls = {"left": "x", "right": "x", **({"front": "y", "back": "y"} if dim == 3 else {})} if between else {}
     if wet:
         options |= {"fluid": mpm.Fluid(), "pressure": mpm.hydrostatic(1.3)}
     options = {"initial_stress": mpm.K0(0.6), "gravity": [*[0.0] * (dim - 1), -9.81], **options}
     given = [hold("bottom", up, dim=dim)] if given is None else given
-    return mpm.Simulation(grid, bodies, materials, fixed=fixed, displacements=given, **options)
+    return mpm.Simulation(
+        grid, bodies, materials, walls=walls, conditions=[*given, *options.pop("conditions", [])], **options
+    )
 
 
 def weight(s):
@@ -77,7 +79,7 @@ def test_a_column_on_a_held_base_is_at_rest(law, E):
         ("linear", {"axisymmetric": True}),
         ("sand", {"bend": 0.2, "wet": True}),
         ("hencky", {"bend": 0.2, "given": [hold("bottom")]}),
-        ("hencky", {"walls": False, "wet": True, "given": [hold("bottom"), hold("left", "x"), hold("right", "x")]}),
+        ("hencky", {"between": False, "wet": True, "given": [hold("bottom"), hold("left", "x"), hold("right", "x")]}),
         pytest.param("hencky", {"dim": 3}, marks=pytest.mark.slow),
         pytest.param("clay", {"dim": 3, "wet": True}, marks=pytest.mark.slow),
     ],
@@ -98,12 +100,12 @@ def test_a_footing_on_soil_at_rest_bears_nothing(wet, axisymmetric):
 @pytest.mark.parametrize("bend", [None, 0.2])
 def test_a_plate_bends_nothing_at_rest(bend):
     """Under layers that dip the stress below a rigid plate is not even."""
-    rests(soil(bend=bend, plates=[mpm.RigidPlate("top", 1e4)], initial_stress=mpm.K0(0.6, surcharge=5e3)), 1e4)
+    rests(soil(bend=bend, conditions=[mpm.RigidPlate("top", 1e4)], initial_stress=mpm.K0(0.6, surcharge=5e3)), 1e4)
 
 
 def test_curved_sides_that_are_held_are_at_rest():
     """Their wet points have the pressures of their centroids from the start: else what holds would feel the change."""
-    grid = mpm.Grid([2, 3], [8, 16], lower=[0, -1])
+    grid = mpm.Grid([0, -1], [2, 3], [8, 16])
     body = mpm.mapped(
         grid,
         mpm.box(grid, [0, 0], [2, 2]),
@@ -113,8 +115,8 @@ def test_curved_sides_that_are_held_are_at_rest():
         grid,
         [body],
         [LAWS["hencky"](2e7)],
-        fixed={"left": "x", "right": "x"},
-        displacements=[hold("bottom")],
+        walls={"left": "x", "right": "x"},
+        conditions=[hold("bottom")],
         fluid=mpm.Fluid(),
         pressure=mpm.hydrostatic(1.3),
         gravity=(0, -9.81),
@@ -128,24 +130,24 @@ def test_curved_sides_that_are_held_are_at_rest():
 def test_half_a_base_bears_all_and_what_then_loses_its_support_sinks_or_is_refused():
     """No force but those that the scene names holds soil once a stage begins."""
     half = ([-1, -1], [1, 1])
-    rests(soil(walls=False, lower=0.13, given=[hold("bottom", region=half)]))
-    s = soil(walls=False, lower=0.13, given=[hold("bottom")])
+    rests(soil(between=False, lower=0.13, given=[hold("bottom", region=half)]))
+    s = soil(between=False, lower=0.13, given=[hold("bottom")])
     rests(s)
-    s.stage(displacements=[hold("bottom", region=half)])
+    s.stage(conditions=[hold("bottom", region=half)])
     assert s.state.held is None and s.state.rest is None
     s.step(1.0)
     assert s.points.corners[:, :, 1].min() < s.points.origin[:, :, 1].min() - 1e-4
     assert s.reactions[0, 1] == pytest.approx(weight(s), rel=1e-6)
-    s.stage(displacements=[])
+    s.stage(conditions=[])
     with pytest.raises(ValueError, match="free to move as a rigid body"):
         s.step(1.0)
 
 
 def test_a_stage_that_leaves_what_holds_moves_nothing():
     s = soil(bend=0.2, given=[hold("bottom")])
-    s.stage(tractions=[])
+    s.stage(conditions=s.conditions)
     rests(s)
-    s.stage(displacements=[hold("bottom", "y")])
+    s.stage(conditions=[hold("bottom", "y")])
     assert s.state.rest is None
 
 

@@ -20,13 +20,12 @@ import mpi_restart
 import numpy as np
 import pytest
 import restart_run
-from helpers import beam, column, limit
+from helpers import beam, column, limit, thresholds
 from test_mpi import mpirun
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.io import checkpoint as restart
 from mpm_dolfinx.io.writer import Series
-from mpm_dolfinx.solve import linear as solvers
 
 
 def cut_beam():
@@ -36,7 +35,7 @@ def cut_beam():
 
 def pressed_column():
     plates, outlets = [mpm.RigidPlate("top", lambda t: 3e4 * t)], [mpm.Drained("top")]
-    simulation = column(width=3, offset=0.3, plates=plates, drained=outlets, gravity=lambda t: (0, -50 * t))
+    simulation = column(width=3, offset=0.3, conditions=[*plates, *outlets], gravity=lambda t: (0, -50 * t))
     return simulation, None
 
 
@@ -50,17 +49,17 @@ def plastic_column():
     }
     sand = mpm.DruckerPrager(bulk=2e7, shear=1e7, hardening=5e6, **options)
     push = mpm.Displacement("top", lambda t, X: (0, -1.5 * t), "y")
-    simulation = column(width=3, cells=6, material=sand, displacements=[push], drained=[mpm.Drained("top")])
+    simulation = column(width=3, cells=6, material=sand, conditions=[push, mpm.Drained("top")])
     return simulation, None
 
 
 def block(fluid=None):
-    grid = mpm.Grid([0.6, 0.4, 0.5], [3, 2, 3])
+    grid = mpm.Grid([0, 0, 0], [0.6, 0.4, 0.5], [3, 2, 3])
     body = mpm.box(grid, [0.1, 0, 0], [0.5, 0.4, 0.35])
     load = mpm.Traction("top", lambda t: (2e6 * t, 0, -4e6 * t))
-    fixed = {"bottom": "xyz", "front": "y", "back": "y"}
+    walls = {"bottom": "xyz", "front": "y", "back": "y"}
     rubber = mpm.NeoHookean(1e7, 5e6, conductivity=1e-4)
-    simulation = mpm.Simulation(grid, [body], [rubber], fixed=fixed, tractions=[load], fluid=fluid)
+    simulation = mpm.Simulation(grid, [body], [rubber], walls=walls, conditions=[load], fluid=fluid)
     return simulation, mpm.probes([body], [[0.5, 0.4, 0.35]])
 
 
@@ -109,7 +108,7 @@ def test_resumed_after_any_step_the_end_is_the_same_to_the_last_bit(scene, tmp_p
 
 @pytest.mark.parametrize("fluid", [None, mpm.Fluid()], ids=["dry", "wet"])
 def test_resumed_runs_end_with_the_same_bits_by_multigrid_too(fluid, tmp_path, monkeypatch):
-    monkeypatch.setattr(solvers, "ITERATIVE", 50)
+    thresholds(monkeypatch, multigrid_3d=50)
     test_resumed_after_any_step_the_end_is_the_same_to_the_last_bit(lambda: block(fluid), tmp_path)
 
 

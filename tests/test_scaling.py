@@ -6,11 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scaling
-from helpers import beam
+from helpers import beam, thresholds
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.points.cutting import cut_faces
-from mpm_dolfinx.solve import linear as solvers
 
 
 def memory() -> float:
@@ -46,23 +45,25 @@ def test_a_run_tells_its_memory_and_its_parts():
 
 
 def test_iterative_solvers_are_freed_with_the_matrices_they_were_made_for(monkeypatch):
-    monkeypatch.setattr(solvers, "ITERATIVE", 1)
-    grid = mpm.Grid([4, 1.5, 2], [16, 6, 8])
+    thresholds(monkeypatch, multigrid_3d=1)
+    grid = mpm.Grid([0, 0, 0], [4, 1.5, 2], [16, 6, 8])
     body = mpm.box(grid, [0, 0.25, 0.625], [3.75, 1.25, 1.625])
     law = mpm.LinearElastic(bulk=1e7, shear=1e7, conductivity=1e-4)
-    water = {"fluid": mpm.Fluid(), "drained": [mpm.Drained("right")]}
+    water = {"fluid": mpm.Fluid(), "conditions": [mpm.Drained("right")]}
     load = mpm.Traction("top", lambda t: (0, 0, -1e3 * t))
-    s = mpm.Simulation(grid, [body], [law], fixed={"left": "xyz"}, tractions=[load], **water)
+    s = mpm.Simulation(
+        grid, [body], [law], walls={"left": "xyz"}, conditions=[load, *water.pop("conditions", [])], **water
+    )
     used = []
     for _ in range(10):
         s.step(0.1)
-        assert solvers.iterative(s.scene.last[1].momentum.unknowns, at_once=True, yields=False)
+        assert s.scene.last[1].plan.iterative
         used.append(memory())
     assert used[-1] - used[3] < 15, f"MB after each step: {used}, 29 in six steps were none freed"
 
 
 def test_faces_that_end_on_grid_planes_have_no_points_without_area():
-    grid = mpm.Grid([2, 2, 2], [2, 2, 2])
+    grid = mpm.Grid([0, 0, 0], [2, 2, 2], [2, 2, 2])
     face = np.array([[[2, 0.25, 0.5], [2, 0.75, 1.0], [2, 0.25, 1.0], [2, 0.75, 1.5]]])
     _, _, _, share, _ = cut_faces(grid, face, face)
     assert share.min() > 0 and share.sum() == pytest.approx(1, abs=1e-14)

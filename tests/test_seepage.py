@@ -15,14 +15,21 @@ def column(base, dim=2, top=0.0, h=0.25, seepage=True, **options):
     """Return a column under gravity with given pressures at its base and a seepage face on its top."""
     width = 0.5
     box = [*[width] * (dim - 1), HEIGHT + 1.0]
-    grid = mpm.Grid(box, [*[2] * (dim - 1), round((HEIGHT + 1.0) / h)])
-    walls = {"left": "x", "right": "x", "front": "y", "back": "y", "bottom": "xyz"[dim - 1]}
-    fixed = {name: axes for name, axes in walls.items() if dim == 3 or name not in ("front", "back")}
+    grid = mpm.Grid([0] * dim, box, [*[2] * (dim - 1), round((HEIGHT + 1.0) / h)])
+    every = {"left": "x", "right": "x", "front": "y", "back": "y", "bottom": "xyz"[dim - 1]}
+    walls = {name: axes for name, axes in every.items() if dim == 3 or name not in ("front", "back")}
     body = mpm.box(grid, [*[0.0] * (dim - 1), 0.0], [*[width] * (dim - 1), HEIGHT])
     drained = [mpm.Drained("bottom", base), mpm.Drained("top", top, seepage=seepage)]
     gravity = [*[0.0] * (dim - 1), -9.81]
     return mpm.Simulation(
-        grid, [body], [SOIL], fixed=fixed, fluid=mpm.Fluid(), drained=drained, gravity=gravity, **options
+        grid,
+        [body],
+        [SOIL],
+        walls=walls,
+        fluid=mpm.Fluid(),
+        conditions=[*drained, *options.pop("conditions", [])],
+        gravity=gravity,
+        **options,
     )
 
 
@@ -62,7 +69,7 @@ def test_under_water_a_seepage_face_is_open_both_ways():
 
 def test_a_seepage_face_opens_when_the_soil_is_pressed_and_closes_when_it_swells():
     """A load presses water out; when it goes the soil would suck it in, but cannot: it stays compressed."""
-    grid = mpm.Grid([0.5, 1.25], [2, 20])
+    grid = mpm.Grid([0, 0], [0.5, 1.25], [2, 20])
     body = mpm.box(grid, [0, 0], [0.5, 1.0])
     soil = mpm.Hencky(bulk=2e6, shear=1e6, conductivity=1e-6)
     load = mpm.Traction("top", lambda t: (0, -1e4 if t <= 1e4 else 0.0))
@@ -70,10 +77,9 @@ def test_a_seepage_face_opens_when_the_soil_is_pressed_and_closes_when_it_swells
         grid,
         [body],
         [soil],
-        fixed={"left": "x", "right": "x", "bottom": "y"},
+        walls={"left": "x", "right": "x", "bottom": "y"},
         fluid=mpm.Fluid(),
-        drained=[mpm.Drained("top", seepage=True)],
-        tractions=[load],
+        conditions=[mpm.Drained("top", seepage=True), load],
     )
     probe = mpm.probes([body], [[0.25, 1.0]])
     result = s.run(2e4, 1e3, probes=probe, progress=False)
@@ -88,7 +94,7 @@ def test_outflows_of_a_stage_are_not_known_before_its_first_step_and_prescribed_
     simulation = column(2 * WEIGHT)
     assert simulation.outflows.tolist() == [0.0, 0.0]
     simulation.run(1e3, 1e3, progress=False)
-    simulation.stage(drained=[mpm.Drained("bottom", 2 * WEIGHT)], inflows=[mpm.Inflow("top", 1e-6)])
+    simulation.stage(conditions=[mpm.Drained("bottom", 2 * WEIGHT), mpm.Inflow("top", 1e-6)])
     assert np.isnan(simulation.outflows).tolist() == [True, True]
     writer = mpm.Writer(simulation, tmp_path)
     simulation.run(2e3, 1e3, observe=writer, progress=False)
@@ -113,6 +119,6 @@ def test_other_couplings_find_the_same_seepage(coupling):
 
 
 def test_the_reference_refuses_seepage_faces():
-    options = {"fixed": {"bottom": "xy"}, "fluid": mpm.Fluid(), "drained": [mpm.Drained("top", seepage=True)]}
+    options = {"walls": {"bottom": "xy"}, "fluid": mpm.Fluid(), "conditions": [mpm.Drained("top", seepage=True)]}
     with pytest.raises(ValueError, match="drained: seepage = True, must be False"):
         BiotFEM([0, 0], [1, 1], [2, 2], SOIL, **options)

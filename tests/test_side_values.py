@@ -9,7 +9,7 @@ from helpers import column, rates, refused_in_one_line
 
 import mpm_dolfinx as mpm
 
-GRID = mpm.Grid([1.2, 1.2], [12, 12])
+GRID = mpm.Grid([0, 0], [1.2, 1.2], [12, 12])
 SOIL = mpm.Hencky(bulk=1e6, shear=6e5)
 WALLS = {"left": "x", "bottom": "y"}
 WEIGHT = 9810.0  # of water, N/m^3
@@ -18,7 +18,9 @@ WEIGHT = 9810.0  # of water, N/m^3
 def block(*tractions, walls=WALLS, **options):
     """Return a block that has taken a step under tractions."""
     body = mpm.box(GRID, [0, 0], [1, 1])
-    s = mpm.Simulation(GRID, [body], [SOIL], fixed=walls, tractions=tractions, **options)
+    s = mpm.Simulation(
+        GRID, [body], [SOIL], walls=walls, conditions=[*tractions, *options.pop("conditions", [])], **options
+    )
     s.run(1.0, 0.5, progress=False)
     return s
 
@@ -43,7 +45,7 @@ def test_a_traction_of_places_is_the_sum_of_those_of_regions():
 def test_a_pressure_of_depth_is_exact_in_its_resultant():
     given = mpm.Displacement("left", (0, 0))
     depth = mpm.Pressure("right", lambda x: 5e3 * (1 - x[:, 1]))
-    s = block(depth, displacements=[given], walls={"bottom": "y"})
+    s = block(depth, conditions=[given], walls={"bottom": "y"})
     area = s.points.corners[:, [1, 3]][np.abs(s.points.reference[:, 1, 0] - 1) < 1e-9]
     y = area[:, :, 1]
     push = (5e3 * (1 - y.mean(axis=1)) * np.diff(y, axis=1)[:, 0]).sum()
@@ -60,10 +62,9 @@ def test_a_side_under_a_level_that_rises_is_at_rest():
         [body],
         [mpm.Hencky(bulk=1e7, shear=6e6, conductivity=1.0, grain_density=1000)],
         fluid=mpm.Fluid(density=1000, bulk=2.2e9),
-        fixed={"left": "x", "right": "x", "bottom": "y"},
+        walls={"left": "x", "right": "x", "bottom": "y"},
         gravity=(0, -9.81),
-        tractions=[mpm.Pressure("top", depth)],
-        drained=[mpm.Drained("top", depth)],
+        conditions=[mpm.Pressure("top", depth), mpm.Drained("top", depth)],
     )
     s.run(20.0, 2.0, progress=False)
     want = WEIGHT * (level(20.0) - s.points.x[:, 1])
@@ -77,10 +78,10 @@ def test_heads_and_inflows_of_time_are_of_second_order(name):
 
     def top(steps):
         if name == "drained":
-            sides = {"drained": [mpm.Drained("top", lambda t: 1e4 * np.sin(2 * t))]}
+            sides = {"conditions": [mpm.Drained("top", lambda t: 1e4 * np.sin(2 * t))]}
         else:
-            sides = {"inflows": [mpm.Inflow("top", lambda t, X: 1e-6 * np.sin(2 * t) * np.ones(len(X)))]}
-            sides["drained"] = [mpm.Drained("bottom")]
+            into = mpm.Inflow("top", lambda t, X: 1e-6 * np.sin(2 * t) * np.ones(len(X)))
+            sides = {"conditions": [into, mpm.Drained("bottom")]}
         s = column(cells=10, material=stiff, **sides)
         s.run(4.0, 4.0 / steps, progress=False)
         return s.points.pressure[s.points.x[:, 1] < 0.5]  # at the side itself the order rises to 2 later
@@ -99,8 +100,8 @@ def test_water_flows_from_side_to_side_by_the_heads_of_its_ends():
         [body],
         [mpm.Hencky(bulk=1e9, shear=6e8, conductivity=k)],
         fluid=mpm.Fluid(),
-        fixed={"left": "x", "bottom": "xy"},
-        drained=[mpm.Drained("left", heads), mpm.Drained("right", heads)],
+        walls={"left": "x", "bottom": "xy"},
+        conditions=[mpm.Drained("left", heads), mpm.Drained("right", heads)],
     )
     s.run(100.0, 50.0, progress=False)
     want = 2e4 - 1.5e4 * (s.points.x[:, 0] - 0.03) / 1.01
@@ -142,11 +143,11 @@ def test_what_a_function_gives_is_read_alike_at_any_number_of_places(form, m, d)
 
 @pytest.mark.parametrize("cells", [1, 2])
 def test_a_vector_for_all_places_acts_as_one_without_places(cells):
-    grid = mpm.Grid([cells / 2, 1.0], [cells, 4])
+    grid = mpm.Grid([0, 0], [cells / 2, 1.0], [cells, 4])
     body, walls = mpm.box(grid, [0, 0], [cells / 2, 0.75], per_cell=1), {"left": "x", "right": "x", "bottom": "y"}
 
     def places(value):
-        s = mpm.Simulation(grid, [body], [SOIL], fixed=walls, tractions=[mpm.Traction("top", value)])
+        s = mpm.Simulation(grid, [body], [SOIL], walls=walls, conditions=[mpm.Traction("top", value)])
         s.run(1.0, 1.0, progress=False)
         return s.points.x
 
@@ -208,10 +209,10 @@ def test_what_a_condition_was_given_is_its_own():
     value, region, gravity, loads = np.array([0.0, -1e4]), [[0, 0], [2, 2]], np.array([0.0, -9.81]), []
     loads.append(mpm.Traction("top", value, region))
     walls = dict(WALLS)
-    s = mpm.Simulation(GRID, [mpm.box(GRID, [0, 0], [1, 1])], [SOIL], fixed=walls, tractions=loads, gravity=gravity)
+    s = mpm.Simulation(GRID, [mpm.box(GRID, [0, 0], [1, 1])], [SOIL], walls=walls, conditions=loads, gravity=gravity)
     value[:], region[1][0], gravity[:], walls["bottom"] = 1e9, 0.1, 1e9, "x"
     loads.append(mpm.Traction("top", (0, 1e9)))
-    s.stage(drained=[])
+    s.stage(conditions=s.conditions)
     s.run(1.0, 0.5, progress=False)
     same = block(mpm.Traction("top", (0, -1e4)), gravity=(0, -9.81))
     assert s.points.x == pytest.approx(same.points.x, abs=1e-12)
@@ -230,7 +231,7 @@ BAD = {
     "three components": (lambda: block(mpm.Traction("top", lambda x: (0, 1, 0))), "Traction(side='top'", "places"),
     "a word": (lambda: mpm.Drained("top", "dry"), "Drained: pressure", "'dry'"),
     "of a head": (
-        lambda: column(drained=[mpm.Drained("top", lambda t: "high")]).step(1.0),
+        lambda: column(conditions=[mpm.Drained("top", lambda t: "high")]).step(1.0),
         "Drained(side='top'",
         "'high'",
     ),

@@ -17,11 +17,11 @@ def bent(across, soil, **options):
         return (x, z) if flat else (x, y, z)
 
     cells = [6, 4] if flat else [6, across, 4]
-    grid = mpm.Grid(place(0.6, 0.4, 0.1 * across), cells)
+    grid = mpm.Grid(place(0, 0, 0), place(0.6, 0.4, 0.1 * across), cells)
     body = mpm.box(grid, place(0, 0.03), place(0.5, 0.27, 0.1 * across))
-    fixed = {"left": "xy"} if flat else {"left": "xz", "front": "y", "back": "y"}
+    walls = {"left": "xy"} if flat else {"left": "xz", "front": "y", "back": "y"}
     load = mpm.Traction("top", place(0, -3e3), region=(place(0.2, 0, -1), place(1, 1, 1)))
-    s = mpm.Simulation(grid, [body], [soil], fixed=fixed, tractions=[load], **options)
+    s = mpm.Simulation(grid, [body], [soil], walls=walls, conditions=[load], **options)
     s.run(1.0, 1.0, progress=False)
     return s
 

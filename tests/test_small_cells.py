@@ -12,12 +12,12 @@ from mpm_dolfinx.mechanics.ghost_penalty import GHOST
 def tip(cells, offset, nu):
     """Return the small sag of the tip of a cantilever of 4 m x 1 m, its underside `offset` cells above a grid line."""
     h = 1 / cells
-    grid = mpm.Grid([4 + 2 * h, 1 + 4 * h], [4 * cells + 2, cells + 4])
+    grid = mpm.Grid([0, 0], [4 + 2 * h, 1 + 4 * h], [4 * cells + 2, cells + 4])
     bottom = (1 + offset) * h
     body = mpm.box(grid, [0, bottom], [4, bottom + 1])
     soil = mpm.Hencky(bulk=1e6 / 3 / (1 - 2 * nu), shear=1e6 / 2 / (1 + nu))
     load = mpm.Traction("right", (0, -1.0))
-    s = mpm.Simulation(grid, [body], [soil], fixed={"left": "xy"}, tractions=[load])
+    s = mpm.Simulation(grid, [body], [soil], walls={"left": "xy"}, conditions=[load])
     probe = mpm.probes([body], [[4, bottom + 0.5]])
     return s.run(1.0, 1.0, probes=probe, progress=False).displacement[-1][0, 1]
 
@@ -34,7 +34,7 @@ def test_nearly_incompressible_beams_bend_wherever_they_lie_on_the_grid(nu):
 @pytest.mark.parametrize("reach", [1e-4, 1e-2])
 def test_an_open_side_that_reaches_into_the_next_cell_does_not_drain_what_else_is_in_it(reach):
     """As the wall of a pit over its base: the side lies behind the centroid, and all water was gone in one step."""
-    grid, soil = mpm.Grid([4.0, 4.0], [4, 4]), mpm.Hencky(bulk=1e6, shear=6e5, conductivity=1e-8)
+    grid, soil = mpm.Grid([0, 0], [4.0, 4.0], [4, 4]), mpm.Hencky(bulk=1e6, shear=6e5, conductivity=1e-8)
     overhang = mpm.box(grid, [2, 0], [4, 3])
     overhang = mpm.mapped(grid, overhang, lambda X: X - np.outer(np.maximum(0, X[:, 1] - 1.5), [reach, 0]))
     pressures = []
@@ -44,9 +44,8 @@ def test_an_open_side_that_reaches_into_the_next_cell_does_not_drain_what_else_i
             [mpm.box(grid, [0, 0], [2, 1.5]), overhang],
             [soil],
             fluid=mpm.Fluid(),
-            fixed={"left": "x", "right": "x", "bottom": "y"},
-            tractions=[mpm.Traction("top", (0, -10.0))],
-            drained=drained,
+            walls={"left": "x", "right": "x", "bottom": "y"},
+            conditions=[mpm.Traction("top", (0, -10.0)), *drained],
         )
         s.run(1.0, 1.0, progress=False)
         cells = s.cells()
@@ -61,11 +60,11 @@ def settled(nu, ratio):
     soil = mpm.DruckerPrager(
         bulk=2 * shear * (1 + nu) / 3 / (1 - 2 * nu), shear=shear, friction=0.0, dilation=0.0, cohesion=cohesion
     )
-    grid = mpm.Grid([2.5 * height, 1.2 * height], [25 * cells // 10, 12 * cells // 10])
+    grid = mpm.Grid([0, 0], [2.5 * height, 1.2 * height], [25 * cells // 10, 12 * cells // 10])
     body = mpm.box(grid, [0, 0], [height, height])
     g = cohesion / (0.6 * soil.grain_density * height)
-    fixed = {"left": "x", "bottom": "xy"}
-    s = mpm.Simulation(grid, [body], [soil], fixed=fixed, gravity=lambda t: (0, -g * t))
+    walls = {"left": "x", "bottom": "xy"}
+    s = mpm.Simulation(grid, [body], [soil], walls=walls, gravity=lambda t: (0, -g * t))
     crest = mpm.probes([body], [[height, height]])
     number, settlement = [0.0], [0.0]
     while settlement[-1] < height / 50:

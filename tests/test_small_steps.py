@@ -43,7 +43,7 @@ def test_soft_water_on_the_move_is_as_exact_as_hard_water():
 def test_the_first_step_overshoots_by_nothing_however_small(dt):
     """In s; the step for which Q1 pressures stop overshooting, h^2 / (6 c_v), is 4e-3 s."""
     load = mpm.Traction("top", (0, -100.0))
-    s = column(cells=20, material=SOIL, fluid=WATER, drained=[mpm.Drained("top")], tractions=[load])
+    s = column(cells=20, material=SOIL, fluid=WATER, conditions=[mpm.Drained("top"), load])
     s.run(dt, dt)
     assert s.points.pressure.max() < 100 * (1 + 1e-6) and s.points.pressure.min() > 0
 
@@ -62,7 +62,7 @@ def test_what_the_step_changes_falls_with_the_cells():
     """Jumps of the step's increment are damped, less where the step's flow is larger: a part of the cells' error."""
     changes = []
     for cells in (5, 10, 15):  # over the load's width
-        grid = mpm.Grid([1.4, 1], [28 * cells // 5, 4 * cells], lower=[-0.2, 0])
+        grid = mpm.Grid([-0.2, 0], [1.4, 1], [28 * cells // 5, 4 * cells])
         soil, water = mpm.Hencky(bulk=1e6, shear=6e5, conductivity=1e-4), mpm.Fluid(bulk=2e7)
 
         def pressed(t, X):
@@ -75,9 +75,8 @@ def test_what_the_step_changes_falls_with_the_cells():
                 [body],
                 [soil],
                 fluid=water,
-                fixed={"bottom": "xy"},
-                tractions=[mpm.Traction("top", pressed)],
-                drained=[mpm.Drained("left"), mpm.Drained("right")],
+                walls={"bottom": "xy"},
+                conditions=[mpm.Traction("top", pressed), mpm.Drained("left"), mpm.Drained("right")],
             )
             result = s.run(1, progress=False, probes=mpm.probes([body], [[0.5, 0.6]]), **steps)
             sunk.append(result.displacement[-1][0][1])

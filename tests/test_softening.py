@@ -45,7 +45,7 @@ def test_a_viscosity_adds_its_stress_at_a_rate():
 def run_out(cells):
     """Return how far a bank of 10 m slides that gains its weight in a second, too weak for it, m."""
     size, weight, h = 10.0, 1e4, 10.0 / cells
-    grid = mpm.Grid([3 * size, size + h], [3 * cells, cells + 1])
+    grid = mpm.Grid([0, 0], [3 * size, size + h], [3 * cells, cells + 1])
     moduli = {"bulk": 60 * size * weight, "shear": 30 * size * weight, "friction": 0.0, "dilation": 0.0}
     strength = {"cohesion": 0.22 * size * weight, "residual": 0.1 * size * weight, "slip": 1.0}
     clay = mpm.SofteningDruckerPrager(**moduli, **strength, viscosity=0.01 * size * weight)
@@ -55,7 +55,7 @@ def run_out(cells):
         return grown / ufl.det(points.F) * points.value(v)[1] * points.dx
 
     walls = {"left": "x", "bottom": "xy"}
-    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [size, size])], [clay], fixed=walls, terms=[falls])
+    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [size, size])], [clay], walls=walls, terms=[falls])
     s.run(1.0, 0.2)
     s.run(21.0, 0.5)
     s.run(421.0, 100.0)
@@ -107,8 +107,8 @@ def crept(steps, dt, load, m):
 def test_a_law_sees_the_length_of_the_step(fluid):
     """Also with water that flows, where a step has two substeps."""
     m = Maxwell(bulk=2e6, shear=1e6, relaxation=2.0, conductivity=1e3)
-    top = {"tractions": [mpm.Traction("top", (0, -3e5))], "fluid": fluid}
-    s = column(cells=3, material=m, **top, **({"drained": [mpm.Drained("top")]} if fluid else {}))
+    top = {"conditions": [mpm.Traction("top", (0, -3e5))], "fluid": fluid}
+    s = column(cells=3, material=m, **top, **({"conditions": [mpm.Drained("top")]} if fluid else {}))
     for _ in range(3):
         s.step(1.0)
     height = s.points.corners[:, :, 1].max()

@@ -8,27 +8,28 @@ from petsc4py import PETSc
 
 import numpy as np
 import pytest
-from helpers import SOFT, pressed
+from helpers import SOFT, noting, pressed, thresholds
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.base.report import Report
-from mpm_dolfinx.solve import linear, monolithic, schur
+from mpm_dolfinx.solve import monolithic, schur
 from mpm_dolfinx.solve.linear import (
     BlockFactors,
     direct_solver,
+    displacement_solver,
     dissection,
-    nodal_solver,
     solved,
 )
+from mpm_dolfinx.solve.plan import NODAL, THRESHOLDS
 
 
 def momentum(dim: int):
     """Return the momentum's matrices of a cube on rollers: some nodes have one unknown, some two or three."""
-    grid = mpm.Grid([1.0] * dim, [4] * dim)
-    walls = {"left": "x", "bottom": "xyz"[dim - 1], "front": "y"}
-    fixed = {wall: axis for wall, axis in walls.items() if dim == 3 or wall != "front"}
+    grid = mpm.Grid([0] * dim, [1.0] * dim, [4] * dim)
+    every = {"left": "x", "bottom": "xyz"[dim - 1], "front": "y"}
+    walls = {wall: axis for wall, axis in every.items() if dim == 3 or wall != "front"}
     body, load = mpm.box(grid, [0] * dim, [0.6] * dim), [0.0] * (dim - 1) + [-1e4]
-    s = mpm.Simulation(grid, [body], [SOFT], fixed=fixed, tractions=[mpm.Traction("top", load)])
+    s = mpm.Simulation(grid, [body], [SOFT], walls=walls, conditions=[mpm.Traction("top", load)])
     s.step(1.0)
     return s.scene.last[1].momentum
 
@@ -40,7 +41,7 @@ def test_blocks_of_nodes_solve_as_single_unknowns_do_also_when_the_matrix_change
     assert m.unknowns.size < dim * len(np.unique(m.unknowns.nodes[0]))  # some blocks are not full
     K, (b, x) = m.K.copy(), m.K.createVecs()
     b.array_w[:] = np.random.default_rng(1).standard_normal(b.size)
-    solver = nodal_solver(K, "nodal", m.unknowns, symmetric)
+    solver = displacement_solver(K, "nodal", m.unknowns, NODAL, symmetric)
     for factor in (1.0, 3.0):
         scale = b.duplicate()
         scale.array_w[:] = factor
@@ -79,7 +80,8 @@ def test_factors_by_nested_dissection_fill_little():
         rows = np.concatenate([[0], np.cumsum([len(c) for c in columns])])
         columns = np.concatenate(columns)
         factors = BlockFactors(rows, columns, block, axis, x[block], 2, symmetric=True)
-        factors.factorise(np.where(columns == np.repeat(np.arange(len(block)), np.diff(rows)), 100.0, -1.0))
+        factors.take(np.where(columns == np.repeat(np.arange(len(block)), np.diff(rows)), 100.0, -1.0))
+        factors.factorise()
         entries = factors._solver.pc.getFactorMatrix().getInfo()["nz_used"] / 4
         assert entries < 0.65 * 31 / 4 * n**2 * np.log2(n)
 
@@ -101,12 +103,12 @@ def test_a_linear_solver_that_breaks_off_fails_the_step():
 def quarter_pushed(soil: mpm.Skeleton, n: int, step: float) -> mpm.Simulation:
     """Return a saturated cube, of which a given displacement, `step` (m) a second, pushes a quarter of the top."""
     air = n // 4
-    grid = mpm.Grid([1.0, 1.0, 1 + air / n], [n, n, n + air])
+    grid = mpm.Grid([0, 0, 0], [1.0, 1.0, 1 + air / n], [n, n, n + air])
     walls = dict.fromkeys(("left", "right"), "x") | dict.fromkeys(("front", "back"), "y") | {"bottom": "xyz"}
     quarter, beside = ((-np.inf,) * 3, (0.45, 0.45, np.inf)), ((0.5, 0, 0), (np.inf,) * 3)
     push = mpm.Displacement("top", lambda t, X: (0, 0, -step * t), region=quarter)
     drained, body = mpm.Drained("top", region=beside), mpm.box(grid, [0, 0, 0], [1, 1, 1])
-    return mpm.Simulation(grid, [body], [soil], fixed=walls, displacements=[push], drained=[drained], fluid=mpm.Fluid())
+    return mpm.Simulation(grid, [body], [soil], walls=walls, conditions=[push, drained], fluid=mpm.Fluid())
 
 
 def pushed(bulk: float) -> list[Report]:
@@ -133,7 +135,7 @@ BLOCKS = {  # soil, cells, step, m, steps, most iterations
 def test_no_linear_solve_of_a_wet_block_takes_many_iterations(block, monkeypatch):
     """Printed with -s: `tests/run.sh -m slow -s tests/test_solvers.py`."""
     counts, solve = [], monolithic.BlockSolver.solve
-    monkeypatch.setattr(monolithic.BlockSolver, "solve", lambda *a: counts.append(solve(*a)) or counts[-1])
+    monkeypatch.setattr(monolithic.BlockSolver, "solve", noting(counts, solve))
     soil, n, step, steps, most = BLOCKS[block]
     s, forces = quarter_pushed(soil, n, step), []
     result = s.run(steps, 1, observe=lambda s: forces.append(-s.reactions[0, 2]), progress=False)
@@ -159,15 +161,15 @@ def test_nearly_incompressible_bodies_in_3d_take_few_iterations_a_solve(bulk):
 
 def test_factors_serve_as_soon_as_a_multigrid_cycle_is_foreseen_to_take_too_many_iterations(monkeypatch):
     counts, solve = [], monolithic.BlockSolver.solve
-    monkeypatch.setattr(monolithic.BlockSolver, "solve", lambda *a: counts.append(solve(*a)) or counts[-1])
+    monkeypatch.setattr(monolithic.BlockSolver, "solve", noting(counts, solve))
     pushed(50e6)
-    assert max(counts) < monolithic.MANY  # 38 without foresight
+    assert max(counts) < THRESHOLDS.many  # 38 without foresight
 
 
 def test_factors_in_place_of_a_multigrid_cycle_solve_the_same_problem(monkeypatch):
     """They are those of the tangent before, the matrix is the present one."""
     few = pushed(500e6)[0]
-    monkeypatch.setattr(monolithic, "FACTORISED", 0)
+    thresholds(monkeypatch, fallback_3d=0)
     many = pushed(500e6)[0]
     assert few.coupling < many.coupling / 3
     assert few.stress == pytest.approx(many.stress, rel=1e-7) and few.change == pytest.approx(many.change, rel=1e-5)
@@ -184,31 +186,31 @@ def test_factors_in_place_of_a_multigrid_cycle_are_made_once_and_serve_other_tan
 
 def test_water_flows_through_a_body_whose_nodes_are_all_held():
     """PETSc's factors in blocks of a matrix without rows ended the process."""
-    grid = mpm.Grid([1.0, 0.1], [10, 1])
+    grid = mpm.Grid([0, 0], [1.0, 0.1], [10, 1])
     soil, ends = mpm.Hencky(bulk=2e6, shear=1e6, conductivity=1e-3), (("left", 1e3), ("right", 0.0))
-    conditions = {"fluid": mpm.Fluid(), "drained": [mpm.Drained(side, pressure=p) for side, p in ends]}
+    conditions = {"fluid": mpm.Fluid(), "conditions": [*(mpm.Drained(side, pressure=p) for side, p in ends)]}
     body, walls = mpm.box(grid, [0, 0], [1, 0.1]), {"bottom": "xy", "top": "xy"}
-    s = mpm.Simulation(grid, [body], [soil], fixed=walls, **conditions)
+    s = mpm.Simulation(grid, [body], [soil], walls=walls, **conditions)
     s.run(1.0, 0.5, progress=False)
     assert s.points.pressure == pytest.approx(1e3 * (1 - s.points.x[:, 0]), abs=1.0)
 
 
 def strip_pushed() -> mpm.Simulation:
     """Return saturated soil, of which a given displacement, 0.01 m a second, pushes half of the top."""
-    grid, half = mpm.Grid([1.0, 1.25], [12, 15]), ((-np.inf, -np.inf), (0.45, np.inf))
-    fixed, drained = (
+    grid, half = mpm.Grid([0, 0], [1.0, 1.25], [12, 15]), ((-np.inf, -np.inf), (0.45, np.inf))
+    walls, drained = (
         {"left": "x", "right": "x", "bottom": "xy"},
         mpm.Drained("top", region=((0.5, 0), (np.inf, np.inf))),
     )
     push, body = mpm.Displacement("top", lambda t, X: (0, -0.01 * t), region=half), mpm.box(grid, [0, 0], [1, 1])
-    given = {"displacements": [push], "drained": [drained], "fluid": mpm.Fluid()}
-    return mpm.Simulation(grid, [body], [FRICTIONAL], fixed=fixed, **given)
+    given = {"conditions": [push, drained], "fluid": mpm.Fluid()}
+    return mpm.Simulation(grid, [body], [FRICTIONAL], walls=walls, **given)
 
 
 def test_large_bodies_that_yield_end_where_small_ones_do_by_mumps(monkeypatch):
     ends = []
-    for least in (linear.LARGE, 1):
-        monkeypatch.setattr(linear, "LARGE", least)
+    for least in (THRESHOLDS.mumps, 1):
+        thresholds(monkeypatch, mumps=least)
         s = strip_pushed()
         newton = [s.step(1.0).newton for _ in range(2)]
         ends.append((s.points, newton, s.scene.last[1].solvers().solve_u.pc.getFactorSolverType()))
@@ -223,7 +225,7 @@ def test_solvers_go_with_their_step_without_the_help_of_pythons_collector(solver
     """Their factors are most of what a large body takes."""
     made, make = weakref.WeakSet(), schur.LinearSolvers.__init__
     monkeypatch.setattr(schur.LinearSolvers, "__init__", lambda self, *a: made.add(self) or make(self, *a))
-    monkeypatch.setattr(linear, "GRIDS", 1 if solvers == "multigrid in 2D" else linear.GRIDS)
+    thresholds(monkeypatch, multigrid_2d=1 if solvers == "multigrid in 2D" else THRESHOLDS.multigrid_2d)
     soil = mpm.Hencky(bulk=500e6, shear=1e6, conductivity=1e-7)
     s = quarter_pushed(soil, 8, 0.01) if solvers == "multigrid in 3D" else pressed()
     gc.collect()

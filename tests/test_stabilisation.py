@@ -60,7 +60,7 @@ def layer(cells, damping=1.0, ghost=1.0, filled=0.5):
     Its top row is filled so far.
     """
     h = 1 / (cells - 1 + filled)
-    grid = mpm.Grid([1, (cells + 1) * h], [cells, cells + 1])
+    grid = mpm.Grid([0, 0], [1, (cells + 1) * h], [cells, cells + 1])
     body = mpm.box(grid, [0, 0], [1, 1])
     x = np.linspace(0, 1, 2 * cells + 1)
     load = -LOAD * np.diff(np.sin(K * x)) / (K * np.diff(x))
@@ -72,7 +72,7 @@ def layer(cells, damping=1.0, ghost=1.0, filled=0.5):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Soil, "strength", damping)
         patch.setattr("mpm_dolfinx.mechanics.ghost_penalty.GHOST", ghost * GHOST)
-        s = mpm.Simulation(grid, [body], [soil], fluid=mpm.Fluid(bulk=np.inf), fixed=walls, tractions=tractions)
+        s = mpm.Simulation(grid, [body], [soil], fluid=mpm.Fluid(bulk=np.inf), walls=walls, conditions=tractions)
         s.run(1.0, 1.0, progress=False)
     cells_pressure = s.scene.storage.p.x.array[s.grid.local(s.grid.number(s.grid.index(body.centre)))]
     return s.points.corners.mean(axis=1) - body.centre, s.points.pressure, *exact(body.centre), cells_pressure
@@ -126,7 +126,7 @@ def pushed(monkeypatch, most, law=mpm.DruckerPrager, **strength):
     under, beside = ((0, -1), (7 / 15, 1)), ((7 / 15, -1), (2, 1))
     foot = mpm.Displacement("top", lambda t, X: (0, -6e-4 * t), region=under)
     walls, open_side = {"left": "x", "right": "x", "bottom": "xy"}, mpm.Drained("top", region=beside)
-    scene = {"fixed": walls, "fluid": mpm.Fluid(), "drained": [open_side], "displacements": [foot]}
+    scene = {"walls": walls, "fluid": mpm.Fluid(), "conditions": [open_side, foot]}
     s = mpm.Simulation(grid, [mpm.box(grid, [0, -1], [1.6, 0])], [soil], **scene)
     s.run(1.0, 0.05)
     cells = s.cells()
@@ -148,8 +148,8 @@ def test_pressures_do_not_alternate_where_soil_flows(monkeypatch):
 
 def test_what_damps_soft_soil_meets_no_even_gradient_and_loses_no_fluid():
     """Cells that alternate along both axes meet what a damping of jumps gives them, away from the sides."""
-    grid = mpm.Grid([6.0, 4.0], [6, 4])
-    cells, index, rng = np.arange(grid.num_local), grid.index(grid.midpoints), np.random.default_rng(0)
+    grid = mpm.Grid([0, 0], [6.0, 4.0], [6, 4])
+    cells, index, rng = np.arange(grid.num_local), grid.index_from_base(grid.midpoints), np.random.default_rng(0)
     own, opening = Unknowns(fem.Function(grid.cellwise()), cells), np.ones((grid.num_local, 2, 2))
     shift = rng.uniform(-0.2, 0.2, size=6)[index[:, :1]] * [1, 0]  # of centroids
     H = second_differences(own, grid, rng.uniform(1, 9, size=(len(cells), 2)), shift, opening)
@@ -175,8 +175,8 @@ def test_soil_that_could_yield_and_does_not_is_damped_as_elastic_soil(monkeypatc
 
 
 def test_only_points_in_water_of_laws_with_a_state_carry_their_softness():
-    grid, walls = mpm.Grid([0.2, 0.4], [2, 4]), {"left": "x", "right": "x", "bottom": "y"}
+    grid, walls = mpm.Grid([0, 0], [0.2, 0.4], [2, 4]), {"left": "x", "right": "x", "bottom": "y"}
     sand = mpm.DruckerPrager(1e7, 5e6, friction=0.0, dilation=0.0, cohesion=1e3)
     for soil, fluid in ((mpm.Hencky(1e7, 5e6), mpm.Fluid()), (sand, None), (sand, mpm.Fluid())):
-        s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [0.2, 0.3])], [soil], fluid=fluid, fixed=walls)
+        s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [0.2, 0.3])], [soil], fluid=fluid, walls=walls)
         assert ("softness" in s.points.data) == bool(soil.state and fluid)

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Stages: conditions change, displacements are reset, bodies are dug away and filled in."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -15,10 +16,10 @@ WALLS = {"left": "x", "right": "x", "bottom": "y"}
 
 def blocks(heights=(0.5, 0.5), **options):
     """Return a simulation of blocks on one another, 1 m wide, and a probe in the middle of the lowest block's top."""
-    grid = mpm.Grid([1.0, 1.4], [10, 14])
+    grid = mpm.Grid([0, 0], [1.0, 1.4], [10, 14])
     bottoms = np.concatenate([[0], np.cumsum(heights)])
     bodies = [mpm.box(grid, [0, a], [1, b]) for a, b in pairwise(bottoms)]
-    options = {"gravity": GRAVITY, "fixed": WALLS} | options
+    options = {"gravity": GRAVITY, "walls": WALLS} | options
     return mpm.Simulation(grid, bodies, [DENSE], **options), mpm.probes(bodies, [[0.5, heights[0]]])
 
 
@@ -31,9 +32,9 @@ def test_after_a_reset_displacements_count_from_there():
     s, probe = blocks()
     first = s.run(1.0, 1.0, probes=probe).displacement[-1]
     stress = vertical(s)
-    s.stage(tractions=[mpm.Traction("top", (0, -1e4))], reset_displacement=True)
+    s.stage(conditions=[mpm.Traction("top", (0, -1e4))], reset_displacement=True)
     second = s.run(2.0, 1.0, probes=probe).displacement
-    whole, probe = blocks(tractions=[mpm.Traction("top", lambda t: (0, -1e4 * (t > 1)))])
+    whole, probe = blocks(conditions=[mpm.Traction("top", lambda t: (0, -1e4 * (t > 1)))])
     both = whole.run(2.0, 1.0, probes=probe).displacement
     assert second[0] == pytest.approx(np.zeros((1, 2)), abs=0)
     assert first + second[-1] == pytest.approx(both[-1], abs=1e-12)
@@ -42,9 +43,9 @@ def test_after_a_reset_displacements_count_from_there():
 
 
 def test_what_a_load_did_to_an_elastic_body_goes_with_it():
-    s, probe = blocks(tractions=[mpm.Traction("top", lambda t: (0, -1e4 * min(1, t)))], gravity=None)
+    s, probe = blocks(conditions=[mpm.Traction("top", lambda t: (0, -1e4 * min(1, t)))], gravity=None)
     s.run(1.0, 0.5, probes=probe)
-    s.stage(tractions=[])
+    s.stage(conditions=[])
     left = s.run(2.0, 1.0, probes=probe).displacement[-1]
     assert np.abs(left).max() < 1e-6
 
@@ -62,7 +63,7 @@ def test_an_excavation_relieves_what_lies_below():
 
 def test_the_top_of_what_is_left_is_a_side():
     """The pressure of an excavation's water goes out through the new surface."""
-    s, _ = blocks(fluid=mpm.Fluid(), pressure=1e3, gravity=(0, 0), drained=[mpm.Drained("top")])
+    s, _ = blocks(fluid=mpm.Fluid(), pressure=1e3, gravity=(0, 0), conditions=[mpm.Drained("top")])
     s.run(10.0, 10.0)
     s.stage(remove=[1])
     result = s.run(1000.0, 100.0)
@@ -72,17 +73,17 @@ def test_the_top_of_what_is_left_is_a_side():
 
 @pytest.mark.parametrize("remove, area", [([1], 0.8), ([1, 2], 1.0)])
 def test_a_condition_that_moves_on_to_what_an_excavation_lays_bare_is_named(caplog, remove, area):
-    grid = mpm.Grid([1.0, 1.4], [10, 14])
+    grid = mpm.Grid([0, 0], [1.0, 1.4], [10, 14])
     bodies = [mpm.box(grid, *part) for part in (([0, 0], [1, 0.5]), ([0, 0.5], [0.8, 1]), ([0.8, 0.5], [1, 1]))]
     load = [mpm.Traction("top", (0, -1e3), region=((0, 0), (0.9, 2))), mpm.Traction("top", (0, -1e3))]
-    s = mpm.Simulation(grid, bodies, [DENSE], fixed=WALLS, tractions=load[1:])
+    s = mpm.Simulation(grid, bodies, [DENSE], walls=WALLS, conditions=[*load[1:]])
     with caplog.at_level("WARNING", "mpm_dolfinx"):
         s.stage(remove=remove)
     (record,) = caplog.records
     assert "Traction(side='top'" in record.getMessage() and f"on {area:.3g} m^1 that were" in record.getMessage()
     caplog.clear()
-    other = mpm.Simulation(grid, bodies, [DENSE], fixed=WALLS, tractions=load[1:])
-    other.stage(remove=remove, tractions=load)
+    other = mpm.Simulation(grid, bodies, [DENSE], walls=WALLS, conditions=[*load[1:]])
+    other.stage(remove=remove, conditions=[replace(one) for one in load])
     assert not caplog.records, "they were given anew"
 
 
@@ -102,22 +103,22 @@ def test_a_fill_loads_what_lies_below():
 
 
 def test_a_wet_fill_keeps_the_fluids_balance():
-    s, _ = blocks(fluid=mpm.Fluid(), later=[1], drained=[mpm.Drained("top")])
+    s, _ = blocks(fluid=mpm.Fluid(), later=[1], conditions=[mpm.Drained("top")])
     s.run(1.0, 0.5)
-    s.stage(add=[1], drained=[mpm.Drained("top")])
+    s.stage(add=[1], conditions=[mpm.Drained("top")])
     result = s.run(2.0, 0.5)
     assert result.balance < 1e-8 and np.isfinite(s.points.pressure).all() and len(s.points) == 400
 
 
 def test_walls_plates_and_given_displacements_come_and_go():
-    s, probe = blocks(gravity=None, fixed=WALLS)
-    s.stage(plates=[mpm.RigidPlate("top", 1e3)])
+    s, probe = blocks(gravity=None, walls=WALLS)
+    s.stage(conditions=[mpm.RigidPlate("top", 1e3)])
     down = s.run(1.0, 1.0, probes=probe).displacement[-1]
     assert down[0, 1] == pytest.approx(-0.5 * 1e3 / DENSE.oedometric, rel=1e-2)
-    s.stage(plates=[], displacements=[mpm.Displacement("top", (0, 0), "y")])
+    s.stage(conditions=[mpm.Displacement("top", (0, 0), "y")])
     back = s.run(2.0, 1.0, probes=probe).displacement[-1]
     assert abs(back[0, 1]) < 1e-6 and s.reactions.shape == (1, 2)
-    s.stage(displacements=[], fixed={"bottom": "xy"})
+    s.stage(conditions=[], walls={"bottom": "xy"})
     assert s.run(3.0, 1.0).converged
 
 
@@ -126,7 +127,7 @@ def test_walls_plates_and_given_displacements_come_and_go():
     [
         ({"remove": [2]}, "stage: remove: body 2, must be one of the bodies that are present, each once: 0"),
         ({"add": [0]}, "stage: add: body 0, must be one of the bodies that are to come later, each once"),
-        ({"drained": [mpm.Drained("top")]}, "need a fluid"),
+        ({"conditions": [mpm.Drained("top")]}, "need a fluid"),
         ({"gravity": (0, -1)}, "gravity: the scene was made without"),
     ],
 )
@@ -143,11 +144,11 @@ def test_a_body_that_is_to_come_must_exist():
 
 def bent(**options):
     """Return a simulation of two bodies that a map has bent, one on the other, pressed from above."""
-    grid = mpm.Grid([1.0, 1.4], [10, 14])
+    grid = mpm.Grid([0, 0], [1.0, 1.4], [10, 14])
     boxes = [mpm.box(grid, [0, a], [0.5, a + 0.5]) for a in (0.0, 0.5)]
     bodies = [mpm.mapped(grid, body, lambda x: x + [0.1, 0] * np.sin(x[:, [1]])) for body in boxes]
     load = [mpm.Traction("top", -1e3)]
-    return mpm.Simulation(grid, bodies, [DENSE], fixed={"bottom": "xy"}, tractions=load, **options)
+    return mpm.Simulation(grid, bodies, [DENSE], walls={"bottom": "xy"}, conditions=load, **options)
 
 
 def test_a_mapped_body_comes_later_and_goes():
@@ -163,7 +164,7 @@ def test_a_mapped_body_comes_later_and_goes():
 
 def test_a_mapped_body_has_no_face_where_a_region_is():
     s = bent()
-    s.stage(tractions=[mpm.Traction("right", -1e3, region=((0, 0), (1, 0.3)))])
+    s.stage(conditions=[mpm.Traction("right", -1e3, region=((0, 0), (1, 0.3)))])
     assert s.run(1.0, 1.0, progress=False).converged
     with pytest.raises(ValueError, match="no point has this side in the region"):
-        s.stage(tractions=[mpm.Traction("top", -1e3, region=((0.8, 0), (1, 2)))])
+        s.stage(conditions=[mpm.Traction("top", -1e3, region=((0.8, 0), (1, 2)))])

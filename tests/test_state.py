@@ -38,7 +38,7 @@ class Refusal(Exception):
 
 def scene(law, wet, held):
     """Return a column off the grid lines, and the dictionary that its load looks into."""
-    grid = mpm.Grid([0.3, 0.8], [3, 8])
+    grid = mpm.Grid([0, 0], [0.3, 0.8], [3, 8])
     asked = {"load": 300.0, "refuses": False}
 
     def load(t):
@@ -46,13 +46,13 @@ def scene(law, wet, held):
             raise Refusal
         return 0.0, -asked["load"]
 
-    options = {"tractions": [mpm.Traction("top", load)]}
+    options = {"conditions": [mpm.Traction("top", load)]}
     if held:
-        options = {"displacements": [mpm.Displacement("top", lambda t, X: (0, 1e-7 * load(t)[1]), "y")]}
+        options = {"conditions": [mpm.Displacement("top", lambda t, X: (0, 1e-7 * load(t)[1]), "y")]}
     if wet:
-        options |= {"fluid": mpm.Fluid(bulk=1e8), "drained": [mpm.Drained("top")]}
+        options = {"fluid": mpm.Fluid(bulk=1e8), "conditions": [*options["conditions"], mpm.Drained("top")]}
     walls = {"left": "x", "right": "x", "bottom": "y"}
-    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [0.3, 0.63])], [LAWS[law]], fixed=walls, **options)
+    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [0.3, 0.63])], [LAWS[law]], walls=walls, **options)
     return s, asked
 
 
@@ -266,12 +266,20 @@ def test_a_step_within_a_stay_depends_on_the_state_alone():
     """Open sides that lie aslant in their cells: how pressures slope there was kept from when the grid was reset."""
 
     def build():
-        grid = mpm.Grid([2, 1.6], [16, 13])
+        grid = mpm.Grid([0, 0], [2, 1.6], [16, 13])
         bodies = [mpm.box(grid, [0, 0], [2, 0.5]), mpm.box(grid, [0, 0.5], [0.9, 0.9])]
         soil = mpm.Hencky(bulk=2e6, shear=6e5, conductivity=1e-6)
-        fixed, load = {"left": "x", "right": "x", "bottom": "xy"}, mpm.Traction("top", (0, -2e3))
-        water = {"fluid": mpm.Fluid(), "drained": [mpm.Drained("top")], "pressure": mpm.hydrostatic(0.5)}
-        return mpm.Simulation(grid, bodies, [soil], fixed=fixed, gravity=(0, -9.81), tractions=[load], **water)
+        walls, load = {"left": "x", "right": "x", "bottom": "xy"}, mpm.Traction("top", (0, -2e3))
+        water = {"fluid": mpm.Fluid(), "conditions": [mpm.Drained("top")], "pressure": mpm.hydrostatic(0.5)}
+        return mpm.Simulation(
+            grid,
+            bodies,
+            [soil],
+            walls=walls,
+            gravity=(0, -9.81),
+            conditions=[load, *water.pop("conditions", [])],
+            **water,
+        )
 
     one, other, states = build(), build(), []
     for _ in range(8):

@@ -5,6 +5,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from helpers import without
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.domains import cut_domains
@@ -17,12 +18,19 @@ WATER = mpm.Fluid(bulk=1e8)
 
 def column(load: float, **options) -> mpm.Simulation:
     """Return a column of 1 m, off the grid lines, that consolidates under a load, Pa."""
-    grid = mpm.Grid([0.5, 1.2], [5, 12])
+    grid = mpm.Grid([0, 0], [0.5, 1.2], [5, 12])
     body = mpm.box(grid, [0, 0], [0.5, 0.97])
-    fixed = {"left": "x", "right": "x", "bottom": "y"}
-    conditions = {"tractions": [mpm.Traction("top", (0, -load))]} | options
-    drained = [mpm.Drained("top")]
-    return mpm.Simulation(grid, [body], [SOIL], fluid=WATER, fixed=fixed, drained=drained, **conditions)
+    walls = {"left": "x", "right": "x", "bottom": "y"}
+    conditions = [mpm.Drained("top"), *options.pop("conditions", [mpm.Traction("top", (0, -load))])]
+    return mpm.Simulation(
+        grid,
+        [body],
+        [SOIL],
+        fluid=WATER,
+        walls=walls,
+        conditions=conditions,
+        **options,
+    )
 
 
 @pytest.fixture
@@ -64,12 +72,12 @@ def test_a_body_at_rest_is_cut_once_and_one_that_moves_in_every_step(cuts):
 
 def test_a_given_displacement_and_a_plate_do_not_drift(cuts):
     push = mpm.Displacement("top", lambda t, X: (0, -1e-6 * t))
-    s = column(0.0, tractions=[], displacements=[push])
+    s = column(0.0, conditions=[push])
     s.run(500, 5, progress=False)
     assert len(cuts) < 40
     top = s.points.corners[..., 1].max()
     assert top == pytest.approx(0.97 - 5e-4, abs=1e-7)
-    s = column(0.0, tractions=[], plates=[mpm.RigidPlate("top", 5e3)])
+    s = column(0.0, conditions=[mpm.RigidPlate("top", 5e3)])
     s.run(500, 5, progress=False)
     top = s.points.corners[..., 1].max(axis=1)
     assert np.ptp(top[top > top.max() - 0.01]) < 1e-9
@@ -80,7 +88,7 @@ def test_pressures_and_stages_are_kept_when_the_domains_leave_their_cells():
     s.run(8, 0.8, progress=False)
     before = s.points.pressure.copy()
     assert before.max() > 3e3
-    s.stage(tractions=[mpm.Traction("top", (0, -1e4))])
+    s.stage(conditions=[*without(s, mpm.Traction), mpm.Traction("top", (0, -1e4))])
     s.run(s.t + 1e-6, 1e-6, progress=False)
     assert s.points.pressure == pytest.approx(before, abs=2e-3 * 1e4)
 
@@ -110,7 +118,7 @@ def test_a_stage_after_a_step_that_failed_begins_with_the_last_good_pressures(lo
                 patch.setattr("mpm_dolfinx.stepping.step.solve_substep", partial(fail, s))
                 with pytest.raises(mpm.GaveUp):
                     s.run(8, 0.8, progress=False)
-        s.stage(tractions=[mpm.Traction("top", (0, -load))])
+        s.stage(conditions=[*without(s, mpm.Traction), mpm.Traction("top", (0, -load))])
         s.run(8, 0.8, progress=False)
         runs.append((s.points.corners, s.points.pressure))
     (x, p), (x2, p2) = runs

@@ -15,13 +15,13 @@ def pulled(cells, size, steps, per_cell):
     The half-width is about 1 m; that of a stiff disc on such a block is a contact of equals.
     """
     R, mu, h = 20.0, 0.3, 1 / cells
-    grid = mpm.Grid([size, size + 4 * h], [round(2 * size * cells), round(size * cells) + 4], lower=[-size, 0])
+    grid = mpm.Grid([-size, 0], [size, size + 4 * h], [round(2 * size * cells), round(size * cells) + 4])
     top = size + 0.3 * h
     disc = mpm.Ball((0, top + R), R)
     tool = mpm.Tool(disc, lambda t: (0.016 * max(0, t - 1), -0.05 * min(1, t)), friction=mu)
     gel = mpm.Hencky(bulk=E / (3 - 6 * 0.49), shear=E / (2 + 2 * 0.49))
     walls = {"left": "x", "right": "x", "bottom": "xy"}
-    s = mpm.Simulation(grid, [mpm.box(grid, [-size, 0], [size, top], per_cell)], [gel], fixed=walls, tools=[tool])
+    s = mpm.Simulation(grid, [mpm.box(grid, [-size, 0], [size, top], per_cell)], [gel], walls=walls, conditions=[tool])
     s.run(1.0, 1.0)
     for k in range(1, steps + 1):
         s.run(1 + k / 4, 0.25)

@@ -23,7 +23,7 @@ def residual(s, pressure, dt=1.0):
 
 @pytest.mark.parametrize("offset", [0.0, 0.1, 0.5])
 def test_hydrostatic_pressure_does_not_flow(offset):
-    s = column(offset=offset, gravity=[0, -STANDARD_GRAVITY], drained=[mpm.Drained("top")], width=2)
+    s = column(offset=offset, gravity=[0, -STANDARD_GRAVITY], conditions=[mpm.Drained("top")], width=2)
     r = residual(s, lambda y: 1000 * STANDARD_GRAVITY * (1 + offset / 10 - y))
     through = SOFT.conductivity * 0.2  # of a unit gradient
     assert np.abs(r).max() < 1e-12 * through
@@ -34,7 +34,7 @@ def test_hydrostatic_pressure_does_not_flow(offset):
 def test_a_steady_flow_is_even_however_the_body_lies_on_the_grid(offset, bulk):
     """Linear is the pressure of water, and the density of one as compressible as the pressure is high."""
     drained = [mpm.Drained("top", pressure=0.0), mpm.Drained("bottom", pressure=1e4)]
-    s = column(offset=offset, drained=drained, fluid=mpm.Fluid(bulk=bulk))
+    s = column(offset=offset, conditions=drained, fluid=mpm.Fluid(bulk=bulk))
     length = 1 + offset / 10
     driving = 1e4 if bulk == np.inf else bulk * np.expm1(1e4 / bulk)
     flux = SOFT.conductivity / 9810 * driving / length * 0.1
@@ -47,7 +47,7 @@ def test_a_steady_flow_is_even_however_the_body_lies_on_the_grid(offset, bulk):
 
 
 def test_a_prescribed_inflow_passes_through():
-    s = column(inflows=[mpm.Inflow("bottom", 1e-5)], drained=[mpm.Drained("top")])
+    s = column(conditions=[mpm.Inflow("bottom", 1e-5), mpm.Drained("top")])
     s.run(200.0, 20.0)
     gradient = 1e-5 / (SOFT.conductivity / 9810)
     assert s.points.pressure == pytest.approx(gradient * (1 - s.points.x[:, 1]), abs=1e-3 * gradient)
@@ -71,7 +71,7 @@ def test_the_fluid_balance_closes_in_every_step(bulk):
 
 
 def test_a_sealed_body_keeps_its_fluid():
-    s = column(tractions=[mpm.Traction("top", (0, -1e4))], material=SOFT)
+    s = column(conditions=[mpm.Traction("top", (0, -1e4))], material=SOFT)
     result = s.run(1.0, 0.25)
     assert result.balance <= 1e-8
     # all the load is carried by the water but for its compressibility
@@ -81,7 +81,7 @@ def test_a_sealed_body_keeps_its_fluid():
 
 def test_biot_coefficient_and_grains_enter_the_undrained_response():
     material = mpm.Hencky(bulk=1e7, shear=6e6, porosity=0.3, biot=0.8, grain_bulk=5e7)
-    s = column(material=material, fluid=mpm.Fluid(bulk=2e7), tractions=[mpm.Traction("top", (0, -100.0))])
+    s = column(material=material, fluid=mpm.Fluid(bulk=2e7), conditions=[mpm.Traction("top", (0, -100.0))])
     s.run(1.0, 1.0)
     storage = 0.3 / 2e7 + 0.5 / 5e7
     skempton = 0.8 / (storage * material.oedometric + 0.64)
@@ -89,7 +89,7 @@ def test_biot_coefficient_and_grains_enter_the_undrained_response():
 
 
 def test_one_dimensional_consolidation_follows_terzaghi():
-    s = column(cells=20, drained=[mpm.Drained("top")], tractions=[mpm.Traction("top", (0, -100.0))], offset=0.3)
+    s = column(cells=20, conditions=[mpm.Drained("top"), mpm.Traction("top", (0, -100.0))], offset=0.3)
     height = 1 + 0.3 / 20
     cv = SOFT.conductivity / 9810 * SOFT.oedometric
     t = 0.5 * height**2 / cv
@@ -101,7 +101,7 @@ def test_one_dimensional_consolidation_follows_terzaghi():
 
 
 def test_pressure_jumps_are_damped_only_where_next_to_nothing_flows():
-    s = column(drained=[mpm.Drained("top")])
+    s = column(conditions=[mpm.Drained("top")])
     kappa, lam = SOFT.conductivity / 9810, SOFT.bulk - 2 * SOFT.shear / 3
     tau = 0.25 * 3 / (8 * (lam + 3 * SOFT.shear))  # a quarter of the patch value of Silvester and Kechkar
     enough = tau * s.grid.h[0] ** 2 / kappa  # the step in which a face carries as much by flow
@@ -127,15 +127,15 @@ def test_a_jump_between_two_cells_is_damped_by_a_quarter_of_the_published_stabil
     """
     lam, shear, biot, brought = 2e6, 5e6, 0.8, 1e-6  # the last: share of a cell's volume
     soil = mpm.Hencky(bulk=lam + 2 * shear / 3, shear=shear, porosity=0.4, biot=biot)
-    grid = mpm.Grid([1.0, *[0.5] * (dim - 1)], [2, *[1] * (dim - 1)])
-    fixed = {side: "xyz"[:dim] for side in ("left", "right", "bottom")} | {"top": "xyz"[: dim - 1]}
-    fixed |= {"front": "xy", "back": "xy"} if dim == 3 else {}
+    grid = mpm.Grid([0] * dim, [1.0, *[0.5] * (dim - 1)], [2, *[1] * (dim - 1)])
+    walls = {side: "xyz"[:dim] for side in ("left", "right", "bottom")} | {"top": "xyz"[: dim - 1]}
+    walls |= {"front": "xy", "back": "xy"} if dim == 3 else {}
     body, water = mpm.box(grid, [0] * dim, grid.upper), mpm.Fluid(bulk=1e7)
 
     def filling(points, q):
         return brought * ufl.conditional(ufl.lt(points.position[0], 0.5), 1.0, 0.0) * q * points.dx
 
-    s = mpm.Simulation(grid, [body], [soil], fixed=fixed, fluid=water, sources=[filling])
+    s = mpm.Simulation(grid, [body], [soil], walls=walls, fluid=water, terms=[mpm.Source(filling)])
     s.step(1.0)
     left, p = s.points.x[:, 0] < 0.5, s.points.pressure
     patch = 3 * biot**2 / (8 * (lam + 3 * shear))
@@ -144,12 +144,12 @@ def test_a_jump_between_two_cells_is_damped_by_a_quarter_of_the_published_stabil
 
 
 def test_a_cell_that_becomes_active_between_active_nodes_gets_an_unknown():
-    grid = mpm.Grid([3.0, 3.0], [3, 3])
+    grid = mpm.Grid([0, 0], [3.0, 3.0], [3, 3])
 
     def ring(x):
         return (np.abs(x - 1.5) > 0.5).any(axis=1)
 
-    s = mpm.Simulation(grid, [mpm.shape(grid, ring)], [SOFT], fluid=mpm.Fluid(), fixed={"left": "xy", "bottom": "xy"})
+    s = mpm.Simulation(grid, [mpm.shape(grid, ring)], [SOFT], fluid=mpm.Fluid(), walls={"left": "xy", "bottom": "xy"})
     assert set_up(s, 1.0).matrices.storage.unknowns.size == 8
     # one domain of the cell below comes to fill the hole, another one the place that it left
     moved, other = np.flatnonzero((np.abs(s.points.x - [1.5, 0.5]) < 0.5).all(axis=1))[:2]

@@ -30,11 +30,11 @@ LOAD = strength(EXACT)
 
 def block(materials, load=LOAD, run=True, **options):
     """Return a block on a smooth floor at rest under a load on its top, its right side free; run: or as built."""
-    grid = mpm.Grid([1.0, 1.0], [4, 4])
+    grid = mpm.Grid([0, 0], [1.0, 1.0], [4, 4])
     half = (mpm.box(grid, [0, 0], [0.5, 0.25]), mpm.box(grid, [0, 0.25], [0.5, 0.5], material=len(materials) - 1))
     top = mpm.Traction("top", lambda t: (0, -load * min(1, t)), region=((0, 0.3), (0.5, 1)))
     walls = {"left": "x", "bottom": "y"}
-    s = mpm.Simulation(grid, half, materials, fixed=walls, tractions=[top], **options)
+    s = mpm.Simulation(grid, half, materials, walls=walls, conditions=[top, *options.pop("conditions", [])], **options)
     if run:
         s.run(1, 1)
     return s
@@ -155,14 +155,13 @@ def bank(cells, *, run=4.0, crest=4.0, wet=False, **strength):
         mpm.box(grid, [0, -below * h], [columns * h, 0]),
         mpm.mapped(grid, mpm.box(grid, [0, 0], [middle, 4]), shape),
     ]
-    conditions = {"fixed": {"left": "x", "right": "x", "bottom": "xy"}, "gravity": (0, -9.81)}
+    conditions = {"walls": {"left": "x", "right": "x", "bottom": "xy"}, "gravity": (0, -9.81)}
     grains = 2650.0
     if wet:
         tractions, drained = zip(*(mpm.water(side, 5.0) for side in ("top", "right")), strict=True)
         conditions |= {
             "fluid": mpm.Fluid(),
-            "tractions": tractions,
-            "drained": drained,
+            "conditions": [*tractions, *drained],
             "pressure": mpm.hydrostatic(5.0),
         }
         strength |= {"conductivity": 1e-3}

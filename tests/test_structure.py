@@ -66,7 +66,9 @@ CHANGES = {
     ("CompiledForm", "_last"): "what a form is bound to, until it is bound again",
     ("Latest", "_entry"): "the key and the value that were made last",
     ("Scene", "_looks"): "what is still to be warned of",
-    ("StorageSystem", "_flowing"): "the active set of seepage faces",
+    ("StorageProblem", "_flowing"): "the active set of seepage faces",
+    ("Writer", "_lock"): "the folder's, let go of as it closes",
+    ("Writer", "closed"): "whether it has been",
     ("Table", "columns"): "of a file that is begun with its first row",
     ("Checkpoint", "_written"): "when the file was written",
 }

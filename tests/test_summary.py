@@ -14,7 +14,7 @@ LINEAR = mpm.LinearElastic(bulk=1e7 / 3, shear=5e6, conductivity=1e-4)
 SEALED = mpm.Hencky(bulk=1e7 / 3, shear=5e6)
 STIFF = mpm.NeoHookean(bulk=1e9, shear=5e6)
 
-ALWAYS = {"stress"}
+ALWAYS = {"stress", "linear solvers"}
 FLUID = {"pore pressure", "coupling"}
 SCENES = {
     "drained beam": (lambda: beam(fluid=False, load=1e3, offset=0.1)[0], {"tractions", "ghost penalty"}),
@@ -23,19 +23,19 @@ SCENES = {
         FLUID | {"tractions", "ghost penalty", "fluxes between cells", "open sides", "second substep"},
     ),
     "sealed column": (
-        lambda: column(material=SEALED, displacements=[mpm.Displacement("top", (0, -0.01), "y")]),
+        lambda: column(material=SEALED, conditions=[mpm.Displacement("top", (0, -0.01), "y")]),
         FLUID | {"given displacements", "damping of pressure jumps"},
     ),
     "linear column": (
-        lambda: column(material=LINEAR, fluid=False, tractions=[mpm.Traction("top", (0, -1e3))]),
+        lambda: column(material=LINEAR, fluid=False, conditions=[mpm.Traction("top", (0, -1e3))]),
         {"tractions", "one factorisation for many steps"},
     ),
     "column that drains under its weight": (
-        lambda: column(gravity=(0, -9.81), drained=[mpm.Drained("top")]),
+        lambda: column(gravity=(0, -9.81), conditions=[mpm.Drained("top")]),
         FLUID | {"body force", "fluxes between cells", "weight of the fluid", "open sides", "second substep"},
     ),
     "incompressible column under a plate": (
-        lambda: column(material=STIFF, fluid=False, plates=[mpm.RigidPlate("top", 1e3)]),
+        lambda: column(material=STIFF, fluid=False, conditions=[mpm.RigidPlate("top", 1e3)]),
         {"mean dilatation", "tractions", "rigid plates"},
     ),
 }
@@ -70,7 +70,7 @@ def counted(monkeypatch):
 
 
 def test_a_linear_law_is_factorised_once_while_the_domains_stay_cut(monkeypatch):
-    s = column(material=LINEAR, tractions=[mpm.Traction("top", lambda t: (0, -1e3 * t))], drained=[mpm.Drained("top")])
+    s = column(material=LINEAR, conditions=[mpm.Traction("top", lambda t: (0, -1e3 * t)), mpm.Drained("top")])
     count = counted(monkeypatch)
     result = s.run(1.0, 0.05)
     assert len(count) == 1 and result.steps == 20 and result.residual <= 1e-8
@@ -79,7 +79,7 @@ def test_a_linear_law_is_factorised_once_while_the_domains_stay_cut(monkeypatch)
 
 
 def test_a_law_that_is_not_linear_is_linearised_in_every_step(monkeypatch):
-    s = column(material=SOFT, fluid=False, tractions=[mpm.Traction("top", lambda t: (0, -1e5 * t))])
+    s = column(material=SOFT, fluid=False, conditions=[mpm.Traction("top", lambda t: (0, -1e5 * t))])
     count = counted(monkeypatch)
     s.run(1.0, 0.25)
     assert len(count) >= 4 and np.isfinite(s.points.x).all()

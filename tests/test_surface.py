@@ -18,7 +18,7 @@ SOIL = mpm.Hencky(bulk=1e6, shear=6e5)
 @st.composite
 def stacks(draw, dim):
     """Return a box, and up to three boxes beside one another on it, with spacings and offsets of their own."""
-    grid = mpm.Grid([4.0] * dim, [4] * dim)
+    grid = mpm.Grid([0] * dim, [4.0] * dim, [4] * dim)
 
     def box(low, high):
         return mpm.box(grid, low, high, per_cell=draw(st.integers(1, 7)))
@@ -65,7 +65,7 @@ def corner(body, end=0):
 
 
 def test_free_parts_of_a_face_do_not_overlap_and_a_region_cuts_each():
-    grid = mpm.Grid([4.0, 4.0, 4.0], [4, 4, 4])
+    grid = mpm.Grid([0, 0, 0], [4.0, 4.0, 4.0], [4, 4, 4])
     below = mpm.box(grid, [0, 0, 0], [4, 4, 1], per_cell=1)
     posts = [mpm.box(grid, [x, y, 1], [x + 0.4, y + 0.3, 2], per_cell=9) for x in (0.2, 1.1) for y in (0.3, 2.2)]
     region = ((0.1, 0.2, 1), (1.35, 2.35, 1))
@@ -77,7 +77,7 @@ def test_free_parts_of_a_face_do_not_overlap_and_a_region_cuts_each():
 
 
 def test_bodies_touch_where_their_maps_put_them():
-    grid = mpm.Grid([4.0, 2.0], [8, 4])
+    grid = mpm.Grid([0, 0], [4.0, 2.0], [8, 4])
     below, above = mpm.box(grid, [0, 0], [4, 1]), mpm.box(grid, [0, 0], [2, 0.5], per_cell=3)
     bodies = [below, mpm.mapped(grid, above, lambda x: np.add(x, [0.7, 1]))]
     top = surface(bodies, "top")
@@ -90,7 +90,7 @@ def test_bodies_touch_where_their_maps_put_them():
 @pytest.mark.parametrize("per_cell", [2, 3, 5])
 def test_a_curve_that_two_bodies_follow_with_other_domains_is_no_surface(per_cell):
     """Their edges are other chords of the curve."""
-    grid = mpm.Grid([3.0, 2.0], [12, 8])
+    grid = mpm.Grid([0, 0], [3.0, 2.0], [12, 8])
 
     def wave(x):
         return x + np.stack([0.1 * x[:, 1], 0.2 * np.sin(2 * x[:, 0])], axis=1)
@@ -104,7 +104,7 @@ def test_a_curve_that_two_bodies_follow_with_other_domains_is_no_surface(per_cel
 
 @pytest.mark.parametrize("per_cell", [1, 2, 5])
 def test_under_a_body_that_is_turned_in_3d_exactly_what_it_covers_is_not_free(per_cell):
-    grid = mpm.Grid([4.0, 4.0, 2.0], [8, 8, 4])
+    grid = mpm.Grid([0, 0, 0], [4.0, 4.0, 2.0], [8, 8, 4])
     below, above = mpm.box(grid, [0, 0, 0], [4, 4, 1], 2), mpm.box(grid, [0, 0, 1], [2, 1.5, 1.5], per_cell)
     c, s = np.cos(0.5), np.sin(0.5)
     turned = mpm.mapped(grid, above, lambda x: (x - [1, 0.75, 0]) @ [[c, s, 0], [-s, c, 0], [0, 0, 1]] + [2.1, 1.9, 0])
@@ -122,13 +122,13 @@ def test_under_a_body_that_is_turned_in_3d_exactly_what_it_covers_is_not_free(pe
 
 
 def test_a_load_on_what_is_free_beside_a_turned_body_carries_its_whole_force():
-    grid = mpm.Grid([4.5, 4.5, 2.0], [10, 10, 5], lower=[-0.5] * 3)
+    grid = mpm.Grid([-0.5] * 3, [4.5, 4.5, 2.0], [10, 10, 5])
     below, above = mpm.box(grid, [0, 0, 0], [4, 4, 1], 2), mpm.box(grid, [0, 0, 1], [2, 1.5, 1.5], 2)
     c, s = np.cos(0.5), np.sin(0.5)
     turned = mpm.mapped(grid, above, lambda x: (x - [1, 0.75, 0]) @ [[c, s, 0], [-s, c, 0], [0, 0, 1]] + [2.1, 1.9, 0])
     ground = ((0, 0, 0), (4, 4, 0))
     hold, load = mpm.Displacement("bottom", (0, 0, 0), region=ground), mpm.Traction("top", (0, 0, -1e3))
-    s = mpm.Simulation(grid, [below, turned], [SOIL], fixed={}, displacements=[hold], tractions=[load])
+    s = mpm.Simulation(grid, [below, turned], [SOIL], walls={}, conditions=[hold, load])
     s.run(1.0, 1.0, progress=False)
     assert s.reactions[0, 2] == pytest.approx(16e3, rel=1e-6)
 
@@ -137,7 +137,7 @@ def test_a_curved_interface_in_3d_between_other_lattices_is_no_surface():
     """Where chords leave slivers between them, drained ones would empty the bodies."""
     errors = []
     for cells in (10, 20):
-        grid = mpm.Grid([1.6] * 3, [cells] * 3)
+        grid = mpm.Grid([0] * 3, [1.6] * 3, [cells] * 3)
 
         def bend(x):
             u = [np.sin(3 * x[:, 1]) + x[:, 1] / 2, np.sin(2 * x[:, 0]), np.sin(3 * x[:, 0]) * np.cos(2 * x[:, 1])]
@@ -155,7 +155,7 @@ def test_a_curved_interface_in_3d_between_other_lattices_is_no_surface():
 
 
 def test_a_body_that_a_map_has_drawn_to_a_point_has_sides():
-    grid = mpm.Grid([2.0] * 3, [4] * 3)
+    grid = mpm.Grid([0] * 3, [2.0] * 3, [4] * 3)
     box = mpm.box(grid, [0, 0, 0], [1, 1, 1])
     cone = mpm.mapped(grid, box, lambda x: np.stack([x[:, 0] * (1.5 - x[:, 2]), x[:, 1] * x[:, 0], x[:, 2]], axis=1))
     bodies = [cone, mpm.mapped(grid, mpm.box(grid, [0, 0, 1], [1, 1, 2]), lambda x: x * [0.5, 0.5, 1])]
@@ -165,7 +165,7 @@ def test_a_body_that_a_map_has_drawn_to_a_point_has_sides():
 
 
 def test_a_second_map_comes_after_the_first():
-    grid = mpm.Grid([4.0, 4.0], [8, 8])
+    grid = mpm.Grid([0, 0], [4.0, 4.0], [8, 8])
     body = mpm.box(grid, [0.5, 0.5], [1.5, 1.5])
     first, second = (lambda x: x * [1, 2]), (lambda x: x + [0.5, 0.1] * x[:, ::-1])
     twice = mpm.mapped(grid, mpm.mapped(grid, body, first), second)
@@ -174,11 +174,11 @@ def test_a_second_map_comes_after_the_first():
 
 
 def scene(grid, bodies, **options):
-    return mpm.Simulation(grid, bodies, [SOIL], fixed={"bottom": "xy"}, **options)
+    return mpm.Simulation(grid, bodies, [SOIL], walls={"bottom": "xy"}, **options)
 
 
 def test_a_body_bent_into_another_is_refused_with_the_depth():
-    grid = mpm.Grid([4.0, 2.0], [8, 4])
+    grid = mpm.Grid([0, 0], [4.0, 2.0], [8, 4])
     below, above = mpm.box(grid, [0, 0], [4, 1]), mpm.box(grid, [0, 1], [2, 1.5])
     with pytest.raises(ValueError, match=r"bodies 0 and 1: both are at .* 0.2 m deep, must not lie in each other"):
         scene(grid, [below, mpm.mapped(grid, above, lambda x: x - [0, 0.2])])
@@ -188,16 +188,16 @@ def test_a_body_bent_into_another_is_refused_with_the_depth():
 
 
 def test_a_plate_lies_on_the_body_as_it_is_bent():
-    grid = mpm.Grid([4.0, 4.0], [8, 8])
+    grid = mpm.Grid([0, 0], [4.0, 4.0], [8, 8])
     body, plate = mpm.box(grid, [0, 0], [2, 1]), [mpm.RigidPlate("top", 1e3)]
     with pytest.raises(ValueError, match=r"RigidPlate\(.* slope, must be one flat side normal to an axis"):
-        scene(grid, [mpm.mapped(grid, body, lambda x: x + np.outer(x[:, 0] * x[:, 1], [0, 0.3]))], plates=plate)
+        scene(grid, [mpm.mapped(grid, body, lambda x: x + np.outer(x[:, 0] * x[:, 1], [0, 0.3]))], conditions=plate)
     sheared = mpm.mapped(grid, body, lambda x: x + np.outer(x[:, 1], [0.5, 0]))
-    assert scene(grid, [sheared], plates=plate).run(1.0, 1.0, progress=False).converged
+    assert scene(grid, [sheared], conditions=plate).run(1.0, 1.0, progress=False).converged
 
 
 def test_bodies_that_do_not_touch_and_yet_will_stick_are_named_with_their_distance(caplog):
-    grid = mpm.Grid([4.0, 4.0], [8, 8])
+    grid = mpm.Grid([0, 0], [4.0, 4.0], [8, 8])
     below = mpm.box(grid, [0, 0], [4, 1])
 
     def warnings(low):

@@ -12,14 +12,14 @@ SOFT = mpm.NeoHookean(bulk=1e7 / 3, shear=5e6)  # Hencky's law loses its stiffne
 
 def sheared(sides, gamma=5.0, steps=100):
     """Return (simulation, result) of a block of 5 x 5 cells whose sides are sheared by gamma in all."""
-    grid = mpm.Grid([5.4, 0.9], [54, 9])
+    grid = mpm.Grid([0, 0], [5.4, 0.9], [54, 9])
     body = mpm.box(grid, [0.2, 0.13], [0.7, 0.63])
 
     def value(t, X):
         return np.stack([gamma * t * (X[:, 1] - 0.13), 0 * t * X[:, 0]], axis=1)
 
     held = [mpm.Displacement(side, value) for side in sides]
-    s = mpm.Simulation(grid, [body], [SOFT], fixed={}, displacements=held)
+    s = mpm.Simulation(grid, [body], [SOFT], walls={}, conditions=held)
     return s, s.run(1.0, 1 / steps)
 
 
@@ -47,12 +47,12 @@ def test_a_block_sheared_between_plates_goes_on_where_domains_have_folded(monkey
 @pytest.mark.parametrize("softness", [1e-3, 1e-6])
 def test_a_column_tears_at_a_weak_layer(softness):
     """The layer is drawn out to twenty times its height; the rest keeps its volume and carries the same force."""
-    grid = mpm.Grid([0.6, 3.2], [6, 32])
+    grid = mpm.Grid([0, 0], [0.6, 3.2], [6, 32])
     column = [mpm.box(grid, [0.1, 0], [0.53, 0.5]), mpm.box(grid, [0.1, 0.5], [0.53, 0.6], material=1)]
     column.append(mpm.box(grid, [0.1, 0.6], [0.53, 1.0]))
     weak = mpm.NeoHookean(bulk=softness * SOFT.bulk, shear=softness * SOFT.shear)
     top = mpm.Displacement("top", lambda t, X: (0, 1.9 * t))
-    s = mpm.Simulation(grid, column, [SOFT, weak], fixed={"bottom": "xy"}, displacements=[top])
+    s = mpm.Simulation(grid, column, [SOFT, weak], walls={"bottom": "xy"}, conditions=[top])
     s.run(1.0, 0.01)
     volume, layer = s.points.volume0 * s.points.J, s.points.material == 1
     assert volume[~layer].sum() == pytest.approx(0.43 * 0.9, rel=2e-2 if softness > 1e-4 else 2e-4)

@@ -25,12 +25,14 @@ def robin(points, u, v):
 
 def column(terms, dim=2, off=0.03, load=LOAD, **options):
     """Return a column between smooth walls, afloat but for what the terms are, its base off the grid lines."""
-    grid = mpm.Grid([0.5] * (dim - 1) + [1.5], [2] * (dim - 1) + [6])
+    grid = mpm.Grid([0] * dim, [0.5] * (dim - 1) + [1.5], [2] * (dim - 1) + [6])
     body = mpm.box(grid, [0] * (dim - 1) + [0.2 + off], [0.5] * (dim - 1) + [1.2 + off])
-    walls = {"left": "x", "right": "x", "front": "y", "back": "y"}
-    fixed = {name: axes for name, axes in walls.items() if dim == 3 or name in ("left", "right")}
+    every = {"left": "x", "right": "x", "front": "y", "back": "y"}
+    walls = {name: axes for name, axes in every.items() if dim == 3 or name in ("left", "right")}
     loads = [mpm.Traction("top", lambda t: [0] * (dim - 1) + [-load * min(t, 1)])]
-    s = mpm.Simulation(grid, [body], [SOIL], fixed=fixed, tractions=loads, terms=terms, **options)
+    s = mpm.Simulation(
+        grid, [body], [SOIL], walls=walls, conditions=[*loads, *options.pop("conditions", [])], terms=terms, **options
+    )
     return s, mpm.probes([body], [[0.25] * (dim - 1) + [y + off] for y in (0.2, 1.2)])
 
 
@@ -59,12 +61,12 @@ def test_a_load_along_the_normal_of_a_slanted_side_is_that_of_a_traction():
         return LOAD * ufl.dot(points.normal, points.value(v)) * points.dx
 
     found = []
-    for options in ({"terms": [mpm.OnSide("top", pressed)]}, {"tractions": [mpm.Traction("top", -LOAD)]}):
-        grid = mpm.Grid([1.5, 1.5], [6, 6])
+    for options in ({"terms": [mpm.OnSide("top", pressed)]}, {"conditions": [mpm.Traction("top", -LOAD)]}):
+        grid = mpm.Grid([0, 0], [1.5, 1.5], [6, 6])
         body = mpm.mapped(
             grid, mpm.box(grid, [0, 0], [1, 1]), lambda X: X * (1, 1) + [0.1, 0] + 0.2 * X[:, ::-1] * (0, 1)
         )
-        s = mpm.Simulation(grid, [body], [SOIL], fixed={"bottom": "xy"}, **options)
+        s = mpm.Simulation(grid, [body], [SOIL], walls={"bottom": "xy"}, **options)
         s.run(1.0, 1.0, progress=False)
         found.append(s.points.x)
     assert found[0] == pytest.approx(found[1], abs=1e-10)
@@ -79,7 +81,7 @@ def test_terms_on_sides_and_in_bodies_act_together_and_later_stages_keep_them():
     assert s.run(1.0, 1.0, probes=probes, progress=False).displacement[-1][0, 1] == pytest.approx(
         -1e3 / SPRING, rel=1e-3
     )
-    s.stage(tractions=[mpm.Traction("top", (0, -LOAD))])
+    s.stage(conditions=[mpm.Traction("top", (0, -LOAD))])
     base = s.run(2.0, 1.0, probes=probes, progress=False).displacement[-1][0, 1]
     assert base == pytest.approx(-(1e3 + LOAD) / SPRING, rel=1e-3)
 

@@ -18,13 +18,13 @@ RUBBER = mpm.NeoHookean(bulk=YOUNG / 3, shear=YOUNG / 2)  # nu = 0: plane strain
 def bent(cells, per_cell):
     """Return the tip's deflection of a cantilever, so many cells thick, over that of a rod which shears."""
     h = HEIGHT / cells
-    grid = mpm.Grid([11 * cells * h, 6 * cells * h], [11 * cells, 6 * cells])
+    grid = mpm.Grid([0, 0], [11 * cells * h, 6 * cells * h], [11 * cells, 6 * cells])
     bottom = 4 * HEIGHT
     body = mpm.box(grid, [0, bottom], [LENGTH, bottom + HEIGHT], per_cell=per_cell)
     inertia = HEIGHT**3 / 12
     load = 0.05 * YOUNG * inertia / LENGTH**2
     end = mpm.Traction("right", (0, -load / HEIGHT))
-    s = mpm.Simulation(grid, [body], [RUBBER], fixed={"left": "xy"}, tractions=[end])
+    s = mpm.Simulation(grid, [body], [RUBBER], walls={"left": "xy"}, conditions=[end])
     result = s.run(1.0, 1.0, probes=mpm.probes([body], [[LENGTH, bottom + HEIGHT / 2]]), progress=False)
     rod = load * LENGTH**3 / (3 * YOUNG * inertia) + load * LENGTH / (5 / 6 * RUBBER.shear * HEIGHT)
     return -result.displacement[-1][0, 1] / rod
@@ -57,9 +57,9 @@ def test_a_wet_body_with_one_point_a_cell_is_named_with_what_it_loses(caplog):
         assert f"with pore fluid it bends some {LOST_WET / n**2:.0%} too much and creeps" in caplog.text
 
 
-@pytest.mark.parametrize("fixed", [{"left": "x", "right": "x", "bottom": "y"}])
-def test_a_column_between_walls_or_a_layer_among_others_is_not_too_thin(fixed, caplog):
-    narrow = mpm.Grid([0.1, 1.0], [1, 10])
-    scene([mpm.box(narrow, [0, 0], [0.1, 1], per_cell=1)], grid=narrow, fixed=fixed)
-    scene([mpm.box(GRID, [0, y], [1, y + 0.1], per_cell=1) for y in (0, 0.1, 0.2)], fixed=fixed)
+@pytest.mark.parametrize("walls", [{"left": "x", "right": "x", "bottom": "y"}])
+def test_a_column_between_walls_or_a_layer_among_others_is_not_too_thin(walls, caplog):
+    narrow = mpm.Grid([0, 0], [0.1, 1.0], [1, 10])
+    scene([mpm.box(narrow, [0, 0], [0.1, 1], per_cell=1)], grid=narrow, walls=walls)
+    scene([mpm.box(GRID, [0, y], [1, y + 0.1], per_cell=1) for y in (0, 0.1, 0.2)], walls=walls)
     assert not caplog.records

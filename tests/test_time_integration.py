@@ -17,11 +17,11 @@ from mpm_dolfinx.stepping.result import Result
 from mpm_dolfinx.stepping.time_integration import METHODS
 from mpm_dolfinx.verification.exact import terzaghi_consolidation
 
-DRAINED = {"drained": [mpm.Drained("top")]}
+OPEN = mpm.Drained("top")
 
 
 def loaded(load, **options):
-    return column(tractions=[mpm.Traction("top", (0, -load))], **options)
+    return column(conditions=[mpm.Traction("top", (0, -load)), *options.pop("conditions", [])], **options)
 
 
 def ramp(load, end):
@@ -34,7 +34,7 @@ SCENES = {
     "compressible fluid and grains": {"fluid": SOFT_WATER, "material": replace(SOFT, grain_bulk=5e7, biot=0.9)},
     "conductivity law": {"material": HALVING},
     "gravity of time": {"gravity": lambda t: (0, -500.0 * min(1.0, t / 40) ** 2)},
-    "source of time": {"sources": [lambda points, q, t: 1e-4 * ufl.sin(t / 20) * q * points.dx]},
+    "source of time": {"terms": [mpm.Source(lambda points, q, t: 1e-4 * ufl.sin(t / 20) * q * points.dx)]},
 }
 
 
@@ -43,7 +43,7 @@ def test_what_changes_within_a_step_is_of_second_order(name):
     """A column of one metre that settles by a tenth, through cells of a fifth."""
 
     def end(steps):
-        s = column(cells=5, tractions=ramp(1e6, 40), **DRAINED, **SCENES[name])
+        s = column(cells=5, conditions=[*ramp(1e6, 40), OPEN], **SCENES[name])
         top = mpm.probes(s.bodies, [[0.1, 1.0]])
         return s.run(40.0, 40 / steps, probes=top, progress=False).displacement[-1][0, 1]
 
@@ -56,7 +56,7 @@ def test_what_changes_within_a_step_is_of_second_order(name):
 @pytest.mark.parametrize("steps", [1, 7, 100])
 def test_a_sealed_bodys_fluid_keeps_its_mass_whatever_the_steps(steps):
     """rho V of the pores stays: (n0 + J - 1) exp(p / K_w) = n0, for water as soft as the skeleton at large strain."""
-    s = column(cells=4, tractions=ramp(3e6, 1.0), fluid=SOFT_WATER)
+    s = column(cells=4, conditions=[*ramp(3e6, 1.0)], fluid=SOFT_WATER)
     s.run(1.0, 1 / steps, progress=False)
     J, p = s.points.J, s.points.pressure
     assert J.max() < 0.9
@@ -70,10 +70,18 @@ def hencky_column(width, headroom=0, load=1.0, porosity=0.7, **options):
     """
     h, law = 1 / 50, {"conductivity": 1e-4, "conductivity_law": linear_diffusion}
     soil = mpm.Hencky(1e6 / 3, 5e5, porosity=porosity, **law)
-    grid = mpm.Grid([width * h, 1.0 + headroom * h], [width, 50 + headroom])
+    grid = mpm.Grid([0, 0], [width * h, 1.0 + headroom * h], [width, 50 + headroom])
     body, push = mpm.box(grid, [0, 0], [width * h, 1.0]), [mpm.Traction("top", (0, -load * soil.oedometric))]
     walls, water = {"left": "x", "right": "x", "bottom": "y"}, mpm.Fluid(bulk=np.inf)
-    s = mpm.Simulation(grid, [body], [soil], fluid=water, fixed=walls, tractions=push, **DRAINED, **options)
+    s = mpm.Simulation(
+        grid,
+        [body],
+        [soil],
+        fluid=water,
+        walls=walls,
+        conditions=[*push, OPEN],
+        **options,
+    )
     return s, mpm.probes([body], [[h / 2, 1.0]]), 1e-4 * soil.oedometric / 9810
 
 
@@ -108,7 +116,7 @@ def test_a_step_that_makes_a_law_meaningless_is_shortened():
 
 
 def test_a_run_takes_a_step_by_backward_euler_before_it_gives_up(monkeypatch, caplog):
-    s, tried = loaded(100.0, cells=2, **DRAINED), []
+    s, tried = loaded(100.0, cells=2, conditions=[OPEN]), []
 
     def step(scene, state, dt, how=()):
         tried.append((dt, len(how or scene.substeps)))
@@ -123,7 +131,7 @@ def test_a_run_takes_a_step_by_backward_euler_before_it_gives_up(monkeypatch, ca
     assert "a step of 1 s by backward Euler" in caplog.text
     monkeypatch.setattr("mpm_dolfinx.simulation.timeloop.EULER", METHODS["sdirk2"])
     with pytest.raises(mpm.GaveUp, match=r"gave up at t = 0 s .*no such step"):
-        again = loaded(100.0, cells=2, **DRAINED)
+        again = loaded(100.0, cells=2, conditions=[OPEN])
         again.run(3.0, 1.0, progress=False)
 
 
@@ -136,14 +144,14 @@ def test_a_body_that_is_loaded_sealed_and_then_drained_does_not_ring(dt):
     s = loaded(100.0, cells=20)
     s.run(1.0, 1.0, progress=False)
     p0 = s.points.pressure.max()
-    s.stage(drained=[mpm.Drained("top")])
+    s.stage(conditions=[*s.conditions, mpm.Drained("top")])
     extremes = np.array(s.run(1 + 3 * dt, dt, progress=False).pressure)
     assert extremes.min() > -1e-3 * p0 and extremes.max() < p0 * (1 + 1e-3)
 
 
 def test_backward_euler_is_an_option_and_of_first_order():
     def end(steps, method):
-        s = column(cells=5, tractions=ramp(1e4, 40), method=method, **DRAINED)
+        s = column(cells=5, method=method, conditions=[*ramp(1e4, 40), OPEN])
         s.run(40.0, 40 / steps, progress=False)
         return s.points.pressure
 
@@ -177,15 +185,23 @@ def test_a_term_of_the_velocity_makes_a_dry_body_creep_exactly():
 
 TIME = 1.0 / (SOFT.conductivity / 9810 * SOFT.oedometric)  # s: T_v = 1
 DRIVEN = {
-    "a load that stays": (0.05, lambda: loaded(100.0, **DRAINED)),
-    "a load that rises": (0.05, lambda: column(tractions=ramp(100.0, 2 * TIME), **DRAINED)),
-    "a load that swings": (0.02, lambda: column(tractions=[swinging(6)], **DRAINED)),
-    "one that swings slowly": (0.2, lambda: column(tractions=[swinging(0.5)], **DRAINED)),
+    "a load that stays": (0.05, lambda: loaded(100.0, conditions=[OPEN])),
+    "a load that rises": (
+        0.05,
+        lambda: column(conditions=[*ramp(100.0, 2 * TIME), OPEN]),
+    ),
+    "a load that swings": (0.02, lambda: column(conditions=[swinging(6), OPEN])),
+    "one that swings slowly": (
+        0.2,
+        lambda: column(conditions=[swinging(0.5), OPEN]),
+    ),
     "a source": (
         0.02,
-        lambda: column(sources=[lambda points, q, t: 1e-9 * ufl.sin(8 * t / TIME) * q * points.dx], **DRAINED),
+        lambda: column(
+            terms=[mpm.Source(lambda points, q, t: 1e-9 * ufl.sin(8 * t / TIME) * q * points.dx)], conditions=[OPEN]
+        ),
     ),
-    "a drained side": (0.02, lambda: column(drained=[mpm.Drained("top", lambda t: 100.0 * np.sin(8 * t / TIME))])),
+    "a drained side": (0.02, lambda: column(conditions=[mpm.Drained("top", lambda t: 100.0 * np.sin(8 * t / TIME))])),
 }
 
 
@@ -212,7 +228,7 @@ def test_the_estimated_error_is_that_of_a_run_to_a_factor_that_is_told_whatever_
 
 def test_output_times_are_hit_whatever_the_steps():
     times, seen = [1e-3, 0.5, 7.0, 100.0], []
-    result = loaded(100.0, **DRAINED).run(
+    result = loaded(100.0, conditions=[OPEN]).run(
         300.0, rtol=1e-3, t_eval=times, observe=lambda s: seen.append(s.t), progress=False
     )
     assert result.t == [0.0, *times, 300.0] and seen == result.t[1:] and result.converged
@@ -227,7 +243,7 @@ def test_steps_grow_over_six_decades_of_consolidation():
     cv = SOFT.conductivity / 9810 * SOFT.oedometric
 
     def run(rtol):
-        s, p = loaded(100.0, cells=20, **DRAINED), []
+        s, p = loaded(100.0, cells=20, conditions=[OPEN]), []
         times = np.logspace(-6, 0, 7) / cv
         result = s.run(
             times[-1], rtol=rtol, t_eval=times, observe=lambda s: p.append(s.points.pressure), progress=False
@@ -243,7 +259,7 @@ def test_a_jump_of_the_load_within_the_run_is_found():
     jump = [mpm.Traction("top", lambda t: (0, -100.0 if t < 7.3 else -200.0))]
 
     def run(times, **options):
-        s = column(cells=10, tractions=jump, **DRAINED)
+        s = column(cells=10, conditions=[*jump, OPEN])
         s.run(7.3 - 1e-9, 0.05, progress=False) if not options else None
         return s, s.run(20.0, *times, **options, progress=False)
 
@@ -265,7 +281,7 @@ def test_pressures_that_flow_away_within_a_step_do_not_hold_it_up():
 
 def test_the_first_step_and_the_longest_are_what_was_asked_for():
     times = []
-    s = loaded(100.0, **DRAINED)
+    s = loaded(100.0, conditions=[OPEN])
     s.run(50.0, rtol=0.1, first_step=1e-4, max_step=2.0, observe=lambda s: times.append(s.t), progress=False)
     steps = np.diff([0.0, *times])
     assert steps[0] == 1e-4 and steps.max() <= 2.0 * (1 + 1e-12) and times[-1] == 50.0
@@ -273,7 +289,7 @@ def test_the_first_step_and_the_longest_are_what_was_asked_for():
 
 def test_no_step_is_longer_than_asked_at_the_end_or_where_a_run_goes_on():
     times = []
-    s = loaded(100.0, **DRAINED)
+    s = loaded(100.0, conditions=[OPEN])
     options = {"rtol": 0.1, "observe": lambda s: times.append(s.t), "progress": False}
     with pytest.raises(KeyboardInterrupt):
         s.run(500.0, **options | {"observe": Stop(3)})
@@ -326,14 +342,14 @@ BAD = {
 @pytest.mark.parametrize("name", BAD)
 def test_steps_that_cannot_be_are_refused_in_a_line(name):
     options, message = BAD[name]
-    s = column(cells=2, **DRAINED)
+    s = column(cells=2, conditions=[OPEN])
     with pytest.raises(ValueError, match=message) as caught:
         s.run(4.0, **options, progress=False)
     assert "\n" not in str(caught.value) and s.t == 0
 
 
 def test_a_method_that_has_no_error_cannot_choose_its_steps():
-    s = column(cells=2, method="backward-euler", **DRAINED)
+    s = column(cells=2, method="backward-euler", conditions=[OPEN])
     with pytest.raises(ValueError, match=r"rtol = 0\.001: backward-euler knows no error of a step, must be sdirk2"):
         s.run(4.0, rtol=1e-3, progress=False)
     with pytest.raises(ValueError, match=r"method 'rk4': must be one of sdirk2, backward-euler"):

@@ -25,19 +25,19 @@ def deepest(simulation):
     """Return how deep corners are in the tools, in cells."""
     t, d = simulation.t, simulation.grid.dim
     x = simulation.points.corners.reshape(-1, d)
-    tools = simulation.state.stage.conditions["tools"]
+    tools = [one for one in simulation.conditions if isinstance(one, mpm.Tool)]
     return max(-tool.shape.distance(tool.pose(t, d).own(x)).min() for tool in tools) / simulation.grid.h.min()
 
 
 def pressed(angle, offset, cells=4):
     """Return a cube of 0.8 m between two plates, along a turned axis, pressed by 0.2 m."""
     R, h = turned(angle), 0.8 / cells
-    grid = mpm.Grid([2.0, 2.0], [round(2 / h)] * 2)
+    grid = mpm.Grid([0, 0], [2.0, 2.0], [round(2 / h)] * 2)
     middle = np.array([1.0, 1.0 + offset * h])
     body = mpm.mapped(grid, mpm.box(grid, [0, 0], [0.8, 0.8]), lambda x: (x - 0.4) @ R.T + middle)
     plates = [mpm.HalfSpace(middle + R @ [0, side * 0.4], R @ [0, -side]) for side in (-1, 1)]
     tools = [mpm.Tool(plates[0], friction=0.3), mpm.Tool(plates[1], displacement=lambda t: R @ [0, -0.2 * t])]
-    s = mpm.Simulation(grid, [body], [SOIL], fixed={}, tools=tools)
+    s = mpm.Simulation(grid, [body], [SOIL], walls={}, conditions=tools)
     worst = []
     s.run(1.0, 0.25, observe=lambda s: worst.append(deepest(s)))
     return s, R, max(worst)
@@ -56,11 +56,11 @@ def test_a_plate_presses_a_cube_evenly_wherever_it_lies(angle, offset, error):
 def test_corners_of_a_gel_that_rough_plates_squeeze_stay_outside():
     """Aslant to the grid; its corners were 5e-3 cells inside of them."""
     R, middle = turned(0.3), np.array([1.0, 1.04])
-    grid = mpm.Grid([2.0, 2.0], [10, 10])
+    grid = mpm.Grid([0, 0], [2.0, 2.0], [10, 10])
     body = mpm.mapped(grid, mpm.box(grid, [0, 0], [0.8, 0.8]), lambda x: (x - 0.4) @ R.T + middle)
     floor, plate = (mpm.HalfSpace(middle + R @ [0, side * 0.4], R @ [0, -side]) for side in (-1, 1))
     tools = [mpm.Tool(floor, friction=1.0), mpm.Tool(plate, displacement=lambda t: R @ [0, -0.2 * t], friction=1.0)]
-    s, worst = mpm.Simulation(grid, [body], [GEL], fixed={}, tools=tools), []
+    s, worst = mpm.Simulation(grid, [body], [GEL], walls={}, conditions=tools), []
     s.run(1.0, 0.125, observe=lambda s: worst.append(deepest(s)))
     assert max(worst) < 1.001e-3
 
@@ -69,12 +69,12 @@ def test_a_disc_presses_as_hertz_says():
     """16 cells over the half-width: this, force and pressure."""
     cells, R, L, nu = 16, 20.0, 4.0, 0.3
     stiff = E / (1 - nu**2)
-    grid = mpm.Grid([L, L + 1], [round(L * cells), round((L + 1) * cells)])
+    grid = mpm.Grid([0, 0], [L, L + 1], [round(L * cells), round((L + 1) * cells)])
     top = L + 0.3 / cells
     soil = mpm.Hencky(bulk=E / (3 - 6 * nu), shear=E / (2 + 2 * nu))
     disc = mpm.Tool(mpm.Ball((0, top + R), R), displacement=lambda t: (0, -0.05 * t))
     walls = {"left": "x", "right": "x", "bottom": "xy"}
-    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [L, top])], [soil], fixed=walls, tools=[disc])
+    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [L, top])], [soil], walls=walls, conditions=[disc])
     s.run(1.0, 1.0)
     force = -2 * s.tool_forces[0, 1]
     half, most = 2 * np.sqrt(force * R / (np.pi * stiff)), np.sqrt(force * stiff / (np.pi * R))
@@ -89,7 +89,7 @@ def test_a_disc_presses_as_hertz_says():
 def on_a_plane(angle, reach, steps=8, mu=0.5):
     """Return a block on a plane, gravity turned to a share of the angle at which it slips, then held; with its run."""
     R, slips = turned(angle), np.arctan(mu)
-    grid = mpm.Grid([2, 2], [8, 8])
+    grid = mpm.Grid([0, 0], [2, 2], [8, 8])
     body = mpm.mapped(grid, mpm.box(grid, [0, 0], [1, 0.5]), lambda x: (x - [0.5, 0]) @ R.T + [1, 0.7])
 
     def gravity(t):
@@ -97,7 +97,7 @@ def on_a_plane(angle, reach, steps=8, mu=0.5):
         return 9.81 * R @ [np.sin(turn), -np.cos(turn)]
 
     plane = mpm.Tool(mpm.HalfSpace((1, 0.7), R @ [0, 1]), friction=mu)
-    s = mpm.Simulation(grid, [body], [GEL], fixed={}, gravity=gravity, tools=[plane])
+    s = mpm.Simulation(grid, [body], [GEL], walls={}, gravity=gravity, conditions=[plane])
     return s, mpm.probes([body], [[0.0, 0.0], [1.0, 0.0]])
 
 
@@ -126,14 +126,14 @@ def test_a_block_that_sticks_does_not_creep(angle):
 @pytest.mark.parametrize(("way", "length"), [(-0.003, 1.5), pytest.param(0.006, 3.0, marks=pytest.mark.slow)])
 def test_a_smooth_retaining_wall_has_the_pressure_of_rankine(way, length):
     h = 1 / 8
-    grid = mpm.Grid([length, 1.25], [round(length / h) + 2, 10], lower=[-2 * h, 0])
+    grid = mpm.Grid([-2 * h, 0], [length, 1.25], [round(length / h) + 2, 10])
     strength = {"friction": 30.0, "dilation": 30.0, "cohesion": 20.0}
     soil = mpm.MohrCoulomb(bulk=2e7, shear=1.2e7, grain_density=4000, porosity=0.5, **strength)
     wall = mpm.Tool(mpm.HalfSpace((0, 0), (1, 0)), displacement=lambda t: (way * max(0, t - 1), 0))
     walls = {"bottom": "y", "right": "x"}
     weight = {"gravity": lambda t: (0, -9.81 * min(1, t))}
     body = mpm.box(grid, [0, 0], [length, 1])
-    s = mpm.Simulation(grid, [body], [soil], fixed=walls, tools=[wall], **weight)
+    s = mpm.Simulation(grid, [body], [soil], walls=walls, conditions=[wall], **weight)
     s.run(2.0, 0.25)
     K = 3.0 ** np.sign(way)
     exact = K * 0.5 * 2000 * 9.81 + np.sign(way) * 2 * 20 * np.sqrt(K)
@@ -147,15 +147,17 @@ def on_a_floor(way, cells, length, delta, floor, steps):
     """
     h, load, c, mu = 1 / cells, 1e4, 1e3, np.tan(np.radians(delta))
     rest = c / np.tan(np.radians(30))
-    grid = mpm.Grid([length + h / 2, 1 + 5.5 * h], [round(length / h) + 4, cells + 8], lower=[-3.5 * h, -2.5 * h])
+    grid = mpm.Grid([-3.5 * h, -2.5 * h], [length + h / 2, 1 + 5.5 * h], [round(length / h) + 4, cells + 8])
     soil = mpm.MohrCoulomb(bulk=2e7, shear=1.2e7, friction=30.0, dilation=30.0, cohesion=c)
     tools = [
         mpm.Tool(mpm.HalfSpace((0, 0), (1, 0)), lambda t: (way * max(0, t - 1), 0), friction=mu, adhesion=rest * mu),
         mpm.Tool(mpm.HalfSpace((0, 0), (0, 1)), **floor),
     ]
-    options = {"tractions": [mpm.Pressure("top", lambda t: load * min(1, t))], "fixed": {}, "tools": tools}
+    options = {"conditions": [mpm.Pressure("top", lambda t: load * min(1, t)), *tools], "walls": {}}
     far = [mpm.Displacement("right", (0, 0), "x")]
-    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [length, 1])], [soil], displacements=far, **options)
+    s = mpm.Simulation(
+        grid, [mpm.box(grid, [0, 0], [length, 1])], [soil], conditions=[*far, *options.pop("conditions", [])], **options
+    )
     s.run(1.0, 1 / steps)
     return (np.array(s.run(2.0, 1 / steps).tools)[1:, 0, 0] + rest) / (load + rest)
 
@@ -180,10 +182,10 @@ def test_a_rough_wall_pushes_with_the_exact_pressure():
 
 def work(friction, path, end, steps):
     """Return the work, J/m, that a plate does on a block along a path (t) -> m, and the sum of its parts' sizes."""
-    grid = mpm.Grid([1.5, 0.75], [12, 6])
+    grid = mpm.Grid([0, 0], [1.5, 0.75], [12, 6])
     body = mpm.box(grid, [0.25, 0], [1.25, 0.53])
     plate = mpm.Tool(mpm.HalfSpace((0, 0.53), (0, -1)), displacement=path, friction=friction)
-    s = mpm.Simulation(grid, [body], [GEL], fixed={"bottom": "xy"}, tools=[plate])
+    s = mpm.Simulation(grid, [body], [GEL], walls={"bottom": "xy"}, conditions=[plate])
     result = s.run(end, 1 / steps)
     force, x = np.array(result.tools)[:, 0, :2], np.array([path(t) for t in result.t])
     parts = ((force[1:] + force[:-1]) / 2 * np.diff(x, axis=0)).sum(axis=1)
@@ -218,10 +220,10 @@ def test_friction_takes_energy_and_slips_at_its_coefficient():
 
 def test_adhesion_bounds_the_shear():
     """A rough plate that is pushed along clay takes alpha s_u on the area that it touches."""
-    grid = mpm.Grid([1.5, 0.75], [12, 6])
+    grid = mpm.Grid([0, 0], [1.5, 0.75], [12, 6])
     body = mpm.box(grid, [0.25, 0], [1.25, 0.5])
     plate = mpm.Tool(mpm.HalfSpace((0, 0.5), (0, -1)), lambda t: (0.1 * max(0, t - 1), -0.01 * min(t, 1)), adhesion=2e3)
-    s = mpm.Simulation(grid, [body], [GEL], fixed={"bottom": "xy"}, tools=[plate])
+    s = mpm.Simulation(grid, [body], [GEL], walls={"bottom": "xy"}, conditions=[plate])
     s.run(2.0, 0.25)
     assert s.tool_forces[0, 0] == pytest.approx(2e3, rel=0.02)
 
@@ -229,11 +231,11 @@ def test_adhesion_bounds_the_shear():
 @pytest.mark.parametrize("friction", [0.0, 0.4])
 def test_the_tangent_of_the_contact_is_its_derivative(friction):
     """In a step in which a disc turns and slips."""
-    grid = mpm.Grid([1.25, 1], [12, 8], lower=[-0.25, 0])
+    grid = mpm.Grid([-0.25, 0], [1.25, 1], [12, 8])
     disc = mpm.Ball((0.5, 0.71), 0.2)
     motion = {"displacement": lambda t: (0.02 * t, -0.01 * t), "rotation": lambda t: 0.2 * t, "centre": (0.5, 0.7)}
     tool = mpm.Tool(disc, **motion, friction=friction)
-    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 0.51])], [GEL], fixed={"bottom": "xy"}, tools=[tool])
+    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 0.51])], [GEL], walls={"bottom": "xy"}, conditions=[tool])
     s.step(0.5)
     momentum: MomentumProblem = set_up(s, 0.5).momentum
     rng, forms, unknowns = np.random.default_rng(1), momentum.forms, momentum.system.unknowns
@@ -259,11 +261,13 @@ def test_the_tangent_of_the_contact_is_its_derivative(friction):
 
 def simple(**options):
     """Return a block under a plate."""
-    grid = mpm.Grid([1.2, 1], [7, 5], lower=[-0.2, 0])
+    grid = mpm.Grid([-0.2, 0], [1.2, 1], [7, 5])
     plate = options.pop("shape", mpm.HalfSpace((0, 0.6), (0, -1)))
     tool = mpm.Tool(plate, **options.pop("tool", {"displacement": lambda t: (0, -0.1 * t)}))
-    options.setdefault("fixed", {"bottom": "xy"})
-    return mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 0.6])], [GEL], tools=[tool], **options)
+    options.setdefault("walls", {"bottom": "xy"})
+    return mpm.Simulation(
+        grid, [mpm.box(grid, [0, 0], [1, 0.6])], [GEL], conditions=[tool, *options.pop("conditions", [])], **options
+    )
 
 
 def shallow(y):
@@ -284,9 +288,9 @@ def shallow(y):
         (lambda: simple(tool={"displacement": lambda t: (0, np.nan)}).run(1, 1), "displacement at t = 0 s.*must be"),
         (lambda: simple(shape=mpm.Ball((0.5, 0.55), 0.2)).run(1, 1), "cells inside of a body.*must be outside"),
         (lambda: simple(shape=shallow).run(1, 1), "slope 0.5 at .*must be a signed distance"),
-        (lambda: simple(fixed={}).run(1, 1), "free to move"),
+        (lambda: simple(walls={}).run(1, 1), "free to move"),
         (
-            lambda: simple(displacements=[mpm.Displacement("top", (0, 0))]).run(1, 1),
+            lambda: simple(conditions=[mpm.Displacement("top", (0, 0))]).run(1, 1),
             "HalfSpace.* and Displacement.*both act at",
         ),
     ],
@@ -306,11 +310,11 @@ def test_a_tool_that_outruns_the_body_cuts_the_step():
 
 def test_a_tool_that_would_be_behind_a_beam_after_a_step_bends_it():
     """From above to below it in one step: no place was in the tool at its end, and no force acted."""
-    grid = mpm.Grid([1.0, 1.0], [10, 10])
+    grid = mpm.Grid([0, 0], [1.0, 1.0], [10, 10])
     beam = mpm.box(grid, [0, 0.6], [0.6, 0.7])
     shape = mpm.Convex([[0.35, 0.71], [0.8, 0.71], [0.8, 0.81], [0.35, 0.81]])
     tool = mpm.Tool(shape, displacement=lambda t: (0, -0.23 * t))
-    s = mpm.Simulation(grid, [beam], [SOIL], fixed={"left": "xy"}, tools=[tool])
+    s = mpm.Simulation(grid, [beam], [SOIL], walls={"left": "xy"}, conditions=[tool])
     assert s.run(1.0, 1.0, progress=False).cuts
     assert s.points.x[:, 1].min() < 0.71 - 0.23 and np.linalg.norm(s.tool_forces[0, :2]) > 100
 
@@ -350,7 +354,7 @@ def test_a_refused_step_leaves_the_contact():
             return 0.0
 
         s = simple(tool={"displacement": lambda t: (0.02 * t, -0.03 * t), "friction": 0.3})
-        s.stage(tractions=[mpm.Pressure("right", load)])
+        s.stage(conditions=[*s.conditions, mpm.Pressure("right", load)])
         s.step(0.5)
         if refuses:
             with pytest.raises(ValueError, match="not now"):
@@ -365,11 +369,13 @@ def test_a_refused_step_leaves_the_contact():
 
 def test_a_stage_goes_on_with_a_tool_wherever_the_step_before_left_it():
     """A disc that is small for its cells is 0.014 of one inside at a place, more than a tool that begins may be."""
-    grid = mpm.Grid([1.2, 1.0], [6, 5])
+    grid = mpm.Grid([0, 0], [1.2, 1.0], [6, 5])
     forces = []
     for stages in (1, 2):
         disc = mpm.Tool(mpm.Ball((0.63, 0.78), 0.18), displacement=lambda t: (0, -0.15 * t))
-        s = mpm.Simulation(grid, [mpm.box(grid, [0.1, 0], [1.1, 0.6])], [GEL], fixed={"bottom": "xy"}, tools=[disc])
+        s = mpm.Simulation(
+            grid, [mpm.box(grid, [0.1, 0], [1.1, 0.6])], [GEL], walls={"bottom": "xy"}, conditions=[disc]
+        )
         s.run(1.0, 0.1, progress=False)
         if stages == 2:
             faces = s.scene.on_grid(s.points).cut.surface(s.state.stage.mechanical.tools.faces)
@@ -385,11 +391,11 @@ def test_a_stage_takes_tools_away_and_brings_others():
     s = simple(tool={"displacement": lambda t: (0, -0.05 * t), "friction": 0.3})
     s.run(1.0, 0.5)
     before = -s.tool_forces[0, 1]
-    s.stage(tools=[])
+    s.stage(conditions=[])
     assert s.tool_forces.shape == (0, 3) and not any(name.startswith("tool") for name in s.points.data)
     s.run(2.0, 1.0)
     assert np.abs(s.effective_stress()).max() < 0.05 * before
-    s.stage(tools=[mpm.Tool(mpm.Ball((0.5, 0.81), 0.2), displacement=lambda t: (0, -0.05 * (t - 2)))])
+    s.stage(conditions=[mpm.Tool(mpm.Ball((0.5, 0.81), 0.2), displacement=lambda t: (0, -0.05 * (t - 2)))])
     assert np.isnan(s.tool_forces).all()
     s.run(3.0, 0.5)
     assert s.tool_forces[0, 1] < 0
@@ -397,11 +403,11 @@ def test_a_stage_takes_tools_away_and_brings_others():
 
 def test_a_plate_presses_a_cube_evenly_in_space():
     """On a rough floor, which it does not slip on: nu = 0."""
-    grid = mpm.Grid([1.2, 1.2, 1], [6, 6, 5])
+    grid = mpm.Grid([0, 0, 0], [1.2, 1.2, 1], [6, 6, 5])
     body = mpm.box(grid, [0.17, 0.2, 0], [0.97, 1, 0.8])
     floor = mpm.Tool(mpm.HalfSpace((0, 0, 0), (0, 0, 1)), friction=0.2)
     plate = mpm.Tool(mpm.HalfSpace((0, 0, 0.8), (0, 0, -1)), displacement=lambda t: (0.1 * t, 0, -0.2 * t))
-    s = mpm.Simulation(grid, [body], [SOIL], fixed={}, tools=[floor, plate])
+    s = mpm.Simulation(grid, [body], [SOIL], walls={}, conditions=[floor, plate])
     s.run(1.0, 0.5)
     exact = E * np.log(0.75) / 0.75
     assert s.effective_stress()[:, 2, 2] == pytest.approx(np.full(len(s.points), exact), rel=1e-3)
@@ -448,14 +454,14 @@ def test_a_disc_that_turns_drives_the_body_by_friction():
 @pytest.mark.parametrize("ends", [(0.3, 0.38), (0.33, 0.41), (0.3, 0.4)])
 def test_a_tool_less_than_a_cell_wide_presses(ends):
     """Its edges left nothing of it: it went into the body without a force."""
-    grid, (a, b) = mpm.Grid([1.0, 0.7], [10, 7]), ends
+    grid, (a, b) = mpm.Grid([0, 0], [1.0, 0.7], [10, 7]), ends
     stamp = mpm.Convex([(a, 0.5), (b, 0.5), (b, 0.6), (a, 0.6)])
     one_cell = mpm.Displacement("top", lambda t: (0, -0.02 * t), "y", region=((0.3, 0.4), (0.4, 0.6)))
     forces = []
-    for how in ({"tools": [mpm.Tool(stamp, displacement=lambda t: (0, -0.02 * t))]}, {"displacements": [one_cell]}):
+    for how in ({"conditions": [mpm.Tool(stamp, displacement=lambda t: (0, -0.02 * t))]}, {"conditions": [one_cell]}):
         body = mpm.box(grid, [0, 0], [1.0, 0.5])
         s = mpm.Simulation(
-            grid, [body], [mpm.Hencky(bulk=1e6, shear=6e5)], fixed={"left": "x", "right": "x", "bottom": "xy"}, **how
+            grid, [body], [mpm.Hencky(bulk=1e6, shear=6e5)], walls={"left": "x", "right": "x", "bottom": "xy"}, **how
         )
         s.run(1.0, 0.5, progress=False)
         forces.append([*s.tool_forces[:, 1], *s.reactions[:, 1]][0])

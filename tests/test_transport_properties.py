@@ -62,7 +62,7 @@ def motions(draw, *kinds):
     """A distorted body of some cells on a grid of any shape, in two or three dimensions, on its way over some cells."""
     d, kind = draw(st.sampled_from([2, 3])), draw(st.sampled_from(kinds))
     h, offset = orders(draw, -2, 2, d), orders(draw, -1, 2, d) * numbers(draw, -1, 1, d)
-    grid = mpm.Grid(h * (offset + 8), [16] * d, h * (offset - 8))
+    grid = mpm.Grid(h * (offset - 8), h * (offset + 8), [16] * d)
     size = numbers(draw, 0.3, 4 if d == 2 else 2, d)
     body = mpm.box(grid, h * (offset - size / 2), h * (offset + size / 2), draw(st.integers(1, 2)))
     y = body.corners() / h - offset
@@ -182,7 +182,7 @@ def test_a_point_does_not_see_the_others(motion, wide):
 
 @cache
 def grid_of(*shape):
-    grid = mpm.Grid(np.array([1.0, 3.0, 0.5])[: len(shape)], shape)
+    grid = mpm.Grid([0] * len(shape), np.array([1.0, 3.0, 0.5])[: len(shape)], shape)
     return grid, Reconstruction(grid)
 
 

@@ -49,12 +49,12 @@ LOAD = 5e4  # Pa
 
 def column(units, *, water=None, **options):
     """Return the largest pore pressures, Pa, of a column that is loaded in steps, by the histories of a run."""
-    grid = mpm.Grid(np.array([0.2, 1.2]) * units.length, [2, 12])
+    grid = mpm.Grid([0, 0], np.array([0.2, 1.2]) * units.length, [2, 12])
     body = mpm.box(grid, [0, 0], np.array([0.2, 1.0]) * units.length)
     walls = {"left": "x", "right": "x", "bottom": "y"}
     load = mpm.Traction("top", lambda t: (0, -LOAD * units.stress * min(1.0, t / units.time / 10)))
-    options = {"tractions": [load], "drained": [mpm.Drained("top")], **options}
-    s = mpm.Simulation(grid, [body], [units.soil()], fixed=walls, fluid=water or units.fluid(), **options)
+    options = {"conditions": [load, mpm.Drained("top")], **options}
+    s = mpm.Simulation(grid, [body], [units.soil()], walls=walls, fluid=water or units.fluid(), **options)
     result = s.run(30 * units.time, 10 * units.time, progress=False)
     return np.array(result.pressure)[:, 1] / units.stress
 
@@ -97,12 +97,12 @@ def test_fluids_know_their_unit_weight():
         with pytest.raises(ValueError, match=r"Fluid: gravity = .*, must be > 0 and finite"):
             mpm.Fluid(gravity=wrong)
     units = OTHERS["mm, N, s"]
-    grid, walls = mpm.Grid([100.0, 100.0], [1, 1]), {"left": "x", "right": "x", "bottom": "y"}
+    grid, walls = mpm.Grid([0, 0], [100.0, 100.0], [1, 1]), {"left": "x", "right": "x", "bottom": "y"}
     scenes = [{"gravity": (0, -9810.0)}, {"gravity": (0, 0)}, {"gravity": lambda t: (0, -9810.0)}, {}]
     found = []
     for options in scenes:
         body = mpm.box(grid, [0, 0], [100.0, 50.0])
-        s = mpm.Simulation(grid, [body], [units.soil()], fixed=walls, fluid=units.fluid(), **options)
+        s = mpm.Simulation(grid, [body], [units.soil()], walls=walls, fluid=units.fluid(), **options)
         found.append(s.scene.fluid.unit_weight)
     assert found == pytest.approx([9.81e-6, 9.81e-9, 9.81e-9, 9.81e-9])
 
@@ -114,14 +114,14 @@ def test_water_on_sides_and_levels_weigh_what_the_pore_fluid_does(name, caplog):
     for units in (Units(), OTHERS[name]):
         push, head = mpm.water("top", 1.5 * units.length)
         level = mpm.hydrostatic(1.5 * units.length)
-        water = {"tractions": [push], "drained": [head], "pressure": level, "gravity": (0, -9.81 * units.gravity)}
+        water = {"conditions": [push, head], "pressure": level, "gravity": (0, -9.81 * units.gravity)}
         found.append(column(units, **water))
     assert found[1] == pytest.approx(found[0], rel=1e-6)
     assert not any("unit_weight" in r.getMessage() for r in caplog.records)
 
 
 def test_a_unit_weight_that_is_given_stays():
-    sea, grid = mpm.Fluid(density=1025), mpm.Grid([1.0, 1.0], [2, 2])
+    sea, grid = mpm.Fluid(density=1025), mpm.Grid([0, 0], [1.0, 1.0], [2, 2])
     for given, weight in (({}, 1025 * 9.81), ({"unit_weight": 9810.0}, 9810.0)):
         push, head = mpm.water("top", 2.0, **given)
         s = mpm.Simulation(
@@ -129,23 +129,22 @@ def test_a_unit_weight_that_is_given_stays():
             [mpm.box(grid, [0, 0], [1, 0.5])],
             [Units().soil()],
             fluid=sea,
-            fixed={"bottom": "xy"},
+            walls={"bottom": "xy"},
             gravity=(0, -9.81),
-            tractions=[push],
-            drained=[head],
+            conditions=[push, head],
             pressure=mpm.hydrostatic(2.0, **given),
         )
         assert s.points.pressure == pytest.approx(weight * (2.0 - s.points.x[:, 1]))
         conditions = s.state.stage.conditions
-        for value in (conditions["tractions"][0].value, conditions["drained"][0].pressure):
+        for value in (conditions["tractions"][0].value, conditions["outlets"][0].pressure):
             assert value(0.0, np.array([[0.0, 1.0]])) == pytest.approx(weight)
 
 
 @pytest.mark.parametrize(("g", "said"), [(9.81, 0), (9810.0, 1)])
 def test_water_on_a_dry_body_is_named_where_gravity_is_of_other_units(g, said, caplog):
-    grid, (push, _) = mpm.Grid([1.0, 1.0], [2, 2]), mpm.water("top", 2.0)
-    body, options = mpm.box(grid, [0, 0], [1, 0.5]), {"fixed": {"bottom": "xy"}, "gravity": (0, -g)}
-    mpm.Simulation(grid, [body], [mpm.Hencky(bulk=1e6, shear=1e6)], tractions=[push], **options)
+    grid, (push, _) = mpm.Grid([0, 0], [1.0, 1.0], [2, 2]), mpm.water("top", 2.0)
+    body, options = mpm.box(grid, [0, 0], [1, 0.5]), {"walls": {"bottom": "xy"}, "gravity": (0, -g)}
+    mpm.Simulation(grid, [body], [mpm.Hencky(bulk=1e6, shear=1e6)], conditions=[push], **options)
     assert sum("unit_weight = 9810" in r.getMessage() for r in caplog.records) == said
 
 
@@ -154,9 +153,9 @@ def test_finite_elements_take_the_same_unit_weight():
     for unit in (Units(), units):
         water = unit.fluid(gravity=9.81 * unit.gravity)
         load = mpm.Traction("top", (0, -LOAD * unit.stress))
-        options = {"fixed": {"left": "x", "right": "x", "bottom": "y"}, "drained": [mpm.Drained("top")]}
+        options = {"walls": {"left": "x", "right": "x", "bottom": "y"}, "conditions": [load, mpm.Drained("top")]}
         size = np.array([0.2, 1.0]) * unit.length
-        fem = BiotFEM([0, 0], size, [1, 8], unit.soil(), fluid=water, tractions=[load], **options)
+        fem = BiotFEM([0, 0], size, [1, 8], unit.soil(), fluid=water, **options)
         fem.run(10 * unit.time, 10 * unit.time, probes=[size / 2])
         pressures.append(fem.pressure(np.array([[0.0, 0.0]]))[0] / unit.stress)
     assert pressures[1] == pytest.approx(pressures[0], rel=1e-6)

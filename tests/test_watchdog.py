@@ -42,7 +42,7 @@ def test_a_step_is_shortened_to_where_a_parabola_of_the_squared_residual_is_leas
 def pushed(dim: int = 2) -> mpm.Simulation:
     """Return soft ground, of which a given displacement pushes half of the top, beyond its limit load."""
     n, free = 6, [np.inf] * (dim - 1)
-    grid = mpm.Grid([1.0] * (dim - 1) + [1.25], [n] * (dim - 1) + [n + 2])
+    grid = mpm.Grid([0] * dim, [1.0] * (dim - 1) + [1.25], [n] * (dim - 1) + [n + 2])
     soil = mpm.DruckerPrager(bulk=2e6, shear=1e6, friction=20.0, dilation=0.0, cohesion=1e4, conductivity=1e-7)
     push = [0.0] * (dim - 1) + [-0.02]
     region = ([-np.inf] * dim, [0.45, *free])
@@ -50,8 +50,8 @@ def pushed(dim: int = 2) -> mpm.Simulation:
     walls = {"left": "x", "right": "x", "bottom": "xyz"[:dim]} | ({"front": "y", "back": "y"} if dim == 3 else {})
     body = mpm.box(grid, [0] * dim, [1] * dim)
     drained = mpm.Drained("top", region=([0.5, *[-np.inf] * (dim - 1)], [np.inf] * dim))
-    bodies = {"displacements": [footing], "drained": [drained], "fluid": mpm.Fluid()}
-    return mpm.Simulation(grid, [body], [soil], fixed=walls, **bodies)
+    bodies = {"conditions": [footing, drained], "fluid": mpm.Fluid()}
+    return mpm.Simulation(grid, [body], [soil], walls=walls, **bodies)
 
 
 def test_a_step_goes_on_as_the_last_one_where_soil_flows():
@@ -105,9 +105,9 @@ def test_a_run_resumed_where_soil_flows_ends_with_the_same_bits(tmp_path):
 
 
 def test_bodies_that_do_not_yield_remember_no_velocities():
-    grid = mpm.Grid([1.0, 1.0], [4, 4])
+    grid = mpm.Grid([0, 0], [1.0, 1.0], [4, 4])
     body, load = mpm.box(grid, [0, 0], [0.5, 0.5]), mpm.Traction("top", (0, -1e3))
-    s = mpm.Simulation(grid, [body], [mpm.Hencky(bulk=1e6, shear=1e6)], fixed={"bottom": "xy"}, tractions=[load])
+    s = mpm.Simulation(grid, [body], [mpm.Hencky(bulk=1e6, shear=1e6)], walls={"bottom": "xy"}, conditions=[load])
     s.step(1.0)
     assert s.state.velocity is None
 

@@ -12,7 +12,7 @@ MUD = {"bulk": 2e6, "shear": 1e6, "porosity": 0.4, "conductivity": 1e-5}
 
 def bank(level, h=0.25):
     """Return a block of 1 m in water up to a level, under gravity."""
-    grid = mpm.Grid([3.0, 2.0], [round(3 / h), round(2 / h)])
+    grid = mpm.Grid([0, 0], [3.0, 2.0], [round(3 / h), round(2 / h)])
     body = mpm.box(grid, [1, 0], [2, 1])
     loads, heads = zip(*(mpm.water(side, level) for side in ("left", "right", "top")), strict=True)
     return mpm.Simulation(
@@ -20,9 +20,8 @@ def bank(level, h=0.25):
         [body],
         [mpm.Hencky(grain_density=1000.0, **MUD)],
         fluid=mpm.Fluid(),
-        fixed={"bottom": "xy"},
-        tractions=loads,
-        drained=heads,
+        walls={"bottom": "xy"},
+        conditions=[*loads, *heads],
         gravity=lambda t: (0, -9.81 * min(1.0, t / 10)),
     )
 
@@ -40,7 +39,7 @@ def test_soil_as_heavy_as_water_hardly_moves_in_still_water(h):
 
 
 def test_heavier_soil_under_water_carries_its_weight_less_the_waters():
-    grid = mpm.Grid([0.5, 2.0], [2, 16])
+    grid = mpm.Grid([0, 0], [0.5, 2.0], [2, 16])
     body = mpm.box(grid, [0, 0], [0.5, 1.0])
     load, head = mpm.water("top", 1.5)
     s = mpm.Simulation(
@@ -48,9 +47,8 @@ def test_heavier_soil_under_water_carries_its_weight_less_the_waters():
         [body],
         [mpm.Hencky(grain_density=2650.0, **{**MUD, "bulk": 2e8, "shear": 1e8})],
         fluid=mpm.Fluid(),
-        fixed={"bottom": "y", "left": "x", "right": "x"},
-        tractions=[load],
-        drained=[head],
+        walls={"bottom": "y", "left": "x", "right": "x"},
+        conditions=[load, head],
         gravity=(0, -9.81),
     )
     s.run(2e5, 2e4, progress=False)
@@ -75,7 +73,7 @@ def test_water_that_falls_leaves_a_seepage_face():
 
 def test_water_that_is_not_as_heavy_as_the_pores_is_named(caplog):
     """Sea water in the pores, fresh water on the sides: it sank into the soil, without a word."""
-    grid = mpm.Grid([0.5, 2.0], [2, 8])
+    grid = mpm.Grid([0, 0], [0.5, 2.0], [2, 8])
     cases = [(1000.0, 9810.0, 9.8, 0), (1025.0, 9810.0, 9.81, 2), (1025.0, 10055.0, 9.81, 0)]
     for density, unit_weight, g, named in cases:
         load, head = mpm.water("top", 1.5, unit_weight=unit_weight)
@@ -85,16 +83,15 @@ def test_water_that_is_not_as_heavy_as_the_pores_is_named(caplog):
             [mpm.box(grid, [0, 0], [0.5, 1.0])],
             [mpm.Hencky(**MUD)],
             fluid=mpm.Fluid(density=density),
-            fixed={"bottom": "y", "left": "x", "right": "x"},
-            tractions=[load],
-            drained=[head],
+            walls={"bottom": "y", "left": "x", "right": "x"},
+            conditions=[load, head],
             gravity=(0, -g),
             pressure=mpm.hydrostatic(1.5, unit_weight),
         )
         said = [r.message for r in caplog.records if "unit_weight" in r.message]
         assert len(said) == named, said
     assert not caplog.records
-    s.stage(drained=[mpm.water("top", 1.2, unit_weight=9810.0)[1]])
+    s.stage(conditions=[load, mpm.water("top", 1.2, unit_weight=9810.0)[1]])
     (message,) = (r.message for r in caplog.records)
     assert message.startswith("water at 'top': unit_weight = 9810 N/m^3") and "is 10055.2" in message
 
@@ -110,10 +107,10 @@ def test_water_that_is_not_as_heavy_as_the_pores_is_named(caplog):
 def test_water_that_is_none_is_refused(arguments, said):
     with pytest.raises(ValueError, match=said):
         load, head = mpm.water(**{"side": "top", **arguments})
-        bank_with = {"tractions": [load], "drained": [head]}
-        grid = mpm.Grid([1.0, 1.0], [2, 2])
+        bank_with = {"conditions": [load, head]}
+        grid = mpm.Grid([0, 0], [1.0, 1.0], [2, 2])
         body, soil = mpm.box(grid, [0, 0], [1, 0.5]), mpm.Hencky(**MUD)
-        mpm.Simulation(grid, [body], [soil], fluid=mpm.Fluid(), fixed={"bottom": "xy"}, **bank_with)
+        mpm.Simulation(grid, [body], [soil], fluid=mpm.Fluid(), walls={"bottom": "xy"}, **bank_with)
 
 
 def test_a_level_that_a_function_does_not_give_is_refused_by_its_step():

@@ -67,7 +67,7 @@ def conductivity():
 @family(0.02)
 def time_step():
     """Terzaghi's layer, dt = 1e-9 ... 1e9 s: mean error of the pressures, settlement, exact."""
-    water = {"fluid": INCOMPRESSIBLE, "drained": [mpm.Drained("top")], "load": 1e-5 * M}
+    water = {"fluid": INCOMPRESSIBLE, "conditions": [mpm.Drained("top")], "load": 1e-5 * M}
     for dt in decades(-9, 9):
         yield f"dt = {dt:.0e} s", column(partial(terzaghi, 0.05), (SOIL, 1.0), end=10 * dt, steps=10, **water)
 
@@ -149,7 +149,7 @@ def contrast_of_conductivity():
         for ratio in decades(-8, 8, 1 if cut == 0.5 else 2):
             layers = (SOIL, cut), (soil(conductivity=SOIL.conductivity * ratio), 1.0)
             ends = [mpm.Drained(side, p, ([-inf, y], [inf, y])) for side, p, y in (("bottom", DROP, 0), ("top", 0, 1))]
-            flow = {"h": 1 / 80, "end": 1e15, "fluid": INCOMPRESSIBLE, "drained": ends}
+            flow = {"h": 1 / 80, "end": 1e15, "fluid": INCOMPRESSIBLE, "conditions": ends}
             yield f"{ratio:.0e}, interface {name}", column(partial(series, cut, ratio), *layers, **flow)
 
 
@@ -281,7 +281,7 @@ def weight():
         yield f"beam, {g:g} m/s2", Beam(load=0, weight=g)
     for bulk in (1e6, inf):
         buoyant = -(1 - SOIL.porosity) * (SOIL.grain_density - 1000) * 9.81 / (2 * M)
-        wet = {"fluid": mpm.Fluid(bulk), "drained": [mpm.Drained("top")], "gravity": (0, -9.81)}
+        wet = {"fluid": mpm.Fluid(bulk), "conditions": [mpm.Drained("top")], "gravity": (0, -9.81)}
         yield f"wet, K_w = {bulk:.0e} Pa", column(settled(buoyant), (SOIL, 1.0), end=1e9, steps=5, **wet)
 
 
@@ -294,7 +294,7 @@ def suction():
         def error(s, r, a=a, p=ratio * M):
             return max(off(tip(r)[1], a - 1), off(s.points.pressure, p))
 
-        physics = {"end": 1e9, "room": 30, "fluid": WATER, "drained": [mpm.Drained("top", ratio * M)]}
+        physics = {"end": 1e9, "room": 30, "fluid": WATER, "conditions": [mpm.Drained("top", ratio * M)]}
         yield f"p = {ratio:g} M", column(error if a > 1 - SOIL.porosity else None, (SOIL, 1.0), **physics)
     for p in (-1e3, -1e6):
         S = SOIL.storage(1e6, SOIL.porosity)

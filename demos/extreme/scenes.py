@@ -98,25 +98,26 @@ class Beam:
             return lambda t: turned(np.array([x, y]), self.angle) * min(1.0, t / (self.ramp * self.end))
 
         loads = [mpm.Traction("top", along(0, -self.load)), mpm.Traction("right", along(-self.thrust, 0))]
-        out: dict = {"tractions": loads}
+        out: dict = {"conditions": loads}
         if self.weight:
             out["gravity"] = along(0, -self.weight)
         if self.fluid:
-            out |= {"fluid": self.fluid, "drained": [mpm.Drained(side) for side in self.drained]}
+            out |= {"fluid": self.fluid, "conditions": [*loads, *(mpm.Drained(side) for side in self.drained)]}
         return out
 
     def __call__(self) -> Scene:
         (length, height), (hx, hy) = self.size, self.h
         nx, below, above = ceil(1.2 * length / hx), ceil(length / hy), ceil((1.2 * length + height) / hy)
         left = nx if self.angle else 0
-        grid = mpm.Grid([nx * hx, above * hy], [left + nx, below + above], [-left * hx, -below * hy])
+        grid = mpm.Grid([-left * hx, -below * hy], [nx * hx, above * hy], [left + nx, below + above])
         low = np.array([0.0, self.offset * hy])
         body = mpm.box(grid, low, low + self.size, per_cell=self.per_cell)
         middle = low + np.array([0, height / 2])
-        clamp: dict = {"fixed": {"left": "xy"}}
+        physics = self.physics()
+        acting, walls = physics.pop("conditions"), {"left": "xy"}
         if self.angle:
-            clamp = {"fixed": {}, "displacements": [mpm.Displacement("left", (0, 0))]}
-        s = mpm.Simulation(grid, [body], [self.material], **clamp, **self.physics())
+            acting, walls = [*acting, mpm.Displacement("left", (0, 0))], {}
+        s = mpm.Simulation(grid, [body], [self.material], walls=walls, conditions=acting, **physics)
         place(s, turned(s.points.corners - middle, self.angle) + middle)
         probes = mpm.probes([body], [middle + np.array([length, 0])])
         return Scene(s, self.end, self.steps, lambda s, r: off(turned(tip(r), -self.angle), self.elements()), probes)
@@ -131,7 +132,7 @@ class Beam:
 @cache
 def finite_elements(beam: Beam, element: str) -> np.ndarray:
     """Return the displacement (2,) of the tip."""
-    fem = BiotFEM([0, 0], beam.size, beam.truth, beam.material, fixed={"left": "xy"}, element=element, **beam.physics())
+    fem = BiotFEM([0, 0], beam.size, beam.truth, beam.material, walls={"left": "xy"}, element=element, **beam.physics())
     return tip(fem.run(beam.end, beam.end / beam.steps, probes=[[beam.size[0], beam.size[1] / 2]]))
 
 
@@ -141,14 +142,20 @@ def column(error: Error | None, *layers, h=0.05, end=1.0, steps=1, per_cell=2, l
     def make() -> Scene:
         tops = [0.0, *(top for _, top in layers)]
         cells = ceil(tops[-1] / h - 1e-12) + room
-        grid = mpm.Grid([h, cells * h], [1, cells])
+        grid = mpm.Grid([0, 0], [h, cells * h], [1, cells])
         bodies = [
             mpm.box(grid, [0, low], [h, high], per_cell=per_cell, material=i)
             for i, (low, high) in enumerate(pairwise(tops))
         ]
         walls = {"left": "x", "right": "x", "bottom": "y"}
         loads = [mpm.Traction("top", (0, -load), region=([-inf, tops[-1]], [inf, inf]))]
-        s = mpm.Simulation(grid, bodies, [m for m, _ in layers], fixed=walls, tractions=loads, **physics)
+        s = mpm.Simulation(
+            grid,
+            bodies,
+            [m for m, _ in layers],
+            walls=walls,
+            **physics | {"conditions": [*loads, *physics.get("conditions", [])]},
+        )
         return Scene(s, end, steps, error, mpm.probes(bodies, [[h / 2, tops[-1]]]))
 
     return make
@@ -163,12 +170,19 @@ def square(angle: float, error: Error | None, cells: int = 12, end=1.0, steps=4,
     """Return a square of 0.6 m, turned by an angle (degrees) in the corner of two walls, under 1e5 Pa all around."""
 
     def make() -> Scene:
-        grid = mpm.Grid([1.2, 1.2], [2 * cells, 2 * cells])
+        grid = mpm.Grid([0, 0], [1.2, 1.2], [2 * cells, 2 * cells])
         body = mpm.box(grid, [0, 0], [0.6, 0.6])
         inward = {"left": (1, 0), "right": (-1, 0), "bottom": (0, 1), "top": (0, -1)}
         loads = [mpm.Traction(side, turned(1e5 * np.array(n), angle)) for side, n in inward.items()]
-        water = {"fluid": fluid, "drained": [mpm.Drained(side) for side in drained]} if fluid else {}
-        s = mpm.Simulation(grid, [body], [SOIL], fixed={"left": "x", "bottom": "y"}, tractions=loads, **water)
+        water = {"fluid": fluid, "conditions": [*(mpm.Drained(side) for side in drained)]} if fluid else {}
+        s = mpm.Simulation(
+            grid,
+            [body],
+            [SOIL],
+            walls={"left": "x", "bottom": "y"},
+            conditions=[*loads, *water.pop("conditions", [])],
+            **water,
+        )
         corners = turned(s.points.corners, angle)
         place(s, corners - corners.min(axis=(0, 1)))
         return Scene(s, end, steps, error)

@@ -185,7 +185,7 @@ def mapped(grid: Grid, body: Body, map: Callable[[NDArray[np.float64]], NDArray[
     smallest, where = np.inf, None
     for part in in_chunks(len(bent)):
         corners = bent.corners(part)
-        out = np.flatnonzero(grid.outside(corners.reshape(-1, grid.dim)))
+        out = np.flatnonzero(grid.outside(corners.reshape(-1, grid.dim) - grid.base))
         if len(out):
             x = corners.reshape(-1, grid.dim)[out[0]]
             raise ValueError(
@@ -203,7 +203,7 @@ def check_inside(grid: Grid, body: Body, name: str = "body") -> Body:
     """Return a body; refuse one that is not wholly in the grid.  What a map has bent has been looked at."""
     count, where = 0, None
     for part in in_chunks(len(body) if body.map is None else 0):
-        lower = body.lower_of(part)
+        lower = body.lower_of(part) - grid.base
         out = np.flatnonzero(grid.outside(lower) | grid.outside(lower + body.boxes(part)))
         where = body.centre_of(part)[out[0]] if len(out) and not count else where
         count += len(out)
@@ -236,7 +236,7 @@ def material_points(
     x = centroids(corners)
     n, pressures, refused = len(mine), np.empty(0), ""
     try:
-        pressures = pressure_at(pressure, x)
+        pressures = pressure_at(pressure, x + grid.base)
     except ValueError as error:
         refused = str(error)
     if refused := first(grid.comm, refused):
@@ -258,9 +258,9 @@ def _own(grid: Grid, body: Body) -> tuple[NDArray[np.int64], NDArray[np.float64]
     """Return the domains (m,) whose centroids are in cells of this process, and their corners (m, 2^d, d), m."""
     rows, corners = [np.empty(0, dtype=np.int64)], [np.empty((0, 2**grid.dim, grid.dim))]
     for part in in_chunks(len(body)):
-        of_part = body.corners(part)
+        of_part = body.corners(part) - grid.base
         # of all copies of the grid alike
-        here = np.flatnonzero(grid.owner(grid.number(grid.index(centroids(of_part)))) == grid.comm.rank)
+        here = np.flatnonzero(grid.owner(grid.number(grid.index_from_base(centroids(of_part)))) == grid.comm.rank)
         rows.append(part.start + here)
         corners.append(of_part[here])
     return np.concatenate(rows), np.concatenate(corners)

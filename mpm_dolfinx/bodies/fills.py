@@ -91,7 +91,7 @@ def put(
     ValueError
         What is there has moved into the fill; the message says where and how far.
     """
-    body, corners, misfit = bodies[fill], bodies[fill].corners(), 0.0
+    body, corners, misfit = bodies[fill], bodies[fill].corners() - grid.base, 0.0
     found = {other: _contacts(grid, bodies, other, body, points) for other in there}
     contacts = [contact for one in found.values() for contact in one]
     if any(contact.moved.any() for contact in contacts):
@@ -105,11 +105,11 @@ def put(
     for other, touching in found.items():
         depth, gap, x = _room(grid, bodies, other, corners, points, misfit)
         if depth:
-            what = f"stage: add: body {fill}: body {other} has moved into it, {depth:.3g} m deep at {x}"
+            what = f"stage: add: body {fill}: body {other} has moved into it, {depth:.3g} m deep at {x + grid.base}"
             raise ValueError(f"{what}; must be seeded where nothing is by now")
         together = grid.copies == 1 or np.ptp(grid.copy(np.array([_start(bodies, i) for i in (other, fill)]))) == 0
         if together and not touching:
-            warn_near(grid, f"bodies {other} and {fill}", gap, x)
+            warn_near(grid, f"bodies {other} and {fill}", gap, x + grid.base)
     mine = corners[new.id - _start(bodies, fill)]
     if (mine == new.corners).all():
         return new
@@ -134,7 +134,7 @@ def _contacts(grid: Grid, bodies: Sequence[Body], other: int, fill: Body, points
                 now = np.zeros((len(rows), 2**grid.dim, grid.dim))
                 here, at = points.find(_start(bodies, other) + rows)
                 now[here] = points.corners[at]
-                moved = over_all(grid.comm, now) - bodies[other].corners(rows)
+                moved = over_all(grid.comm, now) - (bodies[other].corners(rows) - grid.base)
                 moved = moved[pair[:, None], around.index[cover.by]]
                 out.append(Contact((axis, end), own, around, cover, moved))
     return out
@@ -158,7 +158,7 @@ def _follow(grid: Grid, body: Body, corners: NDArray[np.float64], contacts: Sequ
         sides[contact.side] = sides.get(contact.side, 0.0) + contact.area()
     axis, end = max(sides, key=sides.get)
     opposite = Faces.of(body, *body.facing(axis, 1 - end, UPRIGHT))
-    fixed = np.minimum(np.abs(x - grid.lower), np.abs(x - grid.upper)) < SAME * grid.h  # along a wall it only slides
+    fixed = np.minimum(np.abs(x - grid.low), np.abs(x - grid.high)) < SAME * grid.h  # along a wall it only slides
     fixed[hits > 0] = True
     fixed[node[opposite.row[:, None], opposite.index]] = True
     K = _springs(body, node, len(nodes))
@@ -208,12 +208,12 @@ def _check_shape(grid: Grid, fill: int, body: Body, corners: NDArray, u: NDArray
     name = f"stage: add: body {fill}: what it was seeded to touch has moved by up to {far:.3g} m"
     if ratio[k] < TANGLED:
         raise ValueError(
-            f"{name}; to its domain at {corners[k].mean(axis=0)} it leaves {ratio[k]:.2g} of the volume, must leave "
-            f"{TANGLED}"
+            f"{name}; to its domain at {corners[k].mean(axis=0) + grid.base} it leaves {ratio[k]:.2g} of the volume, "
+            f"must leave {TANGLED}"
         )
     out = np.flatnonzero(grid.outside(now.reshape(-1, grid.dim), REACH))
     if len(out):
-        x = now.reshape(-1, grid.dim)[out[0]]
+        x = now.reshape(-1, grid.dim)[out[0]] + grid.base
         raise ValueError(f"{name}; following it, it has a corner at {x}, must be inside {grid.lower} to {grid.upper}")
 
 

@@ -147,7 +147,7 @@ def seeded(grid: Grid, mesh: Mesh, part: str | None, per_cell: int, material: in
     cells = mesh.part(part)
     _check_once(mesh, cells, name)
     domains, keys, cell = map(np.concatenate, zip(*_domains(mesh, cells), strict=True))
-    out = np.flatnonzero(grid.outside(domains.reshape(-1, grid.dim)))
+    out = np.flatnonzero(grid.outside(domains.reshape(-1, grid.dim) - grid.base))
     if len(out):
         x = domains.reshape(-1, grid.dim)[out[0]]
         raise ValueError(f"{name}: has a vertex at {x}, must be inside the grid {grid.lower} to {grid.upper}")

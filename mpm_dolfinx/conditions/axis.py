@@ -13,12 +13,12 @@ from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.parallel.messages import warn
 
 
-def with_axis(grid: Grid, fixed: Mapping[str, str]) -> Mapping[str, str]:
+def with_axis(grid: Grid, walls: Mapping[str, str]) -> Mapping[str, str]:
     """Return walls with their components, also that of the axis of revolution, which stays where it is."""
-    left = fixed.get("left", "") if isinstance(fixed, Mapping) else None
+    left = walls.get("left", "") if isinstance(walls, Mapping) else None
     if not grid.has_axis or not isinstance(left, str) or "x" in left:
-        return fixed
-    return {**fixed, "left": "x" + left}
+        return walls
+    return {**walls, "left": "x" + left}
 
 
 def check_axisymmetry(grid: Grid, bodies: Sequence[Body], quadrature: str) -> None:

@@ -85,7 +85,7 @@ class Traction(_Condition):
 class Pressure(_Condition):
     """Pressure on a side of the bodies, wherever it goes: normal to the present surface, per present area.
 
-    Given among the tractions, with which it adds up.  It acts on skeleton and pore fluid together: of water that also
+    It adds up with tractions.  It acts on skeleton and pore fluid together: of water that also
     enters the pores, `Drained` gives the pressure.  Where pressures of one value meet walls that hold the surface's
     ends, or one another all around the body, they have a potential; else the tangent is unsymmetric (LU, FGMRES), and
     nothing tells whether an equilibrium without pore fluid is stable.
@@ -140,6 +140,29 @@ class OnSide(_Condition):
     term: Callable
     region: Region | None = None
     FUNCTIONS: ClassVar[Mapping[str, Sequence[str]]] = {}
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """Term of the user's own in the storage of fluid, in UFL: fluid that wells up or is lost in the bodies.
+
+    Given among the `terms` of the scene, for all of its stages.
+
+    Parameters
+    ----------
+    term
+        Function with a test function q of the pressure, see `user_functions`; positive: volume comes, 1/s.
+    """
+
+    term: Callable
+
+
+def sorted_terms(terms: Sequence[Callable | OnSide | Source]) -> tuple[list[Callable | OnSide], list[Callable]]:
+    """Return the user's terms in the balance of momentum, and those in the storage of fluid."""
+    if isinstance(terms, (str, bytes)) or not isinstance(terms, Sequence):
+        raise ValueError(f"terms = {line(terms)}, must be a list of functions, OnSide and Source")
+    sources = [term.term for term in terms if isinstance(term, Source)]
+    return [term for term in terms if not isinstance(term, Source)], sources
 
 
 @dataclass(frozen=True, eq=False)

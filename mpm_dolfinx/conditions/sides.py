@@ -145,7 +145,7 @@ def everywhere(grid: Grid, ask: Callable[[], NDArray[np.float64]]) -> NDArray[np
 
 def on_side(patches: Patches, points: MaterialPoints) -> Places:
     """Return what gives the places at which functions of the user's are asked on a side."""
-    return lambda name: patches.X if name == "X" else patches.now(points)
+    return lambda name: patches.X if name == "X" else patches.now(points) + patches.base
 
 
 def gathered(grid: Grid, rows: Sequence[tuple], width: int) -> tuple[NDArray, NDArray, NDArray]:

@@ -23,7 +23,7 @@ def water(
     region: Region | None = None,
     unit_weight: float | None = None,
 ) -> tuple[Pressure, Drained]:
-    """Return the two conditions by which still water acts on a side: one of the `tractions`, one of the `drained`.
+    """Return the two conditions by which still water acts on a side: both are to be given.
 
     Below its level it presses on the side and is open to the pores, with the hydrostatic pressure; above, the side is
     a seepage face.  Both follow the side as it moves, from step to step.

@@ -96,7 +96,7 @@ class BodyContact(CellContact):
     def _apart_by(self, unknowns: Unknowns) -> tuple[PETSc.Mat, PETSc.Vec]:
         grid, rows = self.grid, self.rows
         index = np.stack(np.unravel_index(rows.other % grid.cells, tuple(grid.shape)), axis=1)
-        off = (rows.y - grid.lower) / grid.h - index - 0.5
+        off = (rows.y - grid.low) / grid.h - index - 0.5
         other = np.prod(0.5 + off[:, None] * grid.signs, axis=2)
         value = np.concatenate([grid.shape_values(rows.cell, rows.x), -other], axis=1)
         B = self._of_nodes(unknowns, rows.cell, rows.other, value)
@@ -251,7 +251,7 @@ class BodyContact(CellContact):
         Moments count about the origin, with the places of the start of the step.
         """
         rows = self.rows
-        return self.summed(self._signs[rows.number, None] * self.at(unknowns, u).force, rows.x)
+        return self.summed(self._signs[rows.number, None] * self.at(unknowns, u).force, rows.x + self.grid.base)
 
 
 class Following:

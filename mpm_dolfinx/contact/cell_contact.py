@@ -193,7 +193,7 @@ class CellContact:
 
     def touches(self, push: NDArray[np.float64], gap: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return which rows (m,) touch, with pressures (m,), Pa, and gaps (m,), m."""
-        return (push > 0) | (gap <= TOUCH * self._reach)
+        return (push > 0) | (gap <= TOUCH * np.abs([self.grid.lower, self.grid.upper]).max())
 
     def _friction(self, n: NDArray, slip: NDArray, pressure: NDArray, on: NDArray) -> tuple:
         """Return what a `Touch` has from `sticks` on; n, slip : (k, d), normals and means."""
@@ -258,7 +258,7 @@ class CellContact:
         self._rounds[0] += 1
         if self._rounds[0] > ROUNDS:
             worst = np.flatnonzero(off == most)[:1]
-            where = [f"{line(self.contacts[self.number[k]])}: at {x[self.of == k][0]}" for k in worst]
+            where = [f"{line(self.contacts[self.number[k]])}: at {x[self.of == k][0] + self.grid.base}" for k in worst]
             message = f"{''.join(where)} penetrates by {most:.2g} cells: {why}"
             raise NotConverged(first(self.grid.comm, message if where else ""))
         self.pressure[:] = touch.pressure
@@ -270,8 +270,9 @@ class CellContact:
         return 1e-15 * self.stiffness * self.rows.area * self._reach
 
     @property
-    def _reach(self) -> float:
-        return float(np.abs(np.concatenate([self.grid.lower, self.grid.upper])).max())
+    def _reach(self) -> NDArray[np.float64] | float:
+        """Largest coordinate of what gaps are measured from, m; of the rows (m,), or of all."""
+        return self.grid.reach
 
     def summed(self, force: NDArray[np.float64], arm: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return forces and moments (contacts, d + 1) or, in 3D, (contacts, 6), N and N m, of all processes.

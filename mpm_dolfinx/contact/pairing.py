@@ -249,7 +249,7 @@ class Contacts:
     def _under(self, facets: Facets, chosen: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
         """Return the cells (m,) just under places x (m, d) on faces that hold a part of these, else of their facets."""
         grid, inside = self.grid, x - UNDER * self.grid.h.min() * facets.outward[chosen]
-        number = grid.number(grid.index(inside)) + facets.cell[chosen] // grid.cells * grid.cells
+        number = grid.number(grid.index_from_base(inside)) + facets.cell[chosen] // grid.cells * grid.cells
         keys = np.unique(facets.face * len(grid.owners) + facets.cell)
         return np.where(np.isin(facets.face[chosen] * len(grid.owners) + number, keys), number, facets.cell[chosen])
 
@@ -295,7 +295,7 @@ class Contacts:
             deepest = over_all(comm, float(pairs.gap.min(initial=np.inf)), MPI.MIN)
             if deepest < -BEGINS * h:
                 row = pairs.row[pairs.gap == deepest][:1]
-                where = first(comm, "".join(f"{x}" for x in cut.surface(faces).now(points)[row]))
+                where = first(comm, "".join(f"{x}" for x in cut.surface(faces).now(points)[row] + cut.grid.base))
                 return f"{line(contact)}: bodies are {-deepest / h:.3g} cells in each other at {where}"
         return ""
 

@@ -88,6 +88,16 @@ class ToolContact(CellContact):
         self._touch: Latest[ToolTouch] = Latest()
 
     @property
+    def _reaches(self) -> NDArray[np.float64]:
+        """Largest coordinates (tools,), m, of what gaps are measured from: true ones where functions give these."""
+        own = np.array([callable(tool.shape) for tool in self.contacts])
+        return np.where(own, np.abs([self.grid.lower, self.grid.upper]).max(), self.grid.reach)
+
+    @property
+    def _reach(self) -> NDArray[np.float64]:
+        return self._reaches[self.rows.number]
+
+    @property
     def _gone(self) -> NDArray[np.float64]:
         """How far (tools, d), m, loads have pushed them in the step."""
         return (self.pushed.ways - self.pushed.start)[:, None] * self._along
@@ -109,7 +119,7 @@ class ToolContact(CellContact):
                 gap[rows], n[rows] = solid.distance(y), solid.normal(y) @ pose.R.T
                 second[rows] = pose.R @ solid.curvature(y) @ pose.R.T
                 if isinstance(solid, Distance):
-                    _check_distance(tool, x[rows], gap[rows], n[rows], self.grid.h.min())
+                    _check_distance(tool, x[rows] + self.grid.base, gap[rows], n[rows], self.grid.h.min())
 
         everywhere(self.grid, ask)
         return gap, n, second
@@ -148,7 +158,7 @@ class ToolContact(CellContact):
         slope = self.rows.area * touch.stiff * (touch.n * along).sum(axis=1) ** 2
         met = self.summed(touch.force, 0 * touch.x)[:, : self.grid.dim]
         slope = over_all(self.grid.comm, sum_by(of, slope, len(met)))
-        unknown = unknown + ROUNDING * self._reach * slope
+        unknown = unknown + ROUNDING * self._reaches * slope
         goes = self.pushed.go(u, np.einsum("kd,kd->k", met, self._along), slope, unknown)
         self._rounds[0] *= not goes  # of augmentations, which begin anew
         return goes

@@ -92,6 +92,7 @@ class Tools:
                 raise ValueError(f"Tool: direction = {line(tool.direction)}, must be along the axis in axisymmetry")
             if not callable(tool.displacement) and not callable(tool.rotation):
                 self._pose(tool, 0.0)
+        self.tools = tuple(tool.on(grid) for tool in self.tools)
         self.faces = outside() if self.tools else None
         if self.tools:
             sides = 2 * grid.dim
@@ -279,14 +280,14 @@ class Tools:
         inside = everywhere(self.grid, lambda: (tool.solid(h).distance(y) < 0) | (tool.solid(h).distance(end) < 0))
         a, b = everywhere(self.grid, lambda: (tool.solid(h).normal(y[inside]), tool.solid(h).normal(end[inside])))
         turned = x[1][inside][np.einsum("nd,nd->n", a, b) < 0][:1]  # a middle in the tool that comes to its other side
-        if where := first(comm, "".join(np.array2string(place, precision=6) for place in turned)):
+        if where := first(comm, "".join(np.array2string(place, precision=6) for place in turned + self.grid.base)):
             return where
         on = on[~inside]
         while over_all(comm, len(on)):
             at = y[on] + gone[on, None] * along[on]
             gap = everywhere(self.grid, lambda at=at: tool.solid(h).distance(at))
             inside = x[1][on[gap < 0]][:1]
-            if where := first(comm, "".join(np.array2string(place, precision=6) for place in inside)):
+            if where := first(comm, "".join(np.array2string(place, precision=6) for place in inside + self.grid.base)):
                 return where
             gone[on] += np.maximum(gap, STRIDE * h)
             on = on[gone[on] < way[on]]
@@ -297,5 +298,7 @@ class Tools:
         h, pose = self.grid.h.min(), self._pose(tool, t)
         gap = everywhere(self.grid, lambda: tool.solid(h).distance(pose.own(x)))
         deepest = over_all(self.grid.comm, float(gap.min(initial=np.inf)), MPI.MIN)
-        here = np.array2string(x[gap.argmin()], precision=6) if len(gap) and gap.min() == deepest else ""
+        here = (
+            np.array2string(x[gap.argmin()] + self.grid.base, precision=6) if len(gap) and gap.min() == deepest else ""
+        )
         return -deepest / h, first(self.grid.comm, here)

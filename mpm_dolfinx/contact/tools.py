@@ -7,10 +7,10 @@ A shape is a signed distance, m, positive outside of the tool, in the place that
 from __future__ import annotations
 
 from collections.abc import Callable
-from copy import deepcopy
-from dataclasses import dataclass
+from copy import copy, deepcopy
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple, Protocol
+from typing import ClassVar, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -99,6 +99,10 @@ class HalfSpace:
         """Return the second derivatives (m, d, d) of the distance, 1/m."""
         return _flat(y)
 
+    def moved(self, by: NDArray[np.float64]) -> HalfSpace:
+        """Return the shape moved by a vector (d,), m."""
+        return replace(self, point=np.asarray(self.point) + by)
+
 
 @dataclass(frozen=True, eq=False)
 class Ball:
@@ -135,6 +139,10 @@ class Ball:
     def curvature(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the second derivatives (m, d, d) of the distance, 1/m."""
         return _across(y - self.centre)[2]
+
+    def moved(self, by: NDArray[np.float64]) -> Ball:
+        """Return the shape moved by a vector (d,), m."""
+        return replace(self, centre=np.asarray(self.centre) + by)
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,6 +197,10 @@ class Convex:
     def curvature(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the second derivatives (m, d, d) of the distance, 1/m."""
         return _flat(y)
+
+    def moved(self, by: NDArray[np.float64]) -> Convex:
+        """Return the shape moved by a vector (d,), m."""
+        return replace(self, corners=np.asarray(self.corners) + by)
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,16 +259,29 @@ class Cone:
         along = self._axis[:, None] * self._axis / np.where(near_axis, np.inf, r[:, None, None])
         return np.where(near_axis, 0.0, second - along) * np.cos(np.radians(self.angle))
 
+    def moved(self, by: NDArray[np.float64]) -> Cone:
+        """Return the shape moved by a vector (d,), m."""
+        return replace(self, tip=np.asarray(self.tip) + by)
+
 
 @dataclass(frozen=True, eq=False)
 class Distance:
-    """A shape whose signed distance a function of the user's gives; its derivatives are differences over `step`, m."""
+    """A shape whose signed distance a function of the user's gives; its derivatives are differences over `step`, m.
+
+    base : (d,), m — from which places count; of true places the function is asked.  Steps are powers of two, by which
+    no true place is rounded to another one.
+    """
 
     function: Callable[[NDArray[np.float64]], ArrayLike]
     step: float
+    base: NDArray[np.float64] | float = 0.0
 
     def distance(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the signed distances (m,), m."""
+        return self._at(y + self.base)
+
+    def _at(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the signed distances (m,), m, at true places."""
         if not len(y):  # a function need not have an answer for no places
             return np.zeros(0)
         allowed = f"a finite number for each of {len(y)} places (m, {y.shape[1]})"
@@ -265,16 +290,24 @@ class Distance:
 
     def normal(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the gradients (m, d) of the distance."""
-        steps = self.step * np.eye(y.shape[1])
-        slopes = [(self.distance(y + e) - self.distance(y - e)) / (2 * self.step) for e in steps]
+        return self._slopes(y + self.base, _power_of_two(self.step))
+
+    def _slopes(self, y: NDArray[np.float64], step: float) -> NDArray[np.float64]:
+        """Return differences (m, d) of the distance over a step, m, at true places."""
+        slopes = [(self._at(y + e) - self._at(y - e)) / (2 * step) for e in step * np.eye(y.shape[1])]
         return np.stack(slopes, axis=1)
 
     def curvature(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the second derivatives (m, d, d) of the distance, 1/m."""
-        wide = Distance(self.function, 30 * self.step)  # of second differences less is lost in rounding
-        steps = wide.step * np.eye(y.shape[1])
-        slopes = [(wide.normal(y + e) - wide.normal(y - e)) / (2 * wide.step) for e in steps]
+        y, wide = y + self.base, _power_of_two(30 * self.step)  # of second differences less is lost in rounding
+        steps = wide * np.eye(y.shape[1])
+        slopes = [(self._slopes(y + e, wide) - self._slopes(y - e, wide)) / (2 * wide) for e in steps]
         return np.stack(slopes, axis=2)
+
+
+def _power_of_two(x: float) -> float:
+    """Return the power of two next to a number."""
+    return float(2.0 ** np.rint(np.log2(x)))
 
 
 class Pose(NamedTuple):
@@ -286,11 +319,12 @@ class Pose(NamedTuple):
 
     def own(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return places x (m, d) in the frame of the tool."""
-        return (x - self.centre - self.shift) @ self.R + self.centre
+        y = x - self.shift
+        return y + (y - self.centre) @ (self.R - np.eye(len(self.R)))  # what does not turn loses no digits
 
     def put(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return where places y (m, d) of the tool are."""
-        return (y - self.centre) @ self.R.T + self.centre + self.shift
+        return y + self.shift + (y - self.centre) @ (self.R - np.eye(len(self.R))).T
 
 
 @dataclass(frozen=True, eq=False)
@@ -336,6 +370,8 @@ class Tool:
     adhesion: float = 0.0
     load: float | Callable[[float], float] | None = None
     direction: ArrayLike | None = None
+    _base: ClassVar[NDArray[np.float64] | float] = 0.0
+    _moved: ClassVar[Shape | None] = None
 
     def __post_init__(self):
         if not isinstance(self.shape, (HalfSpace, Ball, Convex, Cone)) and not callable(self.shape):
@@ -376,6 +412,13 @@ class Tool:
             raise ValueError(f"Tool: direction = {line(self.direction)}, must have {dim} components as the grid")
         return along
 
+    def on(self, grid: Grid) -> Tool:
+        """Return the tool as places see it that count from the grid's base."""
+        out, base = copy(self), grid.base
+        if base.any():
+            vars(out).update(_base=base, _moved=None if callable(self.shape) else self.shape.moved(-base))
+        return out
+
     @property
     def grips(self) -> bool:
         """Whether the tool resists slip."""
@@ -383,7 +426,7 @@ class Tool:
 
     def solid(self, h: float) -> Shape:
         """Return the shape; h, m: size of a cell."""
-        return Distance(self.shape, 1e-6 * h) if callable(self.shape) else self.shape
+        return Distance(self.shape, 1e-6 * h, self._base) if callable(self.shape) else self._moved or self.shape
 
     def check(self, dim: int) -> None:
         """Refuse a tool of another dimension, or whose motion at the start is none."""
@@ -400,8 +443,8 @@ class Tool:
 
     def _centre(self, dim: int) -> NDArray[np.float64]:
         if self.centre is None:
-            return np.zeros(dim)
-        return numbers("Tool: centre", self.centre, (dim,), allowed=f"{dim} finite coordinates")
+            return np.zeros(dim) - self._base
+        return numbers("Tool: centre", self.centre, (dim,), allowed=f"{dim} finite coordinates") - self._base
 
     def pose(self, t: float, dim: int, way: float = 0.0) -> Pose:
         """Return where the tool is at time t (s), after a load has pushed it by a way, m."""

@@ -81,10 +81,12 @@ def check_held(
     for k in range(1, count + 1):
         if missing[k - 1]:
             places = [p for p in grid.comm.allgather(grid.midpoints[active & (part == k)][:1].tolist()) if p]
-            where = f"the part at [{' '.join(f'{x:.9g}' for x in places[0][0])}]" if count > 1 else "the body"
+            where = (
+                f"the part at [{' '.join(f'{x:.9g}' for x in places[0][0] + grid.base)}]" if count > 1 else "the body"
+            )
             raise ValueError(
-                f"fixed walls: {where} is free to move as a rigid body in {missing[k - 1]} of {len(modes)} ways; "
-                "it must touch walls whose fixed components hold it, have given displacements, or touch tools, or "
+                f"walls: {where} is free to move as a rigid body in {missing[k - 1]} of {len(modes)} ways; "
+                "it must touch walls whose components hold it, have given displacements, or touch tools, or "
                 "other groups that are held"
             )
 

@@ -20,7 +20,7 @@ FEW_WET, SLENDER_WET = 17, 2  # the same of bodies with pore fluid, up to which 
 LOST_WET = 3.0  # share that these lose, times n^2: beams sealed or open at their end, n = 4 to 32, within a third
 
 
-def warn_thin(grid: Grid, bodies: Sequence[Body], fixed: Mapping[str, str], wet: bool) -> None:
+def warn_thin(grid: Grid, bodies: Sequence[Body], walls: Mapping[str, str], wet: bool) -> None:
     """Log a warning for each slender body that is free to bend and has too few points over its thickness.
 
     A law sees one F in a point's domain: n points over the thickness have 1 - 1/n^2 of the bending stiffness, as
@@ -32,7 +32,7 @@ def warn_thin(grid: Grid, bodies: Sequence[Body], fixed: Mapping[str, str], wet:
     for i, body in enumerate(bodies):
         for axis, letter in enumerate("xyz"[: grid.dim]):
             n, spacing = body.across(axis)
-            if spacing > COARSE * grid.h[axis] and n <= few and _bends(grid, bodies, i, axis, fixed, slender):
+            if spacing > COARSE * grid.h[axis] and n <= few and _bends(grid, bodies, i, axis, walls, slender):
                 much = "it carries no moment and creeps"
                 if n > 1:
                     much = f"it bends {1 / (n**2 - 1):.0%} too much"
@@ -42,7 +42,7 @@ def warn_thin(grid: Grid, bodies: Sequence[Body], fixed: Mapping[str, str], wet:
                 warn(grid.comm, what, i, n, "s" if n > 1 else "", letter, grid.h[axis], much)
 
 
-def _bends(grid: Grid, bodies: Sequence[Body], i: int, axis: int, fixed: Mapping[str, str], slender: float) -> bool:
+def _bends(grid: Grid, bodies: Sequence[Body], i: int, axis: int, walls: Mapping[str, str], slender: float) -> bool:
     """Whether a body is slender across an axis, and neither a wall nor another body holds it from that side."""
     body = bodies[i]
     size = body.bounds[1] - body.bounds[0]
@@ -51,7 +51,7 @@ def _bends(grid: Grid, bodies: Sequence[Body], i: int, axis: int, fixed: Mapping
     for name in (name for name, (a, _) in SIDES[grid.dim].items() if a == axis):
         end = SIDES[grid.dim][name][1]
         wall = (grid.lower, grid.upper)[end][axis]
-        if "xyz"[axis] in fixed.get(name, "") and np.abs(body.bounds[end][axis] - wall) < SAME * grid.h[axis]:
+        if "xyz"[axis] in walls.get(name, "") and np.abs(body.bounds[end][axis] - wall) < SAME * grid.h[axis]:
             return False
         own = Faces.of(body, *body.facing(axis, end))
         others = (Faces.around(other) for other in bodies if other is not body)

@@ -51,6 +51,8 @@ class Patches:
         self._faces, self.here, self.at, self._xi = faces, here, at, xi
         self.cell, self.x, self._grid = cell, x, grid
         self._share0 = share * faces.area0[here]
+        self.base = grid.base
+        """From which places count, see `Grid`."""
         around = grid.around(interpolate(faces.domain[here], xi)) if grid.axisymmetric else 1.0
         self.area0 = self._share0 * around
         """Reference areas (n,), m^(d-1)."""
@@ -222,7 +224,7 @@ class CutDomains(Keyed):
     def _filled_cell(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
         """Return the cells (m,) of positions in domains; where no piece of the domain lies, of its largest piece."""
         pieces, cells = self.pieces, len(self.grid.owners)
-        cell = self.grid.number(self.grid.index(x)) + self.grid.copy(self.points.id[at])
+        cell = self.grid.number(self.grid.index_from_base(x)) + self.grid.copy(self.points.id[at])
         key, keys = at * cells + cell, pieces.point * cells + pieces.cell
         if not len(key):
             return cell
@@ -240,7 +242,7 @@ class CutDomains(Keyed):
 
 def whole_points(grid: Grid, x: NDArray[np.float64]) -> Pieces:
     """Return one piece a point, at the point; a cell that holds points has open faces."""
-    n, number = len(x), grid.number(grid.index(x))
+    n, number = len(x), grid.number(grid.index_from_base(x))
     _, cell, count = np.unique(number, return_inverse=True, return_counts=True)
     share = (grid.cell_volume / grid.h) / count[cell][:, None]
     return Pieces(np.arange(n), number, np.ones(n), x.copy(), np.stack([share, share], axis=2), np.zeros((n, 0)))

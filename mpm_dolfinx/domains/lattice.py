@@ -209,7 +209,7 @@ def given(
         out[rows] = lattice.given(points.id[rows])
     for name, axes in walls.items():
         axis, end = SIDES[grid.dim][name]
-        at_wall = np.abs(points.corners[:, :, axis] - (grid.lower, grid.upper)[end][axis]) < NEAR * grid.h[axis]
+        at_wall = np.abs(points.corners[:, :, axis] - (grid.low, grid.high)[end][axis]) < NEAR * grid.h[axis]
         for letter in axes:
             out[:, :, "xyz".index(letter)] |= at_wall
     return out

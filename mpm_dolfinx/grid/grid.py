@@ -35,6 +35,7 @@ CHUNK = 2**14
 """Rows that are worked on at a time: no temporary holds one for each point of a large body."""
 MOST = 2**31 - 1
 """Unknowns that PETSc's numbers of 32 bits count."""
+ORDER = "the order is Grid(lower, upper, cells)"
 
 
 def side(name: str, dim: int) -> tuple[int, int]:
@@ -70,9 +71,10 @@ class Cells:
     """The cells of a grid that this process has, ghosts included, as the mesh numbers them; complete when made.
 
     num_owned, num_local: number of cells without and with ghosts; cell_nodes (cells, 2^d): their nodes, numbered as
-    the Q1 degrees of freedom; node_x (nodes, d), midpoints (cells, d): positions, m; signs (2^d, d): on which side of
-    the midpoint a node lies; cell_number (cells,): lexicographic numbers; locals: the way back, -1 where there is none;
-    owners: ranks of all cells, copy by copy; cell_facets (cells, 2d); facet_cells (facets, 2): -1 where there is none.
+    the Q1 degrees of freedom; node_x (nodes, d), midpoints (cells, d): places from the grid's base, m; signs
+    (2^d, d): on which side of the midpoint a node lies; cell_number (cells,): lexicographic numbers; locals: the way
+    back, -1 where there is none; owners: ranks of all cells, copy by copy; cell_facets (cells, 2d); facet_cells
+    (facets, 2): -1 where there is none.
     """
 
     def __init__(self, grid: Grid, mesh: Any, owners: NDArray[np.int32]):
@@ -86,7 +88,7 @@ class Cells:
         # all cells list their vertices in the same order (tested), so one set of signs serves all, also a process
         # without a cell: it compiles the same forms
         self.signs = np.concatenate(grid.comm.allgather(np.sign(corners[:1] - self.midpoints[:1, None])))[0]
-        self.cell_number = grid.number(np.floor((self.midpoints - grid.lower) / grid.h).astype(np.int64))
+        self.cell_number = grid.number(np.floor((self.midpoints - grid.low) / grid.h).astype(np.int64))
         if grid.copies > 1:
             brought = np.concatenate(grid.comm.allgather(np.flatnonzero(owners == grid.comm.rank)))
             self.cell_number = brought[np.asarray(mesh.topology.original_cell_index)]
@@ -117,17 +119,15 @@ def of_cells(name: str) -> property:
 class Grid:
     """Background grid of equal cells over the box [lower, upper].
 
-    Bodies must stay in it; what is empty of it costs next to nothing.  Its sides are the walls that `fixed` names:
+    Bodies must stay in it; what is empty of it costs next to nothing.  Its sides are the walls of a scene:
     "left", "right" (x), "bottom", "top" (y in 2D, z in 3D), in 3D also "front", "back" (y).
 
     Parameters
     ----------
-    upper : (d,), m
-        Upper corner; d = 2 (plane strain) or 3.
+    lower, upper : (d,), m
+        Lower and upper corner; d = 2 (plane strain) or 3.
     cells : (d,)
         Number of cells along each axis, at least 1.
-    lower : (d,), m
-        Lower corner, by default the origin.
     comm
         Processes that share the grid.
     axisymmetric
@@ -147,35 +147,38 @@ class Grid:
         d; cells along each axis (d,); their edges (d,), m; corners (d,), m.
     snap
         Distance to a grid plane, along each axis (d,), below which a vertex is taken to lie on it, cells.
+    base, low, high
+        Place (d,), m, from which all places count that are kept of bodies on the grid, so that none of their digits are
+        lost far from the origin: the lower corner, but for a radius; and the corners, counted from there.
     stretches
         Number of axes of deformation gradients: d, in axisymmetry 3, the third one that of the hoops.
     mesh
-        The dolfinx mesh; made when first it is needed.  On several processes a second scene whose points lie elsewhere
-        has a grid with a mesh of its own, `Simulation.grid`; not one with terms or sources, which may be made on this.
+        The dolfinx mesh, of coordinates that count from `base`; made when first it is needed.  On several processes a
+        second scene whose points lie elsewhere has a grid with a mesh of its own, `Simulation.grid`; not one with terms
+        or sources, which may be made on this.
     """
 
     def __init__(
         self,
+        lower: ArrayLike,
         upper: ArrayLike,
         cells: Sequence[int],
-        lower: ArrayLike | None = None,
         comm: MPI.Intracomm = MPI.COMM_WORLD,
         *,
         axisymmetric: bool = False,
     ):
-        self.upper = numbers("grid: upper", upper, (2,), (3,), allowed="2 or 3 finite coordinates")
-        self.dim = d = self.upper.size
-        lower = np.zeros(d) if lower is None else lower
-        self.lower = numbers("grid: lower", lower, (d,), allowed=f"{d} finite coordinates")
+        self.lower = numbers("grid: lower", lower, (2,), (3,), allowed="2 or 3 finite coordinates")
+        self.dim = d = self.lower.size
+        self.upper = numbers("grid: upper", upper, (d,), allowed=f"{d} finite coordinates, as lower")
         if not (self.upper > self.lower).all():
-            raise ValueError(f"grid: upper = {line(upper)}, must be > lower = {line(lower)}")
+            raise ValueError(f"grid: upper = {line(upper)}, must be > lower = {line(lower)}; {ORDER}")
         flag("grid: axisymmetric", axisymmetric)
         if axisymmetric and (d != 2 or self.lower[0] < 0):
             what = f"lower = {line(lower)}, must begin at a radius >= 0" if d == 2 else f"{d} coordinates, must have 2"
             raise ValueError(f"grid: axisymmetric = True: {what}")
         self.axisymmetric, self.stretches = axisymmetric, 3 if axisymmetric else d
         count = numbers(
-            "grid: cells", cells, (d,), allowed=f"{d} integers >= 1", test=lambda n: (n >= 1) & (n % 1 == 0)
+            "grid: cells", cells, (d,), allowed=f"{d} integers >= 1; {ORDER}", test=lambda n: (n >= 1) & (n % 1 == 0)
         )
         instance("grid: comm", comm, MPI.Comm)
         self.shape = count.astype(np.int64)
@@ -184,6 +187,8 @@ class Grid:
                 f"grid: cells = {line(cells)}: has {np.prod(count + 1):.3g} nodes, must be below {MOST // d}"
             )
         self.h = (self.upper - self.lower) / self.shape
+        self.base = self.lower * [not axisymmetric, *[True] * (d - 1)]
+        self.low, self.high = self.lower - self.base, self.upper - self.base
         self.snap = np.maximum(SNAP, [rounding(ends) for ends in zip(self.lower, self.upper, strict=True)] / self.h)
         self.comm = comm
         self._cells: Cells | None = None
@@ -228,7 +233,7 @@ class Grid:
         if self._cells is None:
             self._cells = self._made(owner)
         elif not keep and (self.owners[: self.cells] != owner.ravel()).any():  # of an earlier scene
-            other = Grid(self.upper, self.shape, self.lower, self.comm, axisymmetric=self.axisymmetric)
+            other = Grid(self.lower, self.upper, self.shape, self.comm, axisymmetric=self.axisymmetric)
             other._cells = other._made(owner)
             return other
         return self
@@ -254,7 +259,7 @@ class Grid:
         count = self.copies * self.nodes
         start, stop = (count * (self.comm.rank + end) // self.comm.size for end in (0, 1))
         index = np.stack(np.unravel_index(np.arange(start, stop) % self.nodes, self.shape + 1), axis=-1)
-        return self.lower + index * self.h
+        return self.low + index * self.h
 
     @property
     def copies(self) -> int:
@@ -289,6 +294,11 @@ class Grid:
         return float(np.prod(self.h))
 
     @property
+    def reach(self) -> float:
+        """Largest coordinate of a place that is kept of bodies on the grid, m."""
+        return float(np.abs([self.low, self.high]).max())
+
+    @property
     def has_axis(self) -> bool:
         """Whether its side "left" is the axis of revolution."""
         return self.axisymmetric and bool(self.lower[0] <= SAME * self.h[0])
@@ -302,8 +312,12 @@ class Grid:
         return np.ravel_multi_index(tuple(index.T), tuple(self.shape))
 
     def index(self, x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the (n, d) indices of the cells that hold points, clamped into the grid."""
-        i = np.floor((x - self.lower) / self.h).astype(np.int64)
+        """Return the (n, d) indices of the cells that hold true places (n, d), m, clamped into the grid."""
+        return self.index_from_base(x - self.base)
+
+    def index_from_base(self, x: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Return the same of places that count from the base."""
+        i = np.floor((x - self.low) / self.h).astype(np.int64)
         return np.clip(i, 0, self.shape - 1, out=i)
 
     def owner(self, number: NDArray[np.int64]) -> NDArray[np.int32]:
@@ -319,7 +333,7 @@ class Grid:
         copy = np.zeros(len(self.node_x), dtype=np.int64)
         if self.copies > 1:
             copy[self.cell_nodes] = (self.cell_number // self.cells)[:, None]
-        index = np.rint((self.node_x[nodes] - self.lower) / self.h).astype(np.int64)
+        index = np.rint((self.node_x[nodes] - self.low) / self.h).astype(np.int64)
         return np.column_stack([index, copy[nodes]])
 
     def cell_places(self, cells: NDArray[np.integer]) -> NDArray[np.int64]:
@@ -338,11 +352,11 @@ class Grid:
         return out
 
     def outside(self, x: NDArray[np.float64], tolerance: float = SAME) -> NDArray[np.bool_]:
-        """Return which points lie outside the grid by more than `tolerance` cells, and what is lost in rounding."""
+        """Return which places, from the base, lie outside the grid by more than `tolerance` cells, and by rounding."""
         tolerance = tolerance + rounding(np.stack([self.lower, self.upper])) / self.h
         inside = np.ones(len(x), dtype=bool)
         for a in range(self.dim):
-            y = (x[:, a] - self.lower[a]) / self.h[a]
+            y = (x[:, a] - self.low[a]) / self.h[a]
             inside &= (y >= -tolerance[a]) & (y <= self.shape[a] + tolerance[a])
         return ~inside  # nan is outside as well
 
@@ -400,7 +414,7 @@ class Grid:
     def wall_nodes(self, name: str) -> NDArray[np.bool_]:
         """Return which nodes lie on a side of the box."""
         axis, end = side(name, self.dim)
-        plane = (self.lower, self.upper)[end][axis]
+        plane = (self.low, self.high)[end][axis]
         return np.abs(self.node_x[:, axis] - plane) < NEAR * self.h[axis]
 
 
@@ -418,7 +432,7 @@ class GridOfGroups(Grid):
     """
 
     def __init__(self, grid: Grid, group: NDArray[np.int64]):
-        super().__init__(grid.upper, grid.shape, grid.lower, grid.comm)
+        super().__init__(grid.lower, grid.upper, grid.shape, grid.comm)
         self._group, self._copies = group.astype(np.int16), int(group.max()) + 1
         if self.dim * self.copies * self.nodes > MOST:
             what = f"grid: has {self.nodes:.3g} nodes for each of {self.copies} groups"

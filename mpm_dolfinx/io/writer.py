@@ -15,7 +15,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import IO, Any
+from typing import Any, ClassVar
+from weakref import WeakValueDictionary, finalize
 from xml.etree import ElementTree
 
 from mpi4py import MPI
@@ -26,6 +27,7 @@ from dolfinx import fem, io
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.validation import flag, instance, line_of, on_disk, path, whole
+from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.io.units import text
 from mpm_dolfinx.parallel.exchange import at_root, to_root
 from mpm_dolfinx.points.material_points import MaterialPoints
@@ -59,6 +61,8 @@ class Writer:
     What the folder holds up to the present time stays, and is continued: made after `resume`, a writer leaves
     the files of a run that was never interrupted.
 
+    A writer locks its folder against other processes until `close`, the end of its context, or its own end.
+
     Parameters
     ----------
     simulation
@@ -74,7 +78,7 @@ class Writer:
     ------
     ValueError
         An argument of another kind, files in the folder that no writer has written or of other columns, a run of
-        another simulation or one that does not go on from where the writer was made.
+        another simulation or one that does not go on from where the writer was made, a writer that is closed.
     OSError
         A folder that cannot be written, a disk that is full: `simulation.run(..., after=simulation.result)` goes on.
     """
@@ -84,10 +88,13 @@ class Writer:
         flag("writer: grid", grid)
         folder, comm, self._t = path("writer: folder", folder), simulation.grid.comm, simulation.t
         self.every, self._simulation = whole("writer: every", every), simulation
+        self.closed = False
+        """Whether the writer has released its folder."""
         tools = simulation.state.stage.conditions["tools"]
         self._acting = simulation.reactions, simulation.outflows, simulation.tool_forces  # at the start
         with on_disk("writer: folder", "one that can be written"):
-            at_root(comm, lambda: _lock(folder))
+            self._lock: Lock | None = None
+            at_root(comm, lambda: self._hold(folder))
             self._table = Table(comm, folder / "history.csv", self._t)
             self._points = Series(comm, folder / "points.pvd", self._t)
             self._grid = Series(comm, folder / "grid.pvd", self._t) if grid else None
@@ -96,8 +103,23 @@ class Writer:
             if not self._points.entries:
                 self._write_points(simulation)
 
+    def __enter__(self) -> Writer:
+        return self
+
+    def __exit__(self, *error) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Release the folder to other processes; all that was written is whole.  A second call does nothing."""
+        self._lock, self.closed = None, True
+
+    def _hold(self, folder: Path) -> None:
+        self._lock = Lock.of(folder)
+
     def __call__(self, simulation: Simulation) -> None:
         """Write a row of the histories and, in its turn, the present state."""
+        if self.closed:
+            raise ValueError(f"writer: {self._points.file.parent} is closed, must be open while the run goes on")
         if simulation is not self._simulation:
             raise ValueError("writer: made for another simulation, must be made for the one that runs")
         with on_disk(f"{self._points.file.parent}: writer at t = {simulation.t:g} s", WRITABLE):
@@ -150,7 +172,8 @@ class Writer:
 
     def _write_grid(self, simulation: Simulation) -> None:
         comm, stem = simulation.grid.comm, self._grid.next
-        _write_fields(comm, stem.with_suffix(".pvd"), _grid_fields(simulation), simulation.t)
+        with _true_places(simulation.grid):
+            _write_fields(comm, stem.with_suffix(".pvd"), _grid_fields(simulation), simulation.t)
         if comm.rank == 0:  # our index names the pieces themselves: 0.5's own names each of them once a function
             stem.with_suffix(".pvd").unlink(missing_ok=True)
             stem.with_name(f"{stem.name}000000.pvtu").unlink(missing_ok=True)
@@ -170,22 +193,29 @@ def _write_tools(simulation: Simulation, file: Path) -> None:
         _cells(np.concatenate(corners), {"tool": number, "force": forces[number]}).write(part, file_format="vtu")
 
 
-_LOCKS: dict[Path, IO] = {}  # of the folders that this process writes into, for as long as it lives
+class Lock:
+    """A folder that this process alone writes into, for as long as any of its writers holds the lock."""
 
+    _held: ClassVar[WeakValueDictionary[Path, Lock]] = WeakValueDictionary()
 
-def _lock(folder: Path) -> None:
-    """Refuse a folder that another process writes into, with a ValueError."""
-    folder.mkdir(parents=True, exist_ok=True)
-    file = folder.resolve() / ".lock"
-    if file not in _LOCKS:
-        handle = open(file, "w")
+    def __init__(self, folder: Path):
+        file = open(folder / ".lock", "w")
+        finalize(self, file.close)
         try:
-            fcntl.lockf(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except (BlockingIOError, PermissionError) as error:
-            raise ValueError(
-                f"writer: folder = {folder}: another run writes into it, must be one of its own"
-            ) from error
-        _LOCKS[file] = handle
+            what = f"writer: folder = {folder}: another run writes into it, must be one of its own"
+            raise ValueError(what) from error
+
+    @classmethod
+    def of(cls, folder: Path) -> Lock:
+        """Return the lock of a folder, which is made if it is not there; ValueError where another process has it."""
+        folder.mkdir(parents=True, exist_ok=True)
+        folder = folder.resolve()
+        lock = cls._held.get(folder)
+        if lock is None:
+            lock = cls._held[folder] = cls(folder)
+        return lock
 
 
 def _row(
@@ -279,6 +309,18 @@ def _grid_fields(simulation: Simulation) -> list[fem.Function]:
         out[-1].x.array[cells.cell] = rows
         out[-1].x.scatter_forward()
     return out
+
+
+@contextmanager
+def _true_places(grid: Grid) -> Iterator[None]:
+    """Give the mesh of a grid the true places of its nodes, for as long as it is written."""
+    x = grid.mesh.geometry.x
+    own = x.copy()
+    x[:, : grid.dim] += grid.base
+    try:
+        yield
+    finally:
+        x[:] = own
 
 
 def _write_fields(comm: MPI.Intracomm, file: Path, fields: list[fem.Function], t: float) -> None:

@@ -77,7 +77,7 @@ class LawAtPoints:
     ) -> PointData:
         """Return some of the material points, with values (n, ...) of F and of what the law takes."""
         x = points.x[rows]
-        cells = self.grid.local(self.grid.number(self.grid.index(x)))
+        cells = self.grid.local(self.grid.number(self.grid.index_from_base(x)))
         taken = {name: values[name][rows] for name in ("F", *self._shapes)}
         return self.points.at(cells, x, points.volume0[rows], **taken)
 
@@ -256,7 +256,7 @@ class ConductivityAtPieces:
             chosen = np.isin(material, rows)
             out[chosen] = k.evaluate(data)[chosen]
             bad = np.flatnonzero(chosen & ~((out >= 0) & (out < np.inf)))[:1]
-            shown = [f"k = {out[i]:g} at {data.x[i]}" for i in bad]
+            shown = [f"k = {out[i]:g} at {data.x[i] + data.points.grid.base}" for i in bad]
             if where := first(self._points.grid.comm, "".join(shown)):
                 kind = ValueError if begins else NotConverged
                 raise kind(f"conductivity law: {where}, must be >= 0 and finite")

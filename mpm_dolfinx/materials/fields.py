@@ -378,7 +378,11 @@ class SceneMaterials:
         placed = self._placed(points)
         new = [(law.law, rows, name, v) for law, rows, at in placed for name, v in law.new_state(at, dt)]
         bad = [(law, name, rows[~_finite(values)]) for law, rows, name, values in new]
-        shown = [f"{law.__name__}.update: {name!r} is not finite at {points.x[i[0]]}" for law, name, i in bad if len(i)]
+        shown = [
+            f"{law.__name__}.update: {name!r} is not finite at {points.x[i[0]] + self.grid.base}"
+            for law, name, i in bad
+            if len(i)
+        ]
         if message := first(self.grid.comm, "".join(shown[:1])):
             raise NotConverged(message)
         out = {name: values.copy() if name in self.state_names else values for name, values in points.data.items()}

@@ -152,12 +152,13 @@ class InitialStresses:
         if not self.given:
             return points
         target, rows, refused = np.zeros((len(points), 3, 3)), np.zeros(len(points), dtype=bool), ""
+        placed = points.placed(materials.grid.base)
         above = self._above(materials, points, present, gravity)
         try:
             for body, stress in self.given.items():
                 own = (points.id >= self._start[body]) & (points.id < self._start[body + 1])
                 if own.any():
-                    target[own] = self._at(stress, body, points.map(lambda v, own=own: v[own]), [a[own] for a in above])
+                    target[own] = self._at(stress, body, placed.map(lambda v, own=own: v[own]), [a[own] for a in above])
                 rows |= own
         except ValueError as error:
             refused = str(error)
@@ -204,8 +205,9 @@ class InitialStresses:
         total = over_all(materials.grid.comm, total)
         here = np.repeat(present, [len(body) for body in self._bodies])
         corners = np.concatenate([body.corners() for body, there in zip(self._bodies, present, strict=True) if there])
-        weight, surface = overburden(corners, -gravity[-1] * total[here], points.x)
-        return [weight, surface, materials.table(points, lambda m: m.biot) * points.pressure]
+        base = materials.grid.base
+        weight, surface = overburden(corners - base, -gravity[-1] * total[here], points.x)
+        return [weight, surface + base[-1], materials.table(points, lambda m: m.biot) * points.pressure]
 
 
 def stressed(
@@ -223,7 +225,7 @@ def stressed(
     comm, rows, law = materials.grid.comm, np.flatnonzero(chosen), materials.law_of(points)
     part, target = points.map(lambda values: values[rows]), target[rows]
     given = np.isin(law[rows], [k for k, one in enumerate(materials.laws) if issubclass(one, ModifiedCamClay)])
-    if message := first(comm, _no_constants(part, target, given)):
+    if message := first(comm, _no_constants(part.placed(materials.grid.base), target, given)):
         raise ValueError(message)
     if given.any():
         normal, kappa = np.diagonal(target, axis1=1, axis2=2), materials.table(part, _kappa)
@@ -389,4 +391,4 @@ def _not_borne(materials: SceneMaterials, points: MaterialPoints, target: NDArra
     allowed = f"what {name} can bear: inside its yield surface"
     tension = np.trace(target[i]) > 0  # pores press by more than the weight above
     more = "; of open water above it K0 takes the weight as surcharge" if tension and points.pressure[i] > 0 else ""
-    return f"initial_stress at {points.x[i]}: {target[i].tolist()} Pa, must be {allowed}{more}"
+    return f"initial_stress at {points.x[i] + materials.grid.base}: {target[i].tolist()} Pa, must be {allowed}{more}"

@@ -220,7 +220,7 @@ class _Equations:
 
     def _refuse(self, data: PointData, lost: NDArray[np.int64], why: str) -> None:
         """Raise NotConverged, naming the first point that is lost on any process; all of them together."""
-        shown = [f"{self._law.__name__}{why} at {data.x[i]}" for i in lost[:1]]
+        shown = [f"{self._law.__name__}{why} at {data.x[i] + data.points.grid.base}" for i in lost[:1]]
         if message := first(self._grid.comm, "".join(shown)):
             raise NotConverged(message)
 

@@ -198,7 +198,7 @@ class HeldCells:
         if not suspected:
             return []
         mine = np.isin(self.number[row], suspected)
-        node = np.rint((grid.node_x[grid.cell_nodes[self.cell[row[mine]]]] - grid.lower) / grid.h)
+        node = np.rint((grid.node_x[grid.cell_nodes[self.cell[row[mine]]]] - grid.low) / grid.h)
         columns = (self.number[row[mine]], axis[mine], force[mine], limit[mine], node, self.shape[row[mine]])
         rows = (*columns, self.x[row[mine]])
         number, axis, force, limit, node, N, x = map(np.concatenate, zip(*comm.allgather(rows), strict=True))

@@ -293,8 +293,9 @@ class MechanicalBoundary:
             *rows, wrong = held.rows(axis, given, self._free[:, axis])
             placed.append((*rows, np.tile(np.eye(d)[axis], (len(rows[0]), 1))))
             if wrong >= 0:
-                what = f"{line(self.holds[held.number[wrong]][0])}: moves {'xyz'[axis]} at {held.x[wrong]}"
-                message = f"{what}, where a fixed wall holds it; must be 0 there, or the wall must leave it free"
+                hold, x = self.holds[held.number[wrong]][0], held.x[wrong] + self.grid.base
+                what = f"{line(hold)}: moves {'xyz'[axis]} at {x}"
+                message = f"{what}, where a wall holds it; must be 0 there, or the wall must leave it free"
         if message := first(comm, message):
             raise ValueError(message)
         row, stiffness, gap, own, direction = map(np.concatenate, zip(*placed, strict=True))
@@ -360,7 +361,7 @@ class MechanicalBoundary:
             self._warned.add(number)
             why = "its reaction is an artefact; does something else hold it, or is the step too large?"
             what = "%s: not where it is to be at %s: %s"
-            warn(self.grid.comm, what, line(self.holds[number][0]), x, why)
+            warn(self.grid.comm, what, line(self.holds[number][0]), x + self.grid.base, why)
 
     def under_held(
         self, ids: NDArray[np.int64], tracked: NDArray[np.float64], volume: NDArray[np.float64], corners: NDArray

@@ -330,7 +330,7 @@ class MomentumSystem:
         """Whether laws yield or hardly change their volume."""
         owned = nodes[nodes < forms.u.function_space.dofmap.index_map.size_local]
         self.touched = (owned[:, None] * d + np.arange(d)).ravel()
-        """Where forces may act, fixed or not."""
+        """Where forces may act, held by walls or not."""
         self.parts, comm = parts, forms.grid.comm
         self.of_parts, self._touched = (
             OfParts(comm, parts.nodes[at // d], parts.count) for at in (self.unknowns.owned, self.touched)
@@ -559,7 +559,7 @@ class MomentumProblem:
             told = parts.norms(np.where(size > 0, size / np.maximum(scales[parts.of], least), 0.0))
         return counts, relative(told, np.ones(parts.count))
 
-    def wall_forces(self, fixed: Mapping[str, str]) -> NDArray[np.float64]:
+    def wall_forces(self, walls: Mapping[str, str]) -> NDArray[np.float64]:
         """Return the forces (2 d, d), N, of the walls at u, where the residual was last assembled."""
         system, forces = self.system, self.system.held_residual.copy()
         system.held_penalty.multAdd(system.step, forces, forces)
@@ -569,7 +569,7 @@ class MomentumProblem:
         if self._sides.holds is not None:  # what given sides count of their own
             pulled, own = self._sides.pulled(self.forms.nodal)
             dofs, forces = np.concatenate([dofs, pulled]), np.concatenate([forces, -own])
-        return wall_forces(self.forms.grid, fixed, dofs, forces)
+        return wall_forces(self.forms.grid, walls, dofs, forces)
 
     def assemble_tangent(
         self, data: QuadratureData | None = None, firmness: NDArray[np.float64] | float = 0.0

@@ -204,7 +204,7 @@ class QuadraturePoints:
         """Return what differs from piece to piece of a point, where functions of the user's may ask for it."""
         fields = {}
         if self._extended or self.varies:
-            fields["position"] = cut.pieces.x
+            fields["position"] = cut.pieces.x + cut.grid.base
         if self._extended:
             fields["displacement"] = cut.total_displacement(points)
         return {name: cut.pieces_to_cells(values) for name, values in fields.items()}

@@ -12,7 +12,7 @@ from mpm_dolfinx.grid.grid import SIDES, Grid, sum_by
 
 
 def wall_forces(
-    grid: Grid, fixed: Mapping[str, str], dofs: NDArray[np.int64], forces: NDArray[np.float64]
+    grid: Grid, walls: Mapping[str, str], dofs: NDArray[np.int64], forces: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return the forces (2 d, d), N, of all walls in the order of `SIDES`; on several processes all call it together.
 
@@ -21,7 +21,7 @@ def wall_forces(
 
     Parameters
     ----------
-    fixed
+    walls
         Walls with the components that they hold.
     dofs : (n,)
         Unrolled local degrees of freedom, each once or more often; of those that no wall holds forces do not count.
@@ -30,11 +30,11 @@ def wall_forces(
     """
     d, sides = grid.dim, SIDES[grid.dim]
     node, component = np.divmod(dofs, d)
-    place, letter = np.rint((grid.node_x[node] - grid.lower) / grid.h), np.array(list("xyz"))[component]
+    place, letter = np.rint((grid.node_x[node] - grid.low) / grid.h), np.array(list("xyz"))[component]
     across = np.array([component == axis for axis, _ in sides.values()])
     holds = np.array(
         [
-            (place[:, axis] == end * grid.shape[axis]) & np.isin(letter, list(fixed.get(name, "")))
+            (place[:, axis] == end * grid.shape[axis]) & np.isin(letter, list(walls.get(name, "")))
             for name, (axis, end) in sides.items()
         ]
     )

@@ -204,7 +204,7 @@ def cut(grid: Grid, corners: NDArray[np.float64]) -> Pieces:
 
 
 def _cut(grid: Grid, corners: NDArray[np.float64]) -> Pieces:
-    d, true = grid.dim, np.ascontiguousarray(((corners - grid.lower) / grid.h).transpose(1, 2, 0))
+    d, true = grid.dim, np.ascontiguousarray(((corners - grid.low) / grid.h).transpose(1, 2, 0))
     nearest = np.rint(true)
     y = np.where(np.abs(true - nearest) < grid.snap[:, None], nearest, true)
     v = vertices(y)
@@ -334,7 +334,7 @@ def _sum(
         products = area[0] / 24 * (x0**2 * (3 * x[0, 1] + x[1, 1]) + x1**2 * (x[0, 1] + 3 * x[1, 1]))
         products = total(products + area[0] / 12 * x0 * x1 * sums[1])
         products += slots.beyond(total(area[0] * sums[1] / 2), 0) / 2
-        area[1] *= grid.lower[0] + grid.h[0] * s[:, 0].mean(axis=0)  # sections across the axis are rings too
+        area[1] *= grid.low[0] + grid.h[0] * s[:, 0].mean(axis=0)  # sections across the axis are rings too
     faces = np.empty((len(kept), d, 2))
     for a in range(d):
         shadow = total(area[a]) if a else shadow
@@ -353,11 +353,11 @@ def _sum(
         # of a piece thinner than rounding allows for it is not known, and at most this
         mixed[:, a] = np.clip(product[kept] / volume - middle[:, b] * middle[:, c], -0.25, 0.25) * grid.h[b] * grid.h[c]
     if grid.axisymmetric:
-        faces[:, 0] *= TURN * (grid.lower[0] + grid.h[0] * (cell[:, [0]] + [0, 1]))
+        faces[:, 0] *= TURN * (grid.low[0] + grid.h[0] * (cell[:, [0]] + [0, 1]))
         faces[:, 1] *= TURN
         radius, centroid, hoop = _rings(grid, cell, centroid, squares[kept] / volume, products[kept] / volume)
         volume = volume * radius
-    fraction, x = volume / sum_by(point, volume, len(slots.low[0]))[point], grid.lower + grid.h * (cell + centroid)
+    fraction, x = volume / sum_by(point, volume, len(slots.low[0]))[point], grid.low + grid.h * (cell + centroid)
     return Pieces(point, grid.number(cell), fraction, x, np.abs(faces), mixed, hoop)
 
 
@@ -371,7 +371,7 @@ def _rings(
     (h, height), (x, z) = grid.h, c.T
     squares = np.clip(squares, x**2, x)  # of slivers little is left in rounding
     products = np.clip(products, np.maximum(0.0, x + z - 1), np.minimum(x, z))
-    inner = grid.lower[0] + h * cell[:, 0]
+    inner = grid.low[0] + h * cell[:, 0]
     radius = inner + h * x
     of_volume = np.stack([inner * x + h * squares, inner * z + h * products], axis=1) / radius[:, None]
     product = h * height * (products - (x + z) / 2 + 0.25)
@@ -433,7 +433,7 @@ def cut_faces(
     middle (n, d) of the part of the face in one cell that it belongs to.
     """
     d, m = grid.dim, len(corners)
-    y = (corners - grid.lower) / grid.h
+    y = (corners - grid.low) / grid.h
     nearest = np.rint(y)
     y = np.where(np.abs(y - nearest) < grid.snap, nearest, y)
     both = np.concatenate([y, local], axis=2).transpose(1, 2, 0)
@@ -452,11 +452,11 @@ def cut_faces(
     kept = np.flatnonzero(share > SLIVER)  # what only touches a plane leaves nothing
     s, owner, share = s[:, :, kept], owner[kept], share[kept]
     points = np.einsum("qk,kam->qam", _RULES[d], s)
-    middle = np.tile((grid.lower + grid.h * s[:, :d].mean(axis=0).T), (len(points), 1))
+    middle = np.tile((grid.low + grid.h * s[:, :d].mean(axis=0).T), (len(points), 1))
     points = points.transpose(0, 2, 1).reshape(-1, both.shape[1])
     count = len(_RULES[d])
     face = np.tile(owner % max(1, m), count)
-    return face, grid.lower + grid.h * points[:, :d], points[:, d:], np.tile(share / count, count), middle
+    return face, grid.low + grid.h * points[:, :d], points[:, d:], np.tile(share / count, count), middle
 
 
 def _size(s: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
 
 import numpy as np
@@ -45,9 +45,11 @@ def cofactor(F: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack([np.cross(F[:, (i + 1) % 3], F[:, (i + 2) % 3]) for i in range(3)], axis=1)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class MaterialPoints:
     """Material points of this process; arrays over its n points, that nobody changes.
+
+    Places of a state count from the grid's `base`; those of `Simulation.points` are true.
 
     Attributes
     ----------
@@ -92,6 +94,26 @@ class MaterialPoints:
 
     def __reduce__(self):  # a read-only mapping cannot be sent to other processes
         return MaterialPoints, (*(getattr(self, f.name) for f in fields(self) if f.name != "data"), dict(self.data))
+
+    def placed(self, base: NDArray[np.float64]) -> MaterialPoints:
+        """Return the points with true places, which counted from a base (d,), m."""
+        if not base.any():
+            return self
+        corners, x = self.corners + base, self.x + base
+
+        def of(values: NDArray[np.float64]) -> NDArray[np.float64]:
+            return corners if values is self.corners else values + base
+
+        return replace(self, corners=corners, x=x, origin=of(self.origin), reference=of(self.reference))
+
+    def __repr__(self) -> str:
+        """Return one line: how many points, their volume at rest, and the ranges of J and pressure."""
+        own = [f"{len(self)} points in {self.F.shape[1]}D"]
+        if len(self):
+            own.append(f"{self.volume0.sum():.4g} m^{self.F.shape[1]} at rest")
+            ranges = {"J": (self.J, ""), "pressure": (self.pressure, " Pa")}
+            own += [f"{name} {v.min():.4g} to {v.max():.4g}{unit}" for name, (v, unit) in ranges.items()]
+        return f"MaterialPoints({', '.join([*own, *self.data])})"
 
     @property
     def arrays(self) -> tuple[NDArray, ...]:

@@ -67,4 +67,4 @@ def cell_fields(scene: Scene, state: State) -> CellFields:
         pressure = on_grid.pressures(state)
         biot = mean(cut.to_cells(scene.materials.table(points, lambda m: m.biot)))
         stress = effective - (biot * pressure)[:, None, None] * np.eye(scene.grid.stretches)
-    return CellFields(places.filled, mean(cut.x), volume, moved, effective, stress, pressure)
+    return CellFields(places.filled, mean(cut.x) + cut.grid.base, volume, moved, effective, stress, pressure)

@@ -56,7 +56,7 @@ class _Lattice:
         inside = ((there >= 0) & (there < grid.shape)).all(axis=2)
         number = grid.number(np.where(inside[:, :, None], there, 0).reshape(-1, d)).reshape(inside.shape)
         self.number = np.where(inside, number + copy[:, None] * grid.cells, -1)
-        self.midpoint = grid.lower + (there + 0.5) * grid.h
+        self.midpoint = grid.low + (there + 0.5) * grid.h
         self.middle, self.stride, self.beside = len(steps) // 2, width ** np.arange(d)[::-1], {}
         for axis, end in np.ndindex(d, 2):
             step = steps[:, axis] + 2 * end - 1

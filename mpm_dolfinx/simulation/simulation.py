@@ -15,10 +15,9 @@ from mpm_dolfinx.base.report import Report
 from mpm_dolfinx.base.validation import numbers
 from mpm_dolfinx.bodies.bodies import Body, points_in_cells
 from mpm_dolfinx.conditions.axis import check_axisymmetry, with_axis
-from mpm_dolfinx.conditions.conditions import Displacement, Drained, Inflow, OnSide, Pressure, RigidPlate, Traction
+from mpm_dolfinx.conditions.conditions import OnSide, Source, sorted_terms
 from mpm_dolfinx.conditions.unit_weights import under
-from mpm_dolfinx.contact.groups import Contact, grouped
-from mpm_dolfinx.contact.tools import Tool
+from mpm_dolfinx.contact.groups import grouped
 from mpm_dolfinx.diagnostics.scene_parts import check_options, check_parts
 from mpm_dolfinx.diagnostics.thin import warn_thin
 from mpm_dolfinx.grid.grid import SIDES, Grid
@@ -33,6 +32,7 @@ from mpm_dolfinx.stepping import summary
 from mpm_dolfinx.stepping.initial_state import balanced
 from mpm_dolfinx.stepping.result import Result
 from mpm_dolfinx.stepping.scene import Scene
+from mpm_dolfinx.stepping.stage import Condition, by_kind
 from mpm_dolfinx.stepping.stages import begin_stage, first_state
 from mpm_dolfinx.stepping.state import State
 from mpm_dolfinx.stepping.step import step
@@ -47,15 +47,14 @@ class Simulation:
         Background grid, and seeded bodies.
     materials
         Material of each index that the bodies name.
-    fixed
+    walls
         Walls of the grid ("left", "right", "bottom", "top", in 3D also "front", "back") with the components that
         are zero there, such as {"left": "xy", "bottom": "y"}.
+    conditions
+        What acts on the bodies, in any order: `Traction`, `Pressure`, `Displacement`, `RigidPlate`, `Drained` and
+        `Inflow` on their sides, rigid `Tool`s, and `Contact`s of groups of bodies.  Other sides are free and sealed.
     fluid
         Pore fluid; without it there is no storage problem.
-    tractions, displacements, drained, inflows, plates
-        Boundary conditions on sides of the bodies; other sides are free and sealed.
-    tools, contacts
-        Rigid tools that press on the bodies; groups of bodies that press on each other, see `Contact`.
     gravity : (d,) or callable t -> (d,), m/s^2
         Acceleration of gravity; in axisymmetry along the axis.
     pressure
@@ -70,9 +69,11 @@ class Simulation:
         axisymmetry.
     coupling, tolerance, method
         See `Scheme`; method of time integration: "sdirk2", of second order, or "backward-euler".
-    terms, sources, later
-        Functions that give terms of the user's own to the two balances in UFL: see `user_functions`, `OnSide`.  Indices
-        of bodies that a later stage adds, each once.
+    terms
+        Terms of the user's own in UFL: functions for the balance of momentum, see `user_functions`, such functions on
+        a side, `OnSide`, and those for the storage of fluid, `Source`.
+    later
+        Indices of bodies that a later stage adds, each once.
 
     Attributes
     ----------
@@ -94,15 +95,9 @@ class Simulation:
         bodies: Sequence[Body],
         materials: Sequence[Skeleton],
         *,
-        fixed: Mapping[str, str],
+        walls: Mapping[str, str],
+        conditions: Sequence[Condition] = (),
         fluid: Fluid | None = None,
-        tractions: Sequence[Traction | Pressure] = (),
-        displacements: Sequence[Displacement] = (),
-        drained: Sequence[Drained] = (),
-        inflows: Sequence[Inflow] = (),
-        plates: Sequence[RigidPlate] = (),
-        tools: Sequence[Tool] = (),
-        contacts: Sequence[Contact] = (),
         gravity: ArrayLike | Callable[[float], ArrayLike] | None = None,
         pressure: float | Callable[[NDArray], ArrayLike] = 0.0,
         initial_stress: InitialStress | Mapping[int, InitialStress] | None = None,
@@ -110,24 +105,24 @@ class Simulation:
         coupling: str = "schur-cg",
         tolerance: float = 1e-8,
         method: str = "sdirk2",
-        terms: Sequence[Callable | OnSide] = (),
-        sources: Sequence[Callable] = (),
+        terms: Sequence[Callable | OnSide | Source] = (),
         later: Sequence[int] = (),
     ):
         scheme = Scheme(coupling, tolerance)
         check_parts(grid, bodies, materials, later)
+        contacts = by_kind(conditions)["contacts"]
+        terms, sources = sorted_terms(terms)
         check_options(bodies, fluid, pressure, terms, sources, quadrature)
         grid = grouped(grid, bodies, contacts, quadrature, {"terms": terms, "sources": sources})
         grid = grid.shared(points_in_cells(grid, bodies), keep=bool(len(terms) + len(sources)))
-        warn_thin(grid, bodies, with_axis(grid, fixed), fluid is not None)
+        warn_thin(grid, bodies, with_axis(grid, walls), fluid is not None)
         check_axisymmetry(grid, bodies, quadrature)
         began = time.perf_counter()
         options = (quadrature, scheme, method, gravity is not None, pressure, terms, sources)
         initial = by_body(initial_stress, bodies, later)
         self.scene = Scene(grid, bodies, materials, under(fluid, gravity), *options, initial)
-        conditions = {"fixed": fixed, "tractions": tractions, "displacements": displacements, "drained": drained}
-        conditions |= {"inflows": inflows, "plates": plates, "tools": tools, "gravity": gravity, "contacts": contacts}
-        self.state = first_state(self.scene, conditions, later)
+        given = {"walls": walls, "conditions": conditions, "gravity": gravity}
+        self.state = first_state(self.scene, given, later)
         if initial:
             self.state = balanced(self.scene, self.state)
         self.jit = time.perf_counter() - began
@@ -152,7 +147,7 @@ class Simulation:
     @property
     def points(self) -> MaterialPoints:
         """The material points of this process; their arrays can be read, not written."""
-        return self.state.points
+        return self.state.points.placed(self.grid.base)
 
     @property
     def t(self) -> float:
@@ -167,6 +162,11 @@ class Simulation:
     def result(self) -> Result | None:
         """Histories of the last run, also while it runs."""
         return self.state.result
+
+    @property
+    def conditions(self) -> tuple[Condition, ...]:
+        """The conditions in force, as they were given."""
+        return self.state.stage.given
 
     @property
     def reactions(self) -> NDArray[np.float64]:
@@ -187,7 +187,10 @@ class Simulation:
 
     @property
     def outflows(self) -> NDArray[np.float64]:
-        """(drained sides, then inflows), m^3/s (m^2/s in plane strain): what leaves; nan before a first step."""
+        """(drained sides and inflows, in their order), m^3/s (m^2/s in plane strain): what leaves.
+
+        Nan before a first step.
+        """
         return self.state.outflows
 
     @property
@@ -210,11 +213,11 @@ class Simulation:
 
         In axisymmetry (n, 3, 3), of radius, axis and hoops.  On several processes all call it together.
         """
-        return self.scene.materials.effective_stress(self.points)
+        return self.scene.materials.effective_stress(self.state.points)
 
     def point_fields(self) -> PointFields:
         """Return stresses, p', q and porosity of the points, see `PointFields`; all processes call it together."""
-        return point_fields(self.scene, self.points)
+        return point_fields(self.scene, self.state.points)
 
     def cells(self) -> CellFields:
         """Return centroids and fields of the cells at present, see `CellFields`; all processes call it together."""
@@ -225,36 +228,34 @@ class Simulation:
     def stage(
         self,
         *,
-        fixed: Mapping[str, str] | None = None,
-        tractions: Sequence[Traction | Pressure] | None = None,
-        displacements: Sequence[Displacement] | None = None,
-        drained: Sequence[Drained] | None = None,
-        inflows: Sequence[Inflow] | None = None,
-        plates: Sequence[RigidPlate] | None = None,
-        tools: Sequence[Tool] | None = None,
+        walls: Mapping[str, str] | None = None,
+        conditions: Sequence[Condition] | None = None,
         gravity: ArrayLike | Callable[[float], ArrayLike] | None = None,
         add: Sequence[int] = (),
         remove: Sequence[int] = (),
         reset_displacement: bool = False,
         fields: Mapping[str, ArrayLike] | None = None,
     ) -> None:
-        """Begin a stage: bodies come and go; conditions that are named take the place of those so far.
+        """Begin a stage: bodies come and go; what is given takes the place of what was in force.
 
         Stresses and pressures stay what they are; the next `run` finds the new balance, all at once or, where
         loads depend on time, little by little.
 
         Parameters
         ----------
-        fixed, tractions, displacements, drained, inflows, plates, tools, gravity
+        walls, gravity
             As for the scene; `gravity` only if the scene had it.
+        conditions
+            All conditions from now on; without, those in force stay: `[*simulation.conditions, more]` adds one.
+            Contacts are those of the scene, named or not.
         add
             Indices of bodies that were to come `later`: a fill, at rest and without stress, put onto the
             present surface of what it touches as seeded; the side opposite to it stays where it was seeded.
         remove
             Indices of bodies: an excavation.
         reset_displacement
-            From now on displacements count from the present positions.  Conditions that are not named stay as they
-            are: a `Displacement` then counts from there too, and moves its side once more.
+            From now on displacements count from the present positions.  Conditions that stay are as they
+            were: a `Displacement` then counts from there too, and moves its side once more.
         fields
             New values (n, ...) at the points of this process, or one for all, of what they carry in `points.data`:
             constants of materials that were given as functions of place, and state of laws; or data of your own, that
@@ -265,9 +266,8 @@ class Simulation:
         ValueError
             The scene is then what it was.
         """
-        conditions = {"fixed": fixed, "tractions": tractions, "displacements": displacements, "drained": drained}
-        conditions |= {"inflows": inflows, "plates": plates, "tools": tools, "gravity": gravity}
-        named = {name: value for name, value in conditions.items() if value is not None}
+        given = {"walls": walls, "conditions": conditions, "gravity": gravity}
+        named = {name: value for name, value in given.items() if value is not None}
         self.state = begin_stage(self.scene, self.state, named, add, remove, reset_displacement, fields or {})
 
     # ---- steps ----------------------------------------------------------------------------------

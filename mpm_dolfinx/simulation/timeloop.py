@@ -349,7 +349,8 @@ def _row(simulation: Simulated, probes: Probes | None) -> Row:
         ends = comm.allgather((points.pressure.min(initial=np.inf), points.pressure.max(initial=-np.inf)))
         out["pressure"] = (min(e[0] for e in ends), max(e[1] for e in ends))
     if probes is not None:
-        out |= {name: getattr(probes, name)(points, comm) for name in ("displacement", "position")}
+        out["displacement"] = probes.displacement(points, comm)
+        out["position"] = probes.position(points, comm) + scene.grid.base
     if probes is not None and wet:
         out["probe_pressure"] = probe_pressures(scene, simulation.state, probes)
     if probes is not None and probes.stressed:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Linear solvers by factors, and where they are better than multigrid (`multigrid`).
+"""Linear solvers by factors; where they are better than multigrid (`multigrid`): see `plan`.
 
 PETSc's own factors of displacements in blocks, a block a node, take a third of the time of those of single
 unknowns: with 44000 unknowns in 2D and minimum degree ordering 110 ms, 60 again with the same pattern (single 430 and
@@ -13,7 +13,7 @@ lines, see `dissection`, by PETSc's nested dissection 5.1 s and 5.0e7, by minimu
 6.2 s and 5.3e7).  With a tenth of the unknowns 80, 110, 120 ms; with fewer all are the same.
 
 Those figures are with the reference BLAS, which only MUMPS, UMFPACK and CHOLMOD use.  With OpenBLAS MUMPS takes a half
-to a third of the time: see `LARGE`.
+to a third of the time.
 """
 
 from __future__ import annotations
@@ -27,84 +27,44 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.base.errors import NotConverged
 from mpm_dolfinx.forms.unknowns import Unknowns
+from mpm_dolfinx.solve.options import set_defaults
+from mpm_dolfinx.solve.plan import MUMPS, NODAL
 
-ITERATIVE = 1500
-"""Unknowns of a 3D problem from which on it is solved by multigrid.
+MOST = 500
+"""Most iterations of a linear solve, and vectors that it keeps: it never starts anew.
 
-Seconds of five load steps of a square beam by factors and by iterations: 0.5 and 0.5 with 1200 unknowns, 2.5 and 1.4
-with 2600, 8.2 and 2.1 with 4900.  In a plate of one cell both cost the same up to 6000.
-"""
-GRIDS = 30000
-"""Unknown displacements of a wet 2D problem in which nothing yields from which on it is.
-
-Linear algebra of a step of the beam by factors and by multigrid, s: 0.06 and 0.05 with 10400 unknowns,
-0.19 and 0.14 with 25500, 0.53 and 0.32 with 51000, 2.3 and 1.0 with 151000.
-"""
-LARGE = 100000
-"""Unknown displacements of a wet 2D problem from which on MUMPS makes factors of an unsymmetric K, and those of P.
-
-Seconds of factors of K again and of a solve, with 196000 unknowns: PETSc 2.6 and 0.02, MUMPS 2.2 and 0.10 with the
-reference BLAS, 0.7 and 0.09 with OpenBLAS, 0.5 and 0.08 on four processes; with 51000 unknowns PETSc 0.25 and 0.004,
-MUMPS with OpenBLAS 0.12 and 0.02, 0.09 and 0.02.  Of P, which is symmetric, with 98000: PETSc 0.8 and 0.015, MUMPS 1.1,
-0.3, 0.1 and 0.05.  A Newton step takes five to ten solves.
+With restarts after 30, PETSc's, FGMRES stagnates where the tangent of a footing is nearly singular: solves that end
+after 500 iterations take 50.  Vectors are allocated as they are needed.
 """
 TOLERABLE = (-3, -8, -10)  # PETSc's reasons: too many iterations; indefinite preconditioner, matrix
-FEW = 4
-"""Processes up to which one of them has the factors that are used often."""
-
-
-def iterative(unknowns: Unknowns, at_once: bool, yields: bool) -> bool:
-    """Return whether displacements are better solved for by multigrid than by factors.
-
-    at_once: with pressures; yields: whether soil may.
-    """
-    if unknowns.dim == 3:
-        return unknowns.global_size >= ITERATIVE
-    return at_once and not yields and unknowns.global_size >= GRIDS
-
-
-def by_mumps(unknowns: Unknowns, symmetric: bool) -> bool:
-    """Return whether MUMPS makes the factors of displacements and pressures, on all processes together."""
-    return not symmetric and unknowns.global_size >= LARGE
-
-
-def renewed(pc: PETSc.PC, A: PETSc.Mat) -> None:
-    """Make a preconditioner that of the present A, which may change without it."""
-    pc.setReusePreconditioner(False)
-    pc.setOperators(A, A)
-    pc.setUp()
-    pc.setReusePreconditioner(True)
 
 
 def direct_solver(
-    A: PETSc.Mat, name: str, symmetric: bool = True, often: bool = False, package: str | None = None
+    A: PETSc.Mat, name: str, symmetric: bool = True, gathered: bool = False, package: str | None = None
 ) -> PETSc.KSP:
     """Return a solver that factorises A, a symmetric one as L D L^T, refactorised when A has changed.
 
     Parameters
     ----------
-    often
-        Whether the same factors solve many systems.
+    gathered
+        Whether one process has the factors, the last one, with which many systems are solved.
     package
-        What factorises, on several processes MUMPS in any case; None: PETSc.
+        What factorises; None: PETSc, on several processes MUMPS in any case.
     """
     if symmetric:
         A.setOption(PETSc.Mat.Option.SYMMETRIC, True)
     ksp = _preonly(A, name)
-    kind = PETSc.PC.Type.CHOLESKY if symmetric else PETSc.PC.Type.LU
-    options = PETSc.Options(ksp.getOptionsPrefix())
-    ordering = "nd" if often else "amd"
-    if often and 1 < A.comm.size <= FEW:
+    if gathered and A.comm.size > 1:
         _set_gathered(ksp, A, SingleFactors(name, symmetric), A.comm.size - 1)
     else:
-        ksp.pc.setType(kind)
+        ksp.pc.setType(PETSc.PC.Type.CHOLESKY if symmetric else PETSc.PC.Type.LU)
         if A.comm.size > 1:
-            options.setValue("mat_mumps_icntl_13", 1)  # counts negative pivots
-            ksp.pc.setFactorSolverType("mumps")
-        elif package is not None:
+            PETSc.Options(ksp.getOptionsPrefix()).setValue("mat_mumps_icntl_13", 1)  # counts negative pivots
+            package = "mumps"
+        if package is not None:
             ksp.pc.setFactorSolverType(package)
         else:
-            ksp.pc.setFactorOrdering(ordering)
+            ksp.pc.setFactorOrdering("nd" if gathered else "amd")
             ksp.pc.setFactorPivot(0.0)  # PETSc's 2e-14 refuses slivers of cells: rows of any scale are welcome
     ksp.setOperators(A)
     ksp.setFromOptions()
@@ -137,10 +97,10 @@ def negative_pivots(solver: PETSc.KSP) -> int:
     return factors.getMumpsInfog(12) if factors.comm.size > 1 else factors.getInertia()[0]
 
 
-def nodal_solver(A: PETSc.Mat, name: str, unknowns: Unknowns, symmetric: bool) -> PETSc.KSP:
-    """Return a direct solver for many systems with the same A, a matrix of displacements: see `NodalFactors`."""
-    if A.comm.size > FEW or by_mumps(unknowns, symmetric):
-        return direct_solver(A, name, symmetric, package="mumps")
+def displacement_solver(A: PETSc.Mat, name: str, unknowns: Unknowns, how: str, symmetric: bool) -> PETSc.KSP:
+    """Return a direct solver for many systems with the same A, a matrix of displacements; how: see `plan`."""
+    if how != NODAL:
+        return direct_solver(A, name, symmetric, package="mumps" if how == MUMPS else None)
     ksp = _preonly(A, name)
     _set_gathered(ksp, A, NodalFactors(unknowns, symmetric), 0)
     ksp.setOperators(A)
@@ -154,7 +114,9 @@ def _set_gathered(ksp: PETSc.KSP, A: PETSc.Mat, factors: NodalFactors | SingleFa
 
 
 def factorise(*preconditioners: PETSc.PC) -> None:
-    """Factorise matrices that have been set up, at the same time where several processes have the factors."""
+    """Factorise matrices at the same time where several processes have the factors; else solves do, one by one."""
+    for pc in preconditioners:
+        pc.setUp()
     for pc in preconditioners:
         if pc.getType() == PETSc.PC.Type.PYTHON:
             pc.getPythonContext().factorise()
@@ -172,13 +134,12 @@ class Gathered:
     rank
         Of the process that has them.
 
-    `setUp` brings a matrix together, and `factorise` makes the factors: processes have each theirs to make once all
-    matrices have been brought together.
+    `setUp` brings a matrix together.  Its factors are made when they are needed, or by `factorise`: processes have each
+    theirs to make once all matrices have been brought together.
     """
 
     def __init__(self, x: PETSc.Vec, factors: NodalFactors | SingleFactors, rank: int):
         self._factors, self._here, self._scatter = factors, x.comm.rank == rank, None
-        self._due: list[tuple[NDArray, ...]] = []
         if x.comm.size > 1:
             self._rows = PETSc.IS().createStride(x.size if self._here else 0, step=1, comm=PETSc.COMM_SELF)
             self._whole = PETSc.Vec().createSeq(self._rows.size, comm=PETSc.COMM_SELF)
@@ -188,20 +149,20 @@ class Gathered:
         """Bring the present matrix together."""
         A = pc.getOperators()[1]
         if self._scatter is None:
-            self._due[:] = [A.getValuesCSR()]
+            self._factors.take(*A.getValuesCSR())
             return
         (whole,) = A.createSubMatrices([self._rows], [self._rows])
-        self._due[:] = [whole.getValuesCSR()] if self._here else []
+        if self._here:
+            self._factors.take(*whole.getValuesCSR())
         whole.destroy()
 
     def factorise(self) -> None:
         """Factorise the matrix, if it has changed."""
-        if self._due:
-            self._factors.factorise(*self._due.pop())
+        if self._here:
+            self._factors.factorise()
 
     def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """Solve with the factors."""
-        self.factorise()
         if self._scatter is None:
             y.array_w[:] = self._factors.solve(x.array_r)
             return
@@ -213,7 +174,7 @@ class Gathered:
 
 
 class SingleFactors:
-    """Factors of matrices of one process.
+    """Factors of matrices of one process, made when they are needed.
 
     Parameters
     ----------
@@ -225,19 +186,20 @@ class SingleFactors:
         self._name, self._symmetric = f"{name}_gathered", symmetric
         self._solver: Latest[tuple[PETSc.KSP, PETSc.Vec, PETSc.Vec]] = Latest()
 
-    def factorise(self, rows: NDArray[np.int32], columns: NDArray[np.int32], values: NDArray[np.float64]) -> None:
-        """Factorise the matrix of these entries."""
-        ksp = self._solver((rows, columns), lambda: self._of(rows, columns))[0]
-        A = ksp.getOperators()[0]
+    def take(self, rows: NDArray[np.int32], columns: NDArray[np.int32], values: NDArray[np.float64]) -> None:
+        """Take the matrix of these entries."""
+        A = self._solver((rows, columns), lambda: self._of(rows, columns))[0].getOperators()[0]
         A.setValuesCSR(rows, columns, values)
         A.assemble()
-        ksp.setOperators(A)
-        ksp.setUp()
+
+    def factorise(self) -> None:
+        """Factorise the matrix, if it has changed."""
+        self._solver.value[0].setUp()
 
     def _of(self, rows: NDArray[np.int32], columns: NDArray[np.int32]) -> tuple[PETSc.KSP, PETSc.Vec, PETSc.Vec]:
         """Return a solver for matrices of this pattern, a solution and a right-hand side."""
         A = PETSc.Mat().createAIJ(len(rows) - 1, csr=(rows, columns, np.zeros(len(columns))), comm=PETSc.COMM_SELF)
-        return direct_solver(A, self._name, self._symmetric, often=True), *A.createVecs()
+        return direct_solver(A, self._name, self._symmetric, gathered=True), *A.createVecs()
 
     def solve(self, b: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the solution."""
@@ -248,7 +210,7 @@ class SingleFactors:
 
 
 class NodalFactors:
-    """Factors of matrices of displacements in blocks, which the first process has.
+    """Factors of matrices of displacements in blocks, which the first process has, made when they are needed.
 
     Parameters
     ----------
@@ -268,12 +230,16 @@ class NodalFactors:
         self._dim, self._symmetric = unknowns.dim, symmetric
         self._factors: Latest[BlockFactors] = Latest()
 
-    def factorise(self, rows: NDArray[np.int32], columns: NDArray[np.int32], values: NDArray[np.float64]) -> None:
-        """Factorise the matrix of these entries."""
-        if len(rows) == 1:  # walls hold all nodes: PETSc has no factors of nothing
-            return
-        make = (rows, columns, *self._nodes, self._dim, self._symmetric)
-        self._factors((rows, columns), lambda: BlockFactors(*make)).factorise(values)
+    def take(self, rows: NDArray[np.int32], columns: NDArray[np.int32], values: NDArray[np.float64]) -> None:
+        """Take the matrix of these entries."""
+        if len(rows) > 1:  # else walls hold all nodes: PETSc has no factors of nothing
+            make = (rows, columns, *self._nodes, self._dim, self._symmetric)
+            self._factors((rows, columns), lambda: BlockFactors(*make)).take(values)
+
+    def factorise(self) -> None:
+        """Factorise the matrix, if it has changed."""
+        if self._factors.value is not None:
+            self._factors.value.factorise()
 
     def solve(self, b: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the solution for all unknowns."""
@@ -346,18 +312,21 @@ class BlockFactors:
         ksp.pc.setType(PETSc.PC.Type.CHOLESKY if symmetric else PETSc.PC.Type.LU)
         ksp.pc.setFactorOrdering("natural")
         ksp.pc.setFactorPivot(0.0)  # see `direct_solver`
-        # entries of the factors over those of the matrix: with 5, PETSc's, it makes room twice
-        PETSc.Options(ksp.getOptionsPrefix())["pc_factor_fill"] = 6 + 2.5 * max(0.0, np.log10(max(1, count) / 4000))
+        # room for the factors of nested dissection, 31/4 n^2 log2 n of n^2 nodes (George 1973)
+        fill = 31 / 8 * count * np.log2(count + 1) / max(1, len(self._pattern[1]))
+        set_defaults(ksp, {"pc_factor_fill": max(1.0, fill)})
         ksp.setOperators(self._matrix)
         ksp.setFromOptions()
         self._b, self._x = self._matrix.createVecs()
         self._b.set(0.0)
 
-    def factorise(self, values: NDArray[np.float64]) -> None:
-        """Factorise the matrix of these entries."""
+    def take(self, values: NDArray[np.float64]) -> None:
+        """Take the matrix of these entries."""
         self._matrix.setValuesBlockedIJV(*self._pattern, np.concatenate([[0.0], values, [1.0]])[self._source])
         self._matrix.assemble()
-        self._solver.setOperators(self._matrix)
+
+    def factorise(self) -> None:
+        """Factorise the matrix, if it has changed."""
         self._solver.setUp()
 
     def solve(self, b: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -23,9 +23,8 @@ from dolfinx.common import Timer
 from numpy.typing import NDArray
 
 from mpm_dolfinx.parallel.exchange import Exchange, over_all
+from mpm_dolfinx.solve.options import set_defaults
 
-COARSEST = 1000
-"""Unknowns of a grid that is solved on by factors."""
 OPTIONS = {
     "pc_mg_galerkin": "both",
     "mg_levels_ksp_type": "richardson",
@@ -43,7 +42,13 @@ NONE = np.iinfo(np.int64).max
 
 
 def multigrid_solver(
-    A: PETSc.Mat, name: str, places: NDArray[np.int64], held: NDArray[np.int64], nodal: bool, firmly: bool = False
+    A: PETSc.Mat,
+    name: str,
+    places: NDArray[np.int64],
+    held: NDArray[np.int64],
+    nodal: bool,
+    coarsest: int,
+    firmly: bool = False,
 ) -> PETSc.KSP:
     """Return GMRES with multigrid, set up anew when A has changed.
 
@@ -62,6 +67,8 @@ def multigrid_solver(
         What is no unknown although it belongs to a cell of a body: there interpolations are 0.
     nodal
         Whether they are nodes.
+    coarsest
+        Unknowns of a grid that is solved on by factors.
     firmly
         Whether to smooth three times as often: see `FIRMLY`.
     """
@@ -70,22 +77,19 @@ def multigrid_solver(
     ksp.setPCSide(PETSc.PC.Side.RIGHT)
     ksp.setOptionsPrefix(f"mpm_{name}_{'firmly' if firmly else 'multigrid'}_")  # options for factors are not for it
     with Timer("mpm: factorisation"):
-        steps = interpolations(A.comm.tompi4py(), places, held, nodal)
+        steps = interpolations(A.comm.tompi4py(), places, held, nodal, coarsest)
     ksp.pc.setType(PETSc.PC.Type.MG)
     ksp.pc.setMGLevels(len(steps) + 1)
     for level, Q in zip(range(len(steps), 0, -1), steps, strict=True):
         ksp.pc.setMGInterpolation(level, Q)
-    options = PETSc.Options(ksp.getOptionsPrefix())
-    for option, value in (OPTIONS | (FIRMLY if firmly else {})).items():
-        if not options.hasName(option):
-            options.setValue(option, value)
+    set_defaults(ksp, OPTIONS | (FIRMLY if firmly else {}))
     ksp.setOperators(A)
     ksp.setFromOptions()
     return ksp
 
 
 def interpolations(
-    comm: MPI.Intracomm, places: NDArray[np.int64], held: NDArray[np.int64], nodal: bool
+    comm: MPI.Intracomm, places: NDArray[np.int64], held: NDArray[np.int64], nodal: bool, coarsest: int
 ) -> list[PETSc.Mat]:
     """Return the interpolations from each coarse grid to the one that is twice as fine, the finest first.
 
@@ -93,7 +97,7 @@ def interpolations(
     """
     steps: list[PETSc.Mat] = []
     size = before = over_all(comm, len(places))
-    while not steps or COARSEST < size < 0.7 * before:  # many bodies of a few cells are not united
+    while not steps or coarsest < size < 0.7 * before:  # many bodies of a few cells are not united
         Q, places, held = interpolation(comm, places, held, nodal)
         size, before = over_all(comm, len(places)), size
         steps.append(Q)

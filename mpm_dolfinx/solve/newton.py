@@ -39,22 +39,11 @@ from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.parts import relative
 from mpm_dolfinx.solve.linear import negative_pivots
-from mpm_dolfinx.solve.schur import LinearSolvers
+from mpm_dolfinx.solve.schur import Kept, LinearSolvers
 from mpm_dolfinx.solve.watchdog import Descent, Search, Watchdog
 
-KEEP, KEEP_WET = 0.05, 0.01
-"""The tangent is kept while a Newton step reduces the residual to less than this: the second in 2D, wet and elastic.
-
-The seed beam in 26 steps by error: 205 steps and 79 tangents with 0.05, 179 and 83 with 0.01, 174 and 94 with 0.002.
-In 3D, where tangents cost more, a beam takes up to a fifth longer with 0.01 than with 0.05.
-"""
-FORCING_IN_3D, FORCING, FINEST = 1e-3, 1e-5, 1e-9
-"""Relative accuracy of linear solves by multigrid in 3D and of others, and the best that is asked for.
-
-With factors an iteration is cheap, and what a solve leaves of the fluid's residual costs a Newton step: a step of a
-block of 10 x 10 cells that drains takes 4.6 of them for 6.1 with 1e-3, in 0.86 of the time, the seed beam 383 for 408,
-a footing on 21 cells (backward Euler) 299 for 370.
-"""
+FINEST = 1e-9
+"""The best relative accuracy that is asked of multigrid."""
 INNER = 1e-3  # the momentum is solved to this share of the storage's error: rotations fake volume changes
 MOMENTUM_STEPS = 10
 REBALANCED = 6  # times the most iterations, in all, of what is to balance with other pressures or pairs of contacts
@@ -109,6 +98,7 @@ def solve_substep(
     as_reset: Callable[[], QuadratureData],
     key: Hashable,
     report: Report,
+    kept: Kept,
 ) -> Rates | None:
     """Solve the equations of a substep for (u, p), which the forms then hold; return the rates of the storage.
 
@@ -123,18 +113,20 @@ def solve_substep(
         while the key stays the same.
     report
         Of the step: what the substep took is added.
+    kept
+        What the step's tangents share so far.
 
     Raises
     ------
     NotConverged
         With the residual history.
     """
-    newton = Newton(solvers, momentum, storage)
+    newton = Newton(solvers, momentum, storage, kept)
     in_turn = solvers.scheme.richardson and storage is not None
     serves = report.newton > 0 and momentum.smooth
     errors = newton.alternate() if in_turn else newton.newton(as_reset, key, serves)
     took = newton.report
-    if took.newton and storage is None and solvers.symmetric and not solvers.iterative:
+    if took.newton and storage is None and solvers.plan.symmetric and not solvers.plan.iterative:
         newton.check_stable()
     report.newton, report.coupling = report.newton + took.newton, report.coupling + took.coupling
     report.history += took.history
@@ -192,15 +184,13 @@ class Newton:
 
     Parameters
     ----------
-    solvers, momentum, storage
+    solvers, momentum, storage, kept
         See `solve_substep`.
     """
 
-    def __init__(self, solvers: LinearSolvers, momentum: MomentumProblem, storage: StorageProblem | None):
+    def __init__(self, solvers: LinearSolvers, momentum: MomentumProblem, storage: StorageProblem | None, kept: Kept):
         self._solvers, self._scheme, self._momentum, self._storage = solvers, solvers.scheme, momentum, storage
-        self.report = Report()
-        wet_in_2d = storage is not None and momentum.forms.grid.dim == 2
-        self._keep = KEEP_WET if wet_in_2d and momentum.forms.elastic else KEEP
+        self.report, self._kept = Report(), kept
         self._linear = momentum.linear and (storage is None or storage.linear)
         self._functions = [momentum.forms.u] + ([storage.forms.p] if storage is not None else [])
         systems = [momentum.system] + ([storage.system] if storage is not None else [])
@@ -242,7 +232,9 @@ class Newton:
             self.report.coupling += self._direction(errors, fresh and slow)
             before, (errors, steps) = errors, self._line_search(errors, dogs)
             count += 1
-            lags = errors.each > self._keep * np.minimum(1.0, before.each)  # inf where no fluid has moved yet
+            lags = errors.each > self._solvers.plan.keep * np.minimum(
+                1.0, before.each
+            )  # inf where no fluid has moved yet
             slow = fresh
             fresh = bool((lags & (errors.each > self._scheme.tolerance)).any())
             dogs, errors, back = self._watched(dogs, before, errors, steps)
@@ -369,7 +361,7 @@ class Newton:
             before, (errors, _) = errors.u.max(), self._line_search(errors)
             settled = self._momentum.settle_tools(errors.u.max() <= SETTLED)
             errors = self._errors(errors.start) if settled else errors
-            if settled or errors.u.max() > max(goal, KEEP * before):
+            if settled or errors.u.max() > max(goal, self._solvers.plan.keep * before):
                 self._linearise()
 
     def _check(self, count: int, kind: str) -> None:
@@ -404,7 +396,7 @@ class Newton:
     def _linearise(self, firmness: NDArray[np.float64] | float = 0.0) -> None:
         """Set the tangent at the present (u, p), which no other step is to use; firmness: see `LinearSolvers`."""
         self._solvers.tangent.clear()
-        self._solvers.linearise(self._momentum, self._storage, firmness=firmness)
+        self._solvers.linearise(self._momentum, self._storage, self._kept, firmness=firmness)
 
     def _linearise_as_reset(self, as_reset: Callable[[], QuadratureData]) -> bool:
         """Set the tangent of the pieces and pressures when the grid was reset, whatever steps have been taken since."""
@@ -416,7 +408,7 @@ class Newton:
         pieces = as_reset()
         if self._storage is not None:
             self._storage.set_fluxes()
-        done = self._solvers.linearise(self._momentum, self._storage, pieces)
+        done = self._solvers.linearise(self._momentum, self._storage, self._kept, pieces)
         for f, values in zip(functions, now, strict=True):
             f.x.array[:] = values
         return done
@@ -428,9 +420,9 @@ class Newton:
         gain by displacements.
         """
         # no more accuracy than the next residual can use
-        iterative = self._solvers.iterative
-        in_3d = iterative and self._momentum.forms.grid.dim == 3
-        least = FORCING_IN_3D if in_3d else 0.0 if self._momentum.linear else FORCING
+        iterative, least = self._solvers.plan.iterative, self._solvers.plan.forcing
+        if self._momentum.linear and not (iterative and self._momentum.forms.grid.dim == 3):
+            least = 0.0
         rtol = min(1e-2, max(least, 0.05 * self._scheme.tolerance / min(1.0, errors.worst)))
         if iterative:  # the pull of given displacements, which is all of a first residual, hides the rest
             rtol = max(FINEST, rtol / max(1.0, errors.worst))
@@ -442,13 +434,13 @@ class Newton:
         forces = np.maximum(errors.forces, self._momentum.system.round_off / self._scheme.tolerance)
         with Timer("mpm: linear solve"):
             if errors.fluid is None:
-                return self._solvers.solve(rtol, forces)
+                return self._solvers.solve(self._kept, rtol, forces)
             least = errors.fluid.round_off / self._scheme.tolerance
             measures = forces, np.maximum(errors.exchanged, least)
             if not slow or self._linear:
-                return self._solvers.solve(rtol, *measures)
+                return self._solvers.solve(self._kept, rtol, *measures)
             slope = self._storage.flux_slope(self._momentum.forms.u, self._momentum.system.unknowns)
-            count = self._solvers.solve(rtol, *measures, slope)
+            count = self._solvers.solve(self._kept, rtol, *measures, slope)
             self._storage.set_fluxes()
             return count
 

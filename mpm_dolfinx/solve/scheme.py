@@ -3,9 +3,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
 
 from mpm_dolfinx.base.validation import numbers
+from mpm_dolfinx.solve.options import check
 
 COUPLINGS = {
     "schur-cg": 0.75,
@@ -29,6 +32,9 @@ class Scheme:
         Both residuals fall below this, relative to the forces and to the fluid that changes places; in (0, 1).
     most_newton, most_coupling
         Newton steps, or coupling iterations of `fixed-stress`, before a step is given up.
+    petsc_options
+        PETSc's options for the solvers, such as {"momentum_pc_factor_mat_ordering_type": "nd"}: names begin with one of
+        `options.PREFIXES`.  A warning names those that no solver of the scene reads.
 
     Raises
     ------
@@ -40,11 +46,13 @@ class Scheme:
     tolerance: float
     most_newton: int = 25
     most_coupling: int = 200
+    petsc_options: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self):
         if not isinstance(self.coupling, str) or self.coupling not in COUPLINGS:
             raise ValueError(f"coupling {self.coupling!r}: must be one of {', '.join(COUPLINGS)}")
         numbers("tolerance", self.tolerance, test=lambda v: (0 < v) & (v < 1), allowed="in (0, 1)")
+        check(self.petsc_options)
 
     @property
     def richardson(self) -> bool:

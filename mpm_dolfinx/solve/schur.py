@@ -15,6 +15,7 @@ would still need the parts.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from weakref import finalize
 
 from petsc4py import PETSc
@@ -26,41 +27,77 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.flow.storage import FILTER, FluxSlope, StorageProblem, StorageSystem
 from mpm_dolfinx.mechanics.momentum import MomentumProblem, MomentumSystem
+from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
+from mpm_dolfinx.parallel.messages import warn
 from mpm_dolfinx.points.parts import OfParts
-from mpm_dolfinx.solve.linear import (
-    by_mumps,
-    direct_solver,
-    factorise,
-    iterative,
-    nodal_solver,
-    solved,
-)
-from mpm_dolfinx.solve.monolithic import RESTART, BlockSolver, factorisable
+from mpm_dolfinx.solve.linear import MOST, direct_solver, displacement_solver, factorise, solved
+from mpm_dolfinx.solve.monolithic import BlockSolver, Inverses
 from mpm_dolfinx.solve.multigrid import multigrid_solver
+from mpm_dolfinx.solve.options import using
+from mpm_dolfinx.solve.plan import AT_ONCE, MULTIGRID, MUMPS, SolverPlan, plan
 from mpm_dolfinx.solve.scheme import Scheme
 
-WORN = 25
-"""Iterations of a solve after which the next tangent has factors of its own fixed-stress operator.
 
-Before, those of the first tangent of the step serve: a footing on 41 cells spends a tenth of its time on the others.
-"""
+def planned(scheme: Scheme, momentum: MomentumSystem, storage: StorageSystem | None, symmetric: bool) -> SolverPlan:
+    """Return how problems with these matrices are solved; symmetric: whether the momentum's tangent is."""
+    unknowns = momentum.unknowns
+    return plan(
+        unknowns.global_size,
+        unknowns.dim,
+        wet=storage is not None,
+        yields=momentum.firm is not None,
+        locks=momentum.locks,
+        symmetric=symmetric,
+        processes=unknowns.comm.size,
+        coupling=scheme.coupling,
+    )
 
 
+@dataclass(frozen=True, eq=False)
 class SchurComplement:
-    """Matrix-free S = C + B K^-1 B^T for PETSc's Krylov solvers."""
+    """Matrix-free S = C + B K^-1 B^T for PETSc's Krylov solvers.
 
-    def __init__(self, storage: StorageSystem, solve_momentum: PETSc.KSP):
-        self.storage, self.solve = storage, solve_momentum
-        self.f, self.v = storage.B.createVecRight(), storage.B.createVecRight()
-        self.slope: list[FluxSlope] = []
+    Parameters
+    ----------
+    storage
+        The matrices.
+    solve
+        Solves with K.
+    f, v
+        Two vectors of displacements.
+    slopes
+        What the fluxes gain by displacements, if that counts.
+    """
+
+    storage: StorageSystem
+    solve: PETSc.KSP
+    f: PETSc.Vec
+    v: PETSc.Vec
+    slopes: tuple[FluxSlope, ...] = ()
 
     def mult(self, A: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """Multiply."""
         s = self.storage
         s.B_momentum.multTranspose(x, self.f)
         self.solve.solve(self.f, self.v)
-        s.lost(self.v, y, *self.slope)
+        s.lost(self.v, y, *self.slopes)
         s.C.multAdd(x, y, y)
+
+
+@dataclass
+class Kept:
+    """What the tangents of a step share, so far; the next step begins with none of it.
+
+    Parameters
+    ----------
+    operator
+        Whether the fixed-stress operator has factors that serve.
+    factors
+        Those that take the place of multigrid cycles, if any do.
+    """
+
+    operator: bool = False
+    factors: Inverses | None = None
 
 
 class LinearSolvers:
@@ -68,63 +105,54 @@ class LinearSolvers:
 
     Parameters
     ----------
+    how
+        The plan, as `planned`.
     scheme
         How the two problems are coupled.
     momentum, storage
         Matrices and vectors; storage is None without fluid.
-    symmetric
-        Whether the momentum's tangent is symmetric.
     """
 
-    def __init__(
-        self,
-        scheme: Scheme,
-        momentum: MomentumSystem,
-        storage: StorageSystem | None,
-        symmetric: bool,
-    ):
-        self.scheme, self._momentum, self._storage, self.symmetric = scheme, momentum, storage, symmetric
-        at_once = storage is not None and not scheme.richardson
-        self.iterative = iterative(momentum.unknowns, at_once, momentum.firm is not None)
-        """Whether a multigrid cycle stands for K^-1, not factors."""
+    def __init__(self, how: SolverPlan, scheme: Scheme, momentum: MomentumSystem, storage: StorageSystem | None):
+        self.plan, self.scheme, self._momentum, self._storage = how, scheme, momentum, storage
         self.tangent: Latest[bool] = Latest()
         """What the matrices hold the tangent of, where it is kept."""
         self._solve_s = self._schur = self._block = None
-        self._operator: Latest[bool] = Latest()  # the fixed-stress operator that has been factorised
-        if self.iterative:
-            firmly = momentum.locks and not (at_once and factorisable(momentum.unknowns))
-            self.solve_u = multigrid_solver(momentum.K, "momentum", *momentum.places(), nodal=True, firmly=firmly)
-        elif storage is None:
-            self.solve_u = direct_solver(momentum.K, "momentum", symmetric)
-        else:
-            self.solve_u = nodal_solver(momentum.K, "momentum", momentum.unknowns, symmetric)
         self.du, self._rhs = momentum.unknowns.vector(), momentum.unknowns.vector()
         """Direction of the displacements."""
-        if storage is None:
-            return
-        self.dp, self._g = storage.unknowns.vector(), storage.unknowns.vector()
-        """Direction of the pressures."""
-        if self.iterative and at_once:
-            self._solve_s = multigrid_solver(storage.P, "storage", *storage.places(), nodal=False)
-            self._block = BlockSolver(momentum, storage, self.solve_u.pc, self._solve_s.pc, symmetric)
-            return
-        n, self._context = (storage.unknowns.size, None), SchurComplement(storage, self.solve_u)
-        finalize(self, vars(self._context).clear)  # PETSc keeps contexts of its matrices, and what they refer to
-        self._schur = PETSc.Mat().createPython((n, n), self._context, storage.unknowns.comm)
-        self._schur.setUp()
-        large = by_mumps(momentum.unknowns, symmetric)
-        self._solve_s = direct_solver(storage.P, "storage", often=not large, package="mumps" if large else None)
-        krylov = PETSc.KSP.Type.CG if symmetric else PETSc.KSP.Type.FGMRES
-        kind = {"schur-cg": krylov, "schur-fgmres": PETSc.KSP.Type.FGMRES}
-        self._krylov = kind.get(scheme.coupling, PETSc.KSP.Type.PREONLY)
-        self._solve_s.setType(self._krylov)
-        self._solve_s.setGMRESRestart(RESTART)
+        self._unread = set(scheme.petsc_options)
+        with using(scheme.petsc_options, self._unread):
+            self.solve_u = self._momentum_solver()
+            if storage is None:
+                return
+            self.dp, self._g = storage.unknowns.vector(), storage.unknowns.vector()
+            """Direction of the pressures."""
+            if how.route == AT_ONCE:
+                self._solve_s = multigrid_solver(storage.P, "storage", *storage.places(), False, how.coarsest)
+                self._block = BlockSolver(how, momentum, storage, (self.solve_u.pc, self._solve_s.pc))
+                return
+            work = momentum.unknowns.vector(), momentum.unknowns.vector()
+            n, self._context = (storage.unknowns.size, None), SchurComplement(storage, self.solve_u, *work)
+            finalize(self, vars(self._context).clear)  # PETSc keeps contexts of its matrices, and what they refer to
+            self._schur = PETSc.Mat().createPython((n, n), self._context, storage.unknowns.comm)
+            self._schur.setUp()
+            mumps = how.pressures == MUMPS
+            gathered = how.gathered and not mumps
+            self._solve_s = direct_solver(storage.P, "storage", gathered=gathered, package="mumps" if mumps else None)
+            self._set_krylov(how.krylov)
 
-    def begin(self) -> None:
-        """Begin a step, which depends on no factors of the one before."""
-        self._operator.clear()
-        if self._block is not None:
-            self._block.begin()
+    def _momentum_solver(self) -> PETSc.KSP:
+        """Return what solves for displacements."""
+        how, K, unknowns = self.plan, self._momentum.K, self._momentum.unknowns
+        if how.displacements == MULTIGRID:
+            return multigrid_solver(K, "momentum", *self._momentum.places(), True, how.coarsest, how.firmly)
+        return displacement_solver(K, "momentum", unknowns, how.displacements, how.symmetric)
+
+    def _set_krylov(self, kind: str) -> None:
+        """Let this iterative solver solve for the pressures."""
+        if self._solve_s.getType() != kind:
+            self._solve_s.setType(kind)
+            self._solve_s.setGMRESRestart(MOST)
 
     @property
     def schur(self) -> tuple[PETSc.Mat, PETSc.KSP]:
@@ -137,40 +165,58 @@ class LinearSolvers:
         self,
         momentum: MomentumProblem,
         storage: StorageProblem | None,
-        data=None,
+        kept: Kept | None = None,
+        data: QuadratureData | None = None,
         firmness: NDArray[np.float64] | float = 0.0,
     ) -> bool:
         """Set the tangents at (u, p), of the problems' pieces or of others, and factorise them.
 
-        firmness: share of the elastic shear stiffness that is added, one number or one for each part.
+        Parameters
+        ----------
+        kept
+            What the step's tangents share so far.
+        data
+            Other pieces.
+        firmness
+            Share of the elastic shear stiffness that is added, one number or one for each part.
         """
+        kept = kept or Kept()
         with Timer("mpm: tangent"):
-            K = momentum.assemble_tangent(data, firmness)
+            momentum.assemble_tangent(data, firmness)
             if storage is not None:
                 storage.assemble_tangent(data and data.pieces)
-        with Timer("mpm: factorisation"):
-            if self._block is None or not self._block.factorised:
-                self.solve_u.setOperators(K)
+        with Timer("mpm: factorisation"), using(self.scheme.petsc_options, self._unread):
+            if storage is None:
                 self.solve_u.setUp()
-            if self._block is not None:
+            elif self._block is not None:
                 storage.assemble_preconditioner(self.scheme.beta, FILTER)
-                self._block.linearise()
-            elif storage is not None:
-                self._operator((), lambda: self._set_operator(storage))
+                self._solve_s.pc.setUp()
+                if kept.factors is None:
+                    self.solve_u.setUp()
+            else:
+                if not kept.operator:
+                    share = 0.0 if self.scheme.richardson else FILTER
+                    P = storage.assemble_preconditioner(self.scheme.beta, share)
+                    self._solve_s.setOperators(self._schur, P)
                 factorise(self.solve_u.pc, self._solve_s.pc)
-                if self.scheme.richardson or data is not None:  # what a resumed run may not have any more
-                    self._operator.clear()
+                # what a resumed run may not have any more serves no other tangent
+                kept.operator = not self.scheme.richardson and data is None
+        self._tell_unread()
         return True
 
-    def _set_operator(self, storage: StorageProblem) -> bool:
-        """Take the present fixed-stress operator, which is then to be factorised."""
-        share = 0.0 if self.scheme.richardson else FILTER
-        self._solve_s.setOperators(self._schur, storage.assemble_preconditioner(self.scheme.beta, share))
-        self._solve_s.setUp()
-        return True
+    def _tell_unread(self) -> None:
+        """Warn of options that no solver has read: once all are made."""
+        if not self.scheme.petsc_options:
+            return
+        comm = self.du.comm.tompi4py()
+        names = sorted(set.intersection(*map(set, comm.allgather(self._unread))))
+        if names:
+            warn(comm, "petsc_options: no solver reads %s (%s)", ", ".join(names), self.plan)
+        self._unread.clear()
 
     def solve(
         self,
+        kept: Kept,
         rtol: float,
         forces: NDArray[np.float64],
         exchanged: NDArray[np.float64] | None = None,
@@ -180,6 +226,8 @@ class LinearSolvers:
 
         Parameters
         ----------
+        kept
+            What the step's tangents share so far.
         rtol
             Relative accuracy of each part.
         forces, exchanged : (parts,)
@@ -187,34 +235,34 @@ class LinearSolvers:
         slope
             What the fluxes gain by displacements; without, the tangent leaves that out.
         """
-        residual = self._momentum.residual
+        residual, slopes = self._momentum.residual, () if slope is None else (slope,)
         if self._storage is None:
-            self.solve_u.setTolerances(rtol=rtol, atol=0.0, max_it=500)
+            self.solve_u.setTolerances(rtol=rtol, atol=0.0, max_it=MOST)
             self.solve_momentum()
             count = solved(self.solve_u, "momentum")
-            return count if self.iterative else 0
+            return count if self.plan.iterative else 0
         if self._block is not None:
             r = self._storage.residual  # scales of Euclidean norms that make them the errors
             of = self._storage.of_parts
             size, total = of.norms(r.array_r), of.sums(np.abs(r.array_r))
             share = np.divide(size, total, out=np.ones(of.count), where=total > 0)
             scales = np.where(forces > 0, forces, 1.0), np.where(exchanged > 0, exchanged, 1.0) * share
-            return self._block.solve(self.du, self.dp, scales, rtol, slope)
-        krylov = self._krylov if slope is None else PETSc.KSP.Type.FGMRES
-        self._context.slope[:] = [] if slope is None else [slope]
-        if self._solve_s.getType() != krylov:
-            self._solve_s.setType(krylov)
-            self._solve_s.setGMRESRestart(RESTART)
-        g = self.condense()
-        self._solve_s.setTolerances(rtol=rtol, atol=0.0, max_it=500)
-        measured = self._solve_s.pc.apply if krylov == PETSc.KSP.Type.CG else None  # which takes preconditioned norms
-        self._evenly(self._solve_s, g, self.dp, self._storage.of_parts, measured)
+            with using(self.scheme.petsc_options):
+                count, kept.factors = self._block.solve(self.du, self.dp, scales, rtol, slopes, kept.factors)
+            return count
+        self._set_krylov(self.plan.krylov if slope is None else PETSc.KSP.Type.FGMRES)
+        if slope is not None:
+            self._schur.setPythonContext(replace(self._context, slopes=slopes))
+        g = self.condense(*slopes)
+        self._solve_s.setTolerances(rtol=rtol, atol=0.0, max_it=MOST)
+        cg = self._solve_s.getType() == PETSc.KSP.Type.CG  # which takes preconditioned norms
+        self._evenly(self._solve_s, g, self.dp, self._storage.of_parts, self._solve_s.pc.apply if cg else None)
+        self._schur.setPythonContext(self._context)
         self._storage.B_momentum.multTranspose(self.dp, self._rhs)
         self._rhs.axpy(1.0, residual)
         self.solve_u.solve(self._rhs, self.du)
         count = solved(self._solve_s, "storage")
-        if count > WORN:
-            self._operator.clear()
+        kept.operator = kept.operator and count <= self.plan.many
         return count
 
     @staticmethod
@@ -250,10 +298,10 @@ class LinearSolvers:
             else:
                 direction.array_w[:] *= np.where(parts, -1.0, 1.0)[system.of_parts.of]
 
-    def condense(self) -> PETSc.Vec:
+    def condense(self, *slopes: FluxSlope) -> PETSc.Vec:
         """Return the residual of the Schur complement's system, R_p - B K^-1 R_u."""
         self.solve_u.solve(self._momentum.residual, self.du)
-        self._storage.lost(self.du, self._g, *self._context.slope)
+        self._storage.lost(self.du, self._g, *slopes)
         self._g.aypx(-1.0, self._storage.residual)
         return self._g
 
@@ -267,7 +315,7 @@ class LinearSolvers:
         """Solve for du alone, pressures kept."""
         if self._storage is not None:
             self.dp.set(0.0)
-        if self.iterative:
+        if self.plan.iterative:
             self._evenly(self.solve_u, self._momentum.residual, self.du, self._momentum.of_parts)
         else:
             self.solve_u.solve(self._momentum.residual, self.du)

@@ -151,7 +151,7 @@ class Motion:
         if gravity is None or self._storage.fluxes.flux is None:
             return None
         weight = self._materials.fluid.density * gravity
-        return lambda cells, x: (x - grid.lower + (0.0 if nodal is None else grid.at(cells, x, nodal))) @ weight
+        return lambda cells, x: (x - grid.low + (0.0 if nodal is None else grid.at(cells, x, nodal))) @ weight
 
     def _kept(
         self, values: NDArray[np.float64] | None, on_grid: OnGrid, keeps: NDArray[np.bool_]
@@ -217,7 +217,7 @@ class Motion:
         """
         cut, stage, folded = on_grid.cut, state.stage, 0
         grid = cut.grid
-        own = ~given(grid, stage.lattices, stage.conditions["fixed"], state.points)
+        own = ~given(grid, stage.lattices, stage.conditions["walls"], state.points)
         free = own & ~tools.near(state.points.corners + moved, t)[:, :, None]
         if stage.mechanical.contacts.contacts:
             beside = stage.mechanical.contacts.near(cut, state.points, state.points.corners + moved)
@@ -310,7 +310,7 @@ class Motion:
         least = 1 - self._materials.table(points, lambda m: m.porosity) if wet else np.zeros(len(J))
         bad = np.flatnonzero(~(J > least))
         if over_all(cut.grid.comm, len(bad)):
-            shown = [f"point {points.id[i]} at {points.x[i]} with J = {J[i]:.3g}" for i in bad[:1]]
+            shown = [f"point {points.id[i]} at {points.x[i] + cut.grid.base} with J = {J[i]:.3g}" for i in bad[:1]]
             what = "the pores have closed" if wet else "the body is turned inside out"
             raise NotConverged(f"{what}, J <= {least.max(initial=0):.3g}: {', '.join(shown) or 'elsewhere'}")
 
@@ -333,9 +333,11 @@ def _check_inside(cut: CutDomains, points: MaterialPoints, t: float, report: Rep
     """Refuse points of which a corner has left the grid, and say which."""
     grid, x, message = cut.grid, points.corners if cut.domains else points.x[:, None], ""
     if grid.outside(x.reshape(-1, grid.dim), REACH).any():
-        beyond = np.maximum(grid.lower - x, x - grid.upper).max(axis=2)
+        beyond = np.maximum(grid.low - x, x - grid.high).max(axis=2)
         i, corner = np.unravel_index(np.argmax(np.where(np.isnan(beyond), np.inf, beyond)), beyond.shape)
-        of = f"point {points.id[i]} at {points.x[i]}" + (f": its corner at {x[i, corner]}" if cut.domains else "")
+        of = f"point {points.id[i]} at {points.x[i] + grid.base}" + (
+            f": its corner at {x[i, corner] + grid.base}" if cut.domains else ""
+        )
         by = f"by {beyond[i, corner]:.3g} m at t = {t:g} s"
         message = f"{of} left the grid {grid.lower} to {grid.upper} {by}, must stay in it: take a larger grid"
     if message := first(grid.comm, message):
@@ -357,5 +359,5 @@ def untangled(
     new = new + np.einsum("nab,nkb->nka", F, X - X.mean(axis=1, keepdims=True))
     new = boundary.under_held(points.id[at], corners[at], volume0 * determinant(F), new)
     out = corners.copy()
-    out[at] = np.clip(new, grid.lower, grid.upper)
+    out[at] = np.clip(new, grid.low, grid.high)
     return out

@@ -56,7 +56,7 @@ class Balances(NamedTuple):
         stage, storage, forms = state.stage, self.storage, self.momentum.forms
         return {
             "reactions": stage.mechanical.reactions(acting.sides, forms.nodal),
-            "walls": self.momentum.wall_forces(stage.conditions["fixed"]),
+            "walls": self.momentum.wall_forces(stage.conditions["walls"]),
             "outflows": storage.outflows(len(stage.hydraulic.outlets)) if storage else state.outflows,
         }
 

@@ -31,7 +31,7 @@ from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.parallel.messages import log, warn
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.solve.newton import solve_substep
-from mpm_dolfinx.solve.schur import LinearSolvers
+from mpm_dolfinx.solve.schur import Kept, LinearSolvers, planned
 from mpm_dolfinx.stepping.balances import Start
 from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.state import State, Stay
@@ -54,12 +54,14 @@ def pieces_at_start(scene: Scene, points: MaterialPoints) -> PiecePressures:
     """Return what pieces of domains carry of a field of pressure, by which cells have that of their centroids."""
     on_grid, grid, pressure = scene.on_grid(points), scene.grid, scene.initial.pressure
     cut, contents, bulk = on_grid.cut, on_grid.contents, scene.fluid.bulk
-    pi = mass_potential(cut.pieces_to_cells(pressure_at(pressure, cut.pieces.x)), bulk)  # which adds up in a cell
+    pi = mass_potential(
+        cut.pieces_to_cells(pressure_at(pressure, cut.pieces.x + grid.base)), bulk
+    )  # which adds up in a cell
     store = on_grid.weight * on_grid.data.pieces["storage"][:, 0]
     held = contents.total(cut.cells, store)
     weight = np.where(held[contents.slot(cut.cells)] > 0, store, on_grid.weight)
     mean = contents.total(cut.cells, weight * pi) / contents.total(cut.cells, weight)
-    wanted = pressure_at(pressure, grid.midpoints[contents.filled] + contents.centroid[contents.filled])
+    wanted = pressure_at(pressure, grid.base + grid.midpoints[contents.filled] + contents.centroid[contents.filled])
     pi = pi + (mass_potential(wanted, bulk) - mean)[contents.slot(cut.cells)]
     p = cut.to_pieces(pressure_of(pi, bulk))
     pieces, bounds = cut.pieces, np.stack([p, p], axis=1)
@@ -87,7 +89,8 @@ def balanced(scene: Scene, state: State) -> State:
             pressure = scene.motion.pressures(start.on_grid, state.stage, state.t)
             seeded = replace(seeded, points=replace(seeded.points, pressure=pressure))
         unknowns, best, count = start.matrices.momentum.unknowns, (np.inf, 0), 0
-        solvers, report = LinearSolvers(scene.scheme, start.matrices.momentum, None, start.matrices.symmetric), Report()
+        scheme, momentum, report = scene.scheme, start.matrices.momentum, Report()
+        solvers = LinearSolvers(planned(scheme, momentum, None, start.matrices.symmetric), scheme, momentum, None)
         seen, w, points = [], np.zeros_like(forms.u.x.array), seeded.points
         while count - best[1] < PATIENCE:
             forms.u.x.array[:] = w
@@ -101,7 +104,7 @@ def balanced(scene: Scene, state: State) -> State:
                 best = left, count, points, held, w, mechanical.reactions(start.acting[-1].sides, forms.nodal)
             if left <= scene.scheme.tolerance:
                 break
-            solve_substep(solvers, problem, None, partial(start.on_grid.as_reset, seeded), count, report)
+            solve_substep(solvers, problem, None, partial(start.on_grid.as_reset, seeded), count, report, Kept())
             if mechanical.touches:
                 _, touched = mechanical.touched(start.acting[-1].sides, unknowns, forms.u.x.array, seeded.points)
                 seeded = replace(seeded, points=touched)

@@ -33,7 +33,7 @@ from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.points.parts import parts_of_cells
 from mpm_dolfinx.solve.scheme import Scheme
-from mpm_dolfinx.solve.schur import LinearSolvers
+from mpm_dolfinx.solve.schur import LinearSolvers, planned
 from mpm_dolfinx.stepping.stage import Stage
 from mpm_dolfinx.stepping.state import State
 
@@ -320,19 +320,18 @@ class System:
         if storage is not None:
             unknowns = self.momentum.unknowns
             self.storage = StorageSystem(storage, on_grid.cells, on_grid.facets, unknowns, parts)
+        self.plan = planned(scheme, self.momentum, self.storage, symmetric)
+        """How the linearised problem is solved."""
         self._solvers: Latest[LinearSolvers] = Latest()
 
     def solvers(self) -> LinearSolvers:
-        """Return the solvers at the start of a step."""
-        make = (self._scheme, self.momentum, self.storage, self.symmetric)
-        solvers = self._solvers((), lambda: LinearSolvers(*make))
-        solvers.begin()
-        return solvers
+        """Return the solvers."""
+        return self._solvers((), lambda: LinearSolvers(self.plan, self._scheme, self.momentum, self.storage))
 
     def end_step(self) -> None:
         """Drop coarse grids that hold no tangent for other steps, before the points need the memory to move."""
         made = self._solvers.value
-        if made is not None and made.iterative and made.tangent.value is None:
+        if made is not None and self.plan.iterative and made.tangent.value is None:
             del made
             self._solvers.clear()
             collect_garbage(self.momentum.unknowns.comm)
@@ -365,7 +364,7 @@ class Assembled(Keyed):
         sides: SideData,
     ):
         self.momentum, self.storage, self.symmetric = system.momentum, system.storage, system.symmetric
-        self.solvers, self.end_step = system.solvers, system.end_step
+        self.plan, self.solvers, self.end_step = system.plan, system.solvers, system.end_step
         self._on_grid, self._stage = on_grid, stage
         self._u, self._varies = momentum.u, storage is not None and storage.conductivity is not None
         self._by_pressure = storage if self._varies and storage.conductivity.pressure is not None else None
@@ -391,10 +390,9 @@ class Assembled(Keyed):
         grid, on_grid = self._on_grid.cut.grid, self._on_grid
         of_cells = ROUND_OFF * on_grid.stiffness * grid.cell_volume / grid.h.min()
         if sides.holds is not None:
-            reach = np.abs(np.concatenate([grid.lower, grid.upper])).max()
             held = np.zeros(grid.num_local)
             np.maximum.at(held, sides.holds.cells, sides.holds["stiffness"][:, 0])
-            of_cells = of_cells + 4 * EPSILON * reach * held
+            of_cells = of_cells + 4 * EPSILON * grid.reach * held
         if sides.tools is not None:
             np.maximum.at(of_cells, sides.tools.rows.cell, of_cells[sides.tools.rows.cell] + sides.tools.rounding)
         own = np.flatnonzero(on_grid.active[: grid.num_owned])

@@ -111,9 +111,8 @@ class Scene:
         """Of time integration."""
         substeps(method, True)  # refuses what is none
         self.motion = Motion(scene, bodies, self.momentum, self.storage)
-        # what is still to be looked for, and what has been warned of: nothing but the log knows
+        # what is still to be looked for, to be warned of, of which nothing but the log knows
         self._looks = (warn_overfilled, *[partial(warn_smeared, materials=scene)] * scene.uneven)
-        self._told: set[str] = set()
         self._on_grid: Latest[OnGrid] = Latest()
         self._systems: Latest[System] = Latest()
         self._assembled: Latest[Assembled] = Latest()
@@ -133,6 +132,11 @@ class Scene:
         self.t.value, self.dt.value = t, dt
         if gravity is not None:
             self.gravity.value = gravity
+
+    @cached_property
+    def _told(self) -> set[str]:
+        """What has been warned of, of which nothing but the log knows."""
+        return set()
 
     def look_at(self, gravity: Sequence[NDArray[np.float64] | None]) -> None:
         """Log a warning, once, of a gravity at the start of a step and in it that is not that of the conductivities."""

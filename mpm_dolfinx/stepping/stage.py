@@ -15,9 +15,19 @@ from mpm_dolfinx.base.validation import all_of, line, numbers
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.faces import Surface
 from mpm_dolfinx.conditions.axis import with_axis
-from mpm_dolfinx.conditions.conditions import Displacement, Drained, Inflow, Pressure, RigidPlate, Traction
+from mpm_dolfinx.conditions.conditions import (
+    Displacement,
+    Drained,
+    Inflow,
+    OnSide,
+    Pressure,
+    RigidPlate,
+    Source,
+    Traction,
+)
 from mpm_dolfinx.conditions.sides import Sides
 from mpm_dolfinx.conditions.unit_weights import weighed
+from mpm_dolfinx.contact.groups import Contact
 from mpm_dolfinx.contact.tools import Tool
 from mpm_dolfinx.domains.lattice import Lattice, lattices
 from mpm_dolfinx.flow.hydraulic_boundary import HydraulicBoundary
@@ -26,25 +36,41 @@ from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.materials.skeleton import Fluid
 from mpm_dolfinx.mechanics.mechanical_boundary import MechanicalBoundary
 
-CONDITIONS = {
+Condition = Traction | Pressure | Displacement | RigidPlate | Drained | Inflow | Tool | Contact
+"""What acts on the bodies."""
+KINDS = {
     "tractions": (Traction, Pressure),
-    "displacements": Displacement,
-    "drained": Drained,
-    "inflows": Inflow,
-    "plates": RigidPlate,
-    "tools": Tool,
+    "displacements": (Displacement,),
+    "outlets": (Drained, Inflow),
+    "plates": (RigidPlate,),
+    "tools": (Tool,),
+    "contacts": (Contact,),
 }
+
+
+def by_kind(conditions: Sequence[Condition]) -> dict[str, tuple]:
+    """Return conditions by their kind, in their order; ValueError where one is none."""
+    known = tuple(kind for kinds in KINDS.values() for kind in kinds)
+    if isinstance(conditions, Sequence) and any(isinstance(one, (OnSide, Source)) for one in conditions):
+        raise ValueError("conditions: OnSide and Source are terms, must be given as terms=")
+    all_of("conditions", conditions, known)
+    if len({id(one) for one in conditions}) < len(conditions):
+        twice = next(one for i, one in enumerate(conditions) if any(one is other for other in conditions[:i]))
+        raise ValueError(f"conditions: {line(twice)} is given twice, must be given once")
+    return {name: tuple(one for one in conditions if isinstance(one, kinds)) for name, kinds in KINDS.items()}
 
 
 @dataclass(frozen=True, eq=False)
 class Stage:
     """The conditions in force.
 
-    conditions: as they were given, by name, the axis among the fixed walls; present: which bodies are there; later:
-    those that may still come; free: (nodes, d), components that no wall holds; axisymmetric: as the grid; lattices: of
-    the bodies that are there; mechanical, hydraulic: what acts on the sides of the bodies.
+    given: the conditions, as they were given; conditions: by kind, with walls, the axis among them, gravity and terms;
+    present: which bodies are there; later: those that may still come; free: (nodes, d), components that no wall holds;
+    axisymmetric: as the grid; lattices: of the bodies that are there; mechanical, hydraulic: what acts on the sides of
+    the bodies.
     """
 
+    given: tuple[Condition, ...]
     conditions: Mapping[str, Any]
     present: tuple[bool, ...]
     later: tuple[int, ...]
@@ -87,8 +113,7 @@ def stage(
     fluid
         Pore fluid, if there is one.
     conditions
-        fixed, tractions, displacements, drained, inflows, plates, tools, contacts, gravity: see `Simulation`; terms: on
-        sides.
+        walls, conditions, gravity: see `Simulation`; terms: on sides.
     present, later
         Which bodies are there, and which may still come.
 
@@ -97,9 +122,8 @@ def stage(
     ValueError
         Naming the condition, its value and what is allowed.
     """
-    for name, kind in CONDITIONS.items():
-        all_of(name, conditions[name], kind)
-    if fluid is None and (conditions["drained"] or conditions["inflows"]):
+    own = by_kind(conditions["conditions"])
+    if fluid is None and own["outlets"]:
         raise ValueError("drained and inflow sides need a fluid")
     gravity = conditions["gravity"]
     if callable(gravity):
@@ -108,20 +132,33 @@ def stage(
         gravity = _gravity(gravity, "gravity", grid.dim, grid.axisymmetric).copy()
     if not any(present):
         raise ValueError("bodies: none is there, must be at least one")
-    fixed = with_axis(grid, conditions["fixed"])
-    free = ~_fixed(grid, fixed)
-    own = {name: tuple(values) for name, values in conditions.items() if name not in ("fixed", "gravity")}
+    walls = with_axis(grid, conditions["walls"])
+    free = ~_held(grid, walls)
+    given, own["terms"] = tuple(conditions["conditions"]), tuple(conditions["terms"])
     own["tractions"] = tuple(replace(load, value=weighed(load.value, fluid)) for load in own["tractions"])
-    own["drained"] = tuple(replace(side, pressure=weighed(side.pressure, fluid)) for side in own["drained"])
-    conditions = {**own, "fixed": dict(fixed), "gravity": gravity}  # nobody changes what a stage was given
+    own["outlets"] = tuple(
+        replace(side, pressure=weighed(side.pressure, fluid)) if isinstance(side, Drained) else side
+        for side in own["outlets"]
+    )
+    conditions = {**own, "walls": dict(walls), "gravity": gravity}  # nobody changes what a stage was given
     sides = Sides(grid, bodies, present)
     acting = (conditions[name] for name in ("tractions", "displacements", "plates", "tools", "terms"))
     mechanical = MechanicalBoundary(sides, free, materials, *acting, conditions["contacts"])
-    hydraulic = HydraulicBoundary(sides, [*conditions["drained"], *conditions["inflows"]])
+    hydraulic = HydraulicBoundary(sides, conditions["outlets"])
     held = [(faces, axes) for _, faces, axes in mechanical.holds]
     held += [(faces, range(grid.dim)) for _, faces in mechanical.plates]
     lattice = lattices(bodies, present, held)
-    return Stage(conditions, tuple(present), tuple(later), free, grid.axisymmetric, lattice, mechanical, hydraulic)
+    return Stage(
+        given=given,
+        conditions=conditions,
+        present=tuple(present),
+        later=tuple(later),
+        free=free,
+        axisymmetric=grid.axisymmetric,
+        lattices=lattice,
+        mechanical=mechanical,
+        hydraulic=hydraulic,
+    )
 
 
 def _gravity(value: ArrayLike, name: str, dim: int, axisymmetric: bool) -> NDArray[np.float64]:
@@ -131,15 +168,15 @@ def _gravity(value: ArrayLike, name: str, dim: int, axisymmetric: bool) -> NDArr
     return out
 
 
-def _fixed(grid: Grid, fixed: Mapping[str, str]) -> NDArray[np.bool_]:
+def _held(grid: Grid, walls: Mapping[str, str]) -> NDArray[np.bool_]:
     """Return which components (nodes, d) are held by walls."""
     d = grid.dim
     out = np.zeros((len(grid.node_x), d), dtype=bool)
-    if not isinstance(fixed, Mapping):
-        raise ValueError(f"fixed = {line(fixed)}, must be walls with their components, such as {{'left': 'xy'}}")
-    for wall, axes in fixed.items():
+    if not isinstance(walls, Mapping):
+        raise ValueError(f"walls = {line(walls)}, must be walls with their components, such as {{'left': 'xy'}}")
+    for wall, axes in walls.items():
         if not isinstance(axes, str) or not axes or any(a not in "xyz"[:d] for a in axes):
-            raise ValueError(f"fixed wall {wall!r}: components {axes!r}, must be some of {'xyz'[:d]!r}")
+            raise ValueError(f"walls: {wall!r}: components {axes!r}, must be some of {'xyz'[:d]!r}")
         for a in axes:
             out[grid.wall_nodes(wall), "xyz".index(a)] = True
     return out

@@ -16,9 +16,12 @@ from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.faces import surface
 from mpm_dolfinx.bodies.fills import put, touches
 from mpm_dolfinx.bodies.touching import check_apart
+from mpm_dolfinx.conditions.conditions import Drained
 from mpm_dolfinx.conditions.sides import everywhere
 from mpm_dolfinx.conditions.unit_weights import WEIGHS, warn_units
 from mpm_dolfinx.contact.cell_contact import let_go
+from mpm_dolfinx.contact.groups import Contact
+from mpm_dolfinx.contact.tools import Tool
 from mpm_dolfinx.domains.pressure_transport import at_start
 from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.materials.initial_stress import OfWater
@@ -26,7 +29,7 @@ from mpm_dolfinx.parallel.messages import warn
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.stepping.initial_state import pieces_at_start
 from mpm_dolfinx.stepping.scene import Scene
-from mpm_dolfinx.stepping.stage import CONDITIONS, Stage, stage
+from mpm_dolfinx.stepping.stage import KINDS, Condition, Stage, by_kind, stage
 from mpm_dolfinx.stepping.state import State
 
 
@@ -46,10 +49,17 @@ def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int
     d, unknown = scene.grid.dim, np.nan if scene.initial.given else 0.0  # before a first step
     reactions, walls = (np.full((count, d), unknown) for count in (len(begun.mechanical.holds), 2 * d))
     outflows = np.zeros(len(begun.hydraulic.outlets))
-    points, forces = begun.mechanical.grip(points), begun.mechanical.forces(0.0)
-    ways = np.zeros(len(begun.mechanical.tools.tools))
-    acting = reactions, walls, outflows, forces, ways
-    return State(0.0, points, transported, None, 0, *acting, begun, True, *[None] * 4)
+    return State(
+        t=0.0,
+        points=begun.mechanical.grip(points),
+        transported=transported,
+        reactions=reactions,
+        walls=walls,
+        outflows=outflows,
+        tool_forces=begun.mechanical.forces(0.0),
+        tool_travel=np.zeros(len(begun.mechanical.tools.tools)),
+        stage=begun,
+    )
 
 
 def begin_stage(
@@ -70,11 +80,14 @@ def begin_stage(
     flag("stage: reset_displacement", reset_displacement)
     present = [(here and body not in remove) or body in add for body, here in enumerate(before.present)]
     later = [body for body in before.later if body not in add]
-    begun = _stage(scene, {**before.conditions, **named}, present, later)
-    if named.keys() & {"gravity", "tractions", "drained"}:
+    conditions = _with_contacts(before, named.get("conditions", before.given))
+    begun = _stage(scene, {**before.conditions, **named, "conditions": conditions}, present, later)
+    was, now = by_kind(before.given), by_kind(begun.given)
+    changed = {name for name in KINDS if was[name] != now[name]}
+    if "gravity" in named or changed & {"tractions", "outlets"}:
         _warn_weights(scene, begun, {})
     if remove:
-        _warn_moved_on(scene, before, begun, [name for name in CONDITIONS if name not in {*named, "tools"}])
+        _warn_moved_on(scene, before, begun)
     if state.stays:  # pressures are those of the cells
         state = scene.motion.left_grid(state, scene.on_grid(state.stay.points))
     state = replace(state, stay=None)
@@ -85,7 +98,7 @@ def begin_stage(
         gravity = begun.gravity_at(state.t)
     bare = _without_extra(scene, bare, add, fields) if add else bare
     points, new = _filled(scene, bare.of(gone, kept=False), there, add, gravity)
-    kept = let_go(state.points, before.mechanical.tools.kept(0)) if "tools" in named else state.points
+    kept = let_go(state.points, before.mechanical.tools.kept(0)) if "tools" in changed else state.points
     points = begun.mechanical.grip(points, kept)
     if transported is not None:
         transported = transported.of(gone, kept=False).joined(at_start(new))
@@ -93,17 +106,25 @@ def begin_stage(
     if reset_displacement:
         points = replace(points, origin=points.corners)
     unknown, new = np.nan if state.resets else 0.0, {}
-    if "displacements" in named:
+    if "displacements" in changed:
         new["reactions"] = np.full((len(begun.mechanical.holds), scene.grid.dim), unknown)
-    if "fixed" in named:
+    if "walls" in named:
         new["walls"] = np.full_like(state.walls, unknown)
-    if "tools" in named:
+    if "tools" in changed:
         new["tool_forces"] = begun.mechanical.forces(unknown)
         new["tool_travel"] = np.zeros(len(begun.mechanical.tools.tools))
-    if named.keys() & {"drained", "inflows"}:
+    if "outlets" in changed:
         new["outflows"] = np.full(len(begun.hydraulic.outlets), unknown)
     new["rest"] = state.rest if begun.mechanical.holds_as(before.mechanical) else None
     return replace(state, points=points, transported=transported, stage=begun, begins=True, held=None, **new)
+
+
+def _with_contacts(before: Stage, conditions: Sequence[Condition]) -> list[Condition]:
+    """Return conditions with the scene's contacts, which no stage changes."""
+    there, given = before.conditions["contacts"], by_kind(conditions)["contacts"]
+    if given and given != there:
+        raise ValueError(f"stage: conditions: {line(given[0])}, contacts must be those of the scene, or left out")
+    return [*conditions, *(() if given else there)]
 
 
 def _stage(scene: Scene, conditions: Mapping[str, Any], present: Sequence[bool], later: Sequence[int]) -> Stage:
@@ -117,7 +138,7 @@ def _warn_weights(scene: Scene, begun: Stage, given: Mapping[str, Any]) -> None:
     """
     gravity, fluid = begun.conditions["gravity"], scene.fluid
     g = 0.0 if gravity is None or callable(gravity) else float(np.linalg.norm(gravity))
-    on_sides = [(f"water at {c.side!r}", c.pressure) for c in begun.conditions["drained"]]
+    on_sides = [(f"water at {c.side!r}", c.pressure) for c in begun.conditions["outlets"] if isinstance(c, Drained)]
     on_sides += [(f"water at {c.side!r}", c.value) for c in begun.conditions["tractions"]]
     levels = [*given.items(), *on_sides]
     if fluid is None:
@@ -132,17 +153,19 @@ def _warn_weights(scene: Scene, begun: Stage, given: Mapping[str, Any]) -> None:
             warn(scene.grid.comm, f"{what}: at one level they are not at rest", name, weight, of, own)
 
 
-def _warn_moved_on(scene: Scene, before: Stage, begun: Stage, kept: Sequence[str]) -> None:
-    """Log a warning for each condition that was not given anew and acts on what an excavation has laid bare."""
+def _warn_moved_on(scene: Scene, before: Stage, begun: Stage) -> None:
+    """Log a warning for each condition that stays as it was and acts on what an excavation has laid bare."""
     stop = np.cumsum([len(body) for body in scene.bodies])
-    for condition in (condition for name in kept for condition in begun.conditions[name]):
+    for condition in begun.given:
+        if isinstance(condition, (Tool, Contact)) or not any(condition is one for one in before.given):
+            continue
         was, now = (surface(scene.bodies, condition.side, condition.region, s.present) for s in (before, begun))
         bare = sum_by(now.id, now.area0, stop[-1]) - sum_by(was.id, was.area0, stop[-1])
         here = np.repeat(before.present, [len(body) for body in scene.bodies])
         new = np.flatnonzero(here[now.id] & (bare[now.id] > SAME * now.whole0))
         if len(new):
             area = bare[np.unique(now.id[new])].sum()
-            what = "stage: remove: %s was not given anew and now also acts on %.3g m^%d that were laid bare, from %s on"
+            what = "stage: remove: %s stays as it was and now also acts on %.3g m^%d that were laid bare, from %s on"
             warn(scene.grid.comm, what, line(condition), area, scene.grid.dim - 1, now.X[new[0]].mean(axis=0))
 
 

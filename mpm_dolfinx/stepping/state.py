@@ -74,7 +74,7 @@ class Stay:
         return Stay(points, *(values[order] for values in rows), keeps)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class State:
     """All that a scene remembers between two steps.  A step makes a new one; nobody changes one.
 
@@ -96,7 +96,7 @@ class State:
     walls : (2 d, d), N (N/m in plane strain)
         Forces of the walls of the grid, in the order of `SIDES`, on the bodies in the last step; nan before the first
         one of a stage that holds others.
-    outflows : (drained sides, then inflows), m^3/s (m^2/s in plane strain)
+    outflows : (drained sides and inflows, as given), m^3/s (m^2/s in plane strain)
         Volumes at zero pressure that leave the bodies through them at the end of the last step; nan before the first
         one of a stage.
     tool_forces : (tools + contacts, d + 1), in 3D (..., 6), N and N m (N/m and N in plane strain)
@@ -123,19 +123,19 @@ class State:
     t: float
     points: MaterialPoints
     transported: PiecePressures | None
-    stay: Stay | None
-    resets: int
+    stay: Stay | None = None
+    resets: int = 0
     reactions: NDArray[np.float64]
     walls: NDArray[np.float64]
     outflows: NDArray[np.float64]
     tool_forces: NDArray[np.float64]
     tool_travel: NDArray[np.float64]
     stage: Stage
-    begins: bool
-    velocity: NDArray[np.float64] | None
-    held: NDArray[np.float64] | None
-    rest: NDArray[np.float64] | None
-    result: Result | None
+    begins: bool = True
+    velocity: NDArray[np.float64] | None = None
+    held: NDArray[np.float64] | None = None
+    rest: NDArray[np.float64] | None = None
+    result: Result | None = None
 
     def __post_init__(self):
         _freeze(self)
@@ -165,4 +165,4 @@ class State:
         if grid.comm.size == 1:
             return self
         placed = self.as_cut
-        return self.migrated(grid.owner(grid.number(grid.index(placed.x)) + grid.copy(placed.id)), grid.comm)
+        return self.migrated(grid.owner(grid.number(grid.index_from_base(placed.x)) + grid.copy(placed.id)), grid.comm)

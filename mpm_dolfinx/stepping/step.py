@@ -8,7 +8,7 @@ from functools import partial
 
 from mpm_dolfinx.base.report import Report
 from mpm_dolfinx.forms.unknowns import collect_garbage
-from mpm_dolfinx.solve.newton import note_pressures, solve_substep
+from mpm_dolfinx.solve.newton import Kept, note_pressures, solve_substep
 from mpm_dolfinx.stepping.balances import Acting, Start, at_rest, balances, has_yielded
 from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.state import State
@@ -40,11 +40,11 @@ def set_up(scene: Scene, state: State, dt: float, how: tuple = ()) -> Start:
 
 def step(scene: Scene, state: State, dt: float, how: tuple = ()) -> tuple[State, Report]:
     """Return the state after a step of dt (s), and what it took; `state` stays what it is, whatever is raised."""
-    start, report, rates = set_up(scene, state, dt, how), Report(), []
+    start, report, kept, rates = set_up(scene, state, dt, how), Report(), Kept(), []
     state, on_grid, solvers = start.state, start.on_grid, start.matrices.solvers()
     for acting in start.acting:
         both, key = balances(scene, start, acting, *rates[-1:]), (start.matrices.key, acting.substep.own * dt)
-        rates.append(solve_substep(solvers, *both, partial(on_grid.as_reset, state), key, report))
+        rates.append(solve_substep(solvers, *both, partial(on_grid.as_reset, state), key, report, kept))
     note_pressures(report, solvers, both.storage, acting.substep.before * dt, dt, rates)
     del solvers
     start.matrices.end_step()

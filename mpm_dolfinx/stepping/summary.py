@@ -91,6 +91,7 @@ def _solvers(s: Scene, state: State) -> list[Part]:
             "linear law: until active cells or time step change",
             "the tangent depends on the strain",
         ),
+        Part("linear solvers", True, str(s.last[1].plan) if s.last[1] else "planned in the first step"),
         _either("second substep", len(s.substeps) > 1, "second order in time", _one_substep(s)),
     ]
 

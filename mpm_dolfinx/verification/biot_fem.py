@@ -42,7 +42,7 @@ from mpm_dolfinx.base.tolerances import NEAR, ROUND_OFF, SAME, TINY
 from mpm_dolfinx.base.validation import all_of, functions, line, numbers
 from mpm_dolfinx.bodies.faces import Region, limits
 from mpm_dolfinx.conditions.axis import with_axis
-from mpm_dolfinx.conditions.conditions import RIGIDITY, Drained, Pressure, RigidPlate, Traction
+from mpm_dolfinx.conditions.conditions import RIGIDITY, Drained, Pressure, RigidPlate, Source, Traction, sorted_terms
 from mpm_dolfinx.forms.axes import block
 from mpm_dolfinx.forms.point_forms import PointMeasure
 from mpm_dolfinx.grid.grid import TURN, Grid, side
@@ -103,14 +103,16 @@ class BiotFEM:
         Number of cells along each axis, at least 1.
     material, fluid
         Skeleton without state, and pore fluid, whose pressure is zero at the start.
-    fixed
+    walls
         Sides with the components that are zero there, such as {"left": "xy"}.
-    tractions, drained, plates
-        Conditions on sides, nodal pressures on whole facets of a region; other sides are free and sealed.
+    conditions
+        `Traction`, `Pressure`, `RigidPlate` and `Drained` on sides, nodal pressures on whole facets of a region; other
+        sides are free and sealed.
     gravity : callable t -> (d,), m/s^2
         Acceleration of gravity, without fluid only.
-    terms, sources
-        The user's, as those of `Simulation`: see `user_functions`.  q is a test function of the pressure's elements.
+    terms
+        The user's, as those of `Simulation`, none on sides: see `user_functions`, `Source`.
+        q is a test function of the pressure's elements.
     element
         "taylor-hood": Q2 displacement, Q1 pressure; "q1-dg0": Q1, constant in the cells with two-point fluxes.
     method
@@ -128,14 +130,11 @@ class BiotFEM:
         cells: Sequence[int],
         material: Skeleton,
         *,
-        fixed: Mapping[str, str],
+        walls: Mapping[str, str],
+        conditions: Sequence[Traction | Pressure | RigidPlate | Drained] = (),
         fluid: Fluid | None = None,
-        tractions: Sequence[Traction | Pressure] = (),
-        drained: Sequence[Drained] = (),
-        plates: Sequence[RigidPlate] = (),
         gravity: Callable[[float], ArrayLike] | None = None,
-        terms: Sequence[Callable] = (),
-        sources: Sequence[Callable] = (),
+        terms: Sequence[Callable | Source] = (),
         element: str = "taylor-hood",
         comm: MPI.Intracomm = MPI.COMM_WORLD,
         tolerance: float = 1e-8,
@@ -147,6 +146,11 @@ class BiotFEM:
         numbers("tolerance", tolerance, test=lambda v: (0 < v) & (v < 1), allowed="in (0, 1)")
         if element not in ELEMENTS:
             raise ValueError(f"element {element!r}: must be one of {', '.join(ELEMENTS)}")
+        all_of("conditions", conditions, (Traction, Pressure, RigidPlate, Drained))
+        tractions = [one for one in conditions if isinstance(one, (Traction, Pressure))]
+        plates = [one for one in conditions if isinstance(one, RigidPlate)]
+        drained = [one for one in conditions if isinstance(one, Drained)]
+        terms, sources = sorted_terms(terms)
         functions("terms", terms)
         functions("sources", sources)
         if fluid is None and (drained or sources):
@@ -161,16 +165,16 @@ class BiotFEM:
                 f"{type(material).__name__}: the reference has no state and no local unknowns; only moduli, "
                 "conductivity and parameters of the law may be functions of place, the rest must be numbers"
             )
-        self.grid = Grid(upper, cells, lower, comm, axisymmetric=axisymmetric)
+        self.grid = Grid(lower, upper, cells, comm, axisymmetric=axisymmetric)
         self.material, self.fluid = material, fluid
         radius = ufl.SpatialCoordinate(self.grid.mesh)[0]
         self._around = TURN * radius if axisymmetric else 1.0  # what measures in the plane count by
         self.tolerance, self._t = tolerance, fem.Constant(self.grid.mesh, 0.0)
         self._substeps = substeps(method, fluid is not None or bool(terms))  # terms may depend on the velocity
-        self.scale = float(np.max(material.at(self.grid.midpoints).oedometric))
+        self.scale = float(np.max(material.at(self.grid.midpoints + self.grid.base).oedometric))
         """Unit of the pressure among the unknowns, Pa; both equations are divided by it."""
         self._space = Space(self.grid, fluid is not None, *ELEMENTS[element])
-        self._bcs = self._conditions(with_axis(self.grid, fixed), drained if element == "taylor-hood" else ())
+        self._bcs = self._conditions(with_axis(self.grid, walls), drained if element == "taylor-hood" else ())
         start = time.perf_counter()
         self._plates = [(plate, self._area(plate)) for plate in plates]
         for load in tractions:
@@ -191,6 +195,11 @@ class BiotFEM:
         """Time, s."""
         return float(self._t.value)
 
+    @property
+    def _places(self):
+        """True places at rest as UFL."""
+        return ufl.SpatialCoordinate(self.grid.mesh) + self._constant(self.grid.base)
+
     def _constant(self, value: ArrayLike) -> fem.Constant:
         return fem.Constant(self.grid.mesh, np.asarray(value, dtype=float))
 
@@ -206,7 +215,8 @@ class BiotFEM:
         for f in (at, centre):
             f.interpolate(lambda x: x[:d])
         middle.interpolate(centre)
-        rows = np.asarray(value((middle.x.array + (1 - SAME) * (at.x.array - middle.x.array)).reshape(-1, d)), float)
+        x = (middle.x.array + (1 - SAME) * (at.x.array - middle.x.array)).reshape(-1, d)
+        rows = np.asarray(value(x + self.grid.base), float)
         f = fem.Function(_compat.function_space(msh, "DG", 2, rows.shape[1:]))
         f.x.array[:] = rows.ravel()
         return f
@@ -214,9 +224,9 @@ class BiotFEM:
     def _box(self, name: str, region: Region | None = None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the corners of a flat box around a side, or around the part of it in a region."""
         grid, (axis, end) = self.grid, side(name, self.grid.dim)
-        low, high = limits(region, grid.dim)
-        plane, near = (grid.lower, grid.upper)[end][axis], NEAR * grid.h
-        low, high = np.maximum(low, grid.lower) - near, np.minimum(high, grid.upper) + near
+        low, high = limits(region, grid.dim) - grid.base
+        plane, near = (grid.low, grid.high)[end][axis], NEAR * grid.h
+        low, high = np.maximum(low, grid.low) - near, np.minimum(high, grid.high) + near
         if not (low[axis] <= plane <= high[axis] and (low < high).all()):
             raise ValueError(f"side {name!r}: the region {line(region)} must have a part of it")
         low[axis], high[axis] = plane - near[axis], plane + near[axis]
@@ -228,12 +238,12 @@ class BiotFEM:
         facets = mesh.locate_entities_boundary(msh, d - 1, lambda x: ((x[:d] >= low) & (x[:d] <= high)).all(axis=0))
         return fem.dirichletbc(PETSc.ScalarType(value), fem.locate_dofs_topological(space, d - 1, facets), space)
 
-    def _conditions(self, fixed: Mapping[str, str], drained: Sequence[Drained]) -> list:
+    def _conditions(self, walls: Mapping[str, str], drained: Sequence[Drained]) -> list:
         """Return the conditions of zero displacement and of nodal pressure."""
         axes, bcs, space = "xyz"[: self.grid.dim], [], self._space.u.function_space
-        for name, held in fixed.items():
+        for name, held in walls.items():
             if not isinstance(held, str) or not held or not set(held) <= set(axes):
-                raise ValueError(f"fixed side {name!r}: components {held!r}, must be some of {axes!r}")
+                raise ValueError(f"walls: {name!r}: components {held!r}, must be some of {axes!r}")
             bcs += [self._prescribe(space.sub(axes.index(a)), 0.0, name) for a in held]
         return bcs + [self._prescribe(self._space.W.sub(1), o.pressure / self.scale, o.side, o.region) for o in drained]
 
@@ -245,9 +255,9 @@ class BiotFEM:
     def _area(self, condition: RigidPlate) -> float:
         """Return the area of the part of a side that a condition names (m^(d-1))."""
         low, high = self._box(condition.side, condition.region)
-        within = np.minimum(high, self.grid.upper) - np.maximum(low, self.grid.lower)
+        within = np.minimum(high, self.grid.high) - np.maximum(low, self.grid.low)
         area = float(np.delete(within, side(condition.side, self.grid.dim)[0]).prod())
-        middle = (np.maximum(low, self.grid.lower) + np.minimum(high, self.grid.upper)) / 2
+        middle = (np.maximum(low, self.grid.low) + np.minimum(high, self.grid.high)) / 2
         return area * float(np.squeeze(self.grid.around(middle[None])))
 
     def _on(self, condition: Traction | Pressure | Drained | RigidPlate, integrand):
@@ -279,7 +289,7 @@ class BiotFEM:
             grad=lambda f: ufl.dot(self._grad(f), ufl.inv(F_n)),
             F=F_n,
             displacement=u_n,
-            position=ufl.SpatialCoordinate(self.grid.mesh) + u_n,
+            position=self._places + u_n,
             **parameters,
         )
         seen = {"points": points, "t": t}
@@ -342,7 +352,7 @@ class BiotFEM:
         k = self._field(law.conductivity)
         if law.conductivity_law is not None:
             porosity = {"porosity": n, "porosity0": self._constant(law.porosity)}
-            x = ufl.SpatialCoordinate(self.grid.mesh) + u
+            x = self._places + u
             k = call(law.conductivity_law, conductivity=k, F=F, J=J, x=x, **porosity)
         kappa = dt * self._constant(self.scale / self.fluid.unit_weight) * k
         pull = self._in_plane(ufl.inv(F).T)
@@ -486,7 +496,7 @@ class BiotFEM:
         if steps < 1 or abs(steps * dt - (t_end - self.t)) > NEAR * dt:
             raise ValueError(f"dt = {dt!r}, t_end = {t_end!r}: dt must divide the {t_end - self.t:g} s left")
         x = positions(probes, self.grid.dim)
-        out = np.flatnonzero(self.grid.outside(x))
+        out = np.flatnonzero(self.grid.outside(x - self.grid.base))
         if len(out):
             raise ValueError(f"probe at {x[out[0]]}: outside the body, must be in it or on its surface")
         result, began = Result(rows=(self._row(x),)), time.perf_counter()
@@ -510,8 +520,8 @@ class BiotFEM:
 
     def _at(self, f: fem.Function, x: NDArray[np.float64], size: int) -> NDArray[np.float64]:
         """Return a function's values (m, size) at reference positions x (m, d) in the body, on every process."""
-        grid, out = self.grid, np.zeros((len(x), size))
-        cells = grid.local(grid.number(grid.index(x)))
+        grid, out, x = self.grid, np.zeros((len(x), size)), x - self.grid.base
+        cells = grid.local(grid.number(grid.index_from_base(x)))
         here = np.flatnonzero((cells >= 0) & (cells < grid.num_owned))
         if len(here):
             out[here] = f.eval(np.pad(x[here], ((0, 0), (0, 3 - grid.dim))), cells[here]).reshape(-1, size)

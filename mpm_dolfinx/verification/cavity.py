@@ -31,7 +31,7 @@ class _Rings:
         law = type(material)
         values = {name: np.asarray(getattr(material, name), dtype=float) for name in law.parameters}
         start = {name: np.asarray(v, dtype=float) for name, v in (dict(law.state) | dict(state or {})).items()}
-        grid = Grid([1.0] * 3, [2] * 3, comm=MPI.COMM_SELF)
+        grid = Grid([0] * 3, [1.0] * 3, [2] * 3, comm=MPI.COMM_SELF)
         self._law = LawAtPoints(grid, law, {name: v.shape for name, v in (values | start).items()})
         self._values, self.start = _tiled(values, count), _tiled(start, count)
 

@@ -73,16 +73,18 @@ def _scales(scene: Scene, run: Sequence[Shown]) -> dict[str, float]:
 def resolved(scene: Scene, frame: Frame, run: Sequence[Shown]) -> dict[str, float]:
     """Return what the rounding of coordinates in a frame is in each field, over the largest value of the field.
 
-    A place is known to the last digit of a coordinate, a strain to that over a cell, a stress to the stiffest modulus
-    times that; what holds sides and tools is so many times stiffer still.
+    A place is given, and shown, to the last digit of a coordinate: so far from the origin scenes differ by that over a
+    cell, and displacements by that.  On the grid a place is known to the last digit of the grid's size, a strain to
+    that over a cell, a stress to the stiffest modulus times that; what holds sides and tools is so many times stiffer.
     """
     scales, h, d = _scales(scene, run), min(scene.h), scene.dim if not scene.axisymmetric else 3
     most = np.abs(frame.place([np.zeros(scene.dim), scene.size], scene)).max() / frame.length
-    place = np.finfo(float).eps * most
+    given, place = (np.finfo(float).eps * size for size in (most, scene.size.max()))
     stress = place / h * max(law.get("bulk", 1e7) + 4 / 3 * law["shear"] for _, law in scene.materials)
     out = {name: place / scales["displacement"] for name in scales}
-    out |= {"volume": place / h / scales["volume"]}
+    out |= {"displacement": given / scales["displacement"], "volume": place / h / scales["volume"]}
     out["outflows"] += place / h * _seeps(scene) * h ** (d - 1) / scales["outflows"]
     out |= {name: stress / scales[name] for name in ("stress", "pressure")}
     forces = {"reactions": HOLD, "tools": STIFF}
-    return out | {name: k * stress * h ** (d - 1) / scales[name] for name, k in forces.items()}
+    out |= {name: k * stress * h ** (d - 1) / scales[name] for name, k in forces.items()}
+    return {name: value + given / h for name, value in out.items()}

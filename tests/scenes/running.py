@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import ufl
+from helpers import without
 from numpy.typing import NDArray
 
 import mpm_dolfinx as mpm
@@ -59,7 +60,7 @@ class _Builder:
         size = scene.size + more * scene.h
         lower, upper = frame.box(np.zeros(scene.dim), size, scene)
         cells = np.abs(frame.vector(np.add(scene.cells, more))).astype(int).tolist()
-        self.grid = mpm.Grid(upper, cells, lower=lower, axisymmetric=scene.axisymmetric)
+        self.grid = mpm.Grid(lower, upper, cells, axisymmetric=scene.axisymmetric)
         bodies = self.permuted(list(range(len(scene.bodies) + far)))
         laws = self.permuted(list(range(len(scene.materials) + far)))
         self.order = [bodies.index(i) for i in range(len(bodies))]
@@ -78,7 +79,10 @@ class _Builder:
             walls[frame.side("top")] = "xyz"[: scene.dim]
         walls = dict(self.permuted(list(walls.items())))
         options = self.options(later)
-        simulation = mpm.Simulation(self.grid, found, materials, fixed=walls, later=later, **conditions, **options)
+        terms = [*conditions.pop("terms"), *map(mpm.Source, conditions.pop("sources"))]
+        acting = [one for values in conditions.values() for one in values]
+        options |= {"walls": walls, "conditions": acting, "terms": terms, "later": later}
+        simulation = mpm.Simulation(self.grid, found, materials, **options)
         return Built(scene, frame, simulation, self.order, self.loads, numbers, materials)
 
     def permuted(self, values: list) -> list:
@@ -349,10 +353,10 @@ def _stage(built: Built) -> None:
     if kind == "load":
         built.loads["factor"] *= 1.3
     if kind == "reset":
-        built.simulation.stage(reset_displacement=True, displacements=[])
+        built.simulation.stage(reset_displacement=True, conditions=without(built.simulation, mpm.Displacement))
         built.numbers["displacements"] = []
     if kind == "free":
-        built.simulation.stage(displacements=[])
+        built.simulation.stage(conditions=without(built.simulation, mpm.Displacement))
         built.numbers["displacements"] = []
 
 

@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: MIT
+"""PETSc's options for the solvers: those of the package, and those of the user's in their place.
+
+Names begin with that of a solver, as in {"momentum_ksp_type": "bcgs"}; on the command line with "mpm_" before it.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+from petsc4py import PETSc
+
+PREFIXES = {
+    "momentum_": "factors of K",
+    "momentum_multigrid_": "multigrid on K",
+    "nodal_factors_": "factors of K in blocks",
+    "storage_": "conjugate gradients or FGMRES on the Schur complement, with factors of the fixed-stress operator",
+    "storage_gathered_": "these factors on the one of several processes that has them",
+    "storage_multigrid_": "multigrid on the fixed-stress operator",
+    "block_": "GMRES on displacements and pressures at once",
+    "factors_": "factors of K that replace multigrid cycles",
+    "storage_factors_": "factors of the fixed-stress operator that do",
+}
+"""What names of options begin with, and the solver that this is."""
+
+
+def check(options: Mapping[str, Any]) -> None:
+    """Raise a ValueError for a name that begins as that of no solver."""
+    for name in options:
+        if not isinstance(name, str) or not name.startswith(tuple(PREFIXES)):
+            raise ValueError(f"petsc_options {name!r}: must begin with one of {', '.join(PREFIXES)}")
+
+
+@contextmanager
+def using(options: Mapping[str, Any], unread: set[str] | None = None) -> Iterator[None]:
+    """Give PETSc options of the user's while solvers are made; remove from `unread` those that these read."""
+    given, before = PETSc.Options(), {}
+    for name, value in options.items():
+        full = f"mpm_{name}"
+        before[full] = given.getString(full) if given.hasName(full) else None
+        given.delValue(full)  # looking for it has marked it as read
+        given.setValue(full, value)
+    try:
+        yield
+    finally:
+        if unread:
+            unread -= {name for name in unread if _read(f"mpm_{name}")}
+        for full, value in before.items():
+            given.delValue(full) if value is None else given.setValue(full, value)
+
+
+def set_defaults(solver: PETSc.KSP, values: Mapping[str, Any]) -> None:
+    """Set options of a solver that the user has not."""
+    options = PETSc.Options(solver.getOptionsPrefix())
+    for name, value in values.items():
+        if not options.hasName(name):
+            options.setValue(name, value)
+
+
+def _read(name: str) -> bool:
+    """Return whether PETSc has read an option; petsc4py does not tell."""
+    found = ctypes.c_int()
+    ctypes.CDLL(PETSc.__file__).PetscOptionsUsed(None, name.encode(), ctypes.byref(found))
+    return bool(found.value)

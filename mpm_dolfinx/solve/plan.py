@@ -1,0 +1,187 @@
+# SPDX-License-Identifier: MIT
+"""The choice of solvers: one function of what a problem is, and the one table of where routes cross.
+
+Four routes lead through the linearised problem.  Without fluid the momentum is solved alone.  With fluid displacements
+are eliminated (`schur`), both problems are solved at once (`monolithic`), or in turn (fixed-stress iterations).
+Displacements have factors, a block a node, by PETSc or MUMPS, or multigrid cycles.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+FACTORS, NODAL, MUMPS, MULTIGRID = "factors", "factors in blocks", "factors by MUMPS", "multigrid"
+"""Ways to solve for displacements or pressures."""
+ALONE, SCHUR, AT_ONCE, IN_TURN = "momentum alone", "Schur complement", "both at once", "in turn"
+"""Ways through the linearised problem."""
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """Where one route becomes better than another; `bash demos/run.sh calibrate` times both sides of each.
+
+    multigrid_3d
+        Unknown displacements in 3D from which on multigrid solves.  Seconds of five load steps of a square beam by
+        factors and by multigrid: 0.5 and 0.5 with 1200 unknowns, 2.5 and 1.4 with 2600, 8.2 and 2.1 with 4900.
+    multigrid_2d
+        The same in wet 2D scenes in which nothing yields.  Linear algebra of a step of the beam, s: 0.06 and 0.05 with
+        10400 unknowns, 0.19 and 0.14 with 25500, 0.53 and 0.32 with 51000, 2.3 and 1.0 with 151000.
+    mumps
+        Unknown displacements of wet unsymmetric problems from which on MUMPS makes factors, on all processes.  Seconds
+        of factors of K and of a solve with 196000 unknowns: PETSc 2.6 and 0.02, MUMPS with OpenBLAS 0.7 and 0.09; with
+        51000 unknowns 0.25 and 0.004, 0.12 and 0.02.  A Newton step takes five to ten solves.
+    gathering
+        Processes up to which one of them has the factors that are used often: all of four making both, which share the
+        memory's bandwidth, took 1.7 times as long.
+    fallback_3d
+        Unknown displacements in 3D up to which factors may replace cycles.  MUMPS takes 8 s and 0.2 GB for as many,
+        where K is not symmetric 15 s and 0.4 GB.
+    many
+        Iterations of a solve after which factors replace the cycles, or the next tangent has factors of its own
+        fixed-stress operator.  With 12 and 50 a footing takes 0.98 and 1.03 of the time, the same Newton steps.
+    coarsest
+        Unknowns of a grid that is solved on by factors.
+    """
+
+    multigrid_3d: int = 1500
+    multigrid_2d: int = 30000
+    mumps: int = 100000
+    gathering: int = 4
+    fallback_3d: int = 20000
+    many: int = 29
+    coarsest: int = 1000
+
+
+THRESHOLDS = Thresholds()
+
+
+@dataclass(frozen=True)
+class SolverPlan:
+    """How the linearised problem is solved.
+
+    Parameters
+    ----------
+    route
+        One of `ALONE`, `SCHUR`, `AT_ONCE`, `IN_TURN`.
+    displacements, pressures
+        What stands for the inverses of K and of the fixed-stress operator; pressures is "" without fluid.
+    krylov
+        Type of the iterative solver by PETSc's name, "preonly" where factors alone solve.
+    fallback
+        Factors that replace a cycle on K which takes many iterations; "" where none may.
+    firmly
+        Whether cycles smooth three times as often: volumes hardly change, and no factors may help.
+    gathered
+        Whether one process has the factors.
+    symmetric
+        Whether the tangent of the momentum is.
+    many
+        Iterations of a solve after which other factors are made: see `Thresholds`.
+    coarsest
+        Unknowns of a grid that is solved on by factors.
+    forcing
+        Least relative accuracy of a linear solve; see `plan`.
+    keep
+        A tangent serves on while a Newton step leaves less than this share of the residual; see `plan`.
+    """
+
+    route: str
+    displacements: str
+    pressures: str
+    krylov: str
+    fallback: str
+    firmly: bool
+    gathered: bool
+    symmetric: bool
+    many: int
+    coarsest: int
+    forcing: float
+    keep: float
+
+    @property
+    def iterative(self) -> bool:
+        """Whether a multigrid cycle stands for K^-1, not factors."""
+        return self.displacements == MULTIGRID
+
+    def __str__(self) -> str:
+        """Return the plan in one line."""
+        how = [f"displacements by {self.displacements}"]
+        if self.pressures:
+            how.append(f"pressures by {self.pressures}")
+        if self.krylov != "preonly":
+            how.append(self.krylov.upper())
+        if self.fallback:
+            how.append(f"else {self.fallback}")
+        return f"{self.route}: {', '.join(how)}"
+
+
+def plan(
+    unknowns: int,
+    dim: int,
+    *,
+    wet: bool = True,
+    yields: bool = False,
+    locks: bool = False,
+    symmetric: bool = True,
+    processes: int = 1,
+    coupling: str = "schur-cg",
+) -> SolverPlan:
+    """Return how to solve a problem.
+
+    The tangent is kept while a Newton step reduces the residual to less than 0.05, to 0.01 in 2D, wet and elastic.  The
+    seed beam in 26 steps by error: 205 steps and 79 tangents with 0.05, 179 and 83 with 0.01, 174 and 94 with 0.002.
+    In 3D, where tangents cost more, a beam takes up to a fifth longer with 0.01.
+
+    Linear solves go to 1e-5, by multigrid in 3D to 1e-3.  With factors an iteration is cheap, and what a solve leaves
+    of the fluid's residual costs a Newton step: a footing on 21 cells (backward Euler) takes 299, 370 with 1e-3.
+
+    Parameters
+    ----------
+    unknowns
+        Displacements, of all processes.
+    dim
+        2 or 3.
+    wet
+        Whether there is fluid.
+    yields, locks
+        Whether any law may yield; whether any does or hardly changes its volume.
+    symmetric
+        Whether the tangent of the momentum is.
+    processes
+        Their number.
+    coupling
+        Name in `scheme.COUPLINGS`.
+    """
+    limits, in_turn = THRESHOLDS, wet and coupling.startswith("fixed-stress")
+    at_once = wet and not in_turn
+    if dim == 3:
+        multigrid = unknowns >= limits.multigrid_3d
+    else:
+        multigrid = at_once and not yields and unknowns >= limits.multigrid_2d
+    gathered, mumps = processes <= limits.gathering, not symmetric and unknowns >= limits.mumps
+    direct = MUMPS if wet and (mumps or not gathered) else NODAL if wet else FACTORS
+    fallback = ""
+    if multigrid and at_once and (dim == 2 or unknowns <= limits.fallback_3d):
+        fallback = MUMPS if dim == 3 else direct
+    if not wet:
+        krylov = "gmres" if multigrid else "preonly"
+    elif in_turn:
+        krylov = "preonly"
+    elif multigrid:
+        krylov = "gmres"
+    else:
+        krylov = "cg" if symmetric and coupling == "schur-cg" else "fgmres"
+    return SolverPlan(
+        route=IN_TURN if in_turn else ALONE if not wet else AT_ONCE if multigrid else SCHUR,
+        displacements=MULTIGRID if multigrid else direct,
+        pressures="" if not wet else MULTIGRID if multigrid and at_once else MUMPS if mumps else FACTORS,
+        krylov=krylov,
+        fallback=fallback,
+        firmly=multigrid and locks and not fallback,
+        gathered=gathered,
+        symmetric=symmetric,
+        many=limits.many,
+        coarsest=limits.coarsest,
+        forcing=1e-3 if multigrid and dim == 3 else 1e-5,
+        keep=0.01 if wet and dim == 2 and not yields else 0.05,
+    )
