@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array, diags
 
-from mpm_dolfinx.base.tolerances import SAME
+from mpm_dolfinx.base.tolerances import NEAR, SAME
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.touching import Cover, Faces, covered, covers, local, meeting, warn_near, weights
 from mpm_dolfinx.grid.grid import REACH, Grid
@@ -189,7 +189,7 @@ def _between(K: csr_array, fixed: NDArray[np.bool_], u: NDArray[np.float64]) -> 
         solver.setOperators(matrix)
         solver.setType("cg")
         solver.getPC().setType("icc")
-        solver.setTolerances(rtol=1e-12)
+        solver.setTolerances(rtol=NEAR**2)
         x, b = matrix.createVecs()
         b.array[:] = -(rows[:, held] @ u[held])
         solver.solve(b, x)

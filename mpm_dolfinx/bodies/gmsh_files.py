@@ -39,7 +39,7 @@ class _Numbers:
         """Return the next numbers (count,): "i" int, "u" size_t, "d" double."""
         dtype, out = np.dtype({"i": "<i4", "u": "<u8", "d": "<f8"}[kind]), float if kind == "d" else np.int64
         if self._binary:
-            return np.frombuffer(self._bytes.read(count * dtype.itemsize), dtype, count).astype(out)
+            return np.frombuffer(self._bytes.read(count * dtype.itemsize), dtype).astype(out)
         return np.array(list(islice(self._words, count))).astype(out)
 
 
@@ -48,7 +48,7 @@ def version(file: Path) -> str:
     if not file.is_file():
         return ""
     with file.open("rb") as opened:
-        found = re.search(rb"\$MeshFormat\s+(\d+(?:\.\d+)?)\s", opened.read(10000))
+        found = re.search(rb"\$MeshFormat\s+(\d+(?:\.\d+)?)\s", opened.read(2**14))
     return found[1].decode() if found else ""
 
 

@@ -20,7 +20,7 @@ from mpm_dolfinx.grid.grid import Grid, rounding, sum_by
 from mpm_dolfinx.parallel.messages import warn
 from mpm_dolfinx.points.cutting import FACES, corner_bits, cut_at, kuhn_simplices
 
-BITS = corner_bits(2)
+BITS = corner_bits(2)  # Source: definition
 
 
 @dataclass
@@ -119,7 +119,7 @@ def near(a: NDArray[np.float64], b: NDArray[np.float64], reach: float = 0.0) -> 
     low, high = np.maximum(a.min(axis=(0, 1)), b.min(axis=(0, 1))), np.minimum(a.max(axis=(0, 1)), b.max(axis=(0, 1)))
     size = [np.ptp(c, axis=1) for c in (a, b)]
     edge = np.maximum(size[0].max(axis=0), size[1].max(axis=0))
-    slack = reach + 0.01 * edge.max()
+    slack = reach + edge.max() / 100
     i, j = (
         np.flatnonzero(((c.max(axis=1) >= low - slack) & (c.min(axis=1) <= high + slack)).all(axis=1)) for c in (a, b)
     )

@@ -35,8 +35,8 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 
 FAST = 10
 """Share of a wave of two domains that is taken away, over the cells that it has crossed; at most all of it."""
-THIRD = (-1.0, 3.0, -3.0, 1.0)
-MARGIN = 3
+THIRD = (-1, 3, -3, 1)
+MARGIN = len(THIRD) - 1
 """Layers of a lattice on both sides that the change of one depends on."""
 
 

@@ -26,7 +26,6 @@ SIDES = {
     3: {"left": (0, 0), "right": (0, 1), "front": (1, 0), "back": (1, 1), "bottom": (2, 0), "top": (2, 1)},
 }
 """Names of the sides of a box: (axis, 0 for the lower or 1 for the upper end)."""
-SNAP = 1e-10  # cells: vertices this close to a grid plane, or as close as rounding tells, are taken to lie on it
 REACH = 1e-4  # cells: a side that is given its way to the wall of the grid gives way by as much
 
 TURN = 2 * np.pi
@@ -189,7 +188,7 @@ class Grid:
         self.h = (self.upper - self.lower) / self.shape
         self.base = self.lower * [not axisymmetric, *[True] * (d - 1)]
         self.low, self.high = self.lower - self.base, self.upper - self.base
-        self.snap = np.maximum(SNAP, [rounding(ends) for ends in zip(self.lower, self.upper, strict=True)] / self.h)
+        self.snap = np.maximum(SAME, [rounding(ends) for ends in zip(self.lower, self.upper, strict=True)] / self.h)
         self.comm = comm
         self._cells: Cells | None = None
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.base.errors import NotConverged
-from mpm_dolfinx.base.tolerances import SAME
+from mpm_dolfinx.base.tolerances import NEAR, SAME
 from mpm_dolfinx.base.validation import asked, line, numbers
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.overburden import overburden
@@ -24,7 +24,7 @@ from mpm_dolfinx.materials.trial import PLANE, SPACE
 from mpm_dolfinx.parallel.exchange import first, over_all
 from mpm_dolfinx.points.material_points import MaterialPoints
 
-EXACT, CLOSE = 1e-13, 1e-8  # of the largest given stress: to which laws are solved, and have to be
+EXACT, CLOSE = 1e-13, SAME  # of the largest given stress: to which laws are solved, and have to be
 MOST = 30  # iterations
 LARGEST = 0.2  # change of a strain in an iteration
 
@@ -318,7 +318,7 @@ class _Sought:
             change = (self.off(strain + SAME * np.eye(count)[k])[2] - missing) / SAME
             slopes[:, :, k] = np.where(free & free[:, [k]], change, slopes[:, :, k])
         slopes, missing = (np.nan_to_num(values) for values in (slopes, missing))
-        singular = ~(np.abs(np.linalg.det(slopes / shear[:, None, None])) > 1e-12)
+        singular = ~(np.abs(np.linalg.det(slopes / shear[:, None, None])) > NEAR**2)
         slopes[singular] = np.eye(count) * (2 * shear[singular])[:, None, None]
         change = np.linalg.solve(slopes, missing[:, :, None])[:, :, 0].clip(-LARGEST, LARGEST)
         return np.clip(strain - change, -1, 1)

@@ -24,13 +24,12 @@ import numpy as np
 import ufl
 from numpy.typing import NDArray
 
-from mpm_dolfinx.base.tolerances import EPSILON
+from mpm_dolfinx.base.tolerances import EPSILON, NEAR
 from mpm_dolfinx.forms.axes import embedded, planar
 from mpm_dolfinx.materials.frictional import Frictional
 from mpm_dolfinx.materials.skeleton import Field, _check
 from mpm_dolfinx.materials.trial import PLANE, Coaxial, Isotropic, components, eigen, symmetric
 
-CLOSE = 1e-12  # of stresses over the shear modulus
 FACE, EDGES, ALL = slice(0, 1), slice(1, 3), slice(None)  # of the faces of a return
 NEVER = 1e6  # tensile strength over the bulk modulus where none is given
 
@@ -148,7 +147,7 @@ def _returned(e: NDArray, bulk: NDArray, shear: NDArray, sine: NDArray, sine_flo
         for few in (FACE, EDGES, ALL):  # most end on the first, most others on the next
             at = _Return(trial[rows], *(v[rows] for v in parameters))
             ends, of_trial, offence = at.end(few)
-            there = offence <= CLOSE * shear[rows] if few is not ALL else slice(None)
+            there = offence <= NEAR**2 * shear[rows] if few is not ALL else slice(None)
             t[rows[there]], slopes[rows[there]] = ends[there], of_trial[there] @ elastic[rows[there]]
             rows = np.delete(rows, there)
             if not len(rows):

@@ -358,8 +358,8 @@ def _eigenvalues(C, apart: float = APART):
         return mean + radius, mean - radius
     mean = ufl.tr(C) / 3
     D = C - mean * ufl.Identity(3)
-    r = ufl.sqrt(ufl.inner(D, D) / 6 + 1e-2 * apart**2)
-    phi = ufl.acos((1 - 1e2 * apart**2) * ufl.det(D) / (2 * r * r * r)) / 3
+    r = ufl.sqrt(ufl.inner(D, D) / 6 + (apart / 10) ** 2)
+    phi = ufl.acos((1 - (10 * apart) ** 2) * ufl.det(D) / (2 * r * r * r)) / 3
     return tuple(mean + 2 * r * ufl.cos(phi + 2 * ufl.pi * k / 3) for k in range(3))
 
 

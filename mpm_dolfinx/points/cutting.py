@@ -26,9 +26,11 @@ from itertools import combinations, permutations
 import numpy as np
 from numpy.typing import NDArray
 
+from mpm_dolfinx.base.tolerances import NEAR
 from mpm_dolfinx.grid.grid import TURN, Grid, sum_by
 
-SLIVER = 1e-12  # of the domain: smaller pieces are dropped; less than one `Grid.snap` thin, whose face is open
+SLIVER = NEAR**2
+"""Of the domain: smaller pieces are dropped.  Those less than `Grid.snap` thin have an open face.  Source: epsilon."""
 CHUNK = 2**15  # simplices of domains that are cut at a time, in the processor's cache
 TANGLED = 0.2  # of its volume: a domain whose corners span less is re-derived from F
 
@@ -468,8 +470,8 @@ def _size(s: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.sqrt(sum((a[i] * b[j] - a[j] * b[i]) ** 2 for i, j in combinations(range(len(a)), 2)))
 
 
-_CUBIC = (0.659027622374092, 0.231933368553031, 0.109039009072877)  # Strang and Fix (1973)
-_RULES = {  # barycentric points of equal weight, exact to third order on segments and triangles
+_CUBIC = (0.659027622374092, 0.231933368553031, 0.109039009072877)  # Source: Strang and Fix (1973)
+_RULES = {  # Source: Gauss, Strang and Fix (1973); of equal weight, exact to third order
     2: 0.5 + np.array([[1, -1], [-1, 1]]) / np.sqrt(12),
     3: np.array(list(permutations(_CUBIC))),
 }
@@ -526,7 +528,7 @@ def _on_plane(a, b, axis: int, plane):
     return x
 
 
-_A, _B, _C = (0,), (1,), (2,)
+_A, _B, _C = (0,), (1,), (2,)  # Source: definition, the vertices
 # vertices are sorted along the axis; (i, j) is the point where the edge from i to j meets the plane
 _CUTS = {
     1: {1: {"below": [(_A, (0, 1))], "above": [((0, 1), _B)]}},

@@ -27,7 +27,7 @@ from mpm_dolfinx.stepping.on_grid import OnGrid
 from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.state import State
 
-REACH = 3
+REACH = int(RADIUS)
 """Cells along each axis from that of a probe to the last one that counts: all that `LocalFit` gives weight."""
 
 
