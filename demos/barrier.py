@@ -111,7 +111,7 @@ def slump(cells: int, steps: int, barrier: bool) -> Slump:
         force, between, at = np.zeros(3), (0.0, 0.0), corners[np.abs(corners[..., 0] - WALL) < s.grid.h[0] / 2]
         depth = float(at[:, 1].max(initial=0))
         if barrier and s.t > 0:
-            force, between = s.tool_forces[0] * [-1, -1, 1], bounds(s, depth)
+            force, between = s.tool_forces["tool"] * [-1, -1, 1], bounds(s, depth)
         out.frames.append(Frame(s.t, corners, moved, force, between, depth))
 
     def weaken(s: mpm.Simulation) -> None:

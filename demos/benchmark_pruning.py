@@ -58,10 +58,12 @@ def block(
     h = 1 / cells
     count = [round(box * cells), round(box * cells) + 2]
     grid = mpm.Grid([0, 0], [box, box + 2 * h], count, axisymmetric=axisymmetric)
-    options.setdefault("conditions", [mpm.Traction("top", lambda t: (0, -LOAD * t))])
+    conditions = options.pop("conditions", [])
+    if not any(isinstance(one, (mpm.Traction, mpm.Pressure)) for one in conditions):
+        conditions = [mpm.Traction("top", lambda t: (0, -LOAD * t)), *conditions]
     walls = {"left": "x", "right": "x", "bottom": "y"}
     body = meshed(grid, cells) if from_mesh else mpm.box(grid, [0, 0], [1, 1])
-    return mpm.Simulation(grid, [body], [material or soil()], walls=walls, **options)
+    return mpm.Simulation(grid, [body], [material or soil()], walls=walls, conditions=conditions, **options)
 
 
 def meshed(grid: mpm.Grid, cells: int):
@@ -172,7 +174,7 @@ PAIRS: dict[str, tuple[Make, Make]] = {
     "flux form": (lambda n: block(n, **SEALED), lambda n: block(n, soil(conductivity=1e-30), **SEALED)),
     "seepage face": (draining, lambda n: draining(n, conditions=[mpm.Drained("top", seepage=True)])),
     "layers off the grid lines": (partial(layered, off=0.0), partial(layered, off=0.5)),
-    "second order in time": (lambda n: draining(n, method="backward-euler"), draining),
+    "second order in time": (lambda n: draining(n, numerics=mpm.Numerics(method="backward-euler")), draining),
     "body force": (block, lambda n: block(n, gravity=(0, 0))),
     "initial stress": (block, lambda n: block(n, initial_stress=lambda x: np.zeros((len(x), 3)))),
     "pressure that follows the surface": (

@@ -84,7 +84,7 @@ def ring(cells: int, soil: mpm.Skeleton, widest: float, outside: Callable | None
     size = int(np.ceil(np.sqrt(OUTER**2 + widest**2 - 1) / h)) + 2
     grid = mpm.Grid([0] * 2, [size * h] * 2, [size] * 2)
     body = mpm.mapped(grid, mpm.box(grid, [0, 0], [OUTER - 1] * 2), lambda X: (1 + X[:, :1]) * ray(X))
-    moved = [mpm.Displacement("left", lambda t, X: min(t, widest - 1) * ray(X))]
+    moved = [mpm.Displacement("left", lambda t, X: min(t, widest - 1) * ray(X), name="hole")]
     if outside is not None:
         moved.append(mpm.Displacement("right", lambda t, X: outside(t) * ray(X)))
     return mpm.Simulation(
@@ -106,7 +106,7 @@ def widen(s: mpm.Simulation, cells: int, radius: float, push: float) -> float:
 
 def pressure(s: mpm.Simulation, radius: float) -> float:
     """Return the pressure in the hole over p_0."""
-    return float(s.reactions[0].mean() / radius / P0)
+    return float(s.reactions["hole"].mean() / radius / P0)
 
 
 def drained(name: str, cells: int) -> dict[float, tuple[float, float]]:
@@ -166,7 +166,7 @@ def push(OCR: float, cells: int) -> Undrained:
     look(s)
     result = s.result
     s.t = 0.0
-    held = mpm.Displacement("left", lambda t, X: (widest - 1) * ray(X))
+    held = mpm.Displacement("left", lambda t, X: (widest - 1) * ray(X), name="hole")
     s.stage(conditions=[*(one for one in s.conditions if not isinstance(one, mpm.Displacement)), held])
     times = OUTER**2 / CV * np.array([0.003, 0.03, 0.1, 0.3, 3.0])
     before = out.balance = result.balance

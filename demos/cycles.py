@@ -94,7 +94,7 @@ def cycle(
     grid = mpm.Grid([0, 0], beam.BOX, cells)
     bottom = (round(0.5 * beam.BOX[1] / h) + o.offset) * grid.h[1]
     body = seed(grid, [0, bottom], [beam.LENGTH, bottom + beam.HEIGHT], o.points_per_cell)
-    given = {"quadrature": quadrature, "fluid": fluid, **conditions(o)}
+    given = {"numerics": mpm.Numerics(quadrature=quadrature), "fluid": fluid, **conditions(o)}
     if springs:
 
         def held_up(points, u):

@@ -54,7 +54,7 @@ class Dam:
 
     def see(self, simulation: mpm.Simulation) -> None:
         """Keep what is to be seen now."""
-        self.flows.append(simulation.outflows.copy())
+        self.flows.append(simulation.outflows.array)
         self.frames.append((simulation.points.corners.copy(), simulation.points.pressure))
 
 
@@ -83,7 +83,7 @@ def run(h: float = 0.5, steps: int = 10) -> Dam:
         gravity=(0, -9.81),
         pressure=mpm.hydrostatic(LEVELS[0]),
         initial_stress=mpm.K0(0.5, surcharge=lambda x: WEIGHT * np.maximum(LEVELS[0] - x[:, 1], 0)),
-        method="backward-euler",
+        numerics=mpm.Numerics(method="backward-euler"),
         **conditions(LEVELS[0]),
     )
     out = Dam()
@@ -118,7 +118,7 @@ def rectangular(cells: int) -> float:
         pressure=mpm.hydrostatic(upper),
     )
     simulation.run(600.0, 20.0, progress=False)
-    return float(simulation.outflows[1] / (k * (upper**2 - lower**2) / (2 * width)))
+    return float(simulation.outflows["drained_right"] / (k * (upper**2 - lower**2) / (2 * width)))
 
 
 def drained(cells: int, k: float = 1e-5) -> float:
@@ -140,12 +140,12 @@ def drained(cells: int, k: float = 1e-5) -> float:
         gravity=(0, -9.81),
         pressure=mpm.hydrostatic(high),
         initial_stress=mpm.K0(0.5),
-        method="backward-euler",
+        numerics=mpm.Numerics(method="backward-euler"),
     )
     time = YIELD / k * (high - low + head * np.log((high - head) / (low - head)))
     lost, steps = [], 40
-    simulation.run(time, time / steps, progress=False, observe=lambda s: lost.append(s.outflows[0] * time / steps))
-    return float(sum(lost) / (YIELD * h * (high - low)))
+    simulation.run(time, time / steps, progress=False, observe=lambda s: lost.append(s.outflows["drained_bottom"]))
+    return float(sum(lost) * time / steps / (YIELD * h * (high - low)))
 
 
 def main(argv: list[str] | None = None) -> dict:

@@ -156,7 +156,7 @@ def scene_runs(
         yield PEER, setting, elements(n, m, "q1-dg0")
         yield TRUTH, setting, elements(n, m, "taylor-hood")
     for n in cells:
-        yield STANDARD, f"{n} cells, {time[1]} steps", points(n, time[1], quadrature="point")
+        yield STANDARD, f"{n} cells, {time[1]} steps", points(n, time[1], numerics=mpm.Numerics(quadrature="point"))
     for rtol in (1e-2, 1e-3) if "fluid" in physics else ():
         yield BY_ERROR, f"{cells[-1]} cells, rtol {rtol:g}", points(cells[-1], 0, rtol)
 

@@ -169,18 +169,19 @@ def push(
     body = mpm.box(grid, [0, -rows * h], [columns * h, 0])
     end, edge = (depth * WIDTH**2 / (CV * rate) if rate else 1.0), WIDTH / 2
     under, beside = ((0, -np.inf), (edge, np.inf)), ((edge - h / 2, -np.inf), (np.inf, np.inf))  # from its last node on
-    footing = mpm.Displacement("top", lambda t, X: (0, -depth * WIDTH * min(1, t / end)), region=under)
-    water = {"fluid": WATER, "method": method, "conditions": [mpm.Drained("top", region=beside)]} if rate else {}
+    footing = mpm.Displacement("top", lambda t, X: (0, -depth * WIDTH * min(1, t / end)), region=under, name="footing")
+    sides, water = [footing], {}
+    if rate:
+        sides.append(mpm.Drained("top", region=beside))
+        water = {"fluid": WATER, "numerics": mpm.Numerics(method=method)}
     walls = {"left": "x", "right": "x", "bottom": "xy"}
-    simulation = mpm.Simulation(
-        grid, [body], [soil], walls=walls, conditions=[footing, *water.pop("conditions", [])], **water
-    )
+    simulation = mpm.Simulation(grid, [body], [soil], walls=walls, conditions=sides, **water)
     out = Push()
 
     def observe(s: mpm.Simulation) -> None:
         out.settlement.append(depth * min(1, s.t / end))
         area = np.pi / 4 * WIDTH**2 if circular else WIDTH / 2  # of half of the strip
-        out.load.append(-s.reactions[0, 1] / (area * COHESION))
+        out.load.append(-s.reactions["footing"][1] / (area * COHESION))
         if len(out.load) % 5 == 0 or s.result.converged:
             corners, pressure = common.whole(s, "corners", "pressure")
             top = corners[body.sides[:, 1, 1]][:, 2:].reshape(-1, 2)

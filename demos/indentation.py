@@ -54,13 +54,13 @@ class Contact:
 
 def contact(s: mpm.Simulation) -> Contact:
     """Return the present contact: p^2 is linear in x^2."""
-    p, x = s.points.data["tool_0_pressure"], s.points.x[:, 0]
+    p, x = s.points.data["ball_pressure"], s.points.x[:, 0]
     on = p > 0
     order = np.argsort(x[on])
     x, p = x[on][order], p[on][order]
     inner = x < 0.8 * x.max()
     slope, square = np.polyfit(x[inner] ** 2, p[inner] ** 2, 1)
-    return Contact(-2 * s.tool_forces[0, 1], x, p, np.sqrt(square), np.sqrt(-square / slope))
+    return Contact(-2 * s.tool_forces["ball"][1], x, p, np.sqrt(square), np.sqrt(-square / slope))
 
 
 def scene(cells: int, wet: bool) -> mpm.Simulation:
@@ -69,7 +69,8 @@ def scene(cells: int, wet: bool) -> mpm.Simulation:
     grid = mpm.Grid([0, 0], [SIZE, SIZE + 4 * h], [n, n + 4])
     top = SIZE + 0.3 * h  # the surface is no line of the grid
     at_once = INSTANT * TIME
-    ball = mpm.Tool(mpm.Ball((0, top + RADIUS), RADIUS), displacement=lambda t: (0, -DEPTH * min(1, t / at_once)))
+    shape = mpm.Ball((0, top + RADIUS), RADIUS)
+    ball = mpm.Tool(shape, displacement=lambda t: (0, -DEPTH * min(1, t / at_once)), name="ball")
     water = {"fluid": mpm.Fluid(), "conditions": [mpm.Drained("right")]} if wet else {}
     walls = {"left": "x", "right": "x", "bottom": "y"}
     return mpm.Simulation(
@@ -105,7 +106,7 @@ def pressed(cells: int, wet: bool) -> Pressed:
     if wet:
         out.balance = result.balance
         result = s.run(TIME * TIMES[-1], rtol=1e-2, t_eval=TIME * TIMES, progress=False)
-        out.forces += [-2 * float(forces[0, 1]) for forces in result.tools[1:]]
+        out.forces += [-2 * float(force) for force in result.tool_forces["ball"][1:, 1]]
         out.contacts.append(contact(s))
         out.balance, out.cuts = max(out.balance, result.balance), out.cuts + result.cuts
     return out

@@ -69,7 +69,7 @@ def run(cells: int = 40, steps: int = 30, method: str = "sdirk2") -> tuple[dict[
         fluid=WATER,
         walls={"left": "x", "bottom": "y"},
         conditions=[mpm.RigidPlate("top", FORCE), mpm.Drained("right")],
-        method=method,
+        numerics=mpm.Numerics(method=method),
     )
     top = mpm.probes([quarter], [[x, HEIGHT] for x in np.linspace(0, WIDTH, 11)])
     out = Outcome()

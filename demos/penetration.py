@@ -129,7 +129,7 @@ def leg(out: Push, stress: Callable | None, alpha: float, cells: int, y: float, 
 
     def see(s: mpm.Simulation) -> None:
         out.depth.append(gone + s.t - begin)
-        out.N.append(-2 * float(s.tool_forces[0, 1]) / STRENGTH / D)
+        out.N.append(-2 * float(s.tool_forces["tool"][1]) / STRENGTH / D)
         out.steady.append(s.t - begin > STEADY * way)
 
     result = simulation.run(begin + way, way / max(2, round(way * cells / STEP)), observe=see, progress=False)
@@ -174,7 +174,7 @@ def push_wet(rate: float, cells: int, depth: float) -> Push:
     def see(s: mpm.Simulation) -> None:
         gone = speed * max(0, s.t - start)
         out.depth.append(gone / D)
-        out.N.append(-2 * float(s.tool_forces[0, 1]) / STRENGTH / D)
+        out.N.append(-2 * float(s.tool_forces["tool"][1]) / STRENGTH / D)
         x = s.points.x + np.array([0, gone])
         front = (np.linalg.norm(x, axis=1) < D / 2 + grid.h[0] / 2) & (-x[:, 1] > x[:, 0])
         volume = s.points.volume0[front]

@@ -111,8 +111,8 @@ def scene(o: Namespace) -> tuple[mpm.Simulation, float]:
     grid = mpm.Grid(lower, upper, cells)
     beam = mpm.box(grid, start, end, per_cell=o.points_per_cell)
     conditions = physics(o, o.dim)
-    options = {"quadrature": o.quadrature, "coupling": o.coupling, "method": o.method}
-    return mpm.Simulation(grid, [beam], [material(o)], **options, **conditions), bottom
+    numerics = mpm.Numerics(quadrature=o.quadrature, coupling=o.coupling, method=o.method)
+    return mpm.Simulation(grid, [beam], [material(o)], **conditions, numerics=numerics), bottom
 
 
 def output_times(o: Namespace) -> dict:

@@ -76,15 +76,15 @@ def tilted(name: str, delta: float, cells: int) -> Tilted:
     """Load the sand, then tilt the wall in the way that `name` says."""
     way, length, h, mu = WAYS[name], LENGTH[name], 1 / cells, np.tan(np.radians(delta))
     grid = mpm.Grid([-4 * h, -2.5 * h], [length, 1 + 5.5 * h], [round(length / h) + 4, cells + 8])
-    turn = {"rotation": lambda t: -way * TILT[name] * max(0, t - 1)}
-    wall = mpm.Tool(mpm.HalfSpace((0, 0), (1, 0)), **turn, friction=mu, adhesion=mu * REST)
+    turn = {"rotation_rad": lambda t: -way * TILT[name] * max(0, t - 1)}
+    wall = mpm.Tool(mpm.HalfSpace((0, 0), (1, 0)), **turn, friction=mu, adhesion=mu * REST, name="wall")
     floor = mpm.Tool(mpm.HalfSpace((0, 0), (0, 1)), friction=np.tan(np.radians(PHI)), adhesion=COHESION)
     load = mpm.Pressure("top", lambda t: LOAD * min(1, t))
     sand = mpm.box(grid, [0, 0], [length, 1])
     s = mpm.Simulation(grid, [sand], [SOIL], walls={"right": "x"}, conditions=[load, wall, floor])
     s.run(1.0, 1 / STEPS[name], progress=False)
     result = s.run(2.0, 1 / STEPS[name], progress=False)
-    forces = np.array(result.tools)[:, 0]
+    forces = result.tool_forces["wall"]
     thrust, moment = ((value + REST) / (LOAD + REST) for value in (forces[:, 0], -2 * forces[:, 2]))
     stretch = np.linalg.eigvalsh(s.points.data["plastic"])
     frame = s.points.corners, np.log(stretch[:, -1] / stretch[:, 0]) / 2, wall.drawn(grid, s.t)

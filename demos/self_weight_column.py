@@ -53,7 +53,7 @@ def run(cells: int = 64, steps: int = 40, quadrature: str = "domain") -> Outcome
         [FOAM],
         walls={"left": "x", "right": "x", "bottom": "y"},
         gravity=lambda t: (0, -EXACT.gravity * t),
-        quadrature=quadrature,
+        numerics=mpm.Numerics(quadrature=quadrature),
     )
     top = mpm.probes([column], [[h / 2, EXACT.l0]])
     result = simulation.run(1.0, 1 / steps, probes=top)

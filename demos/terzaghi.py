@@ -63,7 +63,7 @@ def run(
         fluid=WATER,
         walls={"left": "x", "right": "x", "bottom": "y"},
         conditions=[mpm.Traction("top", (0, -load)), mpm.Drained("top")],
-        method=method,
+        numerics=mpm.Numerics(method=method),
     )
     out = Outcome(mpm.Result())
     lattice = (2, cells, 2)  # the four points of a cell: two columns, two rows

@@ -72,9 +72,9 @@ def hertz(cells: int) -> dict[str, float]:
     walls = {"left": "x", "right": "x", "bottom": "xy"}
     s = mpm.Simulation(grid, bodies, [soil], walls=walls, conditions=[held, mpm.Contact(0, 1)])
     s.run(1.0, 1.0, progress=False)
-    force = 2 * abs(s.tool_forces[0, 1])
+    force = 2 * abs(s.tool_forces["contact"][1])
     half, most = 2 * np.sqrt(force * R / (np.pi * stiff)), np.sqrt(force * stiff / (np.pi * R))
-    p, x = s.points.data["contact_0_pressure"], s.points.x[:, 0]
+    p, x = s.points.data["contact_pressure"], s.points.x[:, 0]
     on = (p > 0) & (x < 0.8 * half)
     slope, square = np.polyfit(x[on] ** 2, p[on] ** 2, 1)
     off = {"pressure": np.sqrt(square) / most - 1, "half_width": np.sqrt(-square / slope) / half - 1}
@@ -98,7 +98,7 @@ def main(argv: list[str] | None = None) -> dict:
 
         see(s)
         result = s.run(TIMES[-1], 0.05, observe=see)
-        force = np.array(result.tools)[:, 0, :2]
+        force = result.tool_forces["contact"][:, :2]
         t = np.array(result.t)
         slides = (t > 1.5) & (t <= 2.0)
         ratio = float(np.abs(force[slides, 0]).sum() / force[slides, 1].sum())

@@ -19,6 +19,7 @@ from mpm_dolfinx.bodies.bodies import mapped
 from mpm_dolfinx.bodies.boxes import box, shape
 from mpm_dolfinx.bodies.mesh_files import from_mesh
 from mpm_dolfinx.bodies.polygon import polygon
+from mpm_dolfinx.conditions.acting import Acting, Loads
 from mpm_dolfinx.conditions.conditions import (
     Displacement,
     Drained,
@@ -55,6 +56,7 @@ from mpm_dolfinx.probing.probes import probes
 from mpm_dolfinx.simulation.simulation import Simulation
 from mpm_dolfinx.simulation.strength_reduction import Safety, factor_of_safety
 from mpm_dolfinx.solve.scheme import COUPLINGS
+from mpm_dolfinx.stepping.numerics import Numerics
 from mpm_dolfinx.stepping.result import GaveUp, Result
 from mpm_dolfinx.stepping.state import State
 from mpm_dolfinx.verification.element_test import ElementTest, element_test
@@ -63,6 +65,7 @@ __version__ = "0.1.0"
 __all__ = [
     "COUPLINGS",
     "K0",
+    "Acting",
     "Ball",
     "Checkpoint",
     "Cone",
@@ -81,10 +84,12 @@ __all__ = [
     "Inflow",
     "LeftGrid",
     "LinearElastic",
+    "Loads",
     "ModifiedCamClay",
     "MohrCoulomb",
     "NeoHookean",
     "NotConverged",
+    "Numerics",
     "OnSide",
     "Pressure",
     "Result",

@@ -53,6 +53,12 @@ def pressed(finer: int = 1, conductivity=1e-5, bulk=6.7e6, shear=3.1e6, cells=(3
     return mpm.Simulation(grid, [body], [law], walls={"left": "xy"}, conditions=[load, *drained], **water)
 
 
+def joined(*given):
+    """Return arguments of scenes as one, with the conditions of all."""
+    conditions = [one for options in given for one in options.get("conditions", [])]
+    return {name: value for options in given for name, value in options.items()} | {"conditions": conditions}
+
+
 def without(simulation, *kinds):
     """Return the conditions in force, but for those of some kinds."""
     return [one for one in simulation.conditions if not isinstance(one, kinds)]

@@ -24,7 +24,7 @@ simulation = mpm.Simulation(
         mpm.Traction("top", lambda t: (2e4 * t, 1e4 * t, -5e4 * t)),
         mpm.Pressure("right", lambda t: 2e4 * t),
     ],
-    tolerance=1e-11,
+    numerics=mpm.Numerics(tolerance=1e-11),
 )
 result = simulation.run(1.0, 0.25, progress=False)
 points = simulation.points
@@ -34,5 +34,12 @@ if parts:
     ids, x, p = (np.concatenate(a) for a in zip(*parts, strict=True))
     order = np.argsort(ids)
     counts = [len(part[0]) for part in parts]
-    np.savez(sys.argv[1], x=x[order], p=p[order], balance=result.balance, counts=counts, walls=simulation.state.walls)
+    np.savez(
+        sys.argv[1],
+        x=x[order],
+        p=p[order],
+        balance=result.balance,
+        counts=counts,
+        walls=simulation.wall_reactions.array,
+    )
     print(result.newton, result.coupling, result.cuts)

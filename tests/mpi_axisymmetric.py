@@ -18,7 +18,7 @@ simulation = mpm.Simulation(grid, bodies, [sand, gel], fluid=mpm.Fluid(), walls=
 result = simulation.run(1.0, 0.2, progress=False)
 stress, points = simulation.effective_stress(), simulation.points
 columns = (points.id, points.x, points.pressure, stress, points.F, points.data["hardened"])
-acts = np.concatenate([simulation.reactions.ravel(), simulation.outflows])
+acts = np.concatenate([simulation.reactions.array.ravel(), simulation.outflows.array])
 parts = simulation.grid.comm.gather(columns)
 if parts:
     ids, x, p, s, F, hardened = (np.concatenate(a) for a in zip(*parts, strict=True))
@@ -27,4 +27,4 @@ if parts:
     state = {"x": x, "p": p, "stress": s, "F": F, "hardened": hardened}
     counts = [len(part[0]) for part in parts]
     state = {k: v[order] for k, v in state.items()} | {"reactions": acts[:2], "outflows": acts[2:]}
-    np.savez(sys.argv[1], **state, balance=result.balance, counts=counts, walls=simulation.state.walls)
+    np.savez(sys.argv[1], **state, balance=result.balance, counts=counts, walls=simulation.wall_reactions.array)

@@ -36,11 +36,11 @@ simulation.stage(
 )
 result = simulation.run(1.0, 0.5, progress=False)
 points = simulation.points
-data = (points.data["contact_0_shear"], points.data["contact_0_pressure"])
+data = (points.data["contact_shear"], points.data["contact_pressure"])
 parts = simulation.grid.comm.gather((points.id, points.x, points.pressure, *data))
 if parts:
     ids, x, p, s, push = (np.concatenate(a) for a in zip(*parts, strict=True))
     order = np.argsort(ids)
-    more = {"counts": [len(part[0]) for part in parts], "forces": simulation.tool_forces, "push": push[order]}
-    more["walls"] = simulation.state.walls
+    more = {"counts": [len(part[0]) for part in parts], "forces": simulation.tool_forces.array, "push": push[order]}
+    more["walls"] = simulation.wall_reactions.array
     np.savez(sys.argv[1], x=x[order], p=p[order], shear=s[order], balance=result.balance, **more)

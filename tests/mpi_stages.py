@@ -29,7 +29,7 @@ if parts:
         p=p[order],
         stress=s[order],
         probes=result.displacement[-1],
-        reaction=simulation.reactions,
+        reaction=simulation.reactions.array,
         balance=result.balance,
         counts=[len(part[0]) for part in parts],
     )

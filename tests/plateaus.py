@@ -17,9 +17,9 @@ import numpy as np
 import mpm_dolfinx as mpm
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "demos"))
-import cycles  # noqa: E402
-import footing  # noqa: E402
-import helpers  # noqa: E402
+import cycles
+import footing
+import helpers
 
 
 def bent(h: float, nu: float = 0.0) -> dict[str, float]:
@@ -51,7 +51,7 @@ def strip(cells: int) -> dict[str, float]:
 
 def slope(cells: int) -> dict[str, float]:
     """Wet layers aslant on the grid under a load: settlement, pressures."""
-    grid = mpm.Grid([1.5, 1.5], [3 * cells, 3 * cells])
+    grid = mpm.Grid([0, 0], [1.5, 1.5], [3 * cells, 3 * cells])
     soils = [
         mpm.Hencky(bulk=1e7 / 3, shear=5e6, porosity=0.4, conductivity=conductivity) for conductivity in (1e-4, 1e-6)
     ]
@@ -61,10 +61,8 @@ def slope(cells: int) -> dict[str, float]:
     low, high = ((-np.inf, -np.inf), (np.inf, 0.15)), ((-np.inf, 0.45), (np.inf, np.inf))
     held = mpm.Displacement("bottom", (0, 0), region=low)
     load = mpm.Traction("top", lambda t: -1e5 * min(1, 10 * t) * turn[:, 1], region=high)
-    drained = [mpm.Drained("top", region=high)]
-    s = mpm.Simulation(
-        grid, bodies, soils, fixed={}, displacements=[held], tractions=[load], drained=drained, fluid=mpm.Fluid()
-    )
+    acts = [held, load, mpm.Drained("top", region=high)]
+    s = mpm.Simulation(grid, bodies, soils, walls={}, conditions=acts, fluid=mpm.Fluid())
     run = s.run(0.4, 0.1, probes=mpm.probes(bodies, [[0.3, 0.55], [0.3, 0.1]]))
     move, pressure = np.array(run.displacement), np.array(run.pressure)
     return {"tip": np.linalg.norm(move[-1].ravel()), "pressure": np.abs(pressure).max()}

@@ -63,7 +63,7 @@ def test_iterations_and_factors_give_the_same_answer(monkeypatch, fluid, couplin
     states = []
     for least in (10**9, 0):
         thresholds(monkeypatch, multigrid_3d=least)
-        s = block(n=3, fluid=fluid, coupling=coupling)
+        s = block(n=3, fluid=fluid, numerics=mpm.Numerics(coupling=coupling))
         result = s.run(1.0, 0.5, progress=False)
         assert result.cuts == 0 and result.residual <= 1e-8 and result.balance <= 1e-8
         states.append(s.points)
@@ -75,7 +75,7 @@ def test_iterations_and_factors_give_the_same_answer(monkeypatch, fluid, couplin
 
 def test_a_tangent_that_is_not_symmetric_is_solved_by_iterations(monkeypatch):
     thresholds(monkeypatch, multigrid_3d=0)
-    s = block(fluid=True, coupling="schur-fgmres")
+    s = block(fluid=True, numerics=mpm.Numerics(coupling="schur-fgmres"))
     result = s.run(1.0, 0.5, progress=False)
     assert result.converged and result.cuts == 0 and result.newton <= 20
 

@@ -60,7 +60,7 @@ def pressures(cells, bulk, marks, outer):
     for mark in marks:
         steps = round((mark - 1 - s.t) / (0.2 * h) + 0.499)
         s.run(mark - 1, (mark - 1 - s.t) / steps)
-        found.append(s.reactions[0] / mark)
+        found.append(s.reactions.array[0] / mark)
         print(
             f"{cells} cells, K = {bulk:g} G, a/a0 = {mark}: {found[-1]} s_u, exact {exact(mark, outer):.4f}, "
             f"{found[-1].mean() / exact(mark, outer) - 1:+.2%}"

@@ -21,7 +21,7 @@ def tip():
 
 @pytest.mark.parametrize("coupling", ["schur-fgmres", "fixed-stress", "fixed-stress-full"])
 def test_all_couplings_give_the_same_answer(tip, coupling):
-    s, probe = beam(coupling=coupling)
+    s, probe = beam(numerics=mpm.Numerics(coupling=coupling))
     result = s.run(0.08, 0.02, probes=probe)
     assert result.displacement[-1] == pytest.approx(tip, rel=1e-6)
     assert result.residual <= 1e-8 and result.cuts == 0
@@ -34,7 +34,7 @@ def test_the_krylov_scheme_needs_few_iterations(tip):
 
 
 def test_the_fluid_s_compressibility_as_beta_diverges_and_says_so():
-    s, _ = beam(coupling="fixed-stress-fluid")
+    s, _ = beam(numerics=mpm.Numerics(coupling="fixed-stress-fluid"))
     before = s.points
     with pytest.raises(mpm.GaveUp, match=r"gave up at t = 0 s with dt = .* diverges \(beta is below") as caught:
         s.run(0.08, 0.02)

@@ -42,7 +42,7 @@ def test_the_reaction_is_that_of_the_stress():
     s.run(1.0, 0.1)
     stretch = 1 - 0.3 / height
     exact = SOFT.oedometric * np.log(stretch) / stretch * s.grid.h[0]
-    assert s.reactions[0] == pytest.approx([0, exact], rel=2e-4)
+    assert s.reactions.array[0] == pytest.approx([0, exact], rel=2e-4)
 
 
 def test_a_side_slides_freely_along_the_components_that_are_not_given():

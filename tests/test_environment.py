@@ -18,7 +18,7 @@ import mpm_dolfinx as mpm
 grid = mpm.Grid([0, 0], [1, 1], [4, 4])
 body = mpm.box(grid, [0.25, 0], [0.75, 0.5])
 load = mpm.Traction("top", -1e3)
-s = mpm.Simulation(grid, [body], [mpm.Hencky(1e6, 6e5)], walls={"bottom": "xy"}, tractions=[load])
+s = mpm.Simulation(grid, [body], [mpm.Hencky(1e6, 6e5)], walls={"bottom": "xy"}, conditions=[load])
 print("ran" if s.run(1, 1, progress=False).converged else "did not")
 """
 ROOT = Path(__file__).parent.parent

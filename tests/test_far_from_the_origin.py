@@ -137,7 +137,16 @@ def sealed(away, **options):
     body = mpm.box(grid, away, np.add(away, [1.75, 0.95]), per_cell=3)
     walls, load = {"bottom": "y", "left": "x", "right": "x"}, mpm.Traction("top", (0, -4e3))
     water = mpm.Fluid(bulk=2.2e9)
-    s = mpm.Simulation(grid, [body], [soil], fluid=water, walls=walls, tractions=[load], tolerance=1e-11, **options)
+    s = mpm.Simulation(
+        grid,
+        [body],
+        [soil],
+        fluid=water,
+        walls=walls,
+        conditions=[load],
+        numerics=mpm.Numerics(tolerance=1e-11),
+        **options,
+    )
     s.run(1.0, 0.5, progress=False)
     return s, s.state.points.displacement
 
@@ -164,9 +173,16 @@ def test_tools_and_contacts_press_far_from_the_origin_as_near_it(kind):
         shape = mpm.Ball(centre, 0.25) if kind == "ball" else lambda x, c=centre: np.hypot(*(x - c).T) - 0.25
         tool = mpm.Tool(shape, lambda t: (0.01 * t, -0.02 * t), centre=centre, friction=0.3)
         walls, groups = {"bottom": "xy", "left": "x", "right": "x"}, [mpm.Contact(1, 0, friction=0.3)]
-        s = mpm.Simulation(grid, [base, block], [SOIL], walls=walls, tools=[tool], contacts=groups, tolerance=digits)
+        s = mpm.Simulation(
+            grid,
+            [base, block],
+            [SOIL],
+            walls=walls,
+            conditions=[tool, *groups],
+            numerics=mpm.Numerics(tolerance=digits),
+        )
         s.run(1.0, 0.5, progress=False)
-        forces.append(s.tool_forces)
+        forces.append(s.tool_forces.array)
     moment, at_origin = forces[1][1, 2], np.cross(AWAY, forces[0][1, :2])
     assert moment - forces[0][1, 2] == pytest.approx(at_origin, rel=1e-9), "moments of contacts count from the origin"
     forces = [f.ravel()[:5] for f in forces]
@@ -198,8 +214,7 @@ def test_functions_are_asked_at_true_places_and_results_are_there(tmp_path):
         [soil],
         fluid=mpm.Fluid(),
         walls={"left": "x", "right": "x", "bottom": "y"},
-        tractions=[traction],
-        drained=[drained],
+        conditions=[traction, drained],
         gravity=(0, -9.81),
         pressure=at("pressure", 100.0),
         initial_stress={0: at("stress", [-1e3, -2e3, -1e3])},

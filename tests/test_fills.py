@@ -58,7 +58,7 @@ def test_an_embankment_in_lifts_has_its_crest_and_the_ground_beside_it_free_and_
     s.run(30 * DAY, 30 * DAY, progress=False)
     for k in range(1, 7):
         s.stage(add=[k], conditions=[*without(s, mpm.Traction), mpm.Traction("top", (0, -1.0))])
-        _, top = s.state.stage.mechanical.loads[0]
+        (top,) = s.state.stage.acting[-1].surfaces
         assert top.area0.sum() == pytest.approx(beside + 24 + 2 * slope * (6 - k), rel=1e-12)
         assert k == 1 or gap(s, k - 1, k) < 1e-11, "lifts have as many domains side by side"
         assert gap(s, k - 1, k) < 1e-3, "two straight edges on one of the ground's differ by its bend"
@@ -79,7 +79,7 @@ def settled(dim=2, per_cell=2, quadrature="domain", until=1.0, **options):
     fill = mpm.box(grid, [1] * (dim - 1) + [2], [3] * (dim - 1) + [3], per_cell=per_cell)
     half = mpm.Traction("top", [0] * (dim - 1) + [-8e4], region=([0] * dim, [2, *[4] * (dim - 1)]))
     walls = {name: "xyz"[:dim] for name in ("left", "right", "bottom", *["front", "back"][: 2 * dim - 4])}
-    options = {"conditions": [half], "quadrature": quadrature} | options
+    options = {"conditions": [half], "numerics": mpm.Numerics(quadrature=quadrature)} | options
     s = mpm.Simulation(grid, [ground, fill], [SOFT], walls=walls, later=[1], gravity=[0.0] * dim, **options)
     if until:
         s.run(until, 0.5, progress=False)

@@ -33,7 +33,7 @@ def test_a_held_domain_that_folds_keeps_its_face_and_its_volume(dim):
     bad = tangled(moved, points.volume0)
     assert np.flatnonzero(bad).tolist() == sorted(folded)
 
-    new = untangled(points, moved, bad, F, grid, s.state.stage.mechanical)
+    new = untangled(points, moved, bad, F, grid, s.state.stage.acting)
     assert new[folded[0], up] == pytest.approx(corners[folded[0], up], abs=1e-15)
     assert volumes(new[folded]) == pytest.approx(1.1 * points.volume0[folded], rel=1e-12)
     assert gradient(new[folded[1:]], points.reference[folded[1:]]) == pytest.approx(F[folded[1:]], abs=1e-12)
@@ -63,7 +63,7 @@ def rough_strip(cells, how):
     walls = {"left": "x", "right": "x", "bottom": "xy"}
     s = mpm.Simulation(grid, [mpm.box(grid, [0, -rows * h], [columns * h, 0])], [soil], walls=walls, **pushed)
     s.run(1.0, 1 / 20, progress=False)
-    force = s.reactions[0, 1] if how == "displacement" else s.tool_forces[0, 1]
+    force = s.reactions.array[0, 1] if how == "displacement" else s.tool_forces.array[0, 1]
     return -force / (edge * footing.COHESION * soil.xi * (2 + np.pi))
 
 

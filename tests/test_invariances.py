@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
-from scenes.balancing import Ledger, balanced, held_by_conditions
+from scenes.balancing import ROUNDED, Ledger, balanced, held_by_conditions
 from scenes.comparing import differences, resolved
 from scenes.description import ELASTIC, Block, Condition, RigidTool, Scene, drawn
 from scenes.frames import Frame, composite
@@ -30,8 +30,6 @@ ASKED = 1e-8
 """Largest difference, over the largest value of each field in the scene."""
 DISTURBANCE = 1e-13
 """By how much loads are larger in a run that tells what a scene makes of roundings."""
-ROUNDED = 30
-"""What any scene makes of the rounding of its coordinates, see `resolved`: many places add up, and steps do."""
 OTHER_STEPS = "other steps were cut: "
 EQUILIBRIUM, KEPT = 1e-7, 1e-8
 """Largest resultant over the largest force, and fluid that is lost over what changes places."""

@@ -52,7 +52,7 @@ grid = mpm.Grid([0, 0, 0], [1.0, 1.0, 1.0], [2, 2, 3])
 walls = {{"left": "x", "right": "x", "front": "y", "back": "y", "bottom": "z"}}
 load = mpm.Traction("top", lambda t: (0, 0, -2e4 * (1 + t)))
 body = mpm.box(grid, [0, 0, 0], [1, 1, 0.6])
-mpm.Simulation(grid, [body], [clay], fluid=mpm.Fluid(), walls=walls, tractions=[load]).run(1.0, 0.5)
+mpm.Simulation(grid, [body], [clay], fluid=mpm.Fluid(), walls=walls, conditions=[load]).run(1.0, 0.5)
 """
 
 

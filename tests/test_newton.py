@@ -40,7 +40,14 @@ def test_a_newton_step_is_shortened_where_the_residual_grows_more_than_ten_thous
     pulls = [mpm.Traction("right", (across, 0)), mpm.Traction("top", lambda t: (0, float(t > 1)))]
     law = Stiffening(bulk=1e3 * across, shear=1e3 * across, exponent=exponent)
     walls = {"left": "x", "bottom": "y"}
-    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 1])], [law], walls=walls, conditions=pulls, tolerance=1e-12)
+    s = mpm.Simulation(
+        grid,
+        [mpm.box(grid, [0, 0], [1, 1])],
+        [law],
+        walls=walls,
+        conditions=pulls,
+        numerics=mpm.Numerics(tolerance=1e-12),
+    )
     s.step(1.0)
     report = s.step(1.0)
     residuals = np.array([momentum for momentum, _ in report.history])

@@ -314,7 +314,7 @@ def test_a_strip_footing_sinks_at_prandtls_load(friction, factor):
     walls = {"left": "x", "right": "x", "bottom": "xy"}
     s = mpm.Simulation(grid, [soil], [clay], walls=walls, conditions=[footing])
     loads = []
-    s.run(1.0, 0.1, observe=lambda s: loads.append(-s.reactions[0, 1] / clay.cohesion))
+    s.run(1.0, 0.1, observe=lambda s: loads.append(-s.reactions.array[0, 1] / clay.cohesion))
     assert factor < loads[-1] < 1.12 * factor
     assert abs(loads[-1] / loads[-3] - 1) < 0.02
 

@@ -39,7 +39,7 @@ def test_a_floating_block_has_uniform_stress_at_any_turn_and_offset(turn, offset
     )
     simulation.run(1.0, 0.25)
     assert np.abs(simulation.effective_stress() + 3e6 * np.eye(2)).max() < 1e-9 * 3e6
-    assert simulation.points.J.max() < 0.67 and simulation.state.stage.mechanical.symmetric
+    assert simulation.points.J.max() < 0.67 and simulation.state.stage.symmetric
 
 
 @pytest.mark.parametrize("top", [0.6, 0.7, 0.6371])
@@ -50,7 +50,7 @@ def test_a_block_between_walls_has_uniform_stress_in_3d(top):
     s = mpm.Simulation(grid, [mpm.box(grid, [0] * 3, [top] * 3)], [SOFT], walls=walls, conditions=load)
     s.run(1.0, 1.0)
     assert np.abs(s.effective_stress() + 3e6 * np.eye(3)).max() < 1e-7 * 3e6
-    assert s.state.stage.mechanical.symmetric
+    assert s.state.stage.symmetric
 
 
 def test_a_block_turned_in_space_has_uniform_stress_under_pressure():
@@ -124,7 +124,7 @@ def test_a_beam_under_a_pressure_that_follows_it_agrees_with_finite_elements(wet
         **scene,
     )
     exact = fem.run(*steps, probes=[[1.0, 0.15]]).displacement[-1][0]
-    assert not s.state.stage.mechanical.symmetric and exact[1] < -0.2
+    assert not s.state.stage.symmetric and exact[1] < -0.2
     assert np.abs(tip - exact).max() < 2e-3 * np.abs(exact).max()
 
 
@@ -142,7 +142,7 @@ def clamped_block(dim, tractions):
 @pytest.mark.parametrize("closed", [True, False])
 def test_the_tangent_is_the_derivative_of_the_residual_and_symmetric_where_the_surface_is_closed(dim, closed):
     s = clamped_block(dim, around(1e6, *ALL[dim][1:]) if closed else around(2e5, "right"))
-    assert s.state.stage.mechanical.symmetric == closed
+    assert s.state.stage.symmetric == closed
     m, rng = set_up(s, 0.2).momentum, np.random.default_rng(0)
     unknowns = m.system.unknowns
     u, v, w = (1e-3 * rng.standard_normal(unknowns.size) for _ in range(3))
@@ -187,7 +187,7 @@ def test_surfaces_are_closed_where_one_pressure_meets_itself_or_walls_that_hold_
         bodies = [mpm.box(grid, [0] * dim, [0.4, 0.6, 0.6][:dim]), mpm.box(grid, [0.4, *[0] * (dim - 1)], [0.8] * dim)]
         walls = walls or {"left": "x", "bottom": "y" if dim == 2 else "z", "front": "y"}
         walls = {name: walls[name] for name in walls if dim == 3 or name != "front"}
-        return mpm.Simulation(grid, bodies, [SOFT], walls=walls, conditions=loads).state.stage.mechanical.symmetric
+        return mpm.Simulation(grid, bodies, [SOFT], walls=walls, conditions=loads).state.stage.symmetric
 
     assert symmetric(around(1e5, "right", "top")) is False, "the step between the bodies is a gap on the left"
     assert symmetric(around(1e5, "left", "right", "top"))

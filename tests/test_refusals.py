@@ -24,8 +24,9 @@ def two(**options):
 
 
 def wet(law=None, **options):
-    drained = {"fluid": WATER, "conditions": [mpm.Drained("top")]}
-    return scene(materials=[soil(conductivity=1e-4, conductivity_law=law)], **{**drained, **LOAD, **options})
+    conditions = [mpm.Drained("top"), *options.pop("conditions", LOAD["conditions"])]
+    soils = [soil(conductivity=1e-4, conductivity_law=law)]
+    return scene(materials=soils, fluid=WATER, conditions=conditions, **options)
 
 
 def bad(*values):
@@ -166,7 +167,7 @@ CASES = {
         "linear in v",
     ),
     "term alone": (lambda: scene(terms=lambda points: points.dx), "terms", "a list of functions"),
-    "source alone": (lambda: wet(terms=mpm.Source(lambda points, q: q * points.dx)), "sources", "a list of functions"),
+    "source alone": (lambda: wet(terms=mpm.Source(lambda points, q: q * points.dx)), "terms", "a list of functions"),
     "source on the grid's sides": (lambda: wet(terms=[mpm.Source(lambda q: q * ufl.ds)]), "sources", "over the grid"),
     "source of q squared": (
         lambda: wet(terms=[mpm.Source(lambda points, q: q * q * points.dx)]),
@@ -185,7 +186,7 @@ CASES = {
     ),
     "true fluid": (lambda: scene(fluid=True), "fluid = True", "must be a Fluid"),
     "pressure without fluid": (lambda: scene(pressure=100.0), "pressure = 100.0", "needs a fluid"),
-    "couplings": (lambda: scene(coupling=["schur-cg"]), "coupling", "['schur-cg']"),
+    "couplings": (lambda: scene(numerics=mpm.Numerics(coupling=["schur-cg"])), "coupling", "['schur-cg']"),
     "later, a number": (lambda: two(later=1), "later = 1", "must be a list"),
     "later, a word": (lambda: two(later="1"), "later = '1'", "must be a list"),
     "later, half a body": (lambda: two(later=[0.5]), "later: body 0.5", "0, 1"),
@@ -406,4 +407,10 @@ def test_mapped_bodies_are_not_integrated_at_points():
     grid = mpm.Grid([0, 0], [1.0, 1.0], [4, 4])
     body = mpm.mapped(grid, mpm.box(grid, [0, 0], [0.5, 0.5]), lambda x: x + 0.1 * x[:, ::-1])
     with pytest.raises(ValueError, match=r"body 0 is mapped or a mesh, must be a box along the grid"):
-        mpm.Simulation(grid, [body], [mpm.Hencky(bulk=1e6, shear=1e6)], walls={"bottom": "xy"}, quadrature="point")
+        mpm.Simulation(
+            grid,
+            [body],
+            [mpm.Hencky(bulk=1e6, shear=1e6)],
+            walls={"bottom": "xy"},
+            numerics=mpm.Numerics(quadrature="point"),
+        )

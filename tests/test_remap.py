@@ -29,8 +29,7 @@ def moved(s, state, pressure, way):
     s.scene.storage.p.x.array[:] = pressure
     s.scene.momentum.u.x.array[:] = np.tile(way * s.grid.h, len(s.grid.node_x))
     before = stored(on_grid, pressure)
-    tools = state.stage.mechanical.tools
-    state, _ = s.scene.motion.advanced(state, on_grid, on_grid.data_of(state), 0.0, tools, stays=False)
+    state, _ = s.scene.motion.advanced(state, on_grid, on_grid.data_of(state), 0.0, (), stays=False)
     s.scene.on_grid(state.points).start(state)
     return state, before
 

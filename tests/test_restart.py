@@ -65,7 +65,7 @@ def block(fluid=None):
 
 SCENES = {
     "beam": lambda: beam(h=0.06),
-    "at the points": lambda: beam(h=0.06, quadrature="point", load=5e3),
+    "at the points": lambda: beam(h=0.06, numerics=mpm.Numerics(quadrature="point"), load=5e3),
     "linear": lambda: beam(h=0.06, load=1e3, material=mpm.LinearElastic(1e7 / 3, 5e6, conductivity=1e-4)),
     "cut steps": cut_beam,
     "plate and gravity": pressed_column,
@@ -259,7 +259,7 @@ OTHER_SCENES = {
     "place": ({"offset": 0.6}, "checksum of the positions of body 0"),
     "fluid": ({"fluid": mpm.Fluid(bulk=1e9)}, "bulk of fluid: 2200000000.0 there, 1000000000.0 here"),
     "dry": ({"fluid": False}, "fluid: Fluid there, None here"),
-    "quadrature": ({"quadrature": "point"}, "quadrature: domain there, point here"),
+    "quadrature": ({"numerics": mpm.Numerics(quadrature="point")}, "quadrature: domain there, point here"),
 }
 
 

@@ -49,7 +49,7 @@ def test_a_pressure_of_depth_is_exact_in_its_resultant():
     area = s.points.corners[:, [1, 3]][np.abs(s.points.reference[:, 1, 0] - 1) < 1e-9]
     y = area[:, :, 1]
     push = (5e3 * (1 - y.mean(axis=1)) * np.diff(y, axis=1)[:, 0]).sum()
-    assert s.reactions[0, 0] == pytest.approx(push, rel=1e-3)
+    assert s.reactions.array[0, 0] == pytest.approx(push, rel=1e-3)
 
 
 def test_a_side_under_a_level_that_rises_is_at_rest():
@@ -191,7 +191,7 @@ def test_functions_are_called_by_the_names_of_their_parameters(kind):
     [
         lambda f: mpm.RigidPlate("top", f),
         lambda f: mpm.Tool(mpm.Ball((0, 0), 1.0), displacement=f),
-        lambda f: mpm.Tool(mpm.Ball((0, 0), 1.0), rotation=f),
+        lambda f: mpm.Tool(mpm.Ball((0, 0), 1.0), rotation_rad=f),
         lambda f: mpm.Tool(mpm.Ball((0, 0), 1.0), load=f, direction=(0, 1)),
         lambda f: mpm.water("top", f),
         lambda f: block(gravity=f),

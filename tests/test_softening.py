@@ -107,8 +107,8 @@ def crept(steps, dt, load, m):
 def test_a_law_sees_the_length_of_the_step(fluid):
     """Also with water that flows, where a step has two substeps."""
     m = Maxwell(bulk=2e6, shear=1e6, relaxation=2.0, conductivity=1e3)
-    top = {"conditions": [mpm.Traction("top", (0, -3e5))], "fluid": fluid}
-    s = column(cells=3, material=m, **top, **({"conditions": [mpm.Drained("top")]} if fluid else {}))
+    top = [mpm.Traction("top", (0, -3e5)), *[mpm.Drained("top")] * fluid]
+    s = column(cells=3, material=m, fluid=fluid, conditions=top)
     for _ in range(3):
         s.step(1.0)
     height = s.points.corners[:, :, 1].max()

@@ -138,7 +138,7 @@ def test_no_linear_solve_of_a_wet_block_takes_many_iterations(block, monkeypatch
     monkeypatch.setattr(monolithic.BlockSolver, "solve", noting(counts, solve))
     soil, n, step, steps, most = BLOCKS[block]
     s, forces = quarter_pushed(soil, n, step), []
-    result = s.run(steps, 1, observe=lambda s: forces.append(-s.reactions[0, 2]), progress=False)
+    result = s.run(steps, 1, observe=lambda s: forces.append(-s.reactions.array[0, 2]), progress=False)
     took = f"{result.steps} steps, {result.cuts} cuts, {result.newton} Newton steps, {result.wall:.0f} s"
     print(f"{block}, {n}^3: {took}, iterations {np.mean(counts):.1f}, at most {max(counts)}; load {forces} N")
     assert max(counts) <= most and result.cuts == 0

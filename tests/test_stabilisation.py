@@ -132,7 +132,7 @@ def pushed(monkeypatch, most, law=mpm.DruckerPrager, **strength):
     cells = s.cells()
     p = np.zeros((24, 6))
     p[tuple(grid.index(cells.x).T)] = cells.pressure
-    return s.reactions[0, 1], p[:, :5]
+    return s.reactions.array[0, 1], p[:, :5]
 
 
 def test_pressures_do_not_alternate_where_soil_flows(monkeypatch):

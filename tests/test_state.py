@@ -68,7 +68,7 @@ def same_bits(a: mpm.State, b: mpm.State) -> None:
 def contents(state):
     """Return all arrays of a state by their names."""
     out = {f"points {k}": v for k, v in {**vars(state.points), **state.points.data}.items() if k != "data"}
-    out |= {"reactions": state.reactions, "walls": state.walls}
+    out |= {f"{what} {name}": value for what, of in state.outcome.items() for name, value in of.items()}
     if state.transported is not None:
         out |= {f.name: getattr(state.transported, f.name) for f in fields(state.transported)}
     if state.stay is not None:
@@ -158,7 +158,7 @@ class Driven(RuleBasedStateMachine):
     @rule()
     def look(self):
         """Reading changes nothing."""
-        str(self.s), self.s.effective_stress(), self.s.reactions, self.s.points.pressure
+        str(self.s), self.s.effective_stress(), self.s.reactions.array, self.s.points.pressure
         with pytest.raises(ValueError, match="read-only"):
             self.s.points.pressure[:] = 5e4
 
@@ -243,8 +243,10 @@ def test_a_kept_state_keeps_its_histories():
         ends.append((s.state, result))
         assert before.result.rows is rows and len(rows) == 3
     same_bits(ends[0][0], ends[1][0])
-    for name in ("t", "reactions", "outflows", "pressure"):
+    for name in ("t", "pressure"):
         assert np.array_equal(*(getattr(result, name) for _, result in ends)), name
+    for name in ("reactions", "outflows"):
+        assert np.array_equal(*(result.outcome(name).array for _, result in ends)), name
     assert len(ends[0][1].t) == 5 and ends[0][1].steps == ends[1][1].steps
     s.state = before  # and from histories that another continuation has made, those of the state are taken
     assert s.run(1.5, 0.5, after=ends[0][1], progress=False).t == [0.0, 0.5, 1.0, 1.5]
@@ -255,8 +257,8 @@ def test_nobody_writes_into_a_state_or_its_histories():
     probe = mpm.probes(s.bodies, [[0.1, 0.2]])
     s.run(1.0, 0.5, probes=probe, progress=False)
     state, row = s.state, s.result.rows[-1]
-    kept = [state.reactions, state.walls, state.outflows, state.tool_forces, state.tool_travel, state.velocity]
-    for array in [*kept, row.displacement, row.reactions, row.walls, row.outflows, row.probe_pressure]:
+    kept = [value for outcome in (state.outcome, row.outcome) for of in outcome.values() for value in of.values()]
+    for array in [*kept, state.velocity, row.displacement, row.probe_pressure]:
         assert not array.flags.writeable
     with pytest.raises(TypeError):
         s.result.rows[0] = row

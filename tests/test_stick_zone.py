@@ -25,10 +25,10 @@ def pulled(cells, size, steps, per_cell):
     s.run(1.0, 1.0)
     for k in range(1, steps + 1):
         s.run(1 + k / 4, 0.25)
-        p, q = s.points.data["tool_0_pressure"], s.points.data["tool_0_shear"][:, 0]
+        p, q = s.points.data["tool_pressure"], s.points.data["tool_shear"][:, 0]
         on = np.flatnonzero(p > 0)
         on = on[np.argsort(s.points.x[on, 0])]
-        yield -s.tool_forces[0, 0] / (mu * s.tool_forces[0, 1]), s.points.x[on, 0], mu * p[on], q[on]
+        yield -s.tool_forces.array[0, 0] / (mu * s.tool_forces.array[0, 1]), s.points.x[on, 0], mu * p[on], q[on]
 
 
 def ellipse(x, values, half):

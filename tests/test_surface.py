@@ -130,7 +130,7 @@ def test_a_load_on_what_is_free_beside_a_turned_body_carries_its_whole_force():
     hold, load = mpm.Displacement("bottom", (0, 0, 0), region=ground), mpm.Traction("top", (0, 0, -1e3))
     s = mpm.Simulation(grid, [below, turned], [SOIL], walls={}, conditions=[hold, load])
     s.run(1.0, 1.0, progress=False)
-    assert s.reactions[0, 2] == pytest.approx(16e3, rel=1e-6)
+    assert s.reactions.array[0, 2] == pytest.approx(16e3, rel=1e-6)
 
 
 def test_a_curved_interface_in_3d_between_other_lattices_is_no_surface():

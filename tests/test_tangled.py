@@ -40,7 +40,7 @@ def test_a_block_sheared_between_plates_goes_on_where_domains_have_folded(monkey
     s, result = sheared(("bottom", "top"), gamma=8.0, steps=160)
     assert result.converged and result.residual <= 1e-8
     assert result.rederived > 0, "no domain folded: the test shows nothing"
-    bottom, top = s.reactions
+    bottom, top = s.reactions.array
     assert bottom + top == pytest.approx([0, 0], abs=1e-5 * np.abs(top).max())
 
 
@@ -59,7 +59,7 @@ def test_a_column_tears_at_a_weak_layer(softness):
     assert volume.sum() == pytest.approx(0.43 * 2.9, rel=1e-2)
     stretch = 20.0
     force = 0.43 * weak.shear * (stretch - 1 / stretch)  # nu = 0; uniaxial nominal stress
-    assert s.reactions[0, 1] == pytest.approx(force, rel=0.15)  # the layer's ends are clamped by stiff blocks
+    assert s.reactions.array[0, 1] == pytest.approx(force, rel=0.15)  # the layer's ends are clamped by stiff blocks
 
 
 def test_a_folded_domain_is_found_and_its_own_domain_is_not():

@@ -103,14 +103,14 @@ def test_a_conductivity_law_is_taken_at_the_stages_of_the_step(width):
 @pytest.mark.parametrize("width", [2, 3])
 def test_a_first_step_is_taken_however_long_it_is(width, dt):
     """From T_v = 1e-5, where nothing has drained; Newton's method then has to see what the fluxes gain by strains."""
-    s, _, cv = hencky_column(width, headroom=5, method="backward-euler")
+    s, _, cv = hencky_column(width, headroom=5, numerics=mpm.Numerics(method="backward-euler"))
     report = s.step(dt / cv)
     assert report.newton <= 15 and np.ptp(np.sort(s.points.J)[: 2 * width]) < 1e-8
 
 
 def test_a_step_that_makes_a_law_meaningless_is_shortened():
     """The first Newton step turns the top cells inside out, where k is not a number: it is shortened."""
-    s, _, cv = hencky_column(1, headroom=5, load=1.5, porosity=0.8, method="backward-euler")
+    s, _, cv = hencky_column(1, headroom=5, load=1.5, porosity=0.8, numerics=mpm.Numerics(method="backward-euler"))
     report = s.step(0.005 / cv)
     assert np.isinf(report.history).any() and 0.475 < s.points.J.min() < 0.6  # ln J / J = -1.5 at 0.475
 
@@ -151,7 +151,7 @@ def test_a_body_that_is_loaded_sealed_and_then_drained_does_not_ring(dt):
 
 def test_backward_euler_is_an_option_and_of_first_order():
     def end(steps, method):
-        s = column(cells=5, method=method, conditions=[*ramp(1e4, 40), OPEN])
+        s = column(cells=5, numerics=mpm.Numerics(method=method), conditions=[*ramp(1e4, 40), OPEN])
         s.run(40.0, 40 / steps, progress=False)
         return s.points.pressure
 
@@ -349,11 +349,11 @@ def test_steps_that_cannot_be_are_refused_in_a_line(name):
 
 
 def test_a_method_that_has_no_error_cannot_choose_its_steps():
-    s = column(cells=2, method="backward-euler", conditions=[OPEN])
+    s = column(cells=2, numerics=mpm.Numerics(method="backward-euler"), conditions=[OPEN])
     with pytest.raises(ValueError, match=r"rtol = 0\.001: backward-euler knows no error of a step, must be sdirk2"):
         s.run(4.0, rtol=1e-3, progress=False)
     with pytest.raises(ValueError, match=r"method 'rk4': must be one of sdirk2, backward-euler"):
-        column(cells=2, method="rk4")
+        column(cells=2, numerics=mpm.Numerics(method="rk4"))
 
 
 class Stop:

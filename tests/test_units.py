@@ -135,8 +135,8 @@ def test_a_unit_weight_that_is_given_stays():
             pressure=mpm.hydrostatic(2.0, **given),
         )
         assert s.points.pressure == pytest.approx(weight * (2.0 - s.points.x[:, 1]))
-        conditions = s.state.stage.conditions
-        for value in (conditions["tractions"][0].value, conditions["outlets"][0].pressure):
+        pressed, drained = s.state.stage.named.values()
+        for value in (pressed.value, drained.pressure):
             assert value(0.0, np.array([[0.0, 1.0]])) == pytest.approx(weight)
 
 

@@ -64,7 +64,7 @@ def test_water_that_falls_leaves_a_seepage_face():
     s.run(1e3, 1e2, progress=False)
     full = s.points.pressure.copy()
     s.run(2.5e3, 1e2, progress=False)
-    left, right, top = s.outflows
+    left, right, top = s.outflows.array
     assert left == pytest.approx(right, rel=1e-6) and left > 0 and top >= 0
     y, p = s.points.x[:, 1], s.points.pressure
     middle = (np.abs(s.points.x[:, 0] - 1.5) < 0.2) & (y < 0.2)

@@ -62,7 +62,7 @@ class BodyContact(CellContact):
     ----------
     grid
         Background grid.
-    contacts
+    names, contacts, signs
         The contacts, and with which sign each row counts for the bodies of its `one`.
     rows
         The pairs.
@@ -75,13 +75,14 @@ class BodyContact(CellContact):
     def __init__(
         self,
         grid: Grid,
+        names: Sequence[str],
         contacts: Sequence[Contact],
         signs: NDArray[np.float64],
         rows: PairRows,
         back: tuple[Exchange, NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]],
         reach: Callable[[], NDArray[np.int64]],
     ):
-        super().__init__(grid, "contact", contacts, rows, back)
+        super().__init__(grid, names, contacts, rows, back)
         self._signs, self._reach_of_pairs = signs, reach
         self._apart = rows.apart.copy()  # at no displacement
         self._raised = np.ones(1)

@@ -49,20 +49,22 @@ LEAST = 1e-300
 RAMP = 10.0  # adhesion over the normal pressure, at most
 
 
-def pressure_name(kind: str, number: int) -> str:
-    """Return the name under which points have the pressure (n,), Pa, of a "tool" or "contact" on their faces."""
-    return f"{kind}_{number}_pressure"
+def pressure_name(name: str) -> str:
+    """Return the name under which points have the pressure (n,), Pa, of a tool or contact on their faces."""
+    return f"{name}_pressure"
 
 
-def shear_name(kind: str, number: int) -> str:
-    """Return the name under which points keep the shear traction (n, d), Pa, of a "tool" or "contact"."""
-    return f"{kind}_{number}_shear"
+def shear_name(name: str) -> str:
+    """Return the name under which points keep the shear traction (n, d), Pa, of a tool or contact."""
+    return f"{name}_shear"
 
 
-def kept(kind: str, contacts: Sequence[Resisting], n: int, dim: int) -> dict[str, NDArray[np.float64]]:
-    """Return what n points keep of the contacts, zero: pressures (n,) and, of what resists slip, tractions (n, d)."""
-    out = {pressure_name(kind, i): np.zeros(n) for i in range(len(contacts))}
-    return out | {shear_name(kind, i): np.zeros((n, dim)) for i, contact in enumerate(contacts) if contact.grips}
+def kept(contacts: Mapping[str, Resisting], n: int, dim: int) -> dict[str, dict[str, NDArray[np.float64]]]:
+    """Return what n points keep of each contact, zero: pressures (n,) and, of what resists slip, tractions (n, d)."""
+    return {
+        name: {pressure_name(name): np.zeros(n), **({shear_name(name): np.zeros((n, dim))} if contact.grips else {})}
+        for name, contact in contacts.items()
+    }
 
 
 def let_go(points: MaterialPoints, names: Iterable[str]) -> MaterialPoints:
@@ -134,8 +136,8 @@ class CellContact:
     ----------
     grid
         Background grid.
-    kind
-        "tool" or "contact".
+    names
+        Their names.
     contacts
         The contacts.
     rows
@@ -148,12 +150,12 @@ class CellContact:
     def __init__(
         self,
         grid: Grid,
-        kind: str,
+        names: Sequence[str],
         contacts: Sequence[Resisting],
         rows: Rows,
         back: tuple[Exchange, NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]],
     ):
-        self.grid, self._kind, self.contacts, self.rows, self._back = grid, kind, contacts, rows, back
+        self.grid, self._names, self.contacts, self.rows, self._back = grid, names, contacts, rows, back
         key, self.of = np.unique(rows.number * grid.num_local + rows.cell, return_inverse=True)
         self.number, self.cell = np.divmod(key, grid.num_local)
         self.area = sum_by(self.of, rows.area, len(key))
@@ -298,7 +300,7 @@ class CellContact:
             rows = np.flatnonzero(of == number)
             whole = np.maximum(sum_by(at[rows], area[rows], n), LEAST)
             means = [sum_by(at[rows], area[rows] * column, n) / whole for column in (push[rows], *shear[rows].T)]
-            data[pressure_name(self._kind, number)] = means[0]
+            data[pressure_name(self._names[number])] = means[0]
             if contact.grips:
-                data[shear_name(self._kind, number)] = np.stack(means[1:], axis=1)
+                data[shear_name(self._names[number])] = np.stack(means[1:], axis=1)
         return replace(points, data=data)

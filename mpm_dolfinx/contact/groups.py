@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import combinations
 from typing import Any
 
@@ -21,7 +21,7 @@ class Contact:
 
     Bodies of one group stick where they touch; groups do not pass into each other, and what parts is free.  Where they
     touch no fluid passes.  Where there are contacts all bodies are in groups, and every two groups have one contact.
-    The forces on the bodies of `one` are in the simulation's `tool_forces`, after those of tools.
+    The forces on the bodies of `one` are in the simulation's `tool_forces`.
 
     Parameters
     ----------
@@ -31,6 +31,8 @@ class Contact:
         Coulomb's coefficient mu, >= 0.
     adhesion
         Shear stress that the contact takes besides, Pa, >= 0, as of a `Tool`.
+    name
+        By which its results are found; without, "contact".
 
     Raises
     ------
@@ -42,6 +44,7 @@ class Contact:
     other: int | Sequence[int]
     friction: float = 0.0
     adhesion: float = 0.0
+    name: str | None = field(default=None, kw_only=True, repr=False)
 
     def __post_init__(self):
         for name in ("friction", "adhesion"):

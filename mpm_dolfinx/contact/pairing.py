@@ -6,7 +6,7 @@ The contact itself is in `body_contact`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -91,11 +91,12 @@ class Contacts:
     materials
         Those of the scene.
     contacts
-        The contacts.
+        The contacts by name.
     """
 
-    def __init__(self, sides: Sides, materials: SceneMaterials, contacts: Sequence[Contact]):
-        self.grid, self._materials, self.contacts = sides.grid, materials, tuple(contacts)
+    def __init__(self, sides: Sides, materials: SceneMaterials, contacts: Mapping[str, Contact]):
+        self.grid, self._materials = sides.grid, materials
+        self.names, self.contacts = tuple(contacts), tuple(contacts.values())
         self._faces: list[tuple[Surface, Surface]] = []
         signs = []
         for contact in self.contacts:
@@ -114,14 +115,12 @@ class Contacts:
         """Whether the tangent is symmetric."""
         return not any(contact.grips for contact in self.contacts)
 
-    def kept(self, n: int) -> dict[str, NDArray[np.float64]]:
+    def kept(self, n: int) -> dict[str, dict[str, NDArray[np.float64]]]:
         """Return what n points keep of the contacts, zero."""
-        return kept("contact", self.contacts, n, self.grid.dim)
+        return kept(dict(zip(self.names, self.contacts, strict=True)), n, self.grid.dim)
 
-    def placed(self, cut: CutDomains, points: MaterialPoints) -> Following | None:
+    def placed(self, cut: CutDomains, points: MaterialPoints) -> Following:
         """Return the contact in a step, with the points where they are at its start."""
-        if not self.contacts:
-            return None
         found = self._found(cut.key, lambda: self._met_all(cut, cut.points), self.grid.comm)
         reach = partial(self._reach, cut.key, partial(self._cells_within_reach, cut, found), self.grid.comm)
         begun = self._contact(cut, points, found, cut.points, points, reach)
@@ -165,8 +164,8 @@ class Contacts:
             n /= np.linalg.norm(n, axis=1, keepdims=True)
             old = np.zeros((len(row), d))
             if self.contacts[number].grips:
-                old = _turned(points.data[shear_name("contact", number)][at], n)
-            pressure = points.data[pressure_name("contact", number)][at]
+                old = _turned(points.data[shear_name(self.names[number])][at], n)
+            pressure = points.data[pressure_name(self.names[number])][at]
             resists = np.minimum(own[at], now.resistance[other])
             place = number * PLACES + row + grid.comm.rank * len(self.contacts) * PLACES
             scalars = np.stack([np.full(len(row), number), place, size, resists, pressure], axis=1)
@@ -181,7 +180,7 @@ class Contacts:
         x, y, n, apart, shear = np.split(sent[:, 5:], 5, axis=1)
         placed = PairRows(number, grid.local(cell), *sent[:, 2:5].T, shear, other, x, y, n, apart, place)
         back = (travel, at, values[:, 0].astype(np.int64), values[:, 2])
-        return BodyContact(grid, self.contacts, self._signs, placed, back, reach)
+        return BodyContact(grid, self.names, self.contacts, self._signs, placed, back, reach)
 
     def _met_all(self, cut: CutDomains, points: MaterialPoints) -> list[tuple[Facets, Pairs]]:
         """Return for each contact what `_met` does."""
@@ -276,8 +275,8 @@ class Contacts:
             Saying where; a shorter step may do.
         """
         h, comm = self.grid.h.min(), self.grid.comm
-        moved = np.linalg.norm(points.corners - before.corners, axis=2).max(initial=0.0) if self.contacts else 0.0
-        if self.contacts and 2 * over_all(comm, float(moved), MPI.MAX) > REACH * h:
+        moved = np.linalg.norm(points.corners - before.corners, axis=2).max(initial=0.0)
+        if 2 * over_all(comm, float(moved), MPI.MAX) > REACH * h:
             raise NotConverged(f"contacts: bodies move by more than {REACH / 2:g} cells in a step")
         if message := self._too_deep(cut, points):
             raise NotConverged(message)

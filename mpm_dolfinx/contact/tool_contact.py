@@ -61,7 +61,7 @@ class ToolContact(CellContact):
     ----------
     grid
         Background grid.
-    tools, poses
+    names, tools, poses
         The tools, and where they are at the end of the substep, as far as loads had pushed them at the start.
     pushed
         How far loads push them.
@@ -74,6 +74,7 @@ class ToolContact(CellContact):
     def __init__(
         self,
         grid: Grid,
+        names: Sequence[str],
         tools: Sequence[Tool],
         poses: Sequence[Pose],
         pushed: PushedTools,
@@ -81,7 +82,7 @@ class ToolContact(CellContact):
         places: Places,
         back: tuple[Exchange, NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]],
     ):
-        super().__init__(grid, "tool", tools, rows, back)
+        super().__init__(grid, names, tools, rows, back)
         self._start, self.pushed, self.places = poses, pushed, places
         self._along = np.array([tool.along(grid.dim) for tool in tools])
         self._N = grid.shape_values(rows.cell, places.x)

@@ -6,7 +6,7 @@ The contact itself is in `tool_contact`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from copy import copy
 from typing import NamedTuple
 
@@ -66,9 +66,9 @@ class Tools:
     grid, materials
         Background grid, and the materials of the scene.
     tools
-        The tools.
+        The tools by name.
     outside
-        The surface of the bodies; called where there are tools.
+        The surface of the bodies.
     held
         Given displacements with their faces, on which tools do not act.
     """
@@ -77,11 +77,12 @@ class Tools:
         self,
         grid: Grid,
         materials: SceneMaterials,
-        tools: Sequence[Tool],
-        outside: Callable[[], Surface],
+        tools: Mapping[str, Tool],
+        outside: Surface,
         held: Sequence[tuple[Displacement, Surface]],
     ):
-        self.grid, self._materials, self.tools, self._held = grid, materials, tuple(tools), held
+        self.grid, self._materials, self._held = grid, materials, held
+        self.names, self.tools = tuple(tools), tuple(tools.values())
         still = np.zeros(len(self.tools))
         self._ways = Ways(0.0, 0.0, still, still)
         if len({id(tool) for tool in self.tools}) < len(self.tools):
@@ -90,15 +91,13 @@ class Tools:
             tool.check(grid.dim)
             if grid.axisymmetric and tool.along(grid.dim)[0]:
                 raise ValueError(f"Tool: direction = {line(tool.direction)}, must be along the axis in axisymmetry")
-            if not callable(tool.displacement) and not callable(tool.rotation):
+            if not callable(tool.displacement) and not callable(tool.rotation_rad):
                 self._pose(tool, 0.0)
         self.tools = tuple(tool.on(grid) for tool in self.tools)
-        self.faces = outside() if self.tools else None
-        if self.tools:
-            sides = 2 * grid.dim
-            taken = [faces.id * sides + faces.face for _, faces in held]
-            own = self.faces.id * sides + self.faces.face
-            self._free = ~np.isin(own, np.concatenate([np.zeros(0, np.int64), *taken]))
+        self.faces, sides = outside, 2 * grid.dim
+        taken = [faces.id * sides + faces.face for _, faces in held]
+        own = self.faces.id * sides + self.faces.face
+        self._free = ~np.isin(own, np.concatenate([np.zeros(0, np.int64), *taken]))
 
     @property
     def symmetric(self) -> bool:
@@ -119,14 +118,12 @@ class Tools:
             raise ValueError(f"{line(tool)}: {what}, must move by (0, z) and not turn in axisymmetry")
         return pose
 
-    def kept(self, n: int) -> dict[str, NDArray[np.float64]]:
+    def kept(self, n: int) -> dict[str, dict[str, NDArray[np.float64]]]:
         """Return what n points keep of the tools, zero."""
-        return kept("tool", self.tools, n, self.grid.dim)
+        return kept(dict(zip(self.names, self.tools, strict=True)), n, self.grid.dim)
 
-    def placed(self, cut: CutDomains, points: MaterialPoints, start: float, t: float) -> ToolContact | None:
+    def placed(self, cut: CutDomains, points: MaterialPoints, start: float, t: float) -> ToolContact:
         """Return the contact at time t (s) of a step that began at `start`, with the points where they are now."""
-        if not self.tools:
-            return None
         grid, d = self.grid, self.grid.dim
         patches = cut.surface(self.faces)
         x, area = patches.now(points), patches.area(points)
@@ -140,9 +137,9 @@ class Tools:
             n = everywhere(grid, lambda tool=tool, pose=pose: tool.solid(grid.h.min()).normal(pose.own(x)) @ pose.R.T)
             faces = free & (np.einsum("md,md->m", area, n) < -FACING * size)
             at = np.flatnonzero(faces)[~self._edge(tool, pose, x, area / np.maximum(size, LEAST)[:, None], faces)]
-            old = points.data[shear_name("tool", number)][patches.at[at]] if tool.grips else np.zeros((len(at), d))
+            old = points.data[shear_name(self.names[number])][patches.at[at]] if tool.grips else np.zeros((len(at), d))
             vectors = [x[at], pose.put(before.own(x[at])), old @ (pose.R @ before.R.T).T]
-            pressure = points.data[pressure_name("tool", number)][patches.at[at]]
+            pressure = points.data[pressure_name(self.names[number])][patches.at[at]]
             scalars = [np.full(len(at), number), size[at], resists[at], pressure]
             found.append((at, np.concatenate([np.stack(scalars, axis=1), *vectors], axis=1)))
         at, values = (np.concatenate(column) for column in zip(*found, strict=True))
@@ -152,7 +149,7 @@ class Tools:
         now, carried, shear = np.split(sent[:, 4:], 3, axis=1)
         rows = ToolRows(number.astype(np.int64), grid.local(cell), *own, shear, now, carried)
         back = (travel, patches.at[at], values[:, 0].astype(np.int64), values[:, 1])
-        return ToolContact(grid, self.tools, poses, pushed, rows, Places(grid, rows.cell, place), back)
+        return ToolContact(grid, self.names, self.tools, poses, pushed, rows, Places(grid, rows.cell, place), back)
 
     def _edge(
         self, tool: Tool, pose: Pose, x: NDArray[np.float64], unit: NDArray[np.float64], faces: NDArray[np.bool_]
@@ -191,12 +188,10 @@ class Tools:
 
     def check_start(self, cut: CutDomains, points: MaterialPoints, t: float) -> None:
         """Refuse tools that are inside of a body at time t (s); faces that they press on are where a step left them."""
-        if not self.tools:
-            return
         patches = cut.surface(self.faces)
         x = patches.now(points)
         for number, tool in enumerate(self.tools):
-            met = points.data[pressure_name("tool", number)] > 0
+            met = points.data[pressure_name(self.names[number])] > 0
             deep, where = self._deepest(tool, np.concatenate([x[~met[patches.at]], points.x]), t)
             if deep > BEGINS:
                 what = f"{line(tool)}: is {deep:.3g} cells inside of a body, at {where}, at t = {t:g} s as it begins"

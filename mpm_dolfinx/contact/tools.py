@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from copy import copy, deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import ClassVar, NamedTuple, Protocol
 
@@ -213,17 +213,17 @@ class Cone:
         Its tip.
     axis : (d,)
         Direction from the tip into the tool; of any length.
-    angle
+    angle_deg
         Between axis and flank, degrees, in (0, 90): 30 of a CPT's cone.
     """
 
     tip: ArrayLike
     axis: ArrayLike
-    angle: float
+    angle_deg: float
 
     def __post_init__(self):
         numbers("Cone: tip", self.tip, self._axis.shape, allowed=f"{len(self._axis)} finite coordinates")
-        numbers("Cone: angle", self.angle, test=lambda a: (a > 0) & (a < 90), allowed="in (0, 90) degrees")
+        numbers("Cone: angle_deg", self.angle_deg, test=lambda a: (a > 0) & (a < 90), allowed="in (0, 90) degrees")
 
     @cached_property
     def _axis(self) -> NDArray[np.float64]:
@@ -242,12 +242,12 @@ class Cone:
     def distance(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the signed distances (m,), m, from the flank."""
         z, r, _, _ = self._polar(y)
-        beta = np.radians(self.angle)
+        beta = np.radians(self.angle_deg)
         return r * np.cos(beta) - z * np.sin(beta)
 
     def normal(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the gradients (m, d) of the distance."""
-        beta = np.radians(self.angle)
+        beta = np.radians(self.angle_deg)
         return self._polar(y)[2] * np.cos(beta) - self._axis * np.sin(beta)
 
     def curvature(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -257,7 +257,7 @@ class Cone:
             return _flat(y)
         near_axis = r[:, None, None] <= 1e-6 * np.abs(y - self.tip).max(initial=0.0)
         along = self._axis[:, None] * self._axis / np.where(near_axis, np.inf, r[:, None, None])
-        return np.where(near_axis, 0.0, second - along) * np.cos(np.radians(self.angle))
+        return np.where(near_axis, 0.0, second - along) * np.cos(np.radians(self.angle_deg))
 
     def moved(self, by: NDArray[np.float64]) -> Cone:
         """Return the shape moved by a vector (d,), m."""
@@ -340,7 +340,7 @@ class Tool:
         The solid, as it is before its motion; a function gives the signed distance, positive outside of the tool.
     displacement : (d,) or callable t (s) -> (d,), m
         Of the tool from there; not since a stage.  In axisymmetry along the axis, without a rotation.
-    rotation : float or callable t (s) -> float, rad
+    rotation_rad : float or callable t (s) -> float, rad
         In 2D: turn about `centre`, anti-clockwise, before the displacement.
     centre : (d,), m
         About which it turns, and moments count; by default the origin.  It moves with the tool.
@@ -355,6 +355,9 @@ class Tool:
         simulation's `tool_travel`.  In axisymmetry the load all around.
     direction : (d,)
         In which a load pushes; of any length; in axisymmetry along the axis.
+    name
+        By which its results are found, and what it has on points, as NAME_pressure; without, "tool".
+        A tool of a later stage that is given the same name keeps that.
 
     Raises
     ------
@@ -364,12 +367,13 @@ class Tool:
 
     shape: Shape | Callable[[NDArray[np.float64]], ArrayLike]
     displacement: ArrayLike | Callable[[float], ArrayLike] = 0.0
-    rotation: float | Callable[[float], float] = 0.0
+    rotation_rad: float | Callable[[float], float] = 0.0
     centre: ArrayLike | None = None
     friction: float = 0.0
     adhesion: float = 0.0
     load: float | Callable[[float], float] | None = None
     direction: ArrayLike | None = None
+    name: str | None = field(default=None, kw_only=True, repr=False)
     _base: ClassVar[NDArray[np.float64] | float] = 0.0
     _moved: ClassVar[Shape | None] = None
 
@@ -381,7 +385,7 @@ class Tool:
             numbers(f"Tool: {name}", value, test=lambda v: (v >= 0) & (v < np.inf), allowed=">= 0 and finite")
         if (self.load is None) != (self.direction is None):
             raise ValueError(f"{line(self)}: load and direction, must be given both, or none")
-        for name in ("displacement", "rotation", "load"):
+        for name in ("displacement", "rotation_rad", "load"):
             value = getattr(self, name)
             if callable(value):
                 check_names(f"{line(self)}: {name}", value, ("t",))
@@ -433,9 +437,9 @@ class Tool:
         of = dim if callable(self.shape) else self.shape.dim
         if of != dim:
             raise ValueError(f"{line(self)}: a shape in {of}D, must be in {dim}D as the grid")
-        if dim == 3 and (callable(self.rotation) or self.rotation):
-            raise ValueError(f"{line(self)}: rotation, must be 0 in 3D")
-        for name in ("displacement", "rotation"):  # what a function gives is checked when it is called
+        if dim == 3 and (callable(self.rotation_rad) or self.rotation_rad):
+            raise ValueError(f"{line(self)}: rotation_rad, must be 0 in 3D")
+        for name in ("displacement", "rotation_rad"):  # what a function gives is checked when it is called
             if not callable(getattr(self, name)):
                 self._given(name, 0.0, dim if name == "displacement" else 0)
         self._centre(dim)
@@ -451,7 +455,7 @@ class Tool:
         shift = self._given("displacement", t, dim)
         if shift.ndim == 0 and shift:
             raise ValueError(f"{line(self)}: displacement at t = {t:g} s = {shift:g}, must be {dim} finite numbers")
-        R, angle = np.eye(dim), float(self._given("rotation", t))
+        R, angle = np.eye(dim), float(self._given("rotation_rad", t))
         if angle:
             R = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
         return Pose(R, self._centre(dim), np.broadcast_to(shift, (dim,)) + way * self.along(dim))

@@ -20,9 +20,8 @@ def check_held(
     grid: Grid,
     active: NDArray[np.bool_],
     free: NDArray[np.bool_],
-    holds: Sequence[tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.float64]]],
+    holds: Sequence[tuple[NDArray[np.int32], NDArray[np.int64] | None, NDArray[np.float64], NDArray[np.float64]]],
     each: bool,
-    meeting: tuple[NDArray[np.int32], NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]] | None = None,
 ) -> None:
     """Refuse a scene of which a part can move as a rigid body.
 
@@ -33,12 +32,10 @@ def check_held(
     free : (nodes, d)
         Components that no wall holds.
     holds
-        Cells (m,), positions (m, d) and directions (m, d) in which sides have given displacements, or touch tools.
+        Cells (m,), lexicographic ones of other parts (m,) or None, positions (m, d) and directions (m, d) in which
+        sides have given displacements, touch tools, or other parts: what is held holds the other one.
     each
         Look at each part that hangs together, not only at all of them.
-    meeting
-        Cells (m,), lexicographic ones of the other part (m,), positions (m, d) and directions (m, d) in which parts
-        touch: what is held holds the other one.
 
     Raises
     ------
@@ -52,16 +49,15 @@ def check_held(
     row, axis = np.nonzero(~free[nodes])
     x, direction = grid.node_x[nodes[row]], np.eye(grid.dim)[axis]
     number = part[cells[first[row] // 2**grid.dim]]  # of any cell at the node: they hang together
-    for cell, place, along in holds:
-        number = np.concatenate([number, part[cell]])
-        x, direction = np.concatenate([x, place]), np.concatenate([direction, along])
     against = np.zeros(len(number), dtype=np.int64)
-    if meeting is not None:
-        cell, other, place, along = meeting
-        travel = Exchange(grid.comm, grid.owner(other))
-        both = part[cell], travel.back(part[grid.local(travel.send(other))])
-        number, against = (np.concatenate([a, *b]) for a, b in ((number, both), (against, both[::-1])))
-        x, direction = np.concatenate([x, place, place]), np.concatenate([direction, along, along])
+    for cell, other, place, along in holds:
+        both, twice = [part[cell]], 1
+        if other is not None:
+            travel, twice = Exchange(grid.comm, grid.owner(other)), 2
+            both.append(travel.back(part[grid.local(travel.send(other))]))
+        number = np.concatenate([number, *both])
+        against = np.concatenate([against, *(both[::-1] if twice == 2 else [np.zeros(len(cell), dtype=np.int64)])])
+        x, direction = np.concatenate([x, *[place] * twice]), np.concatenate([direction, *[along] * twice])
     x = (x - centre[number - 1]) / size[number - 1, None]  # else a small part far from the origin would not turn
     modes = list(direction.T)
     modes += [direction[:, a] * x[:, b] - direction[:, b] * x[:, a] for a in range(grid.dim) for b in range(a)]
@@ -76,7 +72,7 @@ def check_held(
         ranks = [np.linalg.matrix_rank(gram, tol=NEAR**2 * max(1.0, np.abs(gram).max())) for gram in grams]
         missing = len(modes) - np.array(ranks)
         held[1:] = missing == 0
-        if meeting is None or (missing == before).all():
+        if (missing == before).all():
             break
     for k in range(1, count + 1):
         if missing[k - 1]:

@@ -7,9 +7,9 @@ from collections.abc import Callable, Sequence
 
 from mpm_dolfinx.base.validation import all_of, chosen, functions, instance, line, numbers
 from mpm_dolfinx.bodies.bodies import Body, check_bodies
+from mpm_dolfinx.conditions.conditions import OnSide
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.materials.skeleton import Fluid, Skeleton
-from mpm_dolfinx.mechanics.side_forms import functions_of
 
 
 def check_parts(grid: Grid, bodies: Sequence[Body], materials: Sequence[Skeleton], later: Sequence[int]) -> None:
@@ -30,12 +30,10 @@ def check_options(
     quadrature: str,
 ) -> None:
     """Refuse terms and sources that are no functions, pressures and sources without fluid, and wrong quadratures."""
-    if quadrature not in ("domain", "point"):
-        raise ValueError(f"quadrature {quadrature!r}: must be domain or point")
     turned = [i for i, body in enumerate(bodies) if not body.aligned]
     if quadrature == "point" and turned:
         raise ValueError(f"quadrature 'point': body {turned[0]} is mapped or a mesh, must be a box along the grid")
-    functions("terms", functions_of(terms))
+    functions("terms", _functions_of(terms))
     functions("sources", sources)
     if fluid is not None:
         instance("fluid", fluid, Fluid)
@@ -43,3 +41,10 @@ def check_options(
         raise ValueError(f"pressure = {line(pressure)}: needs a fluid")
     elif sources:
         raise ValueError("sources need a fluid")
+
+
+def _functions_of(terms):
+    """Return the functions of terms in bodies and on sides; what is no list of them as it is."""
+    if isinstance(terms, str) or not isinstance(terms, Sequence):
+        return terms
+    return [term.term if isinstance(term, OnSide) else term for term in terms]

@@ -34,7 +34,10 @@ from mpm_dolfinx.points.cutting import FACES
 from mpm_dolfinx.points.material_points import MaterialPoints
 
 FAST = 10
-"""Share of a wave of two domains that is taken away, over the cells that it has crossed; at most all of it."""
+"""Share of a wave of two domains that is taken away, over the cells that it has crossed; at most all of it.
+
+Plateau (cycles): halved 1.5e-04, doubled 3.4e-04, cells 6.2e-03.
+"""
 THIRD = (-1, 3, -3, 1)
 MARGIN = len(THIRD) - 1
 """Layers of a lattice on both sides that the change of one depends on."""

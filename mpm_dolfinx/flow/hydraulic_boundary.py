@@ -3,11 +3,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from functools import partial
 from itertools import combinations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.conditions.conditions import Drained, Inflow
@@ -32,7 +33,7 @@ class HydraulicBoundary:
     sides
         The sides of the bodies.
     outlets
-        The conditions.
+        The conditions by name.
 
     Raises
     ------
@@ -40,14 +41,18 @@ class HydraulicBoundary:
         Naming a condition whose side no point has, or two that act on the same faces.
     """
 
-    def __init__(self, sides: Sides, outlets: Sequence[Drained | Inflow]):
-        self._grid = sides.grid
-        self.outlets = [(outlet, sides.of(outlet)) for outlet in outlets]
-        self.varies = any(callable(o.flux if isinstance(o, Inflow) else o.pressure) for o in outlets)
+    def __init__(self, sides: Sides, outlets: Mapping[str, Drained | Inflow]):
+        self._grid, self.names = sides.grid, tuple(outlets)
+        self.outlets = [(outlet, sides.of(outlet)) for outlet in outlets.values()]
+        self.varies = any(callable(o.flux if isinstance(o, Inflow) else o.pressure) for o in outlets.values())
         """Whether what the sides give depends on time or place."""
         for one, other in combinations(self.outlets, 2):
             check_apart(*one, *other)
         self._constant: Latest[OpenSides] = Latest()
+
+    def unknown(self, value: float) -> dict[str, NDArray[np.float64]]:
+        """Return outflows of this value before a first step."""
+        return {name: np.array(value) for name in self.names}
 
     def data(self, cut: CutDomains, points: MaterialPoints, contents: CellContents, t: float) -> OpenSides:
         """Return the open sides where they were cut, with what they give at time t (s)."""

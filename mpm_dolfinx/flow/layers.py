@@ -29,7 +29,10 @@ from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.parallel.exchange import over_all
 
 ASLANT = 0.01
-"""Slope of layers on the grid from which a cell's pressure is rather that of its most conductive part."""
+"""Slope of layers on the grid from which a cell's pressure is rather that of its most conductive part.
+
+Plateau (slope): halved 4.1e-04, doubled 5.0e-05, cells 3.4e-03.
+"""
 PAIRS = 2**16
 """Pairs of pieces in a cell that are looked at, at a time."""
 

@@ -28,9 +28,15 @@ from mpm_dolfinx.grid.grid import sum_by
 ALONG = 1e-4
 """Share of a cell below which centroids lie across from one another."""
 NEAREST = 0.1
-"""Share of a cell: what is nearer counts as if it were as far in the least squares."""
+"""Share of a cell: what is nearer counts as if it were as far in the least squares.
+
+Plateau (slope): halved 3.0e-08, doubled 1.2e-06, cells 3.4e-03.
+"""
 SIDES = 2.0
-"""Weight of all that is known beyond a cell's open sides in its least squares, by their areas, over a neighbour's."""
+"""Weight of all that is known beyond a cell's open sides in its least squares, by their areas, over a neighbour's.
+
+Plateau (slope): halved 4.8e-06, doubled 2.8e-06, cells 3.4e-03.
+"""
 
 
 def off_facets(contents: CellContents, facets: NDArray[np.int32]) -> NDArray[np.int32]:

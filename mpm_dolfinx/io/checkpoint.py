@@ -19,6 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.validation import instance, line, numbers, on_disk, path, whole
+from mpm_dolfinx.conditions.acting import Outcome
+from mpm_dolfinx.contact.groups import Contact
+from mpm_dolfinx.contact.tools import Tool
 from mpm_dolfinx.domains.pressure_transport import PiecePressures
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.io.writer import WRITABLE, replacing
@@ -29,11 +32,9 @@ from mpm_dolfinx.simulation.simulation import Simulation
 from mpm_dolfinx.stepping.result import Result, Row
 from mpm_dolfinx.stepping.state import State, Stay
 
-FORMAT, VERSION = "mpm_dolfinx checkpoint", 9  # Source: the format of the files
+FORMAT, VERSION = "mpm_dolfinx checkpoint", 10  # Source: the format of the files
 FOREIGN = "no checkpoint of mpm_dolfinx, must be one"
 ZIP = b"PK\3\4"  # how numpy's archives begin
-ACTING = ("reactions", "walls", "outflows", "tool_forces", "tool_travel")
-ROWS_OF_STAGES = ("reactions", "outflows")  # of a Row: as many as the stage has conditions
 PIECES = ("id", "pressure", "x", "start")  # of a Stay
 NODAL = ("velocity", "held", "rest")  # of a State
 NOTE = {"t": float, "resets": int, "begins": bool, "scene": dict, "result": dict}  # and their kinds
@@ -151,14 +152,13 @@ def _scalars(result: Result) -> dict[str, Any]:
 
 def _arrays(state: State) -> dict[str, NDArray]:
     """Return the arrays of a state by names with slashes."""
-    named = {"points": vars(state.points), **{name: getattr(state, name) for name in ACTING}}
-    named["result"] = {}
-    for name in Row._fields:
-        rows = [np.asarray(value) for value in state.result.column(name)]
-        if name in ROWS_OF_STAGES:
-            named["result"][f"{name}_count"] = np.array([*map(len, rows)], dtype=np.int64)
-            rows = rows and np.concatenate(rows)
-        named["result"][name] = np.array(rows)
+    named = {"points": vars(state.points), "outcome": state.outcome}
+    named["result"] = {name: np.array(state.result.column(name)) for name in Row._fields if name != "outcome"}
+    for i, outcome in enumerate(state.result.column("outcome")):
+        for name, value in _named("", outcome).items():
+            named["result"].setdefault(f"outcome/{name}", {"row": [], "value": []})
+            for rows, one in zip(named["result"][f"outcome/{name}"].values(), (i, value), strict=True):
+                rows.append(one)
     if state.transported is not None:
         named["transported"] = vars(state.transported)
     if state.stay is not None:
@@ -192,26 +192,59 @@ def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulat
         histories = _part(arrays, "result/")
         times = histories["t"] = histories["t"].tolist()
         histories["pressure"] = [*map(tuple, histories["pressure"].tolist())]
-        for name in ROWS_OF_STAGES:
-            histories[name] = np.split(histories[name], np.cumsum(histories.pop(f"{name}_count")))[:-1]
+        histories["outcome"] = _outcomes(_part(histories, "outcome/"), len(times))
         columns = [[*histories[name]] or [None] * len(times) for name in Row._fields]
         result = Result(rows=[Row(*row) for row in zip(*columns, strict=True)], **note["result"])
-        acting = reactions, walls, outflows, forces, ways = [arrays.pop(name) for name in ACTING]
+        outcome = _nested(_part(arrays, "outcome/"))
         nodal = [_part(arrays, f"{name}/") or None for name in NODAL]
         for name, given in zip(NODAL, nodal, strict=True):
             if given is not None:
                 _check_nodal(name, given, simulation.grid)
-        shapes = reactions.shape[1:], walls.shape, outflows.shape[1:]
-        if arrays or shapes != ((dim,), (2 * dim, dim), ()) or not all(np.isfinite([note["t"], *times])):
-            raise ValueError(f"has {', '.join(arrays) or 'other reactions, outflows or times'}")
-        if forces.shape != now.tool_forces.shape:
-            raise ValueError(f"has forces of {len(forces)} tools")
-        if ways.shape != now.tool_travel.shape or not np.isfinite(ways).all():
-            raise ValueError(f"has ways of {len(ways)} tools, or not finite")
-        start = note["t"], points, transported, stay, note["resets"], *acting, None, note["begins"]
-        return State(*start, *nodal, result)
+        if arrays or not all(np.isfinite([note["t"], *times])):
+            raise ValueError(f"has {', '.join(arrays) or 'other times'}")
+        outcome = _like(outcome, now.outcome)
+        reset = {"stay": stay, "resets": note["resets"], "begins": note["begins"]}
+        told = dict(zip(NODAL, nodal, strict=True)) | {"outcome": outcome, "stage": None, "result": result}
+        return State(t=note["t"], points=points, transported=transported, **reset, **told)
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         raise ValueError(f"{damaged} ({line(error)}), must be a whole checkpoint") from error
+
+
+def _outcomes(arrays: dict[str, NDArray], count: int) -> list[dict[str, dict[str, NDArray]]]:
+    """Return what conditions had done at each of so many output times."""
+    out: list[dict[str, dict[str, NDArray]]] = [{} for _ in range(count)]
+    for quantity, names in _nested(arrays).items():
+        for name, found in names.items():
+            for i, value in zip(found["row"], found["value"], strict=True):
+                out[i].setdefault(quantity, {})[name] = value
+    return out
+
+
+def _like(outcome: dict[str, dict[str, NDArray]], now: Outcome) -> dict[str, dict[str, NDArray]]:
+    """Return an outcome of the conditions that there are now; of those that there were not, as it is.
+
+    ValueError where it has other shapes, or how far tools have been pushed is not finite.
+    """
+    found = {q: {name: outcome.get(q, {}).get(name, value) for name, value in of.items()} for q, of in now.items()}
+    for quantity, of in found.items():
+        for name, value in of.items():
+            if value.shape != now[quantity][name].shape or value.dtype != np.float64:
+                raise ValueError(f"outcome/{quantity}/{name}: {value.dtype} of shape {value.shape}")
+            if quantity == "tool_travel" and not np.isfinite(value):
+                raise ValueError(f"outcome/{quantity}/{name} is not finite")
+    return found
+
+
+def _nested(arrays: dict[str, NDArray]) -> dict[str, Any]:
+    """Return arrays by names with slashes in dictionaries of dictionaries."""
+    out: dict[str, Any] = {}
+    for name, value in arrays.items():
+        *folders, last = name.split("/")
+        at = out
+        for folder in folders:
+            at = at.setdefault(folder, {})
+        at[last] = value
+    return out
 
 
 def _points(arrays: dict[str, NDArray], like: MaterialPoints, ids: NDArray[np.int64]) -> MaterialPoints:
@@ -328,10 +361,9 @@ def _read(file: Path) -> tuple[dict[str, NDArray], dict[str, Any]]:
 
 def describe(simulation: Simulation) -> dict[str, Any]:
     """Return the constants that make the scene, by name, as a checkpoint holds them."""
-    touching = simulation.state.stage.mechanical
-    pairs = [("tools", touching.tools.tools), ("contacts", touching.contacts.contacts)]
-    grips = {f"{name}, each whether it resists slip": [bool(one.grips) for one in of] for name, of in pairs}
-    return {**simulation.scene.description, "bodies present": list(simulation.present), **grips}
+    grips = {name: bool(one.grips) for name, one in simulation.state.stage.of(Tool, Contact).items()}
+    more = {"bodies present": list(simulation.present), "tools and contacts, whether each resists slip": grips}
+    return {**simulation.scene.description, **more}
 
 
 def _check_scene(file: Path, there: dict[str, Any], here: dict[str, Any]) -> None:

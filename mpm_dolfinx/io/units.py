@@ -16,7 +16,7 @@ FIELDS = {
         "porosity": "-, present volume fraction of the pores",
         "owed, due": "-, volume that the fluid has yet to fill, over that at rest; what of it the next step takes in",
         "softness": "-, elastic over present shear stiffness where a law yields, 1 to 100",
-        "tool_0_pressure, tool_0_shear": "Pa, pressure and shear traction of tool 0 on the surface of the domain",
+        "tool_pressure, tool_shear": "Pa, pressure and shear traction of the tool `tool` on the surface of the domain",
         "others": "state of the law (see its documentation), constants that differ from point to point, the user's own",
     },
     "tools.pvd: what tools fill of the grid's cells": {
@@ -37,10 +37,12 @@ FIELDS = {
         "ux_0, uy_0, uz_0": "m, its displacement",
         "p_0": "Pa, pore pressure there",
         "sxx_0, syy_0, szz_0, sxy_0, sxz_0, syz_0": "Pa, effective stress there, tension positive",
-        "reaction_x_0, reaction_y_0, reaction_z_0": "N, in plane strain N/m, force of given displacement 0",
-        "tool_x_0, tool_y_0, tool_z_0": "N, in plane strain N/m, force of tool 0 on the bodies",
-        "tool_moment_0": "N, plane strain: moment of tool 0 about its centre for each m; in 3D _x, _y, _z, N m",
-        "outflow_0": "m^3/s, in plane strain m^2/s, what leaves through drained side 0; then through inflows",
+        "reaction_x_NAME, _y_, _z_": "N, in plane strain N/m, force of the given displacement NAME on the bodies",
+        "wall_reaction_x_WALL, _y_, _z_": "N, in plane strain N/m, force of a wall of the grid on the bodies",
+        "tool_force_x_NAME, _y_, _z_": "N, in plane strain N/m, force of the tool or contact NAME on the bodies",
+        "tool_force_moment_NAME": "N, plane strain: moment about its centre for each m; in 3D _x, _y, _z, N m",
+        "tool_travel_NAME": "m, how far a load has pushed the tool NAME beyond its displacement",
+        "outflow_NAME": "m^3/s, in plane strain m^2/s, what leaves through the open side NAME",
     },
 }
 """Names, units and meaning of what is written, by file."""

@@ -27,6 +27,7 @@ from dolfinx import fem, io
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.validation import flag, instance, line_of, on_disk, path, whole
+from mpm_dolfinx.contact.tools import Tool
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.io.units import text
 from mpm_dolfinx.parallel.exchange import at_root, to_root
@@ -90,12 +91,12 @@ class Writer:
         self.every, self._simulation = whole("writer: every", every), simulation
         self.closed = False
         """Whether the writer has released its folder."""
-        tools = simulation.state.stage.conditions["tools"]
-        self._acting = simulation.reactions, simulation.outflows, simulation.tool_forces  # at the start
+        tools = simulation.state.stage.of(Tool)
+        own = tuple(f"{quantity.removesuffix('s')}_" for quantity in simulation.state.outcome)
         with on_disk("writer: folder", "one that can be written"):
             self._lock: Lock | None = None
             at_root(comm, lambda: self._hold(folder))
-            self._table = Table(comm, folder / "history.csv", self._t)
+            self._table = Table(comm, folder / "history.csv", self._t, own)
             self._points = Series(comm, folder / "points.pvd", self._t)
             self._grid = Series(comm, folder / "grid.pvd", self._t) if grid else None
             self._tools = Series(comm, folder / "tools.pvd", self._t) if tools else None
@@ -129,7 +130,7 @@ class Writer:
         result = simulation.result
         if not self._table.columns:
             self._start(result)
-        self._table.add(_row(result, simulation.reactions, simulation.outflows, simulation.tool_forces))
+        self._table.add(_row(result))
         if (len(result.rows) - 1) % self.every and not result.converged:
             return
         self._write_points(simulation)
@@ -141,7 +142,7 @@ class Writer:
         """Drop what the folder holds of later times: from here on the files are this run's."""
         if (began := result.rows[-2][0]) != self._t:
             raise ValueError(f"writer: made at t = {self._t:g} s for a run that goes on from t = {began:g} s")
-        self._table.start(_row(Result(rows=result.rows[:1]), *self._acting))
+        self._table.start(_row(Result(rows=result.rows[-2:-1])))
         self._write_indices()
 
     def _write_indices(self) -> None:
@@ -185,9 +186,9 @@ class Writer:
 
 def _write_tools(simulation: Simulation, file: Path) -> None:
     """Write what tools fill of the grid's cells, with their numbers and forces."""
-    grid, forces = simulation.grid, simulation.tool_forces[:, : simulation.grid.dim]
-    tools = simulation.state.stage.conditions["tools"]
-    corners = [tool.drawn(grid, simulation.t, way) for tool, way in zip(tools, simulation.tool_travel, strict=True)]
+    grid, tools = simulation.grid, simulation.state.stage.of(Tool)
+    corners = [tool.drawn(grid, simulation.t, float(simulation.tool_travel[name])) for name, tool in tools.items()]
+    forces = np.stack([simulation.tool_forces[name][: grid.dim] for name in tools])
     number = np.repeat(np.arange(len(tools)), [len(one) for one in corners])
     with replacing(file) as part:
         _cells(np.concatenate(corners), {"tool": number, "force": forces[number]}).write(part, file_format="vtu")
@@ -218,9 +219,7 @@ class Lock:
         return lock
 
 
-def _row(
-    result: Result, reactions: NDArray[np.float64], outflows: NDArray[np.float64], tools: NDArray[np.float64]
-) -> dict[str, float]:
+def _row(result: Result) -> dict[str, float]:
     """Return what the histories hold of the last output time, and what acts at the conditions then."""
     row = result.rows[-1]
     out = {"t": row.t, **{name: getattr(result, name) for name in COUNTS}}
@@ -233,12 +232,18 @@ def _row(
             out[f"p_{i}"] = float(row.probe_pressure[i])
         if row.probe_stress is not None:
             out |= {f"s{name}_{i}": value for name, value in _components(row.probe_stress[i], len(u)).items()}
-    for i, force in enumerate(reactions):
-        out |= {f"reaction_{axis}_{i}": value for axis, value in zip("xyz", force.tolist(), strict=False)}
-    names = ["x", "y", "moment"] if tools.shape[1] == 3 else ["x", "y", "z", "moment_x", "moment_y", "moment_z"]
-    for i, forces in enumerate(tools):
-        out |= {f"tool_{name}_{i}": value for name, value in zip(names, forces.tolist(), strict=True)}
-    return out | {f"outflow_{i}": float(flow) for i, flow in enumerate(outflows)}
+    for quantity, values in row.outcome.items():
+        for name, value in values.items():
+            axes = _axes(len(row.outcome["wall_reactions"]) // 2, np.size(value)) if np.ndim(value) else [""]
+            singular = quantity.removesuffix("s")
+            out |= {f"{singular}{axis}_{name}": v for axis, v in zip(axes, np.ravel(value).tolist(), strict=True)}
+    return out
+
+
+def _axes(dim: int, size: int) -> list[str]:
+    """Return what the components of a force are called, and of its moments if it has more than there are axes."""
+    axes = ["_x", "_y", "_z"][:dim]
+    return axes + {0: [], 1: ["_moment"], 3: [f"_moment{axis}" for axis in axes]}[size - dim]
 
 
 def _components(tensors: NDArray[np.float64], dim: int) -> dict[str, NDArray[np.float64]]:
@@ -402,10 +407,13 @@ class Series:
 
 
 class Table:
-    """A table in a CSV file, to which rows are added one by one; the first column is the time."""
+    """A table in a CSV file, to which rows are added one by one; the first column is the time.
 
-    def __init__(self, comm: MPI.Intracomm, file: Path, t: float):
-        self.comm, self.file = comm, file
+    Columns whose names begin with one of `own` are those of conditions, which come and go with stages.
+    """
+
+    def __init__(self, comm: MPI.Intracomm, file: Path, t: float, own: tuple[str, ...] = ()):
+        self.comm, self.file, self._own = comm, file, own
         self._rows = at_root(comm, lambda: kept(self._read(), t))
         self.columns: list[str] = []
         """Names of the columns, once it has been started."""
@@ -431,19 +439,29 @@ class Table:
         at_root(self.comm, write)
 
     def add(self, row: dict[str, float]) -> None:
-        """Add a row."""
+        """Add a row; one of new columns begins the file anew with these, nan in the rows so far."""
         self._check(row)
-        at_root(self.comm, lambda: self._append(self.file, [row], "a"))
+        new = [name for name in row if name not in self.columns]
+        self.columns.extend(new)
+
+        def write() -> None:
+            if not new:
+                return self._append(self.file, [row], "a")
+            rows = [values for _, values in self._read()]
+            with replacing(self.file) as part:
+                self._append(part, [*rows, row], "w")
+
+        at_root(self.comm, write)
 
     def _check(self, row: dict[str, float]) -> None:
-        if list(row) != self.columns:
-            both = f"{', '.join(self.columns)}, the run's {', '.join(row)}"
+        here, there = ([name for name in names if not name.startswith(self._own)] for names in (row, self.columns))
+        if here != there:
+            both = f"{', '.join(there)}, the run's {', '.join(here)}"
             raise ValueError(f"{self.file}: its columns are {both}; must be the same, or in another folder")
 
-    @staticmethod
-    def _append(file: Path, rows: Sequence[dict], mode: str) -> None:
+    def _append(self, file: Path, rows: Sequence[dict], mode: str) -> None:
         with open(file, mode, newline="") as f:
-            writer = csv.DictWriter(f, list(rows[0]), lineterminator="\n")
+            writer = csv.DictWriter(f, self.columns, restval="nan", lineterminator="\n")
             if mode == "w":
                 writer.writeheader()
             writer.writerows(rows)

@@ -142,7 +142,10 @@ def mean_size(grid: Grid) -> float:
 
 
 MOST = 100.0
-"""The most by which a skeleton counts as softer than elastic: perfectly plastic flow has no stiffness at all."""
+"""The most by which a skeleton counts as softer than elastic: perfectly plastic flow has no stiffness at all.
+
+Plateau (soil): halved 4.0e-03, doubled 5.0e-03, cells 3.0e-02.
+"""
 
 
 class SoftnessAtPoints:

@@ -30,9 +30,15 @@ RESERVED = frozenset(
 """Names of what points of integration carry beside parameters and state."""
 WHAT_IS_NAMED = "parameters, state and unknowns"
 EVOLVED = 1e-3
-"""By how much the state of a law differs from that at rest where it counts as another."""
+"""By how much the state of a law differs from that at rest where it counts as another.
+
+Plateau (soil): halved 6.6e-05, doubled 1.4e-04, cells 3.0e-02.
+"""
 STIFFEST = 100.0
-"""How much stiffer than the skeleton pore fluid that cannot flow is taken to be, at most: rounding grows with it."""
+"""How much stiffer than the skeleton pore fluid that cannot flow is taken to be, at most: rounding grows with it.
+
+Plateau (soil): halved 1.2e-07, doubled 1.0e-07, cells 3.0e-02.
+"""
 
 
 class SceneMaterials:

@@ -35,7 +35,10 @@ Tip of the drained beam at h = 0.015 m, plain and with it: -0.02 and +0.22 % at 
 """
 
 APART = 1e-4
-"""By how much equal eigenvalues are set apart, in proportion to them, so that their derivatives are finite."""
+"""By how much equal eigenvalues are set apart, in proportion to them, so that their derivatives are finite.
+
+Plateau (beam): halved 1.8e-09, doubled 7.2e-09, cells 1.5e-02.
+"""
 
 
 @dataclass(frozen=True)

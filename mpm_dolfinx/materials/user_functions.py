@@ -28,7 +28,7 @@ dt
 
 A term that is linear in v and depends on u is taken to have an unsymmetric tangent.
 
-A function in `sources` gives the volume of fluid, as at zero pressure, that is brought in a time, m^d/s:
+The function of a `Source` gives the volume of fluid, as at zero pressure, that is brought in a time, m^d/s:
 
 q
     Test function, constant in the cells: the source is s * q * points.dx with s in 1/s.

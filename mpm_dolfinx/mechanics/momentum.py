@@ -14,8 +14,8 @@ itself.  The derivatives are UFL's.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
 
-from mpi4py import MPI
 from petsc4py import PETSc
 
 import numpy as np
@@ -25,24 +25,20 @@ from dolfinx.common import Timer
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base import _compat
-from mpm_dolfinx.base.validation import line
-from mpm_dolfinx.conditions.conditions import OnSide
-from mpm_dolfinx.contact.tool_contact import ToolContact
+from mpm_dolfinx.conditions.acting import At, FormsOf, Loads
 from mpm_dolfinx.forms.cell_matrices import Beside, ElementForces, ElementMatrices, StackedElementMatrices
-from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointForm
+from mpm_dolfinx.forms.point_forms import FormPoints
 from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts, zero
 from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.materials.evaluate import by_scene
 from mpm_dolfinx.materials.local_unknowns import LocalUnknowns
 from mpm_dolfinx.materials.skeleton import Skeleton
-from mpm_dolfinx.materials.user_functions import compiling, term_of
 from mpm_dolfinx.mechanics.ghost_penalty import GhostPenalty
 from mpm_dolfinx.mechanics.mean_dilatation import MeanDilatation
+from mpm_dolfinx.mechanics.own_terms import OwnTerms
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
-from mpm_dolfinx.mechanics.rigid_motion import rigid_motion
-from mpm_dolfinx.mechanics.side_forms import OwnTerm, SideData, SideForms
 from mpm_dolfinx.mechanics.walls import wall_forces
-from mpm_dolfinx.parallel.exchange import over_all
+from mpm_dolfinx.mechanics.weight import Weight
 from mpm_dolfinx.points.parts import OfParts, Parts, parts_of_cells, relative
 
 
@@ -89,36 +85,24 @@ class MomentumForms:
         V = _compat.function_space(grid.mesh, "Lagrange", 1, (grid.dim,))
         self.u = fem.Function(V)
         """Increment of the displacement since the start of the step, m."""
-        self._work = [fem.Function(V) for _ in range(4)]  # internal, own, external forces, and pulls of given sides
+        self._rooms = [fem.Function(V) for _ in range(3)]  # for sums of forces that are needed at once
         averaged = [number for number, (_, _, locks) in enumerate(laws) if locks]
         self.dilatation = MeanDilatation(grid, averaged, symmetric) if averaged else None
-        # a rate is (u - past) / own: of backward Euler past is 0, and own the step
-        self._past, self._own = fem.Function(V), fem.Constant(grid.mesh, 1.0)
-        self._residuals, self._tangents, self._own_tangents = [], [], []
-        self._residuals_of_all: list[PointForm] = []
+        self._residuals, self._tangents = [], []
         self._local: dict[int, LocalUnknowns] = {}  # by the number of their part
-        self.terms: list[PointForm] = []
         for number, (law, points, locks) in enumerate(laws):
             self._add_law(number, law, points, locks, pressure, symmetric, by_scene(grid) | {"dt": dt})
-        self.sides = SideForms(grid, self.u)
-        kept = [self._add_term(term, pieces, t, dt) for term in terms]
-        self.symmetric = symmetric and all(potential or not holds for potential, holds, _ in kept)
-        self.holding = any(holds for _, holds, _ in kept)
-        """Whether terms of the user's depend on u."""
-        self.rates = any(rate for _, _, rate in kept)
-        """Whether terms of the user's depend on the velocity."""
-        self.linear = not averaged and not self.holding and all(law.linear for law, *_ in laws)
-        """Whether the tangent changes with the places of the points only."""
+        self.conditions = FormsOf(grid, self.u)
+        """The forms of conditions."""
+        self.own = OwnTerms(terms, pieces, self.u, t, dt)
+        self.weight = None if gravity is None else Weight(pieces, self.u, gravity, fluid_density)
+        self.acting = [*filter(None, (self.weight,)), *[self.own] * bool(terms)]
+        """What acts in all stages."""
+        self.symmetric = symmetric and self.own.symmetric
+        self.linear = not averaged and all(law.linear for law, *_ in laws)
+        """Whether the tangent of the laws changes with the places of the points only."""
         self.elastic = not any(law.state for law, *_ in laws)
         """Whether no law has a history: where soil yields, the tangent of one substep leads the next astray."""
-        self.weight = None
-        if gravity is not None:
-            v = ufl.TestFunction(V)
-            pull = ufl.inner(gravity, pieces.value(v))
-            self.weight = PointForm(pieces.density * pull * pieces.dx, pieces)
-            if fluid_density is not None:
-                taken_up = fem.Constant(grid.mesh, fluid_density) * (ufl.det(pieces.increment(self.u)) - 1)
-                self._residuals_of_all.append(PointForm(-taken_up * pull * pieces.dx, pieces))
         self.ghost = GhostPenalty(grid, V, at_points)
 
     def _add_law(
@@ -161,106 +145,47 @@ class MomentumForms:
         else:
             self._tangents.append(StackedElementMatrices(A, points, symmetric, beside))
 
-    def _add_term(self, term: Callable, pieces: FormPoints, t: fem.Constant, dt: fem.Constant) -> tuple:
-        """Add a term of the user's; return whether it has a potential, depends on u, and on the velocity."""
-        V = self.u.function_space
-        v, du = ufl.TestFunction(V), ufl.TrialFunction(V)
-        velocity = (self.u - self._past) / self._own
-        more = {"t": t, "dt": dt, "velocity": velocity}
-        function, points = (term.term, self.sides.own_points()) if isinstance(term, OnSide) else (term, pieces)
-        form, potential = term_of(function, self.u, v, points=points, u=self.u, v=v, **more)
-        holds = self.u in form.coefficients()
-        with compiling(f"terms: {line(term)}", "linear in v, or an energy of u"):
-            own = PointForm(form, points)
-            slope = PointForm(ufl.derivative(form, self.u, du), points) if holds else None
-        if points is not pieces:
-            self.sides.own.append(OwnTerm(term, points, own, slope))
-        else:
-            self.terms.append(own)
-            self._own_tangents.extend([slope] * holds)
-        return potential, holds, self._past in form.coefficients()
-
-    def set_rate(self, own: float, past: float) -> None:
-        """Set the rate at the end of a substep: time in which it counts, s, and share of the present u before it."""
-        self._own.value = own
-        if self.rates:
-            self._past.x.array[:] = past * self.u.x.array
-
-    def external(self, data: QuadratureData, sides: SideData) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the nodal forces of dead loads, weight and tilted plates, and of given displacements, local arrays."""
-        _, _, external, pulls = self._work
-        external.x.array[:] = pulls.x.array[:] = 0.0
-        if sides.loads is not None:
-            self.sides.traction.assemble_vector(external.x.array, sides.loads)
-        if self.weight is not None:
-            self.weight.assemble_vector(external.x.array, data.pieces)
-        if sides.plates is not None:
-            self.sides.tilt.assemble_vector(external.x.array, sides.plates)
-        if sides.holds is not None:
-            self.sides.pull.assemble_vector(pulls.x.array, sides.holds)
-        return sum_ghosts(external), sum_ghosts(pulls)
-
-    def pressures(self, sides: SideData) -> NDArray[np.float64]:
-        """Return the nodal forces of pressures at u, a local array."""
-        forces = self.sides.forces
-        forces.x.array[:] = 0.0
-        self.sides.pressed.assemble_vector(forces.x.array, sides.pressures)
-        return sum_ghosts(forces)
-
-    def pushed(self, contact: ToolContact) -> NDArray[np.float64]:
-        """Return the nodal forces of tools at u, a local array."""
-        sides, places = self.sides, contact.places
-        sides.forces.x.array[:] = 0.0
-        force = contact.at(self.nodal).force
-        sides.traction.assemble_vector(
-            sides.forces.x.array, PointData(sides.loads, places, np.ones(len(force)), {"force": force})
-        )
-        return sum_ghosts(sides.forces)
+    def summed(self, room: int, adders: Sequence[Callable[[NDArray[np.float64]], None]]) -> NDArray[np.float64]:
+        """Return the sum of the nodal forces that are added, of all processes, in one of the rooms for local arrays."""
+        out = self._rooms[room]
+        out.x.array[:] = 0.0
+        for add in adders:
+            add(out.x.array)
+        return sum_ghosts(out)
 
     @property
     def nodal(self) -> NDArray[np.float64]:
         """u by nodes (nodes, d), m."""
         return self.u.x.array.reshape(-1, self.grid.dim)
 
-    def internal(self, data: QuadratureData) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the nodal forces of the stresses, and of the user's terms, at u, local arrays."""
-        internal, own, _, _ = self._work
-        internal.x.array[:] = own.x.array[:] = 0.0
+    def internal(self, data: QuadratureData) -> NDArray[np.float64]:
+        """Return the nodal forces of the stresses at u, a local array."""
         if self.dilatation is not None:
             self.dilatation.set_ratios(data)
         for number, local in self._local.items():
             local.update(data.parts[number], derive=False)
         if self.dilatation is not None:
             self.dilatation.set_stresses(data)
-        for residual, part in zip(self._residuals, data.parts, strict=True):
-            residual.assemble_vector(internal.x.array, part)
-        for residual in self._residuals_of_all:
-            residual.assemble_vector(internal.x.array, data.pieces)
-        for term in self.terms:
-            term.assemble_vector(own.x.array, data.pieces)
-        return sum_ghosts(internal), sum_ghosts(own) if self.terms else own.x.array
 
-    def assemble_tangent(self, K: PETSc.Mat, data: QuadratureData, sides: SideData) -> None:
-        """Add the tangent at u to K, which the caller finalises."""
+        def add(b: NDArray[np.float64]) -> None:
+            for residual, part in zip(self._residuals, data.parts, strict=True):
+                residual.assemble_vector(b, part)
+            if self.weight is not None:
+                self.weight.taken_up(b, data.pieces)
+
+        return self.summed(0, [add])
+
+    def assemble_tangent(self, K: PETSc.Mat, data: QuadratureData) -> None:
+        """Add the tangent of the stresses at u to K, which the caller finalises."""
         for number, local in self._local.items():
             local.derive(data.parts[number])
         sums = [tangent.assemble_matrix(K, part) for tangent, part in zip(self._tangents, data.parts, strict=True)]
-        for tangent in self._own_tangents:
-            tangent.assemble_matrix(K, data.pieces)
         if self.dilatation is not None:
             self.dilatation.assemble_matrix(K, data, sums)
-        if sides.pressures is not None:
-            self.sides.pressed_slope.assemble_matrix(K, sides.pressures)
-        self.sides.assemble_own(K, sides)
-        if sides.tools is not None:
-            places, slope = sides.tools.places, sides.tools.at(self.nodal).slope
-            of_rows = PointData(self.sides.slopes, places, np.ones(len(slope)), {"slope": slope})
-            self.sides.pushed_slope.assemble_matrix(K, of_rows)
-            sides.tools.assemble_matrix(K, self.nodal)
 
     def at_nodes(self, cells: NDArray[np.int32], values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the sums (nodes,) at the local nodes of what owned cells, of all processes, have (cells,)."""
-        shared, nodes = self._work[0], self.grid.cell_nodes[cells]
+        shared, nodes = self._rooms[0], self.grid.cell_nodes[cells]
         sums = sum_by(nodes.ravel(), np.repeat(values, nodes.shape[1]), len(self.grid.node_x))
         shared.x.array[:] = np.repeat(sums, self.grid.dim)
         sum_ghosts(shared)
@@ -286,7 +211,7 @@ class MomentumForms:
         nodes[self.grid.cell_nodes[cells]] = True
         if self.grid.comm.size == 1:
             return nodes
-        shared = self._work[0]
+        shared = self._rooms[0]
         shared.x.array[:] = np.repeat(nodes, self.grid.dim)
         _compat.scatter_reverse_add(shared)
         shared.x.scatter_forward()
@@ -391,15 +316,13 @@ class MomentumSystem:
         A.setOption(PETSc.Mat.Option.IGNORE_ZERO_ENTRIES, True)
         return A
 
-    def set_penalty(self, sides: SideData) -> None:
-        """Assemble what is linear in the step's increment, ghost penalty, plates, given displacements, and firmness."""
+    def set_penalty(self, loads: Sequence[Loads]) -> None:
+        """Assemble what is linear in the step's increment: ghost penalty, that of loads, and firmness."""
         for penalty, ghost in zip((self.held_penalty, self.penalty), self._ghosts, strict=True):
             zero(penalty)
             ghost.assemble_matrix(penalty)
-            if sides.plates is not None:
-                self._forms.sides.plate.assemble_matrix(penalty, sides.plates)
-            if sides.holds is not None and penalty is self.penalty:
-                self._forms.sides.hold.assemble_matrix(penalty, sides.holds)
+            for one in loads:
+                one.penalty(penalty, penalty is self.held_penalty)
             penalty.assemble()
         if self.firm is not None:
             zero(self.firm)
@@ -416,8 +339,8 @@ class MomentumProblem:
         Compiled forms; vectors and matrices, with the penalties in them.
     data
         The pieces.
-    sides
-        What acts on the sides of the bodies.
+    loads
+        What acts on the bodies.
     tolerance
         Share of the forces to which they are balanced.
     goes_on : (unknowns,)
@@ -433,7 +356,7 @@ class MomentumProblem:
         forms: MomentumForms,
         system: MomentumSystem,
         data: QuadratureData,
-        sides: SideData,
+        loads: Sequence[Loads],
         tolerance: float,
         goes_on: NDArray[np.float64] | None = None,
         held: NDArray[np.float64] | None = None,
@@ -441,75 +364,52 @@ class MomentumProblem:
     ):
         self.forms, self.system, self.data = forms, system, data
         self.yielded = yielded
-        self._sides, self._goes_on, self._tolerance = sides, goes_on, tolerance
+        self.loads, self._goes_on, self._tolerance = tuple(loads), goes_on, tolerance
+        self._varying = [one for one in loads if one.varies]
         with Timer("mpm: loads"):
-            external, pulls = forms.external(data, sides)
-            if held is not None:
-                external += held
-            self._external, self._pulls = external[system.touched], pulls[system.touched]
+            external, pulls = (
+                forms.summed(1 + room, [getattr(one, name) for one in loads])[system.touched]
+                for room, name in enumerate(("dead", "pulls"))
+            )
+            self._external, self._pulls = external if held is None else external + held[system.touched], pulls
 
     @property
     def linear(self) -> bool:
         """Whether the tangent changes with the places of the points only."""
-        sides = self._sides
-        return self.forms.linear and sides.pressures is None and sides.tools is None and sides.contact is None
+        return self.forms.linear and all(one.linear for one in self.loads)
 
     @property
     def smooth(self) -> bool:
         """Whether the tangent of one substep may lead the next."""
-        return self.forms.elastic and self._sides.tools is None and self._sides.contact is None
+        return self.forms.elastic and all(one.smooth for one in self.loads)
 
-    def settle_tools(self, sticks: bool) -> bool:
-        """Choose what slips on tools at u, and if asked for what sticks again; return whether it is another choice."""
-        tools, contact = self._sides.tools, self._sides.contact
-        of_tools = tools is not None and tools.settle(self.forms.nodal, sticks)
-        return (contact is not None and contact.now.settle(*self._at, sticks)) or of_tools
+    @cached_property
+    def at(self) -> At:
+        """The displacements at present."""
+        return At(self.system.unknowns, self.forms.u.x.array)
 
-    @property
-    def _at(self) -> tuple[Unknowns, NDArray[np.float64]]:
-        return self.system.unknowns, self.forms.u.x.array
+    def settle(self, sticks: bool) -> bool:
+        """Choose what slips at u, and if asked for what sticks again; return whether it is another choice."""
+        return any([one.settle(self.at, sticks) for one in self.loads])
 
-    def augment_tools(self, forces: NDArray[np.float64]) -> bool:
-        """Shift the pressures of tools that penetrate too deep; return whether the balance is another one since.
+    def augment(self, forces: NDArray[np.float64]) -> bool:
+        """Let what is in balance go on with other forces, or at other places; return whether these are others.
 
         forces (parts,): what residuals are measured by, N.
         """
-        tools, contact = self._sides.tools, self._sides.contact
-        of_tools = tools is not None and tools.augment(self.forms.nodal, self._unknown_of_tools(forces))
-        return (contact is not None and contact.now.augment(*self._at)) or of_tools
-
-    def _unknown_of_tools(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return how well the balance tells the forces of tools (tools,), N: by the parts that they may touch."""
-        system, tools = self.system, self._sides.tools
-        of_parts = system.round_off + self._tolerance * forces
-        unknown = np.zeros(len(tools.contacts))
-        np.maximum.at(unknown, tools.rows.number, of_parts[system.parts.cells[tools.rows.cell]])
-        return over_all(self.forms.grid.comm, unknown, MPI.MAX)
-
-    def follow_contacts(self) -> bool:
-        """Find anew which places of groups face one another at u; return whether the balance is another one since."""
-        return self._sides.contact is not None and self._sides.contact.follow(*self._at)
+        unknown = (self.system.round_off + self._tolerance * forces)[self.system.parts.cells]
+        return any([one.augment(self.at, unknown) for one in self.loads]) or any(
+            [one.follow(self.at) for one in self.loads]
+        )
 
     def guesses(self) -> list[NDArray[np.float64]]:
         """Return displacements (local unknowns,), m, at which Newton's method may begin.
 
-        Those of a turn, if given displacements turn the bodies as one, and those of bodies that move on as before.
+        Those that loads guess, as of a turn, and those of bodies that move on as before.
         """
-        found = [values for values in (self._turned(), self._goes_on) if values is not None]
+        found = [one.guess(self.system.parts, self.forms.nodal) for one in self.loads]
+        found = [values.ravel() for values in (*found, self._goes_on) if values is not None]
         return [np.where(self.system.unknowns.map.indices >= 0, values, 0.0) for values in found]
-
-    def _turned(self) -> NDArray[np.float64] | None:
-        """Return u with the rigid motions of the parts that given displacements turn; None where they turn none."""
-        forms, holds, parts = self.forms, self._sides.holds, self.system.parts
-        if holds is None or forms.grid.axisymmetric:
-            return None
-        of, moved = parts.cells[holds.cells], None
-        for part in np.flatnonzero(over_all(forms.grid.comm, sum_by(of, np.ones(len(of)), parts.count))):
-            motion = rigid_motion(forms.grid.comm, holds, forms.grid.node_x, of == part)
-            if motion is not None:
-                moved = forms.nodal.copy() if moved is None else moved
-                moved[parts.nodes == part] = motion[parts.nodes == part]
-        return None if moved is None else moved.ravel()
 
     def assemble_residual(self) -> tuple[PETSc.Vec, float]:
         """Return the out-of-balance nodal forces at u and their scale, the largest of internal, external, terms (N)."""
@@ -519,28 +419,25 @@ class MomentumProblem:
     def residual_of_parts(self) -> tuple[PETSc.Vec, NDArray[np.float64]]:
         """Return the out-of-balance nodal forces at u and the scales (parts,), N, of each part: see above."""
         forms, system = self.forms, self.system
-        b, own = forms.internal(self.data)
+        b = forms.internal(self.data)
         forces, external = b[system.touched], self._external
-        if self._sides.pressures is not None:
-            external = external + forms.pressures(self._sides)[system.touched]
-        norms = [system.force_of_parts(forces), system.force_of_parts(external)]
-        if forms.terms or forms.sides.own:
-            own = own[system.touched]
-            if forms.sides.own:
-                own = own + forms.sides.own_forces(self._sides)[system.touched]
+        norms = [system.force_of_parts(forces)]
+        if self._varying:
+            loads, own = (
+                forms.summed(1 + room, [getattr(one, name) for one in self._varying])[system.touched]
+                for room, name in enumerate(("loads", "resists"))
+            )
+            external, forces = external + loads, forces + own
             norms.append(system.force_of_parts(own))
-            forces += own
+        norms.append(system.force_of_parts(external))
         b[system.touched] = forces - external
-        if self._sides.tools is not None:
-            b[system.touched] -= forms.pushed(self._sides.tools)[system.touched]
         system.held.gather(b, system.held_residual)  # walls bear what sides beside them would push them by
-        if self._sides.holds is not None:  # no measure of forces: at the start of a step it is far above them
-            b[system.touched] -= self._pulls
+        b[system.touched] -= self._pulls  # no measure of forces: at the start of a step they are far above them
         r = system.unknowns.gather(b, system.residual)
         step = system.unknowns.gather(forms.u.x.array, system.step)
         system.penalty.multAdd(step, r, r)
-        if self._sides.contact is not None:
-            self._sides.contact.now.push(*self._at, r)
+        for one in self.loads:
+            one.push(self.at, r, system.unknowns)
         return r, np.max(norms, axis=0)
 
     def out_of_balance(
@@ -559,17 +456,25 @@ class MomentumProblem:
             told = parts.norms(np.where(size > 0, size / np.maximum(scales[parts.of], least), 0.0))
         return counts, relative(told, np.ones(parts.count))
 
-    def wall_forces(self, walls: Mapping[str, str]) -> NDArray[np.float64]:
-        """Return the forces (2 d, d), N, of the walls at u, where the residual was last assembled."""
+    def wall_forces(self, walls: Mapping[str, str]) -> dict[str, NDArray[np.float64]]:
+        """Return the forces (d,), N, of the walls by their names at u, where the residual was last assembled."""
         system, forces = self.system, self.system.held_residual.copy()
         system.held_penalty.multAdd(system.step, forces, forces)
-        if self._sides.contact is not None:
-            self._sides.contact.now.push_on(system.held, *self._at, forces)
-        dofs, forces = system.held.owned, forces.array_r
-        if self._sides.holds is not None:  # what given sides count of their own
-            pulled, own = self._sides.pulled(self.forms.nodal)
-            dofs, forces = np.concatenate([dofs, pulled]), np.concatenate([forces, -own])
-        return wall_forces(self.forms.grid, walls, dofs, forces)
+        for one in self.loads:
+            one.push(self.at, forces, system.held)
+        dofs, values = [system.held.owned], [forces.array_r]
+        for one in self.loads:
+            at_walls, counted = one.counted(self.at)
+            dofs, values = [*dofs, at_walls], [*values, -counted]
+        return wall_forces(self.forms.grid, walls, np.concatenate(dofs), np.concatenate(values))
+
+    def outcome(self) -> dict[str, dict[str, NDArray[np.float64]]]:
+        """Return what conditions do to the bodies at u, by quantity and name."""
+        out: dict[str, dict[str, NDArray[np.float64]]] = {}
+        for one in self.loads:
+            for quantity, values in one.outcome(self.at).items():
+                out[quantity] = out.get(quantity, {}) | values
+        return out
 
     def assemble_tangent(
         self, data: QuadratureData | None = None, firmness: NDArray[np.float64] | float = 0.0
@@ -582,14 +487,17 @@ class MomentumProblem:
         # the first sums give K the pattern of all: PETSc does not always see that it changes later
         first = not K.assembled
         zero(K)
-        self.forms.assemble_tangent(K, data or self.data, self._sides)
+        self.forms.assemble_tangent(K, data or self.data)
+        for one in self.loads:
+            one.tangent(K)
         K.assemble()
         pattern = PETSc.Mat.Structure
         K.axpy(1.0, self.system.penalty, pattern.UNKNOWN if first else pattern.SUBSET_NONZERO_PATTERN)
-        if self._sides.contact is not None:
-            if first:
-                K.axpy(1.0, self._sides.contact.now.pattern(self.system.unknowns), pattern.UNKNOWN)
-            K.axpy(1.0, self._sides.contact.now.tangent(*self._at), pattern.SUBSET_NONZERO_PATTERN)
+        for one in self.loads:
+            if first and (zeros := one.pattern(self.system.unknowns)) is not None:
+                K.axpy(1.0, zeros, pattern.UNKNOWN)
+            if (coupling := one.coupling(self.at)) is not None:
+                K.axpy(1.0, coupling, pattern.SUBSET_NONZERO_PATTERN)
         shares = np.broadcast_to(firmness, self.system.parts.count)
         if (shares == shares[:1]).all():
             if shares.any():

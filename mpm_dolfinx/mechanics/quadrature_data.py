@@ -161,9 +161,8 @@ class QuadraturePoints:
             share = self._scene.locking(points) * self._scene.table(points, lambda m: told_share(m, bool(self._fluid)))
             factor = cell_ratios(cut, points, share, self._scene.evolved(points)) / cut.to_cells(points.J)
             weight, fields["F"] = factor * weight, factor[:, None, None] ** (1 / cut.grid.stretches) * fields["F"]
-            if self._weighs:  # grains weigh what they do, and water fills the other pores
-                water = self._fluid.density if self._fluid else 0.0
-                fields["density"] = water + (fields["density"] - water) / factor
+            if self._weighs:  # points weigh what they do, however large cells see them
+                fields["density"] = fields["density"] / factor
         pieces = PointData(self.pieces, places.pieces, weight, fields)
         if not places.parts:
             return QuadratureData(pieces, (pieces,), (slice(None),))

@@ -13,8 +13,8 @@ from mpm_dolfinx.grid.grid import SIDES, Grid, sum_by
 
 def wall_forces(
     grid: Grid, walls: Mapping[str, str], dofs: NDArray[np.int64], forces: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return the forces (2 d, d), N, of all walls in the order of `SIDES`; on several processes all call it together.
+) -> dict[str, NDArray[np.float64]]:
+    """Return the forces (d,), N, of all walls by their names; on several processes all call it together.
 
     A component of a node that several walls hold is that of the wall across it, else they share it evenly.  The axis of
     revolution has no surface: nothing acts on it across.
@@ -43,4 +43,4 @@ def wall_forces(
     out = grid.comm.allreduce(np.stack([sum_by(component, share, d) for share in shares]))
     if grid.has_axis:
         out[0, 0] = 0.0
-    return out
+    return dict(zip(sides, out, strict=True))

@@ -12,27 +12,28 @@ from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.base.errors import StepFailed, raise_interrupt
 from mpm_dolfinx.base.report import Report
-from mpm_dolfinx.base.validation import numbers
+from mpm_dolfinx.base.validation import instance, numbers
 from mpm_dolfinx.bodies.bodies import Body, points_in_cells
 from mpm_dolfinx.conditions.axis import check_axisymmetry, with_axis
 from mpm_dolfinx.conditions.conditions import OnSide, Source, sorted_terms
+from mpm_dolfinx.conditions.names import ByName
 from mpm_dolfinx.conditions.unit_weights import under
-from mpm_dolfinx.contact.groups import grouped
+from mpm_dolfinx.contact.groups import Contact, grouped
 from mpm_dolfinx.diagnostics.scene_parts import check_options, check_parts
 from mpm_dolfinx.diagnostics.thin import warn_thin
-from mpm_dolfinx.grid.grid import SIDES, Grid
+from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.materials.initial_stress import InitialStress, by_body
 from mpm_dolfinx.materials.skeleton import Fluid, Skeleton
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.probing.cell_fields import CellFields, cell_fields
 from mpm_dolfinx.probing.point_fields import PointFields, point_fields
 from mpm_dolfinx.simulation.timeloop import run
-from mpm_dolfinx.solve.scheme import Scheme
 from mpm_dolfinx.stepping import summary
 from mpm_dolfinx.stepping.initial_state import balanced
+from mpm_dolfinx.stepping.numerics import DEFAULT, Numerics
 from mpm_dolfinx.stepping.result import Result
 from mpm_dolfinx.stepping.scene import Scene
-from mpm_dolfinx.stepping.stage import Condition, by_kind
+from mpm_dolfinx.stepping.stage import Condition, checked
 from mpm_dolfinx.stepping.stages import begin_stage, first_state
 from mpm_dolfinx.stepping.state import State
 from mpm_dolfinx.stepping.step import step
@@ -64,16 +65,13 @@ class Simulation:
         (n, 3) or tensors (n, 3, 3), Pa, or one of these for each of some bodies, {index: ...}; of fills too, which
         otherwise have none.  It is brought into balance with what acts at the start, at the pore pressures given,
         so that a first step in which nothing changes moves nothing.
-    quadrature
-        "domain": exact pieces of the points' domains; "point": at the points, as in standard MPM, of boxes, not in
-        axisymmetry.
-    coupling, tolerance, method
-        See `Scheme`; method of time integration: "sdirk2", of second order, or "backward-euler".
     terms
         Terms of the user's own in UFL: functions for the balance of momentum, see `user_functions`, such functions on
         a side, `OnSide`, and those for the storage of fluid, `Source`.
     later
         Indices of bodies that a later stage adds, each once.
+    numerics
+        Quadrature, coupling, tolerance and method of time integration, see `Numerics`.
 
     Attributes
     ----------
@@ -101,16 +99,14 @@ class Simulation:
         gravity: ArrayLike | Callable[[float], ArrayLike] | None = None,
         pressure: float | Callable[[NDArray], ArrayLike] = 0.0,
         initial_stress: InitialStress | Mapping[int, InitialStress] | None = None,
-        quadrature: str = "domain",
-        coupling: str = "schur-cg",
-        tolerance: float = 1e-8,
-        method: str = "sdirk2",
         terms: Sequence[Callable | OnSide | Source] = (),
         later: Sequence[int] = (),
+        numerics: Numerics = DEFAULT,
     ):
-        scheme = Scheme(coupling, tolerance)
+        instance("numerics", numerics, Numerics)
+        quadrature = numerics.quadrature
         check_parts(grid, bodies, materials, later)
-        contacts = by_kind(conditions)["contacts"]
+        contacts = [one for one in checked(conditions) if isinstance(one, Contact)]
         terms, sources = sorted_terms(terms)
         check_options(bodies, fluid, pressure, terms, sources, quadrature)
         grid = grouped(grid, bodies, contacts, quadrature, {"terms": terms, "sources": sources})
@@ -118,9 +114,18 @@ class Simulation:
         warn_thin(grid, bodies, with_axis(grid, walls), fluid is not None)
         check_axisymmetry(grid, bodies, quadrature)
         began = time.perf_counter()
-        options = (quadrature, scheme, method, gravity is not None, pressure, terms, sources)
         initial = by_body(initial_stress, bodies, later)
-        self.scene = Scene(grid, bodies, materials, under(fluid, gravity), *options, initial)
+        self.scene = Scene(
+            grid,
+            bodies,
+            materials,
+            under(fluid, gravity),
+            numerics=numerics,
+            weighs=gravity is not None,
+            pressure=pressure,
+            extensions=(terms, sources),
+            initial=initial,
+        )
         given = {"walls": walls, "conditions": conditions, "gravity": gravity}
         self.state = first_state(self.scene, given, later)
         if initial:
@@ -166,42 +171,43 @@ class Simulation:
     @property
     def conditions(self) -> tuple[Condition, ...]:
         """The conditions in force, as they were given."""
-        return self.state.stage.given
+        return tuple(self.state.stage.given.values())
 
     @property
-    def reactions(self) -> NDArray[np.float64]:
-        """(displacements, d): force by which each given displacement acts on the bodies, N (N/m in plane strain).
+    def reactions(self) -> ByName[NDArray[np.float64]]:
+        """Force (d,) by which each given displacement acts on the bodies, by its name, N (N/m in plane strain).
 
         In axisymmetry all around, the radial one the sum of what acts outward.  Of the last step; nan where none has
         been taken since a stage set them.
         """
-        return self.state.reactions
+        return self.outcome("reactions")
 
     @property
-    def wall_reactions(self) -> dict[str, NDArray[np.float64]]:
+    def wall_reactions(self) -> ByName[NDArray[np.float64]]:
         """Force (d,), N (N/m in plane strain), of each wall of the grid on the bodies; zero where it holds nothing.
 
         A component of a node that two walls hold counts once: for the wall across it, else half for each.
         """
-        return dict(zip(SIDES[self.grid.dim], self.state.walls, strict=True))
+        return self.outcome("wall_reactions")
 
     @property
-    def outflows(self) -> NDArray[np.float64]:
-        """(drained sides and inflows, in their order), m^3/s (m^2/s in plane strain): what leaves.
-
-        Nan before a first step.
-        """
-        return self.state.outflows
+    def outflows(self) -> ByName[NDArray[np.float64]]:
+        """What leaves through each drained side and inflow, by its name, m^3/s (m^2/s in plane strain)."""
+        return self.outcome("outflows")
 
     @property
-    def tool_forces(self) -> NDArray[np.float64]:
-        """(tools + contacts, d + 1), in 3D (..., 6): force and moment of each `Tool`, then `Contact`, on the bodies."""
-        return self.state.tool_forces
+    def tool_forces(self) -> ByName[NDArray[np.float64]]:
+        """Force and moment (d + 1,), in 3D (6,), of each `Tool` and `Contact` on the bodies, by its name."""
+        return self.outcome("tool_forces")
 
     @property
-    def tool_travel(self) -> NDArray[np.float64]:
-        """(tools,), m: how far a load has pushed each `Tool` beyond its displacement."""
-        return self.state.tool_travel
+    def tool_travel(self) -> ByName[NDArray[np.float64]]:
+        """How far a load has pushed each `Tool` beyond its displacement, by its name, m."""
+        return self.outcome("tool_travel")
+
+    def outcome(self, quantity: str) -> ByName[NDArray[np.float64]]:
+        """Return what conditions do to the bodies at the end of the last step, by name: of the above, or own ones."""
+        return ByName(self.state.outcome.get(quantity, {}))
 
     @property
     def present(self) -> tuple[bool, ...]:

@@ -249,7 +249,7 @@ def step_rule(times: Times, rtol, first_step, max_step: float, scene: Scene, poi
         return StepSize(times.interval, times.interval)
     least = RESOLVED * scene.scheme.tolerance
     numbers("rtol", rtol, test=lambda v: (least <= v) & (v < 1), allowed=f"in [{least:g}, 1): the solver's tolerance")
-    if scene.method == "backward-euler":
+    if scene.numerics.method == "backward-euler":
         raise ValueError(f"rtol = {line(rtol)}: backward-euler knows no error of a step, must be sdirk2")
     timed = any("dt" in law.by_scene for law in scene.materials.laws)
     if (scene.momentum.rates or timed) and not scene.flows:

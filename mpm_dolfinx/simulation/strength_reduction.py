@@ -29,6 +29,7 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 
 from mpm_dolfinx.base.report import Report
 from mpm_dolfinx.base.validation import flag, line, numbers, whole
+from mpm_dolfinx.contact.groups import Contact
 from mpm_dolfinx.materials.frictional import Frictional
 from mpm_dolfinx.materials.skeleton import Skeleton
 from mpm_dolfinx.parallel.exchange import over_all
@@ -226,7 +227,7 @@ class _Weakened:
                 raise ValueError(f"{what}, must be a law with friction and cohesion")
         if not any(isinstance(m, Frictional) for m in scene.materials.materials):
             raise ValueError("factor_of_safety: no material has a strength, must have friction and cohesion")
-        if simulation.state.stage.conditions["contacts"]:
+        if simulation.state.stage.of(Contact):
             raise ValueError("factor_of_safety: contacts: must be none")
         begun = begin_stage(scene, simulation.state, {}, [], [], False, {})  # free of its grid
         self._viscosity = viscosity = fem.Constant(scene.grid.mesh, 0.0)  # Pa s
@@ -236,10 +237,18 @@ class _Weakened:
             return viscosity / dt * ufl.inner(strain, strain) * points.dx
 
         materials = [_as_fields(m) for m in scene.materials.materials]
-        options = scene.quadrature, scene.scheme, "backward-euler", scene.gravity is not None, 0.0
         terms, sources = scene.extensions
-        options = *options, [*terms, resistance], sources, {}  # what initial stresses need the materials have
-        self._scene = Scene(scene.grid, scene.bodies, materials, scene.fluid, *options)
+        self._scene = Scene(
+            scene.grid,
+            scene.bodies,
+            materials,
+            scene.fluid,
+            numerics=replace(scene.numerics, method="backward-euler"),
+            weighs=scene.gravity is not None,
+            pressure=0.0,
+            extensions=([*terms, resistance], sources),
+            initial={},  # what initial stresses need the materials have
+        )
         self._strengths, self.newton = _strengths(scene, begun.points), []
         points = replace(begun.points, data={**begun.points.data, **self._strengths})
         begun = begin_stage(self._scene, replace(begun, points=points), {}, [], [], False, {})

@@ -245,9 +245,6 @@ def _histories(
     shown = after.rows[0].displacement
     if (recorded := 0 if shown is None else len(shown)) != (0 if probes is None else len(probes.id)):
         raise ValueError(f"probes: the run to go on with has {recorded} of them")
-    tools = 0 if after.rows[0].tools is None else len(after.rows[0].tools)
-    if tools != len(simulation.state.tool_forces):
-        raise ValueError(f"tools: the run to go on with has {tools} of them")
     if probes is not None and probes.stressed != (after.rows[0].probe_stress is not None):
         raise ValueError(f"probes: stress = {probes.stressed}, must be what the run to go on with has")
     return after
@@ -322,7 +319,7 @@ def _by_euler(simulation: Simulated, dt: float, failed: StepFailed) -> tuple[Sta
     except StepFailed:
         return None
     what = "t = %g s: a step of %.3g s by backward Euler, of first order: none by %s has converged: %s"
-    warn(simulation.scene.grid.comm, what, simulation.state.t, dt, simulation.scene.method, failed)
+    warn(simulation.scene.grid.comm, what, simulation.state.t, dt, simulation.scene.numerics.method, failed)
     return found
 
 
@@ -355,9 +352,7 @@ def _row(simulation: Simulated, probes: Probes | None) -> Row:
         out["probe_pressure"] = probe_pressures(scene, simulation.state, probes)
     if probes is not None and probes.stressed:
         out["probe_stress"] = probe_stresses(scene, simulation.state, probes)
-    if len(simulation.state.tool_forces):
-        out["tools"] = simulation.state.tool_forces
-    out |= {name: getattr(simulation.state, name) for name in ("reactions", "walls", "outflows")}
+    out["outcome"] = simulation.state.outcome
     for value in out.values():
         if isinstance(value, np.ndarray):
             value.flags.writeable = False

@@ -240,7 +240,7 @@ class Newton:
             dogs, errors, back = self._watched(dogs, before, errors, steps)
             fresh = fresh or back
             seeps = self._storage is not None and self._storage.settle_seepage()
-            if self._momentum.settle_tools(errors.worst <= SETTLED) or seeps:
+            if self._momentum.settle(errors.worst <= SETTLED) or seeps:
                 errors, fresh = self._errors(errors.start), True
         return found
 
@@ -276,9 +276,7 @@ class Newton:
     def _augmented(self, errors: Errors) -> Errors:
         """Return the errors, of what balances with the pressures of tools that penetrate too deep shifted."""
         momentum = self._momentum
-        while errors.worst <= self._scheme.tolerance and (
-            momentum.settle_tools(True) or momentum.augment_tools(errors.forces) or momentum.follow_contacts()
-        ):
+        while errors.worst <= self._scheme.tolerance and (momentum.settle(True) or momentum.augment(errors.forces)):
             errors = self._errors(errors.start)
         return errors
 
@@ -359,7 +357,7 @@ class Newton:
             with Timer("mpm: linear solve"):
                 self._solvers.solve_momentum()
             before, (errors, _) = errors.u.max(), self._line_search(errors)
-            settled = self._momentum.settle_tools(errors.u.max() <= SETTLED)
+            settled = self._momentum.settle(errors.u.max() <= SETTLED)
             errors = self._errors(errors.start) if settled else errors
             if settled or errors.u.max() > max(goal, self._solvers.plan.keep * before):
                 self._linearise()

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from mpi4py import MPI
@@ -10,10 +11,10 @@ from mpi4py import MPI
 import numpy as np
 from numpy.typing import NDArray
 
+from mpm_dolfinx.conditions.acting import QUANTITIES, Loads, Outcome
 from mpm_dolfinx.flow.storage import Rates, StorageProblem
 from mpm_dolfinx.mechanics.momentum import MomentumProblem
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
-from mpm_dolfinx.mechanics.side_forms import SideData
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.stepping.on_grid import Assembled, OnGrid
 from mpm_dolfinx.stepping.scene import Scene
@@ -22,11 +23,11 @@ from mpm_dolfinx.stepping.time_integration import Substep
 
 
 class Acting(NamedTuple):
-    """What acts in a substep: its shares of the step, time, s, sides, and gravity (d,), m/s^2, if there is any."""
+    """What acts in a substep: its shares of the step, time, s, loads, and gravity (d,), m/s^2, if there is any."""
 
     substep: Substep
     t: float
-    sides: SideData
+    loads: Sequence[Loads]
     gravity: NDArray[np.float64] | None
 
 
@@ -51,26 +52,24 @@ class Balances(NamedTuple):
     momentum: MomentumProblem
     storage: StorageProblem | None
 
-    def outcome(self, state: State, acting: Acting) -> dict[str, NDArray[np.float64]]:
-        """Return what acts between the bodies and what holds or drains them at the end of a step, see `State`."""
-        stage, storage, forms = state.stage, self.storage, self.momentum.forms
-        return {
-            "reactions": stage.mechanical.reactions(acting.sides, forms.nodal),
-            "walls": self.momentum.wall_forces(stage.conditions["walls"]),
-            "outflows": storage.outflows(len(stage.hydraulic.outlets)) if storage else state.outflows,
-        }
+    def outcome(self, state: State) -> Outcome:
+        """Return what conditions do to the bodies at the end of a step, see `State`."""
+        stage, out = state.stage, {quantity: {} for quantity in QUANTITIES} | self.momentum.outcome()
+        out["wall_reactions"] = self.momentum.wall_forces(stage.conditions["walls"])
+        out["outflows"] = self.storage.outflows(stage.hydraulic.names) if self.storage else {}
+        return out
 
     def came(self, rates: Rates | None) -> NDArray[np.float64] | None:
         """Return what came to the cells in the step, see `StorageProblem.came`; None without fluid."""
         return self.storage and self.storage.came(rates)
 
 
-def at_rest(scene: Scene, state: State, sides: list[SideData]) -> list[SideData]:
-    """Return what acts on sides in each substep, what holds them with its forces of an initial stress at rest."""
+def at_rest(scene: Scene, state: State, loads: list[list[Loads]]) -> list[list[Loads]]:
+    """Return what acts in each substep, what holds bodies with its forces of an initial stress at rest."""
     if state.rest is None:
-        return sides
+        return loads
     scene.momentum.u.x.array[:] = state.rest
-    return [of.moved(scene.momentum.u) for of in sides]
+    return [[one.moved(scene.momentum.u) for one in of] for of in loads]
 
 
 def going_on(scene: Scene, start: Start, substep: Substep) -> NDArray[np.float64] | None:
@@ -96,9 +95,9 @@ def balances(scene: Scene, start: Start, acting: Acting, before: Rates | None = 
     """Return the balances at the end of a substep, with u and p as they are; before: rates of the substep before."""
     substep, on_grid, matrices, dt = acting.substep, start.on_grid, start.matrices, start.dt
     scene.set_time(acting.t, substep.end * dt, acting.gravity)
-    scene.momentum.set_rate(substep.own * dt, substep.before / substep.own)
+    scene.momentum.own.set_rate(substep.own * dt, substep.before / substep.own)
     forces = scene.scheme.tolerance, going_on(scene, start, substep), start.state.held
-    momentum = MomentumProblem(scene.momentum, matrices.momentum, start.data, acting.sides, *forces, start.yielded)
+    momentum = MomentumProblem(scene.momentum, matrices.momentum, start.data, acting.loads, *forces, start.yielded)
     if scene.storage is None:
         return Balances(momentum, None)
     weight = None if acting.gravity is None else scene.fluid.density * acting.gravity

@@ -23,6 +23,7 @@ from mpm_dolfinx.base.fluid_content import mass_potential, pressure_of
 from mpm_dolfinx.base.report import Report
 from mpm_dolfinx.base.tolerances import FOREVER, ROUND_OFF
 from mpm_dolfinx.bodies.bodies import pressure_at
+from mpm_dolfinx.conditions.acting import Loads, Place
 from mpm_dolfinx.domains.pressure_transport import PiecePressures
 from mpm_dolfinx.forms.unknowns import Unknowns
 from mpm_dolfinx.materials.initial_stress import strained
@@ -81,7 +82,7 @@ def balanced(scene: Scene, state: State) -> State:
     ValueError
         There is no such balance that the laws can bear.
     """
-    forms, materials, mechanical = scene.momentum, scene.materials, state.stage.mechanical
+    forms, materials = scene.momentum, scene.materials
     try:
         start = set_up(scene, state, 0.0)
         seeded = replace(start.state, stay=_stay(scene, start))
@@ -94,20 +95,18 @@ def balanced(scene: Scene, state: State) -> State:
         seen, w, points = [], np.zeros_like(forms.u.x.array), seeded.points
         while count - best[1] < PATIENCE:
             forms.u.x.array[:] = w
-            start = _placed(scene, start, replace(seeded, points=points))
             problem = _problem(scene, start, replace(seeded, points=points))
             residual, scale = problem.assemble_residual()
             left = residual.norm() / max(scale, start.matrices.round_off)
             if left < LESS * best[0]:
                 unknowns.add(forms.u, 1.0, residual)
                 held, forms.u.x.array[:] = forms.u.x.array.copy(), 0.0
-                best = left, count, points, held, w, mechanical.reactions(start.acting[-1].sides, forms.nodal)
+                best = left, count, points, held, w, problem.outcome()
             if left <= scene.scheme.tolerance:
                 break
             solve_substep(solvers, problem, None, partial(start.on_grid.as_reset, seeded), count, report, Kept())
-            if mechanical.touches:
-                _, touched = mechanical.touched(start.acting[-1].sides, unknowns, forms.u.x.array, seeded.points)
-                seeded = replace(seeded, points=touched)
+            for one in problem.loads:
+                seeded = replace(seeded, points=one.gripped(problem.at, seeded.points))
             seen = [*seen[-DEPTH:], (w, forms.u.x.array.copy())]
             w, count = _mixed(unknowns, seen), count + 1
             forms.u.x.array[:] = w
@@ -116,19 +115,20 @@ def balanced(scene: Scene, state: State) -> State:
     except StepFailed as error:
         scene.forget()
         raise ValueError(f"initial_stress: must be in balance with what acts at the start: {error}") from error
-    left, count, points, held, rest, reactions = best
-    _told(scene, seeded, points, count, left)
-    rest = _rest(scene, start, rest) if mechanical.holds_sides else None
-    return replace(start.state, points=points, held=held, rest=rest, reactions=reactions)
+    left, count, points, held, rest, outcome = best
+    _told(scene, seeded, points, count, left, any(one.touches for one in problem.loads))
+    rest = _rest(scene, problem.loads, rest) if any(one.stiff for one in problem.loads) else None
+    reactions = {name: values for name, values in outcome.items() if name == "reactions"}
+    return replace(start.state, points=points, held=held, rest=rest, outcome={**state.outcome, **reactions})
 
 
-def _told(scene: Scene, seeded: State, points: MaterialPoints, count: int, left: float) -> None:
+def _told(scene: Scene, seeded: State, points: MaterialPoints, count: int, left: float, touches: bool) -> None:
     """Log what the balance has changed; refuse one that leaves too large a share of the forces.
 
-    What tools and groups in contact bear is found in the first step: there a warning tells the share.
+    What bodies bear that may part (touches) is found in the first step: there a warning tells the share.
     """
     materials, comm = scene.materials, scene.grid.comm
-    if left > REMARKABLE and not seeded.stage.mechanical.touches:
+    if left > REMARKABLE and not touches:
         scene.forget()
         what = "initial_stress: must be in balance with what acts at the start, and with what holds the bodies"
         raise ValueError(f"{what}: {100 * left:.2g} % of the forces are left")
@@ -139,32 +139,21 @@ def _told(scene: Scene, seeded: State, points: MaterialPoints, count: int, left:
     tell(comm, what, count, changed, largest, left)
 
 
-def _rest(scene: Scene, start: Start, w: NDArray[np.float64]) -> NDArray[np.float64]:
+def _rest(scene: Scene, loads: Sequence[Loads], w: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return a displacement of the nodes, m, zero but in the cells of sides that are held; a local array."""
-    sides, forms = start.acting[-1].sides, scene.momentum
-    cells = [of.cells for of in (sides.holds, sides.plates) if of is not None]
-    nodes = forms.active_nodes(np.unique(np.concatenate(cells)))
+    nodes = scene.momentum.active_nodes(np.unique(np.concatenate([one.held_cells for one in loads])))
     return np.where(np.repeat(nodes, scene.grid.dim), w, 0.0)
 
 
-def _placed(scene: Scene, start: Start, state: State) -> Start:
-    """Return the start with what acts on the sides of points that are as strained as after u."""
-    mechanical, acting = state.stage.mechanical, start.acting[-1]
-    if not (mechanical.touches or mechanical.holds_sides):
-        return start
-    place = scene.momentum.sides, start.on_grid.cut, (state.t, 0.0), state.tool_travel, state.t, state.points
-    sides = mechanical.data(*place).moved(scene.momentum.u)
-    return start._replace(acting=[acting._replace(sides=sides)])
-
-
 def _problem(scene: Scene, start: Start, state: State) -> MomentumProblem:
-    """Return the balance of momentum of points where they are, at no displacement and without any rate."""
-    acting, matrices = start.acting[-1], start.matrices
-    scene.set_time(state.t, FOREVER, acting.gravity)
-    scene.momentum.set_rate(FOREVER, 0.0)
+    """Return the balance of momentum at no displacement and without any rate, of points that are strained by u."""
+    matrices, data = start.matrices, start.on_grid.data_of(state)
+    place = Place(start.on_grid.cut, state.points, data, state.t, 0.0, state.t, state.outcome)
+    loads = [one.moved(scene.momentum.u) for one in state.stage.placed(place)]
+    scene.set_time(state.t, FOREVER, start.acting[-1].gravity)
+    scene.momentum.own.set_rate(FOREVER, 0.0)
     scene.momentum.u.x.array[:] = 0.0
-    data = start.on_grid.data_of(state)
-    return MomentumProblem(scene.momentum, matrices.momentum, data, acting.sides, scene.scheme.tolerance)
+    return MomentumProblem(scene.momentum, matrices.momentum, data, loads, scene.scheme.tolerance)
 
 
 def _stay(scene: Scene, start: Start) -> Stay:

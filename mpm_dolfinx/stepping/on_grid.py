@@ -3,11 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
-
-from mpi4py import MPI
 
 import numpy as np
 from dolfinx.common import Timer
@@ -15,7 +13,8 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.base.caching import Keyed, Latest
 from mpm_dolfinx.base.fluid_content import mass_potential, pressure_of
-from mpm_dolfinx.base.tolerances import EPSILON, ROUND_OFF
+from mpm_dolfinx.base.tolerances import ROUND_OFF
+from mpm_dolfinx.conditions.acting import Loads
 from mpm_dolfinx.diagnostics.scene_checks import check_held
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.domains.pressure_transport import CellPressures, Reconstruction, share_within, transport
@@ -28,8 +27,6 @@ from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.mechanics.ghost_penalty import stiffness
 from mpm_dolfinx.mechanics.momentum import MomentumForms, MomentumSystem
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData, QuadraturePoints
-from mpm_dolfinx.mechanics.side_forms import SideData
-from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.points.parts import parts_of_cells
 from mpm_dolfinx.solve.scheme import Scheme
@@ -350,8 +347,8 @@ class Assembled(Keyed):
         The bodies on the grid.
     stage
         The conditions.
-    sides
-        What acts on the sides, placed where the points were cut.
+    loads
+        What acts on the bodies, placed where the points were cut.
     """
 
     def __init__(
@@ -361,7 +358,7 @@ class Assembled(Keyed):
         system: System,
         on_grid: OnGrid,
         stage: Stage,
-        sides: SideData,
+        loads: Sequence[Loads],
     ):
         self.momentum, self.storage, self.symmetric = system.momentum, system.storage, system.symmetric
         self.plan, self.solvers, self.end_step = system.plan, system.solvers, system.end_step
@@ -370,8 +367,8 @@ class Assembled(Keyed):
         self._by_pressure = storage if self._varies and storage.conductivity.pressure is not None else None
         self._mobility: Latest[Mobility] = Latest()
         self._outflow: Latest[Outflow] = Latest()
-        self.momentum.set_penalty(sides)
-        self.momentum.set_rounding(self._rounding(momentum, sides))
+        self.momentum.set_penalty(loads)
+        self.momentum.set_rounding(self._rounding(momentum, loads))
         self.round_off = float(self.momentum.rounding.norm())
         """Norm of the momentum's residual that rounding leaves, N."""
         self._off = None
@@ -382,24 +379,18 @@ class Assembled(Keyed):
                 self._off = facets if facets.some else None
         self._gradients: Latest[Gradients] = Latest()
 
-    def _rounding(self, momentum: MomentumForms, sides: SideData) -> NDArray[np.float64]:
+    def _rounding(self, momentum: MomentumForms, loads: Sequence[Loads]) -> NDArray[np.float64]:
         """Return what rounding may leave of the residual at the local nodes (nodes,), N.
 
-        It goes with the stiffness of the cells about a node; that of rigid sides and tools with coordinates as well.
+        It goes with the stiffness of the cells about a node, and with that of what acts there.
         """
         grid, on_grid = self._on_grid.cut.grid, self._on_grid
         of_cells = ROUND_OFF * on_grid.stiffness * grid.cell_volume / grid.h.min()
-        if sides.holds is not None:
-            held = np.zeros(grid.num_local)
-            np.maximum.at(held, sides.holds.cells, sides.holds["stiffness"][:, 0])
-            of_cells = of_cells + 4 * EPSILON * grid.reach * held
-        if sides.tools is not None:
-            np.maximum.at(of_cells, sides.tools.rows.cell, of_cells[sides.tools.rows.cell] + sides.tools.rounding)
+        for one in loads:
+            of_cells = one.rounding(of_cells)
         own = np.flatnonzero(on_grid.active[: grid.num_owned])
         at_nodes = momentum.at_nodes(own, of_cells[own]) / 2 ** (grid.dim - 1)  # as many cells beside a flat side
-        if sides.contact is not None:
-            at_nodes += over_all(grid.comm, float(sides.contact.now.rounding.max(initial=0.0)), MPI.MAX)
-        return at_nodes
+        return at_nodes + sum(one.rounding_beside for one in loads)
 
     def flow(
         self, state: State, weight: NDArray[np.float64] | None, data: QuadratureData, t: float
@@ -458,7 +449,7 @@ def assembled(
     systems: Latest[System],
     on_grid: OnGrid,
     stage: Stage,
-    sides: SideData,
+    loads: Sequence[Loads],
     begins: bool,
 ) -> Assembled:
     """Return the matrices of a cut and a stage; begins: refuse all parts of the bodies that are not held.
@@ -471,21 +462,15 @@ def assembled(
     grid, free = on_grid.cut.grid, stage.free
     nodes = np.flatnonzero(momentum.active_nodes(on_grid.cells))
     dofs = (nodes[:, None] * grid.dim + np.arange(grid.dim))[free[nodes]]
-    stiff, symmetric = sides.plates is not None or sides.holds is not None, stage.mechanical.symmetric
+    stiff, symmetric = any(one.stiff for one in loads), momentum.symmetric and stage.symmetric
 
     def make() -> System:
-        if not momentum.holding:
-            holds, held = sides.holds, []
-            if holds is not None:
-                held.append((holds.cells, holds.x, holds["direction"]))
-            if sides.tools is not None:
-                held.append(sides.tools.touching())
-            meeting = sides.contact.now.touching() if sides.contact is not None else None
-            check_held(grid, on_grid.active, free, held, begins, meeting)
-        return System(momentum, storage, scheme, on_grid, dofs, nodes, stiff, momentum.symmetric and symmetric)
+        if not any(one.holding for one in loads):
+            check_held(grid, on_grid.active, free, [held for one in loads if (held := one.touching())], begins)
+        return System(momentum, storage, scheme, on_grid, dofs, nodes, stiff, symmetric)
 
     # a cell may become active between active nodes, so equal dofs do not mean equal cells
     with Timer("mpm: integration data"):
-        pairs = None if sides.contact is None else on_grid.key  # couple nodes as they lie
+        pairs = on_grid.key if any(one.couples for one in loads) else None  # couple nodes as they lie
         system = systems((stage, on_grid.cells, dofs, on_grid.penalised, pairs), make, grid.comm)
-        return Assembled(momentum, storage, system, on_grid, stage, sides)
+        return Assembled(momentum, storage, system, on_grid, stage, loads)

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.report import Report
-from mpm_dolfinx.grid.grid import SIDES
+from mpm_dolfinx.conditions.acting import Outcome
+from mpm_dolfinx.conditions.names import ByName
 
 
 class Row(NamedTuple):
@@ -19,9 +20,7 @@ class Row(NamedTuple):
 
     t, s; displacement (m, d), m, and present position (m, d), m, of the m probes; pressure: least and largest on the
     points, Pa; probe_pressure (m,), Pa, and probe_stress (m, 3, 3), Pa: pore pressure and effective stress, tension
-    positive, at the places of the probes, see `probe_fields`; tools (k, d + 1) or (k, 6), N and N m: forces and
-    moments of tools, then of contacts, on the bodies; reactions (displacements, d), walls (2 d, d), N, and outflows
-    (drained sides, then inflows), m^3/s: as the simulation's `reactions`, `wall_reactions` and `outflows`.
+    positive, at the places of the probes, see `probe_fields`; outcome: what conditions do to the bodies, see `State`.
     """
 
     t: float
@@ -30,10 +29,7 @@ class Row(NamedTuple):
     position: NDArray[np.float64] | None = None
     probe_pressure: NDArray[np.float64] | None = None
     probe_stress: NDArray[np.float64] | None = None
-    tools: NDArray[np.float64] | None = None
-    reactions: NDArray[np.float64] | None = None
-    walls: NDArray[np.float64] | None = None
-    outflows: NDArray[np.float64] | None = None
+    outcome: Outcome | None = None
 
 
 @dataclass(frozen=True)
@@ -102,28 +98,38 @@ class Result:
         return self.column("probe_stress")
 
     @property
-    def tools(self) -> list[NDArray[np.float64]]:
-        """Forces and moments (k, d + 1), in 3D (k, 6), of tools on the bodies at the output times, N and N m."""
-        return self.column("tools")
+    def reactions(self) -> ByName[NDArray[np.float64]]:
+        """Forces (times, d), N, of each given displacement on the bodies at the output times, by its name."""
+        return self.outcome("reactions")
 
     @property
-    def reactions(self) -> NDArray[np.float64]:
-        """Forces (times, displacements, d) of the given displacements on the bodies at the output times, N.
+    def wall_reactions(self) -> ByName[NDArray[np.float64]]:
+        """Forces (times, d), N, of each wall of the grid on the bodies at the output times; see `Simulation`."""
+        return self.outcome("wall_reactions")
 
-        Where stages have different numbers of them, the array has room for the most, and nan where there is none.
+    @property
+    def outflows(self) -> ByName[NDArray[np.float64]]:
+        """What leaves (times,), m^3/s, through each open side at the output times, by its name."""
+        return self.outcome("outflows")
+
+    @property
+    def tool_forces(self) -> ByName[NDArray[np.float64]]:
+        """Forces and moments (times, d + 1), in 3D (times, 6), N and N m, of each tool and contact, by its name."""
+        return self.outcome("tool_forces")
+
+    @property
+    def tool_travel(self) -> ByName[NDArray[np.float64]]:
+        """How far a load has pushed (times,), m, each tool beyond its displacement at the output times, by its name."""
+        return self.outcome("tool_travel")
+
+    def outcome(self, quantity: str) -> ByName[NDArray[np.float64]]:
+        """Return what conditions have done (times, ...) at the output times, by name, such as "reactions".
+
+        nan where a condition was not there.
         """
-        return _stacked(self.column("reactions"))
-
-    @property
-    def wall_reactions(self) -> dict[str, NDArray[np.float64]]:
-        """Forces (times, d) of each wall of the grid on the bodies at the output times, N; see `Simulation`."""
-        walls = _stacked(self.column("walls"))
-        return {name: walls[:, i] for i, name in enumerate(SIDES[walls.shape[2]])} if len(walls) else {}
-
-    @property
-    def outflows(self) -> NDArray[np.float64]:
-        """What leaves (times, drained sides, then inflows) at the output times, m^3/s; see `reactions` for stages."""
-        return _stacked(self.column("outflows"))
+        rows = [outcome.get(quantity, {}) for outcome in self.column("outcome")]
+        like = {name: np.full_like(value, np.nan) for row in rows for name, value in row.items()}
+        return ByName({name: np.array([row.get(name, none) for row in rows]) for name, none in like.items()})
 
     @property
     def pressure(self) -> list[tuple[float, float]]:
@@ -180,10 +186,3 @@ class GaveUp(RuntimeError):
     def __init__(self, message: str, result: Result, history: Sequence[tuple[float, float]] = ()):
         super().__init__(message)
         self.result, self.history = result, history
-
-
-def _stacked(values: list[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """Return arrays (n, ...) one above the other, filled up with nan to the longest n."""
-    most = max(map(len, values), default=0)
-    filled = [np.pad(v, [(0, most - len(v)), *[(0, 0)] * (v.ndim - 1)], constant_values=np.nan) for v in values]
-    return np.stack(filled) if values else np.zeros((0, 0))

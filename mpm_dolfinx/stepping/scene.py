@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.bodies.bodies import Body, material_points
+from mpm_dolfinx.conditions.acting import Loads
 from mpm_dolfinx.conditions.conditions import OnSide
 from mpm_dolfinx.conditions.unit_weights import other_gravity, weighed
 from mpm_dolfinx.diagnostics.overfilled import warn_overfilled
@@ -31,12 +32,11 @@ from mpm_dolfinx.materials.skeleton import Fluid, Skeleton
 from mpm_dolfinx.materials.user_functions import compiling
 from mpm_dolfinx.mechanics.momentum import MomentumForms
 from mpm_dolfinx.mechanics.quadrature_data import QuadraturePoints
-from mpm_dolfinx.mechanics.side_forms import SideData
 from mpm_dolfinx.parallel.messages import warn
 from mpm_dolfinx.points.cutting import volumes
 from mpm_dolfinx.points.material_points import MaterialPoints
-from mpm_dolfinx.solve.scheme import Scheme
 from mpm_dolfinx.stepping.advance import Motion
+from mpm_dolfinx.stepping.numerics import Numerics
 from mpm_dolfinx.stepping.on_grid import Assembled, OnGrid, System, assembled
 from mpm_dolfinx.stepping.stage import Stage
 from mpm_dolfinx.stepping.state import State
@@ -48,16 +48,14 @@ class Scene:
 
     Parameters
     ----------
-    grid, bodies, materials, fluid, quadrature, terms, sources
+    grid, bodies, materials, fluid, numerics
         See `Simulation`.
-    scheme
-        How the two problems are coupled.
-    method
-        Of time integration, see `time_integration`.
     weighs
         Whether there is gravity.
     pressure
         Pore pressure at the start, Pa, or a function of places.
+    extensions
+        The user's terms in the balance of momentum, and those in the storage of fluid.
     initial
         Stresses of bodies as seeded, see `initial_stress.by_body`.
     """
@@ -68,16 +66,17 @@ class Scene:
         bodies: Sequence[Body],
         materials: Sequence[Skeleton],
         fluid: Fluid | None,
-        quadrature: str,
-        scheme: Scheme,
-        method: str,
+        *,
+        numerics: Numerics,
         weighs: bool,
         pressure: float | Callable,
-        terms: Sequence[Callable],
-        sources: Sequence[Callable],
+        extensions: tuple[Sequence[Callable], Sequence[Callable]],
         initial: Mapping[int, Any],
     ):
-        self.grid, self.bodies, self.fluid, self.quadrature = grid, tuple(bodies), fluid, quadrature
+        self.grid, self.bodies, self.fluid = grid, tuple(bodies), fluid
+        self.numerics, scheme = numerics, numerics.scheme
+        terms, sources = self.extensions = extensions
+        """The user's terms and sources."""
         pressure = weighed(pressure, fluid)
         self.initial = InitialStresses(self.bodies, initial, pressure)
         seeded = material_points(grid, bodies, pressure)
@@ -91,7 +90,7 @@ class Scene:
         with compiling(f"materials: {', '.join(law.__name__ for law in scene.laws)}", "laws in UFL of these shapes"):
             wet = fluid.density if fluid else None
             options = (self.gravity, wet, scene.symmetric)
-            options = (*options, quadrature == "point", terms, self.t, self.dt)
+            options = (*options, numerics.quadrature == "point", terms, self.t, self.dt)
             self.momentum = MomentumForms(self.pieces.pieces, laws, p, *options)
         if not self.momentum.symmetric and scheme.coupling == "schur-cg":
             scheme = replace(scheme, coupling="schur-fgmres")
@@ -105,11 +104,6 @@ class Scene:
             )
             kind = (symmetric, scene.conducts, scene.evolves)
             self.storage = StorageForms(pieces, u, p, fluid.bulk, weight, *kind, law, sources, self.t)
-        self.extensions = terms, sources
-        """The user's terms and sources."""
-        self.method = method
-        """Of time integration."""
-        substeps(method, True)  # refuses what is none
         self.motion = Motion(scene, bodies, self.momentum, self.storage)
         # what is still to be looked for, to be warned of, of which nothing but the log knows
         self._looks = (warn_overfilled, *[partial(warn_smeared, materials=scene)] * scene.uneven)
@@ -125,7 +119,7 @@ class Scene:
     @property
     def substeps(self) -> tuple[Substep, ...]:
         """Substeps of a step."""
-        return substeps(self.method, self.flows or self.momentum.rates)
+        return substeps(self.numerics.method, self.flows or self.momentum.own.rates)
 
     def set_time(self, t: float, dt: float, gravity: NDArray[np.float64] | None) -> None:
         """Set what forms see of a substep: time, and time since the start of the step, s; gravity (d,), m/s^2."""
@@ -150,7 +144,7 @@ class Scene:
 
     def check(self, state: State) -> None:
         """Refuse what is no state of this scene: its conditions act on the materials of another one."""
-        if not isinstance(state, State) or state.stage.mechanical.materials is not self.materials:
+        if not isinstance(state, State) or state.stage.materials is not self.materials:
             raise ValueError(f"state = {line(state)}, must be a state of this simulation")
 
     def on_grid(self, points: MaterialPoints) -> OnGrid:
@@ -160,7 +154,7 @@ class Scene:
         def make() -> OnGrid:
             self._assembled.clear()  # of coefficients that change now
             with Timer("mpm: cut domains"):
-                cut = CutDomains(grid, points, self.quadrature == "domain")
+                cut = CutDomains(grid, points, self.numerics.quadrature == "domain")
                 self._looks = tuple(filter(None, [look(cut, self.bodies) for look in self._looks]))
             with Timer("mpm: integration data"):
                 problems = (self.momentum, self.storage)
@@ -169,15 +163,20 @@ class Scene:
         return self._on_grid(points.arrays, make, grid.comm)
 
     def assembled(
-        self, on_grid: OnGrid, stage: Stage, now: SideData, sides: Callable[[], SideData], begins: bool
+        self,
+        on_grid: OnGrid,
+        stage: Stage,
+        now: Sequence[Loads],
+        as_cut: Callable[[], Sequence[Loads]],
+        begins: bool,
     ) -> Assembled:
         """Return the matrices for a stage of the bodies on the grid.
 
         Parameters
         ----------
         now
-            What acts on the sides.
-        sides
+            What acts on the bodies.
+        as_cut
             Returns this, placed where the points were cut.
         begins
             Whether all parts of the bodies must be held.
@@ -185,9 +184,9 @@ class Scene:
 
         def make() -> Assembled:
             problems = (self.momentum, self.storage, self.scheme, self._systems)
-            return assembled(*problems, on_grid, stage, sides(), begins)
+            return assembled(*problems, on_grid, stage, as_cut(), begins)
 
-        return self._assembled((on_grid.key, stage, now.asked), make, self.grid.comm)
+        return self._assembled((on_grid.key, stage, *(one.key for one in now)), make, self.grid.comm)
 
     def all_ids(self, present: Sequence[bool]) -> NDArray[np.int64]:
         """Return the numbers of all points of the bodies that are there."""
@@ -198,7 +197,7 @@ class Scene:
         """The constants that make the scene, by name: what a checkpoint of it is known by."""
         grid = self.grid
         out = {"grid cells": grid.shape.tolist(), "grid lower": grid.lower.tolist(), "grid upper": grid.upper.tolist()}
-        out |= {"quadrature": self.quadrature, **({"axisymmetric": True} if grid.axisymmetric else {})}
+        out |= {"quadrature": self.numerics.quadrature, **({"axisymmetric": True} if grid.axisymmetric else {})}
         if grid.copies > 1:
             first = np.cumsum([0, *(len(body) for body in self.bodies[:-1])])
             out["groups of the bodies"] = (grid.copy(first) // grid.cells).tolist()

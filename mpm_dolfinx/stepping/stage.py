@@ -3,17 +3,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
+from dolfinx.common import Timer
 from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.base.given_values import check_names, given
 from mpm_dolfinx.base.validation import all_of, line, numbers
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.faces import Surface
+from mpm_dolfinx.conditions.acting import QUANTITIES, Acting, Loads, Outcome, Place, Setting
 from mpm_dolfinx.conditions.axis import with_axis
 from mpm_dolfinx.conditions.conditions import (
     Displacement,
@@ -25,65 +27,125 @@ from mpm_dolfinx.conditions.conditions import (
     Source,
     Traction,
 )
+from mpm_dolfinx.conditions.names import named
 from mpm_dolfinx.conditions.sides import Sides
 from mpm_dolfinx.conditions.unit_weights import weighed
+from mpm_dolfinx.contact.acting import ContactsOfStage, ToolsOfStage
 from mpm_dolfinx.contact.groups import Contact
 from mpm_dolfinx.contact.tools import Tool
 from mpm_dolfinx.domains.lattice import Lattice, lattices
 from mpm_dolfinx.flow.hydraulic_boundary import HydraulicBoundary
-from mpm_dolfinx.grid.grid import Grid
+from mpm_dolfinx.grid.grid import SIDES, Grid
 from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.materials.skeleton import Fluid
-from mpm_dolfinx.mechanics.mechanical_boundary import MechanicalBoundary
+from mpm_dolfinx.mechanics.given_displacements import GivenDisplacements
+from mpm_dolfinx.mechanics.momentum import MomentumForms
+from mpm_dolfinx.mechanics.plates import Plates
+from mpm_dolfinx.mechanics.pressures import Pressures
+from mpm_dolfinx.mechanics.tractions import Tractions
 
 Condition = Traction | Pressure | Displacement | RigidPlate | Drained | Inflow | Tool | Contact
 """What acts on the bodies."""
-KINDS = {
-    "tractions": (Traction, Pressure),
-    "displacements": (Displacement,),
-    "outlets": (Drained, Inflow),
-    "plates": (RigidPlate,),
-    "tools": (Tool,),
-    "contacts": (Contact,),
-}
+KINDS: tuple[type[Acting], ...] = (Tractions, Pressures, Plates, GivenDisplacements, ToolsOfStage, ContactsOfStage)
+"""What acts on the momentum for conditions that do not say it themselves, by their method `acting`."""
 
 
-def by_kind(conditions: Sequence[Condition]) -> dict[str, tuple]:
-    """Return conditions by their kind, in their order; ValueError where one is none."""
-    known = tuple(kind for kinds in KINDS.values() for kind in kinds)
+def checked(conditions: Sequence[Condition]) -> Sequence[Condition]:
+    """Return conditions; ValueError where one is none."""
     if isinstance(conditions, Sequence) and any(isinstance(one, (OnSide, Source)) for one in conditions):
         raise ValueError("conditions: OnSide and Source are terms, must be given as terms=")
-    all_of("conditions", conditions, known)
+    if isinstance(conditions, Sequence) and not isinstance(conditions, (str, bytes)):
+        all_of("conditions", [one for one in conditions if not hasattr(one, "acting")], get_args(Condition))
+    else:
+        all_of("conditions", conditions, get_args(Condition))
     if len({id(one) for one in conditions}) < len(conditions):
         twice = next(one for i, one in enumerate(conditions) if any(one is other for other in conditions[:i]))
         raise ValueError(f"conditions: {line(twice)} is given twice, must be given once")
-    return {name: tuple(one for one in conditions if isinstance(one, kinds)) for name, kinds in KINDS.items()}
+    return conditions
 
 
 @dataclass(frozen=True, eq=False)
 class Stage:
     """The conditions in force.
 
-    given: the conditions, as they were given; conditions: by kind, with walls, the axis among them, gravity and terms;
-    present: which bodies are there; later: those that may still come; free: (nodes, d), components that no wall holds;
-    axisymmetric: as the grid; lattices: of the bodies that are there; mechanical, hydraulic: what acts on the sides of
-    the bodies.
+    given: the conditions by their names, as they were given; named: the same, with water as heavy as the pore fluid;
+    conditions: walls, the axis among them, and gravity; present: which bodies are there; later: those that may still
+    come; free: (nodes, d), components that no wall holds; axisymmetric: as the grid; lattices: of the bodies that are
+    there; materials: of the scene; acting: what the conditions do to the momentum; hydraulic: to the storage of fluid.
     """
 
-    given: tuple[Condition, ...]
+    given: Mapping[str, Condition]
+    named: Mapping[str, Condition]
     conditions: Mapping[str, Any]
     present: tuple[bool, ...]
     later: tuple[int, ...]
     free: NDArray[np.bool_]
     axisymmetric: bool
     lattices: Sequence[Lattice]
-    mechanical: MechanicalBoundary
+    materials: SceneMaterials
+    acting: tuple[Acting, ...]
     hydraulic: HydraulicBoundary
 
     @property
     def surfaces(self) -> list[Surface]:
         """The faces of all conditions but tools and contacts."""
-        return [*self.mechanical.surfaces, *(faces for _, faces in self.hydraulic.outlets)]
+        return [
+            *(faces for one in self.acting for faces in one.surfaces),
+            *(faces for _, faces in self.hydraulic.outlets),
+        ]
+
+    def of(self, *kinds: type) -> dict[str, Any]:
+        """Return the conditions of some classes by their names."""
+        return {name: one for name, one in self.named.items() if isinstance(one, kinds)}
+
+    @property
+    def symmetric(self) -> bool:
+        """Whether the tangent of what acts is symmetric."""
+        return all(one.symmetric for one in self.acting)
+
+    @property
+    def held(self) -> list[tuple[Any, Surface, Sequence[int]]]:
+        """Conditions that hold faces, these, and along which axes."""
+        return [one for acting in self.acting for one in acting.held]
+
+    def placed(self, place: Place) -> list[Loads]:
+        """Return what acts on the momentum in a substep."""
+        with Timer("mpm: loads"):
+            return [one.placed(place) for one in self.acting]
+
+    def kept(self, n: int) -> dict[str, NDArray[np.float64]]:
+        """Return what n points keep of the conditions, as these begin."""
+        return {data: rows for one in self.acting for of in one.kept(n).values() for data, rows in of.items()}
+
+    def data_names(self, names: Collection[str]) -> set[str]:
+        """Return under which names points keep data of conditions of some names."""
+        return {data for one in self.acting for name, of in one.kept(0).items() if name in names for data in of}
+
+    def same(self, before: Stage) -> set[str]:
+        """Return the names of conditions that there were in the stage before, or that had the name given to them."""
+        shared = ((name, one) for name, one in self.given.items() if name in before.given)
+        return {name for name, one in shared if one is before.given[name] or getattr(one, "name", None) == name}
+
+    def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
+        """Return an outcome of this value, where no step has been taken."""
+        d = self.free.shape[1]
+        out = {quantity: {} for quantity in QUANTITIES}
+        out["wall_reactions"] = {wall: np.full(d, value) for wall in SIDES[d]}
+        out["outflows"] = self.hydraulic.unknown(value)
+        for one in self.acting:
+            for quantity, values in one.unknown(value).items():
+                out[quantity] = out.get(quantity, {}) | values
+        return out
+
+    def begun(self, before: Stage, outcome: Outcome, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
+        """Return the outcome as the stage begins after another: of this value for what is new in it."""
+        same = {name for name, one in self.given.items() if before.given.get(name) is one}
+        if self.conditions["walls"] == before.conditions["walls"]:
+            same |= SIDES[self.free.shape[1]].keys()
+        return {
+            quantity: {name: outcome[quantity][name] if name in same else new for name, new in values.items()}
+            for quantity, values in self.unknown(value).items()
+        }
 
     def gravity_at(self, t: float) -> NDArray[np.float64] | None:
         """Return the acceleration of gravity (d,) at time t (s), m/s^2; None without."""
@@ -98,6 +160,7 @@ def stage(
     bodies: Sequence[Body],
     materials: SceneMaterials,
     fluid: Fluid | None,
+    momentum: MomentumForms,
     conditions: Mapping[str, Any],
     present: Sequence[bool],
     later: Sequence[int],
@@ -112,8 +175,10 @@ def stage(
         Those of the scene.
     fluid
         Pore fluid, if there is one.
+    momentum
+        Forms, and what acts in all stages.
     conditions
-        walls, conditions, gravity: see `Simulation`; terms: on sides.
+        walls, conditions, gravity: see `Simulation`.
     present, later
         Which bodies are there, and which may still come.
 
@@ -122,8 +187,9 @@ def stage(
     ValueError
         Naming the condition, its value and what is allowed.
     """
-    own = by_kind(conditions["conditions"])
-    if fluid is None and own["outlets"]:
+    given_by_name = named(checked(conditions["conditions"]))
+    by_name = {name: _weighed(one, fluid) for name, one in given_by_name.items()}
+    if fluid is None and any(isinstance(one, (Drained, Inflow)) for one in by_name.values()):
         raise ValueError("drained and inflow sides need a fluid")
     gravity = conditions["gravity"]
     if callable(gravity):
@@ -134,31 +200,31 @@ def stage(
         raise ValueError("bodies: none is there, must be at least one")
     walls = with_axis(grid, conditions["walls"])
     free = ~_held(grid, walls)
-    given, own["terms"] = tuple(conditions["conditions"]), tuple(conditions["terms"])
-    own["tractions"] = tuple(replace(load, value=weighed(load.value, fluid)) for load in own["tractions"])
-    own["outlets"] = tuple(
-        replace(side, pressure=weighed(side.pressure, fluid)) if isinstance(side, Drained) else side
-        for side in own["outlets"]
-    )
-    conditions = {**own, "walls": dict(walls), "gravity": gravity}  # nobody changes what a stage was given
     sides = Sides(grid, bodies, present)
-    acting = (conditions[name] for name in ("tractions", "displacements", "plates", "tools", "terms"))
-    mechanical = MechanicalBoundary(sides, free, materials, *acting, conditions["contacts"])
-    hydraulic = HydraulicBoundary(sides, conditions["outlets"])
-    held = [(faces, axes) for _, faces, axes in mechanical.holds]
-    held += [(faces, range(grid.dim)) for _, faces in mechanical.plates]
-    lattice = lattices(bodies, present, held)
+    setting = Setting(sides, free, materials, momentum.conditions, by_name)
+    found = [(kind, setting.of(*kind.conditions)) for kind in KINDS]
+    acting = [one.acting(setting) for one in (*momentum.acting, *by_name.values()) if hasattr(one, "acting")]
+    acting += [kind(setting, mine) for kind, mine in found if mine]
+    lattice = lattices(bodies, present, [(faces, axes) for one in acting for _, faces, axes in one.held])
     return Stage(
-        given=given,
-        conditions=conditions,
+        given=given_by_name,
+        named=by_name,
+        conditions={"walls": dict(walls), "gravity": gravity},  # nobody changes what a stage was given
         present=tuple(present),
         later=tuple(later),
         free=free,
         axisymmetric=grid.axisymmetric,
         lattices=lattice,
-        mechanical=mechanical,
-        hydraulic=hydraulic,
+        materials=materials,
+        acting=tuple(acting),
+        hydraulic=HydraulicBoundary(sides, setting.of(Drained, Inflow)),
     )
+
+
+def _weighed(condition: Condition, fluid: Fluid | None) -> Condition:
+    """Return a condition whose pressure of water has a unit weight, see `weighed`."""
+    name = {Drained: "pressure", Pressure: "value", Traction: "value"}.get(type(condition))
+    return condition if name is None else replace(condition, **{name: weighed(getattr(condition, name), fluid)})
 
 
 def _gravity(value: ArrayLike, name: str, dim: int, axisymmetric: bool) -> NDArray[np.float64]:

@@ -16,12 +16,11 @@ from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.faces import surface
 from mpm_dolfinx.bodies.fills import put, touches
 from mpm_dolfinx.bodies.touching import check_apart
-from mpm_dolfinx.conditions.conditions import Drained
+from mpm_dolfinx.conditions.conditions import Drained, Pressure, Traction
 from mpm_dolfinx.conditions.sides import everywhere
 from mpm_dolfinx.conditions.unit_weights import WEIGHS, warn_units
-from mpm_dolfinx.contact.cell_contact import let_go
+from mpm_dolfinx.contact.cell_contact import gripped, let_go
 from mpm_dolfinx.contact.groups import Contact
-from mpm_dolfinx.contact.tools import Tool
 from mpm_dolfinx.domains.pressure_transport import at_start
 from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.materials.initial_stress import OfWater
@@ -29,15 +28,17 @@ from mpm_dolfinx.parallel.messages import warn
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.stepping.initial_state import pieces_at_start
 from mpm_dolfinx.stepping.scene import Scene
-from mpm_dolfinx.stepping.stage import KINDS, Condition, Stage, by_kind, stage
+from mpm_dolfinx.stepping.stage import Condition, Stage, checked, stage
 from mpm_dolfinx.stepping.state import State
+
+LEVELS = (Traction, Pressure, Drained)  # which may be water
 
 
 def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int]) -> State:
     """Return the state of a scene at rest, in its first stage; its stresses as given, not yet in balance."""
     present = [body not in later for body in range(len(scene.bodies))]
     check_apart(scene.grid, scene.bodies, present)
-    begun = _stage(scene, {**conditions, "terms": [term.given for term in scene.momentum.sides.own]}, present, later)
+    begun = _stage(scene, conditions, present, later)
     _warn_weights(scene, begun, {"pressure": scene.initial.pressure})
     if scene.fluid and scene.materials.conducts:
         warn_units(scene.grid.comm, scene.fluid, conditions["gravity"])
@@ -46,18 +47,11 @@ def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int
     transported = None
     if scene.fluid:
         transported = pieces_at_start(scene, points) if callable(scene.initial.pressure) else at_start(points)
-    d, unknown = scene.grid.dim, np.nan if scene.initial.given else 0.0  # before a first step
-    reactions, walls = (np.full((count, d), unknown) for count in (len(begun.mechanical.holds), 2 * d))
-    outflows = np.zeros(len(begun.hydraulic.outlets))
     return State(
         t=0.0,
-        points=begun.mechanical.grip(points),
+        points=_gripped(scene, begun, points),
         transported=transported,
-        reactions=reactions,
-        walls=walls,
-        outflows=outflows,
-        tool_forces=begun.mechanical.forces(0.0),
-        tool_travel=np.zeros(len(begun.mechanical.tools.tools)),
+        outcome=begun.unknown(np.nan if scene.initial.given else 0.0),
         stage=begun,
     )
 
@@ -80,11 +74,10 @@ def begin_stage(
     flag("stage: reset_displacement", reset_displacement)
     present = [(here and body not in remove) or body in add for body, here in enumerate(before.present)]
     later = [body for body in before.later if body not in add]
-    conditions = _with_contacts(before, named.get("conditions", before.given))
+    conditions = _with_contacts(before, named.get("conditions", tuple(before.given.values())))
     begun = _stage(scene, {**before.conditions, **named, "conditions": conditions}, present, later)
-    was, now = by_kind(before.given), by_kind(begun.given)
-    changed = {name for name in KINDS if was[name] != now[name]}
-    if "gravity" in named or changed & {"tractions", "outlets"}:
+    was, now = ([one for one in of.given.values() if isinstance(one, LEVELS)] for of in (before, begun))
+    if "gravity" in named or was != now:
         _warn_weights(scene, begun, {})
     if remove:
         _warn_moved_on(scene, before, begun)
@@ -93,42 +86,52 @@ def begin_stage(
     state = replace(state, stay=None)
     gone, transported = _ids(scene.bodies, remove), state.transported
     there = [body for body, here in enumerate(before.present) if here and body not in remove]
-    bare, gravity = before.mechanical.let_go(state.points), None
+    bare, gravity = let_go(state.points, before.data_names(before.named)), None
     if scene.initial.given:
         gravity = begun.gravity_at(state.t)
     bare = _without_extra(scene, bare, add, fields) if add else bare
     points, new = _filled(scene, bare.of(gone, kept=False), there, add, gravity)
-    kept = let_go(state.points, before.mechanical.tools.kept(0)) if "tools" in changed else state.points
-    points = begun.mechanical.grip(points, kept)
+    others = before.data_names(before.named.keys() - begun.same(before))
+    points = _gripped(scene, begun, points, let_go(state.points, others))
     if transported is not None:
         transported = transported.of(gone, kept=False).joined(at_start(new))
     points = _changed(scene, points, fields)
     if reset_displacement:
         points = replace(points, origin=points.corners)
-    unknown, new = np.nan if state.resets else 0.0, {}
-    if "displacements" in changed:
-        new["reactions"] = np.full((len(begun.mechanical.holds), scene.grid.dim), unknown)
-    if "walls" in named:
-        new["walls"] = np.full_like(state.walls, unknown)
-    if "tools" in changed:
-        new["tool_forces"] = begun.mechanical.forces(unknown)
-        new["tool_travel"] = np.zeros(len(begun.mechanical.tools.tools))
-    if "outlets" in changed:
-        new["outflows"] = np.full(len(begun.hydraulic.outlets), unknown)
-    new["rest"] = state.rest if begun.mechanical.holds_as(before.mechanical) else None
-    return replace(state, points=points, transported=transported, stage=begun, begins=True, held=None, **new)
+    outcome = begun.begun(before, state.outcome, np.nan if state.resets else 0.0)
+    rest = state.rest if _holds_as(begun, before) else None
+    new = {"stage": begun, "begins": True, "outcome": outcome, "held": None, "rest": rest}
+    return replace(state, points=points, transported=transported, **new)
+
+
+def _gripped(
+    scene: Scene, begun: Stage, points: MaterialPoints, before: MaterialPoints | None = None
+) -> MaterialPoints:
+    """Return points with what they keep of conditions: nothing, or what the same points had `before`."""
+    kept = begun.kept(len(points))
+    if taken := sorted(kept.keys() & scene.materials.seeded.data.keys()):
+        raise ValueError(f"{taken[0]!r}: points have data of this name, must be another name of a condition")
+    return gripped(points, kept, before)
+
+
+def _holds_as(begun: Stage, before: Stage) -> bool:
+    """Return whether the same conditions hold the same faces."""
+    return len(begun.held) == len(before.held) and all(
+        hold is was and np.array_equal(faces.id, then.id) and np.array_equal(faces.xi, then.xi)
+        for (hold, faces, _), (was, then, _) in zip(begun.held, before.held, strict=True)
+    )
 
 
 def _with_contacts(before: Stage, conditions: Sequence[Condition]) -> list[Condition]:
     """Return conditions with the scene's contacts, which no stage changes."""
-    there, given = before.conditions["contacts"], by_kind(conditions)["contacts"]
+    there, given = [*before.of(Contact).values()], [one for one in checked(conditions) if isinstance(one, Contact)]
     if given and given != there:
         raise ValueError(f"stage: conditions: {line(given[0])}, contacts must be those of the scene, or left out")
     return [*conditions, *(() if given else there)]
 
 
 def _stage(scene: Scene, conditions: Mapping[str, Any], present: Sequence[bool], later: Sequence[int]) -> Stage:
-    return stage(scene.grid, scene.bodies, scene.materials, scene.fluid, conditions, present, later)
+    return stage(scene.grid, scene.bodies, scene.materials, scene.fluid, scene.momentum, conditions, present, later)
 
 
 def _warn_weights(scene: Scene, begun: Stage, given: Mapping[str, Any]) -> None:
@@ -138,8 +141,8 @@ def _warn_weights(scene: Scene, begun: Stage, given: Mapping[str, Any]) -> None:
     """
     gravity, fluid = begun.conditions["gravity"], scene.fluid
     g = 0.0 if gravity is None or callable(gravity) else float(np.linalg.norm(gravity))
-    on_sides = [(f"water at {c.side!r}", c.pressure) for c in begun.conditions["outlets"] if isinstance(c, Drained)]
-    on_sides += [(f"water at {c.side!r}", c.value) for c in begun.conditions["tractions"]]
+    on_sides = [(f"water at {c.side!r}", c.pressure) for c in begun.of(Drained).values()]
+    on_sides += [(f"water at {c.side!r}", c.value) for c in begun.of(Traction, Pressure).values()]
     levels = [*given.items(), *on_sides]
     if fluid is None:
         levels = [(name, value) for name, value in levels if isinstance(value, OfWater) and value.given is None and g]
@@ -156,10 +159,11 @@ def _warn_weights(scene: Scene, begun: Stage, given: Mapping[str, Any]) -> None:
 def _warn_moved_on(scene: Scene, before: Stage, begun: Stage) -> None:
     """Log a warning for each condition that stays as it was and acts on what an excavation has laid bare."""
     stop = np.cumsum([len(body) for body in scene.bodies])
-    for condition in begun.given:
-        if isinstance(condition, (Tool, Contact)) or not any(condition is one for one in before.given):
+    for name, condition in begun.given.items():
+        if not hasattr(condition, "side") or before.given.get(name) is not condition:
             continue
-        was, now = (surface(scene.bodies, condition.side, condition.region, s.present) for s in (before, begun))
+        where = condition.side, getattr(condition, "region", None)
+        was, now = (surface(scene.bodies, *where, s.present) for s in (before, begun))
         bare = sum_by(now.id, now.area0, stop[-1]) - sum_by(was.id, was.area0, stop[-1])
         here = np.repeat(before.present, [len(body) for body in scene.bodies])
         new = np.flatnonzero(here[now.id] & (bare[now.id] > SAME * now.whole0))

@@ -3,13 +3,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 from mpi4py import MPI
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mpm_dolfinx.conditions.acting import Outcome
 from mpm_dolfinx.domains.pressure_transport import PiecePressures
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.parallel.exchange import Exchange
@@ -18,11 +21,13 @@ from mpm_dolfinx.stepping.result import Result
 from mpm_dolfinx.stepping.stage import Stage
 
 
-def _freeze(kept: Stay | State) -> None:
+def _freeze(kept: Mapping[str, Any]) -> None:
     """Let nobody write into the arrays of what is kept."""
-    for values in vars(kept).values():
+    for values in kept.values():
         if isinstance(values, np.ndarray):
             values.flags.writeable = False
+        elif isinstance(values, Mapping):
+            _freeze(values)
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +64,7 @@ class Stay:
         return out
 
     def __post_init__(self):
-        _freeze(self)
+        _freeze(vars(self))
 
     def migrated(self, exchange: Exchange, destination: NDArray[np.int32]) -> Stay:
         """Return what holds for points that go to their destinations, by the exchange of points."""
@@ -91,18 +96,12 @@ class State:
         What holds of the last reset of the grid; None where the next step resets all of it.
     resets
         How often the grid has been reset.
-    reactions : (displacements, d), N (N/m in plane strain)
-        Forces of the given displacements in the last step; nan before the first one of a stage.
-    walls : (2 d, d), N (N/m in plane strain)
-        Forces of the walls of the grid, in the order of `SIDES`, on the bodies in the last step; nan before the first
-        one of a stage that holds others.
-    outflows : (drained sides and inflows, as given), m^3/s (m^2/s in plane strain)
-        Volumes at zero pressure that leave the bodies through them at the end of the last step; nan before the first
-        one of a stage.
-    tool_forces : (tools + contacts, d + 1), in 3D (..., 6), N and N m (N/m and N in plane strain)
-        Forces and moments of tools, then contacts, on the bodies in the last step; nan before the first one of a stage.
-    tool_travel : (tools,), m
-        How far loads have pushed tools beyond their displacement; zero for those without.
+    outcome
+        What conditions do to the bodies, by quantity and name, at the end of the last step; nan before the first one of
+        a stage that has others.  reactions (d,), N, of given displacements; wall_reactions (d,), N, of the grid's
+        walls; outflows, m^3/s (m^2/s in plane strain), volumes at zero pressure that leave through open sides;
+        tool_forces (d + 1,), in 3D (6,), N and N m, forces and moments of tools and contacts on the bodies;
+        tool_travel, m, how far loads have pushed tools beyond their displacement; and what the user's own give.
     stage
         The conditions in force.
     begins
@@ -125,11 +124,7 @@ class State:
     transported: PiecePressures | None
     stay: Stay | None = None
     resets: int = 0
-    reactions: NDArray[np.float64]
-    walls: NDArray[np.float64]
-    outflows: NDArray[np.float64]
-    tool_forces: NDArray[np.float64]
-    tool_travel: NDArray[np.float64]
+    outcome: Outcome
     stage: Stage
     begins: bool = True
     velocity: NDArray[np.float64] | None = None
@@ -138,7 +133,7 @@ class State:
     result: Result | None = None
 
     def __post_init__(self):
-        _freeze(self)
+        _freeze(vars(self))
 
     @property
     def stays(self) -> bool:

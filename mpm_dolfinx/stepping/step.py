@@ -7,6 +7,7 @@ from dataclasses import replace
 from functools import partial
 
 from mpm_dolfinx.base.report import Report
+from mpm_dolfinx.conditions.acting import Place
 from mpm_dolfinx.forms.unknowns import collect_garbage
 from mpm_dolfinx.solve.newton import Kept, note_pressures, solve_substep
 from mpm_dolfinx.stepping.balances import Acting, Start, at_rest, balances, has_yielded
@@ -26,15 +27,18 @@ def set_up(scene: Scene, state: State, dt: float, how: tuple = ()) -> Start:
     cut_points = state.as_cut
     on_grid = scene.on_grid(cut_points)
     on_grid.cut.surfaces(stage.surfaces)  # all at once
-    place = partial(stage.mechanical.data, scene.momentum.sides, on_grid.cut, (state.t, dt), state.tool_travel)
+    data = on_grid.data_of(state)
+    place = Place(on_grid.cut, state.points, data, state.t, dt, state.t, state.outcome)
     if state.begins:
-        stage.mechanical.check_start(on_grid.cut, state.points, state.t, state.tool_travel)
-    sides, data = [place(t, state.points) for t in times], on_grid.data_of(state)
-    as_cut = partial(place, times[-1], cut_points) if state.stay else partial(sides.__getitem__, -1)
-    matrices, sides = scene.assembled(on_grid, stage, sides[-1], as_cut, state.begins), at_rest(scene, state, sides)
+        for one in stage.acting:
+            one.check_start(place)
+    loads = [stage.placed(place._replace(t=t)) for t in times]
+    at_cut = place._replace(points=cut_points, pieces=on_grid.data, t=times[-1])
+    as_cut = partial(stage.placed, at_cut) if state.stay else partial(loads.__getitem__, -1)
+    matrices, loads = scene.assembled(on_grid, stage, loads[-1], as_cut, state.begins), at_rest(scene, state, loads)
     scene.momentum.u.x.array[:] = 0.0
     on_grid.start(state)
-    acting = [Acting(*one) for one in zip(how or scene.substeps, times, sides, gravity, strict=True)]
+    acting = [Acting(*one) for one in zip(how or scene.substeps, times, loads, gravity, strict=True)]
     return Start(state, on_grid, data, matrices, dt, has_yielded(scene, state), acting)
 
 
@@ -48,13 +52,13 @@ def step(scene: Scene, state: State, dt: float, how: tuple = ()) -> tuple[State,
     note_pressures(report, solvers, both.storage, acting.substep.before * dt, dt, rates)
     del solvers
     start.matrices.end_step()
-    mechanical, at = state.stage.mechanical, (start.matrices.momentum.unknowns, scene.momentum.u.x.array)
-    now = both.outcome(state, acting)
-    tools, ways = mechanical.going(acting.sides, state.t, state.t + dt, state.tool_travel)
-    end = state.t + dt, tools, both.came(rates[-1]), report
+    at, outcome = both.momentum.at, both.outcome(state)
+    loads = [one.ended(at) for one in acting.loads]
+    end = state.t + dt, loads, both.came(rates[-1]), report
     new, report.rederived = scene.motion.advanced(state, on_grid, start.data, *end)
-    velocity = None if scene.momentum.elastic else scene.momentum.u.x.array / dt
-    mechanical.check_end(on_grid.cut, new.points, new.t, state.points, state.t, tools)
-    forces, points = mechanical.touched(acting.sides, *at, new.points)
-    now |= {"tool_forces": forces, "tool_travel": ways, "points": points, "velocity": velocity}
-    return replace(new, **now, resets=state.resets + (not state.stays), begins=False), report
+    velocity, points = None if scene.momentum.elastic else scene.momentum.u.x.array / dt, new.points
+    for one in loads:
+        one.check_end(new.points, state.points)
+        points = one.gripped(at, points)
+    now = {"outcome": outcome, "points": points, "velocity": velocity, "begins": False}
+    return replace(new, **now, resets=state.resets + (not state.stays)), report

@@ -12,6 +12,9 @@ from mpi4py import MPI
 
 import numpy as np
 
+from mpm_dolfinx.conditions.conditions import Displacement, Pressure, RigidPlate, Traction
+from mpm_dolfinx.contact.groups import Contact
+from mpm_dolfinx.contact.tools import Tool
 from mpm_dolfinx.materials.skeleton import LOCKING
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.stepping.scene import Scene
@@ -37,12 +40,17 @@ def _either(name: str, used, what: str, otherwise: str) -> Part:
 
 
 def _momentum(s: Scene, state: State) -> list[Part]:
-    m, side = s.momentum, state.stage.mechanical
+    m, kinds = s.momentum, (Traction, Pressure, Displacement, RigidPlate, Tool, Contact)
+    of = {kind: state.stage.of(kind) for kind in kinds}
     laws, evolves = ", ".join(law.__name__ for law in s.materials.laws), ", ".join(s.materials.state_names)
     return [
         _either("reset of the grid", state.resets > 1, f"{state.resets} so far", "nothing has moved so far"),
         _either("axisymmetry", s.grid.axisymmetric, "rings about r = 0", "plane strain" if s.grid.dim == 2 else "3D"),
-        Part("stress", True, f"{laws}; integrated over {'exact domains' if s.quadrature == 'domain' else 'points'}"),
+        Part(
+            "stress",
+            True,
+            f"{laws}; integrated over {'exact domains' if s.numerics.quadrature == 'domain' else 'points'}",
+        ),
         _either(
             "mean dilatation",
             m.dilatation,
@@ -52,14 +60,14 @@ def _momentum(s: Scene, state: State) -> list[Part]:
         _either("state of the law", evolves, evolves, "the stress depends on F only"),
         _either("initial stress", s.initial.given, f"of {len(s.initial.given)} bodies", "none given"),
         _either("body force", s.gravity is not None, "gravity", "no gravity"),
-        _either("tractions", side.loads, f"on {len(side.loads)} sides", "no tractions"),
-        _either("pressures", side.pressures, f"on {len(side.pressures)} sides", "no pressures"),
-        _either("given displacements", side.holds, f"on {len(side.holds)} sides", "no given displacements"),
-        _either("rigid plates", side.plates, f"on {len(side.plates)} sides", "no plates"),
-        _either("tools", side.tools.tools, f"{len(side.tools.tools)}", "no tools"),
-        _either("contacts", side.contacts.contacts, f"of {s.grid.copies} groups", "bodies that touch stick"),
+        _either("tractions", of[Traction], f"on {len(of[Traction])} sides", "no tractions"),
+        _either("pressures", of[Pressure], f"on {len(of[Pressure])} sides", "no pressures"),
+        _either("given displacements", of[Displacement], f"on {len(of[Displacement])} sides", "no given displacements"),
+        _either("rigid plates", of[RigidPlate], f"on {len(of[RigidPlate])} sides", "no plates"),
+        _either("tools", of[Tool], f"{len(of[Tool])}", "no tools"),
+        _either("contacts", of[Contact], f"of {s.grid.copies} groups", "bodies that touch stick"),
         _either("ghost penalty", m.ghost.form.used, "faces of nearly empty cells", "no nearly empty cell so far"),
-        _either("terms of the user's", m.terms or m.sides.own, f"{len(m.terms) + len(m.sides.own)}", "none given"),
+        _either("terms of the user's", m.own.terms, f"{len(m.own.terms)}", "none given"),
     ]
 
 
@@ -81,13 +89,12 @@ def _storage(s: Scene, state: State) -> list[Part]:
 
 
 def _solvers(s: Scene, state: State) -> list[Part]:
-    side = state.stage.mechanical
-    kind = "symmetric" if s.momentum.symmetric and side.symmetric else "unsymmetric: LU and FGMRES"
+    kind = "symmetric" if s.momentum.symmetric and state.stage.symmetric else "unsymmetric: LU and FGMRES"
     return [
         _either("coupling", s.storage, f"{s.scheme.coupling}, {kind}", "no fluid: Newton on the momentum"),
         _either(
             "one factorisation for many steps",
-            s.momentum.linear and not (side.pressures or side.tools.tools or side.contacts.contacts),
+            s.momentum.linear and not (state.stage.of(Pressure, Tool, Contact) or s.momentum.own.holding),
             "linear law: until active cells or time step change",
             "the tangent depends on the strain",
         ),
@@ -97,7 +104,7 @@ def _solvers(s: Scene, state: State) -> list[Part]:
 
 
 def _one_substep(s: Scene) -> str:
-    return "first order in time" if s.method == "backward-euler" else "nothing has a rate"
+    return "first order in time" if s.numerics.method == "backward-euler" else "nothing has a rate"
 
 
 def table(scene: Scene, state: State) -> str:

@@ -39,7 +39,7 @@ from mpm_dolfinx.base.errors import NotConverged
 from mpm_dolfinx.base.fluid_content import change_of_content, mass_potential, mass_potential_form
 from mpm_dolfinx.base.report import Report
 from mpm_dolfinx.base.tolerances import NEAR, ROUND_OFF, SAME, TINY
-from mpm_dolfinx.base.validation import all_of, functions, line, numbers
+from mpm_dolfinx.base.validation import all_of, functions, instance, line, numbers
 from mpm_dolfinx.bodies.faces import Region, limits
 from mpm_dolfinx.conditions.axis import with_axis
 from mpm_dolfinx.conditions.conditions import RIGIDITY, Drained, Pressure, RigidPlate, Source, Traction, sorted_terms
@@ -50,6 +50,7 @@ from mpm_dolfinx.materials.skeleton import Field, Fluid, Skeleton
 from mpm_dolfinx.materials.user_functions import call, compiling, term_of
 from mpm_dolfinx.materials.user_functions import form as form_of
 from mpm_dolfinx.probing.probes import positions
+from mpm_dolfinx.stepping.numerics import DEFAULT, Numerics
 from mpm_dolfinx.stepping.result import GaveUp, Result, Row
 from mpm_dolfinx.stepping.time_integration import Substep, substeps
 
@@ -115,10 +116,9 @@ class BiotFEM:
         q is a test function of the pressure's elements.
     element
         "taylor-hood": Q2 displacement, Q1 pressure; "q1-dg0": Q1, constant in the cells with two-point fluxes.
-    method
-        Of time integration: "sdirk2" or "backward-euler".
-    tolerance
-        Residual relative to the loads or to the residual at the start of a step, > 0.
+    numerics
+        Its method of time integration, and its tolerance: of the residual, relative to the loads or to the residual at
+        the start of a step.
     axisymmetric
         As that of `Grid`.
     """
@@ -136,14 +136,12 @@ class BiotFEM:
         gravity: Callable[[float], ArrayLike] | None = None,
         terms: Sequence[Callable | Source] = (),
         element: str = "taylor-hood",
-        comm: MPI.Intracomm = MPI.COMM_WORLD,
-        tolerance: float = 1e-8,
-        method: str = "sdirk2",
+        numerics: Numerics = DEFAULT,
         axisymmetric: bool = False,
     ):
         all_of("material", [material], Skeleton)
         all_of("fluid", [fluid] if fluid is not None else [], Fluid)
-        numbers("tolerance", tolerance, test=lambda v: (0 < v) & (v < 1), allowed="in (0, 1)")
+        instance("numerics", numerics, Numerics)
         if element not in ELEMENTS:
             raise ValueError(f"element {element!r}: must be one of {', '.join(ELEMENTS)}")
         all_of("conditions", conditions, (Traction, Pressure, RigidPlate, Drained))
@@ -165,12 +163,12 @@ class BiotFEM:
                 f"{type(material).__name__}: the reference has no state and no local unknowns; only moduli, "
                 "conductivity and parameters of the law may be functions of place, the rest must be numbers"
             )
-        self.grid = Grid(lower, upper, cells, comm, axisymmetric=axisymmetric)
+        self.grid = Grid(lower, upper, cells, axisymmetric=axisymmetric)
         self.material, self.fluid = material, fluid
         radius = ufl.SpatialCoordinate(self.grid.mesh)[0]
         self._around = TURN * radius if axisymmetric else 1.0  # what measures in the plane count by
-        self.tolerance, self._t = tolerance, fem.Constant(self.grid.mesh, 0.0)
-        self._substeps = substeps(method, fluid is not None or bool(terms))  # terms may depend on the velocity
+        self.tolerance, self._t = numerics.tolerance, fem.Constant(self.grid.mesh, 0.0)
+        self._substeps = substeps(numerics.method, fluid is not None or bool(terms))  # terms may depend on the velocity
         self.scale = float(np.max(material.at(self.grid.midpoints + self.grid.base).oedometric))
         """Unit of the pressure among the unknowns, Pa; both equations are divided by it."""
         self._space = Space(self.grid, fluid is not None, *ELEMENTS[element])

@@ -70,6 +70,12 @@ def _scales(scene: Scene, run: Sequence[Shown]) -> dict[str, float]:
     return found
 
 
+def stress_of_rounding(scene: Scene) -> float:
+    """Return the stress, Pa, of a strain by the last digit of a place on the grid, over a cell."""
+    stiffest = max(law.get("bulk", 1e7) + 4 / 3 * law["shear"] for _, law in scene.materials)
+    return np.finfo(float).eps * scene.size.max() / min(scene.h) * stiffest
+
+
 def resolved(scene: Scene, frame: Frame, run: Sequence[Shown]) -> dict[str, float]:
     """Return what the rounding of coordinates in a frame is in each field, over the largest value of the field.
 
@@ -80,10 +86,11 @@ def resolved(scene: Scene, frame: Frame, run: Sequence[Shown]) -> dict[str, floa
     scales, h, d = _scales(scene, run), min(scene.h), scene.dim if not scene.axisymmetric else 3
     most = np.abs(frame.place([np.zeros(scene.dim), scene.size], scene)).max() / frame.length
     given, place = (np.finfo(float).eps * size for size in (most, scene.size.max()))
-    stress = place / h * max(law.get("bulk", 1e7) + 4 / 3 * law["shear"] for _, law in scene.materials)
+    stress = stress_of_rounding(scene)
     out = {name: place / scales["displacement"] for name in scales}
     out |= {"displacement": given / scales["displacement"], "volume": place / h / scales["volume"]}
-    out["outflows"] += place / h * _seeps(scene) * h ** (d - 1) / scales["outflows"]
+    flows = _seeps(scene) + h / (scene.end / scene.steps)  # what a step's rounding of a volume presses out, too
+    out["outflows"] += place / h * flows * h ** (d - 1) / scales["outflows"]
     out |= {name: stress / scales[name] for name in ("stress", "pressure")}
     forces = {"reactions": HOLD, "tools": STIFF}
     out |= {name: k * stress * h ** (d - 1) / scales[name] for name, k in forces.items()}

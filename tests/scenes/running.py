@@ -274,7 +274,7 @@ class _Builder:
 
     def options(self, later: list[int]) -> dict:
         scene, frame = self.scene, self.frame
-        out = {"method": scene.method, "tolerance": scene.tolerance}
+        out = {"numerics": mpm.Numerics(method=scene.method, tolerance=scene.tolerance)}
         down = np.zeros(scene.dim)
         down[-1] = -scene.gravity * frame.length / frame.time**2
         if scene.gravity:
@@ -331,14 +331,14 @@ def shown(built: Built) -> Shown:
     }
     if scene.fluid is not None:
         fields["pressure"] = points.pressure[own] / frame.stress
-    fields["reactions"] = frame.vector_back(s.reactions[built.own("displacements")] / frame.force(scene))
+    fields["reactions"] = frame.vector_back(s.reactions.array[built.own("displacements")] / frame.force(scene))
     drained = len(built.numbers["drained"])
     rows = [*built.own("drained"), *(drained + i for i in built.own("inflows"))]
-    fields["outflows"] = s.outflows[rows] / frame.flow(scene)
+    fields["outflows"] = s.outflows.array[rows] / frame.flow(scene)
     tools = len(built.numbers["tools"])
     rows = [*built.own("tools"), *(tools + i for i in built.own("contacts"))]
-    fields["tools"] = frame.vector_back(s.tool_forces[rows, :d] / frame.force(scene))
-    fields["travel"] = s.tool_travel[built.own("tools")] / frame.length
+    fields["tools"] = frame.vector_back(s.tool_forces.array[rows, :d] / frame.force(scene))
+    fields["travel"] = s.tool_travel.array[built.own("tools")] / frame.length
     return Shown(frame.place_back(places, scene), fields, s.result.steps)
 
 

@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: MIT
+"""Names of conditions, by which their results are found."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpm_dolfinx.base.validation import line
+
+T = TypeVar("T")
+
+
+class ByName(dict[str, T]):
+    """What belongs to conditions by their names; in the order in which they were given."""
+
+    @property
+    def array(self) -> NDArray[np.float64]:
+        """All of it (conditions, ...), one above the other; what belongs to none is of shape (0,)."""
+        return np.stack(list(self.values())) if self else np.zeros(0)
+
+    def __missing__(self, name: Any) -> T:
+        """Refuse what is no name of them, such as a position."""
+        raise KeyError(f"{name!r}: must be the name of a condition: {', '.join(map(repr, self)) or 'there is none'}")
+
+
+def named(conditions: Sequence[Any]) -> dict[str, Any]:
+    """Return conditions by their names: those given, and of others the kind and side, made unique by a number.
+
+    Raises
+    ------
+    ValueError
+        A name that is none, or of two.
+    """
+    given = [getattr(one, "name", None) for one in conditions]
+    for name, one in zip(given, conditions, strict=True):
+        if name is not None and not (isinstance(name, str) and re.fullmatch(r"[\w .-]+", name)):
+            raise ValueError(f"{line(one)}: name = {line(name)}, must be of letters, digits, spaces, and any of _ . -")
+        if name is not None and given.count(name) > 1:
+            raise ValueError(f"{line(one)}: name = {line(name)}: another condition has it, must be a name of its own")
+    out: dict[str, Any] = {}
+    for name, one in zip(given, conditions, strict=True):
+        base, count = name or _default(one), 1
+        name = base
+        while name in out or (name in given and one is not conditions[given.index(name)]):
+            count += 1
+            name = f"{base}_{count}"
+        out[name] = one
+    return out
+
+
+def _default(condition: Any) -> str:
+    """Return the name of a condition that was given none: its kind, and the side on which it acts."""
+    kind = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", type(condition).__name__).lower()
+    side = getattr(condition, "side", None)
+    return kind if side is None else f"{kind}_{re.sub(r'[^A-Za-z0-9]+', '_', str(side))}"

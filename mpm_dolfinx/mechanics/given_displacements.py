@@ -1,0 +1,302 @@
+# SPDX-License-Identifier: MIT
+"""Given displacements of sides: penalties on means in the cells and at points across the side, see `held_cells`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import combinations
+
+from petsc4py import PETSc
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from numpy.typing import NDArray
+
+from mpm_dolfinx.base.tolerances import EPSILON, NEAR
+from mpm_dolfinx.base.validation import line
+from mpm_dolfinx.bodies.faces import Surface, face_vectors
+from mpm_dolfinx.conditions.acting import Acting, At, Loads, Place, Setting
+from mpm_dolfinx.conditions.conditions import Displacement, holding, resistance
+from mpm_dolfinx.conditions.sides import check_apart, everywhere, gathered, meeting
+from mpm_dolfinx.domains.cut_domains import CutDomains
+from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointForm
+from mpm_dolfinx.grid.grid import Grid, sum_by
+from mpm_dolfinx.mechanics.held_cells import HeldCells, HeldPoints
+from mpm_dolfinx.mechanics.rigid_motion import rigid_motion, turned
+from mpm_dolfinx.parallel.exchange import first, over_all
+from mpm_dolfinx.parallel.messages import warn
+from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.points.parts import Parts
+
+
+class HoldForms:
+    """Points, or means over points, with a given displacement along a direction; what holds it, and pulls to it."""
+
+    def __init__(self, grid: Grid, u: fem.Function):
+        d = grid.dim
+        moments = {"squares": (d, d), **({"product": ()} if d == 3 else {})}
+        self.points = h = FormPoints(grid, stiffness=(), direction=(d,), gap=(), **moments)
+        v, du = ufl.TestFunction(u.function_space), ufl.TrialFunction(u.function_space)
+
+        def along(w):
+            """Return the mean of a Q1 field, along the direction, by the moments of the places it is over."""
+            second = ufl.grad(ufl.grad(w))
+            i, j, k = ufl.indices(3)
+            mean = w + ufl.dot(ufl.grad(w), h.offset) + ufl.as_vector(second[i, j, k] * h.squares[j, k], i) / 2
+            if d == 3:  # of third derivatives of a trilinear function one is not zero
+                mean += ufl.grad(second)[:, 0, 1, 2] * h.product
+            return ufl.dot(mean, h.direction)
+
+        self.hold = PointForm(h.stiffness * along(du) * along(v) * h.dx, h)
+        self.pull = PointForm(h.stiffness * h.gap * along(v) * h.dx, h)
+
+
+class GivenDisplacements(Acting):
+    """The given displacements of a stage.
+
+    Parameters
+    ----------
+    setting, displacements
+        Where they are put, and the displacements by name.
+
+    Raises
+    ------
+    ValueError
+        Two give the same component on the same part of a face.
+    """
+
+    conditions = (Displacement,)
+
+    def __init__(self, setting: Setting, displacements: Mapping[str, Displacement]):
+        self._grid, self._forms, self._materials = setting.grid, setting.forms, setting.materials
+        self._free, self._names = setting.free, list(displacements)
+        self._meeting: list[tuple[Displacement, Displacement, list[int], NDArray[np.float64]]] = []
+        self._warned: set[int] = set()  # numbers of the conditions, of which nothing but the log knows
+        sides, d = setting.sides, self._grid.dim
+        whole = [(hold, sides.of(hold), hold.axes(d)) for hold in displacements.values()]
+        for (one, faces, axes), (other, others, more) in combinations(whole, 2):
+            if common := sorted(set(axes) & set(more)):
+                check_apart(one, faces, other, others)
+                self._meeting.append((one, other, common, meeting(sides.bodies, faces, others)))
+        self._holds = self.held = held_faces(setting)
+        for hold in displacements.values():
+            if not callable(hold.value):  # what a function gives is checked when it is called
+                hold.at(0.0, np.empty((1, d)))
+
+    @property
+    def surfaces(self) -> list[Surface]:
+        """The faces that are held."""
+        return [faces for _, faces, _ in self._holds]
+
+    def placed(self, place: Place) -> Loads:
+        """Return what holds them, a row a component, by cells and points."""
+        d, comm = self._grid.dim, self._grid.comm
+        self._check_meeting(place.t)
+        ends = (place.start, place.start + place.dt) if place.dt > 0 else ()  # without: held where they count from
+        held = HeldCells(self._grid, self._held_points(place.cut, place.points, place.t, ends))
+        placed, message = [], ""
+        for axis in range(d):
+            given = np.array([axis in axes for *_, axes in self._holds])
+            *rows, wrong = held.rows(axis, given, self._free[:, axis])
+            placed.append((*rows, np.tile(np.eye(d)[axis], (len(rows[0]), 1))))
+            if wrong >= 0:
+                hold, x = self._holds[held.number[wrong]][0], held.x[wrong] + self._grid.base
+                what = f"{line(hold)}: moves {'xyz'[axis]} at {x}"
+                message = f"{what}, where a wall holds it; must be 0 there, or the wall must leave it free"
+        if message := first(comm, message):
+            raise ValueError(message)
+        row, stiffness, gap, own, direction = map(np.concatenate, zip(*placed, strict=True))
+        fields = {name: values[row] for name, values in held.moments.items()}
+        fields |= {"stiffness": stiffness, "gap": gap, "direction": direction}
+        forms = self._forms(HoldForms)
+        return HoldLoads(
+            self, forms, forms.points.at(held.cell[row], held.x[row], np.ones(len(row)), **fields), held, row, own
+        )
+
+    def _held_points(self, cut: CutDomains, points: MaterialPoints, t: float, ends: Sequence[float]) -> HeldPoints:
+        """Return the points of integration on held sides, at the owners of their cells.
+
+        ends: start and end of the step, s; none for sides at rest.
+        """
+        d, rows = self._grid.dim, []
+        patches = cut.surfaces([faces for _, faces, _ in self._holds])
+        chosen = np.unique(np.concatenate([p.at for p in patches]))
+        cut_points = cut.points if ends else points  # which are where they were cut
+        now, before = (of.map(lambda values: values[chosen]) for of in (points, cut_points))
+        stress = self._materials.total_stress(now)
+        modulus, resists = (self._materials.table(before, of) for of in (holding, resistance))
+        firm = self._materials.confined_modulus(before)
+        # of when the grid was reset, as the stiffnesses: they stay as long as the cut serves
+        tension = np.linalg.norm(stress if points is cut_points else self._materials.total_stress(before), axis=(1, 2))
+        for number, ((hold, *_, axes), p) in enumerate(zip(self._holds, patches, strict=True)):
+            at, now = np.searchsorted(chosen, p.at), p.now(points)
+            given = [self._given(hold, time, p.X) for time in (t, *ends)] if ends else 3 * [np.zeros_like(now)]
+            to, given = p.origin(points) + given[0], np.concatenate(given[1:], axis=1)
+            R = turned(self._grid.comm, p.area0, now, to) if len(axes) == d else np.eye(d)  # as what it carries does
+            force, gap = np.einsum("ij,njk,nk->ni", R, stress[at, :d, :d], p.area(points)), to - now
+            own = (p.area0 * v for v in (1, modulus[at], tension[at], resists[at], firm[at]))
+            each = np.stack([np.full(len(gap), number), *own], axis=1)
+            rows.append((p.cell, p.x, np.concatenate([each, gap, given, p.area(cut.points), force], axis=1)))
+        cell, x, values = gathered(self._grid, rows, 6 + 5 * d)
+        number, *own = values[:, :6].T
+        return HeldPoints(number.astype(np.int64), cell, *own, x, *np.split(values[:, 6:], [d, 3 * d, 4 * d], axis=1))
+
+    def _check_meeting(self, t: float) -> None:
+        """Refuse given displacements that differ where they meet: no body's stress is finite there."""
+        for one, other, axes, X in self._meeting:
+            jump = np.abs(self._given(one, t, X) - self._given(other, t, X))[:, axes].max(axis=1)
+            if jump.max(initial=0.0) > NEAR * self._grid.h.min():
+                what = f"{line(one)} and {line(other)}: differ by {jump.max():.3g} m at t = {t:g} s where they meet"
+                raise ValueError(f"{what}, at {X[jump.argmax()]}; must agree there, or leave two cells between them")
+
+    def _given(self, hold: Displacement, t: float, X: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the displacements (m, d), m, that a side is given at places X (m, d) of this process."""
+        return everywhere(self._grid, lambda: hold.at(t, X))
+
+    def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
+        """Return reactions of this value."""
+        return {"reactions": {name: np.full(self._grid.dim, value) for name in self._names}}
+
+    def reactions(self, loads: HoldLoads, at: At) -> dict[str, NDArray[np.float64]]:
+        """Return the forces (d,), N, by which each of them acts on the bodies at u."""
+        held, data, force = loads.held, loads.data, loads.pull(at.nodal)
+        self._warn(held, loads.row, data["direction"].argmax(axis=1), force)
+        number, force = held.number[loads.row], (loads.share.sum(axis=1) * force)[:, None] * data["direction"]
+        sums = np.stack([sum_by(number, column, len(self._holds)) for column in force.T], axis=1)
+        return dict(zip(self._names, self._grid.comm.allreduce(sums), strict=True))
+
+    def _warn(
+        self, held: HeldCells, row: NDArray[np.int64], axis: NDArray[np.int64], force: NDArray[np.float64]
+    ) -> None:
+        """Log a warning, once a condition, of forces that no change of the body's stress balances."""
+        for number, x in held.beyond(row, axis, force, self._warned):
+            self._warned.add(number)
+            why = "its reaction is an artefact; does something else hold it, or is the step too large?"
+            what = "%s: not where it is to be at %s: %s"
+            warn(self._grid.comm, what, line(self._holds[number][0]), x + self._grid.base, why)
+
+    def under_held(
+        self, ids: NDArray[np.int64], tracked: NDArray[np.float64], volume: NDArray[np.float64], corners: NDArray
+    ) -> NDArray[np.float64]:
+        """Return new corners (m, 2^d, d), m, of domains: prisms of their volume (m,) under faces that are held.
+
+        In axisymmetry the volume is the area in the plane.
+        A held face stays where its tracked corners are: put elsewhere it would be pulled back, all at once.
+        """
+        index = np.arange(2**self._grid.dim)
+        for _, faces, _ in self._holds:
+            held = np.flatnonzero(np.isin(ids, faces.id))
+            number = faces.face[np.searchsorted(faces.id, ids[held])]  # of a domain with two held faces the first
+            axis, end = (k[:, None] for k in np.divmod(number, 2))
+            outward = face_vectors(tracked[held], number)
+            depth = volume[held, None] * outward / (outward**2).sum(axis=1, keepdims=True)
+            face = index ^ ((index >> axis & 1 ^ end) << axis)  # of each corner: that on the face
+            there = np.take_along_axis(tracked[held], face[:, :, None], axis=1)
+            corners[held] = there - np.where((face != index)[:, :, None], depth[:, None], 0.0)
+        return corners
+
+
+class HoldLoads(Loads):
+    """Given displacements in a substep.
+
+    Parameters
+    ----------
+    acting
+        The conditions.
+    forms, data
+        Components that are given, with stiffness, direction and gap.
+    held
+        What holds them.
+    row : (m,)
+        Which of it each component is.
+    share : (m, 2^d)
+        Of its force on each node, but for what walls bear.
+    """
+
+    stiff = True
+
+    def __init__(
+        self,
+        acting: GivenDisplacements,
+        forms: HoldForms,
+        data: PointData,
+        held: HeldCells,
+        row: NDArray[np.int64],
+        share: NDArray[np.float64],
+    ):
+        self._acting, self._forms, self.data = acting, forms, data
+        self.held, self.row, self.share = held, row, share
+        self._d = data.points.grid.dim
+        self.key = self._d * row + data["direction"].argmax(axis=1)
+        self.under_held = acting.under_held
+
+    def pulls(self, b: NDArray[np.float64]) -> None:
+        """Add the forces towards the given displacements."""
+        self._forms.pull.assemble_vector(b, self.data)
+
+    def penalty(self, A: PETSc.Mat, walls: bool) -> None:
+        """Add the stiffness that holds them; what they count at walls is in `counted`."""
+        if not walls:
+            self._forms.hold.assemble_matrix(A, self.data)
+
+    def moved(self, u: fem.Function) -> Loads:
+        """Return given displacements that are off their place by so much more."""
+        data = self.data.having(gap=self.data["gap"][:, 0] - self._along(u.x.array.reshape(-1, self._d)))
+        return HoldLoads(self._acting, self._forms, data, self.held, self.row, self.share)
+
+    def _along(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the displacement (m,), m, of each component that is given, at nodal values u (nodes, d), m."""
+        at_nodes = u[self.data.points.grid.cell_nodes[self.data.cells]]
+        return np.einsum("mk,mkd,md->m", self.held.shape[self.row], at_nodes, self.data["direction"])
+
+    def pull(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the force (m,), N, along each component that is given, at nodal values u (nodes, d), m."""
+        return self.data["stiffness"][:, 0] * (self.data["gap"][:, 0] - self._along(u))
+
+    def counted(self, at: At) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Return degrees of freedom (n,), and forces (n,), N, on them that reactions count."""
+        dofs = (
+            self._d * self.data.points.grid.cell_nodes[self.data.cells] + self.data["direction"].argmax(axis=1)[:, None]
+        )
+        return dofs.ravel(), (self.share * self.pull(at.nodal)[:, None]).ravel()
+
+    def guess(self, parts: Parts, nodal: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """Return u with the rigid motions of the parts that given displacements turn; None where they turn none."""
+        grid = self.data.points.grid
+        if grid.axisymmetric:
+            return None
+        of, moved = parts.cells[self.data.cells], None
+        for part in np.flatnonzero(over_all(grid.comm, sum_by(of, np.ones(len(of)), parts.count))):
+            motion = rigid_motion(grid.comm, self.data, grid.node_x, of == part)
+            if motion is not None:
+                moved = nodal.copy() if moved is None else moved
+                moved[parts.nodes == part] = motion[parts.nodes == part]
+        return moved
+
+    def touching(self) -> tuple:
+        """Return cells, places and directions of what is held."""
+        return self.data.cells, None, self.data.x, self.data["direction"]
+
+    @property
+    def held_cells(self) -> NDArray[np.int32]:
+        """The cells of sides that are held."""
+        return self.data.cells
+
+    def rounding(self, of_cells: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return what rounding leaves: that of rigid sides with coordinates as well."""
+        grid = self.data.points.grid
+        held = np.zeros(grid.num_local)
+        np.maximum.at(held, self.data.cells, self.data["stiffness"][:, 0])
+        return of_cells + 4 * EPSILON * grid.reach * held
+
+    def outcome(self, at: At) -> dict[str, dict[str, NDArray[np.float64]]]:
+        """Return the reactions."""
+        return {"reactions": self._acting.reactions(self, at)}
+
+
+def held_faces(setting: Setting) -> list[tuple[Displacement, Surface, Sequence[int]]]:
+    """Return the given displacements of a stage with the faces at which they are imposed, and the axes along which."""
+    holds = [(hold, hold.axes(setting.grid.dim)) for hold in setting.of(Displacement).values()]
+    others = [[other for other, more in holds if other is not hold and set(axes) & set(more)] for hold, axes in holds]
+    return [(hold, setting.sides.held(hold, rest), axes) for (hold, axes), rest in zip(holds, others, strict=True)]

@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: MIT
+"""Terms of the user's own in the balance of momentum, in bodies and on sides: see `user_functions`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+from petsc4py import PETSc
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from numpy.typing import NDArray
+
+from mpm_dolfinx.base.validation import line
+from mpm_dolfinx.bodies.faces import Surface
+from mpm_dolfinx.conditions.acting import Acting, Loads, Place, Setting
+from mpm_dolfinx.conditions.conditions import OnSide
+from mpm_dolfinx.conditions.sides import gathered
+from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointForm
+from mpm_dolfinx.materials.user_functions import compiling, term_of
+
+
+class OwnTerm(NamedTuple):
+    """A term: as it was given, its points, its form, and the derivative of that by u if it depends on it."""
+
+    given: Callable | OnSide
+    points: FormPoints
+    form: PointForm
+    slope: PointForm | None
+
+
+class OwnTerms:
+    """The terms of a scene, for all of its stages.
+
+    Parameters
+    ----------
+    terms
+        Functions, or functions on sides.
+    pieces
+        All points of integration.
+    u
+        Increment of the displacement in the step, m.
+    t, dt : s
+        Time at the end of the substep, and time since the start of the step, UFL constants.
+    """
+
+    def __init__(
+        self, terms: Sequence[Callable | OnSide], pieces: FormPoints, u: fem.Function, t: fem.Constant, dt: fem.Constant
+    ):
+        self.symmetric, self.holding, self.rates, self._u = True, False, False, u
+        """Whether all tangents are symmetric; whether some depend on u, and on the velocity."""
+        # a rate is (u - past) / own: of backward Euler past is 0, and own the step
+        self._past, self._own = fem.Function(u.function_space), fem.Constant(pieces.grid.mesh, 1.0)
+        more = {"t": t, "dt": dt, "velocity": (u - self._past) / self._own}
+        v, du = ufl.TestFunction(u.function_space), ufl.TrialFunction(u.function_space)
+        self.terms: list[OwnTerm] = []
+        for term in terms:
+            on_side, d = isinstance(term, OnSide), pieces.grid.dim
+            points = FormPoints(pieces.grid, normal=(d,), position=(d,), displacement=(d,)) if on_side else pieces
+            form, potential = term_of(term.term if on_side else term, u, v, points=points, u=u, v=v, **more)
+            holds = u in form.coefficients()
+            with compiling(f"terms: {line(term)}", "linear in v, or an energy of u"):
+                slope = PointForm(ufl.derivative(form, u, du), points) if holds else None
+                self.terms.append(OwnTerm(term, points, PointForm(form, points), slope))
+            self.symmetric &= potential or not holds
+            self.holding |= holds
+            self.rates |= self._past in form.coefficients()
+
+    def set_rate(self, own: float, past: float) -> None:
+        """Set the rate at the end of a substep: time in which it counts, s, and share of the present u before it."""
+        self._own.value = own
+        if self.rates:
+            self._past.x.array[:] = past * self._u.x.array
+
+    def acting(self, setting: Setting) -> Acting:
+        """Return the terms in a stage."""
+        return OwnTermsOfStage(self.terms, setting)
+
+
+class OwnTermsOfStage(Acting):
+    """The terms in a stage: those on sides have faces."""
+
+    def __init__(self, terms: Sequence[OwnTerm], setting: Setting):
+        self._grid = setting.grid
+        self._terms = [
+            (term, setting.sides.of(term.given) if isinstance(term.given, OnSide) else None) for term in terms
+        ]
+
+    @property
+    def surfaces(self) -> list[Surface]:
+        """The faces."""
+        return [faces for _, faces in self._terms if faces is not None]
+
+    def placed(self, place: Place) -> Loads:
+        """Return the terms at the pieces, and at points of integration on sides."""
+        return OwnLoads([(term, self._data(term.points, faces, place)) for term, faces in self._terms])
+
+    def _data(self, of: FormPoints, faces: Surface | None, place: Place) -> PointData:
+        if faces is None:
+            return place.pieces.pieces
+        p = place.cut.surface(faces)
+        area, now = p.area(place.points), p.now(place.points)
+        size = np.linalg.norm(area, axis=1, keepdims=True)
+        rows = np.concatenate([size, area / size, now, now - p.origin(place.points)], axis=1)
+        cell, x, values = gathered(self._grid, [(p.cell, p.x, rows)], 1 + 3 * self._grid.dim)
+        normal, position, displacement = np.split(values[:, 1:], 3, axis=1)
+        return of.at(cell, x, values[:, 0], normal=normal, position=position, displacement=displacement)
+
+
+class OwnLoads(Loads):
+    """Terms in a substep, with their points."""
+
+    varies = True
+
+    def __init__(self, terms: Sequence[tuple[OwnTerm, PointData]]):
+        self._terms = terms
+        self.holding = any(term.slope is not None for term, _ in terms)
+        self.linear = not self.holding
+
+    def resists(self, b: NDArray[np.float64]) -> None:
+        """Add the terms at u."""
+        for term, data in self._terms:
+            term.form.assemble_vector(b, data)
+
+    def tangent(self, K: PETSc.Mat) -> None:
+        """Add their derivatives at u."""
+        for term, data in self._terms:
+            if term.slope is not None:
+                term.slope.assemble_matrix(K, data)

@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: MIT
+"""Rigid plates: an even traction, and a penalty on the slope of the side, kappa/2 int |grad_t u_n|^2 dA."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from petsc4py import PETSc
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from mpm_dolfinx.base.tolerances import NEAR
+from mpm_dolfinx.base.validation import line
+from mpm_dolfinx.bodies.faces import Surface
+from mpm_dolfinx.conditions.acting import Acting, Loads, Place, Setting
+from mpm_dolfinx.conditions.conditions import RIGIDITY, RigidPlate, Traction, facing, inward
+from mpm_dolfinx.conditions.sides import gathered
+from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointForm
+from mpm_dolfinx.grid.grid import Grid
+from mpm_dolfinx.mechanics.tractions import Tractions
+
+
+class PlateForms:
+    """Points under plates: what these resist a slope with, and what turns them back that are tilted."""
+
+    def __init__(self, grid: Grid, u: fem.Function):
+        self.points = p = FormPoints(grid, rigidity=(), normal=(grid.dim,), tilt=(grid.dim,))
+        v, du = ufl.TestFunction(u.function_space), ufl.TrialFunction(u.function_space)
+
+        def slope(w):
+            """Return the tangential gradient of the normal displacement, grad_t(w_n)."""
+            gradient = ufl.dot(p.normal, p.plane_grad(w))
+            return gradient - ufl.dot(gradient, p.normal) * p.normal
+
+        self.bend = PointForm(p.rigidity * ufl.inner(slope(du), slope(v)) * p.dx, p)
+        self.tilt = PointForm(-p.rigidity * ufl.inner(p.tilt, slope(v)) * p.dx, p)
+
+
+class Plates(Acting):
+    """The plates of a stage.
+
+    Parameters
+    ----------
+    setting, plates
+        Where they are put, and the plates by name.
+
+    Raises
+    ------
+    ValueError
+        The faces of a plate are not one flat side.
+    """
+
+    conditions = (RigidPlate,)
+
+    def __init__(self, setting: Setting, plates: Mapping[str, RigidPlate]):
+        self._grid, self._forms, self._materials = setting.grid, setting.forms, setting.materials
+        self._faces = [setting.sides.of(plate) for plate in plates.values()]
+        even: dict[str, Traction] = {}
+        for (name, plate), faces in zip(plates.items(), self._faces, strict=True):
+            area = faces.area0 * self._grid.around(faces.places().mean(axis=1))
+            even[name] = plate.traction(area.sum(), inward(faces))
+            _check_flat(plate, faces)
+        self._even = Tractions(setting, even)
+        self.surfaces = self._faces
+        self.held = [
+            (plate, faces, range(self._grid.dim)) for plate, faces in zip(plates.values(), self._faces, strict=True)
+        ]
+
+    def placed(self, place: Place) -> Loads:
+        """Return the plates on the surface, with their rigidity, normal and present tilt."""
+        d, rows, grid = self._grid.dim, [], self._grid
+        for faces in self._faces:
+            patches = place.cut.surface(faces)
+            area = patches.area(place.points)
+            length = faces.area0.sum() ** (1 / (d - 1))
+            rigidity = RIGIDITY * self._materials.stiffest * length * np.linalg.norm(area, axis=1, keepdims=True)
+            axis = facing(faces)[0]
+            normal = np.tile(np.eye(d)[axis], (len(area), 1))
+            tilt = normal - area / area[:, [axis]]  # slope of the face: its normal is (-slope, 1)
+            rows.append((patches.cell, patches.x, np.concatenate([rigidity, normal, tilt], axis=1)))
+        cell, x, values = gathered(grid, rows, 1 + 2 * d)
+        rigidity, normal, tilt = np.split(values, [1, 1 + d], axis=1)
+        forms = self._forms(PlateForms)
+        data = forms.points.at(cell, x, np.ones(len(cell)), rigidity=rigidity, normal=normal, tilt=tilt)
+        return PlateLoads(forms, data, self._even.placed(place))
+
+
+class PlateLoads(Loads):
+    """Plates in a substep; even: their tractions."""
+
+    stiff = True
+
+    def __init__(self, forms: PlateForms, data: PointData, even: Loads):
+        self._forms, self._data, self._even = forms, data, even
+
+    def dead(self, b: NDArray[np.float64]) -> None:
+        """Add the even tractions, and what turns plates back."""
+        self._even.dead(b)
+        self._forms.tilt.assemble_vector(b, self._data)
+
+    def penalty(self, A: PETSc.Mat, walls: bool) -> None:
+        """Add the stiffness against a slope."""
+        self._forms.bend.assemble_matrix(A, self._data)
+
+    def moved(self, u: fem.Function) -> Loads:
+        """Return plates that are tilted by so much more."""
+        data, d = self._data, self._data.points.grid.dim
+        slope = np.einsum("ni,nij->nj", data["normal"], data.gradients(u).reshape(-1, d, d))
+        slope = slope - (slope * data["normal"]).sum(axis=1, keepdims=True) * data["normal"]
+        return PlateLoads(self._forms, data.having(tilt=data["tilt"] + slope), self._even)
+
+    @property
+    def held_cells(self) -> NDArray[np.int32]:
+        """The cells under plates."""
+        return self._data.cells
+
+
+def _check_flat(plate: RigidPlate, faces: Surface) -> None:
+    """Refuse a plate on faces that are not one flat, connected side as seeded: each part would move by itself."""
+    corners, axis = faces.places(), facing(faces)[0]
+    tangential = np.arange(corners.shape[2]) != axis
+    low, high, height = corners.min(axis=1)[:, tangential], corners.max(axis=1)[:, tangential], corners[..., axis]
+    X, extent = (low + high) / 2, high - low
+    size = extent.max(axis=0)
+    apart = np.flatnonzero(np.abs(height - height[0, 0]).max(axis=1) > NEAR * size.min())
+    if not len(apart):
+        pairs = cKDTree(X / size).query_pairs(1 + NEAR, p=np.inf, output_type="ndarray")
+        i, j = pairs.T
+        pairs = pairs[(np.abs(X[i] - X[j]) <= (extent[i] + extent[j]) / 2 + NEAR * size).all(axis=1)]
+        graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(X), len(X)))
+        _, part = connected_components(graph, directed=False)
+        apart = np.flatnonzero(part != part[0])
+    if len(apart):
+        one, other = corners.mean(axis=1)[[0, apart[0]]]
+        where = "slope" if apart[0] == 0 else f"and {other} do not hang together at one height"
+        raise ValueError(
+            f"{line(plate)}: faces at {one} {where}, must be one flat side normal to an axis; "
+            "take a plate with a region for each"
+        )

@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: MIT
+"""The weight of the bodies: int rho g . v dV, and of the pore fluid that pores take up as they widen in the step."""
+
+from __future__ import annotations
+
+import ufl
+from dolfinx import fem
+from numpy.typing import NDArray
+
+from mpm_dolfinx.conditions.acting import Acting, Loads, Place, Setting
+from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointForm
+from mpm_dolfinx.mechanics.tractions import DeadLoads
+
+
+class Weight(Acting):
+    """The weight in a scene.
+
+    Parameters
+    ----------
+    pieces
+        All points of integration; they carry `density`, kg/m^3, at the start of the step.
+    u
+        Increment of the displacement in the step.
+    gravity : (d,), m/s^2
+        Acceleration, a UFL constant.
+    fluid_density : kg/m^3
+        Of the pore fluid; None without.
+    """
+
+    def __init__(self, pieces: FormPoints, u: fem.Function, gravity: fem.Constant, fluid_density: float | None):
+        pull = ufl.inner(gravity, pieces.value(ufl.TestFunction(u.function_space)))
+        self._dead, self._taken_up = PointForm(pieces.density * pull * pieces.dx, pieces), None
+        if fluid_density is not None:
+            grown = fem.Constant(pieces.grid.mesh, fluid_density) * (ufl.det(pieces.increment(u)) - 1)
+            self._taken_up = PointForm(-grown * pull * pieces.dx, pieces)
+
+    def acting(self, setting: Setting) -> Acting:
+        """Return the weight in a stage."""
+        return self
+
+    def placed(self, place: Place) -> Loads:
+        """Return the weight of the pieces."""
+        return DeadLoads(self._dead, place.pieces.pieces)
+
+    def taken_up(self, b: NDArray, pieces: PointData) -> None:
+        """Add minus the weight of what pores take up at u to the forces of the stresses."""
+        if self._taken_up is not None:
+            self._taken_up.assemble_vector(b, pieces)

@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: MIT
+"""Numerical options of a scene."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from mpm_dolfinx.solve.scheme import Scheme
+from mpm_dolfinx.stepping.time_integration import substeps
+
+QUADRATURES = ("domain", "point")
+
+
+@dataclass(frozen=True)
+class Numerics:
+    """Numerical options of a scene.
+
+    Parameters
+    ----------
+    quadrature
+        "domain": exact pieces of the points' domains; "point": at the points, as in standard MPM, of boxes, not in
+        axisymmetry.
+    coupling
+        How momentum and storage are coupled, one of `COUPLINGS`.
+    tolerance
+        Both residuals fall below this, relative to the forces and to the fluid that changes places; in (0, 1).
+    method
+        Of time integration: "sdirk2", of second order, or "backward-euler".
+    petsc_options
+        PETSc's options for the solvers, see `Scheme`.
+
+    Raises
+    ------
+    ValueError
+        Naming what is none that is allowed.
+    """
+
+    quadrature: str = "domain"
+    coupling: str = "schur-cg"
+    tolerance: float = 1e-8
+    method: str = "sdirk2"
+    petsc_options: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self):
+        if self.quadrature not in QUADRATURES:
+            raise ValueError(f"quadrature {self.quadrature!r}: must be {' or '.join(QUADRATURES)}")
+        substeps(self.method, True)
+        _ = self.scheme  # refuses what is none
+
+    @property
+    def scheme(self) -> Scheme:
+        """How the two problems are coupled, and how exactly they are solved."""
+        return Scheme(self.coupling, self.tolerance, petsc_options=self.petsc_options)
+
+
+DEFAULT = Numerics()
