@@ -17,9 +17,9 @@ On one process.
 
 from __future__ import annotations
 
-import logging
 import signal
 import time
+import warnings
 from collections import Counter
 from dataclasses import asdict, dataclass, fields
 from math import isnan, nan
@@ -73,31 +73,14 @@ def hang(*_) -> None:
     raise Hung
 
 
-class Warnings(logging.Handler):
-    """What the package warns of in a `with` block."""
-
-    def __init__(self):
-        super().__init__(logging.WARNING)
-        self.said: list[str] = []
-
-    def emit(self, record: logging.LogRecord) -> None:
-        self.said.append(record.getMessage())
-
-    def __enter__(self) -> Warnings:
-        logging.getLogger("mpm_dolfinx").addHandler(self)
-        return self
-
-    def __exit__(self, *_) -> None:
-        logging.getLogger("mpm_dolfinx").removeHandler(self)
-
-
 def judge(row: Row, make: Make, bound: float, rtol: float | None = None) -> Row:
     """Run a case and fill in its row; with `rtol` in steps chosen by their error, none longer than the scene's."""
     signal.signal(signal.SIGPROF, hang)
     signal.setitimer(signal.ITIMER_PROF, LIMIT)
     began, result = time.process_time(), mpm.Result()
     try:
-        with Warnings() as warnings:
+        with warnings.catch_warnings(record=True) as warned:
+            warnings.simplefilter("always", mpm.ResultWarning)
             scene = make()
             dt = scene.end / scene.steps
             steps = {"dt": dt} if rtol is None else {"rtol": rtol, "max_step": dt, "t_eval": [scene.end]}
@@ -115,8 +98,9 @@ def judge(row: Row, make: Make, bound: float, rtol: float | None = None) -> Row:
         setattr(row, name, getattr(result, name))
     if row.outcome in ("converged", "recovered"):
         check(row, scene, result, bound)
-        if row.outcome == "wrong" and warnings.said and row.error > bound:
-            row.outcome, row.note = "warned", "; ".join(warnings.said)
+        said = [str(one.message) for one in warned if issubclass(one.category, mpm.ResultWarning)]
+        if row.outcome == "wrong" and said and row.error > bound:
+            row.outcome, row.note = "warned", "; ".join(said)
     return row
 
 

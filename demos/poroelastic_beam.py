@@ -152,7 +152,7 @@ def main(argv: list[str] | None = None) -> dict:
             result = simulation.run(o.t_end, **output_times(o), probes=probes, observe=observers)
         except mpm.GaveUp as error:  # what was found until then is shown
             failure, result = error, error.result
-        result = replace(result, rows=tuple(r._replace(displacement=r.displacement[:, [0, -1]]) for r in result.rows))
+        result = replace(result, rows=[r._replace(displacement=r.displacement[:, [0, -1]]) for r in result.rows])
         out |= summary(simulation, result)
         fem = reference(o, result, axis - [0, bottom]) if o.reference else None
         if common.first():
@@ -170,8 +170,8 @@ def reference(o: Namespace, result: mpm.Result, axis: np.ndarray) -> mpm.Result:
     """Return the finite elements' result at the times of another, of the places (n, 2), m, of the beam's axis."""
     fem = BiotFEM([0, 0], [LENGTH, HEIGHT], REFERENCE_CELLS, material(o), **physics(o))
     found = fem.run(o.t_end, o.dt / 4, probes=axis, progress=True)
-    at = [int(np.argmin(np.abs(np.array(found.t) - t))) for t in result.t]
-    return replace(found, rows=tuple(found.rows[k] for k in at))
+    at = [int(np.argmin(np.abs(found.t - t))) for t in result.t]
+    return replace(found, rows=[found.rows[k] for k in at])
 
 
 def summary(simulation: mpm.Simulation, result: mpm.Result) -> dict:
@@ -179,7 +179,7 @@ def summary(simulation: mpm.Simulation, result: mpm.Result) -> dict:
     comm = simulation.grid.comm
     return {
         "tip": [[t, *map(float, u[-1])] for t, u in zip(result.t[1:], result.displacement[1:], strict=True)],
-        "p_range": [[t, *map(float, p)] for t, p in zip(result.t[1:], result.pressure[1:], strict=False)],
+        "p_range": [[t, *map(float, p)] for t, p in zip(result.t[1:], result.pressure[1:], strict=True) if len(p)],
         "wall_s": result.wall,
         "jit_s": simulation.jit,
         "steps": result.steps,

@@ -15,9 +15,11 @@ SI units throughout, or any that are consistent (`Fluid`).  Stress is positive i
 
 from mpm_dolfinx.base import _environment  # noqa: F401 - first: it says what is missing
 from mpm_dolfinx.base.errors import LeftGrid, NotConverged
-from mpm_dolfinx.bodies.bodies import mapped
+from mpm_dolfinx.base.report import Report
+from mpm_dolfinx.bodies.bodies import Body, mapped
 from mpm_dolfinx.bodies.boxes import box, shape
 from mpm_dolfinx.bodies.mesh_files import from_mesh
+from mpm_dolfinx.bodies.meshes import MeshBody
 from mpm_dolfinx.bodies.polygon import polygon
 from mpm_dolfinx.conditions.acting import Acting, Loads
 from mpm_dolfinx.conditions.conditions import (
@@ -32,7 +34,8 @@ from mpm_dolfinx.conditions.conditions import (
 )
 from mpm_dolfinx.conditions.water import water
 from mpm_dolfinx.contact.groups import Contact
-from mpm_dolfinx.contact.tools import Ball, Cone, Convex, HalfSpace, Tool
+from mpm_dolfinx.contact.shapes import Ball, Cone, Convex, HalfSpace, Shape
+from mpm_dolfinx.contact.tool import Pose, Tool
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.io.checkpoint import Checkpoint, resume
 from mpm_dolfinx.io.one_file import one_file
@@ -52,13 +55,18 @@ from mpm_dolfinx.materials.skeleton import (
     unsaturated,
 )
 from mpm_dolfinx.materials.softening import SofteningDruckerPrager
-from mpm_dolfinx.probing.probes import probes
+from mpm_dolfinx.parallel.messages import ConditionWarning, ResolutionWarning, ResultWarning, set_log_level
+from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.probing.cell_fields import CellFields
+from mpm_dolfinx.probing.point_fields import PointFields
+from mpm_dolfinx.probing.probes import Probes, probes
 from mpm_dolfinx.simulation.simulation import Simulation
 from mpm_dolfinx.simulation.strength_reduction import Safety, factor_of_safety
-from mpm_dolfinx.solve.scheme import COUPLINGS
+from mpm_dolfinx.solve.scheme import COUPLINGS, Scheme
 from mpm_dolfinx.stepping.numerics import Numerics
 from mpm_dolfinx.stepping.result import GaveUp, Result
 from mpm_dolfinx.stepping.state import State
+from mpm_dolfinx.stepping.tangent import Tangent
 from mpm_dolfinx.verification.element_test import ElementTest, element_test
 
 __version__ = "0.1.0"
@@ -67,7 +75,10 @@ __all__ = [
     "K0",
     "Acting",
     "Ball",
+    "Body",
+    "CellFields",
     "Checkpoint",
+    "ConditionWarning",
     "Cone",
     "Contact",
     "Convex",
@@ -85,21 +96,32 @@ __all__ = [
     "LeftGrid",
     "LinearElastic",
     "Loads",
+    "MaterialPoints",
+    "MeshBody",
     "ModifiedCamClay",
     "MohrCoulomb",
     "NeoHookean",
     "NotConverged",
     "Numerics",
     "OnSide",
+    "PointFields",
+    "Pose",
     "Pressure",
+    "Probes",
+    "Report",
+    "ResolutionWarning",
     "Result",
+    "ResultWarning",
     "RigidPlate",
     "Safety",
+    "Scheme",
+    "Shape",
     "Simulation",
     "Skeleton",
     "SofteningDruckerPrager",
     "Source",
     "State",
+    "Tangent",
     "Tool",
     "Traction",
     "Writer",
@@ -114,6 +136,7 @@ __all__ = [
     "polygon",
     "probes",
     "resume",
+    "set_log_level",
     "shape",
     "unsaturated",
     "water",

@@ -4,4 +4,20 @@
 import sys
 from pathlib import Path
 
+import pytest
+
+import mpm_dolfinx as mpm
+
 sys.path.insert(0, str(Path(__file__).parent.parent / "demos"))
+
+
+@pytest.fixture
+def warned(recwarn):
+    """Return a function that gives the messages of the package's warnings since it was called last."""
+
+    def messages():
+        found = [str(one.message) for one in recwarn if issubclass(one.category, mpm.ResultWarning)]
+        recwarn.clear()
+        return found
+
+    return messages

@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: MIT
 """What only one of several processes can see is refused by all, in the same words."""
 
+import warnings
+from dataclasses import replace
+
 import numpy as np
 
 import mpm_dolfinx as mpm
@@ -55,3 +58,19 @@ try:
 except ValueError as error:
     message = str(error)
 assert message == "dt = 0.1 on process 0, 0.2 on process 1, must be the same on all", message
+
+mine = [mpm.box(grid, [0, 0.2], [0.3, 0.5]), mpm.box(grid, [0.5, 0.2], [0.8, 0.5])]
+simulation = mpm.Simulation(grid, mine, [mpm.Hencky(bulk=1e6, shear=6e5)], walls={"left": "xy", "right": "xy"})
+points = simulation.points
+left = np.where(points.id < len(mine[0]), 0.0, 0.4)[:, None] * [1, 0]
+moved = replace(points, corners=points.corners - left[:, None], x=points.x - left)
+before = simulation.state = replace(simulation.state, points=moved)
+try:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", mpm.ResultWarning)
+        simulation.step(1.0)
+    message = "accepted"
+except mpm.ResolutionWarning as error:
+    message = str(error)
+said = grid.comm.allgather(message)
+assert "overlap" in message and len(set(said)) == 1 and simulation.state is before, said

@@ -38,7 +38,7 @@ def test_the_fluid_s_compressibility_as_beta_diverges_and_says_so():
     before = s.points
     with pytest.raises(mpm.GaveUp, match=r"gave up at t = 0 s with dt = .* diverges \(beta is below") as caught:
         s.run(0.08, 0.02)
-    assert len(caught.value.history) > 2 and caught.value.result.t == [0.0]
+    assert len(caught.value.history) > 2 and caught.value.result.t.tolist() == [0.0]
     assert (s.points.corners == before.corners).all() and s.t == 0, "the last good state is lost"
 
 
@@ -65,7 +65,7 @@ def test_a_step_that_does_not_converge_is_cut_and_grows_again():
     whole, _ = beam(fluid=False, ramp=1.0)
     reference = whole.run(1.0, 0.1, probes=probe).displacement[-1]
     assert result.converged and result.cuts > 0
-    assert 3 < result.steps < 30 and result.t == [0, 1, 2, 3]
+    assert 3 < result.steps < 30 and result.t.tolist() == [0, 1, 2, 3]
     assert result.displacement[-1] == pytest.approx(reference, rel=2e-3)
 
 

@@ -52,6 +52,7 @@ QUICK = {
     "footing": ("--cells 3 --depth 0.1", ["footing.png", "footing.gif"]),
     "benchmark_beam": ("--h 0.05 --t-end 0.1 --repeat 1", []),
     "benchmark_pruning": ("--quick", ["pruning.md"]),
+    "calibrate": ("--quick", ["calibration.md"]),
     "scaling": ("--quick --dims 2 --processes 1 2", ["scaling.png", "scaling.csv", "scaling.md"]),
 }
 LONG = {"cavity", "footing", "slope", "image"}  # what they show has tests of its own, or takes long to compile

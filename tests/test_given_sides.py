@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: MIT
 """Given displacements: on curved and slanted sides, beside walls and each other, and what is said where they fail."""
 
-import logging
 import sys
 from dataclasses import replace
 
@@ -166,22 +165,17 @@ def test_a_motion_that_a_wall_forbids_is_refused():
     assert on_top((0, 2, (0, 0)), side="bottom").run(1, 1).converged
 
 
-def said(caplog):
-    return [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
-
-
-def test_a_side_that_something_else_holds_is_named(caplog):
+def test_a_side_that_something_else_holds_is_named(warned):
     s = on_top((0, 0.97, (0, 0)), (1.0, 2, lambda t, X: (0, -0.02 * t)))  # they share a cell, and do not meet
     s.run(1, 0.5)
-    messages = said(caplog)
+    messages = warned()
     assert messages and all("not where it is to be at [" in m and "artefact" in m for m in messages)
     assert len(set(messages)) == 2  # each once
-    caplog.clear()
     on_top((0, 0.8, (0, 0)), (1.0, 2, lambda t, X: (0, -0.02 * t))).run(1, 0.5)
-    assert not said(caplog)
+    assert not warned()
 
 
-def test_a_side_that_comes_to_lie_on_a_grid_line_is_not_named(caplog):
+def test_a_side_that_comes_to_lie_on_a_grid_line_is_not_named(warned):
     """There it is held in the cells above the line and below, by forces up to the limit that balance each other."""
     h, edge, loads = 1 / 9, 4 / 9, []
     grid = mpm.Grid(lower=[0, -10 * h], upper=[18 * h, 3 * h], cells=[18, 13])
@@ -189,10 +183,10 @@ def test_a_side_that_comes_to_lie_on_a_grid_line_is_not_named(caplog):
     strip = mpm.Displacement("top", lambda t, X: (0, -9 / 28 * h * t), region=((0, -9), (edge, 9)))
     s = mpm.Simulation(grid, [body], [footing.SOIL], walls=WALLS, conditions=[strip], fluid=mpm.Fluid())
     s.run(1.0, 1 / 9, observe=lambda s: loads.append(-s.reactions.array[0, 1]), progress=False)
-    assert not said(caplog) and loads[-1] == pytest.approx(2 * loads[-2] - loads[-3], rel=0.01)
+    assert not warned() and loads[-1] == pytest.approx(2 * loads[-2] - loads[-3], rel=0.01)
 
 
-def test_bodies_that_overlap_are_named(caplog):
+def test_bodies_that_overlap_are_named(warned):
     grid = mpm.Grid([0, 0], [1, 1], [10, 10])
     bodies = [mpm.box(grid, [0, 0], [1, 0.3]), mpm.box(grid, [0, 0.5], [1, 0.8])]
     s = mpm.Simulation(grid, bodies, [SOFT], walls=WALLS)
@@ -201,7 +195,7 @@ def test_bodies_that_overlap_are_named(caplog):
     moved = replace(points, corners=points.corners - down[:, None], x=points.x - down)
     s.state = replace(s.state, points=moved)
     s.run(1.0, 0.5)
-    (message,) = said(caplog)
+    (message,) = warned()
     assert "filled to 200 %" in message and "bodies 0, 1 overlap" in message
 
 

@@ -217,11 +217,9 @@ def settled(ratio, offset, thickness=1):
     ("ratio", "offset", "thickness", "lost"),
     [(10, 0.5, 1, 0.736), (100, 0.5, 1, 0.97), (100, 0.25, 1, 0.96), (10, 0.5, 4, 0.184), (0.01, 0.5, 1, 0.109)],
 )
-def test_a_soft_layer_off_the_grid_lines_is_named_once_with_what_it_loses(ratio, offset, thickness, lost, caplog):
-    with caplog.at_level("WARNING", "mpm_dolfinx"):
-        error = 1 - settled(ratio, offset, thickness)
-    (record,) = caplog.records
-    message = record.getMessage()
+def test_a_soft_layer_off_the_grid_lines_is_named_once_with_what_it_loses(ratio, offset, thickness, lost, warned):
+    error = 1 - settled(ratio, offset, thickness)
+    (message,) = warned()
     contrast = max(ratio, 1 / ratio)
     assert "bodies 0 and 1" in message and f"up to {contrast:g} times" in message and "grid lines" in message
     assert f"material {int(ratio > 1)}" in message
@@ -232,7 +230,7 @@ def test_a_soft_layer_off_the_grid_lines_is_named_once_with_what_it_loses(ratio,
 
 
 @pytest.mark.parametrize(("dim", "rings", "order"), [(2, False, -1), (3, False, 1), (2, True, -1)])
-def test_a_soft_layer_is_named_in_space_and_in_rings_and_in_any_order(dim, rings, order, caplog):
+def test_a_soft_layer_is_named_in_space_and_in_rings_and_in_any_order(dim, rings, order, warned):
     grid = mpm.Grid([0] * dim, [*[2 * H] * (dim - 1), 1.2], [*[2] * (dim - 1), 12], axisymmetric=rings)
     soft, flat = mpm.Hencky(bulk=SAND.bulk / 10, shear=SAND.shear / 10), [0] * (dim - 1)
     ends = pairwise((0, 3.5 * H, 4.5 * H, 1))
@@ -242,25 +240,24 @@ def test_a_soft_layer_is_named_in_space_and_in_rings_and_in_any_order(dim, rings
     load = mpm.Traction(top, (*flat, -1.0), ([*flat, 0.99], [9] * dim))
     s = mpm.Simulation(grid, bodies[::order], [SAND, soft], walls=walls, conditions=[load])
     s.step(1.0)
-    (record,) = caplog.records
-    assert "material 1, up to 10 times as soft" in record.getMessage() and "about 74 %" in record.getMessage()
+    (message,) = warned()
+    assert "material 1, up to 10 times as soft" in message and "about 74 %" in message
     exact = (1 + 9 * H) / SAND.oedometric
     assert (1 - s.points.corners[:, :, -1].max()) / exact == pytest.approx((1 + 9 * H - 0.736 * 10 * H) / 1.9, rel=0.01)
 
 
-def test_a_soft_layer_whose_interfaces_move_on_is_named_again(caplog):
+def test_a_soft_layer_whose_interfaces_move_on_is_named_again(warned):
     """A column that shrinks by 3 % carries them from grid lines to 0.3 cells off: it loses 11 %, then half."""
     soft = mpm.Hencky(bulk=SAND.bulk / 10, shear=SAND.shear / 10)
     load = [mpm.Traction("top", lambda t: (0, -2e5 * t), ([0, 1], [H, 1]))]
     s = column([(0.5, 0.6)], [SAND, soft], conditions=load)
     s.run(1.0, 0.05, progress=False)
-    said = [float(record.getMessage().split("about ")[1].split(" %")[0]) for record in caplog.records]
+    said = [float(message.split("about ")[1].split(" %")[0]) for message in warned()]
     assert said[0] < 15 and said[-1] > 40
     assert (np.diff(np.log2(said)) > 0.95).all()
 
 
 @pytest.mark.parametrize(("ratio", "offset"), [(100, 0.0), (100, 1e-3), (2, 0.5), (0.5, 0.5)])
-def test_layers_that_lose_little_are_not_named(ratio, offset, caplog):
-    with caplog.at_level("WARNING", "mpm_dolfinx"):
-        assert settled(ratio, offset) == pytest.approx(1, abs=0.031)
-    assert not caplog.records
+def test_layers_that_lose_little_are_not_named(ratio, offset, warned):
+    assert settled(ratio, offset) == pytest.approx(1, abs=0.031)
+    assert not warned()

@@ -173,7 +173,7 @@ def test_a_load_drags_a_tool_as_far_as_friction_holds_it():
         sunk, drag = lambda t: (0, -0.02 * min(t, 1)), lambda t, most=most: most * max(0.0, t - 1)
         s = layer(mpm.Tool(block, displacement=sunk, load=drag, direction=(1, 0), friction=0.3))
         if slips:
-            with pytest.raises(mpm.GaveUp, match=r"is pushed by 1[23].* N and meets 1.* N, a cell farther too"):
+            with pytest.raises(mpm.GaveUp, match=r"is pushed by 1[23].* N and meets 1.* N, however far it goes"):
                 s.run(2.0, 0.25)
         else:
             s.run(2.0, 0.25)
@@ -214,7 +214,7 @@ def test_a_load_that_soil_cannot_bear_is_refused_and_what_it_bore_is_kept():
     s, seen = layer(pushed(lambda t: 4e3 * t, base), material=clay), []
     with pytest.raises(mpm.GaveUp):
         s.run(2.0, 0.25, observe=lambda s: seen.append(-s.tool_forces.array[0, 1]))
-    assert 2e3 < seen[-1] < 4e3  # (2 + pi) c times half the width is 2.6e3
+    assert 2e3 * (1 - 1e-6) < seen[-1] < 4e3  # (2 + pi) c times half the width is 2.6e3
 
 
 def test_a_load_pushes_along_the_axis_and_in_space():

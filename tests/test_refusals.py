@@ -356,7 +356,7 @@ def test_a_full_disk_loses_nothing(what, tmp_path, small_disk):
         assert mpm.resume(scene([mpm.box(grid, [0, 0.2], [0.1, 0.4])], **LOAD), checkpoint.file).t[-1] == 0.5
     small_disk()
     result = s.run(1.0, 0.25, observe=observer, progress=False, after=s.result)
-    assert result.t == [0, 0.25, 0.5, 0.75, 1] and result.converged
+    assert result.t.tolist() == [0, 0.25, 0.5, 0.75, 1] and result.converged
 
 
 @pytest.mark.parametrize(

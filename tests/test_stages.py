@@ -72,19 +72,17 @@ def test_the_top_of_what_is_left_is_a_side():
 
 
 @pytest.mark.parametrize("remove, area", [([1], 0.8), ([1, 2], 1.0)])
-def test_a_condition_that_moves_on_to_what_an_excavation_lays_bare_is_named(caplog, remove, area):
+def test_a_condition_that_moves_on_to_what_an_excavation_lays_bare_is_named(warned, remove, area):
     grid = mpm.Grid([0, 0], [1.0, 1.4], [10, 14])
     bodies = [mpm.box(grid, *part) for part in (([0, 0], [1, 0.5]), ([0, 0.5], [0.8, 1]), ([0.8, 0.5], [1, 1]))]
     load = [mpm.Traction("top", (0, -1e3), region=((0, 0), (0.9, 2))), mpm.Traction("top", (0, -1e3))]
     s = mpm.Simulation(grid, bodies, [DENSE], walls=WALLS, conditions=[*load[1:]])
-    with caplog.at_level("WARNING", "mpm_dolfinx"):
-        s.stage(remove=remove)
-    (record,) = caplog.records
-    assert "Traction(side='top'" in record.getMessage() and f"on {area:.3g} m^1 that were" in record.getMessage()
-    caplog.clear()
+    s.stage(remove=remove)
+    (message,) = warned()
+    assert "Traction(side='top'" in message and f"on {area:.3g} m^1 that were" in message
     other = mpm.Simulation(grid, bodies, [DENSE], walls=WALLS, conditions=[*load[1:]])
     other.stage(remove=remove, conditions=[replace(one) for one in load])
-    assert not caplog.records, "they were given anew"
+    assert not warned(), "they were given anew"
 
 
 def test_a_fill_loads_what_lies_below():

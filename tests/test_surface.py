@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: MIT
 """Where bodies touch they have no surface: free parts of faces, exact for boxes, after the maps of bent bodies."""
 
-import logging
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -196,19 +194,15 @@ def test_a_plate_lies_on_the_body_as_it_is_bent():
     assert scene(grid, [sheared], conditions=plate).run(1.0, 1.0, progress=False).converged
 
 
-def test_bodies_that_do_not_touch_and_yet_will_stick_are_named_with_their_distance(caplog):
+def test_bodies_that_do_not_touch_and_yet_will_stick_are_named_with_their_distance(warned):
     grid = mpm.Grid([0, 0], [4.0, 4.0], [8, 8])
     below = mpm.box(grid, [0, 0], [4, 1])
 
     def warnings(low):
-        caplog.clear()
-        with caplog.at_level(logging.WARNING, "mpm_dolfinx"):
-            scene(grid, [below, mpm.box(grid, [1, low], [2, 2])])
-        return [r.getMessage() for r in caplog.records]
+        scene(grid, [below, mpm.box(grid, [1, low], [2, 2])])
+        return warned()
 
     assert "bodies 0 and 1: 0.4 cells apart at" in warnings(1.2)[0]
     assert warnings(1.0) == [] and warnings(1.6) == []
-    caplog.clear()
-    with caplog.at_level(logging.WARNING, "mpm_dolfinx"):
-        scene(grid, [below, mpm.box(grid, [0, 1], [4, 1.2]), mpm.box(grid, [1, 1.2], [2, 2])])
-    assert not caplog.records, "what lies between holds them apart"
+    scene(grid, [below, mpm.box(grid, [0, 1], [4, 1.2]), mpm.box(grid, [1, 1.2], [2, 2])])
+    assert not warned(), "what lies between holds them apart"

@@ -13,7 +13,7 @@ import mpm_dolfinx as mpm
 from mpm_dolfinx.base.report import Report
 from mpm_dolfinx.simulation import simulation
 from mpm_dolfinx.simulation.step_size import StepSize
-from mpm_dolfinx.stepping.result import Result
+from mpm_dolfinx.stepping.step_control import StepControl
 from mpm_dolfinx.stepping.time_integration import METHODS
 from mpm_dolfinx.verification.exact import terzaghi_consolidation
 
@@ -115,7 +115,7 @@ def test_a_step_that_makes_a_law_meaningless_is_shortened():
     assert np.isinf(report.history).any() and 0.475 < s.points.J.min() < 0.6  # ln J / J = -1.5 at 0.475
 
 
-def test_a_run_takes_a_step_by_backward_euler_before_it_gives_up(monkeypatch, caplog):
+def test_a_run_takes_a_step_by_backward_euler_before_it_gives_up(monkeypatch, warned):
     s, tried = loaded(100.0, cells=2, conditions=[OPEN]), []
 
     def step(scene, state, dt, how=()):
@@ -127,8 +127,8 @@ def test_a_run_takes_a_step_by_backward_euler_before_it_gives_up(monkeypatch, ca
     so_far = simulation.step
     monkeypatch.setattr(simulation, "step", step)
     result = s.run(3.0, 1.0, progress=False)
-    assert result.t == [0, 1, 2, 3] and result.cuts > 5 and [dt for dt, count in tried if count == 1] == [1.0]
-    assert "a step of 1 s by backward Euler" in caplog.text
+    assert result.t.tolist() == [0, 1, 2, 3] and result.cuts > 5 and [dt for dt, count in tried if count == 1] == [1.0]
+    assert "a step of 1 s by backward Euler" in warned()[0]
     monkeypatch.setattr("mpm_dolfinx.simulation.timeloop.EULER", METHODS["sdirk2"])
     with pytest.raises(mpm.GaveUp, match=r"gave up at t = 0 s .*no such step"):
         again = loaded(100.0, cells=2, conditions=[OPEN])
@@ -231,7 +231,7 @@ def test_output_times_are_hit_whatever_the_steps():
     result = loaded(100.0, conditions=[OPEN]).run(
         300.0, rtol=1e-3, t_eval=times, observe=lambda s: seen.append(s.t), progress=False
     )
-    assert result.t == [0.0, *times, 300.0] and seen == result.t[1:] and result.converged
+    assert result.t.tolist() == [0.0, *times, 300.0] == [0.0, *seen] and result.converged
     assert result.steps > 10
 
 
@@ -293,7 +293,7 @@ def test_no_step_is_longer_than_asked_at_the_end_or_where_a_run_goes_on():
     options = {"rtol": 0.1, "observe": lambda s: times.append(s.t), "progress": False}
     with pytest.raises(KeyboardInterrupt):
         s.run(500.0, **options | {"observe": Stop(3)})
-    assert s.result.small > 2.0
+    assert s.state.control.small > 2.0
     times.append(s.t)
     s.run(s.t + 4.05, **options, max_step=2.0, after=s.result)
     assert len(times) == 4 and np.diff(times).max() <= 2.0 * (1 + 1e-9)
@@ -322,7 +322,7 @@ def test_a_run_with_steps_by_their_error_resumes_with_the_same_bits(tmp_path):
     again = resumed.run(0.3, rtol=5e-3, t_eval=times, after=mpm.resume(resumed, file), progress=False)
     assert np.array_equal(resumed.points.corners, whole.points.corners)
     assert np.array_equal(resumed.points.pressure, whole.points.pressure)
-    assert (again.t, again.steps, again.rejected) == (end.t, end.steps, end.rejected)
+    assert np.array_equal(again.t, end.t) and (again.steps, again.rejected) == (end.steps, end.rejected)
 
 
 BAD = {
@@ -367,36 +367,36 @@ class Stop:
             raise KeyboardInterrupt
 
 
-def driven(fails: Callable[[int, float], bool], intervals: int) -> tuple[Result, list[float]]:
-    """Return the histories of equal steps, of which those fail that `fails` tells by interval and length, and these."""
-    rule, result, taken = StepSize(1.0, 1.0), Result(small=1.0), []
+def driven(fails: Callable[[int, float], bool], intervals: int) -> tuple[int, StepControl, list[float]]:
+    """Return cuts, memory and lengths of equal steps, of which those fail that `fails` tells by interval and length."""
+    rule, control, cuts, taken = StepSize(1.0, 1.0), StepControl(small=1.0), 0, []
     for interval in range(intervals):
         left = 1.0
         while left > 1e-9:
-            length = rule.fitted(left, result.small)
+            length = rule.fitted(left, control.small)
             if fails(interval, length):
-                result = rule.cut(length, result)
+                control, cuts = rule.cut(length, control), cuts + 1
             else:
                 taken.append(length)
-                result = rule.grown(length, Report(), result, failed=False)
+                control = rule.grown(length, Report(), control, failed=False)
                 left -= length
-    return result, taken
+    return cuts, control, taken
 
 
 def test_a_step_that_fails_once_is_cut_and_grows_at_once():
-    result, taken = driven(lambda k, length: k == 3 and length == 1.0, 6)
-    assert result.cuts == 1 and taken == [1, 1, 1, 0.5, 0.5, 1, 1] and result.waits == 0
+    cuts, control, taken = driven(lambda k, length: k == 3 and length == 1.0, 6)
+    assert cuts == 1 and taken == [1, 1, 1, 0.5, 0.5, 1, 1] and control.waits == 0
 
 
 def test_steps_whose_growth_fails_again_and_again_wait_longer_and_longer():
-    result, taken = driven(lambda k, length: length > 0.3, 100)
-    assert result.cuts <= 12 and len(taken) == 400
-    _, only_at_first = driven(lambda k, length: k < 20 and length > 0.3, 100)
+    cuts, _, taken = driven(lambda k, length: length > 0.3, 100)
+    assert cuts <= 12 and len(taken) == 400
+    *_, only_at_first = driven(lambda k, length: k < 20 and length > 0.3, 100)
     assert only_at_first[-50:] == [1.0] * 50, "and grow back"
 
 
 def test_what_is_as_sudden_in_every_step_is_no_jump_of_the_loads():
-    rule, found = StepSize(1.0, 1.0), Result(change=100.0)
+    rule, found = StepSize(1.0, 1.0), StepControl(change=100.0)
     report = Report(first=10.0, sudden=10.0)
     assert rule.refused(1.0, report, found) == 0.5 and rule.next(0.5, report, replace(found, small=0.5), False) == 0.5
     again = replace(found, first=10.0, small=0.5)  # Pa/s, in the step before

@@ -69,24 +69,23 @@ def test_a_column_under_gravity_consolidates_alike_in_all_units(name):
 
 
 @pytest.mark.parametrize("name", OTHERS)
-def test_without_gravity_the_fluid_says_under_which_conductivities_are(name, caplog):
+def test_without_gravity_the_fluid_says_under_which_conductivities_are(name, warned):
     units, want = OTHERS[name], column(Units())
-    assert not caplog.records
+    assert not warned()
     assert column(units, water=units.fluid(gravity=9.81 * units.gravity)) == pytest.approx(want, rel=1e-6)
-    assert not caplog.records
+    assert not warned()
     column(units)
-    (message,) = (r.getMessage() for r in caplog.records)
+    (message,) = warned()
     assert "no liquid in SI units" in message and "give Fluid(gravity=...)" in message
 
 
 @pytest.mark.parametrize("grows", [True, False], ids=["grows", "as a function"])
-def test_a_gravity_of_time_that_comes_to_another_strength_is_named_once(grows, caplog):
+def test_a_gravity_of_time_that_comes_to_another_strength_is_named_once(grows, warned):
     units = OTHERS["mm, N, s"]
     ramp = lambda t: min(1.0, t / 15) if grows else 1.0  # noqa: E731
     for unit, water, said in ((Units(), None, 0), (units, None, 1), (units, units.fluid(gravity=9810.0), 0)):
-        caplog.clear()
         column(unit, water=water, gravity=lambda t, unit=unit: (0, -9.81 * unit.gravity * ramp(t)))
-        messages = [r.getMessage() for r in caplog.records if "as gravity changes with time" in r.getMessage()]
+        messages = [message for message in warned() if "as gravity changes with time" in message]
         assert len(messages) == said
 
 
@@ -108,7 +107,7 @@ def test_fluids_know_their_unit_weight():
 
 
 @pytest.mark.parametrize("name", OTHERS)
-def test_water_on_sides_and_levels_weigh_what_the_pore_fluid_does(name, caplog):
+def test_water_on_sides_and_levels_weigh_what_the_pore_fluid_does(name, warned):
     """They had 9810 for any fluid, and in any units."""
     found = []
     for units in (Units(), OTHERS[name]):
@@ -117,7 +116,7 @@ def test_water_on_sides_and_levels_weigh_what_the_pore_fluid_does(name, caplog):
         water = {"conditions": [push, head], "pressure": level, "gravity": (0, -9.81 * units.gravity)}
         found.append(column(units, **water))
     assert found[1] == pytest.approx(found[0], rel=1e-6)
-    assert not any("unit_weight" in r.getMessage() for r in caplog.records)
+    assert not any("unit_weight" in message for message in warned())
 
 
 def test_a_unit_weight_that_is_given_stays():
@@ -141,11 +140,11 @@ def test_a_unit_weight_that_is_given_stays():
 
 
 @pytest.mark.parametrize(("g", "said"), [(9.81, 0), (9810.0, 1)])
-def test_water_on_a_dry_body_is_named_where_gravity_is_of_other_units(g, said, caplog):
+def test_water_on_a_dry_body_is_named_where_gravity_is_of_other_units(g, said, warned):
     grid, (push, _) = mpm.Grid([0, 0], [1.0, 1.0], [2, 2]), mpm.water("top", 2.0)
     body, options = mpm.box(grid, [0, 0], [1, 0.5]), {"walls": {"bottom": "xy"}, "gravity": (0, -g)}
     mpm.Simulation(grid, [body], [mpm.Hencky(bulk=1e6, shear=1e6)], conditions=[push], **options)
-    assert sum("unit_weight = 9810" in r.getMessage() for r in caplog.records) == said
+    assert sum("unit_weight = 9810" in message for message in warned()) == said
 
 
 def test_finite_elements_take_the_same_unit_weight():

@@ -11,6 +11,7 @@ x : (m, d), m
     Where these are at the start of the step, as for a water level.
 
 A single parameter of another name is the time.  Other names are refused.  Parameters with a default keep it.
+Constants of materials are functions of X, pressures and stresses at the start of x, the places as seeded.
 
 A function of places gives a number, or one for each place (m,); where vectors are allowed also one vector (d,), or one
 for each place (m, d).  Places may be repeated, so that m is above d, and no array may be two of these.
@@ -102,6 +103,21 @@ def called(function: Callable, values: dict) -> object:
     alone = {p.name for p in parameters if p.kind == p.KEYWORD_ONLY}
     positional = [value for name, value in by_name.items() if name not in alone]
     return function(*positional, **{name: by_name[name] for name in alone})
+
+
+def at_places(what: str, allowed: str, function: Callable, name: str, places: NDArray[np.float64]) -> object:
+    """Return what a function of one kind of places gives, "X" or "x": its parameter has that name.
+
+    Raises
+    ------
+    ValueError
+        It is a function of something else, or raises.
+    """
+    names = [p.name for p in _parameters(function) or ()]
+    if _plain(function) and names != [name]:
+        kind = {"X": "reference positions", "x": "positions as seeded"}[name]
+        raise ValueError(f"{what}: a function of ({', '.join(names)}), must be of {name}, the {kind}")
+    return asked(what, allowed, function, places)
 
 
 def given(

@@ -10,6 +10,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mpm_dolfinx.base.given_values import at_places
 from mpm_dolfinx.base.validation import asked, instance, numbers
 from mpm_dolfinx.grid.grid import SIDES, Grid, in_chunks
 from mpm_dolfinx.parallel.exchange import first
@@ -219,7 +220,7 @@ def pressure_at(pressure: float | Callable[[NDArray], ArrayLike], x: NDArray[np.
     """Return the pore pressure as seeded (n,), Pa, a number or a function of places, at places x (n, d), m."""
     if callable(pressure) and len(x):
         allowed = f"a finite number, or one for each of {len(x)} places"
-        given = asked("pressure(x)", allowed, pressure, x)
+        given = at_places("pressure", allowed, pressure, "x", x)
         return np.broadcast_to(numbers("pressure(x)", given, (), (len(x),), allowed=allowed), len(x)).copy()
     return np.full(len(x), 0.0 if callable(pressure) else float(numbers("pressure", pressure)))
 

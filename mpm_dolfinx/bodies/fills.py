@@ -18,7 +18,7 @@ from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.touching import Cover, Faces, covered, covers, local, meeting, warn_near, weights
 from mpm_dolfinx.grid.grid import REACH, Grid
 from mpm_dolfinx.parallel.exchange import over_all
-from mpm_dolfinx.parallel.messages import warn
+from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 from mpm_dolfinx.points.cutting import FACES, TANGLED, centroids, domain_volumes, volumes
 from mpm_dolfinx.points.material_points import MaterialPoints
 
@@ -101,7 +101,7 @@ def put(
         corners = corners + u
     if misfit > MISFIT * grid.h.min():
         what = "stage: add: body %d: its straight edges are up to %.2g m off the surface that it is put on"
-        warn(grid.comm, what + "; seed it with the spacing of what it lies on", fill, misfit)
+        warn(grid.comm, ResolutionWarning, what + "; seed it with the spacing of what it lies on", fill, misfit)
     for other, touching in found.items():
         depth, gap, x = _room(grid, bodies, other, corners, points, misfit)
         if depth:

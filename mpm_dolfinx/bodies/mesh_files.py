@@ -25,7 +25,7 @@ from mpm_dolfinx.bodies.mesh_cells import AS_LATTICE, KINDS, SECOND_ORDER, SIDES
 from mpm_dolfinx.bodies.meshes import Mesh, MeshBody, seeded
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.parallel.exchange import at_root
-from mpm_dolfinx.parallel.messages import warn
+from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 from mpm_dolfinx.points.cutting import FACES
 
 TAGS = ("gmsh:physical", "medit:ref", "cell_tags", "MaterialIDs", "attribute", "material", "nastran:ref", "su2:tag")
@@ -193,11 +193,11 @@ def _beside(x: NDArray[np.float64], rows: NDArray[np.int64], kind: str) -> float
 
 
 def _warn_curved(grid: Grid, name: str, count: int, off: float) -> None:
-    """Log a warning of cells of second order, whose corners alone are taken."""
+    """Warn of cells of second order, whose corners alone are taken."""
     what = (
         "%s: %d cells are of second order: their corners are taken, and edges are straight; nodes between corners lie "
     )
-    warn(grid.comm, what + "up to %.2g m off the middles", name, count, off)
+    warn(grid.comm, ResolutionWarning, what + "up to %.2g m off the middles", name, count, off)
 
 
 def _merged(

@@ -23,7 +23,7 @@ from mpm_dolfinx.bodies.bodies import Body, check_inside
 from mpm_dolfinx.bodies.mesh_cells import KINDS, PARTS, Polytopes, distinct
 from mpm_dolfinx.bodies.touching import Faces, covers, face_vectors
 from mpm_dolfinx.grid.grid import Grid, rounding, sum_by
-from mpm_dolfinx.parallel.messages import warn
+from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 from mpm_dolfinx.points.cutting import FACES, centroids, corner_bits, simplex_volumes, vertices, volumes
 
 LONG = 1.5  # cells over points a cell and direction: domains with longer edges are split
@@ -369,10 +369,10 @@ def _check_conforming(body: MeshBody, name: str) -> None:
 
 
 def _warn_small(grid: Grid, body: MeshBody, per_cell: int, name: str) -> None:
-    """Log a warning of domains that are far smaller than the grid asks for."""
+    """Warn of domains that are far smaller than the grid asks for."""
     size = (volumes(body.vertices) / grid.cell_volume) ** (1 / grid.dim) * per_cell
     small = np.flatnonzero(size < SMALL)
     if len(small):
         what = "%s: %d of %d domains are smaller than %.3g of what the grid can tell apart, the first at %s: "
         what += "they cost as much as large ones; a coarser mesh would do"
-        warn(grid.comm, what, name, len(small), len(body), SMALL, body.centre[small[0]])
+        warn(grid.comm, ResolutionWarning, what, name, len(small), len(body), SMALL, body.centre[small[0]])

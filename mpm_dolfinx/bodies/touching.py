@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from mpm_dolfinx.base.tolerances import NEAR, ROUND_OFF, SAME, TINY
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.grid.grid import Grid, rounding, sum_by
-from mpm_dolfinx.parallel.messages import warn
+from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 from mpm_dolfinx.points.cutting import FACES, corner_bits, cut_at, kuhn_simplices
 
 BITS = corner_bits(2)  # Source: definition
@@ -435,7 +435,14 @@ def _lies_in(x: NDArray[np.float64], domains: NDArray[np.float64]) -> bool:
 
 
 def warn_near(grid: Grid, names: str, gap: float, x: NDArray[np.float64]) -> None:
-    """Log a warning for bodies that do not touch but are less than a cell apart: they share nodes, and so stick."""
+    """Warn for bodies that do not touch but are less than a cell apart: they share nodes, and so stick."""
     if 0 < gap < 1:
         where = "%s: %.2g cells apart at %s, and yet they stick, as they share nodes of the grid"
-        warn(grid.comm, where + "; seed them in contact, or take cells smaller than the gap", names, gap, x)
+        warn(
+            grid.comm,
+            ResolutionWarning,
+            where + "; seed them in contact, or take cells smaller than the gap",
+            names,
+            gap,
+            x,
+        )

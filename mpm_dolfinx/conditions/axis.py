@@ -10,7 +10,7 @@ import numpy as np
 from mpm_dolfinx.base.tolerances import NEAR
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.grid.grid import Grid
-from mpm_dolfinx.parallel.messages import warn
+from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 
 
 def with_axis(grid: Grid, walls: Mapping[str, str]) -> Mapping[str, str]:
@@ -29,7 +29,7 @@ def check_axisymmetry(grid: Grid, bodies: Sequence[Body], quadrature: str) -> No
 
 
 def _warn_narrow_hole(grid: Grid, bodies: Sequence[Body]) -> None:
-    """Log a warning of a hole about the axis that ends within the cells beside it, whose nodes on the axis are held."""
+    """Warn of a hole about the axis that ends within the cells beside it, whose nodes on the axis are held."""
     if not grid.has_axis:
         return
     x = np.concatenate([body.corners() for body in bodies])
@@ -44,4 +44,4 @@ def _warn_narrow_hole(grid: Grid, bodies: Sequence[Body]) -> None:
         k = hole[inner[hole].argmin()]
         what = "a hole about the axis of radius %.3g m, at %s, is narrower than a cell of %.3g m: its side moves as a "
         what += "solid core does; take smaller cells, or a grid that begins at a radius > 0"
-        warn(grid.comm, what, inner[k], x[k].mean(axis=0), grid.h[0])
+        warn(grid.comm, ResolutionWarning, what, inner[k], x[k].mean(axis=0), grid.h[0])

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from mpm_dolfinx.base.validation import line, numbers
 from mpm_dolfinx.materials.initial_stress import OfWater
 from mpm_dolfinx.materials.skeleton import STANDARD_GRAVITY, Fluid
-from mpm_dolfinx.parallel.messages import warn
+from mpm_dolfinx.parallel.messages import ConditionWarning, warn
 
 WEIGHS = 5e-3  # share by which unit weights of water, and gravities, may differ without a warning
 DENSITIES = (500.0, 2000.0)  # kg/m^3: of oils and brines
@@ -38,13 +38,14 @@ def weighed(value, fluid: Fluid | None):
 
 
 def warn_units(comm: MPI.Intracomm, fluid: Fluid, gravity: Gravity) -> None:
-    """Log a warning of a fluid in a scene without gravity that is none in SI units, by which its unit weight counts."""
+    """Warn of a fluid in a scene without gravity that is none in SI units, by which its unit weight counts."""
     if fluid.gravity is not None or gravity is not None:
         return
     if not DENSITIES[0] <= fluid.density <= DENSITIES[1] or fluid.bulk < SOFTEST:
         what = "%s: no liquid in SI units, but without gravity its unit weight is density x %.4g m/s^2; in other units "
         warn(
             comm,
+            ConditionWarning,
             f"{what}give Fluid(gravity=...), by which conductivities become mobilities",
             line(fluid),
             STANDARD_GRAVITY,

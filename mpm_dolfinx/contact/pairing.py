@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """The contacts of groups of a stage: which places on their surfaces face one another, and what points keep of it.
 
-The contact itself is in `body_contact`.
+The contact itself is in `problem`.
 """
 
 from __future__ import annotations
@@ -19,16 +19,17 @@ from scipy.spatial import cKDTree
 
 from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.base.errors import NotConverged
-from mpm_dolfinx.base.tolerances import NEAR as UNDER
+from mpm_dolfinx.base.tolerances import NEAR, TINY
 from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.faces import Surface, surface
 from mpm_dolfinx.bodies.touching import BITS, local, weights
 from mpm_dolfinx.conditions.conditions import resistance
 from mpm_dolfinx.conditions.sides import Sides
-from mpm_dolfinx.contact.body_contact import BodyContact, Following, PairRows
-from mpm_dolfinx.contact.cell_contact import LEAST, kept, pressure_name, shear_name
 from mpm_dolfinx.contact.groups import Contact
+from mpm_dolfinx.contact.history import Origin, kept, pressure_name, shear_name
+from mpm_dolfinx.contact.law import ContactLaw
+from mpm_dolfinx.contact.pairs import FacePairs
 from mpm_dolfinx.contact.tool_placing import BEGINS, FACING
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.materials.fields import SceneMaterials
@@ -48,8 +49,6 @@ BESIDE = 0.6
 """Cells from points on the other surface: corners that are nearer go with it."""
 PLACES = 1 << 32
 """More than a process has points of integration on a surface."""
-EDGE = 1e-6
-"""Of a face: what passes beside it by less meets it."""
 
 
 class Facets(NamedTuple):
@@ -119,20 +118,20 @@ class Contacts:
         """Return what n points keep of the contacts, zero."""
         return kept(dict(zip(self.names, self.contacts, strict=True)), n, self.grid.dim)
 
-    def placed(self, cut: CutDomains, points: MaterialPoints) -> Following:
-        """Return the contact in a step, with the points where they are at its start."""
+    def placed(self, cut: CutDomains, points: MaterialPoints) -> tuple[ContactLaw, Origin, Callable, Callable]:
+        """Return the contact in a step, with the points where they are at its start, as `ContactProblem` takes it."""
         found = self._found(cut.key, lambda: self._met_all(cut, cut.points), self.grid.comm)
         reach = partial(self._reach, cut.key, partial(self._cells_within_reach, cut, found), self.grid.comm)
-        begun = self._contact(cut, points, found, cut.points, points, reach)
+        begun = self._law(cut, points, found, cut.points, points, reach)
 
-        def again(u: NDArray[np.float64]) -> BodyContact:
+        def again(u: NDArray[np.float64]) -> tuple[ContactLaw, Origin]:
             moved, _ = cut.followed(u.reshape(-1, self.grid.dim), np.zeros(self.grid.num_local, dtype=bool))
             there = replace(points, corners=points.corners + moved)
-            return self._contact(cut, points, self._met_all(cut, there), there, there, reach)
+            return self._law(cut, points, self._met_all(cut, there), there, there, reach)
 
-        return Following(begun, again)
+        return *begun, again, reach
 
-    def _contact(
+    def _law(
         self,
         cut: CutDomains,
         points: MaterialPoints,
@@ -140,8 +139,8 @@ class Contacts:
         seen: MaterialPoints,
         there: MaterialPoints,
         reach: Callable[[], NDArray[np.int64]],
-    ) -> BodyContact:
-        """Return the contact of pairs that were found with the points as `seen`, with these now `there`.
+    ) -> tuple[ContactLaw, Origin]:
+        """Return the conditions of pairs that were found with the points as `seen`, with these now `there`.
 
         points: at the start of the step, with the pressures and shears of then.
         """
@@ -178,9 +177,11 @@ class Contacts:
         cell, other, sent = (travel.send(columns) for columns in (cell, other, values))
         number, place = sent[:, :2].T.astype(np.int64)
         x, y, n, apart, shear = np.split(sent[:, 5:], 5, axis=1)
-        placed = PairRows(number, grid.local(cell), *sent[:, 2:5].T, shear, other, x, y, n, apart, place)
-        back = (travel, at, values[:, 0].astype(np.int64), values[:, 2])
-        return BodyContact(grid, self.names, self.contacts, self._signs, placed, back, reach)
+        own = number, grid.local(cell), *sent[:, 2:5].T, shear, x, self._signs
+        pairs = FacePairs(grid, *own, other, y, n, apart, place)
+        return ContactLaw(self.names, self.contacts, pairs), Origin(
+            travel, at, values[:, 0].astype(np.int64), values[:, 2]
+        )
 
     def _met_all(self, cut: CutDomains, points: MaterialPoints) -> list[tuple[Facets, Pairs]]:
         """Return for each contact what `_met` does."""
@@ -214,7 +215,7 @@ class Contacts:
         )
         resists = self._materials.table(cut.points, resistance)[patches.at]
         area, n, k = patches.area(points), len(now), 2 ** (d - 1) * d
-        outward = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), LEAST)
+        outward = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), TINY)
         whole = np.column_stack([patches.here, patches.cell])
         rows = np.column_stack([patches.now(points), resists, now.reshape(n, k), then.reshape(n, k), outward])
         whole, rows = (np.concatenate(self.grid.comm.allgather(part)) for part in (whole, rows))
@@ -226,7 +227,7 @@ class Contacts:
         """Return the points on the faces of the other group, and which of these the points on the faces meet."""
         patches, facets, d = cut.surface(faces), self._facets(cut, others, points), self.grid.dim
         x, area = patches.now(points), patches.area(points)
-        n = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), LEAST)
+        n = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), TINY)
         count = min(CANDIDATES[d], len(facets.x))
         if not count:  # bodies of the other group are not there
             none = np.zeros(0, dtype=np.int64)
@@ -238,7 +239,7 @@ class Contacts:
         facing = np.einsum("md,md->m", n[row], facets.outward[other]) < -FACING
         row, other = row[facing], other[facing]
         t, gap = _along(facets.corners[other], x[row], n[row])
-        met = ((t >= -EDGE) & (t <= 1 + EDGE)).all(axis=1) & (gap <= REACH * self.grid.h.min())
+        met = ((t >= -NEAR) & (t <= 1 + NEAR)).all(axis=1) & (gap <= REACH * self.grid.h.min())
         met &= gap >= -DEEP * self.grid.h.min()
         row, other, t, gap = row[met], other[met], t[met], gap[met]
         order = np.lexsort((np.abs(gap), row))
@@ -247,7 +248,7 @@ class Contacts:
 
     def _under(self, facets: Facets, chosen: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
         """Return the cells (m,) just under places x (m, d) on faces that hold a part of these, else of their facets."""
-        grid, inside = self.grid, x - UNDER * self.grid.h.min() * facets.outward[chosen]
+        grid, inside = self.grid, x - NEAR * self.grid.h.min() * facets.outward[chosen]
         number = grid.number(grid.index_from_base(inside)) + facets.cell[chosen] // grid.cells * grid.cells
         keys = np.unique(facets.face * len(grid.owners) + facets.cell)
         return np.where(np.isin(facets.face[chosen] * len(grid.owners) + number, keys), number, facets.cell[chosen])
@@ -309,7 +310,7 @@ def _extent(bodies: Sequence[Body]) -> tuple:
 def _turned(shear: NDArray[np.float64], n: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return tractions (m, d) turned by the least angle into the planes with normals n (m, d)."""
     flat = shear - np.einsum("md,md->m", shear, n)[:, None] * n
-    size = np.maximum(np.linalg.norm(flat, axis=1), LEAST)
+    size = np.maximum(np.linalg.norm(flat, axis=1), TINY)
     return flat * (np.linalg.norm(shear, axis=1) / size)[:, None]
 
 

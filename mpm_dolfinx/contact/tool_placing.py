@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """The rigid tools of a stage: where they touch the bodies in a step, and what points keep of them.
 
-The contact itself is in `tool_contact`.
+The contact itself is in `problem`.
 """
 
 from __future__ import annotations
@@ -17,16 +17,17 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mpm_dolfinx.base.errors import NotConverged
+from mpm_dolfinx.base.tolerances import TINY
 from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.bodies.faces import Surface
 from mpm_dolfinx.conditions.conditions import Displacement, resistance
 from mpm_dolfinx.conditions.sides import everywhere
-from mpm_dolfinx.contact.cell_contact import LEAST, kept, pressure_name, shear_name
-from mpm_dolfinx.contact.pushed_tools import PushedTools
-from mpm_dolfinx.contact.tool_contact import ToolContact, ToolRows
-from mpm_dolfinx.contact.tools import Pose, Tool
+from mpm_dolfinx.contact.history import Origin, kept, pressure_name, shear_name
+from mpm_dolfinx.contact.law import ContactLaw
+from mpm_dolfinx.contact.pairs import ToolPairs
+from mpm_dolfinx.contact.problem import Pushes
+from mpm_dolfinx.contact.tool import Pose, Tool
 from mpm_dolfinx.domains.cut_domains import CutDomains
-from mpm_dolfinx.forms.point_forms import Places
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.parallel.exchange import Exchange, first, over_all
@@ -122,7 +123,9 @@ class Tools:
         """Return what n points keep of the tools, zero."""
         return kept(dict(zip(self.names, self.tools, strict=True)), n, self.grid.dim)
 
-    def placed(self, cut: CutDomains, points: MaterialPoints, start: float, t: float) -> ToolContact:
+    def placed(
+        self, cut: CutDomains, points: MaterialPoints, start: float, t: float
+    ) -> tuple[ContactLaw, Origin, Pushes]:
         """Return the contact at time t (s) of a step that began at `start`, with the points where they are now."""
         grid, d = self.grid, self.grid.dim
         patches = cut.surface(self.faces)
@@ -131,12 +134,11 @@ class Tools:
         resists = self._materials.table(cut.points, resistance)[patches.at]
         poses, found = [self._pose(tool, t) for tool in self.tools], []
         loads = [tool.pushes(t) if t > start else np.nan for tool in self.tools]  # initial stresses are without them
-        pushed = PushedTools([line(tool) for tool in self.tools], self._ways.before, np.array(loads), grid.h.min())
         for number, (tool, pose) in enumerate(zip(self.tools, poses, strict=True)):
             before = self._pose(tool, start)
             n = everywhere(grid, lambda tool=tool, pose=pose: tool.solid(grid.h.min()).normal(pose.own(x)) @ pose.R.T)
-            faces = free & (np.einsum("md,md->m", area, n) < -FACING * size)
-            at = np.flatnonzero(faces)[~self._edge(tool, pose, x, area / np.maximum(size, LEAST)[:, None], faces)]
+            faces = free & (np.einsum("md,md->m", area, n) < -FACING * size * np.linalg.norm(n, axis=1))
+            at = np.flatnonzero(faces)[~self._edge(tool, pose, x, area / np.maximum(size, TINY)[:, None], faces)]
             old = points.data[shear_name(self.names[number])][patches.at[at]] if tool.grips else np.zeros((len(at), d))
             vectors = [x[at], pose.put(before.own(x[at])), old @ (pose.R @ before.R.T).T]
             pressure = points.data[pressure_name(self.names[number])][patches.at[at]]
@@ -147,9 +149,12 @@ class Tools:
         cell, place, sent = (travel.send(rows) for rows in (patches.cell[at], patches.x[at], values))
         number, *own = sent[:, :4].T
         now, carried, shear = np.split(sent[:, 4:], 3, axis=1)
-        rows = ToolRows(number.astype(np.int64), grid.local(cell), *own, shear, now, carried)
-        back = (travel, patches.at[at], values[:, 0].astype(np.int64), values[:, 1])
-        return ToolContact(grid, self.names, self.tools, poses, pushed, rows, Places(grid, rows.cell, place), back)
+        acts = np.ones(len(self.tools)), self.tools, poses
+        pairs = ToolPairs(grid, number.astype(np.int64), grid.local(cell), *own, shear, place, *acts, now, carried)
+        origin = Origin(travel, patches.at[at], values[:, 0].astype(np.int64), values[:, 1])
+        along = np.array([tool.along(d) for tool in self.tools])
+        pushes = Pushes([line(tool) for tool in self.tools], self._ways.before, along, np.array(loads))
+        return ContactLaw(self.names, self.tools, pairs), origin, pushes
 
     def _edge(
         self, tool: Tool, pose: Pose, x: NDArray[np.float64], unit: NDArray[np.float64], faces: NDArray[np.bool_]
@@ -271,7 +276,7 @@ class Tools:
         h, comm = self.grid.h.min(), self.grid.comm
         y, end = (self._pose(tool, t).own(at) for at, t in zip(x, times, strict=True))
         way, gone, on = np.linalg.norm(end - y, axis=1), np.zeros(len(y)), np.arange(len(y))
-        along = (end - y) / np.maximum(way, LEAST)[:, None]
+        along = (end - y) / np.maximum(way, TINY)[:, None]
         inside = everywhere(self.grid, lambda: (tool.solid(h).distance(y) < 0) | (tool.solid(h).distance(end) < 0))
         a, b = everywhere(self.grid, lambda: (tool.solid(h).normal(y[inside]), tool.solid(h).normal(end[inside])))
         turned = x[1][inside][np.einsum("nd,nd->n", a, b) < 0][:1]  # a middle in the tool that comes to its other side

@@ -15,14 +15,14 @@ from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.parallel.exchange import over_all
-from mpm_dolfinx.parallel.messages import warn
+from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 
 FULL = 1.2
 """Of a cell: domains that have not folded stay below 1.08 where soil is pushed aside by half a footing's width."""
 
 
 def warn_overfilled(cut: CutDomains, bodies: Sequence[Body]) -> Callable[..., Any] | None:
-    """Log a warning of the fullest cell, with the bodies in it, if it is overfilled; return what looks for the next."""
+    """Warn of the fullest cell, with the bodies in it, if it is overfilled; return what looks for the next."""
     grid, points = cut.grid, cut.points
     volume = cut.to_cells(points.volume0 * points.J) * cut.pieces_to_cells(cut.pieces.fraction)
     fill = sum_by(cut.cells, cut.plane(volume)[0], grid.num_owned) / grid.cell_volume
@@ -32,7 +32,14 @@ def warn_overfilled(cut: CutDomains, bodies: Sequence[Body]) -> Callable[..., An
     number = over_all(grid.comm, int(grid.cell_number[fill.argmax()]) if most in fill else -1, MPI.MAX)
     found, x = bodies_in(cut, bodies, number)
     who = f"bodies {', '.join(map(str, found))}" if len(found) > 1 else f"domains of body {found[0]}"
-    warn(grid.comm, "the cell at %s is filled to %.0f %%, more than it holds: %s overlap", x, 100 * most, who)
+    warn(
+        grid.comm,
+        ResolutionWarning,
+        "the cell at %s is filled to %.0f %%, more than it holds: %s overlap",
+        x,
+        100 * most,
+        who,
+    )
     return None
 
 

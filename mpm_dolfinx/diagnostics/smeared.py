@@ -18,7 +18,7 @@ from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.parallel.exchange import over_all
-from mpm_dolfinx.parallel.messages import warn
+from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 
 LOST = 0.03
 """Share of what a soft material gives, lost in cells that it shares, from which a scene is warned of."""
@@ -31,7 +31,7 @@ FINE = 0.1
 def warn_smeared(
     cut: CutDomains, bodies: Sequence[Body], materials: SceneMaterials, least: float = LOST
 ) -> Callable[..., Any]:
-    """Log a warning of the soft material that loses most in cells shared with stiffer ones, if that is much.
+    """Warn of the soft material that loses most in cells shared with stiffer ones, if that is much.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ def warn_smeared(
     what = "materials of bodies %s share cells, as at %s: material %d, up to %.3g times as soft as its neighbour, "
     what += "gives about %.0f %% too little under a load across the layers; lay interfaces along grid lines, or take "
     what += "smaller cells"
-    warn(grid.comm, what, " and ".join(map(str, those)), x, i, much, 100 * share)
+    warn(grid.comm, ResolutionWarning, what, " and ".join(map(str, those)), x, i, much, 100 * share)
     return partial(warn_smeared, materials=materials, least=AGAIN * share)
 
 

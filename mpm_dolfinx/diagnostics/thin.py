@@ -11,7 +11,7 @@ from mpm_dolfinx.base.tolerances import SAME
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.touching import Faces, covered, covers
 from mpm_dolfinx.grid.grid import SIDES, Grid
-from mpm_dolfinx.parallel.messages import warn
+from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 
 COARSE = 0.7  # of a cell: domains above this lack more stiffness than Q1 cells have too much
 FEW = 3  # points over the thickness that bend an eighth too much.  Source: exact, 1 / (n^2 - 1)
@@ -22,7 +22,7 @@ SLENDER_WET = 2  # length over thickness from which a wet body bends
 
 
 def warn_thin(grid: Grid, bodies: Sequence[Body], walls: Mapping[str, str], wet: bool) -> None:
-    """Log a warning for each slender body that is free to bend and has too few points over its thickness.
+    """Warn for each slender body that is free to bend and has too few points over its thickness.
 
     A law sees one F in a point's domain: n points over the thickness have 1 - 1/n^2 of the bending stiffness, as
     n layers of constant stress do, however exactly their domains are integrated.  One point carries no moment at
@@ -40,7 +40,7 @@ def warn_thin(grid: Grid, bodies: Sequence[Body], walls: Mapping[str, str], wet:
                 if n > 1 and wet:
                     much = f"with pore fluid it bends some {LOST_WET / n**2:.0%} too much and creeps"
                 what = "body %d: %.3g point%s over its thickness along %s, in cells of %.3g m: %s; take per_cell >= 2"
-                warn(grid.comm, what, i, n, "s" if n > 1 else "", letter, grid.h[axis], much)
+                warn(grid.comm, ResolutionWarning, what, i, n, "s" if n > 1 else "", letter, grid.h[axis], much)
 
 
 def _bends(grid: Grid, bodies: Sequence[Body], i: int, axis: int, walls: Mapping[str, str], slender: float) -> bool:

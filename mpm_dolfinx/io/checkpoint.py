@@ -18,10 +18,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mpm_dolfinx.base.histories import COLUMNS, Rows
 from mpm_dolfinx.base.validation import instance, line, numbers, on_disk, path, whole
 from mpm_dolfinx.conditions.acting import Outcome
 from mpm_dolfinx.contact.groups import Contact
-from mpm_dolfinx.contact.tools import Tool
+from mpm_dolfinx.contact.tool import Tool
 from mpm_dolfinx.domains.pressure_transport import PiecePressures
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.io.writer import WRITABLE, replacing
@@ -29,15 +30,16 @@ from mpm_dolfinx.parallel.exchange import at_root
 from mpm_dolfinx.parallel.messages import log
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.simulation.simulation import Simulation
-from mpm_dolfinx.stepping.result import Result, Row
+from mpm_dolfinx.stepping.result import Result
 from mpm_dolfinx.stepping.state import State, Stay
+from mpm_dolfinx.stepping.step_control import StepControl
 
 FORMAT, VERSION = "mpm_dolfinx checkpoint", 10  # Source: the format of the files
 FOREIGN = "no checkpoint of mpm_dolfinx, must be one"
 ZIP = b"PK\3\4"  # how numpy's archives begin
 PIECES = ("id", "pressure", "x", "start")  # of a Stay
 NODAL = ("velocity", "held", "rest")  # of a State
-NOTE = {"t": float, "resets": int, "begins": bool, "scene": dict, "result": dict}  # and their kinds
+NOTE = {"t": float, "resets": int, "begins": bool, "scene": dict, "result": dict, "control": dict}  # and their kinds
 
 
 @dataclass
@@ -91,7 +93,7 @@ def save(simulation: Simulation, file: Path) -> None:
     for name in NODAL:
         nodal |= _nodal_of_all(simulation.grid, name, getattr(state, name))
     note = {"version": VERSION, "t": state.t, "resets": state.resets, "begins": state.begins}
-    note |= {"scene": describe(simulation), "result": _scalars(state.result)}
+    note |= {"scene": describe(simulation), "result": _scalars(state.result), "control": vars(state.control)}
 
     def write() -> int:
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -153,8 +155,8 @@ def _scalars(result: Result) -> dict[str, Any]:
 def _arrays(state: State) -> dict[str, NDArray]:
     """Return the arrays of a state by names with slashes."""
     named = {"points": vars(state.points), "outcome": state.outcome}
-    named["result"] = {name: np.array(state.result.column(name)) for name in Row._fields if name != "outcome"}
-    for i, outcome in enumerate(state.result.column("outcome")):
+    named["result"] = {name: state.result.rows.column(name) for name in COLUMNS}
+    for i, outcome in enumerate(state.result.rows.outcomes):
         for name, value in _named("", outcome).items():
             named["result"].setdefault(f"outcome/{name}", {"row": [], "value": []})
             for rows, one in zip(named["result"][f"outcome/{name}"].values(), (i, value), strict=True):
@@ -190,11 +192,9 @@ def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulat
             transported = PiecePressures(**_part(arrays, "transported/"))
             _check_pieces(vars(transported), ids, dim)
         histories = _part(arrays, "result/")
-        times = histories["t"] = histories["t"].tolist()
-        histories["pressure"] = [*map(tuple, histories["pressure"].tolist())]
-        histories["outcome"] = _outcomes(_part(histories, "outcome/"), len(times))
-        columns = [[*histories[name]] or [None] * len(times) for name in Row._fields]
-        result = Result(rows=[Row(*row) for row in zip(*columns, strict=True)], **note["result"])
+        times = histories["t"]
+        outcomes = _outcomes(_part(histories, "outcome/"), len(times))
+        result, control = Result(Rows.of_columns(histories, outcomes), **note["result"]), StepControl(**note["control"])
         outcome = _nested(_part(arrays, "outcome/"))
         nodal = [_part(arrays, f"{name}/") or None for name in NODAL]
         for name, given in zip(NODAL, nodal, strict=True):
@@ -202,10 +202,19 @@ def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulat
                 _check_nodal(name, given, simulation.grid)
         if arrays or not all(np.isfinite([note["t"], *times])):
             raise ValueError(f"has {', '.join(arrays) or 'other times'}")
-        outcome = _like(outcome, now.outcome)
-        reset = {"stay": stay, "resets": note["resets"], "begins": note["begins"]}
-        told = dict(zip(NODAL, nodal, strict=True)) | {"outcome": outcome, "stage": None, "result": result}
-        return State(t=note["t"], points=points, transported=transported, **reset, **told)
+        return State(
+            t=note["t"],
+            points=points,
+            transported=transported,
+            stay=stay,
+            resets=note["resets"],
+            outcome=_like(outcome, now.outcome),
+            stage=None,
+            begins=note["begins"],
+            result=result,
+            control=control,
+            **dict(zip(NODAL, nodal, strict=True)),
+        )
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         raise ValueError(f"{damaged} ({line(error)}), must be a whole checkpoint") from error
 

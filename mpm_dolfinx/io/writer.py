@@ -27,7 +27,7 @@ from dolfinx import fem, io
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.validation import flag, instance, line_of, on_disk, path, whole
-from mpm_dolfinx.contact.tools import Tool
+from mpm_dolfinx.contact.tool import Tool
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.io.units import text
 from mpm_dolfinx.parallel.exchange import at_root, to_root
@@ -142,7 +142,7 @@ class Writer:
         """Drop what the folder holds of later times: from here on the files are this run's."""
         if (began := result.rows[-2][0]) != self._t:
             raise ValueError(f"writer: made at t = {self._t:g} s for a run that goes on from t = {began:g} s")
-        self._table.start(_row(Result(rows=result.rows[-2:-1])))
+        self._table.start(_row(Result(result.rows[-2:-1])))
         self._write_indices()
 
     def _write_indices(self) -> None:
@@ -223,14 +223,13 @@ def _row(result: Result) -> dict[str, float]:
     """Return what the histories hold of the last output time, and what acts at the conditions then."""
     row = result.rows[-1]
     out = {"t": row.t, **{name: getattr(result, name) for name in COUNTS}}
-    if row.pressure is not None:
-        out["p_min"], out["p_max"] = row.pressure
-    for i, u in enumerate(() if row.displacement is None else row.displacement):
+    out |= dict(zip(("p_min", "p_max"), row.pressure.tolist(), strict=False))
+    for i, u in enumerate(row.displacement):
         out |= {f"{axis}_{i}": value for axis, value in zip("xyz", row.position[i].tolist(), strict=False)}
         out |= {f"u{axis}_{i}": value for axis, value in zip("xyz", u.tolist(), strict=False)}
-        if row.probe_pressure is not None:
+        if len(row.probe_pressure):
             out[f"p_{i}"] = float(row.probe_pressure[i])
-        if row.probe_stress is not None:
+        if len(row.probe_stress):
             out |= {f"s{name}_{i}": value for name, value in _components(row.probe_stress[i], len(u)).items()}
     for quantity, values in row.outcome.items():
         for name, value in values.items():

@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.base.errors import NotConverged
+from mpm_dolfinx.base.given_values import at_places
 from mpm_dolfinx.base.tolerances import NEAR, SAME
-from mpm_dolfinx.base.validation import asked, line, numbers
+from mpm_dolfinx.base.validation import line, numbers
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.overburden import overburden
 from mpm_dolfinx.materials.cam_clay import ModifiedCamClay
@@ -60,7 +61,7 @@ class K0:
     def values(self, name: str, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return ratio or surcharge at places (n, d), m: one or (n,)."""
         value = getattr(self, name)
-        given = asked(f"K0: {name}", "one value a place", value, x) if callable(value) else value
+        given = at_places(f"K0: {name}", "one value a place", value, "x", x) if callable(value) else value
         return self._checked(name, given, (len(x),))
 
 
@@ -172,7 +173,7 @@ class InitialStresses:
         if not isinstance(stress, K0):
             name = f"initial_stress of body {body}: {line(stress)}"
             allowed = f"three normal stresses or a symmetric tensor (3, 3), finite, for each of {n} places"
-            value = numbers(name, asked(name, allowed, stress, points.x), (n, 3), (n, 3, 3), allowed=allowed)
+            value = numbers(name, at_places(name, allowed, stress, "x", points.x), (n, 3), (n, 3, 3), allowed=allowed)
             value = value if value.ndim == 3 else value[:, :, None] * np.eye(3)
             wrong = np.abs(value - value.swapaxes(1, 2)).max(axis=(1, 2)) > SAME * np.abs(value).max(initial=0)
             if d == 2:

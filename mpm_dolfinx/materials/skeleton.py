@@ -17,7 +17,8 @@ import numpy as np
 import ufl
 from numpy.typing import ArrayLike, NDArray
 
-from mpm_dolfinx.base.validation import asked, functions, instance, line, numbers
+from mpm_dolfinx.base.given_values import at_places
+from mpm_dolfinx.base.validation import functions, instance, line, numbers
 from mpm_dolfinx.forms.axes import planar
 from mpm_dolfinx.materials.user_functions import expression
 
@@ -187,7 +188,7 @@ class Skeleton:
         for name in (f.name for f in fields(self) if f.name != "conductivity_law"):
             value, what = getattr(self, name), f"{type(self).__name__}: {name}"
             if callable(value):
-                given = asked(f"{what}(X)", f"one value for each of {len(X)} positions", value, X)
+                given = at_places(what, f"one value for each of {len(X)} positions", value, "X", X)
                 values[name] = given = numbers(f"{what}(X)", given, None, allowed="numbers", test=np.isreal)
                 if given.shape[:1] != (len(X),) or (name in scalars and given.ndim > 1):
                     more = "" if name in scalars else " ..."

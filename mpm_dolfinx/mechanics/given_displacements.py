@@ -25,7 +25,7 @@ from mpm_dolfinx.grid.grid import Grid, sum_by
 from mpm_dolfinx.mechanics.held_cells import HeldCells, HeldPoints
 from mpm_dolfinx.mechanics.rigid_motion import rigid_motion, turned
 from mpm_dolfinx.parallel.exchange import first, over_all
-from mpm_dolfinx.parallel.messages import warn
+from mpm_dolfinx.parallel.messages import ConditionWarning, warn
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.points.parts import Parts
 
@@ -169,12 +169,12 @@ class GivenDisplacements(Acting):
     def _warn(
         self, held: HeldCells, row: NDArray[np.int64], axis: NDArray[np.int64], force: NDArray[np.float64]
     ) -> None:
-        """Log a warning, once a condition, of forces that no change of the body's stress balances."""
+        """Warn, once a condition, of forces that no change of the body's stress balances."""
         for number, x in held.beyond(row, axis, force, self._warned):
-            self._warned.add(number)
             why = "its reaction is an artefact; does something else hold it, or is the step too large?"
             what = "%s: not where it is to be at %s: %s"
-            warn(self._grid.comm, what, line(self._holds[number][0]), x + self._grid.base, why)
+            warn(self._grid.comm, ConditionWarning, what, line(self._holds[number][0]), x + self._grid.base, why)
+            self._warned.add(number)
 
     def under_held(
         self, ids: NDArray[np.int64], tracked: NDArray[np.float64], volume: NDArray[np.float64], corners: NDArray

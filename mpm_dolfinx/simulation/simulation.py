@@ -37,6 +37,7 @@ from mpm_dolfinx.stepping.stage import Condition, checked
 from mpm_dolfinx.stepping.stages import begin_stage, first_state
 from mpm_dolfinx.stepping.state import State
 from mpm_dolfinx.stepping.step import step
+from mpm_dolfinx.stepping.tangent import tangent
 
 
 class Simulation:
@@ -229,7 +230,7 @@ class Simulation:
         """Return centroids and fields of the cells at present, see `CellFields`; all processes call it together."""
         return cell_fields(self.scene, self.state)
 
-    # ---- stages ---------------------------------------------------------------------------------
+    # ---- stages and steps -----------------------------------------------------------------------
 
     def stage(
         self,
@@ -276,8 +277,6 @@ class Simulation:
         named = {name: value for name, value in given.items() if value is not None}
         self.state = begin_stage(self.scene, self.state, named, add, remove, reset_displacement, fields or {})
 
-    # ---- steps ----------------------------------------------------------------------------------
-
     def step(self, dt: float) -> Report:
         """Advance by dt (s), > 0; return what the step took.
 
@@ -303,4 +302,4 @@ class Simulation:
             raise_interrupt(error)
             raise
 
-    run = run
+    run, tangent = run, tangent

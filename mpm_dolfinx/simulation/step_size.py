@@ -18,6 +18,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.solve.newton import ERROR
 from mpm_dolfinx.stepping.result import Result
 from mpm_dolfinx.stepping.scene import Scene
+from mpm_dolfinx.stepping.step_control import StepControl
 
 MIN_CUT, MIN_CUT_BY_ERROR = 2.0**-10, 2.0**-30
 """Share of what a step should be long below which it is not cut.
@@ -71,9 +72,9 @@ class StepSize:
         """Whether steps are chosen by their error."""
         return self.rtol is not None
 
-    def ended(self, t: float, target: float, result: Result) -> bool:
+    def ended(self, t: float, target: float, control: StepControl) -> bool:
         """Return whether a time, s, is the target but for rounding."""
-        slack = ROUND_OFF * abs(target) if self.by_error else SAME * min(result.small, self.longest)
+        slack = ROUND_OFF * abs(target) if self.by_error else SAME * min(control.small, self.longest)
         return target - t <= slack
 
     def least(self, wanted: float, t: float) -> float:
@@ -92,79 +93,79 @@ class StepSize:
         # steps that fit but for rounding are all of the same length
         return left if not left > (1 - SAME) * small else small
 
-    def refused(self, taken: float, report: Report, result: Result) -> float:
+    def refused(self, taken: float, report: Report, control: StepControl) -> float:
         """Return by how much its error has to shrink a step that has been solved; 1 where it is accepted.
 
         After a jump of the loads one long step may overshoot by a fifth of what is left, two halves of it do not: the
         stability function is squared.
         """
         if not self.by_error:
-            return 0.5 if taken > 0.75 * self.longest and self._rings(taken, report, result) else 1.0
+            return 0.5 if taken > 0.75 * self.longest and self._rings(taken, report, control) else 1.0
         # steps are refused where loads jump or bend, mostly: there the error is of first order
-        return 1.0 if report.error <= self._allowed(report, result) else self._factor(report, result, 1.0)
+        return 1.0 if report.error <= self._allowed(report, control) else self._factor(report, control, 1.0)
 
-    def next(self, taken: float, report: Report, result: Result, failed: bool) -> float:
+    def next(self, taken: float, report: Report, control: StepControl, failed: bool) -> float:
         """Return the step to try after one that was taken, s; failed: after a longer one had not converged."""
         if not self.by_error:
-            grows = report.easy and not self._rings(taken, report, result)  # twice as long it would be refused
-            return max(result.small, min(2 * taken, self.longest)) if grows else result.small
-        factor = self._factor(report, result, 0.5)
+            grows = report.easy and not self._rings(taken, report, control)  # twice as long it would be refused
+            return max(control.small, min(2 * taken, self.longest)) if grows else control.small
+        factor = self._factor(report, control, 0.5)
         if factor >= 1:
             # a step as long as one that has just failed would mostly fail again: in soil that yields, 78 cuts, not 1
             factor = 1.0 if factor < KEEPS or failed or not report.easy else factor
-            return min(max(taken * factor, result.small), self.longest)  # it may have been short for an output's sake
+            return min(max(taken * factor, control.small), self.longest)  # it may have been short for an output's sake
         return taken * factor
 
-    def cut(self, taken: float, result: Result) -> Result:
-        """Return the histories with half a step, s, to try next: the step has not converged."""
-        whole = taken > (1 - SAME) * result.small
-        waits = 2 * result.waits + 1 if whole and result.kept == 0 else result.waits
-        return replace(result, cuts=result.cuts + 1, small=taken / 2, waits=waits, kept=1)
+    def cut(self, taken: float, control: StepControl) -> StepControl:
+        """Return the memory with half a step, s, to try next: the step has not converged."""
+        whole = taken > (1 - SAME) * control.small
+        waits = 2 * control.waits + 1 if whole and control.kept == 0 else control.waits
+        return replace(control, small=taken / 2, waits=waits, kept=1)
 
-    def grown(self, taken: float, report: Report, result: Result, failed: bool) -> Result:
-        """Return the histories with the step to try next after one that was taken, s; failed: see `next`.
+    def grown(self, taken: float, report: Report, control: StepControl, failed: bool) -> StepControl:
+        """Return the memory with the step to try next after one that was taken, s; failed: see `next`.
 
         Equal steps that were cut grow at once, until one that has just grown fails as well: then they wait for one more
         step, for three, seven ..., and for half as many after one that has grown has converged.  `waits` is how many,
         `kept` how many steps there were since the last cut or growth, from one on; 0: the step has just grown.
         """
-        small, whole = self.next(taken, report, result, failed), taken > (1 - SAME) * result.small
+        small, whole = self.next(taken, report, control, failed), taken > (1 - SAME) * control.small
         if self.by_error:
-            return replace(result, small=small)
-        waits = result.waits // 2 if whole and result.kept == 0 else result.waits
-        if small > (1 + SAME) * result.small and result.kept > waits:  # not by rounding only
-            return replace(result, small=small, waits=waits, kept=0)
+            return replace(control, small=small)
+        waits = control.waits // 2 if whole and control.kept == 0 else control.waits
+        if small > (1 + SAME) * control.small and control.kept > waits:  # not by rounding only
+            return replace(control, small=small, waits=waits, kept=0)
         # a step that was fitted to an output tells nothing of longer ones
-        return replace(result, waits=waits, kept=result.kept + whole)
+        return replace(control, waits=waits, kept=control.kept + whole)
 
-    def _rings(self, taken: float, report: Report, result: Result) -> bool:
+    def _rings(self, taken: float, report: Report, control: StepControl) -> bool:
         """Return whether a step may have overshot.
 
         What is as sudden in step after step is no jump of the loads, of which a step leaves a fifth at most: where the
         grid is reset in every step, pressures beside an edge that is pushed into a body change in the first substep.
         """
-        return report.sudden - AGAIN * result.first * taken > RINGS * result.change
+        return report.sudden - AGAIN * control.first * taken > RINGS * control.change
 
-    def _factor(self, report: Report, result: Result, power: float) -> float:
+    def _factor(self, report: Report, control: StepControl, power: float) -> float:
         """Return the step whose error would be as large as it may be, in proportion to one that was solved."""
-        factor = SAFETY * (self._allowed(report, result) / report.error) ** power if report.error > 0 else GROWS
+        factor = SAFETY * (self._allowed(report, control) / report.error) ** power if report.error > 0 else GROWS
         return min(GROWS, max(SHRINKS, factor))
 
-    def _allowed(self, report: Report, result: Result) -> float:
+    def _allowed(self, report: Report, control: StepControl) -> float:
         """Return how large the error of the pressures may be in a step, Pa.
 
         Where water flows freely pressures follow the motion of the bodies: what time steps make of them moves nothing,
         and what the grid makes of them, some percent, no shorter step mends.
         """
-        return self.rtol * max(result.change, report.sealed)
+        return self.rtol * max(control.change, report.sealed)
 
 
-def measured(result: Result, report: Report) -> Result:
-    """Return the histories with the largest change of the pressures so far, that of a step that was solved included."""
-    change = max(result.change, report.change, NEAR * report.stress)
-    if result.rows and (start := result.rows[0].pressure) is not None and report.extremes is not None:
-        change = max(change, *(abs(now - then) for now, then in zip(report.extremes, start, strict=True)))
-    return replace(result, change=change)
+def measured(control: StepControl, report: Report, result: Result) -> StepControl:
+    """Return the memory with the largest change of the pressures so far, that of a step that was solved included."""
+    change = max(control.change, report.change, NEAR * report.stress)
+    if len(result.rows) and len(start := result.pressure[0]) and report.extremes is not None:
+        change = max(change, *(abs(now - then) for now, then in zip(report.extremes, start.tolist(), strict=True)))
+    return replace(control, change=change)
 
 
 class Times:
@@ -252,7 +253,7 @@ def step_rule(times: Times, rtol, first_step, max_step: float, scene: Scene, poi
     if scene.numerics.method == "backward-euler":
         raise ValueError(f"rtol = {line(rtol)}: backward-euler knows no error of a step, must be sdirk2")
     timed = any("dt" in law.by_scene for law in scene.materials.laws)
-    if (scene.momentum.rates or timed) and not scene.flows:
+    if (scene.momentum.own.rates or timed) and not scene.flows:
         raise ValueError(f"rtol = {line(rtol)}: where nothing flows no error of a velocity is known, must be dt")
     longest = float(numbers("max_step", max_step, **positive)) if max_step != inf else inf
     first = times.after(times.start)[0] - times.start

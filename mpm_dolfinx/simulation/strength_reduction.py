@@ -277,7 +277,7 @@ class _Weakened:
         """Return a trial from a state on, with other strengths of its points."""
         data = {name: strength(name, value) for name, value in self._strengths.items()}
         points = replace(start.points, data={**start.points.data, **data})
-        return _Trial(self._scene, replace(start, points=points, velocity=None, result=None), self.newton)
+        return _Trial(self._scene, replace(start, points=points, velocity=None, result=None, control=None), self.newton)
 
     def _go_on(self, trial: _Trial, what: str) -> None:
         """Take a step; what: names the strength."""

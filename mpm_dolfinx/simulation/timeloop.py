@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from inspect import signature
+from logging import INFO, WARNING
 from math import inf
 from typing import Any, Protocol
 
@@ -20,17 +21,20 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 
 from mpm_dolfinx.base import _compat
 from mpm_dolfinx.base.errors import LeftGrid, StepFailed
+from mpm_dolfinx.base.histories import Row, Rows
 from mpm_dolfinx.base.report import Report
 from mpm_dolfinx.base.tolerances import SAME
 from mpm_dolfinx.base.validation import functions, instance, line
 from mpm_dolfinx.parallel.exchange import first
-from mpm_dolfinx.parallel.messages import log, warn
+from mpm_dolfinx.parallel.messages import ResolutionWarning, log, logger, warn
 from mpm_dolfinx.probing.probe_fields import probe_pressures, probe_stresses
 from mpm_dolfinx.probing.probes import Probes
+from mpm_dolfinx.simulation.events import Event, Events, Step
 from mpm_dolfinx.simulation.step_size import StepSize, Times, measured, step_rule
-from mpm_dolfinx.stepping.result import GaveUp, Result, Row
+from mpm_dolfinx.stepping.result import GaveUp, Result
 from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.state import State
+from mpm_dolfinx.stepping.step_control import StepControl
 from mpm_dolfinx.stepping.summary import imbalance, peak_memory
 from mpm_dolfinx.stepping.time_integration import EULER, Substep
 
@@ -71,6 +75,7 @@ def run(
     t_eval: Sequence[float] | None = None,
     first_step: float | None = None,
     max_step: float = inf,
+    until: Event | Sequence[Event] | None = None,
     probes: Probes | None = None,
     observe: Observer | Sequence[Observer] = (),
     checkpoint: Observer | None = None,
@@ -100,6 +105,13 @@ def run(
     first_step, max_step
         With `rtol`: the first step to try, not of a run that goes on, and the longest, s, > 0.  By default the first is
         about the time in which pressures diffuse through a cell, times 20 rtol, or a thousandth of the first output.
+    until
+        Functions of the simulation, or one, that end the run before t_end: where the sign of a number changes within a
+        step, or a truth turns true, such as `lambda s: -s.points.displacement[:, 1].min() - 0.1`.  What is so at the
+        start is no event.  Steps of other lengths find where: the last state is the first one found in which the event
+        has occurred, a thousandth of that step after it at most.  It is an output; `Result.event` says which and when.
+        On several processes all give the same.  Histories that an event has ended are at their end, as at t_end, where
+        a run goes on with them; without `until` it goes on.
     probes
         Particles that are recorded.
     observe
@@ -141,14 +153,15 @@ def run(
     if after is not None:
         instance("after", after, Result)
     now = simulation.state.t
-    start = now if after is None else after.rows[0][0]
+    start = now if after is None else after.rows[0].t
     times = Times(start, now, t_end, dt, t_eval, rtol, after is not None)
     rule = step_rule(times, rtol, first_step, max_step, simulation.scene, simulation.state.points)
-    result = _histories(simulation, times, rule, probes, after)
-    stopwatch = _Stopwatch(result)
-    targets = times.after(result.rows[-1][0])
-    _note(simulation, replace(result, converged=not targets))
-    bar = _bar(start, result.rows[-1][0], times.end, progress and comm.rank == 0)
+    result, control = _histories(simulation, times, rule, probes, after)
+    stopwatch, last = _Stopwatch(result), result.rows[-1].t
+    events = Events(simulation, until)
+    targets = [] if until is not None and result.event is not None else times.after(last)
+    _note(simulation, replace(result, converged=not targets, event=None if targets else result.event), control)
+    bar = _bar(start, last, times.end, progress and comm.rank == 0)
 
     def output(converged: bool) -> None:
         with Timer("mpm: output"):
@@ -160,12 +173,15 @@ def run(
             if checkpoint is not None:
                 checkpoint(simulation)
 
-    with bar, nullcontext() if bar.disable else logging_redirect_tqdm():  # messages above the bar, not into it
+    # messages above the bar, not into it
+    with bar, nullcontext() if bar.disable else logging_redirect_tqdm([logger] if logger.handlers else None):
         for target in targets:
-            while not rule.ended(simulation.state.t, target, simulation.state.result):
+            while not rule.ended(simulation.state.t, target, simulation.state.control):
                 before = simulation.state.t
-                _advance(simulation, rule, target, progress)
-                there = rule.ended(simulation.state.t, target, simulation.state.result)
+                if _take_step(simulation, rule, target, progress, events):
+                    output(True)
+                    return _note(simulation, stopwatch.read(_measured(simulation)))
+                there = rule.ended(simulation.state.t, target, simulation.state.control)
                 if times.each and not there:
                     output(False)
                 _show(bar, simulation.state, before)
@@ -199,9 +215,9 @@ def _show(bar: tqdm, state: State, before: float) -> None:
     bar.set_postfix(counts | {name: count for name, count in seldom.items() if count})
 
 
-def _note(simulation: Simulated, result: Result) -> Result:
-    """Note the histories so far in the state."""
-    simulation.state = replace(simulation.state, result=result)
+def _note(simulation: Simulated, result: Result, control: StepControl | None = None) -> Result:
+    """Note the histories so far in the state, and the memory of the step sizes if it has changed."""
+    simulation.state = replace(simulation.state, result=result, control=control or simulation.state.control)
     return result
 
 
@@ -229,25 +245,26 @@ def _observe(observer: Callable, simulation: Simulated, comm: MPI.Intracomm) -> 
 
 def _histories(
     simulation: Simulated, times: Times, rule: StepSize, probes: Probes | None, after: Result | None
-) -> Result:
-    """Return new histories that begin with the present state, or those to go on with."""
-    now, latest = simulation.state.t, simulation.state.result
+) -> tuple[Result, StepControl]:
+    """Return new histories that begin with the present state, or those to go on with, and the memory of the steps."""
+    state, latest, control = simulation.state, simulation.state.result, simulation.state.control
     if after is None:
-        first = 0.0 if latest is None else latest.first
-        return Result(dt=times.interval, small=rule.first, first=first, rows=(_row(simulation, probes),))
-    if latest is not None and after.rows[0] is latest.rows[0]:  # of the same run, which may have gone on since, or not
-        after = latest
-    last = after.rows[-1][0]
+        begun = StepControl(times.interval, rule.first, first=0.0 if control is None else control.first)
+        return Result(Rows([_row(simulation, probes)])), begun
+    if latest is None or control is None or after.rows.run is not latest.rows.run:
+        raise ValueError("after: histories of another run, must be those of the last one, or what `resume` returns")
+    after = latest  # which may have gone on since, or not
+    now, start, last = state.t, after.rows[0], after.rows[-1].t
     # a run that was broken off has taken a part of its next interval
-    if after.dt != times.interval or not last <= now <= times.next(last):
-        what = f"dt = {times.interval!r} from t = {now!r}: the run to go on with has dt = {after.dt!r}, t = {last!r}"
-        raise ValueError(f"{what}; with other steps, or t_eval, begin new histories: without after")
-    shown = after.rows[0].displacement
-    if (recorded := 0 if shown is None else len(shown)) != (0 if probes is None else len(probes.id)):
+    if control.interval != times.interval or not last <= now <= times.next(last):
+        what = f"dt = {times.interval!r} from t = {now!r}: the run to go on with has dt = {control.interval!r}"
+        raise ValueError(f"{what}, t = {last!r}; with other steps, or t_eval, begin new histories: without after")
+    count = 0 if probes is None else len(probes.id)
+    if (recorded := len(start.displacement)) != count:
         raise ValueError(f"probes: the run to go on with has {recorded} of them")
-    if probes is not None and probes.stressed != (after.rows[0].probe_stress is not None):
+    if count and probes.stressed != (len(start.probe_stress) > 0):
         raise ValueError(f"probes: stress = {probes.stressed}, must be what the run to go on with has")
-    return after
+    return after, control
 
 
 class _Stopwatch:
@@ -267,44 +284,66 @@ def _timings() -> dict[str, float]:
     return {part: _compat.seconds(f"mpm: {part}") for part in PARTS}
 
 
-def _advance(simulation: Simulated, rule: StepSize, target: float, aloud: bool) -> None:
-    """Take one step towards a time, s, cutting it until it converges and is exact enough.
+def _take_step(simulation: Simulated, rule: StepSize, target: float, aloud: bool, events: Events) -> bool:
+    """Take one step towards a time, s; return whether an event has ended the run in it."""
+    step, new = _advance(simulation, rule, target, aloud)
+    found = events.within(step, new)
+    if found is None:
+        simulation.state = new
+        return False
+    event = found.number, found.new.t
+    new = _accepted(rule, step.start, found.dt, found.new, found.report)
+    simulation.state = replace(new, result=replace(new.result, event=event))
+    return True
+
+
+def _accepted(
+    rule: StepSize, start: State, taken: float, new: State, report: Report, wanted: float | None = None
+) -> State:
+    """Return the state after a step of a length, s, with the histories; wanted: what it should have been, s."""
+    grown = measured(start.control, report, start.result)
+    grown = rule.grown(taken, report, grown, failed=taken < (1 - SAME) * (wanted or taken))
+    grown = replace(grown, first=0.0 if new.stays else report.first / taken)
+    return replace(new, result=start.result.after(report), control=grown)
+
+
+def _advance(simulation: Simulated, rule: StepSize, target: float, aloud: bool) -> tuple[Step, State]:
+    """Return a step towards a time, s, and its end, cut until it converges and is exact enough.
 
     aloud: say of the first cut of a run that there are some.
     """
     comm, wanted, whole = simulation.scene.grid.comm, None, None
     while True:
-        state, result = simulation.state, simulation.state.result
-        taken = rule.fitted(target - state.t, result.small)
+        state, result, control = simulation.state, simulation.state.result, simulation.state.control
+        taken, how = rule.fitted(target - state.t, control.small), ()
         wanted, whole = wanted or rule.wanted(taken), whole or taken
         try:
             new, report = simulation.advanced(taken)
         except StepFailed as failed:
-            cut = rule.cut(taken, result)
-            left = _has_left(failed, rule, taken, result)
+            cut, counted = rule.cut(taken, control), replace(result, cuts=result.cuts + 1)
+            left = _has_left(failed, rule, taken, state)
             if not left and cut.small >= rule.least(wanted, state.t):
-                _note(simulation, cut)
-                tell, more = (warn, "; others: messages of level INFO") if aloud and not result.cuts else (log, "")
-                tell(comm, "t = %g s: step cut to %.3g s: %s%s", state.t, taken / 2, failed, more)
+                _note(simulation, counted, cut)
+                loud = aloud and not result.cuts
+                level, more = (WARNING, "; others: messages of level INFO") if loud else (INFO, "")
+                log(comm, "t = %g s: step cut to %.3g s: %s%s", state.t, taken / 2, failed, more, level=level)
                 continue
             if (found := _by_euler(simulation, whole, failed)) is None:
-                tried = result if left else _note(simulation, replace(cut, small=taken))
+                tried = result if left else _note(simulation, counted, replace(cut, small=taken))
                 raise GaveUp(_why(state.t, taken, failed), tried, failed.history) from failed
-            taken, (new, report) = whole, found
-        known, result = result, measured(result, report)
-        if (shrinks := rule.refused(taken, report, result)) < 1:
+            taken, how, (new, report) = whole, (EULER,), found
+        now = measured(control, report, result)
+        if (shrinks := rule.refused(taken, report, now)) < 1:
             small = wanted = taken * shrinks
             if state.t + small == state.t:
                 why = f"gave up at t = {state.t:g} s: no step is short enough for rtol = {rule.rtol:g}"
-                raise GaveUp(why, known, report.history)
-            _note(simulation, replace(known, rejected=known.rejected + 1, small=small))
+                raise GaveUp(why, result, report.history)
+            _note(simulation, replace(result, rejected=result.rejected + 1), replace(control, small=small))
             continue
-        grown = rule.grown(taken, report, result, failed=taken < (1 - SAME) * wanted)
-        first = 0.0 if new.stays else report.first / taken
-        simulation.state = replace(new, result=grown.after(report, first))
-        if not rule.by_error and grown.small > result.small:
-            log(comm, "t = %g s: step grows to %.3g s", new.t, grown.small)
-        return
+        new = _accepted(rule, state, taken, new, report, wanted)
+        if not rule.by_error and new.control.small > control.small:
+            log(comm, "t = %g s: step grows to %.3g s", new.t, new.control.small)
+        return Step(state, taken, how), new
 
 
 def _by_euler(simulation: Simulated, dt: float, failed: StepFailed) -> tuple[State, Report] | None:
@@ -319,15 +358,23 @@ def _by_euler(simulation: Simulated, dt: float, failed: StepFailed) -> tuple[Sta
     except StepFailed:
         return None
     what = "t = %g s: a step of %.3g s by backward Euler, of first order: none by %s has converged: %s"
-    warn(simulation.scene.grid.comm, what, simulation.state.t, dt, simulation.scene.numerics.method, failed)
+    warn(
+        simulation.scene.grid.comm,
+        ResolutionWarning,
+        what,
+        simulation.state.t,
+        dt,
+        simulation.scene.numerics.method,
+        failed,
+    )
     return found
 
 
-def _has_left(failed: StepFailed, rule: StepSize, taken: float, result: Result) -> bool:
+def _has_left(failed: StepFailed, rule: StepSize, taken: float, state: State) -> bool:
     """Return whether points leave the grid in a step that is exact enough: shorter ones would only lead there."""
     if not isinstance(failed, LeftGrid) or failed.report is None:
         return False
-    return rule.refused(taken, failed.report, measured(result, failed.report)) == 1
+    return rule.refused(taken, failed.report, measured(state.control, failed.report, state.result)) == 1
 
 
 def _why(t: float, small: float, failed: StepFailed) -> str:
@@ -340,23 +387,20 @@ def _why(t: float, small: float, failed: StepFailed) -> str:
 
 def _row(simulation: Simulated, probes: Probes | None) -> Row:
     """Return what the histories hold of the present state."""
-    scene, points = simulation.scene, simulation.state.points
-    comm, out, wet = scene.grid.comm, {}, scene.fluid is not None
+    scene, state = simulation.scene, simulation.state
+    comm, d, points, wet = scene.grid.comm, scene.grid.dim, state.points, scene.fluid is not None
+    out = {"displacement": np.zeros((0, d)), "position": np.zeros((0, d))}
     if wet:
         ends = comm.allgather((points.pressure.min(initial=np.inf), points.pressure.max(initial=-np.inf)))
-        out["pressure"] = (min(e[0] for e in ends), max(e[1] for e in ends))
+        out["pressure"] = np.array([min(e[0] for e in ends), max(e[1] for e in ends)])
     if probes is not None:
         out["displacement"] = probes.displacement(points, comm)
         out["position"] = probes.position(points, comm) + scene.grid.base
     if probes is not None and wet:
-        out["probe_pressure"] = probe_pressures(scene, simulation.state, probes)
+        out["probe_pressure"] = probe_pressures(scene, state, probes)
     if probes is not None and probes.stressed:
-        out["probe_stress"] = probe_stresses(scene, simulation.state, probes)
-    out["outcome"] = simulation.state.outcome
-    for value in out.values():
-        if isinstance(value, np.ndarray):
-            value.flags.writeable = False
-    return Row(simulation.state.t, **out)
+        out["probe_stress"] = probe_stresses(scene, state, probes)
+    return Row(state.t, **out, outcome=state.outcome)
 
 
 def _measured(simulation: Simulated) -> Result:

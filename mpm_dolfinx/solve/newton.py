@@ -22,8 +22,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
-from itertools import compress
 
 from mpi4py import MPI
 
@@ -40,10 +38,8 @@ from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.parts import relative
 from mpm_dolfinx.solve.linear import negative_pivots
 from mpm_dolfinx.solve.schur import Kept, LinearSolvers
-from mpm_dolfinx.solve.watchdog import Descent, Search, Watchdog
+from mpm_dolfinx.solve.search import FIRM, Halving, Search
 
-FINEST = 1e-9
-"""The best relative accuracy that is asked of multigrid."""
 INNER = 1e-3  # the momentum is solved to this share of the storage's error: rotations fake volume changes
 MOMENTUM_STEPS = 10
 REBALANCED = 6  # times the most iterations, in all, of what is to balance with other pressures or pairs of contacts
@@ -202,76 +198,38 @@ class Newton:
         serves: whether the tangent of the substep before may serve.
         """
         errors, other = self._begin()
-        fresh, watched = self._linear or not serves, not self._momentum.forms.elastic
+        fresh = self._linear or not serves
         if other is not None:
             try:
-                return self._iterations(errors, as_reset, key, fresh, watched)
+                return self._iterations(errors, as_reset, key, fresh)
             except NotConverged:
                 self._go_to(other)
                 errors, fresh = self._errors(errors.start), True
-        return self._iterations(errors, as_reset, key, fresh, watched)
+        return self._iterations(errors, as_reset, key, fresh)
 
-    def _iterations(
-        self, errors: Errors, as_reset: Callable[[], QuadratureData], key: Hashable, fresh: bool, watched: bool
-    ) -> Errors:
-        """Iterate from the present (u, p), of these errors; fresh: with its own tangent; watched: by a watchdog."""
-        count, eases, dogs, slow = 0, not self._momentum.yielded, None, False
-        if watched:
-            where = self._iterate()
-            dogs = [Watchdog(error, where, eases=eases) for error in errors.each.tolist()]
-        while (found := self._augmented(errors)).worst > self._scheme.tolerance:
+    def _iterations(self, errors: Errors, as_reset: Callable[[], QuadratureData], key: Hashable, fresh: bool) -> Errors:
+        """Iterate from the present (u, p), of these errors; fresh: with its own tangent."""
+        elastic, tolerance, keep = self._momentum.forms.elastic, self._scheme.tolerance, self._solvers.plan.keep
+        count, slow, eases = 0, False, np.full(len(errors.u), elastic or not self._momentum.yielded)
+        while (found := self._augmented(errors)).worst > tolerance:
             if found is not errors:  # what has balanced is to do so with other pressures or pairs of contacts
                 errors, count, fresh = found, 0, True
-            falls = watched and all(dog.converges for dog in compress(dogs, errors.each > self._scheme.tolerance))
-            if not watched or (fresh and not falls) or count == 2 * self._scheme.most_newton:
+            if elastic or fresh:
                 self._check(max(count, self.report.newton // REBALANCED), "newton")
             if fresh and self._linear and not self.report.newton:
                 self._solvers.tangent(key, lambda: self._linearise_as_reset(as_reset))
             elif fresh:
-                self._linearise(self._firmness(errors, dogs))
+                self._linearise(np.where(eases, 0.0, FIRM * np.minimum(1.0, errors.u)))
             self.report.coupling += self._direction(errors, fresh and slow)
-            before, (errors, steps) = errors, self._line_search(errors, dogs)
-            count += 1
-            lags = errors.each > self._solvers.plan.keep * np.minimum(
-                1.0, before.each
-            )  # inf where no fluid has moved yet
-            slow = fresh
-            fresh = bool((lags & (errors.each > self._scheme.tolerance)).any())
-            dogs, errors, back = self._watched(dogs, before, errors, steps)
-            fresh = fresh or back
+            before, errors = errors, self._line_search(errors, elastic)
+            count, slow = count + 1, fresh
+            # inf where no fluid has moved yet
+            lags = (errors.each > keep * np.minimum(1.0, before.each)) & (errors.each > tolerance)
+            fresh, eases = bool(lags.any()), eases & (elastic | ~lags)
             seeps = self._storage is not None and self._storage.settle_seepage()
             if self._momentum.settle(errors.worst <= SETTLED) or seeps:
                 errors, fresh = self._errors(errors.start), True
         return found
-
-    def _firmness(self, errors: Errors, dogs: list[Watchdog] | None) -> NDArray[np.float64] | float:
-        """Return the share of the elastic shear stiffness that is added to the tangent of each part; 0 of none."""
-        if dogs is None:
-            return 0.0
-        shares = [dog.firmness(error) for dog, error in zip(dogs, errors.u.tolist(), strict=True)]
-        return np.array(shares) if any(shares) else 0.0
-
-    def _watched(
-        self, dogs: list[Watchdog] | None, before: Errors, errors: Errors, steps: NDArray[np.float64]
-    ) -> tuple[list[Watchdog] | None, Errors, bool]:
-        """Return what is known after a step, and the errors where the parts then are; whether some were called back.
-
-        Parts that have balanced before stay as they are, and so does what is known of them.
-        """
-        if dogs is None:
-            return None, errors, False
-        here, dogs, now = cache(self._iterate), list(dogs), None
-        for part in np.flatnonzero(before.each > self._scheme.tolerance):
-            error = float(errors.each[part])
-            dogs[part] = dog = dogs[part].after(error, float(steps[part]), here)
-            if dog.strays(error):
-                dogs[part], now = replace(dog, since=0, descends=True), now or self._iterate()
-                for values, where, of in zip(now, dog.where, self._parts, strict=True):
-                    values[of == part] = where[of == part]
-        if now is not None:
-            self._go_to(now)
-            errors = self._errors(errors.start)
-        return dogs, errors, now is not None
 
     def _augmented(self, errors: Errors) -> Errors:
         """Return the errors, of what balances with the pressures of tools that penetrate too deep shifted."""
@@ -356,7 +314,7 @@ class Newton:
                 return
             with Timer("mpm: linear solve"):
                 self._solvers.solve_momentum()
-            before, (errors, _) = errors.u.max(), self._line_search(errors)
+            before, errors = errors.u.max(), self._line_search(errors, True)
             settled = self._momentum.settle(errors.u.max() <= SETTLED)
             errors = self._errors(errors.start) if settled else errors
             if settled or errors.u.max() > max(goal, self._solvers.plan.keep * before):
@@ -423,7 +381,7 @@ class Newton:
             least = 0.0
         rtol = min(1e-2, max(least, 0.05 * self._scheme.tolerance / min(1.0, errors.worst)))
         if iterative:  # the pull of given displacements, which is all of a first residual, hides the rest
-            rtol = max(FINEST, rtol / max(1.0, errors.worst))
+            rtol = max(0.05 * self._scheme.tolerance, rtol / max(1.0, errors.worst))
         done = errors.each <= self._scheme.tolerance
         if done.any():  # what balances stays where it is
             self._momentum.system.residual.array_w[done[self._momentum.system.of_parts.of]] = 0.0
@@ -442,45 +400,33 @@ class Newton:
             self._storage.set_fluxes()
             return count
 
-    def _line_search(self, before: Errors, dogs: list[Watchdog] | None = None) -> tuple[Errors, NDArray[np.float64]]:
-        """Go against the direction, each part as far as `watchdog` says; return the errors there, and the shares.
-
-        Backtracking while the residual is not finite or explodes; where watchdogs let the iterations stray, to where
-        the forces do no work.  Where one wants them to descend and no residual is as low, the lowest is taken.
-        """
+    def _line_search(self, before: Errors, elastic: bool) -> Errors:
+        """Go against the direction, each part as far as `search` says; return the errors there."""
         self.report.newton += 1
         residual, of = self._momentum.system.residual, self._momentum.system.of_parts
-        free = dogs is not None and not all(dog.descends for dog in dogs)
-        if free:
+        if not elastic:
             self._turn_forwards(before)
-            first = of.sums(residual.array_r * self._solvers.du.array_r)
-        searches = {}
-        for part in np.flatnonzero(before.each > self._scheme.tolerance):
-            dog, error = dogs[part] if dogs is not None else None, float(before.each[part])
-            searches[part] = Search() if dog is not None and not dog.descends else Descent.of(error, dog)
+        first = of.sums(residual.array_r * self._solvers.du.array_r)
+        searches = {
+            part: Halving() if elastic else Search() for part in np.flatnonzero(before.each > self._scheme.tolerance)
+        }
         steps, moved = np.ones(of.count), np.zeros(of.count)
         while True:
             self._move(moved - steps)
             moved, (errors, why) = steps.copy(), self._tried(before)
-            if free:
-                with _ignored():
-                    work = of.sums(residual.array_r * self._solvers.du.array_r)
-                work = np.full(of.count, np.nan) if why is not None else work
+            with _ignored():
+                growth, work = errors.each / before.each, of.sums(residual.array_r * self._solvers.du.array_r)
             for part, search in list(searches.items()):
-                found, error = float(errors.each[part]), float(before.each[part])
-                if isinstance(search, Search):
-                    then = search.after(_ratio(work[part], first[part]), found <= error)
-                else:
-                    then = search.after(found)
-                    if then is None and not search.ends(found):
-                        what = "" if why is None else f": {why.reason}"
-                        raise NotConverged(f"no descent along the Newton direction{what}", self.report.history)
-                if then is None:
+                then = search.after(np.nan if why else _ratio(work[part], first[part]), growth[part])
+                if then is not None:
+                    searches[part], steps[part] = then, then.step
+                elif growth[part] <= search.limit:
                     del searches[part]
                 else:
-                    searches[part], steps[part] = then, then.step
+                    what = "" if why is None else f": {why.reason}"
+                    raise NotConverged(f"no descent along the Newton direction{what}", self.report.history)
             if not searches:
-                return errors, steps
+                return errors
 
     def _tried(self, before: Errors) -> tuple[Errors, NotConverged | None]:
         """Return the errors where a step has led, infinite where a law cannot be evaluated; and why it cannot."""
@@ -492,7 +438,7 @@ class Newton:
             return replace(before, u=away, p=away), failed
 
     def _turn_forwards(self, errors: Errors) -> None:
-        """Turn a direction round along which the residuals do negative work: see `watchdog`.
+        """Turn a direction round along which the residuals do negative work: see `search`.
 
         The work of both residuals, in which the coupling's cancels, is what the tangent takes.
         """

@@ -28,7 +28,7 @@ from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.flow.storage import FILTER, FluxSlope, StorageProblem, StorageSystem
 from mpm_dolfinx.mechanics.momentum import MomentumProblem, MomentumSystem
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
-from mpm_dolfinx.parallel.messages import warn
+from mpm_dolfinx.parallel.messages import ConditionWarning, warn
 from mpm_dolfinx.points.parts import OfParts
 from mpm_dolfinx.solve.linear import MOST, direct_solver, displacement_solver, factorise, solved
 from mpm_dolfinx.solve.monolithic import BlockSolver, Inverses
@@ -140,6 +140,8 @@ class LinearSolvers:
             gathered = how.gathered and not mumps
             self._solve_s = direct_solver(storage.P, "storage", gathered=gathered, package="mumps" if mumps else None)
             self._set_krylov(how.krylov)
+            self._solve_s.setFromOptions()
+            self._krylov = self._solve_s.getType()
 
     def _momentum_solver(self) -> PETSc.KSP:
         """Return what solves for displacements."""
@@ -211,7 +213,7 @@ class LinearSolvers:
         comm = self.du.comm.tompi4py()
         names = sorted(set.intersection(*map(set, comm.allgather(self._unread))))
         if names:
-            warn(comm, "petsc_options: no solver reads %s (%s)", ", ".join(names), self.plan)
+            warn(comm, ConditionWarning, "petsc_options: no solver reads %s (%s)", ", ".join(names), self.plan)
         self._unread.clear()
 
     def solve(
@@ -250,7 +252,7 @@ class LinearSolvers:
             with using(self.scheme.petsc_options):
                 count, kept.factors = self._block.solve(self.du, self.dp, scales, rtol, slopes, kept.factors)
             return count
-        self._set_krylov(self.plan.krylov if slope is None else PETSc.KSP.Type.FGMRES)
+        self._set_krylov(self._krylov if slope is None else PETSc.KSP.Type.FGMRES)
         if slope is not None:
             self._schur.setPythonContext(replace(self._context, slopes=slopes))
         g = self.condense(*slopes)

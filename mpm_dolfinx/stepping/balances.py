@@ -11,11 +11,12 @@ from mpi4py import MPI
 import numpy as np
 from numpy.typing import NDArray
 
-from mpm_dolfinx.conditions.acting import QUANTITIES, Loads, Outcome
+from mpm_dolfinx.conditions.acting import QUANTITIES, At, Loads, Outcome
 from mpm_dolfinx.flow.storage import Rates, StorageProblem
 from mpm_dolfinx.mechanics.momentum import MomentumProblem
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
 from mpm_dolfinx.parallel.exchange import over_all
+from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.stepping.on_grid import Assembled, OnGrid
 from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.state import State
@@ -70,6 +71,15 @@ def at_rest(scene: Scene, state: State, loads: list[list[Loads]]) -> list[list[L
         return loads
     scene.momentum.u.x.array[:] = state.rest
     return [[one.moved(scene.momentum.u) for one in of] for of in loads]
+
+
+def left(loads: Sequence[Loads], at: At, before: MaterialPoints, after: MaterialPoints) -> MaterialPoints:
+    """Return the points after a step with what they keep of the loads; refuse them where they may not be."""
+    for one in loads:
+        one.check_end(after, before)
+    for one in loads:
+        after = one.gripped(at, after)
+    return after
 
 
 def going_on(scene: Scene, start: Start, substep: Substep) -> NDArray[np.float64] | None:

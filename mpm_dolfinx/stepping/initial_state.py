@@ -29,7 +29,7 @@ from mpm_dolfinx.forms.unknowns import Unknowns
 from mpm_dolfinx.materials.initial_stress import strained
 from mpm_dolfinx.mechanics.momentum import MomentumProblem
 from mpm_dolfinx.parallel.exchange import over_all
-from mpm_dolfinx.parallel.messages import log, warn
+from mpm_dolfinx.parallel.messages import ConditionWarning, log, warn
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.solve.newton import solve_substep
 from mpm_dolfinx.solve.schur import Kept, LinearSolvers, planned
@@ -135,8 +135,10 @@ def _told(scene: Scene, seeded: State, points: MaterialPoints, count: int, left:
     before, after = (np.nan_to_num(materials.effective_stress_3d(of)) for of in (seeded.points, points))
     largest, changed = (over_all(comm, float(np.abs(v).max(initial=0.0)), MPI.MAX) for v in (before, after - before))
     what = "initial_stress: in balance after %d iterations, changed by at most %.3g of %.3g Pa; %.2g of its forces held"
-    tell = warn if changed > REMARKABLE * largest or left > REMARKABLE else log
-    tell(comm, what, count, changed, largest, left)
+    if changed > REMARKABLE * largest or left > REMARKABLE:
+        warn(comm, ConditionWarning, what, count, changed, largest, left)
+    else:
+        log(comm, what, count, changed, largest, left)
 
 
 def _rest(scene: Scene, loads: Sequence[Loads], w: NDArray[np.float64]) -> NDArray[np.float64]:

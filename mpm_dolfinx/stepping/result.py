@@ -5,147 +5,138 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mpm_dolfinx.base.histories import Row, Rows
 from mpm_dolfinx.base.report import Report
-from mpm_dolfinx.conditions.acting import Outcome
 from mpm_dolfinx.conditions.names import ByName
-
-
-class Row(NamedTuple):
-    """What the histories hold of an output time; None where nothing is asked for, or there is no fluid.
-
-    t, s; displacement (m, d), m, and present position (m, d), m, of the m probes; pressure: least and largest on the
-    points, Pa; probe_pressure (m,), Pa, and probe_stress (m, 3, 3), Pa: pore pressure and effective stress, tension
-    positive, at the places of the probes, see `probe_fields`; outcome: what conditions do to the bodies, see `State`.
-    """
-
-    t: float
-    displacement: NDArray[np.float64] | None = None
-    pressure: tuple[float, float] | None = None
-    position: NDArray[np.float64] | None = None
-    probe_pressure: NDArray[np.float64] | None = None
-    probe_stress: NDArray[np.float64] | None = None
-    outcome: Outcome | None = None
 
 
 @dataclass(frozen=True)
 class Result:
-    """Histories of a run, and where its time loop is; one row an output time, the start included.
+    """Histories of a run; one row an output time, the start included.
 
-    rows: what is recorded at the output times, see `Row`; each column is a property too.  Of
-    the steps so far: steps, newton, coupling (iterations), balance and residual (worst, relative), cuts (for want of
-    convergence), rejected (for their error), change (largest of the pressures since the run began, Pa), rederived
-    (domains that had folded), wall (s), and profile: seconds of each part of the run on this process, from dolfinx's
-    timers.  points: material points; memory: peak of all processes, libraries included, MB; imbalance: the most that
-    one of several processes has over their mean, at the end of the run.
-    dt: output interval, s, 0 without one; small: the step to try next, s; converged: the end has been reached; first:
-    see `Report`, of the last step over its length where the grid is reset, Pa/s; waits, kept: see `StepSize.grown`.
+    Histories are arrays (n, ...) of n output times, which cannot be written into.  Where nothing was asked for they
+    have no entries along one of their axes: (n, 0, d) without probes.
+
+    Parameters
+    ----------
+    rows
+        What is recorded at the output times, see `Row`.
+    steps, newton, coupling, cuts, rejected
+        Numbers so far: steps, iterations, steps cut for want of convergence, and refused for their error.
+    rederived
+        Domains that had folded, and were derived from F.
+    balance, residual
+        Worst relative errors so far of the fluid's balance, and of the two problems.
+    wall, profile
+        Seconds, of the whole run and of each part of it on this process, from dolfinx's timers.
+    converged
+        Whether the end has been reached.
+    event
+        Which function of `until` has ended the run, from 0 on, and when, s; None where none has.
+    points, memory, imbalance
+        At the end of the run: material points, the peak of all processes, libraries included, MB, and the most that
+        one of several processes has over their mean.
     """
 
-    rows: tuple[Row, ...] = field(default=(), repr=False)
+    rows: Rows = field(default_factory=Rows, repr=False)
     """One an output time."""
     steps: int = 0
     newton: int = 0
     coupling: int = 0
     cuts: int = 0
     rejected: int = 0
-    change: float = 0.0
-    first: float = 0.0
     rederived: int = 0
     balance: float = 0.0
     residual: float = 0.0
     wall: float = 0.0
-    dt: float = 0.0
-    small: float = 0.0
-    waits: int = 0
-    kept: int = 1
     converged: bool = False
+    event: tuple[int, float] | None = None
     profile: dict[str, float] = field(default_factory=dict, repr=False)
     points: int = 0
     memory: float = 0.0
     imbalance: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self):
-        object.__setattr__(self, "rows", tuple(self.rows))  # a kept one does not grow with the run
+        if not isinstance(self.rows, Rows):
+            object.__setattr__(self, "rows", Rows(self.rows))
+        if self.event is not None:
+            object.__setattr__(self, "event", tuple(self.event))
 
     @property
-    def t(self) -> list[float]:
-        """Output times, s."""
-        return self.column("t")
+    def t(self) -> NDArray[np.float64]:
+        """Output times (n,), s."""
+        return self.rows.column("t")
 
     @property
-    def displacement(self) -> list[NDArray[np.float64]]:
-        """Displacements (m, d) of the probes at the output times, m."""
-        return self.column("displacement")
+    def displacement(self) -> NDArray[np.float64]:
+        """Displacements (n, m, d) of the probes, m."""
+        return self.rows.column("displacement")
 
     @property
-    def position(self) -> list[NDArray[np.float64]]:
-        """Positions (m, d) of the probes at the output times, m."""
-        return self.column("position")
+    def position(self) -> NDArray[np.float64]:
+        """Positions (n, m, d) of the probes, m."""
+        return self.rows.column("position")
 
     @property
-    def probe_pressure(self) -> list[NDArray[np.float64]]:
-        """Pore pressures (m,) at the probes at the output times, Pa."""
-        return self.column("probe_pressure")
+    def pressure(self) -> NDArray[np.float64]:
+        """Least and largest pore pressure (n, 2) on the points, Pa; (n, 0) without fluid."""
+        return self.rows.column("pressure")
 
     @property
-    def probe_stress(self) -> list[NDArray[np.float64]]:
-        """Effective stresses (m, 3, 3) at the probes at the output times, Pa, tension positive."""
-        return self.column("probe_stress")
+    def probe_pressure(self) -> NDArray[np.float64]:
+        """Pore pressures (n, m) at the probes, Pa; (n, 0) without fluid."""
+        return self.rows.column("probe_pressure")
 
     @property
+    def probe_stress(self) -> NDArray[np.float64]:
+        """Effective stresses (n, m, 3, 3) at the probes, Pa, tension positive; (n, 0, 3, 3) where not asked for."""
+        return self.rows.column("probe_stress")
+
+    @cached_property
     def reactions(self) -> ByName[NDArray[np.float64]]:
         """Forces (times, d), N, of each given displacement on the bodies at the output times, by its name."""
         return self.outcome("reactions")
 
-    @property
+    @cached_property
     def wall_reactions(self) -> ByName[NDArray[np.float64]]:
         """Forces (times, d), N, of each wall of the grid on the bodies at the output times; see `Simulation`."""
         return self.outcome("wall_reactions")
 
-    @property
+    @cached_property
     def outflows(self) -> ByName[NDArray[np.float64]]:
         """What leaves (times,), m^3/s, through each open side at the output times, by its name."""
         return self.outcome("outflows")
 
-    @property
+    @cached_property
     def tool_forces(self) -> ByName[NDArray[np.float64]]:
         """Forces and moments (times, d + 1), in 3D (times, 6), N and N m, of each tool and contact, by its name."""
         return self.outcome("tool_forces")
 
-    @property
+    @cached_property
     def tool_travel(self) -> ByName[NDArray[np.float64]]:
         """How far a load has pushed (times,), m, each tool beyond its displacement at the output times, by its name."""
         return self.outcome("tool_travel")
 
     def outcome(self, quantity: str) -> ByName[NDArray[np.float64]]:
-        """Return what conditions have done (times, ...) at the output times, by name, such as "reactions".
+        """Return what conditions have done (n, ...) at the output times, by name, such as "reactions".
 
         nan where a condition was not there.
         """
-        rows = [outcome.get(quantity, {}) for outcome in self.column("outcome")]
+        rows = [outcome.get(quantity, {}) for outcome in self.rows.outcomes]
         like = {name: np.full_like(value, np.nan) for row in rows for name, value in row.items()}
         return ByName({name: np.array([row.get(name, none) for row in rows]) for name, none in like.items()})
 
-    @property
-    def pressure(self) -> list[tuple[float, float]]:
-        """Least and largest pore pressure on the points at the output times, Pa."""
-        return self.column("pressure")
-
-    def column(self, name: str) -> list:
-        """Return one quantity of the rows, where it is recorded."""
-        return [value for row in self.rows if (value := getattr(row, name)) is not None]
-
     def more(self, row: Row) -> Result:
         """Return the histories with one more output time."""
-        return replace(self, rows=(*self.rows, row))
+        return replace(self, rows=self.rows.more(row))
 
-    def after(self, report: Report, first: float = 0.0) -> Result:
-        """Return the histories after one more step; first: see `Result`."""
+    def after(self, report: Report) -> Result:
+        """Return the histories after one more step."""
         return replace(
             self,
             steps=self.steps + 1,
@@ -154,7 +145,6 @@ class Result:
             rederived=self.rederived + report.rederived,
             balance=max(self.balance, report.balance),
             residual=max(self.residual, *report.history[-1]),
-            first=first,
         )
 
     def shares(self) -> str:

@@ -32,7 +32,7 @@ from mpm_dolfinx.materials.skeleton import Fluid, Skeleton
 from mpm_dolfinx.materials.user_functions import compiling
 from mpm_dolfinx.mechanics.momentum import MomentumForms
 from mpm_dolfinx.mechanics.quadrature_data import QuadraturePoints
-from mpm_dolfinx.parallel.messages import warn
+from mpm_dolfinx.parallel.messages import ConditionWarning, warn
 from mpm_dolfinx.points.cutting import volumes
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.stepping.advance import Motion
@@ -133,14 +133,14 @@ class Scene:
         return set()
 
     def look_at(self, gravity: Sequence[NDArray[np.float64] | None]) -> None:
-        """Log a warning, once, of a gravity at the start of a step and in it that is not that of the conductivities."""
+        """Warn, once, of a gravity at the start of a step and in it that is not that of the conductivities."""
         if self.fluid is None or not self.materials.conducts or gravity[0] is None or "gravity" in self._told:
             return
         if strength := other_gravity(self.fluid, gravity):
-            self._told.add("gravity")
             what = "gravity = %.6g m/s^2, but conductivities become mobilities by the fluid's density x 9.81 m/s^2, as "
             what += "gravity changes with time: must be given as Fluid(gravity=...)"
-            warn(self.grid.comm, what, strength)
+            warn(self.grid.comm, ConditionWarning, what, strength)
+            self._told.add("gravity")
 
     def check(self, state: State) -> None:
         """Refuse what is no state of this scene: its conditions act on the materials of another one."""

@@ -32,7 +32,7 @@ from mpm_dolfinx.conditions.sides import Sides
 from mpm_dolfinx.conditions.unit_weights import weighed
 from mpm_dolfinx.contact.acting import ContactsOfStage, ToolsOfStage
 from mpm_dolfinx.contact.groups import Contact
-from mpm_dolfinx.contact.tools import Tool
+from mpm_dolfinx.contact.tool import Tool
 from mpm_dolfinx.domains.lattice import Lattice, lattices
 from mpm_dolfinx.flow.hydraulic_boundary import HydraulicBoundary
 from mpm_dolfinx.grid.grid import SIDES, Grid
@@ -112,6 +112,11 @@ class Stage:
         """Return what acts on the momentum in a substep."""
         with Timer("mpm: loads"):
             return [one.placed(place) for one in self.acting]
+
+    def check_start(self, place: Place) -> None:
+        """Refuse a stage that begins in a place where it cannot."""
+        for one in self.acting:
+            one.check_start(place)
 
     def kept(self, n: int) -> dict[str, NDArray[np.float64]]:
         """Return what n points keep of the conditions, as these begin."""

@@ -19,12 +19,12 @@ from mpm_dolfinx.bodies.touching import check_apart
 from mpm_dolfinx.conditions.conditions import Drained, Pressure, Traction
 from mpm_dolfinx.conditions.sides import everywhere
 from mpm_dolfinx.conditions.unit_weights import WEIGHS, warn_units
-from mpm_dolfinx.contact.cell_contact import gripped, let_go
 from mpm_dolfinx.contact.groups import Contact
+from mpm_dolfinx.contact.history import gripped, let_go
 from mpm_dolfinx.domains.pressure_transport import at_start
 from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.materials.initial_stress import OfWater
-from mpm_dolfinx.parallel.messages import warn
+from mpm_dolfinx.parallel.messages import ConditionWarning, warn
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.stepping.initial_state import pieces_at_start
 from mpm_dolfinx.stepping.scene import Scene
@@ -135,7 +135,7 @@ def _stage(scene: Scene, conditions: Mapping[str, Any], present: Sequence[bool],
 
 
 def _warn_weights(scene: Scene, begun: Stage, given: Mapping[str, Any]) -> None:
-    """Log a warning for each level of water, given ones and those on sides, that is not as heavy as the pore fluid.
+    """Warn for each level of water, given ones and those on sides, that is not as heavy as the pore fluid.
 
     In a dry scene for each that is as heavy as water is under another gravity.
     """
@@ -153,11 +153,11 @@ def _warn_weights(scene: Scene, begun: Stage, given: Mapping[str, Any]) -> None:
     for name, weight in sorted(weights):
         if abs(weight - own) > WEIGHS * max(weight, own):
             what = "%s: unit_weight = %.6g N/m^3, but that of %s, its density times gravity, is %.6g"
-            warn(scene.grid.comm, f"{what}: at one level they are not at rest", name, weight, of, own)
+            warn(scene.grid.comm, ConditionWarning, f"{what}: at one level they are not at rest", name, weight, of, own)
 
 
 def _warn_moved_on(scene: Scene, before: Stage, begun: Stage) -> None:
-    """Log a warning for each condition that stays as it was and acts on what an excavation has laid bare."""
+    """Warn for each condition that stays as it was and acts on what an excavation has laid bare."""
     stop = np.cumsum([len(body) for body in scene.bodies])
     for name, condition in begun.given.items():
         if not hasattr(condition, "side") or before.given.get(name) is not condition:
@@ -170,7 +170,8 @@ def _warn_moved_on(scene: Scene, before: Stage, begun: Stage) -> None:
         if len(new):
             area = bare[np.unique(now.id[new])].sum()
             what = "stage: remove: %s stays as it was and now also acts on %.3g m^%d that were laid bare, from %s on"
-            warn(scene.grid.comm, what, line(condition), area, scene.grid.dim - 1, now.X[new[0]].mean(axis=0))
+            values = line(condition), area, scene.grid.dim - 1, now.X[new[0]].mean(axis=0)
+            warn(scene.grid.comm, ConditionWarning, what, *values)
 
 
 def _filled(

@@ -19,6 +19,7 @@ from mpm_dolfinx.parallel.exchange import Exchange
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.stepping.result import Result
 from mpm_dolfinx.stepping.stage import Stage
+from mpm_dolfinx.stepping.step_control import StepControl
 
 
 def _freeze(kept: Mapping[str, Any]) -> None:
@@ -115,8 +116,8 @@ class State:
     rest : (unknowns,), m
         Displacement of the nodes of this process, ghosts included, for which given displacements and plates have the
         forces of an initial stress at rest; None once a stage changes these, and once the grid is reset.
-    result
-        Histories of the last run, None before the first one.
+    result, control
+        Histories of the last run, and the memory of its step sizes; None before the first one.
     """
 
     t: float
@@ -131,6 +132,7 @@ class State:
     held: NDArray[np.float64] | None = None
     rest: NDArray[np.float64] | None = None
     result: Result | None = None
+    control: StepControl | None = None
 
     def __post_init__(self):
         _freeze(vars(self))

@@ -10,7 +10,7 @@ from mpm_dolfinx.base.report import Report
 from mpm_dolfinx.conditions.acting import Place
 from mpm_dolfinx.forms.unknowns import collect_garbage
 from mpm_dolfinx.solve.newton import Kept, note_pressures, solve_substep
-from mpm_dolfinx.stepping.balances import Acting, Start, at_rest, balances, has_yielded
+from mpm_dolfinx.stepping.balances import Acting, Start, at_rest, balances, has_yielded, left
 from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.state import State
 
@@ -30,8 +30,7 @@ def set_up(scene: Scene, state: State, dt: float, how: tuple = ()) -> Start:
     data = on_grid.data_of(state)
     place = Place(on_grid.cut, state.points, data, state.t, dt, state.t, state.outcome)
     if state.begins:
-        for one in stage.acting:
-            one.check_start(place)
+        stage.check_start(place)
     loads = [stage.placed(place._replace(t=t)) for t in times]
     at_cut = place._replace(points=cut_points, pieces=on_grid.data, t=times[-1])
     as_cut = partial(stage.placed, at_cut) if state.stay else partial(loads.__getitem__, -1)
@@ -56,9 +55,6 @@ def step(scene: Scene, state: State, dt: float, how: tuple = ()) -> tuple[State,
     loads = [one.ended(at) for one in acting.loads]
     end = state.t + dt, loads, both.came(rates[-1]), report
     new, report.rederived = scene.motion.advanced(state, on_grid, start.data, *end)
-    velocity, points = None if scene.momentum.elastic else scene.momentum.u.x.array / dt, new.points
-    for one in loads:
-        one.check_end(new.points, state.points)
-        points = one.gripped(at, points)
-    now = {"outcome": outcome, "points": points, "velocity": velocity, "begins": False}
-    return replace(new, **now, resets=state.resets + (not state.stays)), report
+    velocity = None if scene.momentum.elastic else scene.momentum.u.x.array / dt
+    now = {"outcome": outcome, "points": left(loads, at, state.points, new.points), "velocity": velocity}
+    return replace(new, **now, begins=False, resets=state.resets + (not state.stays)), report

@@ -14,7 +14,7 @@ import numpy as np
 
 from mpm_dolfinx.conditions.conditions import Displacement, Pressure, RigidPlate, Traction
 from mpm_dolfinx.contact.groups import Contact
-from mpm_dolfinx.contact.tools import Tool
+from mpm_dolfinx.contact.tool import Tool
 from mpm_dolfinx.materials.skeleton import LOCKING
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.stepping.scene import Scene

@@ -37,6 +37,7 @@ from tqdm import tqdm
 from mpm_dolfinx.base import _compat
 from mpm_dolfinx.base.errors import NotConverged
 from mpm_dolfinx.base.fluid_content import change_of_content, mass_potential, mass_potential_form
+from mpm_dolfinx.base.histories import Row, Rows
 from mpm_dolfinx.base.report import Report
 from mpm_dolfinx.base.tolerances import NEAR, ROUND_OFF, SAME, TINY
 from mpm_dolfinx.base.validation import all_of, functions, instance, line, numbers
@@ -51,7 +52,7 @@ from mpm_dolfinx.materials.user_functions import call, compiling, term_of
 from mpm_dolfinx.materials.user_functions import form as form_of
 from mpm_dolfinx.probing.probes import positions
 from mpm_dolfinx.stepping.numerics import DEFAULT, Numerics
-from mpm_dolfinx.stepping.result import GaveUp, Result, Row
+from mpm_dolfinx.stepping.result import GaveUp, Result
 from mpm_dolfinx.stepping.time_integration import Substep, substeps
 
 ELEMENTS = {"taylor-hood": (2, ("Lagrange", 1, ())), "q1-dg0": (1, ("DG", 0, ()))}  # degree of u; space of p
@@ -497,7 +498,7 @@ class BiotFEM:
         out = np.flatnonzero(self.grid.outside(x - self.grid.base))
         if len(out):
             raise ValueError(f"probe at {x[out[0]]}: outside the body, must be in it or on its surface")
-        result, began = Result(rows=(self._row(x),)), time.perf_counter()
+        result, began = Result(Rows([self._row(x)])), time.perf_counter()
         shown = {"disable": not progress or self.grid.comm.rank > 0 or None, "unit": "step", "desc": "finite elements"}
         for _ in tqdm(range(steps), **shown):
             try:
@@ -505,7 +506,7 @@ class BiotFEM:
             except NotConverged as failed:
                 message = f"gave up at t = {self.t:g} s with dt = {dt:.3g} s: {failed}"
                 raise GaveUp(message, result, failed.history) from failed
-            result = result.after(Report(newton=newton, history=[(residual, 0.0)]), dt).more(self._row(x))
+            result = result.after(Report(newton=newton, history=[(residual, 0.0)])).more(self._row(x))
         return replace(result, wall=time.perf_counter() - began, converged=True)
 
     def displacement(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -527,8 +528,8 @@ class BiotFEM:
 
     def _row(self, x: NDArray[np.float64]) -> Row:
         """Return what the histories hold of the present state."""
-        pressure = None
+        pressure = np.zeros(0)
         if self.fluid:
             p, comm = self.scale * self._space.w.x.array[self._space.p_dofs], self.grid.comm
-            pressure = (comm.allreduce(p.min(), op=MPI.MIN), comm.allreduce(p.max(), op=MPI.MAX))
+            pressure = np.array([comm.allreduce(p.min(), op=MPI.MIN), comm.allreduce(p.max(), op=MPI.MAX)])
         return Row(self.t, self.displacement(x), pressure)

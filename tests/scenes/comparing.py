@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from mpm_dolfinx.conditions.conditions import HOLD
-from mpm_dolfinx.contact.cell_contact import STIFF
+from mpm_dolfinx.contact.law import STIFF
 from scenes.description import Scene
 from scenes.frames import Frame
 from scenes.running import Shown

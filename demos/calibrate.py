@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: MIT
+"""Where one linear solver becomes better than another: both are timed on each side of the thresholds of the plan.
+
+Each row is a scene of so many unknown displacements, stepped with the threshold moved so that either route is taken.
+Times are processor times of two steps, the least of --repeat turns.  The table stands in
+`mpm_dolfinx/solve/plan.py`.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+import common
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.solve import plan
+
+HUGE = 10**9
+STEPS = 2
+
+
+def block(dim: int, n: int, soil: mpm.Skeleton, fluid: bool) -> mpm.Simulation:
+    """Return a block of n cells along each axis, its foot held, that a growing load presses."""
+    grid = mpm.Grid([0.0] * dim, [1.0] * (dim - 1) + [1.25], [n] * (dim - 1) + [n + n // 4])
+    load = mpm.Traction("top", lambda t: [0.0] * (dim - 1) + [-1e4 * t])
+    walls = {"left": "x", "right": "x", "bottom": "xyz"[:dim]} | ({"front": "y", "back": "y"} if dim == 3 else {})
+    wet = {"fluid": mpm.Fluid(), "drained": [mpm.Drained("top")]} if fluid else {}
+    return mpm.Simulation(grid, [mpm.box(grid, [0.0] * dim, [1.0] * dim)], [soil], walls=walls, tractions=[load], **wet)
+
+
+ELASTIC = mpm.Hencky(bulk=2e6, shear=1e6, conductivity=1e-7)
+YIELDS = mpm.DruckerPrager(bulk=2e6, shear=1e6, friction=20.0, dilation=0.0, cohesion=1e4, conductivity=1e-7)
+CASES: dict[str, tuple[Callable[[int], mpm.Simulation], tuple[int, ...], tuple[int, ...]]] = {
+    "multigrid_3d": (lambda n: block(3, n, ELASTIC, False), (4, 8, 12, 16), (4,)),
+    "multigrid_2d": (lambda n: block(2, n, ELASTIC, True), (64, 96, 128, 192), (16,)),
+    "mumps": (lambda n: block(2, n, YIELDS, True), (64, 128, 192, 256), (12,)),
+}
+"""By the name of a threshold: a scene of so many cells along an axis, and such numbers, then those of --quick."""
+
+
+def took(make: Callable[[int], mpm.Simulation], n: int, name: str, least: int) -> tuple[float, int, plan.SolverPlan]:
+    """Return the time (s), the unknowns and the plan of steps with another threshold."""
+    usual, plan.THRESHOLDS = plan.THRESHOLDS, replace(plan.THRESHOLDS, **{name: least})
+    try:
+        s = make(n)
+        s.step(1.0)
+        began = time.process_time()
+        for _ in range(STEPS):
+            s.step(1.0)
+        matrices = s.scene.last[1]
+        return time.process_time() - began, matrices.momentum.unknowns.global_size, matrices.plan
+    finally:
+        plan.THRESHOLDS = usual
+
+
+def main(argv: list[str] | None = None) -> dict:
+    """Print the table and return its times by threshold and unknowns."""
+    parser = common.Parser(__doc__, __file__)
+    parser.add_argument("--repeat", type=int, default=2, help="turns of a pair")
+    parser.add_argument("--quick", action="store_true", help="small blocks, one turn")
+    o = parser.parse_args(argv)
+    lines = [common.markdown([["threshold", "unknowns", "below it (s)", "above it (s)", "plan below", "plan above"]])]
+    with common.results(o) as out:
+        print(lines[0], flush=True)
+        for name, (make, sizes, small) in CASES.items():
+            for n in small if o.quick else sizes:
+                pairs = [[took(make, n, name, least) for least in (HUGE, 0)] for _ in range(1 if o.quick else o.repeat)]
+                below, above = (min(pair[k][0] for pair in pairs) for k in (0, 1))
+                (_, unknowns, one), (_, _, other) = pairs[0]
+                out[f"{name}_{n}"] = [unknowns, below, above]
+                usual = getattr(plan.THRESHOLDS, name)
+                lines.append(f"| {name} {usual} | {unknowns} | {below:.3f} | {above:.3f} | {one} | {other} |")
+                print(lines[-1], flush=True)
+        o.out.mkdir(parents=True, exist_ok=True)
+        (o.out / "calibration.md").write_text("\n".join(lines) + "\n")
+        out["converged"] = True
+    return out
+
+
+if __name__ == "__main__":
+    raise SystemExit(0 if main()["converged"] else 1)

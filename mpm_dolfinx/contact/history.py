@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: MIT
+"""Contact pressures and shear tractions that material points keep from step to step."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpm_dolfinx.grid.grid import sum_by
+from mpm_dolfinx.parallel.exchange import Exchange
+from mpm_dolfinx.points.material_points import MaterialPoints
+
+
+class Rough(Protocol):
+    """A tool, or the contact of two groups: mu, adhesion, Pa, and whether it resists slip."""
+
+    friction: float
+    adhesion: float
+    grips: bool
+
+
+def pressure_name(name: str) -> str:
+    """Return the name under which points have the pressure (n,), Pa, of a tool or contact on their faces."""
+    return f"{name}_pressure"
+
+
+def shear_name(name: str) -> str:
+    """Return the name under which points keep the shear traction (n, d), Pa, of a tool or contact."""
+    return f"{name}_shear"
+
+
+def kept(contacts: Mapping[str, Rough], n: int, dim: int) -> dict[str, dict[str, NDArray[np.float64]]]:
+    """Return what n points keep of each contact, zero: pressures (n,) and, of what resists slip, tractions (n, d)."""
+    return {
+        name: {pressure_name(name): np.zeros(n), **({shear_name(name): np.zeros((n, dim))} if contact.grips else {})}
+        for name, contact in contacts.items()
+    }
+
+
+def let_go(points: MaterialPoints, names: Iterable[str]) -> MaterialPoints:
+    """Return points without what they keep under these names."""
+    return replace(points, data={name: rows for name, rows in points.data.items() if name not in names})
+
+
+def gripped(
+    points: MaterialPoints, new: Mapping[str, NDArray[np.float64]], before: MaterialPoints | None
+) -> MaterialPoints:
+    """Return points with new data, or with what the same points kept of it `before`."""
+    if before is not None:
+        here, at = before.find(points.id)
+        for name in new.keys() & before.data.keys():
+            new[name][here] = before.data[name][at]
+    return replace(points, data={**points.data, **new}) if new else points
+
+
+@dataclass(frozen=True, eq=False)
+class Origin:
+    """Where pairs come from: their way to the owners of their cells, and of each (n,) before it the material point.
+
+    point : (n,) index on this process; number : (n,) contact; area : (n,), m^(d-1).
+    """
+
+    travel: Exchange
+    point: NDArray[np.int64]
+    number: NDArray[np.int64]
+    area: NDArray[np.float64]
+
+    def means(
+        self, contacts: Mapping[str, Rough], points: MaterialPoints, push: NDArray, shear: NDArray
+    ) -> MaterialPoints:
+        """Return the points with the means of the pressures (m,) and shear tractions (m, d), Pa, of their pairs."""
+        push, shear, data, n = self.travel.back(push), self.travel.back(shear), dict(points.data), len(points)
+        for number, (name, contact) in enumerate(contacts.items()):
+            rows = np.flatnonzero(self.number == number)
+            at, area = self.point[rows], self.area[rows]
+            whole = sum_by(at, area, n)
+            whole[whole == 0] = 1.0
+            means = [sum_by(at, area * column, n) / whole for column in (push[rows], *shear[rows].T)]
+            data[pressure_name(name)] = means[0]
+            if contact.grips:
+                data[shear_name(name)] = np.stack(means[1:], axis=1)
+        return replace(points, data=data)

@@ -1,0 +1,195 @@
+# SPDX-License-Identifier: MIT
+"""Pairs of places that may touch: points of integration on a surface, each with a place of a tool or of another group.
+
+How far apart the places of a pair are follows from w = B u.  B has the nodes of the point's cell, and of the other
+side's where that deforms: the place of a tool moves as the tool does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from mpi4py import MPI
+from petsc4py import PETSc
+
+import numpy as np
+import scipy.sparse
+from numpy.typing import NDArray
+
+from mpm_dolfinx.base.validation import line
+from mpm_dolfinx.conditions.sides import everywhere
+from mpm_dolfinx.contact.shapes import DISTANCE, Distance
+from mpm_dolfinx.contact.tool import Pose, Tool
+from mpm_dolfinx.forms.unknowns import Unknowns
+from mpm_dolfinx.grid.grid import Grid
+from mpm_dolfinx.parallel.exchange import Exchange
+
+
+class Geometry(NamedTuple):
+    """The pairs at some w; arrays over m of them.
+
+    gap : (m,), m, negative where they penetrate; n : (m, d) its derivative by w, the unit normal out of the other side;
+    curvature : (m, d, d) second derivative, 1/m, None where it is zero; slip : (m, d), m, in the step;
+    arm : (m, d), m, from where moments count.
+    """
+
+    gap: NDArray[np.float64]
+    n: NDArray[np.float64]
+    curvature: NDArray[np.float64] | None
+    slip: NDArray[np.float64]
+    arm: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Pairs:
+    """Pairs in owned cells; arrays over m of them.
+
+    number, cell : (m,) contact, local cell; area : (m,), m^(d-1); resistance : (m,), Pa, see `conditions`, the lower
+    one of both sides; pressure, shear : (m,) and (m, d), Pa, on the points before the step; x : (m, d), m, where the
+    grid sees the points; sign : (contacts,) with which forces on the points count.
+    """
+
+    grid: Grid
+    number: NDArray[np.int64]
+    cell: NDArray[np.int32]
+    area: NDArray[np.float64]
+    resistance: NDArray[np.float64]
+    pressure: NDArray[np.float64]
+    shear: NDArray[np.float64]
+    x: NDArray[np.float64]
+    sign: NDArray[np.float64]
+
+    def at(self, w: NDArray[np.float64], travel: NDArray[np.float64]) -> Geometry:
+        """Return the pairs at w (m, d), m, where loads have pushed tools (contacts,), m, in the step."""
+        raise NotImplementedError
+
+    @property
+    def reach(self) -> NDArray[np.float64] | float:
+        """Largest coordinate of what gaps are measured from, m; of the pairs (m,), or of all."""
+        return self.grid.reach
+
+    def other_side(self) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
+        """Return the lexicographic cells (m,), and shape functions (m, 2^d), of other sides that deform."""
+        return None
+
+    def operator(self, unknowns: Unknowns) -> PETSc.Mat:
+        """Return B, which gives w (m d,), m, from the unknowns."""
+        value, other = self.grid.shape_values(self.cell, self.x), self.other_side()
+        if other is None:
+            return at_nodes(self.grid, unknowns, self.cell, value)
+        return at_nodes(self.grid, unknowns, self.cell, np.concatenate([value, -other[1]], axis=1), other[0])
+
+
+@dataclass(frozen=True, eq=False)
+class ToolPairs(Pairs):
+    """Points on faces that look at tools.
+
+    tools, poses : (contacts,) the tools, and where they are at the end of the substep, as far as loads had pushed them
+    at the start of the step; now, carried : (m, d), m, place of the point at the start of the step, and where the tool
+    takes what touches it there; shears have turned with the tool.
+    """
+
+    tools: Sequence[Tool]
+    poses: Sequence[Pose]
+    now: NDArray[np.float64]
+    carried: NDArray[np.float64]
+
+    def at(self, w: NDArray[np.float64], travel: NDArray[np.float64]) -> Geometry:
+        """See `Pairs`."""
+        d, m, h = self.grid.dim, len(w), self.grid.h.min()
+        gap, n, second, middle = np.zeros(m), np.zeros((m, d)), np.zeros((m, d, d)), np.zeros((m, d))
+        gone, x = travel[:, None] * [tool.along(d) for tool in self.tools], self.now + w
+
+        def ask() -> None:
+            for number, (tool, pose) in enumerate(zip(self.tools, self.poses, strict=True)):
+                solid, rows = tool.solid(h), np.flatnonzero(self.number == number)
+                pose = pose._replace(shift=pose.shift + gone[number])
+                y, middle[rows] = pose.own(x[rows]), pose.centre + pose.shift
+                gap[rows], n[rows] = solid.distance(y), solid.normal(y) @ pose.R.T
+                second[rows] = pose.R @ solid.curvature(y) @ pose.R.T
+                if isinstance(solid, Distance):
+                    _check_distance(tool, x[rows] + self.grid.base, gap[rows], n[rows], h)
+
+        everywhere(self.grid, ask)
+        return Geometry(gap, n, second, x - self.carried - gone[self.number], x - middle)
+
+    @property
+    def reach(self) -> NDArray[np.float64]:
+        """See `Pairs`: of functions of the user's, which are asked at true places, it is that of these."""
+        true = np.array([callable(tool.shape) for tool in self.tools])[self.number]
+        return np.where(true, np.abs([self.grid.lower, self.grid.upper]).max(), self.grid.reach)
+
+
+@dataclass(frozen=True, eq=False)
+class FacePairs(Pairs):
+    """Points on the surface of one group, and the places on the faces of another that they meet along their normals.
+
+    other : (m,) lexicographic cell of the other side; y : (m, d), m, where the grid sees it; n : (m, d) normal out of
+    it; apart : (m, d), m, from it to the point, without the displacement of the step; place : (m,) number of the point,
+    the same for all pairs that it has in a step.
+    """
+
+    other: NDArray[np.int64]
+    y: NDArray[np.float64]
+    n: NDArray[np.float64]
+    apart: NDArray[np.float64]
+    place: NDArray[np.int64]
+
+    def at(self, w: NDArray[np.float64], travel: NDArray[np.float64]) -> Geometry:
+        """See `Pairs`; moments count with the places of the start of the step."""
+        gap = np.einsum("md,md->m", self.n, self.apart + w)
+        return Geometry(gap, self.n, None, w, self.x + self.grid.base)
+
+    def other_side(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """See `Pairs`."""
+        grid = self.grid
+        index = np.stack(np.unravel_index(self.other % grid.cells, tuple(grid.shape)), axis=1)
+        off = (self.y - grid.low) / grid.h - index - 0.5
+        return self.other, np.prod(0.5 + off[:, None] * grid.signs, axis=2)
+
+
+def at_nodes(
+    grid: Grid,
+    unknowns: Unknowns,
+    cell: NDArray[np.int32],
+    value: NDArray[np.float64],
+    other: NDArray[np.int64] | None = None,
+) -> PETSc.Mat:
+    """Return the matrix with values (m, 2^d) at the nodes of cells, component by component.
+
+    other: lexicographic cells of any process; values (m, 2 * 2^d) are then at the nodes of these as well.
+    """
+    d = grid.dim
+    numbers = unknowns.map.indices.reshape(-1, d)
+    column = numbers[grid.cell_nodes[cell]]
+    if other is not None:
+        travel = Exchange(grid.comm, grid.owner(other))
+        there = travel.back(numbers[grid.cell_nodes[grid.local(travel.send(other))]])
+        column = np.concatenate([column, there], axis=1)
+    column = column.swapaxes(1, 2)
+    value, m = np.broadcast_to(value[:, None], (len(value), d, value.shape[1])), len(cell) * d
+    row = np.broadcast_to(np.arange(m).reshape(-1, d, 1), column.shape)
+    kept = column >= 0
+    shape, own = (m, max(1, unknowns.global_size)), (row[kept], column[kept])
+    return petsc_matrix(scipy.sparse.csr_matrix((value[kept], own), shape=shape), unknowns.size, grid.comm)
+
+
+def petsc_matrix(rows: scipy.sparse.csr_matrix, columns: int, comm: MPI.Intracomm, own: bool = False) -> PETSc.Mat:
+    """Return a matrix of rows of this process, with so many columns of it; own: that have no entries in others."""
+    rows.sort_indices()  # as PETSc wants them
+    start = int(comm.exscan(columns) or 0) if own and comm.size > 1 else 0
+    csr = [values.astype(PETSc.IntType) for values in (rows.indptr, rows.indices + start)]
+    A = PETSc.Mat().createAIJ(((rows.shape[0], None), (columns, None)), csr=(*csr, rows.data), comm=comm)
+    A.assemble()
+    return A
+
+
+def _check_distance(tool: Tool, x: NDArray, gap: NDArray, n: NDArray, h: float) -> None:
+    """Refuse a function of the user's that is no distance near the tool."""
+    size = np.linalg.norm(n, axis=1)
+    wrong = np.flatnonzero((np.abs(gap) < h) & (np.abs(size - 1) > DISTANCE))
+    if len(wrong):
+        what = f"{line(tool)}: shape has slope {size[wrong[0]]:.3g} at {x[wrong[0]]}"
+        raise ValueError(f"{what}, must be a signed distance: of slope 1 near the tool")

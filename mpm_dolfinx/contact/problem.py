@@ -1,0 +1,414 @@
+# SPDX-License-Identifier: MIT
+"""The contact of a substep: with tools, or of groups of bodies with one another.
+
+With w = B u, how the places of pairs move apart in the step, forces on the nodes are B^T f(w): those on both bodies are
+equal and opposite to rounding, whatever the iterations leave.  Where both sides deform, pairs, normals and gaps are at
+first those of the start of the step.  What balances with them is balanced anew with those of where it has come to,
+until gaps are those of the faces at the end of the step.
+
+The way a of a tool that a load pushes is one more unknown, in the direction e: with the forces f(w - a e) on points,
+D minus their derivative by w, and s = e . D e, Newton's method solves e . f = load together with the balance of the
+bodies, by
+
+    da = (e . D dw + load - e . f) / s,
+
+so forces are f + D e (load - e . f) / s, and minus their derivative is D - (D e) (e . D) / s.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+from mpi4py import MPI
+from petsc4py import PETSc
+
+import numpy as np
+import scipy.sparse
+from numpy.typing import NDArray
+
+from mpm_dolfinx.base.caching import Latest
+from mpm_dolfinx.base.errors import NotConverged
+from mpm_dolfinx.base.tolerances import EPSILON, SAME
+from mpm_dolfinx.conditions.acting import At, Loads
+from mpm_dolfinx.contact.history import Origin
+from mpm_dolfinx.contact.law import DEPTH, ROUNDS, ContactLaw, ContactState, Touch
+from mpm_dolfinx.contact.pairs import Geometry, Pairs, at_nodes, petsc_matrix
+from mpm_dolfinx.forms.unknowns import Unknowns
+from mpm_dolfinx.parallel.exchange import Exchange, over_all
+from mpm_dolfinx.points.material_points import MaterialPoints
+
+FOLLOWS = 8  # how often pairs are found at most in a step
+
+
+@dataclass(frozen=True, eq=False)
+class Pushes:
+    """What pushes k tools: names that errors call them; start (k,), m, how far before the step; direction
+    (k, d), unit vectors; load (k,), N, nan where there is none.
+    """
+
+    names: Sequence[str]
+    start: NDArray[np.float64]
+    direction: NDArray[np.float64]
+    load: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Ways:
+    """How far loads push k tools in the step: way (k,), m, at w (m, d), m, and elsewhere
+
+        way + shift + sum slope . (w' - w),
+
+    the sum over the pairs (m,) of each tool: this is how Newton's method goes on from there.
+    """
+
+    w: NDArray[np.float64]
+    way: NDArray[np.float64]
+    shift: NDArray[np.float64]
+    slope: NDArray[np.float64]
+
+
+class Found(NamedTuple):
+    """The contact at some displacement: where pairs are, what acts on them, how far loads push tools (k,), m.
+
+    balanced (m, d), N: forces on the points, with what those change by as tools go on to where they meet their loads.
+    """
+
+    at: Geometry
+    touch: Touch
+    travel: NDArray[np.float64]
+    balanced: NDArray[np.float64]
+
+
+class Current(NamedTuple):
+    """The conditions of the pairs as they are found at present, where these come from, and the state of iterations."""
+
+    law: ContactLaw
+    origin: Origin
+    state: ContactState
+    ways: Ways | None = None
+
+
+class ContactProblem(Loads):
+    """The contact; `now` is replaced as it is solved.
+
+    Parameters
+    ----------
+    law, origin
+        The conditions at the start of the step, and where their pairs come from.
+    pushes
+        What pushes tools.
+    again
+        Returns the law and origin of the pairs that points meet at displacements, a local array, m, see `FacePairs`.
+    reach
+        Returns all pairs of lexicographic cells that pairs of this process may be in, first * cells + second.
+    """
+
+    linear, smooth, touches = False, False, True
+
+    def __init__(
+        self,
+        law: ContactLaw,
+        origin: Origin,
+        pushes: Pushes | None = None,
+        again: Callable[[NDArray[np.float64]], tuple[ContactLaw, Origin]] | None = None,
+        reach: Callable[[], NDArray[np.int64]] | None = None,
+    ):
+        self.grid, self.pushes, self._again, self._reach = law.grid, pushes, again, reach
+        self.now = Current(law, origin, law.begins())
+        self._operator: Latest[tuple[PETSc.Mat, PETSc.Vec]] = Latest()
+        self._found: Latest[Found] = Latest()
+        if self.pushed:
+            self.now = self.now._replace(ways=self._linearised(np.zeros_like(law.pairs.x), self._begins()))
+
+    @property
+    def pairs(self) -> Pairs:
+        """The pairs at present."""
+        return self.now.law.pairs
+
+    @property
+    def pushed(self) -> bool:
+        """Whether loads push tools."""
+        return self.pushes is not None and not np.isnan(self.pushes.load).all()
+
+    @property
+    def couples(self) -> bool:
+        """Whether nodes of different cells act on one another through the contact."""
+        return self.pushed or self._reach is not None
+
+    def found(self, at: At) -> Found:
+        """Return the contact at u."""
+        key = self.now, at.unknowns, at.u[at.unknowns.owned]
+        return self._found(key, lambda: self._find(self._apart_by(self.now.law, at)), self.grid.comm)
+
+    def _apart_by(self, law: ContactLaw, at: At) -> NDArray[np.float64]:
+        """Return w (m, d), m, of the pairs of a law."""
+        B, w = self._B(law, at.unknowns)
+        B.mult(at.unknowns.gather_owned(at.u[at.unknowns.owned]), w)
+        return w.array_r.reshape(-1, self.grid.dim).copy()
+
+    def _B(self, law: ContactLaw, unknowns: Unknowns) -> tuple[PETSc.Mat, PETSc.Vec]:
+        """Return B of the pairs of a law, and room for its product."""
+
+        def make() -> tuple[PETSc.Mat, PETSc.Vec]:
+            B = law.pairs.operator(unknowns)
+            return B, B.createVecLeft()
+
+        return self._operator((law, unknowns), make, self.grid.comm) if law is self.now.law else make()
+
+    def _find(self, w: NDArray[np.float64]) -> Found:
+        return self._find_at(w, self._way(w) if self.pushed else np.zeros(len(self.now.law.contacts)))
+
+    def _find_at(self, w: NDArray[np.float64], way: NDArray[np.float64]) -> Found:
+        law, state, of = self.now.law, self.now.state, self.pairs.number
+        at = law.pairs.at(w, way)
+        touch = law.touch(state, at)
+        found = Found(at, touch, way, touch.force)
+        if not self.pushed:
+            return found
+        more = law.slope(touch, at, self._shift(found)[of, None] * self.pushes.direction[of])
+        return found._replace(balanced=touch.force + more)
+
+    def push(self, at: At, residual: PETSc.Vec, on: Unknowns) -> None:
+        """Take the forces at u off."""
+        B, w = self._B(self.now.law, at.unknowns)
+        w.array_w[:] = -self.found(at).balanced.ravel()
+        B = B if on is at.unknowns else self.pairs.operator(on)
+        B.multTransposeAdd(w, residual, residual)
+
+    def pattern(self, unknowns: Unknowns) -> PETSc.Mat | None:
+        """Return zeros wherever a `coupling` may have entries in the step that cells have not; None if nowhere."""
+        out = self._pattern_of_pairs(unknowns) if self._reach is not None else None
+        for number in np.flatnonzero(~np.isnan(self.pushes.load)) if self.pushed else ():
+            own = self._nodal(unknowns, np.repeat((self.pairs.number == number)[:, None], self.grid.dim, axis=1))
+            more = _outer(own, own)
+            out = more if out is None else out + more
+        if out is not None:
+            out.zeroEntries()
+        return out
+
+    def _pattern_of_pairs(self, unknowns: Unknowns) -> PETSc.Mat:
+        """Return something wherever pairs that follow the bodies may couple nodes."""
+        grid, d = self.grid, self.grid.dim
+        cell, other = np.divmod(self._reach(), len(grid.owners))
+        travel = Exchange(grid.comm, grid.owner(cell))
+        cell, other = travel.send(cell), travel.send(other)
+        key, of = np.unique(cell, return_inverse=True)
+        m = len(cell)
+        together = scipy.sparse.identity(m)
+        if self.now.law.grips:
+            all_of = scipy.sparse.csr_matrix((np.ones(m), (of, np.arange(m))), shape=(len(key), m))
+            together = all_of.T @ all_of
+        all_of = scipy.sparse.kron(together, np.ones((d, d)), format="csr")
+        B = at_nodes(grid, unknowns, grid.local(cell), np.ones((m, 2 ** (d + 1))), other)
+        return petsc_matrix(all_of, m * d, grid.comm, own=True).PtAP(B)
+
+    def coupling(self, at: At) -> PETSc.Mat:
+        """Return minus the derivative of the forces at u."""
+        found, law, unknowns = self.found(at), self.now.law, at.unknowns
+        where, touch, *_ = found
+        B, _ = self._B(law, unknowns)
+        K = petsc_matrix(law.tangent(touch, where), B.getLocalSize()[0], self.grid.comm, own=True).PtAP(B)
+        if not self.pushed:
+            return K
+        _, slope, _ = self._met(found)
+        for k in np.flatnonzero((slope > 0) & ~np.isnan(self.pushes.load)):
+            e = self.pushes.direction[k] * (self.pairs.number == k)[:, None]
+            sides = (self._nodal(unknowns, law.slope(touch, where, e, adjoint)) for adjoint in (False, True))
+            K.axpy((SAME - 1) / slope[k], _outer(*sides), PETSc.Mat.Structure.UNKNOWN)
+        return K
+
+    def _nodal(self, unknowns: Unknowns, values: NDArray[np.float64]) -> PETSc.Vec:
+        """Return B^T of values (m, d) at the pairs."""
+        B, w = self._B(self.now.law, unknowns)
+        w.array_w[:] = values.ravel()
+        out = unknowns.vector()
+        B.multTranspose(w, out)
+        return out
+
+    def _way(self, w: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return how far (tools,), m, loads push tools at w (m, d), m: along the line of the last Newton step."""
+        ways, h = self.now.ways, self.grid.h.min()
+        if not over_all(self.grid.comm, int((w != ways.w).any())):
+            return ways.way
+        more = self.now.law.by_contact((ways.slope * (w - ways.w)).sum(axis=1)[:, None])[:, 0]
+        return np.clip(ways.way + ways.shift + more, -h, h)
+
+    def _linearised(self, w: NDArray[np.float64], way: NDArray[np.float64]) -> Ways:
+        """Return the ways of tools, and how they go on where the bodies do."""
+        law, of = self.now.law, self.pairs.number
+        at, touch, *_ = found = self._find_at(w, way)
+        _, slope, _ = self._met(found)
+        by = np.divide(1, slope, out=np.zeros(len(slope)), where=slope > 0)
+        shift = self._shift(found)
+        return Ways(w, way, shift, by[of, None] * law.slope(touch, at, self.pushes.direction[of], adjoint=True))
+
+    def _met(self, found: Found) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Return what tools meet along their loads (tools,), N, its derivative, N/m, and how well it can be met, N."""
+        law, e = self.now.law, self.pushes.direction[self.pairs.number]
+        slope = law.slope(found.touch, found.at, e)
+        met, slope = law.by_contact(np.stack([(e * found.touch.force).sum(axis=1), (e * slope).sum(axis=1)], axis=1)).T
+        off = law.rounding(self.now.state) * (found.touch.stiff > 0)
+        return met, slope, law.by_contact(off[:, None])[:, 0]
+
+    def _seek(self, found: Found) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Return how far tools go (tools,), m, until a place alone would bear the load, and which tools touch.
+
+        Infinity where there is no such place.
+        """
+        law, state, of = self.now.law, self.now.state, self.pairs.number
+        along, k = (found.at.n * self.pushes.direction[of]).sum(axis=1), law.stiffness(state)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            far = found.at.gap - state.pressure[law.of] / k + self.pushes.load[of] / (k * self.pairs.area * along)
+            far = np.where(along > 0, far / along, np.inf)
+        nearest = np.full(len(self.pushes.load), np.inf)
+        np.minimum.at(nearest, of, far)
+        touches = law.by_contact((found.touch.push > 0)[:, None].astype(float))[:, 0] > 0
+        return over_all(self.grid.comm, nearest, MPI.MIN), touches
+
+    def _shift(self, found: Found) -> NDArray[np.float64]:
+        """Return how far tools go on (tools,), m, to meet their loads by their slope."""
+        met, slope, _ = self._met(found)
+        off = np.nan_to_num(self.pushes.load - met)
+        far, touches = self._seek(found)
+        seeks = np.where((off > 0) & ~touches, np.minimum(far, self.grid.h.min()), 0.0)  # what slips resists no more
+        return np.divide(off, slope, out=seeks, where=slope > 0)
+
+    def _begins(self) -> NDArray[np.float64]:
+        """Return how far tools go (tools,), m, before the bodies do: at most to where one place would bear the load."""
+        way, still, h = np.zeros(len(self.now.law.contacts)), np.zeros_like(self.pairs.x), self.grid.h.min()
+        for _ in range(ROUNDS):
+            found = self._find_at(still, way)
+            before, way = way, np.clip(way + np.minimum(self._shift(found), self._seek(found)[0]), -h, h)
+            if np.abs(way - before).max() <= EPSILON * self.grid.reach:
+                break
+        return way
+
+    def settle(self, at: At, sticks: bool) -> bool:
+        """Choose what slips at u, and if asked for what sticks again; return whether that is another choice."""
+        changed, w = False, self._apart_by(self.now.law, at) if self.pushed else None
+        way = self.found(at).travel
+        if self.now.law.grips:
+            state, changed = self.now.law.choose(self.now.state, self.found(at).touch, sticks)
+            self.now = self.now._replace(state=state)
+        if self.pushed:
+            self.now = self.now._replace(ways=self._linearised(w, way))
+        return changed
+
+    def augment(self, at: At, unknown: NDArray[np.float64]) -> bool:
+        """Augment the pressures where means penetrate too deep at u; return whether they do.
+
+        Where they do not, tools that do not meet their loads go on to where they may.
+        """
+        found, law, state = self.found(at), self.now.law, self.now.state
+        new = law.augmented(state, found.touch, self.pairs.x)
+        self.now = self.now._replace(state=new)
+        if new is not state or not self.pushed:
+            return new is not state
+        met, slope, unknown = self._met(found)
+        load, h = self.pushes.load, self.grid.h.min()
+        off = np.nan_to_num(met - load)
+        wrong = np.abs(off) > np.maximum(SAME * np.nan_to_num(load), unknown)
+        if not wrong.any():
+            return False
+        _, touches = self._seek(found)
+        lost = wrong & ((found.travel >= h) | (touches & (slope <= 0)))
+        for k in np.flatnonzero(lost)[:1]:
+            why = f"meets {met[k]:.6g} N, however far it goes: do the bodies hold it?"
+            if met[k] == 0:
+                why = "meets nothing within a cell: does it begin where it touches the bodies?"
+            raise NotConverged(f"{self.pushes.names[k]}: is pushed by {load[k]:.6g} N and {why}")
+        ways = self.now.ways
+        self.now = self.now._replace(ways=self._linearised(ways.w, np.clip(ways.way + ways.shift * wrong, -h, h)))
+        return True
+
+    def follow(self, at: At) -> bool:
+        """Find pairs anew at u, a local array, m; return whether these change the balance."""
+        if self._again is None or self.now.state.follows == FOLLOWS:
+            return False
+        new = Current(*self._again(at.u), self.now.state)
+        new, off = self._continued(new, at)
+        if off <= DEPTH:
+            return False
+        self.now = new
+        return True
+
+    def _continued(self, new: Current, at: At) -> tuple[Current, float]:
+        """Return the contact with pairs that were found at u, and by how much gaps differ from the present, cells.
+
+        What touches in neither does not count.
+        """
+        found, law, state, pairs = self.found(at), self.now.law, self.now.state, new.law.pairs
+        gap = np.einsum("md,md->m", pairs.n, pairs.apart)
+        pairs = replace(pairs, apart=pairs.apart - self._apart_by(new.law, at))
+        now = ContactLaw(law.names, law.contacts, pairs)
+        fresh = now.begins()
+        _, here, there = np.intersect1d(now.key, law.key, return_indices=True)
+        carried = {name: getattr(fresh, name).copy() for name in ("pressure", "slip", "resticks")}
+        for name, values in carried.items():
+            values[here] = getattr(state, name)[there]
+        fresh = replace(fresh, **carried, raised=state.raised, follows=state.follows + 1)
+        _, row, there = np.intersect1d(pairs.place, self.pairs.place, return_indices=True)
+        push = found.touch.push
+        off, lost = np.maximum(-gap, 0.0), push > 0
+        off[row] = np.where((push[there] > 0) | (gap[row] < 0), np.abs(gap[row] - found.at.gap[there]), 0.0)
+        lost[there] = False
+        most = float(off.max(initial=0.0)) / self.grid.h.min() if not lost.any() else np.inf
+        return Current(now, new.origin, fresh), over_all(self.grid.comm, most, MPI.MAX)
+
+    def gripped(self, at: At, points: MaterialPoints) -> MaterialPoints:
+        """Return the points with the pressures and shear tractions that contacts have on them at u."""
+        law, origin, *_ = self.now
+        contacts = dict(zip(law.names, law.contacts, strict=True))
+        return origin.means(contacts, points, *law.tractions(self.found(at).touch))
+
+    def outcome(self, at: At) -> dict[str, dict[str, NDArray[np.float64]]]:
+        """Return forces and moments (d + 1,), in 3D (6,), on the bodies, N and N m, and how far loads push tools, m."""
+        where, touch, travel, _ = self.found(at)
+        names = self.now.law.names
+        out = {"tool_forces": dict(zip(names, self.now.law.forces(touch, where), strict=True))}
+        if self.pushes is not None:
+            out["tool_travel"] = dict(zip(names, self.pushes.start + travel, strict=True))
+        return out
+
+    def touching(self) -> tuple[NDArray[np.int32], NDArray[np.int64] | None, NDArray[np.float64], NDArray[np.float64]]:
+        """Return cells (m,), lexicographic ones of other sides that deform, places and directions (m, d) of what holds.
+
+        That is what touches at the start of the step.
+        """
+        at, touch, *_ = self._find_at(np.zeros_like(self.pairs.x), np.zeros(len(self.now.law.contacts)))
+        law, d, other = self.now.law, self.grid.dim, self.pairs.other_side()
+        on = np.flatnonzero(touch.stiff > 0)
+        rough = on[law.strength.any(axis=1)[law.of[on]]]
+        rows = np.concatenate([on, np.repeat(rough, d)])
+        along = np.concatenate([at.n[on], np.tile(np.eye(d), (len(rough), 1))])
+        return self.pairs.cell[rows], None if other is None else other[0][rows], self.pairs.x[rows], along
+
+    def rounding(self, of_cells: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return what rounding leaves: that of gaps as well, which goes with coordinates."""
+        if self.pairs.other_side() is not None:
+            return of_cells
+        out, cells = of_cells.copy(), self.pairs.cell
+        np.maximum.at(out, cells, out[cells] + self.now.law.rounding(self.now.state))
+        return out
+
+    @property
+    def rounding_beside(self) -> float:
+        """What rounding leaves on other sides, in other cells."""
+        if self.pairs.other_side() is None:
+            return 0.0
+        return over_all(self.grid.comm, float(self.now.law.rounding(self.now.state).max(initial=0.0)), MPI.MAX)
+
+
+def _outer(a: PETSc.Vec, b: PETSc.Vec) -> PETSc.Mat:
+    """Return a b^T, of what is not zero."""
+    start, comm = b.owner_range[0], b.comm.tompi4py()
+    rows, columns = np.flatnonzero(a.array_r), np.flatnonzero(b.array_r)
+    at, value = start + columns, b.array_r[columns]
+    if comm.size > 1:
+        at, value = (np.concatenate(comm.allgather(part)) for part in (at, value))
+    entries = np.outer(a.array_r[rows], value).ravel()
+    where = np.repeat(rows, len(at)), np.tile(at, len(rows))
+    matrix = scipy.sparse.csr_matrix((entries, where), shape=(len(a.array_r), max(1, b.size)))
+    return petsc_matrix(matrix, len(b.array_r), comm)

@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: MIT
+"""Events that end a run: where in a step a function of the simulation changes its sign."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from scipy.optimize import brentq
+
+from mpm_dolfinx.base.errors import StepFailed
+from mpm_dolfinx.base.report import Report
+from mpm_dolfinx.base.validation import functions, line
+from mpm_dolfinx.parallel.exchange import first
+from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
+from mpm_dolfinx.stepping.scene import Scene
+from mpm_dolfinx.stepping.state import State
+from mpm_dolfinx.stepping.time_integration import Substep
+
+LOCATED = 1e-3
+"""Share of a step to which the time of an event is found.  Source: the documented accuracy of `until`."""
+
+Event = Callable[[Any], float]
+"""A number, or whether something is so, of the simulation."""
+
+
+class Simulated(Protocol):
+    """A `Simulation`, whose `state` is replaced."""
+
+    scene: Scene
+    state: State
+
+    def advanced(self, dt: float, *how: Sequence[Substep]) -> tuple[State, Report]:
+        """Return the state after a step of dt, s, and what it took."""
+
+
+class Step(NamedTuple):
+    """A step as it was taken: its start, its length, s, and its substeps, if not those of the scene."""
+
+    start: State
+    dt: float
+    how: tuple
+
+
+class Found(NamedTuple):
+    """An event: which, how long the step to it is, s, its end, and what it took."""
+
+    number: int
+    dt: float
+    new: State
+    report: Report
+
+
+class Events:
+    """The events of a run.
+
+    Parameters
+    ----------
+    simulation
+        At the start of the run.
+    until
+        Functions of the simulation, or one; numbers occur where their sign changes, truths where they turn true.
+
+    Raises
+    ------
+    ValueError
+        What is no function, or gives no number, or not the same on all processes.
+    """
+
+    def __init__(self, simulation: Simulated, until: Event | Sequence[Event] | None):
+        self._until = [until] if callable(until) else [] if until is None else until
+        functions("until", self._until)
+        self._simulation = simulation
+        self._before = self._values() if self._until else []
+
+    def within(self, step: Step, new: State) -> Found | None:
+        """Return the event that occurs first within a step with a new state; None where there is none.
+
+        Steps of other lengths are tried from the same start: by Brent's method for numbers, in halves for truths.  The
+        end is the first state found in which the event has occurred, `LOCATED` of the step after it at most.  The state
+        of the simulation is that at the start of the step afterwards, whatever is raised.
+        """
+        if not self._until:
+            return None
+        try:
+            self._simulation.state = new
+            now = self._values()
+            if self._crossed(now).any():
+                return self._located(step, now)
+            self._before = now
+            return None
+        finally:
+            self._simulation.state = step.start
+
+    def _located(self, step: Step, now: list[float]) -> Found:
+        tried = {0.0: self._before, step.dt: now}
+        try:
+            for k in range(len(self._until)):
+                end = min(dt for dt, values in tried.items() if self._crossed(values).any())
+                if self._crossed(tried[end])[k] and tried[end][k] != 0:
+                    brentq(lambda dt, k=k: self._at(step, dt, tried)[k], 0.0, end, xtol=LOCATED * step.dt)
+        except StepFailed as failed:
+            what = "until: the search for an event within a step of %.3g s has ended, for a shorter one failed: %s"
+            warn(self._simulation.scene.grid.comm, ResolutionWarning, what, step.dt, failed)
+        end = min(dt for dt, values in tried.items() if self._crossed(values).any())
+        self._simulation.state = step.start
+        new, report = self._simulation.advanced(end, *step.how)  # also where it was tried: what the scene holds is its
+        return Found(int(self._crossed(tried[end]).argmax()), end, new, report)
+
+    def _at(self, step: Step, dt: float, tried: dict[float, list[float]]) -> list[float]:
+        """Return the values at the end of a step of another length, s, and keep them."""
+        if dt not in tried:
+            self._simulation.state = step.start
+            new, _ = self._simulation.advanced(dt, *step.how)
+            self._simulation.state = replace(new, result=step.start.result, control=step.start.control)
+            tried[dt] = self._values()
+        return tried[dt]
+
+    def _crossed(self, now: Sequence[float]) -> np.ndarray:
+        """Return which functions have other signs than at the start of the step; from zero none does."""
+        before = np.sign(self._before)
+        return (before != 0) & (np.sign(now) != before)
+
+    def _values(self) -> list[float]:
+        """Return what the functions give, a truth as 1 or -1; raise on all processes what is raised on one."""
+        comm, out, error = self._simulation.scene.grid.comm, [], None
+        try:
+            out = [_number(k, event(self._simulation)) for k, event in enumerate(self._until)]
+        except BaseException as raised:  # also Ctrl-C
+            error = raised
+        where = first(comm, "" if error is None else f"process {comm.rank}: {error}")
+        if error is not None:
+            raise error
+        if where:
+            raise RuntimeError(f"until: has raised an error on {where}")
+        given = comm.allgather(out)
+        for rank, other in enumerate(given):
+            if other != given[0]:
+                raise ValueError(f"until: {given[0]} on process 0, {other} on process {rank}, must be the same on all")
+        return out
+
+
+def _number(k: int, value) -> float:
+    """Return the value of a function as a number; a truth is 1 or -1."""
+    if isinstance(value, (bool, np.bool_)):
+        return 1.0 if value else -1.0
+    try:
+        out = float(value)
+    except (TypeError, ValueError):
+        out = np.nan
+    if not np.isfinite(out):
+        raise ValueError(f"until: function {k} gives {line(value)}, must be a finite number, or True or False")
+    return out

@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: MIT
+"""The tangent of the balances at the present state as sparse matrices, for modes and sensitivities."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from petsc4py import PETSc
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
+
+from mpm_dolfinx.base.validation import numbers
+from mpm_dolfinx.stepping.balances import balances
+from mpm_dolfinx.stepping.scene import Scene
+from mpm_dolfinx.stepping.state import State
+from mpm_dolfinx.stepping.step import set_up
+from mpm_dolfinx.stepping.time_integration import METHODS
+
+
+@dataclass(frozen=True, eq=False)
+class Tangent:
+    """Change of the residuals with displacements (n,), m, and pressures (m,), Pa, of a step by backward Euler.
+
+    The forces change by `stiffness` du + `pressure` dp, N; the fluid by `content` du + `storage` dp, m^d.  In plane
+    strain both are those of 1 m of thickness.  Blocks of pressures are None without fluid.
+
+    Parameters
+    ----------
+    stiffness : (n, n)
+        With penalties: ghost penalty, given displacements, contacts.  Walls' displacements are no unknowns.
+    nodes, components : (n,)
+        Node of the grid and axis of each displacement.
+    x : (n, d)
+        Place of the node, m.
+    pressure, content, storage : (n, m), (m, n), (m, m)
+        Blocks of the pressures; without what fluxes gain by displacements.
+    cells : (m,)
+        Cell of each pressure.
+    """
+
+    stiffness: csr_matrix
+    nodes: NDArray[np.int64]
+    components: NDArray[np.int64]
+    x: NDArray[np.float64]
+    pressure: csr_matrix | None = None
+    content: csr_matrix | None = None
+    storage: csr_matrix | None = None
+    cells: NDArray[np.int64] | None = None
+
+
+class Simulated(Protocol):
+    """What has a scene and a state."""
+
+    scene: Scene
+    state: State
+
+
+def tangent(simulation: Simulated, dt: float) -> Tangent:
+    """Return the tangent at the present state, at the start of a step of dt (s), > 0; see `Tangent`.
+
+    Raises
+    ------
+    ValueError
+        On several processes.
+    """
+    scene, state = simulation.scene, simulation.state
+    numbers("dt", dt, test=lambda v: (0 < v) & (v < np.inf), allowed="> 0 and finite")
+    if scene.grid.comm.size > 1:
+        raise ValueError(f"tangent: has matrices of one process, not of {scene.grid.comm.size}")
+    start = set_up(scene, state, dt)
+    acting = start.acting[-1]._replace(substep=METHODS["backward-euler"][0])
+    momentum, storage = balances(scene, start, acting)
+    momentum.assemble_residual()
+    unknowns = momentum.system.unknowns
+    blocks = {"stiffness": _csr(momentum.assemble_tangent()), "x": unknowns.positions}
+    blocks |= dict(zip(("nodes", "components"), unknowns.nodes, strict=True))
+    if storage is not None:
+        storage.assemble_residual()
+        storage.assemble_tangent()
+        of = storage.system
+        blocks |= {"pressure": -_csr(of.B_momentum).T.tocsr(), "content": _csr(of.B), "storage": _csr(of.C)}
+        blocks["cells"] = of.unknowns.owned.copy()
+    scene.forget()  # these matrices are those of no step
+    return Tangent(**blocks)
+
+
+def _csr(A: PETSc.Mat) -> csr_matrix:
+    """Return a matrix of one process as one of SciPy's."""
+    rows, columns, values = A.getValuesCSR()
+    return csr_matrix((values.copy(), columns.copy(), rows.copy()), shape=A.getSize())

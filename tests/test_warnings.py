@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: MIT
+"""Warnings about results, by categories that a user can filter, and log lines."""
+
+import logging
+import warnings
+from dataclasses import replace
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+from helpers import SOFT
+from test_state import same_bits
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.parallel import messages
+
+WALLS = {"left": "x", "right": "x", "bottom": "xy"}
+
+
+def overlapping():
+    """Return a scene of two bodies that have come to lie in each other, which its first step finds."""
+    grid = mpm.Grid([0, 0], [1, 1], [10, 10])
+    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 0.3]), mpm.box(grid, [0, 0.5], [1, 0.8])], [SOFT], walls=WALLS)
+    down = np.where(s.points.id < len(s.bodies[0]), 0.0, 0.3)[:, None] * [0, 1]
+    moved = replace(s.points, corners=s.points.corners - down[:, None], x=s.points.x - down)
+    s.state = replace(s.state, points=moved)
+    return s
+
+
+def thin():
+    grid = mpm.Grid([0, 0], [1.0, 1.0], [10, 10])
+    return mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 0.1], per_cell=1)], [SOFT], walls={"left": "xy"})
+
+
+def sea_water():
+    grid, (load, head) = mpm.Grid([0, 0], [0.5, 2.0], [2, 8]), mpm.water("top", 1.5, unit_weight=9810.0)
+    water = {"conditions": [load, head], "gravity": (0, -9.81), "fluid": mpm.Fluid(density=1025.0)}
+    return mpm.Simulation(grid, [mpm.box(grid, [0, 0], [0.5, 1.0])], [SOFT], walls=WALLS, **water)
+
+
+CASES = {
+    "of a seeded body": (thin, mpm.ResolutionWarning, "1 point over its thickness"),
+    "of conditions": (sea_water, mpm.ConditionWarning, "unit_weight = 9810"),
+    "of a step": (lambda: overlapping().step(1.0), mpm.ResolutionWarning, "filled to 200 %"),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_warning_has_a_category_and_names_the_line_of_the_script(case):
+    make, category, words = CASES[case]
+    with pytest.warns(category, match=words) as found:
+        make()
+    assert issubclass(category, mpm.ResultWarning) and {one.filename for one in found} == {__file__}
+
+
+def test_a_warning_that_is_an_error_leaves_the_scene_as_it_was():
+    s, other = overlapping(), overlapping()
+    before = s.state
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", mpm.ResultWarning)
+        for _ in range(2):  # what has raised is not held for told
+            with pytest.raises(mpm.ResolutionWarning, match="bodies 0, 1 overlap"):
+                s.step(1.0)
+            assert s.state is before
+        warnings.simplefilter("ignore", mpm.ResultWarning)
+        s.step(1.0), other.step(1.0)
+    same_bits(s.state, other.state)
+
+
+def test_log_lines_are_shown_from_a_level_on_where_nobody_shows_them(monkeypatch, capsys):
+    logger = logging.getLogger("mpm_dolfinx")
+    monkeypatch.setattr(logger, "propagate", False)
+    monkeypatch.setattr(logger, "handlers", [])
+    monkeypatch.setattr(logger, "level", logging.NOTSET)
+    mpm.set_log_level("INFO")
+    mpm.set_log_level("INFO")
+    messages.log(MPI.COMM_SELF, "step cut to %g s", 0.5)
+    assert capsys.readouterr().err == "mpm_dolfinx: step cut to 0.5 s\n"
+    with pytest.raises(ValueError, match="level = 'LOUD', must be one of logging's"):
+        mpm.set_log_level("LOUD")
+    logger.setLevel(logging.NOTSET)
