@@ -91,7 +91,9 @@ def put(
     ValueError
         What is there has moved into the fill; the message says where and how far.
     """
-    body, corners, misfit = bodies[fill], bodies[fill].corners() - grid.base, 0.0
+    body = bodies[fill]
+    corners = bodies[fill].corners() - grid.base
+    misfit = 0.0
     found = {other: _contacts(grid, bodies, other, body, points) for other in there}
     contacts = [contact for one in found.values() for contact in one]
     if any(contact.moved.any() for contact in contacts):
@@ -145,7 +147,9 @@ def _follow(grid: Grid, body: Body, corners: NDArray[np.float64], contacts: Sequ
     number = body.nodes(np.arange(len(body)))
     nodes, node = np.unique(number, return_inverse=True)
     node = node.reshape(number.shape)
-    u, hits, x = np.zeros((len(nodes), grid.dim)), np.zeros(len(nodes)), np.empty((len(nodes), grid.dim))
+    u = np.zeros((len(nodes), grid.dim))
+    hits = np.zeros(len(nodes))
+    x = np.empty((len(nodes), grid.dim))
     x[node] = corners
     for contact in contacts:
         on, moved = contact.given()

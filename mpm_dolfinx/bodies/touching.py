@@ -292,7 +292,11 @@ def uncovered(
     whole = np.setdiff1d(np.arange(count), touched)
     k, most = len(touched), np.full(len(touched), SAME)
     np.maximum.at(most, row, slack)
-    ends, lines, start, size = [], [], [], []  # along both axes: planes through the ends of boxes, of all faces in turn
+    # along both axes: planes through the ends of boxes, of all faces in turn
+    ends = []
+    lines = []
+    start = []
+    size = []
     for a in range(2):
         value = np.clip(np.concatenate([np.zeros(k), np.ones(k), low[:, a], high[:, a]]), 0, 1)
         owner = np.concatenate([np.arange(k), np.arange(k), row, row])
@@ -326,7 +330,9 @@ def uncovered(
     same = [owner[begin], j[begin], j[stop], i[begin] - np.arange(len(begin))]  # runs of runs along the first
     first = np.append(True, np.any([np.diff(s) != 0 for s in same], axis=0))[: len(begin)]
     last = np.append(first[1:], True)[: len(begin)]
-    begin, stop, o = begin[first], stop[last], owner[begin[first]]
+    stop = stop[last]
+    o = owner[begin[first]]
+    begin = begin[first]
     corners = [
         np.stack([lines[0][start[0][o] + a], lines[1][start[1][o] + b]], axis=1)
         for a, b in ((i[begin], j[begin]), (i[stop] + 1, j[stop] + 1))

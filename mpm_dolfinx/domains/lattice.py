@@ -63,7 +63,9 @@ class Lattice:
         given: Iterable[tuple[Surface, Iterable[int]]],
         joined: tuple[NDArray[np.int64], NDArray[np.int64]],
     ):
-        self._body, self._start, self._stop = body, start, start + len(body)
+        self._body = body
+        self._start = start
+        self._stop = start + len(body)
         self._dim, self._count = body.dim, body.lattice
         self._numbers: Latest[NDArray[np.int64]] = Latest()
         self._parted = np.append(np.full(self._dim, NEAR * body.spacing.min()), NEAR)

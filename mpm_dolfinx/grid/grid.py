@@ -77,7 +77,9 @@ class Cells:
     """
 
     def __init__(self, grid: Grid, mesh: Any, owners: NDArray[np.int32]):
-        self.mesh, self.owners, d = mesh, owners, grid.dim
+        self.mesh = mesh
+        self.owners = owners
+        d = grid.dim
         nodes = _compat.function_space(mesh, "Lagrange", 1)
         self.num_owned, self.num_local = _compat.num_cells(mesh)
         self.cell_nodes = _compat.cell_dofs(nodes)

@@ -87,7 +87,9 @@ class Checkpoint:
 
 def save(simulation: Simulation, file: Path) -> None:
     """Write the state of a simulation between two steps of a run."""
-    comm, began, state = simulation.grid.comm, time.perf_counter(), simulation.state
+    comm = simulation.grid.comm
+    began = time.perf_counter()
+    state = simulation.state
     whole_state = state.migrated(np.zeros(len(state.points), dtype=np.int32), comm)
     nodal = {}
     for name in NODAL:
@@ -179,7 +181,9 @@ def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulat
     ids = simulation.scene.all_ids(now.stage.present)
     try:
         points = _points(_part(arrays, "points/"), now.points, ids)
-        stay, transported, of_stay = None, None, _part(arrays, "stay/")
+        stay = None
+        transported = None
+        of_stay = _part(arrays, "stay/")
         if of_stay:
             own = [of_stay.pop(name) for name in PIECES] if wet else [None] * len(PIECES)
             keeps = of_stay.pop("keeps", None)
@@ -324,7 +328,9 @@ def _check_pieces(arrays: dict[str, NDArray], ids: NDArray[np.int64], dim: int) 
 def _without_rows(state: State) -> State:
     """Return a state without points and pieces."""
     none = np.empty(0, np.int64)
-    points, transported, stay = state.points.of(none), state.transported, state.stay
+    points = state.points.of(none)
+    transported = state.transported
+    stay = state.stay
     if stay is not None:
         rows = [None if rows is None else rows[:0] for rows in (getattr(stay, name) for name in PIECES)]
         stay = Stay(stay.points.of(none), *rows, None if stay.keeps is None else stay.keeps[:0])

@@ -87,7 +87,9 @@ class Writer:
     def __init__(self, simulation: Simulation, folder: str | os.PathLike, *, every: int = 1, grid: bool = False):
         instance("writer: simulation", simulation, Simulation)
         flag("writer: grid", grid)
-        folder, comm, self._t = path("writer: folder", folder), simulation.grid.comm, simulation.t
+        folder = path("writer: folder", folder)
+        comm = simulation.grid.comm
+        self._t = simulation.t
         self.every, self._simulation = whole("writer: every", every), simulation
         self.closed = False
         """Whether the writer has released its folder."""
@@ -151,7 +153,9 @@ class Writer:
 
     def _write_points(self, simulation: Simulation) -> None:
         comm, file = simulation.grid.comm, self._points.next.with_suffix(".vtu")
-        points, wet, asked = simulation.points, simulation.scene.fluid is not None, simulation.point_fields()
+        points = simulation.points
+        wet = simulation.scene.fluid is not None
+        asked = simulation.point_fields()
         data = {**points.data, "porosity": asked.porosity}
         for name in ("effective_stress", "stress")[: 1 + wet]:
             components = _components(getattr(asked, name), simulation.grid.dim)
@@ -373,7 +377,9 @@ class Series:
     """
 
     def __init__(self, comm: MPI.Intracomm, file: Path, t: float):
-        self.comm, self.file, self.folder = comm, file, file.with_suffix("")
+        self.comm = comm
+        self.file = file
+        self.folder = file.with_suffix("")
         self.entries: list[tuple[float, list[Path]]] = at_root(comm, lambda: kept(self._read(), t))
 
     @property
@@ -412,7 +418,9 @@ class Table:
     """
 
     def __init__(self, comm: MPI.Intracomm, file: Path, t: float, own: tuple[str, ...] = ()):
-        self.comm, self.file, self._own = comm, file, own
+        self.comm = comm
+        self.file = file
+        self._own = own
         self._rows = at_root(comm, lambda: kept(self._read(), t))
         self.columns: list[str] = []
         """Names of the columns, once it has been started."""

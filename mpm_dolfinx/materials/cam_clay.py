@@ -184,7 +184,9 @@ class ModifiedCamClay(Skeleton):
     def update(trial, shear, M, lambda_, kappa, pressure, yield_pressure, plastic, consolidated, steeper):
         """Return the state at the end of the step, name -> UFL."""
         to = _Return(trial, shear, M, lambda_, kappa, pressure, yield_pressure, consolidated, steeper)
-        strain, a, ratio = trial["strain"], to.compaction, ufl.exp(-to.flow)
+        strain = trial["strain"]
+        a = to.compaction
+        ratio = ufl.exp(-to.flow)
         volume = strain.volumetric + kappa * a
         b = strain.isotropic(lambda e: ufl.exp(2 * volume / 3 + ratio * (ufl.ln(e) - 2 * strain.volumetric / 3)))
         back = ufl.inv(strain.F)

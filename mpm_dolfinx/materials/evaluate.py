@@ -43,7 +43,10 @@ class LawAtPoints:
     def __init__(
         self, grid: Grid, law: type[Skeleton], shapes: dict[str, tuple[int, ...]], cell_size: float | None = None
     ):
-        self.grid, self.law, self._shapes, self._by_scene = grid, law, shapes, by_scene(grid, cell_size)
+        self.grid = grid
+        self.law = law
+        self._shapes = shapes
+        self._by_scene = by_scene(grid, cell_size)
 
     @cached_property
     def points(self) -> FormPoints:
@@ -122,7 +125,9 @@ class LawAtPoints:
             return []
         expression, shapes = self._update
         self._solve(data, dt)
-        values, out, start = expression.evaluate(data), [], 0
+        values = expression.evaluate(data)
+        out = []
+        start = 0
         for name, shape in shapes.items():
             stop = start + int(np.prod(shape, dtype=int))
             out.append((name, values[:, start:stop].reshape(-1, *shape)))
@@ -165,7 +170,10 @@ class SoftnessAtPoints:
     """
 
     def __init__(self, grid: Grid, law: type[Skeleton], shapes: dict[str, tuple[int, ...]]):
-        self._law, self._grid, self._shapes, d = law, grid, shapes, grid.stretches
+        self._law = law
+        self._grid = grid
+        self._shapes = shapes
+        d = grid.stretches
         self._points = points = FormPoints(grid, F=(d, d), dF=(d, d), **shapes)
         s = ufl.variable(fem.Constant(grid.mesh, 1.0))
         F = points.F - (1 - s) * points.dF
@@ -224,7 +232,9 @@ class ConductivityAtPieces:
         displacement: fem.Function,
         pressure: fem.Function,
     ):
-        self._points, self._materials, self._u = pieces, materials, displacement
+        self._points = pieces
+        self._materials = materials
+        self._u = displacement
         self.pressure = pressure if any("p" in signature(law).parameters for law in laws) else None
         """What laws are given for p, None where none names it."""
         self._p = pressure

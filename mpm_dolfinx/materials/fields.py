@@ -70,7 +70,9 @@ class SceneMaterials:
         prestressed: bool = False,
     ):
         materials = [stressed(m, grid.stretches) for m in materials] if prestressed else materials
-        self.grid, self.materials, self.fluid = grid, materials, fluid
+        self.grid = grid
+        self.materials = materials
+        self.fluid = fluid
         seeded: dict[str, NDArray[np.float64]] = {}
         self._used = _used(bodies, len(materials))  # a material that no body is of changes nothing
         used = [materials[i] for i in self._used]
@@ -446,7 +448,10 @@ def _places(bodies: Sequence[Body], material: int) -> NDArray[np.float64]:
 
 def _rows(bodies: Sequence[Body], material: int, ids: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return which of some points are of a material (m,), and their rows among all that are, see `_places`."""
-    here, rows, start, before = [], [], 0, 0
+    here = []
+    rows = []
+    start = 0
+    before = 0
     for body in bodies:
         if body.material == material:
             of_body = np.flatnonzero((ids >= start) & (ids < start + len(body)))

@@ -137,7 +137,9 @@ class InitialStresses:
     """
 
     def __init__(self, bodies: Sequence[Body], given: Mapping[int, InitialStress], pressure: float | Callable):
-        self._bodies, self.given, self.pressure = bodies, given, pressure
+        self._bodies = bodies
+        self.given = given
+        self.pressure = pressure
         self._start = np.cumsum([0, *(len(body) for body in bodies)])
 
     def of(self, materials: SceneMaterials, points: MaterialPoints, present: Sequence[bool], gravity) -> MaterialPoints:
@@ -152,7 +154,9 @@ class InitialStresses:
         """
         if not self.given:
             return points
-        target, rows, refused = np.zeros((len(points), 3, 3)), np.zeros(len(points), dtype=bool), ""
+        target = np.zeros((len(points), 3, 3))
+        rows = np.zeros(len(points), dtype=bool)
+        refused = ""
         placed = points.placed(materials.grid.base)
         above = self._above(materials, points, present, gravity)
         try:
@@ -223,7 +227,9 @@ def stressed(
     ValueError
         Naming the first place where a law cannot bear its stress.
     """
-    comm, rows, law = materials.grid.comm, np.flatnonzero(chosen), materials.law_of(points)
+    comm = materials.grid.comm
+    rows = np.flatnonzero(chosen)
+    law = materials.law_of(points)
     part, target = points.map(lambda values: values[rows]), target[rows]
     given = np.isin(law[rows], [k for k, one in enumerate(materials.laws) if issubclass(one, ModifiedCamClay)])
     if message := first(comm, _no_constants(part.placed(materials.grid.base), target, given)):
@@ -287,7 +293,9 @@ class _Sought:
 
     def linear(self) -> NDArray[np.float64]:
         """Return the strains (n, k) of a linear law."""
-        (bulk, shear), target, identity = self.moduli(), self.target, np.eye(3)
+        (bulk, shear) = self.moduli()
+        target = self.target
+        identity = np.eye(3)
         mean = np.trace(target, axis1=1, axis2=2) / 3
         elastic = (target - mean[:, None, None] * identity) / (2 * shear)[:, None, None]
         elastic += (mean / (3 * bulk))[:, None, None] * identity
@@ -313,7 +321,9 @@ class _Sought:
 
     def step(self, strain: NDArray[np.float64], missing: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the strains (n, k) after a step from those with which so much is missing, by differences."""
-        count, free, (_, shear) = strain.shape[1], self.free, self.moduli()
+        count = strain.shape[1]
+        free = self.free
+        (_, shear) = self.moduli()
         slopes = np.tile(np.eye(count) * (2 * shear)[:, None, None], (1, 1, 1))
         for k in range(count):
             change = (self.off(strain + SAME * np.eye(count)[k])[2] - missing) / SAME
@@ -328,7 +338,9 @@ class _Sought:
         """Return points with the strains, their stresses, Pa, and which (n,) do not have the target."""
         comm, strain = self.materials.grid.comm, self.linear()
         largest = over_all(comm, float(np.abs(self.target).max(initial=0.0)), MPI.MAX)
-        now, stress, bad = self.points, self.target, np.ones(len(strain), dtype=bool)
+        now = self.points
+        stress = self.target
+        bad = np.ones(len(strain), dtype=bool)
         try:
             for _ in range(MOST):
                 now, stress, missing = self.off(strain)
@@ -344,7 +356,9 @@ class _Sought:
 
 def strained(materials: SceneMaterials, points: MaterialPoints, moved: MaterialPoints) -> MaterialPoints:
     """Return points with the elastic strains of others, to which these have been deformed from where they are."""
-    F, d, law = moved.F, moved.F.shape[1], materials.law_of(points)
+    F = moved.F
+    d = moved.F.shape[1]
+    law = materials.law_of(points)
     own = {name: points.data[name] for name in ("softness", "owed", "due") if name in points.data}
     data = {**moved.data, **own}
     out = replace(points, data=data)

@@ -76,9 +76,13 @@ class GhostPenalty:
     """
 
     def __init__(self, grid: Grid, V: fem.FunctionSpace, at_points: bool):
-        self.grid, self._at_points, cellwise = grid, at_points, grid.cellwise()
+        self.grid = grid
+        self._at_points = at_points
+        cellwise = grid.cellwise()
         self.modulus, self.shear, self.fill, self.beside = (fem.Function(cellwise) for _ in range(4))
-        v, du, n = ufl.TestFunction(V), ufl.TrialFunction(V), ufl.FacetNormal(grid.mesh)("+")
+        v = ufl.TestFunction(V)
+        du = ufl.TrialFunction(V)
+        n = ufl.FacetNormal(grid.mesh)("+")
         h = fem.Constant(grid.mesh, grid.h)
         across = sum(abs(n[a]) * h[a] for a in range(grid.dim))
         dS = ufl.Measure("dS", domain=grid.mesh, subdomain_id=_compat.SUBDOMAIN, metadata={"quadrature_degree": 2})

@@ -294,7 +294,9 @@ def _sum(
 ) -> Pieces:
     """Sum the slices of the surfaces by (point, cell) into pieces."""
     d = grid.dim
-    index, least, most = np.floor(s.mean(axis=0)), s.min(axis=0), s.max(axis=0)
+    index = np.floor(s.mean(axis=0))
+    least = s.min(axis=0)
+    most = s.max(axis=0)
     ends = []
     for a in range(d):
         # what lies on a grid plane belongs to the cell of the body behind it
@@ -347,7 +349,9 @@ def _sum(
         faces[:, a] *= grid.cell_volume / grid.h[a]
 
     # centroids stay off the grid lines, and inside the cell that they belong to
-    volume, hoop, mixed = volume[kept], np.empty((len(kept), 0)), np.zeros((len(kept), len(uneven)))
+    volume = volume[kept]
+    hoop = np.empty((len(kept), 0))
+    mixed = np.zeros((len(kept), len(uneven)))
     middle = np.stack([m[kept] / volume for m in moments], axis=1)
     centroid = np.clip(middle, grid.snap, 1 - grid.snap)
     for a, product in enumerate(uneven):
@@ -452,7 +456,9 @@ def cut_faces(
     total = _size(whole[:, d:]).reshape(len(split), m).sum(axis=0)
     share = _size(s[:, d:]) / total[owner % max(1, m)]
     kept = np.flatnonzero(share > SLIVER)  # what only touches a plane leaves nothing
-    s, owner, share = s[:, :, kept], owner[kept], share[kept]
+    s = s[:, :, kept]
+    owner = owner[kept]
+    share = share[kept]
     points = np.einsum("qk,kam->qam", _RULES[d], s)
     middle = np.tile((grid.low + grid.h * s[:, :d].mean(axis=0).T), (len(points), 1))
     points = points.transpose(0, 2, 1).reshape(-1, both.shape[1])

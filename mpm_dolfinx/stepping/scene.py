@@ -73,7 +73,9 @@ class Scene:
         extensions: tuple[Sequence[Callable], Sequence[Callable]],
         initial: Mapping[int, Any],
     ):
-        self.grid, self.bodies, self.fluid = grid, tuple(bodies), fluid
+        self.grid = grid
+        self.bodies = tuple(bodies)
+        self.fluid = fluid
         self.numerics, scheme = numerics, numerics.scheme
         terms, sources = self.extensions = extensions
         """The user's terms and sources."""
@@ -98,7 +100,9 @@ class Scene:
         if fluid:
             weight = fluid.density * self.gravity if weighs else None
             symmetric = scheme.coupling != "schur-fgmres"
-            pieces, u, laws = self.pieces.pieces, self.momentum.u, scene.conductivity_laws
+            pieces = self.pieces.pieces
+            u = self.momentum.u
+            laws = scene.conductivity_laws
             law = (
                 ConductivityAtPieces(scene.materials, laws, pieces, u, fem.Function(grid.cellwise())) if laws else None
             )

@@ -178,7 +178,9 @@ def _filled(
     scene: Scene, points: MaterialPoints, there: Sequence[int], add: Sequence[int], gravity: NDArray | None
 ) -> tuple[MaterialPoints, MaterialPoints]:
     """Return the points with those of bodies that come, and these alone; what lies on another comes after it."""
-    there, waiting, new = list(there), list(add), scene.materials.seeded.of(_ids(scene.bodies, []))
+    there = list(there)
+    waiting = list(add)
+    new = scene.materials.seeded.of(_ids(scene.bodies, []))
     while waiting:
         fill = next((body for body in waiting if touches(scene.bodies, there, body)), waiting[0])
         placed = scene.materials.seeded.of(_ids(scene.bodies, [fill]))
