@@ -72,7 +72,9 @@ class Rows(Sequence[Row]):
     """
 
     def __init__(self, rows: Iterable[Row] = ()):
-        self._columns, self._count, self.run = _Columns({}, []), 0, object()
+        self._columns = _Columns({}, [])
+        self._count = 0
+        self.run = object()
         for row in rows:
             grown = self.more(row)
             self._columns, self._count = grown._columns, grown._count
@@ -131,5 +133,7 @@ class Rows(Sequence[Row]):
             columns.arrays[name][(n, *map(slice, value.shape))] = value
         columns.outcomes.append(row.outcome)
         out = Rows()
-        out._columns, out._count, out.run = columns, n + 1, self.run
+        out._columns = columns
+        out._count = n + 1
+        out.run = self.run
         return out

@@ -86,7 +86,9 @@ class Writer:
     def __init__(self, simulation: Simulation, folder: str | os.PathLike, *, every: int = 1, grid: bool = False):
         instance("writer: simulation", simulation, Simulation)
         flag("writer: grid", grid)
-        folder, comm, self._t = path("writer: folder", folder), simulation.grid.comm, simulation.t
+        folder = path("writer: folder", folder)
+        comm = simulation.grid.comm
+        self._t = simulation.t
         self.every, self._simulation = whole("writer: every", every), simulation
         self.closed = False
         """Whether the writer has released its folder."""
@@ -354,7 +356,9 @@ class Series:
     """
 
     def __init__(self, comm: MPI.Intracomm, file: Path, t: float):
-        self.comm, self.file, self.folder = comm, file, file.with_suffix("")
+        self.comm = comm
+        self.file = file
+        self.folder = file.with_suffix("")
         self.entries: list[tuple[float, list[Path]]] = at_root(comm, lambda: kept(self._read(), t))
 
     @property
@@ -393,7 +397,9 @@ class Table:
     """
 
     def __init__(self, comm: MPI.Intracomm, file: Path, t: float, own: tuple[str, ...] = ()):
-        self.comm, self.file, self._own = comm, file, own
+        self.comm = comm
+        self.file = file
+        self._own = own
         self._rows = at_root(comm, lambda: kept(self._read(), t))
         self.columns: list[str] = []
         """Names of the columns, once it has been started."""
@@ -409,7 +415,7 @@ class Table:
     def start(self, first: dict[str, float]) -> None:
         """Write the rows that were kept, or else a first row."""
         rows = [row for _, row in self._rows] or [first]
-        self.columns[:] = rows[0]
+        self.columns = list(rows[0])
         self._check(first)
 
         def write() -> None:

@@ -120,7 +120,9 @@ class Events:
 
     def _values(self) -> list[float]:
         """Return what the functions give, a truth as 1 or -1; raise on all processes what is raised on one."""
-        comm, out, error = self._simulation.scene.grid.comm, [], None
+        comm = self._simulation.scene.grid.comm
+        out = []
+        error = None
         try:
             out = [_number(k, event(self._simulation)) for k, event in enumerate(self._until)]
         except BaseException as raised:  # also Ctrl-C

@@ -103,7 +103,10 @@ def has_yielded(scene: Scene, state: State) -> bool:
 
 def balances(scene: Scene, start: Start, acting: Acting, before: Rates | None = None) -> Balances:
     """Return the balances at the end of a substep, with u and p as they are; before: rates of the substep before."""
-    substep, on_grid, matrices, dt = acting.substep, start.on_grid, start.matrices, start.dt
+    substep = acting.substep
+    on_grid = start.on_grid
+    matrices = start.matrices
+    dt = start.dt
     scene.set_time(acting.t, substep.end * dt, acting.gravity)
     scene.momentum.own.set_rate(substep.own * dt, substep.before / substep.own)
     forces = scene.scheme.tolerance, going_on(scene, start, substep), start.state.held
