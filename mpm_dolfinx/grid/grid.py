@@ -114,7 +114,7 @@ class Cells:
 
 def of_cells(name: str) -> property:
     """Return a property of a grid that is one of its `Cells`."""
-    return property(lambda grid: getattr(grid.of_process, name))
+    return property(lambda grid: getattr(grid._of_process, name))
 
 
 class Grid:
@@ -209,7 +209,7 @@ class Grid:
     facets_owned = of_cells("facets_owned")
 
     @property
-    def of_process(self) -> Cells:
+    def _of_process(self) -> Cells:
         """The cells that this process has; shared out evenly where no scene has done so before."""
         if self._cells is None:
             self.share(np.zeros(int(np.prod(self.shape))))
@@ -283,11 +283,11 @@ class Grid:
 
     def cellwise(self, shape: tuple[int, ...] = ()):
         """Return the space of functions of a shape that are constant in the cells (DG0), made once."""
-        return self.of_process.cellwise(shape)
+        return self._of_process.cellwise(shape)
 
     def coefficient(self, shape: tuple[int, ...] = ()) -> fem.Function:
         """Return a new cellwise function that stands in forms for rows of values; all of a shape share its memory."""
-        return fem.Function(self.cellwise(shape), self.of_process.memory(shape).x)
+        return fem.Function(self.cellwise(shape), self._of_process.memory(shape).x)
 
     @cached_property
     def cell_volume(self) -> float:
