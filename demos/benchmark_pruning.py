@@ -31,10 +31,10 @@ import numpy as np
 from dolfinx import mesh
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx.base.time_integration import GAMMA
 from mpm_dolfinx.materials.skeleton import LOCKING
 from mpm_dolfinx.mechanics import ghost_penalty
-from mpm_dolfinx.stepping.summary import peak_memory
-from mpm_dolfinx.stepping.time_integration import GAMMA
+from mpm_dolfinx.simulation.summary import peak_memory
 
 SHEAR, LOAD, DT, STEPS = 5e6, 20.0, 1.0, 4  # Pa, Pa a step, s, steps at a time
 WATER = {"fluid": mpm.Fluid(), "conditions": [mpm.Drained("top")]}

@@ -26,8 +26,15 @@ def block(dim: int, n: int, soil: mpm.Skeleton, fluid: bool) -> mpm.Simulation:
     grid = mpm.Grid([0.0] * dim, [1.0] * (dim - 1) + [1.25], [n] * (dim - 1) + [n + n // 4])
     load = mpm.Traction("top", lambda t: [0.0] * (dim - 1) + [-1e4 * t])
     walls = {"left": "x", "right": "x", "bottom": "xyz"[:dim]} | ({"front": "y", "back": "y"} if dim == 3 else {})
-    wet = {"fluid": mpm.Fluid(), "drained": [mpm.Drained("top")]} if fluid else {}
-    return mpm.Simulation(grid, [mpm.box(grid, [0.0] * dim, [1.0] * dim)], [soil], walls=walls, tractions=[load], **wet)
+    wet = {"fluid": mpm.Fluid(), "conditions": [mpm.Drained("top")]} if fluid else {}
+    return mpm.Simulation(
+        grid,
+        [mpm.box(grid, [0.0] * dim, [1.0] * dim)],
+        [soil],
+        walls=walls,
+        conditions=[load, *wet.pop("conditions", [])],
+        **wet,
+    )
 
 
 ELASTIC = mpm.Hencky(bulk=2e6, shear=1e6, conductivity=1e-7)

@@ -19,7 +19,7 @@ import common
 import numpy as np
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.stepping.time_integration import METHODS
+from mpm_dolfinx.base.time_integration import METHODS
 from mpm_dolfinx.verification.biot_fem import BiotFEM
 from mpm_dolfinx.verification.exact import euler_bernoulli
 

@@ -21,7 +21,7 @@ import common
 import numpy as np
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.stepping.time_integration import METHODS
+from mpm_dolfinx.base.time_integration import METHODS
 from mpm_dolfinx.verification.exact import terzaghi_consolidation, terzaghi_pressure
 
 HEIGHT = 1.0  # m

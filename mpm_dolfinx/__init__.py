@@ -39,6 +39,7 @@ from mpm_dolfinx.contact.tool import Pose, Tool
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.io.checkpoint import Checkpoint, resume
 from mpm_dolfinx.io.one_file import one_file
+from mpm_dolfinx.io.plots import plot
 from mpm_dolfinx.io.writer import Writer
 from mpm_dolfinx.materials.cam_clay import ModifiedCamClay
 from mpm_dolfinx.materials.drucker_prager import DruckerPrager
@@ -62,11 +63,11 @@ from mpm_dolfinx.probing.point_fields import PointFields
 from mpm_dolfinx.probing.probes import Probes, probes
 from mpm_dolfinx.simulation.simulation import Simulation
 from mpm_dolfinx.simulation.strength_reduction import Safety, factor_of_safety
+from mpm_dolfinx.simulation.tangent import Tangent
+from mpm_dolfinx.solve.numerics import Numerics
 from mpm_dolfinx.solve.scheme import COUPLINGS, Scheme
-from mpm_dolfinx.stepping.numerics import Numerics
 from mpm_dolfinx.stepping.result import GaveUp, Result
 from mpm_dolfinx.stepping.state import State
-from mpm_dolfinx.stepping.tangent import Tangent
 from mpm_dolfinx.verification.element_test import ElementTest, element_test
 
 __version__ = "0.1.0"
@@ -133,6 +134,7 @@ __all__ = [
     "kozeny_carman",
     "mapped",
     "one_file",
+    "plot",
     "polygon",
     "probes",
     "resume",

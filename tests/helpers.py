@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx.base.time_integration import METHODS
 from mpm_dolfinx.flow.storage import StorageProblem
 from mpm_dolfinx.mechanics.momentum import MomentumProblem
 from mpm_dolfinx.solve import plan
 from mpm_dolfinx.stepping import step
 from mpm_dolfinx.stepping.balances import Start, balances
-from mpm_dolfinx.stepping.time_integration import METHODS
 
 SOFT = mpm.Hencky(bulk=1e7 / 3, shear=5e6, porosity=0.4, conductivity=1e-4)
 

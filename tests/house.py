@@ -7,8 +7,9 @@ comment beside it, or the string below it, names one of two things:
     Source: an equation, a paper (with its year), a definition, a format, or an exact bound, see `SOURCE`;
     Plateau (scene): halved a, doubled b, cells c.
 
-The latter are relative changes of the scene's answer: with half and twice the number, and with half the cells.  The
-first two have to be below the third, and `python -m tests.plateaus` measures them again.  All else is *ad hoc*.
+The latter are relative changes of the scene's answers: with half and twice the number, and with finer cells.  One of
+the first two is not zero, so the scene knows the number; both are below the third.
+`python tests/plateaus.py` measures them again.  All else is *ad hoc*.
 """
 
 import ast
@@ -24,8 +25,9 @@ SOURCE = re.compile(
     re.DOTALL,
 )
 PLATEAU = re.compile(r"\bPlateau \((\w+)\): halved ([\d.e+-]+), doubled ([\d.e+-]+), cells ([\d.e+-]*[\d])")
-UNITS = {10, 60, 90, 100, 180, 360, 1000, 1e6, 1024, 86400}
-"""Per cent, degrees, and the like; as factors 10 and 60 are none, see `inline`."""
+UNITS = {60, 90, 100, 180, 360, 1000, 1e6, 1024, 86400}
+"""Per cent, degrees, and the like."""
+STYLES = ("figsize", "alpha", "dpi")
 CONDITIONS = ("Traction", "Pressure", "Displacement", "RigidPlate", "Drained", "Inflow", "OnSide", "Tool", "Contact")
 
 
@@ -105,6 +107,8 @@ def structure(value: ast.AST) -> bool:
     """Return whether the numbers of a value at module level are structure."""
     written = [m.value for m in literals(value)]
     harmless = all(v in (0, 1) for v in written)  # `not x[0]`, slices
+    if isinstance(value, ast.Call) and isinstance(value.func, ast.Name) and value.func.id == "slice":
+        return True
     code = any(isinstance(m, ast.Lambda | ast.comprehension | ast.JoinedStr | ast.Subscript) for m in ast.walk(value))
     return not written or harmless or code or power_of_two(value) or table(value)
 
@@ -129,9 +133,9 @@ def plateau(said: str):
 
 
 def sourced(said: str) -> bool:
-    """Return whether what is said of a number names its source, or a plateau on which it moves less than the cells."""
+    """Return whether what is said of a number names its source, or a plateau: what is felt, but less than the cells."""
     flat = plateau(said)
-    return bool(SOURCE.search(said)) or bool(flat and max(flat[1:3]) < flat[3])
+    return bool(SOURCE.search(said)) or bool(flat and 0 < max(flat[1:3]) < flat[3])
 
 
 def ad_hoc() -> list[str]:
@@ -144,12 +148,25 @@ def inline() -> list[str]:
     for module in modules():
         within = [n for n in module.nodes if isinstance(n, ast.FunctionDef | ast.Lambda)]
         chosen = {m for f in within for d in [*f.args.defaults, *f.args.kw_defaults] if d for m in literals(d)}
+        styles = {
+            m
+            for n in module.nodes
+            if isinstance(n, ast.keyword) and n.arg in ("figsize", "alpha", "dpi")
+            for m in literals(n)
+        }
         checks = {m for n in module.nodes if isinstance(n, ast.Compare) and len(n.ops) > 1 for m in literals(n)}
+        factors = {
+            m
+            for n in module.nodes
+            if isinstance(n, ast.BinOp) and isinstance(n.op, ast.Mult)
+            for m in (n.left, n.right)
+        }
         texts = {m for n in module.nodes if isinstance(n, ast.JoinedStr) for m in literals(n)}
-        for number in {m for f in within for m in literals(f)} - chosen - checks - texts:
+        for number in {m for f in within for m in literals(f)} - chosen - styles - checks - texts:
             v, line = abs(number.value), module.lines[number.lineno - 1]
             whole = type(number.value) is int
-            rule = v not in UNITS and (v > 100 if whole else (v * 8 % 1 != 0 or v > 8))
+            most = 8 if number in factors else 100
+            rule = v not in UNITS and (v > most if whole else (v * 8 % 1 != 0 or v > 8))
             if rule and not SOURCE.search(line):
                 out.append(f"{module.where}:{number.lineno} {number.value}")
     return sorted(set(out))
@@ -244,7 +261,7 @@ def _changes(node: ast.AST, functions: set[str]) -> bool:
         if isinstance(target, ast.Subscript) and _of_self(target.value) and _slot(target.slice):
             return isinstance(node, ast.Assign | ast.AugAssign)
         if isinstance(target, ast.Attribute) and isinstance(target.value, ast.Name) and target.value.id in functions:
-            return isinstance(node, ast.Assign | ast.AugAssign)
+            return not target.attr.startswith("__") and isinstance(node, ast.Assign | ast.AugAssign)
     if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and _of_self(node.func.value):
         private = node.func.value.attr.startswith("_")
         return private and node.func.attr in ("append", "clear", "extend", "pop", "setdefault", "insert")

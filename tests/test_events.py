@@ -31,7 +31,7 @@ def test_a_run_ends_where_a_function_changes_its_sign(truth):
     exact = pressed()
     exact.run(t, t, progress=False)  # an elastic body: any steps lead there
     assert -0.05 * 0.5e-3 < depth(s) <= 0 and depth(exact) == pytest.approx(depth(s), abs=1e-8)
-    assert s.reactions is s.state.reactions and result.t[:-1].tolist() == [0, 0.5, 1, 1.5][: len(result.t) - 1]
+    assert result.t[:-1].tolist() == [0, 0.5, 1, 1.5][: len(result.t) - 1]
 
 
 def test_what_is_so_at_the_start_is_no_event():
@@ -71,7 +71,7 @@ def test_what_a_function_raises_leaves_the_state_at_the_start_of_the_step():
 
     def fails(s):
         count.append(s.t)
-        if len(count) == 4:  # while the event is located
+        if len(count) == 6:  # while the event is located
             raise OSError("no more")
         return s.t - 0.8
 

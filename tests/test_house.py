@@ -5,17 +5,17 @@ import house
 import pytest
 
 CEILINGS = {
-    "ad hoc named numbers": 222,
-    "rules among numbers in functions": 102,
-    "imports a file, mean": 5.06,
+    "ad hoc named numbers": 101,
+    "rules among numbers in functions": 21,
+    "imports a file, mean": 5.58,
     "files in a circle of imports": 0,
     "folders in a circle of imports": 0,
     "files of the largest folder": 14,
-    "parameters of the longest list": 22,
-    "assignments of three and more values": 209,
-    "changes of hidden state": 55,
-    "files that name a condition's class, most": 7,
-    "lines of the package": 26348,
+    "parameters of the longest list": 14,
+    "assignments of three and more values": 13,
+    "changes of hidden state": 10,
+    "files that name a condition's class, most": 10,
+    "lines of the package": 28650,
 }
 
 

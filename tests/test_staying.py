@@ -9,8 +9,8 @@ from helpers import without
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.domains import cut_domains
+from mpm_dolfinx.simulation.summary import parts
 from mpm_dolfinx.stepping import scene
-from mpm_dolfinx.stepping.summary import parts
 
 SOIL = mpm.Hencky(bulk=2e7, shear=1e7, porosity=0.4, conductivity=1e-5)
 WATER = mpm.Fluid(bulk=1e8)

@@ -7,8 +7,8 @@ from benchmark_pruning import PAIRS
 from helpers import SOFT, beam, column
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx.simulation.summary import parts
 from mpm_dolfinx.solve.schur import LinearSolvers
-from mpm_dolfinx.stepping.summary import parts
 
 LINEAR = mpm.LinearElastic(bulk=1e7 / 3, shear=5e6, conductivity=1e-4)
 SEALED = mpm.Hencky(bulk=1e7 / 3, shear=5e6)

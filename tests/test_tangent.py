@@ -12,10 +12,12 @@ def block(fluid: bool, dim: int = 2, law: type[mpm.Skeleton] = mpm.Hencky, **opt
     """Return a block that a load has bent aslant, its foot held."""
     grid = mpm.Grid([0.0] * dim, [1.0] * dim, [5] * dim)
     soil = law(bulk=1e5, shear=1e5, conductivity=1e-3, **options)
-    wet = {"fluid": mpm.Fluid(bulk=1e7), "drained": [mpm.Drained("right")]} if fluid else {}
+    wet = {"fluid": mpm.Fluid(bulk=1e7), "conditions": [mpm.Drained("right")]} if fluid else {}
     load = mpm.Traction("top", [2e3] + [0.0] * (dim - 2) + [-1e3])
     body = mpm.box(grid, [0.1] * (dim - 1) + [0.0], [0.7] * dim)
-    s = mpm.Simulation(grid, [body], [soil], walls={"bottom": "xyz"[:dim]}, tractions=[load], **wet)
+    s = mpm.Simulation(
+        grid, [body], [soil], walls={"bottom": "xyz"[:dim]}, conditions=[load, *wet.pop("conditions", [])], **wet
+    )
     s.step(1.0)
     return s
 

@@ -11,10 +11,10 @@ from helpers import SOFT, beam, column, rates
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.base.report import Report
+from mpm_dolfinx.base.time_integration import METHODS
 from mpm_dolfinx.simulation import simulation
 from mpm_dolfinx.simulation.step_size import StepSize
 from mpm_dolfinx.stepping.step_control import StepControl
-from mpm_dolfinx.stepping.time_integration import METHODS
 from mpm_dolfinx.verification.exact import terzaghi_consolidation
 
 OPEN = mpm.Drained("top")

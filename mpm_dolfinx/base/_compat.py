@@ -162,12 +162,12 @@ class CompiledForm:
             count = self._compiled.ufcx_form.num_coefficients
             self._all = coefficients
         self.coefficients = [coefficients[position[i]] for i in range(count)]
-        self._last: list = []
+        self._last = None
 
     @property
     def form(self):
         """The form as it was bound last."""
-        return self._last[0]
+        return self._last if OLD else self._last._cpp_object
 
     def bind(self, entities: NDArray[np.int32]):
         """Set the cells (repeats allowed) or the interior facets over which the form is integrated; return it so bound.
@@ -190,7 +190,7 @@ class CompiledForm:
                 {kind: tags},
                 self.mesh,
             )
-            self._last[:] = [form]
+            self._last = form
         else:
             if not cells:
                 entities = _facet_cells(self.mesh, entities, dim)
@@ -202,7 +202,7 @@ class CompiledForm:
                 {c: c for c in self._all},
                 {c: c for c in self._constants},
             )
-            self._last[:] = bound._cpp_object, bound
+            self._last = bound  # keeps alive what its C++ object points to
         return self.form
 
     def packed(self, form=None) -> dict:

@@ -55,7 +55,9 @@ def compiler(comm: MPI.Intracomm) -> Iterator[None]:
         In one line, on all of them: settings that cannot be read, no folder that can be written, a C compiler that
         fails.
     """
-    folder, said, raised = at_root(comm, _folder), [""], None
+    folder = at_root(comm, _folder)
+    said = [""]
+    raised = None
     makers = {name: _whole(getattr(libraries, name), folder, said) for name in MAKERS}
     try:
         with _quiet(), _replaced(**makers):

@@ -23,7 +23,7 @@ class Latest(Generic[T]):
     """
 
     def __init__(self) -> None:
-        self._entry: list[Any] = []
+        self._entry: tuple[Any, T] | None = None
 
     def __call__(self, key: Any, make: Callable[[], T], comm: MPI.Intracomm = MPI.COMM_SELF) -> T:
         """Return the value of a key, made anew where the key is another than the last one's.
@@ -37,21 +37,20 @@ class Latest(Generic[T]):
         comm
             Processes that make it together: all do where one has to.
         """
-        other = not self._entry or not same(self._entry[0], key)
+        other = self._entry is None or not same(self._entry[0], key)
         if over_all(comm, other) > 0:
-            self._entry.clear()
-            value = make()
-            self._entry[:] = key, value
+            self._entry = None
+            self._entry = key, make()
         return self._entry[1]
 
     @property
     def value(self) -> T | None:
         """The value, None where there is none."""
-        return self._entry[1] if self._entry else None
+        return None if self._entry is None else self._entry[1]
 
     def clear(self) -> None:
         """Forget the value."""
-        self._entry.clear()
+        self._entry = None
 
 
 class Keyed:

@@ -30,7 +30,9 @@ class NotConverged(StepFailed):
         worst = "momentum" if not finite or finite[-1][0] >= finite[-1][1] else "storage"
         shown = ", ".join(f"({u:.1e}, {p:.1e})" for u, p in finite[-4:])
         super().__init__(reason + (f"; worst in {worst}; last residuals (momentum, storage): {shown}" if shown else ""))
-        self.reason, self.field, self.history = reason, worst, history
+        self.reason = reason
+        self.field = worst
+        self.history = history
 
 
 class LeftGrid(StepFailed):

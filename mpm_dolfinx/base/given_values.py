@@ -42,7 +42,8 @@ def _plain(function: Callable) -> bool:
     while isinstance(function, partial):
         function = function.func
     library = str(getattr(function, "__module__", None)).partition(".")[0] in LIBRARIES
-    return isinstance(function, PLAIN) and not library
+    own = type(function).__module__.partition(".")[0] == __name__.partition(".")[0]
+    return (isinstance(function, PLAIN) and not library) or own
 
 
 def _parameters(function: Callable) -> list[Parameter] | None:

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,7 +31,7 @@ class Row(NamedTuple):
     position: NDArray[np.float64] = _none(0, 0)
     probe_pressure: NDArray[np.float64] = _none(0)
     probe_stress: NDArray[np.float64] = _none(0, 3, 3)
-    outcome: Mapping[str, Mapping[str, NDArray[np.float64]]] = MappingProxyType({})
+    outcome: Mapping[str, Mapping[str, NDArray[np.float64]]] = {}
 
 
 COLUMNS = tuple(name for name in Row._fields if name != "outcome")
@@ -73,7 +72,9 @@ class Rows(Sequence[Row]):
     """
 
     def __init__(self, rows: Iterable[Row] = ()):
-        self._columns, self._count, self.run = _Columns({}, []), 0, object()
+        self._columns = _Columns({}, [])
+        self._count = 0
+        self.run = object()
         for row in rows:
             grown = self.more(row)
             self._columns, self._count = grown._columns, grown._count
@@ -132,5 +133,7 @@ class Rows(Sequence[Row]):
             columns.arrays[name][(n, *map(slice, value.shape))] = value
         columns.outcomes.append(row.outcome)
         out = Rows()
-        out._columns, out._count, out.run = columns, n + 1, self.run
+        out._columns = columns
+        out._count = n + 1
+        out.run = self.run
         return out

@@ -86,7 +86,9 @@ class _Placed:
         x = x + self.shift
         if not self.turn:
             return x
-        a, b, angle = np.array(self.turn[:3]), np.array(self.turn[3:6]), np.deg2rad(self.turn[6])
+        a = np.array(self.turn[:3])
+        b = np.array(self.turn[3:6])
+        angle = np.deg2rad(self.turn[6])
         k, r = (b - a) / np.linalg.norm(b - a), x - a
         return a + r * np.cos(angle) + np.cross(k, r) * np.sin(angle) + np.outer(r @ k, k) * (1 - np.cos(angle))
 
@@ -140,7 +142,9 @@ def _keyword(file: Path, line: str, rows: list[str]) -> Iterator[tuple[str, dict
 def _placed(file: Path) -> list[_Placed]:
     """Return what is in no part, then the instances of parts, or, where there are none, all parts as they are."""
     whole = _Scope()
-    scope, parts, instances = whole, {}, []
+    scope = whole
+    parts = {}
+    instances = []
     for keyword, options, rows in _keywords(file):
         if keyword in MAKES:
             raise ValueError(f"*{keyword}, must be nodes and elements one by one, as Abaqus/CAE writes them")
@@ -232,7 +236,10 @@ def _nodes(kind: str) -> int:
 
 def _assembled(placed: list[_Placed]) -> meshio.Mesh:
     """Return all that is in place as one mesh."""
-    x, cells, numbers, start = [np.empty((0, 3))], [], [], 0
+    x = [np.empty((0, 3))]
+    cells = []
+    numbers = []
+    start = 0
     for k, one in enumerate(placed):
         places = one.places(np.concatenate([np.empty((0, 3)), *(p for _, p in one.scope.nodes)]))
         known, where = _once([of for of, _ in one.scope.nodes], "node", places)

@@ -235,7 +235,9 @@ def material_points(
     size = np.concatenate([body.size(row) for body, row in zip(bodies, rows, strict=True)])
     material = np.repeat(np.array([body.material for body in bodies], dtype=np.int32), list(map(len, rows)))
     x = centroids(corners)
-    n, pressures, refused = len(mine), np.empty(0), ""
+    n = len(mine)
+    pressures = np.empty(0)
+    refused = ""
     try:
         pressures = pressure_at(pressure, x + grid.base)
     except ValueError as error:

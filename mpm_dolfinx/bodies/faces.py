@@ -202,7 +202,9 @@ def _limited(
     """
     dim, three = body.dim, (t[:, 2] == t[:, 3]).all(axis=1)
     X = _face_corners(body, row[part], face[part])
-    bent, clipped, of = np.zeros(len(X), dtype=bool), np.empty((0, 3, 2)), np.empty(0, np.int64)
+    bent = np.zeros(len(X), dtype=bool)
+    clipped = np.empty((0, 3, 2))
+    of = np.empty(0, np.int64)
     if dim == 3 and body.lattice is None:  # faces that are not whole, and no rectangles along the axes
         bent = ((X.min(axis=1) < region[0]) | (X.max(axis=1) > region[1])).any(axis=1) & ~_along_axes(X)
         clipped, of = _clipped(X[bent], t[bent], region)

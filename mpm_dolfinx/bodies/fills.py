@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array, diags
 
-from mpm_dolfinx.base.tolerances import SAME
+from mpm_dolfinx.base.tolerances import NEAR, SAME
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.touching import Cover, Faces, covered, covers, local, meeting, warn_near, weights
 from mpm_dolfinx.grid.grid import REACH, Grid
@@ -91,7 +91,9 @@ def put(
     ValueError
         What is there has moved into the fill; the message says where and how far.
     """
-    body, corners, misfit = bodies[fill], bodies[fill].corners() - grid.base, 0.0
+    body = bodies[fill]
+    corners = bodies[fill].corners() - grid.base
+    misfit = 0.0
     found = {other: _contacts(grid, bodies, other, body, points) for other in there}
     contacts = [contact for one in found.values() for contact in one]
     if any(contact.moved.any() for contact in contacts):
@@ -145,7 +147,9 @@ def _follow(grid: Grid, body: Body, corners: NDArray[np.float64], contacts: Sequ
     number = body.nodes(np.arange(len(body)))
     nodes, node = np.unique(number, return_inverse=True)
     node = node.reshape(number.shape)
-    u, hits, x = np.zeros((len(nodes), grid.dim)), np.zeros(len(nodes)), np.empty((len(nodes), grid.dim))
+    u = np.zeros((len(nodes), grid.dim))
+    hits = np.zeros(len(nodes))
+    x = np.empty((len(nodes), grid.dim))
     x[node] = corners
     for contact in contacts:
         on, moved = contact.given()
@@ -189,7 +193,7 @@ def _between(K: csr_array, fixed: NDArray[np.bool_], u: NDArray[np.float64]) -> 
         solver.setOperators(matrix)
         solver.setType("cg")
         solver.getPC().setType("icc")
-        solver.setTolerances(rtol=1e-12)
+        solver.setTolerances(rtol=NEAR**2)
         x, b = matrix.createVecs()
         b.array[:] = -(rows[:, held] @ u[held])
         solver.solve(b, x)

@@ -9,6 +9,8 @@ from __future__ import annotations
 import re
 import shlex
 from collections.abc import Iterator
+from io import BytesIO
+from itertools import islice
 from pathlib import Path
 
 import meshio
@@ -30,16 +32,15 @@ class _Numbers:
     """The numbers of a section, one after the other."""
 
     def __init__(self, section: bytes, binary: bool):
-        self._data, self._binary, self._at = section if binary else section.split(), binary, [0]
+        self._binary = binary
+        self._bytes, self._words = BytesIO(section), iter(() if binary else section.split())
 
     def take(self, count: int, kind: str = "i") -> NDArray:
         """Return the next numbers (count,): "i" int, "u" size_t, "d" double."""
-        start, dtype = self._at[0], np.dtype({"i": "<i4", "u": "<u8", "d": "<f8"}[kind])
+        dtype, out = np.dtype({"i": "<i4", "u": "<u8", "d": "<f8"}[kind]), float if kind == "d" else np.int64
         if self._binary:
-            self._at[0] += count * dtype.itemsize
-            return np.frombuffer(self._data, dtype, count, start).astype(float if kind == "d" else np.int64)
-        self._at[0] += count
-        return np.array(self._data[start : start + count]).astype(float if kind == "d" else np.int64)
+            return np.frombuffer(self._bytes.read(count * dtype.itemsize), dtype).astype(out)
+        return np.array(list(islice(self._words, count))).astype(out)
 
 
 def version(file: Path) -> str:
@@ -47,7 +48,7 @@ def version(file: Path) -> str:
     if not file.is_file():
         return ""
     with file.open("rb") as opened:
-        found = re.search(rb"\$MeshFormat\s+(\d+(?:\.\d+)?)\s", opened.read(10000))
+        found = re.search(rb"\$MeshFormat\s+(\d+(?:\.\d+)?)\s", opened.read(2**14))
     return found[1].decode() if found else ""
 
 

@@ -114,8 +114,12 @@ def _file(file: Path) -> meshio.Mesh:
 def _of_meshio(grid: Grid, mesh: meshio.Mesh, names: Mapping[str, int], tags: str | None, name: str) -> Mesh:
     """Return a mesh of meshio's; tags: name of the cells' data that number parts and sides."""
     mesh_readers.check_systems(mesh)
-    dim, x, sets = grid.dim, _positions(grid.dim, mesh.points), mesh_readers.sets_of(mesh)
-    blocks, curved, off = [], 0, 0.0
+    dim = grid.dim
+    x = _positions(grid.dim, mesh.points)
+    sets = mesh_readers.sets_of(mesh)
+    blocks = []
+    curved = 0
+    off = 0.0
     for block in mesh.cells:
         kind, rows = _first_order(dim, block)
         _check_nodes(rows, len(x))
@@ -297,7 +301,9 @@ def _plane(dim: int, x: NDArray[np.float64], cells: Mapping[str, NDArray[np.int6
 
 def _of_dolfinx(grid: Grid, mesh, cell_tags, facet_tags, names: Mapping[str, int]) -> Mesh:
     """Return a dolfinx mesh, whole on every process; cells are ordered by their places, however they are shared out."""
-    dim, topology, kind = grid.dim, mesh.topology, _compat.cell_kind(mesh)
+    dim = grid.dim
+    topology = mesh.topology
+    kind = _compat.cell_kind(mesh)
     kind = {"quadrilateral": "quad", "tetrahedron": "tetra"}.get(kind, kind)
     if topology.dim != dim or kind not in OF_DOLFINX[dim]:
         raise ValueError(f"mesh: has cells {kind!r}, must be of {' or '.join(OF_DOLFINX[dim])} for a grid in {dim}D")
@@ -326,7 +332,9 @@ def _of_dolfinx(grid: Grid, mesh, cell_tags, facet_tags, names: Mapping[str, int
     vertices[number] = x
     vertices = _plane(dim, vertices, {kind: cells})
     order = np.lexsort(vertices[cells].mean(axis=1).T)
-    cells, tag, side = cells[order], tag[order], side[order]
+    cells = cells[order]
+    tag = tag[order]
+    side = side[order]
     parts = {name: {kind: np.flatnonzero(rows)} for name, rows in numbered(tag, names)}
     sides = {
         name: [cells[on[:, k]][:, corners] for k, corners in enumerate(_facets(dim, kind))]

@@ -180,7 +180,9 @@ def _domains(mesh: Mesh, cells: Mapping[str, NDArray[np.int64]]) -> list[tuple[N
 
     Nodes ascend; those of triangles begin with -1, and those of faces within a cell are all -1.
     """
-    d, start, out = mesh.x.shape[1], 0, []
+    d = mesh.x.shape[1]
+    start = 0
+    out = []
     for kind, nodes in cells.items():
         number = start + np.arange(len(nodes))
         start += len(nodes)
@@ -343,7 +345,9 @@ def _split(
     grid: Grid, domains: NDArray[np.float64], per_cell: int
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.bool_]]:
     """Return domains (m, 2^d, d) small enough for the grid, of which each is a part, and its faces (m, d, 2)."""
-    d, bits, out = grid.dim, corner_bits(grid.dim), []
+    d = grid.dim
+    bits = corner_bits(grid.dim)
+    out = []
     edges = [domains[:, FACES[d][2 * a + 1]] - domains[:, FACES[d][2 * a]] for a in range(d)]
     longest = np.max([np.linalg.norm(e / grid.h, axis=2).max(axis=1) for e in edges], axis=0)
     count = 2 ** np.ceil(np.log2(np.maximum(1.0, longest * per_cell / LONG) - SAME)).astype(np.int64)

@@ -37,12 +37,18 @@ def overburden(
     ray, domain = ray[inside], domain[inside]
     bottom, top = _chord(corners[domain], across[ray], low[domain, -1], high[domain, -1])
     met = top > bottom
-    ray, weight, bottom, top = ray[met], unit_weight[domain[met]], bottom[met], top[met]
+    ray = ray[met]
+    weight = unit_weight[domain[met]]
+    bottom = bottom[met]
+    top = top[met]
     surface = np.full(len(across), -np.inf)
     np.maximum.at(surface, ray, top)
     # places above one another share what their line crosses: sums of it, sorted by line and height
     order = np.lexsort((bottom, ray))
-    ray, weight, bottom, top = ray[order], weight[order], bottom[order], top[order]
+    ray = ray[order]
+    weight = weight[order]
+    bottom = bottom[order]
+    top = top[order]
     total = np.concatenate([[0.0], np.cumsum(weight * (top - bottom))])
     ends = np.searchsorted(ray, np.arange(len(across)), side="right")
     scale = 1 + np.ptp(corners[..., -1])

@@ -165,7 +165,9 @@ def _filled(loops: Sequence[tuple[NDArray[np.float64], Sequence[str]]], size: fl
     extent = np.ptp(loops[0][0], axis=0).max()
     origin = extent * np.round(loops[0][0][0] / extent, -2)  # where coordinates are large gmsh ends the process
     with _gmsh() as gmsh:
-        geo, named, curves = gmsh.model.geo, {}, []
+        geo = gmsh.model.geo
+        named = {}
+        curves = []
         for corners, names in loops:
             points = [geo.addPoint(*x, 0.0, size) for x in corners - origin]
             lines = [geo.addLine(a, b) for a, b in zip(points, points[1:] + points[:1], strict=True)]

@@ -20,7 +20,7 @@ from mpm_dolfinx.grid.grid import Grid, rounding, sum_by
 from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 from mpm_dolfinx.points.cutting import FACES, corner_bits, cut_at, kuhn_simplices
 
-BITS = corner_bits(2)
+BITS = corner_bits(2)  # Source: definition
 
 
 @dataclass
@@ -119,7 +119,7 @@ def near(a: NDArray[np.float64], b: NDArray[np.float64], reach: float = 0.0) -> 
     low, high = np.maximum(a.min(axis=(0, 1)), b.min(axis=(0, 1))), np.minimum(a.max(axis=(0, 1)), b.max(axis=(0, 1)))
     size = [np.ptp(c, axis=1) for c in (a, b)]
     edge = np.maximum(size[0].max(axis=0), size[1].max(axis=0))
-    slack = reach + 0.01 * edge.max()
+    slack = reach + edge.max() / 100
     i, j = (
         np.flatnonzero(((c.max(axis=1) >= low - slack) & (c.min(axis=1) <= high + slack)).all(axis=1)) for c in (a, b)
     )
@@ -292,7 +292,11 @@ def uncovered(
     whole = np.setdiff1d(np.arange(count), touched)
     k, most = len(touched), np.full(len(touched), SAME)
     np.maximum.at(most, row, slack)
-    ends, lines, start, size = [], [], [], []  # along both axes: planes through the ends of boxes, of all faces in turn
+    # along both axes: planes through the ends of boxes, of all faces in turn
+    ends = []
+    lines = []
+    start = []
+    size = []
     for a in range(2):
         value = np.clip(np.concatenate([np.zeros(k), np.ones(k), low[:, a], high[:, a]]), 0, 1)
         owner = np.concatenate([np.arange(k), np.arange(k), row, row])
@@ -326,7 +330,9 @@ def uncovered(
     same = [owner[begin], j[begin], j[stop], i[begin] - np.arange(len(begin))]  # runs of runs along the first
     first = np.append(True, np.any([np.diff(s) != 0 for s in same], axis=0))[: len(begin)]
     last = np.append(first[1:], True)[: len(begin)]
-    begin, stop, o = begin[first], stop[last], owner[begin[first]]
+    stop = stop[last]
+    o = owner[begin[first]]
+    begin = begin[first]
     corners = [
         np.stack([lines[0][start[0][o] + a], lines[1][start[1][o] + b]], axis=1)
         for a, b in ((i[begin], j[begin]), (i[stop] + 1, j[stop] + 1))

@@ -33,7 +33,9 @@ class Sides:
     """
 
     def __init__(self, grid: Grid, bodies: Sequence[Body], present: Sequence[bool]):
-        self.grid, self.bodies, self.present = grid, bodies, present
+        self.grid = grid
+        self.bodies = bodies
+        self.present = present
         self._found: dict[tuple[str, bytes], Surface] = {}
 
     def of(self, condition) -> Surface:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.base.validation import line, numbers
+from mpm_dolfinx.materials.initial_stress import OfWater
 from mpm_dolfinx.materials.skeleton import STANDARD_GRAVITY, Fluid
 from mpm_dolfinx.parallel.messages import ConditionWarning, warn
 
@@ -34,8 +35,8 @@ def under(fluid: Fluid | None, gravity: Gravity) -> Fluid | None:
 
 def weighed(value, fluid: Fluid | None):
     """Return a pressure of water that has, where its unit weight was not given, that of the pore fluid."""
-    make = getattr(value, "weighed", None)
-    return value if make is None or fluid is None else make(fluid.unit_weight)
+    by_fluid = isinstance(value, OfWater) and value.given is None and fluid is not None
+    return replace(value, given=fluid.unit_weight) if by_fluid else value
 
 
 def waters(conditions: Mapping[str, Any]) -> list[tuple[str, Any]]:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from mpm_dolfinx.base.given_values import check_names, given
 from mpm_dolfinx.base.validation import numbers
 from mpm_dolfinx.bodies.faces import Region
 from mpm_dolfinx.conditions.conditions import Drained, Pressure
-from mpm_dolfinx.materials.skeleton import STANDARD_GRAVITY
+from mpm_dolfinx.materials.initial_stress import OfWater
 
 
 def water(
@@ -52,18 +52,19 @@ def water(
     else:
         numbers("water: level", level)
 
-    pressure = _pressure(side, level, 1000 * STANDARD_GRAVITY if unit_weight is None else unit_weight)
-    if unit_weight is None:
-        pressure.weighed = partial(_pressure, side, level)
+    pressure = WaterPressure(side, level, unit_weight)
     return Pressure(side, pressure, region), Drained(side, pressure, region, seepage=True)
 
 
-def _pressure(side: str, level: float | Callable[[float], float], unit_weight: float) -> Callable[..., NDArray]:
-    """Return the pressure of water as a function of time and places."""
+@dataclass(frozen=True)
+class WaterPressure(OfWater):
+    """The pressure of free water, as a function of time and places; its unit weight by default that of the scene."""
 
-    def pressure(t: float, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        height = given(f"water at {side!r}: level at t = {t:g} s", level, t)
-        return unit_weight * np.maximum(height - x[:, -1], 0.0)
+    side: str
+    level: float | Callable[[float], float]
+    given: float | None = None
 
-    pressure.unit_weight = unit_weight
-    return pressure
+    def __call__(self, t: float, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the pressures (m,), Pa, at places x (m, d)."""
+        height = given(f"water at {self.side!r}: level at t = {t:g} s", self.level, t)
+        return self.unit_weight * np.maximum(height - x[:, -1], 0.0)

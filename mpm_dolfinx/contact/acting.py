@@ -32,7 +32,9 @@ class Touching(Acting):
     linear = False
 
     def __init__(self, setting: Setting, names: Sequence[str], found: Tools | Contacts):
-        self._grid, self.names, self.found = setting.grid, tuple(names), found
+        self._grid = setting.grid
+        self.names = tuple(names)
+        self.found = found
         self.symmetric = found.symmetric
 
     def kept(self, n: int) -> dict[str, dict[str, NDArray[np.float64]]]:
@@ -123,7 +125,10 @@ class ToolLoads(ContactProblem):
         self, tools: Tools, cut: CutDomains, points: MaterialPoints, before: NDArray, times: tuple[float, float]
     ):
         super().__init__(*tools.placed(cut, points, *times))
-        self._tools, self._cut, self._before, self._times = tools, cut, before, times
+        self._tools = tools
+        self._cut = cut
+        self._before = before
+        self._times = times
 
     def ended(self, at: At) -> Loads:
         """Return the contact with the tools as they have gone."""

@@ -73,7 +73,10 @@ class Origin:
         self, contacts: Mapping[str, Rough], points: MaterialPoints, push: NDArray, shear: NDArray
     ) -> MaterialPoints:
         """Return the points with the means of the pressures (m,) and shear tractions (m, d), Pa, of their pairs."""
-        push, shear, data, n = self.travel.back(push), self.travel.back(shear), dict(points.data), len(points)
+        push = self.travel.back(push)
+        shear = self.travel.back(shear)
+        data = dict(points.data)
+        n = len(points)
         for number, (name, contact) in enumerate(contacts.items()):
             rows = np.flatnonzero(self.number == number)
             at, area = self.point[rows], self.area[rows]

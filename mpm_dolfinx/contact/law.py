@@ -111,7 +111,10 @@ class ContactLaw:
     """
 
     def __init__(self, names: Sequence[str], contacts: Sequence[Rough], pairs: Pairs):
-        self.grid, self.names, self.contacts, self.pairs = pairs.grid, names, contacts, pairs
+        self.grid = pairs.grid
+        self.names = names
+        self.contacts = contacts
+        self.pairs = pairs
         key, self.of = np.unique(pairs.number * self.grid.num_local + pairs.cell, return_inverse=True)
         self.key = key
         """Contact and cell (k,) of the conditions, in one number."""
@@ -149,7 +152,9 @@ class ContactLaw:
         stiffness = self.stiffness(state)
         push = np.maximum(0.0, state.pressure[self.of] - stiffness * at.gap)
         touches = (push > 0) | (at.gap <= TOUCH * np.abs([self.grid.lower, self.grid.upper]).max())
-        pressure, on, normal = self.mean(push), np.zeros(len(self.area), dtype=bool), self.mean(at.n)
+        pressure = self.mean(push)
+        on = np.zeros(len(self.area), dtype=bool)
+        normal = self.mean(at.n)
         on[self.of[touches]] = True
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), TINY)
         friction = _, _, shear, *_ = self._friction(state, normal, self.mean(at.slip), pressure, on)
@@ -174,7 +179,9 @@ class ContactLaw:
 
     def tangent(self, touch: Touch, at: Geometry) -> scipy.sparse.csr_matrix:
         """Return minus the derivative D (m d, m d) of the forces by w; that shears turn is left out."""
-        pairs, d, m = self.pairs, self.grid.dim, len(self.pairs.cell)
+        pairs = self.pairs
+        d = self.grid.dim
+        m = len(self.pairs.cell)
         own = touch.stiff[:, None, None] * at.n[:, :, None] * at.n[:, None, :]
         if at.curvature is not None:
             own = own - touch.push[:, None, None] * at.curvature

@@ -144,7 +144,10 @@ class Contacts:
 
         points: at the start of the step, with the pressures and shears of then.
         """
-        grid, d, rows, off = self.grid, self.grid.dim, [], ""
+        grid = self.grid
+        d = self.grid.dim
+        rows = []
+        off = ""
         own = self._materials.table(cut.points, resistance)
         for number, ((faces, others), (facets, pairs)) in enumerate(zip(self._faces, found, strict=True)):
             patches = cut.surface(faces)
@@ -155,7 +158,9 @@ class Contacts:
                 slides = not near[pairs.gap < CLEAR * grid.h.min()].all()
                 off += f"{line(self.contacts[number])}: bodies slide by more than a cell" * slides
                 pairs, cell = Pairs(*(values[near] for values in pairs)), cell[near]
-            row, other, at = pairs.row, pairs.facet, patches.at[pairs.row]
+            row = pairs.row
+            other = pairs.facet
+            at = patches.at[pairs.row]
             y, where = (_on(corners[other], pairs.t) for corners in (now.corners, facets.cut))
             area = patches.area(there)[row]
             size = np.linalg.norm(area, axis=1)
@@ -192,7 +197,9 @@ class Contacts:
 
         Those of the pairs found at its start, and all that are next to each other.
         """
-        grid, keys, count = self.grid, [], len(self.grid.owners)
+        grid = self.grid
+        keys = []
+        count = len(self.grid.owners)
         for (faces, _), (facets, pairs) in zip(self._faces, found, strict=True):
             patches = cut.surface(faces)
             where = _on(facets.cut[pairs.facet], pairs.t)
@@ -214,7 +221,9 @@ class Contacts:
             np.take_along_axis(of.corners[patches.at], index[:, :, None], axis=1) for of in (points, cut.points)
         )
         resists = self._materials.table(cut.points, resistance)[patches.at]
-        area, n, k = patches.area(points), len(now), 2 ** (d - 1) * d
+        area = patches.area(points)
+        n = len(now)
+        k = 2 ** (d - 1) * d
         outward = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), TINY)
         whole = np.column_stack([patches.here, patches.cell])
         rows = np.column_stack([patches.now(points), resists, now.reshape(n, k), then.reshape(n, k), outward])
@@ -225,7 +234,9 @@ class Contacts:
 
     def _met(self, cut: CutDomains, faces: Surface, others: Surface, points: MaterialPoints) -> tuple[Facets, Pairs]:
         """Return the points on the faces of the other group, and which of these the points on the faces meet."""
-        patches, facets, d = cut.surface(faces), self._facets(cut, others, points), self.grid.dim
+        patches = cut.surface(faces)
+        facets = self._facets(cut, others, points)
+        d = self.grid.dim
         x, area = patches.now(points), patches.area(points)
         n = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), TINY)
         count = min(CANDIDATES[d], len(facets.x))
@@ -241,7 +252,10 @@ class Contacts:
         t, gap = _along(facets.corners[other], x[row], n[row])
         met = ((t >= -NEAR) & (t <= 1 + NEAR)).all(axis=1) & (gap <= REACH * self.grid.h.min())
         met &= gap >= -DEEP * self.grid.h.min()
-        row, other, t, gap = row[met], other[met], t[met], gap[met]
+        row = row[met]
+        other = other[met]
+        t = t[met]
+        gap = gap[met]
         order = np.lexsort((np.abs(gap), row))
         order = order[np.append(True, np.diff(row[order]) > 0)[: len(order)]]
         return facets, Pairs(row[order], other[order], t[order], gap[order])

@@ -98,8 +98,13 @@ class ToolPairs(Pairs):
 
     def at(self, w: NDArray[np.float64], travel: NDArray[np.float64]) -> Geometry:
         """See `Pairs`."""
-        d, m, h = self.grid.dim, len(w), self.grid.h.min()
-        gap, n, second, middle = np.zeros(m), np.zeros((m, d)), np.zeros((m, d, d)), np.zeros((m, d))
+        d = self.grid.dim
+        m = len(w)
+        h = self.grid.h.min()
+        gap = np.zeros(m)
+        n = np.zeros((m, d))
+        second = np.zeros((m, d, d))
+        middle = np.zeros((m, d))
         gone, x = travel[:, None] * [tool.along(d) for tool in self.tools], self.now + w
 
         def ask() -> None:

@@ -115,7 +115,10 @@ class ContactProblem(Loads):
         again: Callable[[NDArray[np.float64]], tuple[ContactLaw, Origin]] | None = None,
         reach: Callable[[], NDArray[np.int64]] | None = None,
     ):
-        self.grid, self.pushes, self._again, self._reach = law.grid, pushes, again, reach
+        self.grid = law.grid
+        self.pushes = pushes
+        self._again = again
+        self._reach = reach
         self.now = Current(law, origin, law.begins())
         self._operator: Latest[tuple[PETSc.Mat, PETSc.Vec]] = Latest()
         self._found: Latest[Found] = Latest()
@@ -161,7 +164,9 @@ class ContactProblem(Loads):
         return self._find_at(w, self._way(w) if self.pushed else np.zeros(len(self.now.law.contacts)))
 
     def _find_at(self, w: NDArray[np.float64], way: NDArray[np.float64]) -> Found:
-        law, state, of = self.now.law, self.now.state, self.pairs.number
+        law = self.now.law
+        state = self.now.state
+        of = self.pairs.number
         at = law.pairs.at(w, way)
         touch = law.touch(state, at)
         found = Found(at, touch, way, touch.force)
@@ -206,7 +211,9 @@ class ContactProblem(Loads):
 
     def coupling(self, at: At) -> PETSc.Mat:
         """Return minus the derivative of the forces at u."""
-        found, law, unknowns = self.found(at), self.now.law, at.unknowns
+        found = self.found(at)
+        law = self.now.law
+        unknowns = at.unknowns
         where, touch, *_ = found
         B, _ = self._B(law, unknowns)
         K = petsc_matrix(law.tangent(touch, where), B.getLocalSize()[0], self.grid.comm, own=True).PtAP(B)
@@ -257,7 +264,9 @@ class ContactProblem(Loads):
 
         Infinity where there is no such place.
         """
-        law, state, of = self.now.law, self.now.state, self.pairs.number
+        law = self.now.law
+        state = self.now.state
+        of = self.pairs.number
         along, k = (found.at.n * self.pushes.direction[of]).sum(axis=1), law.stiffness(state)
         with np.errstate(divide="ignore", invalid="ignore"):
             far = found.at.gap - state.pressure[law.of] / k + self.pushes.load[of] / (k * self.pairs.area * along)
@@ -277,7 +286,9 @@ class ContactProblem(Loads):
 
     def _begins(self) -> NDArray[np.float64]:
         """Return how far tools go (tools,), m, before the bodies do: at most to where one place would bear the load."""
-        way, still, h = np.zeros(len(self.now.law.contacts)), np.zeros_like(self.pairs.x), self.grid.h.min()
+        way = np.zeros(len(self.now.law.contacts))
+        still = np.zeros_like(self.pairs.x)
+        h = self.grid.h.min()
         for _ in range(ROUNDS):
             found = self._find_at(still, way)
             before, way = way, np.clip(way + np.minimum(self._shift(found), self._seek(found)[0]), -h, h)
@@ -301,7 +312,9 @@ class ContactProblem(Loads):
 
         Where they do not, tools that do not meet their loads go on to where they may.
         """
-        found, law, state = self.found(at), self.now.law, self.now.state
+        found = self.found(at)
+        law = self.now.law
+        state = self.now.state
         new = law.augmented(state, found.touch, self.pairs.x)
         self.now = self.now._replace(state=new)
         if new is not state or not self.pushed:
@@ -339,7 +352,10 @@ class ContactProblem(Loads):
 
         What touches in neither does not count.
         """
-        found, law, state, pairs = self.found(at), self.now.law, self.now.state, new.law.pairs
+        found = self.found(at)
+        law = self.now.law
+        state = self.now.state
+        pairs = new.law.pairs
         gap = np.einsum("md,md->m", pairs.n, pairs.apart)
         pairs = replace(pairs, apart=pairs.apart - self._apart_by(new.law, at))
         now = ContactLaw(law.names, law.contacts, pairs)
@@ -378,7 +394,9 @@ class ContactProblem(Loads):
         That is what touches at the start of the step.
         """
         at, touch, *_ = self._find_at(np.zeros_like(self.pairs.x), np.zeros(len(self.now.law.contacts)))
-        law, d, other = self.now.law, self.grid.dim, self.pairs.other_side()
+        law = self.now.law
+        d = self.grid.dim
+        other = self.pairs.other_side()
         on = np.flatnonzero(touch.stiff > 0)
         rough = on[law.strength.any(axis=1)[law.of[on]]]
         rows = np.concatenate([on, np.repeat(rough, d)])

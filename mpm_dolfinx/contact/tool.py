@@ -175,7 +175,9 @@ class Tool:
         way, m: by which a load has pushed it.
         Corners beyond its surface are put onto it; so its edges are blunt by a part of a cell.
         """
-        pose, solid, nodes = self.pose(t, grid.dim, way), self.solid(grid.h.min()), tuple(grid.shape + 1)
+        pose = self.pose(t, grid.dim, way)
+        solid = self.solid(grid.h.min())
+        nodes = tuple(grid.shape + 1)
         y = pose.own(grid.lower + np.stack(np.unravel_index(np.arange(np.prod(nodes)), nodes), axis=1) * grid.h)
         inside = solid.distance(y) < -ROUNDED * grid.h.min()
         cells = grid.corners(np.arange(np.prod(grid.shape)))

@@ -82,7 +82,9 @@ class Tools:
         outside: Surface,
         held: Sequence[tuple[Displacement, Surface]],
     ):
-        self.grid, self._materials, self._held = grid, materials, held
+        self.grid = grid
+        self._materials = materials
+        self._held = held
         self.names, self.tools = tuple(tools), tuple(tools.values())
         still = np.zeros(len(self.tools))
         self._ways = Ways(0.0, 0.0, still, still)
@@ -275,7 +277,9 @@ class Tools:
         """
         h, comm = self.grid.h.min(), self.grid.comm
         y, end = (self._pose(tool, t).own(at) for at, t in zip(x, times, strict=True))
-        way, gone, on = np.linalg.norm(end - y, axis=1), np.zeros(len(y)), np.arange(len(y))
+        way = np.linalg.norm(end - y, axis=1)
+        gone = np.zeros(len(y))
+        on = np.arange(len(y))
         along = (end - y) / np.maximum(way, TINY)[:, None]
         inside = everywhere(self.grid, lambda: (tool.solid(h).distance(y) < 0) | (tool.solid(h).distance(end) < 0))
         a, b = everywhere(self.grid, lambda: (tool.solid(h).normal(y[inside]), tool.solid(h).normal(end[inside])))

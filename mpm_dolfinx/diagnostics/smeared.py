@@ -43,7 +43,9 @@ def warn_smeared(
     callable
         What looks for it the next time.
     """
-    grid, points, count = cut.grid, cut.points, len(materials.materials)
+    grid = cut.grid
+    points = cut.points
+    count = len(materials.materials)
     volume = cut.to_cells(points.volume0 * points.J) * cut.pieces_to_cells(cut.pieces.fraction)
     whole = over_all(grid.comm, sum_by(cut.to_cells(points.material), volume, count))
     found = []
@@ -80,7 +82,9 @@ def _lost(cut: CutDomains, volume: NDArray[np.float64], modulus: NDArray[np.floa
     softest, hardest = (np.zeros(n, dtype=np.int64) for _ in range(2))
     softest[cut.cells[order]], hardest[cut.cells[order[::-1]]] = order, order[::-1]  # the last one stays
     held, stiffness, compliance = (sum_by(cut.cells, volume * y, n) for y in (1.0, modulus, 1 / modulus))
-    lost, contrast, at = np.zeros(n), np.ones(n), np.flatnonzero(held > 0)
+    lost = np.zeros(n)
+    contrast = np.ones(n)
+    at = np.flatnonzero(held > 0)
     lost[at] = modulus[softest[at]] * (compliance[at] - held[at] ** 2 / stiffness[at])
     contrast[at] = modulus[hardest[at]] / modulus[softest[at]]
     return np.where(lost > FINE * held, lost, 0.0), contrast, softest

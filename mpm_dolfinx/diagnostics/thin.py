@@ -14,10 +14,11 @@ from mpm_dolfinx.grid.grid import SIDES, Grid
 from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 
 COARSE = 0.7  # of a cell: domains above this lack more stiffness than Q1 cells have too much
-FEW = 3  # points over the thickness, up to which an eighth or more of the bending stiffness is lost
+FEW = 3  # points over the thickness that bend an eighth too much.  Source: exact, 1 / (n^2 - 1)
 SLENDER = 4  # length over thickness from which a body bends
-FEW_WET, SLENDER_WET = 17, 2  # the same of bodies with pore fluid, up to which 1 % or more is lost
-LOST_WET = 3.0  # share that these lose, times n^2: beams sealed or open at their end, n = 4 to 32, within a third
+LOST_WET = 3.0  # share that wet ones lose, times n^2: beams sealed or open at their end, n = 4 to 32, within a third
+FEW_WET = int((100 * LOST_WET) ** 0.5)  # up to which they lose 1 %.  Source: exact, by LOST_WET
+SLENDER_WET = 2  # length over thickness from which a wet body bends
 
 
 def warn_thin(grid: Grid, bodies: Sequence[Body], walls: Mapping[str, str], wet: bool) -> None:

@@ -82,13 +82,17 @@ def _second_differences(
 
     That is coefficients (d, 2^(d-1), cells), as `_polynomial` takes them.
     """
-    d, bits, out = grid.dim, corner_bits(grid.dim), []
+    d = grid.dim
+    bits = corner_bits(grid.dim)
+    out = []
     order = np.lexsort(grid.signs.T)  # of the nodes, as `bits` has them
     nodes, beside = grid.cell_nodes[cells], grid.beside(cells)
     for a in range(d):
         low, high = (order[bits[:, a] == end] for end in (0, 1))
         first, last = _at(u, nodes[:, low]), _at(u, nodes[:, high])
-        along, ends, known = last - first, [], []
+        along = last - first
+        ends = []
+        known = []
         for k, (end, value) in enumerate(((low, first), (high, last))):
             local = beside[:, a, k]
             beyond = grid.cell_nodes[local][:, end]

@@ -48,8 +48,13 @@ class Patches:
     """
 
     def __init__(self, grid: Grid, faces: Surface, here, at, cell, x, xi, share):
-        self._faces, self.here, self.at, self._xi = faces, here, at, xi
-        self.cell, self.x, self._grid = cell, x, grid
+        self._faces = faces
+        self.here = here
+        self.at = at
+        self._xi = xi
+        self.cell = cell
+        self.x = x
+        self._grid = grid
         self._share0 = share * faces.area0[here]
         self.base = grid.base
         """From which places count, see `Grid`."""
@@ -94,7 +99,9 @@ class CutDomains(Keyed):
     """
 
     def __init__(self, grid: Grid, points: MaterialPoints, domains: bool):
-        self.grid, self.points, self.domains = grid, points, domains
+        self.grid = grid
+        self.points = points
+        self.domains = domains
         self._patches: dict[Surface, Patches] = {}
         self.pieces = cut(grid, points.corners) if domains else whole_points(grid, points.x)
         if grid.copies > 1:
@@ -168,7 +175,9 @@ class CutDomains(Keyed):
         columns = ((faces.id, faces.face, faces.xi, faces.skew, np.arange(len(faces))) for faces in several)
         ids, number, xi, skew, row = map(np.concatenate, zip(*columns, strict=True))
         here, at = self.points.find(ids)
-        corners, number, xi = self.points.corners[at], number[here], xi[here]
+        corners = self.points.corners[at]
+        number = number[here]
+        xi = xi[here]
         count = xi.shape[1]
         places = interpolate(np.repeat(corners, count, axis=0), xi.reshape(-1, self.grid.dim)).reshape(xi.shape)
         face, x, xi, share, middle = cut_faces(self.grid, places, xi)
@@ -200,7 +209,9 @@ class CutDomains(Keyed):
     @cached_property
     def _followed(self) -> tuple[Exchange, NDArray[np.int32], NDArray[np.float64]]:
         """The way to the owners of the cells of corners or points, these cells, and the positions."""
-        grid, n, d = self.grid, len(self.points), self.grid.dim
+        grid = self.grid
+        n = len(self.points)
+        d = self.grid.dim
         at = np.repeat(np.arange(n), 2**d if self.domains else 1)
         x = self.points.corners.reshape(-1, d) if self.domains else self.points.x
         # of a corner on a grid line, rounding must not choose a cell in which the domain does not lie

@@ -51,7 +51,9 @@ def _of_hexahedra(
     slope = np.zeros_like(X)
     for face, sign in zip(FACES[3], FACE_SIGNS, strict=True):
         p, q, r, s = X[face]
-        total, a, b = p + q + r + s, s - p, r - q
+        total = p + q + r + s
+        a = s - p
+        b = r - q
         area, by_a, by_b = (sign / 24 * cross(*pair) for pair in ((a, b), (b, total), (total, a)))
         for corner, own in zip(face, (-by_a, -by_b, by_b, by_a), strict=True):
             slope[corner] += area + own

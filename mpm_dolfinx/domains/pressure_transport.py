@@ -81,7 +81,9 @@ class PiecePressures:
 def at_start(points: MaterialPoints) -> PiecePressures:
     """Return what points carry that have not been in a cell yet: one piece each, of even pressure."""
     n, p = len(points), points.pressure
-    cell, slope, bounds = np.full(n, -1), np.zeros_like(points.x), np.stack([p, p], axis=1)
+    cell = np.full(n, -1)
+    slope = np.zeros_like(points.x)
+    bounds = np.stack([p, p], axis=1)
     return PiecePressures(points.id, cell, np.ones(n), p, points.x, slope, bounds)
 
 
@@ -135,7 +137,9 @@ class Reconstruction:
         All (n, d, 2), by axis and end, zero where there is neither.
         """
         cells, p, centroid, faces, outer = seen
-        h, there, here = self.grid.h, self._neighbour[cells], p[cells]
+        h = self.grid.h
+        there = self._neighbour[cells]
+        here = p[cells]
         jump, one_sided = np.zeros(there.shape), np.zeros(there.shape)
         is_open = np.zeros(there.shape, dtype=bool)
         for axis in range(self.grid.dim):

@@ -156,7 +156,9 @@ class OpenSides:
         distance = np.einsum("md,md->m", self.reach, self.normal)
         # sides of an inflow have no conductance, seepage faces that let nothing out no pressure
         drained = np.flatnonzero((self.shape > 0) & (distance > 0) & ~(self.seeps & (p[at] <= self.pressure)))
-        at, normal, distance = at[drained], self.normal[drained], distance[drained]
+        at = at[drained]
+        normal = self.normal[drained]
+        distance = distance[drained]
         area, jump = self.shape[drained] * distance, self.pressure[drained] - p[at]
         for axis, end in np.ndindex(out.shape[1:3]):
             looks = (2 * end - 1) * normal[:, axis]
@@ -288,7 +290,10 @@ class FluxForms:
     """
 
     def __init__(self, grid: Grid, weight: ufl.core.expr.Expr | None, flows: bool, pressure: fem.Function, bulk: float):
-        self.grid, mesh, d, Q = grid, grid.mesh, grid.dim, grid.cellwise()
+        self.grid = grid
+        mesh = grid.mesh
+        d = grid.dim
+        Q = grid.cellwise()
         q, dp = ufl.TestFunction(Q), ufl.TrialFunction(Q)
         self.damping, self.fixed_stress = (fem.Function(Q) for _ in range(2))
         vectors = (fem.Function(grid.cellwise((d,))) for _ in range(5))
@@ -319,7 +324,9 @@ class FluxForms:
         smaller = ufl.min_value(self.fixed_stress("+"), self.fixed_stress("-"))
         volume = fem.Constant(mesh, grid.cell_volume)  # not a number: each would be compiled anew
         self.alternation = FacetForm(smaller / (4 * d) * across / volume * ufl.jump(dp) * ufl.jump(q) * dS, grid.comm)
-        self.slope, self.density, self._sum = fem.Function(grid.cellwise((d,))), fem.Function(Q), fem.Function(Q)
+        self.slope = fem.Function(grid.cellwise((d,)))
+        self.density = fem.Function(Q)
+        self._sum = fem.Function(Q)
         apart = ufl.jump(self.centroid)
         along = apart - ufl.dot(apart, n0) * n0
         self.aslant = None
@@ -351,7 +358,9 @@ class FluxForms:
 
     def set_conduction(self, contents: CellContents, flow: Conduction) -> NDArray[np.float64]:
         """Set the coefficients for how the filled owned cells conduct; return their mobilities (n, d) by axis."""
-        d, filled, shift = self.grid.dim, contents.filled, flow.mobility.shift
+        d = self.grid.dim
+        filled = contents.filled
+        shift = flow.mobility.shift
         mobility = flow.along(d)
         values = {self.mobility: mobility}
         if shift is not None:  # the fluid's weight is that at the centroids nevertheless

@@ -69,7 +69,9 @@ class HydraulicBoundary:
             columns = np.full((n, 1), i), np.resize(value, (n, 1)), p.area(points)
             rows.append((p.cell, p.x, np.concatenate(columns, axis=1)))
         cell, x, values = gathered(grid, rows, 2 + grid.dim)
-        number, value, area = values[:, 0].astype(np.int64), values[:, 1], values[:, 2:]
+        number = values[:, 0].astype(np.int64)
+        value = values[:, 1]
+        area = values[:, 2:]
         drains = np.array([isinstance(outlet, Drained) for outlet, _ in self.outlets], dtype=bool)[number]
         seeps = np.array([getattr(outlet, "seepage", False) for outlet, _ in self.outlets], dtype=bool)[number]
         size, reach = np.linalg.norm(area, axis=1), x - grid.midpoints[cell] - contents.centroid[cell]

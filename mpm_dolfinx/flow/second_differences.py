@@ -42,7 +42,9 @@ def second_differences(
     opening : (c, d, 2)
         Open shares of the lower and upper faces of the local cells, in axisymmetry times `Grid.around`.
     """
-    own, number, h = unknowns.owned, unknowns.map.indices, grid.h
+    own = unknowns.owned
+    number = unknowns.map.indices
+    h = grid.h
     beside = grid.beside(own)
     active = (beside >= 0) & (number[beside] >= 0)
     row, axis = np.nonzero(active.all(axis=2))

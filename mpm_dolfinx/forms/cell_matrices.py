@@ -178,7 +178,9 @@ def _of_hoops(tangent, gradients: list, hoops: list, row: tuple[int, int], colum
 
     tangent (3, 3, 3, 3): as for `ElementMatrices`; gradients, hoops: of the shape functions.
     """
-    (v, i), (u, j), out = row, column, 0
+    (v, i) = row
+    (u, j) = column
+    out = 0
     if i == 0:
         out += hoops[v] * sum(tangent[2, 2, j, l] * gradients[u][l] for l in range(2))
     if j == 0:
@@ -264,7 +266,9 @@ def batches(places: Places) -> list[tuple[NDArray[np.int64], NDArray[np.int64], 
     """Return batches of filled cells that hold about as many points: places of the cells among these (c,), points
     (c, most), which are none.
     """
-    cells, filled, out = places.cells, places.filled, []
+    cells = places.cells
+    filled = places.filled
+    out = []
     order = np.argsort(cells, kind="stable")
     start = np.searchsorted(cells[order], filled)
     count = np.diff(start, append=len(cells))

@@ -172,7 +172,10 @@ class Places(Keyed):
         mixed: NDArray[np.float64] | None = None,
         hoop: NDArray[np.float64] | None = None,
     ):
-        self.grid, self.cells, self.x, self.mixed = grid, cells, x, mixed
+        self.grid = grid
+        self.cells = cells
+        self.x = x
+        self.mixed = mixed
         self.offset = offset = x - grid.midpoints[cells]
         if grid.axisymmetric and hoop is None:
             hoop = np.column_stack([offset, offset.prod(axis=1), x[:, 0]])
@@ -229,7 +232,10 @@ class PointData(Keyed):
     """
 
     def __init__(self, points: FormPoints, places: Places, weight: NDArray[np.float64], fields: dict[str, NDArray]):
-        self.points, self.places, self.cells, self.x = points, places, places.cells, places.x
+        self.points = points
+        self.places = places
+        self.cells = places.cells
+        self.x = places.x
         self.volume, n = weight, len(places.cells)
         self._rows = {"offset": places.offset, "weight": (weight / points.grid.cell_volume)[:, None]}
         if points.grid.dim == 3:
@@ -259,7 +265,9 @@ class PointData(Keyed):
         return self._gradients(now, lambda: self._gradients_of(now))
 
     def _gradients_of(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        places, grid, d = self.places, self.points.grid, self.points.grid.dim
+        places = self.places
+        grid = self.points.grid
+        d = self.points.grid.dim
         of_cells, out = grid.monomials @ u.take(places.nodal), np.empty((len(self.cells), d, d))
         # component by component: rows of a few numbers each would take numpy six times as long
         for axis in range(d):
@@ -283,7 +291,9 @@ class Rows:
 
     def __init__(self, compiled: _compat.CompiledForm, points: FormPoints):
         names = {f: name for name, f in points.functions.items()}
-        self._columns, self._gathered, start = [], [], 0
+        self._columns = []
+        self._gathered = []
+        start = 0
         for f in compiled.coefficients:
             dofs, bs = _compat.cell_dofs(f.function_space), f.function_space.dofmap.bs
             stop = start + dofs.shape[1] * bs
@@ -294,7 +304,9 @@ class Rows:
             start = stop
         self._width = start
         self._live = {name: points.live[name] for _, name in self._columns if name in points.live}
-        self._room, self._dofs, self._packed = Latest(), Latest(), Latest()
+        self._room = Latest()
+        self._dofs = Latest()
+        self._packed = Latest()
 
     def live(self, data: PointData) -> dict[str, NDArray[np.float64]]:
         """Return the present values of those fields of the form that change while the points stay."""
@@ -417,7 +429,9 @@ class FacetSum:
     """A form over some facets; some: whether any process has one."""
 
     def __init__(self, form: FacetForm, facets: NDArray[np.int32], some: bool):
-        self._of, self._facets, self.some = form, facets, some
+        self._of = form
+        self._facets = facets
+        self.some = some
 
     @cached_property
     def _bound(self):

@@ -7,7 +7,7 @@ Its mesh is made when first it is needed: by then a simulation has shared out th
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cached_property, reduce
+from functools import cache, cached_property, partial, reduce
 from typing import Any
 
 from mpi4py import MPI
@@ -26,14 +26,8 @@ SIDES = {
     3: {"left": (0, 0), "right": (0, 1), "front": (1, 0), "back": (1, 1), "bottom": (2, 0), "top": (2, 1)},
 }
 """Names of the sides of a box: (axis, 0 for the lower or 1 for the upper end)."""
-SNAP = 1e-10  # cells: vertices this close to a grid plane, or as close as rounding tells, are taken to lie on it
 REACH = 1e-4  # cells: a side that is given its way to the wall of the grid gives way by as much
 
-SHARED = frozenset(
-    "mesh num_owned num_local cell_nodes node_x midpoints signs cell_number cell_facets facet_cells facets_owned "
-    "owners locals".split()
-)
-"""What of a grid is made with its mesh, see `Cells`."""
 TURN = 2 * np.pi
 """The angle of the revolution that volumes, forces and outflows of axisymmetric scenes are of.  Source: definition."""
 CHUNK = 2**14
@@ -83,7 +77,9 @@ class Cells:
     """
 
     def __init__(self, grid: Grid, mesh: Any, owners: NDArray[np.int32]):
-        self.mesh, self.owners, d = mesh, owners, grid.dim
+        self.mesh = mesh
+        self.owners = owners
+        d = grid.dim
         nodes = _compat.function_space(mesh, "Lagrange", 1)
         self.num_owned, self.num_local = _compat.num_cells(mesh)
         self.cell_nodes = _compat.cell_dofs(nodes)
@@ -111,6 +107,14 @@ class Cells:
         self.facet_cells = np.stack([adjacency.array[first], np.full(len(first), -1, dtype=np.int32)], axis=1)
         self.facet_cells[two, 1] = adjacency.array[first[two] + 1]
         self.facets_owned = topology.index_map(d - 1).size_local
+        self.cellwise = cache(partial(_compat.function_space, mesh, "DG", 0))
+        """Spaces by the shapes of their values, each made once, as are the functions whose memory others share."""
+        self.memory = cache(lambda shape, space=self.cellwise: fem.Function(space(shape)))
+
+
+def of_cells(name: str) -> property:
+    """Return a property of a grid that is one of its `Cells`."""
+    return property(lambda grid: getattr(grid._of_process, name))
 
 
 class Grid:
@@ -186,23 +190,35 @@ class Grid:
         self.h = (self.upper - self.lower) / self.shape
         self.base = self.lower * [not axisymmetric, *[True] * (d - 1)]
         self.low, self.high = self.lower - self.base, self.upper - self.base
-        self.snap = np.maximum(SNAP, [rounding(ends) for ends in zip(self.lower, self.upper, strict=True)] / self.h)
+        self.snap = np.maximum(SAME, [rounding(ends) for ends in zip(self.lower, self.upper, strict=True)] / self.h)
         self.comm = comm
-        self._made: list[Cells] = []
-        self._spaces: dict[tuple[int, ...], fem.FunctionSpace] = {}
-        self._coefficients: dict[tuple[int, ...], fem.Function] = {}
+        self._cells: Cells | None = None
 
-    def __getattr__(self, name: str):
-        """Make the mesh when first something of it is asked for; what has been asked for is found at once."""
-        if name not in SHARED:  # notebooks ask for `_repr_html_`, `copy` for other names
-            raise AttributeError(f"the grid has no {name!r}")
-        self.share(np.zeros(int(np.prod(self.shape))))
-        return vars(self).setdefault(name, getattr(self._made[0], name))
+    mesh = of_cells("mesh")
+    owners = of_cells("owners")
+    num_owned = of_cells("num_owned")
+    num_local = of_cells("num_local")
+    cell_nodes = of_cells("cell_nodes")
+    node_x = of_cells("node_x")
+    midpoints = of_cells("midpoints")
+    signs = of_cells("signs")
+    cell_number = of_cells("cell_number")
+    locals = of_cells("locals")
+    cell_facets = of_cells("cell_facets")
+    facet_cells = of_cells("facet_cells")
+    facets_owned = of_cells("facets_owned")
+
+    @property
+    def _of_process(self) -> Cells:
+        """The cells that this process has; shared out evenly where no scene has done so before."""
+        if self._cells is None:
+            self.share(np.zeros(int(np.prod(self.shape))))
+        return self._cells
 
     def share(self, load: NDArray[np.float64]) -> None:
         """Make the mesh, its cells shared out among the processes by what each holds (cells,); once."""
-        if not self._made:
-            self._make(owners(load.reshape(self.shape), self.comm.size))
+        if self._cells is None:
+            self._cells = self._made(owners(load.reshape(self.shape), self.comm.size))
 
     def shared(self, load: NDArray[np.float64], keep: bool) -> Grid:
         """Return the grid with its cells shared out by what each holds (cells,): this one, or an equal one.
@@ -215,22 +231,23 @@ class Grid:
             Whether a mesh that is there stays, however its cells are shared out: something was made on it.
         """
         owner = owners(load.reshape(self.shape), self.comm.size)
-        if not self._made:
-            self._make(owner)
-        elif not keep and (self._made[0].owners[: self.cells] != owner.ravel()).any():  # of an earlier scene
+        if self._cells is None:
+            self._cells = self._made(owner)
+        elif not keep and (self.owners[: self.cells] != owner.ravel()).any():  # of an earlier scene
             other = Grid(self.lower, self.upper, self.shape, self.comm, axisymmetric=self.axisymmetric)
-            other._make(owner)
+            other._cells = other._made(owner)
             return other
         return self
 
-    def _make(self, owner: NDArray[np.int32]) -> None:
+    def _made(self, owner: NDArray[np.int32]) -> Cells:
+        """Return the cells and their mesh, from the ranks of the cells of a copy, an array of the grid's shape."""
         own = np.flatnonzero(owner.ravel() == self.comm.rank)
         nodes = np.concatenate([self.corners(own) + copy * self.nodes for copy in range(self.copies)])
         ranks, first = destinations(owner, own)
         each = np.tile(np.diff(first), self.copies)
         where = np.tile(ranks, self.copies), np.concatenate([[0], np.cumsum(each)]).astype(np.int32)
         mesh = _compat.box_mesh(self.comm, nodes, self._nodes(), *where)
-        self._made.append(Cells(self, mesh, np.tile(owner.ravel(), self.copies)))
+        return Cells(self, mesh, np.tile(owner.ravel(), self.copies))
 
     def corners(self, cells: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return the lexicographic numbers of the nodes (n, 2^d) of cells."""
@@ -266,16 +283,11 @@ class Grid:
 
     def cellwise(self, shape: tuple[int, ...] = ()):
         """Return the space of functions of a shape that are constant in the cells (DG0), made once."""
-        if shape not in self._spaces:
-            self._spaces[shape] = _compat.function_space(self.mesh, "DG", 0, shape)
-        return self._spaces[shape]
+        return self._of_process.cellwise(shape)
 
     def coefficient(self, shape: tuple[int, ...] = ()) -> fem.Function:
         """Return a new cellwise function that stands in forms for rows of values; all of a shape share its memory."""
-        first = self._coefficients.get(shape)
-        out = fem.Function(self.cellwise(shape), None if first is None else first.x)
-        self._coefficients.setdefault(shape, out)
-        return out
+        return fem.Function(self.cellwise(shape), self._of_process.memory(shape).x)
 
     @cached_property
     def cell_volume(self) -> float:

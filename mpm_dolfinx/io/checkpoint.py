@@ -64,7 +64,7 @@ class Checkpoint:
     file: str | os.PathLike
     every: int = 1
     seconds: float = 0.0
-    _written: list[float] = field(default_factory=lambda: [time.monotonic()], init=False, repr=False)
+    _written: float = field(default_factory=time.monotonic, init=False, repr=False)
 
     def __post_init__(self):
         if path("checkpoint: file", self.file).is_dir():
@@ -77,15 +77,17 @@ class Checkpoint:
         result, comm = simulation.result, simulation.grid.comm
         due = (len(result.rows) - 1) % self.every == 0
         if due and self.seconds > 0:
-            due = comm.bcast(time.monotonic() - self._written[0] >= self.seconds)
+            due = comm.bcast(time.monotonic() - self._written >= self.seconds)
         if due or result.converged:
             save(simulation, Path(self.file))
-            self._written[0] = time.monotonic()
+            self._written = time.monotonic()
 
 
 def save(simulation: Simulation, file: Path) -> None:
     """Write the state of a simulation between two steps of a run."""
-    comm, began, state = simulation.grid.comm, time.perf_counter(), simulation.state
+    comm = simulation.grid.comm
+    began = time.perf_counter()
+    state = simulation.state
     whole_state = state.migrated(np.zeros(len(state.points), dtype=np.int32), comm)
     nodal = {}
     for name in NODAL:
@@ -177,7 +179,9 @@ def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulat
     ids = simulation.scene.all_ids(now.stage.present)
     try:
         points = _points(_part(arrays, "points/"), now.points, ids)
-        stay, transported, of_stay = None, None, _part(arrays, "stay/")
+        stay = None
+        transported = None
+        of_stay = _part(arrays, "stay/")
         if of_stay:
             own = [of_stay.pop(name) for name in PIECES] if wet else [None] * len(PIECES)
             keeps = of_stay.pop("keeps", None)
@@ -322,7 +326,9 @@ def _check_pieces(arrays: dict[str, NDArray], ids: NDArray[np.int64], dim: int) 
 def _without_rows(state: State) -> State:
     """Return a state without points and pieces."""
     none = np.empty(0, np.int64)
-    points, transported, stay = state.points.of(none), state.transported, state.stay
+    points = state.points.of(none)
+    transported = state.transported
+    stay = state.stay
     if stay is not None:
         rows = [None if rows is None else rows[:0] for rows in (getattr(stay, name) for name in PIECES)]
         stay = Stay(stay.points.of(none), *rows, None if stay.keeps is None else stay.keeps[:0])

@@ -55,3 +55,12 @@ def text() -> str:
         width = max(map(len, rows))
         out += [file, *(f"  {name:{width}}  {meaning}" for name, meaning in rows.items()), ""]
     return "\n".join(out)
+
+
+def unit(name: str) -> str:
+    """Return the unit of a field of points, or of a component of one; none where it is not known."""
+    for names, meaning in FIELDS["points.pvd: the domains of the material points"].items():
+        for each in names.split(", "):
+            if each not in ("id", "material", "others") and (name == each or name.startswith(f"{each}_")):
+                return meaning.split(",")[0]
+    return ""

@@ -26,6 +26,7 @@ import numpy as np
 from dolfinx import fem, io
 from numpy.typing import NDArray
 
+from mpm_dolfinx.base.tables import columns, components
 from mpm_dolfinx.base.validation import flag, instance, line_of, on_disk, path, whole
 from mpm_dolfinx.contact.tool import Tool
 from mpm_dolfinx.grid.grid import Grid
@@ -35,8 +36,6 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.simulation.simulation import Simulation
 from mpm_dolfinx.stepping.result import Result
 
-SYMMETRIC = {"xx": (0, 0), "yy": (1, 1), "zz": (2, 2), "xy": (0, 1), "xz": (0, 2), "yz": (1, 2)}
-"""Components of a symmetric tensor, the first four those of plane strain."""
 VTK_CELLS = {2: ("quad", [0, 1, 3, 2]), 3: ("hexahedron", [0, 1, 3, 2, 4, 5, 7, 6])}
 """VTK's cell for a domain, and the domain's corners in VTK's order."""
 WRITABLE = "in a folder that can be written, with room; the run goes on with `after=simulation.result`"
@@ -87,7 +86,9 @@ class Writer:
     def __init__(self, simulation: Simulation, folder: str | os.PathLike, *, every: int = 1, grid: bool = False):
         instance("writer: simulation", simulation, Simulation)
         flag("writer: grid", grid)
-        folder, comm, self._t = path("writer: folder", folder), simulation.grid.comm, simulation.t
+        folder = path("writer: folder", folder)
+        comm = simulation.grid.comm
+        self._t = simulation.t
         self.every, self._simulation = whole("writer: every", every), simulation
         self.closed = False
         """Whether the writer has released its folder."""
@@ -151,13 +152,9 @@ class Writer:
 
     def _write_points(self, simulation: Simulation) -> None:
         comm, file = simulation.grid.comm, self._points.next.with_suffix(".vtu")
-        points, wet, asked = simulation.points, simulation.scene.fluid is not None, simulation.point_fields()
-        data = {**points.data, "porosity": asked.porosity}
-        for name in ("effective_stress", "stress")[: 1 + wet]:
-            components = _components(getattr(asked, name), simulation.grid.dim)
-            data |= {f"{name}_{each}": values for each, values in components.items()}
-        data |= {name: getattr(asked, name) for name in ("mean_effective_stress", "deviatoric_stress")}
-        points = replace(points, data=data).migrated(to_root(comm, len(points)))
+        points, wet = simulation.points, simulation.scene.fluid is not None
+        points = replace(points, data={**points.data, **asked_of_points(simulation)})
+        points = points.migrated(to_root(comm, len(points)))
 
         def write() -> None:
             with replacing(file) as part:
@@ -182,6 +179,16 @@ class Writer:
         if not comm.allreduce(_ends(pieces[comm.rank]), op=MPI.LAND):  # dolfinx does not notice a full disk
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(stem))
         self._grid.entries.append((simulation.t, pieces))
+
+
+def asked_of_points(simulation: Simulation) -> dict[str, NDArray[np.float64]]:
+    """Return porosity, stresses by components, and their invariants (n,) at this process's points, by name."""
+    asked, wet = simulation.point_fields(), simulation.scene.fluid is not None
+    out = {"porosity": asked.porosity}
+    for name in ("effective_stress", "stress")[: 1 + wet]:
+        of = components(getattr(asked, name), simulation.grid.dim)
+        out |= {f"{name}_{each}": values for each, values in of.items()}
+    return out | {name: getattr(asked, name) for name in ("mean_effective_stress", "deviatoric_stress")}
 
 
 def _write_tools(simulation: Simulation, file: Path) -> None:
@@ -223,31 +230,7 @@ def _row(result: Result) -> dict[str, float]:
     """Return what the histories hold of the last output time, and what acts at the conditions then."""
     row = result.rows[-1]
     out = {"t": row.t, **{name: getattr(result, name) for name in COUNTS}}
-    out |= dict(zip(("p_min", "p_max"), row.pressure.tolist(), strict=False))
-    for i, u in enumerate(row.displacement):
-        out |= {f"{axis}_{i}": value for axis, value in zip("xyz", row.position[i].tolist(), strict=False)}
-        out |= {f"u{axis}_{i}": value for axis, value in zip("xyz", u.tolist(), strict=False)}
-        if len(row.probe_pressure):
-            out[f"p_{i}"] = float(row.probe_pressure[i])
-        if len(row.probe_stress):
-            out |= {f"s{name}_{i}": value for name, value in _components(row.probe_stress[i], len(u)).items()}
-    for quantity, values in row.outcome.items():
-        for name, value in values.items():
-            axes = _axes(len(row.outcome["wall_reactions"]) // 2, np.size(value)) if np.ndim(value) else [""]
-            singular = quantity.removesuffix("s")
-            out |= {f"{singular}{axis}_{name}": v for axis, v in zip(axes, np.ravel(value).tolist(), strict=True)}
-    return out
-
-
-def _axes(dim: int, size: int) -> list[str]:
-    """Return what the components of a force are called, and of its moments if it has more than there are axes."""
-    axes = ["_x", "_y", "_z"][:dim]
-    return axes + {0: [], 1: ["_moment"], 3: [f"_moment{axis}" for axis in axes]}[size - dim]
-
-
-def _components(tensors: NDArray[np.float64], dim: int) -> dict[str, NDArray[np.float64]]:
-    """Return the components of symmetric tensors (..., 3, 3) that are not zero for any body, by name."""
-    return {name: tensors[..., i, j] for name, (i, j) in list(SYMMETRIC.items())[: 4 if dim == 2 else 6]}
+    return out | {name: float(value) for name, (value, _) in columns(row, row.outcome).items()}
 
 
 def solid(points: MaterialPoints, displacement: NDArray[np.float64], wet: bool) -> meshio.Mesh:
@@ -373,7 +356,9 @@ class Series:
     """
 
     def __init__(self, comm: MPI.Intracomm, file: Path, t: float):
-        self.comm, self.file, self.folder = comm, file, file.with_suffix("")
+        self.comm = comm
+        self.file = file
+        self.folder = file.with_suffix("")
         self.entries: list[tuple[float, list[Path]]] = at_root(comm, lambda: kept(self._read(), t))
 
     @property
@@ -412,7 +397,9 @@ class Table:
     """
 
     def __init__(self, comm: MPI.Intracomm, file: Path, t: float, own: tuple[str, ...] = ()):
-        self.comm, self.file, self._own = comm, file, own
+        self.comm = comm
+        self.file = file
+        self._own = own
         self._rows = at_root(comm, lambda: kept(self._read(), t))
         self.columns: list[str] = []
         """Names of the columns, once it has been started."""
@@ -428,7 +415,7 @@ class Table:
     def start(self, first: dict[str, float]) -> None:
         """Write the rows that were kept, or else a first row."""
         rows = [row for _, row in self._rows] or [first]
-        self.columns[:] = rows[0]
+        self.columns = list(rows[0])
         self._check(first)
 
         def write() -> None:

@@ -28,6 +28,7 @@ from typing import ClassVar
 
 import numpy as np
 import ufl
+from numpy.typing import NDArray
 
 from mpm_dolfinx.base.tolerances import SAME
 from mpm_dolfinx.base.validation import line
@@ -47,6 +48,20 @@ class _Follows(float):
     """A number that follows from other constants."""
 
     follows = True
+
+
+@dataclass(frozen=True)
+class _FollowsByPlace:
+    """The same, as a function of places: P_0 / kappa of initial stresses and slopes, each a value or a function."""
+
+    stress: object
+    kappa: object
+    follows: ClassVar[bool] = True
+
+    def __call__(self, X: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the bulk moduli (m,), Pa, at places X (m, d)."""
+        at = [f(X) if callable(f) else np.asarray(f) for f in (self.stress, self.kappa)]
+        return np.broadcast_to(-np.mean(at[0], axis=-1) / at[1], len(X))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,12 +121,7 @@ class ModifiedCamClay(Skeleton):
         """Set the bulk modulus of the start, from which the scheme takes its scales."""
         stress, kappa = self.initial_stress, self.kappa
         if callable(stress) or callable(kappa):
-
-            def bulk(X):
-                at = [f(X) if callable(f) else np.asarray(f) for f in (stress, kappa)]
-                return np.broadcast_to(-np.mean(at[0], axis=-1) / at[1], len(X))
-
-            bulk.follows = True
+            bulk = _FollowsByPlace(stress, kappa)
         else:
             bulk = -np.mean(stress, axis=-1) / kappa
             bulk = bulk if np.ndim(bulk) else _Follows(bulk)
@@ -174,7 +184,9 @@ class ModifiedCamClay(Skeleton):
     def update(trial, shear, M, lambda_, kappa, pressure, yield_pressure, plastic, consolidated, steeper):
         """Return the state at the end of the step, name -> UFL."""
         to = _Return(trial, shear, M, lambda_, kappa, pressure, yield_pressure, consolidated, steeper)
-        strain, a, ratio = trial["strain"], to.compaction, ufl.exp(-to.flow)
+        strain = trial["strain"]
+        a = to.compaction
+        ratio = ufl.exp(-to.flow)
         volume = strain.volumetric + kappa * a
         b = strain.isotropic(lambda e: ufl.exp(2 * volume / 3 + ratio * (ufl.ln(e) - 2 * strain.volumetric / 3)))
         back = ufl.inv(strain.F)

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 from mpi4py import MPI
 
@@ -14,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.base.errors import NotConverged
 from mpm_dolfinx.base.given_values import at_places
-from mpm_dolfinx.base.tolerances import SAME
+from mpm_dolfinx.base.tolerances import NEAR, SAME
 from mpm_dolfinx.base.validation import line, numbers
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.overburden import overburden
@@ -26,7 +25,7 @@ from mpm_dolfinx.materials.trial import PLANE, SPACE
 from mpm_dolfinx.parallel.exchange import first, over_all
 from mpm_dolfinx.points.material_points import MaterialPoints
 
-EXACT, CLOSE = 1e-13, 1e-8  # of the largest given stress: to which laws are solved, and have to be
+EXACT, CLOSE = 1e-13, SAME  # of the largest given stress: to which laws are solved, and have to be
 MOST = 30  # iterations
 LARGEST = 0.2  # change of a strain in an iteration
 
@@ -86,15 +85,29 @@ def hydrostatic(level: float, unit_weight: float | None = None) -> Callable[[NDA
     if unit_weight is not None:
         allowed = {"test": lambda v: (0 < v) & (v < np.inf), "allowed": "> 0 and finite"}
         numbers("hydrostatic: unit_weight", unit_weight, **allowed)
-    weight = 1000 * STANDARD_GRAVITY if unit_weight is None else unit_weight
+    return Hydrostatic(level, unit_weight)
 
-    def pressure(x: NDArray[np.float64]) -> NDArray[np.float64]:
-        return weight * (level - x[:, -1])
 
-    pressure.unit_weight = weight
-    if unit_weight is None:
-        pressure.weighed = partial(hydrostatic, level)
-    return pressure
+@dataclass(frozen=True)
+class OfWater:
+    """A pressure of water: its unit weight, N/m^3, where none is given that of the scene's fluid, else 9810."""
+
+    @property
+    def unit_weight(self) -> float:
+        """Unit weight, N/m^3."""
+        return 1000 * STANDARD_GRAVITY if self.given is None else self.given
+
+
+@dataclass(frozen=True)
+class Hydrostatic(OfWater):
+    """The pressure of water at rest below a level, as a function of places."""
+
+    level: float
+    given: float | None = None
+
+    def __call__(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the pressures (m,), Pa, at places x (m, d)."""
+        return self.unit_weight * (self.level - x[:, -1])
 
 
 def by_body(given, bodies: Sequence[Body], later: Sequence[int]) -> dict[int, InitialStress]:
@@ -124,7 +137,9 @@ class InitialStresses:
     """
 
     def __init__(self, bodies: Sequence[Body], given: Mapping[int, InitialStress], pressure: float | Callable):
-        self._bodies, self.given, self.pressure = bodies, given, pressure
+        self._bodies = bodies
+        self.given = given
+        self.pressure = pressure
         self._start = np.cumsum([0, *(len(body) for body in bodies)])
 
     def of(self, materials: SceneMaterials, points: MaterialPoints, present: Sequence[bool], gravity) -> MaterialPoints:
@@ -139,7 +154,9 @@ class InitialStresses:
         """
         if not self.given:
             return points
-        target, rows, refused = np.zeros((len(points), 3, 3)), np.zeros(len(points), dtype=bool), ""
+        target = np.zeros((len(points), 3, 3))
+        rows = np.zeros(len(points), dtype=bool)
+        refused = ""
         placed = points.placed(materials.grid.base)
         above = self._above(materials, points, present, gravity)
         try:
@@ -210,7 +227,9 @@ def stressed(
     ValueError
         Naming the first place where a law cannot bear its stress.
     """
-    comm, rows, law = materials.grid.comm, np.flatnonzero(chosen), materials.law_of(points)
+    comm = materials.grid.comm
+    rows = np.flatnonzero(chosen)
+    law = materials.law_of(points)
     part, target = points.map(lambda values: values[rows]), target[rows]
     given = np.isin(law[rows], [k for k, one in enumerate(materials.laws) if issubclass(one, ModifiedCamClay)])
     if message := first(comm, _no_constants(part.placed(materials.grid.base), target, given)):
@@ -274,7 +293,9 @@ class _Sought:
 
     def linear(self) -> NDArray[np.float64]:
         """Return the strains (n, k) of a linear law."""
-        (bulk, shear), target, identity = self.moduli(), self.target, np.eye(3)
+        (bulk, shear) = self.moduli()
+        target = self.target
+        identity = np.eye(3)
         mean = np.trace(target, axis1=1, axis2=2) / 3
         elastic = (target - mean[:, None, None] * identity) / (2 * shear)[:, None, None]
         elastic += (mean / (3 * bulk))[:, None, None] * identity
@@ -300,13 +321,15 @@ class _Sought:
 
     def step(self, strain: NDArray[np.float64], missing: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the strains (n, k) after a step from those with which so much is missing, by differences."""
-        count, free, (_, shear) = strain.shape[1], self.free, self.moduli()
+        count = strain.shape[1]
+        free = self.free
+        (_, shear) = self.moduli()
         slopes = np.tile(np.eye(count) * (2 * shear)[:, None, None], (1, 1, 1))
         for k in range(count):
             change = (self.off(strain + SAME * np.eye(count)[k])[2] - missing) / SAME
             slopes[:, :, k] = np.where(free & free[:, [k]], change, slopes[:, :, k])
         slopes, missing = (np.nan_to_num(values) for values in (slopes, missing))
-        singular = ~(np.abs(np.linalg.det(slopes / shear[:, None, None])) > 1e-12)
+        singular = ~(np.abs(np.linalg.det(slopes / shear[:, None, None])) > NEAR**2)
         slopes[singular] = np.eye(count) * (2 * shear[singular])[:, None, None]
         change = np.linalg.solve(slopes, missing[:, :, None])[:, :, 0].clip(-LARGEST, LARGEST)
         return np.clip(strain - change, -1, 1)
@@ -315,7 +338,9 @@ class _Sought:
         """Return points with the strains, their stresses, Pa, and which (n,) do not have the target."""
         comm, strain = self.materials.grid.comm, self.linear()
         largest = over_all(comm, float(np.abs(self.target).max(initial=0.0)), MPI.MAX)
-        now, stress, bad = self.points, self.target, np.ones(len(strain), dtype=bool)
+        now = self.points
+        stress = self.target
+        bad = np.ones(len(strain), dtype=bool)
         try:
             for _ in range(MOST):
                 now, stress, missing = self.off(strain)
@@ -331,7 +356,9 @@ class _Sought:
 
 def strained(materials: SceneMaterials, points: MaterialPoints, moved: MaterialPoints) -> MaterialPoints:
     """Return points with the elastic strains of others, to which these have been deformed from where they are."""
-    F, d, law = moved.F, moved.F.shape[1], materials.law_of(points)
+    F = moved.F
+    d = moved.F.shape[1]
+    law = materials.law_of(points)
     own = {name: points.data[name] for name in ("softness", "owed", "due") if name in points.data}
     data = {**moved.data, **own}
     out = replace(points, data=data)

@@ -153,7 +153,9 @@ class _Equations:
         by_scene: Mapping[str, fem.Constant],
         bends: bool,
     ):
-        self._law, self._grid, self._by_scene = law, points.grid, by_scene
+        self._law = law
+        self._grid = points.grid
+        self._by_scene = by_scene
         equations = law.residual or law.solution
         self._names = [name for name in (*law.parameters, *law.state) if name in law.taken_by(equations)]
         self._points = own = FormPoints(points.grid, **{name: getattr(points, name).ufl_shape for name in self._names})
@@ -338,7 +340,11 @@ def _newton(system, y: NDArray[np.float64]) -> NDArray[np.int64]:
         close = (np.abs(step) <= SAME * np.maximum(1.0, np.abs(begun))).all(axis=1) | solved
         y[rows] = begun - step  # of those that are close this is the solution
         on = ~(close | lost[rows])
-        rows, step, begun, norm, length = rows[on], step[on], begun[on], norm[on], np.ones(int(on.sum()))
+        rows = rows[on]
+        step = step[on]
+        begun = begun[on]
+        norm = norm[on]
+        length = np.ones(int(on.sum()))
         if not len(rows):
             break
         f, slope, new = system(rows, begun - step)
@@ -348,7 +354,10 @@ def _newton(system, y: NDArray[np.float64]) -> NDArray[np.int64]:
             f[worse], slope[worse], new[worse] = system(rows[worse], begun[worse] - length[worse, None] * step[worse])
         lost[rows] = ~(new < norm)
         on = ~lost[rows]
-        rows, f, slope, norm = rows[on], f[on], slope[on], new[on]
+        rows = rows[on]
+        f = f[on]
+        slope = slope[on]
+        norm = new[on]
     lost[rows] = True  # after so many iterations
     return np.flatnonzero(lost)
 

@@ -24,13 +24,12 @@ import numpy as np
 import ufl
 from numpy.typing import NDArray
 
-from mpm_dolfinx.base.tolerances import EPSILON
+from mpm_dolfinx.base.tolerances import EPSILON, NEAR
 from mpm_dolfinx.forms.axes import embedded, planar
 from mpm_dolfinx.materials.frictional import Frictional
 from mpm_dolfinx.materials.skeleton import Field, _check
 from mpm_dolfinx.materials.trial import PLANE, Coaxial, Isotropic, components, eigen, symmetric
 
-CLOSE = 1e-12  # of stresses over the shear modulus
 FACE, EDGES, ALL = slice(0, 1), slice(1, 3), slice(None)  # of the faces of a return
 NEVER = 1e6  # tensile strength over the bulk modulus where none is given
 
@@ -119,7 +118,9 @@ class MohrCoulomb(Frictional):
     @staticmethod
     def update(trial, bulk, shear, plastic, stress, flows):
         """Return the state at the end of the step, name -> UFL."""
-        (F, plane), tau, I = trial["F"], symmetric(stress), ufl.Identity(3)
+        (F, plane) = trial["F"]
+        tau = symmetric(stress)
+        I = ufl.Identity(3)
         mean = ufl.tr(tau) / 3
         twice_strain = (tau - mean * I) / shear + 2 * mean / (3 * bulk) * I
         b, back = Isotropic(twice_strain, plane)(ufl.exp), ufl.inv(F)
@@ -148,7 +149,7 @@ def _returned(e: NDArray, bulk: NDArray, shear: NDArray, sine: NDArray, sine_flo
         for few in (FACE, EDGES, ALL):  # most end on the first, most others on the next
             at = _Return(trial[rows], *(v[rows] for v in parameters))
             ends, of_trial, offence = at.end(few)
-            there = offence <= CLOSE * shear[rows] if few is not ALL else slice(None)
+            there = offence <= NEAR**2 * shear[rows] if few is not ALL else slice(None)
             t[rows[there]], slopes[rows[there]] = ends[there], of_trial[there] @ elastic[rows[there]]
             rows = np.delete(rows, there)
             if not len(rows):
@@ -160,7 +161,10 @@ class _Surface:
     """The yield surface for ordered stresses: 1 + sin phi, 1 - sin phi, 2 c cos phi and T (n,)."""
 
     def __init__(self, sine: NDArray, strength: NDArray, cutoff: NDArray):
-        self.p, self.q, self.k, self.T = 1 + sine, 1 - sine, strength, cutoff
+        self.p = 1 + sine
+        self.q = 1 - sine
+        self.k = strength
+        self.T = cutoff
 
     def outside(self, t: NDArray) -> NDArray:
         """Return by how much stresses (n, 3) are outside (n,), Pa."""
@@ -171,7 +175,10 @@ class _Return:
     """The return of ordered trial stresses t (n, 3), Pa, that are outside."""
 
     def __init__(self, t, elastic, bulk, shear, sine, sine_flow, strength, cutoff):
-        self._trial, self._elastic, self._K, self._G = t, elastic, bulk, shear
+        self._trial = t
+        self._elastic = elastic
+        self._K = bulk
+        self._G = shear
         self._surface = s = _Surface(sine, strength, cutoff)
         self._p, self._q = 1 + sine_flow, 1 - sine_flow
         zero, one = np.zeros_like(sine), np.ones_like(sine)

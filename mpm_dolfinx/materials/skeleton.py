@@ -36,7 +36,10 @@ Tip of the drained beam at h = 0.015 m, plain and with it: -0.02 and +0.22 % at 
 """
 
 APART = 1e-4
-"""By how much equal eigenvalues are set apart, in proportion to them, so that their derivatives are finite."""
+"""By how much equal eigenvalues are set apart, in proportion to them, so that their derivatives are finite.
+
+Plateau (beam): halved 1.8e-09, doubled 7.2e-09, cells 1.5e-02.
+"""
 
 
 @dataclass(frozen=True)
@@ -359,8 +362,8 @@ def _eigenvalues(C, apart: float = APART):
         return mean + radius, mean - radius
     mean = ufl.tr(C) / 3
     D = C - mean * ufl.Identity(3)
-    r = ufl.sqrt(ufl.inner(D, D) / 6 + 1e-2 * apart**2)
-    phi = ufl.acos((1 - 1e2 * apart**2) * ufl.det(D) / (2 * r * r * r)) / 3
+    r = ufl.sqrt(ufl.inner(D, D) / 6 + (apart / 10) ** 2)
+    phi = ufl.acos((1 - (10 * apart) ** 2) * ufl.det(D) / (2 * r * r * r)) / 3
     return tuple(mean + 2 * r * ufl.cos(phi + 2 * ufl.pi * k / 3) for k in range(3))
 
 

@@ -33,7 +33,10 @@ class Isotropic:
 
     def __call__(self, f: Callable):
         """Return f(b) (3, 3) for a function of the eigenvalues."""
-        b, I, x, y = self._b, ufl.Identity(3), self._nodes, [f(node) for node in self._nodes]
+        b = self._b
+        I = ufl.Identity(3)
+        x = self._nodes
+        y = [f(node) for node in self._nodes]
         slope = (y[0] - y[1]) / (x[0] - x[1])
         linear = y[0] * I + slope * (b - x[0] * I)
         if self._plane:
@@ -94,7 +97,11 @@ def eigen(b: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float
     mean, half = (b[:, 0] + b[:, 1]) / 2, (b[:, 0] - b[:, 1]) / 2
     radius, angle = np.hypot(half, b[:, 3]), np.arctan2(b[:, 3], half) / 2
     axes, (c, s) = np.zeros((n, 3, 3)), (np.cos(angle), np.sin(angle))
-    axes[:, 0, 0], axes[:, 1, 0], axes[:, 0, 1], axes[:, 1, 1], axes[:, 2, 2] = c, s, -s, c, 1.0
+    axes[:, 0, 0] = c
+    axes[:, 1, 0] = s
+    axes[:, 0, 1] = -s
+    axes[:, 1, 1] = c
+    axes[:, 2, 2] = 1.0
     return np.stack([mean + radius, mean - radius, b[:, 2]], axis=1), axes
 
 
@@ -112,7 +119,9 @@ class Coaxial:
     """
 
     def __init__(self, x: NDArray[np.float64], axes: NDArray[np.float64], y: NDArray[np.float64], plane: bool):
-        self._x, self._axes, self._y = x, axes, y
+        self._x = x
+        self._axes = axes
+        self._y = y
         self._inner, self._pairs = (PLANE, ((0, 1),)) if plane else (SPACE, ((0, 1), (0, 2), (1, 2)))
         self._outer = np.stack([self._dyad(a, a) for a in range(3)], axis=2)
 
@@ -134,7 +143,9 @@ class Coaxial:
         In the axes dy_ij = (y_i - y_j) / (x_i - x_j) dx_ij beside the diagonal; where x_i = x_j it is
         (dy_i/dx_i - dy_i/dx_j) dx_ij, for an isotropic function has y_i = y_j there.
         """
-        x, y, inner = self._x, self._y, len(self._inner)
+        x = self._x
+        y = self._y
+        inner = len(self._inner)
         twice = np.array([1.0 if i == j else 2.0 for i, j in self._inner])
         found = np.zeros((len(x), len(SPACE), inner))
         tangent = found[:, :inner]

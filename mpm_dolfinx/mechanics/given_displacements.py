@@ -69,7 +69,9 @@ class GivenDisplacements(Acting):
     conditions, title = (Displacement,), "given displacements"
 
     def __init__(self, setting: Setting, displacements: Mapping[str, Displacement]):
-        self._grid, self._forms, self._materials = setting.grid, setting.forms, setting.materials
+        self._grid = setting.grid
+        self._forms = setting.forms
+        self._materials = setting.materials
         self._free, self._names = setting.free, list(displacements)
         self._meeting: list[tuple[Displacement, Displacement, list[int], NDArray[np.float64]]] = []
         self._warned: set[int] = set()  # numbers of the conditions, of which nothing but the log knows
@@ -160,7 +162,9 @@ class GivenDisplacements(Acting):
 
     def reactions(self, loads: HoldLoads, at: At) -> dict[str, NDArray[np.float64]]:
         """Return the forces (d,), N, by which each of them acts on the bodies at u."""
-        held, data, force = loads.held, loads.data, loads.pull(at.nodal)
+        held = loads.held
+        data = loads.data
+        force = loads.pull(at.nodal)
         self._warn(held, loads.row, data["direction"].argmax(axis=1), force)
         number, force = held.number[loads.row], (loads.share.sum(axis=1) * force)[:, None] * data["direction"]
         sums = np.stack([sum_by(number, column, len(self._holds)) for column in force.T], axis=1)
@@ -225,8 +229,12 @@ class HoldLoads(Loads):
         row: NDArray[np.int64],
         share: NDArray[np.float64],
     ):
-        self._acting, self._forms, self.data = acting, forms, data
-        self.held, self.row, self.share = held, row, share
+        self._acting = acting
+        self._forms = forms
+        self.data = data
+        self.held = held
+        self.row = row
+        self.share = share
         self._d = data.points.grid.dim
         self.key = self._d * row + data["direction"].argmax(axis=1)
         self.under_held = acting.under_held

@@ -54,7 +54,10 @@ class MeanDilatation:
     """
 
     def __init__(self, grid: Grid, numbers: Sequence[int], symmetric: bool = True):
-        self._grid, self._d, self._symmetric, self._numbers = grid, grid.stretches, symmetric, numbers
+        self._grid = grid
+        self._d = grid.stretches
+        self._symmetric = symmetric
+        self._numbers = numbers
         self.theta, self.pi = fem.Function(grid.cellwise()), fem.Function(grid.cellwise())
         self._theta = ufl.variable(self.theta)
         self._filled: Latest[Cells] = Latest()
@@ -133,10 +136,14 @@ class MeanDilatation:
         P, slope = self._stress(law, F, Fbar, values)
         if law.kirchhoff is None or self._grid.dim == 3:
             return tuple(ufl.diff(of, by) for of in (P, slope) for by in (F, self._theta))
-        d, theta, G = self._d, self._theta, ufl.inv(F).T
+        d = self._d
+        theta = self._theta
+        G = ufl.inv(F).T
         i, j, k, l, m = ufl.indices(5)
         tau = law.kirchhoff_in_plane(Fbar, values)
-        C, G_F, dev = ufl.diff(tau, Fbar), ufl.diff(G, F), tau - ufl.tr(tau) / d * ufl.Identity(d)
+        C = ufl.diff(tau, Fbar)
+        G_F = ufl.diff(G, F)
+        dev = tau - ufl.tr(tau) / d * ufl.Identity(d)
         tau_theta = ufl.as_tensor(C[i, j, k, l] * Fbar[k, l], (i, j)) / (d * theta)
         tau_F = ufl.as_tensor(ufl.inner(Fbar, G) / d * C[i, j, k, l] - theta * tau_theta[i, j] * G[k, l], (i, j, k, l))
         mean_F, mean_theta = ufl.as_tensor(tau_F[i, i, k, l], (k, l)) / d, ufl.tr(tau_theta) / d

@@ -362,9 +362,13 @@ class MomentumProblem:
         held: NDArray[np.float64] | None = None,
         yielded: bool = False,
     ):
-        self.forms, self.system, self.data = forms, system, data
+        self.forms = forms
+        self.system = system
+        self.data = data
         self.yielded = yielded
-        self.loads, self._goes_on, self._tolerance = tuple(loads), goes_on, tolerance
+        self.loads = tuple(loads)
+        self._goes_on = goes_on
+        self._tolerance = tolerance
         self._varying = [one for one in loads if one.varies]
         with Timer("mpm: loads"):
             external, pulls = (

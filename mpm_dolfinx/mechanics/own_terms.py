@@ -49,7 +49,10 @@ class OwnTerms:
     def __init__(
         self, terms: Sequence[Callable | OnSide], pieces: FormPoints, u: fem.Function, t: fem.Constant, dt: fem.Constant
     ):
-        self.symmetric, self.holding, self.rates, self._u = True, False, False, u
+        self.symmetric = True
+        self.holding = False
+        self.rates = False
+        self._u = u
         """Whether all tangents are symmetric; whether some depend on u, and on the velocity."""
         # a rate is (u - past) / own: of backward Euler past is 0, and own the step
         self._past, self._own = fem.Function(u.function_space), fem.Constant(pieces.grid.mesh, 1.0)

@@ -59,7 +59,9 @@ class Plates(Acting):
     conditions, title = (RigidPlate,), "rigid plates"
 
     def __init__(self, setting: Setting, plates: Mapping[str, RigidPlate]):
-        self._grid, self._forms, self._materials = setting.grid, setting.forms, setting.materials
+        self._grid = setting.grid
+        self._forms = setting.forms
+        self._materials = setting.materials
         self._faces = [setting.sides.of(plate) for plate in plates.values()]
         even: dict[str, Traction] = {}
         for (name, plate), faces in zip(plates.items(), self._faces, strict=True):
@@ -74,7 +76,9 @@ class Plates(Acting):
 
     def placed(self, place: Place) -> Loads:
         """Return the plates on the surface, with their rigidity, normal and present tilt."""
-        d, rows, grid = self._grid.dim, [], self._grid
+        d = self._grid.dim
+        rows = []
+        grid = self._grid
         for faces in self._faces:
             patches = place.cut.surface(faces)
             area = patches.area(place.points)
@@ -97,7 +101,9 @@ class PlateLoads(Loads):
     stiff = True
 
     def __init__(self, forms: PlateForms, data: PointData, even: Loads):
-        self._forms, self._data, self._even = forms, data, even
+        self._forms = forms
+        self._data = data
+        self._even = even
 
     def dead(self, b: NDArray[np.float64]) -> None:
         """Add the even tractions, and what turns plates back."""
@@ -125,7 +131,9 @@ def _check_flat(plate: RigidPlate, faces: Surface) -> None:
     """Refuse a plate on faces that are not one flat, connected side as seeded: each part would move by itself."""
     corners, axis = faces.places(), facing(faces)[0]
     tangential = np.arange(corners.shape[2]) != axis
-    low, high, height = corners.min(axis=1)[:, tangential], corners.max(axis=1)[:, tangential], corners[..., axis]
+    low = corners.min(axis=1)[:, tangential]
+    high = corners.max(axis=1)[:, tangential]
+    height = corners[..., axis]
     X, extent = (low + high) / 2, high - low
     size = extent.max(axis=0)
     apart = np.flatnonzero(np.abs(height - height[0, 0]).max(axis=1) > NEAR * size.min())

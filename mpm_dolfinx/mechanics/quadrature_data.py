@@ -105,7 +105,9 @@ class QuadraturePoints:
 
     def __init__(self, grid: Grid, scene: SceneMaterials, fluid: Fluid | None, weighs: bool, extended: bool):
         self._grid, self._fluid = grid, fluid
-        self._scene, self._weighs, self._extended = scene, weighs, extended
+        self._scene = scene
+        self._weighs = weighs
+        self._extended = extended
         self.varies = bool(fluid and scene.conductivity_laws)
         self.layered = bool(fluid and scene.conducts and scene.layered)
         d = grid.dim

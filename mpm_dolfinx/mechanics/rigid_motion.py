@@ -44,13 +44,17 @@ def rigid_motion(
     -------
     None where nothing is turned, or where a shift meets the given displacements nearly as well.
     """
-    d, e, gap = x.shape[1], holds["direction"], holds["gap"][:, 0]
+    d = x.shape[1]
+    e = holds["direction"]
+    gap = holds["gap"][:, 0]
     weight = holds["stiffness"] * counts[:, None]
     moments = over_all(comm, np.concatenate([[weight.sum()], (weight * holds.x).sum(axis=0)]))
     if not moments[0] > 0:
         return None
     centre = moments[1:] / moments[0]
-    arm, shift, turn = holds.x - centre, np.zeros(d), Rotation.identity()
+    arm = holds.x - centre
+    shift = np.zeros(d)
+    turn = Rotation.identity()
     size = np.sqrt(over_all(comm, float((weight[:, 0] * (arm**2).sum(axis=1)).sum())) / moments[0])
     left = []  # sum of the squares of the gaps: of no turn at the second, of the nearest one at the end
     for iteration in range(ITERATIONS):

@@ -26,9 +26,11 @@ from itertools import combinations, permutations
 import numpy as np
 from numpy.typing import NDArray
 
+from mpm_dolfinx.base.tolerances import NEAR
 from mpm_dolfinx.grid.grid import TURN, Grid, sum_by
 
-SLIVER = 1e-12  # of the domain: smaller pieces are dropped; less than one `Grid.snap` thin, whose face is open
+SLIVER = NEAR**2
+"""Of the domain: smaller pieces are dropped.  Those less than `Grid.snap` thin have an open face.  Source: epsilon."""
 CHUNK = 2**15  # simplices of domains that are cut at a time, in the processor's cache
 TANGLED = 0.2  # of its volume: a domain whose corners span less is re-derived from F
 
@@ -292,7 +294,9 @@ def _sum(
 ) -> Pieces:
     """Sum the slices of the surfaces by (point, cell) into pieces."""
     d = grid.dim
-    index, least, most = np.floor(s.mean(axis=0)), s.min(axis=0), s.max(axis=0)
+    index = np.floor(s.mean(axis=0))
+    least = s.min(axis=0)
+    most = s.max(axis=0)
     ends = []
     for a in range(d):
         # what lies on a grid plane belongs to the cell of the body behind it
@@ -345,7 +349,9 @@ def _sum(
         faces[:, a] *= grid.cell_volume / grid.h[a]
 
     # centroids stay off the grid lines, and inside the cell that they belong to
-    volume, hoop, mixed = volume[kept], np.empty((len(kept), 0)), np.zeros((len(kept), len(uneven)))
+    volume = volume[kept]
+    hoop = np.empty((len(kept), 0))
+    mixed = np.zeros((len(kept), len(uneven)))
     middle = np.stack([m[kept] / volume for m in moments], axis=1)
     centroid = np.clip(middle, grid.snap, 1 - grid.snap)
     for a, product in enumerate(uneven):
@@ -450,7 +456,9 @@ def cut_faces(
     total = _size(whole[:, d:]).reshape(len(split), m).sum(axis=0)
     share = _size(s[:, d:]) / total[owner % max(1, m)]
     kept = np.flatnonzero(share > SLIVER)  # what only touches a plane leaves nothing
-    s, owner, share = s[:, :, kept], owner[kept], share[kept]
+    s = s[:, :, kept]
+    owner = owner[kept]
+    share = share[kept]
     points = np.einsum("qk,kam->qam", _RULES[d], s)
     middle = np.tile((grid.low + grid.h * s[:, :d].mean(axis=0).T), (len(points), 1))
     points = points.transpose(0, 2, 1).reshape(-1, both.shape[1])
@@ -468,8 +476,8 @@ def _size(s: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.sqrt(sum((a[i] * b[j] - a[j] * b[i]) ** 2 for i, j in combinations(range(len(a)), 2)))
 
 
-_CUBIC = (0.659027622374092, 0.231933368553031, 0.109039009072877)  # Strang and Fix (1973)
-_RULES = {  # barycentric points of equal weight, exact to third order on segments and triangles
+_CUBIC = (0.659027622374092, 0.231933368553031, 0.109039009072877)  # Source: Strang and Fix (1973)
+_RULES = {  # Source: Gauss, Strang and Fix (1973); of equal weight, exact to third order
     2: 0.5 + np.array([[1, -1], [-1, 1]]) / np.sqrt(12),
     3: np.array(list(permutations(_CUBIC))),
 }
@@ -526,7 +534,7 @@ def _on_plane(a, b, axis: int, plane):
     return x
 
 
-_A, _B, _C = (0,), (1,), (2,)
+_A, _B, _C = (0,), (1,), (2,)  # Source: definition, the vertices
 # vertices are sorted along the axis; (i, j) is the point where the edge from i to j meets the plane
 _CUTS = {
     1: {1: {"below": [(_A, (0, 1))], "above": [((0, 1), _B)]}},

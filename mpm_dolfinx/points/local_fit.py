@@ -69,7 +69,9 @@ class LocalFit:
         """Return the values (count, width) at the places, on every process; zero where nothing was added."""
         size = len(self._powers)
         sums = over_all(comm, self._sums).reshape(self._shape)
-        A, b, degree = sums[:, :, :size].copy(), sums[:, :, size:], np.array([len(p) for p in self._powers])
+        A = sums[:, :, :size].copy()
+        b = sums[:, :, size:]
+        degree = np.array([len(p) for p in self._powers])
         some = A[:, 0, 0] > 0
         whole = np.where(some, A[:, 0, 0], 1.0)
         A[:, np.arange(size), np.arange(size)] += whole[:, None] * np.array(UNTOLD)[degree] + (~some)[:, None]

@@ -27,7 +27,7 @@ from mpm_dolfinx.stepping.on_grid import OnGrid
 from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.state import State
 
-REACH = 3
+REACH = int(RADIUS)
 """Cells along each axis from that of a probe to the last one that counts: all that `LocalFit` gives weight."""
 
 
@@ -57,7 +57,9 @@ class _Lattice:
         number = grid.number(np.where(inside[:, :, None], there, 0).reshape(-1, d)).reshape(inside.shape)
         self.number = np.where(inside, number + copy[:, None] * grid.cells, -1)
         self.midpoint = grid.low + (there + 0.5) * grid.h
-        self.middle, self.stride, self.beside = len(steps) // 2, width ** np.arange(d)[::-1], {}
+        self.middle = len(steps) // 2
+        self.stride = width ** np.arange(d)[::-1]
+        self.beside = {}
         for axis, end in np.ndindex(d, 2):
             step = steps[:, axis] + 2 * end - 1
             rows = np.flatnonzero((step >= 0) & (step < width))
@@ -72,8 +74,12 @@ class _Around:
     """
 
     def __init__(self, scene: Scene, state: State, on_grid: OnGrid, probes: Probes):
-        self._grid, self._contents, cut = scene.grid, on_grid.contents, on_grid.cut
-        points, d, m = cut.points, scene.grid.dim, len(probes.id)
+        self._grid = scene.grid
+        self._contents = on_grid.contents
+        cut = on_grid.cut
+        points = cut.points
+        d = scene.grid.dim
+        m = len(probes.id)
         alike = np.column_stack([scene.materials.conducting(points), points.material])
         here, at = points.find(probes.id)
         own = np.zeros((m, d + 4))
@@ -84,7 +90,9 @@ class _Around:
         self._local, rows = self._gathered(on_grid, on_grid.pressures(state), cut.to_cells(alike))
         ends = np.cumsum([1, 1, d, d, d, 3])
         filled, p, self._half, self._kappa, self._shift, held, share = np.split(rows, ends, axis=2)
-        self._filled, self._p, self._open = filled[..., 0] > 0, p[..., 0], share.reshape(*share.shape[:2], d, 2)
+        self._filled = filled[..., 0] > 0
+        self._p = p[..., 0]
+        self._open = share.reshape(*share.shape[:2], d, 2)
         self._centroid = lattice.midpoint + self._half - x[:, None]
         self._counts, self._reached = self._connected(held == key[:, None])
         self._sides = state.stage.hydraulic.data(cut, points, self._contents, state.t)
@@ -96,8 +104,12 @@ class _Around:
         alike.  The columns are one where a cell is filled, p, centroid, mobility, shift, `alike` or nan
         where pieces differ, and open shares.
         """
-        grid, contents, number = self._grid, self._contents, self._lattice.number
-        filled, mobility, slot = contents.filled, on_grid.resting_mobility(), contents.slot(on_grid.cut.cells)
+        grid = self._grid
+        contents = self._contents
+        number = self._lattice.number
+        filled = contents.filled
+        mobility = on_grid.resting_mobility()
+        slot = contents.slot(on_grid.cut.cells)
         held = np.zeros((len(filled), 3))
         held[slot] = alike  # of any of the cell's pieces
         held[np.stack([sum_by(slot, other, len(filled)) > 0 for other in (alike != held[slot]).T], axis=1)] = np.nan
@@ -143,7 +155,9 @@ class _Around:
 
     def pressures(self, weight: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the pressures (m,), Pa, at the probes; weight (d,), N/m^3: of the fluid."""
-        comm, h, head = self._grid.comm, self._grid.h, self._p - self._centroid @ weight
+        comm = self._grid.comm
+        h = self._grid.h
+        head = self._p - self._centroid @ weight
         base, (low, high) = head[:, self._lattice.middle], self._bounds(head)
         at, offset, value, share, own = self._drained(weight)
         rows = [(at, offset, value, share)]
@@ -237,7 +251,10 @@ def probe_stresses(scene: Scene, state: State, probes: Probes) -> NDArray[np.flo
 
     Points count that are of the probe's body and material, by where they were at rest.
     """
-    points, comm, m, d = state.points, scene.grid.comm, len(probes.id), scene.grid.dim
+    points = state.points
+    comm = scene.grid.comm
+    m = len(probes.id)
+    d = scene.grid.dim
     here, at = points.find(probes.id)
     rest = _edges(points.reference[at])
     frames = [np.linalg.inv(edges) for edges in (rest, points.F[at][:, :d, :d] @ rest)]

@@ -8,16 +8,17 @@ from dataclasses import replace
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import brentq
 
 from mpm_dolfinx.base.errors import StepFailed
 from mpm_dolfinx.base.report import Report
+from mpm_dolfinx.base.time_integration import Substep
 from mpm_dolfinx.base.validation import functions, line
 from mpm_dolfinx.parallel.exchange import first
 from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.state import State
-from mpm_dolfinx.stepping.time_integration import Substep
 
 LOCATED = 1e-3
 """Share of a step to which the time of an event is found.  Source: the documented accuracy of `until`."""
@@ -73,7 +74,8 @@ class Events:
         self._until = [until] if callable(until) else [] if until is None else until
         functions("until", self._until)
         self._simulation = simulation
-        self._before = self._values() if self._until else []
+        if self._until:
+            self._values()
 
     def within(self, step: Step, new: State) -> Found | None:
         """Return the event that occurs first within a step with a new state; None where there is none.
@@ -84,30 +86,28 @@ class Events:
         """
         if not self._until:
             return None
+        before = self._values()
         try:
             self._simulation.state = new
             now = self._values()
-            if self._crossed(now).any():
-                return self._located(step, now)
-            self._before = now
-            return None
+            return self._located(step, before, now) if _crossed(before, now).any() else None
         finally:
             self._simulation.state = step.start
 
-    def _located(self, step: Step, now: list[float]) -> Found:
-        tried = {0.0: self._before, step.dt: now}
+    def _located(self, step: Step, before: list[float], now: list[float]) -> Found:
+        tried = {0.0: before, step.dt: now}
         try:
             for k in range(len(self._until)):
-                end = min(dt for dt, values in tried.items() if self._crossed(values).any())
-                if self._crossed(tried[end])[k] and tried[end][k] != 0:
+                end = min(dt for dt, values in tried.items() if _crossed(before, values).any())
+                if _crossed(before, tried[end])[k] and tried[end][k] != 0:
                     brentq(lambda dt, k=k: self._at(step, dt, tried)[k], 0.0, end, xtol=LOCATED * step.dt)
         except StepFailed as failed:
             what = "until: the search for an event within a step of %.3g s has ended, for a shorter one failed: %s"
             warn(self._simulation.scene.grid.comm, ResolutionWarning, what, step.dt, failed)
-        end = min(dt for dt, values in tried.items() if self._crossed(values).any())
+        end = min(dt for dt, values in tried.items() if _crossed(before, values).any())
         self._simulation.state = step.start
         new, report = self._simulation.advanced(end, *step.how)  # also where it was tried: what the scene holds is its
-        return Found(int(self._crossed(tried[end]).argmax()), end, new, report)
+        return Found(int(_crossed(before, tried[end]).argmax()), end, new, report)
 
     def _at(self, step: Step, dt: float, tried: dict[float, list[float]]) -> list[float]:
         """Return the values at the end of a step of another length, s, and keep them."""
@@ -118,14 +118,11 @@ class Events:
             tried[dt] = self._values()
         return tried[dt]
 
-    def _crossed(self, now: Sequence[float]) -> np.ndarray:
-        """Return which functions have other signs than at the start of the step; from zero none does."""
-        before = np.sign(self._before)
-        return (before != 0) & (np.sign(now) != before)
-
     def _values(self) -> list[float]:
         """Return what the functions give, a truth as 1 or -1; raise on all processes what is raised on one."""
-        comm, out, error = self._simulation.scene.grid.comm, [], None
+        comm = self._simulation.scene.grid.comm
+        out = []
+        error = None
         try:
             out = [_number(k, event(self._simulation)) for k, event in enumerate(self._until)]
         except BaseException as raised:  # also Ctrl-C
@@ -140,6 +137,12 @@ class Events:
             if other != given[0]:
                 raise ValueError(f"until: {given[0]} on process 0, {other} on process {rank}, must be the same on all")
         return out
+
+
+def _crossed(before: Sequence[float], now: Sequence[float]) -> NDArray[np.bool_]:
+    """Return which functions have other signs than at the start of a step; from zero none does."""
+    sign = np.sign(before)
+    return (sign != 0) & (np.sign(now) != sign)
 
 
 def _number(k: int, value) -> float:

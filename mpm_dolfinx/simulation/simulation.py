@@ -27,17 +27,17 @@ from mpm_dolfinx.materials.skeleton import Fluid, Skeleton
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.probing.cell_fields import CellFields, cell_fields
 from mpm_dolfinx.probing.point_fields import PointFields, point_fields
+from mpm_dolfinx.simulation import summary
+from mpm_dolfinx.simulation.tangent import tangent
 from mpm_dolfinx.simulation.timeloop import run
-from mpm_dolfinx.stepping import summary
+from mpm_dolfinx.solve.numerics import DEFAULT, Numerics
 from mpm_dolfinx.stepping.initial_state import balanced
-from mpm_dolfinx.stepping.numerics import DEFAULT, Numerics
 from mpm_dolfinx.stepping.result import Result
 from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.stage import Condition, checked
 from mpm_dolfinx.stepping.stages import begin_stage, first_state
 from mpm_dolfinx.stepping.state import State
 from mpm_dolfinx.stepping.step import step
-from mpm_dolfinx.stepping.tangent import tangent
 
 
 class Simulation:

@@ -25,10 +25,16 @@ MIN_CUT, MIN_CUT_BY_ERROR = 2.0**-10, 2.0**-30
 
 Steps by error grow over decades: where soil begins to slide they have to come down to the time that this takes.
 """
-FINEST = 1e-12
-"""Share of the time below which steps by error are not cut: bodies that burst would take ever shorter ones."""
+FINEST = NEAR**2
+"""Share of the time below which steps by error are not cut: bodies that burst would take ever shorter ones.
+
+Source: epsilon, a shorter step is told from the time by less than four digits.
+"""
 SAFETY, SHRINKS, GROWS, KEEPS = 0.9, 0.2, 5.0, 1.2
-"""A step by error follows SAFETY times its error's root, by SHRINKS to GROWS; below KEEPS it stays as it is."""
+"""A step by error follows SAFETY times its error's root, by SHRINKS to GROWS; below KEEPS it stays as it is.
+
+Source: Hairer, Norsett and Wanner (1993), eq. 4.13; the last Hairer and Wanner (1996), IV.8.
+"""
 RINGS = 5e-3
 """Sudden change of the pressures, in proportion to the largest so far, from which on a step is taken in two halves.
 

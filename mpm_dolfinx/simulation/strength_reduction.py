@@ -119,7 +119,9 @@ def factor_of_safety(
     dt, steps = _step_of(simulation, dt), whole("steps", steps, 8)
     rtol = float(numbers("rtol", rtol, allowed="in [1e-4, 0.5]", test=lambda v: (1e-4 <= v) & (v <= 0.5)))
     flag("progress", progress)
-    comm, overloads, least = simulation.grid.comm, {}, LACKS * rtol
+    comm = simulation.grid.comm
+    overloads = {}
+    least = LACKS * rtol
     with _Bar(progress and comm.rank == 0) as bar:
         weakened = _Weakened(simulation, dt, steps, least)
 
@@ -219,7 +221,10 @@ class _Weakened:
     """The scene of a simulation with strengths on its points, and a viscous stress; see `factor_of_safety`."""
 
     def __init__(self, simulation: Simulation, dt: float, steps: int, least: float):
-        scene, self._dt, self._steps, self._least = simulation.scene, dt, steps, least
+        scene = simulation.scene
+        self._dt = dt
+        self._steps = steps
+        self._least = least
         for m in scene.materials.materials:
             if m.state and not isinstance(m, Frictional):
                 what = f"factor_of_safety: strength of {type(m).__name__} is none that can be divided"

@@ -23,6 +23,7 @@ from mpm_dolfinx.base import _compat
 from mpm_dolfinx.base.errors import LeftGrid, StepFailed
 from mpm_dolfinx.base.histories import Row, Rows
 from mpm_dolfinx.base.report import Report
+from mpm_dolfinx.base.time_integration import EULER, Substep
 from mpm_dolfinx.base.tolerances import SAME
 from mpm_dolfinx.base.validation import functions, instance, line
 from mpm_dolfinx.parallel.exchange import first
@@ -31,12 +32,11 @@ from mpm_dolfinx.probing.probe_fields import probe_pressures, probe_stresses
 from mpm_dolfinx.probing.probes import Probes
 from mpm_dolfinx.simulation.events import Event, Events, Step
 from mpm_dolfinx.simulation.step_size import StepSize, Times, measured, step_rule
+from mpm_dolfinx.simulation.summary import imbalance, peak_memory
 from mpm_dolfinx.stepping.result import GaveUp, Result
 from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.state import State
 from mpm_dolfinx.stepping.step_control import StepControl
-from mpm_dolfinx.stepping.summary import imbalance, peak_memory
-from mpm_dolfinx.stepping.time_integration import EULER, Substep
 
 PARTS = (
     "cut domains",
@@ -247,14 +247,18 @@ def _histories(
     simulation: Simulated, times: Times, rule: StepSize, probes: Probes | None, after: Result | None
 ) -> tuple[Result, StepControl]:
     """Return new histories that begin with the present state, or those to go on with, and the memory of the steps."""
-    state, latest, control = simulation.state, simulation.state.result, simulation.state.control
+    state = simulation.state
+    latest = simulation.state.result
+    control = simulation.state.control
     if after is None:
         begun = StepControl(times.interval, rule.first, first=0.0 if control is None else control.first)
         return Result(Rows([_row(simulation, probes)])), begun
     if latest is None or control is None or after.rows.run is not latest.rows.run:
         raise ValueError("after: histories of another run, must be those of the last one, or what `resume` returns")
     after = latest  # which may have gone on since, or not
-    now, start, last = state.t, after.rows[0], after.rows[-1].t
+    now = state.t
+    start = after.rows[0]
+    last = after.rows[-1].t
     # a run that was broken off has taken a part of its next interval
     if control.interval != times.interval or not last <= now <= times.next(last):
         what = f"dt = {times.interval!r} from t = {now!r}: the run to go on with has dt = {control.interval!r}"
@@ -312,9 +316,13 @@ def _advance(simulation: Simulated, rule: StepSize, target: float, aloud: bool) 
 
     aloud: say of the first cut of a run that there are some.
     """
-    comm, wanted, whole = simulation.scene.grid.comm, None, None
+    comm = simulation.scene.grid.comm
+    wanted = None
+    whole = None
     while True:
-        state, result, control = simulation.state, simulation.state.result, simulation.state.control
+        state = simulation.state
+        result = simulation.state.result
+        control = simulation.state.control
         taken, how = rule.fitted(target - state.t, control.small), ()
         wanted, whole = wanted or rule.wanted(taken), whole or taken
         try:
@@ -331,7 +339,9 @@ def _advance(simulation: Simulated, rule: StepSize, target: float, aloud: bool) 
             if (found := _by_euler(simulation, whole, failed)) is None:
                 tried = result if left else _note(simulation, counted, replace(cut, small=taken))
                 raise GaveUp(_why(state.t, taken, failed), tried, failed.history) from failed
-            taken, how, (new, report) = whole, (EULER,), found
+            taken = whole
+            how = (EULER,)
+            (new, report) = found
         now = measured(control, report, result)
         if (shrinks := rule.refused(taken, report, now)) < 1:
             small = wanted = taken * shrinks
@@ -358,15 +368,8 @@ def _by_euler(simulation: Simulated, dt: float, failed: StepFailed) -> tuple[Sta
     except StepFailed:
         return None
     what = "t = %g s: a step of %.3g s by backward Euler, of first order: none by %s has converged: %s"
-    warn(
-        simulation.scene.grid.comm,
-        ResolutionWarning,
-        what,
-        simulation.state.t,
-        dt,
-        simulation.scene.numerics.method,
-        failed,
-    )
+    values = simulation.state.t, dt, simulation.scene.numerics.method, failed
+    warn(simulation.scene.grid.comm, ResolutionWarning, what, *values)
     return found
 
 
@@ -388,7 +391,10 @@ def _why(t: float, small: float, failed: StepFailed) -> str:
 def _row(simulation: Simulated, probes: Probes | None) -> Row:
     """Return what the histories hold of the present state."""
     scene, state = simulation.scene, simulation.state
-    comm, d, points, wet = scene.grid.comm, scene.grid.dim, state.points, scene.fluid is not None
+    comm = scene.grid.comm
+    d = scene.grid.dim
+    points = state.points
+    wet = scene.fluid is not None
     out = {"displacement": np.zeros((0, d)), "position": np.zeros((0, d))}
     if wet:
         ends = comm.allgather((points.pressure.min(initial=np.inf), points.pressure.max(initial=-np.inf)))

@@ -139,7 +139,9 @@ class Gathered:
     """
 
     def __init__(self, x: PETSc.Vec, factors: NodalFactors | SingleFactors, rank: int):
-        self._factors, self._here, self._scatter = factors, x.comm.rank == rank, None
+        self._factors = factors
+        self._here = x.comm.rank == rank
+        self._scatter = None
         if x.comm.size > 1:
             self._rows = PETSc.IS().createStride(x.size if self._here else 0, step=1, comm=PETSc.COMM_SELF)
             self._whole = PETSc.Vec().createSeq(self._rows.size, comm=PETSc.COMM_SELF)

@@ -138,7 +138,10 @@ class BlockSolver:
     """
 
     def __init__(self, how: SolverPlan, momentum: MomentumSystem, storage: StorageSystem, cycles: Inverses):
-        self._plan, self._momentum, self._storage, self._cycles = how, momentum, storage, cycles
+        self._plan = how
+        self._momentum = momentum
+        self._storage = storage
+        self._cycles = cycles
         self._work = tuple(of.unknowns.vector() for of in (momentum, momentum, storage, storage))
         size = (momentum.unknowns.size + storage.unknowns.size, None)
         self._A = PETSc.Mat().createPython((size, size), IDLE, comm=momentum.unknowns.comm)

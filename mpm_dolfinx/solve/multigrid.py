@@ -125,7 +125,9 @@ def interpolation(
     number, mine = _shared(comm, keys, int(np.prod(shape)), said)
     column = number[at[: len(coarse)]]
     kept = column != NONE
-    rows, column, weights = rows[kept], column[kept], weights[kept]
+    rows = rows[kept]
+    column = column[kept]
+    weights = weights[kept]
     if not nodal:
         weights = weights / np.bincount(rows, weights, len(places))[rows]
     Q = scipy.sparse.coo_matrix((weights, (rows, column)), shape=(len(places), column.max(initial=-1) + 1)).tocsr()

@@ -130,7 +130,9 @@ def solve_substep(
     report.easy = report.easy and 3 * count <= 2 * getattr(solvers.scheme, f"most_{most}")
     if storage is None:
         return None
-    grid, nodes, fluid = momentum.forms.grid, momentum.system.of_parts.sizes, errors.fluid
+    grid = momentum.forms.grid
+    nodes = momentum.system.of_parts.sizes
+    fluid = errors.fluid
     area = grid.cell_volume / grid.h.max() * (storage.ring if grid.axisymmetric else 1.0)
     report.stress = float((errors.forces / (area * np.sqrt(np.maximum(1, nodes)))).max(initial=0.0))
     least = fluid.round_off / solvers.scheme.tolerance
@@ -185,7 +187,10 @@ class Newton:
     """
 
     def __init__(self, solvers: LinearSolvers, momentum: MomentumProblem, storage: StorageProblem | None, kept: Kept):
-        self._solvers, self._scheme, self._momentum, self._storage = solvers, solvers.scheme, momentum, storage
+        self._solvers = solvers
+        self._scheme = solvers.scheme
+        self._momentum = momentum
+        self._storage = storage
         self.report, self._kept = Report(), kept
         self._linear = momentum.linear and (storage is None or storage.linear)
         self._functions = [momentum.forms.u] + ([storage.forms.p] if storage is not None else [])
@@ -209,11 +214,17 @@ class Newton:
 
     def _iterations(self, errors: Errors, as_reset: Callable[[], QuadratureData], key: Hashable, fresh: bool) -> Errors:
         """Iterate from the present (u, p), of these errors; fresh: with its own tangent."""
-        elastic, tolerance, keep = self._momentum.forms.elastic, self._scheme.tolerance, self._solvers.plan.keep
-        count, slow, eases = 0, False, np.full(len(errors.u), elastic or not self._momentum.yielded)
+        elastic = self._momentum.forms.elastic
+        tolerance = self._scheme.tolerance
+        keep = self._solvers.plan.keep
+        count = 0
+        slow = False
+        eases = np.full(len(errors.u), elastic or not self._momentum.yielded)
         while (found := self._augmented(errors)).worst > tolerance:
             if found is not errors:  # what has balanced is to do so with other pressures or pairs of contacts
-                errors, count, fresh = found, 0, True
+                errors = found
+                count = 0
+                fresh = True
             if elastic or fresh:
                 self._check(max(count, self.report.newton // REBALANCED), "newton")
             if fresh and self._linear and not self.report.newton:
@@ -245,7 +256,9 @@ class Newton:
         """
         errors, start = self._errors(), self._iterate()
         guesses = [] if self._linear else self._momentum.guesses()
-        at, least, last = start[0], errors.u, start[0]
+        at = start[0]
+        least = errors.u
+        last = start[0]
         for guess in guesses:
             self._go_to([guess, *start[1:]])
             last = None
@@ -337,7 +350,11 @@ class Newton:
             r, forces = self._momentum.residual_of_parts()
             forces = forces if start is None else np.maximum(start, forces)
             u, told = self._momentum.out_of_balance(r, forces, first)
-            p, told_p, exchanged, fluid, size = np.zeros_like(u), np.zeros_like(u), np.zeros_like(u), None, 0.0
+            p = np.zeros_like(u)
+            told_p = np.zeros_like(u)
+            exchanged = np.zeros_like(u)
+            fluid = None
+            size = 0.0
             if self._storage is not None:
                 fluid = self._storage.assemble_residual()
                 exchanged, size = fluid.exchanged, float(fluid.off.sum())

@@ -38,7 +38,7 @@ class Thresholds:
         where K is not symmetric 15 s and 0.4 GB.
     many
         Iterations of a solve after which factors replace the cycles, or the next tangent has factors of its own
-        fixed-stress operator.  The latter with 12, 25, 50, 500: a footing on 9 cells takes the same steps and time.
+        fixed-stress operator.  The latter with 12, 25, 50, 500: a footing on 9 cells takes the same Newton steps.
     coarsest
         Unknowns of a grid that is solved on by factors.
     """

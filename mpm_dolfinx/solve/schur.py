@@ -114,7 +114,10 @@ class LinearSolvers:
     """
 
     def __init__(self, how: SolverPlan, scheme: Scheme, momentum: MomentumSystem, storage: StorageSystem | None):
-        self.plan, self.scheme, self._momentum, self._storage = how, scheme, momentum, storage
+        self.plan = how
+        self.scheme = scheme
+        self._momentum = momentum
+        self._storage = storage
         self.tangent: Latest[bool] = Latest()
         """What the matrices hold the tangent of, where it is kept."""
         self._solve_s = self._schur = self._block = None
@@ -145,7 +148,9 @@ class LinearSolvers:
 
     def _momentum_solver(self) -> PETSc.KSP:
         """Return what solves for displacements."""
-        how, K, unknowns = self.plan, self._momentum.K, self._momentum.unknowns
+        how = self.plan
+        K = self._momentum.K
+        unknowns = self._momentum.unknowns
         if how.displacements == MULTIGRID:
             return multigrid_solver(K, "momentum", *self._momentum.places(), True, how.coarsest, how.firmly)
         return displacement_solver(K, "momentum", unknowns, how.displacements, how.symmetric)

@@ -41,6 +41,8 @@ and 0.4, twenty undrained cycles of a beam of 5 cells leave 7.7, 3.8, 3.7 and 3.
 pressures of a manufactured solution converge with less than order 1.75.  Where hardly anything moves nothing is taken
 in, so the orders in time are those of the method.  To take in the mean of parts that drain would be wrong: it made a
 column under a gravity of time converge with order 1.2 in the step.
+
+Plateau (beam): halved 1.7e-03, doubled 2.8e-03, cells 1.5e-02.
 """
 
 
@@ -64,7 +66,9 @@ class Motion:
         momentum: MomentumForms,
         storage: StorageForms | None,
     ):
-        self._materials, self._momentum, self._storage = materials, momentum, storage
+        self._materials = materials
+        self._momentum = momentum
+        self._storage = storage
         self._bodies, self._starts = bodies, np.cumsum([0, *map(len, bodies)])
         self._reconstruction = Reconstruction(momentum.grid) if storage is not None else None
 
@@ -117,7 +121,10 @@ class Motion:
                 keeps, folded = on_grid.serves(points), 0
             self._check_volumes(points, cut)
             points = replace(points, data=self._materials.updated_state(points, state.points, t - state.t))
-            ids, pressure, x, start = None, None, None, None
+            ids = None
+            pressure = None
+            x = None
+            start = None
             if self._storage is not None:
                 pressure = cut.to_pieces(self._storage.p.x.array[pieces.cells])
                 x = on_grid.of_pieces(state, "x", cut.pieces.x)
@@ -181,7 +188,10 @@ class Motion:
 
     def _deformed(self, cut: CutDomains, data: QuadratureData, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return F (n, d, d) of the points after a step: the means of Delta F and of its det over their pieces."""
-        pieces, grid, n, d = data.pieces, cut.grid, len(cut.points), cut.grid.stretches
+        pieces = data.pieces
+        grid = cut.grid
+        n = len(cut.points)
+        d = cut.grid.stretches
         at_nodes = nodal[grid.cell_nodes[pieces.cells]].transpose(0, 2, 1)
         delta = np.eye(grid.dim) + at_nodes @ data.shape_gradients()
         if grid.axisymmetric:
@@ -213,7 +223,9 @@ class Motion:
         -------
         The points; which of them (n,) are still where they were cut; how many domains had folded.
         """
-        cut, stage, folded = on_grid.cut, state.stage, 0
+        cut = on_grid.cut
+        stage = state.stage
+        folded = 0
         grid = cut.grid
         own = ~given(grid, stage.lattices, stage.conditions["walls"], state.points)
         near = np.zeros(moved.shape[:2], dtype=bool)
@@ -257,7 +269,10 @@ class Motion:
         came: masses, over the density at zero pressure.  Pores that drain are owed nothing: what drains from them is no
         part of this content.  While points stay where they were cut (n,) nothing is due.
         """
-        before, cut, materials, forms = state.points, on_grid.cut, self._materials, self._storage
+        before = state.points
+        cut = on_grid.cut
+        materials = self._materials
+        forms = self._storage
         here = cut.pieces_to_cells(cut.pieces.fraction * (before.volume0 * before.J)[cut.pieces.point])
         volume = sum_by(cut.cells, here, len(came))[cut.cells]
         p, p_n = (f.x.array[cut.cells] for f in (forms.p, forms.p_n))
@@ -317,7 +332,9 @@ class Motion:
 
     def left_grid(self, state: State, on_grid: OnGrid) -> State:
         """Return a state whose points take the pressures of their pieces along: the next step resets the grid."""
-        transported, points, cut = None, state.points, on_grid.cut
+        transported = None
+        points = state.points
+        cut = on_grid.cut
         if self._storage is not None:
             with Timer("mpm: remap"):
                 pieces, stay = cut.pieces, state.stay
@@ -332,7 +349,9 @@ class Motion:
 
 def _check_inside(cut: CutDomains, points: MaterialPoints, t: float, report: Report | None) -> None:
     """Refuse points of which a corner has left the grid, and say which."""
-    grid, x, message = cut.grid, points.corners if cut.domains else points.x[:, None], ""
+    grid = cut.grid
+    x = points.corners if cut.domains else points.x[:, None]
+    message = ""
     if grid.outside(x.reshape(-1, grid.dim), REACH).any():
         beyond = np.maximum(grid.low - x, x - grid.high).max(axis=2)
         i, corner = np.unravel_index(np.argmax(np.where(np.isnan(beyond), np.inf, beyond)), beyond.shape)
@@ -354,7 +373,9 @@ def untangled(
     loads: Sequence[Loads],
 ) -> NDArray[np.float64]:
     """Return corners (n, 2^d, d), m, where domains that have folded, whose neighbours went elsewhere, are of F."""
-    at, X, d = np.flatnonzero(bad), points.reference[bad], grid.dim
+    at = np.flatnonzero(bad)
+    X = points.reference[bad]
+    d = grid.dim
     volume0 = volumes(X) if grid.axisymmetric else points.volume0[at]
     F, new = F[at, :d, :d], corners[at].mean(axis=1, keepdims=True)
     new = new + np.einsum("nab,nkb->nka", F, X - X.mean(axis=1, keepdims=True))

@@ -11,6 +11,7 @@ from mpi4py import MPI
 import numpy as np
 from numpy.typing import NDArray
 
+from mpm_dolfinx.base.time_integration import Substep
 from mpm_dolfinx.conditions.acting import QUANTITIES, At, Loads, Outcome
 from mpm_dolfinx.flow.storage import Rates, StorageProblem
 from mpm_dolfinx.mechanics.momentum import MomentumProblem
@@ -20,7 +21,6 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.stepping.on_grid import Assembled, OnGrid
 from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.state import State
-from mpm_dolfinx.stepping.time_integration import Substep
 
 
 class Acting(NamedTuple):
@@ -103,7 +103,10 @@ def has_yielded(scene: Scene, state: State) -> bool:
 
 def balances(scene: Scene, start: Start, acting: Acting, before: Rates | None = None) -> Balances:
     """Return the balances at the end of a substep, with u and p as they are; before: rates of the substep before."""
-    substep, on_grid, matrices, dt = acting.substep, start.on_grid, start.matrices, start.dt
+    substep = acting.substep
+    on_grid = start.on_grid
+    matrices = start.matrices
+    dt = start.dt
     scene.set_time(acting.t, substep.end * dt, acting.gravity)
     scene.momentum.own.set_rate(substep.own * dt, substep.before / substep.own)
     forces = scene.scheme.tolerance, going_on(scene, start, substep), start.state.held

@@ -53,8 +53,12 @@ Also the share of the forces that may be left out of balance, as the scheme's er
 
 def pieces_at_start(scene: Scene, points: MaterialPoints) -> PiecePressures:
     """Return what pieces of domains carry of a field of pressure, by which cells have that of their centroids."""
-    on_grid, grid, pressure = scene.on_grid(points), scene.grid, scene.initial.pressure
-    cut, contents, bulk = on_grid.cut, on_grid.contents, scene.fluid.bulk
+    on_grid = scene.on_grid(points)
+    grid = scene.grid
+    pressure = scene.initial.pressure
+    cut = on_grid.cut
+    contents = on_grid.contents
+    bulk = scene.fluid.bulk
     pi = mass_potential(
         cut.pieces_to_cells(pressure_at(pressure, cut.pieces.x + grid.base)), bulk
     )  # which adds up in a cell
@@ -89,10 +93,16 @@ def balanced(scene: Scene, state: State) -> State:
         if scene.storage is not None:  # those that a step leaves
             pressure = scene.motion.pressures(start.on_grid, state.stage, state.t)
             seeded = replace(seeded, points=replace(seeded.points, pressure=pressure))
-        unknowns, best, count = start.matrices.momentum.unknowns, (np.inf, 0), 0
-        scheme, momentum, report = scene.scheme, start.matrices.momentum, Report()
+        unknowns = start.matrices.momentum.unknowns
+        best = (np.inf, 0)
+        count = 0
+        scheme = scene.scheme
+        momentum = start.matrices.momentum
+        report = Report()
         solvers = LinearSolvers(planned(scheme, momentum, None, start.matrices.symmetric), scheme, momentum, None)
-        seen, w, points = [], np.zeros_like(forms.u.x.array), seeded.points
+        seen = []
+        w = np.zeros_like(forms.u.x.array)
+        points = seeded.points
         while count - best[1] < PATIENCE:
             forms.u.x.array[:] = w
             problem = _problem(scene, start, replace(seeded, points=points))

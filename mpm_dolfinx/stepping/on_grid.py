@@ -61,7 +61,11 @@ class OnGrid(Keyed):
         cut: CutDomains,
         of_fluid: bool,
     ):
-        grid, points, self.cut, self._quadrature, self._storage = cut.grid, cut.points, cut, quadrature, storage
+        grid = cut.grid
+        points = cut.points
+        self.cut = cut
+        self._quadrature = quadrature
+        self._storage = storage
         self._places = quadrature.places(cut)
         self.data = quadrature.data(cut, self._places, points)
         """The pieces when the grid was reset."""
@@ -167,9 +171,13 @@ class OnGrid(Keyed):
         The mean of their mass potentials in a cell is the cell's: by `store` (m,), m^d/Pa, what the pieces store, or by
         their volumes in a cell that stores nothing.  t, s: time at which drained sides have their pressures.
         """
-        pieces, contents, bulk = self.data.pieces, self.contents, self._storage.bulk
+        pieces = self.data.pieces
+        contents = self.contents
+        bulk = self._storage.bulk
         pi = mass_potential(self._storage.p_n.x.array, bulk)
-        cells, offset, at = pieces.cells, pieces.places.offset, contents.slot(pieces.cells)
+        cells = pieces.cells
+        offset = pieces.places.offset
+        at = contents.slot(pieces.cells)
         store = self.cut.pieces_to_cells(store)
         weight = np.where(contents.total(cells, store)[at] > 0, store, self.weight)
         total = contents.total(cells, weight)
@@ -311,7 +319,9 @@ class System:
         stiff: bool,
         symmetric: bool,
     ):
-        self._scheme, self.symmetric, self.storage = scheme, symmetric, None
+        self._scheme = scheme
+        self.symmetric = symmetric
+        self.storage = None
         own, parts = on_grid.cells[on_grid.cells < momentum.grid.num_owned], momentum.parts(on_grid.active)
         self.momentum = MomentumSystem(momentum, dofs, nodes, own, on_grid.penalised, stiff, parts)
         if storage is not None:
@@ -360,8 +370,12 @@ class Assembled(Keyed):
         stage: Stage,
         loads: Sequence[Loads],
     ):
-        self.momentum, self.storage, self.symmetric = system.momentum, system.storage, system.symmetric
-        self.plan, self.solvers, self.end_step = system.plan, system.solvers, system.end_step
+        self.momentum = system.momentum
+        self.storage = system.storage
+        self.symmetric = system.symmetric
+        self.plan = system.plan
+        self.solvers = system.solvers
+        self.end_step = system.end_step
         self._on_grid, self._stage = on_grid, stage
         self._u, self._varies = momentum.u, storage is not None and storage.conductivity is not None
         self._by_pressure = storage if self._varies and storage.conductivity.pressure is not None else None
@@ -410,7 +424,10 @@ class Assembled(Keyed):
         t
             Time at which open sides have their pressures and fluxes, s.
         """
-        on_grid, contents, grid, u = self._on_grid, self._on_grid.contents, self._on_grid.cut.grid, self._u
+        on_grid = self._on_grid
+        contents = self._on_grid.contents
+        grid = self._on_grid.cut.grid
+        u = self._u
         hydraulic, varies = self._stage.hydraulic, (t,) if self._stage.hydraulic.varies else ()
         at = state.points if weight is not None or varies else on_grid.cut.points  # gravity may change with time
         sides = partial(hydraulic.data, on_grid.cut, at, contents, t)

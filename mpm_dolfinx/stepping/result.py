@@ -12,7 +12,11 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.base.histories import Row, Rows
 from mpm_dolfinx.base.report import Report
+from mpm_dolfinx.base.tables import data_frame, data_set
 from mpm_dolfinx.conditions.names import ByName
+
+OUTCOMES = ("reactions", "wall_reactions", "outflows", "tool_forces", "tool_travel")
+"""What conditions do to the bodies; those of the user's own may have others."""
 
 
 @dataclass(frozen=True)
@@ -130,6 +134,22 @@ class Result:
         rows = [outcome.get(quantity, {}) for outcome in self.rows.outcomes]
         like = {name: np.full_like(value, np.nan) for row in rows for name, value in row.items()}
         return ByName({name: np.array([row.get(name, none) for row in rows]) for name, none in like.items()})
+
+    def to_dataframe(self):
+        """Return the histories as a data frame of pandas, one row an output time, with the columns of `history.csv`.
+
+        Its `attrs["units"]` has the unit of each column.  ImportError where pandas is not installed.
+        """
+        return data_frame(self, {name: self.outcome(name) for name in OUTCOMES})
+
+    def to_xarray(self):
+        """Return the histories as a data set of xarray, with units as attributes of its variables.
+
+        Dimensions are time, probe and axis, of stresses of probes row and column; conditions have variables by their
+        names.  Its attributes are the counts of the run.  ImportError where xarray is not installed.
+        """
+        counts = {name: getattr(self, name) for name in ("steps", "newton", "cuts", "balance", "residual", "wall")}
+        return data_set(self, {name: self.outcome(name) for name in OUTCOMES}, counts)
 
     def more(self, row: Row) -> Result:
         """Return the histories with one more output time."""

@@ -15,6 +15,7 @@ from dolfinx.common import Timer
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.caching import Latest
+from mpm_dolfinx.base.time_integration import Substep, substeps
 from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.bodies.bodies import Body, material_points
 from mpm_dolfinx.conditions.acting import Loads
@@ -35,12 +36,11 @@ from mpm_dolfinx.mechanics.quadrature_data import QuadraturePoints
 from mpm_dolfinx.parallel.messages import ConditionWarning, warn
 from mpm_dolfinx.points.cutting import volumes
 from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.solve.numerics import Numerics
 from mpm_dolfinx.stepping.advance import Motion
-from mpm_dolfinx.stepping.numerics import Numerics
 from mpm_dolfinx.stepping.on_grid import Assembled, OnGrid, System, assembled
 from mpm_dolfinx.stepping.stage import Stage
 from mpm_dolfinx.stepping.state import State
-from mpm_dolfinx.stepping.time_integration import Substep, substeps
 
 
 class Scene:
@@ -73,7 +73,9 @@ class Scene:
         extensions: tuple[Sequence[Callable], Sequence[Callable]],
         initial: Mapping[int, Any],
     ):
-        self.grid, self.bodies, self.fluid = grid, tuple(bodies), fluid
+        self.grid = grid
+        self.bodies = tuple(bodies)
+        self.fluid = fluid
         self.numerics, scheme = numerics, numerics.scheme
         terms, sources = self.extensions = extensions
         """The user's terms and sources."""
@@ -98,7 +100,9 @@ class Scene:
         if fluid:
             weight = fluid.density * self.gravity if weighs else None
             symmetric = scheme.coupling != "schur-fgmres"
-            pieces, u, laws = self.pieces.pieces, self.momentum.u, scene.conductivity_laws
+            pieces = self.pieces.pieces
+            u = self.momentum.u
+            laws = scene.conductivity_laws
             law = (
                 ConductivityAtPieces(scene.materials, laws, pieces, u, fem.Function(grid.cellwise())) if laws else None
             )
@@ -106,7 +110,7 @@ class Scene:
             self.storage = StorageForms(pieces, u, p, fluid.bulk, weight, *kind, law, sources, self.t)
         self.motion = Motion(scene, bodies, self.momentum, self.storage)
         # what is still to be looked for, to be warned of, of which nothing but the log knows
-        self._looked_for = [warn_overfilled, *[partial(warn_smeared, materials=scene)] * scene.uneven]
+        self._looks = (warn_overfilled, *[partial(warn_smeared, materials=scene)] * scene.uneven)
         self._on_grid: Latest[OnGrid] = Latest()
         self._systems: Latest[System] = Latest()
         self._assembled: Latest[Assembled] = Latest()
@@ -155,8 +159,7 @@ class Scene:
             self._assembled.clear()  # of coefficients that change now
             with Timer("mpm: cut domains"):
                 cut = CutDomains(grid, points, self.numerics.quadrature == "domain")
-                looked = [warn(cut, self.bodies) for warn in self._looked_for]
-                self._looked_for[:] = filter(None, looked)
+                self._looks = tuple(filter(None, [look(cut, self.bodies) for look in self._looks]))
             with Timer("mpm: integration data"):
                 problems = (self.momentum, self.storage)
                 return OnGrid(self.pieces, *problems, cut, self.scheme.of_fluid)

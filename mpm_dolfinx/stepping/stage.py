@@ -154,7 +154,9 @@ class Stage:
 
     def gravity_at(self, t: float) -> NDArray[np.float64] | None:
         """Return the acceleration of gravity (d,) at time t (s), m/s^2; None without."""
-        gravity, name, d = self.conditions["gravity"], f"gravity at t = {t:g} s", self.free.shape[1]
+        gravity = self.conditions["gravity"]
+        name = f"gravity at t = {t:g} s"
+        d = self.free.shape[1]
         if gravity is None:
             return None
         return _gravity(given(name, gravity, t, None, d, number=False), name, d, self.axisymmetric)

@@ -22,6 +22,7 @@ from mpm_dolfinx.contact.groups import contacts_of
 from mpm_dolfinx.contact.history import gripped, let_go
 from mpm_dolfinx.domains.pressure_transport import at_start
 from mpm_dolfinx.grid.grid import sum_by
+from mpm_dolfinx.materials.initial_stress import OfWater
 from mpm_dolfinx.parallel.messages import ConditionWarning, warn
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.stepping.initial_state import pieces_at_start
@@ -138,11 +139,11 @@ def _warn_weights(scene: Scene, begun: Stage, given: Mapping[str, Any]) -> None:
     g = 0.0 if gravity is None or callable(gravity) else float(np.linalg.norm(gravity))
     levels = [*given.items(), *waters(begun.named)]
     if fluid is None:
-        levels = [(name, value) for name, value in levels if hasattr(value, "weighed") and g]
+        levels = [(name, value) for name, value in levels if isinstance(value, OfWater) and value.given is None and g]
         own, of = 1000 * g, "water under the scene's gravity"
     else:
         own, of = (fluid.unit_weight if callable(gravity) else fluid.density * g), "the pore fluid"
-    weights = {(name, getattr(value, "unit_weight", own)) for name, value in levels}
+    weights = {(name, value.unit_weight if isinstance(value, OfWater) else own) for name, value in levels}
     for name, weight in sorted(weights):
         if abs(weight - own) > WEIGHS * max(weight, own):
             what = "%s: unit_weight = %.6g N/m^3, but that of %s, its density times gravity, is %.6g"
@@ -171,7 +172,9 @@ def _filled(
     scene: Scene, points: MaterialPoints, there: Sequence[int], add: Sequence[int], gravity: NDArray | None
 ) -> tuple[MaterialPoints, MaterialPoints]:
     """Return the points with those of bodies that come, and these alone; what lies on another comes after it."""
-    there, waiting, new = list(there), list(add), scene.materials.seeded.of(_ids(scene.bodies, []))
+    there = list(there)
+    waiting = list(add)
+    new = scene.materials.seeded.of(_ids(scene.bodies, []))
     while waiting:
         fill = next((body for body in waiting if touches(scene.bodies, there, body)), waiting[0])
         placed = scene.materials.seeded.of(_ids(scene.bodies, [fill]))

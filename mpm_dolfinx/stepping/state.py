@@ -151,7 +151,9 @@ class State:
 
     def migrated(self, destination: NDArray[np.int32], comm: MPI.Intracomm) -> State:
         """Return the state after every point, with its pieces, went to its destination (n,), a rank."""
-        exchange, pressures, stay = Exchange(comm, destination), self.transported, self.stay
+        exchange = Exchange(comm, destination)
+        pressures = self.transported
+        stay = self.stay
         if pressures is not None:
             pressures = pressures.migrated(Exchange(comm, destination[np.searchsorted(self.points.id, pressures.id)]))
         stay = stay and stay.migrated(exchange, destination)

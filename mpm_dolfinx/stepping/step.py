@@ -43,8 +43,13 @@ def set_up(scene: Scene, state: State, dt: float, how: tuple = ()) -> Start:
 
 def step(scene: Scene, state: State, dt: float, how: tuple = ()) -> tuple[State, Report]:
     """Return the state after a step of dt (s), and what it took; `state` stays what it is, whatever is raised."""
-    start, report, kept, rates = set_up(scene, state, dt, how), Report(), Kept(), []
-    state, on_grid, solvers = start.state, start.on_grid, start.matrices.solvers()
+    start = set_up(scene, state, dt, how)
+    report = Report()
+    kept = Kept()
+    rates = []
+    state = start.state
+    on_grid = start.on_grid
+    solvers = start.matrices.solvers()
     for acting in start.acting:
         both, key = balances(scene, start, acting, *rates[-1:]), (start.matrices.key, acting.substep.own * dt)
         rates.append(solve_substep(solvers, *both, partial(on_grid.as_reset, state), key, report, kept))

@@ -39,6 +39,7 @@ from mpm_dolfinx.base.errors import NotConverged
 from mpm_dolfinx.base.fluid_content import change_of_content, mass_potential, mass_potential_form
 from mpm_dolfinx.base.histories import Row, Rows
 from mpm_dolfinx.base.report import Report
+from mpm_dolfinx.base.time_integration import Substep, substeps
 from mpm_dolfinx.base.tolerances import NEAR, ROUND_OFF, SAME, TINY
 from mpm_dolfinx.base.validation import all_of, functions, instance, line, numbers
 from mpm_dolfinx.bodies.faces import Region, limits
@@ -51,9 +52,8 @@ from mpm_dolfinx.materials.skeleton import Field, Fluid, Skeleton
 from mpm_dolfinx.materials.user_functions import call, compiling, term_of
 from mpm_dolfinx.materials.user_functions import form as form_of
 from mpm_dolfinx.probing.probes import positions
-from mpm_dolfinx.stepping.numerics import DEFAULT, Numerics
+from mpm_dolfinx.solve.numerics import DEFAULT, Numerics
 from mpm_dolfinx.stepping.result import GaveUp, Result
-from mpm_dolfinx.stepping.time_integration import Substep, substeps
 
 ELEMENTS = {"taylor-hood": (2, ("Lagrange", 1, ())), "q1-dg0": (1, ("DG", 0, ()))}  # degree of u; space of p
 CUT_DEGREE = 20  # of quadrature on a side of which a region is loaded: the region's edge may cut facets
@@ -233,13 +233,17 @@ class BiotFEM:
 
     def _prescribe(self, space, value: float, name: str, region: Region | None = None):
         """Return the condition that a scalar subspace has a value on the facets of a side that lie in a region."""
-        msh, d, (low, high) = self.grid.mesh, self.grid.dim, np.array(self._box(name, region))[:, :, None]
+        msh = self.grid.mesh
+        d = self.grid.dim
+        (low, high) = np.array(self._box(name, region))[:, :, None]
         facets = mesh.locate_entities_boundary(msh, d - 1, lambda x: ((x[:d] >= low) & (x[:d] <= high)).all(axis=0))
         return fem.dirichletbc(PETSc.ScalarType(value), fem.locate_dofs_topological(space, d - 1, facets), space)
 
     def _conditions(self, walls: Mapping[str, str], drained: Sequence[Drained]) -> list:
         """Return the conditions of zero displacement and of nodal pressure."""
-        axes, bcs, space = "xyz"[: self.grid.dim], [], self._space.u.function_space
+        axes = "xyz"[: self.grid.dim]
+        bcs = []
+        space = self._space.u.function_space
         for name, held in walls.items():
             if not isinstance(held, str) or not held or not set(held) <= set(axes):
                 raise ValueError(f"walls: {name!r}: components {held!r}, must be some of {axes!r}")
@@ -272,7 +276,9 @@ class BiotFEM:
     ) -> Forms:
         """Compile loads, residual and tangent; with `outlets` the pressure is constant in the cells."""
         dt, since, t = (self._constant(1.0) for _ in range(3))
-        law, space, split = self.material, self._space, ufl.split if self.fluid else lambda f: (f, 0)
+        law = self.material
+        space = self._space
+        split = ufl.split if self.fluid else lambda f: (f, 0)
         test = ufl.TestFunction(space.W)
         (u, p), (u_n, p_n), (past, _), (v, q) = map(split, (space.w, space.old, space.past, test))
         degree, scale = 2 * space.degree, self._constant(self.scale)
@@ -435,13 +441,17 @@ class BiotFEM:
 
     def _solve(self, substep: Substep, dt: float) -> tuple[int, float]:
         """Solve for the end of a substep of a step dt, s; return Newton iterations, relative residual."""
-        forms, space, snes = self._forms, self._space, self._snes
+        forms = self._forms
+        space = self._space
+        snes = self._snes
         space.past.x.array[:] = substep.before / substep.own * (space.w.x.array - space.old.x.array)
         space.f.x.array[:] = 0.0
         if substep.before and forms.flux is not None:  # by the rate at the end of the substep before
             forms.dt.value = substep.before * dt
             self._assemble(space.f, forms.flux).scale(-1.0)
-        forms.dt.value, forms.since.value, forms.t.value = substep.own * dt, substep.end * dt, self.t + substep.end * dt
+        forms.dt.value = substep.own * dt
+        forms.since.value = substep.end * dt
+        forms.t.value = self.t + substep.end * dt
         for value, constant in forms.given:
             constant.value = value(self.t + substep.end * dt)
         load = 0.0
@@ -519,7 +529,9 @@ class BiotFEM:
 
     def _at(self, f: fem.Function, x: NDArray[np.float64], size: int) -> NDArray[np.float64]:
         """Return a function's values (m, size) at reference positions x (m, d) in the body, on every process."""
-        grid, out, x = self.grid, np.zeros((len(x), size)), x - self.grid.base
+        grid = self.grid
+        out = np.zeros((len(x), size))
+        x = x - self.grid.base
         cells = grid.local(grid.number(grid.index_from_base(x)))
         here = np.flatnonzero((cells >= 0) & (cells < grid.num_owned))
         if len(here):

@@ -80,7 +80,9 @@ class Cavity:
         r += (radius - r[0]) * r[0] / r  # as if incompressible
         r[0] = radius
         middle, h = (self.R[1:] + self.R[:-1]) / 2, np.diff(self.R)
-        weight, g, t = middle * h, 1 / h, 1 / (2 * middle)
+        weight = middle * h
+        g = 1 / h
+        t = 1 / (2 * middle)
         B = np.array([[-g, t], [g, t]])  # (node, stretch, element)
         for _ in range(MOST):
             P, D = self.rings.nominal(_stretches(self.R, r), self.state)

@@ -18,10 +18,10 @@ from scipy.integrate import solve_bvp
 from scipy.optimize import brentq
 from scipy.special import ellipe, ellipeinc, ellipkinc, ellipkm1, erf, erfc, erfcx, lambertw
 
-from mpm_dolfinx.base.tolerances import EPSILON, ROUND_OFF, TINY
+from mpm_dolfinx.base.tolerances import EPSILON, ROUND_OFF, SAME, TINY
 
-SWITCH = 0.02  # reduced time below which the closed form for short times is taken
-TERMS = 20  # exponentials above it: the last is below exp(-70)
+SWITCH = 0.02  # reduced time below which the form for short times is taken.  Source: both are exact
+TERMS = 20  # exponentials above it.  Source: exact bound, the last is below exp(-70)
 Array = NDArray[np.float64]
 
 
@@ -290,7 +290,7 @@ def elastica_tip(load_parameter: float) -> tuple[float, float]:
     Returns (shortening u/L, deflection v/L), to 1e-12 absolute. Source: Bisshopp & Drucker (1945), Q. Appl. Math. 3.
     """
     _check(0 <= load_parameter <= 1e5, "load_parameter", load_parameter, "in [0, 1e5]")
-    if load_parameter < 1e-4:
+    if load_parameter < EPSILON**0.25:
         return load_parameter**2 / 15, load_parameter / 3
     root = np.sqrt(load_parameter)
 
@@ -344,7 +344,7 @@ def _rod(loads: Array, axial: float, shear: float):
         return np.array([x, stretch * sin + slip * cos, state[3], -force * x])
 
     for part in np.linspace(0, 1, 1 + max(1, int(np.ceil(np.abs(loads).sum() / 2))))[1:]:
-        solution = solve_bvp(slope, lambda a, b: np.append(a[:3], b[3]), s, state, tol=1e-8, max_nodes=20000)
+        solution = solve_bvp(slope, lambda a, b: np.append(a[:3], b[3]), s, state, tol=SAME, max_nodes=2**14)
         if not solution.success:
             raise RuntimeError(f"rod under {part:.3g} of its load: {solution.message}")
         s, state = solution.x, solution.y

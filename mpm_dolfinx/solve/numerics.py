@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from mpm_dolfinx.base.time_integration import substeps
 from mpm_dolfinx.solve.scheme import Scheme
-from mpm_dolfinx.stepping.time_integration import substeps
 
 QUADRATURES = ("domain", "point")
 

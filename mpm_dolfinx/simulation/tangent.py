@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
+from mpm_dolfinx.base.time_integration import METHODS
 from mpm_dolfinx.base.validation import numbers
 from mpm_dolfinx.stepping.balances import balances
 from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.state import State
 from mpm_dolfinx.stepping.step import set_up
-from mpm_dolfinx.stepping.time_integration import METHODS
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-GAMMA = 1 - 1 / np.sqrt(2)
+GAMMA = 1 - 1 / np.sqrt(2)  # Source: Alexander (1977), the L-stable method of two stages
 
 
 @dataclass(frozen=True)

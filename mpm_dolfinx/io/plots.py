@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: MIT
+"""Pictures of a scene: the domains of its points, coloured by what they carry."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpm_dolfinx.base.validation import flag, instance, line
+from mpm_dolfinx.io.units import unit
+from mpm_dolfinx.io.writer import VTK_CELLS, asked_of_points
+from mpm_dolfinx.parallel.exchange import to_root
+from mpm_dolfinx.simulation.simulation import Simulation
+
+
+def plot(simulation: Simulation, field: str = "pressure", ax=None, *, bar: bool = True, label: str = "", **style):
+    """Draw the domains of the material points, coloured by a field; return the axes of matplotlib.
+
+    On several processes all call it together; the first one draws, the others have None.
+
+    Parameters
+    ----------
+    simulation
+        The scene, in plane strain or axisymmetry.
+    field
+        "pressure", "displacement" (its length), "displacement_x", "stress_xx", "effective_stress_xy",
+        "mean_effective_stress", "deviatoric_stress", "porosity", "J", and other names of numbers in `points.pvd` and
+        `points.data`.
+    ax
+        Axes to draw into; by default those of a new figure.
+    bar
+        Draw a colour bar with the unit.
+    label
+        Its label; by default the name of the field and its unit.
+    **style
+        Of matplotlib's PolyCollection, such as cmap and clim.
+
+    Raises
+    ------
+    ValueError
+        A scene in 3D, or a field that the points do not have; the message names those that they have.
+    ImportError
+        matplotlib is not installed.
+    """
+    instance("plot: simulation", simulation, Simulation)
+    flag("plot: bar", bar)
+    if simulation.grid.dim == 3:
+        raise ValueError("plot: a scene in 3D, must be in plane strain or axisymmetry; `Writer` writes it for ParaView")
+    values, points, comm = _values(simulation, field), simulation.points, simulation.grid.comm
+    send = to_root(comm, len(points)).send
+    corners, values = send(points.corners), send(values)
+    if comm.rank:
+        return None
+    try:
+        import matplotlib.pyplot as plt
+        from matplotlib.collections import PolyCollection
+    except ImportError as error:
+        what = f"plot: {error}; must be installed: apt-get install python3-matplotlib, or conda-forge's matplotlib"
+        raise ImportError(what) from error
+    ax = plt.subplots()[1] if ax is None else ax
+    style = {"edgecolors": "face", "linewidth": 0.2} | style
+    drawn = ax.add_collection(PolyCollection(corners[:, VTK_CELLS[2][1]], array=values, **style))
+    ax.autoscale_view()
+    radius = "r" if simulation.grid.axisymmetric else "x"
+    ax.set(aspect="equal", xlabel=f"{radius} (m)", ylabel="y (m)")
+    if bar:
+        known = unit(field)
+        ax.figure.colorbar(drawn, ax=ax, label=label or field.replace("_", " ") + (f" ({known})" if known else ""))
+    return ax
+
+
+def _values(simulation: Simulation, field: str) -> NDArray[np.float64]:
+    """Return the values (n,) of a field at this process's points."""
+    points, asked = simulation.points, {}
+    if str(field).startswith(("porosity", "effective_", "stress", "mean_", "deviatoric_")):
+        asked = asked_of_points(simulation)  # on all processes together
+    known: dict[str, Callable[[], Any]] = {
+        "displacement": lambda: np.linalg.norm(points.displacement, axis=1),
+        "displacement_x": lambda: points.displacement[:, 0],
+        "displacement_y": lambda: points.displacement[:, 1],
+        "J": lambda: points.J,
+    }
+    if simulation.scene.fluid is not None:
+        known["pressure"] = lambda: points.pressure
+    known |= {name: lambda rows=rows: rows for name, rows in {**points.data, **asked}.items() if rows.ndim == 1}
+    if field not in known:
+        names = ", ".join({**known, **(asked or asked_of_points(simulation))})
+        raise ValueError(f"plot: field = {line(field)}, must be one of {names}")
+    return np.asarray(known[field](), dtype=np.float64)

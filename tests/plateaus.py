@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: MIT
+"""What half and twice of a number change in the answers of a small scene: `python tests/plateaus.py` measures all.
+
+Arguments are numbers and scenes, as domains/lattice.py:FAST@cycles; without any all are measured that name a plateau,
+see `house`.  The change is the largest of a scene's answers, relative to each; beside it stands that of finer cells.
+"""
+
+import importlib
+import sys
+import time
+from functools import cache
+from pathlib import Path
+
+import house
+import numpy as np
+
+import mpm_dolfinx as mpm
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "demos"))
+import cycles
+import footing
+import helpers
+
+
+def bent(h: float, nu: float = 0.0) -> dict[str, float]:
+    """A saturated beam under a load on its top: at its tip, and the pressures in it."""
+    material = mpm.Hencky(bulk=1e7 / (3 * (1 - 2 * nu)), shear=1e7 / (2 * (1 + nu)), porosity=0.4, conductivity=1e-4)
+    s, probe = helpers.beam(h=h, material=material)
+    run = s.run(0.12, 0.02, probes=probe)
+    tip, pressure = np.array(run.displacement), np.array(run.pressure)
+    return {"tip": tip[-1].ravel()[1], "pressure": np.abs(pressure).max()}
+
+
+def cycled(h: float) -> dict[str, float]:
+    """A beam without water, loaded and released twice: its tip, and what is left of its stress, over the first peak."""
+    run = cycles.cycle(h, 54e3, 2, 10)
+    return {"tip": run["tips"][5], "left": 1 + run["left"][-1]}
+
+
+def pushed(cells: int) -> dict[str, float]:
+    """A footing on wet soil that yields: its load."""
+    return {"load": footing.effort(cells, 0.06, 4, 2.0, "sdirk2")["load"]}
+
+
+def strip(cells: int) -> dict[str, float]:
+    """A rough strip on soil without friction: its load."""
+    from test_footing import rough_strip
+
+    return {"load": rough_strip(cells, "displacement")}
+
+
+def slope(cells: int) -> dict[str, float]:
+    """Wet layers aslant on the grid under a load: settlement, pressures."""
+    grid = mpm.Grid([0, 0], [1.5, 1.5], [3 * cells, 3 * cells])
+    soils = [
+        mpm.Hencky(bulk=1e7 / 3, shear=5e6, porosity=0.4, conductivity=conductivity) for conductivity in (1e-4, 1e-6)
+    ]
+    turn = np.array([[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]])
+    boxes = [mpm.box(grid, [0, a], [0.6, b], material=i) for i, (a, b) in enumerate(((0.0, 0.3), (0.3, 0.6)))]
+    bodies = [mpm.mapped(grid, body, lambda X: X @ turn.T + [0.5, 0.3]) for body in boxes]
+    low, high = ((-np.inf, -np.inf), (np.inf, 0.15)), ((-np.inf, 0.45), (np.inf, np.inf))
+    held = mpm.Displacement("bottom", (0, 0), region=low)
+    load = mpm.Traction("top", lambda t: -1e5 * min(1, 10 * t) * turn[:, 1], region=high)
+    acts = [held, load, mpm.Drained("top", region=high)]
+    s = mpm.Simulation(grid, bodies, soils, walls={}, conditions=acts, fluid=mpm.Fluid())
+    run = s.run(0.4, 0.1, probes=mpm.probes(bodies, [[0.3, 0.55], [0.3, 0.1]]))
+    move, pressure = np.array(run.displacement), np.array(run.pressure)
+    return {"tip": np.linalg.norm(move[-1].ravel()), "pressure": np.abs(pressure).max()}
+
+
+SCENES = {
+    "beam": (bent, 0.06, 0.03),
+    "clay": (lambda h: bent(h, 0.46), 0.06, 0.03),
+    "cycles": (cycled, 0.06, 0.03),
+    "soil": (pushed, 5, 9),
+    "strip": (strip, 5, 9),
+    "slope": (slope, 6, 12),
+}
+"""Scenes with their cells: those in which a number is varied, and finer ones."""
+
+
+def holders(where: str, name: str) -> list:
+    """Return the modules that have a number under its name, first the one that defines it."""
+    own = importlib.import_module(".".join([house.ROOT.name, *Path(where).with_suffix("").parts]))
+    every = [importlib.import_module(m.name) for m in house.modules() if m.path.name != "__main__.py"]
+    return [own, *(m for m in every if m is not own and getattr(m, name, None) is getattr(own, name))]
+
+
+@cache
+def answer(scene: str, finer: bool = False) -> dict[str, float]:
+    """Return the answers of a scene with the numbers as they are."""
+    run, *cells = SCENES[scene]
+    return run(cells[finer])
+
+
+def change(a: dict[str, float], b: dict[str, float]) -> float:
+    return max(abs(a[name] / b[name] - 1) for name in b)
+
+
+def moved(where: str, name: str, scene: str) -> tuple[float, float, float]:
+    """Return the changes of a scene's answers with half and twice a number, and with finer cells."""
+    run, cells, _ = SCENES[scene]
+    plain, modules, out = answer(scene), holders(where, name), []
+    value = getattr(modules[0], name)
+    for factor in (0.5, 2):
+        other = type(value)(value * factor) if isinstance(value, int | float) else value * factor
+        try:
+            for module in modules:
+                setattr(module, name, other)
+            out.append(change(run(cells), plain))
+        finally:
+            for module in modules:
+                setattr(module, name, value)
+    return out[0], out[1], change(answer(scene, True), plain)
+
+
+def main(arguments: list[str]) -> None:
+    """Print a line for each number."""
+    noted = {}
+    for where, name, said in house.named():
+        if flat := house.plateau(said):
+            noted[f"{where.split(':')[0]}:{name}"] = flat
+    for item in arguments or [f"{item}@{flat[0]}" for item, flat in noted.items()]:
+        number, _, scene = item.partition("@")
+        where, _, name = number.rpartition(":")
+        began = time.time()
+        found = moved(where, name, scene)
+        told = ", ".join(f"{k} {v:.1e}" for k, v in zip(("halved", "doubled", "cells"), found, strict=True))
+        print(f"{number} Plateau ({scene}): {told}.  {time.time() - began:.0f} s", flush=True)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
