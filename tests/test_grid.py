@@ -72,8 +72,8 @@ def test_only_what_is_made_with_the_mesh_makes_it():
     grid, shared = Grid([0, 0], [1.0, 1.0], [2, 2]), Grid([0, 0], [1.0, 1.0], [2, 2])
     for name in ("_repr_html_", "_ipython_display_", "shape_", "__array__"):
         assert not hasattr(grid, name)
-    assert not grid._made
-    made = vars(shared._made[0]).keys() if shared.mesh is not None else set()
+    assert grid._cells is None
+    made = vars(shared.of_process).keys() - {"cellwise", "memory"}  # that of its spaces the grid has methods for
     assert {"mesh", "cell_nodes"} <= made
     for name in made:
         assert hasattr(Grid([0, 0], [1.0, 1.0], [2, 2]), name), f"{name} is made with the mesh, but is not there before"
