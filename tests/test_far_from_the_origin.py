@@ -133,8 +133,8 @@ AWAY = np.array([1e4, -3e4]) * 0.25  # m: cells of 0.25 m
 def sealed(away, **options):
     """Return a simulation of a soft block of hard water and its moves, m, from where it is seeded."""
     soil = mpm.Hencky(bulk=6e5, shear=4.5e5, porosity=0.34, biot=0.76)
-    grid = mpm.Grid(away + [1.75, 1.25], [7, 5], lower=away)
-    body = mpm.box(grid, away, away + [1.75, 0.95], per_cell=3)
+    grid = mpm.Grid(np.add(away, [1.75, 1.25]), [7, 5], lower=away)
+    body = mpm.box(grid, away, np.add(away, [1.75, 0.95]), per_cell=3)
     walls, load = {"bottom": "y", "left": "x", "right": "x"}, mpm.Traction("top", (0, -4e3))
     water = mpm.Fluid(bulk=2.2e9)
     s = mpm.Simulation(grid, [body], [soil], fluid=water, fixed=walls, tractions=[load], tolerance=1e-11, **options)
@@ -155,9 +155,10 @@ def test_hard_water_in_soft_soil_loses_no_digits_far_from_the_origin():
 def test_tools_and_contacts_press_far_from_the_origin_as_near_it(kind):
     forces, digits = [], 1e-11 if kind == "ball" else 1e-8  # a function of places has not more of them
     for away in (np.zeros(2), AWAY):
-        grid = mpm.Grid(away + [2.0, 1.5], [8, 6], lower=away)
-        base, block = mpm.box(grid, away, away + [2.0, 0.6]), mpm.box(grid, away + [0.6, 0.6], away + [1.3, 1.0])
-        centre = away + [0.95, 1.25]
+        grid = mpm.Grid(np.add(away, [2.0, 1.5]), [8, 6], lower=away)
+        base = mpm.box(grid, away, np.add(away, [2.0, 0.6]))
+        block = mpm.box(grid, np.add(away, [0.6, 0.6]), np.add(away, [1.3, 1.0]))
+        centre = np.add(away, [0.95, 1.25])
         shape = mpm.Ball(centre, 0.25) if kind == "ball" else lambda x, c=centre: np.hypot(*(x - c).T) - 0.25
         tool = mpm.Tool(shape, lambda t: (0.01 * t, -0.02 * t), centre=centre, friction=0.3)
         walls, groups = {"bottom": "xy", "left": "x", "right": "x"}, [mpm.Contact(1, 0, friction=0.3)]
@@ -173,7 +174,7 @@ def test_tools_and_contacts_press_far_from_the_origin_as_near_it(kind):
 
 def test_functions_are_asked_at_true_places_and_results_are_there(tmp_path):
     """All functions of places of a scene, and all that it shows, far from the origin."""
-    low, high, seen = AWAY, AWAY + [1.0, 1.5], {}
+    low, high, seen = AWAY, np.add(AWAY, [1.0, 1.5]), {}
 
     def at(name, value):
         def of(x, *_):
@@ -183,8 +184,8 @@ def test_functions_are_asked_at_true_places_and_results_are_there(tmp_path):
         return of
 
     grid = mpm.Grid(high, [4, 6], lower=low)
-    body = mpm.mapped(grid, mpm.box(grid, low, low + [1.0, 0.9]), lambda x: (at("map", 0.0)(x), x)[1])
-    fill = mpm.box(grid, low + [0, 0.9], low + [1.0, 1.2])
+    body = mpm.mapped(grid, mpm.box(grid, low, np.add(low, [1.0, 0.9])), lambda x: (at("map", 0.0)(x), x)[1])
+    fill = mpm.box(grid, np.add(low, [0, 0.9]), np.add(low, [1.0, 1.2]))
     law = {"conductivity_law": lambda conductivity, x: conductivity * (1 + (x[0] - low[0]) ** 2)}
     soil = mpm.Hencky(bulk=at("field", 2e6), shear=1e6, conductivity=1e-5, **law)
     traction = mpm.Traction("top", lambda t, X, x: (at("X", 0.0)(X), at("x", 0.0)(x), (0, -1e3))[-1])
@@ -203,7 +204,7 @@ def test_functions_are_asked_at_true_places_and_results_are_there(tmp_path):
         terms=[lambda points, v: -1e3 * (points.position[0] - low[0]) * points.value(v)[1] * points.dx],
         later=[1],
     )
-    probes = mpm.probes([body, fill], low + [[0.3, 0.4]])
+    probes = mpm.probes([body, fill], np.add(low, [[0.3, 0.4]]))
     writer = mpm.Writer(s, tmp_path, grid=True)
     result = s.run(1.0, 0.5, probes=probes, observe=writer, progress=False)
     s.stage(add=[1])

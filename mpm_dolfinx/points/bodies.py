@@ -255,7 +255,7 @@ def material_points(
 
 
 def _own(grid: Grid, body: Body) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the domains (m,) whose centroids are in cells of this process, and their corners (m, 2^d, d), m, on the grid."""
+    """Return the domains (m,) with centroids in cells of this process, and corners (m, 2^d, d), m, from the base."""
     rows, corners = [np.empty(0, dtype=np.int64)], [np.empty((0, 2**grid.dim, grid.dim))]
     for part in in_chunks(len(body)):
         of_part = body.corners(part) - grid.base

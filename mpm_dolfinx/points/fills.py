@@ -207,8 +207,8 @@ def _check_shape(grid: Grid, fill: int, body: Body, corners: NDArray, u: NDArray
     name = f"stage: add: body {fill}: what it was seeded to touch has moved by up to {far:.3g} m"
     if ratio[k] < TANGLED:
         raise ValueError(
-            f"{name}; to its domain at {corners[k].mean(axis=0) + grid.base} it leaves {ratio[k]:.2g} of the volume, must leave "
-            f"{TANGLED}"
+            f"{name}; to its domain at {corners[k].mean(axis=0) + grid.base} it leaves {ratio[k]:.2g} of the volume, "
+            f"must leave {TANGLED}"
         )
     out = np.flatnonzero(grid.outside(now.reshape(-1, grid.dim), REACH))
     if len(out):

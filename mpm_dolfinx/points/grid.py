@@ -74,7 +74,8 @@ class Cells:
     """The cells of a grid that this process has, ghosts included, as the mesh numbers them; complete when made.
 
     num_owned, num_local: number of cells without and with ghosts; cell_nodes (cells, 2^d): their nodes, numbered as
-    the Q1 degrees of freedom; node_x (nodes, d), midpoints (cells, d): places from the grid's base, m; signs (2^d, d): on which side of
+    the Q1 degrees of freedom; node_x (nodes, d), midpoints (cells, d): places from
+    the grid's base, m; signs (2^d, d): on which side of
     the midpoint a node lies; cell_number (cells,): lexicographic numbers; locals: the way back, -1 where there is none;
     owners: ranks of all cells, copy by copy; cell_facets (cells, 2d); facet_cells (facets, 2): -1 where there is none.
     """
@@ -149,7 +150,8 @@ class Grid:
     stretches
         Number of axes of deformation gradients: d, in axisymmetry 3, the third one that of the hoops.
     mesh
-        The dolfinx mesh, of coordinates that count from `base`; made when first it is needed.  On several processes a second scene whose points lie elsewhere
+        The dolfinx mesh, of coordinates that count from `base`; made when first it is needed.
+        On several processes a second scene whose points lie elsewhere
         has a grid with a mesh of its own, `Simulation.grid`; not one with terms or sources, which may be made on this.
     """
 
@@ -340,7 +342,7 @@ class Grid:
         return out
 
     def outside(self, x: NDArray[np.float64], tolerance: float = 1e-9) -> NDArray[np.bool_]:
-        """Return which places, from the base, lie outside the grid by more than `tolerance` cells, and what is lost in rounding."""
+        """Return which places, from the base, are outside by more than `tolerance` cells, and what rounding loses."""
         tolerance = tolerance + rounding(np.stack([self.lower, self.upper])) / self.h
         inside = np.ones(len(x), dtype=bool)
         for a in range(self.dim):

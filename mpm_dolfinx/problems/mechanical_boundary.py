@@ -292,7 +292,8 @@ class MechanicalBoundary:
             *rows, wrong = held.rows(axis, given, self._free[:, axis])
             placed.append((*rows, np.tile(np.eye(d)[axis], (len(rows[0]), 1))))
             if wrong >= 0:
-                what = f"{line(self.holds[held.number[wrong]][0])}: moves {'xyz'[axis]} at {held.x[wrong] + self.grid.base}"
+                x = held.x[wrong] + self.grid.base
+                what = f"{line(self.holds[held.number[wrong]][0])}: moves {'xyz'[axis]} at {x}"
                 message = f"{what}, where a fixed wall holds it; must be 0 there, or the wall must leave it free"
         if message := first(comm, message):
             raise ValueError(message)
