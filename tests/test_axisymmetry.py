@@ -23,7 +23,7 @@ LAME = ELASTIC.bulk - 2 * ELASTIC.shear / 3
 
 
 def plane(upper=(1.5, 1.5), cells=(7, 9), lower=None):
-    return mpm.Grid(lower, upper, cells, axisymmetric=True)
+    return mpm.Grid([0, 0] if lower is None else lower, upper, cells, axisymmetric=True)
 
 
 def pressed(radial, axial, inner=0.0, upper=(1.03, 1.01), material=ELASTIC, **options):
