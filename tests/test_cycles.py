@@ -320,6 +320,6 @@ def test_a_turn_is_found_where_walls_hold_a_part_of_the_body():
         return s
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("mpm_dolfinx.mechanics.momentum.rigid_motion", lambda *_: None)
+        patch.setattr("mpm_dolfinx.mechanics.given_displacements.rigid_motion", lambda *_: None)
         other = run()
     assert run().points.x == pytest.approx(other.points.x, abs=1e-8)

@@ -135,9 +135,8 @@ def test_what_locks_elsewhere_changes_nothing_in_an_elastic_body(quadrature):
     assert sagging(SOFT, SAND, quadrature=quadrature) == alone
     for other in (SAND, skeleton(0.499)):
         assert sagging(SOFT, other, far=True, quadrature=quadrature) == pytest.approx(alone, rel=1e-10)
-        assert sagging(
-            SOFT, other, far=True, later=True, numerics=mpm.Numerics(quadrature=quadrature)
-        ) == pytest.approx(alone, rel=1e-10)
+        tip = sagging(SOFT, other, far=True, later=True, quadrature=quadrature)
+        assert tip == pytest.approx(alone, rel=1e-10)
 
 
 def test_a_skin_that_does_not_lock_shares_the_cells_of_a_beam_that_does():

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Where the origin of the coordinates is does not matter: metres a kilometre away, national coordinates."""
 
+from dataclasses import replace
+
 import meshio
 import numpy as np
 import pytest
@@ -205,7 +207,7 @@ def test_functions_are_asked_at_true_places_and_results_are_there(tmp_path):
     body = mpm.mapped(grid, mpm.box(grid, low, np.add(low, [1.0, 0.9])), lambda x: (at("map", 0.0)(x), x)[1])
     fill = mpm.box(grid, np.add(low, [0, 0.9]), np.add(low, [1.0, 1.2]))
     law = {"conductivity_law": lambda conductivity, x: conductivity * (1 + (x[0] - low[0]) ** 2)}
-    soil = mpm.Hencky(bulk=at("field", 2e6), shear=1e6, conductivity=1e-5, **law)
+    soil = mpm.Hencky(bulk=lambda X: at("field", 2e6)(X), shear=1e6, conductivity=1e-5, **law)
     traction = mpm.Traction("top", lambda t, X, x: (at("X", 0.0)(X), at("x", 0.0)(x), (0, -1e3))[-1])
     drained = mpm.Drained("top", lambda t, x: at("drained", 100.0)(x))
     s = mpm.Simulation(
@@ -238,3 +240,13 @@ def test_functions_are_asked_at_true_places_and_results_are_there(tmp_path):
     for x in (*places, *files, *grids):
         assert ((x >= low - 1e-6) & (x <= high + 1e-6)).all()
     assert result.position[-1] - result.displacement[-1] == pytest.approx(probes.x0, rel=1e-14)
+
+
+def test_points_at_true_places_are_no_state():
+    """Put into it they would lie elsewhere, without a word."""
+    grid = mpm.Grid([0, -1], [1, 1], [4, 8])
+    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 0.5])], [SOIL], walls={"left": "xy"})
+    with pytest.raises(ValueError, match="from_base"):
+        replace(s.state, points=s.points)
+    again = replace(s.state, points=s.points.from_base(grid.base))
+    assert np.array_equal(again.points.corners, s.state.points.corners)

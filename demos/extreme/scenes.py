@@ -66,7 +66,8 @@ def turned(x: np.ndarray, angle: float) -> np.ndarray:
 
 def place(s: mpm.Simulation, corners: np.ndarray) -> None:
     """Put the undeformed body elsewhere, turned: the corners (n, 4, 2) of its points' domains."""
-    points = replace(s.points, corners=corners, origin=corners, x=corners.mean(axis=1))
+    corners = corners - s.grid.base
+    points = replace(s.state.points, corners=corners, origin=corners, x=corners.mean(axis=1))
     s.state = replace(s.state, points=points)
 
 

@@ -34,6 +34,8 @@ CHUNK = 2**14
 """Rows that are worked on at a time: no temporary holds one for each point of a large body."""
 MOST = 2**31 - 1
 """Unknowns that PETSc's numbers of 32 bits count."""
+SNAP = 1e-10
+"""Cells: vertices this close to a grid plane, or as close as rounding tells, lie on it: far below what answers tell."""
 ORDER = "the order is Grid(lower, upper, cells)"
 
 
@@ -190,7 +192,7 @@ class Grid:
         self.h = (self.upper - self.lower) / self.shape
         self.base = self.lower * [not axisymmetric, *[True] * (d - 1)]
         self.low, self.high = self.lower - self.base, self.upper - self.base
-        self.snap = np.maximum(SAME, [rounding(ends) for ends in zip(self.lower, self.upper, strict=True)] / self.h)
+        self.snap = np.maximum(SNAP, [rounding(ends) for ends in zip(self.lower, self.upper, strict=True)] / self.h)
         self.comm = comm
         self._cells: Cells | None = None
 

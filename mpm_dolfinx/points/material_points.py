@@ -4,8 +4,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,18 +94,21 @@ class MaterialPoints:
             values.flags.writeable = False
 
     def __reduce__(self):  # a read-only mapping cannot be sent to other processes
-        return MaterialPoints, (*(getattr(self, f.name) for f in fields(self) if f.name != "data"), dict(self.data))
+        return type(self), (*(getattr(self, f.name) for f in fields(self) if f.name != "data"), dict(self.data))
 
     def placed(self, base: NDArray[np.float64]) -> MaterialPoints:
-        """Return the points with true places, which counted from a base (d,), m."""
-        if not base.any():
-            return self
-        corners, x = self.corners + base, self.x + base
+        """Return the points with true places, which counted from a base (d,), m: `PlacedPoints`, but for base 0."""
+        return PlacedPoints(**self._moved(base)) if base.any() else self
+
+    def _moved(self, by: NDArray[np.float64]) -> dict[str, Any]:
+        """Return the fields with all places moved by (d,), m."""
+        own = {f.name: getattr(self, f.name) for f in fields(self)}
+        corners, x = self.corners + by, self.x + by
 
         def of(values: NDArray[np.float64]) -> NDArray[np.float64]:
-            return corners if values is self.corners else values + base
+            return corners if values is self.corners else values + by
 
-        return replace(self, corners=corners, x=x, origin=of(self.origin), reference=of(self.reference))
+        return own | {"corners": corners, "x": x, "origin": of(self.origin), "reference": of(self.reference)}
 
     def __repr__(self) -> str:
         """Return one line: how many points, their volume at rest, and the ranges of J and pressure."""
@@ -146,7 +150,7 @@ class MaterialPoints:
             return made[id(values)]
 
         arrays = {f.name: once(getattr(self, f.name)) for f in fields(self) if f.name != "data"}
-        return MaterialPoints(**arrays, data={name: once(values) for name, values in self.data.items()})
+        return type(self)(**arrays, data={name: once(values) for name, values in self.data.items()})
 
     def where(self, rows: NDArray[np.bool_], other: MaterialPoints) -> MaterialPoints:
         """Return these points in some rows (n,), and in the others another state of the same points."""
@@ -155,14 +159,14 @@ class MaterialPoints:
             return a if a is b else np.where(rows.reshape(-1, *[1] * (a.ndim - 1)), a, b)
 
         arrays = {f.name: chosen(getattr(self, f.name), getattr(other, f.name)) for f in fields(self)[:-1]}
-        return MaterialPoints(**arrays, data={name: chosen(v, other.data[name]) for name, v in self.data.items()})
+        return type(self)(**arrays, data={name: chosen(v, other.data[name]) for name, v in self.data.items()})
 
     def joined(self, other: MaterialPoints) -> MaterialPoints:
         """Return these points and others, ordered by id."""
         order = np.argsort(np.concatenate([self.id, other.id]))
         pairs = {f.name: (getattr(self, f.name), getattr(other, f.name)) for f in fields(self) if f.name != "data"}
         data = {name: np.concatenate([rows, other.data[name]])[order] for name, rows in self.data.items()}
-        return MaterialPoints(**{name: np.concatenate(pair)[order] for name, pair in pairs.items()}, data=data)
+        return type(self)(**{name: np.concatenate(pair)[order] for name, pair in pairs.items()}, data=data)
 
     def of(self, ids: NDArray[np.int64], kept: bool = True) -> MaterialPoints:
         """Return the points of these ids, or all others."""
@@ -181,7 +185,7 @@ class MaterialPoints:
     def _apart(self) -> MaterialPoints:
         """Return the points with an array of its own for each of their fields."""
         arrays = {f.name: getattr(self, f.name).copy() for f in fields(self) if f.name != "data"}
-        return MaterialPoints(**arrays, data={name: values.copy() for name, values in self.data.items()})
+        return type(self)(**arrays, data={name: values.copy() for name, values in self.data.items()})
 
     def find(self, ids: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return (which of `ids` are points of this process, their indices); points are ordered by id."""
@@ -189,3 +193,11 @@ class MaterialPoints:
         here = np.flatnonzero((at < len(self)) & (self.id[np.minimum(at, len(self) - 1)] == ids)) if len(self) else []
         here = np.asarray(here, dtype=np.int64)
         return here, at[here]
+
+
+class PlacedPoints(MaterialPoints):
+    """Material points with true places, which do not count from the grid's `base`: no `State` takes them."""
+
+    def from_base(self, base: NDArray[np.float64]) -> MaterialPoints:
+        """Return the points with places that count from a base (d,), m, as those of a state."""
+        return MaterialPoints(**self._moved(-base))

@@ -16,7 +16,7 @@ from mpm_dolfinx.conditions.acting import Outcome
 from mpm_dolfinx.domains.pressure_transport import PiecePressures
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.parallel.exchange import Exchange
-from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.points.material_points import MaterialPoints, PlacedPoints
 from mpm_dolfinx.stepping.result import Result
 from mpm_dolfinx.stepping.stage import Stage
 from mpm_dolfinx.stepping.step_control import StepControl
@@ -89,7 +89,8 @@ class State:
     t
         Time, s.
     points
-        The material points of this process.
+        The material points of this process.  Their places count from the grid's `base`, unlike those of
+        `Simulation.points`, which a state refuses: `PlacedPoints.from_base` gives them back.
     transported
         Pressures that the pieces of the points' domains take to the next grid; None without fluid, or with a stay of
         all points.
@@ -135,6 +136,8 @@ class State:
     control: StepControl | None = None
 
     def __post_init__(self):
+        if isinstance(self.points, PlacedPoints):
+            raise ValueError("state: points are at true places, must count from the grid's base: use points.from_base")
         _freeze(vars(self))
 
     @property
