@@ -73,7 +73,7 @@ def test_only_what_is_made_with_the_mesh_makes_it():
     for name in ("_repr_html_", "_ipython_display_", "shape_", "__array__"):
         assert not hasattr(grid, name)
     assert grid._cells is None
-    made = vars(shared.of_process).keys() - {"cellwise", "memory"}  # that of its spaces the grid has methods for
+    made = vars(shared._of_process).keys() - {"cellwise", "memory"}  # that of its spaces the grid has methods for
     assert {"mesh", "cell_nodes"} <= made
     for name in made:
         assert hasattr(Grid([0, 0], [1.0, 1.0], [2, 2]), name), f"{name} is made with the mesh, but is not there before"
