@@ -102,7 +102,7 @@ def slope(level, soil, h=0.25, axisymmetric=False, **options):
         [bank],
         [soil],
         fluid=mpm.Fluid(),
-        conditions=[*loads, *heads],
+        conditions=[*loads, *heads, *options.pop("conditions", [])],
         gravity=(0, -9.81),
         pressure=mpm.hydrostatic(level),
         initial_stress=mpm.K0(0.5, surcharge=lambda x: WEIGHT * np.maximum(level - x[:, 1], 0.0)),
