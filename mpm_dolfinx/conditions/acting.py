@@ -158,6 +158,9 @@ class Loads:
     def push(self, at: At, residual: PETSc.Vec, on: Unknowns) -> None:
         """Take forces at u that residuals are not measured by off a residual, of the unknowns or what walls hold."""
 
+    def inertia(self, at: At) -> PETSc.Vec | None:
+        """Return forces of the unknowns at u that add to the residual, and that this is measured by, N; None without."""
+
     def pattern(self, unknowns: Unknowns) -> PETSc.Mat | None:
         """Return zeros wherever `coupling` may have entries that cells have not; None if nowhere."""
 

@@ -96,14 +96,16 @@ class CutDomains(Keyed):
         The material points of this process, in the grid.
     domains
         Exact pieces of the points' domains; else one piece a point, as in standard MPM.
+    second
+        Whether second moments of the pieces are asked for.
     """
 
-    def __init__(self, grid: Grid, points: MaterialPoints, domains: bool):
+    def __init__(self, grid: Grid, points: MaterialPoints, domains: bool, second: bool = False):
         self.grid = grid
         self.points = points
         self.domains = domains
         self._patches: dict[Surface, Patches] = {}
-        self.pieces = cut(grid, points.corners) if domains else whole_points(grid, points.x)
+        self.pieces = cut(grid, points.corners, second) if domains else whole_points(grid, points.x)
         if grid.copies > 1:
             self.pieces.cell += grid.copy(points.id)[self.pieces.point]
         self._travel = Exchange(grid.comm, grid.owner(self.pieces.cell))
@@ -111,6 +113,8 @@ class CutDomains(Keyed):
         """Owned cells, and centroids (m, d), m, of the pieces that this process integrates."""
         self.mixed = self._travel.send(self.pieces.mixed) if grid.dim == 3 and domains else None
         """Their mean products of offsets in 3D, see `Pieces`."""
+        self.second = self._travel.send(self.pieces.second) if second else None
+        """Their mean products of all offsets (m, d, d), m^2, if they are asked for."""
         self.hoop = self._travel.send(self.pieces.hoop) if grid.axisymmetric else None
         """Their moments in the plane (m, 4) in axisymmetry, see `Pieces`."""
 

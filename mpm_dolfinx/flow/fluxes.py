@@ -267,6 +267,11 @@ class CellContents(Keyed):
                 hoop[rests] = 1.0
         return CellMotion(F, moved, hoop)
 
+    @property
+    def shape_values(self) -> NDArray[np.float64]:
+        """Values (n, 2^d) of the shape functions at the centroids of what the filled cells hold."""
+        return self._values
+
     def slot(self, cells: NDArray[np.int32]) -> NDArray[np.int64]:
         """Return the places of cells among the filled ones."""
         return self._slot[cells]
@@ -287,9 +292,19 @@ class FluxForms:
         DG0 pore pressure, Pa.
     bulk
         Bulk modulus of the fluid, Pa.
+    inertial : (d,), N/m^3
+        Force of inertia on the pore fluid as UFL, None without.
     """
 
-    def __init__(self, grid: Grid, weight: ufl.core.expr.Expr | None, flows: bool, pressure: fem.Function, bulk: float):
+    def __init__(
+        self,
+        grid: Grid,
+        weight: ufl.core.expr.Expr | None,
+        flows: bool,
+        pressure: fem.Function,
+        bulk: float,
+        inertial: ufl.core.expr.Expr | None = None,
+    ):
         self.grid = grid
         mesh = grid.mesh
         d = grid.dim
@@ -334,6 +349,8 @@ class FluxForms:
             carried = T * ufl.avg(self.density)
             self.aslant = FacetForm(-carried * ufl.dot(ufl.avg(self.slope), along) * ufl.jump(q) * dS, grid.comm)
         self.gravity = None
+        if inertial is not None:
+            weight = ufl.avg(inertial) if weight is None else weight + ufl.avg(inertial)
         if weight is not None and flows:
             apart = across * n0 - ufl.jump(self.centroid + self.moved)
             # so water at rest, whose pressure grows by its weight at zero pressure, stays at rest; the two at once for

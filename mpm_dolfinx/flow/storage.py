@@ -98,6 +98,8 @@ class StorageForms:
         The user's, see `user_functions`.
     t : s
         Time at the end of the substep, a UFL constant.
+    inertial : (d,), N/m^3
+        Force of inertia on the pore fluid, -rho_w a, as UFL; None without.
     """
 
     def __init__(
@@ -113,6 +115,7 @@ class StorageForms:
         conductivity: ConductivityAtPieces | None,
         sources: Sequence[Callable],
         t: fem.Constant,
+        inertial: ufl.core.expr.Expr | None = None,
     ):
         self.grid = pieces.grid
         self.p = pressure
@@ -135,7 +138,7 @@ class StorageForms:
         along = [along_shapes(slope, pieces) for slope in by_u]
         self._derivatives = CellSums([ufl.diff(stored, p), *(part for slope in along for part in slope)], pieces)
         self.symmetric, self.softens = symmetric, softens
-        self.fluxes = FluxForms(pieces.grid, weight, flows, pressure, bulk)
+        self.fluxes = FluxForms(pieces.grid, weight, flows, pressure, bulk, inertial)
         self.sources, self._slopes = [], []
         for source in sources:
             form = form_of("sources", source, points=pieces, q=q, p=pressure, t=t)
@@ -195,7 +198,7 @@ class OpenFaces:
 
     number (m,): of the condition; at (m,): place of the cell among the active owned ones; conductance, inflow (m,):
     outflow per unit of the cell's mass potential, m^d/(Pa s), and what is prescribed or driven in, m^d/s; seeps (m,):
-    whether nothing may flow in.
+    whether nothing may flow in; reach (m, d): way from the cell's centroid, m.
     """
 
     number: NDArray[np.int64]
@@ -203,10 +206,16 @@ class OpenFaces:
     conductance: NDArray[np.float64]
     inflow: NDArray[np.float64]
     seeps: NDArray[np.bool_]
+    reach: NDArray[np.float64]
 
     def outflow(self, pi: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return what leaves through each face, were it open both ways, from cells at potentials (n,), Pa; m^d/s."""
         return self.conductance * pi[self.at] - self.inflow
+
+    def driven(self, force: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return what forces (n, d), N/m^3, on the fluid drive out of cells (n,), m^d/s."""
+        along = np.einsum("md,md->m", force[self.at], self.reach)
+        return sum_by(self.at, np.where(self.seeps, 0.0, self.conductance * along), len(force))
 
     def seepage(self, pi: NDArray[np.float64], flows: NDArray[np.bool_]) -> tuple[NDArray, NDArray]:
         """Return what seeps out of cells (n,), m^d/s, and its derivative, m^d/(Pa s); flows (m,): where."""
@@ -327,7 +336,8 @@ class StorageSystem:
     ) -> Outflow:
         """Assemble the fluxes through inner faces and open sides; off: of `AslantFlow`, where there is any."""
         at = contents.slot(sides.cells)
-        faces = OpenFaces(sides.number, at, *sides.driven(at, flow, self._forms.bulk), sides.seeps)
+        reach = flow.deformed(at, sides.reach)
+        faces = OpenFaces(sides.number, at, *sides.driven(at, flow, self._forms.bulk), sides.seeps, reach)
         both = (np.where(sides.seeps, 0.0, values) for values in (faces.conductance, faces.inflow))
         conductance, inflow = (sum_by(at, values, len(contents.filled)) for values in both)
         mobility = self._forms.fluxes.set_conduction(contents, flow)
@@ -377,6 +387,8 @@ class StorageProblem:
         By how much the pieces are softer than elastic ones, where the forms' soil may be.
     due : (n,), m^d
         What the active owned cells take in of what their points are owed, until the end of the substep.
+    inertial
+        Gives the forces of inertia on the pore fluid (n, d), N/m^3, in the active owned cells at u, if there are any.
 
     The pressure at the start of the step is that of `forms.p_n`.
     """
@@ -392,11 +404,13 @@ class StorageProblem:
         before: Rates | None = None,
         softness: NDArray[np.float64] | float = 1.0,
         due: NDArray[np.float64] | float = 0.0,
+        inertial: Callable[[], NDArray[np.float64]] | None = None,
     ):
         self.forms = forms
         self.system = system
         self.data = data
         self._due = due
+        self._inertial = inertial
         self._contents = contents
         self._flow = flow
         self.dt = dt
@@ -553,13 +567,16 @@ class StorageProblem:
             cells = (system.T * pi).array_r.copy()
         else:
             cells = outflow.conductance * values + forms.driven(system.gravity)[system.unknowns.owned]
-        cells += self._aslant.cells - outflow.inflow
+        inflow = outflow.inflow
+        if self._inertial is not None:
+            inflow = inflow - outflow.faces.driven(self._inertial())
+        cells += self._aslant.cells - inflow
         if forms.sources:
             gain = forms.gain(self.data)[system.unknowns.owned]
             cells -= gain
         seeping, slope = outflow.faces.seepage(values, self._flowing) if self._seeps else (0.0, 0.0)
         cells += seeping
-        lost = outflow.conductance * values - outflow.inflow + seeping + self._aslant.lost - gain
+        lost = outflow.conductance * values - inflow + seeping + self._aslant.lost - gain
         turnover = (np.abs(outflow.total) + slope) * np.abs(values)
         return Rates(p.array_r.copy(), cells, lost, turnover, np.abs(gain))
 

@@ -262,9 +262,10 @@ class PointData(Keyed):
     def gradients(self, u: fem.Function) -> NDArray[np.float64]:
         """Return the gradients (n, d^2) of a Q1 vector function at its present values."""
         now = u.x.array.copy()  # of the key nothing changes
-        return self._gradients(now, lambda: self._gradients_of(now))
+        return self._gradients(now, lambda: self.gradients_of(now))
 
-    def _gradients_of(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
+    def gradients_of(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the gradients (n, d^2) of a Q1 vector function with these values, a local array."""
         places = self.places
         grid = self.points.grid
         d = self.points.grid.dim

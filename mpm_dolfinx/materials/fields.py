@@ -73,7 +73,7 @@ class SceneMaterials:
         self.grid = grid
         self.materials = materials
         self.fluid = fluid
-        seeded: dict[str, NDArray[np.float64]] = {}
+        seeded: dict[str, NDArray[np.float64]] = dict(points.data)
         self._used = _used(bodies, len(materials))  # a material that no body is of changes nothing
         used = [materials[i] for i in self._used]
         self._fields = [[name for name in _names(m) if callable(getattr(m, name))] for m in materials]

@@ -34,6 +34,7 @@ from mpm_dolfinx.materials.evaluate import by_scene
 from mpm_dolfinx.materials.local_unknowns import LocalUnknowns
 from mpm_dolfinx.materials.skeleton import Skeleton
 from mpm_dolfinx.mechanics.ghost_penalty import GhostPenalty
+from mpm_dolfinx.mechanics.inertia import InertiaForms
 from mpm_dolfinx.mechanics.mean_dilatation import MeanDilatation
 from mpm_dolfinx.mechanics.own_terms import OwnTerms
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
@@ -66,6 +67,8 @@ class MomentumForms:
         The user's, see `user_functions`.
     t, dt : s
         Time at the end of the substep, and time since the start of the step, UFL constants.
+    inertia
+        Whether bodies may have inertia.
     """
 
     def __init__(
@@ -80,6 +83,7 @@ class MomentumForms:
         terms: Sequence[Callable],
         t: fem.Constant,
         dt: fem.Constant,
+        inertia: bool = False,
     ):
         self.grid = grid = pieces.grid
         V = _compat.function_space(grid.mesh, "Lagrange", 1, (grid.dim,))
@@ -88,6 +92,8 @@ class MomentumForms:
         self._rooms = [fem.Function(V) for _ in range(3)]  # for sums of forces that are needed at once
         averaged = [number for number, (_, _, locks) in enumerate(laws) if locks]
         self.dilatation = MeanDilatation(grid, averaged, symmetric) if averaged else None
+        self.inertia = InertiaForms(pieces, [points for _, points, _ in laws], self.u) if inertia else None
+        """Of bodies that may have inertia."""
         self._residuals, self._tangents = [], []
         self._local: dict[int, LocalUnknowns] = {}  # by the number of their part
         for number, (law, points, locks) in enumerate(laws):
@@ -136,7 +142,8 @@ class MomentumForms:
             P, A = P + of_pressure, A + ufl.diff(of_pressure, F)
         share = 1 / ufl.det(points.F)  # divided by it, each component would be
         P, A = share * P, share * A
-        self._residuals.append(ElementForces(P * points.F.T, points))
+        stress = P * points.F.T
+        self._residuals.append(ElementForces(stress if self.inertia is None else points.turn * stress, points))
         i, j, k, l, m, n = ufl.indices(6)
         if self.grid.dim == 2:
             A = ufl.as_tensor(A[i, m, j, n] * points.F[k, m] * points.F[l, n], (i, k, j, l))
@@ -442,6 +449,9 @@ class MomentumProblem:
         system.penalty.multAdd(step, r, r)
         for one in self.loads:
             one.push(self.at, r, system.unknowns)
+            if (inertia := one.inertia(self.at)) is not None:
+                r += inertia
+                norms.append(system.of_parts.norms(inertia.array_r))
         return r, np.max(norms, axis=0)
 
     def out_of_balance(

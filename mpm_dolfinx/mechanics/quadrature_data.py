@@ -222,6 +222,10 @@ class QuadraturePoints:
             return self.rows(cut, cut.points, lambda m: m.conductivity) / self._fluid.unit_weight
         return law.evaluate(data, cut.to_cells(cut.points.material), begins) / self._fluid.unit_weight
 
+    def masses(self, points: MaterialPoints) -> NDArray[np.float64]:
+        """Return the masses (n,), kg, of the points, pore fluid included."""
+        return self._scene.density(points) * points.volume0 * points.J
+
     def conducting(self, cut: CutDomains) -> NDArray[np.float64]:
         """Return what pieces (m, 2) that conduct alike have in common."""
         return cut.to_cells(self._scene.conducting(cut.points))

@@ -18,7 +18,7 @@ over the area: the forces of even stresses are then exact.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cache
 from itertools import combinations, permutations
@@ -45,7 +45,8 @@ class Pieces:
     mixed : (m, d) in 3D, else (m, 0): mean product of the offsets from the centroid along the axes other than each,
     m^2;
     hoop : (m, 4) in axisymmetry, else (m, 0): in the plane, offset (2,) of the centroid from the cell's midpoint, m,
-    mean product of the offset's components, m^2, and radius of the centroid, m.
+    mean product of the offset's components, m^2, and radius of the centroid, m;
+    second : (m, d, d) if they are asked for, else (m, 0): all mean products of the offsets from the centroid, m^2.
     """
 
     point: NDArray[np.int64]
@@ -55,6 +56,7 @@ class Pieces:
     faces: NDArray[np.float64]
     mixed: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
     hoop: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
+    second: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
 
 
 def corner_bits(dim: int) -> NDArray[np.int64]:
@@ -185,27 +187,29 @@ def _chunks(count: int, dim: int) -> list[slice]:
     return [slice(start, start + size) for start in range(0, max(1, count), size)]
 
 
-def cut(grid: Grid, corners: NDArray[np.float64]) -> Pieces:
+def cut(grid: Grid, corners: NDArray[np.float64], second: bool = False) -> Pieces:
     """Cut the domains by the grid.
 
     Parameters
     ----------
     corners : (n, 2^d, d), m
         Corners of the domains, inside the grid; corner k has the ends `corner_bits(d)[k]`.
+    second
+        Whether second moments of the pieces are asked for.
 
     Returns
     -------
     The pieces, slivers below 1e-12 of their domain left out; fractions sum to one for every domain.
     """
     chunks = _chunks(len(corners), grid.dim)
-    parts = [_cut(grid, corners[chunk]) for chunk in chunks]
+    parts = [_cut(grid, corners[chunk], second) for chunk in chunks]
     for chunk, part in zip(chunks, parts, strict=True):
         part.point += chunk.start
     columns = zip(*([getattr(part, f.name) for f in fields(Pieces)] for part in parts), strict=True)
     return Pieces(*map(np.concatenate, columns))
 
 
-def _cut(grid: Grid, corners: NDArray[np.float64]) -> Pieces:
+def _cut(grid: Grid, corners: NDArray[np.float64], second: bool) -> Pieces:
     d, true = grid.dim, np.ascontiguousarray(((corners - grid.low) / grid.h).transpose(1, 2, 0))
     nearest = np.rint(true)
     y = np.where(np.abs(true - nearest) < grid.snap[:, None], nearest, true)
@@ -231,7 +235,7 @@ def _cut(grid: Grid, corners: NDArray[np.float64]) -> Pieces:
         s, facet = _slice(s, facet, axis)
     area = _area_vectors(s)
     area *= np.sign((area * outward[:, facet]).sum(axis=0))  # slicing has shuffled the vertices
-    return _sum(grid, _Slots(grid, y), s, area, owner[facet])
+    return _sum(grid, _Slots(grid, y), s, area, owner[facet], second)
 
 
 def _area_vectors(s: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -290,7 +294,12 @@ class _Slots:
 
 
 def _sum(
-    grid: Grid, slots: _Slots, s: NDArray[np.float64], area: NDArray[np.float64], owner: NDArray[np.int64]
+    grid: Grid,
+    slots: _Slots,
+    s: NDArray[np.float64],
+    area: NDArray[np.float64],
+    owner: NDArray[np.int64],
+    second: bool,
 ) -> Pieces:
     """Sum the slices of the surfaces by (point, cell) into pieces."""
     d = grid.dim
@@ -327,7 +336,9 @@ def _sum(
     for a in range(1, d):
         within = total(products * (sums[0] * sums[a] + pair(0, a)))
         moments.append(within + slots.beyond(total(area[0] * sums[a] / d), 0))
-    uneven = _mean_products(x, sums, area[0], pair, total, slots) if d == 3 else []
+    pairs = [(1, 2), (0, 2), (0, 1)] if d == 3 else [(0, 1)] * second
+    pairs += [(a, a) for a in range(d)] * second
+    uneven = _products(pairs, x, sums, area[0], pair, total, slots)
 
     whole = sum_by(slots.point, volume, len(slots.low[0]))[slots.point]
     kept = np.flatnonzero(volume / whole > SLIVER)
@@ -351,20 +362,24 @@ def _sum(
     # centroids stay off the grid lines, and inside the cell that they belong to
     volume = volume[kept]
     hoop = np.empty((len(kept), 0))
-    mixed = np.zeros((len(kept), len(uneven)))
+    spread = np.zeros((len(kept), d, d))
     middle = np.stack([m[kept] / volume for m in moments], axis=1)
     centroid = np.clip(middle, grid.snap, 1 - grid.snap)
-    for a, product in enumerate(uneven):
-        b, c = (k for k in range(d) if k != a)
+    for (a, b), product in zip(pairs, uneven, strict=True):
         # of a piece thinner than rounding allows for it is not known, and at most this
-        mixed[:, a] = np.clip(product[kept] / volume - middle[:, b] * middle[:, c], -0.25, 0.25) * grid.h[b] * grid.h[c]
+        mean = np.clip(product[kept] / volume - middle[:, a] * middle[:, b], 0.0 if a == b else -0.25, 0.25)
+        spread[:, a, b] = spread[:, b, a] = mean * grid.h[a] * grid.h[b]
+    mixed = (
+        np.stack([spread[:, 1, 2], spread[:, 0, 2], spread[:, 0, 1]], axis=1) if d == 3 else np.zeros((len(kept), 0))
+    )
     if grid.axisymmetric:
         faces[:, 0] *= TURN * (grid.low[0] + grid.h[0] * (cell[:, [0]] + [0, 1]))
         faces[:, 1] *= TURN
         radius, centroid, hoop = _rings(grid, cell, centroid, squares[kept] / volume, products[kept] / volume)
         volume = volume * radius
     fraction, x = volume / sum_by(point, volume, len(slots.low[0]))[point], grid.low + grid.h * (cell + centroid)
-    return Pieces(point, grid.number(cell), fraction, x, np.abs(faces), mixed, hoop)
+    moments = spread if second else np.empty((len(kept), 0))
+    return Pieces(point, grid.number(cell), fraction, x, np.abs(faces), mixed, hoop, moments)
 
 
 def _rings(
@@ -385,7 +400,8 @@ def _rings(
     return radius, np.clip(of_volume, grid.snap, 1 - grid.snap), hoop
 
 
-def _mean_products(
+def _products(
+    pairs: Sequence[tuple[int, int]],
     x: NDArray[np.float64],
     sums: NDArray[np.float64],
     area: NDArray[np.float64],
@@ -393,28 +409,37 @@ def _mean_products(
     total: Callable[[NDArray[np.float64]], NDArray[np.float64]],
     slots: _Slots,
 ) -> list[NDArray[np.float64]]:
-    """Return the integrals of yz, xz and xy over the pieces of slots, from the lower corners of their cells.
+    """Return the integrals of products of two coordinates over the pieces of slots, from the corners of their cells.
 
     Parameters
     ----------
+    pairs
+        Axes of the coordinates, ascending.
     x, sums, area
-        Vertices (3, 3, m) of slices, their sums (3, m), and the area of the slices that the first axis sees (m,).
+        Vertices (d, d, m) of slices, their sums (d, m), and the area of the slices that the first axis sees (m,).
     pair, total
         Sums products of two coordinates over the vertices of slices, and values of slices over slots.
     """
+    d = len(x)
 
     def mean(*factors: int) -> NDArray[np.float64]:
-        """Return the integrals over the slices of a product of two or three coordinates."""
+        """Return the integrals over the slices of a product of up to three coordinates."""
+        if not factors:
+            return area
+        if len(factors) == 1:
+            return area / d * sums[factors[0]]
         if len(factors) == 2:
             (a, b), of = factors, sums
-            return area / 12 * (of[a] * of[b] + pair(a, b))
+            return area / (d * (d + 1)) * (of[a] * of[b] + pair(a, b))
         a, b, c = factors
         pairs = sums[a] * pair(b, c) + sums[b] * pair(a, c) + sums[c] * pair(a, b)
-        return area / 60 * (sums[a] * sums[b] * sums[c] + pairs + 2 * (x[:, a] * x[:, b] * x[:, c]).sum(axis=0))
+        cubes = (x[:, a] * x[:, b] * x[:, c]).sum(axis=0)
+        return area / (d * (d + 1) * (d + 2)) * (sums[a] * sums[b] * sums[c] + pairs + 2 * cubes)
 
-    out = [total(mean(0, 1, 2)) + slots.beyond(total(mean(1, 2)), 0)]
-    for a in (2, 1):
-        out.append(total(mean(0, 0, a)) / 2 + slots.beyond(total(area * sums[a] / 3), 0) / 2)
+    out = []
+    for a, b in pairs:
+        rest = [axis for axis in (a, b) if axis]
+        out.append((total(mean(0, a, b)) + slots.beyond(total(mean(*rest)), 0)) / (3 - len(rest)))
     return out
 
 

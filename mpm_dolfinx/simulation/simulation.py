@@ -24,6 +24,7 @@ from mpm_dolfinx.diagnostics.thin import warn_thin
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.materials.initial_stress import InitialStress, by_body
 from mpm_dolfinx.materials.skeleton import Fluid, Skeleton
+from mpm_dolfinx.mechanics.inertia import checked_velocity
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.probing.cell_fields import CellFields, cell_fields
 from mpm_dolfinx.probing.point_fields import PointFields, point_fields
@@ -73,6 +74,11 @@ class Simulation:
         Indices of bodies that a later stage adds, each once.
     numerics
         Quadrature, coupling, tolerance and method of time integration, see `Numerics`.
+    inertia
+        Whether bodies have inertia: then they need no walls.  With False they are at rest at first, and a later stage may
+        give it to them; with None none can.  Not in axisymmetry, nor with `quadrature="point"`.
+    velocity : (d,) or callable x (n, d) -> (n, d), m/s
+        Velocity at the start of bodies that may have inertia, or a function of places; none is rest.
 
     Attributes
     ----------
@@ -103,6 +109,8 @@ class Simulation:
         terms: Sequence[Callable | OnSide | Source] = (),
         later: Sequence[int] = (),
         numerics: Numerics = DEFAULT,
+        inertia: bool | None = None,
+        velocity: ArrayLike | Callable[[NDArray], ArrayLike] | None = None,
     ):
         instance("numerics", numerics, Numerics)
         quadrature = numerics.quadrature
@@ -113,6 +121,7 @@ class Simulation:
         grid = grid.shared(points_in_cells(grid, bodies), keep=bool(len(terms) + len(sources)))
         warn_thin(grid, bodies, with_axis(grid, walls), fluid is not None)
         check_axisymmetry(grid, bodies, quadrature)
+        velocity = checked_velocity(grid, quadrature, inertia, velocity)
         began = time.perf_counter()
         initial = by_body(initial_stress, bodies, later)
         self.scene = Scene(
@@ -125,8 +134,9 @@ class Simulation:
             pressure=pressure,
             extensions=(terms, sources),
             initial=initial,
+            velocity=velocity,
         )
-        given = {"walls": walls, "conditions": conditions, "gravity": gravity}
+        given = {"walls": walls, "conditions": conditions, "gravity": gravity, "inertia": bool(inertia)}
         self.state = first_state(self.scene, given, later)
         if initial:
             self.state = balanced(self.scene, self.state)
@@ -237,6 +247,7 @@ class Simulation:
         walls: Mapping[str, str] | None = None,
         conditions: Sequence[Condition] | None = None,
         gravity: ArrayLike | Callable[[float], ArrayLike] | None = None,
+        inertia: bool | None = None,
         add: Sequence[int] = (),
         remove: Sequence[int] = (),
         reset_displacement: bool = False,
@@ -251,6 +262,8 @@ class Simulation:
         ----------
         walls, gravity
             As for the scene; `gravity` only if the scene had it.
+        inertia
+            Whether bodies have inertia from now on; only if the scene may.  Bodies that get it begin at rest.
         conditions
             All conditions from now on; without, those in force stay: `[*simulation.conditions, more]` adds one.
             Contacts are those of the scene, named or not.
@@ -272,7 +285,7 @@ class Simulation:
         ValueError
             The scene is then what it was.
         """
-        given = {"walls": walls, "conditions": conditions, "gravity": gravity}
+        given = {"walls": walls, "conditions": conditions, "gravity": gravity, "inertia": inertia}
         named = {name: value for name, value in given.items() if value is not None}
         self.state = begin_stage(self.scene, self.state, named, add, remove, reset_displacement, fields or {})
 

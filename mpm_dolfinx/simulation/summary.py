@@ -56,6 +56,7 @@ def _momentum(s: Scene, state: State) -> list[Part]:
         ),
         _either("state of the law", evolves, evolves, "the stress depends on F only"),
         _either("initial stress", s.initial.given, f"of {len(s.initial.given)} bodies", "none given"),
+        _either("inertia", state.stage.inertia, "of all bodies", "none asked for" if m.inertia is None else "at rest"),
         _either("body force", s.gravity is not None, "gravity", "no gravity"),
         *(_either(kind.title, number[kind.title], f"{number[kind.title]}", "none given") for kind in KINDS),
         _either("ghost penalty", m.ghost.form.used, "faces of nearly empty cells", "no nearly empty cell so far"),

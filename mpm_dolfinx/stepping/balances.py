@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 from mpi4py import MPI
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base.time_integration import Substep
 from mpm_dolfinx.conditions.acting import QUANTITIES, At, Loads, Outcome
 from mpm_dolfinx.flow.storage import Rates, StorageProblem
+from mpm_dolfinx.mechanics.inertia import Flight, Inertia
 from mpm_dolfinx.mechanics.momentum import MomentumProblem
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
 from mpm_dolfinx.parallel.exchange import over_all
@@ -46,12 +48,26 @@ class Start(NamedTuple):
     yielded: bool
     acting: list[Acting]
 
+    def flown(self, flight: Flight | None) -> Callable[[NDArray[np.float64]], dict[str, NDArray[np.float64]]] | None:
+        """Return what gives velocities of points after the step, see `Mass.carried`; None without inertia."""
+        if flight is None:
+            return None
+        return partial(self.matrices.mass.carried, self.state.points, (flight.start, flight.velocity))
+
 
 class Balances(NamedTuple):
     """The two balances at the end of a substep; storage is None without fluid."""
 
     momentum: MomentumProblem
     storage: StorageProblem | None
+    inertia: Inertia | None = None
+
+    def flown(self, flight: Flight | None, substep: Substep, dt: float) -> Flight | None:
+        """Return the velocities after a solved substep of a step of dt (s); None of bodies without inertia."""
+        if self.inertia is None:
+            return None
+        acceleration = self.inertia.acceleration(self.momentum.at)
+        return flight.after(acceleration, float(substep.own * dt), float(substep.before * dt))
 
     def outcome(self, state: State) -> Outcome:
         """Return what conditions do to the bodies at the end of a step, see `State`."""
@@ -82,6 +98,15 @@ def left(loads: Sequence[Loads], at: At, before: MaterialPoints, after: Material
     return after
 
 
+def flight_of(start: Start) -> Flight | None:
+    """Return the velocities of the unknowns at the start of a step; None of bodies without inertia."""
+    mass = start.matrices.mass
+    if mass is None:
+        return None
+    v = mass.velocity(start.state.points)
+    return Flight(v, v)
+
+
 def going_on(scene: Scene, start: Start, substep: Substep) -> NDArray[np.float64] | None:
     """Return displacements (unknowns,), m, if bodies that yield moved on as in the substep before, or the last step.
 
@@ -101,21 +126,41 @@ def has_yielded(scene: Scene, state: State) -> bool:
     return over_all(scene.grid.comm, evolved, MPI.LOR)
 
 
-def balances(scene: Scene, start: Start, acting: Acting, before: Rates | None = None) -> Balances:
-    """Return the balances at the end of a substep, with u and p as they are; before: rates of the substep before."""
+def balances(
+    scene: Scene, start: Start, acting: Acting, before: Rates | None = None, flight: Flight | None = None
+) -> Balances:
+    """Return the balances at the end of a substep, with u and p as they are.
+
+    before: rates of the substep before; flight: velocities so far, of bodies with inertia.
+    """
     substep = acting.substep
     on_grid = start.on_grid
     matrices = start.matrices
     dt = start.dt
     scene.set_time(acting.t, substep.end * dt, acting.gravity)
     scene.momentum.own.set_rate(substep.own * dt, substep.before / substep.own)
+    inertia, loads = None, acting.loads
+    if flight is not None:
+        own = float(substep.own * dt)
+        inertia = Inertia(matrices.mass, flight.free(own, float(substep.before * dt)), 1 / own**2)
+        loads = [*loads, inertia]
+    if scene.momentum.inertia is not None:
+        scene.momentum.inertia.set_substep(inertia, substep.end < 1)
     forces = scene.scheme.tolerance, going_on(scene, start, substep), start.state.held
-    momentum = MomentumProblem(scene.momentum, matrices.momentum, start.data, acting.loads, *forces, start.yielded)
+    momentum = MomentumProblem(scene.momentum, matrices.momentum, start.data, loads, *forces, start.yielded)
     if scene.storage is None:
-        return Balances(momentum, None)
+        return Balances(momentum, None, inertia)
     weight = None if acting.gravity is None else scene.fluid.density * acting.gravity
     flow = matrices.flow(start.state, weight, start.data, acting.t)
     lost = before and before.taken(substep.before * dt)
     carried = on_grid.softness(start.state), substep.end * on_grid.due(start.state)
     options = (on_grid.contents, flow, substep.own * dt, lost, *carried)
-    return Balances(momentum, StorageProblem(scene.storage, matrices.storage, start.data.pieces, *options))
+    pushed = None if inertia is None else partial(pushed_back, scene, on_grid)
+    storage = StorageProblem(scene.storage, matrices.storage, start.data.pieces, *options, pushed)
+    return Balances(momentum, storage, inertia)
+
+
+def pushed_back(scene: Scene, on_grid: OnGrid) -> NDArray[np.float64]:
+    """Return the forces of inertia (n, d), N/m^3, on the pore fluid in the filled owned cells at u."""
+    contents = on_grid.contents
+    return -scene.fluid.density * scene.momentum.inertia.at(contents.filled, contents.shape_values)

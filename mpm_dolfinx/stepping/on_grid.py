@@ -25,6 +25,7 @@ from mpm_dolfinx.flow.storage import Outflow, StorageForms, StorageSystem
 from mpm_dolfinx.forms.unknowns import collect_garbage
 from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.mechanics.ghost_penalty import stiffness
+from mpm_dolfinx.mechanics.inertia import FULL
 from mpm_dolfinx.mechanics.momentum import MomentumForms, MomentumSystem
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData, QuadraturePoints
 from mpm_dolfinx.points.material_points import MaterialPoints
@@ -78,6 +79,8 @@ class OnGrid(Keyed):
         momentum.ghost.set_contents(*(sum_by(cut.cells, rows, grid.num_local) for rows in (area, *moduli)))
         self.active = momentum.ghost.fill.x.array > 0
         """Which local cells hold something, ghosts included."""
+        self.fill = momentum.ghost.fill.x.array.copy()
+        """Filled shares of the local cells."""
         self.cells = np.flatnonzero(self.active)
         self.facets = grid.interior_facets(self.active, self.cells)
         """Faces of this process between two active cells."""
@@ -101,6 +104,16 @@ class OnGrid(Keyed):
             self.contents = CellContents(storage.fluxes, brought, self.cells[self.cells < grid.num_owned])
             if quadrature.layered:
                 self._mixed = mixed_cells(cut, quadrature.conducting(cut), self.contents)
+
+    @cached_property
+    def not_full(self) -> NDArray[np.int32]:
+        """Inner faces of cells that are not full, which carry ghost mass."""
+        return self.facets[self.fill[self.cut.grid.facet_cells[self.facets]].min(axis=1) < FULL]
+
+    @property
+    def masses(self) -> NDArray[np.float64]:
+        """Masses (n,), kg, of the points."""
+        return self._quadrature.masses(self.cut.points)
 
     def data_of(self, state: State) -> QuadratureData:
         """Return the pieces with what the points, which have hardly moved since, carry now."""
@@ -382,6 +395,11 @@ class Assembled(Keyed):
         self._mobility: Latest[Mobility] = Latest()
         self._outflow: Latest[Outflow] = Latest()
         self.momentum.set_penalty(loads)
+        self.mass = None
+        if stage.inertia:
+            own = self.momentum
+            faces = on_grid.fill, on_grid.not_full
+            self.mass = momentum.inertia.on(on_grid.cut, on_grid.masses, *faces, own.unknowns, own.held)
         self.momentum.set_rounding(self._rounding(momentum, loads))
         self.round_off = float(self.momentum.rounding.norm())
         """Norm of the momentum's residual that rounding leaves, N."""
@@ -482,12 +500,13 @@ def assembled(
     stiff, symmetric = any(one.stiff for one in loads), momentum.symmetric and stage.symmetric
 
     def make() -> System:
-        if not any(one.holding for one in loads):
+        if not stage.inertia and not any(one.holding for one in loads):
             check_held(grid, on_grid.active, free, [held for one in loads if (held := one.touching())], begins)
         return System(momentum, storage, scheme, on_grid, dofs, nodes, stiff, symmetric)
 
     # a cell may become active between active nodes, so equal dofs do not mean equal cells
     with Timer("mpm: integration data"):
         pairs = on_grid.key if any(one.couples for one in loads) else None  # couple nodes as they lie
+        pairs = pairs, on_grid.not_full if stage.inertia else None
         system = systems((stage, on_grid.cells, dofs, on_grid.penalised, pairs), make, grid.comm)
         return Assembled(momentum, storage, system, on_grid, stage, loads)

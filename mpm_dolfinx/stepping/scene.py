@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from dolfinx import fem
 from dolfinx.common import Timer
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.base.time_integration import Substep, substeps
@@ -31,6 +31,7 @@ from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.materials.initial_stress import InitialStresses
 from mpm_dolfinx.materials.skeleton import Fluid, Skeleton
 from mpm_dolfinx.materials.user_functions import compiling
+from mpm_dolfinx.mechanics.inertia import moving
 from mpm_dolfinx.mechanics.momentum import MomentumForms
 from mpm_dolfinx.mechanics.quadrature_data import QuadraturePoints
 from mpm_dolfinx.parallel.messages import ConditionWarning, warn
@@ -58,6 +59,8 @@ class Scene:
         The user's terms in the balance of momentum, and those in the storage of fluid.
     initial
         Stresses of bodies as seeded, see `initial_stress.by_body`.
+    velocity
+        At the start, m/s, of a scene whose bodies may have inertia, see `Simulation`; None of others.
     """
 
     def __init__(
@@ -72,6 +75,7 @@ class Scene:
         pressure: float | Callable,
         extensions: tuple[Sequence[Callable], Sequence[Callable]],
         initial: Mapping[int, Any],
+        velocity: ArrayLike | Callable | None = None,
     ):
         self.grid = grid
         self.bodies = tuple(bodies)
@@ -82,6 +86,8 @@ class Scene:
         pressure = weighed(pressure, fluid)
         self.initial = InitialStresses(self.bodies, initial, pressure)
         seeded = material_points(grid, bodies, pressure)
+        if velocity is not None:
+            seeded = replace(seeded, data=moving(seeded, velocity, grid.base))
         self.materials = scene = SceneMaterials(grid, materials, bodies, seeded, fluid, bool(initial))
         self.gravity = fem.Constant(grid.mesh, np.zeros(grid.dim)) if weighs else None
         self.t, self.dt = fem.Constant(grid.mesh, 0.0), fem.Constant(grid.mesh, 1.0)
@@ -92,7 +98,7 @@ class Scene:
         with compiling(f"materials: {', '.join(law.__name__ for law in scene.laws)}", "laws in UFL of these shapes"):
             wet = fluid.density if fluid else None
             options = (self.gravity, wet, scene.symmetric)
-            options = (*options, numerics.quadrature == "point", terms, self.t, self.dt)
+            options = (*options, numerics.quadrature == "point", terms, self.t, self.dt, velocity is not None)
             self.momentum = MomentumForms(self.pieces.pieces, laws, p, *options)
         if not self.momentum.symmetric and scheme.coupling == "schur-cg":
             scheme = replace(scheme, coupling="schur-fgmres")
@@ -100,6 +106,8 @@ class Scene:
         if fluid:
             weight = fluid.density * self.gravity if weighs else None
             symmetric = scheme.coupling != "schur-fgmres"
+            moves = self.momentum.inertia
+            inertial = None if moves is None else -fem.Constant(grid.mesh, fluid.density) * moves.acceleration
             pieces = self.pieces.pieces
             u = self.momentum.u
             laws = scene.conductivity_laws
@@ -107,7 +115,7 @@ class Scene:
                 ConductivityAtPieces(scene.materials, laws, pieces, u, fem.Function(grid.cellwise())) if laws else None
             )
             kind = (symmetric, scene.conducts, scene.evolves)
-            self.storage = StorageForms(pieces, u, p, fluid.bulk, weight, *kind, law, sources, self.t)
+            self.storage = StorageForms(pieces, u, p, fluid.bulk, weight, *kind, law, sources, self.t, inertial)
         self.motion = Motion(scene, bodies, self.momentum, self.storage)
         # what is still to be looked for, to be warned of, of which nothing but the log knows
         self._looks = (warn_overfilled, *[partial(warn_smeared, materials=scene)] * scene.uneven)
@@ -123,7 +131,9 @@ class Scene:
     @property
     def substeps(self) -> tuple[Substep, ...]:
         """Substeps of a step."""
-        return substeps(self.numerics.method, self.flows or self.momentum.own.rates)
+        return substeps(
+            self.numerics.method, self.flows or self.momentum.own.rates or self.momentum.inertia is not None
+        )
 
     def set_time(self, t: float, dt: float, gravity: NDArray[np.float64] | None) -> None:
         """Set what forms see of a substep: time, and time since the start of the step, s; gravity (d,), m/s^2."""
@@ -158,7 +168,7 @@ class Scene:
         def make() -> OnGrid:
             self._assembled.clear()  # of coefficients that change now
             with Timer("mpm: cut domains"):
-                cut = CutDomains(grid, points, self.numerics.quadrature == "domain")
+                cut = CutDomains(grid, points, self.numerics.quadrature == "domain", self.momentum.inertia is not None)
                 self._looks = tuple(filter(None, [look(cut, self.bodies) for look in self._looks]))
             with Timer("mpm: integration data"):
                 problems = (self.momentum, self.storage)

@@ -87,6 +87,11 @@ class Stage:
     hydraulic: HydraulicBoundary
 
     @property
+    def inertia(self) -> bool:
+        """Whether bodies have inertia."""
+        return self.conditions["inertia"]
+
+    @property
     def surfaces(self) -> list[Surface]:
         """The faces of all conditions but tools and contacts."""
         return [
@@ -216,7 +221,11 @@ def stage(
     return Stage(
         given=given_by_name,
         named=by_name,
-        conditions={"walls": dict(walls), "gravity": gravity},  # nobody changes what a stage was given
+        conditions={
+            "walls": dict(walls),
+            "gravity": gravity,
+            "inertia": bool(conditions["inertia"]),
+        },  # nobody changes what a stage was given
         present=tuple(present),
         later=tuple(later),
         free=free,

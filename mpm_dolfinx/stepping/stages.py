@@ -23,6 +23,7 @@ from mpm_dolfinx.contact.history import gripped, let_go
 from mpm_dolfinx.domains.pressure_transport import at_start
 from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.materials.initial_stress import OfWater
+from mpm_dolfinx.mechanics.inertia import at_rest
 from mpm_dolfinx.parallel.messages import ConditionWarning, warn
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.stepping.initial_state import pieces_at_start
@@ -66,6 +67,10 @@ def begin_stage(
     before = state.stage
     if "gravity" in named and scene.gravity is None:
         raise ValueError("gravity: the scene was made without, must be made with (0, 0) first")
+    if "inertia" in named:
+        flag("stage: inertia", named["inertia"])
+        if scene.momentum.inertia is None:
+            raise ValueError("stage: inertia: the scene was made without, must be made with inertia=False first")
     chosen("stage: remove", remove, np.flatnonzero(before.present).tolist(), "bodies that are present")
     chosen("stage: add", add, list(before.later), "bodies that are to come later")
     flag("stage: reset_displacement", reset_displacement)
@@ -92,6 +97,8 @@ def begin_stage(
     if transported is not None:
         transported = transported.of(gone, kept=False).joined(at_start(new))
     points = _changed(scene, points, fields)
+    if begun.inertia and not before.inertia:
+        points = replace(points, data=points.data | at_rest(points))
     if reset_displacement:
         points = replace(points, origin=points.corners)
     outcome = begun.begun(before, state.outcome, np.nan if state.resets else 0.0)

@@ -10,7 +10,7 @@ from mpm_dolfinx.base.report import Report
 from mpm_dolfinx.conditions.acting import Place
 from mpm_dolfinx.forms.unknowns import collect_garbage
 from mpm_dolfinx.solve.newton import Kept, note_pressures, solve_substep
-from mpm_dolfinx.stepping.balances import Acting, Start, at_rest, balances, has_yielded, left
+from mpm_dolfinx.stepping.balances import Acting, Start, at_rest, balances, flight_of, has_yielded, left
 from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.state import State
 
@@ -50,16 +50,20 @@ def step(scene: Scene, state: State, dt: float, how: tuple = ()) -> tuple[State,
     state = start.state
     on_grid = start.on_grid
     solvers = start.matrices.solvers()
+    flight = flight_of(start)
     for acting in start.acting:
-        both, key = balances(scene, start, acting, *rates[-1:]), (start.matrices.key, acting.substep.own * dt)
-        rates.append(solve_substep(solvers, *both, partial(on_grid.as_reset, state), key, report, kept))
+        key = start.matrices.key, acting.substep.own * dt
+        both = balances(scene, start, acting, rates[-1] if rates else None, flight)
+        as_reset = partial(on_grid.as_reset, state)
+        rates.append(solve_substep(solvers, both.momentum, both.storage, as_reset, key, report, kept))
+        flight = both.flown(flight, acting.substep, dt)
     note_pressures(report, solvers, both.storage, acting.substep.before * dt, dt, rates)
     del solvers
     start.matrices.end_step()
     at, outcome = both.momentum.at, both.outcome(state)
     loads = [one.ended(at) for one in acting.loads]
     end = state.t + dt, loads, both.came(rates[-1]), report
-    new, report.rederived = scene.motion.advanced(state, on_grid, start.data, *end)
+    new, report.rederived = scene.motion.advanced(state, on_grid, start.data, *end, flown=start.flown(flight))
     velocity = None if scene.momentum.elastic else scene.momentum.u.x.array / dt
     now = {"outcome": outcome, "points": left(loads, at, state.points, new.points), "velocity": velocity}
     return replace(new, **now, begins=False, resets=state.resets + (not state.stays)), report
