@@ -26,7 +26,7 @@ def test_both_elements_converge_to_one_answer():
     tips = {}
     for element, cells in {"taylor-hood": (20, 6), "q1-dg0": (67, 20)}.items():
         drained = [mpm.Drained("left"), mpm.Drained("right")]
-        options = dict(walls={"left": "xy"}, fluid=mpm.Fluid(), tractions=[top_load()], drained=drained)
+        options = dict(walls={"left": "xy"}, fluid=mpm.Fluid(), conditions=[top_load(), *drained])
         fem = BiotFEM(*SIZE, cells, SOFT, element=element, **options)
         result = fem.run(0.2, 0.02, probes=TIP)
         assert result.converged and result.residual <= 1e-8

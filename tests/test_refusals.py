@@ -97,7 +97,7 @@ CASES = {
     "traction in words": (lambda: sides("Traction", "top", ("0", "1")), "Traction(side='top'", "'0'"),
     "plate that raises": (lambda: steps(sides("RigidPlate", "top", bad)), "RigidPlate(side='top'", "KeyError"),
     "gravity of no argument": (lambda: scene(gravity=lambda: (0, 1)), "gravity", "of ()"),
-    "field that raises": (lambda: scene(materials=[soil(bulk=lambda X: X[:, 7])]), "Hencky: bulk(X)", "IndexError"),
+    "field that raises": (lambda: scene(materials=[soil(bulk=lambda X: X[:, 7])]), "Hencky: bulk", "IndexError"),
     "shape that raises": (lambda: mpm.shape(GRID, lambda x: x[:, 2] < 1), "body: inside(x)", "IndexError"),
     "shape of a distance": (lambda: mpm.shape(GRID, lambda x: x[:, 0] - 0.5), "body: inside(x)", "float64"),
     "shape that is no function": (lambda: mpm.shape(GRID, [1, 2]), "body: inside(x)", "not callable"),

@@ -86,7 +86,7 @@ def test_a_checkpoint_with_other_tools_is_one_of_another_scene(other, tmp_path):
     plate = mpm.HalfSpace((0, 0.5), (0, -1))
     tools = [[], [mpm.Tool(plate)], [mpm.Tool(plate, friction=0.3)]]
     scene(conditions=[*tools[other - 1]]).run(0.5, 0.25, checkpoint=mpm.Checkpoint(tmp_path / "c"))
-    with pytest.raises(ValueError, match="checkpoint of another scene: tools"):
+    with pytest.raises(ValueError, match="checkpoint of another scene: data that points keep of conditions"):
         mpm.resume(scene(conditions=[*tools[other]]), tmp_path / "c")
 
 
