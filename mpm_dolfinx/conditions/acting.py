@@ -159,7 +159,7 @@ class Loads:
         """Take forces at u that residuals are not measured by off a residual, of the unknowns or what walls hold."""
 
     def inertia(self, at: At) -> PETSc.Vec | None:
-        """Return forces of the unknowns at u that add to the residual, and that this is measured by, N; None without."""
+        """Return forces at u that add to the residual of the unknowns, and measure it, N; None without."""
 
     def pattern(self, unknowns: Unknowns) -> PETSc.Mat | None:
         """Return zeros wherever `coupling` may have entries that cells have not; None if nowhere."""

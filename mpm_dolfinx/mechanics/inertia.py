@@ -13,11 +13,11 @@ The mass is that of the pieces of the domains, with their second moments S about
 
     (M + G) v_n = sum m_k [N(x_k) v(x_k) + grad N . (L S_k)],    M = sum m_k [N N^T + grad N S_k grad N^T],
 
-G = c rho h^3 int [[d_n N]] [[d_n N]] dS on faces of cells that are not full.  It is zero for affine fields.  So are what
-M and the right side differ by: linear and angular momentum survive the way to the grid and back to rounding.  Points
-carry v and the rate of F, an affine field v + F' F^-1 (x - x_p) over their domain, whose increments come from the grid
-(Brackbill and Ruppel 1986; consistent mass: Burgess, Sulsky and Brackbill 1992).  The first substep of SDIRK2 is the
-midpoint rule of a shorter step.  There a chord replaces the arc of what turns: see `chord`.
+G = c rho h^3 int [[d_n N]] [[d_n N]] dS on faces of cells that are not full.  G is zero for affine fields, on which M and
+the right side agree: linear and angular momentum survive the way to the grid and back to rounding.  Points carry v and
+the rate of F, an affine field v + F' F^-1 (x - x_p) over their domain.  Its increments come from the grid (Brackbill and
+Ruppel 1986; consistent mass: Burgess, Sulsky and Brackbill 1992).  The first substep of SDIRK2 is the midpoint rule of
+a shorter step, in which a chord stands for the arc of a turn: see `chord`.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ from mpm_dolfinx.points.parts import Parts
 GHOST_MASS = 0.02
 """Strength c of the ghost mass.
 
-Plateau: a block that turns and flies keeps momentum and energy alike from 0.002 to 0.2.
+Source: none; a turning block keeps its momentum and energy alike from 0.002 to 0.2, `tests/test_inertia.py`.
 """
 FULL = 0.9
 """Filled share of a cell below which its faces carry the ghost mass; as of `ghost_penalty.FULL`."""
@@ -184,7 +184,7 @@ class InertiaForms:
         self._ghost = FacetForm(GHOST_MASS * rho * across**3 * ufl.inner(*kinks) * dS, grid.comm)
 
     def set_substep(self, inertia: Inertia | None, midpoint: bool) -> None:
-        """Set what forms see of a substep: the acceleration, none of bodies at rest; and whether it is a midpoint rule."""
+        """Set the acceleration that forms see, none of bodies at rest; midpoint: whether the substep is such a rule."""
         self._midpoint.value = float(midpoint and inertia is not None)
         self._rate.value = 0.0 if inertia is None else inertia.rate
         if inertia is not None:
@@ -404,7 +404,7 @@ class Inertia(Loads):
 
 
 class Flight(NamedTuple):
-    """Velocities of the unknowns in a step, m/s: at its start, and at the end of the substep; its acceleration, m/s^2."""
+    """Velocities of the unknowns, m/s, at the start of a step and after a substep, and its acceleration, m/s^2."""
 
     start: PETSc.Vec
     velocity: PETSc.Vec

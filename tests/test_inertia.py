@@ -1,0 +1,279 @@
+# SPDX-License-Identifier: MIT
+"""Inertia: what moves goes on moving, and keeps its momentum, wherever the grid's lines are."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.sparse import csr_matrix
+from scipy.sparse.linalg import eigsh
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.base.time_integration import GAMMA
+from mpm_dolfinx.mechanics import inertia
+from mpm_dolfinx.points.cutting import cut
+
+TIGHT = mpm.Numerics(tolerance=1e-10)
+BLOCK = mpm.NeoHookean(bulk=1e3 / 1.2, shear=1e3 / 2.6, grain_density=2.0, porosity=0.5)  # nu = 0.3, 1 kg/m^3
+
+
+class Bar(mpm.LinearElastic):
+    """P = E (F - 1) along each axis, nu = 0: waves of any height keep their shape."""
+
+    @staticmethod
+    def energy(F, bulk, shear):
+        return shear * ((F[0, 0] - 1) ** 2 + (F[1, 1] - 1) ** 2 + F[0, 1] ** 2 + F[1, 0] ** 2)
+
+
+def csr(A):
+    rows, columns, values = A.getValuesCSR()
+    return csr_matrix((values, columns, rows), shape=A.getSize())
+
+
+def momenta(s):
+    """Return momentum (d,), angular momentum about the centre of mass and kinetic energy, counted from the points."""
+    points, d = s.points, s.grid.dim
+    whole = mpm.Grid(s.grid.lower, s.grid.upper, [1] * d)
+    spread = cut(whole, s.state.points.corners, True).second
+    mass = s.scene.materials.density(points) * points.volume0 * points.J
+    v, L = points.data["velocity"], points.data["F_rate"] @ np.linalg.inv(points.F)
+    momentum, centre = mass @ v, mass @ points.x / mass.sum()
+    off, slip = points.x - centre, v - momentum / mass.sum()
+    moment = np.einsum("ni,nj->nij", off, slip) + spread @ L.swapaxes(1, 2)
+    turn = np.einsum("n,nij->ij", mass, moment - moment.swapaxes(1, 2))
+    energy = mass @ ((slip**2).sum(axis=1) + np.einsum("nij,njk,nik->n", L, spread, L)) / 2
+    return momentum, turn[0, 1], energy
+
+
+def turning(h=0.25, drift=(0.3, 0.2), numerics=TIGHT, **options):
+    """Return a stiff block, 1 x 0.5 m, that turns by 1 rad/s and flies, without walls."""
+    grid = mpm.Grid([0, 0], [4.0, 3.0], [round(4 / h), round(3 / h)])
+    body = mpm.box(grid, [0.6, 0.7], [1.6, 1.2])
+    centre = np.array([1.1, 0.95])
+
+    def velocity(x):
+        off = x - centre
+        return np.stack([drift[0] - off[:, 1], drift[1] + off[:, 0]], axis=1)
+
+    return mpm.Simulation(
+        grid, [body], [BLOCK], walls={}, inertia=True, velocity=velocity, numerics=numerics, **options
+    )
+
+
+def test_a_block_that_turns_and_flies_keeps_its_momenta_and_energy():
+    """Without the chord of `inertia.chord` it would lose 1.6 % of its angular momentum in two radians."""
+    s = turning()
+    start = momenta(s)
+    assert start[1] == pytest.approx(0.0520833333, rel=1e-8)  # m (a^2 + b^2) / 12
+    for _ in range(40):
+        s.step(0.05)
+    end = momenta(s)
+    assert end[0] == pytest.approx(start[0], abs=1e-14)
+    assert end[1] == pytest.approx(start[1], rel=3e-4) and end[2] == pytest.approx(start[2], rel=6e-4)
+
+
+def test_the_chord_is_what_keeps_angular_momentum(monkeypatch):
+    monkeypatch.setattr(inertia, "chord", lambda G: (G, np.broadcast_to(np.eye(2), G.shape)))
+    s = turning()
+    start = momenta(s)[1]
+    for _ in range(20):
+        s.step(0.1)
+    assert momenta(s)[1] < 0.97 * start
+
+
+@pytest.mark.parametrize("factor", [0.1, 10])
+def test_the_ghost_mass_may_be_a_tenth_or_ten_times_as_large(factor, monkeypatch):
+    def end():
+        s = turning()
+        for _ in range(10):
+            s.step(0.05)
+        return np.array(momenta(s)[1:])
+
+    as_is = end()
+    monkeypatch.setattr(inertia, "GHOST_MASS", factor * inertia.GHOST_MASS)
+    assert end() == pytest.approx(as_is, rel=2e-4)
+
+
+def test_a_uniform_velocity_added_changes_nothing_else():
+    """By whole cells a step: pieces are then the same ones."""
+    still, moves = turning(drift=(0, 0)), turning(drift=(2.5, 0))
+    for _ in range(4):
+        still.step(0.1), moves.step(0.1)
+    off = moves.points.x - still.points.x
+    assert off == pytest.approx(np.broadcast_to([1.0, 0.0], off.shape), abs=1e-10)
+    assert moves.points.F == pytest.approx(still.points.F, abs=1e-9)
+
+
+def flown(cells, speed=0.23, periods=1.1, amplitude=0.05, per_period=2):
+    """Return errors of u and v of a bar that vibrates and flies, over their amplitudes, and of its momentum."""
+    h, dt = 1 / cells, 1 / cells * 2 / per_period
+    count = cells + 2 * round(speed * periods / h) + 8
+    grid = mpm.Grid([0, 0], [count * h, h], [count, 1])
+    low = 2.3 * h
+    body = mpm.box(grid, [low, 0], [low + 1, h])
+    bar = Bar(bulk=1 / 3, shear=0.5, grain_density=2.0, porosity=0.5)
+
+    def velocity(x):
+        return np.stack([speed + amplitude * np.cos(np.pi * (x[:, 0] - low)), 0 * x[:, 1]], axis=1)
+
+    walls = {"bottom": "y", "top": "y"}
+    s = mpm.Simulation(grid, [body], [bar], walls=walls, inertia=True, velocity=velocity, numerics=TIGHT)
+    start = momenta(s)[0]
+    for _ in range(round(2 * periods / dt)):
+        s.step(dt)
+    X, t = s.points.reference.mean(axis=1)[:, 0] - low, s.t
+    u = speed * t + amplitude / np.pi * np.cos(np.pi * X) * np.sin(np.pi * t)
+    v = speed + amplitude * np.cos(np.pi * X) * np.cos(np.pi * t)
+    off = (s.points.corners.mean(axis=1)[:, 0] - low - X - u) / (amplitude / np.pi), s.points.data["velocity"][:, 0] - v
+    return [np.sqrt((off[0] ** 2).mean()), np.sqrt((off[1] ** 2).mean()) / amplitude, abs(momenta(s)[0] - start).max()]
+
+
+def test_a_bar_that_vibrates_and_flies_over_the_grid_is_met_at_second_order():
+    (u, v, lost), (finer, finer_v, _) = flown(10), flown(20)
+    assert u < 0.01 and u / finer > 3.6 and v / finer_v > 3.4 and lost < 1e-14
+
+
+def test_frequencies_of_a_clamped_beam_are_those_of_spectral_elements():
+    """f1 to f3, Hz, of a beam of 1 x 0.3 m, nu = 0, converged to eight digits: from below 1 % at h = 0.05 m, order 2."""
+    exact, off = np.array([3.2441904, 15.985029, 17.6776695]), []
+    for h in (0.1, 0.05):
+        grid = mpm.Grid([0, 0], [13 * 0.1, 0.8], [round(1.3 / h), round(0.8 / h)])
+        beam = mpm.box(grid, [0, 0.2], [1, 0.5])
+        law = mpm.LinearElastic(bulk=1e7 / 3, shear=5e6, grain_density=4000.0, porosity=0.5)
+        velocity = lambda x: np.stack([0 * x[:, 0], 1e-3 * x[:, 0]], axis=1)  # noqa: E731
+        s = mpm.Simulation(grid, [beam], [law], walls={"left": "xy"}, inertia=True, velocity=velocity)
+        s.step(1e-4)
+        _, made = s.scene.last
+        M = csr(made.mass.M)
+        K = csr(made.momentum.K) - M / (GAMMA * 1e-4) ** 2
+        found = np.sqrt(eigsh(K, 3, M, sigma=0)[0]) / (2 * np.pi)
+        off.append(found / exact - 1)
+    assert (np.array(off) > 0).all() and (off[1] < 0.01).all() and (off[0] / off[1] > 3.4).all()
+
+
+def column(inertia=True, n=20, **options):
+    """Return a dry confined column, 10 m high: waves run up and down in it at 188.7 m/s."""
+    young, nu = 50e6, 0.3
+    soil = mpm.LinearElastic(
+        bulk=young / 3 / (1 - 2 * nu), shear=young / 2 / (1 + nu), grain_density=2700.0, porosity=0.3
+    )
+    h = 10 / n
+    grid = mpm.Grid([0, 0], [h, 10 + 2 * h], [1, n + 2])
+    body = mpm.box(grid, [0, 0], [h, 10])
+    walls = {"left": "x", "right": "x", "bottom": "y"}
+    return mpm.Simulation(grid, [body], [soil], walls=walls, inertia=inertia, **options)
+
+
+def test_a_sudden_load_runs_down_and_doubles_at_the_base():
+    """Exact: the base bears nothing until t = L / c, then twice the load until 3 L / c."""
+    s, c = column(n=40, conditions=[mpm.Traction("top", (0, -1e3))]), np.sqrt(67307692.31 / 1890)
+    width, dt = s.points.corners[:, :, 0].max(), 10 / 40 / c
+    base = []
+    for _ in range(100):
+        s.step(dt)
+        base.append(s.wall_reactions["bottom"][1] / (1e3 * width))
+    base = np.array(base)
+    assert np.abs(base[:34]).max() < 0.1 and base[60:100].mean() == pytest.approx(2.0, abs=0.02)
+
+
+def test_stages_begin_and_end_inertia_with_forces_in_balance():
+    """A column settles under its weight without it, stays at rest with it, and after a load goes on moving."""
+    s = column(inertia=False, gravity=(0, -9.81))
+    s.run(1.0, 1.0, progress=False)
+    settled = s.points.x.copy()
+    s.stage(inertia=True)
+    s.run(1.1, 0.02, progress=False)
+    assert np.abs(s.points.x - settled).max() < 1e-9
+    s.stage(conditions=[mpm.Traction("top", (0, -1e4))])
+    s.run(1.12, 0.01, progress=False)
+    assert np.abs(s.points.data["velocity"]).max() > 1e-3
+    s.stage(inertia=False, conditions=[])
+    s.run(2.0, 1.0, progress=False)
+    assert np.abs(s.points.x - settled).max() < 1e-6
+
+
+def test_a_block_falls_as_stones_do_and_slides_as_its_friction_says():
+    grid = mpm.Grid([0, 0], [1, 4], [5, 20])
+    block = mpm.box(grid, [0.3, 3.1], [0.7, 3.5])
+    s = mpm.Simulation(grid, [block], [BLOCK], walls={}, gravity=(0, -9.81), inertia=True)
+    start = s.points.x.copy()
+    s.run(0.5, 0.05, progress=False)
+    assert s.points.x - start == pytest.approx(np.broadcast_to([0, -9.81 / 8], start.shape), abs=1e-8)
+
+
+def test_a_block_on_an_incline_slides_with_its_exact_acceleration():
+    angle, mu = np.pi / 6, 0.3
+    grid = mpm.Grid([0, 0], [2.0, 1.0], [20, 10])
+    block = mpm.box(grid, [0.2, 0.23], [0.5, 0.43])
+    stiff = mpm.Hencky(bulk=1e6, shear=6e5, grain_density=2000.0)
+    floor = mpm.Tool(mpm.HalfSpace((0, 0.23), (0, 1)), friction=mu, name="floor")
+    gravity = 9.81 * np.array([np.sin(angle), -np.cos(angle)])
+    s = mpm.Simulation(grid, [block], [stiff], walls={}, conditions=[floor], gravity=gravity, inertia=True)
+    start = s.points.x[:, 0].mean()
+    s.run(0.5, 0.01, progress=False)
+    exact = 9.81 * (np.sin(angle) - mu * np.cos(angle)) * 0.5**2 / 2
+    assert s.points.x[:, 0].mean() - start == pytest.approx(exact, rel=0.01)
+
+
+def test_a_saturated_column_shakes_as_the_exact_one():
+    """u-p with the fluid's acceleration in its flux: Zienkiewicz, Chang and Bettess (1980), Pi1 = 1, Pi2 = 0.1."""
+    frequency, exact = 58.13164491, 1.50970174e-8 * np.exp(-0.7539278j)
+    soil = mpm.LinearElastic(
+        bulk=50e6 / 1.2, shear=50e6 / 2.6, grain_density=2700.0, porosity=0.3, conductivity=7.70570326e-3
+    )
+    grid = mpm.Grid([0, 0], [0.5, 11.0], [1, 22])
+    body = mpm.box(grid, [0, 0], [0.5, 10])
+    load = mpm.Traction("top", lambda t: (0, -np.cos(frequency * t)))
+    s = mpm.Simulation(
+        grid,
+        [body],
+        [soil],
+        walls={"left": "x", "right": "x", "bottom": "xy"},
+        conditions=[load, mpm.Drained("top")],
+        fluid=mpm.Fluid(density=1000.0, bulk=2.2e9),
+        inertia=True,
+    )
+    dt, found = 2 * np.pi / frequency / 25, 0.0
+    for _ in range(10 * 25):
+        s.step(dt)
+        if s.t > 9.01 * 25 * dt:
+            found += (10 - s.points.corners[:, :, 1].max()) * np.exp(-1j * frequency * s.t) * 2 / 25
+    assert abs(found / exact - 1) < 0.04
+
+
+def test_a_resumed_flight_has_the_same_bits(tmp_path):
+    def scene():
+        return turning(h=0.5)
+
+    one, other = scene(), scene()
+    one.run(0.4, 0.1, checkpoint=mpm.Checkpoint(one, tmp_path / "flight.npz"), progress=False)
+    mpm.resume(other, tmp_path / "flight.npz")
+    for s in (one, other):
+        s.run(0.8, 0.1, progress=False)
+    assert np.array_equal(one.points.x, other.points.x)
+    assert np.array_equal(one.points.data["velocity"], other.points.data["velocity"])
+
+
+@pytest.mark.parametrize(
+    ("options", "names"),
+    [
+        ({"velocity": (1, 0)}, "velocity"),
+        ({"inertia": False, "velocity": (1, 0)}, "at rest at first"),
+        ({"inertia": 1}, "inertia"),
+        ({"inertia": True, "velocity": (1, 0, 0)}, "velocity"),
+        ({"inertia": True, "velocity": lambda X: X}, "velocity"),
+        ({"inertia": True, "numerics": mpm.Numerics(quadrature="point")}, "quadrature"),
+    ],
+)
+def test_what_is_no_inertia_is_refused(options, names):
+    grid = mpm.Grid([0, 0], [1, 1], [4, 4])
+    with pytest.raises(ValueError, match=names):
+        mpm.Simulation(grid, [mpm.box(grid, [0, 0], [0.5, 0.5])], [BLOCK], walls={"left": "xy"}, **options)
+
+
+def test_a_scene_without_inertia_has_none_of_its_forms_and_gets_none():
+    s = column(inertia=None)
+    assert s.scene.momentum.inertia is None and "velocity" not in s.points.data
+    with pytest.raises(ValueError, match="inertia=False"):
+        s.stage(inertia=True)
+    assert replace(s.state) is not None
