@@ -13,11 +13,11 @@ The mass is that of the pieces of the domains, with their second moments S about
 
     (M + G) v_n = sum m_k [N(x_k) v(x_k) + grad N . (L S_k)],    M = sum m_k [N N^T + grad N S_k grad N^T],
 
-G = c rho h^3 int [[d_n N]] [[d_n N]] dS on faces of cells that are not full.  G is zero for affine fields, on which M and
-the right side agree: linear and angular momentum survive the way to the grid and back to rounding.  Points carry v and
-the rate of F, an affine field v + F' F^-1 (x - x_p) over their domain.  Its increments come from the grid (Brackbill and
-Ruppel 1986; consistent mass: Burgess, Sulsky and Brackbill 1992).  The first substep of SDIRK2 is the midpoint rule of
-a shorter step, in which a chord stands for the arc of a turn: see `chord`.
+G = c rho h^3 int [[d_n N]] [[d_n N]] dS on faces of cells that are not full.  G is zero for affine fields, on which M
+and the right side agree: linear and angular momentum survive the way to the grid and back to rounding.  Points carry v
+and the rate of F, an affine field v + F' F^-1 (x - x_p) over their domain.  Its increments come from the grid
+(Brackbill and Ruppel 1986; consistent mass: Burgess, Sulsky and Brackbill 1992).  The first substep of SDIRK2 is the
+midpoint rule of a shorter step, in which a chord stands for the arc of a turn: see `chord`.
 """
 
 from __future__ import annotations
@@ -42,7 +42,6 @@ from mpm_dolfinx.forms.point_forms import FacetForm, FormPoints, Places, PointDa
 from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts
 from mpm_dolfinx.grid.grid import Grid, sum_by
 from mpm_dolfinx.points.material_points import MaterialPoints, middle
-from mpm_dolfinx.points.parts import Parts
 
 GHOST_MASS = 0.02
 """Strength c of the ghost mass.
@@ -397,10 +396,6 @@ class Inertia(Loads):
         K = self._mass.M.copy()
         K.scale(self.rate)
         return K
-
-    def guess(self, parts: Parts, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the displacement of free flight (nodes, d), m."""
-        return self.flight.reshape(nodal.shape)
 
 
 class Flight(NamedTuple):

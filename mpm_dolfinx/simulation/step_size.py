@@ -253,6 +253,8 @@ def step_rule(times: Times, rtol, first_step, max_step: float, scene: Scene, poi
     if scene.numerics.method == "backward-euler":
         raise ValueError(f"rtol = {line(rtol)}: backward-euler knows no error of a step, must be sdirk2")
     timed = any("dt" in law.by_scene for law in scene.materials.laws)
+    if scene.momentum.inertia is not None:
+        raise ValueError(f"rtol = {line(rtol)}: the error of a motion with inertia is not known, must be dt")
     if (scene.momentum.own.rates or timed) and not scene.flows:
         raise ValueError(f"rtol = {line(rtol)}: where nothing flows no error of a velocity is known, must be dt")
     longest = float(numbers("max_step", max_step, **positive)) if max_step != inf else inf

@@ -116,6 +116,8 @@ def factor_of_safety(
     """
     if not isinstance(getattr(simulation, "scene", None), Scene):
         raise ValueError(f"simulation = {line(simulation)}, must be a Simulation")
+    if simulation.state.stage.inertia:
+        raise ValueError("factor_of_safety: bodies have inertia, must be a stage without: stage(inertia=False)")
     dt, steps = _step_of(simulation, dt), whole("steps", steps, 8)
     rtol = float(numbers("rtol", rtol, allowed="in [1e-4, 0.5]", test=lambda v: (1e-4 <= v) & (v <= 0.5)))
     flag("progress", progress)

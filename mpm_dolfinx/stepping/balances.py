@@ -144,6 +144,7 @@ def balances(
         own = float(substep.own * dt)
         inertia = Inertia(matrices.mass, flight.free(own, float(substep.before * dt)), 1 / own**2)
         loads = [*loads, inertia]
+        scene.momentum.u.x.array[:] = inertia.flight  # elsewhere forces of inertia would hide what is out of balance
     if scene.momentum.inertia is not None:
         scene.momentum.inertia.set_substep(inertia, substep.end < 1)
     forces = scene.scheme.tolerance, going_on(scene, start, substep), start.state.held

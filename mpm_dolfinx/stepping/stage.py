@@ -203,6 +203,8 @@ def stage(
     by_name = {name: with_weight(one, fluid) for name, one in given_by_name.items()}
     if fluid is None and any(isinstance(one, (Drained, Inflow)) for one in by_name.values()):
         raise ValueError("drained and inflow sides need a fluid")
+    if conditions["inertia"]:
+        _check_inertia(by_name)
     gravity = conditions["gravity"]
     if callable(gravity):
         check_names("gravity", gravity, ("t",))
@@ -235,6 +237,16 @@ def stage(
         acting=tuple(acting),
         hydraulic=HydraulicBoundary(sides, setting.of(Drained, Inflow)),
     )
+
+
+def _check_inertia(by_name: Mapping[str, Any]) -> None:
+    """Refuse conditions that bodies with inertia do not have yet."""
+    for name, one in by_name.items():
+        if isinstance(one, Contact):
+            raise ValueError(f"{name}: contacts of groups are quasi-static, must be left out with inertia")
+        if isinstance(one, Tool) and (one.grips or one.load is not None):
+            what = "a load, and no mass" if one.load is not None else "friction"
+            raise ValueError(f"{name}: the tool has {what}, must be smooth and moved as given with inertia")
 
 
 def _gravity(value: ArrayLike, name: str, dim: int, axisymmetric: bool) -> NDArray[np.float64]:
