@@ -6,8 +6,8 @@ import pytest
 from helpers import SOFT, beam, column, joined, without
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx.conditions.walls import wall_forces
 from mpm_dolfinx.io.checkpoint import save
-from mpm_dolfinx.mechanics.walls import wall_forces
 
 SOIL = mpm.Hencky(bulk=2e8, shear=1e8, porosity=0.4, conductivity=1e-5, grain_density=2650)
 G = 9.81

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.base import _compat
 from mpm_dolfinx.conditions.acting import At, FormsOf, Loads
+from mpm_dolfinx.conditions.walls import wall_forces
 from mpm_dolfinx.forms.cell_matrices import Beside, ElementForces, ElementMatrices, StackedElementMatrices
 from mpm_dolfinx.forms.point_forms import FormPoints
 from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts, zero
@@ -38,7 +39,6 @@ from mpm_dolfinx.mechanics.inertia import InertiaForms
 from mpm_dolfinx.mechanics.mean_dilatation import MeanDilatation
 from mpm_dolfinx.mechanics.own_terms import OwnTerms
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
-from mpm_dolfinx.mechanics.walls import wall_forces
 from mpm_dolfinx.mechanics.weight import Weight
 from mpm_dolfinx.points.parts import OfParts, Parts, parts_of_cells, relative
 
