@@ -138,7 +138,7 @@ def with_water(s: mpm.Simulation, bulk: float) -> mpm.Simulation:
 def linearise(s: mpm.Simulation, dt: float) -> System:
     """Return the first linear system of a step of dt, at the load of the next RAMP_STEP."""
     start = step.set_up(s.scene, s.state, RAMP_STEP)
-    momentum, _ = balances(s.scene, start, start.acting[-1])
+    momentum = balances(s.scene, start, start.acting[-1]).momentum
     matrices, pieces, contents = start.matrices, start.data.pieces, start.on_grid.contents
     flow = matrices.flow(start.state, None, start.data, start.acting[-1].t)
     storage = StorageProblem(s.scene.storage, matrices.storage, pieces, contents, flow, dt)

@@ -103,7 +103,8 @@ def set_up(simulation, dt):
     """Return the balances of a simulation's next step by backward Euler, set up and not solved."""
     start = step.set_up(simulation.scene, simulation.state, dt)
     whole = start.acting[-1]._replace(substep=METHODS["backward-euler"][0])
-    return SetUp(start, *balances(simulation.scene, start, whole))
+    both = balances(simulation.scene, start, whole)
+    return SetUp(start, both.momentum, both.storage)
 
 
 def top_load(load=54e3, ramp=0.06):

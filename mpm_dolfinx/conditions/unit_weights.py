@@ -50,7 +50,7 @@ def with_weight(condition: T, fluid: Fluid | None) -> T:
     new = {
         name: weighed(value, fluid)
         for name, value in getattr(condition, "__dict__", {}).items()
-        if hasattr(value, "weighed")
+        if isinstance(value, OfWater)
     }
     return replace(condition, **new) if new else condition
 

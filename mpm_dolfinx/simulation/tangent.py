@@ -72,7 +72,8 @@ def tangent(simulation: Simulated, dt: float) -> Tangent:
         raise ValueError(f"tangent: has matrices of one process, not of {scene.grid.comm.size}")
     start = set_up(scene, state, dt)
     acting = start.acting[-1]._replace(substep=METHODS["backward-euler"][0])
-    momentum, storage = balances(scene, start, acting)
+    both = balances(scene, start, acting)
+    momentum, storage = both.momentum, both.storage
     momentum.assemble_residual()
     unknowns = momentum.system.unknowns
     blocks = {"stiffness": _csr(momentum.assemble_tangent()), "x": unknowns.positions}
