@@ -74,13 +74,18 @@ def motions(draw, *kinds):
         F = turned(draw, np.diag(numbers(draw, 0.7, 1.3, d)) + 0.2 * np.triu(bend, 1))
 
     def place(y):
-        return h * (y @ F + way + (0.2 * np.sin(y @ bend) if kind == BENT else 0.0) + offset)
+        return h * (y @ F + way + (0.2 * np.sin(y @ bend) if kind == BENT else 0.0) + offset) - grid.base
 
-    before = cut(grid, h * (y + offset))
+    before = cut(grid, h * (y + offset) - grid.base)
     after = before if kind == AT_REST else cut(grid, place(y))
     points = Points(3 + np.cumsum(1 + np.arange(len(y)) % 3))  # some have gone to other processes
     return Motion(
-        h, points, before, place(before.x / h - offset), after, np.random.default_rng(draw(st.integers(0, 2**32)))
+        h,
+        points,
+        before,
+        place((before.x + grid.base) / h - offset),
+        after,
+        np.random.default_rng(draw(st.integers(0, 2**32))),
     )
 
 
