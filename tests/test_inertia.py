@@ -241,6 +241,16 @@ def test_a_saturated_column_shakes_as_the_exact_one():
     assert abs(found / exact - 1) < 0.04
 
 
+def test_a_fill_comes_at_rest():
+    grid = mpm.Grid([0, 0], [1, 2], [4, 8])
+    bodies = [mpm.box(grid, [0, 0], [1, 0.5]), mpm.box(grid, [0, 0.5], [1, 1])]
+    walls = {"left": "x", "right": "x"}
+    s = mpm.Simulation(grid, bodies, [BLOCK], walls=walls, later=[1], inertia=True, velocity=(0, 0.1))
+    s.stage(add=[1])
+    fill = s.points.id >= len(bodies[0])
+    assert (s.points.data["velocity"][fill] == 0).all() and (s.points.data["velocity"][~fill, 1] == 0.1).all()
+
+
 def test_a_resumed_flight_has_the_same_bits(tmp_path):
     def scene():
         return turning(h=0.5)

@@ -189,6 +189,8 @@ def _filled(
         placed = scene.initial.of(
             scene.materials, placed, [i in (*there, *add) for i in range(len(scene.bodies))], gravity
         )
+        if scene.momentum.inertia is not None:
+            placed = replace(placed, data=placed.data | at_rest(placed))
         points, new = points.joined(placed), new.joined(placed)
         there.append(fill)
         waiting.remove(fill)
