@@ -6,14 +6,13 @@ from pathlib import Path
 
 import pytest
 
-import mpm_dolfinx as mpm
-
 sys.path.insert(0, str(Path(__file__).parent.parent / "demos"))
 
 
 @pytest.fixture
 def warned(recwarn):
     """Return a function that gives the messages of the package's warnings since it was called last."""
+    import mpm_dolfinx as mpm  # not above: xdist would hand its workers MPI's variables, with which mpirun ends
 
     def messages():
         found = [str(one.message) for one in recwarn if issubclass(one.category, mpm.ResultWarning)]
