@@ -200,7 +200,8 @@ def perform(s, asked, name, *arguments):
         s.stage(reset_displacement=arguments[0])
 
 
-TestDriven = Driven.TestCase
+# wet sand finds no step within 25 iterations where seepage and yield alternate: to be mended, then it is quick again
+TestDriven = pytest.mark.slow(Driven.TestCase)
 TestDriven.settings = settings(
     max_examples=25, stateful_step_count=14, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck)
 )
