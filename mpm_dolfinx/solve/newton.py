@@ -420,10 +420,11 @@ class Newton:
     def _line_search(self, before: Errors, elastic: bool) -> Errors:
         """Go against the direction, each part as far as `search` says; return the errors there."""
         self.report.newton += 1
-        residual, of = self._momentum.system.residual, self._momentum.system.of_parts
-        if not elastic:
-            self._turn_forwards(before)
-        first = of.sums(residual.array_r * self._solvers.du.array_r)
+        of = self._momentum.system.of_parts
+        first = self._work()
+        if not elastic and (first < 0).any():
+            self._solvers.turn_round(first < 0)
+            first = np.abs(first)
         searches = {
             part: Halving() if elastic else Search() for part in np.flatnonzero(before.each > self._scheme.tolerance)
         }
@@ -432,7 +433,7 @@ class Newton:
             self._move(moved - steps)
             moved, (errors, why) = steps.copy(), self._tried(before)
             with _ignored():
-                growth, work = errors.each / before.each, of.sums(residual.array_r * self._solvers.du.array_r)
+                growth, work = errors.each / before.each, self._work()
             for part, search in list(searches.items()):
                 then = search.after(np.nan if why else _ratio(work[part], first[part]), growth[part])
                 if then is not None:
@@ -454,18 +455,17 @@ class Newton:
             away = np.where(before.each > self._scheme.tolerance, np.inf, before.each)
             return replace(before, u=away, p=away), failed
 
-    def _turn_forwards(self, errors: Errors) -> None:
-        """Turn a direction round along which the residuals do negative work: see `search`.
+    def _work(self) -> NDArray[np.float64]:
+        """Return the work (parts,), J, of both residuals along the direction.
 
-        The work of both residuals, in which the coupling's cancels, is what the tangent takes.
+        That of the coupling cancels in their sum, so the tangent alone makes it: see `search`.
         """
         system = self._momentum.system
         work = system.of_parts.sums(system.residual.array_r * self._solvers.du.array_r)
-        if self._storage is not None:
-            of_fluid = errors.fluid.vector.array_r * self._solvers.dp.array_r
-            work = work + self._storage.system.of_parts.sums(of_fluid)
-        if (work < 0).any():
-            self._solvers.turn_round(work < 0)
+        if self._storage is None:
+            return work
+        system = self._storage.system
+        return work + system.of_parts.sums(system.residual.array_r * self._solvers.dp.array_r)
 
     def _move(self, steps: NDArray[np.float64]) -> None:
         """Move the parts by shares (parts,) of the direction."""

@@ -6,9 +6,10 @@ order.  It is halved while a law cannot be evaluated at its end, or the residual
 
 Where soil yields a step is full if the residual falls, or if the forces do less work along it at its end than half of
 that at its start; else it goes to about where they do none (Matthies and Strang 1979): there points that it unloads
-leave their yield surface, and the next tangent is as stiff as they are.  Shorter steps, with lower residuals, would be
-followed by ones as short.  One secant finds it, as PETSc's critical point search does.  With up to six, Newton's method
-takes as many steps.
+leave their yield surface, and the next tangent is as stiff as they are.  Work is that of the forces and of the fluid:
+that of the forces alone is next to none where these balance and the fluid does not.  Shorter steps, with lower
+residuals, would be followed by ones as short.  One secant finds it, as PETSc's critical point search does.  With up to
+six, Newton's method takes as many steps.
 
 Soil that flows has next to no stiffness along its mechanisms, where flow is not associated even less than none: full
 steps go far astray there.  A share of the elastic shear stiffness in the tangent, as the residual of the forces is
