@@ -150,8 +150,10 @@ class CutDomains(Keyed):
         return volume / (TURN * self.hoop[:, 3]), self.grid.midpoints[self.cells] + self.hoop[:, :2]
 
     def mean(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the volume means (n,) over the pieces of each point of values (m,) on the pieces."""
-        return sum_by(self.pieces.point, self.pieces.fraction * values, len(self.points))
+        """Return the volume means (n, ...) over the pieces of each point of values (m, ...) on the pieces."""
+        columns = values.reshape(len(values), int(np.prod(values.shape[1:]))).T
+        means = [sum_by(self.pieces.point, self.pieces.fraction * column, len(self.points)) for column in columns]
+        return np.stack(means, axis=1).reshape(len(self.points), *values.shape[1:])
 
     def in_plane(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the same means of values at the pieces' centroids in the plane, in axisymmetry by area."""

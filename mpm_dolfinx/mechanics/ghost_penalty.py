@@ -51,6 +51,16 @@ def stiffness(material: Skeleton) -> NDArray[np.float64]:
     return 2 * np.maximum(YIELDING, share) * material.shear
 
 
+def kinks(grid: Grid, V: fem.FunctionSpace, strength: ufl.core.expr.Expr, power: int) -> FacetForm:
+    """Return the form int strength h^power [d_n u].[d_n v] dS over faces, h the edge of the cells across them, m."""
+    n = ufl.FacetNormal(grid.mesh)("+")
+    h = fem.Constant(grid.mesh, grid.h)
+    across = sum(abs(n[a]) * h[a] for a in range(grid.dim))
+    dS = ufl.Measure("dS", domain=grid.mesh, subdomain_id=_compat.SUBDOMAIN, metadata={"quadrature_degree": 2})
+    jumps = [ufl.dot(ufl.grad(w)("+") - ufl.grad(w)("-"), n) for w in (ufl.TrialFunction(V), ufl.TestFunction(V))]
+    return FacetForm(strength * across**power * ufl.inner(*jumps) * dS, grid.comm)
+
+
 class GhostPenalty:
     """The form, with modulus and filled share of the cells.
 
@@ -82,17 +92,8 @@ class GhostPenalty:
         self.modulus, self.shear, self.fill, self.beside = (fem.Function(cellwise) for _ in range(4))
         v = ufl.TestFunction(V)
         du = ufl.TrialFunction(V)
-        n = ufl.FacetNormal(grid.mesh)("+")
-        h = fem.Constant(grid.mesh, grid.h)
-        across = sum(abs(n[a]) * h[a] for a in range(grid.dim))
-        dS = ufl.Measure("dS", domain=grid.mesh, subdomain_id=_compat.SUBDOMAIN, metadata={"quadrature_degree": 2})
-
-        def kink(w):
-            return ufl.dot(ufl.grad(w)("+") - ufl.grad(w)("-"), n)
-
         around = TURN * ufl.SpatialCoordinate(grid.mesh)[0] if grid.axisymmetric else ufl.as_ufl(1.0)
-        form = GHOST / 3 * self._scale() * around("+") * across * ufl.inner(kink(du), kink(v)) * dS
-        self.form = FacetForm(form, grid.comm)
+        self.form = kinks(grid, V, GHOST / 3 * self._scale() * around("+"), 1)
         dx = ufl.Measure("dx", domain=grid.mesh, subdomain_id=_compat.SUBDOMAIN, metadata={"quadrature_degree": 2})
         strains = [ufl.sym(ufl.grad(w)) for w in (du, v)]
         self.firmness = FacetForm(2 * self.fill * self.shear * around * ufl.inner(*strains) * dx, grid.comm)

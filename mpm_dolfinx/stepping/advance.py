@@ -82,7 +82,7 @@ class Motion:
         came: NDArray[np.float64] | None = None,
         report: Report | None = None,
         stays: bool = True,
-        flown: Callable[[NDArray[np.float64]], dict[str, NDArray[np.float64]]] | None = None,
+        carried: Callable[[NDArray[np.float64]], dict[str, NDArray[np.float64]]] | None = None,
     ) -> tuple[State, int]:
         """Return the state at time t (s) after a solved step, and how many domains had folded.
 
@@ -100,7 +100,7 @@ class Motion:
             What the step took, which is told of where a point leaves the grid.
         stays
             Whether pieces stay in their cells where points hardly move.
-        flown
+        carried
             Gives velocities of points by cells (n,) that they have moved where the grid is reset, see `Mass.carried`.
 
         Raises
@@ -123,10 +123,10 @@ class Motion:
                 points = replace(state.points, x=x, F=F, corners=parallelepipeds(x, F, self._sizes(state.points)))
                 keeps, folded = on_grid.serves(points), 0
             self._check_volumes(points, cut)
-            if flown is not None:
+            if carried is not None:
                 part, count = on_grid.parts
                 moved = np.where(keeps & stays, 0.0, cut.moved(points, part, count)[part])
-                points = replace(points, data=points.data | flown(moved))
+                points = replace(points, data=points.data | carried(moved))
             points = replace(points, data=self._materials.updated_state(points, state.points, t - state.t))
             ids = None
             pressure = None
@@ -208,7 +208,7 @@ class Motion:
             delta = self._momentum.dilatation.averaged(delta, data)
         F = delta @ pieces["F"].reshape(-1, d, d)
         columns = np.concatenate([F.reshape(-1, d * d), determinant(F)[:, None]], axis=1)
-        mean = np.stack([cut.mean(column) for column in cut.to_pieces(columns).T], axis=1)
+        mean = cut.mean(cut.to_pieces(columns))
         F, J = mean[:, :-1].reshape(n, d, d), mean[:, -1]
         return with_ratio(F, J)
 

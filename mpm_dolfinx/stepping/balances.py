@@ -48,7 +48,7 @@ class Start(NamedTuple):
     yielded: bool
     acting: list[Acting]
 
-    def flown(self, flight: Flight | None) -> Callable[[NDArray[np.float64]], dict[str, NDArray[np.float64]]] | None:
+    def carrying(self, flight: Flight | None) -> Callable[[NDArray[np.float64]], dict[str, NDArray[np.float64]]] | None:
         """Return what gives velocities of points after the step, see `Mass.carried`; None without inertia."""
         if flight is None:
             return None

@@ -24,8 +24,7 @@ from mpm_dolfinx.flow.nonorthogonal import Gradients, off_facets
 from mpm_dolfinx.flow.storage import Outflow, StorageForms, StorageSystem
 from mpm_dolfinx.forms.unknowns import collect_garbage
 from mpm_dolfinx.grid.grid import sum_by
-from mpm_dolfinx.mechanics.ghost_penalty import stiffness
-from mpm_dolfinx.mechanics.inertia import FULL
+from mpm_dolfinx.mechanics.ghost_penalty import FULL, stiffness
 from mpm_dolfinx.mechanics.momentum import MomentumForms, MomentumSystem
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData, QuadraturePoints
 from mpm_dolfinx.points.material_points import MaterialPoints

@@ -23,7 +23,7 @@ from mpm_dolfinx.contact.history import gripped, let_go
 from mpm_dolfinx.domains.pressure_transport import at_start
 from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.materials.initial_stress import OfWater
-from mpm_dolfinx.mechanics.inertia import at_rest
+from mpm_dolfinx.mechanics.inertia import resting
 from mpm_dolfinx.parallel.messages import ConditionWarning, warn
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.stepping.initial_state import pieces_at_start
@@ -98,7 +98,7 @@ def begin_stage(
         transported = transported.of(gone, kept=False).joined(at_start(new))
     points = _changed(scene, points, fields)
     if begun.inertia and not before.inertia:
-        points = replace(points, data=points.data | at_rest(points))
+        points = replace(points, data=points.data | resting(points))
     if reset_displacement:
         points = replace(points, origin=points.corners)
     outcome = begun.begun(before, state.outcome, np.nan if state.resets else 0.0)
@@ -190,7 +190,7 @@ def _filled(
             scene.materials, placed, [i in (*there, *add) for i in range(len(scene.bodies))], gravity
         )
         if scene.momentum.inertia is not None:
-            placed = replace(placed, data=placed.data | at_rest(placed))
+            placed = replace(placed, data=placed.data | resting(placed))
         points, new = points.joined(placed), new.joined(placed)
         there.append(fill)
         waiting.remove(fill)

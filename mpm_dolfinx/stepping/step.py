@@ -63,7 +63,7 @@ def step(scene: Scene, state: State, dt: float, how: tuple = ()) -> tuple[State,
     at, outcome = both.momentum.at, both.outcome(state)
     loads = [one.ended(at) for one in acting.loads]
     end = state.t + dt, loads, both.came(rates[-1]), report
-    new, report.rederived = scene.motion.advanced(state, on_grid, start.data, *end, flown=start.flown(flight))
+    new, report.rederived = scene.motion.advanced(state, on_grid, start.data, *end, carried=start.carrying(flight))
     velocity = None if scene.momentum.elastic else scene.momentum.u.x.array / dt
     now = {"outcome": outcome, "points": left(loads, at, state.points, new.points), "velocity": velocity}
     return replace(new, **now, begins=False, resets=state.resets + (not state.stays)), report
