@@ -295,3 +295,66 @@ def test_what_does_not_see_inertia_refuses_it():
         s.run(1.0, rtol=1e-2)
     with pytest.raises(ValueError, match="inertia=False"):
         mpm.factor_of_safety(s)
+
+
+def in_frame(length=1.0, mass=1.0, time=1.0, order=(0, 1), sign=(1, 1), wet=False):
+    """Return places, over the length, and J of a turning block after some steps, as in its own frame.
+
+    order, sign: of the axes, in which it is turned and mirrored.
+    """
+    order, sign, stress = list(order), np.array(sign), mass / (length * time**2)
+    size, low, high = (length * np.array(x)[order] for x in ([4.0, 3.0], [0.6, 0.7], [1.6, 1.2]))
+    low, high = (np.where(sign > 0, one, size - other) for one, other in ((low, high), (high, low)))
+
+    def own(x):
+        return (np.where(sign > 0, x, size - x) / length)[:, order]
+
+    def velocity(x):
+        off = own(x) - [1.1, 0.95]
+        return np.stack([0.3 - off[:, 1], 0.2 + off[:, 0]], axis=1)[:, order] * sign * length / time
+
+    law = mpm.NeoHookean(
+        bulk=1e3 / 1.2 * stress,
+        shear=1e3 / 2.6 * stress,
+        grain_density=2 * mass / length**3,
+        porosity=0.5,
+        conductivity=1e-3 * length / time if wet else 0.0,
+    )
+    water = mpm.Fluid(density=mass / length**3, bulk=1e5 * stress, gravity=9.81 * length / time**2)
+    grid = mpm.Grid([0, 0], size, np.array([16, 12])[order])
+    body = mpm.box(grid, low, high)
+    options = {"fluid": water} if wet else {}
+    s = mpm.Simulation(grid, [body], [law], walls={}, inertia=True, velocity=velocity, numerics=TIGHT, **options)
+    for _ in range(3):
+        s.step(0.1 * time)
+    rows = np.lexsort(np.round(own(s.points.reference.mean(axis=1)), 6).T)
+    return own(s.points.x)[rows], s.points.J[rows]
+
+
+@pytest.mark.parametrize("wet", [False, True])
+@pytest.mark.parametrize(
+    "frame",
+    [{"length": 1e3}, {"length": 1e-4}, {"mass": 1e6}, {"time": 86400.0}, {"sign": (-1, 1)}, {"order": (1, 0)}],
+    ids=["length x 1e3", "length x 1e-4", "mass x 1e6", "time x 86400", "mirrored", "turned"],
+)
+def test_a_flight_is_the_same_in_other_units_mirrored_and_turned(frame, wet):
+    for found, asked in zip(in_frame(**frame, wet=wet), in_frame(wet=wet), strict=True):
+        assert found == pytest.approx(asked, rel=1e-10)
+
+
+def test_a_body_far_away_changes_nothing():
+    alone, found = turning(), []
+    grid, centre = alone.grid, np.array([1.1, 0.95])
+    bodies = [mpm.box(grid, [0.6, 0.7], [1.6, 1.2]), mpm.box(grid, [2.9, 2.0], [3.4, 2.5], material=1)]
+    stiff = mpm.NeoHookean(bulk=1e9, shear=1e9, grain_density=8e3)
+
+    def velocity(x):
+        off = x - centre
+        return np.where(x[:, :1] < 2.4, np.stack([0.3 - off[:, 1], 0.2 + off[:, 0]], axis=1), [[-0.1, 0.05]])
+
+    both = mpm.Simulation(grid, bodies, [BLOCK, stiff], walls={}, inertia=True, velocity=velocity, numerics=TIGHT)
+    for s in (alone, both):
+        for _ in range(4):
+            s.step(0.05)
+        found.append(s.points.x[: len(bodies[0])])
+    assert found[1] == pytest.approx(found[0], abs=1e-9)
