@@ -36,22 +36,30 @@ class LawAtPoints:
         Class of the law.
     shapes
         Shape of each of its parameters and of its variables of state.
+    stretches
+        Number of axes of the deformation gradients that it sees; by default that of the grid.
     cell_size
         That laws are given, m; by default that of the grid.
     """
 
     def __init__(
-        self, grid: Grid, law: type[Skeleton], shapes: dict[str, tuple[int, ...]], cell_size: float | None = None
+        self,
+        grid: Grid,
+        law: type[Skeleton],
+        shapes: dict[str, tuple[int, ...]],
+        stretches: int | None = None,
+        cell_size: float | None = None,
     ):
         self.grid = grid
         self.law = law
         self._shapes = shapes
+        self._stretches = grid.stretches if stretches is None else stretches
         self._by_scene = by_scene(grid, cell_size)
 
     @cached_property
     def points(self) -> FormPoints:
         """The points, with F and what the law takes."""
-        return FormPoints(self.grid, F=(self.grid.stretches, self.grid.stretches), **self._shapes)
+        return FormPoints(self.grid, F=(self._stretches, self._stretches), **self._shapes)
 
     @cached_property
     def _F(self):
@@ -83,6 +91,7 @@ class LawAtPoints:
         x = points.x[rows]
         cells = self.grid.local(self.grid.number(self.grid.index_from_base(x)))
         taken = {name: values[name][rows] for name in ("F", *self._shapes)}
+        taken["F"] = taken["F"][:, : self._stretches, : self._stretches]
         return self.points.at(cells, x, points.volume0[rows], **taken)
 
     @cached_property
@@ -103,7 +112,7 @@ class LawAtPoints:
 
     def stress_3d(self, data: PointData) -> NDArray[np.float64]:
         """Return the effective Cauchy stress (n, 3, 3), Pa; nan across the plane where the law does not know it."""
-        if self.grid.stretches == 3:
+        if self._stretches == 3:
             return self.stress(data)
         out = np.zeros((len(data.cells), 3, 3))
         out[:, :2, :2], across = self.stress(data), self._out_of_plane
@@ -165,19 +174,19 @@ class SoftnessAtPoints:
 
     Parameters
     ----------
-    grid, law, shapes
+    grid, law, shapes, stretches
         See `LawAtPoints`.
     """
 
-    def __init__(self, grid: Grid, law: type[Skeleton], shapes: dict[str, tuple[int, ...]]):
+    def __init__(self, grid: Grid, law: type[Skeleton], shapes: dict[str, tuple[int, ...]], stretches: int):
         self._law = law
         self._grid = grid
         self._shapes = shapes
-        d = grid.stretches
+        self._stretches = d = stretches
         self._points = points = FormPoints(grid, F=(d, d), dF=(d, d), **shapes)
         s = ufl.variable(fem.Constant(grid.mesh, 1.0))
         F = points.F - (1 - s) * points.dF
-        F = ufl.variable(block(F) if grid.axisymmetric else F)
+        F = ufl.variable(block(F) if d > grid.dim else F)
         self._by_scene = by_scene(grid)
         values = {**{name: getattr(points, name) for name in shapes}, **self._by_scene}
         self._local = LocalUnknowns(law, points, F, values) if law.unknowns else None
@@ -198,6 +207,7 @@ class SoftnessAtPoints:
         """
         self._by_scene["dt"].value = dt
         fields = {name: at[name] for name in ("F", *self._shapes)}
+        dF = dF[:, : self._stretches, : self._stretches]
         data = PointData(self._points, at.places, at.volume, {"dF": dF, **fields})
         if self._local is not None:
             self._local.update(data)

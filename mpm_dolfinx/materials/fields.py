@@ -22,7 +22,7 @@ from mpm_dolfinx.materials.evaluate import LawAtPoints, SoftnessAtPoints, mean_s
 from mpm_dolfinx.materials.prestressed import AT_REST, stressed
 from mpm_dolfinx.materials.skeleton import BY_SCENE, Fluid, Skeleton
 from mpm_dolfinx.parallel.exchange import first
-from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints
 
 RESERVED = frozenset(
     "F dF softness owed due storage storage_at_one density position displacement porosity0 gradient retention".split()
@@ -69,21 +69,28 @@ class SceneMaterials:
         fluid: Fluid | None,
         prestressed: bool = False,
     ):
-        materials = [stressed(m, grid.stretches) for m in materials] if prestressed else materials
         self.grid = grid
-        self.materials = materials
         self.fluid = fluid
         seeded: dict[str, NDArray[np.float64]] = dict(points.data)
         self._used = _used(bodies, len(materials))  # a material that no body is of changes nothing
+        evaluated = [_evaluated(materials[i], bodies, i) for i in self._used]
+        locks = [bool(np.any(m.nearly_incompressible)) for m in evaluated]
+        self.across = grid.stretches == 2 and any(locks)
+        """Whether laws see a stretch across the plane of plane strain, that of a mean dilatation."""
+        self.stretches = 3 if self.across else grid.stretches
+        """Number of axes of the deformation gradients that laws see."""
+        if self.across:
+            seeded[ACROSS] = np.ones(len(points))
+        if prestressed:
+            materials = [stressed(m, self.stretches) for m in materials]
+            evaluated = [_evaluated(materials[i], bodies, i) for i in self._used]
+        self.materials = materials
         used = [materials[i] for i in self._used]
-        self._fields = [[name for name in _names(m) if callable(getattr(m, name))] for m in materials]
-        places = [_places(bodies, i) if self._fields[i] else np.empty((0, grid.dim)) for i in self._used]
-        evaluated = [m.at(X) for m, X in zip(used, places, strict=True)]
+        self._fields = [_by_place(m) for m in materials]
         self.laws = list(dict.fromkeys(map(type, used)))
         self.conductivity_laws = list(dict.fromkeys(m.conductivity_law for m in used if m.conductivity_law))
         """The different conductivity laws of the scene."""
         self._law = np.array([self.laws.index(type(m)) if type(m) in self.laws else 0 for m in materials])
-        locks = [bool(np.any(m.nearly_incompressible)) for m in evaluated]
         self._parts = list(dict.fromkeys(zip(map(type, used), locks, strict=True)))
         own = dict(zip(self._used, zip(map(type, used), locks, strict=True), strict=True))
         self._part = np.array([self._parts.index(own[i]) if i in own else 0 for i in range(len(materials))])
@@ -133,12 +140,17 @@ class SceneMaterials:
             for number, law in enumerate(self.laws):
                 if law.state:
                     shapes = {name: self.shapes[name] for name in _takes(law)}
-                    self._softness[number] = SoftnessAtPoints(grid, law, shapes)
+                    self._softness[number] = SoftnessAtPoints(grid, law, shapes, self._stretches_of(law))
         self.seeded = replace(points, data=seeded)
         """The points with what they carry at the start: parameters that differ from place to place, state."""
         self._at_points = [
-            LawAtPoints(grid, law, {name: self.shapes[name] for name in _takes(law)}) for law in self.laws
+            LawAtPoints(grid, law, {name: self.shapes[name] for name in _takes(law)}, self._stretches_of(law))
+            for law in self.laws
         ]
+
+    def _stretches_of(self, law: type[Skeleton]) -> int:
+        """Return the number of axes of the deformation gradients that a law sees."""
+        return 3 if self.across and (law, True) in self._parts else self.grid.stretches
 
     def _add_shapes(self, m: Skeleton, seeded: dict[str, NDArray[np.float64]], count: int) -> None:
         """Note the shapes of what a material's law takes, and seed the state of so many points."""
@@ -354,9 +366,9 @@ class SceneMaterials:
 
         In axisymmetry (n, 3, 3).
         """
-        out = np.zeros_like(points.F)
+        out, d = np.zeros_like(points.F), self.grid.stretches
         for law, rows, data in self._placed(points):
-            out[rows] = law.stress(data)
+            out[rows] = law.stress(data)[:, :d, :d]
         return out
 
     def effective_stress_3d(self, points: MaterialPoints) -> NDArray[np.float64]:
@@ -397,7 +409,7 @@ class SceneMaterials:
         for _, rows, name, values in new:
             out[name][rows] = values
         if self._softness:
-            out["softness"], dF = np.ones(len(points)), points.F - before.F
+            out["softness"], dF = np.ones(len(points)), points.F_of_laws - before.F_of_laws
             shear = self.table(points, lambda m: m.shear)
             for number, softness in self._softness.items():
                 _, rows, at = placed[number]
@@ -406,7 +418,8 @@ class SceneMaterials:
 
     def _placed(self, points: MaterialPoints) -> list[tuple[LawAtPoints, NDArray[np.int64], PointData]]:
         """Return every law with the indices and the data of the points that follow it."""
-        number, values = self.law_of(points), {"F": points.F, **self.parameters(points), **self.state(points)}
+        number, values = self.law_of(points), {**self.parameters(points), **self.state(points)}
+        values["F"] = points.F_of_laws
         rows = [np.flatnonzero(number == k) for k in range(len(self.laws))]
         return [(law, own, law.data(points, own, values)) for law, own in zip(self._at_points, rows, strict=True)]
 
@@ -439,6 +452,16 @@ def _used(bodies: Sequence[Body], count: int) -> list[int]:
         if not 0 <= body.material < count:
             raise ValueError(f"body: material = {body.material!r}, must be an index of the {count} materials")
     return sorted({int(body.material) for body in bodies})
+
+
+def _by_place(m: Skeleton) -> list[str]:
+    """Return the names of a material's fields that are functions of places."""
+    return [name for name in _names(m) if callable(getattr(m, name))]
+
+
+def _evaluated(m: Skeleton, bodies: Sequence[Body], material: int) -> Skeleton:
+    """Return a material with its fields evaluated at the places of all its points, see `_places`."""
+    return m.at(_places(bodies, material) if _by_place(m) else np.empty((0, 0)))
 
 
 def _places(bodies: Sequence[Body], material: int) -> NDArray[np.float64]:

@@ -23,7 +23,7 @@ from mpm_dolfinx.materials.prestressed import AT_REST
 from mpm_dolfinx.materials.skeleton import STANDARD_GRAVITY, Field
 from mpm_dolfinx.materials.trial import PLANE, SPACE
 from mpm_dolfinx.parallel.exchange import first, over_all
-from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints
 
 EXACT, CLOSE = 1e-13, SAME  # of the largest given stress: to which laws are solved, and have to be
 MOST = 30  # iterations
@@ -243,7 +243,7 @@ def stressed(
     if message := first(comm, message):
         raise ValueError(message)
     if "across" in points.data:
-        own = np.nan_to_num(target[:, 2, 2] - stress[:, 2, 2]) if materials.grid.stretches == 2 else 0.0
+        own = np.nan_to_num(target[:, 2, 2] - stress[:, 2, 2]) if materials.stretches == 2 else 0.0
         now = _with(now, ~plastic & ~given, across=own)
     if "plastic" in points.data:
         now = _with(now, plastic, **{"plastic" + AT_REST: now.data["plastic"]})
@@ -277,7 +277,7 @@ class _Sought:
     def free(self) -> NDArray[np.bool_]:
         """Which components (n, k) are sought."""
         out = np.repeat(~self.given[:, None], len(self.components), axis=1)
-        if self.materials.grid.stretches == 2:
+        if self.materials.stretches == 2:
             out[:, 2] &= self.plastic  # across the plane
         return out
 
@@ -299,7 +299,7 @@ class _Sought:
         mean = np.trace(target, axis1=1, axis2=2) / 3
         elastic = (target - mean[:, None, None] * identity) / (2 * shear)[:, None, None]
         elastic += (mean / (3 * bulk))[:, None, None] * identity
-        if self.materials.grid.stretches == 2:  # laws without a strain across the plane
+        if self.materials.stretches == 2:  # laws without a strain across the plane
             plane, lam = np.trace(target[:, :2, :2], axis1=1, axis2=2), bulk - 2 * shear / 3
             even = (lam * plane / (4 * shear * (lam + shear)))[:, None, None] * identity
             alone = target / (2 * shear)[:, None, None] - even
@@ -314,7 +314,7 @@ class _Sought:
         logs, turn = np.linalg.eigh(tensor)
         elastic = (turn * np.exp(2 * logs)[:, None]) @ turn.swapaxes(1, 2)
         now = _with(self.points, self.plastic & ~self.given, plastic=elastic)
-        d, stretch = self.materials.grid.stretches, (turn * np.exp(logs)[:, None]) @ turn.swapaxes(1, 2)
+        d, stretch = self.materials.stretches, (turn * np.exp(logs)[:, None]) @ turn.swapaxes(1, 2)
         now = _with(now, ~self.plastic & ~self.given, seeded_stretch=stretch[:, :d, :d])
         stress = self.materials.effective_stress_3d(now)
         return now, stress, self.of(stress - self.target)
@@ -356,10 +356,10 @@ class _Sought:
 
 def strained(materials: SceneMaterials, points: MaterialPoints, moved: MaterialPoints) -> MaterialPoints:
     """Return points with the elastic strains of others, to which these have been deformed from where they are."""
-    F = moved.F
-    d = moved.F.shape[1]
+    F = moved.F_of_laws
+    d = F.shape[1]
     law = materials.law_of(points)
-    own = {name: points.data[name] for name in ("softness", "owed", "due") if name in points.data}
+    own = {name: points.data[name] for name in ("softness", "owed", "due", ACROSS) if name in points.data}
     data = {**moved.data, **own}
     out = replace(points, data=data)
     if "seeded_stretch" in data:

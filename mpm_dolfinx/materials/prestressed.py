@@ -66,7 +66,9 @@ def _seen(function: Callable, name: str) -> Callable:
     def of(**given):
         stretch = given["seeded_stretch"]
         if "F" in given:
-            F, stretch = given["F"], stretch if given["F"].ufl_shape == stretch.ufl_shape else embedded(stretch)
+            F = given["F"]
+            if F.ufl_shape != stretch.ufl_shape:
+                F, stretch = embedded(F), embedded(stretch)
             given["F"] = block(F * stretch) if F.ufl_shape == (3, 3) and planar(F) else F * stretch
         out = function(**{argument: given[argument] for argument in taken})
         return out / ufl.det(stretch) if name in ("energy", "kirchhoff") else out
