@@ -82,7 +82,7 @@ class SceneMaterials:
         if self.across:
             seeded[ACROSS] = np.ones(len(points))
         if prestressed:
-            materials = [stressed(m, self.stretches) for m in materials]
+            materials = [stressed(m) for m in materials]
             evaluated = [_evaluated(materials[i], bodies, i) for i in self._used]
         self.materials = materials
         used = [materials[i] for i in self._used]
