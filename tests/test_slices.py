@@ -78,7 +78,6 @@ def slow(*case):
         (beam(mpm.DruckerPrager(**STRENGTH, dilation=10.0), fluid=mpm.Fluid()), True),
         (ground(mpm.NeoHookean(**SOFT)), False),
         slow(beam(mpm.Hencky(**STIFF), fluid=mpm.Fluid()), False),
-        slow(beam(mpm.DruckerPrager(**STRENGTH, dilation=0.0)), True),
         slow(beam(mpm.MohrCoulomb(**STRENGTH, dilation=0.0), fluid=mpm.Fluid()), True),
         slow(ground(mpm.Hencky(**STIFF), fluid=mpm.Fluid()), False),
         slow(ground(CLAY), True),

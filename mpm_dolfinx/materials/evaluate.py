@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from inspect import signature
@@ -12,6 +13,7 @@ import ufl
 from dolfinx import fem
 from numpy.typing import NDArray
 from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
+from ufl.algorithms.apply_derivatives import apply_derivatives
 
 from mpm_dolfinx.base.errors import NotConverged
 from mpm_dolfinx.base.tolerances import NEAR
@@ -142,6 +144,31 @@ class LawAtPoints:
             out.append((name, values[:, start:stop].reshape(-1, *shape)))
             start = stop
         return out
+
+
+def knows_space(grid: Grid, m: Skeleton) -> bool:
+    """Return whether a material's law takes F (3, 3) of plane strain; one of the user's may be for the plane only.
+
+    m: its constants are arrays over one point.  Laws with local unknowns are taken to.
+    """
+    law = type(m)
+    function, shape = (law.energy, ()) if law.kirchhoff is None else (law.kirchhoff, (3, 3))
+    if law.unknowns or function is None:
+        return True
+    values = {name: np.asarray(getattr(m, name, np.zeros(1)), dtype=float)[0] for name in law.parameters}
+    given = {name: fem.Constant(grid.mesh, value) for name, value in values.items()}
+    given |= {name: fem.Constant(grid.mesh, np.asarray(value, dtype=float)) for name, value in law.state.items()}
+    F = ufl.variable(FormPoints(grid, F=(3, 3)).F)
+    log = logging.getLogger("UFL")  # it tells what goes wrong before it raises
+    log.disabled, before = True, log.disabled
+    try:
+        law_of_F = expression(function, [shape], F=F, **given, **by_scene(grid))
+        apply_derivatives(apply_algebra_lowering(ufl.diff(law_of_F, F)))  # where UFL finds what sizes do not agree
+    except Exception:  # UFL has several kinds
+        return False
+    finally:
+        log.disabled = before
+    return True
 
 
 def by_scene(grid: Grid, cell_size: float | None = None) -> dict[str, fem.Constant]:

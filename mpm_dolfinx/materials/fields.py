@@ -18,7 +18,7 @@ from mpm_dolfinx.base.validation import numbers
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData
 from mpm_dolfinx.grid.grid import Grid
-from mpm_dolfinx.materials.evaluate import LawAtPoints, SoftnessAtPoints, mean_size, sampled
+from mpm_dolfinx.materials.evaluate import LawAtPoints, SoftnessAtPoints, knows_space, mean_size, sampled
 from mpm_dolfinx.materials.prestressed import AT_REST, stressed
 from mpm_dolfinx.materials.skeleton import BY_SCENE, Fluid, Skeleton
 from mpm_dolfinx.parallel.exchange import first
@@ -75,18 +75,23 @@ class SceneMaterials:
         self._used = _used(bodies, len(materials))  # a material that no body is of changes nothing
         evaluated = [_evaluated(materials[i], bodies, i) for i in self._used]
         locks = [bool(np.any(m.nearly_incompressible)) for m in evaluated]
-        self.across = grid.stretches == 2 and any(locks)
+        asked = [grid.stretches == 2 and (prestressed or lock) for lock in locks]
+        each = zip(self._used, evaluated, asked, strict=True)
+        known = [not needed or knows_space(grid, _at_one(materials[i], m)) for i, m, needed in each]
+        self.across = grid.stretches == 2 and any(np.logical_and(locks, known))
         """Whether laws see a stretch across the plane of plane strain, that of a mean dilatation."""
         self.stretches = 3 if self.across else grid.stretches
         """Number of axes of the deformation gradients that laws see."""
         if self.across:
             seeded[ACROSS] = np.ones(len(points))
         if prestressed:
-            materials = [stressed(m) for m in materials]
+            whole = dict(zip(self._used, known, strict=True))
+            materials = [stressed(m, whole.get(i, True)) for i, m in enumerate(materials)]
             evaluated = [_evaluated(materials[i], bodies, i) for i in self._used]
         self.materials = materials
         used = [materials[i] for i in self._used]
         self._fields = [_by_place(m) for m in materials]
+        self._known = dict(zip(map(type, used), known, strict=True))
         self.laws = list(dict.fromkeys(map(type, used)))
         self.conductivity_laws = list(dict.fromkeys(m.conductivity_law for m in used if m.conductivity_law))
         """The different conductivity laws of the scene."""
@@ -150,7 +155,7 @@ class SceneMaterials:
 
     def _stretches_of(self, law: type[Skeleton]) -> int:
         """Return the number of axes of the deformation gradients that a law sees."""
-        return 3 if self.across and (law, True) in self._parts else self.grid.stretches
+        return 3 if self.across and (law, True) in self._parts and self._known[law] else self.grid.stretches
 
     def _add_shapes(self, m: Skeleton, seeded: dict[str, NDArray[np.float64]], count: int) -> None:
         """Note the shapes of what a material's law takes, and seed the state of so many points."""
@@ -195,6 +200,9 @@ class SceneMaterials:
         if len(self._parts) == 1:
             return [(law, pieces, locks) for law, locks in self._parts]
         names = [dict.fromkeys([*common, *_takes(law)]) for law, _ in self._parts]
+        for taken, (law, locks) in zip(names, self._parts, strict=True):
+            if not (locks and self._known[law]):
+                taken.pop(ACROSS, None)
         shapes = [{name: getattr(pieces, name).ufl_shape for name in taken} for taken in names]
         points = [FormPoints(pieces.grid, **s) for s in shapes]
         return [(law, own, locks) for (law, locks), own in zip(self._parts, points, strict=True)]
@@ -210,6 +218,16 @@ class SceneMaterials:
     def locking(self, points: MaterialPoints) -> NDArray[np.bool_]:
         """Return at which points (n,) Q1 cells would lock."""
         return np.array([locks for _, locks in self._parts])[self.part_of(points)]
+
+    def stretched(self, points: MaterialPoints) -> NDArray[np.bool_]:
+        """Return at which points (n,) laws see a stretch across the plane."""
+        return np.array([self.across and locks and self._known[law] for law, locks in self._parts])[
+            self.part_of(points)
+        ]
+
+    def knows_across(self, points: MaterialPoints) -> NDArray[np.bool_]:
+        """Return at which points (n,) laws know a stretch across the plane."""
+        return np.array([self._known[law] for law, _ in self._parts])[self.part_of(points)]
 
     def conducting(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return what points (n, 2) that conduct alike have in common: conductivity, m/s, and number of their law.
@@ -462,6 +480,11 @@ def _by_place(m: Skeleton) -> list[str]:
 def _evaluated(m: Skeleton, bodies: Sequence[Body], material: int) -> Skeleton:
     """Return a material with its fields evaluated at the places of all its points, see `_places`."""
     return m.at(_places(bodies, material) if _by_place(m) else np.empty((0, 0)))
+
+
+def _at_one(m: Skeleton, evaluated: Skeleton) -> Skeleton:
+    """Return a material with its constants as arrays over the first of its points."""
+    return _spread(evaluated, {name: getattr(evaluated, name)[:1] for name in _by_place(m)}, 1)
 
 
 def _places(bodies: Sequence[Body], material: int) -> NDArray[np.float64]:

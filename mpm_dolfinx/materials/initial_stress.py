@@ -254,8 +254,8 @@ def stressed(
 class _Sought:
     """Elastic strains that give target stresses, by Newton's method.
 
-    They are symmetric: of `seeded_stretch` or of C_p^-1.  points: n of them; target : (n, 3, 3), Pa; given, plastic : (n,) which have the stress among
-    their constants, and which have C_p^-1.
+    They are symmetric: of `seeded_stretch` or of C_p^-1.  points: n of them; target : (n, 3, 3), Pa; given, plastic :
+    (n,) which have the stress among their constants, and which have C_p^-1.
     """
 
     materials: SceneMaterials
@@ -272,7 +272,9 @@ class _Sought:
     @property
     def free(self) -> NDArray[np.bool_]:
         """Which components (n, k) are sought."""
-        return np.repeat(~self.given[:, None], len(self.components), axis=1)
+        out = np.repeat(~self.given[:, None], len(self.components), axis=1)
+        out[:, 2] &= self.materials.knows_across(self.points)
+        return out
 
     def of(self, tensor: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the components (n, k) of tensors (n, 3, 3) that are sought, the others zero."""

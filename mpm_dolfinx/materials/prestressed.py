@@ -24,15 +24,18 @@ AT_REST = " at rest"
 """Ends the names of what points carry of a state as seeded, from which yield is told."""
 
 
-def stressed(m: Skeleton) -> Skeleton:
-    """Return a material whose points may have a stress as seeded, by fields of theirs; at first they have none."""
+def stressed(m: Skeleton, knows_space: bool) -> Skeleton:
+    """Return a material whose points may have a stress as seeded, by fields of theirs; at first they have none.
+
+    knows_space: whether its law takes F (3, 3).
+    """
     if "initial_stress" in (names := [f.name for f in fields(m)]):
         own = m.initial_stress if callable(m.initial_stress) else _everywhere(m.initial_stress)
         return type(m)(**{name: getattr(m, name) for name in names} | {"initial_stress": own, "bulk": None})
     if "plastic" in m.state:
         return m
     given = {name: getattr(m, name) for name in names}
-    return prestressed(type(m))(**given, seeded_stretch=_everywhere(np.eye(3)))
+    return prestressed(type(m), knows_space)(**given, seeded_stretch=_everywhere(np.eye(3)))
 
 
 def _everywhere(value) -> Callable:
@@ -40,16 +43,16 @@ def _everywhere(value) -> Callable:
 
 
 @cache
-def prestressed(law: type[Skeleton]) -> type[Skeleton]:
+def prestressed(law: type[Skeleton], knows_space: bool) -> type[Skeleton]:
     """Return a law with one more field: `seeded_stretch` F_i (3, 3)."""
     names = ("energy", "kirchhoff", "update", "trial")
-    given = {name: staticmethod(_seen(f, name)) for name in names if (f := getattr(law, name)) is not None}
+    given = {name: staticmethod(_seen(f, name, knows_space)) for name in names if (f := getattr(law, name)) is not None}
     more = {"__annotations__": {"seeded_stretch": Field}, "seeded_stretch": 1.0}
     more |= {"linear": law.linear, "__doc__": law.__doc__}
     return dataclass(frozen=True)(type(law.__name__, (law,), {**given, **more}))
 
 
-def _seen(function: Callable, name: str) -> Callable:
+def _seen(function: Callable, name: str, knows_space: bool) -> Callable:
     """Return one of a law's functions, called with F F_i in place of F; stresses and energies are per volume now."""
     taken = Skeleton.taken_by(function)
 
@@ -58,6 +61,8 @@ def _seen(function: Callable, name: str) -> Callable:
         if "F" in given:
             F = embedded(given["F"])
             given["F"] = block(F * stretch) if planar(F) else F * stretch
+            if not knows_space:
+                given["F"] = ufl.as_matrix([[given["F"][i, j] for j in range(2)] for i in range(2)])
         out = function(**{argument: given[argument] for argument in taken})
         return out / ufl.det(stretch) if name in ("energy", "kirchhoff") else out
 

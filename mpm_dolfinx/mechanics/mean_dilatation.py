@@ -67,8 +67,11 @@ class MeanDilatation:
         self._stresses: list[StressAtPoints] = []
 
     def seen(self, points: FormPoints, F):
-        """Return Fbar (3, 3), what laws see of F, a UFL variable."""
-        ratio = (self._theta * ufl.det(points.F) / ufl.det(F)) ** (1 / 3)
+        """Return Fbar (3, 3), what laws see of F, a UFL variable; (2, 2) where they are for the plane only."""
+        ratio = self._theta * ufl.det(points.F) / ufl.det(F)
+        if self._grid.stretches == 2 and ACROSS not in points.functions:
+            return ufl.variable(ufl.sqrt(ratio) * F)
+        ratio = ratio ** (1 / 3)
         if self._grid.stretches == 2:  # of F scaled to its determinant, see `in_space`
             across = getattr(points, ACROSS)
             return ufl.variable(embedded(ratio / ufl.sqrt(across) * F, ratio * across))
@@ -123,8 +126,8 @@ class MeanDilatation:
         if law.kirchhoff is None:
             energy = expression(law.energy, [()], F=Fbar, **values)
             return ufl.diff(energy, F), ufl.diff(energy, self._theta)
-        tau = law.kirchhoff_in_plane(Fbar, values)  # dFbar Fbar^-1 = dev(dF F^-1) + dtheta / (3 theta) I
-        mean = ufl.tr(tau) / 3
+        tau = law.kirchhoff_in_plane(Fbar, values)  # dFbar Fbar^-1 = dev(dF F^-1) + dtheta / (n theta) I, n = 3 or 2
+        mean = ufl.tr(tau) / Fbar.ufl_shape[0]
         return _dev(tau, F) * ufl.inv(F).T, mean / self._theta
 
     def _slopes(self, law: type[Skeleton], F, Fbar, values: Mapping[str, object]) -> tuple:
@@ -139,22 +142,22 @@ class MeanDilatation:
         P, slope = self._stress(law, F, Fbar, values)
         if law.kirchhoff is None or self._grid.dim == 3:
             return tuple(ufl.diff(of, by) for of in (P, slope) for by in (F, self._theta))
-        d = range(F.ufl_shape[0])
+        d, n = range(F.ufl_shape[0]), Fbar.ufl_shape[0]
         theta = self._theta
         G = ufl.inv(F).T
         i, j, k, l, m = ufl.indices(5)
         tau = law.kirchhoff_in_plane(Fbar, values)
         C = ufl.diff(tau, Fbar)
         G_F = ufl.diff(G, F)
-        tau_theta = ufl.as_tensor(C[i, j, k, l] * Fbar[k, l], (i, j)) / (3 * theta)
+        tau_theta = ufl.as_tensor(C[i, j, k, l] * Fbar[k, l], (i, j)) / (n * theta)
         s = sum(Fbar[a, b] * G[a, b] for a in d for b in d) / len(d)
 
         def by_F(part, by_theta):
             """Return the derivative by F of a part of tau, of which C has the derivative by Fbar."""
             return ufl.as_matrix([[s * part(a, b) - theta * by_theta * G[a, b] for b in d] for a in d])
 
-        mean_theta = ufl.tr(tau_theta) / 3
-        mean_F = by_F(lambda a, b: sum(C[c, c, a, b] for c in range(3)) / 3, mean_theta)
+        mean_theta = ufl.tr(tau_theta) / n
+        mean_F = by_F(lambda a, b: sum(C[c, c, a, b] for c in range(n)) / n, mean_theta)
         tau_F = ufl.as_tensor([[by_F(lambda a, b, c=c, e=e: C[c, e, a, b], tau_theta[c, e]) for e in d] for c in d])
         P_F = ufl.as_tensor(
             tau_F[i, m, k, l] * G[m, j] - mean_F[k, l] * G[i, j] + _dev(tau, F)[i, m] * G_F[m, j, k, l], (i, j, k, l)
@@ -220,8 +223,8 @@ class MeanDilatation:
 
 
 def _dev(tau, F):
-    """Return the deviator of a UFL tensor (3, 3) in the axes of F (d, d)."""
-    d, mean = range(F.ufl_shape[0]), ufl.tr(tau) / 3
+    """Return the deviator of a UFL tensor in the axes of F (d, d)."""
+    d, mean = range(F.ufl_shape[0]), ufl.tr(tau) / tau.ufl_shape[0]
     return ufl.as_matrix([[tau[a, b] - mean if a == b else tau[a, b] for b in d] for a in d])
 
 

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from mpm_dolfinx.parallel.exchange import Exchange
 from mpm_dolfinx.points.cutting import centroids
 
-
 ACROSS = "stretch across"
 """Name of what points of plane strain carry whose laws see a stretch across the plane, that of a mean dilatation."""
 

@@ -219,7 +219,7 @@ class Motion:
         F = with_ratio(F, J)
         if d > grid.stretches:  # others have no stretch across the plane
             scaled, across = in_plane(F)
-            F = in_space(scaled, np.where(self._materials.locking(cut.points), across, 1.0))
+            F = in_space(scaled, np.where(self._materials.stretched(cut.points), across, 1.0))
         return F
 
     def _shaped(
