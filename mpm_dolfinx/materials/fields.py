@@ -78,9 +78,7 @@ class SceneMaterials:
         asked = [grid.stretches == 2 and (prestressed or lock) for lock in locks]
         each = zip(self._used, evaluated, asked, strict=True)
         known = [not needed or knows_space(grid, _at_one(materials[i], m)) for i, m, needed in each]
-        self.across = grid.stretches == 2 and any(np.logical_and(locks, known))
-        """Whether laws see a stretch across the plane of plane strain, that of a mean dilatation."""
-        self.stretches = 3 if self.across else grid.stretches
+        self.stretches = 3 if any(np.logical_and(locks, known)) else grid.stretches
         """Number of axes of the deformation gradients that laws see."""
         if self.across:
             seeded[ACROSS] = np.ones(len(points))
@@ -91,13 +89,13 @@ class SceneMaterials:
         self.materials = materials
         used = [materials[i] for i in self._used]
         self._fields = [_by_place(m) for m in materials]
-        self._known = dict(zip(map(type, used), known, strict=True))
         self.laws = list(dict.fromkeys(map(type, used)))
         self.conductivity_laws = list(dict.fromkeys(m.conductivity_law for m in used if m.conductivity_law))
         """The different conductivity laws of the scene."""
         self._law = np.array([self.laws.index(type(m)) if type(m) in self.laws else 0 for m in materials])
-        self._parts = list(dict.fromkeys(zip(map(type, used), locks, strict=True)))
-        own = dict(zip(self._used, zip(map(type, used), locks, strict=True), strict=True))
+        kinds = list(zip(map(type, used), locks, known, strict=True))
+        self._parts = list(dict.fromkeys(kinds))
+        own = dict(zip(self._used, kinds, strict=True))
         self._part = np.array([self._parts.index(own[i]) if i in own else 0 for i in range(len(materials))])
         self.symmetric = all(m.symmetric for m in used)
         """Whether the tangents of all materials are symmetric."""
@@ -153,9 +151,14 @@ class SceneMaterials:
             for law in self.laws
         ]
 
+    @property
+    def across(self) -> bool:
+        """Whether laws see a stretch across the plane of plane strain, that of a mean dilatation."""
+        return self.stretches > self.grid.stretches
+
     def _stretches_of(self, law: type[Skeleton]) -> int:
         """Return the number of axes of the deformation gradients that a law sees."""
-        return 3 if self.across and (law, True) in self._parts and self._known[law] else self.grid.stretches
+        return self.stretches if (law, True, True) in self._parts else self.grid.stretches
 
     def _add_shapes(self, m: Skeleton, seeded: dict[str, NDArray[np.float64]], count: int) -> None:
         """Note the shapes of what a material's law takes, and seed the state of so many points."""
@@ -198,14 +201,14 @@ class SceneMaterials:
         `pieces`, those of several have the fields `common` of the pieces and what their law takes.
         """
         if len(self._parts) == 1:
-            return [(law, pieces, locks) for law, locks in self._parts]
-        names = [dict.fromkeys([*common, *_takes(law)]) for law, _ in self._parts]
-        for taken, (law, locks) in zip(names, self._parts, strict=True):
-            if not (locks and self._known[law]):
-                taken.pop(ACROSS, None)
+            return [(law, pieces, locks) for law, locks, _ in self._parts]
+        names = [
+            [name for name in dict.fromkeys([*common, *_takes(law)]) if name != ACROSS or (locks and known)]
+            for law, locks, known in self._parts
+        ]
         shapes = [{name: getattr(pieces, name).ufl_shape for name in taken} for taken in names]
         points = [FormPoints(pieces.grid, **s) for s in shapes]
-        return [(law, own, locks) for (law, locks), own in zip(self._parts, points, strict=True)]
+        return [(law, own, locks) for (law, locks, _), own in zip(self._parts, points, strict=True)]
 
     def part_of(self, points: MaterialPoints) -> NDArray[np.int64]:
         """Return the number of each point's part (n,), see `parts`."""
@@ -217,17 +220,15 @@ class SceneMaterials:
 
     def locking(self, points: MaterialPoints) -> NDArray[np.bool_]:
         """Return at which points (n,) Q1 cells would lock."""
-        return np.array([locks for _, locks in self._parts])[self.part_of(points)]
+        return np.array([locks for _, locks, _ in self._parts])[self.part_of(points)]
 
     def stretched(self, points: MaterialPoints) -> NDArray[np.bool_]:
         """Return at which points (n,) laws see a stretch across the plane."""
-        return np.array([self.across and locks and self._known[law] for law, locks in self._parts])[
-            self.part_of(points)
-        ]
+        return self.across & self.locking(points) & self.knows_across(points)
 
     def knows_across(self, points: MaterialPoints) -> NDArray[np.bool_]:
         """Return at which points (n,) laws know a stretch across the plane."""
-        return np.array([self._known[law] for law, _ in self._parts])[self.part_of(points)]
+        return np.array([known for *_, known in self._parts])[self.part_of(points)]
 
     def conducting(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return what points (n, 2) that conduct alike have in common: conductivity, m/s, and number of their law.
