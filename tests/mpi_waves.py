@@ -16,7 +16,7 @@ simulation = mpm.Simulation(grid, [block], [soil], conditions=[*holds, mpm.Drain
 simulation.run(100.0, 50.0, progress=False)
 quiet = [mpm.Quiet(side, lambda t: (0.1 * (t - 100), 0)) for side in ("bottom", "left", "right")]
 simulation.stage(inertia=True, conditions=[*quiet, mpm.Drained("top")], reset_displacement=True)
-result = simulation.run(100.2, 0.02, progress=False)
+result = simulation.run(100.2, 0.02, energies=True, progress=False)
 points = simulation.points
 parts = grid.comm.gather((points.id, points.x, points.pressure, points.data["velocity"], points.displacement))
 if parts:
@@ -28,6 +28,7 @@ if parts:
         p=p[order],
         velocity=v[order],
         u=u[order],
+        energies=[of[-1] for of in result.energies.values()],
         balance=result.balance,
         counts=[len(part[0]) for part in parts],
     )

@@ -158,6 +158,10 @@ class Loads:
     def penalty(self, A: PETSc.Mat, walls: bool) -> None:
         """Add the matrix of forces that are linear in u; walls: to the rows of what walls hold."""
 
+    def pulling(self, at: At, v: NDArray[np.float64]) -> float:
+        """Return the power, W, of `pulls` and `penalty` at u on this process; v: velocities, a local array, m/s."""
+        return 0.0
+
     def tangent(self, K: PETSc.Mat) -> None:
         """Add minus the derivative of `loads`, and the derivative of `resists`, at u; who calls finalises it."""
 

@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+import numpy as np
 import ufl
 from dolfinx import fem
+from numpy.typing import NDArray
 
 
 class Velocity:
@@ -21,6 +23,11 @@ class Velocity:
         self._own = fem.Constant(u.function_space.mesh, 1.0)
         self.value = (u - self._past) / self._own
         """As UFL, m/s."""
+
+    @property
+    def nodal(self) -> NDArray[np.float64]:
+        """Values (unknowns,) at the nodes, a local array, m/s."""
+        return (self._u.x.array - self._past.x.array) / float(self._own.value)
 
     def among(self, form: ufl.Form) -> bool:
         """Return whether a form depends on it."""

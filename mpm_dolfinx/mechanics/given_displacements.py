@@ -267,6 +267,10 @@ class HoldLoads(Loads):
         """Return the force (m,), N, along each component that is given, at nodal values u (nodes, d), m."""
         return self.data["stiffness"][:, 0] * (self.data["gap"][:, 0] - self._along(u))
 
+    def pulling(self, at: At, v: NDArray[np.float64]) -> float:
+        """Return the power, W, of what pulls the sides along."""
+        return float(self.pull(at.nodal) @ self._along(v.reshape(-1, self._d)))
+
     def counted(self, at: At) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return degrees of freedom (n,), and forces (n,), N, on them that reactions count."""
         dofs = (

@@ -102,7 +102,7 @@ class MomentumForms:
         self.velocity = Velocity(self.u)
         self.conditions = FormsOf(grid, self.u, self.velocity)
         """The forms of conditions."""
-        self.own = OwnTerms(terms, pieces, self.u, self.velocity, t, dt)
+        self.own = OwnTerms(terms, pieces, self.conditions, t, dt)
         self.weight = None if gravity is None else Weight(pieces, self.u, gravity, fluid_density)
         self.acting = [*filter(None, (self.weight,)), *[self.own] * bool(terms)]
         """What acts in all stages."""
@@ -465,6 +465,23 @@ class MomentumProblem:
         norms.append(system.force_of_parts(external))
         b[system.touched] = forces - external
         return b, norms
+
+    def powers(self) -> dict[str, float]:
+        """Return powers at u on this process, W: of stresses, against what resists the velocity, and of what acts."""
+        forms, unknowns = self.forms, self.system.unknowns
+        v = np.where(unknowns.map.indices >= 0, forms.velocity.nodal, 0.0)  # none of what walls hold
+        owned = forms.u.function_space.dofmap.index_map.size_local * forms.grid.dim
+        out = {"internal": forms.internal(self.data)[:owned] @ v[:owned], "viscous": 0.0, "external": 0.0}
+        for one in self.loads:
+            acts, resists = np.zeros((2, len(v)))  # those on ghosts count where they are added
+            one.dead(acts)
+            one.loads(acts)
+            one.resists(resists)
+            pushed = unknowns.vector()
+            one.push(self.at, pushed, unknowns)
+            out["external"] += acts @ v + one.pulling(self.at, v) - v[unknowns.owned] @ pushed.array_r
+            out["viscous"] += resists @ v
+        return out
 
     def out_of_balance(
         self, r: PETSc.Vec, scales: NDArray[np.float64], first: bool

@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.bodies.faces import Surface
-from mpm_dolfinx.conditions.acting import Acting, Loads, Place, Setting
+from mpm_dolfinx.conditions.acting import Acting, FormsOf, Loads, Place, Setting
 from mpm_dolfinx.conditions.conditions import OnSide
 from mpm_dolfinx.conditions.sides import gathered
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointForm
-from mpm_dolfinx.forms.velocity import Velocity
 from mpm_dolfinx.materials.user_functions import compiling, term_of
 
 
@@ -41,10 +40,8 @@ class OwnTerms:
         Functions, or functions on sides.
     pieces
         All points of integration.
-    u
-        Increment of the displacement in the step, m.
-    velocity
-        Of the bodies in a substep.
+    forms
+        Those of the scene's conditions, with u and the velocity of the bodies.
     t, dt : s
         Time at the end of the substep, and time since the start of the step, UFL constants.
     """
@@ -53,8 +50,7 @@ class OwnTerms:
         self,
         terms: Sequence[Callable | OnSide],
         pieces: FormPoints,
-        u: fem.Function,
-        velocity: Velocity,
+        forms: FormsOf,
         t: fem.Constant,
         dt: fem.Constant,
     ):
@@ -62,7 +58,8 @@ class OwnTerms:
         self.holding = False
         self.rates = False
         """Whether all tangents are symmetric; whether some depend on u, and on the velocity."""
-        more = {"t": t, "dt": dt, "velocity": velocity.value}
+        u = forms.u
+        more = {"t": t, "dt": dt, "velocity": forms.velocity.value}
         v, du = ufl.TestFunction(u.function_space), ufl.TrialFunction(u.function_space)
         self.terms: list[OwnTerm] = []
         for term in terms:
@@ -75,7 +72,7 @@ class OwnTerms:
                 self.terms.append(OwnTerm(term, points, PointForm(form, points), slope))
             self.symmetric &= potential or not holds
             self.holding |= holds
-            self.rates |= velocity.among(form)
+            self.rates |= forms.velocity.among(form)
 
     def acting(self, setting: Setting) -> Acting:
         """Return the terms in a stage."""

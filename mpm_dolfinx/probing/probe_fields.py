@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.bodies.faces import interpolate
+from mpm_dolfinx.domains.fitted import fitted_at
 from mpm_dolfinx.domains.pressure_transport import van_leer
 from mpm_dolfinx.grid.grid import Grid, sum_by
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.local_fit import RADIUS, LocalFit, near
 from mpm_dolfinx.probing.probes import Probes
-from mpm_dolfinx.stepping.fitted import fitted_at
 from mpm_dolfinx.stepping.on_grid import OnGrid
 from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.state import State
@@ -247,4 +247,5 @@ class _Around:
 
 def probe_stresses(scene: Scene, state: State, probes: Probes) -> NDArray[np.float64]:
     """Return the effective stresses (m, 3, 3), Pa, at the places of probes; on all processes together."""
-    return fitted_at(scene, state.points, probes.id, probes.xi, scene.materials.effective_stress_3d)
+    comm, sizes = scene.grid.comm, list(map(len, scene.bodies))
+    return fitted_at(comm, sizes, state.points, probes.id, probes.xi, scene.materials.effective_stress_3d)

@@ -21,6 +21,7 @@ from mpm_dolfinx.conditions.sides import everywhere
 from mpm_dolfinx.conditions.unit_weights import WEIGHS, warn_units, waters
 from mpm_dolfinx.contact.groups import contacts_of
 from mpm_dolfinx.contact.history import gripped, let_go
+from mpm_dolfinx.domains.fitted import fitted_at
 from mpm_dolfinx.domains.pressure_transport import at_start
 from mpm_dolfinx.dynamics.at_rest import borne
 from mpm_dolfinx.dynamics.quiet import QuietSides, traction_name
@@ -31,7 +32,6 @@ from mpm_dolfinx.mechanics.momentum import MomentumProblem
 from mpm_dolfinx.mechanics.tractions import owners
 from mpm_dolfinx.parallel.messages import ConditionWarning, warn
 from mpm_dolfinx.points.material_points import MaterialPoints
-from mpm_dolfinx.stepping.fitted import fitted_at
 from mpm_dolfinx.stepping.initial_state import pieces_at_start
 from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.stage import Condition, Stage, checked, stage
@@ -156,8 +156,9 @@ def _released(
             held |= beside([faces], axes)
     counts = ~now & (beside(list(surfaces.values()), range(scene.grid.dim)) | ~then)
     owned = momentum.u.function_space.dofmap.index_map.size_local
+    given = scene.grid.comm, list(map(len, scene.bodies)), state.points
     stresses = {
-        name: fitted_at(scene, state.points, faces.id, faces.xi.mean(axis=1), scene.materials.total_stress)
+        name: fitted_at(*given, faces.id, faces.xi.mean(axis=1), scene.materials.total_stress)
         for name, faces in surfaces.items()
     }
     parts = start.matrices.momentum.parts

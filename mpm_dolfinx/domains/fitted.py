@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+
+from mpi4py import MPI
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,14 +13,14 @@ from scipy.spatial import cKDTree
 
 from mpm_dolfinx.bodies.faces import interpolate
 from mpm_dolfinx.parallel.exchange import over_all
-from mpm_dolfinx.points.cutting import centroids, corner_bits
+from mpm_dolfinx.points.cutting import centroids, edges
 from mpm_dolfinx.points.local_fit import RADIUS, LocalFit, near
 from mpm_dolfinx.points.material_points import MaterialPoints
-from mpm_dolfinx.stepping.scene import Scene
 
 
 def fitted_at(
-    scene: Scene,
+    comm: MPI.Comm,
+    sizes: Sequence[int],
     points: MaterialPoints,
     id: NDArray[np.int64],
     xi: NDArray[np.float64],
@@ -31,17 +33,18 @@ def fitted_at(
 
     Parameters
     ----------
+    sizes
+        Numbers of points of all bodies of the scene.
     id, xi : (m,), (m, d)
         Numbers of the points, and places in their domains; the same on all processes.
     tensor
         Gives it at points (n, k, k).
     """
-    comm = scene.grid.comm
     m = len(id)
-    d = scene.grid.dim
+    d = xi.shape[1]
     here, at = points.find(id)
-    rest = _edges(points.reference[at])
-    frames = [np.linalg.inv(edges) for edges in (rest, points.F[at][:, :d, :d] @ rest)]
+    rest = edges(points.reference[at])
+    frames = [np.linalg.inv(E) for E in (rest, points.F[at][:, :d, :d] @ rest)]
     of = (points.reference, points.corners)
     columns = [*(interpolate(corners[at], xi[here]) for corners in of), *(E.reshape(-1, d * d) for E in frames)]
     own = np.zeros((m, 2 * d + 2 * d * d + 1))
@@ -49,7 +52,7 @@ def fitted_at(
     X, x, rest, now, material = np.split(over_all(comm, own), np.cumsum([d, d, d * d, d * d]), axis=1)
     rest, now = (frame.reshape(m, d, d) for frame in (rest, now))
     rest[~rest.any(axis=(1, 2))] = np.eye(d)
-    middle, last = centroids(points.reference), np.cumsum(list(map(len, scene.bodies)))
+    middle, last = centroids(points.reference), np.cumsum(sizes)
     probe, row = _near(middle, X, RADIUS * np.abs(np.linalg.inv(rest)).sum(axis=2).max(axis=1))
     body, own_body = (np.searchsorted(last, ids, side="right") for ids in (points.id[row], id[probe]))
     weight = near(np.einsum("rij,rj->ri", rest[probe], middle[row] - X[probe]))
@@ -73,9 +76,3 @@ def _near(x: NDArray[np.float64], places: NDArray[np.float64], reach: NDArray[np
         return np.empty(0, np.int64), np.empty(0, np.int64)
     found = cKDTree(x[some]).query_ball_point(places, reach, p=np.inf)
     return np.repeat(np.arange(len(places)), list(map(len, found))), some[np.concatenate(found).astype(np.int64)]
-
-
-def _edges(corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the mean edges (n, d, d), m, of domains (n, 2^d, d), one a column."""
-    signs = 2.0 * corner_bits(corners.shape[2]) - 1
-    return np.einsum("nki,ka->nia", corners, signs) / 2 ** (corners.shape[2] - 1)
