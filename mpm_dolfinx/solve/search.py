@@ -8,8 +8,8 @@ Where soil yields a step is full if the residual falls, or if the forces do less
 that at its start; else it goes to about where they do none (Matthies and Strang 1979): there points that it unloads
 leave their yield surface, and the next tangent is as stiff as they are.  Work is that of the forces and of the fluid:
 that of the forces alone is next to none where these balance and the fluid does not.  Shorter steps, with lower
-residuals, would be followed by ones as short.  Bracketed secants find it.  Soil that has lost its strength needs several
-of them: with one, a bank that slumps takes twice the Newton steps.
+residuals, would be followed by ones as short.  Bracketed secants find it.  Soil that has lost its strength needs
+several: with one, a bank that slumps takes twice the Newton steps.
 
 Soil that flows has next to no stiffness along its mechanisms, where flow is not associated even less than none: full
 steps go far astray there.  A share of the elastic shear stiffness in the tangent, as the residual of the forces is
@@ -62,8 +62,8 @@ class Halving:
 class Search:
     """Search for a step at whose end the residuals do less work than half of that at its start.
 
-    step: the one to try; low, high: steps between which the work changes its sign; at_low, at_high: the work there, over
-    that at the start; ends: whether the next step is the last one.
+    step: the one to try; low, high: steps between which the work changes its sign; at_low, at_high: the work there,
+    over that at the start; ends: whether the next step is the last one.
     """
 
     step: float = 1.0
