@@ -12,10 +12,10 @@ CEILINGS = {
     "folders in a circle of imports": 0,
     "files of the largest folder": 14,
     "parameters of the longest list": 14,
-    "assignments of three and more values": 21,
+    "assignments of three and more values": 20,
     "changes of hidden state": 10,
     "files that name a condition's class, most": 6,
-    "lines of the package": 29523,
+    "lines of the package": 30240,
 }
 
 

@@ -138,7 +138,7 @@ def balances(
     matrices = start.matrices
     dt = start.dt
     scene.set_time(acting.t, substep.end * dt, acting.gravity)
-    scene.momentum.own.set_rate(substep.own * dt, substep.before / substep.own)
+    scene.momentum.velocity.set(substep.own * dt, substep.before / substep.own)
     inertia, loads = None, acting.loads
     if flight is not None:
         own = float(substep.own * dt)
