@@ -34,6 +34,7 @@ from dolfinx import fem
 from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.base.given_values import at_places, check_names
+from mpm_dolfinx.base.tolerances import ROUND_OFF
 from mpm_dolfinx.base.validation import flag, line, numbers
 from mpm_dolfinx.conditions.acting import At, Loads
 from mpm_dolfinx.domains.cut_domains import CutDomains
@@ -280,7 +281,7 @@ class Mass:
         ksp.setType(PETSc.KSP.Type.CG)
         ksp.getPC().setType(PETSc.PC.Type.JACOBI)
         ksp.setOperators(M)
-        ksp.setTolerances(rtol=1e-14, atol=0.0, max_it=10000)
+        ksp.setTolerances(rtol=ROUND_OFF, atol=0.0)
 
     def velocity(self, points: MaterialPoints) -> PETSc.Vec:
         """Return the velocities of the unknowns, m/s: the projection of those of the points."""

@@ -43,8 +43,7 @@ from mpm_dolfinx.materials.skeleton import Fluid
 from mpm_dolfinx.mechanics.given_displacements import GivenDisplacements
 from mpm_dolfinx.mechanics.momentum import MomentumForms
 from mpm_dolfinx.mechanics.plates import Plates
-from mpm_dolfinx.mechanics.pressures import Pressures
-from mpm_dolfinx.mechanics.tractions import Tractions
+from mpm_dolfinx.mechanics.tractions import Pressures, Tractions
 
 Condition = Traction | Pressure | Displacement | RigidPlate | Quiet | Drained | Inflow | Tool | Contact
 """What acts on the bodies."""
