@@ -8,9 +8,8 @@ Where soil yields a step is full if the residual falls, or if the forces do less
 that at its start; else it goes to about where they do none (Matthies and Strang 1979): there points that it unloads
 leave their yield surface, and the next tangent is as stiff as they are.  Work is that of the forces and of the fluid:
 that of the forces alone is next to none where these balance and the fluid does not.  Shorter steps, with lower
-residuals, would be followed by ones as short.  As a rule one secant finds it, as PETSc's critical point search does.
-Where a contact closes within the step the secant ends far short of it, and halvings find it: by secants alone Newton's
-method would go on by steps a thousandth as long.
+residuals, would be followed by ones as short.  Bracketed secants find it.  Soil that has lost its strength needs
+several: with one, a bank that slumps takes twice the Newton steps.
 
 Soil that flows has next to no stiffness along its mechanisms, where flow is not associated even less than none: full
 steps go far astray there.  A share of the elastic shear stiffness in the tangent, as the residual of the forces is
@@ -27,7 +26,7 @@ along it, and the step goes the other way.
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -61,30 +60,39 @@ class Halving:
 
 @dataclass(frozen=True)
 class Search:
-    """Search for a step along which the forces do next to no work at its end, by a secant, else halvings.
+    """Search for a step at whose end the residuals do less work than half of that at its start.
 
-    step: the one to try; ends: whether it is taken as it is; low, high: steps at whose ends the forces do some work and
-    less than none.
+    step: the one to try; low, high: steps between which the work changes its sign; at_low, at_high: the work there,
+    over that at the start; ends: whether the next step is the last one.
     """
 
     step: float = 1.0
-    ends: bool = False
     low: float = 0.0
-    high: float | None = None
+    at_low: float = 1.0
+    high: float = np.inf
+    at_high: float = np.nan
+    ends: bool = False
     limit = sys.float_info.max
     """What the residual may have grown by at its end."""
 
     def after(self, work: float, growth: float) -> Search | None:
         """Return the next step to try after one that ends with such a work, nan if that is not finite; None: none.
 
-        growth: of the residual.  If a full step does not raise it, it is enough that forces do no more work than at its
-        start.
+        growth: of the residual.  If a full step does not raise it, it is enough that the residuals do no more work than
+        at its start.  A secant gives the next step; the middle does where a bound stays for a second time.
         """
         if not np.isfinite(work):
-            return None if self.step < 2 * SHORTEST else replace(self, step=0.5 * self.step)
-        if self.ends or abs(work) <= (1.0 if self.high is None and growth <= 1 else WORK):
+            end = self.step < 2 * SHORTEST
+            return None if end else Search(0.5 * (self.low + self.step), self.low, self.at_low, self.step)
+        enough = 1.0 if growth <= 1 and self.step == 1 else WORK
+        if self.ends or abs(work) <= enough or self.high - self.low < SHORTEST:
             return None
-        if self.high is None:
-            return Search(self.step / (1 - work), high=self.step) if work < 0 else Search(0.5 * self.step, ends=True)
-        low, high = (self.step, self.high) if work > 0 else (self.low, self.step)
-        return Search((low + high) / 2, False, low, high) if high - low > SHORTEST else None
+        if work > 0 and np.isinf(self.high):
+            return Search(0.5 * self.step, ends=True)
+        if work > 0:
+            bounds, stays = (self.step, work, self.high, self.at_high), self.low > 0
+        else:
+            bounds, stays = (self.low, self.at_low, self.step, work), np.isfinite(self.at_high)
+        low, at_low, high, at_high = bounds
+        share = 0.5 if stays or np.isnan(at_high) else at_low / (at_low - at_high)
+        return Search(low + share * (high - low), *bounds)
