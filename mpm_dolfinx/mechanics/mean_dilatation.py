@@ -6,11 +6,10 @@ too stiff.  Here the law sees the deformation gradient with the volume ratio of 
 
     Fbar = (theta J_n / det F)^(1/3) F,     theta = sum w det(Delta) / sum w   over the cell's pieces that lock,
 
-along all three axes: in plane strain points carry the stretch across the plane, so that it is that of a slice of the
-body.  Which do is a matter of their material (`Skeleton.nearly_incompressible`).  In
-a cell that these share with others the others see their own F: one constraint a cell is left, and neither kind of
-material knows of the other but by the displacements that they share.  The energy sum w psi(Fbar) / J_n has the
-derivative
+along all three axes: in plane strain points carry the stretch across the plane, as in a slice of the body.  Which do
+is a matter of their material (`Skeleton.nearly_incompressible`).  In a cell that these share with others the others
+see their own F: one constraint a cell is left, and neither kind of material knows of the other but by the
+displacements that they share.  The energy sum w psi(Fbar) / J_n has the derivative
 
     sum w [dPsi/dF : dF + pi d(det Delta)],   pi = (sum w dPsi/dtheta) / (sum w),
 
