@@ -92,7 +92,6 @@ class SceneMaterials:
         self.laws = list(dict.fromkeys(map(type, used)))
         self.conductivity_laws = list(dict.fromkeys(m.conductivity_law for m in used if m.conductivity_law))
         """The different conductivity laws of the scene."""
-        self._law = np.array([self.laws.index(type(m)) if type(m) in self.laws else 0 for m in materials])
         kinds = list(zip(map(type, used), locks, known, strict=True))
         self._parts = list(dict.fromkeys(kinds))
         own = dict(zip(self._used, kinds, strict=True))
@@ -216,7 +215,7 @@ class SceneMaterials:
 
     def law_of(self, points: MaterialPoints) -> NDArray[np.int64]:
         """Return the number of each point's law (n,)."""
-        return self._law[points.material]
+        return np.array([self.laws.index(law) for law, *_ in self._parts])[self.part_of(points)]
 
     def locking(self, points: MaterialPoints) -> NDArray[np.bool_]:
         """Return at which points (n,) Q1 cells would lock."""
