@@ -100,6 +100,7 @@ BENCHMARK = {
     "damping of what yields": set(),
     "seepage face": set(),
     "initial stress": {"initial stress"},
+    "inertia": {"inertia"} | SECOND,
     "axisymmetry": {"axisymmetry"},
     "body from a mesh": set(),
     "Mohr-Coulomb beside Drucker-Prager": set(),

@@ -149,6 +149,9 @@ class Loads:
     def resists(self, b: NDArray[np.float64]) -> None:
         """Add the forces at u that act as the bodies' own stresses do, against loads."""
 
+    def takes_up(self, b: NDArray[np.float64]) -> None:
+        """Add the forces at u that are counted with those of the stresses."""
+
     def penalty(self, A: PETSc.Mat, walls: bool) -> None:
         """Add the matrix of forces that are linear in u; walls: to the rows of what walls hold."""
 

@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -170,6 +170,17 @@ def sorted_terms(terms: Sequence[Callable | OnSide | Source]) -> tuple[list[Call
     return [term for term in terms if not isinstance(term, Source)], sources
 
 
+class Through(NamedTuple):
+    """What a side lets through at its places, each () or (m,).
+
+    pressure: beyond it, Pa, nan where the flux alone is given; flux: into the body, m/s; one_way: nothing flows in.
+    """
+
+    pressure: NDArray[np.float64] | float
+    flux: NDArray[np.float64] | float
+    one_way: NDArray[np.bool_] | bool
+
+
 @dataclass(frozen=True, eq=False)
 class Drained(Condition):
     """Side of the bodies, moving with them, at which the pore pressure is given.
@@ -211,6 +222,11 @@ class Drained(Condition):
         """Return the pressure () or (m,) at time t (s), Pa."""
         return self._given("pressure", t, side)
 
+    def through(self, t: float, side: Places) -> Through:
+        """Return what the side lets through at time t (s)."""
+        pressure = self.at(t, side)
+        return Through(pressure, 0.0, self.seepage & (pressure <= 0))
+
 
 @dataclass(frozen=True, eq=False)
 class Inflow(Condition):
@@ -244,6 +260,10 @@ class Inflow(Condition):
     def at(self, t: float, side: Places | None = None) -> NDArray[np.float64]:
         """Return the flux () or (m,) at time t (s), m/s."""
         return self._given("flux", t, side)
+
+    def through(self, t: float, side: Places) -> Through:
+        """Return what the side lets through at time t (s)."""
+        return Through(np.nan, self.at(t, side), False)
 
 
 RIGIDITY = 1e4

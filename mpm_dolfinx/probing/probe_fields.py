@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 
 from mpm_dolfinx.bodies.faces import interpolate
 from mpm_dolfinx.domains.pressure_transport import van_leer
+from mpm_dolfinx.flow.feeding import Wet
 from mpm_dolfinx.grid.grid import Grid, sum_by
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.cutting import centroids, corner_bits
@@ -95,7 +96,7 @@ class _Around:
         self._open = share.reshape(*share.shape[:2], d, 2)
         self._centroid = lattice.midpoint + self._half - x[:, None]
         self._counts, self._reached = self._connected(held == key[:, None])
-        self._sides = state.stage.hydraulic.data(cut, points, self._contents, state.t)
+        self._sides = state.stage.open_sides(Wet(cut, points, self._contents, state.t))
 
     def _gathered(self, on_grid: OnGrid, p: NDArray[np.float64], alike: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
         """Return the local numbers (m, cells) of the cells that this process owns, else -1, and what all hold.

@@ -247,7 +247,7 @@ class Newton:
             # inf where no fluid has moved yet
             lags = (errors.each > keep * np.minimum(1.0, before.each)) & (errors.each > tolerance)
             fresh, eases = bool(lags.any()), eases & (elastic | ~lags)
-            seeps = self._storage is not None and self._storage.settle_seepage()
+            seeps = self._storage is not None and self._storage.settle()
             if self._momentum.settle(errors.worst <= SETTLED) or seeps:
                 errors, fresh = self._errors(errors.start), True
         return found
@@ -324,7 +324,7 @@ class Newton:
             with _ignored():
                 self._storage.system.unknowns.add(self._storage.forms.p, -1.0, dp)
             report.coupling += 1
-            if self._storage.settle_seepage():
+            if self._storage.settle():
                 self._linearise()
             errors = self._errors(errors.start)
         return errors

@@ -309,11 +309,8 @@ class Motion:
     def _sealed(self, state: State, on_grid: OnGrid, pieces: PointData) -> NDArray[np.bool_]:
         """Return which parts (count,) have no open side, and are fed by no source at the end of the step."""
         cut, (part, count) = on_grid.cut, on_grid.parts
-        patches = cut.surfaces([faces for _, faces in state.stage.hydraulic.outlets])
-        at = np.concatenate([np.zeros(0, dtype=np.int64), *(patch.at for patch in patches)])
-        if self._storage.sources:
-            fed = self._storage.gain(pieces)[cut.cells] != 0
-            at = np.concatenate([at, cut.pieces.point[cut.to_pieces(fed)]])
+        fed = [one.fed(cut, pieces) for one in state.stage.feeding]
+        at = np.concatenate([np.zeros(0, dtype=np.int64), *fed])
         return over_all(cut.grid.comm, np.bincount(part[at], minlength=count)) == 0
 
     def _body(self, points: MaterialPoints) -> NDArray[np.int64]:

@@ -73,7 +73,7 @@ class Balances(NamedTuple):
         """Return what conditions do to the bodies at the end of a step, see `State`."""
         stage, out = state.stage, {quantity: {} for quantity in QUANTITIES} | self.momentum.outcome()
         out["wall_reactions"] = self.momentum.wall_forces(stage.conditions["walls"])
-        out["outflows"] = self.storage.outflows(stage.hydraulic.names) if self.storage else {}
+        out["outflows"] = self.storage.outflows() if self.storage else {}
         return out
 
     def came(self, rates: Rates | None) -> NDArray[np.float64] | None:
@@ -152,10 +152,10 @@ def balances(
     if scene.storage is None:
         return Balances(momentum, None, inertia)
     weight = None if acting.gravity is None else scene.fluid.density * acting.gravity
-    flow = matrices.flow(start.state, weight, start.data, acting.t)
+    fed = matrices.flow(start.state, weight, start.data, acting.t)
     lost = before and before.taken(substep.before * dt)
     carried = on_grid.softness(start.state), substep.end * on_grid.due(start.state)
-    options = (on_grid.contents, flow, substep.own * dt, lost, *carried)
+    options = (on_grid.contents, *fed, substep.own * dt, lost, *carried)
     pushed = None if inertia is None else partial(pushed_back, scene, on_grid)
     storage = StorageProblem(scene.storage, matrices.storage, start.data.pieces, *options, pushed)
     return Balances(momentum, storage, inertia)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 from dolfinx.common import Timer
@@ -18,6 +18,7 @@ from mpm_dolfinx.conditions.acting import Loads
 from mpm_dolfinx.diagnostics.scene_checks import check_held
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.domains.pressure_transport import CellPressures, Reconstruction, share_within, transport
+from mpm_dolfinx.flow.feeding import Feeds, Wet
 from mpm_dolfinx.flow.fluxes import CellContents, CellMotion, Conduction, Mobility, OpenSides, PieceContents
 from mpm_dolfinx.flow.layers import graded, mixed_cells
 from mpm_dolfinx.flow.nonorthogonal import Gradients, off_facets
@@ -243,7 +244,7 @@ class OnGrid(Keyed):
         at_rest: pressures of the fluid at rest, from which these then are the differences.
         """
         contents = self.contents
-        sides = stage.hydraulic.data(self.cut, self.cut.points, contents, t)
+        sides = stage.open_sides(Wet(self.cut, self.cut.points, contents, t))
         sides = replace(sides, pressure=mass_potential(sides.pressure, bulk))
         if at_rest is not None:
             x = self.cut.grid.midpoints + contents.centroid
@@ -390,6 +391,7 @@ class Assembled(Keyed):
         self.end_step = system.end_step
         self._on_grid, self._stage = on_grid, stage
         self._u, self._varies = momentum.u, storage is not None and storage.conductivity is not None
+        self._bulk = storage.bulk if storage is not None else np.inf
         self._by_pressure = storage if self._varies and storage.conductivity.pressure is not None else None
         self._mobility: Latest[Mobility] = Latest()
         self._outflow: Latest[Outflow] = Latest()
@@ -425,8 +427,8 @@ class Assembled(Keyed):
 
     def flow(
         self, state: State, weight: NDArray[np.float64] | None, data: QuadratureData, t: float
-    ) -> Callable[[bool], Outflow]:
-        """Return what assembles the fluxes at u, called with whether a step begins.
+    ) -> tuple[list[Feeds], Callable[[bool], Outflow]]:
+        """Return what acts on the fluid, and what assembles the fluxes at u, called with whether a step begins.
 
         Where points stay in their cells, and nothing but u would change the fluxes, they are those of the start.
 
@@ -445,35 +447,36 @@ class Assembled(Keyed):
         contents = self._on_grid.contents
         grid = self._on_grid.cut.grid
         u = self._u
-        hydraulic, varies = self._stage.hydraulic, (t,) if self._stage.hydraulic.varies else ()
+        varies = (t,) if any(one.varies for one in self._stage.feeding) else ()
         at = state.points if weight is not None or varies else on_grid.cut.points  # gravity may change with time
-        sides = partial(hydraulic.data, on_grid.cut, at, contents, t)
+        feeds = self._stage.fed(Wet(on_grid.cut, at, contents, t, data.pieces))
+        sides = OpenSides.joined([one.sides for one in feeds if one.sides is not None], grid.dim)
 
         def mobility(begins: bool) -> Mobility:
             if self._varies:
                 return on_grid.mobility(data, begins)
             return self._mobility((), lambda: on_grid.mobility(data, True))
 
-        def set_fluxes(at_sides: OpenSides, kappa: Mobility, motion: CellMotion | None = None) -> Outflow:
-            where = (at_sides.cells, at_sides.shape, at_sides.seeps, at_sides.area, at_sides.reach)
-            off = self._off and (self._off, self._gradients(where, lambda: Gradients(contents, at_sides)))
-            return self.storage.set_fluxes(contents, at_sides, Conduction(kappa, motion, weight), off)
+        def set_fluxes(kappa: Mobility, motion: CellMotion | None = None) -> Outflow:
+            where = (sides.cells, sides.shape, sides.seeps, sides.area, sides.reach)
+            off = self._off and (self._off, self._gradients(where, lambda: Gradients(contents, sides)), sides)
+            return self.storage.set_fluxes(contents, feeds, Conduction(kappa, motion, weight, self._bulk), off)
 
         if (storage := self._by_pressure) is not None:
             varies = (*varies, storage.p.x.array.copy())
             storage.conductivity.pressure.x.array[:] = storage.p.x.array  # of the start of the substep
         if state.stays and not self._varies:
-            outflow = self._outflow((at, weight, *varies), lambda: set_fluxes(sides(), mobility(True)), grid.comm)
-            return lambda begins: outflow
-        placed, rests = sides(), on_grid.rests(state) if not self._varies else None
+            outflow = self._outflow((at, weight, *varies), lambda: set_fluxes(mobility(True)), grid.comm)
+            return feeds, lambda begins: outflow
+        rests = on_grid.rests(state) if not self._varies else None
 
         def at_present(begins: bool) -> Outflow:
             motion = contents.motion(u.x.array.reshape(-1, grid.dim), rests)
-            return set_fluxes(placed, mobility(begins), motion)
+            return set_fluxes(mobility(begins), motion)
 
         # a substep begins where the one before it has ended
         at_u = (data.pieces.key, weight, *varies)
-        return lambda begins: self._outflow((*at_u, u.x.array.copy()), lambda: at_present(begins), grid.comm)
+        return feeds, lambda begins: self._outflow((*at_u, u.x.array.copy()), lambda: at_present(begins), grid.comm)
 
 
 def assembled(

@@ -24,6 +24,7 @@ from mpm_dolfinx.conditions.unit_weights import other_gravity, weighed
 from mpm_dolfinx.diagnostics.overfilled import warn_overfilled
 from mpm_dolfinx.diagnostics.smeared import warn_smeared
 from mpm_dolfinx.domains.cut_domains import CutDomains
+from mpm_dolfinx.flow.sources import Sources
 from mpm_dolfinx.flow.storage import StorageForms
 from mpm_dolfinx.grid.grid import Grid, in_chunks
 from mpm_dolfinx.materials.evaluate import ConductivityAtPieces
@@ -115,7 +116,8 @@ class Scene:
                 ConductivityAtPieces(scene.materials, laws, pieces, u, fem.Function(grid.cellwise())) if laws else None
             )
             kind = (symmetric, scene.conducts, scene.evolves)
-            self.storage = StorageForms(pieces, u, p, fluid.bulk, weight, *kind, law, sources, self.t, inertial)
+            feeding = [Sources(sources, pieces, p, self.t)] if sources else []
+            self.storage = StorageForms(pieces, u, p, fluid.bulk, weight, *kind, law, feeding, inertial)
         self.motion = Motion(scene, bodies, self.momentum, self.storage)
         # what is still to be looked for, to be warned of, of which nothing but the log knows
         self._looks = (warn_overfilled, *[partial(warn_smeared, materials=scene)] * scene.uneven)
@@ -126,7 +128,7 @@ class Scene:
     @property
     def flows(self) -> bool:
         """Whether fluid moves, or is brought by sources."""
-        return self.storage is not None and (self.materials.conducts or bool(self.storage.sources))
+        return self.storage is not None and (self.materials.conducts or bool(self.storage.feeding))
 
     @property
     def substeps(self) -> tuple[Substep, ...]:

@@ -34,7 +34,10 @@ from mpm_dolfinx.contact.acting import ContactsOfStage, ToolsOfStage
 from mpm_dolfinx.contact.groups import Contact
 from mpm_dolfinx.contact.tool import Tool
 from mpm_dolfinx.domains.lattice import Lattice, lattices
-from mpm_dolfinx.flow.hydraulic_boundary import HydraulicBoundary
+from mpm_dolfinx.flow.drained_sides import DrainedSides
+from mpm_dolfinx.flow.feeding import Feeding, Feeds, Wet
+from mpm_dolfinx.flow.fluxes import OpenSides
+from mpm_dolfinx.flow.storage import StorageForms
 from mpm_dolfinx.grid.grid import SIDES, Grid
 from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.materials.skeleton import Fluid
@@ -47,6 +50,8 @@ Condition = Traction | Pressure | Displacement | RigidPlate | Drained | Inflow |
 """What acts on the bodies."""
 KINDS: tuple[type[Acting], ...] = (Tractions, Pressures, Plates, GivenDisplacements, ToolsOfStage, ContactsOfStage)
 """What acts on the momentum for conditions that do not say it themselves, by their method `acting`."""
+FED: tuple[type[Feeding], ...] = (DrainedSides,)
+"""What acts on the storage of fluid."""
 
 
 def checked(conditions: Sequence[Condition]) -> Sequence[Condition]:
@@ -70,7 +75,7 @@ class Stage:
     given: the conditions by their names, as they were given; named: the same, with water as heavy as the pore fluid;
     conditions: walls, the axis among them, and gravity; present: which bodies are there; later: those that may still
     come; free: (nodes, d), components that no wall holds; axisymmetric: as the grid; lattices: of the bodies that are
-    there; materials: of the scene; acting: what the conditions do to the momentum; hydraulic: to the storage of fluid.
+    there; materials: of the scene; acting: what the conditions do to the momentum; feeding: to the storage of fluid.
     """
 
     given: Mapping[str, Condition]
@@ -83,7 +88,7 @@ class Stage:
     lattices: Sequence[Lattice]
     materials: SceneMaterials
     acting: tuple[Acting, ...]
-    hydraulic: HydraulicBoundary
+    feeding: tuple[Feeding, ...]
 
     @property
     def inertia(self) -> bool:
@@ -93,10 +98,7 @@ class Stage:
     @property
     def surfaces(self) -> list[Surface]:
         """The faces of all conditions but tools and contacts."""
-        return [
-            *(faces for one in self.acting for faces in one.surfaces),
-            *(faces for _, faces in self.hydraulic.outlets),
-        ]
+        return [faces for one in (*self.acting, *self.feeding) for faces in one.surfaces]
 
     def of(self, *kinds: type) -> dict[str, Any]:
         """Return the conditions of some classes by their names."""
@@ -116,6 +118,15 @@ class Stage:
         """Return what acts on the momentum in a substep."""
         with Timer("mpm: loads"):
             return [one.placed(place) for one in self.acting]
+
+    def fed(self, wet: Wet) -> list[Feeds]:
+        """Return what acts on the fluid in a substep."""
+        return [one.placed(wet) for one in self.feeding]
+
+    def open_sides(self, wet: Wet) -> OpenSides:
+        """Return the open sides, with what they give."""
+        sides = [one.sides for one in self.fed(wet)]
+        return OpenSides.joined([one for one in sides if one is not None], self.free.shape[1])
 
     def check_start(self, place: Place) -> None:
         """Refuse a stage that begins in a place where it cannot."""
@@ -140,7 +151,7 @@ class Stage:
         d = self.free.shape[1]
         out = {quantity: {} for quantity in QUANTITIES}
         out["wall_reactions"] = {wall: np.full(d, value) for wall in SIDES[d]}
-        out["outflows"] = self.hydraulic.unknown(value)
+        out["outflows"] = {name: values for one in self.feeding for name, values in one.unknown(value).items()}
         for one in self.acting:
             for quantity, values in one.unknown(value).items():
                 out[quantity] = out.get(quantity, {}) | values
@@ -171,7 +182,7 @@ def stage(
     bodies: Sequence[Body],
     materials: SceneMaterials,
     fluid: Fluid | None,
-    momentum: MomentumForms,
+    forms: tuple[MomentumForms, StorageForms | None],
     conditions: Mapping[str, Any],
     present: Sequence[bool],
     later: Sequence[int],
@@ -186,8 +197,8 @@ def stage(
         Those of the scene.
     fluid
         Pore fluid, if there is one.
-    momentum
-        Forms, and what acts in all stages.
+    forms
+        Of momentum and storage, and what acts in all stages.
     conditions
         walls, conditions, gravity: see `Simulation`.
     present, later
@@ -200,7 +211,7 @@ def stage(
     """
     given_by_name = named(checked(conditions["conditions"]))
     by_name = {name: with_weight(one, fluid) for name, one in given_by_name.items()}
-    if fluid is None and any(isinstance(one, (Drained, Inflow)) for one in by_name.values()):
+    if fluid is None and any(isinstance(one, kind.conditions) for one in by_name.values() for kind in FED):
         raise ValueError("drained and inflow sides need a fluid")
     if conditions["inertia"]:
         _check_inertia(by_name)
@@ -214,7 +225,9 @@ def stage(
     walls = with_axis(grid, conditions["walls"])
     free = ~_held(grid, walls)
     sides = Sides(grid, bodies, present)
+    momentum, storage = forms
     setting = Setting(sides, free, materials, momentum.conditions, by_name)
+    feeding = [kind(setting, mine) for kind in FED if (mine := setting.of(*kind.conditions))]
     found = [(kind, setting.of(*kind.conditions)) for kind in KINDS]
     acting = [one.acting(setting) for one in (*momentum.acting, *by_name.values()) if hasattr(one, "acting")]
     acting += [kind(setting, mine) for kind, mine in found if mine]
@@ -234,7 +247,7 @@ def stage(
         lattices=lattice,
         materials=materials,
         acting=tuple(acting),
-        hydraulic=HydraulicBoundary(sides, setting.of(Drained, Inflow)),
+        feeding=(*feeding, *(storage.feeding if storage is not None else ())),
     )
 
 
