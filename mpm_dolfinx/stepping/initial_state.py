@@ -89,7 +89,7 @@ def balanced(scene: Scene, state: State) -> State:
     forms, materials = scene.momentum, scene.materials
     try:
         start = set_up(scene, state, 0.0)
-        seeded = replace(start.state, stay=_stay(scene, start))
+        seeded = _as_reset(scene, start)
         if scene.storage is not None:  # those that a step leaves
             pressure = scene.motion.pressures(start.on_grid, state.stage, state.t)
             seeded = replace(seeded, points=replace(seeded.points, pressure=pressure))
@@ -168,13 +168,14 @@ def _problem(scene: Scene, start: Start, state: State) -> MomentumProblem:
     return MomentumProblem(scene.momentum, matrices.momentum, data, loads, scene.scheme.tolerance)
 
 
-def _stay(scene: Scene, start: Start) -> Stay:
-    """Return what holds of a reset since which nothing has moved."""
-    cut, p = start.on_grid.cut, None
-    if scene.storage is None:
-        return Stay(cut.points, None, None, None, None)
-    p = cut.to_pieces(scene.storage.p_n.x.array[start.data.pieces.cells])
-    return Stay(cut.points, cut.points.id[cut.pieces.point], p, cut.pieces.x, p)
+def _as_reset(scene: Scene, start: Start) -> State:
+    """Return the state at a start, of a reset since which nothing has moved."""
+    cut, pieces = start.on_grid.cut, None
+    if scene.storage is not None:
+        p = cut.to_pieces(scene.storage.p_n.x.array[start.data.pieces.cells])
+        of_cut = (cut.points.id[cut.pieces.point], cut.pieces.cell, cut.pieces.fraction)
+        pieces = PiecePressures(*of_cut, None, cut.pieces.x, None, None, p, p)
+    return replace(start.state, pieces=pieces, stay=Stay(cut.points))
 
 
 def _mixed(unknowns: Unknowns, seen: Sequence[tuple[NDArray, NDArray]]) -> NDArray[np.float64]:

@@ -136,17 +136,17 @@ class OnGrid(Keyed):
         """Return the pressures of the filled owned cells at the start of a step, Pa."""
         if not state.stays:
             bulk = self._storage.bulk
-            carried = transport(state.transported.potentials(bulk), self.cut.points, self.cut.pieces)
+            carried = transport(state.pieces.potentials(bulk), self.cut.points, self.cut.pieces)
             if state.stay:
-                carried = mass_potential(self.of_pieces(state, "pressure", pressure_of(carried, bulk)), bulk)
+                carried = mass_potential(self.of_pieces(state, "of_cell", pressure_of(carried, bulk)), bulk)
             return pressure_of(self._means(carried), bulk)
         p = np.zeros(self.cut.grid.num_local)
-        p[self.cut.cells] = self.cut.pieces_to_cells(state.stay.pressure)
+        p[self.cut.cells] = self.cut.pieces_to_cells(state.pieces.of_cell)
         return p[self.contents.filled]
 
     def of_pieces(self, state: State, name: str, fresh: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return what pieces have of the state's stay by this name, fresh (m, ...) where there is none."""
-        return state.stay.of_pieces(name, fresh, self.cut.pieces.point) if state.stay else fresh
+        """Return what pieces have by this name in the state, fresh ones (m, ...) where they do not stay."""
+        return state.of_pieces(name, fresh, self.cut.pieces.point)
 
     def as_reset(self, state: State) -> QuadratureData:
         """Return the pieces when the grid was reset, and set the present pressures to those of then."""

@@ -42,13 +42,13 @@ def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int
         warn_units(scene.grid.comm, scene.fluid, conditions["gravity"])
     points = scene.materials.seeded.of(_ids(scene.bodies, later), kept=False)
     points = scene.initial.of(scene.materials, points, present, begun.gravity_at(0.0) if scene.initial.given else None)
-    transported = None
+    pieces = None
     if scene.fluid:
-        transported = pieces_at_start(scene, points) if callable(scene.initial.pressure) else at_start(points)
+        pieces = pieces_at_start(scene, points) if callable(scene.initial.pressure) else at_start(points)
     return State(
         t=0.0,
         points=_gripped(scene, begun, points),
-        transported=transported,
+        pieces=pieces,
         outcome=begun.unknown(np.nan if scene.initial.given else 0.0),
         stage=begun,
     )
@@ -85,7 +85,7 @@ def begin_stage(
     if state.stays:  # pressures are those of the cells
         state = scene.motion.left_grid(state, scene.on_grid(state.stay.points))
     state = replace(state, stay=None)
-    gone, transported = _ids(scene.bodies, remove), state.transported
+    gone, pieces = _ids(scene.bodies, remove), state.pieces
     there = [body for body, here in enumerate(before.present) if here and body not in remove]
     bare, gravity = let_go(state.points, before.data_names(before.named)), None
     if scene.initial.given:
@@ -94,8 +94,8 @@ def begin_stage(
     points, new = _filled(scene, bare.of(gone, kept=False), there, add, gravity)
     others = before.data_names(before.named.keys() - begun.same(before))
     points = _gripped(scene, begun, points, let_go(state.points, others))
-    if transported is not None:
-        transported = transported.of(gone, kept=False).joined(at_start(new))
+    if pieces is not None:
+        pieces = pieces.of(gone, kept=False).joined(at_start(new))
     points = _changed(scene, points, fields)
     if begun.inertia and not before.inertia:
         points = replace(points, data=points.data | resting(points))
@@ -104,7 +104,7 @@ def begin_stage(
     outcome = begun.begun(before, state.outcome, np.nan if state.resets else 0.0)
     rest = state.rest if _holds_as(begun, before) else None
     new = {"stage": begun, "begins": True, "outcome": outcome, "held": None, "rest": rest}
-    return replace(state, points=points, transported=transported, **new)
+    return replace(state, points=points, pieces=pieces, **new)
 
 
 def _gripped(
