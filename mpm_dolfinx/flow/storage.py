@@ -32,7 +32,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from petsc4py import PETSc
 
@@ -66,6 +66,17 @@ FluxSlope = Callable[[PETSc.Vec], NDArray[np.float64]]
 """See `StorageProblem.flux_slope`."""
 
 
+class CellPressure(NamedTuple):
+    """The pore pressure of the cells in a step, DG0, Pa: at the present iterate, and at the start of substep and step.
+
+    The only place of it on the grid; that between two steps is `State.pieces`.
+    """
+
+    now: fem.Function
+    before: fem.Function
+    start: fem.Function
+
+
 class StorageForms:
     """The compiled forms of the storage of a scene's pore fluid.
 
@@ -77,7 +88,7 @@ class StorageForms:
     displacement
         Increment of the displacement since the start of the step.
     pressure
-        DG0 pore pressure, Pa, positive in compression.
+        Pore pressure of the cells, positive in compression.
     bulk
         Bulk modulus of the fluid, Pa.
     weight : (d,), N/m^3
@@ -101,7 +112,7 @@ class StorageForms:
         self,
         pieces: FormPoints,
         displacement: fem.Function,
-        pressure: fem.Function,
+        pressure: CellPressure,
         bulk: float,
         weight: ufl.core.expr.Expr | None,
         symmetric: bool,
@@ -112,13 +123,14 @@ class StorageForms:
         inertial: ufl.core.expr.Expr | None = None,
     ):
         self.grid = pieces.grid
-        self.p = pressure
+        self.p, self.p_n = pressure.now, pressure.start
+        self.p_before = pressure.before
         self.bulk = bulk
-        Q = pressure.function_space
+        Q = self.p.function_space
         self.conductivity = conductivity
-        self.p_n, self._work = fem.Function(Q), fem.Function(Q)
+        self._work = fem.Function(Q)
         q = ufl.TestFunction(Q)
-        p, delta = ufl.variable(pressure), ufl.variable(pieces.increment(displacement))
+        p, delta = ufl.variable(self.p), ufl.variable(pieces.increment(displacement))
         J = ufl.det(delta)
         stored = change_of_content(pieces.biot, pieces.storage_at_one, pieces.storage, J, p - self.p_n)
         self.drains = "retention" in pieces.sizes
@@ -131,7 +143,7 @@ class StorageForms:
         along = [along_shapes(slope, pieces) for slope in by_u]
         self._derivatives = CellSums([ufl.diff(stored, p), *(part for slope in along for part in slope)], pieces)
         self.symmetric, self.softens = symmetric, softens
-        self.fluxes = FluxForms(pieces.grid, weight, flows, pressure, bulk, inertial)
+        self.fluxes = FluxForms(pieces.grid, weight, flows, self.p, bulk, inertial)
         self.feeding = tuple(feeding)
         """What feeds the fluid in all stages."""
 
@@ -180,11 +192,10 @@ class Outflow:
 class Rates:
     """Rates at which the owned cells lose fluid, m^d/s, or with `taken` what they lose in a time, m^d.
 
-    pressure: of the cells, Pa; cells: outflow less sources of each; lost: what of that leaves the bodies, less sources;
+    cells: outflow less sources of each; lost: what of that leaves the bodies, less sources;
     turnover: what goes in and out; gain: what sources bring or take, in size.
     """
 
-    pressure: NDArray[np.float64]
     cells: NDArray[np.float64]
     lost: NDArray[np.float64]
     turnover: NDArray[np.float64]
@@ -192,8 +203,7 @@ class Rates:
 
     def taken(self, seconds: float) -> Rates:
         """Return what the cells lose in a time."""
-        taken = (seconds * values for values in (self.cells, self.lost, self.turnover, self.gain))
-        return Rates(self.pressure, *taken)
+        return Rates(*(seconds * values for values in (self.cells, self.lost, self.turnover, self.gain)))
 
 
 class StorageSystem:
@@ -230,7 +240,7 @@ class StorageSystem:
         self.T, self.D, self.L = (matrix(own, own, 2 * d + 1) for _ in range(3))
         self.B = matrix(own, momentum, 2**d * d)
         self.B_momentum = self.B if forms.symmetric else matrix(own, momentum, 2**d * d)
-        self.residual, self.p, self.p_start = (own.vector() for _ in range(3))
+        self.residual, self.step, self._potentials = (own.vector() for _ in range(3))
         kinds = (fluxes.flux, fluxes.damp, fluxes.alternation, fluxes.gravity)
         self._flux, self.damp, self._alternation, self.gravity = (f and f.on(facets) for f in kinds)
         self.set_alternation()
@@ -252,6 +262,11 @@ class StorageSystem:
         self.B.mult(u, out)
         for slope in slopes:
             out.array_w[:] += slope(u)
+
+    def between(self, pi: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return what the cells lose to others at mass potentials (n,), Pa, by their differences alone, m^d/s."""
+        self._potentials.array_w[:] = pi
+        return (self.T * self._potentials).array_r
 
     def set_alternation(self) -> None:
         """Assemble the filter L of `StorageProblem.assemble_preconditioner`."""
@@ -348,9 +363,8 @@ class StorageProblem:
         self._feeds = feeds
         self._flow = flow
         self.dt = dt
-        self._before = before or Rates(np.empty(0), *np.zeros((4, system.unknowns.size)))
+        self._before = before or Rates(*np.zeros((4, system.unknowns.size)))
         outflow = flow(before is None)
-        system.unknowns.gather(forms.p_n.x.array, system.p_start)
         reach = 4 * forms.grid.h.max() ** 2  # no two centroids are further apart than 2 h
         tau, least = contents.set_damping(), dt * outflow.mobility.min(axis=1)
         softest = contents.softest(softness) if forms.softens else np.ones(1)
@@ -448,8 +462,8 @@ class StorageProblem:
         Of what the laws of the conductivity, and the geometry of the fluxes, make of it no matrix is assembled: it is
         taken from differences (Knoll and Keyes 2004).  `set_fluxes` makes the fluxes those at u again.
         """
-        p, h = self.system.unknowns.gather(self.forms.p.x.array, self.system.unknowns.vector()), self.forms.grid.h.min()
-        here, density = self._rates(self._flow(False), p).cells, self._density
+        h = self.forms.grid.h.min()
+        here, density = self._rates(self._flow(False)).cells, self._density
 
         def along(v: PETSc.Vec) -> NDArray[np.float64]:
             largest = v.norm(PETSc.NormType.NORM_INFINITY)
@@ -457,7 +471,7 @@ class StorageProblem:
                 return np.zeros(len(here))
             step, now = np.sqrt(np.finfo(float).eps) * h / largest, u.x.array.copy()
             unknowns.add(u, step, v)
-            there = self._rates(self._flow(False), p).cells
+            there = self._rates(self._flow(False)).cells
             u.x.array[:] = now
             return self.dt * (there - here) / step / density
 
@@ -473,12 +487,13 @@ class StorageProblem:
         owned = system.unknowns.owned
         density = self._density
         b[owned] = change = density * b[owned] + self._due
-        r, p = system.unknowns.gather(b, system.residual), system.unknowns.gather(forms.p.x.array, system.p)
+        r = system.unknowns.gather(b, system.residual)
+        step = system.unknowns.gather(forms.p.x.array - forms.p_n.x.array, system.step)
         if self.damped:
-            system.D.multAdd(p - system.p_start, r, r)
+            system.D.multAdd(step, r, r)
         if self._softer is not None:
-            self._softer.multAdd(p - system.p_start, r, r)
-        rates = self._rates(outflow, p)
+            self._softer.multAdd(step, r, r)
+        rates = self._rates(outflow)
         now = rates.taken(self.dt)
         mass = r.array_r + now.cells + before.cells
         r.array_w[:] = mass / density
@@ -487,13 +502,11 @@ class StorageProblem:
         rows = np.abs(change) + now.gain + before.gain, round_off, np.abs(mass), change + now.lost + before.lost
         return StorageResidual(r, *(system.of_parts.sums(row) for row in rows), rates)
 
-    def _rates(self, outflow: Outflow, p: PETSc.Vec) -> Rates:
+    def _rates(self, outflow: Outflow) -> Rates:
         """Return the rates at (u, p)."""
         system, fluid = self.system, self._fluid
-        pi = p.copy()
-        pi.array_w[:] = fluid.pi
         if system.gravity is None:
-            cells = (system.T * pi).array_r + self._aslant
+            cells = system.between(fluid.pi) + self._aslant
         else:
             cells = self.forms.driven(system.gravity)[system.unknowns.owned] + self._aslant
         lost, gain = np.zeros((2, len(cells)))
@@ -504,7 +517,7 @@ class StorageProblem:
             leaving = one.leaving(at, fluid)
             lost, gain = lost + leaving.cells, gain + leaving.gain
             turnover = turnover + leaving.turnover
-        return Rates(p.array_r.copy(), cells + lost, lost, turnover, gain)
+        return Rates(cells + lost, lost, turnover, gain)
 
     def came(self, rates: Rates) -> NDArray[np.float64]:
         """Return the fluid (cells,), m^d, that came to the local cells in the step by fluxes and sources; ghosts none.

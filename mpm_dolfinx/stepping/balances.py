@@ -21,7 +21,7 @@ from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.stepping.on_grid import Assembled, OnGrid
-from mpm_dolfinx.stepping.scene import Scene
+from mpm_dolfinx.stepping.scene import Scene, When
 from mpm_dolfinx.stepping.state import State
 
 
@@ -137,18 +137,17 @@ def balances(
     on_grid = start.on_grid
     matrices = start.matrices
     dt = start.dt
-    scene.set_time(acting.t, substep.end * dt, acting.gravity)
-    scene.momentum.own.set_rate(substep.own * dt, substep.before / substep.own)
-    inertia, loads = None, acting.loads
+    when = When(acting.t, substep.end * dt, acting.gravity, substep.own * dt, substep.before / substep.own)
+    options = {"goes_on": going_on(scene, start, substep), "held": start.state.held, "yielded": start.yielded}
+    inertia, loads, u = None, acting.loads, None
     if flight is not None:
         own = float(substep.own * dt)
         inertia = Inertia(matrices.mass, flight.free(own, float(substep.before * dt)), 1 / own**2)
         loads = [*loads, inertia]
-        scene.momentum.u.x.array[:] = inertia.flight  # elsewhere forces of inertia would hide what is out of balance
+        u = inertia.flight  # elsewhere forces of inertia would hide what is out of balance
     if scene.momentum.inertia is not None:
         scene.momentum.inertia.set_substep(inertia, substep.end < 1)
-    forces = scene.scheme.tolerance, going_on(scene, start, substep), start.state.held
-    momentum = MomentumProblem(scene.momentum, matrices.momentum, start.data, loads, *forces, start.yielded)
+    momentum = scene.balance(when, matrices.momentum, start.data, loads, u, **options)
     if scene.storage is None:
         return Balances(momentum, None, inertia)
     weight = None if acting.gravity is None else scene.fluid.density * acting.gravity

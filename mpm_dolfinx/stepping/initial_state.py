@@ -34,7 +34,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.solve.newton import solve_substep
 from mpm_dolfinx.solve.schur import Kept, LinearSolvers, planned
 from mpm_dolfinx.stepping.balances import Start
-from mpm_dolfinx.stepping.scene import Scene
+from mpm_dolfinx.stepping.scene import Scene, When
 from mpm_dolfinx.stepping.state import State, Stay
 from mpm_dolfinx.stepping.step import set_up
 
@@ -162,10 +162,8 @@ def _problem(scene: Scene, start: Start, state: State) -> MomentumProblem:
     matrices, data = start.matrices, start.on_grid.data_of(state)
     place = Place(start.on_grid.cut, state.points, data, state.t, 0.0, state.t, state.outcome)
     loads = [one.moved(scene.momentum.u) for one in state.stage.placed(place)]
-    scene.set_time(state.t, FOREVER, start.acting[-1].gravity)
-    scene.momentum.own.set_rate(FOREVER, 0.0)
-    scene.momentum.u.x.array[:] = 0.0
-    return MomentumProblem(scene.momentum, matrices.momentum, data, loads, scene.scheme.tolerance)
+    when = When(state.t, FOREVER, start.acting[-1].gravity, FOREVER, 0.0)
+    return scene.balance(when, matrices.momentum, data, loads, 0.0)
 
 
 def _as_reset(scene: Scene, start: Start) -> State:

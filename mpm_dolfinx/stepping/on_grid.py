@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property
 
@@ -66,7 +67,7 @@ class OnGrid(Keyed):
         points = cut.points
         self.cut = cut
         self._quadrature = quadrature
-        self._storage = storage
+        self._storage, self._u = storage, momentum.u
         self._places = quadrature.places(cut)
         self.data = quadrature.data(cut, self._places, points)
         """The pieces when the grid was reset."""
@@ -148,13 +149,21 @@ class OnGrid(Keyed):
         """Return what pieces have by this name in the state, fresh ones (m, ...) where they do not stay."""
         return state.of_pieces(name, fresh, self.cut.pieces.point)
 
-    def as_reset(self, state: State) -> QuadratureData:
-        """Return the pieces when the grid was reset, and set the present pressures to those of then."""
+    @contextmanager
+    def as_reset(self, state: State) -> Iterator[QuadratureData]:
+        """Give the pieces when the grid was reset; within it displacements are none, and pressures those of then."""
+        functions = [self._u] if self._storage is None else [self._u, self._storage.p, self._storage.p_n]
+        now = [f.x.array.copy() for f in functions]
+        self._u.x.array[:] = 0.0
         if self._storage is not None:
             if state.stay:
                 self.set_pressures(self.of_pieces(state, "start", self.pressures_of_pieces()))
             self._storage.p.x.array[:] = self._storage.p_n.x.array
-        return self.data
+        try:
+            yield self.data
+        finally:
+            for f, values in zip(functions, now, strict=True):
+                f.x.array[:] = values
 
     def pressures_of_pieces(self) -> NDArray[np.float64]:
         """Return the pressures (m,), Pa, at the start of a step of the cells that pieces lie in."""
@@ -392,7 +401,7 @@ class Assembled(Keyed):
         self._on_grid, self._stage = on_grid, stage
         self._u, self._varies = momentum.u, storage is not None and storage.conductivity is not None
         self._bulk = storage.bulk if storage is not None else np.inf
-        self._by_pressure = storage if self._varies and storage.conductivity.pressure is not None else None
+        self._by_pressure = storage.p_before if self._varies and storage.conductivity.by_pressure else None
         self._mobility: Latest[Mobility] = Latest()
         self._outflow: Latest[Outflow] = Latest()
         self.momentum.set_penalty(loads)
@@ -462,9 +471,8 @@ class Assembled(Keyed):
             off = self._off and (self._off, self._gradients(where, lambda: Gradients(contents, sides)), sides)
             return self.storage.set_fluxes(contents, feeds, Conduction(kappa, motion, weight, self._bulk), off)
 
-        if (storage := self._by_pressure) is not None:
-            varies = (*varies, storage.p.x.array.copy())
-            storage.conductivity.pressure.x.array[:] = storage.p.x.array  # of the start of the substep
+        if self._by_pressure is not None:
+            varies = (*varies, self._by_pressure.x.array.copy())
         if state.stays and not self._varies:
             outflow = self._outflow((at, weight, *varies), lambda: set_fluxes(mobility(True)), grid.comm)
             return feeds, lambda begins: outflow
