@@ -72,6 +72,7 @@ class DruckerPrager(Frictional):
     hardening: Field = 0.0
     match: str = "plane strain"
 
+    elastic_hencky: ClassVar = True
     state: ClassVar = {"plastic": np.eye(3), "hardened": 0.0}
 
     def __post_init__(self):

@@ -150,6 +150,12 @@ def domain_volumes(corners: NDArray[np.float64], axisymmetric: bool) -> NDArray[
     return TURN * (simplex_volumes(v) * v[simplices(2), 0].mean(axis=1)).sum(axis=0)
 
 
+def edges(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the mean edges (n, d, d), m, of domains (n, 2^d, d), one a column."""
+    signs = 2.0 * corner_bits(corners.shape[2]) - 1
+    return np.einsum("nki,ka->nia", corners, signs) / 2 ** (corners.shape[2] - 1)
+
+
 def centroids(corners: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the centroids (n, d), m, of domains (n, 2^d, d), in axisymmetry in the plane: where their means count.
 

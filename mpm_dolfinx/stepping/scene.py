@@ -171,7 +171,7 @@ class Scene:
         self.t.value, self.dt.value = when.t, when.since
         if when.gravity is not None:
             self.gravity.value = when.gravity
-        self.momentum.own.set_rate(when.own, when.past)
+        self.momentum.velocity.set(when.own, when.past)
         if self.storage is not None:
             self.storage.p_before.x.array[:] = self.storage.p.x.array
         if u is not None:
