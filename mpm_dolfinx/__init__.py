@@ -14,8 +14,7 @@ SI units throughout, or any that are consistent (`Fluid`).  Stress is positive i
 """
 
 from mpm_dolfinx.base import _environment  # noqa: F401 - first: it says what is missing
-from mpm_dolfinx.base.errors import LeftGrid, NotConverged
-from mpm_dolfinx.base.report import Report
+from mpm_dolfinx.base.errors import LeftGrid, NotConverged, Report
 from mpm_dolfinx.bodies.bodies import Body, mapped
 from mpm_dolfinx.bodies.boxes import box, shape
 from mpm_dolfinx.bodies.mesh_files import from_mesh

@@ -11,7 +11,7 @@ import pytest
 from helpers import SOFT, noting, pressed, thresholds
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.base.report import Report
+from mpm_dolfinx.base.errors import Report
 from mpm_dolfinx.solve import monolithic, schur
 from mpm_dolfinx.solve.linear import (
     BlockFactors,

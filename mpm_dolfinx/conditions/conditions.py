@@ -7,7 +7,7 @@ lies on another body, as seeded, does not count.
 Regions and X are reference positions, before all maps (`mapped`); areas are those as seeded, after them.
 
 Values may be functions of the time t, the reference places X and the present places x, by these names: how they are
-called, and what they may give, stands in `given_values`.
+called, and what they may give, stands in `validation`.
 
 What is wrong with a condition is said, with a ValueError, when it is made, or a scene or a stage with it; of what
 functions give at the step that asks for it.  A condition equals only itself: values and regions may be arrays and
@@ -24,8 +24,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mpm_dolfinx.base.given_values import NAMES, Places, check_names, given
-from mpm_dolfinx.base.validation import flag, line, numbers
+from mpm_dolfinx.base.validation import NAMES, Places, check_names, flag, given, line, numbers
 from mpm_dolfinx.bodies.faces import Region, Surface
 from mpm_dolfinx.materials.skeleton import Skeleton
 
@@ -50,7 +49,7 @@ class Condition:
                 check_names(f"{line(self)}: {name}", getattr(self, name), among)
 
     def _given(self, name: str, t: float, *more, **options) -> NDArray[np.float64]:
-        """Return one of its values at time t (s), see `given_values.given`."""
+        """Return one of its values at time t (s), see `validation.given`."""
         what, among = f"{line(self)}: {name} at t = {t:g} s", self.FUNCTIONS[name]
         return given(what, getattr(self, name), t, *more, among=among, **options)
 

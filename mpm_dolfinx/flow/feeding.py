@@ -8,6 +8,7 @@ the residual is assembled.  The storage loops over them, and knows none by name.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -91,6 +92,11 @@ class Feeds:
     def outflows(self, at: Any, fluid: Fluid) -> dict[str, NDArray[np.float64]]:
         """Return what leaves the bodies by each condition, m^d/s, by name; all processes together."""
         return {}
+
+
+def open_sides(feeds: Sequence[Feeds], dim: int) -> OpenSides:
+    """Return the open sides of all that acts on the fluid, with what they give."""
+    return OpenSides.joined([one.sides for one in feeds if one.sides is not None], dim)
 
 
 class Feeding:

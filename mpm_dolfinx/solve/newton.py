@@ -30,8 +30,7 @@ import numpy as np
 from dolfinx.common import Timer
 from numpy.typing import NDArray
 
-from mpm_dolfinx.base.errors import NotConverged
-from mpm_dolfinx.base.report import Report
+from mpm_dolfinx.base.errors import NotConverged, Report
 from mpm_dolfinx.flow.storage import Rates, StorageProblem, StorageResidual
 from mpm_dolfinx.mechanics.momentum import MomentumProblem
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData

@@ -139,7 +139,8 @@ def balances(
     dt = start.dt
     when = When(acting.t, substep.end * dt, acting.gravity, substep.own * dt, substep.before / substep.own)
     options = {"goes_on": going_on(scene, start, substep), "held": start.state.held, "yielded": start.yielded}
-    inertia, loads, u = None, acting.loads, None
+    inertia, u = None, None
+    loads = acting.loads
     if flight is not None:
         own = float(substep.own * dt)
         inertia = Inertia(matrices.mass, flight.free(own, float(substep.before * dt)), 1 / own**2)

@@ -18,9 +18,8 @@ from mpi4py import MPI
 import numpy as np
 from numpy.typing import NDArray
 
-from mpm_dolfinx.base.errors import StepFailed
+from mpm_dolfinx.base.errors import Report, StepFailed
 from mpm_dolfinx.base.fluid_content import mass_potential, pressure_of
-from mpm_dolfinx.base.report import Report
 from mpm_dolfinx.base.tolerances import FOREVER, ROUND_OFF
 from mpm_dolfinx.bodies.bodies import pressure_at
 from mpm_dolfinx.conditions.acting import Loads, Place

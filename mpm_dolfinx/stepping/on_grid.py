@@ -19,8 +19,8 @@ from mpm_dolfinx.conditions.acting import Loads
 from mpm_dolfinx.diagnostics.scene_checks import check_held
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.domains.pressure_transport import CellPressures, Reconstruction, share_within, transport
-from mpm_dolfinx.flow.feeding import Feeds, Wet
-from mpm_dolfinx.flow.fluxes import CellContents, CellMotion, Conduction, Mobility, OpenSides, PieceContents
+from mpm_dolfinx.flow.feeding import Feeds, Wet, open_sides
+from mpm_dolfinx.flow.fluxes import CellContents, CellMotion, Conduction, Mobility, PieceContents
 from mpm_dolfinx.flow.layers import graded, mixed_cells
 from mpm_dolfinx.flow.nonorthogonal import Gradients, off_facets
 from mpm_dolfinx.flow.storage import Outflow, StorageForms, StorageSystem
@@ -253,7 +253,8 @@ class OnGrid(Keyed):
         at_rest: pressures of the fluid at rest, from which these then are the differences.
         """
         contents = self.contents
-        sides = stage.open_sides(Wet(self.cut, self.cut.points, contents, t))
+        wet = Wet(self.cut, self.cut.points, contents, t)
+        sides = open_sides([one.placed(wet) for one in stage.feeding], self.cut.grid.dim)
         sides = replace(sides, pressure=mass_potential(sides.pressure, bulk))
         if at_rest is not None:
             x = self.cut.grid.midpoints + contents.centroid
@@ -458,8 +459,9 @@ class Assembled(Keyed):
         u = self._u
         varies = (t,) if any(one.varies for one in self._stage.feeding) else ()
         at = state.points if weight is not None or varies else on_grid.cut.points  # gravity may change with time
-        feeds = self._stage.fed(Wet(on_grid.cut, at, contents, t, data.pieces))
-        sides = OpenSides.joined([one.sides for one in feeds if one.sides is not None], grid.dim)
+        wet = Wet(on_grid.cut, at, contents, t, data.pieces)
+        feeds = [one.placed(wet) for one in self._stage.feeding]
+        sides = open_sides(feeds, grid.dim)
 
         def mobility(begins: bool) -> Mobility:
             if self._varies:

@@ -21,8 +21,7 @@ from mpm_dolfinx.bodies.bodies import Body, material_points
 from mpm_dolfinx.conditions.acting import Loads
 from mpm_dolfinx.conditions.conditions import OnSide
 from mpm_dolfinx.conditions.unit_weights import other_gravity, weighed
-from mpm_dolfinx.diagnostics.overfilled import warn_overfilled
-from mpm_dolfinx.diagnostics.smeared import warn_smeared
+from mpm_dolfinx.diagnostics.resolution import warn_overfilled, warn_smeared
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.flow.sources import Sources
 from mpm_dolfinx.flow.storage import CellPressure, StorageForms

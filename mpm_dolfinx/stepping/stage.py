@@ -11,8 +11,7 @@ import numpy as np
 from dolfinx.common import Timer
 from numpy.typing import ArrayLike, NDArray
 
-from mpm_dolfinx.base.given_values import check_names, given
-from mpm_dolfinx.base.validation import all_of, line, numbers
+from mpm_dolfinx.base.validation import all_of, check_names, given, line, numbers
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.faces import Surface
 from mpm_dolfinx.conditions.acting import QUANTITIES, Acting, Loads, Outcome, Place, Setting
@@ -37,9 +36,7 @@ from mpm_dolfinx.contact.tool import Tool
 from mpm_dolfinx.domains.lattice import Lattice, lattices
 from mpm_dolfinx.dynamics.quiet import QuietSides
 from mpm_dolfinx.flow.drained_sides import DrainedSides
-from mpm_dolfinx.flow.feeding import Feeding, Feeds, Wet
-from mpm_dolfinx.flow.fluxes import OpenSides
-from mpm_dolfinx.flow.storage import StorageForms
+from mpm_dolfinx.flow.feeding import Feeding
 from mpm_dolfinx.grid.grid import SIDES, Grid
 from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.materials.skeleton import Fluid
@@ -129,15 +126,6 @@ class Stage:
         with Timer("mpm: loads"):
             return [one.placed(place) for one in self.acting]
 
-    def fed(self, wet: Wet) -> list[Feeds]:
-        """Return what acts on the fluid in a substep."""
-        return [one.placed(wet) for one in self.feeding]
-
-    def open_sides(self, wet: Wet) -> OpenSides:
-        """Return the open sides, with what they give."""
-        sides = [one.sides for one in self.fed(wet)]
-        return OpenSides.joined([one for one in sides if one is not None], self.free.shape[1])
-
     def check_start(self, place: Place) -> None:
         """Refuse a stage that begins in a place where it cannot."""
         for one in self.acting:
@@ -192,7 +180,8 @@ def stage(
     bodies: Sequence[Body],
     materials: SceneMaterials,
     fluid: Fluid | None,
-    forms: tuple[MomentumForms, StorageForms | None],
+    momentum: MomentumForms,
+    fed: Sequence[Feeding],
     conditions: Mapping[str, Any],
     present: Sequence[bool],
     later: Sequence[int],
@@ -207,8 +196,8 @@ def stage(
         Those of the scene.
     fluid
         Pore fluid, if there is one.
-    forms
-        Of momentum and storage, and what acts in all stages.
+    momentum, fed
+        Forms, and what acts on the momentum in all stages; what feeds the fluid in all of them.
     conditions
         walls, conditions, gravity: see `Simulation`.
     present, later
@@ -234,7 +223,6 @@ def stage(
     walls = with_axis(grid, conditions["walls"])
     free = ~_held(grid, walls)
     sides = Sides(grid, bodies, present)
-    momentum, storage = forms
     setting = Setting(sides, free, materials, momentum.conditions, by_name)
     feeding = [kind(setting, mine) for kind in FED if (mine := setting.of(*kind.conditions))]
     found = [(kind, setting.of(*kind.conditions)) for kind in KINDS]
@@ -256,7 +244,7 @@ def stage(
         lattices=lattice,
         materials=materials,
         acting=tuple(acting),
-        feeding=(*feeding, *(storage.feeding if storage is not None else ())),
+        feeding=(*feeding, *fed),
     )
 
 

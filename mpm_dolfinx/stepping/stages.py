@@ -191,8 +191,8 @@ def _with_contacts(before: Stage, conditions: Sequence[Condition]) -> list[Condi
 
 
 def _stage(scene: Scene, conditions: Mapping[str, Any], present: Sequence[bool], later: Sequence[int]) -> Stage:
-    forms = scene.momentum, scene.storage
-    return stage(scene.grid, scene.bodies, scene.materials, scene.fluid, forms, conditions, present, later)
+    of = scene.grid, scene.bodies, scene.materials, scene.fluid, scene.momentum
+    return stage(*of, scene.storage.feeding if scene.storage else (), conditions, present, later)
 
 
 def _warn_weights(scene: Scene, begun: Stage, given: Mapping[str, Any]) -> None:
