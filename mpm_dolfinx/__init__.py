@@ -30,6 +30,7 @@ from mpm_dolfinx.conditions.conditions import (
     Quiet,
     RigidPlate,
     Source,
+    Through,
     Traction,
 )
 from mpm_dolfinx.conditions.record import Record
@@ -37,6 +38,7 @@ from mpm_dolfinx.conditions.water import water
 from mpm_dolfinx.contact.groups import Contact
 from mpm_dolfinx.contact.shapes import Ball, Cone, Convex, HalfSpace, Shape
 from mpm_dolfinx.contact.tool import Pose, Tool
+from mpm_dolfinx.flow.feeding import Feeding, Feeds, Leaving
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.io.checkpoint import Checkpoint, resume
 from mpm_dolfinx.io.one_file import one_file
@@ -88,6 +90,8 @@ __all__ = [
     "Drained",
     "DruckerPrager",
     "ElementTest",
+    "Feeding",
+    "Feeds",
     "Field",
     "Fluid",
     "GaveUp",
@@ -95,6 +99,7 @@ __all__ = [
     "HalfSpace",
     "Hencky",
     "Inflow",
+    "Leaving",
     "LeftGrid",
     "LinearElastic",
     "Loads",
@@ -126,6 +131,7 @@ __all__ = [
     "Source",
     "State",
     "Tangent",
+    "Through",
     "Tool",
     "Traction",
     "Writer",

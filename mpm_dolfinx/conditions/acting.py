@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
 """What acts on the momentum: the one protocol of tractions, given displacements, tools, weight, conditions of users.
 
+To add a condition: give it a method `acting(setting)`, which returns an `Acting`.  For the fluid: `flow/feeding.py`.
+
 A condition is placed three times: `Acting` once a stage, where it finds its faces; `Acting.placed` once a substep, with
 the faces where they have moved to; and its `Loads` add to residual and tangent as often as these are assembled.  The
 step and the balance of momentum loop over them, and know none by name.

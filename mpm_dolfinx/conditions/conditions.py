@@ -6,6 +6,9 @@ in the seeded body, before a map; sides of a mesh as it names them (`from_mesh`)
 lies on another body, as seeded, does not count.
 Regions and X are reference positions, before all maps (`mapped`); areas are those as seeded, after them.
 
+A new kind of condition is a class like these in a file of its own, with a method `acting` for what it does to the
+momentum, see `conditions/acting.py`, or `feeding` for what it does to the fluid, see `flow/feeding.py`.
+
 Values may be functions of the time t, the reference places X and the present places x, by these names: how they are
 called, and what they may give, stands in `validation`.
 

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: MIT
 """What acts on the storage of the pore fluid: the one protocol of drained sides, inflows, sources.
 
-It is to the storage what `conditions/acting.py` is to the momentum.  A condition is placed twice: `Feeding` once a
-stage, where it finds its faces; `Feeding.placed` once a substep.  Its `Feeds` add to what leaves the cells as often as
-the residual is assembled.  The storage loops over them, and knows none by name.
+To add a condition: give it a method `feeding(setting)`, which returns a `Feeding`.  It is placed twice: `Feeding` once
+a stage, where it finds its faces; `Feeding.placed` once a substep.  Its `Feeds` add to what leaves the cells as often
+as the residual is assembled.  The storage loops over them, and knows none by name.  So does the momentum over its own:
+`conditions/acting.py`.
 """
 
 from __future__ import annotations
@@ -110,7 +111,7 @@ class Feeding:
     """How many there are."""
     varies: bool = False
     """Whether what the sides give changes with time or place."""
-    surfaces: list[Surface] = []  # noqa: RUF012 - nobody writes into it
+    surfaces: Sequence[Surface] = ()
     """Faces on which they act."""
 
     def placed(self, wet: Wet) -> Feeds:

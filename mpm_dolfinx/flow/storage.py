@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Storage of the pore fluid: DG0 on the grid, which is the finite volume method.
+"""Storage of the pore fluid: DG0 on the grid, which is the finite volume method.  Sides: see `drained_sides`.
 
 In each active cell, with J_Delta = det(I + grad u) (never div u: a rotation would fake a compression),
 

@@ -23,7 +23,7 @@ from mpm_dolfinx.grid.grid import Grid, sum_by
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.local_fit import RADIUS, LocalFit, near
 from mpm_dolfinx.probing.probes import Probes
-from mpm_dolfinx.stepping.on_grid import OnGrid
+from mpm_dolfinx.stepping.grid_reset import OnGrid
 from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.state import State
 

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The end of a step: domains move with the grid, F is what their corners tell, and pressures travel along."""
+"""The end of a step: domains move with the grid, F is what their corners tell, and pressures travel along.
+
+The grid itself is reset at the start of the next step, see `grid_reset`.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +31,7 @@ from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
 from mpm_dolfinx.parallel.exchange import first, over_all
 from mpm_dolfinx.points.cutting import centroids, parallelepipeds, tangled, volumes
 from mpm_dolfinx.points.material_points import MaterialPoints, determinant, with_ratio
-from mpm_dolfinx.stepping.on_grid import AtPlaces, OnGrid
+from mpm_dolfinx.stepping.grid_reset import AtPlaces, OnGrid
 from mpm_dolfinx.stepping.stage import Stage
 from mpm_dolfinx.stepping.state import State, Stay
 

@@ -20,7 +20,7 @@ from mpm_dolfinx.mechanics.momentum import MomentumProblem
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.material_points import MaterialPoints
-from mpm_dolfinx.stepping.on_grid import Assembled, OnGrid
+from mpm_dolfinx.stepping.grid_reset import Assembled, OnGrid
 from mpm_dolfinx.stepping.scene import Scene, When
 from mpm_dolfinx.stepping.state import State
 

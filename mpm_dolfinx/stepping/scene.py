@@ -39,7 +39,7 @@ from mpm_dolfinx.points.cutting import volumes
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.solve.numerics import Numerics
 from mpm_dolfinx.stepping.advance import Motion
-from mpm_dolfinx.stepping.on_grid import Assembled, OnGrid, System, assembled
+from mpm_dolfinx.stepping.grid_reset import Assembled, OnGrid, System, assembled
 from mpm_dolfinx.stepping.stage import Stage
 from mpm_dolfinx.stepping.state import State
 

@@ -58,7 +58,7 @@ KINDS: tuple[type[Acting], ...] = (
 )
 """What acts on the momentum for conditions that do not say it themselves, by their method `acting`."""
 FED: tuple[type[Feeding], ...] = (DrainedSides,)
-"""What acts on the storage of fluid."""
+"""What acts on the storage of fluid for conditions that do not say it themselves, by their method `feeding`."""
 
 
 def checked(conditions: Sequence[Condition]) -> Sequence[Condition]:
@@ -66,7 +66,8 @@ def checked(conditions: Sequence[Condition]) -> Sequence[Condition]:
     if isinstance(conditions, Sequence) and any(isinstance(one, (OnSide, Source)) for one in conditions):
         raise ValueError("conditions: OnSide and Source are terms, must be given as terms=")
     if isinstance(conditions, Sequence) and not isinstance(conditions, (str, bytes)):
-        all_of("conditions", [one for one in conditions if not hasattr(one, "acting")], get_args(Condition))
+        own = [one for one in conditions if hasattr(one, "acting") or hasattr(one, "feeding")]
+        all_of("conditions", [one for one in conditions if one not in own], get_args(Condition))
     else:
         all_of("conditions", conditions, get_args(Condition))
     if len({id(one) for one in conditions}) < len(conditions):
@@ -210,7 +211,8 @@ def stage(
     """
     given_by_name = named(checked(conditions["conditions"]))
     by_name = {name: with_weight(one, fluid) for name, one in given_by_name.items()}
-    if fluid is None and any(isinstance(one, kind.conditions) for one in by_name.values() for kind in FED):
+    wet = tuple(of for kind in FED for of in kind.conditions)
+    if fluid is None and any(isinstance(one, wet) or hasattr(one, "feeding") for one in by_name.values()):
         raise ValueError("drained and inflow sides need a fluid")
     _check_inertia(by_name, bool(conditions["inertia"]))
     gravity = conditions["gravity"]
@@ -224,7 +226,8 @@ def stage(
     free = ~_held(grid, walls)
     sides = Sides(grid, bodies, present)
     setting = Setting(sides, free, materials, momentum.conditions, by_name)
-    feeding = [kind(setting, mine) for kind in FED if (mine := setting.of(*kind.conditions))]
+    feeding = [one.feeding(setting) for one in by_name.values() if hasattr(one, "feeding")]
+    feeding += [kind(setting, mine) for kind in FED if (mine := setting.of(*kind.conditions))]
     found = [(kind, setting.of(*kind.conditions)) for kind in KINDS]
     acting = [one.acting(setting) for one in (*momentum.acting, *by_name.values()) if hasattr(one, "acting")]
     acting += [kind(setting, mine) for kind, mine in found if mine]

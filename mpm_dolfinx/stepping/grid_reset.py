@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""What a reset of the grid makes: bodies cut by the cells, the active set, matrices that stay while a cut serves."""
+"""The reset of the grid: bodies cut by its cells, the active set, and the matrices that stay while a cut serves.
+
+A step begins with it (`Scene.on_grid`), unless no corner has moved by more than a small part of a cell since the last
+one.  At the end of a step points only move (`advance`), and their pieces take the pressures along.
+"""
 
 from __future__ import annotations
 
