@@ -58,6 +58,8 @@ def borne(
         if not over_all(grid.comm, int(here.sum())):
             continue
         free = over_all(grid.comm, held[: len(forces)][there].sum(axis=0)) == 0
+        if grid.axisymmetric:  # forces along the radius have no sum
+            free[0] = False
         sums = over_all(grid.comm, np.append(area[here] @ x[here], area[here].sum()))
         on_side, on_nodes = (
             _rigid(v - sums[:-1] / sums[-1], free) for v in (x[here], grid.node_x[: len(forces)][there])

@@ -13,18 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.materials.fields import SceneMaterials
-from mpm_dolfinx.mechanics.inertia import RATE, VELOCITY
+from mpm_dolfinx.mechanics.inertia import VELOCITY, velocity_gradients
 from mpm_dolfinx.parallel.exchange import over_all
-from mpm_dolfinx.points.cutting import edges
+from mpm_dolfinx.points.cutting import spreads
 from mpm_dolfinx.points.material_points import MaterialPoints
 
 
 def stored(materials: SceneMaterials, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
     """Return the kinetic and elastic energies, J, of points; on all processes together."""
     mass = materials.density(points) * points.volume0 * points.J
-    v, d = points.data[VELOCITY], points.x.shape[1]
-    L = points.data[RATE] @ np.linalg.inv(points.F[:, :d, :d])
-    turning = ((L @ edges(points.corners)) ** 2).sum(axis=(1, 2)) / 12  # second moments of parallelepipeds
+    v, L = points.data[VELOCITY], velocity_gradients(points)
+    spread = spreads(points.corners, materials.grid.axisymmetric)
+    turning = np.einsum("nij,njk,nik->n", L, spread, L)
     kinetic, elastic = mass @ ((v**2).sum(axis=1) + turning) / 2, materials.stored(points) @ points.volume0
     return dict(zip(("kinetic", "elastic"), over_all(materials.grid.comm, np.array([kinetic, elastic])), strict=True))
 

@@ -145,7 +145,8 @@ class MomentumForms:
         share = 1 / ufl.det(points.F)  # divided by it, each component would be
         P, A = share * P, share * A
         stress = P * points.F.T
-        self._residuals.append(ElementForces(stress if self.inertia is None else points.turn * stress, points))
+        turns = self.inertia is not None and not self.grid.axisymmetric
+        self._residuals.append(ElementForces(points.turn * stress if turns else stress, points))
         i, j, k, l, m, n = ufl.indices(6)
         if self.grid.dim == 2:
             A = ufl.as_tensor(A[i, m, j, n] * points.F[k, m] * points.F[l, n], (i, k, j, l))

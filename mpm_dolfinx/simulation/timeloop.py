@@ -98,8 +98,9 @@ def run(
         Choose the steps by their error: that of the pore pressures stays below about rtol of their largest change
         since the run began, or of what they would change by in the step if no fluid flowed, which is more where it
         flows away within the step; at least ten times `tolerance`, and < 1.  Where nothing flows the steps are as long
-        as the output intervals; refused there with terms of the velocity, of which no error is known.  The error is
-        estimated, as a share of that of a first-order step: true ones were 0.7 to 5 times as large, the latter in
+        as the output intervals; refused there with terms of the velocity, of which no error is known.  Of bodies with
+        inertia the motion counts too, see `motion_error`, in proportion to the largest since the run began.  The error
+        is estimated, as a share of that of a first-order step: true ones were 0.7 to 5 times as large, the latter in
         the step after a load jumps, see `solve.newton.ERROR`.
     t_eval : (m,), s
         Output times, increasing, in (t, t_end]; t_end is one of them in any case.  Steps end at output times.
@@ -256,7 +257,9 @@ def _histories(
     latest = simulation.state.result
     control = simulation.state.control
     if after is None:
-        begun = StepControl(times.interval, rule.first, first=0.0 if control is None else control.first)
+        motion = 0.0 if rule.by_error and state.stage.inertia else None
+        before = 0.0 if control is None else control.first
+        begun = StepControl(times.interval, rule.first, first=before, motion=motion)
         return Result(Rows([_row(simulation, probes)])), begun
     if latest is None or control is None or after.rows.run is not latest.rows.run:
         raise ValueError("after: histories of another run, must be those of the last one, or what `resume` returns")
