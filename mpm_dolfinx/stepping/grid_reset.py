@@ -245,12 +245,7 @@ class OnGrid(Keyed):
         return self.cut.to_pieces(pressures)
 
     def _cell_pressures(
-        self,
-        p: NDArray[np.float64],
-        stage: Stage,
-        t: float,
-        bulk: float = np.inf,
-        at_rest: AtPlaces | None = None,
+        self, p: NDArray[np.float64], stage: Stage, t: float, bulk: float = np.inf, at_rest: AtPlaces | None = None
     ) -> CellPressures:
         """Return what slopes of cells with these pressures, or mass potentials by `bulk` (Pa), are drawn from.
 
