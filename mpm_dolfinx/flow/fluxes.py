@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import ufl
@@ -26,6 +26,9 @@ from mpm_dolfinx.forms.unknowns import sum_ghosts
 from mpm_dolfinx.grid.grid import Grid, sum_by
 from mpm_dolfinx.points.material_points import cofactor, determinant
 
+if TYPE_CHECKING:
+    from mpm_dolfinx.flow.unsaturated import Relative
+
 ALONG = 0.1  # of a unit normal: a side that looks less along an axis tells nothing of the pressure's slope there
 
 
@@ -35,12 +38,14 @@ class Mobility:
 
     mean (n,): of the pieces, m^2/(Pa s); share (n, d): of it along each axis; shift (n, d): way, m, from the centroid
     to the place from which the resistance to the faces counts.  The last two are None where no cell holds several
-    conductivities.
+    conductivities.  Where pores drain, shares (n, k): what soils with full pores, and each law of retention, bring to
+    the mean at k_r = 1; the mean is then one.
     """
 
     mean: NDArray[np.float64]
     share: NDArray[np.float64] | None = None
     shift: NDArray[np.float64] | None = None
+    shares: NDArray[np.float64] | None = None
 
 
 class CellMotion(NamedTuple):
@@ -135,10 +140,13 @@ class OpenSides:
         filled ones; bulk: of the fluid, Pa.
         """
         shape = self.shape * flow.nearer(at, self.normal, self.reach)
-        conductance, outer = flow.across(at, self.normal) * shape, self.pressure
-        if flow.weight is not None:
-            outer = outer - flow.deformed(at, self.reach) @ flow.weight
-        return conductance, self.given + conductance * mass_potential(outer, bulk)
+        conductance = flow.across(at, self.normal) * shape
+        return conductance, self.given + conductance * self.outer(at, flow, bulk)
+
+    def outer(self, at: NDArray[np.int64], flow: Conduction, bulk: float) -> NDArray[np.float64]:
+        """Return the mass potentials (m,) beyond the faces, less the weight of the fluid on the way, Pa."""
+        outer = self.pressure if flow.weight is None else self.pressure - flow.deformed(at, self.reach) @ flow.weight
+        return mass_potential(outer, bulk)
 
     def ahead(self, at: NDArray[np.int64], p: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return what lies ahead of the filled cells (n, d, 2, 2): on drained sides, by axis and end of the cell.
@@ -168,6 +176,37 @@ class OpenSides:
             for k, values in enumerate((jump, jump * normal[:, axis] / distance)):
                 np.divide(sum_by(at, share * values, len(p)), total, out=out[:, axis, end, k], where=total > 0)
         return out
+
+
+@dataclass(frozen=True)
+class OpenFaces:
+    """Faces on open sides; arrays over m faces.
+
+    number (m,): of the condition; at (m,): place of the cell among the active owned ones; conductance, inflow (m,):
+    outflow per unit of the cell's mass potential, m^d/(Pa s), and what is prescribed or driven in, m^d/s; seeps (m,):
+    whether nothing may flow in; reach (m, d): way from the cell's centroid, m.
+    """
+
+    number: NDArray[np.int64]
+    at: NDArray[np.int64]
+    conductance: NDArray[np.float64]
+    inflow: NDArray[np.float64]
+    seeps: NDArray[np.bool_]
+    reach: NDArray[np.float64]
+
+    def outflow(self, pi: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return what leaves through each face, were it open both ways, from cells at potentials (n,), Pa; m^d/s."""
+        return self.conductance * pi[self.at] - self.inflow
+
+    def driven(self, force: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return what forces (n, d), N/m^3, on the fluid drive out of cells (n,), m^d/s."""
+        along = np.einsum("md,md->m", force[self.at], self.reach)
+        return sum_by(self.at, np.where(self.seeps, 0.0, self.conductance * along), len(force))
+
+    def seepage(self, pi: NDArray[np.float64], flows: NDArray[np.bool_]) -> tuple[NDArray, NDArray]:
+        """Return what seeps out of cells (n,), m^d/s, and its derivative, m^d/(Pa s); flows (m,): where."""
+        parts = (np.where(flows & self.seeps, values, 0.0) for values in (self.outflow(pi), self.conductance))
+        return tuple(sum_by(self.at, values, len(pi)) for values in parts)
 
 
 @dataclass(frozen=True)
@@ -242,9 +281,9 @@ class CellContents(Keyed):
         np.maximum.at(softest, self._slot[self._cells], softness)
         return softest
 
-    def set_damping(self) -> NDArray[np.float64]:
-        """Set the strength tau of the damping of elastic soil in the filled cells; return it, 1/Pa."""
-        tau, values = self._damped.x, self.mean(self._damping)
+    def set_damping(self, less: NDArray[np.float64] | float = 0.0) -> NDArray[np.float64]:
+        """Set the strength tau of the damping of elastic soil in the filled cells, less some (n,); return it, 1/Pa."""
+        tau, values = self._damped.x, np.maximum(self.mean(self._damping) - less, 0.0)
         tau.array[:] = 0.0
         tau.array[self.filled] = values
         tau.scatter_forward()
@@ -294,6 +333,8 @@ class FluxForms:
         Bulk modulus of the fluid, Pa.
     inertial : (d,), N/m^3
         Force of inertia on the pore fluid as UFL, None without.
+    relative
+        Conductivities by the pressures, where pores drain.
     """
 
     def __init__(
@@ -304,8 +345,10 @@ class FluxForms:
         pressure: fem.Function,
         bulk: float,
         inertial: ufl.core.expr.Expr | None = None,
+        relative: Relative | None = None,
     ):
         self.grid = grid
+        self.relative = relative
         mesh = grid.mesh
         d = grid.dim
         Q = grid.cellwise()
@@ -330,6 +373,9 @@ class FluxForms:
         d0 = across / 2 - ufl.dot(self.centroid("+"), n0)
         d1 = across / 2 + ufl.dot(self.centroid("-"), n0)
         k0, k1 = (sum(abs(n0[a]) * self.mobility(side)[a] for a in range(d)) for side in "+-")
+        if relative is not None:
+            p0, p1 = pressure("+"), pressure("-")
+            k0, k1 = (k * relative.conducts(relative.shares(side), p0, p1) for k, side in ((k0, "+"), (k1, "-")))
         T = share * k0 * k1 / (d0 * k1 + d1 * k0 + TINY)
         dS = ufl.Measure("dS", domain=mesh, subdomain_id=_compat.SUBDOMAIN, metadata={"quadrature_degree": 0})
         self.flux = FacetForm(T * ufl.jump(dp) * ufl.jump(q) * dS, grid.comm) if flows else None
@@ -351,13 +397,16 @@ class FluxForms:
         self.gravity = None
         if inertial is not None:
             weight = ufl.avg(inertial) if weight is None else weight + ufl.avg(inertial)
-        if weight is not None and flows:
+        if (weight is not None or relative is not None) and flows:
             apart = across * n0 - ufl.jump(self.centroid + self.moved)
             # so water at rest, whose pressure grows by its weight at zero pressure, stays at rest; the two at once for
             # each face: rounding of what leaves a cell enters its neighbour, and is that of small differences
             density = density_between(pressure("+"), pressure("-"), fem.Constant(mesh, 1 / bulk))
-            drives = ufl.jump(pressure) + ufl.dot(weight, apart)
-            self.gravity = FacetForm(T * density * drives * ufl.jump(q) * dS, grid.comm)
+            drives = ufl.jump(pressure) + (0.0 if weight is None else ufl.dot(weight, apart))
+            driven = T * density * drives * ufl.jump(q) * dS
+            self.gravity = FacetForm(driven, grid.comm)
+            if relative is not None:
+                self.flux = FacetForm(ufl.derivative(driven, pressure, dp), grid.comm)
 
     def along(
         self, slope: NDArray[np.float64], cells: NDArray[np.int64], facets: FacetSum, density: NDArray[np.float64]
@@ -379,6 +428,8 @@ class FluxForms:
         filled = contents.filled
         shift = flow.mobility.shift
         mobility = flow.along(d)
+        if self.relative is not None:
+            self.relative.set_shares(filled, flow.mobility.shares)
         values = {self.mobility: mobility}
         if shift is not None:  # the fluid's weight is that at the centroids nevertheless
             values[self.centroid] = contents.centroid[filled] + shift

@@ -44,14 +44,16 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base.fluid_content import change_of_content, mass_potential
 from mpm_dolfinx.base.tolerances import EPSILON
 from mpm_dolfinx.base.validation import line
-from mpm_dolfinx.flow.fluxes import CellContents, Conduction, FluxForms, OpenSides
+from mpm_dolfinx.flow.fluxes import CellContents, Conduction, FluxForms, OpenFaces, OpenSides
 from mpm_dolfinx.flow.nonorthogonal import AslantFlow, Gradients
 from mpm_dolfinx.flow.second_differences import second_differences
+from mpm_dolfinx.flow.unsaturated import Relative, UnsaturatedFaces
 from mpm_dolfinx.forms.cell_matrices import along_shapes, insert_rows
 from mpm_dolfinx.forms.point_forms import CellSums, FacetSum, FormPoints, PointData, PointForm
 from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts, zero
 from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.materials.evaluate import ConductivityAtPieces
+from mpm_dolfinx.materials.retention import Retentions
 from mpm_dolfinx.materials.skeleton import filled
 from mpm_dolfinx.materials.user_functions import compiling
 from mpm_dolfinx.materials.user_functions import form as form_of
@@ -76,7 +78,7 @@ class StorageForms:
     ----------
     pieces
         Points of integration with the fields biot, storage and storage_at_one (1/Pa), see `change_of_content`, and
-        where pores drain `retention`: specific yield and suction (Pa), see `unsaturated`.
+        where pores drain `drainage`: specific yield and suction (Pa), see `unsaturated`.
     displacement
         Increment of the displacement since the start of the step.
     pressure
@@ -100,6 +102,8 @@ class StorageForms:
         Time at the end of the substep, a UFL constant.
     inertial : (d,), N/m^3
         Force of inertia on the pore fluid, -rho_w a, as UFL; None without.
+    retentions
+        The laws of retention of the scene, where some pores drain; the pieces then carry retention and pores.
     """
 
     def __init__(
@@ -116,6 +120,7 @@ class StorageForms:
         sources: Sequence[Callable],
         t: fem.Constant,
         inertial: ufl.core.expr.Expr | None = None,
+        retentions: Retentions | None = None,
     ):
         self.grid = pieces.grid
         self.p = pressure
@@ -128,17 +133,29 @@ class StorageForms:
         p, delta = ufl.variable(pressure), ufl.variable(pieces.increment(displacement))
         J = ufl.det(delta)
         stored = change_of_content(pieces.biot, pieces.storage_at_one, pieces.storage, J, p - self.p_n)
-        self.drains = "retention" in pieces.sizes
+        self.drains = "drainage" in pieces.sizes
         """Whether pores drain as a free surface falls."""
         if self.drains:
-            drains, suction = pieces.retention
+            drains, suction = pieces.drainage
             stored += drains * (filled(p, suction) - filled(self.p_n, suction))
+        felt = 1.0
+        self.retains = retentions is not None
+        """Whether pores drain under suction."""
+        if self.retains:
+            full, before = (retentions.of("saturation", at, pieces.retention) for at in (p, self.p_n))
+            denser = ufl.exp(-fem.Constant(self.grid.mesh, 1 / (2 * bulk)) * (p - self.p_n))
+            drained = (full - before) * pieces.pores
+            stored = full * stored + drained * denser
+            felt = ufl.diff(p * retentions.of("bishop", p, pieces.retention), p)
+            self._capacity = CellSums([ufl.diff(drained, p)], pieces)
         self._change = PointForm(stored * q * pieces.dx, pieces)
-        by_u = [pieces.biot * ufl.diff(J, delta), *([] if symmetric else [ufl.diff(stored, delta)])]
+        taken = pieces.biot * ufl.diff(J, delta) if not self.retains else pieces.biot * felt * ufl.diff(J, delta)
+        by_u = [taken, *([] if symmetric else [ufl.diff(stored, delta)])]
         along = [along_shapes(slope, pieces) for slope in by_u]
         self._derivatives = CellSums([ufl.diff(stored, p), *(part for slope in along for part in slope)], pieces)
         self.symmetric, self.softens = symmetric, softens
-        self.fluxes = FluxForms(pieces.grid, weight, flows, pressure, bulk, inertial)
+        relative = Relative(pieces.grid, retentions) if self.retains and flows else None
+        self.fluxes = FluxForms(pieces.grid, weight, flows, pressure, bulk, inertial, relative)
         self.sources, self._slopes = [], []
         for source in sources:
             form = form_of("sources", source, points=pieces, q=q, p=pressure, t=t)
@@ -152,7 +169,7 @@ class StorageForms:
     @property
     def linear(self) -> bool:
         """Whether sources and drained pores do not depend on the pressure."""
-        return not self._slopes and not self.drains
+        return not self._slopes and not self.drains and not self.retains
 
     def _sum(self, forms: Sequence[PointForm], data: PointData) -> NDArray[np.float64]:
         """Return the sums of forms in the cells, a local array."""
@@ -178,6 +195,10 @@ class StorageForms:
         capacity[data.places.filled] = by_p[:, 0]
         return [capacity, *by_u]
 
+    def drained(self, data: PointData) -> NDArray[np.float64]:
+        """Return what the filled cells store by their saturation, per pressure, m^d/Pa, at p."""
+        return self._capacity(data)[:, 0]
+
     def gain(self, data: PointData) -> NDArray[np.float64]:
         """Return the rate of the sources in each cell at p, m^d/s, a local array."""
         return self._sum(self.sources, data)
@@ -190,37 +211,6 @@ class StorageForms:
         """Return the outflow that p and the fluid's weight drive from each cell to others, m^d/s, a local array."""
         assembled.assemble_vector(self._sum([], None))
         return sum_ghosts(self._work)
-
-
-@dataclass(frozen=True)
-class OpenFaces:
-    """Faces on open sides; arrays over m faces.
-
-    number (m,): of the condition; at (m,): place of the cell among the active owned ones; conductance, inflow (m,):
-    outflow per unit of the cell's mass potential, m^d/(Pa s), and what is prescribed or driven in, m^d/s; seeps (m,):
-    whether nothing may flow in; reach (m, d): way from the cell's centroid, m.
-    """
-
-    number: NDArray[np.int64]
-    at: NDArray[np.int64]
-    conductance: NDArray[np.float64]
-    inflow: NDArray[np.float64]
-    seeps: NDArray[np.bool_]
-    reach: NDArray[np.float64]
-
-    def outflow(self, pi: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return what leaves through each face, were it open both ways, from cells at potentials (n,), Pa; m^d/s."""
-        return self.conductance * pi[self.at] - self.inflow
-
-    def driven(self, force: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return what forces (n, d), N/m^3, on the fluid drive out of cells (n,), m^d/s."""
-        along = np.einsum("md,md->m", force[self.at], self.reach)
-        return sum_by(self.at, np.where(self.seeps, 0.0, self.conductance * along), len(force))
-
-    def seepage(self, pi: NDArray[np.float64], flows: NDArray[np.bool_]) -> tuple[NDArray, NDArray]:
-        """Return what seeps out of cells (n,), m^d/s, and its derivative, m^d/(Pa s); flows (m,): where."""
-        parts = (np.where(flows & self.seeps, values, 0.0) for values in (self.outflow(pi), self.conductance))
-        return tuple(sum_by(self.at, values, len(pi)) for values in parts)
 
 
 @dataclass(frozen=True)
@@ -292,6 +282,8 @@ class StorageSystem:
         parts: Parts,
     ):
         self._forms = forms
+        self.symmetric = not forms.retains
+        """Whether the matrix of the pressures alone is symmetric."""
         d = forms.grid.dim
         fluxes = forms.fluxes
         self.unknowns = own = Unknowns(forms.p, cells.astype(np.int64))
@@ -337,17 +329,35 @@ class StorageSystem:
         """Assemble the fluxes through inner faces and open sides; off: of `AslantFlow`, where there is any."""
         at = contents.slot(sides.cells)
         reach = flow.deformed(at, sides.reach)
-        faces = OpenFaces(sides.number, at, *sides.driven(at, flow, self._forms.bulk), sides.seeps, reach)
-        both = (np.where(sides.seeps, 0.0, values) for values in (faces.conductance, faces.inflow))
+        bulk, relative = self._forms.bulk, self._forms.fluxes.relative
+        conductance, inflow = sides.driven(at, flow, bulk)
+        if relative is None:
+            faces = OpenFaces(sides.number, at, conductance, inflow, sides.seeps, reach)
+            both = (np.where(sides.seeps, 0.0, values) for values in (faces.conductance, faces.inflow))
+        else:
+            outer = sides.outer(at, flow, bulk)
+            of_sides = (sides.number, at, conductance, sides.given, sides.seeps, reach)
+            faces = UnsaturatedFaces(*of_sides, relative, sides.cells, sides.pressure, outer, bulk)
+            both = np.zeros((2, len(at)))  # what leaves depends on the pressure, as where faces seep
         conductance, inflow = (sum_by(at, values, len(contents.filled)) for values in both)
         mobility = self._forms.fluxes.set_conduction(contents, flow)
+        open_by = faces.conductance
+        if relative is not None:
+            p = self._forms.p.x.array
+            mobility = mobility * relative.between(contents.filled, *[p[contents.filled]] * 2)[0][:, None]
+            open_by = open_by * relative.between(sides.cells, p[sides.cells], sides.pressure)[0]
+        self.assemble_fluxes()
+        total = _add_diagonal(self.T, conductance)
+        aslant = off and AslantFlow(self._forms.fluxes, *off, contents, sides, open_by, flow.weight)
+        return Outflow(conductance, inflow, faces, total, mobility, aslant)
+
+
+    def assemble_fluxes(self) -> None:
+        """Assemble the matrix of the fluxes between cells, where pores drain at p."""
         zero(self.T)
         if self._flux is not None:
             self._flux.assemble_matrix(self.T)
         self.T.assemble()
-        total = _add_diagonal(self.T, conductance)
-        aslant = off and AslantFlow(self._forms.fluxes, *off, contents, sides, faces.conductance, flow.weight)
-        return Outflow(conductance, inflow, faces, total, mobility, aslant)
 
 
 @dataclass(frozen=True)
@@ -419,9 +429,13 @@ class StorageProblem:
         system.unknowns.gather(forms.p_n.x.array, system.p_start)
         reach = 4 * forms.grid.h.max() ** 2  # no two centroids are further apart than 2 h
         tau, least = contents.set_damping(), dt * outflow.mobility.min(axis=1)
+        if forms.retains:  # what pores take up or give stabilises as well
+            less = forms.drained(data) / contents.volume
+            tau, least = contents.set_damping(less), 0.0 * least
         softest = contents.softest(softness) if forms.softens else np.ones(1)
         known = [(tau * reach > least).any(), (softest * tau * reach > least).any() and softest.max() > 1]
-        somewhere = over_all(forms.grid.comm, np.array([*known, outflow.faces.seeps.any()], dtype=float)) > 0
+        seeps = outflow.faces.seeps.any() or (forms.retains and len(outflow.faces.at) > 0)
+        somewhere = over_all(forms.grid.comm, np.array([*known, seeps], dtype=float)) > 0
         self.damped, flows, self._seeps = somewhere.tolist()
         """Whether jumps of the pressure are damped somewhere."""
         self._softer = self._damping_of_soft_soil(tau, softest, outflow.mobility) if flows else None
@@ -457,7 +471,9 @@ class StorageProblem:
     def outflows(self, names: Sequence[str]) -> dict[str, NDArray[np.float64]]:
         """Return what leaves through the sides of each condition at (u, p), m^d/s, by name."""
         faces = self._flow(False).faces
-        leaves = np.where(self._flowing | ~faces.seeps, faces.outflow(self._potentials), 0.0)
+        leaves = faces.outflow(self._potentials)
+        if not self.forms.retains:
+            leaves = np.where(self._flowing | ~faces.seeps, leaves, 0.0)
         leaves = leaves + self._aslant.faces
         sums = over_all(self.forms.grid.comm, sum_by(faces.number, leaves, len(names)))
         return {name: np.array(sums[i]) for i, name in enumerate(names)}
@@ -499,7 +515,7 @@ class StorageProblem:
         Newton's method solves for (u, p) with the faces as they are, and then settles them: a primal-dual active set
         (Hintermueller, Ito and Kunisch 2002).
         """
-        if not self._seeps:
+        if not self._seeps or self.forms.retains:
             return False
         faces = self._flow(False).faces
         flows = faces.outflow(self._potentials) > 0
@@ -602,6 +618,9 @@ class StorageProblem:
             insert_rows(A, forms.grid, data.places.filled, rows)
             A.assemble()
         system.C.zeroEntries()
+        if forms.retains:
+            self._flow(False)
+            system.assemble_fluxes()
         system.C.axpy(self.dt, system.T, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
         if self.damped:
             system.C.axpy(1.0, system.D, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)

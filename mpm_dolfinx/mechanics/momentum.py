@@ -31,6 +31,7 @@ from mpm_dolfinx.forms.cell_matrices import Beside, ElementForces, ElementMatric
 from mpm_dolfinx.forms.point_forms import FormPoints
 from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts, zero
 from mpm_dolfinx.grid.grid import sum_by
+from mpm_dolfinx.materials.retention import Retentions
 from mpm_dolfinx.materials.evaluate import by_scene
 from mpm_dolfinx.materials.local_unknowns import LocalUnknowns
 from mpm_dolfinx.materials.skeleton import Skeleton
@@ -69,6 +70,8 @@ class MomentumForms:
         Time at the end of the substep, and time since the start of the step, UFL constants.
     inertia
         Whether bodies may have inertia.
+    retentions
+        The laws of retention of the scene, where some pores drain; the pieces then carry retention and pores.
     """
 
     def __init__(
@@ -84,8 +87,10 @@ class MomentumForms:
         t: fem.Constant,
         dt: fem.Constant,
         inertia: bool = False,
+        retentions: Retentions | None = None,
     ):
         self.grid = grid = pieces.grid
+        self._retentions = retentions
         V = _compat.function_space(grid.mesh, "Lagrange", 1, (grid.dim,))
         self.u = fem.Function(V)
         """Increment of the displacement since the start of the step, m."""
@@ -101,7 +106,10 @@ class MomentumForms:
         self.conditions = FormsOf(grid, self.u)
         """The forms of conditions."""
         self.own = OwnTerms(terms, pieces, self.u, t, dt)
-        self.weight = None if gravity is None else Weight(pieces, self.u, gravity, fluid_density)
+        full = None
+        if retentions is not None:
+            full = retentions.of("saturation", pressure, pieces.retention)
+        self.weight = None if gravity is None else Weight(pieces, self.u, gravity, fluid_density, full)
         self.acting = [*filter(None, (self.weight,)), *[self.own] * bool(terms)]
         """What acts in all stages."""
         self.symmetric = symmetric and self.own.symmetric
@@ -138,7 +146,10 @@ class MomentumForms:
         else:
             P, A = law.first_piola(F, known), ufl.diff(law.first_piola(F, values), F)
         if pressure is not None:
-            of_pressure = -points.biot * pressure * ufl.diff(ufl.det(F), F)
+            felt = points.biot * pressure
+            if self._retentions is not None:
+                felt = felt * self._retentions.of("bishop", pressure, points.retention)
+            of_pressure = -felt * ufl.diff(ufl.det(F), F)
             P, A = P + of_pressure, A + ufl.diff(of_pressure, F)
         share = 1 / ufl.det(points.F)  # divided by it, each component would be
         P, A = share * P, share * A

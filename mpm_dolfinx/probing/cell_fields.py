@@ -65,6 +65,9 @@ def cell_fields(scene: Scene, state: State) -> CellFields:
     pressure, stress = None, effective
     if scene.fluid is not None:
         pressure = on_grid.pressures(state)
-        biot = mean(cut.to_cells(scene.materials.table(points, lambda m: m.biot)))
-        stress = effective - (biot * pressure)[:, None, None] * np.eye(scene.grid.stretches)
+        share = cut.to_cells(scene.materials.table(points, lambda m: m.biot))
+        if scene.materials.retentions is not None:
+            at = cut.to_pieces(pressure[places.slots])
+            share = share * cut.pieces_to_cells(scene.materials.saturation(points, at, cut.pieces.point)[2])
+        stress = effective - (mean(share) * pressure)[:, None, None] * np.eye(scene.grid.stretches)
     return CellFields(places.filled, mean(cut.x) + cut.grid.base, volume, moved, effective, stress, pressure)

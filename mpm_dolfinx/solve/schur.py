@@ -141,7 +141,7 @@ class LinearSolvers:
             self._schur.setUp()
             mumps = how.pressures == MUMPS
             gathered = how.gathered and not mumps
-            self._solve_s = direct_solver(storage.P, "storage", gathered=gathered, package="mumps" if mumps else None)
+            self._solve_s = direct_solver(storage.P, "storage", storage.symmetric, gathered=gathered, package="mumps" if mumps else None)
             self._set_krylov(how.krylov)
             self._solve_s.setFromOptions()
             self._krylov = self._solve_s.getType()

@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.base.caching import Keyed, Latest
 from mpm_dolfinx.base.fluid_content import mass_potential, pressure_of
-from mpm_dolfinx.base.tolerances import ROUND_OFF
+from mpm_dolfinx.base.tolerances import ROUND_OFF, TINY
 from mpm_dolfinx.conditions.acting import Loads
 from mpm_dolfinx.diagnostics.scene_checks import check_held
 from mpm_dolfinx.domains.cut_domains import CutDomains
+from mpm_dolfinx.domains.pore_water import PoreWater, emptied
 from mpm_dolfinx.domains.pressure_transport import CellPressures, Reconstruction, share_within, transport
 from mpm_dolfinx.flow.fluxes import CellContents, CellMotion, Conduction, Mobility, OpenSides, PieceContents
 from mpm_dolfinx.flow.layers import graded, mixed_cells
@@ -104,6 +105,11 @@ class OnGrid(Keyed):
             if quadrature.layered:
                 self._mixed = mixed_cells(cut, quadrature.conducting(cut), self.contents)
 
+    @property
+    def mixes(self) -> bool:
+        """Whether cells hold several soils whose ratio of conductivities depends on the pressure."""
+        return self._mixed is not None and self._storage.fluxes.relative is not None
+
     @cached_property
     def not_full(self) -> NDArray[np.int32]:
         """Inner faces of cells that are not full, which carry ghost mass."""
@@ -138,10 +144,29 @@ class OnGrid(Keyed):
             carried = transport(state.transported.potentials(bulk), self.cut.points, self.cut.pieces)
             if state.stay:
                 carried = mass_potential(self.of_pieces(state, "pressure", pressure_of(carried, bulk)), bulk)
-            return pressure_of(self._means(carried), bulk)
+            p = pressure_of(self._means(carried), bulk)
+            water = self.pore_water(self.cut.points)
+            return p if water is None else water.level(water.sums(*self._carried(state, carried)), p)
         p = np.zeros(self.cut.grid.num_local)
         p[self.cut.cells] = self.cut.pieces_to_cells(state.stay.pressure)
         return p[self.contents.filled]
+
+    def _carried(self, state: State, pi: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+        """Return the potentials (m,), Pa, and (S - 1) rho that pieces bring to their cells, by these potentials."""
+        materials, points, bulk, old = self._quadrature.materials, self.cut.points, self._storage.bulk, state.transported
+        owner = np.searchsorted(points.id, old.id)
+
+        def empty(p: NDArray[np.float64], of: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+            return emptied(p, bulk, *materials.saturation(points, p, of)[:2])
+
+        value, slope = empty(old.pressure, owner)
+        bounds = np.stack([empty(side, owner)[0] for side in old.bounds.T], axis=1)
+        old = replace(old, pressure=value, slope=slope[:, None] * old.slope, bounds=bounds)
+        value = transport(old, points, self.cut.pieces)
+        if state.stay:
+            keeps = state.stay.keeps[self.cut.pieces.point]
+            value = np.where(keeps, empty(pressure_of(pi, bulk), self.cut.pieces.point)[0], value)
+        return [self.cut.pieces_to_cells(values) for values in (pi, value)]
 
     def of_pieces(self, state: State, name: str, fresh: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return what pieces have of the state's stay by this name, fresh (m, ...) where there is none."""
@@ -176,12 +201,18 @@ class OnGrid(Keyed):
         return np.divide(contents.total(cells, store * potential), held, out=mean, where=held > 0)
 
     def pressures_at_pieces(
-        self, reconstruction: Reconstruction, store: NDArray[np.float64], stage: Stage, t: float
+        self,
+        reconstruction: Reconstruction,
+        store: NDArray[np.float64],
+        stage: Stage,
+        t: float,
+        water: PoreWater | None = None,
     ) -> list[NDArray[np.float64]]:
         """Return the pressures (m,), their slopes (m, d) and bounds (m, 2) at the pieces, as `set_pressures` has set.
 
         The mean of their mass potentials in a cell is the cell's: by `store` (m,), m^d/Pa, what the pieces store, or by
-        their volumes in a cell that stores nothing.  t, s: time at which drained sides have their pressures.
+        their volumes in a cell that stores nothing; with `water`, what these hold is.  t, s: time at which drained
+        sides have their pressures.
         """
         pieces = self.data.pieces
         contents = self.contents
@@ -198,6 +229,10 @@ class OnGrid(Keyed):
         rise, here = np.einsum("md,md->m", slope[at], offset - origin[at]), pi[contents.filled]
         share = share_within(rise, *(bounds.T - here), at)  # drained sides may be aslant in their cells
         pi = pi[cells] + share[at] * rise
+        if water is not None:  # whose sum in a cell is that at its pressure
+            p, mean = pressure_of(pi, bulk), pressure_of(here, bulk)
+            offset = p - mean[at]
+            pi = mass_potential(water.level(water.of_cells(mean[at]), mean, offset)[at] + offset, bulk)
         slope = (slope * share[:, None])[at] / (1 + pi / bulk)[:, None]
         values = pressure_of(pi, bulk), slope, pressure_of(bounds, bulk)[at]
         return [self.cut.to_pieces(rows) for rows in values]
@@ -255,10 +290,46 @@ class OnGrid(Keyed):
     def mobility(self, data: QuadratureData, begins: bool) -> Mobility:
         """Return the mobility of the filled owned cells at u; begins: refuse for good what is none."""
         at_pieces = self._quadrature.mobility(self.cut, self._storage.conductivity, data.pieces, begins)
+        if self._storage.fluxes.relative is not None:
+            return self._relative_mobility(at_pieces)
         mean, share = self.contents.mean(at_pieces), None
         if self._storage.conductivity is not None:
             share = graded(self.contents, self._places.pieces.offset, at_pieces, mean)
         return Mobility(mean, share) if self._mixed is None else self._mixed.mobility(at_pieces, mean, share)
+
+    def _relative_mobility(self, full: NDArray[np.float64]) -> Mobility:
+        """Return the mobility of cells by those of their pieces with full pores (m,), m^2/(Pa s), where pores drain.
+
+        Where a cell holds several soils their ratio is that at the present pressure.
+        """
+        cut = self.cut
+        law = cut.to_cells(self._quadrature.materials.retention_of(cut.points))
+        count = self._storage.fluxes.relative.count
+        shares = np.stack([self.contents.mean(full * (law == i)) for i in range(count)], axis=1)
+        one = np.ones(len(shares))
+        if self._mixed is None and self._storage.conductivity is None:
+            return Mobility(one, shares=shares)
+        k = self._quadrature.materials.saturation(cut.points, cut.to_pieces(self._storage.p.x.array[cut.cells]), cut.pieces.point)[3]
+        now = full * np.maximum(cut.pieces_to_cells(k), TINY)
+        mean, share = self.contents.mean(now), None
+        if self._storage.conductivity is not None:
+            share = graded(self.contents, self._places.pieces.offset, now, mean)
+        mobility = Mobility(mean, share) if self._mixed is None else self._mixed.mobility(now, mean, share)
+        return replace(mobility, mean=one, shares=shares)
+
+    def pore_water(self, points: MaterialPoints) -> PoreWater | None:
+        """Return what the pieces store by the porosities of the points, where pores drain; arrays by cells."""
+        materials, cut = self._quadrature.materials, self.cut
+        if materials.retentions is None:
+            return None
+        volume = cut.pieces_to_cells(cut.pieces.fraction * (points.volume0 * points.J)[cut.pieces.point])
+        store, pores = (volume * cut.to_cells(values(points)) for values in (materials.storage, materials.porosity))
+        rows = cut.to_cells(materials.retention_rows(points))
+        scale = np.full(len(self.contents.filled), np.inf)
+        slot = self.contents.slot(cut.cells)
+        np.minimum.at(scale, slot, cut.to_cells(materials.retention_scale(points)))
+        scale[np.isinf(scale)] = 1.0  # of cells all of whose pores stay full
+        return PoreWater(partial(materials.saturations, rows), slot, store, pores, self._storage.bulk, scale)
 
     def resting_mobility(self) -> Mobility:
         """Return the conductivities, m/s, of the filled owned cells as laws of the deformation and pressure have them
@@ -390,7 +461,8 @@ class Assembled(Keyed):
         self.end_step = system.end_step
         self._on_grid, self._stage = on_grid, stage
         self._u, self._varies = momentum.u, storage is not None and storage.conductivity is not None
-        self._by_pressure = storage if self._varies and storage.conductivity.pressure is not None else None
+        by_pressure = on_grid.mixes or (self._varies and storage.conductivity.pressure is not None)
+        self._by_pressure = storage if by_pressure else None
         self._mobility: Latest[Mobility] = Latest()
         self._outflow: Latest[Outflow] = Latest()
         self.momentum.set_penalty(loads)
@@ -452,15 +524,18 @@ class Assembled(Keyed):
         def mobility(begins: bool) -> Mobility:
             if self._varies:
                 return on_grid.mobility(data, begins)
-            return self._mobility((), lambda: on_grid.mobility(data, True))
+            return self._mobility(mixture, lambda: on_grid.mobility(data, True), grid.comm)
 
         def set_fluxes(at_sides: OpenSides, kappa: Mobility, motion: CellMotion | None = None) -> Outflow:
             where = (at_sides.cells, at_sides.shape, at_sides.seeps, at_sides.area, at_sides.reach)
             off = self._off and (self._off, self._gradients(where, lambda: Gradients(contents, at_sides)))
             return self.storage.set_fluxes(contents, at_sides, Conduction(kappa, motion, weight), off)
 
-        if (storage := self._by_pressure) is not None:
-            varies = (*varies, storage.p.x.array.copy())
+        mixture = ()
+        if self._by_pressure is not None:
+            mixture = (self._by_pressure.p.x.array.copy(),)
+            varies = (*varies, *mixture)
+        if self._varies and (storage := self._by_pressure) and storage.conductivity.pressure is not None:
             storage.conductivity.pressure.x.array[:] = storage.p.x.array  # of the start of the substep
         if state.stays and not self._varies:
             outflow = self._outflow((at, weight, *varies), lambda: set_fluxes(sides(), mobility(True)), grid.comm)

@@ -99,8 +99,9 @@ class Scene:
             wet = fluid.density if fluid else None
             options = (self.gravity, wet, scene.symmetric)
             options = (*options, numerics.quadrature == "point", terms, self.t, self.dt, velocity is not None)
+            options = (*options, scene.retentions)
             self.momentum = MomentumForms(self.pieces.pieces, laws, p, *options)
-        if not self.momentum.symmetric and scheme.coupling == "schur-cg":
+        if scheme.coupling == "schur-cg" and not (self.momentum.symmetric and scene.retentions is None):
             scheme = replace(scheme, coupling="schur-fgmres")
         self.scheme, self.storage = scheme, None
         if fluid:
@@ -115,7 +116,7 @@ class Scene:
                 ConductivityAtPieces(scene.materials, laws, pieces, u, fem.Function(grid.cellwise())) if laws else None
             )
             kind = (symmetric, scene.conducts, scene.evolves)
-            self.storage = StorageForms(pieces, u, p, fluid.bulk, weight, *kind, law, sources, self.t, inertial)
+            self.storage = StorageForms(pieces, u, p, fluid.bulk, weight, *kind, law, sources, self.t, inertial, scene.retentions)
         self.motion = Motion(scene, bodies, self.momentum, self.storage)
         # what is still to be looked for, to be warned of, of which nothing but the log knows
         self._looks = (warn_overfilled, *[partial(warn_smeared, materials=scene)] * scene.uneven)

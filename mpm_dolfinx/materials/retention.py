@@ -1,0 +1,384 @@
+# SPDX-License-Identifier: MIT
+"""Retention: how full pores are at a pressure, how they conduct, and the share of it that the skeleton feels.
+
+Air is at zero pressure everywhere, so the suction is s = -p.  Without suction pores are full.  With the saturation S
+and the relative permeability k_r, both functions of p,
+
+    content of fluid   n S,      conductivity   k k_r,      stress   sigma = sigma' - alpha chi p
+
+(Richards 1931; Bishop 1959).  chi is the effective saturation S_e = (S - S_r) / (1 - S_r), or the law's own.
+
+A law of the user's is any object with `saturation(p)` and `relative_permeability(p)`, which return UFL.  Its
+`bishop(p)` is chi, without one chi = S.  One derived from `Retention` has constants that are no part of what is
+compiled.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from copy import copy
+from dataclasses import dataclass, fields
+from math import log, sqrt
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from numpy.typing import NDArray
+from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
+
+from mpm_dolfinx.base.tolerances import TINY
+from mpm_dolfinx.base.validation import line, numbers
+from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointExpression
+from mpm_dolfinx.grid.grid import Grid
+from mpm_dolfinx.materials.user_functions import expression
+
+METHODS = ("saturation", "relative_permeability")
+
+
+@dataclass(frozen=True)
+class Retention:
+    """Law of retention by an effective saturation: S = S_r + (1 - S_r) S_e.
+
+    A law derived from it is a frozen dataclass of numbers.  It defines `effective(s)` and `conducts(s)`: S_e and k_r as
+    UFL of the suction s >= 0, Pa, both 1 at s = 0.  Its `bishop(p)` is S_e unless it defines another.
+
+    Parameters
+    ----------
+    entry
+        Suction about which pores begin to drain, Pa, > 0.
+    residual
+        Saturation S_r that no suction drains, in [0, 1).
+
+    Raises
+    ------
+    ValueError
+        Naming the constant that is out of its range.
+    """
+
+    entry: float
+    residual: float = 0.0
+
+    def __post_init__(self):
+        _number(self, "entry", lambda v: v > 0, "> 0 and finite")
+        _number(self, "residual", lambda v: (0 <= v) & (v < 1), "in [0, 1)")
+
+    @property
+    def scale(self) -> float:
+        """Suction, Pa, about which saturation and permeability fall."""
+        return self.entry
+
+    def bishop(self, p):
+        """Return chi at pressures p, Pa, as UFL."""
+        return self.effective(ufl.max_value(-p, 0.0))
+
+    def saturation(self, p):
+        """Return S at pressures p, Pa, as UFL."""
+        return self.residual + (1 - self.residual) * self.effective(ufl.max_value(-p, 0.0))
+
+    def relative_permeability(self, p):
+        """Return k_r at pressures p, Pa, as UFL."""
+        return self.conducts(ufl.max_value(-p, 0.0))
+
+
+@dataclass(frozen=True)
+class VanGenuchten(Retention):
+    """Retention by van Genuchten (1980), permeability by Mualem (1976).
+
+    With x = s / entry, m = 1 - 1 / n:  S_e = (1 + x^n)^-m,  k_r = S_e^l [1 - x^(n-1) S_e]^2.
+
+    Parameters
+    ----------
+    entry
+        1 / alpha as a pressure, Pa, > 0: the weight of water over alpha in 1/m.
+    residual
+        Saturation S_r that no suction drains, in [0, 1).
+    n
+        How evenly wide pores are, in (1, 20].
+    l
+        Connectivity of the pores, a number.
+    air_entry
+        Suction below which all pores are full, Pa, >= 0 (Ippisch, Vogel and Bastian 2006).  With n < 2 the permeability
+        falls infinitely steeply at s = 0 without it; the height of a few centimetres of water is usual.
+    """
+
+    n: float = 2.0
+    l: float = 0.5
+    air_entry: float = 0.0
+
+    def __post_init__(self):
+        super().__post_init__()
+        _number(self, "n", lambda v: (1 < v) & (v <= 20), "in (1, 20]")
+        _number(self, "l", lambda v: v == v, "a finite number")
+        _number(self, "air_entry", lambda v: v >= 0, ">= 0 and finite")
+
+    def _wide(self, x):
+        """Return x^(n-1) (1 + x^n)^-m, the share of the conductance of pores that are empty, under a root."""
+        return x ** (self.n - 1) * (1 + x**self.n) ** (1 / self.n - 1)
+
+    def _least(self):
+        """Return the suction below which all pores are full, over `entry`; powers of zero have no derivatives."""
+        return ufl.max_value(self.air_entry / self.entry, TINY)
+
+    def effective(self, s):
+        """Return S_e at suctions s, Pa, as UFL."""
+        x, least = ufl.max_value(s / self.entry, self._least()), self._least()
+        return ((1 + x**self.n) / (1 + least**self.n)) ** (1 / self.n - 1)
+
+    def conducts(self, s):
+        """Return k_r at suctions s, Pa, as UFL."""
+        x, least = ufl.max_value(s / self.entry, self._least()), self._least()
+        return self.effective(s) ** self.l * ((1 - self._wide(x)) / (1 - self._wide(least))) ** 2
+
+
+@dataclass(frozen=True)
+class Gardner(Retention):
+    """Exponential retention and permeability: S_e = k_r = exp(-s / entry) (Gardner 1958; Srivastava and Yeh 1991).
+
+    Parameters
+    ----------
+    entry
+        Suction in which they fall by e, Pa, > 0: the weight of water over Gardner's alpha in 1/m.
+    residual
+        Saturation S_r that no suction drains, in [0, 1).
+    """
+
+    def effective(self, s):
+        """Return S_e at suctions s, Pa, as UFL."""
+        return ufl.exp(-s / self.entry)
+
+    conducts = effective
+
+
+@dataclass(frozen=True)
+class BrooksCorey(Retention):
+    """Retention and permeability by powers: S_e = (s / entry)^-index, k_r = S_e^(3 + 2 / index) (Brooks, Corey 1964).
+
+    Parameters
+    ----------
+    entry
+        Suction below which all pores are full, Pa, > 0.
+    residual
+        Saturation S_r that no suction drains, in [0, 1).
+    index
+        How evenly wide pores are, in (0, 20].
+    """
+
+    index: float = 2.0
+
+    def __post_init__(self):
+        super().__post_init__()
+        _number(self, "index", lambda v: (0 < v) & (v <= 20), "in (0, 20]")
+
+    def effective(self, s):
+        """Return S_e at suctions s, Pa, as UFL."""
+        return ufl.max_value(s / self.entry, 1.0) ** (-self.index)
+
+    def conducts(self, s):
+        """Return k_r at suctions s, Pa, as UFL."""
+        return ufl.max_value(s / self.entry, 1.0) ** (-2 - 3 * self.index)
+
+
+def _number(law: Retention, name: str, test: Callable, allowed: str) -> None:
+    """Refuse a constant of a law that fails a test."""
+    what = f"{type(law).__name__}: {name}"
+    numbers(what, getattr(law, name), test=lambda v: np.isfinite(v) & test(v), allowed=allowed)
+
+
+def check_retention(what: str, law) -> None:
+    """Refuse, with a ValueError, what is no law of retention, or none whose values are possible.
+
+    S and k_r are in [0, 1], are 1 at p >= 0, and do not rise with the suction.
+    """
+    missing = [name for name in METHODS if not callable(getattr(law, name, None))]
+    if missing:
+        raise ValueError(f"{what} = {line(law)}, must have {' and '.join(f'{name}(p)' for name in METHODS)}")
+    suctions = scale_of(law) * np.array([-1.0, 0.0, 0.01, 0.1, 0.5, 1.0, 2.0, 5.0])
+    for name in METHODS:
+        values = np.array([_value(getattr(law, name), -s) for s in suctions])
+        good = (values[:2] == 1).all() and (values >= 0).all() and (np.diff(values) <= 0).all()
+        if not good:
+            shown = ", ".join(f"{value:.3g}" for value in values)
+            where = ", ".join(f"{-s:.3g}" for s in suctions)
+            raise ValueError(f"{what}: {name} is {shown} at p = {where} Pa, must fall from 1 at 0 to no less than 0")
+
+
+def _value(function: Callable, p: float) -> float:
+    """Return the number that a function of p, which returns UFL, has at a pressure, Pa."""
+    return float(apply_algebra_lowering(expression(function, [()], p=ufl.as_ufl(float(p))))(()))
+
+
+def scale_of(law) -> float:
+    """Return the suction about which a law's saturation falls, Pa: its `scale`, or where half of the pores are empty.
+
+    Without such a suction it is the one at which the permeability has halved.
+    """
+    if (scale := getattr(law, "scale", None)) is not None:
+        return float(numbers(f"{line(law)}: scale", scale, test=lambda v: v > 0, allowed="> 0"))
+    for name in METHODS:
+        low, high = -sqrt(1 / TINY), -sqrt(TINY)  # pressures, by whose logarithms halves are found
+        if _value(getattr(law, name), low) > 0.5:
+            continue
+        for _ in range(64):
+            middle = -sqrt(low * high)
+            low, high = (middle, high) if _value(getattr(law, name), middle) <= 0.5 else (low, middle)
+        return -low
+    raise ValueError(f"{line(law)}: more than half of its pores stay full at any suction, must have a scale, Pa")
+
+
+class Retentions:
+    """The laws of retention of a scene, as UFL of what points carry of theirs.
+
+    Points carry a row: the number of the kind of their law, from 1, and its constants; zero where pores stay full.
+
+    Parameters
+    ----------
+    laws
+        The different laws of the scene's materials.
+    everywhere
+        Whether every material has one.
+    """
+
+    def __init__(self, laws: Sequence, everywhere: bool):
+        self.laws = list(laws)
+        self._everywhere = everywhere
+        self._kinds = list(dict.fromkeys(type(law) if isinstance(law, Retention) else law for law in self.laws))
+        self._first = [next(law for law in self.laws if self._kind(law) == i) for i in range(len(self._kinds))]
+        self.width = 1 + max(len(_constants(law)) for law in self.laws)
+        """Length of a row."""
+
+    def _kind(self, law) -> int:
+        return self._kinds.index(type(law) if isinstance(law, Retention) else law)
+
+    def row(self, law) -> NDArray[np.float64]:
+        """Return the row of a law, or of None."""
+        out = np.ones(self.width)
+        out[0] = 0 if law is None else 1 + self._kind(law)
+        if law is not None:
+            constants = _constants(law)
+            out[1 : 1 + len(constants)] = [getattr(law, name) for name in constants]
+        return out
+
+    def number(self, law) -> int:
+        """Return the number of a law among all, from 1; 0 for None."""
+        return 0 if law is None else 1 + self.laws.index(law)
+
+    def of(self, name: str, p, row):
+        """Return a property of pores at pressures p, Pa, as UFL.
+
+        Parameters
+        ----------
+        name
+            "saturation", "relative_permeability" or "bishop".
+        row
+            UFL vector of the points' row.
+        """
+        values = [_property(_lifted(law, [row[1 + i] for i in range(self.width - 1)]), name, p) for law in self._first]
+        out = values.pop(0) if self._everywhere else 1.0
+        first = 2 if self._everywhere else 1
+        for number, value in enumerate(values, first):
+            out = ufl.conditional(ufl.eq(row[0], number), value, out)
+        return out
+
+    def constants(self, grid: Grid) -> list:
+        """Return the laws one by one, with constants of UFL in the place of their numbers."""
+        out = []
+        for law in self.laws:
+            values = [fem.Constant(grid.mesh, float(getattr(law, name))) for name in _constants(law)]
+            out.append(_lifted(law, values))
+        return out
+
+
+def _constants(law) -> list[str]:
+    """Return the names of the numbers of a law that are no part of what is compiled."""
+    return [f.name for f in fields(law)] if isinstance(law, Retention) else []
+
+
+def _lifted(law, values: Sequence):
+    """Return a law with UFL in the place of its numbers."""
+    out = copy(law)
+    if isinstance(law, Retention):
+        vars(out).update(zip(_constants(law), values, strict=False))
+    return out
+
+
+def _property(law, name: str, p):
+    """Return a property of a law at pressures p, Pa, as UFL."""
+    if name == "bishop" and not hasattr(law, "bishop"):
+        name = "saturation"
+    return expression(getattr(law, name), [()], p=p)
+
+
+class SaturationAt:
+    """Saturations, and their slopes, of any points at given pressures.
+
+    Parameters
+    ----------
+    grid
+        Background grid.
+    retentions
+        The laws of the scene.
+    """
+
+    def __init__(self, grid: Grid, retentions: Retentions):
+        self._points = points = FormPoints(grid, p=(), retention=(retentions.width,))
+        p = ufl.variable(points.p)
+        names = ("saturation", "bishop", "relative_permeability")
+        S, chi, k = (retentions.of(name, p, points.retention) for name in names)
+        self._values = PointExpression(ufl.as_vector([S, ufl.diff(S, p), chi, k]), points)
+
+    def __call__(
+        self, rows: NDArray[np.float64], p: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Return S, its slope, 1/Pa, chi and k_r (m,) at pressures p (m,), Pa; rows (m, width): of the points."""
+        data = anywhere(self._points, p=p, retention=rows)
+        S, slope, chi, k = self._values.evaluate(data).T
+        return S, slope, chi, k
+
+
+def anywhere(points: FormPoints, **fields: NDArray[np.float64]) -> PointData:
+    """Return points (m,) with some fields (m, ...), all in one cell, for expressions that do not see where they are."""
+    count = len(next(iter(fields.values())))
+    cells = np.zeros(count, dtype=np.int32)
+    return points.at(cells, points.grid.midpoints[cells], np.ones(count), **fields)
+
+
+def mean_between(law, p0, p1):
+    """Return the mean of a law's relative permeability over the pressures between two, Pa, as UFL.
+
+    It makes a flux the difference of two potentials (Kirchhoff's transformation).  Points of Gauss's rule are spread by
+    the logarithm of the suction, or wet soil would not see that it conducts beside dry soil.
+    """
+    scale = law.scale if isinstance(law, Retention) else scale_of(law)
+    y0, y1 = (_asinh(p / scale) for p in (p0, p1))
+    total = 0.0
+    whole = 0.0
+    for x, w in zip(*POINTS, strict=True):
+        y = y0 + x * (y1 - y0)
+        weight = w * ufl.cosh(y)
+        whole += weight
+        total += weight * expression(law.relative_permeability, [()], p=scale * ufl.sinh(y))
+    return total / whole
+
+
+def _gauss(n: int) -> tuple[list[float], list[float]]:
+    """Return points and weights of Gauss's rule of n points in [0, 1]."""
+    x, w = np.polynomial.legendre.leggauss(n)
+    return ((1 + x) / 2).tolist(), (w / 2).tolist()
+
+
+POINTS = _gauss(8)
+
+
+def _asinh(z):
+    root = ufl.sqrt(1 + z**2)
+    return ufl.conditional(ufl.lt(z, 0), -ufl.ln(root - z), ufl.ln(root + z))
+
+
+def logarithm(p: NDArray[np.float64], scale: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return pressures (n,), Pa, on the scale on which a law of this `scale`, Pa, changes evenly: see `pressure_at`."""
+    return np.where(p < 0, np.arcsinh(p / scale), p / scale)
+
+
+def pressure_at(y: NDArray[np.float64], scale: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the pressures (n,), Pa, of such logarithms (n,)."""
+    return np.where(y < 0, scale * np.sinh(y), scale * y)
