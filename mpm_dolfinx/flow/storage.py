@@ -53,7 +53,7 @@ from mpm_dolfinx.forms.point_forms import CellSums, FacetSum, FormPoints, PointD
 from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts, zero
 from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.materials.evaluate import ConductivityAtPieces
-from mpm_dolfinx.materials.retention import Retentions
+from mpm_dolfinx.materials.retention import Retentions, logarithm, pressure_at
 from mpm_dolfinx.materials.skeleton import filled
 from mpm_dolfinx.materials.user_functions import compiling
 from mpm_dolfinx.materials.user_functions import form as form_of
@@ -65,6 +65,10 @@ FILTER = 0.75
 
 Plateau (beam): halved 5.2e-11, doubled 1.3e-10, cells 1.5e-02.
 """
+
+
+FARTHEST = 2.0
+"""Change of the logarithm of the suction in a Newton step, at most.  Without one Newton's method finds no solution."""
 
 
 FluxSlope = Callable[[PETSc.Vec], NDArray[np.float64]]
@@ -399,6 +403,8 @@ class StorageProblem:
         What the active owned cells take in of what their points are owed, until the end of the substep.
     inertial
         Gives the forces of inertia on the pore fluid (n, d), N/m^3, in the active owned cells at u, if there are any.
+    scale
+        Suctions about which pores of these cells drain (n,), Pa, where any do.
 
     The pressure at the start of the step is that of `forms.p_n`.
     """
@@ -415,7 +421,9 @@ class StorageProblem:
         softness: NDArray[np.float64] | float = 1.0,
         due: NDArray[np.float64] | float = 0.0,
         inertial: Callable[[], NDArray[np.float64]] | None = None,
+        scale: NDArray[np.float64] | None = None,
     ):
+        self._scale = scale
         self.forms = forms
         self.system = system
         self.data = data
@@ -508,6 +516,19 @@ class StorageProblem:
         between, faces = outflow.aslant(p, np.exp(p / self.forms.bulk))
         leaving = sum_by(outflow.faces.at, faces, len(between))
         return Aslant(between + leaving, faces, leaving)
+
+    def restrained(self, dp: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return by how much pressures are to fall, Pa, where Newton's method asks for these falls (n,).
+
+        Where pores drain the logarithm of the suction changes by at most `FARTHEST`.
+        """
+        if self._scale is None:
+            return dp
+        p, scale = self.forms.p.x.array[self.system.unknowns.owned], self._scale
+        here, there = logarithm(p, scale), logarithm(p - dp, scale)
+        far = (np.abs(there - here) > FARTHEST) & (np.minimum(here, there) < 0)
+        there = here + np.clip(there - here, -FARTHEST, FARTHEST)
+        return np.where(far, p - pressure_at(there, scale), dp)
 
     def settle_seepage(self) -> bool:
         """Open and close seepage faces as the flow at (u, p) asks for; return whether that has changed anything.

@@ -232,6 +232,8 @@ class Newton:
             elif fresh:
                 self._linearise(np.where(eases, 0.0, FIRM * np.minimum(1.0, errors.u)))
             self.report.coupling += self._direction(errors, fresh and slow)
+            if self._storage is not None:
+                self._solvers.restrain(self._storage)
             before, errors = errors, self._line_search(errors, elastic)
             count, slow = count + 1, fresh
             # inf where no fluid has moved yet

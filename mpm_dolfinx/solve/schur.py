@@ -28,6 +28,7 @@ from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.flow.storage import FILTER, FluxSlope, StorageProblem, StorageSystem
 from mpm_dolfinx.mechanics.momentum import MomentumProblem, MomentumSystem
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
+from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.parallel.messages import ConditionWarning, warn
 from mpm_dolfinx.points.parts import OfParts
 from mpm_dolfinx.solve.linear import MOST, direct_solver, displacement_solver, factorise, solved
@@ -265,9 +266,7 @@ class LinearSolvers:
         cg = self._solve_s.getType() == PETSc.KSP.Type.CG  # which takes preconditioned norms
         self._evenly(self._solve_s, g, self.dp, self._storage.of_parts, self._solve_s.pc.apply if cg else None)
         self._schur.setPythonContext(self._context)
-        self._storage.B_momentum.multTranspose(self.dp, self._rhs)
-        self._rhs.axpy(1.0, residual)
-        self.solve_u.solve(self._rhs, self.du)
+        self._follow()
         count = solved(self._solve_s, "storage")
         kept.operator = kept.operator and count <= self.plan.many
         return count
@@ -295,6 +294,22 @@ class LinearSolvers:
         ksp.solve(b, x)
         b.array_w[:] *= scale
         x.array_w[:] *= scale
+
+    def restrain(self, storage: StorageProblem) -> None:
+        """Let pressures fall by no more along the direction than their storage says, displacements as these ask."""
+        dp = storage.restrained(self.dp.array_r)
+        far = np.array_equal(dp, self.dp.array_r)
+        if over_all(self.du.comm.tompi4py(), int(not far)) == 0:
+            return
+        self.dp.array_w[:] = dp
+        if self._block is None:
+            self._follow()
+
+    def _follow(self) -> None:
+        """Solve for the displacements that go with the direction of the pressures."""
+        self._storage.B_momentum.multTranspose(self.dp, self._rhs)
+        self._rhs.axpy(1.0, self._momentum.residual)
+        self.solve_u.solve(self._rhs, self.du)
 
     def turn_round(self, parts: NDArray[np.bool_] | None = None) -> None:
         """Turn the direction round, of all parts or of some (parts,)."""

@@ -325,11 +325,18 @@ class OnGrid(Keyed):
         volume = cut.pieces_to_cells(cut.pieces.fraction * (points.volume0 * points.J)[cut.pieces.point])
         store, pores = (volume * cut.to_cells(values(points)) for values in (materials.storage, materials.porosity))
         rows = cut.to_cells(materials.retention_rows(points))
-        scale = np.full(len(self.contents.filled), np.inf)
         slot = self.contents.slot(cut.cells)
-        np.minimum.at(scale, slot, cut.to_cells(materials.retention_scale(points)))
-        scale[np.isinf(scale)] = 1.0  # of cells all of whose pores stay full
-        return PoreWater(partial(materials.saturations, rows), slot, store, pores, self._storage.bulk, scale)
+        return PoreWater(partial(materials.saturations, rows), slot, store, pores, self._storage.bulk, self.scale)
+
+    @cached_property
+    def scale(self) -> NDArray[np.float64] | None:
+        """Suctions about which pores of the filled owned cells drain, Pa, 1 where they stay full; None if all do."""
+        if self._quadrature.materials.retentions is None:
+            return None
+        scale = np.full(len(self.contents.filled), np.inf)
+        of_points = self._quadrature.materials.retention_scale(self.cut.points)
+        np.minimum.at(scale, self.contents.slot(self.cut.cells), self.cut.to_cells(of_points))
+        return np.where(np.isinf(scale), 1.0, scale)
 
     def resting_mobility(self) -> Mobility:
         """Return the conductivities, m/s, of the filled owned cells as laws of the deformation and pressure have them
