@@ -203,7 +203,9 @@ class OpenFaces:
         along = np.einsum("md,md->m", force[self.at], self.reach)
         return sum_by(self.at, np.where(self.seeps, 0.0, self.conductance * along), len(force))
 
-    def seepage(self, pi: NDArray[np.float64], flows: NDArray[np.bool_]) -> tuple[NDArray, NDArray]:
+    def seepage(
+        self, pi: NDArray[np.float64], flows: NDArray[np.bool_], even: bool = False
+    ) -> tuple[NDArray, NDArray]:
         """Return what seeps out of cells (n,), m^d/s, and its derivative, m^d/(Pa s); flows (m,): where."""
         parts = (np.where(flows & self.seeps, values, 0.0) for values in (self.outflow(pi), self.conductance))
         return tuple(sum_by(self.at, values, len(pi)) for values in parts)
@@ -281,9 +283,14 @@ class CellContents(Keyed):
         np.maximum.at(softest, self._slot[self._cells], softness)
         return softest
 
-    def set_damping(self, less: NDArray[np.float64] | float = 0.0) -> NDArray[np.float64]:
-        """Set the strength tau of the damping of elastic soil in the filled cells, less some (n,); return it, 1/Pa."""
-        tau, values = self._damped.x, np.maximum(self.mean(self._damping) - less, 0.0)
+    def set_damping(
+        self, share: NDArray[np.float64] | float = 1.0, less: NDArray[np.float64] | float = 0.0
+    ) -> NDArray[np.float64]:
+        """Set the strength tau of the damping of elastic soil in the filled cells; return it, 1/Pa.
+
+        Shares (n,) of it count, less what pores store by their saturation (n,), 1/Pa.
+        """
+        tau, values = self._damped.x, np.maximum(share * self.mean(self._damping) - less, 0.0)
         tau.array[:] = 0.0
         tau.array[self.filled] = values
         tau.scatter_forward()
@@ -374,8 +381,8 @@ class FluxForms:
         d1 = across / 2 + ufl.dot(self.centroid("-"), n0)
         k0, k1 = (sum(abs(n0[a]) * self.mobility(side)[a] for a in range(d)) for side in "+-")
         if relative is not None:
-            p0, p1 = pressure("+"), pressure("-")
-            k0, k1 = (k * relative.conducts(relative.shares(side), p0, p1) for k, side in ((k0, "+"), (k1, "-")))
+            means, slopes = relative.between(pressure)
+            k0, k1 = (k * relative.conducts(side, means) for k, side in ((k0, "+"), (k1, "-")))
         T = share * k0 * k1 / (d0 * k1 + d1 * k0 + TINY)
         dS = ufl.Measure("dS", domain=mesh, subdomain_id=_compat.SUBDOMAIN, metadata={"quadrature_degree": 0})
         self.flux = FacetForm(T * ufl.jump(dp) * ufl.jump(q) * dS, grid.comm) if flows else None
@@ -395,6 +402,8 @@ class FluxForms:
             carried = T * ufl.avg(self.density)
             self.aslant = FacetForm(-carried * ufl.dot(ufl.avg(self.slope), along) * ufl.jump(q) * dS, grid.comm)
         self.gravity = None
+        self.even = None
+        """Where pores drain, the slope of the fluxes but for that of what the weight drives: outflows rise with it."""
         if inertial is not None:
             weight = ufl.avg(inertial) if weight is None else weight + ufl.avg(inertial)
         if (weight is not None or relative is not None) and flows:
@@ -406,7 +415,12 @@ class FluxForms:
             driven = T * density * drives * ufl.jump(q) * dS
             self.gravity = FacetForm(driven, grid.comm)
             if relative is not None:
-                self.flux = FacetForm(ufl.derivative(driven, pressure, dp), grid.comm)
+                by_k = [ufl.diff(T, k) * (a * dp("+") + b * dp("-")) for k, (a, b) in zip(means, slopes, strict=True)]
+                whole, even = (
+                    density * (T * ufl.jump(dp) + by * sum(by_k)) * ufl.jump(q) * dS
+                    for by in (drives, ufl.jump(pressure))
+                )
+                self.flux, self.even = FacetForm(whole, grid.comm), FacetForm(even, grid.comm)
 
     def along(
         self, slope: NDArray[np.float64], cells: NDArray[np.int64], facets: FacetSum, density: NDArray[np.float64]

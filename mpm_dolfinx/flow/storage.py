@@ -68,7 +68,7 @@ Plateau (beam): halved 5.2e-11, doubled 1.3e-10, cells 1.5e-02.
 
 
 FARTHEST = 2.0
-"""Change of the logarithm of the suction in a Newton step, at most.  Without one Newton's method finds no solution."""
+TURN = False
 
 
 FluxSlope = Callable[[PETSc.Vec], NDArray[np.float64]]
@@ -151,7 +151,7 @@ class StorageForms:
             drained = (full - before) * pieces.pores
             stored = full * stored + drained * denser
             felt = ufl.diff(p * retentions.of("bishop", p, pieces.retention), p)
-            self._capacity = CellSums([ufl.diff(drained, p)], pieces)
+            self._capacity = CellSums([ufl.diff(drained, p), full * felt], pieces)
         self._change = PointForm(stored * q * pieces.dx, pieces)
         taken = pieces.biot * ufl.diff(J, delta) if not self.retains else pieces.biot * felt * ufl.diff(J, delta)
         by_u = [taken, *([] if symmetric else [ufl.diff(stored, delta)])]
@@ -199,9 +199,10 @@ class StorageForms:
         capacity[data.places.filled] = by_p[:, 0]
         return [capacity, *by_u]
 
-    def drained(self, data: PointData) -> NDArray[np.float64]:
-        """Return what the filled cells store by their saturation, per pressure, m^d/Pa, at p."""
-        return self._capacity(data)[:, 0]
+    def drained(self, data: PointData) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return what the filled cells (n,) store by their saturation, m^d/Pa, and S d(chi p)/dp, m^d, at p."""
+        capacity, coupled = self._capacity(data).T
+        return capacity, coupled
 
     def gain(self, data: PointData) -> NDArray[np.float64]:
         """Return the rate of the sources in each cell at p, m^d/s, a local array."""
@@ -213,6 +214,8 @@ class StorageForms:
 
     def driven(self, assembled: FacetSum) -> NDArray[np.float64]:
         """Return the outflow that p and the fluid's weight drive from each cell to others, m^d/s, a local array."""
+        if self.fluxes.relative is not None:
+            self.fluxes.relative.set_pressures(self.p.x.array)
         assembled.assemble_vector(self._sum([], None))
         return sum_ghosts(self._work)
 
@@ -299,8 +302,8 @@ class StorageSystem:
         self.B = matrix(own, momentum, 2**d * d)
         self.B_momentum = self.B if forms.symmetric else matrix(own, momentum, 2**d * d)
         self.residual, self.p, self.p_start = (own.vector() for _ in range(3))
-        kinds = (fluxes.flux, fluxes.damp, fluxes.alternation, fluxes.gravity)
-        self._flux, self.damp, self._alternation, self.gravity = (f and f.on(facets) for f in kinds)
+        kinds = (fluxes.flux, fluxes.damp, fluxes.alternation, fluxes.gravity, fluxes.even)
+        self._flux, self.damp, self._alternation, self.gravity, self._even = (f and f.on(facets) for f in kinds)
         self.set_alternation()
         _add_diagonal(self.L, np.zeros(own.size))  # of a cell without faces
         pattern = self.L
@@ -348,19 +351,22 @@ class StorageSystem:
         open_by = faces.conductance
         if relative is not None:
             p = self._forms.p.x.array
-            mobility = mobility * relative.between(contents.filled, *[p[contents.filled]] * 2)[0][:, None]
-            open_by = open_by * relative.between(sides.cells, p[sides.cells], sides.pressure)[0]
+            mobility = mobility * relative.through_sides(contents.filled, *[p[contents.filled]] * 2)[0][:, None]
+            open_by = open_by * relative.through_sides(sides.cells, p[sides.cells], sides.pressure)[0]
         self.assemble_fluxes()
         total = _add_diagonal(self.T, conductance)
         aslant = off and AslantFlow(self._forms.fluxes, *off, contents, sides, open_by, flow.weight)
         return Outflow(conductance, inflow, faces, total, mobility, aslant)
 
 
-    def assemble_fluxes(self) -> None:
-        """Assemble the matrix of the fluxes between cells, where pores drain at p."""
+    def assemble_fluxes(self, even: bool = False) -> None:
+        """Assemble the matrix of the fluxes between cells, where pores drain at p; even: see `FluxForms`."""
         zero(self.T)
-        if self._flux is not None:
-            self._flux.assemble_matrix(self.T)
+        if (relative := self._forms.fluxes.relative) is not None:
+            relative.set_pressures(self._forms.p.x.array)
+        flux = self._even if even else self._flux
+        if flux is not None:
+            flux.assemble_matrix(self.T)
         self.T.assemble()
 
 
@@ -437,9 +443,9 @@ class StorageProblem:
         system.unknowns.gather(forms.p_n.x.array, system.p_start)
         reach = 4 * forms.grid.h.max() ** 2  # no two centroids are further apart than 2 h
         tau, least = contents.set_damping(), dt * outflow.mobility.min(axis=1)
-        if forms.retains:  # what pores take up or give stabilises as well
-            less = forms.drained(data) / contents.volume
-            tau, least = contents.set_damping(less), 0.0 * least
+        if forms.retains:  # dry pores hardly couple the two balances, and what they take up stabilises as well
+            capacity, coupled = (values / contents.volume for values in forms.drained(data))
+            tau, least = contents.set_damping(np.maximum(coupled, 0.0), capacity), 0.0 * least
         softest = contents.softest(softness) if forms.softens else np.ones(1)
         known = [(tau * reach > least).any(), (softest * tau * reach > least).any() and softest.max() > 1]
         seeps = outflow.faces.seeps.any() or (forms.retains and len(outflow.faces.at) > 0)
@@ -520,15 +526,21 @@ class StorageProblem:
     def restrained(self, dp: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return by how much pressures are to fall, Pa, where Newton's method asks for these falls (n,).
 
-        Where pores drain the logarithm of the suction changes by at most `FARTHEST`.
+        Where pores drain no step goes past the suction about which they do: on either side of it Newton's method for
+        the saturation, which is convex or concave there, converges (Wang and Tchelepi 2013).  Nor does a step make dry
+        soil much drier.
         """
         if self._scale is None:
             return dp
-        p, scale = self.forms.p.x.array[self.system.unknowns.owned], self._scale
-        here, there = logarithm(p, scale), logarithm(p - dp, scale)
-        far = (np.abs(there - here) > FARTHEST) & (np.minimum(here, there) < 0)
-        there = here + np.clip(there - here, -FARTHEST, FARTHEST)
-        return np.where(far, p - pressure_at(there, scale), dp)
+        p, turn = self.forms.p.x.array[self.system.unknowns.owned], -self._scale
+        there = p - dp
+        if TURN:
+            there = np.where((p - turn) * (there - turn) < 0, turn, there)
+        here, y = logarithm(p, self._scale), logarithm(there, self._scale)
+        far = (np.abs(y - here) > FARTHEST) & (np.minimum(here, y) < 0)
+        y = here + np.clip(y - here, -FARTHEST, FARTHEST)
+        there = np.where(far, pressure_at(y, self._scale), there)
+        return np.where(there == p - dp, dp, p - there)
 
     def settle_seepage(self) -> bool:
         """Open and close seepage faces as the flow at (u, p) asks for; return whether that has changed anything.
@@ -638,10 +650,24 @@ class StorageProblem:
             zero(A)
             insert_rows(A, forms.grid, data.places.filled, rows)
             A.assemble()
-        system.C.zeroEntries()
         if forms.retains:
             self._flow(False)
-            system.assemble_fluxes()
+        self._assemble_slope(data, capacity)
+        if forms.fluxes.relative is not None:
+            falls = bool((system.C.getDiagonal().array_r <= 0).any())
+            if over_all(forms.grid.comm, int(falls)) > 0:
+                self._assemble_slope(data, capacity, even=True)
+
+    def _assemble_slope(self, data: PointData, capacity: NDArray[np.float64], even: bool = False) -> None:
+        """Assemble C; even: without how the weight drives more as soil gets wetter.
+
+        That is more than very dry soil stores: Newton's method would make it drier.
+        """
+        forms = self.forms
+        system = self.system
+        if forms.fluxes.relative is not None:
+            system.assemble_fluxes(even)
+        system.C.zeroEntries()
         system.C.axpy(self.dt, system.T, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
         if self.damped:
             system.C.axpy(1.0, system.D, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
@@ -650,7 +676,7 @@ class StorageProblem:
         owned = system.unknowns.owned
         _add_diagonal(system.C, capacity[owned])
         if self._seeps:
-            slope = self._flow(False).faces.seepage(self._potentials, self._flowing)[1]
+            slope = self._flow(False).faces.seepage(self._potentials, self._flowing, even)[1]
             _add_diagonal(system.C, self.dt * slope)
         if forms.sources:
             _add_diagonal(system.C, -self.dt * forms.gain_slope(data)[owned])

@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: MIT
 """Fluxes in soil whose pores drain: conductivities by the pressures on both sides of a face.
 
-Through a face soil conducts as on the mean over the pressures between the two sides (`retention.mean_between`): neither
+Through a face soil conducts as on the mean over the pressures between the two sides (`retention.Conductance`): neither
 that of the wetter side, which would let a front run ahead, nor the mean of both.  A cell that holds several soils
 conducts by the sum of their shares.  In series their resistances are those at the start of a substep.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,10 +17,10 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.fluid_content import pressure_of
+from mpm_dolfinx.base.tolerances import SAME
 from mpm_dolfinx.flow.fluxes import OpenFaces
-from mpm_dolfinx.forms.point_forms import FormPoints, PointExpression
 from mpm_dolfinx.grid.grid import Grid, sum_by
-from mpm_dolfinx.materials.retention import Retentions, anywhere, mean_between
+from mpm_dolfinx.materials.retention import Conductance, Retentions
 
 
 class Relative:
@@ -39,24 +40,52 @@ class Relative:
     """
 
     def __init__(self, grid: Grid, retentions: Retentions):
-        self._laws = retentions.constants(grid)
+        self._laws = [Conductance(grid, law) for law in retentions.laws]
         self.count = 1 + len(self._laws)
         self.shares = fem.Function(grid.cellwise((self.count,)))
-        self._points = points = FormPoints(grid, p=(), outer=(), shares=(self.count,))
-        p = ufl.variable(points.p)
-        k = self.conducts(points.shares, p, points.outer)
-        self._values = PointExpression(ufl.as_vector([k, ufl.diff(k, p)]), points)
+        self._tables = fem.Function(grid.cellwise((3 * len(self._laws),)))
+        self._mesh = grid.mesh
 
-    def conducts(self, shares, p0, p1):
-        """Return the mobility between two pressures, Pa, of a cell with these shares, as UFL."""
-        return shares[0] + sum(shares[1 + i] * mean_between(law, p0, p1) for i, law in enumerate(self._laws))
+    def between(self, pressure: fem.Function) -> tuple[list, list]:
+        """Return k_r of each law between the two sides of a face as UFL variables, and their slopes by both pressures.
 
-    def between(
+        It is the quotient of the differences of the integral and the pressure, or the mean where these are next to
+        nothing.
+        """
+        p0, p1 = pressure("+"), pressure("-")
+        means, slopes = [], []
+        for i, law in enumerate(self._laws):
+            (phi0, k0, d0), (phi1, k1, d1) = ([self._tables(side)[3 * i + j] for j in range(3)] for side in "+-")
+            scale = fem.Constant(self._mesh, law.scale)
+            close = ufl.lt(abs(p0 - p1), SAME * (abs(p0) + abs(p1) + scale))
+            apart = ufl.conditional(close, 1.0, p0 - p1)
+            k = ufl.conditional(close, (k0 + k1) / 2, (phi0 - phi1) / apart)
+            means.append(ufl.variable(k))
+            by_both = (ufl.conditional(close, d0 / 2, (k0 - k) / apart), ufl.conditional(close, d1 / 2, (k - k1) / apart))
+            slopes.append(by_both)
+        return means, slopes
+
+    def conducts(self, side: str, means: Sequence):
+        """Return the mobility of the cell on a side of a face, as UFL of k_r of each law there."""
+        return self.shares(side)[0] + sum(self.shares(side)[1 + i] * k for i, k in enumerate(means))
+
+    def set_pressures(self, p: NDArray[np.float64]) -> None:
+        """Set what forms see of the pressures of the local cells (c,), Pa."""
+        self._tables.x.array[:] = np.concatenate([law(p) for law in self._laws], axis=1).ravel()
+
+    def through_sides(
         self, cells: NDArray[np.int32], p: NDArray[np.float64], outer: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return mobilities (m,) of owned cells between their pressures and others (m,), Pa, and slopes by theirs."""
         shares = self.shares.x.array.reshape(-1, self.count)[cells]
-        k, slope = self._values.evaluate(anywhere(self._points, p=p, outer=outer, shares=shares)).T
+        k, slope = shares[:, 0].copy(), np.zeros(len(p))
+        for law, share in zip(self._laws, shares.T[1:], strict=True):
+            (phi, here, d), (beyond, there, _) = law(p).T, law(outer).T
+            close = np.abs(p - outer) < SAME * (np.abs(p) + np.abs(outer) + law.scale)
+            apart = np.where(close, 1.0, p - outer)
+            mean = np.where(close, (here + there) / 2, (phi - beyond) / apart)
+            k += share * mean
+            slope += share * np.where(close, d / 2, (here - mean) / apart)
         return k, slope
 
     def set_shares(self, filled: NDArray[np.int64], shares: NDArray[np.float64]) -> None:
@@ -80,13 +109,18 @@ class UnsaturatedFaces(OpenFaces):
     outer: NDArray[np.float64]
     bulk: float
 
-    def through(self, pi: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return what leaves through each face (m,), m^d/s, and its derivative by the cell's pressure, m^d/(Pa s)."""
+    def through(
+        self, pi: NDArray[np.float64], even: bool = False
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return what leaves through each face (m,), m^d/s, and its derivative by the cell's pressure, m^d/(Pa s).
+
+        even: but for that of what the weight drives.
+        """
         p = pressure_of(pi, self.bulk)[self.at]
-        k, slope = self.relative.between(self.cells, p, self.beyond)
+        k, slope = self.relative.through_sides(self.cells, p, self.beyond)
         drives = pi[self.at] - self.outer
         leaves = self.conductance * k * drives
-        rises = self.conductance * (k + slope * drives)
+        rises = self.conductance * (k + slope * (p - self.beyond if even else drives))
         shut = self.seeps & (leaves < 0)
         return np.where(shut, 0.0, leaves) - self.inflow, np.where(shut, 0.0, rises)
 
@@ -94,6 +128,8 @@ class UnsaturatedFaces(OpenFaces):
         """Return what leaves through each face from cells at potentials (n,), Pa; m^d/s."""
         return self.through(pi)[0]
 
-    def seepage(self, pi: NDArray[np.float64], flows: NDArray[np.bool_]) -> tuple[NDArray, NDArray]:
+    def seepage(
+        self, pi: NDArray[np.float64], flows: NDArray[np.bool_], even: bool = False
+    ) -> tuple[NDArray, NDArray]:
         """Return what leaves cells (n,) through all faces, m^d/s, and its derivative, m^d/(Pa s)."""
-        return tuple(sum_by(self.at, values, len(pi)) for values in self.through(pi))
+        return tuple(sum_by(self.at, values, len(pi)) for values in self.through(pi, even))
