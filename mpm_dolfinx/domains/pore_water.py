@@ -2,8 +2,8 @@
 """The water that pieces of domains bring to their cells, where pores drain: the pressure at which a cell holds it.
 
 A volume that stores s per pressure, with pores n, holds c(p) = s pi(p) + n (S(p) - 1) rho(p) more than it does at zero
-pressure: pi is the mass potential, rho the density over that at zero pressure.  Of several soils, and of pieces that lie
-higher or lower than their cell's centroid, it is c(p + o) with each piece's own S and offset o.
+pressure: pi is the mass potential, rho the density over that at zero pressure.  Of several soils, and of pieces that
+lie higher or lower than their cell's centroid, it is c(p + o) with each piece's own S and offset o.
 """
 
 from __future__ import annotations

@@ -203,9 +203,7 @@ class OpenFaces:
         along = np.einsum("md,md->m", force[self.at], self.reach)
         return sum_by(self.at, np.where(self.seeps, 0.0, self.conductance * along), len(force))
 
-    def seepage(
-        self, pi: NDArray[np.float64], flows: NDArray[np.bool_], even: bool = False
-    ) -> tuple[NDArray, NDArray]:
+    def seepage(self, pi: NDArray[np.float64], flows: NDArray[np.bool_], even: bool = False) -> tuple[NDArray, NDArray]:
         """Return what seeps out of cells (n,), m^d/s, and its derivative, m^d/(Pa s); flows (m,): where."""
         parts = (np.where(flows & self.seeps, values, 0.0) for values in (self.outflow(pi), self.conductance))
         return tuple(sum_by(self.at, values, len(pi)) for values in parts)

@@ -68,7 +68,10 @@ Plateau (beam): halved 5.2e-11, doubled 1.3e-10, cells 1.5e-02.
 
 
 FARTHEST = 2.0
-TURN = False
+"""Change of the logarithm of the suction in a Newton step, at most; without one dry soil beside wet finds no solution.
+
+Celia's column of 25 and 100 cells, 28 steps: 310 and 500 Newton steps with 2, 330 and 920, four steps cut, with 4.
+"""
 
 
 FluxSlope = Callable[[PETSc.Vec], NDArray[np.float64]]
@@ -358,7 +361,6 @@ class StorageSystem:
         aslant = off and AslantFlow(self._forms.fluxes, *off, contents, sides, open_by, flow.weight)
         return Outflow(conductance, inflow, faces, total, mobility, aslant)
 
-
     def assemble_fluxes(self, even: bool = False) -> None:
         """Assemble the matrix of the fluxes between cells, where pores drain at p; even: see `FluxForms`."""
         zero(self.T)
@@ -527,15 +529,14 @@ class StorageProblem:
         """Return by how much pressures are to fall, Pa, where Newton's method asks for these falls (n,).
 
         Where pores drain no step goes past the suction about which they do: on either side of it Newton's method for
-        the saturation, which is convex or concave there, converges (Wang and Tchelepi 2013).  Nor does a step make dry
-        soil much drier.
+        the saturation, which is convex or concave there, converges (Wang and Tchelepi 2013).  The logarithm of the
+        suction changes by at most `FARTHEST`.
         """
         if self._scale is None:
             return dp
         p, turn = self.forms.p.x.array[self.system.unknowns.owned], -self._scale
         there = p - dp
-        if TURN:
-            there = np.where((p - turn) * (there - turn) < 0, turn, there)
+        there = np.where((p - turn) * (there - turn) < 0, turn, there)
         here, y = logarithm(p, self._scale), logarithm(there, self._scale)
         far = (np.abs(y - here) > FARTHEST) & (np.minimum(here, y) < 0)
         y = here + np.clip(y - here, -FARTHEST, FARTHEST)
@@ -654,14 +655,13 @@ class StorageProblem:
             self._flow(False)
         self._assemble_slope(data, capacity)
         if forms.fluxes.relative is not None:
-            falls = bool((system.C.getDiagonal().array_r <= 0).any())
-            if over_all(forms.grid.comm, int(falls)) > 0:
+            if over_all(forms.grid.comm, int(_falls(system.C))) > 0:
                 self._assemble_slope(data, capacity, even=True)
 
     def _assemble_slope(self, data: PointData, capacity: NDArray[np.float64], even: bool = False) -> None:
         """Assemble C; even: without how the weight drives more as soil gets wetter.
 
-        That is more than very dry soil stores: Newton's method would make it drier.
+        In coarse cells, and where dry soil stores next to nothing, that turns Newton's direction round.
         """
         forms = self.forms
         system = self.system
@@ -698,6 +698,13 @@ class StorageProblem:
         system.P.axpy(-factor * share, system.L, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
         _add_diagonal(system.P, factor * self._contents.fixed_stress[system.unknowns.owned])
         return system.P
+
+
+def _falls(A: PETSc.Mat) -> bool:
+    """Return whether a row of a matrix has a diagonal that is not positive, or another entry that is."""
+    starts, columns, values = A.getValuesCSR()
+    row = np.repeat(np.arange(len(starts) - 1), np.diff(starts)) + A.getOwnershipRange()[0]
+    return bool((np.where(row == columns, values <= 0, values > 0)).any())
 
 
 def _add_diagonal(A: PETSc.Mat, values: NDArray[np.float64]) -> NDArray[np.float64]:

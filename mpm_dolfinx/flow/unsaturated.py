@@ -61,7 +61,10 @@ class Relative:
             apart = ufl.conditional(close, 1.0, p0 - p1)
             k = ufl.conditional(close, (k0 + k1) / 2, (phi0 - phi1) / apart)
             means.append(ufl.variable(k))
-            by_both = (ufl.conditional(close, d0 / 2, (k0 - k) / apart), ufl.conditional(close, d1 / 2, (k - k1) / apart))
+            by_both = (
+                ufl.conditional(close, d0 / 2, (k0 - k) / apart),
+                ufl.conditional(close, d1 / 2, (k - k1) / apart),
+            )
             slopes.append(by_both)
         return means, slopes
 
@@ -109,9 +112,7 @@ class UnsaturatedFaces(OpenFaces):
     outer: NDArray[np.float64]
     bulk: float
 
-    def through(
-        self, pi: NDArray[np.float64], even: bool = False
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def through(self, pi: NDArray[np.float64], even: bool = False) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return what leaves through each face (m,), m^d/s, and its derivative by the cell's pressure, m^d/(Pa s).
 
         even: but for that of what the weight drives.
@@ -128,8 +129,6 @@ class UnsaturatedFaces(OpenFaces):
         """Return what leaves through each face from cells at potentials (n,), Pa; m^d/s."""
         return self.through(pi)[0]
 
-    def seepage(
-        self, pi: NDArray[np.float64], flows: NDArray[np.bool_], even: bool = False
-    ) -> tuple[NDArray, NDArray]:
+    def seepage(self, pi: NDArray[np.float64], flows: NDArray[np.bool_], even: bool = False) -> tuple[NDArray, NDArray]:
         """Return what leaves cells (n,) through all faces, m^d/s, and its derivative, m^d/(Pa s)."""
         return tuple(sum_by(self.at, values, len(pi)) for values in self.through(pi, even))

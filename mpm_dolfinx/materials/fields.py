@@ -26,7 +26,8 @@ from mpm_dolfinx.parallel.exchange import first
 from mpm_dolfinx.points.material_points import MaterialPoints
 
 RESERVED = frozenset(
-    "F dF softness owed due storage storage_at_one density position displacement porosity0 gradient drainage retention pores".split()
+    "F dF softness owed due storage storage_at_one density position displacement porosity0 gradient drainage retention "
+    "pores".split()
 )
 """Names of what points of integration carry beside parameters and state."""
 WHAT_IS_NAMED = "parameters, state and unknowns"
@@ -207,16 +208,18 @@ class SceneMaterials:
         return np.array([locks for _, locks in self._parts])[self.part_of(points)]
 
     def conducting(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return what points (n, 2 or 3) that conduct alike have in common: conductivity, m/s, and number of their law.
+        """Return what points (n, 2) that conduct alike have in common: conductivity, m/s, and number of their law.
 
-        By a law of the place none does.  Last is the number of their law of retention, where some have one.
+        By a law of the place none does.  The fraction of that number tells laws of retention.
         """
         laws, known = [m.conductivity_law for m in self.materials], self.conductivity_laws
         law = np.array([known.index(law) if law in known else -1 for law in laws])[points.material]
         by_place = np.array([law is not None and _names_place(law) for law in laws])[points.material]
         conductivity = self.table(points, lambda m: m.conductivity)
-        columns = [conductivity, np.where(by_place, len(known) + points.id, law)]
-        return np.stack(columns + [self.retention_of(points)] * (self.retentions is not None), axis=1)
+        number = np.where(by_place, len(known) + points.id, law)
+        if self.retentions is not None:
+            number = number + self.retention_of(points) / (1 + len(self.retentions.laws))
+        return np.stack([conductivity, number], axis=1)
 
     def retention_of(self, points: MaterialPoints) -> NDArray[np.int64]:
         """Return the number of each point's law of retention (n,), from 1; 0 where pores stay full."""

@@ -18,7 +18,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass, fields
-from math import log, sqrt
+from functools import partial
 
 import numpy as np
 import ufl
@@ -206,21 +206,30 @@ def _value(function: Callable, p: float) -> float:
     return float(apply_algebra_lowering(expression(function, [()], p=ufl.as_ufl(float(p))))(()))
 
 
+def _empty(function: Callable, suction: float) -> bool:
+    """Return whether a function of p has fallen to a half at a suction, Pa, or is no number there."""
+    try:
+        return not _value(function, -suction) > 0.5
+    except OverflowError:
+        return True
+
+
 def scale_of(law) -> float:
-    """Return the suction about which a law's saturation falls, Pa: its `scale`, or where half of the pores are empty.
+    """Return the suction about which a law's saturation falls, Pa: its `scale`, or about where half of the pores drain.
 
     Without such a suction it is the one at which the permeability has halved.
     """
     if (scale := getattr(law, "scale", None)) is not None:
         return float(numbers(f"{line(law)}: scale", scale, test=lambda v: v > 0, allowed="> 0"))
     for name in METHODS:
-        low, high = -sqrt(1 / TINY), -sqrt(TINY)  # pressures, by whose logarithms halves are found
-        if _value(getattr(law, name), low) > 0.5:
-            continue
-        for _ in range(64):
-            middle = -sqrt(low * high)
-            low, high = (middle, high) if _value(getattr(law, name), middle) <= 0.5 else (low, middle)
-        return -low
+        suction = 1.0
+        half = partial(_empty, getattr(law, name))
+        while half(suction) and suction > TINY:
+            suction /= 2
+        while not half(suction) and suction < 1 / TINY:
+            suction *= 2
+        if half(suction):
+            return suction
     raise ValueError(f"{line(law)}: more than half of its pores stay full at any suction, must have a scale, Pa")
 
 
@@ -384,7 +393,7 @@ class Conductance:
 
 
 REACH = (1e-8, 1e8)
-"""Suctions between which the table is, over the law's scale.  Source: exact below and above but for as small a share."""
+"""Suctions between which the table is, over the law's scale.  Source: exact beyond, but for as small a share."""
 ROWS = 4000
 """Rows of the table: the cubics are accurate to 1e-8 of the integral.  Source: their error is z^4 / 384 of a power."""
 GAUSS = 8  # points between two rows.  Source: exact for polynomials of degree 15

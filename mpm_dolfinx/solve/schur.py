@@ -142,7 +142,9 @@ class LinearSolvers:
             self._schur.setUp()
             mumps = how.pressures == MUMPS
             gathered = how.gathered and not mumps
-            self._solve_s = direct_solver(storage.P, "storage", storage.symmetric, gathered=gathered, package="mumps" if mumps else None)
+            self._solve_s = direct_solver(
+                storage.P, "storage", storage.symmetric, gathered=gathered, package="mumps" if mumps else None
+            )
             self._set_krylov(how.krylov)
             self._solve_s.setFromOptions()
             self._krylov = self._solve_s.getType()
@@ -243,7 +245,7 @@ class LinearSolvers:
         slope
             What the fluxes gain by displacements; without, the tangent leaves that out.
         """
-        residual, slopes = self._momentum.residual, () if slope is None else (slope,)
+        slopes = () if slope is None else (slope,)
         if self._storage is None:
             self.solve_u.setTolerances(rtol=rtol, atol=0.0, max_it=MOST)
             self.solve_momentum()

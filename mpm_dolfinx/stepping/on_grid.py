@@ -153,7 +153,12 @@ class OnGrid(Keyed):
 
     def _carried(self, state: State, pi: NDArray[np.float64]) -> list[NDArray[np.float64]]:
         """Return the potentials (m,), Pa, and (S - 1) rho that pieces bring to their cells, by these potentials."""
-        materials, points, bulk, old = self._quadrature.materials, self.cut.points, self._storage.bulk, state.transported
+        materials, points, bulk, old = (
+            self._quadrature.materials,
+            self.cut.points,
+            self._storage.bulk,
+            state.transported,
+        )
         owner = np.searchsorted(points.id, old.id)
 
         def empty(p: NDArray[np.float64], of: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -309,7 +314,9 @@ class OnGrid(Keyed):
         one = np.ones(len(shares))
         if self._mixed is None and self._storage.conductivity is None:
             return Mobility(one, shares=shares)
-        k = self._quadrature.materials.saturation(cut.points, cut.to_pieces(self._storage.p.x.array[cut.cells]), cut.pieces.point)[3]
+        k = self._quadrature.materials.saturation(
+            cut.points, cut.to_pieces(self._storage.p.x.array[cut.cells]), cut.pieces.point
+        )[3]
         now = full * np.maximum(cut.pieces_to_cells(k), TINY)
         mean, share = self.contents.mean(now), None
         if self._storage.conductivity is not None:

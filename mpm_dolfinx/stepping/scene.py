@@ -116,7 +116,9 @@ class Scene:
                 ConductivityAtPieces(scene.materials, laws, pieces, u, fem.Function(grid.cellwise())) if laws else None
             )
             kind = (symmetric, scene.conducts, scene.evolves)
-            self.storage = StorageForms(pieces, u, p, fluid.bulk, weight, *kind, law, sources, self.t, inertial, scene.retentions)
+            self.storage = StorageForms(
+                pieces, u, p, fluid.bulk, weight, *kind, law, sources, self.t, inertial, scene.retentions
+            )
         self.motion = Motion(scene, bodies, self.momentum, self.storage)
         # what is still to be looked for, to be warned of, of which nothing but the log knows
         self._looks = (warn_overfilled, *[partial(warn_smeared, materials=scene)] * scene.uneven)
