@@ -45,6 +45,7 @@ from mpm_dolfinx.materials.cam_clay import ModifiedCamClay
 from mpm_dolfinx.materials.drucker_prager import DruckerPrager
 from mpm_dolfinx.materials.initial_stress import K0, hydrostatic
 from mpm_dolfinx.materials.mohr_coulomb import MohrCoulomb
+from mpm_dolfinx.materials.retention import BrooksCorey, Gardner, Retention, VanGenuchten
 from mpm_dolfinx.materials.skeleton import (
     Field,
     Fluid,
@@ -77,6 +78,7 @@ __all__ = [
     "Acting",
     "Ball",
     "Body",
+    "BrooksCorey",
     "CellFields",
     "Checkpoint",
     "ConditionWarning",
@@ -89,6 +91,7 @@ __all__ = [
     "ElementTest",
     "Field",
     "Fluid",
+    "Gardner",
     "GaveUp",
     "Grid",
     "HalfSpace",
@@ -113,6 +116,7 @@ __all__ = [
     "ResolutionWarning",
     "Result",
     "ResultWarning",
+    "Retention",
     "RigidPlate",
     "Safety",
     "Scheme",
@@ -125,6 +129,7 @@ __all__ = [
     "Tangent",
     "Tool",
     "Traction",
+    "VanGenuchten",
     "Writer",
     "box",
     "element_test",
