@@ -157,7 +157,9 @@ def test_a_sealed_cell_pressed_and_let_go_has_its_water_and_suction(steps):
     assert water(s) == pytest.approx(start, rel=1e-12)
     s.run(2, 1 / steps, progress=False)
     assert water(s) == pytest.approx(start, rel=1e-12)
-    assert s.cells().pressure == pytest.approx(-20e3, rel=1e-8)
+    assert np.abs(s.points.data["owed"]).max() < 1e-13
+    full = 0.4 * np.sqrt(0.5) / (s.points.J.mean() - 0.6)  # the side gives way by 1e-6
+    assert s.cells().pressure == pytest.approx(-20e3 * np.sqrt(1 / full**2 - 1), rel=1e-9)
 
 
 def test_hydrostatic_suction_is_at_rest():
@@ -208,6 +210,13 @@ class Brutsaert(mpm.Retention):
         return self.effective(s) ** 3
 
 
+class Rising(Liakopoulos):
+    """Wetter where it sucks more."""
+
+    def saturation(self, p):
+        return 1 - p / 1e4
+
+
 @pytest.mark.parametrize(
     "law, said",
     [
@@ -217,19 +226,12 @@ class Brutsaert(mpm.Retention):
         (lambda: mpm.BrooksCorey(1e3, index=-1.0), r"BrooksCorey: index = -1.0, must be in \(0, 20\]"),
         (lambda: mpm.Gardner("wide"), "Gardner: entry = 'wide', must be > 0"),
         (lambda: mpm.Hencky(1e6, 1e6, retention=3), r"Hencky: retention = 3, must have saturation\(p\) and"),
-        (lambda: mpm.Hencky(1e6, 1e6, retention=Rising()), "Hencky: retention: saturation is"),
+        (lambda: mpm.Hencky(1e6, 1e6, retention=Rising()), "saturation never falls to a half"),
     ],
 )
 def test_what_is_no_law_of_retention_is_refused(law, said):
     with pytest.raises(ValueError, match=said):
         law()
-
-
-class Rising(Liakopoulos):
-    """Wetter where it sucks more."""
-
-    def saturation(self, p):
-        return 1 - p / 1e4
 
 
 def test_laws_of_the_users_are_those_of_the_package():

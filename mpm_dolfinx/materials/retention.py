@@ -191,7 +191,11 @@ def check_retention(what: str, law) -> None:
     missing = [name for name in METHODS if not callable(getattr(law, name, None))]
     if missing:
         raise ValueError(f"{what} = {line(law)}, must have {' and '.join(f'{name}(p)' for name in METHODS)}")
-    suctions = scale_of(law) * np.array([-1.0, 0.0, 0.01, 0.1, 0.5, 1.0, 2.0, 5.0])
+    try:
+        scale = scale_of(law)
+    except ValueError as error:
+        raise ValueError(f"{what}: {error}") from error
+    suctions = scale * np.array([-1.0, 0.0, 0.01, 0.1, 0.5, 1.0, 2.0, 5.0])
     for name in METHODS:
         values = np.array([_value(getattr(law, name), -s) for s in suctions])
         good = (values[:2] == 1).all() and (values >= 0).all() and (np.diff(values) <= 0).all()
@@ -230,7 +234,7 @@ def scale_of(law) -> float:
             suction *= 2
         if half(suction):
             return suction
-    raise ValueError(f"{line(law)}: more than half of its pores stay full at any suction, must have a scale, Pa")
+    raise ValueError(f"{line(law)}: saturation never falls to a half, must do so or have a scale, Pa")
 
 
 class Retentions:
