@@ -28,10 +28,12 @@ from mpm_dolfinx.conditions.conditions import (
     Inflow,
     OnSide,
     Pressure,
+    Quiet,
     RigidPlate,
     Source,
     Traction,
 )
+from mpm_dolfinx.conditions.record import Record
 from mpm_dolfinx.conditions.water import water
 from mpm_dolfinx.contact.groups import Contact
 from mpm_dolfinx.contact.shapes import Ball, Cone, Convex, HalfSpace, Shape
@@ -112,6 +114,8 @@ __all__ = [
     "Pose",
     "Pressure",
     "Probes",
+    "Quiet",
+    "Record",
     "Report",
     "ResolutionWarning",
     "Result",

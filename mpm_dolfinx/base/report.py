@@ -13,7 +13,8 @@ class Report:
     rederived: domains that had folded and were re-derived from F; easy: whether the next step may be longer; error,
     change, extremes: estimated error, and largest change, of the cells' pressures in the step, and the least and the
     largest of them, Pa; sealed: largest change had no fluid flowed, Pa; first: change in the first substep, Pa; sudden:
-    the same where it is so fast that the step may overshoot, Pa; stress: what forces of the nodes stand for, Pa.
+    the same where it is so fast that the step may overshoot, Pa; stress: what forces of the nodes stand for, Pa; moves:
+    estimated error of the motion, and the motion, see `motion_error`.
     """
 
     newton: int = 0
@@ -29,3 +30,4 @@ class Report:
     first: float = 0.0
     sudden: float = 0.0
     stress: float = 0.0
+    moves: tuple[float, float] = (0.0, 0.0)

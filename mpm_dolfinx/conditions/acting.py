@@ -22,6 +22,7 @@ from mpm_dolfinx.bodies.faces import Surface
 from mpm_dolfinx.conditions.sides import Sides
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.forms.unknowns import Unknowns
+from mpm_dolfinx.forms.velocity import Velocity
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.points.material_points import MaterialPoints
@@ -44,16 +45,19 @@ class FormsOf:
         Background grid.
     u
         Increment of the displacement in the step, m.
+    velocity
+        Of the bodies in a substep.
     """
 
-    def __init__(self, grid: Grid, u: fem.Function):
+    def __init__(self, grid: Grid, u: fem.Function, velocity: Velocity):
         self.grid, self.u = grid, u
+        self.velocity = velocity
         self._made: dict[Callable, Any] = {}
 
-    def __call__(self, make: Callable[[Grid, fem.Function], T]) -> T:
-        """Return what `make` returns of the grid and u, a class of forms."""
+    def __call__(self, make: Callable[..., T], *more) -> T:
+        """Return what `make` returns of the grid, u and more, a class of forms."""
         if make not in self._made:
-            self._made[make] = make(self.grid, self.u)
+            self._made[make] = make(self.grid, self.u, *more)
         return self._made[make]
 
     @property
@@ -90,7 +94,8 @@ class Place(NamedTuple):
     """When and where a condition acts in a substep.
 
     cut, points: the domains as they are cut, and the points as they are now; pieces: their points of integration, see
-    `QuadratureData`; start, dt: of the step, s; t: end of the substep, s; before: outcome of the last step.
+    `QuadratureData`; start, dt: of the step, s; t: end of the substep, s; before: outcome of the last step; inertia:
+    whether bodies have any.
     """
 
     cut: CutDomains
@@ -100,6 +105,7 @@ class Place(NamedTuple):
     dt: float
     t: float
     before: Outcome
+    inertia: bool = False
 
 
 class At(NamedTuple):
@@ -151,6 +157,10 @@ class Loads:
 
     def penalty(self, A: PETSc.Mat, walls: bool) -> None:
         """Add the matrix of forces that are linear in u; walls: to the rows of what walls hold."""
+
+    def pulling(self, at: At, v: NDArray[np.float64]) -> float:
+        """Return the power, W, of `pulls` and `penalty` at u on this process; v: velocities, a local array, m/s."""
+        return 0.0
 
     def tangent(self, K: PETSc.Mat) -> None:
         """Add minus the derivative of `loads`, and the derivative of `resists`, at u; who calls finalises it."""

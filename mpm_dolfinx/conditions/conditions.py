@@ -120,6 +120,41 @@ class Pressure(Condition):
 
 
 @dataclass(frozen=True, eq=False)
+class Quiet(Condition):
+    """Quiet side of bodies with inertia: waves leave through it (Lysmer and Kuhlemeyer 1969).
+
+    It resists by the impedances of the material, rho c_p along the normal and rho c_s across, times the velocity.
+    Waves along the normal leave wholly; of others that meet it aslant a few per cent come back.  A side that a stage
+    without inertia held keeps the tractions that it bore.
+
+    Parameters
+    ----------
+    side
+        Side of the bodies, as for `Traction`.
+    incoming : (d,) or callable t (s) -> (d,), m/s
+        Velocity of particles at the side in a wave that comes in along the normal, alone: at a free surface twice as
+        much arrives.
+    region : ((d,), (d,)), m
+        As for `Traction`.
+
+    Raises
+    ------
+    ValueError
+        From the scene: bodies have no inertia, or had it before the side was quiet; no point has the side; another
+        `Quiet` acts on the same part of a face.
+    """
+
+    side: str
+    incoming: ArrayLike | Callable[[float], ArrayLike] | None = None
+    region: Region | None = None
+    FUNCTIONS: ClassVar[Mapping[str, Sequence[str]]] = {"incoming": ("t",)}
+
+    def at(self, t: float, dim: int) -> NDArray[np.float64]:
+        """Return the velocity (d,) of the incoming wave at time t (s), m/s."""
+        return np.zeros(dim) if self.incoming is None else self._given("incoming", t, None, dim, number=False)
+
+
+@dataclass(frozen=True, eq=False)
 class OnSide(Condition):
     """Term of the user's own on a side of the bodies, in UFL: springs, dashpots, loads that depend on what moves.
 

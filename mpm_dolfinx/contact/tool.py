@@ -139,7 +139,7 @@ class Tool:
 
     def solid(self, h: float) -> Shape:
         """Return the shape; h, m: size of a cell."""
-        return Distance(self.shape, 1e-6 * h, self._base) if callable(self.shape) else self._moved or self.shape
+        return Distance(self.shape, h, self._base) if callable(self.shape) else self._moved or self.shape
 
     def check(self, dim: int) -> None:
         """Refuse a tool of another dimension, or whose motion at the start is none."""

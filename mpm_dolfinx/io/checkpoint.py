@@ -237,8 +237,14 @@ def _like(outcome: dict[str, dict[str, NDArray]], now: Outcome) -> dict[str, dic
     ValueError where it has other shapes, or how far tools have been pushed is not finite.
     """
     found = {q: {name: outcome.get(q, {}).get(name, value) for name, value in of.items()} for q, of in now.items()}
+    if "energy" in outcome:
+        found["energy"] = outcome["energy"]
     for quantity, of in found.items():
         for name, value in of.items():
+            if quantity == "energy" and (value.shape or not np.isfinite(value)):
+                raise ValueError(f"outcome/{quantity}/{name} is no finite number")
+            if quantity == "energy":
+                continue
             if value.shape != now[quantity][name].shape or value.dtype != np.float64:
                 raise ValueError(f"outcome/{quantity}/{name}: {value.dtype} of shape {value.shape}")
             if quantity == "tool_travel" and not np.isfinite(value):

@@ -97,6 +97,16 @@ class LawAtPoints:
         return stress.evaluate(data)
 
     @cached_property
+    def _energy(self) -> PointExpression:
+        return PointExpression(expression(self.law.energy, [()], "F", F=self._F, **self._values), self.points)
+
+    def energy(self, data: PointData) -> NDArray[np.float64]:
+        """Return the stored energy (n,) per reference volume, Pa, of a law that gives it."""
+        energy = self._energy
+        self._solve(data, 0.0)
+        return energy.evaluate(data)
+
+    @cached_property
     def _out_of_plane(self) -> PointExpression | None:
         across = self.law.out_of_plane(self._F, self._values)
         return None if across is None else PointExpression(across, self.points)

@@ -146,6 +146,8 @@ class Skeleton:
     solution: ClassVar[Callable | None] = None
     dilates: ClassVar[bool] = False
     """Whether the law has an angle of `dilation`."""
+    elastic_hencky: ClassVar[bool] = False
+    """Whether stresses are those of elastic strains by Hencky's law: then they tell the elastic energy."""
     linear: ClassVar[bool] = False
     """Whether the stress is linear in F: one factorisation then serves for as long as the active cells stay."""
     state: ClassVar[Mapping[str, ArrayLike]] = {}

@@ -13,6 +13,7 @@ import ufl
 from dolfinx import fem
 from numpy.typing import NDArray
 
+from mpm_dolfinx.base.time_integration import in_step
 from mpm_dolfinx.base.tolerances import EPSILON, NEAR
 from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.bodies.faces import Surface, face_vectors
@@ -96,7 +97,7 @@ class GivenDisplacements(Acting):
         d, comm = self._grid.dim, self._grid.comm
         self._check_meeting(place.t)
         ends = (place.start, place.start + place.dt) if place.dt > 0 else ()  # without: held where they count from
-        held = HeldCells(self._grid, self._held_points(place.cut, place.points, place.t, ends))
+        held = HeldCells(self._grid, self._held_points(place.cut, place.points, place.t, ends, place.inertia))
         placed, message = [], ""
         for axis in range(d):
             given = np.array([axis in axes for *_, axes in self._holds])
@@ -116,10 +117,12 @@ class GivenDisplacements(Acting):
             self, forms, forms.points.at(held.cell[row], held.x[row], np.ones(len(row)), **fields), held, row, own
         )
 
-    def _held_points(self, cut: CutDomains, points: MaterialPoints, t: float, ends: Sequence[float]) -> HeldPoints:
+    def _held_points(
+        self, cut: CutDomains, points: MaterialPoints, t: float, ends: Sequence[float], inertia: bool
+    ) -> HeldPoints:
         """Return the points of integration on held sides, at the owners of their cells.
 
-        ends: start and end of the step, s; none for sides at rest.
+        ends: start and end of the step, s; none for sides at rest; inertia: whether velocities count.
         """
         d, rows = self._grid.dim, []
         patches = cut.surfaces([faces for _, faces, _ in self._holds])
@@ -134,6 +137,8 @@ class GivenDisplacements(Acting):
         for number, ((hold, *_, axes), p) in enumerate(zip(self._holds, patches, strict=True)):
             at, now = np.searchsorted(chosen, p.at), p.now(points)
             given = [self._given(hold, time, p.X) for time in (t, *ends)] if ends else 3 * [np.zeros_like(now)]
+            if inertia and ends and t < ends[1]:
+                given[0] = in_step((t - ends[0]) / (ends[1] - ends[0]), given[1], given[0], given[2])
             to, given = p.origin(points) + given[0], np.concatenate(given[1:], axis=1)
             R = turned(self._grid.comm, p.area0, now, to) if len(axes) == d else np.eye(d)  # as what it carries does
             force, gap = np.einsum("ij,njk,nk->ni", R, stress[at, :d, :d], p.area(points)), to - now
@@ -261,6 +266,10 @@ class HoldLoads(Loads):
     def pull(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the force (m,), N, along each component that is given, at nodal values u (nodes, d), m."""
         return self.data["stiffness"][:, 0] * (self.data["gap"][:, 0] - self._along(u))
+
+    def pulling(self, at: At, v: NDArray[np.float64]) -> float:
+        """Return the power, W, of what pulls the sides along."""
+        return float(self.pull(at.nodal) @ self._along(v.reshape(-1, self._d)))
 
     def counted(self, at: At) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return degrees of freedom (n,), and forces (n,), N, on them that reactions count."""

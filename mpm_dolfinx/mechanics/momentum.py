@@ -30,6 +30,7 @@ from mpm_dolfinx.conditions.walls import wall_forces
 from mpm_dolfinx.forms.cell_matrices import Beside, ElementForces, ElementMatrices, StackedElementMatrices
 from mpm_dolfinx.forms.point_forms import FormPoints
 from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts, zero
+from mpm_dolfinx.forms.velocity import Velocity
 from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.materials.evaluate import by_scene
 from mpm_dolfinx.materials.local_unknowns import LocalUnknowns
@@ -103,12 +104,11 @@ class MomentumForms:
         self._local: dict[int, LocalUnknowns] = {}  # by the number of their part
         for number, (law, points, locks) in enumerate(laws):
             self._add_law(number, law, points, locks, pressure, symmetric, by_scene(grid) | {"dt": dt})
-        self.conditions = FormsOf(grid, self.u)
+        self.velocity = Velocity(self.u)
+        self.conditions = FormsOf(grid, self.u, self.velocity)
         """The forms of conditions."""
-        self.own = OwnTerms(terms, pieces, self.u, t, dt)
-        full = None
-        if retentions is not None:
-            full = retentions.of("saturation", pressure, pieces.retention)
+        self.own = OwnTerms(terms, pieces, self.conditions, t, dt)
+        full = None if retentions is None else retentions.of("saturation", pressure, pieces.retention)
         self.weight = None if gravity is None else Weight(pieces, self.u, gravity, fluid_density, full)
         self.acting = [*filter(None, (self.weight,)), *[self.own] * bool(terms)]
         """What acts in all stages."""
@@ -154,7 +154,8 @@ class MomentumForms:
         share = 1 / ufl.det(points.F)  # divided by it, each component would be
         P, A = share * P, share * A
         stress = P * points.F.T
-        self._residuals.append(ElementForces(stress if self.inertia is None else points.turn * stress, points))
+        turns = self.inertia is not None and not self.grid.axisymmetric
+        self._residuals.append(ElementForces(points.turn * stress if turns else stress, points))
         i, j, k, l, m, n = ufl.indices(6)
         if self.grid.dim == 2:
             A = ufl.as_tensor(A[i, m, j, n] * points.F[k, m] * points.F[l, n], (i, k, j, l))
@@ -440,6 +441,26 @@ class MomentumProblem:
 
     def residual_of_parts(self) -> tuple[PETSc.Vec, NDArray[np.float64]]:
         """Return the out-of-balance nodal forces at u and the scales (parts,), N, of each part: see above."""
+        system = self.system
+        b, norms = self._unbalanced()
+        system.held.gather(b, system.held_residual)  # walls bear what sides beside them would push them by
+        b[system.touched] -= self._pulls  # no measure of forces: at the start of a step they are far above them
+        r = system.unknowns.gather(b, system.residual)
+        step = system.unknowns.gather(self.forms.u.x.array, system.step)
+        system.penalty.multAdd(step, r, r)
+        for one in self.loads:
+            one.push(self.at, r, system.unknowns)
+            if (inertia := one.inertia(self.at)) is not None:
+                r += inertia
+                norms.append(system.of_parts.norms(inertia.array_r))
+        return r, np.max(norms, axis=0)
+
+    def unbalanced(self) -> NDArray[np.float64]:
+        """Return the forces of the stresses less those of loads at u, a local array, N; without what holds sides."""
+        return self._unbalanced()[0].copy()
+
+    def _unbalanced(self) -> tuple[NDArray[np.float64], list[NDArray[np.float64]]]:
+        """Return the same, and the norms (parts,), N, of its parts."""
         forms, system = self.forms, self.system
         b = forms.internal(self.data)
         forces, external = b[system.touched], self._external
@@ -453,17 +474,24 @@ class MomentumProblem:
             norms.append(system.force_of_parts(own))
         norms.append(system.force_of_parts(external))
         b[system.touched] = forces - external
-        system.held.gather(b, system.held_residual)  # walls bear what sides beside them would push them by
-        b[system.touched] -= self._pulls  # no measure of forces: at the start of a step they are far above them
-        r = system.unknowns.gather(b, system.residual)
-        step = system.unknowns.gather(forms.u.x.array, system.step)
-        system.penalty.multAdd(step, r, r)
+        return b, norms
+
+    def powers(self) -> dict[str, float]:
+        """Return powers at u on this process, W: of stresses, against what resists the velocity, and of what acts."""
+        forms, unknowns = self.forms, self.system.unknowns
+        v = np.where(unknowns.map.indices >= 0, forms.velocity.nodal, 0.0)  # none of what walls hold
+        owned = forms.u.function_space.dofmap.index_map.size_local * forms.grid.dim
+        out = {"internal": forms.internal(self.data)[:owned] @ v[:owned], "viscous": 0.0, "external": 0.0}
         for one in self.loads:
-            one.push(self.at, r, system.unknowns)
-            if (inertia := one.inertia(self.at)) is not None:
-                r += inertia
-                norms.append(system.of_parts.norms(inertia.array_r))
-        return r, np.max(norms, axis=0)
+            acts, resists = np.zeros((2, len(v)))  # those on ghosts count where they are added
+            one.dead(acts)
+            one.loads(acts)
+            one.resists(resists)
+            pushed = unknowns.vector()
+            one.push(self.at, pushed, unknowns)
+            out["external"] += acts @ v + one.pulling(self.at, v) - v[unknowns.owned] @ pushed.array_r
+            out["viscous"] += resists @ v
+        return out
 
     def out_of_balance(
         self, r: PETSc.Vec, scales: NDArray[np.float64], first: bool

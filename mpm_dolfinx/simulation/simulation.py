@@ -76,7 +76,7 @@ class Simulation:
         Quadrature, coupling, tolerance and method of time integration, see `Numerics`.
     inertia
         Whether bodies have inertia: then they need no walls.  With False they have none at first, and a later stage may
-        give it to them; with None no stage can.  Not in axisymmetry, nor with `quadrature="point"`.
+        give it to them; with None no stage can.  Not with `quadrature="point"`.
     velocity : (d,) or callable x (n, d) -> (n, d), m/s
         Velocity at the start of bodies that may have inertia, or a function of places; none is rest.
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.base.time_integration import Substep
 from mpm_dolfinx.conditions.acting import QUANTITIES, At, Loads, Outcome
+from mpm_dolfinx.dynamics.step_error import motion_error
 from mpm_dolfinx.flow.storage import Rates, StorageProblem
 from mpm_dolfinx.mechanics.inertia import Flight, Inertia
 from mpm_dolfinx.mechanics.momentum import MomentumProblem
@@ -53,6 +54,17 @@ class Start(NamedTuple):
         if flight is None:
             return None
         return partial(self.matrices.mass.carried, self.state.points, (flight.start, flight.velocity))
+
+    def moves(self, flights: Sequence[Flight | None], substep: Substep) -> tuple[float, float]:
+        """Return error and motion of the step, see `motion_error`, where its run asks for them; else 0.
+
+        flights: after the substeps; substep: the last one.
+        """
+        control = self.state.control
+        if control is None or control.motion is None or len(flights) < 2:
+            return 0.0, 0.0
+        times = float(substep.before * self.dt), float(substep.own * self.dt)
+        return motion_error(self.matrices.solvers(), self.matrices.momentum.K, self.matrices.mass, flights, *times)
 
 
 class Balances(NamedTuple):
@@ -138,7 +150,7 @@ def balances(
     matrices = start.matrices
     dt = start.dt
     scene.set_time(acting.t, substep.end * dt, acting.gravity)
-    scene.momentum.own.set_rate(substep.own * dt, substep.before / substep.own)
+    scene.momentum.velocity.set(substep.own * dt, substep.before / substep.own)
     inertia, loads = None, acting.loads
     if flight is not None:
         own = float(substep.own * dt)

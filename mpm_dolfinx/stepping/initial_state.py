@@ -168,7 +168,7 @@ def _problem(scene: Scene, start: Start, state: State) -> MomentumProblem:
     place = Place(start.on_grid.cut, state.points, data, state.t, 0.0, state.t, state.outcome)
     loads = [one.moved(scene.momentum.u) for one in state.stage.placed(place)]
     scene.set_time(state.t, FOREVER, start.acting[-1].gravity)
-    scene.momentum.own.set_rate(FOREVER, 0.0)
+    scene.momentum.velocity.set(FOREVER, 0.0)
     scene.momentum.u.x.array[:] = 0.0
     return MomentumProblem(scene.momentum, matrices.momentum, data, loads, scene.scheme.tolerance)
 

@@ -87,7 +87,7 @@ class Scene:
         self.initial = InitialStresses(self.bodies, initial, pressure)
         seeded = material_points(grid, bodies, pressure)
         if velocity is not None:
-            seeded = replace(seeded, data=moving(seeded, velocity, grid.base))
+            seeded = replace(seeded, data=moving(seeded, velocity, grid.base, grid.axisymmetric))
         self.materials = scene = SceneMaterials(grid, materials, bodies, seeded, fluid, bool(initial))
         self.gravity = fem.Constant(grid.mesh, np.zeros(grid.dim)) if weighs else None
         self.t, self.dt = fem.Constant(grid.mesh, 0.0), fem.Constant(grid.mesh, 1.0)

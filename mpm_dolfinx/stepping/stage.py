@@ -23,6 +23,7 @@ from mpm_dolfinx.conditions.conditions import (
     Inflow,
     OnSide,
     Pressure,
+    Quiet,
     RigidPlate,
     Source,
     Traction,
@@ -34,6 +35,7 @@ from mpm_dolfinx.contact.acting import ContactsOfStage, ToolsOfStage
 from mpm_dolfinx.contact.groups import Contact
 from mpm_dolfinx.contact.tool import Tool
 from mpm_dolfinx.domains.lattice import Lattice, lattices
+from mpm_dolfinx.dynamics.quiet import QuietSides
 from mpm_dolfinx.flow.hydraulic_boundary import HydraulicBoundary
 from mpm_dolfinx.grid.grid import SIDES, Grid
 from mpm_dolfinx.materials.fields import SceneMaterials
@@ -41,12 +43,19 @@ from mpm_dolfinx.materials.skeleton import Fluid
 from mpm_dolfinx.mechanics.given_displacements import GivenDisplacements
 from mpm_dolfinx.mechanics.momentum import MomentumForms
 from mpm_dolfinx.mechanics.plates import Plates
-from mpm_dolfinx.mechanics.pressures import Pressures
-from mpm_dolfinx.mechanics.tractions import Tractions
+from mpm_dolfinx.mechanics.tractions import Pressures, Tractions
 
-Condition = Traction | Pressure | Displacement | RigidPlate | Drained | Inflow | Tool | Contact
+Condition = Traction | Pressure | Displacement | RigidPlate | Quiet | Drained | Inflow | Tool | Contact
 """What acts on the bodies."""
-KINDS: tuple[type[Acting], ...] = (Tractions, Pressures, Plates, GivenDisplacements, ToolsOfStage, ContactsOfStage)
+KINDS: tuple[type[Acting], ...] = (
+    Tractions,
+    Pressures,
+    Plates,
+    GivenDisplacements,
+    QuietSides,
+    ToolsOfStage,
+    ContactsOfStage,
+)
 """What acts on the momentum for conditions that do not say it themselves, by their method `acting`."""
 
 
@@ -203,8 +212,7 @@ def stage(
     by_name = {name: with_weight(one, fluid) for name, one in given_by_name.items()}
     if fluid is None and any(isinstance(one, (Drained, Inflow)) for one in by_name.values()):
         raise ValueError("drained and inflow sides need a fluid")
-    if conditions["inertia"]:
-        _check_inertia(by_name)
+    _check_inertia(by_name, bool(conditions["inertia"]))
     gravity = conditions["gravity"]
     if callable(gravity):
         check_names("gravity", gravity, ("t",))
@@ -239,9 +247,13 @@ def stage(
     )
 
 
-def _check_inertia(by_name: Mapping[str, Any]) -> None:
-    """Refuse conditions that bodies with inertia do not have yet."""
+def _check_inertia(by_name: Mapping[str, Any], inertia: bool) -> None:
+    """Refuse conditions that bodies with inertia do not have yet, and those that only they have."""
     for name, one in by_name.items():
+        if isinstance(one, Quiet) and not inertia:
+            raise ValueError(f"{name}: bodies have no inertia, must be given with inertia=True")
+        if not inertia:
+            continue
         if isinstance(one, Contact):
             raise ValueError(f"{name}: contacts of groups are quasi-static, must be left out with inertia")
         if isinstance(one, Tool) and (one.grips or one.load is not None):
