@@ -244,3 +244,44 @@ def test_laws_of_the_users_are_those_of_the_package():
         s.run(600, 300, progress=False)
         found.append(water(s))
     assert found[0] != pytest.approx(found[1], rel=1e-3)  # laws differ, and both are seen
+
+
+@pytest.mark.parametrize("cells, steps", [(4, 13), pytest.param(50, 160, marks=pytest.mark.slow)])
+def test_a_body_at_rest_in_itself_keeps_its_water_and_suction_wherever_it_is_carried(cells, steps):
+    """Over so many cells by its sides, in steps of a third of a cell, flow and all."""
+    h, table, end = 1 / 8, 0.3, 1000.0
+    grid = mpm.Grid([0, 0], [1 + (cells + 2) * h, 1 + 2 * h], [cells + 10, 10])
+    law = mpm.VanGenuchten(WATER / 2, residual=0.1, n=2.0)
+    soil = mpm.Hencky(bulk=1e7, shear=5e6, porosity=0.4, conductivity=1e-5, retention=law)
+    sides = [mpm.Displacement(side, lambda t: (t / end * cells * h, 0), components="x") for side in ("left", "right")]
+    scene = {"fluid": mpm.Fluid(), "walls": {"bottom": "y"}, "conditions": sides, "gravity": (0, -9.81)}
+    body = mpm.box(grid, [0.3 * h, 0], [1 + 0.3 * h, 7.5 * h])
+    s = mpm.Simulation(grid, [body], [soil], pressure=mpm.hydrostatic(table), initial_stress=mpm.K0(1.0), **scene)
+    start = water(s)
+    s.run(end, end / steps, progress=False)
+    cell = s.cells()
+    assert water(s) == pytest.approx(start, rel=1e-12)
+    assert np.abs(s.points.data["owed"] * s.points.volume0).sum() < 1e-5 * start
+    assert cell.pressure == pytest.approx(WATER * (table - cell.x[:, 1]), abs=1e-3 * WATER * (7.5 * h - table))
+
+
+def test_a_column_in_axisymmetry_and_in_3d_is_that_of_plane_strain():
+    """Water that soaks in from above: the same pressures."""
+    law = mpm.VanGenuchten(5e3, n=2.0)
+    soil = mpm.Hencky(bulk=1e7, shear=5e6, porosity=0.4, conductivity=1e-6, retention=law)
+    found = []
+    for dim, axisymmetric in ((2, False), (2, True), (3, False)):
+        grid = mpm.Grid([0] * dim, [0.2] * (dim - 1) + [1.4], [1] * (dim - 1) + [7], axisymmetric=axisymmetric)
+        walls = {"left": "x", "right": "x", "bottom": "zy"[dim == 2]} | (
+            {"front": "y", "back": "y"} if dim == 3 else {}
+        )
+        scene = {"walls": walls, "gravity": [0] * (dim - 1) + [-9.81], "fluid": mpm.Fluid(), "pressure": -1e4}
+        body = mpm.box(grid, [0] * dim, [0.2] * (dim - 1) + [1.0])
+        rest = mpm.K0(0.5)
+        top = [mpm.Drained("top", pressure=-1e3)]
+        s = mpm.Simulation(grid, [body], [soil], conditions=top, initial_stress=rest, **scene)
+        s.run(1800, 300, progress=False)
+        found.append(s.cells().pressure[np.argsort(s.cells().x[:, -1])])
+    assert found[0][0] < -8e3
+    assert found[1] == pytest.approx(found[0], rel=1e-6)
+    assert found[2] == pytest.approx(found[0], rel=1e-6)

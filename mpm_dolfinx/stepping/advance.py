@@ -352,12 +352,15 @@ class Motion:
                 pieces, stay = cut.pieces, state.stay
                 store = self._materials.storage(points) * points.volume0 * points.J
                 on_grid.set_pressures(stay.pressure)
+                water = on_grid.pore_water(points)
+                at_rest = None if water is None else self._at_rest(state.stage, state.t, None)
                 pressure, slope, bounds = on_grid.pressures_at_pieces(
                     self._reconstruction,
                     pieces.fraction * store[pieces.point],
                     state.stage,
                     state.t,
-                    on_grid.pore_water(points),
+                    water,
+                    at_rest,
                 )
                 transported = PiecePressures(stay.id, pieces.cell, pieces.fraction, pressure, stay.x, slope, bounds)
         return replace(state, transported=transported, stay=None)

@@ -17,7 +17,7 @@ from mpm_dolfinx.base.tolerances import ROUND_OFF, TINY
 from mpm_dolfinx.conditions.acting import Loads
 from mpm_dolfinx.diagnostics.scene_checks import check_held
 from mpm_dolfinx.domains.cut_domains import CutDomains
-from mpm_dolfinx.domains.pore_water import PoreWater, emptied
+from mpm_dolfinx.domains.pore_water import PoreWater
 from mpm_dolfinx.domains.pressure_transport import CellPressures, Reconstruction, share_within, transport
 from mpm_dolfinx.flow.fluxes import CellContents, CellMotion, Conduction, Mobility, OpenSides, PieceContents
 from mpm_dolfinx.flow.layers import graded, mixed_cells
@@ -146,32 +146,39 @@ class OnGrid(Keyed):
                 carried = mass_potential(self.of_pieces(state, "pressure", pressure_of(carried, bulk)), bulk)
             p = pressure_of(self._means(carried), bulk)
             water = self.pore_water(self.cut.points)
-            return p if water is None else water.level(water.sums(*self._carried(state, carried)), p)
+            return p if water is None else water.level(water.of_cells(self._carried(state, carried)), p)
         p = np.zeros(self.cut.grid.num_local)
         p[self.cut.cells] = self.cut.pieces_to_cells(state.stay.pressure)
         return p[self.contents.filled]
 
-    def _carried(self, state: State, pi: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-        """Return the potentials (m,), Pa, and (S - 1) rho that pieces bring to their cells, by these potentials."""
+    def _carried(self, state: State, pi: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the pressures (m,), Pa, by which pieces bring their points' water to their cells.
+
+        Those of these potentials (m,), Pa, by which pressures that are linear travel unchanged, but for what keeps the
+        water of each point.
+        """
         materials, points, bulk, old = (
             self._quadrature.materials,
             self.cut.points,
             self._storage.bulk,
             state.transported,
         )
+        count, pieces = len(points), self.cut.pieces
+        pores, store = materials.porosity(points), materials.storage(points)
+        rows, scale = materials.retention_rows(points), materials.retention_scale(points)
+        scale = np.where(np.isinf(scale), 1.0, scale)
+
+        def of_points(at: NDArray[np.int64], share: NDArray[np.float64]) -> PoreWater:
+            full = partial(materials.saturations, rows[at])
+            return PoreWater(full, at, share * store[at], share * pores[at], bulk, scale)
+
         owner = np.searchsorted(points.id, old.id)
-
-        def empty(p: NDArray[np.float64], of: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-            return emptied(p, bulk, *materials.saturation(points, p, of)[:2])
-
-        value, slope = empty(old.pressure, owner)
-        bounds = np.stack([empty(side, owner)[0] for side in old.bounds.T], axis=1)
-        old = replace(old, pressure=value, slope=slope[:, None] * old.slope, bounds=bounds)
-        value = transport(old, points, self.cut.pieces)
+        there = pressure_of(pi, bulk)
+        held = of_points(owner, old.fraction).of_cells(old.pressure)
+        more = of_points(pieces.point, pieces.fraction).level(held, np.zeros(count), there)
         if state.stay:
-            keeps = state.stay.keeps[self.cut.pieces.point]
-            value = np.where(keeps, empty(pressure_of(pi, bulk), self.cut.pieces.point)[0], value)
-        return [self.cut.pieces_to_cells(values) for values in (pi, value)]
+            more = np.where(state.stay.keeps, 0.0, more)
+        return self.cut.pieces_to_cells(there + more[pieces.point])
 
     def of_pieces(self, state: State, name: str, fresh: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return what pieces have of the state's stay by this name, fresh (m, ...) where there is none."""
@@ -212,17 +219,20 @@ class OnGrid(Keyed):
         stage: Stage,
         t: float,
         water: PoreWater | None = None,
+        at_rest: AtPlaces | None = None,
     ) -> list[NDArray[np.float64]]:
         """Return the pressures (m,), their slopes (m, d) and bounds (m, 2) at the pieces, as `set_pressures` has set.
 
         The mean of their mass potentials in a cell is the cell's: by `store` (m,), m^d/Pa, what the pieces store, or by
-        their volumes in a cell that stores nothing; with `water`, what these hold is.  t, s: time at which drained
-        sides have their pressures.
+        their volumes in a cell that stores nothing.  t, s: time at which drained sides have their pressures.
+
+        With `water` its sum in a cell is that at the cell's pressure, and what is reconstructed is what pressures
+        differ by from those at rest, `at_rest`, where fluid flows.
         """
         pieces = self.data.pieces
         contents = self.contents
-        bulk = self._storage.bulk
-        pi = mass_potential(self._storage.p_n.x.array, bulk)
+        bulk = self._storage.bulk if water is None else np.inf
+        p_n = self._storage.p_n.x.array
         cells = pieces.cells
         offset = pieces.places.offset
         at = contents.slot(pieces.cells)
@@ -230,16 +240,22 @@ class OnGrid(Keyed):
         weight = np.where(contents.total(cells, store)[at] > 0, store, self.weight)
         total = contents.total(cells, weight)
         origin = np.stack([contents.total(cells, weight * x) / total for x in offset.T], axis=1)
-        slope, bounds = reconstruction(self._cell_pressures(pi, stage, t, bulk), origin)
-        rise, here = np.einsum("md,md->m", slope[at], offset - origin[at]), pi[contents.filled]
+        seen = self._cell_pressures(mass_potential(p_n, bulk), stage, t, bulk, at_rest)
+        slope, bounds = reconstruction(seen, origin)
+        rise, here = np.einsum("md,md->m", slope[at], offset - origin[at]), seen.p[contents.filled]
         share = share_within(rise, *(bounds.T - here), at)  # drained sides may be aslant in their cells
-        pi = pi[cells] + share[at] * rise
-        if water is not None:  # whose sum in a cell is that at its pressure
-            p, mean = pressure_of(pi, bulk), pressure_of(here, bulk)
-            offset = p - mean[at]
-            pi = mass_potential(water.level(water.of_cells(mean[at]), mean, offset)[at] + offset, bulk)
-        slope = (slope * share[:, None])[at] / (1 + pi / bulk)[:, None]
-        values = pressure_of(pi, bulk), slope, pressure_of(bounds, bulk)[at]
+        pi, slope, bounds = here[at] + share[at] * rise, (slope * share[:, None])[at], bounds[at]
+        if at_rest is not None:
+            resting = at_rest(cells, self.cut.grid.midpoints[cells] + offset)
+            step = np.eye(offset.shape[1])
+            slope = slope + at_rest(cells[:1], step) - at_rest(cells[:1], 0 * step)
+            pi, bounds = pi + resting, bounds + resting[:, None]
+        if water is not None:
+            mean = p_n[contents.filled]
+            beyond = pi - mean[at]
+            pi = water.level(water.of_cells(mean[at]), mean, beyond)[at] + beyond
+        slope = slope / (1 + pi / bulk)[:, None]
+        values = pressure_of(pi, bulk), slope, pressure_of(bounds, bulk)
         return [self.cut.to_pieces(rows) for rows in values]
 
     def softness(self, state: State) -> NDArray[np.float64] | float:
