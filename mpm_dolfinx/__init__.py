@@ -47,7 +47,6 @@ from mpm_dolfinx.materials.cam_clay import ModifiedCamClay
 from mpm_dolfinx.materials.drucker_prager import DruckerPrager
 from mpm_dolfinx.materials.initial_stress import K0, hydrostatic
 from mpm_dolfinx.materials.mohr_coulomb import MohrCoulomb
-from mpm_dolfinx.materials.retention import BrooksCorey, Gardner, Retention, VanGenuchten
 from mpm_dolfinx.materials.skeleton import (
     Field,
     Fluid,
@@ -61,6 +60,7 @@ from mpm_dolfinx.materials.skeleton import (
 from mpm_dolfinx.materials.softening import SofteningDruckerPrager
 from mpm_dolfinx.parallel.messages import ConditionWarning, ResolutionWarning, ResultWarning, set_log_level
 from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.pores.retention import BrooksCorey, Gardner, Retention, VanGenuchten
 from mpm_dolfinx.probing.cell_fields import CellFields
 from mpm_dolfinx.probing.point_fields import PointFields
 from mpm_dolfinx.probing.probes import Probes, probes

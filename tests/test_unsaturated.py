@@ -234,6 +234,14 @@ def test_what_is_no_law_of_retention_is_refused(law, said):
         law()
 
 
+def test_neither_inertia_nor_a_specific_yield_goes_with_it():
+    law = mpm.Gardner(1e3)
+    with pytest.raises(ValueError, match="inertia: not of soil whose pores drain"):
+        column(2, [mpm.Hencky(1e6, 1e6, retention=law)], 0.0, inertia=True)
+    with pytest.raises(ValueError, match=r"retention beside a specific yield 0\.1, must be one of them"):
+        mpm.Hencky(1e6, 1e6, conductivity_law=mpm.unsaturated(1e3, specific_yield=0.1), retention=law)
+
+
 def test_laws_of_the_users_are_those_of_the_package():
     """Derived from `Retention`, and an object: the same water as the package's own law."""
     sides = [mpm.Drained("top", pressure=-2e3)]

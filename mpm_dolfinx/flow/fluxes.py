@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import ufl
@@ -25,9 +25,6 @@ from mpm_dolfinx.forms.point_forms import FacetForm, FacetSum
 from mpm_dolfinx.forms.unknowns import sum_ghosts
 from mpm_dolfinx.grid.grid import Grid, sum_by
 from mpm_dolfinx.points.material_points import cofactor, determinant
-
-if TYPE_CHECKING:
-    from mpm_dolfinx.flow.unsaturated import Relative
 
 ALONG = 0.1  # of a unit normal: a side that looks less along an axis tells nothing of the pressure's slope there
 
@@ -339,7 +336,7 @@ class FluxForms:
     inertial : (d,), N/m^3
         Force of inertia on the pore fluid as UFL, None without.
     relative
-        Conductivities by the pressures, where pores drain.
+        Conductivities by the pressures, where pores drain: see `unsaturated`.
     """
 
     def __init__(
@@ -350,7 +347,7 @@ class FluxForms:
         pressure: fem.Function,
         bulk: float,
         inertial: ufl.core.expr.Expr | None = None,
-        relative: Relative | None = None,
+        relative: Any = None,
     ):
         self.grid = grid
         self.relative = relative

@@ -42,7 +42,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.fluid_content import change_of_content, mass_potential
-from mpm_dolfinx.base.tolerances import EPSILON
+from mpm_dolfinx.base.tolerances import EPSILON, SAME
 from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.flow.fluxes import CellContents, Conduction, FluxForms, OpenFaces, OpenSides
 from mpm_dolfinx.flow.nonorthogonal import AslantFlow, Gradients
@@ -53,12 +53,12 @@ from mpm_dolfinx.forms.point_forms import CellSums, FacetSum, FormPoints, PointD
 from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts, zero
 from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.materials.evaluate import ConductivityAtPieces
-from mpm_dolfinx.materials.retention import Retentions, logarithm, pressure_at
 from mpm_dolfinx.materials.skeleton import filled
 from mpm_dolfinx.materials.user_functions import compiling
 from mpm_dolfinx.materials.user_functions import form as form_of
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.parts import OfParts, Parts
+from mpm_dolfinx.pores.retention import Retentions, logarithm, pressure_at
 
 FILTER = 0.75
 """Share of beta V that the filtered fixed-stress operator leaves out for checkerboard modes, in [0, 1].
@@ -67,10 +67,11 @@ Plateau (beam): halved 5.2e-11, doubled 1.3e-10, cells 1.5e-02.
 """
 
 
-FARTHEST = 2.0
+FARTHEST = np.log(10)
 """Change of the logarithm of the suction in a Newton step, at most; without one dry soil beside wet finds no solution.
 
 Celia's column of 25 and 100 cells, 28 steps: 310 and 500 Newton steps with 2, 330 and 920, four steps cut, with 4.
+Source: definition of a decade, over which retention is drawn.
 """
 
 
@@ -524,6 +525,11 @@ class StorageProblem:
         between, faces = outflow.aslant(p, np.exp(p / self.forms.bulk))
         leaving = sum_by(outflow.faces.at, faces, len(between))
         return Aslant(between + leaving, faces, leaving)
+
+    @property
+    def accuracy(self) -> float:
+        """Relative accuracy that a linear solve needs: dry cells store next to nothing, and what is left is theirs."""
+        return SAME if self.forms.retains else 1.0
 
     def restrained(self, dp: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return by how much pressures are to fall, Pa, where Newton's method asks for these falls (n,).

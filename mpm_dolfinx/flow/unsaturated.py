@@ -20,7 +20,7 @@ from mpm_dolfinx.base.fluid_content import pressure_of
 from mpm_dolfinx.base.tolerances import SAME
 from mpm_dolfinx.flow.fluxes import OpenFaces
 from mpm_dolfinx.grid.grid import Grid, sum_by
-from mpm_dolfinx.materials.retention import Conductance, Retentions
+from mpm_dolfinx.pores.retention import Conductance, Retentions
 
 
 class Relative:

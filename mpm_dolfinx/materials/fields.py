@@ -7,6 +7,7 @@ import zlib
 from collections.abc import Callable, Collection, Sequence
 from copy import copy
 from dataclasses import replace
+from functools import cached_property
 from inspect import signature
 
 import numpy as np
@@ -20,10 +21,10 @@ from mpm_dolfinx.forms.point_forms import FormPoints, PointData
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.materials.evaluate import LawAtPoints, SoftnessAtPoints, mean_size, sampled
 from mpm_dolfinx.materials.prestressed import AT_REST, stressed
-from mpm_dolfinx.materials.retention import Retentions, SaturationAt, scale_of
 from mpm_dolfinx.materials.skeleton import BY_SCENE, Fluid, Skeleton, constants_of
 from mpm_dolfinx.parallel.exchange import first
 from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.pores.retention import Retentions, SaturationAt, scale_of
 
 RESERVED = frozenset(
     "F dF softness owed due storage storage_at_one density position displacement porosity0 gradient drainage retention "
@@ -102,15 +103,10 @@ class SceneMaterials:
             callable(m.conductivity) for m in used
         )
         """Whether fluid flows anywhere, or may in a later stage."""
-        laws = list(dict.fromkeys(m.retention for m in used))
-        retained = [law for law in laws if law is not None] if fluid is not None else []
-        self.retentions = Retentions(retained, None not in laws) if retained else None
-        """Laws of retention, if there are any."""
-        self._saturation = SaturationAt(grid, self.retentions) if self.retentions else None
         conductivity = np.concatenate([np.ravel(m.conductivity) for m in evaluated])
         by_place = any(callable(m.conductivity) for m in materials) or any(map(_names_place, self.conductivity_laws))
         self.layered = by_place or len({m.conductivity_law for m in used}) > 1 or bool(np.ptp(conductivity))
-        self.layered = self.layered or (self.retentions is not None and len(laws) > 1)
+        self.layered = self.layered or len({m.retention for m in used}) > 1
         """Whether points may differ in what they conduct."""
         self.checksums: dict[str, int | list[float]] = {
             f"conductivity law of material {i}": sampled(m.conductivity_law)
@@ -230,6 +226,17 @@ class SceneMaterials:
     ) -> tuple[NDArray[np.float64], ...]:
         """Return S, its slope, 1/Pa, chi and k_r at pressures (m,), Pa, of some points (m,), by default all."""
         return self.saturations(self.retention_rows(points)[of], p)
+
+    @cached_property
+    def retentions(self) -> Retentions | None:
+        """Laws of retention, if there are any."""
+        laws = list(dict.fromkeys(self.materials[i].retention for i in self._used))
+        some = [law for law in laws if law is not None]
+        return Retentions(some, None not in laws) if some and self.fluid is not None else None
+
+    @cached_property
+    def _saturation(self) -> SaturationAt:
+        return SaturationAt(self.grid, self.retentions)
 
     def saturations(self, rows: NDArray[np.float64], p: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
         """Return the same of rows (m, width) of points: see `SaturationAt`."""

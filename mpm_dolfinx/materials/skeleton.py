@@ -20,8 +20,8 @@ from numpy.typing import ArrayLike, NDArray
 from mpm_dolfinx.base.given_values import at_places
 from mpm_dolfinx.base.validation import functions, instance, line, numbers
 from mpm_dolfinx.forms.axes import planar
-from mpm_dolfinx.materials.retention import check_retention
 from mpm_dolfinx.materials.user_functions import expression
+from mpm_dolfinx.pores.retention import check_retention
 
 Field = float | Sequence[float] | Callable[[NDArray[np.float64]], ArrayLike]
 """A constant (number or vector), or a function of the reference positions X (n, d), m, that gives (n, ...)."""
@@ -186,6 +186,10 @@ class Skeleton:
             _check(self, name, lambda v: (0 <= v) & (v < inf), ">= 0 and finite")
         _check(self, "porosity", lambda v: (0 < v) & (v < 1), "in (0, 1)")
         drains = getattr(self.conductivity_law, "specific_yield", 0.0)
+        if drains and self.retention is not None:
+            raise ValueError(
+                f"{type(self).__name__}: retention beside a specific yield {drains:g}, must be one of them"
+            )
         _check(self, "porosity", lambda v: v >= drains, f">= the specific yield {drains:g}")
         if not callable(self.porosity):
             n = f" = {self.porosity:g}" if np.ndim(self.porosity) == 0 else ""

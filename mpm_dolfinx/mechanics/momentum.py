@@ -34,7 +34,6 @@ from mpm_dolfinx.forms.velocity import Velocity
 from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.materials.evaluate import by_scene
 from mpm_dolfinx.materials.local_unknowns import LocalUnknowns
-from mpm_dolfinx.materials.retention import Retentions
 from mpm_dolfinx.materials.skeleton import Skeleton
 from mpm_dolfinx.mechanics.ghost_penalty import GhostPenalty
 from mpm_dolfinx.mechanics.inertia import InertiaForms
@@ -43,6 +42,7 @@ from mpm_dolfinx.mechanics.own_terms import OwnTerms
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
 from mpm_dolfinx.mechanics.weight import Weight
 from mpm_dolfinx.points.parts import OfParts, Parts, parts_of_cells, relative
+from mpm_dolfinx.pores.retention import Retentions
 
 
 class MomentumForms:

@@ -67,21 +67,21 @@ def cell_fields(scene: Scene, state: State) -> CellFields:
 
     effective = mean(cut.to_cells(scene.materials.effective_stress(points)))
     moved = mean(cut.pieces_to_cells(cut.total_displacement(points)))
-    pressure, water, stress = None, None, effective
+    stress = effective
+    pressure = None
+    water = None
     if scene.fluid is not None:
         pressure = on_grid.pressures(state)
         share = cut.to_cells(scene.materials.table(points, lambda m: m.biot))
         store, pores = (cut.to_cells(values(points)) for values in (scene.materials.storage, scene.materials.porosity))
-        pi, density, full = mass_potential(pressure, scene.fluid.bulk), 1.0, 1.0
+        volumes = pores + store * mass_potential(pressure, scene.fluid.bulk)[places.slots]
         if scene.materials.retentions is not None:
             at = cut.to_pieces(pressure[places.slots])
             full, _, chi, _ = scene.materials.saturation(points, at, cut.pieces.point)
             share, full = share * cut.pieces_to_cells(chi), cut.pieces_to_cells(full)
-            density = np.exp(pressure / scene.fluid.bulk)[places.slots]
+            volumes -= (1 - full) * pores * np.exp(pressure / scene.fluid.bulk)[places.slots]
         owed = cut.to_cells(points.data["owed"] / points.J)
-        water = sum_by(
-            places.slots, weight * (pores + store * pi[places.slots] + (full - 1) * pores * density - owed), len(volume)
-        )
+        water = sum_by(places.slots, weight * (volumes - owed), len(volume))
         stress = effective - (mean(share) * pressure)[:, None, None] * np.eye(scene.grid.stretches)
     x = mean(cut.x) + cut.grid.base
     return CellFields(places.filled, x, volume, moved, effective, stress, pressure, water)

@@ -31,7 +31,6 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.base.errors import NotConverged
 from mpm_dolfinx.base.report import Report
-from mpm_dolfinx.base.tolerances import SAME
 from mpm_dolfinx.flow.storage import Rates, StorageProblem, StorageResidual
 from mpm_dolfinx.mechanics.momentum import MomentumProblem
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
@@ -412,8 +411,8 @@ class Newton:
         rtol = min(LOOSEST, max(least, SOLVED * self._scheme.tolerance / min(1.0, errors.worst)))
         if iterative:  # the pull of given displacements, which is all of a first residual, hides the rest
             rtol = max(SOLVED * self._scheme.tolerance, rtol / max(1.0, errors.worst))
-        if self._storage is not None and self._storage.forms.retains:
-            rtol = SAME  # dry cells store next to nothing: what a solve leaves would be all of their pressure
+        if self._storage is not None:
+            rtol = min(rtol, self._storage.accuracy)
         done = errors.each <= self._scheme.tolerance
         if done.any():  # what balances stays where it is
             self._momentum.system.residual.array_w[done[self._momentum.system.of_parts.of]] = 0.0

@@ -18,6 +18,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from weakref import finalize
 
+from mpi4py import MPI
 from petsc4py import PETSc
 
 import numpy as np
@@ -28,7 +29,6 @@ from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.flow.storage import FILTER, FluxSlope, StorageProblem, StorageSystem
 from mpm_dolfinx.mechanics.momentum import MomentumProblem, MomentumSystem
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
-from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.parallel.messages import ConditionWarning, warn
 from mpm_dolfinx.points.parts import OfParts
 from mpm_dolfinx.solve.linear import MOST, direct_solver, displacement_solver, factorise, solved
@@ -300,8 +300,8 @@ class LinearSolvers:
     def restrain(self, storage: StorageProblem) -> None:
         """Let pressures fall by no more along the direction than their storage says, displacements as these ask."""
         dp = storage.restrained(self.dp.array_r)
-        far = np.array_equal(dp, self.dp.array_r)
-        if over_all(self.du.comm.tompi4py(), int(not far)) == 0:
+        far = not np.array_equal(dp, self.dp.array_r)
+        if not self.du.comm.tompi4py().allreduce(far, MPI.LOR):
             return
         self.dp.array_w[:] = dp
         if self._block is None:

@@ -17,7 +17,6 @@ from mpm_dolfinx.base.tolerances import ROUND_OFF, TINY
 from mpm_dolfinx.conditions.acting import Loads
 from mpm_dolfinx.diagnostics.scene_checks import check_held
 from mpm_dolfinx.domains.cut_domains import CutDomains
-from mpm_dolfinx.domains.pore_water import PoreWater
 from mpm_dolfinx.domains.pressure_transport import CellPressures, Reconstruction, share_within, transport
 from mpm_dolfinx.flow.fluxes import CellContents, CellMotion, Conduction, Mobility, OpenSides, PieceContents
 from mpm_dolfinx.flow.layers import graded, mixed_cells
@@ -30,6 +29,7 @@ from mpm_dolfinx.mechanics.momentum import MomentumForms, MomentumSystem
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData, QuadraturePoints
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.points.parts import parts_of_cells
+from mpm_dolfinx.pores.pore_water import PoreWater
 from mpm_dolfinx.solve.scheme import Scheme
 from mpm_dolfinx.solve.schur import LinearSolvers, planned
 from mpm_dolfinx.stepping.stage import Stage
@@ -157,12 +157,10 @@ class OnGrid(Keyed):
         Those of these potentials (m,), Pa, by which pressures that are linear travel unchanged, but for what keeps the
         water of each point.
         """
-        materials, points, bulk, old = (
-            self._quadrature.materials,
-            self.cut.points,
-            self._storage.bulk,
-            state.transported,
-        )
+        materials = self._quadrature.materials
+        points = self.cut.points
+        bulk = self._storage.bulk
+        old = state.transported
         count, pieces = len(points), self.cut.pieces
         pores, store = materials.porosity(points), materials.storage(points)
         rows, scale = materials.retention_rows(points), materials.retention_scale(points)
@@ -244,7 +242,8 @@ class OnGrid(Keyed):
         slope, bounds = reconstruction(seen, origin)
         rise, here = np.einsum("md,md->m", slope[at], offset - origin[at]), seen.p[contents.filled]
         share = share_within(rise, *(bounds.T - here), at)  # drained sides may be aslant in their cells
-        pi, slope, bounds = here[at] + share[at] * rise, (slope * share[:, None])[at], bounds[at]
+        pi = here[at] + share[at] * rise
+        slope, bounds = (slope * share[:, None])[at], bounds[at]
         if at_rest is not None:
             resting = at_rest(cells, self.cut.grid.midpoints[cells] + offset)
             step = np.eye(offset.shape[1])

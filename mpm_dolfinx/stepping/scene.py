@@ -89,6 +89,8 @@ class Scene:
         if velocity is not None:
             seeded = replace(seeded, data=moving(seeded, velocity, grid.base, grid.axisymmetric))
         self.materials = scene = SceneMaterials(grid, materials, bodies, seeded, fluid, bool(initial))
+        if velocity is not None and scene.retentions is not None:
+            raise ValueError("inertia: not of soil whose pores drain (retention), must be left out")
         self.gravity = fem.Constant(grid.mesh, np.zeros(grid.dim)) if weighs else None
         self.t, self.dt = fem.Constant(grid.mesh, 0.0), fem.Constant(grid.mesh, 1.0)
         """Time at the end of the substep, and since the start of the step, s, for forms."""

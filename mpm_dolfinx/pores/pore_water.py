@@ -18,9 +18,9 @@ from mpm_dolfinx.base.errors import NotConverged
 from mpm_dolfinx.base.fluid_content import mass_potential
 from mpm_dolfinx.base.tolerances import EPSILON
 from mpm_dolfinx.grid.grid import sum_by
-from mpm_dolfinx.materials.retention import logarithm, pressure_at
+from mpm_dolfinx.pores.retention import logarithm, pressure_at
 
-MOST = 200  # halvings of a bracket end before; more are needed of no law
+MOST = 2200  # Source: exact bound, twice the halvings of a bracket of doubles (IEEE 754)
 
 
 @dataclass(frozen=True)

@@ -26,10 +26,9 @@ from numpy.typing import NDArray
 from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
 
 from mpm_dolfinx.base.tolerances import TINY
-from mpm_dolfinx.base.validation import line, numbers
+from mpm_dolfinx.base.validation import asked, line, numbers
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointExpression
 from mpm_dolfinx.grid.grid import Grid
-from mpm_dolfinx.materials.user_functions import expression
 
 METHODS = ("saturation", "relative_permeability")
 
@@ -195,7 +194,7 @@ def check_retention(what: str, law) -> None:
         scale = scale_of(law)
     except ValueError as error:
         raise ValueError(f"{what}: {error}") from error
-    suctions = scale * np.array([-1.0, 0.0, 0.01, 0.1, 0.5, 1.0, 2.0, 5.0])
+    suctions = scale * np.concatenate([[-1.0, 0.0], np.exp2(np.arange(-8, 3))])
     for name in METHODS:
         values = np.array([_value(getattr(law, name), -s) for s in suctions])
         good = (values[:2] == 1).all() and (values >= 0).all() and (np.diff(values) <= 0).all()
@@ -207,7 +206,7 @@ def check_retention(what: str, law) -> None:
 
 def _value(function: Callable, p: float) -> float:
     """Return the number that a function of p, which returns UFL, has at a pressure, Pa."""
-    return float(apply_algebra_lowering(expression(function, [()], p=ufl.as_ufl(float(p))))(()))
+    return float(apply_algebra_lowering(ufl.as_ufl(function(ufl.as_ufl(float(p)))))(()))
 
 
 def _empty(function: Callable, suction: float) -> bool:
@@ -309,7 +308,22 @@ def _property(law, name: str, p):
     """Return a property of a law at pressures p, Pa, as UFL."""
     if name == "bishop" and not hasattr(law, "bishop"):
         name = "saturation"
-    return expression(getattr(law, name), [()], p=p)
+    return _called(law, name, p)
+
+
+def _called(law, name: str, p):
+    """Return what a method of a law gives at p, a number as UFL.
+
+    Raises
+    ------
+    ValueError
+        It raises, or gives no scalar.
+    """
+    what = f"{line(law)}: {name}"
+    out = asked(what, "UFL of p", lambda: ufl.as_ufl(getattr(law, name)(p)))
+    if out.ufl_shape:
+        raise ValueError(f"{what} has shape {out.ufl_shape}, must be a scalar")
+    return out
 
 
 class SaturationAt:
@@ -362,7 +376,7 @@ class Conductance:
     def __init__(self, grid: Grid, law):
         self.scale = scale_of(law)
         points = FormPoints(grid, p=())
-        k_r = PointExpression(expression(law.relative_permeability, [()], p=points.p), points)
+        k_r = PointExpression(_called(law, "relative_permeability", points.p), points)
         edges = np.exp(np.linspace(*np.log(self.scale * np.array(REACH)), ROWS))
         self._low, self._step = np.log(edges[0]), np.log(edges[1] / edges[0])
         middle, half = (edges[1:] + edges[:-1]) / 2, np.diff(edges) / 2
@@ -386,7 +400,8 @@ class Conductance:
         c, d = self._slope[i], self._slope[i + 1]
         # a cubic about the row below: a + c z + e z^2 + f z^3
         e, f = 3 * (b - a) - 2 * c - d, 2 * (a - b) + c + d
-        phi, first, second = a + z * (c + z * (e + z * f)), c + z * (2 * e + 3 * z * f), 2 * e + 6 * z * f
+        phi = a + z * (c + z * (e + z * f))
+        first, second = c + z * (2 * e + 3 * z * f), 2 * e + 6 * z * f
         by = 1 / (s * self._step)
         k, slope = -first * by, (second * by - first / s) * by
         out = np.stack([phi, k, slope], axis=1)
@@ -399,7 +414,7 @@ class Conductance:
 REACH = (1e-8, 1e8)
 """Suctions between which the table is, over the law's scale.  Source: exact beyond, but for as small a share."""
 ROWS = 4000
-"""Rows of the table: the cubics are accurate to 1e-8 of the integral.  Source: their error is z^4 / 384 of a power."""
+"""Rows of the table.  Source: exact for cubics, so to 1e-8 of the integral for powers of the suction."""
 GAUSS = 8  # points between two rows.  Source: exact for polynomials of degree 15
 
 
