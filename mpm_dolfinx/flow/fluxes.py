@@ -8,7 +8,8 @@ centroid of what a cell holds its mobility kappa becomes J F^-1 kappa F^-T.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -58,12 +59,14 @@ class Conduction:
     """How the filled owned cells conduct, and what has become of them in the step.
 
     motion: since the start of the step, at the centroids; None where the body hardly moves.  weight (d,): of the fluid,
-    N/m^3, if there is gravity.
+    N/m^3, if there is gravity; bulk: its bulk modulus, Pa; relative: see `unsaturated`, where pores drain.
     """
 
     mobility: Mobility
     motion: CellMotion | None
     weight: NDArray[np.float64] | None
+    bulk: float
+    relative: Any = None
 
     @cached_property
     def _turned(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -123,27 +126,34 @@ class OpenSides:
     area: NDArray[np.float64]
     reach: NDArray[np.float64]
 
+    @classmethod
+    def joined(cls, several: Sequence[OpenSides], dim: int) -> OpenSides:
+        """Return the faces of several in their order, of none an empty one."""
+        if len(several) == 1:
+            return several[0]
+        none, vectors = np.empty(0), np.empty((0, dim))
+        empty = cls(none.astype(int), none.astype(np.int32), none, none, none, none.astype(bool), vectors, vectors)
+        return cls(*(np.concatenate([getattr(one, f.name) for one in (empty, *several)]) for f in fields(cls)))
+
     @cached_property
     def normal(self) -> NDArray[np.float64]:
         """Unit vectors (m, d)."""
         return self.area / np.linalg.norm(self.area, axis=1, keepdims=True)
 
-    def driven(
-        self, at: NDArray[np.int64], flow: Conduction, bulk: float
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def driven(self, at: NDArray[np.int64], flow: Conduction) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the outflow (m,) per unit of the cell's mass potential, m^d/(Pa s), and the inflow (m,), m^d/s.
 
         The inflow is prescribed, or driven in by the outer pressure and gravity; at (m,): place of the cells among the
-        filled ones; bulk: of the fluid, Pa.
+        filled ones.
         """
         shape = self.shape * flow.nearer(at, self.normal, self.reach)
         conductance = flow.across(at, self.normal) * shape
-        return conductance, self.given + conductance * self.outer(at, flow, bulk)
+        return conductance, self.given + conductance * self.outer(at, flow)
 
-    def outer(self, at: NDArray[np.int64], flow: Conduction, bulk: float) -> NDArray[np.float64]:
+    def outer(self, at: NDArray[np.int64], flow: Conduction) -> NDArray[np.float64]:
         """Return the mass potentials (m,) beyond the faces, less the weight of the fluid on the way, Pa."""
         outer = self.pressure if flow.weight is None else self.pressure - flow.deformed(at, self.reach) @ flow.weight
-        return mass_potential(outer, bulk)
+        return mass_potential(outer, flow.bulk)
 
     def ahead(self, at: NDArray[np.int64], p: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return what lies ahead of the filled cells (n, d, 2, 2): on drained sides, by axis and end of the cell.

@@ -9,17 +9,14 @@ conducts by the sum of their shares.  In series their resistances are those at t
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import ufl
 from dolfinx import fem
 from numpy.typing import NDArray
 
-from mpm_dolfinx.base.fluid_content import pressure_of
 from mpm_dolfinx.base.tolerances import SAME
-from mpm_dolfinx.flow.fluxes import OpenFaces
-from mpm_dolfinx.grid.grid import Grid, sum_by
+from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.pores.retention import Conductance, Retentions
 
 
@@ -96,39 +93,3 @@ class Relative:
         self.shares.x.array[:] = 0.0
         self.shares.x.array.reshape(-1, self.count)[filled] = shares
         self.shares.x.scatter_forward()
-
-
-@dataclass(frozen=True)
-class UnsaturatedFaces(OpenFaces):
-    """Faces on open sides of soil whose pores drain.
-
-    conductance (m,): over the mobility; inflow (m,): what is prescribed, m^d/s.  cells (m,): behind the faces; beyond
-    (m,): pressures there, Pa; outer (m,): mass potentials there, less the weight of the fluid in between, Pa.
-    """
-
-    relative: Relative
-    cells: NDArray[np.int32]
-    beyond: NDArray[np.float64]
-    outer: NDArray[np.float64]
-    bulk: float
-
-    def through(self, pi: NDArray[np.float64], even: bool = False) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return what leaves through each face (m,), m^d/s, and its derivative by the cell's pressure, m^d/(Pa s).
-
-        even: but for that of what the weight drives.
-        """
-        p = pressure_of(pi, self.bulk)[self.at]
-        k, slope = self.relative.through_sides(self.cells, p, self.beyond)
-        drives = pi[self.at] - self.outer
-        leaves = self.conductance * k * drives
-        rises = self.conductance * (k + slope * (p - self.beyond if even else drives))
-        shut = self.seeps & (leaves < 0)
-        return np.where(shut, 0.0, leaves) - self.inflow, np.where(shut, 0.0, rises)
-
-    def outflow(self, pi: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return what leaves through each face from cells at potentials (n,), Pa; m^d/s."""
-        return self.through(pi)[0]
-
-    def seepage(self, pi: NDArray[np.float64], flows: NDArray[np.bool_], even: bool = False) -> tuple[NDArray, NDArray]:
-        """Return what leaves cells (n,) through all faces, m^d/s, and its derivative, m^d/(Pa s)."""
-        return tuple(sum_by(self.at, values, len(pi)) for values in self.through(pi, even))
