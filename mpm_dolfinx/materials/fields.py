@@ -6,7 +6,8 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable, Collection, Sequence
 from copy import copy
-from dataclasses import fields, replace
+from dataclasses import replace
+from functools import cached_property
 from inspect import signature
 
 import numpy as np
@@ -20,12 +21,14 @@ from mpm_dolfinx.forms.point_forms import FormPoints, PointData
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.materials.evaluate import LawAtPoints, SoftnessAtPoints, knows_space, mean_size, sampled
 from mpm_dolfinx.materials.prestressed import AT_REST, stressed
-from mpm_dolfinx.materials.skeleton import BY_SCENE, Fluid, Skeleton
+from mpm_dolfinx.materials.skeleton import BY_SCENE, Fluid, Skeleton, constants_of
 from mpm_dolfinx.parallel.exchange import first
 from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints
+from mpm_dolfinx.pores.retention import Retentions, SaturationAt, scale_of
 
 RESERVED = frozenset(
-    "F dF softness owed due storage storage_at_one density position displacement porosity0 gradient retention".split()
+    "F dF softness owed due storage storage_at_one density position displacement porosity0 gradient drainage retention "
+    "pores".split()
 )
 """Names of what points of integration carry beside parameters and state."""
 WHAT_IS_NAMED = "parameters, state and unknowns"
@@ -112,6 +115,7 @@ class SceneMaterials:
         conductivity = np.concatenate([np.ravel(m.conductivity) for m in evaluated])
         by_place = any(callable(m.conductivity) for m in materials) or any(map(_names_place, self.conductivity_laws))
         self.layered = by_place or len({m.conductivity_law for m in used}) > 1 or bool(np.ptp(conductivity))
+        self.layered = self.layered or len({m.retention for m in used}) > 1
         """Whether points may differ in what they conduct."""
         self.checksums: dict[str, int | list[float]] = {
             f"conductivity law of material {i}": sampled(m.conductivity_law)
@@ -169,7 +173,7 @@ class SceneMaterials:
         if given != bool(law.unknowns):
             has = f"{'' if law.unknowns else 'no '}unknowns and {given} of residual and solution"
             raise ValueError(f"{law.__name__}: has {has}, must have unknowns and one of these, or neither")
-        own, others = (*_names(m), *law.state), {*_names(m), *law.state, *BY_SCENE, "F", "trial"}
+        own, others = (*constants_of(m), *law.state), {*constants_of(m), *law.state, *BY_SCENE, "F", "trial"}
         if taken := [name for name in own if name in BY_SCENE] + [name for name in law.unknowns if name in others]:
             raise ValueError(f"{law.__name__}: the name {taken[0]!r} is taken; {WHAT_IS_NAMED} must have another")
         for name, value in law.unknowns.items():
@@ -177,7 +181,7 @@ class SceneMaterials:
         m.check_cells(mean_size(self.grid))
         for name in law.parameters:
             if not hasattr(m, name):
-                known = ", ".join([*_names(m), *law.state])
+                known = ", ".join([*constants_of(m), *law.state])
                 raise ValueError(f"{law.__name__}: its law takes {name!r}, must be F or some of {known}")
             value = _known(f"{law.__name__}: {name}", getattr(m, name))
             self._set_shape(law, name, value.shape[1:])
@@ -232,13 +236,55 @@ class SceneMaterials:
     def conducting(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return what points (n, 2) that conduct alike have in common: conductivity, m/s, and number of their law.
 
-        By a law of the place none does.
+        By a law of the place none does.  The fraction of that number tells laws of retention.
         """
         laws, known = [m.conductivity_law for m in self.materials], self.conductivity_laws
         law = np.array([known.index(law) if law in known else -1 for law in laws])[points.material]
         by_place = np.array([law is not None and _names_place(law) for law in laws])[points.material]
         conductivity = self.table(points, lambda m: m.conductivity)
-        return np.stack([conductivity, np.where(by_place, len(known) + points.id, law)], axis=1)
+        number = np.where(by_place, len(known) + points.id, law)
+        if self.retentions is not None:
+            number = number + self.retention_of(points) / (1 + len(self.retentions.laws))
+        return np.stack([conductivity, number], axis=1)
+
+    def retention_of(self, points: MaterialPoints) -> NDArray[np.int64]:
+        """Return the number of each point's law of retention (n,), from 1; 0 where pores stay full."""
+        return np.array([self.retentions.number(m.retention) for m in self.materials])[points.material]
+
+    def saturation(
+        self, points: MaterialPoints, p: NDArray[np.float64], of: NDArray[np.int64] | slice = slice(None)
+    ) -> tuple[NDArray[np.float64], ...]:
+        """Return S, its slope, 1/Pa, chi and k_r at pressures (m,), Pa, of some points (m,), by default all."""
+        return self.saturations(self.retention_rows(points)[of], p)
+
+    @cached_property
+    def retentions(self) -> Retentions | None:
+        """Laws of retention, if there are any."""
+        laws = list(dict.fromkeys(self.materials[i].retention for i in self._used))
+        some = [law for law in laws if law is not None]
+        return Retentions(some, None not in laws) if some and self.fluid is not None else None
+
+    @cached_property
+    def _saturation(self) -> SaturationAt:
+        return SaturationAt(self.grid, self.retentions)
+
+    def saturations(self, rows: NDArray[np.float64], p: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+        """Return the same of rows (m, width) of points: see `SaturationAt`."""
+        return self._saturation(rows, p)
+
+    def retention_scale(self, points: MaterialPoints) -> NDArray[np.float64]:
+        """Return the suction about which pores of the points drain (n,), Pa; infinite where they stay full."""
+        scales = [np.inf if m.retention is None else scale_of(m.retention) for m in self.materials]
+        return np.array(scales)[points.material]
+
+    def felt(self, points: MaterialPoints) -> NDArray[np.float64]:
+        """Return the pore pressures that stresses contain at the points (n,), Pa: alpha chi p."""
+        pressure = self.table(points, lambda m: m.biot) * points.pressure
+        return pressure if self.retentions is None else pressure * self.saturation(points, points.pressure)[2]
+
+    def retention_rows(self, points: MaterialPoints) -> NDArray[np.float64]:
+        """Return what points (n, width) carry of their laws of retention."""
+        return np.stack([self.retentions.row(m.retention) for m in self.materials])[points.material]
 
     def table(self, points: MaterialPoints, value: Callable[..., float], *columns: NDArray) -> NDArray[np.float64]:
         """Return value(material, *columns) at the points (n, ...); columns (n,) are values at the points.
@@ -296,7 +342,7 @@ class SceneMaterials:
     @property
     def constants(self) -> dict[str, Skeleton]:
         """Names of the constants of materials, each with a material that has it."""
-        return {name: self.materials[i] for i in self._used for name in _names(self.materials[i])}
+        return {name: self.materials[i] for i in self._used for name in constants_of(self.materials[i])}
 
     @property
     def field_names(self) -> list[str]:
@@ -330,7 +376,7 @@ class SceneMaterials:
         """Whether pores drain as a free surface falls."""
         return any(getattr(law, "specific_yield", 0.0) > 0 for law in self.conductivity_laws)
 
-    def retention(self, points: MaterialPoints) -> NDArray[np.float64]:
+    def drainage(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the specific yield at the points, and the suction, Pa, at which it has drained (n, 2)."""
         names = {"specific_yield": 0.0, "suction": 1.0}
         return np.stack(
@@ -339,9 +385,16 @@ class SceneMaterials:
         )
 
     def density(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the density of soil and pore fluid at the points (n,), kg/m^3."""
+        """Return the density of soil and pore fluid at the points (n,), kg/m^3, were all pores full."""
         n, wet = self.porosity(points), self.fluid.density if self.fluid else 0.0
         return (1 - n) * self.table(points, lambda m: m.grain_density) + n * wet
+
+    def drained_density(self, points: MaterialPoints) -> NDArray[np.float64] | float:
+        """Return what of this density is not there, as pores have drained (n,), kg/m^3."""
+        if self.retentions is None:
+            return 0.0
+        empty = 1 - self.saturation(points, points.pressure)[0]
+        return empty * self.porosity(points) * self.fluid.density
 
     def confined_modulus(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return what resists where neither skeleton nor pore fluid can give way (n,), Pa: lambda + 2G + alpha^2 / S.
@@ -415,8 +468,7 @@ class SceneMaterials:
 
     def total_stress(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the Cauchy stress of skeleton and fluid, Pa, as `effective_stress`; on all processes together."""
-        pressure = self.table(points, lambda m: m.biot) * points.pressure
-        return self.effective_stress(points) - pressure[:, None, None] * np.eye(self.grid.stretches)
+        return self.effective_stress(points) - self.felt(points)[:, None, None] * np.eye(self.grid.stretches)
 
     def updated_state(
         self, points: MaterialPoints, before: MaterialPoints, dt: float
@@ -491,7 +543,7 @@ def _used(bodies: Sequence[Body], count: int) -> list[int]:
 
 def _by_place(m: Skeleton) -> list[str]:
     """Return the names of a material's fields that are functions of places."""
-    return [name for name in _names(m) if callable(getattr(m, name))]
+    return [name for name in constants_of(m) if callable(getattr(m, name))]
 
 
 def _evaluated(m: Skeleton, bodies: Sequence[Body], material: int) -> Skeleton:
@@ -525,15 +577,10 @@ def _rows(bodies: Sequence[Body], material: int, ids: NDArray[np.int64]) -> tupl
     return np.concatenate(here), np.concatenate(rows)
 
 
-def _names(m: Skeleton) -> list[str]:
-    """Return the names of a material's fields."""
-    return [f.name for f in fields(m) if f.name != "conductivity_law"]
-
-
 def _spread(m: Skeleton, values: dict[str, NDArray[np.float64]], n: int) -> Skeleton:
     """Return a copy of a material with values (n, ...) of some fields, its other numbers repeated n times."""
     out = copy(m)
-    for name in _names(m):
+    for name in constants_of(m):
         value = getattr(m, name)
         if name in values:
             value = values[name]

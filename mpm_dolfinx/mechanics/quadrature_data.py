@@ -115,7 +115,8 @@ class QuadraturePoints:
         shapes: dict[str, tuple[int, ...]] = {**own, **scene.shapes}
         if fluid:
             shapes |= {"biot": (), "storage": (), "storage_at_one": ()}
-            shapes |= {"retention": (2,)} if scene.drains else {}
+            shapes |= {"drainage": (2,)} if scene.drains else {}
+            shapes |= {"retention": (scene.retentions.width,), "pores": ()} if scene.retentions else {}
         if weighs:
             shapes |= {"density": ()}
         if extended:
@@ -124,7 +125,8 @@ class QuadraturePoints:
         if self.varies:
             shapes |= {"position": (d,), "conductivity": (), "porosity0": ()}
         self.pieces = FormPoints(grid, **shapes)
-        self.laws = scene.parts(self.pieces, [*own, "biot"] if fluid else [*own])
+        common = [*own, *["biot"] * bool(fluid), *["retention"] * bool(scene.retentions)]
+        self.laws = scene.parts(self.pieces, common)
         self._locks = any(locks for *_, locks in self.laws)
         self._constants: Latest[dict[str, NDArray[np.float64]]] = Latest()
 
@@ -185,7 +187,9 @@ class QuadraturePoints:
                 fields["biot"] = self._scene.table(points, lambda m: m.biot)
                 fields["storage_at_one"] = self._scene.storage_at_one(points)
                 if self._scene.drains:
-                    fields["retention"] = self._scene.retention(points)
+                    fields["drainage"] = self._scene.drainage(points)
+                if self._scene.retentions:
+                    fields["retention"] = self._scene.retention_rows(points)
             if self.varies:
                 fields["conductivity"] = self._scene.table(points, lambda m: m.conductivity)
                 fields["porosity0"] = self._scene.table(points, lambda m: m.porosity)
@@ -201,6 +205,8 @@ class QuadraturePoints:
             fields |= {name: rows for name, rows in points.data.items() if name not in self._scene.shapes}
         if self._fluid:
             fields["storage"] = self._scene.storage(points)
+        if self._fluid and self._scene.retentions:
+            fields["pores"] = self._scene.porosity(points)
         if self._weighs:
             fields["density"] = self._scene.density(points)
         return fields
@@ -225,6 +231,11 @@ class QuadraturePoints:
         if law is None:
             return self.rows(cut, cut.points, lambda m: m.conductivity) / self._fluid.unit_weight
         return law.evaluate(data, cut.to_cells(cut.points.material), begins) / self._fluid.unit_weight
+
+    @property
+    def materials(self) -> SceneMaterials:
+        """The materials of the scene."""
+        return self._scene
 
     def masses(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the masses (n,), kg, of the points, pore fluid included."""

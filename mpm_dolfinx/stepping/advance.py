@@ -303,8 +303,13 @@ class Motion:
         alpha, at_one = materials.table(points, lambda m: m.biot), materials.storage_at_one(points)
         rows = (alpha, at_one, materials.storage(before), points.J / before.J)
         rows = (values[cut.pieces.point] for values in rows)
-        grown = cut.mean(density * change_at_points(*rows, dp) - came_here)
-        none = materials.retention(points)[:, 0] > 0 if materials.drains else np.zeros(len(points), dtype=bool)
+        grown = change_at_points(*rows, dp)
+        if materials.retentions is not None:
+            of, pores = cut.pieces.point, materials.porosity(before)
+            full, empty = (materials.saturation(points, cut.to_pieces(at), of)[0] for at in (p, p_n))
+            grown = full * grown + (full - empty) * pores[of] * np.exp(-dp / (2 * forms.bulk))
+        grown = cut.mean(density * grown - came_here)
+        none = materials.drainage(points)[:, 0] > 0 if materials.drains else np.zeros(len(points), dtype=bool)
         owed = np.where(none, 0.0, before.data["owed"] + before.J * grown / alpha)
         if not over_all(cut.grid.comm, int(not keeps.all())):
             return {"owed": owed, "due": np.zeros(len(points))}
@@ -357,8 +362,15 @@ class Motion:
                 pieces = on_grid.cut.pieces
                 store = self._materials.storage(points) * points.volume0 * points.J
                 on_grid.set_pressures(carried.of_cell)
+                water = on_grid.pore_water(points)
+                at_rest = None if water is None else self._at_rest(state.stage, state.t, None)
                 pressure, slope, bounds = on_grid.pressures_at_pieces(
-                    self._reconstruction, pieces.fraction * store[pieces.point], state.stage, state.t
+                    self._reconstruction,
+                    pieces.fraction * store[pieces.point],
+                    state.stage,
+                    state.t,
+                    water,
+                    at_rest,
                 )
                 leaves = {"pressure": pressure, "slope": slope, "bounds": bounds, "of_cell": None, "start": None}
                 carried = replace(carried, **leaves)

@@ -166,7 +166,7 @@ class _Point:
     def __init__(self, material: Skeleton, rate: float | None, cell_size: float | None):
         self._rate, law = rate or 1.0, type(material)
         for field in fields(material):
-            if callable(getattr(material, field.name)) and field.name != "conductivity_law":
+            if callable(getattr(material, field.name)) and field.name not in ("conductivity_law", "retention"):
                 raise ValueError(f"{law.__name__}: {field.name} is a function, must be a number in an element test")
         self._parameters = {name: np.asarray(getattr(material, name), dtype=float) for name in law.parameters}
         self._rest = {name: np.asarray(value, dtype=float) for name, value in law.state.items()}
