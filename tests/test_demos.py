@@ -58,7 +58,8 @@ QUICK = {
     "calibrate": ("--quick", ["calibration.md"]),
     "scaling": ("--quick --dims 2 --processes 1 2", ["scaling.png", "scaling.csv", "scaling.md"]),
 }
-LONG = {"cavity", "footing", "slope", "image", "vibration", "wave"}  # what they show has tests of its own, or takes long to compile
+# what they show has tests of its own, or takes long to compile
+LONG = {"cavity", "footing", "slope", "image", "vibration", "wave"}
 
 
 def run(demo, arguments):

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
 """What acts on the momentum: the one protocol of tractions, given displacements, tools, weight, conditions of users.
 
+To add a condition: give it a method `acting(setting)`, which returns an `Acting`.  For the fluid: `flow/feeding.py`.
+
 A condition is placed three times: `Acting` once a stage, where it finds its faces; `Acting.placed` once a substep, with
 the faces where they have moved to; and its `Loads` add to residual and tangent as often as these are assembled.  The
 step and the balance of momentum loop over them, and know none by name.
@@ -154,6 +156,9 @@ class Loads:
 
     def resists(self, b: NDArray[np.float64]) -> None:
         """Add the forces at u that act as the bodies' own stresses do, against loads."""
+
+    def takes_up(self, b: NDArray[np.float64]) -> None:
+        """Add the forces at u that are counted with those of the stresses."""
 
     def penalty(self, A: PETSc.Mat, walls: bool) -> None:
         """Add the matrix of forces that are linear in u; walls: to the rows of what walls hold."""

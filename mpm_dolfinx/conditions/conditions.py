@@ -6,8 +6,11 @@ in the seeded body, before a map; sides of a mesh as it names them (`from_mesh`)
 lies on another body, as seeded, does not count.
 Regions and X are reference positions, before all maps (`mapped`); areas are those as seeded, after them.
 
+A new kind of condition is a class like these in a file of its own, with a method `acting` for what it does to the
+momentum, see `conditions/acting.py`, or `feeding` for what it does to the fluid, see `flow/feeding.py`.
+
 Values may be functions of the time t, the reference places X and the present places x, by these names: how they are
-called, and what they may give, stands in `given_values`.
+called, and what they may give, stands in `validation`.
 
 What is wrong with a condition is said, with a ValueError, when it is made, or a scene or a stage with it; of what
 functions give at the step that asks for it.  A condition equals only itself: values and regions may be arrays and
@@ -19,13 +22,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mpm_dolfinx.base.given_values import NAMES, Places, check_names, given
-from mpm_dolfinx.base.validation import flag, line, numbers
+from mpm_dolfinx.base.validation import NAMES, Places, check_names, flag, given, line, numbers
 from mpm_dolfinx.bodies.faces import Region, Surface
 from mpm_dolfinx.materials.skeleton import Skeleton
 
@@ -50,7 +52,7 @@ class Condition:
                 check_names(f"{line(self)}: {name}", getattr(self, name), among)
 
     def _given(self, name: str, t: float, *more, **options) -> NDArray[np.float64]:
-        """Return one of its values at time t (s), see `given_values.given`."""
+        """Return one of its values at time t (s), see `validation.given`."""
         what, among = f"{line(self)}: {name} at t = {t:g} s", self.FUNCTIONS[name]
         return given(what, getattr(self, name), t, *more, among=among, **options)
 
@@ -205,6 +207,17 @@ def sorted_terms(terms: Sequence[Callable | OnSide | Source]) -> tuple[list[Call
     return [term for term in terms if not isinstance(term, Source)], sources
 
 
+class Through(NamedTuple):
+    """What a side lets through at its places, each () or (m,).
+
+    pressure: beyond it, Pa, nan where the flux alone is given; flux: into the body, m/s; one_way: nothing flows in.
+    """
+
+    pressure: NDArray[np.float64] | float
+    flux: NDArray[np.float64] | float
+    one_way: NDArray[np.bool_] | bool
+
+
 @dataclass(frozen=True, eq=False)
 class Drained(Condition):
     """Side of the bodies, moving with them, at which the pore pressure is given.
@@ -246,6 +259,11 @@ class Drained(Condition):
         """Return the pressure () or (m,) at time t (s), Pa."""
         return self._given("pressure", t, side)
 
+    def through(self, t: float, side: Places) -> Through:
+        """Return what the side lets through at time t (s)."""
+        pressure = self.at(t, side)
+        return Through(pressure, 0.0, self.seepage & (pressure <= 0))
+
 
 @dataclass(frozen=True, eq=False)
 class Inflow(Condition):
@@ -279,6 +297,10 @@ class Inflow(Condition):
     def at(self, t: float, side: Places | None = None) -> NDArray[np.float64]:
         """Return the flux () or (m,) at time t (s), m/s."""
         return self._given("flux", t, side)
+
+    def through(self, t: float, side: Places) -> Through:
+        """Return what the side lets through at time t (s)."""
+        return Through(np.nan, self.at(t, side), False)
 
 
 RIGIDITY = 1e4

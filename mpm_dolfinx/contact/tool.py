@@ -11,8 +11,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mpm_dolfinx.base.given_values import check_names, given
-from mpm_dolfinx.base.validation import line, numbers
+from mpm_dolfinx.base.validation import check_names, given, line, numbers
 from mpm_dolfinx.contact.shapes import ROUNDED, Ball, Cone, Convex, Distance, HalfSpace, Shape, unit_vector
 from mpm_dolfinx.grid.grid import Grid
 

@@ -245,8 +245,8 @@ class ConductivityAtPieces:
         self._points = pieces
         self._materials = materials
         self._u = displacement
-        self.pressure = pressure if any("p" in signature(law).parameters for law in laws) else None
-        """What laws are given for p, None where none names it."""
+        self.by_pressure = any("p" in signature(law).parameters for law in laws)
+        """Whether a law names p."""
         self._p = pressure
         self._laws = {law: PointExpression(self._in_ufl(law), pieces) for law in laws}
 

@@ -17,8 +17,7 @@ import numpy as np
 import ufl
 from numpy.typing import ArrayLike, NDArray
 
-from mpm_dolfinx.base.given_values import at_places
-from mpm_dolfinx.base.validation import functions, instance, line, numbers
+from mpm_dolfinx.base.validation import at_places, functions, instance, line, numbers
 from mpm_dolfinx.forms.axes import planar
 from mpm_dolfinx.materials.user_functions import expression
 

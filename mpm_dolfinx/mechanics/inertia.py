@@ -34,9 +34,8 @@ from dolfinx import fem
 from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.base.caching import Latest
-from mpm_dolfinx.base.given_values import at_places, check_names
 from mpm_dolfinx.base.tolerances import ROUND_OFF
-from mpm_dolfinx.base.validation import flag, line, numbers
+from mpm_dolfinx.base.validation import at_places, check_names, flag, line, numbers
 from mpm_dolfinx.conditions.acting import At, Loads
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.forms.point_forms import FormPoints, Places, PointData, PointForm

@@ -168,22 +168,22 @@ class MomentumForms:
         """u by nodes (nodes, d), m."""
         return self.u.x.array.reshape(-1, self.grid.dim)
 
-    def internal(self, data: QuadratureData) -> NDArray[np.float64]:
-        """Return the nodal forces of the stresses at u, a local array."""
-        if self.dilatation is not None:
-            self.dilatation.set_ratios(data)
-        for number, local in self._local.items():
-            local.update(data.parts[number], derive=False)
-        if self.dilatation is not None:
-            self.dilatation.set_stresses(data)
+    def internal(self, data: QuadratureData, loads: Sequence[Loads] = ()) -> NDArray[np.float64]:
+        """Return the nodal forces of the stresses at u, and of loads that count as such, a local array."""
+
+        def solve() -> None:
+            for number, local in self._local.items():
+                local.update(data.parts[number], derive=False)
 
         def add(b: NDArray[np.float64]) -> None:
             for residual, part in zip(self._residuals, data.parts, strict=True):
                 residual.assemble_vector(b, part)
-            if self.weight is not None:
-                self.weight.taken_up(b, data.pieces)
 
-        return self.summed(0, [add])
+        if self.dilatation is None:
+            solve()
+        else:
+            self.dilatation.update(data, solve)
+        return self.summed(0, [add, *(one.takes_up for one in loads)])
 
     def assemble_tangent(self, K: PETSc.Mat, data: QuadratureData) -> None:
         """Add the tangent of the stresses at u to K, which the caller finalises."""
@@ -283,7 +283,7 @@ class MomentumSystem:
         at_walls = np.zeros(len(forms.grid.node_x), dtype=bool)
         at_walls[self.held.map.indices.reshape(-1, d).max(axis=1, initial=-1) >= 0] = True
         near = at_walls[forms.grid.cell_nodes[forms.grid.facet_cells[facets]]].any(axis=(1, 2))
-        self._ghosts = [forms.ghost.form.on(some) for some in (facets[near], facets)]
+        self._ghost = forms.ghost.on(facets, facets[near])
         self.firm, self._firmness = None, None  # where nothing yields
         if not forms.elastic:
             self.firm, self._firmness = matrix(self.unknowns, self.unknowns, 3**d * d), forms.ghost.firmness.on(cells)
@@ -328,10 +328,9 @@ class MomentumSystem:
 
     def set_penalty(self, loads: Sequence[Loads]) -> None:
         """Assemble what is linear in the step's increment: ghost penalty, that of loads, and firmness."""
-        for penalty, ghost in zip((self.held_penalty, self.penalty), self._ghosts, strict=True):
+        for penalty in (self.held_penalty, self.penalty):
             zero(penalty)
-            ghost.assemble_matrix(penalty)
-            for one in loads:
+            for one in (self._ghost, *loads):
                 one.penalty(penalty, penalty is self.held_penalty)
             penalty.assemble()
         if self.firm is not None:
@@ -453,7 +452,7 @@ class MomentumProblem:
     def _unbalanced(self) -> tuple[NDArray[np.float64], list[NDArray[np.float64]]]:
         """Return the same, and the norms (parts,), N, of its parts."""
         forms, system = self.forms, self.system
-        b = forms.internal(self.data)
+        b = forms.internal(self.data, self.loads)
         forces, external = b[system.touched], self._external
         norms = [system.force_of_parts(forces)]
         if self._varying:

@@ -20,8 +20,8 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.caching import Latest
-from mpm_dolfinx.base.given_values import by_place
 from mpm_dolfinx.base.tolerances import NEAR
+from mpm_dolfinx.base.validation import by_place
 from mpm_dolfinx.bodies.faces import Surface
 from mpm_dolfinx.conditions.acting import Acting, Loads, Place, Setting
 from mpm_dolfinx.conditions.conditions import Pressure, Traction

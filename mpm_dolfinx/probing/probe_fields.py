@@ -18,11 +18,12 @@ from numpy.typing import NDArray
 from mpm_dolfinx.bodies.faces import interpolate
 from mpm_dolfinx.domains.fitted import fitted_at
 from mpm_dolfinx.domains.pressure_transport import van_leer
+from mpm_dolfinx.flow.feeding import Wet, open_sides
 from mpm_dolfinx.grid.grid import Grid, sum_by
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.local_fit import RADIUS, LocalFit, near
 from mpm_dolfinx.probing.probes import Probes
-from mpm_dolfinx.stepping.on_grid import OnGrid
+from mpm_dolfinx.stepping.grid_reset import OnGrid
 from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.state import State
 
@@ -94,7 +95,8 @@ class _Around:
         self._open = share.reshape(*share.shape[:2], d, 2)
         self._centroid = lattice.midpoint + self._half - x[:, None]
         self._counts, self._reached = self._connected(held == key[:, None])
-        self._sides = state.stage.hydraulic.data(cut, points, self._contents, state.t)
+        wet = Wet(cut, points, self._contents, state.t)
+        self._sides = open_sides([one.placed(wet) for one in state.stage.feeding], d)
 
     def _gathered(self, on_grid: OnGrid, p: NDArray[np.float64], alike: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
         """Return the local numbers (m, cells) of the cells that this process owns, else -1, and what all hold.

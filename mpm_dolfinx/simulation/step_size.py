@@ -10,7 +10,7 @@ from mpi4py import MPI
 
 import numpy as np
 
-from mpm_dolfinx.base.report import Report
+from mpm_dolfinx.base.errors import Report
 from mpm_dolfinx.base.tolerances import EPSILON, NEAR, ROUND_OFF, SAME
 from mpm_dolfinx.base.validation import line, numbers
 from mpm_dolfinx.parallel.exchange import over_all

@@ -20,9 +20,8 @@ from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
 from mpm_dolfinx.base import _compat
-from mpm_dolfinx.base.errors import LeftGrid, StepFailed
+from mpm_dolfinx.base.errors import LeftGrid, Report, StepFailed
 from mpm_dolfinx.base.histories import Row, Rows
-from mpm_dolfinx.base.report import Report
 from mpm_dolfinx.base.time_integration import EULER, Substep
 from mpm_dolfinx.base.tolerances import SAME
 from mpm_dolfinx.base.validation import flag, functions, instance, line

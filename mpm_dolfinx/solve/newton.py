@@ -21,6 +21,7 @@ then a momentum solve, in turn.  Large bodies, of which factors of K cost too mu
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 
 from mpi4py import MPI
@@ -29,14 +30,13 @@ import numpy as np
 from dolfinx.common import Timer
 from numpy.typing import NDArray
 
-from mpm_dolfinx.base.errors import NotConverged
-from mpm_dolfinx.base.report import Report
+from mpm_dolfinx.base.errors import NotConverged, Report
 from mpm_dolfinx.flow.storage import Rates, StorageProblem, StorageResidual
 from mpm_dolfinx.mechanics.momentum import MomentumProblem
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.parts import relative
-from mpm_dolfinx.solve.linear import negative_pivots
+from mpm_dolfinx.solve.factors import negative_pivots
 from mpm_dolfinx.solve.schur import Kept, LinearSolvers
 from mpm_dolfinx.solve.search import FIRM, Halving, Search
 
@@ -71,6 +71,10 @@ changes are -gamma z / (1 - gamma z) = sqrt(2) - 1 and 2 - sqrt(2).  What follow
 """
 
 
+AsReset = Callable[[], AbstractContextManager[QuadratureData]]
+"""See `OnGrid.as_reset`."""
+
+
 @dataclass(frozen=True)
 class Errors:
     """Relative residuals of momentum and storage in the parts of the bodies; arrays (parts,).
@@ -101,7 +105,7 @@ def solve_substep(
     solvers: LinearSolvers,
     momentum: MomentumProblem,
     storage: StorageProblem | None,
-    as_reset: Callable[[], QuadratureData],
+    as_reset: AsReset,
     key: Hashable,
     report: Report,
     kept: Kept,
@@ -115,8 +119,7 @@ def solve_substep(
     momentum, storage
         The problems; storage is None without fluid.
     as_reset, key
-        Returns the pieces when the grid was reset, and sets the pressures of then: their tangent serves linear laws
-        while the key stays the same.
+        See `OnGrid.as_reset`: the tangent of then serves linear laws while the key stays the same.
     report
         Of the step: what the substep took is added.
     kept
@@ -173,9 +176,11 @@ def note_pressures(
     """
     if storage is None or not report.newton:
         return
-    start, p = storage.system.p_start.array_r, rates[-1].pressure
+    forms, owned = storage.forms, storage.system.unknowns.owned
+    start, before, p = (f.x.array[owned] for f in (forms.p_n, forms.p_before, forms.p))
+    before = before if len(rates) > 1 else p
     error, sealed = np.zeros((2, len(p)))
-    first, second = rates[0].pressure - start, p - rates[0].pressure
+    first, second = before - start, p - before
     if len(rates) > 1:
         error = ERROR * np.abs(solvers.filtered(seconds * (rates[1].cells - rates[0].cells)))
         sealed = storage.sealed(seconds * rates[0].cells + (dt - seconds) * rates[1].cells)
@@ -207,7 +212,7 @@ class Newton:
         systems = [momentum.system] + ([storage.system] if storage is not None else [])
         self._parts = [system.local_parts for system in systems]
 
-    def newton(self, as_reset: Callable[[], QuadratureData], key: Hashable, serves: bool) -> Errors:
+    def newton(self, as_reset: AsReset, key: Hashable, serves: bool) -> Errors:
         """Solve both problems at once; the tangent is kept while it serves, of linear laws over steps.
 
         serves: whether the tangent of the substep before may serve.
@@ -222,7 +227,7 @@ class Newton:
                 errors, fresh = self._errors(errors.start), True
         return self._iterations(errors, as_reset, key, fresh)
 
-    def _iterations(self, errors: Errors, as_reset: Callable[[], QuadratureData], key: Hashable, fresh: bool) -> Errors:
+    def _iterations(self, errors: Errors, as_reset: AsReset, key: Hashable, fresh: bool) -> Errors:
         """Iterate from the present (u, p), of these errors; fresh: with its own tangent."""
         elastic = self._momentum.forms.elastic
         tolerance = self._scheme.tolerance
@@ -247,7 +252,7 @@ class Newton:
             # inf where no fluid has moved yet
             lags = (errors.each > keep * np.minimum(1.0, before.each)) & (errors.each > tolerance)
             fresh, eases = bool(lags.any()), eases & (elastic | ~lags)
-            seeps = self._storage is not None and self._storage.settle_seepage()
+            seeps = self._storage is not None and self._storage.settle()
             if self._momentum.settle(errors.worst <= SETTLED) or seeps:
                 errors, fresh = self._errors(errors.start), True
         return found
@@ -324,7 +329,7 @@ class Newton:
             with _ignored():
                 self._storage.system.unknowns.add(self._storage.forms.p, -1.0, dp)
             report.coupling += 1
-            if self._storage.settle_seepage():
+            if self._storage.settle():
                 self._linearise()
             errors = self._errors(errors.start)
         return errors
@@ -381,20 +386,12 @@ class Newton:
         self._solvers.tangent.clear()
         self._solvers.linearise(self._momentum, self._storage, self._kept, firmness=firmness)
 
-    def _linearise_as_reset(self, as_reset: Callable[[], QuadratureData]) -> bool:
+    def _linearise_as_reset(self, as_reset: AsReset) -> bool:
         """Set the tangent of the pieces and pressures when the grid was reset, whatever steps have been taken since."""
-        functions = [self._momentum.forms.u]
-        if self._storage is not None:
-            functions += [self._storage.forms.p, self._storage.forms.p_n]
-        now = [f.x.array.copy() for f in functions]
-        self._momentum.forms.u.x.array[:] = 0.0
-        pieces = as_reset()
-        if self._storage is not None:
-            self._storage.set_fluxes()
-        done = self._solvers.linearise(self._momentum, self._storage, self._kept, pieces)
-        for f, values in zip(functions, now, strict=True):
-            f.x.array[:] = values
-        return done
+        with as_reset() as pieces:
+            if self._storage is not None:
+                self._storage.set_fluxes()
+            return self._solvers.linearise(self._momentum, self._storage, self._kept, pieces)
 
     def _direction(self, errors: Errors, slow: bool) -> int:
         """Solve the linearised problem; return the coupling iterations.

@@ -30,12 +30,12 @@ from mpm_dolfinx.mechanics.momentum import MomentumProblem, MomentumSystem
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
 from mpm_dolfinx.parallel.messages import ConditionWarning, warn
 from mpm_dolfinx.points.parts import OfParts
-from mpm_dolfinx.solve.linear import MOST, direct_solver, displacement_solver, factorise, solved
+from mpm_dolfinx.solve.factors import MOST, direct_solver, displacement_solver, factorise, solved
 from mpm_dolfinx.solve.monolithic import BlockSolver, Inverses
 from mpm_dolfinx.solve.multigrid import multigrid_solver
-from mpm_dolfinx.solve.options import using
-from mpm_dolfinx.solve.plan import AT_ONCE, MULTIGRID, MUMPS, SolverPlan, plan
+from mpm_dolfinx.solve.petsc_options import using
 from mpm_dolfinx.solve.scheme import Scheme
+from mpm_dolfinx.solve.solver_choice import AT_ONCE, MULTIGRID, MUMPS, SolverPlan, plan
 
 
 def planned(scheme: Scheme, momentum: MomentumSystem, storage: StorageSystem | None, symmetric: bool) -> SolverPlan:

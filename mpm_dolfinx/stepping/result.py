@@ -10,8 +10,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from mpm_dolfinx.base.errors import Report
 from mpm_dolfinx.base.histories import Row, Rows
-from mpm_dolfinx.base.report import Report
 from mpm_dolfinx.base.tables import data_frame, data_set
 from mpm_dolfinx.conditions.names import ByName
 

@@ -28,12 +28,11 @@ from mpm_dolfinx.dynamics.quiet import QuietSides, traction_name
 from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.materials.initial_stress import OfWater
 from mpm_dolfinx.mechanics.inertia import resting
-from mpm_dolfinx.mechanics.momentum import MomentumProblem
 from mpm_dolfinx.mechanics.tractions import owners
 from mpm_dolfinx.parallel.messages import ConditionWarning, warn
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.stepping.initial_state import pieces_at_start
-from mpm_dolfinx.stepping.scene import Scene
+from mpm_dolfinx.stepping.scene import Scene, When
 from mpm_dolfinx.stepping.stage import Condition, Stage, checked, stage
 from mpm_dolfinx.stepping.state import State
 from mpm_dolfinx.stepping.step import set_up
@@ -53,13 +52,13 @@ def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int
         warn_units(scene.grid.comm, scene.fluid, conditions["gravity"])
     points = scene.materials.seeded.of(_ids(scene.bodies, later), kept=False)
     points = scene.initial.of(scene.materials, points, present, begun.gravity_at(0.0) if scene.initial.given else None)
-    transported = None
+    pieces = None
     if scene.fluid:
-        transported = pieces_at_start(scene, points) if callable(scene.initial.pressure) else at_start(points)
+        pieces = pieces_at_start(scene, points) if callable(scene.initial.pressure) else at_start(points)
     return State(
         t=0.0,
         points=_gripped(scene, begun, points),
-        transported=transported,
+        pieces=pieces,
         outcome=begun.unknown(np.nan if scene.initial.given else 0.0),
         stage=begun,
     )
@@ -100,7 +99,7 @@ def begin_stage(
     if state.stays:  # pressures are those of the cells
         state = scene.motion.left_grid(state, scene.on_grid(state.stay.points))
     state = replace(state, stay=None)
-    gone, transported = _ids(scene.bodies, remove), state.transported
+    gone, pieces = _ids(scene.bodies, remove), state.pieces
     there = [body for body, here in enumerate(before.present) if here and body not in remove]
     bare, gravity = let_go(state.points, before.data_names(before.named)), None
     if scene.initial.given:
@@ -114,8 +113,8 @@ def begin_stage(
         rows = points.data[name].copy()
         rows[at] = values[here]
         points = replace(points, data=points.data | {name: rows})
-    if transported is not None:
-        transported = transported.of(gone, kept=False).joined(at_start(new))
+    if pieces is not None:
+        pieces = pieces.of(gone, kept=False).joined(at_start(new))
     points = _changed(scene, points, fields)
     if begun.inertia and not before.inertia:
         points = replace(points, data=points.data | resting(points))
@@ -124,7 +123,7 @@ def begin_stage(
     outcome = begun.begun(before, state.outcome, np.nan if state.resets else 0.0)
     rest = state.rest if _holds_as(begun, before) else None
     new = {"stage": begun, "begins": True, "outcome": outcome, "held": None, "rest": rest}
-    return replace(state, points=points, transported=transported, **new)
+    return replace(state, points=points, pieces=pieces, **new)
 
 
 def _released(
@@ -138,10 +137,9 @@ def _released(
     """
     start = set_up(scene, state, 0.0)
     state, momentum = start.state, scene.momentum
-    scene.set_time(state.t, 1.0, start.acting[-1].gravity)
-    momentum.velocity.set(1.0, 0.0)
-    given = start.data, start.acting[-1].loads, scene.scheme.tolerance, None, state.held
-    forces = MomentumProblem(momentum, start.matrices.momentum, *given).unbalanced().reshape(-1, scene.grid.dim)
+    when, given = When(state.t, 1.0, start.acting[-1].gravity, 1.0, 0.0), (start.data, start.acting[-1].loads)
+    problem = scene.balance(when, start.matrices.momentum, *given, held=state.held)
+    forces = problem.unbalanced().reshape(-1, scene.grid.dim)
     surfaces = next(of for of in begun.acting if isinstance(of, QuietSides)).named(quiet)
     cut = start.on_grid.cut
 
@@ -193,7 +191,8 @@ def _with_contacts(before: Stage, conditions: Sequence[Condition]) -> list[Condi
 
 
 def _stage(scene: Scene, conditions: Mapping[str, Any], present: Sequence[bool], later: Sequence[int]) -> Stage:
-    return stage(scene.grid, scene.bodies, scene.materials, scene.fluid, scene.momentum, conditions, present, later)
+    of = scene.grid, scene.bodies, scene.materials, scene.fluid, scene.momentum
+    return stage(*of, scene.storage.feeding if scene.storage else (), conditions, present, later)
 
 
 def _warn_weights(scene: Scene, begun: Stage, given: Mapping[str, Any]) -> None:

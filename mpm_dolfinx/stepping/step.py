@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from mpm_dolfinx.base.report import Report
+from mpm_dolfinx.base.errors import Report
 from mpm_dolfinx.conditions.acting import Place
 from mpm_dolfinx.dynamics.energies import after
 from mpm_dolfinx.forms.unknowns import collect_garbage

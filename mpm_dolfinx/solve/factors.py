@@ -28,8 +28,8 @@ from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.base.errors import NotConverged
 from mpm_dolfinx.base.tolerances import SAME
 from mpm_dolfinx.forms.unknowns import Unknowns
-from mpm_dolfinx.solve.options import set_defaults
-from mpm_dolfinx.solve.plan import MUMPS, NODAL
+from mpm_dolfinx.solve.petsc_options import set_defaults
+from mpm_dolfinx.solve.solver_choice import MUMPS, NODAL
 
 MOST = 500
 """Most iterations of a linear solve, and vectors that it keeps: it never starts anew.
