@@ -247,6 +247,8 @@ class Newton:
             elif fresh:
                 self._linearise(np.where(eases, 0.0, FIRM * np.minimum(1.0, errors.u)))
             self.report.coupling += self._direction(errors, fresh and slow)
+            if self._storage is not None:
+                self._solvers.restrain(self._storage)
             before, errors = errors, self._line_search(errors, elastic)
             count, slow = count + 1, fresh
             # inf where no fluid has moved yet
@@ -406,6 +408,8 @@ class Newton:
         rtol = min(LOOSEST, max(least, SOLVED * self._scheme.tolerance / min(1.0, errors.worst)))
         if iterative:  # the pull of given displacements, which is all of a first residual, hides the rest
             rtol = max(SOLVED * self._scheme.tolerance, rtol / max(1.0, errors.worst))
+        if self._storage is not None:
+            rtol = min(rtol, self._storage.accuracy)
         done = errors.each <= self._scheme.tolerance
         if done.any():  # what balances stays where it is
             self._momentum.system.residual.array_w[done[self._momentum.system.of_parts.of]] = 0.0
@@ -417,7 +421,7 @@ class Newton:
                 return self._solvers.solve(self._kept, rtol, forces)
             least = errors.fluid.round_off / self._scheme.tolerance
             measures = forces, np.maximum(errors.exchanged, least)
-            if not slow or self._linear:
+            if not slow or self._linear or self._storage.forms.retains:
                 return self._solvers.solve(self._kept, rtol, *measures)
             slope = self._storage.flux_slope(self._momentum.forms.u, self._momentum.system.unknowns)
             count = self._solvers.solve(self._kept, rtol, *measures, slope)
