@@ -27,18 +27,24 @@ WEAKER = 1.6
 VISCOSITY = 0.1 * WEIGHT * HEIGHT  # Pa s
 
 
-def slope(cells: int) -> mpm.Simulation:
-    """Return the slope at rest, with so many cells over its height; t is zero."""
+def shape(cells: int) -> tuple[mpm.Grid, list[mpm.Body]]:
+    """Return the grid, with so many cells over the slope's height, and ground and bank."""
     h, middle = HEIGHT / cells, CREST + RUN / 2
     columns, rows = round((CREST + RUN + BEFORE) / h), round(DEPTH / h)
     length = columns * h
     grid = mpm.Grid(lower=[0, -rows * h], upper=[length, HEIGHT + h], cells=[columns, rows + cells + 1])
 
-    def shape(X: np.ndarray) -> np.ndarray:
+    def sheared(X: np.ndarray) -> np.ndarray:
         return np.stack([X[:, 0] / middle * (CREST + RUN * (1 - X[:, 1] / HEIGHT)), X[:, 1]], axis=1)
 
     ground = mpm.box(grid, [0, -rows * h], [length, 0])
-    bank = mpm.mapped(grid, mpm.box(grid, [0, 0], [middle, HEIGHT]), shape)
+    bank = mpm.mapped(grid, mpm.box(grid, [0, 0], [middle, HEIGHT]), sheared)
+    return grid, [ground, bank]
+
+
+def slope(cells: int) -> mpm.Simulation:
+    """Return the slope at rest, with so many cells over its height; t is zero."""
+    grid, bodies = shape(cells)
     soil = mpm.MohrCoulomb(
         bulk=YOUNG / (3 - 6 * POISSON),
         shear=YOUNG / (2 + 2 * POISSON),
@@ -47,9 +53,7 @@ def slope(cells: int) -> mpm.Simulation:
         cohesion=lambda X: np.full(len(X), COHESION),
     )
     walls = {"left": "x", "right": "x", "bottom": "xy"}
-    s = mpm.Simulation(
-        grid, [ground, bank], [soil], walls=walls, terms=[common.weight(WEIGHT), common.viscous(VISCOSITY)]
-    )
+    s = mpm.Simulation(grid, bodies, [soil], walls=walls, terms=[common.weight(WEIGHT), common.viscous(VISCOSITY)])
     s.run(1e9, 1e9, progress=False)  # time in which nothing of the viscosity is left
     s.stage(reset_displacement=True)
     s.t = 0.0

@@ -46,6 +46,7 @@ QUICK = {
     "retaining_wall": ("--cells 6 --delta 0 --ways active", ["retaining_wall.png"]),
     "barrier": ("--cells 10 --steps 40", ["barrier.png"]),
     "slope": ("--cells 4 --steps 4 --rtol 0.1", ["slope.png"]),
+    "landslide": ("--cells 4 --dt 0.2", ["landslide.png"]),
     "vibration": ("--h 0.1 --cells 8 --periods 1 --steps 16", ["vibration.png"]),
     "wave": ("--cells 8 --steps 10 --periods 2", ["wave.png"]),
     "shaking": ("--cells 4 --steps 60", ["shaking.png"]),
@@ -59,7 +60,7 @@ QUICK = {
     "scaling": ("--quick --dims 2 --processes 1 2", ["scaling.png", "scaling.csv", "scaling.md"]),
 }
 # what they show has tests of its own, or takes long to compile
-LONG = {"cavity", "footing", "slope", "image", "vibration", "wave"}
+LONG = {"cavity", "footing", "slope", "image", "landslide", "vibration", "wave"}
 
 
 def run(demo, arguments):
