@@ -108,6 +108,25 @@ def test_a_block_stays_at_rest_between_quiet_sides():
     assert np.abs(s.points.x - settled).max() < 5e-3 * depth and speed(s) < 1e-5
 
 
+@pytest.mark.parametrize("kind", ["3D", "axisymmetry"])
+def test_quiet_bases_bear_what_they_bore_in(kind):
+    """A column settles under its weight and is let go on a quiet base: as in plane strain."""
+    n, d = 8, 3 if kind == "3D" else 2
+    h, e = HEIGHT / n, np.eye(d)[-1]
+    size = np.full(d, h)
+    options = {"axisymmetric": True} if d == 2 else {}
+    grid = mpm.Grid(np.zeros(d), size + (HEIGHT + 2 * h) * e, [1] * (d - 1) + [n + 3], **options)
+    body = mpm.box(grid, (1 + OFF) * h * e, size + (HEIGHT + OFF * h) * e)
+    walls = {"left": "x", "right": "x", "front": "y", "back": "y"} if d == 3 else {"right": "x"}
+    held = mpm.Displacement("bottom", np.zeros(d), "xyz"[d - 1])
+    s = mpm.Simulation(grid, [body], [SOIL], walls=walls, conditions=[held], gravity=-9.81 * e, inertia=False)
+    s.run(1.0, 1.0, progress=False)
+    settled, depth = s.points.x.copy(), np.abs(s.points.displacement).max()
+    s.stage(inertia=True, conditions=[mpm.Quiet("bottom")])
+    s.run(1.4, 0.02, progress=False)
+    assert np.abs(s.points.x - settled).max() < 3e-3 * depth and speed(s) < 1e-5
+
+
 def test_a_base_moves_as_it_should_and_bodies_with_it():
     """A shear layer on a base that swings: exact velocities at its foot, displacements on top; second order in time."""
     w, n, amplitude = 0.3 * np.pi * C_S / HEIGHT, 16, 1e-3
