@@ -1,37 +1,49 @@
 # SPDX-License-Identifier: MIT
-"""Given displacements of sides: penalties on means in the cells and at points across the side, see `held_cells`."""
+"""Given displacements of sides: multipliers hold the means in the cells, see `held_cells`."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property
 from itertools import combinations
 
 from petsc4py import PETSc
 
 import numpy as np
+import scipy.sparse
 import ufl
 from dolfinx import fem
 from numpy.typing import NDArray
 
-from mpm_dolfinx.base.tolerances import EPSILON, NEAR
+from mpm_dolfinx.base.caching import Latest
+from mpm_dolfinx.base.tolerances import EPSILON, NEAR, TINY
 from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.bodies.faces import Surface, face_vectors
-from mpm_dolfinx.conditions.acting import Acting, At, Loads, Place, Setting
-from mpm_dolfinx.conditions.conditions import Displacement, holding, resistance
-from mpm_dolfinx.conditions.sides import check_apart, everywhere, gathered, meeting
+from mpm_dolfinx.conditions.acting import Acting, At, Loads, Place, Setting, Unmet
+from mpm_dolfinx.conditions.conditions import HOLD, Displacement, resistance
+from mpm_dolfinx.conditions.sides import check_apart, everywhere, meeting
+from mpm_dolfinx.contact.history import Origin
+from mpm_dolfinx.contact.pairs import petsc_matrix
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointForm
+from mpm_dolfinx.forms.unknowns import Unknowns
 from mpm_dolfinx.grid.grid import Grid, sum_by
-from mpm_dolfinx.mechanics.held_cells import HeldCells, HeldPoints
+from mpm_dolfinx.mechanics.held_cells import HeldCells, HeldPoints, Jumps
 from mpm_dolfinx.mechanics.rigid_motion import rigid_motion, turned
-from mpm_dolfinx.parallel.exchange import first, over_all
+from mpm_dolfinx.parallel.exchange import Exchange, first, over_all
 from mpm_dolfinx.parallel.messages import ConditionWarning, warn
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.points.parts import Parts
 
 
+def traction_name(name: str) -> str:
+    """Return the name under which points keep the traction (n, d), Pa, of a given displacement."""
+    return f"{name}_traction"
+
+
 class HoldForms:
-    """Points, or means over points, with a given displacement along a direction; what holds it, and pulls to it."""
+    """Means over points, with a given displacement along a direction; what holds it, and pulls to it."""
 
     def __init__(self, grid: Grid, u: fem.Function):
         d = grid.dim
@@ -96,28 +108,32 @@ class GivenDisplacements(Acting):
         d, comm = self._grid.dim, self._grid.comm
         self._check_meeting(place.t)
         ends = (place.start, place.start + place.dt) if place.dt > 0 else ()  # without: held where they count from
-        held = HeldCells(self._grid, self._held_points(place.cut, place.points, place.t, ends))
+        points, origin = self._held_points(place.cut, place.points, place.t, ends)
+        held = HeldCells(self._grid, points)
         placed, message = [], ""
         for axis in range(d):
             given = np.array([axis in axes for *_, axes in self._holds])
             *rows, wrong = held.rows(axis, given, self._free[:, axis])
-            placed.append((*rows, np.tile(np.eye(d)[axis], (len(rows[0]), 1))))
+            kind = np.full(len(rows[0]), axis * len(self._holds))
+            placed.append((*rows, np.tile(np.eye(d)[axis], (len(rows[0]), 1)), kind))
             if wrong >= 0:
                 hold, x = self._holds[held.number[wrong]][0], held.x[wrong] + self._grid.base
                 what = f"{line(hold)}: moves {'xyz'[axis]} at {x}"
                 message = f"{what}, where a wall holds it; must be 0 there, or the wall must leave it free"
         if message := first(comm, message):
             raise ValueError(message)
-        row, stiffness, gap, own, direction = map(np.concatenate, zip(*placed, strict=True))
+        row, gap, traction, own, direction, kind = map(np.concatenate, zip(*placed, strict=True))
+        multipliers = Multipliers(self._grid, held, row, kind + held.number[row], HOLD)
         fields = {name: values[row] for name, values in held.moments.items()}
-        fields |= {"stiffness": stiffness, "gap": gap, "direction": direction}
+        fields |= {"stiffness": multipliers.stiffness * multipliers.area, "gap": gap, "direction": direction}
         forms = self._forms(HoldForms)
-        return HoldLoads(
-            self, forms, forms.points.at(held.cell[row], held.x[row], np.ones(len(row)), **fields), held, row, own
-        )
+        data = forms.points.at(held.cell[row], held.x[row], np.ones(len(row)), **fields)
+        return HoldLoads(self, forms, data, held, row, own, multipliers, origin, traction, place.dt > 0)
 
-    def _held_points(self, cut: CutDomains, points: MaterialPoints, t: float, ends: Sequence[float]) -> HeldPoints:
-        """Return the points of integration on held sides, at the owners of their cells.
+    def _held_points(
+        self, cut: CutDomains, points: MaterialPoints, t: float, ends: Sequence[float]
+    ) -> tuple[HeldPoints, Origin]:
+        """Return the points of integration on held sides, at the owners of their cells, and where they come from.
 
         ends: start and end of the step, s; none for sides at rest.
         """
@@ -127,8 +143,7 @@ class GivenDisplacements(Acting):
         cut_points = cut.points if ends else points  # which are where they were cut
         now, before = (of.map(lambda values: values[chosen]) for of in (points, cut_points))
         stress = self._materials.total_stress(now)
-        modulus, resists = (self._materials.table(before, of) for of in (holding, resistance))
-        firm = self._materials.confined_modulus(before)
+        resists = self._materials.table(before, resistance)
         # of when the grid was reset, as the stiffnesses: they stay as long as the cut serves
         tension = np.linalg.norm(stress if points is cut_points else self._materials.total_stress(before), axis=(1, 2))
         for number, ((hold, *_, axes), p) in enumerate(zip(self._holds, patches, strict=True)):
@@ -136,13 +151,40 @@ class GivenDisplacements(Acting):
             given = [self._given(hold, time, p.X) for time in (t, *ends)] if ends else 3 * [np.zeros_like(now)]
             to, given = p.origin(points) + given[0], np.concatenate(given[1:], axis=1)
             R = turned(self._grid.comm, p.area0, now, to) if len(axes) == d else np.eye(d)  # as what it carries does
-            force, gap = np.einsum("ij,njk,nk->ni", R, stress[at, :d, :d], p.area(points)), to - now
-            own = (p.area0 * v for v in (1, modulus[at], tension[at], resists[at], firm[at]))
+            traction, gap = np.einsum("ij,njk,nk->ni", R, stress[at, :d, :d], p.area(points)), to - now
+            before = points.data[traction_name(self._names[number])][p.at]
+            begins = ~before.any(axis=1, keepdims=True)
+            traction = np.where(begins, traction / p.area0[:, None], before @ R.T)
+            own = (p.area0 * v for v in (1, tension[at], resists[at]))
             each = np.stack([np.full(len(gap), number), *own], axis=1)
-            rows.append((p.cell, p.x, np.concatenate([each, gap, given, p.area(cut.points), force], axis=1)))
-        cell, x, values = gathered(self._grid, rows, 6 + 5 * d)
-        number, *own = values[:, :6].T
-        return HeldPoints(number.astype(np.int64), cell, *own, x, *np.split(values[:, 6:], [d, 3 * d, 4 * d], axis=1))
+            rows.append((p.cell, p.x, np.concatenate([each, gap, given, p.area(cut.points), traction, begins], axis=1)))
+        number = np.repeat(np.arange(len(patches)), [len(p.at) for p in patches])
+        point, area = (np.concatenate([getattr(p, name) for p in patches]) for name in ("at", "area0"))
+        where, x, values = (np.concatenate(column) for column in zip(*rows, strict=True))
+        origin = Origin(Exchange(self._grid.comm, self._grid.owner(where)), point, number, area)
+        where, x, values = map(origin.travel.send, (where, x, values))
+        number, *own = values[:, :4].T
+        *fields, begins = np.split(values[:, 4:], [d, 3 * d, 4 * d, 5 * d], axis=1)
+        own = (*own, x, *fields, begins[:, 0])
+        return HeldPoints(number.astype(np.int64), self._grid.local(where), *own), origin
+
+    def kept(self, n: int) -> dict[str, dict[str, NDArray[np.float64]]]:
+        """Return what n points keep of each: tractions (n, d), Pa, zero."""
+        return {name: {traction_name(name): np.zeros((n, self._grid.dim))} for name in self._names}
+
+    def gripped(self, loads: HoldLoads, points: MaterialPoints) -> MaterialPoints:
+        """Return the points with their tractions."""
+        origin = loads.origin
+        traction = np.zeros((len(loads.held.number), self._grid.dim))
+        traction[loads.row, loads.data["direction"].argmax(axis=1)] = loads.traction
+        more, data = origin.travel.back(traction[loads.held.of]), dict(points.data)
+        for number, name in enumerate(self._names):
+            rows = np.flatnonzero(origin.number == number)
+            at, area = origin.point[rows], origin.area[rows]
+            whole = np.maximum(sum_by(at, area, len(points)), TINY)
+            means = [sum_by(at, area * column, len(points)) / whole for column in more[rows].T]
+            data[traction_name(name)] = np.stack(means, axis=1)
+        return replace(points, data=data)
 
     def _check_meeting(self, t: float) -> None:
         """Refuse given displacements that differ where they meet: no body's stress is finite there."""
@@ -165,7 +207,7 @@ class GivenDisplacements(Acting):
         held = loads.held
         data = loads.data
         force = loads.pull(at.nodal)
-        self._warn(held, loads.row, data["direction"].argmax(axis=1), force)
+        self._warn(held, loads.row, data["direction"].argmax(axis=1), force - loads.carried)
         number, force = held.number[loads.row], (loads.share.sum(axis=1) * force)[:, None] * data["direction"]
         sums = np.stack([sum_by(number, column, len(self._holds)) for column in force.T], axis=1)
         return dict(zip(self._names, self._grid.comm.allreduce(sums), strict=True))
@@ -201,6 +243,31 @@ class GivenDisplacements(Acting):
         return corners
 
 
+class Multipliers:
+    """What tractions (m,), Pa, of rows of `HeldCells` do to the gaps.
+
+    Parameters
+    ----------
+    grid, held
+        Where they are.
+    row, kind : (m,)
+        Which of it each component is, and its condition and axis, in one number: see `Jumps`.
+    hold
+        Stiffness in the tangent, in units of (what resists) / (cell size).
+    """
+
+    def __init__(self, grid: Grid, held: HeldCells, row: NDArray[np.int64], kind: NDArray[np.int64], hold: float):
+        self.area = held.area[row]
+        self._compliance = held.compliance[row]
+        self._jumps = Jumps(grid, kind, held.cell[row])
+        self.stiffness = hold / grid.h.min() * held.resists[row]
+        """Pa/m."""
+
+    def jumps(self, traction: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return J of tractions, m."""
+        return self._compliance * self._jumps(traction)
+
+
 class HoldLoads(Loads):
     """Given displacements in a substep.
 
@@ -216,6 +283,12 @@ class HoldLoads(Loads):
         Which of it each component is.
     share : (m, 2^d)
         Of its force on each node, but for what walls bear.
+    multipliers, origin
+        Of the components; where their points come from.
+    traction : (m,), Pa
+        Theirs as iterations begin: the body's.
+    multiplies
+        Whether tractions are found; else what holds gives way.
     """
 
     stiff = True
@@ -228,6 +301,10 @@ class HoldLoads(Loads):
         held: HeldCells,
         row: NDArray[np.int64],
         share: NDArray[np.float64],
+        multipliers: Multipliers,
+        origin: Origin,
+        traction: NDArray[np.float64],
+        multiplies: bool,
     ):
         self._acting = acting
         self._forms = forms
@@ -235,6 +312,12 @@ class HoldLoads(Loads):
         self.held = held
         self.row = row
         self.share = share
+        self._of = multipliers
+        self.origin = origin
+        self._begun = self._aimed = self.traction = traction
+        self._change = np.zeros_like(traction)
+        self._operator: Latest[PETSc.Mat] = Latest()
+        self.multiplies = multiplies
         self._d = data.points.grid.dim
         self.key = self._d * row + data["direction"].argmax(axis=1)
         self.under_held = acting.under_held
@@ -248,10 +331,87 @@ class HoldLoads(Loads):
         if not walls:
             self._forms.hold.assemble_matrix(A, self.data)
 
+    def push(self, at: At, residual: PETSc.Vec, on: Unknowns) -> None:
+        """Take the forces of the tractions off; walls bear none of them: see `counted`."""
+        if on is at.unknowns:
+            self._add(residual, on, -self._of.area * self._held(self.traction))
+
+    def _held(self, traction: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the tractions (m,), Pa, that act where gaps are zero."""
+        return traction - self._of.stiffness * self._of.jumps(traction)
+
+    def _add(self, out: PETSc.Vec, unknowns: Unknowns, force: NDArray[np.float64]) -> None:
+        """Add forces (m,), N, of the rows to those of the nodes."""
+        B = self._means(unknowns)
+        B.multTransposeAdd(self._vector(B, force), out, out)
+
+    def _vector(self, B: PETSc.Mat, values: NDArray[np.float64]) -> PETSc.Vec:
+        """Return a vector of the rows."""
+        out = B.createVecLeft()
+        out.array_w[:] = values
+        return out
+
+    def _means(self, unknowns: Unknowns) -> PETSc.Mat:
+        """Return the matrix that makes the means (m,) of the unknowns."""
+
+        def make() -> PETSc.Mat:
+            column = unknowns.map.indices[self._dofs]
+            free = column >= 0
+            row = np.broadcast_to(np.arange(len(self.row))[:, None], column.shape)
+            entries = (self.held.shape[self.row][free], (row[free], column[free]))
+            shape = (len(self.row), max(1, unknowns.global_size))
+            return petsc_matrix(scipy.sparse.csr_matrix(entries, shape=shape), unknowns.size, unknowns.comm)
+
+        return self._operator(unknowns, make, unknowns.comm)
+
+    @cached_property
+    def _dofs(self) -> NDArray[np.int64]:
+        """Unrolled local degrees of freedom (m, 2^d) of the rows."""
+        axis = self.data["direction"].argmax(axis=1)
+        return self._d * self.data.points.grid.cell_nodes[self.data.cells] + axis[:, None]
+
+    def unmet(self, at: At) -> Unmet:
+        """Return the forces by which tractions are to change at u."""
+        off = self.pull(at.nodal) - self._of.area * self.traction
+        unknown = 4 * EPSILON * self.data.points.grid.reach * self.data["stiffness"][:, 0]
+        return Unmet(off, unknown, self.data.cells.astype(np.int64))
+
+    def drive(self, at: At, x: NDArray[np.float64], out: PETSc.Vec) -> None:
+        """Add the forces on the nodes by which a change x of the forces, N, would drive the bodies."""
+        self._add(out, at.unknowns, self._of.area * self._held(x / self._of.area))
+
+    def response(self, at: At, x: NDArray[np.float64], v: PETSc.Vec) -> NDArray[np.float64]:
+        """Return by how much less (m,), N, forces are to change after a change x of them and displacements v, m."""
+        return self.data["stiffness"][:, 0] * (self._moved_by(at, v) + self._of.jumps(x / self._of.area))
+
+    def _moved_by(self, at: At, v: PETSc.Vec) -> NDArray[np.float64]:
+        """Return displacements (m,), m, of the components that are given."""
+        B = self._means(at.unknowns)
+        out = B.createVecLeft()
+        B.mult(v, out)
+        return out.array_r.copy()
+
+    def aim(self, at: At, x: NDArray[np.float64]) -> None:
+        """Let x be the change of the forces, N, along which `go` goes."""
+        self._aimed, self._change = self.traction, x / self._of.area
+
+    def go(self, shares: NDArray[np.float64]) -> None:
+        """Change the tractions by shares (m,) of that."""
+        self.traction = self._aimed + shares * self._change
+
+    def restart(self) -> None:
+        """Set the tractions to where iterations began."""
+        self.traction = self._begun
+
     def moved(self, u: fem.Function) -> Loads:
-        """Return given displacements that are off their place by so much more."""
-        data = self.data.having(gap=self.data["gap"][:, 0] - self._along(u.x.array.reshape(-1, self._d)))
-        return HoldLoads(self._acting, self._forms, data, self.held, self.row, self.share)
+        """Return given displacements with the tractions of a displacement u, m, that bodies have at rest."""
+        way = self._along(u.x.array.reshape(-1, self._d))
+        gap, traction = self.data["gap"][:, 0] - way, self.traction
+        if self.multiplies:
+            gap = self.data["gap"][:, 0]
+            traction = traction - self.held.begins[self.row] * self._of.stiffness * way
+        more = self._of, self.origin, traction, self.multiplies
+        return HoldLoads(self._acting, self._forms, self.data.having(gap=gap), self.held, self.row, self.share, *more)
 
     def _along(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the displacement (m,), m, of each component that is given, at nodal values u (nodes, d), m."""
@@ -260,14 +420,21 @@ class HoldLoads(Loads):
 
     def pull(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the force (m,), N, along each component that is given, at nodal values u (nodes, d), m."""
-        return self.data["stiffness"][:, 0] * (self.data["gap"][:, 0] - self._along(u))
+        way = self.data["stiffness"][:, 0] * (self.data["gap"][:, 0] - self._along(u))
+        return way + self._of.area * self._held(self.traction)
+
+    @property
+    def carried(self) -> NDArray[np.float64]:
+        """Forces (m,), N, with which iterations began."""
+        return self._of.area * self._begun
+
+    def gripped(self, at: At, points: MaterialPoints) -> MaterialPoints:
+        """Return the points with the tractions, from which the next step begins."""
+        return self._acting.gripped(self, points) if self.multiplies else points
 
     def counted(self, at: At) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return degrees of freedom (n,), and forces (n,), N, on them that reactions count."""
-        dofs = (
-            self._d * self.data.points.grid.cell_nodes[self.data.cells] + self.data["direction"].argmax(axis=1)[:, None]
-        )
-        return dofs.ravel(), (self.share * self.pull(at.nodal)[:, None]).ravel()
+        return self._dofs.ravel(), (self.share * self.pull(at.nodal)[:, None]).ravel()
 
     def guess(self, parts: Parts, nodal: NDArray[np.float64]) -> NDArray[np.float64] | None:
         """Return u with the rigid motions of the parts that given displacements turn; None where they turn none."""
