@@ -122,13 +122,13 @@ class GivenDisplacements(Acting):
                 message = f"{what}, where a wall holds it; must be 0 there, or the wall must leave it free"
         if message := first(comm, message):
             raise ValueError(message)
-        row, gap, traction, own, direction, kind = map(np.concatenate, zip(*placed, strict=True))
+        row, gap, reference, traction, own, direction, kind = map(np.concatenate, zip(*placed, strict=True))
         multipliers = Multipliers(self._grid, held, row, kind + held.number[row], HOLD)
         fields = {name: values[row] for name, values in held.moments.items()}
         fields |= {"stiffness": multipliers.stiffness * multipliers.area, "gap": gap, "direction": direction}
         forms = self._forms(HoldForms)
         data = forms.points.at(held.cell[row], held.x[row], np.ones(len(row)), **fields)
-        return HoldLoads(self, forms, data, held, row, own, multipliers, origin, traction, place.dt > 0)
+        return HoldLoads(self, forms, data, held, row, own, multipliers, origin, reference, traction, place.dt > 0)
 
     def _held_points(
         self, cut: CutDomains, points: MaterialPoints, t: float, ends: Sequence[float]
@@ -154,18 +154,18 @@ class GivenDisplacements(Acting):
             traction, gap = np.einsum("ij,njk,nk->ni", R, stress[at, :d, :d], p.area(points)), to - now
             before = points.data[traction_name(self._names[number])][p.at]
             begins = ~before.any(axis=1, keepdims=True)
-            traction = np.where(begins, traction / p.area0[:, None], before @ R.T)
+            traction = traction / p.area0[:, None]
+            before = np.where(begins, traction, before @ R.T)
             own = (p.area0 * v for v in (1, tension[at], resists[at]))
             each = np.stack([np.full(len(gap), number), *own], axis=1)
-            rows.append((p.cell, p.x, np.concatenate([each, gap, given, p.area(cut.points), traction, begins], axis=1)))
+            rows.append((p.cell, p.x, np.concatenate([each, gap, given, p.area(cut.points), traction, before], axis=1)))
         number = np.repeat(np.arange(len(patches)), [len(p.at) for p in patches])
         point, area = (np.concatenate([getattr(p, name) for p in patches]) for name in ("at", "area0"))
         where, x, values = (np.concatenate(column) for column in zip(*rows, strict=True))
         origin = Origin(Exchange(self._grid.comm, self._grid.owner(where)), point, number, area)
         where, x, values = map(origin.travel.send, (where, x, values))
         number, *own = values[:, :4].T
-        *fields, begins = np.split(values[:, 4:], [d, 3 * d, 4 * d, 5 * d], axis=1)
-        own = (*own, x, *fields, begins[:, 0])
+        own = (*own, x, *np.split(values[:, 4:], [d, 3 * d, 4 * d, 5 * d], axis=1))
         return HeldPoints(number.astype(np.int64), self._grid.local(where), *own), origin
 
     def kept(self, n: int) -> dict[str, dict[str, NDArray[np.float64]]]:
@@ -285,8 +285,8 @@ class HoldLoads(Loads):
         Of its force on each node, but for what walls bear.
     multipliers, origin
         Of the components; where their points come from.
-    traction : (m,), Pa
-        Theirs as iterations begin: the body's.
+    reference, traction : (m,), Pa
+        Tractions at rest, or else of the body; and those with which iterations begin.
     multiplies
         Whether tractions are found; else what holds gives way.
     """
@@ -303,6 +303,7 @@ class HoldLoads(Loads):
         share: NDArray[np.float64],
         multipliers: Multipliers,
         origin: Origin,
+        reference: NDArray[np.float64],
         traction: NDArray[np.float64],
         multiplies: bool,
     ):
@@ -314,6 +315,7 @@ class HoldLoads(Loads):
         self.share = share
         self._of = multipliers
         self.origin = origin
+        self._reference = reference
         self._begun = self._aimed = self.traction = traction
         self._change = np.zeros_like(traction)
         self._operator: Latest[PETSc.Mat] = Latest()
@@ -334,11 +336,11 @@ class HoldLoads(Loads):
     def push(self, at: At, residual: PETSc.Vec, on: Unknowns) -> None:
         """Take the forces of the tractions off; walls bear none of them: see `counted`."""
         if on is at.unknowns:
-            self._add(residual, on, -self._of.area * self._held(self.traction))
+            self._add(residual, on, -self._of.area * self._held())
 
-    def _held(self, traction: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _held(self) -> NDArray[np.float64]:
         """Return the tractions (m,), Pa, that act where gaps are zero."""
-        return traction - self._of.stiffness * self._of.jumps(traction)
+        return self.traction - self._of.stiffness * self._of.jumps(self.traction - self._reference)
 
     def _add(self, out: PETSc.Vec, unknowns: Unknowns, force: NDArray[np.float64]) -> None:
         """Add forces (m,), N, of the rows to those of the nodes."""
@@ -378,7 +380,7 @@ class HoldLoads(Loads):
 
     def drive(self, at: At, x: NDArray[np.float64], out: PETSc.Vec) -> None:
         """Add the forces on the nodes by which a change x of the forces, N, would drive the bodies."""
-        self._add(out, at.unknowns, self._of.area * self._held(x / self._of.area))
+        self._add(out, at.unknowns, x - self._of.stiffness * self._of.area * self._of.jumps(x / self._of.area))
 
     def response(self, at: At, x: NDArray[np.float64], v: PETSc.Vec) -> NDArray[np.float64]:
         """Return by how much less (m,), N, forces are to change after a change x of them and displacements v, m."""
@@ -406,11 +408,14 @@ class HoldLoads(Loads):
     def moved(self, u: fem.Function) -> Loads:
         """Return given displacements with the tractions of a displacement u, m, that bodies have at rest."""
         way = self._along(u.x.array.reshape(-1, self._d))
-        gap, traction = self.data["gap"][:, 0] - way, self.traction
+        gap, tractions = self.data["gap"][:, 0], (self._reference, self.traction)
         if self.multiplies:
-            gap = self.data["gap"][:, 0]
-            traction = traction - self.held.begins[self.row] * self._of.stiffness * way
-        more = self._of, self.origin, traction, self.multiplies
+            fresh = self.traction == self._reference
+            rest = self._reference - self._of.stiffness * way
+            tractions = rest, np.where(fresh, rest, self.traction)
+        else:
+            gap = gap - way
+        more = self._of, self.origin, *tractions, self.multiplies
         return HoldLoads(self._acting, self._forms, self.data.having(gap=gap), self.held, self.row, self.share, *more)
 
     def _along(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -421,7 +426,7 @@ class HoldLoads(Loads):
     def pull(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the force (m,), N, along each component that is given, at nodal values u (nodes, d), m."""
         way = self.data["stiffness"][:, 0] * (self.data["gap"][:, 0] - self._along(u))
-        return way + self._of.area * self._held(self.traction)
+        return way + self._of.area * self._held()
 
     @property
     def carried(self) -> NDArray[np.float64]:

@@ -35,8 +35,8 @@ class HeldPoints(NamedTuple):
     number, cell : (n,) condition, and local cell; area : (n,) reference area, m^(d-1); tension, resistance : (n,) norm
     of the stress when the grid was reset, and what resists, times area, N; x, gap : (n, d) position, and how far it is
     from where it is to be, m; given : (n, 2 d) given displacements at the start and the end of the step, m; normal :
-    (n, d) area vector when the grid was reset, m^(d-1); traction : (n, d), Pa, as the side turns it: that of the step
-    before, or at first the body's; begins : (n,) whether it is the body's.
+    (n, d) area vector when the grid was reset, m^(d-1); traction, before : (n, d), Pa, the body's, as the side turns it, and
+    that of the multipliers of the step before, or at first the body's.
     """
 
     number: NDArray[np.int64]
@@ -49,7 +49,7 @@ class HeldPoints(NamedTuple):
     given: NDArray[np.float64]
     normal: NDArray[np.float64]
     traction: NDArray[np.float64]
-    begins: NDArray[np.float64]
+    before: NDArray[np.float64]
 
 
 class HeldCells:
@@ -107,7 +107,7 @@ class HeldCells:
         # at the end of a side a node's force may come by a small part of a cell
         short = np.maximum(1.0, face / plane)
         self.limit = CARRIED * total(p.resistance + 10 * p.tension) * short
-        self._gap, self._traction, self.begins = gap, mean(p.traction), mean(p.begins)
+        self._gap, self._traction, self._before = gap, mean(p.traction), mean(p.before)
         self.of = at
         """Row (n,) of each point."""
         self._slope, self._along = slope, along
@@ -132,9 +132,9 @@ class HeldCells:
 
         Returns
         -------
-        Rows (k,), their gaps (k,), m, the tractions (k,) that the body has there, Pa, and the shares (k, 2^d) of their
-        forces that they have on each node, but for what the wall bears; of a row that walls hold and that has to move,
-        its index or -1.
+        Rows (k,), their gaps (k,), m, the tractions (k,), Pa, that the body has there, and that multipliers had, and the
+        shares (k, 2^d) of their forces that they have on each node, but for what the wall bears; of a row that walls
+        hold and that has to move, its index or -1.
         """
         grid, chosen = self.grid, np.flatnonzero(given[self.number])
         nodes, x, gap, N = (v[chosen] for v in (grid.cell_nodes[self.cell], self.x, self._gap[:, axis], self.shape))
@@ -154,7 +154,7 @@ class HeldCells:
         kept = ~self._held_beside(self.number[chosen], nodes, N, stuck & torn[:, None])
         gap = gap - (N * stuck * asked).sum(axis=1)
         own = N * ~(stuck & torn[:, None])
-        rows = (chosen, gap, self._traction[chosen, axis], own)
+        rows = (chosen, gap, self._traction[chosen, axis], self._before[chosen, axis], own)
         return *(values[kept] for values in rows), chosen[held][0] if held.any() else -1
 
     def _held_beside(
