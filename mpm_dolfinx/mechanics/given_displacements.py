@@ -21,7 +21,7 @@ from mpm_dolfinx.base.tolerances import EPSILON, NEAR, TINY
 from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.bodies.faces import Surface, face_vectors
 from mpm_dolfinx.conditions.acting import Acting, At, Loads, Place, Setting, Unmet
-from mpm_dolfinx.conditions.conditions import HOLD, Displacement, resistance
+from mpm_dolfinx.conditions.conditions import HOLD, Displacement, holding, resistance
 from mpm_dolfinx.conditions.sides import check_apart, everywhere, meeting
 from mpm_dolfinx.contact.history import Origin
 from mpm_dolfinx.contact.pairs import petsc_matrix
@@ -122,13 +122,15 @@ class GivenDisplacements(Acting):
                 message = f"{what}, where a wall holds it; must be 0 there, or the wall must leave it free"
         if message := first(comm, message):
             raise ValueError(message)
-        row, gap, reference, traction, own, direction, kind = map(np.concatenate, zip(*placed, strict=True))
-        multipliers = Multipliers(self._grid, held, row, kind + held.number[row], HOLD)
+        row, stiffness, gap, traction, own, direction, kind = map(np.concatenate, zip(*placed, strict=True))
+        multipliers = Multipliers(self._grid, held, row, kind + held.number[row])
         fields = {name: values[row] for name, values in held.moments.items()}
-        fields |= {"stiffness": multipliers.stiffness * multipliers.area, "gap": gap, "direction": direction}
+        fields |= {"stiffness": stiffness, "gap": gap, "direction": direction}
         forms = self._forms(HoldForms)
         data = forms.points.at(held.cell[row], held.x[row], np.ones(len(row)), **fields)
-        return HoldLoads(self, forms, data, held, row, own, multipliers, origin, reference, traction, place.dt > 0)
+        traction = traction[multipliers.rows]
+        more = multipliers, origin, 0 * traction, traction, place.dt > 0
+        return HoldLoads(self, forms, data, held, row, own, *more)
 
     def _held_points(
         self, cut: CutDomains, points: MaterialPoints, t: float, ends: Sequence[float]
@@ -143,7 +145,7 @@ class GivenDisplacements(Acting):
         cut_points = cut.points if ends else points  # which are where they were cut
         now, before = (of.map(lambda values: values[chosen]) for of in (points, cut_points))
         stress = self._materials.total_stress(now)
-        resists = self._materials.table(before, resistance)
+        modulus, resists = (self._materials.table(before, of) for of in (holding, resistance))
         # of when the grid was reset, as the stiffnesses: they stay as long as the cut serves
         tension = np.linalg.norm(stress if points is cut_points else self._materials.total_stress(before), axis=(1, 2))
         for number, ((hold, *_, axes), p) in enumerate(zip(self._holds, patches, strict=True)):
@@ -151,21 +153,18 @@ class GivenDisplacements(Acting):
             given = [self._given(hold, time, p.X) for time in (t, *ends)] if ends else 3 * [np.zeros_like(now)]
             to, given = p.origin(points) + given[0], np.concatenate(given[1:], axis=1)
             R = turned(self._grid.comm, p.area0, now, to) if len(axes) == d else np.eye(d)  # as what it carries does
-            traction, gap = np.einsum("ij,njk,nk->ni", R, stress[at, :d, :d], p.area(points)), to - now
-            before = points.data[traction_name(self._names[number])][p.at]
-            begins = ~before.any(axis=1, keepdims=True)
-            traction = traction / p.area0[:, None]
-            before = np.where(begins, traction, before @ R.T)
-            own = (p.area0 * v for v in (1, tension[at], resists[at]))
+            force, gap = np.einsum("ij,njk,nk->ni", R, stress[at, :d, :d], p.area(points)), to - now
+            before = points.data[traction_name(self._names[number])][p.at] @ R.T
+            own = (p.area0 * v for v in (1, modulus[at], tension[at], resists[at]))
             each = np.stack([np.full(len(gap), number), *own], axis=1)
-            rows.append((p.cell, p.x, np.concatenate([each, gap, given, p.area(cut.points), traction, before], axis=1)))
+            rows.append((p.cell, p.x, np.concatenate([each, gap, given, p.area(cut.points), force, before], axis=1)))
         number = np.repeat(np.arange(len(patches)), [len(p.at) for p in patches])
         point, area = (np.concatenate([getattr(p, name) for p in patches]) for name in ("at", "area0"))
         where, x, values = (np.concatenate(column) for column in zip(*rows, strict=True))
         origin = Origin(Exchange(self._grid.comm, self._grid.owner(where)), point, number, area)
         where, x, values = map(origin.travel.send, (where, x, values))
-        number, *own = values[:, :4].T
-        own = (*own, x, *np.split(values[:, 4:], [d, 3 * d, 4 * d, 5 * d], axis=1))
+        number, *own = values[:, :5].T
+        own = (*own, x, *np.split(values[:, 5:], [d, 3 * d, 4 * d, 5 * d], axis=1))
         return HeldPoints(number.astype(np.int64), self._grid.local(where), *own), origin
 
     def kept(self, n: int) -> dict[str, dict[str, NDArray[np.float64]]]:
@@ -175,8 +174,8 @@ class GivenDisplacements(Acting):
     def gripped(self, loads: HoldLoads, points: MaterialPoints) -> MaterialPoints:
         """Return the points with their tractions."""
         origin = loads.origin
-        traction = np.zeros((len(loads.held.number), self._grid.dim))
-        traction[loads.row, loads.data["direction"].argmax(axis=1)] = loads.traction
+        traction = np.zeros((loads.held.means, self._grid.dim))
+        traction[loads.firm] = loads.traction
         more, data = origin.travel.back(traction[loads.held.of]), dict(points.data)
         for number, name in enumerate(self._names):
             rows = np.flatnonzero(origin.number == number)
@@ -244,7 +243,7 @@ class GivenDisplacements(Acting):
 
 
 class Multipliers:
-    """What tractions (m,), Pa, of rows of `HeldCells` do to the gaps.
+    """What tractions of means do to the gaps.
 
     Parameters
     ----------
@@ -252,16 +251,20 @@ class Multipliers:
         Where they are.
     row, kind : (m,)
         Which of it each component is, and its condition and axis, in one number: see `Jumps`.
-    hold
-        Stiffness in the tangent, in units of (what resists) / (cell size).
+
+    Attributes
+    ----------
+    rows, area, stiffness : (k,)
+        Those of the components that are means; area, m^(d-1), and stiffness in the tangent, Pa/m.
     """
 
-    def __init__(self, grid: Grid, held: HeldCells, row: NDArray[np.int64], kind: NDArray[np.int64], hold: float):
-        self.area = held.area[row]
-        self._compliance = held.compliance[row]
-        self._jumps = Jumps(grid, kind, held.cell[row])
-        self.stiffness = hold / grid.h.min() * held.resists[row]
-        """Pa/m."""
+    def __init__(self, grid: Grid, held: HeldCells, row: NDArray[np.int64], kind: NDArray[np.int64]):
+        self.rows = np.flatnonzero(row < held.means)
+        of = row[self.rows]
+        self.area = held.area[of]
+        self.stiffness = HOLD / grid.h.min() * held.resists[of]
+        self._compliance = held.compliance[of]
+        self._jumps = Jumps(grid, kind[self.rows], held.cell[of])
 
     def jumps(self, traction: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return J of tractions, m."""
@@ -285,8 +288,8 @@ class HoldLoads(Loads):
         Of its force on each node, but for what walls bear.
     multipliers, origin
         Of the components; where their points come from.
-    reference, traction : (m,), Pa
-        Tractions at rest, or else of the body; and those with which iterations begin.
+    reference, traction : (k,), Pa
+        Of the multipliers, beyond what the body's stress bears: at rest, and as iterations begin.
     multiplies
         Whether tractions are found; else what holds gives way.
     """
@@ -339,29 +342,30 @@ class HoldLoads(Loads):
             self._add(residual, on, -self._of.area * self._held())
 
     def _held(self) -> NDArray[np.float64]:
-        """Return the tractions (m,), Pa, that act where gaps are zero."""
+        """Return the tractions (k,), Pa, that act where gaps are zero."""
         return self.traction - self._of.stiffness * self._of.jumps(self.traction - self._reference)
 
     def _add(self, out: PETSc.Vec, unknowns: Unknowns, force: NDArray[np.float64]) -> None:
-        """Add forces (m,), N, of the rows to those of the nodes."""
+        """Add forces (k,), N, of the means to those of the nodes."""
         B = self._means(unknowns)
         B.multTransposeAdd(self._vector(B, force), out, out)
 
     def _vector(self, B: PETSc.Mat, values: NDArray[np.float64]) -> PETSc.Vec:
-        """Return a vector of the rows."""
+        """Return a vector of the means."""
         out = B.createVecLeft()
         out.array_w[:] = values
         return out
 
     def _means(self, unknowns: Unknowns) -> PETSc.Mat:
-        """Return the matrix that makes the means (m,) of the unknowns."""
+        """Return the matrix that makes the means (k,) of the unknowns."""
+        rows = self._of.rows
 
         def make() -> PETSc.Mat:
-            column = unknowns.map.indices[self._dofs]
+            column = unknowns.map.indices[self._dofs[rows]]
             free = column >= 0
-            row = np.broadcast_to(np.arange(len(self.row))[:, None], column.shape)
-            entries = (self.held.shape[self.row][free], (row[free], column[free]))
-            shape = (len(self.row), max(1, unknowns.global_size))
+            row = np.broadcast_to(np.arange(len(rows))[:, None], column.shape)
+            entries = (self.held.shape[self.row[rows]][free], (row[free], column[free]))
+            shape = (len(rows), max(1, unknowns.global_size))
             return petsc_matrix(scipy.sparse.csr_matrix(entries, shape=shape), unknowns.size, unknowns.comm)
 
         return self._operator(unknowns, make, unknowns.comm)
@@ -373,21 +377,25 @@ class HoldLoads(Loads):
         return self._d * self.data.points.grid.cell_nodes[self.data.cells] + axis[:, None]
 
     def unmet(self, at: At) -> Unmet:
-        """Return the forces by which tractions are to change at u."""
-        off = self.pull(at.nodal) - self._of.area * self.traction
-        unknown = 4 * EPSILON * self.data.points.grid.reach * self.data["stiffness"][:, 0]
-        return Unmet(off, unknown, self.data.cells.astype(np.int64))
+        """Return the forces by which the means are to change at u."""
+        rows = self._of.rows
+        stiffness = self.data["stiffness"][rows, 0]
+        off = stiffness * (self.data["gap"][:, 0] - self._along(at.nodal))[rows]
+        off -= self._of.area * (self.traction - self._held())
+        unknown = 4 * EPSILON * self.data.points.grid.reach * stiffness
+        return Unmet(off, unknown, self.data.cells[rows].astype(np.int64))
 
     def drive(self, at: At, x: NDArray[np.float64], out: PETSc.Vec) -> None:
         """Add the forces on the nodes by which a change x of the forces, N, would drive the bodies."""
         self._add(out, at.unknowns, x - self._of.stiffness * self._of.area * self._of.jumps(x / self._of.area))
 
     def response(self, at: At, x: NDArray[np.float64], v: PETSc.Vec) -> NDArray[np.float64]:
-        """Return by how much less (m,), N, forces are to change after a change x of them and displacements v, m."""
-        return self.data["stiffness"][:, 0] * (self._moved_by(at, v) + self._of.jumps(x / self._of.area))
+        """Return by how much less (k,), N, forces are to change after a change x of them and displacements v, m."""
+        apart = self._moved_by(at, v) + self._of.jumps(x / self._of.area)
+        return self._of.area * self._of.stiffness * apart
 
     def _moved_by(self, at: At, v: PETSc.Vec) -> NDArray[np.float64]:
-        """Return displacements (m,), m, of the components that are given."""
+        """Return the means (k,), m, of displacements v."""
         B = self._means(at.unknowns)
         out = B.createVecLeft()
         B.mult(v, out)
@@ -398,7 +406,7 @@ class HoldLoads(Loads):
         self._aimed, self._change = self.traction, x / self._of.area
 
     def go(self, shares: NDArray[np.float64]) -> None:
-        """Change the tractions by shares (m,) of that."""
+        """Change the tractions by shares (k,) of that."""
         self.traction = self._aimed + shares * self._change
 
     def restart(self) -> None:
@@ -408,13 +416,12 @@ class HoldLoads(Loads):
     def moved(self, u: fem.Function) -> Loads:
         """Return given displacements with the tractions of a displacement u, m, that bodies have at rest."""
         way = self._along(u.x.array.reshape(-1, self._d))
-        gap, tractions = self.data["gap"][:, 0], (self._reference, self.traction)
+        gap, tractions = self.data["gap"][:, 0] - way, (self._reference, self.traction)
         if self.multiplies:
-            fresh = self.traction == self._reference
-            rest = self._reference - self._of.stiffness * way
-            tractions = rest, np.where(fresh, rest, self.traction)
-        else:
-            gap = gap - way
+            rows = self._of.rows
+            gap[rows] += way[rows]
+            rest = -self._of.stiffness * way[rows]
+            tractions = rest, np.where(self.traction == 0, rest, self.traction)
         more = self._of, self.origin, *tractions, self.multiplies
         return HoldLoads(self._acting, self._forms, self.data.having(gap=gap), self.held, self.row, self.share, *more)
 
@@ -425,17 +432,26 @@ class HoldLoads(Loads):
 
     def pull(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the force (m,), N, along each component that is given, at nodal values u (nodes, d), m."""
-        way = self.data["stiffness"][:, 0] * (self.data["gap"][:, 0] - self._along(u))
-        return way + self._of.area * self._held()
+        force = self.data["stiffness"][:, 0] * (self.data["gap"][:, 0] - self._along(u))
+        force[self._of.rows] += self._of.area * self._held()
+        return force
 
     @property
     def carried(self) -> NDArray[np.float64]:
-        """Forces (m,), N, with which iterations began."""
-        return self._of.area * self._begun
+        """Forces (m,), N, of the multipliers as iterations began."""
+        out = np.zeros(len(self.row))
+        out[self._of.rows] = self._of.area * self._begun
+        return out
 
     def gripped(self, at: At, points: MaterialPoints) -> MaterialPoints:
         """Return the points with the tractions, from which the next step begins."""
         return self._acting.gripped(self, points) if self.multiplies else points
+
+    @property
+    def firm(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Rows of means (k,), and axes (k,), of the multipliers."""
+        rows = self._of.rows
+        return self.row[rows], self.data["direction"][rows].argmax(axis=1)
 
     def counted(self, at: At) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return degrees of freedom (n,), and forces (n,), N, on them that reactions count."""

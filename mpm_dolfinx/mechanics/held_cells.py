@@ -21,9 +21,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.tolerances import NEAR
+from mpm_dolfinx.conditions.conditions import HOLD, WEAK
 from mpm_dolfinx.grid.grid import Grid, among, sum_by
 from mpm_dolfinx.parallel.exchange import Exchange, over_all
 
+ALIGNED = 1e-2
+"""Slope of a side in a cell to an axis below which its cells can follow it, whatever they keep their volume."""
+EVERYWHERE = 1e2
+"""Stiffness of what holds each point of such a side across it, in units of (what resists) / (cell size).
+
+Plateau (soil): halved 2.2e-05, doubled 1.7e-05, cells 3.0e-02.
+"""
 JUMP = 0.01
 """Compliance of J, in units of (cell size) / (what resists)."""
 CARRIED = 0.3  # change of traction in a step, in units of what resists and stress: no body's stress changes so much
@@ -32,28 +40,29 @@ CARRIED = 0.3  # change of traction in a step, in units of what resists and stre
 class HeldPoints(NamedTuple):
     """Points of integration on sides with given displacements; arrays over n points in owned cells.
 
-    number, cell : (n,) condition, and local cell; area : (n,) reference area, m^(d-1); tension, resistance : (n,) norm
-    of the stress when the grid was reset, and what resists, times area, N; x, gap : (n, d) position, and how far it is
-    from where it is to be, m; given : (n, 2 d) given displacements at the start and the end of the step, m; normal :
-    (n, d) area vector when the grid was reset, m^(d-1); traction, before : (n, d), Pa, the body's, as the side turns it, and
-    that of the multipliers of the step before, or at first the body's.
+    number, cell : (n,) condition, and local cell; area : (n,) reference area, m^(d-1); modulus, tension, resistance :
+    (n,) modulus to hold with, norm of the stress when the grid was reset, and what resists, times area, N; x, gap :
+    (n, d) position, and how far it is from where it is to be, m; given : (n, 2 d) given displacements at the start and
+    the end of the step, m; normal : (n, d) area vector when the grid was reset, m^(d-1); force : (n, d) of the body's
+    present stress, as the side turns it, N; before : (n, d) tractions of the multipliers of the step before, Pa.
     """
 
     number: NDArray[np.int64]
     cell: NDArray[np.int32]
     area: NDArray[np.float64]
+    modulus: NDArray[np.float64]
     tension: NDArray[np.float64]
     resistance: NDArray[np.float64]
     x: NDArray[np.float64]
     gap: NDArray[np.float64]
     given: NDArray[np.float64]
     normal: NDArray[np.float64]
-    traction: NDArray[np.float64]
+    force: NDArray[np.float64]
     before: NDArray[np.float64]
 
 
 class HeldCells:
-    """What holds given displacements: rows of means, one a condition and cell.
+    """What holds given displacements: rows of means, one a condition and cell, and after these one a point.
 
     Parameters
     ----------
@@ -67,6 +76,10 @@ class HeldCells:
     number, cell, x, shape, moments
         Of each row: condition, cell, mean position (m), mean shape functions, means of products of
         the components of the offset from the cell's midpoint.
+    stiffness
+        Of each row by component, N/m: of means in the tangent only.
+    means
+        How many rows of means there are; of each:
     area, resists, compliance, limit
         Area, m^(d-1); what resists, Pa; J of a difference of one, m/Pa; and change of the force beyond which it is an
         artefact, N.
@@ -86,6 +99,9 @@ class HeldCells:
             each = (slice(None), *(None,) * (values.ndim - 1))
             return total(p.area[each] * values) / whole[each]
 
+        def both(means: NDArray, values: NDArray) -> NDArray:
+            return np.concatenate([means, values])
+
         x = mean(p.x)
         gap = mean(p.gap)
         normal = total(p.normal)
@@ -95,23 +111,31 @@ class HeldCells:
         slopes = (mean(off[:, :, None] * (v - m[at])[:, None, :]) / spread for v, m in ((p.gap, gap), (p.given, given)))
         slope, rise = slopes
         along = 2 * normal**2 <= (normal**2).sum(axis=1, keepdims=True)
-        self.number, self.cell = np.divmod(key, grid.num_local)
-        self.x, self.shape = x, mean(N)
+        self.means = len(key)
+        self.number, self.cell = both(key // grid.num_local, p.number), both(key % grid.num_local, p.cell)
+        self.x, self.shape = both(x, p.x), both(mean(N), N)
         self.area, self.resists = whole, total(p.resistance) / whole
         local = p.x - grid.midpoints[p.cell]
         moments = {"squares": local[:, :, None] * local[:, None, :], "product": local.prod(axis=1)}
-        self.moments = {name: mean(values) for name, values in moments.items()}
+        self.moments = {name: both(mean(values), values) for name, values in moments.items()}
+        against = p.modulus + 10 * p.tension  # a stressed side buckles if it is held with less than its stress
+        flat = normal**2 > (1 - ALIGNED**2) * (normal**2).sum(axis=1, keepdims=True)
+        each = np.where(flat[at], EVERYWHERE * p.resistance[:, None], WEAK * against[:, None])
+        firm = HOLD * np.tile(total(p.resistance)[:, None], grid.dim)
+        self.stiffness = both(firm, each) / grid.h.min()
         face = grid.cell_volume / grid.h.max()
         plane = whole / grid.around(x)
         self.compliance = JUMP * grid.h.min() * face / (self.resists * plane)
         # at the end of a side a node's force may come by a small part of a cell
         short = np.maximum(1.0, face / plane)
         self.limit = CARRIED * total(p.resistance + 10 * p.tension) * short
-        self._gap, self._traction, self._before = gap, mean(p.traction), mean(p.before)
         self.of = at
-        """Row (n,) of each point."""
-        self._slope, self._along = slope, along
-        self._given, self._rise = given, rise
+        """Row (n,) of means of each point."""
+        self._gap, self._force = both(gap, p.gap), both(0 * gap, p.force)
+        self._before = both(mean(p.before), 0 * p.before)
+        self._slope, self._along = both(slope, slope[at]), both(along, along[at])
+        self._given, self._rise = both(given, given[at]), both(rise, rise[at])
+        self._x = both(x, x[at])
 
     def rows(self, axis: int, given: NDArray[np.bool_], free: NDArray[np.bool_]) -> tuple:
         """Return which rows give a component, their gaps (k,), m, with what their force makes of them; what is refused.
@@ -132,9 +156,9 @@ class HeldCells:
 
         Returns
         -------
-        Rows (k,), their gaps (k,), m, the tractions (k,), Pa, that the body has there, and that multipliers had, and the
-        shares (k, 2^d) of their forces that they have on each node, but for what the wall bears; of a row that walls
-        hold and that has to move, its index or -1.
+        Rows (k,), their stiffnesses (k,), N/m, and gaps (k,), m, the tractions (k,), Pa, of their multipliers in the step
+        before, and the shares (k, 2^d) of their forces that they have on each node, but for what the wall bears; of a
+        row that walls hold and that has to move, its index or -1.
         """
         grid, chosen = self.grid, np.flatnonzero(given[self.number])
         nodes, x, gap, N = (v[chosen] for v in (grid.cell_nodes[self.cell], self.x, self._gap[:, axis], self.shape))
@@ -149,12 +173,13 @@ class HeldCells:
                 at_wall = (walled[:, here].all(axis=1) & self._along[chosen, b])[:, None] & here
                 asked += at_wall * ((grid.node_x[nodes, b] - x[:, b, None]) * self._slope[chosen, b, axis, None])
                 stuck |= at_wall
-                there = moved + rise[:, b] * (grid.node_x[nodes, b] - self.x[chosen, b, None])[:, None]
+                there = moved + rise[:, b] * (grid.node_x[nodes, b] - self._x[chosen, b, None])[:, None]
                 torn |= (at_wall[:, None] & (np.abs(there) > np.abs(moved) / 2)).any(axis=(1, 2))
         kept = ~self._held_beside(self.number[chosen], nodes, N, stuck & torn[:, None])
-        gap = gap - (N * stuck * asked).sum(axis=1)
+        stiffness = self.stiffness[chosen, axis]
+        gap = gap - (N * stuck * asked).sum(axis=1) + self._force[chosen, axis] / stiffness
         own = N * ~(stuck & torn[:, None])
-        rows = (chosen, gap, self._traction[chosen, axis], self._before[chosen, axis], own)
+        rows = (chosen, stiffness, gap, self._before[chosen, axis], own)
         return *(values[kept] for values in rows), chosen[held][0] if held.any() else -1
 
     def _held_beside(
@@ -199,8 +224,8 @@ class HeldCells:
         row = row[asked]
         axis = axis[asked]
         force = force[asked]
-        limit = self.limit[row]
-        far = np.unique(self.number[row[np.abs(force) > limit]])
+        limit = np.append(self.limit, np.zeros(len(self.number) - self.means))[row]
+        far = np.unique(self.number[row[np.abs(force) > np.where(limit > 0, limit, np.inf)]])
         suspected = sorted({int(k) for numbers in comm.allgather(far) for k in numbers})
         if not suspected:
             return []
@@ -216,7 +241,7 @@ class HeldCells:
         on_nodes, most = (sum_by(at.ravel(), (N * v[:, None]).ravel(), size) for v in (force, limit))
         ratio = np.divide(np.abs(on_nodes), most, out=np.zeros(size), where=most > 0)
         net = (N * ratio[at]).sum(axis=1)
-        net = np.where(np.abs(force) > limit, net, 0.0)
+        net = np.where((np.abs(force) > limit) & (limit > 0), net, 0.0)
         worst = [np.where(number == k, net, 0.0).argmax() for k in suspected]
         return [(k, x[i]) for k, i in zip(suspected, worst, strict=True) if number[i] == k and net[i] > 1]
 

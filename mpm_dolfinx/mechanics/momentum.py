@@ -389,6 +389,7 @@ class MomentumProblem:
         self._varying = [one for one in loads if one.varies]
         self._multiplying = [one for one in loads if one.multiplies]
         self._part = np.empty(0, dtype=np.int64)
+        self._driven: PETSc.Vec | None = None
         with Timer("mpm: loads"):
             external, pulls = (
                 forms.summed(1 + room, [getattr(one, name) for one in loads])[system.touched]
@@ -452,8 +453,19 @@ class MomentumProblem:
     def aim(self, x: NDArray[np.float64]) -> None:
         """Let x be the change of multipliers, N, along which `go` goes."""
         self._part = self.unmet().part
+        self._driven = self.system.unknowns.vector()
+        self.drive(x, self._driven)
         for one, own in self._own(x):
             one.aim(self.at, own)
+
+    def work(self, v: PETSc.Vec, left: NDArray[np.float64] | float) -> NDArray[np.float64]:
+        """Return the work (parts,), J, of the residual along v, m, and of what multipliers drive in the rest of a step.
+
+        left: share (parts,) of the step that is left.
+        """
+        of = self.system.of_parts
+        work = of.sums(self.system.residual.array_r * v.array_r)
+        return work if self._driven is None else work - left * of.sums(self._driven.array_r * v.array_r)
 
     def go(self, steps: NDArray[np.float64]) -> None:
         """Change the multipliers of each part by its share (parts,) of that."""

@@ -437,7 +437,7 @@ class Newton:
         """Go against the direction, each part as far as `search` says; return the errors there."""
         self.report.newton += 1
         of = self._momentum.system.of_parts
-        first = self._work()
+        first = self._work(1.0)
         sign = np.where(first < 0, -1.0, 1.0) if not elastic else 1.0
         if not elastic and (first < 0).any():
             self._solvers.turn_round(first < 0)
@@ -451,7 +451,7 @@ class Newton:
             self._momentum.go(sign * steps)
             moved, (errors, why) = steps.copy(), self._tried(before)
             with _ignored():
-                growth, work = errors.each / before.each, self._work()
+                growth, work = errors.each / before.each, self._work(1 - steps)
             for part, search in list(searches.items()):
                 then = search.after(np.nan if why else _ratio(work[part], first[part]), growth[part])
                 if then is not None:
@@ -473,13 +473,12 @@ class Newton:
             away = np.where(before.each > self._scheme.tolerance, np.inf, before.each)
             return replace(before, u=away, p=away), failed
 
-    def _work(self) -> NDArray[np.float64]:
-        """Return the work (parts,), J, of both residuals along the direction.
+    def _work(self, left: NDArray[np.float64] | float) -> NDArray[np.float64]:
+        """Return the work (parts,), J, of both residuals along the direction, of which a share is left.
 
         That of the coupling cancels in their sum, so the tangent alone makes it: see `search`.
         """
-        system = self._momentum.system
-        work = system.of_parts.sums(system.residual.array_r * self._solvers.du.array_r)
+        work = self._momentum.work(self._solvers.du, left)
         if self._storage is None:
             return work
         system = self._storage.system
