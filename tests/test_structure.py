@@ -68,6 +68,8 @@ CHANGES = {
     ("Scene", "_looks"): "what is still to be warned of",
     ("StorageProblem", "_flowing"): "the active set of seepage faces",
     ("ContactProblem", "now"): "the pairs and tractions of contacts as they are held for a Newton step",
+    ("HoldLoads", "_now"): "the tractions of given displacements before and along a Newton step",
+    ("MomentumProblem", "_aim"): "what multipliers change by along a Newton step",
     ("Events", "_before"): "what events were before the step",
     ("Writer", "_lock"): "the folder's, let go of as it closes",
     ("Writer", "closed"): "whether it has been",

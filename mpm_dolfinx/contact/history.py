@@ -4,15 +4,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mpm_dolfinx.grid.grid import sum_by
-from mpm_dolfinx.parallel.exchange import Exchange
 from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.points.origin import Origin
 
 
 class Rough(Protocol):
@@ -57,33 +56,14 @@ def gripped(
     return replace(points, data={**points.data, **new}) if new else points
 
 
-@dataclass(frozen=True, eq=False)
-class Origin:
-    """Where pairs come from: their way to the owners of their cells, and of each (n,) before it the material point.
-
-    point : (n,) index on this process; number : (n,) contact; area : (n,), m^(d-1).
-    """
-
-    travel: Exchange
-    point: NDArray[np.int64]
-    number: NDArray[np.int64]
-    area: NDArray[np.float64]
-
-    def means(
-        self, contacts: Mapping[str, Rough], points: MaterialPoints, push: NDArray, shear: NDArray
-    ) -> MaterialPoints:
-        """Return the points with the means of the pressures (m,) and shear tractions (m, d), Pa, of their pairs."""
-        push = self.travel.back(push)
-        shear = self.travel.back(shear)
-        data = dict(points.data)
-        n = len(points)
-        for number, (name, contact) in enumerate(contacts.items()):
-            rows = np.flatnonzero(self.number == number)
-            at, area = self.point[rows], self.area[rows]
-            whole = sum_by(at, area, n)
-            whole[whole == 0] = 1.0
-            means = [sum_by(at, area * column, n) / whole for column in (push[rows], *shear[rows].T)]
-            data[pressure_name(name)] = means[0]
-            if contact.grips:
-                data[shear_name(name)] = np.stack(means[1:], axis=1)
-        return replace(points, data=data)
+def pressed(
+    contacts: Mapping[str, Rough], origin: Origin, points: MaterialPoints, push: NDArray, shear: NDArray
+) -> MaterialPoints:
+    """Return the points with the means of the pressures (m,) and shear tractions (m, d), Pa, of their pairs."""
+    data = dict(points.data)
+    means = origin.means(len(points), len(contacts), np.column_stack([push, shear]))
+    for (name, contact), values in zip(contacts.items(), means, strict=True):
+        data[pressure_name(name)] = values[:, 0]
+        if contact.grips:
+            data[shear_name(name)] = values[:, 1:]
+    return replace(points, data=data)

@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from mpi4py import MPI
 from petsc4py import PETSc
 
 import numpy as np
@@ -22,7 +21,7 @@ from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.conditions.sides import everywhere
 from mpm_dolfinx.contact.shapes import DISTANCE, Distance
 from mpm_dolfinx.contact.tool import Pose, Tool
-from mpm_dolfinx.forms.unknowns import Unknowns
+from mpm_dolfinx.forms.unknowns import Unknowns, petsc_matrix
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.parallel.exchange import Exchange
 
@@ -179,16 +178,6 @@ def at_nodes(
     kept = column >= 0
     shape, own = (m, max(1, unknowns.global_size)), (row[kept], column[kept])
     return petsc_matrix(scipy.sparse.csr_matrix((value[kept], own), shape=shape), unknowns.size, grid.comm)
-
-
-def petsc_matrix(rows: scipy.sparse.csr_matrix, columns: int, comm: MPI.Intracomm, own: bool = False) -> PETSc.Mat:
-    """Return a matrix of rows of this process, with so many columns of it; own: that have no entries in others."""
-    rows.sort_indices()  # as PETSc wants them
-    start = int(comm.exscan(columns) or 0) if own and comm.size > 1 else 0
-    csr = [values.astype(PETSc.IntType) for values in (rows.indptr, rows.indices + start)]
-    A = PETSc.Mat().createAIJ(((rows.shape[0], None), (columns, None)), csr=(*csr, rows.data), comm=comm)
-    A.assemble()
-    return A
 
 
 def _check_distance(tool: Tool, x: NDArray, gap: NDArray, n: NDArray, h: float) -> None:

@@ -32,12 +32,13 @@ from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.base.errors import NotConverged
 from mpm_dolfinx.base.tolerances import EPSILON, SAME
 from mpm_dolfinx.conditions.acting import At, Loads
-from mpm_dolfinx.contact.history import Origin
+from mpm_dolfinx.contact.history import pressed
 from mpm_dolfinx.contact.law import DEPTH, ROUNDS, ContactLaw, ContactState, Touch
-from mpm_dolfinx.contact.pairs import Geometry, Pairs, at_nodes, petsc_matrix
-from mpm_dolfinx.forms.unknowns import Unknowns
+from mpm_dolfinx.contact.pairs import Geometry, Pairs, at_nodes
+from mpm_dolfinx.forms.unknowns import Unknowns, petsc_matrix
 from mpm_dolfinx.parallel.exchange import Exchange, over_all
 from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.points.origin import Origin
 
 FOLLOWS = 8  # how often pairs are found at most in a step
 
@@ -377,7 +378,7 @@ class ContactProblem(Loads):
         """Return the points with the pressures and shear tractions that contacts have on them at u."""
         law, origin, *_ = self.now
         contacts = dict(zip(law.names, law.contacts, strict=True))
-        return origin.means(contacts, points, *law.tractions(self.found(at).touch))
+        return pressed(contacts, origin, points, *law.tractions(self.found(at).touch))
 
     def outcome(self, at: At) -> dict[str, dict[str, NDArray[np.float64]]]:
         """Return forces and moments (d + 1,), in 3D (6,), on the bodies, N and N m, and how far loads push tools, m."""

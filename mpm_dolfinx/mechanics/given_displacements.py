@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from itertools import combinations
+from typing import NamedTuple
 
 from petsc4py import PETSc
 
@@ -17,23 +18,22 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.caching import Latest
-from mpm_dolfinx.base.tolerances import EPSILON, NEAR, TINY
+from mpm_dolfinx.base.tolerances import EPSILON, NEAR
 from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.bodies.faces import Surface, face_vectors
 from mpm_dolfinx.conditions.acting import Acting, At, Loads, Place, Setting, Unmet
 from mpm_dolfinx.conditions.conditions import HOLD, Displacement, holding, resistance
 from mpm_dolfinx.conditions.sides import check_apart, everywhere, meeting
-from mpm_dolfinx.contact.history import Origin
-from mpm_dolfinx.contact.pairs import petsc_matrix
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointForm
-from mpm_dolfinx.forms.unknowns import Unknowns
+from mpm_dolfinx.forms.unknowns import Unknowns, petsc_matrix
 from mpm_dolfinx.grid.grid import Grid, sum_by
 from mpm_dolfinx.mechanics.held_cells import HeldCells, HeldPoints, Jumps
 from mpm_dolfinx.mechanics.rigid_motion import rigid_motion, turned
 from mpm_dolfinx.parallel.exchange import Exchange, first, over_all
 from mpm_dolfinx.parallel.messages import ConditionWarning, warn
 from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.points.origin import Origin
 from mpm_dolfinx.points.parts import Parts
 
 
@@ -173,17 +173,11 @@ class GivenDisplacements(Acting):
 
     def gripped(self, loads: HoldLoads, points: MaterialPoints) -> MaterialPoints:
         """Return the points with their tractions."""
-        origin = loads.origin
-        traction = np.zeros((loads.held.means, self._grid.dim))
+        traction = np.zeros((len(loads.held.area), self._grid.dim))
         traction[loads.firm] = loads.traction
-        more, data = origin.travel.back(traction[loads.held.of]), dict(points.data)
-        for number, name in enumerate(self._names):
-            rows = np.flatnonzero(origin.number == number)
-            at, area = origin.point[rows], origin.area[rows]
-            whole = np.maximum(sum_by(at, area, len(points)), TINY)
-            means = [sum_by(at, area * column, len(points)) / whole for column in more[rows].T]
-            data[traction_name(name)] = np.stack(means, axis=1)
-        return replace(points, data=data)
+        means = loads.origin.means(len(points), len(self._names), traction[loads.held.of])
+        new = {traction_name(name): values for name, values in zip(self._names, means, strict=True)}
+        return replace(points, data={**points.data, **new})
 
     def _check_meeting(self, t: float) -> None:
         """Refuse given displacements that differ where they meet: no body's stress is finite there."""
@@ -259,7 +253,7 @@ class Multipliers:
     """
 
     def __init__(self, grid: Grid, held: HeldCells, row: NDArray[np.int64], kind: NDArray[np.int64]):
-        self.rows = np.flatnonzero(row < held.means)
+        self.rows = np.flatnonzero(row < len(held.area))
         of = row[self.rows]
         self.area = held.area[of]
         self.stiffness = HOLD / grid.h.min() * held.resists[of]
@@ -269,6 +263,14 @@ class Multipliers:
     def jumps(self, traction: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return J of tractions, m."""
         return self._compliance * self._jumps(traction)
+
+
+class Tractions(NamedTuple):
+    """Tractions (k,), Pa: those at present, and before a Newton step; and its change."""
+
+    present: NDArray[np.float64]
+    before: NDArray[np.float64]
+    change: NDArray[np.float64]
 
 
 class HoldLoads(Loads):
@@ -319,8 +321,7 @@ class HoldLoads(Loads):
         self._of = multipliers
         self.origin = origin
         self._reference = reference
-        self._begun = self._aimed = self.traction = traction
-        self._change = np.zeros_like(traction)
+        self._begun = self._now = Tractions(traction, traction, np.zeros_like(traction))
         self._operator: Latest[PETSc.Mat] = Latest()
         self.multiplies = multiplies
         self._d = data.points.grid.dim
@@ -401,17 +402,22 @@ class HoldLoads(Loads):
         B.mult(v, out)
         return out.array_r.copy()
 
+    @property
+    def traction(self) -> NDArray[np.float64]:
+        """Tractions (k,), Pa, of the multipliers at present."""
+        return self._now.present
+
     def aim(self, at: At, x: NDArray[np.float64]) -> None:
         """Let x be the change of the forces, N, along which `go` goes."""
-        self._aimed, self._change = self.traction, x / self._of.area
+        self._now = Tractions(self.traction, self.traction, x / self._of.area)
 
     def go(self, shares: NDArray[np.float64]) -> None:
         """Change the tractions by shares (k,) of that."""
-        self.traction = self._aimed + shares * self._change
+        self._now = self._now._replace(present=self._now.before + shares * self._now.change)
 
     def restart(self) -> None:
         """Set the tractions to where iterations began."""
-        self.traction = self._begun
+        self._now = self._begun
 
     def moved(self, u: fem.Function) -> Loads:
         """Return given displacements with the tractions of a displacement u, m, that bodies have at rest."""
@@ -440,7 +446,7 @@ class HoldLoads(Loads):
     def carried(self) -> NDArray[np.float64]:
         """Forces (m,), N, of the multipliers as iterations began."""
         out = np.zeros(len(self.row))
-        out[self._of.rows] = self._of.area * self._begun
+        out[self._of.rows] = self._of.area * self._begun.present
         return out
 
     def gripped(self, at: At, points: MaterialPoints) -> MaterialPoints:

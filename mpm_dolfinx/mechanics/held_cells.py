@@ -3,7 +3,7 @@
 
 A Q1 field cannot follow a side at more places than it has nodes for: held at each of them, sides that are curved or lie
 aslant to the grid would lock.  The multiplier t is the traction, one a condition, cell and component: an unknown of the
-step, see `solve.multipliers`.  With the gap g of the mean to where it is to be,
+step, see `schur`.  With the gap g of the mean to where it is to be,
 
     g = J t,
 
@@ -78,10 +78,8 @@ class HeldCells:
         the components of the offset from the cell's midpoint.
     stiffness
         Of each row by component, N/m: of means in the tangent only.
-    means
-        How many rows of means there are; of each:
     area, resists, compliance, limit
-        Area, m^(d-1); what resists, Pa; J of a difference of one, m/Pa; and change of the force beyond which it is an
+        Of means only: area, m^(d-1); what resists, Pa; J of a difference of one, m/Pa; and change of the force beyond which it is an
         artefact, N.
     """
 
@@ -111,7 +109,6 @@ class HeldCells:
         slopes = (mean(off[:, :, None] * (v - m[at])[:, None, :]) / spread for v, m in ((p.gap, gap), (p.given, given)))
         slope, rise = slopes
         along = 2 * normal**2 <= (normal**2).sum(axis=1, keepdims=True)
-        self.means = len(key)
         self.number, self.cell = both(key // grid.num_local, p.number), both(key % grid.num_local, p.cell)
         self.x, self.shape = both(x, p.x), both(mean(N), N)
         self.area, self.resists = whole, total(p.resistance) / whole
@@ -156,9 +153,9 @@ class HeldCells:
 
         Returns
         -------
-        Rows (k,), their stiffnesses (k,), N/m, and gaps (k,), m, the tractions (k,), Pa, of their multipliers in the step
-        before, and the shares (k, 2^d) of their forces that they have on each node, but for what the wall bears; of a
-        row that walls hold and that has to move, its index or -1.
+        Rows (k,), their stiffnesses (k,), N/m, and gaps (k,), m, the tractions (k,), Pa, of their multipliers in the
+        step before, and the shares (k, 2^d) of their forces that they have on each node, but for what the wall bears;
+        of a row that walls hold and that has to move, its index or -1.
         """
         grid, chosen = self.grid, np.flatnonzero(given[self.number])
         nodes, x, gap, N = (v[chosen] for v in (grid.cell_nodes[self.cell], self.x, self._gap[:, axis], self.shape))
@@ -224,7 +221,7 @@ class HeldCells:
         row = row[asked]
         axis = axis[asked]
         force = force[asked]
-        limit = np.append(self.limit, np.zeros(len(self.number) - self.means))[row]
+        limit = np.append(self.limit, np.zeros(len(self.number) - len(self.area)))[row]
         far = np.unique(self.number[row[np.abs(force) > np.where(limit > 0, limit, np.inf)]])
         suspected = sorted({int(k) for numbers in comm.allgather(far) for k in numbers})
         if not suspected:

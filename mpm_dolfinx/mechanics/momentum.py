@@ -388,8 +388,7 @@ class MomentumProblem:
         self._tolerance = tolerance
         self._varying = [one for one in loads if one.varies]
         self._multiplying = [one for one in loads if one.multiplies]
-        self._part = np.empty(0, dtype=np.int64)
-        self._driven: PETSc.Vec | None = None
+        self._aim: tuple[NDArray[np.int64], PETSc.Vec] | None = None
         with Timer("mpm: loads"):
             external, pulls = (
                 forms.summed(1 + room, [getattr(one, name) for one in loads])[system.touched]
@@ -452,9 +451,9 @@ class MomentumProblem:
 
     def aim(self, x: NDArray[np.float64]) -> None:
         """Let x be the change of multipliers, N, along which `go` goes."""
-        self._part = self.unmet().part
-        self._driven = self.system.unknowns.vector()
-        self.drive(x, self._driven)
+        driven = self.system.unknowns.vector()
+        self.drive(x, driven)
+        self._aim = self.unmet().part, driven
         for one, own in self._own(x):
             one.aim(self.at, own)
 
@@ -465,12 +464,12 @@ class MomentumProblem:
         """
         of = self.system.of_parts
         work = of.sums(self.system.residual.array_r * v.array_r)
-        return work if self._driven is None else work - left * of.sums(self._driven.array_r * v.array_r)
+        return work if self._aim is None else work - left * of.sums(self._aim[1].array_r * v.array_r)
 
     def go(self, steps: NDArray[np.float64]) -> None:
         """Change the multipliers of each part by its share (parts,) of that."""
         if self.multiplies:
-            for one, own in self._own(steps[self._part]):
+            for one, own in self._own(steps[self._aim[0]]):
                 one.go(own)
 
     def restart(self) -> None:

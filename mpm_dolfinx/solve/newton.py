@@ -39,8 +39,7 @@ from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.parts import relative
 from mpm_dolfinx.solve.linear import negative_pivots
-from mpm_dolfinx.solve.multipliers import solved_with
-from mpm_dolfinx.solve.schur import Kept, LinearSolvers
+from mpm_dolfinx.solve.schur import Kept, LinearSolvers, solved_with
 from mpm_dolfinx.solve.search import FIRM, Halving, Search
 
 ACC = float(os.environ.get("ACC", "1e-3"))

@@ -7,6 +7,15 @@
 du is eliminated: S = C + B K^-1 B^T is solved with by conjugate gradients (or FGMRES), preconditioned with the
 fixed-stress operator.  Of large bodies both are solved for at once, see `monolithic`.
 
+Multipliers of surfaces are found beside both (`solved_with`).  With E how far they, x, are from what they are to be, K with
+surfaces stiff in it, and G x the forces by which a change of x would drive the bodies,
+
+    [ K  -B^T ] [du]     [R_u - G x]
+    [ B   C   ] [dp] = - [   R_p   ],          F(x, du) = E.
+
+F is linear, and nearly the identity where bodies give way more than what is stiff.  It is solved for x by GCR (Eisenstat,
+Elman and Schultz 1983); an iteration solves for du and dp once.
+
 PETSc's PCFIELDSPLIT with the same two solvers (full Schur factorisation) takes as many iterations, ends with the same
 digits, and takes 0.8 to 1 of the time of a solve.  It wants a copy of -B^T at each tangent, and fixed-stress iterations
 would still need the parts.
@@ -28,6 +37,7 @@ from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.flow.storage import FILTER, FluxSlope, StorageProblem, StorageSystem
 from mpm_dolfinx.mechanics.momentum import MomentumProblem, MomentumSystem
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
+from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.parallel.messages import ConditionWarning, warn
 from mpm_dolfinx.points.parts import OfParts
 from mpm_dolfinx.solve.linear import MOST, direct_solver, displacement_solver, factorise, solved
@@ -160,11 +170,6 @@ class LinearSolvers:
         if self._solve_s.getType() != kind:
             self._solve_s.setType(kind)
             self._solve_s.setGMRESRestart(MOST)
-
-    @property
-    def most(self) -> int:
-        """Most iterations of a solve."""
-        return MOST
 
     @property
     def schur(self) -> tuple[PETSc.Mat, PETSc.KSP]:
@@ -336,3 +341,75 @@ class LinearSolvers:
         """Return dp, solved for at fixed stress."""
         self._solve_s.solve(self._storage.residual, self.dp)
         return self.dp
+
+
+def solved_with(
+    solvers: LinearSolvers,
+    momentum: MomentumProblem,
+    storage: StorageProblem | None,
+    solve: Callable[[], int],
+    rtol: float,
+    idle: NDArray[np.bool_],
+) -> int:
+    """Solve for displacements, pressures and multipliers; return the iterations of `solve`.
+
+    Parameters
+    ----------
+    solvers
+        They hold the directions, against which (u, p) are to go.
+    momentum, storage
+        With the residuals.
+    solve
+        Solves for (u, p) with these; returns the iterations.
+    rtol
+        Share of what multipliers are off by, or change by, that is left.
+    idle : (parts,)
+        Which parts stay where they are.
+    """
+    count = solve()
+    if not momentum.multiplies:
+        return count
+    comm = momentum.forms.grid.comm
+
+    def dot(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+        return over_all(comm, float(a @ b))
+
+    def found() -> list[NDArray[np.float64]]:
+        return [vector.array_r.copy() for vector in directions]
+
+    unmet = momentum.unmet()
+    acts = ~np.append(idle, False)[unmet.part]
+    directions = [solvers.du] if storage is None else [solvers.du, solvers.dp]
+    residuals = [momentum.system.residual] if storage is None else [momentum.system.residual, storage.system.residual]
+    kept = [vector.array_r.copy() for vector in residuals]
+    total = found()
+    x = np.zeros(len(unmet.off))
+    before = acts * momentum.response(x, solvers.du)  # they go against it
+    left = acts * unmet.off + before
+    least = rtol**2 * (dot(unmet.off, unmet.off) + dot(before, before))
+    taken = []
+    while dot(left, left) > least and len(taken) < MOST:
+        change = left
+        for vector in residuals:
+            vector.set(0.0)
+        momentum.drive(change, residuals[0])
+        count += solve()
+        moved, nearer = found(), acts * momentum.response(change, solvers.du)
+        for other_change, other_moved, other_nearer in taken:
+            share = dot(nearer, other_nearer)
+            nearer = nearer - share * other_nearer
+            change = change - share * other_change
+            moved = [one - share * other for one, other in zip(moved, other_moved, strict=True)]
+        size = np.sqrt(dot(nearer, nearer))
+        if not size > 0:
+            break
+        taken.append((change / size, [one / size for one in moved], nearer / size))
+        change, moved, nearer = taken[-1]
+        share = dot(left, nearer)
+        x, left = x + share * change, left - share * nearer
+        total = [one - share * other for one, other in zip(total, moved, strict=True)]
+    for vectors, values in ((directions, total), (residuals, kept)):
+        for vector, each in zip(vectors, values, strict=True):
+            vector.array_w[:] = each
+    momentum.aim(x)
+    return count
