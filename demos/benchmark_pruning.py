@@ -190,6 +190,10 @@ PAIRS: dict[str, tuple[Make, Make]] = {
         lambda n: apart(n, conditions=[mpm.Contact(0, 1, friction=0.3)]),
     ),
     "inertia": (block, lambda n: block(n, inertia=True)),
+    "quiet side": (
+        lambda n: block(n, inertia=True),
+        lambda n: block(n, inertia=True, conditions=[mpm.Quiet("right")]),
+    ),
     "ghost penalty on all faces": (block, weighted),
     "damping of pressure jumps": (lambda n: conducting(n, mpm.Hencky), lambda n: conducting(n, Watched)),
     "damping of what yields": (lambda n: sealed_soil(n, yields=False), sealed_soil),

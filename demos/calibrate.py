@@ -3,7 +3,7 @@
 
 Each row is a scene of so many unknown displacements, stepped with the threshold moved so that either route is taken.
 Times are processor times of two steps, the least of --repeat turns.  The table stands in
-`mpm_dolfinx/solve/plan.py`.
+`mpm_dolfinx/solve/solver_choice.py`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from dataclasses import replace
 import common
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.solve import plan
+from mpm_dolfinx.solve import solver_choice as plan
 
 HUGE = 10**9
 STEPS = 2

@@ -122,16 +122,12 @@ def with_water(s: mpm.Simulation, bulk: float) -> mpm.Simulation:
     """
     soils, walls = s.scene.materials.materials, s.state.stage.conditions["walls"]
     other = mpm.Simulation(s.grid, s.bodies, soils, fluid=mpm.Fluid(bulk=bulk), walls=walls, conditions=s.conditions)
-    state, stay = replace(s.state, stage=other.state.stage), s.state.stay
-    if stay is not None:
-        share = min(1.0, bulk / 10 / max(np.abs(stay.pressure).max(), np.abs(stay.start).max(), 1e-300))
-        state = replace(state, stay=replace(stay, pressure=share * stay.pressure, start=share * stay.start))
-    else:
-        old = state.transported
-        share = min(1.0, bulk / 10 / max(np.abs(old.bounds).max(), 1e-300))
-        scaled = {name: share * getattr(old, name) for name in ("pressure", "slope", "bounds")}
-        state = replace(state, transported=replace(old, **scaled))
-    other.state = state
+    pieces = s.state.pieces
+    rows = {name: pieces.arrays[name] for name in ("pressure", "bounds", "of_cell", "start") if name in pieces.arrays}
+    share = min(1.0, bulk / 10 / max(1e-300, *(np.abs(values).max() for values in rows.values())))
+    rows |= {} if pieces.slope is None else {"slope": pieces.slope}
+    pieces = replace(pieces, **{name: share * values for name, values in rows.items()})
+    other.state = replace(s.state, stage=other.state.stage, pieces=pieces)
     return other
 
 
@@ -140,8 +136,8 @@ def linearise(s: mpm.Simulation, dt: float) -> System:
     start = step.set_up(s.scene, s.state, RAMP_STEP)
     momentum = balances(s.scene, start, start.acting[-1]).momentum
     matrices, pieces, contents = start.matrices, start.data.pieces, start.on_grid.contents
-    flow = matrices.flow(start.state, None, start.data, start.acting[-1].t)
-    storage = StorageProblem(s.scene.storage, matrices.storage, pieces, contents, flow, dt)
+    fed = matrices.flow(start.state, None, start.data, start.acting[-1].t)
+    storage = StorageProblem(s.scene.storage, matrices.storage, pieces, contents, *fed, dt)
     momentum.assemble_residual()
     storage.assemble_residual()
     solvers = matrices.solvers()

@@ -14,8 +14,7 @@ SI units throughout, or any that are consistent (`Fluid`).  Stress is positive i
 """
 
 from mpm_dolfinx.base import _environment  # noqa: F401 - first: it says what is missing
-from mpm_dolfinx.base.errors import LeftGrid, NotConverged
-from mpm_dolfinx.base.report import Report
+from mpm_dolfinx.base.errors import LeftGrid, NotConverged, Report
 from mpm_dolfinx.bodies.bodies import Body, mapped
 from mpm_dolfinx.bodies.boxes import box, shape
 from mpm_dolfinx.bodies.mesh_files import from_mesh
@@ -28,14 +27,18 @@ from mpm_dolfinx.conditions.conditions import (
     Inflow,
     OnSide,
     Pressure,
+    Quiet,
     RigidPlate,
     Source,
+    Through,
     Traction,
 )
+from mpm_dolfinx.conditions.record import Record
 from mpm_dolfinx.conditions.water import water
 from mpm_dolfinx.contact.groups import Contact
 from mpm_dolfinx.contact.shapes import Ball, Cone, Convex, HalfSpace, Shape
 from mpm_dolfinx.contact.tool import Pose, Tool
+from mpm_dolfinx.flow.feeding import Feeding, Feeds, Leaving
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.io.checkpoint import Checkpoint, resume
 from mpm_dolfinx.io.one_file import one_file
@@ -87,6 +90,8 @@ __all__ = [
     "Drained",
     "DruckerPrager",
     "ElementTest",
+    "Feeding",
+    "Feeds",
     "Field",
     "Fluid",
     "GaveUp",
@@ -94,6 +99,7 @@ __all__ = [
     "HalfSpace",
     "Hencky",
     "Inflow",
+    "Leaving",
     "LeftGrid",
     "LinearElastic",
     "Loads",
@@ -109,6 +115,8 @@ __all__ = [
     "Pose",
     "Pressure",
     "Probes",
+    "Quiet",
+    "Record",
     "Report",
     "ResolutionWarning",
     "Result",
@@ -123,6 +131,7 @@ __all__ = [
     "Source",
     "State",
     "Tangent",
+    "Through",
     "Tool",
     "Traction",
     "Writer",

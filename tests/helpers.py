@@ -12,7 +12,7 @@ import mpm_dolfinx as mpm
 from mpm_dolfinx.base.time_integration import METHODS
 from mpm_dolfinx.flow.storage import StorageProblem
 from mpm_dolfinx.mechanics.momentum import MomentumProblem
-from mpm_dolfinx.solve import plan
+from mpm_dolfinx.solve import solver_choice as plan
 from mpm_dolfinx.stepping import step
 from mpm_dolfinx.stepping.balances import Start, balances
 

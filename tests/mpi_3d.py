@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.solve import plan
+from mpm_dolfinx.solve import solver_choice as plan
 
 plan.THRESHOLDS = replace(plan.THRESHOLDS, multigrid_3d=0)
 grid = mpm.Grid([0] * 3, [1.2] * 3, [6] * 3)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from helpers import beam
 
-from mpm_dolfinx.solve import plan
+from mpm_dolfinx.solve import solver_choice as plan
 
 plan.THRESHOLDS = replace(plan.THRESHOLDS, multigrid_2d=1, coarsest=50)
 simulation, _ = beam(h=0.01)

@@ -59,10 +59,10 @@ ALTERED = {
 }
 PIECES = {
     "pressures missing": lambda arrays: arrays.pop(
-        next(n for n in arrays if n.endswith("/pressure") and "points" not in n)
+        next(n for n in arrays if n in ("pieces/pressure", "pieces/of_cell"))
     ),
     "pressures of other points": lambda arrays: arrays.update(
-        {n: np.zeros_like(a) for n, a in arrays.items() if n in ("transported/id", "stay/id")}
+        {n: np.zeros_like(a) for n, a in arrays.items() if n == "pieces/id"}
     ),
 }
 

@@ -15,7 +15,7 @@ from scipy.special import j0, j1, jn_zeros
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.points.cutting import cut, domain_volumes
-from mpm_dolfinx.stepping import on_grid
+from mpm_dolfinx.stepping import grid_reset as on_grid
 from mpm_dolfinx.verification.biot_fem import BiotFEM
 
 ELASTIC = mpm.NeoHookean(bulk=2e6, shear=1e6)

@@ -9,7 +9,7 @@ import pytest
 from helpers import SOFT, beam, limit, set_up
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.base.report import Report
+from mpm_dolfinx.base.errors import Report
 from mpm_dolfinx.flow.storage import FILTER
 
 

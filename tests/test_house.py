@@ -6,16 +6,16 @@ import pytest
 
 CEILINGS = {
     "ad hoc named numbers": 105,
-    "rules among numbers in functions": 24,
-    "imports a file, mean": 5.58,
+    "rules among numbers in functions": 3,
+    "imports a file, mean": 5.56,
     "files in a circle of imports": 0,
     "folders in a circle of imports": 0,
     "files of the largest folder": 14,
     "parameters of the longest list": 14,
-    "assignments of three and more values": 21,
+    "assignments of three and more values": 20,
     "changes of hidden state": 10,
     "files that name a condition's class, most": 6,
-    "lines of the package": 29523,
+    "lines of the package": 30723,
 }
 
 

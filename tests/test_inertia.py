@@ -3,8 +3,10 @@
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 from scipy.sparse import csr_matrix
 from scipy.sparse.linalg import eigsh
+from scipy.special import j0, j1
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.base.time_integration import GAMMA
@@ -202,6 +204,40 @@ def test_a_block_falls_as_stones_do():
     assert s.points.x - start == pytest.approx(np.broadcast_to([0, -9.81 / 8], start.shape), abs=1e-8)
 
 
+def breathing(n):
+    """Return the first frequency, Hz, of a solid cylinder in plane strain, radius 1 m, n cells, and the exact one.
+
+    Exact: x J_0(x) = (1 - 2 nu) / (1 - nu) J_1(x), x = omega R / c_p.
+    """
+    grid = mpm.Grid([0, 0], [1 + 2 / n, 2 / n], [n + 2, 2], axisymmetric=True)
+    body = mpm.box(grid, [0, 0], [1, 2 / n])
+    law = mpm.LinearElastic(bulk=1e7 / 1.2, shear=1e7 / 2.6, grain_density=2000.0, porosity=0.5)
+    velocity = lambda x: np.stack([1e-3 * x[:, 0], 0 * x[:, 0]], axis=1)  # noqa: E731
+    walls = {"bottom": "y", "top": "y"}
+    s = mpm.Simulation(grid, [body], [law], walls=walls, inertia=True, velocity=velocity)
+    s.step(1e-5)
+    _, made = s.scene.last
+    M = csr(made.mass.M)
+    found = eigsh(csr(made.momentum.K) - M / (GAMMA * 1e-5) ** 2, 1, M, sigma=0)[0][0]
+    x = brentq(lambda x: x * j0(x) - 0.4 / 0.7 * j1(x), 1, 3)
+    return np.sqrt(found) / (2 * np.pi), x * np.sqrt((law.bulk + 4 / 3 * law.shear) / 1000) / (2 * np.pi)
+
+
+def test_a_cylinder_breathes_as_bessel_says():
+    off = [found / exact - 1 for found, exact in map(breathing, (6, 12))]
+    assert 0 < off[0] < 3e-3 and off[0] / off[1] > 3.8
+
+
+@pytest.mark.parametrize("hole", [0.0, 0.3])
+def test_a_ring_falls_as_stones_do(hole):
+    grid = mpm.Grid([0, 0], [1, 4], [5, 20], axisymmetric=True)
+    ring = mpm.box(grid, [hole, 3.1], [0.7, 3.5])
+    s = mpm.Simulation(grid, [ring], [BLOCK], walls={}, gravity=(0, -9.81), inertia=True, velocity=(0, 1.0))
+    start = s.points.x.copy()
+    s.run(0.4, 0.05, progress=False)
+    assert s.points.x - start == pytest.approx(np.broadcast_to([0, 0.4 - 9.81 * 0.08], start.shape), abs=1e-8)
+
+
 def test_a_block_slides_down_a_smooth_incline_as_fast_as_it_should():
     angle = np.pi / 6
     grid = mpm.Grid([0, 0], [2.0, 1.0], [20, 10])
@@ -289,12 +325,26 @@ def test_a_scene_without_inertia_has_none_of_its_forms_and_gets_none():
         s.stage(inertia=True)
 
 
-def test_what_does_not_see_inertia_refuses_it():
-    s = turning()
-    with pytest.raises(ValueError, match="must be dt"):
-        s.run(1.0, rtol=1e-2)
+def test_factors_of_safety_are_of_bodies_without_inertia():
     with pytest.raises(ValueError, match="inertia=False"):
-        mpm.factor_of_safety(s)
+        mpm.factor_of_safety(turning())
+
+
+def test_steps_by_error_meet_it():
+    """A column that swings for two periods: the error of a step is met, so that of the phase is some fifteen times it.
+
+    Both fall with rtol as steps of second order do.
+    """
+    c, period = 188.712839, 40 / 188.712839
+    velocity = lambda x: np.stack([0 * x[:, 0], 1e-2 * np.sin(np.pi * x[:, 1] / 20)], axis=1)  # noqa: E731
+    found, fine = [], column(n=6, velocity=velocity)
+    fine.run(2 * period, period / 120, progress=False)
+    for rtol in (2e-2, 5e-3):
+        s = column(n=6, velocity=velocity)
+        result = s.run(2 * period, rtol=rtol, progress=False)
+        off = np.abs(s.points.displacement - fine.points.displacement).max() / (1e-2 * 20 / np.pi / c)
+        found.append((off / rtol, result.steps))
+    assert all(10 < off < 20 for off, _ in found) and 1.7 < found[1][1] / found[0][1] < 2.2
 
 
 def in_frame(length=1.0, mass=1.0, time=1.0, order=(0, 1), sign=(1, 1), wet=False):

@@ -75,7 +75,7 @@ def test_a_sealed_beam_keeps_the_mass_of_compressible_water_that_flows(bulk):
     rows = []
 
     def observe(s):
-        points, carried = s.points, s.state.transported
+        points, carried = s.points, s.state.pieces
         density = np.zeros(len(points))
         np.add.at(density, np.searchsorted(points.id, carried.id), carried.fraction * np.exp(carried.pressure / bulk))
         mass, owed = (points.J - 1 + SOFT.porosity) * density, points.data["owed"]

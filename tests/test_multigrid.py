@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 import mpm_dolfinx as mpm
 from mpm_dolfinx.solve import monolithic, multigrid
 from mpm_dolfinx.solve.multigrid import interpolation, interpolations
-from mpm_dolfinx.solve.plan import THRESHOLDS
+from mpm_dolfinx.solve.solver_choice import THRESHOLDS
 
 
 @pytest.fixture(autouse=True)

@@ -24,7 +24,7 @@ from test_restart import block, cut_beam
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.__main__ import main
-from mpm_dolfinx.base.report import Report
+from mpm_dolfinx.base.errors import Report
 from mpm_dolfinx.points.cutting import volumes
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Conditions of a user's own, outside of the package: objects that have the methods of what acts on the momentum."""
+"""Conditions of a user's own, outside of the package: objects that have the methods of what acts on a balance."""
 
 from dataclasses import dataclass
 
@@ -73,7 +73,7 @@ class SpringLoads(mpm.Loads):
 def block(**options):
     """Return a block that is loaded on top and stands on springs alone, but for rolls."""
     grid = mpm.Grid([0, -0.2], [1.0, 1.0], [5, 6])
-    load = mpm.Traction("top", lambda t: (0, -2e4 * t), name="load")
+    load = mpm.Traction("top", lambda t: (0, -2e4 * min(t, 1)), name="load")
     walls = {"left": "x", "right": "x"}
     body = mpm.box(grid, [0, 0], [1, 0.77])
     conditions = [load, *options.pop("conditions", [])]
@@ -92,6 +92,71 @@ def test_a_condition_of_the_users_own_acts_as_a_term_on_the_same_side():
     assert own.result.outcome("spring_forces")["springs"][1:, 1] == pytest.approx(
         2e4 * np.array([0.25, 0.5, 0.75, 1.0])
     )
+
+
+@dataclass
+class Skin:
+    """A skin on a side that resists the flow, q = conductance p: a Robin condition."""
+
+    side: str
+    conductance: float  # m/(Pa s)
+    name: str = "skin"
+    region = None
+
+    def feeding(self, setting):
+        return SkinOfStage(self, setting)
+
+
+class SkinOfStage(mpm.Feeding):
+    def __init__(self, skin, setting):
+        self.skin, self.grid, self.faces = skin, setting.grid, setting.sides.of(skin)
+        self.surfaces, self.count = [self.faces], 1
+
+    def placed(self, wet):
+        p = wet.cut.surface(self.faces)
+        cell, x, area = gathered(self.grid, [(p.cell, p.x, p.area(wet.points))], self.grid.dim)
+        reach = x - self.grid.midpoints[cell] - wet.contents.centroid[cell]
+        return SkinFeeds(self, wet.contents.slot(cell), area, reach)
+
+    def fed(self, cut, pieces):
+        return cut.surface(self.faces).at
+
+    def unknown(self, value):
+        return {self.skin.name: np.array(value)}
+
+
+class SkinFeeds(mpm.Feeds):
+    def __init__(self, of, cells, area, reach):
+        self.of, self.cells, self.area, self.reach = of, cells, area, reach
+
+    def conducting(self, flow):
+        size = np.linalg.norm(self.area, axis=1)
+        normal = self.area / size[:, None]
+        distance = np.einsum("md,md->m", self.reach, normal)
+        return size / (distance / flow.across(self.cells, normal) + 1 / self.of.skin.conductance)
+
+    def leaving(self, at, fluid):
+        out = np.bincount(self.cells, at, len(fluid.p)) * fluid.pi
+        return mpm.Leaving(out, np.abs(out))
+
+    def slope(self, at, fluid):
+        return np.bincount(self.cells, at, len(fluid.p))
+
+    def outflows(self, at, fluid):
+        return {self.of.skin.name: np.array(self.of.grid.comm.allreduce(at @ fluid.pi[self.cells]))}
+
+
+@pytest.mark.parametrize("conductance", [1e-9, 1e-6])
+def test_a_skin_of_the_users_own_on_a_side_resists_the_flow_through_it(conductance):
+    """What flows is that through body and skin one after the other, p A / (L / kappa + 1 / conductance)."""
+    ends = [mpm.Drained("bottom", 1e4), Skin("top", conductance)]
+    s = block(conditions=[mpm.Displacement("bottom", (0, 0)), *ends], fluid=mpm.Fluid())
+    s.run(1e4, 1e3, progress=False)
+    height = s.points.corners[:, :, 1].max() - s.points.corners[:, :, 1].min()
+    mobility = SOFT.conductivity / s.scene.fluid.unit_weight
+    through = 1e4 / (height / mobility + 1 / conductance)
+    assert s.outflows["skin"] == pytest.approx(through, rel=1e-4)
+    assert s.outflows["skin"] == pytest.approx(-s.outflows["drained_bottom"], rel=1e-6)
 
 
 def test_a_block_without_its_springs_is_free_to_move(tmp_path):

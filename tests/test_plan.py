@@ -6,8 +6,8 @@ from dataclasses import replace
 import pytest
 from helpers import limit, pressed, thresholds
 
-from mpm_dolfinx.solve.plan import plan
 from mpm_dolfinx.solve.scheme import Scheme
+from mpm_dolfinx.solve.solver_choice import plan
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from helpers import SOFT, column, set_up, without
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.solve import schur
-from mpm_dolfinx.solve.plan import plan
+from mpm_dolfinx.solve.solver_choice import plan
 from mpm_dolfinx.stepping.step import step
 from mpm_dolfinx.verification.biot_fem import BiotFEM
 

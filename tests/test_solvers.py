@@ -11,16 +11,16 @@ import pytest
 from helpers import SOFT, noting, pressed, thresholds
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.base.report import Report
+from mpm_dolfinx.base.errors import Report
 from mpm_dolfinx.solve import monolithic, schur
-from mpm_dolfinx.solve.linear import (
+from mpm_dolfinx.solve.factors import (
     BlockFactors,
     direct_solver,
     displacement_solver,
     dissection,
     solved,
 )
-from mpm_dolfinx.solve.plan import NODAL, THRESHOLDS
+from mpm_dolfinx.solve.solver_choice import NODAL, THRESHOLDS
 
 
 def momentum(dim: int):

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """The state is all that a scene remembers: whatever is tried in between, the same accepted steps give the same bits."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -70,11 +70,11 @@ def contents(state):
     """Return all arrays of a state by their names."""
     out = {f"points {k}": v for k, v in {**vars(state.points), **state.points.data}.items() if k != "data"}
     out |= {f"{what} {name}": value for what, of in state.outcome.items() for name, value in of.items()}
-    if state.transported is not None:
-        out |= {f.name: getattr(state.transported, f.name) for f in fields(state.transported)}
+    if state.pieces is not None:
+        out |= {f"pieces {name}": rows for name, rows in state.pieces.arrays.items()}
     if state.stay is not None:
         out |= {f"stay {k}": v for k, v in {**vars(state.stay.points), **state.stay.points.data}.items() if k != "data"}
-        out |= {f"stay of pieces {k}": v for k, v in vars(state.stay).items() if k != "points" and v is not None}
+        out |= {} if state.stay.keeps is None else {"keeps": state.stay.keeps}
     return out
 
 

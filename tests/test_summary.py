@@ -93,6 +93,8 @@ BENCHMARK = {
     "body force": {"body force"},
     "pores that drain": {"pores that drain"},
     "pressure that follows the surface": {"tractions", "pressures"},
+    "inertia": {"inertia"} | SECOND,
+    "quiet side": {"quiet sides"},
     "ghost penalty on all faces": {"ghost penalty"},
     "rough tool that touches nothing": {"tools"},
     "contact of groups that are apart": {"contacts"},

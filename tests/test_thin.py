@@ -8,7 +8,7 @@ from extreme.scenes import WATER, Beam, soil
 from test_bad_input import GRID, scene
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.diagnostics.thin import LOST_WET
+from mpm_dolfinx.diagnostics.resolution import LOST_WET
 
 YOUNG, LENGTH, HEIGHT = 12e6, 1.0, 0.1  # Pa, m, m
 RUBBER = mpm.NeoHookean(bulk=YOUNG / 3, shear=YOUNG / 2)  # nu = 0: plane strain is plane stress

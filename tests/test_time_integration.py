@@ -10,7 +10,7 @@ import ufl
 from helpers import SOFT, beam, column, rates
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.base.report import Report
+from mpm_dolfinx.base.errors import Report
 from mpm_dolfinx.base.time_integration import METHODS
 from mpm_dolfinx.simulation import simulation
 from mpm_dolfinx.simulation.step_size import StepSize

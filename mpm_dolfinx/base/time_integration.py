@@ -18,6 +18,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 GAMMA = 1 - 1 / np.sqrt(2)  # Source: Alexander (1977), the L-stable method of two stages
 
@@ -38,6 +39,19 @@ METHODS = {
     "sdirk2": (Substep(GAMMA, GAMMA, 0.0), Substep(1.0, GAMMA, 1 - GAMMA)),
     "backward-euler": (Substep(1.0, 1.0, 0.0),),
 }
+
+
+def in_step(
+    share: float, start: NDArray[np.float64], now: NDArray[np.float64], end: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the displacement of a first substep in which what is moved as given has the velocity that it should.
+
+    The method has u = share dt v there, and from u at both substeps the velocity at the end.  With the given u itself
+    that is of first order, and accelerations of none.  v is that of the parabola through three given displacements.
+
+    share: of the step, at which the substep ends; start, now, end: displacements at the start, there, and at the end.
+    """
+    return start + ((2 * share - 1) * (now - start) - share**2 * (end - start)) / (share - 1)
 
 
 EULER = METHODS["backward-euler"]

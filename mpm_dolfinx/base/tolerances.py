@@ -15,6 +15,8 @@ is squared.  Source: Dennis and Schnabel (1983), sections 5.4 and 2.4.
 """
 CENTRAL = EPSILON ** (1 / 3)
 """Step of central differences, relative to the size of what changes.  Source: Dennis and Schnabel (1983), 5.6."""
+SECOND = EPSILON**0.25
+"""Step of second differences.  Source: Dennis and Schnabel (1983), 5.6."""
 NEAR = 8 * float(np.finfo(np.float32).eps)
 """Relative distance within which places are one, 1e-6: meshes come with seven digits, and are moved on with more.
 

@@ -10,8 +10,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mpm_dolfinx.base.given_values import at_places
-from mpm_dolfinx.base.validation import asked, instance, numbers
+from mpm_dolfinx.base.validation import asked, at_places, instance, numbers
 from mpm_dolfinx.grid.grid import SIDES, Grid, in_chunks
 from mpm_dolfinx.parallel.exchange import first
 from mpm_dolfinx.points.cutting import FACES, centroids, corner_bits, domain_volumes, volumes

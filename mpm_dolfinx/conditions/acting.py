@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
 """What acts on the momentum: the one protocol of tractions, given displacements, tools, weight, conditions of users.
 
+To add a condition: give it a method `acting(setting)`, which returns an `Acting`.  For the fluid: `flow/feeding.py`.
+
 A condition is placed three times: `Acting` once a stage, where it finds its faces; `Acting.placed` once a substep, with
 the faces where they have moved to; and its `Loads` add to residual and tangent as often as these are assembled.  The
 step and the balance of momentum loop over them, and know none by name.
@@ -22,6 +24,7 @@ from mpm_dolfinx.bodies.faces import Surface
 from mpm_dolfinx.conditions.sides import Sides
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.forms.unknowns import Unknowns
+from mpm_dolfinx.forms.velocity import Velocity
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.points.material_points import MaterialPoints
@@ -44,16 +47,19 @@ class FormsOf:
         Background grid.
     u
         Increment of the displacement in the step, m.
+    velocity
+        Of the bodies in a substep.
     """
 
-    def __init__(self, grid: Grid, u: fem.Function):
+    def __init__(self, grid: Grid, u: fem.Function, velocity: Velocity):
         self.grid, self.u = grid, u
+        self.velocity = velocity
         self._made: dict[Callable, Any] = {}
 
-    def __call__(self, make: Callable[[Grid, fem.Function], T]) -> T:
-        """Return what `make` returns of the grid and u, a class of forms."""
+    def __call__(self, make: Callable[..., T], *more) -> T:
+        """Return what `make` returns of the grid, u and more, a class of forms."""
         if make not in self._made:
-            self._made[make] = make(self.grid, self.u)
+            self._made[make] = make(self.grid, self.u, *more)
         return self._made[make]
 
     @property
@@ -90,7 +96,8 @@ class Place(NamedTuple):
     """When and where a condition acts in a substep.
 
     cut, points: the domains as they are cut, and the points as they are now; pieces: their points of integration, see
-    `QuadratureData`; start, dt: of the step, s; t: end of the substep, s; before: outcome of the last step.
+    `QuadratureData`; start, dt: of the step, s; t: end of the substep, s; before: outcome of the last step; inertia:
+    whether bodies have any.
     """
 
     cut: CutDomains
@@ -100,6 +107,7 @@ class Place(NamedTuple):
     dt: float
     t: float
     before: Outcome
+    inertia: bool = False
 
 
 class At(NamedTuple):
@@ -161,8 +169,15 @@ class Loads:
     def resists(self, b: NDArray[np.float64]) -> None:
         """Add the forces at u that act as the bodies' own stresses do, against loads."""
 
+    def takes_up(self, b: NDArray[np.float64]) -> None:
+        """Add the forces at u that are counted with those of the stresses."""
+
     def penalty(self, A: PETSc.Mat, walls: bool) -> None:
         """Add the matrix of forces that are linear in u; walls: to the rows of what walls hold."""
+
+    def pulling(self, at: At, v: NDArray[np.float64]) -> float:
+        """Return the power, W, of `pulls` and `penalty` at u on this process; v: velocities, a local array, m/s."""
+        return 0.0
 
     def tangent(self, K: PETSc.Mat) -> None:
         """Add minus the derivative of `loads`, and the derivative of `resists`, at u; who calls finalises it."""
@@ -182,10 +197,6 @@ class Loads:
     def settle(self, at: At, sticks: bool) -> bool:
         """Choose what slips at u, and if asked for what sticks again; return whether it is another choice."""
         return False
-
-    def serves(self, at: At) -> bool:
-        """Return whether on this process the last tangent has what acts at u."""
-        return True
 
     def unmet(self, at: At) -> Unmet:
         """Return how far its unknowns are from what they are to be at u."""

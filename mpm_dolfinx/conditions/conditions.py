@@ -6,8 +6,11 @@ in the seeded body, before a map; sides of a mesh as it names them (`from_mesh`)
 lies on another body, as seeded, does not count.
 Regions and X are reference positions, before all maps (`mapped`); areas are those as seeded, after them.
 
+A new kind of condition is a class like these in a file of its own, with a method `acting` for what it does to the
+momentum, see `conditions/acting.py`, or `feeding` for what it does to the fluid, see `flow/feeding.py`.
+
 Values may be functions of the time t, the reference places X and the present places x, by these names: how they are
-called, and what they may give, stands in `given_values`.
+called, and what they may give, stands in `validation`.
 
 What is wrong with a condition is said, with a ValueError, when it is made, or a scene or a stage with it; of what
 functions give at the step that asks for it.  A condition equals only itself: values and regions may be arrays and
@@ -19,13 +22,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mpm_dolfinx.base.given_values import NAMES, Places, check_names, given
-from mpm_dolfinx.base.validation import flag, line, numbers
+from mpm_dolfinx.base.validation import NAMES, Places, check_names, flag, given, line, numbers
 from mpm_dolfinx.bodies.faces import Region, Surface
 from mpm_dolfinx.materials.skeleton import Skeleton
 
@@ -50,7 +52,7 @@ class Condition:
                 check_names(f"{line(self)}: {name}", getattr(self, name), among)
 
     def _given(self, name: str, t: float, *more, **options) -> NDArray[np.float64]:
-        """Return one of its values at time t (s), see `given_values.given`."""
+        """Return one of its values at time t (s), see `validation.given`."""
         what, among = f"{line(self)}: {name} at t = {t:g} s", self.FUNCTIONS[name]
         return given(what, getattr(self, name), t, *more, among=among, **options)
 
@@ -120,6 +122,41 @@ class Pressure(Condition):
 
 
 @dataclass(frozen=True, eq=False)
+class Quiet(Condition):
+    """Quiet side of bodies with inertia: waves leave through it (Lysmer and Kuhlemeyer 1969).
+
+    It resists by the impedances of the material, rho c_p along the normal and rho c_s across, times the velocity.
+    Waves along the normal leave wholly; of others that meet it aslant a few per cent come back.  A side that a stage
+    without inertia held keeps the tractions that it bore.
+
+    Parameters
+    ----------
+    side
+        Side of the bodies, as for `Traction`.
+    incoming : (d,) or callable t (s) -> (d,), m/s
+        Velocity of particles at the side in a wave that comes in along the normal, alone: at a free surface twice as
+        much arrives.
+    region : ((d,), (d,)), m
+        As for `Traction`.
+
+    Raises
+    ------
+    ValueError
+        From the scene: bodies have no inertia, or had it before the side was quiet; no point has the side; another
+        `Quiet` acts on the same part of a face.
+    """
+
+    side: str
+    incoming: ArrayLike | Callable[[float], ArrayLike] | None = None
+    region: Region | None = None
+    FUNCTIONS: ClassVar[Mapping[str, Sequence[str]]] = {"incoming": ("t",)}
+
+    def at(self, t: float, dim: int) -> NDArray[np.float64]:
+        """Return the velocity (d,) of the incoming wave at time t (s), m/s."""
+        return np.zeros(dim) if self.incoming is None else self._given("incoming", t, None, dim, number=False)
+
+
+@dataclass(frozen=True, eq=False)
 class OnSide(Condition):
     """Term of the user's own on a side of the bodies, in UFL: springs, dashpots, loads that depend on what moves.
 
@@ -170,6 +207,17 @@ def sorted_terms(terms: Sequence[Callable | OnSide | Source]) -> tuple[list[Call
     return [term for term in terms if not isinstance(term, Source)], sources
 
 
+class Through(NamedTuple):
+    """What a side lets through at its places, each () or (m,).
+
+    pressure: beyond it, Pa, nan where the flux alone is given; flux: into the body, m/s; one_way: nothing flows in.
+    """
+
+    pressure: NDArray[np.float64] | float
+    flux: NDArray[np.float64] | float
+    one_way: NDArray[np.bool_] | bool
+
+
 @dataclass(frozen=True, eq=False)
 class Drained(Condition):
     """Side of the bodies, moving with them, at which the pore pressure is given.
@@ -211,6 +259,11 @@ class Drained(Condition):
         """Return the pressure () or (m,) at time t (s), Pa."""
         return self._given("pressure", t, side)
 
+    def through(self, t: float, side: Places) -> Through:
+        """Return what the side lets through at time t (s)."""
+        pressure = self.at(t, side)
+        return Through(pressure, 0.0, self.seepage & (pressure <= 0))
+
 
 @dataclass(frozen=True, eq=False)
 class Inflow(Condition):
@@ -245,41 +298,30 @@ class Inflow(Condition):
         """Return the flux () or (m,) at time t (s), m/s."""
         return self._given("flux", t, side)
 
+    def through(self, t: float, side: Places) -> Through:
+        """Return what the side lets through at time t (s)."""
+        return Through(np.nan, self.at(t, side), False)
+
 
 RIGIDITY = 1e4
 """Rigidity of a plate, in units of (oedometric modulus of the body) x (length of the side)."""
 HOLD = 3e2
-"""Stiffness of given displacements in the tangent, in units of (what resists) / (cell size): see `held_cells`.
+"""Stiffness of the means of given displacements in the tangent, in units of (what resists) / (cell size).
 
-Multipliers make it of no account, but in initial stresses.  There sides give way by the unbalanced stress over it.
+Multipliers make it of no account, but for initial stresses: there sides give way, from where they are held later.
+
+Plateau (soil): halved 5.7e-12, doubled 7.0e-11, cells 3.0e-02.
 """
-
-
 WEAK = 8.0
-"""Stiffness of what is left of it at the points of integration, in units of (modulus + 10 stress) / (cell size).
+"""Stiffness of what is left of it at the points of integration, of (what resists + 10 stress) / (cell size).
 
-Plateau (soil): halved 5.0e-06, doubled 7.9e-06, cells 3.0e-02.
-"""
-YIELDING = 0.1
-"""Share of the elastic modulus that sides are held by where the law has a state: soil bears little beside it.
-
-Plateau (soil): halved 6.5e-05, doubled 1.9e-05, cells 3.0e-02.
+Plateau (soil): halved 1.5e-06, doubled 2.7e-06, cells 3.0e-02.
 """
 
 
 def resistance(material: Skeleton) -> NDArray[np.float64]:
     """Return what a side resists with, Pa: the oedometric modulus, at most that of nu = 1/3, which is 4G."""
     return np.minimum(material.oedometric, 4 * material.shear)
-
-
-def holding(material: Skeleton) -> NDArray[np.float64]:
-    """Return the modulus, Pa, in units of which a side is held.
-
-    By as much as a Q1 field whose cells keep their volume cannot follow a curved side it is pushed by what holds it.
-    That must not be stiff beside the body's shear: an undrained cavity in soil, widened with 3e2 (lambda + 2G), has up
-    to 1.9 times the pressure that it should have, with 30 times 4G 1.01.
-    """
-    return (YIELDING if material.state else 1.0) * resistance(material)
 
 
 @dataclass(frozen=True, eq=False)

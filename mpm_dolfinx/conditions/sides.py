@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from mpm_dolfinx.base.given_values import Places
 from mpm_dolfinx.base.tolerances import NEAR, SAME
-from mpm_dolfinx.base.validation import line
+from mpm_dolfinx.base.validation import Places, line
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.faces import Region, Surface, joined, limits, surface
 from mpm_dolfinx.conditions.conditions import Displacement

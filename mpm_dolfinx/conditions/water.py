@@ -9,8 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mpm_dolfinx.base.given_values import check_names, given
-from mpm_dolfinx.base.validation import numbers
+from mpm_dolfinx.base.validation import check_names, given, numbers
 from mpm_dolfinx.bodies.faces import Region
 from mpm_dolfinx.conditions.conditions import Drained, Pressure
 from mpm_dolfinx.materials.initial_stress import OfWater

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import ConvexHull, QhullError
 
-from mpm_dolfinx.base.tolerances import TINY
+from mpm_dolfinx.base.tolerances import CENTRAL, NEAR, SECOND, TINY
 from mpm_dolfinx.base.validation import asked, line, numbers
 
 ROUNDED = 1e-9  # cells: what is no deeper in a tool is on its surface
@@ -248,7 +248,7 @@ class Cone:
         _, r, _, second = self._polar(y)
         if y.shape[1] == 2:
             return _flat(y)
-        near_axis = r[:, None, None] <= 1e-6 * np.abs(y - self.tip).max(initial=0.0)
+        near_axis = r[:, None, None] <= NEAR * np.abs(y - self.tip).max(initial=0.0)
         along = self._axis[:, None] * self._axis / np.where(near_axis, np.inf, r[:, None, None])
         return np.where(near_axis, 0.0, second - along) * np.cos(np.radians(self.angle_deg))
 
@@ -259,14 +259,14 @@ class Cone:
 
 @dataclass(frozen=True, eq=False)
 class Distance:
-    """A shape whose signed distance a function of the user's gives; its derivatives are differences over `step`, m.
+    """A shape whose signed distance a function of the user's gives; its derivatives are differences.
 
-    base : (d,), m — from which places count; of true places the function is asked.  Steps are powers of two, by which
-    no true place is rounded to another one.
+    size : m, of a cell, of which steps are shares.  base : (d,), m — from which places count; of true places the
+    function is asked.  Steps are powers of two, by which no true place is rounded to another one.
     """
 
     function: Callable[[NDArray[np.float64]], ArrayLike]
-    step: float
+    size: float
     base: NDArray[np.float64] | float = 0.0
 
     def distance(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -283,7 +283,7 @@ class Distance:
 
     def normal(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the gradients (m, d) of the distance."""
-        return self._slopes(y + self.base, _power_of_two(self.step))
+        return self._slopes(y + self.base, _power_of_two(CENTRAL * self.size))
 
     def _slopes(self, y: NDArray[np.float64], step: float) -> NDArray[np.float64]:
         """Return differences (m, d) of the distance over a step, m, at true places."""
@@ -292,7 +292,7 @@ class Distance:
 
     def curvature(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the second derivatives (m, d, d) of the distance, 1/m."""
-        y, wide = y + self.base, _power_of_two(30 * self.step)  # of second differences less is lost in rounding
+        y, wide = y + self.base, _power_of_two(SECOND * self.size)
         steps = wide * np.eye(y.shape[1])
         slopes = [(self._slopes(y + e, wide) - self._slopes(y - e, wide)) / (2 * wide) for e in steps]
         return np.stack(slopes, axis=2)

@@ -11,8 +11,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mpm_dolfinx.base.given_values import check_names, given
-from mpm_dolfinx.base.validation import line, numbers
+from mpm_dolfinx.base.validation import check_names, given, line, numbers
 from mpm_dolfinx.contact.shapes import ROUNDED, Ball, Cone, Convex, Distance, HalfSpace, Shape, unit_vector
 from mpm_dolfinx.grid.grid import Grid
 
@@ -139,7 +138,7 @@ class Tool:
 
     def solid(self, h: float) -> Shape:
         """Return the shape; h, m: size of a cell."""
-        return Distance(self.shape, 1e-6 * h, self._base) if callable(self.shape) else self._moved or self.shape
+        return Distance(self.shape, h, self._base) if callable(self.shape) else self._moved or self.shape
 
     def check(self, dim: int) -> None:
         """Refuse a tool of another dimension, or whose motion at the start is none."""

@@ -17,7 +17,8 @@ What is told of the points, and taken along by none, is reconstructed up to seal
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -33,28 +34,37 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 
 @dataclass(frozen=True, eq=False)
 class PiecePressures:
-    """Pressures that pieces take from one grid to the next; arrays over the pieces, ordered by point and cell.
+    """The pore pressure of a scene between two steps; arrays over the pieces of domains, ordered by point and cell.
 
-    id : (m,) number of the point; cell : (m,) lexicographic cell, -1 at the start;
-    fraction : (m,) share of the domain; pressure : (m,), Pa; x : (m, d) centroid, m; slope : (m, d) of the
-    pressure, Pa/m; bounds : (m, 2) least and largest pressure that any part of the piece may have, Pa.
+    id : (m,) number of the point; cell : (m,) lexicographic cell, -1 at the start; fraction : (m,) share of the domain;
+    x : (m, d), m, where the centroid has moved to.  What pieces take to the next grid, None where all stay on this one:
+    pressure : (m,), Pa, at the centroid; slope : (m, d) of it, Pa/m; bounds : (m, 2) least and largest pressure that
+    any part of the piece may have, Pa.  What pieces have that stay, None where none does: of_cell, start : (m,), Pa,
+    pressure of the cell, and that when the grid was reset.
     """
 
     id: NDArray[np.int64]
     cell: NDArray[np.int64]
     fraction: NDArray[np.float64]
-    pressure: NDArray[np.float64]
+    pressure: NDArray[np.float64] | None
     x: NDArray[np.float64]
-    slope: NDArray[np.float64]
-    bounds: NDArray[np.float64]
+    slope: NDArray[np.float64] | None
+    bounds: NDArray[np.float64] | None
+    of_cell: NDArray[np.float64] | None = None
+    start: NDArray[np.float64] | None = None
 
     def __post_init__(self):
-        for f in fields(self):
-            getattr(self, f.name).flags.writeable = False
+        for rows in self.arrays.values():
+            rows.flags.writeable = False
+
+    @property
+    def arrays(self) -> dict[str, NDArray]:
+        """Those that there are, by name."""
+        return {name: rows for name, rows in vars(self).items() if rows is not None}
 
     def migrated(self, exchange: Exchange) -> PiecePressures:
         """Return the pieces of this process after each went to where its point goes."""
-        return PiecePressures(*(exchange.send(getattr(self, f.name)) for f in fields(self)))._ordered()
+        return self._each(exchange.send)._ordered()
 
     def potentials(self, bulk: float) -> PiecePressures:
         """Return the same of the mass potentials of a fluid of this bulk modulus, Pa: see `transport`."""
@@ -64,18 +74,20 @@ class PiecePressures:
 
     def of(self, ids: NDArray[np.int64], kept: bool = True) -> PiecePressures:
         """Return the pieces of the points of these ids, or of all others."""
-        return self._rows(np.isin(self.id, ids) == kept)
+        rows = np.isin(self.id, ids) == kept
+        return self._each(lambda values: values[rows])
 
     def joined(self, other: PiecePressures) -> PiecePressures:
-        """Return these pieces and those of other points, ordered by point and cell."""
-        pairs = [(getattr(self, f.name), getattr(other, f.name)) for f in fields(self)]
-        return PiecePressures(*map(np.concatenate, pairs))._ordered()
+        """Return these pieces and those of other points, that all leave the grid, ordered by point and cell."""
+        pairs = {name: (values, getattr(other, name)) for name, values in self.arrays.items()}
+        return PiecePressures(**{name: np.concatenate(both) for name, both in pairs.items()})._ordered()
 
-    def _rows(self, rows: NDArray) -> PiecePressures:
-        return PiecePressures(*(getattr(self, f.name)[rows] for f in fields(self)))
+    def _each(self, change: Callable[[NDArray], NDArray]) -> PiecePressures:
+        return replace(self, **{name: change(rows) for name, rows in self.arrays.items()})
 
     def _ordered(self) -> PiecePressures:
-        return self._rows(np.lexsort((self.cell, self.id)))
+        order = np.lexsort((self.cell, self.id))
+        return self._each(lambda values: values[order])
 
 
 def at_start(points: MaterialPoints) -> PiecePressures:

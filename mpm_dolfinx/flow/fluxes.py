@@ -8,7 +8,8 @@ centroid of what a cell holds its mobility kappa becomes J F^-1 kappa F^-T.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import NamedTuple
 
@@ -56,12 +57,13 @@ class Conduction:
     """How the filled owned cells conduct, and what has become of them in the step.
 
     motion: since the start of the step, at the centroids; None where the body hardly moves.  weight (d,): of the fluid,
-    N/m^3, if there is gravity.
+    N/m^3, if there is gravity; bulk: its bulk modulus, Pa.
     """
 
     mobility: Mobility
     motion: CellMotion | None
     weight: NDArray[np.float64] | None
+    bulk: float
 
     @cached_property
     def _turned(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -121,24 +123,31 @@ class OpenSides:
     area: NDArray[np.float64]
     reach: NDArray[np.float64]
 
+    @classmethod
+    def joined(cls, several: Sequence[OpenSides], dim: int) -> OpenSides:
+        """Return the faces of several in their order, of none an empty one."""
+        if len(several) == 1:
+            return several[0]
+        none, vectors = np.empty(0), np.empty((0, dim))
+        empty = cls(none.astype(int), none.astype(np.int32), none, none, none, none.astype(bool), vectors, vectors)
+        return cls(*(np.concatenate([getattr(one, f.name) for one in (empty, *several)]) for f in fields(cls)))
+
     @cached_property
     def normal(self) -> NDArray[np.float64]:
         """Unit vectors (m, d)."""
         return self.area / np.linalg.norm(self.area, axis=1, keepdims=True)
 
-    def driven(
-        self, at: NDArray[np.int64], flow: Conduction, bulk: float
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def driven(self, at: NDArray[np.int64], flow: Conduction) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the outflow (m,) per unit of the cell's mass potential, m^d/(Pa s), and the inflow (m,), m^d/s.
 
         The inflow is prescribed, or driven in by the outer pressure and gravity; at (m,): place of the cells among the
-        filled ones; bulk: of the fluid, Pa.
+        filled ones.
         """
         shape = self.shape * flow.nearer(at, self.normal, self.reach)
         conductance, outer = flow.across(at, self.normal) * shape, self.pressure
         if flow.weight is not None:
             outer = outer - flow.deformed(at, self.reach) @ flow.weight
-        return conductance, self.given + conductance * mass_potential(outer, bulk)
+        return conductance, self.given + conductance * mass_potential(outer, flow.bulk)
 
     def ahead(self, at: NDArray[np.int64], p: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return what lies ahead of the filled cells (n, d, 2, 2): on drained sides, by axis and end of the cell.

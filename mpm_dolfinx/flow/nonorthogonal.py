@@ -171,7 +171,7 @@ class AslantFlow(NamedTuple):
     """What flows beside the two-point fluxes.
 
     forms, facets: over the faces of `off_facets`; gradients: of the cut; contents, sides: what the cells hold, open
-    sides; conductance (m,), m^d/(Pa s): of these; weight (d,), N/m^3: of the fluid, None without gravity.
+    sides; weight (d,), N/m^3: of the fluid, None without gravity.
     """
 
     forms: FluxForms
@@ -179,19 +179,16 @@ class AslantFlow(NamedTuple):
     gradients: Gradients
     contents: CellContents
     sides: OpenSides
-    conductance: NDArray[np.float64]
     weight: NDArray[np.float64] | None
 
     def __call__(
         self, p: NDArray[np.float64], density: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return what leaves the filled cells (n,) to others, and through open sides (m,), m^d/s, at p (c,), Pa.
+        """Return what leaves the filled cells (n,) to others, m^d/s, at p (c,), Pa, and what open sides see.
 
-        density (c,): of the fluid over that at zero pressure.
-
-        Seepage faces are left out: they are open or not by the pressure of their cell.
+        The latter (m,), Pa, is what they see more than the pressure of their cell.  density (c,): of the fluid over
+        that at zero pressure.
         """
-        slope, sides = self.gradients(p, self.sides.pressure, self.weight), self.sides
+        slope = self.gradients(p, self.sides.pressure, self.weight)
         leaves = self.forms.along(slope, self.contents.filled[self.gradients.rows], self.facets, density)
-        through = self.conductance * self.gradients.through_sides(slope, len(sides.cells)) * density[sides.cells]
-        return leaves[self.contents.filled], np.where(sides.seeps, 0.0, through)
+        return leaves[self.contents.filled], self.gradients.through_sides(slope, len(self.sides.cells))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Storage of the pore fluid: DG0 on the grid, which is the finite volume method.
+"""Storage of the pore fluid: DG0 on the grid, which is the finite volume method.  Sides: see `drained_sides`.
 
 In each active cell, with J_Delta = det(I + grad u) (never div u: a rotation would fake a compression),
 
@@ -32,7 +32,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from petsc4py import PETSc
 
@@ -43,18 +43,15 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.base.fluid_content import change_of_content, mass_potential
 from mpm_dolfinx.base.tolerances import EPSILON
-from mpm_dolfinx.base.validation import line
+from mpm_dolfinx.flow.feeding import Feeding, Feeds, Fluid
 from mpm_dolfinx.flow.fluxes import CellContents, Conduction, FluxForms, OpenSides
 from mpm_dolfinx.flow.nonorthogonal import AslantFlow, Gradients
 from mpm_dolfinx.flow.second_differences import second_differences
 from mpm_dolfinx.forms.cell_matrices import along_shapes, insert_rows
 from mpm_dolfinx.forms.point_forms import CellSums, FacetSum, FormPoints, PointData, PointForm
 from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts, zero
-from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.materials.evaluate import ConductivityAtPieces
 from mpm_dolfinx.materials.skeleton import filled
-from mpm_dolfinx.materials.user_functions import compiling
-from mpm_dolfinx.materials.user_functions import form as form_of
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.parts import OfParts, Parts
 
@@ -69,6 +66,17 @@ FluxSlope = Callable[[PETSc.Vec], NDArray[np.float64]]
 """See `StorageProblem.flux_slope`."""
 
 
+class CellPressure(NamedTuple):
+    """The pore pressure of the cells in a step, DG0, Pa: at the present iterate, and at the start of substep and step.
+
+    The only place of it on the grid; that between two steps is `State.pieces`.
+    """
+
+    now: fem.Function
+    before: fem.Function
+    start: fem.Function
+
+
 class StorageForms:
     """The compiled forms of the storage of a scene's pore fluid.
 
@@ -80,7 +88,7 @@ class StorageForms:
     displacement
         Increment of the displacement since the start of the step.
     pressure
-        DG0 pore pressure, Pa, positive in compression.
+        Pore pressure of the cells, positive in compression.
     bulk
         Bulk modulus of the fluid, Pa.
     weight : (d,), N/m^3
@@ -94,10 +102,8 @@ class StorageForms:
         Whether soil may be softer than elastic.
     conductivity
         Laws of the conductivity, None where no material has one.
-    sources
-        The user's, see `user_functions`.
-    t : s
-        Time at the end of the substep, a UFL constant.
+    feeding
+        What feeds the fluid in all stages.
     inertial : (d,), N/m^3
         Force of inertia on the pore fluid, -rho_w a, as UFL; None without.
     """
@@ -106,26 +112,25 @@ class StorageForms:
         self,
         pieces: FormPoints,
         displacement: fem.Function,
-        pressure: fem.Function,
+        pressure: CellPressure,
         bulk: float,
         weight: ufl.core.expr.Expr | None,
         symmetric: bool,
         flows: bool,
         softens: bool,
         conductivity: ConductivityAtPieces | None,
-        sources: Sequence[Callable],
-        t: fem.Constant,
+        feeding: Sequence[Feeding],
         inertial: ufl.core.expr.Expr | None = None,
     ):
         self.grid = pieces.grid
-        self.p = pressure
+        self.p, self.p_n = pressure.now, pressure.start
+        self.p_before = pressure.before
         self.bulk = bulk
-        Q = pressure.function_space
+        Q = self.p.function_space
         self.conductivity = conductivity
-        self.p_n, self._work = fem.Function(Q), fem.Function(Q)
-        q, one = ufl.TestFunction(Q), fem.Function(Q)
-        one.x.array[:] = 1.0
-        p, delta = ufl.variable(pressure), ufl.variable(pieces.increment(displacement))
+        self._work = fem.Function(Q)
+        q = ufl.TestFunction(Q)
+        p, delta = ufl.variable(self.p), ufl.variable(pieces.increment(displacement))
         J = ufl.det(delta)
         stored = change_of_content(pieces.biot, pieces.storage_at_one, pieces.storage, J, p - self.p_n)
         self.drains = "retention" in pieces.sizes
@@ -138,33 +143,16 @@ class StorageForms:
         along = [along_shapes(slope, pieces) for slope in by_u]
         self._derivatives = CellSums([ufl.diff(stored, p), *(part for slope in along for part in slope)], pieces)
         self.symmetric, self.softens = symmetric, softens
-        self.fluxes = FluxForms(pieces.grid, weight, flows, pressure, bulk, inertial)
-        self.sources, self._slopes = [], []
-        for source in sources:
-            form = form_of("sources", source, points=pieces, q=q, p=pressure, t=t)
-            if len(form.arguments()) != 1:
-                raise ValueError(f"sources: {line(source)}: does not depend on q, must be linear in it")
-            if pressure in form.coefficients():
-                self._slopes.append(PointForm(ufl.derivative(form, pressure, one), pieces))
-            with compiling(f"sources: {line(source)}", "linear in q"):
-                self.sources.append(PointForm(form, pieces))
-
-    @property
-    def linear(self) -> bool:
-        """Whether sources and drained pores do not depend on the pressure."""
-        return not self._slopes and not self.drains
-
-    def _sum(self, forms: Sequence[PointForm], data: PointData) -> NDArray[np.float64]:
-        """Return the sums of forms in the cells, a local array."""
-        b = self._work.x.array
-        b[:] = 0.0
-        for form in forms:
-            form.assemble_vector(b, data)
-        return b
+        self.fluxes = FluxForms(pieces.grid, weight, flows, self.p, bulk, inertial)
+        self.feeding = tuple(feeding)
+        """What feeds the fluid in all stages."""
 
     def change(self, data: PointData) -> NDArray[np.float64]:
         """Return the change of the fluid in each cell since the start of the step, m^d, a local array."""
-        return self._sum([self._change], data)
+        b = self._work.x.array
+        b[:] = 0.0
+        self._change.assemble_vector(b, data)
+        return b
 
     def derivatives(self, data: PointData) -> list[NDArray[np.float64]]:
         """Return its derivative by the cell's pressure, m^d/Pa, a local array, and those by displacements of its nodes.
@@ -178,85 +166,36 @@ class StorageForms:
         capacity[data.places.filled] = by_p[:, 0]
         return [capacity, *by_u]
 
-    def gain(self, data: PointData) -> NDArray[np.float64]:
-        """Return the rate of the sources in each cell at p, m^d/s, a local array."""
-        return self._sum(self.sources, data)
-
-    def gain_slope(self, data: PointData) -> NDArray[np.float64]:
-        """Return its derivative by the cell's pressure, m^d/(Pa s), a local array."""
-        return self._sum(self._slopes, data)
-
     def driven(self, assembled: FacetSum) -> NDArray[np.float64]:
         """Return the outflow that p and the fluid's weight drive from each cell to others, m^d/s, a local array."""
-        assembled.assemble_vector(self._sum([], None))
+        self._work.x.array[:] = 0.0
+        assembled.assemble_vector(self._work.x.array)
         return sum_ghosts(self._work)
 
 
 @dataclass(frozen=True)
-class OpenFaces:
-    """Faces on open sides; arrays over m faces.
-
-    number (m,): of the condition; at (m,): place of the cell among the active owned ones; conductance, inflow (m,):
-    outflow per unit of the cell's mass potential, m^d/(Pa s), and what is prescribed or driven in, m^d/s; seeps (m,):
-    whether nothing may flow in; reach (m, d): way from the cell's centroid, m.
-    """
-
-    number: NDArray[np.int64]
-    at: NDArray[np.int64]
-    conductance: NDArray[np.float64]
-    inflow: NDArray[np.float64]
-    seeps: NDArray[np.bool_]
-    reach: NDArray[np.float64]
-
-    def outflow(self, pi: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return what leaves through each face, were it open both ways, from cells at potentials (n,), Pa; m^d/s."""
-        return self.conductance * pi[self.at] - self.inflow
-
-    def driven(self, force: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return what forces (n, d), N/m^3, on the fluid drive out of cells (n,), m^d/s."""
-        along = np.einsum("md,md->m", force[self.at], self.reach)
-        return sum_by(self.at, np.where(self.seeps, 0.0, self.conductance * along), len(force))
-
-    def seepage(self, pi: NDArray[np.float64], flows: NDArray[np.bool_]) -> tuple[NDArray, NDArray]:
-        """Return what seeps out of cells (n,), m^d/s, and its derivative, m^d/(Pa s); flows (m,): where."""
-        parts = (np.where(flows & self.seeps, values, 0.0) for values in (self.outflow(pi), self.conductance))
-        return tuple(sum_by(self.at, values, len(pi)) for values in parts)
-
-
-@dataclass(frozen=True)
 class Outflow:
-    """Outflow of the active owned cells: conductance of open sides (m^d/(Pa s)), inflow (m^d/s), and the sum of all.
+    """How the active owned cells lose fluid at present displacements.
 
-    faces: one by one; of those that seep nothing is in these sums; total: outflow per unit of the cell's own
-    potential through all its other faces, m^d/(Pa s).  mobility (n, d): along the axes, m^2/(Pa s).  aslant: what flows
-    besides.
+    at: what each of the feeds makes of it, see `Feeds.conducting`; total (n,): outflow per unit of the cell's own
+    potential through all faces to other cells, m^d/(Pa s).  mobility (n, d): along the axes, m^2/(Pa s).  aslant: what
+    flows besides.
     """
 
-    conductance: NDArray[np.float64]
-    inflow: NDArray[np.float64]
-    faces: OpenFaces
+    at: Sequence[Any]
     total: NDArray[np.float64]
     mobility: NDArray[np.float64]
     aslant: AslantFlow | None
-
-
-class Aslant(NamedTuple):
-    """What flows beside the two-point fluxes, m^d/s: out of active owned cells, through open faces, and theirs."""
-
-    cells: NDArray[np.float64] | float
-    faces: NDArray[np.float64] | float
-    lost: NDArray[np.float64] | float
 
 
 @dataclass(frozen=True)
 class Rates:
     """Rates at which the owned cells lose fluid, m^d/s, or with `taken` what they lose in a time, m^d.
 
-    pressure: of the cells, Pa; cells: outflow less sources of each; lost: what of that leaves the bodies, less sources;
+    cells: outflow less sources of each; lost: what of that leaves the bodies, less sources;
     turnover: what goes in and out; gain: what sources bring or take, in size.
     """
 
-    pressure: NDArray[np.float64]
     cells: NDArray[np.float64]
     lost: NDArray[np.float64]
     turnover: NDArray[np.float64]
@@ -264,8 +203,7 @@ class Rates:
 
     def taken(self, seconds: float) -> Rates:
         """Return what the cells lose in a time."""
-        taken = (seconds * values for values in (self.cells, self.lost, self.turnover, self.gain))
-        return Rates(self.pressure, *taken)
+        return Rates(*(seconds * values for values in (self.cells, self.lost, self.turnover, self.gain)))
 
 
 class StorageSystem:
@@ -302,7 +240,7 @@ class StorageSystem:
         self.T, self.D, self.L = (matrix(own, own, 2 * d + 1) for _ in range(3))
         self.B = matrix(own, momentum, 2**d * d)
         self.B_momentum = self.B if forms.symmetric else matrix(own, momentum, 2**d * d)
-        self.residual, self.p, self.p_start = (own.vector() for _ in range(3))
+        self.residual, self.step, self._potentials = (own.vector() for _ in range(3))
         kinds = (fluxes.flux, fluxes.damp, fluxes.alternation, fluxes.gravity)
         self._flux, self.damp, self._alternation, self.gravity = (f and f.on(facets) for f in kinds)
         self.set_alternation()
@@ -325,6 +263,11 @@ class StorageSystem:
         for slope in slopes:
             out.array_w[:] += slope(u)
 
+    def between(self, pi: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return what the cells lose to others at mass potentials (n,), Pa, by their differences alone, m^d/s."""
+        self._potentials.array_w[:] = pi
+        return (self.T * self._potentials).array_r
+
     def set_alternation(self) -> None:
         """Assemble the filter L of `StorageProblem.assemble_preconditioner`."""
         zero(self.L)
@@ -332,22 +275,24 @@ class StorageSystem:
         self.L.assemble()
 
     def set_fluxes(
-        self, contents: CellContents, sides: OpenSides, flow: Conduction, off: tuple[FacetSum, Gradients] | None
+        self,
+        contents: CellContents,
+        feeds: Sequence[Feeds],
+        flow: Conduction,
+        off: tuple[FacetSum, Gradients, OpenSides] | None,
     ) -> Outflow:
-        """Assemble the fluxes through inner faces and open sides; off: of `AslantFlow`, where there is any."""
-        at = contents.slot(sides.cells)
-        reach = flow.deformed(at, sides.reach)
-        faces = OpenFaces(sides.number, at, *sides.driven(at, flow, self._forms.bulk), sides.seeps, reach)
-        both = (np.where(sides.seeps, 0.0, values) for values in (faces.conductance, faces.inflow))
-        conductance, inflow = (sum_by(at, values, len(contents.filled)) for values in both)
+        """Assemble the fluxes through inner faces; off: of `AslantFlow`, where there is any."""
         mobility = self._forms.fluxes.set_conduction(contents, flow)
         zero(self.T)
         if self._flux is not None:
             self._flux.assemble_matrix(self.T)
         self.T.assemble()
-        total = _add_diagonal(self.T, conductance)
-        aslant = off and AslantFlow(self._forms.fluxes, *off, contents, sides, faces.conductance, flow.weight)
-        return Outflow(conductance, inflow, faces, total, mobility, aslant)
+        total = _add_diagonal(self.T, np.zeros(self.unknowns.size))  # also of a cell without faces
+        aslant = None
+        if off is not None:
+            facets, gradients, sides = off
+            aslant = AslantFlow(self._forms.fluxes, facets, gradients, contents, sides, flow.weight)
+        return Outflow([one.conducting(flow) for one in feeds], total, mobility, aslant)
 
 
 @dataclass(frozen=True)
@@ -377,8 +322,10 @@ class StorageProblem:
         The pieces.
     contents
         What the cells hold.
+    feeds
+        What acts on the fluid.
     flow
-        Assembles what leaves them at (u, p); called with whether this is the start of the substep.
+        Assembles what leaves the cells at (u, p); called with whether this is the start of the substep.
     dt
         Share of the step in which the rate at (u, p) counts, s.
     before
@@ -399,6 +346,7 @@ class StorageProblem:
         system: StorageSystem,
         data: PointData,
         contents: CellContents,
+        feeds: Sequence[Feeds],
         flow: Callable[[bool], Outflow],
         dt: float,
         before: Rates | None = None,
@@ -412,21 +360,21 @@ class StorageProblem:
         self._due = due
         self._inertial = inertial
         self._contents = contents
+        self._feeds = feeds
         self._flow = flow
         self.dt = dt
-        self._before = before or Rates(np.empty(0), *np.zeros((4, system.unknowns.size)))
+        self._before = before or Rates(*np.zeros((4, system.unknowns.size)))
         outflow = flow(before is None)
-        system.unknowns.gather(forms.p_n.x.array, system.p_start)
         reach = 4 * forms.grid.h.max() ** 2  # no two centroids are further apart than 2 h
         tau, least = contents.set_damping(), dt * outflow.mobility.min(axis=1)
         softest = contents.softest(softness) if forms.softens else np.ones(1)
         known = [(tau * reach > least).any(), (softest * tau * reach > least).any() and softest.max() > 1]
-        somewhere = over_all(forms.grid.comm, np.array([*known, outflow.faces.seeps.any()], dtype=float)) > 0
-        self.damped, flows, self._seeps = somewhere.tolist()
+        somewhere = over_all(forms.grid.comm, np.array([*known, any(one.settles for one in feeds)], dtype=float)) > 0
+        self.damped, flows, self._settles = somewhere.tolist()
         """Whether jumps of the pressure are damped somewhere."""
         self._softer = self._damping_of_soft_soil(tau, softest, outflow.mobility) if flows else None
-        self._flowing = outflow.faces.outflow(self._potentials) >= 0
-        self._aslant = self._aslant_now(outflow)
+        self._aslant = self._begin(outflow)
+        """What flows beside the two-point fluxes at the start of the substep, m^d/s: no tangent sees it."""
         if self.damped:
             forms.fluxes.dt.value = dt
             zero(system.D)
@@ -444,9 +392,10 @@ class StorageProblem:
         return second_differences(self.system.unknowns, grid, strength, contents.centroid, contents.open)
 
     @property
-    def _potentials(self) -> NDArray[np.float64]:
-        """Mass potentials of the active owned cells, Pa."""
-        return mass_potential(self.forms.p.x.array[self.system.unknowns.owned], self.forms.bulk)
+    def _fluid(self) -> Fluid:
+        """The fluid in the active owned cells at p."""
+        p = self.forms.p.x.array[self.system.unknowns.owned]
+        return Fluid(p, mass_potential(p, self.forms.bulk), np.exp(p / self.forms.bulk))
 
     @property
     def _density(self) -> NDArray[np.float64]:
@@ -454,18 +403,15 @@ class StorageProblem:
         forms, owned = self.forms, self.system.unknowns.owned
         return np.exp((forms.p.x.array + forms.p_n.x.array)[owned] / (2 * forms.bulk))
 
-    def outflows(self, names: Sequence[str]) -> dict[str, NDArray[np.float64]]:
-        """Return what leaves through the sides of each condition at (u, p), m^d/s, by name."""
-        faces = self._flow(False).faces
-        leaves = np.where(self._flowing | ~faces.seeps, faces.outflow(self._potentials), 0.0)
-        leaves = leaves + self._aslant.faces
-        sums = over_all(self.forms.grid.comm, sum_by(faces.number, leaves, len(names)))
-        return {name: np.array(sums[i]) for i, name in enumerate(names)}
+    def outflows(self) -> dict[str, NDArray[np.float64]]:
+        """Return what leaves the bodies by each condition at (u, p), m^d/s, by name."""
+        fluid, both = self._fluid, zip(self._feeds, self._flow(False).at, strict=True)
+        return {name: values for one, at in both for name, values in one.outflows(at, fluid).items()}
 
     @property
     def linear(self) -> bool:
         """Whether the tangent does not depend on the pressure."""
-        return self.forms.linear and not self._seeps
+        return not self.forms.drains and not self._settles and all(one.linear for one in self._feeds)
 
     @property
     def fill(self) -> NDArray[np.float64]:
@@ -484,28 +430,27 @@ class StorageProblem:
         whole, area = over_all(self.forms.grid.comm, np.array([self._contents.volume.sum(), self._contents.area.sum()]))
         return float(whole / area)
 
-    def _aslant_now(self, outflow: Outflow) -> Aslant:
-        """Return what flows beside the two-point fluxes at the start of the substep: no tangent sees it."""
-        if outflow.aslant is None:
-            return Aslant(0.0, 0.0, 0.0)
-        p = self.forms.p.x.array
-        between, faces = outflow.aslant(p, np.exp(p / self.forms.bulk))
-        leaving = sum_by(outflow.faces.at, faces, len(between))
-        return Aslant(between + leaving, faces, leaving)
+    def _begin(self, outflow: Outflow) -> NDArray[np.float64] | float:
+        """Let what acts begin at the present pressures; return what flows aslant from cell to cell, m^d/s."""
+        p, fluid = self.forms.p.x.array, self._fluid
+        sides = [0 if one.sides is None else len(one.sides.cells) for one in self._feeds]
+        between, beyond = 0.0, np.zeros(sum(sides))
+        if outflow.aslant is not None:
+            between, beyond = outflow.aslant(p, np.exp(p / self.forms.bulk))
+        parts = np.split(beyond, np.cumsum(sides)[:-1])
+        for one, at, part in zip(self._feeds, outflow.at, parts, strict=False):
+            one.begin(at, fluid, part)
+        return between
 
-    def settle_seepage(self) -> bool:
-        """Open and close seepage faces as the flow at (u, p) asks for; return whether that has changed anything.
+    def settle(self) -> bool:
+        """Open and close what asks for it by the flow at (u, p); return whether that has changed anything.
 
-        Newton's method solves for (u, p) with the faces as they are, and then settles them: a primal-dual active set
-        (Hintermueller, Ito and Kunisch 2002).
+        Newton's method solves for (u, p) with what is open as it is, and then settles it.
         """
-        if not self._seeps:
+        if not self._settles:
             return False
-        faces = self._flow(False).faces
-        flows = faces.outflow(self._potentials) > 0
-        changes = over_all(self.forms.grid.comm, int(np.count_nonzero((flows != self._flowing) & faces.seeps)))
-        self._flowing = flows
-        return changes > 0
+        fluid, both = self._fluid, zip(self._feeds, self._flow(False).at, strict=True)
+        return over_all(self.forms.grid.comm, sum(one.settle(at, fluid) for one, at in both)) > 0
 
     def set_fluxes(self) -> None:
         """Assemble the fluxes at u."""
@@ -517,8 +462,8 @@ class StorageProblem:
         Of what the laws of the conductivity, and the geometry of the fluxes, make of it no matrix is assembled: it is
         taken from differences (Knoll and Keyes 2004).  `set_fluxes` makes the fluxes those at u again.
         """
-        p, h = self.system.unknowns.gather(self.forms.p.x.array, self.system.unknowns.vector()), self.forms.grid.h.min()
-        here, density = self._rates(self._flow(False), p).cells, self._density
+        h = self.forms.grid.h.min()
+        here, density = self._rates(self._flow(False)).cells, self._density
 
         def along(v: PETSc.Vec) -> NDArray[np.float64]:
             largest = v.norm(PETSc.NormType.NORM_INFINITY)
@@ -526,7 +471,7 @@ class StorageProblem:
                 return np.zeros(len(here))
             step, now = np.sqrt(np.finfo(float).eps) * h / largest, u.x.array.copy()
             unknowns.add(u, step, v)
-            there = self._rates(self._flow(False), p).cells
+            there = self._rates(self._flow(False)).cells
             u.x.array[:] = now
             return self.dt * (there - here) / step / density
 
@@ -542,12 +487,13 @@ class StorageProblem:
         owned = system.unknowns.owned
         density = self._density
         b[owned] = change = density * b[owned] + self._due
-        r, p = system.unknowns.gather(b, system.residual), system.unknowns.gather(forms.p.x.array, system.p)
+        r = system.unknowns.gather(b, system.residual)
+        step = system.unknowns.gather(forms.p.x.array - forms.p_n.x.array, system.step)
         if self.damped:
-            system.D.multAdd(p - system.p_start, r, r)
+            system.D.multAdd(step, r, r)
         if self._softer is not None:
-            self._softer.multAdd(p - system.p_start, r, r)
-        rates = self._rates(outflow, p)
+            self._softer.multAdd(step, r, r)
+        rates = self._rates(outflow)
         now = rates.taken(self.dt)
         mass = r.array_r + now.cells + before.cells
         r.array_w[:] = mass / density
@@ -556,29 +502,22 @@ class StorageProblem:
         rows = np.abs(change) + now.gain + before.gain, round_off, np.abs(mass), change + now.lost + before.lost
         return StorageResidual(r, *(system.of_parts.sums(row) for row in rows), rates)
 
-    def _rates(self, outflow: Outflow, p: PETSc.Vec) -> Rates:
+    def _rates(self, outflow: Outflow) -> Rates:
         """Return the rates at (u, p)."""
-        forms = self.forms
-        system = self.system
-        gain = np.zeros(self.system.unknowns.size)
-        pi = p.copy()
-        pi.array_w[:] = values = mass_potential(p.array_r, forms.bulk)
+        system, fluid = self.system, self._fluid
         if system.gravity is None:
-            cells = (system.T * pi).array_r.copy()
+            cells = system.between(fluid.pi) + self._aslant
         else:
-            cells = outflow.conductance * values + forms.driven(system.gravity)[system.unknowns.owned]
-        inflow = outflow.inflow
+            cells = self.forms.driven(system.gravity)[system.unknowns.owned] + self._aslant
+        lost, gain = np.zeros((2, len(cells)))
+        turnover = np.abs(outflow.total * fluid.pi)
         if self._inertial is not None:
-            inflow = inflow - outflow.faces.driven(self._inertial())
-        cells += self._aslant.cells - inflow
-        if forms.sources:
-            gain = forms.gain(self.data)[system.unknowns.owned]
-            cells -= gain
-        seeping, slope = outflow.faces.seepage(values, self._flowing) if self._seeps else (0.0, 0.0)
-        cells += seeping
-        lost = outflow.conductance * values - inflow + seeping + self._aslant.lost - gain
-        turnover = (np.abs(outflow.total) + slope) * np.abs(values)
-        return Rates(p.array_r.copy(), cells, lost, turnover, np.abs(gain))
+            fluid = fluid._replace(force=self._inertial())
+        for one, at in zip(self._feeds, outflow.at, strict=True):
+            leaving = one.leaving(at, fluid)
+            lost, gain = lost + leaving.cells, gain + leaving.gain
+            turnover = turnover + leaving.turnover
+        return Rates(cells + lost, lost, turnover, gain)
 
     def came(self, rates: Rates) -> NDArray[np.float64]:
         """Return the fluid (cells,), m^d, that came to the local cells in the step by fluxes and sources; ghosts none.
@@ -607,13 +546,9 @@ class StorageProblem:
             system.C.axpy(1.0, system.D, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
         if self._softer is not None:
             system.C.axpy(1.0, self._softer, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
-        owned = system.unknowns.owned
-        _add_diagonal(system.C, capacity[owned])
-        if self._seeps:
-            slope = self._flow(False).faces.seepage(self._potentials, self._flowing)[1]
-            _add_diagonal(system.C, self.dt * slope)
-        if forms.sources:
-            _add_diagonal(system.C, -self.dt * forms.gain_slope(data)[owned])
+        fluid, both = self._fluid, zip(self._feeds, self._flow(False).at, strict=True)
+        slope = sum(one.slope(at, fluid) for one, at in both)
+        _add_diagonal(system.C, capacity[system.unknowns.owned] + self.dt * slope)
 
     def assemble_preconditioner(self, factor: float, share: float) -> PETSc.Mat:
         """Return the fixed-stress operator C + factor (beta V - share L) for the present C.

@@ -32,10 +32,10 @@ from mpm_dolfinx.stepping.result import Result
 from mpm_dolfinx.stepping.state import State, Stay
 from mpm_dolfinx.stepping.step_control import StepControl
 
-FORMAT, VERSION = "mpm_dolfinx checkpoint", 10  # Source: the format of the files
+FORMAT, VERSION = "mpm_dolfinx checkpoint", 11  # Source: the format of the files
 FOREIGN = "no checkpoint of mpm_dolfinx, must be one"
 ZIP = b"PK\3\4"  # how numpy's archives begin
-PIECES = ("id", "pressure", "x", "start")  # of a Stay
+LEAVE = ("pressure", "slope", "bounds")  # of pieces that do not stay
 NODAL = ("velocity", "held", "rest")  # of a State
 NOTE = {"t": float, "resets": int, "begins": bool, "scene": dict, "result": dict, "control": dict}  # and their kinds
 
@@ -161,12 +161,10 @@ def _arrays(state: State) -> dict[str, NDArray]:
             named["result"].setdefault(f"outcome/{name}", {"row": [], "value": []})
             for rows, one in zip(named["result"][f"outcome/{name}"].values(), (i, value), strict=True):
                 rows.append(one)
-    if state.transported is not None:
-        named["transported"] = vars(state.transported)
+    if state.pieces is not None:
+        named["pieces"] = state.pieces.arrays
     if state.stay is not None:
         named["stay"] = {"points": vars(state.stay.points)}
-        if state.stay.id is not None:
-            named["stay"] |= {name: getattr(state.stay, name) for name in PIECES}
         if state.stay.keeps is not None:
             named["stay"]["keeps"] = state.stay.keeps
     return _named("", named)
@@ -180,19 +178,20 @@ def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulat
     try:
         points = _points(_part(arrays, "points/"), now.points, ids)
         stay = None
-        transported = None
+        pieces = None
         of_stay = _part(arrays, "stay/")
         if of_stay:
-            own = [of_stay.pop(name) for name in PIECES] if wet else [None] * len(PIECES)
             keeps = of_stay.pop("keeps", None)
-            stay = Stay(_points(_part(of_stay, "points/"), now.points, ids), *own, keeps)
-            if wet:
-                _check_pieces(dict(zip(PIECES, own, strict=True)), ids, dim)
+            stay = Stay(_points(_part(of_stay, "points/"), now.points, ids), keeps)
             if keeps is not None and (keeps.dtype != bool or keeps.shape != ids.shape):
                 raise ValueError(f"stay/keeps: {keeps.dtype} of shape {keeps.shape}")
-        if wet and (stay is None or stay.keeps is not None):
-            transported = PiecePressures(**_part(arrays, "transported/"))
-            _check_pieces(vars(transported), ids, dim)
+        if wet:
+            own = _part(arrays, "pieces/")
+            _check_pieces(own, ids, dim)
+            leaves = dict.fromkeys(LEAVE) if stay is not None and stay.keeps is None else {}
+            pieces = PiecePressures(**own, **leaves)
+            if (pieces.of_cell is None or pieces.start is None) != (stay is None):
+                raise ValueError("pieces: of_cell, start: of another stay")
         histories = _part(arrays, "result/")
         times = histories["t"]
         outcomes = _outcomes(_part(histories, "outcome/"), len(times))
@@ -207,7 +206,7 @@ def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulat
         return State(
             t=note["t"],
             points=points,
-            transported=transported,
+            pieces=pieces,
             stay=stay,
             resets=note["resets"],
             outcome=_like(outcome, now.outcome),
@@ -237,8 +236,14 @@ def _like(outcome: dict[str, dict[str, NDArray]], now: Outcome) -> dict[str, dic
     ValueError where it has other shapes, or how far tools have been pushed is not finite.
     """
     found = {q: {name: outcome.get(q, {}).get(name, value) for name, value in of.items()} for q, of in now.items()}
+    if "energy" in outcome:
+        found["energy"] = outcome["energy"]
     for quantity, of in found.items():
         for name, value in of.items():
+            if quantity == "energy" and (value.shape or not np.isfinite(value)):
+                raise ValueError(f"outcome/{quantity}/{name} is no finite number")
+            if quantity == "energy":
+                continue
             if value.shape != now[quantity][name].shape or value.dtype != np.float64:
                 raise ValueError(f"outcome/{quantity}/{name}: {value.dtype} of shape {value.shape}")
             if quantity == "tool_travel" and not np.isfinite(value):
@@ -327,12 +332,10 @@ def _without_rows(state: State) -> State:
     """Return a state without points and pieces."""
     none = np.empty(0, np.int64)
     points = state.points.of(none)
-    transported = state.transported
     stay = state.stay
     if stay is not None:
-        rows = [None if rows is None else rows[:0] for rows in (getattr(stay, name) for name in PIECES)]
-        stay = Stay(stay.points.of(none), *rows, None if stay.keeps is None else stay.keeps[:0])
-    return replace(state, points=points, transported=transported and transported.of(none), stay=stay)
+        stay = Stay(stay.points.of(none), None if stay.keeps is None else stay.keeps[:0])
+    return replace(state, points=points, pieces=state.pieces and state.pieces.of(none), stay=stay)
 
 
 def _named(prefix: str, values: dict) -> dict[str, NDArray]:

@@ -61,7 +61,7 @@ def plot(simulation: Simulation, field: str = "pressure", ax=None, *, bar: bool 
         what = f"plot: {error}; must be installed: apt-get install python3-matplotlib, or conda-forge's matplotlib"
         raise ImportError(what) from error
     ax = plt.subplots()[1] if ax is None else ax
-    style = {"edgecolors": "face", "linewidth": 0.2} | style
+    style = {"edgecolors": "face", "linewidth": 0.25} | style
     drawn = ax.add_collection(PolyCollection(corners[:, VTK_CELLS[2][1]], array=values, **style))
     ax.autoscale_view()
     radius = "r" if simulation.grid.axisymmetric else "x"

@@ -42,6 +42,7 @@ FIELDS = {
         "tool_force_x_NAME, _y_, _z_": "N, in plane strain N/m, force of the tool or contact NAME on the bodies",
         "tool_force_moment_NAME": "N, plane strain: moment about its centre for each m; in 3D _x, _y, _z, N m",
         "tool_travel_NAME": "m, how far a load has pushed the tool NAME beyond its displacement",
+        "energy_NAME": "J, in plane strain J/m, see `Result.energies`",
         "outflow_NAME": "m^3/s, in plane strain m^2/s, what leaves through the open side NAME",
     },
 }

@@ -25,7 +25,8 @@ from mpm_dolfinx.materials.skeleton import Field, _check
 from mpm_dolfinx.materials.trial import Trial
 
 MATCHES = {
-    "plane strain": lambda t, s, c: (3 * t / np.sqrt(9 + 12 * t**2), 3 / np.sqrt(9 + 12 * t**2)),
+    # Source: Drucker and Prager (1952)
+    "plane strain": lambda t, s, c: (t / np.sqrt(1 + 4 / 3 * t**2), 1 / np.sqrt(1 + 4 / 3 * t**2)),
     "compression": lambda t, s, c: (6 * s / np.sqrt(3) / (3 - s), 6 * c / np.sqrt(3) / (3 - s)),
     "extension": lambda t, s, c: (6 * s / np.sqrt(3) / (3 + s), 6 * c / np.sqrt(3) / (3 + s)),
 }
@@ -71,6 +72,7 @@ class DruckerPrager(Frictional):
     hardening: Field = 0.0
     match: str = "plane strain"
 
+    elastic_hencky: ClassVar = True
     state: ClassVar = {"plastic": np.eye(3), "hardened": 0.0}
 
     def __post_init__(self):

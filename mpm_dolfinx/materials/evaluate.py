@@ -97,6 +97,16 @@ class LawAtPoints:
         return stress.evaluate(data)
 
     @cached_property
+    def _energy(self) -> PointExpression:
+        return PointExpression(expression(self.law.energy, [()], "F", F=self._F, **self._values), self.points)
+
+    def energy(self, data: PointData) -> NDArray[np.float64]:
+        """Return the stored energy (n,) per reference volume, Pa, of a law that gives it."""
+        energy = self._energy
+        self._solve(data, 0.0)
+        return energy.evaluate(data)
+
+    @cached_property
     def _out_of_plane(self) -> PointExpression | None:
         across = self.law.out_of_plane(self._F, self._values)
         return None if across is None else PointExpression(across, self.points)
@@ -235,8 +245,8 @@ class ConductivityAtPieces:
         self._points = pieces
         self._materials = materials
         self._u = displacement
-        self.pressure = pressure if any("p" in signature(law).parameters for law in laws) else None
-        """What laws are given for p, None where none names it."""
+        self.by_pressure = any("p" in signature(law).parameters for law in laws)
+        """Whether a law names p."""
         self._p = pressure
         self._laws = {law: PointExpression(self._in_ufl(law), pieces) for law in laws}
 

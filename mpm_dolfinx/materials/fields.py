@@ -366,6 +366,23 @@ class SceneMaterials:
             out[rows] = law.stress_3d(data)
         return out
 
+    def stored(self, points: MaterialPoints) -> NDArray[np.float64]:
+        """Return the elastic energy of the skeleton (n,) per reference volume, Pa; on all processes together.
+
+        Of laws that give stresses it is that of Hencky's law, of constant moduli, where they say so, else none.
+        """
+        out = np.zeros(len(points))
+        bulk, shear = (self.table(points, lambda m, name=name: getattr(m, name)) for name in ("bulk", "shear"))
+        for law, rows, data in self._placed(points):
+            if law.law.energy is not None:
+                out[rows] = law.energy(data)
+            elif law.law.elastic_hencky:
+                tau = law.stress_3d(data) * points.J[rows][:, None, None]
+                p = np.trace(tau, axis1=1, axis2=2) / 3
+                s2 = ((tau - p[:, None, None] * np.eye(3)) ** 2).sum(axis=(1, 2))
+                out[rows] = p**2 / (2 * bulk[rows]) + s2 / (4 * shear[rows])
+        return out
+
     def total_stress(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the Cauchy stress of skeleton and fluid, Pa, as `effective_stress`; on all processes together."""
         pressure = self.table(points, lambda m: m.biot) * points.pressure

@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.base.errors import NotConverged
-from mpm_dolfinx.base.given_values import at_places
 from mpm_dolfinx.base.tolerances import NEAR, SAME
-from mpm_dolfinx.base.validation import line, numbers
+from mpm_dolfinx.base.validation import at_places, line, numbers
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.overburden import overburden
 from mpm_dolfinx.materials.cam_clay import ModifiedCamClay

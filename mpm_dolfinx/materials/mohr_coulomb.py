@@ -61,6 +61,7 @@ class MohrCoulomb(Frictional):
 
     tension: Field = np.inf
 
+    elastic_hencky: ClassVar = True
     state: ClassVar = {"plastic": np.eye(3)}
     unknowns: ClassVar = {"stress": np.zeros(6), "flows": 0.0}
 

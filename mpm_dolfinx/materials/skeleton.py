@@ -17,8 +17,7 @@ import numpy as np
 import ufl
 from numpy.typing import ArrayLike, NDArray
 
-from mpm_dolfinx.base.given_values import at_places
-from mpm_dolfinx.base.validation import functions, instance, line, numbers
+from mpm_dolfinx.base.validation import at_places, functions, instance, line, numbers
 from mpm_dolfinx.forms.axes import planar
 from mpm_dolfinx.materials.user_functions import expression
 
@@ -141,6 +140,8 @@ class Skeleton:
     solution: ClassVar[Callable | None] = None
     dilates: ClassVar[bool] = False
     """Whether the law has an angle of `dilation`."""
+    elastic_hencky: ClassVar[bool] = False
+    """Whether stresses are those of elastic strains by Hencky's law: then they tell the elastic energy."""
     linear: ClassVar[bool] = False
     """Whether the stress is linear in F: one factorisation then serves for as long as the active cells stay."""
     state: ClassVar[Mapping[str, ArrayLike]] = {}

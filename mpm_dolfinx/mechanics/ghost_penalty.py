@@ -17,13 +17,16 @@ cells that are not full carry a fifth of the penalty.
 
 from __future__ import annotations
 
+from petsc4py import PETSc
+
 import numpy as np
 import ufl
 from dolfinx import fem
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base import _compat
-from mpm_dolfinx.forms.point_forms import FacetForm
+from mpm_dolfinx.conditions.acting import Loads
+from mpm_dolfinx.forms.point_forms import FacetForm, FacetSum
 from mpm_dolfinx.grid.grid import TURN, Grid
 from mpm_dolfinx.materials.skeleton import Skeleton
 
@@ -121,7 +124,22 @@ class GhostPenalty:
         self.beside.x.array[own] = np.where(neighbours >= 0, fill[neighbours], 0.0).max(axis=1, initial=0.0)
         self.beside.x.scatter_forward()
 
+    def on(self, facets: NDArray[np.int32], at_walls: NDArray[np.int32]) -> Loads:
+        """Return the penalty on faces of this process, and on those of them in cells that walls hold nodes of."""
+        return GhostLoads(self.form.on(facets), self.form.on(at_walls))
+
     def facets(self, facets: NDArray[np.int32]) -> NDArray[np.int32]:
         """Return those of the inner faces that carry the penalty."""
         fill = self.fill.x.array[self.grid.facet_cells[facets]]
         return facets[fill.min(axis=1) < (FULL if self._at_points else RATIO * fill.max(axis=1))]
+
+
+class GhostLoads(Loads):
+    """The ghost penalty on faces of a cut, on all and on those at walls."""
+
+    def __init__(self, everywhere: FacetSum, at_walls: FacetSum):
+        self._everywhere, self._at_walls = everywhere, at_walls
+
+    def penalty(self, A: PETSc.Mat, walls: bool) -> None:
+        """Add its matrix."""
+        (self._at_walls if walls else self._everywhere).assemble_matrix(A)

@@ -18,11 +18,12 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.caching import Latest
+from mpm_dolfinx.base.time_integration import in_step
 from mpm_dolfinx.base.tolerances import EPSILON, NEAR
 from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.bodies.faces import Surface, face_vectors
 from mpm_dolfinx.conditions.acting import Acting, At, Loads, Place, Setting, Unmet
-from mpm_dolfinx.conditions.conditions import HOLD, Displacement, holding, resistance
+from mpm_dolfinx.conditions.conditions import HOLD, Displacement, resistance
 from mpm_dolfinx.conditions.sides import check_apart, everywhere, meeting
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointForm
@@ -108,7 +109,7 @@ class GivenDisplacements(Acting):
         d, comm = self._grid.dim, self._grid.comm
         self._check_meeting(place.t)
         ends = (place.start, place.start + place.dt) if place.dt > 0 else ()  # without: held where they count from
-        points, origin = self._held_points(place.cut, place.points, place.t, ends)
+        points, origin = self._held_points(place.cut, place.points, place.t, ends, place.inertia)
         held = HeldCells(self._grid, points)
         placed, message = [], ""
         for axis in range(d):
@@ -133,11 +134,11 @@ class GivenDisplacements(Acting):
         return HoldLoads(self, forms, data, held, row, own, *more)
 
     def _held_points(
-        self, cut: CutDomains, points: MaterialPoints, t: float, ends: Sequence[float]
+        self, cut: CutDomains, points: MaterialPoints, t: float, ends: Sequence[float], inertia: bool
     ) -> tuple[HeldPoints, Origin]:
         """Return the points of integration on held sides, at the owners of their cells, and where they come from.
 
-        ends: start and end of the step, s; none for sides at rest.
+        ends: start and end of the step, s; none for sides at rest; inertia: whether velocities count.
         """
         d, rows = self._grid.dim, []
         patches = cut.surfaces([faces for _, faces, _ in self._holds])
@@ -145,17 +146,19 @@ class GivenDisplacements(Acting):
         cut_points = cut.points if ends else points  # which are where they were cut
         now, before = (of.map(lambda values: values[chosen]) for of in (points, cut_points))
         stress = self._materials.total_stress(now)
-        modulus, resists = (self._materials.table(before, of) for of in (holding, resistance))
+        resists = self._materials.table(before, resistance)
         # of when the grid was reset, as the stiffnesses: they stay as long as the cut serves
         tension = np.linalg.norm(stress if points is cut_points else self._materials.total_stress(before), axis=(1, 2))
         for number, ((hold, *_, axes), p) in enumerate(zip(self._holds, patches, strict=True)):
             at, now = np.searchsorted(chosen, p.at), p.now(points)
             given = [self._given(hold, time, p.X) for time in (t, *ends)] if ends else 3 * [np.zeros_like(now)]
+            if inertia and ends and t < ends[1]:
+                given[0] = in_step((t - ends[0]) / (ends[1] - ends[0]), given[1], given[0], given[2])
             to, given = p.origin(points) + given[0], np.concatenate(given[1:], axis=1)
             R = turned(self._grid.comm, p.area0, now, to) if len(axes) == d else np.eye(d)  # as what it carries does
             force, gap = np.einsum("ij,njk,nk->ni", R, stress[at, :d, :d], p.area(points)), to - now
             before = points.data[traction_name(self._names[number])][p.at] @ R.T
-            own = (p.area0 * v for v in (1, modulus[at], tension[at], resists[at]))
+            own = (p.area0 * v for v in (1, tension[at], resists[at]))
             each = np.stack([np.full(len(gap), number), *own], axis=1)
             rows.append((p.cell, p.x, np.concatenate([each, gap, given, p.area(cut.points), force, before], axis=1)))
         number = np.repeat(np.arange(len(patches)), [len(p.at) for p in patches])
@@ -163,8 +166,8 @@ class GivenDisplacements(Acting):
         where, x, values = (np.concatenate(column) for column in zip(*rows, strict=True))
         origin = Origin(Exchange(self._grid.comm, self._grid.owner(where)), point, number, area)
         where, x, values = map(origin.travel.send, (where, x, values))
-        number, *own = values[:, :5].T
-        own = (*own, x, *np.split(values[:, 5:], [d, 3 * d, 4 * d, 5 * d], axis=1))
+        number, *own = values[:, :4].T
+        own = (*own, x, *np.split(values[:, 4:], [d, 3 * d, 4 * d, 5 * d], axis=1))
         return HeldPoints(number.astype(np.int64), self._grid.local(where), *own), origin
 
     def kept(self, n: int) -> dict[str, dict[str, NDArray[np.float64]]]:
@@ -458,6 +461,10 @@ class HoldLoads(Loads):
         """Rows of means (k,), and axes (k,), of the multipliers."""
         rows = self._of.rows
         return self.row[rows], self.data["direction"][rows].argmax(axis=1)
+
+    def pulling(self, at: At, v: NDArray[np.float64]) -> float:
+        """Return the power, W, of what pulls the sides along."""
+        return float(self.pull(at.nodal) @ self._along(v.reshape(-1, self._d)))
 
     def counted(self, at: At) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return degrees of freedom (n,), and forces (n,), N, on them that reactions count."""

@@ -32,25 +32,32 @@ EVERYWHERE = 1e2
 
 Plateau (soil): halved 2.2e-05, doubled 1.7e-05, cells 3.0e-02.
 """
+TENSE = 10
+"""Share of the stress of a side that adds to its modulus: held with less than its stress it buckles.
+
+Plateau (soil): halved 2.8e-06, doubled 4.7e-06, cells 3.0e-02.
+"""
 JUMP = 0.01
-"""Compliance of J, in units of (cell size) / (what resists)."""
+"""Compliance of J, in units of (cell size) / (what resists).
+
+Plateau (soil): halved 2.2e-05, doubled 3.8e-05, cells 3.0e-02.
+"""
 CARRIED = 0.3  # change of traction in a step, in units of what resists and stress: no body's stress changes so much
 
 
 class HeldPoints(NamedTuple):
     """Points of integration on sides with given displacements; arrays over n points in owned cells.
 
-    number, cell : (n,) condition, and local cell; area : (n,) reference area, m^(d-1); modulus, tension, resistance :
-    (n,) modulus to hold with, norm of the stress when the grid was reset, and what resists, times area, N; x, gap :
-    (n, d) position, and how far it is from where it is to be, m; given : (n, 2 d) given displacements at the start and
-    the end of the step, m; normal : (n, d) area vector when the grid was reset, m^(d-1); force : (n, d) of the body's
-    present stress, as the side turns it, N; before : (n, d) tractions of the multipliers of the step before, Pa.
+    number, cell : (n,) condition, and local cell; area : (n,) reference area, m^(d-1); tension, resistance : (n,) norm
+    of the stress when the grid was reset, and what resists, times area, N; x, gap : (n, d) position, and how far it is
+    from where it is to be, m; given : (n, 2 d) given displacements at the start and the end of the step, m; normal :
+    (n, d) area vector when the grid was reset, m^(d-1); force : (n, d) of the body's present stress, as the side turns
+    it, N; before : (n, d) tractions of the multipliers of the step before, Pa.
     """
 
     number: NDArray[np.int64]
     cell: NDArray[np.int32]
     area: NDArray[np.float64]
-    modulus: NDArray[np.float64]
     tension: NDArray[np.float64]
     resistance: NDArray[np.float64]
     x: NDArray[np.float64]
@@ -79,8 +86,10 @@ class HeldCells:
     stiffness
         Of each row by component, N/m: of means in the tangent only.
     area, resists, compliance, limit
-        Of means only: area, m^(d-1); what resists, Pa; J of a difference of one, m/Pa; and change of the force beyond which it is an
-        artefact, N.
+        Of means only: area, m^(d-1); what resists, Pa; J of a difference of one, m/Pa; and change of the force beyond
+        which it is an artefact, N.
+    of
+        Row (n,) of means of each point.
     """
 
     def __init__(self, grid: Grid, points: HeldPoints):
@@ -115,7 +124,7 @@ class HeldCells:
         local = p.x - grid.midpoints[p.cell]
         moments = {"squares": local[:, :, None] * local[:, None, :], "product": local.prod(axis=1)}
         self.moments = {name: both(mean(values), values) for name, values in moments.items()}
-        against = p.modulus + 10 * p.tension  # a stressed side buckles if it is held with less than its stress
+        against = p.resistance + TENSE * p.tension
         flat = normal**2 > (1 - ALIGNED**2) * (normal**2).sum(axis=1, keepdims=True)
         each = np.where(flat[at], EVERYWHERE * p.resistance[:, None], WEAK * against[:, None])
         firm = HOLD * np.tile(total(p.resistance)[:, None], grid.dim)
@@ -125,9 +134,8 @@ class HeldCells:
         self.compliance = JUMP * grid.h.min() * face / (self.resists * plane)
         # at the end of a side a node's force may come by a small part of a cell
         short = np.maximum(1.0, face / plane)
-        self.limit = CARRIED * total(p.resistance + 10 * p.tension) * short
+        self.limit = CARRIED * total(p.resistance + TENSE * p.tension) * short
         self.of = at
-        """Row (n,) of means of each point."""
         self._gap, self._force = both(gap, p.gap), both(0 * gap, p.force)
         self._before = both(mean(p.before), 0 * p.before)
         self._slope, self._along = both(slope, slope[at]), both(along, along[at])

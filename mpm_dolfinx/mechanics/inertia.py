@@ -33,14 +33,15 @@ import ufl
 from dolfinx import fem
 from numpy.typing import ArrayLike, NDArray
 
-from mpm_dolfinx.base.given_values import at_places, check_names
-from mpm_dolfinx.base.validation import flag, line, numbers
+from mpm_dolfinx.base.tolerances import ROUND_OFF
+from mpm_dolfinx.base.validation import at_places, check_names, flag, line, numbers
 from mpm_dolfinx.conditions.acting import At, Loads
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.forms.point_forms import FormPoints, Places, PointData, PointForm
 from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts
 from mpm_dolfinx.grid.grid import Grid, sum_by
 from mpm_dolfinx.mechanics.ghost_penalty import kinks
+from mpm_dolfinx.points.cutting import spreads
 from mpm_dolfinx.points.material_points import MaterialPoints, middle
 
 GHOST_MASS = 0.02
@@ -80,18 +81,22 @@ def checked_velocity(
             raise ValueError(f"velocity = {line(velocity)}: bodies have no inertia, must be given with inertia=True")
         return None
     flag("inertia", inertia)
-    if grid.axisymmetric or quadrature != "domain":
-        where = "in axisymmetry" if grid.axisymmetric else f"with quadrature {quadrature!r}"
-        raise ValueError(f"inertia = {inertia}: not {where}, must be left out")
+    if quadrature != "domain":
+        raise ValueError(f"inertia = {inertia}: not with quadrature {quadrature!r}, must be left out")
     if velocity is not None and not inertia:
         raise ValueError(f"velocity = {line(velocity)}: bodies are at rest at first, must be given with inertia=True")
     if callable(velocity):
         check_names("velocity", velocity, ("x",))
+    elif grid.axisymmetric and velocity is not None and np.ravel(velocity)[:1].any():
+        raise ValueError(f"velocity = {line(velocity)}, must be (0, v): axisymmetric bodies move along the axis")
     return np.zeros(grid.dim) if velocity is None else velocity
 
 
 def moving(
-    points: MaterialPoints, velocity: ArrayLike | Callable[[NDArray], ArrayLike], base: NDArray[np.float64]
+    points: MaterialPoints,
+    velocity: ArrayLike | Callable[[NDArray], ArrayLike],
+    base: NDArray[np.float64],
+    rings: bool = False,
 ) -> dict[str, NDArray[np.float64]]:
     """Return what points carry that move as given: `VELOCITY` and `RATE`.
 
@@ -101,6 +106,8 @@ def moving(
         Velocity, or a function of places, of which domains take the nearest affine field.
     base : (d,), m
         Place from which those of the points count.
+    rings
+        Whether domains are rings, whose centroids are those of their volumes.
 
     Raises
     ------
@@ -118,7 +125,10 @@ def moving(
     v = values.mean(axis=1)
     moment = np.einsum("nki,nkj->nij", values - v[:, None], off)
     L = np.linalg.solve(np.einsum("nki,nkj->nij", off, off), moment.swapaxes(1, 2)).swapaxes(1, 2)
-    v = v + np.einsum("nij,nj->ni", L, points.x - middle(points.corners))
+    x = points.x
+    if rings:
+        x = x + spreads(points.corners, False)[:, 0] / points.x[:, :1]
+    v = v + np.einsum("nij,nj->ni", L, x - middle(points.corners))
     return {VELOCITY: v, RATE: L @ points.F[:, :d, :d]}
 
 
@@ -162,16 +172,16 @@ class InertiaForms:
         self.acceleration = self._rate * (u - self._flight)
         """Acceleration at u as UFL, m/s^2."""
         self._midpoint = fem.Constant(grid.mesh, 0.0)
-        for seen in dict.fromkeys([points, *of_laws]):
+        for seen in dict.fromkeys([points, *of_laws] if not grid.axisymmetric else []):  # no ring turns rigidly
             seen.follow("gradient", (d, d), partial(self._seen, 0))
             seen.follow("turn", (d, d), partial(self._seen, 1))
         a, v = ufl.TrialFunction(V), ufl.TestFunction(V)
         self.pieces = p = FormPoints(grid, spread=(d, d))
         self._mass = PointForm(
-            (ufl.inner(p.value(a), p.value(v)) + ufl.inner(p.grad(a) * p.spread, p.grad(v))) * p.dx, p
+            (ufl.inner(p.value(a), p.value(v)) + ufl.inner(p.plane_grad(a) * p.spread, p.plane_grad(v))) * p.dx, p
         )
         self.moving = p = FormPoints(grid, velocity=(d,), turn=(d, d))
-        self._momentum = PointForm((ufl.inner(p.velocity, p.value(v)) + ufl.inner(p.turn, p.grad(v))) * p.dx, p)
+        self._momentum = PointForm((ufl.inner(p.velocity, p.value(v)) + ufl.inner(p.turn, p.plane_grad(v))) * p.dx, p)
         self.density = fem.Function(grid.cellwise())
         """Density (cells,) of what the cells hold, kg/m^3."""
         self.work = fem.Function(V)
@@ -222,7 +232,7 @@ class InertiaForms:
         """
         grid = self.grid
         rows = cut.pieces_to_cells(cut.pieces.fraction * mass[cut.pieces.point])
-        places = Places(grid, cut.cells, cut.x, cut.mixed)
+        places = Places(grid, cut.cells, cut.x, cut.mixed, cut.hoop)
         pieces = PointData(self.pieces, places, rows, {"spread": cut.second})
         content = sum_by(cut.cells, rows, grid.num_local)
         volume = fill * grid.cell_volume
@@ -270,12 +280,12 @@ class Mass:
         ksp.setType(PETSc.KSP.Type.CG)
         ksp.getPC().setType(PETSc.PC.Type.JACOBI)
         ksp.setOperators(M)
-        ksp.setTolerances(rtol=1e-14, atol=0.0, max_it=10000)
+        ksp.setTolerances(rtol=ROUND_OFF, atol=0.0)
 
     def velocity(self, points: MaterialPoints) -> PETSc.Vec:
         """Return the velocities of the unknowns, m/s: the projection of those of the points."""
         cut, forms, pieces, b = self._cut, self._forms, self._pieces, self._forms.work.x.array
-        L = points.data[RATE] @ np.linalg.inv(points.F)
+        L = velocity_gradients(points)
         v = points.data[VELOCITY][cut.pieces.point] + np.einsum("nij,nj->ni", L[cut.pieces.point], self._off)
         turn = L[cut.pieces.point] @ cut.pieces.second
         fields = {"velocity": cut.pieces_to_cells(v), "turn": cut.pieces_to_cells(turn)}
@@ -334,6 +344,12 @@ class Mass:
         moment = (at - mean[cut.pieces.point])[:, :, None] * self._off[:, None] + slope @ cut.pieces.second
         C = np.linalg.solve(self._spread, cut.mean(moment).swapaxes(1, 2)).swapaxes(1, 2)
         return mean, C @ points.F[:, :d, :d]
+
+
+def velocity_gradients(points: MaterialPoints) -> NDArray[np.float64]:
+    """Return the velocity gradients (n, d, d), 1/s, of points, in axisymmetry in the plane."""
+    d = points.x.shape[1]
+    return points.data[RATE] @ np.linalg.inv(points.F[:, :d, :d])
 
 
 class Inertia(Loads):

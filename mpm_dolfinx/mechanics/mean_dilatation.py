@@ -21,7 +21,7 @@ points keep Fbar; the J_n with which the next step begins is that of the cell's 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from petsc4py import PETSc
 
@@ -153,12 +153,10 @@ class MeanDilatation:
         P_theta = (tau_theta - mean_theta * ufl.Identity(d)) * G
         return P_F, P_theta, mean_F / theta, (mean_theta - slope) / theta
 
-    def set_ratios(self, data: QuadratureData) -> None:
-        """Set theta at the present displacement."""
+    def update(self, data: QuadratureData, solve: Callable[[], None]) -> None:
+        """Set theta, the stresses of the pieces, and pi at the present displacement; solve: for unknowns of laws."""
         self._set_mean(self.theta, self._ratios, data)
-
-    def set_stresses(self, data: QuadratureData) -> None:
-        """Set the stresses of the pieces, and pi, at the present displacement and theta."""
+        solve()
         self._set_mean(self.pi, self._stresses, data)
 
     def _set_mean(self, f: fem.Function, sums: Sequence[CellSums | StressAtPoints], data: QuadratureData) -> None:

@@ -31,6 +31,7 @@ from mpm_dolfinx.conditions.walls import wall_forces
 from mpm_dolfinx.forms.cell_matrices import Beside, ElementForces, ElementMatrices, StackedElementMatrices
 from mpm_dolfinx.forms.point_forms import FormPoints
 from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts, zero
+from mpm_dolfinx.forms.velocity import Velocity
 from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.materials.evaluate import by_scene
 from mpm_dolfinx.materials.local_unknowns import LocalUnknowns
@@ -41,7 +42,6 @@ from mpm_dolfinx.mechanics.mean_dilatation import MeanDilatation
 from mpm_dolfinx.mechanics.own_terms import OwnTerms
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
 from mpm_dolfinx.mechanics.weight import Weight
-from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.parts import OfParts, Parts, parts_of_cells, relative
 
 
@@ -100,9 +100,10 @@ class MomentumForms:
         self._local: dict[int, LocalUnknowns] = {}  # by the number of their part
         for number, (law, points, locks) in enumerate(laws):
             self._add_law(number, law, points, locks, pressure, symmetric, by_scene(grid) | {"dt": dt})
-        self.conditions = FormsOf(grid, self.u)
+        self.velocity = Velocity(self.u)
+        self.conditions = FormsOf(grid, self.u, self.velocity)
         """The forms of conditions."""
-        self.own = OwnTerms(terms, pieces, self.u, t, dt)
+        self.own = OwnTerms(terms, pieces, self.conditions, t, dt)
         self.weight = None if gravity is None else Weight(pieces, self.u, gravity, fluid_density)
         self.acting = [*filter(None, (self.weight,)), *[self.own] * bool(terms)]
         """What acts in all stages."""
@@ -145,7 +146,8 @@ class MomentumForms:
         share = 1 / ufl.det(points.F)  # divided by it, each component would be
         P, A = share * P, share * A
         stress = P * points.F.T
-        self._residuals.append(ElementForces(stress if self.inertia is None else points.turn * stress, points))
+        turns = self.inertia is not None and not self.grid.axisymmetric
+        self._residuals.append(ElementForces(points.turn * stress if turns else stress, points))
         i, j, k, l, m, n = ufl.indices(6)
         if self.grid.dim == 2:
             A = ufl.as_tensor(A[i, m, j, n] * points.F[k, m] * points.F[l, n], (i, k, j, l))
@@ -167,22 +169,22 @@ class MomentumForms:
         """u by nodes (nodes, d), m."""
         return self.u.x.array.reshape(-1, self.grid.dim)
 
-    def internal(self, data: QuadratureData) -> NDArray[np.float64]:
-        """Return the nodal forces of the stresses at u, a local array."""
-        if self.dilatation is not None:
-            self.dilatation.set_ratios(data)
-        for number, local in self._local.items():
-            local.update(data.parts[number], derive=False)
-        if self.dilatation is not None:
-            self.dilatation.set_stresses(data)
+    def internal(self, data: QuadratureData, loads: Sequence[Loads] = ()) -> NDArray[np.float64]:
+        """Return the nodal forces of the stresses at u, and of loads that count as such, a local array."""
+
+        def solve() -> None:
+            for number, local in self._local.items():
+                local.update(data.parts[number], derive=False)
 
         def add(b: NDArray[np.float64]) -> None:
             for residual, part in zip(self._residuals, data.parts, strict=True):
                 residual.assemble_vector(b, part)
-            if self.weight is not None:
-                self.weight.taken_up(b, data.pieces)
 
-        return self.summed(0, [add])
+        if self.dilatation is None:
+            solve()
+        else:
+            self.dilatation.update(data, solve)
+        return self.summed(0, [add, *(one.takes_up for one in loads)])
 
     def assemble_tangent(self, K: PETSc.Mat, data: QuadratureData) -> None:
         """Add the tangent of the stresses at u to K, which the caller finalises."""
@@ -282,7 +284,7 @@ class MomentumSystem:
         at_walls = np.zeros(len(forms.grid.node_x), dtype=bool)
         at_walls[self.held.map.indices.reshape(-1, d).max(axis=1, initial=-1) >= 0] = True
         near = at_walls[forms.grid.cell_nodes[forms.grid.facet_cells[facets]]].any(axis=(1, 2))
-        self._ghosts = [forms.ghost.form.on(some) for some in (facets[near], facets)]
+        self._ghost = forms.ghost.on(facets, facets[near])
         self.firm, self._firmness = None, None  # where nothing yields
         if not forms.elastic:
             self.firm, self._firmness = matrix(self.unknowns, self.unknowns, 3**d * d), forms.ghost.firmness.on(cells)
@@ -327,10 +329,9 @@ class MomentumSystem:
 
     def set_penalty(self, loads: Sequence[Loads]) -> None:
         """Assemble what is linear in the step's increment: ghost penalty, that of loads, and firmness."""
-        for penalty, ghost in zip((self.held_penalty, self.penalty), self._ghosts, strict=True):
+        for penalty in (self.held_penalty, self.penalty):
             zero(penalty)
-            ghost.assemble_matrix(penalty)
-            for one in loads:
+            for one in (self._ghost, *loads):
                 one.penalty(penalty, penalty is self.held_penalty)
             penalty.assemble()
         if self.firm is not None:
@@ -420,12 +421,6 @@ class MomentumProblem:
         """Whether loads have unknowns of their own."""
         return bool(self._multiplying)
 
-    @property
-    def serves(self) -> bool:
-        """Whether the last tangent has what acts at u, on all processes."""
-        other = [not one.serves(self.at) for one in self._multiplying]
-        return not over_all(self.forms.grid.comm, int(any(other)))
-
     def unmet(self) -> UnmetOfParts:
         """Return how far multipliers are from what they are to be at u."""
         each = [one.unmet(self.at) for one in self._multiplying]
@@ -512,8 +507,28 @@ class MomentumProblem:
 
     def residual_of_parts(self) -> tuple[PETSc.Vec, NDArray[np.float64]]:
         """Return the out-of-balance nodal forces at u and the scales (parts,), N, of each part: see above."""
+        system = self.system
+        b, norms = self._unbalanced()
+        system.held.gather(b, system.held_residual)  # walls bear what sides beside them would push them by
+        b[system.touched] -= self._pulls  # no measure of forces: at the start of a step they are far above them
+        r = system.unknowns.gather(b, system.residual)
+        step = system.unknowns.gather(self.forms.u.x.array, system.step)
+        system.penalty.multAdd(step, r, r)
+        for one in self.loads:
+            one.push(self.at, r, system.unknowns)
+            if (inertia := one.inertia(self.at)) is not None:
+                r += inertia
+                norms.append(system.of_parts.norms(inertia.array_r))
+        return r, np.max(norms, axis=0)
+
+    def unbalanced(self) -> NDArray[np.float64]:
+        """Return the forces of the stresses less those of loads at u, a local array, N; without what holds sides."""
+        return self._unbalanced()[0].copy()
+
+    def _unbalanced(self) -> tuple[NDArray[np.float64], list[NDArray[np.float64]]]:
+        """Return the same, and the norms (parts,), N, of its parts."""
         forms, system = self.forms, self.system
-        b = forms.internal(self.data)
+        b = forms.internal(self.data, self.loads)
         forces, external = b[system.touched], self._external
         norms = [system.force_of_parts(forces)]
         if self._varying:
@@ -525,17 +540,24 @@ class MomentumProblem:
             norms.append(system.force_of_parts(own))
         norms.append(system.force_of_parts(external))
         b[system.touched] = forces - external
-        system.held.gather(b, system.held_residual)  # walls bear what sides beside them would push them by
-        b[system.touched] -= self._pulls  # no measure of forces: at the start of a step they are far above them
-        r = system.unknowns.gather(b, system.residual)
-        step = system.unknowns.gather(forms.u.x.array, system.step)
-        system.penalty.multAdd(step, r, r)
+        return b, norms
+
+    def powers(self) -> dict[str, float]:
+        """Return powers at u on this process, W: of stresses, against what resists the velocity, and of what acts."""
+        forms, unknowns = self.forms, self.system.unknowns
+        v = np.where(unknowns.map.indices >= 0, forms.velocity.nodal, 0.0)  # none of what walls hold
+        owned = forms.u.function_space.dofmap.index_map.size_local * forms.grid.dim
+        out = {"internal": forms.internal(self.data)[:owned] @ v[:owned], "viscous": 0.0, "external": 0.0}
         for one in self.loads:
-            one.push(self.at, r, system.unknowns)
-            if (inertia := one.inertia(self.at)) is not None:
-                r += inertia
-                norms.append(system.of_parts.norms(inertia.array_r))
-        return r, np.max(norms, axis=0)
+            acts, resists = np.zeros((2, len(v)))  # those on ghosts count where they are added
+            one.dead(acts)
+            one.loads(acts)
+            one.resists(resists)
+            pushed = unknowns.vector()
+            one.push(self.at, pushed, unknowns)
+            out["external"] += acts @ v + one.pulling(self.at, v) - v[unknowns.owned] @ pushed.array_r
+            out["viscous"] += resists @ v
+        return out
 
     def out_of_balance(
         self, r: PETSc.Vec, scales: NDArray[np.float64], first: bool

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.bodies.faces import Surface
-from mpm_dolfinx.conditions.acting import Acting, Loads, Place, Setting
+from mpm_dolfinx.conditions.acting import Acting, FormsOf, Loads, Place, Setting
 from mpm_dolfinx.conditions.conditions import OnSide
 from mpm_dolfinx.conditions.sides import gathered
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointForm
@@ -40,23 +40,26 @@ class OwnTerms:
         Functions, or functions on sides.
     pieces
         All points of integration.
-    u
-        Increment of the displacement in the step, m.
+    forms
+        Those of the scene's conditions, with u and the velocity of the bodies.
     t, dt : s
         Time at the end of the substep, and time since the start of the step, UFL constants.
     """
 
     def __init__(
-        self, terms: Sequence[Callable | OnSide], pieces: FormPoints, u: fem.Function, t: fem.Constant, dt: fem.Constant
+        self,
+        terms: Sequence[Callable | OnSide],
+        pieces: FormPoints,
+        forms: FormsOf,
+        t: fem.Constant,
+        dt: fem.Constant,
     ):
         self.symmetric = True
         self.holding = False
         self.rates = False
-        self._u = u
         """Whether all tangents are symmetric; whether some depend on u, and on the velocity."""
-        # a rate is (u - past) / own: of backward Euler past is 0, and own the step
-        self._past, self._own = fem.Function(u.function_space), fem.Constant(pieces.grid.mesh, 1.0)
-        more = {"t": t, "dt": dt, "velocity": (u - self._past) / self._own}
+        u = forms.u
+        more = {"t": t, "dt": dt, "velocity": forms.velocity.value}
         v, du = ufl.TestFunction(u.function_space), ufl.TrialFunction(u.function_space)
         self.terms: list[OwnTerm] = []
         for term in terms:
@@ -69,13 +72,7 @@ class OwnTerms:
                 self.terms.append(OwnTerm(term, points, PointForm(form, points), slope))
             self.symmetric &= potential or not holds
             self.holding |= holds
-            self.rates |= self._past in form.coefficients()
-
-    def set_rate(self, own: float, past: float) -> None:
-        """Set the rate at the end of a substep: time in which it counts, s, and share of the present u before it."""
-        self._own.value = own
-        if self.rates:
-            self._past.x.array[:] = past * self._u.x.array
+            self.rates |= forms.velocity.among(form)
 
     def acting(self, setting: Setting) -> Acting:
         """Return the terms in a stage."""

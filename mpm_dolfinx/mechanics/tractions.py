@@ -1,9 +1,18 @@
 # SPDX-License-Identifier: MIT
-"""Dead tractions on sides of the bodies: int t . v dA on the faces as seeded, where they have moved to."""
+"""Loads on sides of the bodies, where these have moved to: dead tractions, and pressures that follow the surface.
+
+A traction, force per reference area, is int t . v dA on the faces as seeded.  A pressure is -int p n . v da over the
+present area, with its tangent.  That is symmetric but for the boundary of the surface, whose edges dx contribute
+p/2 (v x du) . dx: nothing where two surfaces of one pressure meet, and on a wall that holds the normal component, for
+there v, du and the edge lie in the wall.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
+
+from petsc4py import PETSc
 
 import numpy as np
 import ufl
@@ -11,16 +20,59 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.caching import Latest
-from mpm_dolfinx.base.given_values import by_place
+from mpm_dolfinx.base.tolerances import NEAR
+from mpm_dolfinx.base.validation import by_place
 from mpm_dolfinx.bodies.faces import Surface
 from mpm_dolfinx.conditions.acting import Acting, Loads, Place, Setting
-from mpm_dolfinx.conditions.conditions import Traction
+from mpm_dolfinx.conditions.conditions import Pressure, Traction
 from mpm_dolfinx.conditions.sides import everywhere, on_side
 from mpm_dolfinx.domains.cut_domains import Patches
 from mpm_dolfinx.forms.point_forms import FormPoints, Places, PointData, PointForm
-from mpm_dolfinx.grid.grid import Grid
-from mpm_dolfinx.parallel.exchange import Exchange
+from mpm_dolfinx.grid.grid import SIDES, Grid
+from mpm_dolfinx.parallel.exchange import Exchange, over_all
 from mpm_dolfinx.points.material_points import MaterialPoints
+
+
+class SideLoads(Acting):
+    """Loads of one kind on sides, in a stage.
+
+    Parameters
+    ----------
+    setting, loads
+        Where they are put, and the loads by name.
+    """
+
+    def __init__(self, setting: Setting, loads: Mapping[str, Any]):
+        self._grid, self._forms = setting.grid, setting.forms
+        self._loads = [(load, setting.sides.of(load)) for load in loads.values()]
+        self._placed: Latest[tuple[Exchange, Places]] = Latest()
+        for load in loads.values():
+            if not callable(load.value):  # what a function gives is checked when it is called
+                self._given(load, 0.0, None)
+
+    @property
+    def surfaces(self) -> list[Surface]:
+        """The faces."""
+        return [faces for _, faces in self._loads]
+
+    def forces(self, place: Place) -> tuple[Places, NDArray[np.float64]]:
+        """Return points of integration in owned cells, and the forces (n, d), N, on them."""
+        grid, patches = self._grid, place.cut.surfaces(self.surfaces)
+        travel, places = self._placed(place.cut.key, lambda: owners(grid, patches), grid.comm)
+        both = [(load, p) for (load, _), p in zip(self._loads, patches, strict=True)]
+        values = everywhere(grid, lambda: [self._given(of, place.t, on_side(p, place.points)) for of, p in both])
+        forces = [self._on(of, value, p, place.points) for (of, p), value in zip(both, values, strict=True)]
+        return places, travel.send(np.concatenate(forces))
+
+    def _given(self, load: Any, t: float, side: Any) -> NDArray[np.float64]:
+        """Return the value of a load at time t (s) at places on its side."""
+        raise NotImplementedError
+
+    def _on(
+        self, load: Any, value: NDArray[np.float64], patches: Patches, points: MaterialPoints
+    ) -> NDArray[np.float64]:
+        """Return its forces (n, d), N, on the points of integration of its side."""
+        raise NotImplementedError
 
 
 class DeadForces:
@@ -31,40 +83,26 @@ class DeadForces:
         self.work = PointForm(ufl.inner(p.force, p.value(ufl.TestFunction(u.function_space))) * p.dx, p)
 
 
-class Tractions(Acting):
-    """The tractions of a stage.
-
-    Parameters
-    ----------
-    setting, tractions
-        Where they are put, and the tractions by name.
-    """
+class Tractions(SideLoads):
+    """The tractions of a stage."""
 
     conditions, title = (Traction,), "tractions"
 
-    def __init__(self, setting: Setting, tractions: Mapping[str, Traction]):
-        self._grid, self._forms = setting.grid, setting.forms
-        self._loads = [(load, setting.sides.of(load)) for load in tractions.values()]
-        self._placed: Latest[tuple[Exchange, Places]] = Latest()
-        for load in tractions.values():
-            if not callable(load.value):  # what a function gives is checked when it is called
-                load.at(0.0, self._grid.dim)
-
-    @property
-    def surfaces(self) -> list[Surface]:
-        """The faces."""
-        return [faces for _, faces in self._loads]
-
     def placed(self, place: Place) -> Loads:
         """Return the forces on the surface."""
-        patches = place.cut.surfaces(self.surfaces)
-        travel, places = self._placed(place.cut.key, lambda: owners(self._grid, patches), self._grid.comm)
-        loads = [(load, p) for (load, _), p in zip(self._loads, patches, strict=True)]
-        forces = everywhere(
-            self._grid, lambda: np.concatenate([_force(load, place.t, p, place.points) for load, p in loads])
-        )
-        force, forms = travel.send(forces), self._forms(DeadForces)
+        (places, force), forms = self.forces(place), self._forms(DeadForces)
         return DeadLoads(forms.work, PointData(forms.points, places, np.ones(len(force)), {"force": force}))
+
+    def _given(self, load: Traction, t: float, side: Any) -> NDArray[np.float64]:
+        return load.at(t, self._grid.dim, side)
+
+    def _on(
+        self, load: Traction, value: NDArray[np.float64], patches: Patches, points: MaterialPoints
+    ) -> NDArray[np.float64]:
+        if value.ndim == 0 or (value.ndim == 1 and by_place(load.value)):  # along the normal
+            area = patches.area(points)
+            value = value[..., None] * area / np.linalg.norm(area, axis=1, keepdims=True)
+        return patches.area0[:, None] * value
 
 
 class DeadLoads(Loads):
@@ -85,10 +123,110 @@ def owners(grid: Grid, patches: Sequence[Patches]) -> tuple[Exchange, Places]:
     return travel, Places(grid, grid.local(travel.send(cell)), travel.send(x))
 
 
-def _force(load: Traction, t: float, patches: Patches, points: MaterialPoints) -> NDArray[np.float64]:
-    """Return the forces (n, d), N, of a traction at time t (s) on the points of integration of its side."""
-    traction = load.at(t, points.x.shape[1], on_side(patches, points))
-    if traction.ndim == 0 or (traction.ndim == 1 and by_place(load.value)):  # along the normal
-        area = patches.area(points)
-        traction = traction[..., None] * area / np.linalg.norm(area, axis=1, keepdims=True)
-    return patches.area0[:, None] * traction
+class PressureForms:
+    """Points with the force of a pressure on the area at the start of the step; its work, and minus the derivative."""
+
+    def __init__(self, grid: Grid, u: fem.Function):
+        self.points = p = FormPoints(grid, push=(grid.dim,))
+        V = u.function_space
+        # n da = det(Delta) Delta^-T n_n da_n (Nanson) at the present iterate
+        delta = ufl.variable(ufl.Identity(grid.stretches) + p.grad(u))
+        turned = ufl.diff(ufl.det(delta), delta)
+        if grid.axisymmetric:
+            turned = ufl.as_matrix([[turned[i, j] for j in (0, 1)] for i in (0, 1)])
+        pushed = ufl.inner(turned * p.push, p.value(ufl.TestFunction(V))) * p.dx
+        self.work, self.slope = PointForm(pushed, p), PointForm(-ufl.derivative(pushed, u, ufl.TrialFunction(V)), p)
+
+
+class Pressures(SideLoads):
+    """The pressures of a stage."""
+
+    conditions, title, linear = (Pressure,), "pressures", False
+
+    def __init__(self, setting: Setting, pressures: Mapping[str, Pressure]):
+        super().__init__(setting, pressures)
+        self.symmetric = closed(self._grid, setting.free, self._loads)
+
+    def placed(self, place: Place) -> Loads:
+        """Return the pressures on the surface, with their forces on its area at the start of the step."""
+        (places, push), forms = self.forces(place), self._forms(PressureForms)
+        return PressureLoads(forms, PointData(forms.points, places, np.ones(len(push)), {"push": push}))
+
+    def _given(self, load: Pressure, t: float, side: Any) -> NDArray[np.float64]:
+        return load.at(t, side)
+
+    def _on(
+        self, load: Pressure, value: NDArray[np.float64], patches: Patches, points: MaterialPoints
+    ) -> NDArray[np.float64]:
+        return -value[..., None] * patches.area(points)
+
+
+class PressureLoads(Loads):
+    """Pressures in a substep."""
+
+    linear, varies = False, True
+
+    def __init__(self, forms: PressureForms, data: PointData):
+        self._forms, self._data = forms, data
+
+    def loads(self, b: NDArray[np.float64]) -> None:
+        """Add the forces on the present area."""
+        self._forms.work.assemble_vector(b, self._data)
+
+    def tangent(self, K: PETSc.Mat) -> None:
+        """Add the tangent: as the surface moves it turns and stretches."""
+        self._forms.slope.assemble_matrix(K, self._data)
+
+
+def closed(grid: Grid, free: NDArray[np.bool_], pressures: Sequence[tuple[Pressure, Surface]]) -> bool:
+    """Return whether the surfaces of equal pressures are closed, or end on walls that hold them.
+
+    Faces whose corners lie on the edges of others are taken to be open.
+
+    Parameters
+    ----------
+    free : (nodes, d)
+        Components that no wall holds.
+    pressures
+        With the faces on which they act.
+    """
+    if not pressures:
+        return True
+    if any(by_place(pressure.value) for pressure, _ in pressures):
+        return False
+    groups: dict[float, list[Surface]] = {}
+    for pressure, faces in pressures:
+        groups.setdefault(id(pressure.value) if callable(pressure.value) else float(pressure.value), []).append(faces)
+    return all(_closed(grid, _held_walls(grid, free), faces) for faces in groups.values())
+
+
+def _held_walls(grid: Grid, free: NDArray[np.bool_]) -> list[tuple[int, float]]:
+    """Return axis and place, m, of the walls that hold their normal component."""
+    out = []
+    for wall, (axis, end) in SIDES[grid.dim].items():
+        if not over_all(grid.comm, int(free[grid.wall_nodes(wall), axis].sum())):
+            out.append((axis, (grid.lower, grid.upper)[end][axis]))
+    return out
+
+
+def _closed(grid: Grid, walls: Sequence[tuple[int, float]], surfaces: Sequence[Surface]) -> bool:
+    """Return whether every edge of some faces belongs to two of them, or lies in a wall that holds it."""
+    x = np.concatenate([faces.places() for faces in surfaces])
+    count, edges = x.shape[1], _EDGES[grid.dim]
+    number = np.rint((x.reshape(-1, grid.dim) - grid.lower) / (NEAR * grid.h) + 1 / 3)  # on no half between two numbers
+    _, corner = np.unique(number, axis=0, return_inverse=True)
+    edge = np.sort(corner.reshape(-1, count)[:, edges].reshape(-1, edges.shape[1]), axis=1)
+    x = x[:, edges].reshape(-1, edges.shape[1], grid.dim)
+    if grid.dim == 3:  # of a triangle two corners are the same
+        real = edge[:, 0] != edge[:, 1]
+        edge, x = edge[real], x[real]
+    _, kind, often = np.unique(edge, axis=0, return_inverse=True, return_counts=True)
+    lone = x[often[kind.ravel()] == 1]
+    held = np.zeros(len(lone), dtype=bool)
+    for axis, place in walls:
+        held |= (np.abs(lone[:, :, axis] - place) < NEAR * grid.h[axis]).all(axis=1)
+    return bool(held.all() and often.max(initial=0) <= 2)
+
+
+_EDGES = {2: np.array([[0], [1]]), 3: np.array([[0, 1], [1, 3], [3, 2], [2, 0]])}
+"""Corners of the edges of a face; in 2D its ends."""

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import ufl
 from dolfinx import fem
 from numpy.typing import NDArray
@@ -40,9 +41,17 @@ class Weight(Acting):
 
     def placed(self, place: Place) -> Loads:
         """Return the weight of the pieces."""
-        return DeadLoads(self._dead, place.pieces.pieces)
+        return WeightLoads(self._dead, self._taken_up, place.pieces.pieces)
 
-    def taken_up(self, b: NDArray, pieces: PointData) -> None:
-        """Add minus the weight of what pores take up at u to the forces of the stresses."""
+
+class WeightLoads(DeadLoads):
+    """The weight in a substep."""
+
+    def __init__(self, dead: PointForm, taken_up: PointForm | None, pieces: PointData):
+        super().__init__(dead, pieces)
+        self._taken_up = taken_up
+
+    def takes_up(self, b: NDArray[np.float64]) -> None:
+        """Add minus the weight of what pores take up at u."""
         if self._taken_up is not None:
-            self._taken_up.assemble_vector(b, pieces)
+            self._taken_up.assemble_vector(b, self.data)

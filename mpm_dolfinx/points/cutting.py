@@ -46,7 +46,8 @@ class Pieces:
     m^2;
     hoop : (m, 4) in axisymmetry, else (m, 0): in the plane, offset (2,) of the centroid from the cell's midpoint, m,
     mean product of the offset's components, m^2, and radius of the centroid, m;
-    second : (m, d, d) if they are asked for, else (m, 0): all mean products of the offsets from the centroid, m^2.
+    second : (m, d, d) if they are asked for, else (m, 0): all mean products of the offsets from the centroid, m^2; in
+    axisymmetry of pieces that are symmetric in the plane.
     """
 
     point: NDArray[np.int64]
@@ -148,6 +149,12 @@ def domain_volumes(corners: NDArray[np.float64], axisymmetric: bool) -> NDArray[
         return volumes(corners)
     v = vertices(np.ascontiguousarray(corners.transpose(1, 2, 0)))
     return TURN * (simplex_volumes(v) * v[simplices(2), 0].mean(axis=1)).sum(axis=0)
+
+
+def edges(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the mean edges (n, d, d), m, of domains (n, 2^d, d), one a column."""
+    signs = 2.0 * corner_bits(corners.shape[2]) - 1
+    return np.einsum("nki,ka->nia", corners, signs) / 2 ** (corners.shape[2] - 1)
 
 
 def centroids(corners: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -377,9 +384,30 @@ def _sum(
         faces[:, 1] *= TURN
         radius, centroid, hoop = _rings(grid, cell, centroid, squares[kept] / volume, products[kept] / volume)
         volume = volume * radius
+        spread = of_rings(spread, hoop[:, 3])
     fraction, x = volume / sum_by(point, volume, len(slots.low[0]))[point], grid.low + grid.h * (cell + centroid)
     moments = spread if second else np.empty((len(kept), 0))
     return Pieces(point, grid.number(cell), fraction, x, np.abs(faces), mixed, hoop, moments)
+
+
+def spreads(corners: NDArray[np.float64], rings: bool) -> NDArray[np.float64]:
+    """Return second moments (n, d, d), m^2, of domains about their centroids, exact for parallelepipeds.
+
+    rings: whether they are rings, with sections that are parallelograms.
+    """
+    E = edges(corners)
+    out = E @ E.swapaxes(1, 2) / 12  # of a unit length, exact
+    return of_rings(out, centroids(corners)[:, 0]) if rings else out
+
+
+def of_rings(spread: NDArray[np.float64], radius: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return second moments (n, 2, 2), m^2, of rings about their centroids from those of symmetric sections.
+
+    spread (n, 2, 2), m^2, radius (n,), m: of the sections, about their centroids; these lie spread[:, 0] / radius
+    inside of those of the rings.
+    """
+    off = spread[:, 0] / radius[:, None]
+    return spread - off[:, :, None] * off[:, None]
 
 
 def _rings(

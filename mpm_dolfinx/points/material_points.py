@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Material points: what a body remembers while the grid is reset."""
+"""Material points: what a body remembers while the grid is reset.
+
+Places, corners of their domains, F, pore pressure; and `data` by name: states of laws, what they keep of conditions,
+and of bodies with inertia the velocity and the rate of F, which `inertia` carries from step to step.
+"""
 
 from __future__ import annotations
 

@@ -14,16 +14,16 @@ from mpi4py import MPI
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from mpm_dolfinx.bodies.faces import interpolate
+from mpm_dolfinx.domains.fitted import fitted_at
 from mpm_dolfinx.domains.pressure_transport import van_leer
+from mpm_dolfinx.flow.feeding import Wet, open_sides
 from mpm_dolfinx.grid.grid import Grid, sum_by
 from mpm_dolfinx.parallel.exchange import over_all
-from mpm_dolfinx.points.cutting import centroids, corner_bits
 from mpm_dolfinx.points.local_fit import RADIUS, LocalFit, near
 from mpm_dolfinx.probing.probes import Probes
-from mpm_dolfinx.stepping.on_grid import OnGrid
+from mpm_dolfinx.stepping.grid_reset import OnGrid
 from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.state import State
 
@@ -95,7 +95,8 @@ class _Around:
         self._open = share.reshape(*share.shape[:2], d, 2)
         self._centroid = lattice.midpoint + self._half - x[:, None]
         self._counts, self._reached = self._connected(held == key[:, None])
-        self._sides = state.stage.hydraulic.data(cut, points, self._contents, state.t)
+        wet = Wet(cut, points, self._contents, state.t)
+        self._sides = open_sides([one.placed(wet) for one in state.stage.feeding], d)
 
     def _gathered(self, on_grid: OnGrid, p: NDArray[np.float64], alike: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
         """Return the local numbers (m, cells) of the cells that this process owns, else -1, and what all hold.
@@ -247,48 +248,6 @@ class _Around:
 
 
 def probe_stresses(scene: Scene, state: State, probes: Probes) -> NDArray[np.float64]:
-    """Return the effective stresses (m, 3, 3), Pa, at the places of probes; on all processes together.
-
-    Points count that are of the probe's body and material, by where they were at rest.
-    """
-    points = state.points
-    comm = scene.grid.comm
-    m = len(probes.id)
-    d = scene.grid.dim
-    here, at = points.find(probes.id)
-    rest = _edges(points.reference[at])
-    frames = [np.linalg.inv(edges) for edges in (rest, points.F[at][:, :d, :d] @ rest)]
-    of = (points.reference, points.corners)
-    columns = [*(interpolate(corners[at], probes.xi[here]) for corners in of), *(E.reshape(-1, d * d) for E in frames)]
-    own = np.zeros((m, 2 * d + 2 * d * d + 1))
-    own[here] = np.column_stack([*columns, points.material[at]])
-    X, x, rest, now, material = np.split(over_all(comm, own), np.cumsum([d, d, d * d, d * d]), axis=1)
-    rest, now = (frame.reshape(m, d, d) for frame in (rest, now))
-    middle, last = centroids(points.reference), np.cumsum(list(map(len, scene.bodies)))
-    probe, row = _near(middle, X, RADIUS * np.abs(np.linalg.inv(rest)).sum(axis=2).max(axis=1))
-    body, own_body = (np.searchsorted(last, ids, side="right") for ids in (points.id[row], probes.id[probe]))
-    weight = near(np.einsum("rij,rj->ri", rest[probe], middle[row] - X[probe]))
-    weight = weight * ((body == own_body) & (points.material[row] == material[probe, 0]))
-    probe, row, weight = (values[weight > 0] for values in (probe, row, weight))
-    used, place = np.unique(row, return_inverse=True)
-    stress = scene.materials.effective_stress_3d(points.map(lambda rows: rows[used]))[place]
-    fit = LocalFit(m, d, 1, 9)
-    fit.add(probe, np.einsum("rij,rj->ri", now[probe], points.x[row] - x[probe]), stress.reshape(-1, 9), weight)
-    return fit.values(comm).reshape(m, 3, 3)
-
-
-def _near(x: NDArray[np.float64], places: NDArray[np.float64], reach: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
-    """Return the pairs of some places (m, d) and of points at x (n, d) within a reach (m,) along each axis, all m."""
-    low, high = ((places + way * reach[:, None]).T for way in (-1, 1))
-    bounds = low.min(axis=1, initial=np.inf), high.max(axis=1, initial=-np.inf)
-    some = np.flatnonzero(((x >= bounds[0]) & (x <= bounds[1])).all(axis=1))
-    if not len(some):
-        return np.empty(0, np.int64), np.empty(0, np.int64)
-    found = cKDTree(x[some]).query_ball_point(places, reach, p=np.inf)
-    return np.repeat(np.arange(len(places)), list(map(len, found))), some[np.concatenate(found).astype(np.int64)]
-
-
-def _edges(corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the mean edges (n, d, d), m, of domains (n, 2^d, d), one a column."""
-    signs = 2.0 * corner_bits(corners.shape[2]) - 1
-    return np.einsum("nki,ka->nia", corners, signs) / 2 ** (corners.shape[2] - 1)
+    """Return the effective stresses (m, 3, 3), Pa, at the places of probes; on all processes together."""
+    comm, sizes = scene.grid.comm, list(map(len, scene.bodies))
+    return fitted_at(comm, sizes, state.points, probes.id, probes.xi, scene.materials.effective_stress_3d)

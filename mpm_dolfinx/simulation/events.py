@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from mpm_dolfinx.base.errors import StepFailed
-from mpm_dolfinx.base.report import Report
+from mpm_dolfinx.base.errors import Report, StepFailed
 from mpm_dolfinx.base.time_integration import Substep
 from mpm_dolfinx.base.validation import functions, line
 from mpm_dolfinx.parallel.exchange import first

@@ -10,8 +10,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mpm_dolfinx.base.errors import StepFailed, raise_interrupt
-from mpm_dolfinx.base.report import Report
+from mpm_dolfinx.base.errors import Report, StepFailed, raise_interrupt
 from mpm_dolfinx.base.validation import instance, numbers
 from mpm_dolfinx.bodies.bodies import Body, points_in_cells
 from mpm_dolfinx.conditions.axis import check_axisymmetry, with_axis
@@ -19,8 +18,8 @@ from mpm_dolfinx.conditions.conditions import OnSide, Source, sorted_terms
 from mpm_dolfinx.conditions.names import ByName
 from mpm_dolfinx.conditions.unit_weights import under
 from mpm_dolfinx.contact.groups import grouped
+from mpm_dolfinx.diagnostics.resolution import warn_thin
 from mpm_dolfinx.diagnostics.scene_parts import check_options, check_parts
-from mpm_dolfinx.diagnostics.thin import warn_thin
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.materials.initial_stress import InitialStress, by_body
 from mpm_dolfinx.materials.skeleton import Fluid, Skeleton
@@ -76,7 +75,7 @@ class Simulation:
         Quadrature, coupling, tolerance and method of time integration, see `Numerics`.
     inertia
         Whether bodies have inertia: then they need no walls.  With False they have none at first, and a later stage may
-        give it to them; with None no stage can.  Not in axisymmetry, nor with `quadrature="point"`.
+        give it to them; with None no stage can.  Not with `quadrature="point"`.
     velocity : (d,) or callable x (n, d) -> (n, d), m/s
         Velocity at the start of bodies that may have inertia, or a function of places; none is rest.
 

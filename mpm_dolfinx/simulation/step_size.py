@@ -10,7 +10,7 @@ from mpi4py import MPI
 
 import numpy as np
 
-from mpm_dolfinx.base.report import Report
+from mpm_dolfinx.base.errors import Report
 from mpm_dolfinx.base.tolerances import EPSILON, NEAR, ROUND_OFF, SAME
 from mpm_dolfinx.base.validation import line, numbers
 from mpm_dolfinx.parallel.exchange import over_all
@@ -102,7 +102,7 @@ class StepSize:
         if not self.by_error:
             return 0.5 if taken > 0.75 * self.longest and self._rings(taken, report, control) else 1.0
         # steps are refused where loads jump or bend, mostly: there the error is of first order
-        return 1.0 if report.error <= self._allowed(report, control) else self._factor(report, control, 1.0)
+        return 1.0 if self._excess(report, control) <= 1 else self._factor(report, control, 1.0)
 
     def next(self, taken: float, report: Report, control: StepControl, failed: bool) -> float:
         """Return the step to try after one that was taken, s; failed: after a longer one had not converged."""
@@ -148,8 +148,16 @@ class StepSize:
 
     def _factor(self, report: Report, control: StepControl, power: float) -> float:
         """Return the step whose error would be as large as it may be, in proportion to one that was solved."""
-        factor = SAFETY * (self._allowed(report, control) / report.error) ** power if report.error > 0 else GROWS
-        return min(GROWS, max(SHRINKS, factor))
+        excess = self._excess(report, control)
+        return min(GROWS, max(SHRINKS, SAFETY / excess**power if excess > 0 else GROWS))
+
+    def _excess(self, report: Report, control: StepControl) -> float:
+        """Return by how much the error of a step is larger than it may be: that of pressures, or of the motion."""
+        error, motion = report.moves
+        motion = max(control.motion or 0.0, motion)
+        allowed = self._allowed(report, control)
+        errors = [(report.error, allowed), (error, self.rtol * motion)]
+        return max(off / least if least > 0 else 0.0 if off == 0 else inf for off, least in errors)
 
     def _allowed(self, report: Report, control: StepControl) -> float:
         """Return how large the error of the pressures may be in a step, Pa.
@@ -165,7 +173,8 @@ def measured(control: StepControl, report: Report, result: Result) -> StepContro
     change = max(control.change, report.change, NEAR * report.stress)
     if len(result.rows) and len(start := result.pressure[0]) and report.extremes is not None:
         change = max(change, *(abs(now - then) for now, then in zip(report.extremes, start.tolist(), strict=True)))
-    return replace(control, change=change)
+    motion = None if control.motion is None else max(control.motion, report.moves[1])
+    return replace(control, change=change, motion=motion)
 
 
 class Times:
@@ -240,6 +249,15 @@ def diffusion_time(scene: Scene, points: MaterialPoints) -> float:
     return least if isfinite(least) else 0.0
 
 
+def cell_time(scene: Scene, points: MaterialPoints) -> float:
+    """Return the least time in which waves run through a cell, s."""
+    density = scene.materials.density(points)
+    at = density > 0
+    fastest = (scene.materials.confined_modulus(points)[at] / density[at]).max(initial=0.0)
+    fastest = over_all(scene.grid.comm, float(fastest), MPI.MAX)
+    return float(scene.grid.h.min()) / fastest**0.5 if fastest > 0 else inf
+
+
 def step_rule(times: Times, rtol, first_step, max_step: float, scene: Scene, points: MaterialPoints) -> StepSize:
     """Return the rule of a run: see `run`; ValueError naming what is not allowed."""
     positive = {"test": lambda v: v > 0, "allowed": "> 0"}
@@ -253,15 +271,16 @@ def step_rule(times: Times, rtol, first_step, max_step: float, scene: Scene, poi
     if scene.numerics.method == "backward-euler":
         raise ValueError(f"rtol = {line(rtol)}: backward-euler knows no error of a step, must be sdirk2")
     timed = any("dt" in law.by_scene for law in scene.materials.laws)
-    if scene.momentum.inertia is not None:
-        raise ValueError(f"rtol = {line(rtol)}: the error of a motion with inertia is not known, must be dt")
-    if (scene.momentum.own.rates or timed) and not scene.flows:
+    inertia = scene.momentum.inertia is not None
+    if (scene.momentum.own.rates or timed) and not scene.flows and not inertia:
         raise ValueError(f"rtol = {line(rtol)}: where nothing flows no error of a velocity is known, must be dt")
     longest = float(numbers("max_step", max_step, **positive)) if max_step != inf else inf
     first = times.after(times.start)[0] - times.start
     if len(scene.substeps) > 1:  # without a rate no step has an error
         # under a load that grows from nothing the error is ERROR dt c_v / h^2 of the change
         first = min(first, max(FIRST * first, SAFETY * rtol / ERROR * diffusion_time(scene, points)))
+    if inertia:  # what is let go, or pushed all of a sudden
+        first = min(first, cell_time(scene, points))
     if first_step is not None:
         first = float(numbers("first_step", first_step, **positive))
     return StepSize(min(first, longest), longest, float(rtol))

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
-from mpm_dolfinx.base.report import Report
+from mpm_dolfinx.base.errors import Report
 from mpm_dolfinx.base.validation import flag, line, numbers, whole
 from mpm_dolfinx.materials.frictional import Frictional
 from mpm_dolfinx.materials.skeleton import Skeleton

@@ -65,7 +65,7 @@ def _momentum(s: Scene, state: State) -> list[Part]:
 
 
 def _storage(s: Scene, state: State) -> list[Part]:
-    storage, outlets = s.storage, state.stage.hydraulic.outlets
+    storage, count = s.storage, {one.title: one.count for one in state.stage.feeding}
     names = ("pore pressure", "fluxes between cells", "weight of the fluid", "open sides", "damping of pressure jumps")
     if storage is None:
         return [Part(name, False, "no fluid") for name in (*names, "pores that drain", "sources")]
@@ -74,10 +74,10 @@ def _storage(s: Scene, state: State) -> list[Part]:
         Part(names[0], True, "finite volumes, coupled"),
         _either(names[1], f.flux, f"two-point, conductivities over {s.fluid.unit_weight:.6g} N/m^3", still),
         _either(names[2], f.gravity, "gravity", "no gravity" if f.flux else still),
-        _either(names[3], outlets, f"{len(outlets)} drained or with inflow", "sealed"),
+        _either(names[3], names[3] in count, f"{count.get(names[3])} drained or with inflow", "sealed"),
         _either(names[4], f.damp.used, "little flows within a step", "enough flows within a step, so far"),
         _either("pores that drain", storage.drains, "as a free surface falls", "pores stay full"),
-        _either("sources", storage.sources, f"{len(storage.sources)}", "none given"),
+        _either("sources", "sources" in count, f"{count.get('sources')}", "none given"),
     ]
 
 

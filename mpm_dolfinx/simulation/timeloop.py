@@ -20,12 +20,12 @@ from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
 from mpm_dolfinx.base import _compat
-from mpm_dolfinx.base.errors import LeftGrid, StepFailed
+from mpm_dolfinx.base.errors import LeftGrid, Report, StepFailed
 from mpm_dolfinx.base.histories import Row, Rows
-from mpm_dolfinx.base.report import Report
 from mpm_dolfinx.base.time_integration import EULER, Substep
 from mpm_dolfinx.base.tolerances import SAME
-from mpm_dolfinx.base.validation import functions, instance, line
+from mpm_dolfinx.base.validation import flag, functions, instance, line
+from mpm_dolfinx.dynamics.energies import begun
 from mpm_dolfinx.parallel.exchange import first
 from mpm_dolfinx.parallel.messages import ResolutionWarning, log, logger, warn
 from mpm_dolfinx.probing.probe_fields import probe_pressures, probe_stresses
@@ -80,6 +80,7 @@ def run(
     observe: Observer | Sequence[Observer] = (),
     checkpoint: Observer | None = None,
     after: Result | None = None,
+    energies: bool = False,
     progress: bool = True,
 ) -> Result:
     """Advance to t_end, in steps of dt or in steps chosen by their error.
@@ -97,8 +98,9 @@ def run(
         Choose the steps by their error: that of the pore pressures stays below about rtol of their largest change
         since the run began, or of what they would change by in the step if no fluid flowed, which is more where it
         flows away within the step; at least ten times `tolerance`, and < 1.  Where nothing flows the steps are as long
-        as the output intervals; refused there with terms of the velocity, of which no error is known.  The error is
-        estimated, as a share of that of a first-order step: true ones were 0.7 to 5 times as large, the latter in
+        as the output intervals; refused there with terms of the velocity, of which no error is known.  Of bodies with
+        inertia the motion counts too, see `motion_error`, in proportion to the largest since the run began.  The error
+        is estimated, as a share of that of a first-order step: true ones were 0.7 to 5 times as large, the latter in
         the step after a load jumps, see `solve.newton.ERROR`.
     t_eval : (m,), s
         Output times, increasing, in (t, t_end]; t_end is one of them in any case.  Steps end at output times.
@@ -122,6 +124,8 @@ def run(
     after
         Histories to go on with, of a run with the same steps: what `resume` returns, or `result` of a run that was
         interrupted.
+    energies
+        Record energies of bodies with inertia, and works from the start of the run on: `Result.energies`.
     progress
         Show a progress bar on a terminal, and warn of the first step that is cut; the others are logged as INFO by the
         logger `mpm_dolfinx`.
@@ -152,6 +156,8 @@ def run(
     functions("checkpoint", [checkpoint] if checkpoint is not None else [])
     if after is not None:
         instance("after", after, Result)
+    flag("energies", energies)
+    simulation.state = _counting(simulation.scene, simulation.state, energies, after is not None)
     now = simulation.state.t
     start = now if after is None else after.rows[0].t
     times = Times(start, now, t_end, dt, t_eval, rtol, after is not None)
@@ -251,7 +257,9 @@ def _histories(
     latest = simulation.state.result
     control = simulation.state.control
     if after is None:
-        begun = StepControl(times.interval, rule.first, first=0.0 if control is None else control.first)
+        motion = 0.0 if rule.by_error and state.stage.inertia else None
+        before = 0.0 if control is None else control.first
+        begun = StepControl(times.interval, rule.first, first=before, motion=motion)
         return Result(Rows([_row(simulation, probes)])), begun
     if latest is None or control is None or after.rows.run is not latest.rows.run:
         raise ValueError("after: histories of another run, must be those of the last one, or what `resume` returns")
@@ -269,6 +277,18 @@ def _histories(
     if count and probes.stressed != (len(start.probe_stress) > 0):
         raise ValueError(f"probes: stress = {probes.stressed}, must be what the run to go on with has")
     return after, control
+
+
+def _counting(scene: Scene, state: State, energies: bool, goes_on: bool) -> State:
+    """Return the state with energies from which works count, or with those of a run that goes on; or without any."""
+    if energies and not state.stage.inertia:
+        raise ValueError("energies = True: bodies have no inertia, must be a stage with inertia=True")
+    if energies and goes_on and "energy" in state.outcome:
+        return state
+    outcome = {quantity: of for quantity, of in state.outcome.items() if quantity != "energy"}
+    if energies:
+        outcome["energy"] = begun(scene.materials, state.points)
+    return replace(state, outcome=outcome)
 
 
 class _Stopwatch:

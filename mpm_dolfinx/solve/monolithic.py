@@ -39,8 +39,8 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.flow.storage import FluxSlope, StorageSystem
 from mpm_dolfinx.mechanics.momentum import MomentumSystem
-from mpm_dolfinx.solve.linear import MOST, direct_solver, displacement_solver, factorise, solved
-from mpm_dolfinx.solve.plan import SolverPlan
+from mpm_dolfinx.solve.factors import MOST, direct_solver, displacement_solver, factorise, solved
+from mpm_dolfinx.solve.solver_choice import SolverPlan
 
 LEAST = 1e-4
 """What counts as a little fluid, over what the forces would displace if none was in the pores.

@@ -23,7 +23,7 @@ from dolfinx.common import Timer
 from numpy.typing import NDArray
 
 from mpm_dolfinx.parallel.exchange import Exchange, over_all
-from mpm_dolfinx.solve.options import set_defaults
+from mpm_dolfinx.solve.petsc_options import set_defaults
 
 OPTIONS = {
     "pc_mg_galerkin": "both",

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from mpm_dolfinx.base.validation import numbers
-from mpm_dolfinx.solve.options import check
+from mpm_dolfinx.solve.petsc_options import check
 
 COUPLINGS = {
     "schur-cg": 0.75,
@@ -34,7 +34,7 @@ class Scheme:
         Newton steps, or coupling iterations of `fixed-stress`, before a step is given up.
     petsc_options
         PETSc's options for the solvers, such as {"momentum_pc_factor_mat_ordering_type": "nd"}: names begin with one of
-        `options.PREFIXES`.  A warning names those that no solver of the scene reads.
+        `petsc_options.PREFIXES`.  A warning names those that no solver of the scene reads.
 
     Raises
     ------

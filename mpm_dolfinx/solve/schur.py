@@ -7,14 +7,13 @@
 du is eliminated: S = C + B K^-1 B^T is solved with by conjugate gradients (or FGMRES), preconditioned with the
 fixed-stress operator.  Of large bodies both are solved for at once, see `monolithic`.
 
-Multipliers of surfaces are found beside both (`solved_with`).  With E how far they, x, are from what they are to be, K with
-surfaces stiff in it, and G x the forces by which a change of x would drive the bodies,
+Multipliers of surfaces, x, are found beside both, see `solved_with`.  With E how far they are from what they are to be,
+K with surfaces stiff in it, and G x the forces by which a change of x would drive the bodies,
 
     [ K  -B^T ] [du]     [R_u - G x]
     [ B   C   ] [dp] = - [   R_p   ],          F(x, du) = E.
 
-F is linear, and nearly the identity where bodies give way more than what is stiff.  It is solved for x by GCR (Eisenstat,
-Elman and Schultz 1983); an iteration solves for du and dp once.
+F is linear.  It is solved for x by GCR (Eisenstat, Elman and Schultz 1983); an iteration solves for du and dp once.
 
 PETSc's PCFIELDSPLIT with the same two solvers (full Schur factorisation) takes as many iterations, ends with the same
 digits, and takes 0.8 to 1 of the time of a solve.  It wants a copy of -B^T at each tangent, and fixed-stress iterations
@@ -40,12 +39,12 @@ from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.parallel.messages import ConditionWarning, warn
 from mpm_dolfinx.points.parts import OfParts
-from mpm_dolfinx.solve.linear import MOST, direct_solver, displacement_solver, factorise, solved
+from mpm_dolfinx.solve.factors import MOST, direct_solver, displacement_solver, factorise, solved
 from mpm_dolfinx.solve.monolithic import BlockSolver, Inverses
 from mpm_dolfinx.solve.multigrid import multigrid_solver
-from mpm_dolfinx.solve.options import using
-from mpm_dolfinx.solve.plan import AT_ONCE, MULTIGRID, MUMPS, SolverPlan, plan
+from mpm_dolfinx.solve.petsc_options import using
 from mpm_dolfinx.solve.scheme import Scheme
+from mpm_dolfinx.solve.solver_choice import AT_ONCE, MULTIGRID, MUMPS, SolverPlan, plan
 
 
 def planned(scheme: Scheme, momentum: MomentumSystem, storage: StorageSystem | None, symmetric: bool) -> SolverPlan:

@@ -8,8 +8,8 @@ Where soil yields a step is full if the residual falls, or if the forces do less
 that at its start; else it goes to about where they do none (Matthies and Strang 1979): there points that it unloads
 leave their yield surface, and the next tangent is as stiff as they are.  Work is that of the forces and of the fluid:
 that of the forces alone is next to none where these balance and the fluid does not.  Shorter steps, with lower
-residuals, would be followed by ones as short.  One secant finds it, as PETSc's critical point search does.  With up to
-six, Newton's method takes as many steps.
+residuals, would be followed by ones as short.  Bracketed secants find it.  Soil that has lost its strength needs
+several: with one, a bank that slumps takes twice the Newton steps.
 
 Soil that flows has next to no stiffness along its mechanisms, where flow is not associated even less than none: full
 steps go far astray there.  A share of the elastic shear stiffness in the tangent, as the residual of the forces is
@@ -60,24 +60,39 @@ class Halving:
 
 @dataclass(frozen=True)
 class Search:
-    """Search for a step along which the forces do next to no work at its end, by one secant.
+    """Search for a step at whose end the residuals do less work than half of that at its start.
 
-    step: the one to try; found: whether it is that of the secant.
+    step: the one to try; low, high: steps between which the work changes its sign; at_low, at_high: the work there,
+    over that at the start; ends: whether the next step is the last one.
     """
 
     step: float = 1.0
-    found: bool = False
+    low: float = 0.0
+    at_low: float = 1.0
+    high: float = np.inf
+    at_high: float = np.nan
+    ends: bool = False
     limit = sys.float_info.max
     """What the residual may have grown by at its end."""
 
     def after(self, work: float, growth: float) -> Search | None:
         """Return the next step to try after one that ends with such a work, nan if that is not finite; None: none.
 
-        growth: of the residual.  If a full step does not raise it, it is enough that forces do no more work than at its
-        start.
+        growth: of the residual.  If a full step does not raise it, it is enough that the residuals do no more work than
+        at its start.  A secant gives the next step; the middle does where a bound stays for a second time.
         """
         if not np.isfinite(work):
-            return None if self.step < 2 * SHORTEST else Search(0.5 * self.step, self.found)
-        if self.found or abs(work) <= (1.0 if growth <= 1 else WORK):
+            end = self.step < 2 * SHORTEST
+            return None if end else Search(0.5 * (self.low + self.step), self.low, self.at_low, self.step)
+        enough = 1.0 if growth <= 1 and self.step == 1 else WORK
+        if self.ends or abs(work) <= enough or self.high - self.low < SHORTEST:
             return None
-        return Search(self.step / (1 - work) if work < 0 else 0.5 * self.step, True)
+        if work > 0 and np.isinf(self.high):
+            return Search(0.5 * self.step, ends=True)
+        if work > 0:
+            bounds, stays = (self.step, work, self.high, self.at_high), self.low > 0
+        else:
+            bounds, stays = (self.low, self.at_low, self.step, work), np.isfinite(self.at_high)
+        low, at_low, high, at_high = bounds
+        share = 0.5 if stays or np.isnan(at_high) else at_low / (at_low - at_high)
+        return Search(low + share * (high - low), *bounds)

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The end of a step: domains move with the grid, F is what their corners tell, and pressures travel along."""
+"""The end of a step: domains move with the grid, F is what their corners tell, and pressures travel along.
+
+The grid itself is reset at the start of the next step, see `grid_reset`.
+"""
 
 from __future__ import annotations
 
@@ -11,9 +14,8 @@ import numpy as np
 from dolfinx.common import Timer
 from numpy.typing import NDArray
 
-from mpm_dolfinx.base.errors import LeftGrid, NotConverged
+from mpm_dolfinx.base.errors import LeftGrid, NotConverged, Report
 from mpm_dolfinx.base.fluid_content import change_at_points
-from mpm_dolfinx.base.report import Report
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.conditions.acting import Loads
 from mpm_dolfinx.domains.cut_domains import CutDomains
@@ -29,7 +31,7 @@ from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
 from mpm_dolfinx.parallel.exchange import first, over_all
 from mpm_dolfinx.points.cutting import centroids, parallelepipeds, tangled, volumes
 from mpm_dolfinx.points.material_points import MaterialPoints, determinant, with_ratio
-from mpm_dolfinx.stepping.on_grid import AtPlaces, OnGrid
+from mpm_dolfinx.stepping.grid_reset import AtPlaces, OnGrid
 from mpm_dolfinx.stepping.stage import Stage
 from mpm_dolfinx.stepping.state import State, Stay
 
@@ -128,10 +130,7 @@ class Motion:
                 moved = np.where(keeps & stays, 0.0, cut.moved(points, part, count)[part])
                 points = replace(points, data=points.data | carried(moved))
             points = replace(points, data=self._materials.updated_state(points, state.points, t - state.t))
-            ids = None
-            pressure = None
-            x = None
-            start = None
+            carried = None
             if self._storage is not None:
                 pressure = cut.to_pieces(self._storage.p.x.array[pieces.cells])
                 x = on_grid.of_pieces(state, "x", cut.pieces.x)
@@ -139,12 +138,14 @@ class Motion:
                 start = on_grid.of_pieces(state, "start", on_grid.pressures_of_pieces())
                 points = replace(points, pressure=self.pressures(on_grid, state.stage, t, nodal))
                 ids = points.id[cut.pieces.point]
+                of_cut = (ids, cut.pieces.cell, cut.pieces.fraction)
+                carried = PiecePressures(*of_cut, None, x, None, None, pressure, start)
                 if cut.domains and came is not None:
                     owed = self._owed(state, points, on_grid, pieces, came, keeps)
                     points = replace(points, data=points.data | owed)
             _check_inside(cut, points, t, report)
-        stay = Stay(cut.points, ids, pressure, x, start)
-        new = replace(state, t=t, points=points, transported=None, stay=stay)
+        stay = Stay(cut.points)
+        new = replace(state, t=t, points=points, pieces=carried, stay=stay)
         keeps = keeps & stays
         some, others = over_all(grid.comm, np.array([keeps.any(), not keeps.all()], dtype=float)) > 0
         if not others:
@@ -152,6 +153,8 @@ class Motion:
         new = replace(self.left_grid(new, on_grid), held=None, rest=None)
         if some:
             kept = {name: self._kept(getattr(state, name), on_grid, keeps) for name in ("held", "rest")}
+            if carried is not None:
+                kept["pieces"] = replace(new.pieces, of_cell=carried.of_cell, start=carried.start)
             new = replace(new, stay=replace(stay, keeps=keeps), **kept)
         return new, folded
 
@@ -309,11 +312,8 @@ class Motion:
     def _sealed(self, state: State, on_grid: OnGrid, pieces: PointData) -> NDArray[np.bool_]:
         """Return which parts (count,) have no open side, and are fed by no source at the end of the step."""
         cut, (part, count) = on_grid.cut, on_grid.parts
-        patches = cut.surfaces([faces for _, faces in state.stage.hydraulic.outlets])
-        at = np.concatenate([np.zeros(0, dtype=np.int64), *(patch.at for patch in patches)])
-        if self._storage.sources:
-            fed = self._storage.gain(pieces)[cut.cells] != 0
-            at = np.concatenate([at, cut.pieces.point[cut.to_pieces(fed)]])
+        fed = [one.fed(cut, pieces) for one in state.stage.feeding]
+        at = np.concatenate([np.zeros(0, dtype=np.int64), *fed])
         return over_all(cut.grid.comm, np.bincount(part[at], minlength=count)) == 0
 
     def _body(self, points: MaterialPoints) -> NDArray[np.int64]:
@@ -339,19 +339,18 @@ class Motion:
 
     def left_grid(self, state: State, on_grid: OnGrid) -> State:
         """Return a state whose points take the pressures of their pieces along: the next step resets the grid."""
-        transported = None
-        points = state.points
-        cut = on_grid.cut
+        carried, points = state.pieces, state.points
         if self._storage is not None:
             with Timer("mpm: remap"):
-                pieces, stay = cut.pieces, state.stay
+                pieces = on_grid.cut.pieces
                 store = self._materials.storage(points) * points.volume0 * points.J
-                on_grid.set_pressures(stay.pressure)
+                on_grid.set_pressures(carried.of_cell)
                 pressure, slope, bounds = on_grid.pressures_at_pieces(
                     self._reconstruction, pieces.fraction * store[pieces.point], state.stage, state.t
                 )
-                transported = PiecePressures(stay.id, pieces.cell, pieces.fraction, pressure, stay.x, slope, bounds)
-        return replace(state, transported=transported, stay=None)
+                leaves = {"pressure": pressure, "slope": slope, "bounds": bounds, "of_cell": None, "start": None}
+                carried = replace(carried, **leaves)
+        return replace(state, pieces=carried, stay=None)
 
 
 def _check_inside(cut: CutDomains, points: MaterialPoints, t: float, report: Report | None) -> None:

@@ -14,14 +14,15 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.base.time_integration import Substep
 from mpm_dolfinx.conditions.acting import QUANTITIES, At, Loads, Outcome
+from mpm_dolfinx.dynamics.step_error import motion_error
 from mpm_dolfinx.flow.storage import Rates, StorageProblem
 from mpm_dolfinx.mechanics.inertia import Flight, Inertia
 from mpm_dolfinx.mechanics.momentum import MomentumProblem
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.material_points import MaterialPoints
-from mpm_dolfinx.stepping.on_grid import Assembled, OnGrid
-from mpm_dolfinx.stepping.scene import Scene
+from mpm_dolfinx.stepping.grid_reset import Assembled, OnGrid
+from mpm_dolfinx.stepping.scene import Scene, When
 from mpm_dolfinx.stepping.state import State
 
 
@@ -54,6 +55,17 @@ class Start(NamedTuple):
             return None
         return partial(self.matrices.mass.carried, self.state.points, (flight.start, flight.velocity))
 
+    def moves(self, flights: Sequence[Flight | None], substep: Substep) -> tuple[float, float]:
+        """Return error and motion of the step, see `motion_error`, where its run asks for them; else 0.
+
+        flights: after the substeps; substep: the last one.
+        """
+        control = self.state.control
+        if control is None or control.motion is None or len(flights) < 2:
+            return 0.0, 0.0
+        times = float(substep.before * self.dt), float(substep.own * self.dt)
+        return motion_error(self.matrices.solvers(), self.matrices.momentum.K, self.matrices.mass, flights, *times)
+
 
 class Balances(NamedTuple):
     """The two balances at the end of a substep; storage is None without fluid."""
@@ -73,7 +85,7 @@ class Balances(NamedTuple):
         """Return what conditions do to the bodies at the end of a step, see `State`."""
         stage, out = state.stage, {quantity: {} for quantity in QUANTITIES} | self.momentum.outcome()
         out["wall_reactions"] = self.momentum.wall_forces(stage.conditions["walls"])
-        out["outflows"] = self.storage.outflows(stage.hydraulic.names) if self.storage else {}
+        out["outflows"] = self.storage.outflows() if self.storage else {}
         return out
 
     def came(self, rates: Rates | None) -> NDArray[np.float64] | None:
@@ -137,25 +149,25 @@ def balances(
     on_grid = start.on_grid
     matrices = start.matrices
     dt = start.dt
-    scene.set_time(acting.t, substep.end * dt, acting.gravity)
-    scene.momentum.own.set_rate(substep.own * dt, substep.before / substep.own)
-    inertia, loads = None, acting.loads
+    when = When(acting.t, substep.end * dt, acting.gravity, substep.own * dt, substep.before / substep.own)
+    options = {"goes_on": going_on(scene, start, substep), "held": start.state.held, "yielded": start.yielded}
+    inertia, u = None, None
+    loads = acting.loads
     if flight is not None:
         own = float(substep.own * dt)
         inertia = Inertia(matrices.mass, flight.free(own, float(substep.before * dt)), 1 / own**2)
         loads = [*loads, inertia]
-        scene.momentum.u.x.array[:] = inertia.flight  # elsewhere forces of inertia would hide what is out of balance
+        u = inertia.flight  # elsewhere forces of inertia would hide what is out of balance
     if scene.momentum.inertia is not None:
         scene.momentum.inertia.set_substep(inertia, substep.end < 1)
-    forces = scene.scheme.tolerance, going_on(scene, start, substep), start.state.held
-    momentum = MomentumProblem(scene.momentum, matrices.momentum, start.data, loads, *forces, start.yielded)
+    momentum = scene.balance(when, matrices.momentum, start.data, loads, u, **options)
     if scene.storage is None:
         return Balances(momentum, None, inertia)
     weight = None if acting.gravity is None else scene.fluid.density * acting.gravity
-    flow = matrices.flow(start.state, weight, start.data, acting.t)
+    fed = matrices.flow(start.state, weight, start.data, acting.t)
     lost = before and before.taken(substep.before * dt)
     carried = on_grid.softness(start.state), substep.end * on_grid.due(start.state)
-    options = (on_grid.contents, flow, substep.own * dt, lost, *carried)
+    options = (on_grid.contents, *fed, substep.own * dt, lost, *carried)
     pushed = None if inertia is None else partial(pushed_back, scene, on_grid)
     storage = StorageProblem(scene.storage, matrices.storage, start.data.pieces, *options, pushed)
     return Balances(momentum, storage, inertia)

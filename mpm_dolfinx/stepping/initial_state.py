@@ -18,9 +18,8 @@ from mpi4py import MPI
 import numpy as np
 from numpy.typing import NDArray
 
-from mpm_dolfinx.base.errors import StepFailed
+from mpm_dolfinx.base.errors import Report, StepFailed
 from mpm_dolfinx.base.fluid_content import mass_potential, pressure_of
-from mpm_dolfinx.base.report import Report
 from mpm_dolfinx.base.tolerances import FOREVER, ROUND_OFF
 from mpm_dolfinx.bodies.bodies import pressure_at
 from mpm_dolfinx.conditions.acting import Loads, Place
@@ -34,7 +33,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.solve.newton import solve_substep
 from mpm_dolfinx.solve.schur import Kept, LinearSolvers, planned
 from mpm_dolfinx.stepping.balances import Start
-from mpm_dolfinx.stepping.scene import Scene
+from mpm_dolfinx.stepping.scene import Scene, When
 from mpm_dolfinx.stepping.state import State, Stay
 from mpm_dolfinx.stepping.step import set_up
 
@@ -89,7 +88,7 @@ def balanced(scene: Scene, state: State) -> State:
     forms, materials = scene.momentum, scene.materials
     try:
         start = set_up(scene, state, 0.0)
-        seeded = replace(start.state, stay=_stay(scene, start))
+        seeded = _as_reset(scene, start)
         if scene.storage is not None:  # those that a step leaves
             pressure = scene.motion.pressures(start.on_grid, state.stage, state.t)
             seeded = replace(seeded, points=replace(seeded.points, pressure=pressure))
@@ -162,19 +161,18 @@ def _problem(scene: Scene, start: Start, state: State) -> MomentumProblem:
     matrices, data = start.matrices, start.on_grid.data_of(state)
     place = Place(start.on_grid.cut, state.points, data, state.t, 0.0, state.t, state.outcome)
     loads = [one.moved(scene.momentum.u) for one in state.stage.placed(place)]
-    scene.set_time(state.t, FOREVER, start.acting[-1].gravity)
-    scene.momentum.own.set_rate(FOREVER, 0.0)
-    scene.momentum.u.x.array[:] = 0.0
-    return MomentumProblem(scene.momentum, matrices.momentum, data, loads, scene.scheme.tolerance)
+    when = When(state.t, FOREVER, start.acting[-1].gravity, FOREVER, 0.0)
+    return scene.balance(when, matrices.momentum, data, loads, 0.0)
 
 
-def _stay(scene: Scene, start: Start) -> Stay:
-    """Return what holds of a reset since which nothing has moved."""
-    cut, p = start.on_grid.cut, None
-    if scene.storage is None:
-        return Stay(cut.points, None, None, None, None)
-    p = cut.to_pieces(scene.storage.p_n.x.array[start.data.pieces.cells])
-    return Stay(cut.points, cut.points.id[cut.pieces.point], p, cut.pieces.x, p)
+def _as_reset(scene: Scene, start: Start) -> State:
+    """Return the state at a start, of a reset since which nothing has moved."""
+    cut, pieces = start.on_grid.cut, None
+    if scene.storage is not None:
+        p = cut.to_pieces(scene.storage.p_n.x.array[start.data.pieces.cells])
+        of_cut = (cut.points.id[cut.pieces.point], cut.pieces.cell, cut.pieces.fraction)
+        pieces = PiecePressures(*of_cut, None, cut.pieces.x, None, None, p, p)
+    return replace(start.state, pieces=pieces, stay=Stay(cut.points))
 
 
 def _mixed(unknowns: Unknowns, seen: Sequence[tuple[NDArray, NDArray]]) -> NDArray[np.float64]:

@@ -10,12 +10,12 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from mpm_dolfinx.base.errors import Report
 from mpm_dolfinx.base.histories import Row, Rows
-from mpm_dolfinx.base.report import Report
 from mpm_dolfinx.base.tables import data_frame, data_set
 from mpm_dolfinx.conditions.names import ByName
 
-OUTCOMES = ("reactions", "wall_reactions", "outflows", "tool_forces", "tool_travel")
+OUTCOMES = ("reactions", "wall_reactions", "outflows", "tool_forces", "tool_travel", "energy")
 """What conditions do to the bodies; those of the user's own may have others."""
 
 
@@ -125,6 +125,18 @@ class Result:
     def tool_travel(self) -> ByName[NDArray[np.float64]]:
         """How far a load has pushed (times,), m, each tool beyond its displacement at the output times, by its name."""
         return self.outcome("tool_travel")
+
+    @cached_property
+    def energies(self) -> ByName[NDArray[np.float64]]:
+        """Energies and works (times,), J (J/m in plane strain), of a `run(energies=True)`, by name.
+
+        kinetic and elastic are those of the bodies; elastic is 0 where a law tells none.  The others count from the
+        start of the run: external is the work of all that acts, viscous that against quiet sides and terms of the
+        user's, internal that of the stresses; dissipated is what of this is not elastic, of wet bodies also what the
+        flow takes and water stores.  kinetic + elastic + dissipated + viscous - external stays as it is, but for what
+        the method loses.
+        """
+        return self.outcome("energy")
 
     def outcome(self, quantity: str) -> ByName[NDArray[np.float64]]:
         """Return what conditions have done (n, ...) at the output times, by name, such as "reactions".

@@ -7,7 +7,7 @@ import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, replace
 from functools import cached_property, partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from dolfinx import fem
@@ -21,10 +21,10 @@ from mpm_dolfinx.bodies.bodies import Body, material_points
 from mpm_dolfinx.conditions.acting import Loads
 from mpm_dolfinx.conditions.conditions import OnSide
 from mpm_dolfinx.conditions.unit_weights import other_gravity, weighed
-from mpm_dolfinx.diagnostics.overfilled import warn_overfilled
-from mpm_dolfinx.diagnostics.smeared import warn_smeared
+from mpm_dolfinx.diagnostics.resolution import warn_overfilled, warn_smeared
 from mpm_dolfinx.domains.cut_domains import CutDomains
-from mpm_dolfinx.flow.storage import StorageForms
+from mpm_dolfinx.flow.sources import Sources
+from mpm_dolfinx.flow.storage import CellPressure, StorageForms
 from mpm_dolfinx.grid.grid import Grid, in_chunks
 from mpm_dolfinx.materials.evaluate import ConductivityAtPieces
 from mpm_dolfinx.materials.fields import SceneMaterials
@@ -32,16 +32,29 @@ from mpm_dolfinx.materials.initial_stress import InitialStresses
 from mpm_dolfinx.materials.skeleton import Fluid, Skeleton
 from mpm_dolfinx.materials.user_functions import compiling
 from mpm_dolfinx.mechanics.inertia import moving
-from mpm_dolfinx.mechanics.momentum import MomentumForms
-from mpm_dolfinx.mechanics.quadrature_data import QuadraturePoints
+from mpm_dolfinx.mechanics.momentum import MomentumForms, MomentumProblem, MomentumSystem
+from mpm_dolfinx.mechanics.quadrature_data import QuadratureData, QuadraturePoints
 from mpm_dolfinx.parallel.messages import ConditionWarning, warn
 from mpm_dolfinx.points.cutting import volumes
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.solve.numerics import Numerics
 from mpm_dolfinx.stepping.advance import Motion
-from mpm_dolfinx.stepping.on_grid import Assembled, OnGrid, System, assembled
+from mpm_dolfinx.stepping.grid_reset import Assembled, OnGrid, System, assembled
 from mpm_dolfinx.stepping.stage import Stage
 from mpm_dolfinx.stepping.state import State
+
+
+class When(NamedTuple):
+    """A substep: its end, s, with the time since the start of the step, s, and gravity (d,), m/s^2, or None.
+
+    own: time in which a rate at its end counts, s; past: share of the displacements at its start before it.
+    """
+
+    t: float
+    since: float
+    gravity: NDArray[np.float64] | None
+    own: float
+    past: float
 
 
 class Scene:
@@ -87,19 +100,19 @@ class Scene:
         self.initial = InitialStresses(self.bodies, initial, pressure)
         seeded = material_points(grid, bodies, pressure)
         if velocity is not None:
-            seeded = replace(seeded, data=moving(seeded, velocity, grid.base))
+            seeded = replace(seeded, data=moving(seeded, velocity, grid.base, grid.axisymmetric))
         self.materials = scene = SceneMaterials(grid, materials, bodies, seeded, fluid, bool(initial))
         self.gravity = fem.Constant(grid.mesh, np.zeros(grid.dim)) if weighs else None
         self.t, self.dt = fem.Constant(grid.mesh, 0.0), fem.Constant(grid.mesh, 1.0)
         """Time at the end of the substep, and since the start of the step, s, for forms."""
         inside = [term for term in terms if not isinstance(term, OnSide)]
         self.pieces = QuadraturePoints(grid, scene, fluid, weighs, bool(len(inside) + len(sources)))
-        laws, p = self.pieces.laws, fem.Function(grid.cellwise()) if fluid else None
+        laws, p = self.pieces.laws, CellPressure(*(fem.Function(grid.cellwise()) for _ in range(3))) if fluid else None
         with compiling(f"materials: {', '.join(law.__name__ for law in scene.laws)}", "laws in UFL of these shapes"):
             wet = fluid.density if fluid else None
             options = (self.gravity, wet, scene.symmetric)
             options = (*options, numerics.quadrature == "point", terms, self.t, self.dt, velocity is not None)
-            self.momentum = MomentumForms(self.pieces.pieces, laws, p, *options)
+            self.momentum = MomentumForms(self.pieces.pieces, laws, p and p.now, *options)
         if not self.momentum.symmetric and scheme.coupling == "schur-cg":
             scheme = replace(scheme, coupling="schur-fgmres")
         self.scheme, self.storage = scheme, None
@@ -111,11 +124,10 @@ class Scene:
             pieces = self.pieces.pieces
             u = self.momentum.u
             laws = scene.conductivity_laws
-            law = (
-                ConductivityAtPieces(scene.materials, laws, pieces, u, fem.Function(grid.cellwise())) if laws else None
-            )
+            law = ConductivityAtPieces(scene.materials, laws, pieces, u, p.before) if laws else None
             kind = (symmetric, scene.conducts, scene.evolves)
-            self.storage = StorageForms(pieces, u, p, fluid.bulk, weight, *kind, law, sources, self.t, inertial)
+            feeding = [Sources(sources, pieces, p.now, self.t)] if sources else []
+            self.storage = StorageForms(pieces, u, p, fluid.bulk, weight, *kind, law, feeding, inertial)
         self.motion = Motion(scene, bodies, self.momentum, self.storage)
         # what is still to be looked for, to be warned of, of which nothing but the log knows
         self._looks = (warn_overfilled, *[partial(warn_smeared, materials=scene)] * scene.uneven)
@@ -126,7 +138,7 @@ class Scene:
     @property
     def flows(self) -> bool:
         """Whether fluid moves, or is brought by sources."""
-        return self.storage is not None and (self.materials.conducts or bool(self.storage.sources))
+        return self.storage is not None and (self.materials.conducts or bool(self.storage.feeding))
 
     @property
     def substeps(self) -> tuple[Substep, ...]:
@@ -135,11 +147,35 @@ class Scene:
             self.numerics.method, self.flows or self.momentum.own.rates or self.momentum.inertia is not None
         )
 
-    def set_time(self, t: float, dt: float, gravity: NDArray[np.float64] | None) -> None:
-        """Set what forms see of a substep: time, and time since the start of the step, s; gravity (d,), m/s^2."""
-        self.t.value, self.dt.value = t, dt
-        if gravity is not None:
-            self.gravity.value = gravity
+    def balance(
+        self,
+        when: When,
+        system: MomentumSystem,
+        data: QuadratureData,
+        loads: Sequence[Loads],
+        u: NDArray[np.float64] | float | None = None,
+        **options,
+    ) -> MomentumProblem:
+        """Return the balance of momentum at the end of a substep, which begins: all that forms see of it is set.
+
+        Parameters
+        ----------
+        when
+            The substep.
+        system, data, loads, options
+            See `MomentumProblem`.
+        u : (unknowns,), m
+            Displacements at which the iterations begin, a local array; None: the present ones.
+        """
+        self.t.value, self.dt.value = when.t, when.since
+        if when.gravity is not None:
+            self.gravity.value = when.gravity
+        self.momentum.velocity.set(when.own, when.past)
+        if self.storage is not None:
+            self.storage.p_before.x.array[:] = self.storage.p.x.array
+        if u is not None:
+            self.momentum.u.x.array[:] = u
+        return MomentumProblem(self.momentum, system, data, loads, self.scheme.tolerance, **options)
 
     @cached_property
     def _told(self) -> set[str]:

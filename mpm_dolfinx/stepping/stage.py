@@ -11,8 +11,7 @@ import numpy as np
 from dolfinx.common import Timer
 from numpy.typing import ArrayLike, NDArray
 
-from mpm_dolfinx.base.given_values import check_names, given
-from mpm_dolfinx.base.validation import all_of, line, numbers
+from mpm_dolfinx.base.validation import all_of, check_names, given, line, numbers
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.faces import Surface
 from mpm_dolfinx.conditions.acting import QUANTITIES, Acting, Loads, Outcome, Place, Setting
@@ -23,6 +22,7 @@ from mpm_dolfinx.conditions.conditions import (
     Inflow,
     OnSide,
     Pressure,
+    Quiet,
     RigidPlate,
     Source,
     Traction,
@@ -34,20 +34,31 @@ from mpm_dolfinx.contact.acting import ContactsOfStage, ToolsOfStage
 from mpm_dolfinx.contact.groups import Contact
 from mpm_dolfinx.contact.tool import Tool
 from mpm_dolfinx.domains.lattice import Lattice, lattices
-from mpm_dolfinx.flow.hydraulic_boundary import HydraulicBoundary
+from mpm_dolfinx.dynamics.quiet import QuietSides
+from mpm_dolfinx.flow.drained_sides import DrainedSides
+from mpm_dolfinx.flow.feeding import Feeding
 from mpm_dolfinx.grid.grid import SIDES, Grid
 from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.materials.skeleton import Fluid
 from mpm_dolfinx.mechanics.given_displacements import GivenDisplacements
 from mpm_dolfinx.mechanics.momentum import MomentumForms
 from mpm_dolfinx.mechanics.plates import Plates
-from mpm_dolfinx.mechanics.pressures import Pressures
-from mpm_dolfinx.mechanics.tractions import Tractions
+from mpm_dolfinx.mechanics.tractions import Pressures, Tractions
 
-Condition = Traction | Pressure | Displacement | RigidPlate | Drained | Inflow | Tool | Contact
+Condition = Traction | Pressure | Displacement | RigidPlate | Quiet | Drained | Inflow | Tool | Contact
 """What acts on the bodies."""
-KINDS: tuple[type[Acting], ...] = (Tractions, Pressures, Plates, GivenDisplacements, ToolsOfStage, ContactsOfStage)
+KINDS: tuple[type[Acting], ...] = (
+    Tractions,
+    Pressures,
+    Plates,
+    GivenDisplacements,
+    QuietSides,
+    ToolsOfStage,
+    ContactsOfStage,
+)
 """What acts on the momentum for conditions that do not say it themselves, by their method `acting`."""
+FED: tuple[type[Feeding], ...] = (DrainedSides,)
+"""What acts on the storage of fluid for conditions that do not say it themselves, by their method `feeding`."""
 
 
 def checked(conditions: Sequence[Condition]) -> Sequence[Condition]:
@@ -55,7 +66,8 @@ def checked(conditions: Sequence[Condition]) -> Sequence[Condition]:
     if isinstance(conditions, Sequence) and any(isinstance(one, (OnSide, Source)) for one in conditions):
         raise ValueError("conditions: OnSide and Source are terms, must be given as terms=")
     if isinstance(conditions, Sequence) and not isinstance(conditions, (str, bytes)):
-        all_of("conditions", [one for one in conditions if not hasattr(one, "acting")], get_args(Condition))
+        own = [one for one in conditions if hasattr(one, "acting") or hasattr(one, "feeding")]
+        all_of("conditions", [one for one in conditions if one not in own], get_args(Condition))
     else:
         all_of("conditions", conditions, get_args(Condition))
     if len({id(one) for one in conditions}) < len(conditions):
@@ -71,7 +83,7 @@ class Stage:
     given: the conditions by their names, as they were given; named: the same, with water as heavy as the pore fluid;
     conditions: walls, the axis among them, and gravity; present: which bodies are there; later: those that may still
     come; free: (nodes, d), components that no wall holds; axisymmetric: as the grid; lattices: of the bodies that are
-    there; materials: of the scene; acting: what the conditions do to the momentum; hydraulic: to the storage of fluid.
+    there; materials: of the scene; acting: what the conditions do to the momentum; feeding: to the storage of fluid.
     """
 
     given: Mapping[str, Condition]
@@ -84,7 +96,7 @@ class Stage:
     lattices: Sequence[Lattice]
     materials: SceneMaterials
     acting: tuple[Acting, ...]
-    hydraulic: HydraulicBoundary
+    feeding: tuple[Feeding, ...]
 
     @property
     def inertia(self) -> bool:
@@ -94,10 +106,7 @@ class Stage:
     @property
     def surfaces(self) -> list[Surface]:
         """The faces of all conditions but tools and contacts."""
-        return [
-            *(faces for one in self.acting for faces in one.surfaces),
-            *(faces for _, faces in self.hydraulic.outlets),
-        ]
+        return [faces for one in (*self.acting, *self.feeding) for faces in one.surfaces]
 
     def of(self, *kinds: type) -> dict[str, Any]:
         """Return the conditions of some classes by their names."""
@@ -141,7 +150,7 @@ class Stage:
         d = self.free.shape[1]
         out = {quantity: {} for quantity in QUANTITIES}
         out["wall_reactions"] = {wall: np.full(d, value) for wall in SIDES[d]}
-        out["outflows"] = self.hydraulic.unknown(value)
+        out["outflows"] = {name: values for one in self.feeding for name, values in one.unknown(value).items()}
         for one in self.acting:
             for quantity, values in one.unknown(value).items():
                 out[quantity] = out.get(quantity, {}) | values
@@ -173,6 +182,7 @@ def stage(
     materials: SceneMaterials,
     fluid: Fluid | None,
     momentum: MomentumForms,
+    fed: Sequence[Feeding],
     conditions: Mapping[str, Any],
     present: Sequence[bool],
     later: Sequence[int],
@@ -187,8 +197,8 @@ def stage(
         Those of the scene.
     fluid
         Pore fluid, if there is one.
-    momentum
-        Forms, and what acts in all stages.
+    momentum, fed
+        Forms, and what acts on the momentum in all stages; what feeds the fluid in all of them.
     conditions
         walls, conditions, gravity: see `Simulation`.
     present, later
@@ -201,10 +211,10 @@ def stage(
     """
     given_by_name = named(checked(conditions["conditions"]))
     by_name = {name: with_weight(one, fluid) for name, one in given_by_name.items()}
-    if fluid is None and any(isinstance(one, (Drained, Inflow)) for one in by_name.values()):
+    wet = tuple(of for kind in FED for of in kind.conditions)
+    if fluid is None and any(isinstance(one, wet) or hasattr(one, "feeding") for one in by_name.values()):
         raise ValueError("drained and inflow sides need a fluid")
-    if conditions["inertia"]:
-        _check_inertia(by_name)
+    _check_inertia(by_name, bool(conditions["inertia"]))
     gravity = conditions["gravity"]
     if callable(gravity):
         check_names("gravity", gravity, ("t",))
@@ -216,6 +226,8 @@ def stage(
     free = ~_held(grid, walls)
     sides = Sides(grid, bodies, present)
     setting = Setting(sides, free, materials, momentum.conditions, by_name)
+    feeding = [one.feeding(setting) for one in by_name.values() if hasattr(one, "feeding")]
+    feeding += [kind(setting, mine) for kind in FED if (mine := setting.of(*kind.conditions))]
     found = [(kind, setting.of(*kind.conditions)) for kind in KINDS]
     acting = [one.acting(setting) for one in (*momentum.acting, *by_name.values()) if hasattr(one, "acting")]
     acting += [kind(setting, mine) for kind, mine in found if mine]
@@ -235,13 +247,17 @@ def stage(
         lattices=lattice,
         materials=materials,
         acting=tuple(acting),
-        hydraulic=HydraulicBoundary(sides, setting.of(Drained, Inflow)),
+        feeding=(*feeding, *fed),
     )
 
 
-def _check_inertia(by_name: Mapping[str, Any]) -> None:
-    """Refuse conditions that bodies with inertia do not have yet."""
+def _check_inertia(by_name: Mapping[str, Any], inertia: bool) -> None:
+    """Refuse conditions that bodies with inertia do not have yet, and those that only they have."""
     for name, one in by_name.items():
+        if isinstance(one, Quiet) and not inertia:
+            raise ValueError(f"{name}: bodies have no inertia, must be given with inertia=True")
+        if not inertia:
+            continue
         if isinstance(one, Contact):
             raise ValueError(f"{name}: contacts of groups are quasi-static, must be left out with inertia")
         if isinstance(one, Tool) and (one.grips or one.load is not None):

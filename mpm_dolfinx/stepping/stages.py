@@ -13,23 +13,29 @@ from numpy.typing import ArrayLike, NDArray
 from mpm_dolfinx.base.tolerances import SAME
 from mpm_dolfinx.base.validation import chosen, flag, instance, line, numbers
 from mpm_dolfinx.bodies.bodies import Body
-from mpm_dolfinx.bodies.faces import surface
+from mpm_dolfinx.bodies.faces import Surface, surface
 from mpm_dolfinx.bodies.fills import put, touches
 from mpm_dolfinx.bodies.touching import check_apart
+from mpm_dolfinx.conditions.conditions import Quiet
 from mpm_dolfinx.conditions.sides import everywhere
 from mpm_dolfinx.conditions.unit_weights import WEIGHS, warn_units, waters
 from mpm_dolfinx.contact.groups import contacts_of
 from mpm_dolfinx.contact.history import gripped, let_go
+from mpm_dolfinx.domains.fitted import fitted_at
 from mpm_dolfinx.domains.pressure_transport import at_start
+from mpm_dolfinx.dynamics.at_rest import borne
+from mpm_dolfinx.dynamics.quiet import QuietSides, traction_name
 from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.materials.initial_stress import OfWater
 from mpm_dolfinx.mechanics.inertia import resting
+from mpm_dolfinx.mechanics.tractions import owners
 from mpm_dolfinx.parallel.messages import ConditionWarning, warn
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.stepping.initial_state import pieces_at_start
-from mpm_dolfinx.stepping.scene import Scene
+from mpm_dolfinx.stepping.scene import Scene, When
 from mpm_dolfinx.stepping.stage import Condition, Stage, checked, stage
 from mpm_dolfinx.stepping.state import State
+from mpm_dolfinx.stepping.step import set_up
 
 
 def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int]) -> State:
@@ -37,18 +43,22 @@ def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int
     present = [body not in later for body in range(len(scene.bodies))]
     check_apart(scene.grid, scene.bodies, present)
     begun = _stage(scene, conditions, present, later)
+    if scene.initial.given and (quiet := begun.of(Quiet)):
+        raise ValueError(
+            f"{next(iter(quiet))}: holds no initial stress, must come in a stage after one that holds the side"
+        )
     _warn_weights(scene, begun, {"pressure": scene.initial.pressure})
     if scene.fluid and scene.materials.conducts:
         warn_units(scene.grid.comm, scene.fluid, conditions["gravity"])
     points = scene.materials.seeded.of(_ids(scene.bodies, later), kept=False)
     points = scene.initial.of(scene.materials, points, present, begun.gravity_at(0.0) if scene.initial.given else None)
-    transported = None
+    pieces = None
     if scene.fluid:
-        transported = pieces_at_start(scene, points) if callable(scene.initial.pressure) else at_start(points)
+        pieces = pieces_at_start(scene, points) if callable(scene.initial.pressure) else at_start(points)
     return State(
         t=0.0,
         points=_gripped(scene, begun, points),
-        transported=transported,
+        pieces=pieces,
         outcome=begun.unknown(np.nan if scene.initial.given else 0.0),
         stage=begun,
     )
@@ -82,10 +92,14 @@ def begin_stage(
         _warn_weights(scene, begun, {})
     if remove:
         _warn_moved_on(scene, before, begun)
+    new_quiet = {name: one for name, one in begun.of(Quiet).items() if name not in begun.same(before)}
+    if new_quiet and before.inertia:
+        raise ValueError(f"{next(iter(new_quiet))}: bodies had inertia before, must be quiet from its first stage on")
+    state, tractions = _released(scene, state, begun, new_quiet) if new_quiet else (state, {})
     if state.stays:  # pressures are those of the cells
         state = scene.motion.left_grid(state, scene.on_grid(state.stay.points))
     state = replace(state, stay=None)
-    gone, transported = _ids(scene.bodies, remove), state.transported
+    gone, pieces = _ids(scene.bodies, remove), state.pieces
     there = [body for body, here in enumerate(before.present) if here and body not in remove]
     bare, gravity = let_go(state.points, before.data_names(before.named)), None
     if scene.initial.given:
@@ -94,8 +108,13 @@ def begin_stage(
     points, new = _filled(scene, bare.of(gone, kept=False), there, add, gravity)
     others = before.data_names(before.named.keys() - begun.same(before))
     points = _gripped(scene, begun, points, let_go(state.points, others))
-    if transported is not None:
-        transported = transported.of(gone, kept=False).joined(at_start(new))
+    for name, (ids, values) in tractions.items():
+        here, at = points.find(ids)
+        rows = points.data[name].copy()
+        rows[at] = values[here]
+        points = replace(points, data=points.data | {name: rows})
+    if pieces is not None:
+        pieces = pieces.of(gone, kept=False).joined(at_start(new))
     points = _changed(scene, points, fields)
     if begun.inertia and not before.inertia:
         points = replace(points, data=points.data | resting(points))
@@ -104,7 +123,45 @@ def begin_stage(
     outcome = begun.begun(before, state.outcome, np.nan if state.resets else 0.0)
     rest = state.rest if _holds_as(begun, before) else None
     new = {"stage": begun, "begins": True, "outcome": outcome, "held": None, "rest": rest}
-    return replace(state, points=points, transported=transported, **new)
+    return replace(state, points=points, pieces=pieces, **new)
+
+
+def _released(
+    scene: Scene, state: State, begun: Stage, quiet: Mapping[str, Quiet]
+) -> tuple[State, dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]]:
+    """Return a state at rest, and by names of data the tractions (m, d), Pa, that points (m,) bear on quiet sides.
+
+    They balance the stresses, and the loads of the stage that ends, with what goes on holding the bodies.
+
+    begun: the stage that makes sides quiet.
+    """
+    start = set_up(scene, state, 0.0)
+    state, momentum = start.state, scene.momentum
+    when, given = When(state.t, 1.0, start.acting[-1].gravity, 1.0, 0.0), (start.data, start.acting[-1].loads)
+    problem = scene.balance(when, start.matrices.momentum, *given, held=state.held)
+    forces = problem.unbalanced().reshape(-1, scene.grid.dim)
+    surfaces = next(of for of in begun.acting if isinstance(of, QuietSides)).named(quiet)
+    cut = start.on_grid.cut
+
+    def beside(some: Sequence[Surface], axes: Sequence[int]) -> NDArray[np.bool_]:
+        """Return which components (nodes, d) along some axes belong to nodes of cells with some faces."""
+        nodes = momentum.active_nodes(np.unique(owners(scene.grid, cut.surfaces(some))[1].cells))
+        return nodes[:, None] & np.isin(np.arange(scene.grid.dim), list(axes))
+
+    now, then = ~begun.free, ~state.stage.free
+    for of, held in ((begun, now), (state.stage, then)):
+        for _, faces, axes in of.held:
+            held |= beside([faces], axes)
+    counts = ~now & (beside(list(surfaces.values()), range(scene.grid.dim)) | ~then)
+    owned = momentum.u.function_space.dofmap.index_map.size_local
+    given = scene.grid.comm, list(map(len, scene.bodies)), state.points
+    stresses = {
+        name: fitted_at(*given, faces.id, faces.xi.mean(axis=1), scene.materials.total_stress)
+        for name, faces in surfaces.items()
+    }
+    parts = start.matrices.momentum.parts
+    found = borne(cut, state.points, stresses, surfaces, parts, (forces * counts)[:owned], now)
+    return state, {traction_name(name): of for name, of in found.items()}
 
 
 def _gripped(
@@ -134,7 +191,8 @@ def _with_contacts(before: Stage, conditions: Sequence[Condition]) -> list[Condi
 
 
 def _stage(scene: Scene, conditions: Mapping[str, Any], present: Sequence[bool], later: Sequence[int]) -> Stage:
-    return stage(scene.grid, scene.bodies, scene.materials, scene.fluid, scene.momentum, conditions, present, later)
+    of = scene.grid, scene.bodies, scene.materials, scene.fluid, scene.momentum
+    return stage(*of, scene.storage.feeding if scene.storage else (), conditions, present, later)
 
 
 def _warn_weights(scene: Scene, begun: Stage, given: Mapping[str, Any]) -> None:

@@ -37,47 +37,22 @@ class Stay:
 
     points
         The material points when the grid was reset.
-    id, pressure, x, start : (m,), (m,) in Pa, (m, d) in m, (m,) in Pa
-        Of each piece of their domains, ordered by point and cell: number of its point, pressure of its cell, where
-        its centroid has moved to, pressure of its cell when the grid was reset.  None without fluid.
     keeps : (n,)
         Points for which it still holds: those of parts of the bodies that hardly move.  None: for all.
     """
 
     points: MaterialPoints
-    id: NDArray[np.int64] | None
-    pressure: NDArray[np.float64] | None
-    x: NDArray[np.float64] | None
-    start: NDArray[np.float64] | None
     keeps: NDArray[np.bool_] | None = None
-
-    def of_pieces(self, name: str, fresh: NDArray[np.float64], point: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return what pieces have: values of this name where these hold, else fresh ones (m, ...).
-
-        point : (m,)
-            Which of the points each piece belongs to; those that are kept have the pieces that they had.
-        """
-        values = getattr(self, name)
-        if self.keeps is None:
-            return values
-        out = fresh.copy()
-        out[self.keeps[point]] = values[self.keeps[np.searchsorted(self.points.id, self.id)]]
-        return out
 
     def __post_init__(self):
         _freeze(vars(self))
 
-    def migrated(self, exchange: Exchange, destination: NDArray[np.int32]) -> Stay:
+    def migrated(self, exchange: Exchange) -> Stay:
         """Return what holds for points that go to their destinations, by the exchange of points."""
-        points, keeps = self.points.migrated(exchange), self.keeps
+        keeps = self.keeps
         if keeps is not None:
             keeps = exchange.send(keeps)[np.argsort(exchange.send(self.points.id))]
-        if self.id is None:
-            return replace(self, points=points, keeps=keeps)
-        travel = Exchange(exchange.comm, destination[np.searchsorted(self.points.id, self.id)])
-        rows = [travel.send(values) for values in (self.id, self.pressure, self.x, self.start)]
-        order = np.argsort(rows[0], kind="stable")
-        return Stay(points, *(values[order] for values in rows), keeps)
+        return Stay(self.points.migrated(exchange), keeps)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -91,9 +66,8 @@ class State:
     points
         The material points of this process.  Their places count from the grid's `base`, unlike those of
         `Simulation.points`, which a state refuses: `PlacedPoints.from_base` gives them back.
-    transported
-        Pressures that the pieces of the points' domains take to the next grid; None without fluid, or with a stay of
-        all points.
+    pieces
+        Pressures that the pieces of the points' domains have, and take to the next grid; None without fluid.
     stay
         What holds of the last reset of the grid; None where the next step resets all of it.
     resets
@@ -123,7 +97,7 @@ class State:
 
     t: float
     points: MaterialPoints
-    transported: PiecePressures | None
+    pieces: PiecePressures | None
     stay: Stay | None = None
     resets: int = 0
     outcome: Outcome
@@ -152,15 +126,29 @@ class State:
             return self.points
         return self.stay.points if self.stay.keeps is None else self.stay.points.where(self.stay.keeps, self.points)
 
+    def of_pieces(self, name: str, fresh: NDArray[np.float64], point: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return what pieces have: values of this name where they stay, else fresh ones (m, ...).
+
+        point : (m,)
+            Which of the points each piece belongs to; those that are kept have the pieces that they had.
+        """
+        if self.stay is None:
+            return fresh
+        values, keeps = getattr(self.pieces, name), self.stay.keeps
+        if keeps is None:
+            return values
+        out = fresh.copy()
+        out[keeps[point]] = values[keeps[np.searchsorted(self.points.id, self.pieces.id)]]
+        return out
+
     def migrated(self, destination: NDArray[np.int32], comm: MPI.Intracomm) -> State:
         """Return the state after every point, with its pieces, went to its destination (n,), a rank."""
         exchange = Exchange(comm, destination)
-        pressures = self.transported
-        stay = self.stay
-        if pressures is not None:
-            pressures = pressures.migrated(Exchange(comm, destination[np.searchsorted(self.points.id, pressures.id)]))
-        stay = stay and stay.migrated(exchange, destination)
-        return replace(self, points=self.points.migrated(exchange), transported=pressures, stay=stay)
+        pieces = self.pieces
+        if pieces is not None:
+            pieces = pieces.migrated(Exchange(comm, destination[np.searchsorted(self.points.id, pieces.id)]))
+        stay = self.stay and self.stay.migrated(exchange)
+        return replace(self, points=self.points.migrated(exchange), pieces=pieces, stay=stay)
 
     def at_owners(self, grid: Grid) -> State:
         """Return the state with points and pieces at the processes that own the points' cells."""

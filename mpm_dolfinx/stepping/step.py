@@ -6,8 +6,11 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import partial
 
-from mpm_dolfinx.base.report import Report
+import numpy as np
+
+from mpm_dolfinx.base.errors import Report
 from mpm_dolfinx.conditions.acting import Place
+from mpm_dolfinx.dynamics.energies import after
 from mpm_dolfinx.forms.unknowns import collect_garbage
 from mpm_dolfinx.solve.newton import Kept, note_pressures, solve_substep
 from mpm_dolfinx.stepping.balances import Acting, Start, at_rest, balances, flight_of, has_yielded, left
@@ -28,7 +31,7 @@ def set_up(scene: Scene, state: State, dt: float, how: tuple = ()) -> Start:
     on_grid = scene.on_grid(cut_points)
     on_grid.cut.surfaces(stage.surfaces)  # all at once
     data = on_grid.data_of(state)
-    place = Place(on_grid.cut, state.points, data, state.t, dt, state.t, state.outcome)
+    place = Place(on_grid.cut, state.points, data, state.t, dt, state.t, state.outcome, stage.inertia)
     if state.begins:
         stage.check_start(place)
     loads = [stage.placed(place._replace(t=t)) for t in times]
@@ -50,20 +53,26 @@ def step(scene: Scene, state: State, dt: float, how: tuple = ()) -> tuple[State,
     state = start.state
     on_grid = start.on_grid
     solvers = start.matrices.solvers()
-    flight = flight_of(start)
+    flights, found = [flight_of(start)], []
     for acting in start.acting:
         key = start.matrices.key, acting.substep.own * dt
-        both = balances(scene, start, acting, rates[-1] if rates else None, flight)
+        both = balances(scene, start, acting, rates[-1] if rates else None, flights[-1])
         as_reset = partial(on_grid.as_reset, state)
         rates.append(solve_substep(solvers, both.momentum, both.storage, as_reset, key, report, kept))
-        flight = both.flown(flight, acting.substep, dt)
+        flights.append(both.flown(flights[-1], acting.substep, dt))
+        if "energy" in state.outcome:
+            found.append(both.momentum.powers())
     note_pressures(report, solvers, both.storage, acting.substep.before * dt, dt, rates)
+    report.moves = start.moves(flights[1:], acting.substep)
     del solvers
     start.matrices.end_step()
     at, outcome = both.momentum.at, both.outcome(state)
     loads = [one.ended(at) for one in acting.loads]
     end = state.t + dt, loads, both.came(rates[-1]), report
-    new, report.rederived = scene.motion.advanced(state, on_grid, start.data, *end, carried=start.carrying(flight))
+    new, report.rederived = scene.motion.advanced(state, on_grid, start.data, *end, carried=start.carrying(flights[-1]))
     velocity = None if scene.momentum.elastic else scene.momentum.u.x.array / dt
     now = {"outcome": outcome, "points": left(loads, at, state.points, new.points), "velocity": velocity}
+    if found:
+        seconds = dt * np.array([acting.substep.before, acting.substep.own])
+        outcome["energy"] = after(state.outcome["energy"], scene.materials, now["points"], seconds, found)
     return replace(new, **now, begins=False, resets=state.resets + (not state.stays)), report

@@ -22,6 +22,8 @@ class StepControl:
         Largest change of the pressures since the run began.
     first : Pa/s
         See `Report`: of the last step, over its length where the grid is reset.
+    motion : J^(1/2)
+        Largest motion since the run began, see `motion_error`; None where it is not asked for.
     """
 
     interval: float = 0.0
@@ -30,3 +32,4 @@ class StepControl:
     kept: int = 1
     change: float = 0.0
     first: float = 0.0
+    motion: float | None = None

@@ -35,10 +35,9 @@ from numpy.typing import ArrayLike, NDArray
 from tqdm import tqdm
 
 from mpm_dolfinx.base import _compat
-from mpm_dolfinx.base.errors import NotConverged
+from mpm_dolfinx.base.errors import NotConverged, Report
 from mpm_dolfinx.base.fluid_content import change_of_content, mass_potential, mass_potential_form
 from mpm_dolfinx.base.histories import Row, Rows
-from mpm_dolfinx.base.report import Report
 from mpm_dolfinx.base.time_integration import Substep, substeps
 from mpm_dolfinx.base.tolerances import NEAR, ROUND_OFF, SAME, TINY
 from mpm_dolfinx.base.validation import all_of, functions, instance, line, numbers

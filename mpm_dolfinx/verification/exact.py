@@ -230,7 +230,7 @@ def _cryer_long(mu: float, T: Array) -> Array:
     def zero(x):  # (1 - x²/mu) tan(x) = x
         return x * np.cos(x) - (1 - x**2 / mu) * np.sin(x)
 
-    r = np.array([brentq(zero, max(n * np.pi, 0.1), (n + 1) * np.pi, xtol=ROUND_OFF) for n in range(TERMS)])
+    r = np.array([brentq(zero, max(n * np.pi, EPSILON**0.25), (n + 1) * np.pi, xtol=ROUND_OFF) for n in range(TERMS)])
     return _series(2 * (np.sin(r) - r) / ((2 - mu) * np.sin(r) + r * np.cos(r)), r, T)
 
 
@@ -301,7 +301,7 @@ def elastica_tip(load_parameter: float) -> tuple[float, float]:
         m1, theta = angles(q)
         return ellipkm1(m1) - ellipkinc(theta, 1 - m1) - root
 
-    m1, theta = angles(q := brentq(excess, 0, 650, xtol=TINY, rtol=4 * EPSILON))
+    m1, theta = angles(q := brentq(excess, 0, 2 * root, xtol=TINY, rtol=4 * EPSILON))
     v = 1 - 2 / root * (ellipe(1 - m1) - ellipeinc(theta, 1 - m1))
     return float(1 - np.sqrt(-2 * np.expm1(-q)) / root), float(v)
 
@@ -358,4 +358,4 @@ def euler_bernoulli(x: ArrayLike, load: float, length: float, modulus: float, se
     E, Pa, second moment of area I, m^4.
     """
     x = np.asarray(x, dtype=float)
-    return load * x**2 * (6 * length**2 - 4 * length * x + x**2) / (24 * modulus * second_moment)
+    return load * x**2 * (6 * length**2 - 4 * length * x + x**2) / (24 * modulus * second_moment)  # Source: exact

@@ -195,11 +195,10 @@ def _fluid(built: Built) -> float:
     s, bulk = built.simulation, built.scene.fluid
     points, density = s.points, 1.0
     if np.isfinite(bulk):
-        pieces, stay = s.state.transported, s.state.stay
-        ids, pressure = (pieces.id, pieces.pressure) if pieces is not None else (stay.id, stay.pressure)
-        fraction = pieces.fraction if pieces is not None else s.scene.on_grid(stay.points).cut.pieces.fraction
-        at = np.searchsorted(points.id, ids)
-        density = np.bincount(at, fraction * np.exp(pressure / bulk), minlength=len(points))
+        pieces = s.state.pieces
+        pressure = pieces.of_cell if pieces.pressure is None else pieces.pressure
+        at = np.searchsorted(points.id, pieces.id)
+        density = np.bincount(at, pieces.fraction * np.exp(pressure / bulk), minlength=len(points))
     return float((_pores(built) * density - points.volume0 * points.data.get("owed", 0.0)).sum())
 
 

@@ -1,11 +1,16 @@
 # SPDX-License-Identifier: MIT
-"""What a reset of the grid makes: bodies cut by the cells, the active set, matrices that stay while a cut serves."""
+"""The reset of the grid: bodies cut by its cells, the active set, and the matrices that stay while a cut serves.
+
+A step begins with it (`Scene.on_grid`), unless no corner has moved by more than a small part of a cell since the last
+one.  At the end of a step points only move (`advance`), and their pieces take the pressures along.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 from dolfinx.common import Timer
@@ -18,7 +23,8 @@ from mpm_dolfinx.conditions.acting import Loads
 from mpm_dolfinx.diagnostics.scene_checks import check_held
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.domains.pressure_transport import CellPressures, Reconstruction, share_within, transport
-from mpm_dolfinx.flow.fluxes import CellContents, CellMotion, Conduction, Mobility, OpenSides, PieceContents
+from mpm_dolfinx.flow.feeding import Feeds, Wet, open_sides
+from mpm_dolfinx.flow.fluxes import CellContents, CellMotion, Conduction, Mobility, PieceContents
 from mpm_dolfinx.flow.layers import graded, mixed_cells
 from mpm_dolfinx.flow.nonorthogonal import Gradients, off_facets
 from mpm_dolfinx.flow.storage import Outflow, StorageForms, StorageSystem
@@ -65,7 +71,7 @@ class OnGrid(Keyed):
         points = cut.points
         self.cut = cut
         self._quadrature = quadrature
-        self._storage = storage
+        self._storage, self._u = storage, momentum.u
         self._places = quadrature.places(cut)
         self.data = quadrature.data(cut, self._places, points)
         """The pieces when the grid was reset."""
@@ -135,25 +141,33 @@ class OnGrid(Keyed):
         """Return the pressures of the filled owned cells at the start of a step, Pa."""
         if not state.stays:
             bulk = self._storage.bulk
-            carried = transport(state.transported.potentials(bulk), self.cut.points, self.cut.pieces)
+            carried = transport(state.pieces.potentials(bulk), self.cut.points, self.cut.pieces)
             if state.stay:
-                carried = mass_potential(self.of_pieces(state, "pressure", pressure_of(carried, bulk)), bulk)
+                carried = mass_potential(self.of_pieces(state, "of_cell", pressure_of(carried, bulk)), bulk)
             return pressure_of(self._means(carried), bulk)
         p = np.zeros(self.cut.grid.num_local)
-        p[self.cut.cells] = self.cut.pieces_to_cells(state.stay.pressure)
+        p[self.cut.cells] = self.cut.pieces_to_cells(state.pieces.of_cell)
         return p[self.contents.filled]
 
     def of_pieces(self, state: State, name: str, fresh: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return what pieces have of the state's stay by this name, fresh (m, ...) where there is none."""
-        return state.stay.of_pieces(name, fresh, self.cut.pieces.point) if state.stay else fresh
+        """Return what pieces have by this name in the state, fresh ones (m, ...) where they do not stay."""
+        return state.of_pieces(name, fresh, self.cut.pieces.point)
 
-    def as_reset(self, state: State) -> QuadratureData:
-        """Return the pieces when the grid was reset, and set the present pressures to those of then."""
+    @contextmanager
+    def as_reset(self, state: State) -> Iterator[QuadratureData]:
+        """Give the pieces when the grid was reset; within it displacements are none, and pressures those of then."""
+        functions = [self._u] if self._storage is None else [self._u, self._storage.p, self._storage.p_n]
+        now = [f.x.array.copy() for f in functions]
+        self._u.x.array[:] = 0.0
         if self._storage is not None:
             if state.stay:
                 self.set_pressures(self.of_pieces(state, "start", self.pressures_of_pieces()))
             self._storage.p.x.array[:] = self._storage.p_n.x.array
-        return self.data
+        try:
+            yield self.data
+        finally:
+            for f, values in zip(functions, now, strict=True):
+                f.x.array[:] = values
 
     def pressures_of_pieces(self) -> NDArray[np.float64]:
         """Return the pressures (m,), Pa, at the start of a step of the cells that pieces lie in."""
@@ -243,7 +257,8 @@ class OnGrid(Keyed):
         at_rest: pressures of the fluid at rest, from which these then are the differences.
         """
         contents = self.contents
-        sides = stage.hydraulic.data(self.cut, self.cut.points, contents, t)
+        wet = Wet(self.cut, self.cut.points, contents, t)
+        sides = open_sides([one.placed(wet) for one in stage.feeding], self.cut.grid.dim)
         sides = replace(sides, pressure=mass_potential(sides.pressure, bulk))
         if at_rest is not None:
             x = self.cut.grid.midpoints + contents.centroid
@@ -390,7 +405,8 @@ class Assembled(Keyed):
         self.end_step = system.end_step
         self._on_grid, self._stage = on_grid, stage
         self._u, self._varies = momentum.u, storage is not None and storage.conductivity is not None
-        self._by_pressure = storage if self._varies and storage.conductivity.pressure is not None else None
+        self._bulk = storage.bulk if storage is not None else np.inf
+        self._by_pressure = storage.p_before if self._varies and storage.conductivity.by_pressure else None
         self._mobility: Latest[Mobility] = Latest()
         self._outflow: Latest[Outflow] = Latest()
         self.momentum.set_penalty(loads)
@@ -425,8 +441,8 @@ class Assembled(Keyed):
 
     def flow(
         self, state: State, weight: NDArray[np.float64] | None, data: QuadratureData, t: float
-    ) -> Callable[[bool], Outflow]:
-        """Return what assembles the fluxes at u, called with whether a step begins.
+    ) -> tuple[list[Feeds], Callable[[bool], Outflow]]:
+        """Return what acts on the fluid, and what assembles the fluxes at u, called with whether a step begins.
 
         Where points stay in their cells, and nothing but u would change the fluxes, they are those of the start.
 
@@ -445,35 +461,36 @@ class Assembled(Keyed):
         contents = self._on_grid.contents
         grid = self._on_grid.cut.grid
         u = self._u
-        hydraulic, varies = self._stage.hydraulic, (t,) if self._stage.hydraulic.varies else ()
+        varies = (t,) if any(one.varies for one in self._stage.feeding) else ()
         at = state.points if weight is not None or varies else on_grid.cut.points  # gravity may change with time
-        sides = partial(hydraulic.data, on_grid.cut, at, contents, t)
+        wet = Wet(on_grid.cut, at, contents, t, data.pieces)
+        feeds = [one.placed(wet) for one in self._stage.feeding]
+        sides = open_sides(feeds, grid.dim)
 
         def mobility(begins: bool) -> Mobility:
             if self._varies:
                 return on_grid.mobility(data, begins)
             return self._mobility((), lambda: on_grid.mobility(data, True))
 
-        def set_fluxes(at_sides: OpenSides, kappa: Mobility, motion: CellMotion | None = None) -> Outflow:
-            where = (at_sides.cells, at_sides.shape, at_sides.seeps, at_sides.area, at_sides.reach)
-            off = self._off and (self._off, self._gradients(where, lambda: Gradients(contents, at_sides)))
-            return self.storage.set_fluxes(contents, at_sides, Conduction(kappa, motion, weight), off)
+        def set_fluxes(kappa: Mobility, motion: CellMotion | None = None) -> Outflow:
+            where = (sides.cells, sides.shape, sides.seeps, sides.area, sides.reach)
+            off = self._off and (self._off, self._gradients(where, lambda: Gradients(contents, sides)), sides)
+            return self.storage.set_fluxes(contents, feeds, Conduction(kappa, motion, weight, self._bulk), off)
 
-        if (storage := self._by_pressure) is not None:
-            varies = (*varies, storage.p.x.array.copy())
-            storage.conductivity.pressure.x.array[:] = storage.p.x.array  # of the start of the substep
+        if self._by_pressure is not None:
+            varies = (*varies, self._by_pressure.x.array.copy())
         if state.stays and not self._varies:
-            outflow = self._outflow((at, weight, *varies), lambda: set_fluxes(sides(), mobility(True)), grid.comm)
-            return lambda begins: outflow
-        placed, rests = sides(), on_grid.rests(state) if not self._varies else None
+            outflow = self._outflow((at, weight, *varies), lambda: set_fluxes(mobility(True)), grid.comm)
+            return feeds, lambda begins: outflow
+        rests = on_grid.rests(state) if not self._varies else None
 
         def at_present(begins: bool) -> Outflow:
             motion = contents.motion(u.x.array.reshape(-1, grid.dim), rests)
-            return set_fluxes(placed, mobility(begins), motion)
+            return set_fluxes(mobility(begins), motion)
 
         # a substep begins where the one before it has ended
         at_u = (data.pieces.key, weight, *varies)
-        return lambda begins: self._outflow((*at_u, u.x.array.copy()), lambda: at_present(begins), grid.comm)
+        return feeds, lambda begins: self._outflow((*at_u, u.x.array.copy()), lambda: at_present(begins), grid.comm)
 
 
 def assembled(

@@ -26,9 +26,10 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.base.errors import NotConverged
+from mpm_dolfinx.base.tolerances import SAME
 from mpm_dolfinx.forms.unknowns import Unknowns
-from mpm_dolfinx.solve.options import set_defaults
-from mpm_dolfinx.solve.plan import MUMPS, NODAL
+from mpm_dolfinx.solve.petsc_options import set_defaults
+from mpm_dolfinx.solve.solver_choice import MUMPS, NODAL
 
 MOST = 500
 """Most iterations of a linear solve, and vectors that it keeps: it never starts anew.
@@ -269,7 +270,7 @@ def dissection(x: NDArray[np.float64]) -> NDArray[np.int64]:
 def _lines(x: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return the numbers (n,) of the grid lines that coordinates (n,) lie on, of those that any does."""
     values, at = np.unique(x, return_inverse=True)
-    return np.cumsum(np.diff(values, prepend=values[:1]) > 1e-7 * (values[-1:] - values[:1]))[at]
+    return np.cumsum(np.diff(values, prepend=values[:1]) > SAME * (values[-1:] - values[:1]))[at]
 
 
 class BlockFactors:

@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: MIT
+"""Motions that were recorded: accelerograms, or velocities, as functions of time."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import PPoly
+
+from mpm_dolfinx.base.validation import flag, line, numbers, on_disk, path
+
+QUANTITIES = ("acceleration", "velocity")
+ALLOWED = "times that increase, s, and values, finite, in two columns of at least two rows"
+
+
+class Record:
+    """Motion that was recorded along a direction: a function of time (s) that gives its displacement (d,), m.
+
+    Between its times the record is linear, and its integrals are exact.  Before the first one all is at rest; after the
+    last one nothing accelerates any more.
+
+    Parameters
+    ----------
+    record : file, or (n, 2)
+        Times, s, and values at these, in two columns; in a file blanks or commas part them, and # begins comments.
+    direction : (d,)
+        Along which the values count; its length scales them: (9.81, 0) for a record in g.
+    quantity
+        What was recorded: "acceleration", m/s^2, or "velocity", m/s.
+    at_rest
+        Whether the motion ends at rest where it began: accelerations are then less by a line in time.  Without it a
+        record whose integral is not zero goes on moving.
+
+    Raises
+    ------
+    ValueError
+        The record is not finite, its times do not increase, or there are fewer than two.
+    OSError
+        The file cannot be read.
+    """
+
+    def __init__(
+        self,
+        record: str | os.PathLike | ArrayLike,
+        direction: ArrayLike,
+        quantity: str = "acceleration",
+        at_rest: bool = False,
+    ):
+        if quantity not in QUANTITIES:
+            raise ValueError(f"Record: quantity = {line(quantity)}, must be one of {', '.join(QUANTITIES)}")
+        flag("Record: at_rest", at_rest)
+        if at_rest and quantity == "velocity":
+            raise ValueError("Record: at_rest = True with velocities, must be a record of accelerations")
+        self.direction = numbers("Record: direction", direction, (2,), (3,), allowed="2 or 3 finite numbers")
+        rows = numbers(
+            "Record", _read(record) if isinstance(record, (str, os.PathLike)) else record, None, allowed=ALLOWED
+        )
+        if rows.ndim != 2 or rows.shape[1] != 2 or len(rows) < 2 or not (np.diff(rows[:, 0]) > 0).all():
+            raise ValueError(f"Record = {line(record)} of shape {rows.shape}, must be {ALLOWED}")
+        t, values = rows.T
+        if at_rest:
+            end, T = _linear(t, values).antiderivative(), t[-1] - t[0]
+            moments = [end(t[-1]), end.antiderivative()(t[-1])]
+            level, slope = np.linalg.solve([[T, T**2 / 2], [T**2 / 2, T**3 / 6]], moments)
+            values = values - level - slope * (t - t[0])
+        rate = _linear(t, values)
+        velocity = rate if quantity == "velocity" else rate.antiderivative()
+        self._of = velocity.derivative(), velocity, velocity.antiderivative()
+        self.end = float(t[-1])
+        """Last time of the record, s."""
+
+    def __call__(self, t: float) -> NDArray[np.float64]:
+        """Return the displacement (d,) at time t (s), m."""
+        *_, u = self._of
+        return self._within(u, t) + max(t - self.end, 0.0) * self.velocity(min(t, self.end))
+
+    def velocity(self, t: float) -> NDArray[np.float64]:
+        """Return the velocity (d,) at time t (s), m/s."""
+        return self._within(self._of[1], t)
+
+    def acceleration(self, t: float) -> NDArray[np.float64]:
+        """Return the acceleration (d,) at time t (s), m/s^2."""
+        return self._within(self._of[0], t) * (t <= self.end)
+
+    def _within(self, value: PPoly, t: float) -> NDArray[np.float64]:
+        """Return a value along the direction (d,), zero before the record, and after it what it has at its end."""
+        return self.direction * (float(value(min(t, self.end))) if t >= value.x[0] else 0.0)
+
+
+def _linear(t: NDArray[np.float64], values: NDArray[np.float64]) -> PPoly:
+    """Return what is linear between values (n,) at times (n,), s."""
+    return PPoly(np.stack([np.diff(values) / np.diff(t), values[:-1]]), t)
+
+
+def _read(record: str | os.PathLike) -> NDArray[np.float64]:
+    """Return the columns of a file."""
+    file = path("Record", record)
+    with on_disk(f"Record: {file}", "a file that can be read"):
+        text = file.read_text()
+    try:
+        return np.loadtxt(text.replace(",", " ").splitlines(), ndmin=2)
+    except ValueError as error:
+        raise ValueError(f"Record: {file}: {line(str(error))}, must be {ALLOWED}") from error

@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: MIT
+"""Warnings that cells or points are too few: cells that are overfilled or shared by layers, bodies too thin to bend."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+from mpi4py import MPI
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpm_dolfinx.base.tolerances import SAME
+from mpm_dolfinx.bodies.bodies import Body
+from mpm_dolfinx.bodies.touching import Faces, covered, covers
+from mpm_dolfinx.domains.cut_domains import CutDomains
+from mpm_dolfinx.grid.grid import SIDES, Grid, sum_by
+from mpm_dolfinx.materials.fields import SceneMaterials
+from mpm_dolfinx.parallel.exchange import over_all
+from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
+
+FULL = 1.2
+"""Of a cell: domains that have not folded stay below 1.08 where soil is pushed aside by half a footing's width."""
+
+
+def warn_overfilled(cut: CutDomains, bodies: Sequence[Body]) -> Callable[..., Any] | None:
+    """Warn of the fullest cell, with the bodies in it, if it is overfilled; return what looks for the next."""
+    grid, points = cut.grid, cut.points
+    volume = cut.to_cells(points.volume0 * points.J) * cut.pieces_to_cells(cut.pieces.fraction)
+    fill = sum_by(cut.cells, cut.plane(volume)[0], grid.num_owned) / grid.cell_volume
+    most = over_all(grid.comm, float(fill.max(initial=0.0)), MPI.MAX)
+    if not cut.domains or most <= FULL:
+        return warn_overfilled
+    number = over_all(grid.comm, int(grid.cell_number[fill.argmax()]) if most in fill else -1, MPI.MAX)
+    found, x = bodies_in(cut, bodies, number)
+    who = f"bodies {', '.join(map(str, found))}" if len(found) > 1 else f"domains of body {found[0]}"
+    warn(
+        grid.comm,
+        ResolutionWarning,
+        "the cell at %s is filled to %.0f %%, more than it holds: %s overlap",
+        x,
+        100 * most,
+        who,
+    )
+    return None
+
+
+def bodies_in(cut: CutDomains, bodies: Sequence[Body], cell: int) -> tuple[list[int], NDArray[np.float64]]:
+    """Return the bodies in a lexicographic cell, and its midpoint (d,), m; on all processes together."""
+    grid, ids = cut.grid, cut.points.id[cut.pieces.point[cut.pieces.cell == cell]]
+    own = np.searchsorted(np.cumsum([len(body) for body in bodies]), ids, side="right")
+    found = sorted({int(i) for rows in grid.comm.allgather(own) for i in rows})
+    return found, grid.lower + (np.array(np.unravel_index(cell % grid.cells, grid.shape)) + 0.5) * grid.h
+
+
+LOST = 0.03
+"""Share of what a soft material gives, lost in cells that it shares, from which a scene is warned of."""
+AGAIN = 2.0
+"""Times the share that was named, from which it is named again: interfaces move on to the middle of cells."""
+FINE = 0.1
+"""Of what a soft cell gives: what may be lost in a cell; contrasts below 2.1 stay below."""
+
+
+def warn_smeared(
+    cut: CutDomains, bodies: Sequence[Body], materials: SceneMaterials, least: float = LOST
+) -> Callable[..., Any]:
+    """Warn of the soft material that loses most in cells shared with stiffer ones, if that is much.
+
+    Parameters
+    ----------
+    least
+        Share of what the material gives from which it is named, in [0, 1].
+
+    Returns
+    -------
+    callable
+        What looks for it the next time.
+    """
+    grid = cut.grid
+    points = cut.points
+    count = len(materials.materials)
+    volume = cut.to_cells(points.volume0 * points.J) * cut.pieces_to_cells(cut.pieces.fraction)
+    whole = over_all(grid.comm, sum_by(cut.to_cells(points.material), volume, count))
+    found = []
+    for modulus in (lambda m: m.oedometric, lambda m: m.shear):
+        lost, contrast, softest = _lost(cut, volume, cut.to_cells(materials.table(points, modulus)))
+        of = cut.to_cells(points.material)[softest]
+        each = over_all(grid.comm, sum_by(of, lost, count))
+        share = np.divide(each, whole, out=np.zeros(count), where=whole > 0)
+        i = int(share.argmax())
+        found.append((share[i], i, np.where(of == i, lost, 0.0), contrast))
+    share, i, lost, contrast = max(found, key=lambda row: row[0])
+    if share <= least:
+        return partial(warn_smeared, materials=materials, least=least)
+    most = over_all(grid.comm, float(lost.max(initial=0.0)), MPI.MAX)
+    at = np.flatnonzero(lost == most)[:1]
+    cell = over_all(grid.comm, int(grid.cell_number[at].max(initial=-1)), MPI.MAX)
+    much = over_all(grid.comm, float(contrast[at].max(initial=0.0)), MPI.MAX)
+    those, x = bodies_in(cut, bodies, cell)
+    what = "materials of bodies %s share cells, as at %s: material %d, up to %.3g times as soft as its neighbour, "
+    what += "gives about %.0f %% too little under a load across the layers; lay interfaces along grid lines, or take "
+    what += "smaller cells"
+    warn(grid.comm, ResolutionWarning, what, " and ".join(map(str, those)), x, i, much, 100 * share)
+    return partial(warn_smeared, materials=materials, least=AGAIN * share)
+
+
+def _lost(cut: CutDomains, volume: NDArray[np.float64], modulus: NDArray[np.float64]) -> tuple[NDArray, ...]:
+    """Return what owned cells lose (n,), m^d of the softest piece in it, their contrasts (n,), and that piece (n,).
+
+    With moduli M and shares s of a cell, layers one upon the other give sum s/M, and with the cell's strain in all of
+    them 1 / sum s M.  The difference, over the 1/M of the softest, is lost: at most (1 - sqrt(r))^2 of the cell with
+    two moduli, r < 1 their ratio.
+    """
+    n, order = cut.grid.num_owned, np.argsort(-modulus, kind="stable")
+    softest, hardest = (np.zeros(n, dtype=np.int64) for _ in range(2))
+    softest[cut.cells[order]], hardest[cut.cells[order[::-1]]] = order, order[::-1]  # the last one stays
+    held, stiffness, compliance = (sum_by(cut.cells, volume * y, n) for y in (1.0, modulus, 1 / modulus))
+    lost = np.zeros(n)
+    contrast = np.ones(n)
+    at = np.flatnonzero(held > 0)
+    lost[at] = modulus[softest[at]] * (compliance[at] - held[at] ** 2 / stiffness[at])
+    contrast[at] = modulus[hardest[at]] / modulus[softest[at]]
+    return np.where(lost > FINE * held, lost, 0.0), contrast, softest
+
+
+COARSE = 0.7  # of a cell: domains above this lack more stiffness than Q1 cells have too much
+FEW = 3  # points over the thickness that bend an eighth too much.  Source: exact, 1 / (n^2 - 1)
+SLENDER = 4  # length over thickness from which a body bends
+LOST_WET = 3.0  # share that wet ones lose, times n^2: beams sealed or open at their end, n = 4 to 32, within a third
+FEW_WET = int((100 * LOST_WET) ** 0.5)  # up to which they lose 1 %.  Source: exact, by LOST_WET
+SLENDER_WET = 2  # length over thickness from which a wet body bends
+
+
+def warn_thin(grid: Grid, bodies: Sequence[Body], walls: Mapping[str, str], wet: bool) -> None:
+    """Warn for each slender body that is free to bend and has too few points over its thickness.
+
+    A law sees one F in a point's domain: n points over the thickness have 1 - 1/n^2 of the bending stiffness, as
+    n layers of constant stress do, however exactly their domains are integrated.  One point carries no moment at
+    all: what resists is each step's increment only, and the body creeps from step to step.  With pore fluid (wet)
+    more is lost, by measurement, and the body goes on creeping.
+    """
+    few, slender = (FEW_WET, SLENDER_WET) if wet else (FEW, SLENDER)
+    for i, body in enumerate(bodies):
+        for axis, letter in enumerate("xyz"[: grid.dim]):
+            n, spacing = body.across(axis)
+            if spacing > COARSE * grid.h[axis] and n <= few and _bends(grid, bodies, i, axis, walls, slender):
+                much = "it carries no moment and creeps"
+                if n > 1:
+                    much = f"it bends {1 / (n**2 - 1):.0%} too much"
+                if n > 1 and wet:
+                    much = f"with pore fluid it bends some {LOST_WET / n**2:.0%} too much and creeps"
+                what = "body %d: %.3g point%s over its thickness along %s, in cells of %.3g m: %s; take per_cell >= 2"
+                warn(grid.comm, ResolutionWarning, what, i, n, "s" if n > 1 else "", letter, grid.h[axis], much)
+
+
+def _bends(grid: Grid, bodies: Sequence[Body], i: int, axis: int, walls: Mapping[str, str], slender: float) -> bool:
+    """Whether a body is slender across an axis, and neither a wall nor another body holds it from that side."""
+    body = bodies[i]
+    size = body.bounds[1] - body.bounds[0]
+    if size.max() < slender * size[axis]:
+        return False
+    for name in (name for name, (a, _) in SIDES[grid.dim].items() if a == axis):
+        end = SIDES[grid.dim][name][1]
+        wall = (grid.lower, grid.upper)[end][axis]
+        if "xyz"[axis] in walls.get(name, "") and np.abs(body.bounds[end][axis] - wall) < SAME * grid.h[axis]:
+            return False
+        own = Faces.of(body, *body.facing(axis, end))
+        others = (Faces.around(other) for other in bodies if other is not body)
+        if sum(covered(len(own.row), covers(own, other)).sum() for other in others) > len(own.row) / 2:
+            return False
+    return True

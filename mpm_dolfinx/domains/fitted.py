@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: MIT
+"""Tensors at places in the bodies, fitted to those of the points around them (`LocalFit`)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from mpi4py import MPI
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from mpm_dolfinx.bodies.faces import interpolate
+from mpm_dolfinx.parallel.exchange import over_all
+from mpm_dolfinx.points.cutting import centroids, edges
+from mpm_dolfinx.points.local_fit import RADIUS, LocalFit, near
+from mpm_dolfinx.points.material_points import MaterialPoints
+
+
+def fitted_at(
+    comm: MPI.Comm,
+    sizes: Sequence[int],
+    points: MaterialPoints,
+    id: NDArray[np.int64],
+    xi: NDArray[np.float64],
+    tensor: Callable[[MaterialPoints], NDArray[np.float64]],
+) -> NDArray[np.float64]:
+    """Return tensors (m, k, k) at places in domains; on all processes together.
+
+    Points count that are of the place's body and material, by where they were at rest.  Places in domains that are not
+    there have any.
+
+    Parameters
+    ----------
+    sizes
+        Numbers of points of all bodies of the scene.
+    id, xi : (m,), (m, d)
+        Numbers of the points, and places in their domains; the same on all processes.
+    tensor
+        Gives it at points (n, k, k).
+    """
+    m = len(id)
+    d = xi.shape[1]
+    here, at = points.find(id)
+    rest = edges(points.reference[at])
+    frames = [np.linalg.inv(E) for E in (rest, points.F[at][:, :d, :d] @ rest)]
+    of = (points.reference, points.corners)
+    columns = [*(interpolate(corners[at], xi[here]) for corners in of), *(E.reshape(-1, d * d) for E in frames)]
+    own = np.zeros((m, 2 * d + 2 * d * d + 1))
+    own[here] = np.column_stack([*columns, points.material[at]])
+    X, x, rest, now, material = np.split(over_all(comm, own), np.cumsum([d, d, d * d, d * d]), axis=1)
+    rest, now = (frame.reshape(m, d, d) for frame in (rest, now))
+    rest[~rest.any(axis=(1, 2))] = np.eye(d)
+    middle, last = centroids(points.reference), np.cumsum(sizes)
+    probe, row = _near(middle, X, RADIUS * np.abs(np.linalg.inv(rest)).sum(axis=2).max(axis=1))
+    body, own_body = (np.searchsorted(last, ids, side="right") for ids in (points.id[row], id[probe]))
+    weight = near(np.einsum("rij,rj->ri", rest[probe], middle[row] - X[probe]))
+    weight = weight * ((body == own_body) & (points.material[row] == material[probe, 0]))
+    probe, row, weight = (values[weight > 0] for values in (probe, row, weight))
+    used, place = np.unique(row, return_inverse=True)
+    values = tensor(points.map(lambda rows: rows[used]))[place]
+    shape = values.shape[1:]
+    values = values.reshape(len(row), int(np.prod(shape)))
+    fit = LocalFit(m, d, 1, int(np.prod(shape)))
+    fit.add(probe, np.einsum("rij,rj->ri", now[probe], points.x[row] - x[probe]), values, weight)
+    return fit.values(comm).reshape(m, *shape)
+
+
+def _near(x: NDArray[np.float64], places: NDArray[np.float64], reach: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
+    """Return the pairs of some places (m, d) and of points at x (n, d) within a reach (m,) along each axis, all m."""
+    low, high = ((places + way * reach[:, None]).T for way in (-1, 1))
+    bounds = low.min(axis=1, initial=np.inf), high.max(axis=1, initial=-np.inf)
+    some = np.flatnonzero(((x >= bounds[0]) & (x <= bounds[1])).all(axis=1))
+    if not len(some):
+        return np.empty(0, np.int64), np.empty(0, np.int64)
+    found = cKDTree(x[some]).query_ball_point(places, reach, p=np.inf)
+    return np.repeat(np.arange(len(places)), list(map(len, found))), some[np.concatenate(found).astype(np.int64)]

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""Waves and shaking: quiet sides, energies."""

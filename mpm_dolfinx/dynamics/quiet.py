@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: MIT
+"""Quiet sides: t = t_0 - Z (v - 2 v_in), Z = rho c_p n n + rho c_s (I - n n), v_in of a wave that comes in.
+
+t_0 is what the side bore at rest, a traction that stays (Lysmer and Kuhlemeyer 1969; incoming waves: Joyner and Chen
+1975).  Impedances are those of small strains, of soil and water that move together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from itertools import combinations
+
+from petsc4py import PETSc
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from numpy.typing import NDArray
+
+from mpm_dolfinx.bodies.faces import Surface
+from mpm_dolfinx.conditions.acting import Acting, Loads, Place, Setting
+from mpm_dolfinx.conditions.conditions import Quiet
+from mpm_dolfinx.conditions.sides import check_apart, gathered
+from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointForm
+from mpm_dolfinx.forms.velocity import Velocity
+from mpm_dolfinx.grid.grid import Grid
+
+
+def traction_name(name: str) -> str:
+    """Return the name under which points have the traction (n, d), Pa, that a quiet side bore at rest."""
+    return f"{name}_traction"
+
+
+class QuietForms:
+    """Points on quiet sides: impedances along the normal and beyond those across it, kg/m^2/s, and forces that stay."""
+
+    def __init__(self, grid: Grid, u: fem.Function, velocity: Velocity):
+        self.points = p = FormPoints(grid, normal=(grid.dim,), across=(), along=(), force=(grid.dim,))
+        v, du = ufl.TestFunction(u.function_space), ufl.TrialFunction(u.function_space)
+        rate = ufl.dot(p.normal, p.value(velocity.value)) * p.normal
+        resists = ufl.inner(p.across * p.value(velocity.value) + p.along * rate, p.value(v)) * p.dx
+        self.resists, self.slope = PointForm(resists, p), PointForm(ufl.derivative(resists, u, du), p)
+        self.stays = PointForm(ufl.inner(p.force, p.value(v)) * p.dx, p)
+
+
+class QuietSides(Acting):
+    """The quiet sides of a stage.
+
+    Parameters
+    ----------
+    setting, sides
+        Where they are put, and the quiet sides by name.
+
+    Raises
+    ------
+    ValueError
+        Two act on the same part of a face.
+    """
+
+    conditions, title = (Quiet,), "quiet sides"
+
+    def __init__(self, setting: Setting, sides: Mapping[str, Quiet]):
+        self._grid, self._forms = setting.grid, setting.forms
+        self._materials = setting.materials
+        self._sides = {name: (side, setting.sides.of(side)) for name, side in sides.items()}
+        for (one, faces), (other, others) in combinations(self._sides.values(), 2):
+            check_apart(one, faces, other, others)
+        for side in sides.values():
+            side.at(0.0, self._grid.dim)
+
+    def named(self, names: Collection[str]) -> dict[str, Surface]:
+        """Return the faces of sides of some names."""
+        return {name: faces for name, (_, faces) in self._sides.items() if name in names}
+
+    @property
+    def surfaces(self) -> list[Surface]:
+        """The faces."""
+        return [faces for _, faces in self._sides.values()]
+
+    def kept(self, n: int) -> dict[str, dict[str, NDArray[np.float64]]]:
+        """Return the tractions that n points keep, none."""
+        return {name: {traction_name(name): np.zeros((n, self._grid.dim))} for name in self._sides}
+
+    def placed(self, place: Place) -> Loads:
+        """Return their forces on the present surface."""
+        rows, d = [], self._grid.dim
+        points = place.points
+        rho, shear = self._materials.density(points), self._materials.table(points, lambda m: m.shear)
+        across, along = np.sqrt(rho * shear), np.sqrt(rho * self._materials.confined_modulus(points))
+        for name, (side, faces) in self._sides.items():
+            p = place.cut.surface(faces)
+            area, at = p.area(points), p.at
+            incoming = side.at(place.t, d)
+            size = np.linalg.norm(area, axis=1, keepdims=True)
+            n, z = area / size, np.stack([across[at], along[at] - across[at]], axis=1)
+            push = 2 * (z[:, :1] * incoming + z[:, 1:] * (n @ incoming)[:, None] * n)
+            force = push + points.data[traction_name(name)][at] * p.area0[:, None] / size
+            rows.append((p.cell, p.x, np.concatenate([size, n, z, force], axis=1)))
+        cell, x, values = gathered(self._grid, rows, 3 + 2 * d)
+        size, normal, z, force = np.split(values, [1, 1 + d, 3 + d], axis=1)
+        forms = self._forms(QuietForms, self._forms.velocity)
+        fields = {"normal": normal, "across": z[:, 0], "along": z[:, 1], "force": force}
+        return QuietLoads(forms, forms.points.at(cell, x, size[:, 0], **fields))
+
+
+class QuietLoads(Loads):
+    """Quiet sides in a substep."""
+
+    varies = True
+
+    def __init__(self, forms: QuietForms, data: PointData):
+        self._forms, self._data = forms, data
+
+    def dead(self, b: NDArray[np.float64]) -> None:
+        """Add the tractions that stay, and those of incoming waves."""
+        self._forms.stays.assemble_vector(b, self._data)
+
+    def resists(self, b: NDArray[np.float64]) -> None:
+        """Add what resists the velocity."""
+        self._forms.resists.assemble_vector(b, self._data)
+
+    def tangent(self, K: PETSc.Mat) -> None:
+        """Add its derivative."""
+        self._forms.slope.assemble_matrix(K, self._data)

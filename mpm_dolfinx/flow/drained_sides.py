@@ -1,0 +1,198 @@
+# SPDX-License-Identifier: MIT
+"""Drained sides, seepage faces and prescribed inflows: what passes through the sides of the bodies to and from outside.
+
+What leaves a cell through a face is T r [p - p_out + rho_w g . (x_out - x)], T = A kappa / d by the distance d of the
+cell's centroid, or what is prescribed.  A seepage face lets nothing in: it is open where the flow at the start of the
+substep, and then that of a solution, asks for it (`SideFeeds.settle`), a primal-dual active set (Hintermueller, Ito and
+Kunisch 2002).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpm_dolfinx.base.caching import Latest
+from mpm_dolfinx.bodies.faces import Surface
+from mpm_dolfinx.conditions.acting import Setting
+from mpm_dolfinx.conditions.conditions import Drained, Inflow
+from mpm_dolfinx.conditions.sides import check_apart, everywhere, gathered, on_side
+from mpm_dolfinx.domains.cut_domains import CutDomains
+from mpm_dolfinx.flow.feeding import Feeding, Feeds, Fluid, Leaving, Wet
+from mpm_dolfinx.flow.fluxes import Conduction, OpenSides
+from mpm_dolfinx.forms.point_forms import PointData
+from mpm_dolfinx.grid.grid import Grid, sum_by
+from mpm_dolfinx.parallel.exchange import over_all
+
+THICK = np.sqrt(2)
+"""Largest section of a cube over its face.  Source: exact bound (Ball 1986).
+
+A convex body behind a plane has its centroid at least its volume / ((d + 1) THICK h^(d-1)) behind it.  A face that is
+closer to the centroid of what its cell holds, or behind it, bounds a part of that only, and must not drain it at once.
+"""
+
+
+class DrainedSides(Feeding):
+    """Drained sides and prescribed inflows of a stage.
+
+    Parameters
+    ----------
+    setting
+        Where they are put.
+    outlets
+        The conditions by name.
+
+    Raises
+    ------
+    ValueError
+        Naming a condition whose side no point has, or two that act on the same faces.
+    """
+
+    conditions, title = (Drained, Inflow), "open sides"
+
+    def __init__(self, setting: Setting, outlets: Mapping[str, Drained | Inflow]):
+        self._grid = setting.grid
+        self._names, self.count = tuple(outlets), len(outlets)
+        self._outlets = [(outlet, setting.sides.of(outlet)) for outlet in outlets.values()]
+        self.varies = any(callable(getattr(one, name)) for one in outlets.values() for name in one.FUNCTIONS)
+        for one, other in combinations(self._outlets, 2):
+            check_apart(*one, *other)
+        self._constant: Latest[OpenSides] = Latest()
+
+    @property
+    def surfaces(self) -> list[Surface]:
+        """The faces."""
+        return [faces for _, faces in self._outlets]
+
+    def unknown(self, value: float) -> dict[str, NDArray[np.float64]]:
+        """Return outflows of this value before a first step."""
+        return {name: np.array(value) for name in self._names}
+
+    def fed(self, cut: CutDomains, pieces: PointData) -> NDArray[np.int64]:
+        """Return the points at the faces."""
+        return np.concatenate([patch.at for patch in cut.surfaces(self.surfaces)])
+
+    def placed(self, wet: Wet) -> SideFeeds:
+        """Return the open sides where they were cut, with what they give at the time."""
+        if self.varies:
+            return SideFeeds(self._sides(wet), wet, self._grid, self._names)
+        key = (wet.cut.key, wet.contents.key, wet.points)
+        sides = self._constant(key, lambda: self._sides(wet), self._grid.comm)
+        return SideFeeds(sides, wet, self._grid, self._names)
+
+    def _sides(self, wet: Wet) -> OpenSides:
+        grid, rows = self._grid, []
+        patches = wet.cut.surfaces(self.surfaces)
+        for i, ((outlet, _), p) in enumerate(zip(self._outlets, patches, strict=True)):
+            given, n = everywhere(grid, partial(outlet.through, wet.t, on_side(p, wet.points))), len(p.x)
+            columns = [np.resize(column, (n, 1)) for column in (i, *given)]
+            rows.append((p.cell, p.x, np.concatenate([*columns, p.area(wet.points)], axis=1)))
+        cell, x, values = gathered(grid, rows, 4 + grid.dim)
+        number = values[:, 0].astype(np.int64)
+        pressure, flux, one_way = values[:, 1:4].T
+        area = values[:, 4:]
+        drains = np.isfinite(pressure)
+        size, reach = np.linalg.norm(area, axis=1), x - grid.midpoints[cell] - wet.contents.centroid[cell]
+        least = wet.contents.fill[wet.contents.slot(cell)] * grid.h.min() / THICK / (grid.dim + 1)
+        normal = area / size[:, None]
+        distance = np.einsum("md,md->m", reach, normal)
+        shape = size / np.maximum(distance, least)
+        if grid.axisymmetric:  # half-way to the centroid rings are as much longer or shorter
+            shape = shape * (1 - distance * normal[:, 0] / (2 * x[:, 0]))
+        shape, pressure = (np.where(drains, values, 0.0) for values in (shape, pressure))
+        return OpenSides(number, cell, shape, pressure, flux * size, one_way > 0, area, reach)
+
+
+@dataclass(frozen=True)
+class OpenFaces:
+    """Faces on open sides as the cells conduct; arrays over m faces.
+
+    at (m,): place of the cell among the n active owned ones; conductance, inflow (m,): outflow per unit of the cell's
+    mass potential, m^d/(Pa s), and what is prescribed or driven in, m^d/s; seeps (m,): whether nothing may flow in;
+    reach (m, d): way from the cell's centroid, m.
+    """
+
+    at: NDArray[np.int64]
+    conductance: NDArray[np.float64]
+    inflow: NDArray[np.float64]
+    seeps: NDArray[np.bool_]
+    reach: NDArray[np.float64]
+
+    def outflow(self, fluid: Fluid) -> NDArray[np.float64]:
+        """Return what leaves through each face (m,), were it open both ways, m^d/s."""
+        return self.conductance * fluid.pi[self.at] - self.inflow
+
+    def driven(self, force: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return what forces (n, d), N/m^3, on the fluid drive out through each face (m,), m^d/s."""
+        along = np.einsum("md,md->m", force[self.at], self.reach)
+        return np.where(self.seeps, 0.0, self.conductance * along)
+
+
+class SideFeeds(Feeds):
+    """Open sides in a substep.
+
+    Parameters
+    ----------
+    sides
+        Their faces.
+    wet
+        When and where.
+    grid
+        Background grid.
+    names
+        Of the conditions, by the numbers of the faces.
+    """
+
+    def __init__(self, sides: OpenSides, wet: Wet, grid: Grid, names: tuple[str, ...]):
+        self.sides, self._names = sides, names
+        self._contents, self._comm = wet.contents, grid.comm
+        self.settles = bool(sides.seeps.any())
+        self._flows, self._aslant = np.ones(len(sides.cells), dtype=bool), np.zeros(len(sides.cells))
+
+    def conducting(self, flow: Conduction) -> OpenFaces:
+        """Return the faces as the cells conduct."""
+        sides, at = self.sides, self._contents.slot(self.sides.cells)
+        driven = sides.driven(at, flow)
+        return OpenFaces(at, *driven, sides.seeps, flow.deformed(at, sides.reach))
+
+    def begin(self, at: OpenFaces, fluid: Fluid, beyond: NDArray[np.float64]) -> None:
+        """Open seepage faces as the flow asks for; their cells' pressures alone count for these."""
+        self._flows = at.outflow(fluid) >= 0
+        self._aslant = np.where(at.seeps, 0.0, at.conductance * beyond * fluid.density[at.at])
+
+    def leaving(self, at: OpenFaces, fluid: Fluid) -> Leaving:
+        """Return what leaves the cells, what flows aslant as it did at the start of the substep."""
+        through, counts = self._through(at, fluid), self._counts(at)
+        if fluid.force is not None:
+            through = through + at.driven(fluid.force)
+        turnover = sum_by(at.at, counts * at.conductance, len(fluid.pi)) * np.abs(fluid.pi)
+        return Leaving(sum_by(at.at, through, len(fluid.pi)), turnover)
+
+    def slope(self, at: OpenFaces, fluid: Fluid) -> NDArray[np.float64]:
+        """Return the derivative of what leaves."""
+        return sum_by(at.at, self._counts(at) * at.conductance, len(fluid.pi))
+
+    def settle(self, at: OpenFaces, fluid: Fluid) -> int:
+        """Open and close seepage faces as the flow asks for; return how many do."""
+        flows = at.outflow(fluid) > 0
+        changes = int(np.count_nonzero((flows != self._flows) & at.seeps))
+        self._flows = flows
+        return changes
+
+    def outflows(self, at: OpenFaces, fluid: Fluid) -> dict[str, NDArray[np.float64]]:
+        """Return what leaves through the sides of each condition, m^d/s, by name."""
+        sums = over_all(self._comm, sum_by(self.sides.number, self._through(at, fluid), len(self._names)))
+        return {name: np.array(sums[i]) for i, name in enumerate(self._names)}
+
+    def _counts(self, at: OpenFaces) -> NDArray[np.bool_]:
+        """Return which faces (m,) are open."""
+        return self._flows | ~at.seeps
+
+    def _through(self, at: OpenFaces, fluid: Fluid) -> NDArray[np.float64]:
+        """Return what leaves through each face (m,), m^d/s."""
+        return np.where(self._counts(at), at.outflow(fluid), 0.0) + self._aslant
