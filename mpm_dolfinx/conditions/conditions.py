@@ -313,15 +313,30 @@ Multipliers make it of no account, but for initial stresses: there sides give wa
 Plateau (soil): halved 5.7e-12, doubled 7.0e-11, cells 3.0e-02.
 """
 WEAK = 8.0
-"""Stiffness of what is left of it at the points of integration, of (what resists + 10 stress) / (cell size).
+"""Stiffness of what is left of it at the points of integration, of (modulus by `holding` + 10 stress) / (cell size).
 
 Plateau (soil): halved 1.5e-06, doubled 2.7e-06, cells 3.0e-02.
+"""
+YIELDING = 0.1
+"""Share of the elastic modulus that sides are held by where the law has a state: soil bears little beside it.
+
+Plateau (soil): halved 6.5e-05, doubled 1.9e-05, cells 3.0e-02.
 """
 
 
 def resistance(material: Skeleton) -> NDArray[np.float64]:
     """Return what a side resists with, Pa: the oedometric modulus, at most that of nu = 1/3, which is 4G."""
     return np.minimum(material.oedometric, 4 * material.shear)
+
+
+def holding(material: Skeleton) -> NDArray[np.float64]:
+    """Return the modulus, Pa, in units of which a side is held.
+
+    By as much as a Q1 field whose cells keep their volume cannot follow a curved side it is pushed by what holds it.
+    That must not be stiff beside the body's shear: an undrained cavity in soil, widened with 3e2 (lambda + 2G), has up
+    to 1.9 times the pressure that it should have, with 30 times 4G 1.01.
+    """
+    return (YIELDING if material.state else 1.0) * resistance(material)
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,7 +23,7 @@ from mpm_dolfinx.base.tolerances import EPSILON, NEAR
 from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.bodies.faces import Surface, face_vectors
 from mpm_dolfinx.conditions.acting import Acting, At, Loads, Place, Setting, Unmet
-from mpm_dolfinx.conditions.conditions import HOLD, Displacement, resistance
+from mpm_dolfinx.conditions.conditions import Displacement, holding, resistance
 from mpm_dolfinx.conditions.sides import check_apart, everywhere, meeting
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointForm
@@ -146,7 +146,7 @@ class GivenDisplacements(Acting):
         cut_points = cut.points if ends else points  # which are where they were cut
         now, before = (of.map(lambda values: values[chosen]) for of in (points, cut_points))
         stress = self._materials.total_stress(now)
-        resists = self._materials.table(before, resistance)
+        modulus, resists = (self._materials.table(before, of) for of in (holding, resistance))
         # of when the grid was reset, as the stiffnesses: they stay as long as the cut serves
         tension = np.linalg.norm(stress if points is cut_points else self._materials.total_stress(before), axis=(1, 2))
         for number, ((hold, *_, axes), p) in enumerate(zip(self._holds, patches, strict=True)):
@@ -158,7 +158,7 @@ class GivenDisplacements(Acting):
             R = turned(self._grid.comm, p.area0, now, to) if len(axes) == d else np.eye(d)  # as what it carries does
             force, gap = np.einsum("ij,njk,nk->ni", R, stress[at, :d, :d], p.area(points)), to - now
             before = points.data[traction_name(self._names[number])][p.at] @ R.T
-            own = (p.area0 * v for v in (1, tension[at], resists[at]))
+            own = (p.area0 * v for v in (1, modulus[at], tension[at], resists[at]))
             each = np.stack([np.full(len(gap), number), *own], axis=1)
             rows.append((p.cell, p.x, np.concatenate([each, gap, given, p.area(cut.points), force, before], axis=1)))
         number = np.repeat(np.arange(len(patches)), [len(p.at) for p in patches])
@@ -166,8 +166,8 @@ class GivenDisplacements(Acting):
         where, x, values = (np.concatenate(column) for column in zip(*rows, strict=True))
         origin = Origin(Exchange(self._grid.comm, self._grid.owner(where)), point, number, area)
         where, x, values = map(origin.travel.send, (where, x, values))
-        number, *own = values[:, :4].T
-        own = (*own, x, *np.split(values[:, 4:], [d, 3 * d, 4 * d, 5 * d], axis=1))
+        number, *own = values[:, :5].T
+        own = (*own, x, *np.split(values[:, 5:], [d, 3 * d, 4 * d, 5 * d], axis=1))
         return HeldPoints(number.astype(np.int64), self._grid.local(where), *own), origin
 
     def kept(self, n: int) -> dict[str, dict[str, NDArray[np.float64]]]:
@@ -259,7 +259,7 @@ class Multipliers:
         self.rows = np.flatnonzero(row < len(held.area))
         of = row[self.rows]
         self.area = held.area[of]
-        self.stiffness = HOLD / grid.h.min() * held.resists[of]
+        self.stiffness = held.firm[of]
         self._compliance = held.compliance[of]
         self._jumps = Jumps(grid, kind[self.rows], held.cell[of])
 

@@ -48,16 +48,17 @@ CARRIED = 0.3  # change of traction in a step, in units of what resists and stre
 class HeldPoints(NamedTuple):
     """Points of integration on sides with given displacements; arrays over n points in owned cells.
 
-    number, cell : (n,) condition, and local cell; area : (n,) reference area, m^(d-1); tension, resistance : (n,) norm
-    of the stress when the grid was reset, and what resists, times area, N; x, gap : (n, d) position, and how far it is
-    from where it is to be, m; given : (n, 2 d) given displacements at the start and the end of the step, m; normal :
-    (n, d) area vector when the grid was reset, m^(d-1); force : (n, d) of the body's present stress, as the side turns
-    it, N; before : (n, d) tractions of the multipliers of the step before, Pa.
+    number, cell : (n,) condition, and local cell; area : (n,) reference area, m^(d-1); modulus, tension, resistance :
+    (n,) modulus to hold with, norm of the stress when the grid was reset, and what resists, times area, N; x, gap :
+    (n, d) position, and how far it is from where it is to be, m; given : (n, 2 d) given displacements at the start and
+    the end of the step, m; normal : (n, d) area vector when the grid was reset, m^(d-1); force : (n, d) of the body's
+    present stress, as the side turns it, N; before : (n, d) tractions of the multipliers of the step before, Pa.
     """
 
     number: NDArray[np.int64]
     cell: NDArray[np.int32]
     area: NDArray[np.float64]
+    modulus: NDArray[np.float64]
     tension: NDArray[np.float64]
     resistance: NDArray[np.float64]
     x: NDArray[np.float64]
@@ -85,8 +86,8 @@ class HeldCells:
         the components of the offset from the cell's midpoint.
     stiffness
         Of each row by component, N/m: of means in the tangent only.
-    area, resists, compliance, limit
-        Of means only: area, m^(d-1); what resists, Pa; J of a difference of one, m/Pa; and change of the force beyond
+    area, firm, compliance, limit
+        Of means only: area, m^(d-1); stiffness, Pa/m; J of a difference of one, m/Pa; and change of the force beyond
         which it is an artefact, N.
     of
         Row (n,) of means of each point.
@@ -120,18 +121,18 @@ class HeldCells:
         along = 2 * normal**2 <= (normal**2).sum(axis=1, keepdims=True)
         self.number, self.cell = both(key // grid.num_local, p.number), both(key % grid.num_local, p.cell)
         self.x, self.shape = both(x, p.x), both(mean(N), N)
-        self.area, self.resists = whole, total(p.resistance) / whole
+        resists = total(p.resistance) / whole
+        self.area, self.firm = whole, HOLD / grid.h.min() * resists
         local = p.x - grid.midpoints[p.cell]
         moments = {"squares": local[:, :, None] * local[:, None, :], "product": local.prod(axis=1)}
         self.moments = {name: both(mean(values), values) for name, values in moments.items()}
-        against = p.resistance + TENSE * p.tension
+        against = p.modulus + TENSE * p.tension
         flat = normal**2 > (1 - ALIGNED**2) * (normal**2).sum(axis=1, keepdims=True)
         each = np.where(flat[at], EVERYWHERE * p.resistance[:, None], WEAK * against[:, None])
-        firm = HOLD * np.tile(total(p.resistance)[:, None], grid.dim)
-        self.stiffness = both(firm, each) / grid.h.min()
+        self.stiffness = both(np.tile((self.firm * whole)[:, None], grid.dim), each / grid.h.min())
         face = grid.cell_volume / grid.h.max()
         plane = whole / grid.around(x)
-        self.compliance = JUMP * grid.h.min() * face / (self.resists * plane)
+        self.compliance = JUMP * grid.h.min() * face / (resists * plane)
         # at the end of a side a node's force may come by a small part of a cell
         short = np.maximum(1.0, face / plane)
         self.limit = CARRIED * total(p.resistance + TENSE * p.tension) * short
