@@ -27,7 +27,7 @@ from mpm_dolfinx.bodies.touching import BITS, local, weights
 from mpm_dolfinx.conditions.conditions import resistance
 from mpm_dolfinx.conditions.sides import Sides
 from mpm_dolfinx.contact.groups import Contact
-from mpm_dolfinx.contact.history import kept, pressure_name, shear_name
+from mpm_dolfinx.contact.history import Origin, kept, pressure_name, shear_name
 from mpm_dolfinx.contact.law import ContactLaw
 from mpm_dolfinx.contact.pairs import FacePairs
 from mpm_dolfinx.contact.tool_placing import BEGINS, FACING
@@ -36,7 +36,6 @@ from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.parallel.exchange import Exchange, first, over_all
 from mpm_dolfinx.points.cutting import FACES
 from mpm_dolfinx.points.material_points import MaterialPoints
-from mpm_dolfinx.points.origin import Origin
 
 REACH = 2.0
 """Cells: what is farther apart cannot touch within a step; steps in which bodies move farther are refused."""

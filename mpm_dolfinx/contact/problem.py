@@ -32,13 +32,12 @@ from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.base.errors import NotConverged
 from mpm_dolfinx.base.tolerances import EPSILON, SAME
 from mpm_dolfinx.conditions.acting import At, Loads
-from mpm_dolfinx.contact.history import pressed
+from mpm_dolfinx.contact.history import Origin, pressed
 from mpm_dolfinx.contact.law import DEPTH, ROUNDS, ContactLaw, ContactState, Touch
 from mpm_dolfinx.contact.pairs import Geometry, Pairs, at_nodes
 from mpm_dolfinx.forms.unknowns import Unknowns, petsc_matrix
 from mpm_dolfinx.parallel.exchange import Exchange, over_all
 from mpm_dolfinx.points.material_points import MaterialPoints
-from mpm_dolfinx.points.origin import Origin
 
 FOLLOWS = 8  # how often pairs are found at most in a step
 

@@ -22,7 +22,7 @@ from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.bodies.faces import Surface
 from mpm_dolfinx.conditions.conditions import Displacement, resistance
 from mpm_dolfinx.conditions.sides import everywhere
-from mpm_dolfinx.contact.history import kept, pressure_name, shear_name
+from mpm_dolfinx.contact.history import Origin, kept, pressure_name, shear_name
 from mpm_dolfinx.contact.law import ContactLaw
 from mpm_dolfinx.contact.pairs import ToolPairs
 from mpm_dolfinx.contact.problem import Pushes
@@ -32,7 +32,6 @@ from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.parallel.exchange import Exchange, first, over_all
 from mpm_dolfinx.points.material_points import MaterialPoints, middle
-from mpm_dolfinx.points.origin import Origin
 
 BEGINS = 1e-2  # cells: how deep a tool may be in a body as it begins, and where a displacement is given
 NEAR = 0.1  # cells: corners that are nearer go with the tool
