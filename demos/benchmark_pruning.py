@@ -39,6 +39,7 @@ from mpm_dolfinx.simulation.summary import peak_memory
 SHEAR, LOAD, DT, STEPS = 5e6, 20.0, 1.0, 4  # Pa, Pa a step, s, steps at a time
 WATER = {"fluid": mpm.Fluid(), "conditions": [mpm.Drained("top")]}
 SEALED = {"fluid": mpm.Fluid()}
+HEAVY = {"gravity": (0, 0), "numerics": mpm.Numerics(coupling="schur-fgmres"), **WATER}
 
 
 def soil(law: type[mpm.Skeleton] = mpm.Hencky, nu: float = 0.0, **options) -> mpm.Skeleton:
@@ -228,6 +229,10 @@ PAIRS: dict[str, tuple[Make, Make]] = {
         lambda n: restless(
             n, material=soil(conductivity=1e-4, conductivity_law=mpm.unsaturated(1e3, 1e-4, 0.1)), **WATER
         ),
+    ),
+    "retention": (
+        lambda n: restless(n, material=soil(conductivity=1e-8), **HEAVY),
+        lambda n: restless(n, material=soil(conductivity=1e-8, retention=mpm.VanGenuchten(1e6)), **HEAVY),
     ),
     "16 times the background grid": (lambda n: restless(n, box=1 + 2 / n), lambda n: restless(n, box=4.0)),
 }

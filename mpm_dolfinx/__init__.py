@@ -61,6 +61,7 @@ from mpm_dolfinx.materials.skeleton import (
 from mpm_dolfinx.materials.softening import SofteningDruckerPrager
 from mpm_dolfinx.parallel.messages import ConditionWarning, ResolutionWarning, ResultWarning, set_log_level
 from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.pores.retention import BrooksCorey, Gardner, Retention, VanGenuchten
 from mpm_dolfinx.probing.cell_fields import CellFields
 from mpm_dolfinx.probing.point_fields import PointFields
 from mpm_dolfinx.probing.probes import Probes, probes
@@ -80,6 +81,7 @@ __all__ = [
     "Acting",
     "Ball",
     "Body",
+    "BrooksCorey",
     "CellFields",
     "Checkpoint",
     "ConditionWarning",
@@ -94,6 +96,7 @@ __all__ = [
     "Feeds",
     "Field",
     "Fluid",
+    "Gardner",
     "GaveUp",
     "Grid",
     "HalfSpace",
@@ -121,6 +124,7 @@ __all__ = [
     "ResolutionWarning",
     "Result",
     "ResultWarning",
+    "Retention",
     "RigidPlate",
     "Safety",
     "Scheme",
@@ -134,6 +138,7 @@ __all__ = [
     "Through",
     "Tool",
     "Traction",
+    "VanGenuchten",
     "Writer",
     "box",
     "element_test",

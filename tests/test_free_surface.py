@@ -86,7 +86,7 @@ def test_a_block_drains_to_its_side_as_boussinesq_says():
 
 
 def test_pores_that_do_not_drain_cost_nothing():
-    assert "retention" not in dam(10).scene.pieces.pieces.sizes
+    assert "drainage" not in dam(10).scene.pieces.pieces.sizes
 
 
 @pytest.mark.parametrize(

@@ -92,6 +92,7 @@ BENCHMARK = {
     "second order in time": SECOND,
     "body force": {"body force"},
     "pores that drain": {"pores that drain"},
+    "retention": {"retention"},
     "pressure that follows the surface": {"tractions", "pressures"},
     "inertia": {"inertia"} | SECOND,
     "quiet side": {"quiet sides"},

@@ -25,6 +25,7 @@ from mpm_dolfinx.conditions.sides import check_apart, everywhere, gathered, on_s
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.flow.feeding import Feeding, Feeds, Fluid, Leaving, Wet
 from mpm_dolfinx.flow.fluxes import Conduction, OpenSides
+from mpm_dolfinx.flow.unsaturated import Relative
 from mpm_dolfinx.forms.point_forms import PointData
 from mpm_dolfinx.grid.grid import Grid, sum_by
 from mpm_dolfinx.parallel.exchange import over_all
@@ -127,10 +128,44 @@ class OpenFaces:
         """Return what leaves through each face (m,), were it open both ways, m^d/s."""
         return self.conductance * fluid.pi[self.at] - self.inflow
 
+    def open_by(self, fluid: Fluid) -> NDArray[np.float64]:
+        """Return what leaves through each face (m,) by a unit of the cell's mass potential, m^d/(Pa s)."""
+        return self.conductance
+
+    rises = open_by
+
     def driven(self, force: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return what forces (n, d), N/m^3, on the fluid drive out through each face (m,), m^d/s."""
         along = np.einsum("md,md->m", force[self.at], self.reach)
         return np.where(self.seeps, 0.0, self.conductance * along)
+
+
+@dataclass(frozen=True)
+class UnsaturatedFaces(OpenFaces):
+    """The same of soil whose pores drain; conductance: over the mobility.
+
+    relative: mobilities by pressures; cells (m,): behind the faces; outer (m,): potentials beyond, less the weight of
+    the fluid on the way, Pa; beyond (m,): pressures there, Pa.
+    """
+
+    relative: Relative
+    cells: NDArray[np.int32]
+    outer: NDArray[np.float64]
+    beyond: NDArray[np.float64]
+
+    def outflow(self, fluid: Fluid) -> NDArray[np.float64]:
+        """Return what leaves through each face (m,), were it open both ways, m^d/s."""
+        return self.open_by(fluid) * (fluid.pi[self.at] - self.outer) - self.inflow
+
+    def open_by(self, fluid: Fluid) -> NDArray[np.float64]:
+        """Return what leaves through each face (m,) by a unit of the difference of potentials, m^d/(Pa s)."""
+        return self.conductance * self.relative.through_sides(self.cells, fluid.p[self.at], self.beyond)[0]
+
+    def rises(self, fluid: Fluid) -> NDArray[np.float64]:
+        """Return by how much more leaves as the cell's pressure rises, but for that of what the weight drives."""
+        p = fluid.p[self.at]
+        k, slope = self.relative.through_sides(self.cells, p, self.beyond)
+        return self.conductance * (k + slope * (p - self.beyond))
 
 
 class SideFeeds(Feeds):
@@ -157,25 +192,29 @@ class SideFeeds(Feeds):
     def conducting(self, flow: Conduction) -> OpenFaces:
         """Return the faces as the cells conduct."""
         sides, at = self.sides, self._contents.slot(self.sides.cells)
-        driven = sides.driven(at, flow)
-        return OpenFaces(at, *driven, sides.seeps, flow.deformed(at, sides.reach))
+        conductance, inflow = sides.driven(at, flow)
+        reach = flow.deformed(at, sides.reach)
+        if flow.relative is None:
+            return OpenFaces(at, conductance, inflow, sides.seeps, reach)
+        where = flow.relative, sides.cells, sides.outer(at, flow), sides.pressure
+        return UnsaturatedFaces(at, conductance, sides.given, sides.seeps, reach, *where)
 
     def begin(self, at: OpenFaces, fluid: Fluid, beyond: NDArray[np.float64]) -> None:
         """Open seepage faces as the flow asks for; their cells' pressures alone count for these."""
         self._flows = at.outflow(fluid) >= 0
-        self._aslant = np.where(at.seeps, 0.0, at.conductance * beyond * fluid.density[at.at])
+        self._aslant = np.where(at.seeps, 0.0, at.open_by(fluid) * beyond * fluid.density[at.at])
 
     def leaving(self, at: OpenFaces, fluid: Fluid) -> Leaving:
         """Return what leaves the cells, what flows aslant as it did at the start of the substep."""
         through, counts = self._through(at, fluid), self._counts(at)
         if fluid.force is not None:
             through = through + at.driven(fluid.force)
-        turnover = sum_by(at.at, counts * at.conductance, len(fluid.pi)) * np.abs(fluid.pi)
+        turnover = sum_by(at.at, counts * at.open_by(fluid), len(fluid.pi)) * np.abs(fluid.pi)
         return Leaving(sum_by(at.at, through, len(fluid.pi)), turnover)
 
     def slope(self, at: OpenFaces, fluid: Fluid) -> NDArray[np.float64]:
         """Return the derivative of what leaves."""
-        return sum_by(at.at, self._counts(at) * at.conductance, len(fluid.pi))
+        return sum_by(at.at, self._counts(at) * at.rises(fluid), len(fluid.pi))
 
     def settle(self, at: OpenFaces, fluid: Fluid) -> int:
         """Open and close seepage faces as the flow asks for; return how many do."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import ufl
@@ -36,12 +36,14 @@ class Mobility:
 
     mean (n,): of the pieces, m^2/(Pa s); share (n, d): of it along each axis; shift (n, d): way, m, from the centroid
     to the place from which the resistance to the faces counts.  The last two are None where no cell holds several
-    conductivities.
+    conductivities.  Where pores drain, shares (n, k): what soils with full pores, and each law of retention, bring to
+    the mean at k_r = 1; the mean is then one.
     """
 
     mean: NDArray[np.float64]
     share: NDArray[np.float64] | None = None
     shift: NDArray[np.float64] | None = None
+    shares: NDArray[np.float64] | None = None
 
 
 class CellMotion(NamedTuple):
@@ -57,13 +59,14 @@ class Conduction:
     """How the filled owned cells conduct, and what has become of them in the step.
 
     motion: since the start of the step, at the centroids; None where the body hardly moves.  weight (d,): of the fluid,
-    N/m^3, if there is gravity; bulk: its bulk modulus, Pa.
+    N/m^3, if there is gravity; bulk: its bulk modulus, Pa; relative: see `unsaturated`, where pores drain.
     """
 
     mobility: Mobility
     motion: CellMotion | None
     weight: NDArray[np.float64] | None
     bulk: float
+    relative: Any = None
 
     @cached_property
     def _turned(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -144,10 +147,13 @@ class OpenSides:
         filled ones.
         """
         shape = self.shape * flow.nearer(at, self.normal, self.reach)
-        conductance, outer = flow.across(at, self.normal) * shape, self.pressure
-        if flow.weight is not None:
-            outer = outer - flow.deformed(at, self.reach) @ flow.weight
-        return conductance, self.given + conductance * mass_potential(outer, flow.bulk)
+        conductance = flow.across(at, self.normal) * shape
+        return conductance, self.given + conductance * self.outer(at, flow)
+
+    def outer(self, at: NDArray[np.int64], flow: Conduction) -> NDArray[np.float64]:
+        """Return the mass potentials (m,) beyond the faces, less the weight of the fluid on the way, Pa."""
+        outer = self.pressure if flow.weight is None else self.pressure - flow.deformed(at, self.reach) @ flow.weight
+        return mass_potential(outer, flow.bulk)
 
     def ahead(self, at: NDArray[np.int64], p: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return what lies ahead of the filled cells (n, d, 2, 2): on drained sides, by axis and end of the cell.
@@ -177,6 +183,37 @@ class OpenSides:
             for k, values in enumerate((jump, jump * normal[:, axis] / distance)):
                 np.divide(sum_by(at, share * values, len(p)), total, out=out[:, axis, end, k], where=total > 0)
         return out
+
+
+@dataclass(frozen=True)
+class OpenFaces:
+    """Faces on open sides; arrays over m faces.
+
+    number (m,): of the condition; at (m,): place of the cell among the active owned ones; conductance, inflow (m,):
+    outflow per unit of the cell's mass potential, m^d/(Pa s), and what is prescribed or driven in, m^d/s; seeps (m,):
+    whether nothing may flow in; reach (m, d): way from the cell's centroid, m.
+    """
+
+    number: NDArray[np.int64]
+    at: NDArray[np.int64]
+    conductance: NDArray[np.float64]
+    inflow: NDArray[np.float64]
+    seeps: NDArray[np.bool_]
+    reach: NDArray[np.float64]
+
+    def outflow(self, pi: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return what leaves through each face, were it open both ways, from cells at potentials (n,), Pa; m^d/s."""
+        return self.conductance * pi[self.at] - self.inflow
+
+    def driven(self, force: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return what forces (n, d), N/m^3, on the fluid drive out of cells (n,), m^d/s."""
+        along = np.einsum("md,md->m", force[self.at], self.reach)
+        return sum_by(self.at, np.where(self.seeps, 0.0, self.conductance * along), len(force))
+
+    def seepage(self, pi: NDArray[np.float64], flows: NDArray[np.bool_], even: bool = False) -> tuple[NDArray, NDArray]:
+        """Return what seeps out of cells (n,), m^d/s, and its derivative, m^d/(Pa s); flows (m,): where."""
+        parts = (np.where(flows & self.seeps, values, 0.0) for values in (self.outflow(pi), self.conductance))
+        return tuple(sum_by(self.at, values, len(pi)) for values in parts)
 
 
 @dataclass(frozen=True)
@@ -251,9 +288,14 @@ class CellContents(Keyed):
         np.maximum.at(softest, self._slot[self._cells], softness)
         return softest
 
-    def set_damping(self) -> NDArray[np.float64]:
-        """Set the strength tau of the damping of elastic soil in the filled cells; return it, 1/Pa."""
-        tau, values = self._damped.x, self.mean(self._damping)
+    def set_damping(
+        self, share: NDArray[np.float64] | float = 1.0, less: NDArray[np.float64] | float = 0.0
+    ) -> NDArray[np.float64]:
+        """Set the strength tau of the damping of elastic soil in the filled cells; return it, 1/Pa.
+
+        Shares (n,) of it count, less what pores store by their saturation (n,), 1/Pa.
+        """
+        tau, values = self._damped.x, np.maximum(share * self.mean(self._damping) - less, 0.0)
         tau.array[:] = 0.0
         tau.array[self.filled] = values
         tau.scatter_forward()
@@ -303,6 +345,8 @@ class FluxForms:
         Bulk modulus of the fluid, Pa.
     inertial : (d,), N/m^3
         Force of inertia on the pore fluid as UFL, None without.
+    relative
+        Conductivities by the pressures, where pores drain: see `unsaturated`.
     """
 
     def __init__(
@@ -313,8 +357,10 @@ class FluxForms:
         pressure: fem.Function,
         bulk: float,
         inertial: ufl.core.expr.Expr | None = None,
+        relative: Any = None,
     ):
         self.grid = grid
+        self.relative = relative
         mesh = grid.mesh
         d = grid.dim
         Q = grid.cellwise()
@@ -339,6 +385,9 @@ class FluxForms:
         d0 = across / 2 - ufl.dot(self.centroid("+"), n0)
         d1 = across / 2 + ufl.dot(self.centroid("-"), n0)
         k0, k1 = (sum(abs(n0[a]) * self.mobility(side)[a] for a in range(d)) for side in "+-")
+        if relative is not None:
+            means, slopes = relative.between(pressure)
+            k0, k1 = (k * relative.conducts(side, means) for k, side in ((k0, "+"), (k1, "-")))
         T = share * k0 * k1 / (d0 * k1 + d1 * k0 + TINY)
         dS = ufl.Measure("dS", domain=mesh, subdomain_id=_compat.SUBDOMAIN, metadata={"quadrature_degree": 0})
         self.flux = FacetForm(T * ufl.jump(dp) * ufl.jump(q) * dS, grid.comm) if flows else None
@@ -358,15 +407,29 @@ class FluxForms:
             carried = T * ufl.avg(self.density)
             self.aslant = FacetForm(-carried * ufl.dot(ufl.avg(self.slope), along) * ufl.jump(q) * dS, grid.comm)
         self.gravity = None
+        self.even = None
+        """Where pores drain, the slope of the fluxes but for that of what the weight drives: outflows rise with it."""
         if inertial is not None:
-            weight = ufl.avg(inertial) if weight is None else weight + ufl.avg(inertial)
-        if weight is not None and flows:
+            # over two cells as the mass has it, a sixth of each node beside the face: by the face's value alone water
+            # that flows freely would have more mass, in what alternates from node to node, than all of the soil
+            kink = ufl.dot(ufl.grad(inertial)("+"), n0) - ufl.dot(ufl.grad(inertial)("-"), n0)
+            along = ufl.avg(inertial) - across / 6 * kink
+            weight = along if weight is None else weight + along
+        if (weight is not None or relative is not None) and flows:
             apart = across * n0 - ufl.jump(self.centroid + self.moved)
             # so water at rest, whose pressure grows by its weight at zero pressure, stays at rest; the two at once for
             # each face: rounding of what leaves a cell enters its neighbour, and is that of small differences
             density = density_between(pressure("+"), pressure("-"), fem.Constant(mesh, 1 / bulk))
-            drives = ufl.jump(pressure) + ufl.dot(weight, apart)
-            self.gravity = FacetForm(T * density * drives * ufl.jump(q) * dS, grid.comm)
+            drives = ufl.jump(pressure) + (0.0 if weight is None else ufl.dot(weight, apart))
+            driven = T * density * drives * ufl.jump(q) * dS
+            self.gravity = FacetForm(driven, grid.comm)
+            if relative is not None:
+                by_k = [ufl.diff(T, k) * (a * dp("+") + b * dp("-")) for k, (a, b) in zip(means, slopes, strict=True)]
+                whole, even = (
+                    density * (T * ufl.jump(dp) + by * sum(by_k)) * ufl.jump(q) * dS
+                    for by in (drives, ufl.jump(pressure))
+                )
+                self.flux, self.even = FacetForm(whole, grid.comm), FacetForm(even, grid.comm)
 
     def along(
         self, slope: NDArray[np.float64], cells: NDArray[np.int64], facets: FacetSum, density: NDArray[np.float64]
@@ -388,6 +451,8 @@ class FluxForms:
         filled = contents.filled
         shift = flow.mobility.shift
         mobility = flow.along(d)
+        if self.relative is not None:
+            self.relative.set_shares(filled, flow.mobility.shares)
         values = {self.mobility: mobility}
         if shift is not None:  # the fluid's weight is that at the centroids nevertheless
             values[self.centroid] = contents.centroid[filled] + shift

@@ -6,7 +6,8 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable, Collection, Sequence
 from copy import copy
-from dataclasses import fields, replace
+from dataclasses import replace
+from functools import cached_property
 from inspect import signature
 
 import numpy as np
@@ -18,14 +19,16 @@ from mpm_dolfinx.base.validation import numbers
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData
 from mpm_dolfinx.grid.grid import Grid
-from mpm_dolfinx.materials.evaluate import LawAtPoints, SoftnessAtPoints, mean_size, sampled
+from mpm_dolfinx.materials.evaluate import LawAtPoints, SoftnessAtPoints, knows_space, mean_size, sampled
 from mpm_dolfinx.materials.prestressed import AT_REST, stressed
-from mpm_dolfinx.materials.skeleton import BY_SCENE, Fluid, Skeleton
+from mpm_dolfinx.materials.skeleton import BY_SCENE, Fluid, Skeleton, constants_of
 from mpm_dolfinx.parallel.exchange import first
-from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints
+from mpm_dolfinx.pores.retention import Retentions, SaturationAt, scale_of
 
 RESERVED = frozenset(
-    "F dF softness owed due storage storage_at_one density position displacement porosity0 gradient retention".split()
+    "F dF softness owed due storage storage_at_one density position displacement porosity0 gradient drainage retention "
+    "pores".split()
 )
 """Names of what points of integration carry beside parameters and state."""
 WHAT_IS_NAMED = "parameters, state and unknowns"
@@ -69,23 +72,32 @@ class SceneMaterials:
         fluid: Fluid | None,
         prestressed: bool = False,
     ):
-        materials = [stressed(m, grid.stretches) for m in materials] if prestressed else materials
         self.grid = grid
-        self.materials = materials
         self.fluid = fluid
         seeded: dict[str, NDArray[np.float64]] = dict(points.data)
         self._used = _used(bodies, len(materials))  # a material that no body is of changes nothing
+        evaluated = [_evaluated(materials[i], bodies, i) for i in self._used]
+        locks = [bool(np.any(m.nearly_incompressible)) for m in evaluated]
+        asked = [grid.stretches == 2 and (prestressed or lock) for lock in locks]
+        each = zip(self._used, evaluated, asked, strict=True)
+        known = [not needed or knows_space(grid, _at_one(materials[i], m)) for i, m, needed in each]
+        self.stretches = 3 if any(np.logical_and(locks, known)) else grid.stretches
+        """Number of axes of the deformation gradients that laws see."""
+        if self.across:
+            seeded[ACROSS] = np.ones(len(points))
+        if prestressed:
+            whole = dict(zip(self._used, known, strict=True))
+            materials = [stressed(m, whole.get(i, True)) for i, m in enumerate(materials)]
+            evaluated = [_evaluated(materials[i], bodies, i) for i in self._used]
+        self.materials = materials
         used = [materials[i] for i in self._used]
-        self._fields = [[name for name in _names(m) if callable(getattr(m, name))] for m in materials]
-        places = [_places(bodies, i) if self._fields[i] else np.empty((0, grid.dim)) for i in self._used]
-        evaluated = [m.at(X) for m, X in zip(used, places, strict=True)]
+        self._fields = [_by_place(m) for m in materials]
         self.laws = list(dict.fromkeys(map(type, used)))
         self.conductivity_laws = list(dict.fromkeys(m.conductivity_law for m in used if m.conductivity_law))
         """The different conductivity laws of the scene."""
-        self._law = np.array([self.laws.index(type(m)) if type(m) in self.laws else 0 for m in materials])
-        locks = [bool(np.any(m.nearly_incompressible)) for m in evaluated]
-        self._parts = list(dict.fromkeys(zip(map(type, used), locks, strict=True)))
-        own = dict(zip(self._used, zip(map(type, used), locks, strict=True), strict=True))
+        kinds = list(zip(map(type, used), locks, known, strict=True))
+        self._parts = list(dict.fromkeys(kinds))
+        own = dict(zip(self._used, kinds, strict=True))
         self._part = np.array([self._parts.index(own[i]) if i in own else 0 for i in range(len(materials))])
         self.symmetric = all(m.symmetric for m in used)
         """Whether the tangents of all materials are symmetric."""
@@ -103,6 +115,7 @@ class SceneMaterials:
         conductivity = np.concatenate([np.ravel(m.conductivity) for m in evaluated])
         by_place = any(callable(m.conductivity) for m in materials) or any(map(_names_place, self.conductivity_laws))
         self.layered = by_place or len({m.conductivity_law for m in used}) > 1 or bool(np.ptp(conductivity))
+        self.layered = self.layered or len({m.retention for m in used}) > 1
         """Whether points may differ in what they conduct."""
         self.checksums: dict[str, int | list[float]] = {
             f"conductivity law of material {i}": sampled(m.conductivity_law)
@@ -133,12 +146,22 @@ class SceneMaterials:
             for number, law in enumerate(self.laws):
                 if law.state:
                     shapes = {name: self.shapes[name] for name in _takes(law)}
-                    self._softness[number] = SoftnessAtPoints(grid, law, shapes)
+                    self._softness[number] = SoftnessAtPoints(grid, law, shapes, self._stretches_of(law))
         self.seeded = replace(points, data=seeded)
         """The points with what they carry at the start: parameters that differ from place to place, state."""
         self._at_points = [
-            LawAtPoints(grid, law, {name: self.shapes[name] for name in _takes(law)}) for law in self.laws
+            LawAtPoints(grid, law, {name: self.shapes[name] for name in _takes(law)}, self._stretches_of(law))
+            for law in self.laws
         ]
+
+    @property
+    def across(self) -> bool:
+        """Whether laws see a stretch across the plane of plane strain, that of a mean dilatation."""
+        return self.stretches > self.grid.stretches
+
+    def _stretches_of(self, law: type[Skeleton]) -> int:
+        """Return the number of axes of the deformation gradients that a law sees."""
+        return self.stretches if (law, True, True) in self._parts else self.grid.stretches
 
     def _add_shapes(self, m: Skeleton, seeded: dict[str, NDArray[np.float64]], count: int) -> None:
         """Note the shapes of what a material's law takes, and seed the state of so many points."""
@@ -150,7 +173,7 @@ class SceneMaterials:
         if given != bool(law.unknowns):
             has = f"{'' if law.unknowns else 'no '}unknowns and {given} of residual and solution"
             raise ValueError(f"{law.__name__}: has {has}, must have unknowns and one of these, or neither")
-        own, others = (*_names(m), *law.state), {*_names(m), *law.state, *BY_SCENE, "F", "trial"}
+        own, others = (*constants_of(m), *law.state), {*constants_of(m), *law.state, *BY_SCENE, "F", "trial"}
         if taken := [name for name in own if name in BY_SCENE] + [name for name in law.unknowns if name in others]:
             raise ValueError(f"{law.__name__}: the name {taken[0]!r} is taken; {WHAT_IS_NAMED} must have another")
         for name, value in law.unknowns.items():
@@ -158,7 +181,7 @@ class SceneMaterials:
         m.check_cells(mean_size(self.grid))
         for name in law.parameters:
             if not hasattr(m, name):
-                known = ", ".join([*_names(m), *law.state])
+                known = ", ".join([*constants_of(m), *law.state])
                 raise ValueError(f"{law.__name__}: its law takes {name!r}, must be F or some of {known}")
             value = _known(f"{law.__name__}: {name}", getattr(m, name))
             self._set_shape(law, name, value.shape[1:])
@@ -181,11 +204,14 @@ class SceneMaterials:
         `pieces`, those of several have the fields `common` of the pieces and what their law takes.
         """
         if len(self._parts) == 1:
-            return [(law, pieces, locks) for law, locks in self._parts]
-        names = [dict.fromkeys([*common, *_takes(law)]) for law, _ in self._parts]
+            return [(law, pieces, locks) for law, locks, _ in self._parts]
+        names = [
+            [name for name in dict.fromkeys([*common, *_takes(law)]) if name != ACROSS or (locks and known)]
+            for law, locks, known in self._parts
+        ]
         shapes = [{name: getattr(pieces, name).ufl_shape for name in taken} for taken in names]
         points = [FormPoints(pieces.grid, **s) for s in shapes]
-        return [(law, own, locks) for (law, locks), own in zip(self._parts, points, strict=True)]
+        return [(law, own, locks) for (law, locks, _), own in zip(self._parts, points, strict=True)]
 
     def part_of(self, points: MaterialPoints) -> NDArray[np.int64]:
         """Return the number of each point's part (n,), see `parts`."""
@@ -193,22 +219,72 @@ class SceneMaterials:
 
     def law_of(self, points: MaterialPoints) -> NDArray[np.int64]:
         """Return the number of each point's law (n,)."""
-        return self._law[points.material]
+        return np.array([self.laws.index(law) for law, *_ in self._parts])[self.part_of(points)]
 
     def locking(self, points: MaterialPoints) -> NDArray[np.bool_]:
         """Return at which points (n,) Q1 cells would lock."""
-        return np.array([locks for _, locks in self._parts])[self.part_of(points)]
+        return np.array([locks for _, locks, _ in self._parts])[self.part_of(points)]
+
+    def stretched(self, points: MaterialPoints) -> NDArray[np.bool_]:
+        """Return at which points (n,) laws see a stretch across the plane."""
+        return self.across & self.locking(points) & self.knows_across(points)
+
+    def knows_across(self, points: MaterialPoints) -> NDArray[np.bool_]:
+        """Return at which points (n,) laws know a stretch across the plane."""
+        return np.array([known for *_, known in self._parts])[self.part_of(points)]
 
     def conducting(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return what points (n, 2) that conduct alike have in common: conductivity, m/s, and number of their law.
 
-        By a law of the place none does.
+        By a law of the place none does.  The fraction of that number tells laws of retention.
         """
         laws, known = [m.conductivity_law for m in self.materials], self.conductivity_laws
         law = np.array([known.index(law) if law in known else -1 for law in laws])[points.material]
         by_place = np.array([law is not None and _names_place(law) for law in laws])[points.material]
         conductivity = self.table(points, lambda m: m.conductivity)
-        return np.stack([conductivity, np.where(by_place, len(known) + points.id, law)], axis=1)
+        number = np.where(by_place, len(known) + points.id, law)
+        if self.retentions is not None:
+            number = number + self.retention_of(points) / (1 + len(self.retentions.laws))
+        return np.stack([conductivity, number], axis=1)
+
+    def retention_of(self, points: MaterialPoints) -> NDArray[np.int64]:
+        """Return the number of each point's law of retention (n,), from 1; 0 where pores stay full."""
+        return np.array([self.retentions.number(m.retention) for m in self.materials])[points.material]
+
+    def saturation(
+        self, points: MaterialPoints, p: NDArray[np.float64], of: NDArray[np.int64] | slice = slice(None)
+    ) -> tuple[NDArray[np.float64], ...]:
+        """Return S, its slope, 1/Pa, chi and k_r at pressures (m,), Pa, of some points (m,), by default all."""
+        return self.saturations(self.retention_rows(points)[of], p)
+
+    @cached_property
+    def retentions(self) -> Retentions | None:
+        """Laws of retention, if there are any."""
+        laws = list(dict.fromkeys(self.materials[i].retention for i in self._used))
+        some = [law for law in laws if law is not None]
+        return Retentions(some, None not in laws) if some and self.fluid is not None else None
+
+    @cached_property
+    def _saturation(self) -> SaturationAt:
+        return SaturationAt(self.grid, self.retentions)
+
+    def saturations(self, rows: NDArray[np.float64], p: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+        """Return the same of rows (m, width) of points: see `SaturationAt`."""
+        return self._saturation(rows, p)
+
+    def retention_scale(self, points: MaterialPoints) -> NDArray[np.float64]:
+        """Return the suction about which pores of the points drain (n,), Pa; infinite where they stay full."""
+        scales = [np.inf if m.retention is None else scale_of(m.retention) for m in self.materials]
+        return np.array(scales)[points.material]
+
+    def felt(self, points: MaterialPoints) -> NDArray[np.float64]:
+        """Return the pore pressures that stresses contain at the points (n,), Pa: alpha chi p."""
+        pressure = self.table(points, lambda m: m.biot) * points.pressure
+        return pressure if self.retentions is None else pressure * self.saturation(points, points.pressure)[2]
+
+    def retention_rows(self, points: MaterialPoints) -> NDArray[np.float64]:
+        """Return what points (n, width) carry of their laws of retention."""
+        return np.stack([self.retentions.row(m.retention) for m in self.materials])[points.material]
 
     def table(self, points: MaterialPoints, value: Callable[..., float], *columns: NDArray) -> NDArray[np.float64]:
         """Return value(material, *columns) at the points (n, ...); columns (n,) are values at the points.
@@ -266,7 +342,7 @@ class SceneMaterials:
     @property
     def constants(self) -> dict[str, Skeleton]:
         """Names of the constants of materials, each with a material that has it."""
-        return {name: self.materials[i] for i in self._used for name in _names(self.materials[i])}
+        return {name: self.materials[i] for i in self._used for name in constants_of(self.materials[i])}
 
     @property
     def field_names(self) -> list[str]:
@@ -300,7 +376,7 @@ class SceneMaterials:
         """Whether pores drain as a free surface falls."""
         return any(getattr(law, "specific_yield", 0.0) > 0 for law in self.conductivity_laws)
 
-    def retention(self, points: MaterialPoints) -> NDArray[np.float64]:
+    def drainage(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the specific yield at the points, and the suction, Pa, at which it has drained (n, 2)."""
         names = {"specific_yield": 0.0, "suction": 1.0}
         return np.stack(
@@ -309,9 +385,16 @@ class SceneMaterials:
         )
 
     def density(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the density of soil and pore fluid at the points (n,), kg/m^3."""
+        """Return the density of soil and pore fluid at the points (n,), kg/m^3, were all pores full."""
         n, wet = self.porosity(points), self.fluid.density if self.fluid else 0.0
         return (1 - n) * self.table(points, lambda m: m.grain_density) + n * wet
+
+    def drained_density(self, points: MaterialPoints) -> NDArray[np.float64] | float:
+        """Return what of this density is not there, as pores have drained (n,), kg/m^3."""
+        if self.retentions is None:
+            return 0.0
+        empty = 1 - self.saturation(points, points.pressure)[0]
+        return empty * self.porosity(points) * self.fluid.density
 
     def confined_modulus(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return what resists where neither skeleton nor pore fluid can give way (n,), Pa: lambda + 2G + alpha^2 / S.
@@ -354,9 +437,9 @@ class SceneMaterials:
 
         In axisymmetry (n, 3, 3).
         """
-        out = np.zeros_like(points.F)
+        out, d = np.zeros_like(points.F), self.grid.stretches
         for law, rows, data in self._placed(points):
-            out[rows] = law.stress(data)
+            out[rows] = law.stress(data)[:, :d, :d]
         return out
 
     def effective_stress_3d(self, points: MaterialPoints) -> NDArray[np.float64]:
@@ -385,8 +468,7 @@ class SceneMaterials:
 
     def total_stress(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the Cauchy stress of skeleton and fluid, Pa, as `effective_stress`; on all processes together."""
-        pressure = self.table(points, lambda m: m.biot) * points.pressure
-        return self.effective_stress(points) - pressure[:, None, None] * np.eye(self.grid.stretches)
+        return self.effective_stress(points) - self.felt(points)[:, None, None] * np.eye(self.grid.stretches)
 
     def updated_state(
         self, points: MaterialPoints, before: MaterialPoints, dt: float
@@ -414,7 +496,7 @@ class SceneMaterials:
         for _, rows, name, values in new:
             out[name][rows] = values
         if self._softness:
-            out["softness"], dF = np.ones(len(points)), points.F - before.F
+            out["softness"], dF = np.ones(len(points)), points.F_of_laws - before.F_of_laws
             shear = self.table(points, lambda m: m.shear)
             for number, softness in self._softness.items():
                 _, rows, at = placed[number]
@@ -423,7 +505,8 @@ class SceneMaterials:
 
     def _placed(self, points: MaterialPoints) -> list[tuple[LawAtPoints, NDArray[np.int64], PointData]]:
         """Return every law with the indices and the data of the points that follow it."""
-        number, values = self.law_of(points), {"F": points.F, **self.parameters(points), **self.state(points)}
+        number, values = self.law_of(points), {**self.parameters(points), **self.state(points)}
+        values["F"] = points.F_of_laws
         rows = [np.flatnonzero(number == k) for k in range(len(self.laws))]
         return [(law, own, law.data(points, own, values)) for law, own in zip(self._at_points, rows, strict=True)]
 
@@ -458,6 +541,21 @@ def _used(bodies: Sequence[Body], count: int) -> list[int]:
     return sorted({int(body.material) for body in bodies})
 
 
+def _by_place(m: Skeleton) -> list[str]:
+    """Return the names of a material's fields that are functions of places."""
+    return [name for name in constants_of(m) if callable(getattr(m, name))]
+
+
+def _evaluated(m: Skeleton, bodies: Sequence[Body], material: int) -> Skeleton:
+    """Return a material with its fields evaluated at the places of all its points, see `_places`."""
+    return m.at(_places(bodies, material) if _by_place(m) else np.empty((0, 0)))
+
+
+def _at_one(m: Skeleton, evaluated: Skeleton) -> Skeleton:
+    """Return a material with its constants as arrays over the first of its points."""
+    return _spread(evaluated, {name: getattr(evaluated, name)[:1] for name in _by_place(m)}, 1)
+
+
 def _places(bodies: Sequence[Body], material: int) -> NDArray[np.float64]:
     """Return the reference positions (n, d), m, of all points of a material on all processes."""
     return np.concatenate([body.centre for body in bodies if body.material == material])
@@ -479,15 +577,10 @@ def _rows(bodies: Sequence[Body], material: int, ids: NDArray[np.int64]) -> tupl
     return np.concatenate(here), np.concatenate(rows)
 
 
-def _names(m: Skeleton) -> list[str]:
-    """Return the names of a material's fields."""
-    return [f.name for f in fields(m) if f.name != "conductivity_law"]
-
-
 def _spread(m: Skeleton, values: dict[str, NDArray[np.float64]], n: int) -> Skeleton:
     """Return a copy of a material with values (n, ...) of some fields, its other numbers repeated n times."""
     out = copy(m)
-    for name in _names(m):
+    for name in constants_of(m):
         value = getattr(m, name)
         if name in values:
             value = values[name]

@@ -8,10 +8,10 @@ A law of your own is a frozen dataclass derived from `Skeleton`: see there.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from inspect import signature
 from math import inf
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import ufl
@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from mpm_dolfinx.base.validation import at_places, functions, instance, line, numbers
 from mpm_dolfinx.forms.axes import planar
 from mpm_dolfinx.materials.user_functions import expression
+from mpm_dolfinx.pores.retention import check_retention
 
 Field = float | Sequence[float] | Callable[[NDArray[np.float64]], ArrayLike]
 """A constant (number or vector), or a function of the reference positions X (n, d), m, that gives (n, ...)."""
@@ -65,10 +66,14 @@ class Skeleton:
         Function that gives the conductivity k, m/s, in UFL, at the present deformation.  It is called with
         those of these arguments that it names: conductivity (the field above), F, J = det F, porosity,
         porosity0, x (present position), p (pore pressure of the cell at the start of the substep, Pa).
+    retention
+        How pores drain under suction, and how they then conduct: `VanGenuchten`, `Gardner`, `BrooksCorey` or an object
+        with their methods, see `retention`; by keyword.  None: pores stay full.
 
     A law adds its own parameters as fields of the dataclass and defines one of these static methods, which
     are called with those arguments that they name: F, the law's fields and properties, its state.  F is (d, d), in
-    axisymmetry (3, 3) with the hoops' stretch last, see `axes`.
+    axisymmetry (3, 3) with the hoops' stretch last, see `axes`.  So it is in plane strain, with the stretch across the
+    plane, for laws that take it, where Q1 cells would lock and of soil that is seeded with a stress.
 
     energy
         Stored energy psi per reference volume, Pa.  Stress and tangent are UFL's derivatives.
@@ -130,6 +135,7 @@ class Skeleton:
     grain_bulk: Field = inf
     grain_density: Field = 2650.0
     conductivity_law: Callable | None = None
+    retention: Any = field(default=None, kw_only=True)
 
     energy: ClassVar[Callable | None] = None
     kirchhoff: ClassVar[Callable | None] = None
@@ -171,6 +177,8 @@ class Skeleton:
         functions(
             f"{type(self).__name__}: conductivity_law", [self.conductivity_law] * (self.conductivity_law is not None)
         )
+        if self.retention is not None:
+            check_retention(f"{type(self).__name__}: retention", self.retention)
         for name in ("bulk", "shear"):
             _check(self, name, lambda v: (0 < v) & (v < inf), "> 0 and finite")
         _check(self, "grain_bulk", lambda v: 0 < v, "> 0")
@@ -178,6 +186,10 @@ class Skeleton:
             _check(self, name, lambda v: (0 <= v) & (v < inf), ">= 0 and finite")
         _check(self, "porosity", lambda v: (0 < v) & (v < 1), "in (0, 1)")
         drains = getattr(self.conductivity_law, "specific_yield", 0.0)
+        if drains and self.retention is not None:
+            raise ValueError(
+                f"{type(self).__name__}: retention beside a specific yield {drains:g}, must be one of them"
+            )
         _check(self, "porosity", lambda v: v >= drains, f">= the specific yield {drains:g}")
         if not callable(self.porosity):
             n = f" = {self.porosity:g}" if np.ndim(self.porosity) == 0 else ""
@@ -186,7 +198,7 @@ class Skeleton:
     def at(self, X: NDArray[np.float64]) -> Skeleton:
         """Return this material with its fields evaluated at reference positions X (n, d), m: arrays (n, ...)."""
         values, scalars = {}, [f.name for f in fields(Skeleton)]
-        for name in (f.name for f in fields(self) if f.name != "conductivity_law"):
+        for name in constants_of(self):
             value, what = getattr(self, name), f"{type(self).__name__}: {name}"
             if callable(value):
                 given = at_places(what, f"one value for each of {len(X)} positions", value, "X", X)
@@ -290,6 +302,11 @@ class Skeleton:
     def storage(self, fluid_bulk: float, porosity):
         """Return the storage coefficient S = n/K_w + (alpha - n)/K_s, 1/Pa, at a porosity."""
         return porosity / fluid_bulk + (self.biot - porosity) / self.grain_bulk
+
+
+def constants_of(material: Skeleton) -> list[str]:
+    """Return the names of a material's constants, which may differ from place to place."""
+    return [f.name for f in fields(material) if f.name not in ("conductivity_law", "retention")]
 
 
 def check_given(obj, allowed: Mapping[str, str]) -> None:

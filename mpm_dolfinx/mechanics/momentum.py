@@ -43,6 +43,7 @@ from mpm_dolfinx.mechanics.own_terms import OwnTerms
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
 from mpm_dolfinx.mechanics.weight import Weight
 from mpm_dolfinx.points.parts import OfParts, Parts, parts_of_cells, relative
+from mpm_dolfinx.pores.retention import Retentions
 
 
 class MomentumForms:
@@ -71,6 +72,8 @@ class MomentumForms:
         Time at the end of the substep, and time since the start of the step, UFL constants.
     inertia
         Whether bodies may have inertia.
+    retentions
+        The laws of retention of the scene, where some pores drain; the pieces then carry retention and pores.
     """
 
     def __init__(
@@ -86,8 +89,10 @@ class MomentumForms:
         t: fem.Constant,
         dt: fem.Constant,
         inertia: bool = False,
+        retentions: Retentions | None = None,
     ):
         self.grid = grid = pieces.grid
+        self._retentions = retentions
         V = _compat.function_space(grid.mesh, "Lagrange", 1, (grid.dim,))
         self.u = fem.Function(V)
         """Increment of the displacement since the start of the step, m."""
@@ -104,7 +109,8 @@ class MomentumForms:
         self.conditions = FormsOf(grid, self.u, self.velocity)
         """The forms of conditions."""
         self.own = OwnTerms(terms, pieces, self.conditions, t, dt)
-        self.weight = None if gravity is None else Weight(pieces, self.u, gravity, fluid_density)
+        full = None if retentions is None else retentions.of("saturation", pressure, pieces.retention)
+        self.weight = None if gravity is None else Weight(pieces, self.u, gravity, fluid_density, full)
         self.acting = [*filter(None, (self.weight,)), *[self.own] * bool(terms)]
         """What acts in all stages."""
         self.symmetric = symmetric and self.own.symmetric
@@ -141,7 +147,10 @@ class MomentumForms:
         else:
             P, A = law.first_piola(F, known), ufl.diff(law.first_piola(F, values), F)
         if pressure is not None:
-            of_pressure = -points.biot * pressure * ufl.diff(ufl.det(F), F)
+            felt = points.biot * pressure
+            if self._retentions is not None:
+                felt = felt * self._retentions.of("bishop", pressure, points.retention)
+            of_pressure = -felt * ufl.diff(ufl.det(F), F)
             P, A = P + of_pressure, A + ufl.diff(of_pressure, F)
         share = 1 / ufl.det(points.F)  # divided by it, each component would be
         P, A = share * P, share * A

@@ -26,13 +26,25 @@ class Weight(Acting):
         Acceleration, a UFL constant.
     fluid_density : kg/m^3
         Of the pore fluid; None without.
+    saturation
+        Of the pores, as UFL; None: they stay full.
     """
 
-    def __init__(self, pieces: FormPoints, u: fem.Function, gravity: fem.Constant, fluid_density: float | None):
+    def __init__(
+        self,
+        pieces: FormPoints,
+        u: fem.Function,
+        gravity: fem.Constant,
+        fluid_density: float | None,
+        saturation: ufl.core.expr.Expr | None = None,
+    ):
         pull = ufl.inner(gravity, pieces.value(ufl.TestFunction(u.function_space)))
         self._dead, self._taken_up = PointForm(pieces.density * pull * pieces.dx, pieces), None
         if fluid_density is not None:
-            grown = fem.Constant(pieces.grid.mesh, fluid_density) * (ufl.det(pieces.increment(u)) - 1)
+            grown = ufl.det(pieces.increment(u)) - 1
+            if saturation is not None:  # the weight is that of full pores so far
+                grown = saturation * grown - (1 - saturation) * pieces.pores
+            grown = fem.Constant(pieces.grid.mesh, fluid_density) * grown
             self._taken_up = PointForm(-grown * pull * pieces.dx, pieces)
 
     def acting(self, setting: Setting) -> Acting:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mpm_dolfinx.base.fluid_content import mass_potential
 from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.state import State
@@ -34,6 +35,9 @@ class CellFields:
         Mean Cauchy stress of the skeleton, and of skeleton and fluid together; tension is positive.
     pressure : (n,), Pa
         Pore pressure, positive in compression; None without fluid.
+    water : (n,), m^d
+        Fluid in the pores, as at zero pressure, less what their volumes have gained beyond what has come (`owed`); None
+        without fluid.
     """
 
     cell: NDArray[np.int64]
@@ -43,6 +47,7 @@ class CellFields:
     effective_stress: NDArray[np.float64]
     stress: NDArray[np.float64]
     pressure: NDArray[np.float64] | None
+    water: NDArray[np.float64] | None
 
 
 def cell_fields(scene: Scene, state: State) -> CellFields:
@@ -62,9 +67,21 @@ def cell_fields(scene: Scene, state: State) -> CellFields:
 
     effective = mean(cut.to_cells(scene.materials.effective_stress(points)))
     moved = mean(cut.pieces_to_cells(cut.total_displacement(points)))
-    pressure, stress = None, effective
+    stress = effective
+    pressure = None
+    water = None
     if scene.fluid is not None:
         pressure = on_grid.pressures(state)
-        biot = mean(cut.to_cells(scene.materials.table(points, lambda m: m.biot)))
-        stress = effective - (biot * pressure)[:, None, None] * np.eye(scene.grid.stretches)
-    return CellFields(places.filled, mean(cut.x) + cut.grid.base, volume, moved, effective, stress, pressure)
+        share = cut.to_cells(scene.materials.table(points, lambda m: m.biot))
+        store, pores = (cut.to_cells(values(points)) for values in (scene.materials.storage, scene.materials.porosity))
+        volumes = pores + store * mass_potential(pressure, scene.fluid.bulk)[places.slots]
+        if scene.materials.retentions is not None:
+            at = cut.to_pieces(pressure[places.slots])
+            full, _, chi, _ = scene.materials.saturation(points, at, cut.pieces.point)
+            share, full = share * cut.pieces_to_cells(chi), cut.pieces_to_cells(full)
+            volumes -= (1 - full) * pores * np.exp(pressure / scene.fluid.bulk)[places.slots]
+        owed = cut.to_cells(points.data["owed"] / points.J)
+        water = sum_by(places.slots, weight * (volumes - owed), len(volume))
+        stress = effective - (mean(share) * pressure)[:, None, None] * np.eye(scene.grid.stretches)
+    x = mean(cut.x) + cut.grid.base
+    return CellFields(places.filled, x, volume, moved, effective, stress, pressure, water)

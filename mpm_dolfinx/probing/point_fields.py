@@ -28,6 +28,8 @@ class PointFields:
         q = sqrt(3/2 s : s), s the deviator of the stress: |axial - radial| stress in a triaxial test.
     porosity : (n,)
         Present volume fraction of the pores, 1 - (1 - n_0) / J.
+    saturation : (n,)
+        Share of the pores that is full of fluid; without fluid 0.
     """
 
     effective_stress: NDArray[np.float64]
@@ -35,13 +37,17 @@ class PointFields:
     mean_effective_stress: NDArray[np.float64]
     deviatoric_stress: NDArray[np.float64]
     porosity: NDArray[np.float64]
+    saturation: NDArray[np.float64]
 
 
 def point_fields(scene: Scene, points: MaterialPoints) -> PointFields:
     """Return the fields of some points; on all processes together."""
     materials, effective = scene.materials, scene.materials.effective_stress_3d(points)
-    pore = materials.table(points, lambda m: m.biot) * points.pressure
+    pore = materials.felt(points)
     mean = np.trace(effective, axis1=1, axis2=2) / 3
     deviator, stress = (effective - part[:, None, None] * np.eye(3) for part in (mean, pore))
     q = np.sqrt(1.5 * np.square(deviator).sum(axis=(1, 2)))
-    return PointFields(effective, stress, -mean, q, materials.porosity(points))
+    full = np.full(len(points), 0.0 if scene.fluid is None else 1.0)
+    if materials.retentions is not None:
+        full = materials.saturation(points, points.pressure)[0]
+    return PointFields(effective, stress, -mean, q, materials.porosity(points), full)

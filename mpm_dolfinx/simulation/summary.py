@@ -68,7 +68,7 @@ def _storage(s: Scene, state: State) -> list[Part]:
     storage, count = s.storage, {one.title: one.count for one in state.stage.feeding}
     names = ("pore pressure", "fluxes between cells", "weight of the fluid", "open sides", "damping of pressure jumps")
     if storage is None:
-        return [Part(name, False, "no fluid") for name in (*names, "pores that drain", "sources")]
+        return [Part(name, False, "no fluid") for name in (*names, "pores that drain", "retention", "sources")]
     still, f = "nothing conducts", storage.fluxes
     return [
         Part(names[0], True, "finite volumes, coupled"),
@@ -77,8 +77,14 @@ def _storage(s: Scene, state: State) -> list[Part]:
         _either(names[3], names[3] in count, f"{count.get(names[3])} drained or with inflow", "sealed"),
         _either(names[4], f.damp.used, "little flows within a step", "enough flows within a step, so far"),
         _either("pores that drain", storage.drains, "as a free surface falls", "pores stay full"),
+        _either("retention", storage.retains, _laws(s), "no suction drains pores"),
         _either("sources", "sources" in count, f"{count.get('sources')}", "none given"),
     ]
+
+
+def _laws(s: Scene) -> str:
+    laws = s.materials.retentions
+    return "" if laws is None else ", ".join(dict.fromkeys(type(law).__name__ for law in laws.laws))
 
 
 def _solvers(s: Scene, state: State) -> list[Part]:

@@ -249,6 +249,8 @@ class Newton:
             elif fresh:
                 self._linearise(np.where(eases, 0.0, FIRM * np.minimum(1.0, errors.u)))
             self.report.coupling += self._direction(errors, fresh and slow)
+            if self._storage is not None:
+                self._solvers.restrain(self._storage)
             before, errors = errors, self._line_search(errors, elastic)
             count, slow = count + 1, fresh
             # inf where no fluid has moved yet
@@ -416,6 +418,8 @@ class Newton:
         rtol = min(LOOSEST, max(least, SOLVED * self._scheme.tolerance / min(1.0, errors.worst)))
         if iterative:  # the pull of given displacements, which is all of a first residual, hides the rest
             rtol = max(SOLVED * self._scheme.tolerance, rtol / max(1.0, errors.worst))
+        if self._storage is not None:
+            rtol = min(rtol, self._storage.accuracy)
         done = errors.each <= self._scheme.tolerance
         if done.any():  # what balances stays where it is
             self._momentum.system.residual.array_w[done[self._momentum.system.of_parts.of]] = 0.0
@@ -427,7 +431,7 @@ class Newton:
             if errors.fluid is not None:
                 least = errors.fluid.round_off / self._scheme.tolerance
                 measures.append(np.maximum(errors.exchanged, least))
-                if slow and not self._linear:
+                if slow and not self._linear and not self._storage.forms.retains:
                     measures.append(self._storage.flux_slope(self._momentum.forms.u, self._momentum.system.unknowns))
             solve = partial(self._solvers.solve, self._kept, rtol, *measures)
             least = rtol if self._linear else INNER

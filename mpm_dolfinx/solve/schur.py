@@ -26,6 +26,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from weakref import finalize
 
+from mpi4py import MPI
 from petsc4py import PETSc
 
 import numpy as np
@@ -150,7 +151,9 @@ class LinearSolvers:
             self._schur.setUp()
             mumps = how.pressures == MUMPS
             gathered = how.gathered and not mumps
-            self._solve_s = direct_solver(storage.P, "storage", gathered=gathered, package="mumps" if mumps else None)
+            self._solve_s = direct_solver(
+                storage.P, "storage", storage.symmetric, gathered=gathered, package="mumps" if mumps else None
+            )
             self._set_krylov(how.krylov)
             self._solve_s.setFromOptions()
             self._krylov = self._solve_s.getType()
@@ -251,7 +254,7 @@ class LinearSolvers:
         slope
             What the fluxes gain by displacements; without, the tangent leaves that out.
         """
-        residual, slopes = self._momentum.residual, () if slope is None else (slope,)
+        slopes = () if slope is None else (slope,)
         if self._storage is None:
             self.solve_u.setTolerances(rtol=rtol, atol=0.0, max_it=MOST)
             self.solve_momentum()
@@ -274,9 +277,7 @@ class LinearSolvers:
         cg = self._solve_s.getType() == PETSc.KSP.Type.CG  # which takes preconditioned norms
         self._evenly(self._solve_s, g, self.dp, self._storage.of_parts, self._solve_s.pc.apply if cg else None)
         self._schur.setPythonContext(self._context)
-        self._storage.B_momentum.multTranspose(self.dp, self._rhs)
-        self._rhs.axpy(1.0, residual)
-        self.solve_u.solve(self._rhs, self.du)
+        self._follow()
         count = solved(self._solve_s, "storage")
         kept.operator = kept.operator and count <= self.plan.many
         return count
@@ -304,6 +305,22 @@ class LinearSolvers:
         ksp.solve(b, x)
         b.array_w[:] *= scale
         x.array_w[:] *= scale
+
+    def restrain(self, storage: StorageProblem) -> None:
+        """Let pressures fall by no more along the direction than their storage says, displacements as these ask."""
+        dp = storage.restrained(self.dp.array_r)
+        far = not np.array_equal(dp, self.dp.array_r)
+        if not self.du.comm.tompi4py().allreduce(far, MPI.LOR):
+            return
+        self.dp.array_w[:] = dp
+        if self._block is None:
+            self._follow()
+
+    def _follow(self) -> None:
+        """Solve for the displacements that go with the direction of the pressures."""
+        self._storage.B_momentum.multTranspose(self.dp, self._rhs)
+        self._rhs.axpy(1.0, self._momentum.residual)
+        self.solve_u.solve(self._rhs, self.du)
 
     def turn_round(self, parts: NDArray[np.bool_] | None = None) -> None:
         """Turn the direction round, of all parts or of some (parts,)."""

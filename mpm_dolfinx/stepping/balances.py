@@ -64,7 +64,7 @@ class Start(NamedTuple):
         if control is None or control.motion is None or len(flights) < 2:
             return 0.0, 0.0
         times = float(substep.before * self.dt), float(substep.own * self.dt)
-        return motion_error(self.matrices.solvers(), self.matrices.momentum.K, self.matrices.mass, flights, *times)
+        return motion_error(self.matrices.solvers, self.matrices.momentum.K, self.matrices.mass, flights, *times)
 
 
 class Balances(NamedTuple):
@@ -169,7 +169,7 @@ def balances(
     carried = on_grid.softness(start.state), substep.end * on_grid.due(start.state)
     options = (on_grid.contents, *fed, substep.own * dt, lost, *carried)
     pushed = None if inertia is None else partial(pushed_back, scene, on_grid)
-    storage = StorageProblem(scene.storage, matrices.storage, start.data.pieces, *options, pushed)
+    storage = StorageProblem(scene.storage, matrices.storage, start.data.pieces, *options, pushed, on_grid.scale)
     return Balances(momentum, storage, inertia)
 
 

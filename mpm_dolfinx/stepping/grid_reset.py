@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from dolfinx.common import Timer
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.base.caching import Keyed, Latest
 from mpm_dolfinx.base.fluid_content import mass_potential, pressure_of
-from mpm_dolfinx.base.tolerances import ROUND_OFF
+from mpm_dolfinx.base.tolerances import ROUND_OFF, TINY
 from mpm_dolfinx.conditions.acting import Loads
 from mpm_dolfinx.diagnostics.scene_checks import check_held
 from mpm_dolfinx.domains.cut_domains import CutDomains
@@ -35,6 +35,7 @@ from mpm_dolfinx.mechanics.momentum import MomentumForms, MomentumSystem
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData, QuadraturePoints
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.points.parts import parts_of_cells
+from mpm_dolfinx.pores.pore_water import PoreWater
 from mpm_dolfinx.solve.scheme import Scheme
 from mpm_dolfinx.solve.schur import LinearSolvers, planned
 from mpm_dolfinx.stepping.stage import Stage
@@ -110,6 +111,11 @@ class OnGrid(Keyed):
             if quadrature.layered:
                 self._mixed = mixed_cells(cut, quadrature.conducting(cut), self.contents)
 
+    @property
+    def mixes(self) -> bool:
+        """Whether cells hold several soils whose ratio of conductivities depends on the pressure."""
+        return self._mixed is not None and self._storage.fluxes.relative is not None
+
     @cached_property
     def not_full(self) -> NDArray[np.int32]:
         """Inner faces of cells that are not full, which carry ghost mass."""
@@ -144,10 +150,39 @@ class OnGrid(Keyed):
             carried = transport(state.pieces.potentials(bulk), self.cut.points, self.cut.pieces)
             if state.stay:
                 carried = mass_potential(self.of_pieces(state, "of_cell", pressure_of(carried, bulk)), bulk)
-            return pressure_of(self._means(carried), bulk)
+            p = pressure_of(self._means(carried), bulk)
+            water = self.pore_water(self.cut.points)
+            return p if water is None else water.level(water.of_cells(self._carried(state, carried)), p)
         p = np.zeros(self.cut.grid.num_local)
         p[self.cut.cells] = self.cut.pieces_to_cells(state.pieces.of_cell)
         return p[self.contents.filled]
+
+    def _carried(self, state: State, pi: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the pressures (m,), Pa, by which pieces bring their points' water to their cells.
+
+        Those of these potentials (m,), Pa, by which pressures that are linear travel unchanged, but for what keeps the
+        water of each point.
+        """
+        materials = self._quadrature.materials
+        points = self.cut.points
+        bulk = self._storage.bulk
+        old = state.pieces
+        count, pieces = len(points), self.cut.pieces
+        pores, store = materials.porosity(points), materials.storage(points)
+        rows, scale = materials.retention_rows(points), materials.retention_scale(points)
+        scale = np.where(np.isinf(scale), 1.0, scale)
+
+        def of_points(at: NDArray[np.int64], share: NDArray[np.float64]) -> PoreWater:
+            full = partial(materials.saturations, rows[at])
+            return PoreWater(full, at, share * store[at], share * pores[at], bulk, scale)
+
+        owner = np.searchsorted(points.id, old.id)
+        there = pressure_of(pi, bulk)
+        held = of_points(owner, old.fraction).of_cells(old.pressure)
+        more = of_points(pieces.point, pieces.fraction).level(held, np.zeros(count), there)
+        if state.stay:
+            more = np.where(state.stay.keeps, 0.0, more)
+        return self.cut.pieces_to_cells(there + more[pieces.point])
 
     def of_pieces(self, state: State, name: str, fresh: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return what pieces have by this name in the state, fresh ones (m, ...) where they do not stay."""
@@ -190,17 +225,26 @@ class OnGrid(Keyed):
         return np.divide(contents.total(cells, store * potential), held, out=mean, where=held > 0)
 
     def pressures_at_pieces(
-        self, reconstruction: Reconstruction, store: NDArray[np.float64], stage: Stage, t: float
+        self,
+        reconstruction: Reconstruction,
+        store: NDArray[np.float64],
+        stage: Stage,
+        t: float,
+        water: PoreWater | None = None,
+        at_rest: AtPlaces | None = None,
     ) -> list[NDArray[np.float64]]:
         """Return the pressures (m,), their slopes (m, d) and bounds (m, 2) at the pieces, as `set_pressures` has set.
 
         The mean of their mass potentials in a cell is the cell's: by `store` (m,), m^d/Pa, what the pieces store, or by
         their volumes in a cell that stores nothing.  t, s: time at which drained sides have their pressures.
+
+        With `water` its sum in a cell is that at the cell's pressure, and what is reconstructed is what pressures
+        differ by from those at rest, `at_rest`, where fluid flows.
         """
         pieces = self.data.pieces
         contents = self.contents
-        bulk = self._storage.bulk
-        pi = mass_potential(self._storage.p_n.x.array, bulk)
+        bulk = self._storage.bulk if water is None else np.inf
+        p_n = self._storage.p_n.x.array
         cells = pieces.cells
         offset = pieces.places.offset
         at = contents.slot(pieces.cells)
@@ -208,12 +252,23 @@ class OnGrid(Keyed):
         weight = np.where(contents.total(cells, store)[at] > 0, store, self.weight)
         total = contents.total(cells, weight)
         origin = np.stack([contents.total(cells, weight * x) / total for x in offset.T], axis=1)
-        slope, bounds = reconstruction(self._cell_pressures(pi, stage, t, bulk), origin)
-        rise, here = np.einsum("md,md->m", slope[at], offset - origin[at]), pi[contents.filled]
+        seen = self._cell_pressures(mass_potential(p_n, bulk), stage, t, bulk, at_rest)
+        slope, bounds = reconstruction(seen, origin)
+        rise, here = np.einsum("md,md->m", slope[at], offset - origin[at]), seen.p[contents.filled]
         share = share_within(rise, *(bounds.T - here), at)  # drained sides may be aslant in their cells
-        pi = pi[cells] + share[at] * rise
-        slope = (slope * share[:, None])[at] / (1 + pi / bulk)[:, None]
-        values = pressure_of(pi, bulk), slope, pressure_of(bounds, bulk)[at]
+        pi = here[at] + share[at] * rise
+        slope, bounds = (slope * share[:, None])[at], bounds[at]
+        if at_rest is not None:
+            resting = at_rest(cells, self.cut.grid.midpoints[cells] + offset)
+            step = np.eye(offset.shape[1])
+            slope = slope + at_rest(cells[:1], step) - at_rest(cells[:1], 0 * step)
+            pi, bounds = pi + resting, bounds + resting[:, None]
+        if water is not None:
+            mean = p_n[contents.filled]
+            beyond = pi - mean[at]
+            pi = water.level(water.of_cells(mean[at]), mean, beyond)[at] + beyond
+        slope = slope / (1 + pi / bulk)[:, None]
+        values = pressure_of(pi, bulk), slope, pressure_of(bounds, bulk)
         return [self.cut.to_pieces(rows) for rows in values]
 
     def softness(self, state: State) -> NDArray[np.float64] | float:
@@ -245,12 +300,7 @@ class OnGrid(Keyed):
         return self.cut.to_pieces(pressures)
 
     def _cell_pressures(
-        self,
-        p: NDArray[np.float64],
-        stage: Stage,
-        t: float,
-        bulk: float = np.inf,
-        at_rest: AtPlaces | None = None,
+        self, p: NDArray[np.float64], stage: Stage, t: float, bulk: float = np.inf, at_rest: AtPlaces | None = None
     ) -> CellPressures:
         """Return what slopes of cells with these pressures, or mass potentials by `bulk` (Pa), are drawn from.
 
@@ -270,10 +320,55 @@ class OnGrid(Keyed):
     def mobility(self, data: QuadratureData, begins: bool) -> Mobility:
         """Return the mobility of the filled owned cells at u; begins: refuse for good what is none."""
         at_pieces = self._quadrature.mobility(self.cut, self._storage.conductivity, data.pieces, begins)
+        if self._storage.fluxes.relative is not None:
+            return self._relative_mobility(at_pieces)
         mean, share = self.contents.mean(at_pieces), None
         if self._storage.conductivity is not None:
             share = graded(self.contents, self._places.pieces.offset, at_pieces, mean)
         return Mobility(mean, share) if self._mixed is None else self._mixed.mobility(at_pieces, mean, share)
+
+    def _relative_mobility(self, full: NDArray[np.float64]) -> Mobility:
+        """Return the mobility of cells by those of their pieces with full pores (m,), m^2/(Pa s), where pores drain.
+
+        Where a cell holds several soils their ratio is that at the present pressure.
+        """
+        cut = self.cut
+        law = cut.to_cells(self._quadrature.materials.retention_of(cut.points))
+        count = self._storage.fluxes.relative.count
+        shares = np.stack([self.contents.mean(full * (law == i)) for i in range(count)], axis=1)
+        one = np.ones(len(shares))
+        if self._mixed is None and self._storage.conductivity is None:
+            return Mobility(one, shares=shares)
+        k = self._quadrature.materials.saturation(
+            cut.points, cut.to_pieces(self._storage.p_before.x.array[cut.cells]), cut.pieces.point
+        )[3]
+        now = full * np.maximum(cut.pieces_to_cells(k), TINY)
+        mean, share = self.contents.mean(now), None
+        if self._storage.conductivity is not None:
+            share = graded(self.contents, self._places.pieces.offset, now, mean)
+        mobility = Mobility(mean, share) if self._mixed is None else self._mixed.mobility(now, mean, share)
+        return replace(mobility, mean=one, shares=shares)
+
+    def pore_water(self, points: MaterialPoints) -> PoreWater | None:
+        """Return what the pieces store by the porosities of the points, where pores drain; arrays by cells."""
+        materials, cut = self._quadrature.materials, self.cut
+        if materials.retentions is None:
+            return None
+        volume = cut.pieces_to_cells(cut.pieces.fraction * (points.volume0 * points.J)[cut.pieces.point])
+        store, pores = (volume * cut.to_cells(values(points)) for values in (materials.storage, materials.porosity))
+        rows = cut.to_cells(materials.retention_rows(points))
+        slot = self.contents.slot(cut.cells)
+        return PoreWater(partial(materials.saturations, rows), slot, store, pores, self._storage.bulk, self.scale)
+
+    @cached_property
+    def scale(self) -> NDArray[np.float64] | None:
+        """Suctions about which pores of the filled owned cells drain, Pa, 1 where they stay full; None if all do."""
+        if self._quadrature.materials.retentions is None:
+            return None
+        scale = np.full(len(self.contents.filled), np.inf)
+        of_points = self._quadrature.materials.retention_scale(self.cut.points)
+        np.minimum.at(scale, self.contents.slot(self.cut.cells), self.cut.to_cells(of_points))
+        return np.where(np.isinf(scale), 1.0, scale)
 
     def resting_mobility(self) -> Mobility:
         """Return the conductivities, m/s, of the filled owned cells as laws of the deformation and pressure have them
@@ -356,18 +451,16 @@ class System:
             self.storage = StorageSystem(storage, on_grid.cells, on_grid.facets, unknowns, parts)
         self.plan = planned(scheme, self.momentum, self.storage, symmetric)
         """How the linearised problem is solved."""
-        self._solvers: Latest[LinearSolvers] = Latest()
 
+    @cached_property
     def solvers(self) -> LinearSolvers:
-        """Return the solvers."""
-        return self._solvers((), lambda: LinearSolvers(self.plan, self._scheme, self.momentum, self.storage))
+        """The solvers, made when first they are needed."""
+        return LinearSolvers(self.plan, self._scheme, self.momentum, self.storage)
 
     def end_step(self) -> None:
         """Drop coarse grids that hold no tangent for other steps, before the points need the memory to move."""
-        made = self._solvers.value
-        if made is not None and self.plan.iterative and made.tangent.value is None:
-            del made
-            self._solvers.clear()
+        if "solvers" in vars(self) and self.plan.iterative and self.solvers.tangent.value is None:
+            del self.solvers
             collect_garbage(self.momentum.unknowns.comm)
 
 
@@ -397,16 +490,17 @@ class Assembled(Keyed):
         stage: Stage,
         loads: Sequence[Loads],
     ):
+        self._system = system
         self.momentum = system.momentum
         self.storage = system.storage
         self.symmetric = system.symmetric
         self.plan = system.plan
-        self.solvers = system.solvers
         self.end_step = system.end_step
         self._on_grid, self._stage = on_grid, stage
         self._u, self._varies = momentum.u, storage is not None and storage.conductivity is not None
         self._bulk = storage.bulk if storage is not None else np.inf
-        self._by_pressure = storage.p_before if self._varies and storage.conductivity.by_pressure else None
+        by_pressure = on_grid.mixes or (self._varies and storage.conductivity.by_pressure)
+        self._by_pressure = storage.p_before if by_pressure else None
         self._mobility: Latest[Mobility] = Latest()
         self._outflow: Latest[Outflow] = Latest()
         self.momentum.set_penalty(loads)
@@ -425,6 +519,11 @@ class Assembled(Keyed):
                 facets = form.on(off_facets(on_grid.contents, on_grid.facets))
                 self._off = facets if facets.some else None
         self._gradients: Latest[Gradients] = Latest()
+
+    @property
+    def solvers(self) -> LinearSolvers:
+        """The solvers of the system."""
+        return self._system.solvers
 
     def _rounding(self, momentum: MomentumForms, loads: Sequence[Loads]) -> NDArray[np.float64]:
         """Return what rounding may leave of the residual at the local nodes (nodes,), N.
@@ -470,15 +569,17 @@ class Assembled(Keyed):
         def mobility(begins: bool) -> Mobility:
             if self._varies:
                 return on_grid.mobility(data, begins)
-            return self._mobility((), lambda: on_grid.mobility(data, True))
+            return self._mobility(mixture, lambda: on_grid.mobility(data, True), grid.comm)
 
         def set_fluxes(kappa: Mobility, motion: CellMotion | None = None) -> Outflow:
             where = (sides.cells, sides.shape, sides.seeps, sides.area, sides.reach)
             off = self._off and (self._off, self._gradients(where, lambda: Gradients(contents, sides)), sides)
             return self.storage.set_fluxes(contents, feeds, Conduction(kappa, motion, weight, self._bulk), off)
 
+        mixture = ()
         if self._by_pressure is not None:
-            varies = (*varies, self._by_pressure.x.array.copy())
+            mixture = (self._by_pressure.x.array.copy(),)
+            varies = (*varies, *mixture)
         if state.stays and not self._varies:
             outflow = self._outflow((at, weight, *varies), lambda: set_fluxes(mobility(True)), grid.comm)
             return feeds, lambda begins: outflow

@@ -67,7 +67,12 @@ def pieces_at_start(scene: Scene, points: MaterialPoints) -> PiecePressures:
     mean = contents.total(cut.cells, weight * pi) / contents.total(cut.cells, weight)
     wanted = pressure_at(pressure, grid.base + grid.midpoints[contents.filled] + contents.centroid[contents.filled])
     pi = pi + (mass_potential(wanted, bulk) - mean)[contents.slot(cut.cells)]
-    p = cut.to_pieces(pressure_of(pi, bulk))
+    p = pressure_of(pi, bulk)
+    water = on_grid.pore_water(points)
+    if water is not None:
+        offset = p - wanted[water.slot]
+        p = water.level(water.of_cells(wanted[water.slot]), wanted, offset)[water.slot] + offset
+    p = cut.to_pieces(p)
     pieces, bounds = cut.pieces, np.stack([p, p], axis=1)
     return PiecePressures(points.id[pieces.point], pieces.cell, pieces.fraction, p, pieces.x, 0 * pieces.x, bounds)
 

@@ -102,6 +102,8 @@ class Scene:
         if velocity is not None:
             seeded = replace(seeded, data=moving(seeded, velocity, grid.base, grid.axisymmetric))
         self.materials = scene = SceneMaterials(grid, materials, bodies, seeded, fluid, bool(initial))
+        if velocity is not None and scene.retentions is not None:
+            raise ValueError("inertia: not of soil whose pores drain (retention), must be left out")
         self.gravity = fem.Constant(grid.mesh, np.zeros(grid.dim)) if weighs else None
         self.t, self.dt = fem.Constant(grid.mesh, 0.0), fem.Constant(grid.mesh, 1.0)
         """Time at the end of the substep, and since the start of the step, s, for forms."""
@@ -112,8 +114,9 @@ class Scene:
             wet = fluid.density if fluid else None
             options = (self.gravity, wet, scene.symmetric)
             options = (*options, numerics.quadrature == "point", terms, self.t, self.dt, velocity is not None)
+            options = (*options, scene.retentions)
             self.momentum = MomentumForms(self.pieces.pieces, laws, p and p.now, *options)
-        if not self.momentum.symmetric and scheme.coupling == "schur-cg":
+        if scheme.coupling == "schur-cg" and not (self.momentum.symmetric and scene.retentions is None):
             scheme = replace(scheme, coupling="schur-fgmres")
         self.scheme, self.storage = scheme, None
         if fluid:
@@ -127,7 +130,8 @@ class Scene:
             law = ConductivityAtPieces(scene.materials, laws, pieces, u, p.before) if laws else None
             kind = (symmetric, scene.conducts, scene.evolves)
             feeding = [Sources(sources, pieces, p.now, self.t)] if sources else []
-            self.storage = StorageForms(pieces, u, p, fluid.bulk, weight, *kind, law, feeding, inertial)
+            forms = (pieces, u, p, fluid.bulk, weight, *kind, law, feeding, inertial, scene.retentions)
+            self.storage = StorageForms(*forms)
         self.motion = Motion(scene, bodies, self.momentum, self.storage)
         # what is still to be looked for, to be warned of, of which nothing but the log knows
         self._looks = (warn_overfilled, *[partial(warn_smeared, materials=scene)] * scene.uneven)
@@ -213,12 +217,7 @@ class Scene:
         return self._on_grid(points.arrays, make, grid.comm)
 
     def assembled(
-        self,
-        on_grid: OnGrid,
-        stage: Stage,
-        now: Sequence[Loads],
-        as_cut: Callable[[], Sequence[Loads]],
-        begins: bool,
+        self, on_grid: OnGrid, stage: Stage, now: Sequence[Loads], as_cut: Callable[[], Sequence[Loads]], begins: bool
     ) -> Assembled:
         """Return the matrices for a stage of the bodies on the grid.
 

@@ -166,12 +166,12 @@ class _Point:
     def __init__(self, material: Skeleton, rate: float | None, cell_size: float | None):
         self._rate, law = rate or 1.0, type(material)
         for field in fields(material):
-            if callable(getattr(material, field.name)) and field.name != "conductivity_law":
+            if callable(getattr(material, field.name)) and field.name not in ("conductivity_law", "retention"):
                 raise ValueError(f"{law.__name__}: {field.name} is a function, must be a number in an element test")
         self._parameters = {name: np.asarray(getattr(material, name), dtype=float) for name in law.parameters}
         self._rest = {name: np.asarray(value, dtype=float) for name, value in law.state.items()}
         shapes = {name: value.shape for name, value in (self._parameters | self._rest).items()}
-        self._law = LawAtPoints(Grid([0] * 3, [1.0] * 3, [2] * 3, comm=MPI.COMM_SELF), law, shapes, cell_size)
+        self._law = LawAtPoints(Grid([0] * 3, [1.0] * 3, [2] * 3, comm=MPI.COMM_SELF), law, shapes, cell_size=cell_size)
         self._bulk = float(material.bulk)
 
     def _data(self, F: NDArray[np.float64], state: dict[str, NDArray[np.float64]]):

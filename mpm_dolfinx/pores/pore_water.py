@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: MIT
+"""The water that pieces of domains bring to their cells, where pores drain: the pressure at which a cell holds it.
+
+A volume that stores s per pressure, with pores n, holds c(p) = s pi(p) + n (S(p) - 1) rho(p) more than it does at zero
+pressure: pi is the mass potential, rho the density over that at zero pressure.  Of several soils, and of pieces that
+lie higher or lower than their cell's centroid, it is c(p + o) with each piece's own S and offset o.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpm_dolfinx.base.errors import NotConverged
+from mpm_dolfinx.base.fluid_content import mass_potential
+from mpm_dolfinx.base.tolerances import EPSILON
+from mpm_dolfinx.grid.grid import sum_by
+from mpm_dolfinx.pores.retention import logarithm, pressure_at
+
+MOST = 2200  # Source: exact bound, twice the halvings of a bracket of doubles (IEEE 754)
+
+
+@dataclass(frozen=True)
+class PoreWater:
+    """What m pieces in n cells store.
+
+    saturation: gives S and its slope (m,), 1/Pa, at pressures (m,), Pa, and may give more; slot (m,): cell of each
+    piece; store (m,), m^d/Pa; pores (m,), m^d; bulk: of the fluid, Pa; scale (n,): suction about which pores of a cell
+    drain, Pa.
+    """
+
+    saturation: Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], ...]]
+    slot: NDArray[np.int64]
+    store: NDArray[np.float64]
+    pores: NDArray[np.float64]
+    bulk: float
+    scale: NDArray[np.float64]
+
+    def emptied(self, p: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return (S - 1) rho of the pieces, and its slope, 1/Pa, at pressures (m,), Pa."""
+        return emptied(p, self.bulk, *self.saturation(p)[:2])
+
+    def of_cells(self, p: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the contents of the cells (n,), m^d, by pressures of their pieces (m,), Pa."""
+        return self.sums(mass_potential(p, self.bulk), self.emptied(p)[0])
+
+    def sums(self, pi: NDArray[np.float64], empty: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the contents of the cells (n,), m^d, by potentials, Pa, and (S - 1) rho of their pieces (m,)."""
+        return sum_by(self.slot, self.store * pi + self.pores * empty, len(self.scale))
+
+    def level(
+        self, content: NDArray[np.float64], p: NDArray[np.float64], offset: NDArray[np.float64] | float = 0.0
+    ) -> NDArray[np.float64]:
+        """Return the pressures (n,), Pa, at which cells hold these contents (n,), m^d.
+
+        Newton's method on the logarithm of the suction, within a bracket.
+
+        Parameters
+        ----------
+        p : (n,), Pa
+            Where it begins, and the answer where this content is met.
+        offset : (m,), Pa
+            By how much the pressures of pieces differ from their cells'.
+        """
+        count, scale = len(p), self.scale
+        rounding = 4 * EPSILON * sum_by(self.slot, self.pores, count)
+        y = logarithm(p, scale)
+        low, high = np.full(count, -np.inf), np.full(count, np.inf)
+        for _ in range(MOST):
+            p = pressure_at(y, scale) if _ else p
+            at = p[self.slot] + offset
+            empty, slope = self.emptied(at)
+            off = self.sums(mass_potential(at, self.bulk), empty) - content
+            bad = np.abs(off) > rounding + 4 * EPSILON * np.abs(content)
+            if not bad.any():
+                return p
+            low, high = np.where(off < 0, y, low), np.where(off > 0, y, high)
+            rises = sum_by(self.slot, self.store * np.exp(at / self.bulk) + self.pores * slope, count)
+            rises = rises * np.where(y < 0, scale * np.cosh(y), scale)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                there = y - np.clip(np.nan_to_num(off / rises), -2, 2)
+                middle = (low + high) / 2
+            inside = (there > low) & (there < high)
+            there = np.where(inside | ~np.isfinite(middle), there, middle)
+            done = (there == y) | (high - low <= 4 * EPSILON * np.abs(y))
+            if not (bad & ~done).any():
+                return p
+            y = np.where(bad, there, y)
+        raise NotConverged("water that pores hold: no pressure is found for it")
+
+
+def emptied(
+    p: NDArray[np.float64], bulk: float, S: NDArray[np.float64], slope: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return (S - 1) rho and its slope, 1/Pa, at pressures (m,), Pa, of saturations and theirs, 1/Pa."""
+    density = np.exp(p / bulk)
+    return (S - 1) * density, (slope + (S - 1) / bulk) * density

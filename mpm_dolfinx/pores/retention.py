@@ -1,0 +1,428 @@
+# SPDX-License-Identifier: MIT
+"""Retention: how full pores are at a pressure, how they conduct, and the share of it that the skeleton feels.
+
+Air is at zero pressure everywhere, so the suction is s = -p.  Without suction pores are full.  With the saturation S
+and the relative permeability k_r, both functions of p,
+
+    content of fluid   n S,      conductivity   k k_r,      stress   sigma = sigma' - alpha chi p
+
+(Richards 1931; Bishop 1959).  chi is the effective saturation S_e = (S - S_r) / (1 - S_r), or the law's own.
+
+A law of the user's is any object with `saturation(p)` and `relative_permeability(p)`, which return UFL.  Its
+`bishop(p)` is chi, without one chi = S.  One derived from `Retention` has constants that are no part of what is
+compiled.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from copy import copy
+from dataclasses import dataclass, fields
+from functools import partial
+
+import numpy as np
+import ufl
+from numpy.typing import NDArray
+from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
+
+from mpm_dolfinx.base.tolerances import TINY
+from mpm_dolfinx.base.validation import asked, line, numbers
+from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointExpression
+from mpm_dolfinx.grid.grid import Grid
+
+METHODS = ("saturation", "relative_permeability")
+
+
+@dataclass(frozen=True)
+class Retention:
+    """Law of retention by an effective saturation: S = S_r + (1 - S_r) S_e.
+
+    A law derived from it is a frozen dataclass of numbers.  It defines `effective(s)` and `conducts(s)`: S_e and k_r as
+    UFL of the suction s >= 0, Pa, both 1 at s = 0.  Its `bishop(p)` is S_e unless it defines another.
+
+    Parameters
+    ----------
+    entry
+        Suction about which pores begin to drain, Pa, > 0.
+    residual
+        Saturation S_r that no suction drains, in [0, 1).
+
+    Raises
+    ------
+    ValueError
+        Naming the constant that is out of its range.
+    """
+
+    entry: float
+    residual: float = 0.0
+
+    def __post_init__(self):
+        _number(self, "entry", lambda v: v > 0, "> 0 and finite")
+        _number(self, "residual", lambda v: (0 <= v) & (v < 1), "in [0, 1)")
+
+    @property
+    def scale(self) -> float:
+        """Suction, Pa, about which saturation and permeability fall."""
+        return self.entry
+
+    def bishop(self, p):
+        """Return chi at pressures p, Pa, as UFL."""
+        return self.effective(ufl.max_value(-p, 0.0))
+
+    def saturation(self, p):
+        """Return S at pressures p, Pa, as UFL."""
+        return self.residual + (1 - self.residual) * self.effective(ufl.max_value(-p, 0.0))
+
+    def relative_permeability(self, p):
+        """Return k_r at pressures p, Pa, as UFL."""
+        return self.conducts(ufl.max_value(-p, 0.0))
+
+
+@dataclass(frozen=True)
+class VanGenuchten(Retention):
+    """Retention by van Genuchten (1980), permeability by Mualem (1976).
+
+    With x = s / entry, m = 1 - 1 / n:  S_e = (1 + x^n)^-m,  k_r = S_e^l [1 - x^(n-1) S_e]^2.
+
+    Parameters
+    ----------
+    entry
+        1 / alpha as a pressure, Pa, > 0: the weight of water over alpha in 1/m.
+    residual
+        Saturation S_r that no suction drains, in [0, 1).
+    n
+        How evenly wide pores are, in (1, 20].
+    l
+        Connectivity of the pores, a number.
+    air_entry
+        Suction below which all pores are full, Pa, >= 0 (Ippisch, Vogel and Bastian 2006).  With n < 2 the permeability
+        falls infinitely steeply at s = 0 without it; the height of a few centimetres of water is usual.
+    """
+
+    n: float = 2.0
+    l: float = 0.5
+    air_entry: float = 0.0
+
+    def __post_init__(self):
+        super().__post_init__()
+        _number(self, "n", lambda v: (1 < v) & (v <= 20), "in (1, 20]")
+        _number(self, "l", lambda v: v == v, "a finite number")
+        _number(self, "air_entry", lambda v: v >= 0, ">= 0 and finite")
+
+    def _wide(self, x):
+        """Return x^(n-1) (1 + x^n)^-m, the share of the conductance of pores that are empty, under a root."""
+        return x ** (self.n - 1) * (1 + x**self.n) ** (1 / self.n - 1)
+
+    def _least(self):
+        """Return the suction below which all pores are full, over `entry`; powers of zero have no derivatives."""
+        return ufl.max_value(self.air_entry / self.entry, TINY)
+
+    def effective(self, s):
+        """Return S_e at suctions s, Pa, as UFL."""
+        x, least = ufl.max_value(s / self.entry, self._least()), self._least()
+        return ((1 + x**self.n) / (1 + least**self.n)) ** (1 / self.n - 1)
+
+    def conducts(self, s):
+        """Return k_r at suctions s, Pa, as UFL."""
+        x, least = ufl.max_value(s / self.entry, self._least()), self._least()
+        return self.effective(s) ** self.l * ((1 - self._wide(x)) / (1 - self._wide(least))) ** 2
+
+
+@dataclass(frozen=True)
+class Gardner(Retention):
+    """Exponential retention and permeability: S_e = k_r = exp(-s / entry) (Gardner 1958; Srivastava and Yeh 1991).
+
+    Parameters
+    ----------
+    entry
+        Suction in which they fall by e, Pa, > 0: the weight of water over Gardner's alpha in 1/m.
+    residual
+        Saturation S_r that no suction drains, in [0, 1).
+    """
+
+    def effective(self, s):
+        """Return S_e at suctions s, Pa, as UFL."""
+        return ufl.exp(-s / self.entry)
+
+    conducts = effective
+
+
+@dataclass(frozen=True)
+class BrooksCorey(Retention):
+    """Retention and permeability by powers: S_e = (s / entry)^-index, k_r = S_e^(3 + 2 / index) (Brooks, Corey 1964).
+
+    Parameters
+    ----------
+    entry
+        Suction below which all pores are full, Pa, > 0.
+    residual
+        Saturation S_r that no suction drains, in [0, 1).
+    index
+        How evenly wide pores are, in (0, 20].
+    """
+
+    index: float = 2.0
+
+    def __post_init__(self):
+        super().__post_init__()
+        _number(self, "index", lambda v: (0 < v) & (v <= 20), "in (0, 20]")
+
+    def effective(self, s):
+        """Return S_e at suctions s, Pa, as UFL."""
+        return ufl.max_value(s / self.entry, 1.0) ** (-self.index)
+
+    def conducts(self, s):
+        """Return k_r at suctions s, Pa, as UFL."""
+        return ufl.max_value(s / self.entry, 1.0) ** (-2 - 3 * self.index)
+
+
+def _number(law: Retention, name: str, test: Callable, allowed: str) -> None:
+    """Refuse a constant of a law that fails a test."""
+    what = f"{type(law).__name__}: {name}"
+    numbers(what, getattr(law, name), test=lambda v: np.isfinite(v) & test(v), allowed=allowed)
+
+
+def check_retention(what: str, law) -> None:
+    """Refuse, with a ValueError, what is no law of retention, or none whose values are possible.
+
+    S and k_r are in [0, 1], are 1 at p >= 0, and do not rise with the suction.
+    """
+    missing = [name for name in METHODS if not callable(getattr(law, name, None))]
+    if missing:
+        raise ValueError(f"{what} = {line(law)}, must have {' and '.join(f'{name}(p)' for name in METHODS)}")
+    try:
+        scale = scale_of(law)
+    except ValueError as error:
+        raise ValueError(f"{what}: {error}") from error
+    suctions = scale * np.concatenate([[-1.0, 0.0], np.exp2(np.arange(-8, 3))])
+    for name in METHODS:
+        values = np.array([_value(getattr(law, name), -s) for s in suctions])
+        good = (values[:2] == 1).all() and (values >= 0).all() and (np.diff(values) <= 0).all()
+        if not good:
+            shown = ", ".join(f"{value:.3g}" for value in values)
+            where = ", ".join(f"{-s:.3g}" for s in suctions)
+            raise ValueError(f"{what}: {name} is {shown} at p = {where} Pa, must fall from 1 at 0 to no less than 0")
+
+
+def _value(function: Callable, p: float) -> float:
+    """Return the number that a function of p, which returns UFL, has at a pressure, Pa."""
+    return float(apply_algebra_lowering(ufl.as_ufl(function(ufl.as_ufl(float(p)))))(()))
+
+
+def _empty(function: Callable, suction: float) -> bool:
+    """Return whether a function of p has fallen to a half at a suction, Pa, or is no number there."""
+    try:
+        return not _value(function, -suction) > 0.5
+    except OverflowError:
+        return True
+
+
+def scale_of(law) -> float:
+    """Return the suction about which a law's saturation falls, Pa: its `scale`, or about where half of the pores drain.
+
+    Without such a suction it is the one at which the permeability has halved.
+    """
+    if (scale := getattr(law, "scale", None)) is not None:
+        return float(numbers(f"{line(law)}: scale", scale, test=lambda v: v > 0, allowed="> 0"))
+    for name in METHODS:
+        suction = 1.0
+        half = partial(_empty, getattr(law, name))
+        while half(suction) and suction > TINY:
+            suction /= 2
+        while not half(suction) and suction < 1 / TINY:
+            suction *= 2
+        if half(suction):
+            return suction
+    raise ValueError(f"{line(law)}: saturation never falls to a half, must do so or have a scale, Pa")
+
+
+class Retentions:
+    """The laws of retention of a scene, as UFL of what points carry of theirs.
+
+    Points carry a row: the number of the kind of their law, from 1, and its constants; zero where pores stay full.
+
+    Parameters
+    ----------
+    laws
+        The different laws of the scene's materials.
+    everywhere
+        Whether every material has one.
+    """
+
+    def __init__(self, laws: Sequence, everywhere: bool):
+        self.laws = list(laws)
+        self._everywhere = everywhere
+        self._kinds = list(dict.fromkeys(type(law) if isinstance(law, Retention) else law for law in self.laws))
+        self._first = [next(law for law in self.laws if self._kind(law) == i) for i in range(len(self._kinds))]
+        self.width = 1 + max(len(_constants(law)) for law in self.laws)
+        """Length of a row."""
+
+    def _kind(self, law) -> int:
+        return self._kinds.index(type(law) if isinstance(law, Retention) else law)
+
+    def row(self, law) -> NDArray[np.float64]:
+        """Return the row of a law, or of None."""
+        out = np.ones(self.width)
+        out[0] = 0 if law is None else 1 + self._kind(law)
+        if law is not None:
+            constants = _constants(law)
+            out[1 : 1 + len(constants)] = [getattr(law, name) for name in constants]
+        return out
+
+    def number(self, law) -> int:
+        """Return the number of a law among all, from 1; 0 for None."""
+        return 0 if law is None else 1 + self.laws.index(law)
+
+    def of(self, name: str, p, row):
+        """Return a property of pores at pressures p, Pa, as UFL.
+
+        Parameters
+        ----------
+        name
+            "saturation", "relative_permeability" or "bishop".
+        row
+            UFL vector of the points' row.
+        """
+        values = [_property(_lifted(law, [row[1 + i] for i in range(self.width - 1)]), name, p) for law in self._first]
+        out = values.pop(0) if self._everywhere else 1.0
+        first = 2 if self._everywhere else 1
+        for number, value in enumerate(values, first):
+            out = ufl.conditional(ufl.eq(row[0], number), value, out)
+        return out
+
+
+def _constants(law) -> list[str]:
+    """Return the names of the numbers of a law that are no part of what is compiled."""
+    return [f.name for f in fields(law)] if isinstance(law, Retention) else []
+
+
+def _lifted(law, values: Sequence):
+    """Return a law with UFL in the place of its numbers."""
+    out = copy(law)
+    if isinstance(law, Retention):
+        vars(out).update(zip(_constants(law), values, strict=False))
+    return out
+
+
+def _property(law, name: str, p):
+    """Return a property of a law at pressures p, Pa, as UFL."""
+    if name == "bishop" and not hasattr(law, "bishop"):
+        name = "saturation"
+    return _called(law, name, p)
+
+
+def _called(law, name: str, p):
+    """Return what a method of a law gives at p, a number as UFL.
+
+    Raises
+    ------
+    ValueError
+        It raises, or gives no scalar.
+    """
+    what = f"{line(law)}: {name}"
+    out = asked(what, "UFL of p", lambda: ufl.as_ufl(getattr(law, name)(p)))
+    if out.ufl_shape:
+        raise ValueError(f"{what} has shape {out.ufl_shape}, must be a scalar")
+    return out
+
+
+class SaturationAt:
+    """Saturations, and their slopes, of any points at given pressures.
+
+    Parameters
+    ----------
+    grid
+        Background grid.
+    retentions
+        The laws of the scene.
+    """
+
+    def __init__(self, grid: Grid, retentions: Retentions):
+        self._points = points = FormPoints(grid, p=(), retention=(retentions.width,))
+        p = ufl.variable(points.p)
+        names = ("saturation", "bishop", "relative_permeability")
+        S, chi, k = (retentions.of(name, p, points.retention) for name in names)
+        self._values = PointExpression(ufl.as_vector([S, ufl.diff(S, p), chi, k]), points)
+
+    def __call__(
+        self, rows: NDArray[np.float64], p: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Return S, its slope, 1/Pa, chi and k_r (m,) at pressures p (m,), Pa; rows (m, width): of the points."""
+        data = anywhere(self._points, p=p, retention=rows)
+        S, slope, chi, k = self._values.evaluate(data).T
+        return S, slope, chi, k
+
+
+def anywhere(points: FormPoints, **fields: NDArray[np.float64]) -> PointData:
+    """Return points (m,) with some fields (m, ...), all in one cell, for expressions that do not see where they are."""
+    count = len(next(iter(fields.values())))
+    cells = np.zeros(count, dtype=np.int32)
+    return points.at(cells, points.grid.midpoints[cells], np.ones(count), **fields)
+
+
+class Conductance:
+    """The integral of a law's relative permeability over the pressure, whose differences drive flow (Kirchhoff 1894).
+
+    A table over the logarithm of the suction, between whose rows the integral is a cubic with their values and slopes.
+
+    Parameters
+    ----------
+    grid
+        Background grid.
+    law
+        The law.
+    """
+
+    def __init__(self, grid: Grid, law):
+        self.scale = scale_of(law)
+        points = FormPoints(grid, p=())
+        k_r = PointExpression(_called(law, "relative_permeability", points.p), points)
+        edges = np.exp(np.linspace(*np.log(self.scale * np.array(REACH)), ROWS))
+        self._low, self._step = np.log(edges[0]), np.log(edges[1] / edges[0])
+        middle, half = (edges[1:] + edges[:-1]) / 2, np.diff(edges) / 2
+        x, w = np.polynomial.legendre.leggauss(GAUSS)
+        at = np.concatenate([edges, (middle[:, None] + half[:, None] * x).ravel()])
+        values = k_r.evaluate(anywhere(points, p=-at))
+        self._k, inside = values[:ROWS], values[ROWS:].reshape(ROWS - 1, GAUSS)
+        parts = half * (inside @ w)
+        self._phi = np.append(np.cumsum(parts[::-1])[::-1], 0.0)
+        self._whole = self._phi[0] + edges[0] * (1 + self._k[0]) / 2
+        self._slope = -self._k * edges * self._step  # of the integral from row to row
+        self._edges = edges
+
+    def __call__(self, p: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the integral up to pressures (n,), Pa, k_r, and its slope, 1/Pa (n, 3)."""
+        s = np.clip(-p, self._edges[0], self._edges[-1])
+        z = (np.log(s) - self._low) / self._step
+        i = np.minimum(z.astype(np.int64), ROWS - 2)
+        z = z - i
+        a, b = self._phi[i], self._phi[i + 1]
+        c, d = self._slope[i], self._slope[i + 1]
+        # a cubic about the row below: a + c z + e z^2 + f z^3
+        e, f = 3 * (b - a) - 2 * c - d, 2 * (a - b) + c + d
+        phi = a + z * (c + z * (e + z * f))
+        first, second = c + z * (2 * e + 3 * z * f), 2 * e + 6 * z * f
+        by = 1 / (s * self._step)
+        k, slope = -first * by, (second * by - first / s) * by
+        out = np.stack([phi, k, slope], axis=1)
+        wet = -p < self._edges[0]
+        out[wet] = np.stack([self._whole + p, np.ones(len(p)), np.zeros(len(p))], axis=1)[wet]
+        out[-p > self._edges[-1], 1:] = 0.0
+        return out
+
+
+REACH = (1e-8, 1e8)
+"""Suctions between which the table is, over the law's scale.  Source: exact beyond, but for as small a share."""
+ROWS = 4000
+"""Rows of the table.  Source: exact for cubics, so to 1e-8 of the integral for powers of the suction."""
+GAUSS = 8  # points between two rows.  Source: exact for polynomials of degree 15
+
+
+def logarithm(p: NDArray[np.float64], scale: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return pressures (n,), Pa, on the scale on which a law of this `scale`, Pa, changes evenly: see `pressure_at`."""
+    return np.where(p < 0, np.arcsinh(p / scale), p / scale)
+
+
+def pressure_at(y: NDArray[np.float64], scale: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the pressures (n,), Pa, of such logarithms (n,)."""
+    return np.where(y < 0, scale * np.sinh(y), scale * y)

@@ -1,0 +1,295 @@
+# SPDX-License-Identifier: MIT
+"""Soil whose pores drain under suction, against exact and converged solutions."""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import ufl
+
+import mpm_dolfinx as mpm
+
+WATER = 9810.0  # N/m^3
+STIFF = {"bulk": 1e12, "shear": 5e11}  # Pa: soil that hardly deforms
+
+
+def column(cells, soils, pressure, conditions=(), edge=None, width=1, **options):
+    """Return a column of 1 m between smooth walls; edge: height from which the second soil lies, m."""
+    h = 1 / cells
+    grid = mpm.Grid([0, 0], [width * h, 1 + 2 * h], [width, cells + 2])
+    ends = [0.0, 1.0] if edge is None else [0.0, edge, 1.0]
+    bodies = [mpm.box(grid, [0, a], [width * h, b], material=i) for i, (a, b) in enumerate(pairwise(ends))]
+    walls = {"left": "x", "right": "x", "bottom": "y"}
+    scene = {"fluid": mpm.Fluid(), "walls": walls, "conditions": conditions, "gravity": (0, -9.81), **options}
+    return mpm.Simulation(grid, bodies, soils, pressure=pressure, **scene)
+
+
+def heads(s, z):
+    """Return pressures over the weight of water at heights z, m."""
+    cell = s.cells()
+    return np.interp(z, cell.x[:, 1], cell.pressure) / WATER
+
+
+def water(s):
+    """Return the water in all pores, m^2."""
+    return s.cells().water.sum()
+
+
+SRIVASTAVA_YEH = {
+    1: (-0.0874255, -0.2054024, -0.3388616, -0.2845462),
+    6: (-0.0496160, -0.0926696, -0.0924447, -0.0608852),
+}
+TAKEN_IN = {1: 0.0288, 6: 0.1518453}  # m
+
+
+def infiltrated(cells, dt):
+    """Return the column of Srivastava and Yeh (1991), and its heads at four heights less the exact ones, by hour."""
+    a, k = 5.0, 1e-5
+    law = mpm.Gardner(WATER / a)
+    soil = mpm.LinearElastic(**STIFF, porosity=0.35, conductivity=k, retention=law)
+    sides = [mpm.Drained("bottom"), mpm.Inflow("top", 0.9 * k)]
+
+    def steady(x):
+        return WATER / a * np.log(0.1 + 0.9 * np.exp(-a * x[:, 1]))
+
+    s = column(cells, [soil], steady, sides, initial_stress=mpm.K0(0.5))
+    start, off = water(s), {}
+    for hour, exact in SRIVASTAVA_YEH.items():
+        s.run(3600 * hour, dt, progress=False)
+        off[hour] = heads(s, [0.1, 0.25, 0.5, 0.75]) - exact
+        assert (water(s) - start) * cells == pytest.approx(TAKEN_IN[hour], rel=2e-3)
+        assert s.result.balance < 1e-8
+    return off
+
+
+def test_rain_on_exponential_soil_is_that_of_srivastava_and_yeh():
+    """Of second order in h: 0.5 % of the largest head with 20 cells, 0.15 % with 40."""
+    coarse, fine = (infiltrated(cells, 600) for cells in (20, 40))
+    for hour in (1, 6):
+        size = np.abs(SRIVASTAVA_YEH[1]).max()
+        assert np.abs(coarse[hour]).max() < 0.006 * size
+        assert np.abs(fine[hour]).max() < 0.0015 * size
+        assert np.abs(fine[hour]).max() < 0.3 * np.abs(coarse[hour]).max()
+
+
+@pytest.mark.parametrize(
+    "cells, front, taken", [(25, 4e-3, 8e-3), pytest.param(50, 1.5e-3, 2.5e-3, marks=pytest.mark.slow)]
+)
+def test_a_front_runs_into_dry_soil_as_that_of_celia(cells, front, taken):
+    """Celia, Bouloutas and Zarba (1990), second case, after 12 h: place of -5 m (m), water (relative)."""
+    law = mpm.VanGenuchten(WATER / 3.35, residual=0.102 / 0.368, n=2.0)
+    soil = mpm.LinearElastic(**STIFF, porosity=0.368, conductivity=9.22e-5, retention=law)
+    sides = [mpm.Drained("bottom", pressure=-10 * WATER), mpm.Drained("top", pressure=-0.75 * WATER)]
+    s = column(cells, [soil], -10 * WATER, sides, initial_stress=mpm.K0(0.5))
+    start = water(s)
+    s.run(12 * 3600, 3600, progress=False)
+    cell = s.cells()
+    depth = np.interp(5.0, -cell.pressure[::-1] / WATER, 1 - cell.x[::-1, 1])
+    assert depth == pytest.approx(0.375096, abs=front)
+    assert (water(s) - start) * cells == pytest.approx(0.026335, rel=taken)
+    assert s.result.balance < 1e-8
+
+
+class Liakopoulos:
+    """Del Monte sand, of the user's own: chi is the saturation."""
+
+    def saturation(self, p):
+        return ufl.max_value(1 - 1.9722e-11 * ufl.max_value(-p, 0.0) ** 2.4279, 0.2)
+
+    def relative_permeability(self, p):
+        return ufl.max_value(1 - 2.207 * ufl.max_value(1 - self.saturation(p), 1e-30) ** 1.0121, 0.0)
+
+
+def test_a_column_drains_and_settles_as_that_of_liakopoulos():
+    """20 cells: pressures within 0.5 % of the largest, settlement 0.2 %, outflow 2 %."""
+    E, nu, h = 1.3e6, 0.4, 0.05
+    law = {"conductivity": 4.5e-10 * WATER, "retention": Liakopoulos()}
+    soil = mpm.LinearElastic(bulk=E / 3 / (1 - 2 * nu), shear=E / 2 / (1 + nu), porosity=0.2975, **law)
+    at_rest = mpm.K0(nu / (1 - nu))
+    s = column(20, [soil], 0.0, [mpm.Drained("bottom")], fluid=mpm.Fluid(bulk=2e9), initial_stress=at_rest)
+    top, start = mpm.probes(s.bodies, [[h / 2, 1.0]]), water(s)
+    known = {
+        5: ((-233.53, -596.34, -1306.2, -2345.0, -3294.2), 0.54974e-3, 3.36719e-6),
+        30: ((-631.67, -1582.23, -3205.4, -4983.1, -6211.2), 1.15932e-3, 1.57255e-6),
+    }
+    for minutes, (pressures, settled, flows) in known.items():
+        result = s.run(60 * minutes, 60 if minutes < 6 else 300, progress=False, probes=top)
+        assert WATER * heads(s, [0.1, 0.25, 0.5, 0.75, 0.9]) == pytest.approx(pressures, abs=5e-3 * -pressures[-1])
+        assert -result.displacement[-1, 0, 1] == pytest.approx(settled, rel=2e-3)
+        assert s.outflows.array / h == pytest.approx([flows], rel=0.02)
+    # what has left is what the surface has sunk by, and the pores have lost
+    assert (start - water(s)) / h == pytest.approx(1.15932e-3 + 3.39008e-3, rel=5e-3)
+
+
+def test_unsaturated_soil_consolidates_as_its_linear_theory_says():
+    """A load of 1 % of the suction, 40 cells: settlement and pressures, of the first jump."""
+    chi, jump, c, modulus, load = 0.3535533906, 0.01985921, 1.03261675e-8, 5e6, 200.0
+    law = mpm.VanGenuchten(20e3, n=2.0)
+    soil = mpm.LinearElastic(modulus / 3, modulus / 2, porosity=0.4, conductivity=1e-8, retention=law)
+    sides = [mpm.Drained("top", pressure=-20e3), mpm.Traction("top", lambda t: (0, -load * (t > 0)))]
+    felt = -20e3 * np.sqrt(0.5)
+    rest = {"gravity": None, "initial_stress": lambda x: np.full((len(x), 3), felt)}
+    s = column(40, [soil], -20e3, sides, **rest)
+    top = mpm.probes(s.bodies, [[1 / 80, 1.0]])
+    M = (2 * np.arange(400) + 1) * np.pi / 2
+    for T in (0.1, 0.5):
+        result = s.run(T / c, (T / c - s.t) / 10, progress=False, probes=top)
+        left = np.exp(-(M**2) * T)
+        settled = load / modulus * (1 - chi * jump * (2 / M**2 * left).sum())
+        assert -result.displacement[-1, 0, 1] == pytest.approx(settled, rel=1e-5)
+        cell = s.cells()
+        exact = (2 / M * np.sin(M * (1 - cell.x[:, 1:])) * left).sum(axis=1)
+        assert (cell.pressure + 20e3) / (load * jump) == pytest.approx(exact, abs=5e-4)
+
+
+@pytest.mark.parametrize("steps", [1, 5])
+def test_a_sealed_cell_pressed_and_let_go_has_its_water_and_suction(steps):
+    """By 3 %, in any number of steps: the change of the content is exact."""
+    soil = mpm.Hencky(bulk=1e7, shear=5e6, porosity=0.4, retention=mpm.VanGenuchten(20e3, n=2.0))
+    press = mpm.Displacement("top", lambda t: (0, -0.03 * (1 - abs(1 - t))))
+    felt = -20e3 * np.sqrt(0.5)
+    rest = {"gravity": None, "initial_stress": lambda x: np.full((len(x), 3), felt)}
+    s = column(2, [soil], -20e3, [press], width=2, numerics=mpm.Numerics(tolerance=1e-12), **rest)
+    start = water(s)
+    s.run(1, 1 / steps, progress=False)
+    assert s.cells().pressure.max() > -18e3
+    assert water(s) == pytest.approx(start, rel=1e-12)
+    s.run(2, 1 / steps, progress=False)
+    assert water(s) == pytest.approx(start, rel=1e-12)
+    assert np.abs(s.points.data["owed"]).max() < 1e-13
+    full = 0.4 * np.sqrt(0.5) / (s.points.J.mean() - 0.6)  # the side gives way by 1e-6
+    assert s.cells().pressure == pytest.approx(-20e3 * np.sqrt(1 / full**2 - 1), rel=1e-9)
+
+
+def test_hydrostatic_suction_is_at_rest():
+    law = mpm.VanGenuchten(WATER / 2, residual=0.1, n=2.0)
+    soil = mpm.Hencky(bulk=1e7, shear=5e6, porosity=0.4, conductivity=1e-5, retention=law)
+    s = column(10, [soil], mpm.hydrostatic(0.33), initial_stress=mpm.K0(0.5), width=2)
+    z = (np.arange(2000) + 0.5) / 2000
+    full = 0.1 + 0.9 / np.sqrt(1 + (2 * np.maximum(z - 0.33, 0)) ** 2)
+    assert water(s) == pytest.approx(0.2 * (0.4 * full).mean(), rel=1e-3)
+    s.run(1000, 500, progress=False)
+    assert heads(s, [0.05, 0.95]) == pytest.approx([0.28, -0.62], abs=1e-10)
+    assert np.abs(s.points.displacement).max() < 1e-10
+    # the weight follows the water: stresses at the base are those of the soil and of the water in it
+    above = (0.6 * 2650 + 400 * full)[z > 0.05].mean() * 0.95
+    assert s.cells().stress[:, 1, 1].min() == pytest.approx(-9.81 * above, rel=1e-3)
+
+
+@pytest.mark.parametrize("off", [0.0, 0.3, 0.5])
+def test_seepage_through_layers_is_exact_at_any_offset(off):
+    """Steady, of exponential soils; in the cell that holds both to first order, beside it to second."""
+    k, a, q, edge, cells = (1e-6, 1e-5), (2.0, 5.0), 0.5e-6, 0.5 + off / 20, 20
+    soils = [
+        mpm.LinearElastic(**STIFF, porosity=0.4, conductivity=one, retention=mpm.Gardner(WATER / rate))
+        for one, rate in zip(k, a, strict=True)
+    ]
+    sides = [mpm.Drained("bottom"), mpm.Inflow("top", q)]
+    s = column(cells, soils, lambda x: -0.1 * WATER * x[:, 1], sides, edge=edge, initial_stress=mpm.K0(0.5))
+    s.run(1e7, 2e6, progress=False)
+
+    def rising(head, i, z):
+        return np.log(q / k[i] + (np.exp(a[i] * head) - q / k[i]) * np.exp(-a[i] * z)) / a[i]
+
+    z = s.cells().x[:, 1]
+    exact = np.where(z < edge, rising(0, 0, z), rising(rising(0, 0, edge), 1, z - edge))
+    error = np.abs(s.cells().pressure / WATER - exact)
+    assert error[np.abs(z - edge) > 0.05].max() < 4e-4
+    assert error.max() < 5e-3
+
+
+@dataclass(frozen=True)
+class Brutsaert(mpm.Retention):
+    """A law derived from the package's."""
+
+    def effective(self, s):
+        return 1 / (1 + (s / self.entry) ** 2)
+
+    def conducts(self, s):
+        return self.effective(s) ** 3
+
+
+class Rising(Liakopoulos):
+    """Wetter where it sucks more."""
+
+    def saturation(self, p):
+        return 1 - p / 1e4
+
+
+@pytest.mark.parametrize(
+    "law, said",
+    [
+        (lambda: mpm.VanGenuchten(0.0), "VanGenuchten: entry = 0.0, must be > 0"),
+        (lambda: mpm.VanGenuchten(1e3, n=1.0), r"VanGenuchten: n = 1.0, must be in \(1, 20\]"),
+        (lambda: mpm.VanGenuchten(1e3, residual=1.0), r"VanGenuchten: residual = 1.0, must be in \[0, 1\)"),
+        (lambda: mpm.BrooksCorey(1e3, index=-1.0), r"BrooksCorey: index = -1.0, must be in \(0, 20\]"),
+        (lambda: mpm.Gardner("wide"), "Gardner: entry = 'wide', must be > 0"),
+        (lambda: mpm.Hencky(1e6, 1e6, retention=3), r"Hencky: retention = 3, must have saturation\(p\) and"),
+        (lambda: mpm.Hencky(1e6, 1e6, retention=Rising()), "saturation never falls to a half"),
+    ],
+)
+def test_what_is_no_law_of_retention_is_refused(law, said):
+    with pytest.raises(ValueError, match=said):
+        law()
+
+
+def test_neither_inertia_nor_a_specific_yield_goes_with_it():
+    law = mpm.Gardner(1e3)
+    with pytest.raises(ValueError, match="inertia: not of soil whose pores drain"):
+        column(2, [mpm.Hencky(1e6, 1e6, retention=law)], 0.0, inertia=True)
+    with pytest.raises(ValueError, match=r"retention beside a specific yield 0\.1, must be one of them"):
+        mpm.Hencky(1e6, 1e6, conductivity_law=mpm.unsaturated(1e3, specific_yield=0.1), retention=law)
+
+
+def test_laws_of_the_users_are_those_of_the_package():
+    """Derived from `Retention`, and an object: the same water as the package's own law."""
+    sides = [mpm.Drained("top", pressure=-2e3)]
+    found = []
+    for law in (mpm.VanGenuchten(5e3, n=2.0, l=0.0), Brutsaert(5e3)):
+        soil = mpm.LinearElastic(**STIFF, porosity=0.4, conductivity=1e-6, retention=law)
+        s = column(5, [soil], -1e4, sides, initial_stress=mpm.K0(0.5))
+        s.run(600, 300, progress=False)
+        found.append(water(s))
+    assert found[0] != pytest.approx(found[1], rel=1e-3)  # laws differ, and both are seen
+
+
+@pytest.mark.parametrize("cells, steps", [(4, 13), pytest.param(50, 160, marks=pytest.mark.slow)])
+def test_a_body_at_rest_in_itself_keeps_its_water_and_suction_wherever_it_is_carried(cells, steps):
+    """Over so many cells by its sides, in steps of a third of a cell, flow and all."""
+    h, table, end = 1 / 8, 0.3, 1000.0
+    grid = mpm.Grid([0, 0], [1 + (cells + 2) * h, 1 + 2 * h], [cells + 10, 10])
+    law = mpm.VanGenuchten(WATER / 2, residual=0.1, n=2.0)
+    soil = mpm.Hencky(bulk=1e7, shear=5e6, porosity=0.4, conductivity=1e-5, retention=law)
+    sides = [mpm.Displacement(side, lambda t: (t / end * cells * h, 0), components="x") for side in ("left", "right")]
+    scene = {"fluid": mpm.Fluid(), "walls": {"bottom": "y"}, "conditions": sides, "gravity": (0, -9.81)}
+    body = mpm.box(grid, [0.3 * h, 0], [1 + 0.3 * h, 7.5 * h])
+    s = mpm.Simulation(grid, [body], [soil], pressure=mpm.hydrostatic(table), initial_stress=mpm.K0(1.0), **scene)
+    start = water(s)
+    s.run(end, end / steps, progress=False)
+    cell = s.cells()
+    assert water(s) == pytest.approx(start, rel=1e-12)
+    assert np.abs(s.points.data["owed"] * s.points.volume0).sum() < 1e-5 * start
+    assert cell.pressure == pytest.approx(WATER * (table - cell.x[:, 1]), abs=1e-3 * WATER * (7.5 * h - table))
+
+
+def test_a_column_in_axisymmetry_and_in_3d_is_that_of_plane_strain():
+    """Water that soaks in from above: the same pressures."""
+    law = mpm.VanGenuchten(5e3, n=2.0)
+    soil = mpm.Hencky(bulk=1e7, shear=5e6, porosity=0.4, conductivity=1e-6, retention=law)
+    found = []
+    for dim, axisymmetric in ((2, False), (2, True), (3, False)):
+        grid = mpm.Grid([0] * dim, [0.2] * (dim - 1) + [1.4], [1] * (dim - 1) + [7], axisymmetric=axisymmetric)
+        walls = {"left": "x", "right": "x", "bottom": "zy"[dim == 2]} | (
+            {"front": "y", "back": "y"} if dim == 3 else {}
+        )
+        scene = {"walls": walls, "gravity": [0] * (dim - 1) + [-9.81], "fluid": mpm.Fluid(), "pressure": -1e4}
+        body = mpm.box(grid, [0] * dim, [0.2] * (dim - 1) + [1.0])
+        rest = mpm.K0(0.5)
+        top = [mpm.Drained("top", pressure=-1e3)]
+        s = mpm.Simulation(grid, [body], [soil], conditions=top, initial_stress=rest, **scene)
+        s.run(1800, 300, progress=False)
+        found.append(s.cells().pressure[np.argsort(s.cells().x[:, -1])])
+    assert found[0][0] < -8e3
+    assert found[1] == pytest.approx(found[0], rel=1e-6)
+    assert found[2] == pytest.approx(found[0], rel=1e-6)
