@@ -250,6 +250,8 @@ def test_the_tangent_of_the_contact_is_its_derivative(friction):
 
     at = 1e-4 * rng.normal(size=unknowns.size)
     residual(at), contact.settle(momentum.at, True)
+    unmet = contact.unmet(momentum.at).off
+    contact.aim(momentum.at, unmet), contact.go(np.ones(len(unmet)))
     way = rng.normal(size=unknowns.size)
     residual(at)
     x, y = unknowns.vector(), unknowns.vector()

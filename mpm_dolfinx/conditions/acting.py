@@ -114,6 +114,16 @@ class At(NamedTuple):
         return self.u.reshape(-1, self.unknowns.dim)
 
 
+class Unmet(NamedTuple):
+    """How far multipliers and loads are from what they are to be (n,), N, what rounding makes of it (n,), N, and the
+    local cells (n,) that they belong to, -1 where there is none.
+    """
+
+    off: NDArray[np.float64]
+    rounding: NDArray[np.float64]
+    cells: NDArray[np.int64]
+
+
 class Loads:
     """What a condition does in a substep; of what a class does not define it does nothing.
 
@@ -134,6 +144,8 @@ class Loads:
     """Whether its tangent joins nodes of different cells."""
     touches: bool = False
     """Whether bodies may part from it."""
+    multiplies: bool = False
+    """Whether it has unknowns of its own, with the methods from `unmet` to `restart`."""
     key: Any = None
     """What the penalty depends on beside the places of faces."""
 
@@ -170,6 +182,33 @@ class Loads:
     def settle(self, at: At, sticks: bool) -> bool:
         """Choose what slips at u, and if asked for what sticks again; return whether it is another choice."""
         return False
+
+    def serves(self, at: At) -> bool:
+        """Return whether on this process the last tangent has what acts at u."""
+        return True
+
+    def unmet(self, at: At) -> Unmet:
+        """Return how far its unknowns are from what they are to be at u."""
+        raise NotImplementedError
+
+    def drive(self, at: At, x: NDArray[np.float64], out: PETSc.Vec) -> None:
+        """Add the forces on the nodes by which a change x (n,), N, of its unknowns would drive the bodies."""
+
+    def response(self, at: At, x: NDArray[np.float64], v: PETSc.Vec) -> NDArray[np.float64]:
+        """Return by how much less (n,), N, `unmet` is after a change x of its unknowns, with displacements v, m.
+
+        It is x where the bodies do not give way.
+        """
+        raise NotImplementedError
+
+    def aim(self, at: At, x: NDArray[np.float64]) -> None:
+        """Let x be the change of its unknowns, N, from u along which `go` goes."""
+
+    def go(self, shares: NDArray[np.float64]) -> None:
+        """Change its unknowns by shares (n,) of that."""
+
+    def restart(self) -> None:
+        """Set its unknowns to where iterations began."""
 
     def augment(self, at: At, unknown: NDArray[np.float64]) -> bool:
         """Go on with other forces where the balance is met; return whether they differ.

@@ -133,7 +133,7 @@ class ToolLoads(ContactProblem):
     def ended(self, at: At) -> Loads:
         """Return the contact with the tools as they have gone."""
         out = copy(self)
-        out._tools = self._tools.going(Ways(*self._times, self._before, self._before + self.found(at).travel))
+        out._tools = self._tools.going(Ways(*self._times, self._before, self._before + self.now.state.way))
         return out
 
     def near(self, points: MaterialPoints, corners: NDArray[np.float64]) -> NDArray[np.bool_] | bool:

@@ -1,13 +1,17 @@
 # SPDX-License-Identifier: MIT
-"""Contact pressure, Coulomb friction and adhesion by conditions, one a contact and cell.
+"""Contact pressure by multipliers, Coulomb friction and adhesion by conditions, one a contact and cell.
 
-The contact pressure at a place with the gap g, and its energy by area, are
+With the gap g of a place, and one multiplier lambda a contact and cell, the contact pressure is
 
-    p = <lambda - k g>,     psi = p^2 / (2 k).
+    p = <lambda - k (g + J lambda)>.
 
-k is no stiffer than lets a Q1 field follow curved surfaces, to which their places ask for more than it has nodes;
-lambda, one value a contact and cell, is at first the pressure of the step before, and augmented (Uzawa) until the
-cells' surfaces penetrate by less than `DEPTH` in the mean.  Friction acts on the mean slip s of the cell in the step,
+lambda is an unknown, and to be the mean of p in the cell (Alart and Curnier 1991): then g + J lambda = 0 in the mean of
+what touches, whatever k is.
+One multiplier a cell is more than a Q1 field on cut cells tells apart: J, the sum of the differences to cells beside
+it, leaves no wave from cell to cell (Burman and Hansbo 2010, Comput. Methods Appl. Mech. Engrg. 199).  A pressure that
+is linear along the surface has none.
+
+Friction acts on the mean slip s of the cell in the step,
 from the traction t_n of the step before, which the points keep,
 
     t = P (t_n - k_t s),     |t| <= mu p + min(adhesion, 10 p)      by radial return,
@@ -23,31 +27,23 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-
-from mpi4py import MPI
+from functools import cached_property
 
 import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
-from mpm_dolfinx.base.errors import NotConverged
 from mpm_dolfinx.base.tolerances import EPSILON, NEAR, TINY
-from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.contact.history import Rough
 from mpm_dolfinx.contact.pairs import Geometry, Pairs
-from mpm_dolfinx.grid.grid import sum_by
-from mpm_dolfinx.parallel.exchange import first, over_all
+from mpm_dolfinx.grid.grid import Grid, sum_by
+from mpm_dolfinx.parallel.exchange import Exchange, over_all
 
-STIFF = 100.0
-"""k in units of (what resists) / (cell size)."""
+JUMP = 0.01
+"""Compliance of differences between cells, in units of (cell size) / (what resists)."""
 GRIP = 6.0
 """k_t in units of (what resists) / (cell size): stiffer shears alternate from cell to cell, which displaces no node."""
-DEPTH = 5e-4  # cells: mean penetration that is left
 TOUCH = 1e-13  # of the grid: what is nearer touches, but for rounding; light bodies press no deeper than 1e-8 cells
-SLIVER = 0.25  # of a cell's face: of what is smaller less penetration counts
-ROUNDS = 20  # augmentations that are tried
-SLOW, STIFFER = 0.6, 10.0
-"""Where a round leaves more than this share of the penetration, k is made so many times larger."""
 RAMP = 10.0  # adhesion over the normal pressure, at most
 
 
@@ -55,21 +51,18 @@ RAMP = 10.0  # adhesion over the normal pressure, at most
 class ContactState:
     """What iterations change of k conditions, beside the displacements.
 
-    pressure : (k,) lambda, Pa; slip : (k, d) direction of the shear of what slips, else zero; resticks : (k,) what has
-    slipped, and stuck again; parts : (k,) and then has left; stuck : (k, d) traction, Pa, of what stuck at the last
-    choice; raised : by how much k has been; off : penetration, cells, of the last round; rounds : of augmentation;
-    follows : how often pairs have been found anew.
+    pressure : (k,) lambda, Pa; way : (contacts,), m, by which loads have pushed tools in the step; slip : (k, d)
+    direction of the shear of what slips, else zero; resticks : (k,) what has slipped, and stuck again; parts : (k,) and
+    then has left; stuck : (k, d) traction, Pa, of what stuck at the last choice; begins : before the first iteration.
     """
 
     pressure: NDArray[np.float64]
+    way: NDArray[np.float64]
     slip: NDArray[np.float64]
     resticks: NDArray[np.bool_]
     parts: NDArray[np.bool_]
     stuck: NDArray[np.float64]
-    raised: float = 1.0
-    off: float = np.inf
-    rounds: int = 0
-    follows: int = 0
+    begins: bool = False
 
     @property
     def slips(self) -> NDArray[np.bool_]:
@@ -81,15 +74,15 @@ class ContactState:
 class Touch:
     """The contact at some displacement: of m pairs, and of k conditions.
 
-    force : (m, d) on the points, N; push : (m,) pressure, Pa; stiff : (m,) minus its derivative by the gap, Pa/m;
-    pressure : (k,) mean of the pressure, Pa; sticks : (k,) what touches, and does not slip; trial, shear : (k, d)
-    traction if all stuck, and as it is, Pa; most : (k,) what it may be, Pa; grip : (k, d, d) minus its derivative by
-    the slip, Pa/m; rise : (k, d) that by the pressure.
+    force : (m, d) on the points, N; push : (m,) pressure, Pa; presses : (m,) what touches; pressure : (k,) mean of the
+    pressure, Pa; sticks : (k,) what touches, and does not slip; trial, shear : (k, d) traction if all stuck, and as it
+    is, Pa; most : (k,) what it may be, Pa; grip : (k, d, d) minus its derivative by the slip, Pa/m; rise : (k, d) that
+    by the pressure.
     """
 
     force: NDArray[np.float64]
     push: NDArray[np.float64]
-    stiff: NDArray[np.float64]
+    presses: NDArray[np.bool_]
     pressure: NDArray[np.float64]
     sticks: NDArray[np.bool_]
     trial: NDArray[np.float64]
@@ -97,6 +90,35 @@ class Touch:
     most: NDArray[np.float64]
     grip: NDArray[np.float64]
     rise: NDArray[np.float64]
+
+
+class Jumps:
+    """Differences of what conditions have to that of conditions in cells beside theirs.
+
+    Parameters
+    ----------
+    grid
+        Background grid.
+    number, cell : (k,)
+        Surface, and owned local cell of each condition; sorted by the first, then by the second.
+    """
+
+    def __init__(self, grid: Grid, number: NDArray[np.int64], cell: NDArray[np.int64]):
+        beside = grid.beside(cell).reshape(len(cell), 2 * grid.dim)
+        row, column = np.nonzero(beside >= 0)
+        asked = grid.cell_number[beside[row, column]].astype(np.int64)
+        self._travel = Exchange(grid.comm, grid.owner(asked))
+        key = self._travel.send(number[row]) * grid.num_local + grid.local(self._travel.send(asked))
+        own = number * grid.num_local + cell
+        at = np.searchsorted(own, key)
+        there = np.append(own, -1)[at] == key
+        self._row, self._there, self._at = row, self._travel.back(there), np.where(there, at, 0)
+
+    def __call__(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the sums (k, n) of the differences of values (k, n)."""
+        sent = values[self._at] if len(values) else np.zeros((len(self._at), values.shape[1]))
+        off = self._there[:, None] * (values[self._row] - self._travel.back(sent))
+        return np.stack([sum_by(self._row, column, len(values)) for column in off.T], axis=1)
 
 
 class ContactLaw:
@@ -111,25 +133,34 @@ class ContactLaw:
     """
 
     def __init__(self, names: Sequence[str], contacts: Sequence[Rough], pairs: Pairs):
-        self.grid = pairs.grid
+        self.grid = grid = pairs.grid
         self.names = names
         self.contacts = contacts
         self.pairs = pairs
-        key, self.of = np.unique(pairs.number * self.grid.num_local + pairs.cell, return_inverse=True)
+        key, self.of = np.unique(pairs.number * grid.num_local + pairs.cell, return_inverse=True)
         self.key = key
         """Contact and cell (k,) of the conditions, in one number."""
+        self.number, self.cell = np.divmod(key, grid.num_local)
         self.area = sum_by(self.of, pairs.area, len(key))
         strength = np.array([(contact.friction, contact.adhesion) for contact in contacts], dtype=float)
-        self.strength = strength[key // self.grid.num_local]
-        h = self.grid.h.min()
-        self._stiffness, self._hold = STIFF / h * pairs.resistance, GRIP / h * self.mean(pairs.resistance)
+        self.strength = strength[self.number]
+        plane = self.total(pairs.area / grid.around(pairs.x))
+        self._jumps = Jumps(grid, self.number, self.cell)
+        face = grid.cell_volume / grid.h.max()
+        self._compliance = JUMP * grid.h.min() * face / (self.mean(pairs.resistance) * plane)
+        self.stiffness = 1 / (4 * (grid.dim - 1) * self._compliance)
+        """k, Pa/m."""
         self.grips = any(contact.grips for contact in contacts)
+        self._hold = GRIP / grid.h.min() * self.mean(pairs.resistance)
 
     def begins(self) -> ContactState:
-        """Return the state in which iterations begin: the pressures of the step before, and all sticks."""
+        """Return the state in which iterations begin: with the pressures of the step before, and all sticks."""
         k, d = len(self.key), self.grid.dim
         none = np.zeros(k, dtype=bool)
-        return ContactState(self.mean(self.pairs.pressure), np.zeros((k, d)), none, none, np.zeros((k, d)))
+        still = np.zeros(len(self.contacts))
+        return ContactState(
+            self.mean(self.pairs.pressure), still, np.zeros((k, d)), none, none, np.zeros((k, d)), begins=True
+        )
 
     def total(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the sums (k, ...) of values (m, ...) in the conditions."""
@@ -143,23 +174,28 @@ class ContactLaw:
         each = (slice(None), *(None,) * (values.ndim - 1))
         return self.total(self.pairs.area[each] * values) / self.area[each]
 
-    def stiffness(self, state: ContactState) -> NDArray[np.float64]:
-        """Return k (m,), Pa/m."""
-        return state.raised * self._stiffness
+    def _off(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return J of multipliers (k,), Pa, in m."""
+        return self._compliance * self._jumps(values[:, None])[:, 0]
 
     def touch(self, state: ContactState, at: Geometry) -> Touch:
         """Return the contact of the pairs where they are."""
-        stiffness = self.stiffness(state)
-        push = np.maximum(0.0, state.pressure[self.of] - stiffness * at.gap)
-        touches = (push > 0) | (at.gap <= TOUCH * np.abs([self.grid.lower, self.grid.upper]).max())
-        pressure = self.mean(push)
+        gap = at.gap + self._off(state.pressure)[self.of]
+        push = state.pressure[self.of] - self.stiffness[self.of] * gap
+        presses = (push > 0) | (gap <= TOUCH * np.abs([self.grid.lower, self.grid.upper]).max())
+        if state.begins and not self.grips:  # bodies have not given way yet: what pressed before does
+            before = state.pressure[self.of] > 0
+            some = self.by_contact(before[:, None].astype(float))[:, 0] > 0
+            presses = np.where(some[self.pairs.number], before, presses)
+        push = presses * push
         on = np.zeros(len(self.area), dtype=bool)
+        on[self.of[presses]] = True
+        pressure = self.mean(push)
         normal = self.mean(at.n)
-        on[self.of[touches]] = True
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), TINY)
         friction = _, _, shear, *_ = self._friction(state, normal, self.mean(at.slip), pressure, on)
         force = self.pairs.area[:, None] * (push[:, None] * at.n + shear[self.of])
-        return Touch(force, push, stiffness * touches, pressure, *friction)
+        return Touch(force, push, presses, pressure, *friction)
 
     def _friction(self, state: ContactState, n: NDArray, slip: NDArray, pressure: NDArray, on: NDArray) -> tuple:
         """Return what a `Touch` has from `sticks` on; n, slip : (k, d), normals and means."""
@@ -177,44 +213,62 @@ class ContactLaw:
         shear = np.where(slips[:, None], most[:, None] * along, trial)
         return ~slips & on, trial, shear, most, grip, rise
 
+    def trial(
+        self, change: NDArray[np.float64], at: Geometry | None = None, apart: NDArray | None = None
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return by how much pressures (m,), Pa, would change if all touched, and the slip (m, d), m.
+
+        change: of multipliers (k,), Pa; apart: by how much the places of pairs move apart (m, d), m.
+        """
+        out = (change - self.stiffness * self._off(change))[self.of]
+        if apart is None:
+            return out, np.zeros((len(out), self.grid.dim))
+        return out - self.stiffness[self.of] * (at.n * apart).sum(axis=1), apart
+
+    def answer(self, touch: Touch, trial: tuple[NDArray[np.float64], NDArray[np.float64]]) -> NDArray[np.float64]:
+        """Return by how much the pressures (k,) do, Pa."""
+        return self.mean(touch.presses * trial[0])
+
+    def acts(
+        self, touch: Touch, at: Geometry, trial: tuple[NDArray[np.float64], NDArray[np.float64]]
+    ) -> NDArray[np.float64]:
+        """Return by how much forces (m, d), N, on the points change, as far as they are smooth."""
+        force = (touch.presses * trial[0])[:, None] * at.n
+        if self.grips:
+            shear = touch.rise * self.answer(touch, trial)[:, None]
+            force = force + (shear - np.einsum("kij,kj->ki", touch.grip, self.mean(trial[1])))[self.of]
+        return self.pairs.area[:, None] * force
+
     def tangent(self, touch: Touch, at: Geometry) -> scipy.sparse.csr_matrix:
         """Return minus the derivative D (m d, m d) of the forces by w; that shears turn is left out."""
         pairs = self.pairs
         d = self.grid.dim
-        m = len(self.pairs.cell)
-        own = touch.stiff[:, None, None] * at.n[:, :, None] * at.n[:, None, :]
+        m = len(pairs.cell)
+        stiff = pairs.area * self.stiffness[self.of] * touch.presses
+        own = stiff[:, None, None] * at.n[:, :, None] * at.n[:, None, :]
         if at.curvature is not None:
-            own = own - touch.push[:, None, None] * at.curvature
-        own = pairs.area[:, None, None] * own
-        D = scipy.sparse.bsr_matrix((own, np.arange(m), np.arange(m + 1)), shape=(m * d, m * d)).tocsr()
+            own = own - (pairs.area * touch.push)[:, None, None] * at.curvature
+        D = scipy.sparse.bsr_matrix((own, np.arange(m), np.arange(m + 1)), shape=(m * d, m * d))
         if not self.grips:
-            return D
-        # means over the conditions, of displacements and of pressures
-        share = pairs.area / self.area[self.of]
-        mean = scipy.sparse.csr_matrix((share, (self.of, np.arange(m))), shape=(len(self.area), m))
-        wide = scipy.sparse.kron(mean, scipy.sparse.identity(d), format="csr")
-        k, whole = len(self.area), self.area[:, None, None]
-        blocks = (np.arange(k), np.arange(k + 1))
-        grip = scipy.sparse.bsr_matrix((whole * touch.grip, *blocks), shape=(k * d, k * d))
-        rise = scipy.sparse.bsr_matrix((whole * touch.rise[:, :, None], *blocks), shape=(k * d, k))
-        pressed = (touch.stiff[:, None] * at.n)[:, None]
-        slope = scipy.sparse.bsr_matrix((pressed, np.arange(m), np.arange(m + 1)), shape=(m, m * d))
-        return (D + wide.T @ (grip @ wide + rise @ (mean @ slope))).tocsr()
+            return D.tocsr()
+        k = len(self.area)
+        columns, blocks = np.arange(m * d), (np.arange(k), np.arange(k + 1))
+        rows = (self.of[:, None] * d + np.arange(d)).ravel()
+        share = np.repeat(pairs.area / self.area[self.of], d)
+        along = scipy.sparse.csr_matrix((share, (rows, columns)), shape=(k * d, m * d))
+        across = (stiff[:, None] * at.n).ravel(), (np.repeat(self.of, d), columns)
+        grip = scipy.sparse.bsr_matrix((self.area[:, None, None] * touch.grip, *blocks), shape=(k * d, k * d))
+        rise = scipy.sparse.bsr_matrix((touch.rise[:, :, None], *blocks), shape=(k * d, k))
+        rises = rise @ scipy.sparse.csr_matrix(across, shape=(k, m * d))
+        return (D + along.T @ (grip @ along + rises)).tocsr()
 
-    def slope(self, touch: Touch, at: Geometry, v: NDArray, adjoint: bool = False) -> NDArray[np.float64]:
-        """Return D v (m, d), or its adjoint, for v (m, d): see `tangent`."""
-        area, across = self.pairs.area[:, None], (touch.stiff * (at.n * v).sum(axis=1))[:, None]
-        out = across * at.n
+    def slope(self, touch: Touch, at: Geometry, v: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return D v (m, d) for v (m, d): see `tangent`."""
+        out = -self.acts(touch, at, self.trial(np.zeros(len(self.area)), at, v))
         if at.curvature is not None:
-            out = out - touch.push[:, None] * np.einsum("mij,mj->mi", at.curvature, v)
-        if self.grips:
-            mean = self.mean(v)
-            if adjoint:
-                out = out + touch.stiff[:, None] * at.n * (touch.rise * mean).sum(axis=1)[self.of, None]
-            else:
-                out = out + (touch.rise * self.mean(across))[self.of]
-            out = out + np.einsum("kji,kj->ki" if adjoint else "kij,kj->ki", touch.grip, mean)[self.of]
-        return area * out
+            push = (self.pairs.area * touch.push)[:, None]
+            out = out - push * np.einsum("mij,mj->mi", at.curvature, v)
+        return out
 
     def choose(self, state: ContactState, touch: Touch, sticks: bool) -> tuple[ContactState, bool]:
         """Choose what slips, and if asked for what sticks again; return the state, and whether the choice is new."""
@@ -233,36 +287,14 @@ class ContactLaw:
         resticks = state.resticks | (before & ~slips)
         return replace(state, slip=slip, resticks=resticks, parts=parts, stuck=stuck), changed
 
-    def augmented(self, state: ContactState, touch: Touch, x: NDArray[np.float64]) -> ContactState:
-        """Return the state with the present pressures for lambda; the same where means penetrate little enough.
+    def unmet(self, state: ContactState, touch: Touch) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return by how much multipliers are off the pressures (k,), N, and what rounding may make of that."""
+        return self.area * (touch.pressure - state.pressure), self.total(self.rounding)
 
-        x : (m, d), m, where the points are.  Raises NotConverged after as many rounds as are tried.
-        """
-        # what is a sliver of a cell has too little area to be pushed out by itself, and goes with its neighbours
-        plane, h = self.total(self.pairs.area / self.grid.around(x)), self.grid.h
-        whole = np.minimum(1.0, plane / (SLIVER * self.grid.cell_volume / h.max()))
-        off = whole * np.abs(touch.pressure - state.pressure) / self.mean(self.stiffness(state)) / h.min()
-        most = over_all(self.grid.comm, float(off.max(initial=0.0)), MPI.MAX)
-        if most <= DEPTH:
-            return state
-        if state.rounds == ROUNDS:
-            number = self.key // self.grid.num_local
-            worst = np.flatnonzero(off == most)[:1]
-            where = [f"{line(self.contacts[number[k]])}: at {x[self.of == k][0] + self.grid.base}" for k in worst]
-            message = f"{''.join(where)} penetrates by {most:.2g} cells: does a wall hold the body there?"
-            raise NotConverged(first(self.grid.comm, message if where else ""))
-        # fluid, or what hardly changes its volume, resists more than k
-        raised = state.raised * (STIFFER if most > SLOW * state.off else 1.0)
-        return replace(state, pressure=touch.pressure, raised=raised, off=most, rounds=state.rounds + 1)
-
-    def rounding(self, state: ContactState) -> NDArray[np.float64]:
-        """Return what rounding of coordinates makes of the forces (m,), N, of the pairs."""
-        return self.rounding_of_gap * self.stiffness(state) * self.pairs.area
-
-    @property
-    def rounding_of_gap(self) -> NDArray[np.float64] | float:
-        """What rounding of coordinates makes of gaps, m; of the pairs (m,), or of all."""
-        return 4 * EPSILON * self.pairs.reach
+    @cached_property
+    def rounding(self) -> NDArray[np.float64]:
+        """What rounding of coordinates makes of the forces (m,), N, of the pairs."""
+        return 4 * EPSILON * self.pairs.reach * self.stiffness[self.of] * self.pairs.area
 
     def by_contact(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the sums (contacts, ...) of values (m, ...) over each contact, of all processes."""
@@ -286,4 +318,4 @@ class ContactLaw:
         """
         old = self.pairs.shear
         off = (old - self.mean(old)[self.of]) * touch.sticks[self.of, None]
-        return touch.push, touch.shear[self.of] + off
+        return touch.pressure[self.of], touch.shear[self.of] + off

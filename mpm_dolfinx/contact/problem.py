@@ -6,13 +6,8 @@ equal and opposite to rounding, whatever the iterations leave.  Where both sides
 first those of the start of the step.  What balances with them is balanced anew with those of where it has come to,
 until gaps are those of the faces at the end of the step.
 
-The way a of a tool that a load pushes is one more unknown, in the direction e: with the forces f(w - a e) on points,
-D minus their derivative by w, and s = e . D e, Newton's method solves e . f = load together with the balance of the
-bodies, by
-
-    da = (e . D dw + load - e . f) / s,
-
-so forces are f + D e (load - e . f) / s, and minus their derivative is D - (D e) (e . D) / s.
+Unknowns beside u are the multipliers, see `law`, and the ways of tools that loads push: these are moved along the
+directions e of their loads until e . f = load.
 """
 
 from __future__ import annotations
@@ -28,18 +23,20 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
-from mpm_dolfinx.base.caching import Latest
+from mpm_dolfinx.base.caching import Latest, same
 from mpm_dolfinx.base.errors import NotConverged
 from mpm_dolfinx.base.tolerances import EPSILON, SAME
-from mpm_dolfinx.conditions.acting import At, Loads
+from mpm_dolfinx.conditions.acting import At, Loads, Unmet
 from mpm_dolfinx.contact.history import Origin
-from mpm_dolfinx.contact.law import DEPTH, ROUNDS, ContactLaw, ContactState, Touch
+from mpm_dolfinx.contact.law import ContactLaw, ContactState, Touch
 from mpm_dolfinx.contact.pairs import Geometry, Pairs, at_nodes, petsc_matrix
 from mpm_dolfinx.forms.unknowns import Unknowns
 from mpm_dolfinx.parallel.exchange import Exchange, over_all
 from mpm_dolfinx.points.material_points import MaterialPoints
 
 FOLLOWS = 8  # how often pairs are found at most in a step
+DEPTH = 5e-4  # cells: by how much gaps may differ from those of pairs that are found anew
+ROUNDS = 20  # steps of tools to where they begin to bear their loads
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,40 +51,23 @@ class Pushes:
     load: NDArray[np.float64]
 
 
-@dataclass(frozen=True, eq=False)
-class Ways:
-    """How far loads push k tools in the step: way (k,), m, at w (m, d), m, and elsewhere
-
-        way + shift + sum slope . (w' - w),
-
-    the sum over the pairs (m,) of each tool: this is how Newton's method goes on from there.
-    """
-
-    w: NDArray[np.float64]
-    way: NDArray[np.float64]
-    shift: NDArray[np.float64]
-    slope: NDArray[np.float64]
-
-
 class Found(NamedTuple):
-    """The contact at some displacement: where pairs are, what acts on them, how far loads push tools (k,), m.
-
-    balanced (m, d), N: forces on the points, with what those change by as tools go on to where they meet their loads.
-    """
+    """The contact at some displacement: where pairs are, and what acts on them."""
 
     at: Geometry
     touch: Touch
-    travel: NDArray[np.float64]
-    balanced: NDArray[np.float64]
 
 
 class Current(NamedTuple):
-    """The conditions of the pairs as they are found at present, where these come from, and the state of iterations."""
+    """The conditions of the pairs as they are found at present, where these come from, and the state of iterations.
+
+    follows: how often pairs have been found anew.
+    """
 
     law: ContactLaw
     origin: Origin
     state: ContactState
-    ways: Ways | None = None
+    follows: int = 0
 
 
 class ContactProblem(Loads):
@@ -105,7 +85,7 @@ class ContactProblem(Loads):
         Returns all pairs of lexicographic cells that pairs of this process may be in, first * cells + second.
     """
 
-    linear, smooth, touches = False, False, True
+    linear, smooth, touches, multiplies = False, False, True, True
 
     def __init__(
         self,
@@ -123,7 +103,10 @@ class ContactProblem(Loads):
         self._operator: Latest[tuple[PETSc.Mat, PETSc.Vec]] = Latest()
         self._found: Latest[Found] = Latest()
         if self.pushed:
-            self.now = self.now._replace(ways=self._linearised(np.zeros_like(law.pairs.x), self._begins()))
+            self.now = self.now._replace(state=self._started())
+        self._begun = self._aimed = self.now
+        self._change = np.zeros(self._size)
+        self._tangent: tuple = ()
 
     @property
     def pairs(self) -> Pairs:
@@ -138,12 +121,22 @@ class ContactProblem(Loads):
     @property
     def couples(self) -> bool:
         """Whether nodes of different cells act on one another through the contact."""
-        return self.pushed or self._reach is not None
+        return self._reach is not None
+
+    @property
+    def _loads(self) -> NDArray[np.float64]:
+        """Loads on the tools (contacts,), N, nan where there is none."""
+        return np.full(len(self.now.law.contacts), np.nan) if self.pushes is None else self.pushes.load
+
+    @property
+    def _size(self) -> int:
+        """Unknowns on this process."""
+        return len(self.now.law.area) + len(self.now.law.contacts)
 
     def found(self, at: At) -> Found:
         """Return the contact at u."""
         key = self.now, at.unknowns, at.u[at.unknowns.owned]
-        return self._found(key, lambda: self._find(self._apart_by(self.now.law, at)), self.grid.comm)
+        return self._found(key, lambda: self._find(self._apart_by(self.now.law, at), self.now.state), self.grid.comm)
 
     def _apart_by(self, law: ContactLaw, at: At) -> NDArray[np.float64]:
         """Return w (m, d), m, of the pairs of a law."""
@@ -160,185 +153,211 @@ class ContactProblem(Loads):
 
         return self._operator((law, unknowns), make, self.grid.comm) if law is self.now.law else make()
 
-    def _find(self, w: NDArray[np.float64]) -> Found:
-        return self._find_at(w, self._way(w) if self.pushed else np.zeros(len(self.now.law.contacts)))
-
-    def _find_at(self, w: NDArray[np.float64], way: NDArray[np.float64]) -> Found:
-        law = self.now.law
-        state = self.now.state
-        of = self.pairs.number
-        at = law.pairs.at(w, way)
-        touch = law.touch(state, at)
-        found = Found(at, touch, way, touch.force)
-        if not self.pushed:
-            return found
-        more = law.slope(touch, at, self._shift(found)[of, None] * self.pushes.direction[of])
-        return found._replace(balanced=touch.force + more)
+    def _find(self, w: NDArray[np.float64], state: ContactState) -> Found:
+        at = self.pairs.at(w, state.way)
+        return Found(at, self.now.law.touch(state, at))
 
     def push(self, at: At, residual: PETSc.Vec, on: Unknowns) -> None:
         """Take the forces at u off."""
+        self._add(at, residual, on, -self.found(at).touch.force)
+
+    def _add(self, at: At, out: PETSc.Vec, on: Unknowns, force: NDArray[np.float64]) -> None:
+        """Add forces on the points (m, d), N, to those of the nodes."""
         B, w = self._B(self.now.law, at.unknowns)
-        w.array_w[:] = -self.found(at).balanced.ravel()
+        w.array_w[:] = force.ravel()
         B = B if on is at.unknowns else self.pairs.operator(on)
-        B.multTransposeAdd(w, residual, residual)
+        B.multTransposeAdd(w, out, out)
 
     def pattern(self, unknowns: Unknowns) -> PETSc.Mat | None:
-        """Return zeros wherever a `coupling` may have entries in the step that cells have not; None if nowhere."""
-        out = self._pattern_of_pairs(unknowns) if self._reach is not None else None
-        for number in np.flatnonzero(~np.isnan(self.pushes.load)) if self.pushed else ():
-            own = self._nodal(unknowns, np.repeat((self.pairs.number == number)[:, None], self.grid.dim, axis=1))
-            more = _outer(own, own)
-            out = more if out is None else out + more
-        if out is not None:
-            out.zeroEntries()
-        return out
-
-    def _pattern_of_pairs(self, unknowns: Unknowns) -> PETSc.Mat:
-        """Return something wherever pairs that follow the bodies may couple nodes."""
+        """Return zeros wherever pairs that follow the bodies may couple nodes in the step; None without such."""
+        if self._reach is None:
+            return None
         grid, d = self.grid, self.grid.dim
         cell, other = np.divmod(self._reach(), len(grid.owners))
         travel = Exchange(grid.comm, grid.owner(cell))
         cell, other = travel.send(cell), travel.send(other)
         key, of = np.unique(cell, return_inverse=True)
         m = len(cell)
-        together = scipy.sparse.identity(m)
-        if self.now.law.grips:
-            all_of = scipy.sparse.csr_matrix((np.ones(m), (of, np.arange(m))), shape=(len(key), m))
-            together = all_of.T @ all_of
+        all_of = scipy.sparse.csr_matrix((np.ones(m), (of, np.arange(m))), shape=(len(key), m))
+        together = all_of.T @ all_of
         all_of = scipy.sparse.kron(together, np.ones((d, d)), format="csr")
         B = at_nodes(grid, unknowns, grid.local(cell), np.ones((m, 2 ** (d + 1))), other)
-        return petsc_matrix(all_of, m * d, grid.comm, own=True).PtAP(B)
+        out = petsc_matrix(all_of, m * d, grid.comm, own=True).PtAP(B)
+        out.zeroEntries()
+        return out
 
     def coupling(self, at: At) -> PETSc.Mat:
         """Return minus the derivative of the forces at u."""
+        where, touch = self.found(at)
+        law = self.now.law
+        self._tangent = law, touch.presses
+        B, _ = self._B(law, at.unknowns)
+        return petsc_matrix(law.tangent(touch, where), B.getLocalSize()[0], self.grid.comm, own=True).PtAP(B)
+
+    def serves(self, at: At) -> bool:
+        """Return whether what touches at u on this process did so where the tangent was assembled."""
+        return same(self._tangent, (self.now.law, self.found(at).touch.presses))
+
+    def unmet(self, at: At) -> Unmet:
+        """Return by how much multipliers are off the tractions at u, and loads of tools off what these meet, N."""
         found = self.found(at)
         law = self.now.law
-        unknowns = at.unknowns
-        where, touch, *_ = found
-        B, _ = self._B(law, unknowns)
-        K = petsc_matrix(law.tangent(touch, where), B.getLocalSize()[0], self.grid.comm, own=True).PtAP(B)
+        off, unknown = law.unmet(self.now.state, found.touch)
+        met, slope, how_well = self._met(found)
+        own = self.grid.comm.rank == 0  # each load counts once
+        touching = np.full(len(law.contacts), -1)
+        touching[self.pairs.number[found.touch.presses]] = self.pairs.cell[found.touch.presses]
+        goes = (slope > 0) & (np.abs(self.now.state.way) < self.grid.h.min())
+        load = own * np.where(goes, np.nan_to_num(self._loads - met), 0.0)
+        cells = np.concatenate([law.cell, touching])
+        return Unmet(np.concatenate([off, load]), np.concatenate([unknown, own * how_well]), cells)
+
+    def drive(self, at: At, x: NDArray[np.float64], out: PETSc.Vec) -> None:
+        """Add the forces on the nodes by which a change x of the unknowns, N, would drive the bodies."""
+        where, touch = found = self.found(at)
+        law = self.now.law
+        change, gone = self._split(found, x)
+        force = law.acts(touch, where, law.trial(change))
+        self._add(at, out, at.unknowns, force + law.slope(touch, where, gone) if self.pushed else force)
+
+    def response(self, at: At, x: NDArray[np.float64], v: PETSc.Vec) -> NDArray[np.float64]:
+        """Return by how much x, with displacements v, m, brings multipliers and loads nearer: see `Loads`."""
+        where, touch = found = self.found(at)
+        law = self.now.law
+        change, gone = self._split(found, x)
+        B, w = self._B(law, at.unknowns)
+        B.mult(v, w)
+        apart = w.array_r.reshape(-1, self.grid.dim) - gone
+        nearer = change - law.answer(touch, law.trial(change, where, apart))
+        met = np.zeros(len(law.contacts))
+        if self.pushed:
+            met = self._along_loads(law.acts(touch, where, law.trial(change)) - law.slope(touch, where, apart))
+        return np.concatenate([law.area * nearer, met * (self.grid.comm.rank == 0)])
+
+    def aim(self, at: At, x: NDArray[np.float64]) -> None:
+        """Let x be the change of the unknowns, N, along which `go` goes from where they are at u."""
+        change, _ = self._split(self.found(at), x)
+        self._aimed = self.now
+        self._change = np.concatenate([change, self._ways(self.found(at), x)])
+
+    def go(self, shares: NDArray[np.float64]) -> None:
+        """Go so far along the change of the unknowns, shares (n,) of it."""
+        law, state = self.now.law, self._aimed.state
+        count = len(law.contacts)
+        change = shares * self._change
+        pressure = state.pressure + change[: len(change) - count]
+        h = self.grid.h.min()
+        way = over_all(self.grid.comm, change[len(change) - count :]) / self.grid.comm.size
+        gone = replace(state, pressure=pressure, way=np.clip(state.way + way, -h, h), begins=False)
+        self.now = self._aimed._replace(state=gone)
+
+    def restart(self) -> None:
+        """Go back to where the iterations began."""
+        self.now = self._begun
+
+    def _split(self, found: Found, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return a change x of multipliers (k,), Pa, and how far it moves the places of tools (m, d), m."""
+        law = self.now.law
+        change = x[: len(x) - len(law.contacts)] / law.area
         if not self.pushed:
-            return K
+            return change, np.zeros((len(law.of), self.grid.dim))
         _, slope, _ = self._met(found)
-        for k in np.flatnonzero((slope > 0) & ~np.isnan(self.pushes.load)):
-            e = self.pushes.direction[k] * (self.pairs.number == k)[:, None]
-            sides = (self._nodal(unknowns, law.slope(touch, where, e, adjoint)) for adjoint in (False, True))
-            K.axpy((SAME - 1) / slope[k], _outer(*sides), PETSc.Mat.Structure.UNKNOWN)
-        return K
+        load = over_all(self.grid.comm, x[len(x) - len(law.contacts) :])
+        gone = np.divide(load, slope, out=np.zeros(len(load)), where=slope > 0)
+        return change, gone[self.pairs.number, None] * self.pushes.direction[self.pairs.number]
 
-    def _nodal(self, unknowns: Unknowns, values: NDArray[np.float64]) -> PETSc.Vec:
-        """Return B^T of values (m, d) at the pairs."""
-        B, w = self._B(self.now.law, unknowns)
-        w.array_w[:] = values.ravel()
-        out = unknowns.vector()
-        B.multTranspose(w, out)
-        return out
-
-    def _way(self, w: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return how far (tools,), m, loads push tools at w (m, d), m: along the line of the last Newton step."""
-        ways, h = self.now.ways, self.grid.h.min()
-        if not over_all(self.grid.comm, int((w != ways.w).any())):
-            return ways.way
-        more = self.now.law.by_contact((ways.slope * (w - ways.w)).sum(axis=1)[:, None])[:, 0]
-        return np.clip(ways.way + ways.shift + more, -h, h)
-
-    def _linearised(self, w: NDArray[np.float64], way: NDArray[np.float64]) -> Ways:
-        """Return the ways of tools, and how they go on where the bodies do."""
-        law, of = self.now.law, self.pairs.number
-        at, touch, *_ = found = self._find_at(w, way)
+    def _ways(self, found: Found, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return how far x moves tools (contacts,), m."""
+        load = x[len(x) - len(self.now.law.contacts) :]
+        if not self.pushed:
+            return 0 * load
         _, slope, _ = self._met(found)
-        by = np.divide(1, slope, out=np.zeros(len(slope)), where=slope > 0)
-        shift = self._shift(found)
-        return Ways(w, way, shift, by[of, None] * law.slope(touch, at, self.pushes.direction[of], adjoint=True))
+        return np.divide(over_all(self.grid.comm, load), slope, out=np.zeros(len(load)), where=slope > 0)
+
+    def _nearer(self, found: Found) -> NDArray[np.float64]:
+        """Return how far tools that nothing touches go to meet their loads at one place (contacts,), m."""
+        met, _, _ = self._met(found)
+        far, touches = self._seek(found)
+        return np.where((np.nan_to_num(self._loads - met) > 0) & ~touches, np.minimum(far, self.grid.h.min()), 0.0)
+
+    def _along_loads(self, force: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the sums (contacts,), N, of forces (m, d) on the points along the loads of tools."""
+        along = (self.pushes.direction[self.pairs.number] * force).sum(axis=1)
+        return self.now.law.by_contact(along[:, None])[:, 0] * ~np.isnan(self._loads)
 
     def _met(self, found: Found) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Return what tools meet along their loads (tools,), N, its derivative, N/m, and how well it can be met, N."""
-        law, e = self.now.law, self.pushes.direction[self.pairs.number]
-        slope = law.slope(found.touch, found.at, e)
-        met, slope = law.by_contact(np.stack([(e * found.touch.force).sum(axis=1), (e * slope).sum(axis=1)], axis=1)).T
-        off = law.rounding(self.now.state) * (found.touch.stiff > 0)
-        return met, slope, law.by_contact(off[:, None])[:, 0]
+        """Return what tools meet along their loads (contacts,), N, its derivative, N/m, and how well it is known, N."""
+        law = self.now.law
+        if not self.pushed:
+            return (np.zeros(len(law.contacts)),) * 3
+        slope = self._along_loads(law.slope(found.touch, found.at, self.pushes.direction[self.pairs.number]))
+        off = law.rounding * found.touch.presses
+        return self._along_loads(found.touch.force), slope, law.by_contact(off[:, None])[:, 0]
 
     def _seek(self, found: Found) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Return how far tools go (tools,), m, until a place alone would bear the load, and which tools touch.
+        """Return how far tools go (contacts,), m, until a place alone would bear the load, and which tools touch.
 
         Infinity where there is no such place.
         """
         law = self.now.law
-        state = self.now.state
         of = self.pairs.number
-        along, k = (found.at.n * self.pushes.direction[of]).sum(axis=1), law.stiffness(state)
+        k = law.stiffness[law.of]
+        along = (found.at.n * self.pushes.direction[of]).sum(axis=1)
         with np.errstate(divide="ignore", invalid="ignore"):
-            far = found.at.gap - state.pressure[law.of] / k + self.pushes.load[of] / (k * self.pairs.area * along)
+            more = self.pushes.load[of] / (self.pairs.area * along) - self.now.state.pressure[law.of]
+            far = found.at.gap + more / k
             far = np.where(along > 0, far / along, np.inf)
         nearest = np.full(len(self.pushes.load), np.inf)
         np.minimum.at(nearest, of, far)
         touches = law.by_contact((found.touch.push > 0)[:, None].astype(float))[:, 0] > 0
         return over_all(self.grid.comm, nearest, MPI.MIN), touches
 
-    def _shift(self, found: Found) -> NDArray[np.float64]:
-        """Return how far tools go on (tools,), m, to meet their loads by their slope."""
-        met, slope, _ = self._met(found)
-        off = np.nan_to_num(self.pushes.load - met)
-        far, touches = self._seek(found)
-        seeks = np.where((off > 0) & ~touches, np.minimum(far, self.grid.h.min()), 0.0)  # what slips resists no more
-        return np.divide(off, slope, out=seeks, where=slope > 0)
-
-    def _begins(self) -> NDArray[np.float64]:
-        """Return how far tools go (tools,), m, before the bodies do: at most to where one place would bear the load."""
-        way = np.zeros(len(self.now.law.contacts))
+    def _started(self) -> ContactState:
+        """Return the state with tools where they go before the bodies do: at most to where one place bears the load."""
+        state = self.now.state
         still = np.zeros_like(self.pairs.x)
         h = self.grid.h.min()
         for _ in range(ROUNDS):
-            found = self._find_at(still, way)
-            before, way = way, np.clip(way + np.minimum(self._shift(found), self._seek(found)[0]), -h, h)
-            if np.abs(way - before).max() <= EPSILON * self.grid.reach:
+            found = self._find(still, state)
+            met, slope, _ = self._met(found)
+            shift = np.divide(np.nan_to_num(self._loads - met), slope, out=self._nearer(found), where=slope > 0)
+            before = state.way
+            state = replace(state, way=np.clip(before + np.minimum(shift, self._seek(found)[0]), -h, h))
+            if np.abs(state.way - before).max() <= EPSILON * self.grid.reach:
                 break
-        return way
+        return state
 
     def settle(self, at: At, sticks: bool) -> bool:
         """Choose what slips at u, and if asked for what sticks again; return whether that is another choice."""
-        changed, w = False, self._apart_by(self.now.law, at) if self.pushed else None
-        way = self.found(at).travel
+        found, state, changed = self.found(at), self.now.state, False
         if self.now.law.grips:
-            state, changed = self.now.law.choose(self.now.state, self.found(at).touch, sticks)
-            self.now = self.now._replace(state=state)
-        if self.pushed:
-            self.now = self.now._replace(ways=self._linearised(w, way))
+            state, changed = self.now.law.choose(state, found.touch, sticks)
+        if self.pushed and (nearer := self._nearer(found)).any():
+            h = self.grid.h.min()
+            state, changed = replace(state, way=np.clip(state.way + nearer, -h, h)), True
+        self.now = self.now._replace(state=state)
         return changed
 
     def augment(self, at: At, unknown: NDArray[np.float64]) -> bool:
-        """Augment the pressures where means penetrate too deep at u; return whether they do.
-
-        Where they do not, tools that do not meet their loads go on to where they may.
-        """
-        found = self.found(at)
-        law = self.now.law
-        state = self.now.state
-        new = law.augmented(state, found.touch, self.pairs.x)
-        self.now = self.now._replace(state=new)
-        if new is not state or not self.pushed:
-            return new is not state
-        met, slope, unknown = self._met(found)
-        load, h = self.pushes.load, self.grid.h.min()
-        off = np.nan_to_num(met - load)
-        wrong = np.abs(off) > np.maximum(SAME * np.nan_to_num(load), unknown)
-        if not wrong.any():
+        """Refuse tools that do not meet their loads."""
+        if not self.pushed:
             return False
+        found = self.found(at)
+        met, slope, how_well = self._met(found)
+        load, h = self.pushes.load, self.grid.h.min()
+        wrong = np.abs(np.nan_to_num(met - load)) > np.maximum(SAME * np.nan_to_num(load), how_well)
         _, touches = self._seek(found)
-        lost = wrong & ((found.travel >= h) | (touches & (slope <= 0)))
+        lost = wrong & ((self.now.state.way >= h) | (touches & (slope <= 0)))
         for k in np.flatnonzero(lost)[:1]:
             why = f"meets {met[k]:.6g} N, however far it goes: do the bodies hold it?"
             if met[k] == 0:
                 why = "meets nothing within a cell: does it begin where it touches the bodies?"
             raise NotConverged(f"{self.pushes.names[k]}: is pushed by {load[k]:.6g} N and {why}")
-        ways = self.now.ways
-        self.now = self.now._replace(ways=self._linearised(ways.w, np.clip(ways.way + ways.shift * wrong, -h, h)))
-        return True
+        return False
 
     def follow(self, at: At) -> bool:
         """Find pairs anew at u, a local array, m; return whether these change the balance."""
-        if self._again is None or self.now.state.follows == FOLLOWS:
+        if self._again is None or self.now.follows == FOLLOWS:
             return False
         new = Current(*self._again(at.u), self.now.state)
         new, off = self._continued(new, at)
@@ -364,14 +383,15 @@ class ContactProblem(Loads):
         carried = {name: getattr(fresh, name).copy() for name in ("pressure", "slip", "resticks")}
         for name, values in carried.items():
             values[here] = getattr(state, name)[there]
-        fresh = replace(fresh, **carried, raised=state.raised, follows=state.follows + 1)
         _, row, there = np.intersect1d(pairs.place, self.pairs.place, return_indices=True)
         push = found.touch.push
         off, lost = np.maximum(-gap, 0.0), push > 0
         off[row] = np.where((push[there] > 0) | (gap[row] < 0), np.abs(gap[row] - found.at.gap[there]), 0.0)
         lost[there] = False
         most = float(off.max(initial=0.0)) / self.grid.h.min() if not lost.any() else np.inf
-        return Current(now, new.origin, fresh), over_all(self.grid.comm, most, MPI.MAX)
+        state = replace(fresh, **carried, way=state.way, begins=False)
+        going_on = Current(now, new.origin, state, self.now.follows + 1)
+        return going_on, over_all(self.grid.comm, most, MPI.MAX)
 
     def gripped(self, at: At, points: MaterialPoints) -> MaterialPoints:
         """Return the points with the pressures and shear tractions that contacts have on them at u."""
@@ -381,11 +401,11 @@ class ContactProblem(Loads):
 
     def outcome(self, at: At) -> dict[str, dict[str, NDArray[np.float64]]]:
         """Return forces and moments (d + 1,), in 3D (6,), on the bodies, N and N m, and how far loads push tools, m."""
-        where, touch, travel, _ = self.found(at)
+        where, touch = self.found(at)
         names = self.now.law.names
         out = {"tool_forces": dict(zip(names, self.now.law.forces(touch, where), strict=True))}
         if self.pushes is not None:
-            out["tool_travel"] = dict(zip(names, self.pushes.start + travel, strict=True))
+            out["tool_travel"] = dict(zip(names, self.pushes.start + self.now.state.way, strict=True))
         return out
 
     def touching(self) -> tuple[NDArray[np.int32], NDArray[np.int64] | None, NDArray[np.float64], NDArray[np.float64]]:
@@ -393,11 +413,11 @@ class ContactProblem(Loads):
 
         That is what touches at the start of the step.
         """
-        at, touch, *_ = self._find_at(np.zeros_like(self.pairs.x), np.zeros(len(self.now.law.contacts)))
         law = self.now.law
+        at, touch = self._find(np.zeros_like(self.pairs.x), replace(self.now.state, way=np.zeros(len(law.contacts))))
         d = self.grid.dim
         other = self.pairs.other_side()
-        on = np.flatnonzero(touch.stiff > 0)
+        on = np.flatnonzero(touch.presses)
         rough = on[law.strength.any(axis=1)[law.of[on]]]
         rows = np.concatenate([on, np.repeat(rough, d)])
         along = np.concatenate([at.n[on], np.tile(np.eye(d), (len(rough), 1))])
@@ -408,7 +428,7 @@ class ContactProblem(Loads):
         if self.pairs.other_side() is not None:
             return of_cells
         out, cells = of_cells.copy(), self.pairs.cell
-        np.maximum.at(out, cells, out[cells] + self.now.law.rounding(self.now.state))
+        np.maximum.at(out, cells, out[cells] + self.now.law.rounding)
         return out
 
     @property
@@ -416,17 +436,4 @@ class ContactProblem(Loads):
         """What rounding leaves on other sides, in other cells."""
         if self.pairs.other_side() is None:
             return 0.0
-        return over_all(self.grid.comm, float(self.now.law.rounding(self.now.state).max(initial=0.0)), MPI.MAX)
-
-
-def _outer(a: PETSc.Vec, b: PETSc.Vec) -> PETSc.Mat:
-    """Return a b^T, of what is not zero."""
-    start, comm = b.owner_range[0], b.comm.tompi4py()
-    rows, columns = np.flatnonzero(a.array_r), np.flatnonzero(b.array_r)
-    at, value = start + columns, b.array_r[columns]
-    if comm.size > 1:
-        at, value = (np.concatenate(comm.allgather(part)) for part in (at, value))
-    entries = np.outer(a.array_r[rows], value).ravel()
-    where = np.repeat(rows, len(at)), np.tile(at, len(rows))
-    matrix = scipy.sparse.csr_matrix((entries, where), shape=(len(a.array_r), max(1, b.size)))
-    return petsc_matrix(matrix, len(b.array_r), comm)
+        return over_all(self.grid.comm, float(self.now.law.rounding.max(initial=0.0)), MPI.MAX)

@@ -13,8 +13,9 @@ itself.  The derivatives are UFL's.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
+from typing import NamedTuple
 
 from petsc4py import PETSc
 
@@ -40,6 +41,7 @@ from mpm_dolfinx.mechanics.mean_dilatation import MeanDilatation
 from mpm_dolfinx.mechanics.own_terms import OwnTerms
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
 from mpm_dolfinx.mechanics.weight import Weight
+from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.parts import OfParts, Parts, parts_of_cells, relative
 
 
@@ -337,6 +339,14 @@ class MomentumSystem:
             self.firm.assemble()
 
 
+class UnmetOfParts(NamedTuple):
+    """How far multipliers are from what they are to be (n,), N, rounding of it (n,), N, and their parts (n,)."""
+
+    off: NDArray[np.float64]
+    rounding: NDArray[np.float64]
+    part: NDArray[np.int64]
+
+
 class MomentumProblem:
     """The balance of momentum of one step.
 
@@ -377,6 +387,8 @@ class MomentumProblem:
         self._goes_on = goes_on
         self._tolerance = tolerance
         self._varying = [one for one in loads if one.varies]
+        self._multiplying = [one for one in loads if one.multiplies]
+        self._part = np.empty(0, dtype=np.int64)
         with Timer("mpm: loads"):
             external, pulls = (
                 forms.summed(1 + room, [getattr(one, name) for one in loads])[system.touched]
@@ -402,6 +414,62 @@ class MomentumProblem:
     def settle(self, sticks: bool) -> bool:
         """Choose what slips at u, and if asked for what sticks again; return whether it is another choice."""
         return any([one.settle(self.at, sticks) for one in self.loads])
+
+    @property
+    def multiplies(self) -> bool:
+        """Whether loads have unknowns of their own."""
+        return bool(self._multiplying)
+
+    @property
+    def serves(self) -> bool:
+        """Whether the last tangent has what acts at u, on all processes."""
+        other = [not one.serves(self.at) for one in self._multiplying]
+        return not over_all(self.forms.grid.comm, int(any(other)))
+
+    def unmet(self) -> UnmetOfParts:
+        """Return how far multipliers are from what they are to be at u."""
+        each = [one.unmet(self.at) for one in self._multiplying]
+        off, rounding, cells = map(np.concatenate, zip(*each, strict=True))
+        return UnmetOfParts(off, rounding, self.system.parts.cells[cells] * (cells >= 0))
+
+    def unmet_of_parts(self) -> NDArray[np.float64]:
+        """Return the norms (parts,), N, of what multipliers are off by at u, but for rounding."""
+        if not self.multiplies:
+            return np.zeros(self.system.parts.count)
+        unmet = self.unmet()
+        of = OfParts(self.forms.grid.comm, unmet.part, self.system.parts.count)
+        return of.norms(np.maximum(np.abs(unmet.off) - unmet.rounding, 0.0))
+
+    def drive(self, x: NDArray[np.float64], out: PETSc.Vec) -> None:
+        """Add the forces by which a change x of all multipliers, N, would drive the bodies."""
+        for one, own in self._own(x):
+            one.drive(self.at, own, out)
+
+    def response(self, x: NDArray[np.float64], v: PETSc.Vec) -> NDArray[np.float64]:
+        """Return by how much what is unmet falls by x, N, and displacements v, m."""
+        return np.concatenate([one.response(self.at, own, v) for one, own in self._own(x)])
+
+    def aim(self, x: NDArray[np.float64]) -> None:
+        """Let x be the change of multipliers, N, along which `go` goes."""
+        self._part = self.unmet().part
+        for one, own in self._own(x):
+            one.aim(self.at, own)
+
+    def go(self, steps: NDArray[np.float64]) -> None:
+        """Change the multipliers of each part by its share (parts,) of that."""
+        if self.multiplies:
+            for one, own in self._own(steps[self._part]):
+                one.go(own)
+
+    def restart(self) -> None:
+        """Set multipliers to where iterations began."""
+        for one in self._multiplying:
+            one.restart()
+
+    def _own(self, x: NDArray[np.float64]) -> Iterator[tuple[Loads, NDArray[np.float64]]]:
+        """Return each of the loads with unknowns of its own, and its part of x (n,)."""
+        ends = np.cumsum([len(one.unmet(self.at).off) for one in self._multiplying])
+        return zip(self._multiplying, np.split(x, ends[:-1]), strict=True)
 
     def augment(self, forces: NDArray[np.float64]) -> bool:
         """Let what is in balance go on with other forces, or at other places; return whether these are others.

@@ -22,6 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 from mpi4py import MPI
 
@@ -37,6 +38,7 @@ from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.parts import relative
 from mpm_dolfinx.solve.linear import negative_pivots
+from mpm_dolfinx.solve.multipliers import solved_with
 from mpm_dolfinx.solve.schur import Kept, LinearSolvers
 from mpm_dolfinx.solve.search import FIRM, Halving, Search
 
@@ -209,6 +211,7 @@ class Newton:
                 return self._iterations(errors, as_reset, key, fresh)
             except NotConverged:
                 self._go_to(other)
+                self._momentum.restart()
                 errors, fresh = self._errors(errors.start), True
         return self._iterations(errors, as_reset, key, fresh)
 
@@ -236,7 +239,7 @@ class Newton:
             count, slow = count + 1, fresh
             # inf where no fluid has moved yet
             lags = (errors.each > keep * np.minimum(1.0, before.each)) & (errors.each > tolerance)
-            fresh, eases = bool(lags.any()), eases & (elastic | ~lags)
+            fresh, eases = bool(lags.any()) or not self._momentum.serves, eases & (elastic | ~lags)
             seeps = self._storage is not None and self._storage.settle_seepage()
             if self._momentum.settle(errors.worst <= SETTLED) or seeps:
                 errors, fresh = self._errors(errors.start), True
@@ -326,12 +329,18 @@ class Newton:
             if count and errors.u.max() <= goal:
                 return
             with Timer("mpm: linear solve"):
-                self._solvers.solve_momentum()
+                solved_with(self._solvers, self._momentum, None, self._solve_momentum, np.zeros(len(errors.u), bool))
             before, errors = errors.u.max(), self._line_search(errors, True)
             settled = self._momentum.settle(errors.u.max() <= SETTLED)
             errors = self._errors(errors.start) if settled else errors
-            if settled or errors.u.max() > max(goal, self._solvers.plan.keep * before):
+            serves = self._momentum.serves and not settled
+            if not serves or errors.u.max() > max(goal, self._solvers.plan.keep * before):
                 self._linearise()
+
+    def _solve_momentum(self) -> int:
+        """Solve for displacements at fixed pressure; return 0."""
+        self._solvers.solve_momentum()
+        return 0
 
     def _check(self, count: int, kind: str) -> None:
         if count >= getattr(self._scheme, f"most_{kind}"):
@@ -350,6 +359,8 @@ class Newton:
             r, forces = self._momentum.residual_of_parts()
             forces = forces if start is None else np.maximum(start, forces)
             u, told = self._momentum.out_of_balance(r, forces, first)
+            unmet = relative(self._momentum.unmet_of_parts(), forces)
+            u, told = np.maximum(u, unmet), np.maximum(told, unmet)
             p = np.zeros_like(u)
             told_p = np.zeros_like(u)
             exchanged = np.zeros_like(u)
@@ -405,16 +416,17 @@ class Newton:
             if self._storage is not None:
                 errors.fluid.vector.array_w[done[self._storage.system.of_parts.of]] = 0.0
         forces = np.maximum(errors.forces, self._momentum.system.round_off / self._scheme.tolerance)
+        measures = [forces]
         with Timer("mpm: linear solve"):
-            if errors.fluid is None:
-                return self._solvers.solve(self._kept, rtol, forces)
-            least = errors.fluid.round_off / self._scheme.tolerance
-            measures = forces, np.maximum(errors.exchanged, least)
-            if not slow or self._linear:
-                return self._solvers.solve(self._kept, rtol, *measures)
-            slope = self._storage.flux_slope(self._momentum.forms.u, self._momentum.system.unknowns)
-            count = self._solvers.solve(self._kept, rtol, *measures, slope)
-            self._storage.set_fluxes()
+            if errors.fluid is not None:
+                least = errors.fluid.round_off / self._scheme.tolerance
+                measures.append(np.maximum(errors.exchanged, least))
+                if slow and not self._linear:
+                    measures.append(self._storage.flux_slope(self._momentum.forms.u, self._momentum.system.unknowns))
+            solve = partial(self._solvers.solve, self._kept, rtol, *measures)
+            count = solved_with(self._solvers, self._momentum, self._storage, solve, done)
+            if len(measures) > 2:
+                self._storage.set_fluxes()
             return count
 
     def _line_search(self, before: Errors, elastic: bool) -> Errors:
@@ -422,6 +434,7 @@ class Newton:
         self.report.newton += 1
         of = self._momentum.system.of_parts
         first = self._work()
+        sign = np.where(first < 0, -1.0, 1.0) if not elastic else 1.0
         if not elastic and (first < 0).any():
             self._solvers.turn_round(first < 0)
             first = np.abs(first)
@@ -431,6 +444,7 @@ class Newton:
         steps, moved = np.ones(of.count), np.zeros(of.count)
         while True:
             self._move(moved - steps)
+            self._momentum.go(sign * steps)
             moved, (errors, why) = steps.copy(), self._tried(before)
             with _ignored():
                 growth, work = errors.each / before.each, self._work()

@@ -162,6 +162,11 @@ class LinearSolvers:
             self._solve_s.setGMRESRestart(MOST)
 
     @property
+    def most(self) -> int:
+        """Most iterations of a solve."""
+        return MOST
+
+    @property
     def schur(self) -> tuple[PETSc.Mat, PETSc.KSP]:
         """The Schur complement, and the solver with its preconditioner; ValueError where there is none."""
         if self._schur is None:
