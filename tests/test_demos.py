@@ -46,6 +46,8 @@ QUICK = {
     "retaining_wall": ("--cells 6 --delta 0 --ways active", ["retaining_wall.png"]),
     "barrier": ("--cells 10 --steps 40", ["barrier.png"]),
     "slope": ("--cells 4 --steps 4 --rtol 0.1", ["slope.png"]),
+    "infiltration": ("--cells 10 --rain-step 1800 --front-step 3600", ["infiltration.png"]),
+    "drainage": ("--cells 10 --step 120", ["drainage.png"]),
     "dam": ("--h 1 --steps 3 --cells 10", ["dam.png"]),
     "two_gels": ("--cells 4 --hertz 4", ["two_gels.png"]),
     "embankment": ("--h 1 --steps 1", ["embankment.png"]),
