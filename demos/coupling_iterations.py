@@ -140,7 +140,7 @@ def linearise(s: mpm.Simulation, dt: float) -> System:
     storage = StorageProblem(s.scene.storage, matrices.storage, pieces, contents, *fed, dt)
     momentum.assemble_residual()
     storage.assemble_residual()
-    solvers = matrices.solvers()
+    solvers = matrices.solvers
     solvers.linearise(momentum, storage)
     return System(solvers, storage, s.scene.fluid.bulk, s.scene.materials.materials[0])
 

@@ -12,7 +12,7 @@ from mpm_dolfinx.solve import solver_choice as plan
 plan.THRESHOLDS = replace(plan.THRESHOLDS, multigrid_2d=1, coarsest=50)
 simulation, _ = beam(h=0.01)
 result = simulation.run(0.04, 0.02, progress=False)
-solvers = simulation.scene.last[1].solvers()
+solvers = simulation.scene.last[1].solvers
 assert solvers.plan.iterative
 parts = simulation.grid.comm.gather((simulation.points.id, simulation.points.x, simulation.points.pressure))
 if parts:

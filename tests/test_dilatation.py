@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: MIT
 """Mean dilatation: nearly incompressible skeletons do not lock, its tangent is consistent, other bodies do without."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+import ufl
 from extreme.scenes import WATER, Beam
 from extreme.scenes import soil as extreme_soil
 from helpers import SOFT, beam, column, set_up
@@ -14,6 +15,19 @@ from mpm_dolfinx.verification.biot_fem import BiotFEM
 
 YOUNG = 1e7
 SAND = mpm.DruckerPrager(bulk=2e7, shear=1e7, friction=30.0, dilation=0.0, cohesion=1e5)
+
+
+@dataclass(frozen=True)
+class Fibrous(mpm.NeoHookean):
+    """A law of a user's for the plane only: its fibres have two components."""
+
+    fibre: float = 0.0
+    direction: tuple = (1.0, 0.0)
+
+    @staticmethod
+    def energy(F, bulk, shear, fibre, direction):
+        stretch = F * direction
+        return mpm.NeoHookean.energy(F, bulk, shear) + fibre / 4 * (ufl.inner(stretch, stretch) - 1) ** 2
 
 
 def skeleton(nu):
@@ -63,8 +77,16 @@ def two_layers(*materials, dim=2):
         lambda: two_layers(SOFT, SAND),
         lambda: two_layers(skeleton(0.49), SAND),
         lambda: two_layers(skeleton(0.49), SOFT, dim=3),
+        lambda: two_layers(Fibrous(bulk=2e8, shear=1e7), SAND),
     ],
-    ids=["one material", "cells shared with one that does not lock", "plastic beside elastic", "both lock", "in 3D"],
+    ids=[
+        "one material",
+        "cells shared with one that does not lock",
+        "plastic beside elastic",
+        "both lock",
+        "in 3D",
+        "for the plane only",
+    ],
 )
 def test_the_tangent_is_the_derivative_of_the_residual(make):
     s = make()
@@ -83,6 +105,25 @@ def test_the_tangent_is_the_derivative_of_the_residual(make):
     K, x = m.assemble_tangent(), unknowns.vector()
     x.array[:] = v
     assert (K * x).array == pytest.approx(slope, abs=1e-7 * np.abs(slope).max())
+
+
+def test_a_law_for_the_plane_only_has_its_mean_dilatation_there():
+    """Both means differ by a part of the cells' own error: without one the tip goes down by 9 % less."""
+    tips = [sagging(law(bulk=2e8, shear=1e7)) for law in (Fibrous, mpm.NeoHookean)]
+    assert tips[0] == pytest.approx(tips[1], rel=1e-2)
+
+
+def test_a_law_for_the_plane_only_bears_an_initial_stress():
+    def stress(x):
+        return np.tile([-1e4, -2e4, -1.5e4], (len(x), 1))
+
+    grid = mpm.Grid([0, 0], [1.0, 1.0], [4, 4])
+    held = {"left": "x", "right": "x", "bottom": "y", "top": "y"}
+    soils = [law(bulk=2e8, shear=1e7) for law in (Fibrous, mpm.NeoHookean)]
+    for soil in soils:
+        s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 1])], [soil], walls=held, initial_stress=stress)
+        s.run(1.0, 1.0)
+        assert s.effective_stress()[:, [0, 1], [0, 1]] == pytest.approx(stress(s.points.x)[:, :2], rel=1e-6)
 
 
 def test_uniform_strain_is_exact():
@@ -140,12 +181,12 @@ def test_what_locks_elsewhere_changes_nothing_in_an_elastic_body(quadrature):
 
 
 def test_a_skin_that_does_not_lock_shares_the_cells_of_a_beam_that_does():
-    """A skin of a ten thousandth of its stiffness fills the other half of its upper cells: the beam bends as without.
+    """A skin of a millionth of its stiffness fills the other half of its upper cells: the beam bends as without.
 
     With one mean for all that a cell holds the tip would go down by 1.9 % less.
     """
     grid, clay = mpm.Grid([0, 0], [1.2, 1.2], [20, 20]), skeleton(0.499)
-    skin = replace(SOFT, bulk=1e-4 * SOFT.bulk, shear=1e-4 * SOFT.shear, grain_density=0.0)
+    skin = replace(SOFT, bulk=1e-6 * SOFT.bulk, shear=1e-6 * SOFT.shear, grain_density=0.0)
     bodies = [mpm.box(grid, [0, 0.63], [1, 0.93]), mpm.box(grid, [0, 0.93], [1, 0.96], material=1)]
     tips = []
     for count in (1, 2):

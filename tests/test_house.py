@@ -13,9 +13,9 @@ CEILINGS = {
     "files of the largest folder": 14,
     "parameters of the longest list": 14,
     "assignments of three and more values": 20,
-    "changes of hidden state": 10,
+    "changes of hidden state": 9,
     "files that name a condition's class, most": 6,
-    "lines of the package": 31850,
+    "lines of the package": 31940,
 }
 
 

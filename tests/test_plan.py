@@ -49,7 +49,7 @@ def test_options_of_petsc_reach_their_solver_and_no_other_scene_and_unread_ones_
     other, s = pressed(), limit(pressed(), 25)
     s.scene.scheme = replace(s.scene.scheme, petsc_options=options)
     s.step(0.02), other.step(0.02)
-    kinds = [of.scene.last[1].solvers().schur[1].getType() for of in (s, other)]
+    kinds = [of.scene.last[1].solvers.schur[1].getType() for of in (s, other)]
     assert kinds == ["fgmres", "cg"]
     said = " ".join(warned())
     assert "no solver reads storage_ksp_tipe" in said and "storage_ksp_type" not in said

@@ -213,7 +213,7 @@ def test_large_bodies_that_yield_end_where_small_ones_do_by_mumps(monkeypatch):
         thresholds(monkeypatch, mumps=least)
         s = strip_pushed()
         newton = [s.step(1.0).newton for _ in range(2)]
-        ends.append((s.points, newton, s.scene.last[1].solvers().solve_u.pc.getFactorSolverType()))
+        ends.append((s.points, newton, s.scene.last[1].solvers.solve_u.pc.getFactorSolverType()))
     (petsc, few, _), (mumps, many, package) = ends
     assert package == "mumps" and few == many and np.abs(petsc.data["plastic"] - np.eye(3)).max() > 0.02
     assert np.abs(mumps.x - petsc.x).max() < 1e-10

@@ -78,8 +78,8 @@ class PiecePressures:
         return self._each(lambda values: values[rows])
 
     def joined(self, other: PiecePressures) -> PiecePressures:
-        """Return these pieces and those of other points, that all leave the grid, ordered by point and cell."""
-        pairs = {name: (values, getattr(other, name)) for name, values in self.arrays.items()}
+        """Return these pieces and others, of points that have not been on the grid: all leave it, none stays."""
+        pairs = {name: (getattr(self, name), values) for name, values in other.arrays.items()}
         return PiecePressures(**{name: np.concatenate(both) for name, both in pairs.items()})._ordered()
 
     def _each(self, change: Callable[[NDArray], NDArray]) -> PiecePressures:

@@ -23,8 +23,8 @@ def planar(F) -> bool:
     return all(isinstance(part, ufl.classes.Zero) for part in beside)
 
 
-def embedded(F):
-    """Return a deformation gradient (3, 3): that of plane strain, or itself."""
+def embedded(F, across=1):
+    """Return a deformation gradient (3, 3): that of plane strain with a stretch across the plane, or itself."""
     if F.ufl_shape == (3, 3):
         return F
-    return ufl.as_matrix([[F[0, 0], F[0, 1], 0], [F[1, 0], F[1, 1], 0], [0, 0, 1]])
+    return ufl.as_matrix([[F[0, 0], F[0, 1], 0], [F[1, 0], F[1, 1], 0], [0, 0, across]])

@@ -77,7 +77,7 @@ class FormPoints:
     def __getattr__(self, name: str) -> fem.Function:
         functions = self.__dict__.get("functions", {})
         if name in functions:
-            own = self.grid.axisymmetric and name in ("F", "dF")
+            own = self.grid.dim == 2 and name in ("F", "dF") and functions[name].ufl_shape == (3, 3)
             return block(functions[name]) if own else functions[name]
         raise AttributeError(f"the points carry {', '.join(functions)}, not {name!r}")
 

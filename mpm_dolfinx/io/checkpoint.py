@@ -32,7 +32,7 @@ from mpm_dolfinx.stepping.result import Result
 from mpm_dolfinx.stepping.state import State, Stay
 from mpm_dolfinx.stepping.step_control import StepControl
 
-FORMAT, VERSION = "mpm_dolfinx checkpoint", 11  # Source: the format of the files
+FORMAT, VERSION = "mpm_dolfinx checkpoint", 12  # Source: the format of the files
 FOREIGN = "no checkpoint of mpm_dolfinx, must be one"
 ZIP = b"PK\3\4"  # how numpy's archives begin
 LEAVE = ("pressure", "slope", "bounds")  # of pieces that do not stay

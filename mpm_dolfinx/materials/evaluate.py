@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from inspect import signature
@@ -12,6 +13,7 @@ import ufl
 from dolfinx import fem
 from numpy.typing import NDArray
 from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
+from ufl.algorithms.apply_derivatives import apply_derivatives
 
 from mpm_dolfinx.base.errors import NotConverged
 from mpm_dolfinx.base.tolerances import NEAR
@@ -36,22 +38,30 @@ class LawAtPoints:
         Class of the law.
     shapes
         Shape of each of its parameters and of its variables of state.
+    stretches
+        Number of axes of the deformation gradients that it sees; by default that of the grid.
     cell_size
         That laws are given, m; by default that of the grid.
     """
 
     def __init__(
-        self, grid: Grid, law: type[Skeleton], shapes: dict[str, tuple[int, ...]], cell_size: float | None = None
+        self,
+        grid: Grid,
+        law: type[Skeleton],
+        shapes: dict[str, tuple[int, ...]],
+        stretches: int | None = None,
+        cell_size: float | None = None,
     ):
         self.grid = grid
         self.law = law
         self._shapes = shapes
+        self._stretches = grid.stretches if stretches is None else stretches
         self._by_scene = by_scene(grid, cell_size)
 
     @cached_property
     def points(self) -> FormPoints:
         """The points, with F and what the law takes."""
-        return FormPoints(self.grid, F=(self.grid.stretches, self.grid.stretches), **self._shapes)
+        return FormPoints(self.grid, F=(self._stretches, self._stretches), **self._shapes)
 
     @cached_property
     def _F(self):
@@ -83,6 +93,7 @@ class LawAtPoints:
         x = points.x[rows]
         cells = self.grid.local(self.grid.number(self.grid.index_from_base(x)))
         taken = {name: values[name][rows] for name in ("F", *self._shapes)}
+        taken["F"] = taken["F"][:, : self._stretches, : self._stretches]
         return self.points.at(cells, x, points.volume0[rows], **taken)
 
     @cached_property
@@ -113,7 +124,7 @@ class LawAtPoints:
 
     def stress_3d(self, data: PointData) -> NDArray[np.float64]:
         """Return the effective Cauchy stress (n, 3, 3), Pa; nan across the plane where the law does not know it."""
-        if self.grid.stretches == 3:
+        if self._stretches == 3:
             return self.stress(data)
         out = np.zeros((len(data.cells), 3, 3))
         out[:, :2, :2], across = self.stress(data), self._out_of_plane
@@ -143,6 +154,31 @@ class LawAtPoints:
             out.append((name, values[:, start:stop].reshape(-1, *shape)))
             start = stop
         return out
+
+
+def knows_space(grid: Grid, m: Skeleton) -> bool:
+    """Return whether a material's law takes F (3, 3) of plane strain; one of the user's may be for the plane only.
+
+    m: its constants are arrays over one point.  Laws with local unknowns are taken to.
+    """
+    law = type(m)
+    function, shape = (law.energy, ()) if law.kirchhoff is None else (law.kirchhoff, (3, 3))
+    if law.unknowns or function is None:
+        return True
+    values = {name: np.asarray(getattr(m, name, np.zeros(1)), dtype=float)[0] for name in law.parameters}
+    given = {name: fem.Constant(grid.mesh, value) for name, value in values.items()}
+    given |= {name: fem.Constant(grid.mesh, np.asarray(value, dtype=float)) for name, value in law.state.items()}
+    F = ufl.variable(FormPoints(grid, F=(3, 3)).F)
+    log = logging.getLogger("UFL")  # it tells what goes wrong before it raises
+    log.disabled, before = True, log.disabled
+    try:
+        law_of_F = expression(function, [shape], F=F, **given, **by_scene(grid))
+        apply_derivatives(apply_algebra_lowering(ufl.diff(law_of_F, F)))  # where UFL finds what sizes do not agree
+    except Exception:  # UFL has several kinds
+        return False
+    finally:
+        log.disabled = before
+    return True
 
 
 def by_scene(grid: Grid, cell_size: float | None = None) -> dict[str, fem.Constant]:
@@ -175,19 +211,19 @@ class SoftnessAtPoints:
 
     Parameters
     ----------
-    grid, law, shapes
+    grid, law, shapes, stretches
         See `LawAtPoints`.
     """
 
-    def __init__(self, grid: Grid, law: type[Skeleton], shapes: dict[str, tuple[int, ...]]):
+    def __init__(self, grid: Grid, law: type[Skeleton], shapes: dict[str, tuple[int, ...]], stretches: int):
         self._law = law
         self._grid = grid
         self._shapes = shapes
-        d = grid.stretches
+        self._stretches = d = stretches
         self._points = points = FormPoints(grid, F=(d, d), dF=(d, d), **shapes)
         s = ufl.variable(fem.Constant(grid.mesh, 1.0))
         F = points.F - (1 - s) * points.dF
-        F = ufl.variable(block(F) if grid.axisymmetric else F)
+        F = ufl.variable(block(F) if d > grid.dim else F)
         self._by_scene = by_scene(grid)
         values = {**{name: getattr(points, name) for name in shapes}, **self._by_scene}
         self._local = LocalUnknowns(law, points, F, values) if law.unknowns else None
@@ -208,6 +244,7 @@ class SoftnessAtPoints:
         """
         self._by_scene["dt"].value = dt
         fields = {name: at[name] for name in ("F", *self._shapes)}
+        dF = dF[:, : self._stretches, : self._stretches]
         data = PointData(self._points, at.places, at.volume, {"dF": dF, **fields})
         if self._local is not None:
             self._local.update(data)

@@ -19,11 +19,11 @@ from mpm_dolfinx.base.validation import numbers
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData
 from mpm_dolfinx.grid.grid import Grid
-from mpm_dolfinx.materials.evaluate import LawAtPoints, SoftnessAtPoints, mean_size, sampled
+from mpm_dolfinx.materials.evaluate import LawAtPoints, SoftnessAtPoints, knows_space, mean_size, sampled
 from mpm_dolfinx.materials.prestressed import AT_REST, stressed
 from mpm_dolfinx.materials.skeleton import BY_SCENE, Fluid, Skeleton, constants_of
 from mpm_dolfinx.parallel.exchange import first
-from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints
 from mpm_dolfinx.pores.retention import Retentions, SaturationAt, scale_of
 from mpm_dolfinx.pores.retention import sampled as drained
 
@@ -73,23 +73,32 @@ class SceneMaterials:
         fluid: Fluid | None,
         prestressed: bool = False,
     ):
-        materials = [stressed(m, grid.stretches) for m in materials] if prestressed else materials
         self.grid = grid
-        self.materials = materials
         self.fluid = fluid
         seeded: dict[str, NDArray[np.float64]] = dict(points.data)
         self._used = _used(bodies, len(materials))  # a material that no body is of changes nothing
+        evaluated = [_evaluated(materials[i], bodies, i) for i in self._used]
+        locks = [bool(np.any(m.nearly_incompressible)) for m in evaluated]
+        asked = [grid.stretches == 2 and (prestressed or lock) for lock in locks]
+        each = zip(self._used, evaluated, asked, strict=True)
+        known = [not needed or knows_space(grid, _at_one(materials[i], m)) for i, m, needed in each]
+        self.stretches = 3 if any(np.logical_and(locks, known)) else grid.stretches
+        """Number of axes of the deformation gradients that laws see."""
+        if self.across:
+            seeded[ACROSS] = np.ones(len(points))
+        if prestressed:
+            whole = dict(zip(self._used, known, strict=True))
+            materials = [stressed(m, whole.get(i, True)) for i, m in enumerate(materials)]
+            evaluated = [_evaluated(materials[i], bodies, i) for i in self._used]
+        self.materials = materials
         used = [materials[i] for i in self._used]
-        self._fields = [[name for name in constants_of(m) if callable(getattr(m, name))] for m in materials]
-        places = [_places(bodies, i) if self._fields[i] else np.empty((0, grid.dim)) for i in self._used]
-        evaluated = [m.at(X) for m, X in zip(used, places, strict=True)]
+        self._fields = [_by_place(m) for m in materials]
         self.laws = list(dict.fromkeys(map(type, used)))
         self.conductivity_laws = list(dict.fromkeys(m.conductivity_law for m in used if m.conductivity_law))
         """The different conductivity laws of the scene."""
-        self._law = np.array([self.laws.index(type(m)) if type(m) in self.laws else 0 for m in materials])
-        locks = [bool(np.any(m.nearly_incompressible)) for m in evaluated]
-        self._parts = list(dict.fromkeys(zip(map(type, used), locks, strict=True)))
-        own = dict(zip(self._used, zip(map(type, used), locks, strict=True), strict=True))
+        kinds = list(zip(map(type, used), locks, known, strict=True))
+        self._parts = list(dict.fromkeys(kinds))
+        own = dict(zip(self._used, kinds, strict=True))
         self._part = np.array([self._parts.index(own[i]) if i in own else 0 for i in range(len(materials))])
         self.symmetric = all(m.symmetric for m in used)
         """Whether the tangents of all materials are symmetric."""
@@ -141,12 +150,22 @@ class SceneMaterials:
             for number, law in enumerate(self.laws):
                 if law.state:
                     shapes = {name: self.shapes[name] for name in _takes(law)}
-                    self._softness[number] = SoftnessAtPoints(grid, law, shapes)
+                    self._softness[number] = SoftnessAtPoints(grid, law, shapes, self._stretches_of(law))
         self.seeded = replace(points, data=seeded)
         """The points with what they carry at the start: parameters that differ from place to place, state."""
         self._at_points = [
-            LawAtPoints(grid, law, {name: self.shapes[name] for name in _takes(law)}) for law in self.laws
+            LawAtPoints(grid, law, {name: self.shapes[name] for name in _takes(law)}, self._stretches_of(law))
+            for law in self.laws
         ]
+
+    @property
+    def across(self) -> bool:
+        """Whether laws see a stretch across the plane of plane strain, that of a mean dilatation."""
+        return self.stretches > self.grid.stretches
+
+    def _stretches_of(self, law: type[Skeleton]) -> int:
+        """Return the number of axes of the deformation gradients that a law sees."""
+        return self.stretches if (law, True, True) in self._parts else self.grid.stretches
 
     def _add_shapes(self, m: Skeleton, seeded: dict[str, NDArray[np.float64]], count: int) -> None:
         """Note the shapes of what a material's law takes, and seed the state of so many points."""
@@ -189,11 +208,14 @@ class SceneMaterials:
         `pieces`, those of several have the fields `common` of the pieces and what their law takes.
         """
         if len(self._parts) == 1:
-            return [(law, pieces, locks) for law, locks in self._parts]
-        names = [dict.fromkeys([*common, *_takes(law)]) for law, _ in self._parts]
+            return [(law, pieces, locks) for law, locks, _ in self._parts]
+        names = [
+            [name for name in dict.fromkeys([*common, *_takes(law)]) if name != ACROSS or (locks and known)]
+            for law, locks, known in self._parts
+        ]
         shapes = [{name: getattr(pieces, name).ufl_shape for name in taken} for taken in names]
         points = [FormPoints(pieces.grid, **s) for s in shapes]
-        return [(law, own, locks) for (law, locks), own in zip(self._parts, points, strict=True)]
+        return [(law, own, locks) for (law, locks, _), own in zip(self._parts, points, strict=True)]
 
     def part_of(self, points: MaterialPoints) -> NDArray[np.int64]:
         """Return the number of each point's part (n,), see `parts`."""
@@ -201,11 +223,19 @@ class SceneMaterials:
 
     def law_of(self, points: MaterialPoints) -> NDArray[np.int64]:
         """Return the number of each point's law (n,)."""
-        return self._law[points.material]
+        return np.array([self.laws.index(law) for law, *_ in self._parts])[self.part_of(points)]
 
     def locking(self, points: MaterialPoints) -> NDArray[np.bool_]:
         """Return at which points (n,) Q1 cells would lock."""
-        return np.array([locks for _, locks in self._parts])[self.part_of(points)]
+        return np.array([locks for _, locks, _ in self._parts])[self.part_of(points)]
+
+    def stretched(self, points: MaterialPoints) -> NDArray[np.bool_]:
+        """Return at which points (n,) laws see a stretch across the plane."""
+        return self.across & self.locking(points) & self.knows_across(points)
+
+    def knows_across(self, points: MaterialPoints) -> NDArray[np.bool_]:
+        """Return at which points (n,) laws know a stretch across the plane."""
+        return np.array([known for *_, known in self._parts])[self.part_of(points)]
 
     def conducting(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return what points (n, 2) that conduct alike have in common: conductivity, m/s, and number of their law.
@@ -411,9 +441,9 @@ class SceneMaterials:
 
         In axisymmetry (n, 3, 3).
         """
-        out = np.zeros_like(points.F)
+        out, d = np.zeros_like(points.F), self.grid.stretches
         for law, rows, data in self._placed(points):
-            out[rows] = law.stress(data)
+            out[rows] = law.stress(data)[:, :d, :d]
         return out
 
     def effective_stress_3d(self, points: MaterialPoints) -> NDArray[np.float64]:
@@ -470,7 +500,7 @@ class SceneMaterials:
         for _, rows, name, values in new:
             out[name][rows] = values
         if self._softness:
-            out["softness"], dF = np.ones(len(points)), points.F - before.F
+            out["softness"], dF = np.ones(len(points)), points.F_of_laws - before.F_of_laws
             shear = self.table(points, lambda m: m.shear)
             for number, softness in self._softness.items():
                 _, rows, at = placed[number]
@@ -479,7 +509,8 @@ class SceneMaterials:
 
     def _placed(self, points: MaterialPoints) -> list[tuple[LawAtPoints, NDArray[np.int64], PointData]]:
         """Return every law with the indices and the data of the points that follow it."""
-        number, values = self.law_of(points), {"F": points.F, **self.parameters(points), **self.state(points)}
+        number, values = self.law_of(points), {**self.parameters(points), **self.state(points)}
+        values["F"] = points.F_of_laws
         rows = [np.flatnonzero(number == k) for k in range(len(self.laws))]
         return [(law, own, law.data(points, own, values)) for law, own in zip(self._at_points, rows, strict=True)]
 
@@ -512,6 +543,21 @@ def _used(bodies: Sequence[Body], count: int) -> list[int]:
         if not 0 <= body.material < count:
             raise ValueError(f"body: material = {body.material!r}, must be an index of the {count} materials")
     return sorted({int(body.material) for body in bodies})
+
+
+def _by_place(m: Skeleton) -> list[str]:
+    """Return the names of a material's fields that are functions of places."""
+    return [name for name in constants_of(m) if callable(getattr(m, name))]
+
+
+def _evaluated(m: Skeleton, bodies: Sequence[Body], material: int) -> Skeleton:
+    """Return a material with its fields evaluated at the places of all its points, see `_places`."""
+    return m.at(_places(bodies, material) if _by_place(m) else np.empty((0, 0)))
+
+
+def _at_one(m: Skeleton, evaluated: Skeleton) -> Skeleton:
+    """Return a material with its constants as arrays over the first of its points."""
+    return _spread(evaluated, {name: getattr(evaluated, name)[:1] for name in _by_place(m)}, 1)
 
 
 def _places(bodies: Sequence[Body], material: int) -> NDArray[np.float64]:

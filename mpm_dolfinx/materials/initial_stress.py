@@ -22,7 +22,7 @@ from mpm_dolfinx.materials.prestressed import AT_REST
 from mpm_dolfinx.materials.skeleton import STANDARD_GRAVITY, Field
 from mpm_dolfinx.materials.trial import PLANE, SPACE
 from mpm_dolfinx.parallel.exchange import first, over_all
-from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints
 
 EXACT, CLOSE = 1e-13, SAME  # of the largest given stress: to which laws are solved, and have to be
 MOST = 30  # iterations
@@ -237,13 +237,10 @@ def stressed(
         normal, kappa = np.diagonal(target, axis1=1, axis2=2), materials.table(part, _kappa)
         part = _with(part, given, initial_stress=normal, bulk=-normal.mean(axis=1) / kappa)
     plastic = np.isin(law[rows], [k for k, one in enumerate(materials.laws) if "plastic" in one.state])
-    now, stress, bad = _Sought(materials, part, target, given, plastic).found()
+    now, bad = _Sought(materials, part, target, given, plastic).found()
     message = "".join(_not_borne(materials, part, target, law[rows], i) for i in np.flatnonzero(bad)[:1])
     if message := first(comm, message):
         raise ValueError(message)
-    if "across" in points.data:
-        own = np.nan_to_num(target[:, 2, 2] - stress[:, 2, 2]) if materials.grid.stretches == 2 else 0.0
-        now = _with(now, ~plastic & ~given, across=own)
     if "plastic" in points.data:
         now = _with(now, plastic, **{"plastic" + AT_REST: now.data["plastic"]})
     data = {name: values.copy() for name, values in points.data.items()}
@@ -256,9 +253,8 @@ def stressed(
 class _Sought:
     """Elastic strains that give target stresses, by Newton's method.
 
-    They are symmetric: of `seeded_stretch`, in plane strain without that across the plane, whose stress the law is
-    given, or of C_p^-1.  points: n of them; target : (n, 3, 3), Pa; given, plastic : (n,) which have the stress among
-    their constants, and which have C_p^-1.
+    They are symmetric: of `seeded_stretch` or of C_p^-1.  points: n of them; target : (n, 3, 3), Pa; given, plastic :
+    (n,) which have the stress among their constants, and which have C_p^-1.
     """
 
     materials: SceneMaterials
@@ -276,8 +272,7 @@ class _Sought:
     def free(self) -> NDArray[np.bool_]:
         """Which components (n, k) are sought."""
         out = np.repeat(~self.given[:, None], len(self.components), axis=1)
-        if self.materials.grid.stretches == 2:
-            out[:, 2] &= self.plastic  # across the plane
+        out[:, 2] &= self.materials.knows_across(self.points)
         return out
 
     def of(self, tensor: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -298,25 +293,20 @@ class _Sought:
         mean = np.trace(target, axis1=1, axis2=2) / 3
         elastic = (target - mean[:, None, None] * identity) / (2 * shear)[:, None, None]
         elastic += (mean / (3 * bulk))[:, None, None] * identity
-        if self.materials.grid.stretches == 2:  # laws without a strain across the plane
-            plane, lam = np.trace(target[:, :2, :2], axis1=1, axis2=2), bulk - 2 * shear / 3
-            even = (lam * plane / (4 * shear * (lam + shear)))[:, None, None] * identity
-            alone = target / (2 * shear)[:, None, None] - even
-            elastic = np.where(self.plastic[:, None, None], elastic, alone)
         return self.of(elastic)
 
-    def off(self, strain: NDArray[np.float64]) -> tuple[MaterialPoints, NDArray[np.float64], NDArray[np.float64]]:
-        """Return points with elastic strains (n, k), their stresses, Pa, and what is missing of the target (n, k)."""
+    def off(self, strain: NDArray[np.float64]) -> tuple[MaterialPoints, NDArray[np.float64]]:
+        """Return points with elastic strains (n, k), and what is missing of their target, Pa (n, k)."""
         tensor = np.zeros((len(strain), 3, 3))
         for value, (i, j) in zip(strain.T, self.components, strict=True):
             tensor[:, i, j] = tensor[:, j, i] = value
         logs, turn = np.linalg.eigh(tensor)
         elastic = (turn * np.exp(2 * logs)[:, None]) @ turn.swapaxes(1, 2)
         now = _with(self.points, self.plastic & ~self.given, plastic=elastic)
-        d, stretch = self.materials.grid.stretches, (turn * np.exp(logs)[:, None]) @ turn.swapaxes(1, 2)
-        now = _with(now, ~self.plastic & ~self.given, seeded_stretch=stretch[:, :d, :d])
+        stretch = (turn * np.exp(logs)[:, None]) @ turn.swapaxes(1, 2)
+        now = _with(now, ~self.plastic & ~self.given, seeded_stretch=stretch)
         stress = self.materials.effective_stress_3d(now)
-        return now, stress, self.of(stress - self.target)
+        return now, self.of(stress - self.target)
 
     def step(self, strain: NDArray[np.float64], missing: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the strains (n, k) after a step from those with which so much is missing, by differences."""
@@ -325,7 +315,7 @@ class _Sought:
         (_, shear) = self.moduli()
         slopes = np.tile(np.eye(count) * (2 * shear)[:, None, None], (1, 1, 1))
         for k in range(count):
-            change = (self.off(strain + SAME * np.eye(count)[k])[2] - missing) / SAME
+            change = (self.off(strain + SAME * np.eye(count)[k])[1] - missing) / SAME
             slopes[:, :, k] = np.where(free & free[:, [k]], change, slopes[:, :, k])
         slopes, missing = (np.nan_to_num(values) for values in (slopes, missing))
         singular = ~(np.abs(np.linalg.det(slopes / shear[:, None, None])) > NEAR**2)
@@ -333,16 +323,15 @@ class _Sought:
         change = np.linalg.solve(slopes, missing[:, :, None])[:, :, 0].clip(-LARGEST, LARGEST)
         return np.clip(strain - change, -1, 1)
 
-    def found(self) -> tuple[MaterialPoints, NDArray[np.float64], NDArray[np.bool_]]:
-        """Return points with the strains, their stresses, Pa, and which (n,) do not have the target."""
+    def found(self) -> tuple[MaterialPoints, NDArray[np.bool_]]:
+        """Return points with the strains, and which (n,) do not have the target."""
         comm, strain = self.materials.grid.comm, self.linear()
         largest = over_all(comm, float(np.abs(self.target).max(initial=0.0)), MPI.MAX)
         now = self.points
-        stress = self.target
         bad = np.ones(len(strain), dtype=bool)
         try:
             for _ in range(MOST):
-                now, stress, missing = self.off(strain)
+                now, missing = self.off(strain)
                 bad = ~(np.abs(missing).max(axis=1, initial=0.0) <= CLOSE * largest)
                 most = float(np.nan_to_num(np.abs(missing), nan=np.inf).max(initial=0.0))
                 if not over_all(comm, most, MPI.MAX) > EXACT * largest:
@@ -350,23 +339,23 @@ class _Sought:
                 strain = self.step(strain, missing)
         except NotConverged:
             bad = np.ones(len(strain), dtype=bool)
-        return now, stress, bad
+        return now, bad
 
 
 def strained(materials: SceneMaterials, points: MaterialPoints, moved: MaterialPoints) -> MaterialPoints:
     """Return points with the elastic strains of others, to which these have been deformed from where they are."""
-    F = moved.F
-    d = moved.F.shape[1]
+    F = moved.F_of_laws
+    d = F.shape[1]
     law = materials.law_of(points)
-    own = {name: points.data[name] for name in ("softness", "owed", "due") if name in points.data}
+    own = {name: points.data[name] for name in ("softness", "owed", "due", ACROSS) if name in points.data}
     data = {**moved.data, **own}
     out = replace(points, data=data)
+    whole = np.tile(np.eye(3), (len(F), 1, 1))
+    whole[:, :d, :d] = F
     if "seeded_stretch" in data:
-        out = _with(out, np.ones(len(F), dtype=bool), seeded_stretch=F @ data["seeded_stretch"])
+        out = _with(out, np.ones(len(F), dtype=bool), seeded_stretch=whole @ data["seeded_stretch"])
     if "plastic" in data:
         stretch = materials.table(points, _prestretch)
-        whole = np.tile(np.eye(3), (len(F), 1, 1))
-        whole[:, :d, :d] = F
         whole = whole * (stretch[:, None, :] / stretch[:, :, None])  # D^-1 F D
         own = np.isin(law, [k for k, one in enumerate(materials.laws) if "plastic" in one.state])
         elastic = whole @ data["plastic"] @ whole.swapaxes(1, 2)

@@ -3,8 +3,8 @@
 
 A law is evaluated at F F_i, F counted from the state as seeded and F_i a stretch that the points carry: the soil
 answers as if its stress had come by loading, while volumes, porosities and conductivities count from the state as
-seeded.  In plane strain the stress across the plane has a part of its own, which in Hencky's law is that of an elastic
-strain across the plane.  Laws with the state `plastic`, C_p^-1, have their elastic strain in it and need none of this.
+seeded.  F_i has all three axes, also in plane strain.  Laws with the state `plastic`, C_p^-1, have their elastic strain
+in it and need none of this.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ AT_REST = " at rest"
 """Ends the names of what points carry of a state as seeded, from which yield is told."""
 
 
-def stressed(m: Skeleton, stretches: int) -> Skeleton:
+def stressed(m: Skeleton, knows_space: bool) -> Skeleton:
     """Return a material whose points may have a stress as seeded, by fields of theirs; at first they have none.
 
-    stretches: number of axes of F.
+    knows_space: whether its law takes F (3, 3).
     """
     if "initial_stress" in (names := [f.name for f in fields(m)]):
         own = m.initial_stress if callable(m.initial_stress) else _everywhere(m.initial_stress)
@@ -35,7 +35,7 @@ def stressed(m: Skeleton, stretches: int) -> Skeleton:
     if "plastic" in m.state:
         return m
     given = {name: getattr(m, name) for name in names}
-    return prestressed(type(m))(**given, seeded_stretch=_everywhere(np.eye(stretches)), across=_everywhere(0.0))
+    return prestressed(type(m), knows_space)(**given, seeded_stretch=_everywhere(np.eye(3)))
 
 
 def _everywhere(value) -> Callable:
@@ -43,31 +43,26 @@ def _everywhere(value) -> Callable:
 
 
 @cache
-def prestressed(law: type[Skeleton]) -> type[Skeleton]:
-    """Return a law with two more fields: `seeded_stretch` F_i (d, d), and `across`, Pa, of stress across the plane."""
+def prestressed(law: type[Skeleton], knows_space: bool) -> type[Skeleton]:
+    """Return a law with one more field: `seeded_stretch` F_i (3, 3)."""
     names = ("energy", "kirchhoff", "update", "trial")
-    given = {name: staticmethod(_seen(f, name)) for name in names if (f := getattr(law, name)) is not None}
-
-    def out_of_plane(cls, F, values):
-        own = law.out_of_plane.__func__(cls, F, values)
-        return None if own is None else own + values["across"] / ufl.det(F)
-
-    annotations = {"__annotations__": {"seeded_stretch": Field, "across": Field}, "seeded_stretch": 1.0, "across": 0.0}
-    more = {"linear": law.linear, "out_of_plane": classmethod(out_of_plane), "__doc__": law.__doc__}
-    cls = dataclass(frozen=True)(type(law.__name__, (law,), {**given, **annotations, **more}))
-    cls.parameters = (*cls.parameters, "across")
-    return cls
+    given = {name: staticmethod(_seen(f, name, knows_space)) for name in names if (f := getattr(law, name)) is not None}
+    more = {"__annotations__": {"seeded_stretch": Field}, "seeded_stretch": 1.0}
+    more |= {"linear": law.linear, "__doc__": law.__doc__}
+    return dataclass(frozen=True)(type(law.__name__, (law,), {**given, **more}))
 
 
-def _seen(function: Callable, name: str) -> Callable:
+def _seen(function: Callable, name: str, knows_space: bool) -> Callable:
     """Return one of a law's functions, called with F F_i in place of F; stresses and energies are per volume now."""
     taken = Skeleton.taken_by(function)
 
     def of(**given):
         stretch = given["seeded_stretch"]
         if "F" in given:
-            F, stretch = given["F"], stretch if given["F"].ufl_shape == stretch.ufl_shape else embedded(stretch)
-            given["F"] = block(F * stretch) if F.ufl_shape == (3, 3) and planar(F) else F * stretch
+            F = embedded(given["F"])
+            given["F"] = block(F * stretch) if planar(F) else F * stretch
+            if not knows_space:
+                given["F"] = ufl.as_matrix([[given["F"][i, j] for j in range(2)] for i in range(2)])
         out = function(**{argument: given[argument] for argument in taken})
         return out / ufl.det(stretch) if name in ("energy", "kirchhoff") else out
 

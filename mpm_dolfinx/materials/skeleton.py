@@ -72,7 +72,8 @@ class Skeleton:
 
     A law adds its own parameters as fields of the dataclass and defines one of these static methods, which
     are called with those arguments that they name: F, the law's fields and properties, its state.  F is (d, d), in
-    axisymmetry (3, 3) with the hoops' stretch last, see `axes`.
+    axisymmetry (3, 3) with the hoops' stretch last, see `axes`.  So it is in plane strain, with the stretch across the
+    plane, for laws that take it, where Q1 cells would lock and of soil that is seeded with a stress.
 
     energy
         Stored energy psi per reference volume, Pa.  Stress and tangent are UFL's derivatives.

@@ -7,7 +7,7 @@ Laws and conductivities are the material's: see `skeleton.Skeleton`.  Terms of t
 points
     The points of integration.  `points.dx`: their measure; `points.value(f)`, `points.grad(f)`: f and its
     gradient, f one of u and v, in axisymmetry (3, 3), with f_r / r; `points.F`: deformation gradient at the start of
-    the step, of the same shape;
+    the step, of the same shape, whose determinant is the volume ratio;
     `points.position`, `points.displacement`: place, and displacement since the start (or since it was reset),
     both at the start of the step; and what the material points carry in `points.data`: fields of the materials
     that are functions of place, and the laws' state.

@@ -4,12 +4,12 @@
 Four constraints of volume a cell leave a Q1 quadrilateral no freedom to bend: with nu = 0.499 it is up to half
 too stiff.  Here the law sees the deformation gradient with the volume ratio of the step averaged over the cell,
 
-    Fbar = (theta J_n / det F)^(1/d) F,     theta = sum w det(Delta) / sum w   over the cell's pieces that lock,
+    Fbar = (theta J_n / det F)^(1/3) F,     theta = sum w det(Delta) / sum w   over the cell's pieces that lock,
 
-d = 2 in plane strain, 3 in axisymmetry.  Which do is a matter of their material (`Skeleton.nearly_incompressible`).  In
-a cell that these share with others the others see their own F: one constraint a cell is left, and neither kind of
-material knows of the other but by the displacements that they share.  The energy sum w psi(Fbar) / J_n has the
-derivative
+along all three axes: in plane strain points carry the stretch across the plane, as in a slice of the body.  Which do
+is a matter of their material (`Skeleton.nearly_incompressible`).  In a cell that these share with others the others
+see their own F: one constraint a cell is left, and neither kind of material knows of the other but by the
+displacements that they share.  The energy sum w psi(Fbar) / J_n has the derivative
 
     sum w [dPsi/dF : dF + pi d(det Delta)],   pi = (sum w dPsi/dtheta) / (sum w),
 
@@ -31,13 +31,14 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.caching import Latest
-from mpm_dolfinx.forms.axes import block
+from mpm_dolfinx.forms.axes import block, embedded
 from mpm_dolfinx.forms.cell_matrices import Beside, insert
 from mpm_dolfinx.forms.point_forms import CellSums, FormPoints, PointData, PointExpression
 from mpm_dolfinx.grid.grid import Grid, sum_by
 from mpm_dolfinx.materials.skeleton import Skeleton
 from mpm_dolfinx.materials.user_functions import expression
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
+from mpm_dolfinx.points.material_points import ACROSS, with_ratio
 
 
 class MeanDilatation:
@@ -55,7 +56,6 @@ class MeanDilatation:
 
     def __init__(self, grid: Grid, numbers: Sequence[int], symmetric: bool = True):
         self._grid = grid
-        self._d = grid.stretches
         self._symmetric = symmetric
         self._numbers = numbers
         self.theta, self.pi = fem.Function(grid.cellwise()), fem.Function(grid.cellwise())
@@ -66,10 +66,15 @@ class MeanDilatation:
         self._stresses: list[StressAtPoints] = []
 
     def seen(self, points: FormPoints, F):
-        """Return Fbar (d, d), what laws see of F, a UFL variable."""
+        """Return Fbar (3, 3), what laws see of F, a UFL variable; (2, 2) where they are for the plane only."""
         ratio = self._theta * ufl.det(points.F) / ufl.det(F)
-        Fbar = (ufl.sqrt(ratio) if self._d == 2 else ratio ** (1 / self._d)) * F
-        return ufl.variable(block(Fbar) if self._grid.axisymmetric else Fbar)
+        if self._grid.stretches == 2 and ACROSS not in points.functions:
+            return ufl.variable(ufl.sqrt(ratio) * F)
+        ratio = ratio ** (1 / 3)
+        if self._grid.stretches == 2:  # of F scaled to its determinant, see `in_space`
+            across = getattr(points, ACROSS)
+            return ufl.variable(embedded(ratio / ufl.sqrt(across) * F, ratio * across))
+        return ufl.variable(block(ratio * F) if self._grid.axisymmetric else ratio * F)
 
     def add(
         self,
@@ -120,38 +125,43 @@ class MeanDilatation:
         if law.kirchhoff is None:
             energy = expression(law.energy, [()], F=Fbar, **values)
             return ufl.diff(energy, F), ufl.diff(energy, self._theta)
-        tau = law.kirchhoff_in_plane(Fbar, values)  # dFbar Fbar^-1 = dev(dF F^-1) + dtheta / (d theta) I
-        mean = ufl.tr(tau) / self._d
-        return (tau - mean * ufl.Identity(self._d)) * ufl.inv(F).T, mean / self._theta
+        tau = law.kirchhoff_in_plane(Fbar, values)  # dFbar Fbar^-1 = dev(dF F^-1) + dtheta / (n theta) I, n = 3 or 2
+        mean = ufl.tr(tau) / Fbar.ufl_shape[0]
+        return _dev(tau, F) * ufl.inv(F).T, mean / self._theta
 
     def _slopes(self, law: type[Skeleton], F, Fbar, values: Mapping[str, object]) -> tuple:
         """Return the derivatives by F and by theta of both that `_stress` gives.
 
         In the plane a law without energy is itself derived by Fbar only, in half of the time: with Fbar = s F
 
-            dtau = s C : dF + (theta dtau/dtheta) (dtheta / theta - F^-T : dF),   C = dtau/dFbar.
+            dtau = s C : dF + (theta dtau/dtheta) (dtheta / theta - F^-T : dF),   C = dtau/dFbar,
 
-        In 3D that would take two minutes to compile.
+        of F (d, d) and the part of s F that is in its axes.  In 3D that would take two minutes to compile.
         """
         P, slope = self._stress(law, F, Fbar, values)
         if law.kirchhoff is None or self._grid.dim == 3:
             return tuple(ufl.diff(of, by) for of in (P, slope) for by in (F, self._theta))
-        d = self._d
+        d, n = range(F.ufl_shape[0]), Fbar.ufl_shape[0]
         theta = self._theta
         G = ufl.inv(F).T
         i, j, k, l, m = ufl.indices(5)
         tau = law.kirchhoff_in_plane(Fbar, values)
         C = ufl.diff(tau, Fbar)
         G_F = ufl.diff(G, F)
-        dev = tau - ufl.tr(tau) / d * ufl.Identity(d)
-        tau_theta = ufl.as_tensor(C[i, j, k, l] * Fbar[k, l], (i, j)) / (d * theta)
-        tau_F = ufl.as_tensor(ufl.inner(Fbar, G) / d * C[i, j, k, l] - theta * tau_theta[i, j] * G[k, l], (i, j, k, l))
-        mean_F, mean_theta = ufl.as_tensor(tau_F[i, i, k, l], (k, l)) / d, ufl.tr(tau_theta) / d
+        tau_theta = ufl.as_tensor(C[i, j, k, l] * Fbar[k, l], (i, j)) / (n * theta)
+        s = sum(Fbar[a, b] * G[a, b] for a in d for b in d) / len(d)
+
+        def by_F(part, by_theta):
+            """Return the derivative by F of a part of tau, of which C has the derivative by Fbar."""
+            return ufl.as_matrix([[s * part(a, b) - theta * by_theta * G[a, b] for b in d] for a in d])
+
+        mean_theta = ufl.tr(tau_theta) / n
+        mean_F = by_F(lambda a, b: sum(C[c, c, a, b] for c in range(n)) / n, mean_theta)
+        tau_F = ufl.as_tensor([[by_F(lambda a, b, c=c, e=e: C[c, e, a, b], tau_theta[c, e]) for e in d] for c in d])
         P_F = ufl.as_tensor(
-            tau_F[i, m, k, l] * G[m, j] - mean_F[k, l] * G[i, j] + dev[i, m] * G_F[m, j, k, l], (i, j, k, l)
+            tau_F[i, m, k, l] * G[m, j] - mean_F[k, l] * G[i, j] + _dev(tau, F)[i, m] * G_F[m, j, k, l], (i, j, k, l)
         )
-        P_theta = (tau_theta - mean_theta * ufl.Identity(d)) * G
-        return P_F, P_theta, mean_F / theta, (mean_theta - slope) / theta
+        return P_F, _dev(tau_theta, F) * G, mean_F / theta, (mean_theta - slope) / theta
 
     def update(self, data: QuadratureData, solve: Callable[[], None]) -> None:
         """Set theta, the stresses of the pieces, and pi at the present displacement; solve: for unknowns of laws."""
@@ -187,7 +197,7 @@ class MeanDilatation:
         for number in self._numbers:
             rows = data.rows[number]
             theta, own = self.theta.x.array[data.parts[number].cells], delta[rows]
-            delta[rows] = own * ((theta / np.linalg.det(own)) ** (1 / self._d))[:, None, None]
+            delta[rows] = with_ratio(own, theta)
         return delta
 
     def _parts(self, data: QuadratureData) -> list[PointData]:
@@ -207,6 +217,12 @@ class MeanDilatation:
             return self._cells(data).total(sums)
 
         return self._volume(key, volumes)
+
+
+def _dev(tau, F):
+    """Return the deviator of a UFL tensor in the axes of F (d, d)."""
+    d, mean = range(F.ufl_shape[0]), ufl.tr(tau) / tau.ufl_shape[0]
+    return ufl.as_matrix([[tau[a, b] - mean if a == b else tau[a, b] for b in d] for a in d])
 
 
 class StressAtPoints:

@@ -18,7 +18,7 @@ from mpm_dolfinx.materials.evaluate import ConductivityAtPieces
 from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.materials.skeleton import Fluid, Skeleton
 from mpm_dolfinx.parallel.exchange import over_all
-from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints
 
 TOLD = 50
 """Share of what corners tell in the volume ratios with which cells begin a step, over G / (lambda + 2G); at most all.
@@ -111,7 +111,8 @@ class QuadraturePoints:
         self.varies = bool(fluid and scene.conductivity_laws)
         self.layered = bool(fluid and scene.conducts and scene.layered)
         d = grid.dim
-        shapes: dict[str, tuple[int, ...]] = {"F": (grid.stretches, grid.stretches), **scene.shapes}
+        own = {"F": (grid.stretches, grid.stretches)} | ({ACROSS: ()} if scene.across else {})
+        shapes: dict[str, tuple[int, ...]] = {**own, **scene.shapes}
         if fluid:
             shapes |= {"biot": (), "storage": (), "storage_at_one": ()}
             shapes |= {"drainage": (2,)} if scene.drains else {}
@@ -124,7 +125,7 @@ class QuadraturePoints:
         if self.varies:
             shapes |= {"position": (d,), "conductivity": (), "porosity0": ()}
         self.pieces = FormPoints(grid, **shapes)
-        common = ["F"] + ["biot"] * bool(fluid) + ["retention"] * bool(scene.retentions)
+        common = [*own, *["biot"] * bool(fluid), *["retention"] * bool(scene.retentions)]
         self.laws = scene.parts(self.pieces, common)
         self._locks = any(locks for *_, locks in self.laws)
         self._constants: Latest[dict[str, NDArray[np.float64]]] = Latest()
@@ -165,6 +166,8 @@ class QuadraturePoints:
             share = self._scene.locking(points) * self._scene.table(points, lambda m: told_share(m, bool(self._fluid)))
             factor = cell_ratios(cut, points, share, self._scene.evolved(points)) / cut.to_cells(points.J)
             weight, fields["F"] = factor * weight, factor[:, None, None] ** (1 / cut.grid.stretches) * fields["F"]
+            if ACROSS in fields:
+                fields[ACROSS] = np.cbrt(factor) * fields[ACROSS]
             if self._weighs:  # points weigh what they do, however large cells see them
                 fields["density"] = fields["density"] / factor
         pieces = PointData(self.pieces, places.pieces, weight, fields)
@@ -197,6 +200,7 @@ class QuadraturePoints:
     def _changing(self, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
         """Return what the points bring to their pieces and what changes with them."""
         fields = {"F": points.F, **self._scene.state(points)}
+        fields |= {ACROSS: points.data[ACROSS]} if self._scene.across else {}
         if self._extended:  # what laws take is known for all materials, and zero in `data` for those of other points
             fields |= {name: rows for name, rows in points.data.items() if name not in self._scene.shapes}
         if self._fluid:

@@ -8,7 +8,7 @@ and of bodies with inertia the velocity and the rate of F, which `inertia` carri
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
 from typing import Any
 
@@ -17,6 +17,9 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.parallel.exchange import Exchange
 from mpm_dolfinx.points.cutting import centroids
+
+ACROSS = "stretch across"
+"""Name of what points of plane strain carry whose laws see a stretch across the plane, that of a mean dilatation."""
 
 
 def determinant(F: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -42,6 +45,20 @@ def with_ratio(F: NDArray[np.float64], J: NDArray[np.float64]) -> NDArray[np.flo
     return F * (np.sign(ratio) * np.abs(ratio) ** (1 / F.shape[1]))[:, None, None]
 
 
+def in_space(F: NDArray[np.float64], across: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return F (n, 3, 3) of its part in the plane (n, 2, 2), scaled to det F, and the stretch across the plane (n,)."""
+    out = np.zeros((len(F), 3, 3))
+    out[:, :2, :2] = F / np.sqrt(across)[:, None, None]
+    out[:, 2, 2] = across
+    return out
+
+
+def in_plane(F: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return what `in_space` takes of F (n, 3, 3)."""
+    across = F[:, 2, 2]
+    return F[:, :2, :2] * np.sqrt(across)[:, None, None], across.copy()
+
+
 def cofactor(F: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return det F F^-T (n, d, d) of (n, d, d), a tenth of the time of numpy's own inverse."""
     if F.shape[1] == 2:
@@ -63,7 +80,7 @@ class MaterialPoints:
     corners : (n, 2^d, d), m
         Tracked corners of the point's domain, in the order of `cutting.corner_bits`.
     F : (n, d, d)
-        Deformation gradient.
+        Deformation gradient; where laws see a stretch across the plane its part in the plane, scaled to det F.
     volume0 : (n,), m^d
         Reference volume.
     material : (n,)
@@ -135,6 +152,18 @@ class MaterialPoints:
     def J(self) -> NDArray[np.float64]:
         """Volume ratio det F (n,)."""
         return determinant(self.F)
+
+    @property
+    def F_of_laws(self) -> NDArray[np.float64]:
+        """Deformation gradient that laws see (n, 3, 3), in plane strain without a stretch across it (n, 2, 2)."""
+        return in_space(self.F, self.data[ACROSS]) if ACROSS in self.data else self.F
+
+    def strained(self, F: NDArray[np.float64]) -> MaterialPoints:
+        """Return the points with another deformation gradient, of the shape that laws see."""
+        if ACROSS not in self.data:
+            return replace(self, F=F)
+        F, across = in_plane(F)
+        return replace(self, F=F, data={**self.data, ACROSS: across})
 
     @property
     def displacement(self) -> NDArray[np.float64]:

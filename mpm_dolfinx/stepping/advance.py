@@ -30,7 +30,7 @@ from mpm_dolfinx.mechanics.momentum import MomentumForms
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
 from mpm_dolfinx.parallel.exchange import first, over_all
 from mpm_dolfinx.points.cutting import centroids, parallelepipeds, tangled, volumes
-from mpm_dolfinx.points.material_points import MaterialPoints, determinant, with_ratio
+from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints, determinant, in_plane, in_space, with_ratio
 from mpm_dolfinx.stepping.grid_reset import AtPlaces, OnGrid
 from mpm_dolfinx.stepping.stage import Stage
 from mpm_dolfinx.stepping.state import State, Stay
@@ -122,7 +122,8 @@ class Motion:
                 points, keeps, folded = self._shaped(state, loads, on_grid, *followed, deformed)
             else:
                 x, F = state.points.x + cut.displacement(nodal), deformed()
-                points = replace(state.points, x=x, F=F, corners=parallelepipeds(x, F, self._sizes(state.points)))
+                corners = parallelepipeds(x, F[:, :d, :d], self._sizes(state.points))
+                points = replace(state.points.strained(F), x=x, corners=corners)
                 keeps, folded = on_grid.serves(points), 0
             self._check_volumes(points, cut)
             if carried is not None:
@@ -192,28 +193,37 @@ class Motion:
     def strained(self, points: MaterialPoints, on_grid: OnGrid, data: QuadratureData) -> MaterialPoints:
         """Return points with F and state as after a solved step of no time, which stay where they are."""
         nodal = self._momentum.u.x.array.reshape(-1, on_grid.cut.grid.dim)
-        after = replace(points, F=self._deformed(on_grid.cut, data, nodal))
+        after = points.strained(self._deformed(on_grid.cut, data, nodal))
         self._check_volumes(after, on_grid.cut)
         return replace(after, data=self._materials.updated_state(after, points, 0.0))
 
     def _deformed(self, cut: CutDomains, data: QuadratureData, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return F (n, d, d) of the points after a step: the means of Delta F and of its det over their pieces."""
+        """Return F (n, d, d) of the points after a step: the means of Delta F and of its det over their pieces.
+
+        Of the shape that laws see.
+        """
         pieces = data.pieces
         grid = cut.grid
         n = len(cut.points)
-        d = cut.grid.stretches
+        d = self._materials.stretches
+        F = pieces["F"].reshape(-1, grid.stretches, grid.stretches)
+        F = F if d == grid.stretches else in_space(F, pieces[ACROSS][:, 0])
         at_nodes = nodal[grid.cell_nodes[pieces.cells]].transpose(0, 2, 1)
         delta = np.eye(grid.dim) + at_nodes @ data.shape_gradients()
-        if grid.axisymmetric:
+        if d > grid.dim:
             delta = np.pad(delta, ((0, 0), (0, 1), (0, 1)))
-            delta[:, 2, 2] = pieces.places.stretch(nodal)
+            delta[:, 2, 2] = pieces.places.stretch(nodal) if grid.axisymmetric else 1.0
         if self._momentum.dilatation is not None:
             delta = self._momentum.dilatation.averaged(delta, data)
-        F = delta @ pieces["F"].reshape(-1, d, d)
+        F = delta @ F
         columns = np.concatenate([F.reshape(-1, d * d), determinant(F)[:, None]], axis=1)
         mean = cut.mean(cut.to_pieces(columns))
         F, J = mean[:, :-1].reshape(n, d, d), mean[:, -1]
-        return with_ratio(F, J)
+        F = with_ratio(F, J)
+        if d > grid.stretches:  # others have no stretch across the plane
+            scaled, across = in_plane(F)
+            F = in_space(scaled, np.where(self._materials.stretched(cut.points), across, 1.0))
+        return F
 
     def _shaped(
         self,
@@ -257,12 +267,14 @@ class Motion:
                 for one in loads:
                     corners[bad] = one.outside(corners[bad], own[bad], everywhere=True)
         F = gradient(corners, points.reference, grid.axisymmetric)
+        if self._materials.stretches > grid.stretches:
+            F = in_space(F, np.ones(len(F)))
         if self._momentum.dilatation is not None:
             locks = self._materials.locking(points)
             F = with_ratio(F, np.where(locks, determinant(deformed()), determinant(F)))
         if self._materials.evolves:
             F = np.where(evolved[:, None, None], deformed(), F)
-        return replace(points, corners=corners, x=centroids(corners), F=F), keeps, folded
+        return replace(points.strained(F), corners=corners, x=centroids(corners)), keeps, folded
 
     def _owed(
         self,

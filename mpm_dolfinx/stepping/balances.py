@@ -64,7 +64,7 @@ class Start(NamedTuple):
         if control is None or control.motion is None or len(flights) < 2:
             return 0.0, 0.0
         times = float(substep.before * self.dt), float(substep.own * self.dt)
-        return motion_error(self.matrices.solvers(), self.matrices.momentum.K, self.matrices.mass, flights, *times)
+        return motion_error(self.matrices.solvers, self.matrices.momentum.K, self.matrices.mass, flights, *times)
 
 
 class Balances(NamedTuple):

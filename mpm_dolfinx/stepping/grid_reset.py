@@ -300,12 +300,7 @@ class OnGrid(Keyed):
         return self.cut.to_pieces(pressures)
 
     def _cell_pressures(
-        self,
-        p: NDArray[np.float64],
-        stage: Stage,
-        t: float,
-        bulk: float = np.inf,
-        at_rest: AtPlaces | None = None,
+        self, p: NDArray[np.float64], stage: Stage, t: float, bulk: float = np.inf, at_rest: AtPlaces | None = None
     ) -> CellPressures:
         """Return what slopes of cells with these pressures, or mass potentials by `bulk` (Pa), are drawn from.
 
@@ -456,18 +451,16 @@ class System:
             self.storage = StorageSystem(storage, on_grid.cells, on_grid.facets, unknowns, parts)
         self.plan = planned(scheme, self.momentum, self.storage, symmetric)
         """How the linearised problem is solved."""
-        self._solvers: Latest[LinearSolvers] = Latest()
 
+    @cached_property
     def solvers(self) -> LinearSolvers:
-        """Return the solvers."""
-        return self._solvers((), lambda: LinearSolvers(self.plan, self._scheme, self.momentum, self.storage))
+        """The solvers, made when first they are needed."""
+        return LinearSolvers(self.plan, self._scheme, self.momentum, self.storage)
 
     def end_step(self) -> None:
         """Drop coarse grids that hold no tangent for other steps, before the points need the memory to move."""
-        made = self._solvers.value
-        if made is not None and self.plan.iterative and made.tangent.value is None:
-            del made
-            self._solvers.clear()
+        if "solvers" in vars(self) and self.plan.iterative and self.solvers.tangent.value is None:
+            del self.solvers
             collect_garbage(self.momentum.unknowns.comm)
 
 
@@ -497,11 +490,11 @@ class Assembled(Keyed):
         stage: Stage,
         loads: Sequence[Loads],
     ):
+        self._system = system
         self.momentum = system.momentum
         self.storage = system.storage
         self.symmetric = system.symmetric
         self.plan = system.plan
-        self.solvers = system.solvers
         self.end_step = system.end_step
         self._on_grid, self._stage = on_grid, stage
         self._u, self._varies = momentum.u, storage is not None and storage.conductivity is not None
@@ -526,6 +519,11 @@ class Assembled(Keyed):
                 facets = form.on(off_facets(on_grid.contents, on_grid.facets))
                 self._off = facets if facets.some else None
         self._gradients: Latest[Gradients] = Latest()
+
+    @property
+    def solvers(self) -> LinearSolvers:
+        """The solvers of the system."""
+        return self._system.solvers
 
     def _rounding(self, momentum: MomentumForms, loads: Sequence[Loads]) -> NDArray[np.float64]:
         """Return what rounding may leave of the residual at the local nodes (nodes,), N.

@@ -217,12 +217,7 @@ class Scene:
         return self._on_grid(points.arrays, make, grid.comm)
 
     def assembled(
-        self,
-        on_grid: OnGrid,
-        stage: Stage,
-        now: Sequence[Loads],
-        as_cut: Callable[[], Sequence[Loads]],
-        begins: bool,
+        self, on_grid: OnGrid, stage: Stage, now: Sequence[Loads], as_cut: Callable[[], Sequence[Loads]], begins: bool
     ) -> Assembled:
         """Return the matrices for a stage of the bodies on the grid.
 

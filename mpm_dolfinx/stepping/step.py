@@ -52,7 +52,7 @@ def step(scene: Scene, state: State, dt: float, how: tuple = ()) -> tuple[State,
     rates = []
     state = start.state
     on_grid = start.on_grid
-    solvers = start.matrices.solvers()
+    solvers = start.matrices.solvers
     flights, found = [flight_of(start)], []
     for acting in start.acting:
         key = start.matrices.key, acting.substep.own * dt

@@ -171,7 +171,7 @@ class _Point:
         self._parameters = {name: np.asarray(getattr(material, name), dtype=float) for name in law.parameters}
         self._rest = {name: np.asarray(value, dtype=float) for name, value in law.state.items()}
         shapes = {name: value.shape for name, value in (self._parameters | self._rest).items()}
-        self._law = LawAtPoints(Grid([0] * 3, [1.0] * 3, [2] * 3, comm=MPI.COMM_SELF), law, shapes, cell_size)
+        self._law = LawAtPoints(Grid([0] * 3, [1.0] * 3, [2] * 3, comm=MPI.COMM_SELF), law, shapes, cell_size=cell_size)
         self._bulk = float(material.bulk)
 
     def _data(self, F: NDArray[np.float64], state: dict[str, NDArray[np.float64]]):
