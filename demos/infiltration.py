@@ -19,7 +19,7 @@ import numpy as np
 import mpm_dolfinx as mpm
 
 WEIGHT = 9810.0  # N/m³
-STIFF = {"bulk": 1e12, "shear": 5e11}  # Pa: soil that hardly deforms
+STIFF = {"bulk": 1e10, "shear": 5e9}  # Pa: soil that hardly deforms
 ALPHA, K = 5.0, 1e-5  # 1/m, m/s, of the exponential soil
 HOURS = (1, 6, 12)
 FRONT = {6: (0.2544, 0.017406), 12: (0.375096, 0.026335)}

@@ -93,7 +93,7 @@ BENCHMARK = {
     "body force": {"body force"},
     "pores that drain": {"pores that drain"},
     "retention": {"retention"},
-    "rain": {"one factorisation for many steps"},
+    "rain": set(),
     "pressure that follows the surface": {"tractions", "pressures"},
     "inertia": {"inertia"} | SECOND,
     "quiet side": {"quiet sides"},

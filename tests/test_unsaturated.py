@@ -11,7 +11,7 @@ import ufl
 import mpm_dolfinx as mpm
 
 WATER = 9810.0  # N/m^3
-STIFF = {"bulk": 1e12, "shear": 5e11}  # Pa: soil that hardly deforms
+STIFF = {"bulk": 1e10, "shear": 5e9}  # Pa: soil that hardly deforms
 
 
 def column(cells, soils, pressure, conditions=(), edge=None, width=1, **options):
