@@ -48,6 +48,7 @@ QUICK = {
     "slope": ("--cells 4 --steps 4 --rtol 0.1", ["slope.png"]),
     "infiltration": ("--cells 10 --rain-step 1800 --front-step 3600", ["infiltration.png"]),
     "drainage": ("--cells 10 --step 120", ["drainage.png"]),
+    "rain": ("--cells 10 --step 7200", ["rain.png"]),
     "dam": ("--h 1 --steps 3 --cells 10", ["dam.png"]),
     "two_gels": ("--cells 4 --hertz 4", ["two_gels.png"]),
     "embankment": ("--h 1 --steps 1", ["embankment.png"]),

@@ -292,3 +292,18 @@ def test_a_column_in_axisymmetry_and_in_3d_is_that_of_plane_strain():
     assert found[0][0] < -8e3
     assert found[1] == pytest.approx(found[0], rel=1e-6)
     assert found[2] == pytest.approx(found[0], rel=1e-6)
+
+
+@pytest.mark.parametrize("suction", [1e4, 3e4])
+def test_suction_is_strength_by_bishops_stress(suction):
+    """Sand without support at its side bears (K_p - 1) chi s, on its present width."""
+    grid, felt = mpm.Grid([0, 0], [1.6, 1.2], [8, 6]), suction / np.sqrt(1 + (suction / 1e4) ** 2)
+    law = {"conductivity": 1e-3, "retention": mpm.VanGenuchten(1e4, n=2.0)}
+    soil = mpm.MohrCoulomb(bulk=1e7, shear=6e6, porosity=0.4, friction=30.0, dilation=0.0, cohesion=10.0, **law)
+    sides = [mpm.Drained("top", pressure=-suction), mpm.Displacement("top", lambda t: (0, -0.02 * t), "y")]
+    scene = {"fluid": mpm.Fluid(), "walls": {"left": "x", "bottom": "y"}, "conditions": sides, "pressure": -suction}
+    body = mpm.box(grid, [0, 0], [1, 1])
+    s = mpm.Simulation(grid, [body], [soil], initial_stress=lambda x: np.full((len(x), 3), -felt), **scene)
+    s.run(1, 0.1, progress=False)
+    width = s.points.corners[:, :, 0].max()
+    assert -s.reactions.array[0, 1] / width == pytest.approx(2 * felt + 20 * np.sqrt(3), rel=2e-3)
