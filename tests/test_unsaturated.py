@@ -307,3 +307,45 @@ def test_suction_is_strength_by_bishops_stress(suction):
     s.run(1, 0.1, progress=False)
     width = s.points.corners[:, :, 0].max()
     assert -s.reactions.array[0, 1] / width == pytest.approx(2 * felt + 20 * np.sqrt(3), rel=2e-3)
+
+
+class Haverkamp:
+    """River sand of Vauclin, Khanji and Vachaud (1979)."""
+
+    def saturation(self, p):
+        return 4e4 / (4e4 + ufl.max_value(-100 * p / WATER, 1e-12) ** 2.90)
+
+    def relative_permeability(self, p):
+        return 2.99e6 / (2.99e6 + ufl.max_value(-100 * p / WATER, 1e-12) ** 5.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("h", [0.1, 0.05])
+def test_a_water_table_rises_under_rain_as_that_of_vauclin(h):
+    """In two dimensions, after 4 and 8 h: its height within 0.3 cm, flow into the ditch 1.5 %."""
+    grid = mpm.Grid([0, 0], [3, 2 + 2 * h], [round(3 / h), round(2 / h) + 2])
+    soil = mpm.LinearElastic(**STIFF, porosity=0.3, conductivity=0.35 / 3600, retention=Haverkamp())
+    sides = [
+        mpm.Rain("top", 0.148 / 3600, region=((-1, 1.9), (0.5, 2.1))),
+        mpm.Drained("right", lambda t, x: WATER * (0.65 - x[:, 1]), region=((2.9, -1), (3.1, 0.65)), name="ditch"),
+    ]
+    walls = {"left": "x", "right": "x", "bottom": "y"}
+    scene = {"fluid": mpm.Fluid(), "walls": walls, "conditions": sides, "gravity": (0, -9.81)}
+    scene |= {"pressure": mpm.hydrostatic(0.65), "initial_stress": mpm.K0(0.5)}
+    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [3, 2])], [soil], **scene)
+    known = {
+        4: ((1.1005, 1.0426, 0.9378, 0.8528, 0.7834, 0.7210), 389.6e-4),
+        8: ((1.2187, 1.1601, 1.0531, 0.9557, 0.8642, 0.7720), 653.1e-4),
+    }
+    for hours, (heights, flow) in known.items():
+        s.run(3600 * hours, 600, progress=False)
+        cell = s.cells()
+        columns = np.unique(np.round(cell.x[:, 0], 6))
+        tables = []
+        for x in columns:
+            of = np.abs(cell.x[:, 0] - x) < 1e-5
+            order = np.argsort(cell.x[of, 1])
+            tables.append(np.interp(0.0, -cell.pressure[of][order], cell.x[of, 1][order]))
+        assert np.interp([0, 0.5, 1, 1.5, 2, 2.5], columns, tables) == pytest.approx(heights, abs=3e-3)
+        assert 3600 * s.outflows["ditch"] == pytest.approx(flow, rel=0.015)
+    assert s.result.balance < 1e-8
