@@ -49,6 +49,9 @@ QUICK = {
     "infiltration": ("--cells 10 --rain-step 1800 --front-step 3600", ["infiltration.png"]),
     "drainage": ("--cells 10 --step 120", ["drainage.png"]),
     "rain": ("--cells 10 --step 7200", ["rain.png"]),
+    "vibration": ("--h 0.1 --cells 8 --periods 1 --steps 16", ["vibration.png"]),
+    "wave": ("--cells 8 --steps 10 --periods 2", ["wave.png"]),
+    "shaking": ("--cells 4 --steps 60", ["shaking.png"]),
     "dam": ("--h 1 --steps 3 --cells 10", ["dam.png"]),
     "two_gels": ("--cells 4 --hertz 4", ["two_gels.png"]),
     "embankment": ("--h 1 --steps 1", ["embankment.png"]),
@@ -58,7 +61,8 @@ QUICK = {
     "calibrate": ("--quick", ["calibration.md"]),
     "scaling": ("--quick --dims 2 --processes 1 2", ["scaling.png", "scaling.csv", "scaling.md"]),
 }
-LONG = {"cavity", "footing", "slope", "image"}  # what they show has tests of its own, or takes long to compile
+# what they show has tests of its own, or takes long to compile
+LONG = {"cavity", "footing", "slope", "image", "vibration", "wave"}
 
 
 def run(demo, arguments):

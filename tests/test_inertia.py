@@ -277,6 +277,26 @@ def test_a_saturated_column_shakes_as_the_exact_one():
     assert abs(found / exact - 1) < 0.04
 
 
+def test_water_that_flows_freely_does_not_make_a_column_unstable():
+    """Exact settlement of a half-space of hard water and grains, u-p (after de Boer, Ehlers and Liu 1993), at 0.05 s.
+
+    With the face's acceleration alone in the flux pressures grew from step to step: water, 1000 kg/m^3, then has more
+    mass in what alternates between nodes than a third of the mixture, 1670 kg/m^3.
+    """
+    soil = mpm.LinearElastic(
+        bulk=14.515e6 / 1.2, shear=14.515e6 / 2.6, porosity=0.33, grain_density=2000.0, conductivity=1e-2
+    )
+    grid = mpm.Grid([0, 0], [0.5, 11.0], [1, 22])
+    body = mpm.box(grid, [0, 0], [0.5, 10])
+    conditions = [mpm.Traction("top", (0, -3e3)), mpm.Drained("top")]
+    fluid = mpm.Fluid(density=1000.0, bulk=np.inf, gravity=10.0)
+    walls = {"left": "x", "right": "x", "bottom": "y"}
+    s = mpm.Simulation(grid, [body], [soil], walls=walls, conditions=conditions, fluid=fluid, inertia=True)
+    s.run(0.05, 0.0025, progress=False)
+    assert 10 - s.points.corners[:, :, 1].max() == pytest.approx(1.7066e-4, rel=0.03)
+    assert s.points.pressure.max() == pytest.approx(3e3, rel=0.05)
+
+
 def test_a_fill_comes_at_rest():
     grid = mpm.Grid([0, 0], [1, 2], [4, 8])
     bodies = [mpm.box(grid, [0, 0], [1, 0.5]), mpm.box(grid, [0, 0.5], [1, 1])]
