@@ -19,7 +19,7 @@ def rained(flux, cells=10, retention=True, **options):
 
 
 @pytest.mark.parametrize("retention", [True, False])
-@pytest.mark.parametrize(("depth", "flows"), [(0.0, 0.8), (0.05, 0.85)])
+@pytest.mark.parametrize(("depth", "flows"), [(0.0, 0.8), pytest.param(0.05, 0.85, marks=pytest.mark.slow)])
 def test_rain_beyond_what_soil_takes_ponds_and_runs_off(retention, depth, flows):
     """Steady: Darcy's flow between the pond and the base; the rest of three times the conductivity runs off."""
     s = rained(3 * K, ponding=depth * WATER, retention=retention)

@@ -272,6 +272,7 @@ def test_a_body_at_rest_in_itself_keeps_its_water_and_suction_wherever_it_is_car
     assert cell.pressure == pytest.approx(WATER * (table - cell.x[:, 1]), abs=1e-3 * WATER * (7.5 * h - table))
 
 
+@pytest.mark.slow
 def test_a_column_in_axisymmetry_and_in_3d_is_that_of_plane_strain():
     """Water that soaks in from above: the same pressures."""
     law = mpm.VanGenuchten(5e3, n=2.0)
@@ -294,7 +295,7 @@ def test_a_column_in_axisymmetry_and_in_3d_is_that_of_plane_strain():
     assert found[2] == pytest.approx(found[0], rel=1e-6)
 
 
-@pytest.mark.parametrize("suction", [1e4, 3e4])
+@pytest.mark.parametrize("suction", [1e4, pytest.param(3e4, marks=pytest.mark.slow)])
 def test_suction_is_strength_by_bishops_stress(suction):
     """Sand without support at its side bears (K_p - 1) chi s, on its present width."""
     grid, felt = mpm.Grid([0, 0], [1.6, 1.2], [8, 6]), suction / np.sqrt(1 + (suction / 1e4) ** 2)
