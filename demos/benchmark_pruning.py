@@ -230,6 +230,7 @@ PAIRS: dict[str, tuple[Make, Make]] = {
             n, material=soil(conductivity=1e-4, conductivity_law=mpm.unsaturated(1e3, 1e-4, 0.1)), **WATER
         ),
     ),
+    "rain": (draining, lambda n: draining(n, conditions=[mpm.Rain("top", 1e3)])),
     "retention": (
         lambda n: restless(n, material=soil(conductivity=1e-8), **HEAVY),
         lambda n: restless(n, material=soil(conductivity=1e-8, retention=mpm.VanGenuchten(1e6)), **HEAVY),

@@ -28,7 +28,18 @@ PLATEAU = re.compile(r"\bPlateau \((\w+)\): halved ([\d.e+-]+), doubled ([\d.e+-
 UNITS = {60, 90, 100, 180, 360, 1000, 1e6, 1024, 86400}
 """Per cent, degrees, and the like."""
 STYLES = ("figsize", "alpha", "dpi")
-CONDITIONS = ("Traction", "Pressure", "Displacement", "RigidPlate", "Drained", "Inflow", "OnSide", "Tool", "Contact")
+CONDITIONS = (
+    "Traction",
+    "Pressure",
+    "Displacement",
+    "RigidPlate",
+    "Drained",
+    "Inflow",
+    "Rain",
+    "OnSide",
+    "Tool",
+    "Contact",
+)
 
 
 class Module:

@@ -93,6 +93,7 @@ BENCHMARK = {
     "body force": {"body force"},
     "pores that drain": {"pores that drain"},
     "retention": {"retention"},
+    "rain": set(),
     "pressure that follows the surface": {"tractions", "pressures"},
     "inertia": {"inertia"} | SECOND,
     "quiet side": {"quiet sides"},

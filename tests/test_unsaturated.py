@@ -11,7 +11,7 @@ import ufl
 import mpm_dolfinx as mpm
 
 WATER = 9810.0  # N/m^3
-STIFF = {"bulk": 1e12, "shear": 5e11}  # Pa: soil that hardly deforms
+STIFF = {"bulk": 1e10, "shear": 5e9}  # Pa: soil that hardly deforms
 
 
 def column(cells, soils, pressure, conditions=(), edge=None, width=1, **options):
@@ -127,17 +127,16 @@ def test_unsaturated_soil_consolidates_as_its_linear_theory_says():
     chi, jump, c, modulus, load = 0.3535533906, 0.01985921, 1.03261675e-8, 5e6, 200.0
     law = mpm.VanGenuchten(20e3, n=2.0)
     soil = mpm.LinearElastic(modulus / 3, modulus / 2, porosity=0.4, conductivity=1e-8, retention=law)
-    sides = [mpm.Drained("top", pressure=-20e3), mpm.Traction("top", lambda t: (0, -load * (t > 0)))]
-    felt = -20e3 * np.sqrt(0.5)
-    rest = {"gravity": None, "initial_stress": lambda x: np.full((len(x), 3), felt)}
-    s = column(40, [soil], -20e3, sides, **rest)
+    held = 20e3 * np.sqrt(0.5)  # against the suction, so that soil has no stress at first
+    sides = [mpm.Drained("top", pressure=-20e3), mpm.Traction("top", (0, held - load))]
+    s = column(40, [soil], -20e3, sides, gravity=None)
     top = mpm.probes(s.bodies, [[1 / 80, 1.0]])
     M = (2 * np.arange(400) + 1) * np.pi / 2
     for T in (0.1, 0.5):
         result = s.run(T / c, (T / c - s.t) / 10, progress=False, probes=top)
         left = np.exp(-(M**2) * T)
         settled = load / modulus * (1 - chi * jump * (2 / M**2 * left).sum())
-        assert -result.displacement[-1, 0, 1] == pytest.approx(settled, rel=1e-5)
+        assert -result.displacement[-1, 0, 1] == pytest.approx(settled, rel=5e-5)
         cell = s.cells()
         exact = (2 / M * np.sin(M * (1 - cell.x[:, 1:])) * left).sum(axis=1)
         assert (cell.pressure + 20e3) / (load * jump) == pytest.approx(exact, abs=5e-4)
@@ -273,6 +272,7 @@ def test_a_body_at_rest_in_itself_keeps_its_water_and_suction_wherever_it_is_car
     assert cell.pressure == pytest.approx(WATER * (table - cell.x[:, 1]), abs=1e-3 * WATER * (7.5 * h - table))
 
 
+@pytest.mark.slow
 def test_a_column_in_axisymmetry_and_in_3d_is_that_of_plane_strain():
     """Water that soaks in from above: the same pressures."""
     law = mpm.VanGenuchten(5e3, n=2.0)
@@ -293,3 +293,60 @@ def test_a_column_in_axisymmetry_and_in_3d_is_that_of_plane_strain():
     assert found[0][0] < -8e3
     assert found[1] == pytest.approx(found[0], rel=1e-6)
     assert found[2] == pytest.approx(found[0], rel=1e-6)
+
+
+@pytest.mark.parametrize("suction", [1e4, pytest.param(3e4, marks=pytest.mark.slow)])
+def test_suction_is_strength_by_bishops_stress(suction):
+    """Sand without support at its side bears (K_p - 1) chi s, on its present width."""
+    grid, felt = mpm.Grid([0, 0], [1.6, 1.2], [8, 6]), suction / np.sqrt(1 + (suction / 1e4) ** 2)
+    law = {"conductivity": 1e-3, "retention": mpm.VanGenuchten(1e4, n=2.0)}
+    soil = mpm.MohrCoulomb(bulk=1e7, shear=6e6, porosity=0.4, friction=30.0, dilation=0.0, cohesion=10.0, **law)
+    sides = [mpm.Drained("top", pressure=-suction), mpm.Displacement("top", lambda t: (0, -0.02 * t), "y")]
+    scene = {"fluid": mpm.Fluid(), "walls": {"left": "x", "bottom": "y"}, "conditions": sides, "pressure": -suction}
+    body = mpm.box(grid, [0, 0], [1, 1])
+    s = mpm.Simulation(grid, [body], [soil], initial_stress=lambda x: np.full((len(x), 3), -felt), **scene)
+    s.run(1, 0.1, progress=False)
+    width = s.points.corners[:, :, 0].max()
+    assert -s.reactions.array[0, 1] / width == pytest.approx(2 * felt + 20 * np.sqrt(3), rel=2e-3)
+
+
+class Haverkamp:
+    """River sand of Vauclin, Khanji and Vachaud (1979)."""
+
+    def saturation(self, p):
+        return 4e4 / (4e4 + ufl.max_value(-100 * p / WATER, 1e-12) ** 2.90)
+
+    def relative_permeability(self, p):
+        return 2.99e6 / (2.99e6 + ufl.max_value(-100 * p / WATER, 1e-12) ** 5.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("h", [0.1, 0.05])
+def test_a_water_table_rises_under_rain_as_that_of_vauclin(h):
+    """In two dimensions, after 4 and 8 h: its height within 0.3 cm, flow into the ditch 1.5 %."""
+    grid = mpm.Grid([0, 0], [3, 2 + 2 * h], [round(3 / h), round(2 / h) + 2])
+    soil = mpm.LinearElastic(**STIFF, porosity=0.3, conductivity=0.35 / 3600, retention=Haverkamp())
+    sides = [
+        mpm.Rain("top", 0.148 / 3600, region=((-1, 1.9), (0.5, 2.1))),
+        mpm.Drained("right", lambda t, x: WATER * (0.65 - x[:, 1]), region=((2.9, -1), (3.1, 0.65)), name="ditch"),
+    ]
+    walls = {"left": "x", "right": "x", "bottom": "y"}
+    scene = {"fluid": mpm.Fluid(), "walls": walls, "conditions": sides, "gravity": (0, -9.81)}
+    scene |= {"pressure": mpm.hydrostatic(0.65), "initial_stress": mpm.K0(0.5)}
+    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [3, 2])], [soil], **scene)
+    known = {
+        4: ((1.1005, 1.0426, 0.9378, 0.8528, 0.7834, 0.7210), 389.6e-4),
+        8: ((1.2187, 1.1601, 1.0531, 0.9557, 0.8642, 0.7720), 653.1e-4),
+    }
+    for hours, (heights, flow) in known.items():
+        s.run(3600 * hours, 600, progress=False)
+        cell = s.cells()
+        columns = np.unique(np.round(cell.x[:, 0], 6))
+        tables = []
+        for x in columns:
+            of = np.abs(cell.x[:, 0] - x) < 1e-5
+            order = np.argsort(cell.x[of, 1])
+            tables.append(np.interp(0.0, -cell.pressure[of][order], cell.x[of, 1][order]))
+        assert np.interp([0, 0.5, 1, 1.5, 2, 2.5], columns, tables) == pytest.approx(heights, abs=3e-3)
+        assert 3600 * s.outflows["ditch"] == pytest.approx(flow, rel=0.015)
+    assert s.result.balance < 1e-8

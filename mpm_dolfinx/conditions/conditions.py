@@ -210,12 +210,14 @@ def sorted_terms(terms: Sequence[Callable | OnSide | Source]) -> tuple[list[Call
 class Through(NamedTuple):
     """What a side lets through at its places, each () or (m,).
 
-    pressure: beyond it, Pa, nan where the flux alone is given; flux: into the body, m/s; one_way: nothing flows in.
+    pressure: beyond it, Pa, nan where the flux alone is given; flux: into the body, m/s; one_way: nothing flows in;
+    driest: the least pressure at which the flux is what is given, Pa, nan where it is not bounded by pressures.
     """
 
     pressure: NDArray[np.float64] | float
     flux: NDArray[np.float64] | float
     one_way: NDArray[np.bool_] | bool
+    driest: NDArray[np.float64] | float = np.nan
 
 
 @dataclass(frozen=True, eq=False)
@@ -301,6 +303,58 @@ class Inflow(Condition):
     def through(self, t: float, side: Places) -> Through:
         """Return what the side lets through at time t (s)."""
         return Through(np.nan, self.at(t, side), False)
+
+
+@dataclass(frozen=True, eq=False)
+class Rain(Condition):
+    """Side of the bodies on which rain falls, or from which water evaporates, as much as the soil lets.
+
+    Rain soaks in until the pressure at the side is that of `ponding`: what soil does not take then runs off.  Water
+    evaporates until the pressure is `driest`.  What seeps out of the body leaves it too.  What passes the side is in
+    the simulation's `outflows`, and what runs off in `simulation.outcome("runoff")`, m^3/s (m^2/s in plane strain).
+
+    Parameters
+    ----------
+    side
+        Side of the bodies, as for `Traction`.
+    flux : float or callable (t, X, x) -> float, m/s
+        Rain that falls on the present area of the side in a time, as a volume at zero pressure, finite; negative: what
+        would evaporate from a wet side.  Rain that falls straight down on a slope of angle b has flux cos(b).
+    ponding
+        Pressure of the water that stands on the side before it runs off, Pa, >= 0: its depth times its weight.  The
+        volume of the pond is not counted.
+    driest
+        Least pressure at the side, Pa, < 0 and finite: the suction of dry air.
+    region : ((d,), (d,)), m
+        Box of reference positions to which the faces are limited.
+
+    Raises
+    ------
+    ValueError
+        As for `Drained`.
+    """
+
+    side: str
+    flux: float | Callable[..., ArrayLike]
+    ponding: float = 0.0
+    driest: float = -1e7
+    region: Region | None = None
+    FUNCTIONS: ClassVar[Mapping[str, Sequence[str]]] = {"flux": NAMES}
+
+    def __post_init__(self):
+        super().__post_init__()
+        if not callable(self.flux):
+            numbers("Rain: flux", self.flux)
+        numbers("Rain: ponding", self.ponding, test=lambda v: (0 <= v) & (v < np.inf), allowed=">= 0 and finite")
+        numbers("Rain: driest", self.driest, test=lambda v: (v < 0) & (v > -np.inf), allowed="< 0 and finite")
+
+    def at(self, t: float, side: Places | None = None) -> NDArray[np.float64]:
+        """Return the flux () or (m,) at time t (s), m/s."""
+        return self._given("flux", t, side)
+
+    def through(self, t: float, side: Places) -> Through:
+        """Return what the side lets through at time t (s)."""
+        return Through(self.ponding, self.at(t, side), True, self.driest)
 
 
 RIGIDITY = 1e4

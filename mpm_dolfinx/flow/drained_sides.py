@@ -1,16 +1,17 @@
 # SPDX-License-Identifier: MIT
-"""Drained sides, seepage faces and prescribed inflows: what passes through the sides of the bodies to and from outside.
+"""Drained sides, seepage faces, rain, prescribed inflows: what passes through the sides of the bodies.
 
 What leaves a cell through a face is T r [p - p_out + rho_w g . (x_out - x)], T = A kappa / d by the distance d of the
 cell's centroid, or what is prescribed.  A seepage face lets nothing in: it is open where the flow at the start of the
 substep, and then that of a solution, asks for it (`SideFeeds.settle`), a primal-dual active set (Hintermueller, Ito and
-Kunisch 2002).
+Kunisch 2002).  Rain is what is given, but no more than what the pressure of its pond presses in; what evaporates is no
+more than what the driest pressure sucks out.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations
 
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.bodies.faces import Surface
 from mpm_dolfinx.conditions.acting import Setting
-from mpm_dolfinx.conditions.conditions import Drained, Inflow
+from mpm_dolfinx.conditions.conditions import Drained, Inflow, Rain
 from mpm_dolfinx.conditions.sides import check_apart, everywhere, gathered, on_side
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.flow.feeding import Feeding, Feeds, Fluid, Leaving, Wet
@@ -54,9 +55,9 @@ class DrainedSides(Feeding):
         Naming a condition whose side no point has, or two that act on the same faces.
     """
 
-    conditions, title = (Drained, Inflow), "open sides"
+    conditions, title = (Drained, Inflow, Rain), "open sides"
 
-    def __init__(self, setting: Setting, outlets: Mapping[str, Drained | Inflow]):
+    def __init__(self, setting: Setting, outlets: Mapping[str, Drained | Inflow | Rain]):
         self._grid = setting.grid
         self._names, self.count = tuple(outlets), len(outlets)
         self._outlets = [(outlet, setting.sides.of(outlet)) for outlet in outlets.values()]
@@ -73,6 +74,11 @@ class DrainedSides(Feeding):
     def unknown(self, value: float) -> dict[str, NDArray[np.float64]]:
         """Return outflows of this value before a first step."""
         return {name: np.array(value) for name in self._names}
+
+    def dry(self, value: float) -> dict[str, NDArray[np.float64]]:
+        """Return run-offs of this value before a first step."""
+        rains = [isinstance(outlet, Rain) for outlet, _ in self._outlets]
+        return {name: np.array(value) for name, rain in zip(self._names, rains, strict=True) if rain}
 
     def fed(self, cut: CutDomains, pieces: PointData) -> NDArray[np.int64]:
         """Return the points at the faces."""
@@ -93,10 +99,10 @@ class DrainedSides(Feeding):
             given, n = everywhere(grid, partial(outlet.through, wet.t, on_side(p, wet.points))), len(p.x)
             columns = [np.resize(column, (n, 1)) for column in (i, *given)]
             rows.append((p.cell, p.x, np.concatenate([*columns, p.area(wet.points)], axis=1)))
-        cell, x, values = gathered(grid, rows, 4 + grid.dim)
+        cell, x, values = gathered(grid, rows, 5 + grid.dim)
         number = values[:, 0].astype(np.int64)
-        pressure, flux, one_way = values[:, 1:4].T
-        area = values[:, 4:]
+        pressure, flux, one_way, driest = values[:, 1:5].T
+        area = values[:, 5:]
         drains = np.isfinite(pressure)
         size, reach = np.linalg.norm(area, axis=1), x - grid.midpoints[cell] - wet.contents.centroid[cell]
         least = wet.contents.fill[wet.contents.slot(cell)] * grid.h.min() / THICK / (grid.dim + 1)
@@ -106,7 +112,9 @@ class DrainedSides(Feeding):
         if grid.axisymmetric:  # half-way to the centroid rings are as much longer or shorter
             shape = shape * (1 - distance * normal[:, 0] / (2 * x[:, 0]))
         shape, pressure = (np.where(drains, values, 0.0) for values in (shape, pressure))
-        return OpenSides(number, cell, shape, pressure, flux * size, one_way > 0, area, reach)
+        rains = np.isfinite(driest)
+        given, rain = np.where(rains, 0.0, flux * size), np.where(rains, flux * size, np.nan)
+        return OpenSides(number, cell, shape, pressure, given, one_way > 0, area, reach, rain, driest)
 
 
 @dataclass(frozen=True)
@@ -168,6 +176,33 @@ class UnsaturatedFaces(OpenFaces):
         return self.conductance * (k + slope * (p - self.beyond))
 
 
+@dataclass(frozen=True)
+class RainedFaces(OpenFaces):
+    """The same where rain may fall; rain (m,): m^d/s, nan where there is none; pond, dry: faces at either bound.
+
+    What leaves is minus the rain, or what leaves at the bound that it would pass.  So seepage is the rain's: `seeps` is
+    false there.
+    """
+
+    rain: NDArray[np.float64]
+    pond: OpenFaces
+    dry: OpenFaces
+
+    def outflow(self, fluid: Fluid) -> NDArray[np.float64]:
+        """Return what leaves through each face (m,), m^d/s."""
+        wet = self.pond.outflow(fluid)
+        return np.where(np.isnan(self.rain), wet, np.clip(-self.rain, wet, self.dry.outflow(fluid)))
+
+    def open_by(self, fluid: Fluid) -> NDArray[np.float64]:
+        """Return what leaves through each face (m,) by a unit of the difference of potentials, m^d/(Pa s)."""
+        return self.pond.open_by(fluid)
+
+    def rises(self, fluid: Fluid) -> NDArray[np.float64]:
+        """Return by how much more leaves as the cell's pressure rises."""
+        out = np.where(self.rain <= -self.dry.outflow(fluid), self.dry.rises(fluid), 0.0)
+        return np.where(self.rain < -self.pond.outflow(fluid), out, self.pond.rises(fluid))
+
+
 class SideFeeds(Feeds):
     """Open sides in a substep.
 
@@ -186,23 +221,38 @@ class SideFeeds(Feeds):
     def __init__(self, sides: OpenSides, wet: Wet, grid: Grid, names: tuple[str, ...]):
         self.sides, self._names = sides, names
         self._contents, self._comm = wet.contents, grid.comm
-        self.settles = bool(sides.seeps.any())
+        rains = np.isfinite(sides.driest)
+        self._rains = bool(over_all(self._comm, int(rains.any())))
+        self._seeps = sides.seeps & ~rains
+        self.settles = bool(self._seeps.any())
+        self.linear = not self._rains
+        self._drain = wet.drains
         self._flows, self._aslant = np.ones(len(sides.cells), dtype=bool), np.zeros(len(sides.cells))
 
     def conducting(self, flow: Conduction) -> OpenFaces:
         """Return the faces as the cells conduct."""
-        sides, at = self.sides, self._contents.slot(self.sides.cells)
+        faces = self._faces(self.sides, flow)
+        if not self._rains:
+            return faces
+        driest = np.where(np.isnan(self.sides.driest), self.sides.pressure, self.sides.driest)
+        dry = self._faces(replace(self.sides, pressure=driest), flow)
+        same = (faces.at, faces.conductance, faces.inflow, faces.seeps, faces.reach)
+        return RainedFaces(*same, self.sides.rain, faces, dry)
+
+    def _faces(self, sides: OpenSides, flow: Conduction) -> OpenFaces:
+        """Return faces with these pressures beyond."""
+        at = self._contents.slot(sides.cells)
         conductance, inflow = sides.driven(at, flow)
         reach = flow.deformed(at, sides.reach)
         if flow.relative is None:
-            return OpenFaces(at, conductance, inflow, sides.seeps, reach)
+            return OpenFaces(at, conductance, inflow, self._seeps, reach)
         where = flow.relative, sides.cells, sides.outer(at, flow), sides.pressure
-        return UnsaturatedFaces(at, conductance, sides.given, sides.seeps, reach, *where)
+        return UnsaturatedFaces(at, conductance, sides.given, self._seeps, reach, *where)
 
     def begin(self, at: OpenFaces, fluid: Fluid, beyond: NDArray[np.float64]) -> None:
         """Open seepage faces as the flow asks for; their cells' pressures alone count for these."""
         self._flows = at.outflow(fluid) >= 0
-        self._aslant = np.where(at.seeps, 0.0, at.open_by(fluid) * beyond * fluid.density[at.at])
+        self._aslant = np.where(self.sides.seeps, 0.0, at.open_by(fluid) * beyond * fluid.density[at.at])
 
     def leaving(self, at: OpenFaces, fluid: Fluid) -> Leaving:
         """Return what leaves the cells, what flows aslant as it did at the start of the substep."""
@@ -210,7 +260,8 @@ class SideFeeds(Feeds):
         if fluid.force is not None:
             through = through + at.driven(fluid.force)
         turnover = sum_by(at.at, counts * at.open_by(fluid), len(fluid.pi)) * np.abs(fluid.pi)
-        return Leaving(sum_by(at.at, through, len(fluid.pi)), turnover)
+        gain = sum_by(at.at, np.abs(through), len(fluid.pi)) if self._drain else 0.0  # steady rain changes nothing
+        return Leaving(sum_by(at.at, through, len(fluid.pi)), turnover, gain)
 
     def slope(self, at: OpenFaces, fluid: Fluid) -> NDArray[np.float64]:
         """Return the derivative of what leaves."""
@@ -227,6 +278,15 @@ class SideFeeds(Feeds):
         """Return what leaves through the sides of each condition, m^d/s, by name."""
         sums = over_all(self._comm, sum_by(self.sides.number, self._through(at, fluid), len(self._names)))
         return {name: np.array(sums[i]) for i, name in enumerate(self._names)}
+
+    def run_off(self, at: OpenFaces, fluid: Fluid) -> dict[str, NDArray[np.float64]]:
+        """Return what of the rain does not soak in, m^d/s, by name of the conditions of rain."""
+        rain = np.isfinite(self.sides.rain)
+        left = np.where(rain, np.maximum(self.sides.rain, 0.0) + np.minimum(self._through(at, fluid), 0.0), 0.0)
+        number = self.sides.number
+        sums = [sum_by(number, values, len(self._names)) for values in (left, rain.astype(float))]
+        runs, rains = over_all(self._comm, np.stack(sums))
+        return {name: np.array(runs[i]) for i, name in enumerate(self._names) if rains[i]}
 
     def _counts(self, at: OpenFaces) -> NDArray[np.bool_]:
         """Return which faces (m,) are open."""

@@ -26,7 +26,8 @@ class Wet(NamedTuple):
     """When and where a condition acts in a substep.
 
     cut, points: the domains as they are cut, and the points with the places that count; contents: of the cells;
-    pieces: points of integration, None where only open sides are asked for; t: end of the substep, s.
+    pieces: points of integration, None where only open sides are asked for; t: end of the substep, s; drains: whether
+    pores drain under suction.
     """
 
     cut: CutDomains
@@ -34,6 +35,7 @@ class Wet(NamedTuple):
     contents: CellContents
     t: float
     pieces: PointData | None = None
+    drains: bool = False
 
 
 class Fluid(NamedTuple):
@@ -94,6 +96,10 @@ class Feeds:
         """Return what leaves the bodies by each condition, m^d/s, by name; all processes together."""
         return {}
 
+    def run_off(self, at: Any, fluid: Fluid) -> dict[str, NDArray[np.float64]]:
+        """Return what falls on the bodies and does not soak in, m^d/s, by name; all processes together."""
+        return {}
+
 
 def open_sides(feeds: Sequence[Feeds], dim: int) -> OpenSides:
     """Return the open sides of all that acts on the fluid, with what they give."""
@@ -124,4 +130,8 @@ class Feeding:
 
     def unknown(self, value: float) -> dict[str, NDArray[np.float64]]:
         """Return `Feeds.outflows` of this value, before a first step."""
+        return {}
+
+    def dry(self, value: float) -> dict[str, NDArray[np.float64]]:
+        """Return `Feeds.run_off` of this value, before a first step."""
         return {}

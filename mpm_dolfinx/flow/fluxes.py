@@ -114,7 +114,8 @@ class OpenSides:
 
     number (m,): of the condition; cells (m,): owned cell behind each; shape: area over distance from the cell's
     centroid, m^(d-2), zero where the inflow is prescribed; pressure: beyond it, Pa; given: prescribed inflow, m^d/s;
-    seeps: whether nothing may flow in; area (m, d): outward, m^(d-1); reach (m, d): way from the cell's centroid, m.
+    seeps: whether nothing may flow in; area (m, d): outward, m^(d-1); reach (m, d): way from the cell's centroid, m;
+    rain, driest (m,): what falls, m^d/s, and the least pressure beyond, Pa, nan where there is no rain.
     """
 
     number: NDArray[np.int64]
@@ -125,6 +126,8 @@ class OpenSides:
     seeps: NDArray[np.bool_]
     area: NDArray[np.float64]
     reach: NDArray[np.float64]
+    rain: NDArray[np.float64]
+    driest: NDArray[np.float64]
 
     @classmethod
     def joined(cls, several: Sequence[OpenSides], dim: int) -> OpenSides:
@@ -132,7 +135,8 @@ class OpenSides:
         if len(several) == 1:
             return several[0]
         none, vectors = np.empty(0), np.empty((0, dim))
-        empty = cls(none.astype(int), none.astype(np.int32), none, none, none, none.astype(bool), vectors, vectors)
+        indices = none.astype(int), none.astype(np.int32)
+        empty = cls(*indices, none, none, none, none.astype(bool), vectors, vectors, none, none)
         return cls(*(np.concatenate([getattr(one, f.name) for one in (empty, *several)]) for f in fields(cls)))
 
     @cached_property

@@ -460,6 +460,11 @@ class StorageProblem:
         fluid, both = self._fluid, zip(self._feeds, self._flow(False).at, strict=True)
         return {name: values for one, at in both for name, values in one.outflows(at, fluid).items()}
 
+    def run_off(self) -> dict[str, NDArray[np.float64]]:
+        """Return what falls on the bodies and does not soak in, m^d/s, by name."""
+        fluid, both = self._fluid, zip(self._feeds, self._flow(False).at, strict=True)
+        return {name: values for one, at in both for name, values in one.run_off(at, fluid).items()}
+
     @property
     def linear(self) -> bool:
         """Whether the tangent does not depend on the pressure."""

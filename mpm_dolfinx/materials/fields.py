@@ -25,6 +25,7 @@ from mpm_dolfinx.materials.skeleton import BY_SCENE, Fluid, Skeleton, constants_
 from mpm_dolfinx.parallel.exchange import first
 from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints
 from mpm_dolfinx.pores.retention import Retentions, SaturationAt, scale_of
+from mpm_dolfinx.pores.retention import sampled as drained
 
 RESERVED = frozenset(
     "F dF softness owed due storage storage_at_one density position displacement porosity0 gradient drainage retention "
@@ -122,7 +123,10 @@ class SceneMaterials:
             for i, m in zip(self._used, used, strict=True)
             if m.conductivity_law
         }
-        """What tells fields and conductivity laws from others."""
+        """What tells fields and laws of flow from others."""
+        for i, m in zip(self._used, used, strict=True):
+            if m.retention is not None:
+                self.checksums[f"retention of material {i}"] = drained(m.retention)
         self.shapes: dict[str, tuple[int, ...]] = {}
         """Shape of each parameter and variable of state."""
         for i, m in zip(self._used, evaluated, strict=True):

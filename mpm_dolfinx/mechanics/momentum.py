@@ -146,10 +146,9 @@ class MomentumForms:
         else:
             P, A = law.first_piola(F, known), ufl.diff(law.first_piola(F, values), F)
         if pressure is not None:
-            felt = points.biot * pressure
+            of_pressure = -points.biot * pressure * ufl.diff(ufl.det(F), F)
             if self._retentions is not None:
-                felt = felt * self._retentions.of("bishop", pressure, points.retention)
-            of_pressure = -felt * ufl.diff(ufl.det(F), F)
+                of_pressure = self._retentions.of("bishop", pressure, points.retention) * of_pressure
             P, A = P + of_pressure, A + ufl.diff(of_pressure, F)
         share = 1 / ufl.det(points.F)  # divided by it, each component would be
         P, A = share * P, share * A

@@ -204,6 +204,12 @@ def check_retention(what: str, law) -> None:
             raise ValueError(f"{what}: {name} is {shown} at p = {where} Pa, must fall from 1 at 0 to no less than 0")
 
 
+def sampled(law) -> list[float]:
+    """Return saturations and relative permeabilities at some suctions, which tell a law from another."""
+    suctions = scale_of(law) * np.exp2(np.arange(-2, 3))
+    return [_value(getattr(law, name), -s) for name in METHODS for s in suctions] + suctions.tolist()
+
+
 def _value(function: Callable, p: float) -> float:
     """Return the number that a function of p, which returns UFL, has at a pressure, Pa."""
     return float(apply_algebra_lowering(ufl.as_ufl(function(ufl.as_ufl(float(p)))))(()))

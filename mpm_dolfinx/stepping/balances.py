@@ -86,6 +86,8 @@ class Balances(NamedTuple):
         stage, out = state.stage, {quantity: {} for quantity in QUANTITIES} | self.momentum.outcome()
         out["wall_reactions"] = self.momentum.wall_forces(stage.conditions["walls"])
         out["outflows"] = self.storage.outflows() if self.storage else {}
+        if self.storage and (runs := self.storage.run_off()):
+            out["runoff"] = runs
         return out
 
     def came(self, rates: Rates | None) -> NDArray[np.float64] | None:

@@ -562,7 +562,7 @@ class Assembled(Keyed):
         u = self._u
         varies = (t,) if any(one.varies for one in self._stage.feeding) else ()
         at = state.points if weight is not None or varies else on_grid.cut.points  # gravity may change with time
-        wet = Wet(on_grid.cut, at, contents, t, data.pieces)
+        wet = Wet(on_grid.cut, at, contents, t, data.pieces, on_grid.scale is not None)
         feeds = [one.placed(wet) for one in self._stage.feeding]
         sides = open_sides(feeds, grid.dim)
 

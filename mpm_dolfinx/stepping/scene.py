@@ -261,7 +261,9 @@ class Scene:
         for name, one in {**materials, "fluid": self.fluid}.items():
             out[name] = None if one is None else type(one).__name__
             constants = {f.name: getattr(one, f.name) for f in fields(one)} if one is not None else {}
-            constants = {key: value for key, value in constants.items() if value is not None and not callable(value)}
+            laws = ("retention",)  # known by what it gives, in the checksums
+            given = {key: value for key, value in constants.items() if key not in laws and value is not None}
+            constants = {key: value for key, value in given.items() if not callable(value)}
             out |= {f"{key} of {name}": np.asarray(value).tolist() for key, value in constants.items()}
         return {**out, **self.materials.checksums, "data of the points": sorted(self.materials.seeded.data)}
 

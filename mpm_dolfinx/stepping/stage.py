@@ -23,6 +23,7 @@ from mpm_dolfinx.conditions.conditions import (
     OnSide,
     Pressure,
     Quiet,
+    Rain,
     RigidPlate,
     Source,
     Traction,
@@ -45,7 +46,7 @@ from mpm_dolfinx.mechanics.momentum import MomentumForms
 from mpm_dolfinx.mechanics.plates import Plates
 from mpm_dolfinx.mechanics.tractions import Pressures, Tractions
 
-Condition = Traction | Pressure | Displacement | RigidPlate | Quiet | Drained | Inflow | Tool | Contact
+Condition = Traction | Pressure | Displacement | RigidPlate | Quiet | Drained | Inflow | Rain | Tool | Contact
 """What acts on the bodies."""
 KINDS: tuple[type[Acting], ...] = (
     Tractions,
@@ -151,6 +152,8 @@ class Stage:
         out = {quantity: {} for quantity in QUANTITIES}
         out["wall_reactions"] = {wall: np.full(d, value) for wall in SIDES[d]}
         out["outflows"] = {name: values for one in self.feeding for name, values in one.unknown(value).items()}
+        if runs := {name: values for one in self.feeding for name, values in one.dry(value).items()}:
+            out["runoff"] = runs
         for one in self.acting:
             for quantity, values in one.unknown(value).items():
                 out[quantity] = out.get(quantity, {}) | values

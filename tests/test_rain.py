@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: MIT
+"""Rain soaks in until the surface ponds, then runs off; water evaporates until the surface is dry."""
+
+import numpy as np
+import pytest
+from test_unsaturated import STIFF, WATER, column, water
+
+import mpm_dolfinx as mpm
+
+K = 1e-5  # m/s
+
+
+def rained(flux, cells=10, retention=True, **options):
+    """Return a column that drains to a head of 0.2 m at its base, under rain on its top."""
+    law = mpm.VanGenuchten(WATER / 3.35, residual=0.1, n=2.0) if retention else None
+    soil = mpm.LinearElastic(**STIFF, porosity=0.4, conductivity=K, retention=law)
+    sides = [mpm.Drained("bottom", pressure=0.2 * WATER), mpm.Rain("top", flux, name="rain", **options)]
+    return column(cells, [soil], mpm.hydrostatic(0.2), sides, initial_stress=mpm.K0(0.5))
+
+
+@pytest.mark.parametrize("retention", [True, False])
+@pytest.mark.parametrize(("depth", "flows"), [(0.0, 0.8), pytest.param(0.05, 0.85, marks=pytest.mark.slow)])
+def test_rain_beyond_what_soil_takes_ponds_and_runs_off(retention, depth, flows):
+    """Steady: Darcy's flow between the pond and the base; the rest of three times the conductivity runs off."""
+    s = rained(3 * K, ponding=depth * WATER, retention=retention)
+    start, soaked = water(s), 0.0
+    for _ in range(6):
+        s.run(s.t + 3600, 600, progress=False)
+        out, runs = 10 * s.outflows.array, 10 * s.outcome("runoff")["rain"]
+        assert -out[1] + runs == pytest.approx(3 * K, rel=1e-10)  # rain is what soaks in and what runs off
+        soaked += -out.sum()
+    assert [out[0], -out[1], runs] == pytest.approx([flows * K, flows * K, (3 - flows) * K], rel=1e-3)
+    assert not retention or water(s) > start
+
+
+def test_light_rain_soaks_in_and_its_water_is_all_there():
+    s = rained(0.3 * K, cells=20)
+    start = water(s)
+    s.run(3600, 600, progress=False)
+    assert s.outcome("runoff").array == [0.0]
+    assert s.outflows["rain"] == pytest.approx(-0.3 * K / 20, rel=1e-12)
+    assert 20 * (water(s) - start) == pytest.approx(0.3 * K * 3600, rel=1e-4)
+
+
+def test_water_evaporates_at_its_rate_and_then_as_the_driest_pressure_lets_it():
+    s = rained(-1e-7, driest=-5 * WATER)
+    s.run(3600, 1200, progress=False)
+    assert 10 * s.outflows["rain"] == pytest.approx(1e-7, rel=1e-10)
+    s.run(4 * 86400, 43200, progress=False)
+    assert 0 < 10 * s.outflows["rain"] < 0.5e-7
+    assert s.cells().pressure.min() > -5 * WATER
+
+
+def test_a_wet_slope_seeps_where_no_rain_falls():
+    s = rained(0.0, retention=False)
+    s.stage(conditions=[mpm.Drained("bottom", pressure=1.5 * WATER), mpm.Rain("top", 0.0, name="rain")])
+    s.run(1e4, 2e3, progress=False)
+    assert 10 * s.outflows["rain"] == pytest.approx(0.5 * K, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"flux": "much"}, "Rain: flux = 'much', must be a finite number"),
+        ({"flux": 1e-6, "ponding": -1.0}, r"Rain: ponding = -1.0, must be >= 0 and finite"),
+        ({"flux": 1e-6, "driest": 0.0}, r"Rain: driest = 0.0, must be < 0 and finite"),
+    ],
+)
+def test_what_is_no_rain_is_refused(given, said):
+    with pytest.raises(ValueError, match=said):
+        mpm.Rain("top", **given)
+
+
+def test_rain_on_a_drained_side_is_refused():
+    sides = [mpm.Drained("top"), mpm.Rain("top", 1e-6)]
+    with pytest.raises(ValueError, match="top"):
+        column(2, [mpm.Hencky(1e6, 1e6)], 0.0, sides)
+
+
+def test_rain_is_the_same_on_the_left_as_on_the_right():
+    """Mirrored, to rounding."""
+    found = []
+    for side, other in (("left", "right"), ("right", "left")):
+        grid = mpm.Grid([-1, 0], [1, 0.5], [20, 5])
+        law = mpm.BrooksCorey(3e3, index=1.5)
+        soil = mpm.Hencky(bulk=1e7, shear=5e6, porosity=0.4, conductivity=K, retention=law)
+        walls = {"left": "x", "right": "x", "bottom": "y"}
+        rain = mpm.Rain(side, 3e-6)
+        scene = {"walls": walls, "conditions": [rain, mpm.Drained(other, seepage=True)], "fluid": mpm.Fluid()}
+        body = mpm.box(grid, [-1, 0], [1, 0.4])
+        s = mpm.Simulation(grid, [body], [soil], pressure=-6e3, gravity=(0, -9.81), **scene)
+        s.run(1200, 300, progress=False)
+        p = s.cells().pressure[np.lexsort(np.round(s.cells().x * [1 if side == "left" else -1, 1], 6).T)]
+        found.append(p)
+    assert found[0] == pytest.approx(found[1], rel=1e-6)
+
+
+def test_a_resumed_run_goes_on_as_the_one_that_was_not_broken_off(tmp_path):
+    """Of a body that is carried along, bit by bit."""
+
+    def scene(index=1.5):
+        grid = mpm.Grid([-1, 0], [1.4, 0.6], [24, 6])
+        soil = mpm.Hencky(1e6, 5e5, porosity=0.4, conductivity=K, retention=mpm.BrooksCorey(3e3, index=index))
+        acting = [mpm.Rain("top", 2 * K, name="rain"), mpm.Displacement("left", lambda t: (t * 2e-4, 0), "x")]
+        given = {"pressure": -6e3, "gravity": (0, -9.81), "fluid": mpm.Fluid(), "initial_stress": mpm.K0(0.5)}
+        body = mpm.box(grid, [-1, 0], [1, 0.43])
+        return mpm.Simulation(grid, [body], [soil], walls={"bottom": "y"}, conditions=acting, **given)
+
+    whole, broken, later = scene(), scene(), scene()
+    whole.run(600, 200, progress=False)
+    broken.run(400, 200, progress=False, checkpoint=mpm.Checkpoint(tmp_path / "c.npz"))
+    later.run(600, 200, progress=False, after=mpm.resume(later, tmp_path / "c.npz"))
+    assert whole.state.resets > 2
+    assert np.array_equal(whole.cells().pressure, later.cells().pressure)
+    assert np.array_equal(whole.outcome("runoff").array, later.outcome("runoff").array)
+    with pytest.raises(ValueError, match="retention of material 0"):
+        mpm.resume(scene(2.0), tmp_path / "c.npz")
