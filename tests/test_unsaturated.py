@@ -350,3 +350,20 @@ def test_a_water_table_rises_under_rain_as_that_of_vauclin(h):
         assert np.interp([0, 0.5, 1, 1.5, 2, 2.5], columns, tables) == pytest.approx(heights, abs=3e-3)
         assert 3600 * s.outflows["ditch"] == pytest.approx(flow, rel=0.015)
     assert s.result.balance < 1e-8
+
+
+@pytest.mark.slow
+def test_very_dry_sand_beside_clay_is_ponded_and_stands_a_year():
+    """From -100 m of suction: an hour that may be cut, a day, and steps of a month."""
+    grid = mpm.Grid([0, 0], [1, 1.2], [10, 12])
+    porous = {"bulk": 1e8, "shear": 5e7, "porosity": 0.4}
+    sand = mpm.Hencky(**porous, conductivity=1e-4, retention=mpm.VanGenuchten(WATER / 14.5, residual=0.1, n=7.0))
+    clay = mpm.Hencky(**porous, conductivity=1e-8, retention=mpm.VanGenuchten(WATER, residual=0.1, n=1.1))
+    bodies = [mpm.box(grid, [0, 0], [0.5, 1]), mpm.box(grid, [0.5, 0], [1, 1], material=1)]
+    scene = {"fluid": mpm.Fluid(), "walls": {"left": "x", "right": "x", "bottom": "y"}, "gravity": (0, -9.81)}
+    scene |= {"conditions": [mpm.Drained("top", pressure=0.1 * WATER)], "pressure": -100 * WATER}
+    s = mpm.Simulation(grid, bodies, [sand, clay], initial_stress=mpm.K0(0.5), **scene)
+    for end, dt in ((3600.0, 3600.0), (86400.0, 21600.0), (365 * 86400.0, 30 * 86400.0)):
+        result = s.run(end, dt, progress=False)
+        assert result.newton <= 60 * (result.steps + result.cuts) and result.balance < 1e-8
+    assert s.cells().pressure.min() > 0
