@@ -282,3 +282,13 @@ def test_a_stage_changes_what_was_given_as_a_function_of_place_only():
     assert s.points.pressure == pytest.approx(1e3, rel=1e-3)
     with pytest.raises(ValueError, match="'shear': a constant of Hencky, must be given to it as a function of place"):
         s.stage(fields={"shear": np.full(len(s.points), 4e5)})
+
+
+def test_soil_whose_strain_is_lost_in_rounding_bears_an_initial_stress():
+    grid = mpm.Grid([0, 0], [1.0, 1.0], [5, 5])
+    body = mpm.box(grid, [0, 0], [1.0, 0.8])
+    rock = mpm.LinearElastic(bulk=1e12, shear=5e11)
+    walls = {"left": "x", "right": "x", "bottom": "xy"}
+    given = {"initial_stress": lambda X: np.full((len(X), 3), -1e4), "conditions": [mpm.Traction("top", (0, -1e4))]}
+    s = mpm.Simulation(grid, [body], [rock], walls=walls, **given)
+    assert s.effective_stress()[:, [0, 1], [0, 1]] == pytest.approx(-1e4, rel=1e-6)

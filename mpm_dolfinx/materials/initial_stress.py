@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.base.errors import NotConverged
-from mpm_dolfinx.base.tolerances import NEAR, SAME
+from mpm_dolfinx.base.tolerances import NEAR, ROUND_OFF, SAME
 from mpm_dolfinx.base.validation import at_places, line, numbers
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.overburden import overburden
@@ -327,12 +327,13 @@ class _Sought:
         """Return points with the strains, and which (n,) do not have the target."""
         comm, strain = self.materials.grid.comm, self.linear()
         largest = over_all(comm, float(np.abs(self.target).max(initial=0.0)), MPI.MAX)
+        close = CLOSE * largest + ROUND_OFF * np.maximum(*self.moduli())  # of strains that are near none
         now = self.points
         bad = np.ones(len(strain), dtype=bool)
         try:
             for _ in range(MOST):
                 now, missing = self.off(strain)
-                bad = ~(np.abs(missing).max(axis=1, initial=0.0) <= CLOSE * largest)
+                bad = ~(np.abs(missing).max(axis=1, initial=0.0) <= close)
                 most = float(np.nan_to_num(np.abs(missing), nan=np.inf).max(initial=0.0))
                 if not over_all(comm, most, MPI.MAX) > EXACT * largest:
                     break
