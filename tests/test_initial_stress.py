@@ -289,6 +289,6 @@ def test_soil_whose_strain_is_lost_in_rounding_bears_an_initial_stress():
     body = mpm.box(grid, [0, 0], [1.0, 0.8])
     rock = mpm.LinearElastic(bulk=1e12, shear=5e11)
     walls = {"left": "x", "right": "x", "bottom": "xy"}
-    given = {"initial_stress": lambda X: np.full((len(X), 3), -1e4), "conditions": [mpm.Traction("top", (0, -1e4))]}
+    given = {"initial_stress": lambda x: np.full((len(x), 3), -1e4), "conditions": [mpm.Traction("top", (0, -1e4))]}
     s = mpm.Simulation(grid, [body], [rock], walls=walls, **given)
     assert s.effective_stress()[:, [0, 1], [0, 1]] == pytest.approx(-1e4, rel=1e-6)

@@ -44,7 +44,7 @@ class Scheme:
 
     coupling: str
     tolerance: float
-    most_newton: int = 60
+    most_newton: int = 25
     most_coupling: int = 200
     petsc_options: Mapping[str, Any] = field(default_factory=dict)
 
