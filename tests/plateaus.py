@@ -20,6 +20,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "demos"))
 import cycles
 import footing
 import helpers
+import infiltration
 
 
 def bent(h: float, nu: float = 0.0) -> dict[str, float]:
@@ -68,6 +69,13 @@ def slope(cells: int) -> dict[str, float]:
     return {"tip": np.linalg.norm(move[-1].ravel()), "pressure": np.abs(pressure).max()}
 
 
+def wetted(cells: int) -> dict[str, float]:
+    """A front that runs into dry soil, after Celia: its depth and the water that the soil takes up."""
+    _, places, waters, _ = infiltration.front(cells, 3600.0)
+    *_, (depth, _) = infiltration.FRONT.values()
+    return {"front": depth + places[-1], "water": 1 + waters[-1]}
+
+
 SCENES = {
     "beam": (bent, 0.06, 0.03),
     "clay": (lambda h: bent(h, 0.46), 0.06, 0.03),
@@ -75,6 +83,7 @@ SCENES = {
     "soil": (pushed, 5, 9),
     "strip": (strip, 5, 9),
     "slope": (slope, 6, 12),
+    "dry": (wetted, 25, 50),
 }
 """Scenes with their cells: those in which a number is varied, and finer ones."""
 

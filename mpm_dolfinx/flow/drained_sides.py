@@ -60,6 +60,7 @@ class DrainedSides(Feeding):
     def __init__(self, setting: Setting, outlets: Mapping[str, Drained | Inflow | Rain]):
         self._grid = setting.grid
         self._names, self.count = tuple(outlets), len(outlets)
+        self._rains = tuple(isinstance(outlet, Rain) for outlet in outlets.values())
         self._outlets = [(outlet, setting.sides.of(outlet)) for outlet in outlets.values()]
         self.varies = any(callable(getattr(one, name)) for one in outlets.values() for name in one.FUNCTIONS)
         for one, other in combinations(self._outlets, 2):
@@ -77,8 +78,7 @@ class DrainedSides(Feeding):
 
     def dry(self, value: float) -> dict[str, NDArray[np.float64]]:
         """Return run-offs of this value before a first step."""
-        rains = [isinstance(outlet, Rain) for outlet, _ in self._outlets]
-        return {name: np.array(value) for name, rain in zip(self._names, rains, strict=True) if rain}
+        return {name: np.array(value) for name, rain in zip(self._names, self._rains, strict=True) if rain}
 
     def fed(self, cut: CutDomains, pieces: PointData) -> NDArray[np.int64]:
         """Return the points at the faces."""
@@ -87,10 +87,10 @@ class DrainedSides(Feeding):
     def placed(self, wet: Wet) -> SideFeeds:
         """Return the open sides where they were cut, with what they give at the time."""
         if self.varies:
-            return SideFeeds(self._sides(wet), wet, self._grid, self._names)
+            return SideFeeds(self._sides(wet), wet, self._grid, self._names, self._rains)
         key = (wet.cut.key, wet.contents.key, wet.points)
         sides = self._constant(key, lambda: self._sides(wet), self._grid.comm)
-        return SideFeeds(sides, wet, self._grid, self._names)
+        return SideFeeds(sides, wet, self._grid, self._names, self._rains)
 
     def _sides(self, wet: Wet) -> OpenSides:
         grid, rows = self._grid, []
@@ -214,25 +214,24 @@ class SideFeeds(Feeds):
         When and where.
     grid
         Background grid.
-    names
-        Of the conditions, by the numbers of the faces.
+    names, rains
+        Of the conditions, by the numbers of the faces, and which of them are rain.
     """
 
-    def __init__(self, sides: OpenSides, wet: Wet, grid: Grid, names: tuple[str, ...]):
-        self.sides, self._names = sides, names
+    def __init__(self, sides: OpenSides, wet: Wet, grid: Grid, names: tuple[str, ...], rains: tuple[bool, ...]):
+        self.sides, self._rains = sides, rains
+        self._names = names
         self._contents, self._comm = wet.contents, grid.comm
-        rains = np.isfinite(sides.driest)
-        self._rains = bool(over_all(self._comm, int(rains.any())))
-        self._seeps = sides.seeps & ~rains
+        self._seeps = sides.seeps & np.isnan(sides.driest)
         self.settles = bool(self._seeps.any())
-        self.linear = not self._rains
+        self.linear = not any(rains)
         self._drain = wet.drains
         self._flows, self._aslant = np.ones(len(sides.cells), dtype=bool), np.zeros(len(sides.cells))
 
     def conducting(self, flow: Conduction) -> OpenFaces:
         """Return the faces as the cells conduct."""
         faces = self._faces(self.sides, flow)
-        if not self._rains:
+        if not any(self._rains):
             return faces
         driest = np.where(np.isnan(self.sides.driest), self.sides.pressure, self.sides.driest)
         dry = self._faces(replace(self.sides, pressure=driest), flow)
@@ -281,12 +280,11 @@ class SideFeeds(Feeds):
 
     def run_off(self, at: OpenFaces, fluid: Fluid) -> dict[str, NDArray[np.float64]]:
         """Return what of the rain does not soak in, m^d/s, by name of the conditions of rain."""
-        rain = np.isfinite(self.sides.rain)
-        left = np.where(rain, np.maximum(self.sides.rain, 0.0) + np.minimum(self._through(at, fluid), 0.0), 0.0)
-        number = self.sides.number
-        sums = [sum_by(number, values, len(self._names)) for values in (left, rain.astype(float))]
-        runs, rains = over_all(self._comm, np.stack(sums))
-        return {name: np.array(runs[i]) for i, name in enumerate(self._names) if rains[i]}
+        if not any(self._rains):
+            return {}
+        left = np.maximum(self.sides.rain, 0.0) + np.minimum(self._through(at, fluid), 0.0)  # nan where none falls
+        runs = over_all(self._comm, sum_by(self.sides.number, left, len(self._names)))
+        return {name: np.array(runs[i]) for i, name in enumerate(self._names) if self._rains[i]}
 
     def _counts(self, at: OpenFaces) -> NDArray[np.bool_]:
         """Return which faces (m,) are open."""

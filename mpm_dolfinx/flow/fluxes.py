@@ -190,37 +190,6 @@ class OpenSides:
 
 
 @dataclass(frozen=True)
-class OpenFaces:
-    """Faces on open sides; arrays over m faces.
-
-    number (m,): of the condition; at (m,): place of the cell among the active owned ones; conductance, inflow (m,):
-    outflow per unit of the cell's mass potential, m^d/(Pa s), and what is prescribed or driven in, m^d/s; seeps (m,):
-    whether nothing may flow in; reach (m, d): way from the cell's centroid, m.
-    """
-
-    number: NDArray[np.int64]
-    at: NDArray[np.int64]
-    conductance: NDArray[np.float64]
-    inflow: NDArray[np.float64]
-    seeps: NDArray[np.bool_]
-    reach: NDArray[np.float64]
-
-    def outflow(self, pi: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return what leaves through each face, were it open both ways, from cells at potentials (n,), Pa; m^d/s."""
-        return self.conductance * pi[self.at] - self.inflow
-
-    def driven(self, force: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return what forces (n, d), N/m^3, on the fluid drive out of cells (n,), m^d/s."""
-        along = np.einsum("md,md->m", force[self.at], self.reach)
-        return sum_by(self.at, np.where(self.seeps, 0.0, self.conductance * along), len(force))
-
-    def seepage(self, pi: NDArray[np.float64], flows: NDArray[np.bool_], even: bool = False) -> tuple[NDArray, NDArray]:
-        """Return what seeps out of cells (n,), m^d/s, and its derivative, m^d/(Pa s); flows (m,): where."""
-        parts = (np.where(flows & self.seeps, values, 0.0) for values in (self.outflow(pi), self.conductance))
-        return tuple(sum_by(self.at, values, len(pi)) for values in parts)
-
-
-@dataclass(frozen=True)
 class PieceContents:
     """What pieces bring to their owned cells; arrays over m pieces.
 

@@ -569,7 +569,8 @@ class Assembled(Keyed):
         def mobility(begins: bool) -> Mobility:
             if self._varies:
                 return on_grid.mobility(data, begins)
-            return self._mobility(mixture, lambda: on_grid.mobility(data, True), grid.comm)
+            together = [grid.comm] if mixture else []  # without pressures the key is the same on all processes
+            return self._mobility(mixture, lambda: on_grid.mobility(data, True), *together)
 
         def set_fluxes(kappa: Mobility, motion: CellMotion | None = None) -> Outflow:
             where = (sides.cells, sides.shape, sides.seeps, sides.area, sides.reach)
