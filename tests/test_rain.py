@@ -115,3 +115,63 @@ def test_a_resumed_run_goes_on_as_the_one_that_was_not_broken_off(tmp_path):
     assert np.array_equal(whole.outcome("runoff").array, later.outcome("runoff").array)
     with pytest.raises(ValueError, match="retention of material 0"):
         mpm.resume(scene(2.0), tmp_path / "c.npz")
+
+
+def two_soils_in_the_rain(length=1.0, stress=1.0, time=1.0, at=(0.0, 0.0), mirror=False, swapped=False, far=False):
+    """Return pressures of cells and outflows of sand beside loam in rain that swings, in the units of the first."""
+    gravity = 9.81 * length / time**2
+    density = 1000 * stress * time**2 / length**2
+    lower = np.multiply(at, length / 10)
+    grid = mpm.Grid(lower, lower + np.multiply([3.0, 1.4], length), [30, 14])
+    soils = [
+        mpm.Hencky(
+            bulk=1e7 * stress,
+            shear=5e6 * stress,
+            conductivity=k * length / time,
+            grain_density=2.6 * density,
+            retention=mpm.VanGenuchten(entry * stress, residual=0.1, n=n),
+        )
+        for k, entry, n in ((1e-5, 2943.0, 2.5), (1e-6, 9810.0, 3.0))
+    ]
+    boxes = [([0.5, 0], [0.93, 1.03], 0), ([0.93, 0], [1.5, 1.03], 1)] + [([2.2, 0], [2.7, 0.8], 0)] * far
+    if mirror:
+        boxes = [([2 - high[0], 0], [2 - low[0], high[1]], m) for low, high, m in boxes]
+    if swapped:
+        soils, boxes = soils[::-1], [(low, high, 1 - m) for low, high, m in boxes[::-1]]
+    bodies = [mpm.box(grid, *(lower + np.multiply(x, length) for x in ends), material=m) for *ends, m in boxes]
+    flux = lambda t: 3e-6 * (1 + np.sin(t / time / 2000)) * length / time  # noqa: E731
+    near = (lower, lower + np.multiply([1.6, 1.4], length))
+    sides = [
+        mpm.Rain("top", flux, ponding=100 * stress, driest=-1e6 * stress, region=near),
+        mpm.Drained("bottom", pressure=2000 * stress, region=near),
+    ]
+    fluid = mpm.Fluid(density=density, bulk=2e8 * stress, gravity=gravity)
+    water = {"fluid": fluid, "gravity": [0, -gravity], "pressure": -5000 * stress, "initial_stress": mpm.K0(0.5)}
+    numerics = mpm.Numerics(tolerance=1e-10)
+    s = mpm.Simulation(grid, bodies, soils, walls={"bottom": "xy"}, conditions=sides, numerics=numerics, **water)
+    assert s.run(4000 * time, 500 * time, progress=False).cuts == 0
+    cells = s.cells()
+    x = (cells.x - lower) / length
+    pressure = cells.pressure[x[:, 0] < 1.8] / stress
+    x = x[x[:, 0] < 1.8]
+    x[:, 0] = 2 - x[:, 0] if mirror else x[:, 0]
+    order = np.lexsort(np.round(x, 6).T)
+    return pressure[order], s.outflows.array * time / length**2
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"length": 1e3, "stress": 1e-3, "time": 60.0},
+        pytest.param({"length": 1e-4, "stress": 10.0, "time": 0.01}, marks=pytest.mark.slow),
+        {"mirror": True},
+        {"swapped": True},
+        {"far": True},
+        pytest.param({"at": (1e4, -3e4)}, marks=pytest.mark.slow),
+    ],
+    ids=["large units", "small units", "mirrored", "reordered", "beside a far body", "far from the origin"],
+)
+def test_rain_on_two_soils_is_the_same_in_any_frame(other):
+    expected = two_soils_in_the_rain()
+    for found, value in zip(two_soils_in_the_rain(**other), expected, strict=True):
+        assert found == pytest.approx(value, abs=1e-8 * np.abs(value).max())

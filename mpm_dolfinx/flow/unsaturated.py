@@ -15,7 +15,7 @@ import ufl
 from dolfinx import fem
 from numpy.typing import NDArray
 
-from mpm_dolfinx.base.tolerances import SAME
+from mpm_dolfinx.base.tolerances import CENTRAL
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.pores.retention import Conductance, Retentions
 
@@ -54,7 +54,7 @@ class Relative:
         for i, law in enumerate(self._laws):
             (phi0, k0, d0), (phi1, k1, d1) = ([self._tables(side)[3 * i + j] for j in range(3)] for side in "+-")
             scale = fem.Constant(self._mesh, law.scale)
-            close = ufl.lt(abs(p0 - p1), SAME * (abs(p0) + abs(p1) + scale))
+            close = ufl.lt(abs(p0 - p1), CENTRAL * (abs(p0) + abs(p1) + scale))
             apart = ufl.conditional(close, 1.0, p0 - p1)
             k = ufl.conditional(close, (k0 + k1) / 2, (phi0 - phi1) / apart)
             means.append(ufl.variable(k))
@@ -81,7 +81,7 @@ class Relative:
         k, slope = shares[:, 0].copy(), np.zeros(len(p))
         for law, share in zip(self._laws, shares.T[1:], strict=True):
             (phi, here, d), (beyond, there, _) = law(p).T, law(outer).T
-            close = np.abs(p - outer) < SAME * (np.abs(p) + np.abs(outer) + law.scale)
+            close = np.abs(p - outer) < CENTRAL * (np.abs(p) + np.abs(outer) + law.scale)
             apart = np.where(close, 1.0, p - outer)
             mean = np.where(close, (here + there) / 2, (phi - beyond) / apart)
             k += share * mean
