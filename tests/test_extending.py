@@ -356,7 +356,17 @@ class WrongUpdate(Damaged):
         return {"damage": F}
 
 
+class Fibres(mpm.NeoHookean):
+    """A law whose direction has more components than F of the plane and of plane strain."""
+
+    @staticmethod
+    def energy(F, bulk, shear):
+        stretch = F * ufl.as_vector((1.0, 0.0, 0.0, 0.0))
+        return mpm.NeoHookean.energy(F, bulk, shear) + ufl.inner(stretch, stretch)
+
+
 CASES = {
+    "sum over two sizes": (lambda: column(fluid=False, material=Fibres(1, 1)), "Fibres.*must be"),
     "no law": (lambda: column(fluid=False, material=NoLaw(1, 1)), "NoLaw: has neither, must define energy or"),
     "unknown parameter": (lambda: column(fluid=False, material=Unknown(1, 1)), "law takes 'stiffness', must be F or"),
     "reserved name": (lambda: column(fluid=False, material=Taken(1, 1)), "the name 'weight' is taken"),

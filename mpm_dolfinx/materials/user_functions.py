@@ -88,15 +88,21 @@ def expression(function: Callable, shapes: Sequence[tuple[int, ...]], of: str = 
         raise ValueError(f"{_name(function)}: gives shape {out.ufl_shape}, must be {allowed}")
     if of and not any(part is available[of] for part in unique_pre_traversal(out)):
         raise ValueError(f"{_name(function)}: gives {line_of(out)}, must be {allowed}")
-    _check_finite(_name(function), out)
+    _check_parts(_name(function), out)
     return out
 
 
-def _check_finite(what: str, out: ufl.core.expr.Expr) -> None:
-    """Refuse numbers in an expression that no compiler takes."""
+def _check_parts(what: str, out: ufl.core.expr.Expr) -> None:
+    """Refuse numbers that no compiler takes, and sums over an index of two sizes, which new releases of UFL form."""
     for part in unique_pre_traversal(out):
         if isinstance(part, ufl.constantvalue.RealValue) and not np.isfinite(float(part)):
             raise ValueError(f"{what}: contains {float(part)}, must be finite")
+        if isinstance(part, ufl.classes.Product):
+            sizes: dict[int, int] = {}
+            for factor in part.ufl_operands:
+                for index, size in zip(factor.ufl_free_indices, factor.ufl_index_dimensions, strict=True):
+                    if sizes.setdefault(index, size) != size:
+                        raise ValueError(f"{what}: sums over {sizes[index]} and {size} components, must be as many")
 
 
 def named(what: str, given, shapes: Mapping[str, tuple[int, ...]], some: bool = False) -> dict:
@@ -114,7 +120,7 @@ def named(what: str, given, shapes: Mapping[str, tuple[int, ...]], some: bool = 
             out[name] = ufl.as_ufl(value)
         except Exception as error:  # UFL has several kinds
             raise ValueError(f"{what}: {name} = {line(value)}, must be UFL, of {allowed}") from error
-        _check_finite(f"{what}: {name}", out[name])
+        _check_parts(f"{what}: {name}", out[name])
     found = {name: value.ufl_shape for name, value in out.items()}
     if not found or found.items() - shapes.items() or not (some or len(found) == len(shapes)):
         raise ValueError(f"{what}: gives {found}, must have {allowed}")
@@ -138,7 +144,7 @@ def form(kind: str, function: Callable, **available) -> ufl.Form:
     for integral in out.integrals():
         if (integral.integral_type(), integral.subdomain_id()) != (dx.integral_type(), dx.subdomain_id()):
             raise ValueError(f"{kind}: {_name(function)} gives an integral over the grid, must be {allowed}")
-        _check_finite(f"{kind}: {_name(function)}", integral.integrand())
+        _check_parts(f"{kind}: {_name(function)}", integral.integrand())
     return out
 
 
