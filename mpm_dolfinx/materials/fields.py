@@ -102,8 +102,6 @@ class SceneMaterials:
         self._part = np.array([self._parts.index(own[i]) if i in own else 0 for i in range(len(materials))])
         self.symmetric = all(m.symmetric for m in used)
         """Whether the tangents of all materials are symmetric."""
-        self.stiffest = max(float(np.max(m.oedometric, initial=0.0)) for m in evaluated)
-        """Largest oedometric modulus, Pa."""
         self.uneven = any(
             max(float(np.max(y)) for y in moduli) > 2 * min(float(np.min(y)) for y in moduli)
             for moduli in ([m.oedometric for m in evaluated], [m.shear for m in evaluated])
