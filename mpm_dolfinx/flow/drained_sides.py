@@ -142,10 +142,16 @@ class OpenFaces:
 
     rises = open_by
 
-    def driven(self, force: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return what forces (n, d), N/m^3, on the fluid drive out through each face (m,), m^d/s."""
-        along = np.einsum("md,md->m", force[self.at], self.reach)
-        return np.where(self.seeps, 0.0, self.conductance * along)
+    def aslant(
+        self, fluid: Fluid, beyond: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64] | float, NDArray[np.float64] | float]:
+        """Return what flows besides through faces that see more pressure (m,), Pa: a flow, m^d/s, and a share."""
+        return np.where(self.seeps, 0.0, self.open_by(fluid) * beyond * fluid.density[self.at]), 0.0
+
+    def driven(self, fluid: Fluid) -> NDArray[np.float64]:
+        """Return what forces of inertia on the fluid drive out through each face (m,), m^d/s."""
+        along = np.einsum("md,md->m", fluid.force[self.at], self.reach)
+        return np.where(self.seeps, 0.0, self.open_by(fluid) * along)
 
 
 @dataclass(frozen=True)
@@ -153,26 +159,38 @@ class UnsaturatedFaces(OpenFaces):
     """The same of soil whose pores drain; conductance: over the mobility.
 
     relative: mobilities by pressures; cells (m,): behind the faces; outer (m,): potentials beyond, less the weight of
-    the fluid on the way, Pa; beyond (m,): pressures there, Pa.
+    the fluid on the way, Pa; beyond (m,): pressures there, Pa; fall (m,): the weight on the way, Pa.
     """
 
     relative: Relative
     cells: NDArray[np.int32]
     outer: NDArray[np.float64]
     beyond: NDArray[np.float64]
+    fall: NDArray[np.float64]
 
     def outflow(self, fluid: Fluid) -> NDArray[np.float64]:
         """Return what leaves through each face (m,), were it open both ways, m^d/s."""
         return self.open_by(fluid) * (fluid.pi[self.at] - self.outer) - self.inflow
 
+    def aslant(
+        self, fluid: Fluid, beyond: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64] | float, NDArray[np.float64] | float]:
+        """Return what flows besides: as conductivities change by decades in a step, a share of what does anyway.
+
+        It is no more than that, so no soil is emptied by it.
+        """
+        drives = fluid.pi[self.at] - self.outer
+        share = np.divide(beyond, drives, out=np.zeros_like(beyond), where=drives != 0).clip(-1, 1)
+        return 0.0, np.where(self.seeps, 0.0, share)
+
     def open_by(self, fluid: Fluid) -> NDArray[np.float64]:
         """Return what leaves through each face (m,) by a unit of the difference of potentials, m^d/(Pa s)."""
-        return self.conductance * self.relative.through_sides(self.cells, fluid.p[self.at], self.beyond)[0]
+        return self.conductance * self.relative.through_sides(self.cells, fluid.p[self.at], self.beyond, self.fall)[0]
 
     def rises(self, fluid: Fluid) -> NDArray[np.float64]:
         """Return by how much more leaves as the cell's pressure rises, but for that of what the weight drives."""
         p = fluid.p[self.at]
-        k, slope = self.relative.through_sides(self.cells, p, self.beyond)
+        k, slope = self.relative.through_sides(self.cells, p, self.beyond, self.fall)
         return self.conductance * (k + slope * (p - self.beyond))
 
 
@@ -192,6 +210,16 @@ class RainedFaces(OpenFaces):
         """Return what leaves through each face (m,), m^d/s."""
         wet = self.pond.outflow(fluid)
         return np.where(np.isnan(self.rain), wet, np.clip(-self.rain, wet, self.dry.outflow(fluid)))
+
+    def aslant(
+        self, fluid: Fluid, beyond: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64] | float, NDArray[np.float64] | float]:
+        """Return what flows besides; rain is what is given."""
+        return tuple(np.where(np.isnan(self.rain), values, 0.0) for values in self.pond.aslant(fluid, beyond))
+
+    def driven(self, fluid: Fluid) -> NDArray[np.float64]:
+        """Return what forces of inertia on the fluid drive out through each face (m,); rain is what is given."""
+        return np.where(np.isnan(self.rain), super().driven(fluid), 0.0)
 
     def open_by(self, fluid: Fluid) -> NDArray[np.float64]:
         """Return what leaves through each face (m,) by a unit of the difference of potentials, m^d/(Pa s)."""
@@ -226,7 +254,7 @@ class SideFeeds(Feeds):
         self.settles = bool(self._seeps.any())
         self.linear = not any(rains)
         self._drain = wet.drains
-        self._flows, self._aslant = np.ones(len(sides.cells), dtype=bool), np.zeros(len(sides.cells))
+        self._flows, self._aslant, self._share = np.ones(len(sides.cells), dtype=bool), 0.0, 0.0
 
     def conducting(self, flow: Conduction) -> OpenFaces:
         """Return the faces as the cells conduct."""
@@ -245,26 +273,27 @@ class SideFeeds(Feeds):
         reach = flow.deformed(at, sides.reach)
         if flow.relative is None:
             return OpenFaces(at, conductance, inflow, self._seeps, reach)
-        where = flow.relative, sides.cells, sides.outer(at, flow), sides.pressure
+        fall = np.zeros(len(at)) if flow.weight is None else reach @ flow.weight
+        where = flow.relative, sides.cells, sides.outer(at, flow), sides.pressure, fall
         return UnsaturatedFaces(at, conductance, sides.given, self._seeps, reach, *where)
 
     def begin(self, at: OpenFaces, fluid: Fluid, beyond: NDArray[np.float64]) -> None:
         """Open seepage faces as the flow asks for; their cells' pressures alone count for these."""
         self._flows = at.outflow(fluid) >= 0
-        self._aslant = np.where(self.sides.seeps, 0.0, at.open_by(fluid) * beyond * fluid.density[at.at])
+        self._aslant, self._share = at.aslant(fluid, beyond)
 
     def leaving(self, at: OpenFaces, fluid: Fluid) -> Leaving:
         """Return what leaves the cells, what flows aslant as it did at the start of the substep."""
         through, counts = self._through(at, fluid), self._counts(at)
         if fluid.force is not None:
-            through = through + at.driven(fluid.force)
+            through = through + at.driven(fluid)
         turnover = sum_by(at.at, counts * at.open_by(fluid), len(fluid.pi)) * np.abs(fluid.pi)
         gain = sum_by(at.at, np.abs(through), len(fluid.pi)) if self._drain else 0.0  # steady rain changes nothing
         return Leaving(sum_by(at.at, through, len(fluid.pi)), turnover, gain)
 
     def slope(self, at: OpenFaces, fluid: Fluid) -> NDArray[np.float64]:
         """Return the derivative of what leaves."""
-        return sum_by(at.at, self._counts(at) * at.rises(fluid), len(fluid.pi))
+        return sum_by(at.at, self._counts(at) * (1 + self._share) * at.rises(fluid), len(fluid.pi))
 
     def settle(self, at: OpenFaces, fluid: Fluid) -> int:
         """Open and close seepage faces as the flow asks for; return how many do."""
@@ -292,4 +321,4 @@ class SideFeeds(Feeds):
 
     def _through(self, at: OpenFaces, fluid: Fluid) -> NDArray[np.float64]:
         """Return what leaves through each face (m,), m^d/s."""
-        return np.where(self._counts(at), at.outflow(fluid), 0.0) + self._aslant
+        return np.where(self._counts(at), (1 + self._share) * at.outflow(fluid), 0.0) + self._aslant

@@ -118,7 +118,7 @@ class StorageForms:
     inertial : (d,), N/m^3
         Force of inertia on the pore fluid, -rho_w a, as UFL; None without.
     retentions
-        The laws of retention of the scene, where some pores drain; the pieces then carry retention and pores.
+        The laws of retention of the scene, where some pores drain; the pieces then carry retention, lever and pores.
     """
 
     def __init__(
@@ -156,11 +156,11 @@ class StorageForms:
         self.retains = retentions is not None
         """Whether pores drain under suction."""
         if self.retains:
-            full, before = (retentions.of("saturation", at, pieces.retention) for at in (p, self.p_n))
+            full, before = (retentions.of("saturation", at, pieces) for at in (p, self.p_n))
             denser = ufl.exp(-fem.Constant(self.grid.mesh, 1 / (2 * bulk)) * (p - self.p_n))
             drained = (full - before) * pieces.pores
             stored = full * stored + drained * denser
-            felt = ufl.diff(p * retentions.of("bishop", p, pieces.retention), p)
+            felt = ufl.diff(p * retentions.of("bishop", p, pieces), p)
             self._capacity = CellSums([ufl.diff(drained, p), full * felt], pieces)
         self._change = PointForm(stored * q * pieces.dx, pieces)
         by_u = [pieces.biot * felt * ufl.diff(J, delta), *([] if symmetric else [ufl.diff(stored, delta)])]

@@ -21,6 +21,7 @@ from mpm_dolfinx.stepping.state import State
 def set_up(scene: Scene, state: State, dt: float, how: tuple = ()) -> Start:
     """Return the start of a step of dt (s): the state on the grid, its matrices, and what acts in its substeps."""
     scene.check(state)
+    scene.rests_at(state.stage, state.t)
     collect_garbage(scene.grid.mesh.comm)
     stage, times = state.stage, [state.t + substep.end * dt for substep in how or scene.substeps]
     start, *gravity = (stage.gravity_at(t) for t in [state.t, *times])
