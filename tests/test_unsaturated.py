@@ -325,6 +325,36 @@ def test_suction_is_strength_by_bishops_stress(suction):
     assert -s.reactions.array[0, 1] / width == pytest.approx(2 * felt + 20 * np.sqrt(3), rel=2e-3)
 
 
+def test_a_block_with_suction_falls_as_everything_does():
+    """Its weight and its mass are those of soil and water; it keeps its water."""
+    soil = mpm.Hencky(1e7, 5e6, porosity=0.4, conductivity=1e-5, retention=mpm.VanGenuchten(2e4, n=2.0))
+    grid = mpm.Grid([0, 0], [2, 3], [8, 12])
+    scene = {"fluid": mpm.Fluid(), "gravity": (0, -9.81), "walls": {}, "pressure": -3e4, "inertia": True}
+    s = mpm.Simulation(grid, [mpm.box(grid, [0.53, 1.61], [1.53, 2.61])], [soil], **scene)
+    start = water(s)
+    s.run(0.2, 0.02, progress=False)
+    assert s.points.displacement[:, 1].mean() == pytest.approx(-9.81 * 0.2**2 / 2, rel=1e-4)
+    assert water(s) == pytest.approx(start, rel=1e-9)
+
+
+def test_a_dry_column_swings_with_the_mass_of_its_water():
+    """Its period is that of soil and of what pores hold, 8 % less than with full ones."""
+    law, p = mpm.VanGenuchten(1e3, residual=0.3, n=4.0), -1e6
+    soil = mpm.LinearElastic(1e7, 5e6, porosity=0.4, retention=law)
+    grid = mpm.Grid([0, 0], [0.05, 1.1], [1, 22])
+    felt = p * 1e3**-3
+    period = 4 * np.sqrt((0.6 * 2650 + 400 * (0.3 + 0.7 * 1e3**-3)) / (1e7 + 4 / 3 * 5e6))
+    scene = {"fluid": mpm.Fluid(), "walls": {"left": "x", "right": "x", "bottom": "y"}, "pressure": p, "inertia": True}
+    scene |= {"initial_stress": lambda x: np.full((len(x), 3), felt)}
+    speed = lambda x: np.stack([0 * x[:, 0], 1e-3 * np.sin(np.pi * x[:, 1] / 2)], axis=1)  # noqa: E731
+    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [0.05, 1])], [soil], velocity=speed, **scene)
+    top = mpm.probes(s.bodies, [[0.025, 1.0]])
+    result = s.run(0.6 * period, period / 80, progress=False, probes=top)
+    t, u = result.t, result.displacement[:, 0, 1]
+    i = np.flatnonzero((u[:-1] > 0) & (u[1:] <= 0))[0]
+    assert 2 * (t[i] + (t[i + 1] - t[i]) * u[i] / (u[i] - u[i + 1])) == pytest.approx(period, rel=1e-3)
+
+
 class Haverkamp:
     """River sand of Vauclin, Khanji and Vachaud (1979)."""
 

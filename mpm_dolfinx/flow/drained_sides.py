@@ -5,12 +5,13 @@ What leaves a cell through a face is T r [p - p_out + rho_w g . (x_out - x)], T 
 cell's centroid, or what is prescribed.  A seepage face lets nothing in: it is open where the flow at the start of the
 substep, and then that of a solution, asks for it (`SideFeeds.settle`), a primal-dual active set (Hintermueller, Ito and
 Kunisch 2002).  Rain is what is given, but no more than what the pressure of its pond presses in; what evaporates is no
-more than what the driest pressure sucks out.
+more than what the driest pressure sucks out.  A pond of volume V supplies V / dt besides, spread over its side, in the
+step whose rates change it.  So rain is what soaks in, what ponds and what runs off, to rounding.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations
@@ -61,8 +62,11 @@ class DrainedSides(Feeding):
         self._grid = setting.grid
         self._names, self.count = tuple(outlets), len(outlets)
         self._rains = tuple(isinstance(outlet, Rain) for outlet in outlets.values())
+        weight = setting.materials.fluid.unit_weight if any(self._rains) else 1.0
+        self._ponds = tuple(one.ponding / weight if isinstance(one, Rain) else None for one in outlets.values())
         self._outlets = [(outlet, setting.sides.of(outlet)) for outlet in outlets.values()]
         self.varies = any(callable(getattr(one, name)) for one in outlets.values() for name in one.FUNCTIONS)
+        self.varies |= any(self._ponds)
         for one, other in combinations(self._outlets, 2):
             check_apart(*one, *other)
         self._constant: Latest[OpenSides] = Latest()
@@ -80,6 +84,12 @@ class DrainedSides(Feeding):
         """Return run-offs of this value before a first step."""
         return {name: np.array(value) for name, rain in zip(self._names, self._rains, strict=True) if rain}
 
+    def empty(self) -> dict[str, dict[str, NDArray[np.float64]]]:
+        """Return volumes that flow and run off where rain falls, before a first step."""
+        if not any(self._rains):
+            return {}
+        return {"flowed": self.unknown(0.0), "ran_off": self.dry(0.0), "ponded": self.dry(0.0)}
+
     def fed(self, cut: CutDomains, pieces: PointData) -> NDArray[np.int64]:
         """Return the points at the faces."""
         return np.concatenate([patch.at for patch in cut.surfaces(self.surfaces)])
@@ -87,10 +97,10 @@ class DrainedSides(Feeding):
     def placed(self, wet: Wet) -> SideFeeds:
         """Return the open sides where they were cut, with what they give at the time."""
         if self.varies:
-            return SideFeeds(self._sides(wet), wet, self._grid, self._names, self._rains)
+            return SideFeeds(self._sides(wet), wet, self._grid, self._names, self._ponds)
         key = (wet.cut.key, wet.contents.key, wet.points)
         sides = self._constant(key, lambda: self._sides(wet), self._grid.comm)
-        return SideFeeds(sides, wet, self._grid, self._names, self._rains)
+        return SideFeeds(sides, wet, self._grid, self._names, self._ponds)
 
     def _sides(self, wet: Wet) -> OpenSides:
         grid, rows = self._grid, []
@@ -242,19 +252,40 @@ class SideFeeds(Feeds):
         When and where.
     grid
         Background grid.
-    names, rains
-        Of the conditions, by the numbers of the faces, and which of them are rain.
+    names, ponds
+        Of the conditions, by the numbers of the faces, and how deep water may pond, m; None: no rain.
     """
 
-    def __init__(self, sides: OpenSides, wet: Wet, grid: Grid, names: tuple[str, ...], rains: tuple[bool, ...]):
-        self.sides, self._rains = sides, rains
-        self._names = names
+    def __init__(self, sides: OpenSides, wet: Wet, grid: Grid, names: tuple[str, ...], ponds: tuple[float | None, ...]):
+        self.sides, self._rains = sides, tuple(depth is not None for depth in ponds)
+        self._names, self._before = names, wet.outcome
         self._contents, self._comm = wet.contents, grid.comm
+        self._fallen, self._most = sides.rain, np.zeros(len(names))
+        if any(ponds):
+            self._pond(np.array([depth or 0.0 for depth in ponds]), wet.dt)
         self._seeps = sides.seeps & np.isnan(sides.driest)
         self.settles = bool(self._seeps.any())
-        self.linear = not any(rains)
+        self.linear = not any(self._rains)
         self._drain = wet.drains
         self._flows, self._aslant, self._share = np.ones(len(sides.cells), dtype=bool), 0.0, 0.0
+
+    def _pond(self, depth: NDArray[np.float64], dt: float) -> None:
+        """Let ponds (n,) of at most these depths, m, supply what they hold in a time, s, at their pressure."""
+        number, sides = self.sides.number, self.sides
+        size = np.linalg.norm(sides.area, axis=1)
+        area = over_all(self._comm, sum_by(number, size, len(self._names)))
+        self._most = depth * area
+        full = np.divide(self._ponded, self._most, out=np.zeros(len(depth)), where=self._most > 0)
+        held = np.divide(self._ponded, area, out=np.zeros(len(depth)), where=area > 0)
+        ponds = ~np.isnan(sides.rain)
+        pressure = np.where(ponds, full[number] * sides.pressure, sides.pressure)
+        self.sides = replace(sides, pressure=pressure, rain=sides.rain + (held / dt)[number] * size)
+
+    @property
+    def _ponded(self) -> NDArray[np.float64]:
+        """What ponds hold at the start of the step, m^d, by number of the condition."""
+        held = self._before.get("ponded", {})
+        return np.array([float(held.get(name, 0.0)) for name in self._names])
 
     def conducting(self, flow: Conduction) -> OpenFaces:
         """Return the faces as the cells conduct."""
@@ -311,9 +342,37 @@ class SideFeeds(Feeds):
         """Return what of the rain does not soak in, m^d/s, by name of the conditions of rain."""
         if not any(self._rains):
             return {}
-        left = np.maximum(self.sides.rain, 0.0) + np.minimum(self._through(at, fluid), 0.0)  # nan where none falls
+        left = np.maximum(self._fallen, 0.0) + np.minimum(self._through(at, fluid), 0.0)  # nan where none falls
         runs = over_all(self._comm, sum_by(self.sides.number, left, len(self._names)))
+        runs = np.where(self._ponded < self._most, 0.0, np.maximum(runs, 0.0))  # a pond feeds the soil as well
         return {name: np.array(runs[i]) for i, name in enumerate(self._names) if self._rains[i]}
+
+    def passing(self, at: OpenFaces, fluid: Fluid) -> dict[str, NDArray[np.float64]]:
+        """Return what leaves through the sides of each condition, and what falls on it (2,), m^d/s."""
+        if not any(self._rains):
+            return {}
+        both = np.stack([self._through(at, fluid), np.nan_to_num(self._fallen)])
+        sums = over_all(self._comm, np.stack([sum_by(self.sides.number, row, len(self._names)) for row in both]))
+        return dict(zip(self._names, sums.T, strict=True))
+
+    def volumes(
+        self, passed: Sequence[Mapping[str, NDArray[np.float64]]], seconds: Sequence[float]
+    ) -> dict[str, dict[str, NDArray[np.float64]]]:
+        """Return what has left through sides, what has run off them, and what ponds hold."""
+        if not any(self._rains):
+            return {}
+        flowed, fell = np.einsum("s,snk->kn", seconds, [[of[name] for name in self._names] for of in passed])
+        before = {quantity: self._before.get(quantity, {}) for quantity in ("flowed", "ran_off")}
+        held = self._ponded + fell + flowed
+        ponded = held.clip(0, self._most)
+        more = {"flowed": flowed, "ran_off": np.maximum(held - ponded, 0.0)}
+        out: dict[str, dict[str, NDArray[np.float64]]] = {"ponded": {}, "flowed": {}, "ran_off": {}}
+        for i, name in enumerate(self._names):
+            for quantity in more if self._rains[i] else ("flowed",):
+                out[quantity][name] = before[quantity].get(name, 0.0) + more[quantity][i]
+            if self._rains[i]:
+                out["ponded"][name] = np.array(ponded[i])
+        return out
 
     def _counts(self, at: OpenFaces) -> NDArray[np.bool_]:
         """Return which faces (m,) are open."""

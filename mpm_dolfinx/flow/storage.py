@@ -30,7 +30,7 @@ hundredfold, damps second differences only (`second_differences`): on jumps it w
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -464,6 +464,19 @@ class StorageProblem:
         """Return what falls on the bodies and does not soak in, m^d/s, by name."""
         fluid, both = self._fluid, zip(self._feeds, self._flow(False).at, strict=True)
         return {name: values for one, at in both for name, values in one.run_off(at, fluid).items()}
+
+    def passing(self) -> list[Mapping[str, NDArray[np.float64]]]:
+        """Return what `volumes` needs of a solved substep."""
+        fluid, both = self._fluid, zip(self._feeds, self._flow(False).at, strict=True)
+        return [one.passing(at, fluid) for one, at in both]
+
+    def volumes(self, passed: Sequence[Sequence[Mapping]], seconds: Sequence[float]) -> dict[str, dict]:
+        """Return volumes since the conditions began, see `Feeds.volumes`."""
+        found = [one.volumes(of, seconds) for one, of in zip(self._feeds, zip(*passed, strict=True), strict=True)]
+        out: dict[str, dict] = {}
+        for quantity, of in (pair for one in found for pair in one.items()):
+            out[quantity] = out.get(quantity, {}) | of
+        return out
 
     @property
     def linear(self) -> bool:

@@ -247,8 +247,8 @@ class Retentions:
     """The laws of retention of a scene, as UFL of what points carry of theirs.
 
     Points carry a row: the number of the kind of their law, from 1, and its constants; zero where pores stay full.
-    Pieces of domains also carry their `lever`, the way to them from the centroid of what their cell holds.  The pressure
-    that they see is that of water at rest about the cell's.
+    Pieces of domains also carry their `lever`, the way to them from the centroid of what their cell holds.  The
+    pressure that they see is that of water at rest about the cell's.
 
     Parameters
     ----------

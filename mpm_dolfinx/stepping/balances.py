@@ -166,7 +166,7 @@ def balances(
     if scene.storage is None:
         return Balances(momentum, None, inertia)
     weight = None if acting.gravity is None else scene.fluid.density * acting.gravity
-    fed = matrices.flow(start.state, weight, start.data, acting.t)
+    fed = matrices.flow(start.state, weight, start.data, acting.t, dt)
     lost = before and before.taken(substep.before * dt)
     carried = on_grid.softness(start.state), substep.end * on_grid.due(start.state)
     options = (on_grid.contents, *fed, substep.own * dt, lost, *carried)

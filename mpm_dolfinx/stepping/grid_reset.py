@@ -551,7 +551,7 @@ class Assembled(Keyed):
         return at_nodes + sum(one.rounding_beside for one in loads)
 
     def flow(
-        self, state: State, weight: NDArray[np.float64] | None, data: QuadratureData, t: float
+        self, state: State, weight: NDArray[np.float64] | None, data: QuadratureData, t: float, dt: float
     ) -> tuple[list[Feeds], Callable[[bool], Outflow]]:
         """Return what acts on the fluid, and what assembles the fluxes at u, called with whether a step begins.
 
@@ -567,6 +567,8 @@ class Assembled(Keyed):
             The pieces.
         t
             Time at which open sides have their pressures and fluxes, s.
+        dt
+            The step, s.
         """
         on_grid = self._on_grid
         contents = self._on_grid.contents
@@ -574,7 +576,7 @@ class Assembled(Keyed):
         u = self._u
         varies = (t,) if any(one.varies for one in self._stage.feeding) else ()
         at = state.points if weight is not None or varies else on_grid.cut.points  # gravity may change with time
-        wet = Wet(on_grid.cut, at, contents, t, data.pieces, on_grid.scale is not None)
+        wet = Wet(on_grid.cut, at, contents, t, data.pieces, on_grid.scale is not None, dt, state.outcome)
         feeds = [one.placed(wet) for one in self._stage.feeding]
         sides = open_sides(feeds, grid.dim)
 

@@ -54,12 +54,13 @@ def step(scene: Scene, state: State, dt: float, how: tuple = ()) -> tuple[State,
     state = start.state
     on_grid = start.on_grid
     solvers = start.matrices.solvers
-    flights, found = [flight_of(start)], []
+    flights, found, passed = [flight_of(start)], [], []
     for acting in start.acting:
         key = start.matrices.key, acting.substep.own * dt
         both = balances(scene, start, acting, rates[-1] if rates else None, flights[-1])
         as_reset = partial(on_grid.as_reset, state)
         rates.append(solve_substep(solvers, both.momentum, both.storage, as_reset, key, report, kept))
+        passed.append(both.storage.passing() if both.storage else [])
         flights.append(both.flown(flights[-1], acting.substep, dt))
         if "energy" in state.outcome:
             found.append(both.momentum.powers())
@@ -68,12 +69,14 @@ def step(scene: Scene, state: State, dt: float, how: tuple = ()) -> tuple[State,
     del solvers
     start.matrices.end_step()
     at, outcome = both.momentum.at, both.outcome(state)
+    seconds = dt * np.array([acting.substep.before, acting.substep.own])[-len(passed) :]
+    if both.storage is not None:
+        outcome |= both.storage.volumes(passed, seconds)
     loads = [one.ended(at) for one in acting.loads]
     end = state.t + dt, loads, both.came(rates[-1]), report
     new, report.rederived = scene.motion.advanced(state, on_grid, start.data, *end, carried=start.carrying(flights[-1]))
     velocity = None if scene.momentum.elastic else scene.momentum.u.x.array / dt
     now = {"outcome": outcome, "points": left(loads, at, state.points, new.points), "velocity": velocity}
     if found:
-        seconds = dt * np.array([acting.substep.before, acting.substep.own])
         outcome["energy"] = after(state.outcome["energy"], scene.materials, now["points"], seconds, found)
     return replace(new, **now, begins=False, resets=state.resets + (not state.stays)), report
