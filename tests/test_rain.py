@@ -165,7 +165,7 @@ def two_soils_in_the_rain(length=1.0, stress=1.0, time=1.0, at=(0.0, 0.0), mirro
     ]
     fluid = mpm.Fluid(density=density, bulk=2e8 * stress, gravity=gravity)
     water = {"fluid": fluid, "gravity": [0, -gravity], "pressure": -5000 * stress, "initial_stress": mpm.K0(0.5)}
-    numerics = mpm.Numerics(tolerance=1e-10)
+    numerics = mpm.Numerics(tolerance=1e-9)
     s = mpm.Simulation(grid, bodies, soils, walls={"bottom": "xy"}, conditions=sides, numerics=numerics, **water)
     assert s.run(4000 * time, 500 * time, progress=False).cuts == 0
     cells = s.cells()

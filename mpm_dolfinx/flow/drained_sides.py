@@ -257,29 +257,33 @@ class SideFeeds(Feeds):
     """
 
     def __init__(self, sides: OpenSides, wet: Wet, grid: Grid, names: tuple[str, ...], ponds: tuple[float | None, ...]):
-        self.sides, self._rains = sides, tuple(depth is not None for depth in ponds)
+        self._rains = tuple(depth is not None for depth in ponds)
         self._names, self._before = names, wet.outcome
         self._contents, self._comm = wet.contents, grid.comm
-        self._fallen, self._most = sides.rain, np.zeros(len(names))
-        if any(ponds):
-            self._pond(np.array([depth or 0.0 for depth in ponds]), wet.dt)
+        self._fallen = sides.rain
+        self.sides, self._most = self._pond(sides, ponds, wet.dt) if any(ponds) else (sides, np.zeros(len(names)))
         self._seeps = sides.seeps & np.isnan(sides.driest)
         self.settles = bool(self._seeps.any())
         self.linear = not any(self._rains)
         self._drain = wet.drains
-        self._flows, self._aslant, self._share = np.ones(len(sides.cells), dtype=bool), 0.0, 0.0
+        self._flows, self._aslant = np.ones(len(sides.cells), dtype=bool), 0.0
+        self._share: NDArray[np.float64] | float = 0.0
 
-    def _pond(self, depth: NDArray[np.float64], dt: float) -> None:
-        """Let ponds (n,) of at most these depths, m, supply what they hold in a time, s, at their pressure."""
-        number, sides = self.sides.number, self.sides
+    def _pond(
+        self, sides: OpenSides, ponds: tuple[float | None, ...], dt: float
+    ) -> tuple[OpenSides, NDArray[np.float64]]:
+        """Return sides that ponds supply with what they hold in a time, s, at their pressure; their volumes when full.
+
+        ponds (n,): their depths, m, at most.
+        """
+        depth, number = np.array([depth or 0.0 for depth in ponds]), sides.number
         size = np.linalg.norm(sides.area, axis=1)
         area = over_all(self._comm, sum_by(number, size, len(self._names)))
-        self._most = depth * area
-        full = np.divide(self._ponded, self._most, out=np.zeros(len(depth)), where=self._most > 0)
+        most = depth * area
+        full = np.divide(self._ponded, most, out=np.zeros(len(depth)), where=most > 0)
         held = np.divide(self._ponded, area, out=np.zeros(len(depth)), where=area > 0)
-        ponds = ~np.isnan(sides.rain)
-        pressure = np.where(ponds, full[number] * sides.pressure, sides.pressure)
-        self.sides = replace(sides, pressure=pressure, rain=sides.rain + (held / dt)[number] * size)
+        pressure = np.where(np.isnan(sides.rain), sides.pressure, full[number] * sides.pressure)
+        return replace(sides, pressure=pressure, rain=sides.rain + (held / dt)[number] * size), most
 
     @property
     def _ponded(self) -> NDArray[np.float64]:

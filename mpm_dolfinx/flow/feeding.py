@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.bodies.faces import Surface
-from mpm_dolfinx.conditions.acting import Outcome
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.flow.fluxes import CellContents, Conduction, OpenSides
 from mpm_dolfinx.forms.point_forms import PointData
@@ -39,7 +38,7 @@ class Wet(NamedTuple):
     pieces: PointData | None = None
     drains: bool = False
     dt: float = np.inf
-    outcome: Outcome = MappingProxyType({})
+    outcome: Mapping[str, Mapping[str, NDArray[np.float64]]] = MappingProxyType({})
 
 
 class Fluid(NamedTuple):

@@ -50,17 +50,17 @@ def step(scene: Scene, state: State, dt: float, how: tuple = ()) -> tuple[State,
     start = set_up(scene, state, dt, how)
     report = Report()
     kept = Kept()
-    rates = []
+    rates, passed = [], []
     state = start.state
     on_grid = start.on_grid
     solvers = start.matrices.solvers
-    flights, found, passed = [flight_of(start)], [], []
+    flights, found = [flight_of(start)], []
     for acting in start.acting:
         key = start.matrices.key, acting.substep.own * dt
         both = balances(scene, start, acting, rates[-1] if rates else None, flights[-1])
         as_reset = partial(on_grid.as_reset, state)
         rates.append(solve_substep(solvers, both.momentum, both.storage, as_reset, key, report, kept))
-        passed.append(both.storage.passing() if both.storage else [])
+        passed.append(both.passing())
         flights.append(both.flown(flights[-1], acting.substep, dt))
         if "energy" in state.outcome:
             found.append(both.momentum.powers())
@@ -68,10 +68,8 @@ def step(scene: Scene, state: State, dt: float, how: tuple = ()) -> tuple[State,
     report.moves = start.moves(flights[1:], acting.substep)
     del solvers
     start.matrices.end_step()
-    at, outcome = both.momentum.at, both.outcome(state)
-    seconds = dt * np.array([acting.substep.before, acting.substep.own])[-len(passed) :]
-    if both.storage is not None:
-        outcome |= both.storage.volumes(passed, seconds)
+    seconds = dt * np.array([acting.substep.before, acting.substep.own])
+    at, outcome = both.momentum.at, both.outcome(state, passed, seconds)
     loads = [one.ended(at) for one in acting.loads]
     end = state.t + dt, loads, both.came(rates[-1]), report
     new, report.rederived = scene.motion.advanced(state, on_grid, start.data, *end, carried=start.carrying(flights[-1]))
