@@ -42,7 +42,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.fluid_content import change_of_content, mass_potential
-from mpm_dolfinx.base.tolerances import EPSILON, SAME
+from mpm_dolfinx.base.tolerances import EPSILON, ROUND_OFF, SAME
 from mpm_dolfinx.flow.feeding import Feeding, Feeds, Fluid
 from mpm_dolfinx.flow.fluxes import CellContents, Conduction, FluxForms, OpenSides
 from mpm_dolfinx.flow.nonorthogonal import AslantFlow, Gradients
@@ -51,6 +51,7 @@ from mpm_dolfinx.flow.unsaturated import Relative
 from mpm_dolfinx.forms.cell_matrices import along_shapes, insert_rows
 from mpm_dolfinx.forms.point_forms import CellSums, FacetSum, FormPoints, PointData, PointForm
 from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts, zero
+from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.materials.evaluate import ConductivityAtPieces
 from mpm_dolfinx.materials.skeleton import filled
 from mpm_dolfinx.parallel.exchange import over_all
@@ -677,10 +678,12 @@ class StorageProblem:
 
 
 def _falls(A: PETSc.Mat) -> bool:
-    """Return whether a row of a matrix has a diagonal that is not positive, or another entry that is."""
+    """Return whether a row of a matrix has a diagonal that is not positive, or another entry that is, by its size."""
     starts, columns, values = A.getValuesCSR()
     row = np.repeat(np.arange(len(starts) - 1), np.diff(starts)) + A.getOwnershipRange()[0]
-    return bool((np.where(row == columns, values <= 0, values > 0)).any())
+    size = sum_by(row - A.getOwnershipRange()[0], np.abs(values), len(starts) - 1)
+    least = ROUND_OFF * size[row - A.getOwnershipRange()[0]]
+    return bool((np.where(row == columns, values <= 0, values > least)).any())
 
 
 def _add_diagonal(A: PETSc.Mat, values: NDArray[np.float64]) -> NDArray[np.float64]:

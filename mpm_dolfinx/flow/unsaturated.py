@@ -141,18 +141,19 @@ class Relative:
         p: NDArray[np.float64],
         outer: NDArray[np.float64],
         fall: NDArray[np.float64] | float = 0.0,
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return mobilities (m,) of owned cells between their pressures and others (m,), Pa, and even slopes by theirs.
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Return mobilities (m,) of owned cells between their pressures and others (m,), Pa, and slopes, see `Between`.
 
         fall (m,), Pa: what the fluid's weight drives by out of the cells.
         """
         shares = self.shares.x.array.reshape(-1, self.count)[cells]
-        k, slope = shares[:, 0].copy(), np.zeros(len(p))
+        k, (slope, even) = shares[:, 0].copy(), np.zeros((2, len(p)))
         for law, share in zip(self._laws, shares.T[1:], strict=True):
             between = fitted((p, outer), (law(p).T, law(outer).T), fall, law.scale, NUMPY)
             k += share * between.k
-            slope += share * between.even[0]
-        return k, slope
+            slope += share * between.slopes[0]
+            even += share * between.even[0]
+        return k, slope, even
 
     def set_shares(self, filled: NDArray[np.int64], shares: NDArray[np.float64]) -> None:
         """Set the shares (n, count) of the filled owned cells."""
