@@ -496,6 +496,13 @@ class StorageProblem:
         capacity = self.forms.derivatives(self.data)[0]
         return lost / (capacity + self._contents.fixed_stress)[owned]
 
+    def filling(self, error: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return what errors of the pressures (n,), Pa, make of the water content, and its change in the step (n,)."""
+        capacity, _ = self.forms.drained(self.data)
+        change = self.forms.change(self.data)[self.system.unknowns.owned]
+        share = self.fill / self._contents.volume
+        return share * capacity * error, share * np.abs(change)
+
     @property
     def ring(self) -> float:
         """Mean length of the rings that the cells' contents are in axisymmetry, m."""
