@@ -68,6 +68,7 @@ CHANGES = {
     ("Scene", "_looks"): "what is still to be warned of",
     ("SideFeeds", "_flows"): "the active set of seepage faces",
     ("SideFeeds", "_aslant"): "what flows aslant at the start of the substep",
+    ("SideFeeds", "_share"): "the same, as a share of what flows in soil whose pores drain",
     ("ContactProblem", "now"): "the pairs and tractions of contacts as they are held for a Newton step",
     ("Events", "_before"): "what events were before the step",
     ("Writer", "_lock"): "the folder's, let go of as it closes",

@@ -21,6 +21,7 @@ from mpm_dolfinx.stepping.state import State
 def set_up(scene: Scene, state: State, dt: float, how: tuple = ()) -> Start:
     """Return the start of a step of dt (s): the state on the grid, its matrices, and what acts in its substeps."""
     scene.check(state)
+    scene.rests_at(state.stage, state.t)
     collect_garbage(scene.grid.mesh.comm)
     stage, times = state.stage, [state.t + substep.end * dt for substep in how or scene.substeps]
     start, *gravity = (stage.gravity_at(t) for t in [state.t, *times])
@@ -49,7 +50,7 @@ def step(scene: Scene, state: State, dt: float, how: tuple = ()) -> tuple[State,
     start = set_up(scene, state, dt, how)
     report = Report()
     kept = Kept()
-    rates = []
+    rates, passed = [], []
     state = start.state
     on_grid = start.on_grid
     solvers = start.matrices.solvers
@@ -59,6 +60,7 @@ def step(scene: Scene, state: State, dt: float, how: tuple = ()) -> tuple[State,
         both = balances(scene, start, acting, rates[-1] if rates else None, flights[-1])
         as_reset = partial(on_grid.as_reset, state)
         rates.append(solve_substep(solvers, both.momentum, both.storage, as_reset, key, report, kept))
+        passed.append(both.passing())
         flights.append(both.flown(flights[-1], acting.substep, dt))
         if "energy" in state.outcome:
             found.append(both.momentum.powers())
@@ -66,13 +68,13 @@ def step(scene: Scene, state: State, dt: float, how: tuple = ()) -> tuple[State,
     report.moves = start.moves(flights[1:], acting.substep)
     del solvers
     start.matrices.end_step()
-    at, outcome = both.momentum.at, both.outcome(state)
+    seconds = dt * np.array([acting.substep.before, acting.substep.own])
+    at, outcome = both.momentum.at, both.outcome(state, passed, seconds)
     loads = [one.ended(at) for one in acting.loads]
     end = state.t + dt, loads, both.came(rates[-1]), report
     new, report.rederived = scene.motion.advanced(state, on_grid, start.data, *end, carried=start.carrying(flights[-1]))
     velocity = None if scene.momentum.elastic else scene.momentum.u.x.array / dt
     now = {"outcome": outcome, "points": left(loads, at, state.points, new.points), "velocity": velocity}
     if found:
-        seconds = dt * np.array([acting.substep.before, acting.substep.own])
         outcome["energy"] = after(state.outcome["energy"], scene.materials, now["points"], seconds, found)
     return replace(new, **now, begins=False, resets=state.resets + (not state.stays)), report
