@@ -261,11 +261,8 @@ def _check_inertia(by_name: Mapping[str, Any], inertia: bool) -> None:
             raise ValueError(f"{name}: bodies have no inertia, must be given with inertia=True")
         if not inertia:
             continue
-        if isinstance(one, Contact):
-            raise ValueError(f"{name}: contacts of groups are quasi-static, must be left out with inertia")
-        if isinstance(one, Tool) and (one.grips or one.load is not None):
-            what = "a load, and no mass" if one.load is not None else "friction"
-            raise ValueError(f"{name}: the tool has {what}, must be smooth and moved as given with inertia")
+        if isinstance(one, Tool) and one.load is not None:
+            raise ValueError(f"{name}: the tool has a load, and no mass, must be moved as given with inertia")
 
 
 def _gravity(value: ArrayLike, name: str, dim: int, axisymmetric: bool) -> NDArray[np.float64]:
