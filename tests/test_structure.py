@@ -69,6 +69,7 @@ CHANGES = {
     ("SideFeeds", "_flows"): "the active set of seepage faces",
     ("SideFeeds", "_aslant"): "what flows aslant at the start of the substep",
     ("ContactProblem", "now"): "the pairs and tractions of contacts as they are held for a Newton step",
+    ("FreeTools", "now"): "the same, and where tools with a mass are",
     ("Events", "_before"): "what events were before the step",
     ("Writer", "_lock"): "the folder's, let go of as it closes",
     ("Writer", "closed"): "whether it has been",
