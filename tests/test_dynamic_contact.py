@@ -261,10 +261,6 @@ def test_tools_that_are_neither_free_nor_given_are_refused(options, said):
         mpm.Tool(mpm.Ball((0, 0), 1.0), **options)
 
 
-def test_free_tools_are_refused_without_inertia_and_pushed_ones_without_mass_with_it():
+def test_free_tools_are_refused_without_inertia():
     with pytest.raises(ValueError, match="inertia=True"):
         sledge(inertia=False)
-    grid = mpm.Grid([0, 0], [1, 1], [4, 4])
-    tool = mpm.Tool(mpm.Ball((0.5, 0.8), 0.2), load=1.0, direction=(0, -1))
-    with pytest.raises(ValueError, match="no mass"):
-        mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 0.5])], [STIFF], walls={}, conditions=[tool], inertia=True)
