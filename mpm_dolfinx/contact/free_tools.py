@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base.tolerances import SAME
 from mpm_dolfinx.conditions.acting import At, Shares
 from mpm_dolfinx.contact.problem import ContactProblem, Found, Gone, outer
-from mpm_dolfinx.forms.unknowns import Unknowns
 from mpm_dolfinx.mechanics.inertia import Flight
 
 
@@ -150,7 +149,7 @@ class FreeTools(ContactProblem):
         share = np.linalg.norm(off, axis=1) / np.where(parts > 0, parts, 1.0)
         return Met(inverse, share * free, np.einsum("kij,kj->ki", inverse, off))
 
-    def pattern(self, unknowns: Unknowns) -> PETSc.Mat | None:
+    def pattern(self, unknowns) -> PETSc.Mat | None:
         """See `Loads`: nodes under a free tool are coupled."""
         out = None
         for number in np.flatnonzero(self._mass > 0):

@@ -11,7 +11,6 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mpm_dolfinx.base.tolerances import SAME
 from mpm_dolfinx.base.validation import check_names, given, line, numbers
 from mpm_dolfinx.contact.shapes import ROUNDED, Ball, Cone, Convex, Distance, HalfSpace, Shape, unit_vector
 from mpm_dolfinx.grid.grid import Grid
@@ -134,7 +133,7 @@ class Tool:
         if self.velocity is None:
             return np.zeros(dim)
         v = numbers("Tool: velocity", self.velocity, (dim,), allowed=f"{dim} finite numbers")
-        if np.abs(v - self.guide(dim) @ v).max() > SAME * np.abs(v).max():
+        if not np.allclose(v, self.guide(dim) @ v):
             raise ValueError(f"Tool: velocity = {line(self.velocity)}, must be along its direction")
         return v
 

@@ -42,7 +42,6 @@ from mpm_dolfinx.forms.point_forms import FormPoints, Places, PointData, PointFo
 from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts
 from mpm_dolfinx.grid.grid import Grid, sum_by
 from mpm_dolfinx.mechanics.ghost_penalty import kinks
-from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.cutting import spreads
 from mpm_dolfinx.points.material_points import MaterialPoints, middle
 
@@ -327,7 +326,7 @@ class Mass:
         """
         start, end = velocities
         out = {name: points.data[name] + more for name, more in self._at_points(points, end - start).items()}
-        if over_all(self._forms.grid.comm, int(moved.any())):
+        if self._forms.grid.comm.allreduce(int(moved.any())):
             k = -np.expm1(-RELAXES * moved)
             for name, values in self._at_points(points, start).items():
                 own = points.data[name]
