@@ -264,3 +264,26 @@ def test_tools_that_are_neither_free_nor_given_are_refused(options, said):
 def test_free_tools_are_refused_without_inertia():
     with pytest.raises(ValueError, match="inertia=True"):
         sledge(inertia=False)
+
+
+@pytest.mark.slow
+def test_a_block_on_a_base_that_shakes_moves_by_steps_as_newmark_s():
+    """Newmark (1965): a rigid block slides down while its base pulls away faster than friction can follow."""
+    angle, mu, omega, t_end = np.radians(15), 0.4, 4 * np.pi, 1.5
+    size = 0.5 * G / omega**2
+    dt, v, way = 1e-5, 0.0, 0.0
+    for t in np.arange(0, t_end, dt):
+        drive, most = G * np.sin(angle) - 0.5 * G * np.cos(omega * t), mu * G * np.cos(angle)
+        slips = v != 0 or abs(drive) > most
+        then = v + dt * (drive - most * np.sign(v if v else drive)) * slips
+        v = 0.0 if v * then < 0 else then
+        way += v * dt
+    s, _ = incline(0.0, False, friction=mu, length=0.9)
+    block, floor = s.scene.bodies[0], mpm.HalfSpace((0, 0.37 * 0.05), (0, 1))
+    base = mpm.Tool(floor, displacement=lambda t: (size * (1 - np.cos(omega * t)), 0.0), friction=mu)
+    gravity = G * np.array([np.sin(angle), -np.cos(angle)])
+    s = mpm.Simulation(s.grid, [block], [STIFF], walls={}, conditions=[base], gravity=gravity, inertia=True)
+    start = of_centre(s, s.points.x)[0]
+    energies = s.run(t_end, 0.02, energies=True, progress=False).energies
+    slid = of_centre(s, s.points.x)[0] - start - size * (1 - np.cos(omega * t_end))
+    assert slid == pytest.approx(way, rel=0.04) and balance(energies) < 0.01
