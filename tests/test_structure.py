@@ -70,6 +70,7 @@ CHANGES = {
     ("SideFeeds", "_aslant"): "what flows aslant at the start of the substep",
     ("SideFeeds", "_share"): "the same, as a share of what flows in soil whose pores drain",
     ("ContactProblem", "now"): "the pairs and tractions of contacts as they are held for a Newton step",
+    ("FreeTools", "now"): "the same, and where tools with a mass are",
     ("Events", "_before"): "what events were before the step",
     ("Writer", "_lock"): "the folder's, let go of as it closes",
     ("Writer", "closed"): "whether it has been",

@@ -288,7 +288,7 @@ def _counting(scene: Scene, state: State, energies: bool, goes_on: bool) -> Stat
         return state
     outcome = {quantity: of for quantity, of in state.outcome.items() if quantity != "energy"}
     if energies:
-        outcome["energy"] = begun(scene.materials, state.points)
+        outcome["energy"] = begun(scene.materials, state.points, state.stage.kinetic(outcome))
     return replace(state, outcome=outcome)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from mpi4py import MPI
 
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.time_integration import Substep
-from mpm_dolfinx.conditions.acting import QUANTITIES, At, Loads, Outcome
+from mpm_dolfinx.conditions.acting import QUANTITIES, At, Loads, Outcome, Shares
 from mpm_dolfinx.dynamics.step_error import motion_error
 from mpm_dolfinx.flow.storage import Rates, StorageProblem
 from mpm_dolfinx.mechanics.inertia import Flight, Inertia
@@ -48,6 +48,14 @@ class Start(NamedTuple):
     dt: float
     yielded: bool
     acting: list[Acting]
+
+    def begun(self, acting: Acting, gone: Sequence[Any] | None) -> Acting:
+        """Return what acts in a substep as it begins; gone: what loads returned of the last one."""
+        if not self.state.stage.inertia:
+            return acting
+        shares = Shares(acting.substep.own * self.dt, acting.substep.before * self.dt, acting.gravity)
+        before = gone or [None] * len(acting.loads)
+        return acting._replace(loads=[one.begun(shares, of) for one, of in zip(acting.loads, before, strict=True)])
 
     def carrying(self, flight: Flight | None) -> Callable[[NDArray[np.float64]], dict[str, NDArray[np.float64]]] | None:
         """Return what gives velocities of points after the step, see `Mass.carried`; None without inertia."""

@@ -48,14 +48,15 @@ def set_up(scene: Scene, state: State, dt: float, how: tuple = ()) -> Start:
 def step(scene: Scene, state: State, dt: float, how: tuple = ()) -> tuple[State, Report]:
     """Return the state after a step of dt (s), and what it took; `state` stays what it is, whatever is raised."""
     start = set_up(scene, state, dt, how)
-    report = Report()
-    kept = Kept()
+    report, kept = Report(), Kept()
     rates, passed = [], []
+    gone = None
     state = start.state
     on_grid = start.on_grid
     solvers = start.matrices.solvers
     flights, found = [flight_of(start)], []
-    for acting in start.acting:
+    for placed in start.acting:
+        acting = start.begun(placed, gone)
         key = start.matrices.key, acting.substep.own * dt
         both = balances(scene, start, acting, rates[-1] if rates else None, flights[-1])
         as_reset = partial(on_grid.as_reset, state)
@@ -64,6 +65,7 @@ def step(scene: Scene, state: State, dt: float, how: tuple = ()) -> tuple[State,
         flights.append(both.flown(flights[-1], acting.substep, dt))
         if "energy" in state.outcome:
             found.append(both.momentum.powers())
+        gone = [one.flown(both.momentum.at) for one in acting.loads]
     note_pressures(report, solvers, both.storage, acting.substep.before * dt, dt, rates)
     report.moves = start.moves(flights[1:], acting.substep)
     del solvers
@@ -76,5 +78,6 @@ def step(scene: Scene, state: State, dt: float, how: tuple = ()) -> tuple[State,
     velocity = None if scene.momentum.elastic else scene.momentum.u.x.array / dt
     now = {"outcome": outcome, "points": left(loads, at, state.points, new.points), "velocity": velocity}
     if found:
-        outcome["energy"] = after(state.outcome["energy"], scene.materials, now["points"], seconds, found)
+        kinetic = state.stage.kinetic(outcome)
+        outcome["energy"] = after(state.outcome["energy"], scene.materials, now["points"], kinetic, seconds, found)
     return replace(new, **now, begins=False, resets=state.resets + (not state.stays)), report
