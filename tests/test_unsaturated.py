@@ -278,6 +278,16 @@ def test_what_is_no_law_of_retention_is_refused(law, said):
         law()
 
 
+def test_saturated_scenes_have_nothing_of_retention():
+    """No field of pieces, no form, no table, and no volumes but where rain falls."""
+    s = column(2, [mpm.Hencky(1e6, 1e6, conductivity=1e-6)], 0.0, [mpm.Drained("top")])
+    s.run(1, 1, progress=False)
+    forms = s.scene.storage
+    assert not {"retention", "lever", "pores"} & s.scene.pieces.pieces.sizes.keys()
+    assert (forms.retains, forms.fluxes.relative, forms.fluxes.even) == (False, None, None)
+    assert not {"runoff", "flowed", "ran_off", "ponded"} & s.state.outcome.keys()
+
+
 def test_a_specific_yield_does_not_go_with_it():
     law = mpm.Gardner(1e3)
     with pytest.raises(ValueError, match=r"retention beside a specific yield 0\.1, must be one of them"):
