@@ -21,7 +21,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 
 def stored(materials: SceneMaterials, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
     """Return the kinetic and elastic energies, J, of points; on all processes together."""
-    mass = materials.density(points) * points.volume0 * points.J
+    mass = materials.present_density(points) * points.volume0 * points.J
     v, L = points.data[VELOCITY], velocity_gradients(points)
     spread = spreads(points.corners, materials.grid.axisymmetric)
     turning = np.einsum("nij,njk,nik->n", L, spread, L)

@@ -72,7 +72,7 @@ class MomentumForms:
     inertia
         Whether bodies may have inertia.
     retentions
-        The laws of retention of the scene, where some pores drain; the pieces then carry retention and pores.
+        The laws of retention of the scene, where some pores drain; the pieces then carry retention, lever and pores.
     """
 
     def __init__(
@@ -108,7 +108,7 @@ class MomentumForms:
         self.conditions = FormsOf(grid, self.u, self.velocity)
         """The forms of conditions."""
         self.own = OwnTerms(terms, pieces, self.conditions, t, dt)
-        full = None if retentions is None else retentions.of("saturation", pressure, pieces.retention)
+        full = None if retentions is None else retentions.of("saturation", pressure, pieces)
         self.weight = None if gravity is None else Weight(pieces, self.u, gravity, fluid_density, full)
         self.acting = [*filter(None, (self.weight,)), *[self.own] * bool(terms)]
         """What acts in all stages."""
@@ -148,7 +148,7 @@ class MomentumForms:
         if pressure is not None:
             of_pressure = -points.biot * pressure * ufl.diff(ufl.det(F), F)
             if self._retentions is not None:
-                of_pressure = self._retentions.of("bishop", pressure, points.retention) * of_pressure
+                of_pressure = self._retentions.of("bishop", pressure, points) * of_pressure
             P, A = P + of_pressure, A + ufl.diff(of_pressure, F)
         share = 1 / ufl.det(points.F)  # divided by it, each component would be
         P, A = share * P, share * A

@@ -16,6 +16,7 @@ from mpm_dolfinx.base.tables import data_frame, data_set
 from mpm_dolfinx.conditions.names import ByName
 
 OUTCOMES = ("reactions", "wall_reactions", "outflows", "tool_forces", "tool_travel", "tool_velocity", "energy")
+OUTCOMES += ("runoff", "flowed", "ran_off", "ponded")
 """What conditions do to the bodies; those of the user's own may have others."""
 
 

@@ -154,6 +154,8 @@ class Stage:
         out["outflows"] = {name: values for one in self.feeding for name, values in one.unknown(value).items()}
         if runs := {name: values for one in self.feeding for name, values in one.dry(value).items()}:
             out["runoff"] = runs
+        for one in self.feeding:
+            out |= one.empty()
         for one in self.acting:
             for quantity, values in one.unknown(value).items():
                 out[quantity] = out.get(quantity, {}) | values
