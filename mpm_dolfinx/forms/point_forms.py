@@ -211,8 +211,9 @@ class Places(Keyed):
     def stretch(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return 1 + u_r / r (n,) of nodal displacements u (nodes, d), m, in axisymmetry: see `FormPoints.hoop`."""
         grid, (*offset, product, radius) = self.grid, self.hoop.T
-        hats = [0.5 + x[:, None] * grid.signs[:, a] / grid.h[a] for a, x in enumerate(offset)]
-        uneven = (product - offset[0] * offset[1])[:, None] * grid.signs.prod(axis=1) / grid.h.prod()
+        h = grid.h if grid.even else grid.sizes(self.cells).T[..., None]
+        hats = [0.5 + x[:, None] * grid.signs[:, a] / h[a] for a, x in enumerate(offset)]
+        uneven = (product - offset[0] * offset[1])[:, None] * grid.signs.prod(axis=1) / h.prod(axis=0)
         return 1 + ((hats[0] * hats[1] + uneven) * u[grid.cell_nodes[self.cells], 0]).sum(axis=1) / radius
 
 
@@ -237,7 +238,7 @@ class PointData(Keyed):
         self.cells = places.cells
         self.x = places.x
         self.volume, n = weight, len(places.cells)
-        self._rows = {"offset": places.offset, "weight": (weight / points.grid.cell_volume)[:, None]}
+        self._rows = {"offset": places.offset, "weight": (weight / points.grid.volumes(self.cells))[:, None]}
         if points.grid.dim == 3:
             self._rows["mixed"] = np.zeros_like(places.x) if places.mixed is None else places.mixed
         if points.grid.axisymmetric:
@@ -269,7 +270,8 @@ class PointData(Keyed):
         places = self.places
         grid = self.points.grid
         d = self.points.grid.dim
-        of_cells, out = grid.monomials @ u.take(places.nodal), np.empty((len(self.cells), d, d))
+        of_cells = grid.over_edges(grid.monomials @ u.take(places.nodal), places.filled)
+        out = np.empty((len(self.cells), d, d))
         # component by component: rows of a few numbers each would take numpy six times as long
         for axis in range(d):
             along = 0.0
@@ -453,7 +455,7 @@ class FacetSum:
 class PointExpression:
     """A UFL expression of the fields that points carry, evaluated at every point.
 
-    The kernel sees of its cell the size only, which all have in common.  So it is called for as many
+    The kernel sees of its cell the size only, over which its value is divided.  So it is called for as many
     different cells, whichever, and DG0, which tests the expression, keeps a value for each point.
 
     Parameters
@@ -465,7 +467,7 @@ class PointExpression:
     """
 
     def __init__(self, expression: ufl.core.expr.Expr, points: FormPoints):
-        self._volume, self._shape = points.grid.cell_volume, expression.ufl_shape
+        self._shape = expression.ufl_shape
         q = ufl.TestFunction(points.grid.cellwise(self._shape))
         dx = ufl.dx(domain=points.grid.mesh, subdomain_id=_compat.SUBDOMAIN, metadata={"quadrature_degree": 0})
         self._compiled = _compat.CompiledForm(ufl.inner(expression, q) * dx)
@@ -474,6 +476,8 @@ class PointExpression:
         self._bound = {size: self._compiled.bind(np.arange(size)) for size in sorted(sizes)}
         self._rows.room(max(sizes))
         self._values = np.empty((max(sizes), int(np.prod(self._shape, dtype=int))))
+        volumes = points.grid.volumes(np.arange(max(sizes)))
+        self._volume = volumes if points.grid.even else volumes[:, None]
 
     def live(self, data: PointData) -> dict[str, NDArray[np.float64]]:
         """Return the present values of the fields that change while the points stay."""
@@ -492,7 +496,8 @@ class PointExpression:
             self._rows(data, slice(start, stop) if chosen is None else chosen[start:stop], live)
             values[:] = 0.0
             self._compiled.assemble_vector(values.reshape(-1), self._rows.room(size)[:size], self._bound[size])
-            np.divide(values[: stop - start], self._volume, out=out[start:stop])
+            of_cell = self._volume if np.isscalar(self._volume) else self._volume[: stop - start]
+            np.divide(values[: stop - start], of_cell, out=out[start:stop])
             start = stop
         return out.reshape(count, *self._shape)
 

@@ -153,7 +153,7 @@ class GivenDisplacements(Acting):
         """Refuse given displacements that differ where they meet: no body's stress is finite there."""
         for one, other, axes, X in self._meeting:
             jump = np.abs(self._given(one, t, X) - self._given(other, t, X))[:, axes].max(axis=1)
-            if jump.max(initial=0.0) > NEAR * self._grid.h.min():
+            if jump.max(initial=0.0) > NEAR * self._grid.least:
                 what = f"{line(one)} and {line(other)}: differ by {jump.max():.3g} m at t = {t:g} s where they meet"
                 raise ValueError(f"{what}, at {X[jump.argmax()]}; must agree there, or leave two cells between them")
 
