@@ -127,7 +127,18 @@ class FormPoints:
 
     def increment(self, u: fem.Function):
         """Return Delta = I + grad u at the points as UFL."""
+        if self.grid.axisymmetric and not self.grid.even:
+            if "increment" not in self.live:
+                self.follow("increment", (3, 3), lambda data: data.increments(u.x.array.copy()))
+            return self.functions["increment"]
         return ufl.Identity(self.grid.stretches) + (self.grad(u) if self.grid.axisymmetric else self.gradient(u))
+
+    def displacement(self, u: fem.Function):
+        """Return u at the points as UFL, in cells of many sizes as a coefficient: for forms called for other cells."""
+        if self.grid.even:
+            return self.value(u)
+        d = self.grid.dim
+        return self.follow("displaced", (d,), lambda data: self.grid.at(data.cells, data.x, u.x.array.reshape(-1, d)))
 
     def deformation(self, u: fem.Function):
         """Return F = Delta F_n at the points, which carry F_n as F, as a UFL variable."""
@@ -265,6 +276,13 @@ class PointData(Keyed):
         now = u.x.array.copy()  # of the key nothing changes
         return self._gradients(now, lambda: self.gradients_of(now))
 
+    def increments(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return I + grad u (n, 9), in axisymmetry with hoops, of a Q1 vector function with these values."""
+        out = np.zeros((len(self.cells), 3, 3))
+        out[:, :2, :2] = np.eye(2) + self.gradients_of(u).reshape(-1, 2, 2)
+        out[:, 2, 2] = self.places.stretch(u.reshape(-1, 2))
+        return out.reshape(len(out), 9)
+
     def gradients_of(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the gradients (n, d^2) of a Q1 vector function with these values, a local array."""
         places = self.places
@@ -371,7 +389,7 @@ class PointForm:
         The points.
     dense
         Tested by DG0, it has a value for each of the filled cells rather than for each cell of the grid: as
-        `PointExpression`, it is called for other cells.
+        `PointExpression`, it is called for other cells, which must be equal.
     """
 
     def __init__(self, form: ufl.Form, points: FormPoints, dense: bool = False):
@@ -455,8 +473,9 @@ class FacetSum:
 class PointExpression:
     """A UFL expression of the fields that points carry, evaluated at every point.
 
-    The kernel sees of its cell the size only, over which its value is divided.  So it is called for as many
-    different cells, whichever, and DG0, which tests the expression, keeps a value for each point.
+    The kernel sees of its cell the size only, by which it is divided: of grid functions expressions have no gradients,
+    but where all cells are equal.  So it is called for as many different cells, whichever, and DG0, which tests the
+    expression, keeps a value for each point.
 
     Parameters
     ----------
@@ -515,11 +534,16 @@ class CellSums:
 
     def __init__(self, quantities: Sequence[ufl.core.expr.Expr], points: FormPoints):
         self._count = len(quantities)
-        q = ufl.TestFunction(points.grid.cellwise((self._count,)))
-        self._form = PointForm(ufl.inner(ufl.as_vector(quantities), q) * points.dx, points, dense=True)
+        self._grid, q = points.grid, ufl.TestFunction(points.grid.cellwise((self._count,)))
+        dense = points.grid.even
+        self._form = PointForm(ufl.inner(ufl.as_vector(quantities), q) * points.dx, points, dense)
 
     def __call__(self, data: PointData) -> NDArray[np.float64]:
         """Return the sums (cells, quantities) in the filled cells of the points."""
+        if not self._grid.even:
+            sums = np.zeros((self._grid.num_local, self._count))
+            self._form.assemble_vector(sums.reshape(-1), data)
+            return sums[data.places.filled]
         sums = np.zeros((len(data.places.filled), self._count))
         self._form.assemble_vector(sums.reshape(-1), data)
         return sums
