@@ -124,8 +124,7 @@ class CutDomains(Keyed):
         part (n,): of each point.
         """
         far = np.zeros(count)
-        h = self.grid.sizes_at(self.points.corners)
-        np.maximum.at(far, part, np.abs((points.corners - self.points.corners) / h).max(axis=(1, 2)))
+        np.maximum.at(far, part, self.grid.cells_between(self.points.corners, points.corners).max(axis=(1, 2)))
         return over_all(self.grid.comm, far, MPI.MAX)
 
     def serves(self, points: MaterialPoints, part: NDArray[np.int64], count: int) -> NDArray[np.bool_]:

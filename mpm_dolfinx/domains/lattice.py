@@ -266,4 +266,4 @@ def filtered(
 
 def crossed(grid: Grid, points: MaterialPoints, then: MaterialPoints, free: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Return how many cells the corners (n, 2^d) have crossed since the grid was reset; of points not free none."""
-    return np.abs((points.corners - then.corners) / grid.sizes_at(then.corners)).sum(axis=2) * free[:, None]
+    return grid.cells_between(then.corners, points.corners).sum(axis=2) * free[:, None]

@@ -128,12 +128,12 @@ class FormPoints:
     def increment(self, u: fem.Function):
         """Return Delta = I + grad u at the points as UFL."""
         if self.grid.axisymmetric and not self.grid.even:
-            if "increment" not in self.live:
-                self.follow("increment", (3, 3), lambda data: data.increments(u.x.array.copy()))
-            return self.functions["increment"]
+            if "increments" not in self.live:
+                self.follow("increments", (3, 3), lambda data: data.increments(u.x.array.copy()))
+            return self.functions["increments"]
         return ufl.Identity(self.grid.stretches) + (self.grad(u) if self.grid.axisymmetric else self.gradient(u))
 
-    def displacement(self, u: fem.Function):
+    def moved_by(self, u: fem.Function):
         """Return u at the points as UFL, in cells of many sizes as a coefficient: for forms called for other cells."""
         if self.grid.even:
             return self.value(u)

@@ -286,6 +286,12 @@ class Grid:
             out[..., a] = i + (x[..., a] - lines[i]) / width[i]
         return out
 
+    def cells_between(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return by how many cells places (..., d), m, from the base, are apart from others along each axis, >= 0."""
+        if self.even:
+            return np.abs((y - x) / self._h)
+        return np.abs(self.in_cells(y) - self.in_cells(x))
+
     def places(self, index: NDArray[np.integer], share: NDArray[np.float64] | float = 0.0) -> NDArray[np.float64]:
         """Return places (n, d), m, from the base: by indices of cells, and shares of these from their lower corners.
 

@@ -310,7 +310,7 @@ class ConductivityAtPieces:
             J=J,
             porosity=1 - (1 - points.porosity0) / J,
             porosity0=points.porosity0,
-            x=points.position + points.displacement(self._u),
+            x=points.position + points.moved_by(self._u),
             p=self._p,
         )
 
