@@ -191,7 +191,9 @@ class Tools:
         low, high = (over_all(grid.comm, end, op) for end, op in _box(cells(y[edge])))
         off = ~faces & (np.abs(np.clip(cells(x), low, high) - cells(x)) <= 1).all(axis=1)
         beyond = np.concatenate(grid.comm.allgather(np.hstack([cells(x[off]), unit[off]])))
-        pairs = cKDTree(cells(y[edge])).sparse_distance_matrix(cKDTree(beyond[:, : grid.dim]), 1.0, output_type="ndarray")
+        pairs = cKDTree(cells(y[edge])).sparse_distance_matrix(
+            cKDTree(beyond[:, : grid.dim]), 1.0, output_type="ndarray"
+        )
         on = np.einsum("md,md->m", n[edge][pairs["i"]], beyond[pairs["j"], grid.dim :]) > np.sqrt(0.5)
         goes_on = np.zeros(int(edge.sum()), dtype=bool)
         goes_on[pairs["i"][on]] = True

@@ -41,7 +41,7 @@ MOST = 2**31 - 1
 SNAP = 1e-10
 """Cells: vertices this close to a grid plane, or as close as rounding tells, lie on it: far below what answers tell."""
 ORDER = "the order is Grid(lower, upper, cells)"
-MANY = "grid: its cells have many sizes and no common h; ask for sizes"
+MANY = "grid: h of cells of many sizes: must be asked of each cell, see sizes"
 
 
 def side(name: str, dim: int) -> tuple[int, int]:

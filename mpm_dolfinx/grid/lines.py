@@ -77,7 +77,9 @@ def graded(
     lower = numbers("graded: lower", lower, (2,), (3,), allowed="2 or 3 finite coordinates")
     d = lower.size
     upper = numbers("graded: upper", upper, (d,), allowed=f"{d} finite coordinates, as lower")
-    size = np.broadcast_to(numbers("graded: size", size, (), (d,), allowed="> 0", test=lambda v: (v > 0) & (v < np.inf)), (d,))
+    size = np.broadcast_to(
+        numbers("graded: size", size, (), (d,), allowed="> 0", test=lambda v: (v > 0) & (v < np.inf)), (d,)
+    )
     ratio = float(numbers("graded: ratio", ratio, allowed="> 1", test=lambda v: (v > 1) & (v < np.inf)))
     if largest != np.inf:
         largest = float(numbers("graded: largest", largest, test=lambda v: v >= size.max(), allowed=f">= {size.max()}"))
@@ -86,7 +88,7 @@ def graded(
     if boxes.ndim != 3 or boxes.shape[1:] != (2, d) or not (boxes[:, 1] > boxes[:, 0]).all():
         raise ValueError(f"graded: fine = {line(fine)}, must be {allowed}")
     if not (boxes[:, 0] >= lower - rounding(lower)).all() or not (boxes[:, 1] <= upper + rounding(upper)).all():
-        raise ValueError(f"graded: fine = {line(fine)}, must be in {line(lower)} to {line(upper)}")
+        raise ValueError(f"graded: fine = {line(fine)}, must be in {lower.tolist()} to {upper.tolist()}")
     return [_along(lower[a], upper[a], boxes[:, :, a], size[a], ratio, largest) for a in range(d)]
 
 

@@ -66,7 +66,7 @@ class LawAtPoints:
 
     @cached_property
     def _by_scene(self) -> dict[str, Any]:
-        return by_scene(self.grid, self._cell_size, self.points)
+        return by_scene(self.grid, self._cell_size, self.law, self.points)
 
     @cached_property
     def _F(self):
@@ -186,12 +186,14 @@ def knows_space(grid: Grid, m: Skeleton) -> bool:
     return True
 
 
-def by_scene(grid: Grid, cell_size: float | None = None, points: FormPoints | None = None) -> dict[str, Any]:
+def by_scene(
+    grid: Grid, cell_size: float | None = None, law: type[Skeleton] | None = None, points: FormPoints | None = None
+) -> dict[str, Any]:
     """Return what the scene gives to laws, see `BY_SCENE`, as UFL constants; the time is to be set.
 
-    points: of forms; those in cells of many sizes carry that of theirs.
+    points: of a law; in cells of many sizes they carry that of theirs.
     """
-    if points is not None and not grid.even and cell_size is None:
+    if points is not None and not grid.even and cell_size is None and "cell_size" in law.by_scene:
         sizes = points.follow("cell_size", (), lambda data: grid.volumes(data.cells)[:, None] ** (1 / grid.dim))
         return {"dt": fem.Constant(grid.mesh, 0.0), "cell_size": sizes}
     size = mean_size(grid) if cell_size is None else cell_size
@@ -236,7 +238,7 @@ class SoftnessAtPoints:
         s = ufl.variable(fem.Constant(grid.mesh, 1.0))
         F = points.F - (1 - s) * points.dF
         F = ufl.variable(block(F) if d > grid.dim else F)
-        self._by_scene = by_scene(grid, points=points)
+        self._by_scene = by_scene(grid, None, law, points)
         values = {**{name: getattr(points, name) for name in shapes}, **self._by_scene}
         self._local = LocalUnknowns(law, points, F, values) if law.unknowns else None
         if self._local is not None:

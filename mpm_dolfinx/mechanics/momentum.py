@@ -103,7 +103,9 @@ class MomentumForms:
         self._residuals, self._tangents = [], []
         self._local: dict[int, LocalUnknowns] = {}  # by the number of their part
         for number, (law, points, locks) in enumerate(laws):
-            self._add_law(number, law, points, locks, pressure, symmetric, by_scene(grid, points=points) | {"dt": dt})
+            self._add_law(
+                number, law, points, locks, pressure, symmetric, by_scene(grid, None, law, points) | {"dt": dt}
+            )
         self.velocity = Velocity(self.u)
         self.conditions = FormsOf(grid, self.u, self.velocity)
         """The forms of conditions."""
