@@ -1,16 +1,13 @@
 # SPDX-License-Identifier: MIT
 """Cells of many sizes, between lines at random: what holds in equal cells holds there, and equal lines are these."""
 
-import footing
 import manufactured as made
 import numpy as np
-import poroelastic_beam
 import pytest
 import terzaghi
-from helpers import SOFT, joined, rates, refused_in_one_line, thresholds
+from helpers import SOFT, rates, refused_in_one_line, thresholds
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.base.time_integration import METHODS
 from mpm_dolfinx.grid.grid import SIDES
 from mpm_dolfinx.points.cutting import centroids, corner_bits, cut
 from mpm_dolfinx.verification.exact import terzaghi_pressure

@@ -22,8 +22,8 @@ class Body:
     """A body as seeded: reference geometry of all its domains, the same on every process.
 
     material : index in the scene's list; map : where the corners of the domains' boxes are put, see `mapped`; each kind
-    has its `spacing`, the edges of these boxes, (d,) of all alike or (n, d), or the shortest (d,) of rows, m.  What is asked of all domains is made
-    anew each time: large bodies are asked in parts.
+    has its `spacing`, the edges of these boxes, (d,) of all alike, (n, d), or (d,) the shortest of rows, m.  What is
+    asked of all domains is made anew each time: large bodies are asked in parts.
     """
 
     material: int = 0

@@ -400,7 +400,8 @@ def meeting(
 ) -> tuple[float, float, NDArray[np.float64]]:
     """Return how deep domains lie in others, m, how many cells they are apart, and where (d,).
 
-    in_cells gives places in cells.  a, b: domains and their allowances, see `solids`.  Those that touch are 0 m deep, 0 cells apart; far ones inf cells.
+    in_cells gives places in cells.  a, b: domains and their allowances, see `solids`.  Those that touch are 0 m deep,
+    0 cells apart; far ones inf cells.
     """
     i, j = near(a[0], b[0])
     apart, slack = separation(a[0][i], b[0][j]), a[1][i] + b[1][j] + rounding(a[0])

@@ -8,9 +8,9 @@ it as stress.  So corners follow the field with its second differences along eac
     u(x) = sum_i N_i(x) [u_i - 1/2 sum_a t_a (1 - t_a) D_a],
 
 t_a in [0, 1] the place in the cell: exact for quadratic fields, Q1 at the nodes, and continuous.  D_a is the second
-difference along the edge of the cell that node i ends, of cells of many sizes edge^2 times the divided one: the smaller one of those at its two ends, zero where their signs
-differ, and that of one end where the other has none.  So a kink that is no error of the grid, as between materials,
-stays one.
+difference along the edge of the cell that node i ends, of cells of many sizes edge^2 times the divided one: the
+smaller one of those at its two ends, zero where their signs differ, and that of one end where the other has none.  So a
+kink that is no error of the grid, as between materials, stays one.
 """
 
 from __future__ import annotations

@@ -7,11 +7,11 @@ what crossing grid lines leaves of it would add up from cycle to cycle.  When th
     d <- d - D_a^T s / 64 D_a d     for one axis a after the other, the mean over all orders of the axes,
 
 d their displacement since they were at rest, D_a the third difference along axis a where the lattice has four corners
-in a row (of rows of many widths the divided one, of weights as large in sum), s = `FAST` times the cells that they have crossed, at most 1: what hardly moves is left alone.  Quadratic
-fields stay as they are, also at the surface; along its axis a wave of two domains is taken away by the share s, one of
-eight by 0.003 s.  Nothing is filtered where domains have parted from their neighbours, and where soil has yielded: it
-does not come back, and its kinks are its own.  Corners that a wall, a given displacement, a plate or another body holds
-stay where they are.
+in a row (of rows of many widths the divided one, of weights as large in sum), s = `FAST` times the cells that they have
+crossed, at most 1: what hardly moves is left alone.  Quadratic fields stay as they are, also at the surface; along its
+axis a wave of two domains is taken away by the share s, one of eight by 0.003 s.  Nothing is filtered where domains
+have parted from their neighbours, and where soil has yielded: it does not come back, and its kinks are its own.
+Corners that a wall, a given displacement, a plate or another body holds stay where they are.
 """
 
 from __future__ import annotations

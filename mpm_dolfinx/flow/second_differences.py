@@ -3,10 +3,10 @@
 
     (H p, q) = sum over cells and axes of w D p D q,   D p = h ((p_+ - p) / d_+ - (p - p_-) / d_-),
 
-h the edge of the cell, where d_+- are the distances between the centroids of what the cells hold.  A cell has a term along an axis where both
-its faces are open.  Pressures that alternate from cell to cell meet 16 w, as they meet 4 times the coefficient of a
-damping of jumps; a gradient that is even meets nothing, so that steep pressures are not smeared, up to sides of the
-body.  The sum of H p over the cells is zero: no fluid is lost.
+where h is the edge of the cell and d_+- are the distances between the centroids of what the cells hold.  A cell has a
+term along an axis where both its faces are open.  Pressures that alternate from cell to cell meet 16 w, as they meet 4
+times the coefficient of a damping of jumps; a gradient that is even meets nothing, so that steep pressures are not
+smeared, up to sides of the body.  The sum of H p over the cells is zero: no fluid is lost.
 """
 
 from __future__ import annotations

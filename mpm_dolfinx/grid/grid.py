@@ -253,7 +253,7 @@ class Grid:
         return self.h[axis] if self.even else self._of_process.sizes[cells, axis]
 
     def between(self, cells: Any, others: Any, axis: Any) -> NDArray[np.float64]:
-        """Return the distances (n,), m, of the midpoints of local cells (n,) that lie beside one another along an axis."""
+        """Return the distances (n,), m, of the midpoints of local cells (n,) from those beside them along an axis."""
         return self.h[axis] if self.even else (self.along(cells, axis) + self.along(others, axis)) / 2
 
     def volumes(self, cells: Any) -> NDArray[np.float64] | float:
@@ -271,7 +271,7 @@ class Grid:
         return self.widths_of(np.stack(np.unravel_index(number % self.cells, tuple(self.shape)), axis=-1))
 
     def sizes_at(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the edges (..., d), m, of the cells that hold places (..., d), m, from the base; of equal ones (d,)."""
+        """Return the edges (..., d), m, of the cells at places (..., d), m, from the base; of equal cells (d,)."""
         if self.even:
             return self._h
         return self.widths_of(self.index_from_base(x.reshape(-1, self.dim))).reshape(x.shape)

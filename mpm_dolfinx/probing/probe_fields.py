@@ -43,8 +43,9 @@ def probe_pressures(scene: Scene, state: State, probes: Probes) -> NDArray[np.fl
 class _Lattice:
     """The (2 REACH + 1)^d cells about those of probes, along the axes.
 
-    number (m, cells): lexicographic, -1 outside of the grid; midpoint, size (m, cells, d), m; middle: which is the probe's
-    own; stride (d,): from one to the next along each axis; beside: by axis and end, which cells have one there, and it.
+    number (m, cells): lexicographic, -1 outside of the grid; midpoint, size (m, cells, d), m; middle: which is the
+    probe's own; stride (d,): from one to the next along each axis; beside: by axis and end, which cells have one there,
+    and it.
     """
 
     def __init__(self, grid: Grid, cell: NDArray[np.int64]):

@@ -82,8 +82,8 @@ class Scene:
 
     cells, h : (d,), -, m — of the grid, which begins at the origin; materials: name of the law, its constants;
     initial: stress at rest, None or "K0" or "given", with `ratio` and `surcharge`, Pa; level: of the water table, m;
-    contact: friction between the last body and the others; uneven: whether grid lines lie at random; rate: of a source, 1/s; stiffness: of springs in the bodies,
-    N/m^4.
+    contact: friction between the last body and the others; rate: of a source, 1/s; stiffness: of springs in the bodies,
+    N/m^4; uneven: whether grid lines lie at random.
     """
 
     seed: int
@@ -122,7 +122,7 @@ class Scene:
         return np.array(self.cells) * np.array(self.h)
 
     def lines(self) -> list[np.ndarray]:
-        """Places of the grid lines along each axis, m; of cells of many sizes neighbours are up to three times as wide."""
+        """Places of the grid lines along each axis, m; uneven: neighbouring cells are up to three times as wide."""
         if not self.uneven:
             return [h * np.arange(n + 1) for n, h in zip(self.cells, self.h, strict=True)]
         rng, out = np.random.default_rng(self.seed), []
