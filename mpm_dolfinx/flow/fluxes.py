@@ -370,11 +370,11 @@ class FluxForms:
         self.damp = FacetForm(damped * ufl.jump(dp) * ufl.jump(q) * dS, grid.comm)
         smaller = ufl.min_value(self.fixed_stress("+"), self.fixed_stress("-"))
         if grid.even:
-            over_face = across / fem.Constant(mesh, grid.cell_volume)  # not a number: each would be compiled anew
+            volume = fem.Constant(mesh, grid.cell_volume)  # not a number: each would be compiled anew
         else:
             h = grid.edge_in_forms()("+")
-            over_face = h0 / prod(h[a] for a in range(d))  # one over the face's area, on both sides
-        self.alternation = FacetForm(smaller / (4 * d) * over_face * ufl.jump(dp) * ufl.jump(q) * dS, grid.comm)
+            volume = prod(h[a] for a in range(d))  # over h0 it is the area of the face, on both sides
+        self.alternation = FacetForm(smaller / (4 * d) * h0 / volume * ufl.jump(dp) * ufl.jump(q) * dS, grid.comm)
         self.slope = fem.Function(grid.cellwise((d,)))
         self.density = fem.Function(Q)
         self._sum = fem.Function(Q)
