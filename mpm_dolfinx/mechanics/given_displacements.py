@@ -200,7 +200,7 @@ class GivenDisplacements(Acting):
             start, end = (self._given(hold, t, p.X) for t in (place.start, place.t))
             gaps = (p.origin(of) + given - p.now(of) for of, given in ((before, start), (points, end)))
             old, new, way = (np.linalg.norm(v[:, axes], axis=1) for v in (*gaps, end - start))
-            moves = way > NEAR * self._grid.h.min()
+            moves = way > NEAR * self._grid.least
             came = 1 - ((new - old)[moves] / way[moves]).min(initial=np.inf)
             came = over_all(self._grid.comm, float(came), MPI.MAX)
             if -np.inf < came < 0.5:  # nearer to none of the way than to all of it
