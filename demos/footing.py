@@ -29,8 +29,8 @@ cells.
 
 A rough circular footing on Tresca's soil carries 6.05 s_u (Cox, Eason and Hopkins 1961), axisymmetric.
 
-With --graded cells grow by a tenth from one to the next, up to eight times, away from a fine box of 2 B x B about the
-footing: a box of 20 B x 10 B then has hardly more cells than one of 4 B x 2.5 B whose cells are all fine.
+With --graded cells grow by a tenth from one to the next, up to eight times, away from a fine box of 2 B x 0.75 B below
+the footing: a box of 20 B x 10 B then has hardly more cells than one of 4 B x 2.5 B whose cells are all fine.
 
 Soil whose flow dilates less than its friction has no one answer: bands of shear a cell wide jump from place to place,
 the more of them the finer the cells (Rudnicki and Rice 1975), and on fine grids step after step is cut.
@@ -73,7 +73,7 @@ LIMITS_OF = {  # how: depth of the push over B, box
     "drained": (0.003, (4.0, 1.7)),
     "circular": (0.0012, (2.0, 1.2)),
 }
-NEAR, RATIO, LARGEST = (1.0, 1.0), 1.1, 8  # half of the fine box over B; of cells that are graded; over the fine ones
+NEAR, RATIO, LARGEST = (1.0, 0.75), 1.1, 8  # half of the fine box over B; of cells that are graded; over the fine ones
 FAR = {"equal": (2.0, 2.5), "graded": (10.0, 10.0)}  # box of half the soil over B
 ROUND = 6.05  # limit load of a rough circular footing over its area and s_u
 
