@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Cells of many sizes, between lines at random: what holds in equal cells holds there, and equal lines are these."""
 
+import footing
 import manufactured as made
 import numpy as np
 import pytest
@@ -371,3 +372,25 @@ def test_contacts_of_groups_are_refused():
     contact = mpm.Contact([0], [1], friction=0.3)
     with pytest.raises(ValueError, match="contacts: must be none on a grid whose cells have many sizes"):
         mpm.Simulation(grid, bodies, [SOFT], walls={"bottom": "xy"}, conditions=[contact])
+
+
+@pytest.mark.slow
+def test_a_footing_in_a_large_box_of_graded_cells_carries_what_it_does_in_a_small_one_of_equal_cells():
+    loads = [footing.limit_load("undrained", 5, footing.FAR[how], how == "graded").load[-1] for how in footing.FAR]
+    assert loads[1] == pytest.approx(loads[0], rel=0.01)
+
+
+@pytest.mark.slow
+def test_a_body_that_is_carried_through_graded_lines_and_back_is_as_one_in_equal_cells():
+    """A wet beam, clamped to what moves it by its length and bent on its way: stress, pressure and fluid that are left."""
+    left, h = [], 0.05
+    lines = mpm.graded([-0.2, 0], [2.6, 1.2], [[[-0.2, 0.45], [1.0, 0.85]]], h, 1.2, 3 * h)
+    for grid in (mpm.Grid([-0.2, 0], [2.6, 1.2], [56, 24]), mpm.Grid(lines=lines)):
+        hold = mpm.Displacement("left", lambda t: (np.sin(np.pi * t), 0.0))
+        load = mpm.Traction("right", lambda t: (0, -600 * np.sin(np.pi * t)))
+        body, soil = mpm.box(grid, [0.1, 0.5], [0.9, 0.8]), mpm.Hencky(1e6 / 3, 2e5, porosity=0.4, conductivity=1e-4)
+        s = mpm.Simulation(grid, [body], [soil], fluid=mpm.Fluid(), walls={}, conditions=[hold, load])
+        result = s.run(1.0, 1 / 60, progress=False)
+        assert result.balance < 1e-8
+        left.append([np.linalg.norm(s.effective_stress(), axis=(1, 2)).mean(), np.abs(s.points.pressure).max()])
+    assert (np.array(left[1]) < 1.5 * np.array(left[0])).all(), left
