@@ -382,7 +382,7 @@ def test_a_footing_in_a_large_box_of_graded_cells_carries_what_it_does_in_a_smal
 
 @pytest.mark.slow
 def test_a_body_that_is_carried_through_graded_lines_and_back_is_as_one_in_equal_cells():
-    """A wet beam, clamped to what moves it by its length and bent on its way: stress, pressure and fluid that are left."""
+    """A wet beam, clamped to what moves it by its length and bent on its way: stress and pressure that are left."""
     left, h = [], 0.05
     lines = mpm.graded([-0.2, 0], [2.6, 1.2], [[[-0.2, 0.45], [1.0, 0.85]]], h, 1.2, 3 * h)
     for grid in (mpm.Grid([-0.2, 0], [2.6, 1.2], [56, 24]), mpm.Grid(lines=lines)):
