@@ -51,6 +51,7 @@ QUICK = {
     "infiltration": ("--cells 10 --rain-step 1800 --front-step 3600", ["infiltration.png"]),
     "drainage": ("--cells 10 --step 120", ["drainage.png"]),
     "rain": ("--cells 10 --step 7200", ["rain.png"]),
+    "water_table": ("--h 0.25 --step 1800", ["water_table.png"]),
     "vibration": ("--h 0.1 --cells 8 --periods 1 --steps 16", ["vibration.png"]),
     "wave": ("--cells 8 --steps 10 --periods 2", ["wave.png"]),
     "shaking": ("--cells 4 --steps 60", ["shaking.png"]),
@@ -64,7 +65,7 @@ QUICK = {
     "scaling": ("--quick --dims 2 --processes 1 2", ["scaling.png", "scaling.csv", "scaling.md"]),
 }
 # what they show has tests of its own, or takes long to compile
-LONG = {"slump", "cavity", "footing", "slope", "image", "falling", "landslide", "vibration", "wave"}
+LONG = {"slump", "water_table", "cavity", "footing", "slope", "image", "falling", "landslide", "vibration", "wave"}
 
 
 def run(demo, arguments):

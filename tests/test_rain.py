@@ -51,6 +51,30 @@ def test_all_rain_is_stored_ponds_runs_off_or_flows_out(retention):
     assert depths[1] > depths[2] > depths[3] >= 0
 
 
+@pytest.mark.slow
+def test_a_slope_that_fails_in_a_storm_comes_to_rest_and_its_water_is_all_there():
+    """It slides once it is wet, by a tenth of its height; inertia carries it from balance to balance."""
+    grid = mpm.Grid([0, 0], [3.5, 1.25], [28, 10])
+    law = {"conductivity": 1e-4, "retention": mpm.VanGenuchten(5e3, residual=0.05, n=2.5), "porosity": 0.4}
+    soil = mpm.MohrCoulomb(bulk=3e6, shear=1.5e6, friction=25.0, dilation=0.0, cohesion=100.0, **law)
+    bank = mpm.polygon(grid, [[0, 0], [1.9, 0], [1, 1], [0, 1]], ["bottom", "slope", "top", "left"])
+    scene = {"fluid": mpm.Fluid(), "gravity": (0, -9.81), "walls": {"left": "x", "bottom": "xy"}, "inertia": False}
+    scene |= {"pressure": mpm.hydrostatic(-0.35), "initial_stress": mpm.K0(0.5)}
+    s = mpm.Simulation(grid, [bank], [soil], conditions=[mpm.Rain("top", 3e-4, name="rain")], **scene)
+    start = water(s)
+    with pytest.raises(mpm.GaveUp):
+        s.run(4000, 100, progress=False)
+    s.stage(inertia=True)
+    speeds = []
+    for _ in range(8):
+        s.run(s.t + 0.25, 0.025, progress=False)
+        speeds.append(np.linalg.norm(s.points.data["velocity"], axis=1).max())
+        assert water(s) - start == pytest.approx(-s.outcome("flowed").array.sum(), abs=1e-8 * start)
+    assert s.outcome("ran_off")["rain"] > 0
+    assert np.linalg.norm(s.points.displacement, axis=1).max() > 0.1
+    assert speeds[-1] < 0.2 * max(speeds)
+
+
 def test_light_rain_soaks_in_and_its_water_is_all_there():
     s = rained(0.3 * K, cells=20)
     start = water(s)

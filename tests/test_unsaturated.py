@@ -73,6 +73,21 @@ def test_rain_on_exponential_soil_is_that_of_srivastava_and_yeh():
         assert np.abs(fine[hour]).max() < 0.3 * np.abs(coarse[hour]).max()
 
 
+@pytest.mark.slow
+def test_rain_on_exponential_soil_is_of_second_order_in_the_step():
+    """After 6 h, beside steps of 112.5 s: errors of steps of 900 and 450 s."""
+    soil = mpm.LinearElastic(**STIFF, porosity=0.35, conductivity=1e-5, retention=mpm.Gardner(WATER / 5))
+    found = []
+    for dt in (900, 450, 112.5):
+        sides = [mpm.Drained("bottom"), mpm.Inflow("top", 9e-6)]
+        rest = {"initial_stress": mpm.K0(0.5), "numerics": mpm.Numerics(tolerance=1e-11)}
+        s = column(20, [soil], lambda x: WATER / 5 * np.log(0.1 + 0.9 * np.exp(-5 * x[:, 1])), sides, **rest)
+        s.run(6 * 3600, dt, progress=False)
+        found.append(s.cells().pressure)
+    errors = [np.abs(p - found[-1]).max() for p in found[:-1]]
+    assert np.log2(errors[0] / errors[1]) > 1.8
+
+
 @pytest.mark.parametrize(
     "cells, front, taken", [(25, 1.2e-3, 2.5e-3), pytest.param(50, 1e-3, 1e-3, marks=pytest.mark.slow)]
 )
@@ -261,6 +276,16 @@ class Rising(Liakopoulos):
 def test_what_is_no_law_of_retention_is_refused(law, said):
     with pytest.raises(ValueError, match=said):
         law()
+
+
+def test_saturated_scenes_have_nothing_of_retention():
+    """No field of pieces, no form, no table, and no volumes but where rain falls."""
+    s = column(2, [mpm.Hencky(1e6, 1e6, conductivity=1e-6)], 0.0, [mpm.Drained("top")])
+    s.run(1, 1, progress=False)
+    forms = s.scene.storage
+    assert not {"retention", "lever", "pores"} & s.scene.pieces.pieces.sizes.keys()
+    assert (forms.retains, forms.fluxes.relative, forms.fluxes.even) == (False, None, None)
+    assert not {"runoff", "flowed", "ran_off", "ponded"} & s.state.outcome.keys()
 
 
 def test_a_specific_yield_does_not_go_with_it():

@@ -13,7 +13,7 @@ from mpm_dolfinx.conditions.acting import Place
 from mpm_dolfinx.dynamics.energies import after
 from mpm_dolfinx.forms.unknowns import collect_garbage
 from mpm_dolfinx.solve.newton import Kept, note_pressures, solve_substep
-from mpm_dolfinx.stepping.balances import Acting, Start, at_rest, balances, flight_of, has_yielded, left
+from mpm_dolfinx.stepping.balances import Acting, Start, at_rest, balances, flight_of, has_yielded, leads, left
 from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.state import State
 
@@ -72,7 +72,7 @@ def step(scene: Scene, state: State, dt: float, how: tuple = ()) -> tuple[State,
     at, outcome = both.momentum.at, both.outcome(state, passed, seconds)
     end = state.t + dt, [one.ended(at) for one in acting.loads], both.came(rates[-1]), report
     new, report.rederived = scene.motion.advanced(state, on_grid, start.data, *end, carried=start.carrying(flights[-1]))
-    velocity = None if scene.momentum.elastic else scene.momentum.u.x.array / dt
+    velocity = scene.momentum.u.x.array / dt if leads(scene, acting.loads) else None
     now = {"outcome": outcome, "points": left(end[1], at, state.points, new.points), "velocity": velocity}
     if found:
         kinetic = state.stage.kinetic(outcome)
