@@ -29,6 +29,9 @@ cells.
 
 A rough circular footing on Tresca's soil carries 6.05 s_u (Cox, Eason and Hopkins 1961), axisymmetric.
 
+With --graded cells grow by a tenth from one to the next, up to eight times, away from a fine box of 2 B x 0.75 B below
+the footing: a box of 20 B x 10 B then has hardly more cells than one of 4 B x 2.5 B whose cells are all fine.
+
 Soil whose flow dilates less than its friction has no one answer: bands of shear a cell wide jump from place to place,
 the more of them the finer the cells (Rudnicki and Rice 1975), and on fine grids step after step is cut.
 --viscosity gives it a resistance to the rate of shear, small beside the cohesion: then there is one (Needleman 1988).
@@ -70,6 +73,8 @@ LIMITS_OF = {  # how: depth of the push over B, box
     "drained": (0.003, (4.0, 1.7)),
     "circular": (0.0012, (2.0, 1.2)),
 }
+NEAR, RATIO, LARGEST = (1.0, 0.75), 1.1, 8  # half of the fine box over B; of cells that are graded; over the fine ones
+FAR = {"equal": (2.0, 2.5), "graded": (10.0, 10.0)}  # box of half the soil over B
 ROUND = 6.05  # limit load of a rough circular footing over its area and s_u
 
 
@@ -140,6 +145,7 @@ def push(
     steps: int | None = None,
     circular: bool = False,
     method: str = "sdirk2",
+    graded: bool = False,
 ) -> Push:
     """Push the footing.
 
@@ -161,11 +167,17 @@ def push(
         A disc of the diameter B, not a strip.
     method
         Of time integration.
+    graded
+        Whether cells grow away from the footing.
     """
     h = WIDTH / cells
     columns, rows, air = (round(size * cells) for size in (*box, 0.25 + 0.5 * depth))
     size, cells_of = {"lower": [0, -rows * h], "upper": [columns * h, air * h]}, [columns, rows + air]
     grid = mpm.Grid(**size, cells=cells_of, axisymmetric=circular)
+    if graded:
+        wide, deep = (round(edge * cells) * h for edge in NEAR)
+        lines = mpm.graded(*size.values(), [[[0, -deep], [wide, air * h]]], h, RATIO, LARGEST * h)
+        grid = mpm.Grid(lines=lines, axisymmetric=circular)
     body = mpm.box(grid, [0, -rows * h], [columns * h, 0])
     end, edge = (depth * WIDTH**2 / (CV * rate) if rate else 1.0), WIDTH / 2
     under, beside = ((0, -np.inf), (edge, np.inf)), ((edge - h / 2, -np.inf), (np.inf, np.inf))  # from its last node on
@@ -196,14 +208,19 @@ def push(
     return out
 
 
-def limit_load(how: str, cells: int) -> Push:
-    """Push the footing into very stiff soil; its loads are over those of the theory."""
-    soil, (depth, box) = replace(SOIL, bulk=STIFF * SOIL.bulk, shear=STIFF * SOIL.shear), LIMITS_OF[how]
+def limit_load(how: str, cells: int, box: tuple[float, float] | None = None, graded: bool = False) -> Push:
+    """Push the footing into very stiff soil; its loads are over those of the theory.
+
+    box, graded: see `push`; by default that of `LIMITS_OF`, of equal cells.
+    """
+    soil, (depth, own) = replace(SOIL, bulk=STIFF * SOIL.bulk, shear=STIFF * SOIL.shear), LIMITS_OF[how]
+    box = box or own
     if how == "circular":
         tresca = mpm.MohrCoulomb(bulk=soil.bulk, shear=soil.shear, friction=0, dilation=0, cohesion=COHESION)
         out = push(tresca, cells, depth, None, box=box, steps=40, circular=True)
     elif how == "undrained":
-        out = push(replace(soil, friction=0.0, conductivity=0.0), cells, depth, RATES["fast"], box=box, steps=40)
+        clay = replace(soil, friction=0.0, conductivity=0.0)
+        out = push(clay, cells, depth, RATES["fast"], box=box, steps=40, graded=graded)
     else:
         out = push(replace(soil, dilation=FRICTION), cells, depth, None, box=box, steps=40)
     limit = {"undrained": capacity(0.0), "drained": capacity(FRICTION), "circular": ROUND}[how]
@@ -222,7 +239,12 @@ def main(argv: list[str] | None = None) -> dict:
     parser.add_argument("--method", choices=methods, default=methods[0], help="with --steps: of time integration")
     what = "with --steps: viscosity of the soil over the cohesion and the time of the push"
     parser.add_argument("--viscosity", type=float, default=0.0, help=what)
+    parser.add_argument(
+        "--graded", action="store_true", help="only the undrained limit load, in a large box of graded cells"
+    )
     o = parser.parse_args(argv)
+    if o.graded and (o.steps, o.depth) != (None, 1.0):
+        parser.error("--graded: must go without --steps and --depth")
     if o.cells < 3 or o.cells % 2 == 0 or not 0 < o.depth <= 1.5:
         parser.error(f"--cells {o.cells} --depth {o.depth:g}: must be odd and >= 3, and in (0, 1.5]")
     if o.steps is not None and (o.steps < 1 or not 1 <= o.box <= 32):
@@ -234,6 +256,9 @@ def main(argv: list[str] | None = None) -> dict:
     if o.steps is None:
         parser.refuse_processes(" without --steps")
     with common.results(o) as out:
+        if o.graded:
+            out |= of_many_sizes(o.cells, o.out)
+            return out
         if o.steps is not None:
             out |= effort(o.cells, o.depth, o.steps, o.box, o.method, o.viscosity)
             return out
@@ -246,6 +271,44 @@ def main(argv: list[str] | None = None) -> dict:
         draw(o.out, runs, stiff)
         animate(o.out, runs["intermediate"])
     return out
+
+
+def of_many_sizes(cells: int, folder: Path) -> dict:
+    """Print and draw the undrained limit load in a large box of graded cells beside a small one of equal cells.
+
+    Returns it with the points and the seconds of processor time.
+    """
+    out, runs = {}, {}
+    for how, box in FAR.items():
+        began = time.process_time()
+        runs[how] = run = limit_load("undrained", cells, box, graded=how == "graded")
+        seconds = time.process_time() - began
+        out[how] = {"error": run.load[-1] - 1, "points": run.results[0].points, "cpu": seconds}
+        print(f"{how:>7} cells, box of {2 * box[0]:g} B x {box[1]:g} B: limit load {run.load[-1] - 1:+.2%}, ", end="")
+        print(f"{out[how]['points']} points, {run.total('newton')} Newton steps, {seconds:.0f} s of processor time")
+    out["load"] = runs["graded"].load[-1] / runs["equal"].load[-1] - 1
+    out["time"] = out["graded"]["cpu"] / out["equal"]["cpu"]
+    print(f"graded over equal: load {out['load']:+.2%}, time {out['time']:.2f}")
+    fig, axes = common.figure(1, 2, (12, 4.6))
+    for ax, (how, run) in zip(axes[0], runs.items(), strict=True):
+        draw_cells(ax, run.frames[-1])
+        ax.set_title(f"{how} cells: limit load {run.load[-1] - 1:+.1%}")
+    common.save(fig, folder / "footing_graded.png", dpi=90)
+    return out
+
+
+def draw_cells(ax, frame: Frame) -> None:
+    """Draw the domains of points with their pressures, over the largest one."""
+    from matplotlib.collections import PolyCollection
+
+    corners, p = frame.corners[:, [0, 1, 3, 2]], frame.pressure / COHESION
+    quads = PolyCollection(corners, array=p, cmap="viridis", clim=(0, np.quantile(p, 0.99)))
+    quads.set(edgecolors="black", linewidth=0.1)
+    ax.add_collection(quads)
+    ax.autoscale()
+    block(ax, frame)
+    ax.set(xlim=(0, 10), ylim=(-10, 0.7), ylabel="y / B (-)")
+    ax.figure.colorbar(quads, ax=ax, label="pore pressure / c (-)", shrink=0.8, extend="both")
 
 
 def viscous(viscosity: float, seconds: float) -> mpm.DruckerPrager:

@@ -41,6 +41,7 @@ from mpm_dolfinx.contact.shapes import Ball, Cone, Convex, HalfSpace, Shape
 from mpm_dolfinx.contact.tool import Pose, Tool
 from mpm_dolfinx.flow.feeding import Feeding, Feeds, Leaving
 from mpm_dolfinx.grid.grid import Grid
+from mpm_dolfinx.grid.lines import graded
 from mpm_dolfinx.io.checkpoint import Checkpoint, resume
 from mpm_dolfinx.io.one_file import one_file
 from mpm_dolfinx.io.plots import plot
@@ -146,6 +147,7 @@ __all__ = [
     "element_test",
     "factor_of_safety",
     "from_mesh",
+    "graded",
     "hydrostatic",
     "kozeny_carman",
     "mapped",

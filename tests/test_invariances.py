@@ -125,6 +125,13 @@ def reported(scenes, seconds: float = np.inf) -> Counter:
     return count
 
 
+@pytest.mark.slow
+def test_scenes_on_lines_at_random_show_the_same_in_any_frame():
+    scenes = [quick(seed) for seed in range(int(os.environ.get("INVARIANCE_UNEVEN", 40)))]
+    count = reported(scene.with_(uneven=True) for scene in scenes if scene.contact is None)
+    assert count["same"] > 2 * (count["chaotic"] + count["refused"] + count["steps"]) and not count["differs"]
+
+
 @pytest.mark.parametrize("part", range(3))
 def test_scenes_show_the_same_in_any_frame(part):
     scenes = [quick(seed) for seed in range(part * QUICK // 3, (part + 1) * QUICK // 3)]

@@ -22,8 +22,8 @@ class Body:
     """A body as seeded: reference geometry of all its domains, the same on every process.
 
     material : index in the scene's list; map : where the corners of the domains' boxes are put, see `mapped`; each kind
-    has its `spacing`, the edges of these boxes, (d,) of all alike or (n, d), m.  What is asked of all domains is made
-    anew each time: large bodies are asked in parts.
+    has its `spacing`, the edges of these boxes, (d,) of all alike, (n, d), or (d,) the shortest of rows, m.  What is
+    asked of all domains is made anew each time: large bodies are asked in parts.
     """
 
     material: int = 0
@@ -147,6 +147,11 @@ class Body:
     def boxes(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
         """Return the edges (m, d), m, of the boxes of domains, before the map."""
         return np.broadcast_to(self.spacing, (len(self), self.dim))[chosen]
+
+    @property
+    def volume_of_boxes(self) -> float:
+        """Volume of all boxes that are alike, m^d."""
+        return float(len(self) * self.spacing.prod())
 
     def size(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
         """Return the edges (m, d), m, of boxes that are as large as domains."""

@@ -6,10 +6,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mpm_dolfinx.base.tolerances import SAME
 from mpm_dolfinx.base.validation import asked, instance, numbers, whole
 from mpm_dolfinx.bodies.bodies import Body, check_inside
 from mpm_dolfinx.grid.grid import MOST, Grid, among, in_chunks
@@ -98,6 +100,75 @@ class LatticeBody(Body):
         return np.ravel_multi_index(tuple(np.moveaxis(corners, 2, 0)), tuple(np.add(self.lattice, 1)))
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RowsBody(LatticeBody):
+    """A body whose domains are boxes of a lattice with rows of many widths.
+
+    rows : (count + 1,) along each axis, m — where they begin and end; spacing : (d,) — the narrowest ones.
+    """
+
+    rows: tuple[NDArray[np.float64], ...]
+
+    def _at(self, index: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the corners (..., d), m, of the lattice by their indices (..., d)."""
+        return np.stack([rows[i] for rows, i in zip(self.rows, np.moveaxis(index, -1, 0), strict=True)], axis=-1)
+
+    def lower_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the lower corners (m, d), m, of the boxes of domains."""
+        return self._at(self._index(chosen))
+
+    def boxes(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
+        """Return the edges (m, d), m, of the boxes of domains, before the map."""
+        index = self._index(chosen)
+        return self._at(index + 1) - self._at(index)
+
+    def centre_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the reference positions (m, d), m, of the centres of domains."""
+        return self.lower_of(chosen) + 0.5 * self.boxes(chosen)
+
+    def reference(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
+        """Return the reference positions (m, 2^d, d), m, of the corners of domains: those before the map."""
+        return self._at(self._index(chosen)[:, None] + corner_bits(self.dim))
+
+    def across(self, axis: int) -> tuple[float, float]:
+        """Return how many domains the body has across an axis, and their edge, m; means."""
+        low, high = self.bounds
+        return super().across(axis)[0], float(high[axis] - low[axis]) / self.lattice[axis]
+
+    @property
+    def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Corners (d,), m, of the box around the body, before the map."""
+        low, high = self._ends
+        return self._at(low), self._at(high + 1)
+
+    @property
+    def volume_of_boxes(self) -> float:
+        """Volume of all boxes, m^d."""
+        return sum(float(self.boxes(part).prod(axis=1).sum()) for part in in_chunks(len(self)))
+
+    def corner_rows(self, axis: int) -> NDArray[np.float64]:
+        """Return the places (n,), m, along an axis of the corners of `lattice`."""
+        low, high = self._ends
+        return self.rows[axis][low[axis] : high[axis] + 2]
+
+
+def _rows(grid: Grid, axis: int, low: float, high: float, per_cell: int) -> NDArray[np.float64]:
+    """Return where rows of domains begin and end from low to high, m: so many a cell, and as many in parts of cells."""
+    lines = grid.lines[axis] + grid.base[axis]
+    apart = SAME * grid.finest[axis]
+    ends = np.concatenate([[low], lines[(lines > low + apart) & (lines < high - apart)], [high]])
+    width = grid.widths[axis][grid.cells_along(axis, (ends[1:] + ends[:-1]) / 2 - grid.base[axis])]
+    count = np.maximum(1, np.rint(np.diff(ends) / width * per_cell)).astype(int)
+    parts = [np.linspace(a, b, n + 1)[:-1] for a, b, n in zip(ends[:-1], ends[1:], count, strict=True)]
+    return np.concatenate([*parts, [high]])
+
+
+def _lattice(rows: list[NDArray[np.float64]], **more: Any) -> RowsBody:
+    """Return a body on a lattice of rows."""
+    narrowest, count = np.array([np.diff(r).min() for r in rows]), tuple(len(r) - 1 for r in rows)
+    return RowsBody(origin=np.array([r[0] for r in rows]), spacing=narrowest, count=count, rows=tuple(rows), **more)
+
+
 def box(grid: Grid, lower: ArrayLike, upper: ArrayLike, per_cell: int = 2, material: int = 0) -> Body:
     """Seed the box [lower, upper] with a lattice of points that fills it exactly; return the body.
 
@@ -108,7 +179,8 @@ def box(grid: Grid, lower: ArrayLike, upper: ArrayLike, per_cell: int = 2, mater
     lower, upper : (d,), m
         Corners of the box, inside the grid; they need not lie on grid lines.
     per_cell
-        Points per cell and direction (rounded so that they fit the box), >= 1.  With 1, bodies of a few cells'
+        Points per cell and direction (rounded so that they fit the box), >= 1; in cells of many sizes rows of points
+        begin and end at grid lines.  With 1, bodies of a few cells'
         thickness bend too easily (a warning says so), and the error is about ten times that of 2.
     material
         Index of the material in the scene's list, >= 0.
@@ -126,6 +198,9 @@ def box(grid: Grid, lower: ArrayLike, upper: ArrayLike, per_cell: int = 2, mater
     if not (upper > lower).all():
         raise ValueError(f"body: box {lower.tolist()} to {upper.tolist()}: upper must be > lower")
     material, per_cell = whole("body: material", material, 0), whole("body: per_cell", per_cell)
+    if not grid.even:
+        rows = [_rows(grid, a, lower[a], upper[a], per_cell) for a in range(grid.dim)]
+        return check_inside(grid, _lattice(rows, material=material))
     count = np.maximum(1, np.rint((upper - lower) / (grid.h / per_cell))).astype(int)
     lattice = {"origin": lower, "spacing": (upper - lower) / count, "count": tuple(count.tolist())}
     return check_inside(grid, LatticeBody(**lattice, material=material))
@@ -156,15 +231,22 @@ def shape(
     """
     instance("body: grid", grid, Grid)
     material, per_cell = whole("body: material", material, 0), whole("body: per_cell", per_cell)
-    spacing = grid.h / per_cell
     count = grid.shape * per_cell
     index = np.stack(np.meshgrid(*map(np.arange, count), indexing="ij"), axis=-1).reshape(-1, grid.dim)
     allowed = f"one bool a position, ({len(index)},)"
-    filled = np.asarray(asked("body: inside(x)", allowed, inside, grid.lower + (index + 0.5) * spacing))
+    if grid.even:
+        spacing = grid.h / per_cell
+        x = grid.lower + (index + 0.5) * spacing
+    else:
+        rows = [_rows(grid, a, grid.lower[a], grid.upper[a], per_cell) for a in range(grid.dim)]
+        x = np.stack([((r[1:] + r[:-1]) / 2)[i] for r, i in zip(rows, index.T, strict=True)], axis=1)
+    filled = np.asarray(asked("body: inside(x)", allowed, inside, x))
     if filled.shape != (len(index),) or filled.dtype != bool:  # a distance is neither inside nor outside
         raise ValueError(f"body: inside(x) has shape {filled.shape} of {filled.dtype}, must be {allowed}")
     if not filled.any():
         raise ValueError("body: inside(x) holds at no point of the grid, must hold at one; the body fits in no cell")
     numbers_of = np.flatnonzero(filled).astype(np.int32 if len(filled) <= MOST else np.int64)
+    if not grid.even:
+        return check_inside(grid, _lattice(rows, filled=numbers_of, material=material))
     lattice = {"origin": grid.lower, "spacing": spacing, "count": tuple(count.tolist()), "filled": numbers_of}
     return check_inside(grid, LatticeBody(**lattice, material=material))

@@ -101,7 +101,7 @@ def put(
         misfit = max(contact.misfit(u) for contact in contacts)
         _check_shape(grid, fill, body, corners, u)
         corners = corners + u
-    if misfit > MISFIT * grid.h.min():
+    if misfit > MISFIT * grid.least:
         what = "stage: add: body %d: its straight edges are up to %.2g m off the surface that it is put on"
         warn(grid.comm, ResolutionWarning, what + "; seed it with the spacing of what it lies on", fill, misfit)
     for other, touching in found.items():
@@ -162,7 +162,7 @@ def _follow(grid: Grid, body: Body, corners: NDArray[np.float64], contacts: Sequ
         sides[contact.side] = sides.get(contact.side, 0.0) + contact.area()
     axis, end = max(sides, key=sides.get)
     opposite = Faces.of(body, *body.facing(axis, 1 - end, UPRIGHT))
-    fixed = np.minimum(np.abs(x - grid.low), np.abs(x - grid.high)) < SAME * grid.h  # along a wall it only slides
+    fixed = np.minimum(np.abs(x - grid.low), np.abs(x - grid.high)) < SAME * grid.finest  # along a wall it only slides
     fixed[hits > 0] = True
     fixed[node[opposite.row[:, None], opposite.index]] = True
     K = _springs(body, node, len(nodes))
@@ -228,6 +228,6 @@ def _room(
     start = _start(bodies, other)
     rows = np.flatnonzero((points.id >= start) & (points.id < start + len(bodies[other])))
     both = [(c, INSIDE / 2 * np.ptp(c, axis=1).min(axis=1) + misfit) for c in (points.corners[rows], corners)]
-    found = grid.comm.allgather(meeting(*both, grid.h))
+    found = grid.comm.allgather(meeting(*both, grid.in_cells))
     deepest, nearest = max(found, key=lambda m: m[0]), min(found, key=lambda m: m[1])
     return deepest if deepest[0] else nearest

@@ -349,7 +349,12 @@ def _split(
     bits = corner_bits(grid.dim)
     out = []
     edges = [domains[:, FACES[d][2 * a + 1]] - domains[:, FACES[d][2 * a]] for a in range(d)]
-    longest = np.max([np.linalg.norm(e / grid.h, axis=2).max(axis=1) for e in edges], axis=0)
+    if grid.even:
+        longest = np.max([np.linalg.norm(e / grid.h, axis=2).max(axis=1) for e in edges], axis=0)
+    else:  # as many cells as they reach over
+        y = grid.in_cells(domains - grid.base)
+        edges = [y[:, FACES[d][2 * a + 1]] - y[:, FACES[d][2 * a]] for a in range(d)]
+        longest = np.max([np.linalg.norm(e, axis=2).max(axis=1) for e in edges], axis=0)
     count = 2 ** np.ceil(np.log2(np.maximum(1.0, longest * per_cell / LONG) - SAME)).astype(np.int64)
     for n in np.unique(count):
         row = np.flatnonzero(count == n)
@@ -374,7 +379,8 @@ def _check_conforming(body: MeshBody, name: str) -> None:
 
 def _warn_small(grid: Grid, body: MeshBody, per_cell: int, name: str) -> None:
     """Warn of domains that are far smaller than the grid asks for."""
-    size = (volumes(body.vertices) / grid.cell_volume) ** (1 / grid.dim) * per_cell
+    cell = grid.sizes_at(body.centre - grid.base).prod(axis=-1)
+    size = (volumes(body.vertices) / cell) ** (1 / grid.dim) * per_cell
     small = np.flatnonzero(size < SMALL)
     if len(small):
         what = "%s: %d of %d domains are smaller than %.3g of what the grid can tell apart, the first at %s: "

@@ -70,7 +70,9 @@ def polygon(
     for name, inner in (holes or {}).items():
         inner = _outline(f"hole {name!r}", inner)
         loops.append((inner, [name] * len(inner)))
-    default = grid.h.min() / whole("body: per_cell", per_cell)
+    if size is None and not grid.even:
+        raise ValueError("polygon: size = None, must be given on a grid of cells of many sizes, m")
+    default = grid.least / whole("body: per_cell", per_cell)
     edge = float(numbers("polygon: size", default if size is None else size, test=lambda v: (v > 0) & np.isfinite(v)))
     _check_simple([corners for corners, _ in loops])
     mesh = at_root(grid.comm, lambda: _filled(loops, edge))

@@ -6,7 +6,7 @@ Faces are quadrilaterals in space; in plane strain they are a unit of length wid
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -375,7 +375,7 @@ def solids(body: Body) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return convex domains (m, 2^d, d), m, that fill a body, a box as one, and their allowances (m,), m."""
     low, high = body.bounds
     size, edge = high - low, body.spacing.min()
-    if body.aligned and np.isclose(size.prod(), len(body) * body.spacing.prod(), rtol=SAME, atol=0):
+    if body.aligned and np.isclose(size.prod(), body.volume_of_boxes, rtol=SAME, atol=0):
         return (low + corner_bits(len(size)) * size)[None], allowance(np.full(1, edge))
     corners = body.corners()
     warp = np.zeros(len(body))
@@ -396,11 +396,12 @@ def allowance(edge: NDArray[np.float64]) -> NDArray[np.float64]:
 def meeting(
     a: tuple[NDArray[np.float64], NDArray[np.float64]],
     b: tuple[NDArray[np.float64], NDArray[np.float64]],
-    h: NDArray[np.float64],
+    in_cells: Callable[[NDArray[np.float64]], NDArray[np.float64]],
 ) -> tuple[float, float, NDArray[np.float64]]:
-    """Return how deep domains lie in others, m, how many cells of size h (d,) they are apart, and where (d,).
+    """Return how deep domains lie in others, m, how many cells they are apart, and where (d,).
 
-    a, b: domains and their allowances, see `solids`.  Those that touch are 0 m deep, 0 cells apart; far ones inf cells.
+    in_cells gives places in cells.  a, b: domains and their allowances, see `solids`.  Those that touch are 0 m deep,
+    0 cells apart; far ones inf cells.
     """
     i, j = near(a[0], b[0])
     apart, slack = separation(a[0][i], b[0][j]), a[1][i] + b[1][j] + rounding(a[0])
@@ -408,10 +409,11 @@ def meeting(
         k = int(np.argmin(apart + slack))
         depth, gap = max(0.0, -apart[k]) if apart[k] < -slack[k] else 0.0, 0.0
     else:
-        i, j = near(a[0] / h, b[0] / h, 1.0)
-        apart = separation(a[0][i] / h, b[0][j] / h)
+        one, other = in_cells(a[0]), in_cells(b[0])
+        i, j = near(one, other, 1.0)
+        apart = separation(one[i], other[j])
         if not len(i):
-            return 0.0, np.inf, np.zeros(len(h))
+            return 0.0, np.inf, np.zeros(one.shape[-1])
         k = int(np.argmin(apart))
         depth, gap = 0.0, float(apart[k])
     one, other = a[0][i[k]], b[0][j[k]]
@@ -425,7 +427,7 @@ def check_apart(grid: Grid, bodies: Sequence[Body], present: Sequence[bool]) -> 
     found = {i: solids(bodies[i]) for i in there} if len(there) > 1 else {}
     first = np.cumsum([0, *(len(body) for body in bodies[:-1])])  # point of each body
     for i, j in combinations(there, 2):
-        depth, gap, x = meeting(found[i], found[j], grid.h)
+        depth, gap, x = meeting(found[i], found[j], lambda x: grid.in_cells(x - grid.base))
         if depth:
             raise ValueError(f"bodies {i} and {j}: both are at {x}, {depth:.3g} m deep, must not lie in each other")
         together = grid.copies == 1 or np.ptp(grid.copy(first[[i, j]])) == 0  # else they share no node

@@ -34,14 +34,15 @@ def _warn_narrow_hole(grid: Grid, bodies: Sequence[Body]) -> None:
         return
     x = np.concatenate([body.corners() for body in bodies])
     inner = x[:, :, 0].min(axis=1)
-    near = np.flatnonzero(inner < grid.h[0] * (1 - NEAR))
+    h = grid.h[0] if grid.even else grid.widths[0][0]
+    near = np.flatnonzero(inner < h * (1 - NEAR))
     row = grid.index(x[near].mean(axis=1))[:, 1]
     touches = np.zeros(grid.shape[1] + 2, dtype=bool)
     for k in range(3):  # a surface aslant begins off the axis in the next row
-        touches[row[inner[near] <= NEAR * grid.h[0]] + k] = True
+        touches[row[inner[near] <= NEAR * h] + k] = True
     hole = near[~touches[row + 1]]
     if len(hole):
         k = hole[inner[hole].argmin()]
         what = "a hole about the axis of radius %.3g m, at %s, is narrower than a cell of %.3g m: its side moves as a "
         what += "solid core does; take smaller cells, or a grid that begins at a radius > 0"
-        warn(grid.comm, ResolutionWarning, what, inner[k], x[k].mean(axis=0), grid.h[0])
+        warn(grid.comm, ResolutionWarning, what, inner[k], x[k].mean(axis=0), h)

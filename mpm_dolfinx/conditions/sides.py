@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from mpm_dolfinx.base.tolerances import NEAR, SAME
+from mpm_dolfinx.base.tolerances import NEAR, SAME, TINY
 from mpm_dolfinx.base.validation import Places, line
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.faces import Region, Surface, joined, limits, surface
@@ -109,11 +109,17 @@ class Sides:
         faces = np.flatnonzero(at_end)
         X, places = side.corners[faces][:, :, axis], side.places()[faces]
         way, moved = X - X.mean(axis=1, keepdims=True), places - places.mean(axis=1, keepdims=True)
-        slope = np.einsum("mk,mkd->d", way, moved) / np.square(way).sum() / self.grid.h  # of a map, cells over metres
+        slope, grid = np.einsum("mk,mkd->d", way, moved) / np.square(way).sum(), self.grid
+        there = places.mean(axis=1)[0] + (x - X.mean(axis=1)[0]) * slope - grid.base  # the end
+        inner = there - sign * NEAR * grid.least / max(float(np.abs(slope).max()), TINY) * slope
+        slope = slope / (grid.h if grid.even else grid.sizes_at(inner[None])[0])  # of a map, cells over metres
         a = np.abs(slope).argmax()
         if np.abs(np.delete(slope, a)).max() > SAME * abs(slope[a]):
             return 0.5 / float(np.linalg.norm(slope))
-        end = (places.mean(axis=1)[0, a] - self.grid.lower[a]) / self.grid.h[a] + (x - X.mean(axis=1)[0]) * slope[a]
+        if grid.even:
+            end = (places.mean(axis=1)[0, a] - grid.lower[a]) / grid.h[a] + (x - X.mean(axis=1)[0]) * slope[a]
+        else:
+            end = grid.in_cells(there[None])[0, a]
         share = (sign * np.sign(slope[a]) * end) % 1.0
         return share / abs(float(slope[a])) if share <= (1 + NEAR) / 2 else 0.0
 

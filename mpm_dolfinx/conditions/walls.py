@@ -30,7 +30,7 @@ def wall_forces(
     """
     d, sides = grid.dim, SIDES[grid.dim]
     node, component = np.divmod(dofs, d)
-    place, letter = np.rint((grid.node_x[node] - grid.low) / grid.h), np.array(list("xyz"))[component]
+    place, letter = grid.nodes_along(grid.node_x[node]), np.array(list("xyz"))[component]
     across = np.array([component == axis for axis, _ in sides.values()])
     holds = np.array(
         [

@@ -121,8 +121,9 @@ class ContactLaw:
         self.area = sum_by(self.of, pairs.area, len(key))
         strength = np.array([(contact.friction, contact.adhesion) for contact in contacts], dtype=float)
         self.strength = strength[key // self.grid.num_local]
-        h = self.grid.h.min()
-        self._stiffness, self._hold = STIFF / h * pairs.resistance, GRIP / h * self.mean(pairs.resistance)
+        h, of_pairs = (self.grid.sizes(cells).min(axis=-1) for cells in (key % self.grid.num_local, pairs.cell))
+        self._size = h
+        self._stiffness, self._hold = STIFF / of_pairs * pairs.resistance, GRIP / h * self.mean(pairs.resistance)
         self.grips = any(contact.grips for contact in contacts)
 
     def begins(self) -> ContactState:
@@ -239,9 +240,9 @@ class ContactLaw:
         x : (m, d), m, where the points are.  Raises NotConverged after as many rounds as are tried.
         """
         # what is a sliver of a cell has too little area to be pushed out by itself, and goes with its neighbours
-        plane, h = self.total(self.pairs.area / self.grid.around(x)), self.grid.h
-        whole = np.minimum(1.0, plane / (SLIVER * self.grid.cell_volume / h.max()))
-        off = whole * np.abs(touch.pressure - state.pressure) / self.mean(self.stiffness(state)) / h.min()
+        plane = self.total(self.pairs.area / self.grid.around(x))
+        whole = np.minimum(1.0, plane / (SLIVER * self.grid.smallest_faces(self.key % self.grid.num_local)))
+        off = whole * np.abs(touch.pressure - state.pressure) / self.mean(self.stiffness(state)) / self._size
         most = over_all(self.grid.comm, float(off.max(initial=0.0)), MPI.MAX)
         if most <= DEPTH:
             return state

@@ -103,7 +103,7 @@ class ToolPairs(Pairs):
         """See `Pairs`."""
         d = self.grid.dim
         m = len(w)
-        h = self.grid.h.min()
+        h = self.grid.least
         gap = np.zeros(m)
         n = np.zeros((m, d))
         second = np.zeros((m, d, d))
@@ -155,7 +155,7 @@ class FacePairs(Pairs):
         """See `Pairs`."""
         grid = self.grid
         index = np.stack(np.unravel_index(self.other % grid.cells, tuple(grid.shape)), axis=1)
-        off = (self.y - grid.low) / grid.h - index - 0.5
+        off = grid.in_cells(self.y) - index - 0.5
         return self.other, np.prod(0.5 + off[:, None] * grid.signs, axis=2)
 
 

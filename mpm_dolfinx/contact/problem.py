@@ -244,7 +244,7 @@ class ContactProblem(Loads):
 
     def _way(self, w: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return how far (tools,), m, loads push tools at w (m, d), m: along the line of the last Newton step."""
-        ways, h = self.now.ways, self.grid.h.min()
+        ways, h = self.now.ways, self.grid.least
         if not over_all(self.grid.comm, int((w != ways.w).any())):
             return ways.way
         more = self.now.law.by_contact((ways.slope * (w - ways.w)).sum(axis=1)[:, None])[:, 0]
@@ -289,14 +289,14 @@ class ContactProblem(Loads):
         met, slope, _ = self._met(found)
         off = np.nan_to_num(self.pushes.load - met)
         far, touches = self._seek(found)
-        seeks = np.where((off > 0) & ~touches, np.minimum(far, self.grid.h.min()), 0.0)  # what slips resists no more
+        seeks = np.where((off > 0) & ~touches, np.minimum(far, self.grid.least), 0.0)  # what slips resists no more
         return np.divide(off, slope, out=seeks, where=slope > 0)
 
     def _begins(self) -> NDArray[np.float64]:
         """Return how far tools go (tools,), m, before the bodies do: at most to where one place would bear the load."""
         way = np.zeros(len(self.now.law.contacts))
         still = np.zeros_like(self.pairs.x)
-        h = self.grid.h.min()
+        h = self.grid.least
         for _ in range(ROUNDS):
             found = self._find_at(still, way)
             before, way = way, np.clip(way + np.minimum(self._shift(found), self._seek(found)[0]), -h, h)
@@ -328,7 +328,7 @@ class ContactProblem(Loads):
         if new is not state or not self.pushed:
             return new is not state
         met, slope, unknown = self._met(found)
-        load, h = self.pushes.load, self.grid.h.min()
+        load, h = self.pushes.load, self.grid.least
         off = np.nan_to_num(met - load)
         wrong = np.abs(off) > np.maximum(SAME * np.nan_to_num(load), unknown)
         if not wrong.any():
@@ -378,7 +378,7 @@ class ContactProblem(Loads):
         off, lost = np.maximum(-gap, 0.0), push > 0
         off[row] = np.where((push[there] > 0) | (gap[row] < 0), np.abs(gap[row] - found.at.gap[there]), 0.0)
         lost[there] = False
-        most = float(off.max(initial=0.0)) / self.grid.h.min() if not lost.any() else np.inf
+        most = float(off.max(initial=0.0)) / self.grid.least if not lost.any() else np.inf
         return Current(now, new.origin, fresh), over_all(self.grid.comm, most, MPI.MAX)
 
     def gripped(self, at: At, points: MaterialPoints) -> MaterialPoints:

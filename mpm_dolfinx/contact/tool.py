@@ -217,16 +217,16 @@ class Tool:
         Corners beyond its surface are put onto it; so its edges are blunt by a part of a cell.
         """
         pose = self.pose(t, grid.dim, way)
-        solid = self.solid(grid.h.min())
+        solid = self.solid(grid.least)
         nodes = tuple(grid.shape + 1)
-        y = pose.own(grid.lower + np.stack(np.unravel_index(np.arange(np.prod(nodes)), nodes), axis=1) * grid.h)
-        inside = solid.distance(y) < -ROUNDED * grid.h.min()
+        y = pose.own(grid.base + grid.places(np.stack(np.unravel_index(np.arange(np.prod(nodes)), nodes), axis=1)))
+        inside = solid.distance(y) < -ROUNDED * grid.least
         cells = grid.corners(np.arange(np.prod(grid.shape)))
         used, at = np.unique(cells[inside[cells].any(axis=1)], return_inverse=True)
         y = y[used]
         for _ in range(ONTO):  # where planes meet
             gap = solid.distance(y)
-            if (gap <= ROUNDED * grid.h.min()).all():
+            if (gap <= ROUNDED * grid.least).all():
                 break
             y = y - np.maximum(gap, 0)[:, None] * solid.normal(y)
         return pose.put(y)[at.reshape(-1, cells.shape[1])]

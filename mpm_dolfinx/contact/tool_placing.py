@@ -186,7 +186,7 @@ class Tools:
         loads = [tool.pushes(t) if t > start and not tool.free else np.nan for tool in self.tools]
         for number, (tool, pose) in enumerate(zip(self.tools, poses, strict=True)):
             before = self._pose(tool, start)
-            n = everywhere(grid, lambda tool=tool, pose=pose: tool.solid(grid.h.min()).normal(pose.own(x)) @ pose.R.T)
+            n = everywhere(grid, lambda tool=tool, pose=pose: tool.solid(grid.least).normal(pose.own(x)) @ pose.R.T)
             faces = free & (np.einsum("md,md->m", area, n) < -FACING * size * np.linalg.norm(n, axis=1))
             at = np.flatnonzero(faces)[~self._edge(tool, pose, x, area / np.maximum(size, TINY)[:, None], faces)]
             old = points.data[shear_name(self.names[number])][patches.at[at]] if tool.grips else np.zeros((len(at), d))
@@ -221,20 +221,27 @@ class Tools:
         faces : (m,)
             Which of them face the tool.
         """
-        grid, h = self.grid, self.grid.h
-        y, n = x[faces], unit[faces]
+        grid, (y, n) = self.grid, (x[faces], unit[faces])
+        h = grid.sizes_at(y)
         edge = np.zeros(len(y), dtype=bool)
         for axis, e in enumerate(np.eye(grid.dim)):
             for half in (-0.5 * h, 0.5 * h):
                 beside = pose.own(y + half * (e - n[:, [axis]] * n))
-                to = everywhere(grid, lambda beside=beside: tool.solid(h.min()).normal(beside) @ pose.R.T)
+                to = everywhere(grid, lambda beside=beside: tool.solid(grid.least).normal(beside) @ pose.R.T)
                 edge |= np.einsum("md,md->m", n, to) >= -FACING
         if not over_all(grid.comm, int(edge.sum())):
             return edge
-        low, high = (over_all(grid.comm, end, op) for end, op in _box(y[edge] / h))
-        off = ~faces & (np.abs(np.clip(x / h, low, high) - x / h) <= 1).all(axis=1)
-        beyond = np.concatenate(grid.comm.allgather(np.hstack([x[off] / h, unit[off]])))
-        pairs = cKDTree(y[edge] / h).sparse_distance_matrix(cKDTree(beyond[:, : grid.dim]), 1.0, output_type="ndarray")
+
+        def cells(x: NDArray[np.float64]) -> NDArray[np.float64]:
+            """Return places in cells."""
+            return x / grid.h if grid.even else grid.in_cells(x)
+
+        low, high = (over_all(grid.comm, end, op) for end, op in _box(cells(y[edge])))
+        off = ~faces & (np.abs(np.clip(cells(x), low, high) - cells(x)) <= 1).all(axis=1)
+        beyond = np.concatenate(grid.comm.allgather(np.hstack([cells(x[off]), unit[off]])))
+        pairs = cKDTree(cells(y[edge])).sparse_distance_matrix(
+            cKDTree(beyond[:, : grid.dim]), 1.0, output_type="ndarray"
+        )
         on = np.einsum("md,md->m", n[edge][pairs["i"]], beyond[pairs["j"], grid.dim :]) > np.sqrt(0.5)
         goes_on = np.zeros(int(edge.sum()), dtype=bool)
         goes_on[pairs["i"][on]] = True
@@ -265,7 +272,7 @@ class Tools:
                 if deep > BEGINS:
                     what = f"{line(tool)} and {line(hold)}: both act at {where} at t = {t:g} s"
                     raise ValueError(f"{what}, must not; limit the displacement by a region, or move the tool")
-            corners = points.corners[self._gaps(tool, points.corners, t).min(axis=1) < -BEGINS * self.grid.h.min()]
+            corners = points.corners[self._gaps(tool, points.corners, t).min(axis=1) < -BEGINS * self.grid.least]
             deep, where = self._deepest(tool, points.x, t)
             held, there = self._deepest(tool, middle(corners), t)
             if deep > NEAR or held > 0:  # stretched domains have their middles in round tools, not their corners
@@ -279,7 +286,7 @@ class Tools:
 
         What else they follow would be pushed back by the tool in the next step, and roughen the pressure.
         """
-        out, h = np.zeros(corners.shape[:2], dtype=bool), self.grid.h.min()
+        out, h = np.zeros(corners.shape[:2], dtype=bool), self.grid.least
         for tool in self.tools:
             out |= self._gaps(tool, corners, t) < NEAR * h
         return out
@@ -302,7 +309,7 @@ class Tools:
         most
             What is deeper stays, cells.
         """
-        out, h = corners.copy(), self.grid.h.min()
+        out, h = corners.copy(), self.grid.least
         for tool in self.tools:
             gap, pose = self._gaps(tool, out, t), self._pose(tool, t)
             gap += LEFT * h
@@ -315,7 +322,7 @@ class Tools:
     def _gaps(self, tool: Tool, corners: NDArray[np.float64], t: float) -> NDArray[np.float64]:
         """Return distances (n, 2^d), m, of corners (n, 2^d, d) from a tool at time t (s)."""
         own = self._pose(tool, t).own(corners.reshape(-1, self.grid.dim))
-        gap = everywhere(self.grid, lambda: tool.solid(self.grid.h.min()).distance(own))
+        gap = everywhere(self.grid, lambda: tool.solid(self.grid.least).distance(own))
         return gap.reshape(corners.shape[:2])
 
     def _passed(self, tool: Tool, x: tuple[NDArray[np.float64], ...], times: tuple[float, ...]) -> str:
@@ -323,7 +330,7 @@ class Tools:
 
         Places go on by their distance to the tool (sphere tracing: Hart 1996).
         """
-        h, comm = self.grid.h.min(), self.grid.comm
+        h, comm = self.grid.least, self.grid.comm
         y, end = (self._pose(tool, t).own(at) for at, t in zip(x, times, strict=True))
         way = np.linalg.norm(end - y, axis=1)
         gone = np.zeros(len(y))
@@ -347,7 +354,7 @@ class Tools:
 
     def _deepest(self, tool: Tool, x: NDArray[np.float64], t: float) -> tuple[float, str]:
         """Return how deep places x (m, d) are in a tool at most, in cells, and where."""
-        h, pose = self.grid.h.min(), self._pose(tool, t)
+        h, pose = self.grid.least, self._pose(tool, t)
         gap = everywhere(self.grid, lambda: tool.solid(h).distance(pose.own(x)))
         deepest = over_all(self.grid.comm, float(gap.min(initial=np.inf)), MPI.MIN)
         here = (

@@ -29,7 +29,8 @@ def warn_overfilled(cut: CutDomains, bodies: Sequence[Body]) -> Callable[..., An
     """Warn of the fullest cell, with the bodies in it, if it is overfilled; return what looks for the next."""
     grid, points = cut.grid, cut.points
     volume = cut.to_cells(points.volume0 * points.J) * cut.pieces_to_cells(cut.pieces.fraction)
-    fill = sum_by(cut.cells, cut.plane(volume)[0], grid.num_owned) / grid.cell_volume
+    fill = sum_by(cut.cells, cut.plane(volume)[0], grid.num_owned)
+    fill /= grid.volumes(np.arange(grid.num_owned))
     most = over_all(grid.comm, float(fill.max(initial=0.0)), MPI.MAX)
     if not cut.domains or most <= FULL:
         return warn_overfilled
@@ -52,7 +53,7 @@ def bodies_in(cut: CutDomains, bodies: Sequence[Body], cell: int) -> tuple[list[
     grid, ids = cut.grid, cut.points.id[cut.pieces.point[cut.pieces.cell == cell]]
     own = np.searchsorted(np.cumsum([len(body) for body in bodies]), ids, side="right")
     found = sorted({int(i) for rows in grid.comm.allgather(own) for i in rows})
-    return found, grid.lower + (np.array(np.unravel_index(cell % grid.cells, grid.shape)) + 0.5) * grid.h
+    return found, grid.base + grid.places(np.array(np.unravel_index(cell % grid.cells, grid.shape)), 0.5)
 
 
 LOST = 0.03
@@ -145,14 +146,23 @@ def warn_thin(grid: Grid, bodies: Sequence[Body], walls: Mapping[str, str], wet:
     for i, body in enumerate(bodies):
         for axis, letter in enumerate("xyz"[: grid.dim]):
             n, spacing = body.across(axis)
-            if spacing > COARSE * grid.h[axis] and n <= few and _bends(grid, bodies, i, axis, walls, slender):
+            h = _edge(grid, body, axis)
+            if spacing > COARSE * h and n <= few and _bends(grid, bodies, i, axis, walls, slender):
                 much = "it carries no moment and creeps"
                 if n > 1:
                     much = f"it bends {1 / (n**2 - 1):.0%} too much"
                 if n > 1 and wet:
                     much = f"with pore fluid it bends some {LOST_WET / n**2:.0%} too much and creeps"
                 what = "body %d: %.3g point%s over its thickness along %s, in cells of %.3g m: %s; take per_cell >= 2"
-                warn(grid.comm, ResolutionWarning, what, i, n, "s" if n > 1 else "", letter, grid.h[axis], much)
+                warn(grid.comm, ResolutionWarning, what, i, n, "s" if n > 1 else "", letter, h, much)
+
+
+def _edge(grid: Grid, body: Body, axis: int) -> float:
+    """Return the edge along an axis of the cells that a body lies in, m; of many sizes the mean."""
+    if grid.even:
+        return grid.h[axis]
+    low, high = body.bounds
+    return float(((high - low) / np.ptp(grid.in_cells(np.stack([low, high]) - grid.base), axis=0))[axis])
 
 
 def _bends(grid: Grid, bodies: Sequence[Body], i: int, axis: int, walls: Mapping[str, str], slender: float) -> bool:
@@ -164,7 +174,7 @@ def _bends(grid: Grid, bodies: Sequence[Body], i: int, axis: int, walls: Mapping
     for name in (name for name, (a, _) in SIDES[grid.dim].items() if a == axis):
         end = SIDES[grid.dim][name][1]
         wall = (grid.lower, grid.upper)[end][axis]
-        if "xyz"[axis] in walls.get(name, "") and np.abs(body.bounds[end][axis] - wall) < SAME * grid.h[axis]:
+        if "xyz"[axis] in walls.get(name, "") and np.abs(body.bounds[end][axis] - wall) < SAME * grid.finest[axis]:
             return False
         own = Faces.of(body, *body.facing(axis, end))
         others = (Faces.around(other) for other in bodies if other is not body)

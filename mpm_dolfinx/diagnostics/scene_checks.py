@@ -93,4 +93,4 @@ def _extents(grid: Grid, part: NDArray[np.int64], count: int) -> tuple[NDArray[n
     for sign, ends in ((1, low), (-1, high)):
         np.minimum.at(ends, part[part > 0] - 1, sign * grid.midpoints[part > 0])
         grid.comm.Allreduce(MPI.IN_PLACE, ends, op=MPI.MIN)
-    return (low - high) / 2, (-high - low + grid.h).max(axis=1)
+    return (low - high) / 2, (-high - low + (grid.h if grid.even else grid.most)).max(axis=1)

@@ -8,9 +8,9 @@ it as stress.  So corners follow the field with its second differences along eac
     u(x) = sum_i N_i(x) [u_i - 1/2 sum_a t_a (1 - t_a) D_a],
 
 t_a in [0, 1] the place in the cell: exact for quadratic fields, Q1 at the nodes, and continuous.  D_a is the second
-difference along the edge of the cell that node i ends: the smaller one of those at its two ends, zero where their signs
-differ, and that of one end where the other has none.  So a kink that is no error of the grid, as between materials,
-stays one.
+difference along the edge of the cell that node i ends, of cells of many sizes edge^2 times the divided one: the
+smaller one of those at its two ends, zero where their signs differ, and that of one end where the other has none.  So a
+kink that is no error of the grid, as between materials, stays one.
 """
 
 from __future__ import annotations
@@ -39,14 +39,15 @@ def followed(
     used = np.flatnonzero(np.bincount(cells, minlength=1))
     slot = np.zeros(used.max(initial=0) + 1, dtype=np.intp)
     slot[used] = np.arange(len(used))
-    field = grid.monomials @ _at(u, grid.cell_nodes[used])
+    field = grid.over_edges(grid.monomials @ _at(u, grid.cell_nodes[used]), used)
     bends = _second_differences(grid, used, u, filled)
     out = np.empty((2, *x.shape))
     # with the corners last: rows of a few numbers each would take numpy six times as long
     for part in in_chunks(len(x)):
         here, y = slot[cells[part]], (x[part] - grid.midpoints[cells[part]]).T.copy()
         out[0, part] = _polynomial(field, y, here).T
-        weights = 0.5 * ((y / grid.h[:, None]) ** 2 - 0.25)  # t (t - 1) / 2
+        h = grid.h[:, None] if grid.even else grid.sizes(cells[part]).T
+        weights = 0.5 * ((y / h) ** 2 - 0.25)  # t (t - 1) / 2
         out[1, part] = sum(weights[a] * _polynomial(bends[a], y, here, a) for a in range(grid.dim)).T
     return out
 
@@ -97,10 +98,20 @@ def _second_differences(
             local = beside[:, a, k]
             beyond = grid.cell_nodes[local][:, end]
             known.append(np.broadcast_to((local >= 0) & filled[local], (2 ** (d - 1), len(local))))
-            ends.append(_at(u, beyond) - value - (2 * k - 1) * along)
+            if grid.even:
+                ends.append(_at(u, beyond) - value - (2 * k - 1) * along)
+            else:  # h^2 times the divided difference
+                h, g = grid.along(cells, a), grid.along(local, a)
+                ends.append(2 * h / (h + g) * (h / g * (_at(u, beyond) - value) - (2 * k - 1) * along))
         first, last = (np.where(known[k], ends[k], ends[1 - k]) for k in (0, 1))
         smaller = np.where(np.abs(first) < np.abs(last), first, last)
         bend = np.where((first * last > 0) & (known[0] | known[1]), smaller, 0.0)
         across = grid.monomials[np.arange(2**d) >> a & 1 == 0]  # one and the same at both ends
-        out.append((across[:, low] + across[:, high]) @ bend)
+        bend = (across[:, low] + across[:, high]) @ bend
+        if not grid.even:  # for offsets in m, as of the field
+            rows = np.flatnonzero(np.arange(2**d) >> a & 1 == 0)
+            whole = np.zeros((d, 2**d, len(cells)))
+            whole[:, rows] = bend
+            bend = grid.over_edges(whole, cells)[:, rows]
+        out.append(bend)
     return out

@@ -124,7 +124,7 @@ class CutDomains(Keyed):
         part (n,): of each point.
         """
         far = np.zeros(count)
-        np.maximum.at(far, part, np.abs((points.corners - self.points.corners) / self.grid.h).max(axis=(1, 2)))
+        np.maximum.at(far, part, self.grid.cells_between(self.points.corners, points.corners).max(axis=(1, 2)))
         return over_all(self.grid.comm, far, MPI.MAX)
 
     def serves(self, points: MaterialPoints, part: NDArray[np.int64], count: int) -> NDArray[np.bool_]:
@@ -192,7 +192,7 @@ class CutDomains(Keyed):
         skew = np.flatnonzero(skew[here][face])  # xi is linear over a triangle, and places are not in xi
         if len(skew):
             xi[skew] = on_face(corners[face[skew]], number[face[skew]], x[skew], xi[skew])
-        inward = -NEAR * self.grid.h.min() * np.divide(outward, size, out=np.zeros_like(outward), where=size > 0)
+        inward = -NEAR * self.grid.least * np.divide(outward, size, out=np.zeros_like(outward), where=size > 0)
         cell = self._filled_cell(at[face], middle + inward[face])
         rows = row[here][face], at[face], cell, x, xi, share
         surface = np.repeat(np.arange(len(several)), list(map(len, several)))[here][face]
@@ -261,5 +261,6 @@ def whole_points(grid: Grid, x: NDArray[np.float64]) -> Pieces:
     """Return one piece a point, at the point; a cell that holds points has open faces."""
     n, number = len(x), grid.number(grid.index_from_base(x))
     _, cell, count = np.unique(number, return_inverse=True, return_counts=True)
-    share = (grid.cell_volume / grid.h) / count[cell][:, None]
+    h = grid.sizes_of(number)
+    share = h.prod(axis=-1, keepdims=True) / h / count[cell][:, None]
     return Pieces(np.arange(n), number, np.ones(n), x.copy(), np.stack([share, share], axis=2), np.zeros((n, 0)))

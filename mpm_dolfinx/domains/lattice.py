@@ -7,11 +7,11 @@ what crossing grid lines leaves of it would add up from cycle to cycle.  When th
     d <- d - D_a^T s / 64 D_a d     for one axis a after the other, the mean over all orders of the axes,
 
 d their displacement since they were at rest, D_a the third difference along axis a where the lattice has four corners
-in a row, s = `FAST` times the cells that they have crossed, at most 1: what hardly moves is left alone.  Quadratic
-fields stay as they are, also at the surface; along its axis a wave of two domains is taken away by the share s, one of
-eight by 0.003 s.  Nothing is filtered where domains have parted from their neighbours, and where soil has yielded: it
-does not come back, and its kinks are its own.  Corners that a wall, a given displacement, a plate or another body holds
-stay where they are.
+in a row (of rows of many widths the divided one, of weights as large in sum), s = `FAST` times the cells that they have
+crossed, at most 1: what hardly moves is left alone.  Quadratic fields stay as they are, also at the surface; along its
+axis a wave of two domains is taken away by the share s, one of eight by 0.003 s.  Nothing is filtered where domains
+have parted from their neighbours, and where soil has yielded: it does not come back, and its kinks are its own.
+Corners that a wall, a given displacement, a plate or another body holds stay where they are.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.base.tolerances import NEAR
 from mpm_dolfinx.bodies.bodies import Body
+from mpm_dolfinx.bodies.boxes import RowsBody
 from mpm_dolfinx.bodies.faces import Surface
 from mpm_dolfinx.bodies.touching import Faces, covers
 from mpm_dolfinx.grid.grid import SIDES, Grid, among, in_chunks
@@ -67,6 +68,9 @@ class Lattice:
         self._start = start
         self._stop = start + len(body)
         self._dim, self._count = body.dim, body.lattice
+        self._thirds = None
+        if isinstance(body, RowsBody):
+            self._thirds = [_divided(body.corner_rows(axis)) for axis in range(self._dim)]
         self._numbers: Latest[NDArray[np.int64]] = Latest()
         self._parted = np.append(np.full(self._dim, NEAR * body.spacing.min()), NEAR)
         # the numbers of corners that are held: a flag for each corner would be as large as the body, on every process
@@ -112,7 +116,8 @@ class Lattice:
             return np.zeros_like(d)
         number = self._nodes(ids)
         values = np.concatenate([d, crossed[:, :, None]], axis=2).reshape(-1, self._dim + 1)
-        change = _change(comm, tuple(np.add(self._count, 1)), number.ravel(), values, self._parted).reshape(d.shape)
+        shape = tuple(np.add(self._count, 1))
+        change = _change(comm, shape, number.ravel(), values, self._parted, self._thirds).reshape(d.shape)
         change[self._held_of(ids)[1]] = 0.0
         return change
 
@@ -123,6 +128,7 @@ def _change(
     number: NDArray[np.int64],
     values: NDArray[np.float64],
     parted: NDArray[np.float64],
+    thirds: Sequence[NDArray[np.float64]] | None = None,
 ) -> NDArray[np.float64]:
     """Return what the filter adds (m, k) to values at places of a lattice.
 
@@ -136,6 +142,8 @@ def _change(
         Values, and last how many cells their place has crossed.
     parted : (k + 1,)
         Places of which some of these differ by more are nobody's neighbours.
+    thirds : (4, n - 3) along each axis
+        Weights of third differences along n corners in rows of many widths, see `_divided`.
     """
     across, starts = int(np.prod(shape[1:])), np.arange(comm.size + 1) * shape[0] // comm.size
     layer = number // across
@@ -158,12 +166,17 @@ def _change(
             here = at[part]
             field[here[(np.abs(field[here] - d[part]) > parted).any(axis=1)]] = np.nan
     field = field.reshape(-1, *shape[1:], values.shape[1])
-    change = np.nan_to_num(_filtered(field[..., :-1], field[..., -1:]) - field[..., :-1])
+    if thirds is not None:  # of this slab
+        thirds = [thirds[0][:, first : max(first, last - MARGIN)], *thirds[1:]]
+    change = np.nan_to_num(_filtered(field[..., :-1], field[..., -1:], thirds) - field[..., :-1])
     return to_home.back(change.reshape(-1, values.shape[1] - 1)[rows[0][0]])
 
 
 def _filtered(
-    d: NDArray[np.float64], crossed: NDArray[np.float64], axes: tuple[int, ...] | None = None
+    d: NDArray[np.float64],
+    crossed: NDArray[np.float64],
+    thirds: Sequence[NDArray[np.float64]] | None = None,
+    axes: tuple[int, ...] | None = None,
 ) -> NDArray[np.float64]:
     """Return a box (..., k) of values after the filter along axes, by default all; nan stands for no place.
 
@@ -174,18 +187,34 @@ def _filtered(
         axes = tuple(axis for axis, count in enumerate(d.shape[:-1]) if count >= len(THIRD))
     if not axes:
         return d
-    orders = [_filtered(_along(d, crossed, a), crossed, tuple(b for b in axes if b != a)) for a in axes]
+    by = [None] * (d.ndim - 1) if thirds is None else thirds
+    orders = [_filtered(_along(d, crossed, a, by[a]), crossed, thirds, tuple(b for b in axes if b != a)) for a in axes]
     return sum(orders[1:], orders[0]) / len(orders)
 
 
-def _along(d: NDArray[np.float64], crossed: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
-    """Return a box (..., k) of values after the filter along one axis."""
+def _divided(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the weights (4, n - 3) of third differences at places (n,): quadratics have none, alternation has 8."""
+    rows = np.stack([x[k : max(k, len(x) - 3 + k)] for k in range(len(THIRD))])
+    apart = rows[:, None] - rows[None]
+    weights = 1 / np.where(np.eye(len(THIRD), dtype=bool)[:, :, None], 1.0, apart).prod(axis=1)
+    return 8 * weights / np.abs(weights).sum(axis=0)
+
+
+def _along(
+    d: NDArray[np.float64], crossed: NDArray[np.float64], axis: int, weights: NDArray[np.float64] | None = None
+) -> NDArray[np.float64]:
+    """Return a box (..., k) of values after the filter along one axis; weights: see `_divided`, else even rows."""
     out, count = d.copy(), d.shape[axis]
     along, cells = np.moveaxis(out, axis, 0), np.moveaxis(crossed, axis, 0)
     share = np.minimum(1.0, FAST * (cells[1 : count - 2] + cells[2 : count - 1]) / 2)
-    third = share / 64 * np.diff(along, 3, axis=0)
+    if weights is None:
+        factors, third = THIRD, np.diff(along, 3, axis=0)
+    else:
+        factors = weights.reshape(len(THIRD), -1, *(1,) * (along.ndim - 1))
+        third = sum(factor * along[k : count - 3 + k] for k, factor in enumerate(factors))
+    third = share / 64 * third
     third[np.isnan(third)] = 0.0
-    for k, factor in enumerate(THIRD):
+    for k, factor in enumerate(factors):
         along[k : count - 3 + k] -= factor * third
     return out
 
@@ -214,7 +243,7 @@ def given(
         out[rows] = lattice.given(points.id[rows])
     for name, axes in walls.items():
         axis, end = SIDES[grid.dim][name]
-        at_wall = np.abs(points.corners[:, :, axis] - (grid.low, grid.high)[end][axis]) < NEAR * grid.h[axis]
+        at_wall = np.abs(points.corners[:, :, axis] - (grid.low, grid.high)[end][axis]) < NEAR * grid.finest[axis]
         for letter in axes:
             out[:, :, "xyz".index(letter)] |= at_wall
     return out
@@ -237,4 +266,4 @@ def filtered(
 
 def crossed(grid: Grid, points: MaterialPoints, then: MaterialPoints, free: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Return how many cells the corners (n, 2^d) have crossed since the grid was reset; of points not free none."""
-    return np.abs((points.corners - then.corners) / grid.h).sum(axis=2) * free[:, None]
+    return grid.cells_between(then.corners, points.corners).sum(axis=2) * free[:, None]

@@ -141,8 +141,8 @@ class Reconstruction:
         cells, p, centroid, *_ = seen
         jump, one_sided, _, drained = self._differences(seen)
         slope, low, high = van_leer(one_sided), *_spread(jump)
-        whole = self.grid.h[:, None] * [-0.5, 0.5]
-        filled = (2 * centroid[cells][:, :, None] - whole[:, ::-1]).clip(whole[:, :1], whole[:, 1:])
+        whole = self.grid.sizes(cells)[..., None] * [-0.5, 0.5]
+        filled = (2 * centroid[cells][:, :, None] - whole[..., ::-1]).clip(whole[..., :1], whole[..., 1:])
         ends = slope[:, :, None] * (np.where(drained, filled, whole) - origin[:, :, None])
         scale = np.ones(len(cells))
         for reach, room in ((ends.min(axis=2).sum(axis=1), low), (ends.max(axis=2).sum(axis=1), high)):
@@ -155,7 +155,6 @@ class Reconstruction:
         All (n, d, 2), by axis and end, zero where there is neither.
         """
         cells, p, centroid, faces, outer = seen
-        h = self.grid.h
         there = self._neighbour[cells]
         here = p[cells]
         jump, one_sided = np.zeros(there.shape), np.zeros(there.shape)
@@ -167,7 +166,7 @@ class Reconstruction:
                     (other >= 0) & (faces[cells, axis, end] > 0) & (faces[other, axis, 1 - end] > 0)
                 )
                 jump[:, axis, end] = np.where(inside, p[other] - here, 0.0)
-                apart = h[axis] + way * (centroid[other, axis] - centroid[cells, axis])
+                apart = self.grid.between(cells, other, axis) + way * (centroid[other, axis] - centroid[cells, axis])
                 one_sided[:, axis, end] = way * jump[:, axis, end] / np.where(inside, apart, 1.0)
         drained = ~is_open & np.isfinite(outer[..., 0])
         jump, one_sided = np.where(drained, outer[..., 0], jump), np.where(drained, outer[..., 1], one_sided)
@@ -199,7 +198,7 @@ class Reconstruction:
         same = before * to > 0
         slope[at, axis] = np.where(same, np.sign(to) * np.minimum(np.abs(before), np.abs(2 * to - before)), 0.0)
         way = 1 - 2 * end
-        reach = self.grid.h[axis] / 2 - way * centroid[cells[at], axis]
+        reach = self.grid.along(cells[at], axis) / 2 - way * centroid[cells[at], axis]
         on = way * slope[at, axis] * reach
         low, high = _spread(jump)
         low, high = low + sum_by(at, np.minimum(on, 0), len(cells)), high + sum_by(at, np.maximum(on, 0), len(cells))

@@ -115,7 +115,7 @@ class DrainedSides(Feeding):
         area = values[:, 5:]
         drains = np.isfinite(pressure)
         size, reach = np.linalg.norm(area, axis=1), x - grid.midpoints[cell] - wet.contents.centroid[cell]
-        least = wet.contents.fill[wet.contents.slot(cell)] * grid.h.min() / THICK / (grid.dim + 1)
+        least = wet.contents.fill[wet.contents.slot(cell)] * grid.sizes(cell).min(axis=-1) / THICK / (grid.dim + 1)
         normal = area / size[:, None]
         distance = np.einsum("md,md->m", reach, normal)
         shape = size / np.maximum(distance, least)

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
+from math import prod
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,7 +25,7 @@ from mpm_dolfinx.base.fluid_content import density_between, mass_potential
 from mpm_dolfinx.base.tolerances import TINY
 from mpm_dolfinx.forms.point_forms import FacetForm, FacetSum
 from mpm_dolfinx.forms.unknowns import sum_ghosts
-from mpm_dolfinx.grid.grid import Grid, sum_by
+from mpm_dolfinx.grid.grid import Grid, across_faces, sum_by
 from mpm_dolfinx.points.material_points import cofactor, determinant
 
 ALONG = 0.1  # of a unit normal: a side that looks less along an axis tells nothing of the pressure's slope there
@@ -229,7 +230,7 @@ class CellContents(Keyed):
         """Volumes (n,) of what the filled cells hold, m^d."""
         self.area, area = pieces.area, self.total(cells, pieces.area)
         """Of the pieces (m,), m^d; in axisymmetry in the plane, m^2."""
-        self.fill = np.minimum(area / grid.cell_volume, 1.0)
+        self.fill = np.minimum(area / grid.volumes(filled), 1.0)
         """Filled share of the filled cells."""
         shapes = (forms.centroid, forms.lower_face, forms.upper_face)
         self._damped, self._damping = forms.damping, pieces.damping
@@ -237,11 +238,12 @@ class CellContents(Keyed):
             f.x.array[:] = 0.0
         forms.fixed_stress.x.array[filled] = self.total(cells, weight * pieces.fixed_stress)
         centroid, lower, upper = (f.x.array.reshape(-1, grid.dim) for f in shapes)
+        h, volume = grid.sizes(filled).T, grid.volumes(filled)
         for a in range(grid.dim):
             mean = self.total(cells, pieces.area * pieces.x[:, a]) / area
             centroid[filled, a] = mean - grid.midpoints[filled, a]
             for target, end in ((lower, 0), (upper, 1)):
-                target[filled, a] = self.total(cells, pieces.faces[:, a, end]) * grid.h[a] / grid.cell_volume
+                target[filled, a] = self.total(cells, pieces.faces[:, a, end]) * h[a] / volume
         for f in (forms.fixed_stress, *shapes):
             f.x.scatter_forward()
         self.fixed_stress = forms.fixed_stress.x.array.copy()
@@ -341,9 +343,8 @@ class FluxForms:
         self.damping, self.fixed_stress = (fem.Function(Q) for _ in range(2))
         vectors = (fem.Function(grid.cellwise((d,))) for _ in range(5))
         self.mobility, self.moved, self.centroid, self.lower_face, self.upper_face = vectors
-        n, h = ufl.FacetNormal(mesh), fem.Constant(mesh, grid.h)
-        n0 = n("+")
-        across = sum(abs(n0[a]) * h[a] for a in range(d))
+        n0 = ufl.FacetNormal(mesh)("+")
+        h0, h1, across = across_faces(grid, n0)
 
         def opening(side, sign):
             """Share of the face that the body covers, times `Grid.around`, on the side that sign * n0 looks to."""
@@ -355,15 +356,18 @@ class FluxForms:
             )
 
         share = ufl.min_value(opening("+", 1), opening("-", -1))
-        d0 = across / 2 - ufl.dot(self.centroid("+"), n0)
-        d1 = across / 2 + ufl.dot(self.centroid("-"), n0)
+        d0 = h0 / 2 - ufl.dot(self.centroid("+"), n0)
+        d1 = h1 / 2 + ufl.dot(self.centroid("-"), n0)
         k0, k1 = (sum(abs(n0[a]) * self.mobility(side)[a] for a in range(d)) for side in "+-")
         apart = across * n0 - ufl.jump(self.centroid + self.moved)
         if inertial is not None:
             # over two cells as the mass has it, a sixth of each node beside the face: by the face's value alone water
             # that flows freely would have more mass, in what alternates from node to node, than all of the soil
-            kink = ufl.dot(ufl.grad(inertial)("+"), n0) - ufl.dot(ufl.grad(inertial)("-"), n0)
-            along = ufl.avg(inertial) - across / 6 * kink
+            along_n = [ufl.dot(ufl.grad(inertial)(side), n0) for side in "+-"]
+            if grid.even:
+                along = ufl.avg(inertial) - across / 6 * (along_n[0] - along_n[1])
+            else:
+                along = ufl.avg(inertial) - (h0**2 * along_n[0] - h1**2 * along_n[1]) / (3 * (h0 + h1))
             weight = along if weight is None else weight + along
         fall = 0.0 if weight is None else ufl.dot(weight, apart)
         if relative is not None:
@@ -377,8 +381,12 @@ class FluxForms:
         damped = ufl.max_value(ufl.avg(self.damping) * share * (d0 + d1) - self.dt * T, 0.0)
         self.damp = FacetForm(damped * ufl.jump(dp) * ufl.jump(q) * dS, grid.comm)
         smaller = ufl.min_value(self.fixed_stress("+"), self.fixed_stress("-"))
-        volume = fem.Constant(mesh, grid.cell_volume)  # not a number: each would be compiled anew
-        self.alternation = FacetForm(smaller / (4 * d) * across / volume * ufl.jump(dp) * ufl.jump(q) * dS, grid.comm)
+        if grid.even:
+            volume = fem.Constant(mesh, grid.cell_volume)  # not a number: each would be compiled anew
+        else:
+            h = grid.edge_in_forms()("+")
+            volume = prod(h[a] for a in range(d))  # over h0 it is the area of the face, on both sides
+        self.alternation = FacetForm(smaller / (4 * d) * h0 / volume * ufl.jump(dp) * ufl.jump(q) * dS, grid.comm)
         self.slope = fem.Function(grid.cellwise((d,)))
         self.density = fem.Function(Q)
         self._sum = fem.Function(Q)

@@ -69,22 +69,20 @@ class MixedCells:
         Their volumes (m,), m^d.
     contents
         What the cells hold.
-    h : (d,), m
-        Edges of a cell.
     """
 
-    def __init__(self, rows, cells, low, high, x, volume, contents: CellContents, h: NDArray[np.float64]):
+    def __init__(self, rows, cells, low, high, x, volume, contents: CellContents):
         self._rows = rows
         self._x = x
         self._volume = volume
-        self._h = h
         own, first, self._at, count = np.unique(cells, return_index=True, return_inverse=True, return_counts=True)
-        self._filled, middle = contents.slot(own), contents.centroid[own] / h
+        self._h = contents.grid.sizes(own)
+        self._filled, middle = contents.slot(own), contents.centroid[own] / self._h
         self._room = np.minimum(ROUND_OFF - 0.5 - middle, 0.0), np.maximum(0.5 - ROUND_OFF - middle, 0.0)
         count, first = count[self._at], first[self._at]
         ends = 1 + np.flatnonzero(np.diff(np.cumsum(count) // PAIRS, append=-1))
         met = [self._crossed(slice(a, b), first, count, low, high) for a, b in pairwise([0, *ends])]
-        size, share = np.maximum(high - low, NEAR), volume / h.prod()
+        size, share = np.maximum(high - low, NEAR), volume / contents.grid.sizes(cells).prod(axis=-1)
         self._lines = []
         for axis, found in enumerate(zip(*met, strict=True)):
             line, piece, meets = (np.concatenate(rows) for rows in zip(*found, strict=True))
@@ -180,7 +178,7 @@ def graded(
     with np.errstate(divide="ignore"):
         series = 1 / contents.mean(1 / kappa)
     parts = []  # of the variance, by the linear change along each axis
-    for x, least in zip(offset.T, (NEAR * contents.grid.h) ** 2, strict=True):
+    for x, least in zip(offset.T, (NEAR * contents.grid.sizes(contents.filled).T) ** 2, strict=True):
         middle, moment = contents.mean(x), contents.mean(x * kappa)
         spread = contents.mean(x**2) - middle**2
         parts.append(np.divide((moment - middle * mean) ** 2, spread, out=np.zeros(len(mean)), where=spread > least))
@@ -209,10 +207,11 @@ def mixed_cells(cut: CutDomains, alike: NDArray[np.float64], contents: CellConte
     rows = np.flatnonzero(mixed[cells])
     rows = rows[np.argsort(cells[rows], kind="stable")]
     cells, volume = cells[rows], volume[rows]
-    x = (cut.x[rows] - grid.midpoints[cells]) / grid.h + 0.5
+    h = grid.sizes(cells)
+    x = (cut.x[rows] - grid.midpoints[cells]) / h + 0.5
     if cut.domains:
-        low, high = (((y[rows] - grid.midpoints[cells]) / grid.h + 0.5).clip(0, 1) for y in (low, high))
+        low, high = (((y[rows] - grid.midpoints[cells]) / h + 0.5).clip(0, 1) for y in (low, high))
     else:
-        half = 0.5 * (volume / grid.cell_volume)[:, None] ** (1 / grid.dim)
+        half = 0.5 * (volume / grid.volumes(cells))[:, None] ** (1 / grid.dim)
         low, high = x - half, x + half
-    return MixedCells(rows, cells, low, high, x, volume, contents, grid.h)
+    return MixedCells(rows, cells, low, high, x, volume, contents)

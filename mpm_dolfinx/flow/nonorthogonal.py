@@ -44,8 +44,9 @@ def off_facets(contents: CellContents, facets: NDArray[np.int32]) -> NDArray[np.
     grid = contents.grid
     first, other = grid.facet_cells[facets].T
     apart = contents.centroid[other] - contents.centroid[first]
-    across = np.abs(grid.midpoints[other] - grid.midpoints[first]) > 0.5 * grid.h
-    return facets[(np.where(across, 0.0, np.abs(apart) / grid.h) > ALONG).any(axis=1)]
+    h = grid.sizes(first)
+    across = np.abs(grid.midpoints[other] - grid.midpoints[first]) > 0.5 * h
+    return facets[(np.where(across, 0.0, np.abs(apart) / h) > ALONG).any(axis=1)]
 
 
 class Gradients:
@@ -60,9 +61,8 @@ class Gradients:
     """
 
     def __init__(self, contents: CellContents, sides: OpenSides):
-        grid = contents.grid
+        self._grid = grid = contents.grid
         d = contents.grid.dim
-        h = contents.grid.h
         centroid = contents.centroid
         share = contents.open
         towards = np.repeat(np.arange(d), 2)
@@ -77,11 +77,13 @@ class Gradients:
         way = centroid[there] - centroid[contents.filled][:, None]
         along = np.where(inside[:, :, None], way / 2, 0.0)
         along[:, np.arange(2 * d), towards] = 0.0
-        off = np.abs(along / h).max(axis=(1, 2)) > ALONG / 2
-        off[at[(np.abs(foot / h) > ALONG).any(axis=1)]] = True
+        h = grid.sizes(contents.filled)
+        off = np.abs(along / (h if grid.even else h[:, None])).max(axis=(1, 2)) > ALONG / 2
+        off[at[(np.abs(foot / grid.sizes(sides.cells)) > ALONG).any(axis=1)]] = True
         self.rows = rows = np.flatnonzero(off)
         """Places of these cells among the filled ones."""
-        way[:, np.arange(2 * d), towards] += np.tile([-1, 1], d) * h[towards]
+        apart = h[towards] if grid.even else grid.between(contents.filled[:, None], there, towards)
+        way[:, np.arange(2 * d), towards] += np.tile([-1, 1], d) * apart
         self._here = contents.filled[rows]
         self._there = there[rows]
         self._inside = inside[rows]
@@ -97,7 +99,7 @@ class Gradients:
         size = np.linalg.norm(sides.area, axis=1)[self._faces[self._known]]
         at_sides = self._at[self._known]
         weight = SIDES * size / sum_by(at_sides, size, len(rows))[at_sides]
-        self._of_cells, self._of_sides = self._units(self._sealed(contents, sides)[rows], weight, h.min())
+        self._of_cells, self._of_sides = self._units(self._sealed(contents, sides)[rows], weight)
 
     def _sealed(self, contents: CellContents, sides: OpenSides) -> NDArray[np.float64]:
         """Return the area vectors (n, d) of sealed sides in the filled cells, over that of a cell's face."""
@@ -105,20 +107,21 @@ class Gradients:
         out = -(share[:, :, 1] - share[:, :, 0])
         for axis in range(grid.dim):
             area = sum_by(contents.slot(sides.cells), sides.area[:, axis], len(out))
-            out[:, axis] -= area * grid.h[axis] / grid.cell_volume
+            out[:, axis] -= area * grid.along(contents.filled, axis) / grid.volumes(contents.filled)
         return np.where(np.linalg.norm(out, axis=1, keepdims=True) > ALONG, out, 0.0)
 
     def _units(
-        self, sealed: NDArray[np.float64], weight: NDArray[np.float64], h: float
+        self, sealed: NDArray[np.float64], weight: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the gradients by a unit of difference to each neighbour (n, 2 d, d), and to each side (m, d), 1/m."""
         known, d = self._known, self._way.shape[2]
         at = self._at[known]
         reach = self._reach[known]
-        near = (NEAREST * h) ** 2
-        to_cells = self._inside[:, :, None] * self._way / np.maximum((self._way**2).sum(axis=2), near)[:, :, None]
+        near = np.broadcast_to((NEAREST * self._grid.sizes(self._here).min(axis=-1)) ** 2, len(self._here))
+        apart = np.maximum((self._way**2).sum(axis=2), near[:, None])
+        to_cells = self._inside[:, :, None] * self._way / apart[:, :, None]
         distance = np.einsum("md,md->m", reach, self._normal[known])
-        to_sides = (weight / np.maximum(distance**2, near))[:, None] * reach
+        to_sides = (weight / np.maximum(distance**2, near[at]))[:, None] * reach
         size = np.linalg.norm(sealed, axis=1, keepdims=True)
         closed = np.divide(sealed, np.sqrt(np.maximum(size, size**2)), out=np.zeros_like(sealed), where=size > 0)
         A = np.einsum("nki,nkj->nij", to_cells, self._way) + closed[:, :, None] * closed[:, None, :]

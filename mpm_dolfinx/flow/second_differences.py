@@ -3,10 +3,10 @@
 
     (H p, q) = sum over cells and axes of w D p D q,   D p = h ((p_+ - p) / d_+ - (p - p_-) / d_-),
 
-where d_+- are the distances between the centroids of what the cells hold.  A cell has a term along an axis where both
-its faces are open.  Pressures that alternate from cell to cell meet 16 w, as they meet 4 times the coefficient of a
-damping of jumps; a gradient that is even meets nothing, so that steep pressures are not smeared, up to sides of the
-body.  The sum of H p over the cells is zero: no fluid is lost.
+where h is the edge of the cell and d_+- are the distances between the centroids of what the cells hold.  A cell has a
+term along an axis where both its faces are open.  Pressures that alternate from cell to cell meet 16 w, as they meet 4
+times the coefficient of a damping of jumps; a gradient that is even meets nothing, so that steep pressures are not
+smeared, up to sides of the body.  The sum of H p over the cells is zero: no fluid is lost.
 """
 
 from __future__ import annotations
@@ -44,7 +44,6 @@ def second_differences(
     """
     own = unknowns.owned
     number = unknowns.map.indices
-    h = grid.h
     beside = grid.beside(own)
     active = (beside >= 0) & (number[beside] >= 0)
     row, axis = np.nonzero(active.all(axis=2))
@@ -54,8 +53,11 @@ def second_differences(
         np.minimum(opening[here, axis, 0], opening[low, axis, 1]),
         np.minimum(opening[here, axis, 1], opening[high, axis, 0]),
     )
-    apart = [h[axis] + centroid[b, axis] - centroid[a, axis] for a, b in ((low, here), (here, high))]
-    steep = [h[axis] / np.maximum(d, h[axis] / 2) for d in apart]
+    h = [grid.along(cells, axis) for cells in (low, here, high)]
+    between = [h[1], h[1]] if grid.even else [(h[0] + h[1]) / 2, (h[1] + h[2]) / 2]
+    pairs = (low, here), (here, high)
+    apart = [way + centroid[b, axis] - centroid[a, axis] for way, (a, b) in zip(between, pairs, strict=True)]
+    steep = [h[1] / np.maximum(d, way / 2) for way, d in zip(between, apart, strict=True)]
     values = np.sqrt(share * strength[row, axis] / 4)[:, None] * np.stack([steep[0], -sum(steep), steep[1]], axis=1)
     columns = number[np.stack([low, here, high], axis=1)].astype(PETSc.IntType)
     starts = np.arange(0, 3 * len(row) + 1, 3, dtype=PETSc.IntType)

@@ -415,7 +415,7 @@ class StorageProblem:
         self.dt = dt
         self._before = before or Rates(*np.zeros((4, system.unknowns.size)))
         outflow = flow(before is None)
-        reach = 4 * forms.grid.h.max() ** 2  # no two centroids are further apart than 2 h
+        reach = 4 * forms.grid.most**2  # no two centroids are further apart than 2 h
         tau, least = contents.set_damping(), dt * outflow.mobility.min(axis=1)
         if forms.retains:  # dry pores hardly couple the two balances, and what they take up stabilises as well
             capacity, coupled = (values / contents.volume for values in forms.drained(data))
@@ -439,9 +439,9 @@ class StorageProblem:
     ) -> PETSc.Mat:
         """Return what the cells' softness (n,) adds to the damping tau (n,), 1/Pa, beside the flow."""
         contents, grid = self._contents, self.forms.grid
-        flow = self.dt * mobility / grid.h**2
+        flow = self.dt * mobility / grid.sizes(contents.filled) ** 2
         more = np.maximum((softest * tau)[:, None] - flow, 0) - np.maximum(tau[:, None] - flow, 0)
-        strength = grid.cell_volume * more
+        strength = (grid.cell_volume if grid.even else grid.volumes(contents.filled)[:, None]) * more
         return second_differences(self.system.unknowns, grid, strength, contents.centroid, contents.open)
 
     @property
@@ -564,7 +564,7 @@ class StorageProblem:
         Of what the laws of the conductivity, and the geometry of the fluxes, make of it no matrix is assembled: it is
         taken from differences (Knoll and Keyes 2004).  `set_fluxes` makes the fluxes those at u again.
         """
-        h = self.forms.grid.h.min()
+        h = self.forms.grid.least
         here, density = self._rates(self._flow(False)).cells, self._density
 
         def along(v: PETSc.Vec) -> NDArray[np.float64]:

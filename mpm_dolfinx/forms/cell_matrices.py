@@ -14,7 +14,6 @@ from petsc4py import PETSc
 
 import numpy as np
 import ufl
-from dolfinx import fem
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.caching import Latest
@@ -25,7 +24,7 @@ from mpm_dolfinx.grid.grid import Grid, sum_by
 def shape_gradients(points: FormPoints) -> list:
     """Return the gradients of the cell's Q1 shape functions at the point as UFL, in 3D their means over a piece."""
     grid, xi = points.grid, points.offset
-    h = fem.Constant(grid.mesh, grid.h)
+    h = grid.edge_in_forms()
     out = []
     for signs in grid.signs.tolist():
         t = [0.5 + signs[a] * xi[a] / h[a] for a in range(grid.dim)]
@@ -43,7 +42,7 @@ def shape_gradients(points: FormPoints) -> list:
 def shape_hoops(points: FormPoints) -> list:
     """Return N / r of the cell's Q1 shape functions N as UFL, in axisymmetry: their means, see `FormPoints.hoop`."""
     grid, hoop = points.grid, points.functions["hoop"]
-    h, out = fem.Constant(grid.mesh, grid.h), []
+    h, out = grid.edge_in_forms(), []
     for s in grid.signs.tolist():
         linear = (0.5 + s[0] * hoop[0] / h[0]) * (0.5 + s[1] * hoop[1] / h[1])
         out.append((linear + s[0] * s[1] * (hoop[2] - hoop[0] * hoop[1]) / (h[0] * h[1])) / hoop[3])
@@ -248,7 +247,7 @@ class StackedElementMatrices:
         nodes, values = g.shape[1], self._values.evaluate(data, chosen, live)
         tangent = values[:, self._entry].reshape(-1, d**3, d)
         right = (tangent @ g.transpose(0, 2, 1)).reshape(cells, most * d, d * d * nodes)
-        weight = np.where(missing.ravel(), 0.0, data["weight"][chosen, 0] * self._grid.cell_volume)
+        weight = np.where(missing.ravel(), 0.0, data["weight"][chosen, 0] * self._grid.volumes(data.cells[chosen]))
         g *= weight[:, None, None]
         left = g.reshape(cells, most, nodes, d).transpose(0, 2, 1, 3).reshape(cells, nodes, most * d)
         matrices = (left @ right).reshape(cells, nodes, d, d, nodes)

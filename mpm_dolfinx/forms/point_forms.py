@@ -127,7 +127,18 @@ class FormPoints:
 
     def increment(self, u: fem.Function):
         """Return Delta = I + grad u at the points as UFL."""
+        if self.grid.axisymmetric and not self.grid.even:
+            if "increments" not in self.live:
+                self.follow("increments", (3, 3), lambda data: data.increments(u.x.array.copy()))
+            return self.functions["increments"]
         return ufl.Identity(self.grid.stretches) + (self.grad(u) if self.grid.axisymmetric else self.gradient(u))
+
+    def moved_by(self, u: fem.Function):
+        """Return u at the points as UFL, in cells of many sizes as a coefficient: for forms called for other cells."""
+        if self.grid.even:
+            return self.value(u)
+        d = self.grid.dim
+        return self.follow("displaced", (d,), lambda data: self.grid.at(data.cells, data.x, u.x.array.reshape(-1, d)))
 
     def deformation(self, u: fem.Function):
         """Return F = Delta F_n at the points, which carry F_n as F, as a UFL variable."""
@@ -211,8 +222,9 @@ class Places(Keyed):
     def stretch(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return 1 + u_r / r (n,) of nodal displacements u (nodes, d), m, in axisymmetry: see `FormPoints.hoop`."""
         grid, (*offset, product, radius) = self.grid, self.hoop.T
-        hats = [0.5 + x[:, None] * grid.signs[:, a] / grid.h[a] for a, x in enumerate(offset)]
-        uneven = (product - offset[0] * offset[1])[:, None] * grid.signs.prod(axis=1) / grid.h.prod()
+        h = grid.h if grid.even else grid.sizes(self.cells).T[..., None]
+        hats = [0.5 + x[:, None] * grid.signs[:, a] / h[a] for a, x in enumerate(offset)]
+        uneven = (product - offset[0] * offset[1])[:, None] * grid.signs.prod(axis=1) / h.prod(axis=0)
         return 1 + ((hats[0] * hats[1] + uneven) * u[grid.cell_nodes[self.cells], 0]).sum(axis=1) / radius
 
 
@@ -237,7 +249,7 @@ class PointData(Keyed):
         self.cells = places.cells
         self.x = places.x
         self.volume, n = weight, len(places.cells)
-        self._rows = {"offset": places.offset, "weight": (weight / points.grid.cell_volume)[:, None]}
+        self._rows = {"offset": places.offset, "weight": (weight / points.grid.volumes(self.cells))[:, None]}
         if points.grid.dim == 3:
             self._rows["mixed"] = np.zeros_like(places.x) if places.mixed is None else places.mixed
         if points.grid.axisymmetric:
@@ -264,12 +276,20 @@ class PointData(Keyed):
         now = u.x.array.copy()  # of the key nothing changes
         return self._gradients(now, lambda: self.gradients_of(now))
 
+    def increments(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return I + grad u (n, 9), in axisymmetry with hoops, of a Q1 vector function with these values."""
+        out = np.zeros((len(self.cells), 3, 3))
+        out[:, :2, :2] = np.eye(2) + self.gradients_of(u).reshape(-1, 2, 2)
+        out[:, 2, 2] = self.places.stretch(u.reshape(-1, 2))
+        return out.reshape(len(out), 9)
+
     def gradients_of(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the gradients (n, d^2) of a Q1 vector function with these values, a local array."""
         places = self.places
         grid = self.points.grid
         d = self.points.grid.dim
-        of_cells, out = grid.monomials @ u.take(places.nodal), np.empty((len(self.cells), d, d))
+        of_cells = grid.over_edges(grid.monomials @ u.take(places.nodal), places.filled)
+        out = np.empty((len(self.cells), d, d))
         # component by component: rows of a few numbers each would take numpy six times as long
         for axis in range(d):
             along = 0.0
@@ -369,7 +389,7 @@ class PointForm:
         The points.
     dense
         Tested by DG0, it has a value for each of the filled cells rather than for each cell of the grid: as
-        `PointExpression`, it is called for other cells.
+        `PointExpression`, it is called for other cells, which must be equal.
     """
 
     def __init__(self, form: ufl.Form, points: FormPoints, dense: bool = False):
@@ -453,8 +473,9 @@ class FacetSum:
 class PointExpression:
     """A UFL expression of the fields that points carry, evaluated at every point.
 
-    The kernel sees of its cell the size only, which all have in common.  So it is called for as many
-    different cells, whichever, and DG0, which tests the expression, keeps a value for each point.
+    The kernel sees of its cell the size only, by which it is divided: of grid functions expressions have no gradients,
+    but where all cells are equal.  So it is called for as many different cells, whichever, and DG0, which tests the
+    expression, keeps a value for each point.
 
     Parameters
     ----------
@@ -465,7 +486,7 @@ class PointExpression:
     """
 
     def __init__(self, expression: ufl.core.expr.Expr, points: FormPoints):
-        self._volume, self._shape = points.grid.cell_volume, expression.ufl_shape
+        self._shape = expression.ufl_shape
         q = ufl.TestFunction(points.grid.cellwise(self._shape))
         dx = ufl.dx(domain=points.grid.mesh, subdomain_id=_compat.SUBDOMAIN, metadata={"quadrature_degree": 0})
         self._compiled = _compat.CompiledForm(ufl.inner(expression, q) * dx)
@@ -474,6 +495,8 @@ class PointExpression:
         self._bound = {size: self._compiled.bind(np.arange(size)) for size in sorted(sizes)}
         self._rows.room(max(sizes))
         self._values = np.empty((max(sizes), int(np.prod(self._shape, dtype=int))))
+        volumes = points.grid.volumes(np.arange(max(sizes)))
+        self._volume = volumes if points.grid.even else volumes[:, None]
 
     def live(self, data: PointData) -> dict[str, NDArray[np.float64]]:
         """Return the present values of the fields that change while the points stay."""
@@ -492,7 +515,8 @@ class PointExpression:
             self._rows(data, slice(start, stop) if chosen is None else chosen[start:stop], live)
             values[:] = 0.0
             self._compiled.assemble_vector(values.reshape(-1), self._rows.room(size)[:size], self._bound[size])
-            np.divide(values[: stop - start], self._volume, out=out[start:stop])
+            of_cell = self._volume if np.isscalar(self._volume) else self._volume[: stop - start]
+            np.divide(values[: stop - start], of_cell, out=out[start:stop])
             start = stop
         return out.reshape(count, *self._shape)
 
@@ -510,11 +534,16 @@ class CellSums:
 
     def __init__(self, quantities: Sequence[ufl.core.expr.Expr], points: FormPoints):
         self._count = len(quantities)
-        q = ufl.TestFunction(points.grid.cellwise((self._count,)))
-        self._form = PointForm(ufl.inner(ufl.as_vector(quantities), q) * points.dx, points, dense=True)
+        self._grid, q = points.grid, ufl.TestFunction(points.grid.cellwise((self._count,)))
+        dense = points.grid.even
+        self._form = PointForm(ufl.inner(ufl.as_vector(quantities), q) * points.dx, points, dense)
 
     def __call__(self, data: PointData) -> NDArray[np.float64]:
         """Return the sums (cells, quantities) in the filled cells of the points."""
+        if not self._grid.even:
+            sums = np.zeros((self._grid.num_local, self._count))
+            self._form.assemble_vector(sums.reshape(-1), data)
+            return sums[data.places.filled]
         sums = np.zeros((len(data.places.filled), self._count))
         self._form.assemble_vector(sums.reshape(-1), data)
         return sums

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The background grid: a box of equal quadrilaterals or hexahedra, in which points are found by arithmetic.
+"""The background grid: a box of quadrilaterals or hexahedra between lines along the axes.
+
+Where cells are equal points are found in them by arithmetic, else by searching the lines of each axis.  What depends on
+the size of a cell asks for `sizes`, `volumes` and their like: of equal cells these are one row, `h`, or one number.
 
 Its mesh is made when first it is needed: by then a simulation has shared out the cells by the points in them.
 """
@@ -17,8 +20,9 @@ from dolfinx import fem
 from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.base import _compat
-from mpm_dolfinx.base.tolerances import EPSILON, NEAR, SAME
+from mpm_dolfinx.base.tolerances import NEAR, SAME
 from mpm_dolfinx.base.validation import flag, instance, line, numbers
+from mpm_dolfinx.grid.lines import checked, equal, rounding
 from mpm_dolfinx.grid.partition import destinations, owners
 
 SIDES = {
@@ -37,6 +41,7 @@ MOST = 2**31 - 1
 SNAP = 1e-10
 """Cells: vertices this close to a grid plane, or as close as rounding tells, lie on it: far below what answers tell."""
 ORDER = "the order is Grid(lower, upper, cells)"
+MANY = "grid: h of cells of many sizes: must be asked of each cell, see sizes"
 
 
 def side(name: str, dim: int) -> tuple[int, int]:
@@ -63,9 +68,13 @@ def among(numbers: NDArray[np.integer], chosen: NDArray[np.integer]) -> NDArray[
     return chosen[np.minimum(np.searchsorted(chosen, numbers), len(chosen) - 1)] == numbers
 
 
-def rounding(x: NDArray[np.float64]) -> float:
-    """Return by how much coordinates of this size, m, may differ although they should be equal."""
-    return 8 * EPSILON * float(np.abs(x).max(initial=0.0))
+def across_faces(grid: Grid, n: Any) -> tuple[Any, Any, Any]:
+    """Return the edges across a face, m, of the cells beside it, "+" and "-", and their mean, as UFL; n: its normal."""
+    h = grid.edge_in_forms()
+    if grid.even:
+        return (sum(abs(n[a]) * h[a] for a in range(grid.dim)),) * 3
+    first, other = (sum(abs(n[a]) * h(side)[a] for a in range(grid.dim)) for side in "+-")
+    return first, other, (first + other) / 2
 
 
 class Cells:
@@ -75,7 +84,7 @@ class Cells:
     the Q1 degrees of freedom; node_x (nodes, d), midpoints (cells, d): places from the grid's base, m; signs
     (2^d, d): on which side of the midpoint a node lies; cell_number (cells,): lexicographic numbers; locals: the way
     back, -1 where there is none; owners: ranks of all cells, copy by copy; cell_facets (cells, 2d); facet_cells
-    (facets, 2): -1 where there is none.
+    (facets, 2): -1 where there is none; sizes (cells, d): their edges, m, where these are of many sizes.
     """
 
     def __init__(self, grid: Grid, mesh: Any, owners: NDArray[np.int32]):
@@ -91,10 +100,11 @@ class Cells:
         # all cells list their vertices in the same order (tested), so one set of signs serves all, also a process
         # without a cell: it compiles the same forms
         self.signs = np.concatenate(grid.comm.allgather(np.sign(corners[:1] - self.midpoints[:1, None])))[0]
-        self.cell_number = grid.number(np.floor((self.midpoints - grid.low) / grid.h).astype(np.int64))
+        self.cell_number = grid.number(grid.index_from_base(self.midpoints))
         if grid.copies > 1:
             brought = np.concatenate(grid.comm.allgather(np.flatnonzero(owners == grid.comm.rank)))
             self.cell_number = brought[np.asarray(mesh.topology.original_cell_index)]
+        self.sizes = None if grid.even else grid.sizes_of(self.cell_number)
         self.locals = np.full(len(owners), -1, dtype=np.int32)
         self.locals[self.cell_number] = np.arange(self.num_local)
         topology = mesh.topology
@@ -120,7 +130,7 @@ def of_cells(name: str) -> property:
 
 
 class Grid:
-    """Background grid of equal cells over the box [lower, upper].
+    """Background grid over the box [lower, upper]: of equal cells, or of those between given lines.
 
     Bodies must stay in it; what is empty of it costs next to nothing.  Its sides are the walls of a scene:
     "left", "right" (x), "bottom", "top" (y in 2D, z in 3D), in 3D also "front", "back" (y).
@@ -133,6 +143,9 @@ class Grid:
         Number of cells along each axis, at least 1.
     comm
         Processes that share the grid.
+    lines : (n,) along each axis, m
+        In place of the first three: the coordinates of all grid lines along each of d axes, ascending; see `graded`.
+        Lines that are equally far apart along all axes are the grid of equal cells.
     axisymmetric
         The first axis is the radius r >= 0 and the second the axis of revolution: bodies are what the plane sweeps as
         it turns once, without torsion.  Volumes, forces and outflows are those of the whole revolution, m^3, N, m^3/s.
@@ -141,13 +154,16 @@ class Grid:
     Raises
     ------
     ValueError
-        Corners that are not finite or not in order, numbers of cells that are no integers >= 1, more cells than
-        PETSc's numbers count, or an axisymmetric grid in 3D or beyond its axis.
+        Corners or lines that are not finite or not in order, numbers of cells that are no integers >= 1, more cells
+        than PETSc's numbers count, or an axisymmetric grid in 3D or beyond its axis.
 
     Attributes
     ----------
-    dim, shape, h, lower, upper
-        d; cells along each axis (d,); their edges (d,), m; corners (d,), m.
+    dim, shape, lower, upper
+        d; cells along each axis (d,); corners (d,), m.
+    even, lines, widths
+        Whether all cells are equal; the lines (n,), m, along each axis, counted from `base`; where cells have many
+        sizes, their edges (n - 1,), m, along each axis.
     snap
         Distance to a grid plane, along each axis (d,), below which a vertex is taken to lie on it, cells.
     base, low, high
@@ -163,13 +179,21 @@ class Grid:
 
     def __init__(
         self,
-        lower: ArrayLike,
-        upper: ArrayLike,
-        cells: Sequence[int],
+        lower: ArrayLike | None = None,
+        upper: ArrayLike | None = None,
+        cells: Sequence[int] | None = None,
         comm: MPI.Intracomm = MPI.COMM_WORLD,
         *,
+        lines: Sequence[ArrayLike] | None = None,
         axisymmetric: bool = False,
     ):
+        self.even = lines is None
+        if not self.even:
+            if any(value is not None for value in (lower, upper, cells)):
+                raise ValueError("grid: lines are given, must have no lower, upper and cells beside them")
+            lines = checked(lines)
+            self.even = all(map(equal, lines))
+            lower, upper, cells = ([of(x) for x in lines] for of in (np.min, np.max, lambda x: len(x) - 1))
         self.lower = numbers("grid: lower", lower, (2,), (3,), allowed="2 or 3 finite coordinates")
         self.dim = d = self.lower.size
         self.upper = numbers("grid: upper", upper, (d,), allowed=f"{d} finite coordinates, as lower")
@@ -189,12 +213,124 @@ class Grid:
             raise ValueError(
                 f"grid: cells = {line(cells)}: has {np.prod(count + 1):.3g} nodes, must be below {MOST // d}"
             )
-        self.h = (self.upper - self.lower) / self.shape
         self.base = self.lower * [not axisymmetric, *[True] * (d - 1)]
         self.low, self.high = self.lower - self.base, self.upper - self.base
-        self.snap = np.maximum(SNAP, [rounding(ends) for ends in zip(self.lower, self.upper, strict=True)] / self.h)
+        self._h = (self.upper - self.lower) / self.shape if self.even else None
+        if not self.even:
+            self.lines = tuple(x - start for x, start in zip(lines, self.base, strict=True))
+            self.widths = tuple(map(np.diff, self.lines))
+        self.finest = self._h if self.even else np.array([w.min() for w in self.widths])
+        """Shortest edges (d,), m, along each axis: of equal cells the edges."""
+        self.least, self.most = float(self.finest.min()), float(max(map(np.max, self._h if self.even else self.widths)))
+        """Shortest and longest edge of a cell, m."""
+        self.snap = np.maximum(SNAP, [rounding(e) for e in zip(self.lower, self.upper, strict=True)] / self.finest)
         self.comm = comm
         self._cells: Cells | None = None
+
+    @cached_property
+    def lines(self) -> tuple[NDArray[np.float64], ...]:
+        """The lines (n,), m, along each axis, counted from the base."""
+        return tuple(low + np.arange(n + 1) * h for low, n, h in zip(self.low, self.shape, self.h, strict=True))
+
+    @property
+    def h(self) -> NDArray[np.float64]:
+        """Edges (d,), m, of all cells, where these are equal."""
+        if self._h is None:
+            raise ValueError(MANY)
+        return self._h
+
+    @cached_property
+    def cell_volume(self) -> float:
+        """Volume of every cell, where these are equal, in axisymmetry its area in the plane (m^d)."""
+        return float(np.prod(self.h))
+
+    def sizes(self, cells: Any) -> NDArray[np.float64]:
+        """Return the edges (n, d), m, of local cells; of equal cells one row, (d,)."""
+        return self._h if self.even else self._of_process.sizes[cells]
+
+    def along(self, cells: Any, axis: Any) -> NDArray[np.float64]:
+        """Return the edges (n,), m, of local cells (n,) along an axis, one for all or each its own (n,)."""
+        return self.h[axis] if self.even else self._of_process.sizes[cells, axis]
+
+    def between(self, cells: Any, others: Any, axis: Any) -> NDArray[np.float64]:
+        """Return the distances (n,), m, of the midpoints of local cells (n,) from those beside them along an axis."""
+        return self.h[axis] if self.even else (self.along(cells, axis) + self.along(others, axis)) / 2
+
+    def volumes(self, cells: Any) -> NDArray[np.float64] | float:
+        """Return the volumes (n,), m^d, of local cells, in axisymmetry in the plane; of equal cells one number."""
+        return self.cell_volume if self.even else self._of_process.sizes[cells].prod(axis=-1)
+
+    def smallest_faces(self, cells: Any) -> NDArray[np.float64] | float:
+        """Return the volumes of local cells (n,) over their longest edges, m^(d-1); of equal cells one number."""
+        return self.volumes(cells) / self.sizes(cells).max(axis=-1)
+
+    def sizes_of(self, number: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the edges (n, d), m, of cells by their lexicographic numbers; of equal cells one row, (d,)."""
+        if self.even:
+            return self._h
+        return self.widths_of(np.stack(np.unravel_index(number % self.cells, tuple(self.shape)), axis=-1))
+
+    def sizes_at(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the edges (..., d), m, of the cells at places (..., d), m, from the base; of equal cells (d,)."""
+        if self.even:
+            return self._h
+        return self.widths_of(self.index_from_base(x.reshape(-1, self.dim))).reshape(x.shape)
+
+    def in_cells(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return places (..., d), m, from the base, as numbers of cells from the lower corner along each axis."""
+        if self.even:
+            return (x - self.low) / self._h
+        out = np.empty(x.shape)
+        for a, (lines, width) in enumerate(zip(self.lines, self.widths, strict=True)):
+            i = self.cells_along(a, x[..., a])
+            out[..., a] = i + (x[..., a] - lines[i]) / width[i]
+        return out
+
+    def cells_between(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return by how many cells places (..., d), m, from the base, are apart from others along each axis, >= 0."""
+        if self.even:
+            return np.abs((y - x) / self._h)
+        return np.abs(self.in_cells(y) - self.in_cells(x))
+
+    def places(self, index: NDArray[np.integer], share: NDArray[np.float64] | float = 0.0) -> NDArray[np.float64]:
+        """Return places (n, d), m, from the base: by indices of cells, and shares of these from their lower corners.
+
+        index (n, d) may lie beyond the grid: the cells there are as the last ones.
+        """
+        if self.even:
+            return self.low + (index + share) * self._h
+        out = np.empty(index.shape)
+        for a, (lines, width) in enumerate(zip(self.lines, self.widths, strict=True)):
+            i = np.clip(index[..., a], 0, len(width) - 1)
+            part = share if np.isscalar(share) else share[..., a]
+            out[..., a] = lines[i] + (index[..., a] - i + part) * width[i]
+        return out
+
+    def edge_in_forms(self) -> Any:
+        """Return the edges (d,), m, of the cell as UFL: of equal cells a constant."""
+        if self.even:
+            return fem.Constant(self.mesh, self._h)
+        out = fem.Function(self.cellwise((self.dim,)))
+        out.x.array[:] = self._of_process.sizes.ravel()
+        return out
+
+    def nodes_along(self, x: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Return the indices (..., d) along the axes of nodes at places (..., d), m, from the base."""
+        return np.rint(self.in_cells(x)).astype(np.int64)
+
+    def widths_of(self, index: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the edges (n, d), m, of cells by their indices (n, d) along the axes; of equal cells one row, (d,)."""
+        if self.even:
+            return self._h
+        return np.stack([w[i] for w, i in zip(self.widths, index.T, strict=True)], axis=-1)
+
+    def next_plane(self, axis: int, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the next line (n,), m, beyond coordinates (n,) of cells of many sizes; inf beyond the last one."""
+        return np.append(self.lines[axis], np.inf)[np.searchsorted(self.lines[axis], x, side="right")]
+
+    def cells_along(self, axis: int, x: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Return the indices along an axis of cells of many sizes that hold coordinates, m, clamped into the grid."""
+        return np.clip(np.searchsorted(self.lines[axis], x, side="right") - 1, 0, self.shape[axis] - 1)
 
     mesh = of_cells("mesh")
     owners = of_cells("owners")
@@ -236,7 +372,7 @@ class Grid:
         if self._cells is None:
             self._cells = self._made(owner)
         elif not keep and (self.owners[: self.cells] != owner.ravel()).any():  # of an earlier scene
-            other = Grid(self.lower, self.upper, self.shape, self.comm, axisymmetric=self.axisymmetric)
+            other = Grid(**self.given, comm=self.comm, axisymmetric=self.axisymmetric)
             other._cells = other._made(owner)
             return other
         return self
@@ -262,7 +398,7 @@ class Grid:
         count = self.copies * self.nodes
         start, stop = (count * (self.comm.rank + end) // self.comm.size for end in (0, 1))
         index = np.stack(np.unravel_index(np.arange(start, stop) % self.nodes, self.shape + 1), axis=-1)
-        return self.low + index * self.h
+        return self.places(index)
 
     @property
     def copies(self) -> int:
@@ -291,10 +427,12 @@ class Grid:
         """Return a new cellwise function that stands in forms for rows of values; all of a shape share its memory."""
         return fem.Function(self.cellwise(shape), self._of_process.memory(shape).x)
 
-    @cached_property
-    def cell_volume(self) -> float:
-        """Volume of a cell, in axisymmetry its area in the plane (m^d)."""
-        return float(np.prod(self.h))
+    @property
+    def given(self) -> dict[str, Any]:
+        """What makes an equal grid: its corners and numbers of cells, or its lines."""
+        if self.even:
+            return {"lower": self.lower, "upper": self.upper, "cells": self.shape}
+        return {"lines": [x + start for x, start in zip(self.lines, self.base, strict=True)]}
 
     @property
     def reach(self) -> float:
@@ -304,7 +442,7 @@ class Grid:
     @property
     def has_axis(self) -> bool:
         """Whether its side "left" is the axis of revolution."""
-        return self.axisymmetric and bool(self.lower[0] <= SAME * self.h[0])
+        return self.axisymmetric and bool(self.lower[0] <= SAME * self.finest[0])
 
     def around(self, x: NDArray[np.float64]) -> NDArray[np.float64] | float:
         """Return by what measures in the plane at places (n, d), m, count: 2 pi r (n,), m, in axisymmetry, else 1."""
@@ -320,6 +458,8 @@ class Grid:
 
     def index_from_base(self, x: NDArray[np.float64]) -> NDArray[np.int64]:
         """Return the same of places that count from the base."""
+        if not self.even:
+            return np.stack([self.cells_along(a, x[:, a]) for a in range(self.dim)], axis=1)
         i = np.floor((x - self.low) / self.h).astype(np.int64)
         return np.clip(i, 0, self.shape - 1, out=i)
 
@@ -336,8 +476,7 @@ class Grid:
         copy = np.zeros(len(self.node_x), dtype=np.int64)
         if self.copies > 1:
             copy[self.cell_nodes] = (self.cell_number // self.cells)[:, None]
-        index = np.rint((self.node_x[nodes] - self.low) / self.h).astype(np.int64)
-        return np.column_stack([index, copy[nodes]])
+        return np.column_stack([self.nodes_along(self.node_x[nodes]), copy[nodes]])
 
     def cell_places(self, cells: NDArray[np.integer]) -> NDArray[np.int64]:
         """Return the same of local cells (n,)."""
@@ -356,10 +495,11 @@ class Grid:
 
     def outside(self, x: NDArray[np.float64], tolerance: float = SAME) -> NDArray[np.bool_]:
         """Return which places, from the base, lie outside the grid by more than `tolerance` cells, and by rounding."""
-        tolerance = tolerance + rounding(np.stack([self.lower, self.upper])) / self.h
-        inside = np.ones(len(x), dtype=bool)
+        least = self.h if self.even else np.array([w[[0, -1]].min() for w in self.widths])  # of those at the sides
+        tolerance = tolerance + rounding(np.stack([self.lower, self.upper])) / least
+        inside, cells = np.ones(len(x), dtype=bool), None if self.even else self.in_cells(x)
         for a in range(self.dim):
-            y = (x[:, a] - self.low[a]) / self.h[a]
+            y = (x[:, a] - self.low[a]) / self.h[a] if self.even else cells[:, a]
             inside &= (y >= -tolerance[a]) & (y <= self.shape[a] + tolerance[a])
         return ~inside  # nan is outside as well
 
@@ -370,25 +510,33 @@ class Grid:
 
         mixed (n, 3), m^2: in 3D the means over pieces about these points, by their mean products of offsets.
         """
-        hats = self._hats(cells, x)
+        hats, h = self._hats(cells, x), self.sizes(cells).T[..., None] if not self.even else self.h
         dN = np.empty((*hats[0].shape, self.dim))
         for a in range(self.dim):
             b, *more = [k for k in range(self.dim) if k != a]
             others = reduce(np.multiply, [hats[k] for k in (b, *more)])
             if mixed is not None and more:
                 c = more[0]
-                others = others + mixed[:, a, None] * (self.signs[:, b] * self.signs[:, c] / (self.h[b] * self.h[c]))
-            np.multiply(others, self.signs[:, a] / self.h[a], out=dN[:, :, a])
+                others = others + mixed[:, a, None] * (self.signs[:, b] * self.signs[:, c] / (h[b] * h[c]))
+            np.multiply(others, self.signs[:, a] / h[a], out=dN[:, :, a])
         return dN
 
     @cached_property
     def monomials(self) -> NDArray[np.float64]:
         """Coefficients (2^d, 2^d) of the Q1 shape functions about the midpoint of a cell, one column each.
 
-        Row s is that of the product of the offsets along the axes whose bits are set in s.
+        Row s is that of the product of the offsets along the axes whose bits are set in s; of cells of many sizes these
+        count in edges of the cell, see `over_edges`.
         """
         bits = np.arange(2**self.dim)[:, None, None] >> np.arange(self.dim) & 1
-        return np.where(bits, self.signs / self.h, 0.5).prod(axis=2)
+        return np.where(bits, self.signs / (self.h if self.even else 1.0), 0.5).prod(axis=2)
+
+    def over_edges(self, coefficients: NDArray[np.float64], cells: NDArray[np.int32]) -> NDArray[np.float64]:
+        """Return what `monomials` give (d, 2^d, cells) for offsets in m: of equal cells the same."""
+        if self.even:
+            return coefficients
+        bits = np.arange(2**self.dim)[:, None, None] >> np.arange(self.dim) & 1
+        return coefficients / np.where(bits, self.sizes(cells), 1.0).prod(axis=2)
 
     def shape_values(self, cells: NDArray[np.int32], x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the Q1 shape functions (n, 2^d) of local cells at points."""
@@ -404,7 +552,7 @@ class Grid:
 
     def _hats(self, cells: NDArray[np.int32], x: NDArray[np.float64]) -> list[NDArray[np.float64]]:
         """Return the linear factors (n, 2^d) of the shape functions, one an axis."""
-        y = (x - self.midpoints[cells]) / self.h
+        y = (x - self.midpoints[cells]) / self.sizes(cells)
         return [0.5 + y[:, a, None] * self.signs[:, a] for a in range(self.dim)]
 
     def interior_facets(self, active: NDArray[np.bool_], cells: NDArray[np.int32]) -> NDArray[np.int32]:
@@ -418,7 +566,7 @@ class Grid:
         """Return which nodes lie on a side of the box."""
         axis, end = side(name, self.dim)
         plane = (self.low, self.high)[end][axis]
-        return np.abs(self.node_x[:, axis] - plane) < NEAR * self.h[axis]
+        return np.abs(self.node_x[:, axis] - plane) < NEAR * self.finest[axis]
 
 
 class GridOfGroups(Grid):

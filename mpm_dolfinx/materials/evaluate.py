@@ -7,6 +7,7 @@ import logging
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from inspect import signature
+from typing import Any
 
 import numpy as np
 import ufl
@@ -56,12 +57,16 @@ class LawAtPoints:
         self.law = law
         self._shapes = shapes
         self._stretches = grid.stretches if stretches is None else stretches
-        self._by_scene = by_scene(grid, cell_size)
+        self._cell_size = cell_size
 
     @cached_property
     def points(self) -> FormPoints:
         """The points, with F and what the law takes."""
         return FormPoints(self.grid, F=(self._stretches, self._stretches), **self._shapes)
+
+    @cached_property
+    def _by_scene(self) -> dict[str, Any]:
+        return by_scene(self.grid, self._cell_size, self.law, self.points)
 
     @cached_property
     def _F(self):
@@ -181,15 +186,24 @@ def knows_space(grid: Grid, m: Skeleton) -> bool:
     return True
 
 
-def by_scene(grid: Grid, cell_size: float | None = None) -> dict[str, fem.Constant]:
-    """Return what the scene gives to laws, see `BY_SCENE`, as UFL constants; the time is to be set."""
+def by_scene(
+    grid: Grid, cell_size: float | None = None, law: type[Skeleton] | None = None, points: FormPoints | None = None
+) -> dict[str, Any]:
+    """Return what the scene gives to laws, see `BY_SCENE`, as UFL constants; the time is to be set.
+
+    points: of a law; in cells of many sizes they carry that of theirs.
+    """
+    if points is not None and not grid.even and cell_size is None and "cell_size" in law.by_scene:
+        sizes = points.follow("cell_size", (), lambda data: grid.volumes(data.cells)[:, None] ** (1 / grid.dim))
+        return {"dt": fem.Constant(grid.mesh, 0.0), "cell_size": sizes}
     size = mean_size(grid) if cell_size is None else cell_size
     return dict(zip(BY_SCENE, (fem.Constant(grid.mesh, 0.0), fem.Constant(grid.mesh, float(size))), strict=True))
 
 
 def mean_size(grid: Grid) -> float:
-    """Return the mean length of a cell, m: that of a square or cube of its size."""
-    return float(np.prod(grid.h) ** (1 / grid.dim))
+    """Return the mean length of a cell, of many sizes the largest one, m: that of a square or cube of its size."""
+    h = grid.h if grid.even else [w.max() for w in grid.widths]
+    return float(np.prod(h) ** (1 / grid.dim))
 
 
 MOST = 100.0
@@ -224,7 +238,7 @@ class SoftnessAtPoints:
         s = ufl.variable(fem.Constant(grid.mesh, 1.0))
         F = points.F - (1 - s) * points.dF
         F = ufl.variable(block(F) if d > grid.dim else F)
-        self._by_scene = by_scene(grid)
+        self._by_scene = by_scene(grid, None, law, points)
         values = {**{name: getattr(points, name) for name in shapes}, **self._by_scene}
         self._local = LocalUnknowns(law, points, F, values) if law.unknowns else None
         if self._local is not None:
@@ -298,7 +312,7 @@ class ConductivityAtPieces:
             J=J,
             porosity=1 - (1 - points.porosity0) / J,
             porosity0=points.porosity0,
-            x=points.position + points.value(self._u),
+            x=points.position + points.moved_by(self._u),
             p=self._p,
         )
 

@@ -181,6 +181,9 @@ class SceneMaterials:
         for name, value in law.unknowns.items():
             _known(f"{law.__name__}: unknown {name!r}", value)
         m.check_cells(mean_size(self.grid))
+        if law.unknowns and "cell_size" in law.by_scene and not self.grid.even:
+            what = "has unknowns and takes cell_size, must not on a grid of cells of many sizes"
+            raise ValueError(f"{law.__name__}: {what}")
         for name in law.parameters:
             if not hasattr(m, name):
                 known = ", ".join([*constants_of(m), *law.state])

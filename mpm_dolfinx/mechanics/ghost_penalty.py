@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base import _compat
 from mpm_dolfinx.conditions.acting import Loads
 from mpm_dolfinx.forms.point_forms import FacetForm, FacetSum
-from mpm_dolfinx.grid.grid import TURN, Grid
+from mpm_dolfinx.grid.grid import TURN, Grid, across_faces
 from mpm_dolfinx.materials.skeleton import Skeleton
 
 GHOST = 0.05
@@ -55,10 +55,9 @@ def stiffness(material: Skeleton) -> NDArray[np.float64]:
 
 
 def kinks(grid: Grid, V: fem.FunctionSpace, strength: ufl.core.expr.Expr, power: int) -> FacetForm:
-    """Return the form int strength h^power [d_n u].[d_n v] dS over faces, h the edge of the cells across them, m."""
+    """Return the form int strength h^power [d_n u].[d_n v] dS over faces, h the mean edge of the cells across, m."""
     n = ufl.FacetNormal(grid.mesh)("+")
-    h = fem.Constant(grid.mesh, grid.h)
-    across = sum(abs(n[a]) * h[a] for a in range(grid.dim))
+    *_, across = across_faces(grid, n)
     dS = ufl.Measure("dS", domain=grid.mesh, subdomain_id=_compat.SUBDOMAIN, metadata={"quadrature_degree": 2})
     jumps = [ufl.dot(ufl.grad(w)("+") - ufl.grad(w)("-"), n) for w in (ufl.TrialFunction(V), ufl.TestFunction(V))]
     return FacetForm(strength * across**power * ufl.inner(*jumps) * dS, grid.comm)
@@ -114,7 +113,7 @@ class GhostPenalty:
     def set_contents(self, volume: NDArray[np.float64], *moduli: NDArray[np.float64]) -> None:
         """Set volumes (cells,), m^d, of what the owned cells hold, and `modulus` and `shear`, Pa, times volume."""
         grid, fill = self.grid, self.fill.x.array
-        fill[:] = volume / grid.cell_volume
+        fill[:] = volume / grid.volumes(np.arange(grid.num_local))
         for f, total in zip((self.modulus, self.shear), moduli, strict=True):
             f.x.array[:] = np.divide(total, volume, out=np.zeros_like(total), where=volume > 0)
         for f in (self.fill, self.modulus):

@@ -161,7 +161,7 @@ class GivenDisplacements(Acting):
         """Refuse given displacements that differ where they meet: no body's stress is finite there."""
         for one, other, axes, X in self._meeting:
             jump = np.abs(self._given(one, t, X) - self._given(other, t, X))[:, axes].max(axis=1)
-            if jump.max(initial=0.0) > NEAR * self._grid.h.min():
+            if jump.max(initial=0.0) > NEAR * self._grid.least:
                 what = f"{line(one)} and {line(other)}: differ by {jump.max():.3g} m at t = {t:g} s where they meet"
                 raise ValueError(f"{what}, at {X[jump.argmax()]}; must agree there, or leave two cells between them")
 
@@ -200,7 +200,7 @@ class GivenDisplacements(Acting):
             start, end = (self._given(hold, t, p.X) for t in (place.start, place.t))
             gaps = (p.origin(of) + given - p.now(of) for of, given in ((before, start), (points, end)))
             old, new, way = (np.linalg.norm(v[:, axes], axis=1) for v in (*gaps, end - start))
-            moves = way > NEAR * self._grid.h.min()
+            moves = way > NEAR * self._grid.least
             came = 1 - ((new - old)[moves] / way[moves]).min(initial=np.inf)
             came = over_all(self._grid.comm, float(came), MPI.MAX)
             if -np.inf < came < 0.5:  # nearer to none of the way than to all of it

@@ -101,7 +101,8 @@ class HeldCells:
         normal = total(p.normal)
         N = grid.shape_values(p.cell, p.x)
         off = p.x - x[at]
-        given, spread = mean(p.given), (mean(off**2) + NEAR * grid.h**2)[:, :, None]
+        cell = key % grid.num_local
+        given, spread = mean(p.given), (mean(off**2) + NEAR * grid.sizes(cell) ** 2)[:, :, None]
         slopes = (mean(off[:, :, None] * (v - m[at])[:, None, :]) / spread for v, m in ((p.gap, gap), (p.given, given)))
         slope, rise = slopes
         along = 2 * normal**2 <= (normal**2).sum(axis=1, keepdims=True)
@@ -111,13 +112,13 @@ class HeldCells:
         moments = {"squares": local[:, :, None] * local[:, None, :], "product": local.prod(axis=1)}
         self.moments = {name: both(mean(values), values) for name, values in moments.items()}
         against = p.modulus + TENSE * p.tension
-        h = grid.h.min()
         flat = normal**2 > (1 - ALIGNED**2) * (normal**2).sum(axis=1, keepdims=True)
         modulus = np.where(flat, total(p.firm)[:, None], total(p.modulus)[:, None])
         each = np.where(flat[at], EVERYWHERE * p.resistance[:, None], WEAK * against[:, None])
-        self.stiffness = both(HOLD / h * modulus, each / h)
+        h = [grid.sizes(cells).min(axis=-1, keepdims=True) for cells in (cell, p.cell)]
+        self.stiffness = both(HOLD / h[0] * modulus, each / h[1])
         # at the end of a side a node's force may come by a small part of a cell
-        short = np.maximum(1.0, grid.cell_volume / grid.h.max() * grid.around(x) / whole)
+        short = np.maximum(1.0, grid.smallest_faces(cell) * grid.around(x) / whole)
         self.limit = CARRIED * total(p.resistance + TENSE * p.tension) * short
         self._gap, self._force = both(gap, p.gap), both(0 * gap, p.force)
         self._slope, self._along = both(slope, slope[at]), both(along, along[at])
@@ -149,7 +150,7 @@ class HeldCells:
         grid, chosen = self.grid, np.flatnonzero(given[self.number])
         nodes, x, gap, N = (v[chosen] for v in (grid.cell_nodes[self.cell], self.x, self._gap[:, axis], self.shape))
         walled = ~free[nodes]
-        held = ((N * ~walled).sum(axis=1) < NEAR) & (np.abs(gap) > NEAR * grid.h.min())
+        held = ((N * ~walled).sum(axis=1) < NEAR) & (np.abs(gap) > NEAR * grid.least)
         stuck, asked = np.zeros_like(walled), np.repeat(gap[:, None], N.shape[1], axis=1)
         moved, rise = (v[chosen][..., axis :: grid.dim, None] for v in (self._given, self._rise))  # at both ends
         torn = np.zeros(len(chosen), dtype=bool)
@@ -215,7 +216,7 @@ class HeldCells:
         if not suspected:
             return []
         mine = np.isin(self.number[row], suspected)
-        node = np.rint((grid.node_x[grid.cell_nodes[self.cell[row[mine]]]] - grid.low) / grid.h)
+        node = grid.nodes_along(grid.node_x[grid.cell_nodes[self.cell[row[mine]]]])
         columns = (self.number[row[mine]], axis[mine], force[mine], limit[mine], node, self.shape[row[mine]])
         rows = (*columns, self.x[row[mine]])
         number, axis, force, limit, node, N, x = map(np.concatenate, zip(*comm.allgather(rows), strict=True))

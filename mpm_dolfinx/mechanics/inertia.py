@@ -249,7 +249,7 @@ class InertiaForms:
         places = Places(grid, cut.cells, cut.x, cut.mixed, cut.hoop)
         pieces = PointData(self.pieces, places, rows, {"spread": cut.second})
         content = sum_by(cut.cells, rows, grid.num_local)
-        volume = fill * grid.cell_volume
+        volume = fill * grid.volumes(np.arange(grid.num_local))
         self.density.x.array[:] = np.divide(content, volume, out=np.zeros_like(content), where=volume > 0)
         self.density.x.scatter_forward()
         ghost = self._ghost.on(facets)

@@ -103,7 +103,9 @@ class MomentumForms:
         self._residuals, self._tangents = [], []
         self._local: dict[int, LocalUnknowns] = {}  # by the number of their part
         for number, (law, points, locks) in enumerate(laws):
-            self._add_law(number, law, points, locks, pressure, symmetric, by_scene(grid) | {"dt": dt})
+            self._add_law(
+                number, law, points, locks, pressure, symmetric, by_scene(grid, None, law, points) | {"dt": dt}
+            )
         self.velocity = Velocity(self.u)
         self.conditions = FormsOf(grid, self.u, self.velocity)
         """The forms of conditions."""
@@ -313,6 +315,12 @@ class MomentumSystem:
     def set_rounding(self, nodes: NDArray[np.float64]) -> None:
         """Set what rounding may leave of the residual at the local nodes, N."""
         self.rounding.array_w[:] = nodes[self.unknowns.owned // self.unknowns.dim]
+
+    @property
+    def lines(self) -> tuple[NDArray[np.float64], ...] | None:
+        """Lines of a grid of cells of many sizes: see `multigrid_solver`."""
+        grid = self._forms.grid
+        return None if grid.even else grid.lines
 
     def places(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return where on the grid this process's unknowns are, and what walls hold: see `multigrid_solver`."""

@@ -213,7 +213,9 @@ def _closed(grid: Grid, walls: Sequence[tuple[int, float]], surfaces: Sequence[S
     """Return whether every edge of some faces belongs to two of them, or lies in a wall that holds it."""
     x = np.concatenate([faces.places() for faces in surfaces])
     count, edges = x.shape[1], _EDGES[grid.dim]
-    number = np.rint((x.reshape(-1, grid.dim) - grid.lower) / (NEAR * grid.h) + 1 / 3)  # on no half between two numbers
+    number = np.rint(
+        (x.reshape(-1, grid.dim) - grid.lower) / (NEAR * grid.finest) + 1 / 3
+    )  # on no half between two numbers
     _, corner = np.unique(number, axis=0, return_inverse=True)
     edge = np.sort(corner.reshape(-1, count)[:, edges].reshape(-1, edges.shape[1]), axis=1)
     x = x[:, edges].reshape(-1, edges.shape[1], grid.dim)
@@ -224,7 +226,7 @@ def _closed(grid: Grid, walls: Sequence[tuple[int, float]], surfaces: Sequence[S
     lone = x[often[kind.ravel()] == 1]
     held = np.zeros(len(lone), dtype=bool)
     for axis, place in walls:
-        held |= (np.abs(lone[:, :, axis] - place) < NEAR * grid.h[axis]).all(axis=1)
+        held |= (np.abs(lone[:, :, axis] - place) < NEAR * grid.finest[axis]).all(axis=1)
     return bool(held.all() and often.max(initial=0) <= 2)
 
 

@@ -216,15 +216,50 @@ def cut(grid: Grid, corners: NDArray[np.float64], second: bool = False) -> Piece
     return Pieces(*map(np.concatenate, columns))
 
 
-def _cut(grid: Grid, corners: NDArray[np.float64], second: bool) -> Pieces:
-    d, true = grid.dim, np.ascontiguousarray(((corners - grid.low) / grid.h).transpose(1, 2, 0))
+def _on_planes(
+    grid: Grid, true: NDArray[np.float64], x: NDArray[np.float64], axes: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return places in cells from the grid's lower corner, and as edges are straight: what is near planes on them.
+
+    Edges of domains are straight in cells that are equal; else the second are in m, from the base.
+
+    Parameters
+    ----------
+    true, x
+        The places in cells and, from the base, in m; components along the axis number `axes`.
+    """
+    shape = [1] * true.ndim
+    shape[axes] = grid.dim
     nearest = np.rint(true)
-    y = np.where(np.abs(true - nearest) < grid.snap[:, None], nearest, true)
+    near = np.abs(true - nearest) < grid.snap.reshape(shape)
+    y = np.where(near, nearest, true)
+    if grid.even:
+        return y, y
+    planes = np.moveaxis(grid.places(np.moveaxis(nearest, axes, -1).astype(np.int64)), -1, axes)
+    return y, np.where(near, planes, x)
+
+
+def _in_cells(grid: Grid, s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return slices (d, d, m) that lie in a cell each, as edges are straight, in cells from the lower corner."""
+    if grid.even:
+        return s
+    out = s.copy()
+    for a in range(grid.dim):
+        i = grid.cells_along(a, s[:, a].min(axis=0))
+        out[:, a] = i + (s[:, a] - grid.lines[a][i]) / grid.widths[a][i]
+    return out
+
+
+def _cut(grid: Grid, corners: NDArray[np.float64], second: bool) -> Pieces:
+    d, true = grid.dim, np.ascontiguousarray(grid.in_cells(corners).transpose(1, 2, 0))
+    x = true if grid.even else np.ascontiguousarray(corners.transpose(1, 2, 0))
+    in_cells, y = _on_planes(grid, true, x, 1)
     v = vertices(y)
     volume = simplex_volumes(v)
     flat = np.flatnonzero(~volume.any(axis=0))
     if len(flat):  # thinner than that, and on a plane: nothing would be left of them
-        y[:, :, flat] = true[:, :, flat]
+        in_cells[:, :, flat] = true[:, :, flat]
+        y[:, :, flat] = x[:, :, flat]
         v = vertices(y)
         volume = simplex_volumes(v)
     # segments or triangles (d, d, m): vertices and coordinates first, which keeps the loops in numpy's fast lanes
@@ -239,10 +274,11 @@ def _cut(grid: Grid, corners: NDArray[np.float64], second: bool) -> Pieces:
         owner = np.concatenate([owner, *[np.repeat(folded, d + 1)] * 2])
     facet = np.arange(s.shape[2])
     for axis in range(d):
-        s, facet = _slice(s, facet, axis)
+        s, facet = _slice(s, facet, axis, grid)
+    s = _in_cells(grid, s)
     area = _area_vectors(s)
     area *= np.sign((area * outward[:, facet]).sum(axis=0))  # slicing has shuffled the vertices
-    return _sum(grid, _Slots(grid, y), s, area, owner[facet], second)
+    return _sum(grid, _Slots(grid, in_cells), s, area, owner[facet], second)
 
 
 def _area_vectors(s: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -347,16 +383,22 @@ def _sum(
     pairs += [(a, a) for a in range(d)] * second
     uneven = _products(pairs, x, sums, area[0], pair, total, slots)
 
-    whole = sum_by(slots.point, volume, len(slots.low[0]))[slots.point]
-    kept = np.flatnonzero(volume / whole > SLIVER)
+    size = volume if grid.even else volume * grid.widths_of(slots.cell.T).prod(axis=1)
+    whole = sum_by(slots.point, size, len(slots.low[0]))[slots.point]
+    kept = np.flatnonzero(size / whole > SLIVER)
     point, cell = slots.point[kept], slots.cell[:, kept].T
+    h = grid.widths_of(cell).T  # (d, m), or of equal cells (d,)
     if grid.axisymmetric:
         x0, x1 = x[:, 0]
         squares = total(area[0] / 12 * (x0 + x1) * (x0**2 + x1**2)) + beyond / 3
         products = area[0] / 24 * (x0**2 * (3 * x[0, 1] + x[1, 1]) + x1**2 * (x[0, 1] + 3 * x[1, 1]))
         products = total(products + area[0] / 12 * x0 * x1 * sums[1])
         products += slots.beyond(total(area[0] * sums[1] / 2), 0) / 2
-        area[1] *= grid.low[0] + grid.h[0] * s[:, 0].mean(axis=0)  # sections across the axis are rings too
+        r = s[:, 0].mean(axis=0)
+        if grid.even:
+            area[1] *= grid.low[0] + grid.h[0] * r  # sections across the axis are rings too
+        else:
+            area[1] *= grid.lines[0][index[0].astype(int)] + grid.widths[0][index[0].astype(int)] * (r - index[0])
     faces = np.empty((len(kept), d, 2))
     for a in range(d):
         shadow = total(area[a]) if a else shadow
@@ -364,7 +406,7 @@ def _sum(
         lower, upper = (total(area[a], chosen) for chosen in ends[a])
         # the section of the body just above the lower and just below the upper face
         faces[:, a] = np.stack([beyond + shadow - lower, beyond + upper], axis=1)[kept]
-        faces[:, a] *= grid.cell_volume / grid.h[a]
+        faces[:, a] *= grid.cell_volume / h[a] if grid.even else (h.prod(axis=0) / h[a])[:, None]
 
     # centroids stay off the grid lines, and inside the cell that they belong to
     volume = volume[kept]
@@ -375,17 +417,20 @@ def _sum(
     for (a, b), product in zip(pairs, uneven, strict=True):
         # of a piece thinner than rounding allows for it is not known, and at most this
         mean = np.clip(product[kept] / volume - middle[:, a] * middle[:, b], 0.0 if a == b else -0.25, 0.25)
-        spread[:, a, b] = spread[:, b, a] = mean * grid.h[a] * grid.h[b]
+        spread[:, a, b] = spread[:, b, a] = mean * h[a] * h[b]
     mixed = (
         np.stack([spread[:, 1, 2], spread[:, 0, 2], spread[:, 0, 1]], axis=1) if d == 3 else np.zeros((len(kept), 0))
     )
     if grid.axisymmetric:
-        faces[:, 0] *= TURN * (grid.low[0] + grid.h[0] * (cell[:, [0]] + [0, 1]))
+        ends = cell[:, [0]] + [0, 1]
+        faces[:, 0] *= TURN * (grid.low[0] + grid.h[0] * ends if grid.even else grid.lines[0][ends])
         faces[:, 1] *= TURN
         radius, centroid, hoop = _rings(grid, cell, centroid, squares[kept] / volume, products[kept] / volume)
-        volume = volume * radius
+        volume = volume * radius if grid.even else volume * h.prod(axis=0) * radius
         spread = of_rings(spread, hoop[:, 3])
-    fraction, x = volume / sum_by(point, volume, len(slots.low[0]))[point], grid.low + grid.h * (cell + centroid)
+    elif not grid.even:
+        volume = volume * h.prod(axis=0)
+    fraction, x = volume / sum_by(point, volume, len(slots.low[0]))[point], grid.places(cell, centroid)
     moments = spread if second else np.empty((len(kept), 0))
     return Pieces(point, grid.number(cell), fraction, x, np.abs(faces), mixed, hoop, moments)
 
@@ -417,10 +462,10 @@ def _rings(
 
     cell (m, 2): indices; c (m, 2): centroids in the plane, from 0 to 1; squares, products (m,): means of r^2 and r z.
     """
-    (h, height), (x, z) = grid.h, c.T
+    (h, height), (x, z) = grid.widths_of(cell).T, c.T
     squares = np.clip(squares, x**2, x)  # of slivers little is left in rounding
     products = np.clip(products, np.maximum(0.0, x + z - 1), np.minimum(x, z))
-    inner = grid.low[0] + h * cell[:, 0]
+    inner = grid.low[0] + h * cell[:, 0] if grid.even else grid.lines[0][cell[:, 0]]
     radius = inner + h * x
     of_volume = np.stack([inner * x + h * squares, inner * z + h * products], axis=1) / radius[:, None]
     product = h * height * (products - (x + z) / 2 + 0.25)
@@ -492,9 +537,7 @@ def cut_faces(
     middle (n, d) of the part of the face in one cell that it belongs to.
     """
     d, m = grid.dim, len(corners)
-    y = (corners - grid.low) / grid.h
-    nearest = np.rint(y)
-    y = np.where(np.abs(y - nearest) < grid.snap, nearest, y)
+    y = _on_planes(grid, grid.in_cells(corners), corners, 2)[1]
     both = np.concatenate([y, local], axis=2).transpose(1, 2, 0)
     split = [(0, 1)]
     if d == 3:
@@ -508,23 +551,30 @@ def cut_faces(
     s = np.concatenate([whole, np.repeat(np.eye(d)[:, :, None], count, axis=2)], axis=1)  # shares of the corners, too
     owner = np.arange(count)
     for axis in range(d):
-        s, owner = _slice(s, owner, axis)
+        s, owner = _slice(s, owner, axis, grid)
     kept = np.flatnonzero(_size(s[:, -d:-1]) * share[owner] > SLIVER)  # what only touches a plane leaves nothing
     s, owner = s[:, :, kept], owner[kept]
     if d == 3:
-        s, owner = _polygons(s, owner)
+        s, owner = _polygons(grid, s, owner)
     share = _size(s[:, -d:-1]) * share[owner]
     s, owner = s[:, :-d], owner % max(1, m)
     share /= sum_by(owner, share, m)[owner]  # with slivers of its parts nothing of a face is lost
+
+    def place(y: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return places (n, d), m, from the base."""
+        return grid.low + grid.h * y if grid.even else y
+
     points = np.einsum("qk,kam->qam", _RULES[d], s)
-    middle = np.tile((grid.low + grid.h * s[:, :d].mean(axis=0).T), (len(points), 1))
+    middle = np.tile(place(s[:, :d].mean(axis=0).T), (len(points), 1))
     points = points.transpose(0, 2, 1).reshape(-1, both.shape[1])
     count = len(_RULES[d])
     face, share = np.tile(owner, count), np.tile(share / count, count)
-    return face, grid.low + grid.h * points[:, :d], points[:, d:], share, middle
+    return face, place(points[:, :d]), points[:, d:], share, middle
 
 
-def _polygons(s: NDArray[np.float64], owner: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _polygons(
+    grid: Grid, s: NDArray[np.float64], owner: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Return the parts of cut triangles as triangles that do not tell which axis was cut first.
 
     The slices of a triangle in one cell are a convex polygon.  It is split about the mean of its corners.
@@ -532,13 +582,13 @@ def _polygons(s: NDArray[np.float64], owner: NDArray[np.int64]) -> tuple[NDArray
     Parameters
     ----------
     s : (3, a, n)
-        Corners of the slices: places in cells first, and last their shares of the corners of the triangle.
+        Corners of the slices: places as edges are straight first, and last their shares of the corners of the triangle.
     owner : (n,)
         Triangles that these are slices of.
     """
     cut = np.bincount(owner, minlength=1)[owner] > 1
     part, of = s[:, :, cut], owner[cut]
-    cell = np.floor(part[:, :3].mean(axis=0)).astype(np.int64)
+    cell = np.floor(_in_cells(grid, part[:, :3]).mean(axis=0)).astype(np.int64)
     cell -= cell.min(axis=1, initial=0, keepdims=True)
     keys = np.ravel_multi_index((of, *cell), (owner.max(initial=0) + 1, *(cell.max(axis=1, initial=0) + 1)))
     _, first, group = np.unique(keys, return_index=True, return_inverse=True)
@@ -593,12 +643,12 @@ _RULES = {  # Source: Gauss, Strang and Fix (1973); of equal weight, exact to th
 }
 
 
-def _slice(s: NDArray[np.float64], owner: NDArray[np.int64], axis: int):
-    """Slice simplices by the integer planes of an axis until none crosses a plane."""
+def _slice(s: NDArray[np.float64], owner: NDArray[np.int64], axis: int, grid: Grid):
+    """Slice simplices, as edges are straight, by the grid planes of an axis until none crosses a plane."""
     done_s, done_owner = [], []
     while True:
         t = s[:, axis]
-        plane = np.floor(t.min(axis=0)) + 1
+        plane = np.floor(t.min(axis=0)) + 1 if grid.even else grid.next_plane(axis, t.min(axis=0))
         crossing = t.max(axis=0) > plane
         if not crossing.any():
             break

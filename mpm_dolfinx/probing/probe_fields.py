@@ -43,8 +43,9 @@ def probe_pressures(scene: Scene, state: State, probes: Probes) -> NDArray[np.fl
 class _Lattice:
     """The (2 REACH + 1)^d cells about those of probes, along the axes.
 
-    number (m, cells): lexicographic, -1 outside of the grid; midpoint (m, cells, d), m; middle: which is the probe's
-    own; stride (d,): from one to the next along each axis; beside: by axis and end, which cells have one there, and it.
+    number (m, cells): lexicographic, -1 outside of the grid; midpoint, size (m, cells, d), m; middle: which is the
+    probe's own; stride (d,): from one to the next along each axis; beside: by axis and end, which cells have one there,
+    and it.
     """
 
     def __init__(self, grid: Grid, cell: NDArray[np.int64]):
@@ -56,7 +57,9 @@ class _Lattice:
         inside = ((there >= 0) & (there < grid.shape)).all(axis=2)
         number = grid.number(np.where(inside[:, :, None], there, 0).reshape(-1, d)).reshape(inside.shape)
         self.number = np.where(inside, number + copy[:, None] * grid.cells, -1)
-        self.midpoint = grid.low + (there + 0.5) * grid.h
+        self.midpoint = grid.places(there, 0.5)
+        self.size = np.broadcast_to(grid.widths_of(np.clip(there, 0, grid.shape - 1).reshape(-1, d)), (inside.size, d))
+        self.size = self.size.reshape(there.shape)
         self.middle = len(steps) // 2
         self.stride = width ** np.arange(d)[::-1]
         self.beside = {}
@@ -87,6 +90,7 @@ class _Around:
         own[here] = np.column_stack([x, alike[at], cut.cells_at(at, x)])
         x, key, cell = np.split(over_all(scene.grid.comm, own), [d, d + 3], axis=1)
         self._lattice = lattice = _Lattice(scene.grid, cell[:, 0].astype(np.int64))
+        self._x = x
         self._local, rows = self._gathered(on_grid, on_grid.pressures(state), cut.to_cells(alike))
         ends = np.cumsum([1, 1, d, d, d, 3])
         filled, p, self._half, self._kappa, self._shift, held, share = np.split(rows, ends, axis=2)
@@ -157,7 +161,6 @@ class _Around:
     def pressures(self, weight: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the pressures (m,), Pa, at the probes; weight (d,), N/m^3: of the fluid."""
         comm = self._grid.comm
-        h = self._grid.h
         head = self._p - self._centroid @ weight
         base, (low, high) = head[:, self._lattice.middle], self._bounds(head)
         at, offset, value, share, own = self._drained(weight)
@@ -168,7 +171,11 @@ class _Around:
             rows += self._beside_others(head)
         fit = LocalFit(len(base), self._grid.dim, 2)
         for probe, away, values, part in rows:
-            fit.add(probe, away / h, (values - base[probe])[:, None], near(away / h) * part)
+            y = away / self._lattice.size[probe, self._lattice.middle]
+            cells = y
+            if not self._grid.even:
+                cells = self._grid.in_cells(self._x[probe] + away) - self._grid.in_cells(self._x[probe])
+            fit.add(probe, y, (values - base[probe])[:, None], near(cells) * part)
         least, most = (np.full(len(base), start) for start in (np.inf, -np.inf))
         np.minimum.at(least, at[own], value[own])
         np.maximum.at(most, at[own], value[own])
@@ -180,7 +187,7 @@ class _Around:
         i = self._lattice.middle
         low, high = head[:, i].copy(), head[:, i].copy()
         for axis in range(self._grid.dim):
-            stride, h = self._lattice.stride[axis], self._grid.h[axis]
+            stride, h = self._lattice.stride[axis], self._lattice.size[:, :, axis]
             beside = {}
             for way in (-1, 1):
                 j = i + way * stride
@@ -192,7 +199,7 @@ class _Around:
                 j, k = i - way * stride, i - 2 * way * stride
                 to, before = (
                     (head[:, a] - head[:, b])
-                    / np.maximum(way * (self._centroid[:, a, axis] - self._centroid[:, b, axis]), h / 2)
+                    / np.maximum(way * (self._centroid[:, a, axis] - self._centroid[:, b, axis]), h[:, i] / 2)
                     for a, b in ((i, j), (j, k))
                 )
                 before = np.where(self._counts[:, k], van_leer(np.stack([to, before], axis=1)), to)
@@ -209,7 +216,7 @@ class _Around:
             here, there = pair
             inward = (1 - 2 * end, 2 * end - 1)  # from the face
             ways = [
-                np.maximum(self._grid.h[axis] / 2 + way * (self._half + self._shift)[:, cells, axis], 0)
+                np.maximum(self._lattice.size[:, cells, axis] / 2 + way * (self._half + self._shift)[:, cells, axis], 0)
                 for way, cells in zip(inward, pair, strict=True)
             ]
             with np.errstate(divide="ignore", invalid="ignore"):

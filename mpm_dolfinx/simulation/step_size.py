@@ -249,7 +249,8 @@ def diffusion_time(scene: Scene, points: MaterialPoints) -> float:
     stored = stored + scene.materials.storage(points)
     mobility = scene.materials.table(points, lambda m: m.conductivity) / scene.fluid.unit_weight
     at = mobility > 0
-    least = scene.grid.h.min() ** 2 * (stored[at] / mobility[at]).min(initial=inf)
+    h = np.broadcast_to(scene.grid.sizes_at(points.x).min(axis=-1), len(points))[at]
+    least = (h**2 * (stored[at] / mobility[at])).min(initial=inf)
     least = float(over_all(scene.grid.comm, least, MPI.MIN))
     return least if isfinite(least) else 0.0
 
@@ -258,9 +259,11 @@ def cell_time(scene: Scene, points: MaterialPoints) -> float:
     """Return the least time in which waves run through a cell, s."""
     density = scene.materials.density(points)
     at = density > 0
-    fastest = (scene.materials.confined_modulus(points)[at] / density[at]).max(initial=0.0)
-    fastest = over_all(scene.grid.comm, float(fastest), MPI.MAX)
-    return float(scene.grid.h.min()) / fastest**0.5 if fastest > 0 else inf
+    grid = scene.grid
+    h, of_all = (1.0, grid.least) if grid.even else (grid.sizes_at(points.x[at]).min(axis=1), 1.0)
+    fastest = (scene.materials.confined_modulus(points)[at] / density[at] / h**2).max(initial=0.0)
+    fastest = over_all(grid.comm, float(fastest), MPI.MAX)
+    return of_all / fastest**0.5 if fastest > 0 else inf
 
 
 def step_rule(times: Times, rtol, first_step, max_step: float, scene: Scene, points: MaterialPoints) -> StepSize:

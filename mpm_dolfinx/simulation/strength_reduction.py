@@ -319,7 +319,7 @@ def _mean_stress(scene: Scene, points: MaterialPoints) -> float:
     grid = scene.grid
     size = np.linalg.norm(scene.materials.effective_stress_3d(points), axis=(1, 2))
     moduli, volume = scene.materials.table(points, lambda m: m.oedometric), points.volume0 * points.J
-    far = grid.reach / grid.h.min()
+    far = grid.reach / grid.least
     sums = np.array([size @ volume, np.finfo(float).eps * far * moduli @ volume, volume.sum()])
     total, rounding, whole_volume = over_all(grid.comm, sums)
     if not total > rounding:

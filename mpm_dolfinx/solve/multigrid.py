@@ -12,6 +12,7 @@ of 20^3 cells that is sheared, 16 Newton steps: 2.0 s, by smoothed aggregation (
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import product
 
 from mpi4py import MPI
@@ -49,6 +50,7 @@ def multigrid_solver(
     nodal: bool,
     coarsest: int,
     firmly: bool = False,
+    lines: Sequence[NDArray[np.float64]] | None = None,
 ) -> PETSc.KSP:
     """Return GMRES with multigrid, set up anew when A has changed.
 
@@ -71,13 +73,15 @@ def multigrid_solver(
         Unknowns of a grid that is solved on by factors.
     firmly
         Whether to smooth three times as often: see `FIRMLY`.
+    lines : (n,) along each axis, m
+        Grid lines, where cells have many sizes: nodes are then interpolated by their distances.
     """
     ksp = PETSc.KSP().create(A.comm)
     ksp.setType(PETSc.KSP.Type.GMRES)
     ksp.setPCSide(PETSc.PC.Side.RIGHT)
     ksp.setOptionsPrefix(f"mpm_{name}_{'firmly' if firmly else 'multigrid'}_")  # options for factors are not for it
     with Timer("mpm: factorisation"):
-        steps = interpolations(A.comm.tompi4py(), places, held, nodal, coarsest)
+        steps = interpolations(A.comm.tompi4py(), places, held, nodal, coarsest, lines)
     ksp.pc.setType(PETSc.PC.Type.MG)
     ksp.pc.setMGLevels(len(steps) + 1)
     for level, Q in zip(range(len(steps), 0, -1), steps, strict=True):
@@ -89,7 +93,12 @@ def multigrid_solver(
 
 
 def interpolations(
-    comm: MPI.Intracomm, places: NDArray[np.int64], held: NDArray[np.int64], nodal: bool, coarsest: int
+    comm: MPI.Intracomm,
+    places: NDArray[np.int64],
+    held: NDArray[np.int64],
+    nodal: bool,
+    coarsest: int,
+    lines: Sequence[NDArray[np.float64]] | None = None,
 ) -> list[PETSc.Mat]:
     """Return the interpolations from each coarse grid to the one that is twice as fine, the finest first.
 
@@ -98,22 +107,27 @@ def interpolations(
     steps: list[PETSc.Mat] = []
     size = before = over_all(comm, len(places))
     while not steps or coarsest < size < 0.7 * before:  # many bodies of a few cells are not united
-        Q, places, held = interpolation(comm, places, held, nodal)
+        Q, places, held = interpolation(comm, places, held, nodal, lines)
+        lines = None if lines is None else [_every_other(x) for x in lines]
         size, before = over_all(comm, len(places)), size
         steps.append(Q)
     return steps
 
 
 def interpolation(
-    comm: MPI.Intracomm, places: NDArray[np.int64], held: NDArray[np.int64], nodal: bool
+    comm: MPI.Intracomm,
+    places: NDArray[np.int64],
+    held: NDArray[np.int64],
+    nodal: bool,
+    lines: Sequence[NDArray[np.float64]] | None = None,
 ) -> tuple[PETSc.Mat, NDArray[np.int64], NDArray[np.int64]]:
     """Return the interpolation to unknowns, places of the coarse ones that this process has, and those that are held.
 
     A coarse cell is an unknown where it holds one.  So is a coarse node if one is interpolated from it, but if what is
     held lies beside it, only where there is an unknown at the same place.  Then no column depends on others.
     """
-    rows, coarse, weights = _hats(places, nodal)
-    beside = _hats(held, nodal)[1]
+    rows, coarse, weights = _hats(places, nodal, lines)
+    beside = _hats(held, nodal, lines)[1]
     whole = 1.0 if nodal else 0.75 ** (places.shape[1] - 1)  # the weight of what lies at the same place, or in it
     says = np.concatenate([np.where(weights == whole, IS, MAYBE if nodal else NOT), np.full(len(beside), NOT)])
     among = np.concatenate([coarse, beside])
@@ -138,11 +152,24 @@ def interpolation(
     return PETSc.Mat().createAIJ(sizes, csr=csr, comm=comm), found[mine], found[(number == NONE) & nodal]
 
 
-def _hats(places: NDArray[np.int64], nodal: bool) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+def _every_other(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the lines (m,), m, of the grid of half as many cells; its last cell may reach beyond the grid."""
+    return x[::2] if len(x) % 2 else np.append(x[::2], 2 * x[-1] - x[-2])
+
+
+def _hats(
+    places: NDArray[np.int64], nodal: bool, lines: Sequence[NDArray[np.float64]] | None = None
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
     """Return by which weights (m,) which of the fine (m,) are interpolated from which coarse places (m, d + 1)."""
     half, odd = np.divmod(places[:, :-1], 2)
     if nodal:
-        ends = (half, half + 1), (np.where(odd, 0.5, 1.0), np.where(odd, 0.5, 0.0))
+        share = 0.5
+        if lines is not None:  # of the node above it
+            share = np.empty(half.shape)
+            for a, x in enumerate(lines):
+                x = np.append(x, 2 * x[-1] - x[-2])
+                share[:, a] = ((x[1:-1] - x[:-2]) / (x[2:] - x[:-2]))[np.maximum(places[:, a] - 1, 0)]
+        ends = (half, half + 1), (np.where(odd, 1 - share, 1.0), np.where(odd, share, 0.0))
     else:
         ends = (half, half + 2 * odd - 1), (np.full(half.shape, 0.75), np.full(half.shape, 0.25))
     parts = []

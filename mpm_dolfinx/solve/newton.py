@@ -146,7 +146,7 @@ def solve_substep(
     grid = momentum.forms.grid
     nodes = momentum.system.of_parts.sizes
     fluid = errors.fluid
-    area = grid.cell_volume / grid.h.max() * (storage.ring if grid.axisymmetric else 1.0)
+    area = grid.finest.prod() / grid.finest.max() * (storage.ring if grid.axisymmetric else 1.0)
     report.stress = float((errors.forces / (area * np.sqrt(np.maximum(1, nodes)))).max(initial=0.0))
     least = fluid.round_off / solvers.scheme.tolerance
     report.balance = float(relative(np.abs(fluid.gain), np.maximum(fluid.exchanged, least)).max(initial=0.0))

@@ -155,7 +155,8 @@ class LinearSolvers:
         K = self._momentum.K
         unknowns = self._momentum.unknowns
         if how.displacements == MULTIGRID:
-            return multigrid_solver(K, "momentum", *self._momentum.places(), True, how.coarsest, how.firmly)
+            lines = self._momentum.lines
+            return multigrid_solver(K, "momentum", *self._momentum.places(), True, how.coarsest, how.firmly, lines)
         return displacement_solver(K, "momentum", unknowns, how.displacements, how.symmetric)
 
     def _set_krylov(self, kind: str) -> None:

@@ -77,7 +77,7 @@ class OnGrid(Keyed):
         self.data = quadrature.data(cut, self._places, points)
         """The pieces when the grid was reset."""
         pieces = self.data.pieces
-        self.weight = weight = pieces["weight"][:, 0] * grid.cell_volume
+        self.weight = weight = pieces["weight"][:, 0] * grid.volumes(pieces.cells)
         """Volumes (m,) of the pieces, m^d."""
         area, x = cut.plane(weight)
         scales = stiffness, lambda m: m.shear if m.state else 0.0  # what never yields is firm enough
@@ -543,7 +543,8 @@ class Assembled(Keyed):
         It goes with the stiffness of the cells about a node, and with that of what acts there.
         """
         grid, on_grid = self._on_grid.cut.grid, self._on_grid
-        of_cells = ROUND_OFF * on_grid.stiffness * grid.cell_volume / grid.h.min()
+        everywhere = np.arange(grid.num_local)
+        of_cells = ROUND_OFF * on_grid.stiffness * grid.volumes(everywhere) / grid.sizes(everywhere).min(axis=-1)
         for one in loads:
             of_cells = one.rounding(of_cells)
         own = np.flatnonzero(on_grid.active[: grid.num_owned])

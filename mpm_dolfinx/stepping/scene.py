@@ -253,6 +253,8 @@ class Scene:
         """The constants that make the scene, by name: what a checkpoint of it is known by."""
         grid = self.grid
         out = {"grid cells": grid.shape.tolist(), "grid lower": grid.lower.tolist(), "grid upper": grid.upper.tolist()}
+        if not grid.even:
+            out |= {f"grid lines along {letter}": x.tolist() for letter, x in zip("xyz", grid.lines, strict=False)}
         out |= {"quadrature": self.numerics.quadrature, **({"axisymmetric": True} if grid.axisymmetric else {})}
         if grid.copies > 1:
             first = np.cumsum([0, *(len(body) for body in self.bodies[:-1])])

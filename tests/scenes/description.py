@@ -83,7 +83,7 @@ class Scene:
     cells, h : (d,), -, m — of the grid, which begins at the origin; materials: name of the law, its constants;
     initial: stress at rest, None or "K0" or "given", with `ratio` and `surcharge`, Pa; level: of the water table, m;
     contact: friction between the last body and the others; rate: of a source, 1/s; stiffness: of springs in the bodies,
-    N/m^4.
+    N/m^4; uneven: whether grid lines lie at random.
     """
 
     seed: int
@@ -110,6 +110,7 @@ class Scene:
     method: str = "sdirk2"
     stage: Stage | None = None
     tolerance: float = 1e-11
+    uneven: bool = False
 
     @property
     def dim(self) -> int:
@@ -119,6 +120,16 @@ class Scene:
     def size(self) -> np.ndarray:
         """Edges of the grid (d,), m."""
         return np.array(self.cells) * np.array(self.h)
+
+    def lines(self) -> list[np.ndarray]:
+        """Places of the grid lines along each axis, m; uneven: neighbouring cells are up to three times as wide."""
+        if not self.uneven:
+            return [h * np.arange(n + 1) for n, h in zip(self.cells, self.h, strict=True)]
+        rng, out = np.random.default_rng(self.seed), []
+        for n, size in zip(self.cells, self.size, strict=True):
+            x = np.append(0.0, np.cumsum(rng.uniform(1, 3, n)))
+            out.append(size * x / x[-1])
+        return out
 
     def with_(self, **changes) -> Scene:
         return replace(self, **changes)

@@ -61,6 +61,14 @@ class _Builder:
         lower, upper = frame.box(np.zeros(scene.dim), size, scene)
         cells = np.abs(frame.vector(np.add(scene.cells, more))).astype(int).tolist()
         self.grid = mpm.Grid(lower, upper, cells, axisymmetric=scene.axisymmetric)
+        if scene.uneven:
+            lines = scene.lines()
+            lines[-1] = np.append(lines[-1], scene.size[-1] + scene.h[-1] * np.arange(1, BEYOND * far + 1))
+            x = [np.zeros((len(lines[axis]), scene.dim)) for axis in frame.axes]
+            for along, axis in zip(x, frame.axes, strict=True):
+                along[:, axis] = lines[axis]
+            lines = [np.sort(frame.place(along, scene)[:, k]) for k, along in enumerate(x)]
+            self.grid = mpm.Grid(lines=lines, axisymmetric=scene.axisymmetric)
         bodies = self.permuted(list(range(len(scene.bodies) + far)))
         laws = self.permuted(list(range(len(scene.materials) + far)))
         self.order = [bodies.index(i) for i in range(len(bodies))]

@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: MIT
+"""Lines of a grid whose cells have many sizes: equal ones are found, others are graded away from fine boxes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import brentq
+
+from mpm_dolfinx.base.tolerances import EPSILON, SAME
+from mpm_dolfinx.base.validation import line, numbers
+
+
+def rounding(x: NDArray[np.float64]) -> float:
+    """Return by how much coordinates of this size, m, may differ although they should be equal."""
+    return 8 * EPSILON * float(np.abs(x).max(initial=0.0))
+
+
+def checked(lines: Sequence[ArrayLike]) -> list[NDArray[np.float64]]:
+    """Return the lines (n,), m, along each of two or three axes; ValueError naming what is not allowed."""
+    if not isinstance(lines, Sequence | np.ndarray) or len(lines) not in (2, 3):
+        raise ValueError(f"grid: lines = {line(lines)}, must be 2 or 3 lists of coordinates, one an axis")
+    out = []
+    for letter, places in zip("xyz", lines, strict=False):
+        allowed = "at least 2 finite coordinates, each > the one before"
+        x = numbers(f"grid: lines along {letter}", places, None, allowed=allowed)
+        if x.ndim != 1 or len(x) < 2 or not (np.diff(x) > 0).all():
+            raise ValueError(f"grid: lines along {letter} = {line(places)}, must be {allowed}")
+        if np.diff(x).min() <= rounding(x) / SAME:
+            what = f"are {np.diff(x).min():.3g} m apart at the least"
+            raise ValueError(f"grid: lines along {letter}: {what}, must be > {rounding(x) / SAME:.3g} m: of rounding")
+        out.append(x)
+    return out
+
+
+def equal(x: NDArray[np.float64]) -> bool:
+    """Return whether lines (n,), m, are as far apart from one another as rounding tells."""
+    return bool(np.abs(x - np.linspace(x[0], x[-1], len(x))).max() <= rounding(x))
+
+
+def graded(
+    lower: ArrayLike,
+    upper: ArrayLike,
+    fine: Sequence[ArrayLike],
+    size: ArrayLike,
+    ratio: float = 1.1,
+    largest: float = np.inf,
+) -> list[NDArray[np.float64]]:
+    """Return the lines of a grid whose cells are small in fine boxes and grow away from them.
+
+    Lines go through the whole grid: cells beside a fine box are as narrow as those in it.
+
+    Parameters
+    ----------
+    lower, upper : (d,), m
+        Lower and upper corner of the grid; d = 2 or 3.
+    fine : (boxes, 2, d), m
+        Lower and upper corners of the boxes of small cells, at least one, in the grid.
+    size : number or (d,), m
+        Edges of the small cells, > 0: at most, so that a whole number of them fits a box.
+    ratio
+        Of the edges of neighbouring cells, > 1: at most, where there is room for it.
+    largest : m
+        Edge of the largest cells, >= size.
+
+    Returns
+    -------
+    Lines (n,), m, along each axis, for `Grid(lines=...)`.
+
+    Raises
+    ------
+    ValueError
+        Boxes that are not in the grid, or numbers out of their range.
+    """
+    lower = numbers("graded: lower", lower, (2,), (3,), allowed="2 or 3 finite coordinates")
+    d = lower.size
+    upper = numbers("graded: upper", upper, (d,), allowed=f"{d} finite coordinates, as lower")
+    size = np.broadcast_to(
+        numbers("graded: size", size, (), (d,), allowed="> 0", test=lambda v: (v > 0) & (v < np.inf)), (d,)
+    )
+    ratio = float(numbers("graded: ratio", ratio, allowed="> 1", test=lambda v: (v > 1) & (v < np.inf)))
+    if largest != np.inf:
+        largest = float(numbers("graded: largest", largest, test=lambda v: v >= size.max(), allowed=f">= {size.max()}"))
+    allowed = f"at least one box, a lower and an upper corner of {d} coordinates each, in the grid"
+    boxes = numbers("graded: fine", fine, None, allowed=allowed)
+    if boxes.ndim != 3 or boxes.shape[1:] != (2, d) or not (boxes[:, 1] > boxes[:, 0]).all():
+        raise ValueError(f"graded: fine = {line(fine)}, must be {allowed}")
+    if not (boxes[:, 0] >= lower - rounding(lower)).all() or not (boxes[:, 1] <= upper + rounding(upper)).all():
+        raise ValueError(f"graded: fine = {line(fine)}, must be in {lower.tolist()} to {upper.tolist()}")
+    return [_along(lower[a], upper[a], boxes[:, :, a], size[a], ratio, largest) for a in range(d)]
+
+
+def _along(
+    low: float, high: float, fine: NDArray[np.float64], size: float, ratio: float, largest: float
+) -> NDArray[np.float64]:
+    """Return the lines (n,), m, from low to high; fine (k, 2): intervals of small cells."""
+    joined: list[list[float]] = []
+    for start, stop in sorted(fine.tolist()):
+        if joined and start <= joined[-1][1] + SAME * size:
+            joined[-1][1] = max(joined[-1][1], stop)
+        else:
+            joined.append([start, stop])
+    if joined[0][0] - low <= SAME * size:
+        joined[0][0] = low
+    if high - joined[-1][1] <= SAME * size:
+        joined[-1][1] = high
+    parts = [joined[0][0] - np.cumsum(_growing(joined[0][0] - low, size, ratio, largest))[::-1]]
+    for k, (start, stop) in enumerate(joined):
+        count = max(1, int(np.ceil((stop - start) / size - SAME)))
+        parts.append(np.linspace(start, stop, count + 1))
+        if k + 1 < len(joined):
+            gap = joined[k + 1][0] - stop
+            half = np.cumsum(_growing(gap / 2, size, ratio, largest))
+            parts += [stop + half[:-1], stop + gap - half[::-1]]
+    parts.append(joined[-1][1] + np.cumsum(_growing(high - joined[-1][1], size, ratio, largest)))
+    out = np.concatenate(parts)
+    out = out[np.append(True, np.diff(out) > SAME * size)]
+    out[0], out[-1] = low, high
+    return out
+
+
+def _growing(gap: float, size: float, ratio: float, largest: float) -> NDArray[np.float64]:
+    """Return edges (n,), m, that fill a gap, m: each by at most a ratio larger than the one before, the first of size.
+
+    They grow alike, by what fits the gap; those of the least change are taken.
+    """
+    if gap <= 0:
+        return np.empty(0)
+
+    def edges(growth: float, count: int) -> NDArray[np.float64]:
+        return np.minimum(size * growth ** np.arange(1, count + 1), largest)
+
+    count = 1
+    while edges(ratio, count).sum() < gap:
+        count += 1
+    best = None
+    for n in {count, max(1, count - 1)}:
+        most = gap / size + 1
+        if edges(most, n).sum() < gap:
+            continue
+        growth = brentq(lambda g, n=n: edges(g, n).sum() - gap, 0.0, most)
+        if best is None or abs(np.log(growth)) < abs(np.log(best[0])):
+            best = growth, n
+    out = edges(*best)
+    return out * (gap / out.sum())

@@ -1,0 +1,396 @@
+# SPDX-License-Identifier: MIT
+"""Cells of many sizes, between lines at random: what holds in equal cells holds there, and equal lines are these."""
+
+import footing
+import manufactured as made
+import numpy as np
+import pytest
+import terzaghi
+from helpers import SOFT, rates, refused_in_one_line, thresholds
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.grid.grid import SIDES
+from mpm_dolfinx.points.cutting import centroids, corner_bits, cut
+from mpm_dolfinx.verification.exact import terzaghi_pressure
+
+KINDS = [(2, False), (2, True), (3, False)]
+EXACT = mpm.Numerics(tolerance=1e-12)
+
+
+def at_random(low, high, cells, seed=0, ratio=3.0):
+    """Return lines of which neighbouring cells are up to three times as wide."""
+    rng = np.random.default_rng(seed)
+    out = []
+    for a, b, n in zip(low, high, cells, strict=True):
+        x = np.append(0.0, np.cumsum(rng.uniform(1, ratio, n)))
+        out.append(a + (b - a) * x / x[-1])
+    return out
+
+
+def uneven(dim, axisymmetric=False, seed=0, high=1.3):
+    cells = (8, 7) if dim == 2 else (5, 4, 5)
+    return mpm.Grid(lines=at_random([0] * dim, [high] * dim, cells, seed), axisymmetric=axisymmetric)
+
+
+def nearly_equal(lower, upper, cells, **more):
+    """Return the grid of equal cells, and one whose lines are off theirs by a little more than rounding."""
+    equal = mpm.Grid(lower, upper, cells, **more)
+    lines = [np.linspace(a, b, n + 1) for a, b, n in zip(lower, upper, cells, strict=True)]
+    for x in lines:
+        x[1:-1] *= 1 + 1e-12 * (-1) ** np.arange(len(x) - 2)
+    other = mpm.Grid(lines=lines, **more)
+    assert equal.even and not other.even
+    return equal, other
+
+
+# ---- lines --------------------------------------------------------------------------------------------
+
+
+def test_lines_that_are_equally_far_apart_are_the_grid_of_equal_cells():
+    """The same arithmetic, and so the same bits and time."""
+    equal = mpm.Grid([0.1, -0.3], [1.3, 0.9], [12, 10])
+    lines = mpm.Grid(lines=[np.linspace(0.1, 1.3, 13), np.linspace(-0.3, 0.9, 11)])
+    ends = []
+    for grid in (equal, lines):
+        assert grid.even and (grid.h == equal.h).all()
+        body = mpm.box(grid, [0.1, 0.1], [1.1, 0.4])
+        load = mpm.Traction("top", lambda t: (0, -1e4 * t))
+        options = {"walls": {"left": "xy"}, "fluid": mpm.Fluid(), "conditions": [load, mpm.Drained("right")]}
+        s = mpm.Simulation(grid, [body], [SOFT], **options)
+        s.run(0.1, 0.05, progress=False)
+        ends.append(s.points)
+    assert (ends[0].corners == ends[1].corners).all() and (ends[0].pressure == ends[1].pressure).all()
+
+
+@pytest.mark.parametrize("largest", [0.4, np.inf])
+def test_graded_lines_meet_the_boxes_and_grow_by_the_ratio(largest):
+    lower, upper = np.array([-2.0, 0.0]), np.array([5.0, 3.0])
+    boxes = [[[0.0, 1.0], [1.0, 2.0]], [[3.2, 0.0], [4.0, 2.5]]]
+    lines = mpm.graded(lower, upper, boxes, 0.1, 1.15, largest)
+    for a, x in enumerate(lines):
+        width = np.diff(x)
+        assert x[0] == lower[a] and x[-1] == upper[a]
+        assert width.max() < min(largest, 1.0) * (1 + 1e-12) and (width[1:] / width[:-1]).max() < 1.15 + 1e-9
+        for box in boxes:
+            inside = (x[:-1] > box[0][a] - 1e-9) & (x[1:] < box[1][a] + 1e-9)
+            assert width[inside] == pytest.approx(0.1) and inside.sum() == round((box[1][a] - box[0][a]) / 0.1)
+
+
+def test_points_and_nodes_are_found_and_shape_functions_are_exact_for_linear_fields():
+    for dim, axisymmetric in KINDS:
+        grid = uneven(dim, axisymmetric)
+        x = np.random.default_rng(1).uniform(grid.low, grid.high, (200, dim))
+        cells = grid.local(grid.number(grid.index_from_base(x)))
+        assert (np.abs(x - grid.midpoints[cells]) <= grid.sizes(cells) / 2 * (1 + 1e-12)).all()
+        assert grid.in_cells(grid.node_x) == pytest.approx(grid.node_places(np.arange(len(grid.node_x)))[:, :-1])
+        A = np.random.default_rng(2).normal(size=(dim, dim))
+        assert grid.at(cells, x, grid.node_x @ A.T) == pytest.approx(x @ A.T, abs=1e-12)
+        slopes = np.einsum("nkd,nkc->ncd", grid.shape_gradients(cells, x), (grid.node_x @ A.T)[grid.cell_nodes[cells]])
+        assert slopes == pytest.approx(np.broadcast_to(A, slopes.shape), abs=1e-12)
+
+
+@pytest.mark.parametrize("dim, axisymmetric", KINDS)
+def test_domains_are_cut_exactly(dim, axisymmetric):
+    """Volumes, centroids and what lies on faces between cells, from both sides."""
+    grid, rng = uneven(dim, axisymmetric), np.random.default_rng(3)
+    F = np.eye(dim) + 0.3 * rng.normal(size=(100, dim, dim))
+    corners = rng.uniform(0.4, 0.9, (100, 1, dim)) + np.einsum("nab,kb->nka", 0.2 * F, corner_bits(dim) - 0.5)
+    corners = corners.clip(1e-3, 1.299)
+    p = cut(grid, corners)
+    index = np.stack(np.unravel_index(p.cell, tuple(grid.shape)), axis=1)
+    assert (p.x > grid.places(index)).all() and (p.x < grid.places(index + 1)).all()
+    assert np.bincount(p.point, p.fraction) == pytest.approx(1, abs=1e-13)
+    if not axisymmetric:
+        mean = np.stack([np.bincount(p.point, p.fraction * p.x[:, a]) for a in range(dim)], axis=1)
+        assert mean == pytest.approx(centroids(corners), abs=1e-13)
+    key = p.point * grid.cells + p.cell
+    for axis in range(dim):
+        stride = int(np.prod(grid.shape[axis + 1 :]))
+        beyond = dict(zip(key.tolist(), p.faces[:, axis, 0], strict=True))
+        there = [beyond.get(k + stride, 0.0) for k in key.tolist()]
+        assert p.faces[:, axis, 1] == pytest.approx(there, abs=1e-14)
+    finer = mpm.Grid(  # each cell in two: volumes add up
+        lines=[np.sort(np.append(x, (x[1:] + x[:-1]) / 2)) for x in grid.lines], axisymmetric=axisymmetric
+    )
+    q = cut(finer, corners)
+    there = grid.number(np.stack(np.unravel_index(q.cell, tuple(finer.shape)), axis=1) // 2)
+    parts = np.bincount(np.searchsorted(key, q.point * grid.cells + there), q.fraction, len(key))
+    assert parts == pytest.approx(p.fraction, abs=1e-12)
+
+
+# ---- exact solutions ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dim, axisymmetric", KINDS)
+def test_even_stresses_are_exact(dim, axisymmetric):
+    """A block that ends within cells is pressed on all sides by a tenth, in two steps, and lines cross its domains."""
+    grid = uneven(dim, axisymmetric)
+    body = mpm.box(grid, [0] * dim, [1.03, 1.01, 0.97][:dim] if dim == 3 else [1.03, 1.01])
+    push = (lambda t: -3e5 * t) if not axisymmetric else (lambda t: -4e5 * t)
+    sides = ["right", "top", "back"][:dim]
+    walls = {"left": "x", "bottom": "y"} if dim == 2 else {"left": "x", "front": "y", "bottom": "z"}
+    loads = [mpm.Pressure(side, push) for side in sides]
+    soil = mpm.NeoHookean(bulk=2e6, shear=1e6)
+    s = mpm.Simulation(grid, [body], [soil], walls=walls, conditions=loads, numerics=EXACT)
+    s.run(1.0, 0.5, progress=False)
+    stress = s.effective_stress()
+    assert np.abs(stress - stress.mean(axis=0)).max() < 1e-10 * np.abs(stress).max()
+    assert np.abs(s.points.F - s.points.F.mean(axis=0)).max() < 1e-10
+    assert grid.cells_between(s.points.reference, s.points.corners).max() > 0.1
+
+
+@pytest.mark.parametrize("dim, axisymmetric", KINDS)
+def test_linear_pressures_are_exact(dim, axisymmetric):
+    """In steady flow through a block that ends within cells, in cells and by probes, with gravity."""
+    grid, g = uneven(dim, axisymmetric), np.array([0.0] * (dim - 1) + [-9.81])
+    slope = np.array([0.0 if axisymmetric else 3e3, -2e3, 1e3])[:dim]
+    body = mpm.box(grid, [0] * dim, [1.03] * dim)
+    rock = mpm.Hencky(bulk=1e15, shear=1e15, porosity=0.4, conductivity=1e-4)
+    names = ["bottom", "top"] if axisymmetric else list(SIDES[dim])
+    drained = [mpm.Drained(name, lambda x: 1e4 + x @ slope) for name in names]
+    hold = dict.fromkeys(("left", "bottom", "front")[: dim if dim == 3 else 2], "xyz"[:dim])
+    options = {"walls": hold, "fluid": mpm.Fluid(bulk=np.inf), "gravity": g, "conditions": drained, "numerics": EXACT}
+    s = mpm.Simulation(grid, [body], [rock], **options)
+    asked = mpm.probes([body], np.random.default_rng(4).uniform(0.05, 0.98, (6, dim)))
+    result = s.run(2e3, 1e3, probes=asked, progress=False)
+    cells = s.cells()
+    assert np.abs(cells.pressure - 1e4 - cells.x @ slope).max() < 1e-10 * 2e4
+    assert np.abs(result.probe_pressure[-1] - 1e4 - asked.x0 @ slope).max() < 1e-8 * 2e4
+
+
+def test_a_quadratic_motion_is_followed_exactly_by_corners():
+    """The difference at the ends of an edge is divided by the distances, so corners meet parabolas."""
+    from mpm_dolfinx.domains.bending import followed
+
+    grid = uneven(2)
+    cells = np.arange(grid.num_owned, dtype=np.int32)
+    x = grid.midpoints + 0.3 * grid.sizes(cells) * [1, -1]
+
+    def motion(x):
+        return np.stack([x[:, 0] ** 2 - x[:, 0] * x[:, 1], x[:, 1] ** 2 + 2 * x[:, 0]], axis=1)
+
+    field, more = followed(grid, cells, x, motion(grid.node_x), np.ones(grid.num_local, dtype=bool))
+    assert field + more == pytest.approx(motion(x), abs=1e-12)
+
+
+# ---- beside equal cells -------------------------------------------------------------------------------
+
+
+def beam(grid):
+    """Return a clamped wet beam whose ground is stiff, sagging under its weight."""
+    soil = mpm.Hencky(1e7, 4e6, porosity=0.4, conductivity=1e-5)
+    acting = [mpm.Traction("right", lambda t: (0, -300 * t)), mpm.Drained("top")]
+    body = mpm.box(grid, [0, 0.3], [1, 0.6])
+    more = {"fluid": mpm.Fluid(), "gravity": (0, -9.81), "walls": {"left": "xy"}, "conditions": acting}
+    return mpm.Simulation(grid, [body], [soil], **more)
+
+
+def layers(grid):
+    """Return two layers, the upper one of a conductivity that changes, which settle."""
+    bodies = [mpm.box(grid, [0, 0], [1, 0.4]), mpm.box(grid, [0, 0.4], [1, 0.8], material=1)]
+    law = mpm.kozeny_carman
+    soils = [mpm.Hencky(1e5, 4e4, porosity=0.4, conductivity=k, conductivity_law=law) for k in (1e-5, 1e-4)]
+    acting = [mpm.Drained("top"), mpm.Traction("top", lambda t: (0, -1000.0 * t))]
+    walls = {"left": "x", "right": "x", "bottom": "y"}
+    return mpm.Simulation(grid, bodies, soils, fluid=mpm.Fluid(), walls=walls, conditions=acting)
+
+
+def yielding(grid, **soil):
+    """Return soil into which a side is pushed, beside its drained top."""
+    soil = mpm.DruckerPrager(1e6, 4e5, porosity=0.4, conductivity=1e-5, cohesion=1e3, friction=20.0, dilation=5.0)
+    push = mpm.Displacement("top", lambda t: (0, -0.02 * t), region=([0, 0.7], [0.35, 0.9]))
+    walls = {"left": "x", "right": "x", "bottom": "xy"}
+    body = mpm.box(grid, [0, 0], [1, 0.8])
+    return mpm.Simulation(grid, [body], [soil], fluid=mpm.Fluid(), walls=walls, conditions=[push])
+
+
+def softening(grid):
+    """Return soil of which each cell softens by its own size."""
+    soil = mpm.SofteningDruckerPrager(
+        1e6, 4e5, cohesion=1e3, friction=0.0, dilation=0.0, residual=500.0, slip=0.05, viscosity=10.0
+    )
+    push = mpm.Displacement("top", lambda t: (0, -0.01 * t), region=([0, 0.7], [0.35, 0.9]))
+    walls = {"left": "x", "right": "x", "bottom": "xy"}
+    return mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 0.8])], [soil], walls=walls, conditions=[push])
+
+
+def vibrating(grid):
+    """Return a wet beam with inertia, let go."""
+    soil = mpm.Hencky(1e5, 4e4, porosity=0.4, conductivity=1e-3, grain_density=2600)
+    body = mpm.box(grid, [0, 0.3], [0.6, 0.6])
+    more = {"fluid": mpm.Fluid(), "inertia": True, "gravity": (0, -9.81), "walls": {"left": "xy"}}
+    return mpm.Simulation(grid, [body], [soil], conditions=[mpm.Drained("top")], **more)
+
+
+def touched(grid):
+    """Return soft soil under a rough disc."""
+    tool = mpm.Tool(mpm.Ball([0.5, 1.0], 0.2), displacement=lambda t: (0, -0.05 * t), friction=0.3)
+    walls = {"left": "x", "right": "x", "bottom": "xy"}
+    soil = mpm.Hencky(1e5, 4e4)
+    return mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 0.8])], [soil], walls=walls, conditions=[tool])
+
+
+def draining(grid):
+    """Return soil that drains under suction."""
+    dries = mpm.VanGenuchten(entry=1e4, n=2.0)
+    soil = mpm.Hencky(1e6, 4e5, porosity=0.4, conductivity=1e-5, retention=dries)
+    walls = {"left": "x", "right": "x", "bottom": "xy"}
+    more = {"fluid": mpm.Fluid(), "gravity": (0, -9.81), "walls": walls}
+    body = mpm.box(grid, [0, 0], [1, 0.8])
+    return mpm.Simulation(grid, [body], [soil], conditions=[mpm.Drained("bottom", -5e3)], **more)
+
+
+def of_points(grid):
+    """Return a dry beam that is integrated at its points."""
+    load = mpm.Traction("right", lambda t: (0, -100 * t))
+    numerics = mpm.Numerics(quadrature="point")
+    body = mpm.box(grid, [0, 0.3], [1, 0.6])
+    return mpm.Simulation(
+        grid, [body], [mpm.Hencky(1e5, 4e4)], walls={"left": "xy"}, conditions=[load], numerics=numerics
+    )
+
+
+SCENES = [(beam, 1.0), (layers, 1.0), (yielding, 1.0), (softening, 1.0), (vibrating, 0.1), (touched, 1.0)]
+SCENES += [(draining, 1e3), (of_points, 1.0)]
+
+
+@pytest.mark.parametrize(
+    "make, end", [pytest.param(*s, marks=[] if s[0] in (beam, touched) else [pytest.mark.slow]) for s in SCENES]
+)
+def test_lines_that_are_nearly_equal_show_what_equal_cells_do(make, end):
+    """All terms of the code for cells of many sizes are met beside those of equal ones."""
+    ends = []
+    for grid in nearly_equal([0, 0], [1.2, 1.2], [12, 12]):
+        s = make(grid)
+        s.run(end, end / 2, progress=False)
+        moved = s.points.corners - s.points.reference
+        ends.append([moved, s.effective_stress(), s.points.pressure])
+    for one, other in zip(*ends, strict=True):
+        assert np.abs(one - other).max() <= 1e-5 * np.abs(one).max()
+
+
+def test_multigrid_takes_as_many_iterations_on_graded_lines(monkeypatch):
+    """As on equal cells of their mean size, within a half, and ends where factors do."""
+    found = []
+    lines = mpm.graded([0, -0.6], [1.2, 0.4], [[[0.0, 0.0], [0.3, 0.3]]], 0.02, 1.1)
+    for grid, least in ((mpm.Grid([0, -0.6], [1.2, 0.4], [36, 30]), 1), (mpm.Grid(lines=lines), 1), (None, 10**6)):
+        thresholds(monkeypatch, multigrid_2d=least, coarsest=50)
+        grid = grid or mpm.Grid(lines=lines)
+        load, more = mpm.Traction("top", lambda t: (0, -1e5 * t)), {"fluid": mpm.Fluid(), "walls": {"left": "xy"}}
+        body, soil = mpm.box(grid, [0, 0], [1, 0.3]), mpm.Hencky(6.7e6, 3.1e6, porosity=0.4, conductivity=1e-5)
+        s = mpm.Simulation(grid, [body], [soil], conditions=[load, mpm.Drained("right")], **more)
+        result = s.run(0.04, 0.02, progress=False)
+        found.append((result.coupling / result.newton, s.points.corners))
+    assert found[1][0] < 1.5 * found[0][0], found
+    assert np.abs(found[1][1] - found[2][1]).max() < 1e-9
+
+
+# ---- errors -------------------------------------------------------------------------------------------
+
+
+def smooth(cells, strength):
+    """Return lines from 0 to 1 whose distances change smoothly, by 1 : (1 + strength) / (1 - strength)."""
+    t = np.arange(cells + 1) / cells
+    return t + strength / (2 * np.pi) * np.sin(2 * np.pi * t)
+
+
+@pytest.mark.slow
+def test_displacement_and_pressure_are_of_second_order_on_smoothly_graded_lines():
+    """Cells of 1 : 4, in twice as many steps as cells, while the top passes a fifth of the block."""
+    found = []
+    for cells in (6, 12, 24):
+        x = smooth(cells, 0.6)
+        lines = [x, np.append(x, 1 + (1 - x[-2]) * np.array([1, 2]))]
+        grid = mpm.Grid(lines=lines)
+        s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 1])], [made.SOIL], **made.PHYSICS)
+        for _ in range(2 * cells):
+            assert s.step(12.0 / (2 * cells)).balance < 1e-8
+        found.append(made.errors(s))
+    assert rates(found).min() > 1.9, found
+
+
+def test_a_boundary_layer_needs_fine_cells_where_it_is():
+    """Terzaghi's column at T = 0.005 and 0.01, fine near its top: a third of the cells, the same error."""
+    errors, cells = [], 50
+    h, load = 1 / cells, 1e-5 * terzaghi.SOIL.oedometric
+    lines = mpm.graded([0, 0], [h, 1], [[[0, 0.7], [h, 1]]], h, 1.2)
+    for grid in (mpm.Grid([0, 0], [h, 1], [1, cells]), mpm.Grid(lines=lines)):
+        acting = [mpm.Traction("top", (0, -load)), mpm.Drained("top")]
+        walls = {"left": "x", "right": "x", "bottom": "y"}
+        body, more = mpm.box(grid, [0, 0], [h, 1]), {"fluid": terzaghi.WATER, "walls": walls}
+        s = mpm.Simulation(grid, [body], [terzaghi.SOIL], conditions=acting, **more)
+        of = []
+        for T in (0.005, 0.01):
+            s.run(T / terzaghi.CV, 0.005 / terzaghi.CV / 20, after=s.result, progress=False)
+            at = s.cells()
+            of.append(np.abs(at.pressure / load - terzaghi_pressure(1 - at.x[:, 1], T, 1.0, 1.0)).max())
+        errors.append(of)
+    assert (np.array(errors[1]) < 1.3 * np.array(errors[0])).all(), errors
+    assert len(lines[1]) < 0.55 * cells
+
+
+# ---- what else ----------------------------------------------------------------------------------------
+
+
+def test_a_run_goes_on_from_a_checkpoint_with_the_same_bits_and_on_the_same_lines_only(tmp_path):
+    file, ends = tmp_path / "kept", []
+    for parts in (1, 2):
+        s = beam(uneven(2))
+        result = s.run(0.5, 0.5, progress=False, checkpoint=mpm.Checkpoint(file))
+        if parts == 2:
+            s = beam(uneven(2))
+            result = mpm.resume(s, file)
+        s.run(1.0, 0.5, progress=False, after=result)
+        ends.append(s.points)
+    assert (ends[0].corners == ends[1].corners).all() and (ends[0].pressure == ends[1].pressure).all()
+    other = beam(uneven(2, seed=1))
+    refused_in_one_line(lambda: mpm.resume(other, file), "lines", "0.", None, 1000)
+
+
+@pytest.mark.parametrize(
+    "make, name, value",
+    [
+        (lambda: mpm.Grid(lines=[[0, 1]]), "grid: lines", "[[0, 1]]"),
+        (lambda: mpm.Grid(lines=[[0, 1], [0, 2, 1]]), "grid: lines along y", "[0, 2, 1]"),
+        (lambda: mpm.Grid(lines=[[0, 1], [0, np.nan]]), "grid: lines along y", "nan"),
+        (lambda: mpm.Grid([0, 0], lines=[[0, 1], [0, 1]]), "grid: lines", "lower"),
+        (lambda: mpm.Grid(lines=[[0, 1, 3], [-1, 1]]).h, "grid", "sizes"),
+        (lambda: mpm.Grid(lines=[[-1, 1, 2], [0, 1]], axisymmetric=True), "axisymmetric", "radius"),
+        (lambda: mpm.graded([0, 0], [1, 1], [[[0, 0], [2, 1]]], 0.1), "graded: fine", "[[[0, 0], [2, 1]]]"),
+        (lambda: mpm.graded([0, 0], [1, 1], [[[0, 0], [1, 1]]], 0.1, ratio=1.0), "graded: ratio", "1"),
+        (lambda: mpm.graded([0, 0], [1, 1], [[[0, 0], [1, 1]]], 0.1, largest=0.01), "graded: largest", "0.01"),
+        (lambda: mpm.polygon(uneven(2), [[0, 0], [1, 0], [0, 1]], "side"), "polygon: size", "None"),
+    ],
+)
+def test_what_lines_do_not_allow_is_refused_in_one_line(make, name, value):
+    refused_in_one_line(make, name, value, None, 200)
+
+
+def test_contacts_of_groups_are_refused():
+    grid = uneven(2)
+    bodies = [mpm.box(grid, [0, 0], [1, 0.4]), mpm.box(grid, [0, 0.4], [1, 0.8])]
+    contact = mpm.Contact([0], [1], friction=0.3)
+    with pytest.raises(ValueError, match="contacts: must be none on a grid whose cells have many sizes"):
+        mpm.Simulation(grid, bodies, [SOFT], walls={"bottom": "xy"}, conditions=[contact])
+
+
+@pytest.mark.slow
+def test_a_footing_in_a_large_box_of_graded_cells_carries_what_it_does_in_a_small_one_of_equal_cells():
+    loads = [footing.limit_load("undrained", 5, footing.FAR[how], how == "graded").load[-1] for how in footing.FAR]
+    assert loads[1] == pytest.approx(loads[0], rel=0.01)
+
+
+@pytest.mark.slow
+def test_a_body_that_is_carried_through_graded_lines_and_back_is_as_one_in_equal_cells():
+    """A wet beam, clamped to what moves it by its length and bent on its way: stress and pressure that are left."""
+    left, h = [], 0.05
+    lines = mpm.graded([-0.2, 0], [2.6, 1.2], [[[-0.2, 0.45], [1.0, 0.85]]], h, 1.2, 3 * h)
+    for grid in (mpm.Grid([-0.2, 0], [2.6, 1.2], [56, 24]), mpm.Grid(lines=lines)):
+        hold = mpm.Displacement("left", lambda t: (np.sin(np.pi * t), 0.0))
+        load = mpm.Traction("right", lambda t: (0, -600 * np.sin(np.pi * t)))
+        body, soil = mpm.box(grid, [0.1, 0.5], [0.9, 0.8]), mpm.Hencky(1e6 / 3, 2e5, porosity=0.4, conductivity=1e-4)
+        s = mpm.Simulation(grid, [body], [soil], fluid=mpm.Fluid(), walls={}, conditions=[hold, load])
+        result = s.run(1.0, 1 / 60, progress=False)
+        assert result.balance < 1e-8
+        left.append([np.linalg.norm(s.effective_stress(), axis=(1, 2)).mean(), np.abs(s.points.pressure).max()])
+    assert (np.array(left[1]) < 1.5 * np.array(left[0])).all(), left
