@@ -28,6 +28,8 @@ class Numerics:
         Both residuals fall below this, relative to the forces and to the fluid that changes places; in (0, 1).
     method
         Of time integration: "sdirk2", of second order, or "backward-euler".
+    renewal
+        Whether domains of yielded soil that have become longer than a cell are renewed, see `domains/renewal.py`.
     petsc_options
         PETSc's options for the solvers, see `Scheme`.
 
@@ -41,6 +43,7 @@ class Numerics:
     coupling: str = "schur-cg"
     tolerance: float = 1e-8
     method: str = "sdirk2"
+    renewal: bool = True
     petsc_options: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self):

@@ -38,7 +38,7 @@ class Acting(NamedTuple):
 class Start(NamedTuple):
     """The start of a step of dt (s): the state on the grid, with the pieces' data, matrices, and what acts.
 
-    yielded: whether soil has yielded before, on any process.
+    yielded: whether soil has yielded before, on any process; renewed: how many domains were renewed.
     """
 
     state: State
@@ -48,6 +48,7 @@ class Start(NamedTuple):
     dt: float
     yielded: bool
     acting: list[Acting]
+    renewed: int = 0
 
     def carrying(self, flight: Flight | None) -> Callable[[NDArray[np.float64]], dict[str, NDArray[np.float64]]] | None:
         """Return what gives velocities of points after the step, see `Mass.carried`; None without inertia."""

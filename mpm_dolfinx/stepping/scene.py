@@ -23,6 +23,7 @@ from mpm_dolfinx.conditions.conditions import OnSide
 from mpm_dolfinx.conditions.unit_weights import other_gravity, weighed
 from mpm_dolfinx.diagnostics.resolution import warn_overfilled, warn_smeared
 from mpm_dolfinx.domains.cut_domains import CutDomains
+from mpm_dolfinx.domains.renewal import Renewal
 from mpm_dolfinx.flow.sources import Sources
 from mpm_dolfinx.flow.storage import CellPressure, StorageForms
 from mpm_dolfinx.grid.grid import Grid, in_chunks
@@ -138,6 +139,7 @@ class Scene:
         self._on_grid: Latest[OnGrid] = Latest()
         self._systems: Latest[System] = Latest()
         self._assembled: Latest[Assembled] = Latest()
+        self._renewed: Latest[tuple[MaterialPoints, int]] = Latest()
 
     @property
     def flows(self) -> bool:
@@ -215,6 +217,27 @@ class Scene:
                 return OnGrid(self.pieces, *problems, cut, self.scheme.of_fluid)
 
         return self._on_grid(points.arrays, make, grid.comm)
+
+    @cached_property
+    def _renewal(self) -> Renewal | None:
+        """Renews domains; None where these are never renewed."""
+        grid = self.grid
+        plane = grid.dim == 2 and not grid.axisymmetric and grid.comm.size == 1 and grid.copies == 1
+        dry = self.fluid is None and self.momentum.inertia is None
+        used = self.numerics.renewal and self.numerics.quadrature == "domain" and self.materials.evolves
+        return Renewal(grid, self.bodies, self.materials) if plane and dry and used else None
+
+    def renewed(self, state: State) -> tuple[State, int]:
+        """Return a state some of whose domains are renewed before the grid is reset, and how many were."""
+        if self._renewal is None or state.stay is not None:
+            return state, 0
+
+        def make() -> tuple[MaterialPoints, int]:
+            with Timer("mpm: renew domains"):
+                return self._renewal.renewed(state.points, state.stage)
+
+        points, count = self._renewed((*state.points.arrays, state.stage), make, self.grid.comm)
+        return (replace(state, points=points) if count else state), count
 
     def assembled(
         self, on_grid: OnGrid, stage: Stage, now: Sequence[Loads], as_cut: Callable[[], Sequence[Loads]], begins: bool

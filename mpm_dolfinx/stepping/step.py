@@ -26,7 +26,10 @@ def set_up(scene: Scene, state: State, dt: float, how: tuple = ()) -> Start:
     start, *gravity = (stage.gravity_at(t) for t in [state.t, *times])
     if dt > 0:
         scene.look_at([start, *gravity])
-    state = state if state.stays else state.at_owners(scene.grid)
+    renewed = 0
+    if not state.stays:
+        state, renewed = scene.renewed(state) if dt > 0 else (state, 0)
+        state = state.at_owners(scene.grid)
     cut_points = state.as_cut
     on_grid = scene.on_grid(cut_points)
     on_grid.cut.surfaces(stage.surfaces)  # all at once
@@ -41,13 +44,13 @@ def set_up(scene: Scene, state: State, dt: float, how: tuple = ()) -> Start:
     scene.momentum.u.x.array[:] = 0.0
     on_grid.start(state)
     acting = [Acting(*one) for one in zip(how or scene.substeps, times, loads, gravity, strict=True)]
-    return Start(state, on_grid, data, matrices, dt, has_yielded(scene, state), acting)
+    return Start(state, on_grid, data, matrices, dt, has_yielded(scene, state), acting, renewed)
 
 
 def step(scene: Scene, state: State, dt: float, how: tuple = ()) -> tuple[State, Report]:
     """Return the state after a step of dt (s), and what it took; `state` stays what it is, whatever is raised."""
     start = set_up(scene, state, dt, how)
-    report = Report()
+    report = Report(renewed=start.renewed)
     kept = Kept()
     rates = []
     state = start.state
