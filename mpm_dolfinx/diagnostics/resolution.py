@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.tolerances import SAME
-from mpm_dolfinx.bodies.bodies import Body
+from mpm_dolfinx.bodies.bodies import Body, body_of
 from mpm_dolfinx.bodies.touching import Faces, covered, covers
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.grid.grid import SIDES, Grid, sum_by
@@ -50,7 +50,7 @@ def warn_overfilled(cut: CutDomains, bodies: Sequence[Body]) -> Callable[..., An
 def bodies_in(cut: CutDomains, bodies: Sequence[Body], cell: int) -> tuple[list[int], NDArray[np.float64]]:
     """Return the bodies in a lexicographic cell, and its midpoint (d,), m; on all processes together."""
     grid, ids = cut.grid, cut.points.id[cut.pieces.point[cut.pieces.cell == cell]]
-    own = np.searchsorted(np.cumsum([len(body) for body in bodies]), ids, side="right")
+    own = body_of(ids, np.cumsum([0, *map(len, bodies)]))
     found = sorted({int(i) for rows in grid.comm.allgather(own) for i in rows})
     return found, grid.lower + (np.array(np.unravel_index(cell % grid.cells, grid.shape)) + 0.5) * grid.h
 

@@ -18,8 +18,10 @@ left alone.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
+
+from mpi4py import MPI
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,9 +30,10 @@ from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.base.tolerances import EPSILON, NEAR, SAME, TINY
 from mpm_dolfinx.bodies.bodies import Body, body_of
 from mpm_dolfinx.bodies.faces import Surface
-from mpm_dolfinx.domains.renewed_faces import AREA, ENDS, PARENT, keys
+from mpm_dolfinx.domains.renewed_faces import AREA, ENDS, PARENT, keys, with_faces
 from mpm_dolfinx.grid.grid import Grid, sum_by
 from mpm_dolfinx.materials.fields import SceneMaterials
+from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.cutting import FACES, _slice, centroids, corner_bits, cut, volumes
 from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints, in_space
 from mpm_dolfinx.points.polygons import NONE, Polygons
@@ -38,12 +41,16 @@ from mpm_dolfinx.stepping.stage import Stage
 
 LONGEST = 1.0
 """Cells that a domain may be long; the nodes bend a longer one, whose edges are straight.  Source: definition."""
-import os
-ROUNDS = int(os.environ.get("ROUNDS", 1))
-MANY = int(os.environ.get("MANY", 25))
-SMALL = float(os.environ.get("SMALL", 1/16))
-SLOPES = int(os.environ.get("SLOPES", 1))
-LONGEST = float(os.environ.get("LONGEST", 1))
+MANY = 64
+"""Pieces in a cell from which it is filled anew: four times those of a lattice of half cells at any place."""
+EDGES = 4
+"""Edges that the surface has in a cell afterwards; with two a bar in clay loses 5 % of its resistance in the step."""
+BENT = 0.05
+"""Cells by which the surface turns at a corner: what is less is divided evenly."""
+APART = 0.01
+"""Cells by which ends of the surface of two domains may part, and be one."""
+COVERED = 0.25
+"""Share of a cell by which its pieces may miss what its surface says that it holds."""
 RING = np.array([0, 1, 3, 2])
 """Corners of a domain, anti-clockwise."""
 SIDE = np.array([2, 1, 3, 0])
@@ -79,7 +86,7 @@ class OuterFaces:
 
 
 class New(NamedTuple):
-    """New domains: corners (n, 4, 2), m; the group (n,) that shares what it gets, and keys, lengths and ends of faces."""
+    """New domains: corners (n, 4, 2), m; the group (n,) that shares what it gets; keys, lengths and ends of faces."""
 
     corners: NDArray[np.float64]
     group: NDArray[np.int64]
@@ -121,15 +128,13 @@ class Renewal:
             self._seeded = OuterFaces(*(column[order] for column in columns))
         return self._seeded
 
-    def _faces(self, points: MaterialPoints, rows: NDArray[np.bool_]) -> OuterFaces:
-        """Return the outer faces of some of the points (n,)."""
+    def _faces(self, points: MaterialPoints) -> OuterFaces:
+        """Return the outer faces of points."""
         seeded = self._outer
         here, at = points.find(seeded.point)
-        some = rows[at]
-        here, at = here[some], at[some]
         columns = [(at, *(v[here] for v in (seeded.face, seeded.key, seeded.area, seeded.ends)))]
         if PARENT in points.data:
-            at, face = np.nonzero((points.data[PARENT] != NONE) & rows[:, None])
+            at, face = np.nonzero(points.data[PARENT] != NONE)
             columns.append((at, face, *(points.data[name][at, face] for name in (PARENT, AREA, ENDS))))
         return OuterFaces(*map(np.concatenate, zip(*columns, strict=True)))
 
@@ -149,19 +154,40 @@ class Renewal:
         known = np.array(["plastic" in law.state for law in self._materials.laws])[self._materials.law_of(points)]
         return known & (self._materials.evolved(points) | (points.id >= self._starts[-1]))
 
-    def renewed(
-        self,
-        points: MaterialPoints,
-        stage: Stage,
-    ) -> tuple[MaterialPoints, int]:
-        """Return points some of whose domains are renewed, and how many were; stage: the conditions in force."""
+    def due(self, points: MaterialPoints, watched: NDArray[np.int64] | None) -> bool:
+        """Return whether domains of this process should be renewed; watched (m,): numbers of points that may not."""
+        return bool((self._free(points, watched) & self.long(points)).any())
+
+    def _free(self, points: MaterialPoints, watched: NDArray[np.int64] | None) -> NDArray[np.bool_]:
+        """Return which points (n,) may be renewed."""
         flowed = self.flowed(points)
-        if not (flowed & self.long(points)).any():
-            return points, 0
+        return flowed if watched is None else flowed & ~np.isin(points.id, watched)
+
+    def renewed(
+        self, points: MaterialPoints, stage: Stage, watched: NDArray[np.int64] | None, comm: MPI.Comm
+    ) -> tuple[MaterialPoints, int]:
+        """Return points some of whose domains are renewed, and how many were; of all processes together.
+
+        Parameters
+        ----------
+        points
+            All points on the first process, none on others.
+        stage
+            The conditions in force.
+        watched : (m,)
+            Numbers of points that may not be renewed.
+        comm
+            The processes.
+        """
+        made, count = (points, 0) if comm.rank else self._renewed(points, stage, self._free(points, watched))
+        count = over_all(comm, count)
+        return (with_faces(made) if count else made), count
+
+    def _renewed(self, points: MaterialPoints, stage: Stage, free: NDArray[np.bool_]) -> tuple[MaterialPoints, int]:
         held, touched = [faces for _, faces, _ in stage.held], tuple(stage.kept(0))
-        signs = self._signs((stage,), lambda: self._signatures(stage.faces, held), self._grid.comm)
-        work = _Work(self._grid, points, body_of(points.id, self._starts), flowed, self.long(points))
-        work.classify(self._faces(points, np.ones(len(points), dtype=bool)), signs)
+        signs = self._signs((stage,), lambda: self._signatures(stage.faces, held), MPI.COMM_SELF)
+        work = _Work(self._grid, points, body_of(points.id, self._starts), free, self.long(points))
+        work.classify(self._faces(points), signs)
         if not work.chosen.any():
             return points, 0
         new = [work.full(), *work.partial(), work.rest()]
@@ -204,7 +230,7 @@ class Renewal:
         def mean(values: NDArray) -> NDArray:
             flat = values[old].reshape(len(old), int(np.prod(values.shape[1:])))
             sums = [sum_by(at, weight * column, n) / total for column in flat.T]
-            if SLOPES and sums:
+            if sums:
                 rise = work.rise(values.reshape(len(values), flat.shape[1]), group)
                 low, high = np.full((n, flat.shape[1]), np.inf), np.full((n, flat.shape[1]), -np.inf)
                 np.minimum.at(low, at, flat)
@@ -261,7 +287,7 @@ class Renewal:
         )
         kept = np.ones(len(points), dtype=bool)
         kept[gone_rows] = False
-        stay = _with_faces(points).map(lambda rows: rows[kept])
+        stay = with_faces(points).map(lambda rows: rows[kept])
         return stay.joined(made), len(gone_rows)
 
     def _elastic(self, points: MaterialPoints, rows: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -289,15 +315,6 @@ def _pulled(F: NDArray[np.float64], across: NDArray[np.float64] | None, b: NDArr
     whole[:, : seen.shape[1], : seen.shape[1]] = seen
     back = np.linalg.inv(whole)
     return back @ b @ back.swapaxes(1, 2)
-
-
-def _with_faces(points: MaterialPoints) -> MaterialPoints:
-    """Return the points with what renewed faces have, none."""
-    if PARENT in points.data:
-        return points
-    n = len(points)
-    none = {PARENT: np.full((n, 4), NONE), AREA: np.zeros((n, 4)), ENDS: np.zeros((n, 4, 2, 2))}
-    return replace(points, data={**points.data, **none})
 
 
 class _Work:
@@ -354,15 +371,11 @@ class _Work:
         self._chains(inner, barred)
         area = sum_by(cell, self.pieces.fraction * np.abs(volumes(self.points.corners))[of], self.cells)
         region = self.grid.cell_volume * np.where(self.passed, self.region.area_of(self.cells), 1.0)
-        barred |= np.abs(area - region) > 0.25 * self.grid.cell_volume
+        barred |= np.abs(area - region) > COVERED * self.grid.cell_volume
         chosen = np.zeros(self.cells, dtype=bool)
         chosen[cell[(self.flowed & self._needs)[of]]] = True
         chosen |= np.bincount(cell, minlength=self.cells) > MANY
         chosen &= ~barred
-        small = self.pieces.fraction * np.abs(volumes(self.points.corners))[of] < SMALL * self.grid.cell_volume
-        for _ in range(ROUNDS):
-            gone = self._at(chosen)
-            chosen[cell[gone[of] & small & ~barred[cell]]] = True
         self.chosen = chosen
         self.gone = self._at(chosen)
 
@@ -410,13 +423,22 @@ class _Work:
         for at, k, place in ((starts, 0, P), (ends, 1, Q)):
             once &= np.bincount(cell[at], minlength=self.cells) == 1
             place[cell[at]] = x[at, k]
-        once &= np.abs(Q - P - way).max(axis=1) < 1e-2
-        once &= np.linalg.norm(Q - P, axis=1) > 1e-3
+        once &= np.abs(Q - P - way).max(axis=1) < APART
+        once &= np.linalg.norm(Q - P, axis=1) > APART
         a, b = x[:, 0] - P[cell], x[:, 1] - P[cell]
         bulge = sum_by(cell, (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 2, self.cells)
+        along = np.einsum("mi,mi->m", a + b, (Q - P)[cell])
+        order = np.lexsort((along, cell))
+        order = order[once[cell[order]]]
+        cell, x = cell[order], x[order]
+        apart = (np.abs(x[1:, 0] - x[:-1, 1]).max(axis=1) > APART) & (cell[1:] == cell[:-1])
+        once[cell[1:][apart]] = False
         barred |= self.passed & ~once
+        kept = once[cell]
+        cell, x = cell[kept], x[kept]
         at = np.flatnonzero(once)
-        self.region = region = _Region(at, P[at], Q[at], bulge[at])
+        surface = _resampled(np.searchsorted(at, cell), x, P[at], Q[at], bulge[at])
+        self.region = region = _Region(at, surface)
         barred[at[~region.sound]] = True
 
     # ---- new domains ----------------------------------------------------------------------------
@@ -468,13 +490,15 @@ class _Work:
         lower: NDArray[np.float64],
         upper: NDArray[np.float64],
     ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return the key (m,) of the part of the surface nearest to the middle of edges in cells (m,), and the reference
+        """Return of edges in cells (m,) the key (m,) of the part of the surface nearest to their middle, and the reference
         positions (m, 2, 2), m, of their ends, by the parts nearest to these.
         """
         first = np.searchsorted(parts.cell[order], cells, side="left")
         stop = np.searchsorted(parts.cell[order], cells, side="right")
         edge = np.repeat(np.arange(len(cells)), stop - first)
-        part = order[np.arange(len(edge)) - np.repeat(np.cumsum(stop - first) - (stop - first), stop - first) + first[edge]]
+        part = order[
+            np.arange(len(edge)) - np.repeat(np.cumsum(stop - first) - (stop - first), stop - first) + first[edge]
+        ]
         a, way = parts.x[part, 0], parts.x[part, 1] - parts.x[part, 0]
         found = []
         for place in ((lower + upper) / 2, lower, upper):
@@ -591,7 +615,8 @@ class _Work:
         normal = means((y[:, :, None] * y[:, None]).reshape(-1, 4)).reshape(-1, 2, 2)
         right = means((y[:, :, None] * q[:, None]).reshape(len(y), -1)).reshape(-1, 2, q.shape[1])
         value, axes = np.linalg.eigh(normal)
-        back = np.where(value > 1e-2, 1 / np.maximum(value, 1e-2), 0.0)
+        some = value > SAME  # cells squared: along a row of places nothing is known across it
+        back = np.where(some, 1 / np.where(some, value, 1.0), 0.0)
         slope = (axes * back[:, None]) @ axes.swapaxes(1, 2) @ right / h[:, None]
         return slope[np.concatenate([np.flatnonzero(self.chosen), self.cell[self.left]])[group]]
 
@@ -680,7 +705,7 @@ def _convex(corners: NDArray[np.float64]) -> tuple[Polygons, NDArray[np.int64]]:
 
 _BOX = np.array([[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]])
 _HALVES = np.array([[0, 0], [1, 0], [2, 0], [2, 1], [2, 2], [1, 2], [0, 2], [0, 1]]) / 2
-MOST = 12  # vertices of what a cell holds: ends and middle of the surface, those of halves of its sides, and one more
+MOST = EDGES + 10  # vertices of what a cell holds: of the surface, of halves of its sides, and one more
 
 
 class _Region:
@@ -690,39 +715,32 @@ class _Region:
     ----------
     cells
         The cells.
-    P, Q : (n, 2)
-        Where the surface enters and leaves them, with the body on its left.
-    bulge : (n,)
-        Area between the surface and the chord.
+    surface : (n, EDGES + 1, 2)
+        Vertices of the surface in them, from where it enters to where it leaves, with the body on its left.
     """
 
-    def __init__(self, cells: NDArray[np.int64], P: NDArray, Q: NDArray, bulge: NDArray):
+    def __init__(self, cells: NDArray[np.int64], surface: NDArray[np.float64]):
         self.cells = cells
-        chord = Q - P
-        normal = np.stack([chord[:, 1], -chord[:, 0]], axis=1)
-        M = (P + Q) / 2 + 2 * (bulge / np.maximum((chord**2).sum(axis=1), TINY))[:, None] * normal
-        M = np.clip(M, 0.0, 1.0)
-        start, end = 2 * _around(Q), 2 * _around(P)  # in halves of a side
+        start, end = (2 * _around(surface[:, k]) for k in (-1, 0))  # in halves of a side
         end = np.where(end <= start + NEAR, end + 8, end)
         first = np.floor(start + NEAR).astype(np.int64) + 1
         count = np.maximum(0, np.ceil(end - NEAR).astype(np.int64) - first)
         x = np.zeros((len(cells), MOST, 2))
-        x[:, 0] = M
-        x[:, 1] = Q
-        n = np.arange(len(cells))
+        x[:, : EDGES + 1] = surface
         for k in range(8):
             has = count > k
-            x[has, 2 + k] = _HALVES[(first[has] + k) % 8]
-        x[n, 2 + count] = P
-        size = 3 + count
+            x[has, EDGES + 1 + k] = _HALVES[(first[has] + k) % 8]
+        size = EDGES + 1 + count
         odd = np.flatnonzero(size % 2)
-        after = np.where((np.arange(MOST) < size[:, None] - 1)[:, :, None], np.roll(x, -1, axis=1), x)
+        after = np.where((np.arange(MOST) < size[:, None] - 1)[:, :, None], np.roll(x, -1, axis=1), x[:, :1])
+        after = np.where((np.arange(MOST) < size[:, None])[:, :, None], after, x)
         length = np.linalg.norm(after - x, axis=2)[odd]
-        length[:, 0] = 0.0  # not of the surface
+        length[:, :EDGES] = 0.0  # not of the surface
         at = length.argmax(axis=1)
         place = np.arange(MOST)[None]
+        middle = (x[odd, at] + after[odd, at]) / 2
         grown = np.take_along_axis(x[odd], np.where(place <= at[:, None], place, place - 1)[:, :, None], axis=1)
-        grown[np.arange(len(odd)), at + 1] = (x[odd, at] + x[odd, at + 1]) / 2
+        grown[np.arange(len(odd)), at + 1] = middle
         x[odd] = grown
         self._size = size + size % 2
         last = np.take_along_axis(x, (self._size - 1)[:, None, None], axis=1)
@@ -735,7 +753,7 @@ class _Region:
         a, b = x - self._middle[:, None], after - self._middle[:, None]
         sees = a[:, :, 0] * b[:, :, 1] - a[:, :, 1] * b[:, :, 0]
         sees = np.where(np.arange(MOST) < self._size[:, None], sees, 1.0)
-        self.sound = (sees.min(axis=1) > 0) & (self.area > 1e-3)
+        self.sound = (sees.min(axis=1) > 0) & (self.area > APART**2)
 
     def area_of(self, count: int) -> NDArray[np.float64]:
         """Return the areas of so many cells, from 0 to 1; of those without a region 1."""
@@ -758,13 +776,63 @@ class _Region:
             domain = np.empty_like(ring)
             domain[:, RING] = ring
             on = np.zeros((len(at), 4), dtype=bool)
-            on[:, 1] = k == 0
-            on[:, 3] = k + 2 == size
+            on[:, 1] = k < EDGES
+            on[:, 3] = k + 1 < EDGES
             corners.append(domain)
             of.append(at)
             surface.append(on)
         out.append((np.concatenate(of), np.concatenate(corners), np.concatenate(surface)))
         return out
+
+
+def _resampled(
+    of: NDArray[np.int64], x: NDArray[np.float64], P: NDArray[np.float64], Q: NDArray[np.float64], bulge: NDArray
+) -> NDArray[np.float64]:
+    """Return vertices (n, EDGES + 1, 2) of surfaces from P to Q (n, 2), evenly along their parts.
+
+    Their area beyond the chords, bulge (n,), stays what it is: vertices are shifted by what they would lose.
+
+    of, x : (m,), (m, 2, 2): surface of each part, one after the other, and its ends.
+    """
+    length = np.linalg.norm(x[:, 1] - x[:, 0], axis=1)
+    gone = np.concatenate([[0.0], np.cumsum(length)])
+    first, stop = (np.searchsorted(of, np.arange(len(P)), side=side) for side in ("left", "right"))
+    ends = gone[first], gone[stop]
+    out = np.concatenate([P[:, None], np.zeros((len(P), EDGES - 1, 2)), Q[:, None]], axis=1)
+    at = np.zeros((len(P), EDGES + 1))
+    at[:, 0], at[:, -1] = ends
+
+    def divide(low: int, high: int) -> None:
+        """Put a vertex between two: at the sharpest corner, or in the middle of what is nearly straight."""
+        middle = (low + high) // 2
+        a, chord = out[:, low], out[:, high] - out[:, low]
+        off = x[:, 0] - a[of]
+        far = np.abs(chord[of, 0] * off[:, 1] - chord[of, 1] * off[:, 0])
+        far /= np.maximum(np.linalg.norm(chord, axis=1), TINY)[of]
+        within = (gone[:-1] > at[of, low]) & (gone[:-1] < at[of, high])
+        far = np.where(within, far, 0.0)
+        order = np.lexsort((far, of))
+        corner = order[stop - 1]
+        aim = (at[:, low] + at[:, high]) / 2
+        aim = np.where(far[corner] > BENT, gone[corner], aim)
+        part = np.clip(np.searchsorted(gone, aim, side="right") - 1, first, stop - 1)
+        t = (aim - gone[part]) / np.maximum(length[part], TINY)
+        at[:, middle] = aim
+        out[:, middle] = x[part, 0] + t[:, None] * (x[part, 1] - x[part, 0])
+
+    step = EDGES
+    while step > 1:
+        for low in range(0, EDGES, step):
+            divide(low, low + step)
+        step //= 2
+    y = out - P[:, None]
+    has = (y[:, :-1, 0] * y[:, 1:, 1] - y[:, :-1, 1] * y[:, 1:, 0]).sum(axis=1) / 2
+    way = out[:, 2:] - out[:, :-2]
+    normal = np.stack([way[:, :, 1], -way[:, :, 0]], axis=2)
+    size = np.maximum(np.linalg.norm(way, axis=2), TINY)
+    shift = 2 * (bulge - has) / size.sum(axis=1)
+    out[:, 1:-1] += shift[:, None, None] * normal / size[:, :, None]
+    return np.clip(out, 0.0, 1.0)
 
 
 def _around(x: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,15 @@ seeded, m; the reference positions of its ends, m."""
 def keys(point: NDArray[np.int64], face: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return numbers (m,) of faces of domains in the plane, of points as seeded and by their numbers there."""
     return 4 * np.asarray(point, dtype=np.int64) + face
+
+
+def with_faces(points: MaterialPoints) -> MaterialPoints:
+    """Return the points with what renewed faces have, none where they have nothing of it."""
+    if PARENT in points.data:
+        return points
+    n = len(points)
+    none = {PARENT: np.full((n, 4), -1), AREA: np.zeros((n, 4)), ENDS: np.zeros((n, 4, 2, 2))}
+    return replace(points, data={**points.data, **none})
 
 
 @dataclass(frozen=True)
@@ -54,7 +63,7 @@ class RenewedFaces:
     def in_place_of(
         self, area: NDArray[np.float64], whole: NDArray[np.float64], face: NDArray[np.int64]
     ) -> tuple[NDArray, NDArray, NDArray]:
-        """Return areas of the parts that count, and of whole faces, m, and numbers, for those (n,) of faces as seeded."""
+        """Return areas of parts and of whole faces, m, and their numbers, in place of those (n,) of faces as seeded."""
         part = np.ptp(self.xi, axis=1).max(axis=1) / 2
         new = self.area * part, self.area, self.face
         return tuple(np.where(self.old, a, b) for a, b in zip((area, whole, face), new, strict=True))
@@ -76,7 +85,9 @@ def renewed_faces(points: MaterialPoints, several: Sequence[Surface]) -> Renewed
     for faces in several:
         own = keys(faces.id, faces.face)
         order = np.argsort(own, kind="stable")
-        near = order[np.minimum(np.searchsorted(own[order], key), len(own) - 1)] if len(own) else np.zeros(len(key), int)
+        near = (
+            order[np.minimum(np.searchsorted(own[order], key), len(own) - 1)] if len(own) else np.zeros(len(key), int)
+        )
         rows = np.flatnonzero(own[near] == key) if len(own) else np.zeros(0, dtype=np.int64)
         low, high = _within(ends[rows], faces.region)
         rows, low, high = (v[high > low] for v in (rows, low, high))

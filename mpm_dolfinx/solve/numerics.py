@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from mpm_dolfinx.base.time_integration import substeps
+from mpm_dolfinx.base.validation import flag
 from mpm_dolfinx.solve.scheme import Scheme
 
 QUADRATURES = ("domain", "point")
@@ -50,6 +51,7 @@ class Numerics:
         if self.quadrature not in QUADRATURES:
             raise ValueError(f"quadrature {self.quadrature!r}: must be {' or '.join(QUADRATURES)}")
         substeps(self.method, True)
+        flag("renewal", self.renewal)
         _ = self.scheme  # refuses what is none
 
     @property

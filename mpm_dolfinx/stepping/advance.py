@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.base.errors import LeftGrid, NotConverged, Report
 from mpm_dolfinx.base.fluid_content import change_at_points
-from mpm_dolfinx.bodies.bodies import Body
+from mpm_dolfinx.bodies.bodies import Body, body_of
 from mpm_dolfinx.conditions.acting import Loads
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.domains.domain_gradient import gradient
@@ -335,7 +335,7 @@ class Motion:
 
     def _body(self, points: MaterialPoints) -> NDArray[np.int64]:
         """Return the number of each point's body (n,)."""
-        return np.searchsorted(self._starts, points.id, side="right") - 1
+        return body_of(points.id, self._starts)
 
     def _sizes(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the edges (n, d), m, of boxes as large as the points' domains at rest, as seeded or put on others."""

@@ -35,6 +35,7 @@ from mpm_dolfinx.materials.user_functions import compiling
 from mpm_dolfinx.mechanics.inertia import moving
 from mpm_dolfinx.mechanics.momentum import MomentumForms, MomentumProblem, MomentumSystem
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData, QuadraturePoints
+from mpm_dolfinx.parallel.exchange import Exchange, over_all
 from mpm_dolfinx.parallel.messages import ConditionWarning, warn
 from mpm_dolfinx.points.cutting import volumes
 from mpm_dolfinx.points.material_points import MaterialPoints
@@ -222,21 +223,31 @@ class Scene:
     def _renewal(self) -> Renewal | None:
         """Renews domains; None where these are never renewed."""
         grid = self.grid
-        plane = grid.dim == 2 and not grid.axisymmetric and grid.comm.size == 1 and grid.copies == 1
+        plane = grid.dim == 2 and not grid.axisymmetric and grid.copies == 1
         dry = self.fluid is None and self.momentum.inertia is None
         used = self.numerics.renewal and self.numerics.quadrature == "domain" and self.materials.evolves
         return Renewal(grid, self.bodies, self.materials) if plane and dry and used else None
 
     def renewed(self, state: State) -> tuple[State, int]:
-        """Return a state some of whose domains are renewed before the grid is reset, and how many were."""
+        """Return a state some of whose domains are renewed before the grid is reset, and how many were.
+
+        On several processes the first one has all points afterwards.
+        """
         if self._renewal is None or state.stay is not None:
             return state, 0
+        comm = self.grid.comm
 
         def make() -> tuple[MaterialPoints, int]:
             with Timer("mpm: renew domains"):
-                return self._renewal.renewed(state.points, state.stage)
+                due = self._renewal.due(state.points, state.watched)
+                if not over_all(comm, int(due)):
+                    return state.points, 0
+                points = state.points
+                if comm.size > 1:
+                    points = points.migrated(Exchange(comm, np.zeros(len(points), dtype=np.int32)))
+                return self._renewal.renewed(points, state.stage, state.watched, comm)
 
-        points, count = self._renewed((*state.points.arrays, state.stage), make, self.grid.comm)
+        points, count = self._renewed((*state.points.arrays, state.stage), make, comm)
         return (replace(state, points=points) if count else state), count
 
     def assembled(

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.base.tolerances import SAME
 from mpm_dolfinx.base.validation import chosen, flag, instance, line, numbers
-from mpm_dolfinx.bodies.bodies import Body
+from mpm_dolfinx.bodies.bodies import Body, body_of
 from mpm_dolfinx.bodies.faces import Surface, surface
 from mpm_dolfinx.bodies.fills import put, touches
 from mpm_dolfinx.bodies.touching import check_apart
@@ -23,12 +23,14 @@ from mpm_dolfinx.contact.groups import contacts_of
 from mpm_dolfinx.contact.history import gripped, let_go
 from mpm_dolfinx.domains.fitted import fitted_at
 from mpm_dolfinx.domains.pressure_transport import at_start
+from mpm_dolfinx.domains.renewed_faces import PARENT
 from mpm_dolfinx.dynamics.at_rest import borne
 from mpm_dolfinx.dynamics.quiet import QuietSides, traction_name
 from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.materials.initial_stress import OfWater
 from mpm_dolfinx.mechanics.inertia import resting
 from mpm_dolfinx.mechanics.tractions import owners
+from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.parallel.messages import ConditionWarning, warn
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.stepping.initial_state import pieces_at_start
@@ -99,11 +101,15 @@ def begin_stage(
     if state.stays:  # pressures are those of the cells
         state = scene.motion.left_grid(state, scene.on_grid(state.stay.points))
     state = replace(state, stay=None)
-    gone, pieces = _ids(scene.bodies, remove), state.pieces
+    own = body_of(state.points.id, np.cumsum([0, *map(len, scene.bodies)]))
+    gone, pieces = state.points.id[np.isin(own, list(remove))], state.pieces
     there = [body for body, here in enumerate(before.present) if here and body not in remove]
     bare, gravity = let_go(state.points, before.data_names(before.named)), None
     if scene.initial.given:
         gravity = begun.gravity_at(state.t)
+    if add and over_all(scene.grid.comm, int(PARENT in bare.data)):
+        what = f"stage: add: body {add[0]}: domains of others have been renewed"
+        raise ValueError(f"{what}, must come before, or with Numerics(renewal=False)")
     bare = _without_extra(scene, bare, add, fields) if add else bare
     points, new = _filled(scene, bare.of(gone, kept=False), there, add, gravity)
     others = before.data_names(before.named.keys() - begun.same(before))
