@@ -29,12 +29,12 @@ if __name__ == "__main__":
     simulation = pushed()
     if "restart" in sys.argv:
         half = mpm.Checkpoint(file.with_suffix(".checkpoint"))
-        simulation.run(0.1, 0.02, checkpoint=half, until=lambda s: s.t > 0.06, progress=False)
+        simulation.run(0.06, 0.02, checkpoint=half, until=lambda s: s.t > 0.03, progress=False)
         simulation = pushed()
-        simulation.run(0.1, 0.02, after=mpm.resume(simulation, half.file), progress=False)
+        simulation.run(0.06, 0.02, after=mpm.resume(simulation, half.file), progress=False)
     else:
-        simulation.run(0.1, 0.02, until=lambda s: s.t > 0.06, progress=False)
-        simulation.run(0.1, 0.02, after=simulation.result, progress=False)
+        simulation.run(0.06, 0.02, until=lambda s: s.t > 0.03, progress=False)
+        simulation.run(0.06, 0.02, after=simulation.result, progress=False)
     points = simulation.points
     names = ("plastic", "tool_shear")
     rows = points.id, points.x, points.volume0, *(points.data[name] for name in names)

@@ -112,7 +112,7 @@ def test_elastic_soil_is_left_alone(monkeypatch):
     half = s.state.points.x[:, 0] < 1
     some = yielded(s, 1e-3 * np.diag([1.0, -1.0]) * half[:, None, None])
     new, count = renewed(s, some, monkeypatch)
-    here, at = new.find(some.id[~half])
+    _, at = new.find(some.id[~half])
     assert count > 0 and len(at) == (~half).sum()
     assert (new.corners[at] == some.corners[~half]).all() and (new.F[at] == some.F[~half]).all()
 
@@ -146,12 +146,13 @@ def test_a_run_that_renews_is_the_same_after_a_restart_and_on_several_processes(
         assert one[name] == pytest.approx(other[name], abs=(0 if processes == 1 else 1e-7) * size)
 
 
-def test_domains_of_probes_and_those_of_a_scene_that_renews_nothing_stay():
+def test_domains_of_probes_and_those_of_a_scene_that_renews_nothing_stay(monkeypatch):
+    monkeypatch.setattr(renewal, "LONGEST", 0.6)
     runs = []
     for on in (True, False):
         simulation = mpi_renewal.pushed(renewal=on)
-        probe = mpm.probes(simulation.bodies, [[0.9, 0.6]])
-        runs.append(simulation.run(0.1, 0.02, probes=probe, progress=False))
+        probe = mpm.probes(simulation.bodies, [[0.05, 0.5]])
+        runs.append(simulation.run(0.06, 0.02, probes=probe, progress=False))
         assert probe.id[0] in simulation.points.id
     assert runs[0].renewed > 0 and runs[0].renewals > 0
     assert runs[1].renewed == runs[1].renewals == 0

@@ -34,7 +34,16 @@ from mpm_dolfinx.domains.renewed_faces import AREA, ENDS, PARENT, keys, with_fac
 from mpm_dolfinx.grid.grid import Grid, sum_by
 from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.parallel.exchange import over_all
-from mpm_dolfinx.points.cutting import FACES, _slice, centroids, corner_bits, cut, volumes
+from mpm_dolfinx.points.cutting import (
+    FACES,
+    _slice,
+    centroids,
+    corner_bits,
+    cut,
+    simplex_volumes,
+    vertices,
+    volumes,
+)
 from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints, in_space
 from mpm_dolfinx.points.polygons import NONE, Polygons
 from mpm_dolfinx.stepping.stage import Stage
@@ -47,6 +56,10 @@ EDGES = 4
 """Edges that the surface has in a cell afterwards; with two a bar in clay loses 5 % of its resistance in the step."""
 BENT = 0.05
 """Cells by which the surface turns at a corner: what is less is divided evenly."""
+SMALL = 1 / 64
+"""Share of a cell: where less is left of a domain, its cell is filled anew as well."""
+CRUMB = 1e-4
+"""Share of a cell that is no domain of its own: what is left of one beside it has its mass."""
 APART = 0.01
 """Cells by which ends of the surface of two domains may part, and be one."""
 COVERED = 0.25
@@ -139,13 +152,12 @@ class Renewal:
         return OuterFaces(*map(np.concatenate, zip(*columns, strict=True)))
 
     def long(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return which domains (n,) have an edge longer than `LONGEST` cells, or have turned inside out in a part."""
+        """Return which domains (n,) have an edge longer than `LONGEST` cells, or are turned inside out in a part."""
         ring = points.corners[:, RING] / self._grid.h
         edge = np.roll(ring, -1, axis=1) - ring
-        before = np.roll(edge, 1, axis=1)
-        turn = before[:, :, 0] * edge[:, :, 1] - before[:, :, 1] * edge[:, :, 0]
-        least = -SAME * np.abs(edge).max(axis=(1, 2)) ** 2
-        return ((edge**2).sum(axis=2).max(axis=1) > LONGEST**2) | (turn.min(axis=1) < least)
+        parts = simplex_volumes(vertices(np.ascontiguousarray(points.corners.transpose(1, 2, 0))))
+        turned = parts.min(axis=0, initial=0.0) < -CRUMB * self._grid.cell_volume
+        return ((edge**2).sum(axis=2).max(axis=1) > LONGEST**2) | turned
 
     def flowed(self, points: MaterialPoints) -> NDArray[np.bool_]:
         """Return which points (n,) have yielded, and have a law whose elastic strain is known."""
@@ -376,6 +388,12 @@ class _Work:
         chosen[cell[(self.flowed & self._needs)[of]]] = True
         chosen |= np.bincount(cell, minlength=self.cells) > MANY
         chosen &= ~barred
+        small = self.pieces.fraction * np.abs(volumes(self.points.corners))[of] < SMALL * self.grid.cell_volume
+        more = chosen
+        while more.any():
+            more = np.zeros(self.cells, dtype=bool)
+            more[cell[self._at(chosen)[of] & small & ~(barred | chosen)[cell]]] = True
+            chosen |= more
         self.chosen = chosen
         self.gone = self._at(chosen)
 
@@ -490,8 +508,8 @@ class _Work:
         lower: NDArray[np.float64],
         upper: NDArray[np.float64],
     ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return of edges in cells (m,) the key (m,) of the part of the surface nearest to their middle, and the reference
-        positions (m, 2, 2), m, of their ends, by the parts nearest to these.
+        """Return of edges in cells (m,) the key (m,) of the part of the surface nearest to their middles, and the
+        reference positions (m, 2, 2), m, of their ends, by the parts nearest to these.
         """
         first = np.searchsorted(parts.cell[order], cells, side="left")
         stop = np.searchsorted(parts.cell[order], cells, side="right")
@@ -564,14 +582,15 @@ class _Work:
         """Return what domains that are gone leave beyond the renewed cells: each piece a group."""
         pieces, points = self.pieces, self.points
         left = np.flatnonzero(self.gone[pieces.point] & ~self.chosen[self.cell])
-        left = left[pieces.fraction[left] * points.volume0[pieces.point[left]] > NEAR * self.grid.cell_volume]
+        area = pieces.fraction[left] * np.abs(volumes(points.corners[pieces.point[left]]))
+        left = left[area > CRUMB * self.grid.cell_volume]
         rings, of = _convex(points.corners[pieces.point[left]])
         rings, of = rings.of(np.repeat(np.arange(len(of)), 4)), np.repeat(of, 4)
         halves = np.tile((_BOX + corner_bits(2)[:, None]) / 2, (len(of) // 4, 1, 1))
         polygons = rings.within(self._place(self.cell[left][of], halves)).simplified(NEAR * self.grid.h.min())
         row, quads, edge = polygons.quadrilaterals()
         piece = left[of[row]]
-        sound = Polygons.rings(quads).area > (NEAR * self.grid.h.min()) ** 2
+        sound = Polygons.rings(quads).area > CRUMB**2 * self.grid.cell_volume
         piece, quads, edge = piece[sound], quads[sound], edge[sound]
         self.left, number = np.unique(piece, return_inverse=True)
         corners = np.empty_like(quads)
