@@ -9,9 +9,9 @@ import pytest
 from test_mpi import mpirun
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.domains import renewal
 from mpm_dolfinx.points.cutting import volumes
 from mpm_dolfinx.points.polygons import Polygons
+from mpm_dolfinx.stepping import renewal
 
 CLAY = mpm.DruckerPrager(bulk=5e6, shear=1e5, friction=0.0, dilation=0.0, cohesion=1e3)
 

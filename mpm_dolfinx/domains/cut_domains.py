@@ -57,7 +57,8 @@ class Patches:
         self.x = x
         self._grid = grid
         self._renewed = renewed
-        area0, self._whole0, self._face = faces.area0[here], faces.whole0[here], faces.face[here]
+        area0 = faces.area0[here]
+        self._whole0, self._face = faces.whole0[here], faces.face[here]
         if renewed is not None:
             area0, self._whole0, self._face = renewed.in_place_of(area0, self._whole0, self._face)
         self._share0 = share * area0

@@ -13,7 +13,9 @@ from mpm_dolfinx.base.tolerances import SAME
 from mpm_dolfinx.bodies.faces import Surface
 from mpm_dolfinx.points.material_points import MaterialPoints
 
-PARENT, AREA, ENDS = "renewed faces", "renewed areas", "renewed ends"
+PARENT = "renewed faces"
+AREA = "renewed areas"
+ENDS = "renewed ends"
 """Names of what points carry for each face: the key of the face as seeded on which it lies, -1 for none; its area as
 seeded, m; the reference positions of its ends, m."""
 

@@ -30,7 +30,7 @@ class Numerics:
     method
         Of time integration: "sdirk2", of second order, or "backward-euler".
     renewal
-        Whether domains of yielded soil that have become longer than a cell are renewed, see `domains/renewal.py`.
+        Whether domains of yielded soil that have become longer than a cell are renewed, see `stepping/renewal.py`.
     petsc_options
         PETSc's options for the solvers, see `Scheme`.
 

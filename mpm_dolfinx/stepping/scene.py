@@ -23,7 +23,6 @@ from mpm_dolfinx.conditions.conditions import OnSide
 from mpm_dolfinx.conditions.unit_weights import other_gravity, weighed
 from mpm_dolfinx.diagnostics.resolution import warn_overfilled, warn_smeared
 from mpm_dolfinx.domains.cut_domains import CutDomains
-from mpm_dolfinx.domains.renewal import Renewal
 from mpm_dolfinx.flow.sources import Sources
 from mpm_dolfinx.flow.storage import CellPressure, StorageForms
 from mpm_dolfinx.grid.grid import Grid, in_chunks
@@ -42,6 +41,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.solve.numerics import Numerics
 from mpm_dolfinx.stepping.advance import Motion
 from mpm_dolfinx.stepping.grid_reset import Assembled, OnGrid, System, assembled
+from mpm_dolfinx.stepping.renewal import Renewal
 from mpm_dolfinx.stepping.stage import Stage
 from mpm_dolfinx.stepping.state import State
 

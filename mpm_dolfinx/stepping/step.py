@@ -26,10 +26,8 @@ def set_up(scene: Scene, state: State, dt: float, how: tuple = ()) -> Start:
     start, *gravity = (stage.gravity_at(t) for t in [state.t, *times])
     if dt > 0:
         scene.look_at([start, *gravity])
-    renewed = 0
-    if not state.stays:
-        state, renewed = scene.renewed(state) if dt > 0 else (state, 0)
-        state = state.at_owners(scene.grid)
+    state, renewed = scene.renewed(state) if dt > 0 else (state, 0)
+    state = state if state.stays else state.at_owners(scene.grid)
     cut_points = state.as_cut
     on_grid = scene.on_grid(cut_points)
     on_grid.cut.surfaces(stage.surfaces)  # all at once

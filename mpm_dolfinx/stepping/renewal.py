@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 from mpi4py import MPI
@@ -50,20 +51,24 @@ from mpm_dolfinx.stepping.stage import Stage
 
 LONGEST = 1.0
 """Cells that a domain may be long; the nodes bend a longer one, whose edges are straight.  Source: definition."""
-MANY = 64
-"""Pieces in a cell from which it is filled anew: four times those of a lattice of half cells at any place."""
 EDGES = 4
 """Edges that the surface has in a cell afterwards; with two a bar in clay loses 5 % of its resistance in the step."""
-BENT = 0.05
-"""Cells by which the surface turns at a corner: what is less is divided evenly."""
-SMALL = 1 / 64
-"""Share of a cell: where less is left of a domain, its cell is filled anew as well."""
-CRUMB = 1e-4
-"""Share of a cell that is no domain of its own: what is left of one beside it has its mass."""
+BENT = 1 - 3**0.5 / 2
+"""Cells by which the surface turns at a corner; what bends less is divided evenly.
+
+Source: exact, a chord of one cell in a circle of a cell's radius: the grid sees no smaller one.
+"""
 APART = 0.01
 """Cells by which ends of the surface of two domains may part, and be one."""
+CRUMB = APART**2
+"""Share of a cell that is no domain of its own: what is left of one beside it has its mass.  Source: definition."""
+SMALL = (0.5 / EDGES) ** 2
+"""Share of a cell: where less is left of a domain, its cell is filled anew as well.
+
+Source: definition, half of an edge wide.
+"""
 COVERED = 0.25
-"""Share of a cell by which its pieces may miss what its surface says that it holds."""
+"""Share of a cell by which its pieces may miss what its surface says that it holds.  Source: definition, one domain."""
 RING = np.array([0, 1, 3, 2])
 """Corners of a domain, anti-clockwise."""
 SIDE = np.array([2, 1, 3, 0])
@@ -122,24 +127,21 @@ class Renewal:
         self._bodies = bodies
         self._starts = np.cumsum([0, *map(len, bodies)])
         self._materials = materials
-        self._seeded: OuterFaces | None = None
         self._signs: Latest[tuple[NDArray, NDArray]] = Latest()
 
-    @property
+    @cached_property
     def _outer(self) -> OuterFaces:
         """All outer faces of the bodies as seeded, ordered by key."""
-        if self._seeded is None:
-            found = []
-            for start, body in zip(self._starts, self._bodies, strict=False):
-                row, face = body.outer()
-                at = FACES[2][face]
-                X, x = (np.take_along_axis(of(row), at[:, :, None], axis=1) for of in (body.reference, body.corners))
-                size = np.linalg.norm(x[:, 1] - x[:, 0], axis=1)
-                found.append((start + row, face, keys(start + row, face), size, X))
-            columns = [np.concatenate(column) for column in zip(*found, strict=True)]
-            order = np.argsort(columns[2])
-            self._seeded = OuterFaces(*(column[order] for column in columns))
-        return self._seeded
+        found = []
+        for start, body in zip(self._starts, self._bodies, strict=False):
+            row, face = body.outer()
+            at = FACES[2][face]
+            X, x = (np.take_along_axis(of(row), at[:, :, None], axis=1) for of in (body.reference, body.corners))
+            size = np.linalg.norm(x[:, 1] - x[:, 0], axis=1)
+            found.append((start + row, face, keys(start + row, face), size, X))
+        columns = [np.concatenate(column) for column in zip(*found, strict=True)]
+        order = np.argsort(columns[2])
+        return OuterFaces(*(column[order] for column in columns))
 
     def _faces(self, points: MaterialPoints) -> OuterFaces:
         """Return the outer faces of points."""
@@ -348,7 +350,11 @@ class _Work:
         flowed: NDArray[np.bool_],
         needs: NDArray[np.bool_],
     ):
-        self.grid, self.points, self.body, self.flowed, self._needs = grid, points, body, flowed, needs
+        self.grid = grid
+        self.points = points
+        self.body = body
+        self.flowed = flowed
+        self._needs = needs
         self.pieces = cut(grid, points.corners)
         self.cell = self.pieces.cell + (grid.copy(points.id)[self.pieces.point] if grid.copies > 1 else 0)
         self.cells = grid.cells * grid.copies
@@ -361,7 +367,8 @@ class _Work:
 
     def classify(self, faces: OuterFaces, signs: tuple[NDArray, NDArray]) -> None:
         """Find the cells that are renewed, and what the surface makes of them."""
-        of, cell, body = self.pieces.point, self.cell, self.body[self.pieces.point]
+        of, cell = self.pieces.point, self.cell
+        body = self.body[of]
         low, high = np.full(self.cells, np.iinfo(np.int64).max), np.full(self.cells, -1)
         np.minimum.at(low, cell, body)
         np.maximum.at(high, cell, body)
@@ -386,7 +393,6 @@ class _Work:
         barred |= np.abs(area - region) > COVERED * self.grid.cell_volume
         chosen = np.zeros(self.cells, dtype=bool)
         chosen[cell[(self.flowed & self._needs)[of]]] = True
-        chosen |= np.bincount(cell, minlength=self.cells) > MANY
         chosen &= ~barred
         small = self.pieces.fraction * np.abs(volumes(self.points.corners))[of] < SMALL * self.grid.cell_volume
         more = chosen
@@ -414,7 +420,8 @@ class _Work:
         way = s[1, :2] - s[0, :2]
         size = np.hypot(*way)
         some = size > NEAR
-        s, row, way, size = s[:, :, some], row[some], way[:, some], size[some]
+        s, way = s[:, :, some], way[:, some]
+        row, size = row[some], size[some]
         outward = np.stack([way[1], -way[0]]) / size
         middle = s[:, :2].mean(axis=0)
         flat = np.abs(way) < grid.snap[:, None]
@@ -573,7 +580,8 @@ class _Work:
                 np.maximum.at(high, place, bordered.x[:, :, 1 - axis].max(axis=1))
                 covered = (middle > low[here]) & (middle < high[here])
                 dense = sum_by(place, seeded, 4 * self.cells) / np.maximum(sum_by(place, length, 4 * self.cells), TINY)
-                at, here, key, X = at[covered], here[covered], key[covered], X[covered]
+                at, here = at[covered], here[covered]
+                key, X = key[covered], X[covered]
                 parent[at, face], ends[at, face] = key, X
                 area[at, face] = np.linalg.norm(b[at] - a[at], axis=1) * dense[here]
         return New(self._place(cells, local), self._group(cells), parent, area, ends)
@@ -591,7 +599,8 @@ class _Work:
         row, quads, edge = polygons.quadrilaterals()
         piece = left[of[row]]
         sound = Polygons.rings(quads).area > CRUMB**2 * self.grid.cell_volume
-        piece, quads, edge = piece[sound], quads[sound], edge[sound]
+        piece, quads = piece[sound], quads[sound]
+        edge = edge[sound]
         self.left, number = np.unique(piece, return_inverse=True)
         corners = np.empty_like(quads)
         corners[:, RING] = quads
@@ -786,7 +795,8 @@ class _Region:
         """Return rows (m,) of this, corners (m, 4, 2) of the domains there, and which faces (m, 4) are the surface."""
         out = []
         rows = np.flatnonzero(chosen[self.cells])
-        corners, of, surface = [np.zeros((0, 4, 2))], [rows[:0]], [np.zeros((0, 4), dtype=bool)]
+        corners, of = [np.zeros((0, 4, 2))], [rows[:0]]
+        surface = [np.zeros((0, 4), dtype=bool)]
         for k in range(0, MOST, 2):
             at = rows[self._size[rows] > k]
             size = self._size[at]
