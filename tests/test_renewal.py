@@ -41,7 +41,7 @@ def renewed(s, points, monkeypatch, longest=1e-3):
     """Return the points with domains renewed that are longer than so many cells, and how many were."""
     monkeypatch.setattr(renewal, "LONGEST", longest)
     own = renewal.Renewal(s.grid, s.bodies, s.scene.materials)
-    return own.renewed(points, s.state.stage, None, s.grid.comm)
+    return own.renewed(points, s.state.stage)
 
 
 def strain_of(s, points):
@@ -147,17 +147,24 @@ def test_a_run_that_renews_is_the_same_after_a_restart_and_on_several_processes(
 
 
 def test_domains_of_probes_and_those_of_a_scene_that_renews_nothing_stay(monkeypatch):
+    """A probe is put where a domain would be renewed."""
     monkeypatch.setattr(renewal, "LONGEST", 0.6)
-    runs = []
-    for on in (True, False):
-        simulation = mpi_renewal.pushed(renewal=on)
-        probe = mpm.probes(simulation.bodies, [[0.05, 0.5]])
-        runs.append(simulation.run(0.06, 0.02, probes=probe, progress=False))
-        assert probe.id[0] in simulation.points.id
-    assert runs[0].renewed > 0 and runs[0].renewals > 0
-    assert runs[1].renewed == runs[1].renewals == 0
-    with pytest.raises(ValueError, match="renewed"):
-        mpi_renewal.pushed(renewal=1)
+
+    def run(place=None, **options):
+        simulation = mpi_renewal.pushed(**options)
+        probe = mpm.probes(simulation.bodies, [[0.99, 0.01] if place is None else place])
+        return simulation, simulation.run(0.05, 0.01, probes=probe, progress=False), probe.id[0]
+
+    simulation, result, _ = run()
+    assert result.renewed > 0 and result.renewals > 0
+    body = simulation.bodies[0]
+    gone = np.setdiff1d(np.arange(len(body)), simulation.points.id)
+    simulation, _, probe = run(body.centre_of(gone[:1])[0])
+    assert probe == gone[0] and probe in simulation.points.id
+    _, result, _ = run(renewal=False)
+    assert result.renewed == result.renewals == 0
+    with pytest.raises(ValueError, match="renewal"):
+        mpm.Numerics(renewal=1)
 
 
 def test_polygons_are_cut_and_divided():
@@ -166,7 +173,6 @@ def test_polygons_are_cut_and_divided():
     assert half.area == pytest.approx([2.0]) and half.simplified(1e-9).count.tolist() == [3]
     other = np.array([[[1.0, -1.0], [3, 1], [1, 3], [-1, 1]]])
     within = ring.within(other)
-    row, quads, edge = within.quadrilaterals()
+    row, quads, _ = within.quadrilaterals()
     assert Polygons.rings(quads).area.sum() == pytest.approx(within.area[0]) and set(row) == {0}
     assert np.allclose(within.centroid, [[1, 1]])
-    assert sorted(edge[edge >= 0].tolist()) == []  # all its edges lie on those of the other one

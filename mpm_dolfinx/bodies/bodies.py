@@ -224,15 +224,6 @@ def pressure_at(pressure: float | Callable[[NDArray], ArrayLike], x: NDArray[np.
     return np.full(len(x), 0.0 if callable(pressure) else float(numbers("pressure", pressure)))
 
 
-def body_of(ids: NDArray[np.int64], starts: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the body (n,) of each point by its number; starts (bodies + 1,): first numbers of bodies, and of none.
-
-    Points beyond those as seeded are of one body after the other.
-    """
-    beyond = ids - starts[-1]
-    return np.where(beyond < 0, np.searchsorted(starts, ids, side="right") - 1, beyond % max(1, len(starts) - 1))
-
-
 def material_points(
     grid: Grid, bodies: Sequence[Body], pressure: float | Callable[[NDArray], ArrayLike] = 0.0
 ) -> MaterialPoints:

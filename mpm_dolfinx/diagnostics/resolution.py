@@ -13,13 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.tolerances import SAME
-from mpm_dolfinx.bodies.bodies import Body, body_of
+from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.touching import Faces, covered, covers
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.grid.grid import SIDES, Grid, sum_by
 from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
+from mpm_dolfinx.points.material_points import body_of
 
 FULL = 1.2
 """Of a cell: domains that have not folded stay below 1.08 where soil is pushed aside by half a footing's width."""

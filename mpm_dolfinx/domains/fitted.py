@@ -11,12 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from mpm_dolfinx.bodies.bodies import body_of
 from mpm_dolfinx.bodies.faces import interpolate
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.cutting import centroids, edges
 from mpm_dolfinx.points.local_fit import RADIUS, LocalFit, near
-from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.points.material_points import MaterialPoints, body_of
 
 
 def fitted_at(

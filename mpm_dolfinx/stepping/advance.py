@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.base.errors import LeftGrid, NotConverged, Report
 from mpm_dolfinx.base.fluid_content import change_at_points
-from mpm_dolfinx.bodies.bodies import Body, body_of
+from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.conditions.acting import Loads
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.domains.domain_gradient import gradient
@@ -30,7 +30,15 @@ from mpm_dolfinx.mechanics.momentum import MomentumForms
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
 from mpm_dolfinx.parallel.exchange import first, over_all
 from mpm_dolfinx.points.cutting import centroids, parallelepipeds, tangled, volumes
-from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints, determinant, in_plane, in_space, with_ratio
+from mpm_dolfinx.points.material_points import (
+    ACROSS,
+    MaterialPoints,
+    body_of,
+    determinant,
+    in_plane,
+    in_space,
+    with_ratio,
+)
 from mpm_dolfinx.stepping.grid_reset import AtPlaces, OnGrid
 from mpm_dolfinx.stepping.stage import Stage
 from mpm_dolfinx.stepping.state import State, Stay

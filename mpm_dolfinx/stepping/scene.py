@@ -34,7 +34,6 @@ from mpm_dolfinx.materials.user_functions import compiling
 from mpm_dolfinx.mechanics.inertia import moving
 from mpm_dolfinx.mechanics.momentum import MomentumForms, MomentumProblem, MomentumSystem
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData, QuadraturePoints
-from mpm_dolfinx.parallel.exchange import Exchange, over_all
 from mpm_dolfinx.parallel.messages import ConditionWarning, warn
 from mpm_dolfinx.points.cutting import volumes
 from mpm_dolfinx.points.material_points import MaterialPoints
@@ -235,19 +234,12 @@ class Scene:
         """
         if self._renewal is None or state.stay is not None:
             return state, 0
-        comm = self.grid.comm
 
         def make() -> tuple[MaterialPoints, int]:
             with Timer("mpm: renew domains"):
-                due = self._renewal.due(state.points, state.watched)
-                if not over_all(comm, int(due)):
-                    return state.points, 0
-                points = state.points
-                if comm.size > 1:
-                    points = points.migrated(Exchange(comm, np.zeros(len(points), dtype=np.int32)))
-                return self._renewal.renewed(points, state.stage, state.watched, comm)
+                return self._renewal.renewed(state.points, state.stage, state.watched)
 
-        points, count = self._renewed((*state.points.arrays, state.stage), make, comm)
+        points, count = self._renewed((*state.points.arrays, state.stage), make, self.grid.comm)
         return (replace(state, points=points) if count else state), count
 
     def assembled(

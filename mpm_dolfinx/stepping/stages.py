@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.base.tolerances import SAME
 from mpm_dolfinx.base.validation import chosen, flag, instance, line, numbers
-from mpm_dolfinx.bodies.bodies import Body, body_of
+from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.faces import Surface, surface
 from mpm_dolfinx.bodies.fills import put, touches
 from mpm_dolfinx.bodies.touching import check_apart
@@ -23,7 +23,6 @@ from mpm_dolfinx.contact.groups import contacts_of
 from mpm_dolfinx.contact.history import gripped, let_go
 from mpm_dolfinx.domains.fitted import fitted_at
 from mpm_dolfinx.domains.pressure_transport import at_start
-from mpm_dolfinx.domains.renewed_faces import PARENT
 from mpm_dolfinx.dynamics.at_rest import borne
 from mpm_dolfinx.dynamics.quiet import QuietSides, traction_name
 from mpm_dolfinx.grid.grid import sum_by
@@ -32,7 +31,7 @@ from mpm_dolfinx.mechanics.inertia import resting
 from mpm_dolfinx.mechanics.tractions import owners
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.parallel.messages import ConditionWarning, warn
-from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.points.material_points import MaterialPoints, body_of
 from mpm_dolfinx.stepping.initial_state import pieces_at_start
 from mpm_dolfinx.stepping.scene import Scene, When
 from mpm_dolfinx.stepping.stage import Condition, Stage, checked, stage
@@ -107,7 +106,7 @@ def begin_stage(
     bare, gravity = let_go(state.points, before.data_names(before.named)), None
     if scene.initial.given:
         gravity = begun.gravity_at(state.t)
-    if add and over_all(scene.grid.comm, int(PARENT in bare.data)):
+    if add and over_all(scene.grid.comm, int((bare.id >= sum(map(len, scene.bodies))).any())):
         what = f"stage: add: body {add[0]}: domains of others have been renewed"
         raise ValueError(f"{what}, must come before, or with Numerics(renewal=False)")
     bare = _without_extra(scene, bare, add, fields) if add else bare
